@@ -10,16 +10,8 @@ from codegen.build import compiler_of
 from codegen.cache import Cache
 from codegen.compiler import interruptible
 from codegen.errors import CodegenError
-from hybrid_opt.campaign.stages import Progress
 from hybrid_opt.cell import Cell
-from hybrid_opt.job.plan import JobCollisions
-from hybrid_opt.polishing.drive import is_polishable
-from hybrid_opt.polishing.rows import row_library
-from hybrid_opt.polishing.solvers.dense import dense_method
-from hybrid_opt.polishing.solvers.quadratic import quadratic_method
-from hybrid_opt.robust.force import at_rest, pressing_model, robust_model
-from hybrid_opt.timing.model import TimingModel
-from hybrid_opt.timing.path_timer import PATH_INTERVALS
+from hybrid_opt.progress import Progress
 from symbolic.errors import DualArmError
 
 Maker = Callable[[], object]
@@ -89,6 +81,16 @@ def _driven(cell: Cell) -> bool:
 
 
 def _makers(cell: Cell, polish: bool) -> Iterator[Maker]:
+    # Not imported at the top: who builds a few functions needs none of it.
+    from hybrid_opt.job.plan import JobCollisions
+    from hybrid_opt.polishing.drive import is_polishable
+    from hybrid_opt.polishing.rows import row_library
+    from hybrid_opt.polishing.solvers.dense import dense_method
+    from hybrid_opt.polishing.solvers.quadratic import quadratic_method
+    from hybrid_opt.robust.force import at_rest, pressing_model, robust_model
+    from hybrid_opt.timing.model import TimingModel
+    from hybrid_opt.timing.path_timer import PATH_INTERVALS
+
     compiled, workcell, cache = cell.compiled, cell.workcell, cell.compiled.cache
     polished = polish and workcell.has_facing_pads
     if _driven(cell):

@@ -15,7 +15,7 @@ from hybrid_opt.front import Front
 from hybrid_opt.metaheuristics.run import SearchSettings, search_carries
 from hybrid_opt.polishing.polisher import Polisher
 from hybrid_opt.polishing.settings import PolishSettings, usual_settings
-from hybrid_opt.progress import Progress, counted
+from hybrid_opt.progress import ShowProgress, counted
 from hybrid_opt.store.trajectory_file import write_trajectory
 from hybrid_opt.timing.analysis import TimedTrajectory, timed_trajectory
 from hybrid_opt.timing.jerk import time_with_jerk as solve_with_jerk
@@ -32,7 +32,7 @@ def search(
     evaluations: int = 1000,
     rng: np.random.Generator,
     settings: SearchSettings | None = None,
-    progress: Progress = False,
+    progress: ShowProgress = False,
 ) -> Front:
     """Search for the carries of least objectives.
 
@@ -63,7 +63,7 @@ def polish(
     rng: np.random.Generator,
     settings: PolishSettings | None = None,
     paths: Sequence[Carry | Array] = (),
-    progress: Progress = False,
+    progress: ShowProgress = False,
 ) -> Front:
     """Improve a front: both peak forces with an interior-point method, or, under the time law
     'optimal', path and speed profile together.

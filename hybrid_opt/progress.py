@@ -1,17 +1,20 @@
-"""How far a call is: a bar in the terminal or notebook, or a function of the caller's."""
+"""How far work is: lines of a program, a bar of a call, or a function of the caller's."""
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Literal
 
-Progress = Literal[False, True] | Callable[[int, int], None]
+from tqdm import tqdm
+
+ShowProgress = Literal[False, True] | Callable[[int, int], None]
 """Whether to show a bar, or what is called with the units done and those in all."""
 
 
 @contextmanager
-def counted(progress: Progress, what: str, total: int) -> Iterator[Callable[[int], None]]:
+def counted(progress: ShowProgress, what: str, total: int) -> Iterator[Callable[[int], None]]:
     """Count the units of a call.
 
     Args:
@@ -36,3 +39,63 @@ def counted(progress: Progress, what: str, total: int) -> Iterator[Callable[[int
             progress(done, total)
 
     yield advance
+
+
+Advance = Callable[[int], None]
+"""Tells how many more units are done."""
+
+_QUIET_SECONDS = 10.0
+"""Between lines where the terminal is none, as in a log."""
+
+
+class Progress:
+    """Shows one stage at a time as a line on standard error.
+
+    Attributes:
+        shown: False to show nothing.
+        of: what the stages belong to, in front of their titles.
+    """
+
+    def __init__(self, shown: bool = True, of: str = "") -> None:
+        self.shown = shown
+        self.of = of
+
+    @contextmanager
+    def stage(
+        self, title: str, total: int, unit: str, done: int = 0, delay: float = 0.0
+    ) -> Iterator[Advance]:
+        """A line for the time of the `with` block.
+
+        Args:
+            title: what is being done.
+            total: units in all.
+            unit: what is counted.
+            done: units that an earlier attempt did.
+            delay: what is over sooner is not shown [s].
+        """
+        bar = tqdm(
+            total=total,
+            initial=done,
+            desc=f"{self.of} {title}".strip(),
+            unit=f" {unit}",
+            file=sys.stderr,
+            mininterval=0.2 if sys.stderr.isatty() else _QUIET_SECONDS,
+            miniters=0,  # to tell of nothing new tells how long it has been going on
+            delay=delay,
+            dynamic_ncols=True,
+            disable=not self.shown,
+            bar_format="{desc}: {n_fmt} of {total_fmt}{unit} [{elapsed} gone, {remaining} left]",
+        )
+        with bar:
+
+            def advance(count: int) -> None:
+                if bar.total is not None and bar.n + count > bar.total:
+                    bar.total = None  # more than was thought: nobody knows how much is left
+                bar.update(count)
+
+            yield advance
+
+    def note(self, text: str) -> None:
+        """A line of its own."""
+        if self.shown:
+            tqdm.write(text, file=sys.stderr)

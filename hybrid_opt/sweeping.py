@@ -26,7 +26,7 @@ from hybrid_opt.evaluate.evaluations import Evaluations
 from hybrid_opt.evaluate.objectives import Objective
 from hybrid_opt.front import Front
 from hybrid_opt.polishing.settings import DrivableSettings, PolishSettings
-from hybrid_opt.progress import Progress, counted
+from hybrid_opt.progress import ShowProgress, counted
 from hybrid_opt.recommending.choice import (
     DrivenPaths,
     Goal,
@@ -111,7 +111,7 @@ def sweep(
     fixed: bool = False,
     file: str | Path | None = None,
     jobs: int = 1,
-    progress: Progress = False,
+    progress: ShowProgress = False,
 ) -> Sweep:
     """The recommended carry's duration and force for every combination of some numbers of a cell.
 

@@ -2,15 +2,14 @@
 
 Prints the cell's facts, the postures at the start, the static bound, the verdicts on the
 hand-made trajectory and on the straight line, the feasibility of random candidates by
-constraint, with the pairs, joints and robots that are in the way most, the bounds that a short
-polish ends on, and the number of collision pairs (--pairs lists them with the reasons for those
-left out); draws the cell, both arms' reach and the first collision of trajectories that fail;
-with --view writes a page that shows the hand-made one at any sample.
+constraint, with the pairs, joints and robots that are in the way most, and the number of collision
+pairs (--pairs lists them with the reasons for those left out); with --polish the bounds that a
+short polish ends on; draws the cell, both arms' reach and the first collision of trajectories that
+fail; with --view writes a page that shows the hand-made one at any sample.
 """
 
 from __future__ import annotations
 
-import argparse
 import sys
 
 from studies.options import add, whole
@@ -35,8 +34,7 @@ def _add_options(parser: Parser) -> None:
     )
     parser.add_argument(
         "--polish",
-        action=argparse.BooleanOptionalAction,
-        default=True,
+        action="store_true",
         help="polish the hand-made trajectory shortly, to see which bounds bind",
     )
     parser.add_argument(

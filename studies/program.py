@@ -158,8 +158,12 @@ def later(work: str) -> Callable[[argparse.Namespace], int]:
     """
 
     def run(options: argparse.Namespace) -> int:
+        from hybrid_opt.work.service import one_thread
+
         module, _, name = work.rpartition(".")
-        code: int = getattr(import_module(module), name)(options)
+        do = getattr(import_module(module), name)
+        with one_thread():
+            code: int = do(options)
         return code
 
     return run

@@ -26,7 +26,7 @@ def _add_options(parser: Parser) -> None:
 
 
 def _run(options: argparse.Namespace) -> int:
-    from hybrid_opt.campaign import Progress
+    from hybrid_opt.progress import Progress
     from hybrid_opt.recommending.choice import Wish
     from studies.study.recommendation import recommend_from, recommendation_text
 

@@ -41,6 +41,7 @@ from hybrid_opt.collision.certify import certify
 from hybrid_opt.display.table import text_table
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.store.files import read_bytes
+from hybrid_opt.store.trajectory_file import FORMAT as CARRY_FORMAT
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.read.arms import arm_model
@@ -206,6 +207,8 @@ def _csv_columns(text: str) -> Columns:
 
 def _document_columns(document: Any) -> Columns:
     found: dict[str, dict[str, Array]] = {each: {} for each in QUANTITIES}
+    if document.get("format") == CARRY_FORMAT:
+        raise ValueError("it is a stored carry: export it first (python -m studies.export)")
     if "robots" in document:
         for robot in document["robots"]:
             for what, kept in found.items():

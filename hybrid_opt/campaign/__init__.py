@@ -3,13 +3,12 @@
 from hybrid_opt.campaign.folder import CampaignFolder, ExecutionSettings, executor_for, open_folder
 from hybrid_opt.campaign.search_stage import search_stage
 from hybrid_opt.campaign.settings import CampaignSettings
-from hybrid_opt.campaign.stages import Progress, Stage, check_stages, run_stages
+from hybrid_opt.campaign.stages import Stage, check_stages, run_stages
 
 __all__ = [
     "CampaignFolder",
     "CampaignSettings",
     "ExecutionSettings",
-    "Progress",
     "Stage",
     "check_stages",
     "executor_for",

@@ -28,9 +28,9 @@ from numpy.typing import NDArray
 
 from hybrid_opt.campaign.folder import CampaignFolder, executor_for, identity, replica_identity
 from hybrid_opt.campaign.settings import JOURNAL, CampaignSettings
-from hybrid_opt.campaign.stages import Advance, Progress
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.evaluate.evaluations import FEASIBLE, REASONS, Evaluations
+from hybrid_opt.progress import Advance, Progress
 from hybrid_opt.store.files import csv_text, read_bytes, storing
 from hybrid_opt.work.service import Ledger, Service, give_up
 from symbolic.array import Array

@@ -22,7 +22,7 @@ from hybrid_opt.campaign.folder import CampaignFolder
 from hybrid_opt.campaign.journal import ReplicaLedger, ReplicaRequest
 from hybrid_opt.campaign.results import Replica, read_campaign, read_polished
 from hybrid_opt.campaign.settings import JOURNAL, POLISH, polished_folder
-from hybrid_opt.campaign.stages import Progress, Stage
+from hybrid_opt.campaign.stages import Stage
 from hybrid_opt.errors import DamagedResultsWarning, ResultsError
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.polishing.front import Lost, use_one_thread
@@ -30,6 +30,7 @@ from hybrid_opt.polishing.polisher import Polisher
 from hybrid_opt.polishing.records import PolishedFront, PolishOutcome
 from hybrid_opt.polishing.settings import PolishSettings
 from hybrid_opt.polishing.solvers.base import MOST_SECONDS
+from hybrid_opt.progress import Progress
 from hybrid_opt.store.files import json_of, write_json
 from hybrid_opt.store.json_records import from_json, to_json
 from hybrid_opt.work.service import Service, give_up

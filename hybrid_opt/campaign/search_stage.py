@@ -33,12 +33,13 @@ from hybrid_opt.campaign.settings import (
     FinishedReplica,
     replica_folder,
 )
-from hybrid_opt.campaign.stages import Progress, Stage
+from hybrid_opt.campaign.stages import Stage
 from hybrid_opt.errors import DamagedResultsWarning, ResultsError
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.evaluate.evaluations import Evaluations
 from hybrid_opt.indicators import metrics
 from hybrid_opt.metaheuristics.run import Evaluator, SearchSettings, disarmed, search_carries
+from hybrid_opt.progress import Progress
 from hybrid_opt.store.files import read_bytes, sha256, write_atomically, write_json
 from hybrid_opt.store.json_records import read_record, to_json
 from hybrid_opt.work.service import Service

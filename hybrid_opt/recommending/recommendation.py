@@ -20,7 +20,7 @@ from hybrid_opt.front import Front
 from hybrid_opt.job.plan import JobModel
 from hybrid_opt.job.records import Job
 from hybrid_opt.job.smooth import driven_timing
-from hybrid_opt.progress import Progress, counted
+from hybrid_opt.progress import ShowProgress, counted
 from hybrid_opt.recommending.advice import Advice, advice, commanded_margins
 from hybrid_opt.recommending.choice import (
     FORCES,
@@ -142,7 +142,7 @@ def recommend(
     front: Front,
     wish: Wish | None = None,
     others: Mapping[str, Array] | None = None,
-    progress: Progress = False,
+    progress: ShowProgress = False,
 ) -> Recommendation:
     """The carry to run of a drivable front.
 

@@ -11,9 +11,9 @@ import numpy as np
 
 import hybrid_opt as ho
 from hybrid_opt.building import build_study
-from hybrid_opt.campaign.stages import Progress
 from hybrid_opt.display.table import Table
 from hybrid_opt.polishing.settings import quick_settings
+from hybrid_opt.progress import Progress
 from studies.options import QUICK_EVALUATIONS
 from studies.rack import main as rack
 from studies.report.stage import PAGE

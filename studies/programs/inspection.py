@@ -13,17 +13,13 @@ import numpy as np
 
 import hybrid_opt as ho
 from hybrid_opt.building import Maker, build_all
-from hybrid_opt.campaign.stages import Progress
 from hybrid_opt.carry import Carry, Judgement
 from hybrid_opt.cell import Cell
-from hybrid_opt.display.view import CarryView, Look
 from hybrid_opt.evaluate.explanation import Explanation, explain, frequent
 from hybrid_opt.front import Front
 from hybrid_opt.indicators.metrics import BindingBound, binding_bounds
+from hybrid_opt.progress import Progress
 from studies.program import load_workcell
-from studies.report.data import DrawnCarry, reach_map
-from studies.report.drawing import in_style, save, settled
-from studies.report.pictures_cell import environment, meeting, reachable_regions
 from symbolic.array import Array
 from symbolic.cell_model import CellModel, own_pairs
 from symbolic.errors import SettingsError
@@ -211,7 +207,6 @@ def _optimum(cell: Cell, progress: Progress) -> Optimum:
     verdicts = cell.evaluate(cell.initial)
     if not verdicts.feasible.all():
         return Optimum(0, (), "the hand-made trajectory, its start, is infeasible")
-    progress.note("polishing the hand-made trajectory shortly (--no-polish leaves it out)")
     try:
         with progress.stage("short polish", POLISH_ATTEMPTS, "attempts") as advance:
             front = ho.polish(
@@ -323,6 +318,11 @@ def draw(
     Raises:
         SettingsError: the folder cannot be made.
     """
+    # Not imported at the top: without pictures nothing of it is needed.
+    from studies.report.data import DrawnCarry, reach_map
+    from studies.report.drawing import in_style, save, settled
+    from studies.report.pictures_cell import environment, meeting, reachable_regions
+
     _made(output)
     geometry, initial = cell.geometry, DrawnCarry("", carries["initial"])
     reach = reach_map(geometry, np.random.default_rng(0))
@@ -335,9 +335,8 @@ def draw(
             if why.pair is not None:
                 at = carries[name].pose[why.sample], carries[name].q[why.sample]
                 figures[f"collision_{name}"] = settled(meeting(geometry, why.pair, *at, str(why)))
-    return tuple(
-        str(path) for name, figure in figures.items() for path in save(figure, output, name)
-    )
+    drawn = figures.items()
+    return tuple(str(path) for name, one in drawn for path in save(one, output, name, pdf=False))
 
 
 def show(carry: Carry, why: Explanation | None, path: Path) -> str:
@@ -348,6 +347,8 @@ def show(carry: Carry, why: Explanation | None, path: Path) -> str:
         SettingsError: its folder cannot be made.
         DisplayError: it cannot be written.
     """
+    from hybrid_opt.display.view import CarryView, Look
+
     _made(path.parent)
     look = None if why is None else Look(why.sample, str(why), why.pair or ())
     CarryView(carry, look=look).save(path)

@@ -27,8 +27,8 @@ def regenerate(options: argparse.Namespace) -> int:
     seconds: float | None = None
     if options.study and options.workcell is not None:
         from hybrid_opt.building import build_study
-        from hybrid_opt.campaign.stages import Progress
         from hybrid_opt.cell import Cell
+        from hybrid_opt.progress import Progress
 
         begin = time.perf_counter()
         build_study(Cell.load(options.workcell), Progress())

@@ -11,7 +11,6 @@ from hybrid_opt.campaign import (
     CampaignFolder,
     CampaignSettings,
     ExecutionSettings,
-    Progress,
     Stage,
     check_stages,
     open_folder,
@@ -33,6 +32,7 @@ from hybrid_opt.polishing.settings import (
     quick_settings,
     usual_settings,
 )
+from hybrid_opt.progress import Progress
 from hybrid_opt.recommending.choice import Wish
 from hybrid_opt.static_hold import require_hold
 from hybrid_opt.witness.box import mujoco_module

@@ -14,7 +14,6 @@ from hybrid_opt.bundles import BundleOptions, Origin, export
 from hybrid_opt.bundles.bundle import warnings_of
 from hybrid_opt.bundles.check import as_document, check
 from hybrid_opt.bundles.check import read_trajectory as joint_trajectory
-from hybrid_opt.campaign.stages import Progress
 from hybrid_opt.carry import Carry
 from hybrid_opt.cell import Cell
 from hybrid_opt.display.table import number, text_table
@@ -29,6 +28,7 @@ from hybrid_opt.job.compliance import (
 )
 from hybrid_opt.job.plan import JobModel
 from hybrid_opt.job.records import Job
+from hybrid_opt.progress import Progress
 from hybrid_opt.robust.force import (
     LARGEST_FACTOR,
     SCREENED,

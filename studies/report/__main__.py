@@ -30,7 +30,7 @@ def _add_options(parser: Parser) -> None:
 
 
 def _run(options: argparse.Namespace) -> int:
-    from hybrid_opt.campaign import Progress
+    from hybrid_opt.progress import Progress
     from hybrid_opt.work.service import warm_up
     from studies.report.stage import follow_looks, rewrite
 

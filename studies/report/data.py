@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
+from scipy.spatial.transform import Rotation
 
 from hybrid_opt.branches import BranchCompetition
 from hybrid_opt.campaign.cell_source import ReadyCell, cells_of, read_branches, ready_cells
@@ -19,7 +20,6 @@ from hybrid_opt.campaign.results import CampaignResults, ReplicaFront, read_camp
 from hybrid_opt.campaign.settings import CONFIGURATION, HAND_MADE, RECOMMENDED, SUMMARY
 from hybrid_opt.campaign.summary import CampaignSummary, ReplicaFigures
 from hybrid_opt.carry import Carry
-from hybrid_opt.display.scene import joint_placements
 from hybrid_opt.display.table import Table
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
@@ -53,8 +53,6 @@ STEP = 0.05
 
 POSTURES = 300_000
 """Random postures per arm; some ten per cube of the reach of an arm of 1.3 m."""
-
-_BATCH = 50_000
 
 
 @dataclass(frozen=True)
@@ -99,12 +97,14 @@ def _pad_points(geometry: CellGeometry, i: int, rng: np.random.Generator) -> Arr
     """(POSTURES, 3) pad positions in the world, of random postures within the joint limits."""
     arm, contact = geometry.arms[i], geometry.workcell.contacts[i]
     pad = (arm.T_joint_box @ contact.T_box_pad)[:3, 3]
-    found = []
-    for _ in range(POSTURES // _BATCH):
-        q = rng.uniform(arm.lower, arm.upper, (_BATCH, arm.joints))
-        T_world_joint = joint_placements(arm, q)[:, -1]
-        found.append(T_world_joint[:, :3, :3] @ pad + T_world_joint[:, :3, 3])
-    return np.concatenate(found)
+    q = rng.uniform(arm.lower, arm.upper, (POSTURES, arm.joints))
+    # From the pad back to the root: points are a fifth of the work of placements.
+    points = np.tile(pad, (POSTURES, 1))
+    for j in reversed(range(arm.joints)):
+        along = np.outer(q[:, j], arm.axes[j])
+        moved = Rotation.from_rotvec(along).apply(points) if arm.turning[j] else points + along
+        points = moved @ arm.origins[j][:3, :3].T + arm.origins[j][:3, 3]
+    return np.asarray(points @ arm.T_world_root[:3, :3].T + arm.T_world_root[:3, 3])
 
 
 def _common(geometry: CellGeometry, pads: list[NDArray[np.bool_]]) -> NDArray[np.bool_]:

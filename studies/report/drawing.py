@@ -183,10 +183,10 @@ def files_of(figure: Figure, pdf: bool = True) -> dict[str, bytes]:
     return files
 
 
-def save(figure: Figure, folder: Path, name: str) -> tuple[Path, ...]:
-    """Write a settled figure as PNG and PDF; returns the files."""
+def save(figure: Figure, folder: Path, name: str, pdf: bool = True) -> tuple[Path, ...]:
+    """Write a settled figure as PNG, and as PDF where it is wanted; returns the files."""
     paths = []
-    for suffix, content in files_of(figure).items():
+    for suffix, content in files_of(figure, pdf).items():
         paths.append(folder / f"{name}.{suffix}")
         write_atomically(paths[-1], content)
     return tuple(paths)

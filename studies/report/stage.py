@@ -6,7 +6,8 @@ import argparse
 from collections.abc import Mapping
 from pathlib import Path
 
-from hybrid_opt.campaign import CampaignFolder, Progress, Stage, executor_for
+from hybrid_opt.campaign import CampaignFolder, Stage, executor_for
+from hybrid_opt.progress import Progress
 from hybrid_opt.work.service import Executor, local_executor
 
 PAGE = "report.html"

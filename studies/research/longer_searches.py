@@ -14,7 +14,6 @@ import numpy as np
 from hybrid_opt.campaign import (
     CampaignSettings,
     ExecutionSettings,
-    Progress,
     open_folder,
     run_stages,
     search_stage,
@@ -26,6 +25,7 @@ from hybrid_opt.display.table import number, text_table
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.indicators import metrics
 from hybrid_opt.metaheuristics.registry import title
+from hybrid_opt.progress import Progress
 from hybrid_opt.store.json_records import to_json
 from studies.research.best_front import ReferenceFront, read_reference_front
 from studies.research.control import LONG

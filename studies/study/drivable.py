@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hybrid_opt.campaign import CampaignFolder, Progress, Stage, executor_for
+from hybrid_opt.campaign import CampaignFolder, Stage, executor_for
 from hybrid_opt.campaign.cell_source import ReadyCell, cells_of, ready_cells
 from hybrid_opt.campaign.results import CampaignResults, ReplicaFront, read_campaign, read_summary
 from hybrid_opt.campaign.settings import (
@@ -28,6 +28,7 @@ from hybrid_opt.evaluate.objectives import DRIVABLE_PAIRS
 from hybrid_opt.indicators import metrics
 from hybrid_opt.indicators.selection import select
 from hybrid_opt.metaheuristics.registry import title
+from hybrid_opt.progress import Progress
 from hybrid_opt.store.files import write_json
 from hybrid_opt.store.json_records import to_json
 from hybrid_opt.store.trajectory_file import read_trajectory

@@ -13,10 +13,9 @@ import numpy as np
 
 import hybrid_opt as ho
 from codegen.function import available_cores
-from hybrid_opt.campaign import CampaignFolder, ExecutionSettings, Progress, Stage
+from hybrid_opt.campaign import CampaignFolder, ExecutionSettings, Stage
 from hybrid_opt.campaign.results import CampaignResults, read_campaign
 from hybrid_opt.campaign.settings import NO_RECOMMENDATION, RECOMMENDATION, RECOMMENDED, STAGES
-from hybrid_opt.campaign.stages import Advance
 from hybrid_opt.campaign.summary import (
     CampaignSummary,
     ForceTable,
@@ -28,6 +27,7 @@ from hybrid_opt.campaign.summary import (
 from hybrid_opt.errors import NoCarryError
 from hybrid_opt.evaluate.evaluations import concatenated
 from hybrid_opt.evaluate.explanation import explain
+from hybrid_opt.progress import Advance, Progress
 from hybrid_opt.recommending.choice import LEADER, DrivenPaths
 from hybrid_opt.recommending.comparison import (
     Rival,

@@ -12,7 +12,7 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from hybrid_opt.campaign import CampaignFolder, Progress, Stage, executor_for
+from hybrid_opt.campaign import CampaignFolder, Stage, executor_for
 from hybrid_opt.campaign.results import read_summary
 from hybrid_opt.campaign.settings import (
     HAND_MADE,
@@ -24,6 +24,7 @@ from hybrid_opt.campaign.settings import (
 )
 from hybrid_opt.errors import ResultsError, WitnessError
 from hybrid_opt.metaheuristics.registry import title
+from hybrid_opt.progress import Progress
 from hybrid_opt.store.files import read_bytes, sha256, write_json
 from hybrid_opt.store.json_records import read_record, to_json
 from hybrid_opt.store.trajectory_file import StoredTrajectory, read_trajectory

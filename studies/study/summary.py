@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from hybrid_opt.campaign import CampaignFolder, Progress, Stage
+from hybrid_opt.campaign import CampaignFolder, Stage
 from hybrid_opt.campaign.results import CampaignResults, Replica, read_campaign
 from hybrid_opt.campaign.settings import (
     FRONTS,
@@ -47,6 +47,7 @@ from hybrid_opt.indicators.statistics import (
     rank_test,
     summarise,
 )
+from hybrid_opt.progress import Progress
 from hybrid_opt.static_hold import StaticHold
 from hybrid_opt.store.files import csv_text, storing, write_atomically, write_json
 from hybrid_opt.store.json_records import to_json

@@ -16,9 +16,10 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from hybrid_opt.campaign import CampaignSettings, ExecutionSettings, Progress
+from hybrid_opt.campaign import CampaignSettings, ExecutionSettings
 from hybrid_opt.campaign.results import read_campaign
 from hybrid_opt.polishing.settings import PolishSettings
+from hybrid_opt.progress import Progress
 from studies.programs.comparison import compare
 from studies.programs.study import StudySettings, run_study
 from studies.report.data import gather_carries

@@ -8,11 +8,11 @@ import pytest
 
 from codegen.compiler import Compiler
 from hybrid_opt.building import build_study
-from hybrid_opt.campaign.stages import Progress
 from hybrid_opt.cell import Cell
 from hybrid_opt.job.plan import JobCollisions
 from hybrid_opt.polishing.polisher import Polisher
 from hybrid_opt.polishing.settings import PolishSettings
+from hybrid_opt.progress import Progress
 from hybrid_opt.robust.cases import CaseForces
 from hybrid_opt.robust.force import at_rest, pressing_model
 from hybrid_opt.timing.model import TimingModel

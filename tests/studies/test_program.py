@@ -177,7 +177,7 @@ def test_the_installed_command_runs_every_program(
     [
         ("rack", ["--qick"], "--qick; did you mean '--quick'?; see --help"),
         ("run", ["cell.toml", "--evaluation=5"], "did you mean '--evaluations'?"),
-        ("inspect", ["cell.toml", "--no-polsh"], "did you mean '--no-polish'?"),
+        ("inspect", ["cell.toml", "--no-picturs"], "did you mean '--no-pictures'?"),
         ("recommend", ["results", "--force", "52"], "did you mean '--force-limit'?"),
         ("replay", ["file.json", "--zzzzzz"], "--zzzzzz; see --help"),
     ],

@@ -16,6 +16,7 @@ import yaml
 from hybrid_opt.bundles.check import Finding, check, read_trajectory
 from hybrid_opt.bundles.job_file import Interpolation
 from hybrid_opt.errors import ResultsError
+from hybrid_opt.store.trajectory_file import FORMAT
 from symbolic.errors import SettingsError
 from tests.hybrid_opt.bundles.bundles import exported, text_of
 from tests.hybrid_opt.job.jobs import rack, rack_job
@@ -183,6 +184,11 @@ def without_times(document: dict[str, Any]) -> None:
         ("b.yaml", lambda: spoilt(without_times), "times have to ascend"),
         ("c.yaml", lambda: "a: [", "no joint trajectory"),
         ("d.json", lambda: "{}", "no joint trajectory"),
+        (
+            "carry.json",
+            lambda: json.dumps({"format": FORMAT, "version": 1}),
+            r"it is a stored carry: export it first \(python -m studies.export\)",
+        ),
         ("e.csv", lambda: "a,b\n1,2\n", "no joint trajectory"),
         ("f.csv", lambda: "", "no joint trajectory"),
     ],

@@ -15,13 +15,13 @@ import numpy as np
 from hybrid_opt.campaign import (
     CampaignSettings,
     ExecutionSettings,
-    Progress,
     Stage,
     open_folder,
     run_stages,
     search_stage,
 )
 from hybrid_opt.evaluate.evaluations import FEASIBLE, REASONS, Evaluations
+from hybrid_opt.progress import Progress
 from symbolic.array import Array
 from symbolic.errors import DualArmError
 from symbolic.read.cell import load

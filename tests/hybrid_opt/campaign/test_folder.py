@@ -15,12 +15,12 @@ from hybrid_opt.campaign import (
     CampaignFolder,
     CampaignSettings,
     ExecutionSettings,
-    Progress,
     Stage,
     open_folder,
     run_stages,
 )
 from hybrid_opt.errors import ResultsError
+from hybrid_opt.progress import Progress
 from symbolic.read.cell import load
 from tests.hybrid_opt.campaign.fake import RACK, run_search
 

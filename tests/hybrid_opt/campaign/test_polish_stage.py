@@ -14,7 +14,6 @@ import pytest
 from hybrid_opt.campaign import (
     CampaignSettings,
     ExecutionSettings,
-    Progress,
     Stage,
     open_folder,
     run_stages,
@@ -31,6 +30,7 @@ from hybrid_opt.polishing.polisher import Polisher
 from hybrid_opt.polishing.records import PolishedFront, PolishOutcome
 from hybrid_opt.polishing.settings import FillSettings, PolishSettings, ProbeSettings
 from hybrid_opt.polishing.solvers.base import Residuals
+from hybrid_opt.progress import Progress
 from hybrid_opt.store.json_records import from_json, to_json
 from symbolic.array import Array
 from symbolic.read.cell import load

@@ -19,11 +19,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hybrid_opt.campaign import CampaignSettings, ExecutionSettings, Progress, open_folder
+from hybrid_opt.campaign import CampaignSettings, ExecutionSettings, open_folder
 from hybrid_opt.campaign.folder import replica_identity
 from hybrid_opt.campaign.journal import Journal, encode_generation
 from hybrid_opt.campaign.results import read_campaign
 from hybrid_opt.errors import DamagedResultsWarning, ResultsError, WorkerError
+from hybrid_opt.progress import Progress
 from symbolic.errors import DualArmError
 from symbolic.read.cell import load
 from tests.hybrid_opt.campaign.fake import (

@@ -8,13 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hybrid_opt.campaign import CampaignSettings, ExecutionSettings, Progress, open_folder
+from hybrid_opt.campaign import CampaignSettings, ExecutionSettings, open_folder
 from hybrid_opt.campaign.polish_stage import polish_stage
 from hybrid_opt.campaign.results import read_campaign
 from hybrid_opt.campaign.search_stage import search_stage
 from hybrid_opt.campaign.stages import run_stages
 from hybrid_opt.indicators import metrics
 from hybrid_opt.polishing.settings import FillSettings, PolishSettings
+from hybrid_opt.progress import Progress
 from studies.compare import main
 from studies.programs.comparison import compare
 from studies.study.summary import summary_stage

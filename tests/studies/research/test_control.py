@@ -8,11 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hybrid_opt.campaign import CampaignSettings, ExecutionSettings, Progress
+from hybrid_opt.campaign import CampaignSettings, ExecutionSettings
 from hybrid_opt.campaign.results import read_campaign, read_summary
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.indicators import metrics
 from hybrid_opt.polishing.settings import PolishSettings
+from hybrid_opt.progress import Progress
 from studies.programs.study import StudySettings, run_study
 from studies.research import longer_searches
 from studies.research.best_front import ReferenceFront

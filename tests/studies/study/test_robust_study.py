@@ -8,7 +8,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 import pytest
 
-from hybrid_opt.campaign import CampaignSettings, ExecutionSettings, Progress
+from hybrid_opt.campaign import CampaignSettings, ExecutionSettings
 from hybrid_opt.campaign.results import read_campaign, read_summary
 from hybrid_opt.campaign.summary import StoredRecommendation
 from hybrid_opt.carry import Carry
@@ -16,6 +16,7 @@ from hybrid_opt.cell import Cell
 from hybrid_opt.evaluate.objectives import ROBUST_DRIVABLE_OBJECTIVES
 from hybrid_opt.job.smooth import driven_timing
 from hybrid_opt.polishing.settings import DrivableSettings, PolishSettings
+from hybrid_opt.progress import Progress
 from hybrid_opt.recommending.comparison import level_force
 from hybrid_opt.robust.force import robust_model
 from hybrid_opt.store.trajectory_file import read_trajectory, replay

@@ -17,10 +17,10 @@ import numpy as np
 import pytest
 
 import hybrid_opt as ho
-from hybrid_opt.campaign import Progress
 from hybrid_opt.campaign.results import read_campaign, read_summary
 from hybrid_opt.errors import NoCarryError
 from hybrid_opt.indicators import metrics
+from hybrid_opt.progress import Progress
 from hybrid_opt.recommending.choice import Wish
 from hybrid_opt.store.trajectory_file import read_trajectory, replay
 from hybrid_opt.timing.document import read_timing

@@ -14,11 +14,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hybrid_opt.campaign import ExecutionSettings, Progress, Stage, open_folder, run_stages
+from hybrid_opt.campaign import ExecutionSettings, Stage, open_folder, run_stages
 from hybrid_opt.campaign.results import read_campaign
 from hybrid_opt.campaign.summary import StoredRecommendation
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.evaluate.evaluations import REASONS
+from hybrid_opt.progress import Progress
 from studies import recommend, run
 from studies.programs.study import campaign_settings
 from studies.report import __main__ as report
