@@ -49,6 +49,10 @@ class UrdfError(RobotModelError):
         super().__init__("\n".join(f"{file}: {problem}" for problem in problems))
 
 
+class SceneError(DualArmError):
+    """A scene of another program cannot be read; the text names its file and every problem."""
+
+
 class BridgeError(DualArmError):
     """The compiled Pinocchio-CasADi bridge is missing or was built for other versions."""
 

@@ -26,7 +26,7 @@ from symbolic.read.arms import (
 )
 from symbolic.read.urdf import Urdf, UrdfMesh
 from symbolic.records import Body, Box, Capsule, Cylinder, Mesh, Robot, Shape, Sphere, Workcell
-from symbolic.records.poses import pose_matrix
+from symbolic.records.poses import pose_matrix, rpy_from_rotation
 
 _LONGEST_COMMENT = 60
 WORLD = "world"
@@ -291,17 +291,8 @@ def _joint(root: ElementTree.Element, name: str, parent: str, child: str, pose: 
 
 
 def _origin(element: ElementTree.Element, pose: Array) -> None:
-    origin = {"xyz": _text(pose[:3, 3]), "rpy": _text(_rpy(pose[:3, :3]))}
+    origin = {"xyz": _text(pose[:3, 3]), "rpy": _text(rpy_from_rotation(pose[:3, :3]))}
     ElementTree.SubElement(element, "origin", origin)
-
-
-def _rpy(rotation: Array) -> Array:
-    """Roll, pitch, yaw (3,) [rad] of a rotation (3, 3); no roll at a pitch of a quarter turn."""
-    pitch = np.arctan2(-rotation[2, 0], np.hypot(rotation[0, 0], rotation[1, 0]))
-    if np.hypot(rotation[0, 0], rotation[1, 0]) < 1e-9:
-        return np.array([0.0, pitch, np.arctan2(-rotation[0, 1], rotation[1, 1])])
-    roll = np.arctan2(rotation[2, 1], rotation[2, 2])
-    return np.array([roll, pitch, np.arctan2(rotation[1, 0], rotation[0, 0])])
 
 
 def _numbers(text: str) -> list[float]:

@@ -479,7 +479,35 @@ def completed(text: str, data: Mapping[str, Any], changes: Changes) -> str:
             document[key] = _item(value)
     else:
         _apply(document, changes)
-    found: str = tomlkit.dumps(document)
+    return _checked(tomlkit.dumps(document), wanted)
+
+
+def extended(text: str, data: Mapping[str, Any], key: str, tables: list[dict[str, Any]]) -> str:
+    """A workcell file's text with tables added behind those of an array, as `[[environment]]`.
+
+    Args:
+        text, data: the file, and what it holds.
+        key: of the array, at the top level; it may be missing.
+        tables: what is added.
+
+    Raises:
+        SettingsError: see `completed`.
+    """
+    tomlkit = _library()
+    document = tomlkit.parse(f"{text.rstrip()}\n\n")
+    if key not in document:
+        document[key] = _item(tables)
+    elif isinstance(document[key], tomlkit.items.AoT):
+        for table in map(_item, tables):
+            table.add(tomlkit.nl())
+            document[key].append(table)
+    before = data.get(key, [])
+    wanted = {**data, key: [*(before if isinstance(before, list) else ()), *tables]}
+    return _checked(f"{document.as_string().rstrip()}\n", wanted)
+
+
+def _checked(found: str, wanted: Mapping[str, Any]) -> str:
+    """A text that says what it should."""
     try:
         same = _alike(outside.toml_tables(found.encode()), wanted)
     except OutsideError:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,7 +25,7 @@ from symbolic.array import Array
 from symbolic.errors import DualArmError, WorkcellError
 from symbolic.read.cell_files import collect_cell, unpack_cell
 from symbolic.records import POSE_SIZE, Workcell
-from symbolic.records.poses import box_placement, inverse
+from symbolic.records.poses import box_placement, inverse, rpy_from_rotation
 
 EVALUATIONS = 400
 """Candidates of a search around the carry at hand: 1.6 s on the rack."""
@@ -224,15 +223,12 @@ def handles(workcell: Workcell) -> tuple[Handle, ...]:
 def moved(workcell: Workcell, handle: Handle, pose: Array) -> dict[str, Any]:
     """The changes, by key path, that put a handle at another place (4, 4) of the world."""
     xyz = [round(value, 6) for value in pose[:3, 3].tolist()]
-    turned = Rotation.from_matrix(pose[:3, :3])
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # looking straight up or down, one angle is free
-        rpy = [round(value, 6) for value in turned.as_euler("ZYX")[::-1].tolist()]
+    rpy = [round(value, 6) for value in rpy_from_rotation(pose[:3, :3]).tolist()]
     section = handle.key.partition(".")[0].partition("[")[0]
     if section == "task":
         orientation = workcell.task.orientation
         if orientation.is_vector:
-            turn = turned * Rotation.from_matrix(orientation.reference).inv()
+            turn = Rotation.from_matrix(pose[:3, :3] @ orientation.reference.T)
             rpy = [round(value, 6) for value in turn.as_rotvec().tolist()]
         return {handle.key: [*xyz, *rpy]}
     if section == "robots":

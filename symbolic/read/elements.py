@@ -46,8 +46,8 @@ class _Bounded(ElementTree.TreeBuilder):
         return super().end(tag)
 
 
-def parse_elements(document: str) -> ElementTree.Element:
-    """The root element `robot` of an XML document.
+def parse_elements(document: str, root_tag: str = "robot") -> ElementTree.Element:
+    """The root element of an XML document, of that tag.
 
     Raises:
         OutsideError: it is no XML, has too many elements, or another root.
@@ -69,8 +69,8 @@ def parse_elements(document: str) -> ElementTree.Element:
         ) from error
     except ValueError as error:
         raise OutsideError("is not readable XML: it holds characters that are none") from error
-    if root.tag != "robot":
-        raise OutsideError(f"its root is <{shown(root.tag)[1:-1]}>; allowed is <robot>")
+    if root.tag != root_tag:
+        raise OutsideError(f"its root is <{shown(root.tag)[1:-1]}>; allowed is <{root_tag}>")
     if any("xacro}" in element.tag for element in root.iter()):
         raise OutsideError("holds xacro macros; expand it: `xacro FILE > robot.urdf`")
     return root
@@ -96,15 +96,15 @@ class Part:
         return self.element.tag
 
     def named(self, tag: str) -> dict[str, Part]:
-        """The root's elements of a tag by their names, which have to differ."""
+        """The inner elements of a tag by their names, which have to differ."""
         found: dict[str, Part] = {}
         for index, element in enumerate(self.element.findall(tag)):
-            part = Part(element, f"{tag}[{index}]", self.problems)
+            part = self._inner(element, f"{tag}[{index}]")
             name = part.text("name")
             if name in found:
                 self.problems.add(f"{part.path} name", f"found {name!r} again; names differ")
             elif name:
-                found[name] = Part(element, f"{tag} {name!r}", self.problems)
+                found[name] = self._inner(element, f"{tag} {name!r}")
         return found
 
     def child(self, tag: str) -> Part | None:
@@ -176,8 +176,13 @@ class Part:
 
     def numbers(self, key: str, allowed: Sequence[Quantity], default: str | None = None) -> Array:
         """Numbers separated by spaces, one quantity each."""
-        path = f"{self.path} {key}"
-        value = self.element.get(key, default)
+        return self._numbers(f"{self.path} {key}", self.element.get(key, default), allowed)
+
+    def content(self, allowed: Sequence[Quantity]) -> Array:
+        """The numbers between the element's tags, one quantity each."""
+        return self._numbers(self.path, self.element.text, allowed)
+
+    def _numbers(self, path: str, value: str | None, allowed: Sequence[Quantity]) -> Array:
         if value is None:
             self.problems.add(path, "is missing")
             return read_only(np.ones(len(allowed)))
@@ -198,4 +203,4 @@ class Part:
         return read_only(found)
 
     def _inner(self, element: ElementTree.Element, name: str) -> Part:
-        return Part(element, f"{self.path}/{name}", self.problems)
+        return Part(element, f"{self.path}/{name}".removeprefix("/"), self.problems)

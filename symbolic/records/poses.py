@@ -79,6 +79,16 @@ def rotation_from_rpy(rpy: ArrayLike) -> Array:
     return np.moveaxis(np.array(rows), (0, 1), (-2, -1))
 
 
+def rpy_from_rotation(rotation: Array) -> Array:
+    """Roll, pitch, yaw (3,) [rad] of a rotation (3, 3); no roll at a pitch of a quarter turn."""
+    level = np.hypot(rotation[0, 0], rotation[1, 0])
+    pitch = np.arctan2(-rotation[2, 0], level)
+    if level < 1e-9:
+        return np.array([0.0, pitch, np.arctan2(-rotation[0, 1], rotation[1, 1])])
+    roll = np.arctan2(rotation[2, 1], rotation[2, 2])
+    return np.array([roll, pitch, np.arctan2(rotation[1, 0], rotation[0, 0])])
+
+
 def rotation_from_vector(vector: ArrayLike) -> Array:
     """Rotations exp(v) of rotation vectors (..., 3) [rad], by Rodrigues' formula: (..., 3, 3)."""
     v = np.asarray(vector, dtype=float)

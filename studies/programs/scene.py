@@ -1,0 +1,52 @@
+"""What `studies.scene` does with the bodies of another program's scene."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from hybrid_opt.proposing.problem import completed, extended
+from symbolic import outside
+from symbolic.errors import OutsideError, SceneError
+from symbolic.read.scenes import Scene, read_scene
+from symbolic.replacing import replace_file
+
+
+def add_scene(options: argparse.Namespace) -> int:
+    """Print a scene's bodies, or add them to a file; returns the exit code."""
+    scene = read_scene(options.scene)
+    for told in scene.notes:
+        print(f"note: {told}", file=sys.stderr)
+    for told in scene.left_out:
+        print(f"left out: {told}", file=sys.stderr)
+    if options.into:
+        _add(scene, options.into)
+        print(f"{options.into}: {len(scene.bodies)} bodies added to its environment")
+    elif scene.bodies:
+        print(completed("", {}, {"environment": scene.tables(Path.cwd())}), end="")
+    return 1 if scene.left_out else 0
+
+
+def _add(scene: Scene, path: Path) -> None:
+    try:
+        content = outside.read_bytes(path, outside.WORKCELL_BYTES)
+        data = outside.toml_tables(content)
+    except OutsideError as error:
+        raise SceneError(f"{path}: {error}") from error
+    tables = scene.tables(path.parent)
+    taken = {str(each.get("name")) for each in (*_entries(data, "robots"), *_entries(data))}
+    again = sorted(taken & {table["name"] for table in tables})
+    if again:
+        raise SceneError(
+            f"{path}: has bodies or robots called {', '.join(map(repr, again[:5]))} already; "
+            "remove those that came from this scene before, or rename them"
+        )
+    replace_file(path, extended(content.decode(), data, "environment", tables).encode())
+
+
+def _entries(data: Mapping[str, Any], key: str = "environment") -> list[Mapping[str, Any]]:
+    found = data.get(key, [])
+    return [each for each in found if isinstance(each, dict)] if isinstance(found, list) else []

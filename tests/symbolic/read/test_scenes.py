@@ -1,0 +1,274 @@
+"""Scenes of other programs: what becomes a body where, and what is told instead."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from symbolic.array import Array
+from symbolic.errors import SceneError
+from symbolic.read.scenes import Scene, read_scene
+from symbolic.read.tables import Table, read_body
+from symbolic.records import Body, Box, Cylinder, Mesh, Sphere
+from symbolic.records.problems import Problems
+
+
+def scene(folder: Path, text: str, name: str = "scene.sdf") -> Scene:
+    path = folder / name
+    path.write_text(text, encoding="utf-8")
+    return read_scene(path)
+
+
+def by_name(found: Scene) -> dict[str, Body]:
+    return {body.name: body for body in found.bodies}
+
+
+def places(found: Scene) -> dict[str, list[float]]:
+    return {body.name: body.pose[:3, 3].round(9).tolist() for body in found.bodies}
+
+
+def sdf(inside: str) -> str:
+    return f"<?xml version='1.0'?>\n<!-- a test -->\n<sdf version='1.9'>{inside}</sdf>"
+
+
+def collision(name: str, shape: str, pose: str = "") -> str:
+    return f"<collision name='{name}'>{pose}<geometry>{shape}</geometry></collision>"
+
+
+BALL = "<sphere><radius>0.1</radius></sphere>"
+ELSEWHERE = "<pose relative_to='lnk'/>"
+QUARTER = repr(np.pi / 2)
+
+FRAMES = f"""
+<world name='w'>
+  <frame name='corner'><pose>1 0 0 0 0 {QUARTER}</pose></frame>
+  <model name='shelf'>
+    <static>true</static>
+    <pose relative_to='corner'>1 0 0 0 0 0</pose>
+    <link name='back'><pose>0 0 1 0 0 0</pose>
+      {collision("own", BALL, "<pose>0.5 0 0 0 0 0</pose>")}
+      {collision("low", BALL, "<pose relative_to='__model__'>0 0 0.25 0 0 0</pose>")}
+      {collision("far", BALL, "<pose relative_to='drawer::handle'>0 0 0.1 0 0 0</pose>")}
+    </link>
+    <frame name='rail' attached_to='back'><pose>0 0.5 0 0 0 0</pose></frame>
+    <model name='drawer' placement_frame='handle'>
+      <pose relative_to='rail' degrees='true'>0 0 0 0 0 90</pose>
+      <link name='box'>{collision("c", BALL)}</link>
+      <frame name='handle'><pose>0.2 0 0 0 0 0</pose></frame>
+    </model>
+    <joint name='slide' type='fixed'><parent>back</parent><child>drawer::box</child></joint>
+    <link name='knob'><pose relative_to='slide'>0 0 0.3 0 0 0</pose>{collision("c", BALL)}</link>
+  </model>
+</world>
+"""
+
+
+def test_frames_of_sdf_are_followed(tmp_path: Path) -> None:
+    """The shelf stands at (1, 1, 0), turned by a quarter; the drawer's handle is at the rail."""
+    found = scene(tmp_path, sdf(FRAMES))
+    assert (found.left_out, found.notes) == ((), ())
+    assert places(found) == {
+        "shelf back own": [1.0, 1.5, 1.0],
+        "shelf back low": [1.0, 1.0, 0.25],
+        "shelf back far": [0.5, 1.0, 1.1],
+        "shelf drawer box c": [0.7, 1.0, 1.0],
+        "shelf knob c": [0.7, 1.0, 1.3],
+    }
+
+
+def test_every_shape_of_sdf(tmp_path: Path) -> None:
+    """A plane is a slab below its surface, a capsule three bodies, a mesh keeps its scale."""
+    trimesh.creation.box((1.0, 2.0, 3.0)).export(tmp_path / "part.stl")
+    shapes = {
+        "box": "<box><size>0.3 0.02 0.8</size></box>",
+        "post": "<cylinder><radius>0.05</radius><length>2</length></cylinder>",
+        "rail": "<capsule><radius>0.1</radius><length>0.4</length></capsule>",
+        "wall": "<plane><normal>1 0 0</normal><size>100 100</size></plane>",
+        "mesh": "<mesh><uri>part.stl</uri><scale>0.1 0.1 0.2</scale></mesh>",
+        "none": "<empty/>",
+    }
+    inside = "".join(collision(name, shape) for name, shape in shapes.items())
+    model = f"<model name='m'><static>1</static><pose>2 0 0 0 0 0</pose><link name='l'>{inside}"
+    bodies = by_name(scene(tmp_path, sdf(f"{model}</link></model>")))
+    assert list(bodies) == [
+        *("m l box", "m l post", "m l rail", "m l rail end", "m l rail end 2", "m l wall"),
+        "m l mesh",
+    ]
+    box = bodies["m l box"].shape
+    assert isinstance(box, Box)
+    assert box.size.tolist() == [0.3, 0.02, 0.8]
+    assert bodies["m l post"].shape == Cylinder(0.05, 2.0)
+    assert bodies["m l rail end"].shape == Sphere(0.1)
+    assert [bodies[f"m l rail end{n}"].pose[2, 3] for n in ("", " 2")] == [-0.2, 0.2]
+    mesh = bodies["m l mesh"].shape
+    assert isinstance(mesh, Mesh)
+    size = np.asarray(trimesh.load_mesh(mesh.path).extents) * mesh.scale
+    np.testing.assert_allclose(size, np.array([0.1, 0.2, 0.6]), atol=1e-12)
+    slab = bodies["m l wall"]
+    assert isinstance(slab.shape, Box)
+    corners = np.asarray(trimesh.creation.box(slab.shape.size, slab.pose).bounds)
+    np.testing.assert_allclose(corners, np.array([[1.9, -5, -5], [2, 5, 5]]), atol=1e-12)
+
+
+def test_models_are_included(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By a path, by a model's folder and its configuration, and by the folders of Gazebo."""
+    parcel = "<model name='parcel'><pose>0 0 1 0 0 0</pose><link name='l'>"
+    text = sdf(f"{parcel}{collision('c', BALL)}</link></model>")
+    (tmp_path / "near").mkdir()
+    (tmp_path / "near" / "parcel.sdf").write_text(text)
+    folder = tmp_path / "elsewhere" / "crate"
+    folder.mkdir(parents=True)
+    (folder / "crate.sdf").write_text(text)
+    (folder / "model.config").write_text("<model><name>c</name><sdf>crate.sdf</sdf></model>")
+    monkeypatch.setenv("GZ_SIM_RESOURCE_PATH", str(folder.parent))
+    world = """<world name='w'>
+      <include><uri>near/parcel.sdf</uri><static>true</static></include>
+      <include><uri>near/parcel.sdf</uri><name>second</name><pose>1 0 0 0 0 0</pose></include>
+      <include><uri>model://crate</uri><name>third</name></include>
+      <include><uri>model://nowhere</uri></include>
+      <include><uri>https://fuel.gazebosim.org/x</uri><name>online</name></include>
+    </world>"""
+    found = scene(tmp_path, sdf(world))
+    assert places(found) == {
+        "parcel l c": [0.0, 0.0, 1.0],
+        "second l c": [1.0, 0.0, 0.0],
+        "third l c": [0.0, 0.0, 1.0],
+    }
+    assert [note.partition(":")[0] for note in found.notes] == ["second", "third"]
+    assert [told.partition(":")[0] for told in found.left_out] == [
+        "world 'w'/include[3]",
+        "online",
+    ]
+    assert "GZ_SIM_RESOURCE_PATH" in found.left_out[0]
+
+
+@pytest.mark.parametrize(
+    ("shape", "why"),
+    [
+        ("<ellipsoid><radii>1 1 2</radii></ellipsoid>", "of the kind 'ellipsoid'"),
+        ("<heightmap/>", "of the kind 'heightmap'"),
+        ("<box><size>300 1 1</size></box>", "this looks like mm"),
+        ("<sphere><radius>0</radius></sphere>", "allowed is 1e-06 to 10 m"),
+        ("<mesh><uri>none.stl</uri></mesh>", "'none.stl' is not found"),
+        ("<mesh><uri>flat.stl</uri></mesh>", "the mesh is flat"),
+        ("<mesh><uri>flat.stl</uri><submesh><name>a</name></submesh></mesh>", "a part of the mesh"),
+        ("<mesh><uri>box.stl</uri><scale>-1 1 1</scale></mesh>", "allowed is 1e-06 to 1000"),
+    ],
+)
+def test_what_is_no_body_is_told(tmp_path: Path, shape: str, why: str) -> None:
+    plate = trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]])
+    plate.export(tmp_path / "flat.stl")
+    trimesh.creation.box((1, 1, 1)).export(tmp_path / "box.stl")
+    link = f"<link name='l'>{collision('odd', shape)}{collision('ball', BALL)}</link>"
+    found = scene(tmp_path, sdf(f"<model name='m'>{link}</model>"))
+    assert list(by_name(found)) == ["m l ball"]
+    (told,) = found.left_out
+    assert told.startswith("m l odd: ")
+    assert why in told
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("<sdf version='1.9'><model>", "is not readable XML"),
+        ("<robot name='r'/>", "is no scene that is read"),
+        ("name: nothing", "is no scene that is read"),
+        (sdf(""), "holds no obstacle"),
+        (sdf("<model name='m'><link name='l'><collision name='c'/></link></model>"), "<geometry>"),
+        (sdf(f"<model><link name='l'>{collision('c', BALL)}</link></model>"), "name: is missing"),
+        (
+            sdf(f"<model name='m'><link name='l'>{collision('c', '<box/>')}</link></model>"),
+            "link 'l'/collision 'c'/geometry/box: <size> is missing",
+        ),
+        (sdf("<model name='m'><pose>0 0 one 0 0 0</pose></model>"), "pose[2]: found 'one'"),
+        (sdf("<model name='m'><pose>0 0 0</pose></model>"), "allowed: 6 numbers"),
+        (
+            sdf("<model name='m'><pose rotation_format='quat_xyzw'>0 0 0 1 1 1 1</pose></model>"),
+            "a quaternion of length 2",
+        ),
+        (
+            sdf(f"<model name='m'><link name='l'>{collision('c', BALL, ELSEWHERE)}</link></model>"),
+            "names the frame 'lnk'",
+        ),
+        (
+            sdf(
+                "<model name='m'><frame name='a' attached_to='b'/><frame name='b' attached_to='a'/>"
+                f"<link name='l'><pose relative_to='a'/>{collision('c', BALL)}</link></model>"
+            ),
+            "depends on itself",
+        ),
+        (
+            sdf("<world name='w'><include><uri>scene.sdf</uri></include></world>"),
+            "scene.sdf includes itself",
+        ),
+        ("<!DOCTYPE x><sdf/>", "is no scene"),
+    ],
+)
+def test_a_broken_scene_is_refused(tmp_path: Path, text: str, words: str) -> None:
+    with pytest.raises(SceneError) as refused:
+        scene(tmp_path, text)
+    assert str(refused.value).startswith("scene.sdf: ")
+    assert words in str(refused.value)
+
+
+def test_a_missing_scene_is_told(tmp_path: Path) -> None:
+    with pytest.raises(SceneError, match=r"none\.sdf: cannot be read"):
+        read_scene(tmp_path / "none.sdf")
+
+
+# --- the names and poses that are written ---
+
+
+def test_names_are_those_of_an_environment(tmp_path: Path) -> None:
+    """Unique, at most 80 letters, without what key paths, patterns and robots' bodies hold."""
+    inside = "".join(collision(name, BALL) for name in ("a/b", "a.b", "a*b", "x" * 90))
+    model = f"<model name='payload'><link name='l'>{inside}</link></model>"
+    found = scene(tmp_path, sdf(model))
+    assert list(by_name(found)) == [
+        *("payload l a-b", "payload l a-b 2", "payload l a-b 3"),
+        f"payload l {'x' * 64}",
+    ]
+
+
+metres = st.floats(-1.5, 1.5)
+angle = st.one_of(st.floats(-6.0, 6.0), st.just(np.pi / 2))
+poses = st.tuples(st.tuples(metres, metres, metres), st.tuples(angle, angle, angle))
+
+
+def by_scipy(pose: tuple[tuple[float, ...], tuple[float, ...]]) -> Array:
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_euler("xyz", pose[1]).as_matrix()
+    T[:3, 3] = pose[0]
+    return T
+
+
+def written(pose: tuple[tuple[float, ...], tuple[float, ...]]) -> str:
+    return f"<pose>{' '.join(map(repr, (*pose[0], *pose[1])))}</pose>"
+
+
+@given(model=poses, link=poses, shape=poses)
+def test_a_pose_survives_the_scene_and_the_table(
+    tmp_path_factory: pytest.TempPathFactory,
+    model: tuple[tuple[float, ...], tuple[float, ...]],
+    link: tuple[tuple[float, ...], tuple[float, ...]],
+    shape: tuple[tuple[float, ...], tuple[float, ...]],
+) -> None:
+    """SciPy composes the same poses; the workcell's own reader reads what is written."""
+    text = (
+        f"<model name='m'>{written(model)}<link name='l'>{written(link)}"
+        f"{collision('c', BALL, written(shape))}</link></model>"
+    )
+    folder = tmp_path_factory.getbasetemp()
+    expected = by_scipy(model) @ by_scipy(link) @ by_scipy(shape)
+    found = scene(folder, sdf(text))
+    (table,) = found.tables(folder)
+    problems = Problems()
+    body = read_body(Table(table, "", problems), folder)
+    assert not problems.found
+    np.testing.assert_allclose(body.pose, expected, atol=1e-8)
