@@ -11,7 +11,8 @@ from typing import Any
 from hybrid_opt.proposing.problem import completed, extended
 from symbolic import outside
 from symbolic.errors import OutsideError, SceneError
-from symbolic.read.scenes import Scene, read_scene
+from symbolic.read.scenes.bodies import Scene
+from symbolic.read.scenes.read import read_scene
 from symbolic.replacing import replace_file
 
 
@@ -25,8 +26,14 @@ def add_scene(options: argparse.Namespace) -> int:
     if options.into:
         _add(scene, options.into)
         print(f"{options.into}: {len(scene.bodies)} bodies added to its environment")
+    elif scene.files:
+        raise SceneError(
+            f"{options.scene}: holds meshes of its own, which become files beside a workcell; name "
+            "that by --into"
+        )
     elif scene.bodies:
-        print(completed("", {}, {"environment": scene.tables(Path.cwd())}), end="")
+        folder = Path.cwd()
+        print(completed("", {}, {"environment": scene.tables(folder, folder)}), end="")
     return 1 if scene.left_out else 0
 
 
@@ -36,7 +43,8 @@ def _add(scene: Scene, path: Path) -> None:
         data = outside.toml_tables(content)
     except OutsideError as error:
         raise SceneError(f"{path}: {error}") from error
-    tables = scene.tables(path.parent)
+    meshes = path.absolute().with_name(f"{path.stem}-meshes")
+    tables = scene.tables(path.parent, meshes)
     taken = {str(each.get("name")) for each in (*_entries(data, "robots"), *_entries(data))}
     again = sorted(taken & {table["name"] for table in tables})
     if again:
@@ -44,7 +52,11 @@ def _add(scene: Scene, path: Path) -> None:
             f"{path}: has bodies or robots called {', '.join(map(repr, again[:5]))} already; "
             "remove those that came from this scene before, or rename them"
         )
-    replace_file(path, extended(content.decode(), data, "environment", tables).encode())
+    text = extended(content.decode(), data, "environment", tables)
+    for name, mesh in scene.files.items():
+        meshes.mkdir(exist_ok=True)
+        replace_file(meshes / name, mesh)
+    replace_file(path, text.encode())
 
 
 def _entries(data: Mapping[str, Any], key: str = "environment") -> list[Mapping[str, Any]]:

@@ -2,4 +2,5 @@
 
 cell: a whole workcell file. cell_files: that and all it names as one value. tables, elements: typed
 reading of TOML and XML. descriptions, urdf, arms: a robot's description, and the arm in it.
+scenes: those of other programs, as bodies.
 """

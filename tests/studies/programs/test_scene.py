@@ -10,6 +10,7 @@ import pytest
 from studies.program import BAD_INPUT
 from studies.scene import main
 from symbolic.read.cell import load
+from symbolic.records import Mesh
 
 SHELF = """<sdf version='1.9'><model name='shelf'><static>true</static><link name='board'>
 <collision name='top'><pose>0 0 3 0 0 0</pose>
@@ -88,3 +89,24 @@ def test_a_file_that_takes_none_is_left_alone(
     assert words in told
     assert len(told.splitlines()) == 1
     assert (path.read_text() if path.exists() else None) == cell
+
+
+def test_meshes_of_the_scene_become_files(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    corners = "[[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]"
+    faces = "[[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]]"
+    path = tmp_path / "scene.yaml"
+    path.write_text(
+        "world: {collision_objects: [{id: a/b, meshes: "
+        f"[{{vertices: {corners}, triangles: {faces}}}]}}]}}"
+    )
+    assert main([str(path)]) == BAD_INPUT
+    assert "--into" in capsys.readouterr().err
+    before = Path("studies/workcells/transfer.toml").read_text(encoding="utf-8")
+    cell = tmp_path / "cell.toml"
+    cell.write_text(before.replace("../robots", str(Path("studies/robots").resolve())))
+    assert main([str(path), "--into", str(cell)]) == 0
+    shape = load(cell).environment[-1].shape
+    assert isinstance(shape, Mesh)
+    assert shape.path == tmp_path / "cell-meshes" / "1-a-b.stl"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,8 @@ from scipy.spatial.transform import Rotation
 
 from symbolic.array import Array
 from symbolic.errors import SceneError
-from symbolic.read.scenes import Scene, read_scene
+from symbolic.read.scenes.bodies import Scene
+from symbolic.read.scenes.read import read_scene
 from symbolic.read.tables import Table, read_body
 from symbolic.records import Body, Box, Cylinder, Mesh, Sphere
 from symbolic.records.problems import Problems
@@ -222,6 +224,167 @@ def test_a_missing_scene_is_told(tmp_path: Path) -> None:
         read_scene(tmp_path / "none.sdf")
 
 
+# --- planning scenes of MoveIt ---
+
+
+MESSAGE = f"""
+name: bench
+fixed_frame_transforms:
+- header: {{frame_id: world}}
+  child_frame_id: cart
+  transform: {{translation: {{x: 0.0, y: 2.0, z: 0.0}}, rotation: {{x: 0, y: 0, z: 0, w: 1}}}}
+robot_state:
+  attached_collision_objects:
+  - object: {{id: cup}}
+world:
+  collision_objects:
+  - header: {{frame_id: cart}}
+    id: table
+    pose:
+      position: {{x: 1.0, y: 0, z: 0}}
+      orientation: {{x: 0, y: 0, z: {2**-0.5}, w: {2**-0.5}}}
+    primitives:
+    - {{type: 1, dimensions: [1.0, 0.5, 0.1]}}
+    - {{type: 3, dimensions: [0.8, 5e-02]}}
+    primitive_poses:
+    - {{position: {{x: 0, y: 0, z: 0.5}}, orientation: {{x: 0, y: 0, z: 0, w: 1}}}}
+    - {{position: {{x: 0.5, y: 0, z: 0}}, orientation: {{x: 0, y: 0, z: 0, w: 0}}}}
+    operation: 0
+  - id: can
+    primitives: [{{type: cylinder, dimensions: [0.1, 3e-2]}}]
+    primitive_poses: [{{position: [0.5, 0.0, 0.25], orientation: [0, 0, 0, 1]}}]
+  - id: floor
+    header: {{frame_id: odom}}
+    planes: [{{coef: [0, 0, 2, 1]}}]
+  - id: hat
+    primitives: [{{type: 4, dimensions: [1, 1]}}]
+  - id: gone
+    operation: 1
+  - id: wedge
+    meshes:
+    - triangles:
+      - vertex_indices: [0, 2, 1]
+      - [0, 1, 3]
+      - [1, 2, 3]
+      - [0, 3, 2]
+      vertices: [{{x: 0, y: 0, z: 0}}, [1, 0, 0], [0, 1, 0], [0, 0, 1]]
+    mesh_poses: [{{position: [0, 0, 1]}}]
+  octomap: {{octomap: {{data: [1, 2]}}}}
+---
+"""
+
+
+def test_a_planning_scene(tmp_path: Path) -> None:
+    """As MoveIt reads it: an object's pose counts, a row of zeros is no rotation."""
+    found = scene(tmp_path, MESSAGE, "scene.yaml")
+    assert places(found) == {
+        "table primitives 1": [1.0, 2.0, 0.5],
+        "table primitives 2": [1.0, 2.5, 0.0],
+        "can": [0.5, 0.0, 0.25],
+        "floor": [0.0, 0.0, -0.55],
+        "wedge": [0.0, 0.0, 1.0],
+    }
+    bodies = by_name(found)
+    assert bodies["table primitives 2"].shape == Cylinder(0.05, 0.8)
+    assert bodies["can"].shape == Cylinder(0.03, 0.1)
+    np.testing.assert_allclose(bodies["table primitives 1"].pose[:3, 0], np.eye(3)[1], atol=1e-12)
+    assert [told.partition(":")[0] for told in found.left_out] == ["hat", "gone", "octomap", "cup"]
+    assert [note.partition(":")[0] for note in found.notes] == ["floor", "floor"]
+    (content,) = found.files.values()
+    wedge = trimesh.load_mesh(BytesIO(content), file_type="stl")
+    assert wedge.is_watertight
+    assert abs(wedge.volume - 1 / 6) < 1e-9
+
+
+SAVED = """(noname)+
+* shelf board
+{placed}2
+box
+1 0.5 0.1
+{first}
+0 0 0 1
+0 0 0 0
+cylinder
+0.05 0.8
+0 0 3
+0 0 0 1
+0 0 0 0
+{subframes}* tip
+{unmoved}1
+mesh
+4 4
+0 0 0
+1 0 0
+0 1 0
+0 0 1
+0 2 1
+0 1 3
+1 2 3
+0 3 2
+0 0 1
+0 0 0 1
+0 0 0 0
+{none}.
+"""
+OLD = dict.fromkeys(("placed", "subframes", "unmoved", "none"), "") | {"first": "1 2 0.5"}
+NEW = {
+    "placed": "1 2 0\n0 0 0 1\n",
+    "first": "0 0 0.5",
+    "subframes": "1\nmiddle of it\n0 0 0\n0 0 0 1\n",
+    "unmoved": "0 0 0\n0 0 0 1\n",
+    "none": "0\n",
+}
+
+
+@pytest.mark.parametrize("words", [OLD, NEW])
+def test_a_saved_scene_of_either_age(tmp_path: Path, words: dict[str, str]) -> None:
+    """Shapes are in the world, or in their object."""
+    found = scene(tmp_path, SAVED.format(**words), "saved.scene")
+    second = [1.0, 2.0, 3.0] if words is NEW else [0.0, 0.0, 3.0]
+    expected = {"shelf board 1": [1.0, 2.0, 0.5], "shelf board 2": second, "tip": [0.0, 0.0, 1.0]}
+    assert places(found) == expected
+    assert by_name(found)["shelf board 2"].shape == Cylinder(0.05, 0.8)
+    assert len(found.files) == 1
+
+
+OBJECT = "world: {collision_objects: [{id: a, "
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "words"),
+    [
+        ("s.yaml", "a: [", "is not readable YAML"),
+        ("s.yaml", "- 1", "is no planning scene"),
+        ("s.yaml", "world: {}", "has no world.collision_objects"),
+        ("s.yaml", "world: {collision_objects: 3}", "allowed is an array of tables"),
+        ("s.yaml", f"{OBJECT}primitives: [{{type: 1, dimensions: [1, 2]}}]}}]}}", "of 3 numbers"),
+        ("s.yaml", f"{OBJECT}primitives: [{{type: 2, dimensions: [.inf]}}]}}]}}", "found inf"),
+        (
+            "s.yaml",
+            f"{OBJECT}primitives: [{{}}], primitive_poses: [{{}}, {{}}]}}]}}",
+            "primitive_poses: found 2; allowed are as many as primitives, 1",
+        ),
+        ("s.yaml", f"{OBJECT}pose: {{position: [0, 0]}}}}]}}", "position: found [0, 0]"),
+        ("s.yaml", f"{OBJECT}meshes: [{{triangles: 3}}]}}]}}", "without triangles"),
+        ("s.yaml", f"{OBJECT}meshes: [{{triangles: [[0, 1]]}}]}}]}}", "are not rows of three"),
+        ("s.yaml", f"{OBJECT}meshes: [{{triangles: [[0, 1, 2]]}}]}}]}}", "it does not have"),
+        ("s.yaml", f"{OBJECT}planes: [{{coef: [0, 0, 0, 1]}}]}}]}}", "a plane without a normal"),
+        ("s.scene", "name\n* a\n1\nbox\n1 2", "it ends too early"),
+        ("s.scene", "name\n* a\n1\nmesh\n-1 0\n", "it counts backwards"),
+        ("s.scene", "name\n* a\n1\nteapot\n", "of the kind 'teapot'"),
+        ("s.scene", "name\n* a\n1\nsphere\nbig\n", "object 'a' is not as MoveIt writes it"),
+        ("s.scene", "name\n.\n", "holds no obstacle"),
+    ],
+)
+def test_a_broken_planning_scene_is_refused(
+    tmp_path: Path, name: str, text: str, words: str
+) -> None:
+    with pytest.raises(SceneError) as refused:
+        scene(tmp_path, text, name)
+    assert str(refused.value).startswith(f"{name}: ")
+    assert words in str(refused.value)
+
+
 # --- the names and poses that are written ---
 
 
@@ -267,7 +430,7 @@ def test_a_pose_survives_the_scene_and_the_table(
     folder = tmp_path_factory.getbasetemp()
     expected = by_scipy(model) @ by_scipy(link) @ by_scipy(shape)
     found = scene(folder, sdf(text))
-    (table,) = found.tables(folder)
+    (table,) = found.tables(folder, folder)
     problems = Problems()
     body = read_body(Table(table, "", problems), folder)
     assert not problems.found

@@ -1,0 +1,238 @@
+"""What readers of scenes gather: shapes with their poses in the world, and what no body can be.
+
+Whatever is no body is told by its name and its reason: an obstacle that is silently missing would
+make every verdict of a cell wrong.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from symbolic import outside
+from symbolic.array import Array
+from symbolic.errors import CollisionModelError, OutsideError
+from symbolic.read.descriptions import find_package
+from symbolic.read.elements import parse_elements
+from symbolic.read.tables import Table, read_body
+from symbolic.records import PAYLOAD, Body, Box, Capsule, Cylinder, Mesh, Shape, Sphere
+from symbolic.records.poses import rpy_from_rotation, transform
+from symbolic.records.problems import MAX_NAME_LENGTH, Problems
+from symbolic.records.quantities import Quantity
+
+MOST_BODIES = 5000
+SLAB = (10.0, 10.0, 0.1)
+"""What stands for a plane: as wide as a body may be, around its point nearest to the world's origin
+[m]."""
+
+ANY = Quantity("", -1e9, 1e9)
+"""A number that is only read; whether a body may have it is judged with the body."""
+
+DIGITS = 12
+"""Decimals of lengths and angles that are written: what is beyond them is rounding of poses."""
+
+
+@dataclass(frozen=True)
+class Scene:
+    """The obstacles of a scene.
+
+    Attributes:
+        bodies: in the world; every name is a body's of an environment, and unique.
+        left_out: what is no body of it, each 'NAME: why'.
+        notes: what a body says otherwise than its scene, each 'NAME: what'.
+        files: meshes that stand in the scene itself, STL by the path that their body names.
+    """
+
+    bodies: tuple[Body, ...]
+    left_out: tuple[str, ...]
+    notes: tuple[str, ...]
+    files: Mapping[str, bytes]
+
+    def tables(self, folder: Path, meshes: Path) -> list[dict[str, Any]]:
+        """`[[environment]]` of a workcell file.
+
+        Args:
+            folder: that of the file, to which meshes are relative.
+            meshes: where `files` are.
+        """
+        return [_table(body, folder, meshes) for body in self.bodies]
+
+
+@dataclass
+class Gathered:
+    """What a scene holds so far."""
+
+    bodies: list[Body] = field(default_factory=list)
+    left_out: list[str] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+    files: dict[str, bytes] = field(default_factory=dict)
+    problems: Problems = field(default_factory=Problems)
+    names: set[str] = field(default_factory=lambda: {PAYLOAD})
+
+    def add(self, name: str, shape: Shape, pose: Array) -> None:
+        """Take a shape at its pose (4, 4) in the world, unless a workcell would refuse it."""
+        if len(self.bodies) == MOST_BODIES:
+            raise OutsideError(f"holds more than {MOST_BODIES} shapes; allowed are so many")
+        body = Body(self._name(name), shape, pose)
+        problems = Problems()
+        if not np.all(np.isfinite(pose)):
+            problems.add("pose", "is not finite")
+        else:
+            read_body(Table(_table(body, Path("/"), Path("/")), "", problems), Path("/"))
+        if isinstance(shape, Mesh) and not problems.found:
+            # Not imported at the top: reading meshes takes long to load.
+            from symbolic.read.meshes import read_mesh
+
+            try:
+                read_mesh(shape.path, shape.scale)
+            except CollisionModelError as error:
+                problems.add("mesh", str(error).removeprefix(f"{shape.path}: "))
+        if problems.found:
+            self.leave(name, "; ".join(problems.messages()))
+        else:
+            self.names.add(body.name)
+            self.bodies.append(body)
+
+    def triangles(self, name: str, vertices: Array, faces: NDArray[np.int64], pose: Array) -> None:
+        """Take a mesh that has no file: vertices (n, 3) [m], and corners (m, 3) of its faces."""
+        import trimesh
+
+        content = trimesh.exchange.stl.export_stl(trimesh.Trimesh(vertices, faces, process=False))
+        file = f"{len(self.files) + 1}-{re.sub(r'[^A-Za-z0-9_-]+', '-', name)[:60]}.stl"
+        count = len(self.bodies)
+        with TemporaryDirectory() as folder:  # a body's mesh is judged as a file
+            path = Path(folder).resolve() / file
+            path.write_bytes(content)
+            self.add(name, Mesh(path, np.ones(3)), pose)
+        if len(self.bodies) > count:
+            self.bodies[-1] = replace(self.bodies[-1], shape=Mesh(Path(file), np.ones(3)))
+            self.files[file] = content
+
+    def capsule(self, name: str, shape: Capsule, pose: Array) -> None:
+        """A capsule is a cylinder and the spheres at its ends."""
+        self.add(name, Cylinder(shape.radius, shape.length), pose)
+        for end in (-0.5, 0.5):
+            place = transform(np.eye(3), [0.0, 0.0, end * shape.length])
+            self.add(f"{name} end", Sphere(shape.radius), pose @ place)
+
+    def plane(self, name: str, pose: Array) -> None:
+        """The half-space below a frame's x-y plane."""
+        normal = pose[:3, 2]
+        middle = normal * (normal @ pose[:3, 3] - SLAB[2] / 2.0)
+        self.note(name, f"is a plane; a slab of {SLAB[0]:g} x {SLAB[1]:g} x {SLAB[2]:g} m stands")
+        self.add(name, Box(np.array(SLAB)), transform(pose[:3, :3], middle))
+
+    def leave(self, name: str, why: str) -> None:
+        """Something is no body."""
+        self.left_out.append(f"{_printable(name) or 'scene'}: {why}")
+
+    def note(self, name: str, what: str) -> None:
+        """Something is taken otherwise than it is."""
+        self.notes.append(f"{_printable(name) or 'scene'}: {what}")
+
+    def _name(self, name: str) -> str:
+        """One that an environment takes: a key path names bodies, a pattern stands for some."""
+        wanted = re.sub(r"[/.*?\[\]]+", "-", _printable(name)).strip() or "body"
+        wanted = wanted[: MAX_NAME_LENGTH - 6].strip()
+        free = (wanted if k == 1 else f"{wanted} {k}" for k in range(1, MOST_BODIES + 3))
+        return next(each for each in free if each not in self.names)
+
+
+def _printable(name: str) -> str:
+    return " ".join("".join(c if c.isprintable() else " " for c in name).split())
+
+
+def _table(body: Body, folder: Path, meshes: Path) -> dict[str, Any]:
+    """A body as a table of a workcell file, its mesh, one below `meshes`, relative to a folder."""
+    table: dict[str, Any] = {"name": body.name, "kind": type(body.shape).__name__.lower()}
+    match body.shape:
+        case Box(size):
+            table["size"] = _plain(size)
+        case Cylinder(radius, length):
+            table |= {"radius": float(radius), "length": float(length)}
+        case Sphere(radius):
+            table["radius"] = float(radius)
+        case Mesh(path, scale):
+            table["path"] = Path(os.path.relpath(meshes / path, folder.absolute())).as_posix()
+            if not np.array_equal(scale, np.ones(3)):
+                table["scale"] = _plain(scale)
+    table["xyz"] = _plain(body.pose[:3, 3])
+    rpy = _plain(rpy_from_rotation(body.pose[:3, :3]))
+    return table | {"rpy": rpy} if any(rpy) else table
+
+
+def _plain(values: Array) -> list[float]:
+    return [round(value, DIGITS) + 0.0 for value in np.asarray(values, dtype=float).tolist()]
+
+
+def quaternion_pose(xyz: Array, xyzw: Array, at: str, problems: Problems) -> Array:
+    """(4, 4) of a position and a quaternion x, y, z, w; of all zeros no rotation, as in MoveIt."""
+    length = float(np.linalg.norm(xyzw))
+    if length == 0.0:
+        return transform(np.eye(3), xyz)
+    if abs(length - 1.0) > 1e-2:
+        problems.add(at, f"found a quaternion of length {length:g}; allowed is 1")
+        return np.eye(4)
+    x, y, z, w = xyzw / length
+    rotation = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
+    return transform(rotation, xyz)
+
+
+def upwards(normal: Array) -> Array:
+    """A rotation (3, 3) whose z axis is along a vector (3,)."""
+    z = np.asarray(normal) / np.linalg.norm(normal)
+    x = np.cross(np.eye(3)[int(np.argmin(np.abs(z)))], z)
+    x /= np.linalg.norm(x)
+    return np.column_stack([x, np.cross(z, x), z])
+
+
+# --- files that a scene names ---
+
+
+WHERE = "name the folder that holds it in GZ_SIM_RESOURCE_PATH, or write a path beside the scene"
+_VARIABLES = ("GZ_SIM_RESOURCE_PATH", "GAZEBO_MODEL_PATH", "SDF_PATH")
+
+
+def file_at(address: str, file: Path) -> Path | None:
+    """The file behind an address in an SDF file; of a model's folder the file that it names."""
+    scheme, _, rest = address.rpartition("://")
+    if not rest or "\0" in rest or scheme not in ("", "file", "model", "package"):
+        return None
+    if scheme in ("model", "package"):
+        name, _, inside = rest.partition("/")
+        variables = os.pathsep.join(os.environ.get(variable, "") for variable in _VARIABLES)
+        above = file.resolve().parents[:2]
+        near = [folder for parent in above for folder in (parent, parent / "models")]
+        given = [Path(entry) for entry in variables.split(os.pathsep) if entry]
+        package = find_package(name, [*near, *given], file)
+        if package is None:
+            return None
+        path = package / inside
+    else:
+        path = file.parent / rest
+    if path.is_dir():
+        path = path / (_main_file(path) or "model.sdf")
+    return path.resolve() if path.is_file() else None
+
+
+def _main_file(folder: Path) -> str | None:
+    """What a model's folder names as its description; of several versions the last."""
+    config = folder / "model.config"
+    if not config.is_file():
+        return None
+    content = outside.read_bytes(config, outside.WORKCELL_BYTES)
+    root = parse_elements(outside.xml_text(content), "model")
+    named = [(each.text or "").strip() for each in root.findall("sdf")]
+    return named[-1] if named else None
