@@ -7,11 +7,13 @@ import shlex
 import shutil
 import signal
 import subprocess
+import sys
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cache
+from importlib.util import find_spec
 from pathlib import Path
 
 from codegen.errors import CodegenError
@@ -59,6 +61,9 @@ kB) take gcc 12 in lanes 5.1 s at -O2 and 2.2 s at -O1, and run in 32.6 and 29.9
 one they take it 4.0 s at -O3 and 2.3 s at -O2, and run in 11.3 and 11.2 us."""
 
 NAMES = ("cc", "gcc", "clang")
+
+PACKAGED = "ziglang"
+"""A package of PyPI with a compiler in it, for machines that have none (extra `compiler`)."""
 
 MOST_SECONDS = 1200.0
 """After so long a compiler counts as hung [s]; sources here take it seconds, at most minutes."""
@@ -214,7 +219,8 @@ def part_level(c_bytes: int, in_lanes: bool) -> int:
 
 
 def find_compiler() -> Compiler:
-    """The C compiler: the one that CC names, otherwise the first of cc, gcc and clang that works.
+    """The C compiler: the one that CC names, otherwise the first that works of cc, gcc, clang, and
+    that of the package `ziglang`.
 
     A set CC is taken at its word: if it does not run, nothing else is tried.
 
@@ -224,11 +230,15 @@ def find_compiler() -> Compiler:
     own = os.environ.get("CC", "")
     found = _find(own, os.environ.get("PATH", ""))
     if found is None:
-        tried = f"CC names {own.strip()!r}" if own.strip() else "tried were cc, gcc and clang"
+        tried = (
+            f"CC names {own.strip()!r}"
+            if own.strip()
+            else "tried were cc, gcc, clang and the package ziglang"
+        )
         raise CodegenError(
             f"no C compiler that works was found ({tried}), and without one nothing can be "
-            "computed: install one (Debian and Ubuntu: `apt install g++`), or name it in the "
-            "environment variable CC"
+            "computed: install one (Debian and Ubuntu: `apt install g++`; without rights to, `pip "
+            "install ziglang`), or name it in the environment variable CC"
         )
     return found
 
@@ -246,6 +256,8 @@ def _words(cc: str) -> list[str]:
 @cache
 def _find(cc: str, path: str) -> Compiler | None:
     candidates = [_words(cc)] if cc.strip() else [[name] for name in NAMES]
+    if not cc.strip() and find_spec(PACKAGED) is not None:
+        candidates.append([sys.executable, "-m", PACKAGED, "cc"])
     for command in candidates:
         executable = shutil.which(command[0], path=path)
         if executable is None:

@@ -169,7 +169,7 @@ def read_trajectory(path: Path, workcell: Workcell) -> JointTrajectory:
     try:
         text = content.decode("utf-8")
         if path.suffix.lower() == ".csv":
-            columns, carry = _csv_columns(text), None
+            columns, carry = _csv_columns(text)
         else:
             is_json = path.suffix.lower() == ".json"
             document = json.loads(text) if is_json else yaml.load(text, Loader=yaml.CSafeLoader)
@@ -186,7 +186,8 @@ Columns = tuple[Array, dict[str, dict[str, Array]]]
 """Times (n,); positions, velocities and accelerations (n,) by quantity and the joint's name."""
 
 
-def _csv_columns(text: str) -> Columns:
+def _csv_columns(text: str) -> tuple[Columns, tuple[float, float] | None]:
+    """The columns, and from when to when a column `phase` says 'carry' [s]."""
     rows = list(csv.reader(io.StringIO(text)))
     header, body = rows[0], [row for row in rows[1:] if row]
     words = [re.sub(r"\s*\[.*\]$", "", name).strip() for name in header]
@@ -202,7 +203,12 @@ def _csv_columns(text: str) -> Columns:
             found[what][name] = column(k)
         elif not name and k != at and what != "phase":
             found["position"][what] = column(k)
-    return column(at), found
+    time, carry = column(at), None
+    if "phase" in words:
+        phase = words.index("phase")
+        carried = [t for t, row in zip(time.tolist(), body, strict=True) if row[phase] == "carry"]
+        carry = (carried[0], carried[-1]) if carried else None
+    return (time, found), carry
 
 
 def _document_columns(document: Any) -> Columns:

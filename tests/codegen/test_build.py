@@ -14,6 +14,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
+from codegen import compiler
 from codegen.build import build, compile_function, load_or_build
 from codegen.cache import Cache
 from codegen.compiled import CompiledFunction
@@ -206,10 +207,33 @@ def test_compilers_are_tried_in_order(tmp_path: Path, monkeypatch: pytest.Monkey
     monkeypatch.setenv("PATH", f"{tmp_path}:/bin:/usr/bin")
     assert find_compiler().command == (str(tmp_path / "gcc"),)
     monkeypatch.setenv("PATH", "")
+    monkeypatch.setattr(compiler, "PACKAGED", "a_package_that_is_not_there")
+    compiler._find.cache_clear()
     for cc in ("", "   "):
         monkeypatch.setenv("CC", cc)
-        with pytest.raises(CodegenError, match=r"no C compiler .* cc, gcc and clang"):
+        with pytest.raises(CodegenError, match=r"no C compiler .* cc, gcc, clang and the package"):
             find_compiler()
+
+
+def test_a_compiler_that_is_a_package_is_found_last(
+    cache: Cache, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A package as `ziglang` is one, which runs the system's compiler here."""
+    gcc = shutil.which("gcc")
+    (tmp_path / "packaged_cc").mkdir()
+    (tmp_path / "packaged_cc" / "__init__.py").touch()
+    run = f"import os, sys\nos.environ['PATH'] = '/usr/bin:/bin'\nos.execv({gcc!r}, sys.argv[1:])\n"
+    (tmp_path / "packaged_cc" / "__main__.py").write_text(run)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    monkeypatch.setattr(compiler, "PACKAGED", "packaged_cc")
+    monkeypatch.delenv("CC", raising=False)
+    monkeypatch.setenv("PATH", "")
+    compiler._find.cache_clear()
+    assert find_compiler().command == (sys.executable, "-m", "packaged_cc", "cc")
+    compiled = compile_function(functions()["norm"], cache)
+    np.testing.assert_allclose(compiled(np.full(4, 1.5))["y"], 3.0)
+    compiler._find.cache_clear()
 
 
 def test_compiler_that_fails_is_told(
