@@ -1,9 +1,9 @@
 """Obstacles of another program's scene as bodies of a workcell: `python -m studies.scene SCENE`.
 
-SCENE is SDF (a world or a model) or a planning scene of MoveIt (its message in YAML, or the text
-that its panel saves, .scene). Prints the `[[environment]]` tables, or adds them to a workcell or
-problem file, whose comments stay. Exit code 1 where something in the scene is no such body: it is
-told, with its reason.
+SCENE is SDF (a world or a model), MJCF, or a planning scene of MoveIt (its message in YAML, or the
+text that its panel saves, .scene). Prints the `[[environment]]` tables, or adds them to a workcell
+or problem file, whose comments stay. Exit code 1 where something in the scene is no such body: it
+is told, with its reason.
 """
 
 from __future__ import annotations

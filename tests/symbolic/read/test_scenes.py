@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from io import BytesIO
 from pathlib import Path
 
@@ -383,6 +384,70 @@ def test_a_broken_planning_scene_is_refused(
         scene(tmp_path, text, name)
     assert str(refused.value).startswith(f"{name}: ")
     assert words in str(refused.value)
+
+
+# --- MJCF ---
+
+
+MJCF = """<mujoco>
+<compiler angle="degree"/>
+<asset><mesh name="wedge" vertex="0 0 0  1 0 0  0 1 0  0 0 1"/>
+<hfield name="hills" nrow="2" ncol="2" size="1 1 1 1" elevation="0 1 0 1"/></asset>
+<worldbody>
+  <geom name="floor" type="plane" size="0 0 1" pos="0 0 -0.1"/>
+  <geom type="box" size="0.5 0.25 0.05" pos="1 2 0.5" euler="0 0 90"/>
+  <geom name="hills" type="hfield" hfield="hills"/>
+  <geom name="ghost" size="0.1" contype="0" conaffinity="0"/>
+  <body name="shelf" pos="1 0 0" euler="0 0 90">
+    <body name="board" pos="1 0 0.25">
+      <geom name="rail" type="capsule" fromto="0 0 0  0.4 0 0" size="0.1"/>
+      <geom name="post" type="cylinder" size="0.05 0.4" pos="0 0 1"/>
+      <geom name="wedge" type="mesh" mesh="wedge"/>
+    </body>
+  </body>
+  <body name="arm"><joint/><geom size="0.1"/><body><geom size="0.1"/></body></body>
+</worldbody></mujoco>"""
+
+
+def test_fixed_shapes_of_mjcf(tmp_path: Path) -> None:
+    """Where the file puts them; a mesh where its vertices are, wherever MuJoCo puts its frame."""
+    found = scene(tmp_path, MJCF, "scene.xml")
+    near = {
+        "floor": [0.0, 0.0, -0.15],
+        "geom 1": [1.0, 2.0, 0.5],
+        "board rail": [1.0, 1.2, 0.25],
+        "board rail end": [1.0, 1.4, 0.25],
+        "board rail end 2": [1.0, 1.0, 0.25],
+        "board post": [1.0, 1.0, 1.25],
+    }
+    assert {name: place for name, place in places(found).items() if "wedge" not in name} == near
+    bodies = by_name(found)
+    crate = bodies["geom 1"]
+    assert isinstance(crate.shape, Box)
+    bounds = np.asarray(trimesh.creation.box(crate.shape.size, crate.pose).bounds)
+    expected = np.array([[0.75, 1.5, 0.45], [1.25, 2.5, 0.55]])
+    np.testing.assert_allclose(bounds, expected, atol=1e-12)
+    assert bodies["board post"].shape == Cylinder(0.05, 0.8)
+    (content,) = found.files.values()
+    wedge = trimesh.load_mesh(BytesIO(content), file_type="stl")
+    wedge.apply_transform(bodies["board wedge"].pose)
+    np.testing.assert_allclose(wedge.bounds, np.array([[0, 1, 0.25], [1, 2, 1.25]]), atol=1e-6)
+    assert [told.partition(":")[0] for told in found.left_out] == ["hills", "ghost", "arm"]
+    assert "2 shapes" in found.left_out[2]
+
+
+@pytest.mark.parametrize(
+    "text", ["<mujoco><worldbody><geom/></worldbody></mujoco>", "<mujoco><world></mujoco>"]
+)
+def test_what_mujoco_refuses_is_told_in_its_words(tmp_path: Path, text: str) -> None:
+    with pytest.raises(SceneError, match=r"scene\.xml: MuJoCo does not take it: \w+"):
+        scene(tmp_path, text, "scene.xml")
+
+
+def test_mjcf_needs_mujoco(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "mujoco", None)
+    with pytest.raises(SceneError, match=r"pip install 'dual-arm-carry\[sim\]'"):
+        scene(tmp_path, MJCF, "scene.xml")
 
 
 # --- the names and poses that are written ---
