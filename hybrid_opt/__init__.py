@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from hybrid_opt.recommending.choice import Wish
     from hybrid_opt.recommending.recommendation import Recommendation, recommend
     from hybrid_opt.robust.squeeze import SqueezeSettings
+    from hybrid_opt.sensitivity import Sensitivities, sensitivities
     from hybrid_opt.sweeping import Sweep, sweep
     from hybrid_opt.timing.records import JerkLimits, JerkTiming, Timing, TimingLimits
     from hybrid_opt.workbench.browser import live
@@ -58,6 +59,7 @@ __all__ = [
     "ProposeSettings",
     "Recommendation",
     "SearchSettings",
+    "Sensitivities",
     "SqueezeSettings",
     "Sweep",
     "Timing",
@@ -77,6 +79,7 @@ __all__ = [
     "save",
     "search",
     "search_branches",
+    "sensitivities",
     "sweep",
     "targets",
     "time_every_way",
@@ -100,6 +103,7 @@ _HOMES = {
     "ProposeSettings": "hybrid_opt.proposing.proposal",
     "Recommendation": "hybrid_opt.recommending.recommendation",
     "SearchSettings": "hybrid_opt.metaheuristics.run",
+    "Sensitivities": "hybrid_opt.sensitivity",
     "SqueezeSettings": "hybrid_opt.robust.squeeze",
     "Sweep": "hybrid_opt.sweeping",
     "Timing": "hybrid_opt.timing.records",
@@ -119,6 +123,7 @@ _HOMES = {
     "save": "hybrid_opt.door",
     "search": "hybrid_opt.door",
     "search_branches": "hybrid_opt.branches",
+    "sensitivities": "hybrid_opt.sensitivity",
     "sweep": "hybrid_opt.sweeping",
     "targets": "hybrid_opt.catalogue",
     "time_every_way": "hybrid_opt.door",

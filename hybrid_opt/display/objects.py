@@ -23,12 +23,16 @@ from hybrid_opt.front import Front
 from hybrid_opt.indicators.metrics import excess_above_static
 from hybrid_opt.job.records import Job
 from hybrid_opt.recommending.recommendation import Recommendation
+from hybrid_opt.sensitivity import Sensitivities, Sensitivity
 from hybrid_opt.static_hold import static_hold
 from hybrid_opt.timing.records import Timing
 from symbolic.array import Array
 
 MAX_CLOUD = 1500
 """Feasible candidates behind a front."""
+
+ONE_WAY = 1e-6
+"""Share by which what a raised and a lowered number change may differ and count as one slope."""
 
 
 def text_of(shown: object) -> str:
@@ -200,6 +204,34 @@ def _(timing: Timing) -> dict[str, str]:
 @picture_of.register
 def _(timing: Timing) -> str:
     return "" if timing.carry is None else html_of(timing.carry)
+
+
+@heading_of.register
+def _(found: Sensitivities) -> str:
+    told = f"{len(found.missing)} not told of" if found.missing else "all told of"
+    return (
+        f"Numbers of {found.workcell.name!r}: press with {found.force:.2f} N, "
+        f"{found.duration:.3f} s; the largest changes first, {told}"
+    )
+
+
+@figures_of.register
+def _(found: Sensitivities) -> dict[str, str]:
+    """What a usual change of each number changes."""
+    return {f"{row.key} = {row.value:g} {row.unit}".rstrip(): _changes(row) for row in found.rows}
+
+
+@picture_of.register
+def _(found: Sensitivities) -> str:
+    return ""
+
+
+def _changes(row: Sensitivity) -> str:
+    change = row.change
+    told = [f"{change:+.3g} {row.unit}".rstrip() + f": {change * row.force:+8.3f} N"]
+    if abs(row.force + row.lowered) > ONE_WAY * max(abs(row.force), abs(row.lowered)):
+        told.append(f"lowered {change * row.lowered:+.3f} N")
+    return ", ".join([*told, f"{change * row.duration:+.4f} s"])
 
 
 def _where(robot: str, joint: str) -> str:

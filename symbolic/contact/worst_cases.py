@@ -31,7 +31,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from symbolic.contact.central_path import least_effort
+from symbolic.contact.central_path import differentiable_least_effort, least_effort
 from symbolic.contact.force_closure import WRENCH_SIZE, has_force_closure, presses_evenly
 from symbolic.contact.grasp import (
     BEYOND,
@@ -93,16 +93,22 @@ def case_squeeze_function(workcell: Workcell, displaced: bool = True) -> ca.Func
     return ca.Function("case_squeeze", inputs, [force], names, ["normal_force"])
 
 
-def case_gradient_function(workcell: Workcell) -> ca.Function:
+def case_gradient_function(workcell: Workcell, numbers: bool = False) -> ca.Function:
     """As `case_squeeze_function`, and slope (NumPy shape (2, 18)), of each force by pose, rate and
-    second_rate; of cases without displaced pads."""
+    second_rate; of cases without displaced pads.
+
+    Args:
+        numbers: whether slope goes on, by the case (18,) and by the cell's numbers.
+    """
     kind = _kind(workcell)
     motion = [kind.sym(name, 6) for name in ("pose", "rate", "second_rate")]
     case = kind.sym("case", CASE_SIZE)
     detached: Detached = []
     given = _given(workcell)
-    force = _least_squeeze(workcell, motion, case, given, detached, differentiable=True)
-    slope = ca.densify(ca.horzcat(*[ca.jacobian(force, part) for part in motion]).T)
+    # Pads that are moved alone lie beside one another then.
+    force = _least_squeeze(workcell, motion, case, given, detached, True, displaced=numbers)
+    by = [*motion, case, *given.values()] if numbers else motion
+    slope = ca.densify(ca.horzcat(*[ca.jacobian(force, part) for part in by]).T)
     inputs, names = [*motion, case, *given.values()], [*MOTION, "case", *given]
     found = _solved([force, slope], detached)
     return ca.Function("case_gradient", inputs, found, names, ["normal_force", "slope"])
@@ -299,20 +305,41 @@ def case_grasp_function(workcell: Workcell, commanded: int) -> ca.Function:
     Raises:
         SettingsError: the pads do not close their grasp.
     """
-    motion = [ca.MX.sym(name, 6) for name in ("pose", "rate", "second_rate")]
+    motion = [ca.MX.sym(name, 6) for name in MOTION]
     case = ca.MX.sym("case", CASE_SIZE)
-    friction, *_, tracking, internal = case_parts(case)
-    squeeze, sizes = GraspSqueeze(workcell, commanded), _sizes(workcell, case)
-    load = _origin_load_function(workcell)(*motion, case)
-    *_, displacement, _, _ = case_parts(case)
-    force = commanded_forces(squeeze, load, friction, sizes, displacement)
+    load = case_origin_load_function(workcell)(*motion, case)
+    force = _to_command_of(GraspSqueeze(workcell, commanded), load, case)
+    return ca.Function("case_grasp", [*motion, case], [force], [*MOTION, "case"], ["normal_force"])
+
+
+def case_grasp_gradient_function(workcell: Workcell, commanded: int) -> ca.Function:
+    """As `case_grasp_function`, and slope (NumPy shape (2, 42)), of each force by pose, rate and
+    second_rate, by the case and by the load of `case_origin_load_function`."""
+    motion = [ca.MX.sym(name, 6) for name in MOTION]
+    case, beside = ca.MX.sym("case", CASE_SIZE), ca.MX.sym("beside", LOAD_SIZE)
+    load = case_origin_load_function(workcell)(*motion, case) + beside
+    squeeze = GraspSqueeze(workcell, commanded)
+    force = _to_command_of(squeeze, load, case, differentiable=True)
+    slope = ca.horzcat(*[ca.jacobian(force, part) for part in (*motion, case, beside)])
+    found = ca.Function("beside", [*motion, case, beside], [force, ca.densify(slope.T)])
+    outputs = found(*motion, case, ca.DM.zeros(LOAD_SIZE))
+    names = [*MOTION, "case"]
+    return ca.Function("gradient", [*motion, case], outputs, names, ["normal_force", "slope"])
+
+
+def _to_command_of(
+    squeeze: GraspSqueeze, load: ca.MX, case: ca.MX, differentiable: bool = False
+) -> ca.MX:
+    """(2,) normal forces of pads anywhere to command [N] in a case whose load (6,) is known."""
+    friction, *_, displacement, tracking, internal = case_parts(case)
+    sizes, commanded = _sizes(squeeze.workcell, case), squeeze.commanded
+    force = commanded_forces(squeeze, load, friction, sizes, displacement, differentiable)
     needed = force[commanded] + internal * _against_internal(squeeze)(friction, sizes)
     more = needed / (1.0 - tracking[commanded]) - force[commanded]
     normals = squeeze.squeeze_normals()
     # One entry after the other: a scalar times a vector repeats it by a form without lanes.
     force += ca.vertcat(*[more * share for share in (normals / normals[commanded]).tolist()])
-    names = ["pose", "rate", "second_rate", "case"]
-    return ca.Function("case_grasp", [*motion, case], [force], names, ["normal_force"])
+    return force
 
 
 def case_grasp_slack_function(workcell: Workcell, commanded: int) -> ca.Function:
@@ -322,7 +349,7 @@ def case_grasp_slack_function(workcell: Workcell, commanded: int) -> ca.Function
     case, force = ca.SX.sym("case", CASE_SIZE), ca.SX.sym("force")
     friction, *_, tracking, internal = case_parts(case)
     squeeze, sizes = GraspSqueeze(workcell, commanded), _sizes(workcell, case)
-    load = _origin_load_function(workcell)(*motion, case)
+    load = case_origin_load_function(workcell)(*motion, case)
     left = (1.0 - tracking[commanded]) * force
     left -= internal * _against_internal(squeeze)(friction, sizes)
     *_, displacement, _, _ = case_parts(case)
@@ -360,7 +387,7 @@ def _sizes(workcell: Workcell, case: ca.SX | ca.MX) -> ca.SX | ca.MX:
     return radius / own - ca.vertcat(*lengths) / ca.DM(least_reaches(workcell))
 
 
-def _origin_load_function(workcell: Workcell) -> ca.Function:
+def case_origin_load_function(workcell: Workcell) -> ca.Function:
     """The load about the box frame's origin (6,), box axes."""
     inputs = [ca.SX.sym(name, 6) for name in ("pose", "rate", "second_rate")]
     inputs.append(ca.SX.sym("case", CASE_SIZE))
@@ -390,6 +417,7 @@ class GraspSqueeze(Grasp):
     press evenly, their displacements (4,), the same for all pads of a robot, along their tangents.
 
     Attributes:
+        workcell: the cell.
         commanded: index of the robot whose force is commanded.
         reach: the size of the patches that the squeeze lies within, as a share.
     """
@@ -404,7 +432,7 @@ class GraspSqueeze(Grasp):
         closed = ((share, cell) for share, cell in smaller if has_force_closure(cell))
         self.reach, cell = next(closed, (1.0, workcell))
         super().__init__(cell)
-        self.commanded = commanded
+        self.workcell, self.commanded = workcell, commanded
         self.cell_sizes = (("load", LOAD_SIZE), ("friction", 2), ("reach", 2))
         self.nominal = (*self.nominal, [1.0, 1.0])
         self.is_even = presses_evenly(workcell)
@@ -442,7 +470,12 @@ class GraspSqueeze(Grasp):
 
 
 def commanded_forces(
-    squeeze: GraspSqueeze, load: ca.MX, friction: ca.MX, share: ca.MX, displacement: ca.MX
+    squeeze: GraspSqueeze,
+    load: ca.MX,
+    friction: ca.MX,
+    share: ca.MX,
+    displacement: ca.MX,
+    differentiable: bool = False,
 ) -> ca.MX:
     """(2,) normal forces of the robots [N]: what is commanded, a convex function of the load, and
     what the other one then presses with. Beyond any limit where the grasp does not close.
@@ -452,11 +485,13 @@ def commanded_forces(
         friction: (2,) Coulomb coefficients of the robots' pads.
         share: (2,) sizes of their patches over the cell's own.
         displacement: (4,) of pads that press evenly [m].
+        differentiable: whether first derivatives are wanted.
     """
     size = ca.sqrt(ca.sumsqr(load[:3]) + ca.sumsqr(load[3:] / MOMENT_ARM) + SCALE_FLOOR**2)
     reach = share / squeeze.reach
     displaced = [displacement] if squeeze.is_even else []
-    found = least_effort(squeeze, load / size, friction, reach, *displaced)
+    solve = differentiable_least_effort if differentiable else least_effort
+    found = solve(squeeze, load / size, friction, reach, *displaced)
     return _in_newtons(squeeze)(found, size, friction, reach)
 
 
