@@ -20,10 +20,14 @@ from symbolic.geometry.pairs import build_geometry
 from symbolic.read.arms import arm_model
 from symbolic.read.cell import load
 from symbolic.read.descriptions import XACRO_NAMESPACE
+from symbolic.read.scenes.read import read_scene
+from symbolic.read.tables import Table, read_body
 from symbolic.records import Workcell
+from symbolic.records.problems import Problems
 from tests.fuzz.damage import Bytes, Tree, byte_damage, tree_damage, xml_damage
 from tests.fuzz.promises import MANY, Checks, all_kept, kept
 from tests.symbolic.read.samples import GOFA, RACK, sample_data, write
+from tests.symbolic.read.test_scenes import FRAMES, MESSAGE, NEW, SAVED, sdf
 
 FEW, FEW_PROCESSES = 40, 8
 SOUND = RACK.read_bytes().replace(b"../robots/gofa12.urdf", str(GOFA).encode())
@@ -118,6 +122,23 @@ def mesh(kind: str, damaged: Bytes) -> None:
             assert np.isfinite(piece.vertices).all()
 
 
+def scene(kind: str, damaged: Bytes) -> None:
+    """Bodies of a scene that is accepted are those of an environment."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / f"scene.{kind}"
+        path.write_bytes(damaged(SCENES[kind].encode()))
+        found = kept(lambda: read_scene(path), path.name)
+        tables = found.tables(Path(folder), Path(folder)) if found else ()
+        for name, content in found.files.items() if found else ():
+            (Path(folder) / name).write_bytes(content)
+        for table in tables:
+            problems = Problems()
+            read_body(Table(table, "", problems), Path(folder))
+            assert problems.found == []
+
+
+SCENES = {"sdf": sdf(FRAMES), "yaml": MESSAGE, "scene": SAVED.format(**NEW)}
+
 TESTS: Checks = {
     "workcell, bytes": (workcell_text, (byte_damage(),)),
     "workcell, values": (workcell_tree, (tree_damage(),)),
@@ -127,6 +148,8 @@ TESTS: Checks = {
     "xacro, elements": (xacro, (st.floats(0.0, 1.0), xml_damage())),
     "srdf, bytes": (srdf, (byte_damage(),)),
     "srdf, elements": (srdf, (xml_damage(),)),
+    "scene, bytes": (scene, (st.sampled_from([*SCENES]), byte_damage())),
+    "scene, elements": (scene, (st.just("sdf"), xml_damage())),
     "mesh": (mesh, (st.sampled_from(["stl", "stl_ascii", "obj", "ply", "off"]), byte_damage())),
 }
 

@@ -173,7 +173,7 @@ def _triangles(name: str, vertices: Any, faces: Any, pose: Array, found: Gathere
     """A mesh of vertices and corners as they are written."""
     try:
         places = np.array(vertices, dtype=float).reshape(-1, 3)
-        corners = np.array(faces, dtype=np.int64).reshape(-1, 3)
+        corners = np.array(faces, dtype=float).reshape(-1, 3)
     except (ValueError, TypeError, OverflowError):
         found.problems.add(name, "found a mesh whose triangles and vertices are not rows of three")
         return
@@ -181,10 +181,10 @@ def _triangles(name: str, vertices: Any, faces: Any, pose: Array, found: Gathere
         found.problems.add(
             name, "found a mesh without triangles or with vertices that are no place"
         )
-    elif corners.min() < 0 or corners.max() >= len(places):
+    elif not np.all((corners >= 0.0) & (corners < len(places)) & (corners % 1.0 == 0.0)):
         found.problems.add(name, "found a mesh with triangles whose corners it does not have")
     else:
-        found.triangles(name, places, corners, pose)
+        found.triangles(name, places, corners.astype(np.int64), pose)
 
 
 def read_moveit_text(path: Path, found: Gathered) -> None:
@@ -212,25 +212,29 @@ def _written_object(name: str, words: Sequence[str], placed: bool, found: Gather
 
     def numbers(count: int) -> Array:
         nonlocal at
-        if count < 0:
-            raise ValueError("it counts backwards")
         part = words[at : at + count]
         if len(part) < count:
             raise ValueError("it ends too early")
         at += count
         return np.array([float(word) for word in part])
 
+    def counted() -> int:
+        (number,) = numbers(1)
+        if not 0 <= number <= len(words):
+            raise ValueError(f"it counts {number:g} things")
+        return int(number)
+
     def pose() -> Array:
         row = numbers(7)
         return quaternion_pose(row[:3], row[3:], name, found.problems)
 
     T_world_object = pose() if placed else np.eye(4)
-    (count,) = numbers(1).astype(int)
+    count = counted()
     for index in range(count):
         called = f"{name} {index + 1}" if count > 1 else name
         kind, at = words[at], at + 1
         if kind == "mesh":
-            vertices, faces = numbers(2).astype(int)
+            vertices, faces = counted(), counted()
             places, corners = numbers(3 * vertices), numbers(3 * faces)
             _triangles(called, places, corners, T_world_object @ pose(), found)
         elif kind in _DIMENSIONS:

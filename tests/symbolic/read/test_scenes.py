@@ -371,7 +371,7 @@ OBJECT = "world: {collision_objects: [{id: a, "
         ("s.yaml", f"{OBJECT}meshes: [{{triangles: [[0, 1, 2]]}}]}}]}}", "it does not have"),
         ("s.yaml", f"{OBJECT}planes: [{{coef: [0, 0, 0, 1]}}]}}]}}", "a plane without a normal"),
         ("s.scene", "name\n* a\n1\nbox\n1 2", "it ends too early"),
-        ("s.scene", "name\n* a\n1\nmesh\n-1 0\n", "it counts backwards"),
+        ("s.scene", "name\n* a\n1\nmesh\n-1 0\n", "it counts -1 things"),
         ("s.scene", "name\n* a\n1\nteapot\n", "of the kind 'teapot'"),
         ("s.scene", "name\n* a\n1\nsphere\nbig\n", "object 'a' is not as MoveIt writes it"),
         ("s.scene", "name\n.\n", "holds no obstacle"),
