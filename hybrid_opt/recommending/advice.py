@@ -2,7 +2,7 @@
 
 The commanded force is in closed form: the worst case at the sample that asks for most. What a small
 change of the cell changes there is its derivative, by differences; what more or less force means in
-time is the slope of the path's own duration against force.
+time is the path's own duration within other limits of the force.
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ DEGREE = np.pi / 180.0
 PITCH = 4
 """Of the numbers of a pose."""
 
-SLOPE = 0.02
-"""Share of the force limit over which the slope of duration against force is taken."""
+LIMITS = 1.0 + np.array([-0.02, 0.0, 0.02, 0.05, 0.1, 0.2, 0.4, 0.8])
+"""Times the force limit, where it is known how long the path takes."""
 
 LEAST_HEIGHT = 2e-3
 """Height of the pads over the centre of mass from which on it is told [m]."""
@@ -109,15 +109,24 @@ def commanded_margins(carry: Carry, forces: Array) -> tuple[Margin, ...]:
 def advice(cell: Cell, paths: DrivenPaths, option: Option, timing: Timing) -> tuple[Advice, ...]:
     """What changes of the cell would change of a recommended carry, most force first."""
     assert timing.carry is not None, "what is driven has a carry"
-    limits = [option.limit * (1.0 + share) for share in (-SLOPE, 0.0, SLOPE)]
     # With less the path may not move: a tilted box asks for more than a level one.
+    limits = np.minimum(LIMITS * option.limit, max(paths.highest_force, option.limit)).tolist()
     near = [each for limit in limits for each in paths.options(limit, [option.index])]
-    low, high = near[0], near[-1]
+    forces = np.maximum.accumulate([each.commanded for each in near])
+    durations, steps = np.array([each.duration for each in near]), np.flatnonzero(np.diff(forces))
     slope = 0.0
-    if high.commanded > low.commanded:
-        slope = (high.duration - low.duration) / (high.commanded - low.commanded)
+    if len(steps):
+        low, high = steps[0], min(steps[0] + 2, len(near) - 1)
+        slope = float((durations[high] - durations[low]) / (forces[high] - forces[low]))
+
+    def in_time(force: float) -> float:
+        """What a change of the force to command is worth at the same force [s]."""
+        spare = float(np.interp(option.commanded - force, forces, durations))
+        lost = max(forces[0] - (option.commanded - force), 0.0)
+        return float(spare - slope * lost - np.interp(option.commanded, forces, durations))
+
     found = [
-        Advice(change, force, -slope * force)
+        Advice(change, force, in_time(force))
         for change, force in _of_cell(cell.workcell, timing.carry)
     ]
     found += _of_pitch(cell, paths.x[option.index], option, slope)

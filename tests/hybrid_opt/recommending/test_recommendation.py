@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.optimize import brentq
 
 import hybrid_opt as ho
 from hybrid_opt.evaluate.objectives import ROBUST_OBJECTIVES
@@ -172,6 +173,16 @@ def test_advice_is_what_changes_of_the_cell_change(
         lowered.append(replace(contact, T_box_pad=pad))
     assert level.force == pytest.approx(force(lowered) - now, rel=0.05)
     assert level is found.advice[0]  # it costs most
+    # No carry takes less than no time, however much force a change saves.
+    assert all(each.duration > -found.timing.duration for each in found.advice)
+    paths = DrivenPaths.of(drivable, found.x[:-1])
+    (own,) = paths.options(found.limit)
+
+    def beyond(limit: float) -> float:
+        return paths.options(limit)[0].commanded - (own.commanded - rubs.force)
+
+    (faster,) = paths.options(brentq(beyond, found.limit, 2.0 * found.limit, xtol=1e-3))
+    assert rubs.duration == pytest.approx(faster.duration - own.duration, rel=0.1)
 
 
 def test_margins_are_those_at_the_commanded_force(found: Recommendation) -> None:
