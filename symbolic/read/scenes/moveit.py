@@ -181,7 +181,7 @@ def _triangles(name: str, vertices: Any, faces: Any, pose: Array, found: Gathere
         found.problems.add(
             name, "found a mesh without triangles or with vertices that are no place"
         )
-    elif not np.all((corners >= 0.0) & (corners < len(places)) & (corners % 1.0 == 0.0)):
+    elif not np.all((corners >= 0.0) & (corners < len(places))):
         found.problems.add(name, "found a mesh with triangles whose corners it does not have")
     else:
         found.triangles(name, places, corners.astype(np.int64), pose)
@@ -195,7 +195,8 @@ def read_moveit_text(path: Path, found: Gathered) -> None:
     """
     text = outside.text(outside.read_bytes(path, outside.URDF_BYTES))
     _, *objects = re.split(r"^\*", text, flags=re.MULTILINE)
-    placed = bool(objects) and len([*objects[0].splitlines(), ""][1].split()) > 1
+    # Behind the first name stands a place, or in an old text the number of shapes.
+    placed = any(len(line.split()) > 1 for each in objects[:1] for line in each.split("\n")[1:2])
     for written in objects:
         name, _, rest = written.partition("\n")
         try:

@@ -374,6 +374,7 @@ OBJECT = "world: {collision_objects: [{id: a, "
         ("s.scene", "name\n* a\n1\nmesh\n-1 0\n", "it counts -1 things"),
         ("s.scene", "name\n* a\n1\nteapot\n", "of the kind 'teapot'"),
         ("s.scene", "name\n* a\n1\nsphere\nbig\n", "object 'a' is not as MoveIt writes it"),
+        ("s.scene", "name\n*", "is not as MoveIt writes it"),
         ("s.scene", "name\n.\n", "holds no obstacle"),
     ],
 )
