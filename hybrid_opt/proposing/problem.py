@@ -471,7 +471,7 @@ def completed(text: str, data: Mapping[str, Any], changes: Changes) -> str:
         SettingsError: the file is written in a way that cannot be completed, or TOML Kit is not
             installed.
     """
-    tomlkit = _library()
+    tomlkit = library()
     wanted = merged(data, changes)
     document = tomlkit.parse(text) if text else tomlkit.document()
     if not text:
@@ -563,7 +563,7 @@ def _apply(place: Any, changes: Any) -> None:
 
 def _item(value: Any) -> Any:
     """A value as TOML: tables with headings, rows of numbers one below the other."""
-    tomlkit = _library()
+    tomlkit = library()
     if isinstance(value, Mapping):
         table = tomlkit.table()
         for key, entry in value.items():
@@ -586,7 +586,12 @@ def _item(value: Any) -> Any:
     return value
 
 
-def _library() -> Any:
+def library() -> Any:
+    """TOML Kit.
+
+    Raises:
+        SettingsError: it is not installed.
+    """
     try:
         import tomlkit
     except ImportError as error:

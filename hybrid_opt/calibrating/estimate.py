@@ -1,0 +1,278 @@
+"""What holds, steps of force and slips say: pure functions of arrays.
+
+**Loads.** While a box is held still, what its pads give balances its weight. With the readings
+(f, m) of arm i about its pad, free of offsets, N the normal force among them, and c the share of N
+that the sensor shows along the pad's x and y as well (crosstalk),
+
+    sum_i f_i - N_i (c_xi, c_yi, 0) = m g                                                     (1)
+    sum_i m_i + p_i x (f_i - N_i (c_xi, c_yi, 0)) = (m c) x g                                 (2)
+
+in the frame of the box. That is linear in the mass m, the mass's moment m c, the four numbers of
+crosstalk and what the tares left of offsets: weighted least squares over all holds, each with the
+sensors' noise. Every unknown has a width before; what the singular values of the problem leave near
+a wide one was not seen.
+
+**Friction.** The ratio of a hold is the coefficient of both pads with which soft fingers
+(`symbolic.contact.soft_finger`) just hold what was measured, torsion included.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import casadi as ca
+import numpy as np
+from scipy.optimize import brentq
+from scipy.signal import correlate
+
+from symbolic.array import Array
+from symbolic.contact.soft_finger import SoftPatch, torsion_capacity
+from symbolic.records import Workcell
+from symbolic.records.poses import skew
+from symbolic.records.quantities import GRAVITY
+
+NOISE = np.array([0.3] * 3 + [0.03] * 3)
+"""Of a sensor's mean over a hold, drift included [N, N m]. What the fit leaves may raise it."""
+
+WIDTHS = np.array([1e3, *[1e2] * 3, *[0.3] * 4, *NOISE, *NOISE])
+"""Of the unknowns before anything was measured: mass [kg], mass times centre [kg m], crosstalk, and
+what tares left of both arms' offsets."""
+
+SOUGHT = 8
+"""Unknowns in front of the offsets."""
+
+WEIGHED = 0.01
+"""Standard deviation of a scale [kg]."""
+
+SEEN_MASS, SEEN_CENTRE, SEEN_CROSSTALK = 0.05, 0.005, 0.02
+"""Standard deviations up to which the mass (a share), the centre of mass [m] and crosstalk count
+as seen."""
+
+
+# --- mass, centre of mass, crosstalk ---
+
+
+@dataclass(frozen=True)
+class Hold:
+    """A box held still, in means over a short time.
+
+    Attributes:
+        pads: (2, 4, 4), the pads in the box frame.
+        gravity: (3,) in the box frame [m/s^2].
+        wrench: (2, 6) that acts on each arm, about its pad, along its axes, without offset.
+        mass: of the box, weighed [kg]; None where it was not.
+    """
+
+    pads: Array
+    gravity: Array
+    wrench: Array
+    mass: float | None = None
+
+    @property
+    def normal(self) -> Array:
+        """(2,) normal forces [N]."""
+        return -self.wrench[:, 2]
+
+
+@dataclass(frozen=True)
+class Load:
+    """What holds say; standard deviations are infinite of what they do not show.
+
+    Attributes:
+        mass: [kg].
+        centre: (3,) in the box frame [m].
+        crosstalk: (2, 2) of each arm along its pad's x and y [N/N].
+        deviations: (8,) of mass, centre and crosstalk, in this order.
+        residual: root mean square of the force that (1) leaves [N].
+    """
+
+    mass: float
+    centre: Array
+    crosstalk: Array
+    deviations: Array
+    residual: float
+
+    @property
+    def sees_mass(self) -> bool:
+        """Whether the holds show the mass."""
+        return bool(self.deviations[0] <= SEEN_MASS * abs(self.mass))
+
+    @property
+    def sees_centre(self) -> Array:
+        """(3,) along which axes of the box they show the centre of mass."""
+        return np.asarray(self.deviations[1:4] <= SEEN_CENTRE)
+
+    @property
+    def sees_crosstalk(self) -> Array:
+        """(2, 2) which crosstalk they show."""
+        return np.asarray(self.deviations[4:].reshape(2, 2) <= SEEN_CROSSTALK)
+
+
+def fit_load(holds: Sequence[Hold], moments: bool = True) -> Load:
+    """The load and the crosstalk that explain holds best.
+
+    Args:
+        holds: at least one.
+        moments: whether the sensors tell moments; without them nothing shows the centre of mass.
+    """
+    rows, values, forces = [], [], []
+    for hold in holds:
+        matrix, value, noise = _balance(hold)
+        forces.append((matrix[:3], value[:3]))
+        keep = slice(None) if moments else slice(0, 3)
+        white = np.linalg.inv(np.linalg.cholesky(noise[keep, keep]))
+        rows.append(white @ matrix[keep])
+        values.append(white @ value[keep])
+    weighed = {hold.mass for hold in holds if hold.mass is not None}
+    for mass in sorted(weighed):
+        rows.append(np.eye(1, len(WIDTHS)) / WEIGHED)
+        values.append(np.array([mass / WEIGHED]))
+    scaled, right = np.concatenate(rows) * WIDTHS, np.concatenate(values)
+    u, singular, v = np.linalg.svd(scaled, full_matrices=False)
+    x = WIDTHS * (v.T @ (singular / (singular**2 + 1.0) * (u.T @ right)))
+    spare = max(len(right) - SOUGHT, 1)
+    worse = max(1.0, float(np.sum((scaled @ (x / WIDTHS) - right) ** 2)) / spare)
+    information = np.full(len(WIDTHS), 1.0)
+    information[: len(singular)] += singular**2 / worse
+    basis = np.linalg.svd(scaled, full_matrices=True)[2]
+    covariance = np.outer(WIDTHS, WIDTHS) * ((basis.T / information) @ basis)
+    mass = x[0] if abs(x[0]) > 1e-6 else 1e-6
+    centre = x[1:4] / mass
+    # d centre = (d moment - centre d mass) / mass
+    slope = np.hstack([-centre[:, None], np.eye(3)]) / mass
+    spread = np.sqrt(np.diag(slope @ covariance[:4, :4] @ slope.T))
+    own = np.sqrt(np.diag(covariance))[:SOUGHT]
+    left = [matrix @ x - value for matrix, value in forces]
+    residual = float(np.sqrt(np.mean(np.sum(np.square(left), axis=1))))
+    deviations = np.concatenate([own[:1], spread, own[4:]])
+    return Load(float(x[0]), centre, x[4:SOUGHT].reshape(2, 2), deviations, residual)
+
+
+def _balance(hold: Hold) -> tuple[Array, Array, Array]:
+    """(1) and (2) of a hold: matrix (6, unknowns), right side (6,), covariance of that (6, 6)."""
+    matrix, value, noise = np.zeros((6, len(WIDTHS))), np.zeros(6), np.zeros((6, 6))
+    matrix[:3, 0] = hold.gravity
+    matrix[3:, 1:4] = -skew(hold.gravity)
+    for i, T_box_pad in enumerate(hold.pads):
+        R = T_box_pad[:3, :3]
+        to_box = np.zeros((6, 6))
+        to_box[:3, :3] = to_box[3:, 3:] = R
+        to_box[3:, :3] = skew(T_box_pad[:3, 3]) @ R
+        matrix[:, 4 + 2 * i : 6 + 2 * i] = hold.normal[i] * to_box[:, :2]
+        matrix[:, SOUGHT + 6 * i : SOUGHT + 6 * (i + 1)] = to_box
+        value += to_box @ hold.wrench[i]
+        noise += (to_box * NOISE**2) @ to_box.T
+    return matrix, value, noise
+
+
+def swapped(hold: Hold) -> Hold:
+    """The hold with the readings of both arms exchanged."""
+    return replace(hold, wrench=hold.wrench[::-1])
+
+
+def gravity_in(T_world_box: Array) -> Array:
+    """(3,) gravity in the frame of a box [m/s^2]."""
+    return np.asarray(T_world_box[:3, :3].T @ GRAVITY)
+
+
+def without_crosstalk(wrench: Array, crosstalk: Array) -> Array:
+    """Readings (..., 2, 6) about the pads with what the normal force shows elsewhere taken out."""
+    found = np.array(wrench)
+    found[..., :2] += wrench[..., 2:3] * crosstalk
+    return found
+
+
+# --- delays ---
+
+
+STEP = 0.005
+"""Of the grid that signals are compared on [s]."""
+
+SMOOTHED = 0.05
+"""Over which rates are taken [s]."""
+
+LEAST_LIKENESS = 0.5
+"""Correlation of two signals' rates from which on one is the other, later."""
+
+
+def delay(time: Array, first: Array, second: Array, most: float = 1.0) -> float | None:
+    """How much later the second signal (n,) does what the first (n,) does [s]; negative: earlier.
+
+    Args:
+        time: (n,) [s].
+        most: largest delay that is looked for [s].
+
+    Returns:
+        where the rates of both correlate best; None where they hardly do.
+    """
+    grid = np.arange(time[0], time[-1], STEP)
+    wide = round(SMOOTHED / STEP)
+    if len(grid) < 4 * wide:
+        return None
+    kernel = np.ones(wide) / wide
+
+    def rate(signal: Array) -> Array:
+        smooth = np.convolve(np.interp(grid, time, signal), kernel, "valid")
+        found = smooth[wide:] - smooth[:-wide]
+        return np.asarray(found - found.mean())
+
+    a, b = rate(first), rate(second)
+    size = float(np.linalg.norm(a) * np.linalg.norm(b))
+    if size == 0.0:
+        return None
+    likeness = correlate(b, a, method="fft") / size
+    centre, reach = len(a) - 1, min(round(most / STEP), len(a) - 1)
+    near = likeness[centre - reach : centre + reach + 1]
+    best = int(np.argmax(near))
+    return (best - reach) * STEP if near[best] >= LEAST_LIKENESS else None
+
+
+# --- friction ---
+
+
+LARGEST_RATIO = 20.0
+
+
+class FrictionRatio:
+    """The coefficient of both pads with which what was measured is just held.
+
+    Args:
+        workcell: whose patches press, evenly.
+    """
+
+    def __init__(self, workcell: Workcell) -> None:
+        grip, tangent = ca.SX.sym("grip"), ca.SX.sym("tangent", 2)
+        self._capacity = []
+        for contact in workcell.contacts:
+            # In the axes of its own pad.
+            patch = SoftPatch.of(contact, contact.T_box_pad[:3, :3])
+            carried, _ = torsion_capacity(grip, tangent, patch)
+            self._capacity.append(ca.Function("capacity", [grip, tangent], [carried]))
+
+    def __call__(self, wrench: Array) -> float:
+        """Of readings (2, 6) about the pads, along their axes, free of offset and crosstalk.
+
+        Returns:
+            the ratio; infinite where a pad does not press.
+        """
+        normal, tangent = -wrench[:, 2], wrench[:, :2]
+        # Both moments act about the same line, their normals being opposite.
+        torsion = abs(float(wrench[0, 5] - wrench[1, 5]))
+        if normal.min() <= 0.0:
+            return np.inf
+        pulled = np.linalg.norm(tangent, axis=1)
+        least = float((pulled / normal).max())
+
+        def spare(ratio: float) -> float:
+            grips = np.sqrt(np.maximum((ratio * normal) ** 2 - pulled**2, 0.0))
+            carried = [
+                float(capacity(grips[i], tangent[i])) for i, capacity in enumerate(self._capacity)
+            ]
+            return sum(carried) - torsion
+
+        if spare(least) >= 0.0:
+            return least
+        if spare(LARGEST_RATIO) < 0.0:
+            return np.inf
+        return float(brentq(spare, least, LARGEST_RATIO))

@@ -1,0 +1,414 @@
+"""From recorded runs to what they show of a cell, and to its workcell file with that in it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hybrid_opt.calibrating.estimate import (
+    FrictionRatio,
+    Hold,
+    Load,
+    delay,
+    fit_load,
+    gravity_in,
+    without_crosstalk,
+)
+from hybrid_opt.calibrating.faults import Fault, load_faults, recording_faults
+from hybrid_opt.calibrating.recording import Places, Run, places_of
+from hybrid_opt.display.table import number, text_table
+from hybrid_opt.proposing.problem import Problem, completed, library
+from symbolic import outside
+from symbolic.array import Array
+from symbolic.errors import OutsideError, SettingsError, WorkcellError
+from symbolic.read.cell import load as load_cell
+from symbolic.records import Workcell
+from symbolic.records.cell import RANGES
+from symbolic.records.poses import inverse
+
+PIECE, SHORTEST = 2.0, 0.5
+"""Holds are cut into pieces of so long, at least [s]."""
+
+STILL = 0.01
+"""Most that a joint moves in a piece of a hold that counts as still [rad or m]."""
+
+RATIO_TIME = 0.2
+"""Over which forces are averaged for a ratio of friction [s]."""
+
+SURE = 3.0
+"""Standard deviations that a range covers."""
+
+LEAST_MASS, LEAST_CENTRE, LEAST_FRICTION = 0.005, 0.001, 0.10
+"""Least ranges that are written: shares, and [m]. Slips of one pair of surfaces spread by 10 %."""
+
+SAME_BOX = 0.03
+"""Weighed masses of one box differ by less, as a share."""
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One quantity that the runs show.
+
+    Attributes:
+        name, found: in words.
+        key: of the workcell file that has it now, '' where it has none.
+    """
+
+    name: str
+    found: str
+    key: str = ""
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What runs show of a cell.
+
+    Attributes:
+        runs: names of the recordings.
+        entries: what was found.
+        faults: what is wrong with the runs.
+        asks: what to record for what is not seen.
+        changes: of the workcell file.
+    """
+
+    runs: tuple[str, ...]
+    entries: tuple[Entry, ...]
+    faults: tuple[Fault, ...]
+    asks: tuple[str, ...]
+    changes: dict[str, Any]
+
+    def __str__(self) -> str:
+        rows = [("quantity", "found", "written to")]
+        rows += [(entry.name, entry.found, entry.key or "a comment") for entry in self.entries]
+        told = [text_table(rows)] if self.entries else []
+        told += [f"{'refused' if f.serious else 'warning'}: {f}" for f in self.faults]
+        told += [f"to record: {ask}" for ask in self.asks]
+        return "\n".join(told)
+
+    @property
+    def document(self) -> dict[str, Any]:
+        """The same as JSON values."""
+        return {
+            "runs": list(self.runs),
+            "entries": [vars(entry) for entry in self.entries],
+            "faults": [vars(fault) for fault in self.faults],
+            "asks": list(self.asks),
+            "changes": self.changes,
+        }
+
+
+def calibrate(workcell: Workcell, runs: Sequence[Run]) -> Evidence:
+    """What runs show of a cell.
+
+    Raises:
+        SettingsError: runs of different boxes.
+    """
+    masses = [run.labels.mass for run in runs if run.labels.mass is not None]
+    if masses and max(masses) > (1.0 + SAME_BOX) * min(masses):
+        raise SettingsError(
+            f"runs of boxes of {min(masses):g} and {max(masses):g} kg; calibrate with one box"
+        )
+    collected = _Collected(workcell)
+    sound = []
+    for run in runs:
+        places = places_of(workcell, run)
+        faults = recording_faults(workcell, run, places)
+        collected.faults += faults
+        if not any(fault.serious for fault in faults):
+            tared = _tared(run, places, collected)
+            sound.append((run, tared))
+    load = _load(workcell, sound, collected)
+    if not any(fault.serious and not fault.run for fault in collected.faults):
+        _friction(workcell, sound, load, collected)
+        _tracking(sound, collected)
+        _drift(workcell, sound, collected)
+    return collected.evidence(tuple(run.name for run in runs))
+
+
+class _Collected:
+    """What is found, one after the other."""
+
+    def __init__(self, workcell: Workcell) -> None:
+        self._workcell = workcell
+        self.entries: list[Entry] = []
+        self.faults: list[Fault] = []
+        self.asks: list[str] = []
+        self._tables: dict[str, Any] = {}
+        self._ranges: dict[str, Any] = {}
+
+    def tell(self, name: str, found: str, key: str = "") -> None:
+        self.entries.append(Entry(name, found, key))
+
+    def put(self, table: str, values: Any) -> None:
+        """Change a table of the file: keys, or one mapping per contact."""
+        self._tables[table] = values
+
+    def doubt(self, name: str, value: Any) -> None:
+        """Set a range of `[uncertainty]`, rounded up."""
+        up = np.ceil(np.maximum(1e4 * np.asarray(value, dtype=float) - 1e-6, 0.0)) / 1e4
+        self._ranges[name] = up.tolist()
+
+    def evidence(self, runs: tuple[str, ...]) -> Evidence:
+        changes = dict(self._tables)
+        if self._ranges:
+            # What a stated table does not name would be exact.
+            doubt = self._workcell.uncertainty
+            usual = {name: np.asarray(getattr(doubt, name)).tolist() for name in RANGES}
+            changes["uncertainty"] = (usual if not doubt.stated else {}) | self._ranges
+        return Evidence(runs, tuple(self.entries), tuple(self.faults), tuple(self.asks), changes)
+
+
+# --- sensors and load ---
+
+
+def _tared(run: Run, places: Places, collected: _Collected) -> Places:
+    """The run without the sensors' offsets, each as at the tare before."""
+    offsets = []
+    for instant in sorted(run.labels.tare):
+        inside = run.around(instant)
+        if inside.any():
+            offsets.append((instant, places.wrench[inside].mean(axis=0)))
+    instants = np.array([instant for instant, _ in offsets])
+    before = np.maximum(np.searchsorted(instants, run.time, side="right") - 1, 0)
+    values = np.array([offset for _, offset in offsets])
+    for i in range(2):
+        told = ", ".join(number(value, 2) for value in values[:, i, :3].mean(axis=0))
+        moved = np.ptp(values[:, i, :3], axis=0).max()
+        drift = f", drift {moved:.2f} N" if len(values) > 1 else ""
+        collected.tell(f"{run.name}, offset of arm {i + 1}", f"{told} N{drift}")
+    return Places(places.pads, places.box, places.wrench - values[before])
+
+
+def _pieces(run: Run, places: Places) -> list[Hold]:
+    """A run's holds that are still and whole, in pieces."""
+    found = []
+    for begin, end in run.labels.held:
+        squeeze = places.normal[run.within(begin, end)].min(axis=1, initial=np.inf)
+        lost = any(a < end and b > begin for a, b in run.lost)
+        if lost or not len(squeeze) or squeeze.min() < 0.1 * np.median(squeeze):
+            continue
+        count = max(1, round((end - begin) / PIECE))
+        edges = np.linspace(begin, end, count + 1)
+        for first, last in pairwise(edges):
+            inside = run.within(first, last)
+            moved = max(float(np.ptp(q[inside], axis=0).max(initial=0.0)) for q in run.joints)
+            if last - first < SHORTEST or moved > STILL or np.count_nonzero(inside) < 5:
+                continue
+            middle = np.flatnonzero(inside)[np.count_nonzero(inside) // 2]
+            T_world_box = places.box[middle]
+            pads = np.array([inverse(T_world_box) @ pad for pad in places.pads[middle]])
+            wrench = np.nan_to_num(places.wrench[inside].mean(axis=0))
+            found.append(Hold(pads, gravity_in(T_world_box), wrench, run.labels.mass))
+    return found
+
+
+Sound = list[tuple[Run, Places]]
+"""Runs without serious faults, their readings without offsets."""
+
+
+def _load(workcell: Workcell, sound: Sound, collected: _Collected) -> Load | None:
+    """Mass, centre of mass and crosstalk, as far as they are seen."""
+    holds, moments = [], True
+    for run, places in sound:
+        if not run.labels.empty:
+            found = _pieces(run, places)
+            holds += found
+            moments &= run.has_moments or not found
+    if not holds:
+        collected.asks.append("holds of the box at rest, two seconds each, after a tare")
+        return None
+    load = fit_load(holds, moments)
+    known = next((hold.mass for hold in holds if hold.mass), workcell.payload.mass)
+    faults = load_faults(holds, load, known, moments)
+    collected.faults += faults
+    if faults:
+        return None
+    source = f"from {len(holds)} holds, {load.residual:.2f} N left"
+    share = SURE * float(load.deviations[0]) / load.mass
+    if load.sees_mass:
+        told = f"{load.mass:.3f} kg ± {100.0 * share:.1f} % (3 σ), {source}"
+        collected.tell("mass", told, "payload.mass")
+        collected.doubt("mass", max(share, LEAST_MASS))
+    else:
+        collected.asks.append(
+            "holds at three squeezes, or the box's weight from a scale: mass and crosstalk cannot "
+            "be told apart"
+        )
+    payload: dict[str, Any] = {"mass": round(load.mass, 4)} if load.sees_mass else {}
+    spread = load.deviations[1:4]
+    if load.sees_mass and load.sees_centre.all():
+        told = ", ".join(
+            f"{1e3 * value:.1f} ± {1e3 * SURE * wide:.1f}"
+            for value, wide in zip(load.centre, spread, strict=True)
+        )
+        collected.tell("centre of mass", f"{told} mm (3 σ), {source}", "payload.centre_of_mass")
+        payload["centre_of_mass"] = np.round(load.centre, 5).tolist()
+        collected.doubt("centre_of_mass", np.maximum(SURE * spread, LEAST_CENTRE))
+    else:
+        unseen = " ".join(
+            axis for axis, seen in zip("xyz", load.sees_centre, strict=True) if not seen
+        )
+        collected.asks.append(
+            f"holds tilted by 14 degrees, either way about both level axes, at three squeezes: the "
+            f"centre of mass along {unseen or 'x y z'} cannot be seen"
+        )
+    if payload:
+        collected.put("payload", payload)
+    for i in range(2):
+        seen = load.sees_crosstalk[i]
+        told = ", ".join(
+            f"{value:.3f} ± {SURE * wide:.3f}" if known else "not seen"
+            for value, wide, known in zip(
+                load.crosstalk[i], load.deviations[4 + 2 * i : 6 + 2 * i], seen, strict=True
+            )
+        )
+        collected.tell(f"crosstalk of arm {i + 1}", f"{told} N/N along the pad's x, y (3 σ)")
+    return load
+
+
+# --- friction, forces, pads ---
+
+
+def _friction(workcell: Workcell, sound: Sound, load: Load | None, collected: _Collected) -> None:
+    """A bracket of the friction: greatest ratio that held, least that slipped."""
+    if load is None or not load.sees_crosstalk.all() or not workcell.has_opposite_pads:
+        return
+    ratio_of = FrictionRatio(workcell)
+    held: list[tuple[float, str]] = []
+    slipped: list[tuple[float, str]] = []
+    for run, places in sound:
+        if run.labels.empty or not run.has_moments:
+            continue
+        wrench = without_crosstalk(places.wrench, load.crosstalk)
+
+        def ratio(begin: float, run: Run = run, wrench: Array = wrench) -> float:
+            inside = run.within(begin, begin + RATIO_TIME)
+            return ratio_of(wrench[inside].mean(axis=0)) if inside.any() else np.nan
+
+        for begin, end in run.labels.held:
+            lost = any(a < end and b > begin for a, b in run.lost)
+            steps = np.arange(begin, end - RATIO_TIME, RATIO_TIME)
+            ratios = [ratio(step) for step in steps if not lost]
+            held += [(value, run.name) for value in ratios if np.isfinite(value)]
+        slips = [ratio(instant - RATIO_TIME) for instant in run.labels.slip_at]
+        slipped += [(value, run.name) for value in slips if np.isfinite(value)]
+    if held:
+        collected.tell("friction, greatest held", "{:.3f} in {}".format(*max(held)))
+    if slipped:
+        collected.tell("friction, least slipped", "{:.3f} in {}".format(*min(slipped)))
+    if not held or not slipped or len({name for _, name in held + slipped}) < 2:
+        collected.asks.append(
+            "runs that slip (slip_at) beside others that hold: friction is bracketed by two runs "
+            "and more, never told by one"
+        )
+        return
+    low, high = sorted((max(held)[0], min(slipped)[0]))
+    middle = (low + high) / 2.0
+    share = max((high - low) / 2.0 / middle, LEAST_FRICTION)
+    collected.tell("friction", f"{low:.3f} to {high:.3f}", "contacts.friction")
+    collected.put("contacts", [{"friction": round(middle, 3)}] * 2)
+    collected.doubt("friction", share)
+
+
+def _tracking(sound: Sound, collected: _Collected) -> None:
+    """Force over the commanded one as quantiles, and its lag."""
+    worst: list[float] = []
+    for i in range(2):
+        shares, lags = [], []
+        for run, places in sound:
+            commanded, normal = run.commanded[:, i], places.normal[:, i]
+            known = np.isfinite(commanded)
+            if not known.any():
+                continue
+            late = delay(run.time[known], commanded[known], normal[known])
+            lags += [] if late is None else [late]
+            for begin, end in run.labels.held:
+                inside = run.within(begin, end) & known & (commanded > 1.0)
+                shares.append(normal[inside] / np.where(inside, commanded, 1.0)[inside])
+        every = np.concatenate(shares) if shares else np.empty(0)
+        if not len(every):
+            continue
+        low, usual, high = np.quantile(every, [0.01, 0.5, 0.99])
+        worst.append(float(low))
+        told = f"{low:.3f}, {usual:.3f}, {high:.3f} (1, 50, 99 %)"
+        collected.tell(f"force over command, arm {i + 1}", told, "uncertainty.tracking")
+        if lags:
+            collected.tell(f"lag of the force, arm {i + 1}", f"{max(lags):.3f} s at most")
+    if worst:
+        collected.doubt("tracking", float(np.clip(1.0 - min(worst), 0.0, 0.9)))
+
+
+def _drift(workcell: Workcell, sound: Sound, collected: _Collected) -> None:
+    """How far the pads move along one another while they hold, and how late one arm is."""
+    beside: list[Array] = []
+    turned: list[Array] = []
+    delays = []
+    for run, places in sound:
+        for begin, end in run.labels.held:
+            inside = run.within(begin, end)
+            if run.labels.empty or np.count_nonzero(inside) < 5:
+                continue
+            between = np.linalg.inv(places.pads[inside, 0]) @ places.pads[inside, 1]
+            change = between[0, :3, :3].T @ between[:, :3, :3]
+            cosine = (np.trace(change, axis1=1, axis2=2) - 1.0) / 2.0
+            turned.append(np.arccos(np.clip(cosine, -1.0, 1.0)))
+            beside.append(np.linalg.norm(between[:, :2, 3] - between[0, :2, 3], axis=1))
+        path = [
+            places.pads[:, i, :3, :] @ inverse(workcell.contacts[i].T_box_pad)[:, 3]
+            for i in range(2)
+        ]
+        axis = int(np.argmax(np.ptp(path[0], axis=0)))
+        late = delay(run.time, path[0][:, axis], path[1][:, axis])
+        delays += [] if late is None else [late]
+    if not beside:
+        return
+    for name, values, scale, unit, key in (
+        ("drift of the pads", np.concatenate(beside), 1e3, "mm", "relative_position"),
+        ("turn of the pads", np.concatenate(turned), 1.0, "rad", "relative_angle"),
+    ):
+        rms, most = float(np.sqrt(np.mean(values**2))), float(np.quantile(values, 0.99))
+        told = f"{scale * rms:.2g} {unit} rms, {scale * most:.2g} {unit} (99 %), by the joints"
+        collected.tell(name, told, f"uncertainty.{key}")
+        collected.doubt(key, most)
+    if delays:
+        most = max(delays, key=abs)
+        collected.tell("delay of arm 2 after arm 1", f"{most:.3f} s at most")
+
+
+# --- the file ---
+
+
+def calibrated_file(source: Path, evidence: Evidence, output: Path) -> str:
+    """The text of a workcell file with what runs show, comments kept, evidence as comments.
+
+    Args:
+        source: the workcell file.
+        output: where it will be; paths are then relative to its folder.
+
+    Raises:
+        WorkcellError: the calibrated cell would not be a valid one.
+        SettingsError: the file is written in a way that cannot be completed.
+    """
+    try:
+        text = outside.text(outside.read_bytes(source, outside.WORKCELL_BYTES))
+        data = outside.toml_tables(text.encode())
+    except OutsideError as error:
+        raise WorkcellError(str(source), (f"file: {error}",)) from error
+    load_cell(source, text=completed(text, data, evidence.changes).encode())
+    changed = Problem(source, text, data).completed(evidence.changes, output.parent)
+    document = library().parse(changed)
+    for entry in evidence.entries:
+        table, _, key = entry.key.partition(".")
+        if key and table in document:
+            places = document[table] if isinstance(document[table], list) else [document[table]]
+            for place in places:
+                place[key].comment(f"{entry.name}: {entry.found}")
+    head = [f"# Calibrated from {', '.join(evidence.runs)}:"]
+    head += [f"#   {entry.name}: {entry.found}" for entry in evidence.entries]
+    head += [f"#   {fault}" for fault in evidence.faults]
+    return "\n".join(head) + "\n\n" + str(library().dumps(document))

@@ -1,0 +1,317 @@
+"""A recorded run of a cell: joints, what the sensors at both wrists felt, what was commanded, and
+what a person says of it in a side file.
+
+RUN.toml lies beside RUN.csv; docs/calibration.md explains its keys. Each arm may have a file and a
+clock of its own; what the second recorded is taken at the times of the first.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from hybrid_opt.bundles.job_file import pad_places
+from hybrid_opt.errors import ResultsError
+from hybrid_opt.store.files import read_bytes
+from symbolic import outside
+from symbolic.array import Array
+from symbolic.errors import OutsideError, WorkcellError
+from symbolic.read.arms import arm_model
+from symbolic.read.tables import Table
+from symbolic.records import Workcell
+from symbolic.records import quantities as quantity
+from symbolic.records.poses import inverse, skew
+from symbolic.records.problems import Problems, shown
+from symbolic.records.quantities import Quantity
+
+FRAMES = ("flange", "pad", "base")
+"""In which a wrench may be told: about the flange or the pad and along its axes, or about the pad
+along the axes of the arm's base, as RTDE does."""
+
+TARE_TIME = 0.4
+"""Around a tare instant over which readings are averaged [s]."""
+
+TIME = Quantity("s", -1e12, 1e12)
+FORCE_RANGE = Quantity("N", 1.0, 1e6)
+MOMENT_RANGE = Quantity("N m", 0.1, 1e5)
+
+Spans = tuple[tuple[float, float], ...]
+
+
+@dataclass(frozen=True)
+class Labels:
+    """What a person says of a run, times on its clock [s].
+
+    Attributes:
+        mass: of the box, weighed [kg]; None where it was not.
+        empty: whether no box was held at any time.
+        tare: instants at which both arms stood still and touched nothing.
+        held: from when to when the pads held the box without slip.
+        slip_at: instants at which it began to slip.
+    """
+
+    mass: float | None
+    empty: bool
+    tare: tuple[float, ...]
+    held: Spans
+    slip_at: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run as it was recorded.
+
+    Attributes:
+        name: of its file.
+        time: (n,) ascending [s].
+        joints: (n, joints) of each arm [rad or m].
+        wrench: (n, 2, 6) force and moment that act on each arm, in `frame` [N, N m]; moments are
+            not finite where none were recorded.
+        commanded: (n, 2) normal force [N]; not finite where none was recorded.
+        lost: from when to when an arm recorded nothing new, far longer than usual [s].
+        frame: one of `FRAMES`.
+        largest: (2,) force and moment that the sensors can measure [N, N m]; infinite if not said.
+        labels: see there.
+    """
+
+    name: str
+    time: Array
+    joints: tuple[Array, Array]
+    wrench: Array
+    commanded: Array
+    lost: Spans
+    frame: str
+    largest: Array
+    labels: Labels
+
+    @property
+    def has_moments(self) -> bool:
+        """Whether moments were recorded, of both arms."""
+        return bool(np.isfinite(self.wrench[:, :, 3:]).all())
+
+    def within(self, begin: float, end: float) -> Array:
+        """(n,) which samples lie between two instants."""
+        return np.asarray((self.time >= begin) & (self.time <= end))
+
+    def around(self, instant: float) -> Array:
+        """(n,) which samples are near an instant at which both arms stand still."""
+        return self.within(instant - TARE_TIME / 2.0, instant + TARE_TIME / 2.0)
+
+
+# --- files ---
+
+
+GAP, LONG_GAP = 10.0, 0.2
+"""A step of so many usual ones, and at least so long [s], is a gap."""
+
+
+@dataclass(frozen=True)
+class _Recorded:
+    """One arm's columns: (m,), (m, joints), (m, 6), (m,)."""
+
+    time: Array
+    joints: Array
+    wrench: Array
+    commanded: Array
+
+    def at(self, time: Array) -> _Recorded:
+        """Between its samples."""
+
+        def taken(values: Array) -> Array:
+            flat = values.reshape(len(self.time), -1)
+            columns = [np.interp(time, self.time, column) for column in flat.T]
+            return np.column_stack(columns).reshape(len(time), *values.shape[1:])
+
+        return _Recorded(time, taken(self.joints), taken(self.wrench), taken(self.commanded))
+
+    @property
+    def lost(self) -> Spans:
+        """Without samples, or with the very same force in all of them."""
+        steps = np.diff(self.time)
+        long = np.flatnonzero(steps > max(GAP * float(np.median(steps)), LONG_GAP))
+        same = (np.diff(self.wrench[:, :3], axis=0) == 0.0).all(axis=1)
+        edges = np.flatnonzero(np.diff(np.concatenate([[0], same.astype(int), [0]])))
+        spans = [(k, k + 1) for k in long]
+        spans += zip(edges[::2], edges[1::2], strict=True)
+        times = [(float(self.time[begin]), float(self.time[end])) for begin, end in spans]
+        return tuple(span for span in times if span[1] - span[0] > LONG_GAP)
+
+
+def read_run(path: Path, workcell: Workcell) -> Run:
+    """A run and its side file, the same name with the ending `.toml`.
+
+    Raises:
+        ResultsError: the recording cannot be read, or lacks a column.
+        WorkcellError: with all problems of the side file.
+    """
+    side = path.with_suffix(".toml")
+    try:
+        data = outside.toml_tables(outside.read_bytes(outside.resolved(side), 2**20))
+    except OutsideError as error:
+        raise WorkcellError(str(side), (f"file: {error}",)) from error
+    problems = Problems()
+    table = Table(data, "", problems)
+    labels = _labels(table)
+    frame = table.choice("frame", FRAMES, "flange")
+    largest = np.full(2, np.inf)
+    if table.has("sensor_range"):
+        largest = table.vector("sensor_range", (FORCE_RANGE, MOMENT_RANGE))
+    arms = table.tables("arms", exactly=2)
+    if problems.found or len(arms) != 2:
+        raise WorkcellError(str(side), problems.messages())
+    recorded = [_read_arm(arm, path, workcell, i) for i, arm in enumerate(arms)]
+    for each in (*arms, table):
+        each.close()
+    if problems.found:
+        raise WorkcellError(str(side), problems.messages())
+    first, second = recorded
+    time = first.time[(first.time >= second.time[0]) & (first.time <= second.time[-1])]
+    if len(time) < 10:
+        raise ResultsError(
+            f"{path}: both arms recorded at the same time on {len(time)} samples; allowed are 10 "
+            "and more, on one clock"
+        )
+    both = [each.at(time) for each in recorded]
+    return Run(
+        name=path.name,
+        time=time,
+        joints=(both[0].joints, both[1].joints),
+        wrench=np.stack([each.wrench for each in both], axis=1),
+        commanded=np.stack([each.commanded for each in both], axis=1),
+        lost=tuple(sorted({*first.lost, *second.lost})),
+        frame=frame,
+        largest=np.asarray(largest),
+        labels=labels,
+    )
+
+
+def _labels(table: Table) -> Labels:
+    mass = table.number("mass", quantity.MASS) if table.has("mass") else None
+    empty = table.flag("empty")
+    if empty and mass is not None:
+        table.problems.add("mass", "is stated for an empty run; leave out one of them")
+    spans = table.raw("held", [])
+    if not isinstance(spans, list) or not all(
+        isinstance(span, list)
+        and len(span) == 2
+        and all(isinstance(value, int | float) for value in span)
+        and span[0] < span[1]
+        for span in spans
+    ):
+        table.problems.add("held", f"found {shown(spans)}; allowed are pairs [begin, end] in s")
+        spans = []
+    held = tuple((float(begin), float(end)) for begin, end in spans)
+    return Labels(mass, empty, _instants(table, "tare"), held, _instants(table, "slip_at"))
+
+
+def _instants(table: Table, key: str) -> tuple[float, ...]:
+    value = table.raw(key, [])
+    count = len(value) if isinstance(value, list) else 1
+    return tuple(table.vector(key, (TIME,) * count, []).tolist())
+
+
+def _read_arm(table: Table, path: Path, workcell: Workcell, arm: int) -> _Recorded:
+    """What one arm recorded, by the columns that the side file names."""
+    file = path.parent / table.text("file") if table.has("file") else path
+    columns = _csv_columns(file)
+    names = list(arm_model(workcell.robots[arm]).names)[1:]
+
+    def column(name: str) -> Array:
+        if name not in columns:
+            raise ResultsError(f"{file}: no column {name!r}; it has {', '.join(columns)[:300]}")
+        return columns[name]
+
+    def several(key: str, counts: Sequence[int]) -> Array:
+        value = table.raw(key)
+        words = [f"{value}{k}" for k in range(max(counts))] if isinstance(value, str) else value
+        if not isinstance(words, list) or len(words) not in counts:
+            allowed = " or ".join(map(str, counts))
+            table.problems.add(
+                table.at(key),
+                f"found {shown(value)}; allowed are names of {allowed} columns, or what stands "
+                "before 0, 1, 2 ... in them",
+            )
+            return np.zeros((len(column(time_name)), max(counts)))
+        return np.column_stack([column(str(word)) for word in words])
+
+    time_name = table.text("time", "time")
+    time = column(time_name)
+    joints = several("joints", (len(names),))
+    wrench = several("wrench", (6, 3))
+    if wrench.shape[1] == 3:
+        wrench = np.hstack([wrench, np.full_like(wrench, np.nan)])
+    commanded = np.full(len(time), np.nan)
+    if table.has("commanded"):
+        commanded = column(table.text("commanded"))
+    sound = np.isfinite(time) & np.isfinite(joints).all(1) & np.isfinite(wrench[:, :3]).all(1)
+    if np.count_nonzero(sound) < 2 or (np.diff(time[sound]) <= 0.0).any():
+        raise ResultsError(f"{file}: {time_name!r} does not ascend, or has fewer than two samples")
+    return _Recorded(time[sound], joints[sound], wrench[sound], commanded[sound])
+
+
+def _csv_columns(path: Path) -> dict[str, Array]:
+    """Columns by name; commas, semicolons or blanks between them, what is empty is not finite."""
+    try:
+        text = outside.text(read_bytes(path))
+        dialect = csv.Sniffer().sniff(text.partition("\n")[0], ",; \t")
+        header, *rows = [row for row in csv.reader(io.StringIO(text), dialect) if row]
+        values = np.array([[float(word or "nan") for word in row] for row in rows])
+        if values.shape != (len(rows), len(header)) or not len(rows):
+            raise ValueError("rows differ in length")
+    except (OutsideError, ValueError, csv.Error) as error:
+        raise ResultsError(f"{path}: no table of numbers below a line of names: {error}") from error
+    return dict(zip((name.strip() for name in header), values.T, strict=True))
+
+
+# --- frames ---
+
+
+@dataclass(frozen=True)
+class Places:
+    """Where both pads are in a run, and what acts on them.
+
+    Attributes:
+        pads: (n, 2, 4, 4), the pads in the world.
+        box: (n, 4, 4), the box between them: in the middle of where either pad puts it.
+        wrench: (n, 2, 6) that acts on each arm, about its pad and along the pad's axes [N, N m].
+    """
+
+    pads: Array
+    box: Array
+    wrench: Array
+
+    @property
+    def normal(self) -> Array:
+        """(n, 2) normal forces [N]."""
+        return -self.wrench[:, :, 2]
+
+
+def places_of(workcell: Workcell, run: Run) -> Places:
+    """A run in the frames of the pads."""
+    pads, boxes, wrenches = [], [], []
+    for i, (robot, contact) in enumerate(zip(workcell.robots, workcell.contacts, strict=True)):
+        T_world_pad = pad_places(workcell, i, run.joints[i])
+        if run.frame == "base":
+            turned = robot.T_world_base[:3, :3].T @ T_world_pad[:, :3, :3]
+            force, moment = (
+                np.einsum("nji,nj->ni", turned, run.wrench[:, i, part])
+                for part in (slice(0, 3), slice(3, 6))
+            )
+        else:
+            T = robot.T_flange_pad if run.frame == "flange" else np.eye(4)
+            R, at = T[:3, :3], T[:3, 3]
+            force = run.wrench[:, i, :3] @ R
+            moment = (run.wrench[:, i, 3:] - run.wrench[:, i, :3] @ skew(at).T) @ R
+        pads.append(T_world_pad)
+        boxes.append(T_world_pad @ inverse(contact.T_box_pad))
+        wrenches.append(np.hstack([force, moment]))
+    middle = (boxes[0] + boxes[1]) / 2.0
+    # The nearest rotation to the mean of both.
+    u, _, v = np.linalg.svd(middle[:, :3, :3])
+    middle[:, :3, :3] = u @ v
+    return Places(np.stack(pads, axis=1), middle, np.stack(wrenches, axis=1))

@@ -1,0 +1,209 @@
+"""What is found in runs is what the generator knows; every planted fault is told by its name."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hybrid_opt.calibrating.estimate import delay
+from hybrid_opt.calibrating.evidence import Evidence, calibrate
+from hybrid_opt.calibrating.recording import Run, places_of
+from tests.hybrid_opt.calibrating.generator import (
+    CELL,
+    LEVEL,
+    RATE,
+    SQUEEZES,
+    TILTED,
+    Truth,
+    run,
+)
+
+QUIET = Truth(force_noise=1e-6, moment_noise=1e-7)
+
+
+def errors(seed: int) -> list[float]:
+    """Of the mass, as a share, and of the centre of mass [m]."""
+    truth, found = Truth(), calibrate(CELL, [run(seed)]).changes["payload"]
+    centre = np.array(found["centre_of_mass"]) - truth.centre
+    return [found["mass"] / truth.mass - 1.0, *centre.tolist()]
+
+
+def names(evidence: Evidence) -> set[str]:
+    return {fault.name for fault in evidence.faults}
+
+
+def told(evidence: Evidence, name: str) -> str:
+    (found,) = [entry.found for entry in evidence.entries if entry.name == name]
+    return found
+
+
+def test_without_noise_the_truth_is_found() -> None:
+    found = calibrate(CELL, [run(0, truth=QUIET)])
+    assert found.changes["payload"]["mass"] == pytest.approx(4.4, abs=2e-4)
+    np.testing.assert_allclose(found.changes["payload"]["centre_of_mass"], QUIET.centre, atol=2e-5)
+    assert {"0.065", "0.070"} == {
+        told(found, f"crosstalk of arm {arm}").partition(" ")[0] for arm in (1, 2)
+    }
+    assert found.faults == ()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_tilts_and_three_squeezes_show_the_load(seed: int) -> None:
+    mass, *centre = errors(seed)
+    assert abs(mass) < 3 * 0.007
+    assert np.abs(centre).max() < 3 * 1.6e-3
+
+
+@pytest.mark.slow
+def test_over_thirty_seeds_the_load_is_as_near_as_promised() -> None:
+    mass, *centre = np.sqrt(np.mean(np.square([errors(seed) for seed in range(30)]), axis=0))
+    assert mass < 0.007
+    assert max(centre) < 1.6e-3
+
+
+def test_ranges_cover_the_truth() -> None:
+    found = [calibrate(CELL, [run(seed)]).changes for seed in range(3)]
+    for changes in found:
+        doubt, payload = changes["uncertainty"], changes["payload"]
+        assert abs(payload["mass"] - 4.4) < doubt["mass"] * 4.4
+        off = np.abs(np.array(payload["centre_of_mass"]) - Truth().centre)
+        assert (off < doubt["centre_of_mass"]).all()
+        # What nobody measured keeps what the cell says.
+        assert "tilt" not in doubt or doubt["tilt"] == CELL.uncertainty.tilt
+
+
+def test_level_holds_at_one_squeeze_show_neither_mass_nor_centre() -> None:
+    found = calibrate(CELL, [run(0, LEVEL, SQUEEZES[:1])])
+    assert "payload" not in found.changes
+    asks = " ".join(found.asks)
+    assert "tilted" in asks
+    assert "three squeezes" in asks
+
+
+def test_level_holds_of_a_weighed_box_still_ask_for_tilts() -> None:
+    found = calibrate(CELL, [run(0, LEVEL, SQUEEZES, weighed=4.4)])
+    assert found.changes["payload"] == {"mass": pytest.approx(4.4, abs=0.03)}
+    assert any("tilted" in ask for ask in found.asks)
+
+
+def test_lag_and_tracking() -> None:
+    found = calibrate(CELL, [run(0, truth=QUIET)])
+    for arm in (1, 2):
+        lag = float(told(found, f"lag of the force, arm {arm}").split()[0])
+        assert lag == pytest.approx(QUIET.lag, abs=0.011)
+    assert found.changes["uncertainty"]["tracking"] < 0.05
+    weak = run(0, truth=QUIET)
+    weak = replace(weak, commanded=weak.commanded / 0.8)
+    assert calibrate(CELL, [weak]).changes["uncertainty"]["tracking"] == pytest.approx(
+        0.2, abs=0.05
+    )
+
+
+def test_a_delay_is_found_where_there_is_one() -> None:
+    time = np.arange(0.0, 10.0, 0.01)
+    first, second = np.tanh(3.0 * (time - 4.0)), np.tanh(3.0 * (time - 4.25))
+    assert delay(time, first, second) == pytest.approx(0.25, abs=0.006)
+    assert delay(time, second, first) == pytest.approx(-0.25, abs=0.006)
+    noise = np.random.default_rng(0).normal(size=(2, len(time)))
+    assert delay(time, *noise) is None
+
+
+def test_wrenches_in_every_frame_are_the_same() -> None:
+    """Told about the flange, and along the axes of the base, by transports written here."""
+    made = run(0, truth=QUIET)
+    places = places_of(CELL, made)
+    flange, base = np.empty_like(made.wrench), np.empty_like(made.wrench)
+    for i, robot in enumerate(CELL.robots):
+        R, at = robot.T_flange_pad[:3, :3], robot.T_flange_pad[:3, 3]
+        R_base = robot.T_world_base[:3, :3]
+        for k, (force, moment) in enumerate(made.wrench[:, i].reshape(-1, 2, 3)):
+            flange[k, i] = [*(R @ force), *(R @ moment + np.cross(at, R @ force))]
+            turned = R_base.T @ places.pads[k, i, :3, :3]
+            base[k, i] = [*(turned @ force), *(turned @ moment)]
+    for frame, wrench in (("flange", flange), ("base", base)):
+        found = places_of(CELL, replace(made, frame=frame, wrench=wrench)).wrench
+        np.testing.assert_allclose(found, made.wrench, atol=1e-9)
+
+
+# --- planted faults ---
+
+
+def late(made: Run, seconds: float) -> Run:
+    """The second arm's readings on a clock that is off."""
+    columns = [np.interp(made.time - seconds, made.time, column) for column in made.wrench[:, 1].T]
+    return replace(made, wrench=np.stack([made.wrench[:, 0], np.column_stack(columns)], axis=1))
+
+
+def changed(made: Run, **labels: object) -> Run:
+    return replace(made, labels=replace(made.labels, **labels))  # type: ignore[arg-type]
+
+
+def scaled(made: Run, forces: float, moments: float) -> Run:
+    return replace(made, wrench=made.wrench * ([forces] * 3 + [moments] * 3))
+
+
+def turned(made: Run, angle: float) -> Run:
+    """The second arm about its base."""
+    return replace(made, joints=(made.joints[0], made.joints[1] + [angle, 0, 0, 0, 0, 0]))
+
+
+def without_squeeze(made: Run) -> Run:
+    """The first hold loses its squeeze."""
+    wrench, (begin, end) = made.wrench.copy(), made.labels.held[0]
+    fallen = made.within((begin + end) / 2.0, end)
+    wrench[fallen] -= made.wrench[made.within(begin, end)].mean(axis=0) * 0.99
+    return replace(made, wrench=wrench)
+
+
+FAULTS: dict[str, tuple[str, Callable[[Run], Run]]] = {
+    "tare": ("missing tare", lambda made: changed(made, tare=())),
+    "tare at no sample": ("missing tare", lambda made: changed(made, tare=(-9.0,))),
+    "clock": ("clock offset", lambda made: late(made, 0.3)),
+    "sensors": ("swapped arms", lambda made: replace(made, wrench=made.wrench[:, ::-1])),
+    "joints": ("swapped arms", lambda made: replace(made, joints=made.joints[::-1])),
+    "pads": ("pads do not overlap", lambda made: turned(made, 0.3)),
+    "kgf": ("unit error", lambda made: scaled(changed(made, mass=4.4), 1 / 9.81, 1 / 9.81)),
+    "N mm": ("unit error", lambda made: scaled(made, 1.0, 1e3)),
+    "degrees": (
+        "unit error",
+        lambda made: replace(made, joints=(np.degrees(made.joints[0]), np.degrees(made.joints[1]))),
+    ),
+    "ms": ("unit error", lambda made: replace(made, time=1e3 * made.time)),
+    "range": ("beyond the sensor's range", lambda made: replace(made, largest=np.array([90, 9]))),
+    "sign": ("wrong sign or frame", lambda made: replace(made, wrench=-made.wrench)),
+    "squeeze": ("squeeze vanishes", without_squeeze),
+    "weight": ("residual", lambda made: scaled(changed(made, mass=4.4), 2.0, 2.0)),
+}
+
+
+@pytest.mark.parametrize("which", FAULTS)
+def test_a_planted_fault_is_told_by_its_name(which: str) -> None:
+    name, plant = FAULTS[which]
+    found = calibrate(CELL, [plant(run(0))])
+    assert name in names(found)
+    if which != "squeeze":
+        assert "payload" not in found.changes
+        assert any(fault.serious for fault in found.faults)
+
+
+def test_what_is_no_fault_is_not_told() -> None:
+    assert names(calibrate(CELL, [run(0), run(1, LEVEL)])) == set()
+
+
+def test_without_moments_the_centre_of_mass_is_not_written() -> None:
+    made = run(0)
+    found = calibrate(CELL, [scaled(made, 1.0, np.nan)])
+    assert names(found) == {"moments missing"}
+    assert found.changes["payload"] == {"mass": pytest.approx(4.4, rel=0.03)}
+
+
+def test_a_hold_with_a_dropout_is_left_out() -> None:
+    made = run(0)
+    begin, end = made.labels.held[0]
+    found = calibrate(CELL, [replace(made, lost=((begin + 0.2, begin + 0.7),))])
+    assert names(found) == {"dropout"}
+    assert f"from {len(TILTED) * len(SQUEEZES) - 1} holds" in told(found, "mass")
+    assert end - begin > 10.0 / RATE

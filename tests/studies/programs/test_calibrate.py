@@ -1,0 +1,108 @@
+"""The program reads recordings, says what they show, and writes a cell that has it."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from studies.calibrate import main
+from symbolic.read.cell import load
+from tests.hybrid_opt.calibrating.generator import CELL, LEVEL, SQUEEZES, run, side_file, write
+from tests.symbolic.cells import RACK
+
+
+def test_a_written_cell_loads_and_has_the_values(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    recording, out = write(run(0), tmp_path), tmp_path / "cell.toml"
+    assert main([str(RACK), str(recording), "--out", str(out)]) == 0
+    assert "payload.mass" in capsys.readouterr().out
+    assert main([str(RACK), str(recording), "--json"]) == 0
+    said = json.loads(capsys.readouterr().out)["changes"]
+    found = load(out)
+    assert found.payload.mass == said["payload"]["mass"] == pytest.approx(4.4, rel=0.02)
+    assert found.payload.centre_of_mass.tolist() == said["payload"]["centre_of_mass"]
+    doubt = found.uncertainty
+    assert doubt.stated
+    assert doubt.mass == said["uncertainty"]["mass"]
+    assert doubt.centre_of_mass.tolist() == said["uncertainty"]["centre_of_mass"]
+    assert doubt.tracking == said["uncertainty"]["tracking"]
+    assert (doubt.tilt, doubt.friction) == (CELL.uncertainty.tilt, CELL.uncertainty.friction)
+    text = out.read_text()
+    assert "# Calibrated from run.csv" in text
+    assert "crosstalk of arm 1" in text
+    for line in RACK.read_text().splitlines():
+        if line.startswith("#"):
+            assert line in text
+    with pytest.raises(AssertionError):
+        np.testing.assert_allclose(CELL.payload.centre_of_mass, found.payload.centre_of_mass)
+
+
+def test_a_file_per_arm_and_columns_by_name(tmp_path: Path) -> None:
+    """As RTDE records: blanks between columns, a clock's own start, each arm in its file."""
+    made = run(0, LEVEL, SQUEEZES, weighed=4.4)
+    for i in range(2):
+        words = [*(f"actual_q_{k}" for k in range(6)), *(f"force_{k}" for k in range(6))]
+        values = np.column_stack([made.time + 1e6, made.joints[i], made.wrench[:, i]])
+        header = " ".join(["timestamp", *words])
+        np.savetxt(tmp_path / f"arm{i + 1}.csv", values, header=header, comments="", fmt="%.10g")
+    labels = made.labels
+    later = tuple((begin + 1e6, end + 1e6) for begin, end in labels.held)
+    made = replace(made, labels=replace(labels, tare=(1e6 + 0.5,), held=later))
+    common = side_file(made).partition("[[arms]]")[0]
+    arms = [
+        f'[[arms]]\nfile = "arm{i}.csv"\ntime = "timestamp"\njoints = "actual_q_"\n'
+        f"wrench = {[f'force_{k}' for k in range(6)]}\n"
+        for i in (1, 2)
+    ]
+    (tmp_path / "both.toml").write_text(common + "".join(arms))
+    out = tmp_path / "cell.toml"
+    assert main([str(RACK), str(tmp_path / "both.csv"), "--out", str(out)]) == 0
+    assert load(out).payload.mass == pytest.approx(4.4, abs=0.03)
+
+
+def test_refusals_end_with_code_one(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    made = run(0)
+    made = replace(made, labels=replace(made.labels, tare=()))
+    out = tmp_path / "cell.toml"
+    assert main([str(RACK), str(write(made, tmp_path)), "--out", str(out)]) == 1
+    assert "refused: run.csv: missing tare" in capsys.readouterr().out
+    assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda text: text.replace("tare", "tara", 1), "tara: unknown key; did you mean 'tare'"),
+        (lambda text: text.replace('"w1_"', '"f1_"'), "no column 'f1_0'"),
+        (lambda text: "mass = -1\n" + text, "mass: found -1"),
+        (lambda text: text.replace('"pad"', '"tool"'), "frame: found 'tool'"),
+        (lambda text: text.rpartition("[[arms]]")[0], "arms: found 1 tables"),
+        (lambda text: text.replace("held = [[", "held = [[9e9, 1], ["), "pairs [begin, end]"),
+        (lambda text: text.replace('joints = "q1_"', "joints = [1, 2]"), "names of 6 columns"),
+    ],
+)
+def test_what_is_wrong_with_a_side_file_is_told(
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    change: object,
+    message: str,
+) -> None:
+    recording = write(run(0, LEVEL, SQUEEZES[:1]), tmp_path)
+    side = recording.with_suffix(".toml")
+    side.write_text(change(side.read_text()))  # type: ignore[operator]
+    assert main([str(RACK), str(recording)]) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_what_is_no_table_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    recording = write(run(0, LEVEL, SQUEEZES[:1]), tmp_path)
+    recording.write_text("time,a\n1,b\n")
+    assert main([str(RACK), str(recording)]) == 2
+    assert "no table of numbers" in capsys.readouterr().err
+    assert main([str(RACK), str(recording), "--out", str(RACK)]) == 2
+    assert "workcell itself" in capsys.readouterr().err
