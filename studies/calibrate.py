@@ -1,6 +1,6 @@
 """Calibrate a cell from its own runs: `python -m studies.calibrate CELL RUN... --out CELL2`.
 
-From recordings (CSV, RTDE's as well, one file or one per arm) with a side file in TOML each it
+From recordings (MCAP, rosbag2, CSV, RTDE's as well) with a side file in TOML each it
 tells the sensors' offsets and crosstalk, mass, centre of mass, a bracket of the friction, how
 forces follow their commands, how the pads drift; and writes the workcell file with that in it. What
 is wrong with a run, or missing, is told by name (docs/calibration.md). Exit code 1 where something

@@ -1,8 +1,8 @@
 """A recorded run of a cell: joints, what the sensors at both wrists felt, what was commanded, and
 what a person says of it in a side file.
 
-RUN.toml lies beside RUN.csv; docs/calibration.md explains its keys. Each arm may have a file and a
-clock of its own; what the second recorded is taken at the times of the first.
+RUN.toml lies beside RUN.csv, RUN.mcap or the folder RUN; docs/calibration.md explains its keys.
+Each arm may have a file of its own; what the second recorded is taken at the times of the first.
 """
 
 from __future__ import annotations
@@ -15,7 +15,15 @@ from pathlib import Path
 
 import numpy as np
 
+from hybrid_opt.bundles.arms import prefixes
 from hybrid_opt.bundles.job_file import pad_places
+from hybrid_opt.calibrating.bags import (
+    force_series,
+    is_bag,
+    joint_series,
+    read_topics,
+    wrench_series,
+)
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.store.files import read_bytes
 from symbolic import outside
@@ -112,12 +120,13 @@ GAP, LONG_GAP = 10.0, 0.2
 
 @dataclass(frozen=True)
 class _Recorded:
-    """One arm's columns: (m,), (m, joints), (m, 6), (m,)."""
+    """One arm's columns: (m,), (m, joints), (m, 6), (m,); and when it recorded nothing new."""
 
     time: Array
     joints: Array
     wrench: Array
     commanded: Array
+    lost: Spans
 
     def at(self, time: Array) -> _Recorded:
         """Between its samples."""
@@ -127,19 +136,19 @@ class _Recorded:
             columns = [np.interp(time, self.time, column) for column in flat.T]
             return np.column_stack(columns).reshape(len(time), *values.shape[1:])
 
-        return _Recorded(time, taken(self.joints), taken(self.wrench), taken(self.commanded))
+        joints, wrench = taken(self.joints), taken(self.wrench)
+        return _Recorded(time, joints, wrench, taken(self.commanded), self.lost)
 
-    @property
-    def lost(self) -> Spans:
-        """Without samples, or with the very same force in all of them."""
-        steps = np.diff(self.time)
-        long = np.flatnonzero(steps > max(GAP * float(np.median(steps)), LONG_GAP))
-        same = (np.diff(self.wrench[:, :3], axis=0) == 0.0).all(axis=1)
-        edges = np.flatnonzero(np.diff(np.concatenate([[0], same.astype(int), [0]])))
-        spans = [(k, k + 1) for k in long]
-        spans += zip(edges[::2], edges[1::2], strict=True)
-        times = [(float(self.time[begin]), float(self.time[end])) for begin, end in spans]
-        return tuple(span for span in times if span[1] - span[0] > LONG_GAP)
+
+def _lost(time: Array, values: Array) -> Spans:
+    """Spans without samples, or with the very same values (m, k) in all of them."""
+    steps = np.diff(time)
+    long = np.flatnonzero(steps > max(GAP * float(np.median(steps)), LONG_GAP))
+    same = (np.diff(values, axis=0) == 0.0).all(axis=1)
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], same.astype(int), [0]])))
+    spans = [*((k, k + 1) for k in long), *zip(edges[::2], edges[1::2], strict=True)]
+    times = [(float(time[begin]), float(time[end])) for begin, end in spans]
+    return tuple(span for span in times if span[1] - span[0] > LONG_GAP)
 
 
 def read_run(path: Path, workcell: Workcell) -> Run:
@@ -218,8 +227,10 @@ def _instants(table: Table, key: str) -> tuple[float, ...]:
 def _read_arm(table: Table, path: Path, workcell: Workcell, arm: int) -> _Recorded:
     """What one arm recorded, by the columns that the side file names."""
     file = path.parent / table.text("file") if table.has("file") else path
-    columns = _csv_columns(file)
     names = list(arm_model(workcell.robots[arm]).names)[1:]
+    if is_bag(file):
+        return _read_bag(table, file, [f"{prefixes(workcell)[arm]}{name}" for name in names])
+    columns = _csv_columns(file)
 
     def column(name: str) -> Array:
         if name not in columns:
@@ -251,7 +262,40 @@ def _read_arm(table: Table, path: Path, workcell: Workcell, arm: int) -> _Record
     sound = np.isfinite(time) & np.isfinite(joints).all(1) & np.isfinite(wrench[:, :3]).all(1)
     if np.count_nonzero(sound) < 2 or (np.diff(time[sound]) <= 0.0).any():
         raise ResultsError(f"{file}: {time_name!r} does not ascend, or has fewer than two samples")
-    return _Recorded(time[sound], joints[sound], wrench[sound], commanded[sound])
+    lost = _lost(time[sound], wrench[sound, :3])
+    return _Recorded(time[sound], joints[sound], wrench[sound], commanded[sound], lost)
+
+
+def _read_bag(table: Table, file: Path, names: list[str]) -> _Recorded:
+    """What one arm recorded in ROS 2, at the times of its joint states."""
+    if table.has("joints"):
+        value = table.raw("joints")
+        if not isinstance(value, list) or len(value) != len(names):
+            allowed = f"allowed are the names of {len(names)} joints"
+            table.problems.add(table.at("joints"), f"found {shown(value)}; {allowed}")
+        else:
+            names = [str(name) for name in value]
+    states = table.text("joint_states", "/joint_states")
+    felt = table.text("wrench")
+    asked = table.text("commanded") if table.has("commanded") else ""
+    if table.problems.found:
+        nothing = np.zeros(2)
+        return _Recorded(nothing, nothing, nothing, nothing, ())
+    messages = read_topics(file, [topic for topic in (states, felt, asked) if topic])
+    time, joints = joint_series(messages[states], names, file)
+    wrench_time, wrench = wrench_series(messages[felt])
+    if min(len(time), len(wrench_time)) < 2 or not np.isfinite(wrench[:, :3]).all():
+        raise ResultsError(f"{file}: fewer than two samples, or forces that are not finite")
+    commanded = np.full(len(time), np.nan)
+    if asked and messages[asked]:
+        commanded = np.interp(time, *force_series(messages[asked]), left=np.nan)
+    lost = {*_lost(time, time[:, None]), *_lost(wrench_time, wrench[:, :3])}
+    felt_then = np.column_stack([np.interp(time, wrench_time, column) for column in wrench.T])
+    inside = (time >= wrench_time[0]) & (time <= wrench_time[-1])
+    inside &= np.append(True, np.diff(time) > 0.0)
+    return _Recorded(
+        time[inside], joints[inside], felt_then[inside], commanded[inside], tuple(sorted(lost))
+    )
 
 
 def _csv_columns(path: Path) -> dict[str, Array]:

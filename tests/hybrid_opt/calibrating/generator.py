@@ -7,12 +7,14 @@ by the plain reference's kinematics.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
 import numpy as np
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
@@ -142,20 +144,18 @@ def run(
     )
 
 
-def side_file(made: Run, extra: str = "") -> str:
+def side_file(made: Run, arms: Sequence[str] = ()) -> str:
     """What lies beside a run that `write` wrote."""
     labels = made.labels
+    arms = arms or [f'joints = "q{i}_"\nwrench = "w{i}_"\ncommanded = "n{i}"' for i in (1, 2)]
     lines = [
         f'frame = "{made.frame}"',
         f"tare = {list(labels.tare)}",
         f"held = {[list(span) for span in labels.held]}",
         f"slip_at = {list(labels.slip_at)}",
         *([f"mass = {labels.mass}"] if labels.mass is not None else []),
-        extra,
+        *(f"[[arms]]\n{arm}" for arm in arms),
     ]
-    for i in range(2):
-        lines += ["[[arms]]", f'joints = "q{i + 1}_"', f'wrench = "w{i + 1}_"']
-        lines += [f'commanded = "n{i + 1}"']
     return "\n".join(lines)
 
 
@@ -170,4 +170,47 @@ def write(made: Run, folder: Path) -> Path:
     values = np.column_stack(list(columns.values()))
     np.savetxt(path, values, delimiter=",", header=",".join(columns), comments="", fmt="%.9g")
     path.with_suffix(".toml").write_text(side_file(made))
+    return path
+
+
+def write_bag(made: Run, folder: Path) -> Path:
+    """A run as rosbag2's folder with an MCAP file and a side file; wrenches half a step late."""
+    store = get_typestore(Stores.ROS2_JAZZY)
+    kinds = store.types
+    stamp = kinds["builtin_interfaces/msg/Time"](0, 0)
+    header = kinds["std_msgs/msg/Header"](stamp, "")
+    vector = kinds["geometry_msgs/msg/Vector3"]
+    names = [
+        f"{robot.name}_{joint}"
+        for robot in CELL.robots
+        for joint in PlainArm(robot, CELL.contacts[0]).model.names[1:]
+    ]
+    none = np.empty(0)
+    path = folder / made.name.partition(".")[0]
+    with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+
+        def channel(topic: str, kind: str) -> Callable[[float, object], None]:
+            connection = writer.add_connection(topic, kind, typestore=store)
+
+            def put(time: float, message: object) -> None:
+                data = store.serialize_cdr(message, kind)
+                writer.write(connection, round(1e9 * (1.7e9 + time)), data)
+
+            return put
+
+        states = channel("/joint_states", "sensor_msgs/msg/JointState")
+        felt = [channel(f"/{i}/wrench", "geometry_msgs/msg/WrenchStamped") for i in (1, 2)]
+        asked = channel("/2/force", "std_msgs/msg/Float64")
+        state = kinds["sensor_msgs/msg/JointState"]
+        for k, time in enumerate(made.time.tolist()):
+            both = np.concatenate([q[k] for q in made.joints])
+            states(time, state(header, names, both, none, none))
+            for put, each in zip(felt, made.wrench[k], strict=True):
+                parts = [vector(*part) for part in each.reshape(2, 3).tolist()]
+                wrench = kinds["geometry_msgs/msg/Wrench"](*parts)
+                message = kinds["geometry_msgs/msg/WrenchStamped"](header, wrench)
+                put(time + 0.5 / RATE, message)
+            asked(time, kinds["std_msgs/msg/Float64"](float(made.commanded[k, 1])))
+    arms = ['wrench = "/1/wrench"', 'wrench = "/2/wrench"\ncommanded = "/2/force"']
+    path.with_suffix(".toml").write_text(side_file(made, arms))
     return path

@@ -11,7 +11,15 @@ import pytest
 
 from studies.calibrate import main
 from symbolic.read.cell import load
-from tests.hybrid_opt.calibrating.generator import CELL, LEVEL, SQUEEZES, run, side_file, write
+from tests.hybrid_opt.calibrating.generator import (
+    CELL,
+    LEVEL,
+    SQUEEZES,
+    run,
+    side_file,
+    write,
+    write_bag,
+)
 from tests.symbolic.cells import RACK
 
 
@@ -63,6 +71,53 @@ def test_a_file_per_arm_and_columns_by_name(tmp_path: Path) -> None:
     out = tmp_path / "cell.toml"
     assert main([str(RACK), str(tmp_path / "both.csv"), "--out", str(out)]) == 0
     assert load(out).payload.mass == pytest.approx(4.4, abs=0.03)
+
+
+@pytest.mark.parametrize("alone", [False, True])
+def test_a_recording_of_ros_2(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], alone: bool
+) -> None:
+    """rosbag2's folder, and its MCAP file alone."""
+    made = run(0, LEVEL, SQUEEZES, weighed=4.4)
+    recording = write_bag(made, tmp_path)
+    if alone:
+        (file,) = recording.glob("*.mcap")
+        file.with_suffix(".toml").write_text(recording.with_suffix(".toml").read_text())
+        recording = file
+    assert main([str(RACK), str(recording), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["changes"]["payload"]["mass"] == pytest.approx(4.4, abs=0.03)
+    names = {entry["name"]: entry["found"] for entry in found["entries"]}
+    assert float(names["lag of the force, arm 2"].split()[0]) == pytest.approx(0.11, abs=0.02)
+    assert "lag of the force, arm 1" not in names
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("/1/wrench", "/3/wrench", "no topic '/3/wrench'; it has /1/wrench"),
+        ('"/1/wrench"', '"/1/wrench"\njoints = ["a", "b", "c", "d", "e", "f"]', "no joint 'a'"),
+        ('"/1/wrench"', '"/1/wrench"\njoints = ["a"]', "names of 6 joints"),
+    ],
+)
+def test_what_is_wrong_with_a_recording_of_ros_2_is_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], old: str, new: str, message: str
+) -> None:
+    recording = write_bag(run(0, LEVEL, SQUEEZES[:1]), tmp_path)
+    side = recording.with_suffix(".toml")
+    side.write_text(side.read_text().replace(old, new))
+    assert main([str(RACK), str(recording)]) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_a_damaged_recording_of_ros_2_is_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    recording = write_bag(run(0, LEVEL, SQUEEZES[:1]), tmp_path)
+    (file,) = recording.glob("*.mcap")
+    file.write_bytes(file.read_bytes()[:5000])
+    assert main([str(RACK), str(recording)]) == 2
+    assert "no recording that can be read" in capsys.readouterr().err
 
 
 def test_refusals_end_with_code_one(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
