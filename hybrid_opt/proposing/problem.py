@@ -493,7 +493,7 @@ def extended(text: str, data: Mapping[str, Any], key: str, tables: list[dict[str
     Raises:
         SettingsError: see `completed`.
     """
-    tomlkit = _library()
+    tomlkit = library()
     document = tomlkit.parse(f"{text.rstrip()}\n\n")
     if key not in document:
         document[key] = _item(tables)
