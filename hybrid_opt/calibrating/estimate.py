@@ -189,6 +189,9 @@ def without_crosstalk(wrench: Array, crosstalk: Array) -> Array:
 STEP = 0.005
 """Of the grid that signals are compared on [s]."""
 
+LARGEST_GRID = 2_000_000
+"""Points of it; a longer recording has no delay."""
+
 SMOOTHED = 0.05
 """Over which rates are taken [s]."""
 
@@ -206,10 +209,10 @@ def delay(time: Array, first: Array, second: Array, most: float = 1.0) -> float 
     Returns:
         where the rates of both correlate best; None where they hardly do.
     """
-    grid = np.arange(time[0], time[-1], STEP)
     wide = round(SMOOTHED / STEP)
-    if len(grid) < 4 * wide:
+    if not 4 * wide < (time[-1] - time[0]) / STEP < LARGEST_GRID:
         return None
+    grid = np.arange(time[0], time[-1], STEP)
     kernel = np.ones(wide) / wide
 
     def rate(signal: Array) -> Array:
@@ -218,12 +221,16 @@ def delay(time: Array, first: Array, second: Array, most: float = 1.0) -> float 
         return np.asarray(found - found.mean())
 
     a, b = rate(first), rate(second)
-    size = float(np.linalg.norm(a) * np.linalg.norm(b))
-    if size == 0.0:
-        return None
-    likeness = correlate(b, a, method="fft") / size
-    centre, reach = len(a) - 1, min(round(most / STEP), len(a) - 1)
-    near = likeness[centre - reach : centre + reach + 1]
+    n = len(a)
+    reach = min(round(most / STEP), n // 2)
+    lags = np.arange(-reach, reach + 1)
+    product = correlate(b, a, method="fft")[n - 1 + lags]
+    # Of what overlaps: else the fewer samples of a long delay would count against it.
+    energy_a, energy_b = (np.append(0.0, np.cumsum(each**2)) for each in (a, b))
+    own = energy_a[np.minimum(n - lags, n)] - energy_a[np.maximum(-lags, 0)]
+    other = energy_b[np.minimum(n + lags, n)] - energy_b[np.maximum(lags, 0)]
+    size = np.sqrt(own * other)
+    near = np.divide(product, size, out=np.zeros(len(lags)), where=size > 0.0)
     best = int(np.argmax(near))
     return (best - reach) * STEP if near[best] >= LEAST_LIKENESS else None
 

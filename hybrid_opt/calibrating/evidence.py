@@ -40,6 +40,9 @@ STILL = 0.01
 RATIO_TIME = 0.2
 """Over which forces are averaged for a ratio of friction [s]."""
 
+LEAST_PATH = 0.02
+"""Way of the box from which on one arm's delay after the other can be seen [m]."""
+
 SURE = 3.0
 """Standard deviations that a range covers."""
 
@@ -363,7 +366,8 @@ def _drift(workcell: Workcell, sound: Sound, collected: _Collected) -> None:
             for i in range(2)
         ]
         axis = int(np.argmax(np.ptp(path[0], axis=0)))
-        late = delay(run.time, path[0][:, axis], path[1][:, axis])
+        far = float(np.ptp(path[0][:, axis])) >= LEAST_PATH
+        late = delay(run.time, path[0][:, axis], path[1][:, axis]) if far else None
         delays += [] if late is None else [late]
     if not beside:
         return

@@ -8,9 +8,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hybrid_opt.calibrating.estimate import delay
+from hybrid_opt.calibrating.estimate import FrictionRatio, delay
 from hybrid_opt.calibrating.evidence import Evidence, calibrate
 from hybrid_opt.calibrating.recording import Run, places_of
+from studies.research.plain.arm import PlainArm
+from symbolic.records.cell import USUAL
 from tests.hybrid_opt.calibrating.generator import (
     CELL,
     LEVEL,
@@ -107,6 +109,7 @@ def test_a_delay_is_found_where_there_is_one() -> None:
     first, second = np.tanh(3.0 * (time - 4.0)), np.tanh(3.0 * (time - 4.25))
     assert delay(time, first, second) == pytest.approx(0.25, abs=0.006)
     assert delay(time, second, first) == pytest.approx(-0.25, abs=0.006)
+    assert delay(1e6 * time, first, second) is None
     noise = np.random.default_rng(0).normal(size=(2, len(time)))
     assert delay(time, *noise) is None
 
@@ -126,6 +129,98 @@ def test_wrenches_in_every_frame_are_the_same() -> None:
     for frame, wrench in (("flange", flange), ("base", base)):
         found = places_of(CELL, replace(made, frame=frame, wrench=wrench)).wrench
         np.testing.assert_allclose(found, made.wrench, atol=1e-9)
+
+
+# --- friction and pads ---
+
+
+def disc(distance: float, radius: float) -> tuple[float, float]:
+    """Share of mu N that an even disc's tangential force takes, and its torsion over mu N [m], when
+    it slides about a point so far from its centre: sums over 40,000 points."""
+    k = np.arange(40_000) + 0.5
+    r, angle = radius * np.sqrt(k / len(k)), np.pi * (1.0 + 5.0**0.5) * k
+    x, y = r * np.cos(angle), r * np.sin(angle)
+    length = np.hypot(x + distance, y)
+    pull = np.array([-y, x + distance]) / length
+    return float(np.linalg.norm(pull.mean(axis=1))), float((x * pull[1] - y * pull[0]).mean())
+
+
+@pytest.mark.parametrize("distance", [0.0, 0.01, 0.03, 0.1, 1.0])
+def test_the_ratio_is_the_coefficient_of_discs_that_slide(distance: float) -> None:
+    mu, normal = 0.57, 60.0
+    pull, twist = disc(distance, CELL.contacts[0].patch_radius)
+    wrench = np.zeros((2, 6))
+    wrench[:, 1], wrench[:, 2] = mu * normal * pull, -normal
+    wrench[:, 5] = mu * normal * twist * np.array([1.0, -1.0])
+    assert FrictionRatio(CELL)(wrench) == pytest.approx(mu, rel=0.006)
+
+
+def slipping(seed: int, name: str, squeeze: float) -> Run:
+    """A level hold that slips when it ends."""
+    made = run(seed, LEVEL, (squeeze,), name=name, truth=QUIET)
+    ((begin, end),) = made.labels.held
+    return changed(made, held=((begin, end - 0.5),), slip_at=(end,))
+
+
+def test_friction_is_bracketed_by_two_runs() -> None:
+    runs = [run(0, truth=QUIET), slipping(1, "low.csv", 30.0), slipping(2, "lower.csv", 25.0)]
+    runs[1:] = [changed(made, held=()) for made in runs[1:]]
+    found = calibrate(CELL, runs)
+    held, slipped = (
+        float(told(found, f"friction, {which}").split()[0])
+        for which in ("greatest held", "least slipped")
+    )
+    assert "low.csv" in told(found, "friction, least slipped")
+    assert held < slipped
+    (first, second), share = found.changes["contacts"], found.changes["uncertainty"]["friction"]
+    assert first == second
+    assert held < first["friction"] < slipped
+    assert share >= max(0.1, (slipped - held) / (slipped + held) - 1e-3)
+
+
+def test_one_run_never_tells_the_friction() -> None:
+    made = run(0, truth=QUIET)
+    found = calibrate(CELL, [changed(made, slip_at=(made.labels.held[-1][1],))])
+    assert "contacts" not in found.changes
+    assert "friction" not in found.changes["uncertainty"]
+    assert any("two runs" in ask for ask in found.asks)
+
+
+def test_the_drift_of_the_pads_is_what_plain_kinematics_say() -> None:
+    made = run(0, LEVEL, (75.0,), truth=QUIET)
+    ((begin, end),) = made.labels.held
+    share = np.clip((made.time - begin) / (end - begin), 0.0, 1.0)
+    ramp = np.outer(share, [0.005, 0, 0, 0, 0, 0])
+    found = calibrate(CELL, [replace(made, joints=(made.joints[0], made.joints[1] + ramp))])
+    arm = PlainArm(CELL.robots[1], CELL.contacts[1])
+    places = [
+        arm.place(q).homogeneous @ CELL.robots[1].T_flange_pad
+        for q in (made.joints[1][-1], made.joints[1][-1] + ramp[-1])
+    ]
+    move = places[0][:3, :3].T @ (places[1][:3, 3] - places[0][:3, 3])
+    drift = found.changes["uncertainty"]["relative_position"]
+    assert drift == pytest.approx(float(np.hypot(*move[:2])), rel=0.05)
+    assert found.changes["uncertainty"]["relative_angle"] == pytest.approx(0.005, rel=0.05)
+
+
+def test_an_arm_that_moves_late_is_told() -> None:
+    """Both turn about their bases: the box goes to and fro between them."""
+    made = run(0, LEVEL, truth=QUIET)
+    swing = 0.03 * np.sin(np.linspace(0.0, 20.0, len(made.time)))
+    late = np.interp(made.time - 0.2, made.time, swing)
+    joints = []
+    for q, turn in zip(made.joints, (swing, -late), strict=True):
+        joints.append(q + np.outer(turn, [1, 0, 0, 0, 0, 0]))
+    found = calibrate(CELL, [replace(made, joints=(joints[0], joints[1]))])
+    entry = told(found, "delay of arm 2 after arm 1")
+    assert float(entry.split()[0]) == pytest.approx(0.2, abs=0.02)
+
+
+def test_a_cell_that_states_no_range_keeps_the_usual_ones() -> None:
+    doubt = calibrate(replace(CELL, uncertainty=USUAL), [run(0)]).changes["uncertainty"]
+    assert doubt["friction"] == USUAL.friction
+    assert doubt["tilt"] == USUAL.tilt
+    assert doubt["mass"] != USUAL.mass
 
 
 # --- planted faults ---

@@ -11,6 +11,7 @@ import pytest
 
 from studies.calibrate import main
 from symbolic.read.cell import load
+from symbolic.records.cell import USUAL
 from tests.hybrid_opt.calibrating.generator import (
     CELL,
     LEVEL,
@@ -71,6 +72,42 @@ def test_a_file_per_arm_and_columns_by_name(tmp_path: Path) -> None:
     out = tmp_path / "cell.toml"
     assert main([str(RACK), str(tmp_path / "both.csv"), "--out", str(out)]) == 0
     assert load(out).payload.mass == pytest.approx(4.4, abs=0.03)
+
+
+def test_a_cell_without_ranges_gets_them_all(tmp_path: Path) -> None:
+    text = RACK.read_text().replace("../robots", str(RACK.parents[1] / "robots"))
+    before, _, after = text.partition("[uncertainty]")
+    cell, out = tmp_path / "plain.toml", tmp_path / "cell.toml"
+    cell.write_text(before + after[after.find("\n[") :] if "\n[" in after else before)
+    assert not load(cell).uncertainty.stated
+    assert main([str(cell), str(write(run(0), tmp_path)), "--out", str(out)]) == 0
+    found = load(out).uncertainty
+    assert found.stated
+    assert (found.friction, found.tilt) == (USUAL.friction, USUAL.tilt)
+    assert found.mass < USUAL.mass
+
+
+@pytest.mark.parametrize("frozen", [False, True])
+def test_a_dropout_in_a_file_is_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], frozen: bool
+) -> None:
+    """Rows that are missing, and a sensor that shows the same for half a second."""
+    made = run(0)
+    begin, _ = made.labels.held[3]
+    inside = made.within(begin + 0.3, begin + 0.8)
+    if frozen:
+        wrench = made.wrench.copy()
+        wrench[inside, 1] = wrench[inside, 1][0]
+        made = replace(made, wrench=wrench)
+    recording = write(made, tmp_path)
+    if not frozen:
+        rows = recording.read_text().splitlines()
+        kept = [row for row, gone in zip(rows[1:], inside, strict=True) if not gone]
+        recording.write_text("\n".join([rows[0], *kept]))
+    assert main([str(RACK), str(recording)]) == 0
+    said = capsys.readouterr().out
+    assert "warning: run.csv: dropout: nothing new for 0.5" in said
+    assert "from 14 holds" in said
 
 
 @pytest.mark.parametrize("alone", [False, True])
