@@ -19,7 +19,13 @@ from hybrid_opt.calibrating.estimate import (
     gravity_in,
     without_crosstalk,
 )
-from hybrid_opt.calibrating.faults import Fault, load_faults, recording_faults
+from hybrid_opt.calibrating.faults import (
+    LARGEST_RESIDUAL,
+    VANISHED,
+    Fault,
+    load_faults,
+    recording_faults,
+)
 from hybrid_opt.calibrating.recording import Places, Run, places_of
 from hybrid_opt.display.table import number, text_table
 from hybrid_opt.proposing.problem import Problem, completed, library
@@ -30,6 +36,7 @@ from symbolic.read.cell import load as load_cell
 from symbolic.records import Workcell
 from symbolic.records.cell import RANGES
 from symbolic.records.poses import inverse
+from symbolic.records.quantities import GRAVITY
 
 PIECE, SHORTEST = 2.0, 0.5
 """Holds are cut into pieces of so long, at least [s]."""
@@ -191,9 +198,11 @@ def _pieces(run: Run, places: Places) -> list[Hold]:
     """A run's holds that are still and whole, in pieces."""
     found = []
     for begin, end in run.labels.held:
-        squeeze = places.normal[run.within(begin, end)].min(axis=1, initial=np.inf)
+        squeeze = places.normal[run.within(begin, end)].min(axis=1)
         lost = any(a < end and b > begin for a, b in run.lost)
-        if lost or not len(squeeze) or squeeze.min() < 0.1 * np.median(squeeze):
+        if lost or not len(squeeze):
+            continue
+        if not run.labels.empty and squeeze.min() < VANISHED * np.median(squeeze):
             continue
         count = max(1, round((end - begin) / PIECE))
         edges = np.linspace(begin, end, count + 1)
@@ -210,6 +219,18 @@ def _pieces(run: Run, places: Places) -> list[Hold]:
     return found
 
 
+def _empty(workcell: Workcell, run: Run, pieces: list[Hold], collected: _Collected) -> None:
+    """What sensors tell of nothing, in the postures of an empty run."""
+    if not pieces:
+        return
+    most = max(float(np.linalg.norm(piece.wrench[:, :3], axis=1).max()) for piece in pieces)
+    collected.tell(f"{run.name}, force of nothing", f"{most:.2f} N at most")
+    weight = workcell.payload.mass * abs(GRAVITY[2])
+    if most > LARGEST_RESIDUAL * weight:
+        text = f"{most:.1f} N of nothing: have the driver compensate the tool's weight"
+        collected.faults.append(Fault(run.name, "residual", text, serious=False))
+
+
 Sound = list[tuple[Run, Places]]
 """Runs without serious faults, their readings without offsets."""
 
@@ -218,10 +239,12 @@ def _load(workcell: Workcell, sound: Sound, collected: _Collected) -> Load | Non
     """Mass, centre of mass and crosstalk, as far as they are seen."""
     holds, moments = [], True
     for run, places in sound:
-        if not run.labels.empty:
-            found = _pieces(run, places)
-            holds += found
-            moments &= run.has_moments or not found
+        found = _pieces(run, places)
+        if run.labels.empty:
+            _empty(workcell, run, found, collected)
+            continue
+        holds += found
+        moments &= run.has_moments or not found
     if not holds:
         collected.asks.append("holds of the box at rest, two seconds each, after a tare")
         return None
@@ -330,7 +353,7 @@ def _tracking(sound: Sound, collected: _Collected) -> None:
                 continue
             late = delay(run.time[known], commanded[known], normal[known])
             lags += [] if late is None else [late]
-            for begin, end in run.labels.held:
+            for begin, end in () if run.labels.empty else run.labels.held:
                 inside = run.within(begin, end) & known & (commanded > 1.0)
                 shares.append(normal[inside] / np.where(inside, commanded, 1.0)[inside])
         every = np.concatenate(shares) if shares else np.empty(0)
@@ -406,12 +429,15 @@ def calibrated_file(source: Path, evidence: Evidence, output: Path) -> str:
     load_cell(source, text=completed(text, data, evidence.changes).encode())
     changed = Problem(source, text, data).completed(evidence.changes, output.parent)
     document = library().parse(changed)
+    told: dict[str, list[str]] = {}
     for entry in evidence.entries:
-        table, _, key = entry.key.partition(".")
-        if key and table in document:
+        told.setdefault(entry.key, []).append(f"{entry.name}: {entry.found}")
+    for path, texts in told.items():
+        table, _, key = path.partition(".")
+        if key:
             places = document[table] if isinstance(document[table], list) else [document[table]]
             for place in places:
-                place[key].comment(f"{entry.name}: {entry.found}")
+                place[key].comment("; ".join(texts))
     head = [f"# Calibrated from {', '.join(evidence.runs)}:"]
     head += [f"#   {entry.name}: {entry.found}" for entry in evidence.entries]
     head += [f"#   {fault}" for fault in evidence.faults]

@@ -288,6 +288,23 @@ def test_what_is_no_fault_is_not_told() -> None:
     assert names(calibrate(CELL, [run(0), run(1, LEVEL)])) == set()
 
 
+@pytest.mark.parametrize("weight", [0.0, 30.0])
+def test_an_empty_run_shows_whether_the_tool_is_compensated(weight: float) -> None:
+    """A tool that weighs turns with the pads; the tare knows one posture."""
+    made = changed(run(0, truth=QUIET), empty=True, mass=None)
+    up = places_of(CELL, made).pads[:, :, 2, :3]
+    wrench = np.zeros_like(made.wrench)
+    wrench[:, :, :3] = -weight * up
+    # The arms hang the other way up at the tare.
+    wrench[made.time < 1.0] *= -1.0
+    wrench += np.random.default_rng(0).normal(size=wrench.shape) * 0.1
+    found = calibrate(CELL, [replace(made, wrench=wrench), run(1)])
+    nothing = float(told(found, "run.csv, force of nothing").split()[0])
+    assert nothing == pytest.approx(2.0 * weight, rel=0.05, abs=0.2)
+    assert names(found) == ({"residual"} if weight else set())
+    assert found.changes["payload"]["mass"] == pytest.approx(4.4, rel=0.03)
+
+
 def test_without_moments_the_centre_of_mass_is_not_written() -> None:
     made = run(0)
     found = calibrate(CELL, [scaled(made, 1.0, np.nan)])

@@ -44,6 +44,9 @@ def test_a_written_cell_loads_and_has_the_values(
     text = out.read_text()
     assert "# Calibrated from run.csv" in text
     assert "crosstalk of arm 1" in text
+    (line,) = [line for line in text.splitlines() if line.startswith("tracking = ")]
+    assert "# force over command, arm 1" in line
+    assert "; force over command, arm 2" in line
     for line in RACK.read_text().splitlines():
         if line.startswith("#"):
             assert line in text
