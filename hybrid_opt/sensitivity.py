@@ -1,17 +1,17 @@
 """What every number of a cell does to a carry: derivatives of the force and of the duration.
 
-The path stays, driven by the task's time law. The force is the largest to
-command that holds in every case of the cell's uncertainty, as a recommendation commands it. Its
+The path stays, driven by the task's time law or as fast as limits allow. The force is the largest
+to command that holds in every case of the cell's uncertainty, as a recommendation commands it. Its
 derivatives, and those of a time law's duration, are exact by what formulas take
-(`hybrid_opt.robust.slopes`); how that follows from a number of the file is read off two cells
-nearby.
+(`hybrid_opt.robust.slopes`); the fastest duration's follow from what its limits leave at the same
+speeds (`hybrid_opt.timing.nearby`). How formulas' inputs and ratios over limits follow from a
+number of the file is read off two cells nearby.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import casadi as ca
@@ -19,13 +19,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_opt.carry import Carry
+from hybrid_opt.compiled_cell import CompiledCell
 from hybrid_opt.recommending.choice import LEADER
 from hybrid_opt.robust.force import BoxMotion
 from hybrid_opt.robust.slopes import RulingForce
 from hybrid_opt.shown import Shown
+from hybrid_opt.timing.limits import limit_ratios
+from hybrid_opt.timing.model import TimingModel
+from hybrid_opt.timing.nearby import NearTimings
+from hybrid_opt.timing.records import Timing
 from symbolic import outside
+from symbolic.array import Array
 from symbolic.errors import SettingsError, WorkcellError
-from symbolic.path.spline import sample_basis
+from symbolic.numbers import WorkcellNumbers
+from symbolic.path.spline import path_basis, sample_basis
 from symbolic.path.time_law import timed_path
 from symbolic.read.cell import changed
 from symbolic.records import Workcell
@@ -114,16 +121,18 @@ class Sensitivity:
         key: in the workcell file; of one entry of an array with its index.
         value: of the number [unit].
         force: of the force per unit that the number rises [N/unit].
-        lowered: likewise per unit that it falls; other than `-force` where several cases rule.
-        duration: likewise of the duration as the number rises [s/unit].
+        lowered_force: likewise per unit that it falls; other than `-force` where several cases
+            rule.
+        duration, lowered_duration: likewise of the duration [s/unit]; None where it is missing.
     """
 
     key: str
     value: float
     unit: str
     force: float
-    lowered: float
-    duration: float
+    lowered_force: float
+    duration: float | None
+    lowered_duration: float | None
 
     @property
     def change(self) -> float:
@@ -140,7 +149,7 @@ class Sensitivities(Shown):
         force: the largest to command that holds in every case of the uncertainty [N].
         duration: of the carry [s].
         rows: by how much a usual change moves force or duration.
-        missing: by key why nothing is told of a number.
+        missing: by key why nothing is told of a number, or not what it does to the duration.
     """
 
     workcell: Workcell
@@ -172,6 +181,14 @@ class _Number:
     def key(self) -> str:
         return self.path if self.index is None else f"{self.path}[{self.index}]"
 
+    @property
+    def section(self) -> str:
+        return self.path.partition(".")[0].partition("[")[0]
+
+    @property
+    def is_limit(self) -> bool:
+        return self.path.endswith("_max")
+
     def moved(self, workcell: Workcell, by: float) -> Workcell:
         if self.index is None:
             return changed(workcell, {self.path: self.value + by})
@@ -180,58 +197,141 @@ class _Number:
         return changed(workcell, {self.path: values})
 
 
-def sensitivities(carry: Carry) -> Sensitivities:
+def sensitivities(carry: Carry | Timing) -> Sensitivities:
     """Derivatives of a carry's force and duration by the numbers of its cell.
 
     Args:
-        carry: under the time law of its task.
+        carry: under the time law of its task; or the fastest timing of a path within limits. Of a
+            timing the force is that of the same motion, and the duration that of the fastest one
+            within the same limits, a limit of force included.
 
     Raises:
-        SettingsError: it has another timing, or the uncertainty leaves nothing that holds.
+        SettingsError: the carry has another timing, a timing limits robust forces or is not the
+            fastest, or the uncertainty leaves nothing that holds.
     """
-    if carry.timing not in ("constant", "ramped"):
-        raise SettingsError(
-            f"a carry under the timing {carry.timing!r}; give one of Cell.carry under the time law "
-            "'constant' or 'ramped'"
-        )
-    workcell, ruling = carry.workcell, RulingForce(carry, LEADER)
-    drive = partial(_driven, carry, ruling.samples)
-    rows, missing, (still, duration) = [], {}, drive(workcell)
+    drive = _Law(carry) if isinstance(carry, Carry) else _Fastest(carry)
+    workcell, ruling = drive.carry.workcell, RulingForce(drive.carry, LEADER)
+    rows, missing = [], {}
     for number in _numbers(workcell):
-        section = number.path.partition(".")[0].partition("[")[0]
-        if section == "robots":
-            continue
-        if section == "uncertainty" and number.value == 0.0:
+        if number.section == "uncertainty" and number.value == 0.0:
             missing[number.key] = "zero: a range begins or ends there"
+            continue
+        if not drive.moved_by(number) and number.section == "robots":
             continue
         try:
             low, high = (number.moved(workcell, by) for by in (-STEP, STEP))
         except WorkcellError as error:
             missing[number.key] = str(error).splitlines()[-1].strip(" -")
             continue
-        ends = [(still, duration)] * 2 if section != "task" else [drive(low), drive(high)]
-        motions, pads = (ends[0][0], ends[1][0]), section == "contacts"
-        rise, fall = ruling.slopes(low, high, motions, pads)
-        longer = (ends[1][1] - ends[0][1]) / 2.0
-        slopes = [change / STEP for change in (rise, fall, longer)]
-        rows.append(Sensitivity(number.key, number.value, number.unit, *slopes))
+        longer: tuple[float | None, float | None] = (0.0, 0.0)
+        if drive.is_compiled_with(number, high):
+            longer, missing[number.key] = (
+                (None, None),
+                "duration: another structure, to be compiled",
+            )
+        elif drive.moved_by(number):
+            changes = drive.durations(number, low, high)
+            longer = changes[0] / STEP, changes[1] / STEP
+            if not np.isfinite(changes).all():
+                longer, missing[number.key] = (None, None), "duration: no timing nearby holds"
+        rise = fall = 0.0
+        if number.section != "robots":
+            motions = drive.motion(low, ruling.samples), drive.motion(high, ruling.samples)
+            rise, fall = ruling.slopes(low, high, motions, number.section == "contacts")
+        forces = rise / STEP, fall / STEP
+        rows.append(Sensitivity(number.key, number.value, number.unit, *forces, *longer))
+    duration = drive.carry.duration
 
     def size(row: Sensitivity) -> float:
-        harder = max(abs(row.force), abs(row.lowered)) / ruling.force
-        return row.change * max(harder, abs(row.duration) / duration)
+        harder = max(abs(row.force), abs(row.lowered_force)) / ruling.force
+        longer = max(abs(row.duration or 0.0), abs(row.lowered_duration or 0.0)) / duration
+        return row.change * max(harder, longer)
 
     told = tuple(sorted((row for row in rows if size(row) > LEAST), key=lambda row: -size(row)))
     return Sensitivities(workcell, ruling.force, duration, told, missing)
 
 
-def _driven(carry: Carry, samples: NDArray[np.intp], workcell: Workcell) -> tuple[BoxMotion, float]:
-    """The carry's motion at some samples in a cell nearby, and its duration there [s]."""
-    task = workcell.task
-    points = waypoints_of(task, carry.x)
-    path = timed_path(task, sample_basis(task), ca.MX(ca.DM(points.T)))
-    parts = (path.time, path.pose, path.rate, path.second_rate)
-    time, *motion = (np.array(ca.evalf(part)).T for part in parts)
-    return BoxMotion(*[part[samples] for part in motion]), float(time[-1, 0])
+class _Law:
+    """A carry under its task's time law, in cells nearby."""
+
+    def __init__(self, carry: Carry) -> None:
+        if carry.timing not in ("constant", "ramped"):
+            raise SettingsError(
+                f"a carry under the timing {carry.timing!r}; give the timing itself, as of "
+                "ho.time_path, or a carry of Cell.carry under the time law 'constant' or 'ramped'"
+            )
+        self.carry = carry
+
+    def moved_by(self, number: _Number) -> bool:
+        """Whether the motion or its duration may depend on a number."""
+        return number.section == "task"
+
+    def is_compiled_with(self, number: _Number, workcell: Workcell) -> bool:
+        """Whether the duration in another cell cannot be told without compiling."""
+        return False
+
+    def durations(self, number: _Number, low: Workcell, high: Workcell) -> tuple[float, float]:
+        """What the duration changes by towards the higher and the lower of two cells [s]."""
+        before, after = (float(self._driven(cell)[0][-1, 0]) for cell in (low, high))
+        return (after - before) / 2.0, (before - after) / 2.0
+
+    def motion(self, workcell: Workcell, samples: NDArray[np.intp]) -> BoxMotion:
+        """At some samples, in another cell."""
+        return BoxMotion(*[part[samples] for part in self._driven(workcell)[1:]])
+
+    def _driven(self, workcell: Workcell) -> list[Array]:
+        task = workcell.task
+        points = waypoints_of(task, self.carry.x)
+        path = timed_path(task, sample_basis(task), ca.MX(ca.DM(points.T)))
+        parts = (path.time, path.pose, path.rate, path.second_rate)
+        return [np.array(ca.evalf(part)).T for part in parts]
+
+
+class _Fastest:
+    """The fastest timing of a path, in cells nearby: the motion is what its speeds make of the path
+    there, the duration what the limits' shares at these speeds leave."""
+
+    def __init__(self, timing: Timing) -> None:
+        if timing.limits.robust:
+            raise SettingsError(
+                "the timing limits robust forces; give one within a limit of planned ones, or none"
+            )
+        if timing.carry is None:
+            raise SettingsError(f"there is no timing: {timing.reason}")
+        self.carry, self._limits = timing.carry, timing.limits
+        self._compiled = CompiledCell(self.carry.workcell)
+        self._digest = WorkcellNumbers(self.carry.workcell).digest
+        self._near = NearTimings(TimingModel(self._compiled), timing)
+
+    def moved_by(self, number: _Number) -> bool:
+        """See `_Law`."""
+        return number.section != "uncertainty"
+
+    def is_compiled_with(self, number: _Number, workcell: Workcell) -> bool:
+        """See `_Law`: as of upright bases that are tilted, and of pads anywhere that move."""
+        if number.is_limit or not self.moved_by(number):
+            return False
+        return WorkcellNumbers(workcell).digest != self._digest
+
+    def durations(self, number: _Number, low: Workcell, high: Workcell) -> tuple[float, float]:
+        """See `_Law`."""
+        before, after = (self._ratios(number, cell) for cell in (low, high))
+        return self._near.changes(before, after)
+
+    def _ratios(self, number: _Number, workcell: Workcell) -> dict[str, Array]:
+        carry = self.carry
+        if not number.is_limit:
+            model = TimingModel(self._compiled.of_changed(workcell))
+            carry = self._near.speeds.carry(model, model.path_motion(carry.x))
+        return limit_ratios(carry, workcell, self._limits)
+
+    def motion(self, workcell: Workcell, samples: NDArray[np.intp]) -> BoxMotion:
+        """See `_Law`."""
+        points, speeds = waypoints_of(workcell.task, self.carry.x), self._near.speeds
+        basis = path_basis(len(points), self.carry.parameter[samples])
+        first, second = basis.first @ points, basis.second @ points
+        a, w = speeds.a[samples, None], speeds.w[samples, None]
+        return BoxMotion(basis.position @ points, first * np.sqrt(w), second * w + first * a)
 
 
 # --- the numbers of a file ---

@@ -227,11 +227,17 @@ def _(found: Sensitivities) -> str:
 
 
 def _changes(row: Sensitivity) -> str:
-    change = row.change
-    told = [f"{change:+.3g} {row.unit}".rstrip() + f": {change * row.force:+8.3f} N"]
-    if abs(row.force + row.lowered) > ONE_WAY * max(abs(row.force), abs(row.lowered)):
-        told.append(f"lowered {change * row.lowered:+.3f} N")
-    return ", ".join([*told, f"{change * row.duration:+.4f} s"])
+    told = [f"{row.change:+.3g} {row.unit}".rstrip() + ":"]
+    for slope, lowered, text, unit in (
+        (row.force, row.lowered_force, "{:+8.3f}", "N"),
+        (row.duration, row.lowered_duration, "{:+8.4f}", "s"),
+    ):
+        if slope is None or lowered is None:
+            continue
+        told.append(f"{text.format(row.change * slope)} {unit}")
+        if abs(slope + lowered) > ONE_WAY * max(abs(slope), abs(lowered)):
+            told.append(f"(lowered {text.format(row.change * lowered).strip()} {unit})")
+    return " ".join(told)
 
 
 def _where(robot: str, joint: str) -> str:
