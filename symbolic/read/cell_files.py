@@ -27,7 +27,13 @@ from typing import Any
 from symbolic import outside
 from symbolic.errors import BundleError, DualArmError, OutsideError, RobotModelError
 from symbolic.read.cell import load, with_branches
-from symbolic.read.descriptions import PACKAGE_SCHEME, description_content, is_xacro, resolve_mesh
+from symbolic.read.descriptions import (
+    PACKAGE_SCHEME,
+    description_content,
+    is_mjcf,
+    is_xacro,
+    resolve_mesh,
+)
 from symbolic.read.named_robots import with_paths
 from symbolic.read.urdf import parse_urdf, read_urdf
 from symbolic.records import Robot, Workcell
@@ -225,6 +231,8 @@ def _check_references(stored: CellFiles, root: Path) -> None:
                 raise OutsideError(
                     "holds xacro macros, which are never expanded from a stored cell"
                 )
+            if is_mjcf(stored.files[target]):
+                raise OutsideError("is MJCF, which a stored cell holds as URDF")
             named = read_urdf(root / target)
         except (OutsideError, RobotModelError) as error:
             raise BundleError(f"the stored {shown(target)} is not valid: {error}") from error

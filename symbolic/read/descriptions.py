@@ -144,6 +144,7 @@ WAIT_SECONDS = 60.0
 """So long an expansion may take, its computing time being bounded more tightly."""
 
 _MACRO = re.compile(rb"<xacro:|\$\{|\$\(")
+_MJCF = re.compile(rb"\s*+(?:(?><\?.*?\?>|<!--.*?-->)\s*+)*+<mujoco[\s/>]", re.DOTALL)
 _PROCESS = "symbolic.read.descriptions"
 
 Arguments = tuple[tuple[str, str], ...]
@@ -153,10 +154,11 @@ Parts = tuple[tuple[str, bytes], ...]
 def description_content(
     path: Path, arguments: Arguments = (), package_dirs: Sequence[Path] = ()
 ) -> bytes:
-    """The URDF text of a robot's description: the file's own, or what its macros expand to.
+    """The URDF text of a robot's description: the file's own, or what its macros expand to, or what
+    an MJCF file says.
 
     Args:
-        path: a URDF, or a xacro file.
+        path: a URDF, a xacro or an MJCF file.
         arguments: values of the xacro file's arguments, by name; a plain URDF takes none.
         package_dirs: folders of packages that `$(find NAME)` looks in first.
 
@@ -164,6 +166,11 @@ def description_content(
         OutsideError: it cannot be read or expanded, or not within the bounds of that process.
     """
     content = outside.read_bytes(path, outside.URDF_BYTES)
+    if is_mjcf(content):
+        # Not imported at the top: the process that expands xacro has little memory.
+        from symbolic.read.mjcf import mjcf_as_urdf
+
+        return mjcf_as_urdf(path, content)
     if not is_xacro(content):
         return content
     key = (path, content, arguments, tuple(package_dirs))
@@ -177,6 +184,11 @@ def description_content(
             "expression count too far?"
         )
     return expanded
+
+
+def is_mjcf(content: bytes) -> bool:
+    """Whether the root of a file is MuJoCo's."""
+    return _MJCF.match(content) is not None
 
 
 def is_xacro(content: bytes) -> bool:

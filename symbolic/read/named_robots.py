@@ -90,8 +90,9 @@ def _downloaded(name: str) -> NamedRobot:
     path = getattr(module, "URDF_PATH", None)
     arguments = {} if path else getattr(module, "XACRO_ARGS", {})
     path = path or getattr(module, "XACRO_PATH", None)
+    path = path or getattr(module, "MJCF_PATH", None)
     if path is None:
-        raise OutsideError("has no URDF; name a description that has, without '_mj' in its name")
+        raise OutsideError("has neither URDF nor MJCF; name a description that has")
     package, repository = Path(module.PACKAGE_PATH), Path(module.REPOSITORY_PATH)
     folders = dict.fromkeys((package.parent, repository, repository.parent))
     named = tuple((str(key), str(value)) for key, value in arguments.items())

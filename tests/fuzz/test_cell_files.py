@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
+import mujoco
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -52,6 +53,12 @@ tip_link="tool0"/></group><group_state name="home" group="arm"><joint name="join
 <disable_collisions link1="link_2" link2="link_4" reason="Never"/></robot>"""
 
 
+_SPEC = mujoco.MjSpec.from_file(str(GOFA))
+_SPEC.compiler.fusestatic = False
+_SPEC.compile()
+MJCF = _SPEC.to_xml().encode()
+
+
 def sound_cell(cell: Workcell) -> None:
     """An accepted cell holds finite numbers, and its geometry is built or refused."""
     assert len(cell.digest) == 64
@@ -81,7 +88,7 @@ def workcell_tree(damaged: Tree) -> None:
             sound_cell(cell)
 
 
-def judged(files: Mapping[str, bytes], **named: str) -> None:
+def judged(files: Mapping[str, bytes], **named: Any) -> None:
     """A cell with these files beside it: URDFs are those of both robots, an SRDF of the first."""
     with tempfile.TemporaryDirectory() as folder:
         for name, content in files.items():
@@ -107,6 +114,10 @@ def xacro(share: float, damaged: Bytes) -> None:
 
 def srdf(damaged: Bytes) -> None:
     judged({"arm.srdf": damaged(SRDF)}, srdf="arm.srdf")
+
+
+def mjcf(damaged: Bytes) -> None:
+    judged({"arm.xml": damaged(MJCF)}, urdf="arm.xml", velocity_max=2.0)
 
 
 def mesh(kind: str, damaged: Bytes) -> None:
@@ -146,6 +157,8 @@ TESTS: Checks = {
     "urdf, elements": (urdf, (xml_damage(),)),
     "xacro, bytes": (xacro, (st.floats(0.0, 1.0), byte_damage())),
     "xacro, elements": (xacro, (st.floats(0.0, 1.0), xml_damage())),
+    "mjcf, bytes": (mjcf, (byte_damage(),)),
+    "mjcf, elements": (mjcf, (xml_damage(),)),
     "srdf, bytes": (srdf, (byte_damage(),)),
     "srdf, elements": (srdf, (xml_damage(),)),
     "scene, bytes": (scene, (st.sampled_from([*SCENES]), byte_damage())),
@@ -154,7 +167,7 @@ TESTS: Checks = {
 }
 
 
-@pytest.mark.parametrize("check", [xacro, srdf, urdf])
+@pytest.mark.parametrize("check", [xacro, srdf, urdf, mjcf])
 def test_what_is_damaged_is_sound_at_first(check: Callable[..., None]) -> None:
     seen: list[Workcell] = []
 

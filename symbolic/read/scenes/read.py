@@ -8,6 +8,7 @@ from pathlib import Path
 
 from symbolic import outside
 from symbolic.errors import OutsideError, SceneError
+from symbolic.read.mjcf import compiled
 from symbolic.read.scenes.bodies import Gathered, Scene
 from symbolic.read.scenes.moveit import read_moveit, read_moveit_text
 from symbolic.read.scenes.sdf import read_sdf
@@ -39,7 +40,7 @@ def read_scene(path: Path) -> Scene:
 def _reader(path: Path) -> Callable[[Path, Gathered], None]:
     """What reads a file, by what is in it."""
     text = outside.text(outside.read_bytes(path, outside.URDF_BYTES))
-    head = re.match(r"\s*(?:(?:<\?.*?\?>|<!--.*?-->)\s*)*<([A-Za-z]\w*)", text, re.DOTALL)
+    head = re.match(r"\s*+(?:(?><\?.*?\?>|<!--.*?-->)\s*+)*+<([A-Za-z]\w*)", text, re.DOTALL)
     by_root = {"sdf": read_sdf, "mujoco": _read_mjcf}
     if head and head[1] in by_root:
         return by_root[head[1]]
@@ -57,16 +58,7 @@ def _reader(path: Path) -> Callable[[Path, Gathered], None]:
 
 def _read_mjcf(path: Path, found: Gathered) -> None:
     """Gather the shapes of the world and of bodies that are fixed in it, as MuJoCo places them."""
-    try:
-        import mujoco
-    except ImportError as error:
-        raise OutsideError(
-            "is a scene of MuJoCo, whose reader is not installed: pip install 'dual-arm-carry[sim]'"
-        ) from error
-    try:
-        model = mujoco.MjModel.from_xml_path(str(path))
-    except ValueError as error:
-        raise OutsideError(f"MuJoCo does not take it: {' '.join(str(error).split())}") from error
+    mujoco, _, model = compiled(path)
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     moving, kinds = dict[int, int](), mujoco.mjtGeom

@@ -182,6 +182,7 @@ def test_what_is_no_body_is_told(tmp_path: Path, shape: str, why: str) -> None:
         ("<sdf version='1.9'><model>", "is not readable XML"),
         ("<robot name='r'/>", "is no scene that is read"),
         ("name: nothing", "is no scene that is read"),
+        ("<!-- --> " * 5000, "is no scene that is read"),
         (sdf(""), "holds no obstacle"),
         (sdf("<model name='m'><link name='l'><collision name='c'/></link></model>"), "<geometry>"),
         (sdf(f"<model><link name='l'>{collision('c', BALL)}</link></model>"), "name: is missing"),

@@ -1,0 +1,198 @@
+"""MJCF, MuJoCo's descriptions of robots, as URDF: bodies, joints, masses, limits and shapes.
+
+MuJoCo's own reader compiles the file, so includes, defaults and angles in degrees are its. What is
+written is what the compiled model holds; what URDF has no words for is refused.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+
+from symbolic.array import Array
+from symbolic.errors import OutsideError
+from symbolic.records.poses import inverse, rpy_from_rotation, transform
+
+NO_READER = "is a file of MuJoCo, whose reader is not installed: pip install 'dual-arm-carry[sim]'"
+
+
+def compiled(path: Path) -> Any:
+    """MuJoCo's module, the file as it is written (`MjSpec`), and its compiled model.
+
+    Raises:
+        OutsideError: MuJoCo is not installed, or does not take the file.
+    """
+    try:
+        import mujoco
+    except ImportError as error:
+        raise OutsideError(NO_READER) from error
+    try:
+        spec = mujoco.MjSpec.from_file(str(path))
+        return mujoco, spec, spec.compile()
+    except ValueError as error:
+        raise OutsideError(f"MuJoCo does not take it: {' '.join(str(error).split())}") from error
+
+
+@lru_cache(maxsize=8)
+def mjcf_as_urdf(path: Path, content: bytes) -> bytes:
+    """The URDF of a robot's MJCF: a link per body, and per named site.
+
+    The world is the root link `world`. MJCF knows no velocity limits: they are zero, and a cell
+    has to give its own (`velocity_max`). Shapes that collide with nothing (contype and
+    conaffinity zero) are left out.
+
+    Args:
+        path: the file.
+        content: its content, by which the result is remembered: files that it includes and meshes
+            count as they are when the process reads them first.
+
+    Raises:
+        OutsideError: MuJoCo does not take it, or it holds what a URDF has no words for.
+    """
+    mujoco, spec, model = compiled(path)
+    if any(np.any(mesh.refpos) or abs(mesh.refquat[0]) < 1.0 for mesh in spec.meshes):
+        raise OutsideError("moves a mesh by refpos or refquat; move its geom instead")
+    return _Writer(mujoco, model).urdf()
+
+
+class _Writer:
+    """Writes a compiled model."""
+
+    def __init__(self, mujoco: Any, model: Any) -> None:
+        self._mujoco, self._model = mujoco, model
+        self._root = ElementTree.Element("robot", {"name": "robot"})
+        self._names = [
+            "world" if k == 0 else model.body(k).name or f"body_{k}" for k in range(model.nbody)
+        ]
+
+    def urdf(self) -> bytes:
+        model = self._model
+        for body, name in enumerate(self._names):
+            link = ElementTree.SubElement(self._root, "link", {"name": name})
+            if model.body_mass[body] > 0.0:
+                self._inertial(link, body)
+            for geom in np.flatnonzero(model.geom_bodyid == body):
+                self._collision(link, int(geom), name)
+            if body:
+                self._joints(body, name)
+        taken = set(self._names)
+        for site in range(model.nsite):
+            name = model.site(site).name
+            if name and name not in taken:
+                ElementTree.SubElement(self._root, "link", {"name": name})
+                parent = self._names[model.site_bodyid[site]]
+                pose = self._pose(model.site_pos[site], model.site_quat[site])
+                self._joint(f"{name}_fixed", "fixed", (parent, name), pose)
+        return ElementTree.tostring(self._root)
+
+    def _joints(self, body: int, name: str) -> None:
+        """The joints between a body and its parent, each about its own point of the body."""
+        model, kinds = self._model, self._mujoco.mjtJoint
+        parent = self._names[model.body_parentid[body]]
+        T_parent_body = self._pose(model.body_pos[body], model.body_quat[body])
+        first, count = int(model.body_jntadr[body]), int(model.body_jntnum[body])
+        for joint in range(first, first + count):
+            called = model.joint(joint).name or f"joint_{joint}"
+            kind = kinds(int(model.jnt_type[joint]))
+            if kind not in (kinds.mjJNT_HINGE, kinds.mjJNT_SLIDE):
+                raise OutsideError(
+                    f"joint {called!r} of body {name!r} is free or a ball; allowed are hinges and "
+                    "slides: leave what stands around to the cell's environment"
+                )
+            if model.qpos0[model.jnt_qposadr[joint]]:
+                raise OutsideError(f"joint {called!r} has a ref; allowed is zero")
+            at = transform(np.eye(3), model.jnt_pos[joint])
+            last = joint == first + count - 1 and not np.any(model.jnt_pos[joint])
+            child = name if last else f"{called}_link"
+            if not last:
+                ElementTree.SubElement(self._root, "link", {"name": child})
+            slides, limited = kind == kinds.mjJNT_SLIDE, bool(model.jnt_limited[joint])
+            word = "prismatic" if slides else "revolute" if limited else "continuous"
+            element = self._joint(called, word, (parent, child), T_parent_body @ at)
+            ElementTree.SubElement(element, "axis", {"xyz": _text(model.jnt_axis[joint])})
+            lower, upper = model.jnt_range[joint].tolist() if limited else (0.0, 0.0)
+            limit = {"lower": lower, "upper": upper, "effort": self._effort(joint), "velocity": 0.0}
+            ElementTree.SubElement(element, "limit", {k: repr(v) for k, v in limit.items()})
+            parent, T_parent_body = child, inverse(at)
+        if parent != name:
+            self._joint(f"{name}_fixed", "fixed", (parent, name), T_parent_body)
+
+    def _joint(
+        self, name: str, kind: str, ends: tuple[str, str], pose: Array
+    ) -> ElementTree.Element:
+        element = ElementTree.SubElement(self._root, "joint", {"name": name, "type": kind})
+        _origin(element, pose)
+        for tag, link in zip(("parent", "child"), ends, strict=True):
+            ElementTree.SubElement(element, tag, {"link": link})
+        return element
+
+    def _effort(self, joint: int) -> float:
+        """What may act at a joint: its own bound, else that of its motors; 0 where none is."""
+        model = self._model
+        if model.jnt_actfrclimited[joint]:
+            return float(np.abs(model.jnt_actfrcrange[joint]).min())
+        moves = model.actuator_trntype == self._mujoco.mjtTrn.mjTRN_JOINT
+        bounded = moves & (model.actuator_trnid[:, 0] == joint) & (model.actuator_forcelimited > 0)
+        forces = np.abs(model.actuator_forcerange).min(axis=1)
+        return float(np.sum((forces * np.abs(model.actuator_gear[:, 0]))[bounded]))
+
+    def _inertial(self, link: ElementTree.Element, body: int) -> None:
+        model = self._model
+        element = ElementTree.SubElement(link, "inertial")
+        _origin(element, self._pose(model.body_ipos[body], model.body_iquat[body]))
+        ElementTree.SubElement(element, "mass", {"value": repr(float(model.body_mass[body]))})
+        moments = dict.fromkeys(("ixx", "ixy", "ixz", "iyy", "iyz", "izz"), 0.0)
+        keys = ("ixx", "iyy", "izz")
+        moments |= dict(zip(keys, model.body_inertia[body].tolist(), strict=True))
+        ElementTree.SubElement(element, "inertia", {k: repr(v) for k, v in moments.items()})
+
+    def _collision(self, link: ElementTree.Element, geom: int, name: str) -> None:
+        model, kinds = self._model, self._mujoco.mjtGeom
+        if not model.geom_contype[geom] and not model.geom_conaffinity[geom]:
+            return
+        pose = self._pose(model.geom_pos[geom], model.geom_quat[geom])
+        size = model.geom_size[geom]
+        round_one = {"radius": repr(float(size[0])), "length": repr(2.0 * float(size[1]))}
+        match kinds(int(model.geom_type[geom])):
+            case kinds.mjGEOM_BOX:
+                tag, said = "box", {"size": _text(2.0 * size)}
+            case kinds.mjGEOM_SPHERE:
+                tag, said = "sphere", {"radius": round_one["radius"]}
+            case kinds.mjGEOM_CYLINDER:
+                tag, said = "cylinder", round_one
+            case kinds.mjGEOM_CAPSULE:
+                tag, said = "capsule", round_one
+            case kinds.mjGEOM_MESH if model.mesh_pathadr[model.geom_dataid[geom]] >= 0:
+                mesh = int(model.geom_dataid[geom])
+                start = int(model.mesh_pathadr[mesh])
+                path = bytes(model.paths[start:]).split(b"\0", 1)[0].decode()
+                tag, said = "mesh", {"filename": path, "scale": _text(model.mesh_scale[mesh])}
+                # MuJoCo turns a mesh to its principal axes, and the geom with it.
+                pose = pose @ inverse(self._pose(model.mesh_pos[mesh], model.mesh_quat[mesh]))
+            case other:
+                raise OutsideError(
+                    f"body {name!r} has a shape of the kind {other.name[7:].lower()} without a "
+                    "file; allowed are boxes, cylinders, spheres, capsules and mesh files"
+                )
+        element = ElementTree.SubElement(link, "collision")
+        _origin(element, pose)
+        geometry = ElementTree.SubElement(element, "geometry")
+        ElementTree.SubElement(geometry, tag, said)
+
+    def _pose(self, place: Array, quaternion: Array) -> Array:
+        rotation = np.empty(9)
+        self._mujoco.mju_quat2Mat(rotation, quaternion)
+        return transform(rotation.reshape(3, 3), place)
+
+
+def _origin(element: ElementTree.Element, pose: Array) -> None:
+    said = {"xyz": _text(pose[:3, 3]), "rpy": _text(rpy_from_rotation(pose[:3, :3]))}
+    ElementTree.SubElement(element, "origin", said)
+
+
+def _text(values: Array) -> str:
+    return " ".join(repr(float(value)) for value in values)
