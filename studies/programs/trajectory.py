@@ -157,6 +157,8 @@ def _planned(
 def _chosen(
     model: TimingModel, stored: StoredTrajectory, use: str | None, force: float | None
 ) -> Timing:
+    if force is None and model.workcell.task.time_law == "optimal":
+        force = float(stored.x[-1])  # what the carry was found within
     chosen = use or ("closest" if force is None else "force")
     if chosen == "force":
         if force is None:

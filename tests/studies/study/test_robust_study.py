@@ -141,10 +141,15 @@ def test_what_is_exported_keeps_the_robust_limit(
 ) -> None:
     root, _ = study
     found = recommended(root)
-    options = ["--target", "json", "--force-limit", f"{found.force_limit:.6g}"]
     file = str(root / found.file)
-    assert export.main([file, *options, "--output", str(tmp_path / "out")]) == 0
-    assert "carry" in capsys.readouterr().out
+    stated = ["--force-limit", repr(found.force_limit)]
+    told = []
+    for name, options in {"own": [], "stated": stated}.items():
+        output = ["--target", "json", "--output", str(tmp_path / name)]
+        assert export.main([file, *options, *output]) == 0
+        told.append(capsys.readouterr().out.partition("files in")[0])
+    assert "carry" in told[0]
+    assert told[0] == told[1]
 
 
 def test_the_table_begins_above_what_holds_still_in_every_case(study: tuple[Path, str]) -> None:
