@@ -33,7 +33,6 @@ _address_of = ctypes.addressof
 OTHER_COMPILER = "another compiler (environment variable CC) may do better"
 
 _SUCCESS = -1
-_TOO_MANY = -2
 
 
 class CompiledFunction(NumericFunction):
@@ -230,11 +229,8 @@ class CompiledFunction(NumericFunction):
         return all(map(_same, together, apart))
 
     def _check(self, status: int, of: str) -> None:
-        if status == _SUCCESS:
-            return
-        if status == _TOO_MANY:
-            raise CodegenError(f"{self.name}: too many evaluations at once; use fewer threads")
-        raise CodegenError(f"{self.name}: the function failed at candidate {status}{of}")
+        if status != _SUCCESS:
+            raise CodegenError(f"{self.name}: the function failed at candidate {status}{of}")
 
 
 class _Work:

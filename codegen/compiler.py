@@ -30,8 +30,6 @@ FLAGS = (
     # Without fused multiply-adds the results are the same to the last bit, whatever the processor.
     # Never -ffast-math: NaN must stay NaN.
     "-ffp-contract=off",
-    # Evaluations of functions with memory (solvers) that may run at once in one process.
-    "-DCASADI_MAX_NUM_THREADS=128",
 )
 
 LANE_FLAGS = (

@@ -53,7 +53,10 @@ def c_source(function: ca.Function, lanes: int = 1, generated: str = "") -> str:
     generated, signature = generated or generated_c([function]), Signature.of(function)
     shared = shared_inputs(function)
     in_lanes = None if lanes == 1 else lane_text(generated, "lanes", shared)
-    before, after = [include, runtime("arithmetic.h")], [_filled(runtime("driver.c"), signature)]
+    before, after = (
+        [include, runtime("arithmetic.h")],
+        [_filled(runtime("driver.c"), signature, generated)],
+    )
     if in_lanes is not None:
         width = f"#define DUAL_ARM_LANES {lanes}\n" if lanes else ""
         before += [runtime("one_lane.h"), width, runtime("lanes.h")]
@@ -147,14 +150,15 @@ def generated_c(functions: Sequence[ca.Function]) -> str:
         raise CodegenError(f"{name}: CasADi cannot generate C for it: {reason}") from error
 
 
-def _filled(driver: str, signature: Signature) -> str:
-    """A driver with the names and sizes of a function."""
+def _filled(driver: str, signature: Signature, generated: str = "") -> str:
+    """A driver with the names and sizes of a function, and whether its C keeps state."""
     inputs = [prod(shape) for shape in signature.input_shapes]
     outputs = [prod(shape) for shape in signature.output_shapes]
     return (
         driver.replace("@NAME@", signature.name)
         .replace("@N_IN@", str(len(inputs)))
         .replace("@N_OUT@", str(len(outputs)))
+        .replace("@STATE@", str(int("_mem_counter" in generated)))
         .replace("@SIZES@", ", ".join(map(str, [*inputs, *outputs, 0])))
     )
 
