@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import tomllib
 from importlib import import_module
 from importlib.resources import files
@@ -41,3 +42,13 @@ def test_build_and_run_time_versions_agree() -> None:
     run = set(project["project"]["dependencies"])
     assert {"casadi>=3.8.2,<3.9", "libpinocchio>=4.1,<4.2"} <= build
     assert {"casadi>=3.8.2,<3.9", "pin>=4.1,<4.2"} <= run
+
+
+def test_messages_name_extras_as_a_user_of_the_wheel_installs_them() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    texts = [path.read_text("utf-8") for name in PACKAGES for path in (ROOT / name).rglob("*.py")]
+    named = [found for text in texts for found in re.findall(r"pip install [^\n`]*\[.*?\]", text)]
+    extras = [re.search(r"dual-arm-carry\[(\w+)\]", each) for each in named]
+    assert len(named) >= 8
+    assert all(extras), named
+    assert {each[1] for each in extras if each} <= set(project["project"]["optional-dependencies"])

@@ -564,8 +564,7 @@ def _packages() -> tuple[ModuleType, Any]:
         from rosbags.typesys import Stores, get_typestore
     except ImportError as error:
         raise ResultsError(
-            "the packages mcap and rosbags are not installed; install the extra: "
-            "pip install -e '.[ros]'"
+            "the packages mcap and rosbags are not installed: pip install 'dual-arm-carry[ros]'"
         ) from error
     module: ModuleType = mcap.writer
     return module, get_typestore(Stores.ROS2_JAZZY)

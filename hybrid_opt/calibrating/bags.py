@@ -34,7 +34,7 @@ def read_topics(path: Path, topics: Collection[str]) -> dict[str, Messages]:
         from rosbags.typesys import Stores, get_typestore
     except ImportError as error:
         raise ResultsError(
-            "the package rosbags is not installed; install the extra: pip install -e '.[ros]'"
+            "the package rosbags is not installed: pip install 'dual-arm-carry[ros]'"
         ) from error
     found: dict[str, Messages] = {topic: [] for topic in topics}
     try:

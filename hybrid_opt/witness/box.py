@@ -130,9 +130,7 @@ def mujoco_module() -> ModuleType:
     try:
         import mujoco
     except ImportError as error:
-        raise WitnessError(
-            "MuJoCo is not installed; install the extra: pip install -e '.[sim]'"
-        ) from error
+        raise WitnessError("MuJoCo is not installed: pip install 'dual-arm-carry[sim]'") from error
     module: ModuleType = mujoco
     return module
 

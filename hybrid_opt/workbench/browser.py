@@ -54,7 +54,9 @@ class Workbench:
         try:
             import viser
         except ImportError as error:
-            raise DisplayError("the live view needs viser: pip install viser") from error
+            raise DisplayError(
+                "the live view needs viser: pip install 'dual-arm-carry[live]'"
+            ) from error
         self.session = session
         self._rng = np.random.default_rng(seed)
         self._news = threading.Condition()

@@ -1,4 +1,4 @@
-"""The examples run, and docs/library.md and the README hold the same code."""
+"""The examples run, their copies too; docs/library.md and the README hold the same code."""
 
 from __future__ import annotations
 
@@ -9,6 +9,9 @@ from pathlib import Path
 import pytest
 
 import hybrid_opt as ho
+from studies.examples.__main__ import main as copy
+from studies.program import BAD_INPUT
+from symbolic.read.cell import load
 
 ROOT = Path(__file__).resolve().parents[2]
 EXAMPLES = sorted((ROOT / "studies" / "examples").glob("[0-9]*.py"))
@@ -81,6 +84,23 @@ def run(code: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (folder / "studies").symlink_to(ROOT / "studies")
     monkeypatch.chdir(folder)
     exec(compile(code, "example", "exec"), {"__name__": "__main__"})
+
+
+def test_a_copy_holds_what_the_examples_and_its_cells_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert copy([str(tmp_path / "new")]) == 0
+    monkeypatch.chdir(tmp_path / "new")
+    copies = sorted(Path("studies/examples").iterdir())
+    assert [path.name for path in copies] == NAMES
+    read = {name for path in copies for name in re.findall(r'"(studies/[^"]+)"', path.read_text())}
+    assert read == {"studies/workcells/rack.toml", "studies/problems/past-a-post.toml"}
+    assert all(Path(name).is_file() for name in read)
+    cells = sorted(Path("studies/workcells").iterdir())
+    assert [load(path).digest for path in cells] == [load(ROOT / path).digest for path in cells]
+    capsys.readouterr()
+    assert copy([]) == BAD_INPUT
+    assert "studies: exists already" in capsys.readouterr().err
 
 
 def test_the_library_page_holds_every_example_in_order() -> None:

@@ -1,0 +1,49 @@
+"""The examples, and the cells, problems and robots they read: `python -m studies.examples FOLDER`.
+
+They are copied to FOLDER/studies and run in FOLDER as they do in the repository:
+`python studies/examples/01_evaluate.py`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from importlib.resources import files
+from pathlib import Path
+
+from studies.program import Parser, Program, run_program
+
+SHIPPED = ("examples/[0-9]*.py", "problems/*.toml", "robots/*.urdf", "workcells/*.toml")
+"""What is copied, below `studies`."""
+
+
+def _add_options(parser: Parser) -> None:
+    parser.add_argument(
+        "folder",
+        metavar="FOLDER",
+        type=Path,
+        nargs="?",
+        default=Path("."),
+        help="a folder without a folder studies in it (default: this one)",
+    )
+
+
+def _copy(options: argparse.Namespace) -> int:
+    from hybrid_opt.errors import ResultsError
+    from hybrid_opt.store.files import write_atomically
+
+    source, target = Path(str(files("studies"))), options.folder / "studies"
+    if target.exists():
+        raise ResultsError(f"{target}: exists already; name another folder")
+    found = [path for pattern in SHIPPED for path in sorted(source.glob(pattern))]
+    for path in found:
+        write_atomically(target / path.relative_to(source), path.read_bytes())
+    print(f"{len(found)} files written to {target}")
+    return 0
+
+
+main = Program("examples", __doc__, _add_options, _copy)
+
+
+if __name__ == "__main__":
+    sys.exit(run_program(main))
