@@ -23,7 +23,8 @@ def programs() -> dict[str, tuple[str, str]]:
     """By every program's name its module, and what it says of itself first."""
     folder = Path(__file__).parent
     found = {}
-    for path in sorted([*folder.glob("*.py"), *folder.glob("*/*.py")]):
+    doors = ("*.py", "*/*.py", "*/*/__main__.py")
+    for path in sorted(path for door in doors for path in folder.glob(door)):
         text = path.read_text("utf-8")
         if path == Path(__file__) or not text.rstrip().endswith(START):
             continue

@@ -105,6 +105,8 @@ class Proposal:
         feasible_share: of random candidates within the bounds.
         candidates: by which that was measured.
         seconds: that it took.
+        certified: of these until the first carry was certified, before bounds around it.
+        q: per arm its joints (n, joints) at the task's samples [rad or m].
         blocked: what is in the way of the pads before the carry or after it, '' where nothing is,
             or no time was left to look.
     """
@@ -115,7 +117,14 @@ class Proposal:
     feasible_share: float
     candidates: int
     seconds: float
+    certified: float
+    q: tuple[Array, Array]
     blocked: str = ""
+
+    @property
+    def length(self) -> float:
+        """How far both arms' joints go together, as the Euclidean length of their path [rad]."""
+        return float(np.linalg.norm(np.diff(np.hstack(self.q), axis=0), axis=1).sum())
 
     def text(self, folder: Path) -> str:
         """The workcell file, for a folder: the problem file's text, completed.
@@ -129,7 +138,8 @@ class Proposal:
         forces = ", ".join(f"{value:.4f}" for value in self.judgement.objectives.values())
         spins = " and ".join(f"{np.degrees(spin):.0f}" for spin in self.found.spins)
         return (
-            f"a carry through {len(self.found.via)} via-points, certified; objectives {forces}; "
+            f"a carry through {len(self.found.via)} via-points, joints go {self.length:.2f} rad, "
+            f"certified; objectives {forces}; "
             f"spins {spins} deg, start branches {self.found.branches[0]} and "
             f"{self.found.branches[1]}; {100.0 * self.feasible_share:.1f} % of "
             f"{self.candidates} random candidates feasible; {self.seconds:.1f} s"
@@ -311,6 +321,7 @@ class _Search:
         if not judgement.feasible:
             self.refusals.append(why)
             return None
+        certified = self.spent
         self.tell("bounds")
         # The verdict on the file takes about as long as this one did.
         bounds = self._bounds(trial, self.settings.seconds - 1.5 * (self.spent - begun))
@@ -325,6 +336,7 @@ class _Search:
         if not judgement.feasible:
             self.refusals.append(why)
             return None
+        outputs = last.evaluator.outputs(last.initial[None])
         self.tell("the pads' way to the box")
         blocked = "" if self.out_of_time else grasp_blocked(last)
         return Proposal(
@@ -334,6 +346,8 @@ class _Search:
             bounds.share,
             bounds.candidates,
             self.spent,
+            certified,
+            (outputs["q_1"][0], outputs["q_2"][0]),
             blocked,
         )
 

@@ -1,0 +1,75 @@
+"""Other people's benchmarks beside what they published: `python -m studies.research.benchmarks`.
+
+Their files are read from a folder, nothing of theirs comes with this project; without `--folder` it
+says how to get them. Every task becomes a problem file, whose first carry is proposed and measured.
+With `--study` a small drivable study follows: the fastest carry whose squeeze holds. Both take
+minutes, most of them for compiling.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+from studies.options import add, number, stated
+from studies.program import Parser, Program, run_program
+from symbolic.errors import SettingsError
+
+
+def _add_options(parser: Parser) -> None:
+    parser.add_argument(
+        "name", metavar="NAME", nargs="?", default="", help="the benchmark (default: all)"
+    )
+    parser.add_argument(
+        "--folder", metavar="FOLDER", type=Path, help="with the files of others, as it says"
+    )
+    parser.add_argument(
+        "--output",
+        metavar="FOLDER",
+        type=Path,
+        default=Path("results/benchmarks"),
+        help="for problem files and proposed workcells",
+    )
+    parser.add_argument(
+        "--time",
+        type=number(1.0, 1e6),
+        default=stated("hybrid_opt.proposing.proposal.ProposeSettings.seconds"),
+        metavar="S",
+        help="seconds that a proposal may work",
+    )
+    parser.add_argument(
+        "--study", action="store_true", help="also look for the fastest carry of every task"
+    )
+    add(parser, "--seed", help="of its randomness")
+
+
+def _run(options: argparse.Namespace) -> int:
+    from hybrid_opt.proposing.proposal import ProposeSettings
+    from studies.research.benchmarks import shelves
+    from studies.research.benchmarks.measuring import measured, table
+
+    known = {"shelves": shelves}
+    if options.name not in ("", *known):
+        raise SettingsError(f"no benchmark {options.name!r}; there are {', '.join(known)}")
+    chosen = {name: known[name] for name in known if options.name in ("", name)}
+    if options.folder is None:
+        for name, module in chosen.items():
+            print(f"{name}: get its files, then name FOLDER by --folder\n{module.HOW}")
+        return 0
+    settings = ProposeSettings(seconds=options.time)
+    for module in chosen.values():
+        given = module.benchmark(options.folder)
+        found = [
+            measured(given, task, options.output, settings, options.seed, options.study)
+            for task in given.tasks
+        ]
+        print(table(given, found).text())
+    return 0
+
+
+main = Program("research.benchmarks", __doc__, _add_options, _run)
+
+
+if __name__ == "__main__":
+    sys.exit(run_program(main))

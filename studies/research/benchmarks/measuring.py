@@ -1,0 +1,181 @@
+"""Carries of other people's tasks: proposed, studied, beside the figures that they published."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import hybrid_opt as ho
+from hybrid_opt.display.table import Table, number
+from hybrid_opt.errors import ProposalError
+from hybrid_opt.proposing.problem import completed
+from studies.research.turns import progress
+from symbolic.array import Array
+from symbolic.replacing import replace_file
+
+EVALUATIONS = 1000
+"""Of the search behind a fastest carry."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """One carry of a benchmark.
+
+    Attributes:
+        name: for the table, and of its files.
+        problem: the problem file's tables.
+        published: length of the others' shortest carry [rad].
+        straight: between the postures in which theirs begins and ends, in their coordinates [rad].
+    """
+
+    name: str
+    problem: dict[str, Any]
+    published: float
+    straight: float
+
+
+@dataclass(frozen=True)
+class Benchmark:
+    """What somebody published.
+
+    Attributes:
+        name: for the command line.
+        title: for the table.
+        tasks: the carries.
+        note: what was published beside lengths, and what is not comparable.
+        coordinates: theirs (n, m) of both arms' joints (n, joints) [rad].
+    """
+
+    name: str
+    title: str
+    tasks: tuple[Task, ...]
+    note: str
+    coordinates: Callable[[Array, Array], Array]
+
+
+@dataclass(frozen=True)
+class Length:
+    """Of a carry.
+
+    Attributes:
+        joints: over all joints of both arms [rad].
+        theirs: in the coordinates of those who published the task [rad].
+    """
+
+    joints: float
+    theirs: float
+
+
+@dataclass(frozen=True)
+class Measured:
+    """A task's figures.
+
+    Attributes:
+        task: which.
+        refused: why no carry was found, '' where one was.
+        certified, seconds: worked until the first certified carry, and until its file was whole.
+        first: length of the proposed carry.
+        fastest: of a study, None without.
+        duration, force: of the fastest carry [s, N].
+    """
+
+    task: Task
+    refused: str = ""
+    certified: float | None = None
+    seconds: float | None = None
+    first: Length | None = None
+    fastest: Length | None = None
+    duration: float | None = None
+    force: float | None = None
+
+
+def measured(
+    benchmark: Benchmark,
+    task: Task,
+    output: Path,
+    settings: ho.ProposeSettings,
+    seed: int,
+    study: bool,
+) -> Measured:
+    """Propose a carry for one task, and study it where that is asked for.
+
+    Args:
+        output: folder for the problem file and the workcell.
+        settings: of the proposal.
+        seed: of the randomness.
+        study: whether the fastest carry is looked for as well.
+    """
+    output.mkdir(parents=True, exist_ok=True)
+    path = output / f"{benchmark.name}-{task.name.replace(' ', '-')}.toml"
+    replace_file(path, completed("", {}, task.problem).encode())
+    progress(f"{task.name}: a first carry")
+    rng = np.random.default_rng(seed)
+    try:
+        proposal = ho.propose(path, rng=rng, settings=settings)
+    except ProposalError as error:
+        return Measured(task, refused=str(error))
+    workcell = path.with_name(f"{path.stem}-proposed.toml")
+    replace_file(workcell, proposal.text(output).encode())
+    first = length(benchmark, proposal.q)
+    found = Measured(task, "", proposal.certified, proposal.seconds, first)
+    if not study:
+        return found
+    progress(f"{task.name}: the fastest carry")
+    cell = ho.Cell.load(workcell).drivable()
+    front = ho.polish(ho.search(cell, "nsga2", evaluations=EVALUATIONS, rng=rng), rng=rng)
+    fastest = front.lowest("duration")
+    return replace(
+        found,
+        fastest=length(benchmark, (fastest.arms[0].q, fastest.arms[1].q)),
+        duration=fastest.duration,
+        force=float(fastest.peak_normal_force.max()),
+    )
+
+
+def length(benchmark: Benchmark, q: tuple[Array, Array]) -> Length:
+    """How far both arms' joints (n, joints) go along a carry."""
+    return Length(travelled(np.hstack(q)), travelled(benchmark.coordinates(*q)))
+
+
+def travelled(points: Array) -> float:
+    """Euclidean length of a path through points (n, m)."""
+    return float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
+
+
+def table(benchmark: Benchmark, found: list[Measured]) -> Table:
+    """The figures beside the published ones: work until the first certified carry and until its
+    file, its length over all joints and in their coordinates, in these also the straight line
+    between their ends; then the fastest carry."""
+    rows = []
+    for one in found:
+        first = (None, None) if one.first is None else (one.first.joints, one.first.theirs)
+        figures = (
+            (one.certified, 1),
+            (one.seconds, 1),
+            (first[0], 2),
+            (first[1], 2),
+            (one.task.straight, 2),
+            (one.task.published, 2),
+            (one.duration, 2),
+            (one.force, 1),
+            (None if one.fastest is None else one.fastest.theirs, 2),
+        )
+        rows.append((one.task.name, *(number(value, digits) for value, digits in figures)))
+    header = (
+        "task",
+        "certified [s]",
+        "file [s]",
+        "joints [rad]",
+        "theirs [rad]",
+        "straight [rad]",
+        "published [rad]",
+        "fastest [s]",
+        "force [N]",
+        "its theirs [rad]",
+    )
+    refused = "".join(f" {one.task.name}: {one.refused}." for one in found if one.refused)
+    return Table(benchmark.name, benchmark.title, header, tuple(rows), benchmark.note + refused)

@@ -1,0 +1,198 @@
+"""Two iiwa 14 carry between three shelves (Cohn, Shaw, Simchowitz and Tedrake, arXiv 2309.08770).
+
+The files are those of github.com/cohnt/constrained-bimanual-planning-example at commit aca3cbd.
+Its directives `models/old_shelves.dmd.yaml` say where things stand, its notebook in which postures
+a carry begins and ends. There nothing is held: one gripper keeps its place in front of the other.
+Here pads take the fingers' place, and hold a box no larger than the grippers' outline.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+from pinocchio.utils import rotate
+
+from studies.research.benchmarks.measuring import Benchmark, Task
+from symbolic import outside
+from symbolic.array import Array
+from symbolic.errors import OutsideError, SettingsError
+from symbolic.read.scenes.read import read_scene
+
+PACKAGE = "bimanual"
+"""What their URDF calls the folder."""
+
+HOW = f"""\
+git clone https://github.com/cohnt/constrained-bimanual-planning-example FOLDER/{PACKAGE}
+git -C FOLDER/{PACKAGE} checkout aca3cbd"""
+
+APART = 0.765
+"""Between both bases, along y [m]."""
+
+GRASP = 0.6
+"""Between both last links, along y [m]."""
+
+STANDING = {
+    "old_table/table_wide.sdf": np.array([0.4, 0.3825, 0.0]),
+    "old_shelves.sdf": np.array([0.8, 0.3825, 0.0]),
+}
+"""Where the scene's models stand [m]."""
+
+PAD = 0.2
+"""From a last link to its pad: between palm and tip of their fingers [m]."""
+
+BOX = (0.12, GRASP - 2.0 * PAD, 0.12)
+
+ACCELERATION = [8.57, 8.57, 8.74, 11.36, 12.23, 15.72, 15.72]
+"""As their URDF states it in an attribute of Drake's [rad/s^2]."""
+
+UPPER_ARM, FOREARM = 0.42, 0.4
+"""From shoulder to elbow, and from there to the wrist [m]."""
+
+GRIPPER: dict[str, Any] = {
+    "name": "gripper",
+    "kind": "box",
+    "size": [0.146, 0.0725, 0.05],
+    "xyz": [0.0, 0.0, 0.040867],
+    "rpy": [np.pi / 2.0, 0.0, np.radians(68.0)],
+}
+"""The palm, as their SDF has it and their directives mount it."""
+
+CARRIES = (
+    ("top", "middle", 2.09),
+    ("middle", "bottom", 3.32),
+    ("bottom", "top", 5.62),
+)
+"""From, to, and the length that was published of IK-GCS [rad]."""
+
+NOTE = (
+    "Published: lengths of IK-GCS (arXiv 2309.08770), which plans in 2 to 3 s once regions are "
+    "grown around postures chosen by hand; IK-BiRRT takes 49 to 54 s, Atlas-BiRRT 141 to 201 s. "
+    "There both ends' postures are given, nothing is held, and no speed or force is planned; here "
+    "postures are chosen, and a box is carried that has to stay held."
+)
+
+
+def benchmark(folder: Path) -> Benchmark:
+    """The three carries.
+
+    Args:
+        folder: in which their files are.
+
+    Raises:
+        SettingsError: they are not there, or not those.
+    """
+    there = folder / PACKAGE
+    try:
+        given = postures(outside.read_bytes(there / "notebooks/main.ipynb", outside.WORKCELL_BYTES))
+    except OutsideError as error:
+        raise SettingsError(f"{there}: {error}; get the files by\n{HOW}") from error
+    urdf = there / "models/iiwa14_convex_decimated_collision.urdf"
+    model = pin.buildModelFromUrdf(str(urdf))
+    poses = {name: _box(model, q[:7]) for name, q in given.items()}
+    scene = _scene(there / "models")
+    tasks = []
+    for start, goal, length in CARRIES:
+        problem = {
+            "name": f"Shelves, {start} to {goal}",
+            "robots": [_robot("left", urdf, folder, 0.0), _robot("right", urdf, folder, APART)],
+            "payload": {"size": list(BOX), "mass": 2.0},
+            "contacts": [
+                {"xyz": [0.0, side * BOX[1] / 2.0, 0.0], "friction": 0.8, "patch_radius": 0.03}
+                for side in (-1.0, 1.0)
+            ],
+            "task": {
+                "start": poses[start],
+                "goal": poses[goal],
+                "reference_speed": 0.25,
+                "reference_force": 100.0,
+            },
+            "handling": {"lift_height": 0.0, "set_down_height": 0.0},
+            "environment": scene,
+        }
+        straight = float(np.linalg.norm(given[goal] - given[start]))
+        tasks.append(Task(f"{start} to {goal}", problem, length, straight))
+    return Benchmark("shelves", "Two iiwa 14 and shelves", tuple(tasks), NOTE, coordinates)
+
+
+def postures(notebook: bytes) -> dict[str, Array]:
+    """By shelf the eight coordinates (8,) of the notebook: the left arm's joints, and the turn of
+    the right arm's elbow about the line from shoulder to wrist [rad].
+
+    Raises:
+        OutsideError: it is no notebook that has them.
+    """
+    try:
+        cells = json.loads(notebook)["cells"]
+        text = "\n".join("".join(cell["source"]) for cell in cells)
+        found = re.findall(r"^q_tilde_(\w+) = np\.array\(\[([^]]*)\]\)", text, re.MULTILINE)
+        given = {name: np.array([float(each) for each in row.split(",")]) for name, row in found}
+    except (ValueError, KeyError, TypeError) as error:
+        raise OutsideError("main.ipynb is no notebook of postures") from error
+    if {q.shape for q in given.values()} != {(8,)} or not {"top", "middle", "bottom"} <= set(given):
+        raise OutsideError("main.ipynb lacks the postures at the three shelves")
+    return given
+
+
+def coordinates(q_1: Array, q_2: Array) -> Array:
+    """(n, 8) their coordinates of both arms' joints (n, 7), see `postures`.
+
+    The turn is counted from the plane through the arm's first axis. Where the wrist is on that axis
+    it is without meaning.
+    """
+    return np.column_stack([q_1, np.unwrap([elbow_turn(q) for q in q_2])])
+
+
+def elbow_turn(q: Array) -> float:
+    """Of an iiwa's elbow about the line from shoulder to wrist, for joints (7,) [rad]."""
+    upper = rotate("z", q[0]) @ rotate("y", q[1])
+    elbow = upper @ [0.0, 0.0, UPPER_ARM]
+    wrist = elbow + upper @ rotate("z", q[2]) @ rotate("y", -q[3]) @ [0.0, 0.0, FOREARM]
+    line = wrist / np.linalg.norm(wrist)
+    across = np.cross(line, [0.0, 0.0, 1.0])
+    return float(np.arctan2(elbow @ across, elbow @ np.cross(across, line)))
+
+
+def _box(model: pin.Model, q: Array) -> list[float]:
+    """The box's pose where the left arm stands so; the last link points along y."""
+    data = model.createData()
+    pin.framesForwardKinematics(model, data, q)
+    hand = data.oMf[model.getFrameId("iiwa_link_7")]
+    centre = hand.act(np.array([0.0, 0.0, GRASP / 2.0]))
+    return [*np.round(centre, 3).tolist(), 0.0, 0.0, 0.0]
+
+
+def _robot(name: str, urdf: Path, folder: Path, y: float) -> dict[str, Any]:
+    start = float(GRIPPER["xyz"][2]) + 0.036
+    return {
+        "name": name,
+        "urdf": str(urdf.resolve()),
+        "package_dirs": [str(folder.resolve())],
+        "chain": ["base", "iiwa_link_7"],
+        "base": {"xyz": [0.0, y, 0.0], "rpy": [0.0, 0.0, 0.0]},
+        "pad": {"xyz": [0.0, 0.0, PAD]},
+        "acceleration_max": ACCELERATION,
+        "tool": [
+            GRIPPER,
+            {
+                "name": "pad",
+                "kind": "cylinder",
+                "radius": 0.03,
+                "length": PAD - start,
+                "xyz": [0.0, 0.0, (PAD + start) / 2.0],
+            },
+        ],
+    }
+
+
+def _scene(models: Path) -> list[dict[str, Any]]:
+    """Table and shelves as bodies of a workcell."""
+    return [
+        {**table, "xyz": (np.array(table["xyz"]) + at).tolist()}
+        for name, at in STANDING.items()
+        for table in read_scene(models / name).tables(models, models)
+    ]

@@ -1,0 +1,158 @@
+"""Other people's benchmarks, from a folder laid out as theirs, with an arm of its dimensions."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from scipy.optimize import fsolve
+from scipy.spatial.transform import Rotation
+
+import hybrid_opt as ho
+from hybrid_opt.display.table import NOTHING
+from hybrid_opt.proposing.problem import completed, read_problem
+from studies.research.benchmarks import shelves
+from studies.research.benchmarks.__main__ import main
+from studies.research.benchmarks.measuring import Length, Measured, measured, table, travelled
+from symbolic.errors import SettingsError
+
+POSTURES = {
+    "bottom": [-0.6431, 1.9156, -1.7968, 1.2945, -0.0238, -0.8770, -1.7042, 1.45],
+    "middle": [-0.5997, 1.4898, -1.4740, 1.2905, -0.0442, -0.8794, -1.1603, 1.45],
+    "top": [-0.1995, 0.9141, -2.2366, 0.5239, 0.7998, -1.3575, -1.0153, 2.41],
+}
+"""Those of the notebook at commit aca3cbd, to four digits [rad]."""
+
+HEIGHTS = (0.15, 0.21, 0.2, 0.22, 0.2, 0.2, 0.081)
+"""Of an iiwa 14's joints above the one before [m]."""
+
+AXES = ("0 0 1", "0 1 0", "0 0 1", "0 -1 0", "0 0 1", "0 1 0", "0 0 1")
+
+
+def arm() -> str:
+    """URDF of an arm with an iiwa 14's joints, a small ball on every link."""
+    inertia = '<inertia ixx="0.1" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"/>'
+    ball = '<collision><geometry><sphere radius="0.05"/></geometry></collision>'
+    parts = ['<link name="base"/>']
+    for k, (height, axis) in enumerate(zip(HEIGHTS, AXES, strict=True), 1):
+        before = "base" if k == 1 else f"iiwa_link_{k - 1}"
+        parts.append(
+            f'<link name="iiwa_link_{k}"><inertial><mass value="3"/>{inertia}</inertial>{ball}'
+            f'</link><joint name="iiwa_joint_{k}" type="revolute"><parent link="{before}"/>'
+            f'<child link="iiwa_link_{k}"/><origin xyz="0 0 {height}"/><axis xyz="{axis}"/>'
+            '<limit lower="-3" upper="3" velocity="1.5" effort="200"/></joint>'
+        )
+    return f'<robot name="iiwa14">{"".join(parts)}</robot>'
+
+
+def scene(name: str, size: str, height: float) -> str:
+    return (
+        f'<sdf version="1.7"><model name="{name}"><link name="body"><collision name="{name}">'
+        f"<pose>0 0 {height} 0 0 0</pose><geometry><box><size>{size}</size></box></geometry>"
+        "</collision></link></model></sdf>"
+    )
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """Laid out as their repository."""
+    models = tmp_path / "bimanual" / "models"
+    lines = [f"q_tilde_{name} = np.array({q})\n" for name, q in POSTURES.items()]
+    cells = [{"cell_type": "markdown", "source": ["text"]}, {"source": lines}]
+    written = {
+        models.parent / "notebooks" / "main.ipynb": json.dumps({"cells": cells}),
+        models / "iiwa14_convex_decimated_collision.urdf": arm(),
+        models / "old_table" / "table_wide.sdf": scene("table_top", "5 5 0.2", -0.1),
+        models / "old_shelves.sdf": scene("shelf", "0.4 1.0 0.014", 0.3),
+    }
+    for path, text in written.items():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text, encoding="utf-8")
+    return tmp_path
+
+
+def test_the_shelves_become_problems_of_this_project(folder: Path) -> None:
+    given = shelves.benchmark(folder)
+    assert [task.name for task in given.tasks] == [
+        "top to middle",
+        "middle to bottom",
+        "bottom to top",
+    ]
+    places = {"bottom": [0.6, 0.4, 0.1], "middle": [0.65, 0.4, 0.44], "top": [0.7, 0.4, 0.73]}
+    for task in given.tasks:
+        start, goal = task.name.split(" to ")
+        path = folder / "problem.toml"
+        path.write_text(completed("", {}, task.problem), encoding="utf-8")
+        poses = np.array(read_problem(path).poses)
+        np.testing.assert_allclose(poses[:, :3], [places[start], places[goal]], atol=2e-3)
+        apart = np.subtract(POSTURES[goal], POSTURES[start])
+        assert task.straight == pytest.approx(np.sqrt(apart @ apart))
+    by_name = {body["name"]: body["xyz"] for body in given.tasks[0].problem["environment"]}
+    np.testing.assert_allclose(by_name["table_top body table_top"], [0.4, 0.3825, -0.1])
+    np.testing.assert_allclose(by_name["shelf body shelf"], [0.8, 0.3825, 0.3])
+
+
+def test_the_elbow_turns_about_shoulder_and_wrist() -> None:
+    """Turn the elbow by SciPy, find joints that reach it, and see them turned by as much."""
+    model = pin.buildModelFromXML(arm())
+    data = model.createData()
+
+    def bend(q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        pin.forwardKinematics(model, data, np.concatenate([q, np.zeros(7 - len(q))]))
+        found = [data.oMi[k].translation.copy() for k in (2, 4, 6)]
+        return found[0], found[1], found[2]
+
+    q = np.array([0.4, 0.7, -0.3, -1.2])
+    shoulder, elbow, wrist = bend(q)
+    line = (wrist - shoulder) / np.linalg.norm(wrist - shoulder)
+    for angle in (-0.4, 0.1, 0.5):
+        there = shoulder + Rotation.from_rotvec(angle * line).apply(elbow - shoulder)
+
+        def missed(some: np.ndarray, there: np.ndarray = there) -> np.ndarray:
+            _, now, hand = bend(some)
+            return np.array([*(now - there)[:2], *(hand - wrist)[:2]])
+
+        turned = fsolve(missed, q, xtol=1e-13)
+        np.testing.assert_allclose(bend(turned)[2], wrist, atol=1e-9)
+        wider = [np.concatenate([each, np.zeros(3)]) for each in (q, turned)]
+        by = shelves.elbow_turn(wider[1]) - shelves.elbow_turn(wider[0])
+        assert by == pytest.approx(angle, abs=1e-8)
+        path = shelves.coordinates(np.zeros((2, 7)), np.array(wider))
+        assert travelled(path) == pytest.approx(abs(angle), abs=1e-8)
+
+
+def test_what_is_not_theirs_is_refused(folder: Path) -> None:
+    notebook = folder / "bimanual" / "notebooks" / "main.ipynb"
+    for text in ("{", '{"cells": 3}', '{"cells": [{"source": ["q_tilde_top = np.array([1])"]}]}'):
+        notebook.write_text(text, encoding="utf-8")
+        with pytest.raises(SettingsError, match=r"(?s)main.ipynb .*git clone"):
+            shelves.benchmark(folder)
+    with pytest.raises(SettingsError, match="git clone"):
+        shelves.benchmark(folder / "nowhere")
+
+
+def test_the_program_says_how_to_get_files(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([]) == 0
+    assert "git clone" in capsys.readouterr().out
+    assert main(["shelfs"]) == 2
+    assert "no benchmark 'shelfs'; there are shelves" in capsys.readouterr().err
+
+
+def test_a_task_without_a_carry_says_why(folder: Path) -> None:
+    given = shelves.benchmark(folder)
+    task = given.tasks[0]
+    task.problem["task"]["goal"][2] = 0.3
+    found = measured(given, task, folder / "out", ho.ProposeSettings(), 1, study=False)
+    assert "payload meets shelf body shelf at the goal" in found.refused
+    assert found.refused in table(given, [found]).note
+
+
+def test_the_table_has_figures_where_there_are_some(folder: Path) -> None:
+    given = shelves.benchmark(folder)
+    some = Measured(given.tasks[0], "", 12.0, 20.0, Length(3.0, 2.1))
+    rows = table(given, [some]).rows
+    assert rows[0][:7] == ("top to middle", "12.0", "20.0", "3.00", "2.10", "1.88", "2.09")
+    assert rows[0][7:] == (NOTHING,) * 3
