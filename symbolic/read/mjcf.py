@@ -43,7 +43,7 @@ def mjcf_as_urdf(path: Path, content: bytes) -> bytes:
 
     The world is the root link `world`. MJCF knows no velocity limits: they are zero, and a cell
     has to give its own (`velocity_max`). Shapes that collide with nothing (contype and
-    conaffinity zero) are left out.
+    conaffinity zero) are left out. A floating base is fixed where the file has it.
 
     Args:
         path: the file.
@@ -98,10 +98,13 @@ class _Writer:
         for joint in range(first, first + count):
             called = model.joint(joint).name or f"joint_{joint}"
             kind = kinds(int(model.jnt_type[joint]))
+            if kind == kinds.mjJNT_FREE and np.count_nonzero(model.jnt_type == kind) == 1:
+                continue  # a floating base, the only one
             if kind not in (kinds.mjJNT_HINGE, kinds.mjJNT_SLIDE):
                 raise OutsideError(
-                    f"joint {called!r} of body {name!r} is free or a ball; allowed are hinges and "
-                    "slides: leave what stands around to the cell's environment"
+                    f"joint {called!r} of body {name!r} is a ball or one of several free ones; "
+                    "allowed are hinges, slides and one floating base: leave what stands around "
+                    "to the cell's environment"
                 )
             if model.qpos0[model.jnt_qposadr[joint]]:
                 raise OutsideError(f"joint {called!r} has a ref; allowed is zero")
@@ -132,13 +135,27 @@ class _Writer:
 
     def _effort(self, joint: int) -> float:
         """What may act at a joint: its own bound, else that of its motors; 0 where none is."""
-        model = self._model
+        model, words = self._model, self._mujoco
         if model.jnt_actfrclimited[joint]:
             return float(np.abs(model.jnt_actfrcrange[joint]).min())
-        moves = model.actuator_trntype == self._mujoco.mjtTrn.mjTRN_JOINT
-        bounded = moves & (model.actuator_trnid[:, 0] == joint) & (model.actuator_forcelimited > 0)
-        forces = np.abs(model.actuator_forcerange).min(axis=1)
-        return float(np.sum((forces * np.abs(model.actuator_gear[:, 0]))[bounded]))
+        # A motor's force is its control times its gain, so bounds of either bound it.
+        motor = (model.actuator_gaintype == words.mjtGain.mjGAIN_FIXED) & (
+            model.actuator_biastype == words.mjtBias.mjBIAS_NONE
+        )
+        limited = np.array(
+            [model.actuator_forcelimited > 0, motor & (model.actuator_ctrllimited > 0)]
+        )
+        gains = np.abs(model.actuator_gainprm[:, 0])
+        ranges = np.array(
+            [
+                np.abs(model.actuator_forcerange).min(axis=1),
+                np.abs(model.actuator_ctrlrange).min(axis=1) * gains,
+            ]
+        )
+        forces = np.where(limited, ranges, np.inf).min(axis=0)
+        moves = model.actuator_trntype == words.mjtTrn.mjTRN_JOINT
+        counted = moves & (model.actuator_trnid[:, 0] == joint) & np.isfinite(forces)
+        return float(np.sum((forces * np.abs(model.actuator_gear[:, 0]))[counted]))
 
     def _inertial(self, link: ElementTree.Element, body: int) -> None:
         model = self._model
@@ -174,9 +191,10 @@ class _Writer:
                 # MuJoCo turns a mesh to its principal axes, and the geom with it.
                 pose = pose @ inverse(self._pose(model.mesh_pos[mesh], model.mesh_quat[mesh]))
             case other:
+                scene = "" if model.geom_bodyid[geom] else "; name the robot's file, not a scene's"
                 raise OutsideError(
-                    f"body {name!r} has a shape of the kind {other.name[7:].lower()} without a "
-                    "file; allowed are boxes, cylinders, spheres, capsules and mesh files"
+                    f"body {name!r} has a shape of the kind {other.name[7:].lower()}; allowed are "
+                    f"boxes, cylinders, spheres, capsules and meshes with a file{scene}"
                 )
         element = ElementTree.SubElement(link, "collision")
         _origin(element, pose)

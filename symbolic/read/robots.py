@@ -200,8 +200,9 @@ def _limit(table: Table, key: str, each: tuple[Quantity, ...], urdf_value: Array
         if not allowed.contains(float(value)):
             table.problems.add(
                 table.at(key),
-                f"the URDF gives {value:g} for joint {joint + 1}; allowed is {allowed.allowed()}"
-                f"{allowed.suspicion(float(value))}; correct the URDF or give {key} here",
+                f"the description gives {value:g} for joint {joint + 1}; allowed is "
+                f"{allowed.allowed()}{allowed.suspicion(float(value))}; correct it, or give {key} "
+                "here",
             )
             return read_only(np.ones(len(each)))
     return read_only(urdf_value)

@@ -80,7 +80,12 @@ ODD = """<mujoco><compiler angle="degree" meshdir="meshes"/>
   <body pos="0.5 0 0" euler="0 40 0"><joint name="last" axis="1 0 0"/><geom size="0.1" mass="2"/>
    <site name="tool" pos="0 0 0.3"/></body>
  </body></body></worldbody>
-<actuator><motor joint="turn" gear="10" forcerange="-3 4"/></actuator></mujoco>"""
+<actuator>
+ <motor joint="turn" gear="10" forcerange="-3 4" ctrlrange="-9 9"/>
+ <general joint="tilt" gear="-2" gainprm="5" ctrlrange="-3 7"/>
+ <motor joint="tilt" ctrlrange="-4 4" forcerange="-100 100"/>
+ <position joint="last" kp="50" ctrlrange="-1 1"/>
+</actuator></mujoco>"""
 
 
 @pytest.fixture
@@ -100,7 +105,12 @@ def test_links_move_as_in_mujoco(odd: Path) -> None:
     model, other = reduced_model(urdf), mujoco.MjModel.from_xml_path(str(odd))
     data = mujoco.MjData(other)
     assert list(model.names)[1:] == ["slide", "turn", "tilt", "last"]
-    np.testing.assert_allclose(model.effortLimit, [0.0, 30.0, 0.0, 0.0])
+    np.testing.assert_allclose(model.effortLimit, [0.0, 30.0, 34.0, 0.0])
+    for control in (-1e6, 1e6):
+        data.ctrl[:3] = control, -control, control
+        mujoco.mj_forward(other, data)
+        reached = np.abs(data.qfrc_actuator)
+        assert np.all(model.effortLimit[1:3] <= reached[1:3] + 1e-9)
     kinds = [urdf.joints[name].kind for name in ("slide", "turn", "tilt")]
     assert kinds == ["prismatic", "revolute", "continuous"]
     (mesh,) = urdf.collisions["carriage"]
@@ -127,6 +137,24 @@ def test_links_move_as_in_mujoco(odd: Path) -> None:
         )
 
 
+def test_a_floating_base_stands_where_the_file_has_it(tmp_path: Path) -> None:
+    path = tmp_path / "humanoid.xml"
+    path.write_text(
+        '<mujoco><worldbody><body name="pelvis" pos="0.1 0.2 1" euler="0 0 90"><freejoint/>'
+        '<geom size=".1"/><body name="arm" pos="0.3 0 0"><joint name="turn"/><geom size=".1"/>'
+        "</body></body></worldbody></mujoco>"
+    )
+    model, other = reduced_model(read_urdf(path)), mujoco.MjModel.from_xml_path(str(path))
+    assert list(model.names)[1:] == ["turn"]
+    data = mujoco.MjData(other)
+    data.qpos[7] = 0.4
+    mujoco.mj_kinematics(other, data)
+    found = placements(model, np.array([0.4]))
+    for name in ("pelvis", "arm"):
+        np.testing.assert_allclose(found[name][:3, 3], data.body(name).xpos, atol=1e-9)
+        np.testing.assert_allclose(found[name][:3, :3].ravel(), data.body(name).xmat, atol=1e-9)
+
+
 def test_a_cell_of_mjcf_is_stored_with_its_digest(gofa: Path, tmp_path: Path) -> None:
     """MJCF has no velocity limits: the cell gives them, or is told to."""
     data = sample_data()
@@ -151,12 +179,18 @@ def body(inside: str) -> str:
     ("text", "words"),
     [
         ("<mujoco><worldbody><geom/></worldbody></mujoco>", "MuJoCo does not take it"),
-        (body("<freejoint/>"), "is free or a ball"),
+        (body("<body><joint type='ball'/><geom size='.1'/></body>"), "is a ball"),
+        (
+            "<mujoco><worldbody><body><freejoint/><geom size='.1'/></body>"
+            "<body><freejoint/><geom size='.1'/></body></worldbody></mujoco>",
+            "one of several free ones",
+        ),
         (body("<joint name='j' ref='1' type='slide'/>"), "joint 'j' has a ref"),
         (body("<geom type='ellipsoid' size='1 2 3'/>"), "of the kind ellipsoid"),
         (
             "<mujoco><worldbody><geom type='plane' size='1 1 1'/></worldbody></mujoco>",
-            "body 'world' has a shape of the kind plane",
+            "body 'world' has a shape of the kind plane; allowed are boxes, cylinders, spheres, "
+            "capsules and meshes with a file; name the robot's file, not a scene's",
         ),
         (
             "<mujoco><asset><mesh name='m' vertex='0 0 0 1 0 0 0 1 0 0 0 1' refpos='1 0 0'/>"
@@ -166,7 +200,7 @@ def body(inside: str) -> str:
         (
             "<mujoco><asset><mesh name='m' vertex='0 0 0 1 0 0 0 1 0 0 0 1'/>"
             "</asset><worldbody><geom type='mesh' mesh='m'/></worldbody></mujoco>",
-            "without a file",
+            "of the kind mesh; allowed",
         ),
     ],
 )

@@ -178,7 +178,7 @@ URDF_CASES: list[tuple[str, UrdfChange, str, str]] = [
         "no effort",
         lambda text: text.replace('effort="390"', 'effort="0"'),
         "robots[0].torque_max",
-        "the URDF gives 0 for joint 1",
+        "the description gives 0 for joint 1",
     ),
     (
         "range reversed",
