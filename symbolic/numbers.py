@@ -244,7 +244,7 @@ def _workcell(take: _Take, cell: Workcell) -> NumberedWorkcell:
     """The cell with its numbers taken; what no formula reads is left out."""
     pairs = zip(cell.robots, cell.contacts, strict=True)
     first, second = (_robot(take, i, *pair) for i, pair in enumerate(pairs))
-    # A squeeze to start from is looked for with the contacts' numbers themselves.
+    # A squeeze to start from is looked for with the numbers of what is held themselves.
     searched = cell.has_force_slopes and not cell.has_closed_form
     payload: Any = replace(cell.payload, size=np.zeros(3), shape=None, jerk_max=None)
     contacts: Any = cell.contacts
@@ -263,17 +263,17 @@ def _workcell(take: _Take, cell: Workcell) -> NumberedWorkcell:
             _contact(take, f"contacts[{i}]", contact, cell) for i, contact in enumerate(contacts)
         )
         payload = _as(NumberedPayload, payload, **own, given=take.group(HELD))
-        task = _task(take, task)
     return NumberedWorkcell(
         name="",
         robots=(first, second),
         payload=payload,
         contacts=contacts,
-        task=task,
+        task=_task(take, task),
         environment=(),
         facing=cell.has_facing_pads,
         opposite=cell.has_opposite_pads,
         beside=cell.has_pads_beside,
+        turn=cell.start_turn if searched else None,
     )
 
 

@@ -306,8 +306,8 @@ def whole_wrench(wrench: ca.SX) -> ca.SX:
 
 def _load_at_rest(workcell: Workcell) -> Array:
     """(6,) of the payload as it stands at the start, as a direction that is scaled like loads."""
-    task = workcell.task
-    turn = ca.evalf(rotation_matrix(task.orientation, ca.SX(ca.DM(task.waypoints[0].lower[3:]))))
+    start = ca.SX(ca.DM(workcell.start_turn))
+    turn = ca.evalf(rotation_matrix(workcell.task.orientation, start))
     force = -np.array(turn).T @ np.array(GRAVITY)
     moment = np.cross(workcell.payload.centre_of_mass, force)
     load = np.concatenate([force, moment])

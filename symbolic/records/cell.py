@@ -545,6 +545,11 @@ class Workcell:
         return self.has_closed_form or not self.has_facing_pads
 
     @property
+    def start_turn(self) -> Array:
+        """(3,) orientation of the payload at the first waypoint [rad]."""
+        return self.task.waypoints[0].lower[3:]
+
+    @property
     def pads(self) -> tuple[Contact, ...]:
         """All pads: those of the first robot, then those of the second."""
         return tuple(pad for contact in self.contacts for pad in (contact, *contact.further))

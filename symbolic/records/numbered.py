@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from symbolic.array import Array
 from symbolic.records.cell import Contact, Payload, Robot, Workcell
 from symbolic.records.task import RedundantJoint, Task, Waypoint
 
@@ -97,11 +98,23 @@ class NumberedTask(Task):
 
 @dataclass(frozen=True)
 class NumberedWorkcell(Workcell):
-    """A cell whose pads stand as these say, whatever their numbers."""
+    """A cell whose pads stand as these say, whatever their numbers.
+
+    Attributes:
+        facing, opposite, beside: see the properties of `Workcell`.
+        turn: `start_turn` where a squeeze is looked for under the load there, else None.
+    """
 
     facing: bool = False
     opposite: bool = False
     beside: bool = False
+    turn: Array | None = None
+
+    @property
+    def start_turn(self) -> Array:
+        """See `Workcell`."""
+        assert self.turn is not None, "only where a squeeze is looked for"
+        return self.turn
 
     @property
     def has_facing_pads(self) -> bool:

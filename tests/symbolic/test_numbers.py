@@ -17,9 +17,10 @@ from symbolic.contact.load import load_function
 from symbolic.functions import arm_functions, sample_functions
 from symbolic.limits import path_force_function, sample_limits_function
 from symbolic.numbers import BODIES, GROUPS, START, CellNumbers
+from symbolic.read.cell import load
 from symbolic.records import Workcell
 from symbolic.records.poses import pose_matrix
-from tests.symbolic.cells import hand_cell, hand_model, rack_cell, with_task
+from tests.symbolic.cells import RACK, hand_cell, hand_model, rack_cell, with_task
 
 
 @cache
@@ -105,6 +106,24 @@ def test_so_does_a_path_under_each_law(law: Any) -> None:
     given = values["task_numbers"]
     x = np.random.default_rng(2).uniform(plain.workcell.task.lower, plain.workcell.task.upper)
     for one, other in zip(symbols.call([x, given]), constants.call([x]), strict=True):
+        np.testing.assert_allclose(np.array(one), np.array(other), rtol=1e-10, atol=1e-12)
+
+
+def test_where_a_squeeze_is_looked_for_the_path_is_numbers_all_the_same() -> None:
+    """Only the payload, the pads and how the start turns it are structure."""
+    cell = load(RACK.with_name("fork.toml"))
+    plain, symbolic, values = both(cell)
+    ours, task = numbers_of(cell), cell.task
+    start, *others = task.waypoints
+    for lift, turn, same in ((0.01, 0.0, True), (0.0, 0.1, False)):
+        pose = start.lower + np.array([0.0, 0.0, lift, turn, 0.0, 0.0])
+        points = (replace(start, lower=pose, upper=pose), *others)
+        changed = numbers_of(replace(cell, task=replace(task, waypoints=points)))
+        assert (changed.bodies_digest == ours.bodies_digest) is same
+    constants, symbols = (sample_functions(model)["path"] for model in (plain, symbolic))
+    x = np.random.default_rng(2).uniform(task.lower, task.upper)
+    found = symbols.call([x, values["task_numbers"]])
+    for one, other in zip(found, constants.call([x]), strict=True):
         np.testing.assert_allclose(np.array(one), np.array(other), rtol=1e-10, atol=1e-12)
 
 
