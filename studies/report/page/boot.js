@@ -1,6 +1,10 @@
 "use strict";
-/* Unpacks the page's data and runs its scripts, in order; each is allowed by its hash. */
+/* Unpacks the page's data and runs its scripts, in order; each is allowed by its hash. What stands in
+   the page already, the answer, is painted first. */
 (async function () {
+  if (!document.hidden) {
+    await new Promise((painted) => requestAnimationFrame(() => setTimeout(painted)));
+  }
   for (const block of document.querySelectorAll("script[type='application/gzip']")) {
     const bytes = Uint8Array.from(atob(block.textContent), (letter) => letter.charCodeAt(0));
     const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"));
