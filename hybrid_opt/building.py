@@ -92,9 +92,10 @@ def _makers(cell: Cell, polish: bool) -> Iterator[Maker]:
     from hybrid_opt.timing.path_timer import PATH_INTERVALS
 
     compiled, workcell, cache = cell.compiled, cell.workcell, cell.compiled.cache
-    polished = polish and workcell.has_facing_pads
+    known = workcell.has_facing_pads
     if _driven(cell):
-        polished = polished and is_polishable(workcell)
+        known = is_polishable(workcell, cell.force_kind.robust)
+    polished = polish and known
     yield lambda: cell.evaluator
     if polished:
         yield lambda: cell.polish_functions

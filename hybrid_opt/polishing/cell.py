@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import cache, lru_cache
+from functools import cache, lru_cache, partial
 
 import casadi as ca
 import numpy as np
@@ -18,6 +18,7 @@ from hybrid_opt.evaluate.objectives import ROBUST_OBJECTIVES
 from hybrid_opt.polishing.robust import RobustSamples
 from symbolic.array import Array
 from symbolic.cell_model import CellBodies, CellModel
+from symbolic.limits import WEIGHT as TIMING_WEIGHT
 from symbolic.path.spline import path_basis
 from symbolic.records.cell import Workcell
 from symbolic.records.task import POSE_SIZE, Task, extended_waypoints
@@ -36,6 +37,7 @@ from symbolic.smooth.places import (
     row_name,
 )
 from symbolic.smooth.samples import (
+    WEIGHT,
     Quantity,
     branch_coefficients,
     held_functions,
@@ -181,12 +183,14 @@ def polish_functions(compiled: CompiledCell) -> PolishFunctions:
     )
     built |= compiled.functions("polish", one_by_one, details, bodies=False)
     built |= compiled.functions("polish rows", rows, details, levels=levels, lanes=0)
-    if "load" in quantities:
-        built |= compiled.made(
-            "held", lambda: held_functions(compiled.workcell), levels=levels, lanes=0
-        )
-    if compiled.workcell.task.time_law == "optimal":
+    driven = compiled.workcell.task.time_law == "optimal"
+    if driven:
         built |= compiled.functions("driven", driven_functions, lanes=0, bodies=False)
+    if "load" in quantities or (driven and not compiled.workcell.has_closed_form):
+        # What is driven is judged by timings, whose forces are those at a weight of their own.
+        name, weight = ("driven held", TIMING_WEIGHT) if driven else ("held", WEIGHT)
+        make = partial(held_functions, compiled.workcell, weight)
+        built |= compiled.made(name, make, levels=levels, lanes=0)
     return PolishFunctions(built, RowFunctions(compiled.bodies, built, compiled))
 
 

@@ -40,6 +40,7 @@ from hybrid_opt.polishing.solvers.quadratic import (
     convex,
     quadratic_method,
 )
+from hybrid_opt.robust.cases import is_squeezed
 from hybrid_opt.robust.path_force import PathPoints, robust_path
 from hybrid_opt.timing.drive import Driver
 from symbolic.array import Array
@@ -82,13 +83,20 @@ FARTHER = (2.0, 4.0, 8.0)
 LEAST_SQUARED, LARGEST_SQUARED = 0.9, 3.0
 """How far a squared speed may fall and rise in a step, as shares of it."""
 
+UNPOLISHABLE = (
+    "the polish does not know the allocation 'joint' of two pads that face one another, nor robust "
+    "forces of pads whose normals are not opposite"
+)
+"""What is not `is_polishable`."""
+
 STILL = 1e-3
 """The least force limit is this share above the force that holds the box at rest."""
 
 
-def is_polishable(workcell: Workcell) -> bool:
-    """Whether drivable carries of a cell can be polished: those whose forces have a closed form."""
-    return workcell.has_closed_form
+def is_polishable(workcell: Workcell, robust: bool) -> bool:
+    """Whether drivable carries of a cell can be polished: those whose planned forces have slopes,
+    and where robust ones are limited, of two pads with opposite normals."""
+    return workcell.has_force_slopes and (is_squeezed(workcell) or not robust)
 
 
 @dataclass(frozen=True)
@@ -204,10 +212,10 @@ class DriveWay(Way[DriveReached, DriveStep]):
             SettingsError: the time law is not 'optimal', or forces have no closed form.
         """
         driver, task = cell.evaluator.driver, cell.task
-        if driver is None or not is_polishable(cell.workcell):
+        if driver is None or not is_polishable(cell.workcell, driver.robust):
             raise SettingsError(
-                "the polish of drivable carries needs the time law 'optimal' and the allocation "
-                "'paper', or 'soft-finger' with two pads of opposite normals: switch the polish off"
+                f"the polish of drivable carries needs the time law 'optimal'; {UNPOLISHABLE}: "
+                "switch the polish off"
             )
         super().__init__(cell, ActiveSet(cell), CarryReader(cell))
         self.driver, self.settings, self._n = driver, settings, task.n_path

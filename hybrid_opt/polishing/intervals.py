@@ -8,6 +8,7 @@ interval: u'' = (w_end - w_begin) n / 2, u'^2 = w.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,6 +27,10 @@ from symbolic.smooth.driven import (
     driven_layout,
     planned_branches,
 )
+from symbolic.smooth.samples import held_name
+
+GRASP_ROWS = 2
+"""Forces that a program finds, those of both robots."""
 
 
 @dataclass(frozen=True)
@@ -48,11 +53,13 @@ class RowKinds:
         """Those of a workcell: both signs where a quantity has one, all branches of the forces.
 
         Args:
-            robust: further forces beside the quantities, each with a row of its own.
+            robust: further forces behind the quantities, each with a row of its own, as both of a
+                program have.
         """
         layout = driven_layout(workcell)
         eye = np.eye(layout.size)
         forces = planned_branches(workcell)
+        further = robust + (GRASP_ROWS if layout.by_program else 0)
         blocks = [
             eye[layout.block("speed")],
             eye[layout.block("acceleration")],
@@ -64,7 +71,7 @@ class RowKinds:
             forces.reshape(-1, layout.size),
         ]
         planned = np.concatenate(blocks)
-        mix = block_diag(planned, np.eye(robust))
+        mix = block_diag(planned, np.eye(further))
         is_force = np.arange(len(mix)) >= len(planned) - forces.shape[0] * forces.shape[1]
         terms = int(np.count_nonzero(mix, axis=1).max())
         where = np.argsort(mix == 0.0, axis=1, kind="stable")[:, :terms]
@@ -91,6 +98,8 @@ class IntervalGrid:
         carry_over: (points, moving, n_path) from the path's variables to them.
         kinds: the inequalities of a point.
         robust: robust forces, None where planned ones are limited.
+        layout: of the quantities.
+        load: place of the load among them.
     """
 
     def __init__(self, workcell: Workcell, intervals: int, robust: bool = False) -> None:
@@ -108,6 +117,7 @@ class IntervalGrid:
         self.robust = RobustForces(workcell, self.pose) if robust else None
         self.kinds = RowKinds.of(workcell, 0 if self.robust is None else ROBUST_ROWS)
         self.layout = driven_layout(workcell)
+        self.load = self.layout.block("load")
 
     def by_path(self, slope: Array, points: NDArray[np.intp]) -> Array:
         """(rows, n_path) slopes by the path's variables of slopes (rows, moving) at points."""
@@ -138,7 +148,7 @@ class IntervalValues:
 
     Attributes:
         grid: what the path shares with others.
-        value: (points, quantities), robust forces behind them.
+        value: (points, quantities), robust forces or those of a program behind them.
         slope: (points, quantities, moving + 2) by the extended pose and its derivatives, u'' and
             u'^2, the joints following.
     """
@@ -151,6 +161,7 @@ class IntervalValues:
     _follow: tuple[Array, Array]
     _pull: tuple[Array, Array]
     _functions: PolishFunctions
+    _held: Mapping[str, Array] | None
 
     @classmethod
     def at(
@@ -180,6 +191,11 @@ class IntervalValues:
             force, by_motion = grid.robust.at(inputs[:3], a, squared[s])
             value = np.hstack([value, force])
             slope = np.concatenate([slope, by_motion], axis=1)
+        pressed = None
+        if grid.layout.by_program:
+            pressed = functions.built[held_name("first")].batch(value[:, grid.load])
+            value = np.hstack([value, pressed["normal"]])
+            slope = np.concatenate([slope, _by_load(pressed, slope[:, grid.load])], axis=1)
         pull = tuple(found["pull"][s] for found in held)
         return cls(
             grid,
@@ -190,6 +206,7 @@ class IntervalValues:
             (follow[0], follow[1]),
             (pull[0], pull[1]),
             functions,
+            pressed,
         )
 
     def at_rest(self, force: float) -> tuple[Array, Array]:
@@ -197,16 +214,18 @@ class IntervalValues:
         or of a force limit [N] where pads press evenly; and their slopes (rows, moving) by the
         extended pose."""
         begins = [values[::2] for values in self._inputs]
-        still = np.zeros(len(begins[-1]))
+        still, grid = np.zeros(len(begins[-1])), self.grid
         out = self._functions.built[DRIVEN_FIRST].batch(*begins[:-2], still, still)
         follow = tuple(along[::2] for along in self._follow)
-        soft = self.grid.workcell.task.allocation == "soft-finger"
-        block = self.grid.layout.block("force" if soft else "pressure")
-        slope = _followed(self.grid, out["slope"][:, block], follow)[:, :, : self.grid.moving]
-        whole = force if soft else 1.0
-        return out["value"][:, block].reshape(-1) / whole, slope.reshape(
-            -1, self.grid.moving
-        ) / whole
+        paper, by_program = grid.workcell.task.allocation == "paper", grid.layout.by_program
+        block = grid.layout.block("pressure" if paper else "load" if by_program else "force")
+        value, slope = out["value"][:, block], out["slope"][:, block]
+        slope = _followed(grid, slope, follow)[:, :, : grid.moving]
+        if by_program:
+            pressed = self._functions.built[held_name("first")].batch(value)
+            value, slope = pressed["normal"], _by_load(pressed, slope)
+        whole = 1.0 if paper else force
+        return value.reshape(-1) / whole, slope.reshape(-1, grid.moving) / whole
 
     def rows(self) -> Array:
         """(points, kinds) mix . quantities of every inequality."""
@@ -216,13 +235,18 @@ class IntervalValues:
         """Second derivatives of weight . value.
 
         Args:
-            weight: (points, quantities and robust forces); the latter bend as planned forces do.
+            weight: (points, quantities and further forces); robust ones bend as planned ones do.
 
         Returns:
             The points (m,) with any weight, and (m, moving + 2, moving + 2) of each.
         """
         if self.grid.robust is not None:
             weight = self.grid.robust.as_planned(weight, self.value)
+        pressing = np.zeros((len(weight), 0))
+        if self._held is not None:
+            weight, pressing = np.hsplit(weight, [self.grid.layout.size])
+            weight = weight.copy()
+            weight[:, self.grid.load] += np.einsum("prl,pr->pl", self._held["slope"], pressing)
         at = np.flatnonzero(np.abs(weight).max(axis=1) > 0.0)
         n, variables = len(at), self.grid.layout.variables
         pose, moving = self.grid.pose, self.grid.moving
@@ -257,7 +281,17 @@ class IntervalValues:
             follow = np.concatenate([np.tile(np.eye(pose), (n, 1, 1)), along[at]], axis=2)
             total[:, :pose, :pose] += follow @ closed @ np.swapaxes(follow, 1, 2)
             start += n_joints
+        if self._held is not None:
+            second = self._functions.built[held_name("second")]
+            bent = second.batch(self._held["state"][at], pressing[at])["curvature"]
+            by_motion = self.slope[at][:, self.grid.load]
+            total += np.swapaxes(by_motion, 1, 2) @ bent @ by_motion
         return at, (total + np.swapaxes(total, 1, 2)) / 2.0
+
+
+def _by_load(pressed: Mapping[str, Array], slope: Array) -> Array:
+    """Slopes (points, 2, ...) of a program's forces, from those of their load (points, 6, ...)."""
+    return np.asarray(pressed["slope"] @ slope)
 
 
 def _followed(grid: IntervalGrid, full: Array, follow: tuple[Array, ...]) -> Array:

@@ -24,8 +24,13 @@ from hybrid_opt.campaign.settings import DRIVABLE, SUMMARY
 from hybrid_opt.campaign.stages import drivable_settings, drivable_stage
 from hybrid_opt.cell import Cell
 from hybrid_opt.display.table import counted
-from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES, FORCE_PAIRS, PAPER_OBJECTIVES
-from hybrid_opt.polishing.drive import is_polishable
+from hybrid_opt.evaluate.objectives import (
+    DRIVABLE_OBJECTIVES,
+    FORCE_PAIRS,
+    PAPER_OBJECTIVES,
+    force_kind,
+)
+from hybrid_opt.polishing.drive import UNPOLISHABLE, is_polishable
 from hybrid_opt.polishing.polisher import knows_forces
 from hybrid_opt.polishing.settings import (
     PolishSettings,
@@ -145,13 +150,9 @@ def run_study(
         study = replace(study, polish=None)
     polish = study.polish if alone else study.drivable_polish
     driven = Cell(cell).drivable().workcell if study.drivable and not alone else cell
-    if polish is not None and not is_polishable(driven):
-        allocation = driven.task.allocation
-        found = "pads lie otherwise" if allocation == "soft-finger" else f'it is "{allocation}"'
+    if polish is not None and not is_polishable(driven, force_kind(settings.objectives).robust):
         progress.note(
-            "the drivable carries of this cell are not polished, only searched: the polish of time "
-            'and force knows the allocation "paper", and "soft-finger" with two pads of opposite '
-            f"normals; here {found}"
+            f"the drivable carries of this cell are only searched, not polished: {UNPOLISHABLE}"
         )
         study = replace(study, drivable_polish=None, polish=None if alone else study.polish)
     with open_folder(settings, execution, cell) as folder:

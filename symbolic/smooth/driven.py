@@ -14,7 +14,9 @@ import numpy as np
 
 from symbolic.array import Array
 from symbolic.cell_model import CellModel
+from symbolic.contact.grasp import LOAD_SIZE
 from symbolic.contact.soft_finger import Detached
+from symbolic.expression import number
 from symbolic.limits import (
     PATH_OUTPUTS,
     contact_limits,
@@ -36,7 +38,8 @@ TANGENT_FLOOR = 1e-9
 class DrivenLayout:
     """Where the quantities at a driven point lie in their vector.
 
-    `joints` counts both arms', `pose` the entries of the extended pose.
+    `joints` counts both arms', `pose` the entries of the extended pose; `by_program` says that a
+    program finds the forces: then the load stands for them, and torque and pressure are left out.
 
     Blocks, in order:
     speed (joints + 2): squared speeds over their squared limits: joints, payload, its turning.
@@ -44,24 +47,28 @@ class DrivenLayout:
     cone (2): squared length of the payload's acceleration and angular acceleration, likewise.
     force (2): normal component and tangential magnitude of the required force, of which the
     paper's normal forces are made (`planned_branches`), or both normal forces of soft fingers [N].
+    load (6): force and moment that the pads have to balance, as
+    `symbolic.contact.grasp.grasp_wrenches` takes it [N, N m].
     torque (joints): over their limits, signed.
     pressure (2): shifts of the centres of pressure over their patches' radii.
     """
 
     joints: int
     pose: int = POSE_SIZE
+    by_program: bool = False
 
     @property
     def sizes(self) -> dict[str, int]:
         """Numbers per block."""
-        j = self.joints
+        j, closed = self.joints, 0 if self.by_program else 1
         return {
             "speed": j + 2,
             "acceleration": j,
             "cone": 2,
-            "force": 2,
-            "torque": j,
-            "pressure": 2,
+            "force": 2 * closed,
+            "load": LOAD_SIZE * (1 - closed),
+            "torque": j * closed,
+            "pressure": 2 * closed,
         }
 
     def block(self, name: str) -> slice:
@@ -83,13 +90,16 @@ class DrivenLayout:
 
 def driven_layout(workcell: Workcell) -> DrivenLayout:
     """The layout for a workcell's arms."""
-    return DrivenLayout(limit_layout(workcell).joints, workcell.task.extended_size)
+    joints, pose = limit_layout(workcell).joints, workcell.task.extended_size
+    return DrivenLayout(joints, pose, not workcell.has_closed_form)
 
 
 def planned_branches(workcell: Workcell) -> Array:
     """(2, branches, quantities) both planned normal forces' branches as sums of a point's
-    quantities."""
+    quantities; none where a program finds them."""
     layout, own = driven_layout(workcell), branch_coefficients(workcell)
+    if layout.by_program:
+        return np.zeros((2, 0, layout.size))
     forces = np.zeros((2, own.shape[1], layout.size))
     forces[:, :, layout.block("force")] = own
     return forces
@@ -151,18 +161,23 @@ def _value(model: CellModel, inputs: list[ca.SX], detached: Detached) -> ca.SX:
     )
     # Not the lengths' squares: a length has no slope where the box does not move.
     speeds = [ca.sumsqr(cones[k][:3] * reach[k]) for k in (0, 1)]
-    normal, ratios = contact_limits(workcell, block, (a, w), detached)
+    force = block["force"][:3] * a + block["force"][3:6] * w + block["force"][6:]
+    if not workcell.has_closed_form:
+        axes = ca.SX(number(workcell.contacts[0].T_box_pad[:3, :3]))
+        moment = block["moment"][:3] * a + block["moment"][3:] * w
+        in_box, centre = ca.mtimes(axes, force), ca.SX(number(payload.centre_of_mass))
+        forces, ratios = ca.vertcat(in_box, ca.mtimes(axes, moment) + ca.cross(centre, in_box)), []
+    else:
+        forces, found = contact_limits(workcell, block, (a, w), detached)
+        ratios = [found]
     if workcell.task.allocation == "paper":
-        force = block["force"][:3] * a + block["force"][3:6] * w + block["force"][6:]
         tangential = ca.sqrt(force[0] ** 2 + force[1] ** 2 + TANGENT_FLOOR**2)
         forces = ca.vertcat(force[2], tangential)
-    else:
-        forces = normal
     return ca.vertcat(
         block["speed"][:joints] ** 2 * w,
         *[speed * w for speed in speeds],
         block["acceleration"][:joints] * a + block["acceleration"][joints:] * w,
         *[ca.sumsqr(cone[:3] * a + cone[3:] * w) for cone in cones],
         forces,
-        ratios,
+        *ratios,
     )

@@ -144,9 +144,9 @@ def sample_functions(workcell: Workcell, quantity: Quantity) -> dict[str, ca.Fun
     return functions
 
 
-def held_functions(workcell: Workcell) -> dict[str, ca.Function]:
+def held_functions(workcell: Workcell, weight: float = WEIGHT) -> dict[str, ca.Function]:
     """Normal forces as smooth convex functions of a sample's load where they have no closed form,
-    see `symbolic.contact.soft_grasp.SoftGrasp.first` and `second`:
+    see `symbolic.contact.soft_grasp.SoftGrasp.first` and `second`, at a weight of the barriers:
 
     first: load (6,) -> normal (2,) [N], slope (6, 2), state (n,), whatever the second takes.
     second: state, weight (2,) -> curvature (6, 6), the Hessian of weight . normal by the load.
@@ -155,7 +155,7 @@ def held_functions(workcell: Workcell) -> dict[str, ca.Function]:
         SettingsError: the pads do not close their grasp.
     """
     friction = np.array([contact.friction for contact in workcell.contacts])
-    soft = SoftGrasp(Grasp(workcell), friction, WEIGHT)
+    soft = SoftGrasp(Grasp(workcell), friction, weight)
     return {held_name("first"): soft.first(), held_name("second"): soft.second()}
 
 

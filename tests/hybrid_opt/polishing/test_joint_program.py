@@ -34,7 +34,7 @@ class Programs:
         owner = owner or polisher()
         self.cell = smooth_cell(owner.evaluator)
         self.half, self.x = self.cell.half[:-1], x
-        self.timed = way_of(owner).paths.timed(x[:-1], FORCE)
+        self.timed = way_of(owner).paths.timed(x[:-1], float(x[-1]))
         self.carry = CarryReader(self.cell).read(x)
         self.intervals = IntervalGrid(self.cell.workcell, 100)
 

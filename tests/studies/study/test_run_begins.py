@@ -118,11 +118,13 @@ def test_why_carries_are_not_polished_is_told(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "stray").touch()  # so that it ends here
-    drum = str(RACK.with_name("drum.toml"))
-    assert run.main([drum, "--output", str(tmp_path)]) == 2
-    told = capsys.readouterr().err
-    assert "are not polished, only searched" in told
-    assert "here pads lie otherwise" in told
+    (tmp_path / "robots").symlink_to(RACK.parents[1] / "robots")
+    cell = tmp_path / "workcells" / "rack.toml"
+    cell.parent.mkdir()
+    joint = RACK.read_text("utf-8").replace("[task]", '[task]\ndrivable_allocation = "joint"')
+    cell.write_text(joint, "utf-8")
+    assert run.main([str(cell), "--output", str(tmp_path)]) == 2
+    assert "are only searched, not polished: the polish does not" in capsys.readouterr().err
 
 
 @pytest.fixture(scope="module")
