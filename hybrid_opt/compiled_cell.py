@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from functools import cached_property
+from functools import cached_property, lru_cache, wraps
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
@@ -20,10 +21,13 @@ if TYPE_CHECKING:
 
     from symbolic.cell_model import CellBodies, CellModel
     from symbolic.geometry.pairs import CellGeometry
-    from symbolic.numbers import CellNumbers
+    from symbolic.numbers import CellNumbers, WorkcellNumbers
     from symbolic.robot.branches import ArmSearch
 
 Loaded = TypeVar("Loaded")
+
+KEPT = 2
+"""Workcells that a function remembers."""
 
 
 class CompiledCell:
@@ -285,6 +289,45 @@ class CompiledCell:
         return self.functions(SCREENING, make, lanes=EVALUATOR_LANES)
 
 
+class _Identity:
+    """Lets a cache compare workcells by what they are, not by what they say."""
+
+    def __init__(self, workcell: Workcell) -> None:
+        self.workcell = workcell
+
+    def __hash__(self) -> int:
+        return id(self.workcell)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Identity) and self.workcell is other.workcell
+
+
+def kept_per_workcell(build: Callable[[Workcell], Loaded]) -> Callable[[Workcell], Loaded]:
+    """A function that gives the same record the same answer of `build` again."""
+
+    @lru_cache(maxsize=KEPT)
+    def kept(identity: _Identity) -> Loaded:
+        return build(identity.workcell)
+
+    @wraps(build, updated=())
+    def built(workcell: Workcell) -> Loaded:
+        return kept(_Identity(workcell))
+
+    return built
+
+
+def _numbers(workcell: Workcell) -> WorkcellNumbers:
+    from symbolic.numbers import WorkcellNumbers
+
+    return WorkcellNumbers(workcell)
+
+
+_held_numbers = kept_per_workcell(_numbers)
+
+_held: dict[tuple[Path, str, int], NumericFunction] = {}
+"""Functions that `held_function` loaded: cells that are tried out share them."""
+
+
 def held_function(
     workcell: Workcell,
     name: str,
@@ -303,17 +346,18 @@ def held_function(
     Raises:
         DualArmError: its code cannot be built.
     """
-    from symbolic.numbers import WorkcellNumbers
-
-    numbers, cache = WorkcellNumbers(workcell), cache or Cache()
+    numbers, cache = _held_numbers(workcell), cache or Cache()
     key = key_of(
         name,
         structure=numbers.digest,
         expressions=cache.code_digest("symbolic"),
         libraries=[f"scipy {library_version('scipy')}"],
     )
-    built = load_or_build(key, lambda: {name: make(numbers.symbols())}, cache, lanes=lanes)
-    return built[name].bound(numbers.values)
+    of = (cache.folder, key, lanes)
+    if of not in _held:
+        built = load_or_build(key, lambda: {name: make(numbers.symbols())}, cache, lanes=lanes)
+        _held[of] = built[name]
+    return _held[of].bound(numbers.values)
 
 
 EVALUATORS, SCREENING = "evaluators", "screening"

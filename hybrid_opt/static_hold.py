@@ -5,12 +5,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import lru_cache, wraps
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING
 
 import casadi as ca
 import numpy as np
 
+from hybrid_opt.compiled_cell import kept_per_workcell
 from symbolic.array import Array, Pair
 from symbolic.contact.load import LOAD_OUTPUTS, closed_load_function, uncertain_load_function
 from symbolic.errors import WorkcellError
@@ -28,38 +28,6 @@ ROUNDING = 1e-6
 
 STEPS = 24
 """Bisections for the mass or the friction that would do."""
-
-KEPT = 2
-"""Workcells that a function remembers."""
-
-Built = TypeVar("Built")
-
-
-class _Identity:
-    """Lets a cache compare workcells by what they are, not by what they say."""
-
-    def __init__(self, workcell: Workcell) -> None:
-        self.workcell = workcell
-
-    def __hash__(self) -> int:
-        return id(self.workcell)
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Identity) and self.workcell is other.workcell
-
-
-def kept_per_workcell(build: Callable[[Workcell], Built]) -> Callable[[Workcell], Built]:
-    """A function that gives the same record the same answer of `build` again."""
-
-    @lru_cache(maxsize=KEPT)
-    def kept(identity: _Identity) -> Built:
-        return build(identity.workcell)
-
-    @wraps(build, updated=())
-    def built(workcell: Workcell) -> Built:
-        return kept(_Identity(workcell))
-
-    return built
 
 
 @dataclass(frozen=True)

@@ -227,7 +227,7 @@ def _row(
         front = Front.of_search(changed, "neighbour", _tried(changed, near, fixed))
         if not fixed and len(front):
             front = polish(front, rng=np.random.default_rng(0), settings=POLISH)
-        found = recommend(front)
+        found = recommend(front, alone=True)
     except DualArmError as error:
         return Combination(
             numbers, np.nan, np.nan, np.zeros(0), str(error).splitlines()[-1].strip()

@@ -28,6 +28,7 @@ ROOMS = {
     ),
     "browser": (
         "hybrid_opt/display/test_view.py",
+        "hybrid_opt/workbench/test_live_page.py",
         "studies/report/test_report_browser.py",
     ),
     "heavy": (

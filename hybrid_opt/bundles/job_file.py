@@ -28,11 +28,11 @@ from scipy.interpolate import BPoly
 
 from hybrid_opt.bundles.arms import prefixes
 from hybrid_opt.bundles.programs.carry_job import Limits
+from hybrid_opt.compiled_cell import kept_per_workcell
 from hybrid_opt.errors import JobError
 from hybrid_opt.job.compliance import HELD, TRACKED, largest_skew, require_delay, require_stiffness
 from hybrid_opt.job.motions import unit_squeeze
 from hybrid_opt.job.records import Job, SampledJob, sample_job
-from hybrid_opt.static_hold import kept_per_workcell
 from hybrid_opt.store.files import csv_text
 from hybrid_opt.timing.model import TimingModel
 from symbolic.array import Array

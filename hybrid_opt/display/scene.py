@@ -7,6 +7,7 @@ import base64
 import json
 from collections.abc import Collection
 from dataclasses import dataclass
+from functools import lru_cache
 from importlib.resources import files
 from itertools import product
 from typing import Any
@@ -22,6 +23,7 @@ from symbolic.geometry.bodies import ArmGeometry, Frame
 from symbolic.geometry.pairs import CellGeometry
 from symbolic.geometry.pieces import Hull, Piece
 from symbolic.records import Box, Capsule, Cylinder, Sphere
+from symbolic.records.content import Seen
 from symbolic.records.poses import box_placement
 
 SECTIONS = 24
@@ -53,18 +55,23 @@ class Solid:
 
 def cell_solids(geometry: CellGeometry) -> tuple[Solid, ...]:
     """Every collision body of a cell as triangles."""
-    solids = []
-    for body in geometry.bodies:
-        meshes = [_mesh(piece) for piece in body.pieces]
-        vertices = np.concatenate([np.asarray(mesh.vertices, np.float64) for mesh in meshes])
-        first = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
-        faces = np.concatenate(
-            [np.asarray(m.faces, np.int64) + k for m, k in zip(meshes, first[:-1], strict=True)]
-        )
-        extent = np.sort(np.ptp(vertices, axis=0))[::-1]
-        ground = body.frame.kind == "world" and bool(extent[1] >= GROUND_SIZE)
-        solids.append(Solid(body.name, body.group, body.frame, vertices, faces, ground))
-    return tuple(solids)
+    return tuple(_triangles(Seen(body, known=body.content)) for body in geometry.bodies)
+
+
+@lru_cache(maxsize=256)
+def _triangles(seen: Seen) -> Solid:
+    (body,) = seen.given
+    meshes = [_mesh(piece) for piece in body.pieces]
+    vertices = np.concatenate([np.asarray(mesh.vertices, np.float64) for mesh in meshes])
+    first = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
+    faces = np.concatenate(
+        [np.asarray(m.faces, np.int64) + k for m, k in zip(meshes, first[:-1], strict=True)]
+    )
+    extent = np.sort(np.ptp(vertices, axis=0))[::-1]
+    ground = body.frame.kind == "world" and bool(extent[1] >= GROUND_SIZE)
+    for values in (vertices, faces):
+        values.setflags(write=False)
+    return Solid(body.name, body.group, body.frame, vertices, faces, ground)
 
 
 def _mesh(piece: Piece) -> trimesh.Trimesh:

@@ -24,7 +24,7 @@ from hybrid_opt.carry import Carry, joints_of
 from hybrid_opt.collision.certify import Certificate, SampledPath, certificates, certify
 from hybrid_opt.collision.checker import RESTING_TOLERANCE, CollisionChecker
 from hybrid_opt.collision.judge import FCL_RESOLUTION, Judge
-from hybrid_opt.compiled_cell import CompiledCell
+from hybrid_opt.compiled_cell import CompiledCell, kept_per_workcell
 from hybrid_opt.errors import JobError
 from hybrid_opt.job.motions import (
     EXCESS,
@@ -45,7 +45,6 @@ from hybrid_opt.job.motions import (
 from hybrid_opt.job.records import Force, Job, Phase, PhaseMotion
 from hybrid_opt.job.smooth import WIDEST, WIDTH, rests_at_ends, without_jumps
 from hybrid_opt.robust.squeeze import SqueezeSettings
-from hybrid_opt.static_hold import kept_per_workcell
 from hybrid_opt.timing.model import TimingModel
 from hybrid_opt.timing.records import JerkLimits, Timing
 from symbolic.array import Array

@@ -143,6 +143,7 @@ def recommend(
     wish: Wish | None = None,
     others: Mapping[str, Array] | None = None,
     progress: ShowProgress = False,
+    alone: bool = False,
 ) -> Recommendation:
     """The carry to run of a drivable front.
 
@@ -155,6 +156,7 @@ def recommend(
         others: (n_path,) paths by label, beside which the answer stands; the hand-made one always
             is.
         progress: True for a bar, or what takes steps done and in all.
+        alone: whether margins, rivals and advice are left out, which take half of the time.
 
     Raises:
         SettingsError: the cell has another time law, the front is empty, no member can do what is
@@ -171,13 +173,13 @@ def recommend(
             "the drivable front is empty: no feasible carry was found; give the search more "
             "evaluations or the task wider bounds"
         )
-    named = {HAND_MADE: cell.initial[:-1]} | dict(others or {})
+    named: dict[str, Array] = {} if alone else {HAND_MADE: cell.initial[:-1]} | dict(others or {})
     with counted(progress, "recommendation", STEPS + len(named)) as advance:
-        return _recommended(front, wish, named, lambda: advance(1))
+        return _recommended(front, wish, named, lambda: advance(1), alone)
 
 
 def _recommended(
-    front: Front, wish: Wish, named: Mapping[str, Array], told: Callable[[], None]
+    front: Front, wish: Wish, named: Mapping[str, Array], told: Callable[[], None], alone: bool
 ) -> Recommendation:
     cell, given = front.cell, front.x
     rows = spread_rows(given[:, :-1])
@@ -210,9 +212,9 @@ def _recommended(
     for label, path in named.items():
         beside.append(rival(cell, label, path, timing, squeeze.force))
         told()
-    margins = commanded_margins(carry, forces)
+    margins = () if alone else commanded_margins(carry, forces)
     told()
-    hints = advice(cell, paths, option, timing)
+    hints = () if alone else advice(cell, paths, option, timing)
     told()
     return Recommendation(
         wish=wish,

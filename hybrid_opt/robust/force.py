@@ -17,6 +17,7 @@ from scipy.optimize import brentq
 
 from codegen.cache import Cache
 from hybrid_opt.carry import Carry
+from hybrid_opt.compiled_cell import kept_per_workcell
 from hybrid_opt.robust.cases import (
     CaseForces,
     RulingCases,
@@ -27,7 +28,6 @@ from hybrid_opt.robust.cases import (
     ruling_cases,
     worst_cases,
 )
-from hybrid_opt.static_hold import kept_per_workcell
 from symbolic.array import Array, Count, Figure, Pair, Row, Shape
 from symbolic.contact.force_closure import has_force_closure
 from symbolic.contact.worst_cases import least_distance

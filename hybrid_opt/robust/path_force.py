@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from codegen.cache import Cache
-from hybrid_opt.compiled_cell import held_function
+from hybrid_opt.compiled_cell import held_function, kept_per_workcell
 from hybrid_opt.robust.cases import (
     RulingCases,
     check_pads,
@@ -25,7 +25,6 @@ from hybrid_opt.robust.cases import (
     worst_cases,
 )
 from hybrid_opt.robust.force import check_set
-from hybrid_opt.static_hold import kept_per_workcell
 from symbolic.array import Array
 from symbolic.contact.worst_cases import (
     case_difference_function,

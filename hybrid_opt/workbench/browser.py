@@ -17,7 +17,6 @@ from hybrid_opt.errors import DisplayError
 from hybrid_opt.workbench.session import Handle, Session, Verdict, handles, moved
 from symbolic.array import Array
 from symbolic.errors import DualArmError
-from symbolic.geometry.pairs import build_geometry
 
 HOST = "127.0.0.1"
 
@@ -227,7 +226,7 @@ class Workbench:
 
     def _show(self, verdict: Verdict) -> None:
         state, _, rest = verdict.text.partition(" ")
-        self._told(f"**{state}** {rest}\n\njudged in {1e3 * verdict.seconds:.0f} ms")
+        self._told(f"**{state}** {rest}\n\njudged in {1e3 * verdict.seconds:.1f} ms")
         if verdict.carry is None:
             return
         carry = verdict.carry
@@ -241,11 +240,11 @@ class Workbench:
     def _draw(self, verdict: Verdict) -> None:
         """Meshes of bodies that are new, or changed their shape or place."""
         assert verdict.cell is not None
-        self._geometry = build_geometry(verdict.cell.workcell)
+        self._geometry = verdict.cell.geometry
         scene = self._server.scene
         for solid in cell_solids(self._geometry):
             known = self._solids.get(solid.name)
-            if known is not None and np.array_equal(known[0].vertices, solid.vertices):
+            if known is not None and known[0] is solid:
                 continue
             mesh = scene.add_mesh_simple(
                 f"/bodies/{solid.name.replace('/', ' ')}",

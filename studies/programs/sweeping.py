@@ -18,6 +18,7 @@ from hybrid_opt.recommending.recommendation import recommend
 from hybrid_opt.store.json_records import to_json
 from hybrid_opt.store.trajectory_file import read_trajectory
 from hybrid_opt.sweeping import Sweep, stored_sweep, sweep
+from hybrid_opt.work.service import warm_up
 from studies.program import load_workcell
 from studies.report.drawing import FULL_WIDTH, in_style, legend_below, new_figure, save, series
 from symbolic.array import Array
@@ -29,6 +30,8 @@ ATTEMPTS = 4
 
 def sweep_numbers(options: argparse.Namespace) -> int:
     """Sweep, and print and write what was found."""
+    if options.jobs != 1:
+        warm_up("hybrid_opt.sweeping")  # while this process finds the first path
     cell = Cell(load_workcell(options.workcell)).drivable()
     file = Path(options.output) / "sweep.json"
     file.parent.mkdir(parents=True, exist_ok=True)
