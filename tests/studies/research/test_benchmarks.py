@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 import hybrid_opt as ho
 from hybrid_opt.display.table import NOTHING
 from hybrid_opt.proposing.problem import completed, read_problem
-from studies.research.benchmarks import shelves
+from studies.research.benchmarks import shelves, slot
 from studies.research.benchmarks.__main__ import main
 from studies.research.benchmarks.measuring import Length, Measured, measured, table, travelled
 from symbolic.errors import SettingsError
@@ -138,7 +138,7 @@ def test_the_program_says_how_to_get_files(capsys: pytest.CaptureFixture[str]) -
     assert main([]) == 0
     assert "git clone" in capsys.readouterr().out
     assert main(["shelfs"]) == 2
-    assert "no benchmark 'shelfs'; there are shelves" in capsys.readouterr().err
+    assert "no benchmark 'shelfs'; there are shelves, slot" in capsys.readouterr().err
 
 
 def test_a_task_without_a_carry_says_why(folder: Path) -> None:
@@ -155,4 +155,67 @@ def test_the_table_has_figures_where_there_are_some(folder: Path) -> None:
     some = Measured(given.tasks[0], "", 12.0, 20.0, Length(3.0, 2.1))
     rows = table(given, [some]).rows
     assert rows[0][:7] == ("top to middle", "12.0", "20.0", "3.00", "2.10", "1.88", "2.09")
-    assert rows[0][7:] == (NOTHING,) * 3
+    assert rows[0][7:] == (NOTHING,) * 4
+
+
+GATE = """<mujoco><include file="workcell.xml"/><worldbody>
+<body name="slot" pos="0 -0.65 0.75"><geom name="base" size="0.32 0.07 0.1" pos="0 0 0.1"/>
+<geom name="wall" size="0.32 0.025 0.025" pos="0 -0.045 0.225"/></body>
+<body name="gate" pos="0 -0.465 1.385"><geom name="gate" type="box" size="0.32 0.015 0.215"/></body>
+<body name="plate" pos="0 -0.45 0.876"><freejoint/><geom size="0.3 0.1 0.01"/></body>
+</worldbody></mujoco>"""
+
+
+def test_the_slot_becomes_a_problem_within_both_limits(tmp_path: Path) -> None:
+    """MuJoCo says where the bodies are, Pinocchio that its own postures hold the plate's ends."""
+    mujoco = pytest.importorskip("mujoco")
+    scene = tmp_path / "slot" / "models" / "scene_slot_gate.xml"
+    scene.parent.mkdir(parents=True)
+    scene.write_text(GATE, encoding="utf-8")
+    given = slot.benchmark(tmp_path)
+    assert [task.seconds for task in given.tasks] == [7.60, 8.96]
+    model = mujoco.MjModel.from_xml_string(GATE.replace('<include file="workcell.xml"/>', ""))
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    table, *found = given.tasks[0].problem["environment"]
+    assert table["xyz"][2] + table["size"][2] / 2.0 == pytest.approx(0.7499)
+    assert [body["name"] for body in found] == ["base", "wall", "gate"]
+    for k, body in enumerate(found):
+        np.testing.assert_allclose(body["xyz"], data.geom_xpos[k])
+        np.testing.assert_allclose(body["size"], 2.0 * model.geom_size[k])
+    path = tmp_path / "problem.toml"
+    path.write_text(completed("", {}, given.tasks[1].problem), encoding="utf-8")
+    cell = read_problem(path).workcell({})
+    assert cell.payload.velocity_max == 0.08
+    panda = pin.buildModelFromUrdf(str(cell.robots[0].urdf))
+    for robot, contact, q in zip(cell.robots, cell.contacts, GRIPPING, strict=True):
+        numbers = panda.createData()
+        pin.framesForwardKinematics(panda, numbers, np.array([*q, 0.0, 0.0]))
+        flange = robot.T_world_base @ numbers.oMf[panda.getFrameId("panda_link8")].homogeneous
+        pad = flange @ np.array([0.0, 0.0, slot.PAD, 1.0])
+        np.testing.assert_allclose(
+            pad[:3], np.add(slot.START[:3], contact.T_box_pad[:3, 3]), atol=2e-4
+        )
+
+
+GRIPPING = (
+    (0.82126, 0.609877, -0.273083, -2.2449, -1.20616, 1.61184, -1.12358),
+    (-0.871891, 0.618396, 0.323701, -2.24691, 1.18778, 1.63681, -0.439111),
+)
+"""Postures that the scene's file states for the plate on its riser [rad]."""
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("<mujoco><worldbody/></mujoco>", "no bodies that stand"),
+        (GATE.replace("0.32 0.07 0.1", "0.32 x"), "three numbers"),
+        ("<mujoco", "slot"),
+    ],
+)
+def test_another_scene_is_refused(tmp_path: Path, text: str, told: str) -> None:
+    scene = tmp_path / "slot" / "models" / "scene_slot_gate.xml"
+    scene.parent.mkdir(parents=True)
+    scene.write_text(text, encoding="utf-8")
+    with pytest.raises(SettingsError, match=rf"(?s){told}.*git clone"):
+        slot.benchmark(tmp_path)

@@ -1,0 +1,161 @@
+"""Two Pandas roll a plate under a gate and set it into a slot.
+
+The scene is that of github.com/haot1an/dual-arm-cooperative-manipulation at commit ed943f0,
+`models/scene_slot_gate.xml`; its task stands in `config/scenes/slot_gate.yaml`, its arms' places in
+`models/workcell.xml`. There fingers grip the plate's short edges, and are welded to it; here pads
+press on these edges from both ends. The arms are those of `example-robot-data`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from studies.research.benchmarks.measuring import Benchmark, Task
+from symbolic import outside
+from symbolic.errors import OutsideError, SettingsError
+from symbolic.read.elements import parse_elements
+
+FOLDER = "slot"
+
+HOW = f"""\
+git clone https://github.com/haot1an/dual-arm-cooperative-manipulation FOLDER/{FOLDER}
+git -C FOLDER/{FOLDER} checkout ed943f0"""
+
+PLATE = (0.6, 0.2, 0.02)
+
+START = [0.0, -0.45, 0.876, 0.0, 0.0, 0.0]
+GOAL = [0.0, -0.65, 1.051, -np.pi / 2.0, 0.0, 0.0]
+"""Lying on the riser, and standing in the slot, a millimetre of air below [m, rad]."""
+
+ARMS = {"left": (0.375, -105.0), "right": (-0.375, -75.0)}
+"""Places along x [m] and yaw [degrees], on the table."""
+
+TABLE = {"name": "table", "kind": "box", "size": [1.7, 1.3, 0.04], "xyz": [0.0, -0.35, 0.7299]}
+
+PAD = 0.0934
+"""From the flange to the plate's edge, which their grip overlaps by 10 mm [m]."""
+
+LIMITS: tuple[tuple[str, dict[str, float], float], ...] = (
+    ("joint limits", {}, 7.60),
+    (
+        "plate at 0.08 m/s",
+        {"velocity_max": 0.08, "acceleration_max": 0.2, "angular_velocity_max": 0.6},
+        8.96,
+    ),
+)
+"""What bounds the speed beside the arms, and the published time to the goal [s]."""
+
+NOTE = (
+    "Published (docs/trajectory_planning.md there): 15.49 s along straight lines and turns one "
+    "after the other; 7.60 s with path and time optimised together, 8.96 s with the plate's speed "
+    "bounded as before; 3.6 s of planning; 7 N of internal force undisturbed, 36 N at most. These "
+    "times are simulated, with a controller that follows the plan, and begin with a second of "
+    "rest; the plan keeps 20 mm of air. Fingers are welded to the plate there; here friction holds "
+    "it."
+)
+
+
+def benchmark(folder: Path) -> Benchmark:
+    """The carry, within two kinds of limits.
+
+    Args:
+        folder: in which their files are.
+
+    Raises:
+        SettingsError: they are not there, or not those.
+    """
+    there = folder / FOLDER
+    try:
+        content = outside.read_bytes(there / "models/scene_slot_gate.xml", outside.URDF_BYTES)
+        scene = [TABLE, *bodies(outside.text(content))]
+    except OutsideError as error:
+        raise SettingsError(f"{there}: {error}; get the files by\n{HOW}") from error
+    tasks = []
+    for name, limits, seconds in LIMITS:
+        problem = {
+            "name": f"Plate through a gate, {name}",
+            "robots": [_robot(arm) for arm in ARMS],
+            "payload": {"size": list(PLATE), "mass": 1.2, **limits},
+            "contacts": [
+                {"xyz": [side * PLATE[0] / 2.0, 0.0, 0.0], "friction": 0.8, "patch_radius": 0.009}
+                for side in (1.0, -1.0)
+            ],
+            "task": {
+                "start": START,
+                "goal": GOAL,
+                "reference_speed": 0.08,
+                "reference_force": 30.0,
+            },
+            "handling": {"lift_height": 0.0, "set_down_height": 0.0},
+            "environment": scene,
+        }
+        tasks.append(Task(name, problem, seconds=seconds))
+    return Benchmark("slot", "Two Pandas and a slot behind a gate", tuple(tasks), NOTE)
+
+
+def bodies(scene: str) -> Iterator[dict[str, Any]]:
+    """The boxes of a scene's bodies that do not move, as bodies of a workcell.
+
+    Raises:
+        OutsideError: it is no such scene.
+    """
+    found = 0
+    for body in parse_elements(scene, "mujoco").iterfind("worldbody/body"):
+        if body.find("freejoint") is not None:
+            continue
+        at = np.array(_numbers(body.get("pos")))
+        for geom in body.iterfind("geom"):
+            half, offset = _numbers(geom.get("size")), _numbers(geom.get("pos", "0 0 0"))
+            found += 1
+            yield {
+                "name": geom.get("name", f"body {found}"),
+                "kind": "box",
+                "size": [2.0 * value for value in half],
+                "xyz": (at + offset).tolist(),
+            }
+    if not found:
+        raise OutsideError("the scene has no bodies that stand")
+
+
+def _numbers(text: str | None) -> list[float]:
+    """Three of an attribute."""
+    try:
+        found = [float(each) for each in (text or "").split()]
+    except ValueError:
+        found = []
+    if len(found) != 3:
+        raise OutsideError(f"the scene has {text!r} where three numbers belong")
+    return found
+
+
+def _robot(name: str) -> dict[str, Any]:
+    x, yaw = ARMS[name]
+    return {
+        "name": name,
+        "urdf": "package://example-robot-data/robots/panda_description/urdf/panda.urdf",
+        "chain": ["panda_link0", "panda_link8"],
+        "drop_links": ["panda_hand"],
+        "base": {"xyz": [x, 0.0, 0.75], "rpy": [0.0, 0.0, float(np.radians(yaw))]},
+        "pad": {"xyz": [0.0, 0.0, PAD]},
+        "acceleration_max": [15.0, 15.0, 15.0, 15.0, 20.0, 20.0, 20.0],
+        "tool": [
+            {
+                "name": "hand",
+                "kind": "box",
+                "size": [0.06, 0.2, 0.07],
+                "xyz": [0.0, 0.0, 0.035],
+                "rpy": [0.0, 0.0, -np.pi / 4.0],
+            },
+            {
+                "name": "pad",
+                "kind": "cylinder",
+                "radius": 0.009,
+                "length": PAD - 0.07,
+                "xyz": [0.0, 0.0, (PAD + 0.07) / 2.0],
+            },
+        ],
+    }
