@@ -54,7 +54,8 @@ class Rival:
     force_at_duration: Figure
 
     def __repr__(self) -> str:
-        force, time = "cannot be held with so little force", "is never so fast"
+        force = "cannot be held with the same force"
+        time = "cannot be driven in the same time"
         if np.isfinite(self.duration_at_force):
             force = f"{self.duration_at_force:.3f} s at the same force"
         if np.isfinite(self.force_at_duration):

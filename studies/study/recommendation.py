@@ -320,7 +320,8 @@ def export_command(path: Path, force: float) -> str:
 def _rival(rival: Rival, found: StoredRecommendation) -> str:
     """Another path beside the recommended carry."""
     duration, force = rival.duration_at_force, rival.force_at_duration
-    same_force, same_time = "cannot be held with so little force", "is never so fast"
+    same_force = "cannot be held with the same force"
+    same_time = "cannot be driven in the same time"
     if math.isfinite(duration):
         same_force = f"{duration:.2f} s at the same force ({_percent(duration / found.duration)})"
     if math.isfinite(force):

@@ -231,7 +231,7 @@ def _without(name: str) -> Uncertainty:
 def test_what_a_rival_cannot_is_told_in_words() -> None:
     inf = float("inf")
     assert str(Rival("hand-made", inf, inf)) == (
-        "hand-made: cannot be held with so little force, is never so fast"
+        "hand-made: cannot be held with the same force, cannot be driven in the same time"
     )
     assert str(Rival("hand-made", 2.0, 55.0)) == (
         "hand-made: 2.000 s at the same force, 55.0 N in the same time"
