@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from hybrid_opt.door import polish, save, search, time_every_way, time_path, time_with_jerk
     from hybrid_opt.evaluate.objectives import Objective
     from hybrid_opt.front import Front
+    from hybrid_opt.gripping import Grip, propose_grip
     from hybrid_opt.job.plan import plan_job
     from hybrid_opt.job.records import Job
     from hybrid_opt.metaheuristics.run import SearchSettings
@@ -49,6 +50,7 @@ __all__ = [
     "Cell",
     "DualArmError",
     "Front",
+    "Grip",
     "JerkLimits",
     "JerkTiming",
     "Job",
@@ -75,6 +77,7 @@ __all__ = [
     "plan_job",
     "polish",
     "propose",
+    "propose_grip",
     "recommend",
     "save",
     "search",
@@ -93,6 +96,7 @@ _HOMES = {
     "Cell": "hybrid_opt.cell",
     "DualArmError": "symbolic.errors",
     "Front": "hybrid_opt.front",
+    "Grip": "hybrid_opt.gripping",
     "JerkLimits": "hybrid_opt.timing.records",
     "JerkTiming": "hybrid_opt.timing.records",
     "Job": "hybrid_opt.job.records",
@@ -119,6 +123,7 @@ _HOMES = {
     "plan_job": "hybrid_opt.job.plan",
     "polish": "hybrid_opt.door",
     "propose": "hybrid_opt.proposing.proposal",
+    "propose_grip": "hybrid_opt.gripping",
     "recommend": "hybrid_opt.recommending.recommendation",
     "save": "hybrid_opt.door",
     "search": "hybrid_opt.door",

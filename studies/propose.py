@@ -18,6 +18,20 @@ from symbolic.errors import SettingsError
 from symbolic.replacing import replace_file
 
 
+def _ranges(text: str) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Of 'LOW:HIGH,LOW:HIGH', the second one none where it is missing."""
+    read, found = number(-1.0, 1.0), []
+    for part in text.split(","):
+        low, _, high = part.partition(":")
+        found.append((read(low), read(high)))
+    up, along = [*found, (0.0, 0.0)][:2]
+    if len(found) > 2 or up[0] > up[1] or along[0] > along[1]:
+        raise argparse.ArgumentTypeError(
+            f"found {text!r}; allowed is LOW:HIGH or LOW:HIGH,LOW:HIGH [m]"
+        )
+    return up, along
+
+
 def _add_options(parser: Parser) -> None:
     add(parser, "PROBLEM")
     add(
@@ -30,6 +44,13 @@ def _add_options(parser: Parser) -> None:
         "--bases",
         action="store_true",
         help="propose where the robots stand as well; only the height of their bases counts then",
+    )
+    parser.add_argument(
+        "--grips",
+        type=_ranges,
+        metavar="LOW:HIGH,LOW:HIGH",
+        help="how far the pads may go from there upwards, and along their faces [m], for the carry "
+        "that was found: compiles, and takes its time beside --time; write --grips=-0.04:0.01",
     )
     parser.add_argument(
         "--time",
@@ -67,6 +88,11 @@ def _run(options: argparse.Namespace) -> int:
     )
     replace_file(output, proposal.text(output.parent).encode())
     print(f"{output}: {proposal}")
+    if options.grips is not None:
+        grip = ho.propose_grip(ho.Cell.load(output), *options.grips)
+        assert grip.cell.workcell.text is not None, "it was read from a file"
+        replace_file(output, grip.cell.workcell.text)
+        print(f"{output}: {grip}")
     return 0
 
 

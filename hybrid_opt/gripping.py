@@ -1,0 +1,159 @@
+"""Where two pads press on their faces: places within given ranges, compared by what the cell's
+hand-made path costs with them.
+
+The places are numbers of the cell, so that each trial takes what a changed cell takes, without a
+compiler. Both pads move alike, so that they stay opposite one another.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.optimize import direct
+
+from hybrid_opt.cell import Cell
+from hybrid_opt.recommending.choice import DrivenPaths, Goal, Wish, best_of_paths, ranked
+from symbolic.array import Array
+from symbolic.errors import DualArmError, SettingsError
+from symbolic.records import Workcell
+from symbolic.records.poses import box_rotation
+
+TRIALS = 40
+"""Places that are tried; those that come out equal count each time."""
+
+UPRIGHT = 0.9
+"""Least part of the world's z that lies in an upright face."""
+
+WORST = 1e9
+"""Cost of what cannot be driven [N s]."""
+
+Range = tuple[float, float]
+"""Least and largest [m]."""
+
+
+@dataclass(frozen=True)
+class Grip:
+    """A place of both pads on their faces.
+
+    Attributes:
+        cell: with it, and nothing else changed.
+        up, along: from where the pads were, upwards and level along the faces [m].
+        duration: of the hand-made path as robots drive it with least product of duration and
+            commanded force, before limits on jerk [s].
+        force: to command then [N].
+        before: the same product where the pads were [N s]; infinite where they did not hold.
+    """
+
+    cell: Cell
+    up: float
+    along: float
+    duration: float
+    force: float
+    before: float
+
+    def __str__(self) -> str:
+        moved = f"pads {1e3 * self.up:+.0f} mm up and {1e3 * self.along:+.0f} mm along their faces"
+        was = f", in place of {self.before:.0f} N s" if np.isfinite(self.before) else ""
+        return (
+            f"{moved}: {self.duration:.3f} s at {self.force:.1f} N, "
+            f"{self.duration * self.force:.0f} N s{was}"
+        )
+
+
+def propose_grip(cell: Cell, up: Range, along: Range, trials: int = TRIALS) -> Grip:
+    """The best place of the pads for the cell's hand-made path, which is certified with it.
+
+    Args:
+        cell: with upright faces where the pads press, and forces in closed form.
+        up: how far the pads may go upwards from where they are.
+        along: how far they may go level along their faces: of the first robot's pad to its left,
+            seen from the robot.
+        trials: places that are tried.
+
+    Raises:
+        SettingsError: a range is empty or none, the pads are others, or nothing within the ranges
+            lets the path be driven.
+    """
+    for low, high in (up, along):
+        if not -1.0 <= low <= high <= 1.0:
+            raise SettingsError(f"a range from {low:g} to {high:g} m: allowed is -1 <= low <= high")
+    drivable = cell.drivable()
+    if not (cell.workcell.has_closed_form and drivable.workcell.has_closed_form):
+        raise SettingsError(
+            "places of pads are compared where their forces have a closed form: two opposite pads, "
+            "allocation 'paper' or 'soft-finger'"
+        )
+    ways, tried = _ways(cell.workcell), dict[tuple[float, float], tuple[float, float, float]]()
+    bounds = np.array([up, along])
+    open_, middle = bounds[:, 1] > bounds[:, 0], bounds.mean(axis=1)
+
+    def cost(values: Array) -> float:
+        place = middle.copy()
+        place[open_] = values
+        at = float(np.round(place[0], 4)), float(np.round(place[1], 4))
+        if at not in tried:
+            tried[at] = _cost(drivable, _changes(cell.workcell, ways, at))
+        return min(tried[at][0], WORST)
+
+    tried[0.0, 0.0] = before = _cost(drivable, {})
+    if open_.any():
+        direct(cost, bounds[open_].tolist(), maxfun=trials, eps=1e-2)
+    else:
+        cost(middle[open_])
+    inside = [
+        at
+        for at in sorted(tried, key=lambda each: tried[each][0])
+        if np.isfinite(tried[at][0]) and (bounds[:, 0] <= at).all() and (at <= bounds[:, 1]).all()
+    ]
+    for at in inside:
+        found = cell.changed(changes) if (changes := _changes(cell.workcell, ways, at)) else cell
+        x = found.initial
+        if found.evaluator.certified(found.evaluate(x)).feasible.all():
+            return Grip(found, *at, *tried[at][1:], before[0])
+    raise SettingsError("no place of the pads within the ranges lets the hand-made path be driven")
+
+
+def _ways(workcell: Workcell) -> Array:
+    """(2, 3) upwards and level along the faces, box axes, as the payload stands at the start.
+
+    Raises:
+        SettingsError: the faces are not upright.
+    """
+    turn = box_rotation(workcell.task.orientation, workcell.task.waypoints[0].lower)
+    normal, upwards = workcell.contacts[0].T_box_pad[:3, 2], turn.T @ [0.0, 0.0, 1.0]
+    upwards = upwards - (upwards @ normal) * normal
+    if np.linalg.norm(upwards) < UPRIGHT:
+        raise SettingsError("places of pads are proposed on upright faces; these are not")
+    upwards /= np.linalg.norm(upwards)
+    return np.array([upwards, np.cross(upwards, normal)])
+
+
+def _changes(workcell: Workcell, ways: Array, at: tuple[float, float]) -> dict[str, Any]:
+    """By key path, see `Cell.changed`."""
+    if at == (0.0, 0.0):
+        return {}
+    shift = np.asarray(at) @ ways
+    return {
+        f"contacts[{k}].xyz": np.round(contact.T_box_pad[:3, 3] + shift, 6).tolist()
+        for k, contact in enumerate(workcell.contacts)
+    }
+
+
+def _cost(drivable: Cell, changes: dict[str, Any]) -> tuple[float, float, float]:
+    """Least product of duration and commanded force [N s], and both; infinite for none."""
+    none = np.inf, np.inf, np.inf
+    try:
+        cell = drivable.changed(changes) if changes else drivable
+        if not cell.evaluate(cell.initial).feasible[0]:
+            return none
+    except DualArmError:
+        return none
+    paths = DrivenPaths.of(cell, cell.initial[None, :-1])
+    options = paths.all_options(cell.workcell.task.force_limit[1])
+    goal = Goal(np.inf, np.full(2, np.inf), Goal.of(Wish(), cell.workcell).cost)
+    if not ranked(options, goal):
+        return none
+    best = next(best_of_paths(paths, options, goal, 1))
+    return best.duration * best.commanded, best.duration, best.commanded
