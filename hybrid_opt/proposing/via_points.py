@@ -132,7 +132,8 @@ def straightened(
     places = list(_closed_path(chain, start, basis @ waypoints))
     if len(places) < MEASURED:
         return waypoints
-    best, least = waypoints, joint_length(places)
+    shorter: list[tuple[float, Array]] = []
+    least = joint_length(places)
     near = np.array([place.q[0] for place in places]), np.array([place.q[1] for place in places])
 
     def moved(y: Array) -> Array:
@@ -147,11 +148,13 @@ def straightened(
         lengths, blocked = _lengths(chain, np.array([basis @ one for one in tried]), near)
         strategy.tell(asked, (lengths + blocked).tolist())
         k = int(np.argmin(lengths + blocked))
-        if blocked[k] == 0.0 and lengths[k] < least and free_share(chain, start, tried[k]) == 1.0:
-            best, least = tried[k], float(lengths[k])
+        if blocked[k] == 0.0 and lengths[k] < least:
+            shorter.append((float(lengths[k]), tried[k]))
         if strategy.stop():
             break
-    return best
+    # All places are looked at in the end: most of these are on the way to a shorter one.
+    shorter.sort(key=lambda item: item[0])
+    return next((one for _, one in shorter if free_share(chain, start, one) == 1.0), waypoints)
 
 
 def _closed_path(chain: ClosedChain, start: Place, path: Array) -> Iterator[Place]:
