@@ -8,12 +8,17 @@ from __future__ import annotations
 
 import ast
 import inspect
+import os
+import re
 import sys
 from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
+os.environ["TQDM_DISABLE"] = "1"  # an example's bar would be shown once per step
+
+from sphinx_gallery.scrapers import figure_rst  # noqa: E402
 
 import hybrid_opt as ho  # noqa: E402
 
@@ -74,6 +79,18 @@ def examples() -> Path:
     return folder
 
 
+def picture(_: Any, block: dict[str, Any], gallery: dict[str, Any]) -> str:
+    """What an example made last and has a picture, as a notebook shows it."""
+    for made in reversed(list(block["example_globals"].values())):
+        if not inspect.isclass(made) and hasattr(made, "_repr_html_"):
+            drawn = re.search("<svg.*</svg>", made._repr_html_(), flags=re.DOTALL)
+            if drawn:
+                path = Path(next(block["image_path_iterator"])).with_suffix(".svg")
+                path.write_text(drawn[0], "utf-8")
+                return str(figure_rst([path], gallery["src_dir"]))
+    return ""
+
+
 def reference() -> Path:
     """A page for every public name, with the examples that use it."""
     folder = ROOT / "docs" / "reference"
@@ -122,7 +139,8 @@ sphinx_gallery_conf: dict[str, Any] = {
     "remove_config_comments": True,
     "backreferences_dir": "gallery/backreferences",
     "doc_module": ("hybrid_opt", "symbolic"),
-    "image_scrapers": (),
+    "image_scrapers": (picture,),
+    "default_thumb_file": str(ROOT / "docs" / "images" / "cell-rack.png"),
     "show_memory": False,
     "write_computation_times": False,
     "abort_on_example_error": True,
