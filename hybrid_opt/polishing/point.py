@@ -16,7 +16,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Generic, TypeVar
+from typing import Generic, TypeVar
 
 import numpy as np
 
@@ -362,6 +362,3 @@ class Climb(Generic[AnyReached, AnyStep]):
     def _move(self, reached: AnyReached, is_short: bool = False) -> None:
         self.best = reached
         self._learned.move(is_short)
-
-
-AnyClimb = Climb[Any, Any]
