@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import cache, lru_cache, partial
+from functools import cache, lru_cache
 
 import casadi as ca
 import numpy as np
@@ -37,7 +37,6 @@ from symbolic.smooth.places import (
     row_name,
 )
 from symbolic.smooth.samples import (
-    WEIGHT,
     Quantity,
     branch_coefficients,
     held_functions,
@@ -183,15 +182,22 @@ def polish_functions(compiled: CompiledCell) -> PolishFunctions:
     )
     built |= compiled.functions("polish", one_by_one, details, bodies=False)
     built |= compiled.functions("polish rows", rows, details, levels=levels, lanes=0)
-    driven = compiled.workcell.task.time_law == "optimal"
-    if driven:
+    if "load" in quantities:
+        built |= compiled.made(
+            "held", lambda: held_functions(compiled.workcell), levels=levels, lanes=0
+        )
+    if compiled.workcell.task.time_law == "optimal":
         built |= compiled.functions("driven", driven_functions, lanes=0, bodies=False)
-    if "load" in quantities or (driven and not compiled.workcell.has_closed_form):
-        # What is driven is judged by timings, whose forces are those at a weight of their own.
-        name, weight = ("driven held", TIMING_WEIGHT) if driven else ("held", WEIGHT)
-        make = partial(held_functions, compiled.workcell, weight)
-        built |= compiled.made(name, make, levels=levels, lanes=0)
+        if not compiled.workcell.has_closed_form:
+            built |= compiled.functions(
+                "driven held", _driven_held, levels=levels, lanes=0, bodies=False
+            )
     return PolishFunctions(built, RowFunctions(compiled.bodies, built, compiled))
+
+
+def _driven_held(model: CellModel) -> dict[str, ca.Function]:
+    """The forces that timings know, which judge what is driven."""
+    return held_functions(model.workcell, TIMING_WEIGHT)
 
 
 def _names(quantities: tuple[Quantity, ...]) -> set[str]:
