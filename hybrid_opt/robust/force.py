@@ -20,7 +20,6 @@ from hybrid_opt.carry import Carry
 from hybrid_opt.compiled_cell import kept_per_workcell
 from hybrid_opt.robust.cases import (
     CaseForces,
-    RulingCases,
     least_friction,
     nominal_case,
     patches_left,
@@ -201,9 +200,11 @@ class RobustModel:
         if leader not in (0, 1):
             raise SettingsError(f"leader {leader}: give 0 or 1, the index of an arm")
         check_set(self.workcell, uncertainty)
-        cases = worst_cases(self.workcell, uncertainty, leader)
-        force = self._held(box_motion(motion), cases, uncertainty, leader).force
-        return force[:, 1 - leader], force[:, leader]
+        worst = self.least_squeeze(motion, worst_cases(self.workcell, uncertainty, leader), leader)
+        follower, share = 1 - leader, self._cases.leading_share(leader)
+        force = ruling_cases(worst, uncertainty, leader, leading_share=share).force
+        force[np.isnan(force)] = np.inf
+        return force[:, follower], force[:, leader]
 
     def commanded(
         self,
@@ -247,30 +248,14 @@ class RobustModel:
         return force
 
     def peak(self, motion: HeldMotion, uncertainty: Uncertainty, leader: int = 0) -> Array:
-        """(2,) the largest forces of `hold`, sooner: all cases are asked only where the cases that
-        ruled so far ask for most."""
-        check_set(self.workcell, uncertainty)
-        motion, cases = box_motion(motion), worst_cases(self.workcell, uncertainty, leader)
-        # Bounds from below, but where all cases were asked.
-        force, asked, ruling = self.nominal(motion, leader), set[int](), set[int]()
-        while rows := set(force.argmax(axis=0).tolist()) - asked:
-            asked |= rows
-            most = np.array(sorted(rows))
-            held = self._held(motion.at(most), cases, uncertainty, leader)
-            ruling |= {*held.commanded.tolist(), *held.felt.tolist()}
-            again = self._held(motion, cases[sorted(ruling)], uncertainty, leader)
-            force = np.maximum(force, again.force)
-            force[most] = held.force
-        return np.asarray(force.max(axis=0))
-
-    def _held(
-        self, motion: BoxMotion, cases: Array, uncertainty: Uncertainty, leader: int
-    ) -> RulingCases:
-        """What rules of some cases; infinite forces where none is found."""
-        worst, share = self.least_squeeze(motion, cases, leader), self._cases.leading_share(leader)
-        found = ruling_cases(worst, uncertainty, leader, leading_share=share)
-        found.force[np.isnan(found.force)] = np.inf
-        return found
+        """(2,) the largest forces of `hold`, sooner: what the leader feels is asked for where most
+        is commanded, or where most is with the plan's difference of both forces."""
+        force, planned = self.commanded(motion, uncertainty, leader), self.nominal(motion, leader)
+        felt = force + planned[:, leader] - planned[:, 1 - leader]
+        most = np.unique([force.argmax(), felt.argmax()])
+        peaks = np.full(2, force.max())
+        peaks[leader] = self.hold(box_motion(motion).at(most), uncertainty, leader)[1].max()
+        return peaks
 
     def robust_force(
         self, motion: HeldMotion, uncertainty: Uncertainty | None = None, leader: int = 0
