@@ -53,10 +53,8 @@ def c_source(function: ca.Function, lanes: int = 1, generated: str = "") -> str:
     generated, signature = generated or generated_c([function]), Signature.of(function)
     shared = shared_inputs(function)
     in_lanes = None if lanes == 1 else lane_text(generated, "lanes", shared)
-    before, after = (
-        [include, runtime("arithmetic.h")],
-        [_filled(runtime("driver.c"), signature, generated)],
-    )
+    before = [include, runtime("arithmetic.h")]
+    after = [_filled(runtime("driver.c"), signature, generated)]
     if in_lanes is not None:
         width = f"#define DUAL_ARM_LANES {lanes}\n" if lanes else ""
         before += [runtime("one_lane.h"), width, runtime("lanes.h")]

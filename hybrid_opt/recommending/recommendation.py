@@ -156,7 +156,7 @@ def recommend(
         others: (n_path,) paths by label, beside which the answer stands; the hand-made one always
             is.
         progress: True for a bar, or what takes steps done and in all.
-        alone: whether margins, rivals and advice are left out, which take half of the time.
+        alone: whether margins, rivals and advice are left out.
 
     Raises:
         SettingsError: the cell has another time law, the front is empty, no member can do what is
