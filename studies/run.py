@@ -29,7 +29,9 @@ from symbolic.errors import SettingsError
 
 DESCRIPTION = "Search for the least-force carries of a dual-arm workcell."
 
-ALGORITHMS: tuple[str, ...] = stated("hybrid_opt.metaheuristics.registry.REGISTRY")
+KNOWN: tuple[str, ...] = stated("hybrid_opt.metaheuristics.registry.REGISTRY")
+
+USUAL = "hybrid_opt.campaign.settings.ALGORITHMS"
 
 WORKERS_LOAD = (
     "hybrid_opt.campaign.polish_stage",
@@ -78,7 +80,7 @@ def add_options(parser: Parser, output: str) -> None:
         nargs="+",
         action="extend",
         metavar="NAME",
-        help=f"which of {', '.join(ALGORITHMS)} (default: {' '.join(_stated('algorithms'))})",
+        help=f"which of {', '.join(KNOWN)} (default: {' '.join(stated(USUAL))})",
     )
     search.add_argument(
         "--population",
@@ -232,8 +234,8 @@ def _population(text: str) -> tuple[str, int]:
     name, separator, size = text.partition("=")
     if not separator or not size.isdecimal():
         raise argparse.ArgumentTypeError(f"found {text!r}; allowed is NAME=N, as nsga2=40")
-    if name not in ALGORITHMS:
-        raise SettingsError(f"unknown algorithm '{name}'; known are {', '.join(ALGORITHMS)}")
+    if name not in KNOWN:
+        raise SettingsError(f"unknown algorithm '{name}'; known are {', '.join(KNOWN)}")
     return name, int(size)
 
 

@@ -17,10 +17,18 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from codegen.cache import source_digest
-from hybrid_opt.campaign.settings import CONFIGURATION, STAGES, WORKCELL, CampaignSettings
+from hybrid_opt.campaign.settings import (
+    CONFIGURATION,
+    STAGES,
+    WORKCELL,
+    CampaignSettings,
+    Configuration,
+    StoredCell,
+)
 from hybrid_opt.cell import Cell
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.store.files import LOCK, locked, read_json, storing, write_json
+from hybrid_opt.store.json_records import to_json
 from hybrid_opt.version import own_version
 from hybrid_opt.work.dask_cluster import DaskExecutor
 from hybrid_opt.work.service import Executor, local_executor
@@ -95,8 +103,8 @@ def environment() -> Mapping[str, str]:
     return versions
 
 
-def identity(settings: CampaignSettings, root: Path, workcell: Workcell) -> dict[str, Any]:
-    """The identity as JSON values.
+def configuration_of(settings: CampaignSettings, root: Path, workcell: Workcell) -> Configuration:
+    """What identifies a campaign.
 
     Args:
         settings: the campaign's.
@@ -104,16 +112,11 @@ def identity(settings: CampaignSettings, root: Path, workcell: Workcell) -> dict
         workcell: the folder's copy.
     """
     file = workcell.source.relative_to(root.resolve()).as_posix()
-    return {
-        "format": FORMAT,
-        "version": VERSION,
-        "workcell": {"name": workcell.name, "file": file, "digest": workcell.digest},
-        "settings": settings.effective(),
-        "environment": dict(environment()),
-    }
+    cell = StoredCell(workcell.name, file, workcell.digest)
+    return Configuration(FORMAT, VERSION, cell, settings, environment())
 
 
-def replica_identity(campaign: Mapping[str, Any], algorithm: str, replica: int) -> bytes:
+def replica_identity(campaign: Any, algorithm: str, replica: int) -> bytes:
     """32 bytes that identify one replica of a campaign."""
     text = json.dumps([campaign, algorithm, replica], sort_keys=True)
     return hashlib.sha256(text.encode()).digest()
@@ -190,23 +193,20 @@ def open_folder(
         require_usable(execution)
         if execution.overwrite:
             _clear(root)
-        configuration = root / CONFIGURATION
-        exists = configuration.exists()
-        if exists:
-            stored = read_json(configuration)
+        stored = read_json(root / CONFIGURATION) if (root / CONFIGURATION).exists() else None
+        if stored is not None:
             digest = stored.get("workcell", {}).get("digest") if isinstance(stored, dict) else None
-            if digest == files.digest:
-                require_equal(
-                    stored, identity(settings, root, _stored_cell(root, files)), str(root)
-                )
-            else:
+            if digest != files.digest:
                 raise ResultsError(
                     f"{root}: holds results of another workcell, or of this one before a change; "
                     f"{_ELSEWHERE}"
                 )
         copy = _stored_cell(root, files)
-        if not exists:
-            write_json(configuration, identity(settings, root, copy))
+        wanted = to_json(configuration_of(settings, root, copy))
+        if stored is None:
+            write_json(root / CONFIGURATION, wanted)
+        else:
+            require_equal(stored, wanted, str(root))
         yield CampaignFolder(root, settings, execution, Cell(copy, settings.objectives), files)
 
 

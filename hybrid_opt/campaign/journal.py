@@ -26,12 +26,18 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_opt.campaign.folder import CampaignFolder, executor_for, identity, replica_identity
+from hybrid_opt.campaign.folder import (
+    CampaignFolder,
+    configuration_of,
+    executor_for,
+    replica_identity,
+)
 from hybrid_opt.campaign.settings import JOURNAL, CampaignSettings
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.evaluate.evaluations import FEASIBLE, REASONS, Evaluations
 from hybrid_opt.progress import Advance, Progress
 from hybrid_opt.store.files import csv_text, read_bytes, storing
+from hybrid_opt.store.json_records import to_json
 from hybrid_opt.work.service import Ledger, Service, give_up
 from symbolic.array import Array
 
@@ -373,7 +379,7 @@ class ReplicaLedger:
             further: what decides the answers beside the campaign.
         """
         self.folder, self.left = folder, list(left.items())
-        campaign = identity(folder.settings, folder.root, folder.workcell)
+        campaign = to_json(configuration_of(folder.settings, folder.root, folder.workcell))
         self._identity = {"campaign": campaign, **further}
         self._journals: dict[int, Journal] = {}
 

@@ -23,6 +23,7 @@ from hybrid_opt.campaign.settings import (
     POLISH,
     STAGES,
     SUMMARY,
+    CampaignSettings,
     Configuration,
     FinishedReplica,
     polished_folder,
@@ -133,14 +134,19 @@ class CampaignResults:
         return self.cell.workcell
 
     @property
+    def settings(self) -> CampaignSettings:
+        """The campaign's."""
+        return self.configuration.settings
+
+    @property
     def algorithms(self) -> tuple[str, ...]:
         """Names, in order."""
-        return tuple(self.configuration.settings.algorithms)
+        return tuple(self.settings.algorithms)
 
     @property
     def objectives(self) -> tuple[str, ...]:
         """Names, in order."""
-        return self.configuration.settings.objectives
+        return self.settings.objectives
 
     def of(self, algorithm: str) -> tuple[Replica, ...]:
         """The replicas of one algorithm."""

@@ -74,7 +74,7 @@ def run_replica(
         algorithm,
         settings.evaluations,
         settings.replica_rng(algorithm, request.replica),
-        SearchSettings(settings.overrides(algorithm), settings.constraint_handling, start),
+        SearchSettings(settings.algorithms[algorithm], settings.constraint_handling, start),
     )
     # Without what was repeated from a journal.
     seconds = sum(recording.seconds) + recording.certification_seconds

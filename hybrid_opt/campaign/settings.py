@@ -4,8 +4,8 @@ records, and where they lie (docs/results.md)."""
 from __future__ import annotations
 
 import zlib
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -24,8 +24,40 @@ Budget = Annotated[int, Range(1, 10**9)]
 Runs = Annotated[int, Range(1, 10_000)]
 Seed = Annotated[int, Range(0, 2**63 - 1)]
 
+ALGORITHMS = ("nsga2", "mopso")
+"""The algorithms of a campaign that names none."""
+
 SIZE_KEYS = ("population", "swarm", "batch")
-"""How the algorithms' settings call the candidates of one generation."""
+"""What the algorithms' settings call the candidates of one generation."""
+
+
+def sized(algorithm: str, size: int) -> dict[str, Any]:
+    """The settings of an algorithm that evaluates `size` candidates per generation."""
+    known = asdict(metaheuristics.settings_of(algorithm))
+    return {key: size for key in SIZE_KEYS if key in known}
+
+
+def chosen(
+    names: Sequence[str], populations: Sequence[tuple[str, int]] = ()
+) -> dict[str, dict[str, Any]]:
+    """The algorithms of a campaign with those of their settings that are no defaults.
+
+    Args:
+        names: known to `hybrid_opt.metaheuristics`, each once.
+        populations: (algorithm, candidates per generation), each algorithm at most once.
+
+    Raises:
+        SettingsError: a name is missing, unknown or there twice.
+    """
+    if not names or len(set(names)) != len(names):
+        raise SettingsError(f"algorithms {tuple(names)}: name at least one, each once")
+    sizes = dict(populations)
+    if len(sizes) != len(populations) or not sizes.keys() <= set(names):
+        raise SettingsError(
+            f"populations for {', '.join(name for name, _ in populations)}: name each algorithm of "
+            f"the campaign ({', '.join(names)}) at most once"
+        )
+    return {name: sized(name, sizes[name]) if name in sizes else {} for name in names}
 
 
 @dataclass(frozen=True)
@@ -33,67 +65,43 @@ class CampaignSettings:
     """Everything that decides a campaign's results, besides the workcell.
 
     Attributes:
-        algorithms: names known to `hybrid_opt.metaheuristics`, each once.
+        algorithms: settings of each algorithm by its name, see `hybrid_opt.metaheuristics`; the
+            defaults of those that are not given are filled in.
         evaluations: budget of every replica.
         replicas: independent runs per algorithm.
         seed: the campaign's seed; every replica derives its own from it.
         objectives: names known to `hybrid_opt.evaluate.objectives`, each once.
         constraint_handling: 'penalty' (the paper's) or 'constraints'.
         first_generation: what the searches start from; uniform random search is always all random.
-        populations: (algorithm, candidates per generation) where not the algorithm's default.
     """
 
-    algorithms: tuple[str, ...] = ("nsga2", "mopso")
+    algorithms: Mapping[str, Mapping[str, Any]] = field(default_factory=lambda: chosen(ALGORITHMS))
     evaluations: Budget = 1000
     replicas: Runs = 10
     seed: Seed = 1
     objectives: tuple[str, ...] = PAPER_OBJECTIVES
     constraint_handling: ConstraintHandling = "penalty"
     first_generation: FirstGeneration = "initial"
-    populations: tuple[tuple[str, int], ...] = ()
 
     def __post_init__(self) -> None:
-        """Check every value.
+        """Check every value and spell out the algorithms' settings.
 
         Raises:
             SettingsError: with the value, and what is allowed.
         """
         require_allowed(self)
         select_objectives(self.objectives)
-        if not self.algorithms or len(set(self.algorithms)) != len(self.algorithms):
-            raise SettingsError(f"algorithms {self.algorithms}: name at least one, each once")
-        sized = [name for name, _ in self.populations]
-        strays = [name for name in sized if name not in self.algorithms]
-        if strays or len(set(sized)) != len(sized):
-            raise SettingsError(
-                f"populations for {', '.join(sized)}: name each algorithm of the campaign "
-                f"({', '.join(self.algorithms)}) at most once"
-            )
-        for name in self.algorithms:
-            metaheuristics.settings_of(name, self.overrides(name))
-
-    def overrides(self, algorithm: str) -> dict[str, object]:
-        """The settings of an algorithm that differ from its defaults."""
-        size = dict(self.populations).get(algorithm)
-        if size is None:
-            return {}
-        known = {field.name for field in fields(metaheuristics.settings_of(algorithm))}
-        return {key: size for key in SIZE_KEYS if key in known}
+        if not self.algorithms:
+            raise SettingsError("algorithms: name at least one")
+        whole = {
+            name: asdict(metaheuristics.settings_of(name, own))
+            for name, own in self.algorithms.items()
+        }
+        object.__setattr__(self, "algorithms", whole)
 
     def starts_from_initial(self, algorithm: str) -> bool:
         """Whether an algorithm's first generation holds the hand-made trajectory."""
         return self.first_generation == "initial" and algorithm != "random"
-
-    def effective(self) -> dict[str, Any]:
-        """Every setting as JSON values, the algorithms' own ones spelt out."""
-        values = asdict(self)
-        del values["populations"]
-        values["algorithms"] = {
-            name: asdict(metaheuristics.settings_of(name, self.overrides(name)))
-            for name in self.algorithms
-        }
-        values["objectives"] = list(self.objectives)
-        return values
 
     def replica_rng(self, algorithm: str, replica: int) -> np.random.Generator:
         """The only source of randomness of one replica.
@@ -126,31 +134,13 @@ class StoredCell:
 
 
 @dataclass(frozen=True)
-class StoredSettings:
-    """`CampaignSettings.effective` as it was stored; the algorithms' own settings by name."""
-
-    algorithms: Mapping[str, Mapping[str, Any]]
-    evaluations: Budget
-    replicas: Runs
-    seed: Seed
-    objectives: tuple[str, ...]
-    constraint_handling: ConstraintHandling
-    first_generation: FirstGeneration
-
-    def __post_init__(self) -> None:
-        """Refuse what no campaign has."""
-        if not self.algorithms or not self.objectives:
-            raise ValueError("names no algorithm or no objective")
-
-
-@dataclass(frozen=True)
 class Configuration:
     """configuration.json: what the results depend on."""
 
     format: str
     version: int
     workcell: StoredCell
-    settings: StoredSettings
+    settings: CampaignSettings
     environment: Mapping[str, str]
 
 

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated
 
-from hybrid_opt.campaign.settings import Seconds, StoredCell, StoredSettings
+from hybrid_opt.campaign.settings import CampaignSettings, Seconds, StoredCell
 from hybrid_opt.evaluate.objectives import PLANNED_FORCE, ROBUST_FORCE, ForceKind
 from hybrid_opt.indicators.metrics import BindingBound
 from hybrid_opt.indicators.statistics import RankTest, Summary
@@ -318,7 +318,7 @@ class CampaignSummary:
 
     workcell: StoredCell
     robots: tuple[str, ...]
-    settings: StoredSettings
+    settings: CampaignSettings
     environment: Mapping[str, str]
     objectives: tuple[str, ...]
     reference_force: Pair

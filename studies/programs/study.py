@@ -20,7 +20,7 @@ from hybrid_opt.campaign import (
 from hybrid_opt.campaign.cell_source import decided_cell, store_branches
 from hybrid_opt.campaign.polish_stage import polish_stage
 from hybrid_opt.campaign.results import read_summary
-from hybrid_opt.campaign.settings import DRIVABLE, SUMMARY
+from hybrid_opt.campaign.settings import ALGORITHMS, DRIVABLE, SUMMARY, chosen
 from hybrid_opt.campaign.stages import drivable_settings, drivable_stage
 from hybrid_opt.cell import Cell
 from hybrid_opt.display.table import counted
@@ -275,16 +275,15 @@ def campaign_settings(
     if replicas is None:
         replicas = QUICK_REPLICAS if options.quick else usual.replicas
         replicas = 1 if options.recommend_only else replicas
-    algorithms = usual.algorithms[: 1 if options.recommend_only else None]
+    algorithms = ALGORITHMS[: 1 if options.recommend_only else None]
     settings = CampaignSettings(
-        algorithms=tuple(options.algorithm or algorithms),
+        algorithms=chosen(options.algorithm or algorithms, options.population or ()),
         evaluations=evaluations,
         replicas=replicas,
         seed=options.seed,
         objectives=tuple(options.objective or objectives),
         constraint_handling=options.constraint_handling,
         first_generation=options.first_generation,
-        populations=tuple(options.population or ()),
     )
     beside = drivable_settings(settings, options.drivable_replicas)  # told before any work
     return replace(beside, replicas=settings.replicas) if options.recommend_only else settings

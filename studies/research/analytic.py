@@ -12,6 +12,7 @@ from dataclasses import asdict, dataclass
 from typing import Literal
 
 from hybrid_opt import metaheuristics
+from hybrid_opt.campaign.settings import sized
 from hybrid_opt.display.table import number, text_table
 from hybrid_opt.indicators import metrics
 from hybrid_opt.indicators.statistics import RankTest, Summary, corrected, rank_test, summarise
@@ -131,14 +132,8 @@ def _indicators(target: AnalyticProblem, points: Evaluated) -> tuple[float, floa
     return metrics.hypervolume(front), metrics.igd(front, target.normalise(target.front))
 
 
-def _settings(name: str, population: int) -> dict[str, object]:
-    known = metaheuristics.settings_of(name)
-    size = next(key for key in ("swarm", "population", "batch") if hasattr(known, key))
-    return {size: population}
-
-
 def _run(target: AnalyticProblem, name: str, evaluations: int, population: int, seed: int) -> _Run:
-    algorithm = metaheuristics.make(name, _settings(name, population))
+    algorithm = metaheuristics.make(name, sized(name, population))
     result = metaheuristics.search(target.problem, algorithm, evaluations, seed)
     # Judged anew from the decisions: an algorithm's word for feasibility is not enough.
     constraints = target.problem.evaluate(result.front.decisions, return_values_of=["G"])

@@ -19,7 +19,7 @@ from hybrid_opt.campaign import (
     search_stage,
 )
 from hybrid_opt.campaign.results import CampaignResults, read_campaign, read_summary
-from hybrid_opt.campaign.settings import CONFIGURATION, SIZE_KEYS
+from hybrid_opt.campaign.settings import CONFIGURATION
 from hybrid_opt.campaign.summary import CampaignSummary
 from hybrid_opt.display.table import number, text_table
 from hybrid_opt.errors import ResultsError
@@ -68,7 +68,7 @@ def controls(
         ResultsError: the study is not complete, or was not polished.
     """
     study, summary = read_campaign(root), read_summary(root)
-    settings = _settings(study)
+    settings = study.settings
     budgets = tuple(evaluations) or (settings.evaluations + _polish_cost(root, summary), LONG)
     found = []
     for budget in budgets:
@@ -77,25 +77,6 @@ def controls(
             rivals = dict.fromkeys((name, "nsga2" if "nsga2" in study.algorithms else name))
             found += [_compare(summary, longer, name, rival, budget) for rival in rivals]
     return found
-
-
-def _settings(study: CampaignResults) -> CampaignSettings:
-    stored = study.configuration.settings
-    return CampaignSettings(
-        algorithms=study.algorithms,
-        evaluations=stored.evaluations,
-        replicas=stored.replicas,
-        seed=stored.seed,
-        objectives=study.objectives,
-        constraint_handling=stored.constraint_handling,
-        first_generation=stored.first_generation,
-        populations=tuple(
-            (name, own[key])
-            for name, own in stored.algorithms.items()
-            for key in SIZE_KEYS
-            if key in own
-        ),
-    )
 
 
 def _polish_cost(root: Path, summary: CampaignSummary) -> int:

@@ -150,13 +150,13 @@ def recommend_from(
             ho.Front.of(cell, x), wish, others, progress=lambda done, total: advance(1)
         )
         durations = _force_table(cell, drivable, others, found, advance)
-        price = _price(found.carry, campaign.configuration.settings.seed, threads)
+        price = _price(found.carry, campaign.settings.seed, threads)
         advance(1)
     source = sources[found.member]
     provenance = {
         "recommended": str(wish),
         "source": source,
-        "settings": to_json(campaign.configuration.settings),
+        "settings": to_json(campaign.settings),
     }
     figures = cell.carry(found.x).figures
     write_trajectory(path, cell.compiled, found.x, figures, provenance)

@@ -331,7 +331,7 @@ def _store_selected(
         "algorithm": replica[0],
         "replica": replica[1],
         "row": selected.row,
-        "settings": folder.settings.effective(),
+        "settings": to_json(folder.settings),
     }
     carry = selected.carry
     write_trajectory(path, folder.cell.compiled, carry.x, carry.figures, provenance)

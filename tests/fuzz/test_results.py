@@ -39,9 +39,7 @@ thorough = settings(max_examples=1000, suppress_health_check=list(HealthCheck))
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A polished and timed study, as small as it can be."""
     root = tmp_path_factory.mktemp("whole") / "results"
-    campaign = CampaignSettings(
-        algorithms=("nsga2",), evaluations=60, replicas=1, seed=3, populations=(("nsga2", 20),)
-    )
+    campaign = CampaignSettings({"nsga2": {"population": 20}}, evaluations=60, replicas=1, seed=3)
     study = StudySettings(PolishSettings(attempts=1), report=False)
     execution = ExecutionSettings(root, jobs=1)
     run_study(load(TRANSFER), campaign, execution, Progress(shown=False), study)

@@ -76,7 +76,7 @@ def test_importing_it_imports_nothing_slow() -> None:
 
 
 def test_a_search_is_the_one_that_a_campaign_runs() -> None:
-    settings = CampaignSettings(algorithms=("nsga2",), evaluations=EVALUATIONS)
+    settings = CampaignSettings(algorithms={"nsga2": {}}, evaluations=EVALUATIONS)
     request = ReplicaRequest(settings, "nsga2", 0, cell().initial[None])
     outcome, _ = run_replica(cell().evaluator, request, lambda block: None)
     rows = outcome[FRONT].decode().splitlines()[1:]

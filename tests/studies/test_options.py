@@ -16,7 +16,7 @@ from studies.research import reference_front, thresholds
 from tests.symbolic.cells import ROOT
 
 CAMPAIGN = (
-    *("algorithms", "evaluations", "replicas", "seed"),
+    *("evaluations", "replicas", "seed"),
     *("constraint_handling", "first_generation"),
 )
 """Settings whose defaults `studies.run` tells."""

@@ -39,7 +39,10 @@ def refused(message: str, *given: Any) -> None:
         ({"evaluations": 201}, r"settings.evaluations: stored 200, now 201"),
         ({"replicas": 3}, r"settings.replicas: stored 2, now 3"),
         ({"constraint_handling": "constraints"}, r'stored "penalty", now "constraints"'),
-        ({"populations": (("mopso", 30),)}, r"settings.algorithms.mopso.swarm: stored 40, now 30"),
+        (
+            {"algorithms": {"nsga2": {}, "mopso": {"swarm": 30}}},
+            r"settings.algorithms.mopso.swarm: stored 40, now 30",
+        ),
         ({"objectives": ("duration", "mean_force")}, r"settings.objectives: stored"),
     ],
 )

@@ -85,7 +85,7 @@ def recorded_in(replica: Path) -> float:
 
 def test_results_hold_every_candidate_in_order(tmp_path: Path) -> None:
     log = tmp_path / "log"
-    settings = replace(SETTINGS, algorithms=("mopso",), replicas=1)
+    settings = replace(SETTINGS, algorithms={"mopso": {}}, replicas=1)
     root = run_search(settings, ExecutionSettings(tmp_path / "a", 1), FakeSource(log=str(log)))
     (replica,) = read_campaign(root).replicas
     expected = verdicts(logged(log))
@@ -109,7 +109,7 @@ def test_replicas_differ(undisturbed: dict[str, bytes]) -> None:
 def test_other_algorithms_and_replicas_do_not_matter(
     tmp_path: Path, undisturbed: dict[str, bytes]
 ) -> None:
-    settings = replace(SETTINGS, algorithms=("random", "mopso"), replicas=1)
+    settings = replace(SETTINGS, algorithms={"random": {}, "mopso": {}}, replicas=1)
     found = files_of(run_search(settings, ExecutionSettings(tmp_path / "a", 1)))
     common = found.keys() & undisturbed.keys()
     assert len(common) == 2

@@ -9,7 +9,9 @@ from typing import Any
 import pytest
 
 from hybrid_opt.campaign import CampaignSettings, ExecutionSettings
+from hybrid_opt.campaign.settings import chosen
 from hybrid_opt.campaign.stages import drivable_settings
+from hybrid_opt.store.json_records import from_json, to_json
 from symbolic.errors import SettingsError
 
 
@@ -20,20 +22,35 @@ from symbolic.errors import SettingsError
         ({"evaluations": 10.0}, r"evaluations is 10\.0"),
         ({"replicas": True}, "replicas is True"),
         ({"seed": -1}, "seed is -1; allowed are whole numbers 0 to"),
-        ({"algorithms": ()}, "name at least one, each once"),
-        ({"algorithms": ("nsga2", "nsga2")}, "name at least one, each once"),
-        ({"algorithms": ("nsga3",)}, "unknown algorithm 'nsga3'; known are"),
+        ({"algorithms": {}}, "name at least one"),
+        ({"algorithms": {"nsga3": {}}}, "unknown algorithm 'nsga3'; known are"),
+        ({"algorithms": {"nsga2": {"swarm": 10}}}, "nsga2: unknown setting swarm"),
+        ({"algorithms": {"nsga2": {"population": 1}}}, "population is 1; allowed are whole"),
         ({"objectives": ("speed",)}, "unknown objective speed; known are"),
         ({"constraint_handling": "hope"}, "'hope'; known are penalty, constraints"),
         ({"first_generation": "lucky"}, "'lucky'; known are initial, random"),
-        ({"populations": (("random", 10),)}, r"of the campaign \(nsga2, mopso\)"),
-        ({"populations": (("nsga2", 10), ("nsga2", 20))}, "at most once"),
-        ({"populations": (("nsga2", 1),)}, "population is 1; allowed are whole numbers 4 to"),
     ],
 )
 def test_wrong_settings_are_told(change: dict[str, Any], message: str) -> None:
     with pytest.raises(SettingsError, match=message):
         CampaignSettings(**change)
+
+
+@pytest.mark.parametrize(
+    ("names", "populations", "message"),
+    [
+        ((), (), "name at least one, each once"),
+        (("nsga2", "nsga2"), (), "name at least one, each once"),
+        (("nsga2", "mopso"), (("random", 10),), r"of the campaign \(nsga2, mopso\)"),
+        (("nsga2",), (("nsga2", 10), ("nsga2", 20)), "at most once"),
+        (("nsga3",), (("nsga3", 10),), "unknown algorithm 'nsga3'; known are"),
+    ],
+)
+def test_wrong_algorithms_are_told(
+    names: tuple[str, ...], populations: tuple[tuple[str, int], ...], message: str
+) -> None:
+    with pytest.raises(SettingsError, match=message):
+        chosen(names, populations)
 
 
 @pytest.mark.parametrize(
@@ -75,14 +92,12 @@ def test_random_search_stays_random() -> None:
     assert not CampaignSettings(first_generation="random").starts_from_initial("nsga2")
 
 
-def test_effective_settings_spell_out_the_algorithms() -> None:
-    settings = CampaignSettings(
-        algorithms=("mopso", "random"), populations=(("mopso", 30), ("random", 7))
-    )
-    effective = settings.effective()
-    assert effective["algorithms"]["mopso"]["swarm"] == 30
-    assert effective["algorithms"]["mopso"]["inertia"] == 0.4
-    assert effective["algorithms"]["random"] == {"batch": 7}
+def test_settings_spell_out_the_algorithms() -> None:
+    settings = CampaignSettings(chosen(("mopso", "random"), (("mopso", 30), ("random", 7))))
+    assert settings.algorithms["mopso"]["swarm"] == 30
+    assert settings.algorithms["mopso"]["inertia"] == 0.4
+    assert settings.algorithms["random"] == {"batch": 7}
+    assert from_json(CampaignSettings, to_json(settings), "", "") == settings
 
 
 def test_streams_differ_and_repeat() -> None:
@@ -96,5 +111,5 @@ def test_streams_differ_and_repeat() -> None:
         for replica in range(20)
     }
     assert len(set(streams.values())) == len(streams)
-    other = CampaignSettings(algorithms=("mopso",), replicas=3, evaluations=5)
+    other = CampaignSettings(algorithms={"mopso": {}}, replicas=3, evaluations=5)
     assert tuple(other.replica_rng("mopso", 2).integers(2**63, size=2)) == streams[1, "mopso", 2]

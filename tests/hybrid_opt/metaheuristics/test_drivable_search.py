@@ -47,7 +47,7 @@ def test_a_worker_elsewhere_searches_without_the_cells_files(
     cell = ho.Cell.load(RACK.with_name("drum.toml")).drivable()
     packed = PackedCell.of(collect_cell(cell.workcell))
     source = partial(packed.make, partial(CandidateEvaluator, objectives=DRIVABLE_OBJECTIVES))
-    settings = CampaignSettings(("random",), EVALUATIONS, 1, objectives=DRIVABLE_OBJECTIVES)
+    settings = CampaignSettings({"random": {}}, EVALUATIONS, 1, objectives=DRIVABLE_OBJECTIVES)
     request = ReplicaRequest(settings, "random", 0, cell.initial[None])
     monkeypatch.chdir(tmp_path)
     ((files, _),) = answer_all(ProcessExecutor(1), Service(source, run_replica), [request])

@@ -55,7 +55,7 @@ def test_a_killed_worker_changes_nothing(tmp_path: Path, cluster: Any) -> None:
 
 
 def test_what_a_lost_campaign_recorded_is_not_repeated(tmp_path: Path, cluster: Any) -> None:
-    settings = replace(SETTINGS, algorithms=("mopso",), replicas=1)
+    settings = replace(SETTINGS, algorithms={"mopso": {}}, replicas=1)
     log = tmp_path / "log"
     with pytest.raises(WorkerError, match="--resume"):
         run_search(

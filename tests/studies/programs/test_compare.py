@@ -27,7 +27,7 @@ from tests.studies.conftest import TRANSFER
 def other(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A campaign with another seed and another set of algorithms."""
     root = tmp_path_factory.mktemp("other") / "results"
-    settings = CampaignSettings(("nsga2", "random"), evaluations=80, replicas=5, seed=9)
+    settings = CampaignSettings({"nsga2": {}, "random": {}}, evaluations=80, replicas=5, seed=9)
     execution = ExecutionSettings(root, jobs=1)
     with open_folder(settings, execution, load(TRANSFER)) as folder:
         run_stages(folder, (search_stage(), summary_stage()), Progress(shown=False))

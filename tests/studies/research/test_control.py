@@ -25,9 +25,7 @@ from tests.symbolic.read.samples import RACK
 @pytest.fixture(scope="module")
 def study(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("control") / "results"
-    settings = CampaignSettings(
-        algorithms=("nsga2",), evaluations=120, replicas=2, seed=4, populations=(("nsga2", 20),)
-    )
+    settings = CampaignSettings({"nsga2": {"population": 20}}, evaluations=120, replicas=2, seed=4)
     run_study(
         load(RACK),
         settings,
@@ -42,7 +40,7 @@ def test_longer_searches_repeat_the_studys_own_settings(study: Path) -> None:
     (found,) = longer_searches.controls(study, [160], 1, Progress(shown=False))
     longer = read_campaign(study / "control" / "160")
     own = read_campaign(study)
-    stored, wanted = longer.configuration.settings, own.configuration.settings
+    stored, wanted = longer.settings, own.settings
     assert stored == replace(wanted, evaluations=160)
     # The same seed: the longer search begins as the shorter one, up to its cut last generation.
     first, second = longer.replicas[0].evaluations.x, own.replicas[0].evaluations.x
@@ -83,7 +81,7 @@ def test_distance_to_a_reference_front(study: Path) -> None:
 def test_a_study_without_a_polish_is_told(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    settings = CampaignSettings(algorithms=("random",), evaluations=60, replicas=1)
+    settings = CampaignSettings(algorithms={"random": {}}, evaluations=60, replicas=1)
     root = tmp_path / "results"
     execution = ExecutionSettings(root, jobs=1)
     run_study(load(RACK), settings, execution, Progress(shown=False), StudySettings(report=False))

@@ -46,7 +46,7 @@ def study(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     text, _ = driven.read_text().split("[uncertainty]")
     driven.write_text(f"{text}[uncertainty]\nfriction = {FRICTION}\nmass = {MASS}\n")
     settings = CampaignSettings(
-        algorithms=("nsga2",),
+        algorithms={"nsga2": {}},
         objectives=ROBUST_DRIVABLE_OBJECTIVES,
         evaluations=120,
         replicas=1,

@@ -301,8 +301,8 @@ def test_options_become_settings() -> None:
     )
     options = rack.main.parser().parse_args(arguments.split())
     settings = campaign_settings(options)
-    assert settings.algorithms == ("mopso", "random")
-    assert settings.populations == (("mopso", 30),)
+    assert list(settings.algorithms) == ["mopso", "random"]
+    assert settings.algorithms["mopso"]["swarm"] == 30
     assert settings.objectives == ("duration",)
     assert settings.constraint_handling == "constraints"
     assert settings.first_generation == "random"

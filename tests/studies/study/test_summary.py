@@ -18,9 +18,9 @@ from hybrid_opt.campaign.search_stage import front_rows
 from hybrid_opt.campaign.settings import (
     POLISH,
     SIMULATED,
+    CampaignSettings,
     Configuration,
     StoredCell,
-    StoredSettings,
     polished_folder,
 )
 from hybrid_opt.campaign.summary import CampaignSummary, ReplicaFigures, SelectedEntry
@@ -144,14 +144,12 @@ def entry(number: int, **figures: Any) -> ReplicaFigures:
 
 
 def results(entries: dict[str, list[ReplicaFigures]]) -> CampaignResults:
-    settings = StoredSettings(
+    settings = CampaignSettings(
         algorithms={name: {} for name in entries},
         evaluations=10,
         replicas=len(next(iter(entries.values()))),
         seed=1,
         objectives=OBJECTIVES,
-        constraint_handling="penalty",
-        first_generation="initial",
     )
     configuration = Configuration("", 1, StoredCell("Rack", "", ""), settings, {})
     return CampaignResults(Path("results"), configuration, Cell(load(RACK)), ())
