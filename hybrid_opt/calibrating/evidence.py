@@ -21,12 +21,12 @@ from hybrid_opt.calibrating.estimate import (
 )
 from hybrid_opt.calibrating.faults import (
     LARGEST_RESIDUAL,
-    VANISHED,
     Fault,
     load_faults,
     recording_faults,
+    vanished,
 )
-from hybrid_opt.calibrating.recording import Places, Run, places_of
+from hybrid_opt.calibrating.recording import Places, Run, places_of, tared
 from hybrid_opt.display.table import number, text_table
 from hybrid_opt.proposing.problem import Problem, completed, library
 from symbolic import outside
@@ -126,12 +126,12 @@ def calibrate(workcell: Workcell, runs: Sequence[Run]) -> Evidence:
     collected = _Collected(workcell)
     sound = []
     for run in runs:
-        places = places_of(workcell, run)
+        places, offsets = tared(run, places_of(workcell, run))
         faults = recording_faults(workcell, run, places)
         collected.faults += faults
         if not any(fault.serious for fault in faults):
-            tared = _tared(run, places, collected)
-            sound.append((run, tared))
+            _tell_offsets(run, offsets, collected)
+            sound.append((run, places))
     load = _load(workcell, sound, collected)
     if not any(fault.serious and not fault.run for fault in collected.faults):
         _friction(workcell, sound, load, collected)
@@ -176,40 +176,29 @@ class _Collected:
 # --- sensors and load ---
 
 
-def _tared(run: Run, places: Places, collected: _Collected) -> Places:
-    """The run without the sensors' offsets, each as at the tare before."""
-    offsets = []
-    for instant in sorted(run.labels.tare):
-        inside = run.around(instant)
-        if inside.any():
-            offsets.append((instant, places.wrench[inside].mean(axis=0)))
-    instants = np.array([instant for instant, _ in offsets])
-    before = np.maximum(np.searchsorted(instants, run.time, side="right") - 1, 0)
-    values = np.array([offset for _, offset in offsets])
+def _tell_offsets(run: Run, offsets: Array, collected: _Collected) -> None:
     for i in range(2):
-        told = ", ".join(number(value, 2) for value in values[:, i, :3].mean(axis=0))
-        moved = np.ptp(values[:, i, :3], axis=0).max()
-        drift = f", drift {moved:.2f} N" if len(values) > 1 else ""
+        told = ", ".join(number(value, 2) for value in offsets[:, i, :3].mean(axis=0))
+        moved = np.ptp(offsets[:, i, :3], axis=0).max()
+        drift = f", drift {moved:.2f} N" if len(offsets) > 1 else ""
         collected.tell(f"{run.name}, offset of arm {i + 1}", f"{told} N{drift}")
-    return Places(places.pads, places.box, places.wrench - values[before])
 
 
 def _pieces(run: Run, places: Places) -> list[Hold]:
     """A run's holds that are still and whole, in pieces."""
     found = []
     for begin, end in run.labels.held:
-        squeeze = places.normal[run.within(begin, end)].min(axis=1)
-        lost = any(a < end and b > begin for a, b in run.lost)
-        if lost or not len(squeeze):
+        if any(a < end and b > begin for a, b in run.lost):
             continue
-        if not run.labels.empty and squeeze.min() < VANISHED * np.median(squeeze):
+        if not run.labels.empty and vanished(places.normal[run.within(begin, end)]).any():
             continue
         count = max(1, round((end - begin) / PIECE))
         edges = np.linspace(begin, end, count + 1)
         for first, last in pairwise(edges):
             inside = run.within(first, last)
-            moved = max(float(np.ptp(q[inside], axis=0).max(initial=0.0)) for q in run.joints)
-            if last - first < SHORTEST or moved > STILL or np.count_nonzero(inside) < 5:
+            if last - first < SHORTEST or np.count_nonzero(inside) < 5:
+                continue
+            if max(np.ptp(q[inside], axis=0).max() for q in run.joints) > STILL:
                 continue
             middle = np.flatnonzero(inside)[np.count_nonzero(inside) // 2]
             T_world_box = places.box[middle]
@@ -249,8 +238,7 @@ def _load(workcell: Workcell, sound: Sound, collected: _Collected) -> Load | Non
         collected.asks.append("holds of the box at rest, two seconds each, after a tare")
         return None
     load = fit_load(holds, moments)
-    known = next((hold.mass for hold in holds if hold.mass), workcell.payload.mass)
-    faults = load_faults(holds, load, known, moments)
+    faults = load_faults(holds, load, moments)
     collected.faults += faults
     if faults:
         return None
@@ -261,10 +249,12 @@ def _load(workcell: Workcell, sound: Sound, collected: _Collected) -> Load | Non
         collected.tell("mass", told, "payload.mass")
         collected.doubt("mass", max(share, LEAST_MASS))
     else:
-        collected.asks.append(
-            "holds at three squeezes, or the box's weight from a scale: mass and crosstalk cannot "
-            "be told apart"
+        text = (
+            "mass and crosstalk cannot be told apart; record holds at three squeezes, or state the "
+            "mass from a scale"
         )
+        names = ", ".join(run.name for run, _ in sound if not run.labels.empty)
+        collected.faults.append(Fault(names, "load not seen", text))
     payload: dict[str, Any] = {"mass": round(load.mass, 4)} if load.sees_mass else {}
     spread = load.deviations[1:4]
     if load.sees_mass and load.sees_centre.all():

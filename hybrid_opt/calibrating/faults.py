@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hybrid_opt.calibrating.estimate import Hold, Load, delay, fit_load, swapped
-from hybrid_opt.calibrating.recording import Places, Run
+from hybrid_opt.calibrating.recording import TARE_TIME, Places, Run, places_of
 from symbolic.array import Array
 from symbolic.records import Workcell
 from symbolic.records.poses import inverse
@@ -20,22 +20,37 @@ FULL = 0.98
 """Share of a sensor's range from which on it may not show all."""
 
 VANISHED = 0.1
-"""Share of a hold's median squeeze below which it has vanished."""
+"""Share of a hold's usual squeeze below which it has vanished."""
+
+LEAST_NORMAL = 0.5
+"""Normal over whole force below which a frame is not what it is said to be: friction of 1.7."""
 
 APART = 0.03
 """Difference of both arms' clocks that is told [s]: the box hands normal forces on at once."""
 
+LARGEST_DELAY = 5.0
+"""Of one clock after the other that is looked for [s]."""
+
 LONGEST_STEP = 0.5
 """Usual step of a recording above which its times are in another unit [s]."""
 
-LONGEST_LEVER = 3.0
-"""Moments over forces above which moments are in another unit [m]."""
+LONGEST_LEVER = 10.0
+"""Moments about the pads over normal forces, over the radius of their patch, above which moments
+are in another unit. Pressure at a patch's rim gives 1."""
 
-FORCE_UNITS = (("kgf", 1.0 / STANDARD_GRAVITY), ("lbf", 0.224809), ("mN", 1e3))
-"""Units that forces are told in by mistake, in newtons."""
+FORCE_UNITS = (("kgf", 1.0 / STANDARD_GRAVITY), ("lbf", 0.224809), ("kN", 1e-3), ("mN", 1e3))
+"""Units that forces are told in by mistake, of a newton."""
 
 LIKE_UNIT = 0.2
-"""How near the mass in another unit has to be to the known one, as a share."""
+"""How near a force in another unit has to be to the known one, as a share."""
+
+LEAST_PULL, SHARE_PULL = 5.0, 0.2
+"""Pull at pads that are not said to hold from which on a tare is wrong [N], and over the greatest
+normal force."""
+
+TARE_CHANGE, TARE_ERRORS = 2.0, 6.0
+"""Change of the mean force within a tare from which on an arm touches something [N], and over its
+standard error."""
 
 
 @dataclass(frozen=True)
@@ -60,29 +75,73 @@ class Fault:
 
 
 def recording_faults(workcell: Workcell, run: Run, places: Places) -> list[Fault]:
-    """What a run shows by itself."""
-    units = _unit_faults(workcell, run)
-    if units:
-        return units
-    found = [
-        *_dropouts(run),
-        *_range_faults(run),
-        *_pad_faults(workcell, run, places),
-        *_clock_faults(run, places),
-    ]
-    if not any(run.around(instant).any() for instant in run.labels.tare):
-        text = "name an instant of the recording at which both arms touch nothing"
-        found.append(Fault(run.name, "missing tare", text))
+    """What a run shows by itself.
+
+    Args:
+        places: its pads, the sensors' offsets taken out.
+    """
+    found = [*_dropouts(run), *_range_faults(run)]
     if not run.has_moments:
         text = "the centre of mass and torsion cannot be seen; record all six numbers"
         found.append(Fault(run.name, "moments missing", text, serious=False))
+    # What follows from a fault would lead astray.
+    return found + (
+        _unit_faults(workcell, run, places)
+        or _tare_faults(run, places)
+        or _frame_faults(run, places)
+        or _clock_faults(run, places)
+        or _pad_faults(workcell, run, places)
+    )
+
+
+def _tare_faults(run: Run, places: Places) -> list[Fault]:
+    """Tares at which nothing was recorded, or an arm touches something."""
+    found = []
+    recorded = [instant for instant in run.labels.tare if run.around(instant).any()]
+    if not recorded:
+        found.append("name an instant of the recording at which both arms touch nothing")
+    for instant in recorded:
+        inside = run.around(instant)
+        force, asked = run.wrench[inside, :, :3], np.nan_to_num(run.commanded[inside]).max()
+        first, second = (half.mean(axis=0) for half in np.array_split(force, 2))
+        error = force.std(axis=0) * np.sqrt(4.0 / len(force))
+        change = np.abs(second - first)
+        at = f"at {instant:g} s "
+        if any(begin <= instant <= end for begin, end in run.labels.held):
+            found.append(f"{at}the pads hold the box; name an instant when both are free")
+        elif asked > 1.0:
+            found.append(f"{at}{asked:.1f} N are commanded; name an instant when both are free")
+        elif (change > np.maximum(TARE_CHANGE, TARE_ERRORS * error)).any():
+            found.append(
+                f"{at}forces change by {change.max():.1f} N; name an instant at which both arms "
+                "stand still and touch nothing"
+            )
     held = _held(run)
-    if held.any() and not run.labels.empty:
-        normal = np.median(places.normal[held], axis=0)
-        if (normal < 0.0).any():
-            text = "the sensors tell of pulling; tell what acts on the arm, in the stated frame"
-            found.append(Fault(run.name, "wrong sign or frame", text))
-    return found
+    free = np.cumsum(held) * np.cumsum(held[::-1])[::-1] == 0
+    if not found and held.any() and free.any() and not run.labels.empty:
+        wide = max(1, round(TARE_TIME / run.steps.max()))
+        smooth = np.apply_along_axis(np.convolve, 0, places.normal, np.ones(wide) / wide, "same")
+        least, pressed = smooth[free].min(axis=0), smooth[held].min(axis=0)
+        pull = np.maximum(LEAST_PULL, SHARE_PULL * np.ptp(smooth, axis=0))
+        if (least < np.minimum(pressed, 0.0) - pull).any():
+            found.append(
+                f"the pads pull by {-least.min():.0f} N before or after all holds: at the tare "
+                "they pressed, or the tool's weight is not compensated"
+            )
+    return [Fault(run.name, "missing tare", text) for text in found]
+
+
+def _frame_faults(run: Run, places: Places) -> list[Fault]:
+    held = _held(run)
+    if not held.any() or run.labels.empty:
+        return []
+    normal = np.median(places.normal[held], axis=0)
+    force = np.median(np.linalg.norm(places.wrench[held, :, :3], axis=2), axis=0)
+    if (normal >= LEAST_NORMAL * force).all():
+        return []
+    told = ", ".join(f"{n:.0f} of {f:.0f} N" for n, f in zip(normal, force, strict=True))
+    text = f"arms press with {told}; tell what acts on the arm, in the stated frame"
+    return [Fault(run.name, "wrong sign or frame", text)]
 
 
 def _held(run: Run) -> Array:
@@ -93,33 +152,67 @@ def _held(run: Run) -> Array:
     return found
 
 
-def _unit_faults(workcell: Workcell, run: Run) -> list[Fault]:
+def _unit_faults(workcell: Workcell, run: Run, places: Places) -> list[Fault]:
     found = []
-    step = float(np.median(np.diff(run.time)))
-    if step > LONGEST_STEP:
-        found.append(f"a sample every {step:g} s; times look like ms")
+    if run.steps.max() > LONGEST_STEP:
+        found.append(f"a sample every {run.steps.max():g} s; times look like ms")
     for robot, q in zip(workcell.robots, run.joints, strict=True):
         beyond = np.maximum(np.abs(robot.position_lower), np.abs(robot.position_upper))
         if (np.abs(q).max(axis=0) > 1.5 * beyond).any():
             found.append(f"{robot.name!r} is far beyond its joint limits; they look like degrees")
-    if run.has_moments:
-        force, moment = (float(np.linalg.norm(part)) for part in np.split(run.wrench, 2, axis=2))
-        if moment > LONGEST_LEVER * force:
-            found.append(f"moments are {moment / force:.0f} m times forces; they look like N mm")
+    held = _held(run)
+    if not found and held.any() and not run.labels.empty:
+        found = _force_units(run, places, held) or _moment_units(workcell, places, held)
     return [Fault(run.name, "unit error", text) for text in found]
 
 
+def _force_units(run: Run, places: Places, held: Array) -> list[str]:
+    """Forces, of whatever frame, against what is commanded and against those of the other arm."""
+    force = np.median(np.linalg.norm(places.wrench[held, :, :3], axis=2), axis=0)
+    asked = np.nanmedian(np.where(run.has_command, run.commanded[held], 0.0), axis=0)
+    for unit, factor in FORCE_UNITS:
+        for i in range(2):
+            near = LIKE_UNIT * factor
+            told = f"{force[i]:.3g} measured by arm {i + 1} where {asked[i]:.3g} are commanded"
+            if abs(force[i] - factor * asked[i]) < near * asked[i]:
+                return [f"{told}; the measured look like {unit}"]
+            if factor < 1.0 and abs(asked[i] - factor * force[i]) < near * force[i]:
+                return [f"{told}; the commanded look like {unit}"]
+            if factor < 1.0 and abs(force[i] - factor * force[1 - i]) < near * force[1 - i]:
+                return [
+                    f"arm {i + 1} measures {force[i]:.3g}, the other {force[1 - i]:.3g}; the "
+                    f"first look like {unit}"
+                ]
+    return []
+
+
+def _moment_units(workcell: Workcell, places: Places, held: Array) -> list[str]:
+    """Moments about the pads against what their patches can bear."""
+    normal = np.abs(np.median(places.normal[held], axis=0)).mean()
+    for i, contact in enumerate(workcell.contacts):
+        moment = float(np.median(np.linalg.norm(places.wrench[held, i, 3:], axis=1)))
+        if moment > LONGEST_LEVER * contact.patch_radius * normal:
+            unit = "N mm" if moment > 2.0 * normal else "N cm"
+            return [f"moments of arm {i + 1} are {moment:.3g}; they look like {unit}"]
+    return []
+
+
 def _dropouts(run: Run) -> list[Fault]:
-    return [
-        Fault(
-            run.name,
-            "dropout",
-            f"nothing new for {end - begin:.2f} s from {begin:.2f} s on; holds with it are left "
-            "out",
-            serious=False,
-        )
-        for begin, end in run.lost
+    """Spans without anything new, and holds that are not in the recording."""
+    found = [
+        f"nothing new for {end - begin:.2f} s from {begin:.2f} s on" for begin, end in run.lost
     ]
+    room = run.steps.max()
+    first, last = run.time[0] - room, run.time[-1] + room
+    outside = [span for span in run.labels.held if span[0] < first or span[1] > last]
+    if outside:
+        spans = ", ".join(f"{begin:g} to {end:g}" for begin, end in outside)
+        found.append(
+            f"both arms recorded from {run.time[0]:.2f} to {run.time[-1]:.2f} s, not all of the "
+            f"holds from {spans} s"
+        )
+    text = "; holds with it are left out"
+    return [Fault(run.name, "dropout", each + text, serious=False) for each in found]
 
 
 def _range_faults(run: Run) -> list[Fault]:
@@ -139,30 +232,46 @@ def _pad_faults(workcell: Workcell, run: Run, places: Places) -> list[Fault]:
     found = []
     nominal = inverse(workcell.contacts[0].T_box_pad) @ workcell.contacts[1].T_box_pad
     room = sum(contact.patch_radius for contact in workcell.contacts)
+
+    def apart(pads: Array) -> float:
+        between = np.linalg.inv(pads[:, 0]) @ pads[:, 1]
+        return float(np.median(np.linalg.norm(between[:, :2, 3] - nominal[:2, 3], axis=1)))
+
     for begin, end in run.labels.held:
         inside = run.within(begin, end)
         if not inside.any() or run.labels.empty:
             continue
-        between = np.linalg.inv(places.pads[inside, 0]) @ places.pads[inside, 1]
-        beside = between[:, :2, 3] - nominal[:2, 3]
-        far = float(np.median(np.linalg.norm(beside, axis=1)))
+        far = apart(places.pads[inside])
+        if far > room and run.joints[0].shape == run.joints[1].shape:
+            other = places_of(workcell, replace(run, joints=run.joints[::-1]))
+            if apart(other.pads[inside]) < room:
+                text = (
+                    "with the joints exchanged the pads face one another; check which arm is which"
+                )
+                return [Fault(run.name, "swapped arms", text)]
         if far > room:
             text = (
                 f"they stand {1e3 * far:.0f} mm beside one another from {begin:g} to {end:g} s; "
                 "check the joints' order, which arm is which, and the bases"
             )
             found.append(Fault(run.name, "pads do not overlap", text))
-        squeeze = places.normal[inside].min(axis=1)
-        gone = squeeze < VANISHED * np.median(squeeze)
-        if np.median(squeeze) > 0.0 and gone.any():
+        gone = vanished(places.normal[inside])
+        if gone.any():
             at = run.time[inside][int(np.argmax(gone))]
             text = f"at {at:.2f} s, in a hold from {begin:g} to {end:g} s, which is left out"
             found.append(Fault(run.name, "squeeze vanishes", text, serious=False))
     return found
 
 
+def vanished(normal: Array) -> Array:
+    """(n,) at which samples of a hold the lesser of both normal forces (n, 2) has vanished."""
+    squeeze = normal.min(axis=1)
+    usual = np.quantile(squeeze, 0.75) if len(squeeze) else 0.0
+    return np.asarray((squeeze < VANISHED * usual) & (usual > 0.0))
+
+
 def _clock_faults(run: Run, places: Places) -> list[Fault]:
-    late = delay(run.time, places.normal[:, 0], places.normal[:, 1])
+    late = delay(run.time, places.normal[:, 0], places.normal[:, 1], LARGEST_DELAY)
     if late is None or abs(late) <= APART:
         return []
     text = (
@@ -172,12 +281,11 @@ def _clock_faults(run: Run, places: Places) -> list[Fault]:
     return [Fault(run.name, "clock offset", text)]
 
 
-def load_faults(holds: list[Hold], load: Load, known: float, moments: bool) -> list[Fault]:
+def load_faults(holds: list[Hold], load: Load, moments: bool) -> list[Fault]:
     """What the balance of all holds shows: other units, swapped arms, or what nobody knows.
 
     Args:
         load: what they show together.
-        known: mass of the box that is known, from a scale or the workcell [kg].
         moments: whether the sensors tell moments.
     """
     left = LARGEST_RESIDUAL * abs(load.mass * GRAVITY[2])
@@ -190,10 +298,11 @@ def load_faults(holds: list[Hold], load: Load, known: float, moments: bool) -> l
             )
             return [Fault("", "swapped arms", text)]
     free = fit_load([replace(hold, mass=None) for hold in holds], moments)
-    for unit, factor in FORCE_UNITS:
-        near = LIKE_UNIT * factor * known
-        if abs(free.mass - factor * known) < near and free.deviations[0] < near:
-            text = f"forces of a box of {known:g} kg look like {unit}, not N"
+    weighed = next((hold.mass for hold in holds if hold.mass), None)
+    for unit, factor in FORCE_UNITS if weighed else ():
+        near = LIKE_UNIT * factor * (weighed or 0.0)
+        if abs(free.mass - factor * (weighed or 0.0)) < near and free.deviations[0] < near:
+            text = f"forces of a box of {weighed:g} kg look like {unit}, not N"
             return [Fault("", "unit error", text)]
     if load.residual <= left:
         return []

@@ -10,7 +10,7 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -77,6 +77,7 @@ class Run:
     Attributes:
         name: of its file.
         time: (n,) ascending [s].
+        steps: (2,) usual step of each arm's recording [s].
         joints: (n, joints) of each arm [rad or m].
         wrench: (n, 2, 6) force and moment that act on each arm, in `frame` [N, N m]; moments are
             not finite where none were recorded.
@@ -89,6 +90,7 @@ class Run:
 
     name: str
     time: Array
+    steps: Array
     joints: tuple[Array, Array]
     wrench: Array
     commanded: Array
@@ -101,6 +103,11 @@ class Run:
     def has_moments(self) -> bool:
         """Whether moments were recorded, of both arms."""
         return bool(np.isfinite(self.wrench[:, :, 3:]).all())
+
+    @property
+    def has_command(self) -> Array:
+        """(2,) for which arms a normal force was commanded at any time."""
+        return np.asarray(np.isfinite(self.commanded).any(axis=0))
 
     def within(self, begin: float, end: float) -> Array:
         """(n,) which samples lie between two instants."""
@@ -179,16 +186,19 @@ def read_run(path: Path, workcell: Workcell) -> Run:
     if problems.found:
         raise WorkcellError(str(side), problems.messages())
     first, second = recorded
+    steps = np.array([np.median(np.diff(each.time)) for each in recorded])
     time = first.time[(first.time >= second.time[0]) & (first.time <= second.time[-1])]
     if len(time) < 10:
         raise ResultsError(
             f"{path}: both arms recorded at the same time on {len(time)} samples; allowed are 10 "
-            "and more, on one clock"
+            "and more, on one clock in s (usual steps are "
+            f"{steps[0]:g} and {steps[1]:g})"
         )
     both = [each.at(time) for each in recorded]
     return Run(
         name=path.name,
         time=time,
+        steps=steps,
         joints=(both[0].joints, both[1].joints),
         wrench=np.stack([each.wrench for each in both], axis=1),
         commanded=np.stack([each.commanded for each in both], axis=1),
@@ -359,3 +369,17 @@ def places_of(workcell: Workcell, run: Run) -> Places:
     u, _, v = np.linalg.svd(middle[:, :3, :3])
     middle[:, :3, :3] = u @ v
     return Places(np.stack(pads, axis=1), middle, np.stack(wrenches, axis=1))
+
+
+def tared(run: Run, places: Places) -> tuple[Places, Array]:
+    """A run without its sensors' offsets, each as at the tare before.
+
+    Returns:
+        the readings without them, and (k, 2, 6) the offsets of the k tares that were recorded.
+    """
+    instants = [instant for instant in sorted(run.labels.tare) if run.around(instant).any()]
+    if not instants:
+        return places, np.empty((0, 2, 6))
+    offsets = np.array([places.wrench[run.around(instant)].mean(axis=0) for instant in instants])
+    before = np.maximum(np.searchsorted(instants, run.time, side="right") - 1, 0)
+    return replace(places, wrench=places.wrench - offsets[before]), offsets

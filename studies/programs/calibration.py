@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 
 from hybrid_opt.calibrating import evidence as found_in
 from hybrid_opt.calibrating.recording import read_run
@@ -29,4 +30,7 @@ def calibrate(options: argparse.Namespace) -> int:
         replace_file(output, text.encode())
         if not options.json:
             print(f"written: {output}")
-    return REFUSED if any(fault.serious for fault in evidence.faults) else 0
+    elif output is not None:
+        print(f"not written: {output}, because the runs show nothing for it", file=sys.stderr)
+    missed = output is not None and not evidence.changes
+    return REFUSED if missed or any(fault.serious for fault in evidence.faults) else 0

@@ -134,6 +134,7 @@ def run(
     return Run(
         name=name,
         time=time,
+        steps=np.full(2, 1.0 / RATE),
         joints=(joints[0], joints[1]),
         wrench=wrench,
         commanded=through(knots(asked, np.zeros(2)), time),

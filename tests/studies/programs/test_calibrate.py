@@ -169,6 +169,19 @@ def test_refusals_end_with_code_one(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert not out.exists()
 
 
+def test_a_cell_that_is_not_written_is_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    made = run(0, LEVEL, SQUEEZES[:1])
+    made = replace(made, labels=replace(made.labels, held=((900.0, 902.0),)))
+    out = tmp_path / "cell.toml"
+    assert main([str(RACK), str(write(made, tmp_path)), "--out", str(out)]) == 1
+    said = capsys.readouterr()
+    assert "warning: run.csv: dropout: both arms recorded from 0.00 to" in said.out
+    assert f"not written: {out}" in said.err
+    assert not out.exists()
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
