@@ -181,7 +181,7 @@ def machine_places(problem: Problem, draft: Workcell) -> list[Array]:
     """Bases (6,) of a machine with both arms: the line through its shoulders as the line through
     both contacts, the carry where its arms reach."""
     own = inverse(draft.robots[0].T_world_base)
-    at = [(own @ np.append(point, 1.0))[:3] for point in shoulders(draft)]
+    at = [(own @ np.append(point, 1.0))[:3] for point in shoulders(draft.robots)]
     middle, outwards = _sideways(problem, 0)
     middle = (middle + _sideways(problem, 1)[0]) / 2.0
     across = at[0] - at[1]
@@ -246,7 +246,7 @@ class PlaceScorer:
         start, goal = problem.poses
         self._detours = free_detours(draft, start, goal)
         own = [inverse(robot.T_world_base) for robot in draft.robots]
-        at = zip(own, shoulders(draft), strict=True)
+        at = zip(own, shoulders(draft.robots), strict=True)
         self._shoulders = [(T @ np.append(point, 1.0))[:3] for T, point in at]
         self._queries, self._arms = [], []
         for arm in (0, 1):

@@ -11,13 +11,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+import pinocchio as pin
 from numpy.typing import NDArray
 
 from hybrid_opt.proposing.trial import PoseJudge
 from symbolic.array import Array
 from symbolic.geometry.bodies import ArmGeometry, arm_geometry
 from symbolic.read.arms import arm_model, common_joints
-from symbolic.records import Contact, Workcell
+from symbolic.records import Contact, Robot, Workcell
 from symbolic.records.poses import box_placement, inverse, pose_matrix
 
 REACHED = 1e-6
@@ -206,16 +207,16 @@ def spun(contact: Contact, spin: float) -> Contact:
     return replace(contact, T_box_pad=contact.T_box_pad @ turn)
 
 
-def shoulders(workcell: Workcell) -> Array:
+def shoulders(robots: tuple[Robot, Robot]) -> Array:
     """(2, 3) where each arm's first joint of its own is in the world, all joints at the middle of
     their ranges [m]."""
     found = []
-    for i, robot in enumerate(workcell.robots):
-        arm = ArmKinematics.of(workcell, i, ())
-        names = list(arm_model(robot).names)[1:]
-        own = [k for k, name in enumerate(names) if name not in common_joints(workcell.robots)]
-        frames, _ = arm.chain((arm.lower + arm.upper)[None] / 2.0)
-        found.append(frames[0, own[0], :3])
+    for robot in robots:
+        model = arm_model(robot)
+        own = [name not in common_joints(robots) for name in list(model.names)[1:]].index(True)
+        data, q = model.createData(), (robot.position_lower + robot.position_upper) / 2.0
+        pin.forwardKinematics(model, data, q)
+        found.append((robot.T_world_base @ data.oMi[own + 1].homogeneous)[:3, 3])
     return np.array(found)
 
 

@@ -21,8 +21,11 @@ from symbolic.array import Array
 from symbolic.errors import OutsideError, SettingsError, WorkcellError
 from symbolic.read.cell import load
 from symbolic.read.descriptions import PACKAGE_SCHEME
-from symbolic.records import POSE_SIZE, Workcell
+from symbolic.read.robots import read_robot
+from symbolic.read.tables import Table
+from symbolic.records import POSE_SIZE, Robot, Workcell
 from symbolic.records.poses import Orientation, box_placement, rotation_from_rpy
+from symbolic.records.problems import Problems
 
 UPRIGHT = 0.7
 """Share of the vertical from which on an edge of the box counts as upright."""
@@ -32,9 +35,6 @@ LEAST_LEVEL = 0.1
 
 PROPOSED = ("waypoints", "initial", "redundant")
 """Keys of the task that are proposed anew, whatever the file has."""
-
-_TINY = {"patch_size": None, "patch_radius": 0.001, "further": None, "normal": None}
-"""A contact that fits onto any face; of no meaning."""
 
 REACH_OF_DRAFT = 0.01
 """How far beside start and goal the one free waypoint of a draft may be [m, rad]; of no meaning."""
@@ -88,7 +88,7 @@ class Problem:
         sideways where the robots have no bases.
 
         Raises:
-            WorkcellError: shoulders are asked for, and the file is wrong.
+            WorkcellError: shoulders are asked for, and the robots are wrong.
         """
         entries = self.data["contacts"]
         if all("xyz" in entry for entry in entries):
@@ -97,9 +97,17 @@ class Problem:
         known = all(isinstance(xyz, list) and len(xyz) == 3 for xyz in found)
         bases = np.array(found, dtype=float) if known else None
         if known and self.is_machine:
-            draft = [{**face, **_TINY} for face in self._faces(None)]
-            bases = shoulders(self._draft({"contacts": draft}))
+            bases = shoulders(self._robots())
         return self._faces(bases)
+
+    def _robots(self) -> tuple[Robot, Robot]:
+        """The robots alone, wherever the box is."""
+        problems = Problems()
+        entries = Table(self.data, "", problems).tables("robots", exactly=2)
+        found = [read_robot(entry, self.source.parent)[0] for entry in entries]
+        if problems.found:
+            raise WorkcellError(str(self.source), problems.messages())
+        return found[0], found[1]
 
     def _faces(self, bases: Array | None) -> list[dict[str, Any]]:
         """Middles of faces, see `contact_points`."""

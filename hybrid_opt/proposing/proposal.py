@@ -26,7 +26,7 @@ from hybrid_opt.proposing.planner import Place, Stray, freedom, plan, straight_p
 from hybrid_opt.proposing.problem import Found, Problem, changes, decision_bounds, read_problem
 from hybrid_opt.proposing.setup import Pair, Setup, no_path, prepare
 from hybrid_opt.proposing.trial import BoxAlone, BranchLostError, Trial, grasp_blocked
-from hybrid_opt.proposing.via_points import MOST_VIA_POINTS, fit, shortened, straightened
+from hybrid_opt.proposing.via_points import MOST_VIA_POINTS, fit, shortened, straightened, travelled
 from symbolic.array import Array
 from symbolic.errors import SettingsError, WorkcellError
 from symbolic.records import Workcell
@@ -124,7 +124,7 @@ class Proposal:
     @property
     def length(self) -> float:
         """How far both arms' joints go together, as the Euclidean length of their path [rad]."""
-        return float(np.linalg.norm(np.diff(np.hstack(self.q), axis=0), axis=1).sum())
+        return travelled(np.hstack(self.q))
 
     def text(self, folder: Path) -> str:
         """The workcell file, for a folder: the problem file's text, completed.

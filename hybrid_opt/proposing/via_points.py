@@ -45,10 +45,14 @@ BLOCKED = 100.0
 """What a spline counts whose places are all out of reach; half as much where all collide [rad]."""
 
 
+def travelled(points: Array) -> float:
+    """Euclidean length of a path through points (n, m)."""
+    return float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
+
+
 def joint_length(places: Sequence[Place]) -> float:
-    """How far all joints go together, as the Euclidean length of their path [rad]."""
-    q = np.array([np.concatenate(place.q) for place in places])
-    return float(np.linalg.norm(np.diff(q, axis=0), axis=1).sum())
+    """How far all joints go together [rad]."""
+    return travelled(np.array([np.concatenate(place.q) for place in places]))
 
 
 def shortened(

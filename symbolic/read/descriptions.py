@@ -39,16 +39,18 @@ DEEPEST_PACKAGE = 4
 LONGEST_NAME = 200
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
+_PACKAGE = re.compile(rb"<name>\s*([^<\s]+)\s*</name>")
 _SKIPPED = ("build", "devel", "install", "log")
 
 
 def find_package(name: str, package_dirs: Sequence[Path], description: Path) -> Path | None:
     """The folder of a package, or None where there is none.
 
-    In this order: NAME in one of `package_dirs`; a folder NAME above the description;
-    `share/NAME` below each prefix of AMENT_PREFIX_PATH; NAME in or at most `DEEPEST_PACKAGE`
-    levels below a folder of ROS_PACKAGE_PATH; `share/NAME` of the Python environment and of the
-    prefix that wheels of robotics libraries share in it (`cmeel.prefix`).
+    In this order: in one of `package_dirs`; a folder NAME above the description; `share/NAME` below
+    each prefix of AMENT_PREFIX_PATH; in or at most `DEEPEST_PACKAGE` levels below a folder of
+    ROS_PACKAGE_PATH; `share/NAME` of the Python environment and of the prefix that wheels of
+    robotics libraries share in it (`cmeel.prefix`). A folder of another name counts in the first
+    and the second if its package.xml says NAME.
 
     Args:
         name: the package.
@@ -58,10 +60,11 @@ def find_package(name: str, package_dirs: Sequence[Path], description: Path) -> 
     if len(name) > LONGEST_NAME or not _NAME.fullmatch(name):
         return None
     for folder in package_dirs:
-        if os.path.isdir(folder / name):
-            return folder / name
+        package = package_in(folder, name)
+        if package is not None:
+            return package
     for parent in description.resolve().parents:
-        if parent.name == name:
+        if parent.name == name or _package_name(parent) == name:
             return parent
     for prefix in _paths("AMENT_PREFIX_PATH"):
         if (prefix / "share" / name).is_dir():
@@ -72,6 +75,30 @@ def find_package(name: str, package_dirs: Sequence[Path], description: Path) -> 
             return found
     installed = (prefix / "share" / name for prefix in _environment_prefixes())
     return next((folder for folder in installed if folder.is_dir()), None)
+
+
+def package_in(folder: Path, name: str) -> Path | None:
+    """The folder NAME in a folder, else the one whose package.xml says so; None where neither is
+    there."""
+    if os.path.isdir(folder / name):
+        return folder / name
+    try:
+        inner = sorted(entry for entry in folder.iterdir() if _package_name(entry) == name)
+    except OSError:
+        return None
+    return inner[0] if inner else None
+
+
+def _package_name(folder: Path) -> str | None:
+    """What a folder's package.xml says, None where it has none."""
+    file = folder / "package.xml"
+    if not file.is_file():
+        return None
+    try:
+        found = _PACKAGE.search(outside.read_bytes(file, outside.WORKCELL_BYTES))
+    except OutsideError:
+        return None
+    return found[1].decode("utf-8", "replace") if found else None
 
 
 def further_package_dirs(
@@ -123,12 +150,13 @@ def _environment_prefixes() -> Iterator[Path]:
 def resolve_mesh(address: str, urdf: Path, package_dirs: Sequence[Path]) -> Path | None:
     """The file behind a mesh address of a URDF, or None where there is none.
 
-    `package://NAME/REST` is looked up as NAME/REST in each package folder; `file://` addresses
-    are absolute; anything else is relative to the URDF's folder.
+    `package://NAME/REST` is looked up in the package NAME of each folder (`package_in`); `file://`
+    addresses are absolute; anything else is relative to the URDF's folder.
     """
-    if address.startswith("package://"):
-        rest = address.removeprefix("package://")
-        candidates = [folder / rest for folder in package_dirs]
+    if address.startswith(PACKAGE_SCHEME):
+        name, _, rest = address.removeprefix(PACKAGE_SCHEME).partition("/")
+        packages = (package_in(folder, name) for folder in package_dirs)
+        candidates = [package / rest for package in packages if package is not None]
     else:
         candidates = [urdf.parent / address.removeprefix("file://")]
     return next(

@@ -46,10 +46,10 @@ def _add_options(parser: Parser) -> None:
 
 def _run(options: argparse.Namespace) -> int:
     from hybrid_opt.proposing.proposal import ProposeSettings
-    from studies.research.benchmarks import shelves, slot
+    from studies.research.benchmarks import machines, shelves, slot
     from studies.research.benchmarks.measuring import measured, table
 
-    known = {"shelves": shelves, "slot": slot}
+    known = {"shelves": shelves, "slot": slot, "machines": machines}
     if options.name not in ("", *known):
         raise SettingsError(f"no benchmark {options.name!r}; there are {', '.join(known)}")
     chosen = {name: known[name] for name in known if options.name in ("", name)}

@@ -13,12 +13,16 @@ import hybrid_opt as ho
 from hybrid_opt.display.table import Table, number
 from hybrid_opt.errors import ProposalError
 from hybrid_opt.proposing.problem import completed
+from hybrid_opt.proposing.via_points import travelled
 from studies.research.turns import progress
 from symbolic.array import Array
 from symbolic.replacing import replace_file
 
 EVALUATIONS = 1000
 """Of the search behind a fastest carry."""
+
+FRICTION = 0.8
+"""Of every pad."""
 
 
 @dataclass(frozen=True)
@@ -57,6 +61,35 @@ class Benchmark:
     tasks: tuple[Task, ...]
     note: str
     coordinates: Callable[[Array, Array], Array] = lambda q_1, q_2: np.hstack([q_1, q_2])
+
+
+def carry_problem(
+    name: str,
+    robots: list[dict[str, Any]],
+    payload: dict[str, Any],
+    pads: list[dict[str, Any]],
+    ends: tuple[list[float], list[float]],
+    scene: list[dict[str, Any]],
+    **task: float,
+) -> dict[str, Any]:
+    """The tables of a problem file: a carry that begins and ends in the air.
+
+    Args:
+        name: of the cell.
+        robots, payload, scene: `[[robots]]`, `[payload]` and `[[environment]]`.
+        pads: `[[contacts]]`, friction aside.
+        ends: start and goal of the box.
+        task: further keys of `[task]`.
+    """
+    return {
+        "name": name,
+        "robots": robots,
+        "payload": payload,
+        "contacts": [{"friction": FRICTION, **pad} for pad in pads],
+        "task": {"start": ends[0], "goal": ends[1], **task},
+        "handling": {"lift_height": 0.0, "set_down_height": 0.0},
+        "environment": scene,
+    }
 
 
 @dataclass(frozen=True)
@@ -140,11 +173,6 @@ def measured(
 def length(benchmark: Benchmark, q: tuple[Array, Array]) -> Length:
     """How far both arms' joints (n, joints) go along a carry."""
     return Length(travelled(np.hstack(q)), travelled(benchmark.coordinates(*q)))
-
-
-def travelled(points: Array) -> float:
-    """Euclidean length of a path through points (n, m)."""
-    return float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
 
 
 def table(benchmark: Benchmark, found: list[Measured]) -> Table:

@@ -17,7 +17,7 @@ import numpy as np
 import pinocchio as pin
 from pinocchio.utils import rotate
 
-from studies.research.benchmarks.measuring import Benchmark, Task
+from studies.research.benchmarks.measuring import Benchmark, Task, carry_problem
 from symbolic import outside
 from symbolic.array import Array
 from symbolic.errors import OutsideError, SettingsError
@@ -97,23 +97,19 @@ def benchmark(folder: Path) -> Benchmark:
     scene = _scene(there / "models")
     tasks = []
     for start, goal, length in CARRIES:
-        problem = {
-            "name": f"Shelves, {start} to {goal}",
-            "robots": [_robot("left", urdf, folder, 0.0), _robot("right", urdf, folder, APART)],
-            "payload": {"size": list(BOX), "mass": 2.0},
-            "contacts": [
-                {"xyz": [0.0, side * BOX[1] / 2.0, 0.0], "friction": 0.8, "patch_radius": 0.03}
+        problem = carry_problem(
+            f"Shelves, {start} to {goal}",
+            [_robot("left", urdf, folder, 0.0), _robot("right", urdf, folder, APART)],
+            {"size": list(BOX), "mass": 2.0},
+            [
+                {"xyz": [0.0, side * BOX[1] / 2.0, 0.0], "patch_radius": 0.03}
                 for side in (-1.0, 1.0)
             ],
-            "task": {
-                "start": poses[start],
-                "goal": poses[goal],
-                "reference_speed": 0.25,
-                "reference_force": 100.0,
-            },
-            "handling": {"lift_height": 0.0, "set_down_height": 0.0},
-            "environment": scene,
-        }
+            (poses[start], poses[goal]),
+            scene,
+            reference_speed=0.25,
+            reference_force=100.0,
+        )
         straight = float(np.linalg.norm(given[goal] - given[start]))
         tasks.append(Task(f"{start} to {goal}", problem, length, straight))
     return Benchmark("shelves", "Two iiwa 14 and shelves", tuple(tasks), NOTE, coordinates)

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from studies.research.benchmarks.measuring import Benchmark, Task
+from studies.research.benchmarks.measuring import Benchmark, Task, carry_problem
 from symbolic import outside
 from symbolic.errors import OutsideError, SettingsError
 from symbolic.read.elements import parse_elements
@@ -76,23 +76,19 @@ def benchmark(folder: Path) -> Benchmark:
         raise SettingsError(f"{there}: {error}; get the files by\n{HOW}") from error
     tasks = []
     for name, limits, seconds in LIMITS:
-        problem = {
-            "name": f"Plate through a gate, {name}",
-            "robots": [_robot(arm) for arm in ARMS],
-            "payload": {"size": list(PLATE), "mass": 1.2, **limits},
-            "contacts": [
-                {"xyz": [side * PLATE[0] / 2.0, 0.0, 0.0], "friction": 0.8, "patch_radius": 0.009}
+        problem = carry_problem(
+            f"Plate through a gate, {name}",
+            [_robot(arm) for arm in ARMS],
+            {"size": list(PLATE), "mass": 1.2, **limits},
+            [
+                {"xyz": [side * PLATE[0] / 2.0, 0.0, 0.0], "patch_radius": 0.009}
                 for side in (1.0, -1.0)
             ],
-            "task": {
-                "start": START,
-                "goal": GOAL,
-                "reference_speed": 0.08,
-                "reference_force": 30.0,
-            },
-            "handling": {"lift_height": 0.0, "set_down_height": 0.0},
-            "environment": scene,
-        }
+            (START, GOAL),
+            scene,
+            reference_speed=0.08,
+            reference_force=30.0,
+        )
         tasks.append(Task(name, problem, seconds=seconds))
     return Benchmark("slot", "Two Pandas and a slot behind a gate", tuple(tasks), NOTE)
 

@@ -136,6 +136,18 @@ def test_contacts_face_the_shoulders_of_a_machine(tmp_path: Path) -> None:
     assert [contact["xyz"] for contact in problem.contacts] == [[0.0, 0.18, 0.0], [0.0, -0.18, 0.0]]
 
 
+def test_contacts_face_shoulders_that_are_out_of_one_anothers_reach(tmp_path: Path) -> None:
+    """A beam of 3 m: each arm reaches the end on its own side only, the left arm that at -y."""
+    text = tiago_problem(tmp_path).read_text(encoding="utf-8")
+    data = tomllib.loads(text)
+    chains = [robot["chain"] for robot in data["robots"]]
+    swapped = {"robots": [{"chain": chains[1]}, {"chain": chains[0]}]}
+    changes = {"payload": {"size": [0.1, 3.0, 0.1]}, **swapped}
+    path = tmp_path / "beam.toml"
+    path.write_text(completed(text, data, changes), encoding="utf-8")
+    assert [contact["xyz"][1] for contact in read_problem(path).contacts] == [-1.5, 1.5]
+
+
 def test_two_arms_of_one_type_are_no_machine() -> None:
     assert not read_problem(POST).is_machine
 

@@ -14,9 +14,10 @@ from scipy.spatial.transform import Rotation
 import hybrid_opt as ho
 from hybrid_opt.display.table import NOTHING
 from hybrid_opt.proposing.problem import completed, read_problem
-from studies.research.benchmarks import shelves, slot
+from hybrid_opt.proposing.via_points import travelled
+from studies.research.benchmarks import machines, shelves, slot
 from studies.research.benchmarks.__main__ import main
-from studies.research.benchmarks.measuring import Length, Measured, measured, table, travelled
+from studies.research.benchmarks.measuring import Length, Measured, measured, table
 from symbolic.errors import SettingsError
 
 POSTURES = {
@@ -138,7 +139,7 @@ def test_the_program_says_how_to_get_files(capsys: pytest.CaptureFixture[str]) -
     assert main([]) == 0
     assert "git clone" in capsys.readouterr().out
     assert main(["shelfs"]) == 2
-    assert "no benchmark 'shelfs'; there are shelves, slot" in capsys.readouterr().err
+    assert "no benchmark 'shelfs'; there are shelves, slot, machines" in capsys.readouterr().err
 
 
 def test_a_task_without_a_carry_says_why(folder: Path) -> None:
@@ -156,6 +157,24 @@ def test_the_table_has_figures_where_there_are_some(folder: Path) -> None:
     rows = table(given, [some]).rows
     assert rows[0][:7] == ("top to middle", "12.0", "20.0", "3.00", "2.10", "1.88", "2.09")
     assert rows[0][7:] == (NOTHING,) * 4
+
+
+def test_machines_are_problems_whose_box_stands_clear_of_the_post(tmp_path: Path) -> None:
+    with pytest.raises(SettingsError, match=r"dual_ur10e.urdf is not there; .*\ngit clone"):
+        machines.benchmark(tmp_path)
+    for file in (machines.UR10E, machines.PANDAS):
+        (tmp_path / file).parent.mkdir(parents=True)
+        (tmp_path / file).touch()
+    given = machines.benchmark(tmp_path)
+    assert len(given.tasks) == 4
+    for task in given.tasks:
+        half = np.array(task.problem["payload"]["size"]) / 2.0
+        post = next(body for body in task.problem["environment"] if body["name"] == "post")
+        for end in ("start", "goal"):
+            apart = np.abs(np.subtract(task.problem["task"][end][:3], post["xyz"]))
+            assert np.any(apart > half + np.array(post["size"]) / 2.0 + 0.01)
+        ends = [task.problem["task"][end][0] for end in ("start", "goal")]
+        assert post["xyz"][0] == pytest.approx(np.mean(ends)), "in between"
 
 
 GATE = """<mujoco><include file="workcell.xml"/><worldbody>

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from symbolic.read.descriptions import find_package, further_package_dirs
+from symbolic.read.descriptions import find_package, further_package_dirs, resolve_mesh
 from tests.robots import ur10_urdf
 
 NOWHERE = Path("/nowhere/arm.urdf")
@@ -18,9 +18,10 @@ def no_ros(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("AMENT_PREFIX_PATH", raising=False)
 
 
-def package(folder: Path) -> Path:
+def package(folder: Path, name: str = "") -> Path:
     folder.mkdir(parents=True)
-    (folder / "package.xml").write_text("<package/>", encoding="utf-8")
+    text = f"<package><name>{name}</name></package>" if name else "<package/>"
+    (folder / "package.xml").write_text(text, encoding="utf-8")
     return folder
 
 
@@ -46,6 +47,20 @@ def test_a_workspace_is_searched_below_its_folder(
 def test_a_description_lies_in_its_own_package(tmp_path: Path) -> None:
     own = package(tmp_path / "arm_description")
     assert find_package("arm_description", [], own / "urdf" / "arm.urdf") == own
+
+
+def test_a_source_folder_may_bear_another_name_than_its_package(tmp_path: Path) -> None:
+    """As moveit_resources/panda_description, the package moveit_resources_panda_description."""
+    arm = package(tmp_path / "src" / "arm", "vendor_arm")
+    (arm / "arm.stl").write_bytes(b"solid")
+    assert find_package("vendor_arm", [tmp_path / "src"], NOWHERE) == arm
+    assert find_package("vendor_arm", [], arm / "urdf" / "arm.urdf") == arm
+    assert find_package("vendor", [tmp_path / "src"], NOWHERE) is None
+    address = "package://vendor_arm/arm.stl"
+    assert resolve_mesh(address, NOWHERE, [tmp_path / "src"]) == (arm / "arm.stl").resolve()
+    assert further_package_dirs([address], [], arm / "arm.urdf") == (tmp_path / "src",)
+    package(tmp_path / "src" / "vendor_arm")
+    assert find_package("vendor_arm", [tmp_path / "src"], NOWHERE) == arm.with_name("vendor_arm")
 
 
 def test_packages_of_the_python_environment_are_found() -> None:
