@@ -21,15 +21,12 @@ from hybrid_opt.campaign.settings import (
     DONE,
     EVALUATIONS,
     POLISH,
-    STAGES,
-    SUMMARY,
     CampaignSettings,
     Configuration,
     FinishedReplica,
     polished_folder,
     replica_folder,
 )
-from hybrid_opt.campaign.summary import CampaignSummary
 from hybrid_opt.cell import Cell
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.evaluate.evaluations import Evaluations
@@ -208,20 +205,6 @@ def read_configuration(root: str | Path) -> Configuration:
         raise ResultsError(f"{root}: is no results folder, {CONFIGURATION} is missing")
     remedy = "run the study again into another --output"
     return from_json(Configuration, read_document(path, FORMAT, VERSION, remedy), path, remedy)
-
-
-def read_summary(root: str | Path) -> CampaignSummary:
-    """The figures of summary.json.
-
-    Raises:
-        ResultsError: it is missing, damaged, or not that of the campaign.
-    """
-    path = Path(root) / SUMMARY
-    remedy = f"delete {STAGES}/summary.json in its folder and continue the study with --resume"
-    summary = read_record(CampaignSummary, path, remedy)
-    if summary.settings != read_configuration(root).settings:
-        raise ResultsError(f"{path}: damaged: is that of another campaign; {remedy}")
-    return summary
 
 
 def read_replica(root: Path, algorithm: str, number: int, objectives: tuple[str, ...]) -> Replica:

@@ -11,15 +11,20 @@ from pathlib import Path
 import numpy as np
 
 from hybrid_opt.campaign.folder import differences
-from hybrid_opt.campaign.results import CampaignResults, read_campaign, read_summary
+from hybrid_opt.campaign.results import CampaignResults, read_campaign
 from hybrid_opt.campaign.settings import DRIVABLE, SUMMARY
-from hybrid_opt.campaign.summary import CampaignSummary
 from hybrid_opt.display.table import NOTHING, Quantity, Table, number
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.indicators.statistics import RankTest, Summary, corrected, rank_test, summarise
 from hybrid_opt.metaheuristics.registry import title
 from hybrid_opt.store.json_records import to_json
-from studies.study.summary import LEAST_TESTED, front_indicators, reference_front
+from studies.study.summary import (
+    LEAST_TESTED,
+    CampaignSummary,
+    front_indicators,
+    read_summary,
+    reference_front,
+)
 from studies.study.tables import QUANTITIES
 from symbolic.array import Array
 

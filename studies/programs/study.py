@@ -19,7 +19,6 @@ from hybrid_opt.campaign import (
 )
 from hybrid_opt.campaign.cell_source import decided_cell, store_branches
 from hybrid_opt.campaign.polish_stage import polish_stage
-from hybrid_opt.campaign.results import read_summary
 from hybrid_opt.campaign.settings import ALGORITHMS, DRIVABLE, SUMMARY, chosen
 from hybrid_opt.campaign.stages import drivable_settings, drivable_stage
 from hybrid_opt.cell import Cell
@@ -44,11 +43,12 @@ from hybrid_opt.witness.box import mujoco_module
 from studies.options import QUICK_EVALUATIONS, QUICK_REPLICAS
 from studies.program import load_workcell
 from studies.report.stage import PAGE, TABLES, follow_looks, report_stage
-from studies.study.drivable import is_drivable, known_paths, limits_on_jerk, timing_stage
-from studies.study.recommendation import recommendation_stage, study_words
+from studies.study.drivable import is_drivable, known_paths
+from studies.study.recommendation import recommendation_stage
 from studies.study.simulation import read_simulations, simulation_stage
-from studies.study.summary import summary_stage
+from studies.study.summary import read_summary, summary_stage
 from studies.study.tables import effort, study_tables
+from studies.study.timing import limits_on_jerk, timing_stage
 from symbolic.array import Array
 from symbolic.records import Workcell
 
@@ -182,7 +182,7 @@ def study_text(root: Path, with_paper: bool, brief: bool = False) -> str:
         ResultsError: the folder is not complete or damaged.
     """
     summary = read_summary(root)
-    words = study_words(summary, str(root))
+    words = summary.words(str(root))
     carry = "" if words is None else words.terminal()
     if carry and brief:
         return carry

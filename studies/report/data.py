@@ -16,9 +16,8 @@ from scipy.spatial.transform import Rotation
 
 from hybrid_opt.branches import BranchCompetition
 from hybrid_opt.campaign.cell_source import ReadyCell, cells_of, read_branches, ready_cells
-from hybrid_opt.campaign.results import CampaignResults, ReplicaFront, read_campaign, read_summary
+from hybrid_opt.campaign.results import CampaignResults, ReplicaFront, read_campaign
 from hybrid_opt.campaign.settings import CONFIGURATION, HAND_MADE, RECOMMENDED, SUMMARY
-from hybrid_opt.campaign.summary import CampaignSummary, ReplicaFigures
 from hybrid_opt.carry import Carry
 from hybrid_opt.display.table import Table
 from hybrid_opt.errors import ResultsError
@@ -40,8 +39,10 @@ from hybrid_opt.timing.document import TimingDocument, read_timing
 from hybrid_opt.timing.robustness import PayloadSensitivity, payload_sensitivity
 from hybrid_opt.work.service import Executor, SerialExecutor, Service, answer_all, called
 from studies.report.page_carries import RECOMMENDED_LABEL, DrawnJob, drawn_job
-from studies.study.drivable import TIMING, drivable_root, is_drivable, limits_on_jerk, shown_files
+from studies.study.drivable import drivable_root, is_drivable
 from studies.study.simulation import StoredSimulation, read_simulations
+from studies.study.summary import CampaignSummary, ReplicaFigures, read_summary
+from studies.study.timing import TIMING, limits_on_jerk
 from symbolic.array import Array
 from symbolic.geometry.pairs import CellGeometry, build_geometry
 from symbolic.read.cell_files import CellFiles, collect_cell
@@ -322,7 +323,7 @@ def gather(results: CampaignResults, executor: Executor | None = None) -> Report
             f"{results.root}: a study with --recommend-only has no report; its carry is in "
             f"{RECOMMENDED}. Run the study without it, into another folder, for one"
         )
-    files = shown_files(first.summary).values()
+    files = first.summary.shown_files.values()
     timings = [read_timing(results.root / TIMING / file) for file in files]
     if len(timings) != len(carries):
         raise ResultsError(f"{results.root / SUMMARY}: damaged: does not fit the fronts beside it")

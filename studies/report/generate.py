@@ -22,7 +22,6 @@ from typing import Any
 
 from PIL import Image
 
-from hybrid_opt.campaign.results import read_summary
 from hybrid_opt.display.scene import embedded_json, scene_js, three_js
 from hybrid_opt.display.table import Table, counted, number
 from hybrid_opt.store.files import write_atomically
@@ -35,7 +34,7 @@ from studies.report.page_carries import phases
 from studies.report.page_data import page_document
 from studies.report.pictures import ReportPicture, report_pictures
 from studies.report.stage import PAGE, PICTURES, TABLES
-from studies.study.recommendation import study_words
+from studies.study.summary import read_summary
 from studies.study.tables import margins, study_tables, timings
 
 BEGIN = "<!-- measured: begin -->"
@@ -236,7 +235,7 @@ IN_FOLDER = {"file": "file, beside this page", "export": "export, from this fold
 
 def _recommendation(data: ReportData) -> str:
     """The words that the terminal opens with, too."""
-    words = study_words(data.summary, "")
+    words = data.summary.words("")
     if words is None:
         return ""
     told = [(heading, html.escape(text)) for heading, text in words.facts]

@@ -11,7 +11,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from hybrid_opt.campaign.summary import StoredRecommendation
 from hybrid_opt.display.table import counted
 from hybrid_opt.evaluate.evaluations import FEASIBLE, REASONS
 from hybrid_opt.indicators.metrics import best_so_far, front_of
@@ -27,6 +26,7 @@ from studies.report.drawing import (
     series,
 )
 from studies.report.page_data import curves, drive_look, limits
+from studies.study.recommendation import StoredRecommendation
 from symbolic.array import Array
 
 QUARTILES = (25.0, 75.0)

@@ -18,9 +18,8 @@ from hybrid_opt.campaign import (
     run_stages,
     search_stage,
 )
-from hybrid_opt.campaign.results import CampaignResults, read_campaign, read_summary
+from hybrid_opt.campaign.results import CampaignResults, read_campaign
 from hybrid_opt.campaign.settings import CONFIGURATION
-from hybrid_opt.campaign.summary import CampaignSummary
 from hybrid_opt.display.table import number, text_table
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.indicators import metrics
@@ -29,6 +28,7 @@ from hybrid_opt.progress import Progress
 from hybrid_opt.store.json_records import to_json
 from studies.research.best_front import ReferenceFront, read_reference_front
 from studies.research.control import LONG
+from studies.study.summary import CampaignSummary, read_summary
 
 
 @dataclass(frozen=True)

@@ -16,18 +16,12 @@ from codegen.function import available_cores
 from hybrid_opt.campaign import CampaignFolder, ExecutionSettings, Stage
 from hybrid_opt.campaign.results import CampaignResults, read_campaign
 from hybrid_opt.campaign.settings import NO_RECOMMENDATION, RECOMMENDATION, RECOMMENDED, STAGES
-from hybrid_opt.campaign.summary import (
-    CampaignSummary,
-    ForceTable,
-    NoRecommendation,
-    StoredDurations,
-    StoredRecommendation,
-    stored_recommendation,
-)
 from hybrid_opt.errors import NoCarryError
 from hybrid_opt.evaluate.evaluations import concatenated
 from hybrid_opt.evaluate.explanation import explain
+from hybrid_opt.evaluate.objectives import PLANNED_FORCE, ROBUST_FORCE, ForceKind
 from hybrid_opt.progress import Advance, Progress
+from hybrid_opt.recommending.advice import Advice
 from hybrid_opt.recommending.choice import LEADER, DrivenPaths
 from hybrid_opt.recommending.comparison import (
     Rival,
@@ -38,10 +32,11 @@ from hybrid_opt.recommending.comparison import (
 )
 from hybrid_opt.recommending.recommendation import HAND_MADE, STEPS, Recommendation
 from hybrid_opt.robust.force import RobustPrice, pressing_model, robust_price
-from hybrid_opt.robust.squeeze import account
+from hybrid_opt.robust.squeeze import Part, account
 from hybrid_opt.store.files import write_json
 from hybrid_opt.store.json_records import read_record, to_json
 from hybrid_opt.store.trajectory_file import write_trajectory
+from hybrid_opt.timing.robustness import Margin
 from hybrid_opt.work.service import (
     Executor,
     ProcessExecutor,
@@ -58,7 +53,107 @@ from studies.study.drivable import (
     is_drivable,
     least_force,
 )
-from symbolic.array import Array
+from symbolic.array import Array, Count, Figure, Pair
+
+
+@dataclass(frozen=True)
+class StoredDurations:
+    """How long paths take at the forces of a table [s], null where they cannot move.
+
+    Attributes:
+        label: whose they are.
+        replicas: how many fronts stand behind the figures, 1 for a single path.
+        median, least, largest: over the replicas, one per force.
+    """
+
+    label: str
+    replicas: Count
+    median: tuple[Figure, ...]
+    least: tuple[Figure, ...]
+    largest: tuple[Figure, ...]
+
+
+@dataclass(frozen=True)
+class ForceTable:
+    """Durations at the same forces.
+
+    Attributes:
+        forces: limits on both forces [N].
+        rows: hand-made path, optimum of the other experiment, then every algorithm's fronts.
+    """
+
+    forces: tuple[float, ...]
+    rows: tuple[StoredDurations, ...]
+
+
+@dataclass(frozen=True)
+class StoredRecommendation:
+    """The carry to run.
+
+    Attributes:
+        wish, why: what was asked for, as values and as words.
+        source: whose it is, as 'NSGA-II, polished, replica 3'.
+        file: its trajectory file, relative to the folder.
+        export: the command that makes of it what robots need, run in the folder.
+        duration: as robots drive it, limits on jerk kept [s].
+        force: largest force to command of the force-controlled arm [N]; the one force.
+        parts: what it is made of, its sum.
+        job_duration: of the whole job [s], null where none can be planned.
+        force_limit: of the search [N].
+        peak_force: largest planned normal force of each robot [N].
+        robust_force: likewise in every case of the workcell's uncertainty, where force limits are
+            about these; else null.
+        squeeze, squeeze_reason: largest normal force to command of each robot [N], and why.
+        payload_limit: payload that the robots bear on the same motion, nothing uncertain [kg].
+        rivals: other paths at the same force and in the same time, the hand-made one first.
+        margins: how far the cell's description may be off at the commanded force.
+        advice: what changes of the cell would change.
+        warnings: what speaks against it.
+        considered: carries that it was chosen from.
+        durations: how long all fronts take at the same forces.
+        price: of robustness, null where no set leaves friction and patches.
+    """
+
+    wish: ho.Wish
+    why: str
+    source: str
+    file: str
+    export: str
+    duration: float
+    force: float
+    parts: tuple[Part, ...]
+    job_duration: Figure
+    force_limit: float
+    peak_force: Pair
+    squeeze: Pair
+    squeeze_reason: str
+    payload_limit: float
+    rivals: tuple[Rival, ...]
+    margins: tuple[Margin, ...]
+    advice: tuple[Advice, ...]
+    warnings: tuple[str, ...]
+    considered: Count
+    durations: ForceTable
+    price: RobustPrice | None = None
+    robust_force: Pair | None = None
+
+    @property
+    def force_kind(self) -> ForceKind:
+        """The forces that limits, of the table and of rivals too, are about."""
+        return PLANNED_FORCE if self.robust_force is None else ROBUST_FORCE
+
+    @property
+    def limited_force(self) -> Array:
+        """(2,) largest of them of each robot [N]."""
+        return self.peak_force if self.robust_force is None else self.robust_force
+
+
+@dataclass(frozen=True)
+class NoRecommendation:
+    """no-recommendation.json: why a study has no carry to run."""
+
+    reason: str
+
 
 _Call = Callable[[None], StoredRecommendation | NoRecommendation]
 
@@ -162,14 +257,29 @@ def recommend_from(
     write_trajectory(path, cell.compiled, found.x, figures, provenance)
     inside = path.resolve().is_relative_to(root.resolve())
     file = path.resolve().relative_to(root.resolve()).as_posix() if inside else str(path)
-    return stored_recommendation(
-        found,
+    return StoredRecommendation(
+        wish=found.wish,
+        why=str(found.wish),
         source=source,
         file=file,
         export=export_command(Path(file), found.limit),
+        duration=found.duration,
+        force=found.force,
+        parts=found.squeeze.parts,
+        job_duration=math.nan if found.job is None else found.job.duration,
+        force_limit=found.limit,
+        peak_force=found.carry.peak_normal_force,
+        squeeze=found.commanded,
+        squeeze_reason=str(found.squeeze),
+        payload_limit=found.carry.payload_limit,
+        rivals=found.rivals,
+        margins=found.margins,
+        advice=found.advice,
+        warnings=found.warnings,
         considered=len(x),
         durations=durations,
         price=price,
+        robust_force=found.limited_force if found.force_kind.robust else None,
     )
 
 
@@ -268,20 +378,6 @@ class RecommendationText:
         lines = [self.headline]
         lines += [f"  {heading:<{width}}  {text}" for heading, text in self.facts]
         return "\n".join(lines + [f"  WARNING: {text}" for text in self.warnings])
-
-
-def study_words(summary: CampaignSummary, folder: str) -> RecommendationText | None:
-    """What a study opens with: the carry to run, or why there is none; None where nothing is known
-    of either.
-
-    Args:
-        folder: as for `recommendation_text`.
-    """
-    if summary.recommendation is not None:
-        return recommendation_text(summary.recommendation, folder)
-    if not summary.no_recommendation:
-        return None
-    return RecommendationText("No carry is recommended", (("why", summary.no_recommendation),), ())
 
 
 def recommendation_text(found: StoredRecommendation, folder: str) -> RecommendationText:

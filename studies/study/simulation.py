@@ -13,17 +13,8 @@ from typing import Annotated, Any
 import numpy as np
 
 from hybrid_opt.campaign import CampaignFolder, Stage, executor_for
-from hybrid_opt.campaign.results import read_summary
-from hybrid_opt.campaign.settings import (
-    HAND_MADE,
-    RECOMMENDED,
-    SELECTED,
-    SIMULATED,
-    polished_selected_file,
-    selected_file,
-)
+from hybrid_opt.campaign.settings import RECOMMENDED, SELECTED, SIMULATED
 from hybrid_opt.errors import ResultsError, WitnessError
-from hybrid_opt.metaheuristics.registry import title
 from hybrid_opt.progress import Progress
 from hybrid_opt.store.files import read_bytes, sha256, write_json
 from hybrid_opt.store.json_records import read_record, to_json
@@ -31,6 +22,8 @@ from hybrid_opt.store.trajectory_file import StoredTrajectory, read_trajectory
 from hybrid_opt.witness.arms import Account, CellWitness, account_of
 from hybrid_opt.witness.reference import Control, driven_carry
 from hybrid_opt.work.service import Emit, ListLedger, Service, nothing
+from studies.study.summary import read_summary
+from studies.study.timing import file_label
 from symbolic.array import Array, Figure, Row, Shape
 from symbolic.errors import SettingsError
 
@@ -218,14 +211,12 @@ def is_done(root: Path, one: Simulated) -> bool:
 
 def wanted_carries(root: Path) -> list[Simulated]:
     """The carries that a report shows: hand-made, best of each algorithm, recommended."""
-    files = {"0-hand-made": ("hand-made", root / SELECTED / HAND_MADE)}
-    for place, (name, found) in enumerate(read_summary(root).algorithms.items(), start=1):
-        if found.representative is None:
-            continue
-        polished = polished_selected_file(root, name, found.representative)
-        own = selected_file(root, name, found.representative)
-        best = (f"{title(name)}, polished", polished) if polished.exists() else (title(name), own)
-        files[f"{place}-{name}"] = best
+    summary = read_summary(root)
+    shown, places = summary.shown_files, ["", *summary.algorithms]
+    files = {
+        f"{places.index(name)}-{name or 'hand-made'}": (file_label(file), root / SELECTED / file)
+        for name, file in shown.items()
+    }
     files["9-recommended"] = ("recommended", root / RECOMMENDED)
     return [
         Simulated(name, label, read_trajectory(path), sha256(read_bytes(path)))

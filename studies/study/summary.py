@@ -1,43 +1,37 @@
-"""The stage that turns a finished search into figures, fronts and selected trajectories."""
+"""The figures of a campaign: the records of `summary.json` (docs/results.md), and the stage that
+makes them of a finished search, with fronts and selected trajectories."""
 
 from __future__ import annotations
 
 import itertools
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
 from hybrid_opt.campaign import CampaignFolder, Stage
-from hybrid_opt.campaign.results import CampaignResults, Replica, read_campaign
+from hybrid_opt.campaign.results import CampaignResults, Replica, read_campaign, read_configuration
 from hybrid_opt.campaign.settings import (
     FRONTS,
     HAND_MADE,
     SELECTED,
+    STAGES,
     SUMMARY,
+    CampaignSettings,
+    Seconds,
+    StoredCell,
     polished_selected_file,
     reference_front_file,
     selected_file,
 )
-from hybrid_opt.campaign.summary import (
-    AlgorithmFigures,
-    Bounds,
-    CampaignSummary,
-    FrontFigures,
-    NoRecommendation,
-    PolishedFigures,
-    PolishedStatistics,
-    ReplicaFigures,
-    SelectedEntry,
-    StoredFront,
-)
 from hybrid_opt.carry import Carry
+from hybrid_opt.errors import ResultsError
 from hybrid_opt.indicators import metrics
-from hybrid_opt.indicators.metrics import binding_bounds
+from hybrid_opt.indicators.metrics import BindingBound, binding_bounds
 from hybrid_opt.indicators.selection import Selected, select
 from hybrid_opt.indicators.statistics import (
     RankTest,
@@ -47,13 +41,250 @@ from hybrid_opt.indicators.statistics import (
     rank_test,
     summarise,
 )
+from hybrid_opt.polishing.records import PolishEffort
 from hybrid_opt.progress import Progress
 from hybrid_opt.static_hold import StaticHold
 from hybrid_opt.store.files import csv_text, storing, write_atomically, write_json
-from hybrid_opt.store.json_records import to_json
+from hybrid_opt.store.json_records import read_record, to_json
 from hybrid_opt.store.trajectory_file import write_trajectory
-from studies.study.recommendation import read_recommendation
-from symbolic.array import Array
+from studies.study.recommendation import (
+    NoRecommendation,
+    RecommendationText,
+    StoredRecommendation,
+    read_recommendation,
+    recommendation_text,
+)
+from symbolic.array import Array, Count, Figure, Pair, Range, Row
+
+Share = Annotated[float, Range(0.0, 1.0)]
+
+
+@dataclass(frozen=True)
+class SelectedEntry:
+    """The solution selected from a front, or the hand-made trajectory.
+
+    Attributes:
+        evaluation: its number, from 1; 0 for the hand-made one.
+        file: its trajectory file, relative to the folder.
+        objectives: (n_obj,).
+        peak_normal_force, minimum_normal_force: per robot [N].
+        excess_above_static: per robot [%].
+        payload_limit: [kg].
+        duration: [s].
+        feasible: the evaluator's verdict.
+    """
+
+    evaluation: Count
+    file: str | None
+    objectives: Row
+    peak_normal_force: Pair
+    minimum_normal_force: Pair
+    excess_above_static: Pair
+    payload_limit: float
+    duration: float
+    feasible: bool = True
+
+    @property
+    def mean_excess_above_static(self) -> float:
+        """Mean of both robots' [%]."""
+        return float(self.excess_above_static.mean())
+
+
+@dataclass(frozen=True)
+class FrontFigures:
+    """Indicators of a front, and of the solution selected from it.
+
+    Attributes:
+        non_dominated: points.
+        hypervolume, igd, igd_plus, spacing: see `hybrid_opt.indicators.metrics`.
+        mean_excess_above_static: of the selected solution [%].
+        payload_limit: of the selected solution [kg].
+        selected: None where no candidate is feasible.
+    """
+
+    non_dominated: Count
+    hypervolume: float
+    igd: Figure
+    igd_plus: Figure
+    spacing: Figure
+    mean_excess_above_static: Figure
+    payload_limit: Figure
+    selected: SelectedEntry | None
+
+
+@dataclass(frozen=True)
+class PolishedFigures(PolishEffort, FrontFigures):
+    """A replica's polished front, and the effort."""
+
+
+@dataclass(frozen=True)
+class ReplicaFigures(FrontFigures):
+    """One replica.
+
+    Attributes:
+        replica: its number, from 0.
+        evaluations, feasible, feasible_share: candidates.
+        seconds: what the search took.
+        infeasible_by_reason: candidates by what made them infeasible.
+        best_so_far: evaluations at which the best of an objective changed: number, then the best.
+        polished: None without a polish.
+    """
+
+    replica: Count
+    evaluations: Annotated[int, Range(1, 10**12)]
+    feasible: Count
+    feasible_share: Share
+    seconds: Seconds
+    infeasible_by_reason: Mapping[str, Count]
+    best_so_far: tuple[Row, ...]
+    polished: PolishedFigures | None = None
+
+
+@dataclass(frozen=True)
+class PolishedStatistics:
+    """An algorithm's polished fronts, over the replicas."""
+
+    statistics: Mapping[str, Summary]
+    hypervolume_gain: Summary
+    replicas_improved: Count
+
+
+@dataclass(frozen=True)
+class AlgorithmFigures:
+    """One algorithm.
+
+    Attributes:
+        representative: the replica with the largest hypervolume, None if it found nothing.
+        statistics: by figure, over the replicas.
+        replicas: in order.
+        polished: None without a polish.
+    """
+
+    representative: int | None
+    statistics: Mapping[str, Summary]
+    replicas: tuple[ReplicaFigures, ...]
+    polished: PolishedStatistics | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse what does not belong together."""
+        if not self.replicas:
+            raise ValueError("has no replicas")
+        if self.representative is not None and not (
+            0 <= self.representative < len(self.replicas)
+            and self.replicas[self.representative].selected is not None
+        ):
+            raise ValueError("its representative replica selected no solution")
+
+
+@dataclass(frozen=True)
+class StoredFront:
+    """The campaign's reference front: its file, points and hypervolume."""
+
+    file: str
+    points: Count
+    hypervolume: float
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """Bounds of the decision variables on which members of the best fronts lie.
+
+    Attributes:
+        solutions: members of these fronts, polished where they were.
+        binding: the bounds that some of them lie on.
+    """
+
+    solutions: Count
+    binding: tuple[BindingBound, ...]
+
+
+NO_BOUNDS = Bounds(0, ())
+
+
+@dataclass(frozen=True)
+class CampaignSummary:
+    """summary.json.
+
+    Attributes:
+        robots: their names, in the order of all pairs.
+        hand_made: the workcell file's own trajectory, None where it has no forces.
+        recommendation: the carry to run, None where the study has none.
+        no_recommendation: why it has none, '' where it has one or where the study is part of
+            another, which recommends.
+    """
+
+    workcell: StoredCell
+    robots: tuple[str, ...]
+    settings: CampaignSettings
+    environment: Mapping[str, str]
+    objectives: tuple[str, ...]
+    reference_force: Pair
+    static_hold: StaticHold
+    reference_front: StoredFront
+    algorithms: Mapping[str, AlgorithmFigures]
+    tests: tuple[RankTest, ...]
+    hand_made: SelectedEntry | None = None
+    bounds: Bounds = NO_BOUNDS
+    recommendation: StoredRecommendation | None = None
+    no_recommendation: str = ""
+
+    def __post_init__(self) -> None:
+        """Refuse what does not belong together."""
+        if len(self.robots) != 2:
+            raise ValueError("does not name two robots")
+        if list(self.algorithms) != list(self.settings.algorithms):
+            raise ValueError("its algorithms are not those of its settings")
+        for name, entry in self.algorithms.items():
+            if len(entry.replicas) != self.settings.replicas:
+                raise ValueError(f"algorithms.{name} has not as many replicas as the settings say")
+        strays = {name for test in self.tests for name in (test.first, test.second)}
+        if not strays <= self.algorithms.keys():
+            raise ValueError("its tests name unknown algorithms")
+
+    @property
+    def shown_files(self) -> dict[str, Path]:
+        """Files of the trajectories that a report shows, in the folders of selected ones and of
+        their timings: the hand-made one's by '', the best of every algorithm that has one by its
+        name."""
+        best = {
+            name: entry.replicas[entry.representative]
+            for name, entry in self.algorithms.items()
+            if entry.representative is not None
+        }
+        files = {"": Path(HAND_MADE)}
+        for name, found in best.items():
+            polished = found.polished is not None and found.polished.selected is not None
+            file_of = polished_selected_file if polished else selected_file
+            files[name] = file_of(Path(), name, found.replica).relative_to(SELECTED)
+        return files
+
+    def words(self, folder: str) -> RecommendationText | None:
+        """What a study opens with: the carry to run, or why there is none; None where nothing is
+        known of either.
+
+        Args:
+            folder: as for `recommendation_text`.
+        """
+        if self.recommendation is not None:
+            return recommendation_text(self.recommendation, folder)
+        if not self.no_recommendation:
+            return None
+        return RecommendationText("No carry is recommended", (("why", self.no_recommendation),), ())
+
+
+def read_summary(root: str | Path) -> CampaignSummary:
+    """The figures of summary.json.
+
+    Raises:
+        ResultsError: it is missing, damaged, or not that of the campaign.
+    """
+    path = Path(root) / SUMMARY
+    remedy = f"delete {STAGES}/summary.json in its folder and continue the study with --resume"
+    summary = read_record(CampaignSummary, path, remedy)
+    if summary.settings != read_configuration(root).settings:
+        raise ResultsError(f"{path}: damaged: is that of another campaign; {remedy}")
+    return summary
+
 
 FIGURES = (
     "feasible",

@@ -9,14 +9,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from hybrid_opt.campaign.summary import (
-    AlgorithmFigures,
-    Bounds,
-    CampaignSummary,
-    FrontFigures,
-    SelectedEntry,
-    StoredRecommendation,
-)
 from hybrid_opt.display.table import NOTHING, Quantity, Table, counted, number
 from hybrid_opt.indicators.statistics import summarise
 from hybrid_opt.metaheuristics.registry import title
@@ -24,7 +16,15 @@ from hybrid_opt.robust.force import RobustPrice
 from hybrid_opt.timing.analysis import ForceCurve
 from hybrid_opt.timing.document import StoredTiming, TimingDocument
 from hybrid_opt.timing.robustness import KILOGRAM_FORCE
+from studies.study.recommendation import StoredRecommendation
 from studies.study.simulation import StoredSimulation
+from studies.study.summary import (
+    AlgorithmFigures,
+    Bounds,
+    CampaignSummary,
+    FrontFigures,
+    SelectedEntry,
+)
 
 FORCE = Quantity("normal force", "N")
 DURATION = Quantity("duration", "s")

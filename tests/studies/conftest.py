@@ -11,14 +11,13 @@ import pytest
 
 from hybrid_opt.campaign import CampaignSettings, ExecutionSettings
 from hybrid_opt.campaign.results import ReplicaFront, read_campaign
-from hybrid_opt.campaign.summary import PolishedFigures
 from hybrid_opt.indicators.metrics import non_dominated
 from hybrid_opt.polishing.records import PolishEffort
 from hybrid_opt.progress import Progress
 from studies.programs.study import StudySettings, run_study
 from studies.report.data import ReportData, Run, gather
 from studies.study.simulation import StoredSimulation
-from studies.study.summary import front_indicators
+from studies.study.summary import PolishedFigures, front_indicators
 from symbolic.read.cell import load
 from tests.symbolic.cells import ROOT
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from hybrid_opt.campaign import CampaignSettings, ExecutionSettings
-from hybrid_opt.campaign.results import read_campaign, read_summary
+from hybrid_opt.campaign.results import read_campaign
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.indicators import metrics
 from hybrid_opt.polishing.settings import PolishSettings
@@ -18,6 +18,7 @@ from studies.programs.study import StudySettings, run_study
 from studies.research import longer_searches
 from studies.research.best_front import ReferenceFront
 from studies.research.control import main
+from studies.study.summary import read_summary
 from symbolic.read.cell import load
 from tests.symbolic.read.samples import RACK
 

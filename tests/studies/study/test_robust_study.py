@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from hybrid_opt.campaign import CampaignSettings, ExecutionSettings
-from hybrid_opt.campaign.results import read_campaign, read_summary
-from hybrid_opt.campaign.summary import StoredRecommendation
+from hybrid_opt.campaign.results import read_campaign
 from hybrid_opt.carry import Carry
 from hybrid_opt.cell import Cell
 from hybrid_opt.evaluate.objectives import ROBUST_DRIVABLE_OBJECTIVES
@@ -27,6 +26,8 @@ from studies.report.data import ReportData, gather
 from studies.report.generate import report_tables
 from studies.report.page_data import page_document
 from studies.report.pictures_fronts import duration_against_force
+from studies.study.recommendation import StoredRecommendation
+from studies.study.summary import read_summary
 from symbolic.array import Array
 from symbolic.read.cell import load
 from symbolic.read.cell_files import collect_cell, drivable_files, unpack_cell

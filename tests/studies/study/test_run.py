@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 import hybrid_opt as ho
-from hybrid_opt.campaign.results import read_campaign, read_summary
+from hybrid_opt.campaign.results import read_campaign
 from hybrid_opt.errors import NoCarryError
 from hybrid_opt.indicators import metrics
 from hybrid_opt.progress import Progress
@@ -28,6 +28,7 @@ from studies import rack, recommend, run
 from studies.programs.study import campaign_settings, polish_settings
 from studies.report.stage import PAGE
 from studies.study.recommendation import recommend_from, recommendation_text
+from studies.study.summary import read_summary
 from symbolic.read.cell import load
 from symbolic.read.cell_files import collect_cell, drivable_files, unpack_cell
 from tests.hybrid_opt.campaign.fake import RACK, ROOT

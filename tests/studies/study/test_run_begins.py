@@ -16,14 +16,13 @@ import pytest
 
 from hybrid_opt.campaign import ExecutionSettings, Stage, open_folder, run_stages
 from hybrid_opt.campaign.results import read_campaign
-from hybrid_opt.campaign.summary import StoredRecommendation
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.evaluate.evaluations import REASONS
 from hybrid_opt.progress import Progress
 from studies import recommend, run
 from studies.programs.study import campaign_settings
 from studies.report import __main__ as report
-from studies.study.recommendation import read_recommendation
+from studies.study.recommendation import StoredRecommendation, read_recommendation
 from symbolic.read.cell import load
 from tests.hybrid_opt.campaign.fake import RACK, ROOT
 from tests.hybrid_opt.cells import shipped

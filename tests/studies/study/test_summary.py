@@ -23,7 +23,6 @@ from hybrid_opt.campaign.settings import (
     StoredCell,
     polished_folder,
 )
-from hybrid_opt.campaign.summary import CampaignSummary, ReplicaFigures, SelectedEntry
 from hybrid_opt.cell import Cell
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.evaluate.evaluations import FEASIBLE, REASONS, Evaluations
@@ -48,6 +47,9 @@ from studies.study.simulation import (
 from studies.study.summary import (
     FIGURES,
     TESTED,
+    CampaignSummary,
+    ReplicaFigures,
+    SelectedEntry,
     best_steps,
     campaign_summary,
     reference_front,
