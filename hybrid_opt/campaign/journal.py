@@ -5,8 +5,7 @@ In CSV, numbers have the fewest digits that give the same bits when read back. A
 of magic, 32 bytes of identity, then blocks. A block is the length and the CRC-32 of its payload
 (two little-endian 32-bit numbers) and the payload. Whatever follows the last whole block, as an
 interruption leaves it, is cut off when the journal is opened again. The payload holds one
-generation: the seconds it took, the number of candidates, and the arrays of `Evaluations` in order,
-little-endian.
+generation: the seconds it took, the number of candidates, and these one after the other.
 """
 
 from __future__ import annotations
@@ -206,11 +205,18 @@ _SYNC_SECONDS = 1.0
 nothing that was written; only a machine that goes down does."""
 
 
+def _layout(n_var: int, n_obj: int) -> np.dtype[np.void]:
+    """A candidate in a block: the fields of `Evaluations` in order, little-endian, unpadded."""
+    n = len(REASONS)
+    return np.dtype(f"({n_var},)<f8,({n_obj},)<f8,({n_obj},)<f8,?,i1,<f8,({n},)<f8,({n},)<f8")
+
+
 def encode_generation(seconds: float, generation: Evaluations) -> bytes:
     """One generation as the payload of a block."""
-    arrays = (getattr(generation, field.name) for field in fields(Evaluations))
-    parts = [array.astype(array.dtype.newbyteorder("<"), copy=False).tobytes() for array in arrays]
-    return _HEAD.pack(seconds, len(generation)) + b"".join(parts)
+    rows = np.empty(len(generation), _layout(generation.x.shape[1], generation.objectives.shape[1]))
+    for name, field in zip(rows.dtype.names or (), fields(Evaluations), strict=True):
+        rows[name] = getattr(generation, field.name)
+    return _HEAD.pack(seconds, len(generation)) + rows.tobytes()
 
 
 def candidates_in(payload: bytes) -> int:
@@ -222,36 +228,18 @@ def decode_generation(payload: bytes, n_var: int, n_obj: int) -> tuple[float, Ev
     """The seconds and candidates of a block's payload.
 
     Raises:
-        ResultsError: the size does not fit.
+        ResultsError: the size does not fit, or a value is none of a candidate's.
     """
-    kinds: dict[str, tuple[str, tuple[int, ...]]] = {
-        "x": ("<f8", (n_var,)),
-        "objectives": ("<f8", (n_obj,)),
-        "penalised": ("<f8", (n_obj,)),
-        "feasible": ("?", ()),
-        "reason": ("<i1", ()),
-        "position": ("<f8", ()),
-        "violation": ("<f8", (len(REASONS),)),
-        "violation_time": ("<f8", (len(REASONS),)),
-    }
     seconds, count = _HEAD.unpack_from(payload)
-    offset, arrays = _HEAD.size, {}
-    try:
-        for field in fields(Evaluations):
-            kind, shape = kinds[field.name]
-            size = int(np.prod(shape, dtype=int)) * count
-            array = np.frombuffer(payload, kind, size, offset).reshape(count, *shape)
-            offset += array.nbytes
-            arrays[field.name] = array.astype(array.dtype.newbyteorder("="))
-    except ValueError as error:
-        raise ResultsError(f"a journal's block does not fit the problem ({error})") from error
-    if offset != len(payload):
-        raise ResultsError("a journal's block does not fit the problem (it is too long)")
-    reasons = arrays["reason"]
-    known = (reasons == FEASIBLE) | ((reasons >= 0) & (reasons < len(REASONS)))
+    layout = _layout(n_var, n_obj)
+    if len(payload) != _HEAD.size + count * layout.itemsize:
+        raise ResultsError("a journal's block does not fit the problem (its size)")
+    rows = np.frombuffer(payload, layout, count, _HEAD.size)
+    found = Evaluations(*(np.ascontiguousarray(rows[name]) for name in layout.names or ()))
+    known = (found.reason == FEASIBLE) | ((found.reason >= 0) & (found.reason < len(REASONS)))
     if not (np.isfinite(seconds) and seconds >= 0.0 and known.all()):
         raise ResultsError("a journal's block does not fit the problem (a value is none of its)")
-    return float(seconds), Evaluations(**arrays)
+    return float(seconds), found
 
 
 class Journal:

@@ -8,7 +8,6 @@ interrupted one repeats none.
 from __future__ import annotations
 
 import json
-import warnings
 from collections import Counter
 from collections.abc import Callable
 from contextlib import closing
@@ -20,10 +19,9 @@ import numpy as np
 from hybrid_opt.campaign.cell_source import PackedCell
 from hybrid_opt.campaign.folder import CampaignFolder
 from hybrid_opt.campaign.journal import ReplicaLedger, ReplicaRequest
-from hybrid_opt.campaign.results import Replica, read_campaign, read_polished
+from hybrid_opt.campaign.results import Replica, is_whole, read_campaign, read_polished
 from hybrid_opt.campaign.settings import JOURNAL, POLISH, polished_folder
 from hybrid_opt.campaign.stages import Stage
-from hybrid_opt.errors import DamagedResultsWarning, ResultsError
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.polishing.front import Lost, use_one_thread
 from hybrid_opt.polishing.polisher import Polisher
@@ -78,12 +76,9 @@ def polish_stage(
 
 
 def _is_polished(folder: CampaignFolder, replica: Replica) -> bool:
-    """Whether a front's polish is there; a damaged one is told and computed anew."""
-    try:
-        return read_polished(folder.root, replica, folder.workcell) is not None
-    except ResultsError as error:
-        warnings.warn(str(error), DamagedResultsWarning, stacklevel=2)
-        return False
+    """Whether a front's polish is there; a damaged one is computed anew."""
+    path = polished_folder(folder.root, replica.algorithm, replica.replica) / POLISH
+    return is_whole(path.exists(), lambda: read_polished(folder.root, replica, folder.workcell))
 
 
 def polish_replica(

@@ -6,8 +6,10 @@ written. docs/results.md describes the folder.
 
 from __future__ import annotations
 
+import warnings
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +17,6 @@ from numpy.typing import NDArray
 
 from hybrid_opt.campaign.folder import FORMAT, VERSION
 from hybrid_opt.campaign.journal import EvaluationTable, decode
-from hybrid_opt.campaign.search_stage import front_rows
 from hybrid_opt.campaign.settings import (
     CONFIGURATION,
     DONE,
@@ -28,8 +29,9 @@ from hybrid_opt.campaign.settings import (
     replica_folder,
 )
 from hybrid_opt.cell import Cell
-from hybrid_opt.errors import ResultsError
+from hybrid_opt.errors import DamagedResultsWarning, ResultsError
 from hybrid_opt.evaluate.evaluations import Evaluations
+from hybrid_opt.indicators import metrics
 from hybrid_opt.metaheuristics.registry import title
 from hybrid_opt.polishing.records import PolishedFront
 from hybrid_opt.store.files import read_bytes, read_document, sha256
@@ -37,6 +39,8 @@ from hybrid_opt.store.json_records import from_json, read_record, record_of
 from symbolic.array import Array
 from symbolic.read.cell import load
 from symbolic.records import Workcell
+
+ANEW = "--resume computes it anew"
 
 KEPT = 64
 """Tables of candidates, and polished fronts, that are remembered by their content: a study's stages
@@ -82,7 +86,6 @@ class Replica:
         replica: its number, from 0.
         evaluations: every candidate in the order of evaluation.
         generation: (n,) the generation of each, from 1.
-        front_rows: (k,) rows of the non-dominated feasible candidates, by increasing objectives.
         seconds: what the search took.
     """
 
@@ -90,8 +93,17 @@ class Replica:
     replica: int
     evaluations: Evaluations
     generation: NDArray[np.int64]
-    front_rows: NDArray[np.intp]
     seconds: float
+
+    def __post_init__(self) -> None:
+        arrays = [getattr(self.evaluations, field.name) for field in fields(Evaluations)]
+        for array in (*arrays, self.generation):
+            array.setflags(write=False)
+
+    @cached_property
+    def front_rows(self) -> NDArray[np.intp]:
+        """(k,) rows of the non-dominated feasible candidates, by increasing objectives."""
+        return metrics.front_rows(self.evaluations.objectives, self.evaluations.feasible)
 
     @property
     def front(self) -> Array:
@@ -207,11 +219,13 @@ def read_configuration(root: str | Path) -> Configuration:
     return from_json(Configuration, read_document(path, FORMAT, VERSION, remedy), path, remedy)
 
 
-def read_replica(root: Path, algorithm: str, number: int, objectives: tuple[str, ...]) -> Replica:
-    """Read one finished replica.
+def finished_replica(
+    root: Path, algorithm: str, number: int, names: Sequence[str]
+) -> tuple[FinishedReplica, tuple[bytes, ...]]:
+    """The record of a finished replica and the content of its files of these names.
 
     Raises:
-        ResultsError: it is not finished, or a file is damaged.
+        ResultsError: it is not finished, or one of these files is damaged.
     """
     folder = replica_folder(root, algorithm, number)
     if not (folder / DONE).exists():
@@ -219,16 +233,26 @@ def read_replica(root: Path, algorithm: str, number: int, objectives: tuple[str,
             f"{folder}: {algorithm} replica {number} is not finished; continue the campaign with "
             "--resume"
         )
-    marker = read_record(FinishedReplica, folder / DONE, "--resume computes it anew")
-    content = read_bytes(folder / EVALUATIONS)
-    if marker.sha256.get(EVALUATIONS) != sha256(content):
-        raise ResultsError(
-            f"{folder / EVALUATIONS}: damaged, its checksum differs; --resume computes it anew"
-        )
-    table = _decoded(content, folder / EVALUATIONS)
+    marker = read_record(FinishedReplica, folder / DONE, ANEW)
+    contents = tuple(read_bytes(folder / name) for name in names)
+    for name, content in zip(names, contents, strict=True):
+        if marker.sha256.get(name) != sha256(content):
+            raise ResultsError(f"{folder / name}: damaged, its checksum differs; {ANEW}")
+    return marker, contents
+
+
+def read_replica(root: Path, algorithm: str, number: int, objectives: tuple[str, ...]) -> Replica:
+    """Read one finished replica.
+
+    Raises:
+        ResultsError: it is not finished, or a file is damaged.
+    """
+    marker, (content,) = finished_replica(root, algorithm, number, [EVALUATIONS])
+    path = replica_folder(root, algorithm, number) / EVALUATIONS
+    table = _decoded(content, path)
     if table.objective_names != objectives:
-        raise ResultsError(f"{folder / EVALUATIONS}: holds other objectives than the campaign")
-    return _replica(algorithm, number, table, marker.seconds)
+        raise ResultsError(f"{path}: holds other objectives than the campaign")
+    return Replica(algorithm, number, table.evaluations, table.generation, marker.seconds)
 
 
 @lru_cache(maxsize=KEPT)
@@ -236,12 +260,21 @@ def _decoded(content: bytes, path: Path) -> EvaluationTable:
     return decode(content, path)
 
 
-def _replica(algorithm: str, number: int, table: EvaluationTable, seconds: float) -> Replica:
-    rows = front_rows(table.evaluations)
-    arrays = [getattr(table.evaluations, field.name) for field in fields(Evaluations)]
-    for array in (*arrays, table.generation, rows):
-        array.setflags(write=False)
-    return Replica(algorithm, number, table.evaluations, table.generation, rows, seconds)
+def is_whole(exists: bool, read: Callable[[], object]) -> bool:
+    """Whether what a stage left is there and can be read; what is damaged is told.
+
+    Args:
+        exists: whether it is there.
+        read: raises a `ResultsError` where it is damaged.
+    """
+    try:
+        if exists:
+            read()
+    except ResultsError as error:
+        told = str(error).removesuffix(f"; {ANEW}")
+        warnings.warn(f"{told}; {ANEW}", DamagedResultsWarning, stacklevel=2)
+        return False
+    return exists
 
 
 def read_polished(root: Path, replica: Replica, workcell: Workcell) -> PolishedFront | None:
@@ -253,8 +286,7 @@ def read_polished(root: Path, replica: Replica, workcell: Workcell) -> PolishedF
     path = polished_folder(root, replica.algorithm, replica.replica) / POLISH
     if not path.exists():
         return None
-    remedy = "--resume polishes it anew"
-    found, task = _polished(read_bytes(path), path, remedy), workcell.task
+    found, task = _polished(read_bytes(path), path), workcell.task
     problem = ""
     if bool(len(found.x)) != bool(len(replica.front)):
         problem = f"at x: found {len(found.x)} points"
@@ -263,10 +295,10 @@ def read_polished(root: Path, replica: Replica, workcell: Workcell) -> PolishedF
     elif len(found.x) and ((found.x < task.lower) | (found.x > task.upper)).any():
         problem = "at x: is outside of the decision variables' bounds"
     if problem:
-        raise ResultsError(f"{path}: damaged {problem}; {remedy}")
+        raise ResultsError(f"{path}: damaged {problem}; {ANEW}")
     return found if len(found.x) else replace(found, x=found.x.reshape(0, task.n_var))
 
 
 @lru_cache(maxsize=KEPT)
-def _polished(content: bytes, path: Path, remedy: str) -> PolishedFront:
-    return record_of(PolishedFront, content, path, remedy)
+def _polished(content: bytes, path: Path) -> PolishedFront:
+    return record_of(PolishedFront, content, path, ANEW)

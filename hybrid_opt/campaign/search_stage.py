@@ -4,7 +4,6 @@ records every generation and can repeat what was recorded."""
 from __future__ import annotations
 
 import time
-import warnings
 from collections.abc import Callable, Sequence
 from contextlib import closing
 from functools import partial
@@ -25,6 +24,7 @@ from hybrid_opt.campaign.journal import (
     encode_front,
     encode_generation,
 )
+from hybrid_opt.campaign.results import finished_replica, is_whole
 from hybrid_opt.campaign.settings import (
     DONE,
     EVALUATIONS,
@@ -34,14 +34,14 @@ from hybrid_opt.campaign.settings import (
     replica_folder,
 )
 from hybrid_opt.campaign.stages import Stage
-from hybrid_opt.errors import DamagedResultsWarning, ResultsError
+from hybrid_opt.errors import ResultsError
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.evaluate.evaluations import Evaluations
 from hybrid_opt.indicators import metrics
 from hybrid_opt.metaheuristics.run import Evaluator, SearchSettings, disarmed, search_carries
 from hybrid_opt.progress import Progress
-from hybrid_opt.store.files import read_bytes, sha256, write_atomically, write_json
-from hybrid_opt.store.json_records import read_record, to_json
+from hybrid_opt.store.files import sha256, write_atomically, write_json
+from hybrid_opt.store.json_records import to_json
 from hybrid_opt.work.service import Service
 from symbolic.array import Array
 from symbolic.records.task import initial_decision
@@ -78,15 +78,11 @@ def run_replica(
     )
     # Without what was repeated from a journal.
     seconds = sum(recording.seconds) + recording.certification_seconds
+    rows = metrics.front_rows(found.objectives, found.feasible)
     table = EvaluationTable(found, generation, evaluator.objective_names)
-    files = {EVALUATIONS: encode(table), FRONT: encode_front(table, front_rows(found))}
+    files = {EVALUATIONS: encode(table), FRONT: encode_front(table, rows)}
     checksums = {name: sha256(content) for name, content in files.items()}
     return files, FinishedReplica(algorithm, request.replica, len(found), seconds, checksums)
-
-
-def front_rows(evaluations: Evaluations) -> np.ndarray[tuple[int], np.dtype[np.intp]]:
-    """(k,) rows of the feasible candidates that none dominates, by increasing objectives."""
-    return metrics.front_rows(evaluations.objectives, evaluations.feasible)
 
 
 class _Recording:
@@ -141,9 +137,6 @@ class _Recording:
         return certified
 
 
-ANEW = "--resume computes it anew"
-
-
 def search_stage(source: EvaluatorSource | None = None) -> Stage:
     """The stage that runs all replicas.
 
@@ -157,29 +150,16 @@ def search_stage(source: EvaluatorSource | None = None) -> Stage:
         _Search(folder).run(source or maker, progress)
 
     def whole(folder: CampaignFolder) -> bool:
-        return all(is_whole(folder.root, *key) for key in _replicas(folder))
+        return all(_is_done(folder.root, *key) for key in _replicas(folder))
 
     return Stage("search", run, whole=whole)
 
 
-def is_whole(root: Path, algorithm: str, replica: int) -> bool:
-    """Whether a replica is finished and its files are as they were written.
-
-    A search gives the same bits again, so what is damaged is told and computed anew.
-    """
-    folder = replica_folder(root, algorithm, replica)
-    if not (folder / DONE).exists():
-        return False
-    try:
-        marker = read_record(FinishedReplica, folder / DONE, ANEW)
-        for name in (EVALUATIONS, FRONT):
-            if marker.sha256.get(name) != sha256(read_bytes(folder / name)):
-                raise ResultsError(f"{folder / name}: damaged, its checksum differs; {ANEW}")
-    except ResultsError as error:
-        told = str(error).removesuffix(f"; {ANEW}")
-        warnings.warn(f"{told}; {ANEW}", DamagedResultsWarning, stacklevel=2)
-        return False
-    return True
+def _is_done(root: Path, algorithm: str, replica: int) -> bool:
+    """Whether a replica is finished and its files are as they were written: a search gives the same
+    bits again, so what is damaged is computed anew."""
+    read = partial(finished_replica, root, algorithm, replica, (EVALUATIONS, FRONT))
+    return is_whole((replica_folder(root, algorithm, replica) / DONE).exists(), read)
 
 
 def _replicas(folder: CampaignFolder) -> list[Key]:
@@ -197,7 +177,7 @@ class _Search(ReplicaLedger):
 
     def __init__(self, folder: CampaignFolder) -> None:
         self._every = _replicas(folder)
-        left = [key for key in self._every if not is_whole(folder.root, *key)]
+        left = [key for key in self._every if not _is_done(folder.root, *key)]
         super().__init__(folder, {key: replica_folder(folder.root, *key) for key in left})
 
     def run(self, source: EvaluatorSource, progress: Progress) -> None:

@@ -264,5 +264,5 @@ def test_a_damaged_file_is_told(finished: Path, tmp_path: Path, fault: str, told
     path = polished_folder(tmp_path, "nsga2", 0) / POLISH
     path.parent.mkdir(parents=True)
     path.write_text(json.dumps(spoilt(whole, fault)))
-    with pytest.raises(ResultsError, match=rf"damaged ?{told}.*; --resume polishes it anew"):
+    with pytest.raises(ResultsError, match=rf"damaged ?{told}.*; --resume computes it anew"):
         read_polished(tmp_path, replica, load(RACK))

@@ -10,7 +10,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hybrid_opt.campaign.results import Replica
-from hybrid_opt.campaign.search_stage import front_rows
 from hybrid_opt.cell import Cell
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.indicators.selection import balanced, knee, peak_normal_forces, select, selected_row
@@ -35,7 +34,7 @@ def replica_of(evaluator: CandidateEvaluator, count: int) -> Replica:
     x = np.random.default_rng(8).uniform(evaluator.lower, evaluator.upper, (count, evaluator.n_var))
     found = evaluator.evaluate(x)
     generation = np.ones(count, dtype=np.int64)
-    return Replica("random", 0, found, generation, front_rows(found), 0.0)
+    return Replica("random", 0, found, generation, 0.0)
 
 
 def test_balanced_is_the_least_mean() -> None:

@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 
 from hybrid_opt.campaign.results import CampaignResults, Replica, read_campaign
-from hybrid_opt.campaign.search_stage import front_rows
 from hybrid_opt.campaign.settings import (
     POLISH,
     SIMULATED,
@@ -83,9 +82,7 @@ def replica(objectives: list[list[float]], reasons: list[str], number: int = 0) 
         violation,
         violation,
     )
-    return Replica(
-        "nsga2", number, found, np.ones(n, dtype=np.int64), front_rows(found), 1.5 + number
-    )
+    return Replica("nsga2", number, found, np.ones(n, dtype=np.int64), 1.5 + number)
 
 
 FRONT = [[0.6, 0.4], [0.5, 0.5], [0.3, 0.3], [0.4, 0.7]]
