@@ -12,7 +12,7 @@ import argparse
 import sys
 from collections.abc import Callable
 
-from studies.options import add, number, stated
+from studies.options import add, number, stated, whole
 from studies.program import Parser, Program, run_program
 from symbolic.errors import SettingsError
 from symbolic.replacing import replace_file
@@ -46,6 +46,23 @@ def _add_options(parser: Parser) -> None:
         help="propose where the robots stand as well; only the height of their bases counts then",
     )
     parser.add_argument(
+        "--classes",
+        type=whole(1, 100),
+        default=1,
+        metavar="N",
+        help="look for up to N carries that pass what is in the way on different sides, or hold "
+        "the box in other postures; the first goes into the workcell file, the others into files "
+        "whose names end in -2 and so on",
+    )
+    parser.add_argument(
+        "--study",
+        type=whole(100, 10**6),
+        metavar="N",
+        help="search N carries around each of them as robots drive it, polish, and put the class "
+        "of the fastest first (default: that whose joints go least far): compiles, and takes its "
+        "time beside --time",
+    )
+    parser.add_argument(
         "--grips",
         type=_ranges,
         metavar="LOW:HIGH,LOW:HIGH",
@@ -67,7 +84,7 @@ def _run(options: argparse.Namespace) -> int:
     import numpy as np
 
     import hybrid_opt as ho
-    from hybrid_opt.proposing.proposal import worked
+    from hybrid_opt.proposing.proposal import propose_classes, worked
 
     problem = options.problem
     output = options.output or problem.with_name(f"{problem.stem}-proposed.toml")
@@ -80,14 +97,21 @@ def _run(options: argparse.Namespace) -> int:
     own = sys.argv[-len(options.arguments) :] == options.arguments
     begun = 0.0 if own else worked()  # of a process of its own imports count
     left = max(options.time - (worked() - begun), 1.0)
-    proposal = ho.propose(
+    proposals = propose_classes(
         problem,
         rng=np.random.default_rng(options.seed),
-        settings=ho.ProposeSettings(seconds=left, bases=options.bases),
+        settings=ho.ProposeSettings(seconds=left, bases=options.bases, classes=options.classes),
         tell=(lambda text: None) if options.quiet else _teller(lambda: worked() - begun),
     )
-    replace_file(output, proposal.text(output.parent).encode())
-    print(f"{output}: {proposal}")
+    if options.study is not None:
+        from hybrid_opt.classes import compared
+
+        proposals, table = compared(proposals, options.study, np.random.default_rng(options.seed))
+        print(table.text())
+    for k, proposal in enumerate(proposals, 1):
+        name = output if k == 1 else output.with_stem(f"{output.stem}-{k}")
+        replace_file(name, proposal.text(name.parent).encode())
+        print(f"{name}: {proposal}")
     if options.grips is not None:
         grip = ho.propose_grip(ho.Cell.load(output), *options.grips)
         assert grip.cell.workcell.text is not None, "it was read from a file"

@@ -308,11 +308,13 @@ class Stray:
             from the one to the other and no other way.
         range: see `Freedom`.
         aside: how far the box may be beyond start and goal along each of the world's axes [m].
+        towards: (3,) the axis along which alone it may, and the sign; None: all, either way.
     """
 
     tilt: float
     range: float
     aside: float
+    towards: tuple[int, int, int] | None = None
 
 
 def freedom(start: Array, goal: Array, stray: Stray, limits: Array) -> Freedom:
@@ -326,7 +328,11 @@ def freedom(start: Array, goal: Array, stray: Stray, limits: Array) -> Freedom:
     size, weight, tilt = len(start), levers(len(start)), stray.tilt
     aside = np.full(size, stray.aside)
     aside[POSE_SIZE:] *= REDUNDANT_ASIDE
-    lower, upper = np.minimum(start, goal) - aside, np.maximum(start, goal) + aside
+    less, more = aside.copy(), aside.copy()
+    if stray.towards is not None:
+        less[:3] *= np.less(stray.towards, 0)
+        more[:3] *= np.greater(stray.towards, 0)
+    lower, upper = np.minimum(start, goal) - less, np.maximum(start, goal) + more
     lower[POSE_SIZE:] = np.maximum(lower[POSE_SIZE:], limits[:, 0])
     upper[POSE_SIZE:] = np.minimum(upper[POSE_SIZE:], limits[:, 1])
     columns, low, high = [], [], []
@@ -370,27 +376,28 @@ def retreats(chain: ClosedChain, ends: tuple[Place, Place]) -> Retreats:
     return found
 
 
-def straight_path(chain: ClosedChain, out: Retreats, box: BoxAlone) -> list[Place] | None:
-    """Corners of the shortest free path found of a retreat, a straight motion, and the opposite of
-    a retreat along the same direction; None if none is free."""
-    ways: dict[tuple[bytes, bytes], tuple[float, list[Place]]] = {}
-    for first, last in zip(*out, strict=True):
+def straight_paths(chain: ClosedChain, out: Retreats, box: BoxAlone) -> Iterator[list[Place]]:
+    """Corners of free paths of a retreat, a straight motion, and the opposite of a retreat along
+    the same direction: the shortest found first, along each direction one."""
+    ways: dict[tuple[bytes, bytes], tuple[float, int, list[Place]]] = {}
+    for along, (first, last) in enumerate(zip(*out, strict=True)):
         for a, b in product(first[::RETREAT_STOPS], last[::RETREAT_STOPS]):
             corners = [first[0], a, b, last[0]]
             length = sum(distance(p.extended, q.extended) for p, q in pairwise(corners))
-            ways[a.extended.tobytes(), b.extended.tobytes()] = length, corners
-    tried = 0
-    for _, corners in sorted(ways.values(), key=lambda way: way[0]):
+            ways[a.extended.tobytes(), b.extended.tobytes()] = length, along, corners
+    tried, done = 0, set[int]()
+    for _, along, corners in sorted(ways.values(), key=lambda way: way[0]):
         begin, end = corners[1].extended, corners[2].extended
-        if box.meets((begin + BETWEEN[:, None] * (end - begin))[:, :POSE_SIZE]):
+        if along in done or box.meets((begin + BETWEEN[:, None] * (end - begin))[:, :POSE_SIZE]):
             continue
         there = chain.reach(corners[1], end)
-        if there is not None and same(there, corners[2]):
-            return corners
         tried += 1
-        if tried == STRAIGHT_TRIED:
-            break
-    return None
+        if there is not None and same(there, corners[2]):
+            done.add(along)
+            tried = 0
+            yield corners
+        elif tried == STRAIGHT_TRIED:
+            return
 
 
 def plan(

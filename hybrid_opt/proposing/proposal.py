@@ -12,6 +12,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -22,14 +23,23 @@ from hybrid_opt.carry import Judgement
 from hybrid_opt.errors import ProposalError
 from hybrid_opt.proposing.bases import base_choices
 from hybrid_opt.proposing.bounds import Bounds, Sampling, find_bounds
-from hybrid_opt.proposing.planner import Place, Stray, freedom, plan, straight_path
+from hybrid_opt.proposing.planner import Place, Stray, freedom, plan, straight_paths
 from hybrid_opt.proposing.problem import Found, Problem, changes, decision_bounds, read_problem
 from hybrid_opt.proposing.setup import Pair, Setup, no_path, prepare
 from hybrid_opt.proposing.trial import BoxAlone, BranchLostError, Trial, grasp_blocked
-from hybrid_opt.proposing.via_points import MOST_VIA_POINTS, fit, shortened, straightened, travelled
+from hybrid_opt.proposing.via_points import (
+    LEAST_SAMPLES,
+    MOST_VIA_POINTS,
+    along,
+    fit,
+    shortened,
+    straightened,
+    travelled,
+)
 from symbolic.array import Array
 from symbolic.errors import SettingsError, WorkcellError
-from symbolic.records import Workcell
+from symbolic.path.spline import path_basis
+from symbolic.records import POSE_SIZE, Workcell
 
 ROUNDS = ((0, 4), (2000, 2), (6000, 6), (20000, 16), (60000, 24))
 """Configurations that the planner may look at for a path, 0 for straight motions alone, and pairs
@@ -45,6 +55,9 @@ STRAYS = (
 )
 """What paths are looked for among; the narrower, the sooner a gap is found, if it is there."""
 
+SIDES = ((0, 0, 1), (0, 1, 0), (0, -1, 0), (1, 0, 0), (-1, 0, 0))
+"""Ways to stray, each by itself, among which further classes are looked for."""
+
 FEW = 3
 """Via-points that are taken at once; where a path needs more, others are tried first."""
 
@@ -53,6 +66,8 @@ LONG_TRIED = 2
 
 LONGER = 2.5
 """What is tried next where the time was too short, in that time."""
+
+MOST_CLASSES = 100
 
 PLANNING = 0.7
 """Share of the time after which no path is looked for any more."""
@@ -76,17 +91,21 @@ class ProposeSettings:
         feasible: least and largest share of random candidates within the bounds that is feasible.
         bases: whether the robots' bases are proposed too; of those in the file only the height
             counts.
+        classes: carries of different classes that are looked for, as far as the time goes.
         clock: what seconds are counted by; other programs' work does not count.
     """
 
     seconds: float = 120.0
     feasible: tuple[float, float] = (0.02, 0.20)
     bases: bool = False
+    classes: int = 1
     clock: Callable[[], float] = worked
 
     def __post_init__(self) -> None:
         if not 1.0 <= self.seconds <= 1e6:
             raise SettingsError(f"seconds: found {self.seconds:g}; allowed is 1 to 1e6")
+        if not 1 <= self.classes <= MOST_CLASSES:
+            raise SettingsError(f"classes: found {self.classes}; allowed is 1 to {MOST_CLASSES}")
         low, high = self.feasible
         if not 0.0 < low < high <= 1.0:
             raise SettingsError(
@@ -107,6 +126,7 @@ class Proposal:
         seconds: that it took.
         certified: of these until the first carry was certified, before bounds around it.
         q: per arm its joints (n, joints) at the task's samples [rad or m].
+        sides: on which sides it passes what a straight motion of the box would meet.
         blocked: what is in the way of the pads before the carry or after it, '' where nothing is,
             or no time was left to look.
     """
@@ -119,6 +139,7 @@ class Proposal:
     seconds: float
     certified: float
     q: tuple[Array, Array]
+    sides: tuple[str, ...]
     blocked: str = ""
 
     @property
@@ -137,9 +158,10 @@ class Proposal:
     def __str__(self) -> str:
         forces = ", ".join(f"{value:.4f}" for value in self.judgement.objectives.values())
         spins = " and ".join(f"{np.degrees(spin):.0f}" for spin in self.found.spins)
+        where = f" {' and '.join(self.sides)}," if self.sides else ""
         return (
-            f"a carry through {len(self.found.via)} via-points, joints go {self.length:.2f} rad, "
-            f"certified; objectives {forces}; "
+            f"a carry{where} through {len(self.found.via)} via-points, joints go "
+            f"{self.length:.2f} rad, certified; objectives {forces}; "
             f"spins {spins} deg, start branches {self.found.branches[0]} and "
             f"{self.found.branches[1]}; {100.0 * self.feasible_share:.1f} % of "
             f"{self.candidates} random candidates feasible; {self.seconds:.1f} s"
@@ -154,13 +176,27 @@ def propose(
     settings: ProposeSettings | None = None,
     tell: Callable[[str], None] = lambda text: None,
 ) -> Proposal:
-    """Propose a complete workcell for a problem file.
+    """Propose a complete workcell for a problem file; of several classes that whose joints go least
+    far. Arguments and errors as for `propose_classes`."""
+    return propose_classes(path, rng=rng, settings=settings, tell=tell)[0]
+
+
+def propose_classes(
+    path: str | Path,
+    *,
+    rng: np.random.Generator,
+    settings: ProposeSettings | None = None,
+    tell: Callable[[str], None] = lambda text: None,
+) -> list[Proposal]:
+    """Propose complete workcells whose carries are of different classes, those whose joints go
+    least far first: they pass what is in the way on different sides, or hold the box in other
+    postures.
 
     Args:
         path: a workcell file in which what is proposed may be missing (docs/your-own-cell.md).
-        rng: its only randomness. The same state gives the same proposal where time does not run
+        rng: its only randomness. The same state gives the same proposals where time does not run
             out.
-        settings: None for the defaults.
+        settings: how many are looked for, among others; None for the defaults: one.
         tell: called with what is being done.
 
     Raises:
@@ -171,7 +207,7 @@ def propose(
     """
     find_compiler()
     search = _Search(read_problem(path), rng, settings or ProposeSettings(), tell)
-    return search.run()
+    return sorted(search.run(), key=lambda one: one.length)
 
 
 @dataclass
@@ -194,6 +230,8 @@ class _Search:
     tell: Callable[[str], None]
     begun: float = 0.0
     refusals: list[str] = field(default_factory=list)
+    known: set[tuple[int, tuple[str, ...]]] = field(default_factory=set)
+    """Classes that were found: the pair that holds the box, by identity, and the sides."""
 
     @property
     def spent(self) -> float:
@@ -210,22 +248,27 @@ class _Search:
         """Whether it is too late for another path: bounds and verdicts take time as well."""
         return self.spent > PLANNING * self.settings.seconds
 
-    def run(self) -> Proposal:
+    def run(self) -> list[Proposal]:
         self.begun = self.settings.clock()
         self.tell("bases" if self.settings.bases else "ways to hold the box")
         spins = 2.0 * np.pi * np.arange(SPINS) / SPINS
         choices = base_choices(self.problem, spins, self.rng) if self.settings.bases else [{}]
         setups = [_Lazy(given, spins) for given in choices]
+        found: list[Proposal] = []
         for effort, most in ROUNDS:
             for setup in setups:
-                found = self._round(setup, effort, most)
-                if found is not None:
-                    return found
+                for one in self._round(setup, effort, most):
+                    found.append(one)
+                    self.tell(f"carry {len(found)}: {' and '.join(one.sides) or 'straight'}")
+                    if len(found) == self.settings.classes:
+                        return found
                 if self.too_late:
                     break
-        raise self._failed(setups)
+        if not found:
+            raise self._failed(setups)
+        return found
 
-    def _round(self, lazy: _Lazy, effort: int, most: int) -> Proposal | None:
+    def _round(self, lazy: _Lazy, effort: int, most: int) -> Iterator[Proposal]:
         """One round with one choice of bases."""
         if lazy.setup is None and not lazy.problem:
             self.tell("ways to hold the box")
@@ -236,27 +279,30 @@ class _Search:
                     raise  # the file is wrong, not the bases that were tried
                 lazy.problem = str(error)
         if lazy.setup is None:
-            return None
+            return
+        box = BoxAlone(lazy.setup.workcell)
         for number, pair in enumerate(lazy.setup.pairs[:most]):
             if self.too_late:
                 break
             self.tell(f"paths of pair {number + 1} of {len(lazy.setup.pairs)}")
             long: list[Array] = []
-            for corners in self._paths(lazy.setup, pair, effort):
-                via = None if corners is None else self._via_points(pair, corners)
+            for corners in self._paths(lazy.setup, pair, effort, box):
+                if corners is None or self._is_known(pair, box, along(corners)):
+                    continue
+                via = self._via_points(pair, corners)
                 if via is None:
                     continue
                 if len(via) > FEW:  # another path may do with fewer
                     long.append(via)
                     continue
-                found = self._judged(lazy.setup, pair, via)
-                if found is not None:
-                    return found
-            for via in sorted(long, key=len)[:LONG_TRIED]:
-                found = None if self.out_of_time else self._judged(lazy.setup, pair, via)
-                if found is not None:
-                    return found
-        return None
+                yield from self._judged(lazy.setup, pair, via, box)
+            for via in sorted(long, key=len)[: LONG_TRIED + self.settings.classes - 1]:
+                if not self.out_of_time:
+                    yield from self._judged(lazy.setup, pair, via, box)
+
+    def _is_known(self, pair: Pair, box: BoxAlone, path: Array) -> bool:
+        """Whether a carry of the class of these poses (n, 6) was found before."""
+        return bool(self.known) and (id(pair), box.passed(path)) in self.known
 
     def _failed(self, setups: list[_Lazy]) -> ProposalError:
         begin = f"{self.problem.source}: no carry found in {self.spent:.0f} s"
@@ -273,13 +319,17 @@ class _Search:
             begin = f"{begin}, when it was out of time; try {more} s (--time {more})"
         return ProposalError(f"{begin}: {met or 'no path was tried yet'}")
 
-    def _paths(self, setup: Setup, pair: Pair, effort: int) -> Iterator[list[Place] | None]:
+    def _paths(
+        self, setup: Setup, pair: Pair, effort: int, box: BoxAlone
+    ) -> Iterator[list[Place] | None]:
         """Corners of paths in one way of holding."""
         if not effort:
-            yield straight_path(pair.chain, pair.retreats, BoxAlone(setup.workcell))
+            found = straight_paths(pair.chain, pair.retreats, box)
+            yield from islice(found, None if self.settings.classes > 1 else 1)
             return
         limits = [(joint.lower.min(), joint.upper.max()) for joint in setup.workcell.task.redundant]
-        for stray in STRAYS:
+        sided = [replace(STRAYS[0], towards=side) for side in SIDES]
+        for stray in (*STRAYS, *(sided if self.settings.classes > 1 else ())):
             if self.too_late:
                 return
             ends = pair.start.extended, pair.goal.extended
@@ -308,19 +358,23 @@ class _Search:
                 break
         return None
 
-    def _judged(self, setup: Setup, pair: Pair, via: Array) -> Proposal | None:
-        """The proposal with these via-points, or None where the evaluator refuses it."""
-        self.tell("the evaluator's verdict")
-        begun = self.spent
+    def _judged(self, setup: Setup, pair: Pair, via: Array, box: BoxAlone) -> Iterator[Proposal]:
+        """The proposal with these via-points, none where the evaluator refuses it or one of its
+        class was found before."""
         ends = np.round([pair.start.extended, pair.goal.extended], 4)
         waypoints = np.vstack([ends[0], via, ends[1]])
+        path = path_basis(len(waypoints), np.linspace(0.0, 1.0, LEAST_SAMPLES)).position @ waypoints
+        if self._is_known(pair, box, path[:, :POSE_SIZE]):
+            return
+        self.tell("the evaluator's verdict")
+        begun = self.spent
         spins = (pair.holds[0].spin, pair.holds[1].spin)
         found = Found(setup.workcell, spins, (-1, -1), waypoints, setup.given)
         trial = Trial(self._workcell(found), pair.start.q, named=False)
         judgement, why = trial.verdict()
         if not judgement.feasible:
             self.refusals.append(why)
-            return None
+            return
         certified = self.spent
         self.tell("bounds")
         # The verdict on the file takes about as long as this one did.
@@ -331,15 +385,16 @@ class _Search:
             last = Trial(self._workcell(moved), trial.start_of(bounds.carry), trial.bodies)
         except BranchLostError:
             self.refusals.append("the start posture is not among the arm's start branches")
-            return None
+            return
         judgement, why = last.verdict()
         if not judgement.feasible:
             self.refusals.append(why)
-            return None
+            return
         outputs = last.evaluator.outputs(last.initial[None])
+        self.known.add((id(pair), box.passed(path[:, :POSE_SIZE])))
         self.tell("the pads' way to the box")
         blocked = "" if self.out_of_time else grasp_blocked(last)
-        return Proposal(
+        yield Proposal(
             self.problem,
             replace(moved, branches=last.branches),
             judgement,
@@ -348,6 +403,7 @@ class _Search:
             self.spent,
             certified,
             (outputs["q_1"][0], outputs["q_2"][0]),
+            box.passed(outputs["pose"][0]),
             blocked,
         )
 

@@ -34,6 +34,7 @@ from symbolic.functions import cell_functions, motion_function
 from symbolic.geometry.bodies import MeshReader, shape_pieces
 from symbolic.geometry.clearance import screening_functions
 from symbolic.geometry.pairs import CellGeometry, coal_distance
+from symbolic.geometry.pieces import Piece, support
 from symbolic.records import PAYLOAD, Workcell
 from symbolic.records.poses import box_placement
 from symbolic.records.task import initial_decision
@@ -48,6 +49,13 @@ MARGINS = (0.01, 0.004, 0.0015, 0.0005, 0.0)
 [m]."""
 
 
+LOOKED_AT = 0.02
+"""Between places of a straight motion of the box at which is looked what it meets [m]."""
+
+LEVEL = 0.1
+"""Least level share of a motion that has a left and a right."""
+
+
 class BoxAlone:
     """The box among the environment, without the arms."""
 
@@ -56,17 +64,65 @@ class BoxAlone:
         meshes = MeshReader()
         self._orientation = workcell.task.orientation
         self._box = shape_pieces(workcell.payload.solid, np.eye(4), PAYLOAD, meshes)
+        self._names = [body.name for body in workcell.environment]
         self._standing = [
             shape_pieces(body.shape, body.pose, body.name, meshes) for body in workcell.environment
         ]
 
     def meets(self, path: Array) -> bool:
         """Whether the box meets the environment at one of these poses (n, 6)."""
-        for T_world_box in box_placement(self._orientation, path):
-            box = tuple(piece.moved(T_world_box) for piece in self._box)
-            if any(coal_distance(box, pieces) <= 0.0 for pieces in self._standing):
-                return True
-        return False
+        return any(
+            self._meets(box, k) for box in self._boxes(path) for k in range(len(self._names))
+        )
+
+    def passed(self, path: Array) -> tuple[str, ...]:
+        """On which sides a path (n, 6) passes what the straight motion between its ends meets, such
+        as 'over post' or 'left of post' (looking along the motion); nothing where that is free.
+
+        What the box meets at an end, such as the board that it stands on, does not count.
+        """
+        n = max(int(np.ceil(np.linalg.norm(path[-1, :3] - path[0, :3]) / LOOKED_AT)), 2)
+        straight = self._boxes(np.linspace(path[0], path[-1], n + 1))
+        ends, between = (straight[0], straight[-1]), straight[1:-1]
+        way, placed = path[-1, :3] - path[0, :3], self._boxes(path)
+        found = []
+        for k, name in enumerate(self._names):
+            if any(self._meets(box, k) for box in ends):
+                continue
+            if any(self._meets(box, k) for box in between):
+                found.append(f"{_side(placed, self._standing[k], way)} {name}")
+        return tuple(found)
+
+    def _boxes(self, path: Array) -> list[tuple[Piece, ...]]:
+        placements = box_placement(self._orientation, path)
+        return [tuple(piece.moved(T) for piece in self._box) for T in placements]
+
+    def _meets(self, box: tuple[Piece, ...], k: int) -> bool:
+        return coal_distance(box, self._standing[k]) <= 0.0
+
+
+def _side(boxes: list[tuple[Piece, ...]], body: tuple[Piece, ...], way: Array) -> str:
+    """On which side of a body a box passes: along the axis, across the way (3,), on which most is
+    between them where the box is abreast of the body."""
+    length = float(np.linalg.norm(way))
+    along = way / length if length > 0.0 else np.array([1.0, 0.0, 0.0])
+    level = np.array([along[0], along[1], 0.0])
+    if np.linalg.norm(level) > LEVEL:
+        left = np.cross([0.0, 0.0, 1.0], level / np.linalg.norm(level))
+        sides = {"left of": left, "right of": -left}
+        up = np.cross(along, left)
+        sides |= {"over": up, "under": -up}
+    else:
+        sides = {"+x of": np.eye(3)[0], "-x of": -np.eye(3)[0]}
+        sides |= {"+y of": np.eye(3)[1], "-y of": -np.eye(3)[1]}
+    middle = _reach(body, along) - _reach(body, -along)
+    abreast = min(boxes, key=lambda box: abs(_reach(box, along) - _reach(box, -along) - middle))
+    return max(sides, key=lambda side: -_reach(abreast, -sides[side]) - _reach(body, sides[side]))
+
+
+def _reach(pieces: tuple[Piece, ...], direction: Array) -> float:
+    """How far pieces reach along a direction (3,) [m]."""
+    return max(float(support(piece, direction)[0]) for piece in pieces)
 
 
 class PoseJudge:

@@ -55,6 +55,12 @@ def joint_length(places: Sequence[Place]) -> float:
     return travelled(np.array([np.concatenate(place.q) for place in places]))
 
 
+def along(corners: Sequence[Place]) -> Array:
+    """(n, 6) box poses on the straight motions between corners."""
+    legs = [straight(a.extended, b.extended)[:, :POSE_SIZE] for a, b in pairwise(corners)]
+    return np.vstack(legs)
+
+
 def shortened(
     chain: ClosedChain, corners: Sequence[Place], rng: np.random.Generator
 ) -> list[Place]:

@@ -12,7 +12,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from studies.options import add, number, stated
+from studies.options import add, number, stated, whole
 from studies.program import Parser, Program, run_program
 from symbolic.errors import SettingsError
 
@@ -39,6 +39,13 @@ def _add_options(parser: Parser) -> None:
         help="seconds that a proposal may work",
     )
     parser.add_argument(
+        "--classes",
+        type=whole(1, 100),
+        default=1,
+        metavar="N",
+        help="carries of so many classes are looked for; that whose joints go least far is taken",
+    )
+    parser.add_argument(
         "--study", action="store_true", help="also look for the fastest carry of every task"
     )
     add(parser, "--seed", help="of its randomness")
@@ -57,7 +64,7 @@ def _run(options: argparse.Namespace) -> int:
         for name, module in chosen.items():
             print(f"{name}: get its files, then name FOLDER by --folder\n{module.HOW}")
         return 0
-    settings = ProposeSettings(seconds=options.time)
+    settings = ProposeSettings(seconds=options.time, classes=options.classes)
     for module in chosen.values():
         given = module.benchmark(options.folder)
         found = [

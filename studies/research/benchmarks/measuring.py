@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 import hybrid_opt as ho
+from hybrid_opt.classes import fastest_carry
 from hybrid_opt.display.table import Table, number
 from hybrid_opt.errors import ProposalError
 from hybrid_opt.proposing.problem import completed
@@ -159,9 +160,7 @@ def measured(
     if not study:
         return found
     progress(f"{task.name}: the fastest carry")
-    rng, cell = np.random.default_rng(seed), ho.Cell.load(workcell).drivable()
-    front = ho.polish(ho.search(cell, "nsga2", evaluations=EVALUATIONS, rng=rng), rng=rng)
-    fastest = front.lowest("duration")
+    fastest = fastest_carry(ho.Cell.load(workcell), EVALUATIONS, np.random.default_rng(seed))
     return replace(
         found,
         fastest=length(benchmark, (fastest.arms[0].q, fastest.arms[1].q)),

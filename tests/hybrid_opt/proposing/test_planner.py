@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hybrid_opt.proposing.holding import ArmKinematics, box_to_last_joint, spun
-from hybrid_opt.proposing.planner import Place, Stray, freedom, plan, straight, straight_path
+from hybrid_opt.proposing.planner import Place, Stray, freedom, plan, straight, straight_paths
 from hybrid_opt.proposing.problem import read_problem
 from hybrid_opt.proposing.setup import Setup, prepare
 from hybrid_opt.proposing.trial import BoxAlone
@@ -58,8 +58,7 @@ def test_paths_hold_the_box_with_both_arms_and_are_free(rack: Setup) -> None:
 def test_straight_motions_lead_out_of_the_shelf_and_in_again(rack: Setup) -> None:
     """Of three: away from the rack, up beside it, back; collisions are FCL's without screening."""
     pair = rack.pairs[0]
-    corners = straight_path(pair.chain, pair.retreats, BoxAlone(rack.workcell))
-    assert corners is not None
+    corners = next(straight_paths(pair.chain, pair.retreats, BoxAlone(rack.workcell)))
     out, over = (corners[k + 1].extended - corners[k].extended for k in (0, 1))
     assert out[0] < -0.2
     assert over[2] > 0.3
@@ -74,14 +73,13 @@ def test_where_no_straight_motion_is_free_none_is_made_up(rack: Setup) -> None:
     pair = rack.pairs[0]
     ends = pair.start, pair.goal
     alone = tuple([[end]] * len(ways) for end, ways in zip(ends, pair.retreats, strict=True))
-    assert straight_path(pair.chain, (alone[0], alone[1]), BoxAlone(rack.workcell)) is None
+    assert not list(straight_paths(pair.chain, (alone[0], alone[1]), BoxAlone(rack.workcell)))
 
 
 def test_shortcuts_make_the_way_of_the_joints_shorter(rack: Setup) -> None:
     """A path that wanders to both sides, on a task that is symmetric."""
     pair = rack.pairs[0]
-    corners = straight_path(pair.chain, pair.retreats, BoxAlone(rack.workcell))
-    assert corners is not None
+    corners = next(straight_paths(pair.chain, pair.retreats, BoxAlone(rack.workcell)))
     path = np.array([corner.extended for corner in corners])
     path = np.insert(path, 2, (path[1] + path[2]) / 2.0, axis=0)
     path[2, 1] += 0.08
@@ -163,3 +161,11 @@ def test_redundant_joints_stray_farther_than_the_box_and_not_beyond_their_limits
     least, most = room.extended(room.lower), room.extended(room.upper)
     np.testing.assert_allclose(least, [-0.2, -0.2, -0.2, 0, 0, 0, -0.3, -1.0], atol=1e-7)
     np.testing.assert_allclose(most, [0.7, 0.2, 0.2, 0, 0, 0, 1.4, 1.0], atol=1e-7)
+
+
+def test_a_path_may_be_kept_to_one_side() -> None:
+    start, goal = np.zeros(6), np.array([0.5, 0.0, 0.1, 0.0, 0.0, 0.0])
+    room = freedom(start, goal, Stray(0.0, 0.15, 0.8, (0, -1, 0)), NO_LIMITS)
+    low, high = room.extended(room.lower), room.extended(room.upper)
+    np.testing.assert_allclose(low[:3], [0.0, -0.8, 0.0], atol=1e-6)
+    np.testing.assert_allclose(high[:3], [0.5, 0.0, 0.1], atol=1e-6)

@@ -17,7 +17,7 @@ import hybrid_opt as ho
 from hybrid_opt.errors import ProposalError
 from hybrid_opt.proposing import setup
 from hybrid_opt.proposing.problem import completed, merged
-from hybrid_opt.proposing.proposal import worked
+from hybrid_opt.proposing.proposal import propose_classes, worked
 from symbolic.errors import SettingsError, WorkcellError
 from symbolic.read.cell import load
 from tests.hybrid_opt.proposing.generated import write_problem
@@ -183,7 +183,30 @@ def test_cells_of_every_kind_get_carries(name: str, tmp_path: Path) -> None:
         np.testing.assert_allclose(contacts[0].T_box_pad, load(path).contacts[0].T_box_pad)
 
 
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::symbolic.geometry.hulls.CollisionModelWarning")
+def test_carries_of_other_classes_are_found_beside_the_first(tmp_path: Path) -> None:
+    """Past the post on three sides, each as its own file says; the shortest first."""
+    settings = ho.ProposeSettings(seconds=300.0, classes=3)
+    problem = Path("studies/problems/past-a-post.toml")
+    found = propose_classes(problem, rng=np.random.default_rng(1), settings=settings)
+    assert [one.length for one in found] == sorted(one.length for one in found)
+    for number, one in enumerate(found):
+        path = tmp_path / f"{number}.toml"
+        path.write_text(one.text(tmp_path), encoding="utf-8")
+        cell = ho.Cell.load(path)
+        assert cell.certify(cell.initial).is_free
+        pose = cell.carry(cell.initial).pose
+        at = pose[np.argmin(np.abs(pose[:, 0]))]
+        told = one.sides[0].removesuffix(" post")
+        assert told == ("over" if at[2] > 0.6 else "left of" if at[1] > 0.0 else "right of")
+    assert len({(one.sides, one.found.branches) for one in found}) == 3
+    assert len({one.sides for one in found}) >= 2
+
+
 def test_settings_are_checked() -> None:
+    with pytest.raises(SettingsError, match="classes"):
+        ho.ProposeSettings(classes=0)
     with pytest.raises(SettingsError, match="seconds"):
         ho.ProposeSettings(seconds=0.0)
     with pytest.raises(SettingsError, match="feasible"):

@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import casadi as ca
 import numpy as np
 import pytest
 
 from hybrid_opt.errors import JobError
-from hybrid_opt.proposing.trial import Trial, grasp_blocked
+from hybrid_opt.proposing.problem import read_problem
+from hybrid_opt.proposing.trial import BoxAlone, Trial, grasp_blocked
 from symbolic.cell_model import build_cell_model
 from symbolic.functions import CONSTRAINTS, candidate_function, motion_function
 from symbolic.read.cell import load
 from symbolic.records import Handling
 from tests.hybrid_opt.job.jobs import rack, rack_jobs, rack_timing
 from tests.symbolic.read.samples import RACK
+
+POST = Path("studies/problems/past-a-post.toml")
 
 
 @pytest.mark.parametrize("name", ["drum", "transfer"])
@@ -45,6 +49,49 @@ def test_verdicts_are_those_of_the_whole_evaluation(name: str) -> None:
     expected = trial.evaluator.evaluate(x).feasible
     assert 0 < expected.sum() < len(x)
     np.testing.assert_array_equal(trial.feasible(x), expected)
+
+
+WAY = np.linspace(-0.45, 0.45, 41)
+BOW = 0.5 * np.cos(np.pi * WAY / 0.9)
+
+
+@pytest.mark.parametrize(
+    ("aside", "sides"),
+    [
+        ((0.0, 0.0, 0.0), ("over post",)),
+        ((0.0, 1.0, 0.0), ("left of post",)),
+        ((0.0, -1.0, 0.0), ("right of post",)),
+        ((0.0, 0.3, 1.0), ("over post",)),
+    ],
+)
+@pytest.mark.parametrize("forth", [True, False])
+def test_a_path_says_on_which_side_it_passes_what_is_in_the_way(
+    aside: tuple[float, float, float], sides: tuple[str, ...], forth: bool
+) -> None:
+    """A post from 0 to 0.6 m, a box that would meet it; left and right change with the way."""
+    box = BoxAlone(read_problem(POST).workcell())
+    path = np.zeros((len(WAY), 6))
+    path[:, 0], path[:, 2] = WAY, 0.35
+    path[:, :3] += BOW[:, None] * aside
+    if aside == (0.0, 0.0, 0.0):
+        path[10:31, 2] = 0.75
+    if not forth:
+        path = path[::-1]
+        swapped = {"left of post": "right of post", "right of post": "left of post"}
+        sides = tuple(swapped.get(side, side) for side in sides)
+    assert box.passed(path) == sides
+    path[:, 2] += 0.5
+    assert box.passed(path) == (), "the straight motion is free there"
+
+
+def test_what_the_box_stands_on_is_not_passed(tmp_path: Path) -> None:
+    text = POST.read_text(encoding="utf-8").replace("0.35, 0.0, 0.0, 0.0]", "0.115, 0.0, 0.0, 0.0]")
+    path = tmp_path / "standing.toml"
+    path.write_text(text, encoding="utf-8")
+    box = BoxAlone(read_problem(path).workcell())
+    way = np.zeros((len(WAY), 6))
+    way[:, 0], way[:, 1], way[:, 2] = WAY, BOW, 0.115
+    assert box.passed(way) == ("left of post",)
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,63 @@
+"""Carries of several classes, each studied a little: which is the fastest?"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+
+from hybrid_opt.carry import Carry
+from hybrid_opt.cell import Cell
+from hybrid_opt.display.table import Table, number
+from hybrid_opt.door import polish, search
+from hybrid_opt.proposing.proposal import Proposal
+from symbolic.errors import DualArmError
+
+
+def fastest_carry(cell: Cell, evaluations: int, rng: np.random.Generator) -> Carry:
+    """The fastest carry of a small study of a cell as robots drive it: one search, one polish.
+
+    Raises:
+        SettingsError: no carry that holds was found.
+    """
+    found = search(cell.drivable(), "nsga2", evaluations=evaluations, rng=rng)
+    return polish(found, rng=rng).lowest("duration")
+
+
+def compared(
+    proposals: Sequence[Proposal], evaluations: int, rng: np.random.Generator
+) -> tuple[list[Proposal], Table]:
+    """Proposals with the fastest class first, and what was found of each.
+
+    Args:
+        evaluations: of the search within each class.
+        rng: its only randomness.
+    """
+    rows = []
+    for proposal in proposals:
+        seconds = force = float("inf")
+        with TemporaryDirectory() as folder:
+            file = Path(folder) / "proposed.toml"
+            file.write_text(proposal.text(file.parent), encoding="utf-8")
+            try:
+                fastest = fastest_carry(Cell.load(file), evaluations, rng)
+                seconds, force = fastest.duration, float(fastest.peak_normal_force.max())
+            except DualArmError:
+                pass  # none that holds: it comes last
+        rows.append((seconds, force, proposal))
+    rows.sort(key=lambda row: row[0])
+    header = ("passes", "start branches", "joints [rad]", "fastest [s]", "force [N]")
+    cells = tuple(
+        (
+            " and ".join(proposal.sides) or "straight",
+            "{} and {}".format(*proposal.found.branches),
+            number(proposal.length, 2),
+            number(seconds, 2),
+            number(force, 1),
+        )
+        for seconds, force, proposal in rows
+    )
+    note = f"Each class searched with {evaluations} carries and polished, as robots drive it."
+    return [row[2] for row in rows], Table("classes", "Classes of carries", header, cells, note)
