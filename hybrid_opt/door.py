@@ -112,7 +112,7 @@ def time_path(cell: Cell, carry: Carry | Array, limits: TimingLimits | None = No
     Raises:
         SettingsError: the carry does not fit the cell.
     """
-    return solve_timing(cell.timing_model, _decision(carry), limits or TimingLimits())
+    return solve_timing(cell.timing_model, _decision(carry), limits)
 
 
 def time_with_jerk(

@@ -10,9 +10,9 @@ target's anchor, span, direction, offset and cost,
                 1 - (shift_i,k(x) / patch radius_i)^2 >= margin      chosen robots and samples
                 c_r(x) / scale_r >= required_r / scale_r             chosen rows at chosen places.
 
-That covers the scalarisation of Pascoletti and Serafini (direction of ones) and the epsilon
-constraint (a zero in the direction). Another set of rows costs no more than choosing them. Joints
-as variables with closure constraints lead to the same optima and take four times as long.
+With a direction of ones that is the scalarisation of Pascoletti and Serafini (1984). Another set
+of rows costs no more than choosing them. Joints as variables with closure constraints lead to the
+same optima and take four times as long.
 """
 
 from __future__ import annotations
@@ -30,22 +30,13 @@ from hybrid_opt.polishing.constraints.kinds import Limits
 from hybrid_opt.polishing.point import Climb, Judged, Reached, Solution, Step, Way
 from hybrid_opt.polishing.rows import HELD, Layout, Row, Rows
 from hybrid_opt.polishing.settings import PolishSettings
-from hybrid_opt.polishing.solvers.base import (
-    Inequalities,
-    Residuals,
-    Solve,
-    estimated,
-    residuals,
-)
+from hybrid_opt.polishing.solvers.base import Residuals, Solve, optimality
 from hybrid_opt.polishing.solvers.dense import dense_method
 from hybrid_opt.polishing.solvers.ipopt import ipopt
 from symbolic.array import Array
 
 NO_LIMIT = 1e3
 """Offset that leaves an objective free, in units of the range."""
-
-CLOSED_SIDE = 1e-4
-"""By this share of the range a side may be exceeded: what the solver rounds off."""
 
 LARGER = 0.5
 """Weight of the larger objective beside the sum of both in the balanced middle."""
@@ -101,13 +92,8 @@ class Target:
         return float(np.max((phi - self.offset)[ahead] / self.direction[ahead]))
 
     def level(self, peak: Array) -> float:
-        """What the smooth problem minimises, at given peak forces (2,) over their references.
-
-        Infinite where a side that the direction does not open is exceeded.
-        """
+        """What the smooth problem minimises, at given peak forces (2,) over their references."""
         phi = (peak - self.anchor) / self.span
-        if np.any((phi > self.offset + CLOSED_SIDE) & (self.direction <= 0.0)):
-            return float("inf")
         return float(self.cost @ np.concatenate([[self.needed(phi)], phi]))
 
 
@@ -118,12 +104,6 @@ def pascoletti_serafini(anchor: Array, span: Array) -> Target:
         anchor, span: (2,) point started from, and the scale of each objective.
     """
     return Target(anchor, span, np.ones(2), np.zeros(2), np.array([1.0, TIE, TIE]))
-
-
-def epsilon_constraint(anchor: Array, span: Array, objective: int) -> Target:
-    """Minimise one objective while the other stays at most at the anchor."""
-    direction = np.eye(2)[objective]
-    return Target(anchor, span, direction, np.zeros(2), np.array([1.0, TIE, TIE]))
 
 
 def extreme(anchor: Array, span: Array, objective: int) -> Target:
@@ -257,10 +237,7 @@ class ForceProgram:
         phi = (carry.peak - target.anchor) / target.span
         z = np.concatenate([self._cell.scaled(x), phi, [target.needed(phi)]])
         low, high = self._own_bounds
-        rows = Inequalities(self)
-        slacks = np.abs(rows.values(z)), np.abs(z - low), np.abs(high - z)
-        lam_z, y = estimated(self.cost, rows.slopes(z), slacks)
-        return residuals(self, z, lam_z, rows.multipliers(y), (low, high))
+        return optimality(self, z, (low, high))
 
     def candidate(self, z: Array) -> Array:
         """(n_var,) the decision vector at z, within its bounds and the box of trust."""

@@ -31,7 +31,6 @@ from hybrid_opt.polishing.force import (
     Reach,
     Target,
     aimed,
-    epsilon_constraint,
     pascoletti_serafini,
 )
 from hybrid_opt.polishing.front import LEAST_SPAN, OWN_SHARE, Attempt, GrowingFront, Lost, PolishRun
@@ -105,11 +104,7 @@ def points(archive: GrowingFront, settings: PolishSettings) -> list[ForceAttempt
     attempts = []
     for k in sorted(chosen, key=rows.index):
         start = archive.objectives[k]
-        if settings.method == "epsilon":
-            objective = int(rows.index(k) >= len(rows) / 2.0)
-            target = epsilon_constraint(start, span, objective)
-        else:
-            target = pascoletti_serafini(start, span)
+        target = pascoletti_serafini(start, span)
         attempts.append(ForceAttempt("point", archive.parent[k], archive.x[k], start, target))
     return attempts
 

@@ -9,13 +9,12 @@ from typing import Annotated
 import numpy as np
 
 from hybrid_opt.carry import Carry
-from hybrid_opt.timing.given import drive_path, path_failure
+from hybrid_opt.timing.given import drive_path, untimed
 from hybrid_opt.timing.jerk import drive_with_jerk
 from hybrid_opt.timing.limits import (
     RECOMPUTED_TOLERANCE,
     duration_at_speed_limits,
     joint_at,
-    joint_use,
     limit_use,
     limited_force,
     worst,
@@ -34,24 +33,6 @@ NEAREST_FORCE = 1.001
 
 REST_SPEED = 1e-3
 """Joint speed over its limit below which an arm counts as standing still."""
-
-
-@dataclass(frozen=True)
-class JudgedTiming:
-    """A given timing held against the limits.
-
-    Attributes:
-        timing: status `OK` or `EXCEEDED` (also for a carry that starts or ends at speed), or why
-            the path itself fails; with every limit's use.
-        joint_use: (all joints,) worst use of each joint by constraint, both arms in order.
-        start_speed, end_speed: (all joints,) that the timing asks for at its ends, where a
-            robot stands still [rad/s].
-    """
-
-    timing: Timing
-    joint_use: dict[str, Array]
-    start_speed: Array
-    end_speed: Array
 
 
 @dataclass(frozen=True)
@@ -74,14 +55,16 @@ class ForceCurve:
     unlimited_force: Figure
 
 
-def judge_timing(model: TimingModel, x: Array) -> JudgedTiming:
-    """The search's own timing (the task's time law) held against every limit of the workcell.
+def judge_timing(model: TimingModel, x: Array) -> Timing:
+    """The search's own timing (the task's time law) held against every limit of the workcell:
+    status `OK` or `EXCEEDED`, also for a carry that starts or ends at speed, or why the path itself
+    fails; with every limit's use.
 
     Raises:
         SettingsError: x does not fit the workcell.
     """
     carry = model.search_carry(x)
-    failure = path_failure(model, model.path_motion(x))
+    failure = untimed(model, model.path_motion(x))
     use = limit_use(carry, model.workcell, TimingLimits(), model.joint_names)
     excess = worst(use)
     status, place = TimingStatus.OK, excess.place
@@ -93,11 +76,9 @@ def judge_timing(model: TimingModel, x: Array) -> JudgedTiming:
     elif jump is not None:
         status, place = TimingStatus.EXCEEDED, jump
         reason = f"the robots would have to be at speed without accelerating: {place}"
-    timing = Timing(status, reason, place, carry, use)
     if failure is not None:
-        timing = replace(failure, carry=carry, use=use)
-    q_rate = carry.side_by_side("q_rate")
-    return JudgedTiming(timing, joint_use(carry, model.workcell), q_rate[0], q_rate[-1])
+        return replace(failure, carry=carry, use=use)
+    return Timing(status, reason, place, carry, use)
 
 
 def _jump(model: TimingModel, carry: Carry) -> Place | None:
@@ -116,11 +97,6 @@ def _jump(model: TimingModel, carry: Carry) -> Place | None:
         sample,
         float(carry.parameter[sample]),
     )
-
-
-def fastest_timing(model: TimingModel, x: Array) -> Timing:
-    """The fastest timing from rest to rest within the robots' and the payload's limits."""
-    return time_path(model, x, TimingLimits())
 
 
 def drivable_timing(model: TimingModel, x: Array) -> Timing:
@@ -151,19 +127,6 @@ def closest_to_reference_timing(model: TimingModel, x: Array) -> Timing:
     return time_path(model, x, TimingLimits(reference_speed=True))
 
 
-def force_limited_timing(model: TimingModel, x: Array, force: float) -> Timing:
-    """The fastest timing whose normal forces, robust ones where the model limits these, stay below
-    a limit while friction holds.
-
-    Args:
-        force: largest normal force of each robot [N].
-
-    Raises:
-        SettingsError: the limit is not a positive force.
-    """
-    return time_path(model, x, model.drive_limits(force))
-
-
 def duration_against_force_limit(model: TimingModel, x: Array, points: int = 12) -> ForceCurve:
     """Durations of the fastest timings between the least force that holds and the unlimited one.
 
@@ -177,7 +140,7 @@ def duration_against_force_limit(model: TimingModel, x: Array, points: int = 12)
     motion = model.path_motion(x)
     still = np.zeros(len(motion.parameter))
     static = _peak_force(model, model.carry(motion, still, still, still))
-    free = time_path(model, x, TimingLimits(), motion)
+    free = time_path(model, x, motion=motion)
     if free.carry is None:
         return ForceCurve(np.zeros(0), np.zeros(0), (free.status,), static, float("nan"))
     top = _peak_force(model, free.carry)
@@ -199,83 +162,26 @@ def _peak_force(model: TimingModel, carry: Carry) -> float:
 
 
 @dataclass(frozen=True)
-class TimingReport:
+class TimedTrajectory:
     """A trajectory under the search's timing and under timings that robots can drive.
 
     Attributes:
-        judged: the search's own timing.
+        workcell: the cell.
         nominal_duration: at the reference speeds without ramps [s].
-        fastest, closest: see the functions of those names.
-        force_limited: with the given limit, None without one.
+        timings: by name: the search's first (`judge_timing`), then the drivable ones.
         jerk: of a drivable carry within its force limit and the cell's limits on jerk; None under
             other time laws, and without such limits.
-    """
-
-    judged: JudgedTiming
-    nominal_duration: float
-    fastest: Timing
-    closest: Timing
-    force_limited: Timing | None
-    jerk: JerkTiming | None = None
-
-    @property
-    def timings(self) -> dict[str, Timing]:
-        """The timings by name, the search's first."""
-        named = {
-            "search": self.judged.timing,
-            "closest to reference": self.closest,
-            "fastest": self.fastest,
-        }
-        if self.force_limited is not None:
-            named["force limited"] = self.force_limited
-        if self.jerk is not None:
-            named["within jerk limits"] = self.jerk.timing
-        return named
-
-
-def report_timing(
-    model: TimingModel, x: Array, force: float | None = None, own: TimingModel | None = None
-) -> TimingReport:
-    """All timings of a trajectory beside one another.
-
-    Args:
-        model: of the cell that robots drive.
-        x: (n_var,) decision vector.
-        force: limit on the normal forces for the force-limited timing [N].
-        own: of the cell that x was found in, None for the same.
-
-    Raises:
-        SettingsError: x does not fit the workcell, or the limit is not a positive force.
-    """
-    driven = model.workcell.task
-    return TimingReport(
-        judged=judge_timing(own or model, x),
-        nominal_duration=duration_at_speed_limits(
-            model, model.path_motion(x), TimingLimits(reference_speed=True)
-        ),
-        fastest=fastest_timing(model, x),
-        closest=closest_to_reference_timing(model, x),
-        force_limited=None if force is None else force_limited_timing(model, x, force),
-        jerk=drive_with_jerk(model, x) if len(x) == driven.n_var > driven.n_path else None,
-    )
-
-
-@dataclass(frozen=True)
-class TimedTrajectory:
-    """All that timing says of one trajectory.
-
-    Attributes:
-        report: the search's timing and the drivable ones.
         margins: how wrong the cell's description may be under the timing closest to the reference
             speeds; empty without that timing.
         curve: duration against force limit, None where it was not asked for.
-        workcell: the cell.
     """
 
-    report: TimingReport
+    workcell: Workcell
+    nominal_duration: float
+    timings: dict[str, Timing]
+    jerk: JerkTiming | None
     margins: tuple[Margin, ...]
     curve: ForceCurve | None
-    workcell: Workcell
 
 
 def timed_trajectory(
@@ -288,18 +194,31 @@ def timed_trajectory(
     """Time one decision vector (n_var,) in every way.
 
     Args:
-        model, own: as for `report_timing`.
+        model: of the cell that robots drive.
         force_limit: normal force [N] of a force-limited timing, None for no such timing.
         curve_points: points of the curve of duration against force limit, None for no curve.
+        own: of the cell that x was found in, None for the same.
 
     Raises:
         SettingsError: x does not fit the workcell, or the limit is not a positive force.
     """
-    report = report_timing(model, x, force_limit, own)
-    closest = report.closest.carry
+    task, closest = model.workcell.task, closest_to_reference_timing(model, x)
+    timings = {
+        "search": judge_timing(own or model, x),
+        "closest to reference": closest,
+        "fastest": time_path(model, x),
+    }
+    if force_limit is not None:
+        timings["force limited"] = time_path(model, x, model.drive_limits(force_limit))
+    jerk = drive_with_jerk(model, x) if len(x) == task.n_var > task.n_path else None
+    if jerk is not None:
+        timings["within jerk limits"] = jerk.timing
+    nominal = TimingLimits(reference_speed=True)
     return TimedTrajectory(
-        report,
-        () if closest is None else robustness_margins(model, closest),
-        None if curve_points is None else duration_against_force_limit(model, x, curve_points),
         model.workcell,
+        duration_at_speed_limits(model, model.path_motion(x), nominal),
+        timings,
+        jerk,
+        () if closest.carry is None else robustness_margins(model, closest.carry),
+        None if curve_points is None else duration_against_force_limit(model, x, curve_points),
     )

@@ -97,11 +97,11 @@ class TimingDocument:
 def timing_document(timed: TimedTrajectory) -> TimingDocument:
     """The record of a timed trajectory."""
     return TimingDocument(
-        nominal_duration=timed.report.nominal_duration,
-        timings={name: _timing(timing) for name, timing in timed.report.timings.items()},
+        nominal_duration=timed.nominal_duration,
+        timings={name: _timing(timing) for name, timing in timed.timings.items()},
         margins=timed.margins,
         force_curve=timed.curve,
-        jerk=None if timed.report.jerk is None else StoredJerk.of(timed.report.jerk),
+        jerk=None if timed.jerk is None else StoredJerk.of(timed.jerk),
     )
 
 

@@ -20,91 +20,100 @@ LEAST_LENGTH = 1e-9
 """A path along which box and joints move less than this does not move [m, rad]."""
 
 
-@dataclass(frozen=True)
-class ArmCheck:
-    """One way in which an arm can fail a path.
+ARM_CHECKS = (
+    (TimingStatus.OFF_PATH, "reach", "loses the path"),
+    (TimingStatus.JOINT_LIMITS, "joint position", "leaves its joint range"),
+    (TimingStatus.NEAR_SINGULAR, "manipulability", "comes too near a singular posture"),
+)
+"""What an arm can fail a path by, in the order in which it is told: what that makes of the timing,
+its name in a `Place`, and what the robot does, for people."""
 
-    Attributes:
-        status: what it makes of the timing.
-        failed: (n, 2) by sample and arm.
-        constraint: its name in a `Place`.
-        text: what the robot does, for people.
-    """
+
+@dataclass(frozen=True)
+class PathFailure:
+    """Why a path cannot be timed at all; attributes as of `Timing`."""
 
     status: TimingStatus
-    failed: NDArray[np.bool_]
-    constraint: str
-    text: str
+    place: Place
+    reason: str
 
 
-def arm_checks(
-    workcell: Workcell, lost: Array, limit_margin: Array, manipulability: Array
-) -> tuple[ArmCheck, ...]:
-    """The checks in the order in which they are told; inputs (n, 2) by sample and arm."""
+def path_failure(
+    workcell: Workcell, pose: Array, lost: Array, limit_margin: Array, manipulability: Array
+) -> PathFailure | None:
+    """Why a path cannot be timed, with arm and place, or None.
+
+    Args:
+        pose: (n, 6) box poses at uniform samples.
+        lost, limit_margin, manipulability: (n, 2) by sample and arm, as of
+            `symbolic.robot.arm.TRACK_OUTPUTS`.
+    """
+    if float(np.abs(pose - pose[0]).max()) < LEAST_LENGTH:
+        reason = "all poses of the path are the same: there is nothing to time"
+        return PathFailure(TimingStatus.NO_MOTION, Place("path length", "", "", 0, 0.0), reason)
     least = [robot.min_manipulability for robot in workcell.robots]
-    return (
-        ArmCheck(TimingStatus.OFF_PATH, lost > 0.5, "reach", "loses the path"),
-        ArmCheck(
-            TimingStatus.JOINT_LIMITS,
-            limit_margin < 0.0,
-            "joint position",
-            "leaves its joint range",
-        ),
-        ArmCheck(
-            TimingStatus.NEAR_SINGULAR,
-            manipulability < least,
-            "manipulability",
-            "comes too near a singular posture",
-        ),
-    )
-
-
-def path_failure(model: TimingModel, motion: PathMotion) -> Timing | None:
-    """Why a path cannot be timed, with arm and place, or None."""
-    if float(np.abs(motion.pose - motion.pose[0]).max()) < LEAST_LENGTH:
-        place = Place("path length", "", "", 0, 0.0)
-        return Timing(
-            TimingStatus.NO_MOTION,
-            "all poses of the path are the same: there is nothing to time",
-            place,
-            None,
-        )
-    workcell = model.workcell
-    checks = arm_checks(workcell, motion.lost, motion.limit_margin, motion.manipulability)
-    for check in checks:
-        if check.failed.any():
-            sample = int(np.argmax(check.failed.any(axis=1)))
-            robot = workcell.robots[int(np.argmax(check.failed[sample]))].name
-            parameter = float(motion.parameter[sample])
-            return Timing(
-                check.status,
-                f"robot {robot!r} {check.text} at u = {parameter:.4f}",
-                Place(check.constraint, robot, "", sample, parameter),
-                None,
-            )
+    found = (lost > 0.5, limit_margin < 0.0, manipulability < least)
+    for failed, (status, constraint, text) in zip(found, ARM_CHECKS, strict=True):
+        if failed.any():
+            sample = int(np.argmax(failed.any(axis=1)))
+            robot = workcell.robots[int(np.argmax(failed[sample]))].name
+            place = Place(constraint, robot, "", sample, sample / (len(pose) - 1))
+            reason = f"robot {robot!r} {text} at u = {place.parameter:.4f}"
+            return PathFailure(status, place, reason)
     return None
 
 
-def refined_carry(model: TimingModel, motion: PathMotion, grid_speed: Array) -> Carry:
-    """The carry at `REFINEMENT` samples per interval, both ends of every interval included.
+def untimed(model: TimingModel, motion: PathMotion) -> Timing | None:
+    """The answer for a path that cannot be timed, None for others."""
+    arms = motion.lost, motion.limit_margin, motion.manipulability
+    found = path_failure(model.workcell, motion.pose, *arms)
+    return None if found is None else Timing(found.status, found.reason, found.place, None)
 
-    Args:
-        motion: the path's geometry.
-        grid_speed: (intervals + 1,) path speed u' at the grid points, u'' constant between [1/s].
+
+@dataclass(frozen=True)
+class DrivenSpeeds:
+    """Path speeds with constant u'' on intervals, at `REFINEMENT` samples per interval, both ends
+    of every interval included; to be driven along any path.
+
+    Attributes:
+        index: (n,) of the samples among those of a path's motion.
+        time: (n,) [s].
+        share: (n,) how far the samples lie within their intervals.
+        a, w: (n,) u'' and u'^2.
     """
-    squared = grid_speed**2
-    share = np.linspace(0.0, 1.0, REFINEMENT + 1)
-    w = squared[:-1, None] + np.outer(np.diff(squared), share)
-    speed = np.sqrt(np.maximum(w, 0.0))
-    # Average speed over a piece of constant acceleration is that of its ends.
-    total = speed[:, :1] + speed
-    elapsed = 2.0 * share / model.intervals / np.where(total > 0.0, total, 1.0)
-    starts = np.concatenate([[0.0], np.cumsum(elapsed[:, -1])])[:-1]
-    a = np.repeat(np.diff(squared) * model.intervals / 2.0, REFINEMENT + 1)
-    index = REFINEMENT * np.arange(model.intervals)[:, None] + np.arange(REFINEMENT + 1)
-    return model.carry(
-        motion.at(index.reshape(-1)), (starts[:, None] + elapsed).reshape(-1), speed.reshape(-1), a
-    )
+
+    index: NDArray[np.intp]
+    time: Array
+    share: Array
+    a: Array
+    w: Array
+
+    @classmethod
+    def of(cls, grid_speed: Array) -> DrivenSpeeds:
+        """grid_speed: (intervals + 1,) path speed u' at the grid points [1/s]."""
+        squared, intervals = grid_speed**2, len(grid_speed) - 1
+        share = np.linspace(0.0, 1.0, REFINEMENT + 1)
+        w = squared[:-1, None] + np.outer(np.diff(squared), share)
+        speed = np.sqrt(np.maximum(w, 0.0))
+        # Average speed over a piece of constant acceleration is that of its ends.
+        total = speed[:, :1] + speed
+        elapsed = 2.0 * share / intervals / np.where(total > 0.0, total, 1.0)
+        starts = np.concatenate([[0.0], np.cumsum(elapsed[:, -1])])[:-1]
+        index = REFINEMENT * np.arange(intervals)[:, None] + np.arange(REFINEMENT + 1)
+        return cls(
+            index.reshape(-1),
+            (starts[:, None] + elapsed).reshape(-1),
+            np.tile(share, intervals),
+            np.repeat(np.diff(squared) * intervals / 2.0, REFINEMENT + 1),
+            w.reshape(-1),
+        )
+
+    def carry(
+        self, model: TimingModel, motion: PathMotion, a: float = 0.0, w: float = 0.0
+    ) -> Carry:
+        """A path driven so, with so much more u'' and u'^2 everywhere."""
+        speed = np.sqrt(np.maximum(self.w + w, 0.0))
+        return model.carry(motion.at(self.index), self.time, speed, self.a + a)
 
 
 def drive_path(
@@ -136,10 +145,10 @@ def drive_path(
             "stand still over an interval"
         )
     motion = model.path_motion(x) if motion is None else motion
-    failure = path_failure(model, motion)
+    failure = untimed(model, motion)
     if failure is not None:
         return failure
-    carry = refined_carry(model, motion, grid_speed)
+    carry = DrivenSpeeds.of(grid_speed).carry(model, motion)
     use = limit_use(carry, model.workcell, limits, model.joint_names)
     excess = worst(use)
     status, reason = TimingStatus.OK, f"{carry.duration:.3f} s; most used: {excess.place}"

@@ -30,7 +30,6 @@ from scipy.interpolate import BSpline
 
 from hybrid_opt.carry import Carry
 from hybrid_opt.robust.cases import is_squeezed
-from hybrid_opt.timing.given import path_failure
 from hybrid_opt.timing.limits import (
     NEAR,
     RECOMPUTED_TOLERANCE,
@@ -103,7 +102,7 @@ def time_with_jerk(
     """
     motion = model.path_motion(x)
     fastest = time_path(model, x, limits, motion)
-    if path_failure(model, motion) is not None or not fastest.ok:
+    if not fastest.ok:
         return JerkTiming(fastest, jerk, (np.nan, np.nan), fastest.duration)
     problem = _Problem(model, motion, limits, jerk)
     return replace(problem.solve(), without=fastest.duration)

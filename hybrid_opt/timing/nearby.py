@@ -10,16 +10,13 @@ derivative is (the envelope theorem). Neither the timing nor what it uses is fou
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import linprog
 from scipy.sparse import csr_array
 
-from hybrid_opt.carry import Carry
+from hybrid_opt.timing.given import DrivenSpeeds
 from hybrid_opt.timing.limits import limit_ratios
-from hybrid_opt.timing.model import REFINEMENT, PathMotion, TimingModel
+from hybrid_opt.timing.model import REFINEMENT, TimingModel
 from hybrid_opt.timing.records import Timing
 from symbolic.array import Array
 from symbolic.errors import SettingsError
@@ -40,50 +37,6 @@ STEP = 1e-6
 """Share of the largest value by which ratios are differenced."""
 
 
-@dataclass(frozen=True)
-class DrivenSpeeds:
-    """The path speeds of a timing at the samples of its carry, to be driven along other paths.
-
-    Attributes:
-        index: (n,) of the samples among those of a path's motion.
-        time: (n,) [s].
-        share: (n,) how far the samples lie within their intervals.
-        a, w: (n,) u'' and u'^2.
-    """
-
-    index: NDArray[np.intp]
-    time: Array
-    share: Array
-    a: Array
-    w: Array
-
-    @classmethod
-    def of(cls, timing: Timing, intervals: int) -> DrivenSpeeds:
-        """Those of a timing.
-
-        Raises:
-            SettingsError: there is none.
-        """
-        if timing.carry is None or timing.grid_speed is None:
-            raise SettingsError(f"there is no timing: {timing.reason}")
-        squared, share = timing.grid_speed**2, np.linspace(0.0, 1.0, REFINEMENT + 1)
-        index = REFINEMENT * np.arange(intervals)[:, None] + np.arange(REFINEMENT + 1)
-        return cls(
-            index.ravel(),
-            timing.carry.time,
-            np.tile(share, intervals),
-            np.repeat(np.diff(squared) * intervals / 2.0, REFINEMENT + 1),
-            (squared[:-1, None] + np.outer(np.diff(squared), share)).ravel(),
-        )
-
-    def carry(
-        self, model: TimingModel, motion: PathMotion, a: float = 0.0, w: float = 0.0
-    ) -> Carry:
-        """A path driven so, with so much more u'' and u'^2 everywhere."""
-        speed = np.sqrt(np.maximum(self.w + w, 0.0))
-        return model.carry(motion.at(self.index), self.time, speed, self.a + a)
-
-
 class NearTimings:
     """Timings near the fastest one of a path, as a linear program.
 
@@ -97,9 +50,9 @@ class NearTimings:
         Raises:
             SettingsError: there is no timing, or it is not the fastest.
         """
-        self.speeds = at = DrivenSpeeds.of(timing, model.intervals)
-        assert timing.carry is not None
-        assert timing.grid_speed is not None
+        if timing.carry is None or timing.grid_speed is None:
+            raise SettingsError(f"there is no timing: {timing.reason}")
+        self.speeds = at = DrivenSpeeds.of(timing.grid_speed)
         motion, intervals = model.path_motion(timing.carry.x), model.intervals
 
         def ratios(**more: float) -> dict[str, Array]:

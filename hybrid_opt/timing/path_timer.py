@@ -16,7 +16,7 @@ import numpy as np
 from hybrid_opt.compiled_cell import CompiledCell
 from hybrid_opt.robust.cases import is_squeezed
 from hybrid_opt.robust.path_force import robust_path
-from hybrid_opt.timing.given import LEAST_LENGTH, arm_checks
+from hybrid_opt.timing.given import path_failure
 from hybrid_opt.timing.limits import limited_force
 from hybrid_opt.timing.model import TimingModel, joint_names
 from hybrid_opt.timing.passes import KINDS, OUTCOMES, passes_function
@@ -239,20 +239,12 @@ class PathTimer:
 
     def _path_failure(self, paths: dict[str, Array], row: int) -> PathTiming | None:
         """Why a path cannot be timed at all."""
-        pose = paths["pose"][row][:, :6]
-        if float(np.abs(pose - pose[0]).max()) < LEAST_LENGTH:
-            return self._failed(TimingStatus.NO_MOTION, Place("path length", "", "", 0, 0.0))
         sides = [
             np.stack([paths[f"{name}_{arm}"][row] for arm in (1, 2)], axis=1)
             for name in ("lost", "limit_margin", "manipulability")
         ]
-        for check in arm_checks(self.workcell, *sides):
-            if check.failed.any():
-                sample = int(np.argmax(check.failed.any(axis=1)))
-                robot = self.workcell.robots[int(np.argmax(check.failed[sample]))].name
-                place = Place(check.constraint, robot, "", sample, sample / (2 * self.intervals))
-                return self._failed(check.status, place)
-        return None
+        found = path_failure(self.workcell, paths["pose"][row][:, :6], *sides)
+        return None if found is None else self._failed(found.status, found.place)
 
     def _failed(self, status: TimingStatus, place: Place) -> PathTiming:
         return PathTiming(

@@ -17,7 +17,7 @@ import numpy as np
 
 from hybrid_opt.carry import Carry
 from hybrid_opt.timing.adapter import SPEED_CEILING, IntervalRows, SolverFailure, fastest_speed
-from hybrid_opt.timing.given import path_failure, refined_carry
+from hybrid_opt.timing.given import DrivenSpeeds, untimed
 from hybrid_opt.timing.limits import (
     NEAR,
     RECOMPUTED_TOLERANCE,
@@ -59,20 +59,24 @@ class PointRows:
 
 
 def time_path(
-    model: TimingModel, x: Array, limits: TimingLimits, motion: PathMotion | None = None
+    model: TimingModel,
+    x: Array,
+    limits: TimingLimits | None = None,
+    motion: PathMotion | None = None,
 ) -> Timing:
     """The fastest timing from rest to rest within the workcell's and the given limits.
 
     Args:
         x: (n_var,) decision vector, or its free waypoints (n_path,).
+        limits: None for the joint torques and the contact patches.
         motion: the path's geometry, where it is known already.
 
     Raises:
         SettingsError: x does not fit the workcell.
     """
-    begin = time.perf_counter()
+    begin, limits = time.perf_counter(), limits or TimingLimits()
     motion = model.path_motion(x) if motion is None else motion
-    timing = path_failure(model, motion) or _failure_at_rest(model, motion, limits)
+    timing = untimed(model, motion) or _failure_at_rest(model, motion, limits)
     timing = timing or _Problem(model, motion, limits).solve()
     seconds = time.perf_counter() - begin
     return replace(timing, seconds=seconds, limits=limits)
@@ -278,7 +282,8 @@ class _Problem:
         )
 
     def _refined(self, squared: Array) -> Carry:
-        return refined_carry(self._model, self._motion, np.sqrt(squared) / self._scale)
+        speeds = DrivenSpeeds.of(np.sqrt(squared) / self._scale)
+        return speeds.carry(self._model, self._motion)
 
     def _solver_failure(self, failure: SolverFailure, iterations: int) -> Timing:
         point = len(INTERVAL_ENDS) * failure.interval

@@ -7,7 +7,7 @@ carry = cell.carry(cell.initial)
 print(ho.time_path(cell, carry))
 print(ho.time_path(cell, carry, ho.TimingLimits(force=51.0)))
 every = ho.time_every_way(cell, carry, force_limit=51.0, curve_points=5)
-for name, timing in every.report.timings.items():
+for name, timing in every.timings.items():
     print(f"{name}: {timing.duration:.3f} s, {timing.status}")
 for margin in every.margins:
     print(margin)

@@ -44,9 +44,6 @@ from hybrid_opt.store.trajectory_file import Replay, StoredTrajectory, read_traj
 from hybrid_opt.timing import (
     Timing,
     TimingLimits,
-    closest_to_reference_timing,
-    fastest_timing,
-    force_limited_timing,
     time_path,
     timed_trajectory,
 )
@@ -163,10 +160,8 @@ def _chosen(
     if chosen == "force":
         if force is None:
             raise SettingsError("--use force needs --force-limit")
-        return force_limited_timing(model, stored.x, force)
-    return {"closest": closest_to_reference_timing, "fastest": fastest_timing}[chosen](
-        model, stored.x
-    )
+        return time_path(model, stored.x, model.drive_limits(force))
+    return time_path(model, stored.x, TimingLimits(reference_speed=chosen == "closest"))
 
 
 def _report(job: Job, stiffness: float) -> str:

@@ -47,11 +47,11 @@ def test_a_ramped_carry_rests_at_its_ends() -> None:
         for arm in carry.arms:
             np.testing.assert_allclose(arm.q_rate[[0, -1]], 0.0, atol=1e-6)
         judged = judge_timing(timing("ramped"), x)
-        assert "at speed" not in judged.timing.reason
-    assert judge_timing(timing("ramped"), initial()).timing.status is TimingStatus.OK
+        assert "at speed" not in judged.reason
+    assert judge_timing(timing("ramped"), initial()).status is TimingStatus.OK
 
 
 def test_a_constant_carry_is_at_speed_at_its_ends() -> None:
     judged = judge_timing(timing("constant"), initial())
-    assert judged.timing.status is TimingStatus.EXCEEDED
-    assert "at speed" in judged.timing.reason
+    assert judged.status is TimingStatus.EXCEEDED
+    assert "at speed" in judged.reason

@@ -160,7 +160,7 @@ def test_a_carry_is_timed_and_exported(tmp_path: Path) -> None:
     assert {folder / name for name in told} == set(files) - {folder / "manifest.json"}
     assert told == {name: sha256((folder / name).read_bytes()) for name in told}
     every = ho.time_every_way(cell(), carry.x, force_limit=52.0)
-    assert every.report.timings["force limited"].duration == pytest.approx(timing.duration)
+    assert every.timings["force limited"].duration == pytest.approx(timing.duration)
 
 
 def test_a_carry_is_stored_with_its_cell(tmp_path: Path) -> None:

@@ -1,15 +1,13 @@
 """What is solved, and what comes of it, whichever solver is chosen.
 
-A solver's word is not trusted: an answer's multipliers and residuals are recomputed from the
-program.
+A solver's word is not trusted: `optimality` recomputes residuals from the program.
 """
 
 from __future__ import annotations
 
 import ctypes
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from functools import cached_property
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
@@ -88,9 +86,6 @@ class Residuals:
 UNKNOWN = Residuals(np.nan, np.nan, np.nan)
 """Of a solve that returned nothing."""
 
-Conditions = tuple[tuple[Array, Array], Residuals]
-"""Multipliers and residuals."""
-
 
 @dataclass(frozen=True)
 class Answer:
@@ -102,7 +97,6 @@ class Answer:
         converged: whether it claims an optimum.
         usable: whether z is finite.
         iterations: its own.
-        conditions: tells the multipliers and the residuals, when somebody asks for them.
     """
 
     z: Array
@@ -110,22 +104,6 @@ class Answer:
     converged: bool
     usable: bool
     iterations: int
-    conditions: Callable[[], Conditions] = field(repr=False)
-
-    @cached_property
-    def _told(self) -> Conditions:
-        return self.conditions()
-
-    @property
-    def multipliers(self) -> tuple[Array, Array]:
-        """Of the variables' bounds (n_variables,) and of the rows (n_rows,), in CasADi's
-        convention."""
-        return self._told[0]
-
-    @property
-    def residuals(self) -> Residuals:
-        """Recomputed from the program."""
-        return self._told[1]
 
 
 Solve = Callable[[Program, int, float], Answer]
@@ -164,23 +142,32 @@ class Inequalities:
         return multipliers
 
 
+def optimality(program: Program, z: Array, bounds: tuple[Array, Array] | None = None) -> Residuals:
+    """Residuals at z with the multipliers that satisfy the conditions best there.
+
+    Args:
+        bounds: lower and upper (n_variables,) in place of the program's.
+    """
+    low, high = bounds or (program.low, program.high)
+    rows = Inequalities(program)
+    slacks = np.abs(rows.values(z)), np.abs(z - low), np.abs(high - z)
+    lam_z, y = estimated(program.cost, rows.slopes(z), slacks)
+    return residuals(program, z, lam_z, rows.multipliers(y), (low, high))
+
+
 def residuals(
-    program: Program,
-    z: Array,
-    lam_z: Array,
-    lam_g: Array,
-    bounds: tuple[Array, Array] | None = None,
+    program: Program, z: Array, lam_z: Array, lam_g: Array, bounds: tuple[Array, Array]
 ) -> Residuals:
     """Residuals of the optimality conditions at z with the given multipliers.
 
     In CasADi's convention: positive multipliers belong to upper bounds, negative to lower ones.
 
     Args:
-        bounds: lower and upper (n_variables,) in place of the program's.
+        bounds: of the variables, lower and upper (n_variables,).
     """
     values, jacobian = program.constraints(z)
     lagrangian = program.cost + jacobian.T @ lam_g + lam_z
-    low, high = bounds or (program.low, program.high)
+    low, high = bounds
     sides = (z, low, high, lam_z), (values, program.below, program.above, lam_g)
     violation, product = 0.0, 0.0
     for value, low, high, multiplier in sides:

@@ -30,17 +30,12 @@ from hybrid_opt.polishing.solvers.base import (
     FEASIBLE,
     PATIENCE,
     TOLERANCE,
-    UNKNOWN,
     Answer,
-    Conditions,
     Inequalities,
     Program,
     Solve,
     compiled,
-    estimated,
-    residuals,
 )
-from symbolic.array import Array
 
 PUSH = 1e-4
 """Least distance of the start from bounds, as a share of their width."""
@@ -186,15 +181,7 @@ class _Solver:
             converged=usable and message == "Solve_Succeeded",
             usable=usable,
             iterations=iterations,
-            conditions=lambda: self._conditions(z, usable),
         )
-
-    def _conditions(self, z: Array, usable: bool) -> Conditions:
-        """Multipliers that satisfy the conditions best where the solve ended, and residuals."""
-        slacks = self.h, self.z - self._low, self._high - self.z
-        lam_z, y = estimated(self._program.cost, self.A, slacks)
-        multipliers = lam_z, self._rows.multipliers(y)
-        return multipliers, residuals(self._program, z, *multipliers) if usable else UNKNOWN
 
     def _error(self, mu: float) -> float:
         """The largest residual of a barrier's conditions, multipliers scaled as in the paper."""

@@ -13,10 +13,8 @@ from hybrid_opt.polishing.solvers.base import (
     MOST_SECONDS,
     PATIENCE,
     TOLERANCE,
-    UNKNOWN,
     Answer,
     Program,
-    residuals,
 )
 from symbolic.array import Array
 
@@ -142,19 +140,12 @@ def ipopt(program: Program, iterations: int, barrier: float) -> Answer:
         # CasADi's way to report that a function failed outright.
         message = str(error).strip().splitlines()[-1]
         nowhere = np.full(len(program.start), np.nan)
-        none = np.zeros(len(program.start)), np.zeros(len(program.below))
-        return Answer(nowhere, message, False, False, 0, lambda: (none, UNKNOWN))
-    statistics = solver.stats()
-    z, lam_z, lam_g = (found[name].full().ravel() for name in ("x", "lam_x", "lam_g"))
-    usable = bool(np.isfinite(z).all())
+        return Answer(nowhere, message, False, False, 0)
+    statistics, z = solver.stats(), found["x"].full().ravel()
     return Answer(
         z=z,
         message=str(statistics["return_status"]),
         converged=statistics["return_status"] == "Solve_Succeeded",
-        usable=usable,
+        usable=bool(np.isfinite(z).all()),
         iterations=int(statistics["iter_count"]),
-        conditions=lambda: (
-            (lam_z, lam_g),
-            residuals(program, z, lam_z, lam_g) if usable else UNKNOWN,
-        ),
     )

@@ -16,11 +16,9 @@ from hypothesis import strategies as st
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.polishing.carry import CarryReader
 from hybrid_opt.polishing.force import (
-    CLOSED_SIDE,
     ForceProgram,
     Target,
     balance,
-    epsilon_constraint,
     extreme,
     pascoletti_serafini,
 )
@@ -238,18 +236,6 @@ def test_pascoletti_serafini_is_better_only_where_neither_side_is_worse(shift: n
     assert target.needed(shift / SPAN) == pytest.approx(float(np.max(shift / SPAN)))
 
 
-@given(shifts)
-def test_epsilon_constraint_improves_one_side_and_holds_the_other(shift: np.ndarray) -> None:
-    for objective in (0, 1):
-        target = epsilon_constraint(ANCHOR, SPAN, objective)
-        other = 1 - objective
-        value = target.level(ANCHOR + shift)
-        if shift[other] > 1.01 * CLOSED_SIDE * SPAN[other]:
-            assert value == float("inf")
-        elif shift[objective] < -1e-4 and shift[other] < 0.0:
-            assert value < target.level(ANCHOR)
-
-
 @given(shifts, shifts)
 def test_an_end_compares_one_objective_and_breaks_ties(a: np.ndarray, b: np.ndarray) -> None:
     for objective in (0, 1):
@@ -280,14 +266,14 @@ def test_the_middle_compares_sums_and_the_larger(a: np.ndarray, b: np.ndarray) -
         ("rounds", 0),
         ("clearance", 0.0),
         ("clearance", float("nan")),
-        ("method", "weights"),
         ("solver", "simplex"),
-        ("fill", FillSettings(members=-1)),
     ],
 )
 def test_wrong_settings_are_told(name: str, value: object) -> None:
     with pytest.raises(SettingsError, match=f"polish {name}"):
         PolishSettings(**{name: value})  # type: ignore[arg-type]
+    with pytest.raises(SettingsError, match=r"polish fill\.members"):
+        FillSettings(members=-1)
 
 
 def test_settings_are_the_same_after_json() -> None:

@@ -192,14 +192,6 @@ def test_no_points_means_no_polish() -> None:
     assert not result.polished.any()
 
 
-def test_epsilon_constraint_improves_too() -> None:
-    settings = PolishSettings(attempts=3, method="epsilon")
-    result = Polisher(evaluator(), settings).polish(start_front(), np.random.default_rng(0))
-    own = [o for o in result.outcomes if o.aim == "point"]
-    assert own[0].status == "accepted"
-    assert np.all(own[0].objectives <= own[0].start + TOLERANCE)
-
-
 @pytest.mark.slow
 def test_ipopt_finds_as_good_a_front() -> None:
     result = Polisher(evaluator(), replace(SETTINGS, solver="ipopt")).polish(

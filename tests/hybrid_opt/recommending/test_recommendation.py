@@ -18,7 +18,7 @@ from hybrid_opt.recommending.recommendation import HAND_MADE, STEPS, Recommendat
 from hybrid_opt.robust.cases import random_cases
 from hybrid_opt.robust.force import BoxMotion, RobustModel, pressing_model
 from hybrid_opt.robust.squeeze import DOUBTS, commanded_forces, largest_commanded
-from hybrid_opt.timing import force_limited_timing
+from hybrid_opt.timing import time_path
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.records import USUAL, Contact, Uncertainty
@@ -81,7 +81,8 @@ def test_it_holds_in_random_cases_with_what_is_commanded(
 def test_one_duration_and_one_force(drivable: ho.Cell, found: Recommendation) -> None:
     """Those of its job, of one that is planned anew, and of what an export plans from its file."""
     assert found.job is not None
-    exported = force_limited_timing(drivable.timing_model, found.x, found.limit)
+    model = drivable.timing_model
+    exported = time_path(model, found.x, model.drive_limits(found.limit))
     jobs = JobModel(drivable.compiled, drivable.timing_model)
     for job in (found.job, ho.plan_job(found), jobs.plan(exported)):
         assert job.phase("carry").duration == pytest.approx(found.duration, abs=1e-9)

@@ -7,7 +7,7 @@ import pytest
 
 from hybrid_opt.carry import Carry
 from hybrid_opt.static_hold import static_hold
-from hybrid_opt.timing import TimingModel, closest_to_reference_timing, force_limited_timing
+from hybrid_opt.timing import TimingModel, closest_to_reference_timing, time_path
 from hybrid_opt.timing.robustness import (
     Margin,
     payload_sensitivity,
@@ -51,7 +51,7 @@ def test_forces_are_proportional_to_the_mass() -> None:
 
 def test_slow_carries_bear_almost_the_static_payload() -> None:
     model = hand_timing()
-    timing = force_limited_timing(model, initial(), 1.001 * 49.05)
+    timing = time_path(model, initial(), model.drive_limits(1.001 * 49.05))
     assert timing.carry is not None
     limit = payload_sensitivity(timing.carry).payload_limit
     static = static_hold(model.workcell).payload_limit
