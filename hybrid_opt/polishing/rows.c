@@ -4,10 +4,7 @@
    called on arrays that were prepared for them; matrices that they return are transposed ones. Rows at
    places stand family by family. */
 
-#include <math.h>
-#include <string.h>
-
-typedef long long integer;
+/* ---- offered ---- */
 typedef integer (*Run)(const void *ports, const void *work, integer begin, integer end);
 
 /* A function on prepared arrays; `one` is null where none is prepared yet. */
@@ -102,6 +99,12 @@ typedef struct {
 } Program;
 
 enum { DONE = 0, FAILED = -1, UNWRAP = -2 };
+
+OFFERED integer dual_arm_rows_values(const Program *p, integer unwrapped);
+OFFERED void dual_arm_rows_slopes(const Program *p);
+OFFERED integer dual_arm_rows_curvature(const Program *p);
+/* ---- within ---- */
+
 enum { MOST = 64 }; /* entries of a gradient */
 
 static int runs(const Call *c, integer count) {
@@ -180,8 +183,7 @@ static void held_slopes(const Program *p) {
 }
 
 /* Values at z; `unwrapped` tells that the waypoints are placed already. */
-__attribute__((visibility("default"))) integer dual_arm_rows_values(const Program *p,
-                                                                    integer unwrapped) {
+OFFERED integer dual_arm_rows_values(const Program *p, integer unwrapped) {
   const integer nv = p->n_var, tail = p->width - nv;
   for (integer r = 0; r < p->n_rows; r++) {
     p->values[r] = p->offset[r];
@@ -214,7 +216,7 @@ static integer joints_at(const Program *p, const Group *g, int arm) {
 }
 
 /* The Jacobian's columns by x where the values were found last. */
-__attribute__((visibility("default"))) void dual_arm_rows_slopes(const Program *p) {
+OFFERED void dual_arm_rows_slopes(const Program *p) {
   const integer nv = p->n_var, n = p->width, size = p->size;
   if (p->held) held_slopes(p);
   for (integer r = 0; r < p->forces; r++) {
@@ -439,7 +441,7 @@ static integer add_held(const Program *p) {
 /* Second derivatives where the slopes were found last. Returns DONE, FAILED, or the number of what
    has to be prepared first: blocks of forces from 1, of loads from 51, of pressure from
    101, arms from 201, groups from 301. */
-__attribute__((visibility("default"))) integer dual_arm_rows_curvature(const Program *p) {
+OFFERED integer dual_arm_rows_curvature(const Program *p) {
   const integer nv = p->n_var;
   integer lacks;
   memset(p->curvature, 0, sizeof(double) * nv * nv);

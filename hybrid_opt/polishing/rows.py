@@ -10,21 +10,17 @@ NumPy does between them, in many small arrays, takes longer than the functions t
 
 from __future__ import annotations
 
-import ctypes
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from codegen.cache import Cache
 from codegen.errors import CodegenError
-from codegen.function import PreparedBatch
 from hybrid_opt.polishing.cell import Indices, RowFunctions, SmoothCell
-from hybrid_opt.polishing.solvers.base import compiled
+from hybrid_opt.polishing.native import Native, Records, native
 from symbolic.array import Array
 from symbolic.records.task import POSE_SIZE
 from symbolic.smooth.places import PlaceConstraint
@@ -102,96 +98,8 @@ far from ruling, whose multipliers vanish. It changes steps by as much, no solut
 INPUTS = ("pose", "rate", "q_1", "q_2", "numbers", "weight")
 """Of functions of rows at places, in their order in a record."""
 
-_DONE, _UNWRAP = 0, -2
 _FORCES, _LOADS, _PRESSURE, _ARMS, _GROUPS = 1, 51, 101, 201, 301
 """As in `rows.c`: from where what has to be prepared is counted."""
-
-
-def _record(name: str, *fields: str | tuple[str, Any]) -> Any:
-    """A structure of `rows.c`: names behind 'integer' and 'array', others with their types."""
-    listed = list[tuple[str, Any]]()
-    for entry in fields:
-        if isinstance(entry, tuple):
-            listed.append(entry)
-            continue
-        kind, *names = entry.split()
-        of = ctypes.c_longlong if kind == "integer" else ctypes.c_void_p
-        listed += [(each, of) for each in names]
-    return type(name, (ctypes.Structure,), {"_fields_": listed})
-
-
-_Call = _record("Call", "array one lanes ports work lane_work")
-_CALLS = (("first", _Call), ("second", _Call))
-_Block = _record(
-    "Block",
-    "integer served n start window",
-    "array basis",
-    *_CALLS,
-    "array x columns weight curvature",
-)
-_Samples = _record("Samples", "integer count blocks width", "array block x values gradients weight")
-_Held = _record(
-    "Held",
-    "integer count start size",
-    "array at loads",
-    *_CALLS,
-    "array load slope state states weight curvature active",
-)
-_Group = _record(
-    "Group",
-    "integer start stop moving arms width",
-    *_CALLS,
-    "array gradient",
-    ("given", ctypes.c_void_p * len(INPUTS)),
-    ("inputs", ctypes.c_void_p * len(INPUTS)),
-    ("sizes", ctypes.c_longlong * len(INPUTS)),
-    "array hessian",
-)
-_Arm = _record(
-    "Arm",
-    "integer places joints",
-    "array place at basis",
-    *_CALLS,
-    "array pose q follow pull rows pulls active poses joint nu hessian",
-)
-_Program = _record(
-    "Program",
-    "integer n_var n_path n_rows width forces pressed first_patch",
-    "integer n first_place waypoints size groups",
-    "array x tail fixed offset force_column pressed_column pressed_robot",
-    "array mix lacking_slope x_0 samples patches held order place scale",
-    "array free_row free_column whole whole_rate free free_rate still",
-    "array group arm pose rate value points values jacobian curvature multipliers",
-    ("negligible", ctypes.c_double),
-)
-
-
-class _Memory:
-    """Addresses of arrays, which it keeps alive."""
-
-    def __init__(self) -> None:
-        self._kept: list[object] = []
-
-    def of(self, array: Any) -> int:
-        """Of an array or a record that C reads or writes where it is."""
-        self._kept.append(array)
-        return array.ctypes.data if isinstance(array, np.ndarray) else ctypes.addressof(array)
-
-    def all(self, **arrays: NDArray[Any]) -> dict[str, int]:
-        """Of numbers and indices; of those that are not contiguous, copies."""
-        found = dict[str, int]()
-        for name, array in arrays.items():
-            kind = np.int64 if array.dtype == np.intp else np.float64
-            found[name] = self.of(np.ascontiguousarray(array, dtype=kind))
-        return found
-
-    def call(self, batch: PreparedBatch) -> Any:
-        """How C evaluates a batch of a compiled function."""
-        self._kept.append(batch)
-        native = batch.native
-        if native is None:
-            raise CodegenError("the polish needs compiled functions, and these are interpreted")
-        return _Call(native.one, native.lanes, native.ports, native.work, native.lane_work)
 
 
 class _SampleRows:
@@ -209,7 +117,7 @@ class _SampleRows:
         cell: SmoothCell,
         quantity: Quantity,
         wanted: Collection[int],
-        memory: _Memory,
+        memory: Records,
         beyond: int = 0,
     ) -> None:
         """A program's samples.
@@ -245,44 +153,47 @@ class _SampleRows:
             batch.inputs["basis"][...] = basis
             batch.inputs["rounding"][...] = ROUNDING
             records.append(
-                _Block(
+                memory.new(
+                    "Block",
                     served=samples.shape[1],
                     n=n,
                     start=start,
                     window=basis[0].size,
                     first=memory.call(batch),
-                    **memory.all(basis=basis),
+                    basis=basis,
                 )
             )
             self._names.append(sample_name(quantity, block.block, "second"))
             start = rows.stop
-        self._blocks = (_Block * len(records))(*records)
-        self.record = _Samples(
+        self._blocks = memory.array("Block", records)
+        self.record = memory.new(
+            "Samples",
             count=count,
             blocks=len(records),
             width=width,
-            block=memory.of(self._blocks),
-            **memory.all(
-                x=self.x,
-                values=self.found,
-                gradients=self.gradients,
-                weight=np.empty((count, width)),
-            ),
+            block=self._blocks,
+            x=self.x,
+            values=self.found,
+            gradients=self.gradients,
+            weight=np.empty((count, width)),
         )
 
     def prepare(self, k: int) -> None:
         """The second derivatives of a function along every direction of x: each of its samples is
         evaluated n_var times. Most programs need those of few."""
-        block, n_var = self._blocks[k], len(self.x)
+        block, n_var = self._blocks + k, len(self.x)
         second = self._functions.built[self._names[k]]
         batch = second.prepared(block.n * n_var, ("x", "rounding"))
         batch.inputs["rounding"][...] = ROUNDING
         batch.inputs["along"][...] = np.tile(np.eye(n_var), (block.n, 1))
-        block.second = self._memory.call(batch)
-        block.x, block.columns, block.weight = (
-            self._memory.of(batch.inputs[name]) for name in ("x", "basis", "weight")
+        self._memory.fill(
+            block,
+            second=self._memory.call(batch),
+            x=batch.inputs["x"],
+            columns=batch.inputs["basis"],
+            weight=batch.inputs["weight"],
+            curvature=batch.outputs["curvature"],
         )
-        block.curvature = self._memory.of(batch.outputs["curvature"])
 
 
 class Rows:
@@ -315,9 +226,9 @@ class Rows:
         Raises:
             DualArmError: a function cannot be built.
         """
-        self._cell, self._memory, n_var = cell, _Memory(), cell.task.n_var
-        self._library = row_library(cell.evaluator.compiled.cache)
-        memory, n_rows = self._memory, layout.n_rows
+        library, n_var = row_library(cell.evaluator.compiled.cache), cell.task.n_var
+        self._cell, self._c, self._memory = cell, library.functions, Records(library)
+        n_rows = layout.n_rows
         mix = np.zeros((0, 2)) if mix is None else mix
         fixed = np.zeros((n_rows, 0)) if fixed is None else fixed
         self._x, self._tail = np.empty(n_var), np.empty(fixed.shape[1])
@@ -326,7 +237,8 @@ class Rows:
         self._points, self._multipliers = cell.still.copy(), np.empty(n_rows)
         self._curvature = np.empty((n_var, n_var))
         sampled = self._lay_out_samples(layout)
-        self._program = _Program(
+        self._program = self._memory.new(
+            "Program",
             n_var=n_var,
             n_path=len(cell.free[0]),
             n_rows=n_rows,
@@ -337,25 +249,22 @@ class Rows:
             negligible=NEGLIGIBLE,
             **sampled,
             **self._lay_out_places(layout.place_rows, q),
-            **memory.all(
-                x=self._x,
-                tail=self._tail,
-                fixed=fixed,
-                offset=self.offset,
-                mix=mix,
-                free_row=cell.free[0],
-                free_column=cell.free[1],
-                still=cell.still,
-                points=self._points,
-                values=self._values,
-                jacobian=self._jacobian,
-                curvature=self._curvature,
-                multipliers=self._multipliers,
-            ),
+            x=self._x,
+            tail=self._tail,
+            fixed=fixed,
+            offset=self.offset,
+            mix=mix,
+            free_row=cell.free[0],
+            free_column=cell.free[1],
+            still=cell.still,
+            points=self._points,
+            values=self._values,
+            jacobian=self._jacobian,
+            curvature=self._curvature,
+            multipliers=self._multipliers,
         )
-        self._address = ctypes.addressof(self._program)
 
-    def _lay_out_samples(self, layout: Layout) -> dict[str, int]:
+    def _lay_out_samples(self, layout: Layout) -> dict[str, Any]:
         """Forces and pressure. Where forces are no branches, they come from what a sample's load
         asks of the pads (`symbolic.smooth.samples.held_functions`); derivatives by the decision
         vector follow by the chain rule, so that no load is solved for twice at a place."""
@@ -367,14 +276,14 @@ class Rows:
         pressed = {row.sample for row in layout.pressure_rows}
         patches = _SampleRows(cell, "pressure", pressed, memory)
         self._sampled = {_FORCES: forces, _PRESSURE: patches}
-        record = None
+        record = dict[str, Any]()
         column = forces.column
         by_load = np.full(len(column), -1)
         if held:
             start = len(forces.found) - len(held)
             by_load[held] = start + np.arange(len(held))
             loads = self._sampled[_LOADS] = _SampleRows(cell, "load", set(held), memory)
-            record = self._lay_out_held(loads, held, forces.found[start:])
+            record["held"] = self._lay_out_held(loads, held, forces.found[start:])
         self._column = np.array(
             [(by_load if row.branch == HELD else column)[row.sample] for row in rows], dtype=np.intp
         )
@@ -384,14 +293,12 @@ class Rows:
         return {
             "forces": len(rows),
             "pressed": len(self._pressed),
-            "samples": memory.of(forces.record),
-            "patches": memory.of(patches.record),
-            "held": 0 if record is None else memory.of(record),
-            **memory.all(
-                force_column=self._column,
-                pressed_column=self._pressed_column,
-                pressed_robot=self._pressed,
-            ),
+            "samples": forces.record,
+            "patches": patches.record,
+            "force_column": self._column,
+            "pressed_column": self._pressed_column,
+            "pressed_robot": self._pressed,
+            **record,
         }
 
     def _lay_out_held(self, loads: _SampleRows, held: list[int], normal: Array) -> Any:
@@ -399,26 +306,25 @@ class Rows:
         memory, built, at = self._memory, self._cell.functions.built, loads.column[held]
         first = built[held_name("first")].prepared(len(held), given={"normal": normal})
         second = built[held_name("second")].prepared(len(held))
-        return _Held(
+        return memory.new(
+            "Held",
             count=len(held),
             start=len(self._sampled[_FORCES].found) - len(held),
             size=first.outputs["state"].shape[1],
-            loads=memory.of(loads.record),
+            loads=loads.record,
             first=memory.call(first),
             second=memory.call(second),
-            **memory.all(
-                at=at,
-                active=np.empty(len(held), dtype=np.intp),
-                load=first.inputs["load"],
-                slope=first.outputs["slope"],
-                state=first.outputs["state"],
-                states=second.inputs["state"],
-                weight=second.inputs["weight"],
-                curvature=second.outputs["curvature"],
-            ),
+            at=at,
+            active=np.empty(len(held), dtype=np.intp),
+            load=first.inputs["load"],
+            slope=first.outputs["slope"],
+            state=first.outputs["state"],
+            states=second.inputs["state"],
+            weight=second.inputs["weight"],
+            curvature=second.outputs["curvature"],
         )
 
-    def _lay_out_places(self, rows: Sequence[PlaceRow], q: tuple[Array, Array]) -> dict[str, int]:
+    def _lay_out_places(self, rows: Sequence[PlaceRow], q: tuple[Array, Array]) -> dict[str, Any]:
         """Inside, rows at places stand family by family; the joints of every place that needs them
         are solved once."""
         cell, memory = self._cell, self._memory
@@ -447,30 +353,28 @@ class Rows:
                 needed[arm].append(at[start:stop])
             groups.append(group)
             start = stop
-        self._groups = (_Group * len(groups))(*groups)
+        self._groups = memory.array("Group", groups)
         arms = []
         for arm, own_places in enumerate(needed):
             places = np.unique(np.concatenate([np.empty(0, dtype=np.intp), *own_places]))
             arms.append(self._lay_out_arm(arm, places, at, basis, q[arm][there]))
-            arms[-1].rows = memory.of(shared[f"q_{arm + 1}"])
-        self._arms = (_Arm * 2)(*arms)
+            memory.fill(arms[-1], rows=shared[f"q_{arm + 1}"])
+        self._arms = memory.array("Arm", arms)
         scale = np.array([row.constraint.scale for row in rows], dtype=float)
         return {
             "n": n,
             "size": cell.task.extended_size,
             "groups": len(groups),
-            "group": memory.of(self._groups),
-            "arm": memory.of(self._arms),
-            **memory.all(
-                order=order,
-                place=at,
-                scale=scale,
-                whole=basis[at],
-                whole_rate=rate_basis[at],
-                free=basis[:, free_row],
-                free_rate=rate_basis[:, free_row],
-                **{name: shared[name] for name in ("pose", "rate", "value")},
-            ),
+            "group": self._groups,
+            "arm": self._arms,
+            "order": order,
+            "place": at,
+            "scale": scale,
+            "whole": basis[at],
+            "whole_rate": rate_basis[at],
+            "free": basis[:, free_row],
+            "free_rate": rate_basis[:, free_row],
+            **{name: shared[name] for name in ("pose", "rate", "value")},
         }
 
     def _lay_out_group(
@@ -485,18 +389,19 @@ class Rows:
             first.inputs["numbers"][...] = row_numbers(constraints, functions)[0]
         self._families.append(one)
         gradient = first.outputs["gradient"]
-        record = _Group(
+        record = memory.new(
+            "Group",
             start=rows.start,
             stop=rows.stop,
             moving=one.moving,
             arms=sum(1 << arm for arm in one.arms(functions.model)),
             width=gradient.shape[1],
             first=memory.call(first),
-            gradient=memory.of(gradient),
+            gradient=gradient,
         )
         for k, name in enumerate(INPUTS):
             if name in first.inputs:
-                record.given[k] = memory.of(first.inputs[name])
+                memory.point(record.given, k, first.inputs[name])
                 record.sizes[k] = first.inputs[name][0].size
         return record
 
@@ -507,21 +412,20 @@ class Rows:
         first = self._cell.functions.closure(arm, "first").prepared(max(1, len(places)))
         first.inputs["q_reference"][: len(places)] = q[places]
         found = first.outputs
-        return _Arm(
+        return memory.new(
+            "Arm",
             places=len(places),
             joints=q.shape[1],
             first=memory.call(first),
-            **memory.all(
-                place=places,
-                at=position[at],
-                active=np.empty(len(places), dtype=np.intp),
-                basis=basis[places],
-                pose=first.inputs["pose"],
-                q=found["q"],
-                follow=found["follow"],
-                pull=found["pull"],
-                pulls=np.empty((len(places), q.shape[1])),
-            ),
+            place=places,
+            at=position[at],
+            active=np.empty(len(places), dtype=np.intp),
+            basis=basis[places],
+            pose=first.inputs["pose"],
+            q=found["q"],
+            follow=found["follow"],
+            pull=found["pull"],
+            pulls=np.empty((len(places), q.shape[1])),
         )
 
     def values(self, x: Array, tail: Array | None = None) -> Array:
@@ -533,17 +437,17 @@ class Rows:
         self._x[...] = x
         if tail is not None:
             self._tail[...] = tail
-        status = self._library.dual_arm_rows_values(self._address, 0)
-        if status == _UNWRAP:
+        status = self._c.dual_arm_rows_values(self._program, 0)
+        if status == self._c.UNWRAP:
             # Angles that go the long way.
             self._points[...] = self._cell.waypoints(x)
-            status = self._library.dual_arm_rows_values(self._address, 1)
-        _require_done(status)
+            status = self._c.dual_arm_rows_values(self._program, 1)
+        self._require_done(status)
         return self._values.copy()
 
     def slopes(self) -> Array:
         """(n_rows, n_var + k) by all variables where the values were found last."""
-        self._library.dual_arm_rows_slopes(self._address)
+        self._c.dual_arm_rows_slopes(self._program)
         return self._jacobian.copy()
 
     def curvature(self, multipliers: Array) -> Array:
@@ -554,9 +458,9 @@ class Rows:
             CodegenError: a function failed.
         """
         self._multipliers[...] = multipliers
-        while (status := self._library.dual_arm_rows_curvature(self._address)) > 0:
+        while (status := self._c.dual_arm_rows_curvature(self._program)) > 0:
             self._prepare(status)
-        _require_done(status)
+        self._require_done(status)
         return self._curvature
 
     @property
@@ -576,55 +480,46 @@ class Rows:
 
     def correct(self, slope: Array, x: Array) -> None:
         """Add (n_forces, n_var) to the slopes of forces, and to values what that makes beside x."""
-        added = self._memory.all(lacking_slope=slope, x_0=x)
-        self._program.lacking_slope, self._program.x_0 = added["lacking_slope"], added["x_0"]
+        self._memory.fill(self._program, lacking_slope=slope, x_0=x)
 
     def _prepare(self, which: int) -> None:
         """The second derivatives that are asked for the first time."""
         memory, functions = self._memory, self._cell.functions
         if which >= _GROUPS:
-            group = self._groups[which - _GROUPS]
+            group = self._groups + which - _GROUPS
             second = functions.rows.of(self._families[which - _GROUPS], "second")
             batch = second.prepared(group.stop - group.start)
             for k, name in enumerate(INPUTS):
                 if name in batch.inputs:
-                    group.inputs[k] = memory.of(batch.inputs[name])
-            group.second, group.hessian = memory.call(batch), memory.of(batch.outputs["hessian"])
+                    memory.point(group.inputs, k, batch.inputs[name])
+            memory.fill(group, second=memory.call(batch), hessian=batch.outputs["hessian"])
         elif which >= _ARMS:
-            arm = self._arms[which - _ARMS]
+            arm = self._arms + which - _ARMS
             batch = functions.closure(which - _ARMS, "second").prepared(arm.places)
-            arm.second, arm.hessian = memory.call(batch), memory.of(batch.outputs["hessian"])
-            arm.poses, arm.joint, arm.nu = (
-                memory.of(batch.inputs[name]) for name in ("pose", "q", "nu")
+            memory.fill(
+                arm,
+                second=memory.call(batch),
+                hessian=batch.outputs["hessian"],
+                poses=batch.inputs["pose"],
+                joint=batch.inputs["q"],
+                nu=batch.inputs["nu"],
             )
         else:
             first = max(first for first in self._sampled if first <= which)
             self._sampled[first].prepare(which - first)
 
+    def _require_done(self, status: int) -> None:
+        if status != self._c.DONE:
+            raise CodegenError("a function of the polish's rows failed")
 
-def row_library(kept: Cache | None = None) -> ctypes.CDLL:
+
+def row_library(kept: Cache | None = None) -> Native:
     """`rows.c`, from a cache where it was built before.
 
     Raises:
         CodegenError: it cannot be compiled, cached or loaded.
     """
-    return _library((kept or Cache()).folder)
-
-
-@cache
-def _library(folder: Path) -> ctypes.CDLL:
-    library = compiled("rows", "hybrid_opt.polishing", ["rows.c"], Cache(folder))
-    values, slopes = library.dual_arm_rows_values, library.dual_arm_rows_slopes
-    values.argtypes = [ctypes.c_void_p, ctypes.c_longlong]
-    library.dual_arm_rows_curvature.argtypes = slopes.argtypes = [ctypes.c_void_p]
-    library.dual_arm_rows_curvature.restype = values.restype = ctypes.c_longlong
-    slopes.restype = None
-    return library
-
-
-def _require_done(status: int) -> None:
-    if status != _DONE:
-        raise CodegenError("a function of the polish's rows failed")
+    return native("rows.c", kept)
 
 
 def row_numbers(

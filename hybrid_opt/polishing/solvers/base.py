@@ -5,16 +5,13 @@ A solver's word is not trusted: `optimality` recomputes residuals from the progr
 
 from __future__ import annotations
 
-import ctypes
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 from scipy.optimize import nnls
 
-from codegen.build import c_text, load_or_build_library
-from codegen.cache import Cache
 from symbolic.array import Array, Figure
 
 TOLERANCE = 1e-6
@@ -209,12 +206,3 @@ def estimated(cost: Array, A: Array, slacks: tuple[Array, Array, Array]) -> tupl
         pass
     y, low, high = np.split(found, [m, m + n])
     return high - low, y
-
-
-def compiled(name: str, package: str, sources: Sequence[str], cache: Cache) -> ctypes.CDLL:
-    """C of the polish as a library, see `codegen.library`.
-
-    Raises:
-        CodegenError: there is no compiler, or it cannot be compiled, cached or loaded.
-    """
-    return load_or_build_library(name, c_text(package, sources), cache)

@@ -3,10 +3,7 @@
    Slacks, multipliers and their changes hold the m inequalities first, then the n lower and the n
    upper bounds. */
 
-#include <math.h>
-#include <string.h>
-
-typedef long long integer;
+/* ---- offered ---- */
 
 typedef struct {
   integer n, m;           /* variables, inequalities */
@@ -29,8 +26,16 @@ typedef struct {
   double price, before, slope, alpha; /* of the search along a direction */
 } Step;
 
-enum { VECTOR = 8 };
 enum { TAKEN = 0, AGAIN = 1 };
+
+OFFERED integer dual_arm_dense_work(integer n, integer m);
+OFFERED void dual_arm_dense_ruling(const Step *s);
+OFFERED integer dual_arm_dense_direction(Step *s);
+OFFERED integer dual_arm_dense_judge(Step *s);
+OFFERED integer dual_arm_dense_heed(const Step *s);
+OFFERED void dual_arm_dense_move(const Step *s);
+OFFERED void dual_arm_dense_errors(const Step *s);
+/* ---- within ---- */
 
 /* Share of the way to a bound that a step may take; factor to the multiplier of a row that shortened
    a step; least slack of all. */
@@ -48,8 +53,6 @@ static const double SHIFT = 1e-7, SHIFTED = 8.0;
 static const double LONGEST = 2.0;
 /* Multipliers stay within this factor of what the barrier asks for. */
 static const double DUAL_RANGE = 1e10;
-
-static integer whole_vectors(integer n) { return (n + VECTOR - 1) / VECTOR * VECTOR; }
 
 /* The parts of the work memory. */
 typedef struct {
@@ -70,7 +73,7 @@ static Work parts(const Step *s) {
   return w;
 }
 
-__attribute__((visibility("default"))) integer dual_arm_dense_work(integer n, integer m) {
+OFFERED integer dual_arm_dense_work(integer n, integer m) {
   const integer wide = whole_vectors(n);
   return 2 * n * wide + 2 * wide + 3 * (m + 2 * n) + m;
 }
@@ -82,11 +85,6 @@ static double dot_wide(const double *a, const double *b, integer n) {
     for (int j = 0; j < VECTOR; j++) sums[j] += a[i + j] * b[i + j];
   for (int j = 0; j < VECTOR; j++) total += sums[j];
   return total;
-}
-
-static void add_wide(double *restrict to, double by, const double *restrict what, integer n) {
-  for (integer i = 0; i < n; i += VECTOR)
-    for (int j = 0; j < VECTOR; j++) to[i + j] += by * what[i + j];
 }
 
 static double dot(const double *a, const double *b, integer n) {
@@ -123,7 +121,7 @@ static void place_trial(Step *s, const double *dz) {
 }
 
 /* Multipliers, in CasADi's convention, of the rows whose curvature matters to a step. */
-__attribute__((visibility("default"))) void dual_arm_dense_ruling(const Step *s) {
+OFFERED void dual_arm_dense_ruling(const Step *s) {
   double most = 0.0;
   for (integer k = 0; k < s->m; k++) most = fmax(most, s->dual[k]);
   for (integer k = 0; k < s->m; k++) s->ruling[s->row[k]] = 0.0;
@@ -183,7 +181,7 @@ static int direction(const Step *s, Work *w) {
 }
 
 /* A direction, and the first trial along it; whether there is one. */
-__attribute__((visibility("default"))) integer dual_arm_dense_direction(Step *s) {
+OFFERED integer dual_arm_dense_direction(Step *s) {
   const integer n = s->n, m = s->m, all = m + 2 * n, wide = whole_vectors(n);
   Work w = parts(s);
   double theta = 0.0, most = 0.0, slope = 0.0;
@@ -239,7 +237,7 @@ static double until(const Step *s, const Work *w) {
 }
 
 /* Judges the trial's values: taken, or a shorter one is placed. */
-__attribute__((visibility("default"))) integer dual_arm_dense_judge(Step *s) {
+OFFERED integer dual_arm_dense_judge(Step *s) {
   const integer m = s->m;
   Work w = parts(s);
   int is_finite = 1;
@@ -273,7 +271,7 @@ __attribute__((visibility("default"))) integer dual_arm_dense_judge(Step *s) {
 }
 
 /* Raises the multipliers of rows that shortened the last step; whether any was raised. */
-__attribute__((visibility("default"))) integer dual_arm_dense_heed(const Step *s) {
+OFFERED integer dual_arm_dense_heed(const Step *s) {
   int any = 0;
   for (integer k = 0; k < s->m; k++) {
     const double y = s->dual[k], raised = fmin(1.0, RAISED * y);
@@ -283,7 +281,7 @@ __attribute__((visibility("default"))) integer dual_arm_dense_heed(const Step *s
 }
 
 /* Moves to the trial that was taken, with the rows' slopes there. */
-__attribute__((visibility("default"))) void dual_arm_dense_move(const Step *s) {
+OFFERED void dual_arm_dense_move(const Step *s) {
   const integer n = s->n, m = s->m, all = m + 2 * n, wide = whole_vectors(n);
   const Work w = parts(s);
   memcpy(s->z, s->trial, sizeof(double) * n);
@@ -301,7 +299,7 @@ __attribute__((visibility("default"))) void dual_arm_dense_move(const Step *s) {
 }
 
 /* Residuals: the largest without complementarity, the least and the largest product, their scale. */
-__attribute__((visibility("default"))) void dual_arm_dense_errors(const Step *s) {
+OFFERED void dual_arm_dense_errors(const Step *s) {
   const integer n = s->n, m = s->m, all = m + 2 * n, wide = whole_vectors(n);
   Work w = parts(s);
   double total = 0.0, least = INFINITY, most = -INFINITY, steepest = 0.0, lack = 0.0;

@@ -18,14 +18,12 @@ What does not call the program is in `dense.c`, which works on the iterate's own
 
 from __future__ import annotations
 
-import ctypes
-from functools import cache as remembered
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from codegen.cache import Cache
+from hybrid_opt.polishing.native import Native, Records, native
 from hybrid_opt.polishing.solvers.base import (
     FEASIBLE,
     PATIENCE,
@@ -34,7 +32,6 @@ from hybrid_opt.polishing.solvers.base import (
     Inequalities,
     Program,
     Solve,
-    compiled,
 )
 
 PUSH = 1e-4
@@ -58,25 +55,8 @@ SOLVED = 10.0
 TRIALS = 8
 """Trials of a line search before it gives up."""
 
-_INTEGERS = ("n", "m")
-_GIVEN = ("row", "sign", "shift", "cost", "low", "high", "inner_low", "inner_high")
-_CALLED = ("values", "jacobian", "W")
-_STATE = ("z", "slack", "dual", "h", "A")
-_FOUND = ("trial", "ruling", "errors", "blocking")
-_VECTOR, _TAKEN = 8, 0
-"""As in `dense.c`."""
-
-
-class _Step(ctypes.Structure):
-    """As in `dense.c`."""
-
-    _fields_ = (
-        *((name, ctypes.c_longlong) for name in _INTEGERS),
-        *((name, ctypes.c_void_p) for name in (*_GIVEN, *_CALLED, *_STATE, *_FOUND)),
-        ("mu", ctypes.c_double),
-        ("work", ctypes.c_void_p),
-        *((name, ctypes.c_double) for name in ("price", "before", "slope", "alpha")),
-    )
+VECTOR = 8
+"""As in `common.c`."""
 
 
 def dense_method(cache: Cache | None = None) -> Solve:
@@ -88,23 +68,8 @@ def dense_method(cache: Cache | None = None) -> Solve:
     Raises:
         CodegenError: it cannot be compiled, cached or loaded.
     """
-    library = _library((cache or Cache()).folder)
+    library = native("solvers/dense.c", cache)
     return lambda program, iterations, barrier: _Solver(library, program, barrier).solve(iterations)
-
-
-@remembered
-def _library(folder: Path) -> ctypes.CDLL:
-    package = "hybrid_opt.polishing.solvers"
-    library = compiled("dense_interior", package, ["dense.c"], Cache(folder))
-    library.dual_arm_dense_work.argtypes = [ctypes.c_longlong] * 2
-    library.dual_arm_dense_work.restype = ctypes.c_longlong
-    for name in ("ruling", "direction", "judge", "heed", "move", "errors"):
-        function = library[f"dual_arm_dense_{name}"]
-        answers = name in ("direction", "judge", "heed")
-        function.argtypes = [ctypes.c_void_p]
-        function.restype = ctypes.c_longlong if answers else None
-        setattr(library, name, function)
-    return library
 
 
 class _Solver:
@@ -114,8 +79,8 @@ class _Solver:
     multipliers (m + 2 n,) are of the inequalities, then of the lower and of the upper bounds.
     """
 
-    def __init__(self, library: ctypes.CDLL, program: Program, barrier: float) -> None:
-        self._c, self._program, self._mu = library, program, barrier
+    def __init__(self, library: Native, program: Program, barrier: float) -> None:
+        self._c, self._program, self._mu = library.functions, program, barrier
         self._rows, self._renewals = Inequalities(program), 0
         # Bounds are a hair wider than they are, so that no rounding puts an iterate on one.
         hair = HAIR * (program.high - program.low)
@@ -126,14 +91,15 @@ class _Solver:
         m, n = A.shape
         slack = np.concatenate([np.maximum(self.h, SLACK), self.z - low, high - self.z])
         self.slack, self.dual = slack, barrier / slack
-        wide = np.zeros((m, -(-n // _VECTOR) * _VECTOR))
+        # Rows filled up with zeros, as C has them.
+        wide = np.zeros((m, -(-n // VECTOR) * VECTOR))
         wide[:, :n] = A
-        self.A, n_rows = wide[:, :n], len(program.below)
+        n_rows = len(program.below)
         self._arrays: dict[str, Any] = {
-            "row": self._rows.rows.astype(np.int64),
+            "row": self._rows.rows,
             "sign": self._rows.sign,
             "shift": self._rows.shift,
-            "cost": np.ascontiguousarray(program.cost),
+            "cost": program.cost,
             "low": low,
             "high": high,
             "inner_low": low + 1e-3 * hair,
@@ -150,17 +116,16 @@ class _Solver:
             "ruling": np.zeros(n_rows),
             "errors": np.empty(4),
             "blocking": np.zeros(m, dtype=np.int8),
-            "work": np.empty(library.dual_arm_dense_work(n, m)),
+            "work": np.empty(self._c.dual_arm_dense_work(n, m)),
         }
-        addresses = {name: array.ctypes.data for name, array in self._arrays.items()}
-        self._step = _Step(n, m, mu=self._mu, price=0.0, **addresses)
-        self._address = ctypes.addressof(self._step)
+        self._records = Records(library)
+        self._step = self._records.new("Step", n=n, m=m, mu=self._mu, **self._arrays)
 
     def solve(self, wanted: int) -> Answer:
         """Iterate until an optimum, or as often as wanted and until an iterate is feasible."""
         iterations, message = 0, "Maximum_Iterations_Exceeded"
         for iterations in range(PATIENCE * wanted + 1):
-            self._c.errors(self._address)
+            self._c.dual_arm_dense_errors(self._step)
             if self._error(0.0) <= TOLERANCE:
                 message = "Solve_Succeeded"
                 break
@@ -190,19 +155,19 @@ class _Solver:
 
     def _advance(self) -> bool:
         """One step; whether one was found, or will be with other multipliers."""
-        c, step, program, arrays = self._c, self._address, self._program, self._arrays
-        self._step.mu = self._mu
-        c.ruling(step)
+        c, step, program, arrays = self._c, self._step, self._program, self._arrays
+        step.mu = self._mu
+        c.dual_arm_dense_ruling(step)
         arrays["W"][...] = program.curvature(self.z, arrays["ruling"])
-        if not c.direction(step):
+        if not c.dual_arm_dense_direction(step):
             return False
         for _ in range(TRIALS):
             arrays["values"][...] = program.values(arrays["trial"])
-            if c.judge(step) == _TAKEN:
+            if c.dual_arm_dense_judge(step) == c.TAKEN:
                 arrays["jacobian"][...] = program.constraints(arrays["trial"])[1]
-                c.move(step)
+                c.dual_arm_dense_move(step)
                 return True
-        return bool(c.heed(step))
+        return bool(c.dual_arm_dense_heed(step))
 
     def _renew(self) -> bool:
         """Slacks as large as at the start; whether that changes anything."""

@@ -4,10 +4,7 @@
    Vectors of all variables hold the border first, then the chain. Rows of matrices are filled up with
    zeros to whole vectors. */
 
-#include <math.h>
-#include <string.h>
-
-typedef long long integer;
+/* ---- offered ---- */
 
 typedef struct {
   integer k, n, m;          /* border, chain, rows */
@@ -26,6 +23,12 @@ typedef struct {
   double *d, *rows, *bounds; /* the answer */
   double *work;              /* dual_arm_work(k, n, m) doubles */
 } Program;
+
+enum { SOLVED = 0, INFEASIBLE = 1, FAILED = 2 };
+
+OFFERED integer dual_arm_work(integer k, integer n, integer m);
+OFFERED integer dual_arm_quadratic(const Program *p);
+/* ---- within ---- */
 
 /* The rows as they are used here. */
 typedef struct {
@@ -47,10 +50,6 @@ typedef struct {
   double *head;
 } Factors;
 
-enum { VECTOR = 8 };
-
-static integer whole_vectors(integer n) { return (n + VECTOR - 1) / VECTOR * VECTOR; }
-
 /* In so many sums, which compilers put into vectors. */
 static double dot(const double *a, const double *b, integer n) {
   double sums[VECTOR] = {0.0}, rest = 0.0;
@@ -64,12 +63,6 @@ static double dot(const double *a, const double *b, integer n) {
 
 static void add(double *restrict to, double by, const double *restrict what, integer n) {
   for (integer i = 0; i < n; i++) to[i] += by * what[i];
-}
-
-/* The same of whole vectors. */
-static void add_wide(double *restrict to, double by, const double *restrict what, integer n) {
-  for (integer i = 0; i < n; i += VECTOR)
-    for (int j = 0; j < VECTOR; j++) to[i + j] += by * what[i + j];
 }
 
 static void spread(double *to, const double *from, integer rows, integer k, integer wide) {
@@ -208,7 +201,6 @@ typedef struct {
 } State;
 
 enum { ITERATIONS = 50 }; /* at most; ten to twenty are the rule */
-enum { SOLVED = 0, INFEASIBLE = 1, FAILED = 2 };
 /* Share of the way to a bound that a step may take; least distance of the start from the bounds, as a
    share of their width; least slack and multiplier at the start. */
 static const double TO_BOUNDARY = 0.995, PUSH = 0.1, LEAST = 1e-2;
@@ -315,13 +307,13 @@ static State state(double **work, integer all, integer rows) {
   return made;
 }
 
-__attribute__((visibility("default"))) integer dual_arm_work(integer k, integer n, integer m) {
+OFFERED integer dual_arm_work(integer k, integer n, integer m) {
   const integer all = k + n, rows = m, wide = whole_vectors(k);
   const integer states = 4 * (3 * all + 2 * rows), matrices = 3 * (k + n) * wide + 4 * n;
   return states + matrices + (m + 2) * wide + 5 * all + 3 * rows;
 }
 
-__attribute__((visibility("default"))) integer dual_arm_quadratic(const Program *p) {
+OFFERED integer dual_arm_quadratic(const Program *p) {
   const integer k = p->k, n = p->n, all = k + n, rows = p->m;
   const integer wide = whole_vectors(k);
   double *work = p->work;

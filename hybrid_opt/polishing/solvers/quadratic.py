@@ -19,12 +19,9 @@ are too large, which is rare, Clarabel is asked.
 
 from __future__ import annotations
 
-import ctypes
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache as remembered
 from functools import cached_property
-from pathlib import Path
 from typing import Literal, get_args
 
 import numpy as np
@@ -33,7 +30,7 @@ from scipy import sparse
 from scipy.linalg import eigvalsh_tridiagonal, lapack
 
 from codegen.cache import Cache
-from hybrid_opt.polishing.solvers.base import compiled
+from hybrid_opt.polishing.native import Native, Records, native
 from symbolic.array import Array
 
 TOLERANCE = 1e-8
@@ -222,20 +219,6 @@ class QuadraticAnswer:
 SolveQuadratic = Callable[[QuadraticProgram], QuadraticAnswer | None]
 """A solver of quadratic programs: their least value, None where there is none."""
 
-_MATRIX, _ROWS = ("corner", "beside", "diagonal", "off"), ("border", "column", "left", "right")
-_ARRAYS = (*_MATRIX, "g", *_ROWS, "b", "low", "high")
-
-
-class _Program(ctypes.Structure):
-    """As in `quadratic.c`."""
-
-    _fields_ = (
-        *((name, ctypes.c_longlong) for name in ("k", "n", "m")),
-        *((name, ctypes.c_void_p) for name in _ARRAYS),
-        ("tolerance", ctypes.c_double),
-        *((name, ctypes.c_void_p) for name in ("d", "rows", "bounds", "work")),
-    )
-
 
 def quadratic_method(cache: Cache | None = None) -> SolveQuadratic:
     """The method, Clarabel's where its answer does not hold.
@@ -246,7 +229,7 @@ def quadratic_method(cache: Cache | None = None) -> SolveQuadratic:
     Raises:
         CodegenError: it cannot be compiled, cached or loaded.
     """
-    library = _library((cache or Cache()).folder)
+    library = native("solvers/quadratic.c", cache)
 
     def solve(program: QuadraticProgram) -> QuadraticAnswer | None:
         found = solve_inside(library, program)
@@ -259,33 +242,18 @@ def quadratic_method(cache: Cache | None = None) -> SolveQuadratic:
     return solve
 
 
-@remembered
-def _library(folder: Path) -> ctypes.CDLL:
-    package = "hybrid_opt.polishing.solvers"
-    library = compiled("quadratic", package, ["quadratic.c"], Cache(folder))
-    library.dual_arm_quadratic.argtypes = [ctypes.c_void_p]
-    library.dual_arm_work.argtypes = [ctypes.c_longlong] * 3
-    library.dual_arm_quadratic.restype = library.dual_arm_work.restype = ctypes.c_longlong
-    return library
-
-
-def solve_inside(library: ctypes.CDLL, program: QuadraticProgram) -> QuadraticAnswer:
+def solve_inside(library: Native, program: QuadraticProgram) -> QuadraticAnswer:
     """Iterate until the conditions hold, or multipliers prove that they never do."""
-    H, A = program.H, program.A
+    H, A, c = program.H, program.A, library.functions
     k, n, m = len(H.corner), len(H.diagonal), len(A)
-    parts = [(H, _MATRIX), (A, ("border", "left", "right")), (program, ("g", "b", "low", "high"))]
-    arrays = {
-        name: np.ascontiguousarray(getattr(part, name), dtype=float)
-        for part, names in parts
-        for name in names
-    }
     d, rows, bounds = np.empty(k + n), np.empty(m), np.empty(k + n)
-    arrays |= {"d": d, "rows": rows, "bounds": bounds}
-    arrays["work"] = np.empty(library.dual_arm_work(k, n, m))
-    column = np.ascontiguousarray(A.column, dtype=np.int64)
-    addresses = {name: array.ctypes.data for name, array in arrays.items()}
-    asked = _Program(k, n, m, tolerance=TOLERANCE, column=column.ctypes.data, **addresses)
-    ending: Ending = get_args(Ending)[library.dual_arm_quadratic(ctypes.byref(asked))]
+    records = Records(library)
+    asked = records.new("Program", k=k, n=n, m=m, tolerance=TOLERANCE, **vars(H))
+    given = {name: getattr(A, name) for name in ("border", "column", "left", "right")}
+    records.fill(asked, **given, g=program.g, b=program.b, low=program.low, high=program.high)
+    work = np.empty(c.dual_arm_work(k, n, m))
+    records.fill(asked, d=d, rows=rows, bounds=bounds, work=work)
+    ending: Ending = get_args(Ending)[c.dual_arm_quadratic(asked)]
     return QuadraticAnswer(d, rows, bounds, ending)
 
 

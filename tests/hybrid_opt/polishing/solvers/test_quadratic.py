@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import ctypes
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from codegen.cache import Cache
+from hybrid_opt.polishing.native import Native, native
 from hybrid_opt.polishing.solvers import quadratic
 from hybrid_opt.polishing.solvers.quadratic import (
     BorderedMatrix,
@@ -25,7 +24,7 @@ from tests.hybrid_opt.polishing.cells import solved, start, way
 
 def inside(of: QuadraticProgram) -> QuadraticAnswer:
     """By the own method alone."""
-    return solve_inside(quadratic._library(Cache().folder), of)
+    return solve_inside(native("solvers/quadratic.c"), of)
 
 
 def matrix(rng: np.random.Generator, k: int, n: int) -> BorderedMatrix:
@@ -139,7 +138,7 @@ def test_what_is_impossible_is_proven_so(seed: int) -> None:
 def test_programs_of_a_polish_agree_with_clarabel(monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[QuadraticProgram] = []
 
-    def recorded(library: ctypes.CDLL, of: QuadraticProgram) -> QuadraticAnswer:
+    def recorded(library: Native, of: QuadraticProgram) -> QuadraticAnswer:
         asked.append(of)
         return solve_inside(library, of)
 
