@@ -126,8 +126,16 @@ GAP, LONG_GAP = 10.0, 0.2
 
 
 @dataclass(frozen=True)
-class _Recorded:
-    """One arm's columns: (m,), (m, joints), (m, 6), (m,); and when it recorded nothing new."""
+class Recorded:
+    """What one arm recorded, at m samples.
+
+    Attributes:
+        time: (m,) ascending [s].
+        joints: (m, joints) [rad or m].
+        wrench: (m, 6) that acts on the arm [N, N m].
+        commanded: (m,) normal force [N].
+        lost: from when to when it recorded nothing new [s].
+    """
 
     time: Array
     joints: Array
@@ -135,19 +143,21 @@ class _Recorded:
     commanded: Array
     lost: Spans
 
-    def at(self, time: Array) -> _Recorded:
+    def at(self, time: Array) -> Recorded:
         """Between its samples."""
 
         def taken(values: Array) -> Array:
-            flat = values.reshape(len(self.time), -1)
-            columns = [np.interp(time, self.time, column) for column in flat.T]
-            return np.column_stack(columns).reshape(len(time), *values.shape[1:])
+            found = np.empty((len(time), *values.shape[1:]))
+            for column in np.ndindex(values.shape[1:]):
+                at = (slice(None), *column)
+                found[at] = np.interp(time, self.time, values[at])
+            return found
 
         joints, wrench = taken(self.joints), taken(self.wrench)
-        return _Recorded(time, joints, wrench, taken(self.commanded), self.lost)
+        return Recorded(time, joints, wrench, taken(self.commanded), self.lost)
 
 
-def _lost(time: Array, values: Array) -> Spans:
+def lost_spans(time: Array, values: Array) -> Spans:
     """Spans without samples, or with the very same values (m, k) in all of them."""
     steps = np.diff(time)
     long = np.flatnonzero(steps > max(GAP * float(np.median(steps)), LONG_GAP))
@@ -156,6 +166,45 @@ def _lost(time: Array, values: Array) -> Spans:
     spans = [*((k, k + 1) for k in long), *zip(edges[::2], edges[1::2], strict=True)]
     times = [(float(time[begin]), float(time[end])) for begin, end in spans]
     return tuple(span for span in times if span[1] - span[0] > LONG_GAP)
+
+
+def together(
+    name: str,
+    recorded: tuple[Recorded, Recorded],
+    labels: Labels,
+    frame: str,
+    largest: Array | None = None,
+) -> Run:
+    """A run of what both arms recorded; what the second did is taken at the times of the first.
+
+    Args:
+        name: of its file.
+        labels, frame, largest: see `Run`.
+
+    Raises:
+        ResultsError: they hardly recorded at the same time.
+    """
+    first, second = recorded
+    steps = np.array([np.median(np.diff(each.time)) for each in recorded])
+    time = first.time[(first.time >= second.time[0]) & (first.time <= second.time[-1])]
+    if len(time) < 10:
+        raise ResultsError(
+            f"{name}: both arms recorded at the same time on {len(time)} samples; allowed are 10 "
+            f"and more, on one clock in s (usual steps are {steps[0]:g} and {steps[1]:g})"
+        )
+    both = [each.at(time) for each in recorded]
+    return Run(
+        name=name,
+        time=time,
+        steps=steps,
+        joints=(both[0].joints, both[1].joints),
+        wrench=np.stack([each.wrench for each in both], axis=1),
+        commanded=np.stack([each.commanded for each in both], axis=1),
+        lost=tuple(sorted({*first.lost, *second.lost})),
+        frame=frame,
+        largest=np.full(2, np.inf) if largest is None else np.asarray(largest),
+        labels=labels,
+    )
 
 
 def read_run(path: Path, workcell: Workcell) -> Run:
@@ -174,7 +223,7 @@ def read_run(path: Path, workcell: Workcell) -> Run:
     table = Table(data, "", problems)
     labels = _labels(table)
     frame = table.choice("frame", FRAMES, "flange")
-    largest = np.full(2, np.inf)
+    largest = None
     if table.has("sensor_range"):
         largest = table.vector("sensor_range", (FORCE_RANGE, MOMENT_RANGE))
     arms = table.tables("arms", exactly=2)
@@ -185,28 +234,7 @@ def read_run(path: Path, workcell: Workcell) -> Run:
         each.close()
     if problems.found:
         raise WorkcellError(str(side), problems.messages())
-    first, second = recorded
-    steps = np.array([np.median(np.diff(each.time)) for each in recorded])
-    time = first.time[(first.time >= second.time[0]) & (first.time <= second.time[-1])]
-    if len(time) < 10:
-        raise ResultsError(
-            f"{path}: both arms recorded at the same time on {len(time)} samples; allowed are 10 "
-            "and more, on one clock in s (usual steps are "
-            f"{steps[0]:g} and {steps[1]:g})"
-        )
-    both = [each.at(time) for each in recorded]
-    return Run(
-        name=path.name,
-        time=time,
-        steps=steps,
-        joints=(both[0].joints, both[1].joints),
-        wrench=np.stack([each.wrench for each in both], axis=1),
-        commanded=np.stack([each.commanded for each in both], axis=1),
-        lost=tuple(sorted({*first.lost, *second.lost})),
-        frame=frame,
-        largest=np.asarray(largest),
-        labels=labels,
-    )
+    return together(path.name, (recorded[0], recorded[1]), labels, frame, largest)
 
 
 def _labels(table: Table) -> Labels:
@@ -234,7 +262,7 @@ def _instants(table: Table, key: str) -> tuple[float, ...]:
     return tuple(table.vector(key, (TIME,) * count, []).tolist())
 
 
-def _read_arm(table: Table, path: Path, workcell: Workcell, arm: int) -> _Recorded:
+def _read_arm(table: Table, path: Path, workcell: Workcell, arm: int) -> Recorded:
     """What one arm recorded, by the columns that the side file names."""
     file = path.parent / table.text("file") if table.has("file") else path
     names = list(arm_model(workcell.robots[arm]).names)[1:]
@@ -272,11 +300,11 @@ def _read_arm(table: Table, path: Path, workcell: Workcell, arm: int) -> _Record
     sound = np.isfinite(time) & np.isfinite(joints).all(1) & np.isfinite(wrench[:, :3]).all(1)
     if np.count_nonzero(sound) < 2 or (np.diff(time[sound]) <= 0.0).any():
         raise ResultsError(f"{file}: {time_name!r} does not ascend, or has fewer than two samples")
-    lost = _lost(time[sound], wrench[sound, :3])
-    return _Recorded(time[sound], joints[sound], wrench[sound], commanded[sound], lost)
+    lost = lost_spans(time[sound], wrench[sound, :3])
+    return Recorded(time[sound], joints[sound], wrench[sound], commanded[sound], lost)
 
 
-def _read_bag(table: Table, file: Path, names: list[str]) -> _Recorded:
+def _read_bag(table: Table, file: Path, names: list[str]) -> Recorded:
     """What one arm recorded in ROS 2, at the times of its joint states."""
     if table.has("joints"):
         value = table.raw("joints")
@@ -290,7 +318,7 @@ def _read_bag(table: Table, file: Path, names: list[str]) -> _Recorded:
     asked = table.text("commanded") if table.has("commanded") else ""
     if table.problems.found:
         nothing = np.zeros(2)
-        return _Recorded(nothing, nothing, nothing, nothing, ())
+        return Recorded(nothing, nothing, nothing, nothing, ())
     messages = read_topics(file, [topic for topic in (states, felt, asked) if topic])
     time, joints = joint_series(messages[states], names, file)
     wrench_time, wrench = wrench_series(messages[felt])
@@ -299,11 +327,11 @@ def _read_bag(table: Table, file: Path, names: list[str]) -> _Recorded:
     commanded = np.full(len(time), np.nan)
     if asked and messages[asked]:
         commanded = np.interp(time, *force_series(messages[asked]), left=np.nan)
-    lost = {*_lost(time, time[:, None]), *_lost(wrench_time, wrench[:, :3])}
+    lost = {*lost_spans(time, time[:, None]), *lost_spans(wrench_time, wrench[:, :3])}
     felt_then = np.column_stack([np.interp(time, wrench_time, column) for column in wrench.T])
     inside = (time >= wrench_time[0]) & (time <= wrench_time[-1])
     inside &= np.append(True, np.diff(time) > 0.0)
-    return _Recorded(
+    return Recorded(
         time[inside], joints[inside], felt_then[inside], commanded[inside], tuple(sorted(lost))
     )
 
