@@ -6,9 +6,12 @@ CC is set; Ctrl-C reaches the programs that tests start. Tests are marked by the
 
 from __future__ import annotations
 
+import fcntl
 import os
 import shlex
+import shutil
 import signal
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -85,13 +88,39 @@ def pytest_configure(config: pytest.Config) -> None:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark tests by their rooms."""
+    """Mark tests by their rooms; those that take long begin, so that no worker is left alone with
+    them in the end."""
     for item in items:
         path = item.path.relative_to(TESTS)
         places = {path.as_posix(), *(folder.as_posix() for folder in path.parents)}
         for mark, rooms in ROOMS.items():
             if places & set(rooms) and not (mark == "compiled" and places & set(PLAIN)):
                 item.add_marker(mark)
+    items.sort(key=lambda item: not any(item.get_closest_marker(mark) for mark in ROOMS))
+
+
+Once = Callable[[str, Callable[[Path], None]], Path]
+"""Gives the folder of a name that one of a run's processes makes for all of them."""
+
+
+@pytest.fixture(scope="session")
+def once(tmp_path_factory: pytest.TempPathFactory) -> Once:
+    """What is made once for all processes of a run, in folders that no test changes."""
+    base = tmp_path_factory.getbasetemp()
+    # Each worker of pytest-xdist has a folder of its own in the run's.
+    common = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
+
+    def made(name: str, make: Callable[[Path], None]) -> Path:
+        folder, done = common / name, common / f"{name}.done"
+        with open(common / f"{name}.lock", "w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            if not done.exists():
+                shutil.rmtree(folder, ignore_errors=True)
+                make(folder)
+                done.touch()
+        return folder
+
+    return made
 
 
 @pytest.fixture

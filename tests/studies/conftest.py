@@ -1,37 +1,56 @@
-"""A small study of the second cell that the tests of the report share."""
+"""A small study of the second cell that tests share."""
 
 from __future__ import annotations
 
 import shutil
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from hybrid_opt.campaign import CampaignSettings, ExecutionSettings
 from hybrid_opt.campaign.results import ReplicaFront, read_campaign
 from hybrid_opt.indicators.metrics import non_dominated
 from hybrid_opt.polishing.records import PolishEffort
-from hybrid_opt.progress import Progress
-from studies.programs.study import StudySettings, run_study
 from studies.report.data import ReportData, Run, gather
 from studies.study.simulation import StoredSimulation
 from studies.study.summary import PolishedFigures, front_indicators
-from symbolic.read.cell import load
+from tests.conftest import Once
 from tests.symbolic.cells import ROOT
 
 TRANSFER = ROOT / "studies" / "workcells" / "transfer.toml"
 
+SMALL = ["--evaluations", "120", "--replicas", "2", "--seed", "3", "--jobs", "1", "--no-polish"]
+"""Options of the study."""
+
+PRINTED = "printed.txt"
+
 
 @pytest.fixture(scope="session")
-def study(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def program_run(once: Once) -> tuple[Path, str]:
+    """A small study by the program itself: its results folder and what it printed."""
+
+    def run(folder: Path) -> None:
+        folder.mkdir()
+        command = [sys.executable, "-m", "studies.run", str(TRANSFER), *SMALL, "--output"]
+        done = subprocess.run(
+            [*command, str(folder / "results")], cwd=ROOT, capture_output=True, text=True
+        )
+        assert done.returncode == 0, done.stderr
+        assert "240 of 480" in done.stderr or "480 of 480" in done.stderr
+        assert "left]" in done.stderr
+        (folder / PRINTED).write_text(done.stdout, "utf-8")
+
+    folder = once("study", run)
+    return folder / "results", (folder / PRINTED).read_text("utf-8")
+
+
+@pytest.fixture(scope="session")
+def study(program_run: tuple[Path, str]) -> Path:
     """Results folder of two algorithms, two replicas and 120 evaluations each."""
-    root = tmp_path_factory.mktemp("study") / "results"
-    settings = CampaignSettings(evaluations=120, replicas=2, seed=3)
-    execution, silent = ExecutionSettings(root, jobs=1), Progress(shown=False)
-    run_study(load(TRANSFER), settings, execution, silent, StudySettings(report=False))
-    return root
+    return program_run[0]
 
 
 @pytest.fixture(scope="session")

@@ -28,6 +28,9 @@ SMALL = {
 }
 """What makes the examples after the first small enough for a test."""
 
+LONG = ("propose", "sweep", "sensitivities", "grips")
+"""Examples of what has short tests of its own."""
+
 TEN_LINES = 12
 """Lines that the way from a file to a robot's trajectory may take, imports included."""
 
@@ -48,7 +51,7 @@ def blocks(page: str) -> list[str]:
 @pytest.mark.parametrize(
     "path",
     [
-        pytest.param(path, marks=pytest.mark.slow if "propose" in path.name else ())
+        pytest.param(path, marks=pytest.mark.slow if path.stem[3:] in LONG else ())
         for path in EXAMPLES
     ],
     ids=NAMES,

@@ -38,7 +38,7 @@ from tests.symbolic.cells import RACK
 
 SETTINGS = CampaignSettings(algorithms={"nsga2": {}}, evaluations=200, replicas=1, seed=5)
 PROBE = ProbeSettings(starts=2, middle_starts=2)
-POLISHED = PolishSettings(attempts=4, fill=FillSettings(attempts=1), probe=PROBE)
+POLISHED = PolishSettings(attempts=2, fill=FillSettings(attempts=1), probe=PROBE)
 SILENT = Progress(shown=False)
 
 

@@ -19,10 +19,12 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 from matplotlib.transforms import Bbox
+from numpy.typing import NDArray
 from PIL import Image, ImageSequence
 
 from hybrid_opt.display.scene import frame_placements
 from studies.errors import ReportError
+from studies.report import looks
 from studies.report.__main__ import main
 from studies.report.data import DrawnCarry, ReportData, Run, reach_map
 from studies.report.drawing import ARMS, FRONT, HAND_MADE, SERIES, SIDE, in_style, oblique, save
@@ -426,6 +428,18 @@ def carry(data: ReportData) -> DrawnCarry:
     return data.initial
 
 
+@pytest.fixture(scope="module")
+def pictures(data: ReportData, carry: DrawnCarry) -> list[NDArray[np.uint8]]:
+    return list(frames(data.geometry, Film.of(carry)))
+
+
+@pytest.fixture
+def drawn_once(pictures: list[NDArray[np.uint8]], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Files of any format are written from the same pictures."""
+    monkeypatch.setattr(looks, "frames", lambda geometry, film: iter(pictures))
+
+
+@pytest.mark.usefixtures("drawn_once")
 def test_a_gif_plays_in_real_time(data: ReportData, carry: DrawnCarry, tmp_path: Path) -> None:
     path = tmp_path / "made" / "carry.gif"
     write_animation(data.geometry, Film.of(carry), path)
@@ -442,14 +456,16 @@ def test_a_gif_plays_in_real_time(data: ReportData, carry: DrawnCarry, tmp_path:
     ).mean() > 0.01
 
 
-def test_frames_show_the_motion_from_start_to_goal(data: ReportData, carry: DrawnCarry) -> None:
-    pictures = list(frames(data.geometry, Film.of(carry)))
+def test_frames_show_the_motion_from_start_to_goal(
+    carry: DrawnCarry, pictures: list[NDArray[np.uint8]]
+) -> None:
     assert len(pictures) == round(carry.timed.duration * FRAMES_PER_SECOND) + 1
     assert {picture.shape for picture in pictures} == {(400, 640, 3)}
     steps = [np.abs(a.astype(int) - b).mean() for a, b in pairwise(pictures)]
     assert max(steps) > 0.1
 
 
+@pytest.mark.usefixtures("drawn_once")
 def test_an_mp4_plays_in_real_time(data: ReportData, carry: DrawnCarry, tmp_path: Path) -> None:
     path = tmp_path / "carry.mp4"
     write_animation(data.geometry, Film.of(carry), path)
@@ -476,10 +492,12 @@ def test_the_program_tells_what_is_no_results_folder(
     assert "configuration.json is missing" in capsys.readouterr().err
 
 
-def test_a_browser_is_given_the_report(study: Path, own_study: Path) -> None:
+def test_a_browser_is_given_the_report(own_study: Path) -> None:
     """Or, where there is none, a page that plays a trajectory."""
     (own_study / PAGE).write_text("<p>the report</p>")
-    for page, words in ((page_of(own_study), "<p>the report</p>"), (page_of(study), "CellScene")):
+    report = page_of(own_study)
+    (own_study / PAGE).unlink()
+    for page, words in ((report, "<p>the report</p>"), (page_of(own_study), "CellScene")):
         server = page_server(page, 0)
         Thread(target=server.serve_forever, daemon=True).start()
         try:

@@ -32,7 +32,7 @@ def study(tmp_path_factory: pytest.TempPathFactory) -> Path:
         settings,
         ExecutionSettings(root, jobs=1),
         Progress(shown=False),
-        StudySettings(PolishSettings(attempts=3), report=False),
+        StudySettings(PolishSettings(attempts=3), drivable=False, report=False),
     )
     return root
 
@@ -85,6 +85,12 @@ def test_a_study_without_a_polish_is_told(
     settings = CampaignSettings(algorithms={"random": {}}, evaluations=60, replicas=1)
     root = tmp_path / "results"
     execution = ExecutionSettings(root, jobs=1)
-    run_study(load(RACK), settings, execution, Progress(shown=False), StudySettings(report=False))
+    run_study(
+        load(RACK),
+        settings,
+        execution,
+        Progress(shown=False),
+        StudySettings(drivable=False, report=False),
+    )
     assert main([str(root)]) == 2
     assert "not polished; run the study with --polish" in capsys.readouterr().err

@@ -31,27 +31,15 @@ from studies.study.recommendation import recommend_from, recommendation_text
 from studies.study.summary import read_summary
 from symbolic.read.cell import load
 from symbolic.read.cell_files import collect_cell, drivable_files, unpack_cell
-from tests.hybrid_opt.campaign.fake import RACK, ROOT
+from tests.studies.conftest import SMALL, TRANSFER
+from tests.symbolic.cells import ROOT
 from tests.waiting import HANGS, until
 
-CELL = str(RACK.with_name("transfer.toml"))
-SMALL = ["--evaluations", "120", "--replicas", "2", "--jobs", "1", "--no-polish"]
+CELL = str(TRANSFER)
 
 
-@pytest.fixture(scope="module")
-def study(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
-    """A small study by the program itself: its results folder and what it printed."""
-    root = tmp_path_factory.mktemp("study") / "a"
-    command = [sys.executable, "-m", "studies.run", CELL, "--output", str(root), *SMALL]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    assert "240 of 480" in done.stderr or "480 of 480" in done.stderr
-    assert "left]" in done.stderr
-    return root, done.stdout
-
-
-def test_study_leaves_everything_behind(study: tuple[Path, str]) -> None:
-    root, printed = study
+def test_study_leaves_everything_behind(program_run: tuple[Path, str]) -> None:
+    root, printed = program_run
     summary = read_summary(root)
     results = read_campaign(root)
     assert [found.algorithm for found in results.replicas] == ["nsga2"] * 2 + ["mopso"] * 2
@@ -80,9 +68,9 @@ def test_study_leaves_everything_behind(study: tuple[Path, str]) -> None:
     assert "paper" not in printed.lower()
 
 
-def test_study_opens_with_a_carry_to_run(study: tuple[Path, str]) -> None:
+def test_study_opens_with_a_carry_to_run(program_run: tuple[Path, str]) -> None:
     """Terminal, summary.json and the stored trajectory agree; the hand-made one stands beside."""
-    root, printed = study
+    root, printed = program_run
     found = read_summary(root).recommendation
     assert found is not None
     words = recommendation_text(found, str(root))
@@ -114,15 +102,15 @@ def test_study_opens_with_a_carry_to_run(study: tuple[Path, str]) -> None:
     assert (root / "timing/hand-made.json").exists()
 
 
-def test_the_recommended_file_is_reproduced(study: tuple[Path, str], tmp_path: Path) -> None:
-    root, _ = study
+def test_the_recommended_file_is_reproduced(program_run: tuple[Path, str], tmp_path: Path) -> None:
+    root, _ = program_run
     assert replay(read_trajectory(root / "recommended.json"), tmp_path).reproduced
 
 
 def test_another_wish_needs_no_other_study(
-    study: tuple[Path, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    program_run: tuple[Path, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    root, _ = study
+    root, _ = program_run
     file = tmp_path / "gentle.json"
     assert recommend.main([str(root), "--duration", "4", "--output", str(file)]) == 0
     printed = capsys.readouterr().out
@@ -133,15 +121,15 @@ def test_another_wish_needs_no_other_study(
     assert "give at most one" in capsys.readouterr().err
 
 
-def test_searches_start_from_the_initial_trajectory(study: tuple[Path, str]) -> None:
-    for replica in read_campaign(study[0]).replicas:
+def test_searches_start_from_the_initial_trajectory(program_run: tuple[Path, str]) -> None:
+    for replica in read_campaign(program_run[0]).replicas:
         initial = load(Path(CELL)).task.initial.ravel()
         assert (replica.evaluations.x[0] == initial).all()
         assert not (replica.evaluations.x[1:40] == initial).all(axis=1).any()
 
 
-def test_reference_front_file_is_the_union(study: tuple[Path, str]) -> None:
-    root, _ = study
+def test_reference_front_file_is_the_union(program_run: tuple[Path, str]) -> None:
+    root, _ = program_run
     rows = np.loadtxt(root / "fronts/reference.csv", delimiter=",", skiprows=1, ndmin=2)
     union = np.concatenate([replica.front for replica in read_campaign(root).replicas])
     np.testing.assert_array_equal(rows, metrics.front_of(union))
@@ -150,9 +138,9 @@ def test_reference_front_file_is_the_union(study: tuple[Path, str]) -> None:
 
 
 def test_a_stored_study_can_be_repeated_from_its_own_workcell(
-    study: tuple[Path, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    program_run: tuple[Path, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    root, _ = study
+    root, _ = program_run
     configuration = json.loads((root / "configuration.json").read_text())
     cell = str(root / configuration["workcell"]["file"])
     arguments = [cell, "--output", str(tmp_path / "b"), *SMALL, "--no-drivable", "--no-report"]
@@ -167,9 +155,9 @@ def test_a_stored_study_can_be_repeated_from_its_own_workcell(
 
 
 def test_resuming_a_finished_study_only_tells(
-    study: tuple[Path, str], capsys: pytest.CaptureFixture[str]
+    program_run: tuple[Path, str], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    root, printed = study
+    root, printed = program_run
     before = {path: path.stat().st_mtime_ns for path in root.rglob("*.*") if path.name != ".lock"}
     assert run.main([CELL, "--output", str(root), *SMALL, "--resume"]) == 0
     assert capsys.readouterr().out == printed
@@ -179,6 +167,7 @@ def test_resuming_a_finished_study_only_tells(
 def test_interrupt_tells_how_to_go_on(tmp_path: Path) -> None:
     root = tmp_path / "my results"
     command = [sys.executable, "-m", "studies.run", CELL, "--output", str(root)]
+    command += ["--no-polish", "--no-drivable"]  # what they need is not compiled for it
     command += ["--evaluations", "20000", "--replicas", "1", "--jobs", "2", "--seed", "5"]
     process = subprocess.Popen(
         command, cwd=ROOT, stderr=subprocess.PIPE, text=True, start_new_session=True

@@ -26,7 +26,8 @@ from studies.study.recommendation import StoredRecommendation, read_recommendati
 from symbolic.read.cell import load
 from tests.hybrid_opt.campaign.fake import RACK, ROOT
 from tests.hybrid_opt.cells import shipped
-from tests.studies.study.test_run import CELL, SMALL
+from tests.studies.conftest import SMALL
+from tests.studies.study.test_run import CELL
 from tests.waiting import HANGS, soon, until
 
 

@@ -16,11 +16,10 @@ from symbolic.geometry.clearance import screening_functions
 from symbolic.geometry.expressions import EXACT, Softness
 from symbolic.geometry.pairs import CellGeometry, build_geometry, coal_distance
 from symbolic.geometry.pieces import Piece
-from symbolic.read.arms import arm_model
 from symbolic.read.cell import load
-from symbolic.records import Body, Box, Cylinder, Mesh, Sphere, Workcell
+from symbolic.records import Body, Box, Cylinder, Mesh, Robot, Sphere, Workcell
 from symbolic.records.poses import pose_matrix
-from symbolic.robot.model import build_robot_model
+from symbolic.robot.model import RobotModel, build_robot_model
 from tests.robots import ur10_urdf
 
 RACK = Path(__file__).parent / "data" / "plain_rack.toml"
@@ -96,10 +95,18 @@ def geometry_of(name: str, folder: Path = Path()) -> CellGeometry:
 
 def functions_of(geometry: CellGeometry, softness: Softness = EXACT) -> dict[str, ca.Function]:
     """The collision functions of a geometry."""
-    first, second = (build_robot_model(robot) for robot in geometry.workcell.robots)
-    return screening_functions(
-        geometry, (first.joint_placements, second.joint_placements), softness
-    )
+    first, second = (model_of(robot).joint_placements for robot in geometry.workcell.robots)
+    return screening_functions(geometry, (first, second), softness)
+
+
+def model_of(robot: Robot) -> RobotModel:
+    """The kinematics of an arm, which its base does not change."""
+    if robot.urdf not in _MODELS:
+        _MODELS[robot.urdf] = build_robot_model(robot)
+    return _MODELS[robot.urdf]
+
+
+_MODELS: dict[Path, RobotModel] = {}
 
 
 def whole_geometry_of(name: str, folder: Path = Path()) -> CellGeometry:
@@ -127,7 +134,7 @@ def placed_pieces(
     """The pieces of every body in the world, by numeric Pinocchio, of one configuration."""
     placements = []
     for robot, q in zip(geometry.workcell.robots, (q_1, q_2), strict=True):
-        model = arm_model(robot)
+        model = model_of(robot).model
         data = model.createData()
         pin.forwardKinematics(model, data, q)
         placements.append([robot.T_world_base @ data.oMi[j].homogeneous for j in range(1, 7)])
