@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 
 from hybrid_opt.campaign import CampaignSettings, ExecutionSettings
 from hybrid_opt.campaign.results import read_campaign
-from hybrid_opt.polishing.settings import PolishSettings
+from hybrid_opt.polishing.settings import FillSettings, PolishSettings, ProbeSettings
 from hybrid_opt.progress import Progress
 from studies.programs.comparison import compare
 from studies.programs.study import StudySettings, run_study
@@ -40,7 +40,8 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A polished and timed study, as small as it can be."""
     root = tmp_path_factory.mktemp("whole") / "results"
     campaign = CampaignSettings({"nsga2": {"population": 20}}, evaluations=60, replicas=1, seed=3)
-    study = StudySettings(PolishSettings(attempts=1), report=False)
+    fill, probe = FillSettings(solved=3, members=3, attempts=1), ProbeSettings(1, 1, rounds=1)
+    study = StudySettings(PolishSettings(attempts=1, fill=fill, probe=probe), report=False)
     execution = ExecutionSettings(root, jobs=1)
     run_study(load(TRANSFER), campaign, execution, Progress(shown=False), study)
     return root

@@ -19,6 +19,7 @@ from hybrid_opt.campaign.search_stage import run_replica
 from hybrid_opt.campaign.settings import FRONT, CampaignSettings
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.indicators import metrics
+from hybrid_opt.polishing.settings import FillSettings
 from hybrid_opt.store.files import sha256
 from hybrid_opt.store.trajectory_file import read_trajectory
 from symbolic.array import Array
@@ -43,7 +44,8 @@ def front() -> ho.Front:
 @cache
 def polished() -> ho.Front:
     rng = np.random.default_rng(1)
-    return ho.polish(front(), rng=rng, settings=ho.PolishSettings(attempts=2))
+    fill = FillSettings(attempts=1)
+    return ho.polish(front(), rng=rng, settings=ho.PolishSettings(attempts=2, fill=fill))
 
 
 def test_an_unknown_objective_is_refused_where_a_cell_is_loaded() -> None:

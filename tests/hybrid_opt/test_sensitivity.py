@@ -67,7 +67,14 @@ def assert_derivatives(cell: ho.Cell, row: Sensitivity, here: tuple[float, float
         assert sign * row.duration == pytest.approx(duration, rel=1e-4, abs=1e-6), row.key
 
 
-@pytest.mark.parametrize(("name", "first"), [("rack", 0), ("pandas", 1), ("transfer", 2)])
+@pytest.mark.parametrize(
+    ("name", "first"),
+    [
+        ("rack", 0),
+        pytest.param("pandas", 1, marks=pytest.mark.slow),
+        pytest.param("transfer", 2, marks=pytest.mark.slow),
+    ],
+)
 def test_numbers_do_what_changed_cells_say(name: str, first: int) -> None:
     """Another third of the numbers in every cell."""
     cell = ho.Cell.load(CELLS / f"{name}.toml")
@@ -81,6 +88,7 @@ def test_numbers_do_what_changed_cells_say(name: str, first: int) -> None:
         assert_derivatives(cell, row, here)
 
 
+@pytest.mark.slow
 def test_where_several_cases_rule_lowering_is_another_matter() -> None:
     """The pandas' path asks for as much at two samples, and both frictions are alike."""
     cell = ho.Cell.load(CELLS / "pandas.toml")
@@ -116,7 +124,9 @@ TIMED = {
 """How far numbers are changed where paths are timed anew."""
 
 
-@pytest.mark.parametrize(("name", "force"), [("rack", 60.0), ("pandas", None)])
+@pytest.mark.parametrize(
+    ("name", "force"), [("rack", 60.0), pytest.param("pandas", None, marks=pytest.mark.slow)]
+)
 def test_the_fastest_duration_is_that_of_paths_timed_anew(name: str, force: float | None) -> None:
     """Both arms are at their limits together: most numbers cost more one way than the other."""
     cell, limits = ho.Cell.load(CELLS / f"{name}.toml"), ho.TimingLimits(force=force)

@@ -1,4 +1,4 @@
-"""Small drivable searches of every cell that ships, here and in a worker."""
+"""Small drivable searches of cells that ship, here and in a worker."""
 
 from __future__ import annotations
 
@@ -20,11 +20,17 @@ from hybrid_opt.work.service import ProcessExecutor, Service, answer_all
 from symbolic.read.cell_files import collect_cell
 from tests.symbolic.read.samples import RACK
 
-CELLS = sorted(RACK.parent.glob("*.toml"))
+QUICK = ("fork", "rack", "transfer", "uneven")
+"""Cells that others compile as well; the rest takes minutes."""
+
+CELLS = [
+    pytest.param(path, marks=() if path.stem in QUICK else pytest.mark.slow, id=path.stem)
+    for path in sorted(RACK.parent.glob("*.toml"))
+]
 EVALUATIONS = 6
 
 
-@pytest.mark.parametrize("path", CELLS, ids=[path.stem for path in CELLS])
+@pytest.mark.parametrize("path", CELLS)
 def test_every_cell_that_ships_is_searched(path: Path) -> None:
     cell = ho.Cell.load(path).drivable()
     rng = np.random.default_rng(1)
@@ -43,8 +49,8 @@ def test_every_cell_that_ships_is_searched(path: Path) -> None:
 def test_a_worker_elsewhere_searches_without_the_cells_files(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """With the joint allocation paths are timed one by one, which reads the robots' files."""
-    cell = ho.Cell.load(RACK.with_name("drum.toml")).drivable()
+    """Paths of pads without closed form are timed one by one, which reads the robots' files."""
+    cell = ho.Cell.load(RACK.with_name("fork.toml")).drivable()
     packed = PackedCell.of(collect_cell(cell.workcell))
     source = partial(packed.make, partial(CandidateEvaluator, objectives=DRIVABLE_OBJECTIVES))
     settings = CampaignSettings({"random": {}}, EVALUATIONS, 1, objectives=DRIVABLE_OBJECTIVES)

@@ -15,6 +15,8 @@ from tests.hybrid_opt.polishing.cells import solved, start_in, way_of
 from tests.hybrid_opt.polishing.test_joint_program import Programs, assert_curvature, assert_slopes
 from tests.symbolic.read.samples import RACK
 
+pytestmark = pytest.mark.slow  # its functions compile for a minute
+
 FORCE = 80.0
 
 

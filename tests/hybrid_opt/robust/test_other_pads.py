@@ -26,7 +26,7 @@ from tests.hybrid_opt.robust.test_force import at_rest
 from tests.symbolic.cells import ROOT
 
 SET = Uncertainty(0.08, 0.05, np.full(3, 0.004), 0.003, np.array([0.2, 0.0, 0.3]))
-NAMES = ("drum", "fork", "corner")
+NAMES = ["drum", "fork", pytest.param("corner", marks=pytest.mark.slow)]
 
 
 @cache

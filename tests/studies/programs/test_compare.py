@@ -14,7 +14,7 @@ from hybrid_opt.campaign.results import read_campaign
 from hybrid_opt.campaign.search_stage import search_stage
 from hybrid_opt.campaign.stages import run_stages
 from hybrid_opt.indicators import metrics
-from hybrid_opt.polishing.settings import FillSettings, PolishSettings
+from hybrid_opt.polishing.settings import FillSettings, PolishSettings, ProbeSettings
 from hybrid_opt.progress import Progress
 from studies.compare import main
 from studies.programs.comparison import compare
@@ -81,7 +81,8 @@ def test_polished_fronts_are_compared_too(own_study: Path, study: Path) -> None:
     workcell = load(TRANSFER)
     settings = CampaignSettings(evaluations=120, replicas=2, seed=3)
     with open_folder(settings, ExecutionSettings(own_study, 1, resume=True), workcell) as folder:
-        polished = polish_stage(PolishSettings(attempts=1, fill=FillSettings(solved=3, members=3)))
+        fill, probe = FillSettings(solved=3, members=3), ProbeSettings(1, 1, rounds=1)
+        polished = polish_stage(PolishSettings(attempts=1, fill=fill, probe=probe))
         run_stages(folder, (search_stage(), polished, summary_stage()), Progress(shown=False))
     figures = {f.figure: f for f in compare(own_study, own_study).figures if f.algorithm == "nsga2"}
     run = read_campaign(own_study)

@@ -165,7 +165,8 @@ def test_the_straight_line_is_straight(transfer: Workcell) -> None:
             assert min(gaps) == pytest.approx(0.0, abs=1e-12)
 
 
-def test_tells_which_bounds_bind() -> None:
+def test_tells_which_bounds_bind(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(inspection, "POLISH_ATTEMPTS", 1)
     found = find(load(TRANSFER), 10, 1, polish=True)
     assert found.optimum.solutions >= 1
     assert found.optimum.problem == ""

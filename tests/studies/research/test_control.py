@@ -12,7 +12,7 @@ from hybrid_opt.campaign import CampaignSettings, ExecutionSettings
 from hybrid_opt.campaign.results import read_campaign
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.indicators import metrics
-from hybrid_opt.polishing.settings import PolishSettings
+from hybrid_opt.polishing.settings import FillSettings, PolishSettings, ProbeSettings
 from hybrid_opt.progress import Progress
 from studies.programs.study import StudySettings, run_study
 from studies.research import longer_searches
@@ -32,7 +32,11 @@ def study(tmp_path_factory: pytest.TempPathFactory) -> Path:
         settings,
         ExecutionSettings(root, jobs=1),
         Progress(shown=False),
-        StudySettings(PolishSettings(attempts=3), drivable=False, report=False),
+        StudySettings(
+            PolishSettings(attempts=3, fill=FillSettings(attempts=1), probe=ProbeSettings(2, 2)),
+            drivable=False,
+            report=False,
+        ),
     )
     return root
 

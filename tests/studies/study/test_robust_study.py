@@ -34,6 +34,8 @@ from symbolic.read.cell_files import collect_cell, drivable_files, unpack_cell
 from symbolic.records import Workcell
 from tests.symbolic.read.samples import RACK
 
+pytestmark = pytest.mark.slow  # a whole study of one cell more
+
 FRICTION, MASS = 0.08, 0.05
 MORE = (1.0 + MASS) / (1.0 - FRICTION)
 """What such a set asks for at rest, over the planned force."""
