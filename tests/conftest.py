@@ -36,9 +36,7 @@ ROOMS = {
     ),
     "heavy": (
         "symbolic/contact/test_grasp.py",
-        "symbolic/contact/test_grasp_squeeze.py",
         "symbolic/contact/test_soft_finger.py",
-        "symbolic/contact/test_soft_grasp.py",
         "symbolic/functions/test_redundant_candidate.py",
         "symbolic/geometry/test_clearance.py",
         "symbolic/read/test_machines.py",
@@ -54,7 +52,6 @@ PLAIN = (
     "hybrid_opt/indicators/test_metrics.py",
     "hybrid_opt/indicators/test_statistics.py",
     "hybrid_opt/metaheuristics/test_run.py",
-    "hybrid_opt/metaheuristics/test_analytic_problems.py",
     "hybrid_opt/metaheuristics/test_mopso.py",
     "hybrid_opt/polishing/constraints",
     "hybrid_opt/polishing/test_point.py",

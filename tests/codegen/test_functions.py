@@ -1,9 +1,13 @@
-"""Compiled and interpreted functions: the same laws, against CasADi's own evaluation."""
+"""Compiled and interpreted functions: the same laws, against CasADi; from many threads."""
 
 from __future__ import annotations
 
 import ctypes
+import os
+import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 from typing import Any
 
 import casadi as ca
@@ -19,6 +23,7 @@ from codegen.errors import CodegenError
 from codegen.function import NumericFunction
 from codegen.interpreted import (
     InterpretedFunction,
+    compare,
     directional_derivative,
     relative_difference,
 )
@@ -243,3 +248,120 @@ def test_maximum_and_minimum_yield_to_numbers(cache: Cache) -> None:
             high, low = compiled(a, b).values()
             np.testing.assert_array_equal(high, np.fmax(a, b))
             np.testing.assert_array_equal(low, np.fmin(a, b))
+
+
+@pytest.mark.parametrize(
+    ("reference", "other", "expected"),
+    [
+        ([2.0, 1.0], [2.0, 1.0], 0.0),
+        ([2.0, 1.0], [2.0, 1.5], 0.25),
+        ([np.nan, 4.0], [np.nan, 3.0], 0.25),
+        ([np.nan, 4.0], [0.0, 4.0], np.inf),
+        ([0.0, 4.0], [np.nan, 4.0], np.inf),
+        ([np.inf], [np.inf], 0.0),
+        ([np.inf], [-np.inf], np.inf),
+        ([np.nan], [np.nan], 0.0),
+        ([], [], 0.0),
+        ([0.0], [1e-17], 1e-11),
+    ],
+)
+def test_relative_difference(reference: list[float], other: list[float], expected: float) -> None:
+    found = relative_difference(np.array(reference), np.array(other))
+    assert found == pytest.approx(expected)
+
+
+def test_another_function_is_told_apart(cache: Cache) -> None:
+    x = ca.SX.sym("x", 2)
+    function = ca.Function("f", [x], [ca.sin(x)], ["x"], ["y"])
+    shifted = ca.Function("f", [x], [ca.sin(x) + 1e-9], ["x"], ["y"])
+    bounds = {"x": (np.full(2, 0.5), np.full(2, 1.0))}
+    rng = np.random.default_rng(0)
+    same = compare(function, compile_function(function, cache), bounds, rng, cache=cache)
+    assert same.agrees
+    other = compare(function, compile_function(shifted, cache), bounds, rng, cache=cache)
+    assert not other.agrees
+    assert other.worst_output == "y"
+    assert 1e-9 <= other.outputs < 3e-9
+
+
+def test_inputs_stay_within_their_bounds(cache: Cache) -> None:
+    """Outside the bounds this function is NaN, which would hide every difference."""
+    x = ca.SX.sym("x", 2)
+    inside = ca.if_else(ca.logic_and(x[0] > 3.0, x[0] < 4.0), x[0], 1e3)
+    function = ca.Function("f", [x], [inside], ["x"], ["y"])
+    other = ca.Function("f", [x], [x[0]], ["x"], ["y"])
+    bounds = {"x": (np.full(2, 3.0), np.full(2, 4.0))}
+    rng = np.random.default_rng(0)
+    assert compare(function, compile_function(other, cache), bounds, rng, cache=cache).agrees
+    loose = {"x": (np.full(2, 2.0), np.full(2, 5.0))}
+    assert not compare(function, compile_function(other, cache), loose, rng, cache=cache).agrees
+
+
+def test_many_threads_share_one_function(cache: Cache) -> None:
+    function = compile_function(random_function(np.random.default_rng(2), ca.MX), cache)
+    rng = np.random.default_rng(3)
+    cases = [[rng.standard_normal(s) for s in function.input_shapes] for _ in range(400)]
+    expected = [function(*case) for case in cases]
+    with ThreadPoolExecutor(8) as pool:
+        found = list(pool.map(lambda case: function(*case), cases))
+    for one, other in zip(expected, found, strict=True):
+        for name in function.output_names:
+            np.testing.assert_array_equal(one[name], other[name])
+
+
+def test_other_threads_run_during_a_batch(cache: Cache) -> None:
+    """The interpreter's lock is free while candidates are computed, so that cores add up."""
+    x = ca.SX.sym("x")
+    step = ca.Function("step", [x], [ca.sin(x) + 0.5])
+    slow = compile_function(step.mapaccum("slow", 1000), cache)
+    with ThreadPoolExecutor(1) as pool:
+        running = pool.submit(slow.batch, np.zeros(40_000))
+        turns = 0
+        while not running.done():
+            time.sleep(0.001)
+            turns += 1
+    # The lock held, this thread would get a turn before and one after.
+    assert turns > 10
+
+
+def test_functions_with_memory_in_threads(cache: Cache, capfd: pytest.CaptureFixture[str]) -> None:
+    """A solver keeps state in its generated code, without a guard of its own."""
+    x, target = ca.SX.sym("x", 2), ca.SX.sym("p", 2)
+    solver = ca.nlpsol(
+        "solver",
+        "sqpmethod",
+        {"x": x, "p": target, "f": ca.sumsqr(x - target) + ca.sumsqr(x) ** 2},
+        {
+            "qpsol": "qrqp",
+            "print_header": False,
+            "print_iteration": False,
+            "print_time": False,
+            "print_status": False,
+            "qpsol_options": {"print_iter": False, "print_header": False, "print_info": False},
+        },
+    )
+    p = ca.MX.sym("p", 2)
+    function = compile_function(
+        ca.Function("nearest", [p], [solver(x0=[0.0, 0.0], p=p)["x"]], ["p"], ["x"]), cache
+    )
+    assert isinstance(function, CompiledFunction)
+    points = np.random.default_rng(4).standard_normal((20_000, 2))
+    serial = function.batch(points, threads=1)["x"]
+    parallel = function.batch(points, threads=4)["x"]
+    capfd.readouterr()
+    np.testing.assert_array_equal(serial, parallel)
+    gradient = 2.0 * (serial - points) + 4.0 * np.sum(serial**2, axis=1, keepdims=True) * serial
+    assert np.abs(gradient).max() < 1e-5
+
+
+def test_a_forked_child_has_threads_of_its_own(cache: Cache, tmp_path: Path) -> None:
+    function = compile_function(small(), cache)
+    inputs = (np.ones((16, 3)), np.ones((4, 2)))
+    expected = function.batch(*inputs, threads=2)["b"]
+    reply = tmp_path / "reply.npy"
+    child = os.fork()
+    if child == 0:
+        np.save(reply, function.batch(*inputs, threads=2)["b"])
+        os._exit(0)
+    assert os.waitpid(child, 0)[1] == 0
+    np.testing.assert_array_equal(np.load(reply), expected)

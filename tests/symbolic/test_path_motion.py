@@ -1,18 +1,31 @@
-"""The geometry along the path against finite differences, Pinocchio and the timed load."""
+"""The motion of a cell along its path, redundant joints, and what limits its timing."""
 
 from __future__ import annotations
 
 from functools import cache
 
+import casadi as ca
 import numpy as np
 import pinocchio as pin
 import pytest
 
 from symbolic.array import Array
+from symbolic.cell_model import CellModel, build_cell_model
 from symbolic.contact.load import LOAD_OUTPUTS, load_function
+from symbolic.limits import (
+    PATH_OUTPUTS,
+    limit_layout,
+    path_function,
+    ratio_functions,
+    sample_limits_function,
+)
 from symbolic.path_motion import path_motion_function
+from symbolic.records import Workcell
 from symbolic.records.poses import inverse, pose_matrix
-from tests.symbolic.cells import call, hand_cell, hand_model, with_payload
+from symbolic.records.task import initial_decision
+from symbolic.smooth.places import closure_functions, closure_name
+from tests.redundant_cells import free_pandas
+from tests.symbolic.cells import call, hand_cell, hand_model, with_contacts, with_payload
 
 SAMPLES = 401
 WEIGHT = np.array([0.0, 0.0, -9.81])
@@ -146,3 +159,181 @@ def test_rotation_and_normal_belong_to_the_pose() -> None:
         R = m["rotation"][k].reshape(3, 3)
         np.testing.assert_allclose(R, pose_matrix([0, 0, 0], m["pose"][k, 3:])[:3, :3], atol=1e-12)
         np.testing.assert_allclose(m["normal"][k], R @ cell.contacts[0].T_box_pad[:3, 2])
+
+
+PLACES = 21
+
+
+def uneven() -> Workcell:
+    """The hand cell with nothing symmetric about its contacts and its payload."""
+    cell = with_payload(hand_cell(), centre_of_mass=np.array([0.004, -0.01, 0.02]))
+    return with_contacts(cell, friction=(0.9, 1.1), patch_radius=(0.02, 0.04))
+
+
+@cache
+def outputs() -> tuple[dict[str, Array], dict[str, Array]]:
+    """Packed limits and the path's motion of a tilted trajectory."""
+    model = hand_model(uneven())
+    rng = np.random.default_rng(2)
+    x = model.workcell.task.initial.reshape(-1) + 0.05 * rng.uniform(-1.0, 1.0, 18)
+    path = call(path_function(model, PLACES), x)
+    rows = sample_limits_function(model).map(PLACES)(*[path[name].T for name in PATH_OUTPUTS])
+    motion = call(path_motion_function(model, PLACES), x)
+    np.testing.assert_allclose(path["q_1"], motion["q_1"], atol=1e-12)
+    return {"limits": np.array(rows.T)}, motion
+
+
+def block(name: str) -> Array:
+    layout = limit_layout(uneven())
+    start = layout.offsets[name]
+    return outputs()[0]["limits"][:, start : start + layout.sizes[name]]
+
+
+def both(name: str) -> Array:
+    motion = outputs()[1]
+    return np.concatenate([motion[f"{name}_{i}"] for i in (1, 2)], axis=1)
+
+
+def limits_of(name: str) -> Array:
+    return np.concatenate([getattr(robot, name) for robot in uneven().robots])
+
+
+def test_speeds_and_accelerations_are_the_paths_over_their_limits() -> None:
+    motion, cell = outputs()[1], uneven()
+    speed = np.linalg.norm(motion["pose_first"][:, :3], axis=1)
+    turn = np.linalg.norm(motion["angular_first"], axis=1)
+    np.testing.assert_allclose(
+        block("speed"),
+        np.column_stack(
+            [
+                both("q_first") / limits_of("velocity_max"),
+                speed / cell.payload.velocity_max,
+                turn / cell.payload.angular_velocity_max,
+                speed / cell.task.reference_speed,
+                turn / cell.task.reference_angular_speed,
+            ]
+        ),
+        atol=1e-10,
+    )
+    np.testing.assert_allclose(
+        block("acceleration"),
+        np.hstack([both("q_first"), both("q_second")]) / np.tile(limits_of("acceleration_max"), 2),
+        atol=1e-9,
+    )
+    linear = np.hstack([motion["pose_first"][:, :3], motion["pose_second"][:, :3]])
+    angular = np.hstack([motion["angular_first"], motion["angular_second"]])
+    cones = np.hstack([linear / cell.payload.acceleration_max, angular / 10.0])
+    np.testing.assert_allclose(block("cone"), cones, atol=1e-10)
+
+
+def test_torques_and_shifts_are_those_of_the_load_and_the_arms() -> None:
+    """The other route: contact forces in the world frame, then each arm's own torques."""
+    motion, cell = outputs()[1], uneven()
+    values, slopes = ratio_functions(cell)
+    rng = np.random.default_rng(3)
+    load = load_function(cell)
+    packed = np.hstack([block(name) for name in ("force", "moment", "torque", "wrench")])
+    for k in range(PLACES):
+        a, w = rng.normal(scale=0.3), rng.uniform(0.0, 0.4)
+        found = np.array(values(packed[k], a, w)).reshape(-1)
+        rate = motion["pose_first"][k] * np.sqrt(w)
+        second = motion["pose_second"][k] * w + motion["pose_first"][k] * a
+        loads = dict(zip(LOAD_OUTPUTS, load(motion["pose"][k], rate, second), strict=True))
+        torques = []
+        for i in (1, 2):
+            wrench = motion[f"wrench_torque_{i}"][k].reshape(6, 6)
+            own = motion[f"torque_by_acceleration_{i}"][k] * a
+            own = own + motion[f"torque_by_speed_{i}"][k] * w + motion[f"torque_at_rest_{i}"][k]
+            torques.append(own + wrench @ np.array(loads[f"wrench_{i}"]).reshape(-1))
+        shifts = np.array(loads["pressure_shift"]).reshape(-1) / [0.02, 0.04]
+        expected = np.concatenate([np.concatenate(torques) / limits_of("torque_max"), shifts])
+        np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-8)
+
+        same, by_a, by_w = (np.array(part).reshape(-1) for part in slopes(packed[k], a, w))
+        np.testing.assert_allclose(same, found, atol=1e-14)
+        step = 1e-6
+        for slope, da, dw in ((by_a, step, 0.0), (by_w, 0.0, step)):
+            ahead = np.array(values(packed[k], a + da, w + dw)).reshape(-1)
+            behind = np.array(values(packed[k], a - da, w - dw)).reshape(-1)
+            np.testing.assert_allclose(slope, (ahead - behind) / (2.0 * step), atol=2e-5)
+
+
+ELBOW_SAMPLES = 201
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory: pytest.TempPathFactory) -> CellModel:
+    return build_cell_model(free_pandas(tmp_path_factory.mktemp("pandas"), "initial = 0.1"))
+
+
+@pytest.fixture(scope="module")
+def elbow_motion(model: CellModel) -> dict[str, Array]:
+    x = initial_decision(model.workcell.task)
+    x[6:] = [0.1, 0.3, 0.6, 0.2, 0.0, -0.3]
+    function = path_motion_function(model, ELBOW_SAMPLES)
+    return {
+        name: np.array(value).T
+        for name, value in zip(function.name_out(), function(ca.DM(x)), strict=True)
+    }
+
+
+@pytest.mark.parametrize("arm", [1, 2])
+def test_derivatives_of_all_joints_are_those_of_differences(
+    elbow_motion: dict[str, Array], arm: int
+) -> None:
+    q = elbow_motion[f"q_{arm}"]
+    u = np.linspace(0.0, 1.0, ELBOW_SAMPLES)
+    first = np.gradient(q, u, axis=0, edge_order=2)
+    inner = slice(2, -2)
+    np.testing.assert_allclose(elbow_motion[f"q_first_{arm}"][inner], first[inner], atol=2e-3)
+    second = np.gradient(elbow_motion[f"q_first_{arm}"], u, axis=0, edge_order=2)
+    np.testing.assert_allclose(elbow_motion[f"q_second_{arm}"][inner], second[inner], atol=2e-2)
+
+
+@pytest.mark.parametrize("arm", [1, 2])
+def test_own_torques_are_pinocchios(
+    model: CellModel, elbow_motion: dict[str, Array], arm: int
+) -> None:
+    robot = model.robots[arm - 1].model
+    data = robot.createData()
+    speed, acceleration = 0.7, -0.4
+    for k in range(0, ELBOW_SAMPLES, 40):
+        q, first, second = (
+            elbow_motion[f"{name}_{arm}"][k] for name in ("q", "q_first", "q_second")
+        )
+        expected = pin.rnea(robot, data, q, first * speed, second * speed**2 + first * acceleration)
+        found = (
+            elbow_motion[f"torque_by_acceleration_{arm}"][k] * acceleration
+            + elbow_motion[f"torque_by_speed_{arm}"][k] * speed**2
+            + elbow_motion[f"torque_at_rest_{arm}"][k]
+        )
+        np.testing.assert_allclose(found, expected, rtol=1e-10, atol=1e-10)
+
+
+@pytest.mark.parametrize("arm", [0, 1])
+def test_the_closure_has_exact_derivatives_by_the_extended_pose(model: CellModel, arm: int) -> None:
+    functions = closure_functions(model, arm)
+    first, second = (functions[closure_name(arm, order)] for order in ("first", "second"))
+    x = initial_decision(model.workcell.task)
+    pose = np.concatenate([model.workcell.task.waypoints[0].lower, [0.15, 0.05]])
+    assert len(x) == 12
+    q, follow, pull = (np.array(value) for value in first(pose, model.start[arm]))
+    width = 1e-6
+    columns = []
+    for k in range(8):
+        step = np.eye(8)[k] * width
+        ends = [np.array(first(pose + sign * step, q)[0]).ravel() for sign in (1, -1)]
+        columns.append((ends[0] - ends[1]) / (2 * width))
+    np.testing.assert_allclose(follow, np.array(columns).T, atol=1e-7)
+    # The curvature of one joint along any direction, by the formula of `symbolic.smooth.places`.
+    direction = np.random.default_rng(arm).normal(size=8)
+    T = np.vstack([np.eye(8), follow])
+    for joint in range(7):
+        nu = pull.T @ np.eye(7)[joint]
+        hessian = T.T @ np.array(second(pose, q, nu)) @ T
+        h = 1e-4
+        ends = [
+            np.array(first(pose + sign * h * direction, q)[0]).ravel()[joint] for sign in (1, 0, -1)
+        ]
+        measured = (ends[0] - 2 * ends[1] + ends[2]) / h**2
+        assert direction @ hessian @ direction == pytest.approx(measured, rel=1e-3, abs=2e-4)

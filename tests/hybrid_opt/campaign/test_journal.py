@@ -1,20 +1,41 @@
-"""A journal keeps every whole block, whatever happened to the file behind it."""
+"""A campaign's settings, journals and tables of candidates."""
 
 from __future__ import annotations
 
-from dataclasses import fields
+import csv
+import gzip
+import io
+import re
+import tracemalloc
+from dataclasses import fields, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
 
-from hybrid_opt.campaign.journal import Journal, candidates_in, decode_generation, encode_generation
+from hybrid_opt.campaign import CampaignSettings, ExecutionSettings
+from hybrid_opt.campaign.journal import (
+    EvaluationTable,
+    Journal,
+    candidates_in,
+    decode,
+    decode_generation,
+    encode,
+    encode_front,
+    encode_generation,
+)
+from hybrid_opt.campaign.settings import chosen
+from hybrid_opt.campaign.stages import drivable_settings
 from hybrid_opt.errors import ResultsError
-from hybrid_opt.evaluate.evaluations import Evaluations
-from tests.hybrid_opt.campaign.fake import verdicts
+from hybrid_opt.evaluate.evaluations import REASONS, Evaluations
+from hybrid_opt.store.json_records import from_json, to_json
+from symbolic.errors import SettingsError
+from tests.hybrid_opt.campaign.fake import OBJECTIVES, verdicts
 
 IDENTITY = bytes(range(32))
 BLOCKS = [
@@ -96,3 +117,214 @@ def test_discarding_removes_the_file(tmp_path: Path) -> None:
     journal.append(BLOCKS[0])
     journal.discard()
     assert not journal.path.exists()
+
+
+PATH = Path("evaluations.csv.gz")
+
+
+def table(count: int = 30) -> EvaluationTable:
+    x = np.random.default_rng(3).random((count, 4))
+    x[::7, 0] = 0.31
+    return EvaluationTable(verdicts(x), np.arange(count, dtype=np.int64) // 8 + 1, OBJECTIVES)
+
+
+def test_table_survives_to_the_bit() -> None:
+    before = table()
+    after = decode(encode(before), PATH)
+    assert after.objective_names == OBJECTIVES
+    np.testing.assert_array_equal(after.generation, before.generation)
+    for field in fields(Evaluations):
+        old = getattr(before.evaluations, field.name)
+        new = getattr(after.evaluations, field.name)
+        assert (old.dtype, old.shape, old.tobytes()) == (new.dtype, new.shape, new.tobytes())
+
+
+def test_files_from_before_a_reason_was_added_are_read() -> None:
+    before = table()
+    header, *lines = gzip.decompress(encode(before)).decode().splitlines()
+    names = header.split(",")
+    kept = [k for k, name in enumerate(names) if not name.endswith("no_timing")]
+    old = [",".join(line.split(",")[k] for k in kept) for line in (header, *lines)]
+    after = decode(gzip.compress(("\n".join(old) + "\n").encode()), PATH).evaluations
+    np.testing.assert_array_equal(after.violation, before.evaluations.violation)
+    np.testing.assert_array_equal(after.violation_time, before.evaluations.violation_time)
+    np.testing.assert_array_equal(after.reason, before.evaluations.reason)
+
+
+@given(hnp.arrays(np.float64, (2, 4), elements=st.floats(allow_nan=False, allow_infinity=False)))
+def test_any_number_survives(x: np.ndarray[tuple[int, int], np.dtype[np.float64]]) -> None:
+    found = verdicts(np.full((2, 4), 0.5))
+    arrays = {f.name: getattr(found, f.name) for f in fields(Evaluations)} | {"x": x}
+    names = EvaluationTable(Evaluations(**arrays), np.ones(2, dtype=np.int64), OBJECTIVES)
+    assert decode(encode(names), PATH).evaluations.x.tobytes() == x.tobytes()
+
+
+def test_columns_mean_what_they_say() -> None:
+    before = table()
+    rows = list(csv.DictReader(io.StringIO(gzip.decompress(encode(before)).decode())))
+    found = before.evaluations
+    assert [int(row["evaluation"]) for row in rows] == list(range(1, 31))
+    for k, row in enumerate(rows):
+        assert row["feasible"] == str(int(found.feasible[k]))
+        assert row["reason"] == ("" if found.feasible[k] else REASONS[found.reason[k]])
+        assert float(row["x_4"]) == found.x[k, 3]
+        if not np.isnan(found.penalised[k, 1]):
+            assert float(row["penalised_peak_force_2"]) == found.penalised[k, 1]
+        collision = REASONS.index("collision")
+        assert float(row["violation_collision"]) == found.violation[k, collision]
+        assert float(row["violation_time_collision"]) == found.violation_time[k, collision]
+
+
+def test_same_table_same_bytes() -> None:
+    assert encode(table()) == encode(table())
+
+
+def test_front_names_its_evaluations() -> None:
+    before = table()
+    text = encode_front(before, np.array([4, 2])).decode()
+    rows = list(csv.DictReader(io.StringIO(text)))
+    assert [row["evaluation"] for row in rows] == ["5", "3"]
+    assert float(rows[0]["x_1"]) == before.evaluations.x[4, 0]
+    assert float(rows[1]["peak_force_2"]) == before.evaluations.objectives[2, 1]
+
+
+def unpacked(content: bytes) -> bytes:
+    return gzip.decompress(content)
+
+
+def test_a_small_file_does_not_unfold_into_a_huge_one() -> None:
+    header = unpacked(encode(table())).partition(b"\n")[0] + b"\n"
+    tracemalloc.start()
+    packed = gzip.compress(header + b"0" * 2**28, 1)
+    tracemalloc.reset_peak()
+    before = tracemalloc.get_traced_memory()[0]
+    with pytest.raises(ResultsError, match=r"a line of more than"):
+        decode(packed, PATH)
+    assert tracemalloc.get_traced_memory()[1] - before < 2**24
+    tracemalloc.stop()
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        lambda content: content[:-20],
+        lambda content: b"not gzip",
+        lambda content: gzip.compress(b""),
+        lambda content: gzip.compress(gzip.decompress(content).replace(b"x_1", b"y_1")),
+        lambda content: gzip.compress(
+            gzip.decompress(content).replace(b"collision,", b"luck,", 99)
+        ),
+        lambda content: gzip.compress(gzip.decompress(content).replace(b"\n3,", b"\n4,")),
+        lambda content: gzip.compress(gzip.decompress(content).replace(b"0.", b"zero", 40)),
+        lambda content: gzip.compress(gzip.decompress(content).replace(b"\n3,", b"\n\n3,")),
+        lambda content: gzip.compress(gzip.decompress(content).partition(b"\n")[0] + b"\n"),
+        lambda content: gzip.compress(gzip.decompress(content) + b"31,1,1,,0.0\n"),
+        lambda content: gzip.compress(re.sub(rb"\n1,\d+,", rb"\n1,1e308,", unpacked(content))),
+        lambda content: gzip.compress(re.sub(rb"\n1,(\d+),\d,", rb"\n1,\1,2,", unpacked(content))),
+        lambda content: gzip.compress(re.sub(rb",[^,]*\n2,", rb",x\n2,", unpacked(content))),
+    ],
+)
+def test_damage_is_told(spoil: object) -> None:
+    assert callable(spoil)
+    with pytest.raises(ResultsError, match=r"evaluations.csv.gz: damaged"):
+        decode(spoil(encode(table())), PATH)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"evaluations": 0}, "evaluations is 0; allowed are whole numbers 1 to"),
+        ({"evaluations": 10.0}, r"evaluations is 10\.0"),
+        ({"replicas": True}, "replicas is True"),
+        ({"seed": -1}, "seed is -1; allowed are whole numbers 0 to"),
+        ({"algorithms": {}}, "name at least one"),
+        ({"algorithms": {"nsga3": {}}}, "unknown algorithm 'nsga3'; known are"),
+        ({"algorithms": {"nsga2": {"swarm": 10}}}, "nsga2: unknown setting swarm"),
+        ({"algorithms": {"nsga2": {"population": 1}}}, "population is 1; allowed are whole"),
+        ({"objectives": ("speed",)}, "unknown objective speed; known are"),
+        ({"constraint_handling": "hope"}, "'hope'; known are penalty, constraints"),
+        ({"first_generation": "lucky"}, "'lucky'; known are initial, random"),
+    ],
+)
+def test_wrong_settings_are_told(change: dict[str, Any], message: str) -> None:
+    with pytest.raises(SettingsError, match=message):
+        CampaignSettings(**change)
+
+
+@pytest.mark.parametrize(
+    ("names", "populations", "message"),
+    [
+        ((), (), "name at least one, each once"),
+        (("nsga2", "nsga2"), (), "name at least one, each once"),
+        (("nsga2", "mopso"), (("random", 10),), r"of the campaign \(nsga2, mopso\)"),
+        (("nsga2",), (("nsga2", 10), ("nsga2", 20)), "at most once"),
+        (("nsga3",), (("nsga3", 10),), "unknown algorithm 'nsga3'; known are"),
+    ],
+)
+def test_wrong_algorithms_are_told(
+    names: tuple[str, ...], populations: tuple[tuple[str, int], ...], message: str
+) -> None:
+    with pytest.raises(SettingsError, match=message):
+        chosen(names, populations)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"jobs": -1}, "jobs is -1"),
+        ({"executor": "slurm"}, "'slurm'; known are processes, dask"),
+        ({"executor": "dask"}, "needs a scheduler's address"),
+        ({"scheduler": "tcp://host:8786"}, "needs a scheduler's address"),
+    ],
+)
+def test_wrong_execution_is_told(change: dict[str, Any], message: str) -> None:
+    with pytest.raises(SettingsError, match=message):
+        ExecutionSettings(Path("results"), **change)
+
+
+@pytest.mark.parametrize(
+    ("objectives", "drivable"),
+    [
+        (("peak_force_1", "peak_force_2"), ("duration", "peak_force")),
+        (("mean_force",), ("duration", "peak_force")),
+        (("robust_force_1", "robust_force_2"), ("duration", "robust_force")),
+    ],
+)
+def test_the_drivable_experiment_is_about_the_same_forces(
+    objectives: tuple[str, ...], drivable: tuple[str, ...]
+) -> None:
+    settings = CampaignSettings(objectives=objectives, seed=5)
+    assert drivable_settings(settings) == replace(settings, objectives=drivable, replicas=3)
+    assert drivable_settings(replace(settings, replicas=2)).replicas == 2
+    assert drivable_settings(settings, 7).replicas == 7
+    with pytest.raises(SettingsError, match="replicas is 0"):
+        drivable_settings(settings, 0)
+
+
+def test_random_search_stays_random() -> None:
+    assert CampaignSettings().starts_from_initial("nsga2")
+    assert not CampaignSettings().starts_from_initial("random")
+    assert not CampaignSettings(first_generation="random").starts_from_initial("nsga2")
+
+
+def test_settings_spell_out_the_algorithms() -> None:
+    settings = CampaignSettings(chosen(("mopso", "random"), (("mopso", 30), ("random", 7))))
+    assert settings.algorithms["mopso"]["swarm"] == 30
+    assert settings.algorithms["mopso"]["inertia"] == 0.4
+    assert settings.algorithms["random"] == {"batch": 7}
+    assert from_json(CampaignSettings, to_json(settings), "", "") == settings
+
+
+def test_streams_differ_and_repeat() -> None:
+    settings = CampaignSettings()
+    streams = {
+        (seed, name, replica): tuple(
+            replace(settings, seed=seed).replica_rng(name, replica).integers(2**63, size=2)
+        )
+        for seed in (0, 1)
+        for name in ("nsga2", "mopso", "random")
+        for replica in range(20)
+    }
+    assert len(set(streams.values())) == len(streams)
+    other = CampaignSettings(algorithms={"mopso": {}}, replicas=3, evaluations=5)
+    assert tuple(other.replica_rng("mopso", 2).integers(2**63, size=2)) == streams[1, "mopso", 2]

@@ -1,4 +1,4 @@
-"""Evaluation against the plain reference: physics, collisions, objectives and verdicts."""
+"""Verdicts: against the plain reference, by the kernel that makes them, and why in words."""
 
 from __future__ import annotations
 
@@ -11,20 +11,32 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from codegen import compiled as compiled_module
+from hybrid_opt.cell import Cell
 from hybrid_opt.collision.judge import FCL_RESOLUTION
+from hybrid_opt.compiled_cell import CompiledCell
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.evaluate.evaluations import FEASIBLE, REASONS, Evaluations
-from hybrid_opt.evaluate.kernel import reached_samples
+from hybrid_opt.evaluate.explanation import Explanation, explain, frequent, missing_reach
+from hybrid_opt.evaluate.kernel import (
+    Kernel,
+    SampledVerdicts,
+    load_kernel,
+    one_by_one,
+    reached_samples,
+)
 from studies.research.plain.collisions import PlainCollisionChecker
 from studies.research.plain.verdict import PlainJudge, PlainVerdict
 from symbolic.array import Array
-from symbolic.functions import CONSTRAINTS
+from symbolic.functions import CONSTRAINTS, SAMPLE_NAMES, force_sizes
+from symbolic.read.cell import load
 from symbolic.records import CollisionSettings, Uncertainty, Workcell
-from symbolic.records.task import initial_decision
+from symbolic.records.poses import box_placement
+from symbolic.records.task import initial_decision, straight_line
 from tests.hybrid_opt.cells import shipped
 from tests.hybrid_opt.collision.test_checker import checker_of, resting_cell
-from tests.symbolic.cells import RACK
 from tests.symbolic.geometry.collision_cells import geometry_of, random_configurations
+from tests.symbolic.read.samples import RACK
 
 pytestmark = pytest.mark.filterwarnings("ignore::symbolic.geometry.hulls.CollisionModelWarning")
 
@@ -177,3 +189,217 @@ def test_screening_changes_no_sample_of_random_candidates() -> None:
         assert colliding.tolist() == mask.any(axis=1).tolist()
         samples += n
     assert samples > 20_000
+
+
+UNEVEN = RACK.parent / "uneven.toml"
+
+FIELDS = ("objectives", "penalised", "feasible", "reason", "position", "violation_time")
+
+
+@cache
+def fused(
+    path: Path, objectives: tuple[str, ...] = ("peak_force_1", "peak_force_2")
+) -> CandidateEvaluator:
+    made = CandidateEvaluator(load(path), objectives)
+    assert made._kernel is not None
+    return made
+
+
+@cache
+def stepwise(
+    path: Path, objectives: tuple[str, ...] = ("peak_force_1", "peak_force_2")
+) -> CandidateEvaluator:
+    workcell = load(path)
+    made = CandidateEvaluator(workcell, objectives, functions=CompiledCell(workcell).evaluators)
+    assert made._kernel is None
+    return made
+
+
+def kernel(path: Path, lanes: int) -> Kernel:
+    ours = fused(path)
+    made = load_kernel(ours.compiled, ours.checker, ours.outputs, lanes=lanes)
+    assert made is not None
+    assert made.lanes == lanes or lanes == 0
+    return made
+
+
+def mixed(path: Path, n: int, seed: int) -> Array:
+    """Candidates within the bounds, and some far beyond them, which lose the path."""
+    workcell = load(path)
+    parts = [candidates(workcell, n - 2 * (n // 4), seed, 1.0)]
+    parts += [candidates(workcell, n // 4, seed + 1, widening) for widening in (3.0, 8.0)]
+    x = np.concatenate(parts)
+    np.random.default_rng(seed).shuffle(x)
+    return x
+
+
+def assert_same(found: Evaluations, expected: Evaluations) -> None:
+    for name in FIELDS:
+        np.testing.assert_array_equal(getattr(found, name), getattr(expected, name), name)
+    np.testing.assert_array_equal(found.violation, expected.violation)
+
+
+def assert_same_samples(found: SampledVerdicts, expected: SampledVerdicts) -> None:
+    for name, values in found.outputs.items():
+        np.testing.assert_array_equal(values, expected.outputs[name], name)
+    for name in ("first_sample", "first_reason", "colliding"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(expected, name), name)
+
+
+@pytest.mark.parametrize("path", [RACK, TRANSFER], ids=["rack", "transfer"])
+def test_verdicts_are_those_of_one_by_one(path: Path) -> None:
+    x = mixed(path, 400, 1)
+    found = fused(path).evaluate(x)
+    assert_same(found, stepwise(path).evaluate(x))
+    assert len(set(found.reason.tolist())) >= 4
+
+
+@pytest.mark.slow
+def test_verdicts_of_twenty_thousand_candidates_are_those_of_one_by_one() -> None:
+    """Half uniform, half near good carries, as a search's are."""
+    workcell = load(RACK)
+    x = mixed(RACK, 10_000, 2)
+    verdicts = fused(RACK).evaluate(x)
+    best = x[np.argsort(verdicts.penalised.sum(axis=1))[:200]]
+    rng = np.random.default_rng(0)
+    width = workcell.task.upper - workcell.task.lower
+    near = best[rng.integers(0, 200, 10_000)] + 0.05 * width * rng.standard_normal(
+        (10_000, len(width))
+    )
+    for some in (x, near):
+        assert_same(fused(RACK).evaluate(some), stepwise(RACK).evaluate(some))
+
+
+@pytest.mark.parametrize(
+    "lanes", [0, 2, *(pytest.param(lanes, marks=pytest.mark.slow) for lanes in (4, 8))]
+)
+def test_every_width_and_batch_gives_the_same_bits(lanes: int) -> None:
+    x = mixed(RACK, 27, 3)
+    ours = fused(RACK)
+    whole = one_by_one(ours.outputs(x), ours.checker)
+    made = kernel(RACK, lanes)
+    assert_same_samples(made.evaluate(x, tuple(SAMPLE_NAMES)), whole)
+    for n in (1, 2, 9):
+        part = made.evaluate(x[:n], ("normal_force",))
+        np.testing.assert_array_equal(
+            part.outputs["normal_force"], whole.outputs["normal_force"][:n]
+        )
+        np.testing.assert_array_equal(part.colliding, whole.colliding[:n])
+    empty = made.evaluate(x[:0], ("q_1",))
+    assert empty.colliding.shape == (0, 100)
+    assert empty.outputs["q_1"].shape == (0, 100, 6)
+
+
+def test_threads_and_small_rooms_change_nothing() -> None:
+    x = mixed(RACK, 60, 4)
+    made = kernel(RACK, 0)
+    expected = made.evaluate(x, ("q_2",))
+    assert_same_samples(made.evaluate(x, ("q_2",), threads=3), expected)
+    # Room for one pass at a time: the kernel hands its open pairs on after every few candidates.
+    made._room -= 4000
+    assert_same_samples(made.evaluate(x, ("q_2",)), expected)
+
+
+def test_a_candidate_that_is_no_number_disturbs_no_other() -> None:
+    x = mixed(RACK, 9, 5)
+    expected = fused(RACK).evaluate(x)
+    x_bad = np.insert(x, 4, np.nan, axis=0)
+    found = fused(RACK).evaluate(x_bad)
+    assert not found.feasible[4]
+    assert np.isfinite(found.penalised).all()
+    assert_same(found[np.arange(10) != 4], expected)
+
+
+@pytest.mark.parametrize(
+    "objectives",
+    [("mean_force", "duration"), ("peak_torque_use", "force_imbalance", "friction_use")],
+)
+def test_every_objective_gets_what_it_needs(objectives: tuple[str, ...]) -> None:
+    x = mixed(RACK, 30, 6)
+    assert_same(fused(RACK, objectives).evaluate(x), stepwise(RACK, objectives).evaluate(x))
+
+
+@pytest.mark.parametrize("lanes", [0, pytest.param(2, marks=pytest.mark.slow)])
+def test_forces_that_come_last_are_those_of_one_by_one(lanes: int) -> None:
+    """Where a program finds them: of all where that is wanted, else of what violates nothing."""
+    x, ours, made = mixed(UNEVEN, 21, 7), fused(UNEVEN), kernel(UNEVEN, lanes)
+    x[::4] = initial_decision(ours.workcell.task)
+    whole, names = one_by_one(ours.outputs(x), ours.checker), tuple(SAMPLE_NAMES)
+    assert_same_samples(made.evaluate(x, names, all_forces=True), whole)
+    found = made.evaluate(x, names, threads=2)
+    kept = (found.first_reason < 0) & ~found.colliding.any(axis=1)
+    assert 5 < np.count_nonzero(kept) < 21
+    for name in force_sizes(ours.workcell).keys() & SAMPLE_NAMES:
+        np.testing.assert_array_equal(found.outputs[name][kept], whole.outputs[name][kept], name)
+        assert not found.outputs[name][~kept].any(), name
+    for name in ("violation", "violation_time", "q_1", "constraint"):
+        np.testing.assert_array_equal(found.outputs[name][kept], whole.outputs[name][kept], name)
+    np.testing.assert_array_equal(found.colliding, whole.colliding)
+    verdicts, expected = ours.evaluate(x), stepwise(UNEVEN).evaluate(x)
+    for name in ("penalised", "feasible", "reason", "position", "violation", "violation_time"):
+        np.testing.assert_array_equal(getattr(verdicts, name), getattr(expected, name), name)
+
+
+def test_a_kernel_that_differs_is_not_used(monkeypatch: pytest.MonkeyPatch) -> None:
+    ours = fused(RACK)
+    monkeypatch.setattr(compiled_module, "_warned", False)
+
+    def others(x: Array) -> dict[str, Array]:
+        outputs = ours.outputs(x)
+        return outputs | {"q_1": np.nextafter(outputs["q_1"], np.inf)}
+
+    with pytest.warns(RuntimeWarning, match="it differs from the functions"):
+        assert load_kernel(ours.compiled, ours.checker, others) is None
+
+
+@pytest.fixture(scope="module")
+def cell() -> Cell:
+    return Cell(load(RACK))
+
+
+@pytest.fixture(scope="module")
+def found(cell: Cell) -> tuple[Explanation, ...]:
+    x = cell.initial + np.random.default_rng(2).normal(0.0, 0.15, (60, cell.n_var))
+    judged = cell.evaluate(x)
+    return explain(cell.evaluator, judged[~judged.feasible])
+
+
+def test_the_straight_line_meets_a_board(cell: Cell) -> None:
+    judged = cell.evaluate(straight_line(cell.workcell.task))
+    (why,) = explain(cell.evaluator, judged)
+    outputs = cell.evaluator.outputs(judged.x)
+    at = [outputs[name][0, [why.sample]] for name in ("pose", "q_1", "q_2")]
+    hit = cell.evaluator.checker.collision_mask(*map(np.ascontiguousarray, at))[0]
+    names = {cell.geometry.pair_names[k] for k in np.flatnonzero(hit)}
+    assert why.pair in names
+    assert f"{why.pair[0]} meets {why.pair[1]}" in str(why)
+    assert why.position == judged.position[0]
+
+
+def test_reasons_come_with_what_they_are_about(cell: Cell, found: tuple[Explanation, ...]) -> None:
+    assert len(found) > 20
+    for why in found:
+        assert why.reason in REASONS
+        assert (why.pair is not None) == (why.reason == "collision")
+        assert (why.joint is not None) == why.reason.startswith("joint_limits")
+        assert (why.robot is not None) == why.reason.startswith("reach")
+        if why.joint is not None:
+            assert why.joint.startswith(("left/joint_", "right/joint_"))
+            assert why.excess > 0.0
+            assert f"{why.excess:.3f} rad beyond its limit" in str(why)
+    counts = frequent(found)
+    assert sum(counts["pairs"].values()) == sum(why.pair is not None for why in found)
+    assert list(counts["pairs"].values()) == sorted(counts["pairs"].values(), reverse=True)
+
+
+def test_missing_reach_is_the_distance_beyond_the_stretched_arm(cell: Cell) -> None:
+    robot, contact = cell.workcell.robots[0], cell.workcell.contacts[0]
+    carry, orientation = cell.carry(cell.initial), cell.workcell.task.orientation
+    at = box_placement(orientation, carry.pose[0])
+    held = missing_reach(robot, contact, at, carry.arms[0].q[0])
+    assert held == pytest.approx(0.0, abs=1e-6)
+    near, far = at.copy(), at.copy()
+    near[1, 3], far[1, 3] = -2.0, -3.0
+    lacks = [missing_reach(robot, contact, T, carry.arms[0].q[0]) for T in (near, far)]
+    assert lacks[0] > 0.5
+    assert lacks[1] - lacks[0] == pytest.approx(1.0, abs=0.2)

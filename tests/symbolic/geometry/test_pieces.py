@@ -1,9 +1,14 @@
-"""Convex pieces: supports, distances and covers against points of the shapes themselves."""
+"""Convex pieces: shapes, hulls and what becomes of meshes."""
 
 from __future__ import annotations
 
+import os
+import zipfile
+from pathlib import Path
+
 import numpy as np
 import pytest
+import trimesh
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial import ConvexHull
@@ -11,6 +16,7 @@ from scipy.spatial import ConvexHull
 from symbolic.array import Array
 from symbolic.errors import CollisionModelError
 from symbolic.geometry.covers import chain_cover, slab_cover
+from symbolic.geometry.hulls import CollisionModelWarning, convex_pieces
 from symbolic.geometry.pieces import (
     ConvexShape,
     Hull,
@@ -26,9 +32,12 @@ from symbolic.geometry.pieces import (
     support,
     swept_cylinder,
 )
+from symbolic.read.meshes import MOST_FACES
 from symbolic.records import Box, Capsule, Cylinder, Sphere
 from symbolic.records.poses import pose_matrix
+from tests.robots import ur10_urdf
 from tests.symbolic.geometry.collision_cells import geometry_of
+from tests.waiting import soon
 
 lengths = st.floats(0.02, 1.0)
 angles = st.floats(-3.0, 3.0)
@@ -186,3 +195,268 @@ def test_shapes_without_size_are_refused(shape: ConvexShape, word: str) -> None:
 def test_poses_that_are_no_poses_are_refused() -> None:
     with pytest.raises(CollisionModelError, match="not a rotation"):
         check_piece(Piece(Sphere(1.0), 2.0 * np.eye(4)), "'shelf'")
+
+
+MESHES = ur10_urdf().parents[1] / "meshes" / "ur10" / "collision"
+ONES = np.ones(3)
+
+
+def outside(points: Array, pieces: tuple[Hull, ...]) -> Array:
+    """Distance of each point from the nearest piece's half-spaces; at most 0 inside one."""
+    depth = [
+        (points @ hull.equations[:, :3].T + hull.equations[:, 3]).max(axis=1)
+        for hull in (ConvexHull(piece.vertices) for piece in pieces)
+    ]
+    return np.asarray(np.min(depth, axis=0))
+
+
+def angle_profile() -> trimesh.Trimesh:
+    polygon = [(0, 0), (1, 0), (1, 0.1), (0.1, 0.1), (0.1, 1), (0, 1)]
+    lower, upper = (np.array([(x, y, z) for x, y in polygon]) for z in (0.0, 0.5))
+    vertices = np.vstack([lower, upper])
+    caps = [(0, 3, 1), (1, 3, 2), (0, 5, 3), (3, 5, 4)]
+    faces = caps + [tuple(6 + k for k in reversed(face)) for face in caps]
+    for k in range(6):
+        n = (k + 1) % 6
+        faces += [(k, n, n + 6), (k, n + 6, k + 6)]
+    mesh = trimesh.Trimesh(vertices, faces)
+    mesh.fix_normals()
+    return mesh
+
+
+@pytest.mark.filterwarnings("ignore::symbolic.geometry.hulls.CollisionModelWarning")
+@pytest.mark.parametrize("name", sorted(path.name for path in MESHES.glob("*.stl")))
+def test_pieces_of_the_ur10_contain_its_meshes(name: str) -> None:
+    mesh = trimesh.load_mesh(MESHES / name)
+    pieces = convex_pieces(MESHES / name, ONES)
+    points, _ = trimesh.sample.sample_surface(mesh, 3000, seed=1)
+    assert outside(np.vstack([points, mesh.vertices]), pieces).max() < 1e-9
+    hull_volume = ConvexHull(mesh.vertices).volume
+    assert sum(ConvexHull(piece.vertices).volume for piece in pieces) < 1.3 * hull_volume
+
+
+def test_a_concave_mesh_is_cut_at_its_corner(tmp_path: Path) -> None:
+    path = tmp_path / "angle.stl"
+    mesh = angle_profile()
+    mesh.export(path)
+    pieces = convex_pieces(path, ONES)
+    volume = sum(ConvexHull(piece.vertices).volume for piece in pieces)
+    assert mesh.is_watertight
+    assert volume < 1.5 * mesh.volume < ConvexHull(mesh.vertices).volume
+    block = np.random.default_rng(4).uniform(0.0, (1.0, 1.0, 0.5), (4000, 3))
+    inside = block[(block[:, 0] < 0.1) | (block[:, 1] < 0.1)]
+    surface, _ = trimesh.sample.sample_surface(mesh, 3000, seed=2)
+    assert outside(np.vstack([inside, surface, mesh.vertices]), pieces).max() < 1e-9
+
+
+def test_faces_of_a_hull_point_outwards() -> None:
+    (hull,) = convex_pieces(MESHES / "base.stl", ONES)
+    corners = hull.vertices[hull.faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    outward = np.einsum("ij,ij->i", normals, corners[:, 0] - hull.vertices.mean(axis=0))
+    assert np.all(outward > 0.0)
+
+
+@pytest.mark.parametrize("scale", [(0.5, 1.0, 2.0), (-1.0, 1.0, 1.0)])
+def test_the_scale_is_applied(tmp_path: Path, scale: tuple[float, float, float]) -> None:
+    path = tmp_path / "box.stl"
+    trimesh.creation.box((1.0, 2.0, 3.0)).export(path)
+    (hull,) = convex_pieces(path, np.array(scale))
+    assert np.ptp(hull.vertices, axis=0) == pytest.approx(np.abs(scale) * (1.0, 2.0, 3.0))
+
+
+def test_a_mesh_with_holes_is_used_as_its_hull_with_a_warning(tmp_path: Path) -> None:
+    path = tmp_path / "open.stl"
+    mesh = angle_profile()
+    mesh.update_faces(np.arange(len(mesh.faces)) > 2)
+    mesh.export(path)
+    with pytest.warns(CollisionModelWarning, match=r"1 part\(s\).*not watertight.*Close the holes"):
+        (hull,) = convex_pieces(path, ONES)
+    assert ConvexHull(hull.vertices).volume == pytest.approx(ConvexHull(mesh.vertices).volume)
+
+
+def write_flat(path: Path) -> None:
+    trimesh.Trimesh([(0, 0, 0), (1, 0, 0), (0, 1, 0)], [(0, 1, 2)]).export(path)
+
+
+def write_empty(path: Path) -> None:
+    path.write_text("solid nothing\nendsolid nothing\n")
+
+
+def write_nonsense(path: Path) -> None:
+    path.write_bytes(b"not a mesh at all")
+
+
+def write_millimetres(path: Path) -> None:
+    trimesh.creation.box((300.0, 200.0, 100.0)).export(path)
+
+
+def write_endless(path: Path) -> None:
+    mesh = trimesh.creation.icosphere(subdivisions=7)
+    assert len(mesh.faces) > MOST_FACES
+    mesh.export(path)
+
+
+@pytest.mark.parametrize(
+    ("write", "message"),
+    [
+        (write_flat, "flat.*give it a thickness"),
+        (write_empty, "cannot be read|empty"),
+        (write_nonsense, "cannot be read|empty"),
+        (write_millimetres, "enormous.*150 m from its origin.*millimetres"),
+        (write_endless, "enormous.*327680 triangles.*simplify"),
+    ],
+)
+def test_unusable_meshes_are_refused(tmp_path: Path, write: object, message: str) -> None:
+    path = tmp_path / "bad.stl"
+    assert callable(write)
+    write(path)
+    with pytest.raises(CollisionModelError, match=message):
+        convex_pieces(path, ONES)
+
+
+def test_a_missing_mesh_is_named(tmp_path: Path) -> None:
+    with pytest.raises(
+        CollisionModelError, match=r"gone\.stl: the mesh cannot be read \(No such file"
+    ):
+        convex_pieces(tmp_path / "gone.stl", ONES)
+
+
+def write_loose(path: Path, count: int) -> None:
+    rng = np.random.default_rng(5)
+    corners = rng.uniform(-0.5, 0.5, (count, 1, 3)) + rng.normal(0.0, 0.01, (count, 3, 3))
+    faces = np.arange(3 * count).reshape(-1, 3)
+    trimesh.Trimesh(corners.reshape(-1, 3), faces, process=False).export(path)
+
+
+@pytest.mark.parametrize(
+    ("count", "message"),
+    [(190_000, "enormous mesh, 190000 triangles"), (3000, "3000 separate parts; at most 400")],
+)
+def test_more_than_can_be_worked_with_is_told_at_once(
+    tmp_path: Path, count: int, message: str
+) -> None:
+    write_loose(tmp_path / "loose.stl", count)
+    with soon(), pytest.raises(CollisionModelError, match=rf"loose\.stl: {message}.*simplify"):
+        convex_pieces(tmp_path / "loose.stl", ONES)
+
+
+@pytest.mark.parametrize("name", ["mesh.zip", "mesh.stl", "mesh.ply", "mesh.glb"])
+def test_an_archive_is_no_mesh(tmp_path: Path, name: str) -> None:
+    mesh = trimesh.creation.box((0.1, 0.1, 0.1)).export(file_type="stl")
+    with zipfile.ZipFile(tmp_path / name, "w") as archive:
+        archive.writestr("box.stl", mesh)
+    with pytest.raises(CollisionModelError, match=r"cannot be read as a mesh|empty"):
+        convex_pieces(tmp_path / name, ONES)
+
+
+def test_a_header_that_promises_more_than_there_is(tmp_path: Path) -> None:
+    path = tmp_path / "m.ply"
+    for kind in ("ascii", "binary_little_endian"):
+        path.write_text(
+            f"ply\nformat {kind} 1.0\nelement vertex 1000000000\nproperty double x\n"
+            "property double y\nproperty double z\nelement face 1000000000\n"
+            "property list uchar int vertex_indices\nend_header\n0 0 0\n"
+        )
+        with pytest.raises(CollisionModelError, match=r"m\.ply"):
+            convex_pieces(path, ONES)
+
+
+def test_entities_are_not_unfolded(tmp_path: Path) -> None:
+    path = tmp_path / "m.dae"
+    path.write_text('<?xml version="1.0"?><!DOCTYPE a [<!ENTITY b "c">]><COLLADA>&b;</COLLADA>')
+    with pytest.raises(CollisionModelError, match=r"m\.dae: the mesh has a document type"):
+        convex_pieces(path, ONES)
+
+
+@pytest.mark.parametrize("encoding", ["utf-16", "utf-7"])
+def test_entities_are_not_hidden_by_an_encoding(tmp_path: Path, encoding: str) -> None:
+    path = tmp_path / "m.dae"
+    document = f'<?xml version="1.0" encoding="{encoding}"?><!DOCTYPE a><COLLADA/>'
+    path.write_bytes(document.encode(encoding))
+    with pytest.raises(CollisionModelError, match=r"the mesh (byte 0 is|declares the enco)"):
+        convex_pieces(path, ONES)
+
+
+@pytest.mark.parametrize(
+    ("name", "begin", "piece"),
+    [
+        ("m.obj", "v 0 0 0\n", "f 1 1 1\n"),
+        ("m.obj", "v 0 0 0\nf ", "1\u00a0"),
+        ("m.off", "OFF\n9 9 0\n", "0 0 0\n"),
+        ("m.ply", "ply\nformat ascii 1.0\ncomment binary\n", "0 0 0\n"),
+        ("m.dae", "<COLLADA>", "<a/>"),
+        ("m.dae", "<COLLADA>", "<a b='' c=''/>"),
+    ],
+)
+def test_a_text_without_end_is_not_read(tmp_path: Path, name: str, begin: str, piece: str) -> None:
+    path = tmp_path / name
+    path.write_text(begin + piece * 1_600_000)
+    refused = r"enormous mesh, more than \d+ (words|elements)"
+    with soon(), pytest.raises(CollisionModelError, match=refused):
+        convex_pieces(path, ONES)
+
+
+def test_a_pipe_is_no_mesh(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe.stl")
+    with pytest.raises(CollisionModelError, match=r"it is a pipe"):
+        convex_pieces(tmp_path / "pipe.stl", ONES)
+
+
+@pytest.mark.parametrize("scale", [(1e308, 1.0, 1.0), (-1e308, 1e308, 1e308)])
+def test_a_scale_beyond_all_bounds_is_told(
+    tmp_path: Path, scale: tuple[float, float, float]
+) -> None:
+    path = tmp_path / "box.stl"
+    trimesh.creation.box((20.0, 20.0, 20.0)).export(path)
+    with pytest.raises(CollisionModelError, match=r"enormous mesh.*Set its scale"):
+        convex_pieces(path, np.array(scale))
+
+
+def test_vertices_that_are_no_numbers_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "nan.obj"
+    path.write_text("v 0 0 0\nv 1 0 0\nv 0 nan 0\nv 0 0 1\nf 1 2 3\nf 1 2 4\nf 2 3 4\nf 1 3 4\n")
+    with pytest.raises(CollisionModelError, match="not finite"):
+        convex_pieces(path, ONES)
+
+
+COLLADA = """<?xml version="1.0"?>
+<COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1">
+<asset><unit meter="{unit}"/><up_axis>{up}</up_axis></asset>
+<library_geometries><geometry id="g"><mesh>
+<source id="p"><float_array id="a" count="12">0 0 0 1 0 0 0 2 0 0 0 3</float_array>
+<technique_common><accessor source="#a" count="4" stride="3">
+<param name="X" type="float"/><param name="Y" type="float"/><param name="Z" type="float"/>
+</accessor></technique_common></source>
+<vertices id="v"><input semantic="POSITION" source="#p"/></vertices>
+<triangles count="4"><input semantic="VERTEX" source="#v" offset="0"/>
+<p>0 2 1 0 1 3 0 3 2 1 2 3</p></triangles></mesh></geometry></library_geometries>
+<library_visual_scenes><visual_scene id="s"><node><matrix>{matrix}</matrix>
+<instance_geometry url="#g"/></node></visual_scene></library_visual_scenes>
+<scene><instance_visual_scene url="#s"/></scene></COLLADA>"""
+
+
+@pytest.mark.parametrize("unit", [1.0, 0.01])
+@pytest.mark.parametrize("up", ["Z_UP", "Y_UP"])
+def test_collada_units_and_transforms_count_and_its_up_axis_does_not(
+    tmp_path: Path, unit: float, up: str
+) -> None:
+    path = tmp_path / "shape.dae"
+    matrix = "0 -1 0 5  1 0 0 0  0 0 1 0  0 0 0 1"
+    path.write_text(COLLADA.format(unit=unit, up=up, matrix=matrix), encoding="utf-8")
+    (hull,) = convex_pieces(path, np.array([1.0, 1.0, 2.0]))
+    corners = np.array([[5, 0, 0], [5, 1, 0], [3, 0, 0], [5, 0, 6]]) * unit
+    found = hull.vertices[np.lexsort(hull.vertices.T)]
+    assert found == pytest.approx(corners[np.lexsort(corners.T)], abs=1e-12)
+
+
+@pytest.mark.parametrize("form", ["stl", "obj", "dae"])
+def test_every_form_of_a_mesh_gives_the_same_pieces(tmp_path: Path, form: str) -> None:
+    mesh = angle_profile()
+    path = tmp_path / f"angle.{form}"
+    mesh.export(path)
+    pieces = convex_pieces(path, ONES)
+    volume = sum(ConvexHull(piece.vertices).volume for piece in pieces)
+    mesh.export(tmp_path / "angle.ply")
+    expected = convex_pieces(tmp_path / "angle.ply", ONES)
+    assert volume == pytest.approx(sum(ConvexHull(p.vertices).volume for p in expected), rel=1e-5)

@@ -1,16 +1,34 @@
-"""docs/workcell.md names every key and shows messages as they are."""
+"""Workcell files: read, changed, written and read again."""
 
 from __future__ import annotations
 
+import dataclasses
+import importlib.metadata
+import math
 import re
+import tempfile
+import tomllib
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from symbolic.errors import WorkcellError
-from symbolic.read.cell import load
+from symbolic.read.arms import body_names
+from symbolic.read.cell import changed, load
+from symbolic.read.changes import changed_text
+from symbolic.read.checks import stretched_length
+from symbolic.read.payload import face_normal, pad_rotation
+from symbolic.records import USUAL, Body, Box, Cylinder, Driver, Sphere, Uncertainty, Workcell
+from symbolic.records.poses import inverse, pose_matrix
+from tests.symbolic.cells import rack_cell
 from tests.symbolic.read.problem_cases import put
-from tests.symbolic.read.samples import STUDIES, sample_data, write
+from tests.symbolic.read.samples import GOFA, RACK, STUDIES, sample_data, write
+from tests.symbolic.read.strategies import cells, numbers, vectors
 
 DOCUMENT = (STUDIES.parent / "docs" / "workcell.md").read_text(encoding="utf-8")
 SECTIONS = (
@@ -62,3 +80,324 @@ def test_the_messages_shown_are_real(tmp_path: Path) -> None:
     assert len(told) == 2
     for text in told:
         assert f"  - {text}\n" in DOCUMENT
+
+
+TEXT = b"""
+name = "a \\"cell\\""
+[task]
+samples = 100
+goal = [0.0, 1e-3, 2]
+[[contacts]]
+friction = 1.0
+[[contacts]]
+friction = 2.0
+further = [{ xyz = [0, 0, 1], normal = [0.0, 1.0, 0.0] }]
+[[environment]]
+name = "top board"
+xyz = [1.0, 2.0, 3.0]
+[[environment]]
+name = "v1.5"
+kind = "box"
+"""
+
+
+def read(changes: dict[str, Any]) -> dict[str, Any]:
+    return tomllib.loads(changed_text(TEXT, changes, "cell.toml").decode())
+
+
+def test_nothing_changed_reads_the_same() -> None:
+    assert read({}) == tomllib.loads(TEXT.decode())
+
+
+def test_the_rack_reads_the_same() -> None:
+    content = RACK.read_bytes()
+    again = changed_text(content, {}, "rack.toml")
+    assert tomllib.loads(again.decode()) == tomllib.loads(content.decode())
+
+
+def test_paths_lead_by_index_by_name_or_to_all() -> None:
+    assert read({"task.samples": 50})["task"]["samples"] == 50
+    assert [c["friction"] for c in read({"contacts.friction": 0.5})["contacts"]] == [0.5, 0.5]
+    assert [c["friction"] for c in read({"contacts[1].friction": 0.5})["contacts"]] == [1.0, 0.5]
+    found = read({"environment.top board.xyz": np.array([0.0, 0.0, 1.0])})["environment"]
+    assert found[0]["xyz"] == [0.0, 0.0, 1.0]
+    assert "xyz" not in found[1]
+    assert read({"environment.v1.5.kind": "sphere"})["environment"][1]["kind"] == "sphere"
+    assert read({"uncertainty.friction": 0.1})["uncertainty"] == {"friction": 0.1}
+    assert read({"contacts[1].further[0].xyz": [1, 2, 3]})["contacts"][1]["further"][0]["xyz"] == [
+        1, 2, 3,
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "path", ["", "contacts[2].friction", "task.samples.more", "name.of", "contacts[0]", ".x"]
+)
+def test_a_path_that_leads_nowhere_is_told(path: str) -> None:
+    with pytest.raises(WorkcellError, match="leads nowhere"):
+        changed_text(TEXT, {path: 1.0}, "cell.toml")
+
+
+def test_a_changed_cell_is_checked_like_a_file() -> None:
+    with pytest.raises(WorkcellError, match=r"payload\.mass: found -1; allowed is"):
+        changed(rack_cell(), {"payload.mass": -1.0})
+    with pytest.raises(WorkcellError, match=r"payload\.mas: unknown key"):
+        changed(rack_cell(), {"payload.mas": 1.0})
+    with pytest.raises(WorkcellError, match="outside the box"):
+        changed(rack_cell(), {"contacts[0].xyz": [0.0, 0.3, 0.0]})
+
+
+def test_changes_add_up_and_do_not_touch_the_cell(tmp_path: Any) -> None:
+    cell = rack_cell()
+    lighter = changed(cell, {"payload.mass": 5.0})
+    both = changed(lighter, {"contacts.friction": 0.8})
+    assert cell.payload.mass == 10.0
+    assert (both.payload.mass, both.contacts[1].friction) == (5.0, 0.8)
+    assert len({cell.digest, lighter.digest, both.digest}) == 3
+    # Solid boxes of another mass have another inertia.
+    assert lighter.payload.inertia[0, 0] == pytest.approx(0.5 * cell.payload.inertia[0, 0])
+    file = RACK.with_name("never written.toml")
+    assert load(file.with_name(RACK.name), text=both.text).digest == both.digest
+
+
+def expected_pose(data: dict[str, Any]) -> np.ndarray:
+    """The transform of {xyz, rpy} by another library."""
+    matrix = np.eye(4)
+    # Extrinsic x, y, z turns are Rz(yaw) Ry(pitch) Rx(roll).
+    matrix[:3, :3] = Rotation.from_euler("xyz", data.get("rpy", [0, 0, 0])).as_matrix()
+    matrix[:3, 3] = data.get("xyz", [0, 0, 0])
+    return matrix
+
+
+def assert_same_body(body: Body, data: dict[str, Any]) -> None:
+    assert body.name == data["name"]
+    np.testing.assert_allclose(body.pose, expected_pose(data), atol=1e-14)
+    if data["kind"] == "box":
+        assert isinstance(body.shape, Box)
+        assert body.shape.size.tolist() == data["size"]
+    elif data["kind"] == "sphere":
+        assert body.shape == Sphere(data["radius"])
+    else:
+        assert body.shape == Cylinder(data["radius"], data["length"])
+
+
+def assert_same_cell(cell: Workcell, data: dict[str, Any]) -> None:
+    assert cell.name == data["name"]
+    assert cell.start_branch == tuple(r.get("start_branch", -1) for r in data["robots"])
+    for robot, entry in zip(cell.robots, data["robots"], strict=True):
+        np.testing.assert_allclose(robot.T_world_base, expected_pose(entry["base"]), atol=1e-14)
+        np.testing.assert_allclose(robot.T_flange_pad, expected_pose(entry["pad"]), atol=1e-14)
+        for key in ("velocity_max", "torque_max", "position_lower", "position_upper"):
+            if key in entry:
+                assert getattr(robot, key).tolist() == entry[key]
+        acceleration = np.broadcast_to(entry.get("acceleration_max", 5.0), 6)
+        np.testing.assert_array_equal(robot.acceleration_max, acceleration)
+        assert (robot.jerk_max is None) == ("jerk_max" not in entry)
+        if robot.jerk_max is not None:
+            np.testing.assert_array_equal(robot.jerk_max, np.broadcast_to(entry["jerk_max"], 6))
+        assert robot.driver == Driver(**entry.get("driver", {}))
+        assert robot.min_manipulability == entry.get("min_manipulability", 0.005)
+        for tool, tool_entry in zip(robot.tool, entry["tool"], strict=True):
+            assert_same_body(tool, tool_entry)
+    payload = data["payload"]
+    assert cell.payload.size.tolist() == payload["size"]
+    assert cell.payload.mass == payload["mass"]
+    assert cell.payload.centre_of_mass.tolist() == payload.get("centre_of_mass", [0, 0, 0])
+    if isinstance(payload.get("inertia"), list):
+        assert cell.payload.inertia.tolist() == payload["inertia"]
+    assert cell.payload.acceleration_max == payload.get("acceleration_max", 5.0)
+    assert cell.payload.jerk_max == payload.get("jerk_max")
+    for contact, entry in zip(cell.contacts, data["contacts"], strict=True):
+        np.testing.assert_allclose(contact.T_box_pad[:3, 3], entry["xyz"], atol=1e-15)
+        assert (contact.friction, contact.patch_radius) == (
+            entry["friction"],
+            entry["patch_radius"],
+        )
+    assert_same_task(cell, data["task"])
+    for body, entry in zip(cell.environment, data["environment"], strict=True):
+        assert_same_body(body, entry)
+    collision = data.get("collision", {})
+    assert cell.collision.tolerance == collision.get("tolerance", 0.0)
+    assert [vars(pair) for pair in cell.collision.ignored] == collision.get("ignored", [])
+
+
+def assert_same_uncertainty(cell: Workcell, data: dict[str, Any] | None) -> None:
+    """Nothing that is not told, but the usual set where there is no table."""
+    if data is None:
+        assert cell.uncertainty is USUAL
+        return
+    assert cell.uncertainty.stated
+    for name, nothing in vars(Uncertainty()).items():
+        if name != "stated":
+            found = getattr(cell.uncertainty, name)
+            np.testing.assert_array_equal(found, data.get(name, nothing), err_msg=name)
+
+
+def assert_same_handling(cell: Workcell, data: dict[str, Any]) -> None:
+    usual = {"stand_off": 0.05, "pressing_speed": 0.05, "pressing_rate": 100.0}
+    usual |= {"lifting_speed": 0.1}
+    nothing = {"lift_height": None, "set_down_height": None}
+    assert vars(cell.handling) == usual | nothing | data
+
+
+def assert_same_task(cell: Workcell, data: dict[str, Any]) -> None:
+    task = cell.task
+    bounds = [(data["start"], data["start"])]
+    for waypoint in data["waypoints"]:
+        pair = (
+            waypoint.get("lower", waypoint.get("fixed")),
+            waypoint.get("upper", waypoint.get("fixed")),
+        )
+        bounds += [pair] * waypoint.get("count", 1)
+    bounds.append((data["goal"], data["goal"]))
+    assert [(w.lower.tolist(), w.upper.tolist()) for w in task.waypoints] == bounds
+    free = [pair for pair in bounds if pair[0] != pair[1]]
+    assert task.n_path == 6 * len(free)
+    assert task.n_var == task.n_path + (task.time_law == "optimal") == len(task.lower)
+    if "force_limit" in data:
+        assert list(task.force_limit) == data["force_limit"]
+    else:
+        still = cell.payload.mass * 9.81 / sum(c.friction for c in cell.contacts)
+        assert task.force_limit[0] == 1.001 * still
+        assert task.force_limit[1] == max(1.001 * still, task.reference_force.min())
+    centres = np.mean(free, axis=1)
+    np.testing.assert_allclose(task.initial, np.array(data.get("initial", centres)), atol=1e-15)
+    assert task.samples == data.get("samples", 100)
+    assert task.allocation == data.get("allocation", "paper")
+    assert task.time_law == data.get("time_law", "constant")
+    assert task.reference_speed == data["reference_speed"]
+    assert task.reference_angular_speed == data.get("reference_angular_speed", 0.5)
+    assert task.ramp_time == data.get("ramp_time", 0.5)
+    np.testing.assert_array_equal(task.reference_force, np.broadcast_to(data["reference_force"], 2))
+    assert [vars(contact) for contact in task.allowed_contacts] == data["allowed_contacts"]
+
+
+@given(cells())
+def test_written_cells_are_read_back(data: dict[str, Any]) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        cell = load(write(Path(folder), data))
+    assert_same_cell(cell, data)
+    assert_same_uncertainty(cell, data.get("uncertainty"))
+    assert_same_handling(cell, data.get("handling", {}))
+
+
+@given(st.integers(0, 2), st.sampled_from([-1, 1]), numbers(-6, 6))
+def test_pad_rotation(axis: int, side: int, spin: float) -> None:
+    rotation = pad_rotation(face_normal(axis, side), spin)
+    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-14)
+    assert np.linalg.det(rotation) == pytest.approx(1.0)
+    inward = np.zeros(3)
+    inward[axis] = -side
+    np.testing.assert_array_equal(rotation[:, 2], inward)
+    # Turning back about the inward normal restores the documented x axis.
+    zero_spin = Rotation.from_rotvec(-spin * inward).as_matrix() @ rotation
+    expected = [1, 0, 0] if axis == 2 else [0, 0, 1]
+    np.testing.assert_allclose(zero_spin[:, 0], expected, atol=1e-14)
+
+
+@given(vectors(-9, 9), vectors(-6, 6))
+def test_inverse_of_a_pose(xyz: list[float], rpy: list[float]) -> None:
+    pose = pose_matrix(xyz, rpy)
+    np.testing.assert_allclose(pose @ inverse(pose), np.eye(4), atol=1e-13)
+
+
+def test_contact_is_moved_onto_its_face(tmp_path: Path) -> None:
+    data = sample_data()
+    data["contacts"][0]["xyz"] = [0.01, 0.2 + 9e-7, -0.02]
+    cell = load(write(tmp_path, data))
+    assert cell.contacts[0].T_box_pad[:3, 3].tolist() == [0.01, 0.2, -0.02]
+
+
+def test_locked_joint_leaves_six(tmp_path: Path) -> None:
+    """A seventh joint, between the base and the first one, is held where the file says."""
+    text = GOFA.read_text(encoding="utf-8")
+    text = text.replace('<parent link="base_link"/>', '<parent link="turntable"/>')
+    text = text.replace(
+        '<link name="tool0"/>',
+        '<link name="tool0"/><link name="turntable"/><joint name="turn" type="revolute">'
+        '<parent link="base_link"/><child link="turntable"/><axis xyz="0 0 1"/>'
+        '<origin xyz="0 0 0.1"/><limit lower="-3" upper="3" velocity="1" effort="500"/></joint>',
+    )
+    (tmp_path / "arm.urdf").write_text(text, encoding="utf-8")
+    data = sample_data()
+    data["robots"][0] |= {"urdf": "arm.urdf", "locked_joints": {"turn": 0.5}}
+    cell = load(write(tmp_path, data))
+    assert cell.robots[0].locked_joints == (("turn", 0.5),)
+    np.testing.assert_allclose(cell.robots[0].torque_max, [390, 400, 160, 60, 60, 60])
+
+
+def test_another_make_of_arm(tmp_path: Path) -> None:
+    """A UR10 with its meshes, as its own package ships it."""
+    files = importlib.metadata.files("example-robot-data") or []
+    (entry,) = (file for file in files if file.name == "ur10_robot.urdf")
+    urdf = Path(str(entry.locate())).resolve()
+    share = next(folder.parent for folder in urdf.parents if folder.name == "example-robot-data")
+    data = sample_data()
+    for robot in data["robots"]:
+        robot |= {"urdf": str(urdf), "package_dirs": [str(share)], "flange": "tool0"}
+    cell = load(write(tmp_path, data))
+    robot = cell.robots[0]
+    np.testing.assert_allclose(robot.torque_max, [330, 330, 150, 54, 54, 54])
+    assert robot.position_upper[2] == pytest.approx(math.pi)
+
+
+@pytest.fixture(scope="module")
+def rack() -> Workcell:
+    return load(RACK)
+
+
+def test_contacts_squeeze_the_box(rack: Workcell) -> None:
+    for robot, contact in zip(rack.robots, rack.contacts, strict=True):
+        origin, normal = contact.T_box_pad[:3, 3], contact.T_box_pad[:3, 2]
+        assert abs(origin[1]) == pytest.approx(0.20)
+        # The normal leads from the robot that holds the contact into the box.
+        assert normal @ origin < 0
+        assert normal @ (origin - robot.T_world_base[:3, 3]) > 0
+        assert (contact.friction, contact.patch_radius) == (1.0, 0.0315)
+
+
+def test_boards_from_the_paper(rack: Workcell) -> None:
+    bodies = {body.name: body for body in rack.environment}
+    for name, top in (("bottom board", 0.2), ("middle board", 0.6), ("top board", 1.0)):
+        shape = bodies[name].shape
+        assert isinstance(shape, Box)
+        np.testing.assert_allclose(shape.size[:2], [0.40, 1.00])
+        assert bodies[name].pose[2, 3] + shape.size[2] / 2 == pytest.approx(top)
+    ground = bodies["ground"]
+    assert isinstance(ground.shape, Box)
+    assert ground.pose[2, 3] + ground.shape.size[2] / 2 == pytest.approx(0.0)
+
+
+def test_names_of_bodies(rack: Workcell) -> None:
+    names = body_names(rack)
+    assert names["payload"] == ("payload",)
+    assert names["left"][0] == "left/base_link"
+    assert names["right"][-1] == "right/pad"
+    assert "top board" in names["environment"]
+    flat = [name for group in names.values() for name in group]
+    assert len(set(flat)) == len(flat)
+
+
+def test_stretched_length_is_the_sum_of_the_links(rack: Workcell) -> None:
+    shoulder, length = stretched_length(rack.robots[0])
+    above = shoulder - rack.robots[0].T_world_base[:3, 3]
+    np.testing.assert_allclose(above, [0.0, 0.0, 0.338], atol=1e-12)
+    assert length == pytest.approx(0.707 + 0.110 + 0.534 + np.hypot(0.101, 0.080))
+
+
+def arrays_in(value: object) -> list[np.ndarray]:
+    if isinstance(value, np.ndarray):
+        return [value]
+    if isinstance(value, tuple):
+        return [array for entry in value for array in arrays_in(entry)]
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        fields = dataclasses.fields(value)
+        return [array for f in fields for array in arrays_in(getattr(value, f.name))]
+    return []
+
+
+def test_arrays_are_read_only(rack: Workcell) -> None:
+    arrays = arrays_in(rack)
+    assert len(arrays) > 40
+    for array in arrays:
+        assert array.dtype == np.float64
+        assert not array.flags.writeable

@@ -1,19 +1,27 @@
-"""URDF files as records: what is right is read as Pinocchio reads it, what is wrong is named."""
+"""URDF and SRDF files, packages and robots by name."""
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
 import pytest
+from robot_descriptions._repositories import REPOSITORIES
 
-from symbolic.errors import UrdfError
+from symbolic.errors import OutsideError, UrdfError, WorkcellError
 from symbolic.read.arms import arm_model, link_frame, reduced_model
-from symbolic.read.urdf import MOST_LINKS, UrdfMesh, parse_urdf, read_urdf
+from symbolic.read.cell import load
+from symbolic.read.cell_files import collect_cell, unpack_cell
+from symbolic.read.descriptions import find_package, further_package_dirs, resolve_mesh
+from symbolic.read.named_robots import named_robot
+from symbolic.read.urdf import MOST_LINKS, DisabledPair, UrdfMesh, parse_urdf, read_srdf, read_urdf
 from symbolic.records import Box, Cylinder
 from tests.robots import GOFA_URDF, robot_record, ur10_urdf
+from tests.symbolic.cells import RACK
 from tests.symbolic.read.urdf_cases import CASES, LOOP
 from tests.waiting import soon
 
@@ -133,3 +141,189 @@ def test_nothing_is_said_on_the_terminal(capfd: pytest.CaptureFixture[str], tmp_
         reduced_model(read_urdf(path))
     reduced_model(read_urdf(GOFA_URDF))
     assert capfd.readouterr() == ("", "")
+
+
+def test_pairs_are_read_in_order_and_the_rest_is_passed_over(tmp_path: Path) -> None:
+    path = tmp_path / "arm.srdf"
+    path.write_text(
+        '<robot name="arm"><group name="g"><joint name="j"/></group>'
+        '<disable_collisions link1="a" link2="b" reason="Adjacent"/>'
+        '<disable_collisions link1="a" link2="c"/></robot>',
+        encoding="utf-8",
+    )
+    assert read_srdf(path) == (DisabledPair("a", "b", "Adjacent"), DisabledPair("a", "c", ""))
+
+
+def test_a_pair_without_a_link_is_told(tmp_path: Path) -> None:
+    path = tmp_path / "arm.srdf"
+    path.write_text('<robot><disable_collisions link1="a"/></robot>', encoding="utf-8")
+    with pytest.raises(UrdfError, match=r"arm\.srdf: .*disable_collisions\[0\] link2: is missing"):
+        read_srdf(path)
+
+
+NOWHERE = Path("/nowhere/arm.urdf")
+
+
+@pytest.fixture(autouse=True)
+def no_ros(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("ROS_PACKAGE_PATH", raising=False)
+    monkeypatch.delenv("AMENT_PREFIX_PATH", raising=False)
+
+
+def package(folder: Path, name: str = "") -> Path:
+    folder.mkdir(parents=True)
+    text = f"<package><name>{name}</name></package>" if name else "<package/>"
+    (folder / "package.xml").write_text(text, encoding="utf-8")
+    return folder
+
+
+def test_given_folders_come_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    given, ament = package(tmp_path / "a" / "arm"), package(tmp_path / "b" / "share" / "arm")
+    monkeypatch.setenv("AMENT_PREFIX_PATH", f"/nothing:{tmp_path / 'b'}")
+    assert find_package("arm", [tmp_path / "a"], NOWHERE) == given
+    assert find_package("arm", [], NOWHERE) == ament
+
+
+def test_a_workspace_is_searched_below_its_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    deep = package(tmp_path / "src" / "vendor" / "arm")
+    package(tmp_path / "src" / "build" / "arm_2")
+    monkeypatch.setenv("ROS_PACKAGE_PATH", f"{tmp_path / 'src'}")
+    assert find_package("arm", [], NOWHERE) == deep
+    assert find_package("arm_2", [], NOWHERE) is None
+    monkeypatch.setenv("ROS_PACKAGE_PATH", str(deep))
+    assert find_package("arm", [], NOWHERE) == deep
+
+
+def test_a_description_lies_in_its_own_package(tmp_path: Path) -> None:
+    own = package(tmp_path / "arm_description")
+    assert find_package("arm_description", [], own / "urdf" / "arm.urdf") == own
+
+
+def test_a_source_folder_may_bear_another_name_than_its_package(tmp_path: Path) -> None:
+    """As moveit_resources/panda_description, the package moveit_resources_panda_description."""
+    arm = package(tmp_path / "src" / "arm", "vendor_arm")
+    (arm / "arm.stl").write_bytes(b"solid")
+    assert find_package("vendor_arm", [tmp_path / "src"], NOWHERE) == arm
+    assert find_package("vendor_arm", [], arm / "urdf" / "arm.urdf") == arm
+    assert find_package("vendor", [tmp_path / "src"], NOWHERE) is None
+    address = "package://vendor_arm/arm.stl"
+    assert resolve_mesh(address, NOWHERE, [tmp_path / "src"]) == (arm / "arm.stl").resolve()
+    assert further_package_dirs([address], [], arm / "arm.urdf") == (tmp_path / "src",)
+    package(tmp_path / "src" / "vendor_arm")
+    assert find_package("vendor_arm", [tmp_path / "src"], NOWHERE) == arm.with_name("vendor_arm")
+
+
+def test_packages_of_the_python_environment_are_found() -> None:
+    found = find_package("example-robot-data", [], NOWHERE)
+    assert found is not None
+    assert ur10_urdf().is_relative_to(found)
+
+
+@pytest.mark.parametrize("name", ["", "..", "../arm", "/etc", ".", "a" * 100_000])
+def test_no_name_leads_elsewhere(name: str) -> None:
+    assert find_package(name, [Path("/")], NOWHERE) is None
+
+
+def test_only_what_is_missing_is_added(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    package(tmp_path / "given" / "one")
+    package(tmp_path / "ament" / "share" / "two")
+    monkeypatch.setenv("AMENT_PREFIX_PATH", str(tmp_path / "ament"))
+    addresses = ["package://one/a.stl", "package://two/b.stl", "package://three/c.stl", "d.stl"]
+    found = further_package_dirs(addresses, [tmp_path / "given"], NOWHERE)
+    assert found == (tmp_path / "ament" / "share",)
+
+
+XACRO = """<robot name="arm" xmlns:xacro="http://www.ros.org/wiki/xacro">
+<xacro:arg name="ur_type" default="none"/><link name="$(arg ur_type)"/></robot>"""
+
+
+@pytest.fixture
+def no_network(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+    """An empty cache of downloads, and a proxy that answers nobody."""
+    monkeypatch.setenv("ROBOT_DESCRIPTIONS_CACHE", str(tmp_path))
+    monkeypatch.setenv("https_proxy", "http://127.0.0.1:9")
+    monkeypatch.delitem(sys.modules, "robot_descriptions.ur10e_description", raising=False)
+    return tmp_path
+
+
+def test_files_of_an_installed_wheel() -> None:
+    assert named_robot("ur10_robot").path == ur10_urdf()
+    assert named_robot("ur10").path == ur10_urdf()
+
+
+@pytest.mark.parametrize(
+    ("name", "told"),
+    [
+        ("ur10_robt", "did you mean 'ur10_robot'"),
+        ("ur10f_description", "did you mean 'ur10e_description'"),
+        ("../ur10", "is no name"),
+    ],
+)
+def test_what_has_no_such_name(name: str, told: str) -> None:
+    with pytest.raises(OutsideError, match=told):
+        named_robot(name)
+
+
+def test_a_failed_download_is_one_message(no_network: Path) -> None:
+    with pytest.raises(OutsideError, match="is the network reachable, and git installed") as told:
+        named_robot("ur10e_description")
+    assert "\n" not in str(told.value)
+
+
+def test_a_clone_in_the_cache_is_used(no_network: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def git(*words: str) -> str:
+        who = ("-c", "user.name=a", "-c", "user.email=a@b.c")
+        done = subprocess.run(
+            ["git", "-C", str(clone), *who, *words], capture_output=True, text=True, check=True
+        )
+        return done.stdout.strip()
+
+    place = REPOSITORIES["Universal_Robots_ROS2_Description"].cache_path
+    clone = no_network / "first"
+    (clone / "urdf").mkdir(parents=True)
+    (clone / "urdf" / "ur.urdf.xacro").write_text(XACRO, encoding="utf-8")
+    git("init", "-q")
+    git("add", ".")
+    git("commit", "-qm", "as downloaded")
+    commit = git("rev-parse", "HEAD")
+    (no_network / f"{place}-{commit}").mkdir()
+    clone.rename(no_network / f"{place}-{commit}" / place)
+    monkeypatch.setenv("ROBOT_DESCRIPTION_COMMIT", commit)
+    found = named_robot("ur10e_description")
+    # The links are those of the macro with the module's own arguments.
+    assert read_urdf(found.path, found.arguments, found.package_dirs).links == ("ur10e",)
+
+
+def by_name(folder: Path, name: str) -> Path:
+    """The rack with robots by name, whatever they are there."""
+    text = RACK.read_text(encoding="utf-8")
+    path = folder / "cell.toml"
+    key = 'urdf = "../robots/gofa12.urdf"'
+    assert text.count(key) == 2
+    path.write_text(text.replace(key, f"robot = '{name}'  # by name"), encoding="utf-8")
+    return path
+
+
+def test_a_cell_is_that_of_the_file_and_travels_without_the_name(tmp_path: Path) -> None:
+    cell = load(by_name(tmp_path, "ur10"))
+    assert cell.robots[0].urdf == ur10_urdf()
+    stored = collect_cell(cell)
+    (tmp_path / "unpacked").mkdir()
+    unpacked = unpack_cell(stored, tmp_path / "unpacked")
+    assert unpacked.robots[0].urdf.is_relative_to(tmp_path)
+    assert b"robot = " not in stored.files[stored.workcell]
+
+
+def test_a_name_that_is_none_is_told_with_its_key(tmp_path: Path) -> None:
+    with pytest.raises(WorkcellError, match=r"robots\[0\].urdf: robot = 'ur11' is the name of no"):
+        load(by_name(tmp_path, "ur11"))
+
+
+def test_a_name_beside_a_file_is_refused(tmp_path: Path) -> None:
+    path = by_name(tmp_path, "ur10")
+    text = path.read_text(encoding="utf-8")
+    path.write_text(text.replace("# by name", "\nurdf = 'a.urdf'", 1), encoding="utf-8")
+    with pytest.raises(WorkcellError, match=r"robots\[0\].urdf: found beside 'robot'"):
+        load(path)

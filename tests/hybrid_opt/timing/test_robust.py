@@ -1,0 +1,309 @@
+"""Timings within robust forces, compiled and not, and margins of a timed carry."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from hybrid_opt.carry import Carry
+from hybrid_opt.compiled_cell import CompiledCell
+from hybrid_opt.robust.cases import worst_cases
+from hybrid_opt.robust.force import RobustModel, robust_model
+from hybrid_opt.static_hold import static_hold
+from hybrid_opt.timing import (
+    PathTimer,
+    TimingLimits,
+    TimingModel,
+    TimingStatus,
+    closest_to_reference_timing,
+    drive_path,
+    time_path,
+)
+from hybrid_opt.timing.limits import limit_ratios, limit_use
+from hybrid_opt.timing.robustness import (
+    Margin,
+    payload_sensitivity,
+    robustness_margins,
+)
+from symbolic.errors import SettingsError
+from symbolic.records import Uncertainty, Workcell
+from tests.hybrid_opt.timing import convex_oracle
+from tests.hybrid_opt.timing.cells import hand_timing, initial, near_initial, timing_of
+from tests.hybrid_opt.timing.robust_oracle import robust_limit
+from tests.symbolic.cells import hand_cell, hand_model, with_contacts, with_payload
+
+SET = Uncertainty(0.1, 0.05, np.array([0.005, 0.005, 0.0]), 0.003, np.array([0.0, 0.2, 0.2]))
+INTERVALS = 50
+
+
+def unsure() -> TimingModel:
+    return timing_of(replace(hand_cell(), uncertainty=SET), INTERVALS)
+
+
+def test_the_robust_forces_use_the_limit_up_and_keep_it() -> None:
+    model = unsure()
+    plain = time_path(model, initial(), TimingLimits(force=60.0))
+    assert plain.carry is not None
+    forces = RobustModel(model.workcell)
+    needed = float(forces.robust_force(plain.carry).peak.max())
+    assert needed > 62.0
+    timing = time_path(model, initial(), TimingLimits(force=needed, robust=True))
+    assert timing.status is TimingStatus.OK
+    assert timing.carry is not None
+    peak = float(forces.robust_force(timing.carry).peak.max())
+    assert peak == pytest.approx(needed, rel=2e-3)
+    # The plan's own timing keeps this limit, so that the fastest is no slower.
+    assert timing.duration <= plain.duration * (1.0 + 1e-3)
+    only_plan = time_path(model, initial(), TimingLimits(force=needed))
+    assert only_plan.duration < timing.duration
+
+
+def test_a_limit_below_what_holds_still_in_every_case_is_told() -> None:
+    model = unsure()
+    timing = time_path(model, initial(), TimingLimits(force=53.0, robust=True))
+    assert timing.status is TimingStatus.INFEASIBLE_AT_REST
+    assert timing.place is not None
+    assert timing.place.constraint == "normal force"
+    assert time_path(model, initial(), TimingLimits(force=53.0)).ok
+
+
+def test_robust_forces_need_a_limit() -> None:
+    with pytest.raises(SettingsError, match="give one"):
+        TimingLimits(robust=True)
+
+
+@pytest.mark.parametrize("share", [0.9, 1.0, 1.1, 1.5])
+def test_the_use_of_the_limit_is_that_of_all_cases(share: float) -> None:
+    """Cases far below the limit are left out, where others are near it."""
+    model = unsure()
+    plain = time_path(model, initial(), TimingLimits(force=60.0)).carry
+    assert plain is not None
+    held = RobustModel(model.workcell).robust_force(plain)
+    limit = share * float(held.peak.max())
+    limits = TimingLimits(force=limit, robust=True)
+    use = limit_use(plain, model.workcell, limits, model.joint_names)["normal force"]
+    assert use.ratio == pytest.approx(held.peak.max() / limit, rel=1e-6)
+    every = limit_ratios(plain, model.workcell, limits)["normal force"].max(axis=1)
+    needed = np.maximum(held.commanded, held.leading) / limit
+    near = needed > 0.985
+    np.testing.assert_allclose(every[near], needed[near], rtol=1e-6)
+    assert (every < needed * (1.0 + 1e-6)).all()
+
+
+FINE = 100
+
+
+def unsure_cell(uncertainty: Uncertainty = SET) -> Workcell:
+    return replace(hand_cell(), uncertainty=uncertainty)
+
+
+@cache
+def timer() -> PathTimer:
+    cell = unsure_cell()
+    return PathTimer(CompiledCell(cell, model=hand_model(cell)), FINE, lanes=1)
+
+
+def test_they_agree_with_time_path_and_keep_the_limit_on_the_tenfold_grid() -> None:
+    model = timing_of(timer().workcell, FINE)
+    paths = np.vstack([initial(), near_initial(np.random.default_rng(3), 2)])
+    limits = [TimingLimits(force=force, robust=True) for force in (63.0, 70.0, 75.0)]
+    for x, limit, found in zip(paths, limits, timer().time_all(paths, limits), strict=True):
+        expected = time_path(model, x, limit)
+        assert found.ok, (found.status, expected.reason)
+        assert found.duration == pytest.approx(expected.duration, rel=1e-3)
+        judged = drive_path(model, x, found.grid_speed, limit)
+        assert judged.ok, judged.reason
+        assert judged.carry is not None
+        peak = robust_model(model.workcell).robust_force(judged.carry).peak
+        assert (peak <= 1.005 * (limit.force or 0.0)).all()
+        assert found.robust_force == pytest.approx(peak, rel=1e-3)
+        assert found.robust_force is not None
+        assert found.peak_force.max() < found.robust_force.max()
+
+
+def test_they_agree_with_a_convex_program() -> None:
+    """Of four cases, each with wrenches of its own as variables."""
+    some = Uncertainty(0.1, 0.05, np.array([0.005, 0.0, 0.0]), 0.003, np.array([0.0, 0.3, 0.0]))
+    cell, intervals = unsure_cell(some), 24
+    model = timing_of(cell, intervals)
+    limits = TimingLimits(force=64.0, torque=False, pressure=False, robust=True)
+    other = PathTimer(CompiledCell(cell, model=hand_model(cell)), intervals, lanes=1)
+    cases = list(worst_cases(cell, some))
+    assert len(cases) == 4
+    exact = convex_oracle.shortest_duration(
+        model, initial(), limits, robust_limit(cases, 0.95 / 1.05)
+    )
+    found = other.time(initial(), limits)
+    plain = other.time(initial(), replace(limits, robust=False))
+    assert found.duration == pytest.approx(exact, rel=3e-3)
+    assert found.duration > 1.02 * plain.duration
+
+
+def test_one_nominal_case_changes_nothing() -> None:
+    """Where the patches suffice the least squeeze is the planned one."""
+    cell = unsure_cell(Uncertainty())
+    one = PathTimer(CompiledCell(cell, model=hand_model(cell)), FINE, lanes=1)
+    for force in (51.0, 60.0):
+        robust = one.time(initial(), TimingLimits(force=force, robust=True))
+        planned = one.time(initial(), TimingLimits(force=force))
+        assert robust.duration == pytest.approx(planned.duration, rel=5e-4)
+        assert robust.robust_force == pytest.approx(planned.peak_force, rel=5e-4)
+
+
+def test_what_cannot_stand_still_says_with_what_force_it_could() -> None:
+    weak, strong = timer().time_all(
+        np.array([initial(), initial()]),
+        [TimingLimits(force=force, robust=True) for force in (55.0, 63.0)],
+    )
+    assert strong.ok
+    assert weak.status is TimingStatus.INFEASIBLE_AT_REST
+    assert weak.place.constraint == "normal force"
+    needed = 55.0 * weak.use["normal force"]
+    assert needed == pytest.approx(weak.peak_force.max())
+    still = timer().time(initial(), TimingLimits(force=1.002 * needed, robust=True))
+    assert still.ok
+    at_rest = timer().time(initial(), TimingLimits(force=0.998 * needed, robust=True))
+    assert at_rest.status is TimingStatus.INFEASIBLE_AT_REST
+
+
+def test_a_batch_gives_what_single_calls_give() -> None:
+    paths = np.vstack([initial(), near_initial(np.random.default_rng(8), 2), initial()])
+    paths[3] += np.tile([-2.0, 0, 0, 0, 0, 0], 3)
+    limits = [
+        TimingLimits(force=64.0, robust=True),
+        TimingLimits(force=60.0),
+        TimingLimits(force=70.0, robust=True),
+        TimingLimits(force=70.0, robust=True),
+    ]
+    together = timer().time_all(paths, limits)
+    for x, limit, timing in zip(paths, limits, together, strict=True):
+        alone = timer().time(x, limit)
+        assert alone.status is timing.status
+        np.testing.assert_allclose(alone.grid_speed, timing.grid_speed, rtol=1e-9)
+    assert together[3].status is TimingStatus.OFF_PATH
+
+
+def carry(model: TimingModel, x: np.ndarray | None = None) -> Carry:
+    return model.search_carry(initial() if x is None else x)
+
+
+def by_name(margins: tuple[Margin, ...]) -> dict[str, Margin]:
+    return {margin.quantity: margin for margin in margins}
+
+
+def test_static_payload_limit_has_a_closed_form() -> None:
+    # (m g / 2) sqrt(1 + 1 / mu^2) = 12 kgf
+    assert static_hold(hand_cell()).payload_limit == pytest.approx(16.9648, abs=1e-4)
+    for mu in (0.5, 0.8):
+        cell = with_contacts(hand_cell(), friction=(mu, mu))
+        expected = 2.0 * 117.68 / (9.81 * np.sqrt(1.0 + 1.0 / mu**2))
+        assert static_hold(cell).payload_limit == pytest.approx(expected, rel=1e-9)
+
+
+def test_forces_are_proportional_to_the_mass() -> None:
+    """The payload at the limit, carried for real: its resultant is the limit."""
+    x = near_initial(np.random.default_rng(2), 1)[0]
+    cell = hand_cell()
+    sensitivity = payload_sensitivity(carry(hand_timing(), x))
+    mass = sensitivity.payload_limit
+    heavy = with_payload(cell, mass=mass, inertia=cell.payload.inertia * mass / cell.payload.mass)
+    force = np.linalg.norm(carry(timing_of(heavy, 20), x).contact_force, axis=2).max()
+    assert force == pytest.approx(117.68, rel=1e-9)
+    assert sensitivity.force_at(np.array([mass])).max() == pytest.approx(117.68)
+    assert (sensitivity.mass_by_normal > sensitivity.mass_by_resultant).all()
+    assert mass < sensitivity.static_mass
+
+
+def test_slow_carries_bear_almost_the_static_payload() -> None:
+    model = hand_timing()
+    timing = time_path(model, initial(), model.drive_limits(1.001 * 49.05))
+    assert timing.carry is not None
+    limit = payload_sensitivity(timing.carry).payload_limit
+    static = static_hold(model.workcell).payload_limit
+    assert 0.995 * static < limit < static
+
+
+def test_friction_margin_is_the_normal_force_margin_while_level() -> None:
+    """Level and symmetric: N = F_t / (2 mu) at the peak, so mu may fall to mu N / N_ref."""
+    model = hand_timing()
+    level = carry(model)
+    margin = by_name(robustness_margins(model, level))["friction of both contacts"]
+    assert margin.fails == "normal force"
+    expected = level.normal_force.max() / 117.68
+    # Accelerations along the squeeze axis are zero on the level hand-made path.
+    assert margin.limit == pytest.approx(expected, rel=1e-4)
+
+
+def test_centre_of_mass_margin_is_the_patch_radius_while_level() -> None:
+    model = hand_timing()
+    margins = by_name(robustness_margins(model, carry(model)))
+    radius = hand_cell().contacts[0].patch_radius
+    for sign, name in ((1.0, "+x"), (-1.0, "-x")):
+        margin = margins[f"centre of mass towards {name}"]
+        assert margin.fails == "pressure shift"
+        # Equal tangential forces carry an offset by equal shifts.
+        assert sign * margin.limit == pytest.approx(radius, rel=0.01)
+
+
+def changed(cell: Workcell, margin: Margin, factor: float) -> Workcell:
+    """The cell with the margin's quantity moved to a share of the way to its limit."""
+    value = margin.nominal + factor * (margin.limit - margin.nominal)
+    if margin.quantity == "friction of both contacts":
+        return with_contacts(cell, friction=(value, value))
+    axis = "xyz".index(margin.quantity[-1])
+    return with_payload(cell, centre_of_mass=value * np.eye(3)[axis])
+
+
+@pytest.mark.parametrize(
+    "quantity",
+    ["friction of both contacts", *(f"centre of mass towards {d}" for d in ("+x", "-y"))],
+)
+def test_margins_are_where_a_full_model_of_the_changed_cell_fails(quantity: str) -> None:
+    cell, x = hand_cell(), near_initial(np.random.default_rng(7), 1)[0]
+    model = hand_timing()
+    timed = closest_to_reference_timing(model, x)
+    assert timed.carry is not None
+    margin = by_name(robustness_margins(model, timed.carry))[quantity]
+    assert margin.fails in ("normal force", "pressure shift", "joint torque")
+    motion = model.path_motion(x)
+    sample = np.searchsorted(motion.parameter, timed.carry.parameter - 1e-9)
+    at = motion.at(sample)
+    tangent = at.pose_first[:, np.abs(at.pose_first).sum(axis=0).argmax()]
+    axis = np.abs(at.pose_first).sum(axis=0).argmax()
+    keep = np.abs(tangent) > 0.05
+    speed = timed.carry.rate[keep, axis] / tangent[keep]
+    second = timed.carry.second_rate[keep, axis] - at.pose_second[keep, axis] * speed**2
+    acceleration = second / tangent[keep]
+    held = []
+    for factor in (0.99, 1.01):
+        other = timing_of(changed(cell, margin, factor))
+        used = other.carry(
+            other.path_motion(x).at(sample[keep]), timed.carry.time[keep], speed, acceleration
+        )
+        limit = np.concatenate([robot.torque_max for robot in cell.robots])
+        worst = max(
+            float(used.normal_force.max() / 117.68),
+            float(used.pressure_shift.max() / cell.contacts[0].patch_radius),
+            float((np.abs(used.torque) / limit).max()),
+        )
+        held.append(worst <= 1.0)
+    assert held == [True, False]
+
+
+def test_a_carry_that_fails_already_has_no_margin() -> None:
+    cell = with_payload(hand_cell(), centre_of_mass=np.array([0.05, 0.0, 0.0]))
+    model = timing_of(cell, 20)
+    for margin in robustness_margins(model, carry(model))[:3]:
+        assert margin.limit == margin.nominal
+        assert margin.fails == "pressure shift"
+
+
+def test_least_patch_radius_is_the_largest_shift() -> None:
+    model = hand_timing()
+    tilted = carry(model, near_initial(np.random.default_rng(9), 1)[0])
+    margins = by_name(robustness_margins(model, tilted))
+    for i, name in enumerate(("first", "second")):
+        assert margins[f"patch radius of {name}"].limit == tilted.pressure_shift[:, i].max()
