@@ -46,7 +46,7 @@ PLACES: dict[str, dict[str, Any]] = {
     "bounds": {"task.waypoints[0].upper": [-0.27, 0.03, 0.93, 0.02, 0.12, 0.12]},
     "limits of arms": {
         "robots.acceleration_max": 4.5,
-        "robots.left.torque_max": [95.0, 95.0, 49.0, 39.0, 34.0, 24.0],
+        "robots.left.torque_max": [380.0, 390.0, 155.0, 58.0, 58.0, 58.0],
         "robots.min_manipulability": 0.028,
     },
     "limits of the payload": {
