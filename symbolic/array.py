@@ -51,6 +51,15 @@ Row = Annotated[Array, Shape((None,))]
 """(n,) numbers."""
 
 
+def interpolated(at: Array, along: Array, values: Array) -> Array:
+    """(m, ...) values (n, ...) at places (m,), linearly between those at ascending places (n,)."""
+    found = np.empty((len(at), *values.shape[1:]))
+    for column in np.ndindex(values.shape[1:]):
+        every = (slice(None), *column)
+        found[every] = np.interp(at, along, values[every])
+    return found
+
+
 def require_allowed(settings: object, whose: str = "") -> None:
     """Refuse a record of settings with a value that its annotations do not allow: another one than
     a `Literal` names, or no number of a `Range`. None is allowed where the annotation has it.

@@ -30,8 +30,7 @@ from scipy.spatial.transform import Rotation
 from hybrid_opt.bundles.arms import SEVEN, SIX, comment
 from hybrid_opt.bundles.job_file import Export, job_text, pad_places
 from hybrid_opt.bundles.programs import program
-from hybrid_opt.job.compliance import HELD
-from hybrid_opt.job.records import Job
+from hybrid_opt.job.records import HELD, Job
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.records import Workcell
@@ -107,7 +106,7 @@ def require_rapid(job: Job) -> None:
 
 def _turned(job: Job) -> float:
     """Largest turn of the box against where it is gripped, while it is held [degrees]."""
-    poses = np.concatenate([p.motion.pose for p in job.phases if p.name in HELD])
+    poses = np.concatenate([p.motion.pose for p in job.held])
     rotation = Rotation.from_matrix(box_rotation(job.workcell.task.orientation, poses))
     return float(np.rad2deg((rotation[0].inv() * rotation).magnitude().max()))
 

@@ -40,6 +40,7 @@ from hybrid_opt.cell import Cell
 from hybrid_opt.collision.certify import certify
 from hybrid_opt.display.table import text_table
 from hybrid_opt.errors import ResultsError
+from hybrid_opt.job.motions import joint_use
 from hybrid_opt.store.files import read_bytes
 from hybrid_opt.store.trajectory_file import FORMAT as CARRY_FORMAT
 from symbolic.array import Array
@@ -310,7 +311,7 @@ def check(
     places = _places(time)
     # Straight lines have no accelerations: those of a smooth motion along them are told.
     smooth = CubicSpline(time, trajectory.q) if kind == "linear" else joints
-    use = _joint_use(workcell, joints(places), joints(places, 1), smooth(places, 2))
+    use = joint_use(workcell, joints(places), joints(places, 1), smooth(places, 2))
     rated = np.asarray(workcell.task.reference_force, dtype=float)
     if not mask.any():
         nothing, end = np.zeros(2), float(time[-1])
@@ -385,18 +386,6 @@ def _poses(workcell: Workcell, q: Array) -> Array:
     else:
         numbers = Rotation.from_matrix(T[:, :3, :3]).as_euler("xyz")
     return np.ascontiguousarray(np.column_stack([T[:, :3, 3], orientation.unwrapped(numbers)]))
-
-
-def _joint_use(workcell: Workcell, q: Array, rate: Array, second: Array) -> dict[str, float]:
-    def joints(name: str) -> Array:
-        return np.concatenate([getattr(robot, name) for robot in workcell.robots])
-
-    lower, upper = joints("position_lower"), joints("position_upper")
-    return {
-        "joint position": float((np.abs(2.0 * q - lower - upper) / (upper - lower)).max()),
-        "joint velocity": float((np.abs(rate) / joints("velocity_max")).max()),
-        "joint acceleration": float((np.abs(second) / joints("acceleration_max")).max()),
-    }
 
 
 def _most(values: Array, limit: float) -> float:

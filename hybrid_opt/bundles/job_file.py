@@ -30,12 +30,12 @@ from hybrid_opt.bundles.arms import prefixes
 from hybrid_opt.bundles.programs.carry_job import Limits
 from hybrid_opt.compiled_cell import kept_per_workcell
 from hybrid_opt.errors import JobError
-from hybrid_opt.job.compliance import HELD, TRACKED, largest_skew, require_delay, require_stiffness
+from hybrid_opt.job.compliance import TRACKED, largest_skew, require_delay, require_stiffness
 from hybrid_opt.job.motions import unit_squeeze
-from hybrid_opt.job.records import Job, SampledJob, sample_job
+from hybrid_opt.job.records import HELD, Job, SampledJob, sample_job
 from hybrid_opt.store.files import csv_text
 from hybrid_opt.timing.model import TimingModel
-from symbolic.array import Array
+from symbolic.array import Array, interpolated
 from symbolic.errors import SettingsError
 from symbolic.read.arms import arm_model, turning_joints
 from symbolic.records import Workcell
@@ -107,7 +107,7 @@ def gap_of(sampled: SampledJob, interpolation: Interpolation, stiffness: float) 
         stiffness: of each arm at its pad [N/m].
     """
     job, time = sampled.job, sampled.time
-    spans = [sampled.span(k) for k, phase in enumerate(job.phases) if phase.name in HELD]
+    spans = [sampled.span(job.phases.index(phase)) for phase in job.held]
     starts = np.concatenate([np.arange(span.start, span.stop - 1) for span in spans])
     starts = starts[:: -(-len(starts) // MOST_INTERVALS)]
     steps = np.diff(time)[starts]
@@ -235,10 +235,8 @@ def efforts(sampled: SampledJob) -> Efforts:
 def _still_wrench(model: TimingModel, sampled: SampledJob) -> Array:
     """(n, 2, 6) wrenches on the box that hold it still and press as commanded [N, N m]."""
     wrench = sampled.wrench.copy()
-    for index, phase in enumerate(sampled.job.phases):
-        if phase.name not in HELD:
-            continue
-        span = sampled.span(index)
+    for phase in sampled.job.held:
+        span = sampled.span(sampled.job.phases.index(phase))
         pose = np.ascontiguousarray(sampled.pose[span])
         load = model.load(pose, np.zeros_like(pose), np.zeros_like(pose))
         # The leader's force differs from the other's by what the box needs: the mean is squeezed.
@@ -288,7 +286,6 @@ class _Path:
             for name in ("pose", "rate", "second_rate", "q_rate", "q_second")
         }
         self._columns["force"] = joined([phase.force.normal for phase in job.phases])
-        self._limit = np.concatenate([r.acceleration_max for r in job.workcell.robots])
 
     def stop(self, duration: float) -> Stop:
         """A stop of a duration [s], tried all along the path."""
@@ -300,18 +297,15 @@ class _Path:
         s = np.minimum(places[:, None] + passed, self._time[-1]).ravel()
         r = np.tile(rate, len(places))[:, None]
         change = np.tile(slope, len(places))[:, None]
-        at = {name: self._at(values, s) for name, values in self._columns.items()}
+        at = {k: interpolated(s, self._time, values) for k, values in self._columns.items()}
         second = at["q_second"] * r**2 + at["q_rate"] * change
-        joint_use = float((np.abs(second) / self._limit).max())
+        joint_use = float((np.abs(second) / self._job.workcell.of_joints("acceleration_max")).max())
         # Between two samples of phases that hold the box, pads alone hold it.
         held = np.interp(s, self._time, self._held.astype(float)) == 1.0
         box = (at["rate"] * r, at["second_rate"] * r**2 + at["rate"] * change)
         load = self._model.load(*(np.ascontiguousarray(v[held]) for v in (at["pose"], *box)))
         use = load["normal_force"] / at["force"][held]
         return Stop(duration, float(use.max()), joint_use, duration)
-
-    def _at(self, values: Array, s: Array) -> Array:
-        return np.column_stack([np.interp(s, self._time, column) for column in values.T])
 
 
 JSON_FORMAT = "dual-arm-carry job"
@@ -412,7 +406,7 @@ class Export:
     @cached_property
     def limits(self) -> Limits:
         """When programs stop."""
-        held = [phase.force for phase in self.job.phases if phase.name in HELD]
+        held = [phase.force for phase in self.job.held]
         spare = min(float(((f.normal - f.least) / f.normal).min()) for f in held)
         survived = largest_skew(self.job, self.options.stiffness)
         return Limits(

@@ -23,8 +23,8 @@ from hybrid_opt.bundles.arms import comment, robot_prefix
 from hybrid_opt.bundles.job_file import Export
 from hybrid_opt.bundles.programs import program
 from hybrid_opt.bundles.programs.carry_job import PRESSED
-from hybrid_opt.job.compliance import HELD
 from hybrid_opt.job.motions import TICK
+from hybrid_opt.job.records import HELD
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -74,23 +74,46 @@ class Entry:
     key: str = ""
 
 
-@dataclass(frozen=True)
+@dataclass
 class Evidence:
-    """What runs show of a cell.
+    """What runs show of a cell, found one after the other.
 
     Attributes:
+        workcell: the cell.
         runs: names of the recordings.
         entries: what was found.
         faults: what is wrong with the runs.
         asks: what to record for what is not seen.
-        changes: of the workcell file.
+        tables: of the workcell file, as changed: keys, or one mapping per contact.
+        ranges: of `[uncertainty]`.
     """
 
+    workcell: Workcell
     runs: tuple[str, ...]
-    entries: tuple[Entry, ...]
-    faults: tuple[Fault, ...]
-    asks: tuple[str, ...]
-    changes: dict[str, Any]
+    entries: list[Entry] = field(default_factory=list)
+    faults: list[Fault] = field(default_factory=list)
+    asks: list[str] = field(default_factory=list)
+    tables: dict[str, Any] = field(default_factory=dict)
+    ranges: dict[str, Any] = field(default_factory=dict)
+
+    def tell(self, name: str, found: str, key: str = "") -> None:
+        """Add a quantity."""
+        self.entries.append(Entry(name, found, key))
+
+    def doubt(self, name: str, value: Any) -> None:
+        """Set a range of `[uncertainty]`, rounded up."""
+        up = np.ceil(np.maximum(1e4 * np.asarray(value, dtype=float) - 1e-6, 0.0)) / 1e4
+        self.ranges[name] = up.tolist()
+
+    @property
+    def changes(self) -> dict[str, Any]:
+        """Of the workcell file."""
+        if not self.ranges:
+            return self.tables
+        # What a stated table does not name would be exact.
+        doubt = self.workcell.uncertainty
+        usual = {name: np.asarray(getattr(doubt, name)).tolist() for name in RANGES}
+        return self.tables | {"uncertainty": (usual if not doubt.stated else {}) | self.ranges}
 
     def __str__(self) -> str:
         rows = [("quantity", "found", "written to")]
@@ -107,7 +130,7 @@ class Evidence:
             "runs": list(self.runs),
             "entries": [vars(entry) for entry in self.entries],
             "faults": [vars(fault) for fault in self.faults],
-            "asks": list(self.asks),
+            "asks": self.asks,
             "changes": self.changes,
         }
 
@@ -123,65 +146,32 @@ def calibrate(workcell: Workcell, runs: Sequence[Run]) -> Evidence:
         raise SettingsError(
             f"runs of boxes of {min(masses):g} and {max(masses):g} kg; calibrate with one box"
         )
-    collected = _Collected(workcell)
+    evidence = Evidence(workcell, tuple(run.name for run in runs))
     sound = []
     for run in runs:
         places, offsets = tared(run, places_of(workcell, run))
         faults = recording_faults(workcell, run, places)
-        collected.faults += faults
+        evidence.faults += faults
         if not any(fault.serious for fault in faults):
-            _tell_offsets(run, offsets, collected)
+            _tell_offsets(run, offsets, evidence)
             sound.append((run, places))
-    load = _load(workcell, sound, collected)
-    if not any(fault.serious and not fault.run for fault in collected.faults):
-        _friction(workcell, sound, load, collected)
-        _tracking(sound, collected)
-        _drift(workcell, sound, collected)
-    return collected.evidence(tuple(run.name for run in runs))
-
-
-class _Collected:
-    """What is found, one after the other."""
-
-    def __init__(self, workcell: Workcell) -> None:
-        self._workcell = workcell
-        self.entries: list[Entry] = []
-        self.faults: list[Fault] = []
-        self.asks: list[str] = []
-        self._tables: dict[str, Any] = {}
-        self._ranges: dict[str, Any] = {}
-
-    def tell(self, name: str, found: str, key: str = "") -> None:
-        self.entries.append(Entry(name, found, key))
-
-    def put(self, table: str, values: Any) -> None:
-        """Change a table of the file: keys, or one mapping per contact."""
-        self._tables[table] = values
-
-    def doubt(self, name: str, value: Any) -> None:
-        """Set a range of `[uncertainty]`, rounded up."""
-        up = np.ceil(np.maximum(1e4 * np.asarray(value, dtype=float) - 1e-6, 0.0)) / 1e4
-        self._ranges[name] = up.tolist()
-
-    def evidence(self, runs: tuple[str, ...]) -> Evidence:
-        changes = dict(self._tables)
-        if self._ranges:
-            # What a stated table does not name would be exact.
-            doubt = self._workcell.uncertainty
-            usual = {name: np.asarray(getattr(doubt, name)).tolist() for name in RANGES}
-            changes["uncertainty"] = (usual if not doubt.stated else {}) | self._ranges
-        return Evidence(runs, tuple(self.entries), tuple(self.faults), tuple(self.asks), changes)
+    load = _load(sound, evidence)
+    if not any(fault.serious and not fault.run for fault in evidence.faults):
+        _friction(sound, load, evidence)
+        _tracking(sound, evidence)
+        _drift(sound, evidence)
+    return evidence
 
 
 # --- sensors and load ---
 
 
-def _tell_offsets(run: Run, offsets: Array, collected: _Collected) -> None:
+def _tell_offsets(run: Run, offsets: Array, evidence: Evidence) -> None:
     for i in range(2):
         told = ", ".join(number(value, 2) for value in offsets[:, i, :3].mean(axis=0))
         moved = np.ptp(offsets[:, i, :3], axis=0).max()
         drift = f", drift {moved:.2f} N" if len(offsets) > 1 else ""
-        collected.tell(f"{run.name}, offset of arm {i + 1}", f"{told} N{drift}")
+        evidence.tell(f"{run.name}, offset of arm {i + 1}", f"{told} N{drift}")
 
 
 def _pieces(run: Run, places: Places) -> list[Hold]:
@@ -208,53 +198,53 @@ def _pieces(run: Run, places: Places) -> list[Hold]:
     return found
 
 
-def _empty(workcell: Workcell, run: Run, pieces: list[Hold], collected: _Collected) -> None:
+def _empty(run: Run, pieces: list[Hold], evidence: Evidence) -> None:
     """What sensors tell of nothing, in the postures of an empty run."""
     if not pieces:
         return
     most = max(float(np.linalg.norm(piece.wrench[:, :3], axis=1).max()) for piece in pieces)
-    collected.tell(f"{run.name}, force of nothing", f"{most:.2f} N at most")
-    weight = workcell.payload.mass * abs(GRAVITY[2])
+    evidence.tell(f"{run.name}, force of nothing", f"{most:.2f} N at most")
+    weight = evidence.workcell.payload.mass * abs(GRAVITY[2])
     if most > LARGEST_RESIDUAL * weight:
         text = f"{most:.1f} N of nothing: have the driver compensate the tool's weight"
-        collected.faults.append(Fault(run.name, "residual", text, serious=False))
+        evidence.faults.append(Fault(run.name, "residual", text, serious=False))
 
 
 Sound = list[tuple[Run, Places]]
 """Runs without serious faults, their readings without offsets."""
 
 
-def _load(workcell: Workcell, sound: Sound, collected: _Collected) -> Load | None:
+def _load(sound: Sound, evidence: Evidence) -> Load | None:
     """Mass, centre of mass and crosstalk, as far as they are seen."""
     holds, moments = [], True
     for run, places in sound:
         found = _pieces(run, places)
         if run.labels.empty:
-            _empty(workcell, run, found, collected)
+            _empty(run, found, evidence)
             continue
         holds += found
         moments &= run.has_moments or not found
     if not holds:
-        collected.asks.append("holds of the box at rest, two seconds each, after a tare")
+        evidence.asks.append("holds of the box at rest, two seconds each, after a tare")
         return None
     load = fit_load(holds, moments)
     faults = load_faults(holds, load, moments)
-    collected.faults += faults
+    evidence.faults += faults
     if faults:
         return None
     source = f"from {len(holds)} holds, {load.residual:.2f} N left"
     share = SURE * float(load.deviations[0]) / load.mass
     if load.sees_mass:
         told = f"{load.mass:.3f} kg ± {100.0 * share:.1f} % (3 σ), {source}"
-        collected.tell("mass", told, "payload.mass")
-        collected.doubt("mass", max(share, LEAST_MASS))
+        evidence.tell("mass", told, "payload.mass")
+        evidence.doubt("mass", max(share, LEAST_MASS))
     else:
         text = (
             "mass and crosstalk cannot be told apart; record holds at three squeezes, or state the "
             "mass from a scale"
         )
         names = ", ".join(run.name for run, _ in sound if not run.labels.empty)
-        collected.faults.append(Fault(names, "load not seen", text))
+        evidence.faults.append(Fault(names, "load not seen", text))
     payload: dict[str, Any] = {"mass": round(load.mass, 4)} if load.sees_mass else {}
     spread = load.deviations[1:4]
     if load.sees_mass and load.sees_centre.all():
@@ -262,19 +252,19 @@ def _load(workcell: Workcell, sound: Sound, collected: _Collected) -> Load | Non
             f"{1e3 * value:.1f} ± {1e3 * SURE * wide:.1f}"
             for value, wide in zip(load.centre, spread, strict=True)
         )
-        collected.tell("centre of mass", f"{told} mm (3 σ), {source}", "payload.centre_of_mass")
+        evidence.tell("centre of mass", f"{told} mm (3 σ), {source}", "payload.centre_of_mass")
         payload["centre_of_mass"] = np.round(load.centre, 5).tolist()
-        collected.doubt("centre_of_mass", np.maximum(SURE * spread, LEAST_CENTRE))
+        evidence.doubt("centre_of_mass", np.maximum(SURE * spread, LEAST_CENTRE))
     else:
         unseen = " ".join(
             axis for axis, seen in zip("xyz", load.sees_centre, strict=True) if not seen
         )
-        collected.asks.append(
+        evidence.asks.append(
             f"holds tilted by 14 degrees, either way about both level axes, at three squeezes: the "
             f"centre of mass along {unseen or 'x y z'} cannot be seen"
         )
     if payload:
-        collected.put("payload", payload)
+        evidence.tables["payload"] = payload
     for i in range(2):
         seen = load.sees_crosstalk[i]
         told = ", ".join(
@@ -283,18 +273,18 @@ def _load(workcell: Workcell, sound: Sound, collected: _Collected) -> Load | Non
                 load.crosstalk[i], load.deviations[4 + 2 * i : 6 + 2 * i], seen, strict=True
             )
         )
-        collected.tell(f"crosstalk of arm {i + 1}", f"{told} N/N along the pad's x, y (3 σ)")
+        evidence.tell(f"crosstalk of arm {i + 1}", f"{told} N/N along the pad's x, y (3 σ)")
     return load
 
 
 # --- friction, forces, pads ---
 
 
-def _friction(workcell: Workcell, sound: Sound, load: Load | None, collected: _Collected) -> None:
+def _friction(sound: Sound, load: Load | None, evidence: Evidence) -> None:
     """A bracket of the friction: greatest ratio that held, least that slipped."""
-    if load is None or not load.sees_crosstalk.all() or not workcell.has_opposite_pads:
+    if load is None or not load.sees_crosstalk.all() or not evidence.workcell.has_opposite_pads:
         return
-    ratio_of = FrictionRatio(workcell)
+    ratio_of = FrictionRatio(evidence.workcell)
     held: list[tuple[float, str]] = []
     slipped: list[tuple[float, str]] = []
     for run, places in sound:
@@ -314,11 +304,11 @@ def _friction(workcell: Workcell, sound: Sound, load: Load | None, collected: _C
         slips = [ratio(instant - RATIO_TIME) for instant in run.labels.slip_at]
         slipped += [(value, run.name) for value in slips if np.isfinite(value)]
     if held:
-        collected.tell("friction, greatest held", "{:.3f} in {}".format(*max(held)))
+        evidence.tell("friction, greatest held", "{:.3f} in {}".format(*max(held)))
     if slipped:
-        collected.tell("friction, least slipped", "{:.3f} in {}".format(*min(slipped)))
+        evidence.tell("friction, least slipped", "{:.3f} in {}".format(*min(slipped)))
     if not held or not slipped or len({name for _, name in held + slipped}) < 2:
-        collected.asks.append(
+        evidence.asks.append(
             "runs that slip (slip_at) beside others that hold: friction is bracketed by two runs "
             "and more, never told by one"
         )
@@ -326,12 +316,12 @@ def _friction(workcell: Workcell, sound: Sound, load: Load | None, collected: _C
     low, high = sorted((max(held)[0], min(slipped)[0]))
     middle = (low + high) / 2.0
     share = max((high - low) / 2.0 / middle, LEAST_FRICTION)
-    collected.tell("friction", f"{low:.3f} to {high:.3f}", "contacts.friction")
-    collected.put("contacts", [{"friction": round(middle, 3)}] * 2)
-    collected.doubt("friction", share)
+    evidence.tell("friction", f"{low:.3f} to {high:.3f}", "contacts.friction")
+    evidence.tables["contacts"] = [{"friction": round(middle, 3)}] * 2
+    evidence.doubt("friction", share)
 
 
-def _tracking(sound: Sound, collected: _Collected) -> None:
+def _tracking(sound: Sound, evidence: Evidence) -> None:
     """Force over the commanded one as quantiles, and its lag."""
     worst: list[float] = []
     for i in range(2):
@@ -352,14 +342,14 @@ def _tracking(sound: Sound, collected: _Collected) -> None:
         low, usual, high = np.quantile(every, [0.01, 0.5, 0.99])
         worst.append(float(low))
         told = f"{low:.3f}, {usual:.3f}, {high:.3f} (1, 50, 99 %)"
-        collected.tell(f"force over command, arm {i + 1}", told, "uncertainty.tracking")
+        evidence.tell(f"force over command, arm {i + 1}", told, "uncertainty.tracking")
         if lags:
-            collected.tell(f"lag of the force, arm {i + 1}", f"{max(lags):.3f} s at most")
+            evidence.tell(f"lag of the force, arm {i + 1}", f"{max(lags):.3f} s at most")
     if worst:
-        collected.doubt("tracking", float(np.clip(1.0 - min(worst), 0.0, 0.9)))
+        evidence.doubt("tracking", float(np.clip(1.0 - min(worst), 0.0, 0.9)))
 
 
-def _drift(workcell: Workcell, sound: Sound, collected: _Collected) -> None:
+def _drift(sound: Sound, evidence: Evidence) -> None:
     """How far the pads move along one another while they hold, and how late one arm is."""
     beside: list[Array] = []
     turned: list[Array] = []
@@ -375,7 +365,7 @@ def _drift(workcell: Workcell, sound: Sound, collected: _Collected) -> None:
             turned.append(np.arccos(np.clip(cosine, -1.0, 1.0)))
             beside.append(np.linalg.norm(between[:, :2, 3] - between[0, :2, 3], axis=1))
         path = [
-            places.pads[:, i, :3, :] @ inverse(workcell.contacts[i].T_box_pad)[:, 3]
+            places.pads[:, i, :3, :] @ inverse(evidence.workcell.contacts[i].T_box_pad)[:, 3]
             for i in range(2)
         ]
         axis = int(np.argmax(np.ptp(path[0], axis=0)))
@@ -390,11 +380,11 @@ def _drift(workcell: Workcell, sound: Sound, collected: _Collected) -> None:
     ):
         rms, most = float(np.sqrt(np.mean(values**2))), float(np.quantile(values, 0.99))
         told = f"{scale * rms:.2g} {unit} rms, {scale * most:.2g} {unit} (99 %), by the joints"
-        collected.tell(name, told, f"uncertainty.{key}")
-        collected.doubt(key, most)
+        evidence.tell(name, told, f"uncertainty.{key}")
+        evidence.doubt(key, most)
     if delays:
         most = max(delays, key=abs)
-        collected.tell("delay of arm 2 after arm 1", f"{most:.3f} s at most")
+        evidence.tell("delay of arm 2 after arm 1", f"{most:.3f} s at most")
 
 
 # --- the file ---

@@ -27,7 +27,7 @@ from hybrid_opt.calibrating.bags import (
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.store.files import read_bytes
 from symbolic import outside
-from symbolic.array import Array
+from symbolic.array import Array, interpolated
 from symbolic.errors import OutsideError, WorkcellError
 from symbolic.read.arms import arm_model
 from symbolic.read.tables import Table
@@ -126,7 +126,7 @@ GAP, LONG_GAP = 10.0, 0.2
 
 
 @dataclass(frozen=True)
-class Recorded:
+class ArmLog:
     """What one arm recorded, at m samples.
 
     Attributes:
@@ -143,18 +143,12 @@ class Recorded:
     commanded: Array
     lost: Spans
 
-    def at(self, time: Array) -> Recorded:
+    def at(self, time: Array) -> ArmLog:
         """Between its samples."""
 
-        def taken(values: Array) -> Array:
-            found = np.empty((len(time), *values.shape[1:]))
-            for column in np.ndindex(values.shape[1:]):
-                at = (slice(None), *column)
-                found[at] = np.interp(time, self.time, values[at])
-            return found
-
-        joints, wrench = taken(self.joints), taken(self.wrench)
-        return Recorded(time, joints, wrench, taken(self.commanded), self.lost)
+        own = (self.joints, self.wrench, self.commanded)
+        joints, wrench, commanded = (interpolated(time, self.time, each) for each in own)
+        return ArmLog(time, joints, wrench, commanded, self.lost)
 
 
 def lost_spans(time: Array, values: Array) -> Spans:
@@ -170,7 +164,7 @@ def lost_spans(time: Array, values: Array) -> Spans:
 
 def together(
     name: str,
-    recorded: tuple[Recorded, Recorded],
+    recorded: tuple[ArmLog, ArmLog],
     labels: Labels,
     frame: str,
     largest: Array | None = None,
@@ -262,7 +256,7 @@ def _instants(table: Table, key: str) -> tuple[float, ...]:
     return tuple(table.vector(key, (TIME,) * count, []).tolist())
 
 
-def _read_arm(table: Table, path: Path, workcell: Workcell, arm: int) -> Recorded:
+def _read_arm(table: Table, path: Path, workcell: Workcell, arm: int) -> ArmLog:
     """What one arm recorded, by the columns that the side file names."""
     file = path.parent / table.text("file") if table.has("file") else path
     names = list(arm_model(workcell.robots[arm]).names)[1:]
@@ -301,10 +295,10 @@ def _read_arm(table: Table, path: Path, workcell: Workcell, arm: int) -> Recorde
     if np.count_nonzero(sound) < 2 or (np.diff(time[sound]) <= 0.0).any():
         raise ResultsError(f"{file}: {time_name!r} does not ascend, or has fewer than two samples")
     lost = lost_spans(time[sound], wrench[sound, :3])
-    return Recorded(time[sound], joints[sound], wrench[sound], commanded[sound], lost)
+    return ArmLog(time[sound], joints[sound], wrench[sound], commanded[sound], lost)
 
 
-def _read_bag(table: Table, file: Path, names: list[str]) -> Recorded:
+def _read_bag(table: Table, file: Path, names: list[str]) -> ArmLog:
     """What one arm recorded in ROS 2, at the times of its joint states."""
     if table.has("joints"):
         value = table.raw("joints")
@@ -318,7 +312,7 @@ def _read_bag(table: Table, file: Path, names: list[str]) -> Recorded:
     asked = table.text("commanded") if table.has("commanded") else ""
     if table.problems.found:
         nothing = np.zeros(2)
-        return Recorded(nothing, nothing, nothing, nothing, ())
+        return ArmLog(nothing, nothing, nothing, nothing, ())
     messages = read_topics(file, [topic for topic in (states, felt, asked) if topic])
     time, joints = joint_series(messages[states], names, file)
     wrench_time, wrench = wrench_series(messages[felt])
@@ -328,10 +322,10 @@ def _read_bag(table: Table, file: Path, names: list[str]) -> Recorded:
     if asked and messages[asked]:
         commanded = np.interp(time, *force_series(messages[asked]), left=np.nan)
     lost = {*lost_spans(time, time[:, None]), *lost_spans(wrench_time, wrench[:, :3])}
-    felt_then = np.column_stack([np.interp(time, wrench_time, column) for column in wrench.T])
+    felt_then = interpolated(time, wrench_time, wrench)
     inside = (time >= wrench_time[0]) & (time <= wrench_time[-1])
     inside &= np.append(True, np.diff(time) > 0.0)
-    return Recorded(
+    return ArmLog(
         time[inside], joints[inside], felt_then[inside], commanded[inside], tuple(sorted(lost))
     )
 

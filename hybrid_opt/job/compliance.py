@@ -35,9 +35,6 @@ SKEWS = (0.001, 0.002, 0.005, 0.01, 0.02)
 LARGEST_SKEW = 0.1
 """Largest delay that is looked at [s]."""
 
-HELD = ("lift", "carry", "set_down")
-"""Phases in which the box is held and moves."""
-
 _BISECTIONS = 16
 
 
@@ -104,8 +101,7 @@ def position_control(job: Job, stiffness: float) -> PositionControl:
         SettingsError: the stiffness is not positive.
     """
     require_stiffness(stiffness)
-    held = [phase for phase in job.phases if phase.name in HELD]
-    least = min(float(phase.force.normal.min()) for phase in held)
+    least = min(float(phase.force.normal.min()) for phase in job.held)
     error = stiffness * POSITION_ERROR
     return PositionControl(
         stiffness, job.peak_normal_force / stiffness, error, error / least, force_margin(job)
@@ -114,8 +110,7 @@ def position_control(job: Job, stiffness: float) -> PositionControl:
 
 def force_margin(job: Job) -> float:
     """Least commanded beyond least necessary normal force while the box is held [N]."""
-    held = [phase.force for phase in job.phases if phase.name in HELD]
-    return min(float((force.normal - force.least).min()) for force in held)
+    return min(float((p.force.normal - p.force.least).min()) for p in job.held)
 
 
 def skewed(job: Job, delay: float, stiffness: float) -> Skew:
@@ -133,8 +128,7 @@ def skewed(job: Job, delay: float, stiffness: float) -> Skew:
     """
     require_stiffness(stiffness)
     require_delay(delay)
-    held = [phase for phase in job.phases if phase.name in HELD]
-    found = [_skewed(job, phase, late, delay, stiffness) for phase in held for late in (0, 1)]
+    found = [_skewed(job, phase, late, delay, stiffness) for phase in job.held for late in (0, 1)]
     worst = min(found, key=lambda each: each.margin)
     return replace(
         worst,

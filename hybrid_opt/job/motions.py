@@ -25,7 +25,7 @@ from hybrid_opt.robust.force import BoxMotion
 from hybrid_opt.robust.squeeze import Squeeze, SqueezeSettings, pressed_beyond, pressed_together
 from hybrid_opt.timing.model import TimingModel
 from hybrid_opt.timing.records import JerkLimits
-from symbolic.array import Array
+from symbolic.array import Array, interpolated
 from symbolic.contact.grasp import Grasp
 from symbolic.contact.load import robot_wrenches
 from symbolic.records import Handling, Workcell
@@ -188,18 +188,13 @@ def followed(
             break
     reached = np.array([q for q in passed[1:] if np.isfinite(q).all()] or [known])
     samples = rise(1.0, SAMPLES).value
-    guess = np.column_stack(
-        [np.interp(samples, ways[: len(reached)], column) for column in reached.T]
-    )
+    guess = interpolated(samples, ways[: len(reached)], reached)
     q = held_at(workcell, posture, line, share(samples), guess)
     lost = ~np.isfinite(q).all(axis=1)
     if lost.any():
         place = share(samples[lost][0])
         raise JobError(_unreached(line, float(place), "does not reach"))
-    lower, upper = (
-        np.concatenate([getattr(robot, name) for robot in workcell.robots])
-        for name in ("position_lower", "position_upper")
-    )
+    lower, upper = map(workcell.of_joints, ("position_lower", "position_upper"))
     outside = ((q < lower) | (q > upper)).any(axis=1)
     if outside.any():
         place = share(samples[outside][0])
@@ -254,9 +249,8 @@ def timed(model: TimingModel, line: Straight, q: Array) -> PhaseMotion:
     rate, second_rate = v * way, a * way
     third = CubicSpline(unit.time, q_second).derivative()(unit.time)
     payload = model.workcell.payload
-    joint_speed, joint_acceleration = (
-        np.concatenate([getattr(robot, name) for robot in model.workcell.robots])
-        for name in ("velocity_max", "acceleration_max")
+    joint_speed, joint_acceleration = map(
+        model.workcell.of_joints, ("velocity_max", "acceleration_max")
     )
     jerk = JerkLimits.of(model.workcell) or JerkLimits(np.full(q.shape[1], np.inf))
     gentle = min(payload.acceleration_max, LIFTING_ACCELERATION)
@@ -438,21 +432,25 @@ def phase_use(
     judged where forces are planned (`hybrid_opt.timing`): pressing harder only helps them.
     """
 
-    def joints(name: str) -> Array:
-        return np.concatenate([getattr(robot, name) for robot in workcell.robots])
-
-    lower, upper = joints("position_lower"), joints("position_upper")
     effort = motion.own_torque + contact_effort(motion, force.wrench)
     payload = workcell.payload
     bounded = {} if jerk is None else _jerk_use(motion, jerk)
     return bounded | {
-        "joint position": _most(np.abs(2.0 * motion.q - lower - upper) / (upper - lower)),
-        "joint velocity": _most(np.abs(motion.q_rate) / joints("velocity_max")),
-        "joint acceleration": _most(np.abs(motion.q_second) / joints("acceleration_max")),
-        "joint torque": _most(np.abs(effort) / joints("torque_max")),
+        **joint_use(workcell, motion.q, motion.q_rate, motion.q_second),
+        "joint torque": _most(np.abs(effort) / workcell.of_joints("torque_max")),
         "payload velocity": _most(_length(motion.rate) / payload.velocity_max),
         "payload acceleration": _most(_length(motion.second_rate) / payload.acceleration_max),
         "least normal force": _most(force.least / np.maximum(force.normal, _FORCE_FLOOR)),
+    }
+
+
+def joint_use(workcell: Workcell, q: Array, rate: Array, second: Array) -> dict[str, float]:
+    """Largest position, velocity and acceleration of joints (n, joints) over their limits."""
+    lower, upper = map(workcell.of_joints, ("position_lower", "position_upper"))
+    return {
+        "joint position": _most(np.abs(2.0 * q - lower - upper) / (upper - lower)),
+        "joint velocity": _most(np.abs(rate) / workcell.of_joints("velocity_max")),
+        "joint acceleration": _most(np.abs(second) / workcell.of_joints("acceleration_max")),
     }
 
 

@@ -47,7 +47,7 @@ from hybrid_opt.job.smooth import WIDEST, WIDTH, rests_at_ends, without_jumps
 from hybrid_opt.robust.squeeze import SqueezeSettings
 from hybrid_opt.timing.model import TimingModel
 from hybrid_opt.timing.records import JerkLimits, Timing
-from symbolic.array import Array
+from symbolic.array import Array, interpolated
 from symbolic.contact.force_closure import presses_evenly
 from symbolic.errors import SettingsError
 from symbolic.geometry.bodies import CollisionBody
@@ -418,7 +418,7 @@ class JobModel:
     def _proof(self, checker: CollisionChecker, carry: Carry) -> Certificate:
         """The continuous verdict on the carry."""
         u = np.linspace(0.0, 1.0, PATH_SAMPLES)
-        q = np.column_stack([np.interp(u, carry.parameter, column) for column in carry.q.T])
+        q = interpolated(u, carry.parameter, carry.q)
         task = self.workcell.task
         path = SampledPath(task, extended_waypoints(task, carry.x), *joints_of(self.workcell, q))
         return certificates(checker, self._posture, [path])[0]
@@ -428,7 +428,7 @@ class JobModel:
         share = rise(1.0, SAMPLES).value
 
         def at(u: Array) -> tuple[Array, Array, Array]:
-            guess = np.column_stack([np.interp(u, share, column) for column in motion.q.T])
+            guess = interpolated(u, share, motion.q)
             q = held_at(self.workcell, self._posture, line, u, guess)
             return line.at(u)[0], *joints_of(self.workcell, q)
 

@@ -15,12 +15,15 @@ from hybrid_opt.display.table import text_table
 from hybrid_opt.robust.squeeze import Squeeze
 from hybrid_opt.shown import Shown
 from hybrid_opt.timing.records import Timing
-from symbolic.array import Array
+from symbolic.array import Array, interpolated
 from symbolic.errors import SettingsError
 from symbolic.records import Workcell
 
 PHASES = ("approach", "press", "lift", "carry", "set_down", "release", "retreat")
 """Every phase of a job in order; without a height there is no lift or no set-down."""
+
+HELD = ("lift", "carry", "set_down")
+"""Those in which the box is held and moves."""
 
 _STATIC = ("friction", "path speed", "joint position", "least normal force")
 """Uses that say nothing of how hard a phase drives the cell."""
@@ -161,6 +164,11 @@ class Job(Shown):
         return next(phase for phase in self.phases if phase.name == name)
 
     @property
+    def held(self) -> tuple[Phase, ...]:
+        """The phases in which the box is held and moves."""
+        return tuple(phase for phase in self.phases if phase.name in HELD)
+
+    @property
     def peak_normal_force(self) -> Array:
         """(2,) largest commanded normal force of each robot [N]."""
         peaks = [phase.force.normal.max(axis=0) for phase in self.phases]
@@ -276,9 +284,7 @@ def _sampled(phase: Phase, step: float) -> dict[str, Array]:
     grid = np.linspace(0.0, motion.duration, math.ceil(motion.duration / step - 1e-9) + 1)
 
     def between(values: Array) -> Array:
-        flat = values[keep].reshape(len(time), -1)
-        rows = np.stack([np.interp(grid, time, column) for column in flat.T], axis=1)
-        found = rows.reshape(len(grid), *values.shape[1:])
+        found = interpolated(grid, time, values[keep])
         found[-1] = values[-1]
         return found
 

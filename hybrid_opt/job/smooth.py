@@ -60,7 +60,7 @@ def acceleration_at_ends(timing: Timing) -> float:
     """Largest acceleration of a joint at either end, over its limit."""
     carry = timing.carry
     assert carry is not None, "a timing that is to be driven has a carry"
-    limit = np.concatenate([robot.acceleration_max for robot in carry.workcell.robots])
+    limit = carry.workcell.of_joints("acceleration_max")
     return float((np.abs(carry.side_by_side("q_second")[[0, -1]]) / limit).max())
 
 

@@ -26,16 +26,16 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from hybrid_opt.calibrating.estimate import without_crosstalk
 from hybrid_opt.calibrating.recording import (
+    ArmLog,
     Labels,
     Places,
-    Recorded,
     Run,
     lost_spans,
     tared,
     together,
 )
 from hybrid_opt.display.table import Table, number
-from symbolic.array import Array
+from symbolic.array import Array, interpolated
 from symbolic.contact.soft_finger import SoftPatch, least_soft_squeeze
 from symbolic.errors import SettingsError
 from symbolic.records.quantities import GRAVITY
@@ -179,13 +179,13 @@ class _Poses:
         return found
 
 
-_Arm = tuple[Recorded, _Poses]
+_Arm = tuple[ArmLog, _Poses]
 
 
 def _arm(time: Array, force: Array, commanded: Array, poses: _Poses) -> _Arm:
     wrench = np.hstack([force, np.full_like(force, np.nan)])
     nothing = np.empty((len(time), 0))
-    return Recorded(time, nothing, wrench, commanded, lost_spans(time, force)), poses
+    return ArmLog(time, nothing, wrench, commanded, lost_spans(time, force)), poses
 
 
 def _one_file(path: Path) -> list[_Arm]:
@@ -247,7 +247,7 @@ def _need() -> ca.Function:
 
 
 @dataclass(frozen=True)
-class Judged:
+class Comparison:
     """A carry beside the model, at n samples from when the box is lifted until it is set down or
     lost.
 
@@ -275,16 +275,13 @@ class Judged:
         return np.asarray(self.squeeze / self.need[:, 0])
 
 
-def judged(carry: Carry) -> Judged:
+def compared(carry: Carry) -> Comparison:
     """What the model asks for in a carry."""
     run, places = carry.run, carry.places
     time = np.arange(run.time[0], run.time[-1], STEP)
     near = np.searchsorted(run.time, time).clip(0, len(run.time) - 1)
 
-    def evenly(values: Array) -> Array:
-        return np.column_stack([np.interp(time, run.time, column) for column in values.T])
-
-    points = [evenly(places.pads[:, i, :3, 3]) for i in range(2)]
+    points = interpolated(time, run.time, places.pads[:, :, :3, 3]).swapaxes(0, 1)
     middle = (points[0] + points[1]) / 2.0
     turned = Rotation.from_matrix(places.pads[near, 0, :3, :3])
     width = round(SMOOTHED / STEP) | 1
@@ -301,7 +298,7 @@ def judged(carry: Carry) -> Judged:
         np.asarray(_need()(force.T, moment.T, half[None], friction)).ravel()
         for friction in FRICTION
     ]
-    wrench = evenly(places.wrench[:, :, :3].reshape(len(run.time), 6)).reshape(-1, 2, 3)
+    wrench = interpolated(time, run.time, places.wrench[:, :, :3])
     squeeze = -wrench[:, :, 2].mean(axis=1)
     tangential = np.linalg.norm(wrench[:, :, :2], axis=2).mean(axis=1)
     used = median_filter(tangential / np.maximum(squeeze, 1e-3), round(BRIEF / STEP))
@@ -315,7 +312,7 @@ def judged(carry: Carry) -> Judged:
     end = run.labels.slip_at[0] if run.labels.slip_at else time[-1] - SMOOTHED
     carried = (height - np.maximum(slid, 0.0) > LIFTED) & (time <= end)
     known = seen[near][carried].mean() >= BELIEVED
-    return Judged(
+    return Comparison(
         time[carried],
         squeeze[carried],
         np.column_stack(needs)[carried],
@@ -364,7 +361,7 @@ def table(folder: Path) -> Table:
     rows = []
     for path in labelled(folder):
         carry = read(path)
-        found = judged(carry)
+        found = compared(carry)
         lost = bool(carry.run.labels.slip_at)
         k = len(found.time) - 1 if lost else int(np.argmin(found.margin))
         most = float(found.slid.max())

@@ -511,6 +511,10 @@ class Workcell:
     handling: Handling = field(default_factory=Handling)
     text: bytes | None = field(default=None, repr=False)
 
+    def of_joints(self, name: str) -> Array:
+        """(joints,) what robots tell of each joint under a name, both arms side by side."""
+        return np.concatenate([getattr(robot, name) for robot in self.robots])
+
     @property
     def has_facing_pads(self) -> bool:
         """Whether two round pads with opposite normals hold the payload: what the paper's

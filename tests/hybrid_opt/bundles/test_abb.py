@@ -27,7 +27,7 @@ from hybrid_opt.bundles.bundle import prepared
 from hybrid_opt.bundles.job_file import pad_places
 from hybrid_opt.bundles.programs.carry_job import Job
 from hybrid_opt.bundles.programs.egm_wire import FromRobot, read_robot, to_robot
-from hybrid_opt.job.compliance import HELD
+from hybrid_opt.job.records import HELD, PHASES
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.records.poses import inverse
@@ -131,7 +131,7 @@ def test_the_other_presses_with_every_move() -> None:
     job = sheet.sampled
     start, *moves, end = called(module, *FORCE)
     assert (start.name, end.name) == ("FCPress1LStart", "FCPressEnd")
-    spans = [job.span(k) for k, p in enumerate(rack_job().phases) if p.name in HELD]
+    spans = [job.span(rack_job().phases.index(p)) for p in rack_job().held]
     places = np.concatenate([np.arange(s.start + 1, s.stop) for s in spans])
     assert len(moves) == len(places)
     declared = {name: value for _, _, name, value in module.declarations}
@@ -228,7 +228,7 @@ def test_steps_that_no_controller_plans_are_refused() -> None:
 
 def test_a_box_that_turns_is_refused() -> None:
     """The force keeps its direction in the room."""
-    (carry,) = (phase for phase in rack_job().phases if phase.name == "carry")
+    carry = rack_job().phase("carry")
     pose = carry.motion.pose.copy()
     pose[:, 5] += np.linspace(0.0, 0.5, len(pose))
     turned = replace(carry, motion=replace(carry.motion, pose=pose))
@@ -299,9 +299,7 @@ def test_a_sign_that_nobody_found_out_moves_nothing() -> None:
 
 
 @pytest.mark.parametrize("gone", [0, 1])
-@pytest.mark.parametrize(
-    "phase", ["approach", "press", "lift", "carry", "set_down", "release", "retreat"]
-)
+@pytest.mark.parametrize("phase", PHASES)
 def test_a_task_that_does_not_come_is_not_waited_for(phase: str, gone: int) -> None:
     """It ends in a phase: the other ends before the next, keeps its place and its force."""
     whole = sound()
@@ -494,9 +492,6 @@ FAULTS: dict[str, tuple[Callable[[Cell], None], str]] = {
 }
 
 
-PHASES = ("approach", "press", "lift", "carry", "set_down", "release", "retreat")
-
-
 @pytest.mark.parametrize(
     ("name", "phase"),
     [
@@ -508,7 +503,7 @@ PHASES = ("approach", "press", "lift", "carry", "set_down", "release", "retreat"
 def test_faults_hold_both_arms(name: str, phase: str) -> None:
     fault, told = FAULTS[name]
     cell = Cell()
-    (planned,) = (each for each in rack_job().phases if each.name == phase)
+    planned = rack_job().phase(phase)
     middle = planned.begin + 0.4 * planned.duration
     cell.run(lambda cell: cell.stream.machine.clock.s > middle)
     fault(cell)

@@ -23,7 +23,7 @@ from tests.hybrid_opt.job.jobs import rack, rack_job
 
 
 def carry() -> tuple[float, float]:
-    (found,) = (phase for phase in rack_job().phases if phase.name == "carry")
+    found = rack_job().phase("carry")
     return found.begin, found.begin + found.duration
 
 
@@ -66,7 +66,7 @@ def test_our_own_job_passes(tmp_path: Path) -> None:
         assert max(found.along, found.across) < 1e-4
         assert "it can be driven" in repr(found)
     np.testing.assert_allclose(again.held.mean(), whole.held.mean(), atol=0.01)
-    (phase,) = (p for p in rack_job().phases if p.name == "carry")
+    phase = rack_job().phase("carry")
     np.testing.assert_allclose(whole.normal_force, phase.force.least.max(axis=0), rtol=0.02)
     np.testing.assert_allclose(ros.normal_force, whole.normal_force, rtol=0.05)
 

@@ -33,7 +33,7 @@ from hybrid_opt.bundles.job_file import (
 )
 from hybrid_opt.bundles.ros2 import message_of
 from hybrid_opt.errors import JobError
-from hybrid_opt.job.compliance import HELD, TRACKED
+from hybrid_opt.job.compliance import TRACKED
 from hybrid_opt.job.records import SampledJob, sample_job
 from symbolic.errors import SettingsError
 from tests.hybrid_opt.bundles.bundles import contents, exported, rack_driven, text_of
@@ -158,7 +158,7 @@ def test_holding_bears_half_of_the_box_each_and_presses() -> None:
     load = found.efforts.holding - found.efforts.gravity
     model = pin.buildModelFromXML(text_of("ros2-control", "description/cell.urdf"))
     data = model.createData()
-    span = sampled.span([p.name for p in sampled.job.phases].index("carry"))
+    span = sampled.span(3)
     for k in range(span.start, span.stop, 15):
         total = np.zeros(3)
         for arm, name in enumerate(("left_contact_pad", "right_contact_pad")):
@@ -194,16 +194,14 @@ def test_a_stop_needs_the_force_of_its_deceleration() -> None:
     stop = stop_of(job)
     mu = min(contact.friction for contact in cell.contacts)
     worst = 0.0
-    for phase in job.phases:
-        if phase.name not in HELD:
-            continue
+    for phase in job.held:
         motion = phase.motion
         # A bound: full speed and the largest slope of the rate at once, whole planned acceleration.
         slope = 1.875 / stop.time
         second = np.abs(motion.second_rate[:, :3]) + slope * np.abs(motion.rate[:, :3])
         size = np.linalg.norm(second, axis=1) + 9.81
         worst = max(worst, float((cell.payload.mass * size / (2.0 * mu)).max()))
-    commanded = min(float(p.force.normal.min()) for p in job.phases if p.name in HELD)
+    commanded = min(float(p.force.normal.min()) for p in job.held)
     # Soft fingers and moments ask for more than the cone alone.
     assert stop.force_use <= 1.6 * worst / commanded
 
@@ -218,7 +216,7 @@ def independent_gap(sampled: SampledJob, kind: str) -> float:
         for d in range(n)
     ]
     coefficients = np.linalg.inv(np.array(ends))
-    spans = [sampled.span(k) for k, phase in enumerate(job.phases) if phase.name in HELD]
+    spans = [sampled.span(job.phases.index(phase)) for phase in job.held]
     starts = np.concatenate([np.arange(span.start, span.stop - 1) for span in spans])[::3]
     h = np.diff(sampled.time)[starts][:, None]
     known = [
@@ -245,7 +243,7 @@ def test_every_target_keeps_the_gap(target: str) -> None:
     """At the step and by the interpolation that it chooses by itself."""
     found = prepared(rack_driven(), TARGETS[target], BundleOptions())
     gap = independent_gap(found.sampled, TARGETS[target].interpolation)
-    held = [phase.force.normal.min() for phase in rack_job().phases if phase.name in HELD]
+    held = [phase.force.normal.min() for phase in rack_job().held]
     assert 1e4 / 2.0 * gap <= TRACKED * min(held)
     assert found.gap.along == pytest.approx(gap, rel=0.5, abs=1e-6)
 

@@ -16,7 +16,7 @@ import pytest
 from hybrid_opt.bundles import TARGETS, BundleOptions
 from hybrid_opt.bundles.bundle import prepared
 from hybrid_opt.bundles.urscript import urscript_files
-from hybrid_opt.job.compliance import HELD
+from hybrid_opt.job.records import HELD, PHASES
 from symbolic.errors import SettingsError
 from tests.hybrid_opt.bundles.bundles import contents, exported, rack_driven
 from tests.hybrid_opt.job.jobs import rack_job
@@ -253,7 +253,7 @@ def test_both_programs_stream_the_job_and_press() -> None:
 
 
 def in_held(s: float) -> bool:
-    held = [phase for phase in rack_job().phases if phase.name in HELD]
+    held = rack_job().held
     return held[0].begin + 0.1 < s < held[-1].begin + held[-1].duration - 0.01
 
 
@@ -266,7 +266,7 @@ def begun(q: Any) -> int:
 
 
 def in_carry(share: float = 0.4) -> float:
-    (carry,) = (phase for phase in rack_job().phases if phase.name == "carry")
+    carry = rack_job().phase("carry")
     return carry.begin + share * carry.duration
 
 
@@ -290,16 +290,13 @@ FAULTS: dict[str, tuple[Callable[[Pair], None], str]] = {
 }
 
 
-PHASES = ("approach", "press", "lift", "carry", "set_down", "release", "retreat")
-
-
 @pytest.mark.parametrize("phase", PHASES)
 @pytest.mark.parametrize("name", FAULTS)
 def test_both_arms_hold_and_press(name: str, phase: str) -> None:
     """Both stand, at one place but for what the heartbeat and the stop take, and press as the job
     does there."""
     fault, told = FAULTS[name]
-    (planned,) = (each for each in rack_job().phases if each.name == phase)
+    planned = rack_job().phase(phase)
     sheet = exported("ur-script")
     job, lift = sheet.sampled, rack_job().phases[2].begin
     at = planned.begin + 0.4 * planned.duration

@@ -50,7 +50,7 @@ def test_without_noise_the_truth_is_found() -> None:
     assert {"0.065", "0.070"} == {
         told(found, f"crosstalk of arm {arm}").partition(" ")[0] for arm in (1, 2)
     }
-    assert found.faults == ()
+    assert found.faults == []
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from studies.research.logged_carries import CROSSTALK, FRICTION, TOOL, judged, read
+from studies.research.logged_carries import CROSSTALK, FRICTION, TOOL, compared, read
 from studies.research.real_runs import main
 from symbolic.array import Array
 
@@ -143,7 +143,7 @@ def test_what_was_planted_is_read(tmp_path: Path, write: Callable[[Path], Path])
     assert carry.run.lost == ()
     distance = np.linalg.norm(np.diff(carry.places.pads[:, :, :3, 3], axis=1)[:, 0], axis=1)
     np.testing.assert_allclose(distance, LENGTH, atol=1e-5)
-    found = judged(carry)
+    found = compared(carry)
     np.testing.assert_allclose(found.squeeze, SQUEEZE, rtol=1e-3)
     weight = MASS * (9.81 + rise(found.time, 2))
     for k, friction in enumerate(FRICTION):
