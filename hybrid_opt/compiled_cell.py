@@ -165,10 +165,11 @@ class CompiledCell:
         if self._given is not None or "model" in vars(self):
             return self.model.start
         # Found by a search, which does not know what is held: kept.
-        from symbolic.numbers import HELD
+        from symbolic.numbers import HELD, SQUEEZES
 
         cache, task = self.cache or Cache(), self.workcell.task
-        values = [v for name, v in self.numbers.values.items() if name != HELD]
+        names = [name for name in self.numbers.sizes if name not in (HELD, *SQUEEZES)]
+        values = [self.numbers.vector(name) for name in names]
         chosen = np.array(self.workcell.start_branch), self.geometry.columns
         of = [*values, initial_decision(task), *chosen]
         key = self.key("start", *[value.tobytes().hex() for value in of])
@@ -187,7 +188,7 @@ class CompiledCell:
         """The numbers (n,) of a group, see `symbolic.numbers`."""
         from symbolic.numbers import START
 
-        return np.concatenate(self.start) if group == START else self.numbers.values[group]
+        return np.concatenate(self.start) if group == START else self.numbers.vector(group)
 
     @property
     def _expressions(self) -> str:
@@ -239,25 +240,6 @@ class CompiledCell:
             ),
         )
         return {name: self.bound(function) for name, function in built.items()}
-
-    def made(
-        self,
-        name: str,
-        make: Callable[[], Mapping[str, ca.Function]],
-        *,
-        lanes: int = 1,
-        levels: Mapping[str, int] | None = None,
-    ) -> dict[str, NumericFunction]:
-        """A set of functions in which numbers of this cell are constants.
-
-        Raises:
-            DualArmError: the code cannot be built.
-        """
-        values = [
-            f"{group} {numbers.tobytes()!r}" for group, numbers in self.numbers.values.items()
-        ]
-        key = self.key(name, *values)
-        return load_or_build(key, make, self.cache, lanes=lanes, levels=levels)
 
     def bound(self, function: NumericFunction) -> NumericFunction:
         """A function with this cell's numbers for its last inputs."""
@@ -324,6 +306,13 @@ def _numbers(workcell: Workcell) -> WorkcellNumbers:
 
 _held_numbers = kept_per_workcell(_numbers)
 
+
+def bound_to(function: NumericFunction, numbers: WorkcellNumbers) -> NumericFunction:
+    """A function with a cell's numbers, but for start postures, for its last inputs."""
+    names = [name for name in function.input_names if name in numbers.sizes]
+    return function.bound({name: numbers.vector(name) for name in names})
+
+
 _held: dict[tuple[Path, str, int], NumericFunction] = {}
 """Functions that `held_function` loaded: cells that are tried out share them."""
 
@@ -357,7 +346,7 @@ def held_function(
     if of not in _held:
         built = load_or_build(key, lambda: {name: make(numbers.symbols())}, cache, lanes=lanes)
         _held[of] = built[name]
-    return _held[of].bound(numbers.values)
+    return bound_to(_held[of], numbers)
 
 
 EVALUATORS, SCREENING = "evaluators", "screening"

@@ -34,8 +34,12 @@ def sx_given(*records: Any) -> dict[str, ca.SX]:
 
 def mx_given(*records: Any) -> dict[str, ca.MX]:
     """The same as new symbols, of functions that only hand them on."""
-    found = sx_given(*records).items()
-    return {name: ca.MX.sym(name, symbols.numel()) for name, symbols in found}
+    return mx_symbols(sx_given(*records))
+
+
+def mx_symbols(given: Mapping[str, ca.SX]) -> dict[str, ca.MX]:
+    """Symbols that hand on groups of numbers."""
+    return {name: ca.MX.sym(name, symbols.numel()) for name, symbols in given.items()}
 
 
 def of(handed: Mapping[str, ca.MX], *records: Any) -> dict[str, ca.MX]:

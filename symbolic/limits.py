@@ -14,11 +14,12 @@ import numpy as np
 
 from symbolic.cell_model import CellModel
 from symbolic.contact.closed_form import Asked, HeldLoad, held_by
+from symbolic.contact.force_closure import WRENCH_SIZE
 from symbolic.contact.grasp import Grasp
-from symbolic.contact.load import frictions, robot_wrenches
+from symbolic.contact.load import frictions
 from symbolic.contact.soft_finger import Detached
 from symbolic.contact.soft_grasp import SoftGrasp
-from symbolic.expression import mx_given, number, of, sx_given
+from symbolic.expression import as_mx, mx_given, number, of, sx_given
 from symbolic.path.spline import path_basis, waypoint_matrix
 from symbolic.path_motion import (
     ARM_OUTPUTS,
@@ -228,11 +229,13 @@ def force_functions(workcell: Workcell) -> tuple[ca.Function, ca.Function]:
     names = ("limit_forces", "limit_force_slopes")
     if not workcell.has_closed_form:
         inputs = [ca.MX.sym("asked", sizes["force"] + sizes["moment"]), *map(ca.MX.sym, "aw")]
-        load, by_timing = _load_function(workcell)(*inputs)
-        soft = _on_central_path(workcell)
-        normal, slope, _ = soft.first()(load)
+        handed = mx_given(workcell.payload)
+        load, by_timing = _load_function(workcell)(*inputs, *handed.values())
+        soft = SoftGrasp(Grasp(workcell), WEIGHT)
+        normal, slope, _ = soft.first()(load, *handed.values())
         slopes = ca.horzsplit(ca.mtimes(slope.T, by_timing))
-        alone = ca.mtimes(soft.normals, soft.solved(load))
+        alone = ca.mtimes(soft.normals, soft.solved(load, handed))
+        inputs += handed.values()
         return (
             ca.Function(names[0], inputs, [ca.densify(alone)]),
             ca.Function(names[1], inputs, [normal, *slopes]),
@@ -245,24 +248,21 @@ def force_functions(workcell: Workcell) -> tuple[ca.Function, ca.Function]:
     return _with_slopes(names, value, inputs, detached)
 
 
-def _on_central_path(workcell: Workcell) -> SoftGrasp:
-    friction = np.array([contact.friction for contact in workcell.contacts])
-    return SoftGrasp(Grasp(workcell), friction, WEIGHT)
-
-
 def _load_function(workcell: Workcell) -> ca.Function:
     """Force and moment blocks of `LimitLayout`, u'' and u'^2 to the load (6,) about the box frame's
     origin, box axes, and its derivatives (6, 2) by u'' and u'^2."""
     size = limit_layout(workcell).sizes["force"]
-    axes, centre = ca.DM(workcell.contacts[0].T_box_pad[:3, :3]), workcell.payload.centre_of_mass
+    payload = workcell.payload
+    axes, centre = number(workcell.contacts[0].T_box_pad[:3, :3]), number(payload.centre_of_mass)
     asked = ca.SX.sym("asked", size + limit_layout(workcell).sizes["moment"])
     timing = ca.SX.sym("timing", 2)
     factors = ca.vertcat(timing, 1.0)
     force = ca.mtimes(axes, ca.mtimes(ca.reshape(asked[:size], 3, 3), factors))
     about = ca.mtimes(axes, ca.mtimes(ca.reshape(asked[size:], 3, 2), timing))
-    load = ca.vertcat(force, about + ca.cross(ca.SX(ca.DM(centre)), force))
+    load = ca.vertcat(force, about + ca.cross(ca.SX(centre), force))
     outputs = [load, ca.densify(ca.jacobian(load, timing))]
-    return ca.Function("load", [asked, timing[0], timing[1]], ca.cse(outputs))
+    inputs = [asked, timing[0], timing[1], *sx_given(payload).values()]
+    return ca.Function("load", inputs, ca.cse(outputs))
 
 
 def path_force_function(workcell: Workcell) -> ca.Function:
@@ -359,20 +359,26 @@ def _program_ratios(workcell: Workcell) -> tuple[ca.Function, ca.Function]:
     asked, torque, wrench = ca.vertsplit(inputs[0], ends.tolist())
     own, by_wrench = ca.reshape(torque, joints, 3), ca.reshape(wrench, 6, joints).T
     # Each arm's joints feel its own wrench.
-    first, to_robots = workcell.robots[0].velocity_max.shape[0], robot_wrenches(workcell)
-    felt = [ca.sparsify(ca.DM(part)) for part in (to_robots[:6], to_robots[6:])]
-    load, by_timing = _load_function(workcell)(asked, *inputs[1:])
-    soft, none = _on_central_path(workcell), ca.DM.zeros(2, 1)
+    first, grasp = workcell.robots[0].velocity_max.shape[0], Grasp(workcell)
+    handed = mx_given(workcell.payload)
+    given = list(handed.values())
+    felt = as_mx(ca.SX(number(grasp.numbers.to_robots)), grasp.given, handed)
+    # The pads of the first robot come first.
+    others = WRENCH_SIZE * grasp.robots.index(1)
+    load, by_timing = _load_function(workcell)(asked, *inputs[1:], *given)
+    soft, none = SoftGrasp(grasp, WEIGHT), ca.DM.zeros(2, 1)
 
     def on_joints(held: ca.MX) -> ca.MX:
-        each = (by_wrench[:first, :], by_wrench[first:, :])
-        turned = [ca.mtimes(by, ca.mtimes(to, held)) for by, to in zip(each, felt, strict=True)]
-        return ca.vertcat(*turned)
+        one = ca.mtimes(felt[:, :others], held[:others, :])
+        other = ca.mtimes(felt[:, others:], held[others:, :])
+        arms = (by_wrench[:first, :], by_wrench[first:, :])
+        return ca.vertcat(ca.mtimes(arms[0], one), ca.mtimes(arms[1], other))
 
     ratios = ca.mtimes(own, ca.vertcat(*inputs[1:], 1.0))
-    held, by_load = soft.wrenches(slopes=True)(load)
+    held, by_load = soft.wrenches(slopes=True)(load, *given)
     slopes = own[:, :2] + on_joints(ca.mtimes(by_load, by_timing))
-    alone = soft.wrenches(slopes=False)(load)
+    alone = soft.wrenches(slopes=False)(load, *given)
+    inputs += given
     whole = [ratios + on_joints(held), *ca.horzsplit(slopes)]
     return (
         ca.Function("limit_ratios", inputs, [ca.vertcat(ratios + on_joints(alone), none)]),

@@ -13,9 +13,9 @@ file; those that NumPy derives from several keys are named by what they are.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, is_dataclass, replace
-from functools import cached_property
+from functools import cache, cached_property, partial
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Protocol
@@ -25,12 +25,14 @@ import numpy as np
 
 from symbolic.array import Array
 from symbolic.cell_model import CellBodies, CellModel
+from symbolic.contact.grasp_numbers import grasp_shapes, left_components
 from symbolic.contact.soft_finger import SoftPatch
 from symbolic.geometry.screen import Base, Bounded, Screen
 from symbolic.records import Contact, RedundantJoint, Robot, Task, Waypoint, Workcell
 from symbolic.records.cell import box_flange, flange_lever
 from symbolic.records.content import digest_of_parts
 from symbolic.records.numbered import (
+    GraspNumbers,
     Group,
     NumberedContact,
     NumberedJoint,
@@ -44,7 +46,8 @@ from symbolic.robot.model import RobotModel
 
 TASK, HELD, START, BODIES = "task_numbers", "held_numbers", "start_numbers", "body_numbers"
 ARMS = ("arm_1_numbers", "arm_2_numbers")
-GROUPS = frozenset((TASK, HELD, START, BODIES, *ARMS))
+SQUEEZES = ("squeeze_1_numbers", "squeeze_2_numbers")
+GROUPS = frozenset((TASK, HELD, START, BODIES, *ARMS, *SQUEEZES))
 """Names of the groups, which end functions' inputs."""
 
 
@@ -61,6 +64,14 @@ class Number:
     group: str
     key: str
     shape: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class _Later:
+    """Numbers that are found when they are first asked for."""
+
+    shape: tuple[int, ...]
+    find: Callable[[], Array]
 
 
 class _Take(Protocol):
@@ -83,10 +94,10 @@ class _Collected:
     """Places in the structure, the values aside."""
 
     def __init__(self) -> None:
-        self.entries: dict[str, list[tuple[Number, Array]]] = {}
+        self.entries: dict[str, list[tuple[Number, Array | _Later]]] = {}
 
     def __call__(self, group: str, key: str, value: Any) -> Any:
-        array = np.asarray(value, dtype=float)
+        array = value if isinstance(value, _Later) else np.asarray(value, dtype=float)
         entry = Number(group, key, array.shape)
         self.entries.setdefault(group, []).append((entry, array))
         return entry
@@ -109,7 +120,7 @@ class _Symbols:
         self._taken = dict.fromkeys(sizes, 0)
 
     def __call__(self, group: str, key: str, value: Any) -> Any:
-        shape = np.shape(value)
+        shape = value.shape if isinstance(value, _Later) else np.shape(value)
         at, size = self._taken[group], int(np.prod(shape, dtype=int))
         self._taken[group] = at + size
         found = self._groups[group].symbols[at : at + size]
@@ -148,7 +159,7 @@ class WorkcellNumbers:
         return self._collected[1]
 
     @property
-    def _entries(self) -> dict[str, list[tuple[Number, Array]]]:
+    def _entries(self) -> dict[str, list[tuple[Number, Array | _Later]]]:
         return self._collected[0].entries
 
     @property
@@ -157,12 +168,27 @@ class WorkcellNumbers:
         return {name: tuple(each for each, _ in found) for name, found in self._entries.items()}
 
     @cached_property
-    def values(self) -> dict[str, Array]:
-        """The vector (n,) of every group, but for the start postures."""
+    def sizes(self) -> dict[str, int]:
+        """Numbers per group, but for the start postures."""
         return {
-            name: np.concatenate([array.ravel() for _, array in found])
-            for name, found in self._entries.items()
+            name: sum(int(np.prod(each.shape, dtype=int)) for each in found)
+            for name, found in self.layout.items()
         }
+
+    def vector(self, name: str) -> Array:
+        """The numbers (n,) of a group.
+
+        Raises:
+            SettingsError: the pads do not close the grasp that they are of.
+        """
+        if name not in self._vectors:
+            parts = [v.find() if isinstance(v, _Later) else v for _, v in self._entries[name]]
+            self._vectors[name] = np.concatenate([np.ravel(part) for part in parts])
+        return self._vectors[name]
+
+    @cached_property
+    def _vectors(self) -> dict[str, Array]:
+        return {}
 
     @cached_property
     def digest(self) -> str:
@@ -174,7 +200,7 @@ class WorkcellNumbers:
         return _workcell(self._symbols(), self.cell)
 
     def _symbols(self, further: Mapping[str, int] = MappingProxyType({})) -> _Symbols:
-        return _Symbols({name: len(values) for name, values in self.values.items()} | dict(further))
+        return _Symbols(self.sizes | dict(further))
 
 
 @dataclass(frozen=True)
@@ -200,7 +226,7 @@ class CellNumbers(WorkcellNumbers):
         return self._of_bodies[1]
 
     @property
-    def _entries(self) -> dict[str, list[tuple[Number, Array]]]:
+    def _entries(self) -> dict[str, list[tuple[Number, Array | _Later]]]:
         return super()._entries | self._of_bodies[0].entries
 
     @cached_property
@@ -244,10 +270,7 @@ def _workcell(take: _Take, cell: Workcell) -> NumberedWorkcell:
     """The cell with its numbers taken; what no formula reads is left out."""
     pairs = zip(cell.robots, cell.contacts, strict=True)
     first, second = (_robot(take, i, *pair) for i, pair in enumerate(pairs))
-    # A squeeze to start from is looked for with the numbers of what is held themselves.
-    searched = cell.has_force_slopes and not cell.has_closed_form
     payload: Any = replace(cell.payload, size=np.zeros(3), shape=None, jerk_max=None)
-    contacts: Any = cell.contacts
     task: Any = replace(
         cell.task,
         reference_force=np.ones(2),
@@ -255,14 +278,13 @@ def _workcell(take: _Take, cell: Workcell) -> NumberedWorkcell:
         allowed_contacts=(),
         force_limit=(0.0, 0.0),
     )
-    if not searched:
-        names = ["mass", "centre_of_mass", "inertia", "velocity_max", "acceleration_max"]
-        names += ["angular_velocity_max", "angular_acceleration_max"]
-        own = {name: take(HELD, f"payload.{name}", getattr(payload, name)) for name in names}
-        contacts = tuple(
-            _contact(take, f"contacts[{i}]", contact, cell) for i, contact in enumerate(contacts)
-        )
-        payload = _as(NumberedPayload, payload, **own, given=take.group(HELD))
+    names = ["mass", "centre_of_mass", "inertia", "velocity_max", "acceleration_max"]
+    names += ["angular_velocity_max", "angular_acceleration_max"]
+    own = {name: take(HELD, f"payload.{name}", getattr(payload, name)) for name in names}
+    payload = _as(NumberedPayload, payload, **own, given=take.group(HELD))
+    contacts: Any = tuple(
+        _contact(take, f"contacts[{i}]", contact, cell) for i, contact in enumerate(cell.contacts)
+    )
     return NumberedWorkcell(
         name="",
         robots=(first, second),
@@ -273,8 +295,39 @@ def _workcell(take: _Take, cell: Workcell) -> NumberedWorkcell:
         facing=cell.has_facing_pads,
         opposite=cell.has_opposite_pads,
         beside=cell.has_pads_beside,
-        turn=cell.start_turn if searched else None,
+        grasp=_grasp(take, HELD, "grasp", cell, None) if cell.has_searched_grasp else None,
+        squeezes=()
+        if cell.has_one_squeeze
+        else tuple(_grasp(take, name, name, cell, i) for i, name in enumerate(SQUEEZES)),
     )
+
+
+def _grasp(
+    take: _Take, group: str, path: str, cell: Workcell, commanded: int | None
+) -> GraspNumbers:
+    """What the program of pads anywhere derives, under a commanded force or without."""
+
+    @cache
+    def found() -> GraspNumbers:
+        # Not imported at the top: few cells have such pads.
+        from symbolic.contact.grasp import Grasp
+        from symbolic.contact.worst_cases import GraspSqueeze
+
+        made = Grasp(cell) if commanded is None else GraspSqueeze(cell, commanded)
+        return made.complete()
+
+    def shape_of(pad: int) -> Array:
+        return np.asarray(found().shapes[pad])
+
+    def taken(name: str, shape: Any) -> Any:
+        if name == "shapes":
+            pads = (_Later(each, partial(shape_of, k)) for k, each in enumerate(shape))
+            return tuple(take(group, f"{path}.shapes[{k}]", pad) for k, pad in enumerate(pads))
+        return take(group, f"{path}.{name}", _Later(shape, lambda: getattr(found(), name)))
+
+    shapes = grasp_shapes(cell)
+    numbers = {name: taken(name, shape) for name, shape in shapes.items()}
+    return GraspNumbers(left=left_components(cell), **numbers, given=take.group(group))
 
 
 def _as(kind: Any, record: Any, **changes: Any) -> Any:

@@ -274,7 +274,7 @@ def load_kernel(
     def make() -> Mapping[str, Any]:
         return kernel_functions(compiled.symbols)
 
-    values, key = compiled.numbers.values, compiled.key("kernel")
+    key = compiled.key("kernel")
     own = (
         _definitions(checker.geometry)
         + _given(compiled)
@@ -293,7 +293,7 @@ def load_kernel(
         return None
     if library.dual_arm_lanes() < 2:
         return None
-    groups = [np.zeros(0), *values.values()]
+    groups = [np.zeros(0), *(compiled.vector(name) for name in _groups(compiled))]
     kernel = Kernel(library, checker, np.concatenate(groups), np.concatenate(compiled.start))
     task = compiled.workcell.task
     x = np.random.default_rng(0).uniform(task.lower, task.upper, (kernel.lanes + 1, task.n_var))
@@ -363,17 +363,24 @@ def _definitions(geometry: CellGeometry) -> str:
     return "\n".join(lines) + "\n"
 
 
+def _groups(compiled: CompiledCell) -> list[str]:
+    """The groups of numbers that the kernel holds, in order: no squeezes of commanded forces."""
+    from symbolic.numbers import SQUEEZES
+
+    return [name for name in compiled.numbers.sizes if name not in SQUEEZES]
+
+
 def _given(compiled: CompiledCell) -> str:
     """Macros of kernel.c: where each function's numbers are among all groups."""
-    numbers = compiled.numbers
-    sizes = [len(values) for values in numbers.values.values()]
-    at = dict(zip(numbers.values, np.cumsum([0, *sizes]).tolist(), strict=False))
+    numbers, groups = compiled.numbers, _groups(compiled)
+    sizes = [numbers.sizes[name] for name in groups]
+    at = dict(zip(groups, np.cumsum([0, *sizes]).tolist(), strict=False))
     lines = [f"#define N_NUMBERS {sum(sizes)}"]
-    for name, groups in kernel_numbers(numbers.workcell, numbers.screen).items():
+    for name, taken in kernel_numbers(numbers.workcell, numbers.screen).items():
         parts = [
             f"s->arg[(k) + {i}] = {name}_SHARED ? (const lanes_real*)(batch->numbers + {at[group]})"
             f" : s->numbers + {at[group]};"
-            for i, group in enumerate(groups)
+            for i, group in enumerate(taken)
         ]
         lines.append(f"#define {name}_GIVEN(k) {' '.join(parts)}")
     return "\n".join(lines) + "\n"

@@ -27,7 +27,7 @@ from hybrid_opt.timing.model import TimingModel
 from hybrid_opt.timing.records import JerkLimits
 from symbolic.array import Array, interpolated
 from symbolic.contact.grasp import Grasp
-from symbolic.contact.load import robot_wrenches
+from symbolic.contact.grasp_numbers import robot_wrenches
 from symbolic.records import Handling, Workcell
 from symbolic.records.poses import box_rotation
 from symbolic.robot.arm import REACH_TOLERANCE
@@ -406,7 +406,9 @@ def unit_squeeze(workcell: Workcell, pose: Array, leader: int = 0) -> Array:
     turned = box_rotation(workcell.task.orientation, pose)
     if not workcell.has_opposite_pads:
         grasp = Grasp(workcell)
-        parts = robot_wrenches(workcell) @ grasp.squeeze_wrenches().ravel()
+        to_robots = robot_wrenches(workcell).reshape(6, -1, 6)
+        each = np.einsum("ipj,pj->pi", to_robots, grasp.squeeze_wrenches())
+        parts = np.stack([each[np.array(grasp.robots) == robot].sum(axis=0) for robot in (0, 1)])
         axes = workcell.contacts[0].T_box_pad[:3, :3]
         wrenches = parts.reshape(2, 2, 3) @ axes.T / grasp.squeeze_normals()[1 - leader]
         return np.asarray(np.einsum("nij,abj->nabi", turned, wrenches).reshape(len(pose), 2, 6))

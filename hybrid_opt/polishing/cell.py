@@ -183,9 +183,7 @@ def polish_functions(compiled: CompiledCell) -> PolishFunctions:
     built |= compiled.functions("polish", one_by_one, details, bodies=False)
     built |= compiled.functions("polish rows", rows, details, levels=levels, lanes=0)
     if "load" in quantities:
-        built |= compiled.made(
-            "held", lambda: held_functions(compiled.workcell), levels=levels, lanes=0
-        )
+        built |= compiled.functions("held", _held, levels=levels, lanes=0, bodies=False)
     if compiled.workcell.task.time_law == "optimal":
         built |= compiled.functions("driven", driven_functions, lanes=0, bodies=False)
         if not compiled.workcell.has_closed_form:
@@ -193,6 +191,10 @@ def polish_functions(compiled: CompiledCell) -> PolishFunctions:
                 "driven held", _driven_held, levels=levels, lanes=0, bodies=False
             )
     return PolishFunctions(built, RowFunctions(compiled.bodies, built, compiled))
+
+
+def _held(model: CellModel) -> dict[str, ca.Function]:
+    return held_functions(model.workcell)
 
 
 def _driven_held(model: CellModel) -> dict[str, ca.Function]:

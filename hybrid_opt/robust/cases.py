@@ -34,18 +34,17 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from codegen.build import compile_function
 from codegen.cache import Cache
 from codegen.function import NumericFunction
 from hybrid_opt.compiled_cell import held_function
 from symbolic.array import Array
+from symbolic.contact.grasp_numbers import least_reaches
 from symbolic.contact.worst_cases import (
     GraspSqueeze,
     case_grasp_function,
     case_grasp_slack_function,
     case_slack_function,
     case_squeeze_function,
-    least_reaches,
 )
 from symbolic.errors import SettingsError
 from symbolic.read.checks import PATCH_OVERLAP, pads_beside
@@ -223,7 +222,13 @@ class CaseForces:
             return self._facing[0], self._facing[1]
         if commanded not in self._general:
             first, second = (
-                compile_function(function(self.workcell, commanded), self._cache, lanes=0)
+                held_function(
+                    self.workcell,
+                    f"{function.__name__} {commanded}",
+                    partial(function, commanded=commanded),
+                    self._cache,
+                    lanes=0,
+                )
                 for function in (case_grasp_function, case_grasp_slack_function)
             )
             self._general[commanded] = first, second
@@ -232,8 +237,7 @@ class CaseForces:
 
 def is_squeezed(workcell: Workcell) -> bool:
     """Whether the force of one pad decides that of the other, so that a least squeeze says all."""
-    soft = workcell.task.allocation == "soft-finger"
-    return workcell.has_facing_pads or (soft and workcell.has_opposite_pads)
+    return workcell.has_one_squeeze
 
 
 def check_pads(workcell: Workcell) -> None:

@@ -16,6 +16,7 @@ import numpy as np
 from codegen.interpreted import InterpretedFunction
 from codegen.source import dense
 from hybrid_opt.carry import Carry
+from hybrid_opt.compiled_cell import bound_to
 from hybrid_opt.robust.cases import is_squeezed, worst_cases
 from hybrid_opt.robust.force import BoxMotion, box_motion, pressing_model
 from symbolic.array import Array
@@ -102,7 +103,7 @@ class RulingForce:
         cases = cases[self._ruling]
         moved = np.hstack([motion.pose, motion.rate, motion.second_rate, cases])
         if self._squeezed:
-            held = WorkcellNumbers(cell).values[HELD]
+            held = WorkcellNumbers(cell).vector(HELD)
             return np.hstack([moved, np.tile(held, (len(moved), 1))])
         if pads:
             least = case_grasp_function(cell, 1 - self._leader)
@@ -119,7 +120,7 @@ class RulingForce:
         if self._squeezed:
             numbers = WorkcellNumbers(self._workcell)
             found = case_gradient_function(numbers.symbols(), numbers=True)
-            function = InterpretedFunction(dense(found)).bound(numbers.values)
+            function = bound_to(InterpretedFunction(dense(found)), numbers)
         else:
             found = case_grasp_gradient_function(self._workcell, 1 - self._leader)
             function = InterpretedFunction(dense(found))

@@ -72,6 +72,10 @@ class Program(Protocol):
     def cell_sizes(self) -> tuple[tuple[str, int], ...]:
         """Names and sizes of the inputs."""
 
+    @property
+    def given(self) -> dict[str, ca.SX]:
+        """Numbers in its formulas that are symbols, by group: inputs behind the cell."""
+
     def free(self, wrenches: list[ca.SX]) -> ca.SX:
         """The components that are free."""
 
@@ -92,6 +96,9 @@ class Program(Protocol):
 def least_effort(program: Program, *cell: ca.MX) -> ca.MX:
     """Scaled wrenches of least effort side by side, in the order of the program's patches.
 
+    Args:
+        cell: the program's inputs, its given numbers behind them.
+
     Where derivatives are wanted: `differentiable_least_effort`.
     """
     return _wrenches(program, central_path(program)(*cell))
@@ -110,7 +117,7 @@ def differentiable_least_effort(program: Program, *cell: ca.MX) -> ca.MX:
 @lru_cache(PROGRAMS)
 def central_path(program: Program, final_weight: float = FINAL_WEIGHT) -> ca.Function:
     """The cell to an iterate of all patches near the central path's place of a last weight."""
-    cell = [ca.MX.sym(name, size) for name, size in program.cell_sizes]
+    cell = _handed(program)
     step = _step(program, final_weight)
     iterate = _repeated(program, step, STEPS, _start(program)(*cell), cell)
     return ca.Function("central_path", cell, [iterate])
@@ -119,7 +126,7 @@ def central_path(program: Program, final_weight: float = FINAL_WEIGHT) -> ca.Fun
 @lru_cache(PROGRAMS)
 def centred(program: Program, final_weight: float = FINAL_WEIGHT) -> ca.Function:
     """The cell to an iterate on the central path. Its derivatives count as zero."""
-    cell = [ca.MX.sym(name, size) for name, size in program.cell_sizes]
+    cell = _handed(program)
     near = central_path(program, final_weight)(*cell)
     iterate = _repeated(program, _barrier_step(program, final_weight), CENTRING, near, cell)
     constant = {"is_diff_in": [False] * len(cell), "is_diff_out": [False]}
@@ -131,7 +138,7 @@ def _repeated(
 ) -> ca.MX:
     """The iterate after so many steps at most, whole blocks of them, as long as they go on."""
     held = [ca.MX.sym("iterate", ends_of(program)[-1]), ca.MX.sym("goes_on")]
-    inputs = [*held, *[ca.MX.sym(name, size) for name, size in program.cell_sizes]]
+    inputs = [*held, *_handed(program)]
     keep = ca.Function("keep", inputs, held)
 
     def after(count: int, one: ca.Function, state: list[ca.MX], cell: list[ca.MX]) -> list[ca.MX]:
@@ -173,7 +180,7 @@ def _step(program: Program, final_weight: float = FINAL_WEIGHT) -> ca.Function:
     gap = sum(step.gap_after(length) for step in second)
     return ca.Function(
         "step",
-        [iterate, ca.SX.sym("goes_on"), *cell],
+        [iterate, ca.SX.sym("goes_on"), *cell, *program.given.values()],
         ca.cse([iterate + length * change, gap > NEAR * degree * final]),
     )
 
@@ -195,7 +202,7 @@ def _barrier_step(program: Program, final_weight: float = FINAL_WEIGHT) -> ca.Fu
     steps = [own.step(change) for own, change in zip(barriers, changes, strict=True)]
     length = _length([step.lowest_of_state for step in steps], STEP_SHARE)
     found = iterate + length * ca.vertcat(*[step.change for step in steps])
-    inputs = [iterate, ca.SX.sym("goes_on"), *cell]
+    inputs = [iterate, ca.SX.sym("goes_on"), *cell, *program.given.values()]
     return ca.Function("barrier_step", inputs, ca.cse([found, downhill > CENTRED * weight]))
 
 
@@ -209,7 +216,8 @@ def _start(program: Program) -> ca.Function:
     """The program's start, as an iterate on the central path of a problem like it."""
     cell = [ca.SX.sym(name, size) for name, size in program.cell_sizes]
     states, share = program.start(cell)
-    return ca.Function("start", cell, ca.cse([_centred_at(program, states, share, cell)]))
+    inputs = [*cell, *program.given.values()]
+    return ca.Function("start", inputs, ca.cse([_centred_at(program, states, share, cell)]))
 
 
 def _centred_at(
@@ -331,8 +339,14 @@ def efforts(
     return found[0], list(found[1 : k + 1]), list(found[k + 1 :])
 
 
+def _handed(program: Program) -> list[ca.MX]:
+    """The cell and the given numbers, as inputs of functions that hand them on."""
+    given = ((name, numbers.numel()) for name, numbers in program.given.items())
+    return [ca.MX.sym(name, size) for name, size in (*program.cell_sizes, *given)]
+
+
 def iterate_and_cell(program: Program) -> tuple[ca.SX, list[ca.SX]]:
-    """An iterate and the cell."""
+    """An iterate and the cell, without the given numbers."""
     cell = [ca.SX.sym(name, size) for name, size in program.cell_sizes]
     return ca.SX.sym("iterate", ends_of(program)[-1]), cell
 

@@ -130,8 +130,8 @@ class LocalEven:
         symbol, along = ca.SX.sym("s", len(EVEN)), ca.SX.sym("d", len(EVEN))
         curvature, slope = ca.hessian(patch.potential(symbol), symbol)
         bend = ca.jtimes(ca.mtimes(curvature, along), symbol, along)
-        self.slope, self.curvature = ca.Function("by", [symbol], [slope, curvature])(state)
-        self._bend = ca.Function("bend", [symbol, along], [bend])
+        self.slope, self.curvature = ca.substitute([slope, curvature], [symbol], [state])
+        self._bend = bend, symbol, along
         self.stored = weight
         self.weight = ca.fmax(weight, ca.dot(state, multiplier) / DEGREE)
         self.gap = DEGREE * self.weight
@@ -150,7 +150,8 @@ class LocalEven:
 
     def second_order(self, change: ca.SX) -> ca.SX:
         """The correction that a whole step leaves out."""
-        bend = self._bend(self.wrench, change)
+        bend, *symbols = self._bend
+        (bend,) = ca.substitute([bend], symbols, [self.wrench, change])
         return self.weight * (bend / 2.0 - ca.mtimes(self.curvature, change))
 
 

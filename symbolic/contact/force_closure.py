@@ -189,8 +189,12 @@ def state_to_box(contact: Contact, even: bool = False) -> Array:
     in_box = np.block([[R, np.zeros((3, 3))], [skew(p) @ R, R]])
     if even:
         return np.asarray(in_box @ local[:, list(EVEN)])
-    size = WRENCH_SIZE if contact.half_sides is None else STATE_SIZE
-    return np.asarray(in_box @ local @ np.eye(WRENCH_SIZE, size))
+    return np.asarray(in_box @ local @ np.eye(WRENCH_SIZE, state_size(contact)))
+
+
+def state_size(contact: Contact) -> int:
+    """Entries of a patch's state, unless it presses evenly."""
+    return WRENCH_SIZE if contact.half_sides is None else STATE_SIZE
 
 
 def corner_modes(half_sides: tuple[float, float]) -> Array:
@@ -240,7 +244,10 @@ def _with_friction(states: Array, share: float) -> Array:
 
 
 def scaled_patch(contact: Contact) -> SoftPatch:
-    """A contact's patch under even pressure in its own axes, its lengths over its radius."""
+    """A contact's patch under even pressure in its own axes, its lengths over its radius: of every
+    disc the same."""
+    if contact.half_sides is None:
+        return SoftPatch(2.0 / 3.0, np.eye(2))
     own = SoftPatch.of(contact, contact.T_box_pad[:3, :3])
     return SoftPatch(own.twist / contact.patch_radius, own.spread / contact.patch_radius)
 

@@ -14,14 +14,14 @@ normal n = a x b of contact 1. Shifts and arms in m, forces in N.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import cache, cached_property
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cache, cached_property, partial
 from itertools import accumulate
-from typing import Literal
+from typing import Any, Literal
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
 from symbolic.array import Array
 from symbolic.contact.central_path import (
@@ -34,24 +34,19 @@ from symbolic.contact.even_patch import EvenPatch
 from symbolic.contact.force_closure import (
     EVEN,
     WRENCH_SIZE,
-    balance_maps,
-    closing_squeeze,
     presses_evenly,
     scaled_patch,
     size_powers,
     tangential,
 )
+from symbolic.contact.grasp_numbers import LOAD_SIZE, MOMENT_ARM, derived
 from symbolic.contact.patches import Patch, least
 from symbolic.contact.rectangular_patch import RectangularPatch
 from symbolic.contact.round_patch import RoundPatch, cross_2, patch_slack
-from symbolic.errors import SettingsError
-from symbolic.expression import Expression, reciprocal
-from symbolic.path.rotation import rotation_matrix
+from symbolic.contact.soft_finger import SoftPatch
+from symbolic.expression import Expression, number, reciprocal, sx_given
 from symbolic.records import Contact, Workcell
-from symbolic.records.quantities import GRAVITY
-
-LOAD_SIZE = 6
-"""Force and moment about the box frame's origin, along the box's axes [N, N m]."""
+from symbolic.records.numbered import GraspNumbers, NumberedWorkcell
 
 SCALE_FLOOR = 1e-9
 """Force scale [N] where nothing has to be carried."""
@@ -74,9 +69,6 @@ REST_SHARE = 0.95
 ALIKE = 0.1
 """Squeeze, over the scale, up to which a load counts as like that at rest."""
 
-MOMENT_ARM = 0.1
-"""Of moments in the load's scale [m]: about half a payload, so that they count like forces."""
-
 
 SIZES = ("friction", "reach")
 """Inputs after the load that scale states; others may follow."""
@@ -90,43 +82,34 @@ class Grasp:
 
     Attributes:
         robots: per pad the index of its robot.
-        patches, cell_sizes: see `symbolic.contact.central_path.Program`.
-        nominal: the cell's own numbers for the inputs after the load.
+        patches, cell_sizes, given: see `symbolic.contact.central_path.Program`.
+        friction: (2,) coefficients of the robots' pads.
+        numbers: what else its formulas are made of.
     """
 
-    def __init__(self, workcell: Workcell) -> None:
-        """Find the squeeze to start from.
+    def __init__(self, workcell: Workcell, numbers: GraspNumbers | None = None) -> None:
+        """Find the squeeze to start from, where the cell's numbers are not symbols.
+
+        Args:
+            numbers: where they are known.
 
         Raises:
             SettingsError: no squeeze holds the payload whatever is asked.
         """
-        pads, even = workcell.pads, presses_evenly(workcell)
-        squeeze = closing_squeeze(workcell)
-        if squeeze is None:
-            raise SettingsError(
-                "the pads do not close their grasp: no internal squeeze lies within their friction "
-                "cones; raise the friction or turn them towards one another"
-            )
-        self.robots = workcell.pad_robots
-        self.patches = tuple(_patch(pad, even) for pad in pads)
+        if numbers is None and isinstance(workcell, NumberedWorkcell):
+            numbers = workcell.grasp
+        self.numbers = derived(workcell) if numbers is None else numbers
+        self.given = sx_given(workcell.payload, self.numbers)
+        self.robots, self._pads = workcell.pad_robots, workcell.pads
+        even, shapes = presses_evenly(workcell), self.numbers.shapes
+        self.patches = tuple(map(partial(_patch, even), self._pads, shapes))
+        self.friction = ca.vertcat(*[ca.SX(number(c.friction)) for c in workcell.contacts])
         self.cell_sizes: tuple[tuple[str, int], ...] = (("load", LOAD_SIZE), ("friction", 2))
-        self.nominal: tuple[list[float], ...] = ([c.friction for c in workcell.contacts],)
-        self._load_at_rest = _load_at_rest(workcell)
-        self._pads = pads
-        self._squeeze = squeeze.states
-        # The least states that balance a load, whether they lie within the cones or not.
-        whole, in_units = (np.hstack(balance_maps(workcell, units)) for units in (False, True))
-        spread = np.linalg.pinv(whole)[:, :LOAD_SIZE]
-        ends = np.cumsum([len(state) for state in squeeze.states])[:-1]
-        self._spread = tuple(np.split(spread, ends))
-        # Which components are what the others leave: all of the last pad's, or those that the load
-        # reaches best.
-        n = in_units.shape[1]
-        self._left = _reached_best(whole) if even else np.arange(n - 6, n)
-        self._free = np.setdiff1d(np.arange(n), self._left)
-        to_left = np.asarray(np.linalg.inv(in_units[:, self._left]), dtype=float)
-        self._load_to_left = _sparse(to_left[:, :LOAD_SIZE])
-        self._free_to_left = _sparse(to_left @ in_units[:, self._free])
+        self._left = np.array(self.numbers.left)
+        sizes = [patch.wrench_size for patch in self.patches]
+        self._wrench_ends = [0, *accumulate(sizes)]
+        self._free = np.setdiff1d(np.arange(sum(sizes)), self._left)
+        self._ends = [0, *accumulate(patch.state_size for patch in self.patches)]
 
     @property
     def free_size(self) -> int:
@@ -145,13 +128,12 @@ class Grasp:
     def _left_by(self, load: ca.SX, free: ca.SX, sizes: list[ca.SX]) -> list[ca.SX]:
         """All wrenches that balance a load, from their free components."""
         units = ca.vertcat(*[self.units(i, *sizes) for i in range(len(self.patches))])
-        given = ca.mtimes(self._free_to_left, units[self._free.tolist()] * free)
-        left = ca.mtimes(self._load_to_left, load) - given
+        given = ca.mtimes(number(self.numbers.free_to_left), units[self._free.tolist()] * free)
+        left = ca.mtimes(number(self.numbers.load_to_left), load) - given
         whole = ca.SX(units.shape[0], 1)
         whole[self._free.tolist()] = free
         whole[self._left.tolist()] = left * reciprocal(units[self._left.tolist()])
-        ends = [0, *accumulate(patch.wrench_size for patch in self.patches)]
-        wrenches: list[ca.SX] = ca.vertsplit(whole, ends)
+        wrenches: list[ca.SX] = ca.vertsplit(whole, self._wrench_ends)
         return wrenches
 
     def effort(self, wrenches: list[ca.SX], cell: list[ca.SX]) -> ca.SX:
@@ -165,11 +147,11 @@ class Grasp:
         """For loads like that at rest what to first order lies on their central path, else the
         least states that balance them; and as much of the squeeze as takes that into the cones."""
         load, *sizes = cell[: 1 + len(SIZES)]
-        given, rest = self.squeezed(*sizes), ca.DM(self._load_at_rest)
+        given, rest = self.squeezed(*sizes), ca.SX(number(self.numbers.load_at_rest))
         states, slopes = self._at_rest
         times = ca.fmax(ca.dot(rest, load) / ca.sumsqr(rest), 0.0)
-        near = self._at([times * ca.DM(state) for state in states], *sizes)
-        moves = self._at([ca.mtimes(ca.DM(by), load - times * rest) for by in slopes], *sizes)
+        near = self._at(times * states, *sizes)
+        moves = self._at(ca.mtimes(slopes, load - times * rest), *sizes)
         inside = [p.slack(state) for p, state in zip(self.patches, near, strict=True)]
         taken = [p.lowest(s, move) for p, s, move in zip(self.patches, near, moves, strict=True)]
         # With much less friction than the cell's, what is held at rest lies beyond the cones.
@@ -190,24 +172,33 @@ class Grasp:
         return ca.fmax(-least(shares), 0.0) / START_SHARE + START_FLOOR
 
     @cached_property
-    def _at_rest(self) -> tuple[list[Array], list[Array]]:
-        """States (n,) on the central path under `_load_at_rest`, and their slopes (n, 6) by it."""
-        inputs = [self._load_at_rest, *[np.array(value) for value in self.nominal]]
-        cell = [ca.SX(ca.DM(value)) for value in inputs]
-        load, *sizes = cell[: 1 + len(SIZES)]
+    def _at_rest(self) -> tuple[ca.SX, ca.SX]:
+        """States (n,) on the central path under the load at rest, and their slopes (n, 6) by it."""
+        numbers = self.numbers if self.numbers.rest is not None else self.complete()
+        return ca.SX(number(numbers.rest)), ca.SX(number(numbers.rest_slopes))
+
+    def complete(self) -> GraspNumbers:
+        """The numbers with those of the central path's place under the load at rest, of a grasp
+        without symbols."""
+        inputs = [self.numbers.load_at_rest, *map(np.array, self._nominal())]
+        load, *sizes = [ca.SX(ca.DM(value)) for value in inputs][: 1 + len(SIZES)]
         asked, given = self.asked(load, *sizes), self.squeezed(*sizes)
         press = self._pressed(given, asked)
         pairs = zip(asked, given, strict=True)
         states = [np.array(ca.evalf(a + press * s)).ravel() for a, s in pairs]
         iterate, slope = central_point(self, states, inputs, REST_WEIGHT)
         starts = np.cumsum([0, *[patch.iterate_size for patch in self.patches]])
-        places = [slice(at, at + len(own)) for at, own in zip(starts, states, strict=False)]
-        return [iterate[at] for at in places], [slope[at] for at in places]
+        at = [k + np.arange(len(own)) for k, own in zip(starts, states, strict=False)]
+        rows = np.concatenate(at)
+        return replace(self.numbers, rest=iterate[rows], rest_slopes=slope[rows])
+
+    def _nominal(self) -> tuple[list[float], ...]:
+        """The cell's own numbers for the inputs after the load."""
+        return (np.array(ca.evalf(self.friction)).ravel().tolist(),)
 
     def asked(self, load: ca.SX, friction: ca.SX, reach: ca.SX = WHOLE) -> list[ca.SX]:
         """The least states that balance a load (6,), whether they lie within the cones or not."""
-        states = [ca.mtimes(ca.DM(spread), load) for spread in self._spread]
-        return self._at(states, friction, reach)
+        return self._at(ca.mtimes(number(self.numbers.spread), load), friction, reach)
 
     def squeezed(self, friction: ca.SX, reach: ca.SX = WHOLE) -> list[ca.SX]:
         """The squeeze to start from, as states at friction coefficients (2,) of the robots; it may
@@ -216,34 +207,41 @@ class Grasp:
         Args:
             reach: (2,) sizes of the robots' patches over their own.
         """
-        return self._at([ca.SX(ca.DM(state)) for state in self._squeeze], friction, reach)
+        return self._at(ca.SX(number(self.numbers.squeeze)), friction, reach)
 
     def squeeze_normals(self) -> Array:
+        """As `normals`, of a grasp without symbols."""
+        return np.array(ca.evalf(self.normals)).ravel()
+
+    @property
+    def normals(self) -> ca.SX:
         """(2,) what each robot's pads press with in the squeeze."""
-        normals = np.array([state[0] for state in self._squeeze])
-        return np.bincount(np.array(self.robots), normals, 2).astype(float)
+        squeeze, found = number(self.numbers.squeeze), ca.SX(2, 1)
+        for at, robot in zip(self._ends, self.robots, strict=False):
+            found[robot] += squeeze[at]
+        return found
 
     def squeeze_wrenches(self) -> Array:
-        """(k, 6) of all pads in the squeeze, see `grasp_wrenches`."""
-        friction, states = ca.SX(ca.DM(self.nominal[0])), self._squeeze
-        sizes = [patch.wrench_size for patch in self.patches]
+        """(k, 6) of all pads in the squeeze, see `grasp_wrenches`; without symbols."""
+        states = ca.vertsplit(ca.SX(number(self.numbers.squeeze)), self._ends)
         parts = [
-            whole_wrench(self.units(i, friction) * ca.SX(ca.DM(state[:size])))
-            for i, (state, size) in enumerate(zip(states, sizes, strict=True))
+            whole_wrench(self.units(i, self.friction) * state[: patch.wrench_size])
+            for i, (state, patch) in enumerate(zip(states, self.patches, strict=True))
         ]
         return np.array(ca.evalf(ca.horzcat(*parts))).T
 
     def units(self, i: int, friction: ca.SX, reach: ca.SX = WHOLE) -> ca.SX:
         """(m,) what the entries of pad i's scaled wrench are multiples of."""
         robot = self.robots[i]
-        units = _units(friction[robot], reach[robot] * self._pads[i].patch_radius)
+        radius = self.numbers.reach * self._pads[i].patch_radius
+        units = _units(friction[robot], reach[robot] * radius)
         return units[list(EVEN)] if self.patches[i].wrench_size == len(EVEN) else units
 
-    def _at(self, states: list[ca.SX], friction: ca.SX, reach: ca.SX = WHOLE) -> list[ca.SX]:
-        """States at the nominal friction and size with what they carry, at others: each corner's
-        force is shared among those of the other size."""
-        moved = []
-        for pad, robot, state in zip(self._pads, self.robots, states, strict=True):
+    def _at(self, states: ca.SX, friction: ca.SX, reach: ca.SX = WHOLE) -> list[ca.SX]:
+        """States (n,) at the nominal friction and size with what they carry, at others: each
+        corner's force is shared among those of the other size."""
+        moved, owns = [], ca.vertsplit(states, self._ends)
+        for pad, robot, state in zip(self._pads, self.robots, owns, strict=True):
             by_friction, by_reach = pad.friction / friction[robot], 1.0 / reach[robot]
             size = state.shape[0]
             held, by_size = tangential(size), size_powers(size)
@@ -255,7 +253,11 @@ class Grasp:
 
 
 def grasp_wrenches(
-    grasp: Grasp, load: ca.MX, friction: ca.MX, differentiable: bool = False
+    grasp: Grasp,
+    load: ca.MX,
+    friction: ca.MX,
+    given: Sequence[ca.MX] = (),
+    differentiable: bool = False,
 ) -> ca.MX:
     """Per pad (6,) side by side: N, T (2,) [N], the first moment N d (2,) and M [N m], of least
     effort, in its pad's axes. Friction that does not close the grasp gives normal forces beyond
@@ -264,21 +266,13 @@ def grasp_wrenches(
     Args:
         load: (6,) force and moment about the box frame's origin, along the box's axes.
         friction: (2,) Coulomb coefficients of the robots' pads.
+        given: the grasp's given numbers, where they are symbols.
         differentiable: whether first derivatives are wanted.
     """
     size = ca.sqrt(ca.sumsqr(load[:3]) + ca.sumsqr(load[3:] / MOMENT_ARM) + SCALE_FLOOR**2)
     solve = differentiable_least_effort if differentiable else least_effort
-    found = solve(grasp, load / size, friction)
-    return _in_newtons(grasp)(found, size, friction)
-
-
-def _reached_best(to_box: Array) -> NDArray[np.intp]:
-    """Components (m,) of states that what is balanced (m,) reaches best, by a QR decomposition
-    with pivots."""
-    # Not imported at the top: a warm start makes no grasp.
-    from scipy.linalg import qr
-
-    return np.sort(qr(to_box, pivoting=True)[2][: len(to_box)])
+    found = solve(grasp, load / size, friction, *given)
+    return _in_newtons(grasp)(found, size, friction, *given)
 
 
 def _in_newtons(grasp: Grasp) -> ca.Function:
@@ -292,7 +286,8 @@ def _in_newtons(grasp: Grasp) -> ca.Function:
     closes = least([patch.slack(state) for patch, state in squeezed]) > 0.0
     beyond = ca.repmat(ca.DM([BEYOND, 0, 0, 0, 0, 0]), len(wrenches), 1)
     held = size * ca.if_else(closes, ca.vertcat(*wrenches), beyond)
-    return ca.Function("in_newtons", [found, size, friction], [held])
+    inputs = [found, size, friction, *grasp.given.values()]
+    return ca.Function("in_newtons", inputs, [held])
 
 
 def whole_wrench(wrench: ca.SX) -> ca.SX:
@@ -304,26 +299,13 @@ def whole_wrench(wrench: ca.SX) -> ca.SX:
     return ca.densify(whole)
 
 
-def _load_at_rest(workcell: Workcell) -> Array:
-    """(6,) of the payload as it stands at the start, as a direction that is scaled like loads."""
-    start = ca.SX(ca.DM(workcell.start_turn))
-    turn = ca.evalf(rotation_matrix(workcell.task.orientation, start))
-    force = -np.array(turn).T @ np.array(GRAVITY)
-    moment = np.cross(workcell.payload.centre_of_mass, force)
-    load = np.concatenate([force, moment])
-    return np.asarray(load / np.hypot(np.linalg.norm(force), np.linalg.norm(moment) / MOMENT_ARM))
-
-
-def _patch(contact: Contact, even: bool) -> Patch:
+def _patch(even: bool, contact: Contact, shape: Any) -> Patch:
+    if contact.half_sides is None:
+        return EvenPatch(scaled_patch(contact)) if even else RoundPatch()
+    sizes = ca.vertsplit(ca.SX(number(shape)))
     if even:
-        return EvenPatch(scaled_patch(contact))
-    return RoundPatch() if contact.half_sides is None else RectangularPatch(*contact.half_sides)
-
-
-def _sparse(matrix: Array) -> ca.DM:
-    """Without what is zero but for rounding."""
-    small = np.abs(matrix) < 1e-14 * np.abs(matrix).max()
-    return ca.sparsify(ca.DM(np.where(small, 0.0, matrix)))
+        return EvenPatch(SoftPatch(sizes[0], ca.diagcat(*sizes[1:])))
+    return RectangularPatch(*sizes)
 
 
 def _units(mu: ca.SX, r: ca.SX) -> ca.SX:
@@ -409,6 +391,11 @@ class OppositePads:
     objective: Objective
     patches: tuple[Patch, ...] = (RoundPatch(), RoundPatch())
     cell_sizes: tuple[tuple[str, int], ...] = CELL_SIZES
+
+    @property
+    def given(self) -> dict[str, ca.SX]:
+        """None: all are inputs."""
+        return {}
 
     def free(self, wrenches: list[ca.SX]) -> ca.SX:
         """That of contact 1."""

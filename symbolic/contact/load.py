@@ -11,9 +11,7 @@ alone answers, for both other allocations.
 from __future__ import annotations
 
 import casadi as ca
-import numpy as np
 
-from symbolic.array import Array
 from symbolic.contact.closed_form import Asked, held_by
 from symbolic.contact.force_closure import WRENCH_SIZE
 from symbolic.contact.grasp import Grasp, balance_of, facing_wrenches, grasp_wrenches
@@ -21,7 +19,6 @@ from symbolic.contact.paper import required_force, required_moment
 from symbolic.expression import Expression, as_mx, mx_given, number, sx_given
 from symbolic.path.rotation import angular_acceleration, angular_velocity, rotation_matrix
 from symbolic.records import Allocation, Workcell
-from symbolic.records.poses import skew
 
 LOAD_OUTPUTS = (
     "angular_velocity",
@@ -254,7 +251,7 @@ def _sample_function(workcell: Workcell) -> ca.Function:
         wrenches = _facing_wrenches(workcell, asked, friction, list(given.values()))
     else:
         load = box_load_function(workcell)(*asked)
-        wrenches = grasp_wrenches(Grasp(workcell), load, friction)
+        wrenches = grasp_wrenches(Grasp(workcell), load, friction, list(given.values()))
     outputs = grasp_world_function(workcell)(*asked, wrenches, *given.values())
     return ca.Function("grasp_sample", [*inputs, *given.values()], outputs)
 
@@ -323,25 +320,6 @@ def box_load_function(workcell: Workcell) -> ca.Function:
     in_box = ca.mtimes(to_box, force)
     about = ca.mtimes(to_box, moment) + ca.cross(centre_of_mass, in_box)
     return ca.Function("box_load", inputs, [ca.vertcat(in_box, about)])
-
-
-def robot_wrenches(workcell: Workcell) -> Array:
-    """(12, 6 k) from all pads' wrenches, see `symbolic.contact.grasp.grasp_wrenches`, to force and
-    moment of both robots about their nominal contact points, along the axes of contact 1."""
-    axes, columns = workcell.contacts[0].T_box_pad[:3, :3], []
-    for pad, robot in zip(workcell.pads, workcell.pad_robots, strict=True):
-        force, moment = np.zeros((2, 3, WRENCH_SIZE))
-        force[[0, 1, 2], [1, 2, 0]] = 1.0
-        # A normal force N n at d turns about d x n = (d_y, -d_x).
-        moment[[0, 1, 2], [4, 3, 5]] = 1.0, -1.0, 1.0
-        beside = pad.T_box_pad[:3, 3] - workcell.contacts[robot].T_box_pad[:3, 3]
-        to_axes = axes.T @ pad.T_box_pad[:3, :3]
-        force = to_axes @ force
-        moment = to_axes @ moment + skew(axes.T @ beside) @ force
-        own = np.zeros((2, 2 * 3, WRENCH_SIZE))
-        own[robot] = np.vstack([force, moment])
-        columns.append(own.reshape(-1, WRENCH_SIZE))
-    return np.hstack(columns)
 
 
 def grasp_world_function(workcell: Workcell) -> ca.Function:

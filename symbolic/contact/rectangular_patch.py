@@ -17,7 +17,7 @@ from dataclasses import dataclass
 
 import casadi as ca
 
-from symbolic.contact.force_closure import POINT_SIZE, STATE_SIZE, WRENCH_SIZE, corner_modes
+from symbolic.contact.force_closure import POINT_SIZE, STATE_SIZE, WRENCH_SIZE
 from symbolic.contact.patches import BarrierPatch, Elimination, StateStep, least
 from symbolic.expression import reciprocal
 
@@ -37,8 +37,8 @@ class RectangularPatch:
         half_x, half_y: half its sides along the pad's x and y axes [m].
     """
 
-    half_x: float
-    half_y: float
+    half_x: float | ca.SX
+    half_y: float | ca.SX
     wrench_size: int = WRENCH_SIZE
     iterate_size: int = 2 * STATE_SIZE
     state_size: int = STATE_SIZE
@@ -80,13 +80,17 @@ class RectangularPatch:
 
     def _corners(self, state: ca.SX) -> list[ca.SX]:
         """The corners' forces (3,)."""
-        modes = ca.sparsify(ca.DM(corner_modes((self.half_x, self.half_y))))
-        return [ca.mtimes(mode, state) for mode in ca.vertsplit(modes, POINT_SIZE)]
+        return corners_of(self.waves(state))
+
+    @property
+    def _sides(self) -> tuple[float | ca.SX, float | ca.SX]:
+        """Over the whole diagonal."""
+        radius = (self.half_x**2 + self.half_y**2) ** 0.5
+        return self.half_x / radius, self.half_y / radius
 
     def waves(self, state: ca.SX) -> list[list[ca.SX]]:
         """Four times what the corners' N, T_x and T_y are sums of, wave by wave."""
-        radius = (self.half_x**2 + self.half_y**2) ** 0.5
-        x, y = self.half_x / radius, self.half_y / radius
+        x, y = self._sides
         n, t_x, t_y, q_x, q_y, m, n_xy, x_x, x_xy, y_y, y_xy, more = ca.vertsplit(state)
         return [
             [n, q_x * (1.0 / x), q_y * (1.0 / y), n_xy],
@@ -96,8 +100,7 @@ class RectangularPatch:
 
     def gathered(self, waves: list[list[ca.SX]]) -> list[ca.SX]:
         """The transposed map: what acts on the waves, as it acts on the state, a quarter of it."""
-        radius = (self.half_x**2 + self.half_y**2) ** 0.5
-        x, y = self.half_x / radius, self.half_y / radius
+        x, y = self._sides
         (n, n_x, n_y, n_xy), (t_x, x_x, x_y, x_xy), (t_y, y_x, y_y, y_xy) = waves
         outer = [n, t_x, t_y, n_x * (1.0 / x), n_y * (1.0 / y), x * y_x - y * x_y]
         return [*outer, n_xy, x_x, x_xy, y_y, y_xy, x * x_y + y * y_x]

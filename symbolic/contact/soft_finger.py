@@ -73,8 +73,8 @@ class SoftPatch:
             times a rotation for a disc.
     """
 
-    twist: float
-    spread: Array
+    twist: float | ca.SX
+    spread: Array | ca.SX
 
     @classmethod
     def of(cls, contact: Contact, axes: Array) -> SoftPatch:

@@ -23,10 +23,11 @@ from itertools import accumulate
 import casadi as ca
 import numpy as np
 
-from symbolic.array import Array
 from symbolic.contact.central_path import centred, wrenches_of
-from symbolic.contact.grasp import LOAD_SIZE, MOMENT_ARM, SCALE_FLOOR, Grasp, whole_wrench
+from symbolic.contact.grasp import SCALE_FLOOR, Grasp, whole_wrench
+from symbolic.contact.grasp_numbers import LOAD_SIZE, MOMENT_ARM
 from symbolic.contact.patches import Elimination, Patch
+from symbolic.expression import as_mx, mx_symbols
 
 POLISH_STEPS = 2
 """Newton steps of f itself, from the central path's iterate, which lies a tenth of a per mille of
@@ -36,7 +37,8 @@ ROBOTS = 2
 
 
 class SoftGrasp:
-    """The program of a grasp's pads at their own friction, at one weight.
+    """The program of a grasp's pads at their own friction, at one weight. Its functions take the
+    grasp's given numbers last.
 
     Attributes:
         grasp: the pads.
@@ -46,10 +48,10 @@ class SoftGrasp:
         normals: C (2, size).
     """
 
-    def __init__(self, grasp: Grasp, friction: Array, weight: float) -> None:
-        """friction: (2,) Coulomb coefficients of the robots' pads."""
+    def __init__(self, grasp: Grasp, weight: float) -> None:
         self.grasp, self.weight = grasp, weight
-        self._friction = ca.DM(friction)
+        self.given = grasp.given
+        self._friction = grasp.friction
         sizes = [patch.state_size for patch in grasp.patches]
         self.ends = [0, *accumulate(sizes)]
         self.size = self.ends[-1]
@@ -61,15 +63,22 @@ class SoftGrasp:
     def first(self) -> ca.Function:
         """load (6,), see `symbolic.contact.grasp.grasp_wrenches`, to normal (2,) forces of the
         robots [N], slope (6, 2), their gradients, and state (size,)."""
-        load = ca.MX.sym("load", LOAD_SIZE)
-        state = self.solved(load)
-        outputs = [*self._slopes()(state), state]
-        return ca.Function("held_first", [load], outputs, ["load"], ["normal", "slope", "state"])
+        load, handed = ca.MX.sym("load", LOAD_SIZE), mx_symbols(self.given)
+        state = self.solved(load, handed)
+        outputs = [*self._slopes()(state, *handed.values()), state]
+        inputs, names = [load, *handed.values()], ["load", *handed]
+        return ca.Function("held_first", inputs, outputs, names, ["normal", "slope", "state"])
 
-    def solved(self, load: ca.MX) -> ca.MX:
-        """The state (size,) that holds a load (6,)."""
+    def solved(self, load: ca.MX, handed: dict[str, ca.MX]) -> ca.MX:
+        """The state (size,) that holds a load (6,).
+
+        Args:
+            handed: the given numbers.
+        """
+        given = list(handed.values())
+        friction = as_mx(self._friction, self.given, handed)
         scale = ca.sqrt(ca.sumsqr(load[:3]) + ca.sumsqr(load[3:] / MOMENT_ARM) + SCALE_FLOOR**2)
-        iterate = centred(self.grasp, self.weight)(load / scale, self._friction)
+        iterate = centred(self.grasp, self.weight)(load / scale, friction, *given)
         held, at = [], 0
         for patch in self.grasp.patches:
             held.append(iterate[at : at + patch.state_size])
@@ -77,22 +86,24 @@ class SoftGrasp:
         state = scale * ca.vertcat(*held)
         step = self._newton()
         for _ in range(POLISH_STEPS):
-            state = step(state)
+            state = step(state, *given)
         return state
 
     def wrenches(self, slopes: bool) -> ca.Function:
         """load (6,) to wrenches (6 k,) of all pads, see `symbolic.contact.grasp.grasp_wrenches`,
         and where asked for, to by_load (6 k, 6)."""
         load, state = ca.MX.sym("load", LOAD_SIZE), ca.SX.sym("state", self.size)
+        handed = mx_symbols(self.given)
         own = wrenches_of(self.grasp, ca.vertsplit(state, self.ends))
-        friction = ca.SX(self._friction)
-        units = [self.grasp.units(i, friction) * wrench for i, wrench in enumerate(own)]
+        units = [self.grasp.units(i, self._friction) * wrench for i, wrench in enumerate(own)]
         outputs = [ca.vertcat(*map(whole_wrench, units))]
         if slopes:
             by_state = ca.jacobian(outputs[0], state)
             outputs.append(ca.mtimes(by_state, _Local(self, state).by_load()))
-        whole = ca.Function("whole", [state], ca.cse([ca.densify(value) for value in outputs]))
-        return ca.Function("held_wrenches", [load], whole.call([self.solved(load)]))
+        results = ca.cse([ca.densify(value) for value in outputs])
+        whole = ca.Function("whole", [state, *self.given.values()], results)
+        found = whole.call([self.solved(load, handed), *handed.values()])
+        return ca.Function("held_wrenches", [load, *handed.values()], found)
 
     def second(self) -> ca.Function:
         """state (size,) and weight (2,) to curvature (6, 6), the weighted second derivatives of the
@@ -104,9 +115,9 @@ class SoftGrasp:
         curvature = local.third(along, local.by_load())
         return ca.Function(
             "held_second",
-            [state, weight],
+            [state, weight, *self.given.values()],
             [ca.cse(ca.densify(curvature))],
-            ["state", "weight"],
+            ["state", "weight", *self.given],
             ["curvature"],
         )
 
@@ -115,21 +126,23 @@ class SoftGrasp:
         state = ca.SX.sym("state", self.size)
         by_load = _Local(self, state).by_load()
         outputs = [ca.mtimes(self.normals, state), ca.mtimes(self.normals, by_load).T]
-        return ca.Function("slopes", [state], ca.cse([ca.densify(value) for value in outputs]))
+        inputs = [state, *self.given.values()]
+        return ca.Function("slopes", inputs, ca.cse([ca.densify(value) for value in outputs]))
 
     def _newton(self) -> ca.Function:
         """A state to the next one, under the same load."""
         state = ca.SX.sym("state", self.size)
         local = _Local(self, state)
         change = local.solved(-ca.mtimes(self.free.T, local.slope))
-        return ca.Function("newton", [state], [ca.cse(state + ca.mtimes(self.free, change))])
+        inputs = [state, *self.given.values()]
+        return ca.Function("newton", inputs, [ca.cse(state + ca.mtimes(self.free, change))])
 
     def effort(self, state: ca.SX) -> ca.SX:
         """Half the sum of all squared forces."""
         wrenches = wrenches_of(self.grasp, ca.vertsplit(state, self.ends))
-        return self.grasp.effort(wrenches, [ca.SX(LOAD_SIZE, 1), ca.SX(self._friction)])
+        return self.grasp.effort(wrenches, [ca.SX(LOAD_SIZE, 1), self._friction])
 
-    def _states(self) -> tuple[ca.DM, ca.DM]:
+    def _states(self) -> tuple[ca.SX, ca.SX]:
         """Y (n, free) and W (n, 6). What is free: whatever leaves the wrenches as they are, then
         the wrenches' components that are free."""
         patches = self.grasp.patches
@@ -137,13 +150,10 @@ class SoftGrasp:
             ca.SX.sym(f"inner_{i}", p.state_size - p.wrench_size) for i, p in enumerate(patches)
         ]
         load, wrenches = ca.SX.sym("load", LOAD_SIZE), ca.SX.sym("free", self.grasp.free_size)
-        whole = self.grasp.balanced(wrenches, [load, ca.SX(self._friction)])
+        whole = self.grasp.balanced(wrenches, [load, self._friction])
         state = ca.vertcat(*[part for pair in zip(whole, inner, strict=True) for part in pair])
         free = ca.vertcat(*inner, wrenches)
-        by = [ca.jacobian(state, symbols) for symbols in (free, load)]
-        found = ca.Function("by", [], [ca.sparsify(ca.evalf(matrix)) for matrix in by])
-        free_part, loaded = found.call([])
-        return free_part, loaded
+        return ca.jacobian(state, free), ca.jacobian(state, load)
 
 
 class _Local:
@@ -158,12 +168,12 @@ class _Local:
         self._program, self._ends = program, program.ends
         symbol = ca.SX.sym("s", program.size)
         effort = program.effort(symbol)
-        by = ca.Function("effort", [symbol], [effort, *ca.hessian(effort, symbol)[::-1]])
-        self._effort, self._by_effort, self._square = by(state)
+        by = [effort, *ca.hessian(effort, symbol)[::-1]]
+        self._effort, self._by_effort, self._square = ca.substitute(by, [symbol], [state])
         self._g = self._by_effort / self._effort
         self._owns = ca.vertsplit(state, self._ends)
         patches = zip(program.grasp.patches, self._owns, strict=True)
-        slopes, stiff = zip(*[_barrier(patch)(own) for patch, own in patches], strict=True)
+        slopes, stiff = zip(*[_barrier(patch, own) for patch, own in patches], strict=True)
         self.slope = self._g + program.weight * ca.vertcat(*slopes)
         # Without g g'.
         self._curvature = program.weight * ca.diagcat(*stiff) + self._square / self._effort
@@ -197,7 +207,7 @@ class _Local:
             ca.vertsplit(by_load, self._ends),
             strict=True,
         )
-        barriers = sum(ca.mtimes(u.T, _third(patch)(own, d, u)) for patch, own, d, u in rows)
+        barriers = sum(ca.mtimes(u.T, _third(patch, own, d, u)) for patch, own, d, u in rows)
         # Of log effort.
         over = 1.0 / self._effort
         turned = ca.mtimes(self._square, along)
@@ -212,18 +222,19 @@ class _Local:
         return ca.vertcat(*self._system.first(self._system.reduced(ca.vertsplit(right)), []))
 
 
-def _barrier(patch: Patch) -> ca.Function:
-    """A state to the barrier's gradient and Hessian."""
+def _barrier(patch: Patch, at: ca.SX) -> list[ca.SX]:
+    """The barrier's gradient and Hessian at a state."""
     state = ca.SX.sym("state", patch.state_size)
     hessian, gradient = ca.hessian(patch.potential(state), state)
-    return ca.Function("barrier", [state], ca.cse([ca.densify(gradient), hessian]))
+    found: list[ca.SX] = ca.substitute([ca.densify(gradient), hessian], [state], [at])
+    return found
 
 
-def _third(patch: Patch) -> ca.Function:
-    """A state, a direction and columns (., 6) to the barrier's third derivative along the direction
-    and each of the columns."""
-    size = patch.state_size
-    state, along = ca.SX.sym("state", size), ca.SX.sym("along", size)
-    columns = ca.SX.sym("columns", size, LOAD_SIZE)
-    moved = ca.jtimes(ca.gradient(patch.potential(state), state), state, along)
-    return ca.Function("third", [state, along, columns], [ca.jtimes(moved, state, columns)])
+def _third(patch: Patch, at: ca.SX, along: ca.SX, columns: ca.SX) -> ca.SX:
+    """The barrier's third derivative at a state, along a direction and each of some columns
+    (., 6)."""
+    state, direction = (ca.SX.sym(name, patch.state_size) for name in ("state", "along"))
+    others = ca.SX.sym("columns", patch.state_size, LOAD_SIZE)
+    moved = ca.jtimes(ca.gradient(patch.potential(state), state), state, direction)
+    bent = ca.jtimes(moved, state, others)
+    return ca.substitute([bent], [state, direction, others], [at, along, ca.densify(columns)])[0]

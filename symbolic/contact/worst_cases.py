@@ -24,7 +24,6 @@ does.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from itertools import accumulate
 from typing import Any
 
@@ -35,21 +34,21 @@ from symbolic.contact.central_path import differentiable_least_effort, least_eff
 from symbolic.contact.force_closure import WRENCH_SIZE, has_force_closure, presses_evenly
 from symbolic.contact.grasp import (
     BEYOND,
-    LOAD_SIZE,
-    MOMENT_ARM,
     SCALE_FLOOR,
     Grasp,
     balance_of,
     even_slack,
     facing_wrenches,
 )
+from symbolic.contact.grasp_numbers import LOAD_SIZE, MOMENT_ARM, derived, smaller_patches
 from symbolic.contact.load import resultant_force
 from symbolic.contact.paper import required_moment
 from symbolic.contact.patches import least
 from symbolic.contact.soft_finger import Detached, SoftPatch, least_soft_squeeze
-from symbolic.expression import Expression, mx_given, number, sx_given
+from symbolic.expression import Expression, as_mx, mx_given, mx_symbols, number, of, sx_given
 from symbolic.path.rotation import angular_acceleration, angular_velocity, rotation_matrix
-from symbolic.records import Contact, Workcell
+from symbolic.records import Workcell
+from symbolic.records.numbered import NumberedWorkcell
 
 CASE_SIZES = {
     "friction": 2,
@@ -306,10 +305,12 @@ def case_grasp_function(workcell: Workcell, commanded: int) -> ca.Function:
         SettingsError: the pads do not close their grasp.
     """
     motion = [ca.MX.sym(name, 6) for name in MOTION]
-    case = ca.MX.sym("case", CASE_SIZE)
-    load = case_origin_load_function(workcell)(*motion, case)
-    force = _to_command_of(GraspSqueeze(workcell, commanded), load, case)
-    return ca.Function("case_grasp", [*motion, case], [force], [*MOTION, "case"], ["normal_force"])
+    case, squeeze = ca.MX.sym("case", CASE_SIZE), GraspSqueeze(workcell, commanded)
+    handed = mx_symbols(squeeze.given)
+    load = _origin_load(workcell, [*motion, case], handed)
+    force = _to_command_of(squeeze, load, case, handed)
+    inputs, names = [*motion, case, *handed.values()], [*MOTION, "case", *handed]
+    return ca.Function("case_grasp", inputs, [force], names, ["normal_force"])
 
 
 def case_grasp_gradient_function(workcell: Workcell, commanded: int) -> ca.Function:
@@ -317,28 +318,40 @@ def case_grasp_gradient_function(workcell: Workcell, commanded: int) -> ca.Funct
     second_rate, by the case and by the load of `case_origin_load_function`."""
     motion = [ca.MX.sym(name, 6) for name in MOTION]
     case, beside = ca.MX.sym("case", CASE_SIZE), ca.MX.sym("beside", LOAD_SIZE)
-    load = case_origin_load_function(workcell)(*motion, case) + beside
     squeeze = GraspSqueeze(workcell, commanded)
-    force = _to_command_of(squeeze, load, case, differentiable=True)
+    handed = mx_symbols(squeeze.given)
+    load = _origin_load(workcell, [*motion, case], handed) + beside
+    force = _to_command_of(squeeze, load, case, handed, differentiable=True)
     slope = ca.horzcat(*[ca.jacobian(force, part) for part in (*motion, case, beside)])
-    found = ca.Function("beside", [*motion, case, beside], [force, ca.densify(slope.T)])
-    outputs = found(*motion, case, ca.DM.zeros(LOAD_SIZE))
-    names = [*MOTION, "case"]
-    return ca.Function("gradient", [*motion, case], outputs, names, ["normal_force", "slope"])
+    inputs, names = [*motion, case, *handed.values()], [*MOTION, "case", *handed]
+    found = ca.Function("beside", [*inputs, beside], [force, ca.densify(slope.T)])
+    outputs = found(*inputs, ca.DM.zeros(LOAD_SIZE))
+    return ca.Function("gradient", inputs, outputs, names, ["normal_force", "slope"])
+
+
+def _origin_load(workcell: Workcell, inputs: list[ca.MX], handed: dict[str, ca.MX]) -> ca.MX:
+    own = of(handed, workcell.payload).values()
+    return case_origin_load_function(workcell)(*inputs, *own)
 
 
 def _to_command_of(
-    squeeze: GraspSqueeze, load: ca.MX, case: ca.MX, differentiable: bool = False
+    squeeze: GraspSqueeze,
+    load: ca.MX,
+    case: ca.MX,
+    handed: dict[str, ca.MX],
+    differentiable: bool = False,
 ) -> ca.MX:
     """(2,) normal forces of pads anywhere to command [N] in a case whose load (6,) is known."""
     friction, *_, displacement, tracking, internal = case_parts(case)
-    sizes, commanded = _sizes(squeeze.workcell, case), squeeze.commanded
-    force = commanded_forces(squeeze, load, friction, sizes, displacement, differentiable)
-    needed = force[commanded] + internal * _against_internal(squeeze)(friction, sizes)
+    commanded, given = squeeze.commanded, list(handed.values())
+    sizes = _sizes_function(squeeze)(case, *given)
+    force = commanded_forces(squeeze, load, friction, sizes, displacement, handed, differentiable)
+    needed = force[commanded] + internal * _against_internal(squeeze)(friction, sizes, *given)
     more = needed / (1.0 - tracking[commanded]) - force[commanded]
-    normals = squeeze.squeeze_normals()
+    normals = squeeze.normals
+    shares = as_mx(normals / normals[commanded], squeeze.given, handed)
     # One entry after the other: a scalar times a vector repeats it by a form without lanes.
-    force += ca.vertcat(*[more * share for share in (normals / normals[commanded]).tolist()])
+    force += ca.vertcat(*[more * shares[i] for i in (0, 1)])
     return force
 
 
@@ -348,24 +361,17 @@ def case_grasp_slack_function(workcell: Workcell, commanded: int) -> ca.Function
     motion = [ca.SX.sym(name, 6) for name in ("pose", "rate", "second_rate")]
     case, force = ca.SX.sym("case", CASE_SIZE), ca.SX.sym("force")
     friction, *_, tracking, internal = case_parts(case)
-    squeeze, sizes = GraspSqueeze(workcell, commanded), _sizes(workcell, case)
-    load = case_origin_load_function(workcell)(*motion, case)
+    squeeze = GraspSqueeze(workcell, commanded)
+    given = list(squeeze.given.values())
+    sizes = _sizes_function(squeeze)(case, *given)
+    load = case_origin_load_function(workcell)(*motion, case, *sx_given(workcell.payload).values())
     left = (1.0 - tracking[commanded]) * force
-    left -= internal * _against_internal(squeeze)(friction, sizes)
+    left -= internal * _against_internal(squeeze)(friction, sizes, *given)
     *_, displacement, _, _ = case_parts(case)
     slack = commanded_slack(squeeze, load, friction, sizes, displacement, left)
-    names = ["pose", "rate", "second_rate", "case", "force"]
-    inputs = [*motion, case, force]
+    names = ["pose", "rate", "second_rate", "case", "force", *squeeze.given]
+    inputs = [*motion, case, force, *given]
     return ca.Function("case_grasp_slack", inputs, ca.cse([slack]), names, ["slack"])
-
-
-def least_reaches(workcell: Workcell) -> tuple[float, float]:
-    """Of each robot's patches the least radius or half side [m]."""
-    first, second = (
-        min(pad.patch_radius if pad.half_sides is None else min(pad.half_sides) for pad in pads)
-        for pads in ((contact, *contact.further) for contact in workcell.contacts)
-    )
-    return first, second
 
 
 def least_distance(workcell: Workcell) -> float:
@@ -377,22 +383,25 @@ def least_distance(workcell: Workcell) -> float:
     return float(np.linalg.norm(places[0][:, None] - places[1], axis=2).min())
 
 
-def _sizes(workcell: Workcell, case: ca.SX | ca.MX) -> ca.SX | ca.MX:
-    """(2,) of the robots' patches over the cell's own, less what displacements take off."""
+def _sizes_function(squeeze: GraspSqueeze) -> ca.Function:
+    """A case to the sizes (2,) of the robots' patches over the cell's own, less what displacements
+    take off."""
+    case = ca.SX.sym("case", CASE_SIZE)
     _, radius, *_, displacement, _, _ = case_parts(case)
-    own = ca.DM([contact.patch_radius for contact in workcell.contacts])
-    if presses_evenly(workcell):
-        return radius / own
-    lengths = [ca.norm_2(displacement[2 * i : 2 * i + 2]) for i in (0, 1)]
-    return radius / own - ca.vertcat(*lengths) / ca.DM(least_reaches(workcell))
+    own = [ca.SX(number(contact.patch_radius)) for contact in squeeze.workcell.contacts]
+    share = radius / ca.vertcat(*own)
+    if not squeeze.is_even:
+        lengths = [ca.norm_2(displacement[2 * i : 2 * i + 2]) for i in (0, 1)]
+        share -= ca.vertcat(*lengths) / number(squeeze.numbers.least_reaches)
+    return ca.Function("sizes", [case, *squeeze.given.values()], [share])
 
 
 def case_origin_load_function(workcell: Workcell) -> ca.Function:
     """The load about the box frame's origin (6,), box axes."""
     inputs = [ca.SX.sym(name, 6) for name in ("pose", "rate", "second_rate")]
-    inputs.append(ca.SX.sym("case", CASE_SIZE))
+    inputs += [ca.SX.sym("case", CASE_SIZE), *sx_given(workcell.payload).values()]
     force, moment = case_load_function(workcell)(*inputs)
-    about = moment + ca.cross(ca.DM(workcell.payload.centre_of_mass), force)
+    about = moment + ca.cross(ca.SX(number(workcell.payload.centre_of_mass)), force)
     return ca.Function("origin_load", inputs, ca.cse([ca.vertcat(force, about)]))
 
 
@@ -419,7 +428,6 @@ class GraspSqueeze(Grasp):
     Attributes:
         workcell: the cell.
         commanded: index of the robot whose force is commanded.
-        reach: the size of the patches that the squeeze lies within, as a share.
     """
 
     def __init__(self, workcell: Workcell, commanded: int) -> None:
@@ -428,17 +436,21 @@ class GraspSqueeze(Grasp):
         Raises:
             SettingsError: no squeeze holds the payload whatever is asked.
         """
-        smaller = ((share, smaller_patches(workcell, share)) for share in REACHES)
-        closed = ((share, cell) for share, cell in smaller if has_force_closure(cell))
-        self.reach, cell = next(closed, (1.0, workcell))
-        super().__init__(cell)
+        if isinstance(workcell, NumberedWorkcell):
+            numbers = workcell.squeezes[commanded]
+        else:
+            shares = (s for s in REACHES if has_force_closure(smaller_patches(workcell, s)))
+            numbers = derived(workcell, next(shares, 1.0))
+        super().__init__(workcell, numbers)
         self.workcell, self.commanded = workcell, commanded
         self.cell_sizes = (("load", LOAD_SIZE), ("friction", 2), ("reach", 2))
-        self.nominal = (*self.nominal, [1.0, 1.0])
         self.is_even = presses_evenly(workcell)
         if self.is_even:
             self.cell_sizes += (("displacement", 4),)
-            self.nominal += ([0.0] * 4,)
+
+    def _nominal(self) -> tuple[list[float], ...]:
+        """See `Grasp`."""
+        return (*super()._nominal(), [1.0, 1.0], *([[0.0] * 4] if self.is_even else []))
 
     def balanced(self, free: ca.SX, cell: list[ca.SX]) -> list[ca.SX]:
         """See `symbolic.contact.central_path.Program`."""
@@ -458,7 +470,7 @@ class GraspSqueeze(Grasp):
             normal, *tangent = ca.vertsplit((self.units(i, *sizes) * own)[:3])
             moved = ca.vertcat(displacement[2 * robot : 2 * robot + 2], 0.0)
             force = ca.vertcat(*tangent, normal)
-            total += ca.mtimes(ca.DM(pad.T_box_pad[:3, :3]), ca.cross(moved, force))
+            total += ca.mtimes(number(pad.T_box_pad[:3, :3]), ca.cross(moved, force))
         return total
 
     def effort(self, wrenches: list[ca.SX], cell: list[ca.SX]) -> ca.SX:
@@ -475,6 +487,7 @@ def commanded_forces(
     friction: ca.MX,
     share: ca.MX,
     displacement: ca.MX,
+    handed: dict[str, ca.MX] | None = None,
     differentiable: bool = False,
 ) -> ca.MX:
     """(2,) normal forces of the robots [N]: what is commanded, a convex function of the load, and
@@ -485,14 +498,17 @@ def commanded_forces(
         friction: (2,) Coulomb coefficients of the robots' pads.
         share: (2,) sizes of their patches over the cell's own.
         displacement: (4,) of pads that press evenly [m].
+        handed: the squeeze's given numbers, where they are symbols.
         differentiable: whether first derivatives are wanted.
     """
     size = ca.sqrt(ca.sumsqr(load[:3]) + ca.sumsqr(load[3:] / MOMENT_ARM) + SCALE_FLOOR**2)
-    reach = share / squeeze.reach
+    handed = handed or {}
+    given = list(handed.values())
+    reach = share / as_mx(ca.SX(number(squeeze.numbers.reach)), squeeze.given, handed)
     displaced = [displacement] if squeeze.is_even else []
     solve = differentiable_least_effort if differentiable else least_effort
-    found = solve(squeeze, load / size, friction, reach, *displaced)
-    return _in_newtons(squeeze)(found, size, friction, reach)
+    found = solve(squeeze, load / size, friction, reach, *displaced, *given)
+    return _in_newtons(squeeze)(found, size, friction, reach, *given)
 
 
 def commanded_slack(
@@ -505,7 +521,7 @@ def commanded_slack(
 ) -> ca.SX:
     """Positive where the least wrenches that balance a load, and as much of the squeeze as makes
     the commanded force (arguments as in `commanded_forces`), lie within all cones."""
-    reach = share / squeeze.reach
+    reach = share / squeeze.numbers.reach
     asked, given = squeeze.asked(load, friction, reach), squeeze.squeezed(friction, reach)
     own = [k for k, robot in enumerate(squeeze.robots) if robot == squeeze.commanded]
     pressed = (force - sum(asked[k][0] for k in own)) / sum(given[k][0] for k in own)
@@ -524,31 +540,16 @@ def _against_internal(squeeze: GraspSqueeze) -> ca.Function:
     per newton of tangential force of any pad: what the squeeze leaves of that pad's friction holds
     it."""
     friction, share = ca.SX.sym("friction", 2), ca.SX.sym("share", 2)
-    given = squeeze.squeezed(friction, share / squeeze.reach)
+    given = squeeze.squeezed(friction, share / squeeze.numbers.reach)
     robots, turning = enumerate(squeeze.robots), 3 if squeeze.is_even else 5
     left = [
         friction[r] * (given[k][0] - ca.norm_2(given[k][1:3]) - ca.fabs(given[k][turning]))
         for k, r in robots
     ]
-    pressed = float(squeeze.squeeze_normals()[squeeze.commanded])
+    pressed = squeeze.normals[squeeze.commanded]
     held = ca.fmax(least(left), SCALE_FLOOR)
-    return ca.Function("against_internal", [friction, share], [pressed / held])
-
-
-def smaller_patches(workcell: Workcell, share: float) -> Workcell:
-    """The cell with smaller patches about the same places."""
-
-    def smaller(contact: Contact) -> Contact:
-        sides = contact.half_sides
-        return replace(
-            contact,
-            patch_radius=share * contact.patch_radius,
-            half_sides=None if sides is None else (share * sides[0], share * sides[1]),
-            further=tuple(smaller(pad) for pad in contact.further),
-        )
-
-    first, second = (smaller(contact) for contact in workcell.contacts)
-    return replace(workcell, contacts=(first, second))
+    inputs = [friction, share, *squeeze.given.values()]
+    return ca.Function("against_internal", inputs, [pressed / held])
 
 
 def _in_newtons(squeeze: GraspSqueeze) -> ca.Function:
@@ -562,4 +563,5 @@ def _in_newtons(squeeze: GraspSqueeze) -> ca.Function:
     squeezed = zip(squeeze.patches, squeeze.squeezed(friction, reach), strict=True)
     closes = least([patch.slack(state) for patch, state in squeezed]) > 0.0
     outputs = size * ca.if_else(closes, ca.vertcat(*force), BEYOND)
-    return ca.Function("in_newtons", [found, size, friction, reach], [outputs])
+    inputs = [found, size, friction, reach, *squeeze.given.values()]
+    return ca.Function("in_newtons", inputs, [outputs])

@@ -17,7 +17,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from symbolic.array import Array
 from symbolic.records.cell import Contact, Payload, Robot, Workcell
 from symbolic.records.task import RedundantJoint, Task, Waypoint
 
@@ -97,24 +96,56 @@ class NumberedTask(Task):
 
 
 @dataclass(frozen=True)
+class GraspNumbers:
+    """What formulas of pads anywhere hold beside the pads' own numbers, as NumPy derives it: n
+    entries of all pads' states, of which m belong to their scaled wrenches; b rows of balance.
+
+    Attributes:
+        left: (b,) which of the m components are what the others leave.
+        squeeze: (n,) internal squeeze to start from.
+        spread: (n, 6) the least states that balance a load.
+        load_to_left, free_to_left: (b, 6) and (b, m - b), what the load and the free components
+            leave to the others, in units of `symbolic.contact.grasp.Grasp.units`.
+        to_robots: (6, 6 k) from all pads' wrenches to force and moment of the robot that has the
+            pad, see `symbolic.contact.grasp.robot_wrenches`.
+        shapes: per pad what its cone depends on, its lengths over its radius; () of a disc.
+        load_at_rest: (6,) direction of the load at the start.
+        rest, rest_slopes: (n,) and (n, 6) states on the central path there, and their slopes.
+        reach: size of the patches that the squeeze lies within, over the cell's own.
+        least_reaches: (2,) of each robot's patches the least radius or half side [m].
+        given: the group of those that are symbols.
+    """
+
+    left: tuple[int, ...]
+    squeeze: Any
+    spread: Any
+    load_to_left: Any
+    free_to_left: Any
+    to_robots: Any
+    shapes: tuple[Any, ...]
+    load_at_rest: Any
+    rest: Any
+    rest_slopes: Any
+    reach: Any
+    least_reaches: Any
+    given: Group | None = None
+
+
+@dataclass(frozen=True)
 class NumberedWorkcell(Workcell):
     """A cell whose pads stand as these say, whatever their numbers.
 
     Attributes:
         facing, opposite, beside: see the properties of `Workcell`.
-        turn: `start_turn` where a squeeze is looked for under the load there, else None.
+        grasp: of pads anywhere, else None.
+        squeezes: likewise, where either robot's force is commanded.
     """
 
     facing: bool = False
     opposite: bool = False
     beside: bool = False
-    turn: Array | None = None
-
-    @property
-    def start_turn(self) -> Array:
-        """See `Workcell`."""
-        assert self.turn is not None, "only where a squeeze is looked for"
-        return self.turn
+    grasp: GraspNumbers | None = None
+    squeezes: tuple[GraspNumbers, ...] = ()
 
     @property
     def has_facing_pads(self) -> bool:

@@ -14,7 +14,7 @@ import numpy as np
 
 from symbolic.array import Array
 from symbolic.cell_model import CellModel
-from symbolic.contact.grasp import LOAD_SIZE
+from symbolic.contact.grasp_numbers import LOAD_SIZE
 from symbolic.contact.soft_finger import Detached
 from symbolic.expression import number
 from symbolic.limits import (

@@ -154,8 +154,7 @@ def held_functions(workcell: Workcell, weight: float = WEIGHT) -> dict[str, ca.F
     Raises:
         SettingsError: the pads do not close their grasp.
     """
-    friction = np.array([contact.friction for contact in workcell.contacts])
-    soft = SoftGrasp(Grasp(workcell), friction, weight)
+    soft = SoftGrasp(Grasp(workcell), weight)
     return {held_name("first"): soft.first(), held_name("second"): soft.second()}
 
 

@@ -16,7 +16,7 @@ from symbolic.cell_model import CellBodies, CellModel, build_cell_bodies
 from symbolic.contact.load import load_function
 from symbolic.functions import arm_functions, sample_functions
 from symbolic.limits import path_force_function, sample_limits_function
-from symbolic.numbers import BODIES, GROUPS, START, CellNumbers
+from symbolic.numbers import BODIES, GROUPS, HELD, START, CellNumbers
 from symbolic.read.cell import load
 from symbolic.records import Workcell
 from symbolic.records.poses import pose_matrix
@@ -52,11 +52,16 @@ def turned_cell() -> Workcell:
     return replace(cell, robots=(first, second), payload=payload, contacts=(one, two))
 
 
+def vectors(numbers: CellNumbers) -> dict[str, Array]:
+    """Of all groups."""
+    return {name: numbers.vector(name) for name in numbers.sizes}
+
+
 def both(cell: Workcell) -> tuple[CellModel, CellModel, dict[str, Array]]:
     """The model with constants, with symbols, and the values of these."""
     plain = hand_model(cell)
     numbers = CellNumbers(cell, plain.screen, plain.robots)
-    values = numbers.values | {START: np.concatenate(plain.start)}
+    values = vectors(numbers) | {START: np.concatenate(plain.start)}
     return plain, numbers.symbolic(plain), values
 
 
@@ -109,17 +114,16 @@ def test_so_does_a_path_under_each_law(law: Any) -> None:
         np.testing.assert_allclose(np.array(one), np.array(other), rtol=1e-10, atol=1e-12)
 
 
-def test_where_a_squeeze_is_looked_for_the_path_is_numbers_all_the_same() -> None:
-    """Only the payload, the pads and how the start turns it are structure."""
+def test_where_a_squeeze_is_looked_for_what_it_starts_from_is_a_number() -> None:
     cell = load(RACK.with_name("fork.toml"))
     plain, symbolic, values = both(cell)
     ours, task = numbers_of(cell), cell.task
     start, *others = task.waypoints
-    for lift, turn, same in ((0.01, 0.0, True), (0.0, 0.1, False)):
-        pose = start.lower + np.array([0.0, 0.0, lift, turn, 0.0, 0.0])
-        points = (replace(start, lower=pose, upper=pose), *others)
-        changed = numbers_of(replace(cell, task=replace(task, waypoints=points)))
-        assert (changed.bodies_digest == ours.bodies_digest) is same
+    pose = start.lower + np.array([0.0, 0.0, 0.01, 0.1, 0.0, 0.0])
+    points = (replace(start, lower=pose, upper=pose), *others)
+    changed = numbers_of(replace(cell, task=replace(task, waypoints=points)))
+    assert changed.bodies_digest == ours.bodies_digest
+    assert not np.array_equal(changed.vector(HELD), ours.vector(HELD))
     constants, symbols = (sample_functions(model)["path"] for model in (plain, symbolic))
     x = np.random.default_rng(2).uniform(task.lower, task.upper)
     found = symbols.call([x, values["task_numbers"]])
@@ -160,7 +164,7 @@ def test_a_changed_number_changes_values_alone(name: str) -> None:
     ours, other = numbers_of(rack_cell()), numbers_of(changes()[name])
     assert other.bodies_digest == ours.bodies_digest
     assert other.layout == ours.layout
-    differ = [k for k in ours.values if not np.array_equal(ours.values[k], other.values[k])]
+    differ = [k for k in ours.sizes if not np.array_equal(ours.vector(k), other.vector(k))]
     assert differ
     assert (differ == [BODIES]) == (name == "board")
 
@@ -176,8 +180,8 @@ def test_bounds_of_the_search_are_neither_number_nor_structure() -> None:
         numbers_of(replace(cell, task=replace(cell.task, waypoints=points))),
     )
     assert other.bodies_digest == ours.bodies_digest
-    assert {k: v.tolist() for k, v in other.values.items()} == {
-        k: v.tolist() for k, v in ours.values.items()
+    assert {k: v.tolist() for k, v in vectors(other).items()} == {
+        k: v.tolist() for k, v in vectors(ours).items()
     }
 
 
@@ -205,4 +209,4 @@ def test_entries_are_named_by_their_keys() -> None:
     assert {"payload.mass", "contacts[0].friction", "contacts[1].patch_radius"} <= held
     for group, entries in numbers.layout.items():
         sizes = [int(np.prod(entry.shape, dtype=int)) for entry in entries]
-        assert sum(sizes) == len(numbers.values[group])
+        assert sum(sizes) == numbers.sizes[group] == len(numbers.vector(group))

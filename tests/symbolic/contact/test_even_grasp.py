@@ -239,7 +239,7 @@ def test_turning_all_turns_the_forces(seed: int, kinds: tuple[str, ...]) -> None
 def test_forces_on_the_central_path_have_exact_slopes(kinds: tuple[str, ...]) -> None:
     rng = np.random.default_rng(9)
     cell, load = random_grasp(rng, even_cell(), kinds), random_load(rng)
-    soft = SoftGrasp(Grasp(cell), np.array([c.friction for c in cell.contacts]), 1e-4)
+    soft = SoftGrasp(Grasp(cell), 1e-4)
     first, second = soft.first(), soft.second()
     normal, slope, state = (np.array(value) for value in first(load))
     least = np.bincount(cell.pad_robots, wrenches(cell, load)[:, 2])

@@ -19,6 +19,7 @@ from symbolic.array import Array
 from symbolic.contact.central_path import START_WEIGHT
 from symbolic.contact.force_closure import has_force_closure, state_to_box
 from symbolic.contact.grasp import REST_WEIGHT, Grasp, grasp_wrenches
+from symbolic.contact.grasp_numbers import smaller_patches
 from symbolic.contact.paper import normal_force_branches
 from symbolic.contact.soft_grasp import SoftGrasp
 from symbolic.contact.worst_cases import (
@@ -26,7 +27,6 @@ from symbolic.contact.worst_cases import (
     GraspSqueeze,
     commanded_forces,
     commanded_slack,
-    smaller_patches,
 )
 from symbolic.errors import SettingsError
 from symbolic.records import Contact, Workcell
@@ -51,7 +51,7 @@ KINDS = (
 
 def function_of(cell: Workcell, differentiable: bool = False) -> ca.Function:
     load, friction = ca.MX.sym("load", 6), ca.MX.sym("friction", 2)
-    found = grasp_wrenches(Grasp(cell), load, friction, differentiable)
+    found = grasp_wrenches(Grasp(cell), load, friction, differentiable=differentiable)
     return ca.Function("grasp", [load, friction], [found])
 
 
@@ -282,8 +282,7 @@ def soft(kinds: tuple[str, ...], weight: float) -> tuple[ca.Function, ca.Functio
 
 
 def functions_of(cell: Workcell, weight: float) -> tuple[ca.Function, ca.Function]:
-    friction = np.array([contact.friction for contact in cell.contacts])
-    program = SoftGrasp(Grasp(cell), friction, weight)
+    program = SoftGrasp(Grasp(cell), weight)
     return program.first(), program.second()
 
 
