@@ -57,12 +57,13 @@ class CompiledCell:
         self.workcell = workcell
         self.cache = cache
         self._given = model
+        self._is_changed = False
         self._loaded: dict[object, Any] = {}
 
     def of_changed(self, workcell: Workcell) -> CompiledCell:
         """Another workcell, for which what is loaded for this one is not loaded again."""
         other = CompiledCell(workcell, self.cache)
-        other._loaded = self._loaded
+        other._loaded, other._is_changed = self._loaded, True
         return other
 
     def once(self, key: object, load: Callable[[], Loaded]) -> Loaded:
@@ -175,6 +176,8 @@ class CompiledCell:
         key = self.key("start", *[value.tobytes().hex() for value in of])
 
         def find() -> tuple[Array, Array]:
+            if self._is_changed:  # one of many that are tried out
+                return self.model.start
             record = cache.read_record(key)
             if record is None:
                 record = {"joints": [q.tolist() for q in self.model.start]}
@@ -190,10 +193,6 @@ class CompiledCell:
 
         return np.concatenate(self.start) if group == START else self.numbers.vector(group)
 
-    @property
-    def _expressions(self) -> str:
-        return self.once("expressions", lambda: (self.cache or Cache()).code_digest("symbolic"))
-
     def key(self, name: str, *details: str, bodies: bool = True) -> str:
         """A recipe's key: what a set of functions is made from (CasADi is part of every set's).
 
@@ -205,7 +204,7 @@ class CompiledCell:
         return key_of(
             name,
             structure=numbers.bodies_digest if bodies else numbers.digest,
-            expressions=self._expressions,
+            expressions=_expressions((self.cache or Cache()).folder),
             libraries=[f"{name} {library_version(name)}" for name in ("pin", "scipy")],
             details=details,
         )
@@ -269,6 +268,12 @@ class CompiledCell:
             return model.screening
 
         return self.functions(SCREENING, make, lanes=EVALUATOR_LANES)
+
+
+@lru_cache
+def _expressions(folder: Path) -> str:
+    """What formulas are written in, as it was when this process first asked."""
+    return Cache(folder).code_digest("symbolic")
 
 
 class _Identity:
@@ -339,7 +344,7 @@ def held_function(
     key = key_of(
         name,
         structure=numbers.digest,
-        expressions=cache.code_digest("symbolic"),
+        expressions=_expressions(cache.folder),
         libraries=[f"scipy {library_version('scipy')}"],
     )
     of = (cache.folder, key, lanes)

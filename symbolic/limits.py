@@ -268,15 +268,17 @@ def _load_function(workcell: Workcell) -> ca.Function:
 def path_force_function(workcell: Workcell) -> ca.Function:
     """Box pose and its derivatives by u (6,), u'' and u'^2 to normal_force (2,) [N] and slope
     (2, 2), of each force by u'' and by u'^2."""
-    closed = workcell.has_closed_form
+    closed, payload = workcell.has_closed_form, workcell.payload
     kind, given = (ca.SX, sx_given) if closed else (ca.MX, mx_given)
-    numbers: dict[str, Any] = dict(given(workcell.payload))
+    numbers: dict[str, Any] = dict(given(payload))
+    own = [ca.SX(number(workcell.contacts[0].T_box_pad[:3, :3])), ca.DM(GRAVITY) * payload.mass]
+    if not closed:
+        own = [as_mx(ca.SX(value), sx_given(payload), numbers) for value in own]
     path = [kind.sym(name, 6) for name in ("pose", "first", "second")]
     a, w = kind.sym("a"), kind.sym("w")
     box = dict(zip(BOX_OUTPUTS, box_function(workcell)(*path, *numbers.values()), strict=True))
     rotation = ca.reshape(box["rotation"], 3, 3).T
-    axes = ca.mtimes(rotation, number(workcell.contacts[0].T_box_pad[:3, :3]))
-    weight = ca.DM(GRAVITY) * workcell.payload.mass
+    axes, weight = ca.mtimes(rotation, own[0]), own[1]
     asked = (
         *(box["force_by_acceleration"], box["force_by_speed"], -weight),
         *(box["moment_by_acceleration"], box["moment_by_speed"]),

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, is_dataclass, replace
-from functools import cache, cached_property, partial
+from functools import cache, cached_property, lru_cache, partial
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Protocol
@@ -30,7 +30,7 @@ from symbolic.contact.soft_finger import SoftPatch
 from symbolic.geometry.screen import Base, Bounded, Screen
 from symbolic.records import Contact, RedundantJoint, Robot, Task, Waypoint, Workcell
 from symbolic.records.cell import box_flange, flange_lever
-from symbolic.records.content import digest_of_parts
+from symbolic.records.content import Seen, digest_of_parts
 from symbolic.records.numbered import (
     GraspNumbers,
     Group,
@@ -89,6 +89,9 @@ class _Take(Protocol):
     def group(self, name: str) -> Group:
         """Of which all is taken."""
 
+    def body(self, path: str, body: Bounded) -> Any:
+        """A body whose numbers were taken."""
+
 
 class _Collected:
     """Places in the structure, the values aside."""
@@ -110,6 +113,11 @@ class _Collected:
 
     def group(self, name: str) -> Group:
         return Group(name, ())
+
+    def body(self, path: str, body: Bounded) -> Any:
+        taken, entries = _collected_body(Seen(path, body, known=(path, body.content)))
+        self.entries.setdefault(BODIES, []).extend(entries)
+        return taken
 
 
 class _Symbols:
@@ -136,6 +144,9 @@ class _Symbols:
 
     def group(self, name: str) -> Group:
         return self._groups[name]
+
+    def body(self, path: str, body: Bounded) -> Any:
+        return _body(self, path, body)
 
 
 @dataclass(frozen=True)
@@ -239,7 +250,7 @@ class CellNumbers(WorkcellNumbers):
         """Of the whole structure."""
         return digest_of_parts((self.workcell, self.screen, self._arms))
 
-    @property
+    @cached_property
     def _arms(self) -> tuple[Any, ...]:
         return tuple(
             (model.model.saveToString(), model.flange_id, model.redundant, model.pose_size)
@@ -437,7 +448,7 @@ def _screen(take: _Take, screen: Screen) -> Screen:
     return replace(
         screen,
         bases=(first, second),
-        bodies=tuple(_body(take, f"body {k}", body) for k, body in enumerate(screen.bodies)),
+        bodies=tuple(take.body(f"body {k}", body) for k, body in enumerate(screen.bodies)),
         payload=screen.payload
         if screen.payload_is_mesh
         else _own(take, "payload box", screen.payload),
@@ -449,6 +460,13 @@ def _screen(take: _Take, screen: Screen) -> Screen:
 def _base(take: _Take, path: str, base: Base) -> Base:
     rotation = _turn(take, BODIES, path, base.rotation)
     return Base(rotation, take(BODIES, f"{path}.base.xyz", base.position))
+
+
+@lru_cache(maxsize=512)
+def _collected_body(seen: Seen) -> tuple[Any, list[tuple[Number, Array | _Later]]]:
+    """Cells that are tried out share most bodies."""
+    take, (path, body) = _Collected(), seen.given
+    return _body(take, path, body), take.entries.get(BODIES, [])
 
 
 def _body(take: _Take, path: str, body: Bounded) -> Any:

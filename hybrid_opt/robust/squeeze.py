@@ -144,7 +144,12 @@ class Squeeze:
 
 
 def pressed_beyond(
-    workcell: Workcell, settings: SqueezeSettings, time: Array, motion: HeldMotion, least: Array
+    workcell: Workcell,
+    settings: SqueezeSettings,
+    time: Array,
+    motion: HeldMotion,
+    least: Array,
+    in_parts: bool = True,
 ) -> tuple[Array, Squeeze]:
     """(n,) what the commanded robot presses with beyond the planned normal force [N], the other one
     in the proportion of `pressed_together`, and how it came about.
@@ -156,6 +161,7 @@ def pressed_beyond(
         time: (n,) of the samples, not decreasing [s].
         motion: of the box at the samples.
         least: (n, 2) planned normal forces [N].
+        in_parts: whether each doubt is asked for its part of robust forces; else there is one.
 
     Raises:
         SettingsError: the uncertainty leaves no friction or patch.
@@ -164,6 +170,8 @@ def pressed_beyond(
     planned, doubt = least[:, 1 - leader], workcell.uncertainty
     if settings.factor is None:
         needed = _in_every_case(workcell, doubt, leader, motion, planned)
+        parts = [Part("in every case", float(needed.max()))]
+    if settings.factor is None and in_parts:
         most = np.union1d(np.argsort(-needed)[:MOST], np.argsort(-planned)[:MOST])
         there, own = box_motion(motion).at(most), planned[most]
         names: tuple[str, ...] = ()
@@ -175,7 +183,7 @@ def pressed_beyond(
                 force = _in_every_case(workcell, doubt.only(names), leader, there, own).max()
                 parts.append(Part(name, float(force) - before))
                 before = float(force)
-    else:
+    elif settings.factor is not None:
         still = np.zeros(len(planned))
         if even:
             least = np.maximum(least, soft_model(workcell).nominal(motion, leader))
@@ -242,19 +250,21 @@ def pressed_together(workcell: Workcell, leader: int) -> Array:
 
 
 def commanded_forces(
-    workcell: Workcell, carry: Carry, settings: SqueezeSettings
+    workcell: Workcell, carry: Carry, settings: SqueezeSettings, in_parts: bool = True
 ) -> tuple[Array, Squeeze]:
     """(n, 2) normal forces to command of both robots along a carry [N], and how they came about.
 
     Args:
         workcell: states what is uncertain.
+        in_parts: see `pressed_beyond`.
 
     Raises:
         SettingsError: the cell's uncertainty leaves no friction or patch.
     """
-    extra, squeeze = pressed_beyond(workcell, settings, carry.time, carry, carry.normal_force)
+    held = carry.normal_force
+    extra, squeeze = pressed_beyond(workcell, settings, carry.time, carry, held, in_parts)
     together = pressed_together(workcell, settings.leader)
-    return carry.normal_force + np.multiply.outer(extra, together), squeeze
+    return held + np.multiply.outer(extra, together), squeeze
 
 
 def smooth_above(time: Array, values: Array, width: float) -> Array:

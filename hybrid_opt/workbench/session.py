@@ -186,7 +186,8 @@ class Session:
         text = f"feasible, {carry.duration:.3f} s"
         if judgement.feasible:
             try:
-                commanded, squeeze = commanded_forces(cell.workcell, carry, SqueezeSettings())
+                given = cell.workcell, carry, SqueezeSettings()
+                commanded, squeeze = commanded_forces(*given, in_parts=False)
                 most = cell.workcell.task.reference_force
                 text += f", press with {squeeze.force:.1f} N"
                 if (commanded.max(axis=0) > most).any():

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from types import MappingProxyType
 from xml.etree import ElementTree
 
@@ -193,10 +194,16 @@ def reduced_model(urdf: Urdf, held: Positions = ()) -> pin.Model:
     Raises:
         RobotModelError: Pinocchio refuses the description.
     """
+    return pin.Model(_reduced(urdf.kinematics, str(urdf.file), tuple(held)))
+
+
+@lru_cache(maxsize=16)
+def _reduced(kinematics: str, file: str, held: Positions) -> pin.Model:
+    """See `reduced_model`; not to be modified."""
     try:
-        model = pin.buildModelFromXML(urdf.kinematics)
+        model = pin.buildModelFromXML(kinematics)
     except (ValueError, RuntimeError, IndexError) as error:
-        raise RobotModelError(f"Pinocchio cannot read {urdf.file}: {_first_line(error)}") from error
+        raise RobotModelError(f"Pinocchio cannot read {file}: {_first_line(error)}") from error
     configuration = pin.neutral(model)
     joints = []
     for name, position in held:

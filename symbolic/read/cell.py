@@ -69,8 +69,10 @@ def load(
     try:
         source = outside.resolved(path)
         content = outside.read_bytes(source, outside.WORKCELL_BYTES) if text is None else text
-        content = with_branches(content, outside.toml_tables(content), decided)
         data = outside.toml_tables(content)
+        settled = with_branches(content, data, decided)
+        if settled != content:
+            content, data = settled, outside.toml_tables(settled)
     except OutsideError as error:
         raise WorkcellError(str(path), (f"file: {error}",)) from error
     problems = Problems()
@@ -97,7 +99,8 @@ def changed(workcell: Workcell, changes: Mapping[str, Any]) -> Workcell:
     source, text = workcell.source, workcell.text
     try:
         known = outside.read_bytes(source, outside.WORKCELL_BYTES) if text is None else text
-        known = with_branches(known, outside.toml_tables(known), workcell.start_branch)
+        if b"search" in known:
+            known = with_branches(known, outside.toml_tables(known), workcell.start_branch)
         content = changed_text(known, changes, str(source))
     except OutsideError as error:
         raise WorkcellError(str(source), (f"file: {error}",)) from error

@@ -448,6 +448,9 @@ BESIDE = 1e-9
 """Distance between contacts, seen along their normals, from which on they count as beside one
 another [m]."""
 
+OPPOSITE = 1e-9
+"""Sum of two unit normals that counts as none."""
+
 SEARCHED = -2
 """`Workcell.start_branch` of a robot whose branches compete."""
 
@@ -524,9 +527,10 @@ class Workcell:
     @property
     def has_opposite_pads(self) -> bool:
         """Whether two pads with opposite normals hold the payload, whatever their patches."""
+        if any(contact.further for contact in self.contacts):
+            return False
         first, second = (contact.T_box_pad[:3, 2] for contact in self.contacts)
-        opposite = np.allclose(first, -second, atol=1e-9)
-        return opposite and not any(contact.further for contact in self.contacts)
+        return bool((np.abs(first + second) <= OPPOSITE).all())
 
     @property
     def has_pads_beside(self) -> bool:

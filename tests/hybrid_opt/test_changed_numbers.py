@@ -36,7 +36,8 @@ SHORT = PolishSettings(
 
 def moved(values: Any, *by: float) -> list[float]:
     """Numbers with others added."""
-    return (np.asarray(values) + by).round(12).tolist()
+    found: list[float] = (np.asarray(values) + by).round(12).tolist()
+    return found
 
 
 def changes(cell: ho.Cell) -> dict[str, dict[str, Any]]:
