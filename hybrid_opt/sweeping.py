@@ -38,7 +38,7 @@ from hybrid_opt.recommending.choice import (
 from hybrid_opt.recommending.recommendation import recommend
 from hybrid_opt.store.files import write_json
 from hybrid_opt.store.json_records import from_json, read_record, to_json
-from hybrid_opt.work.service import Emit, Service, give_up, local_executor
+from hybrid_opt.work.service import Emit, LocalExecutor, Service, give_up
 from symbolic.array import Array, Figure, Row
 from symbolic.errors import DualArmError, SettingsError
 from symbolic.records import Workcell
@@ -151,7 +151,7 @@ def sweep(
         ledger = _Chains(known, file, advance)
         context = partial(_context, cell.workcell, tuple(cell.objectives), known.x, fixed)
         if len(ledger):
-            local_executor(jobs).run(Service(context, _walk), ledger)
+            LocalExecutor(jobs).run(Service(context, _walk), ledger)
     return ledger.sweep
 
 

@@ -3,7 +3,6 @@ to any process or machine, with resources made from them there."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -22,13 +21,7 @@ from hybrid_opt.job.plan import JobModel
 from hybrid_opt.store.files import write_json
 from hybrid_opt.store.json_records import read_record, to_json
 from symbolic.read.cell import load
-from symbolic.read.cell_files import (
-    CellFiles,
-    cell_from_json,
-    cell_to_json,
-    drivable_files,
-    unpack_cell,
-)
+from symbolic.read.cell_files import CellFiles, drivable_files, unpack_cell
 from symbolic.records import SEARCHED, Workcell
 
 _ANEW = "start the study anew"
@@ -82,25 +75,10 @@ def store_branches(root: Path, competition: BranchCompetition | None) -> str:
 Made = TypeVar("Made")
 
 
-@dataclass(frozen=True)
-class PackedCell:
-    """A workcell with its files.
-
-    Attributes:
-        text: JSON of `symbolic.read.cell_files.cell_to_json`.
-    """
-
-    text: str
-
-    @classmethod
-    def of(cls, files: CellFiles) -> PackedCell:
-        """The value for a stored workcell."""
-        return cls(json.dumps(cell_to_json(files)))
-
-    def make(self, of_workcell: Callable[[Workcell], Made]) -> Made:
-        """Result of a function of the workcell, whose files exist only as long as it runs."""
-        with TemporaryDirectory() as folder:
-            return of_workcell(unpack_cell(cell_from_json(json.loads(self.text)), Path(folder)))
+def with_cell(of_workcell: Callable[[Workcell], Made], files: CellFiles) -> Made:
+    """Result of a function of a stored workcell, whose files exist only as long as it runs."""
+    with TemporaryDirectory() as folder:
+        return of_workcell(unpack_cell(files, Path(folder)))
 
 
 @dataclass(frozen=True)
@@ -126,8 +104,8 @@ class ReadyCell:
         return cls(cell, JobModel(cell.compiled, cell.timing_model))
 
 
-Cells = tuple[tuple[PackedCell, tuple[str, ...]], ...]
-"""Cells of a study, each with its objectives; the last one is the cell that robots drive."""
+Cells = tuple[tuple[CellFiles, tuple[str, ...]], ...]
+"""Files of cells, each with its objectives; the last one is the cell that robots drive."""
 
 
 def cells_of(files: CellFiles, objectives: tuple[str, ...], driven: bool) -> Cells:
@@ -136,12 +114,12 @@ def cells_of(files: CellFiles, objectives: tuple[str, ...], driven: bool) -> Cel
     Args:
         driven: whether robots drive the experiment's own cell.
     """
-    own = (PackedCell.of(files), objectives)
+    own = (files, objectives)
     if driven:
         return (own,)
-    return (own, (PackedCell.of(drivable_files(files)), force_kind(objectives).drivable))
+    return (own, (drivable_files(files), force_kind(objectives).drivable))
 
 
 def ready_cells(cells: Cells) -> tuple[ReadyCell, ...]:
     """Load the cells' compiled functions, or build them where they are missing; in any process."""
-    return tuple(cell.make(partial(ReadyCell.of, names)) for cell, names in cells)
+    return tuple(with_cell(partial(ReadyCell.of, names), files) for files, names in cells)

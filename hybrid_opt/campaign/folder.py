@@ -31,7 +31,7 @@ from hybrid_opt.store.files import LOCK, locked, read_json, storing, write_json
 from hybrid_opt.store.json_records import to_json
 from hybrid_opt.version import own_version
 from hybrid_opt.work.dask_cluster import DaskExecutor
-from hybrid_opt.work.service import Executor, local_executor
+from hybrid_opt.work.service import Executor, LocalExecutor
 from symbolic.array import Range, require_allowed
 from symbolic.errors import SettingsError
 from symbolic.read.cell import load
@@ -83,7 +83,7 @@ def executor_for(execution: ExecutionSettings) -> Executor:
     if execution.executor == "dask":
         assert execution.scheduler is not None
         return DaskExecutor(execution.scheduler, environment(), environment)
-    return local_executor(execution.jobs)
+    return LocalExecutor(execution.jobs)
 
 
 FORMAT = "dual-arm-carry campaign"

@@ -16,7 +16,7 @@ from functools import partial
 
 import numpy as np
 
-from hybrid_opt.campaign.cell_source import PackedCell
+from hybrid_opt.campaign.cell_source import with_cell
 from hybrid_opt.campaign.folder import CampaignFolder
 from hybrid_opt.campaign.journal import ReplicaLedger, ReplicaRequest
 from hybrid_opt.campaign.results import Replica, is_whole, read_campaign, read_polished
@@ -33,6 +33,7 @@ from hybrid_opt.store.files import json_of, write_json
 from hybrid_opt.store.json_records import from_json, to_json
 from hybrid_opt.work.service import Service, give_up
 from symbolic.array import Array
+from symbolic.read.cell_files import CellFiles
 from symbolic.records import Workcell
 
 JUDGING_SECONDS = 540.0
@@ -44,10 +45,10 @@ _ANEW = f"delete {JOURNAL} in its folder of polished fronts to polish it anew"
 
 
 def polisher_source(
-    cell: PackedCell, objectives: tuple[str, ...], settings: PolishSettings
+    cell: CellFiles, objectives: tuple[str, ...], settings: PolishSettings
 ) -> Callable[[], Polisher]:
     """What makes a polisher, in any process."""
-    return partial(cell.make, partial(_polisher, objectives, settings))
+    return partial(with_cell, partial(_polisher, objectives, settings), cell)
 
 
 def _polisher(objectives: tuple[str, ...], settings: PolishSettings, cell: Workcell) -> Polisher:
@@ -123,8 +124,8 @@ class PolishLedger(ReplicaLedger):
 
     def run(self, progress: Progress) -> None:
         """Polish all open fronts."""
-        cell, objectives = PackedCell.of(self.folder.files), self.folder.settings.objectives
-        source = polisher_source(cell, objectives, self._settings)
+        objectives = self.folder.settings.objectives
+        source = polisher_source(self.folder.files, objectives, self._settings)
         service = Service(source, polish_replica, patience=MOST_SECONDS + JUDGING_SECONDS)
         with closing(self):
             done = self._all - len(self)

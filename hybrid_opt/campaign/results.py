@@ -182,6 +182,14 @@ class CampaignResults:
         return tuple(found)
 
 
+def union(fronts: Sequence[ReplicaFront]) -> list[tuple[ReplicaFront, int]]:
+    """What none of several fronts dominates, by increasing objectives: each member as its front and
+    its row there."""
+    members = [(front, row) for front in fronts for row in range(len(front))]
+    objectives = np.concatenate([front.objectives for front in fronts])
+    return [members[k] for k in metrics.front_rows(objectives, np.ones(len(members), dtype=bool))]
+
+
 def read_campaign(root: str | Path) -> CampaignResults:
     """Read a campaign whose search is complete.
 

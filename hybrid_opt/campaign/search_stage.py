@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hybrid_opt.campaign.cell_source import PackedCell
+from hybrid_opt.campaign.cell_source import with_cell
 from hybrid_opt.campaign.folder import CampaignFolder
 from hybrid_opt.campaign.journal import (
     EvaluationTable,
@@ -145,8 +145,8 @@ def search_stage(source: EvaluatorSource | None = None) -> Stage:
     """
 
     def run(folder: CampaignFolder, progress: Progress) -> None:
-        cell, objectives = PackedCell.of(folder.files), folder.settings.objectives
-        maker = partial(cell.make, partial(CandidateEvaluator, objectives=objectives))
+        evaluator = partial(CandidateEvaluator, objectives=folder.settings.objectives)
+        maker = partial(with_cell, evaluator, folder.files)
         _Search(folder).run(source or maker, progress)
 
     def whole(folder: CampaignFolder) -> bool:

@@ -198,8 +198,8 @@ def nothing() -> None:
 
 
 @dataclass(frozen=True)
-class Attempted:
-    """Outcome of a request on a worker; failures are texts, as not every exception can be
+class Outcome:
+    """What became of a request on a worker; failures are texts, as not every exception can be
     pickled.
 
     Attributes:
@@ -222,29 +222,14 @@ class Attempted:
         raise DualArmError(self.content) if self.kind == "error" else RuntimeError(self.content)
 
 
-def attempt(call: Callable[[], Any]) -> Attempted:
+def attempt(call: Callable[[], Any]) -> Outcome:
     """Outcome of a call, a result or a failure."""
     try:
-        return Attempted("answer", call())
+        return Outcome("answer", call())
     except DualArmError as error:
-        return Attempted("error", str(error))
+        return Outcome("error", str(error))
     except Exception:
-        return Attempted("failure", traceback.format_exc())
-
-
-class SerialExecutor:
-    """Answers all requests in this process, which nothing shields from what the work does."""
-
-    def run(
-        self, service: Service[Context, Request, Answer], ledger: Ledger[Request, Answer]
-    ) -> None:
-        """See `hybrid_opt.work.service.Executor`."""
-        if len(ledger) == 0:
-            return
-        context = service.make_context()
-        for index in range(len(ledger)):
-            answer = service.answer(context, ledger.request(index), partial(ledger.heard, index))
-            ledger.answered(index, answer)
+        return Outcome("failure", traceback.format_exc())
 
 
 def one_thread() -> AbstractContextManager[object]:
@@ -278,42 +263,35 @@ def warm_up(*modules: str) -> None:
         forkserver.ensure_running()
 
 
-def local_executor(jobs: int) -> Executor:
-    """An executor with this number of processes on this machine; 0 for one per core."""
-    return LocalExecutor(jobs or available_cores())
-
-
+@dataclass(frozen=True)
 class LocalExecutor:
-    """Works in this process where one is enough, else in several."""
+    """Works on this machine: in this process, which nothing shields from what the work does, where
+    one worker is enough, else in several fresh processes.
 
-    def __init__(self, jobs: int) -> None:
-        self.jobs = jobs
+    Attributes:
+        jobs: most workers, 0 for one per core.
+        apart: whether one worker alone is a process of its own, too.
+    """
 
-    def run(
-        self, service: Service[Context, Request, Answer], ledger: Ledger[Request, Answer]
-    ) -> None:
-        """See `hybrid_opt.work.service.Executor`."""
-        count = min(self.jobs, len(ledger))
-        alone = count <= 1 and service.patience is None
-        executor: Executor = SerialExecutor() if alone else ProcessExecutor(count)
-        executor.run(service, ledger)
-
-
-class ProcessExecutor:
-    """Works in several fresh processes."""
-
-    def __init__(self, jobs: int) -> None:
-        self.jobs = jobs
+    jobs: int = 1
+    apart: bool = False
 
     def run(
         self, service: Service[Context, Request, Answer], ledger: Ledger[Request, Answer]
     ) -> None:
-        """See `hybrid_opt.work.service.Executor`."""
-        workforce = _Workforce(service, ledger, self.jobs)
-        try:
-            workforce.run()
-        finally:
-            workforce.end()
+        """See `Executor`."""
+        count = min(self.jobs or available_cores(), len(ledger))
+        if count > 1 or self.apart or service.patience is not None:
+            workforce = _Workforce(service, ledger, count)
+            try:
+                workforce.run()
+            finally:
+                workforce.end()
+        elif count:
+            context = service.make_context()
+            for index in range(len(ledger)):
+                heard = partial(ledger.heard, index)
+                ledger.answered(index, service.answer(context, ledger.request(index), heard))
 
 
 class _Workforce:
@@ -373,7 +351,7 @@ class _Workforce:
         worker.silence = 0.0
         index = worker.index
         assert index is not None
-        if isinstance(word, Attempted):
+        if isinstance(word, Outcome):
             worker.index, worker.working = None, False
             self._ledger.answered(index, word.answer())
         elif word is None:

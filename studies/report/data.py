@@ -37,7 +37,7 @@ from hybrid_opt.store.trajectory_file import read_trajectory
 from hybrid_opt.timing import TimingLimits
 from hybrid_opt.timing.document import TimingDocument, read_timing
 from hybrid_opt.timing.robustness import PayloadSensitivity, payload_sensitivity
-from hybrid_opt.work.service import Executor, SerialExecutor, Service, answer_all, called
+from hybrid_opt.work.service import Executor, LocalExecutor, Service, answer_all, called
 from studies.report.page_carries import RECOMMENDED_LABEL, DrawnJob, drawn_job
 from studies.study.drivable import drivable_root, is_drivable
 from studies.study.simulation import StoredSimulation, read_simulations
@@ -334,7 +334,7 @@ def gather(results: CampaignResults, executor: Executor | None = None) -> Report
     # Jobs are what robots are told: by the cell that they drive.
     cells = cells_of(first.files, results.objectives, alone)
     service: Service[Any, Any, Any] = Service(partial(ready_cells, cells), called)
-    reach, *jobs = answer_all(executor or SerialExecutor(), service, calls)
+    reach, *jobs = answer_all(executor or LocalExecutor(), service, calls)
     return ReportData(
         **vars(first),
         root=results.root,

@@ -26,7 +26,7 @@ from hybrid_opt.display.scene import embedded_json, scene_js, three_js
 from hybrid_opt.display.table import Table, counted, number
 from hybrid_opt.store.files import write_atomically
 from hybrid_opt.store.json_records import to_json
-from hybrid_opt.work.service import Executor, SerialExecutor, Service, answer_all, called
+from hybrid_opt.work.service import Executor, LocalExecutor, Service, answer_all, called
 from studies.errors import ReportError
 from studies.report.data import ReportData
 from studies.report.drawing import files_of
@@ -70,7 +70,7 @@ def write_report(
     listed = _listed(data)
     service: Service[Any, Any, dict[str, bytes]] = Service(partial(_listed, data), called)
     calls = [partial(_drawn, k, pdf) for k in range(len(listed))]
-    drawn = answer_all(executor or SerialExecutor(), service, calls, done)
+    drawn = answer_all(executor or LocalExecutor(), service, calls, done)
     pictures = []
     for picture, made in zip(listed, drawn, strict=True):
         for suffix, content in made.items():

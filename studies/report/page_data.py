@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from hybrid_opt.campaign.cell_source import PackedCell, cells_of, ready_cells
+from hybrid_opt.campaign.cell_source import cells_of, ready_cells
 from hybrid_opt.display.scene import packed, scene_data
-from hybrid_opt.work.service import Executor, SerialExecutor, Service, answer_all
+from hybrid_opt.work.service import Executor, LocalExecutor, Service, answer_all
 from studies.report.data import DrawnCarry, Experiment, ReportData
 from studies.report.drawing import ARMS, HAND_MADE, MARKED, LineStyle, series, spread
 from studies.report.page_carries import (
@@ -305,11 +305,11 @@ def page_document(data: ReportData, executor: Executor | None = None) -> dict[st
     if data.drivable is not None:
         drive = list(_drive_groups(data, data.drivable, len(cells)))
         cells.append((data.drivable.files, data.drivable.objectives))
-        ready = partial(ready_cells, tuple((PackedCell.of(f), names) for f, names in cells))
+        ready = partial(ready_cells, tuple(cells))
     else:
         ready = partial(ready_cells, cells_of(data.files, data.objectives, data.alone))
     shown = [one for group in (*drive, *search) for one in group.shown]
-    found = answer_all(executor or SerialExecutor(), Service(ready, page_trajectory), shown)
+    found = answer_all(executor or LocalExecutor(), Service(ready, page_trajectory), shown)
     numbers = count()
     numbered = [(group, [next(numbers) for _ in group.shown]) for group in (*drive, *search)]
     views = []

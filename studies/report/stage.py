@@ -8,7 +8,7 @@ from pathlib import Path
 
 from hybrid_opt.campaign import CampaignFolder, Stage, executor_for
 from hybrid_opt.progress import Progress
-from hybrid_opt.work.service import Executor, local_executor
+from hybrid_opt.work.service import Executor, LocalExecutor
 
 PAGE = "report.html"
 PICTURES = "figures"
@@ -85,4 +85,4 @@ def rewrite(root: Path, progress: Progress, pdf: bool = False) -> None:
         "with_paper": bool(settings.get("with_paper")),
         "pdf": pdf or bool(settings.get("pdf", True)),
     }
-    _write(root, asked, progress, local_executor(0))
+    _write(root, asked, progress, LocalExecutor(0))

@@ -11,7 +11,6 @@ from pathlib import Path
 
 import numpy as np
 
-from hybrid_opt.campaign.cell_source import PackedCell
 from hybrid_opt.campaign.polish_stage import polisher_source
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
@@ -21,12 +20,12 @@ from hybrid_opt.polishing.polisher import Polisher
 from hybrid_opt.polishing.records import PolishedFront
 from hybrid_opt.polishing.settings import FillSettings, PolishSettings
 from hybrid_opt.store.files import AGAIN, read_bytes, write_atomically
-from hybrid_opt.work.service import Emit, Service, answer_all, local_executor
+from hybrid_opt.work.service import Emit, LocalExecutor, Service, answer_all
 from studies.program import load_workcell
 from symbolic import outside
 from symbolic.array import Array
 from symbolic.errors import SettingsError
-from symbolic.read.cell_files import collect_cell
+from symbolic.read.cell_files import CellFiles, collect_cell
 from symbolic.records.task import initial_decision
 
 CANDIDATES = 4000
@@ -84,9 +83,9 @@ def compute_reference_front(
             "most as many starts"
         )
     begins = [initial_decision(evaluator.workcell.task), *candidates[feasible[:starts]]]
-    cell = PackedCell.of(collect_cell(evaluator.workcell))
+    cell = collect_cell(evaluator.workcell)
     count = itertools.count(1)
-    executor = local_executor(jobs)
+    executor = LocalExecutor(jobs)
     parts = answer_all(
         executor,
         _polish_service(cell, ATTEMPTS, FillSettings(attempts=0)),
@@ -100,7 +99,7 @@ def compute_reference_front(
 
 
 def _polish_service(
-    cell: PackedCell, attempts: int, fill: FillSettings
+    cell: CellFiles, attempts: int, fill: FillSettings
 ) -> Service[Polisher, tuple[Array, np.random.Generator], PolishedFront]:
     settings = PolishSettings(attempts=attempts, rounds=ROUNDS, fill=fill)
     source = polisher_source(cell, PAPER_OBJECTIVES, settings)

@@ -3,48 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from hybrid_opt.campaign.results import CampaignResults, ReplicaFront, read_campaign
+from hybrid_opt.campaign.results import CampaignResults, read_campaign
 from hybrid_opt.campaign.settings import (
     DRIVABLE,
 )
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.evaluate.objectives import DRIVABLE_PAIRS
-from hybrid_opt.indicators import metrics
 from hybrid_opt.indicators.selection import select
 from symbolic.array import Array
 from symbolic.records import Workcell
 
 LEAST_FORCE = "least-force"
 """The path that the other experiment ends with, beside which the recommended carry stands."""
-
-
-@dataclass(frozen=True)
-class DrivableFronts:
-    """All fronts of a drivable experiment, and their non-dominated union.
-
-    Attributes:
-        results: of the experiment.
-        fronts: of all replicas, searched and polished.
-        x: (k, n_var) of the union, by increasing duration.
-        sources: whose each of the union is.
-    """
-
-    results: CampaignResults
-    fronts: tuple[ReplicaFront, ...]
-    x: Array
-    sources: tuple[str, ...]
-
-    def labelled(self) -> dict[str, list[ReplicaFront]]:
-        """The fronts by label."""
-        found: dict[str, list[ReplicaFront]] = {}
-        for front in self.fronts:
-            found.setdefault(front.label, []).append(front)
-        return found
 
 
 def known_paths(root: Path) -> Array:
@@ -86,21 +60,3 @@ def drivable_root(root: Path, workcell: Workcell, objectives: Sequence[str]) -> 
         workcell, objectives: of its first experiment.
     """
     return root if is_drivable(workcell, objectives) else root / DRIVABLE
-
-
-def drivable_fronts(root: Path) -> DrivableFronts:
-    """The fronts of a drivable experiment.
-
-    Args:
-        root: its own results folder, see `drivable_root`.
-
-    Raises:
-        ResultsError: the folder is not complete or damaged.
-    """
-    results = read_campaign(root)
-    fronts = results.fronts
-    x = np.concatenate([front.x for front in fronts])
-    objectives = np.concatenate([front.objectives for front in fronts])
-    sources = [front.source for front in fronts for _ in front.x]
-    rows = metrics.front_rows(objectives, np.ones(len(objectives), dtype=bool))
-    return DrivableFronts(results, fronts, x[rows], tuple(sources[row] for row in rows))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import shlex
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -13,8 +13,8 @@ import numpy as np
 
 import hybrid_opt as ho
 from codegen.function import available_cores
-from hybrid_opt.campaign import CampaignFolder, ExecutionSettings, Stage
-from hybrid_opt.campaign.results import CampaignResults, read_campaign
+from hybrid_opt.campaign import CampaignFolder, Stage
+from hybrid_opt.campaign.results import CampaignResults, ReplicaFront, read_campaign, union
 from hybrid_opt.campaign.settings import NO_RECOMMENDATION, RECOMMENDATION, RECOMMENDED, STAGES
 from hybrid_opt.errors import NoCarryError
 from hybrid_opt.evaluate.evaluations import concatenated
@@ -38,17 +38,13 @@ from hybrid_opt.store.json_records import read_record, to_json
 from hybrid_opt.store.trajectory_file import write_trajectory
 from hybrid_opt.timing.robustness import Margin
 from hybrid_opt.work.service import (
-    Executor,
-    ProcessExecutor,
-    SerialExecutor,
+    LocalExecutor,
     Service,
     answer_all,
     called,
     nothing,
 )
 from studies.study.drivable import (
-    DrivableFronts,
-    drivable_fronts,
     drivable_root,
     is_drivable,
     least_force,
@@ -168,7 +164,10 @@ def recommendation_stage(wish: ho.Wish) -> Stage:
         call: _Call = partial(_recommended, folder.root, wish, progress, folder.execution.jobs)
         service: Service[None, _Call, StoredRecommendation | NoRecommendation]
         service = Service(nothing, called)
-        (found,) = answer_all(_executor(folder.execution), service, [call])
+        # A worker here, where the folder is: its libraries are loaded already, which takes this
+        # process a second.
+        apart = folder.execution.jobs != 1 and folder.execution.executor == "processes"
+        (found,) = answer_all(LocalExecutor(apart=apart), service, [call])
         none = isinstance(found, NoRecommendation)
         written, other = (NO_RECOMMENDATION, RECOMMENDATION)[:: 1 if none else -1]
         # Also after an earlier attempt that was interrupted.
@@ -176,13 +175,6 @@ def recommendation_stage(wish: ho.Wish) -> Stage:
         write_json(folder.root / written, to_json(found))
 
     return Stage("recommendation", run, dict(wish.given))
-
-
-def _executor(execution: ExecutionSettings) -> Executor:
-    """A worker here, where the folder is: its libraries are loaded already, which takes this
-    process a second."""
-    alone = execution.jobs == 1 or execution.executor != "processes"
-    return SerialExecutor() if alone else ProcessExecutor(1)
 
 
 def _recommended(
@@ -229,22 +221,23 @@ def recommend_from(
         ResultsError: the folder is not complete or damaged, or the file cannot be written.
     """
     campaign = read_campaign(root)
-    drivable = drivable_fronts(drivable_root(root, campaign.workcell, campaign.objectives))
+    drivable = read_campaign(drivable_root(root, campaign.workcell, campaign.objectives))
     threads = threads or available_cores()
-    cell = ho.Cell(drivable.results.workcell, drivable.results.objectives, threads)
-    own = _hand_made(cell)
-    x, sources = np.vstack([drivable.x, own]), [*drivable.sources, *[HAND_MADE] * len(own)]
+    cell = ho.Cell(drivable.workcell, drivable.objectives, threads)
+    own, best, fronts = _hand_made(cell), union(drivable.fronts), drivable.fronts
+    x = np.vstack([*(front.x[row, None] for front, row in best), own])
+    sources = [*(front.source for front, _ in best), *[HAND_MADE] * len(own)]
     if len(x) == 0:
-        raise NoCarryError(_why_none(cell, drivable.results))
+        raise NoCarryError(_why_none(cell, drivable))
     alone = is_drivable(campaign.workcell, campaign.objectives)
     others = {} if alone else least_force(campaign)
     # The choice with its rivals, the table's rows and the price.
-    steps = STEPS + 3 + 2 * len(others) + len(drivable.fronts)
+    steps = STEPS + 3 + 2 * len(others) + len(fronts)
     with progress.stage("recommendation", steps, "steps") as advance:
         found = ho.recommend(
             ho.Front.of(cell, x), wish, others, progress=lambda done, total: advance(1)
         )
-        durations = _force_table(cell, drivable, others, found, advance)
+        durations = _force_table(cell, fronts, others, found, advance)
         price = _price(found.carry, campaign.settings.seed, threads)
         advance(1)
     source = sources[found.member]
@@ -318,7 +311,7 @@ def _price(carry: ho.Carry, seed: int, threads: int) -> RobustPrice | None:
 
 def _force_table(
     cell: ho.Cell,
-    drivable: DrivableFronts,
+    fronts: Sequence[ReplicaFront],
     others: Mapping[str, Array],
     found: Recommendation,
     advance: Advance,
@@ -337,8 +330,15 @@ def _force_table(
     paths = {HAND_MADE: cell.initial[: task.n_path]} | dict(others)
     rows = [_row(label, [durations(path[None])]) for label, path in paths.items()]
     rows += [
-        _row(label, [durations(_spread(front.x[:, : task.n_path])) for front in fronts])
-        for label, fronts in drivable.labelled().items()
+        _row(
+            label,
+            [
+                durations(_spread(front.x[:, : task.n_path]))
+                for front in fronts
+                if front.label == label
+            ],
+        )
+        for label in dict.fromkeys(front.label for front in fronts)
     ]
     return ForceTable(tuple(forces.tolist()), tuple(rows))
 

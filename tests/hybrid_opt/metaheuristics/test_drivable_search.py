@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 
 import hybrid_opt as ho
-from hybrid_opt.campaign.cell_source import PackedCell
+from hybrid_opt.campaign.cell_source import with_cell
 from hybrid_opt.campaign.journal import ReplicaRequest, decode
 from hybrid_opt.campaign.search_stage import run_replica
 from hybrid_opt.campaign.settings import EVALUATIONS as FILE
 from hybrid_opt.campaign.settings import CampaignSettings
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES
-from hybrid_opt.work.service import ProcessExecutor, Service, answer_all
+from hybrid_opt.work.service import LocalExecutor, Service, answer_all
 from symbolic.read.cell_files import collect_cell
 from tests.symbolic.read.samples import RACK
 
@@ -51,12 +51,14 @@ def test_a_worker_elsewhere_searches_without_the_cells_files(
 ) -> None:
     """Paths of pads without closed form are timed one by one, which reads the robots' files."""
     cell = ho.Cell.load(RACK.with_name("fork.toml")).drivable()
-    packed = PackedCell.of(collect_cell(cell.workcell))
-    source = partial(packed.make, partial(CandidateEvaluator, objectives=DRIVABLE_OBJECTIVES))
+    evaluator = partial(CandidateEvaluator, objectives=DRIVABLE_OBJECTIVES)
+    source = partial(with_cell, evaluator, collect_cell(cell.workcell))
     settings = CampaignSettings({"random": {}}, EVALUATIONS, 1, objectives=DRIVABLE_OBJECTIVES)
     request = ReplicaRequest(settings, "random", 0, cell.initial[None])
     monkeypatch.chdir(tmp_path)
-    ((files, _),) = answer_all(ProcessExecutor(1), Service(source, run_replica), [request])
+    ((files, _),) = answer_all(
+        LocalExecutor(1, apart=True), Service(source, run_replica), [request]
+    )
     found = decode(files[FILE], tmp_path).evaluations
     assert len(found.x) == EVALUATIONS
     expected = cell.evaluate(found.x)

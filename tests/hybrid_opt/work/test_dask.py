@@ -14,7 +14,7 @@ import pytest
 from hybrid_opt.campaign import CampaignSettings, ExecutionSettings
 from hybrid_opt.errors import WorkerError
 from hybrid_opt.work.dask_cluster import DaskExecutor
-from hybrid_opt.work.service import KILLED, SILENT, SerialExecutor, Service
+from hybrid_opt.work.service import KILLED, SILENT, LocalExecutor, Service
 from symbolic.errors import DualArmError, SettingsError
 from tests.hybrid_opt.campaign.fake import FakeSource, files_of, logged, run_search
 from tests.hybrid_opt.work import services
@@ -87,7 +87,7 @@ def test_messages_come_in_order_and_once(cluster: Any) -> None:
 
 
 def test_the_cluster_changes_no_bit(cluster: Any) -> None:
-    here = services.run(SerialExecutor(), services.numbers, [1, 2, 3])
+    here = services.run(LocalExecutor(), services.numbers, [1, 2, 3])
     assert services.run(executor(cluster), services.numbers, [1, 2, 3]).answers == here.answers
 
 

@@ -22,19 +22,16 @@ from hybrid_opt.work.service import (
     SILENT,
     Executor,
     LocalExecutor,
-    ProcessExecutor,
-    SerialExecutor,
     Service,
     answer_all,
     give_up,
-    local_executor,
 )
 from symbolic.errors import DualArmError
 from tests.hybrid_opt.work import services
 from tests.hybrid_opt.work.services import Kept, run
 from tests.waiting import HANGS, soon, until
 
-EXECUTORS: list[Executor] = [SerialExecutor(), ProcessExecutor(2), LocalExecutor(3)]
+EXECUTORS: list[Executor] = [LocalExecutor(), LocalExecutor(2, apart=True), LocalExecutor(3)]
 
 
 @pytest.mark.parametrize("executor", EXECUTORS)
@@ -70,7 +67,9 @@ def test_who_works_changes_no_bit() -> None:
 def test_a_list_is_answered_in_order_and_every_answer_told() -> None:
     told: list[int] = []
     service = Service(services.context, services.echo)
-    answers = answer_all(ProcessExecutor(3), service, [4, 3, 2, 1], lambda: told.append(1))
+    answers = answer_all(
+        LocalExecutor(3, apart=True), service, [4, 3, 2, 1], lambda: told.append(1)
+    )
     assert [answer[0] for answer in answers] == [4, 3, 2, 1]
     assert len(told) == 4
 
@@ -105,7 +104,7 @@ ROOT = Path(__file__).parents[3]
 def test_a_killed_worker_is_replaced_and_its_request_repeated(tmp_path: Path) -> None:
     requests = [tmp_path / "a", tmp_path / "b"]
     requests[1].touch()
-    found = run(ProcessExecutor(2), services.killed_once, requests)
+    found = run(LocalExecutor(2, apart=True), services.killed_once, requests)
     assert found.answers == ["alive", "alive"]
     assert found.messages == {0: [b"begun", b"begun"], 1: [b"begun"]}
     assert found.losses == []
@@ -117,17 +116,23 @@ def test_deaths_with_progress_in_between_lose_nothing() -> None:
             return len(self.messages[index])
 
     ledger = Progressing([None])
-    ProcessExecutor(1).run(Service(services.context, services.killed_step_by_step), ledger)
+    LocalExecutor(1, apart=True).run(
+        Service(services.context, services.killed_step_by_step), ledger
+    )
     assert ledger.answers == [5] > [MAX_DEATHS]
     assert ledger.losses == []
 
 
 def test_a_request_that_kills_its_workers_is_lost_and_no_other() -> None:
-    found = run(ProcessExecutor(2), services.moody, ["a", "die", "b", "c"], instead="instead")
+    found = run(
+        LocalExecutor(2, apart=True), services.moody, ["a", "die", "b", "c"], instead="instead"
+    )
     assert found.answers == ["a", "instead", "b", "c"]
     assert found.losses == [(1, KILLED)]
     with pytest.raises(WorkerError, match="died 3 times"):
-        answer_all(ProcessExecutor(2), Service(services.context, services.moody), ["die", "a"])
+        answer_all(
+            LocalExecutor(2, apart=True), Service(services.context, services.moody), ["die", "a"]
+        )
 
 
 @pytest.mark.parametrize("processes", [1, 2])
@@ -143,25 +148,25 @@ def test_only_what_must_be_given_up_needs_a_process_of_its_own() -> None:
     assert run(LocalExecutor(1), services.process, [1, 2]).answers == [os.getpid()] * 2
     assert run(LocalExecutor(8), services.process, [1]).answers == [os.getpid()]
     assert os.getpid() not in run(LocalExecutor(1), services.process, [1], patience=60.0).answers
-    assert isinstance(local_executor(3), LocalExecutor)
-    assert local_executor(0).jobs >= 1  # type: ignore[attr-defined]
+    assert run(LocalExecutor(0), services.process, [1]).answers == [os.getpid()]
+    assert os.getpid() not in run(LocalExecutor(1, apart=True), services.process, [1]).answers
 
 
 def test_no_worker_is_left_behind() -> None:
-    run(ProcessExecutor(2), services.echo, [1, 2, 3])
+    run(LocalExecutor(2, apart=True), services.echo, [1, 2, 3])
     assert not [child for child in multiprocessing.active_children() if child.name == "worker"]
 
 
 PROGRAM = """
 import sys, time
 from hybrid_opt.work.service import Service
-from hybrid_opt.work.service import ProcessExecutor, warm_up
+from hybrid_opt.work.service import LocalExecutor, warm_up
 from tests.hybrid_opt.work import services
 warm_up("tests.hybrid_opt.work.services")
 ledger = services.Kept(["hang", "hang"])
 print("started", flush=True)
 try:
-    ProcessExecutor(2).run(Service(services.context, services.moody), ledger)
+    LocalExecutor(2, apart=True).run(Service(services.context, services.moody), ledger)
 except KeyboardInterrupt:
     print("interrupted", flush=True)
 """

@@ -32,7 +32,7 @@ from hybrid_opt.store.files import write_json
 from hybrid_opt.store.json_records import from_json, to_json
 from hybrid_opt.timing import closest_to_reference_timing, time_path
 from hybrid_opt.timing.document import read_timing
-from hybrid_opt.work.service import SerialExecutor, Service
+from hybrid_opt.work.service import LocalExecutor, Service
 from studies import run
 from studies.study.drivable import known_paths, least_force
 from studies.study.simulation import (
@@ -295,7 +295,7 @@ def test_every_answer_is_kept_and_not_asked_for_again(own_study: Path) -> None:
     assert not any(is_done(own_study, one) for one in wanted)
     told: list[int] = []
     ledger = Written(wanted[:3], own_study, lambda: told.append(1))
-    SerialExecutor().run(Service(lambda: None, same), ledger)
+    LocalExecutor().run(Service(lambda: None, same), ledger)
     assert len(told) == 3
     assert [is_done(own_study, one) for one in wanted] == [True, True, True, False]
     changed = replace(wanted[0], digest="another trajectory")
