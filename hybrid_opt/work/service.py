@@ -132,37 +132,29 @@ def give_up(reason: str) -> NoReturn:
     )
 
 
-class ListLedger(Generic[Request, Answer]):
-    """Requests of a list, answers in a list; a lost request ends the run.
-
-    Attributes:
-        answers: in the order of the requests.
-    """
+class _Listed(Generic[Request, Answer]):
+    """Requests of a list, answers in a list; a lost request ends the run."""
 
     def __init__(
-        self, requests: Sequence[Request], done: Callable[[], None] = lambda: None
+        self, requests: Sequence[Request], answered: Callable[[int, Answer], None]
     ) -> None:
-        """done: called after every answer."""
-        self._requests, self._done = requests, done
-        self.answers: list[Any] = [None] * len(requests)
+        self.requests, self.answers = requests, list[Any]([None] * len(requests))
+        self._answered = answered
 
     def __len__(self) -> int:
-        return len(self._requests)
+        return len(self.requests)
 
     def request(self, index: int) -> Request:
-        """See `Ledger`."""
-        return self._requests[index]
+        return self.requests[index]
 
     def heard(self, index: int, message: bytes) -> None:
         """Messages are left out."""
 
     def answered(self, index: int, answer: Answer) -> None:
-        """See `Ledger`."""
         self.answers[index] = answer
-        self._done()
+        self._answered(index, answer)
 
     def lost(self, index: int, reason: str) -> None:
-        """See `Ledger`."""
         give_up(reason)
 
 
@@ -170,7 +162,7 @@ def answer_all(
     executor: Executor,
     service: Service[Context, Request, Answer],
     requests: Sequence[Request],
-    done: Callable[[], None] = lambda: None,
+    answered: Callable[[int, Answer], None] = lambda index, answer: None,
 ) -> list[Answer]:
     """The answers to independent requests, in their order.
 
@@ -178,12 +170,12 @@ def answer_all(
         executor: who does it.
         service: what to do.
         requests: can be pickled.
-        done: called in this process after every answer.
+        answered: takes every answer as it comes, with the index of its request, in this process.
 
     Raises:
         DualArmError: a request failed with this text, or was lost.
     """
-    ledger: ListLedger[Request, Answer] = ListLedger(requests, done)
+    ledger = _Listed(requests, answered)
     executor.run(service, ledger)
     return ledger.answers
 

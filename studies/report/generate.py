@@ -70,7 +70,7 @@ def write_report(
     listed = _listed(data)
     service: Service[Any, Any, dict[str, bytes]] = Service(partial(_listed, data), called)
     calls = [partial(_drawn, k, pdf) for k in range(len(listed))]
-    drawn = answer_all(executor or LocalExecutor(), service, calls, done)
+    drawn = answer_all(executor or LocalExecutor(), service, calls, lambda *_: done())
     pictures = []
     for picture, made in zip(listed, drawn, strict=True):
         for suffix, content in made.items():

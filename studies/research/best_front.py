@@ -90,7 +90,7 @@ def compute_reference_front(
         executor,
         _polish_service(cell, ATTEMPTS, FillSettings(attempts=0)),
         list(zip([start[None] for start in begins], rng.spawn(len(begins)), strict=True)),
-        lambda: tell(f"start {next(count)} of {len(begins)}"),
+        lambda *_: tell(f"start {next(count)} of {len(begins)}"),
     )
     union = np.concatenate([part.x for part in parts])
     (front,) = answer_all(executor, _polish_service(cell, attempts, FillSettings()), [(union, rng)])

@@ -4,7 +4,6 @@ records (`simulated/*.json`)."""
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -21,7 +20,7 @@ from hybrid_opt.store.json_records import read_record, to_json
 from hybrid_opt.store.trajectory_file import StoredTrajectory, read_trajectory
 from hybrid_opt.witness.arms import Account, CellWitness, account_of
 from hybrid_opt.witness.reference import Control, driven_carry
-from hybrid_opt.work.service import Emit, ListLedger, Service, nothing
+from hybrid_opt.work.service import Emit, Service, answer_all, nothing
 from studies.study.summary import read_summary
 from studies.study.timing import file_label
 from symbolic.array import Array, Figure, Row, Shape
@@ -147,7 +146,7 @@ CONTROL: Control = "leader"
 
 
 @dataclass(frozen=True)
-class Simulated:
+class SimulationRequest:
     """A carry to simulate.
 
     Attributes:
@@ -176,31 +175,21 @@ def _run(folder: CampaignFolder, progress: Progress) -> None:
         if path.stem not in kept:
             path.unlink()
     left = [one for one in wanted if not is_done(folder.root, one)]
-    with progress.stage("simulation", len(wanted), "carries") as advance:
-        for _ in range(len(wanted) - len(left)):
+    with progress.stage("simulation", len(wanted), "carries", len(wanted) - len(left)) as advance:
+
+        def answered(index: int, answer: StoredSimulation) -> None:
+            # As it comes, so that what is interrupted goes on from there.
+            write_json(_file(folder.root, left[index].name), to_json(answer))
             advance(1)
-        ledger = Written(left, folder.root, lambda: advance(1))
-        executor_for(folder.execution).run(Service(nothing, _simulated), ledger)
 
-
-class Written(ListLedger[Simulated, StoredSimulation]):
-    """Writes every answer as it comes, so that what is interrupted goes on from there."""
-
-    def __init__(self, wanted: list[Simulated], root: Path, done: Callable[[], None]) -> None:
-        super().__init__(wanted, done)
-        self._wanted, self._root = wanted, root
-
-    def answered(self, index: int, answer: StoredSimulation) -> None:
-        """See `Ledger`."""
-        write_json(_file(self._root, self._wanted[index].name), to_json(answer))
-        super().answered(index, answer)
+        answer_all(executor_for(folder.execution), Service(nothing, _simulated), left, answered)
 
 
 def _file(root: Path, name: str) -> Path:
     return root / SIMULATED / f"{name}.json"
 
 
-def is_done(root: Path, one: Simulated) -> bool:
+def is_done(root: Path, one: SimulationRequest) -> bool:
     """Whether this very trajectory was simulated."""
     try:
         stored = read_record(StoredSimulation, _file(root, one.name), "")
@@ -209,7 +198,7 @@ def is_done(root: Path, one: Simulated) -> bool:
     return stored.trajectory == one.digest and stored.controller == CONTROL
 
 
-def wanted_carries(root: Path) -> list[Simulated]:
+def wanted_carries(root: Path) -> list[SimulationRequest]:
     """The carries that a report shows: hand-made, best of each algorithm, recommended."""
     summary = read_summary(root)
     shown, places = summary.shown_files, ["", *summary.algorithms]
@@ -219,13 +208,13 @@ def wanted_carries(root: Path) -> list[Simulated]:
     }
     files["9-recommended"] = ("recommended", root / RECOMMENDED)
     return [
-        Simulated(name, label, read_trajectory(path), sha256(read_bytes(path)))
+        SimulationRequest(name, label, read_trajectory(path), sha256(read_bytes(path)))
         for name, (label, path) in files.items()
         if path.exists()
     ]
 
 
-def _simulated(_: None, one: Simulated, emit: Emit) -> StoredSimulation:
+def _simulated(_: None, one: SimulationRequest, emit: Emit) -> StoredSimulation:
     whose = (one.label, one.digest, CONTROL)
     with TemporaryDirectory() as folder:
         cell = one.trajectory.open_cell(Path(folder))

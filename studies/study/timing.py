@@ -60,7 +60,7 @@ def timing_stage(
         source = partial(ready_cells, cells_of(folder.files, folder.settings.objectives, driven))
         with progress.stage(TIMING, len(requests), "trajectories") as advance:
             workers = executor_for(folder.execution)
-            found = answer_all(workers, Service(source, _document), requests, lambda: advance(1))
+            found = answer_all(workers, Service(source, _document), requests, lambda *_: advance(1))
         for file, document in zip(files, found, strict=True):
             write_json(folder.root / TIMING / file, to_json(document))
 

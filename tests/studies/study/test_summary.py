@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from hybrid_opt.campaign import CampaignFolder, ExecutionSettings
 from hybrid_opt.campaign.results import CampaignResults, Replica, read_campaign
 from hybrid_opt.campaign.settings import (
     POLISH,
@@ -27,20 +28,21 @@ from hybrid_opt.errors import ResultsError
 from hybrid_opt.evaluate.evaluations import FEASIBLE, REASONS, Evaluations
 from hybrid_opt.indicators.statistics import rank_test
 from hybrid_opt.polishing.records import PolishedFront
+from hybrid_opt.progress import Progress
 from hybrid_opt.static_hold import StaticHold
 from hybrid_opt.store.files import write_json
 from hybrid_opt.store.json_records import from_json, to_json
 from hybrid_opt.timing import closest_to_reference_timing, time_path
 from hybrid_opt.timing.document import read_timing
-from hybrid_opt.work.service import LocalExecutor, Service
 from studies import run
+from studies.study import simulation as stage
 from studies.study.drivable import known_paths, least_force
 from studies.study.simulation import (
-    Simulated,
+    SimulationRequest,
     StoredSimulation,
-    Written,
     is_done,
     read_simulations,
+    simulation_stage,
     wanted_carries,
 )
 from studies.study.summary import (
@@ -56,6 +58,7 @@ from studies.study.summary import (
 )
 from studies.study.tables import PAPER, simulated, study_tables
 from symbolic.read.cell import load
+from symbolic.read.cell_files import collect_cell
 from tests.hybrid_opt.campaign.fake import OBJECTIVES
 from tests.studies.conftest import simulation
 from tests.symbolic.cells import RACK
@@ -285,19 +288,34 @@ def test_paths_are_timed_in_the_cell_that_robots_drive(study: Path) -> None:
     assert found["closest to reference"].duration == pytest.approx(closest.duration, rel=1e-9)
 
 
-def same(_: None, one: Simulated, emit: object) -> StoredSimulation:
+def same(_: None, one: SimulationRequest, emit: object) -> StoredSimulation:
     return replace(simulation(one.label), trajectory=one.digest)
 
 
-def test_every_answer_is_kept_and_not_asked_for_again(own_study: Path) -> None:
+def test_every_answer_is_kept_and_not_asked_for_again(
+    own_study: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     wanted = wanted_carries(own_study)
     assert [one.label for one in wanted] == ["hand-made", "NSGA-II", "MOPSO", "recommended"]
     assert not any(is_done(own_study, one) for one in wanted)
-    told: list[int] = []
-    ledger = Written(wanted[:3], own_study, lambda: told.append(1))
-    LocalExecutor().run(Service(lambda: None, same), ledger)
-    assert len(told) == 3
+    asked: list[str] = []
+
+    def few(_: None, one: SimulationRequest, emit: object) -> StoredSimulation:
+        asked.append(one.label)
+        if one.label == "recommended" and len(asked) == 4:
+            raise KeyboardInterrupt
+        return same(_, one, emit)
+
+    monkeypatch.setattr(stage, "_simulated", few)
+    results, silent = read_campaign(own_study), Progress(shown=False)
+    execution, files = ExecutionSettings(own_study, jobs=1), collect_cell(results.workcell)
+    folder = CampaignFolder(own_study, results.settings, execution, results.cell, files)
+    with pytest.raises(KeyboardInterrupt):
+        simulation_stage().run(folder, silent)
     assert [is_done(own_study, one) for one in wanted] == [True, True, True, False]
+    simulation_stage().run(folder, silent)
+    assert asked[4:] == ["recommended"]
+    (own_study / SIMULATED / f"{wanted[3].name}.json").unlink()
     changed = replace(wanted[0], digest="another trajectory")
     assert not is_done(own_study, changed)
     found = read_simulations(own_study)
