@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import argparse
-import json
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -20,6 +18,7 @@ from hybrid_opt.front import Front
 from hybrid_opt.indicators.metrics import BindingBound, binding_bounds
 from hybrid_opt.progress import Progress
 from studies.program import load_workcell
+from studies.programs.findings import Finding, print_findings
 from symbolic.array import Array
 from symbolic.cell_model import CellModel, own_pairs
 from symbolic.errors import SettingsError
@@ -50,19 +49,6 @@ class Optimum:
     problem: str = ""
 
 
-@dataclass(frozen=True)
-class Part:
-    """One finding of an inspection.
-
-    Attributes:
-        values: by name, for JSON; records are left to `dataclasses.asdict`.
-        lines: the same for people.
-    """
-
-    values: Mapping[str, Any]
-    lines: tuple[str, ...] = ()
-
-
 def inspected(
     workcell: Workcell,
     candidates: int,
@@ -73,8 +59,8 @@ def inspected(
     view: Path | None = None,
     pairs: bool = False,
     progress: Progress | None = None,
-) -> Iterator[Part]:
-    """All there is to know of a cell, each part worked out when it is asked for.
+) -> Iterator[Finding]:
+    """All there is to know of a cell, each finding worked out when it is asked for.
 
     Args:
         candidates: random ones to judge, at least 1.
@@ -88,9 +74,9 @@ def inspected(
         DualArmError: the model cannot be built, or a picture cannot be written.
     """
     cell, progress = Cell(workcell), progress or Progress(shown=False)
-    yield Part({"candidates": candidates, "seed": seed})
+    yield Finding({"candidates": candidates, "seed": seed})
     facts = _facts(workcell)
-    yield Part(
+    yield Finding(
         {"name": workcell.name, "facts": facts},
         (workcell.name, "", *(f"  {heading}: {text}" for heading, text in facts.items()), ""),
     )
@@ -112,24 +98,24 @@ def inspected(
         for why in explain(cell.evaluator, cell.evaluate(carry.x)):
             whys[name] = why
         told = (f"  {whys[name]}",) if name in whys else ()
-        yield Part({name: carry.judgement}, (f"{title}: {_judged_text(carry.judgement)}", *told))
-    yield Part({"explained": {name: str(why) for name, why in whys.items()}})
+        yield Finding({name: carry.judgement}, (f"{title}: {_judged_text(carry.judgement)}", *told))
+    yield Finding({"explained": {name: str(why) for name, why in whys.items()}})
     yield _postures(cell)
     yield from _candidates(cell, candidates, seed)
     yield _pairs(cell, pairs)
     optimum = _optimum(cell, progress) if polish else None
     lines = () if optimum is None else ("", *_optimum_lines(optimum))
-    yield Part({"optimum": optimum}, lines)
+    yield Finding({"optimum": optimum}, lines)
     files: tuple[str, ...] = ()
     if output is not None:
         progress.note("drawing pictures (--no-pictures leaves them out)")
         files = draw(cell, carries, whys, output)
-    yield Part({"files": files}, ("", "Pictures: " + ", ".join(files)) if files else ())
+    yield Finding({"files": files}, ("", "Pictures: " + ", ".join(files)) if files else ())
     shown = "" if view is None else show(carries["initial"], whys.get("initial"), view)
-    yield Part({"view": shown}, ("", f"View: {shown} (open it in a browser)") if shown else ())
+    yield Finding({"view": shown}, ("", f"View: {shown} (open it in a browser)") if shown else ())
 
 
-def _at_rest(cell: Cell) -> Part:
+def _at_rest(cell: Cell) -> Finding:
     """Forces of holding the payload level and still, and whether it can be held."""
     hold, unheld = cell.static_hold, cell.unheld
     force = hold.normal_force
@@ -149,10 +135,10 @@ def _at_rest(cell: Cell) -> Part:
         "static_payload_limit": hold.payload_limit,
         "unheld": unheld,
     }
-    return Part(values, tuple(lines))
+    return Finding(values, tuple(lines))
 
 
-def _postures(cell: Cell) -> Part:
+def _postures(cell: Cell) -> Finding:
     """Per robot's name its postures at the start, best first."""
     robots = cell.workcell.robots
     branches = {robot.name: branches_of(cell, i) for i, robot in enumerate(robots)}
@@ -160,10 +146,10 @@ def _postures(cell: Cell) -> Part:
     for robot, found in branches.items():
         lines.append(f"  {robot}")
         lines += [f"  {'*' if b.chosen else ' '} {_branch_text(b)}" for b in found]
-    return Part({"branches": branches}, tuple(lines))
+    return Finding({"branches": branches}, tuple(lines))
 
 
-def _candidates(cell: Cell, count: int, seed: int) -> Iterator[Part]:
+def _candidates(cell: Cell, count: int, seed: int) -> Iterator[Finding]:
     """Random candidates: how many are feasible, and what is in the way of the others."""
     found = cell.evaluate(cell.random(count, np.random.default_rng(seed)))
     share, reasons = float(found.feasible.mean()), found.infeasible_by_reason
@@ -174,7 +160,7 @@ def _candidates(cell: Cell, count: int, seed: int) -> Iterator[Part]:
     ]
     for name, number in reasons.items():
         lines.append(f"  {name.replace('_', ' ')}: {number} ({100.0 * number / count:.1f} %)")
-    yield Part({"feasible_share": share, "infeasible_by_reason": reasons}, tuple(lines))
+    yield Finding({"feasible_share": share, "infeasible_by_reason": reasons}, tuple(lines))
     failed = found[~found.feasible][:EXPLAINED]
     in_the_way = frequent(explain(cell.evaluator, failed))
     lines = []
@@ -183,10 +169,10 @@ def _candidates(cell: Cell, count: int, seed: int) -> Iterator[Part]:
         if counts:
             lines += ["", f"{title}, in {len(failed)} of the infeasible ones:"]
             lines += [f"  {name}: {number}" for name, number in counts]
-    yield Part({"explained_candidates": len(failed), "in_the_way": in_the_way}, tuple(lines))
+    yield Finding({"explained_candidates": len(failed), "in_the_way": in_the_way}, tuple(lines))
 
 
-def _pairs(cell: Cell, listed: bool) -> Part:
+def _pairs(cell: Cell, listed: bool) -> Finding:
     """Pairs of bodies that are checked, and those that are not, and why."""
     geometry = cell.geometry
     names, active = [body.name for body in geometry.bodies], geometry.pair_names
@@ -199,7 +185,7 @@ def _pairs(cell: Cell, listed: bool) -> Part:
     if listed:
         lines += [f"  {first} – {second}" for first, second in active]
         lines += [f"  {first} – {second}: {why}" for first, second, why in excluded]
-    return Part({"active_pairs": active, "excluded_pairs": excluded}, tuple(lines))
+    return Finding({"active_pairs": active, "excluded_pairs": excluded}, tuple(lines))
 
 
 def _optimum(cell: Cell, progress: Progress) -> Optimum:
@@ -410,8 +396,7 @@ def inspect(options: argparse.Namespace) -> int:
         DualArmError: the workcell is wrong, or a picture cannot be written.
     """
     output = options.output or Path("inspect") / options.workcell.stem
-    values: dict[str, Any] = {}
-    for part in inspected(
+    findings = inspected(
         load_workcell(options.workcell),
         options.candidates,
         options.seed,
@@ -420,10 +405,6 @@ def inspect(options: argparse.Namespace) -> int:
         view=output / "view.html" if options.view else None,
         pairs=options.pairs,
         progress=Progress(),
-    ):
-        values |= part.values
-        for line in () if options.json else part.lines:
-            print(line, flush=True)
-    if options.json:
-        print(json.dumps(values, default=asdict, indent=2))
+    )
+    print_findings(findings, options.json)
     return 0

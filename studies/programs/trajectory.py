@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+from collections.abc import Iterator
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -50,6 +51,7 @@ from hybrid_opt.timing import (
 from hybrid_opt.timing.document import timing_document
 from hybrid_opt.timing.model import TimingModel
 from studies.program import load_workcell
+from studies.programs.findings import Finding, print_findings
 from studies.study.tables import force_curve, margins, timings
 from symbolic.array import Array
 from symbolic.errors import SettingsError
@@ -68,64 +70,45 @@ def replay_file(options: argparse.Namespace) -> int:
     stored = read_trajectory(options.file)
     with TemporaryDirectory() as folder:
         replayed = replay(stored, Path(folder))
-        document: dict[str, Any] = _replay_json(stored, replayed)
-        if not options.json:
-            print(_replay_text(stored, replayed), flush=True)
-        asked = (options.force_limit, options.force_curve)
-        if options.timing or any(option is not None for option in asked):
-            Progress().note("timing it, which takes some seconds")
-            document["timing"], timing = _timings(stored, replayed, options)
-            if not options.json:
-                print(f"\n{timing}")
-    if options.json:
-        print(json.dumps(document, indent=1, allow_nan=False))
+        print_findings(_replayed(stored, replayed, options), options.json)
     return 0 if replayed.reproduced else EXIT_DIFFERENT
 
 
-def _timings(
+def _replayed(
     stored: StoredTrajectory, replayed: Replay, options: argparse.Namespace
-) -> tuple[dict[str, Any], str]:
-    model = replayed.cell.timing_model
-    timed = timed_trajectory(model, stored.x, options.force_limit, options.force_curve)
-    document, robots = timing_document(timed), [robot.name for robot in timed.workcell.robots]
-    found = [timings([("", document)], robots)]
-    found += [margins([("", document)])] if document.margins else []
-    found += [force_curve(document.force_curve)] if document.force_curve is not None else []
-    return to_json(document), "\n\n".join(table.text() for table in found)
-
-
-def _replay_json(stored: StoredTrajectory, replayed: Replay) -> dict[str, Any]:
-    return {
-        "workcell": replayed.cell.workcell.name,
-        "digest": replayed.cell.workcell.digest,
-        "reproduced": replayed.reproduced,
-        "start_difference": replayed.start_difference,
-        "figures": {
-            figure.name: {
-                "stored": figure.stored,
-                "recomputed": figure.recomputed,
-                "same": figure.same,
-            }
-            for figure in replayed.figures
-        },
-        "provenance": dict(stored.provenance),
-    }
-
-
-def _replay_text(stored: StoredTrajectory, replayed: Replay) -> str:
+) -> Iterator[Finding]:
+    workcell, values = replayed.cell.workcell, dict[str, Any]()
     rows = [("figure", "stored", "recomputed", "")]
     for figure in replayed.figures:
         recomputed = "-" if figure.recomputed is None else f"{figure.recomputed:.9g}"
         mark = "" if figure.same else "DIFFERS"
         rows.append((figure.name, f"{figure.stored:.9g}", recomputed, mark))
-    return "\n".join(
-        [
-            f"{replayed.cell.workcell.name}, {len(stored.x)} variables",
-            text_table(rows, left=(0, 3)),
-            f"start postures differ by at most {replayed.start_difference:.2e} rad",
-            "reproduced" if replayed.reproduced else "NOT reproduced",
-        ]
+        both = {"stored": figure.stored, "recomputed": figure.recomputed}
+        values[figure.name] = both | {"same": figure.same}
+    lines = (
+        f"{workcell.name}, {len(stored.x)} variables",
+        text_table(rows, left=(0, 3)),
+        f"start postures differ by at most {replayed.start_difference:.2e} rad",
+        "reproduced" if replayed.reproduced else "NOT reproduced",
     )
+    document = {
+        "workcell": workcell.name,
+        "digest": workcell.digest,
+        "reproduced": replayed.reproduced,
+        "start_difference": replayed.start_difference,
+        "figures": values,
+        "provenance": dict(stored.provenance),
+    }
+    yield Finding(document, lines)
+    asked = (options.force_limit, options.force_curve)
+    if options.timing or any(option is not None for option in asked):
+        Progress().note("timing it, which takes some seconds")
+        timing = timing_document(timed_trajectory(replayed.cell.timing_model, stored.x, *asked))
+        found = [timings([("", timing)], [robot.name for robot in workcell.robots])]
+        found += [margins([("", timing)])] if timing.margins else []
+        found += [force_curve(timing.force_curve)] if timing.force_curve is not None else []
+        texts = (f"\n{table.text()}" for table in found)
+        yield Finding({"timing": to_json(timing)}, tuple(texts))
 
 
 def export_file(options: argparse.Namespace) -> int:
