@@ -234,7 +234,7 @@ class _Session:
     def _finish(self, number: int, order: _Order) -> None:
         del self._orders[number]
         try:
-            attempted = order.future.result()
+            reply = order.future.result()
         except Exception as error:
             # Dask repeats what a death interrupts, until it happens too often.
             died_often = type(error).__name__ == "KilledWorker" and order.expected <= 1
@@ -244,7 +244,7 @@ class _Session:
                 self._give_up(order.index, error)
             self._submit(order.index)
             return
-        self._ledger.answered(order.index, attempted.answer())
+        self._ledger.answered(order.index, reply.answer())
 
     def _give_up(self, index: int, error: Exception) -> None:
         try:

@@ -190,9 +190,8 @@ def nothing() -> None:
 
 
 @dataclass(frozen=True)
-class Outcome:
-    """What became of a request on a worker; failures are texts, as not every exception can be
-    pickled.
+class Reply:
+    """A worker's reply to a request; failures are texts, as not every exception can be pickled.
 
     Attributes:
         kind: 'answer', 'error' for one raised on purpose, 'failure' for one that was not.
@@ -214,14 +213,14 @@ class Outcome:
         raise DualArmError(self.content) if self.kind == "error" else RuntimeError(self.content)
 
 
-def attempt(call: Callable[[], Any]) -> Outcome:
-    """Outcome of a call, a result or a failure."""
+def attempt(call: Callable[[], Any]) -> Reply:
+    """The reply to a call: its result or its failure."""
     try:
-        return Outcome("answer", call())
+        return Reply("answer", call())
     except DualArmError as error:
-        return Outcome("error", str(error))
+        return Reply("error", str(error))
     except Exception:
-        return Outcome("failure", traceback.format_exc())
+        return Reply("failure", traceback.format_exc())
 
 
 def one_thread() -> AbstractContextManager[object]:
@@ -343,7 +342,7 @@ class _Workforce:
         worker.silence = 0.0
         index = worker.index
         assert index is not None
-        if isinstance(word, Outcome):
+        if isinstance(word, Reply):
             worker.index, worker.working = None, False
             self._ledger.answered(index, word.answer())
         elif word is None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -159,12 +159,7 @@ def _with_holm(figures: list[ComparedFigure]) -> tuple[ComparedFigure, ...]:
     """The figures with their tests corrected as one family."""
     tests = iter(corrected([figure.test for figure in figures if figure.test is not None]))
     return tuple(
-        figure
-        if figure.test is None
-        else ComparedFigure(
-            figure.algorithm, figure.figure, figure.first, figure.second, next(tests)
-        )
-        for figure in figures
+        figure if figure.test is None else replace(figure, test=next(tests)) for figure in figures
     )
 
 

@@ -154,27 +154,23 @@ def _band(problem: str, evaluations: int, algorithm: str, population: int) -> Ba
 def _score(
     problem: str, evaluations: int, algorithm: str, population: int, runs: Sequence[_Run]
 ) -> Score:
-    hypervolume = summarise([run.hypervolume for run in runs])
-    distance = summarise([run.igd for run in runs])
+    names = ("hypervolume", "igd", "archive_hypervolume", "archive_igd")
+    found = {name: summarise([getattr(run, name) for run in runs]) for name in names}
     band = _band(problem, evaluations, algorithm, population)
-    verdicts: tuple[Verdict | None, Verdict | None] = (None, None)
+    hypervolume = igd = None
     if band is not None:
-        verdicts = (
-            judge(hypervolume, band.hypervolume, higher_is_better=True),
-            judge(distance, band.igd, higher_is_better=False, std=band.igd_std),
-        )
+        hypervolume = judge(found["hypervolume"], band.hypervolume, higher_is_better=True)
+        igd = judge(found["igd"], band.igd, higher_is_better=False, std=band.igd_std)
     return Score(
         problem,
         evaluations,
         algorithm,
         population,
-        hypervolume,
-        distance,
-        summarise([run.archive_hypervolume for run in runs]),
-        summarise([run.archive_igd for run in runs]),
-        sum(run.overhead_us for run in runs) / len(runs),
-        sum(run.infeasible_in_front for run in runs),
-        *verdicts,
+        **found,
+        overhead_us=sum(run.overhead_us for run in runs) / len(runs),
+        infeasible_in_front=sum(run.infeasible_in_front for run in runs),
+        hypervolume_verdict=hypervolume,
+        igd_verdict=igd,
     )
 
 

@@ -23,8 +23,8 @@ from symbolic.records import Task
 
 
 @dataclass(frozen=True)
-class Replica:
-    """One replica.
+class LockedReplica:
+    """One replica with the redundant joints free, and locked.
 
     Attributes:
         free: hypervolume with the redundant joints free.
@@ -48,7 +48,9 @@ def locks(task: Task, count: int) -> tuple[tuple[float, ...], ...]:
     return tuple(tuple(float(v) for v in entry) for entry in product(*values))
 
 
-def compare(cell: Cell, count: int, replicas: int, evaluations: int, seed: int) -> list[Replica]:
+def compare(
+    cell: Cell, count: int, replicas: int, evaluations: int, seed: int
+) -> list[LockedReplica]:
     """The replicas.
 
     Raises:
@@ -70,7 +72,7 @@ def compare(cell: Cell, count: int, replicas: int, evaluations: int, seed: int) 
             done, _ = search_carries(locked, "nsga2", evaluations, rng, start)
             volumes.append(_volume(done))
         best = tried[int(np.argmax(volumes))]
-        found.append(Replica(_volume(free), tuple(volumes), best))
+        found.append(LockedReplica(_volume(free), tuple(volumes), best))
     return found
 
 
@@ -79,7 +81,7 @@ def _volume(evaluations: Evaluations) -> float:
     return float(hypervolume(evaluations.objectives[rows])) if len(rows) else 0.0
 
 
-def as_text(found: Sequence[Replica]) -> str:
+def as_text(found: Sequence[LockedReplica]) -> str:
     """The comparison for people."""
     lines = ["replica     free  best lock  locks with a carry  at"]
     for k, one in enumerate(found):

@@ -32,7 +32,7 @@ from studies.study.summary import CampaignSummary, read_summary
 
 
 @dataclass(frozen=True)
-class Control:
+class LongerSearch:
     """One algorithm's replicas beside a longer search of the same algorithm or of another.
 
     Attributes:
@@ -56,7 +56,7 @@ class Control:
 
 def controls(
     root: Path, evaluations: Sequence[int], jobs: int, progress: Progress
-) -> list[Control]:
+) -> list[LongerSearch]:
     """Run the longer searches, in `ROOT/control/EVALUATIONS`, and compare.
 
     Args:
@@ -109,14 +109,14 @@ def _search(
 
 def _compare(
     summary: CampaignSummary, longer: CampaignResults, name: str, rival: str, budget: int
-) -> Control:
+) -> LongerSearch:
     rows = summary.algorithms[name].replicas
     before = [row.hypervolume for row in rows]
     after = [row.polished.hypervolume for row in rows if row.polished is not None]
     alone = [
         metrics.hypervolume(replica.front, metrics.REFERENCE_POINT) for replica in longer.of(rival)
     ]
-    return Control(
+    return LongerSearch(
         algorithm=name,
         rival=rival,
         evaluations=budget,
@@ -129,8 +129,8 @@ def _compare(
 
 
 @dataclass(frozen=True)
-class Approach:
-    """How near one algorithm's fronts come to a reference front, medians over the replicas.
+class Gap:
+    """Distance of one algorithm's fronts from a reference front, medians over the replicas.
 
     Attributes:
         algorithm: its name.
@@ -147,7 +147,7 @@ class Approach:
     closed: float
 
 
-def approaches(root: Path, reference: ReferenceFront) -> list[Approach]:
+def approaches(root: Path, reference: ReferenceFront) -> list[Gap]:
     """The distances of a polished study's fronts to a reference front.
 
     Raises:
@@ -161,25 +161,22 @@ def approaches(root: Path, reference: ReferenceFront) -> list[Approach]:
     for name in study.algorithms:
         searched, polished = [], []
         for replica in study.of(name):
-            after = study.polished(replica)
-            if after is None:
+            front = study.polished(replica)
+            if front is None:
                 raise ResultsError(f"{root}: replica {replica.replica} of {name} is not polished")
             searched.append(replica.front)
-            polished.append(after.objectives)
-        gaps = [
-            float(np.median([best - metrics.hypervolume(front) for front in fronts]))
-            for fronts in (searched, polished)
-        ]
-        igds = [
-            float(np.median([metrics.igd(front, reference.objectives) for front in fronts]))
-            for fronts in (searched, polished)
-        ]
-        closed = 100.0 * (1.0 - gaps[1] / gaps[0]) if gaps[0] else math.nan
-        found.append(Approach(name, gaps[0], gaps[1], igds[0], igds[1], closed))
+            polished.append(front.objectives)
+        both = (searched, polished)
+        volumes = ([metrics.hypervolume(one) for one in fronts] for fronts in both)
+        igds = ([metrics.igd(one, reference.objectives) for one in fronts] for fronts in both)
+        before, after = (float(np.median(best - np.array(each))) for each in volumes)
+        closed = 100.0 * (1.0 - after / before) if before else math.nan
+        far, near = (float(np.median(each)) for each in igds)
+        found.append(Gap(name, before, after, far, near, closed))
     return found
 
 
-def approaches_text(found: Sequence[Approach]) -> str:
+def approaches_text(found: Sequence[Gap]) -> str:
     """The distances as a table."""
     head = ["medians over the replicas", "HV gap", "polished", "closed %", "IGD", "polished"]
     rows = [
@@ -196,7 +193,7 @@ def approaches_text(found: Sequence[Approach]) -> str:
     return f"Distance to the reference front\n{text_table([head, *rows])}"
 
 
-def as_text(found: Sequence[Control]) -> str:
+def as_text(found: Sequence[LongerSearch]) -> str:
     """The comparison as a table."""
     rows = [["polished front of", "search", "polished", "longer search", "HV", "wins"]]
     rows += [
@@ -218,7 +215,7 @@ def as_text(found: Sequence[Control]) -> str:
 
 def control(options: argparse.Namespace) -> int:
     """Hold the study of the options against longer searches; returns the exit code."""
-    found: Sequence[Control | Approach]
+    found: Sequence[LongerSearch | Gap]
     if options.reference is not None:
         found = near = approaches(options.results, read_reference_front(options.reference))
         text = approaches_text(near)
