@@ -64,7 +64,7 @@ PLAIN = (
 
 TESTS = Path(__file__).parent
 
-settings.register_profile("local", deadline=None, print_blob=True, max_examples=40)
+settings.register_profile("local", deadline=None, print_blob=True, max_examples=25)
 settings.register_profile("ci", settings.get_profile("local"), derandomize=True, database=None)
 settings.register_profile("night", settings.get_profile("local"), max_examples=400)
 settings.load_profile("ci" if os.environ.get("CI") else "local")

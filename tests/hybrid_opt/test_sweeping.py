@@ -50,6 +50,7 @@ def test_a_fixed_path_is_what_it_is_in_each_cell(
         ho.sweep(cell, cell.initial, OVER, file=file)
 
 
+@pytest.mark.slow
 def test_a_polished_path_is_better_than_the_fixed_one(cell: ho.Cell) -> None:
     over = {"payload.mass": [9.0]}
     fixed = ho.sweep(cell, cell.initial, over, fixed=True).rows[0]

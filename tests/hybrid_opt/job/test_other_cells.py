@@ -26,8 +26,9 @@ from tests.hybrid_opt.cells import shipped
 from tests.symbolic.cells import RACK
 
 CELLS = ["transfer", "pandas"]
-QUICK = ("fork", "uneven")
-"""Of `SHIPPED` what the default run looks at; others compile for minutes."""
+QUICK = ("fork",)
+"""Of `SHIPPED` what the default run looks at; others compile for minutes. The rack has tests of its
+own."""
 SHIPPED = [
     pytest.param(path.stem, marks=() if path.stem in QUICK else pytest.mark.slow)
     for path in sorted(RACK.parent.glob("*.toml"))

@@ -20,7 +20,7 @@ from hybrid_opt.work.service import LocalExecutor, Service, answer_all
 from symbolic.read.cell_files import collect_cell
 from tests.symbolic.read.samples import RACK
 
-QUICK = ("fork", "rack", "transfer", "uneven")
+QUICK = ("fork", "rack", "transfer")
 """Cells that others compile as well; the rest takes minutes."""
 
 CELLS = [

@@ -50,6 +50,7 @@ def test_an_answer_is_nearly_stationary() -> None:
     assert solution.residuals.feasibility < 2e-2
 
 
+@pytest.mark.slow
 def test_most_points_end_stationary() -> None:
     """In what is recomputed from the program, whichever way they came there."""
     forces = (50.0, 51.0, 53.0)

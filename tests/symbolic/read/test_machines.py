@@ -81,14 +81,14 @@ def test_kinematics_and_dynamics_are_those_of_the_whole_file(name: str, tmp_path
                 assert found == pytest.approx(torque, abs=1e-12 * max(1.0, np.abs(torque).max()))
 
 
-@pytest.mark.parametrize("name", ["ur5", "z1", "panda", "pr2"])
+@pytest.mark.parametrize("name", ["panda", "pr2"])
 def test_the_box_is_held_and_followed(name: str, tmp_path: Path) -> None:
     follow_a_candidate(cell_of(name, tmp_path))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "name", ["ur3", "ur10", "kinova", "xarm7", "tiago_dual", "tiago_pro", "talos"]
+    "name", ["ur3", "ur5", "ur10", "z1", "kinova", "xarm7", "tiago_dual", "tiago_pro", "talos"]
 )
 def test_more_machines_hold_the_box_and_follow(name: str, tmp_path: Path) -> None:
     follow_a_candidate(cell_of(name, tmp_path))
