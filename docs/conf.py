@@ -92,7 +92,7 @@ def picture(_: Any, block: dict[str, Any], gallery: dict[str, Any]) -> str:
 
 
 def reference() -> Path:
-    """A page for every public name, with the examples that use it."""
+    """A page for every public name, with the examples that use it, and one for stored figures."""
     folder = ROOT / "docs" / "reference"
     folder.mkdir(exist_ok=True)
     rows = []
@@ -115,7 +115,11 @@ def reference() -> Path:
         )
         _write(folder / f"{name}.rst", page)
         rows.append(f"* :doc:`{name} <{name}>`: {summary}")
-    listed = "\n".join(f"   {name}" for name in sorted(ho.__all__))
+    stored = "Figures of a study: summary.json"
+    page = f"{stored}\n{'=' * len(stored)}\n\n.. automodule:: studies.study.summary\n"
+    _write(folder / "summary.rst", page)
+    rows.append(f"* :doc:`{stored} <summary>`")
+    listed = "\n".join(f"   {name}" for name in (*sorted(ho.__all__), "summary"))
     index = "Reference\n=========\n\nWhat ``import hybrid_opt as ho`` gives.\n\n"
     hidden = f"\n\n.. toctree::\n   :hidden:\n\n{listed}\n"
     _write(folder / "index.rst", index + "\n".join(rows) + hidden)

@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from hybrid_opt.job.plan import plan_job
     from hybrid_opt.job.records import Job
     from hybrid_opt.metaheuristics.run import SearchSettings
+    from hybrid_opt.metaheuristics.settings import GeneticSettings, MopsoSettings
     from hybrid_opt.polishing.settings import PolishSettings
     from hybrid_opt.proposing.proposal import Proposal, ProposeSettings, propose
     from hybrid_opt.recommending.choice import Wish
@@ -50,10 +51,12 @@ __all__ = [
     "Cell",
     "DualArmError",
     "Front",
+    "GeneticSettings",
     "Grip",
     "JerkLimits",
     "JerkTiming",
     "Job",
+    "MopsoSettings",
     "Objective",
     "Origin",
     "PolishSettings",
@@ -96,10 +99,12 @@ _HOMES = {
     "Cell": "hybrid_opt.cell",
     "DualArmError": "symbolic.errors",
     "Front": "hybrid_opt.front",
+    "GeneticSettings": "hybrid_opt.metaheuristics.settings",
     "Grip": "hybrid_opt.gripping",
     "JerkLimits": "hybrid_opt.timing.records",
     "JerkTiming": "hybrid_opt.timing.records",
     "Job": "hybrid_opt.job.records",
+    "MopsoSettings": "hybrid_opt.metaheuristics.settings",
     "Objective": "hybrid_opt.evaluate.objectives",
     "Origin": "hybrid_opt.bundles.bundle",
     "PolishSettings": "hybrid_opt.polishing.settings",

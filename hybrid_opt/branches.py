@@ -23,6 +23,7 @@ from hybrid_opt.evaluate.evaluations import Evaluations, concatenated
 from hybrid_opt.evaluate.objectives import PAPER_OBJECTIVES
 from hybrid_opt.indicators.metrics import REFERENCE_POINT, front_rows, hypervolume
 from hybrid_opt.metaheuristics.run import SearchSettings, search_carries
+from hybrid_opt.progress import ShowProgress, counted
 from symbolic.array import Array
 from symbolic.errors import SettingsError, WorkcellError
 from symbolic.functions import CONSTRAINTS
@@ -146,7 +147,12 @@ class _Pair:
 
 
 def search_branches(
-    cell: Cell, *, evaluations: int = 2000, rng: np.random.Generator, algorithm: str = "nsga2"
+    cell: Cell,
+    *,
+    evaluations: int = 2000,
+    rng: np.random.Generator,
+    algorithm: str = "nsga2",
+    progress: ShowProgress = False,
 ) -> BranchCompetition:
     """Let all pairs of start branches compete that hold the hand-made trajectory or a sampled one.
 
@@ -158,6 +164,7 @@ def search_branches(
             beside those in which pairs are tried out.
         rng: its only randomness.
         algorithm: that searches.
+        progress: True for a bar, or what takes searches done and in all.
 
     Raises:
         SettingsError: candidates of this cell are not evaluated in lanes, or it has not two
@@ -189,12 +196,16 @@ def search_branches(
             ),
         )
     rounds = max(ceil(log2(len(pairs))), 1)
-    left = pairs
-    for _ in range(rounds):
-        each = max(evaluations // (rounds * len(left)), LEAST)
-        for pair in left:
-            pair.search(algorithm, each, rng)
-        left = sorted(left, key=_standing)[: ceil(len(left) / 2)]
+    left, standing = pairs, [len(pairs)]
+    while len(standing) < rounds:
+        standing.append(ceil(standing[-1] / 2))
+    with counted(progress, "start branches", sum(standing)) as advance:
+        for _ in range(rounds):
+            each = max(evaluations // (rounds * len(left)), LEAST)
+            for pair in left:
+                pair.search(algorithm, each, rng)
+                advance(1)
+            left = sorted(left, key=_standing)[: ceil(len(left) / 2)]
     ranked = sorted([*pairs, *out], key=_standing)
     results = tuple(pair.result() for pair in ranked)
     spent = sum(pair.evaluations for pair in results)

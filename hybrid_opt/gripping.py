@@ -14,6 +14,7 @@ import numpy as np
 from scipy.optimize import direct
 
 from hybrid_opt.cell import Cell
+from hybrid_opt.progress import Advance, ShowProgress, counted
 from hybrid_opt.recommending.choice import DrivenPaths, Goal, Wish, best_of_paths, ranked
 from symbolic.array import Array
 from symbolic.errors import DualArmError, SettingsError
@@ -62,7 +63,9 @@ class Grip:
         )
 
 
-def propose_grip(cell: Cell, up: Range, along: Range, trials: int = TRIALS) -> Grip:
+def propose_grip(
+    cell: Cell, up: Range, along: Range, trials: int = TRIALS, *, progress: ShowProgress = False
+) -> Grip:
     """The best place of the pads for the cell's hand-made path, which is certified with it.
 
     Args:
@@ -71,6 +74,7 @@ def propose_grip(cell: Cell, up: Range, along: Range, trials: int = TRIALS) -> G
         along: how far they may go level along their faces: of the first robot's pad to its left,
             seen from the robot.
         trials: places that are tried.
+        progress: True for a bar, or what takes places done and in all.
 
     Raises:
         SettingsError: a range is empty or none, the pads are others, or nothing within the ranges
@@ -89,19 +93,21 @@ def propose_grip(cell: Cell, up: Range, along: Range, trials: int = TRIALS) -> G
     bounds = np.array([up, along])
     open_, middle = bounds[:, 1] > bounds[:, 0], bounds.mean(axis=1)
 
-    def cost(values: Array) -> float:
+    def cost(values: Array, advance: Advance) -> float:
         place = middle.copy()
         place[open_] = values
         at = float(np.round(place[0], 4)), float(np.round(place[1], 4))
         if at not in tried:
             tried[at] = _cost(drivable, _changes(cell.workcell, ways, at))
+        advance(1)
         return min(tried[at][0], WORST)
 
     tried[0.0, 0.0] = before = _cost(drivable, {})
-    if open_.any():
-        direct(cost, bounds[open_].tolist(), maxfun=trials, eps=1e-2)
-    else:
-        cost(middle[open_])
+    with counted(progress, "places of the pads", trials if open_.any() else 1) as advance:
+        if open_.any():
+            direct(cost, bounds[open_].tolist(), args=(advance,), maxfun=trials, eps=1e-2)
+        else:
+            cost(middle[open_], advance)
     inside = [
         at
         for at in sorted(tried, key=lambda each: tried[each][0])

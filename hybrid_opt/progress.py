@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import Literal
+from typing import Literal, TypeVar
 
 from tqdm import tqdm
+
+T = TypeVar("T")
 
 ShowProgress = Literal[False, True] | Callable[[int, int], None]
 """Whether to show a bar, or what is called with the units done and those in all."""
@@ -39,6 +41,14 @@ def counted(progress: ShowProgress, what: str, total: int) -> Iterator[Callable[
             progress(done, total)
 
     yield advance
+
+
+def following(progress: ShowProgress, what: str, items: Sequence[T]) -> Iterator[T]:
+    """The items of a call one by one, each counted when the next is asked for."""
+    with counted(progress, what, len(items)) as advance:
+        for item in items:
+            yield item
+            advance(1)
 
 
 Advance = Callable[[int], None]

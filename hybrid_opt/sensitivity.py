@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from hybrid_opt.carry import Carry
 from hybrid_opt.compiled_cell import CompiledCell
+from hybrid_opt.progress import ShowProgress, following
 from hybrid_opt.recommending.choice import LEADER
 from hybrid_opt.robust.force import BoxMotion
 from hybrid_opt.robust.slopes import RulingForce
@@ -197,13 +198,14 @@ class _Number:
         return changed(workcell, {self.path: values})
 
 
-def sensitivities(carry: Carry | Timing) -> Sensitivities:
+def sensitivities(carry: Carry | Timing, *, progress: ShowProgress = False) -> Sensitivities:
     """Derivatives of a carry's force and duration by the numbers of its cell.
 
     Args:
         carry: under the time law of its task; or the fastest timing of a path within limits. Of a
             timing the force is that of the same motion, and the duration that of the fastest one
             within the same limits, a limit of force included.
+        progress: True for a bar, or what takes numbers done and in all.
 
     Raises:
         SettingsError: the carry has another timing, a timing limits robust forces or is not the
@@ -212,7 +214,7 @@ def sensitivities(carry: Carry | Timing) -> Sensitivities:
     drive = _Law(carry) if isinstance(carry, Carry) else _Fastest(carry)
     workcell, ruling = drive.carry.workcell, RulingForce(drive.carry, LEADER)
     rows, missing = [], {}
-    for number in _numbers(workcell):
+    for number in following(progress, "sensitivities", list(_numbers(workcell))):
         if number.section == "uncertainty" and number.value == 0.0:
             missing[number.key] = "zero: a range begins or ends there"
             continue

@@ -73,9 +73,10 @@ def require_allowed(settings: object, whose: str = "") -> None:
     for name, kind in get_type_hints(type(settings), include_extras=True).items():
         value: Any = getattr(settings, name)
         if get_origin(kind) in (Union, UnionType):
-            if value is None:
+            choices = [choice for choice in get_args(kind) if choice is not type(None)]
+            if value is None or len(choices) > 1:
                 continue
-            (kind,) = (choice for choice in get_args(kind) if choice is not type(None))
+            (kind,) = choices
         if get_origin(kind) is Literal and value not in get_args(kind):
             known = ", ".join(get_args(kind))
             raise SettingsError(f"{whose}{name.replace('_', ' ')} {value!r}; known are {known}")

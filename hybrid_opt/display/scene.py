@@ -201,7 +201,16 @@ def scene_js() -> str:
 
 def three_js() -> str:
     """three.js with its licence line."""
-    return (files("hybrid_opt.display") / "vendor" / "three.min.js").read_text("utf-8")
+    return _vendored("three.min.js")
+
+
+def plotly_js() -> str:
+    """plotly.js with its licence line: what draws points, lines and bars."""
+    return _vendored("plotly-basic.min.js")
+
+
+def _vendored(name: str) -> str:
+    return (files("hybrid_opt.display") / "vendor" / name).read_text("utf-8")
 
 
 def embedded_json(document: Any) -> str:

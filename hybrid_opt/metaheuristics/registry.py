@@ -1,5 +1,5 @@
 """The search algorithms by name: MOPSO, pymoo's NSGA-II and SMS-EMOA with this project's promises,
-and uniform random search."""
+and uniform random search. pymoo's MOPSO_CD, CMOPSO and NSGA3 draw from unseeded generators."""
 
 from __future__ import annotations
 
@@ -18,7 +18,12 @@ from pymoo.operators.selection.tournament import TournamentSelection
 
 from hybrid_opt.metaheuristics.guarded import FillingMating, Guarded, WarmSampling, feasible_front
 from hybrid_opt.metaheuristics.mopso import Mopso
-from hybrid_opt.metaheuristics.settings import GeneticSettings, MopsoSettings, RandomSettings
+from hybrid_opt.metaheuristics.settings import (
+    AlgorithmSettings,
+    GeneticSettings,
+    MopsoSettings,
+    RandomSettings,
+)
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 
@@ -86,14 +91,11 @@ class RandomSearch(Guarded, Algorithm):  # type: ignore[misc]
         self.opt = self.members
 
 
-Settings = GeneticSettings | MopsoSettings | RandomSettings
-
-
 @dataclasses.dataclass(frozen=True)
 class _Entry:
     title: str
     build: Callable[[Any, Array | None], Algorithm]
-    defaults: Settings
+    defaults: AlgorithmSettings
 
 
 REGISTRY: dict[str, _Entry] = {
@@ -117,7 +119,7 @@ def title(name: str) -> str:
     return REGISTRY[name].title if name in REGISTRY else name
 
 
-def settings_of(name: str, overrides: Mapping[str, object] | None = None) -> Settings:
+def settings_of(name: str, overrides: Mapping[str, object] | None = None) -> AlgorithmSettings:
     """The effective settings of an algorithm: its defaults with `overrides`.
 
     Raises:
@@ -137,7 +139,7 @@ def settings_of(name: str, overrides: Mapping[str, object] | None = None) -> Set
 
 def make(
     name: str,
-    settings: Settings | Mapping[str, object] | None = None,
+    settings: AlgorithmSettings | Mapping[str, object] | None = None,
     initial: Array | None = None,
 ) -> Algorithm:
     """A fresh algorithm for one run.

@@ -16,6 +16,7 @@ from pymoo.core.problem import Problem
 from hybrid_opt.evaluate.evaluations import NOT_FINITE, REASONS, Evaluations, concatenated
 from hybrid_opt.metaheuristics.guarded import violation_of
 from hybrid_opt.metaheuristics.registry import make
+from hybrid_opt.metaheuristics.settings import AlgorithmSettings
 from symbolic.array import Array, require_allowed
 from symbolic.errors import SettingsError
 
@@ -217,14 +218,14 @@ class SearchSettings:
     """How a search is done.
 
     Attributes:
-        algorithm: values that differ from the algorithm's defaults, see
-            `hybrid_opt.metaheuristics.settings`.
+        algorithm: settings of the algorithm, `GeneticSettings` of NSGA-II and SMS-EMOA or
+            `MopsoSettings` of both MOPSO; or the values that differ from its defaults.
         constraint_handling: 'penalty' (the paper's) or 'constraints'.
         initial: (k, n_var) decision vectors that the first generation starts with, the rest being
             uniformly random; None for what the caller starts from by default.
     """
 
-    algorithm: Mapping[str, object] = field(default_factory=dict)
+    algorithm: AlgorithmSettings | Mapping[str, object] = field(default_factory=dict)
     constraint_handling: ConstraintHandling = "penalty"
     initial: Array | None = None
 

@@ -73,3 +73,6 @@ class RandomSettings:
 
     def __post_init__(self) -> None:
         require_allowed(self, "random: ")
+
+
+AlgorithmSettings = GeneticSettings | MopsoSettings | RandomSettings

@@ -98,7 +98,7 @@ def timing_document(timed: TimedTrajectory) -> TimingDocument:
     """The record of a timed trajectory."""
     return TimingDocument(
         nominal_duration=timed.nominal_duration,
-        timings={name: _timing(timing) for name, timing in timed.timings.items()},
+        timings={name: stored_timing(timing) for name, timing in timed.timings.items()},
         margins=timed.margins,
         force_curve=timed.curve,
         jerk=None if timed.jerk is None else StoredJerk.of(timed.jerk),
@@ -115,7 +115,8 @@ def read_timing(path: Path) -> TimingDocument:
     return read_record(TimingDocument, path, remedy)
 
 
-def _timing(timing: Timing) -> StoredTiming:
+def stored_timing(timing: Timing) -> StoredTiming:
+    """One timing as it is stored."""
     known = StoredTiming(
         status=timing.status,
         reason=timing.reason,

@@ -1,4 +1,8 @@
-"""Look at a carry in three dimensions, in a page of its own."""
+"""Look at a carry in three dimensions, in a page of its own.
+
+`carry.view()` shows the carry in a notebook's cell. Elsewhere it is saved as one page that needs no
+network.
+"""
 
 from pathlib import Path
 

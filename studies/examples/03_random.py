@@ -1,4 +1,8 @@
-"""Judge many candidates: how many are feasible, and what the others fail of."""
+"""Judge many candidates: how many are feasible, and why the others are not.
+
+`cell.evaluate(x)` takes (n, n_var) and judges on the task's samples. `penalised` is what a search
+minimises: the objectives, or a value above one that grows with the time in violation.
+"""
 
 import numpy as np
 

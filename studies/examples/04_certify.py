@@ -1,4 +1,8 @@
-"""Prove that a carry is free of collisions between its samples too."""
+"""Prove that a carry is free of collisions between its samples too.
+
+`cell.certify` proves the continuous path free, or says where it is not. Fronts hold certified
+carries only.
+"""
 
 import hybrid_opt as ho
 

@@ -1,4 +1,8 @@
-"""Search for the best compromises between the two arms' forces."""
+"""Search for the best compromises between the two arms' forces.
+
+A front knows every candidate that its search evaluated. `ho.SearchSettings` has the settings of the
+algorithm, how it learns of infeasibility, and where it starts.
+"""
 
 import numpy as np
 
@@ -6,7 +10,7 @@ import hybrid_opt as ho
 
 print("algorithms:", *ho.algorithms())
 cell = ho.example("rack")
-settings = ho.SearchSettings(algorithm={"inertia": 0.5})
+settings = ho.SearchSettings(algorithm=ho.MopsoSettings(inertia=0.5))
 rng = np.random.default_rng(1)
 front: ho.Front = ho.search(cell, "mopso", evaluations=1000, rng=rng, settings=settings)
 print(front)

@@ -1,4 +1,9 @@
-"""Select from a front: the balanced carry, or the one that spares a robot."""
+"""Select from a front: the balanced carry, or the one that spares a robot.
+
+A front is a sequence of carries by increasing first objective. `balanced()`, the paper's selection,
+has the least mean of both robots' peak forces; `lowest_force(robot)` and `lowest(objective)` are
+its ends.
+"""
 
 import numpy as np
 

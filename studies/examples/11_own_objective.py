@@ -1,4 +1,9 @@
-"""Search with an objective of one's own: the box's largest height, beside a robot's force."""
+"""Search with an objective of one's own: the box's largest height, beside a robot's force.
+
+An objective is a function of the compiled outputs, each with a leading axis over candidates, and of
+the workcell. The candidate's function in `symbolic/functions.py` lists the outputs. Scale the
+objective so that values of interest lie below one: infeasible candidates get values above.
+"""
 
 from collections.abc import Mapping
 

@@ -1,4 +1,9 @@
-"""Search for drivable carries, and have one of them recommended."""
+"""Recommend the carry to run, as the robots drive it, and say why.
+
+In a drivable cell each candidate is a path and a force limit, timed as fast as all limits allow. In
+a cell that minimises robust forces the limit is about these (docs/robust.md). Wishes are about the
+commanded force, the driven duration or the payload (docs/results.md).
+"""
 
 import numpy as np
 

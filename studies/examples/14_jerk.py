@@ -1,4 +1,8 @@
-"""Time a carry within limits on jerk as well."""
+"""Time a carry within limits on jerk as well.
+
+Without `jerk=` the limits are those that the workcell states as `jerk_max` of its robots
+(docs/timing.md).
+"""
 
 import numpy as np
 

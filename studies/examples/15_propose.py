@@ -1,4 +1,8 @@
-"""Propose a first carry and a complete workcell file for a problem."""
+"""Propose a first carry and a complete workcell file for a problem.
+
+A problem file has no carry yet. `ho.propose` finds one and completes the file
+(docs/your-own-cell.md); store its text beside the problem's robots.
+"""
 
 from pathlib import Path
 

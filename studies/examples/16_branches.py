@@ -1,4 +1,8 @@
-"""Let start branches of the arms compete."""
+"""Let start branches of the arms compete.
+
+Where the workcell says `start_branch = "search"`, pairs of branches compete before the search
+(docs/results.md).
+"""
 
 import numpy as np
 

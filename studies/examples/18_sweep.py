@@ -1,4 +1,9 @@
-"""What a heavier box or other pads change, for a path that stays as it is."""
+"""What a heavier box or other pads change, for a path that stays as it is.
+
+`ho.sweep` gives duration and commanded force of the recommended carry for every combination of some
+numbers. Without `fixed=True` the path is polished anew in every cell. With `file=` a sweep can be
+continued; with `jobs=` workers share it. `python -m studies.sweep` adds a table and a figure.
+"""
 
 import hybrid_opt as ho
 

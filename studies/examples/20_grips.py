@@ -1,4 +1,9 @@
-"""Where on their faces pads press best for a path."""
+"""Where on their faces pads press best for a path.
+
+`ho.propose_grip` moves both pads alike on their faces, within ranges [m], to where the hand-made
+path of the cell has the least product of duration and commanded force as robots drive it; with the
+pads there it is certified. `python -m studies.propose --grips` does it for a proposed carry.
+"""
 
 import hybrid_opt as ho
 

@@ -16,7 +16,7 @@ from hybrid_opt.polishing.settings import quick_settings
 from hybrid_opt.progress import Progress
 from studies.options import QUICK_EVALUATIONS
 from studies.rack import main as rack
-from studies.report.stage import PAGE
+from studies.report import PAGE
 
 SHOWN = 5
 """Carries of the first front that are shown."""

@@ -42,7 +42,8 @@ from hybrid_opt.static_hold import require_hold
 from hybrid_opt.witness.box import mujoco_module
 from studies.options import QUICK_EVALUATIONS, QUICK_REPLICAS
 from studies.program import load_workcell
-from studies.report.stage import PAGE, TABLES, follow_looks, report_stage
+from studies.report import PAGE, TABLES
+from studies.report.stage import follow_looks, report_stage
 from studies.study.drivable import is_drivable, known_paths
 from studies.study.recommendation import recommendation_stage
 from studies.study.simulation import read_simulations, simulation_stage
@@ -52,8 +53,8 @@ from studies.study.timing import limits_on_jerk, timing_stage
 from symbolic.array import Array
 from symbolic.records import Workcell
 
-OPENING = ("table1_quality", "table2_selected", "time_against_force", "simulation")
-"""Tables that the terminal shows where a report has all of them."""
+OPENING = ("table1_quality", "simulation")
+"""Tables that the terminal shows where a report has all of them: 25 lines in all."""
 
 
 NOT_ASKED = "drivable carries were not searched for (--no-drivable)"
@@ -194,16 +195,16 @@ def study_text(root: Path, with_paper: bool, brief: bool = False) -> str:
         read_simulations(root),
         with_paper,
     )
+    if (root / TABLES).exists():
+        shown = [table for table in tables if table.name in OPENING]
+    else:
+        shown = [*tables, effort(summary)]
     settings = summary.settings
     made = (
         f"{summary.workcell.name}: {counted(settings.replicas, 'replica')} of "
-        f"{settings.evaluations} evaluations, seed {settings.seed}"
+        f"{settings.evaluations} evaluations, seed {settings.seed}; all of it in {root}"
     )
-    written = root / TABLES
-    shown = [t for t in tables if t.name in OPENING or not written.exists()]
-    told = [part for part in (carry, made) if part]
-    told += [table.text() for table in (*shown, effort(summary))]
-    return "\n\n".join(told + ([f"All tables: {written}"] if written.exists() else []))
+    return "\n\n".join([*([carry] if carry else []), *(t.text() for t in shown), made])
 
 
 def make_study(path: Path, options: argparse.Namespace, with_paper: bool) -> None:
@@ -248,9 +249,8 @@ def make_study(path: Path, options: argparse.Namespace, with_paper: bool) -> Non
         pdf=not options.quick,
     )
     print(run_study(cell, settings, execution, Progress(not options.quiet), study))
-    print(f"\nResults: {execution.output}")
     if study.report:
-        print(f"Report: {execution.output / PAGE}")
+        print(f"Report: {execution.output / PAGE}; all tables: {execution.output / TABLES}")
     follow_looks(execution.output, options)
 
 

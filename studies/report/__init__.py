@@ -1,1 +1,6 @@
 """The report of a study: pictures for print, tables, a self-contained page, an animation."""
+
+PAGE = "report.html"
+PICTURES = "figures"
+TABLES = "tables"
+"""Where in a results folder."""

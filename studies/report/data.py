@@ -34,7 +34,7 @@ from hybrid_opt.indicators.selection import selected_row
 from hybrid_opt.metaheuristics.registry import title
 from hybrid_opt.recommending.comparison import level_force
 from hybrid_opt.store.trajectory_file import read_trajectory
-from hybrid_opt.timing import TimingLimits
+from hybrid_opt.timing import Timing, TimingLimits
 from hybrid_opt.timing.document import TimingDocument, read_timing
 from hybrid_opt.timing.robustness import PayloadSensitivity, payload_sensitivity
 from hybrid_opt.work.service import Executor, LocalExecutor, Service, answer_all, called
@@ -296,6 +296,11 @@ class ReportData(Experiment):
     def carries(self) -> tuple[DrawnCarry, ...]:
         """The initial trajectory and each algorithm's best selected one."""
         return (self.initial, *(a.best for a in self.algorithms if a.best is not None))
+
+    @property
+    def recommended_timing(self) -> Timing | None:
+        """The recommended carry as its job drives it, None without a job."""
+        return next((job.timing for job in self.jobs if job.label == RECOMMENDED_LABEL), None)
 
 
 def gather(results: CampaignResults, executor: Executor | None = None) -> ReportData:

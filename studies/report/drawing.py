@@ -86,8 +86,14 @@ class LineStyle:
         }
 
 
+MARKED = "#b00020"
+"""Colour of what stands out."""
+
 HAND_MADE = LineStyle("#555555", ":", "s", "....")
 """Style of the hand-made trajectory."""
+
+RECOMMENDED = LineStyle(MARKED, "-", "*", "")
+"""Style of the recommended carry."""
 
 SERIES = (
     LineStyle("#0072B2", "-", "o", ""),
@@ -104,7 +110,6 @@ ARMS = ("#3b6ea8", "#a8733b")
 PAYLOAD = "#c9a227"
 OBSTACLE = "#9aa3ab"
 GROUND = "#e8e8e4"
-MARKED = "#b00020"
 
 
 def series(index: int) -> LineStyle:
@@ -163,7 +168,7 @@ def limit_line(axes: Axes, level: float, label: str | None = None, across: bool 
 def rest_line(axes: Axes, level: float, label: str, across: bool = True) -> None:
     """What holds the payload still as a line, across or up the panel."""
     draw = axes.axhline if across else axes.axvline
-    draw(level, color=MARKED, linewidth=0.8, linestyle=(0, (2, 2)), label=label)
+    draw(level, color="black", linewidth=0.8, linestyle=(0, (7, 2, 1, 2)), label=label)
 
 
 def panel_label(axes: Axes, letter: str, text: str) -> None:

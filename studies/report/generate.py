@@ -12,6 +12,7 @@ import gzip
 import hashlib
 import html
 import json
+import math
 from collections.abc import Callable
 from functools import partial
 from importlib.resources import files
@@ -22,18 +23,19 @@ from typing import Any
 
 from PIL import Image
 
-from hybrid_opt.display.scene import embedded_json, scene_js, three_js
+from hybrid_opt.display.scene import embedded_json, plotly_js, scene_js, three_js
 from hybrid_opt.display.table import Table, counted, number
 from hybrid_opt.store.files import write_atomically
 from hybrid_opt.store.json_records import to_json
+from hybrid_opt.timing.document import TimingDocument, stored_timing
 from hybrid_opt.work.service import Executor, LocalExecutor, Service, answer_all, called
 from studies.errors import ReportError
+from studies.report import PAGE, PICTURES, TABLES
 from studies.report.data import ReportData
 from studies.report.drawing import files_of
-from studies.report.page_carries import phases
+from studies.report.page_carries import RECOMMENDED_LABEL, phases
 from studies.report.page_data import page_document
 from studies.report.pictures import ReportPicture, report_pictures
-from studies.report.stage import PAGE, PICTURES, TABLES
 from studies.study.summary import read_summary
 from studies.study.tables import margins, study_tables, timings
 
@@ -65,7 +67,6 @@ def write_report(
 
     Raises:
         ResultsError: the folder cannot be written.
-        ReportError: the page cannot be made.
     """
     listed = _listed(data)
     service: Service[Any, Any, dict[str, bytes]] = Service(partial(_listed, data), called)
@@ -100,11 +101,19 @@ def report_tables(data: ReportData, with_paper: bool) -> tuple[Table, ...]:
     beside = None if data.drivable is None or data.alone else data.drivable.summary
     found = list(study_tables(data.summary, beside, data.jerk, data.simulations, with_paper))
     robots = data.summary.robots
-    found.append(timings(data.timings, robots))
+    found.append(timings([*data.timings, *_driven(data)], robots))
     found += [phases(data.jobs, robots)] if data.jobs else []
     if any(timed.margins for _, timed in data.timings):
         found.append(margins(data.timings))
     return tuple(found)
+
+
+def _driven(data: ReportData) -> list[tuple[str, TimingDocument]]:
+    """The recommended carry's timing, where it has one."""
+    if data.recommended_timing is None:
+        return []
+    found = {"as robots drive it": stored_timing(data.recommended_timing)}
+    return [(RECOMMENDED_LABEL, TimingDocument(math.nan, found, (), None))]
 
 
 def insert_tables(root: Path, document: Path) -> None:
@@ -158,9 +167,6 @@ def render_page(
         document: what the scripts show, from `page_data`.
         tables: shown in this order.
         pictures: PNG file and caption of every figure.
-
-    Raises:
-        ReportError: the installed plotly does not hold the script that the page embeds.
     """
     texts = files("studies.report") / "page"
     boot, own = ((texts / name).read_text("utf-8") for name in ("boot.js", "page.js"))
@@ -183,18 +189,6 @@ def render_page(
         ),
         boot=boot,
     )
-
-
-def plotly_js() -> str:
-    """plotly.js as the plotly package carries it.
-
-    Raises:
-        ReportError: the installed plotly has no such file.
-    """
-    try:
-        return (files("plotly") / "package_data" / "plotly.min.js").read_text("utf-8")
-    except (OSError, ModuleNotFoundError) as error:
-        raise ReportError(f"plotly.js cannot be read ({error}); install plotly anew") from error
 
 
 def _block(text: str, attributes: str = "") -> str:

@@ -52,6 +52,7 @@ class DrawnJob:
             centres of pressure.
         torque_use, contact_torque_use: (joints,) largest use of each joint's torque, of all loads
             and of the contacts alone [-].
+        timing: of its carry.
     """
 
     label: str
@@ -63,6 +64,7 @@ class DrawnJob:
     samples: Array | None = None
     torque_use: Array | None = None
     contact_torque_use: Array | None = None
+    timing: Timing | None = None
 
 
 def drawn_job(model: JobModel, label: str, x: Array, limits: TimingLimits) -> DrawnJob:
@@ -101,6 +103,7 @@ def drawn(model: JobModel, label: str, timing: Timing, within_jerk: bool = False
         samples=_job_samples(job),
         torque_use=np.max(whole, axis=0) / limit,
         contact_torque_use=np.max(contact, axis=0) / limit,
+        timing=job.timing,
     )
 
 

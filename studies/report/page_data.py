@@ -183,7 +183,7 @@ def carry_plots(workcell: Workcell, rest: float | None) -> dict[str, Plot]:
     """
     first = 7 + sum(len(robot.torque_max) for robot in workcell.robots)
     radius = 1e3 * min(contact.patch_radius for contact in workcell.contacts)
-    levels = [] if rest is None else [("level payload at rest", rest, MARKED)]
+    levels = [] if rest is None else [("level payload at rest", rest, "#000")]
     return {
         "force-plot": _over_time(workcell, "normal force [N]", first, 1.0, levels),
         "pressure-plot": _over_time(
@@ -235,26 +235,24 @@ def _torque(workcell: Workcell) -> Plot:
     traces = []
     for i, robot in enumerate(workcell.robots):
         count = len(robot.torque_max)
-        for use, label, style in (
-            ("torqueUse", robot.name, {"dash": DASHES[i]}),
-            ("contactTorqueUse", f"{robot.name}, load alone", {"dash": "dot", "width": 1}),
+        for use, label, opacity in (
+            ("torqueUse", robot.name, 1.0),
+            ("contactTorqueUse", f"{robot.name}, load alone", 0.45),
         ):
             traces.append(
                 {
-                    "type": "scatterpolar",
-                    "mode": "lines+markers" if use == "torqueUse" else "lines",
+                    "type": "bar",
                     "name": plain(label),
-                    "theta": [f"joint {j + 1}" for j in (*range(count), 0)],
-                    "line": {"color": ARMS[i], **style},
+                    "x": [f"joint {j + 1}" for j in range(count)],
+                    "marker": {"color": ARMS[i], "opacity": opacity},
                     "meta": {"use": use, "arm": i},
                 }
             )
-    radial = {"rangemode": "tozero", "ticksuffix": " %", "nticks": 5, "tickfont": {"size": 10}}
     layout = {
-        "margin": {"l": 50, "r": 50, "t": 40, "b": 30},
-        "title": {"text": "largest joint torque [% of maximum]", "font": {"size": 12}},
-        "polar": {"radialaxis": radial},
-        "legend": {"orientation": "h", "y": -0.08, "font": {"size": 10}},
+        "margin": {"l": 60, "r": 15, "t": 40, "b": 55},
+        "barmode": "group",
+        "yaxis": {"title": {"text": "largest joint torque [% of maximum]"}, "rangemode": "tozero"},
+        "legend": _legend("top", 0.99, 10),
     }
     return {"data": traces, "layout": layout}
 

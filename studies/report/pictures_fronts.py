@@ -13,12 +13,14 @@ from matplotlib.ticker import MaxNLocator
 
 from hybrid_opt.display.table import counted
 from hybrid_opt.evaluate.evaluations import FEASIBLE, REASONS
+from hybrid_opt.evaluate.objectives import PAPER_OBJECTIVES
 from hybrid_opt.indicators.metrics import best_so_far, front_of
 from hybrid_opt.indicators.statistics import attainment_surfaces
 from studies.report.data import AlgorithmRuns, Experiment, ReportData
 from studies.report.drawing import (
     FULL_WIDTH,
     MARKED,
+    RECOMMENDED,
     legend_below,
     new_figure,
     panel_label,
@@ -35,7 +37,8 @@ QUARTILES = (25.0, 75.0)
 
 def fronts(data: ReportData) -> Figure:
     """Feasible candidates and non-dominated ones of each algorithm's run with the largest
-    hypervolume (paper Figure 7). The cross is the level payload at rest."""
+    hypervolume (paper Figure 7). The cross is the level payload at rest, the star the planned
+    forces of the recommended carry as robots drive it."""
     figure = new_figure(FULL_WIDTH, 0.5 * FULL_WIDTH)
     panels = figure.subplots(1, 2)
     found = [a.shown.front.objectives for a in data.solved]
@@ -52,6 +55,10 @@ def fronts(data: ReportData) -> Figure:
     for axes in panels:
         axes.step(*union.T, **joined, label="non-dominated of all")
         _objectives(axes, data)
+    choice = data.summary.recommendation
+    if choice is not None and data.objectives[:2] == PAPER_OBJECTIVES:
+        forces = choice.peak_force / data.workcell.task.reference_force
+        panels[0].plot(*forces, **RECOMMENDED.marks(9.0, MARKED), label="recommended, driven")
     panel_label(panels[0], "a", "all feasible candidates")
     panel_label(panels[1], "b", "the fronts")
     _zoom(panels[1], found, data.static)
@@ -143,7 +150,7 @@ def _objectives(axes: Axes, data: ReportData) -> None:
     """The axes of the first two objectives, with the level payload at rest."""
     if np.isfinite(data.static[:2]).all():
         look: dict[str, Any] = {
-            "color": MARKED,
+            "color": "black",
             "markersize": 7,
             "markeredgewidth": 1.6,
             "zorder": 5,
@@ -189,7 +196,7 @@ def duration_against_force(data: ReportData) -> Figure:
     always = np.zeros((0, 2))
     if choice is not None:
         always = np.array([[choice.force_limit, choice.duration]])
-        axes.plot(*always[0], "*", color=MARKED, markersize=11.0, label="recommended")
+        axes.plot(*always[0], **RECOMMENDED.marks(11.0, MARKED), label="recommended")
     rest_line(axes, data.level_force, "at rest", across=False)
     if any(len(found) for found in drawn):
         x_limits, y_limits = limits(drive_look(np.concatenate(drawn), always))

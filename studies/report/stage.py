@@ -10,11 +10,6 @@ from hybrid_opt.campaign import CampaignFolder, Stage, executor_for
 from hybrid_opt.progress import Progress
 from hybrid_opt.work.service import Executor, LocalExecutor
 
-PAGE = "report.html"
-PICTURES = "figures"
-TABLES = "tables"
-"""The report in a results folder."""
-
 # Drawing libraries are heavy: they are imported when something is drawn.
 
 

@@ -75,7 +75,8 @@ class ForceTable:
 
     Attributes:
         forces: limits on both forces [N].
-        rows: hand-made path, optimum of the other experiment, then every algorithm's fronts.
+        rows: hand-made path, recommended one, optimum of the other experiment, then every
+            algorithm's fronts.
     """
 
     forces: tuple[float, ...]
@@ -232,7 +233,7 @@ def recommend_from(
     alone = is_drivable(campaign.workcell, campaign.objectives)
     others = {} if alone else least_force(campaign)
     # The choice with its rivals, the table's rows and the price.
-    steps = STEPS + 3 + 2 * len(others) + len(fronts)
+    steps = STEPS + 4 + 2 * len(others) + len(fronts)
     with progress.stage("recommendation", steps, "steps") as advance:
         found = ho.recommend(
             ho.Front.of(cell, x), wish, others, progress=lambda done, total: advance(1)
@@ -327,7 +328,8 @@ def _force_table(
         advance(1)
         return least
 
-    paths = {HAND_MADE: cell.initial[: task.n_path]} | dict(others)
+    paths = {HAND_MADE: cell.initial[: task.n_path], "recommended": found.x[: task.n_path]}
+    paths |= dict(others)
     rows = [_row(label, [durations(path[None])]) for label, path in paths.items()]
     rows += [
         _row(

@@ -162,7 +162,12 @@ def selected(summary: CampaignSummary, with_paper: bool) -> Table:
         if with_paper and name in PAPER:
             limit = f"{PAPER[name].payload_limit:.2f}"
             rows.append((f"{title(name)}, paper", *[NOTHING] * 6, limit))
-    still = summary.static_hold
+    still, found = summary.static_hold, summary.recommendation
+    if found is not None:
+        peaks = [FORCE(value) for value in found.peak_force]
+        excess = 100.0 * float((found.peak_force / still.normal_force).mean() - 1.0)
+        figures = (ABOVE_REST(excess), DURATION(found.duration), PAYLOAD(found.payload_limit))
+        rows.append(("recommended, driven", NOTHING, NOTHING, *peaks, *figures))
     force = [FORCE(value) for value in still.normal_force]
     rows.append(
         ("level payload at rest", *force, *force, "0.00", NOTHING, PAYLOAD(still.payload_limit))
@@ -178,7 +183,8 @@ def selected(summary: CampaignSummary, with_paper: bool) -> Table:
         tuple(rows),
         "Selected: least mean peak force of the replica with the largest hypervolume. Above rest: "
         "mean of both peaks over that of the level payload at rest. Payload: at which the first "
-        "robot's whole contact force reaches its reference force.",
+        "robot's whole contact force reaches its reference force. Recommended, driven: as robots "
+        "drive it, planned forces.",
     )
 
 
@@ -430,7 +436,9 @@ def timings(timed: Timed, robots: Sequence[str]) -> Table:
         "friction and pressure shift; drivable timings start and end at rest, in the cell that "
         "robots drive. At the reference speeds without ramps: "
         + ", ".join(
-            f"{_of(label, '')}{FINE_DURATION(found.nominal_duration)} s" for label, found in timed
+            f"{_of(label, '')}{FINE_DURATION(found.nominal_duration)} s"
+            for label, found in timed
+            if math.isfinite(found.nominal_duration)
         )
         + ".",
     )

@@ -89,8 +89,15 @@ def test_pairs_that_hold_nothing_get_nothing(cell: Cell, found: BranchCompetitio
 
 def test_a_robot_with_a_number_keeps_it() -> None:
     cell = Cell(replace(load(RACK), start_branch=(SEARCHED, 2)))
-    found = search_branches(cell, evaluations=50, rng=np.random.default_rng(1))
+    told: list[tuple[int, int]] = []
+    found = search_branches(
+        cell,
+        evaluations=50,
+        rng=np.random.default_rng(1),
+        progress=lambda done, total: told.append((done, total)),
+    )
     assert {pair.branches[1] for pair in found.pairs} == {2}
+    assert [done for done, _ in told] == list(range(1, told[-1][1] + 1))
 
 
 def test_starting_at_the_own_branches_gives_the_same_bits(cell: Cell) -> None:

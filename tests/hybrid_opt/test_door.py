@@ -227,3 +227,23 @@ def test_calls_tell_how_far_they_are(capsys: pytest.CaptureFixture[str]) -> None
     assert told[-1] == (60, 60)
     ho.search(cell(), evaluations=60, rng=np.random.default_rng(1), progress=True)
     assert "nsga2: 100%" in capsys.readouterr().err
+
+
+def test_settings_of_an_algorithm_are_a_record_or_what_differs_from_its_defaults() -> None:
+    fronts = [
+        ho.search(
+            cell(),
+            "mopso",
+            evaluations=60,
+            rng=np.random.default_rng(1),
+            settings=ho.SearchSettings(algorithm=own),
+        )
+        for own in (ho.MopsoSettings(swarm=20), {"swarm": 20})
+    ]
+    np.testing.assert_array_equal(fronts[0].evaluations.x, fronts[1].evaluations.x)
+    with pytest.raises(ho.DualArmError, match=r"nsga2: unknown setting swarm"):
+        ho.search(
+            cell(),
+            rng=np.random.default_rng(1),
+            settings=ho.SearchSettings(algorithm=ho.MopsoSettings()),
+        )

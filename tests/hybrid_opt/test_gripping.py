@@ -15,7 +15,17 @@ LOWEST, HIGHEST = -0.03, 0.006
 
 @pytest.fixture(scope="module")
 def grip() -> ho.Grip:
-    return ho.propose_grip(shipped("rack"), (LOWEST, HIGHEST), (0.0, 0.0), trials=15)
+    told = list[int]()
+    found = ho.propose_grip(
+        shipped("rack"),
+        (LOWEST, HIGHEST),
+        (0.0, 0.0),
+        trials=15,
+        progress=lambda done, total: told.append(done),
+    )
+    assert told == list(range(1, len(told) + 1))
+    assert len(told) >= 10
+    return found
 
 
 def product(up: float) -> float:

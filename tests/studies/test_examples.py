@@ -1,4 +1,4 @@
-"""The examples run, their copies too; docs/library.md and the README hold the same code."""
+"""The examples run, their copies too; docs/library.md and the README hold the first."""
 
 from __future__ import annotations
 
@@ -106,14 +106,26 @@ def test_a_copy_holds_what_the_examples_and_its_cells_read(
     assert "studies: exists already" in capsys.readouterr().err
 
 
-def test_the_library_page_holds_every_example_in_order() -> None:
+def test_the_library_page_lists_every_example_and_names_only_what_it_calls() -> None:
     page = (ROOT / "docs" / "library.md").read_text("utf-8")
-    assert blocks(page) == [code_of(path) for path in EXAMPLES]
-    assert re.findall(r"`studies/examples/(\d\d_\w+\.py)`", page) == NAMES
+    rows = re.findall(r"^\| `(\d\d_\w+\.py)` \|.*\|(.*)\|$", page, flags=re.MULTILINE)
+    assert [name for name, _ in rows] == NAMES
+    for path, (_, calls) in zip(EXAMPLES[1:], rows[1:], strict=True):
+        code = code_of(path)
+        assert all(name.split(".")[-1] in code for name in re.findall(r"`([\w.]+)`", calls)), path
 
 
-def test_the_readme_shows_the_first() -> None:
-    assert code_of(EXAMPLES[0]) in blocks((ROOT / "README.md").read_text("utf-8"))
+@pytest.mark.parametrize("page", ["README.md", "docs/library.md"])
+def test_pages_show_the_first(page: str) -> None:
+    assert code_of(EXAMPLES[0]) in blocks((ROOT / page).read_text("utf-8"))
+
+
+def test_every_example_is_explained() -> None:
+    for path in EXAMPLES:
+        words = ast.get_docstring(ast.parse(path.read_text("utf-8"))) or ""
+        title, _, text = words.partition("\n\n")
+        assert title.endswith("."), path
+        assert text, path
 
 
 def test_every_public_name_is_used_in_an_example() -> None:

@@ -22,12 +22,18 @@
   function themed(layout) {
     const line = colour("--line");
     const axis = { gridcolor: line, linecolor: line, zerolinecolor: line };
-    const polar = layout.polar && { polar: { bgcolor: "rgba(0,0,0,0)", angularaxis: axis,
-      radialaxis: { ...layout.polar.radialaxis, ...axis } } };
     return { ...layout, paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)",
       font: { family: "system-ui, DejaVu Sans, sans-serif", size: 12, color: colour("--ink") },
-      xaxis: { ...layout.xaxis, ...axis }, yaxis: { ...layout.yaxis, ...axis }, ...polar,
+      xaxis: { ...layout.xaxis, ...axis }, yaxis: { ...layout.yaxis, ...axis },
       modebar: { bgcolor: "rgba(0,0,0,0)", color: colour("--soft"), activecolor: colour("--ink") } };
+  }
+
+  /* A trace of the fronts in the page's colours where its own would not stand out in the dark. */
+  function tinted(trace) {
+    const own = { "#b00020": "--mark", "#555555": "--soft", "#1d2327": "--ink" };
+    const of = (part) => part && own[part.color] ? { ...part, color: colour(own[part.color]) } : part;
+    const marker = trace.marker && { ...of(trace.marker), line: of(trace.marker.line) };
+    return { ...trace, ...(marker && { marker }), ...(trace.line && { line: of(trace.line) }) };
   }
 
   const carries = data.trajectories;
@@ -69,7 +75,7 @@
     const { margin, xaxis, yaxis } = view.layout;
     const layout = themed({ ...view.layout, margin: { ...margin, b: below },
       xaxis: { ...xaxis, range: range[0].slice() }, yaxis: { ...yaxis, range: range[1].slice() } });
-    Plotly.react("front-plot", view.data.map((trace) => ({ ...trace, selectedpoints: kept(trace) })),
+    Plotly.react("front-plot", view.data.map((trace) => ({ ...tinted(trace), selectedpoints: kept(trace) })),
       layout, CONFIG);
     mark();
     [...$("views").querySelectorAll("button[data-view]")].forEach((button) =>
@@ -185,23 +191,11 @@
     return i === 0 ? use.slice(0, data.joints[0]) : use.slice(data.joints[0]);
   }
 
-  /* The direction [degrees] between the two neighbouring joints that leave most room. */
-  function freeDirection(use) {
-    const count = Math.max(...data.joints), step = 360 / count;
-    const most = Array.from({ length: count }, (_, j) => Math.max(0,
-      ...data.robots.map((_, i) => (j < data.joints[i] ? useOf(use, i)[j] : 0))));
-    const taken = most.map((value, j) => value + most[(j + 1) % count]);
-    return step / 2 + step * taken.indexOf(Math.min(...taken));
-  }
-
   function drawTorque(motion) {
     const { data: traces, layout } = data.plots["torque-plot"];
-    const filled = traces.map((trace) => {
-      const use = useOf(motion[trace.meta.use], trace.meta.arm);
-      return { ...trace, r: [...use, use[0]] };
-    });
-    const radialaxis = { ...layout.polar.radialaxis, angle: freeDirection(motion.torqueUse) };
-    Plotly.react("torque-plot", filled, themed({ ...layout, polar: { radialaxis } }), PLAIN);
+    const filled = traces.map((trace) => ({ ...trace,
+      y: useOf(motion[trace.meta.use], trace.meta.arm) }));
+    Plotly.react("torque-plot", filled, themed(layout), PLAIN);
   }
 
   function select(index) {
@@ -315,8 +309,15 @@
     return (phases.find((phase) => phase.name === "carry") || carry.motions[0]).duration;
   }
 
+  /* The largest force that its job commands; NaN where none is planned. */
+  function commanded(carry) {
+    const job = carry.motions.find((motion) => motion.phases);
+    return job ? Math.max(...job.peaks) : NaN;
+  }
+
   const TOLD = [["carry", (c) => c.label.split(": ")[0]], ["time [s]", duration],
-    ["force [N]", (c) => c.force], ["payload at the limit [kg]", (c) => c.motions[0].payloadLimit]];
+    ["force [N]", (c) => c.force], ["commanded [N]", commanded],
+    ["payload at the limit [kg]", (c) => c.motions[0].payloadLimit]];
   const listing = { column: 1, sign: 1, brushed: null };
   const recommended = data.lists.find((list) => list.label === "Recommended")?.members[0];
 
@@ -338,6 +339,8 @@
     const value = TOLD[listing.column][1];
     const order = carries.map((_, k) => k).filter(passes).sort((a, b) => {
       const [x, y] = [value(carries[a]), value(carries[b])];
+      /* What has no value stands last. */
+      if (x !== x || y !== y) return Number(x !== x) - Number(y !== y);
       return listing.sign * (x < y ? -1 : Number(x > y));
     });
     $("carry-table").tBodies[0].replaceChildren(...order.map((k) => {
@@ -346,7 +349,7 @@
       line.setAttribute("aria-selected", String(k === state.selected));
       TOLD.forEach(([, of], i) => {
         const told = of(carries[k]), cell = line.insertCell();
-        const text = i ? told.toFixed(2) : (k === recommended ? "\u2605 " : "") + told;
+        const text = i ? (told !== told ? "\u2013" : told.toFixed(2)) : (k === recommended ? "\u2605 " : "") + told;
         if (i) { cell.textContent = text; return; }
         const button = cell.appendChild(document.createElement("button"));
         button.type = "button";

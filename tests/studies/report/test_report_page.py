@@ -18,7 +18,6 @@ import pytest
 
 import hybrid_opt as ho
 from hybrid_opt.branches import BranchCompetition, PairResult
-from hybrid_opt.bundles.bundle import read_manifest
 from hybrid_opt.campaign.cell_source import ReadyCell
 from hybrid_opt.cell import Cell
 from hybrid_opt.display.table import NOTHING, Table
@@ -34,7 +33,6 @@ from studies.report.page_carries import DrawnJob, Shown, page_trajectory, pressu
 from studies.report.page_data import page_document
 from studies.study import tables
 from studies.study.recommendation import recommendation_text
-from tests.studies.test_examples import ROOT, SMALL, blocks
 
 HOSTILE = "</title></script><script>window.broken = 1</script><img src=x onerror=alert(1)>\"'&"
 WINNER = PairResult((2, 0), 2, 120, 0.5, 0.4, 0.6)
@@ -321,27 +319,6 @@ def test_every_file_of_the_report_is_written(report: Path, text: str) -> None:
         assert [f"{name}.{suffix}" for suffix in ("csv", "md", "tex")] == [
             entry for entry in tables if entry.startswith(f"{name}.")
         ]
-
-
-def test_the_page_runs_from_its_first_block_to_the_last(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (tmp_path / "studies").symlink_to(ROOT / "studies")
-    monkeypatch.chdir(tmp_path)
-    space: dict[str, object] = {"__name__": "__main__"}
-    code = blocks((ROOT / "docs" / "cell-to-bundle.md").read_text("utf-8"))
-    assert len(code) == 5
-    for block in code:
-        for full, small in SMALL.items():
-            block = block.replace(full, small)
-        exec(compile(block, "docs/cell-to-bundle.md", "exec"), space)
-    out = capsys.readouterr().out
-    assert "approach" in out
-    (folder,) = (tmp_path / "bundles").iterdir()
-    assert folder.name.startswith("rack-nsga2-r00-p0001-")
-    assert {target.name for target in folder.iterdir()} == {"ros2-control", "json", "csv"}
-    for target in folder.iterdir():
-        assert read_manifest(target)["target"] == target.name
 
 
 def named(tables: tuple[Table, ...], name: str) -> Table:

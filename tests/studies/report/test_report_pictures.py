@@ -24,7 +24,7 @@ from PIL import Image, ImageSequence
 
 from hybrid_opt.display.scene import frame_placements
 from studies.errors import ReportError
-from studies.report import looks
+from studies.report import PAGE, looks
 from studies.report.__main__ import main
 from studies.report.data import DrawnCarry, ReportData, Run, reach_map
 from studies.report.drawing import ARMS, FRONT, HAND_MADE, SERIES, SIDE, in_style, oblique, save
@@ -38,7 +38,6 @@ from studies.report.looks import (
 )
 from studies.report.pictures import ReportPicture, report_pictures
 from studies.report.pictures_cell import planes
-from studies.report.stage import PAGE
 from symbolic.array import Array
 from symbolic.geometry.bodies import Frame
 from symbolic.geometry.pairs import CellGeometry, build_geometry
@@ -63,6 +62,7 @@ NAMES = (
     "fig13_paths",
     "motion_nsga2",
     "motion_mopso",
+    "motion_recommended",
     "duration_against_force",
     "robust_price",
     "simulated_forces",
