@@ -33,3 +33,7 @@ class JobError(DualArmError):
 
 class ProposalError(DualArmError):
     """No carry was found for a problem; the text says what is in the way."""
+
+
+class NoHoldError(ProposalError):
+    """No way was found to hold the box at start and goal, so that no path was looked for."""

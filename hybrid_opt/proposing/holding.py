@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 
 from hybrid_opt.proposing.trial import PoseJudge
 from symbolic.array import Array
-from symbolic.geometry.bodies import ArmGeometry, arm_geometry
+from symbolic.geometry.bodies import WORLD, ArmGeometry, Frame, arm_geometry
+from symbolic.geometry.pairs import coal_distance
 from symbolic.read.arms import arm_model, common_joints
 from symbolic.records import Contact, Robot, Workcell
 from symbolic.records.poses import box_placement, inverse, pose_matrix
@@ -230,6 +231,40 @@ def possible_spins(contact: Contact, spins: Array) -> Array:
     return np.asarray(spins[np.abs(np.sin(spins)) < 1e-9])
 
 
+def clear_spins(query: HoldQuery, arm: int, spins: Array) -> Array:
+    """Those of spins (n,) [rad] at which what is fixed to the arm's last joint, hand, tool and pad,
+    meets nothing that stands, at the start and at the goal; all of them where none is so.
+
+    Within a shelf that is a few of twelve, on which all random starts are spent then.
+    """
+    if query.judge is None:
+        return spins
+    geometry = query.judge.geometry
+    last = Frame("link", arm, geometry.arms[arm].joints - 1)
+    bodies = [
+        (geometry.bodies[pair.first], geometry.bodies[pair.second]) for pair in geometry.active
+    ]
+    pairs = [
+        (a, b) if a.frame == last else (b, a)
+        for a, b in bodies
+        if last in (a.frame, b.frame) and WORLD in (a.frame, b.frame)
+    ]
+    ends = box_placement(query.workcell.task.orientation, np.array([query.start, query.goal]))
+
+    def clear(spin: float) -> bool:
+        contact = spun(query.workcell.contacts[arm], spin)
+        T = box_to_last_joint(query.workcell, geometry.arms[arm], contact, arm)
+        return all(
+            coal_distance(tuple(piece.moved(end @ T) for piece in hand.pieces), standing.pieces)
+            > 0.0
+            for end in ends
+            for hand, standing in pairs
+        )
+
+    found = np.array([spin for spin in spins if clear(spin)])
+    return found if len(found) else spins
+
+
 def guide(start: Array, goal: Array, bow: Array) -> Array:
     """(GUIDE_POSES, 6 + m) from one extended pose to another, bowing out by (3,) in the middle."""
     poses = np.linspace(start, goal, GUIDE_POSES)
@@ -365,7 +400,7 @@ def find_holds(
     """The ways in which an arm can hold the box from start to goal, the other arm left out."""
     finder = _Finder(query, arm, kinematics, rng)
     found, contact = finder.found, query.workcell.contacts[arm]
-    spins = possible_spins(contact, query.spins)
+    spins = clear_spins(query, arm, possible_spins(contact, query.spins))
     T_box_joint = [
         box_to_last_joint(query.workcell, kinematics.geometry, spun(contact, spin), arm)
         for spin in spins

@@ -20,7 +20,7 @@ import numpy as np
 
 from codegen.compiler import find_compiler
 from hybrid_opt.carry import Judgement
-from hybrid_opt.errors import ProposalError
+from hybrid_opt.errors import NoHoldError, ProposalError
 from hybrid_opt.proposing.bases import base_choices
 from hybrid_opt.proposing.bounds import Bounds, Sampling, find_bounds
 from hybrid_opt.proposing.planner import Place, Stray, freedom, plan, straight_paths
@@ -312,7 +312,7 @@ class _Search:
             )
         tried = next((lazy for lazy in setups if lazy.setup is not None), setups[0])
         if tried.setup is None and tried.problem:
-            return ProposalError(f"{begin}: {tried.problem}")
+            return NoHoldError(f"{begin}: {tried.problem}")
         met = "" if tried.setup is None else no_path(tried.setup.pairs, self.refusals)
         if self.too_late:
             more = f"{LONGER * self.settings.seconds:.0f}"

@@ -28,7 +28,6 @@ from symbolic.cell_model import (
     CellModel,
     build_cell_bodies,
     build_cell_model,
-    own_pairs,
 )
 from symbolic.functions import cell_functions, motion_function
 from symbolic.geometry.bodies import MeshReader, shape_pieces
@@ -141,8 +140,16 @@ class PoseJudge:
         self.margin = margin
         self.met: Counter[tuple[str, str]] = Counter()
         self.checker = checker
+        # What the other arm moves; not the torso of a machine, which is listed with the first.
+        frames = [
+            (geometry.bodies[pair.first].frame, geometry.bodies[pair.second].frame)
+            for pair in geometry.active
+        ]
+        robots = [{frame.robot for frame in both} for both in frames]
         self._others = [
-            np.setdiff1d(np.arange(len(geometry.active)), own_pairs(geometry, arm))
+            np.array(
+                [k for k, met in enumerate(robots) if 1 - arm in met or met == {-1}], dtype=int
+            )
             for arm in (0, 1)
         ]
 

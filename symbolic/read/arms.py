@@ -204,6 +204,10 @@ def _reduced(kinematics: str, file: str, held: Positions) -> pin.Model:
         model = pin.buildModelFromXML(kinematics)
     except (ValueError, RuntimeError, IndexError) as error:
         raise RobotModelError(f"Pinocchio cannot read {file}: {_first_line(error)}") from error
+    links = {frame.name for frame in model.frames if frame.type == pin.FrameType.BODY}
+    for frame in model.frames:
+        if frame.type == pin.FrameType.FIXED_JOINT and frame.name in links:
+            frame.name += " (joint)"  # Pinocchio reduces no model in which a link has the same name
     configuration = pin.neutral(model)
     joints = []
     for name, position in held:

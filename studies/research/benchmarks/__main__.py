@@ -10,6 +10,8 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 from studies.options import add, number, stated, whole
@@ -46,6 +48,13 @@ def _add_options(parser: Parser) -> None:
         help="carries of so many classes are looked for; that whose joints go least far is taken",
     )
     parser.add_argument(
+        "--sample",
+        type=whole(1, 600),
+        default=10,
+        metavar="N",
+        help="scenes of each kind that are drawn for Baxter (default: 10)",
+    )
+    parser.add_argument(
         "--study", action="store_true", help="also look for the fastest carry of every task"
     )
     add(parser, "--seed", help="of its randomness")
@@ -53,20 +62,26 @@ def _add_options(parser: Parser) -> None:
 
 def _run(options: argparse.Namespace) -> int:
     from hybrid_opt.proposing.proposal import ProposeSettings
-    from studies.research.benchmarks import machines, shelves, slot
-    from studies.research.benchmarks.measuring import measured, table
+    from studies.research.benchmarks import baxter, machines, shelves, slot
+    from studies.research.benchmarks.measuring import Benchmark, measured, table
 
-    known = {"shelves": shelves, "slot": slot, "machines": machines}
+    scenes = partial(baxter.benchmark, count=options.sample, seed=options.seed)
+    known: dict[str, tuple[str, Callable[[Path], Benchmark]]] = {
+        "shelves": (shelves.HOW, shelves.benchmark),
+        "slot": (slot.HOW, slot.benchmark),
+        "machines": (machines.HOW, machines.benchmark),
+        "baxter": (baxter.HOW, scenes),
+    }
     if options.name not in ("", *known):
         raise SettingsError(f"no benchmark {options.name!r}; there are {', '.join(known)}")
     chosen = {name: known[name] for name in known if options.name in ("", name)}
     if options.folder is None:
-        for name, module in chosen.items():
-            print(f"{name}: get its files, then name FOLDER by --folder\n{module.HOW}")
+        for name, (how, _) in chosen.items():
+            print(f"{name}: get its files, then name FOLDER by --folder\n{how}")
         return 0
     settings = ProposeSettings(seconds=options.time, classes=options.classes)
-    for module in chosen.values():
-        given = module.benchmark(options.folder)
+    for _, benchmark in chosen.values():
+        given = benchmark(options.folder)
         found = [
             measured(given, task, options.output, settings, options.seed, options.study)
             for task in given.tasks

@@ -12,7 +12,7 @@ import numpy as np
 import hybrid_opt as ho
 from hybrid_opt.classes import fastest_carry
 from hybrid_opt.display.table import Table, number
-from hybrid_opt.errors import ProposalError
+from hybrid_opt.errors import NoHoldError, ProposalError
 from hybrid_opt.proposing.problem import completed
 from hybrid_opt.proposing.via_points import travelled
 from studies.research.turns import progress
@@ -113,6 +113,7 @@ class Measured:
     Attributes:
         task: which.
         refused: why no carry was found, '' where one was.
+        held: whether the box can be held at start and goal.
         certified, seconds: worked until the first certified carry, and until its file was whole.
         first: length of the proposed carry.
         fastest: of a study, None without.
@@ -121,6 +122,7 @@ class Measured:
 
     task: Task
     refused: str = ""
+    held: bool = True
     certified: float | None = None
     seconds: float | None = None
     first: Length | None = None
@@ -152,11 +154,13 @@ def measured(
     try:
         proposal = ho.propose(path, rng=np.random.default_rng(seed), settings=settings)
     except ProposalError as error:
-        return Measured(task, refused=str(error))
+        progress(f"{task.name}: {error}")
+        return Measured(task, str(error), not isinstance(error, NoHoldError))
+    progress(f"{task.name}: {proposal}")
     workcell = path.with_name(f"{path.stem}-proposed.toml")
     replace_file(workcell, proposal.text(output).encode())
     first = length(benchmark, proposal.q)
-    found = Measured(task, "", proposal.certified, proposal.seconds, first)
+    found = Measured(task, "", True, proposal.certified, proposal.seconds, first)
     if not study:
         return found
     progress(f"{task.name}: the fastest carry")
@@ -208,4 +212,19 @@ def table(benchmark: Benchmark, found: list[Measured]) -> Table:
         "its theirs [rad]",
     )
     refused = "".join(f" {one.task.name}: {one.refused}." for one in found if one.refused)
-    return Table(benchmark.name, benchmark.title, header, tuple(rows), benchmark.note + refused)
+    note = f"{solved(found)} {benchmark.note}{refused}"
+    return Table(benchmark.name, benchmark.title, header, tuple(rows), note)
+
+
+def solved(found: list[Measured]) -> str:
+    """How many carries were found, and after how much work their verdict stood."""
+    held = [one for one in found if one.held]
+    times = sorted(one.certified for one in found if one.certified is not None)
+    told = (
+        f"Of {len(found)} the box can be held at both ends in {len(held)}, carried in {len(times)}"
+    )
+    if not times:
+        return f"{told}."
+    return (
+        f"{told}; certified after {np.median(times):.1f} s in the median, {times[-1]:.1f} at most."
+    )

@@ -38,11 +38,11 @@ _Loader.add_implicit_resolver(
 )
 
 
-def read_moveit(path: Path, found: Gathered) -> None:
-    """Gather a planning scene's message, or its world alone.
+def read_message(path: Path) -> dict[str, Any]:
+    """The fields of a message that `ros2 topic echo` or robowflex wrote as YAML.
 
     Raises:
-        OutsideError: it is no such scene.
+        OutsideError: it is no such file.
     """
     text = outside.text(outside.read_bytes(path, outside.URDF_BYTES))
     try:
@@ -51,7 +51,17 @@ def read_moveit(path: Path, found: Gathered) -> None:
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         raise OutsideError(f"is not readable YAML: {' '.join(str(error).split())[:200]}") from error
     if not isinstance(document, dict):
-        raise OutsideError("is no planning scene; allowed is one with world.collision_objects")
+        raise OutsideError("is no message; allowed is a mapping, as `ros2 topic echo` writes it")
+    return document
+
+
+def read_moveit(path: Path, found: Gathered) -> None:
+    """Gather a planning scene's message, or its world alone.
+
+    Raises:
+        OutsideError: it is no such scene.
+    """
+    document = read_message(path)
     scene = document.get("scene")
     whole = Table(scene if isinstance(scene, dict) else document, "", found.problems)
     world = whole.table("world", {}) if "world" in whole else whole

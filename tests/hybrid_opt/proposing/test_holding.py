@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -12,16 +14,19 @@ from hybrid_opt.proposing.holding import (
     HoldQuery,
     HoldSearch,
     box_to_last_joint,
+    clear_spins,
     find_holds,
     possible_spins,
     spun,
 )
 from hybrid_opt.proposing.setup import Agreement
+from hybrid_opt.proposing.trial import judge_of
 from symbolic.array import Array
+from symbolic.geometry.pairs import build_geometry
 from symbolic.read.arms import arm_model
 from symbolic.read.cell import load
-from symbolic.records import Workcell
-from symbolic.records.poses import pose_matrix
+from symbolic.records import Body, Box, Workcell
+from symbolic.records.poses import box_placement, pose_matrix
 from tests.symbolic.read.samples import RACK
 
 
@@ -85,6 +90,25 @@ def test_the_spin_turns_the_pad_as_the_file_does(rack: Workcell) -> None:
     angle = pin.log3(plain[:3, :3].T @ turned[:3, :3])
     assert np.linalg.norm(angle) == pytest.approx(0.7)
     np.testing.assert_allclose(np.linalg.inv(geometry.T_joint_box), plain, atol=1e-12)
+
+
+def test_spins_are_left_out_at_which_the_pad_meets_what_stands(rack: Workcell) -> None:
+    """A bar beside the pad, and a fin on the pad that meets it in one of four turns."""
+    start = np.array(rack.task.waypoints[0].lower)
+    goal, robot = start + 0.05 * np.eye(6)[2], rack.robots[0]
+    at = pose_matrix(np.array([0.15, 0.0, -0.05]), np.zeros(3))
+    fin = Body("fin", Box(np.array([0.3, 0.02, 0.02])), robot.T_flange_pad @ at)
+    robot = replace(robot, tool=(fin,))
+    pad = box_placement(rack.task.orientation, start) @ rack.contacts[0].T_box_pad
+    at = pose_matrix(np.array([0.22, 0.0, -0.05]), np.zeros(3))
+    bar = Body("bar", Box(np.full(3, 0.1)), pad @ at)
+    cell = replace(rack, robots=(robot, rack.robots[1]), environment=(bar,))
+    judge = judge_of(build_geometry(cell))
+    spins: Array = np.pi / 2.0 * np.arange(4.0)
+    query = HoldQuery(cell, start, goal, spins, judge)
+    np.testing.assert_allclose(clear_spins(query, 0, spins), spins[1:])
+    np.testing.assert_array_equal(clear_spins(query, 0, spins[:1]), spins[:1])
+    np.testing.assert_array_equal(clear_spins(replace(query, judge=None), 0, spins), spins)
 
 
 def test_pads_that_stand_rigidly_beside_one_another_are_not_spun() -> None:

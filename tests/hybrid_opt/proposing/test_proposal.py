@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import hybrid_opt as ho
-from hybrid_opt.errors import ProposalError
+from hybrid_opt.errors import NoHoldError, ProposalError
 from hybrid_opt.proposing import setup
 from hybrid_opt.proposing.problem import completed, merged
 from hybrid_opt.proposing.proposal import propose_classes, worked
@@ -99,7 +99,7 @@ def test_what_is_out_of_reach_or_too_wide_is_told_before_any_work(
     path = rack_problem(tmp_path, changes)
     begun = worked()
     told = rf"(left|right) lacks 0\.\d+ m to its contact at the {end}"
-    with pytest.raises(ProposalError, match=told):
+    with pytest.raises(NoHoldError, match=told):
         ho.propose(path, rng=np.random.default_rng(1))
     assert worked() - begun < 5.0  # measured: 0.4
 

@@ -11,12 +11,15 @@ import pytest
 
 from hybrid_opt.errors import JobError
 from hybrid_opt.proposing.problem import read_problem
-from hybrid_opt.proposing.trial import BoxAlone, Trial, grasp_blocked
+from hybrid_opt.proposing.setup import redundancy
+from hybrid_opt.proposing.trial import BoxAlone, Trial, grasp_blocked, judge_of
 from symbolic.cell_model import build_cell_model
 from symbolic.functions import CONSTRAINTS, candidate_function, motion_function
+from symbolic.geometry.pairs import build_geometry
 from symbolic.read.cell import load
 from symbolic.records import Handling
 from tests.hybrid_opt.job.jobs import rack, rack_jobs, rack_timing
+from tests.hybrid_opt.proposing.problems import BAXTER
 from tests.symbolic.read.samples import RACK
 
 POST = Path("studies/problems/past-a-post.toml")
@@ -92,6 +95,28 @@ def test_what_the_box_stands_on_is_not_passed(tmp_path: Path) -> None:
     way = np.zeros((len(WAY), 6))
     way[:, 0], way[:, 1], way[:, 2] = WAY, BOW, 0.115
     assert box.passed(way) == ("left of post",)
+
+
+def test_the_torso_counts_for_both_arms_of_a_machine(tmp_path: Path) -> None:
+    """Baxter's forearms folded onto its chest; the torso is listed with the left arm."""
+    path = tmp_path / "baxter.toml"
+    path.write_text(BAXTER, encoding="utf-8")
+    problem = read_problem(path)
+    given = redundancy(problem, problem.workcell({}))
+    judge = judge_of(build_geometry(problem.workcell(given)))
+    rng, met = np.random.default_rng(0), []
+    pose = np.array([2.0, 0.0, 1.0, 0.0, 0.0, 0.0])
+    for arm in (0, 1):
+        lower, upper = judge.geometry.arms[arm].lower, judge.geometry.arms[arm].upper
+        pairs = set()
+        for q in rng.uniform(lower, upper, (60, len(lower))):
+            q_1, q_2 = (q, np.zeros(len(q))) if arm == 0 else (np.zeros(len(q)), q)
+            pairs.add(judge.first_pair(pose, q_1, q_2, arm))
+        named = {name for pair in pairs if pair for name in pair}
+        assert not any("/right" in name for name in named) or arm == 1
+        met.append(named)
+    for named in met:
+        assert any(name.startswith("left/") and "torso" in name for name in named)
 
 
 @pytest.fixture(scope="module")

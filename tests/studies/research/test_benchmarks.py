@@ -15,9 +15,9 @@ import hybrid_opt as ho
 from hybrid_opt.display.table import NOTHING
 from hybrid_opt.proposing.problem import completed, read_problem
 from hybrid_opt.proposing.via_points import travelled
-from studies.research.benchmarks import machines, shelves, slot
+from studies.research.benchmarks import baxter, machines, shelves, slot
 from studies.research.benchmarks.__main__ import main
-from studies.research.benchmarks.measuring import Length, Measured, measured, table
+from studies.research.benchmarks.measuring import Length, Measured, measured, solved, table
 from symbolic.errors import SettingsError
 
 POSTURES = {
@@ -139,7 +139,10 @@ def test_the_program_says_how_to_get_files(capsys: pytest.CaptureFixture[str]) -
     assert main([]) == 0
     assert "git clone" in capsys.readouterr().out
     assert main(["shelfs"]) == 2
-    assert "no benchmark 'shelfs'; there are shelves, slot, machines" in capsys.readouterr().err
+    assert (
+        "no benchmark 'shelfs'; there are shelves, slot, machines, baxter"
+        in capsys.readouterr().err
+    )
 
 
 def test_a_task_without_a_carry_says_why(folder: Path) -> None:
@@ -153,10 +156,12 @@ def test_a_task_without_a_carry_says_why(folder: Path) -> None:
 
 def test_the_table_has_figures_where_there_are_some(folder: Path) -> None:
     given = shelves.benchmark(folder)
-    some = Measured(given.tasks[0], "", 12.0, 20.0, Length(3.0, 2.1))
+    some = Measured(given.tasks[0], "", True, 12.0, 20.0, Length(3.0, 2.1))
     rows = table(given, [some]).rows
     assert rows[0][:7] == ("top to middle", "12.0", "20.0", "3.00", "2.10", "1.88", "2.09")
     assert rows[0][7:] == (NOTHING,) * 4
+    told = solved([some, Measured(given.tasks[1], "out of reach", False)])
+    assert told.startswith("Of 2 the box can be held at both ends in 1, carried in 1; certified")
 
 
 def test_machines_are_problems_whose_box_stands_clear_of_the_post(tmp_path: Path) -> None:
@@ -175,6 +180,55 @@ def test_machines_are_problems_whose_box_stands_clear_of_the_post(tmp_path: Path
             assert np.any(apart > half + np.array(post["size"]) / 2.0 + 0.01)
         ends = [task.problem["task"][end][0] for end in ("start", "goal")]
         assert post["xyz"][0] == pytest.approx(np.mean(ends)), "in between"
+
+
+SCENE = """
+world:
+  collision_objects:
+    - {id: Can1, primitives: [{type: cylinder, dimensions: [0.14, 0.03]}],
+       primitive_poses: [{position: [0.9, 0.1, 0.11], orientation: [0, 0, 0, 1]}]}
+    - {id: Can2, primitives: [{type: cylinder, dimensions: [0.14, 0.03]}],
+       primitive_poses: [{position: [0.9, 0.1, 0.41], orientation: [0, 0, 0, 1]}]}
+    - {id: shelf_low, primitives: [{type: box, dimensions: [1.2, 1, 0.04]}],
+       primitive_poses: [{position: [1.4, 0.0, 0.02], orientation: [0, 0, 0, 1]}]}
+    - {id: shelf_high, primitives: [{type: box, dimensions: [1.2, 1, 0.04]}],
+       primitive_poses: [{position: [1.4, 0.0, 0.32], orientation: [0, 0, 0, 1]}]}
+"""
+
+
+def test_baxters_box_ends_on_the_board_that_the_left_hand_reaches_over(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Hands on slides, the joints as the request says; the board's cans are put away."""
+    slides = "".join(
+        f'<link name="{side}_hand"/><joint name="{side}_{axis}" type="prismatic">'
+        f'<parent link="base"/><child link="{side}_hand"/><axis xyz="0 1 0"/>'
+        f'<origin xyz="0.8 0 {height}"/><limit lower="-2" upper="2" velocity="1" effort="1"/>'
+        "</joint>"
+        for side, axis, height in (("left", "s0", 0.12), ("right", "s0", 0.43))
+    )
+    there = tmp_path / baxter.ROOM
+    scenes = there / "problems" / "bookshelf_tall_both_arms_easy_baxter"
+    scenes.mkdir(parents=True)
+    (there / "baxter.urdf").write_text(f'<robot name="b"><link name="base"/>{slides}</robot>')
+    start = "{name: [left_s0, right_s0, head], position: [0.5, -0.3, 0]}"
+    goal = "[{joint_name: left_s0, position: 0.2}, {joint_name: right_s0, position: 0.0}]"
+    text = (
+        f"start_state: {{joint_state: {start}}}\ngoal_constraints: [{{joint_constraints: {goal}}}]"
+    )
+    (scenes / "request0001.yaml").write_text(text)
+    (scenes / "scene0001.yaml").write_text(SCENE)
+    monkeypatch.setattr(baxter, "SCENES", 1)
+    monkeypatch.setattr(baxter, "KINDS", ("easy",))
+    (task,) = baxter.benchmark(tmp_path, 1, 3).tasks
+    begins, ends = (task.problem["task"][end][:3] for end in ("start", "goal"))
+    np.testing.assert_allclose(begins, [baxter.BEFORE[0], 0.1, baxter.BEFORE[1]])
+    np.testing.assert_allclose(ends, [0.8 + 0.05, 0.1, 0.04 + 0.05 + baxter.AIR], atol=1e-4)
+    names = [body["name"] for body in task.problem["environment"]]
+    assert names == ["Can2", "shelf_low", "shelf_high"]
+    (scenes / "request0001.yaml").write_text("start_state: 3")
+    with pytest.raises(SettingsError, match=r"(?s)lacks start and goal.*git clone"):
+        baxter.benchmark(tmp_path, 1, 3)
 
 
 GATE = """<mujoco><include file="workcell.xml"/><worldbody>

@@ -100,6 +100,19 @@ def test_everything_else_is_held_and_mimics_follow() -> None:
     assert len(moving) + len(held) == 1 + 2 * 8
 
 
+def test_a_fixed_joint_may_bear_a_links_name() -> None:
+    """As Baxter's hands do; Pinocchio itself refuses to hold joints of such a model."""
+    plate = joint("left_thumb", "left_thumb", "left_plate", "fixed")
+    text = machine().replace("</robot>", f'<link name="left_plate"/>{plate}</robot>')
+    urdf = parse_urdf(text.encode(), "machine.urdf")
+    moving = chain_joints(urdf, "base", "left_5")
+    model = reduced_model(urdf, held_joints(urdf, moving, ()))
+    assert tuple(model.names)[1:] == moving
+    names = [frame.name for frame in model.frames]
+    assert {"left_thumb", "left_plate"} <= set(names)
+    assert names.count("left_thumb") == 1
+
+
 def test_a_joint_without_zero_in_its_range_is_held_at_its_nearest_limit() -> None:
     text = machine().replace('lower="-2" upper="2"', 'lower="0.4" upper="2"', 1)
     held = dict(held_joints(parse_urdf(text.encode(), "m"), (), ()))

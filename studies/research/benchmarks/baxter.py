@@ -1,0 +1,173 @@
+"""Baxter before bookshelves, MotionBenchMaker's scenes as VAMP ships them, with a box of our own.
+
+The files are those of github.com/KavrakiLab/vamp at commit f6de6a7, `resources/baxter`: 600 scenes
+each of `bookshelf_tall_both_arms_easy`, `_medium` and `_hard`, the request of each with the joints
+in which both arms begin and end. There each hand reaches for a can of its own, the two always on
+different boards, so that no box is between both hands in the end. Here the box begins ahead of the
+machine, in the middle between both hands of theirs; it ends at the edge of the board that the left
+hand reaches over, abreast of the middle between both, and the cans of that board are put away.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+
+from studies.research.benchmarks.measuring import Benchmark, Task, carry_problem
+from symbolic import outside
+from symbolic.array import Array
+from symbolic.errors import OutsideError, SettingsError
+from symbolic.read.scenes.moveit import read_message
+from symbolic.read.scenes.read import read_scene
+
+ROOM = Path("vamp/resources/baxter")
+
+HOW = f"""\
+git clone https://github.com/KavrakiLab/vamp FOLDER/vamp
+git -C FOLDER/vamp checkout f6de6a7
+tar -xjf FOLDER/{ROOM}/problems.tar.bz2 -C FOLDER/{ROOM}"""
+
+KINDS = ("easy", "medium", "hard")
+
+SCENES = 600
+"""Of each kind."""
+
+BOX = (0.10, 0.20, 0.10)
+"""A little lower than a can [m]."""
+
+BEFORE = (0.70, 0.10)
+"""How far ahead of the machine the box begins, and how high above its shoulders' frame [m]."""
+
+CLEARED = 0.2
+"""Above a board, cans whose middle is there stand on it [m]."""
+
+AIR = 0.01
+"""Below the box where it stands on a board [m]."""
+
+PADDLE = (0.06, 0.03, 0.17)
+"""In the place of each gripper and as long, its flat side presses: width, thickness, length [m]."""
+
+PAD = 0.14
+"""From a hand to the middle of its pad, on that side [m]."""
+
+NOTE = (
+    "Published (arXiv 2309.14545): each arm to a can of its own, nothing held, no path of a box; "
+    "times and rates there are of motions of free arms."
+)
+
+
+def benchmark(folder: Path, count: int, seed: int) -> Benchmark:
+    """A sample of the scenes, as many of each kind.
+
+    Args:
+        folder: in which their files are.
+        count: of each kind.
+        seed: of the sample.
+
+    Raises:
+        SettingsError: they are not there, or not those.
+    """
+    there, rng = folder / ROOM, np.random.default_rng(seed)
+    tasks = []
+    try:
+        outside.require(there / "baxter.urdf", outside.URDF_BYTES)
+        hands = Hands(there / "baxter.urdf")
+        for kind in KINDS:
+            scenes = there / "problems" / f"bookshelf_tall_both_arms_{kind}_baxter"
+            chosen = np.sort(rng.choice(SCENES, count, replace=False) + 1).tolist()
+            tasks += [_task(there, scenes, f"{kind} {k}", k, hands) for k in chosen]
+    except OutsideError as error:
+        raise SettingsError(f"{there}: {error}; get the files by\n{HOW}") from error
+    return Benchmark("baxter", "Baxter before bookshelves", tuple(tasks), NOTE)
+
+
+class Hands:
+    """Where Baxter's hands are."""
+
+    def __init__(self, urdf: Path) -> None:
+        self._model = pin.buildModelFromUrdf(str(urdf))
+        self._data = self._model.createData()
+
+    def at(self, joints: dict[str, float]) -> tuple[Array, Array]:
+        """Positions (3,) of the left and the right hand [m]."""
+        q = pin.neutral(self._model)
+        for name, value in joints.items():
+            if self._model.existJointName(name):
+                q[self._model.joints[self._model.getJointId(name)].idx_q] = value
+        pin.framesForwardKinematics(self._model, self._data, q)
+        frames = [self._model.getFrameId(f"{side}_hand", pin.BODY) for side in ("left", "right")]
+        left, right = (self._data.oMf[frame].translation.copy() for frame in frames)
+        return left, right
+
+
+def request(path: Path) -> tuple[dict[str, float], dict[str, float]]:
+    """The joints in which both arms begin and end, by name.
+
+    Raises:
+        OutsideError: it is no such request.
+    """
+    data = read_message(path)
+    try:
+        start = data["start_state"]["joint_state"]
+        goal = data["goal_constraints"][0]["joint_constraints"]
+        return (
+            {str(name): float(q) for name, q in zip(start["name"], start["position"], strict=True)},
+            {str(one["joint_name"]): float(one["position"]) for one in goal},
+        )
+    except (KeyError, TypeError, IndexError, ValueError) as error:
+        raise OutsideError("the request lacks start and goal joints") from error
+
+
+def _task(there: Path, scenes: Path, name: str, number: int, hands: Hands) -> Task:
+    joints = request(scenes / f"request{number:04d}.yaml")
+    start, goal = (hands.at(one) for one in joints)
+    bodies = read_scene(scenes / f"scene{number:04d}.yaml").tables(scenes, scenes)
+    boards = [body for body in bodies if body["name"].startswith("shelf")]
+    board = max(
+        (one for one in boards if one["xyz"][2] < goal[0][2]), key=lambda one: float(one["xyz"][2])
+    )
+    top = board["xyz"][2] + board["size"][2] / 2.0
+    begins = [BEFORE[0], (start[0][1] + start[1][1]) / 2.0, BEFORE[1]]
+    ends = [
+        board["xyz"][0] - board["size"][0] / 2.0 + BOX[0] / 2.0,
+        (goal[0][1] + goal[1][1]) / 2.0,
+        top + BOX[2] / 2.0 + AIR,
+    ]
+    cleared = [
+        body
+        for body in bodies
+        if not (body["name"].startswith("Can") and top < body["xyz"][2] < top + CLEARED)
+    ]
+    problem = carry_problem(
+        f"Baxter, {name}",
+        [_robot(there, side) for side in ("left", "right")],
+        {"size": list(BOX), "mass": 1.0},
+        [{"patch_radius": 0.03}] * 2,
+        (_upright(begins), _upright(ends)),
+        cleared,
+        reference_speed=0.2,
+        reference_force=30.0,
+    )
+    return Task(name, problem)
+
+
+def _upright(xyz: list[float]) -> list[float]:
+    return [*np.round(xyz, 4).tolist(), 0.0, 0.0, 0.0]
+
+
+def _robot(there: Path, side: str) -> dict[str, Any]:
+    paddle = {"kind": "box", "size": list(PADDLE), "xyz": [0.0, 0.0, PADDLE[2] / 2.0]}
+    return {
+        "name": side,
+        "urdf": str((there / "baxter.urdf").resolve()),
+        "srdf": str((there / "baxter.srdf").resolve()),
+        "chain": ["base", f"{side}_hand"],
+        "drop_links": [f"{side}_gripper_base"],
+        "base": {"xyz": [0.0, 0.0, 0.0]},
+        "pad": {"xyz": [0.0, PADDLE[1] / 2.0, PAD], "rpy": [-np.pi / 2.0, 0.0, 0.0]},
+        "min_manipulability": 0.002,
+        "tool": [{"name": "paddle", **paddle}],
+    }
