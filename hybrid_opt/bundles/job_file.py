@@ -32,7 +32,7 @@ from hybrid_opt.compiled_cell import kept_per_workcell
 from hybrid_opt.errors import JobError
 from hybrid_opt.job.compliance import TRACKED, largest_skew, require_delay, require_stiffness
 from hybrid_opt.job.motions import unit_squeeze
-from hybrid_opt.job.records import HELD, Job, SampledJob, sample_job
+from hybrid_opt.job.records import HELD, Job, SampledJob, contact_effort, sample_job
 from hybrid_opt.store.files import csv_text
 from hybrid_opt.timing.model import TimingModel
 from symbolic.array import Array, interpolated
@@ -183,21 +183,6 @@ JOINT_USE = 1.1
 _model = kept_per_workcell(TimingModel)
 
 
-@dataclass(frozen=True, eq=False)
-class Efforts:
-    """Joint torques at n samples, both arms' joints side by side [N m, N].
-
-    Attributes:
-        moving: (n, joints) of the job as planned, with gravity.
-        holding: (n, joints) that stand still there and press as commanded, with gravity.
-        gravity: (n, joints) that bear the arms and their tools alone.
-    """
-
-    moving: Array
-    holding: Array
-    gravity: Array
-
-
 @dataclass(frozen=True)
 class Stop:
     """How a job stops along its path.
@@ -216,20 +201,23 @@ class Stop:
     quick: float
 
 
-def efforts(sampled: SampledJob) -> Efforts:
-    """The torques of a sampled job, of holding it at each sample, and of gravity."""
-    model, gravity = _model(sampled.job.workcell), []
+def bearing_torque(sampled: SampledJob) -> Array:
+    """(n, joints) torques that bear the arms and their tools alone [N m, N]."""
+    found = []
     for arm, robot in enumerate(sampled.job.workcell.robots):
         numeric = build_robot_model(robot).model
         data = numeric.createData()
         rows = sampled.arm(arm, sampled.q)
-        gravity.append(np.array([pin.computeGeneralizedGravity(numeric, data, q) for q in rows]))
-    own = np.concatenate(gravity, axis=1)
+        found.append(np.array([pin.computeGeneralizedGravity(numeric, data, q) for q in rows]))
+    return np.concatenate(found, axis=1)
+
+
+def pressing_torque(sampled: SampledJob) -> Array:
+    """(n, joints) torques that hold the box still at each sample and press as commanded, without
+    gravity of the arms [N m, N]."""
+    model, first = _model(sampled.job.workcell), len(sampled.job.joint_names[0])
     matrices = model.wrench_torque(np.ascontiguousarray(sampled.q), sampled.pose)
-    first, wrench = gravity[0].shape[1], _still_wrench(model, sampled)
-    parts = (matrices[:, :first], matrices[:, first:])
-    pressing = [np.einsum("njk,nk->nj", part, wrench[:, i]) for i, part in enumerate(parts)]
-    return Efforts(sampled.effort, own + np.concatenate(pressing, axis=1), own)
+    return contact_effort(matrices, first, _still_wrench(model, sampled))
 
 
 def _still_wrench(model: TimingModel, sampled: SampledJob) -> Array:
@@ -399,9 +387,15 @@ class Export:
         return float(np.diff(self.sampled.time).max())
 
     @cached_property
-    def efforts(self) -> Efforts:
-        """Joint torques with and without gravity, moving and holding."""
-        return efforts(self.sampled)
+    def gravity(self) -> Array:
+        """(n, joints) torques that bear the arms and their tools alone [N m, N]."""
+        return bearing_torque(self.sampled)
+
+    @cached_property
+    def holding(self) -> Array:
+        """(n, joints) torques that stand still there and press as commanded, with gravity [N m,
+        N]."""
+        return self.gravity + pressing_torque(self.sampled)
 
     @cached_property
     def limits(self) -> Limits:
@@ -450,16 +444,16 @@ class Export:
         }
 
     def _robot(self, arm: int) -> dict[str, Any]:
-        sampled, found = self.sampled, self.efforts
+        sampled = self.sampled
         robot = self.workcell.robots[arm]
         rows = {
             "position": sampled.q,
             "velocity": sampled.q_rate,
             "acceleration": sampled.q_second,
-            "effort_with_gravity": found.moving,
-            "effort_without_gravity": found.moving - found.gravity,
-            "hold_effort_with_gravity": found.holding,
-            "hold_effort_without_gravity": found.holding - found.gravity,
+            "effort_with_gravity": sampled.effort,
+            "effort_without_gravity": sampled.effort - self.gravity,
+            "hold_effort_with_gravity": self.holding,
+            "hold_effort_without_gravity": self.holding - self.gravity,
         }
         return {
             "name": robot.name,
@@ -530,13 +524,13 @@ _JOINT_QUANTITIES = (
 
 def job_table(export: Export) -> str:
     """One row per time step, one column per quantity, named with its unit."""
-    job, sampled, torque = export.job, export.sampled, export.efforts
+    job, sampled = export.job, export.sampled
     values_of = (
         sampled.q,
         sampled.q_rate,
         sampled.q_second,
-        torque.moving,
-        torque.moving - torque.gravity,
+        sampled.effort,
+        sampled.effort - export.gravity,
     )
     robots = [robot.name for robot in job.workcell.robots]
     names = zip(components(job.workcell.task.orientation), _POSE_UNITS, strict=True)

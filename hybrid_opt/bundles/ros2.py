@@ -10,7 +10,7 @@ from __future__ import annotations
 import io
 import json
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from string import Template
 from types import ModuleType
 from typing import Any
@@ -24,7 +24,7 @@ from hybrid_opt.bundles.arms import COMMANDS, WORLD, described, description, pad
 from hybrid_opt.bundles.job_file import Export, job_text
 from hybrid_opt.bundles.programs import program
 from hybrid_opt.errors import ResultsError
-from hybrid_opt.job.records import Job, SampledJob, contact_effort
+from hybrid_opt.job.records import Job, SampledJob
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.read.arms import arm_model, link_frame
@@ -189,7 +189,7 @@ def _franka_type(joints: Sequence[str]) -> str:
 
 
 def _require_torque_rate(export: Export) -> None:
-    torque = export.efforts.moving - export.efforts.gravity
+    torque = export.sampled.effort - export.gravity
     rate = np.abs(np.diff(torque, axis=0)) / np.diff(export.sampled.time)[:, None]
     if rate.max() > TORQUE_RATE:
         raise SettingsError(
@@ -236,7 +236,7 @@ def _contact(job: Job, arm: int) -> tuple[Array, tuple[float, float]]:
     """The most of contact: of each joint (n_joints,) [N m], force [N] and moment [N m]."""
     first = len(job.joint_names[0])
     span = slice(0, first) if arm == 0 else slice(first, None)
-    torque = [np.abs(contact_effort(p.motion, p.force.wrench)[:, span]).max(0) for p in job.phases]
+    torque = [np.abs(p.motion.contact_effort(p.force.wrench)[:, span]).max(0) for p in job.phases]
     wrench = np.concatenate([phase.force.wrench[:, arm] for phase in job.phases])
     size = [float(np.linalg.norm(part, axis=1).max()) for part in (wrench[:, :3], wrench[:, 3:])]
     return np.max(torque, axis=0), (size[0], size[1])
@@ -409,18 +409,6 @@ def _yaml(document: Any) -> str:
     return text
 
 
-TYPES = (
-    "sensor_msgs/msg/JointState",
-    "geometry_msgs/msg/PoseStamped",
-    "geometry_msgs/msg/WrenchStamped",
-    "tf2_msgs/msg/TFMessage",
-    "std_msgs/msg/String",
-)
-
-Message = tuple[str, str, dict[str, Any]]
-"""Topic, type and content."""
-
-
 def mcap_files(export: Export) -> dict[str, str | bytes]:
     """One recording; times count from zero.
 
@@ -435,44 +423,41 @@ def mcap_files(export: Export) -> dict[str, str | bytes]:
         name: writer.register_schema(
             name, "ros2msg", store.generate_msgdef(name, ros_version=2)[0].encode()
         )
-        for name in TYPES
+        for name in RECORDED
     }
     channels: dict[str, int] = {}
-    recording = _Recording(export)
+    recording = _Recording(export, store)
     for k, time in enumerate(export.sampled.time.tolist()):
         stamp = round(time * 1e9)
-        for topic, kind, content in recording.messages(k, duration(time)):
+        for topic, message in recording.messages(k, stamp):
+            kind = message.__msgtype__
             if topic not in channels:
                 channels[topic] = writer.register_channel(topic, "cdr", schemas[kind])
-            data = bytes(store.serialize_cdr(message_of(store, content, kind), kind))
-            writer.add_message(channels[topic], stamp, data, stamp)
+            writer.add_message(
+                channels[topic], stamp, bytes(store.serialize_cdr(message, kind)), stamp
+            )
     writer.finish()
     return {"job.mcap": file.getvalue()}
 
 
-def message_of(store: Any, content: Mapping[str, Any], kind: str) -> Any:
-    """A message of a type store from plain values; unknown and missing fields are errors."""
-    fields = store.get_msgdef(kind).fields
-    values = {name: _field(store, content[name], node) for name, node in fields}
-    return store.types[kind](**values)
+RECORDED = (
+    "sensor_msgs/msg/JointState",
+    "geometry_msgs/msg/PoseStamped",
+    "geometry_msgs/msg/WrenchStamped",
+    "tf2_msgs/msg/TFMessage",
+    "std_msgs/msg/String",
+)
+"""Types of the messages."""
 
-
-def _field(store: Any, value: Any, node: Any) -> Any:
-    sort, described = node
-    if sort.name == "NAME":
-        return message_of(store, value, described)
-    if sort.name == "BASE":
-        return value
-    (inner, name), _ = described
-    if inner.name == "NAME":
-        return [message_of(store, each, name) for each in value]
-    return list(value) if name[0] == "string" else np.array(value, dtype=name[0])
+Message = tuple[str, Any]
+"""With its topic."""
 
 
 class _Recording:
-    """The messages of each sample."""
+    """The messages of each sample, of a type store."""
 
-    def __init__(self, export: Export) -> None:
+    def __init__(self, export: Export, store: Any) -> None:
+        self._types = store.types
         self._sampled = sampled = export.sampled
         self._joints = [*export.ros_joints(0), *export.ros_joints(1)]
         self._cell = sampled.job.workcell
@@ -484,35 +469,50 @@ class _Recording:
         self._data = [model.createData() for model in self._models]
         self._boxes = box_placement(self._cell.task.orientation, sampled.pose)
 
-    def messages(self, k: int, stamp: dict[str, int]) -> Iterator[Message]:
-        """Messages of sample k."""
-        sampled = self._sampled
+    def _of(self, kind: str, *values: Any) -> Any:
+        """A message, of its fields in order."""
+        package, name = kind.split("/")
+        return self._types[f"{package}/msg/{name}"](*values)
+
+    def messages(self, k: int, stamp: int) -> Iterator[Message]:
+        """Messages of sample k, at a time [ns]."""
+        sampled, of = self._sampled, self._of
         if k == 0:
-            text = description(self._cell, sampled.q[0])
-            yield "/robot_description", "std_msgs/msg/String", {"data": text}
+            yield "/robot_description", of("std_msgs/String", description(self._cell, sampled.q[0]))
         if k in self._begins:
-            yield "/phase", "std_msgs/msg/String", {"data": self._begins[k]}
-        world = {"stamp": stamp, "frame_id": WORLD}
-        joints = {
-            "header": world,
-            "name": self._joints,
-            "position": sampled.q[k].tolist(),
-            "velocity": sampled.q_rate[k].tolist(),
-            "effort": sampled.effort[k].tolist(),
-        }
-        yield "/joint_states", "sensor_msgs/msg/JointState", joints
-        box = self._boxes[k]
-        yield "/box_pose", "geometry_msgs/msg/PoseStamped", {"header": world, "pose": _pose(box)}
+            yield "/phase", of("std_msgs/String", self._begins[k])
+        time = of("builtin_interfaces/Time", *divmod(stamp, 10**9))
+        world = of("std_msgs/Header", time, WORLD)
+        rows = (sampled.q[k], sampled.q_rate[k], sampled.effort[k])
+        yield "/joint_states", of("sensor_msgs/JointState", world, self._joints, *rows)
+        box = of("geometry_msgs/Pose", *self._placed("Point", self._boxes[k]))
+        yield "/box_pose", of("geometry_msgs/PoseStamped", world, box)
         for arm, prefix in enumerate(self._prefixes):
             frame = pad_frame(prefix, arm)
-            header = {"stamp": stamp, "frame_id": frame}
-            wrench = zip(("force", "torque"), np.split(self._wrenches[arm][k], 2), strict=True)
-            axes = {name: dict(zip("xyz", part.tolist(), strict=True)) for name, part in wrench}
-            message = {"header": header, "wrench": axes}
-            yield f"/{frame}/wrench_reference", "geometry_msgs/msg/WrenchStamped", message
-        frames = [("box", box), *self._frames(k)]
-        transforms = [_transform(world, name, pose) for name, pose in frames]
-        yield "/tf", "tf2_msgs/msg/TFMessage", {"transforms": transforms}
+            parts = np.split(self._wrenches[arm][k], 2)
+            vectors = [of("geometry_msgs/Vector3", *part.tolist()) for part in parts]
+            header, wrench = (
+                of("std_msgs/Header", time, frame),
+                of("geometry_msgs/Wrench", *vectors),
+            )
+            stamped = of("geometry_msgs/WrenchStamped", header, wrench)
+            yield f"/{frame}/wrench_reference", stamped
+        transforms = [
+            of(
+                "geometry_msgs/TransformStamped",
+                world,
+                name,
+                of("geometry_msgs/Transform", *self._placed("Vector3", pose)),
+            )
+            for name, pose in (("box", self._boxes[k]), *self._frames(k))
+        ]
+        yield "/tf", of("tf2_msgs/TFMessage", transforms)
+
+    def _placed(self, kind: str, T: Array) -> tuple[Any, Any]:
+        """Position, as a message of a kind, and quaternion of a pose (4, 4)."""
+        turn = Rotation.from_matrix(T[:3, :3]).as_quat().tolist()
+        position = self._of(f"geometry_msgs/{kind}", *T[:3, 3].tolist())
+        return position, self._of("geometry_msgs/Quaternion", *turn)
 
     def _frames(self, k: int) -> Iterator[tuple[str, Array]]:
         """Every link of both arms with its pose (4, 4) in the world, and both pads."""
@@ -525,27 +525,6 @@ class _Recording:
             flange = data.oMf[link_frame(model, robot.flange)].homogeneous
             T_world_pad = robot.T_world_base @ flange @ robot.T_flange_pad
             yield pad_frame(prefix, arm), T_world_pad
-
-
-def _transform(header: dict[str, Any], child: str, pose: Array) -> dict[str, Any]:
-    at = _pose(pose)
-    transform = {"translation": at["position"], "rotation": at["orientation"]}
-    return {"header": header, "child_frame_id": child, "transform": transform}
-
-
-def _pose(T: Array) -> dict[str, Any]:
-    """A geometry_msgs/Pose of a transform (4, 4)."""
-    turn = Rotation.from_matrix(T[:3, :3]).as_quat().tolist()
-    return {
-        "position": dict(zip("xyz", T[:3, 3].tolist(), strict=True)),
-        "orientation": dict(zip("xyzw", turn, strict=True)),
-    }
-
-
-def duration(seconds: float) -> dict[str, int]:
-    """A builtin_interfaces/msg/Duration, or Time."""
-    nanoseconds = round(seconds * 1e9)
-    return {"sec": nanoseconds // 10**9, "nanosec": nanoseconds % 10**9}
 
 
 def pad_wrench(sampled: SampledJob, arm: int) -> Array:

@@ -20,7 +20,7 @@ from scipy.interpolate import CubicSpline
 from codegen.function import NumericFunction
 from hybrid_opt.carry import Carry, joints_of
 from hybrid_opt.errors import JobError
-from hybrid_opt.job.records import Force, PhaseMotion, contact_effort
+from hybrid_opt.job.records import Force, PhaseMotion
 from hybrid_opt.robust.force import BoxMotion
 from hybrid_opt.robust.squeeze import Squeeze, SqueezeSettings, pressed_beyond, pressed_together
 from hybrid_opt.timing.model import TimingModel
@@ -434,7 +434,7 @@ def phase_use(
     judged where forces are planned (`hybrid_opt.timing`): pressing harder only helps them.
     """
 
-    effort = motion.own_torque + contact_effort(motion, force.wrench)
+    effort = motion.own_torque + motion.contact_effort(force.wrench)
     payload = workcell.payload
     bounded = {} if jerk is None else _jerk_use(motion, jerk)
     return bounded | {

@@ -66,6 +66,10 @@ class PhaseMotion:
         """[s]."""
         return float(self.time[-1])
 
+    def contact_effort(self, wrench: Array) -> Array:
+        """(n, joints) joint torques that exert wrenches (n, 2, 6) on the box [N m]."""
+        return contact_effort(self.wrench_torque, self.first, wrench)
+
 
 @dataclass(frozen=True, eq=False)
 class Force:
@@ -116,7 +120,7 @@ class Phase:
     @property
     def effort(self) -> Array:
         """(n, joints) joint torques of arms and commanded contact wrenches together [N m]."""
-        return self.motion.own_torque + contact_effort(self.motion, self.force.wrench)
+        return self.motion.own_torque + self.motion.contact_effort(self.force.wrench)
 
     def __post_init__(self) -> None:
         for record in (self.motion, self.force):
@@ -126,9 +130,13 @@ class Phase:
                     value.setflags(write=False)
 
 
-def contact_effort(motion: PhaseMotion, wrench: Array) -> Array:
-    """(n, joints) joint torques that exert wrenches (n, 2, 6) on the box [N m]."""
-    parts = (motion.wrench_torque[:, : motion.first], motion.wrench_torque[:, motion.first :])
+def contact_effort(wrench_torque: Array, first: int, wrench: Array) -> Array:
+    """(n, joints) joint torques that exert wrenches (n, 2, 6) on the box [N m].
+
+    Args:
+        wrench_torque, first: see `PhaseMotion`.
+    """
+    parts = (wrench_torque[:, :first], wrench_torque[:, first:])
     torques = [np.einsum("njk,nk->nj", part, wrench[:, arm]) for arm, part in enumerate(parts)]
     return np.concatenate(torques, axis=1)
 

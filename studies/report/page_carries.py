@@ -17,7 +17,7 @@ from hybrid_opt.display.scene import packed
 from hybrid_opt.display.table import NOTHING, Table, number
 from hybrid_opt.evaluate.objectives import PAPER_OBJECTIVES
 from hybrid_opt.job.plan import JobModel
-from hybrid_opt.job.records import Job, Phase, contact_effort
+from hybrid_opt.job.records import Job, Phase
 from hybrid_opt.job.smooth import driven_timing
 from hybrid_opt.timing import JerkLimits, Timing, TimingLimits, drivable_timing, time_path
 from hybrid_opt.work.service import Emit
@@ -88,8 +88,8 @@ def drawn(model: JobModel, label: str, timing: Timing, within_jerk: bool = False
         job = model.plan(timing, within_jerk=within_jerk)
     except DualArmError as error:
         return DrawnJob(label, str(error))
-    limit = np.concatenate([robot.torque_max for robot in job.workcell.robots])
-    contact = [np.abs(contact_effort(p.motion, p.force.wrench)).max(axis=0) for p in job.phases]
+    limit = job.workcell.of_joints("torque_max")
+    contact = [np.abs(p.motion.contact_effort(p.force.wrench)).max(axis=0) for p in job.phases]
     whole = [np.abs(phase.effort).max(axis=0) for phase in job.phases]
     bounded = within_jerk or JerkLimits.of(job.workcell) is None
     first, second = job.peak_normal_force.tolist()

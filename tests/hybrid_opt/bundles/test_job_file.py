@@ -31,7 +31,6 @@ from hybrid_opt.bundles.job_file import (
     pad_errors,
     stop_of,
 )
-from hybrid_opt.bundles.ros2 import message_of
 from hybrid_opt.errors import JobError
 from hybrid_opt.job.compliance import TRACKED
 from hybrid_opt.job.records import SampledJob, sample_job
@@ -83,7 +82,7 @@ def test_csv_read_back() -> None:
         assert float(row["left/joint_1 velocity [rad/s]"]) == job.q_rate[k, 0]
         assert float(row["right/joint_6 acceleration [rad/s^2]"]) == job.q_second[k, 11]
         assert float(row["left/joint_2 effort with gravity [N m]"]) == job.effort[k, 1]
-        less = job.effort[k, 1] - exported("csv").efforts.gravity[k, 1]
+        less = job.effort[k, 1] - exported("csv").gravity[k, 1]
         assert float(row["left/joint_2 effort without gravity [N m]"]) == less
         assert float(row["box z [m]"]) == job.pose[k, 2]
         assert float(row["left normal force [N]"]) == job.normal_force[k, 0]
@@ -147,7 +146,7 @@ def test_gravity_is_that_of_the_description() -> None:
     data, found = model.createData(), exported("ros2-control")
     for k in range(0, len(found.sampled.time), 20):
         gravity = pin.computeGeneralizedGravity(model, data, found.sampled.q[k])
-        np.testing.assert_allclose(found.efforts.gravity[k], gravity, atol=1e-2)
+        np.testing.assert_allclose(found.gravity[k], gravity, atol=1e-2)
 
 
 def test_holding_bears_half_of_the_box_each_and_presses() -> None:
@@ -155,7 +154,7 @@ def test_holding_bears_half_of_the_box_each_and_presses() -> None:
     wrench does along the pad's way; both wrenches together bear the box."""
     found = exported("ros2-control")
     sampled, cell = found.sampled, rack().workcell
-    load = found.efforts.holding - found.efforts.gravity
+    load = found.holding - found.gravity
     model = pin.buildModelFromXML(text_of("ros2-control", "description/cell.urdf"))
     data = model.createData()
     span = sampled.span(3)
@@ -176,7 +175,7 @@ def test_holding_bears_half_of_the_box_each_and_presses() -> None:
 def test_at_rest_holding_is_moving() -> None:
     found = exported("ros2-control")
     last = np.array(found.sampled.last)
-    np.testing.assert_allclose(found.efforts.moving[last], found.efforts.holding[last], atol=1e-6)
+    np.testing.assert_allclose(found.sampled.effort[last], found.holding[last], atol=1e-6)
 
 
 def test_a_stop_keeps_the_squeeze() -> None:
@@ -352,9 +351,3 @@ def test_a_damaged_recording_is_refused() -> None:
     for damaged in (content[:-40], b"x" + content, content[:200] + b"damage" + content[206:]):
         with pytest.raises((McapError, EndOfFile, ValueError)):
             list(make_reader(io.BytesIO(damaged), validate_crcs=True).iter_messages())
-
-
-def test_messages_have_all_fields() -> None:
-    store = get_typestore(Stores.ROS2_JAZZY)
-    with pytest.raises(KeyError):
-        message_of(store, {"force": {"x": 0.0, "y": 0.0}}, "geometry_msgs/msg/Wrench")

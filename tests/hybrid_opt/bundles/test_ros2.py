@@ -226,11 +226,11 @@ def test_frankas_know_their_tool_and_what_is_no_collision() -> None:
     found = exported("franka-ros2")
     for arm, call in enumerate(calls[1::2]):
         torque = np.array(call["request"]["upper_torque_thresholds_nominal"])
-        contact = found.efforts.holding - found.efforts.gravity
+        contact = found.holding - found.gravity
         assert (torque > np.abs(found.sampled.arm(arm, contact)).max(axis=0)).all()
         force = call["request"]["upper_force_thresholds_nominal"]
         assert min(force[:3]) > found.sampled.normal_force[:, arm].max()
-    rate = np.diff(found.efforts.moving - found.efforts.gravity, axis=0)
+    rate = np.diff(found.sampled.effort - found.gravity, axis=0)
     assert np.abs(rate / np.diff(found.sampled.time)[:, None]).max() < 1000.0
 
 
