@@ -7,8 +7,9 @@ for a digest to be right. The dynamics of an arm come from its description and a
 the meshes and where bodies of several pieces are fixed to a link.
 
 A vector is a group of numbers that functions share: those of the task, of either arm, of what is
-held, of both start postures, of the bodies. Its entries are named by the key paths of the workcell
-file; those that NumPy derives from several keys are named by what they are.
+held, of both start postures, of the bodies, and of the squeezes of pads anywhere under either
+robot's commanded force. Its entries are named by the key paths of the workcell file; those that
+NumPy derives from several keys are named by what they are.
 """
 
 from __future__ import annotations

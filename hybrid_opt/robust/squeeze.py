@@ -171,19 +171,11 @@ def pressed_beyond(
     if settings.factor is None:
         needed = _in_every_case(workcell, doubt, leader, motion, planned)
         parts = [Part("in every case", float(needed.max()))]
-    if settings.factor is None and in_parts:
-        most = np.union1d(np.argsort(-needed)[:MOST], np.argsort(-planned)[:MOST])
-        there, own = box_motion(motion).at(most), planned[most]
-        names: tuple[str, ...] = ()
-        before = float(_in_every_case(workcell, doubt.only(names), leader, there, own).max())
-        parts = [Part("least force", before)]
-        for name, ranges in DOUBTS.items():
-            names += ranges
-            if not doubt.only(ranges).is_empty:
-                force = _in_every_case(workcell, doubt.only(names), leader, there, own).max()
-                parts.append(Part(name, float(force) - before))
-                before = float(force)
-    elif settings.factor is not None:
+        if in_parts:
+            most = np.union1d(np.argsort(-needed)[:MOST], np.argsort(-planned)[:MOST])
+            there = box_motion(motion).at(most)
+            parts = _by_doubt(workcell, leader, there, planned[most])
+    else:
         still = np.zeros(len(planned))
         if even:
             least = np.maximum(least, soft_model(workcell).nominal(motion, leader))
@@ -202,6 +194,20 @@ def pressed_beyond(
         tuple(parts),
     )
     return smooth_above(time, needed, settings.smoothing) - planned, squeeze
+
+
+def _by_doubt(workcell: Workcell, leader: int, motion: HeldMotion, planned: Array) -> list[Part]:
+    """What the doubts of a cell add to the largest robust force, one after the other."""
+    doubt, names = workcell.uncertainty, tuple[str, ...]()
+    before = float(_in_every_case(workcell, doubt.only(names), leader, motion, planned).max())
+    parts = [Part("least force", before)]
+    for name, ranges in DOUBTS.items():
+        names += ranges
+        if not doubt.only(ranges).is_empty:
+            force = _in_every_case(workcell, doubt.only(names), leader, motion, planned).max()
+            parts.append(Part(name, float(force) - before))
+            before = float(force)
+    return parts
 
 
 def _in_every_case(
