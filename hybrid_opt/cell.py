@@ -28,6 +28,7 @@ from hybrid_opt.evaluate.objectives import (
 from hybrid_opt.static_hold import StaticHold, require_hold, static_hold, unheld
 from symbolic.array import Array
 from symbolic.geometry.pairs import CellGeometry
+from symbolic.path.pieces import same_paths, stated
 from symbolic.read.cell import changed, load
 from symbolic.read.cell_files import collect_cell, drivable_files, unpack_cell
 from symbolic.records import Workcell
@@ -247,8 +248,11 @@ class Cell:
         return concatenated(parts) if len(parts) > 1 else self.evaluator.evaluate(x[:_CHUNK])
 
     def random(self, count: int, rng: np.random.Generator) -> Array:
-        """(count, n_var) decision vectors drawn uniformly from within the bounds."""
-        return rng.uniform(self.lower, self.upper, (count, self.n_var))
+        """(count, n_var) decision vectors drawn uniformly from within the bounds of the waypoints
+        that the file states."""
+        task, drawn = self.workcell.task, stated(self.workcell.task)
+        x = rng.uniform(drawn.lower, drawn.upper, (count, drawn.n_var))
+        return same_paths(x, drawn, task)
 
     def carry(self, x: Array) -> Carry:
         """One decision vector (n_var,) in detail, with its verdict, under the task's time law.

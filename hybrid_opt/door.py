@@ -53,7 +53,9 @@ def search(
     if settings.initial is None and algorithm != "random":
         settings = replace(settings, initial=cell.initial[None])
     with counted(progress, algorithm, evaluations) as advance:
-        found, _ = search_carries(cell.evaluator, algorithm, evaluations, rng, settings, advance)
+        found, _ = search_carries(
+            cell.evaluator, algorithm, evaluations, rng, settings, advance, cell.workcell.task
+        )
     return Front.of_search(cell, algorithm, found)
 
 

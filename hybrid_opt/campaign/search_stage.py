@@ -75,6 +75,7 @@ def run_replica(
         settings.evaluations,
         settings.replica_rng(algorithm, request.replica),
         SearchSettings(settings.algorithms[algorithm], settings.constraint_handling, start),
+        task=evaluator.workcell.task if isinstance(evaluator, CandidateEvaluator) else None,
     )
     # Without what was repeated from a journal.
     seconds = sum(recording.seconds) + recording.certification_seconds

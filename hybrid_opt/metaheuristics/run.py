@@ -19,6 +19,8 @@ from hybrid_opt.metaheuristics.registry import make
 from hybrid_opt.metaheuristics.settings import AlgorithmSettings
 from symbolic.array import Array, require_allowed
 from symbolic.errors import SettingsError
+from symbolic.path.pieces import same_paths, stated
+from symbolic.records import Task
 
 ConstraintHandling = Literal["penalty", "constraints"]
 """How a search learns of infeasibility: by the paper's penalised objectives, or by objectives
@@ -68,6 +70,31 @@ def disarmed(evaluations: Evaluations) -> Evaluations:
         changed[name][broken] = 0.0
         changed[name][broken, REASONS.index(NOT_FINITE)] = 1.0
     return replace(evaluations, **changed)
+
+
+class StatedPaths:
+    """Evaluates the decision vectors of a task's stated waypoints, see `symbolic.path.pieces`.
+
+    Attributes:
+        objective_names, n_var, lower, upper: see `Evaluator`.
+    """
+
+    def __init__(self, evaluator: Evaluator, task: Task) -> None:
+        self._evaluator, self._task, self._stated = evaluator, task, stated(task)
+        self.objective_names, self.n_var = evaluator.objective_names, self._stated.n_var
+        self.lower, self.upper = self._stated.lower, self._stated.upper
+
+    def evaluate(self, x: Array) -> Evaluations:
+        """See `Evaluator`; the candidates are the task's own."""
+        return self._evaluator.evaluate(same_paths(x, self._stated, self._task))
+
+    def certified(self, evaluations: Evaluations) -> Evaluations:
+        """See `Evaluator`."""
+        return self._evaluator.certified(evaluations)
+
+    def drawn(self, x: Array | None) -> Array | None:
+        """Candidates of the task (n, its n_var) as searches draw them."""
+        return None if x is None else same_paths(x, self._task, self._stated)
 
 
 class CarryProblem(Problem):  # type: ignore[misc]
@@ -240,6 +267,7 @@ def search_carries(
     rng: np.random.Generator,
     settings: SearchSettings,
     evaluated: Callable[[int], None] = lambda count: None,
+    task: Task | None = None,
 ) -> tuple[Evaluations, NDArray[np.intp]]:
     """Spend exactly that many evaluations and certify the front of all of them; returns the
     candidates in order and the generation (n,) of each, from 1.
@@ -247,12 +275,17 @@ def search_carries(
     Args:
         algorithm: one of `hybrid_opt.metaheuristics.names()`.
         evaluated: called with the number of candidates after each batch.
+        task: of the candidates, where only its stated waypoints are drawn.
 
     Raises:
         SettingsError: an unknown algorithm or a value that is not allowed.
     """
+    initial = settings.initial
+    if task is not None and task.pieces > 1:
+        evaluator = StatedPaths(evaluator, task)
+        initial = evaluator.drawn(initial)
     problem = CarryProblem(evaluator, settings.constraint_handling, evaluated)
-    search(problem, make(algorithm, settings.algorithm, settings.initial), evaluations, rng)
+    search(problem, make(algorithm, settings.algorithm, initial), evaluations, rng)
     sizes = [len(batch) for batch in problem.batches]
     generation = np.repeat(np.arange(1, len(sizes) + 1), sizes)
     return evaluator.certified(problem.evaluations), generation

@@ -45,6 +45,7 @@ from hybrid_opt.robust.path_force import PathPoints, robust_path
 from hybrid_opt.timing.drive import Driver
 from symbolic.array import Array
 from symbolic.errors import SettingsError
+from symbolic.path.pieces import by_stated_waypoints, stated, stated_entries
 from symbolic.records import Workcell
 from symbolic.records.task import waypoints_of
 
@@ -176,7 +177,7 @@ class DriveStep(Step):
     """A step of a path.
 
     Attributes:
-        d: (n_path,) scaled.
+        d: scaled, of the waypoints that are moved.
         squared: (intervals + 1,) u'^2 that its program promises.
         gain: the share of the duration that it promises to take off.
     """
@@ -200,13 +201,20 @@ class DriveWay(Way[DriveReached, DriveStep]):
     Attributes:
         driver, paths: how carries and paths are timed.
         settings: of the polish of drivable carries.
+        stated: the same by moves of the waypoints that the file states, along which the others
+            follow; itself where there are no others. Fewer variables take fewer and cheaper rounds.
     """
 
     least_radius, farther = LEAST_RADIUS, FARTHER
     refused_by_length = stays_lenient = True
 
-    def __init__(self, cell: SmoothCell, settings: DrivableSettings) -> None:
+    def __init__(
+        self, cell: SmoothCell, settings: DrivableSettings, by_stated: bool = False
+    ) -> None:
         """Prepare programs.
+
+        Args:
+            by_stated: whether moves are those of the stated waypoints.
 
         Raises:
             SettingsError: the time law is not 'optimal', or forces have no closed form.
@@ -220,9 +228,19 @@ class DriveWay(Way[DriveReached, DriveStep]):
         super().__init__(cell, ActiveSet(cell), CarryReader(cell))
         self.driver, self.settings, self._n = driver, settings, task.n_path
         self.half = cell.half[: task.n_path]
+        moving = stated(task) if by_stated else task
+        self._bounds = moving.lower[: moving.n_path], moving.upper[: moving.n_path]
+        self._unit = (self._bounds[1] - self._bounds[0]) / 2.0
+        self._own = stated_entries(task) if by_stated else np.arange(task.n_path)
+        self._spread = (
+            by_stated_waypoints(task) if by_stated else np.eye(task.n_path)
+        ) * self._unit
         self.paths = PathJudge(driver)
         self._intervals = IntervalGrid(cell.workcell, driver.timer.intervals, driver.robust)
         self._method = quadratic_method(cell.evaluator.compiled.cache)
+        self.stated = self
+        if task.pieces > 1 and not by_stated:
+            self.stated = DriveWay(cell, settings, by_stated=True)
 
     def start(self, x: Array) -> DriveReached:
         """See `Way`."""
@@ -236,7 +254,8 @@ class DriveWay(Way[DriveReached, DriveStep]):
     def _moved(self, x: Array, d: Array) -> Array:
         """(n_var,) after a scaled step of the path."""
         n, task = self._n, self.cell.task
-        return np.append(np.clip(x[:n] + self.half * d, task.lower[:n], task.upper[:n]), x[n:])
+        moved = x[:n] + self._spread @ d
+        return np.append(np.clip(moved, task.lower[:n], task.upper[:n]), x[n:])
 
     def judge(self, best: DriveReached, step: DriveStep) -> Judged[DriveReached]:
         """See `Way`. What the timing rounds off may hide a small gain, but must not add up."""
@@ -275,10 +294,12 @@ class DriveWay(Way[DriveReached, DriveStep]):
         """Form the joint program about the best carry so far, and solve its quadratic model."""
         grid = self._intervals
         values = IntervalValues.at(grid, self.cell.functions, best.x, best.squared, best.joints)
-        program = JointProgram(grid, values, best.x, best.squared, self.cell, required, best.carry)
+        program = JointProgram(
+            grid, values, best.x, best.squared, self.cell, required, best.carry, self._spread
+        )
         box, chosen = self._box(best, radius), program.near()
         steady = np.zeros(program.n)
-        steady[: self._n] = STEADINESS
+        steady[: program.n_path] = STEADINESS
         plain = program.curvature().raised(steady)
         first = self._solved(program, chosen, (plain, np.zeros(program.n)), box)
         if first is None:
@@ -308,7 +329,7 @@ class DriveWay(Way[DriveReached, DriveStep]):
         squared[1:-1] *= 1.0 + d[program.speeds]
         rows = program.place_rows
         presses = second.answer.rows[len(second.linear.point) :][: len(rows)] > NEGLIGIBLE
-        path = d[: self._n]
+        path = d[: program.n_path]
         return DriveStep(
             length=float(np.abs(path).max()),
             required=required,
@@ -352,10 +373,10 @@ class DriveWay(Way[DriveReached, DriveStep]):
 
     def _box(self, best: DriveReached, radius: float) -> tuple[Array, Array]:
         """Bounds of a step."""
-        n, task, xi = self._n, self.cell.task, best.x[: self._n]
+        (lower, upper), xi = self._bounds, best.x[self._own]
         speeds = np.ones(self._intervals.intervals - 1)
-        low = np.maximum((task.lower[:n] - xi) / self.half, -radius)
-        high = np.minimum((task.upper[:n] - xi) / self.half, radius)
+        low = np.maximum((lower - xi) / self._unit, -radius)
+        high = np.minimum((upper - xi) / self._unit, radius)
         return (
             np.concatenate([low, -LEAST_SQUARED * speeds]),
             np.concatenate([high, LARGEST_SQUARED * speeds]),
@@ -364,11 +385,11 @@ class DriveWay(Way[DriveReached, DriveStep]):
     def _residuals(self, program: JointProgram, best: DriveReached, found: _Found) -> Residuals:
         """Of the program at its iterate, with the multipliers of a step. Of those of its bounds the
         variables' own count, not those of the box of trust."""
-        n, task, answer = self._n, self.cell.task, found.answer
-        x, edge, own = best.x[:n], 1e-6 * self.half, answer.bounds[:n]
-        reached = x + self.half * answer.d[:n]
-        at_low = (own < 0.0) & (reached < task.lower[:n] + edge)
-        at_high = (own > 0.0) & (reached > task.upper[:n] - edge)
+        (lower, upper), n, answer = self._bounds, program.n_path, found.answer
+        edge, own = 1e-6 * self._unit, answer.bounds[:n]
+        reached = best.x[self._own] + self._unit * answer.d[:n]
+        at_low = (own < 0.0) & (reached < lower + edge)
+        at_high = (own > 0.0) & (reached > upper - edge)
         bounds = np.zeros(program.n)
         bounds[:n] = np.where(at_low | at_high, own, 0.0)
         return program.residuals(bounds, found.linear, answer.rows)

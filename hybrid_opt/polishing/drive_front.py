@@ -21,6 +21,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from math import ceil
+from typing import Literal
 
 import numpy as np
 
@@ -56,6 +57,9 @@ RIVALS = 3
 COMPARED = 8
 """Force limits at which paths from beside the front are compared."""
 
+GENTLE = 0.02
+"""Of a force limit above the box at rest, from which on points are moved by all waypoints."""
+
 STALLED = 1e-3
 """Gain of half a turn below which a climb that is nearly stationary has arrived, as a share of its
 level."""
@@ -78,11 +82,11 @@ class DriveAttempt(Attempt):
 
     Attributes:
         rivals: starts of a tournament in place of x, none where there is none.
-        solved: whether x is to be improved; otherwise it is judged as it is.
+        moves: which waypoints improve x: the stated ones, all, or none where it is judged as it is.
     """
 
     rivals: tuple[Array, ...] = ()
-    solved: bool = True
+    moves: Literal["stated", "all", "none"] = "stated"
 
 
 def best_of(way: DriveWay, starts: Sequence[Array]) -> Solution:
@@ -217,6 +221,8 @@ class DriveRun(PolishRun[DriveAttempt]):
                 self._elsewhere(rng)
             else:
                 self._at("gap", middle)
+        if self._way.stated is not self._way:
+            self._refine()
         self._spread()
 
     def _force(self, index: int) -> float:
@@ -284,6 +290,19 @@ class DriveRun(PolishRun[DriveAttempt]):
         start = self._evaluator.evaluate(x[None]).objectives[0]
         self._do([DriveAttempt(aim, -1, x, start, rivals)])
 
+    def _refine(self) -> None:
+        """Points moved by all waypoints, from gentle to fast: what rest holds within one limit is
+        driven within every higher one."""
+        count, still = self._settings.drivable.refined, self._range[0] * (1.0 - STILL)
+        least = min(max(self._range[0], (1.0 + GENTLE) * still), self._largest)
+        self._most += count
+        for above in np.geomspace(least - still, self._largest - still, count):
+            force = float(np.clip(still + above, self._range[0], self._largest))
+            paths, durations = self._driven(force)
+            x = np.append(paths[int(np.argmin(durations))], force)
+            start = self._evaluator.evaluate(x).objectives[0]
+            self._do([DriveAttempt("gap", -1, x, start, moves="all")])
+
     def _spread(self) -> None:
         """Points of the best known paths, and of paths between them, at force limits up to the
         front's largest."""
@@ -296,7 +315,7 @@ class DriveRun(PolishRun[DriveAttempt]):
             found = self._evaluator.evaluate(x)
             objectives = found.objectives[0]
             if found.feasible[0] and not self._archive.dominates(objectives):
-                self._do([DriveAttempt("gap", -1, x, objectives, solved=False)])
+                self._do([DriveAttempt("gap", -1, x, objectives, moves="none")])
 
     def _blends(self) -> Array:
         """(m, n_path) paths between neighbours on the front."""
@@ -351,14 +370,14 @@ class DriveRun(PolishRun[DriveAttempt]):
         return None
 
     def _solution(self, attempt: DriveAttempt) -> Solution:
-        if not attempt.solved:
+        if attempt.moves == "none":
             return Solution(attempt.x, usable=True)
-        if attempt.rivals:
-            return best_of(self._way, attempt.rivals)
-        return self._way.finish(self._way.climb(attempt.x))
+        if attempt.moves == "all":
+            return self._way.climb(attempt.x).go_on(self._way.settings.refining)
+        return best_of(self._way.stated, attempt.rivals or (attempt.x,))
 
     def _verdict(self, attempt: DriveAttempt, answer: Solution | Lost) -> tuple[Status, str, Array]:
-        if not attempt.solved and isinstance(answer, Solution):
+        if attempt.moves == "none" and isinstance(answer, Solution):
             return self._recomputed(attempt, answer)
         return super()._verdict(attempt, answer)
 

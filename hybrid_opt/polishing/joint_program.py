@@ -1,8 +1,8 @@
 """Path and speed profile as one program, and its quadratic model about an iterate.
 
-Variables z = (xi, omega): the free waypoints scaled to [-1, 1] by their bounds, and the squared
-speeds at the grid points between both ends as u'^2_i = w_i (1 + omega_i). With T the duration, F
-the force limit, and all of it about the iterate (xi, w) with duration T_0,
+Variables z = (xi, omega): the waypoints that are moved, scaled to [-1, 1] by their bounds, and the
+squared speeds at the grid points between both ends as u'^2_i = w_i (1 + omega_i). With T the
+duration, F the force limit, and all of it about the iterate (xi, w) with duration T_0,
 
     minimise    T / T_0
     subject to  every limit at both ends of every interval <= 1, normal forces <= F
@@ -69,7 +69,7 @@ class JointProgram:
 
     Attributes:
         place_rows: the geometric rows, in their order.
-        n, n_path: variables, and those of the path.
+        n, n_path: variables, and those that move the path.
         speeds: place of the squared speeds among the variables.
         total: duration of the iterate [s].
         rows: (points, kinds) values of the timing's rows less their bounds, unscaled.
@@ -85,6 +85,7 @@ class JointProgram:
         cell: SmoothCell,
         required: Mapping[Row, float],
         carry: PlacedCarry,
+        spread: Array,
     ) -> None:
         """Form it.
 
@@ -94,10 +95,10 @@ class JointProgram:
             squared: (intervals + 1,) its u'^2.
             required: geometric rows, and what each has to keep.
             carry: the iterate on places.
+            spread: (the path's variables, n_path) how they follow the program's.
         """
         self._grid, self._values, self._x, self._force = grid, values, x, float(x[-1])
-        self.n_path = cell.task.n_path
-        self._half = cell.half[: self.n_path]
+        self._spread, self.n_path = spread, spread.shape[1]
         self.n = self.n_path + grid.intervals - 1
         self.speeds = slice(self.n_path, self.n)
         self.scale = np.where(grid.kinds.is_force, self._force, 1.0)
@@ -108,7 +109,7 @@ class JointProgram:
         self._required = np.array([required[row] for row in self.place_rows]) / scale
         self._places = Rows(cell, layout, carry.q)
         self.geometry = self._required - self._places.values(x)
-        self._geometry_slope = -self._places.slopes()[:, : self.n_path] * self._half
+        self._geometry_slope = -self._places.slopes()[:, : len(spread)] @ spread
         self._still(values)
         self._speeds(squared)
 
@@ -117,7 +118,7 @@ class JointProgram:
         share, slope = values.at_rest(self._force)
         near = np.flatnonzero(share > NEAR)
         begins = 2 * (near // (len(share) // self._grid.intervals))
-        by_path = self._grid.by_path(slope[near], begins) * self._half
+        by_path = self._grid.by_path(slope[near], begins) @ self._spread
         self.geometry = np.append(self.geometry, share[near] - 1.0 + REST_MARGIN)
         self._geometry_slope = np.concatenate([self._geometry_slope, by_path])
 
@@ -151,7 +152,7 @@ class JointProgram:
     def geometry_after(self, d: Array) -> Array:
         """(geometric rows,) what they lack after a step, beyond what their slopes foretell."""
         x, step = self._x.copy(), d[: self.n_path]
-        x[: self.n_path] += self._half * step
+        x[: len(self._spread)] += self._spread @ step
         lacking = self._required - self._places.values(x)
         beyond = np.zeros(len(self.geometry))
         foretold = self.geometry + self._geometry_slope @ step
@@ -168,7 +169,7 @@ class JointProgram:
     def predicted(self, d: Array) -> Array:
         """(points, kinds) linear prediction of the timing's rows after a step."""
         omega = d[self.speeds]
-        moved = self._grid.moved(self._half * d[: self.n_path])
+        moved = self._grid.moved(self._spread @ d[: self.n_path])
         beside = np.stack([omega[self._column], omega[self._column + 1]], axis=1)
         speeds = np.matmul(self._local, beside[:, :, None])[:, :, 0]
         change = np.matmul(self._values.slope, np.hstack([moved, speeds])[:, :, None])[:, :, 0]
@@ -186,7 +187,7 @@ class JointProgram:
         moving, n = self._grid.moving, self.n_path
         by_speed = np.matmul(local[:, None, moving:], self._local[point])[:, 0]
         border = np.zeros((m + count, self.n_path))
-        border[:m, :n] = self._grid.by_path(local[:, :moving], point) * self._half
+        border[:m, :n] = self._grid.by_path(local[:, :moving], point) @ self._spread
         border[m:, :n] = self._geometry_slope
         scale = np.ones(m + count)
         scale[:m] = np.maximum(np.abs(by_speed).max(axis=1, initial=0.0), LEAST_SCALE)
@@ -222,19 +223,20 @@ class JointProgram:
         timing[linear.point, linear.kind] = np.where(rows > NEGLIGIBLE, unscaled, 0.0)[:count]
         m = self._grid.moving
         at, local = self._values.curvature((timing / self.scale) @ self._grid.kinds.mix)
-        over, speeds, column = self._grid.carry_over[at], self._local[at], self._column[at]
+        over = self._grid.carry_over[at] @ self._spread
+        speeds, column = self._local[at], self._column[at]
         corner += np.einsum("pia,pij->aj", over, local[:, :m, :m] @ over, optimize=True)
         mixed = np.swapaxes(speeds, 1, 2) @ local[:, m:, :m] @ over
         own = np.swapaxes(speeds, 1, 2) @ local[:, m:, m:] @ speeds
         for side in (0, 1):
-            np.add.at(beside, column + side, mixed[:, side] * self._half)
+            np.add.at(beside, column + side, mixed[:, side])
             diagonal += np.bincount(column + side, own[:, side, side], n)
         off += np.bincount(column, own[:, 0, 1], n)[:-1]
-        corner *= np.outer(self._half, self._half)
         weight = unscaled[count : count + len(self.place_rows)]
         if weight.any():
-            second = self._places.curvature(weight)[:n_path, :n_path]
-            corner -= second * np.outer(self._half, self._half)
+            whole = len(self._spread)
+            second = self._places.curvature(weight)[:whole, :whole]
+            corner -= self._spread.T @ second @ self._spread
         return BorderedMatrix(corner, beside, diagonal, off)
 
     def residuals(self, bounds: Array, linear: Linear, multipliers: Array) -> Residuals:

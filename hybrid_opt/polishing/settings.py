@@ -73,6 +73,9 @@ class DrivableSettings:
             goes on for two turns more, and again.
         most_rounds: with such gains.
         turn: rounds of each start in a turn of a tournament of starts.
+        refined: force limits at which points are moved by all waypoints after the others, in tasks
+            with more than the stated ones.
+        refining: rounds of each of them.
         members: force limits, spread over their range, at which the front gets a point where the
             best known path wins one.
     """
@@ -81,6 +84,8 @@ class DrivableSettings:
     worth: Small = 5e-4
     most_rounds: Number = 48
     turn: Number = 3
+    refined: NumberOrNone = 12
+    refining: Number = 5
     members: NumberOrNone = 20
 
     def __post_init__(self) -> None:

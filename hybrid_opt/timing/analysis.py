@@ -25,6 +25,7 @@ from hybrid_opt.timing.robustness import Margin, robustness_margins
 from hybrid_opt.timing.solve import time_path
 from symbolic.array import Array, Figure, Missing, Row, Shape
 from symbolic.errors import SettingsError
+from symbolic.path.pieces import same_paths
 from symbolic.records import Workcell
 
 NEAREST_FORCE = 1.001
@@ -202,9 +203,11 @@ def timed_trajectory(
     Raises:
         SettingsError: x does not fit the workcell, or the limit is not a positive force.
     """
-    task, closest = model.workcell.task, closest_to_reference_timing(model, x)
-    timings = {
-        "search": judge_timing(own or model, x),
+    task, found_in = model.workcell.task, own or model
+    timings = {"search": judge_timing(found_in, x)}
+    (x,) = same_paths(x, found_in.workcell.task, task)
+    closest = closest_to_reference_timing(model, x)
+    timings |= {
         "closest to reference": closest,
         "fastest": time_path(model, x),
     }

@@ -13,6 +13,7 @@ ruled out elsewhere (`hybrid_opt.collision`).
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from types import ModuleType
 from typing import Any, Literal
@@ -22,7 +23,6 @@ import pinocchio
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from hybrid_opt.errors import WitnessError
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.geometry.bodies import Frame, arm_geometry, collision_bodies
@@ -423,14 +423,10 @@ def joint_torque_max(workcell: Workcell) -> Array:
 def cell_text(workcell: Workcell, settings: ArmSettings) -> str:
     """The MJCF document of a whole cell; see `compiled`.
 
-    Joints are named `joint_ROBOT_NUMBER`, sites of the pads `pad_1` and `pad_2`, the box `box`.
-
-    Raises:
-        WitnessError: one joint moves both arms.
+    Joints are named `joint_ROBOT_NUMBER`, sites of the pads `pad_1` and `pad_2`, the box `box`. A
+    joint that moves both arms, and the link that it moves, stand in both and are tied together:
+    either arm's effort has the link's whole weight.
     """
-    common = common_joints(workcell.robots)
-    if common:
-        raise WitnessError(f"joint {common[0]!r} moves both arms; hold it (locked_joints)")
     meshes: list[str] = []
     shown: dict[Frame, list[str]] = {}
     for body in collision_bodies(workcell):
@@ -464,7 +460,16 @@ def cell_text(workcell: Workcell, settings: ArmSettings) -> str:
     {arms}
     {box_body(payload, solid)}
   </worldbody>
+  <equality>{"".join(_ties(workcell))}</equality>
 </mujoco>"""
+
+
+def _ties(workcell: Workcell) -> Iterator[str]:
+    """Of each joint that moves both arms its two copies, tied as stiffly as the steps allow."""
+    names = [tuple(arm_model(robot).names)[1:] for robot in workcell.robots]
+    for name in common_joints(workcell.robots):
+        first, second = (_name("joint", i, own.index(name)) for i, own in enumerate(names))
+        yield f'<joint joint1="{first}" joint2="{second}" solref="{2.0 * LARGEST_STEP!r} 1"/>'
 
 
 def _arm(workcell: Workcell, settings: ArmSettings, i: int, shown: dict[Frame, list[str]]) -> str:

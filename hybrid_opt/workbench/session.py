@@ -23,6 +23,7 @@ from hybrid_opt.robust.squeeze import Squeeze, SqueezeSettings, commanded_forces
 from hybrid_opt.timing.records import TimingLimits
 from symbolic.array import Array
 from symbolic.errors import DualArmError, WorkcellError
+from symbolic.path.pieces import same_paths, stated
 from symbolic.read.cell_files import collect_cell, unpack_cell
 from symbolic.records import POSE_SIZE, Workcell
 from symbolic.records.poses import box_placement, inverse, rpy_from_rotation
@@ -142,8 +143,11 @@ class Session:
         first = np.clip(np.vstack([self.x, near]), task.lower, task.upper)
         settings = SearchSettings(initial=first)
         front = search(cell, evaluations=evaluations, rng=rng, settings=settings)
-        if len(front):
-            self.x = np.array(front.x[np.argmin(np.prod(front.objectives, axis=1))])
+        # The path at hand may have waypoints between those that a search draws.
+        tried = cell.evaluate(np.vstack([self.x, front.x]))
+        if tried.feasible.any():
+            product = np.where(tried.feasible, np.prod(tried.objectives, axis=1), np.inf)
+            self.x = np.array(tried.x[np.argmin(product)])
         self.verdict = self._judged(cell)
         return self.verdict
 
@@ -157,8 +161,9 @@ class Session:
         folder = Path(folder)
         if folder.exists() and any(folder.iterdir()):
             raise ResultsError(f"{folder}: is not empty; save the cell into a folder of its own")
-        task = self.base.workcell.task
-        poses = self.x[: task.n_box].reshape(-1, POSE_SIZE)
+        task = stated(self.base.workcell.task)
+        (x,) = same_paths(self.x, self.cell.workcell.task, task)
+        poses = x[: task.n_box].reshape(-1, POSE_SIZE)
         cell = self.base.changed(self.changes | {"task.initial": poses.tolist()})
         return unpack_cell(collect_cell(cell.workcell), folder).source
 

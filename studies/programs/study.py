@@ -121,7 +121,7 @@ def stages(study: StudySettings, alone: bool = False) -> tuple[Stage, ...]:
 
 def _paths_beside(folder: CampaignFolder) -> Array:
     """Paths that a study's first experiment ended with; the drivable one lies in its folder."""
-    return known_paths(folder.root.parent)
+    return known_paths(folder.root.parent, folder.workcell.task)
 
 
 def run_study(

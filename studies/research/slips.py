@@ -44,6 +44,10 @@ LOW, HIGH, BISECTIONS = 0.97, 1.03, 4
 WIDER, MORE_BISECTIONS = (0.5, 2.0), 9
 """What a threshold beyond them is looked for with."""
 
+FINE_POINTS = 91
+"""Of a patch where normals are not opposite: force rises by up to five times the share by which
+friction falls there, and so does what 37 points leave off the torsion of a disc."""
+
 PRESSED_SHARE = 0.95
 """Share of the holding force that is pressed all along to see where the box slips first: a plan
 often asks for its most for some hundredths of a second, in which a box that lacks less force moves
@@ -99,20 +103,23 @@ class Slip:
 
 @dataclass(frozen=True)
 class Slips:
-    """The file of all carries so far, in order, and the seed that they are drawn with."""
+    """The file of all carries so far, in order, the seed that they are drawn with, and their pads'
+    layer [N/m^3]."""
 
     seed: int
+    layer: float
     found: tuple[Slip, ...]
 
 
 def thresholds(options: argparse.Namespace) -> int:
     """Print and store the threshold of every carry that is asked for; returns the exit code."""
-    path, done = options.output, Slips(options.seed, ())
+    path, done = options.output, Slips(options.seed, options.layer, ())
     if path.exists():
         done = read_record(Slips, path, "delete it to begin anew")
-        if done.seed != options.seed:
+        if (done.seed, done.layer) != (options.seed, options.layer):
             raise WitnessError(
-                f"{path} was begun with seed {done.seed}; give that one or a new file"
+                f"{path} was begun with seed {done.seed} and layer {done.layer:g}; give these or "
+                "a new file"
             )
     paths = options.cells or sorted(WORKCELLS.glob("*.toml"))
     sources = {path.stem: _Source(path, options.seed) for path in paths}
@@ -122,7 +129,7 @@ def thresholds(options: argparse.Namespace) -> int:
     for k in range(len(done.found), options.carries):
         have = Counter(slip.cell for slip in done.found)
         name = min(sources, key=lambda name: have[name])  # the first one of those with fewest
-        slip = slip_of(*sources[name].case(have[name]))
+        slip = slip_of(*sources[name].case(have[name]), layer=options.layer)
         done = replace(done, found=(*done.found, slip))
         path.parent.mkdir(parents=True, exist_ok=True)
         write_json(path, to_json(done))
@@ -151,9 +158,17 @@ def summary(found: Sequence[Slip]) -> str:
     return "\n".join(lines)
 
 
-def slip_of(name: str, candidate: str, carry: Carry) -> Slip:
-    """Simulate one carry whose forces are planned, and see where it slips first."""
-    settings, needed = SimulationSettings(), carry.normal_force[:, 1]
+def slip_of(
+    name: str, candidate: str, carry: Carry, layer: float = SimulationSettings.layer
+) -> Slip:
+    """Simulate one carry whose forces are planned, and see where it slips first.
+
+    Args:
+        layer: stiffness of the pads' layers [N/m^3].
+    """
+    needed, settings = carry.normal_force[:, 1], SimulationSettings(layer=layer)
+    if not carry.workcell.has_opposite_pads:
+        settings = replace(settings, points=FINE_POINTS)
     witness, drive = Witness(carry.workcell, settings), drive_of(carry, settings)
     simulate = partial(witness.simulate, drive)
     factor = begins = float("nan")
@@ -232,7 +247,7 @@ class _Source:
     def _random(self, rng: np.random.Generator) -> Array:
         cell = self._cell
         while True:
-            x = rng.uniform(cell.lower, cell.upper, (DRAWN, cell.n_var))
+            x = cell.random(DRAWN, rng)
             feasible = np.flatnonzero(cell.evaluate(x).feasible)
             if len(feasible):
                 return np.asarray(x[feasible[0]])

@@ -11,7 +11,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from studies.options import add, whole
+from studies.options import add, number, stated, whole
 from studies.program import Parser, Program, later, run_program
 
 
@@ -30,6 +30,14 @@ def _add_options(parser: Parser) -> None:
         help="where they are stored (default: results/thresholds.json)",
     )
     add(parser, "--seed", help="of the random candidates and of the searches")
+    layer = stated("hybrid_opt.witness.scene.ContactSettings.layer")
+    parser.add_argument(
+        "--layer",
+        type=number(1e6, 1e10),
+        default=layer,
+        metavar="N/m^3",
+        help=f"stiffness of the pads' layers (default: {layer:g})",
+    )
 
 
 main = Program(

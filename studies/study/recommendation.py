@@ -231,7 +231,7 @@ def recommend_from(
     if len(x) == 0:
         raise NoCarryError(_why_none(cell, drivable))
     alone = is_drivable(campaign.workcell, campaign.objectives)
-    others = {} if alone else least_force(campaign)
+    others = {} if alone else least_force(campaign, cell.workcell.task)
     # The choice with its rivals, the table's rows and the price.
     steps = STEPS + 4 + 2 * len(others) + len(fronts)
     with progress.stage("recommendation", steps, "steps") as advance:

@@ -148,6 +148,11 @@ def _build(table: Table, source: Path, content: bytes, stored: bool) -> Workcell
     )
     check_all(workcell, problems)
     workcell = with_redundancy(workcell, redundant, problems)
+    if workcell.task.pieces > 1 and not problems.found:
+        # Not imported at the top: it needs CasADi.
+        from symbolic.path.pieces import in_pieces
+
+        workcell = replace(workcell, task=in_pieces(workcell.task))
     return replace(workcell, reading=reading_of(workcell, identity)) if identity else workcell
 
 

@@ -20,6 +20,7 @@ from symbolic.records.task import components
 MIN_SAMPLES = 5
 MAX_SAMPLES = 2_000
 MAX_WAYPOINTS = 100
+MAX_PIECES = 10
 TIME_LAWS = ("constant", "ramped", "optimal")
 ALLOCATIONS = get_args(Allocation)
 ROTATIONS = ("roll-pitch-yaw", "quaternion")
@@ -52,6 +53,7 @@ def read_task(table: Table) -> Task:
                 f"found {len(waypoints)} poses with start and goal; allowed are {MAX_WAYPOINTS}",
             )
     time_law = cast("TimeLaw", table.choice("time_law", TIME_LAWS, "constant"))
+    pieces = table.integer("drivable_pieces", 1, MAX_PIECES, 1)
     task = Task(
         waypoints=waypoints,
         samples=table.integer("samples", MIN_SAMPLES, MAX_SAMPLES, 100),
@@ -67,6 +69,7 @@ def read_task(table: Table) -> Task:
         allocation=_allocation(table, time_law),
         force_limit=_force_limit(table),
         orientation=orientation,
+        pieces=pieces if time_law == "optimal" else 1,
     )
     if orientation.is_vector:
         _check_vectors(task, problems)

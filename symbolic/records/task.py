@@ -104,6 +104,7 @@ class Task:
         force_limit: (2,) bounds of the force limit, the last decision variable of 'optimal' [N].
         redundant: the joints whose paths are decided beside the box's, see RedundantJoint.
         orientation: what the last three numbers of every pose mean.
+        pieces: of the path between two waypoints that its file states, see `symbolic.path.pieces`.
     """
 
     waypoints: tuple[Waypoint, ...]
@@ -119,6 +120,7 @@ class Task:
     force_limit: tuple[float, float] = (0.0, np.inf)
     redundant: tuple[RedundantJoint, ...] = ()
     orientation: Orientation = field(default_factory=Orientation)
+    pieces: int = 1
 
     @property
     def extended_size(self) -> int:

@@ -29,11 +29,16 @@ ROWS = (PlaceRow(Reach(0), 150), PlaceRow(Reach(1), 250))
 class Programs:
     """Programs about points near one timed path."""
 
-    def __init__(self, x: Array, owner: Polisher | None = None) -> None:
-        """owner: of another cell than the rack."""
+    def __init__(
+        self, x: Array, owner: Polisher | None = None, together: Array | None = None
+    ) -> None:
+        """owner: of another cell than the rack; together: (n_path, k) how the scaled waypoints
+        follow fewer variables."""
         owner = owner or polisher()
         self.cell = smooth_cell(owner.evaluator)
-        self.half, self.x = self.cell.half[:-1], x
+        half, self.x = self.cell.half[:-1], x
+        own: Array = np.eye(len(half)) if together is None else together
+        self.spread: Array = half[:, None] * own
         self.timed = way_of(owner).paths.timed(x[:-1], float(x[-1]))
         self.carry = CarryReader(self.cell).read(x)
         self.intervals = IntervalGrid(self.cell.workcell, 100)
@@ -42,19 +47,19 @@ class Programs:
         """The program after a step d of the scaled variables from the path."""
         x, squared = self.x.copy(), self.timed.squared.copy()
         if d is not None:
-            n = len(self.half)
-            x[:n] += self.half * d[:n]
+            n, k = self.spread.shape
+            x[:n] += self.spread @ d[:k]
             squared[1:-1] *= 1.0 + d[-len(squared) + 2 :]
         functions, joints = self.cell.functions, self.timed.joints
         values = IntervalValues.at(self.intervals, functions, x, squared, joints)
         required: dict[Row, float] = dict.fromkeys(ROWS, 0.01)
         grid = self.intervals
-        return JointProgram(grid, values, x, squared, self.cell, required, self.carry)
+        return JointProgram(grid, values, x, squared, self.cell, required, self.carry, self.spread)
 
 
 def direction(program: JointProgram, seed: int) -> Array:
     rng = np.random.default_rng(seed)
-    d = rng.normal(size=program.n)
+    d: Array = rng.normal(size=program.n)
     d[: program.n_path] *= 0.1
     return d
 
@@ -72,6 +77,14 @@ def test_the_compiled_timing_satisfies_the_program() -> None:
 @pytest.mark.parametrize("seed", [0, 1])
 def test_rows_have_exact_slopes(seed: int) -> None:
     assert_slopes(Programs(start(FORCE, seed)), seed)
+
+
+def test_waypoints_that_follow_others_have_exact_slopes_and_curvature() -> None:
+    together = np.random.default_rng(4).normal(size=(18, 5)) / 3.0
+    programs = Programs(start(FORCE), together=together)
+    assert programs.at().n_path == 5
+    assert_slopes(programs, 6)
+    assert_curvature(programs)
 
 
 def assert_slopes(programs: Programs, seed: int) -> None:

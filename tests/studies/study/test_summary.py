@@ -250,9 +250,10 @@ def test_ends_and_middle_of_polished_fronts_and_the_balanced_path_are_known(
     root = tmp_path / "results"
     shutil.copytree(study, root)
     campaign = read_campaign(root)
-    n = campaign.workcell.task.n_path
-    (balanced,) = least_force(campaign).values()
-    np.testing.assert_array_equal(known_paths(root), balanced[None])
+    task = campaign.workcell.task
+    n = task.n_path
+    (balanced,) = least_force(campaign, task).values()
+    np.testing.assert_array_equal(known_paths(root, task), balanced[None])
     replica = max(campaign.replicas, key=lambda one: len(one.front))
     front = PolishedFront(
         np.array(replica.front_x),
@@ -269,7 +270,7 @@ def test_ends_and_middle_of_polished_fronts_and_the_balanced_path_are_known(
     write_json(path, to_json(front))
     wanted = replica.front_x[[0, len(replica.front) // 2, -1], :n]
     both = np.unique(np.vstack([balanced, wanted]), axis=0)
-    np.testing.assert_array_equal(known_paths(root), both)
+    np.testing.assert_array_equal(known_paths(root, task), both)
 
 
 def test_paths_are_timed_in_the_cell_that_robots_drive(study: Path) -> None:

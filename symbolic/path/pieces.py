@@ -1,0 +1,111 @@
+"""Paths of more waypoints than a file states, and the same path through those of another task.
+
+The pieces between the stated waypoints are halved, or cut into more, by free waypoints. The path's
+knots are uniform and its spline's end conditions do not depend on them, so that every path through
+the stated waypoints is one through all of them, to the bit at the stated ones. Searches draw the
+stated waypoints; a polish moves all of them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from symbolic.array import Array
+from symbolic.path.spline import path_position
+from symbolic.records.task import RedundantJoint, Task, Waypoint, extended_waypoints
+
+
+def in_pieces(task: Task) -> Task:
+    """A task as its file states it, with the waypoints between those.
+
+    Bounds hold every path that the stated ones allow.
+    """
+    n = len(task.waypoints)
+    by = _through(n, (n - 1) * task.pieces + 1)
+
+    def bounds(lower: Array, upper: Array) -> tuple[Array, Array]:
+        middle, half = by @ ((lower + upper) / 2.0), np.abs(by) @ ((upper - lower) / 2.0)
+        least, most = middle - half, middle + half
+        least[:: task.pieces], most[:: task.pieces] = lower, upper
+        return least, most
+
+    lower, upper = bounds(*(np.array([getattr(w, k) for w in task.waypoints]) for k in BOUNDS))
+    hand_made = np.array([waypoint.lower for waypoint in task.waypoints])
+    hand_made[list(task.free_indices)] = task.initial
+    hand_made[:, 3:] = task.orientation.unwrapped(hand_made[:, 3:])
+    hand_made = np.clip(by @ hand_made, lower, upper)
+    redundant = []
+    for joint in task.redundant:
+        least, most = bounds(joint.lower, joint.upper)
+        initial = np.clip(by @ joint.initial, least, most)
+        redundant.append(replace(joint, lower=least, upper=most, initial=initial))
+    return _with_waypoints(task, lower, upper, hand_made, redundant)
+
+
+def stated(task: Task) -> Task:
+    """The task with the waypoints that its file states alone."""
+    if task.pieces == 1:
+        return task
+    every = slice(None, None, task.pieces)
+    lower, upper = (np.array([getattr(w, k) for w in task.waypoints[every]]) for k in BOUNDS)
+    hand_made = np.array([waypoint.lower for waypoint in task.waypoints])
+    hand_made[list(task.free_indices)] = task.initial
+    redundant = [
+        replace(j, lower=j.lower[every], upper=j.upper[every], initial=j.initial[every])
+        for j in task.redundant
+    ]
+    return replace(_with_waypoints(task, lower, upper, hand_made[every], redundant), pieces=1)
+
+
+BOUNDS = ("lower", "upper")
+
+
+def _with_waypoints(
+    task: Task, lower: Array, upper: Array, hand_made: Array, redundant: list[RedundantJoint]
+) -> Task:
+    waypoints = tuple(map(Waypoint, lower, upper))
+    found = replace(task, waypoints=waypoints, redundant=tuple(redundant))
+    return replace(found, initial=hand_made[list(found.free_indices)])
+
+
+def stated_entries(task: Task) -> NDArray[np.intp]:
+    """(n_path of the stated task,) the path's variables that are of stated waypoints."""
+    return np.flatnonzero(task.free_entries[0] % task.pieces == 0)
+
+
+def by_stated_waypoints(task: Task) -> Array:
+    """(n_path, that of the stated task) how a path through stated waypoints moves with them."""
+    (rows, columns), m = task.free_entries, len(task.waypoints)
+    own, by = stated_entries(task), _through((m - 1) // task.pieces + 1, m)
+    together = columns[:, None] == columns[own]
+    return np.where(together, by[np.ix_(rows, rows[own] // task.pieces)], 0.0)
+
+
+def same_paths(x: Array, source: Task, target: Task) -> Array:
+    """Decision vectors (n, n_path or more) of one task through the waypoints of another: the same
+    paths if the target has all waypoints of the source, else paths through what it has of them.
+
+    What follows the path, a force limit, stays.
+    """
+    x = np.atleast_2d(x)
+    if len(source.waypoints) == len(target.waypoints):
+        return x
+    by, n = _through(len(source.waypoints), len(target.waypoints)), target.n_path
+    paths = [(by @ extended_waypoints(source, row))[target.free_entries] for row in x]
+    within = np.clip(np.reshape(paths, (-1, n)), target.lower[:n], target.upper[:n])
+    return np.hstack([within, x[:, source.n_path :]])
+
+
+@cache
+def _through(n: int, m: int) -> Array:
+    """(m, n) from waypoints to the places of m waypoints on their path."""
+    u = np.linspace(0.0, 1.0, m)
+    by = path_position(n, u).copy()
+    known, where = np.divmod(np.arange(m) * (n - 1), m - 1)
+    by[where == 0] = np.eye(n)[known[where == 0]]
+    by.flags.writeable = False
+    return by
