@@ -99,8 +99,7 @@ def polish(
     beside = np.array([path[: task.n_path] for path in known]).reshape(-1, task.n_path)
     with counted(progress, "polish", settings.attempts) as advance:
         done = polisher.polish(front.x, rng, emit=lambda outcome: advance(1), paths=beside)
-    title = f"{front.title}, polished"
-    return Front(cell, title, done.x, done.objectives, front.evaluations, done)
+    return front.after(done)
 
 
 def time_path(cell: Cell, carry: Carry | Array, limits: TimingLimits | None = None) -> Timing:

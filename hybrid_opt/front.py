@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -26,32 +26,37 @@ class Front(Shown):
 
     Attributes:
         cell: the cell.
-        title: how it came about, as 'nsga2' or 'nsga2, polished'.
+        algorithm: what found it, as 'nsga2', or a word for how else it came about.
         x: (k, n_var) decision vectors.
         objectives: (k, n_obj).
         evaluations: every candidate of the search, in order.
         polished: what the polish did, None without one.
+        replica: of a study, from 0; None where it is of none.
     """
 
     cell: Cell
-    title: str
+    algorithm: str
     x: Array
     objectives: Array
     evaluations: Evaluations
     polished: PolishedFront | None = None
+    replica: int | None = None
 
     def __post_init__(self) -> None:
         for array in (self.x, self.objectives):
             array.setflags(write=False)
 
     @classmethod
-    def of_search(cls, cell: Cell, title: str, evaluations: Evaluations) -> Front:
+    def of_search(
+        cls, cell: Cell, algorithm: str, evaluations: Evaluations, replica: int | None = None
+    ) -> Front:
         """The front among evaluated candidates that `CandidateEvaluator.certified` went through."""
         rows = metrics.front_rows(evaluations.objectives, evaluations.feasible)
-        return cls(cell, title, evaluations.x[rows], evaluations.objectives[rows], evaluations)
+        x, objectives = evaluations.x[rows], evaluations.objectives[rows]
+        return cls(cell, algorithm, x, objectives, evaluations, replica=replica)
 
     @classmethod
-    def of(cls, cell: Cell, x: Array, title: str = "given") -> Front:
+    def of(cls, cell: Cell, x: Array) -> Front:
         """The front of carries that are known to be feasible and free; they are evaluated anew.
 
         Args:
@@ -61,7 +66,24 @@ class Front(Shown):
             SettingsError: x has the wrong shape.
         """
         found = cell.evaluate(x)
-        return cls(cell, title, found.x, found.objectives, found)
+        return cls(cell, "given", found.x, found.objectives, found)
+
+    def after(self, polish: PolishedFront) -> Front:
+        """What a polish made of it."""
+        return replace(self, x=polish.x, objectives=polish.objectives, polished=polish)
+
+    @property
+    def title(self) -> str:
+        """The algorithm's, and whether polished."""
+        # Not imported at the top: the searches take long to load.
+        from hybrid_opt.metaheuristics.registry import title
+
+        return title(self.algorithm) + ("" if self.polished is None else ", polished")
+
+    @property
+    def source(self) -> str:
+        """The title with the number of the replica, as its files have it."""
+        return self.title if self.replica is None else f"{self.title}, replica {self.replica}"
 
     @property
     def objective_names(self) -> tuple[str, ...]:

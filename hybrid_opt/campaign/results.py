@@ -31,8 +31,8 @@ from hybrid_opt.campaign.settings import (
 from hybrid_opt.cell import Cell
 from hybrid_opt.errors import DamagedResultsWarning, ResultsError
 from hybrid_opt.evaluate.evaluations import Evaluations
+from hybrid_opt.front import Front
 from hybrid_opt.indicators import metrics
-from hybrid_opt.metaheuristics.registry import title
 from hybrid_opt.polishing.records import PolishedFront
 from hybrid_opt.store.files import read_bytes, read_document, sha256
 from hybrid_opt.store.json_records import from_json, read_record, record_of
@@ -45,36 +45,6 @@ ANEW = "--resume computes it anew"
 KEPT = 64
 """Tables of candidates, and polished fronts, that are remembered by their content: a study's stages
 read them again and again."""
-
-
-@dataclass(frozen=True)
-class ReplicaFront:
-    """The front of one replica, as searched or as polished; arrays are read-only.
-
-    Attributes:
-        algorithm, replica: whose it is; replicas count from 0.
-        polished: whether it is the polished one.
-        x, objectives: (k, n_var) and (k, n_obj), by increasing first objective.
-    """
-
-    algorithm: str
-    replica: int
-    polished: bool
-    x: Array
-    objectives: Array
-
-    def __len__(self) -> int:
-        return len(self.objectives)
-
-    @property
-    def label(self) -> str:
-        """The algorithm's title, and whether polished."""
-        return title(self.algorithm) + (", polished" if self.polished else "")
-
-    @property
-    def source(self) -> str:
-        """The label with the number of the replica, as its files have it."""
-        return f"{self.label}, replica {self.replica}"
 
 
 @dataclass(frozen=True)
@@ -114,11 +84,6 @@ class Replica:
     def front_x(self) -> Array:
         """(k, n_var) their decision vectors."""
         return self.evaluations.x[self.front_rows]
-
-    @property
-    def searched(self) -> ReplicaFront:
-        """Both of them together."""
-        return ReplicaFront(self.algorithm, self.replica, False, self.front_x, self.front)
 
 
 @dataclass(frozen=True)
@@ -166,7 +131,7 @@ class CampaignResults:
         return read_polished(self.root, replica, self.workcell)
 
     @property
-    def fronts(self) -> tuple[ReplicaFront, ...]:
+    def fronts(self) -> tuple[Front, ...]:
         """Those of all replicas, each as searched and then, where it was polished, as polished.
 
         Raises:
@@ -174,11 +139,10 @@ class CampaignResults:
         """
         found = []
         for replica in self.replicas:
-            found.append(replica.searched)
+            of = replica.algorithm, replica.evaluations, replica.replica
+            found.append(Front.of_search(self.cell, *of))
             polished = self.polished(replica)
-            if polished is not None:
-                key = replica.algorithm, replica.replica
-                found.append(ReplicaFront(*key, True, polished.x, polished.objectives))
+            found += [] if polished is None else [found[-1].after(polished)]
         return tuple(found)
 
 

@@ -208,7 +208,7 @@ class CarryReader:
 
     def __init__(self, cell: SmoothCell) -> None:
         self._evaluator, self._grid, self._robust = cell.evaluator, cell.grid, cell.robust
-        self._rows = cell.functions.rows
+        self._functions = cell.functions
         self._radii = [contact.patch_radius for contact in cell.workcell.contacts]
 
     def read(self, x: Array) -> PlacedCarry:
@@ -234,13 +234,13 @@ class CarryReader:
         q_1, q_2 = posture["q_1"], posture["q_2"]
         rate = np.ascontiguousarray((grid.rate_basis @ waypoints)[:, :POSE_SIZE])
         squares = [
-            1.0 + self._rows.of(Reach(arm), "first").batch(pose, rate, q_1, q_2)["value"]
+            1.0 + self._functions.row(Reach(arm), "first").batch(pose, rate, q_1, q_2)["value"]
             for arm in (0, 1)
         ]
         force = found["normal_force"]
         minimised = force if self._robust is None else self._robust.forces(found)
         held = pose[:reached], q_1[:reached], q_2[:reached]
-        gaps = lru_cache(maxsize=None)(partial(self._rows.gaps, pose=held[0]))
+        gaps = lru_cache(maxsize=None)(partial(self._functions.gaps, pose=held[0]))
         return PlacedCarry(
             pose=pose,
             rate=rate,
@@ -276,6 +276,6 @@ class CarryReader:
     def _sharpened(self, bounds: Array, gaps: Callable[[int], Array]) -> Array:
         """Bounds (n, n_pairs), those of the payload from a box raised to the largest gap."""
         near = bounds.min(axis=0, initial=np.inf) < SHARPENED_BELOW
-        for pair in self._rows.separable.intersection(np.flatnonzero(near).tolist()):
+        for pair in self._functions.separable.intersection(np.flatnonzero(near).tolist()):
             np.maximum(bounds[:, pair], gaps(pair).max(axis=1), out=bounds[:, pair])
         return bounds

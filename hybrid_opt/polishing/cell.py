@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from functools import cache, lru_cache
 
 import casadi as ca
@@ -11,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from codegen.function import NumericFunction
-from codegen.interpreted import InterpretedFunction
 from hybrid_opt.compiled_cell import CompiledCell
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.evaluate.objectives import ROBUST_OBJECTIVES
@@ -28,8 +26,8 @@ from symbolic.smooth.places import (
     ORDERS,
     JointLimit,
     Order,
-    Place,
     PlaceConstraint,
+    PlaceSymbols,
     Reach,
     closure_functions,
     closure_name,
@@ -70,38 +68,40 @@ covered by the distance kept from obstacles, and in the end certified."""
 Indices = NDArray[np.intp]
 
 
-class RowFunctions:
-    """The functions of rows at places; what is not known is built when first asked for."""
+class PolishFunctions:
+    """What the programs of a workcell are assembled from.
 
-    def __init__(
-        self,
-        model: CellBodies,
-        known: Mapping[str, NumericFunction],
-        compiled: CompiledCell | None = None,
-    ) -> None:
-        """known: by name; compiled: what compiles others and keeps them, None interprets them."""
-        self.model, self._known = model, dict(known)
-        self._place, self._cell = Place(model), compiled
-        self._symbols = cache(Place)
+    Attributes:
+        built: by name; see `symbolic.smooth`: forces and pressure at samples, the inverse
+            kinematics of both arms, under the time law 'optimal' limits along a driven path; and
+            constraints at places of the path, of which those that are not known are built when they
+            are first asked for.
+        model: of the cell's bodies.
+        separable: the pairs whose gaps are known, see `gaps`.
+    """
+
+    def __init__(self, compiled: CompiledCell, built: Mapping[str, NumericFunction]) -> None:
+        self.model, self.built, self._cell = compiled.bodies, dict(built), compiled
+        self._place, self._symbols = PlaceSymbols(self.model), cache(PlaceSymbols)
         self.numbers = lru_cache(maxsize=None)(self._numbers)
-        self.obstacle = lru_cache(maxsize=None)(self._place.obstacle)
+        self._obstacle = lru_cache(maxsize=None)(self._place.obstacle)
         self.separable = frozenset(self._place.separable())
 
-    def of(self, constraint: PlaceConstraint, order: Order) -> NumericFunction:
+    def closure(self, arm: int, order: Order) -> NumericFunction:
+        """How an arm's joints follow the box."""
+        return self.built[closure_name(arm, order)]
+
+    def row(self, constraint: PlaceConstraint, order: Order) -> NumericFunction:
         """See `symbolic.smooth.places.row_function`."""
         name = row_name(constraint.family, order)
-        if name not in self._known:
+        if name not in self.built:
 
             def make(model: CellBodies) -> dict[str, ca.Function]:
                 return {name: row_function(self._symbols(model), constraint, order)}
 
             level = {name: LATER_LEVELS[order]}
-            self._known[name] = (
-                InterpretedFunction(row_function(self._place, constraint, order))
-                if self._cell is None
-                else self._cell.functions(f"polish {name}", make, str(level), levels=level)[name]
-            )
-        return self._known[name]
+            self.built |= self._cell.functions(f"polish {name}", make, str(level), levels=level)
+        return self.built[name]
 
     def _numbers(self, constraint: PlaceConstraint) -> Array:
         """See `PlaceConstraint.numbers`."""
@@ -109,25 +109,7 @@ class RowFunctions:
 
     def gaps(self, pair: int, pose: Array) -> Array:
         """(n, DIRECTIONS) gaps [m] of a separable pair at box poses (n, 6)."""
-        return self._known[GAPS].batch(pose, self.obstacle(pair))["gaps"]
-
-
-@dataclass(frozen=True)
-class PolishFunctions:
-    """What the programs of a workcell are assembled from.
-
-    Attributes:
-        built: by name; see `symbolic.smooth`: forces and pressure at samples, the inverse
-            kinematics of both arms, under the time law 'optimal' limits along a driven path.
-        rows: constraints at places of the path.
-    """
-
-    built: Mapping[str, NumericFunction]
-    rows: RowFunctions = field(repr=False)
-
-    def closure(self, arm: int, order: Order) -> NumericFunction:
-        """How an arm's joints follow the box."""
-        return self.built[closure_name(arm, order)]
+        return self.built[GAPS].batch(pose, self._obstacle(pair))["gaps"]
 
 
 def quantities_of(workcell: Workcell) -> tuple[Quantity, ...]:
@@ -168,7 +150,7 @@ def polish_functions(compiled: CompiledCell) -> PolishFunctions:
         return {name: f for name, f in samples(model).items() if name not in levels}
 
     def rows(model: CellModel) -> dict[str, ca.Function]:
-        place = Place(model)
+        place = PlaceSymbols(model)
         found = {
             row_name(constraint.family, order): row_function(place, constraint, order)
             for constraint in COMPILED
@@ -190,7 +172,7 @@ def polish_functions(compiled: CompiledCell) -> PolishFunctions:
             built |= compiled.functions(
                 "driven held", _driven_held, levels=levels, lanes=0, bodies=False
             )
-    return PolishFunctions(built, RowFunctions(compiled.bodies, built, compiled))
+    return PolishFunctions(compiled, built)
 
 
 def _held(model: CellModel) -> dict[str, ca.Function]:

@@ -19,7 +19,7 @@ import numpy as np
 
 from codegen.cache import Cache
 from codegen.errors import CodegenError
-from hybrid_opt.polishing.cell import Indices, RowFunctions, SmoothCell
+from hybrid_opt.polishing.cell import Indices, PolishFunctions, SmoothCell
 from hybrid_opt.polishing.native import Native, Records, native
 from symbolic.array import Array
 from symbolic.records.task import POSE_SIZE
@@ -349,7 +349,7 @@ class Rows:
         for own in members.values():
             constraints, stop = [rows[k].constraint for k in own], start + len(own)
             group = self._lay_out_group(constraints, slice(start, stop), shared)
-            for arm in constraints[0].arms(cell.functions.rows.model):
+            for arm in constraints[0].arms(cell.functions.model):
                 needed[arm].append(at[start:stop])
             groups.append(group)
             start = stop
@@ -382,9 +382,9 @@ class Rows:
     ) -> Any:
         """Rows of one family; what second derivatives need is filled in when they are asked for:
         most rows never rule."""
-        functions, one, memory = self._cell.functions.rows, constraints[0], self._memory
+        functions, one, memory = self._cell.functions, constraints[0], self._memory
         given = {name: array[rows] for name, array in shared.items()}
-        first = functions.of(one, "first").prepared(len(constraints), given=given)
+        first = functions.row(one, "first").prepared(len(constraints), given=given)
         if "numbers" in first.inputs:
             first.inputs["numbers"][...] = row_numbers(constraints, functions)[0]
         self._families.append(one)
@@ -487,7 +487,7 @@ class Rows:
         memory, functions = self._memory, self._cell.functions
         if which >= _GROUPS:
             group = self._groups + which - _GROUPS
-            second = functions.rows.of(self._families[which - _GROUPS], "second")
+            second = functions.row(self._families[which - _GROUPS], "second")
             batch = second.prepared(group.stop - group.start)
             for k, name in enumerate(INPUTS):
                 if name in batch.inputs:
@@ -523,7 +523,7 @@ def row_library(kept: Cache | None = None) -> Native:
 
 
 def row_numbers(
-    constraints: Sequence[PlaceConstraint], functions: RowFunctions
+    constraints: Sequence[PlaceConstraint], functions: PolishFunctions
 ) -> tuple[Array, ...]:
     """(rows, n) numbers of constraints of one family, in a tuple; an empty one without any."""
     numbers = np.array([functions.numbers(constraint) for constraint in constraints])

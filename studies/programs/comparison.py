@@ -139,7 +139,8 @@ def _values(
     better = [row.polished for row in stored if row.polished is not None]
     values: dict[str, list[float]] = {}
     for prefix, rows in (("", stored), (POLISHED, better)):
-        fronts = [f for f in run.fronts if (f.algorithm, f.polished) == (name, bool(prefix))]
+        own = [front for front in run.fronts if front.algorithm == name]
+        fronts = [front for front in own if (front.polished is not None) == bool(prefix)]
         if not rows or not fronts:
             continue
         anew = [front_indicators(front.objectives, reference, None, None) for front in fronts]

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from hybrid_opt.branches import BranchCompetition
 from hybrid_opt.campaign.cell_source import ReadyCell, cells_of, read_branches, ready_cells
-from hybrid_opt.campaign.results import CampaignResults, ReplicaFront, read_campaign
+from hybrid_opt.campaign.results import CampaignResults, read_campaign
 from hybrid_opt.campaign.settings import CONFIGURATION, HAND_MADE, RECOMMENDED, SUMMARY
 from hybrid_opt.carry import Carry
 from hybrid_opt.display.table import Table
@@ -30,6 +30,7 @@ from hybrid_opt.evaluate.objectives import (
     duration_unit,
     force_kind,
 )
+from hybrid_opt.front import Front
 from hybrid_opt.indicators.selection import selected_row
 from hybrid_opt.metaheuristics.registry import title
 from hybrid_opt.recommending.comparison import level_force
@@ -170,8 +171,8 @@ class Run:
     """
 
     evaluations: Evaluations
-    front: ReplicaFront
-    hybrid: ReplicaFront | None
+    front: Front
+    hybrid: Front | None
     figures: ReplicaFigures
 
 
@@ -235,7 +236,7 @@ class Experiment:
         """Whether fronts were polished."""
         return any(run.hybrid is not None for a in self.algorithms for run in a.runs)
 
-    def fronts(self) -> Iterator[tuple[AlgorithmRuns, ReplicaFront, bool]]:
+    def fronts(self) -> Iterator[tuple[AlgorithmRuns, Front, bool]]:
         """Fronts of the representative runs, and whether a polished one stands beside each."""
         for algorithm in self.solved:
             run = algorithm.shown
@@ -397,7 +398,7 @@ def _best(evaluator: CandidateEvaluator, run: Run) -> DrawnCarry | None:
     front = run.hybrid if run.hybrid is not None and len(run.hybrid) else run.front
     if not len(front):
         return None
-    return DrawnCarry(front.label, evaluator.carry(front.x[selected_row(evaluator, front.x)]))
+    return DrawnCarry(front.title, evaluator.carry(front.x[selected_row(evaluator, front.x)]))
 
 
 def _hand_made(evaluator: CandidateEvaluator) -> DrawnCarry:

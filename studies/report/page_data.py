@@ -361,7 +361,7 @@ def _drive_groups(data: ReportData, drivable: Experiment, cell: int) -> Iterator
             Shown(front.source, front.x[k], front.source, cell)
             for k in spread(len(front), MAX_FRONT)
         )
-        yield Group(front.source, some, front.label, marker(series(algorithm.index), opened))
+        yield Group(front.source, some, front.title, marker(series(algorithm.index), opened))
 
 
 def _search_groups(data: ReportData) -> Iterator[Group]:
@@ -377,7 +377,7 @@ def _search_groups(data: ReportData) -> Iterator[Group]:
         rows = spread(len(front), MAX_FRONT)
         some = tuple(Shown(front.source, front.x[k], front.source, has_job=False) for k in rows)
         look = marker(series(algorithm.index), opened) if two else None
-        yield Group(front.source, some, front.label, look, front.objectives[rows][:, :2])
+        yield Group(front.source, some, front.title, look, front.objectives[rows][:, :2])
 
 
 def curves(data: ReportData) -> Iterator[tuple[DrawnCarry, str, LineStyle, Array]]:
@@ -431,7 +431,7 @@ def _drive_view(
         if not front.polished:
             run = algorithm.shown.evaluations
             at = drivable.driven(run.objectives[run.feasible])
-            clouds.append(cloud(front.label, at, series(algorithm.index)))
+            clouds.append(cloud(front.title, at, series(algorithm.index)))
     for _, label, look, curve in curves(data):
         lines.append(line(label, curve, look.colour, "dot" if look is HAND_MADE else "dash"))
         drawn.append(curve)

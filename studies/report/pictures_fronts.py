@@ -189,7 +189,7 @@ def duration_against_force(data: ReportData) -> Figure:
     if data.drivable is not None:
         for algorithm, front, opened in data.drivable.fronts():
             found, look = data.drivable.driven(front.objectives), series(algorithm.index)
-            axes.plot(*found.T, **look.marks(4.0, opened=opened), label=front.label)
+            axes.plot(*found.T, **look.marks(4.0, opened=opened), label=front.title)
             drawn.append(found)
         if choice is not None:
             drawn += _replicas(axes, data.drivable, choice)
@@ -211,7 +211,7 @@ def duration_against_force(data: ReportData) -> Figure:
 def _replicas(axes: Axes, drivable: Experiment, choice: StoredRecommendation) -> list[Array]:
     """Durations of the best fronts' paths at the same forces; returns the points of the medians."""
     # Of fronts that a polished one stands beside, that one alone.
-    looks = {f.label: series(a.index) for a, f, opened in drivable.fronts() if not opened}
+    looks = {f.title: series(a.index) for a, f, opened in drivable.fronts() if not opened}
     force, drawn = np.array(choice.durations.forces), []
     for row in choice.durations.rows:
         if row.label not in looks:

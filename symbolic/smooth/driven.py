@@ -72,7 +72,7 @@ class DrivenLayout:
         }
 
     def block(self, name: str) -> slice:
-        """Place of a block."""
+        """PlaceSymbols of a block."""
         sizes = self.sizes
         start = sum(list(sizes.values())[: list(sizes).index(name)])
         return slice(start, start + sizes[name])

@@ -24,7 +24,7 @@ import numpy as np
 from symbolic.array import Array
 from symbolic.expression import sx_given
 from symbolic.geometry.clearance import BOX_NUMBERS
-from symbolic.smooth.places import Place, PlaceConstraint
+from symbolic.smooth.places import PlaceConstraint, PlaceSymbols
 
 GAPS = "gaps"
 """Name of `gap_function`."""
@@ -71,7 +71,7 @@ def direction_numbers(obstacle: Array, k: int) -> Array:
     return np.concatenate([turned[0], along_payload, turned[1], other])
 
 
-def direction(place: Place, numbers: ca.SX) -> ca.SX:
+def direction(place: PlaceSymbols, numbers: ca.SX) -> ca.SX:
     """(3,) not normalised: the sum of a fixed vector, one of the payload, and the product of a
     fixed edge and one of the payload. All but one are zero.
 
@@ -83,7 +83,7 @@ def direction(place: Place, numbers: ca.SX) -> ca.SX:
     return fixed + turned[:, 0] + ca.cross(edge, turned[:, 1])
 
 
-def gap(place: Place, obstacle: ca.SX, numbers: ca.SX) -> ca.SX:
+def gap(place: PlaceSymbols, obstacle: ca.SX, numbers: ca.SX) -> ca.SX:
     """The gap along a direction, its kinks rounded [m]."""
     n = direction(place, numbers)
     return place.scene.separation(obstacle, n / ca.norm_2(n))
@@ -103,15 +103,15 @@ class Separation(PlaceConstraint):
         """All pairs and directions."""
         return "separation"
 
-    def expression(self, place: Place, numbers: ca.SX) -> ca.SX:
+    def expression(self, place: PlaceSymbols, numbers: ca.SX) -> ca.SX:
         """The gap."""
         return gap(place, numbers[:BOX_NUMBERS], numbers[BOX_NUMBERS:])
 
-    def count(self, place: Place) -> int:
+    def count(self, place: PlaceSymbols) -> int:
         """Those of the obstacle and of the direction."""
         return BOX_NUMBERS + DIRECTION_NUMBERS
 
-    def numbers(self, place: Place) -> Array:
+    def numbers(self, place: PlaceSymbols) -> Array:
         """The obstacle, and the direction."""
         obstacle = place.obstacle(self.pair)
         return np.concatenate([obstacle, direction_numbers(obstacle, self.direction)])
@@ -133,7 +133,7 @@ class Passing(PlaceConstraint):
         """All pairs and directions."""
         return "passing"
 
-    def expression(self, place: Place, numbers: ca.SX) -> ca.SX:
+    def expression(self, place: PlaceSymbols, numbers: ca.SX) -> ca.SX:
         """Where the lines of both gaps meet."""
         obstacle, both = (
             numbers[:BOX_NUMBERS],
@@ -143,18 +143,18 @@ class Passing(PlaceConstraint):
         falls, rises = (ca.jtimes(one, place.pose, place.rate) for one in (before, after))
         return (rises * before - falls * after) / (rises - falls)
 
-    def count(self, place: Place) -> int:
+    def count(self, place: PlaceSymbols) -> int:
         """Those of the obstacle and of both directions."""
         return BOX_NUMBERS + 2 * DIRECTION_NUMBERS
 
-    def numbers(self, place: Place) -> Array:
+    def numbers(self, place: PlaceSymbols) -> Array:
         """The obstacle, and both directions."""
         obstacle = place.obstacle(self.pair)
         both = [direction_numbers(obstacle, k) for k in (self.before, self.after)]
         return np.concatenate([obstacle, *both])
 
 
-def gap_function(place: Place) -> ca.Function:
+def gap_function(place: PlaceSymbols) -> ca.Function:
     """pose (6,), obstacle (BOX_NUMBERS,) -> gaps (DIRECTIONS,) along single directions, with their
     kinks [m]. The largest is positive where the payload, a box, and the obstacle are apart, and
     never more than their distance then; but for edges that are nearly parallel."""

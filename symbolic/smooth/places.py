@@ -56,7 +56,7 @@ TURN = 3e-3
 in these kinks, and a solver that sees them sharp creeps along."""
 
 
-class Place:
+class PlaceSymbols:
     """The symbols of one place and what is built from them once.
 
     Attributes:
@@ -124,14 +124,14 @@ class PlaceConstraint(ABC):
         """Name of those that share their functions."""
 
     @abstractmethod
-    def expression(self, place: Place, numbers: ca.SX) -> ca.SX:
+    def expression(self, place: PlaceSymbols, numbers: ca.SX) -> ca.SX:
         """The value, by the numbers (n,) of a member of the family."""
 
-    def count(self, place: Place) -> int:
+    def count(self, place: PlaceSymbols) -> int:
         """How many numbers the family's functions take."""
         return 0
 
-    def numbers(self, place: Place) -> Array:
+    def numbers(self, place: PlaceSymbols) -> Array:
         """(count,) what tells this one from others of its family."""
         return np.zeros(0)
 
@@ -159,7 +159,7 @@ class Clearance(PlaceConstraint):
         """Every pair is its own."""
         return f"clearance_{self.column}"
 
-    def expression(self, place: Place, numbers: ca.SX) -> ca.SX:
+    def expression(self, place: PlaceSymbols, numbers: ca.SX) -> ca.SX:
         """The bound of `symbolic.geometry.clearance`, its kinks rounded."""
         return place.scene.bound(self.column)
 
@@ -186,15 +186,15 @@ class JointLimit(PlaceConstraint):
         """All limits of one arm."""
         return f"joint_limit_{self.arm + 1}"
 
-    def expression(self, place: Place, numbers: ca.SX) -> ca.SX:
+    def expression(self, place: PlaceSymbols, numbers: ca.SX) -> ca.SX:
         """The margin, negative beyond the limit."""
         return numbers[0] + ca.dot(numbers[1:], place.q[self.arm])
 
-    def count(self, place: Place) -> int:
+    def count(self, place: PlaceSymbols) -> int:
         """A margin and a slope per joint."""
         return 1 + int(place.q[self.arm].numel())
 
-    def numbers(self, place: Place) -> Array:
+    def numbers(self, place: PlaceSymbols) -> Array:
         """The margin at zero joints, and its gradient."""
         robot = place.model.workcell.robots[self.arm]
         slope = np.zeros(robot.position_lower.shape[0])
@@ -228,7 +228,7 @@ class Reach(PlaceConstraint):
         """Every arm is its own."""
         return f"reach_{self.arm + 1}"
 
-    def expression(self, place: Place, numbers: ca.SX) -> ca.SX:
+    def expression(self, place: PlaceSymbols, numbers: ca.SX) -> ca.SX:
         """Zero at the least manipulability that the workcell allows."""
         least = place.model.workcell.robots[self.arm].min_manipulability
         model = place.model.robots[self.arm]
@@ -254,7 +254,7 @@ def closure_name(arm: int, order: Order) -> str:
     return f"closure_{arm + 1}_{order}"
 
 
-def row_function(place: Place, constraint: PlaceConstraint, order: Order) -> ca.Function:
+def row_function(place: PlaceSymbols, constraint: PlaceConstraint, order: Order) -> ca.Function:
     """The value and gradient, or the Hessian, of a constraint's family by what it depends on.
 
     With y = pose, then the rate where it is `moving`, then the joints of its `arms`:

@@ -1,7 +1,7 @@
 """No compiler runs after a change of a number, whatever is then asked of the cell.
 
 What is built when a solve first asks for it are rows of the distances of single pairs
-(`hybrid_opt.polishing.cell.RowFunctions`): another number can bring another pair near.
+(`hybrid_opt.polishing.cell.PolishFunctions`): another number can bring another pair near.
 """
 
 from __future__ import annotations

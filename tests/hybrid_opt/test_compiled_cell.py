@@ -52,7 +52,7 @@ def test_the_model_is_built_once_for_all_functions(monkeypatch: pytest.MonkeyPat
     assert not models
     assert cell.evaluator.functions is cell.compiled.evaluators
     assert cell.timing_model.search_carry(cell.initial).workcell is cell.workcell
-    assert cell.polish_functions.rows.model is cell.compiled.bodies
+    assert cell.polish_functions.model is cell.compiled.bodies
     assert len(models) <= 1
 
 

@@ -130,7 +130,7 @@ def test_an_empty_front_says_so() -> None:
 
 def test_a_polish_makes_it_better() -> None:
     assert polished().hypervolume() > front().hypervolume()
-    assert polished().title == "nsga2, polished"
+    assert polished().title == "NSGA-II, polished"
     done = polished().polished
     assert done is not None
     accepted = sum(outcome.status == "accepted" for outcome in done.outcomes)

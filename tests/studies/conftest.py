@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hybrid_opt.campaign.results import ReplicaFront, read_campaign
+from hybrid_opt.campaign.results import read_campaign
 from hybrid_opt.indicators.metrics import non_dominated
-from hybrid_opt.polishing.records import PolishEffort
+from hybrid_opt.polishing.records import PolishedFront, PolishEffort
 from studies.report.data import ReportData, Run, gather
 from studies.study.simulation import StoredSimulation
 from studies.study.summary import PolishedFigures, front_indicators
@@ -71,8 +71,10 @@ def hybrid_data(data: ReportData) -> ReportData:
     figures = PolishedFigures(**indicators, **vars(effort))
 
     def polished(run: Run) -> Run:
-        of = run.front.algorithm, run.front.replica
-        hybrid = ReplicaFront(*of, True, x[best], objectives[best])
+        n = int(best.sum())
+        rows, made = np.arange(n), np.ones(n, dtype=bool)
+        done = PolishedFront(x[best], objectives[best], rows, made, (), 1.0, 1.0, "dense")
+        hybrid = run.front.after(done)
         return replace(run, hybrid=hybrid, figures=replace(run.figures, polished=figures))
 
     algorithms = tuple(

@@ -68,7 +68,7 @@ class DistanceKind(Kind[PlaceRow]):
         self.wanted = tolerance + cell.clearance
         # Half of what is wanted beyond the tolerance is left to what solver and FCL round off.
         self.least = tolerance + cell.clearance / 2.0
-        self.separable = cell.functions.rows.separable
+        self.separable = cell.functions.separable
         self._columns = cell.evaluator.checker.geometry.columns.tolist()
 
     def required(

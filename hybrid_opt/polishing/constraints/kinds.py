@@ -304,9 +304,9 @@ def smooth_values(cell: SmoothCell, carry: PlacedCarry, rows: Sequence[PlaceRow]
         groups.setdefault(row.constraint.family, []).append(k)
     for members in groups.values():
         at = [rows[k].place for k in members]
-        functions, kinds = cell.functions.rows, [rows[k].constraint for k in members]
+        functions, kinds = cell.functions, [rows[k].constraint for k in members]
         inputs = [array[at] for array in (carry.pose, carry.rate, *carry.q)]
         inputs += row_numbers(kinds, functions)
-        function = functions.of(kinds[0], "first")
+        function = functions.row(kinds[0], "first")
         values[members] = function.batch(*inputs)["value"]
     return values

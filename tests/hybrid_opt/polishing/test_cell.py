@@ -11,10 +11,11 @@ import pytest
 
 from codegen.cache import Cache
 from codegen.compiled import CompiledFunction
+from codegen.interpreted import InterpretedFunction
 from hybrid_opt.compiled_cell import CompiledCell
 from hybrid_opt.polishing import cell as cell_module
-from hybrid_opt.polishing.cell import PLACE_SPACING, Grid, RowFunctions
-from symbolic.smooth.places import ORDERS, Clearance
+from hybrid_opt.polishing.cell import PLACE_SPACING, Grid, PolishFunctions
+from symbolic.smooth.places import ORDERS, Clearance, PlaceSymbols, row_function
 from tests.symbolic.cells import hand_cell, rack_cell
 
 
@@ -22,19 +23,20 @@ def test_a_row_compiled_on_demand_is_the_interpreted_one_and_is_kept(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     compiled = CompiledCell(rack_cell(), Cache(tmp_path))
-    plain = RowFunctions(compiled.bodies, {})
-    pair = next(k for k in range(99) if k not in plain.separable)
+    made = PolishFunctions(compiled, {})
+    pair = next(k for k in range(99) if k not in made.separable)
     row = Clearance(pair, int(compiled.geometry.columns[pair]))
-    made = RowFunctions(compiled.bodies, {}, compiled)
-    again = RowFunctions(compiled.bodies, {}, CompiledCell(rack_cell(), Cache(tmp_path)))
+    again = PolishFunctions(CompiledCell(rack_cell(), Cache(tmp_path)), {})
+    symbols = PlaceSymbols(compiled.bodies)
     rng = np.random.default_rng(0)
     for order in ORDERS:
-        function, expected = made.of(row, order), plain.of(row, order)
+        function = made.row(row, order)
+        expected = InterpretedFunction(row_function(symbols, row, order))
         assert isinstance(function, CompiledFunction)
-        assert made.of(row, order) is function
+        assert made.row(row, order) is function
         with monkeypatch.context() as patched:
             patched.setattr(cell_module, "row_function", not_again)
-            assert again.of(row, order).signature == function.signature
+            assert again.row(row, order).signature == function.signature
         inputs = [rng.uniform(-1.0, 1.0, (5, *shape)) for shape in function.input_shapes]
         found, interpreted = function.batch(*inputs), expected.batch(*inputs)
         for name in function.output_names:

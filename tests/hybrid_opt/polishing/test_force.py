@@ -70,8 +70,8 @@ def program_of(judge: CandidateEvaluator) -> tuple[ForceProgram, Array]:
     task, cell = judge.workcell.task, smooth_cell(judge)
     x = initial_decision(task)
     carry = CarryReader(cell).read(x)
-    box, *_ = sorted(cell.functions.rows.separable)
-    separable, pairs = cell.functions.rows.separable, carry.distances.bounds.shape[1]
+    box, *_ = sorted(cell.functions.separable)
+    separable, pairs = cell.functions.separable, carry.distances.bounds.shape[1]
     columns = cell.evaluator.checker.geometry.columns
     arms = [k for k in range(pairs) if k not in separable]
     rows: list[Row] = [

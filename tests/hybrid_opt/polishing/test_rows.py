@@ -13,8 +13,8 @@ from symbolic.smooth.passage import Passing, Separation
 from symbolic.smooth.places import (
     Clearance,
     JointLimit,
-    Place,
     PlaceConstraint,
+    PlaceSymbols,
     Reach,
     closure_functions,
     closure_name,
@@ -33,7 +33,7 @@ def written(constraint: PlaceConstraint, place: int, x: Array, near: tuple[Array
         near: both arms' joints near those that hold the box there.
     """
     cell, model = smooth_cell(evaluator(RACK)), evaluator(RACK).compiled.model
-    points, symbols = cell.waypoints(x), Place(model)
+    points, symbols = cell.waypoints(x), PlaceSymbols(model)
     pose, rate = (basis[place] @ points for basis in (cell.grid.basis, cell.grid.rate_basis))
     joints, follow = [], []
     for arm in (0, 1):
@@ -61,8 +61,8 @@ def test_values_and_slopes_are_those_of_the_expressions() -> None:
     cell = smooth_cell(evaluator(RACK))
     x = initial_decision(cell.task)
     carry = CarryReader(cell).read(x)
-    box, *_ = sorted(cell.functions.rows.separable)
-    arm = next(k for k in range(99) if k not in cell.functions.rows.separable)
+    box, *_ = sorted(cell.functions.separable)
+    arm = next(k for k in range(99) if k not in cell.functions.separable)
     column = int(cell.evaluator.checker.geometry.columns[arm])
     kinds: list[PlaceConstraint] = [Clearance(arm, column), Reach(1), JointLimit(0, 2, "lower")]
     kinds += [JointLimit(1, 4, "upper"), Separation(box, 3), Passing(box, 5, 0)]

@@ -168,7 +168,7 @@ def test_every_point_shows_what_robots_drive(data: ReportData, document: dict[st
     assert data.drivable is not None
     view = document["views"][0]
     _, front, _ = next(data.drivable.fronts())
-    group = next(g for g in points(view) if g["name"] == front.label)
+    group = next(g for g in points(view) if g["name"] == front.title)
     assert len(group["customdata"]) == len(front.x)
     cell = ho.Cell(data.drivable.workcell, DRIVABLE_OBJECTIVES)
     for k in (0, len(front.x) - 1):
@@ -200,7 +200,7 @@ def test_every_point_has_the_phases_of_its_job(
     """As `plan_job` plans them around the same timing."""
     assert data.drivable is not None
     _, front, _ = next(data.drivable.fronts())
-    group = next(g for g in points(document["views"][0]) if g["name"] == front.label)
+    group = next(g for g in points(document["views"][0]) if g["name"] == front.title)
     x = front.x[0]
     cell = Cell(data.drivable.workcell, DRIVABLE_OBJECTIVES)
     limits = ho.TimingLimits(force=float(x[-1]))

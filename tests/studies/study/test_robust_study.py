@@ -190,7 +190,7 @@ def test_the_report_shows_robust_forces(data: ReportData) -> None:
     # Points of the fronts are driven as the search found them.
     assert data.drivable is not None
     _, front, _ = next(data.drivable.fronts())
-    (shown,) = (each for each in view["data"] if each["name"] == front.label)
+    (shown,) = (each for each in view["data"] if each["name"] == front.title)
     cell = Cell(data.drivable.workcell, data.objectives)
     for k in (0, len(front.x) - 1):
         point = page["trajectories"][shown["customdata"][k]]

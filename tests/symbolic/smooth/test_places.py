@@ -34,8 +34,8 @@ from symbolic.smooth.places import (
     TURN,
     Clearance,
     JointLimit,
-    Place,
     PlaceConstraint,
+    PlaceSymbols,
     Reach,
     closure_functions,
     closure_name,
@@ -55,8 +55,8 @@ STILL = np.zeros(6)
 
 
 @cache
-def place() -> Place:
-    return Place(rack_model())
+def place() -> PlaceSymbols:
+    return PlaceSymbols(rack_model())
 
 
 def value_of(constraint: PlaceConstraint, *at: Array) -> float:
