@@ -181,7 +181,7 @@ class Cell:
     @cached_property
     def unheld(self) -> str:
         """Why the payload cannot be held still, and what would do; '' where it can."""
-        return unheld(self.workcell) or unheld(self.workcell, self.evaluator)
+        return unheld(self.workcell) or unheld(self.workcell, self.evaluator.outputs)
 
     def require_hold(self) -> None:
         """Refuse a payload that cannot be held still; what needs no compiled code is asked first.
@@ -190,7 +190,7 @@ class Cell:
             WorkcellError: it cannot; the text says what is needed, allowed, and what would do.
         """
         require_hold(self.workcell)
-        require_hold(self.workcell, self.evaluator)
+        require_hold(self.workcell, self.evaluator.outputs)
 
     @property
     def geometry(self) -> CellGeometry:

@@ -20,11 +20,13 @@ from symbolic.records.quantities import FRICTION
 from symbolic.records.task import initial_decision
 
 if TYPE_CHECKING:
-    from hybrid_opt.evaluate.evaluation import CandidateEvaluator
     from symbolic.robot.model import RobotModel
 
 ROUNDING = 1e-6
 """Share by which a limit may be exceeded that is met exactly."""
+
+Outputs = Callable[[Array], dict[str, Array]]
+"""Every per-sample output of decision vectors (n, n_var)."""
 
 STEPS = 24
 """Bisections for the mass or the friction that would do."""
@@ -148,7 +150,7 @@ NORMAL, WHOLE = "normal force", "force in all"
 PRESSURE, TORQUE = "shift of the pressure", "joint torque"
 
 
-def unheld(workcell: Workcell, evaluator: CandidateEvaluator | None = None) -> str:
+def unheld(workcell: Workcell, outputs: Outputs | None = None) -> str:
     """Why the payload cannot be held still at the start or the goal, and what would do; '' where
     it can.
 
@@ -157,13 +159,14 @@ def unheld(workcell: Workcell, evaluator: CandidateEvaluator | None = None) -> s
 
     Args:
         workcell: the cell.
-        evaluator: of the cell; with it joint torques count as well, in the postures that the
-            hand-made trajectory begins and ends with.
+        outputs: of decision vectors, as `CandidateEvaluator.outputs` gives them; with it joint
+            torques count as well, in the postures that the hand-made trajectory begins and ends
+            with.
 
     Raises:
         RobotModelError: a URDF does not give an arm.
     """
-    still = _Still(workcell, [] if evaluator is None else _ends(evaluator))
+    still = _Still(workcell, [] if outputs is None else _ends(workcell, outputs))
     exceeded = still.exceeded()
     if not exceeded:
         return ""
@@ -174,25 +177,25 @@ def unheld(workcell: Workcell, evaluator: CandidateEvaluator | None = None) -> s
     return f"it cannot be held still: {told}. {still.remedy(exceeded)}"
 
 
-def require_hold(workcell: Workcell, evaluator: CandidateEvaluator | None = None) -> None:
+def require_hold(workcell: Workcell, outputs: Outputs | None = None) -> None:
     """Refuse a cell whose payload cannot be held still, see `unheld`.
 
     Raises:
         WorkcellError: it cannot.
     """
-    told = unheld(workcell, evaluator)
+    told = unheld(workcell, outputs)
     if told:
         raise WorkcellError(str(workcell.source), (f"payload: {told}",))
 
 
-def _ends(evaluator: CandidateEvaluator) -> list[tuple[Array, Array]]:
+def _ends(workcell: Workcell, outputs: Outputs) -> list[tuple[Array, Array]]:
     """Both arms' joints at the start and the goal of the hand-made trajectory; those that are
     reached."""
-    outputs = evaluator.outputs(initial_decision(evaluator.workcell.task)[None])
+    found = outputs(initial_decision(workcell.task)[None])
     return [
-        (outputs["q_1"][0, sample], outputs["q_2"][0, sample])
+        (found["q_1"][0, sample], found["q_2"][0, sample])
         for sample in (0, -1)
-        if not (outputs["lost_1"][0, sample] or outputs["lost_2"][0, sample])
+        if not (found["lost_1"][0, sample] or found["lost_2"][0, sample])
     ]
 
 

@@ -6,6 +6,7 @@ a sample is a function of (u'', u'^2) whose coefficients lie packed in one vecto
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Any
 
@@ -45,8 +46,40 @@ SPEEDS_OF_BOX = 4
 
 
 @dataclass(frozen=True)
-class LimitLayout:
-    """Where the coefficients lie in a sample's vector; `joints` counts those of both arms.
+class BlockLayout(ABC):
+    """Where blocks of numbers lie in a vector, one behind the other.
+
+    Attributes:
+        joints: of both arms.
+    """
+
+    joints: int
+
+    @property
+    @abstractmethod
+    def sizes(self) -> dict[str, int]:
+        """Numbers per block, in order."""
+
+    @property
+    def offsets(self) -> dict[str, int]:
+        """First place of each block."""
+        sizes = self.sizes
+        ends = np.cumsum([0, *sizes.values()]).tolist()
+        return dict(zip(sizes, ends, strict=False))
+
+    def block(self, name: str) -> slice:
+        """Place of a block."""
+        start = self.offsets[name]
+        return slice(start, start + self.sizes[name])
+
+    @property
+    def size(self) -> int:
+        """All numbers."""
+        return sum(self.sizes.values())
+
+
+class LimitLayout(BlockLayout):
+    """Where the coefficients of limits lie in a sample's vector.
 
     Blocks, in order:
     speed (joints + 4): demands d, each |d u'| <= 1: joints, payload, payload turning, and the
@@ -62,11 +95,9 @@ class LimitLayout:
     limits.
     """
 
-    joints: int
-
     @property
     def sizes(self) -> dict[str, int]:
-        """Numbers per block."""
+        """See `BlockLayout`."""
         j = self.joints
         return {
             "speed": j + SPEEDS_OF_BOX,
@@ -77,18 +108,6 @@ class LimitLayout:
             "torque": 3 * j,
             "wrench": 6 * j,
         }
-
-    @property
-    def offsets(self) -> dict[str, int]:
-        """First place of each block."""
-        sizes = self.sizes
-        ends = np.cumsum([0, *sizes.values()]).tolist()
-        return dict(zip(sizes, ends, strict=False))
-
-    @property
-    def size(self) -> int:
-        """Numbers per sample."""
-        return sum(self.sizes.values())
 
 
 def limit_layout(workcell: Workcell) -> LimitLayout:

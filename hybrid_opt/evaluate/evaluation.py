@@ -57,7 +57,7 @@ from symbolic.records import Workcell
 from symbolic.records.task import extended_waypoints
 
 if TYPE_CHECKING:
-    from hybrid_opt.timing.drive import Driver
+    from hybrid_opt.timing.drive import CandidateDriver
 
 MOST_KNOWN = 4096
 """Paths that are remembered; then it begins anew."""
@@ -82,7 +82,7 @@ class CandidateEvaluator:
         objectives: Sequence[str | Objective] = PAPER_OBJECTIVES,
         threads: int = 1,
         functions: Mapping[str, NumericFunction] | None = None,
-        driver: Driver | None = None,
+        driver: CandidateDriver | None = None,
         compiled: CompiledCell | None = None,
     ) -> None:
         """Load or build the compiled functions.
@@ -119,13 +119,15 @@ class CandidateEvaluator:
         """The evaluation in lanes, where there is one."""
         return load_kernel(self.compiled, self.checker, self.outputs) if self._in_lanes else None
 
-    def _driver(self, threads: int) -> Driver | None:
+    def _driver(self, threads: int) -> CandidateDriver | None:
         if self.workcell.task.time_law != "optimal":
             return None
         # Not imported at the top: other time laws need no timing, and hence no CasADi.
-        from hybrid_opt.timing.drive import driver_of
+        from hybrid_opt.timing.drive import CandidateDriver
+        from hybrid_opt.timing.path_timer import PathTimer
 
-        return driver_of(self.compiled, threads, force_kind(self.objectives).robust)
+        timer = PathTimer(self.compiled, threads=threads)
+        return CandidateDriver(timer, threads, force_kind(self.objectives).robust)
 
     def beginning_at(self, q_1: Array, q_2: Array) -> CandidateEvaluator:
         """The same evaluator with other start postures: joints (n,) of each arm that hold the box
@@ -147,7 +149,7 @@ class CandidateEvaluator:
     def outputs(self, x: Array) -> dict[str, Array]:
         """Every per-sample output for decision vectors (n, n_var), see
         `symbolic.functions`; under the time law 'optimal' also what
-        `hybrid_opt.timing.drive.Driver.outputs` adds."""
+        `hybrid_opt.timing.drive.CandidateDriver.outputs` adds."""
         x = self._checked(x)
         if self.driver is not None:
             return self.driver.outputs(self._candidate, x)

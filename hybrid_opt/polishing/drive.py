@@ -42,7 +42,7 @@ from hybrid_opt.polishing.solvers.quadratic import (
 )
 from hybrid_opt.robust.cases import is_squeezed
 from hybrid_opt.robust.path_force import PathPoints, robust_path
-from hybrid_opt.timing.drive import Driver
+from hybrid_opt.timing.drive import CandidateDriver
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.path.pieces import by_stated_waypoints, stated, stated_entries
@@ -122,7 +122,7 @@ class PathJudge:
         force_limit: least and largest [N].
     """
 
-    def __init__(self, driver: Driver) -> None:
+    def __init__(self, driver: CandidateDriver) -> None:
         self._timer, self._limits, self.force_limit = (
             driver.timer,
             driver.limits,
@@ -144,7 +144,7 @@ class PathJudge:
         return np.array([t.duration if t.ok else np.inf for t in found])
 
 
-def force_range(driver: Driver) -> tuple[float, float]:
+def force_range(driver: CandidateDriver) -> tuple[float, float]:
     """The task's least and largest force limit [N]; of robust forces the least is at least what
     holds the box at both ends of every path."""
     workcell = driver.timer.workcell

@@ -31,7 +31,7 @@ from hybrid_opt.polishing.point import Climb, Solution
 from hybrid_opt.polishing.records import Aim, PolishOutcome, Status
 from hybrid_opt.polishing.settings import PolishSettings
 from hybrid_opt.polishing.starts import turned
-from hybrid_opt.timing.drive import Driver
+from hybrid_opt.timing.drive import CandidateDriver
 from hybrid_opt.timing.given import drive_path
 from hybrid_opt.timing.model import TimingModel
 from hybrid_opt.timing.solve import time_path
@@ -149,7 +149,7 @@ def distance(path: Array, other: Array, half: Array) -> float:
     return float(np.sqrt(np.mean(((path - other) / half) ** 2)))
 
 
-def second_opinion(driver: Driver, model: TimingModel, x: Array) -> str:
+def second_opinion(driver: CandidateDriver, model: TimingModel, x: Array) -> str:
     """Why the timing of a decision vector (n_var,) is not believed, empty where it is: by the
     tenfold grid, and the independent `time_path`.
 

@@ -301,7 +301,7 @@ class Trial:
         """Whether the proposed carry is feasible, certified between its samples and held still at
         both ends, and if not why."""
         judgement, why = self.verdict_on(self.initial)
-        told = unheld(self.workcell, self.evaluator) if judgement.feasible else ""
+        told = unheld(self.workcell, self.evaluator.outputs) if judgement.feasible else ""
         return (
             (replace(judgement, feasible=False, reason="hold"), told) if told else (judgement, why)
         )

@@ -6,13 +6,10 @@ force and all limits of robots, payload and contacts (`hybrid_opt.timing.path_ti
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from codegen.function import NumericFunction
 from hybrid_opt.carry import DRIVE_CONSTRAINTS, FORCE_LIMIT, JOINT_TORQUE, NO_TIMING
-from hybrid_opt.compiled_cell import CompiledCell
 from hybrid_opt.timing.path_timer import PathTimer, PathTiming
 from hybrid_opt.timing.records import TimingLimits, TimingStatus
 from symbolic.array import Array
@@ -20,30 +17,7 @@ from symbolic.array import Array
 _AT_REST = {"normal force": FORCE_LIMIT, "joint torque": JOINT_TORQUE}
 
 
-@dataclass(frozen=True)
-class Drive:
-    """How n candidates are driven, at m samples uniform in u.
-
-    Attributes:
-        time, speed, acceleration: (n, m) [s], u' [1/s], u'' [1/s^2]. A path without a timing
-            stands still, its samples one second apart in all.
-        peak_force: (n, 2) largest normal forces [N].
-        robust_force: (n, 2) the same in every case of the workcell's uncertainty, None where the
-            limit is one of the planned forces.
-        violation: (n, len(DRIVE_CONSTRAINTS)).
-        position: (n,) path parameter of the violation, NaN without one.
-    """
-
-    time: Array
-    speed: Array
-    acceleration: Array
-    peak_force: Array
-    robust_force: Array | None
-    violation: Array
-    position: Array
-
-
-class Driver:
+class CandidateDriver:
     """Drives candidates of one workcell.
 
     Attributes:
@@ -72,37 +46,32 @@ class Driver:
 
         Args:
             candidate: compiled `symbolic.functions.candidate_function`.
-            x: decision vectors.
+            x: decision vectors. A path without a timing stands still, its samples one second apart
+                in all.
 
         Returns:
-            Its outputs, and `peak_force`, `drive_violation`, `drive_position` as in `Drive`; with
-            robust limits `robust_force` as well.
+            Its outputs; peak_force (n, 2), the largest normal forces [N]; drive_violation
+            (n, len(DRIVE_CONSTRAINTS)), and drive_position (n,), its path parameter, NaN without
+            one. With robust limits robust_force (n, 2) as well, the largest in every case of the
+            workcell's uncertainty.
         """
-        found = self.drive(x)
-        motion = (found.time, found.speed, found.acceleration)
-        outputs = candidate.batch(x, *motion, threads=self._threads)
-        # Where the path itself fails no timing tells the forces: those of its samples at rest.
-        sampled = outputs["normal_force"].max(axis=1)
-        forces = {"peak_force": found.peak_force}
-        if found.robust_force is not None:
-            forces["robust_force"] = found.robust_force
-        told = {name: np.where(np.isfinite(f), f, sampled) for name, f in forces.items()}
-        return (
-            outputs | told | {"drive_violation": found.violation, "drive_position": found.position}
-        )
-
-    def timings(self, x: Array) -> list[PathTiming]:
-        """The timing of every decision vector (n, n_var)."""
-        limits = [self.limits(float(force)) for force in x[:, -1]]
-        return self.timer.time_all(x[:, : self._task.n_path], limits)
-
-    def drive(self, x: Array) -> Drive:
-        """How decision vectors (n, n_var) are driven."""
         timings = self.timings(x)
         u = np.linspace(0.0, 1.0, self._task.samples)
-        driven = [_at(timing, u) for timing in timings]
-        violation = np.zeros((len(x), len(DRIVE_CONSTRAINTS)))
-        position = np.full(len(x), np.nan)
+        # An axis of three that no candidates leave empty, too.
+        driven = np.array([_at(timing, u) for timing in timings]).reshape(len(x), 3, len(u))
+        time, speed, acceleration = np.swapaxes(driven, 0, 1)
+        outputs = candidate.batch(x, time, speed, acceleration, threads=self._threads)
+        forces = {"peak_force": [timing.peak_force for timing in timings]}
+        if self.robust:
+            unknown = np.full(2, np.nan)
+            known = [timing.robust_force for timing in timings]
+            forces["robust_force"] = [unknown if force is None else force for force in known]
+        # Where the path itself fails no timing tells the forces: those of its samples at rest.
+        sampled = outputs["normal_force"].max(axis=1)
+        for name, values in forces.items():
+            force = np.array(values).reshape(-1, 2)
+            outputs[name] = np.where(np.isfinite(force), force, sampled)
+        violation, position = np.zeros((len(x), len(DRIVE_CONSTRAINTS))), np.full(len(x), np.nan)
         for row, timing in enumerate(timings):
             if np.isfinite(timing.duration):
                 continue
@@ -112,21 +81,12 @@ class Driver:
                 excess = max(timing.use[timing.place.constraint] - 1.0, 1e-9)
             violation[row, DRIVE_CONSTRAINTS.index(name)] = excess
             position[row] = timing.place.parameter
-        force = np.array([timing.peak_force for timing in timings]).reshape(-1, 2)
-        robust = None
-        if self.robust:
-            unknown = np.full(2, np.nan)
-            known = [t.robust_force for t in timings]
-            robust = np.array([unknown if f is None else f for f in known]).reshape(-1, 2)
-        # An axis of three that no candidates leave empty, too.
-        parts = np.array(driven).reshape(len(x), 3, len(u))
-        time, speed, acceleration = np.swapaxes(parts, 0, 1)
-        return Drive(time, speed, acceleration, force, robust, violation, position)
+        return outputs | {"drive_violation": violation, "drive_position": position}
 
-
-def driver_of(compiled: CompiledCell, threads: int, robust: bool) -> Driver:
-    """What drives candidates of a cell under the time law 'optimal', see `Driver`."""
-    return Driver(PathTimer(compiled, threads=threads), threads, robust)
+    def timings(self, x: Array) -> list[PathTiming]:
+        """The timing of every decision vector (n, n_var)."""
+        limits = [self.limits(float(force)) for force in x[:, -1]]
+        return self.timer.time_all(x[:, : self._task.n_path], limits)
 
 
 def _at(timing: PathTiming, u: Array) -> tuple[Array, Array, Array]:

@@ -34,7 +34,7 @@ _SPLINE_EVERY = 2
 if TYPE_CHECKING:
     import casadi as ca
 
-    from hybrid_opt.timing.drive import Driver
+    from hybrid_opt.timing.drive import CandidateDriver
     from hybrid_opt.timing.path_timer import PathTiming
 
 
@@ -304,12 +304,12 @@ class TimingModel:
         return carry_under_time_law(self.workcell, functions, x, single)
 
     @cached_property
-    def _driver(self) -> Driver:
+    def _driver(self) -> CandidateDriver:
         # Not imported at the top: it is built on this module.
-        from hybrid_opt.timing.drive import Driver
+        from hybrid_opt.timing.drive import CandidateDriver
         from hybrid_opt.timing.path_timer import PathTimer
 
-        return Driver(PathTimer(self._compiled), robust=self._robust)
+        return CandidateDriver(PathTimer(self._compiled), robust=self._robust)
 
     def _checked(self, x: Array) -> Array:
         x = np.ascontiguousarray(x, dtype=float)

@@ -18,8 +18,8 @@ from hybrid_opt.robust.cases import nominal_case, random_cases
 from hybrid_opt.robust.squeeze import SqueezeSettings, commanded_forces
 from hybrid_opt.store.files import AGAIN, storing
 from hybrid_opt.store.trajectory_file import read_trajectory
-from hybrid_opt.timing import TimingLimits
 from hybrid_opt.timing.analysis import closest_to_reference_timing
+from hybrid_opt.timing.records import TimingLimits
 from hybrid_opt.timing.solve import time_path
 from hybrid_opt.witness.arms import BISECTIONS, HIGH, LOW, ArmOutcome, CellWitness, account_of
 from hybrid_opt.witness.box import (

@@ -35,8 +35,8 @@ from hybrid_opt.indicators.selection import selected_row
 from hybrid_opt.metaheuristics.registry import title
 from hybrid_opt.recommending.comparison import level_force
 from hybrid_opt.store.trajectory_file import read_trajectory
-from hybrid_opt.timing import Timing, TimingLimits
 from hybrid_opt.timing.document import TimingDocument, read_timing
+from hybrid_opt.timing.records import Timing, TimingLimits
 from hybrid_opt.timing.robustness import PayloadSensitivity, payload_sensitivity
 from hybrid_opt.work.service import Executor, LocalExecutor, Service, answer_all, called
 from studies.report.page_carries import RECOMMENDED_LABEL, DrawnJob, drawn_job

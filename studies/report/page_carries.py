@@ -19,7 +19,9 @@ from hybrid_opt.evaluate.objectives import PAPER_OBJECTIVES
 from hybrid_opt.job.plan import JobModel
 from hybrid_opt.job.records import Job, Phase
 from hybrid_opt.job.smooth import driven_timing
-from hybrid_opt.timing import JerkLimits, Timing, TimingLimits, drivable_timing, time_path
+from hybrid_opt.timing.analysis import drivable_timing
+from hybrid_opt.timing.records import JerkLimits, Timing, TimingLimits
+from hybrid_opt.timing.solve import time_path
 from hybrid_opt.work.service import Emit
 from symbolic.array import Array
 from symbolic.errors import DualArmError

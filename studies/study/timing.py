@@ -17,7 +17,7 @@ from hybrid_opt.progress import Progress
 from hybrid_opt.store.files import write_json
 from hybrid_opt.store.json_records import to_json
 from hybrid_opt.store.trajectory_file import read_trajectory
-from hybrid_opt.timing import timed_trajectory
+from hybrid_opt.timing.analysis import timed_trajectory
 from hybrid_opt.timing.document import StoredJerk, TimingDocument, read_timing, timing_document
 from hybrid_opt.timing.records import TimingStatus
 from hybrid_opt.work.service import Emit, Service, answer_all

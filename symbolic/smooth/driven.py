@@ -19,6 +19,7 @@ from symbolic.contact.soft_finger import Detached
 from symbolic.expression import number
 from symbolic.limits import (
     PATH_OUTPUTS,
+    BlockLayout,
     contact_limits,
     limit_layout,
     limit_numbers,
@@ -35,10 +36,10 @@ TANGENT_FLOOR = 1e-9
 
 
 @dataclass(frozen=True)
-class DrivenLayout:
+class DrivenLayout(BlockLayout):
     """Where the quantities at a driven point lie in their vector.
 
-    `joints` counts both arms', `pose` the entries of the extended pose; `by_program` says that a
+    `pose` counts the entries of the extended pose; `by_program` says that a
     program finds the forces: then the load stands for them, and torque and pressure are left out.
 
     Blocks, in order:
@@ -53,13 +54,12 @@ class DrivenLayout:
     pressure (2): shifts of the centres of pressure over their patches' radii.
     """
 
-    joints: int
     pose: int = POSE_SIZE
     by_program: bool = False
 
     @property
     def sizes(self) -> dict[str, int]:
-        """Numbers per block."""
+        """See `BlockLayout`."""
         j, closed = self.joints, 0 if self.by_program else 1
         return {
             "speed": j + 2,
@@ -70,17 +70,6 @@ class DrivenLayout:
             "torque": j * closed,
             "pressure": 2 * closed,
         }
-
-    def block(self, name: str) -> slice:
-        """PlaceSymbols of a block."""
-        sizes = self.sizes
-        start = sum(list(sizes.values())[: list(sizes).index(name)])
-        return slice(start, start + sizes[name])
-
-    @property
-    def size(self) -> int:
-        """Quantities at a point."""
-        return sum(self.sizes.values())
 
     @property
     def variables(self) -> int:
@@ -151,8 +140,7 @@ def _value(model: CellModel, inputs: list[ca.SX], detached: Detached) -> ca.SX:
     limits, joints = limit_layout(workcell), limit_layout(workcell).joints
     *path, a, w = inputs
     row = sample_limits_function(model)(*path, *limit_numbers(workcell).values())
-    at = limits.offsets
-    block = {name: row[at[name] : at[name] + size] for name, size in limits.sizes.items()}
+    block = {name: row[limits.block(name)] for name in limits.sizes}
     cones = [block["cone"][6 * k : 6 * k + 6] for k in (0, 1)]
     payload = workcell.payload
     reach = (

@@ -7,8 +7,9 @@ from functools import cache
 
 import numpy as np
 
-from hybrid_opt.timing import TimingModel, TimingStatus, judge_timing
-from hybrid_opt.timing.model import REFINEMENT
+from hybrid_opt.timing.analysis import judge_timing
+from hybrid_opt.timing.model import REFINEMENT, TimingModel
+from hybrid_opt.timing.records import TimingStatus
 from symbolic.records import TimeLaw
 from tests.hybrid_opt.timing.cells import initial, near_initial, timing_of
 from tests.symbolic.cells import hand_cell

@@ -124,8 +124,8 @@ def test_a_joint_that_is_too_weak_is_told() -> None:
         robots = [replace(r, torque_max=factor * r.torque_max) for r in cell.workcell.robots]
         return replace(cell.workcell, robots=(robots[0], robots[1]))
 
-    assert unheld(limited(1.001 * share), cell.evaluator) == ""
-    why = unheld(limited(0.999 * share), cell.evaluator)
+    assert unheld(limited(1.001 * share), cell.evaluator.outputs) == ""
+    why = unheld(limited(0.999 * share), cell.evaluator.outputs)
     end, joint = np.unravel_index(int((ends / limit).argmax()), ends.shape)
     assert "joint torque" in why
     assert f"of {ends[end, joint]:.4g} N m at the {('start', 'goal')[end]}" in why

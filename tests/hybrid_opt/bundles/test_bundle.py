@@ -15,7 +15,8 @@ from hybrid_opt.bundles.bundle import read_manifest, write_bundle
 from hybrid_opt.errors import JobError, ResultsError
 from hybrid_opt.robust.squeeze import SqueezeSettings
 from hybrid_opt.store.files import sha256
-from hybrid_opt.timing import TimingLimits, time_path
+from hybrid_opt.timing.records import TimingLimits
+from hybrid_opt.timing.solve import time_path
 from symbolic.errors import SettingsError
 from tests.hybrid_opt.bundles.bundles import DRIVER, driven
 from tests.hybrid_opt.job.jobs import rack, rack_job, rack_jobs, rack_timing

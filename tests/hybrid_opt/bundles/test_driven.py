@@ -24,7 +24,8 @@ from hybrid_opt.bundles import TARGETS, BundleOptions
 from hybrid_opt.bundles.bundle import prepared
 from hybrid_opt.bundles.job_file import Contents, pad_errors
 from hybrid_opt.bundles.programs.carry_job import Job
-from hybrid_opt.timing import TimingLimits, time_path
+from hybrid_opt.timing.records import TimingLimits
+from hybrid_opt.timing.solve import time_path
 from hybrid_opt.witness.arms import ArmOutcome, CellWitness
 from hybrid_opt.witness.reference import (
     BoxJob,

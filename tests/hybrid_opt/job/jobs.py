@@ -7,7 +7,8 @@ from functools import cache
 from hybrid_opt.cell import Cell
 from hybrid_opt.job.plan import JobModel
 from hybrid_opt.job.records import Job
-from hybrid_opt.timing import Timing, TimingLimits, time_path
+from hybrid_opt.timing.records import Timing, TimingLimits
+from hybrid_opt.timing.solve import time_path
 from tests.hybrid_opt.cells import shipped
 
 

@@ -10,8 +10,10 @@ import pytest
 from hybrid_opt.job.motions import PEAK_RATE, at_even_steps, rise, unit_squeeze
 from hybrid_opt.job.smooth import acceleration_at_ends, rests_at_ends, smoothed
 from hybrid_opt.robust.squeeze import pressed_together
-from hybrid_opt.timing import JerkLimits, Timing, TimingLimits, time_path, time_with_jerk
+from hybrid_opt.timing.jerk import time_with_jerk
 from hybrid_opt.timing.limits import limit_use, worst
+from hybrid_opt.timing.records import JerkLimits, Timing, TimingLimits
+from hybrid_opt.timing.solve import time_path
 from symbolic.path.spline import path_basis
 from symbolic.read.cell import load
 from symbolic.records.poses import box_rotation

@@ -18,7 +18,8 @@ from hybrid_opt.job.records import Job
 from hybrid_opt.job.smooth import driven_timing
 from hybrid_opt.robust.force import thinned
 from hybrid_opt.robust.squeeze import largest_commanded
-from hybrid_opt.timing import TimingLimits, time_path
+from hybrid_opt.timing.records import TimingLimits
+from hybrid_opt.timing.solve import time_path
 from symbolic.errors import SettingsError
 from tests.hybrid_opt.bundles.bundles import driven
 from tests.hybrid_opt.bundles.mock_rapid import parse

@@ -14,7 +14,9 @@ from hybrid_opt.job.motions import lift_line, timed
 from hybrid_opt.job.plan import JobModel
 from hybrid_opt.job.records import PHASES, Job, Phase, sample_job
 from hybrid_opt.robust.squeeze import SqueezeSettings
-from hybrid_opt.timing import JerkLimits, TimingLimits, time_path, time_with_jerk
+from hybrid_opt.timing.jerk import time_with_jerk
+from hybrid_opt.timing.records import JerkLimits, TimingLimits
+from hybrid_opt.timing.solve import time_path
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.read.arms import arm_model, link_frame

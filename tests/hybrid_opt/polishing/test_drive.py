@@ -11,7 +11,9 @@ from hybrid_opt.polishing.drive import DriveWay
 from hybrid_opt.polishing.drive_front import second_opinion
 from hybrid_opt.polishing.point import Solution
 from hybrid_opt.polishing.settings import DrivableSettings
-from hybrid_opt.timing import TimingLimits, TimingModel, time_path
+from hybrid_opt.timing.model import TimingModel
+from hybrid_opt.timing.records import TimingLimits
+from hybrid_opt.timing.solve import time_path
 from tests.hybrid_opt.polishing.cells import evaluator, smooth_cell, solved, start, way
 
 

@@ -10,7 +10,7 @@ import hybrid_opt as ho
 from hybrid_opt.polishing.drive_front import second_opinion
 from hybrid_opt.polishing.polisher import Polisher
 from hybrid_opt.polishing.settings import DrivableSettings, PolishSettings
-from hybrid_opt.timing import TimingModel
+from hybrid_opt.timing.model import TimingModel
 from tests.hybrid_opt.polishing.cells import solved, start_in, way_of
 from tests.hybrid_opt.polishing.test_joint_program import Programs, assert_curvature, assert_slopes
 from tests.symbolic.read.samples import RACK

@@ -11,7 +11,7 @@ from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES
 from hybrid_opt.polishing.drive_front import second_opinion
 from hybrid_opt.polishing.polisher import Polisher
 from hybrid_opt.polishing.settings import DrivableSettings, PolishSettings
-from hybrid_opt.timing import TimingModel
+from hybrid_opt.timing.model import TimingModel
 from tests.hybrid_opt.polishing.cells import driven, solved, start_in, way_of
 from tests.hybrid_opt.polishing.test_joint_program import Programs, assert_curvature, assert_slopes
 from tests.hybrid_opt.polishing.transcription import without_obstacles

@@ -21,7 +21,7 @@ from hybrid_opt.polishing.robust import CASES, ROBUST_ROWS, RobustSamples
 from hybrid_opt.polishing.rows import ForceRow, Row
 from hybrid_opt.polishing.settings import DrivableSettings, PolishSettings
 from hybrid_opt.robust.path_force import PathPoints, robust_path
-from hybrid_opt.timing import TimingModel
+from hybrid_opt.timing.model import TimingModel
 from symbolic.records.cell import Uncertainty, Workcell
 from symbolic.records.task import initial_decision
 from tests.hybrid_opt.polishing.cells import (

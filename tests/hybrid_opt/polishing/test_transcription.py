@@ -17,8 +17,9 @@ from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES
 from hybrid_opt.polishing.drive import DriveWay
 from hybrid_opt.polishing.polisher import Polisher
 from hybrid_opt.polishing.settings import PolishSettings
-from hybrid_opt.timing import TimingLimits, TimingModel, time_path
-from hybrid_opt.timing.model import REFINEMENT
+from hybrid_opt.timing.model import REFINEMENT, TimingModel
+from hybrid_opt.timing.records import TimingLimits
+from hybrid_opt.timing.solve import time_path
 from symbolic.array import Array
 from tests.hybrid_opt.polishing.cells import drivable_rack, solved, start_in, way_of
 from tests.hybrid_opt.polishing.transcription import (

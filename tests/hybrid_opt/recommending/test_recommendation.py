@@ -18,7 +18,7 @@ from hybrid_opt.recommending.recommendation import HAND_MADE, STEPS, Recommendat
 from hybrid_opt.robust.cases import random_cases
 from hybrid_opt.robust.force import BoxMotion, RobustModel, pressing_model
 from hybrid_opt.robust.squeeze import DOUBTS, commanded_forces, largest_commanded
-from hybrid_opt.timing import time_path
+from hybrid_opt.timing.solve import time_path
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.records import USUAL, Contact, Uncertainty

@@ -8,7 +8,7 @@ from functools import cache
 import numpy as np
 
 from hybrid_opt.compiled_cell import CompiledCell
-from hybrid_opt.timing import TimingModel
+from hybrid_opt.timing.model import TimingModel
 from symbolic.array import Array
 from symbolic.records import Workcell
 from tests.symbolic.cells import hand_cell, hand_model

@@ -14,8 +14,8 @@ import clarabel
 import numpy as np
 from scipy import sparse
 
-from hybrid_opt.timing import TimingLimits, TimingModel
-from hybrid_opt.timing.model import REFINEMENT, PathMotion
+from hybrid_opt.timing.model import REFINEMENT, PathMotion, TimingModel
+from hybrid_opt.timing.records import TimingLimits
 from symbolic.array import Array
 
 Terms = dict[int, float]

@@ -13,7 +13,8 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 
-from hybrid_opt.timing import JerkLimits, TimingLimits, TimingModel
+from hybrid_opt.timing.model import TimingModel
+from hybrid_opt.timing.records import JerkLimits, TimingLimits
 from symbolic.array import Array
 
 INTERVALS = 80

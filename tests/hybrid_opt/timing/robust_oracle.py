@@ -11,8 +11,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from hybrid_opt.timing import TimingModel
-from hybrid_opt.timing.model import PathMotion
+from hybrid_opt.timing.model import PathMotion, TimingModel
 from studies.research.plain.load import GRAVITY
 from studies.research.plain.motion import angular_rates, rotation
 from symbolic.array import Array

@@ -19,9 +19,11 @@ from hybrid_opt.indicators.metrics import non_dominated
 from hybrid_opt.metaheuristics.run import CarryProblem
 from hybrid_opt.polishing.drive_front import AGREEMENT
 from hybrid_opt.robust.force import robust_model
-from hybrid_opt.timing import PathTimer, TimingLimits, drivable_timing, time_path
-from hybrid_opt.timing.drive import Driver
-from hybrid_opt.timing.path_timer import PATH_INTERVALS
+from hybrid_opt.timing.analysis import drivable_timing
+from hybrid_opt.timing.drive import CandidateDriver
+from hybrid_opt.timing.path_timer import PATH_INTERVALS, PathTimer
+from hybrid_opt.timing.records import TimingLimits
+from hybrid_opt.timing.solve import time_path
 from symbolic.array import Array
 from symbolic.functions import candidate_function
 from symbolic.geometry.clearance import screening_functions
@@ -61,7 +63,7 @@ def evaluator_of(objectives: tuple[str, ...]) -> CandidateEvaluator:
         PathTimer(CompiledCell(cell, model=model), lanes=1),
         "robust_force" in objectives,
     )
-    driver = Driver(timer, robust=robust)
+    driver = CandidateDriver(timer, robust=robust)
     return CandidateEvaluator(cell, objectives, functions=functions, driver=driver)
 
 

@@ -12,16 +12,10 @@ from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 
 from hybrid_opt.robust.force import robust_model
-from hybrid_opt.timing import (
-    JerkLimits,
-    JerkTiming,
-    TimingLimits,
-    TimingStatus,
-    time_path,
-    time_with_jerk,
-)
-from hybrid_opt.timing.jerk import Point, Rows
+from hybrid_opt.timing.jerk import Point, Rows, time_with_jerk
 from hybrid_opt.timing.model import PathMotion
+from hybrid_opt.timing.records import JerkLimits, JerkTiming, TimingLimits, TimingStatus
+from hybrid_opt.timing.solve import time_path
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.records import Uncertainty

@@ -10,15 +10,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hybrid_opt.compiled_cell import CompiledCell
-from hybrid_opt.timing import (
-    PathTimer,
-    TimingLimits,
-    TimingModel,
-    TimingStatus,
-    drive_path,
-    path_timer,
-    time_path,
-)
+from hybrid_opt.timing import path_timer
+from hybrid_opt.timing.given import drive_path
+from hybrid_opt.timing.model import TimingModel
+from hybrid_opt.timing.path_timer import PathTimer
+from hybrid_opt.timing.records import TimingLimits, TimingStatus
+from hybrid_opt.timing.solve import time_path
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.read.cell import load

@@ -12,8 +12,9 @@ from collections.abc import Callable
 from time import process_time
 
 from hybrid_opt.compiled_cell import CompiledCell
-from hybrid_opt.timing import TimingLimits, time_path
 from hybrid_opt.timing.path_timer import PATH_INTERVALS, PathTimer
+from hybrid_opt.timing.records import TimingLimits
+from hybrid_opt.timing.solve import time_path
 from tests.hybrid_opt.timing.cells import hand_timing, initial, timing_of, with_robots
 from tests.symbolic.cells import hand_cell, hand_model
 

@@ -14,7 +14,7 @@ import mujoco
 
 from hybrid_opt.cell import Cell
 from hybrid_opt.robust.cases import nominal_case
-from hybrid_opt.timing import TimingLimits
+from hybrid_opt.timing.records import TimingLimits
 from hybrid_opt.timing.solve import time_path
 from hybrid_opt.witness.arms import CellWitness
 from hybrid_opt.witness.box import workcell_of_case

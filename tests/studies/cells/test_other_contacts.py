@@ -16,7 +16,8 @@ from hybrid_opt.polishing.polisher import Polisher
 from hybrid_opt.polishing.settings import PolishSettings
 from hybrid_opt.robust.force import BoxMotion, RobustModel
 from hybrid_opt.robust.path_force import RobustPath
-from hybrid_opt.timing import TimingLimits, TimingModel
+from hybrid_opt.timing.model import TimingModel
+from hybrid_opt.timing.records import TimingLimits
 from hybrid_opt.timing.solve import time_path
 from studies.research.plain.collisions import PlainCollisionChecker
 from symbolic.contact.load import load_function

@@ -32,8 +32,9 @@ from hybrid_opt.progress import Progress
 from hybrid_opt.static_hold import StaticHold
 from hybrid_opt.store.files import write_json
 from hybrid_opt.store.json_records import from_json, to_json
-from hybrid_opt.timing import closest_to_reference_timing, time_path
+from hybrid_opt.timing.analysis import closest_to_reference_timing
 from hybrid_opt.timing.document import read_timing
+from hybrid_opt.timing.solve import time_path
 from studies import run
 from studies.study import simulation as stage
 from studies.study.drivable import known_paths, least_force
