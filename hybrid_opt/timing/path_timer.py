@@ -2,6 +2,10 @@
 
 The method is that of `hybrid_opt.timing.solve` without its linear programs over all intervals; see
 docs/timing.md. A carry is not built: `drive_path` recomputes one for a timing found here.
+
+Robust forces are convex in (u'', u'^2) (`hybrid_opt.robust.path_force`), but take an interior-point
+method per case. So they enter as supporting lines: the passes drive the paths, where the forces
+come near the limit their tangents are added, and the passes drive again (Kelley's cutting planes).
 """
 
 from __future__ import annotations
@@ -12,16 +16,17 @@ from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
+from codegen.function import NumericFunction
 from hybrid_opt.compiled_cell import CompiledCell
 from hybrid_opt.robust.cases import is_squeezed
-from hybrid_opt.robust.path_force import robust_path
+from hybrid_opt.robust.path_force import BY_TIMING, PathPoints, RobustPath, robust_path
 from hybrid_opt.timing.given import path_failure
 from hybrid_opt.timing.limits import limited_force
 from hybrid_opt.timing.model import TimingModel, joint_names
 from hybrid_opt.timing.passes import KINDS, OUTCOMES, passes_function
 from hybrid_opt.timing.records import Place, TimingLimits, TimingStatus
-from hybrid_opt.timing.robust_timer import CUTS, RestForce, RobustPasses
 from hybrid_opt.timing.solve import time_path
 from symbolic.array import Array
 from symbolic.errors import SettingsError
@@ -34,6 +39,26 @@ if TYPE_CHECKING:
 
 PATH_INTERVALS = 100
 """Pieces of constant path acceleration."""
+
+CUTS = 24
+"""Supporting lines that a sample has room for; the oldest make room for new ones."""
+
+ROUNDS = 20
+"""Times that paths are driven anew with more lines."""
+
+TOLERANCE = 1e-4
+"""Excess over the limit that counts as none, as a share of it."""
+
+NEAR = 0.98
+"""Forces above this share of the limit have a tangent in advance."""
+
+STILL = 1.0 - 1e-6
+"""Share of the limit that standing still may use, as in the passes."""
+
+
+AtRest = tuple[Array, int]
+"""Where standing still needs more than the limit: largest robust forces (2,) of both robots there
+[N], and the sample where the larger of them is."""
 
 
 @dataclass(frozen=True)
@@ -222,14 +247,15 @@ class PathTimer:
                 found[k] = replace(found[k], robust_force=peak[k], use=use)
         return found
 
-    def _held_too_weakly(self, rest: RestForce, limit: float) -> PathTiming:
+    def _held_too_weakly(self, rest: AtRest, limit: float) -> PathTiming:
         """Standing still needs more than the limit in some case."""
-        arm, u = int(rest.force.argmax()), rest.sample / (2 * self.intervals)
+        force, sample = rest
+        arm, u = int(force.argmax()), sample / (2 * self.intervals)
         name = self.workcell.robots[arm].name
         place = Place("normal force", name, "", round(u * self.intervals), u)
         failed = self._failed(TimingStatus.INFEASIBLE_AT_REST, place)
-        use = {"normal force": float(rest.force.max()) / limit}
-        return replace(failed, peak_force=rest.force, robust_force=rest.force, use=use)
+        use = {"normal force": float(force.max()) / limit}
+        return replace(failed, peak_force=force, robust_force=force, use=use)
 
     @cached_property
     def _robust(self) -> RobustPasses:
@@ -318,3 +344,143 @@ def from_time_path(model: TimingModel, x: Array, limits: TimingLimits) -> PathTi
 def _options(limits: TimingLimits) -> list[float]:
     force = float("inf") if limits.force is None else limits.force
     return [force, float(limits.torque), float(limits.pressure), float(limits.reference_speed)]
+
+
+@dataclass
+class _Paths:
+    """Some paths with their limits, and the lines that they have so far.
+
+    Attributes:
+        parts: (n, samples, 6) box poses and their derivatives by u.
+        limit: (n,) [N].
+        cuts: (n, samples, CUTS, 3).
+        count: (n, samples) how many each sample was given.
+        peak: (n, 2) largest robust forces of the last timing [N].
+    """
+
+    parts: tuple[Array, Array, Array]
+    limit: Array
+    cuts: Array
+    count: NDArray[np.intp]
+    peak: Array
+
+
+class RobustPasses:
+    """The passes of one workcell with lines for its robust forces."""
+
+    def __init__(self, passes: NumericFunction, forces: RobustPath, intervals: int) -> None:
+        """passes: `passes_function` with `CUTS`."""
+        self._passes, self._forces, self._intervals = passes, forces, intervals
+        # Both ends and the middle of every interval, each with its interval's u''.
+        first = 2 * np.arange(intervals)[:, None]
+        self._sample = (first + np.array([0, 1, 2])).reshape(-1)
+        self._share = np.tile([0.0, 0.5, 1.0], intervals)
+
+    def time(
+        self, paths: dict[str, Array], options: Array, threads: int
+    ) -> tuple[dict[str, Array], Array, list[AtRest | None]]:
+        """Drive n paths.
+
+        Args:
+            paths: their `PathTimer.path_limits`.
+            options: (n, 4) of the passes, finite force limits first.
+            threads: threads that share a batch.
+
+        Returns:
+            The passes' outputs; (n, 2) largest robust forces [N]; and of each path whether it
+            cannot stand still.
+        """
+        n, samples = len(options), 2 * self._intervals + 1
+        names = ("pose", "pose_first", "pose_second")
+        parts = [np.ascontiguousarray(paths[name][:, :, :6]) for name in names]
+        cuts = np.zeros((n, samples, CUTS, 3))
+        cuts[..., 2] = np.inf
+        state = _Paths(
+            (parts[0], parts[1], parts[2]),
+            options[:, 0],
+            cuts,
+            np.zeros((n, samples), dtype=np.intp),
+            np.zeros((n, 2)),
+        )
+        still = self._at_rest(state)
+        out = self._passes.batch(paths["limits"], options, state.cuts, threads=threads)
+        left = np.array([k for k in range(n) if still[k] is None], dtype=np.intp)
+        for _ in range(ROUNDS):
+            left = left[np.isfinite(out["duration"][left])]
+            left = left[self._cut(state, left, out["squared"][left])]
+            if not len(left):
+                break
+            driven = (paths["limits"][left], options[left], state.cuts[left])
+            fresh = self._passes.batch(*driven, threads=threads)
+            for name, values in fresh.items():
+                out[name][left] = values
+        return out, state.peak, still
+
+    def _at_rest(self, state: _Paths) -> list[AtRest | None]:
+        """Which paths cannot stand still; the others get a tangent there."""
+        n, samples = len(state.limit), state.parts[0].shape[1]
+        found: list[AtRest | None] = [None] * n
+        path, sample = np.divmod(np.arange(n * samples), samples)
+        points = self._points(state, path, sample, *np.zeros((2, n * samples)))
+        rows, force, slope = self._forces.beyond(points, NEAR * state.limit[path])
+        for k in np.unique(path[rows]):
+            own = path[rows] == k
+            at = int(force[own].max(axis=1).argmax())
+            if force[own].max() > STILL * state.limit[k]:
+                found[k] = force[own].max(axis=0), int(sample[rows][own][at])
+        place = (path[rows], sample[rows])
+        self._add(state, place, np.zeros((len(rows), 2)), force, slope[:, :, BY_TIMING])
+        return found
+
+    def _cut(self, state: _Paths, chosen: NDArray[np.intp], squared: Array) -> NDArray[np.bool_]:
+        """Add tangents where timings (m, intervals + 1) of the chosen paths come near their limits;
+        which of them exceed theirs."""
+        m, per = len(chosen), len(self._sample)
+        if not m:
+            return np.zeros(0, dtype=bool)
+        begin = np.repeat(squared[:, :-1], 3, axis=1)
+        rise = np.repeat(np.diff(squared, axis=1), 3, axis=1)
+        w = (begin + self._share * rise).reshape(-1)
+        a = (rise * self._intervals / 2.0).reshape(-1)
+        path, sample = np.repeat(chosen, per), np.tile(self._sample, m)
+        points, limit = self._points(state, path, sample, a, w), state.limit[path]
+        rows, ruling = self._forces.ruling_beyond(points, NEAR * limit)
+        force = ruling.force
+        exceeded = np.zeros(len(state.limit), dtype=bool)
+        exceeded[path[rows][force.max(axis=1) > (1.0 + TOLERANCE) * limit[rows]]] = True
+        state.peak[chosen] = 0.0
+        np.maximum.at(state.peak, path[rows], force)
+        for k in chosen[state.peak[chosen].max(axis=1) == 0.0]:
+            own = np.flatnonzero(path == k)
+            state.peak[k] = self._forces.at(points.at(own))[0].max(axis=0)
+        keep = np.flatnonzero(exceeded[path[rows]])
+        z = np.stack([a[rows], w[rows]], axis=1)[keep]
+        place = (path[rows][keep], sample[rows][keep])
+        slope = self._forces.slopes(points.at(rows[keep]), ruling.at(keep))
+        self._add(state, place, z, force[keep], slope[:, :, BY_TIMING])
+        return exceeded[chosen]
+
+    def _add(
+        self,
+        state: _Paths,
+        place: tuple[NDArray[np.intp], NDArray[np.intp]],
+        z: Array,
+        force: Array,
+        slope: Array,
+    ) -> None:
+        """Tangents of the larger force at points z (m, 2) of paths and samples `place`."""
+        larger, every = force.argmax(axis=1), np.arange(len(force))
+        limit = state.limit[place[0]]
+        gradient = slope[every, larger] / limit[:, None]
+        bound = 1.0 - force[every, larger] / limit + (gradient * z).sum(axis=1)
+        lines = np.column_stack([gradient, bound])
+        # Ends of neighbouring intervals share a sample: one after the other.
+        for path, sample, line in zip(*place, lines, strict=True):
+            state.cuts[path, sample, state.count[path, sample] % CUTS] = line
+            state.count[path, sample] += 1
+
+    def _points(
+        self, state: _Paths, path: NDArray[np.intp], sample: NDArray[np.intp], a: Array, w: Array
+    ) -> PathPoints:
+        pose, first, second = (part[path, sample] for part in state.parts)
+        return PathPoints(pose, first, second, a, w)

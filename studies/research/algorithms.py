@@ -42,7 +42,7 @@ def _add_options(parser: Parser) -> None:
     parser.add_argument(
         "--problems",
         nargs="+",
-        default=list(stated("hybrid_opt.metaheuristics.analytic_problems.PROBLEMS")),
+        default=list(stated("studies.research.analytic_problems.PROBLEMS")),
         metavar="NAME",
         help="which",
     )

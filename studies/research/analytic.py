@@ -16,14 +16,15 @@ from hybrid_opt.campaign.settings import sized
 from hybrid_opt.display.table import number, text_table
 from hybrid_opt.indicators import metrics
 from hybrid_opt.indicators.statistics import RankTest, Summary, corrected, rank_test, summarise
-from hybrid_opt.metaheuristics import Evaluated, analytic_problems
-from hybrid_opt.metaheuristics.analytic_problems import AnalyticProblem
+from hybrid_opt.metaheuristics import Evaluated
+from studies.research import analytic_problems
 from studies.research.algorithms import (
     BAND_POPULATION,
     SHIFTED,
     SHIFTED_EVALUATIONS,
     SHIFTED_POPULATION,
 )
+from studies.research.analytic_problems import AnalyticProblem
 from symbolic.errors import SettingsError
 
 Verdict = Literal["inside", "better", "worse"]

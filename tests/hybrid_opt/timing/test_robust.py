@@ -13,21 +13,18 @@ from hybrid_opt.compiled_cell import CompiledCell
 from hybrid_opt.robust.cases import worst_cases
 from hybrid_opt.robust.force import RobustModel, robust_model
 from hybrid_opt.static_hold import static_hold
-from hybrid_opt.timing import (
-    PathTimer,
-    TimingLimits,
-    TimingModel,
-    TimingStatus,
-    closest_to_reference_timing,
-    drive_path,
-    time_path,
-)
+from hybrid_opt.timing.analysis import closest_to_reference_timing
+from hybrid_opt.timing.given import drive_path
 from hybrid_opt.timing.limits import limit_ratios, limit_use
+from hybrid_opt.timing.model import TimingModel
+from hybrid_opt.timing.path_timer import PathTimer
+from hybrid_opt.timing.records import TimingLimits, TimingStatus
 from hybrid_opt.timing.robustness import (
     Margin,
     payload_sensitivity,
     robustness_margins,
 )
+from hybrid_opt.timing.solve import time_path
 from symbolic.errors import SettingsError
 from symbolic.records import Uncertainty, Workcell
 from tests.hybrid_opt.timing import convex_oracle

@@ -7,20 +7,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hybrid_opt.timing import (
-    Timing,
-    TimingLimits,
-    TimingModel,
-    TimingStatus,
+from hybrid_opt.timing.analysis import (
     closest_to_reference_timing,
     duration_against_force_limit,
     judge_timing,
-    time_path,
     timed_trajectory,
 )
 from hybrid_opt.timing.limits import limit_ratios
+from hybrid_opt.timing.model import TimingModel
+from hybrid_opt.timing.records import Timing, TimingLimits, TimingStatus
 from hybrid_opt.timing.robustness import robustness_margins
-from hybrid_opt.timing.solve import linearised_rows
+from hybrid_opt.timing.solve import linearised_rows, time_path
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.read.cell import load
