@@ -17,7 +17,6 @@ from hybrid_opt.evaluate.evaluations import FEASIBLE, NOT_FINITE, REASONS, Evalu
 from hybrid_opt.indicators import metrics
 from hybrid_opt.metaheuristics import (
     SearchResult,
-    analytic_problems,
     make,
     names,
     search,
@@ -25,6 +24,7 @@ from hybrid_opt.metaheuristics import (
 )
 from hybrid_opt.metaheuristics.guarded import violation_of
 from hybrid_opt.metaheuristics.run import WORST_PENALTY, CarryProblem, SearchSettings, disarmed
+from studies.research import analytic_problems
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from tests.hybrid_opt.campaign.fake import OBJECTIVES, verdicts
