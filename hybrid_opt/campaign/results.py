@@ -146,7 +146,7 @@ class CampaignResults:
         return tuple(found)
 
 
-def union(fronts: Sequence[ReplicaFront]) -> list[tuple[ReplicaFront, int]]:
+def union(fronts: Sequence[Front]) -> list[tuple[Front, int]]:
     """What none of several fronts dominates, by increasing objectives: each member as its front and
     its row there."""
     members = [(front, row) for front in fronts for row in range(len(front))]

@@ -14,12 +14,13 @@ import numpy as np
 import hybrid_opt as ho
 from codegen.function import available_cores
 from hybrid_opt.campaign import CampaignFolder, Stage
-from hybrid_opt.campaign.results import CampaignResults, ReplicaFront, read_campaign, union
+from hybrid_opt.campaign.results import CampaignResults, read_campaign, union
 from hybrid_opt.campaign.settings import NO_RECOMMENDATION, RECOMMENDATION, RECOMMENDED, STAGES
 from hybrid_opt.errors import NoCarryError
 from hybrid_opt.evaluate.evaluations import concatenated
 from hybrid_opt.evaluate.explanation import explain
 from hybrid_opt.evaluate.objectives import PLANNED_FORCE, ROBUST_FORCE, ForceKind
+from hybrid_opt.front import Front
 from hybrid_opt.progress import Advance, Progress
 from hybrid_opt.recommending.advice import Advice
 from hybrid_opt.recommending.choice import LEADER, DrivenPaths
@@ -312,7 +313,7 @@ def _price(carry: ho.Carry, seed: int, threads: int) -> RobustPrice | None:
 
 def _force_table(
     cell: ho.Cell,
-    fronts: Sequence[ReplicaFront],
+    fronts: Sequence[Front],
     others: Mapping[str, Array],
     found: Recommendation,
     advance: Advance,
@@ -337,10 +338,10 @@ def _force_table(
             [
                 durations(_spread(front.x[:, : task.n_path]))
                 for front in fronts
-                if front.label == label
+                if front.title == label
             ],
         )
-        for label in dict.fromkeys(front.label for front in fronts)
+        for label in dict.fromkeys(front.title for front in fronts)
     ]
     return ForceTable(tuple(forces.tolist()), tuple(rows))
 
