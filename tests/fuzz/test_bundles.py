@@ -26,7 +26,7 @@ ABOUT: dict[str, Any] = {
     "warnings": ["nothing holds the box"],
 }
 
-FEW = 60
+FEW = 25
 
 
 def judged(name: str, damaged: Callable[[bytes], bytes]) -> None:

@@ -30,7 +30,7 @@ from tests.fuzz.promises import MANY, Checks, all_kept, kept
 from tests.symbolic.read.samples import GOFA, RACK, sample_data, write
 from tests.symbolic.read.test_scenes import FRAMES, MESSAGE, NEW, SAVED, sdf
 
-FEW, FEW_PROCESSES = 40, 8
+FEW, FEW_PROCESSES = 20, 4
 SOUND = RACK.read_bytes().replace(b"../robots/gofa12.urdf", str(GOFA).encode())
 
 ElementTree.register_namespace("xacro", XACRO_NAMESPACE.decode())

@@ -287,7 +287,7 @@ def test_scaling_all_rates_scales_the_time() -> None:
 FORCE_SHARES = (None, 1.005, 1.05, 1.2)
 """Force limits over the largest force at rest."""
 
-SEEDS = [pytest.param(seed, marks=pytest.mark.slow if seed >= 6 else ()) for seed in range(24)]
+SEEDS = [pytest.param(seed, marks=pytest.mark.slow if seed >= 4 else ()) for seed in range(24)]
 
 
 @pytest.mark.parametrize("seed", SEEDS)
