@@ -1,4 +1,4 @@
-"""How far work is: lines of a program, a bar of a call, or a function of the caller's."""
+"""Progress of work: lines on standard error, a bar, or a function of the caller's."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def counted(progress: ShowProgress, what: str, total: int) -> Iterator[Callable[
         total: units in all.
 
     Yields:
-        What tells that so many more are done.
+        A function that takes how many more units are done.
     """
     if progress is True:
         from tqdm.auto import tqdm
@@ -52,7 +52,7 @@ def following(progress: ShowProgress, what: str, items: Sequence[T]) -> Iterator
 
 
 Advance = Callable[[int], None]
-"""Tells how many more units are done."""
+"""Takes how many more units are done."""
 
 _QUIET_SECONDS = 10.0
 """Between lines where the terminal is none, as in a log."""
@@ -90,7 +90,7 @@ class Progress:
             unit=f" {unit}",
             file=sys.stderr,
             mininterval=0.2 if sys.stderr.isatty() else _QUIET_SECONDS,
-            miniters=0,  # to tell of nothing new tells how long it has been going on
+            miniters=0,  # the time goes on where nothing new is done
             delay=delay,
             dynamic_ncols=True,
             disable=not self.shown,

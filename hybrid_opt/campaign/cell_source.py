@@ -65,7 +65,7 @@ def read_branches(root: Path) -> BranchCompetition | None:
 
 
 def store_branches(root: Path, competition: BranchCompetition | None) -> str:
-    """Store a decision in a results folder; what to tell of it, '' without one."""
+    """Store a decision in a results folder; returns what to print of it, '' without one."""
     if competition is None:
         return ""
     write_json(root / BRANCHES, to_json(competition))

@@ -132,7 +132,7 @@ class CampaignResults:
 
     @property
     def fronts(self) -> tuple[Front, ...]:
-        """Those of all replicas, each as searched and then, where it was polished, as polished.
+        """The fronts of all replicas: each as searched, then as polished where it was polished.
 
         Raises:
             ResultsError: a polished one is damaged.
@@ -147,8 +147,8 @@ class CampaignResults:
 
 
 def union(fronts: Sequence[Front]) -> list[tuple[Front, int]]:
-    """What none of several fronts dominates, by increasing objectives: each member as its front and
-    its row there."""
+    """Members of several fronts that no other one dominates, by increasing objectives: each as its
+    front and its row there."""
     members = [(front, row) for front in fronts for row in range(len(front))]
     objectives = np.concatenate([front.objectives for front in fronts])
     return [members[k] for k in metrics.front_rows(objectives, np.ones(len(members), dtype=bool))]
@@ -233,7 +233,7 @@ def _decoded(content: bytes, path: Path) -> EvaluationTable:
 
 
 def is_whole(exists: bool, read: Callable[[], object]) -> bool:
-    """Whether what a stage left is there and can be read; what is damaged is told.
+    """Whether what a stage left is there and can be read; damage is reported as a warning.
 
     Args:
         exists: whether it is there.

@@ -49,7 +49,7 @@ class Quantity:
     scale: float = 1.0
 
     def heading(self, whose: str = "") -> str:
-        """Of a column: the name, whose it is, and the unit."""
+        """Heading of a column: the name, whose it is, and the unit."""
         named = f"{self.name}, {whose}" if whose else self.name
         return f"{named} [{self.unit}]" if self.unit else named
 
@@ -87,7 +87,7 @@ class Table:
 
     @property
     def words(self) -> tuple[bool, ...]:
-        """Of every column, whether it holds words, which begin at the left; others hold figures."""
+        """Whether each column holds words, which begin at the left; others hold figures."""
         columns = zip(*self.rows, strict=True) if self.rows else [()] * len(self.header)
         return tuple(k == 0 or not any(map(_is_figure, column)) for k, column in enumerate(columns))
 

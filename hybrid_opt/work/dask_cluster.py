@@ -57,7 +57,7 @@ class DaskExecutor:
 
     Attributes:
         address: of the scheduler.
-        environment: what a worker's environment has to be, as `probe` tells it there.
+        environment: what a worker's environment has to be, as `probe` reports it there.
         probe: a function of the package, called on the workers.
     """
 
@@ -115,7 +115,7 @@ def _require_address(address: str) -> None:
 
 @contextmanager
 def _hushed() -> Iterator[None]:
-    """Keep Dask from logging tracebacks of a lost connection, of which an error of ours tells."""
+    """Keep Dask from logging tracebacks of a lost connection, which an error of ours reports."""
     loggers = [logging.getLogger(name) for name in ("distributed", "distributed.client")]
     levels = [logger.level for logger in loggers]
     try:

@@ -1,4 +1,4 @@
-"""What `studies.inspect` finds out of a workcell before a study, and how it tells it."""
+"""What `studies.inspect` finds out about a workcell before a study."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ def inspected(
     makers: list[Maker] = [lambda: cell.evaluator]
     if polish:
         makers.append(lambda: cell.polish_functions)
-    # What cannot be compiled is told by who needs it.
+    # Whoever needs what cannot be compiled reports it.
     build_all(makers, progress)
     carries = {
         "initial": cell.carry(cell.initial),
@@ -354,7 +354,7 @@ _IN_THE_WAY = {
     "reach": "Robots that do not reach first",
 }
 MOST_TOLD = 10
-"""Most obstacles that are told."""
+"""Most obstacles that are listed."""
 
 
 def _optimum_lines(optimum: Optimum) -> list[str]:

@@ -129,7 +129,7 @@ def _film(cell: Cell, outcome: ArmOutcome, path: Path) -> None:
 
 
 PAD_BISECTIONS = 9
-"""Of the factors of pads without arms, to about 0.1 %."""
+"""Bisections of the factor of pads without arms, to about 0.1 %."""
 
 CREEP_FACTOR = 1.05
 

@@ -177,7 +177,7 @@ def study_text(root: Path, with_paper: bool, brief: bool = False) -> str:
 
     Args:
         with_paper: whether to print what the paper states.
-        brief: whether the carry to run is all that is told, where there is one.
+        brief: whether only the carry to run is printed, where there is one.
 
     Raises:
         ResultsError: the folder is not complete or damaged.
@@ -218,7 +218,7 @@ def make_study(path: Path, options: argparse.Namespace, with_paper: bool) -> Non
         DualArmError: the workcell, an option or the results folder is wrong, or work failed.
     """
     if options.simulate:
-        mujoco_module()  # told before hours of work
+        mujoco_module()  # a missing simulator is reported before hours of work
     cell = load_workcell(path)
     if options.recommend_only:
         drivable = Cell(cell).drivable()  # keeps the file of its workcell
@@ -285,7 +285,9 @@ def campaign_settings(
         constraint_handling=options.constraint_handling,
         first_generation=options.first_generation,
     )
-    beside = drivable_settings(settings, options.drivable_replicas)  # told before any work
+    beside = drivable_settings(
+        settings, options.drivable_replicas
+    )  # its errors come before any work
     return replace(beside, replicas=settings.replicas) if options.recommend_only else settings
 
 

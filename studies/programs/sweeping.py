@@ -25,7 +25,7 @@ from symbolic.array import Array
 from symbolic.errors import SettingsError
 
 ATTEMPTS = 4
-"""Of the polish that gives the first path."""
+"""Attempts of the polish that gives the first path."""
 
 
 def sweep_numbers(options: argparse.Namespace) -> int:

@@ -358,7 +358,7 @@ def _row(label: str, found: list[Array]) -> StoredDurations:
 EXPORT_TARGET = "ros2-control"
 
 ADVICE = 3
-"""Changes that a terminal tells."""
+"""Most changes that a terminal lists."""
 
 
 @dataclass(frozen=True)
@@ -445,8 +445,8 @@ def _percent(ratio: float) -> str:
 
 
 def _margins(found: StoredRecommendation) -> list[str]:
-    """Of friction, force and mass, and the nearest limit of the centre of mass along each axis, at
-    the commanded force."""
+    """Margins of friction, force and mass at the commanded force, and the nearest limit of the
+    centre of mass along each axis."""
     texts = []
     for margin in found.margins:
         if margin.quantity == "friction of both contacts":

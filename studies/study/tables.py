@@ -223,7 +223,7 @@ def replicas(summary: CampaignSummary) -> Table:
 
 
 def effort(summary: CampaignSummary) -> Table:
-    """What a replica took: of no table that is stored, because times differ from run to run."""
+    """Time of a replica; only printed and not stored, because times differ from run to run."""
     rows = []
     for name, entry in summary.algorithms.items():
         for label, figures in _variants(name, entry):
@@ -462,8 +462,8 @@ def _timing_cells(timing: StoredTiming) -> tuple[str, ...]:
 
 
 def margins(timed: Timed) -> Table:
-    """How wrong the model's assumptions may be, under the drivable timing; of trajectories that
-    have one, at least one."""
+    """How far the model's assumptions may be off under the drivable timing, which at least one of
+    the trajectories has."""
     judged = [(label, document.margins) for label, document in timed if document.margins]
     rows = []
     for found in zip(*(margins for _, margins in judged), strict=True):

@@ -108,7 +108,7 @@ def limits_on_jerk(root: Path) -> Table | None:
 
 
 def file_label(path: Path) -> str:
-    """Whose the trajectory in a file is, by its place in the folder of selected ones."""
+    """Label of a trajectory, by the place of its file in the folder of selected ones."""
     if len(path.parts) == 1:
         return path.stem
     folder = path.parts[0]

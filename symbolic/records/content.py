@@ -1,4 +1,4 @@
-"""What records and their values are, as bytes: for digests, and for answers that are kept."""
+"""Records and their values as bytes: for digests, and to recognise what was computed before."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import numpy as np
 
 
 def parts(value: Any, folder: Path) -> list[bytes]:
-    """What a record and its values are, piece by piece; paths as seen from a folder."""
+    """The content of a record, piece by piece; paths as seen from a folder."""
     found: list[bytes] = []
 
     def add(value: Any) -> None:
@@ -61,7 +61,7 @@ def digest_of_parts(value: Any, folder: Path = Path()) -> str:
 
 
 class Known:
-    """A record that keeps what it is: what is made of it is told apart fast."""
+    """A record that keeps its digest, so that what is made of it is recognised fast."""
 
     @cached_property
     def content(self) -> str:
@@ -79,7 +79,7 @@ class Seen:
     """
 
     def __init__(self, *given: Any, known: Hashable = None) -> None:
-        """known: what they are told apart by; None for all that they are."""
+        """known: what identifies them; None for their whole content."""
         self.given = given
         self._known = digest_of_parts(given) if known is None else known
 

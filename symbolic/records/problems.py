@@ -1,4 +1,4 @@
-"""Problems of a file gathered by place, the words in which they are told, and patterns of names."""
+"""Problems of a file gathered by place, the words that report them, and patterns of names."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ MAX_NAME_LENGTH = 80
 
 
 MOST_LETTERS = 2000
-"""So much of a problem is told: it may quote what was found, or list what is allowed."""
+"""Longest text of a problem: it may quote what was found, or list what is allowed."""
 
 MOST_PROBLEMS = 100
-"""So many problems of a file are told, the rest is counted."""
+"""Most problems of a file that are listed; the rest is counted."""
 
 
 LONGEST_WORD = 200

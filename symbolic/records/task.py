@@ -128,8 +128,8 @@ class Task:
         return POSE_SIZE + len(self.redundant)
 
     def redundant_of(self, arm: int) -> tuple[tuple[int, int], ...]:
-        """Of each redundant joint of robot `arm` its index in the arm and its place in the
-        extended pose."""
+        """Per redundant joint of robot `arm` its index in the arm and its place in the extended
+        pose."""
         return tuple(
             (joint.drives[arm], POSE_SIZE + k)
             for k, joint in enumerate(self.redundant)
