@@ -121,11 +121,11 @@ def smoothed(model: TimingModel, timing: Timing, width: float = WIDTH) -> Timing
     motion = model.path_motion(carry.x).between(u)
     limits = timing.limits
 
-    def driven(factor: float) -> _Driven:
+    def driven(factor: float) -> _Slowdown:
         time = np.asarray(EVERY * STEP / factor * np.arange(len(u)))
         carry = model.carry(motion, time, factor * rate, factor**2 * second)
         ratios = limit_ratios(carry, model.workcell, limits)
-        return _Driven(factor, carry, ratios, use_of(ratios, carry, model.joint_names))
+        return _Slowdown(factor, carry, ratios, use_of(ratios, carry, model.joint_names))
 
     found = _fastest(driven)
     place = worst(found.use).place
@@ -142,7 +142,7 @@ def smoothed(model: TimingModel, timing: Timing, width: float = WIDTH) -> Timing
 
 
 @dataclass(frozen=True)
-class _Driven:
+class _Slowdown:
     """A timing slowed by a factor, and how far it uses its limits."""
 
     factor: float
@@ -161,7 +161,7 @@ class _Driven:
         return np.concatenate(parts)
 
 
-def _fastest(driven: Callable[[float], _Driven]) -> _Driven:
+def _fastest(driven: Callable[[float], _Slowdown]) -> _Slowdown:
     """The motion with the largest factor up to 1 that holds the limits.
 
     Raises:
@@ -188,7 +188,7 @@ def _fastest(driven: Callable[[float], _Driven]) -> _Driven:
     return slow
 
 
-def _between(slow: _Driven, fast: _Driven) -> float:
+def _between(slow: _Slowdown, fast: _Slowdown) -> float:
     """A factor between two at which what is exceeded with one of them is used fully.
 
     Accelerations, forces and torques are nearly affine in the factor's square, so that hardly more

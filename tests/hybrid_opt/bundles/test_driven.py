@@ -77,7 +77,7 @@ def witness() -> CellWitness:
 
 
 @dataclass(frozen=True, eq=False)
-class Told:
+class Commands:
     """What a program told the arms at n moments.
 
     Attributes:
@@ -95,7 +95,9 @@ class Told:
     force: Array | None = None
 
 
-def reference(told: Told, goal: bool, carried: Job | None = None, delay: float = 0.0) -> Reference:
+def reference(
+    told: Commands, goal: bool, carried: Job | None = None, delay: float = 0.0
+) -> Reference:
     """What the simulated arms are told, the second one a delay later [s]."""
     carried = carried or job()
     workcell, time = rack().workcell, told.time
@@ -152,13 +154,13 @@ def late(time: Array, rows: Array, delay: float) -> Array:
     return shifted
 
 
-def commanded(world: World) -> Told:
+def commanded(world: World) -> Commands:
     """Of the program of ROS 2 that tells whole torques."""
     time, q, torque = (column(world, k) for k in range(3))
-    return Told(time - time[0], q, torque)
+    return Commands(time - time[0], q, torque)
 
 
-def of_franka(world: World) -> Told:
+def of_franka(world: World) -> Commands:
     """Its arms bear themselves."""
     told = commanded(world)
     assert told.effort is not None
@@ -170,7 +172,7 @@ def of_franka(world: World) -> Told:
     return replace(told, effort=told.effort + own)
 
 
-def of_ur(world: World) -> Told:
+def of_ur(world: World) -> Commands:
     """Its arms make up their torques themselves, one of them for a force."""
     force = np.array([row[3][1] for row in world.record])
     return replace(commanded(world), effort=None, force=force)
@@ -179,35 +181,35 @@ def of_ur(world: World) -> Told:
 TOLD = {"ros2-control": commanded, "franka-ros2": of_franka, "ur-ros2": of_ur}
 
 
-def ran(target: str, folder: Path) -> Told:
+def ran(target: str, folder: Path) -> Commands:
     code, world = run(dict(contents(target)), folder, lambda world: None, [])
     assert code == 0, world.log
     return TOLD[target](world)
 
 
-def by_urscript(folder: Path) -> Told:
+def by_urscript(folder: Path) -> Commands:
     arms = test_urscript.pair().run().arms
     n = min(len(arm.record) for arm in arms)
     time, first, _ = zip(*arms[0].record[:n], strict=True)
     _, second, force = zip(*arms[1].record[:n], strict=True)
-    return Told(np.array(time), np.hstack([first, second]), force=np.array(force))
+    return Commands(np.array(time), np.hstack([first, second]), force=np.array(force))
 
 
-def by_rapid(folder: Path) -> Told:
+def by_rapid(folder: Path) -> Commands:
     time, q, force = test_abb.sound().rounded(STEPS["abb-rapid"])
-    return Told(time, q, force=force)
+    return Commands(time, q, force=force)
 
 
-def by_egm(folder: Path) -> Told:
+def by_egm(folder: Path) -> Commands:
     cell = test_abb.Cell()
     cell.run(lambda cell: cell.stream.machine.state == "done")
     time, s, _, wanted, q = (np.array(column) for column in zip(*cell.record, strict=True))
     # The way into the box is the simulated force control's own business.
     q[:, 6:] = [job().position(1, each) for each in s]
-    return Told(time - time[0], q, force=wanted)
+    return Commands(time - time[0], q, force=wanted)
 
 
-PROGRAMS: dict[str, tuple[Callable[[Path], Told], Control]] = {
+PROGRAMS: dict[str, tuple[Callable[[Path], Commands], Control]] = {
     "ros2-control": (partial(ran, "ros2-control"), "leader"),
     "franka-ros2": (partial(ran, "franka-ros2"), "impedance"),
     "ur-ros2": (partial(ran, "ur-ros2"), "leader"),
@@ -219,7 +221,7 @@ PROGRAMS: dict[str, tuple[Callable[[Path], Told], Control]] = {
 
 
 @cache
-def told_by(target: str) -> Told:
+def told_by(target: str) -> Commands:
     with TemporaryDirectory() as folder:
         return PROGRAMS[target][0](Path(folder))
 

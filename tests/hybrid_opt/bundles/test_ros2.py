@@ -88,20 +88,30 @@ def test_wrong_parameters_are_refused(wrong: dict[str, Any]) -> None:
         judged(document["carry_controller"]["ros__parameters"] | wrong)
 
 
+def by_yourdfpy(text: str) -> yourdfpy.URDF:
+    """The description as another reader takes it."""
+    content = io.BytesIO(text.encode())
+    found = yourdfpy.URDF.load(content, load_meshes=False, build_collision_scene_graph=False)
+    if not found.validate():
+        raise ValueError(found.errors)
+    return found
+
+
 def test_the_description_places_both_pads_on_the_box() -> None:
-    """Read by Pinocchio: joints in the job's order lead both pads to the box."""
-    model = pin.buildModelFromXML(text_of("ros2-control", "description/cell.urdf"))
-    assert list(model.names)[1:] == JOINTS
-    data = model.createData()
-    job = exported("ros2-control").sampled
-    press = job.span(1)
-    for k in range(press.start, job.span(5).stop, 15):
+    """Read by Pinocchio and by yourdfpy: joints in the job's order lead both pads to the box."""
+    text = text_of("ros2-control", "description/cell.urdf")
+    model, other = pin.buildModelFromXML(text), by_yourdfpy(text)
+    assert list(model.names)[1:] == list(other.actuated_joint_names) == JOINTS
+    data, job = model.createData(), exported("ros2-control").sampled
+    for k in range(job.span(1).start, job.span(5).stop, 15):
         pin.framesForwardKinematics(model, data, job.q[k])
+        other.update_cfg(job.q[k])
         box = pose_matrix(job.pose[k, :3], job.pose[k, 3:])
         for arm, name in enumerate(("left_contact_pad", "right_contact_pad")):
-            pad = data.oMf[model.getFrameId(name)].homogeneous
             expected = box @ rack().workcell.contacts[arm].T_box_pad
+            pad = data.oMf[model.getFrameId(name)].homogeneous
             np.testing.assert_allclose(pad, expected, atol=1e-5)
+            np.testing.assert_allclose(other.get_transform(name, "world"), expected, atol=1e-5)
 
 
 def test_the_description_weighs_what_the_efforts_hold() -> None:
@@ -171,27 +181,6 @@ def test_mock_hardware_begins_at_the_first_position() -> None:
     parameters = yaml.safe_load(text_of("ros2-control", "config/controllers.yaml"))
     controller = parameters["carry_controller"]["ros__parameters"]
     assert controller["command_interfaces"] == commands == ["position", "effort"]
-
-
-def by_yourdfpy(text: str) -> yourdfpy.URDF:
-    """The description as another reader takes it."""
-    content = io.BytesIO(text.encode())
-    found = yourdfpy.URDF.load(content, load_meshes=False, build_collision_scene_graph=False)
-    if not found.validate():
-        raise ValueError(found.errors)
-    return found
-
-
-def test_another_reader_places_the_pads_as_well() -> None:
-    found = by_yourdfpy(text_of("ros2-control", "description/cell.urdf"))
-    assert list(found.actuated_joint_names) == JOINTS
-    job, cell = exported("ros2-control").sampled, rack().workcell
-    for k in range(job.span(1).start, job.span(5).stop, 40):
-        found.update_cfg(job.q[k])
-        box = pose_matrix(job.pose[k, :3], job.pose[k, 3:])
-        for arm, name in enumerate(("left_contact_pad", "right_contact_pad")):
-            expected = box @ cell.contacts[arm].T_box_pad
-            np.testing.assert_allclose(found.get_transform(name, "world"), expected, atol=1e-5)
 
 
 def test_a_broken_description_is_refused() -> None:
