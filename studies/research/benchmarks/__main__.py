@@ -61,6 +61,8 @@ def _add_options(parser: Parser) -> None:
 
 
 def _run(options: argparse.Namespace) -> int:
+    import numpy as np
+
     from hybrid_opt.proposing.proposal import ProposeSettings
     from studies.research.benchmarks import baxter, machines, shelves, slot
     from studies.research.benchmarks.measuring import Benchmark, measured, table
@@ -86,7 +88,7 @@ def _run(options: argparse.Namespace) -> int:
             measured(given, task, options.output, settings, options.seed, options.study)
             for task in given.tasks
         ]
-        print(table(given, found).text())
+        print(table(given, found, np.random.default_rng(options.seed)).text())
     return 0
 
 

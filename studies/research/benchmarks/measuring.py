@@ -14,13 +14,20 @@ from hybrid_opt.classes import fastest_carry
 from hybrid_opt.display.table import Table, number
 from hybrid_opt.errors import NoHoldError, ProposalError
 from hybrid_opt.proposing.problem import completed
+from hybrid_opt.proposing.proposal import worked
+from hybrid_opt.proposing.trial import judge_of
 from hybrid_opt.proposing.via_points import travelled
 from studies.research.turns import progress
 from symbolic.array import Array
+from symbolic.geometry.pairs import build_geometry
+from symbolic.read.cell import load
 from symbolic.replacing import replace_file
 
 EVALUATIONS = 1000
 """Of the search behind a fastest carry."""
+
+CHECKS, TOGETHER = 4000, 200
+"""Configurations by which the rate of collision checks is measured, and so many at once."""
 
 FRICTION = 0.8
 """Of every pad."""
@@ -114,6 +121,7 @@ class Measured:
         task: which.
         refused: why no carry was found, '' where one was.
         held: whether the box can be held at start and goal.
+        workcell: the proposed file, None where there is none.
         certified, seconds: worked until the first certified carry, and until its file was whole.
         first: length of the proposed carry.
         fastest: of a study, None without.
@@ -123,6 +131,7 @@ class Measured:
     task: Task
     refused: str = ""
     held: bool = True
+    workcell: Path | None = None
     certified: float | None = None
     seconds: float | None = None
     first: Length | None = None
@@ -160,7 +169,7 @@ def measured(
     workcell = path.with_name(f"{path.stem}-proposed.toml")
     replace_file(workcell, proposal.text(output).encode())
     first = length(benchmark, proposal.q)
-    found = Measured(task, "", True, proposal.certified, proposal.seconds, first)
+    found = Measured(task, "", True, workcell, proposal.certified, proposal.seconds, first)
     if not study:
         return found
     progress(f"{task.name}: the fastest carry")
@@ -178,10 +187,27 @@ def length(benchmark: Benchmark, q: tuple[Array, Array]) -> Length:
     return Length(travelled(np.hstack(q)), travelled(benchmark.coordinates(*q)))
 
 
-def table(benchmark: Benchmark, found: list[Measured]) -> Table:
+def checks_per_second(workcell: Path, rng: np.random.Generator) -> float:
+    """How many random configurations of both arms a cell's collision judge looks at in a second of
+    work, nothing of it compiled, as a proposal asks it."""
+    cell = load(workcell)
+    judge = judge_of(build_geometry(cell))
+    q_1, q_2 = (
+        rng.uniform(arm.lower, arm.upper, (CHECKS, arm.joints)) for arm in judge.geometry.arms
+    )
+    ends = cell.task.waypoints[0].lower, cell.task.waypoints[-1].lower
+    pose = np.tile(np.mean(ends, axis=0), (CHECKS, 1))
+    begun = worked()
+    for few in np.split(np.arange(CHECKS), CHECKS // TOGETHER):
+        judge.colliding(pose[few], q_1[few], q_2[few])
+    return CHECKS / (worked() - begun)
+
+
+def table(benchmark: Benchmark, found: list[Measured], rng: np.random.Generator) -> Table:
     """The figures beside the published ones: work until the first certified carry and until its
     file, its length over all joints and in their coordinates, in these also the straight line
-    between their ends; then the fastest carry."""
+    between their ends; then the fastest carry. Below how many were found, and the rate of collision
+    checks in the first one's cell."""
     rows = []
     for one in found:
         first = (None, None) if one.first is None else (one.first.joints, one.first.theirs)
@@ -212,7 +238,9 @@ def table(benchmark: Benchmark, found: list[Measured]) -> Table:
         "its theirs [rad]",
     )
     refused = "".join(f" {one.task.name}: {one.refused}." for one in found if one.refused)
-    note = f"{solved(found)} {benchmark.note}{refused}"
+    cell = next((one.workcell for one in found if one.workcell is not None), None)
+    rate = "" if cell is None else f" {checks_per_second(cell, rng):.0f} collision checks a second."
+    note = f"{solved(found)}{rate} {benchmark.note}{refused}"
     return Table(benchmark.name, benchmark.title, header, tuple(rows), note)
 
 

@@ -17,8 +17,17 @@ from hybrid_opt.proposing.problem import completed, read_problem
 from hybrid_opt.proposing.via_points import travelled
 from studies.research.benchmarks import baxter, machines, shelves, slot
 from studies.research.benchmarks.__main__ import main
-from studies.research.benchmarks.measuring import Length, Measured, measured, solved, table
+from studies.research.benchmarks.measuring import (
+    Length,
+    Measured,
+    checks_per_second,
+    measured,
+    solved,
+    table,
+)
 from symbolic.errors import SettingsError
+
+RNG = np.random.default_rng(1)
 
 POSTURES = {
     "bottom": [-0.6431, 1.9156, -1.7968, 1.2945, -0.0238, -0.8770, -1.7042, 1.45],
@@ -151,13 +160,13 @@ def test_a_task_without_a_carry_says_why(folder: Path) -> None:
     task.problem["task"]["goal"][2] = 0.3
     found = measured(given, task, folder / "out", ho.ProposeSettings(), 1, study=False)
     assert "payload meets shelf body shelf at the goal" in found.refused
-    assert found.refused in table(given, [found]).note
+    assert found.refused in table(given, [found], RNG).note
 
 
 def test_the_table_has_figures_where_there_are_some(folder: Path) -> None:
     given = shelves.benchmark(folder)
-    some = Measured(given.tasks[0], "", True, 12.0, 20.0, Length(3.0, 2.1))
-    rows = table(given, [some]).rows
+    some = Measured(given.tasks[0], "", True, None, 12.0, 20.0, Length(3.0, 2.1))
+    rows = table(given, [some], RNG).rows
     assert rows[0][:7] == ("top to middle", "12.0", "20.0", "3.00", "2.10", "1.88", "2.09")
     assert rows[0][7:] == (NOTHING,) * 4
     told = solved([some, Measured(given.tasks[1], "out of reach", False)])
@@ -292,3 +301,8 @@ def test_another_scene_is_refused(tmp_path: Path, text: str, told: str) -> None:
     scene.write_text(text, encoding="utf-8")
     with pytest.raises(SettingsError, match=rf"(?s){told}.*git clone"):
         slot.benchmark(tmp_path)
+
+
+def test_collision_checks_are_counted_by_work() -> None:
+    rate = checks_per_second(Path("studies/workcells/rack.toml"), RNG)
+    assert 100.0 < rate < 1e6  # measured: thousands

@@ -1,0 +1,46 @@
+"""Classes of carries compared: what stands first is the fastest, what holds nothing last."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hybrid_opt import classes
+from hybrid_opt.display.table import NOTHING
+from symbolic.errors import SettingsError
+
+SECONDS = {"over post": 2.0, "left of post": 1.5, "right of post": None}
+
+
+def proposal(side: str) -> Any:
+    """As much of a proposal as is compared; its file says which it is."""
+    return SimpleNamespace(
+        sides=(side,),
+        length=4.0,
+        found=SimpleNamespace(branches=(1, 0)),
+        text=lambda folder: side,
+    )
+
+
+def test_the_fastest_class_comes_first(monkeypatch: pytest.MonkeyPatch) -> None:
+    def load(path: Path) -> str:
+        return path.read_text(encoding="utf-8")
+
+    def fastest(side: str, evaluations: int, rng: np.random.Generator) -> Any:
+        assert evaluations == 300
+        seconds = SECONDS[side]
+        if seconds is None:
+            raise SettingsError("no carry that holds")
+        return SimpleNamespace(duration=seconds, peak_normal_force=np.array([[30.0, 31.25]]))
+
+    monkeypatch.setattr(classes, "Cell", SimpleNamespace(load=load))
+    monkeypatch.setattr(classes, "fastest_carry", fastest)
+    given = [proposal(side) for side in ("right of post", "over post", "left of post")]
+    found, table = classes.compared(given, 300, np.random.default_rng(1))
+    assert [one.sides[0] for one in found] == ["left of post", "over post", "right of post"]
+    assert table.rows[0] == ("left of post", "1 and 0", "4.00", "1.50", "31.2")
+    assert table.rows[2][3:] == (NOTHING, NOTHING)
