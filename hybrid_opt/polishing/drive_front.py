@@ -36,6 +36,7 @@ from hybrid_opt.timing.given import drive_path
 from hybrid_opt.timing.model import TimingModel
 from hybrid_opt.timing.solve import time_path
 from symbolic.array import Array
+from symbolic.path.pieces import same_paths, stated
 from symbolic.records.task import initial_decision
 
 LEAST_GAP = 0.02
@@ -270,19 +271,21 @@ class DriveRun(PolishRun[DriveAttempt]):
 
     def _tournament(self, force: float) -> None:
         """An attempt from the best of several starts: the best known path and the hand-made one,
-        turned in every sense."""
+        turned in every sense by their stated waypoints."""
         paths, durations = self._driven(force)
         best = paths[int(np.argmin(durations))]
+        task, own = self._way.cell.task, stated(self._way.cell.task)
+
+        def durations_of(turned_paths: Array) -> Array:
+            return self._way.paths.durations(same_paths(turned_paths, own, task), force)
+
         starts = [
-            np.append(path, force)
-            for base in (best, self._hand_made)
-            for path in turned(self._way.cell.task, base, self._within(force))
+            np.append(same_paths(path, own, task)[0], force)
+            for base in same_paths(np.array([best, self._hand_made]), task, own)
+            for path in turned(own, base, durations_of)
         ]
         if starts:
             self._attempt("extreme", best, force, tuple(starts))
-
-    def _within(self, force: float) -> Callable[[Array], Array]:
-        return lambda paths: self._way.paths.durations(paths, force)
 
     def _attempt(self, aim: Aim, path: Array, force: float, rivals: tuple[Array, ...] = ()) -> None:
         self._tried.add(force)
