@@ -20,8 +20,8 @@ from hybrid_opt.work.service import LocalExecutor, Service, answer_all
 from symbolic.read.cell_files import collect_cell
 from tests.symbolic.read.samples import RACK
 
-QUICK = ("fork", "rack", "transfer")
-"""Cells that others compile as well; the rest takes minutes."""
+QUICK = ("drum", "fork", "rack", "transfer")
+"""Cells that other tests compile as well; the rest takes minutes."""
 
 CELLS = [
     pytest.param(path, marks=() if path.stem in QUICK else pytest.mark.slow, id=path.stem)
@@ -49,8 +49,8 @@ def test_every_cell_that_ships_is_searched(path: Path) -> None:
 def test_a_worker_elsewhere_searches_without_the_cells_files(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Paths of pads without closed form are timed one by one, which reads the robots' files."""
-    cell = ho.Cell.load(RACK.with_name("fork.toml")).drivable()
+    """With the joint allocation paths are timed one by one, which reads the robots' files."""
+    cell = ho.Cell.load(RACK.with_name("drum.toml")).drivable()
     evaluator = partial(CandidateEvaluator, objectives=DRIVABLE_OBJECTIVES)
     source = partial(with_cell, evaluator, collect_cell(cell.workcell))
     settings = CampaignSettings({"random": {}}, EVALUATIONS, 1, objectives=DRIVABLE_OBJECTIVES)
