@@ -303,6 +303,13 @@ class ReportData(Experiment):
         """The recommended carry as its job drives it, None without a job."""
         return next((job.timing for job in self.jobs if job.label == RECOMMENDED_LABEL), None)
 
+    @property
+    def recommended_carry(self) -> DrawnCarry | None:
+        """The same as what is drawn of it."""
+        timing = self.recommended_timing
+        carry = None if timing is None else timing.carry
+        return None if carry is None else DrawnCarry(RECOMMENDED_LABEL, carry)
+
 
 def gather(results: CampaignResults, executor: Executor | None = None) -> ReportData:
     """Evaluate what is drawn in detail.

@@ -57,13 +57,18 @@ def report_pictures(data: ReportData) -> Iterator[ReportPicture]:
     yield _of("residual_moments", pictures_carry.residual_moments, data)
     yield _of("fig12_payload", pictures_carry.payload, data)
     yield _of("fig13_paths", pictures_cell.paths, data.geometry, pictures_carry.styled(data))
-    names = {a.best.label: a.name for a in data.algorithms if a.best is not None}
-    for carry, _ in pictures_carry.styled(data)[1:]:
-        whose = f"selected from {carry.label}" if carry.label in names else "recommended"
-        text = f"The trajectory {whose} at 0, 33, 66 and 100 % of its duration"
-        text += " (paper Figures 14 and 15)." if carry.label in names else "."
-        draw, name = pictures_cell.motion_sequence, f"motion_{names.get(carry.label, carry.label)}"
-        yield _of(name, draw, data.geometry, carry, caption=text)
+    paper = " (paper Figures 14 and 15)"
+    drawn = [
+        (a.name, a.best, f"selected from {a.best.label}", paper)
+        for a in data.algorithms
+        if a.best is not None
+    ]
+    if (driven := data.recommended_carry) is not None:
+        drawn.append((driven.label, driven, "recommended", ""))
+    for name, carry, whose, source in drawn:
+        text = f"The trajectory {whose} at 0, 33, 66 and 100 % of its duration{source}."
+        sequence = pictures_cell.motion_sequence
+        yield _of(f"motion_{name}", sequence, data.geometry, carry, caption=text)
     if any(timed.force_curve is not None for _, timed in data.timings):
         text = (
             f"Drivable durations against the {data.force_kind.title}: single paths timed anew at "

@@ -28,7 +28,7 @@ from studies.report.drawing import (
     series,
     shortened,
 )
-from studies.report.page_carries import RECOMMENDED_LABEL, torque_use
+from studies.report.page_carries import torque_use
 from symbolic.array import Array
 
 PREDICTED: dict[str, Any] = {"color": "black", "linestyle": (0, (2, 1.5)), "linewidth": 0.8}
@@ -39,9 +39,7 @@ def styled(data: ReportData) -> tuple[tuple[DrawnCarry, LineStyle], ...]:
     """The hand-made trajectory, each algorithm's best one and the recommended carry as robots drive
     it, with their looks."""
     shown = [(data.initial, HAND_MADE), *((a.best, series(a.index)) for a in data.algorithms)]
-    timing = data.recommended_timing
-    if timing is not None and timing.carry is not None:
-        shown.append((DrawnCarry(RECOMMENDED_LABEL, timing.carry), RECOMMENDED))
+    shown.append((data.recommended_carry, RECOMMENDED))
     return tuple((carry, look) for carry, look in shown if carry is not None)
 
 
