@@ -79,6 +79,10 @@ class Cell:
         self._objectives = tuple(objectives)
         self._folder: TemporaryDirectory[str] | None = None  # of its files
 
+    def __reduce__(self) -> tuple[type[Cell], tuple[Any, ...]]:
+        """Its description: another process loads its functions anew."""
+        return Cell, (self.workcell, self._objectives, self.threads)
+
     @classmethod
     def load(
         cls,

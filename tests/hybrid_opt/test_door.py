@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 import subprocess
 import sys
 from collections.abc import Mapping
@@ -126,6 +127,13 @@ def test_an_empty_front_says_so() -> None:
     assert "<svg" not in empty._repr_html_()
     with pytest.raises(SettingsError, match="front is empty"):
         empty.balanced()
+
+
+def test_another_process_can_be_given_a_front() -> None:
+    cell().evaluator.evaluate(front().x)
+    given = pickle.loads(pickle.dumps(front()))
+    np.testing.assert_array_equal(given.objectives, front().objectives)
+    assert (given.title, given.objective_names) == (front().title, front().objective_names)
 
 
 def test_a_polish_makes_it_better() -> None:
