@@ -144,7 +144,7 @@ class Session:
         settings = SearchSettings(initial=first)
         front = search(cell, evaluations=evaluations, rng=rng, settings=settings)
         # The path at hand may have waypoints between those that a search draws.
-        tried = cell.evaluate(np.vstack([self.x, front.x]))
+        tried = cell.evaluator.certified(cell.evaluate(np.vstack([self.x, front.x])))
         if tried.feasible.any():
             product = np.where(tried.feasible, np.prod(tried.objectives, axis=1), np.inf)
             self.x = np.array(tried.x[np.argmin(product)])
