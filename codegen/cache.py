@@ -85,7 +85,7 @@ def digest(*parts: str | bytes) -> str:
 
 @cache
 def library_version(name: str) -> str:
-    """Of an installed library; to ask for it takes milliseconds."""
+    """Version of an installed library, kept: the look-up takes milliseconds."""
     return version(name)
 
 

@@ -344,7 +344,7 @@ class PreparedBatch:
         """Evaluate all, or the first `count` of them, and return the outputs.
 
         Raises:
-            CodegenError: the function failed, or there is no room for so many.
+            CodegenError: the function failed, or the batch does not fit into memory.
         """
         wanted = self.size if count is None else count
         if not 0 <= wanted <= self.size:

@@ -131,7 +131,7 @@ class StillUse:
 
     @property
     def share(self) -> float:
-        """Of the limit."""
+        """Share of the limit that is needed."""
         return self.needed / self.allowed
 
     @property

@@ -44,7 +44,7 @@ from symbolic.errors import DualArmError, SettingsError
 from symbolic.records import Workcell
 
 POLISH = PolishSettings(attempts=1, drivable=DrivableSettings(rounds=12, most_rounds=12, members=4))
-"""Of a path that was the best one of a cell nearby."""
+"""Polish of a path that was the best one of a nearby cell."""
 
 _OTHER_FILE = "remove it, or name another file"
 

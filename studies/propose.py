@@ -19,7 +19,7 @@ from symbolic.replacing import replace_file
 
 
 def _ranges(text: str) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Of 'LOW:HIGH,LOW:HIGH', the second one none where it is missing."""
+    """The two ranges of 'LOW:HIGH,LOW:HIGH'; (0, 0) for the second where it is missing."""
     read, found = number(-1.0, 1.0), []
     for part in text.split(","):
         low, _, high = part.partition(":")

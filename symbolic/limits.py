@@ -35,11 +35,11 @@ from symbolic.records.quantities import GRAVITY
 from symbolic.robot.arm import TRACK_OUTPUTS, follow_function
 
 VERDICTS = ("ik_residual", "lost", "limit_margin", "manipulability")
-"""What `symbolic.robot.arm.TRACK_OUTPUTS` says of an arm beside its joints."""
+"""Outputs of `symbolic.robot.arm.TRACK_OUTPUTS` beside an arm's joints."""
 
 WEIGHT = 1e-6
-"""Of the barriers where a program finds the forces (`symbolic.contact.soft_grasp`), which are above
-the least ones by less than what timings are exact to."""
+"""Weight of the barriers where a program finds the forces (`symbolic.contact.soft_grasp`): they
+exceed the least ones by less than what timings are exact to."""
 
 SPEEDS_OF_BOX = 4
 """Payload, payload turning, reference, reference turning."""

@@ -88,7 +88,7 @@ class _Take(Protocol):
         """A turn about z whose parts were taken."""
 
     def group(self, name: str) -> Group:
-        """Of which all is taken."""
+        """The group of that name, all of whose numbers are taken."""
 
     def body(self, path: str, body: Bounded) -> Any:
         """A body whose numbers were taken."""
@@ -204,7 +204,7 @@ class WorkcellNumbers:
 
     @cached_property
     def digest(self) -> str:
-        """Of the structure without bodies."""
+        """Digest of the structure without bodies."""
         return digest_of_parts((self.workcell,))
 
     def symbols(self) -> NumberedWorkcell:
@@ -243,12 +243,12 @@ class CellNumbers(WorkcellNumbers):
 
     @cached_property
     def digest(self) -> str:
-        """Of the structure without bodies, the arms' own included."""
+        """Digest of the structure without bodies but the arms' own."""
         return digest_of_parts((self.workcell, self._arms))
 
     @cached_property
     def bodies_digest(self) -> str:
-        """Of the whole structure."""
+        """Digest of the whole structure."""
         return digest_of_parts((self.workcell, self.screen, self._arms))
 
     @cached_property
@@ -379,7 +379,7 @@ def _split(T: Array) -> tuple[Array, Array]:
 
 
 def _turn(take: _Take, group: str, path: str, rotation: Array) -> Any:
-    """Of a base: those of most cells stand upright, which is structure."""
+    """Rotation of a base. Most bases stand upright, which is structure."""
     level = np.array([0.0, 0.0, 1.0])
     if np.array_equal(rotation[2], level) and np.array_equal(rotation[:, 2], level):
         cosine, sine = rotation[0, 0], rotation[1, 0]

@@ -74,7 +74,7 @@ MOST_TURN = 15.0
 object, and misses 3.4 % of the normal force there."""
 
 LEAST_SPEED = 0.1
-"""Of a move under force [mm/s], [degrees/s]."""
+"""Least speed of a move under force [mm/s], [degrees/s]."""
 
 
 def require_force_control(job: Job, target: str) -> None:
@@ -324,16 +324,16 @@ def _numbers(values: Array) -> str:
 
 
 PORTS = (6511, 6512)
-"""Of this computer, that the controller writes to for each arm."""
+"""Ports of this computer to which the controller writes, one per arm."""
 
 CROSSOVER = 0.3
-"""Of the force loop: its gain times its lag."""
+"""Crossover of the force loop: its gain times its lag."""
 
 LEAST_LAG = 0.01
 """Least lag that the force loop reckons with [s]."""
 
 MOST_WAY, PRESS_SPEED = 1.5, 0.05
-"""Of the pressing pad beyond its plan: over what its largest force needs, and [m/s]."""
+"""Most travel of the pressing pad beyond its plan, over that of its largest force; speed [m/s]."""
 
 
 def require_egm(job: Job) -> None:

@@ -172,7 +172,7 @@ STOP_TIMES = (0.1, 0.15, 0.2, 0.3, 0.45, 0.7, 1.0, 1.5, 2.0, 3.0)
 """Times of a stop that are tried, the shortest first [s]."""
 
 EVERY = 5
-"""Of the job's own samples, one in so many is where a stop is tried."""
+"""Stride of the job's own samples at which a stop is tried."""
 
 INSTANTS = 9
 """Instants at which a stop is looked at."""
@@ -304,7 +304,7 @@ START, PATH = 0.005, 0.02
 """Largest distance of a pad from its first place and from its path [m]."""
 
 BEHIND, LAGS = 0.05, 3.0
-"""How far an arm may lag behind its reference [s]; at least so many times its usual lag."""
+"""How far an arm may lag behind its reference [s]; at least this multiple of its usual lag."""
 
 LEAST_SKEW, MOST_SKEW = 0.008, 0.05
 """Range of the distance of both arms along the path that a program watches for [s]: less cannot be

@@ -38,29 +38,29 @@ FRANKA_STATE = "franka_robot_state_broadcaster"
 ACTION = "follow_joint_trajectory"
 
 UPDATE_RATE = 1000
-"""Of a controller manager [Hz], unless the driver says otherwise."""
+"""Rate of a controller manager [Hz], unless the driver says otherwise."""
 
 MONITOR_RATE = 100.0
-"""At which a controller tells how its goal ended [Hz]."""
+"""Rate at which a controller checks whether its goal has ended [Hz]."""
 
 GAIN, DAMPING = 7.0, 0.7
-"""Of Franka's joints: their whole torque at so many radians' inverse, and the share of the root of
-the gain that damps: about those of the maker's own examples."""
+"""Gains of Franka's joints: stiffness over largest torque [1/rad], and damping over the root of the
+stiffness; about those of the maker's own examples."""
 
 TORQUE_RATE = 1000.0
 """Fastest change of a torque that libfranka takes [N m/s] (kMaxTorqueRate)."""
 
 CONTACT, SPARE_FORCE, SPARE_TORQUE = 1.5, 20.0, 5.0
-"""A collision is what exceeds so many times the planned contact by so much [N], [N m]."""
+"""A collision exceeds this multiple of the planned contact by this force [N] or torque [N m]."""
 
 UR_RATE = 500
-"""Of an e-series controller [Hz]."""
+"""Rate of an e-series controller [Hz]."""
 
 FORCE_EVERY = 0.1
 """Time between two force references of a UR [s]: each is a call of a service."""
 
 FORCE_DAMPING, FORCE_GAIN = 0.1, 0.5
-"""Of UR's force mode: more damping than its default of 0.025, the default gain."""
+"""Parameters of UR's force mode: more damping than its default of 0.025, the default gain."""
 
 FORCE_SPEED, DEVIATION = 0.05, 0.02
 """Largest speed along the normal [m/s], largest deviation across it [m], [rad]."""

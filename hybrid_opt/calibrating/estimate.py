@@ -33,11 +33,11 @@ from symbolic.records.poses import skew
 from symbolic.records.quantities import GRAVITY
 
 NOISE = np.array([0.3] * 3 + [0.03] * 3)
-"""Of a sensor's mean over a hold, drift included [N, N m]. What the fit leaves may raise it."""
+"""Noise of a sensor's mean over a hold, with drift [N, N m]. The fit's residual may raise it."""
 
 WIDTHS = np.array([1e3, *[1e2] * 3, *[0.3] * 4, *NOISE, *NOISE])
-"""Of the unknowns before anything was measured: mass [kg], mass times centre [kg m], crosstalk, and
-what tares left of both arms' offsets."""
+"""Prior widths of the unknowns: mass [kg], mass times centre [kg m], crosstalk, and what tares left
+of both arms' offsets."""
 
 SOUGHT = 8
 """Unknowns in front of the offsets."""
@@ -187,7 +187,7 @@ def without_crosstalk(wrench: Array, crosstalk: Array) -> Array:
 
 
 STEP = 0.005
-"""Of the grid that signals are compared on [s]."""
+"""Step of the grid on which signals are compared [s]."""
 
 LARGEST_GRID = 2_000_000
 """Points of it; a longer recording has no delay."""
@@ -258,7 +258,7 @@ class FrictionRatio:
             self._capacity.append(ca.Function("capacity", [grip, tangent], [carried]))
 
     def __call__(self, wrench: Array) -> float:
-        """Of readings (2, 6) about the pads, along their axes, free of offset and crosstalk.
+        """Ratio of readings (2, 6) about the pads, along their axes, free of offset and crosstalk.
 
         Returns:
             the ratio; infinite where a pad does not press.

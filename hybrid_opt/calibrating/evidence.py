@@ -107,7 +107,7 @@ class Evidence:
 
     @property
     def changes(self) -> dict[str, Any]:
-        """Of the workcell file."""
+        """Changes of the workcell file."""
         if not self.ranges:
             return self.tables
         # What a stated table does not name would be exact.

@@ -29,7 +29,7 @@ APART = 0.03
 """Difference of both arms' clocks that is told [s]: the box hands normal forces on at once."""
 
 LARGEST_DELAY = 5.0
-"""Of one clock after the other that is looked for [s]."""
+"""Largest delay between two clocks that is looked for [s]."""
 
 LONGEST_STEP = 0.5
 """Usual step of a recording above which its times are in another unit [s]."""

@@ -122,7 +122,7 @@ class Run:
 
 
 GAP, LONG_GAP = 10.0, 0.2
-"""A step of so many usual ones, and at least so long [s], is a gap."""
+"""A gap is a step of at least this many usual ones and at least this long [s]."""
 
 
 @dataclass(frozen=True)

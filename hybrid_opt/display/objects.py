@@ -246,7 +246,7 @@ def _where(robot: str, joint: str) -> str:
 
 
 SIZE = (5.4, 3.4)
-"""Of a plot [inch]."""
+"""Size of a plot [inch]."""
 
 ROOM = 0.06
 """Share of the data's range left free around it."""

@@ -24,7 +24,7 @@ LEVER = 0.1
 """What a turn counts beside a distance [m]."""
 
 DAMPING = 1e-4
-"""Of these steps, squared [m^2]."""
+"""Damping of these steps, squared [m^2]."""
 
 
 @dataclass(frozen=True)

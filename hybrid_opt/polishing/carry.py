@@ -80,7 +80,7 @@ class PlacedCarry:
 
 
 def lowest(values: Array, limit: float, stride: int | None = None) -> list[int]:
-    """Of every stretch of places below the limit the lowest, and those by the stride from it."""
+    """The lowest place of every stretch below the limit, and those by the stride from it."""
     below = values < limit
     if not below.any():
         return []

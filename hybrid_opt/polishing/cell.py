@@ -185,7 +185,7 @@ def _driven_held(model: CellModel) -> dict[str, ca.Function]:
 
 
 def _names(quantities: tuple[Quantity, ...]) -> set[str]:
-    """Of all functions that `polish_functions` makes."""
+    """Names of all functions that `polish_functions` makes."""
     blocks = ("inner", "first", "last", "path")
     return {
         GAPS,

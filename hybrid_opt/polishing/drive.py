@@ -50,7 +50,7 @@ from symbolic.records import Workcell
 from symbolic.records.task import waypoints_of
 
 FIRST_RADIUS, LEAST_RADIUS = 0.3, 1e-4
-"""Of the box of trust, in halves of the ranges of the waypoints; below the least a point is
+"""Radii of the box of trust, in half ranges of the waypoints; below the least a point is
 left."""
 
 STATIONARY, FEASIBLE = 1e-4, 5e-3
@@ -76,7 +76,7 @@ STEADINESS = 1.0
 """Curvature by the path of the program that finds multipliers."""
 
 CORRECTIONS, BEND = 3, 0.01
-"""Of a step by how geometric rows bend along it, at most, and what of a scaled row is left."""
+"""Most corrections of a step for the curvature of geometric rows, and the error that ends them."""
 
 FARTHER = (2.0, 4.0, 8.0)
 """Times a step that brought more than it promised: judging costs a tenth of a round."""
@@ -383,8 +383,8 @@ class DriveWay(Way[DriveReached, DriveStep]):
         )
 
     def _residuals(self, program: JointProgram, best: DriveReached, found: _Found) -> Residuals:
-        """Of the program at its iterate, with the multipliers of a step. Of those of its bounds the
-        variables' own count, not those of the box of trust."""
+        """Residuals of the program at its iterate, with a step's multipliers. Bounds count where
+        they are the variables' own, not the box of trust's."""
         (lower, upper), n, answer = self._bounds, program.n_path, found.answer
         edge, own = 1e-6 * self._unit, answer.bounds[:n]
         reached = best.x[self._own] + self._unit * answer.d[:n]

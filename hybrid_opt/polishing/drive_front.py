@@ -59,7 +59,7 @@ COMPARED = 8
 """Force limits at which paths from beside the front are compared."""
 
 GENTLE = 0.02
-"""Of a force limit above the box at rest, from which on points are moved by all waypoints."""
+"""Least force limit, as a share above the box at rest, whose points are moved by all waypoints."""
 
 STALLED = 1e-3
 """Gain of half a turn below which a climb that is nearly stationary has arrived, as a share of its
@@ -328,8 +328,8 @@ class DriveRun(PolishRun[DriveAttempt]):
         return np.unique(blends.reshape(-1, self._n_path), axis=0)
 
     def _leading(self, paths: Array, count: int) -> Array:
-        """Of some paths (n, n_path) those that are feasible when pressed hard enough, and of these
-        the fastest within some of so many forces."""
+        """Those of some paths (n, n_path) that are feasible when pressed hard enough and are the
+        fastest within one of `count` forces."""
         x = np.hstack([paths, np.full((len(paths), 1), self._range[1])])
         paths = paths[self._evaluator.evaluate(x).feasible]
         if not len(paths):

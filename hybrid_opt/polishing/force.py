@@ -51,14 +51,14 @@ LEVEL_BOUND = 2e3
 """Bound of |phi| and |a|; beyond anything the targets ask for."""
 
 LEAST_RADIUS = 1e-3
-"""Of the box of trust, below which a point is left."""
+"""Radius of the box of trust below which a point is left."""
 
 PARTS = (3 / 4, 2 / 4, 1 / 4)
-"""Of a step that violates something, which are judged in its place."""
+"""Shares of a step that violates something, which are judged in its place."""
 
 BARRIER, WIDE_BARRIER, NEAR_BARRIER = 3e-4, 3e-2, 1e-5
-"""Of the solver at the start. A search's point is near the solution but has no multipliers; solves
-that look for other basins are led to the middle of what is feasible first."""
+"""Barriers of the solver at the start. A search's point is near the solution but has no
+multipliers; solves that look for other basins first go to the middle of what is feasible."""
 
 NEAR_ROUNDS, NEAR_ITERATIONS = 12, 30
 """Rounds of a start that is nearly an optimum, and the solver's iterations in each."""

@@ -30,7 +30,7 @@ LEAST_SPAN = 2e-3
 """Least scale of an objective: of a front of one point, or one that is nearly flat."""
 
 OWN_SHARE = 1.0 / 8.0
-"""Of the attempts that go to points of the given front."""
+"""Share of the attempts that go to points of the given front."""
 
 TOLERANCE = 1e-6
 """Improvement of an objective below which a point counts as optimal already."""

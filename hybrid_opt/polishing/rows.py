@@ -96,7 +96,7 @@ NEGLIGIBLE = 1e-7
 far from ruling, whose multipliers vanish. It changes steps by as much, no solution."""
 
 INPUTS = ("pose", "rate", "q_1", "q_2", "numbers", "weight")
-"""Of functions of rows at places, in their order in a record."""
+"""Inputs of functions of rows at places, in their order in a record."""
 
 _FORCES, _LOADS, _PRESSURE, _ARMS, _GROUPS = 1, 51, 101, 201, 301
 """As in `rows.c`: from where what has to be prepared is counted."""

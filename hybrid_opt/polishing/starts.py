@@ -46,8 +46,8 @@ SAME = 1e-6
 """Differences below this are rounding [m, rad]."""
 
 TURNED = (0.8, 0.6, 0.4)
-"""Of what the bounds leave, the first share with which the path can be driven. Less turned paths
-fall back to where they came from."""
+"""Shares of the turn that the bounds leave; the first with which the path can be driven is taken.
+Less turned paths fall back to where they came from."""
 
 LEAST_TURN = 0.1
 """Turns below this, in the mean of the waypoints, lead nowhere else [rad]."""
@@ -56,12 +56,12 @@ LEAST_TURN = 0.1
 def first_feasible(
     evaluator: CandidateEvaluator, x: Array, count: int, objective: int | None = None
 ) -> tuple[NDArray[np.intp], Array]:
-    """Of candidates the first feasible ones: their rows (k,) and objectives (k, m).
+    """The first feasible ones of candidates: their rows (k,) and objectives (k, m).
 
     Args:
         x: (n, n_var) candidates.
-        count: at most so many.
-        objective: they come in its order, the lowest first; None for theirs.
+        count: how many at most.
+        objective: the one they are ordered by, lowest first; None for their own order.
     """
     but_collisions = evaluator.evaluate(x, with_collisions=False)
     rows = np.flatnonzero(but_collisions.feasible)
@@ -125,7 +125,7 @@ class Start:
 def random_starts(
     evaluator: CandidateEvaluator, count: int, rng: np.random.Generator
 ) -> list[Start]:
-    """Feasible ones among random candidates, at most so many."""
+    """At most `count` feasible ones among random candidates."""
     shape = CANDIDATES, evaluator.n_var
     candidates = rng.uniform(evaluator.lower, evaluator.upper, shape)
     rows, objectives = first_feasible(evaluator, candidates, count)

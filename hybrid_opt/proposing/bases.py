@@ -35,20 +35,20 @@ from symbolic.records import Cylinder, Workcell
 from symbolic.records.poses import box_placement, inverse, pose_matrix, transform
 
 DISTANCES = (0.35, 0.45, 0.55, 0.65, 0.75)
-"""Of a base from the middle of its contact's way, sideways, in the stretched arm's length."""
+"""Distances of a base from the middle of its contact's way, sideways, in stretched arms."""
 
 MACHINE_DISTANCES = (0.28, 0.34, 0.40, 0.46, 0.52)
-"""The same of the line through a machine's shoulders, from the middle of the carry."""
+"""Distances of the line through a machine's shoulders from the middle of the carry, likewise."""
 
 SHIFTS = (0.0, -0.2, 0.2)
-"""Of a base along the carry, likewise."""
+"""Shifts of a base along the carry, likewise."""
 
 BEHIND = 0.05
 """A machine's arms reach ahead if they do so by this much in the mean of their postures, in the
 stretched arm's length."""
 
 POSTURES = 500
-"""Of that mean."""
+"""Postures in that mean."""
 
 MOST_CHOICES = 6
 """Pairs of bases that are handed on."""
@@ -57,7 +57,7 @@ STARTS = 192
 """Random postures by which a place is judged."""
 
 EVERY_SPIN = 2
-"""Every so many spins of the pads it is judged by."""
+"""Stride among the pads' spins by which it is judged."""
 
 GUIDES_TRIED = 2
 """Guides by which it is judged."""
@@ -75,7 +75,7 @@ HIDDEN = 2.0
 """What it costs if something stands between a shoulder and its contact."""
 
 ARM_RADIUS = 0.05
-"""Of what has to find room between them [m]."""
+"""Radius of the arm that must fit between them [m]."""
 
 LIFT = 0.03
 """How far the box is lifted off what it stands on, and lowered in the end [m]."""
@@ -84,7 +84,7 @@ ASIDE = (0.15, 0.25, 0.40)
 """How far it goes aside, level in eight directions or up [m]."""
 
 POSES = 33
-"""Of a detour."""
+"""Poses along a detour."""
 
 
 def base_choices(problem: Problem, spins: Array, rng: np.random.Generator) -> list[dict[str, Any]]:

@@ -296,10 +296,10 @@ STARTS = 768
 """Random starts of the search for postures."""
 
 SEARCH_STEPS = 50
-"""Newton steps of it."""
+"""Newton steps of the search."""
 
 SEARCH_DAMPING = 1e-3
-"""Of these steps."""
+"""Damping of these steps."""
 
 GUIDES = np.array(
     [[0, 0, 0], [0, 0, 0.2], [0, 0, 0.4], [0.25, 0, 0], [-0.25, 0, 0], [0, 0.25, 0], [0, -0.25, 0]]
@@ -382,7 +382,7 @@ class HoldQuery:
         spins: of the pad beside that of the file [rad].
         judge: of collisions; None: they do not count.
         starts: random starts of the search for postures.
-        guides: of `GUIDES`, so many are tried.
+        guides: how many of `GUIDES` are tried.
     """
 
     workcell: Workcell
@@ -552,8 +552,8 @@ class _Finder:
 
 
 def _diverse(holds: Sequence[Hold], compared: int) -> list[Hold]:
-    """Of ways that differ in the spin and a joint about the same axis alone the best, then those
-    unlike all before them first.
+    """The best of ways that differ only in the spin and a joint about the same axis, ordered so
+    that those unlike all before them come first.
 
     Args:
         compared: joints that make a difference, from the first.

@@ -258,7 +258,7 @@ SHORT_RETREAT = 0.06
 """Shortest one that is of use [m]."""
 
 RETREAT_STOPS = 4
-"""Every so many configurations of a retreat the box may turn to the other end's."""
+"""Stride of a retreat's configurations at which the box may turn to the other end's pose."""
 
 STRAIGHT_TRIED = 100
 """Straight motions of the box between two retreats that are tried with the arms."""

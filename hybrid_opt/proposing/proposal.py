@@ -62,10 +62,10 @@ FEW = 3
 """Via-points that are taken at once; where a path needs more, others are tried first."""
 
 LONG_TRIED = 2
-"""Of those that need more, so many are judged."""
+"""Most paths with more via-points that are judged."""
 
 LONGER = 2.5
-"""What is tried next where the time was too short, in that time."""
+"""Multiple of the time that a user is told to try where it was too short."""
 
 MOST_CLASSES = 100
 
@@ -411,7 +411,7 @@ class _Search:
         return self.problem.workcell(changes(self.problem, found))
 
     def _bounds(self, trial: Trial, until: float) -> Bounds:
-        """Bounds around a trial's carry, found by so many seconds from the beginning."""
+        """Bounds around a trial's carry, found by a time `until` [s] after the beginning."""
         unit, limits = decision_bounds(trial.workcell)
         low, high = self.settings.feasible
         sampling = Sampling(

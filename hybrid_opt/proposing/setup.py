@@ -47,7 +47,7 @@ MOST_PAIRS = 32
 """Pairs that are looked at closer, the best of both arms' own scores."""
 
 SHARES = np.array([0.5, 0.25, 0.75, 0.0, 1.0])
-"""Of the way from the first arm's value to the second's: what is tried, in this order."""
+"""Shares of the way from the first arm's value to the second's, in the order they are tried."""
 
 STEPS = 15
 """Newton steps from each arm's own posture."""
@@ -129,7 +129,7 @@ def _free(judge: PoseJudge, *places: Place) -> bool:
 
 
 def _free_share(chain: ClosedChain, start: Place, goal: Place) -> float:
-    """Of the freest guide."""
+    """Share of the freest guide that the chain can follow."""
     best = 0.0
     for bow in GUIDES[:GUIDES_TRIED]:
         path = guide(start.extended, goal.extended, bow)

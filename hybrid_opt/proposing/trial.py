@@ -224,10 +224,10 @@ SAME_BRANCH = 0.02
 branch that stands for it [rad or m]."""
 
 COARSE = 9
-"""Every so many samples are judged first: most candidates that collide do so there."""
+"""Stride of the samples judged first: most candidates that collide do so there."""
 
 LOOKED = (1, 3)
-"""Of them so many at first, and by then."""
+"""Samples, nearest first, that are checked in the first batch, and by the end of the second."""
 
 _PLACED = ("pose", "q_1", "q_2", "time")
 

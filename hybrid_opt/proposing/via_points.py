@@ -33,7 +33,7 @@ SHIFT = 0.04
 """Their standard deviation [m], and in a turn counted by its lever."""
 
 GENERATIONS = 60
-"""Of the evolution strategy that shortens a free spline."""
+"""Generations of the evolution strategy that shortens a free spline."""
 
 OFFSPRING = 16
 """Splines of a generation."""

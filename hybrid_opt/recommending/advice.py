@@ -36,7 +36,7 @@ FRICTION = 0.05
 DEGREE = np.pi / 180.0
 
 PITCH = 4
-"""Of the numbers of a pose."""
+"""Index of the pitch among the numbers of a pose."""
 
 LIMITS = 1.0 + np.array([-0.02, 0.0, 0.02, 0.05, 0.1, 0.2, 0.4, 0.8])
 """Times the force limit, where it is known how long the path takes."""

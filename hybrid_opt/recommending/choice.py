@@ -260,7 +260,7 @@ class Option:
 
     @property
     def commanded(self) -> float:
-        """Of the force-controlled arm [N]."""
+        """Largest normal force of the force-controlled arm [N]."""
         return float(self.force[1 - LEADER])
 
 

@@ -62,13 +62,13 @@ TRIED = 3
 """Paths that are driven within limits on jerk before the best of them is chosen."""
 
 PRECISE = 1e-3
-"""Of the multiple of an uncertainty set that would do."""
+"""Tolerance of the multiple of an uncertainty set that would do."""
 
 GENTLE = 1.02
-"""Of the least commanded force where no carry keeps to the reference forces, what is taken."""
+"""Limit over the least commanded force, where no carry keeps to the reference forces."""
 
 STEPS = 4 + FORCES
-"""Of a recommendation, and one more per rival."""
+"""Steps of a recommendation; each rival adds one."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -114,7 +114,7 @@ class Recommendation(Shown):
 
     @property
     def duration(self) -> float:
-        """Of the carry as robots drive it [s]: that of its job, whose phases take whole ticks."""
+        """Duration of the carry as driven [s]: that of its job, whose phases take whole ticks."""
         return self.timing.duration if self.job is None else self.job.phase("carry").duration
 
     @property
@@ -308,7 +308,7 @@ def _too_weak(workcell: Workcell, carry: Carry, needed: Array, commanded: Array)
     motion, planned = box_motion(carry).at(rows), planned[rows]
 
     def share(known: Uncertainty) -> float:
-        """Of the reference force, of the robot that presses harder."""
+        """Commanded over reference force of the robot that presses harder."""
         force = largest_commanded(workcell, motion, planned, known, LEADER).max()
         return float(force * harder / allowed)
 

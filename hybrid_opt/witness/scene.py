@@ -40,10 +40,10 @@ PAD_MASS = 10.0
 """[kg]; its inertia is fed forward."""
 
 PAD_INERTIA = 2e-3
-"""[kg m^2]; what its turning takes is lost in the planned moments."""
+"""Inertia of a pad [kg m^2]; what its turning takes is lost in the planned moments."""
 
 TILT_STIFFNESS = 20.0
-"""Of each driven pad about the axes in its plane [N m/rad]."""
+"""Tilt stiffness of each driven pad about the axes in its plane [N m/rad]."""
 
 TILT_DAMPING_TIME = 2e-3
 """Damping of a pad's tilt over its stiffness [s]."""
@@ -268,7 +268,7 @@ def contact_points(
 
 
 def patch_area(contact: Contact) -> float:
-    """Of all pads of a robot [m^2]."""
+    """Area of all pads of a robot [m^2]."""
     return sum(_area(pad) for pad in (contact, *contact.further))
 
 
@@ -465,7 +465,7 @@ def cell_text(workcell: Workcell, settings: ArmSettings) -> str:
 
 
 def _ties(workcell: Workcell) -> Iterator[str]:
-    """Of each joint that moves both arms its two copies, tied as stiffly as the steps allow."""
+    """Ties between the two copies of each joint that moves both arms, as stiff as steps allow."""
     names = [tuple(arm_model(robot).names)[1:] for robot in workcell.robots]
     for name in common_joints(workcell.robots):
         first, second = (_name("joint", i, own.index(name)) for i, own in enumerate(names))

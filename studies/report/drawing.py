@@ -70,11 +70,11 @@ class LineStyle:
 
     @property
     def drawn(self) -> dict[str, Any]:
-        """Of a line, for Matplotlib."""
+        """Keywords of a line, for Matplotlib."""
         return {"color": self.colour, "linestyle": self.line}
 
     def marks(self, size: float, edge: str = "black", opened: bool = False) -> dict[str, Any]:
-        """Of marks without a line, open ones in the colour alone, for Matplotlib."""
+        """Keywords of marks without a line, open ones in the colour alone, for Matplotlib."""
         return {
             "marker": self.marker,
             "linestyle": "none",

@@ -44,7 +44,7 @@ END = "<!-- measured: end -->"
 """Between them the tables stand in a Markdown file."""
 
 COLOURS = 160
-"""Of a picture on the page, to which those of its file are reduced."""
+"""Colours of a picture on the page; its file's are reduced to them."""
 
 
 def write_report(

@@ -55,7 +55,7 @@ CHOICE = {"color": MARKED, "symbol": "star", "size": 17}
 """Marker of the recommended carry."""
 
 DASHES = ("solid", "dash")
-"""Of the two robots' lines."""
+"""Dashes of the two robots' lines."""
 
 
 def plain(text: str) -> str:

@@ -51,7 +51,7 @@ PATCH = 0.03
 """Radius of the patches [m]."""
 
 CROSSTALK = 0.068
-"""Of the squeeze into lift [N/N], from boxes of known mass in these logs: 0.063 to 0.085."""
+"""Crosstalk of squeeze into lift [N/N], from boxes of known mass in these logs: 0.063 to 0.085."""
 
 EMPTY = 0.3
 """Mass of the small box, which is not stated, as the wrists tell it [kg]."""
@@ -81,7 +81,7 @@ LABELLED = (
 """Runs of a stated mass, and those of the notes and of the markers with their likes."""
 
 STEP, SMOOTHED, BRIEF = 0.02, 0.5, 0.2
-"""Of the samples that are judged, and over which motion and forces are smoothed [s]."""
+"""Step of the judged samples, and times over which motion and forces are smoothed [s]."""
 
 GLITCH = 5
 """Samples of which the median is taken: single ones jump."""
@@ -114,7 +114,7 @@ class Carry:
 
     @property
     def mass(self) -> float:
-        """Of the box [kg]."""
+        """Mass of the box [kg]."""
         return self.run.labels.mass or EMPTY
 
 

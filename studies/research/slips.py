@@ -29,8 +29,8 @@ KINDS = ("hand-made", "fastest", "random", "middle", "random", "gentlest")
 """Candidates of a cell, in turn; all but the hand-made and the random ones of a short search."""
 
 FRICTIONS, SHARES = (1.0, 0.6, 0.3), (1.0, 0.9, 0.8)
-"""Of pads with opposite normals; of others, which little friction does not close, shares of the
-cell's own."""
+"""Frictions of pads with opposite normals; for others, which little friction does not close, shares
+of the cell's own."""
 
 SEARCHED = 500
 """Evaluations of the search whose front members are simulated."""
@@ -42,11 +42,11 @@ LOW, HIGH, BISECTIONS = 0.97, 1.03, 4
 """Factors between which a threshold is looked for, to 0.2 %."""
 
 WIDER, MORE_BISECTIONS = (0.5, 2.0), 9
-"""What a threshold beyond them is looked for with."""
+"""Range and bisections with which a threshold beyond them is looked for."""
 
 FINE_POINTS = 91
-"""Of a patch where normals are not opposite: force rises by up to five times the share by which
-friction falls there, and so does what 37 points leave off the torsion of a disc."""
+"""Points of a patch where normals are not opposite: force rises there by up to five times the share
+by which friction falls, and so does the error of a disc's torsion with 37 points."""
 
 PRESSED_SHARE = 0.95
 """Share of the holding force that is pressed all along to see where the box slips first: a plan

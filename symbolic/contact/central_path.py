@@ -37,8 +37,8 @@ Newton's decrement, over the weight, that counts as being there."""
 
 STEPS = 30
 STEP_SHARE, LAST_SHARE, APPROACH = 0.97, 0.999, 100.0
-"""Of the way to the cones' boundary that a step goes at most; the same near the end, where what is
-left may be this many times the weight, over the effort."""
+"""Largest share of the way to the cones' boundary in one step; the same near the end; and how many
+times the weight, over the effort, what is left near the end may be."""
 
 START_WEIGHT = 0.5
 """Weight of a start whose multipliers are not known, over the effort there per degree."""
@@ -66,7 +66,7 @@ class Program(Protocol):
 
     @property
     def patches(self) -> tuple[Patch, ...]:
-        """Of every contact."""
+        """Patches of all contacts."""
 
     @property
     def cell_sizes(self) -> tuple[tuple[str, int], ...]:
@@ -136,7 +136,7 @@ def centred(program: Program, final_weight: float = FINAL_WEIGHT) -> ca.Function
 def _repeated(
     program: Program, step: ca.Function, most: int, iterate: ca.MX, cell: list[ca.MX]
 ) -> ca.MX:
-    """The iterate after so many steps at most, whole blocks of them, as long as they go on."""
+    """The iterate after at most that many steps, in whole blocks, as long as they go on."""
     held = [ca.MX.sym("iterate", ends_of(program)[-1]), ca.MX.sym("goes_on")]
     inputs = [*held, *_handed(program)]
     keep = ca.Function("keep", inputs, held)
@@ -207,7 +207,7 @@ def _barrier_step(program: Program, final_weight: float = FINAL_WEIGHT) -> ca.Fu
 
 
 def _length(lowest: list[ca.SX], share: ca.SX | float) -> ca.SX:
-    """Of a step, at most whole, that goes at most a share of the way to the boundary."""
+    """Length of a step: at most whole, and at most a share of the way to the boundary."""
     return ca.fmin(1.0, share / ca.fmax(-least(lowest), share))
 
 
@@ -314,7 +314,7 @@ class Equations:
         return sum(ca.dot(pull - slope, change) for pull, slope, change in terms)
 
     def changes(self, pulls: list[ca.SX]) -> list[ca.SX]:
-        """Of every wrench (m,), where the patches' multipliers pull so (m,)."""
+        """Changes of all wrenches (m,) under the pulls (m,) of the patches' multipliers."""
         right = (
             ca.vertcat(*pulls) - ca.vertcat(*self._slopes) - ca.mtimes(self._stiff, self._missing)
         )

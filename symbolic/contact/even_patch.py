@@ -31,10 +31,10 @@ from symbolic.contact.soft_finger import SoftPatch, torsion_capacity
 DEGREE = 2.0
 
 CHORDS = 5
-"""Of the concave slack along a step, each of which ends within the cone."""
+"""Chords of the concave slack along a step; each ends within the cone."""
 
 LEAST_LENGTH = 1e-12
-"""Of a step; the boundary is never nearer."""
+"""Least length of a step; the boundary is never nearer."""
 
 
 NEAR_PATH, OFF_PATH = 0.1, 0.6
@@ -42,10 +42,10 @@ NEAR_PATH, OFF_PATH = 0.1, 0.6
 low as it leads, and from which on it has to come back to the central path first."""
 
 LEAST_TRUST = 1e-3
-"""Of the way, then."""
+"""Share of the way that a step may then still aim at."""
 
 SAFE = 0.9
-"""Of the way to the boundary that a step may go: Newton's method is slow to come back from it."""
+"""Largest share of the way to the boundary in one step: Newton's method leaves it slowly."""
 
 
 @dataclass(frozen=True)

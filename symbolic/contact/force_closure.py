@@ -25,7 +25,7 @@ from symbolic.records.poses import skew
 
 WRENCH_SIZE = 6
 POINT_SIZE, STATE_SIZE = 3, 12
-"""Of a corner's force, and of a rectangular patch's state."""
+"""Sizes of a corner's force, and of a rectangular patch's state."""
 
 EVEN = (0, 1, 2, 5)
 """Entries of a wrench that a patch under even pressure can bear: its state."""

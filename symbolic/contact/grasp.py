@@ -55,7 +55,7 @@ START_FLOOR = 1e-3
 """Squeeze over the scale to start from where nothing has to be carried."""
 
 START_SHARE = 0.97
-"""Of the way to the cones' boundary that the load takes a start from the squeeze."""
+"""Share of the way to the cones' boundary by which a load may move a start off the squeeze."""
 
 BEYOND = 1e12
 """Normal force over the load's scale that says that friction does not close the grasp."""
@@ -64,7 +64,7 @@ REST_WEIGHT = 0.02
 """Weight, over the effort per degree, of the central path's place that is known at rest."""
 
 REST_SHARE = 0.95
-"""Of the way from there to the cones' boundary that the slope by the load is followed."""
+"""Share of the way from there to the cones' boundary along which the slope by the load is used."""
 
 ALIKE = 0.1
 """Squeeze, over the scale, up to which a load counts as like that at rest."""

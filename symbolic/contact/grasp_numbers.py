@@ -30,7 +30,7 @@ LOAD_SIZE = 6
 """Force and moment about the box frame's origin, along the box's axes [N, N m]."""
 
 MOMENT_ARM = 0.1
-"""Of moments in the load's scale [m]: about half a payload, so that they count like forces."""
+"""Lever of moments in the load's scale [m]: about half a payload, so they count like forces."""
 
 
 def left_components(workcell: Workcell) -> tuple[int, ...]:
@@ -116,7 +116,7 @@ def _shape(even: bool, pad: Contact) -> Array:
 
 
 def least_reaches(workcell: Workcell) -> tuple[float, float]:
-    """Of each robot's patches the least radius or half side [m]."""
+    """Least radius or half side of each robot's patches [m]."""
     first, second = (
         min(pad.patch_radius if pad.half_sides is None else min(pad.half_sides) for pad in pads)
         for pads in ((contact, *contact.further) for contact in workcell.contacts)

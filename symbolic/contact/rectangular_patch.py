@@ -131,7 +131,7 @@ class LocalRectangle:
         return RectangleAim(self, [weight * inverse - c for inverse, c in pairs])
 
     def eliminated(self, right: list[ca.SX]) -> list[ca.SX]:
-        """Of what acts on the state, inner entries first, what is left for the wrench."""
+        """The part for the wrench of what acts on the state, with the inner entries eliminated."""
         return self._elimination.reduced([*right[WRENCH_SIZE:], *right[:WRENCH_SIZE]])
 
     def inner(self, reduced: list[ca.SX], change: ca.SX) -> list[ca.SX]:
@@ -216,7 +216,7 @@ def corners_of(waves: list[list[ca.SX]]) -> list[ca.SX]:
 
 
 def _wave_sums(values: list[ca.SX]) -> list[ca.SX]:
-    """Of four numbers at the corners the sums with each wave's signs."""
+    """Sums of four numbers at the corners with each wave's signs."""
     a, b, c, d = values
     ab, cd, a_b, d_c = a + b, c + d, a - b, d - c
     # Corners (+, +), (-, +), (-, -), (+, -).

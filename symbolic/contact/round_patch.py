@@ -195,7 +195,7 @@ FREE_SIZE, MULTIPLIER_SIZE = WRENCH_SIZE + 1, HERMITIAN_SIZE - 1
 """Wrench and z; the multipliers' matrix."""
 
 COSINE = (0.50018, 0.57449, -0.09524, 0.02072)
-"""Of v, from above: cos(pi / 3 - 2 / 3 asin(v)), within 2e-4 on [0, 1]."""
+"""Polynomial in v that bounds cos(pi / 3 - 2 / 3 asin(v)) from above, within 2e-4 on [0, 1]."""
 
 LEAST_SPREAD = 1e-60
 """Square of the eigenvalues' spread that counts as none."""
@@ -271,7 +271,7 @@ class LocalDisc:
         return DiscAim(self, self.inverse.scaled(weight).less(Hermitian.of(correction)))
 
     def eliminated(self, right: ca.SX) -> list[ca.SX]:
-        """Of what acts on z and the wrench (7,), what is left for the wrench, after z's part."""
+        """The part for the wrench of what acts on z and the wrench (7,), with z eliminated."""
         return self._elimination.reduced(ca.vertsplit(right))
 
     def z_change(self, reduced: list[ca.SX], change: ca.SX) -> ca.SX:
@@ -342,7 +342,7 @@ def _numbers(multiplier: Hermitian) -> list[ca.SX]:
 
 
 def _matrix(free: ca.SX) -> Hermitian:
-    """Of a wrench and z (7,), or of their change."""
+    """Matrix of a wrench and z (7,), or of their change."""
     n, t_x, t_y, q_x, q_y, m, z = ca.vertsplit(free)
     return Hermitian((n, n, n), ((q_x, q_y), (t_x, t_y), (z, m)))
 

@@ -41,7 +41,7 @@ OFFSET_STEPS = 7
 """Secant steps where the pads lie beside one another."""
 
 LEAST_SLOPE = 1e-3
-"""Of those steps: where pressing harder asks for nearly as much more, nothing holds."""
+"""Least slope of those steps: where pressing harder asks for nearly as much more, nothing holds."""
 
 LEVER_FLOOR = 1e-12
 """Keeps a slope of the torsion by the grip positive [m]."""

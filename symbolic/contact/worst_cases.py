@@ -66,7 +66,7 @@ pads along the tangents of contact 1 [m], of pads anywhere along their own; shar
 normal force that either robot lacks, none of the one that leads; opposed tangential force [N]."""
 
 SQUARED_SPEED_FLOOR = 1e-12
-"""Of u'^2 [1/s^2]; what it adds to a force is far below rounding."""
+"""Floor of u'^2 [1/s^2]; what it adds to a force is far below rounding."""
 
 CASE_SIZE = sum(CASE_SIZES.values())
 
@@ -375,7 +375,7 @@ def case_grasp_slack_function(workcell: Workcell, commanded: int) -> ca.Function
 
 
 def least_distance(workcell: Workcell) -> float:
-    """Of two pads of different robots [m]."""
+    """Least distance between two pads of different robots [m]."""
     places = [
         np.array([pad.T_box_pad[:3, 3] for pad in (contact, *contact.further)])
         for contact in workcell.contacts
@@ -413,7 +413,7 @@ REACHES = (0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95)
 """Sizes of the patches, as shares, at which a squeeze to start from is looked for."""
 
 ROUNDING = 1e-6
-"""Of the commanded force, which balancing displaced forces may change."""
+"""Share of the commanded force by which balancing displaced forces may exceed it."""
 
 OTHER_WEIGHT = 1e-3
 """Weight of the other robot's normal force, which alone may be anything: what it adds to the

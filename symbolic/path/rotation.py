@@ -19,7 +19,7 @@ from symbolic.expression import Expression
 from symbolic.records.poses import Orientation
 
 TERMS = 16
-"""Of the power series: the rest is below 1e-17 up to a full turn, below 1e-13 up to 1.5 turns."""
+"""Terms of the power series; the rest is below 1e-17 up to one turn, 1e-13 up to 1.5 turns."""
 
 _COSINE = [(-0.25) ** n / factorial(2 * n) for n in range(TERMS)]
 _SINE = [0.5 * (-0.25) ** n / factorial(2 * n + 1) for n in range(TERMS)]

@@ -399,7 +399,7 @@ def _cramer(A: ca.SX) -> Callable[[ca.SX], ca.SX]:
 
 @lru_cache(maxsize=8)
 def _independent_axes(model: RobotModel) -> tuple[int, ...]:
-    """Of the six joints the three whose axes keep farthest from a common plane, in most
+    """The three of the six joints whose axes keep farthest from a common plane, in most
     postures."""
     lower, upper = model.model.lowerPositionLimit, model.model.upperPositionLimit
     postures = np.random.default_rng(0).uniform(lower, upper, (_POSTURES, len(lower)))

@@ -245,12 +245,12 @@ class Reach(PlaceConstraint):
 
 
 def row_name(family: str, order: Order) -> str:
-    """Of `row_function`."""
+    """Name of a `row_function`."""
     return f"row_{family}_{order}"
 
 
 def closure_name(arm: int, order: Order) -> str:
-    """Of `closure_functions`."""
+    """Name of one of `closure_functions`."""
     return f"closure_{arm + 1}_{order}"
 
 

@@ -54,24 +54,24 @@ Block = Literal["inner", "first", "last", "path"]
 """Inner samples, one at a call; the first two; the last two; all of another time law."""
 
 WEIGHT = 1e-4
-"""Of the joint allocation's barriers, see `symbolic.contact.soft_grasp`. Forces exceed the least
-ones by about as much, relatively, times the number of constraints that bind, which the polish
+"""Weight of the joint allocation's barriers, see `symbolic.contact.soft_grasp`. Forces exceed the
+least ones by a share of about this times the number of constraints that bind, which the polish
 corrects at every round's candidate."""
 
 INPUTS = ("x", "basis", "rounding")
-"""Of every function of samples."""
+"""Inputs of every function of samples."""
 
 WINDOW = 5
 """Samples that the motion at one of them depends on with the constant-speed law."""
 
 
 def sample_name(quantity: Quantity, block: Block, order: Order) -> str:
-    """Of a function of `sample_functions`."""
+    """Name of a function of `sample_functions`."""
     return f"{quantity}_{block}_{order}"
 
 
 def held_name(order: Order) -> str:
-    """Of a function of `held_functions`."""
+    """Name of a function of `held_functions`."""
     return f"held_{order}"
 
 

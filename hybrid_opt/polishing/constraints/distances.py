@@ -208,7 +208,7 @@ class Gaps:
 
     @classmethod
     def of(cls, along: Array) -> Gaps:
-        """Of all gaps."""
+        """From the gaps along all directions (m, n) [m]."""
         best = along.argmax(axis=1)
         return cls(along, best, along[np.arange(len(best)), best])
 
@@ -258,7 +258,7 @@ def violated_passages(
 
 
 def gaps_of(kind: DistanceKind, carry: PlacedCarry, pair: int) -> Gaps:
-    """Of a separable pair, at the places that are reached."""
+    """Gaps of a separable pair at the places of a carry."""
 
     def find() -> Gaps:
         return Gaps.of(carry.gaps(pair))

@@ -15,7 +15,7 @@ from scipy.optimize import nnls
 from symbolic.array import Array, Figure
 
 TOLERANCE = 1e-6
-"""Of the optimality conditions, in a program's scaled rows and variables."""
+"""Tolerance of the optimality conditions, in a program's scaled rows and variables."""
 
 FEASIBLE = 1e-3
 """Violation of a scaled row at which an iterate counts as feasible."""
@@ -76,12 +76,12 @@ class Residuals:
     complementarity: Figure
 
     def scaled(self, unit: float) -> Residuals:
-        """With the objective in units that are so many times smaller."""
+        """The same with the objective in units that are `unit` times smaller."""
         return Residuals(unit * self.stationarity, self.feasibility, unit * self.complementarity)
 
 
 UNKNOWN = Residuals(np.nan, np.nan, np.nan)
-"""Of a solve that returned nothing."""
+"""Residuals of a solve that returned nothing."""
 
 
 @dataclass(frozen=True)

@@ -63,19 +63,19 @@ class _Called(ca.Callback):  # type: ignore[misc]  # CasADi has no types
         return len(self._outputs)
 
     def get_name_in(self, index: int) -> str:
-        """Of an input."""
+        """Name of an input."""
         return self._inputs[index][0]
 
     def get_name_out(self, index: int) -> str:
-        """Of an output."""
+        """Name of an output."""
         return self._outputs[index][0]
 
     def get_sparsity_in(self, index: int) -> ca.Sparsity:
-        """Of an input."""
+        """Sparsity of an input."""
         return self._inputs[index][1]
 
     def get_sparsity_out(self, index: int) -> ca.Sparsity:
-        """Of an output."""
+        """Sparsity of an output."""
         return self._outputs[index][1]
 
     def eval(self, arguments: Sequence[ca.DM]) -> list[Any]:

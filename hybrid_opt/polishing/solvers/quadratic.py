@@ -34,10 +34,10 @@ from hybrid_opt.polishing.native import Native, Records, native
 from symbolic.array import Array
 
 TOLERANCE = 1e-8
-"""Of the conditions, of their residuals relative to their terms, and of the objective."""
+"""Tolerance of the conditions, of their residuals over their terms, and of the objective."""
 
 CHECKED = 1e-6
-"""The same of what is believed."""
+"""Tolerance with which an answer is accepted when it is checked."""
 
 LEAST_CURVATURE = 1e-6
 """Curvature by the path that is left where the Lagrangian has less."""

@@ -33,7 +33,7 @@ tar -xjf FOLDER/{ROOM}/problems.tar.bz2 -C FOLDER/{ROOM}"""
 KINDS = ("easy", "medium", "hard")
 
 SCENES = 600
-"""Of each kind."""
+"""Scenes of each kind."""
 
 BOX = (0.10, 0.20, 0.10)
 """A little lower than a can [m]."""

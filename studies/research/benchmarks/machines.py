@@ -26,7 +26,7 @@ PAD = 0.12
 """From a flange to its pad [m]."""
 
 TOP = 0.1
-"""Of the table [m]."""
+"""Thickness of the table top [m]."""
 
 TABLE = {"name": "table", "kind": "box", "size": [0.8, 1.6, TOP], "xyz": [0.75, 0.0, TOP / 2.0]}
 GROUND = {"name": "ground", "kind": "box", "size": [4.0, 5.0, 0.1], "xyz": [0.0, 0.0, -0.06]}

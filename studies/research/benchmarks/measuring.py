@@ -24,13 +24,13 @@ from symbolic.read.cell import load
 from symbolic.replacing import replace_file
 
 EVALUATIONS = 1000
-"""Of the search behind a fastest carry."""
+"""Evaluations of the search behind a fastest carry."""
 
 CHECKS, TOGETHER = 4000, 200
-"""Configurations by which the rate of collision checks is measured, and so many at once."""
+"""Configurations by which the rate of collision checks is measured: in all, and at once."""
 
 FRICTION = 0.8
-"""Of every pad."""
+"""Friction of every pad."""
 
 
 @dataclass(frozen=True)
@@ -102,7 +102,7 @@ def carry_problem(
 
 @dataclass(frozen=True)
 class Length:
-    """Of a carry.
+    """Length of a carry.
 
     Attributes:
         joints: over all joints of both arms [rad].

@@ -144,7 +144,7 @@ def coordinates(q_1: Array, q_2: Array) -> Array:
 
 
 def elbow_turn(q: Array) -> float:
-    """Of an iiwa's elbow about the line from shoulder to wrist, for joints (7,) [rad]."""
+    """Angle of an iiwa's elbow about the line from shoulder to wrist, for joints (7,) [rad]."""
     upper = rotate("z", q[0]) @ rotate("y", q[1])
     elbow = upper @ [0.0, 0.0, UPPER_ARM]
     wrist = elbow + upper @ rotate("z", q[2]) @ rotate("y", -q[3]) @ [0.0, 0.0, FOREARM]
