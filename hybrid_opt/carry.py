@@ -15,7 +15,7 @@ import numpy as np
 
 from codegen.function import NumericFunction
 from hybrid_opt.indicators.metrics import excess_above_static
-from hybrid_opt.shown import Page, Shown, display
+from hybrid_opt.shown import Displayable, Page, display
 from hybrid_opt.static_hold import payload_limit, static_hold
 from symbolic.array import Array
 from symbolic.path.spline import sample_basis
@@ -89,7 +89,7 @@ class ArmMotion:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Carry(Shown):
+class Carry(Displayable):
     """A carry with its timing and every physical quantity; n samples, world frame, read-only.
 
     At the joint between two pieces of constant path acceleration a sample may stand twice, once

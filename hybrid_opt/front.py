@@ -13,13 +13,13 @@ from hybrid_opt.evaluate.evaluations import Evaluations
 from hybrid_opt.indicators import metrics
 from hybrid_opt.indicators.selection import balanced, peak_normal_forces
 from hybrid_opt.polishing.records import PolishedFront
-from hybrid_opt.shown import Shown
+from hybrid_opt.shown import Displayable
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Front(Shown):
+class Front(Displayable):
     """Non-dominated feasible carries of a cell, by increasing first objective; read-only arrays.
 
     Every member is proven free of collisions between the samples too.

@@ -24,7 +24,7 @@ from hybrid_opt.progress import ShowProgress, following
 from hybrid_opt.recommending.choice import LEADER
 from hybrid_opt.robust.force import BoxMotion
 from hybrid_opt.robust.slopes import RulingForce
-from hybrid_opt.shown import Shown
+from hybrid_opt.shown import Displayable
 from hybrid_opt.timing.limits import limit_ratios
 from hybrid_opt.timing.model import TimingModel
 from hybrid_opt.timing.nearby import NearTimings
@@ -142,7 +142,7 @@ class Sensitivity:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Sensitivities(Shown):
+class Sensitivities(Displayable):
     """What the numbers of a cell do to a carry, the largest first; others do nothing.
 
     Attributes:

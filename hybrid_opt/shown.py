@@ -24,7 +24,7 @@ def display(room: str) -> Any:
     return _rooms[0](room)
 
 
-class Shown:
+class Displayable:
     """An object that has a text and a page."""
 
     def __repr__(self) -> str:

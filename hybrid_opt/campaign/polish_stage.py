@@ -23,7 +23,7 @@ from hybrid_opt.campaign.results import Replica, is_whole, read_campaign, read_p
 from hybrid_opt.campaign.settings import JOURNAL, POLISH, polished_folder
 from hybrid_opt.campaign.stages import Stage
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
-from hybrid_opt.polishing.front import Lost, use_one_thread
+from hybrid_opt.polishing.front import Loss, use_one_thread
 from hybrid_opt.polishing.polisher import Polisher
 from hybrid_opt.polishing.records import PolishedFront, PolishOutcome
 from hybrid_opt.polishing.settings import PolishSettings
@@ -96,11 +96,11 @@ def polish_replica(
     )
 
 
-def _from_block(block: bytes, request: ReplicaRequest) -> PolishOutcome | Lost:
+def _from_block(block: bytes, request: ReplicaRequest) -> PolishOutcome | Loss:
     of = f"{request.algorithm} replica {request.replica}: a recorded attempt of the polish"
     values = json_of(block, of, _ANEW)
     if isinstance(values, dict) and "lost" in values:
-        return Lost(str(values["lost"]))
+        return Loss(str(values["lost"]))
     return from_json(PolishOutcome, values, of, _ANEW)
 
 

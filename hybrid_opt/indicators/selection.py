@@ -26,7 +26,7 @@ _CHUNK = 256
 
 
 @dataclass(frozen=True)
-class Selected:
+class SelectedCarry:
     """The carry that stands for a front.
 
     Attributes:
@@ -72,18 +72,18 @@ def knee(points: Array) -> int:
 
 def select(
     evaluator: CandidateEvaluator, x: Array, rows: NDArray[np.intp] | None = None
-) -> Selected | None:
+) -> SelectedCarry | None:
     """The carry that stands for a front, None where the front is empty.
 
     Args:
         x: (k, n_var) the front's decision vectors.
-        rows: (k,) what `Selected.row` names them by, None for their places in the front.
+        rows: (k,) what `SelectedCarry.row` names them by, None for their places in the front.
     """
     if len(x) == 0:
         return None
     index = selected_row(evaluator, x)
     row = index if rows is None else int(rows[index])
-    return Selected(row, evaluator.carry(x[index]))
+    return SelectedCarry(row, evaluator.carry(x[index]))
 
 
 def selected_row(evaluator: CandidateEvaluator, x: Array) -> int:

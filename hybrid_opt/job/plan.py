@@ -67,7 +67,7 @@ EVERY = 10
 
 
 @dataclass(frozen=True)
-class Standing:
+class SupportedPose:
     """Where a box stands.
 
     Attributes:
@@ -98,7 +98,7 @@ class JobCollisions:
         self.geometry = job_geometry(compiled.workcell)
         self._functions = compiled.screening
 
-    def standing(self, pose: Array, height: float | None) -> Standing:
+    def standing(self, pose: Array, height: float | None) -> SupportedPose:
         """Where the box stands below a pose (6,).
 
         Args:
@@ -126,9 +126,9 @@ class JobCollisions:
             found = 0.0 if found > LARGEST_DROP else found
         touched = gaps(found) <= RESTING_TOLERANCE if below else np.zeros(0, dtype=bool)
         names = [self.geometry.bodies[body].name for body in np.array(below)[touched].tolist()]
-        return Standing(_lowered(pose, found), found, tuple(names))
+        return SupportedPose(_lowered(pose, found), found, tuple(names))
 
-    def checker(self, places: Sequence[Standing]) -> CollisionChecker:
+    def checker(self, places: Sequence[SupportedPose]) -> CollisionChecker:
         """The checker of a job whose box stands at these places before and after the carry."""
         task = self._workcell.task
         poses = tuple(Waypoint(place.pose, place.pose) for place in places)
@@ -261,7 +261,7 @@ class _Part:
 
 
 @dataclass(frozen=True)
-class _Around:
+class _JobEnds:
     """The phases around carries that begin and end alike, and their judges."""
 
     before: tuple[_Part, ...]
@@ -294,7 +294,7 @@ class JobModel:
         self._posture: NumericFunction = compiled.evaluators["posture"]
         self._collisions = JobCollisions(compiled)
         self._jerk = JerkLimits.of(compiled.workcell)
-        self._known: dict[tuple[Handling, bytes], _Around] = {}
+        self._known: dict[tuple[Handling, bytes], _JobEnds] = {}
 
     def plan(
         self,
@@ -377,7 +377,7 @@ class JobModel:
         refuse_excess(job)
         return job
 
-    def _around(self, carry: Carry, handling: Handling) -> _Around:
+    def _around(self, carry: Carry, handling: Handling) -> _JobEnds:
         """The phases around a carry, computed once for carries with the same ends."""
         pose, q = carry.pose[[0, -1]], carry.q[[0, -1]].round(_SAME_POSTURE)
         key = handling, pose.tobytes() + q.tobytes()
@@ -387,7 +387,7 @@ class JobModel:
             self._known[key] = self._handling(pose, q, handling)
         return self._known[key]
 
-    def _handling(self, pose: Array, known: Array, handling: Handling) -> _Around:
+    def _handling(self, pose: Array, known: Array, handling: Handling) -> _JobEnds:
         """The moving phases before a carry, in order, and after it.
 
         Args:
@@ -408,7 +408,7 @@ class JobModel:
                 q = parts[-1].motion.q[end]
         before, after = found
         stands_on = (places[0].bodies, places[1].bodies)
-        return _Around(tuple(before[::-1]), tuple(after), stands_on, checker)
+        return _JobEnds(tuple(before[::-1]), tuple(after), stands_on, checker)
 
     def _part(self, checker: CollisionChecker, line: Straight, known: Array, at_end: bool) -> _Part:
         q = followed(self.workcell, self._posture, line, known, at_end)
@@ -480,7 +480,7 @@ def refuse_excess(job: Job) -> None:
 _model = kept_per_workcell(JobModel)
 
 
-class Timed(Protocol):
+class HasTiming(Protocol):
     """What knows how its carry is timed, as a recommendation does."""
 
     @property
@@ -489,7 +489,7 @@ class Timed(Protocol):
 
 
 def plan_job(
-    timing: Timing | Timed, squeeze: SqueezeSettings | None = None, smoothing: float = WIDTH
+    timing: Timing | HasTiming, squeeze: SqueezeSettings | None = None, smoothing: float = WIDTH
 ) -> Job:
     """The whole job around a timed carry, or one that is recommended, see `JobModel.plan`."""
     timing = timing if isinstance(timing, Timing) else timing.timing

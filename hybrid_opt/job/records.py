@@ -13,7 +13,7 @@ from scipy.interpolate import CubicHermiteSpline
 from hybrid_opt.collision.certify import Certificate
 from hybrid_opt.display.table import text_table
 from hybrid_opt.robust.squeeze import Squeeze
-from hybrid_opt.shown import Shown
+from hybrid_opt.shown import Displayable
 from hybrid_opt.timing.records import Timing
 from symbolic.array import Array, interpolated
 from symbolic.errors import SettingsError
@@ -142,7 +142,7 @@ def contact_effort(wrench_torque: Array, first: int, wrench: Array) -> Array:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Job(Shown):
+class Job(Displayable):
     """A carry with all that has to happen before and after it.
 
     Attributes:

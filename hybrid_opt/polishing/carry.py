@@ -16,7 +16,7 @@ from symbolic.records.task import POSE_SIZE, extended_waypoints, place_redundant
 from symbolic.robot.arm import REACH_TOLERANCE
 from symbolic.smooth.places import Reach
 
-_Found = TypeVar("_Found")
+_Value = TypeVar("_Value")
 
 SHARPENED_BELOW = 0.1
 """Bounds of the payload's distances that are lower are raised by the gaps across its edges [m]."""
@@ -71,11 +71,11 @@ class PlacedCarry:
         """Whether both arms reach all places."""
         return self.reached == len(self.pose)
 
-    def once(self, key: object, find: Callable[[], _Found]) -> _Found:
+    def once(self, key: object, find: Callable[[], _Value]) -> _Value:
         """What several kinds of constraints want to know of this candidate, found by the first."""
         if key not in self._known:
             self._known[key] = find()
-        found: _Found = self._known[key]
+        found: _Value = self._known[key]
         return found
 
 

@@ -24,10 +24,10 @@ from hybrid_opt.polishing.point import (
     HALVED,
     QUARTERED,
     Climb,
-    Judged,
-    Reached,
+    ClimbPoint,
     Solution,
     Step,
+    StepVerdict,
     Way,
 )
 from hybrid_opt.polishing.rows import Row
@@ -158,7 +158,7 @@ def force_range(driver: CandidateDriver) -> tuple[float, float]:
 
 
 @dataclass(frozen=True)
-class DriveReached(Reached):
+class DrivePoint(ClimbPoint):
     """A carry whose level is its duration [s].
 
     Attributes:
@@ -188,14 +188,14 @@ class DriveStep(Step):
 
 
 @dataclass(frozen=True)
-class _Found:
+class _StepAnswer:
     """A quadratic program's answer, and the rows that it was given."""
 
     answer: QuadraticAnswer
     linear: Linear
 
 
-class DriveWay(Way[DriveReached, DriveStep]):
+class DriveWay(Way[DrivePoint, DriveStep]):
     """The least duration within the force limit of the start. A resource: one per process.
 
     Attributes:
@@ -242,14 +242,14 @@ class DriveWay(Way[DriveReached, DriveStep]):
         if task.pieces > 1 and not by_stated:
             self.stated = DriveWay(cell, settings, by_stated=True)
 
-    def start(self, x: Array) -> DriveReached:
+    def start(self, x: Array) -> DrivePoint:
         """See `Way`."""
         timed = self.paths.timed(x[: self._n], float(x[-1]))
         return self._reached(x, timed, timed.squared, np.inf)
 
-    def _reached(self, x: Array, timed: TimedPath, squared: Array, lowest: float) -> DriveReached:
+    def _reached(self, x: Array, timed: TimedPath, squared: Array, lowest: float) -> DrivePoint:
         lowest = min(lowest, timed.duration)
-        return DriveReached(x, self.reader.read(x), timed.duration, timed.joints, squared, lowest)
+        return DrivePoint(x, self.reader.read(x), timed.duration, timed.joints, squared, lowest)
 
     def _moved(self, x: Array, d: Array) -> Array:
         """(n_var,) after a scaled step of the path."""
@@ -257,7 +257,7 @@ class DriveWay(Way[DriveReached, DriveStep]):
         moved = x[:n] + self._spread @ d
         return np.append(np.clip(moved, task.lower[:n], task.upper[:n]), x[n:])
 
-    def judge(self, best: DriveReached, step: DriveStep) -> Judged[DriveReached]:
+    def judge(self, best: DrivePoint, step: DriveStep) -> StepVerdict[DrivePoint]:
         """See `Way`. What the timing rounds off may hide a small gain, but must not add up."""
         x = self._moved(best.x, step.d)
         timed = self.paths.timed(x[: self._n], float(x[-1]))
@@ -266,11 +266,11 @@ class DriveWay(Way[DriveReached, DriveStep]):
         kept = timed.duration <= best.lowest * (1.0 + NOISE)
         if gain < CLOSER * step.gain and not (tiny and kept):
             finite = np.isfinite(timed.duration)
-            return Judged(None, closer=False, factor=HALVED if finite else QUARTERED)
+            return StepVerdict(None, closer=False, factor=HALVED if finite else QUARTERED)
         share = gain / max(step.gain, 1e-300)
         is_short = step.length <= NEWTON
         squared = step.squared if is_short else timed.squared
-        return Judged(
+        return StepVerdict(
             self._reached(x, timed, squared, best.lowest),
             closer=True,
             kept=max(share, 0.5) if tiny else share,
@@ -279,8 +279,8 @@ class DriveWay(Way[DriveReached, DriveStep]):
         )
 
     def along(
-        self, begin: DriveReached, best: DriveReached, step: DriveStep, share: float
-    ) -> DriveReached | None:
+        self, begin: DrivePoint, best: DrivePoint, step: DriveStep, share: float
+    ) -> DrivePoint | None:
         """See `Way`."""
         x = self._moved(begin.x, share * step.d)
         timed = self.paths.timed(x[: self._n], float(x[-1]))
@@ -289,7 +289,7 @@ class DriveWay(Way[DriveReached, DriveStep]):
         return self._reached(x, timed, timed.squared, best.lowest)
 
     def propose(
-        self, best: DriveReached, required: Mapping[Row, float], radius: float
+        self, best: DrivePoint, required: Mapping[Row, float], radius: float
     ) -> DriveStep | None:
         """Form the joint program about the best carry so far, and solve its quadratic model."""
         grid = self._intervals
@@ -349,10 +349,10 @@ class DriveWay(Way[DriveReached, DriveStep]):
         model: tuple[BorderedMatrix, Array],
         box: tuple[Array, Array],
         bent: Array | float = 0.0,
-    ) -> _Found | None:
+    ) -> _StepAnswer | None:
         """Solve a quadratic model; rows that its answer violates are added. `chosen` grows."""
         g = program.gradient() + model[1]
-        found: _Found | None = None
+        found: _StepAnswer | None = None
         for left in reversed(range(ROW_ROUNDS)):
             linear = program.linear(chosen, bent)
             asked = QuadraticProgram(model[0], g, linear.A, linear.b, *box)
@@ -362,7 +362,7 @@ class DriveWay(Way[DriveReached, DriveStep]):
                 answer = self._method(replace(asked, b=np.maximum(linear.b, 0.0)))
             if answer is None:
                 return None
-            found = _Found(answer, linear)
+            found = _StepAnswer(answer, linear)
             fresh = (program.predicted(answer.d) > ROW_TOLERANCE) & ~chosen
             if not fresh.any():
                 break
@@ -371,7 +371,7 @@ class DriveWay(Way[DriveReached, DriveStep]):
                 chosen &= ~fresh
         return found
 
-    def _box(self, best: DriveReached, radius: float) -> tuple[Array, Array]:
+    def _box(self, best: DrivePoint, radius: float) -> tuple[Array, Array]:
         """Bounds of a step."""
         (lower, upper), xi = self._bounds, best.x[self._own]
         speeds = np.ones(self._intervals.intervals - 1)
@@ -382,7 +382,7 @@ class DriveWay(Way[DriveReached, DriveStep]):
             np.concatenate([high, LARGEST_SQUARED * speeds]),
         )
 
-    def _residuals(self, program: JointProgram, best: DriveReached, found: _Found) -> Residuals:
+    def _residuals(self, program: JointProgram, best: DrivePoint, found: _StepAnswer) -> Residuals:
         """Residuals of the program at its iterate, with a step's multipliers. Bounds count where
         they are the variables' own, not the box of trust's."""
         (lower, upper), n, answer = self._bounds, program.n_path, found.answer
@@ -394,11 +394,11 @@ class DriveWay(Way[DriveReached, DriveStep]):
         bounds[:n] = np.where(at_low | at_high, own, 0.0)
         return program.residuals(bounds, found.linear, answer.rows)
 
-    def climb(self, x: Array) -> Climb[DriveReached, DriveStep]:
+    def climb(self, x: Array) -> Climb[DrivePoint, DriveStep]:
         """From a decision vector (n_var,), with none of its rounds done."""
         return Climb(self, x, FIRST_RADIUS)
 
-    def finish(self, climb: Climb[DriveReached, DriveStep]) -> Solution:
+    def finish(self, climb: Climb[DrivePoint, DriveStep]) -> Solution:
         """The rounds of a point, and more of them while these bring much."""
         settings, solution = self.settings, climb.go_on(self.settings.rounds)
         most = solution.rounds - settings.rounds + settings.most_rounds

@@ -25,8 +25,8 @@ from typing import Literal
 
 import numpy as np
 
-from hybrid_opt.polishing.drive import STILL, DriveReached, DriveStep, DriveWay
-from hybrid_opt.polishing.front import LEAST_SPAN, OWN_SHARE, Attempt, GrowingFront, Lost, PolishRun
+from hybrid_opt.polishing.drive import STILL, DrivePoint, DriveStep, DriveWay
+from hybrid_opt.polishing.front import LEAST_SPAN, OWN_SHARE, Attempt, GrowingFront, Loss, PolishRun
 from hybrid_opt.polishing.point import Climb, Solution
 from hybrid_opt.polishing.records import Aim, PolishOutcome, Status
 from hybrid_opt.polishing.settings import PolishSettings
@@ -74,7 +74,7 @@ BETWEEN = (0.25, 0.5, 0.75)
 SAME = 0.25
 """Paths nearer than this to one another lie in one basin, in halves of the variables' ranges."""
 
-DriveClimb = Climb[DriveReached, DriveStep]
+DriveClimb = Climb[DrivePoint, DriveStep]
 
 
 @dataclass(frozen=True)
@@ -181,7 +181,7 @@ class DriveRun(PolishRun[DriveAttempt]):
         settings: PolishSettings,
         doubt: Callable[[Array], str],
         archive: GrowingFront,
-        recorded: list[PolishOutcome | Lost],
+        recorded: list[PolishOutcome | Loss],
         emit: Callable[[PolishOutcome], None],
         paths: Array,
     ) -> None:
@@ -379,7 +379,7 @@ class DriveRun(PolishRun[DriveAttempt]):
             return self._way.climb(attempt.x).go_on(self._way.settings.refining)
         return best_of(self._way.stated, attempt.rivals or (attempt.x,))
 
-    def _verdict(self, attempt: DriveAttempt, answer: Solution | Lost) -> tuple[Status, str, Array]:
+    def _verdict(self, attempt: DriveAttempt, answer: Solution | Loss) -> tuple[Status, str, Array]:
         if attempt.moves == "none" and isinstance(answer, Solution):
             return self._recomputed(attempt, answer)
         return super()._verdict(attempt, answer)

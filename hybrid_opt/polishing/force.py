@@ -27,7 +27,7 @@ from hybrid_opt.polishing.carry import CarryReader, PlacedCarry
 from hybrid_opt.polishing.cell import SmoothCell
 from hybrid_opt.polishing.constraints.active import ActiveSet
 from hybrid_opt.polishing.constraints.kinds import Limits
-from hybrid_opt.polishing.point import Climb, Judged, Reached, Solution, Step, Way
+from hybrid_opt.polishing.point import Climb, ClimbPoint, Solution, Step, StepVerdict, Way
 from hybrid_opt.polishing.rows import HELD, Layout, Row, Rows
 from hybrid_opt.polishing.settings import PolishSettings
 from hybrid_opt.polishing.solvers.base import Residuals, Solve, optimality
@@ -252,7 +252,7 @@ class ForceStep(Step):
     x: Array
 
 
-class ForceWay(Way[Reached, ForceStep]):
+class ForceWay(Way[ClimbPoint, ForceStep]):
     """Towards one target."""
 
     least_radius, parts = LEAST_RADIUS, PARTS
@@ -268,13 +268,13 @@ class ForceWay(Way[Reached, ForceStep]):
         self._solve, self._target, self.limits = solver.method, target, target.limits
         self._iterations, self._barrier = iterations, barrier
 
-    def start(self, x: Array) -> Reached:
+    def start(self, x: Array) -> ClimbPoint:
         """See `Way`."""
         carry = self.reader.read(x)
-        return Reached(x, carry, self._target.level(carry.peak))
+        return ClimbPoint(x, carry, self._target.level(carry.peak))
 
     def propose(
-        self, best: Reached, required: Mapping[Row, float], radius: float
+        self, best: ClimbPoint, required: Mapping[Row, float], radius: float
     ) -> ForceStep | None:
         """Solve the program in the box."""
         program = ForceProgram(self.cell, required, self._target, best.carry, best.x, radius)
@@ -291,17 +291,19 @@ class ForceWay(Way[Reached, ForceStep]):
             x=x,
         )
 
-    def judge(self, best: Reached, step: ForceStep) -> Judged[Reached]:
+    def judge(self, best: ClimbPoint, step: ForceStep) -> StepVerdict[ClimbPoint]:
         """See `Way`."""
         reached = self.start(step.x)
-        return Judged(reached, reached.level < best.level)
+        return StepVerdict(reached, reached.level < best.level)
 
-    def along(self, begin: Reached, best: Reached, step: ForceStep, share: float) -> Reached | None:
+    def along(
+        self, begin: ClimbPoint, best: ClimbPoint, step: ForceStep, share: float
+    ) -> ClimbPoint | None:
         """See `Way`."""
         reached = self.start(begin.x + share * (step.x - begin.x))
         return reached if reached.level < best.level else None
 
-    def missing(self, reached: Reached) -> set[Row]:
+    def missing(self, reached: ClimbPoint) -> set[Row]:
         """Rows at peaks that are higher than the program foresaw."""
         return set(self.active.forces.higher(reached.carry, self.limits))
 

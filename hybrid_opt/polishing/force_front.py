@@ -33,7 +33,7 @@ from hybrid_opt.polishing.force import (
     aimed,
     pascoletti_serafini,
 )
-from hybrid_opt.polishing.front import LEAST_SPAN, OWN_SHARE, Attempt, GrowingFront, Lost, PolishRun
+from hybrid_opt.polishing.front import LEAST_SPAN, OWN_SHARE, Attempt, GrowingFront, Loss, PolishRun
 from hybrid_opt.polishing.point import Solution
 from hybrid_opt.polishing.records import Aim, PolishOutcome
 from hybrid_opt.polishing.settings import PolishSettings
@@ -313,7 +313,7 @@ class ForceRun(PolishRun[ForceAttempt]):
         solver: ForceSolver,
         settings: PolishSettings,
         archive: GrowingFront,
-        recorded: list[PolishOutcome | Lost],
+        recorded: list[PolishOutcome | Loss],
         emit: Callable[[PolishOutcome], None],
     ) -> None:
         super().__init__(solver.cell.evaluator, settings, archive, recorded, emit)

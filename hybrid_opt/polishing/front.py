@@ -90,7 +90,7 @@ class GrowingFront:
 
 
 @dataclass(frozen=True)
-class Lost:
+class Loss:
     """An attempt without a solution; reason: killed, timeout, or what was raised.
 
     An exception is caught here. What ends or blocks the process, a crash or a hang, is noticed by
@@ -130,7 +130,7 @@ class PolishRun(ABC, Generic[AnyAttempt]):
         evaluator: CandidateEvaluator,
         settings: PolishSettings,
         archive: GrowingFront,
-        recorded: list[PolishOutcome | Lost],
+        recorded: list[PolishOutcome | Loss],
         emit: Callable[[PolishOutcome], None],
     ) -> None:
         self._evaluator, self._settings = evaluator, settings
@@ -163,12 +163,12 @@ class PolishRun(ABC, Generic[AnyAttempt]):
             if known is None:
                 self._emit(outcome)
 
-    def _solved_safely(self, attempt: AnyAttempt) -> Solution | Lost:
+    def _solved_safely(self, attempt: AnyAttempt) -> Solution | Loss:
         """The solution, or what was raised instead."""
         try:
             return self._solution(attempt)
         except Exception as error:
-            return Lost(f"{type(error).__name__}: {error}".splitlines()[0])
+            return Loss(f"{type(error).__name__}: {error}".splitlines()[0])
 
     def _take(self, attempt: AnyAttempt, outcome: PolishOutcome) -> None:
         self.outcomes.append(outcome)
@@ -179,7 +179,7 @@ class PolishRun(ABC, Generic[AnyAttempt]):
         else:
             self._archive.add(outcome.x, outcome.objectives)
 
-    def _judged(self, attempt: AnyAttempt, answer: Solution | Lost, begin: float) -> PolishOutcome:
+    def _judged(self, attempt: AnyAttempt, answer: Solution | Loss, begin: float) -> PolishOutcome:
         status, reason, objectives = self._verdict(attempt, answer)
         told = answer if isinstance(answer, Solution) else NO_SOLUTION
         return PolishOutcome(
@@ -197,8 +197,8 @@ class PolishRun(ABC, Generic[AnyAttempt]):
             seconds=time.perf_counter() - begin,
         )
 
-    def _verdict(self, attempt: AnyAttempt, answer: Solution | Lost) -> tuple[Status, str, Array]:
-        if isinstance(answer, Lost):
+    def _verdict(self, attempt: AnyAttempt, answer: Solution | Loss) -> tuple[Status, str, Array]:
+        if isinstance(answer, Loss):
             return "failed", answer.reason, attempt.start
         if not answer.usable:
             return "failed", answer.message, attempt.start

@@ -22,7 +22,7 @@ import numpy as np
 
 from hybrid_opt.polishing.carry import CarryReader, PlacedCarry
 from hybrid_opt.polishing.cell import SmoothCell
-from hybrid_opt.polishing.constraints.active import ActiveSet, Learned
+from hybrid_opt.polishing.constraints.active import ActiveSet, LearnedRows
 from hybrid_opt.polishing.constraints.kinds import Limits
 from hybrid_opt.polishing.rows import PlaceRow, Row
 from hybrid_opt.polishing.solvers.base import UNKNOWN, Residuals
@@ -123,7 +123,7 @@ class Solution:
 
 
 @dataclass(frozen=True)
-class Reached:
+class ClimbPoint:
     """A candidate that the full model has judged.
 
     Attributes:
@@ -153,19 +153,19 @@ class Step:
 
     length: float
     required: Mapping[Row, float]
-    residuals: Callable[[Reached], Residuals] = field(repr=False)
+    residuals: Callable[[ClimbPoint], Residuals] = field(repr=False)
     iterations: int
     is_end: bool = False
     converged: bool = False
     pressing: tuple[PlaceRow, ...] = ()
 
 
-AnyReached = TypeVar("AnyReached", bound=Reached)
+AnyPoint = TypeVar("AnyPoint", bound=ClimbPoint)
 AnyStep = TypeVar("AnyStep", bound=Step)
 
 
 @dataclass(frozen=True)
-class Judged(Generic[AnyReached]):
+class StepVerdict(Generic[AnyPoint]):
     """What the full model says of a step.
 
     Attributes:
@@ -177,7 +177,7 @@ class Judged(Generic[AnyReached]):
         is_short: whether rows that press stay.
     """
 
-    reached: AnyReached | None
+    reached: AnyPoint | None
     closer: bool
     factor: float = QUARTERED
     kept: float | None = None
@@ -185,7 +185,7 @@ class Judged(Generic[AnyReached]):
     is_short: bool = False
 
 
-class Way(ABC, Generic[AnyReached, AnyStep]):
+class Way(ABC, Generic[AnyPoint, AnyStep]):
     """What one polish wants, and how its steps are proposed and judged.
 
     Attributes:
@@ -213,32 +213,32 @@ class Way(ABC, Generic[AnyReached, AnyStep]):
         self.half = cell.half
 
     @abstractmethod
-    def start(self, x: Array) -> AnyReached:
+    def start(self, x: Array) -> AnyPoint:
         """Where a climb begins."""
 
     @abstractmethod
     def propose(
-        self, best: AnyReached, required: Mapping[Row, float], radius: float
+        self, best: AnyPoint, required: Mapping[Row, float], radius: float
     ) -> AnyStep | None:
         """A step within the box of trust about the best candidate; None where there is none."""
 
     @abstractmethod
-    def judge(self, best: AnyReached, step: AnyStep) -> Judged[AnyReached]:
+    def judge(self, best: AnyPoint, step: AnyStep) -> StepVerdict[AnyPoint]:
         """Where a step leads."""
 
     @abstractmethod
     def along(
-        self, begin: AnyReached, best: AnyReached, step: AnyStep, share: float
-    ) -> AnyReached | None:
+        self, begin: AnyPoint, best: AnyPoint, step: AnyStep, share: float
+    ) -> AnyPoint | None:
         """Where a share of a step from its beginning leads; None where that is no closer than the
         best candidate."""
 
-    def missing(self, reached: AnyReached) -> set[Row]:
+    def missing(self, reached: AnyPoint) -> set[Row]:
         """Rows that a program lacked whose step came no closer."""
         return set()
 
 
-class Climb(Generic[AnyReached, AnyStep]):
+class Climb(Generic[AnyPoint, AnyStep]):
     """One point's polish, which may be left and gone on with.
 
     Attributes:
@@ -247,7 +247,7 @@ class Climb(Generic[AnyReached, AnyStep]):
         last_gain: what the later half of the rounds that were asked for last took off the level.
     """
 
-    def __init__(self, way: Way[AnyReached, AnyStep], x: Array, radius: float) -> None:
+    def __init__(self, way: Way[AnyPoint, AnyStep], x: Array, radius: float) -> None:
         """Judge the start.
 
         Args:
@@ -258,7 +258,7 @@ class Climb(Generic[AnyReached, AnyStep]):
         self.best = way.start(np.clip(x, task.lower, task.upper))
         self._first, self._lenient, self.last_gain = self.best.level, True, 0.0
         self._region = TrustRegion(radius, way.least_radius)
-        self._learned = Learned(way.active, way.half)
+        self._learned = LearnedRows(way.active, way.half)
         self._last: Step | None = None
         self.solution = Solution(self.best.x, usable=bool(np.isfinite(self.best.level)))
 
@@ -312,7 +312,7 @@ class Climb(Generic[AnyReached, AnyStep]):
             else:
                 self._stay(step, judged.reached)
 
-    def _refuses(self, step: AnyStep, reached: AnyReached) -> bool:
+    def _refuses(self, step: AnyStep, reached: AnyPoint) -> bool:
         """Learn from what a step violates, if it does; the longest part of it that violates nothing
         and comes closer is taken, if there is one."""
         best, carry = self.best, reached.carry
@@ -327,7 +327,7 @@ class Climb(Generic[AnyReached, AnyStep]):
                 break
         return True
 
-    def _take(self, step: AnyStep, judged: Judged[AnyReached], reached: AnyReached) -> None:
+    def _take(self, step: AnyStep, judged: StepVerdict[AnyPoint], reached: AnyPoint) -> None:
         begin = self.best
         self._move(reached, judged.is_short)
         self.solution.converged = step.converged and not self._region.holds(step.length)
@@ -337,7 +337,7 @@ class Climb(Generic[AnyReached, AnyStep]):
                     break
         self._region.taken(step.length, judged.kept)
 
-    def _stay(self, step: AnyStep, reached: AnyReached) -> None:
+    def _stay(self, step: AnyStep, reached: AnyPoint) -> None:
         """A step that violates nothing came no closer: its program lacked rows, or it ended at an
         optimum, or the box is too large."""
         asked = self._way.missing(reached) - step.required.keys()
@@ -349,7 +349,7 @@ class Climb(Generic[AnyReached, AnyStep]):
         elif not asked:
             self._region.barren(step.length)
 
-    def _goes(self, begin: AnyReached, step: AnyStep, share: float, is_short: bool = False) -> bool:
+    def _goes(self, begin: AnyPoint, step: AnyStep, share: float, is_short: bool = False) -> bool:
         """Go to a share of a step if that is closer and violates nothing; whether it is."""
         reached = self._way.along(begin, self.best, step, share)
         if reached is None or not reached.carry.is_followed:
@@ -359,6 +359,6 @@ class Climb(Generic[AnyReached, AnyStep]):
         self._move(reached, is_short)
         return True
 
-    def _move(self, reached: AnyReached, is_short: bool = False) -> None:
+    def _move(self, reached: AnyPoint, is_short: bool = False) -> None:
         self.best = reached
         self._learned.move(is_short)

@@ -16,7 +16,7 @@ from hybrid_opt.polishing.drive import DriveWay
 from hybrid_opt.polishing.drive_front import DriveRun, second_opinion
 from hybrid_opt.polishing.force import ForceSolver
 from hybrid_opt.polishing.force_front import ForceRun
-from hybrid_opt.polishing.front import GrowingFront, Lost, PolishRun
+from hybrid_opt.polishing.front import GrowingFront, Loss, PolishRun
 from hybrid_opt.polishing.records import PolishedFront, PolishOutcome
 from hybrid_opt.polishing.settings import PolishSettings
 from hybrid_opt.timing.model import TimingModel
@@ -85,7 +85,7 @@ class Polisher:
         self,
         front_x: Array,
         rng: np.random.Generator,
-        recorded: Sequence[PolishOutcome | Lost] = (),
+        recorded: Sequence[PolishOutcome | Loss] = (),
         emit: Callable[[PolishOutcome], None] = lambda outcome: None,
         paths: Array | None = None,
     ) -> PolishedFront:
@@ -95,7 +95,7 @@ class Polisher:
             front_x: (k, n_var) decision vectors; k may be 0.
             rng: spreads the starts of attempts at the balanced middle.
             recorded: outcomes of an earlier, interrupted polish of the same front, not repeated;
-                `Lost` for an attempt that ended its process.
+                `Loss` for an attempt that ended its process.
             emit: takes each new outcome.
             paths: (m, n_path) free waypoints that are known to be good, and need not be on the
                 front; only the polish of drivable carries uses them. None for none.

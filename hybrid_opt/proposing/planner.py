@@ -430,7 +430,7 @@ def plan(
         bounds.setHigh(k, float(high))
     space.setBounds(bounds)
     information = base.SpaceInformation(space)
-    known = _Known(chain, room)
+    known = _ReachedStates(chain, room)
     information.setStateValidityChecker(lambda state: True)
     validator = _validator(base, information, known.joined)
     information.setMotionValidator(validator)
@@ -475,7 +475,7 @@ def _usable(stops: list[Place], place: Place, room: Freedom) -> list[Place]:
     ]
 
 
-class _Known:
+class _ReachedStates:
     """The configurations of all states that the planner has reached."""
 
     def __init__(self, chain: ClosedChain, room: Freedom) -> None:

@@ -331,8 +331,8 @@ DRAFTED = 0.01
 
 
 @dataclass(frozen=True, eq=False)
-class Found:
-    """What was found.
+class Draft:
+    """A path as found, and the cell it was found in.
 
     Attributes:
         workcell: the cell that it was found in, with its redundant joints chosen.
@@ -355,13 +355,13 @@ class Found:
         """(n - 2, 6) poses between start and goal."""
         return self.waypoints[1:-1, :POSE_SIZE]
 
-    def around(self, centre: Array) -> Found:
+    def around(self, centre: Array) -> Draft:
         """The same with another decision vector as its carry."""
         m = len(self.workcell.task.redundant)
         return replace(self, waypoints=_as_waypoints(centre, self.waypoints, m))
 
 
-def changes(problem: Problem, found: Found) -> dict[str, Any]:
+def changes(problem: Problem, found: Draft) -> dict[str, Any]:
     """What completes the problem's tables."""
     lower, upper = _boxes(found)
     task: dict[str, Any] = {
@@ -433,7 +433,7 @@ def _pose_limits(pose: Array, is_vector: bool) -> tuple[Array, Array]:
     return low, high
 
 
-def _boxes(found: Found) -> tuple[Array, Array]:
+def _boxes(found: Draft) -> tuple[Array, Array]:
     """Bounds (n, 6 + m) of the waypoints."""
     if found.bounds is None:
         return found.waypoints - DRAFTED, found.waypoints + DRAFTED

@@ -24,7 +24,7 @@ from hybrid_opt.errors import NoHoldError, ProposalError
 from hybrid_opt.proposing.bases import base_choices
 from hybrid_opt.proposing.bounds import Bounds, Sampling, find_bounds
 from hybrid_opt.proposing.planner import Place, Stray, freedom, plan, straight_paths
-from hybrid_opt.proposing.problem import Found, Problem, changes, decision_bounds, read_problem
+from hybrid_opt.proposing.problem import Draft, Problem, changes, decision_bounds, read_problem
 from hybrid_opt.proposing.setup import Pair, Setup, no_path, prepare
 from hybrid_opt.proposing.trial import BoxAlone, BranchLostError, Trial, grasp_blocked
 from hybrid_opt.proposing.via_points import (
@@ -132,7 +132,7 @@ class Proposal:
     """
 
     problem: Problem
-    found: Found
+    found: Draft
     judgement: Judgement
     feasible_share: float
     candidates: int
@@ -369,7 +369,7 @@ class _Search:
         self.tell("the evaluator's verdict")
         begun = self.spent
         spins = (pair.holds[0].spin, pair.holds[1].spin)
-        found = Found(setup.workcell, spins, (-1, -1), waypoints, setup.given)
+        found = Draft(setup.workcell, spins, (-1, -1), waypoints, setup.given)
         trial = Trial(self._workcell(found), pair.start.q, named=False)
         judgement, why = trial.verdict()
         if not judgement.feasible:
@@ -407,7 +407,7 @@ class _Search:
             blocked,
         )
 
-    def _workcell(self, found: Found) -> Workcell:
+    def _workcell(self, found: Draft) -> Workcell:
         return self.problem.workcell(changes(self.problem, found))
 
     def _bounds(self, trial: Trial, until: float) -> Bounds:

@@ -42,7 +42,7 @@ from hybrid_opt.robust.squeeze import (
     commanded_forces,
     largest_commanded,
 )
-from hybrid_opt.shown import Shown
+from hybrid_opt.shown import Displayable
 from hybrid_opt.timing.limits import limited_force
 from hybrid_opt.timing.records import Timing
 from hybrid_opt.timing.robustness import Margin
@@ -72,7 +72,7 @@ STEPS = 4 + FORCES
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Recommendation(Shown):
+class Recommendation(Displayable):
     """The carry to run.
 
     Attributes:

@@ -9,7 +9,7 @@ from typing import Annotated
 import numpy as np
 
 from hybrid_opt.carry import Carry
-from hybrid_opt.shown import Shown
+from hybrid_opt.shown import Displayable
 from symbolic.array import Array, Count, Figure, Range
 from symbolic.errors import SettingsError
 from symbolic.records import Workcell
@@ -136,7 +136,7 @@ class Excess:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Timing(Shown):
+class Timing(Displayable):
     """A timing of a path, or why there is none.
 
     Attributes:

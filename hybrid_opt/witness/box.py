@@ -78,19 +78,19 @@ class Outcome:
         return float(self.time[beyond[0]]) if len(beyond) else float("inf")
 
 
-Shown = TypeVar("Shown", bound=Outcome)
+AnyOutcome = TypeVar("AnyOutcome", bound=Outcome)
 
 
 @dataclass(frozen=True)
-class Threshold(Generic[Shown]):
+class Threshold(Generic[AnyOutcome]):
     """The least multiple of a force that holds.
 
     Attributes:
         slips, holds: simulations right below and above it.
     """
 
-    slips: Shown
-    holds: Shown
+    slips: AnyOutcome
+    holds: AnyOutcome
 
     @property
     def factor(self) -> float:
@@ -99,8 +99,8 @@ class Threshold(Generic[Shown]):
 
 
 def bisected(
-    simulate: Callable[[float], Shown], low: float, high: float, steps: int
-) -> Threshold[Shown]:
+    simulate: Callable[[float], AnyOutcome], low: float, high: float, steps: int
+) -> Threshold[AnyOutcome]:
     """The least factor with which a simulation holds, by bisection.
 
     Args:

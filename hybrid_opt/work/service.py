@@ -132,7 +132,7 @@ def give_up(reason: str) -> NoReturn:
     )
 
 
-class _Listed(Generic[Request, Answer]):
+class _RequestList(Generic[Request, Answer]):
     """Requests of a list, answers in a list; a lost request ends the run."""
 
     def __init__(
@@ -175,7 +175,7 @@ def answer_all(
     Raises:
         DualArmError: a request failed with this text, or was lost.
     """
-    ledger = _Listed(requests, answered)
+    ledger = _RequestList(requests, answered)
     executor.run(service, ledger)
     return ledger.answers
 

@@ -23,8 +23,8 @@ from hybrid_opt.timing.records import TimingLimits
 from hybrid_opt.timing.solve import time_path
 from hybrid_opt.witness.arms import BISECTIONS, HIGH, LOW, ArmOutcome, CellWitness, account_of
 from hybrid_opt.witness.box import (
+    AnyOutcome,
     Outcome,
-    Shown,
     Threshold,
     Witness,
     bisected,
@@ -181,7 +181,7 @@ def _swept(step: float) -> tuple[float, float]:
     return step / 2.0, min(2.0 * step, LARGEST_STEP)
 
 
-def _tell_sweep(step: float, threshold: Threshold[Shown]) -> None:
+def _tell_sweep(step: float, threshold: Threshold[AnyOutcome]) -> None:
     print(f"  with a time step of {step:g} s: {threshold.factor:.4f}")
 
 
@@ -199,7 +199,7 @@ def tell_least(outcome: Outcome) -> None:
     print(f"  least forces with the set's worst friction: {word}")
 
 
-def threshold_text(threshold: Threshold[Shown], slip: float) -> str:
+def threshold_text(threshold: Threshold[AnyOutcome], slip: float) -> str:
     """One line: the factors on both sides, and where and when the box slips."""
     slips, holds = threshold.slips, threshold.holds
     return (

@@ -214,7 +214,7 @@ LAWS = {"constant": "constant speed", "ramped": "ramped speed"}
 
 
 @dataclass(frozen=True)
-class Shown:
+class PageTrajectory:
     """One trajectory of the page.
 
     Attributes:
@@ -273,7 +273,7 @@ def _phase(phase: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def page_trajectory(
-    cells: Sequence[ReadyCell], shown: Shown, emit: Emit | None = None
+    cells: Sequence[ReadyCell], shown: PageTrajectory, emit: Emit | None = None
 ) -> dict[str, Any]:
     """A trajectory of the page as JSON values: its motions, and all that is said of it.
 

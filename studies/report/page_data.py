@@ -20,7 +20,7 @@ from studies.report.drawing import ARMS, HAND_MADE, MARKED, LineStyle, series, s
 from studies.report.page_carries import (
     RECOMMENDED_LABEL,
     DrawnJob,
-    Shown,
+    PageTrajectory,
     page_trajectory,
 )
 from symbolic.array import Array
@@ -281,7 +281,7 @@ class Group:
     """
 
     listed: str
-    shown: tuple[Shown, ...]
+    shown: tuple[PageTrajectory, ...]
     label: str = ""
     look: Plot | None = None
     points: Array | None = None
@@ -344,21 +344,21 @@ def _drive_groups(data: ReportData, drivable: Experiment, cell: int) -> Iterator
         found = data.summary.recommendation
         source = "" if found is None else found.source
         title, job = f"{RECOMMENDED} ({source})", _planned(data, RECOMMENDED_LABEL)
-        shown = Shown(title, data.recommended, source, cell, jerk=True, job=job)
+        shown = PageTrajectory(title, data.recommended, source, cell, jerk=True, job=job)
         yield Group(RECOMMENDED, (shown,), RECOMMENDED, CHOICE)
     low, high = drivable.workcell.task.force_limit
     for carry, label, look, curve in curves(data):
         source, path = _source(data, carry), carry.x[: drivable.workcell.task.n_path]
         force = curve[spread(len(curve), CURVE_MEMBERS), 0]
         some = tuple(
-            Shown(source, np.append(path, limit), source, cell)
+            PageTrajectory(source, np.append(path, limit), source, cell)
             for limit in force
             if low <= limit <= high
         )
         yield Group(f"{label}, timed", some, f"{label}, timed", marker(look, size=7))
     for algorithm, front, opened in drivable.fronts():
         some = tuple(
-            Shown(front.source, front.x[k], front.source, cell)
+            PageTrajectory(front.source, front.x[k], front.source, cell)
             for k in spread(len(front), MAX_FRONT)
         )
         yield Group(front.source, some, front.title, marker(series(algorithm.index), opened))
@@ -368,14 +368,16 @@ def _search_groups(data: ReportData) -> Iterator[Group]:
     """Hand-made and selected trajectories, and the fronts of the first experiment."""
     sources = [_source(data, carry) for carry in data.carries]
     picked = [
-        Shown(source, carry.x, source, job=_planned(data, carry.label))
+        PageTrajectory(source, carry.x, source, job=_planned(data, carry.label))
         for carry, source in zip(data.carries, sources, strict=True)
     ]
     yield Group("Hand-made and selected", tuple(picked))
     two = len(data.objectives) >= 2
     for algorithm, front, opened in data.fronts():
         rows = spread(len(front), MAX_FRONT)
-        some = tuple(Shown(front.source, front.x[k], front.source, has_job=False) for k in rows)
+        some = tuple(
+            PageTrajectory(front.source, front.x[k], front.source, has_job=False) for k in rows
+        )
         look = marker(series(algorithm.index), opened) if two else None
         yield Group(front.source, some, front.title, look, front.objectives[rows][:, :2])
 

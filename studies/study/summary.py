@@ -32,7 +32,7 @@ from hybrid_opt.carry import Carry
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.indicators import metrics
 from hybrid_opt.indicators.metrics import BindingBound, binding_bounds
-from hybrid_opt.indicators.selection import Selected, select
+from hybrid_opt.indicators.selection import SelectedCarry, select
 from hybrid_opt.indicators.statistics import (
     RankTest,
     Summary,
@@ -328,7 +328,7 @@ def reference_front(fronts: Sequence[Array]) -> Array:
 
 
 def front_indicators(
-    front: Array, reference: Array, selected: Selected | None, file: str | None
+    front: Array, reference: Array, selected: SelectedCarry | None, file: str | None
 ) -> dict[str, Any]:
     """The fields of `FrontFigures` for a front's objectives (k, n_obj)."""
     carry = None if selected is None else selected.carry
@@ -347,7 +347,7 @@ def front_indicators(
 
 
 def replica_figures(
-    replica: Replica, reference: Array, selected: Selected | None, file: str | None
+    replica: Replica, reference: Array, selected: SelectedCarry | None, file: str | None
 ) -> ReplicaFigures:
     """One replica's entry in the summary; figures that do not exist are NaN or infinite."""
     found = replica.evaluations
@@ -551,7 +551,7 @@ def _store_hand_made(folder: CampaignFolder) -> SelectedEntry | None:
 
 
 def _store_selected(
-    folder: CampaignFolder, path: Path, replica: tuple[str, int], selected: Selected | None
+    folder: CampaignFolder, path: Path, replica: tuple[str, int], selected: SelectedCarry | None
 ) -> str | None:
     """Write a selected trajectory; returns its path in the folder, None where there is none."""
     if selected is None:

@@ -410,11 +410,11 @@ def simulated(found: Sequence[StoredSimulation]) -> Table:
     )
 
 
-Timed = Sequence[tuple[str, TimingDocument]]
+LabelledTimings = Sequence[tuple[str, TimingDocument]]
 """Timings of trajectories by their labels; a trajectory alone needs none."""
 
 
-def timings(timed: Timed, robots: Sequence[str]) -> Table:
+def timings(timed: LabelledTimings, robots: Sequence[str]) -> Table:
     """Durations and forces under the search's timing and under drivable ones."""
     return Table(
         "timing",
@@ -461,7 +461,7 @@ def _timing_cells(timing: StoredTiming) -> tuple[str, ...]:
     )
 
 
-def margins(timed: Timed) -> Table:
+def margins(timed: LabelledTimings) -> Table:
     """How far the model's assumptions may be off under the drivable timing, which at least one of
     the trajectories has."""
     judged = [(label, document.margins) for label, document in timed if document.margins]

@@ -142,7 +142,7 @@ class ActiveSet:
         }
 
 
-class Learned:
+class LearnedRows:
     """What the steps of one climb taught: rows beside those near its candidate, and the value that
     each has to keep from then on. It grows with refused steps."""
 

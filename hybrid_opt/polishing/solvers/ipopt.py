@@ -43,7 +43,7 @@ OPTIONS: dict[str, Any] = {
 Shapes = Mapping[str, ca.Sparsity]
 
 
-class _Called(ca.Callback):  # type: ignore[misc]  # CasADi has no types
+class _Callback(ca.Callback):  # type: ignore[misc]  # CasADi has no types
     """A Python function of vectors (n,) as CasADi calls it; the first methods are its questions."""
 
     def __init__(
@@ -83,7 +83,7 @@ class _Called(ca.Callback):  # type: ignore[misc]  # CasADi has no types
         return self._evaluate(*[argument.full().ravel() for argument in arguments])
 
 
-def _functions(program: Program, wanted: int) -> tuple[_Called, dict[str, _Called]]:
+def _functions(program: Program, wanted: int) -> tuple[_Callback, dict[str, _Callback]]:
     """A program as nlpsol wants it, and its derivatives with what ends a solve.
 
     A solve that is cut off wherever it stands ends in an obstacle more often than not: it ends
@@ -115,11 +115,11 @@ def _functions(program: Program, wanted: int) -> tuple[_Called, dict[str, _Calle
     slopes = {"g": g, "jac_g_x": ca.Sparsity.dense(m, n)}
     bent = {"triu_hess_gamma_x_x": upper}
     reached = {"x": x, "f": one, "g": g, "lam_x": x, "lam_g": g, "lam_p": p}
-    return _Called("nlp", given, {"f": one, "g": g}, values), {
-        "grad_f": _Called("nlp_grad_f", given, {"f": one, "grad_f_x": x}, gradient),
-        "jac_g": _Called("nlp_jac_g", given, slopes, jacobian),
-        "hess_lag": _Called("nlp_hess_l", given | multiplied, bent, hessian),
-        "iteration_callback": _Called("stop", reached, {"ret": one}, stop),
+    return _Callback("nlp", given, {"f": one, "g": g}, values), {
+        "grad_f": _Callback("nlp_grad_f", given, {"f": one, "grad_f_x": x}, gradient),
+        "jac_g": _Callback("nlp_jac_g", given, slopes, jacobian),
+        "hess_lag": _Callback("nlp_hess_l", given | multiplied, bent, hessian),
+        "iteration_callback": _Callback("stop", reached, {"ret": one}, stop),
     }
 
 

@@ -114,7 +114,7 @@ class Length:
 
 
 @dataclass(frozen=True)
-class Measured:
+class TaskResult:
     """A task's figures.
 
     Attributes:
@@ -147,7 +147,7 @@ def measured(
     settings: ho.ProposeSettings,
     seed: int,
     study: bool,
-) -> Measured:
+) -> TaskResult:
     """Propose a carry for one task, and study it where that is asked for.
 
     Args:
@@ -164,12 +164,12 @@ def measured(
         proposal = ho.propose(path, rng=np.random.default_rng(seed), settings=settings)
     except ProposalError as error:
         progress(f"{task.name}: {error}")
-        return Measured(task, str(error), not isinstance(error, NoHoldError))
+        return TaskResult(task, str(error), not isinstance(error, NoHoldError))
     progress(f"{task.name}: {proposal}")
     workcell = path.with_name(f"{path.stem}-proposed.toml")
     replace_file(workcell, proposal.text(output).encode())
     first = length(benchmark, proposal.q)
-    found = Measured(task, "", True, workcell, proposal.certified, proposal.seconds, first)
+    found = TaskResult(task, "", True, workcell, proposal.certified, proposal.seconds, first)
     if not study:
         return found
     progress(f"{task.name}: the fastest carry")
@@ -203,7 +203,7 @@ def checks_per_second(workcell: Path, rng: np.random.Generator) -> float:
     return CHECKS / (worked() - begun)
 
 
-def table(benchmark: Benchmark, found: list[Measured], rng: np.random.Generator) -> Table:
+def table(benchmark: Benchmark, found: list[TaskResult], rng: np.random.Generator) -> Table:
     """The figures beside the published ones: work until the first certified carry and until its
     file, its length over all joints and in their coordinates, in these also the straight line
     between their ends; then the fastest carry. Below how many were found, and the rate of collision
@@ -244,7 +244,7 @@ def table(benchmark: Benchmark, found: list[Measured], rng: np.random.Generator)
     return Table(benchmark.name, benchmark.title, header, tuple(rows), note)
 
 
-def solved(found: list[Measured]) -> str:
+def solved(found: list[TaskResult]) -> str:
     """How many carries were found, and after how much work their verdict stood."""
     held = [one for one in found if one.held]
     times = sorted(one.certified for one in found if one.certified is not None)

@@ -22,7 +22,7 @@ PLACES, PAIRS, LIMIT = 60, 4, 0.02
 
 
 @dataclass
-class Measured:
+class DistanceOracle:
     """Bounds and the distances that a judge finds, and how many it was asked for."""
 
     seed: int
@@ -46,7 +46,7 @@ class Measured:
 
 @given(seed=st.integers(0, 1000))
 def test_the_least_of_a_stretch_is_that_of_all_its_distances(seed: int) -> None:
-    judge, lazy = Measured(seed), Measured(seed)
+    judge, lazy = DistanceOracle(seed), DistanceOracle(seed)
     rng = np.random.default_rng(seed)
     drawn = rng.integers(0, (PLACES - 9, PAIRS), (6, 2)).tolist()
     stretches = [(slice(first, first + 9), pair) for first, pair in drawn]
@@ -60,7 +60,7 @@ def test_the_least_of_a_stretch_is_that_of_all_its_distances(seed: int) -> None:
 
 @given(seed=st.integers(0, 1000), limit=st.floats(-0.02, 0.03))
 def test_limits_are_kept_as_all_distances_say(seed: int, limit: float) -> None:
-    judge, lazy = Measured(seed), Measured(seed)
+    judge, lazy = DistanceOracle(seed), DistanceOracle(seed)
     limits = np.full(PAIRS, limit)
     distances = judge.distances()
     close = distances.lowered < limits

@@ -23,7 +23,7 @@ from hybrid_opt.polishing.force_front import (
     gaps,
     widest,
 )
-from hybrid_opt.polishing.front import OPTIMAL, TOLERANCE, GrowingFront, Lost
+from hybrid_opt.polishing.front import OPTIMAL, TOLERANCE, GrowingFront, Loss
 from hybrid_opt.polishing.point import Solution
 from hybrid_opt.polishing.polisher import Polisher
 from hybrid_opt.polishing.records import PolishedFront, PolishOutcome
@@ -149,7 +149,7 @@ def test_recorded_attempts_are_not_repeated() -> None:
 
 @pytest.mark.slow
 def test_an_attempt_that_ended_its_process_costs_itself_alone() -> None:
-    recorded: list[PolishOutcome | Lost] = [*polished().outcomes[:2], Lost("killed")]
+    recorded: list[PolishOutcome | Loss] = [*polished().outcomes[:2], Loss("killed")]
     emitted: list[PolishOutcome] = []
     again = polisher().polish(
         start_front(), np.random.default_rng(0), recorded=recorded, emit=emitted.append

@@ -38,7 +38,7 @@ class Guess:
 
 
 @dataclass(frozen=True)
-class Found:
+class TranscribedOptimum:
     """An optimum: the path's variables (n_path,), duration [s]."""
 
     path: Array
@@ -60,7 +60,7 @@ class Transcription:
         assert task.n_path == 6 * len(task.free_indices), "arms of six joints"
         assert not self._cell.payload.centre_of_mass.any()
 
-    def solve(self, guess: Guess, force: float) -> Found:
+    def solve(self, guess: Guess, force: float) -> TranscribedOptimum:
         """Least duration within a force limit [N]."""
         cell, n = self._cell, self.intervals
         task = cell.task
@@ -126,7 +126,7 @@ class Transcription:
             ubg=upper,
         )
         assert solver.stats()["success"], solver.stats()["return_status"]
-        return Found(np.array(found["x"]).ravel()[: task.n_path], float(found["f"]))
+        return TranscribedOptimum(np.array(found["x"]).ravel()[: task.n_path], float(found["f"]))
 
     @cached_property
     def _held(self) -> ca.Function:

@@ -72,7 +72,7 @@ def moody(context: dict[str, int], mood: str, emit: Emit) -> str:
     return mood
 
 
-class Kept:
+class MessageLedger:
     """Keeps messages, answers and losses; a lost request is replaced by another one."""
 
     def __init__(self, requests: list[Any], instead: Any = None) -> None:
@@ -104,7 +104,7 @@ def run(
     requests: list[Any],
     patience: float | None = None,
     instead: Any = None,
-) -> Kept:
-    ledger = Kept(requests, instead)
+) -> MessageLedger:
+    ledger = MessageLedger(requests, instead)
     executor.run(Service(context, work, patience), ledger)
     return ledger

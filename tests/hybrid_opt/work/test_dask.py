@@ -141,7 +141,7 @@ def test_a_lost_scheduler_is_told(
 def test_other_addresses_are_refused(address: str) -> None:
     nowhere = DaskExecutor(address, machine(), machine)
     with pytest.raises(SettingsError, match="is no address of a Dask scheduler") as caught:
-        nowhere.run(Service(services.context, services.echo), services.Kept([1]))
+        nowhere.run(Service(services.context, services.echo), services.MessageLedger([1]))
     assert str(caught.value).isprintable()
     assert len(str(caught.value)) < 600
 
@@ -150,4 +150,4 @@ def test_no_scheduler_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("hybrid_opt.work.dask_cluster.CONNECT_SECONDS", 0.5)
     nobody = DaskExecutor("tcp://127.0.0.1:9", machine(), machine)
     with pytest.raises(SettingsError, match=r"no Dask scheduler answers at tcp://127.0.0.1:9"):
-        nobody.run(Service(services.context, services.echo), services.Kept([1]))
+        nobody.run(Service(services.context, services.echo), services.MessageLedger([1]))

@@ -28,7 +28,7 @@ from hybrid_opt.work.service import (
 )
 from symbolic.errors import DualArmError
 from tests.hybrid_opt.work import services
-from tests.hybrid_opt.work.services import Kept, run
+from tests.hybrid_opt.work.services import MessageLedger, run
 from tests.waiting import HANGS, soon, until
 
 EXECUTORS: list[Executor] = [LocalExecutor(), LocalExecutor(2, apart=True), LocalExecutor(3)]
@@ -109,7 +109,7 @@ def test_a_killed_worker_is_replaced_and_its_request_repeated(tmp_path: Path) ->
 
 
 def test_deaths_with_progress_in_between_lose_nothing() -> None:
-    class Progressing(Kept):
+    class Progressing(MessageLedger):
         def request(self, index: int) -> Any:
             return len(self.messages[index])
 
@@ -161,7 +161,7 @@ from hybrid_opt.work.service import Service
 from hybrid_opt.work.service import LocalExecutor, warm_up
 from tests.hybrid_opt.work import services
 warm_up("tests.hybrid_opt.work.services")
-ledger = services.Kept(["hang", "hang"])
+ledger = services.MessageLedger(["hang", "hang"])
 print("started", flush=True)
 try:
     LocalExecutor(2, apart=True).run(Service(services.context, services.moody), ledger)

@@ -38,23 +38,23 @@ def transfer() -> Workcell:
     return load(TRANSFER)
 
 
-class Found(SimpleNamespace):
+class Inspection(SimpleNamespace):
     """The values of an inspection as attributes, and its lines."""
 
 
-def find(workcell: Workcell, *given: Any, **more: Any) -> Found:
+def find(workcell: Workcell, *given: Any, **more: Any) -> Inspection:
     parts = list(inspected(workcell, *given, **more))
     values = {name: value for part in parts for name, value in part.values.items()}
-    return Found(**values, lines=[line for part in parts for line in part.lines])
+    return Inspection(**values, lines=[line for part in parts for line in part.lines])
 
 
 @pytest.fixture(scope="module")
-def found(transfer: Workcell, tmp_path_factory: pytest.TempPathFactory) -> Found:
+def found(transfer: Workcell, tmp_path_factory: pytest.TempPathFactory) -> Inspection:
     folder = tmp_path_factory.mktemp("pictures")
     return find(transfer, 1500, 7, folder, view=folder / "new" / "view.html")
 
 
-def test_the_second_cell_is_worth_searching(found: Found) -> None:
+def test_the_second_cell_is_worth_searching(found: Inspection) -> None:
     assert found.initial.feasible
     assert not found.straight_line.feasible
     assert 0.02 <= found.feasible_share <= 0.20
@@ -71,7 +71,7 @@ def test_the_second_cell_is_of_another_kind(transfer: Workcell) -> None:
     assert transfer.contacts[0].friction < rack.contacts[0].friction
 
 
-def test_counts_agree_with_the_evaluator(found: Found, transfer: Workcell) -> None:
+def test_counts_agree_with_the_evaluator(found: Inspection, transfer: Workcell) -> None:
     evaluator = CandidateEvaluator(transfer)
     x = np.random.default_rng(7).uniform(evaluator.lower, evaluator.upper, (500, evaluator.n_var))
     again = find(transfer, 500, 7)
@@ -83,7 +83,7 @@ def test_counts_agree_with_the_evaluator(found: Found, transfer: Workcell) -> No
     assert total == 1500
 
 
-def test_the_static_bound_is_the_closed_form(found: Found) -> None:
+def test_the_static_bound_is_the_closed_form(found: Inspection) -> None:
     # m g / (2 mu), and (m g / 2) sqrt(1 + 1 / mu^2) at the reference force of 117.68 N.
     force = 8.0 * 9.81 / (2.0 * 0.8)
     assert found.static_normal_force == pytest.approx((force, force), rel=1e-12)
@@ -91,7 +91,7 @@ def test_the_static_bound_is_the_closed_form(found: Found) -> None:
     assert found.static_payload_limit == pytest.approx(limit, rel=1e-12)
 
 
-def test_every_pair_is_active_or_excluded_with_a_reason(found: Found) -> None:
+def test_every_pair_is_active_or_excluded_with_a_reason(found: Inspection) -> None:
     pairs = [frozenset(pair) for pair in found.active_pairs]
     pairs += [frozenset(pair[:2]) for pair in found.excluded_pairs]
     bodies = frozenset().union(*pairs)
@@ -100,7 +100,7 @@ def test_every_pair_is_active_or_excluded_with_a_reason(found: Found) -> None:
     assert frozenset(("payload", "wall")) in {frozenset(pair) for pair in found.active_pairs}
 
 
-def test_one_branch_of_each_arm_is_chosen(found: Found) -> None:
+def test_one_branch_of_each_arm_is_chosen(found: Inspection) -> None:
     assert set(found.branches) == {"north", "south"}
     for branches in found.branches.values():
         assert sum(branch.chosen for branch in branches) == 1
@@ -108,7 +108,7 @@ def test_one_branch_of_each_arm_is_chosen(found: Found) -> None:
         assert branches[0].kept_samples == max(branch.kept_samples for branch in branches)
 
 
-def test_pictures_are_drawn(found: Found) -> None:
+def test_pictures_are_drawn(found: Inspection) -> None:
     names = sorted(Path(file).name for file in found.files)
     drawn = ("cell", "collision_straight_line", "reachable_regions")
     assert names == [f"{name}.png" for name in drawn]
@@ -116,7 +116,7 @@ def test_pictures_are_drawn(found: Found) -> None:
         assert np.asarray(Image.open(file).convert("L")).std() > 10.0
 
 
-def test_the_view_plays_the_hand_made_trajectory(found: Found) -> None:
+def test_the_view_plays_the_hand_made_trajectory(found: Inspection) -> None:
     page = Path(found.view).read_text("utf-8")
     assert "Transfer over a wall" in page
     assert '<div id="note"></div>' in page
@@ -125,7 +125,7 @@ def test_the_view_plays_the_hand_made_trajectory(found: Found) -> None:
 
 
 def test_the_view_of_a_carry_that_fails_begins_there(
-    transfer: Workcell, found: Found, tmp_path: Path
+    transfer: Workcell, found: Inspection, tmp_path: Path
 ) -> None:
     cell = Cell(transfer)
     (why,) = explain(cell.evaluator, cell.evaluate(straight_line(transfer.task)))

@@ -29,7 +29,7 @@ from studies.errors import ReportError
 from studies.report import page_carries, page_data
 from studies.report.data import ReportData
 from studies.report.generate import BEGIN, END, insert_tables, report_tables, write_report
-from studies.report.page_carries import DrawnJob, Shown, page_trajectory, pressure_shift
+from studies.report.page_carries import DrawnJob, PageTrajectory, page_trajectory, pressure_shift
 from studies.report.page_data import page_document
 from studies.study import tables
 from studies.study.recommendation import recommendation_text
@@ -233,7 +233,7 @@ def test_every_point_has_the_phases_of_its_job(
 def test_points_are_named_by_what_was_minimised(data: ReportData) -> None:
     cell = Cell(data.workcell, ("mean_force", "friction_use"))
     ready = ReadyCell(cell, JobModel(cell.compiled, cell.timing_model))
-    trajectory = page_trajectory((ready,), Shown("NSGA-II, replica 1", data.initial.x, ""))
+    trajectory = page_trajectory((ready,), PageTrajectory("NSGA-II, replica 1", data.initial.x, ""))
     mean, friction = trajectory["objectives"]
     assert trajectory["label"] == (
         f"NSGA-II, replica 1: mean force {mean:.4f}, friction use {friction:.4f}"

@@ -19,7 +19,7 @@ from studies.research.benchmarks import baxter, machines, shelves, slot
 from studies.research.benchmarks.__main__ import main
 from studies.research.benchmarks.measuring import (
     Length,
-    Measured,
+    TaskResult,
     checks_per_second,
     measured,
     solved,
@@ -165,11 +165,11 @@ def test_a_task_without_a_carry_says_why(folder: Path) -> None:
 
 def test_the_table_has_figures_where_there_are_some(folder: Path) -> None:
     given = shelves.benchmark(folder)
-    some = Measured(given.tasks[0], "", True, None, 12.0, 20.0, Length(3.0, 2.1))
+    some = TaskResult(given.tasks[0], "", True, None, 12.0, 20.0, Length(3.0, 2.1))
     rows = table(given, [some], RNG).rows
     assert rows[0][:7] == ("top to middle", "12.0", "20.0", "3.00", "2.10", "1.88", "2.09")
     assert rows[0][7:] == (NOTHING,) * 4
-    told = solved([some, Measured(given.tasks[1], "out of reach", False)])
+    told = solved([some, TaskResult(given.tasks[1], "out of reach", False)])
     assert told.startswith("Of 2 the box can be held at both ends in 1, carried in 1; certified")
 
 

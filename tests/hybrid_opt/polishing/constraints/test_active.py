@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from hybrid_opt.polishing.carry import PlacedCarry
-from hybrid_opt.polishing.constraints.active import KEPT, ActiveSet, Learned
+from hybrid_opt.polishing.constraints.active import KEPT, ActiveSet, LearnedRows
 from hybrid_opt.polishing.rows import PlaceRow, Row
 from symbolic.smooth.passage import Separation
 from symbolic.smooth.places import Clearance
@@ -43,11 +43,11 @@ class Rows:
         return row != GAP
 
 
-def memory() -> Learned:
-    return Learned(cast(ActiveSet, Rows()), HALF)
+def memory() -> LearnedRows:
+    return LearnedRows(cast(ActiveSet, Rows()), HALF)
 
 
-def required(known: Learned, radius: float = 0.2) -> dict[Row, float]:
+def required(known: LearnedRows, radius: float = 0.2) -> dict[Row, float]:
     return known.required(NOTHING, (True, True), HERE, radius, lenient=False)
 
 
