@@ -14,7 +14,7 @@ import casadi as ca
 import numpy as np
 
 from symbolic.cell_model import CellModel
-from symbolic.contact.closed_form import Asked, HeldLoad, held_by
+from symbolic.contact.closed_form import ContactLoad, HeldLoad, held_by
 from symbolic.contact.force_closure import WRENCH_SIZE
 from symbolic.contact.grasp import Grasp
 from symbolic.contact.load import frictions
@@ -226,7 +226,7 @@ def _held(
     by = [blocks["force"][3 * k : 3 * k + 3] for k in range(3)]
     axes, centre = workcell.contacts[0].T_box_pad[:3, :3], workcell.payload.centre_of_mass
     arms = [ca.SX(number(axes.T @ (c.T_box_pad[:3, 3] - centre))) for c in workcell.contacts]
-    asked = Asked(
+    asked = ContactLoad(
         by[0] * a + by[1] * w + by[2],
         blocks["moment"][:3] * a + blocks["moment"][3:] * w,
         (arms[0], arms[1]),

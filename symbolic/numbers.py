@@ -28,10 +28,10 @@ from symbolic.array import Array
 from symbolic.cell_model import CellBodies, CellModel
 from symbolic.contact.grasp_numbers import grasp_shapes, left_components
 from symbolic.contact.soft_finger import SoftPatch
-from symbolic.geometry.screen import Base, Bounded, Screen
+from symbolic.geometry.screen import Base, Screen, ScreenBody
 from symbolic.records import Contact, RedundantJoint, Robot, Task, Waypoint, Workcell
 from symbolic.records.cell import box_flange, flange_lever
-from symbolic.records.content import Seen, digest_of_parts
+from symbolic.records.content import CacheKey, digest_of_parts
 from symbolic.records.numbered import (
     GraspNumbers,
     Group,
@@ -90,11 +90,11 @@ class _Take(Protocol):
     def group(self, name: str) -> Group:
         """The group of that name, all of whose numbers are taken."""
 
-    def body(self, path: str, body: Bounded) -> Any:
+    def body(self, path: str, body: ScreenBody) -> Any:
         """A body whose numbers were taken."""
 
 
-class _Collected:
+class _Collector:
     """Places in the structure, the values aside."""
 
     def __init__(self) -> None:
@@ -115,8 +115,8 @@ class _Collected:
     def group(self, name: str) -> Group:
         return Group(name, ())
 
-    def body(self, path: str, body: Bounded) -> Any:
-        taken, entries = _collected_body(Seen(path, body, known=(path, body.content)))
+    def body(self, path: str, body: ScreenBody) -> Any:
+        taken, entries = _collected_body(CacheKey(path, body, known=(path, body.content)))
         self.entries.setdefault(BODIES, []).extend(entries)
         return taken
 
@@ -146,7 +146,7 @@ class _Symbols:
     def group(self, name: str) -> Group:
         return self._groups[name]
 
-    def body(self, path: str, body: Bounded) -> Any:
+    def body(self, path: str, body: ScreenBody) -> Any:
         return _body(self, path, body)
 
 
@@ -161,8 +161,8 @@ class WorkcellNumbers:
     cell: Workcell
 
     @cached_property
-    def _collected(self) -> tuple[_Collected, NumberedWorkcell]:
-        take = _Collected()
+    def _collected(self) -> tuple[_Collector, NumberedWorkcell]:
+        take = _Collector()
         return take, _workcell(take, self.cell)
 
     @property
@@ -228,8 +228,8 @@ class CellNumbers(WorkcellNumbers):
     models: tuple[RobotModel, RobotModel]
 
     @cached_property
-    def _of_bodies(self) -> tuple[_Collected, Screen]:
-        take = _Collected()
+    def _of_bodies(self) -> tuple[_Collector, Screen]:
+        take = _Collector()
         return take, _screen(take, self.bounds)
 
     @property
@@ -464,13 +464,13 @@ def _base(take: _Take, path: str, base: Base) -> Base:
 
 
 @lru_cache(maxsize=512)
-def _collected_body(seen: Seen) -> tuple[Any, list[tuple[Number, Array | _Later]]]:
+def _collected_body(seen: CacheKey) -> tuple[Any, list[tuple[Number, Array | _Later]]]:
     """Cells that are tried out share most bodies."""
-    take, (path, body) = _Collected(), seen.given
+    take, (path, body) = _Collector(), seen.given
     return _body(take, path, body), take.entries.get(BODIES, [])
 
 
-def _body(take: _Take, path: str, body: Bounded) -> Any:
+def _body(take: _Take, path: str, body: ScreenBody) -> Any:
     if not body.is_constant:
         return _own(take, path, body)
     if body.frame.kind != "world" or body.chain is None:

@@ -141,7 +141,7 @@ def json_value(content: bytes) -> Any:
     count = sum(content.count(mark) for mark in (b",", b"[", b"{"))
     # Quotation marks within texts count as well, so there may be more of them.
     if count > MOST_VALUES or content.count(b'"') > 8 * MOST_VALUES:
-        raise OutsideError(f"holds more than {MOST_VALUES} values; allowed are so many")
+        raise OutsideError(f"holds more than {MOST_VALUES} values, which is the limit")
     found = text(content)
     depth = _json_depth(found)
     if depth > MOST_DEPTH:

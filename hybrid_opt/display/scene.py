@@ -23,7 +23,7 @@ from symbolic.geometry.bodies import ArmGeometry, Frame
 from symbolic.geometry.pairs import CellGeometry
 from symbolic.geometry.pieces import Hull, Piece
 from symbolic.records import Box, Capsule, Cylinder, Sphere
-from symbolic.records.content import Seen
+from symbolic.records.content import CacheKey
 from symbolic.records.poses import box_placement
 
 SECTIONS = 24
@@ -55,11 +55,11 @@ class Solid:
 
 def cell_solids(geometry: CellGeometry) -> tuple[Solid, ...]:
     """Every collision body of a cell as triangles."""
-    return tuple(_triangles(Seen(body, known=body.content)) for body in geometry.bodies)
+    return tuple(_triangles(CacheKey(body, known=body.content)) for body in geometry.bodies)
 
 
 @lru_cache(maxsize=256)
-def _triangles(seen: Seen) -> Solid:
+def _triangles(seen: CacheKey) -> Solid:
     (body,) = seen.given
     meshes = [_mesh(piece) for piece in body.pieces]
     vertices = np.concatenate([np.asarray(mesh.vertices, np.float64) for mesh in meshes])

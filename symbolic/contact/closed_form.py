@@ -13,8 +13,8 @@ from symbolic.records import Allocation, Workcell
 
 
 @dataclass(frozen=True)
-class Asked:
-    """What two contacts have to give; all vectors along the same axes, the world's for instance.
+class ContactLoad:
+    """The load that two contacts bear; all vectors along the same axes, the world's for instance.
 
     Attributes:
         force, moment: (3,) on the payload, about its centre of mass [N, N m].
@@ -32,7 +32,7 @@ class Asked:
 
 @dataclass(frozen=True)
 class HeldLoad:
-    """How two contacts give it.
+    """How two contacts bear a load.
 
     Attributes:
         normal, tangential: (2,) normal forces and magnitudes of the tangential ones [N].
@@ -56,7 +56,7 @@ class HeldLoad:
 
 
 def held_by(
-    workcell: Workcell, allocation: Allocation, asked: Asked, detached: Detached | None = None
+    workcell: Workcell, allocation: Allocation, asked: ContactLoad, detached: Detached | None = None
 ) -> HeldLoad:
     """The least contact forces: of the paper, or of soft fingers.
 
@@ -71,7 +71,7 @@ def held_by(
     return _by_soft_fingers(workcell, asked, detached)
 
 
-def _by_paper(asked: Asked) -> HeldLoad:
+def _by_paper(asked: ContactLoad) -> HeldLoad:
     """Least forces first; then the least shifts of the pressure that carry the moment."""
     axes, mu = asked.axes, asked.friction
     forces = allocate(asked.force, axes[:, 2], (mu[0], mu[1]))
@@ -90,7 +90,7 @@ def _by_paper(asked: Asked) -> HeldLoad:
     )
 
 
-def _by_soft_fingers(workcell: Workcell, asked: Asked, detached: Detached | None) -> HeldLoad:
+def _by_soft_fingers(workcell: Workcell, asked: ContactLoad, detached: Detached | None) -> HeldLoad:
     """Pads that press evenly: no shift, torsion in proportion to what either can carry."""
     axes = asked.axes
     in_box = workcell.contacts[0].T_box_pad[:3, :3]

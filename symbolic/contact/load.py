@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import casadi as ca
 
-from symbolic.contact.closed_form import Asked, held_by
+from symbolic.contact.closed_form import ContactLoad, held_by
 from symbolic.contact.force_closure import WRENCH_SIZE
 from symbolic.contact.grasp import Grasp, balance_of, facing_wrenches, grasp_wrenches
 from symbolic.contact.paper import required_force, required_moment
@@ -125,7 +125,9 @@ def closed_load_function(workcell: Workcell, allocation: Allocation) -> ca.Funct
     points = [number(contact.T_box_pad[:3, 3]) for contact in contacts]
     arms = [ca.mtimes(rotation, point - centre_of_mass) for point in points]
     axes = ca.mtimes(rotation, number(contacts[0].T_box_pad[:3, :3]))
-    held = held_by(workcell, allocation, Asked(force, moment, (arms[0], arms[1]), axes, friction))
+    held = held_by(
+        workcell, allocation, ContactLoad(force, moment, (arms[0], arms[1]), axes, friction)
+    )
     outputs = {
         "angular_velocity": omega,
         "angular_acceleration": alpha,

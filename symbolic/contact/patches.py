@@ -141,7 +141,7 @@ class Step(Protocol):
         """(correction_size,) what the whole step leaves out: sym(X^-1 dX dS)."""
 
     def gap_after(self, length: ca.SX) -> ca.SX:
-        """Pairing of X with S after so much of the step."""
+        """Pairing of X with S after a share `length` of the step."""
 
 
 def least(values: list[ca.SX]) -> ca.SX:

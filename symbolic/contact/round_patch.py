@@ -89,7 +89,7 @@ class Hermitian:
         return Hermitian.of(ca.vertcat(*self.entries) - ca.vertcat(*other.entries))
 
     def moved(self, change: Hermitian, length: ca.SX) -> Hermitian:
-        """After so much of a change."""
+        """The matrix after a share `length` of a change."""
         return Hermitian.of(ca.vertcat(*self.entries) + length * ca.vertcat(*change.entries))
 
     def adjugate(self) -> Hermitian:

@@ -19,7 +19,7 @@ from symbolic.read.arms import ArmLinks, arm_links, arm_model, link_frame, one_m
 from symbolic.read.descriptions import resolve_mesh
 from symbolic.read.urdf import UrdfMesh
 from symbolic.records import PAYLOAD, Capsule, Mesh, Robot, Shape, Workcell
-from symbolic.records.content import Known, digest_of_parts
+from symbolic.records.content import ContentRecord, digest_of_parts
 from symbolic.records.problems import shown
 
 Group = Literal["robot 1", "robot 2", "payload", "environment"]
@@ -46,7 +46,7 @@ BOX = Frame("box")
 
 
 @dataclass(frozen=True)
-class CollisionBody(Known):
+class CollisionBody(ContentRecord):
     """A named rigid body.
 
     Attributes:
@@ -70,7 +70,7 @@ class CollisionBody(Known):
 
 
 @dataclass(frozen=True)
-class ArmGeometry(Known):
+class ArmGeometry(ContentRecord):
     """The constant geometry of an arm's joints.
 
     Attributes:

@@ -84,7 +84,7 @@ def screening_functions(
 
 
 def _piece_pose(placed: tuple[ca.SX, ca.SX] | None, turn: Any, centre: Any) -> tuple[ca.SX, ca.SX]:
-    """Unit quaternion (4,) and position (3,) in the world of a piece, see `Bounded.pieces`.
+    """Unit quaternion (4,) and position (3,) in the world of a piece, see `ScreenBody.pieces`.
 
     Args:
         placed: rotation and position of its frame; None of what stands.

@@ -28,7 +28,7 @@ from symbolic.geometry.pieces import (
     support,
 )
 from symbolic.records import Box
-from symbolic.records.content import Seen, digest_of_parts
+from symbolic.records.content import CacheKey, digest_of_parts
 from symbolic.records.poses import rotation_from_vector
 
 MERGE_SLACK = 0.004
@@ -71,11 +71,11 @@ def slab_cover(body: CollisionBody) -> tuple[Piece, ...]:
 
 def chain_cover(body: CollisionBody) -> SphereChain:
     """A chain of equal spheres that contains the body, along its longest principal side."""
-    return _chain_cover(Seen(body.pieces))
+    return _chain_cover(CacheKey(body.pieces))
 
 
 @lru_cache(maxsize=256)
-def _chain_cover(seen: Seen) -> SphereChain:
+def _chain_cover(seen: CacheKey) -> SphereChain:
     (pieces,) = seen.given
     chains = (sphere_chain(pieces, axes, SLENDERNESS) for axes in _orientations(pieces))
     return min(chains, key=lambda chain: chain.radius)
@@ -91,16 +91,16 @@ def close_pairs(geometry: CellGeometry) -> frozenset[tuple[int, int]]:
         arm = geometry.arms[b.frame.robot]
         # Where the arm stands does not matter.
         first = a.content if a.root is None else digest_of_parts(a.root[1])
-        if _often_close(Seen(a, b, arm, known=(first, b.content, arm.chain))):
+        if _often_close(CacheKey(a, b, arm, known=(first, b.content, arm.chain))):
             found.append((pair.first, pair.second))
     return frozenset(found)
 
 
 @lru_cache(maxsize=512)
-def _often_close(seen: Seen) -> bool:
+def _often_close(seen: CacheKey) -> bool:
     a, b, arm = seen.given
     a = a if a.root is None else replace(a, pieces=a.root[1])
-    steps, chains = _steps(Seen(arm, known=arm.chain)), [chain_cover(body) for body in (a, b)]
+    steps, chains = _steps(CacheKey(arm, known=arm.chain)), [chain_cover(body) for body in (a, b)]
     T = np.broadcast_to(np.eye(4), (POSTURES, 4, 4))
     for k in range(a.frame.joint + 1, b.frame.joint + 1):
         T = T @ steps[k]
@@ -113,7 +113,7 @@ def _often_close(seen: Seen) -> bool:
 
 
 @lru_cache(maxsize=4)
-def _steps(seen: Seen) -> list[Array]:
+def _steps(seen: CacheKey) -> list[Array]:
     """Per joint of an arm its frame in the one before it (POSTURES, 4, 4) at random postures."""
     (arm,), found = seen.given, []
     q = np.random.default_rng(0).uniform(arm.lower, arm.upper, (POSTURES, arm.joints))

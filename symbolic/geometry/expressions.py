@@ -103,7 +103,7 @@ EXACT = Softness()
 # --- placements ---
 
 
-class Placed(Protocol):
+class BasePose(Protocol):
     """Where an arm stands: rotation (3, 3) and position (3,) [m], arrays or symbols."""
 
     @property
@@ -115,7 +115,7 @@ class Placed(Protocol):
         """(3,) [m]."""
 
 
-def world_placements(base: Placed, placements: tuple[ca.SX, ca.SX]) -> list[tuple[ca.SX, ca.SX]]:
+def world_placements(base: BasePose, placements: tuple[ca.SX, ca.SX]) -> list[tuple[ca.SX, ca.SX]]:
     """Rotation and position in the world of each joint frame given in the root."""
     rotations, positions = placements
     R, p = ca.SX(number(base.rotation)), ca.SX(number(base.position))

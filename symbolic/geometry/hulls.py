@@ -28,7 +28,7 @@ class CollisionModelWarning(DualArmWarning):
 
 
 _TOLD: dict[str | tuple[str, type[Warning], int], int] = {}
-"""What Python's warnings remember, so that each is told once."""
+"""What Python's warnings remember, so that each is shown once."""
 
 
 def convex_pieces(path: Path, scale: Array) -> tuple[Hull, ...]:

@@ -27,7 +27,7 @@ from symbolic.expression import number, sx_given
 from symbolic.geometry.bodies import BOX, WORLD, Frame
 from symbolic.geometry.expressions import world_placements
 from symbolic.geometry.pairs import CellGeometry
-from symbolic.geometry.screen import Bounded, Reach, Screen
+from symbolic.geometry.screen import Reach, Screen, ScreenBody
 from symbolic.path.rotation import rotation_matrix
 
 
@@ -88,7 +88,7 @@ def motion_function(
 
 def _body_motion(
     screen: Screen,
-    body: Bounded,
+    body: ScreenBody,
     placed_a: dict[Frame, tuple[ca.SX, ca.SX]],
     placed_b: dict[Frame, tuple[ca.SX, ca.SX]],
     steps: list[ca.SX],
@@ -108,7 +108,7 @@ def _body_motion(
     return chord, _bend(body.reach, screen.turning[robot], steps[1 + robot])
 
 
-def _between_links(first: Bounded, second: Bounded, step: ca.SX) -> ca.SX:
+def _between_links(first: ScreenBody, second: ScreenBody, step: ca.SX) -> ca.SX:
     """Length of the path of the later link seen from the earlier one."""
     assert second.reach is not None, "the later of two links moves"
     reach = number(second.reach.joints)

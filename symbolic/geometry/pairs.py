@@ -38,7 +38,7 @@ from symbolic.geometry.pieces import (
 from symbolic.read.arms import one_machine
 from symbolic.read.urdf import read_srdf
 from symbolic.records import Box, Capsule, Cylinder, Sphere, Workcell
-from symbolic.records.content import Seen, digest_of_parts
+from symbolic.records.content import CacheKey, digest_of_parts
 from symbolic.records.problems import matching
 
 MOST_ENTERED = 1e-3
@@ -174,7 +174,7 @@ def build_geometry(workcell: Workcell) -> CellGeometry:
         given = a, b, arms, pair_tolerance(workcell, a, b), bodies
         of_arms = tuple(arms[k].content for k in sorted({*_arms_of(a), *_arms_of(b)}))
         known = a.content, b.content, of_arms, given[3], order
-        found = _Sorted(named, False) if named else _sorted(Seen(*given, known=known))
+        found = _PairStatus(named, False) if named else _sorted(CacheKey(*given, known=known))
         if found.reason:
             excluded.append(ExcludedPair(i, j, found.reason))
         else:
@@ -195,7 +195,7 @@ def _arms_of(body: CollisionBody) -> tuple[int, ...]:
 
 
 @dataclass(frozen=True)
-class _Sorted:
+class _PairStatus:
     """What becomes of a pair: why it is not active, '' where it is; whether it is possible, and
     not among the near ones."""
 
@@ -205,12 +205,12 @@ class _Sorted:
 
 
 @lru_cache(maxsize=4096)
-def _sorted(seen: Seen) -> _Sorted:
+def _sorted(seen: CacheKey) -> _PairStatus:
     a, b, arms, tolerance, bodies = seen.given
     rigid = _rigid(a, b, arms)
     fixed = ("" if a.frame != b.frame else rigid) or _neighbours(a, b, bodies)
     if fixed:
-        return _Sorted(fixed, possible=False)
+        return _PairStatus(fixed, possible=False)
     apart = (
         rigid
         or out_of_reach(a, b, arms, tolerance)
@@ -219,7 +219,7 @@ def _sorted(seen: Seen) -> _Sorted:
     )
     # An arm's own links keep apart, or do not, whatever is held.
     links = a.group == b.group and not (a.is_tool or b.is_tool)
-    return _Sorted(apart, not (apart and links), bool(rigid) or _is_far(a, b))
+    return _PairStatus(apart, not (apart and links), bool(rigid) or _is_far(a, b))
 
 
 def _is_far(a: CollisionBody, b: CollisionBody) -> bool:
@@ -347,11 +347,11 @@ def anchor(body: CollisionBody, arms: tuple[ArmGeometry, ArmGeometry], robot: in
     if body.frame.kind != "box":
         return body
     known = body.content, arms[robot].content, robot
-    return _anchored(Seen(body, arms[robot], robot, known=known))
+    return _anchored(CacheKey(body, arms[robot], robot, known=known))
 
 
 @lru_cache(maxsize=16)
-def _anchored(seen: Seen) -> CollisionBody:
+def _anchored(seen: CacheKey) -> CollisionBody:
     body, arm, robot = seen.given
     pieces = tuple(piece.moved(arm.T_joint_box) for piece in body.pieces)
     return CollisionBody(body.name, body.group, Frame("link", robot, arm.joints - 1), pieces)
@@ -431,11 +431,11 @@ def _zone(body: CollisionBody, arm: ArmGeometry, below: int) -> Piece:
     One joint that turns between them: the swept cylinder about its axis. Else the ball about the
     first joint's origin whose radius is the stretched chain.
     """
-    return _zone_of(Seen(body, arm, below, known=(body.content, arm.content, below)))
+    return _zone_of(CacheKey(body, arm, below, known=(body.content, arm.content, below)))
 
 
 @lru_cache(maxsize=256)
-def _zone_of(seen: Seen) -> Piece:
+def _zone_of(seen: CacheKey) -> Piece:
     body, arm, below = seen.given
     first = below + 1
     T = arm.T_world_root @ arm.origins[0] if first == 0 else arm.origins[first]

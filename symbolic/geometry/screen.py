@@ -34,7 +34,7 @@ from symbolic.geometry.pieces import (
     support,
 )
 from symbolic.records import Box, Capsule, Cylinder, Sphere
-from symbolic.records.content import Known, Seen
+from symbolic.records.content import CacheKey, ContentRecord
 from symbolic.records.numbered import Group
 
 LONG = 0.25
@@ -105,7 +105,7 @@ class Obstacle:
 
 
 @dataclass(frozen=True)
-class Bounded(Known):
+class ScreenBody(ContentRecord):
     """A body.
 
     Attributes:
@@ -163,7 +163,7 @@ class Screen:
 
     bases: tuple[Base, Base]
     turning: tuple[tuple[bool, ...], tuple[bool, ...]]
-    bodies: tuple[Bounded, ...]
+    bodies: tuple[ScreenBody, ...]
     pairs: tuple[tuple[int, int], ...]
     own: tuple[bool | None, ...]
     payload: Solid
@@ -200,18 +200,18 @@ def has_hulls(body: CollisionBody) -> bool:
     return any(isinstance(piece.shape, Hull) for piece in body.pieces)
 
 
-def _seen(body: CollisionBody, arms: tuple[ArmGeometry, ArmGeometry]) -> Seen:
+def _seen(body: CollisionBody, arms: tuple[ArmGeometry, ArmGeometry]) -> CacheKey:
     """A body and what of both arms its bounds are made of."""
     of: tuple[Any, ...] = (body.content,)
     if body.frame.kind == "link":
         of = (body.content, arms[body.frame.robot].chain)
     elif body.root is not None:
         of = (body.content, arms[body.root[0]].content)
-    return Seen(body, arms, known=of)
+    return CacheKey(body, arms, known=of)
 
 
 @lru_cache(maxsize=256)
-def _bounded(seen: Seen) -> Bounded:
+def _bounded(seen: CacheKey) -> ScreenBody:
     body, arms = seen.given
     still = body.frame == WORLD
     pieces = tuple(
@@ -222,7 +222,7 @@ def _bounded(seen: Seen) -> Bounded:
     )
     if body.group == "environment":
         obstacles = tuple(_obstacle(piece) for piece in body.pieces)
-        return Bounded(
+        return ScreenBody(
             body.group, body.frame, (), None, None, None, pieces, obstacles, False, False
         )
     frame, is_link = body.frame, body.frame.kind != "box" and not body.is_tool
@@ -243,7 +243,9 @@ def _bounded(seen: Seen) -> Bounded:
     spheres = Chain(clean(centres), np.array([chain.radius]))
     cover, constant = tuple(_solid(piece) for piece in solids), is_link or has_hulls(body)
     slanted = _slanted_matters(body)
-    return Bounded(body.group, frame, cover, spheres, extent, reach, pieces, (), slanted, constant)
+    return ScreenBody(
+        body.group, frame, cover, spheres, extent, reach, pieces, (), slanted, constant
+    )
 
 
 def _solid(piece: Piece) -> Solid:

@@ -287,11 +287,11 @@ def _digest(path: str) -> bytes:
 
 
 CPU_SECONDS = 5
-"""So long an expansion may compute."""
+"""Longest time that an expansion may compute."""
 
 MEMORY_BYTES = 192 * outside.MEBIBYTE
 MEMORY_PER_BYTE = 6
-"""So much memory it may take, and so much more per byte of the file."""
+"""Memory that it may take, and how much more per byte of the file."""
 
 ANSWER_BYTES = 8 * outside.URDF_BYTES
 """Largest answer; JSON may take six bytes for a letter."""
@@ -365,7 +365,7 @@ def _expand(
     text = document.documentElement.toxml()
     if len(text) > outside.URDF_BYTES:
         raise OutsideError(
-            f"expands to more than {outside.megabytes(outside.URDF_BYTES)}; allowed is so much"
+            f"expands to more than {outside.megabytes(outside.URDF_BYTES)}, which is the limit"
         )
     return {"urdf": text, "included": list(dict.fromkeys(map(str, xacro.all_includes)))}
 

@@ -24,7 +24,7 @@ MOST_NAME = 200
 _NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
 
 
-class _Bounded(ElementTree.TreeBuilder):
+class _LimitedBuilder(ElementTree.TreeBuilder):
     """Builds elements, but neither too many nor too deep."""
 
     def __init__(self) -> None:
@@ -38,7 +38,7 @@ class _Bounded(ElementTree.TreeBuilder):
         if self._depth > MOST_DEPTH:
             raise OutsideError(f"nested too deeply; allowed is a depth of {MOST_DEPTH}")
         if self._count > MOST_ELEMENTS:
-            raise OutsideError(f"has more than {MOST_ELEMENTS} elements; allowed are so many")
+            raise OutsideError(f"has more than {MOST_ELEMENTS} elements, which is the limit")
         return super().start(tag, attrs)
 
     def end(self, tag: str, /) -> ElementTree.Element:
@@ -53,8 +53,8 @@ def parse_elements(document: str, root_tag: str = "robot") -> ElementTree.Elemen
         OutsideError: it is no XML, has too many elements, or another root.
     """
     if document.count("=") > MOST_ATTRIBUTES:
-        raise OutsideError(f"has more than {MOST_ATTRIBUTES} attributes; allowed are so many")
-    parser = ElementTree.XMLParser(target=_Bounded())
+        raise OutsideError(f"has more than {MOST_ATTRIBUTES} attributes, which is the limit")
+    parser = ElementTree.XMLParser(target=_LimitedBuilder())
     # The declaration may name ASCII; by now it is text.
     body = re.sub(r"^\s*<\?xml[^>]*\?>", "", document, count=1)
     lines = document[: len(document) - len(body)].count("\n")

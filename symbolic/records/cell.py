@@ -108,7 +108,7 @@ class Driver:
         address: host name or IP address; '' where nobody says.
         prefix: of the arm's joints as its driver names them; None for the robot's name.
         rate: of the driver's cycle [Hz]; None for what the target has.
-        lag: how late the arm follows what it is told [s].
+        lag: delay of the arm behind its command [s].
         force_control: whether the controller has its maker's force control, where that is an
             option: a sensor at the flange, and instructions that press with a force.
     """

@@ -27,7 +27,7 @@ def parts(value: Any, folder: Path) -> list[bytes]:
             found.append(value.tobytes())
         elif isinstance(value, type):
             found.append(value.__name__.encode())
-        elif isinstance(value, Known):
+        elif isinstance(value, ContentRecord):
             found.append(value.content.encode())
         elif is_dataclass(value):
             found.append(type(value).__name__.encode())
@@ -60,7 +60,7 @@ def digest_of_parts(value: Any, folder: Path = Path()) -> str:
     return total.hexdigest()
 
 
-class Known:
+class ContentRecord:
     """A record that keeps its digest, so that what is made of it is recognised fast."""
 
     @cached_property
@@ -70,7 +70,7 @@ class Known:
         return digest_of_parts((kind, tuple(getattr(self, name) for name in _names(kind))))
 
 
-class Seen:
+class CacheKey:
     """Arguments of a function whose answers are kept (`functools.lru_cache`): equal to others where
     these are the same. Cells that are tried out share most of what they are made of.
 
@@ -87,4 +87,4 @@ class Seen:
         return hash(self._known)
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, Seen) and self._known == other._known
+        return isinstance(other, CacheKey) and self._known == other._known

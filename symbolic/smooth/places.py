@@ -132,7 +132,7 @@ class PlaceConstraint(ABC):
         return 0
 
     def numbers(self, place: PlaceSymbols) -> Array:
-        """(count,) what tells this one from others of its family."""
+        """(count,) numbers that distinguish this one from others of its family."""
         return np.zeros(0)
 
     def arms(self, model: CellBodies) -> tuple[int, ...]:

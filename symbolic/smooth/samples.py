@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from symbolic.array import Array
-from symbolic.contact.closed_form import Asked, held_by
+from symbolic.contact.closed_form import ContactLoad, held_by
 from symbolic.contact.grasp import Grasp
 from symbolic.contact.load import frictions, resultant_force
 from symbolic.contact.paper import (
@@ -280,12 +280,12 @@ def _force_function(workcell: Workcell) -> ca.Function:
     return ca.Function("sample_split", [wrench, *given], [quantities])
 
 
-def _asked(workcell: Workcell, wrench: ca.SX) -> Asked:
+def _asked(workcell: Workcell, wrench: ca.SX) -> ContactLoad:
     """What force and moment (6,) in the box's frame ask of the contacts."""
     contacts, centre = workcell.contacts, workcell.payload.centre_of_mass
     first, second = (ca.SX(number(c.T_box_pad[:3, 3] - centre)) for c in contacts)
     axes = ca.SX(number(contacts[0].T_box_pad[:3, :3]))
-    return Asked(wrench[:3], wrench[3:], (first, second), axes, frictions(workcell))
+    return ContactLoad(wrench[:3], wrench[3:], (first, second), axes, frictions(workcell))
 
 
 def _functions(

@@ -1,6 +1,6 @@
-"""What readers of scenes gather: shapes with their poses in the world, and what no body can be.
+"""What readers of scenes gather: shapes with their poses in the world, and what cannot be a body.
 
-Whatever is no body is told by its name and its reason: an obstacle that is silently missing would
+Whatever is left out is reported by name and reason: an obstacle that is silently missing would
 make every verdict of a cell wrong.
 """
 
@@ -67,7 +67,7 @@ class Scene:
 
 
 @dataclass
-class Gathered:
+class SceneBuilder:
     """What a scene holds so far."""
 
     bodies: list[Body] = field(default_factory=list)
@@ -80,7 +80,7 @@ class Gathered:
     def add(self, name: str, shape: Shape, pose: Array) -> None:
         """Take a shape at its pose (4, 4) in the world, unless a workcell would refuse it."""
         if len(self.bodies) == MOST_BODIES:
-            raise OutsideError(f"holds more than {MOST_BODIES} shapes; allowed are so many")
+            raise OutsideError(f"holds more than {MOST_BODIES} shapes, which is the limit")
         body = Body(self._name(name), shape, pose)
         problems = Problems()
         if not np.all(np.isfinite(pose)):

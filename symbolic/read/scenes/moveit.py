@@ -13,7 +13,7 @@ import yaml
 from symbolic import outside
 from symbolic.array import Array
 from symbolic.errors import OutsideError
-from symbolic.read.scenes.bodies import ANY, WHERE, Gathered, file_at, quaternion_pose, upwards
+from symbolic.read.scenes.bodies import ANY, WHERE, SceneBuilder, file_at, quaternion_pose, upwards
 from symbolic.read.tables import Table
 from symbolic.records import Box, Cylinder, Mesh, Sphere
 from symbolic.records.poses import transform
@@ -55,7 +55,7 @@ def read_message(path: Path) -> dict[str, Any]:
     return document
 
 
-def read_moveit(path: Path, found: Gathered) -> None:
+def read_moveit(path: Path, found: SceneBuilder) -> None:
     """Gather a planning scene's message, or its world alone.
 
     Raises:
@@ -82,7 +82,7 @@ def read_moveit(path: Path, found: Gathered) -> None:
         found.leave(str(name), "is attached to a robot; describe it as the payload or a tool")
 
 
-def _object(table: Table, frames: Mapping[str, Array], path: Path, found: Gathered) -> None:
+def _object(table: Table, frames: Mapping[str, Array], path: Path, found: SceneBuilder) -> None:
     """One collision object: its primitives, meshes and planes."""
     name = str(table.raw("id", "") or "object")
     if table.raw("operation", None) not in _ADDED:
@@ -134,7 +134,7 @@ def _frame(table: Table, place: str = "position", turn: str = "orientation") -> 
     return quaternion_pose(parts[0], parts[1], table.at(turn), table.problems)
 
 
-def _primitive(name: str, kind: str, sizes: Array, pose: Array, found: Gathered) -> None:
+def _primitive(name: str, kind: str, sizes: Array, pose: Array, found: SceneBuilder) -> None:
     """A shape of MoveIt's message; of a cylinder the length comes first, of a plane its factors."""
     match kind:
         case "box":
@@ -154,7 +154,7 @@ def _primitive(name: str, kind: str, sizes: Array, pose: Array, found: Gathered)
             found.leave(name, f"is a {other}, which no body is")
 
 
-def _moveit_mesh(name: str, table: Table, pose: Array, path: Path, found: Gathered) -> None:
+def _moveit_mesh(name: str, table: Table, pose: Array, path: Path, found: SceneBuilder) -> None:
     """A mesh by its address, or by its triangles."""
     if table.has("resource"):
         address = str(table.raw("resource"))
@@ -179,7 +179,7 @@ def _moveit_mesh(name: str, table: Table, pose: Array, path: Path, found: Gather
     _triangles(name, vertices, faces, pose, found)
 
 
-def _triangles(name: str, vertices: Any, faces: Any, pose: Array, found: Gathered) -> None:
+def _triangles(name: str, vertices: Any, faces: Any, pose: Array, found: SceneBuilder) -> None:
     """A mesh of vertices and corners as they are written."""
     try:
         places = np.array(vertices, dtype=float).reshape(-1, 3)
@@ -197,7 +197,7 @@ def _triangles(name: str, vertices: Any, faces: Any, pose: Array, found: Gathere
         found.triangles(name, places, corners.astype(np.int64), pose)
 
 
-def read_moveit_text(path: Path, found: Gathered) -> None:
+def read_moveit_text(path: Path, found: SceneBuilder) -> None:
     """Gather a scene's text: objects behind stars, numbers in rows.
 
     Raises:
@@ -217,7 +217,7 @@ def read_moveit_text(path: Path, found: Gathered) -> None:
             ) from error
 
 
-def _written_object(name: str, words: Sequence[str], placed: bool, found: Gathered) -> None:
+def _written_object(name: str, words: Sequence[str], placed: bool, found: SceneBuilder) -> None:
     """One object of such a text; in an old one shapes are in the world, in others in the object."""
     at = 0
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from symbolic import outside
 from symbolic.errors import OutsideError, SceneError
 from symbolic.read.mjcf import compiled
-from symbolic.read.scenes.bodies import Gathered, Scene
+from symbolic.read.scenes.bodies import Scene, SceneBuilder
 from symbolic.read.scenes.moveit import read_moveit, read_moveit_text
 from symbolic.read.scenes.sdf import read_sdf
 from symbolic.records import Box, Capsule, Cylinder, Sphere
@@ -24,7 +24,7 @@ def read_scene(path: Path) -> Scene:
         SceneError: the file cannot be read, is no scene, or is wrong; every problem with its
             place.
     """
-    found = Gathered()
+    found = SceneBuilder()
     try:
         _reader(path)(path, found)
     except OutsideError as error:
@@ -37,7 +37,7 @@ def read_scene(path: Path) -> Scene:
     return Scene(tuple(found.bodies), tuple(found.left_out), tuple(found.notes), found.files)
 
 
-def _reader(path: Path) -> Callable[[Path, Gathered], None]:
+def _reader(path: Path) -> Callable[[Path, SceneBuilder], None]:
     """What reads a file, by what is in it."""
     text = outside.text(outside.read_bytes(path, outside.URDF_BYTES))
     head = re.match(r"\s*+(?:(?><\?.*?\?>|<!--.*?-->)\s*+)*+<([A-Za-z]\w*)", text, re.DOTALL)
@@ -56,7 +56,7 @@ def _reader(path: Path) -> Callable[[Path, Gathered], None]:
 # --- MJCF ---
 
 
-def _read_mjcf(path: Path, found: Gathered) -> None:
+def _read_mjcf(path: Path, found: SceneBuilder) -> None:
     """Gather the shapes of the world and of bodies that are fixed in it, as MuJoCo places them."""
     mujoco, _, model = compiled(path)
     data = mujoco.MjData(model)

@@ -11,7 +11,7 @@ from symbolic import outside
 from symbolic.array import Array
 from symbolic.errors import OutsideError
 from symbolic.read.elements import Part, parse_elements
-from symbolic.read.scenes.bodies import ANY, WHERE, Gathered, file_at, quaternion_pose, upwards
+from symbolic.read.scenes.bodies import ANY, WHERE, SceneBuilder, file_at, quaternion_pose, upwards
 from symbolic.records import Box, Capsule, Cylinder, Mesh, Sphere
 from symbolic.records.poses import inverse, pose_matrix, transform
 from symbolic.records.problems import shown, suggestion
@@ -59,7 +59,7 @@ class _Scope:
         return T_name
 
 
-def read_sdf(path: Path, found: Gathered) -> None:
+def read_sdf(path: Path, found: SceneBuilder) -> None:
     """Gather the first world of a file, or its models.
 
     Raises:
@@ -71,7 +71,7 @@ def read_sdf(path: Path, found: Gathered) -> None:
 class _Sdf:
     """Reads SDF files, those that are included as well."""
 
-    def __init__(self, found: Gathered) -> None:
+    def __init__(self, found: SceneBuilder) -> None:
         self._found = found
         self._files = 0
 
@@ -98,7 +98,7 @@ class _Sdf:
     def _root(self, path: Path, found_in: str) -> Part:
         self._files += 1
         if self._files > MOST_FILES:
-            raise OutsideError(f"includes more than {MOST_FILES} files; allowed are so many")
+            raise OutsideError(f"includes more than {MOST_FILES} files, which is the limit")
         content = outside.read_bytes(path, outside.URDF_BYTES)
         return Part(
             parse_elements(outside.xml_text(content), "sdf"), found_in, self._found.problems
