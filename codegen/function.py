@@ -248,8 +248,8 @@ class NumericFunction(ABC):
     def _prepared(
         self, inputs: Sequence[Array], batched: Sequence[bool], outputs: Sequence[Array]
     ) -> tuple[Callable[[int], None], Callable[[], NativeCall] | None]:
-        """What evaluates the first so many of a batch on fixed arrays, and what tells C how; None
-        where it cannot."""
+        """A call that evaluates the first `count` of a batch on fixed arrays, and one that returns
+        how C evaluates them; None where it cannot."""
 
         def run(count: int) -> None:
             self._evaluate_batch(inputs, batched, outputs, count, 1)

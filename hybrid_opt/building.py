@@ -18,7 +18,7 @@ Maker = Callable[[], object]
 """Loads or builds functions."""
 
 _TICK = 1.0
-"""The time that is gone is told anew so often [s]."""
+"""Interval at which the elapsed time is shown [s]."""
 
 
 def build_study(cell: Cell, progress: Progress, polish: bool = True, drivable: bool = True) -> None:

@@ -262,7 +262,7 @@ class CompiledCell:
 
     @cached_property
     def screening(self) -> dict[str, NumericFunction]:
-        """Those of them that know the bodies."""
+        """The functions that know the bodies."""
 
         def make(model: CellModel) -> Mapping[str, ca.Function]:
             return model.screening

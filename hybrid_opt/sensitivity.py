@@ -150,7 +150,7 @@ class Sensitivities(Displayable):
         force: the largest to command that holds in every case of the uncertainty [N].
         duration: of the carry [s].
         rows: by how much a usual change moves force or duration.
-        missing: by key why nothing is told of a number, or not what it does to the duration.
+        missing: by key why a number has no sensitivity, or none of the duration.
     """
 
     workcell: Workcell
@@ -163,7 +163,7 @@ class Sensitivities(Displayable):
         """The number of a key.
 
         Raises:
-            KeyError: the number does nothing, or nothing is told of it.
+            KeyError: the number does nothing, or its sensitivity is missing.
         """
         return {row.key: row for row in self.rows}[key]
 

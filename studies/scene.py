@@ -2,8 +2,8 @@
 
 SCENE is SDF (a world or a model), MJCF, or a planning scene of MoveIt (its message in YAML, or the
 text that its panel saves, .scene). Prints the `[[environment]]` tables, or adds them to a workcell
-or problem file, whose comments stay. Exit code 1 where something in the scene is no such body: it
-is told, with its reason.
+or problem file, whose comments stay. Exit code 1 where something in the scene cannot be a
+body: it is named, with the reason.
 """
 
 from __future__ import annotations

@@ -177,7 +177,7 @@ _LOAD_SIZES = {
 }
 
 FORCE_CONSTRAINTS = CONSTRAINTS[6:]
-"""Those that depend on the contact forces."""
+"""Constraints that depend on the contact forces."""
 
 SAMPLE_NAMES = frozenset(
     (*_LOAD_SIZES, *(f"{name}_{i}" for i in (1, 2) for name in TRACK_OUTPUTS), "constraint")

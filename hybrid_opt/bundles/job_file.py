@@ -378,7 +378,7 @@ class Export:
 
     @property
     def lag(self) -> float:
-        """By which the slower of both arms follows what it is told [s]."""
+        """Delay of the slower arm behind its command [s]."""
         return max(robot.driver.lag for robot in self.workcell.robots)
 
     @property

@@ -66,7 +66,7 @@ FORCE_SPEED, DEVIATION = 0.05, 0.02
 """Largest speed along the normal [m/s], largest deviation across it [m], [rad]."""
 
 UR_LAG = 0.05
-"""By which a UR follows what its driver reports, where the workcell does not say [s]."""
+"""Delay of a UR behind what its driver reports, where the workcell does not say [s]."""
 
 
 # --- one controller for both arms ---

@@ -38,11 +38,11 @@ from symbolic.records.problems import Problems, shown
 from symbolic.records.quantities import Quantity
 
 FRAMES = ("flange", "pad", "base")
-"""In which a wrench may be told: about the flange or the pad and along its axes, or about the pad
-along the axes of the arm's base, as RTDE does."""
+"""Frames of a wrench: about the flange or the pad and along its axes, or about the pad along the
+axes of the arm's base, as RTDE does."""
 
 TARE_TIME = 0.4
-"""Around a tare instant over which readings are averaged [s]."""
+"""Time around a tare instant over which readings are averaged [s]."""
 
 TIME = Quantity("s", -1e12, 1e12)
 FORCE_RANGE = Quantity("N", 1.0, 1e6)

@@ -385,8 +385,8 @@ class ReplicaLedger:
         """Have all requests answered.
 
         Args:
-            stage: title of what is being done, and what is counted.
-            total, done: so much in all, and before.
+            stage: title of the work, and the unit of its progress.
+            total, done: how much there is in all, and was done before.
         """
         if len(self):
             # Compiles what is missing here, once, instead of in every worker.

@@ -56,9 +56,9 @@ class ForceKind:
         robust: whether they hold in every case of the workcell's uncertainty.
         drivable: the pair of objectives of the time law 'optimal': how long a carry takes and how
             hard it presses.
-        name: of them, in sentences.
-        title: the largest of them, for axes.
-        pressing: before the largest of them, where a carry is told.
+        name: of the forces, in sentences.
+        title: of the largest force, for axes.
+        pressing: words before the largest force, where a carry is described.
     """
 
     robust: bool

@@ -67,7 +67,7 @@ class RankTest:
         a12: Vargha and Delaney's effect size, the chance that a value of the first sample
             exceeds one of the second, ties counting half; 0.5 is no effect.
         magnitude: of |a12 - 0.5|: small from 0.06, medium from 0.14, large from 0.21.
-        figure: what was compared, '' where that is told elsewhere.
+        figure: what was compared, '' where that is stated elsewhere.
     """
 
     first: str
@@ -176,7 +176,7 @@ def _exact_with_ties(ranks: Array, count: int) -> tuple[float, float]:
 def attainment_surfaces(
     fronts: Sequence[ArrayLike], percentiles: Sequence[float] = (25.0, 50.0, 75.0)
 ) -> dict[float, Array]:
-    """Attainment surfaces of replicas' fronts by percentile: the goals that so many percent attain.
+    """Attainment surfaces of replicas' fronts by percentile: goals that this percentage attains.
 
     Each is given by its corners (k, n_obj), by increasing first objective; it is empty where fewer
     fronts than that hold any point. A surface belongs to the least number of fronts that makes up

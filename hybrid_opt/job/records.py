@@ -23,7 +23,7 @@ PHASES = ("approach", "press", "lift", "carry", "set_down", "release", "retreat"
 """Every phase of a job in order; without a height there is no lift or no set-down."""
 
 HELD = ("lift", "carry", "set_down")
-"""Those in which the box is held and moves."""
+"""Phases in which the box is held and moves."""
 
 _STATIC = ("friction", "path speed", "joint position", "least normal force")
 """Uses that say nothing of how hard a phase drives the cell."""

@@ -168,7 +168,7 @@ def halve(pool: list[Start], objective: int | None, solve: Callable[[Start], Sta
 
 
 def better_half(reached: list[Start], objective: int | None) -> list[Start]:
-    """Those that go on, the best first; none after the last."""
+    """Starts that go on, the best first; none after the last."""
     ranked = sorted(reached, key=lambda start: start.value(objective))
     return ranked[: len(reached) // 2]
 
@@ -409,8 +409,8 @@ class ForceRun(PolishRun[ForceAttempt]):
         return gaps(self._archive)[place - 1].width > FAR
 
     def _fill(self, solved: int) -> None:
-        """Attempts between the ends, until the front has so many points or no side of a gap is
-        left; then points on chords between neighbours."""
+        """Attempts between the ends, until the front has its points or no side of a gap is left;
+        then points on chords between neighbours."""
         tried: set[Edge] = set()
         self._most += self._settings.fill.attempts * self._settings.attempts
         while self._left() > 0:

@@ -50,7 +50,7 @@ class RowKinds:
 
     @classmethod
     def of(cls, workcell: Workcell, robust: int = 0) -> RowKinds:
-        """Those of a workcell: both signs where a quantity has one, all branches of the forces.
+        """Rows of a workcell: both signs where a quantity has one, all branches of the forces.
 
         Args:
             robust: further forces behind the quantities, each with a row of its own, as both of a

@@ -142,8 +142,8 @@ def _bisected(centre: Array, scale: float, aim: float, sampling: Sampling) -> tu
 def _judged(
     centre: Array, scale: float, sampling: Sampling, most: int, wanted: tuple[float, float]
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """Candidates (n, n_var) and verdicts (n,): at most so many, fewer where the share of feasible
-    ones is surely outside of what is wanted, or the time is up."""
+    """Candidates (n, n_var) and verdicts (n,): at most `most`, fewer where the share of feasible
+    ones is surely outside the wanted range, or the time is up."""
     x, fine = np.empty((0, len(centre))), np.empty(0, dtype=bool)
     bounds = _box(centre, scale, sampling)
     while len(x) < most:

@@ -203,7 +203,7 @@ def box_to_last_joint(workcell: Workcell, arm: ArmGeometry, contact: Contact, i:
 
 
 def spun(contact: Contact, spin: float) -> Contact:
-    """A contact whose pad is turned about its normal by so much more [rad]."""
+    """A contact whose pad is turned about its normal by an angle [rad]."""
     turn = pose_matrix(np.zeros(3), np.array([0.0, 0.0, spin]))
     return replace(contact, T_box_pad=contact.T_box_pad @ turn)
 

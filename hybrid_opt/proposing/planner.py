@@ -465,7 +465,7 @@ def plan(
 
 
 def _usable(stops: list[Place], place: Place, room: Freedom) -> list[Place]:
-    """Those that lie apart from an end and within the room."""
+    """Configurations that lie apart from an end and within the room."""
     at = [room.coordinates(stop.extended) for stop in stops]
     return [
         stop

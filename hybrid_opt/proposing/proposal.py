@@ -42,8 +42,8 @@ from symbolic.path.spline import path_basis
 from symbolic.records import POSE_SIZE, Workcell
 
 ROUNDS = ((0, 4), (2000, 2), (6000, 6), (20000, 16), (60000, 24))
-"""Configurations that the planner may look at for a path, 0 for straight motions alone, and pairs
-of ways to hold that get so many."""
+"""Configurations that the planner may look at for a path, 0 for straight motions alone, and how
+many pairs of holds get them."""
 
 STRAYS = (
     Stray(0.0, 0.15, 0.8),

@@ -219,7 +219,7 @@ MISSING = 1e-3
 """Reach that counts as missing [m]."""
 
 TOLD = 3
-"""So many pairs or joints are named."""
+"""Most pairs or joints that are named."""
 
 
 @dataclass(frozen=True, eq=False)

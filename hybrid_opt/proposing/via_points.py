@@ -30,7 +30,7 @@ SHIFTS = 12
 """Random shifts of via-points that are tried where fits collide."""
 
 SHIFT = 0.04
-"""Their standard deviation [m], and in a turn counted by its lever."""
+"""Standard deviation of the shifts [m], and in a turn counted by its lever."""
 
 GENERATIONS = 60
 """Generations of the evolution strategy that shortens a free spline."""

@@ -42,7 +42,7 @@ LIMITS = 1.0 + np.array([-0.02, 0.0, 0.02, 0.05, 0.1, 0.2, 0.4, 0.8])
 """Times the force limit, where it is known how long the path takes."""
 
 LEAST_HEIGHT = 2e-3
-"""Height of the pads over the centre of mass from which on it is told [m]."""
+"""Height of the pads over the centre of mass above which the advice mentions it [m]."""
 
 
 @dataclass(frozen=True)

@@ -28,7 +28,7 @@ from symbolic.array import Array, Figure
 from symbolic.records import Workcell
 
 BETTER = 1e-3
-"""Share by which a rival has to be shorter to count as better: timings agree to so much."""
+"""Share by which a rival must be shorter to count as better: timings agree that closely."""
 
 ABOVE_STILL = (1.02, 1.04, 1.06, 1.08, 1.12, 1.2)
 """Forces of the table over that of holding the payload level and still."""

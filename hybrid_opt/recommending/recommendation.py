@@ -55,8 +55,8 @@ HAND_MADE = "hand-made"
 """Name of the workcell file's own trajectory."""
 
 SHORTENED = 4
-"""So often a path is driven, each time with more left of what was wished for, until limits on jerk
-and the whole force keep to it as well."""
+"""Times that a path is driven at most, each with more margin to the wish, until limits on jerk and
+the whole force keep to it as well."""
 
 TRIED = 3
 """Paths that are driven within limits on jerk before the best of them is chosen."""
@@ -300,7 +300,7 @@ def _job(cell: Cell, timing: Timing) -> tuple[Array, Squeeze, Job | None, list[s
 
 
 def _too_weak(workcell: Workcell, carry: Carry, needed: Array, commanded: Array) -> str:
-    """That the reference forces are not enough for what has to be commanded (2,) [N], along the
+    """Says that the reference forces do not reach the commanded forces (2,) [N], along the
     carry (n,), and what would do."""
     doubt, allowed = workcell.uncertainty, workcell.task.reference_force.min()
     planned, pressed = carry.normal_force, np.argsort(-commanded)[:MOST]
@@ -330,7 +330,7 @@ def _too_weak(workcell: Workcell, carry: Carry, needed: Array, commanded: Array)
 
 
 def _better(beside: Sequence[Rival], timing: Timing, force: float) -> Iterator[str]:
-    """That another path is faster at the same force."""
+    """Says that another path is faster at the same force."""
     for other in beside:
         if other.duration_at_force < timing.duration * (1.0 - BETTER):
             yield (

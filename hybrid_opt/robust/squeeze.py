@@ -37,7 +37,7 @@ SMOOTHING = 0.1
 """Half the width of the time window over which commanded forces are smoothed [s]."""
 
 MOST = 16
-"""Samples that ask for most, at which it is told what each doubt adds."""
+"""Samples with the largest demand, for which the share of each doubt is reported."""
 
 STEP = 1e-3
 """Time step of the smoothing [s]."""

@@ -38,7 +38,7 @@ class CandidateDriver:
         self.timer, self.robust = timer, robust
 
     def limits(self, force: float) -> TimingLimits:
-        """Those of a candidate whose force limit this is [N]."""
+        """Limits of a candidate whose force limit this is [N]."""
         return TimingLimits(force=max(force, 1e-9), robust=self.robust)
 
     def outputs(self, candidate: NumericFunction, x: Array) -> dict[str, Array]:

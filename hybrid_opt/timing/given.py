@@ -25,8 +25,8 @@ ARM_CHECKS = (
     (TimingStatus.JOINT_LIMITS, "joint position", "leaves its joint range"),
     (TimingStatus.NEAR_SINGULAR, "manipulability", "comes too near a singular posture"),
 )
-"""What an arm can fail a path by, in the order in which it is told: what that makes of the timing,
-its name in a `Place`, and what the robot does, for people."""
+"""How an arm can fail a path, in the order of reporting: the timing's status, its name in a
+`Place`, and what the robot does, for people."""
 
 
 @dataclass(frozen=True)
@@ -111,7 +111,7 @@ class DrivenSpeeds:
     def carry(
         self, model: TimingModel, motion: PathMotion, a: float = 0.0, w: float = 0.0
     ) -> Carry:
-        """A path driven so, with so much more u'' and u'^2 everywhere."""
+        """A path driven so, with `a` added to u'' and `w` to u'^2 everywhere."""
         speed = np.sqrt(np.maximum(self.w + w, 0.0))
         return model.carry(motion.at(self.index), self.time, speed, self.a + a)
 

@@ -30,10 +30,10 @@ NEAR = 0.6
 """Torques and shifts that stay below this share of their limit enter no program."""
 
 EXACT = 0.98
-"""Share of a limit of robust forces from which on they are told exactly."""
+"""Share of a limit of robust forces above which they are computed exactly."""
 
 SPREAD = 20
-"""Samples per one whose robust force is told, where the largest is looked for."""
+"""Stride of the samples whose robust force is computed in the search for the largest."""
 
 AT_A_TIME = 2000
 """Samples of a carry whose cases are held in memory together."""

@@ -101,7 +101,7 @@ class NearTimings:
         return np.concatenate([ratios[name][places] for name, places in self._used.items()])
 
     def _program(self, left: Array) -> float:
-        """The least change of the duration [s] with so much left of every limit (m,)."""
+        """The least change of the duration [s] with what is `left` (m,) of the limits."""
         found = linprog(
             self._slope,
             A_ub=self._matrix,

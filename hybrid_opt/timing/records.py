@@ -117,7 +117,7 @@ class JerkLimits:
 
     @classmethod
     def of(cls, workcell: Workcell) -> JerkLimits | None:
-        """Those that a workcell states, None where it states none."""
+        """Limits that a workcell states, None where it states none."""
         joints = [
             np.full(len(robot.torque_max), np.inf) if robot.jerk_max is None else robot.jerk_max
             for robot in workcell.robots

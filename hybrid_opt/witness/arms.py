@@ -114,7 +114,7 @@ class PressedBox(HeldBox):
         per second and lift off. Call it between the two halves of a step.
 
         A step takes joints along arcs and the box along a line, which parts them by half of
-        dJ/dt v dt^2. The contacts' damping is told to make up for it.
+        dJ/dt v dt^2. The contacts' damping is set to make up for it.
         """
         pad, is_first, address, axes = self._contacts()
         if not len(pad):
@@ -183,7 +183,7 @@ class CellWitness:
         """One job, up to its end or to a slip.
 
         Args:
-            reference: what the cell is told; its workcell may differ from the simulated one in
+            reference: the cell's commands; its workcell may differ from the simulated one in
                 payload, friction and the pads' places.
             factor: multiple of the normal forces to press with.
         """
@@ -381,7 +381,7 @@ class Account:
         threshold: the least multiple of the planned forces that holds; None where there is none
             between `LOW` and `HIGH`.
         problem: why there is none, '' where there is.
-        reference: what the cell is told in the run that is shown.
+        reference: the cell's commands in the run that is shown.
         squeeze: how its forces came about.
         shown: that run.
     """

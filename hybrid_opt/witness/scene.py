@@ -62,7 +62,7 @@ LAYER_DAMPING = 0.7
 more a pad that slides is pushed off by its damping, which widens its pressure."""
 
 CREEP = 3e3
-"""MuJoCo's impratio: by so much frictional contacts creep less than they would give normally."""
+"""MuJoCo's impratio: the factor by which frictional contacts creep less than normal ones."""
 
 SUPPORT = 'solref="0.01 1" solimp="0.7 0.7 0.001"'
 """What the box stands on. Much stiffer contacts lose touch where accelerations jump."""

@@ -33,7 +33,7 @@ MAX_CLOUD = 1500
 """Feasible candidates per algorithm in the background of the fronts."""
 
 ROOM = 0.06
-"""Beside the points that a look shows, as a share of their range."""
+"""Margin beside the points that a look shows, as a share of their range."""
 
 LONGEST = 2.2
 """Durations in the first look at time and force, over the shortest one."""

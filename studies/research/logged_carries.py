@@ -348,7 +348,7 @@ HEADER = (
 )
 
 CREPT = 0.025
-"""The markers of empty boxes that hold move by up to so much [m]."""
+"""Largest motion of an empty box's markers that counts as holding [m]."""
 
 
 def table(folder: Path) -> Table:

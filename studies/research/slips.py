@@ -57,7 +57,7 @@ ALLOWED = {"disc": 0.03, "rectangle": 0.05, "fork": 0.05}
 """How far from one a threshold may be, by the kind of pads."""
 
 SAME_PLACE = 0.1
-"""So near the plan's first demand the first slip counts as there [s]."""
+"""Time around the plan's first demand within which the first slip counts as there [s]."""
 
 
 @dataclass(frozen=True)
@@ -180,7 +180,7 @@ def slip_of(
         steady = replace(drive, press=np.full(len(drive.time), needed.max()))
         begins = witness.simulate(steady, PRESSED_SHARE * factor).begins(settings.slip)
     except WitnessError:
-        pass  # it is told as no number
+        pass  # stays without a number
     return Slip(
         cell=name,
         candidate=candidate,

@@ -46,7 +46,7 @@ def least_force(campaign: CampaignResults, task: Task) -> dict[str, Array]:
     carry was found.
 
     Args:
-        task: whose waypoints it is told by.
+        task: the one whose waypoints describe the path.
     """
     evaluator = CandidateEvaluator(campaign.workcell, campaign.objectives)
     chosen = select(evaluator, np.concatenate([front.x for front in campaign.fronts]))

@@ -232,7 +232,7 @@ def tangential(state_size: int) -> list[int]:
 
 
 def size_powers(state_size: int) -> tuple[int, ...]:
-    """With which power of a patch's size over another's a state's entries shrink, if the forces at
+    """Powers of a patch's size over another's by which a state's entries shrink, if the forces at
     its corners are shared among those of the other: once for each axis along which they vary."""
     return (0, 0, 0, 1, 1, 1, 2, 1, 2, 1, 2, 1)[:state_size]  # (0, 0, 0, 1) of `EVEN`
 

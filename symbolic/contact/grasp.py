@@ -398,7 +398,7 @@ class OppositePads:
         return {}
 
     def free(self, wrenches: list[ca.SX]) -> ca.SX:
-        """That of contact 1."""
+        """The wrench of contact 1."""
         return wrenches[0]
 
     def balanced(self, free: ca.SX, cell: list[ca.SX]) -> list[ca.SX]:

@@ -306,7 +306,7 @@ GRASP_OUTPUTS = (
     "wrench_1",
     "wrench_2",
 )
-"""Those of `LOAD_OUTPUTS` that depend on the allocation."""
+"""Entries of `LOAD_OUTPUTS` that depend on the allocation."""
 
 LEAST_FORCE = 1e-9
 """Normal force below which a centre of pressure counts as the patch's [N]."""

@@ -169,7 +169,7 @@ def resolve_mesh(address: str, urdf: Path, package_dirs: Sequence[Path]) -> Path
 
 XACRO_NAMESPACE = b"http://www.ros.org/wiki/xacro"
 WAIT_SECONDS = 60.0
-"""So long an expansion may take, its computing time being bounded more tightly."""
+"""Longest time that an expansion may take; its computing time is bounded more tightly."""
 
 _MACRO = re.compile(rb"<xacro:|\$\{|\$\(")
 _MJCF = re.compile(rb"\s*+(?:(?><\?.*?\?>|<!--.*?-->)\s*+)*+<mujoco[\s/>]", re.DOTALL)

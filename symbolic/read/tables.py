@@ -25,7 +25,7 @@ from symbolic.records.problems import MAX_NAME_LENGTH, Problems, shown, suggesti
 from symbolic.records.quantities import Quantity
 
 MOST_UNKNOWN = 10
-"""So many unknown keys of one table are told."""
+"""Most unknown keys of one table that are reported."""
 
 
 _REQUIRED: Any = object()

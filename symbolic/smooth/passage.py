@@ -108,7 +108,7 @@ class Separation(PlaceConstraint):
         return gap(place, numbers[:BOX_NUMBERS], numbers[BOX_NUMBERS:])
 
     def count(self, place: PlaceSymbols) -> int:
-        """Those of the obstacle and of the direction."""
+        """Numbers of the obstacle and of the direction."""
         return BOX_NUMBERS + DIRECTION_NUMBERS
 
     def numbers(self, place: PlaceSymbols) -> Array:
@@ -144,7 +144,7 @@ class Passing(PlaceConstraint):
         return (rises * before - falls * after) / (rises - falls)
 
     def count(self, place: PlaceSymbols) -> int:
-        """Those of the obstacle and of both directions."""
+        """Numbers of the obstacle and of both directions."""
         return BOX_NUMBERS + 2 * DIRECTION_NUMBERS
 
     def numbers(self, place: PlaceSymbols) -> Array:

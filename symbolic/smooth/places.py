@@ -164,7 +164,7 @@ class Clearance(PlaceConstraint):
         return place.scene.bound(self.column)
 
     def arms(self, model: CellBodies) -> tuple[int, ...]:
-        """Those whose links are in the pair."""
+        """The arms whose links are in the pair."""
         geometry = model.geometry
         bodies = geometry.possible[self.column]
         frames = [geometry.bodies[body].frame for body in (bodies.first, bodies.second)]
@@ -240,7 +240,7 @@ class Reach(PlaceConstraint):
         return (self.arm,)
 
     def given(self, model: CellBodies) -> dict[str, ca.SX]:
-        """Those of the arm."""
+        """Symbols of the arm."""
         return sx_given(model.workcell.robots[self.arm])
 
 

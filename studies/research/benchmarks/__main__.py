@@ -45,7 +45,7 @@ def _add_options(parser: Parser) -> None:
         type=whole(1, 100),
         default=1,
         metavar="N",
-        help="carries of so many classes are looked for; that whose joints go least far is taken",
+        help="number of classes of carries to look for; the carry whose joints move least is taken",
     )
     parser.add_argument(
         "--sample",
