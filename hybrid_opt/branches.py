@@ -48,7 +48,7 @@ _HOLDING = [
 
 @dataclass(frozen=True)
 class PairResult:
-    """What a pair of start branches came to.
+    """Result of a pair of start branches.
 
     Attributes:
         branches: of both robots, among the ranked ones.

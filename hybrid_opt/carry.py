@@ -23,7 +23,7 @@ from symbolic.records import Workcell
 from symbolic.records.task import waypoints_of
 
 OBJECTIVE = "objective_"
-"""Before the name of an objective among a carry's figures."""
+"""Prefix of an objective's name among a carry's figures."""
 
 
 FORCE_LIMIT = "force_limit"

@@ -116,7 +116,7 @@ USUAL = {
 
 @dataclass(frozen=True)
 class Sensitivity:
-    """What one number does.
+    """Effect of one number.
 
     Attributes:
         key: in the workcell file; of one entry of an array with its index.
@@ -273,7 +273,7 @@ class _Law:
         return False
 
     def durations(self, number: _Number, low: Workcell, high: Workcell) -> tuple[float, float]:
-        """What the duration changes by towards the higher and the lower of two cells [s]."""
+        """Changes of the duration towards the higher and the lower of two cells [s]."""
         before, after = (float(self._driven(cell)[0][-1, 0]) for cell in (low, high))
         return (after - before) / 2.0, (before - after) / 2.0
 

@@ -256,7 +256,7 @@ class _Still:
             yield StillUse(TORQUE, whose, where, float(torque[joint]), float(most), unit)
 
     def remedy(self, exceeded: list[StillUse]) -> str:
-        """Which mass, friction or patch would do, each with all else as it is."""
+        """Mass, friction or patch that would suffice, each with all else as it is."""
         ways = []
         if any(use.quantity != PRESSURE for use in exceeded):
             ways = [way for way in (self._mass(), self._friction(), self._patch()) if way]

@@ -120,7 +120,7 @@ class Finding:
 
     @property
     def problems(self) -> list[str]:
-        """What speaks against driving it."""
+        """Reasons not to drive it."""
         if not self.held.any():
             return ["the pads hold the box nowhere: another cell, or another order of the joints?"]
         found = []

@@ -46,7 +46,7 @@ from symbolic.robot.model import build_robot_model
 Interpolation = Literal["linear", "cubic", "quintic"]
 
 DERIVATIVES: Mapping[Interpolation, int] = {"linear": 1, "cubic": 2, "quintic": 3}
-"""What each takes of a sample: its position, also its velocity, also its acceleration."""
+"""Derivatives that each takes of a sample: position, also velocity, also acceleration."""
 
 BETWEEN = (0.25, 0.5, 0.75)
 """Shares of a step at which the pads are looked at."""
@@ -57,7 +57,7 @@ MOST_INTERVALS = 1500
 
 @dataclass(frozen=True)
 class Gap:
-    """What a time step does to the pads while they hold the box.
+    """Effect of a time step on the pads while they hold the box.
 
     Attributes:
         step: [s].
@@ -467,7 +467,7 @@ class Export:
         }
 
     def carried(self, arm: int, loaded: bool) -> tuple[float, Array]:
-        """What hangs on an arm's flange: mass [kg] and centre of mass (3,) in its frame [m].
+        """Load on an arm's flange: mass [kg] and centre of mass (3,) in its frame [m].
 
         Args:
             loaded: whether half of the box is part of it.

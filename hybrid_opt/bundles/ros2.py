@@ -199,7 +199,7 @@ def _require_torque_rate(export: Export) -> None:
 
 
 def _franka(export: Export, arm: int, space: str) -> list[dict[str, Any]]:
-    """What a Franka has to know before it moves: its tool, and what is no collision."""
+    """Settings of a Franka before it moves: its tool, and what is no collision."""
     mass, centre = export.carried(arm, loaded=False)
     load = export.workcell.robots[arm].tool_load
     inertia = np.zeros((3, 3)) if load is None else load.inertia
@@ -450,7 +450,7 @@ RECORDED = (
 """Types of the messages."""
 
 Message = tuple[str, Any]
-"""With its topic."""
+"""A message and its topic."""
 
 
 class _Recording:
@@ -537,7 +537,7 @@ def pad_wrench(sampled: SampledJob, arm: int) -> Array:
 
 
 def _packages() -> tuple[ModuleType, Any]:
-    """What writes recordings, and ROS 2's message types."""
+    """Writer of recordings, and ROS 2's message types."""
     try:
         import mcap.writer
         from rosbags.typesys import Stores, get_typestore

@@ -39,10 +39,10 @@ LONGEST_LEVER = 10.0
 are in another unit. Pressure at a patch's rim gives 1."""
 
 FORCE_UNITS = (("kgf", 1.0 / STANDARD_GRAVITY), ("lbf", 0.224809), ("kN", 1e-3), ("mN", 1e3))
-"""Units that forces are told in by mistake, of a newton."""
+"""Units that forces are given in by mistake, per newton."""
 
 LIKE_UNIT = 0.2
-"""How near a force in another unit has to be to the known one, as a share."""
+"""Largest difference of a force in another unit from the known one, as a share."""
 
 LEAST_PULL, SHARE_PULL = 5.0, 0.2
 """Pull at pads that are not said to hold from which on a tare is wrong [N], and over the greatest

@@ -201,7 +201,7 @@ _MAGIC = b"DACARRY1"
 _FRAME = struct.Struct("<II")
 _HEAD = struct.Struct("<dI")
 _SYNC_SECONDS = 1.0
-"""At most so long may pass before written blocks are forced to disk. A killed process loses
+"""Longest time before written blocks are forced to disk. A killed process loses
 nothing that was written; only a machine that goes down does."""
 
 

@@ -78,7 +78,7 @@ class Certificate:
 
     @property
     def problem(self) -> str:
-        """What speaks against the path, in words; '' where it is free."""
+        """Why the path is refused, in words; '' where it is free."""
         if self.is_free:
             return ""
         if self.lost:

@@ -74,7 +74,7 @@ def sample_durations(time: Array) -> Array:
 
 
 Separations = dict[tuple[bytes, int], float | None]
-"""By configuration and pair the distance that it surely keeps [m], None where it collides."""
+"""Distance that a pair surely keeps in a configuration [m], None where it collides."""
 
 
 @dataclass(frozen=True)

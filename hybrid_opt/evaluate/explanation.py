@@ -21,7 +21,7 @@ STEPS = 60
 """Damped steps in which an arm goes as near to a pose as it can."""
 
 LEVER = 0.1
-"""What a turn counts beside a distance [m]."""
+"""Length that a radian counts beside a distance [m]."""
 
 DAMPING = 1e-4
 """Damping of these steps, squared [m^2]."""

@@ -68,7 +68,7 @@ EVERY = 10
 
 @dataclass(frozen=True)
 class SupportedPose:
-    """Where a box stands.
+    """Pose in which a box stands.
 
     Attributes:
         pose: (6,) of the box [m, rad].
@@ -481,11 +481,11 @@ _model = kept_per_workcell(JobModel)
 
 
 class HasTiming(Protocol):
-    """What knows how its carry is timed, as a recommendation does."""
+    """An object that knows its carry's timing, such as a recommendation."""
 
     @property
     def timing(self) -> Timing:
-        """As robots drive it."""
+        """The timing as robots drive it."""
 
 
 def plan_job(

@@ -274,11 +274,11 @@ class SmoothCell:
         self.still = np.column_stack([fixed, *[joint.lower for joint in self.task.redundant]])
 
     def scaled(self, x: Array) -> Array:
-        """From x to xi."""
+        """Scaled variables xi of x."""
         return (x - self.centre) / self.half
 
     def unscaled(self, xi: Array) -> Array:
-        """From xi to x."""
+        """Variables x of scaled ones xi."""
         return self.centre + self.half * xi
 
     def step(self, start: Array, end: Array) -> float:

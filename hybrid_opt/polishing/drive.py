@@ -88,7 +88,7 @@ UNPOLISHABLE = (
     "the polish does not know the allocation 'joint' of two pads that face one another, nor robust "
     "forces of pads whose normals are not opposite"
 )
-"""What is not `is_polishable`."""
+"""Why a cell is not `is_polishable`."""
 
 STILL = 1e-3
 """The least force limit is this share above the force that holds the box at rest."""
@@ -395,7 +395,7 @@ class DriveWay(Way[DrivePoint, DriveStep]):
         return program.residuals(bounds, found.linear, answer.rows)
 
     def climb(self, x: Array) -> Climb[DrivePoint, DriveStep]:
-        """From a decision vector (n_var,), with none of its rounds done."""
+        """A climb from a decision vector (n_var,), before its first round."""
         return Climb(self, x, FIRST_RADIUS)
 
     def finish(self, climb: Climb[DrivePoint, DriveStep]) -> Solution:

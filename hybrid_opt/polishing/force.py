@@ -71,7 +71,7 @@ optimum of the target, as a neighbour on the front is. brief: to end after
 
 @dataclass(frozen=True)
 class Target:
-    """What one solve aims at; see the module; all (2,) but cost (3,): of the level and both
+    """Target of one solve; see the module; all (2,) but cost (3,): of the level and both
     peaks."""
 
     anchor: Array

@@ -144,7 +144,7 @@ class PolishRun(ABC, Generic[AnyAttempt]):
 
     @abstractmethod
     def _solution(self, attempt: AnyAttempt) -> Solution:
-        """What the solver makes of an attempt."""
+        """Solution of an attempt."""
 
     def _left(self) -> int:
         return self._most - len(self.outcomes)
@@ -207,7 +207,7 @@ class PolishRun(ABC, Generic[AnyAttempt]):
         return self._recomputed(attempt, answer)
 
     def _recomputed(self, attempt: AnyAttempt, answer: Solution) -> tuple[Status, str, Array]:
-        """What the full evaluator and the certificate between the samples say of an answer."""
+        """Verdict of the full evaluator and the certificate between the samples on an answer."""
         found = self._evaluated(attempt, answer.x)
         reason = int(found.reason[0])
         if reason != FEASIBLE:
@@ -215,7 +215,7 @@ class PolishRun(ABC, Generic[AnyAttempt]):
         return self._worth(attempt, answer, found.objectives[0])
 
     def _evaluated(self, attempt: AnyAttempt, x: Array) -> Evaluations:
-        """What the full evaluator and the certificate between the samples say of x (n_var,)."""
+        """Verdict of the full evaluator and the certificate between the samples on x (n_var,)."""
         return self._evaluator.certified(self._evaluator.evaluate(x))
 
     def _worth(

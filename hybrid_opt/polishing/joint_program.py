@@ -205,7 +205,7 @@ class JointProgram:
         return np.concatenate([np.zeros(self.n_path), self.cost])
 
     def gain(self, d: Array) -> float:
-        """What a step is to take off the objective, as a share of it."""
+        """Reduction of the objective that a step promises, as a share of it."""
         omega = d[self.speeds]
         bent = self.cost_diagonal @ omega**2 / 2.0 + self.cost_beside @ (omega[:-1] * omega[1:])
         return -float(self.cost @ omega + bent)

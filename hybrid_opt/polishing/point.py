@@ -100,7 +100,7 @@ class TrustRegion:
 
 @dataclass
 class Solution:
-    """What a climb has come to; not yet believed.
+    """Result of a climb, not yet verified.
 
     Attributes:
         x: (n_var,) the best candidate, the start where nothing was gained.
@@ -139,7 +139,7 @@ class ClimbPoint:
 
 @dataclass(frozen=True, kw_only=True)
 class Step:
-    """What a way proposes.
+    """A step that a way proposes.
 
     Attributes:
         length: largest change of a scaled variable.
@@ -166,7 +166,7 @@ AnyStep = TypeVar("AnyStep", bound=Step)
 
 @dataclass(frozen=True)
 class StepVerdict(Generic[AnyPoint]):
-    """What the full model says of a step.
+    """Verdict of the full model on a step.
 
     Attributes:
         reached: where it leads; None where that is no closer and teaches nothing.

@@ -19,7 +19,7 @@ Status = Literal["accepted", "optimal", "rejected", "failed"]
 
 @dataclass(frozen=True)
 class PolishOutcome:
-    """What became of one attempt.
+    """Outcome of one attempt.
 
     Attributes:
         aim: 'point' improves a point of the given front; 'extreme', 'balance' and 'gap' look for
@@ -130,7 +130,7 @@ class PolishedFront:
 
     @property
     def effort(self) -> PolishEffort:
-        """What it took."""
+        """Effort that it took."""
         own = [o.status in ("accepted", "optimal") for o in self.outcomes if o.aim == "point"]
         # Others were judged as they are, without a solver.
         solved = [o for o in self.outcomes if o.rounds or o.status == "failed"]

@@ -46,7 +46,7 @@ class ForceRow:
 
 @dataclass(frozen=True, order=True)
 class PressureRow:
-    """What a robot's shift of the centre of pressure leaves of its patch at a sample."""
+    """Margin of a robot's shift of the centre of pressure within its patch at a sample."""
 
     robot: int
     sample: int

@@ -63,16 +63,16 @@ GUIDES_TRIED = 2
 """Guides by which it is judged."""
 
 FOOT = Cylinder(0.12, 0.20)
-"""What stands on the ground at a base and may touch nothing else [m]."""
+"""Foot that stands on the ground at a base and may touch nothing else [m]."""
 
 ROOMY = 4.0
-"""What it is worth if both arms follow the box along all of them."""
+"""Score if both arms follow the box along all of them."""
 
 ABOVE = 0.02
 """How far above its floor a robot is looked at [m]."""
 
 HIDDEN = 2.0
-"""What it costs if something stands between a shoulder and its contact."""
+"""Cost if something stands between a shoulder and its contact."""
 
 ARM_RADIUS = 0.05
 """Radius of the arm that must fit between them [m]."""
@@ -337,7 +337,7 @@ def _feet(draft: Workcell, arm: int) -> tuple[Piece, ...]:
 
 
 def shared_room(first: Base, second: Base) -> float:
-    """What it is worth along how many detours both arms follow the box."""
+    """Score for the share of detours along which both arms follow the box."""
     both = first.follows & second.follows
     return ROOMY * float(both.mean()) if len(both) else 0.0
 

@@ -313,10 +313,10 @@ SAME_REDUNDANT = 0.3
 """The same of an arm with redundant joints."""
 
 SPIN_OF_FILE = 0.1
-"""What it is worth to keep the spin of the file."""
+"""Score for keeping the spin of the file."""
 
 LENGTH_COST = 0.3
-"""What the way of the joints between start and goal costs, in a straight line [1/rad]."""
+"""Cost of the joints' way between start and goal, in a straight line [1/rad]."""
 
 ENOUGH_HOLDS = 96
 """Ways to hold of one arm after which no further guide is tried: the first are the straightest."""
@@ -349,7 +349,7 @@ class Hold:
 
 @dataclass
 class HoldSearch:
-    """What came of looking for ways to hold with one arm.
+    """Result of the search for ways to hold with one arm.
 
     Attributes:
         holds: the best first.

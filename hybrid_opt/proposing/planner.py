@@ -44,10 +44,10 @@ STEP = 0.02
 """Distance between configurations that are looked at, see `LEVERS` [m]."""
 
 LEVER = 0.3
-"""What a turn of the box counts beside a distance [m]."""
+"""Length that a radian of the box's turn counts beside a distance [m]."""
 
 REDUNDANT_LEVER = 0.2
-"""What a redundant joint's turn counts [m]."""
+"""Length that a radian of a redundant joint counts [m]."""
 
 TOGETHER = 8
 """Configurations that are judged at once."""
@@ -241,7 +241,7 @@ def levers(size: int) -> Array:
 
 
 def distance(first: Array, second: Array) -> float:
-    """Between extended poses [m]."""
+    """Distance between extended poses [m]."""
     return float(np.linalg.norm(levers(len(first)) * (second - first)))
 
 
@@ -264,10 +264,10 @@ STRAIGHT_TRIED = 100
 """Straight motions of the box between two retreats that are tried with the arms."""
 
 BETWEEN = np.array([0.5, 0.25, 0.75, 0.375, 0.625, 0.125, 0.875])
-"""Where on them the box alone is looked at first."""
+"""Places on them where the box alone is checked first."""
 
 REDUNDANT_ASIDE = 5.0
-"""What redundant joints may stray by, in what the box may [rad/m]."""
+"""How far redundant joints may stray per metre of the box [rad/m]."""
 
 MATCH = 1e-3
 """Largest difference of joints of two trees that meet [rad]: both arms on the same branch."""

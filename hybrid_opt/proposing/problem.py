@@ -64,7 +64,7 @@ class Problem:
 
     @property
     def orientation(self) -> Orientation:
-        """What the last three numbers of a pose mean."""
+        """Meaning of the last three numbers of a pose."""
         task = self.data["task"]
         if task.get("rotation") != "quaternion":
             return Orientation()
@@ -210,7 +210,7 @@ def read_problem(path: str | Path) -> Problem:
 
 
 def _problems(data: dict[str, Any]) -> list[str]:
-    """What this module needs; the rest is checked by the reader of workcell files."""
+    """Checks of what this module needs; the reader of workcell files checks the rest."""
     found = []
     for name, kind in (("task", dict), ("payload", dict), ("robots", list), ("contacts", list)):
         if not isinstance(data.get(name), kind):
@@ -315,13 +315,13 @@ REDUNDANT_UNIT = 0.15
 """Half-width of a redundant joint's value [rad or m]."""
 
 LIMITS = np.array([10.0, 10.0, 10.0, 3.14, 1.57, 3.14])
-"""Beyond which no pose of a workcell file may be, or should need to be (angles) [m, rad]."""
+"""Limits of a pose in a workcell file; for angles, what none should need to exceed [m, rad]."""
 
 ROOM = 0.5
-"""What angles may vary by where a carry itself is beyond these [rad]."""
+"""Range by which angles may vary where a carry itself is beyond `LIMITS` [rad]."""
 
 ANGLE_LIMIT = 6.28
-"""Beyond which no angle of a workcell file may be [rad]."""
+"""Limit of every angle in a workcell file [rad]."""
 
 VECTOR_LIMIT = 4.99
 """The same of a rotation vector's length [rad]."""
@@ -362,7 +362,7 @@ class Draft:
 
 
 def changes(problem: Problem, found: Draft) -> dict[str, Any]:
-    """What completes the problem's tables."""
+    """Additions that complete the problem's tables."""
     lower, upper = _boxes(found)
     task: dict[str, Any] = {
         "initial": _plain(found.via),
@@ -538,7 +538,7 @@ def _alike(found: Any, wanted: Any) -> bool:
 
 
 def merged(data: Any, changes: Any) -> Any:
-    """What a file says after the changes, as plain values; also changes after further ones."""
+    """Content of a file after the changes, as plain values; also changes after further ones."""
     if isinstance(changes, Mapping) and isinstance(data, Mapping):
         found = dict(data)
         for key, value in changes.items():

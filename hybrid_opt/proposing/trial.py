@@ -49,7 +49,7 @@ MARGINS = (0.01, 0.004, 0.0015, 0.0005, 0.0)
 
 
 LOOKED_AT = 0.02
-"""Between places of a straight motion of the box at which is looked what it meets [m]."""
+"""Step along a straight motion of the box at which it is checked for contact [m]."""
 
 LEVEL = 0.1
 """Least level share of a motion that has a left and a right."""

@@ -18,7 +18,7 @@ SHORTCUTS = 80
 """Shortcuts of a path that are tried."""
 
 SHORTER = 0.99
-"""What a shortcut may leave of the length that it replaces, at most."""
+"""Largest length of a shortcut, as a share of the length that it replaces."""
 
 MOST_VIA_POINTS = 6
 """Via-points of a proposal; more make a search long."""
@@ -42,7 +42,7 @@ MEASURED = 24
 """Places of a spline by which the strategy measures its length and looks for collisions."""
 
 BLOCKED = 100.0
-"""What a spline counts whose places are all out of reach; half as much where all collide [rad]."""
+"""Cost of a spline whose places are all out of reach; half as much where all collide [rad]."""
 
 
 def travelled(points: Array) -> float:

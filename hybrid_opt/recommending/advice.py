@@ -47,7 +47,7 @@ LEAST_HEIGHT = 2e-3
 
 @dataclass(frozen=True)
 class Advice:
-    """What one change of the cell or the path would change.
+    """Effect of one change of the cell or the path.
 
     Attributes:
         change: of what, and by how much.
@@ -107,7 +107,7 @@ def commanded_margins(carry: Carry, forces: Array) -> tuple[Margin, ...]:
 
 
 def advice(cell: Cell, paths: DrivenPaths, option: Option, timing: Timing) -> tuple[Advice, ...]:
-    """What changes of the cell would change of a recommended carry, most force first."""
+    """Effects of changes of the cell on a recommended carry, most force first."""
     assert timing.carry is not None, "what is driven has a carry"
     # With less the path may not move: a tilted box asks for more than a level one.
     limits = np.minimum(LIMITS * option.limit, max(paths.highest_force, option.limit)).tolist()

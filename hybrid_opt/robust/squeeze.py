@@ -74,7 +74,7 @@ class SqueezeSettings:
 
 @dataclass(frozen=True)
 class Part:
-    """What one doubt adds to the largest force of the force-controlled arm [N]."""
+    """Rise of the force-controlled arm's largest force by one doubt [N]."""
 
     name: str
     force: float

@@ -24,7 +24,7 @@ COLOURS = {"robot": (148, 156, 166), "payload": (222, 158, 64), "environment": (
 TOUCHED = (206, 66, 60)
 
 FRAME = 0.04
-"""Between two frames of a carry that plays [s]."""
+"""Time between two frames of a carry that plays [s]."""
 
 NUMBERS = {"payload.mass": "mass [kg]", "contacts.friction": "friction"}
 """Fields, by key path of the workcell file."""

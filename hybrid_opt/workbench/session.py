@@ -206,7 +206,7 @@ class Session:
 
 
 def handles(workcell: Workcell) -> tuple[Handle, ...]:
-    """What of a cell may be dragged: start, goal, bodies around, bases and pads."""
+    """Parts of a cell that may be dragged: start, goal, bodies around, bases and pads."""
     task, bodies = workcell.task, workcell.environment
     first, last = (
         box_placement(task.orientation, task.waypoints[k].lower[:POSE_SIZE]) for k in (0, -1)

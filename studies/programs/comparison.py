@@ -35,7 +35,7 @@ STORED = ("feasible_share", "mean_excess_above_static", "payload_limit", "second
 """Figures taken from summary.json."""
 
 POLISHED = "polished_"
-"""In front of the figures of polished fronts."""
+"""Prefix of the figures of polished fronts."""
 
 
 @dataclass(frozen=True)

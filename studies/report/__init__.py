@@ -3,4 +3,4 @@
 PAGE = "report.html"
 PICTURES = "figures"
 TABLES = "tables"
-"""Where in a results folder."""
+"""Places in a results folder."""

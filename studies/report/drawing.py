@@ -232,10 +232,10 @@ class View:
 _X, _Y, _Z = np.eye(3)
 
 FRONT = View(-_Y, _Z, "y [m]", "z [m]", mirrored=True)
-"""From the side of -x, as one stands before the rack."""
+"""View from -x, as one stands before the rack."""
 
 SIDE = View(_X, _Z, "x [m]", "z [m]")
-"""From the side of -y."""
+"""View from -y."""
 
 
 def oblique(azimuth: float, elevation: float) -> View:
@@ -252,7 +252,7 @@ def oblique(azimuth: float, elevation: float) -> View:
 
 
 ISOMETRIC = oblique(np.deg2rad(-152.0), np.deg2rad(26.0))
-"""From the side of -x, a little to the right and above."""
+"""View from -x, a little to the right and above."""
 
 
 @dataclass(frozen=True)

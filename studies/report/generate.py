@@ -41,7 +41,7 @@ from studies.study.tables import margins, study_tables, timings
 
 BEGIN = "<!-- measured: begin -->"
 END = "<!-- measured: end -->"
-"""Between them the tables stand in a Markdown file."""
+"""Marks around the tables in a Markdown file."""
 
 COLOURS = 160
 """Colours of a picture on the page; its file's are reduced to them."""

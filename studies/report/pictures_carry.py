@@ -32,7 +32,7 @@ from studies.report.page_carries import torque_use
 from symbolic.array import Array
 
 PREDICTED: dict[str, Any] = {"color": "black", "linestyle": (0, (2, 1.5)), "linewidth": 0.8}
-"""How it is drawn what was predicted of a simulation."""
+"""Style of the predicted quantities of a simulation."""
 
 
 def styled(data: ReportData) -> tuple[tuple[DrawnCarry, LineStyle], ...]:

@@ -41,7 +41,7 @@ from symbolic.array import Array
 from symbolic.geometry.pairs import CellGeometry
 
 _PLAN = View(np.array([0.0, -1.0, 0.0]), np.array([1.0, 0.0, 0.0]), "y [m]", "x [m]", mirrored=True)
-"""From above, the front below."""
+"""View from above, the front below."""
 
 HATCHES = ("////", "\\\\\\\\")
 """Hatches of the regions that the pads reach."""

@@ -35,7 +35,7 @@ from symbolic.records import Contact
 from symbolic.records.numbered import NumberedContact
 
 NEWTON_STEPS = 5
-"""For given tangential forces; the equation is nearly linear."""
+"""Newton steps for given tangential forces; the equation is nearly linear."""
 
 OFFSET_STEPS = 7
 """Secant steps where the pads lie beside one another."""

@@ -143,7 +143,7 @@ class ActiveSet:
 
 
 class LearnedRows:
-    """What the steps of one climb taught: rows beside those near its candidate, and the value that
+    """Rows learned by the steps of one climb, beside those near its candidate, and the value that
     each has to keep from then on. It grows with refused steps."""
 
     def __init__(self, active: ActiveSet, half: Array) -> None:

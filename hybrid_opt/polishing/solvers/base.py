@@ -86,7 +86,7 @@ UNKNOWN = Residuals(np.nan, np.nan, np.nan)
 
 @dataclass(frozen=True)
 class Answer:
-    """What a solver of nonlinear programs returned.
+    """Answer of a solver of nonlinear programs.
 
     Attributes:
         z: (n_variables,) where it ended.

@@ -38,7 +38,7 @@ PUSH = 1e-4
 """Least distance of the start from bounds, as a share of their width."""
 
 HAIR = 1e-8
-"""By this share of their width bounds are wider for the solver; its answer is clipped."""
+"""Share of their width by which bounds are widened for the solver; its answer is clipped."""
 
 SLACK = 1e-2
 """Least slack at the start: rows nearer than that to their limit may come nearer for a while."""

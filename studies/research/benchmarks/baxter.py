@@ -39,19 +39,19 @@ BOX = (0.10, 0.20, 0.10)
 """A little lower than a can [m]."""
 
 BEFORE = (0.70, 0.10)
-"""How far ahead of the machine the box begins, and how high above its shoulders' frame [m]."""
+"""Distance of the box's start ahead of the machine, and height above the shoulders' frame [m]."""
 
 CLEARED = 0.2
-"""Above a board, cans whose middle is there stand on it [m]."""
+"""Height above a board within which a can's middle means that it stands there [m]."""
 
 AIR = 0.01
 """Below the box where it stands on a board [m]."""
 
 PADDLE = (0.06, 0.03, 0.17)
-"""In the place of each gripper and as long, its flat side presses: width, thickness, length [m]."""
+"""Paddle in place of each gripper, as long; its flat side presses: width, thickness, length [m]."""
 
 PAD = 0.14
-"""From a hand to the middle of its pad, on that side [m]."""
+"""Distance from a hand to the middle of its pad, on that side [m]."""
 
 NOTE = (
     "Published (arXiv 2309.14545): each arm to a can of its own, nothing held, no path of a box; "

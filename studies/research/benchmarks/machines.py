@@ -23,7 +23,7 @@ git clone https://github.com/moveit/moveit_resources FOLDER/moveit_resources
 git -C FOLDER/moveit_resources checkout ef5836d"""
 
 PAD = 0.12
-"""From a flange to its pad [m]."""
+"""Distance from a flange to its pad [m]."""
 
 TOP = 0.1
 """Thickness of the table top [m]."""

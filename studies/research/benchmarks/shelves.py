@@ -31,27 +31,27 @@ git clone https://github.com/cohnt/constrained-bimanual-planning-example FOLDER/
 git -C FOLDER/{PACKAGE} checkout aca3cbd"""
 
 APART = 0.765
-"""Between both bases, along y [m]."""
+"""Distance between both bases, along y [m]."""
 
 GRASP = 0.6
-"""Between both last links, along y [m]."""
+"""Distance between both last links, along y [m]."""
 
 STANDING = {
     "old_table/table_wide.sdf": np.array([0.4, 0.3825, 0.0]),
     "old_shelves.sdf": np.array([0.8, 0.3825, 0.0]),
 }
-"""Where the scene's models stand [m]."""
+"""Places of the scene's models [m]."""
 
 PAD = 0.2
-"""From a last link to its pad: between palm and tip of their fingers [m]."""
+"""Distance from a last link to its pad: between palm and tip of their fingers [m]."""
 
 BOX = (0.12, GRASP - 2.0 * PAD, 0.12)
 
 ACCELERATION = [8.57, 8.57, 8.74, 11.36, 12.23, 15.72, 15.72]
-"""As their URDF states it in an attribute of Drake's [rad/s^2]."""
+"""Accelerations as their URDF states them in an attribute of Drake's [rad/s^2]."""
 
 UPPER_ARM, FOREARM = 0.42, 0.4
-"""From shoulder to elbow, and from there to the wrist [m]."""
+"""Distance from shoulder to elbow, and from elbow to wrist [m]."""
 
 GRIPPER: dict[str, Any] = {
     "name": "gripper",

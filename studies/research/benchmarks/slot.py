@@ -37,7 +37,7 @@ ARMS = {"left": (0.375, -105.0), "right": (-0.375, -75.0)}
 TABLE = {"name": "table", "kind": "box", "size": [1.7, 1.3, 0.04], "xyz": [0.0, -0.35, 0.7299]}
 
 PAD = 0.0934
-"""From the flange to the plate's edge, which their grip overlaps by 10 mm [m]."""
+"""Distance from the flange to the plate's edge, which their grip overlaps by 10 mm [m]."""
 
 LIMITS: tuple[tuple[str, dict[str, float], float], ...] = (
     ("joint limits", {}, 7.60),
