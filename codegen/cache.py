@@ -50,7 +50,7 @@ MOST_KEPT = 4 * 2**30
 """Size from which on a cache loses what was not used for longest [bytes]."""
 
 _NOTED_SECONDS = 3600.0
-"""A use is noted so long after the one before."""
+"""Least time between two recorded uses."""
 
 _KEPT = {".so", ".o", ".json", ".lock", ".draft"}
 _KEY_END = re.compile("[-.]")

@@ -64,7 +64,7 @@ PACKAGED = "ziglang"
 """A package of PyPI with a compiler in it, for machines that have none (extra `compiler`)."""
 
 MOST_SECONDS = 1200.0
-"""After so long a compiler counts as hung [s]; sources here take it seconds, at most minutes."""
+"""Time after which a compiler counts as hung [s]; sources here take seconds, at most minutes."""
 
 _CORES = threading.BoundedSemaphore(available_cores())
 

@@ -117,7 +117,7 @@ def in_parts(text: str, lanes: int, most: int = 3) -> tuple[str, tuple[Part, ...
         name = f"dual_arm_{digest(before[kind], content)[:32]}"
         whole = f"{before[kind]}#define PART {name}\n{content}{after}"
         level = part_level(len(body), kind == "lanes")
-        # What is long and has lanes is evaluated in batches; one by one it only tells whether lanes
+        # Long functions with lanes are evaluated in batches; one by one they only check that lanes
         # are right.
         hardly_used = kind == "casadi" and "dual_arm_run_lanes" in text and is_long(body)
         parts[name] = Part(name, whole, 0 if hardly_used else min(level, most))

@@ -40,7 +40,7 @@ def build_study(cell: Cell, progress: Progress, polish: bool = True, drivable: b
     key = cell.compiled.key("study", *what, version("casadi"), sources)
     if key is None or cache.read_record(key) is not None:
         return
-    # What drives has the longest functions.
+    # Drivable cells have the longest functions.
     cells = [cell.drivable(), cell] if drivable and not _driven(cell) else [cell]
     makers = [make for each in cells for make in _makers(each, polish)]
     failures = build_all(makers, progress)
@@ -70,7 +70,7 @@ def build_all(makers: Sequence[Maker], progress: Progress) -> list[DualArmError]
         pool.shutdown(wait=False, cancel_futures=True)
     failures = [failure for future in futures if (failure := future.exception()) is not None]
     for failure in failures:
-        # What a cell cannot have is told by who needs it.
+        # Callers that need a function report why a cell cannot have it.
         if not isinstance(failure, DualArmError):
             raise failure
     return [failure for failure in failures if isinstance(failure, DualArmError)]

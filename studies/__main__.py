@@ -16,11 +16,11 @@ COMMAND = "dual-arm-carry"
 """The command that `pyproject.toml` installs."""
 
 START = "sys.exit(run_program(main))"
-"""What every program ends with."""
+"""Last line of every program."""
 
 
 def programs() -> dict[str, tuple[str, str]]:
-    """By every program's name its module, and what it says of itself first."""
+    """Module and first sentence of every program, by name."""
     folder = Path(__file__).parent
     found = {}
     doors = ("*.py", "*/*.py", "*/*/__main__.py")
@@ -31,7 +31,7 @@ def programs() -> dict[str, tuple[str, str]]:
         parts = path.relative_to(folder).with_suffix("").parts
         name = ".".join(part for part in parts if part != "__main__")
         said = (ast.get_docstring(ast.parse(text)) or "").partition("\n\n")[0]
-        # What it is called by stands in front.
+        # The sentence ends before the command.
         told = " ".join(said.partition(": `")[0].split()).rstrip(".")
         found[name] = (".".join(("studies", *parts)), told)
     return found

@@ -127,7 +127,7 @@ def build_cell_model(
         np.array(found[max(workcell.start_branch[i], 0)].q) for i, found in enumerate(branches)
     ]
     model = CellModel(workcell, robots, geometry, branches, (start[0], start[1]))
-    # Of the same bodies: not made again.
+    # The bodies are the same: their functions are not made again.
     vars(model).update({k: v for k, v in vars(bodies).items() if k in ("screen", "screening")})
     return model
 

@@ -42,7 +42,7 @@ TWO_ARMED_TASKS = ("T_ROB_L", "T_ROB_R")
 """Task names of two robots, and of the two seven-axis arms of a YuMi."""
 
 EXTRA = 2
-"""Along the chain, the joint of a seven-axis arm that ABB counts as the seventh, `eax_a`."""
+"""Index along the chain of the joint that ABB counts as a seven-axis arm's seventh, `eax_a`."""
 
 MAX_MOVES = 2000
 """A module beyond this many moves is refused: controllers load them slowly or not at all."""

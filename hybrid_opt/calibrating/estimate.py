@@ -193,7 +193,7 @@ LARGEST_GRID = 2_000_000
 """Points of it; a longer recording has no delay."""
 
 SMOOTHED = 0.05
-"""Over which rates are taken [s]."""
+"""Time over which rates are taken [s]."""
 
 LEAST_LIKENESS = 0.5
 """Correlation of two signals' rates from which on one is the other, later."""
@@ -225,7 +225,7 @@ def delay(time: Array, first: Array, second: Array, most: float = 1.0) -> float 
     reach = min(round(most / STEP), n // 2)
     lags = np.arange(-reach, reach + 1)
     product = correlate(b, a, method="fft")[n - 1 + lags]
-    # Of what overlaps: else the fewer samples of a long delay would count against it.
+    # Only what overlaps counts, else a long delay's fewer samples would count against it.
     energy_a, energy_b = (np.append(0.0, np.cumsum(each**2)) for each in (a, b))
     own = energy_a[np.minimum(n - lags, n)] - energy_a[np.maximum(-lags, 0)]
     other = energy_b[np.minimum(n + lags, n)] - energy_b[np.maximum(lags, 0)]

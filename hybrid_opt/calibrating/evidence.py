@@ -39,13 +39,13 @@ from symbolic.records.poses import inverse
 from symbolic.records.quantities import GRAVITY
 
 PIECE, SHORTEST = 2.0, 0.5
-"""Holds are cut into pieces of so long, at least [s]."""
+"""Least length of the pieces into which holds are cut [s]."""
 
 STILL = 0.01
 """Most that a joint moves in a piece of a hold that counts as still [rad or m]."""
 
 RATIO_TIME = 0.2
-"""Over which forces are averaged for a ratio of friction [s]."""
+"""Time over which forces are averaged for a ratio of friction [s]."""
 
 LEAST_PATH = 0.02
 """Way of the box from which on one arm's delay after the other can be seen [m]."""
@@ -110,7 +110,7 @@ class Evidence:
         """Changes of the workcell file."""
         if not self.ranges:
             return self.tables
-        # What a stated table does not name would be exact.
+        # A stated table takes what it does not name for exact.
         doubt = self.workcell.uncertainty
         usual = {name: np.asarray(getattr(doubt, name)).tolist() for name in RANGES}
         return self.tables | {"uncertainty": (usual if not doubt.stated else {}) | self.ranges}

@@ -84,7 +84,7 @@ def recording_faults(workcell: Workcell, run: Run, places: Places) -> list[Fault
     if not run.has_moments:
         text = "the centre of mass and torsion cannot be seen; record all six numbers"
         found.append(Fault(run.name, "moments missing", text, serious=False))
-    # What follows from a fault would lead astray.
+    # One kind of fault is reported at a time: what follows from it would mislead.
     return found + (
         _unit_faults(workcell, run, places)
         or _tare_faults(run, places)

@@ -154,7 +154,7 @@ class _Sweep:
                     unsafe[work.index[row]] = True
                     hits.append(self._touch(work, row, int(hit[row]), fraction))
                     np.minimum.at(beyond, self.owner[work.index[row]], work.index[row])
-            # What comes after a collision says nothing new.
+            # Samples after a collision say nothing new.
             work = self._uncleared(work[work.index < beyond[self.owner[work.index]]])
             given_up = self._given_up(work, level, depth)
             unsafe[work.index[given_up]] = True

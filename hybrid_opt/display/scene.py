@@ -148,7 +148,7 @@ def extent_points(
 
 
 _VIEWED = 12
-"""About as many samples of a carry decide where its scene is looked at from."""
+"""Approximate number of a carry's samples by which the viewpoint of its scene is chosen."""
 
 
 def scene_data(

@@ -296,7 +296,7 @@ class CandidateEvaluator:
         if self.driver is not None:
             driven = described["drive_violation"]
             violation[:, -len(DRIVE_CONSTRAINTS) :] = driven
-            # What no timing drives violates it throughout, the more the farther it is from one.
+            # Paths that no timing drives violate it throughout, the more the farther from one.
             violation_time[:, -len(DRIVE_CONSTRAINTS) :] = driven / (1.0 + driven)
         judged = np.column_stack([values, violation])
         broken = np.asarray(~np.isfinite(judged).all(axis=1), dtype=np.bool_)

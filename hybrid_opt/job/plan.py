@@ -442,7 +442,7 @@ class JobModel:
     ) -> Iterator[Phase]:
         begin = 0.0
         for name, motion, force, proof in planned:
-            # A carry that is to keep its jumps is told so elsewhere.
+            # Jumps that a carry is to keep are reported elsewhere.
             jumps = name == "carry" and not rests_at_ends(timing)
             use = phase_use(self.workcell, motion, force, None if jumps else jerk)
             if name == "carry":

@@ -358,7 +358,7 @@ class DriveWay(Way[DrivePoint, DriveStep]):
             asked = QuadraticProgram(model[0], g, linear.A, linear.b, *box)
             answer = self._method(asked)
             if answer is None:
-                # What the box has no room for is asked for as far as it is kept now.
+                # Rows that the box has no room for are asked for as far as they are kept now.
                 answer = self._method(replace(asked, b=np.maximum(linear.b, 0.0)))
             if answer is None:
                 return None

@@ -422,7 +422,7 @@ class _Finder:
     """The search for one arm's ways to hold.
 
     Attributes:
-        found: what came of it so far.
+        found: the result so far.
     """
 
     def __init__(

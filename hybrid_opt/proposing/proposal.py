@@ -77,7 +77,7 @@ SPINS = 12
 
 
 def worked() -> float:
-    """What this process and those that it waited for have worked so far [s]."""
+    """Processor time of this process and those it waited for, so far [s]."""
     spent = os.times()
     return spent.user + spent.system + spent.children_user + spent.children_system
 

@@ -39,7 +39,7 @@ PITCH = 4
 """Index of the pitch among the numbers of a pose."""
 
 LIMITS = 1.0 + np.array([-0.02, 0.0, 0.02, 0.05, 0.1, 0.2, 0.4, 0.8])
-"""Times the force limit, where it is known how long the path takes."""
+"""Multiples of the force limit at which the path's duration is computed."""
 
 LEAST_HEIGHT = 2e-3
 """Height of the pads over the centre of mass above which the advice mentions it [m]."""

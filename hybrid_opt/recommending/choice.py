@@ -46,7 +46,7 @@ class Wish:
     is meant.
 
     Attributes:
-        duration: the carry may take so long, limits on jerk kept; asked for is the least force [s].
+        duration: longest time of the carry, limits on jerk kept; the least force is sought [s].
         force: no more may be commanded; asked for is the shortest duration [N].
         payload: so heavy a box has to hold on the same motion within the reference forces; asked
             for is the shortest duration [kg].

@@ -65,10 +65,10 @@ CREEP = 3e3
 """MuJoCo's impratio: the factor by which frictional contacts creep less than normal ones."""
 
 SUPPORT = 'solref="0.01 1" solimp="0.7 0.7 0.001"'
-"""What the box stands on. Much stiffer contacts lose touch where accelerations jump."""
+"""Contact of the box with its support. Much stiffer ones lose touch where accelerations jump."""
 
 LARGEST_STEP = 2e-3
-"""Beyond it the pads' layers are too stiff to be followed [s]."""
+"""Longest step; with longer ones the pads' layers are too stiff to be followed [s]."""
 
 Pads = Literal["even", "driven"]
 

@@ -38,7 +38,7 @@ CONNECT_SECONDS = 15.0
 """Time that the scheduler, and then a first worker, may take to answer."""
 
 LOST_SECONDS = 10.0
-"""After so long without its scheduler the work is given up."""
+"""Time without its scheduler after which the work is given up."""
 
 _TICK = 1.0
 """Longest wait for news [s]."""
@@ -271,7 +271,7 @@ class _Session:
 
 @dataclass(frozen=True)
 class _Return:
-    """Where a worker sends its news, and what it has to be."""
+    """Address to which a worker sends its news, and what it has to be."""
 
     number: int
     topic: str

@@ -288,7 +288,7 @@ def page_trajectory(
     path = shown.x[: cell.workcell.task.n_path]
     limits = _limits(cell, shown.x)
     if shown.jerk:
-        # What is recommended is driven as an export does, others without limits on jerk.
+        # The recommended carry is driven as an export does, others without limits on jerk.
         timing = driven_timing(cell.timing_model, shown.x)
     elif limits.robust:
         # Anew, robust forces take long: as the search found it.

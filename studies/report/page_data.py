@@ -437,14 +437,14 @@ def _drive_view(
     for _, label, look, curve in curves(data):
         lines.append(line(label, curve, look.colour, "dot" if look is HAND_MADE else "dash"))
         drawn.append(curve)
-    # What is recommended is drawn last, above all others.
+    # The recommended carry is drawn last, above all others.
     shown = sorted(_traces(groups, found), key=lambda trace: trace["name"] == RECOMMENDED)
     timed = {f"{one['name']}, timed" for one in lines}
     chosen = np.zeros((0, 2))
     for trace in shown:
         at = np.column_stack([trace["x"], trace["y"]])
         trace["showlegend"] = trace["name"] not in timed
-        # What robots cannot drive has no place between force and time.
+        # Carries that robots cannot drive have no place between force and time.
         drawn.append(at[[not found[member]["problem"] for member in trace["customdata"]]])
         chosen = at if trace["name"] == RECOMMENDED else chosen
     seen = drive_look(np.concatenate([*drawn, np.zeros((0, 2))]), chosen)

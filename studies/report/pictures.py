@@ -30,7 +30,7 @@ class ReportPicture:
     make: Callable[[], Figure]
 
     def draw(self) -> Figure:
-        """It in the common style."""
+        """The figure in the common style."""
         with in_style():
             return settled(self.make())
 

@@ -210,7 +210,7 @@ def duration_against_force(data: ReportData) -> Figure:
 
 def _replicas(axes: Axes, drivable: Experiment, choice: StoredRecommendation) -> list[Array]:
     """Durations of the best fronts' paths at the same forces; returns the points of the medians."""
-    # Of fronts that a polished one stands beside, that one alone.
+    # Where a front was polished, only the polished one.
     looks = {f.title: series(a.index) for a, f, opened in drivable.fronts() if not opened}
     force, drawn = np.array(choice.durations.forces), []
     for row in choice.durations.rows:

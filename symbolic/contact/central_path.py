@@ -299,7 +299,7 @@ class Equations:
         stiff = [curve + own for curve, (_, own) in zip(curvatures, local, strict=True)]
         at, own = program.free(wrenches), ca.vertcat(*wrenches)
         free = ca.SX.sym("free", at.shape[0])
-        # What the free components make of all of them.
+        # All wrenches by the free components.
         self._by_free = ca.jacobian(ca.vertcat(*program.balanced(free, cell)), free)
         self._missing = ca.vertcat(*program.balanced(at, cell)) - own
         self._stiff, self._ends = ca.diagcat(*stiff), [0, *accumulate(w.shape[0] for w in wrenches)]

@@ -208,7 +208,7 @@ class _Local:
             strict=True,
         )
         barriers = sum(ca.mtimes(u.T, _third(patch, own, d, u)) for patch, own, d, u in rows)
-        # Of log effort.
+        # Derivatives of log effort.
         over = 1.0 / self._effort
         turned = ca.mtimes(self._square, along)
         by, bent = (ca.mtimes(by_load.T, v) for v in (self._g, turned))

@@ -46,10 +46,10 @@ KINK_DISTANCE = 0.06
 """Kinks of the payload's clearance lower than this get a row [m]."""
 
 BESIDE_KINK = 0.03
-"""Around a kink without rows of a gap: they would hold the kink in its place."""
+"""Distance from a kink within which gaps get no rows: they would hold the kink in its place."""
 
 KINK_WINDOW = 0.04
-"""Around a kink, where its height is measured."""
+"""Distance from a kink within which its height is measured."""
 
 
 class DistanceKind(Kind[PlaceRow]):
@@ -143,7 +143,7 @@ class Separations(DistanceKind):
     """Rows of single gaps between the payload and a box, away from kinks."""
 
     def near(self, carry: PlacedCarry, limits: Limits) -> Iterable[PlaceRow]:
-        """Along every stretch where the payload is near, at a few places each."""
+        """Rows along every stretch where the payload is near, at a few places each."""
         grid = self.grid
         beside = grid.places(BESIDE_KINK)
         stretches = (

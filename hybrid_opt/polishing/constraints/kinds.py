@@ -203,7 +203,7 @@ class Pressure(Kind[PressureRow]):
     lasting = True
 
     def near(self, carry: PlacedCarry, limits: Limits) -> Iterable[PressureRow]:
-        """Beyond a share of the patch's radius."""
+        """Rows of shifts beyond a share of the patch's radius."""
         return self._beyond(carry, PRESSURE_SHARE)
 
     def violated(self, carry: PlacedCarry, known: PlacedCarry) -> Iterable[PressureRow]:

@@ -45,7 +45,7 @@ CLEARED = 0.2
 """Height above a board within which a can's middle means that it stands there [m]."""
 
 AIR = 0.01
-"""Below the box where it stands on a board [m]."""
+"""Gap below the box where it stands on a board [m]."""
 
 PADDLE = (0.06, 0.03, 0.17)
 """Paddle in place of each gripper, as long; its flat side presses: width, thickness, length [m]."""

@@ -75,7 +75,7 @@ class PlainJudge:
                 reason, position = here[0], k / (n - 1)
                 break
         shares = dict(zip(CONSTRAINTS, outputs["violation_time"].tolist(), strict=True))
-        # Of the last sample before an arm is lost both neighbouring steps count.
+        # Both steps beside the last sample before an arm is lost count.
         hit = np.zeros(n)
         hit[:reached] = collisions.colliding
         shares["collision"] = float(np.trapezoid(hit, time) / time[-1])
