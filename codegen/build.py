@@ -56,7 +56,7 @@ class Source:
     """C to compile.
 
     Attributes:
-        name: of what it becomes, in its set.
+        name: name of the compiled function in its set.
         text: the C.
         level: optimisation level.
         lanes: evaluations side by side, 0 for what suits the machine; 1 for none.

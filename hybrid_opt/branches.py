@@ -52,11 +52,11 @@ class PairResult:
 
     Attributes:
         branches: of both robots, among the ranked ones.
-        rounds: in which it took part, 0 where it holds no trajectory that was tried.
-        evaluations: it was given.
-        feasible_share: of these.
-        hypervolume: of what it found.
-        least_penalty: its least penalised objectives' mean.
+        rounds: rounds in which it took part, 0 where it holds no trajectory that was tried.
+        evaluations: evaluations that it was given.
+        feasible_share: feasible share of these.
+        hypervolume: hypervolume of the front that it found.
+        least_penalty: least mean of its penalised objectives.
     """
 
     branches: tuple[int, int]

@@ -358,4 +358,4 @@ EVALUATORS, SCREENING = "evaluators", "screening"
 """Names of the sets of a cell's evaluators: those that know no bodies, and the others."""
 
 EVALUATOR_LANES = 0
-"""As many as suit the machine."""
+"""Lanes of the evaluators; 0 for as many as suit the machine."""

@@ -137,7 +137,7 @@ def _ways(workcell: Workcell) -> Array:
 
 
 def _changes(workcell: Workcell, ways: Array, at: tuple[float, float]) -> dict[str, Any]:
-    """By key path, see `Cell.changed`."""
+    """Changes by key path, see `Cell.changed`."""
     if at == (0.0, 0.0):
         return {}
     shift = np.asarray(at) @ ways

@@ -278,7 +278,7 @@ class _Law:
         return (after - before) / 2.0, (before - after) / 2.0
 
     def motion(self, workcell: Workcell, samples: NDArray[np.intp]) -> BoxMotion:
-        """At some samples, in another cell."""
+        """The motion at some samples, in another cell."""
         return BoxMotion(*[part[samples] for part in self._driven(workcell)[1:]])
 
     def _driven(self, workcell: Workcell) -> list[Array]:

@@ -93,7 +93,7 @@ class Origin:
         replica: number of the replica; None where there is none.
         point: row of the candidate among the evaluations, or another number of the point.
         file: the trajectory file, '' where there is none.
-        sha256: of that file.
+        sha256: digest of that file.
         provenance: as stored in it.
     """
 

@@ -14,7 +14,7 @@ from symbolic.array import Array
 ENDINGS = (".mcap", ".db3")
 
 Messages = list[tuple[float, Any]]
-"""With the time of each since the recording's begin [s]."""
+"""Messages, each after its time since the recording's begin [s]."""
 
 
 def is_bag(path: Path) -> bool:

@@ -140,7 +140,7 @@ def drivable_stage(stages: Sequence[Stage], replicas: int | None = None) -> Stag
     The folder is a campaign like any other, of the drivable variant of the study's cell.
 
     Args:
-        stages: of that campaign.
+        stages: stages of that campaign.
         replicas: as for `drivable_settings`.
     """
 

@@ -37,8 +37,8 @@ class Explanation:
         sample: its number, from 0.
         pair: names of the bodies that collide there, None for another reason.
         joint: 'robot/joint' that is beyond a limit there, likewise.
-        excess: by how much [rad, or m of a joint that slides].
-        unit: of it.
+        excess: how far the joint is beyond it [rad, or m of a joint that slides].
+        unit: unit of the excess.
         robot: name of the arm that does not reach, likewise.
         missing: how far its flange stays from where it has to be, at best [m].
     """

@@ -120,7 +120,7 @@ def balance(anchor: Array, span: Array) -> Target:
 
 
 def aimed(anchor: Array, span: Array, objective: int | None) -> Target:
-    """At an end of a front, or at its balanced middle."""
+    """Target at an end of a front, or at its balanced middle."""
     return balance(anchor, span) if objective is None else extreme(anchor, span, objective)
 
 

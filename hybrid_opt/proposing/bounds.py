@@ -46,10 +46,10 @@ class Bounds:
     """Bounds of a decision vector.
 
     Attributes:
-        carry: (n_var,) a feasible one within them, as near as may be to the one that was given.
+        carry: (n_var,) a feasible one within them, as near as possible to the given one.
         lower, upper: (n_var,) [m, rad].
         share: of random candidates that is feasible.
-        candidates: by which it was measured.
+        candidates: number of candidates by which the share was measured.
     """
 
     carry: Array

@@ -358,13 +358,13 @@ def freedom(start: Array, goal: Array, stray: Stray, limits: Array) -> Freedom:
 
 
 Retreats = tuple[list[list[Place]], list[list[Place]]]
-"""From the start and from the goal, along the same directions: free configurations one after the
-other, the end itself first."""
+"""Free configurations from the start and from the goal along the same directions, in order, the end
+itself first."""
 
 
 def retreats(chain: ClosedChain, ends: tuple[Place, Place]) -> Retreats:
-    """Where straight motions out of start and goal lead, along the world's axes and between them:
-    out of a shelf, for instance."""
+    """Straight motions out of start and goal along the world's axes and between them: out of a
+    shelf, for instance."""
     signs = np.array(list(product((-1.0, 0.0, 1.0), repeat=3)))
     found: Retreats = ([], [])
     for way in signs[np.any(signs != 0.0, axis=1)]:

@@ -122,11 +122,11 @@ class Proposal:
         found: what was found, as values of the workcell.
         judgement: the evaluator's verdict on the carry, certified between its samples.
         feasible_share: of random candidates within the bounds.
-        candidates: by which that was measured.
-        seconds: that it took.
-        certified: of these until the first carry was certified, before bounds around it.
+        candidates: number of candidates by which that was measured.
+        seconds: time that the proposal took.
+        certified: seconds until the first carry was certified, before bounds around it.
         q: per arm its joints (n, joints) at the task's samples [rad or m].
-        sides: on which sides it passes what a straight motion of the box would meet.
+        sides: sides on which it passes what a straight motion of the box would meet.
         blocked: what is in the way of the pads before the carry or after it, '' where nothing is,
             or no time was left to look.
     """

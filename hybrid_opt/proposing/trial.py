@@ -75,7 +75,7 @@ class BoxAlone:
         )
 
     def passed(self, path: Array) -> tuple[str, ...]:
-        """On which sides a path (n, 6) passes what the straight motion between its ends meets, such
+        """Sides on which a path (n, 6) passes what the straight motion between its ends meets, such
         as 'over post' or 'left of post' (looking along the motion); nothing where that is free.
 
         What the box meets at an end, such as the board that it stands on, does not count.
@@ -101,8 +101,8 @@ class BoxAlone:
 
 
 def _side(boxes: list[tuple[Piece, ...]], body: tuple[Piece, ...], way: Array) -> str:
-    """On which side of a body a box passes: along the axis, across the way (3,), on which most is
-    between them where the box is abreast of the body."""
+    """The side of a body on which a box passes: the axis across the way (3,) along which the gap is
+    largest while the box is abreast of the body."""
     length = float(np.linalg.norm(way))
     along = way / length if length > 0.0 else np.array([1.0, 0.0, 0.0])
     level = np.array([along[0], along[1], 0.0])

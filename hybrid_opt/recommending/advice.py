@@ -50,9 +50,9 @@ class Advice:
     """Effect of one change of the cell or the path.
 
     Attributes:
-        change: of what, and by how much.
-        force: of the force to command, in the same time [N].
-        duration: with the same force [s].
+        change: the quantity, and by how much it changes.
+        force: change of the force to command, in the same time [N].
+        duration: change of the duration, with the same force [s].
     """
 
     change: str

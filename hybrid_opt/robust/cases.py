@@ -276,7 +276,7 @@ class RulingCases:
     share: Array
 
     def at(self, rows: NDArray[np.intp]) -> RulingCases:
-        """At some of the samples."""
+        """The cases at some of the samples."""
         cases = self.commanded[rows], self.felt[rows]
         return RulingCases(self.leader, self.force[rows], *cases, self.share[rows])
 

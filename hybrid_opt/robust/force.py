@@ -73,16 +73,16 @@ class BoxMotion:
     second_rate: Array
 
     def at(self, rows: NDArray[np.intp]) -> BoxMotion:
-        """At some of the samples."""
+        """The motion at some of the samples."""
         return BoxMotion(self.pose[rows], self.rate[rows], self.second_rate[rows])
 
 
 HeldMotion = BoxMotion | Carry
-"""What robust forces are asked for."""
+"""A motion whose robust forces can be asked for."""
 
 
 def box_motion(motion: HeldMotion) -> BoxMotion:
-    """What of it matters."""
+    """The part of a motion that forces depend on."""
     return BoxMotion(motion.pose, motion.rate, motion.second_rate)
 
 

@@ -70,7 +70,7 @@ class StoredJerk:
 
     @classmethod
     def of(cls, found: JerkTiming) -> StoredJerk:
-        """As it is stored."""
+        """The record of a timing as it is stored."""
         timing = found.timing
         return cls(timing.status, timing.duration, found.without, *found.jerk_use)
 

@@ -281,7 +281,7 @@ class _Problem:
         return timing, excess.ratio, joint, box
 
     def _factor(self, c: Array) -> float:
-        """On the speeds, with which the timing exceeds no limit on the finer grid."""
+        """Largest factor on the speeds with which the timing keeps all limits on the finer grid."""
         if max(self._judge(self._fine, c)[1:]) <= 1.0 + RECOMPUTED_TOLERANCE:
             return 1.0
         low, high = 0.0, 1.0

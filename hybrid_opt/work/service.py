@@ -382,7 +382,7 @@ class _Worker:
     """A process and this side of its pipe.
 
     Attributes:
-        connection: to it.
+        connection: this side's end of the pipe.
         index: the request that it has, None without one.
         working: whether its context is made and it works on the request.
         silence: seconds since it was heard.

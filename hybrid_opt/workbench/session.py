@@ -62,12 +62,12 @@ class Verdict:
 
     Attributes:
         cell: the changed cell under the time law 'optimal', None where the change is refused.
-        carry: in it, None likewise.
+        carry: the carry in that cell, None likewise.
         text: whether the carry is feasible, or why not.
         feasible: whether it is.
         commanded: (n, 2) normal forces to command [N], None where the carry is not feasible.
         squeeze: how these came about.
-        seconds: that the verdict took.
+        seconds: time that the verdict took.
     """
 
     cell: Cell | None
@@ -86,7 +86,7 @@ class Session:
         base: the cell as it was given.
         changes: by key path of the workcell file, see `Cell.changed`.
         x: (n_var,) decision vector of the carry under the time law 'optimal'.
-        verdict: on it.
+        verdict: the verdict on that carry.
     """
 
     def __init__(self, cell: Cell, x: Array | None = None) -> None:

@@ -212,7 +212,7 @@ def recommend_from(
         wish: what is asked for.
         path: the trajectory file to write.
         progress: where to show it.
-        threads: in which carries are timed, 0 for one per core; has no influence on what is found.
+        threads: threads that time carries, 0 for one per core; results do not depend on it.
 
     Returns:
         What is said of it.

@@ -145,7 +145,7 @@ def _is_text(kind: str, content: bytes) -> bool:
 
 
 def _gaps(content: bytes) -> int:
-    """At least as many as there are gaps between words: letters beyond ASCII may be some."""
+    """Upper bound of the gaps between words: letters beyond ASCII may be some."""
     letters = np.frombuffer(content, np.uint8)
     return int(np.count_nonzero((letters <= 32) | (letters >= 128)))
 

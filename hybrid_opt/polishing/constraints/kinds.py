@@ -133,7 +133,7 @@ class Forces(Kind[ForceRow]):
         self._facing = cell.workcell.has_facing_pads
 
     def near(self, carry: PlacedCarry, limits: Limits) -> Iterable[ForceRow]:
-        """At every few samples, at the highest and beside them, where the sample decides."""
+        """Rows at every few samples, at the highest and beside them, where the sample decides."""
         samples = self._every | self._ends | self._peaks(carry)
         main = self._main(carry)
         for robot, limited in enumerate(limits):

@@ -74,7 +74,7 @@ class BorderedMatrix:
         )
 
     def raised(self, by: Array) -> BorderedMatrix:
-        """With (k + n,) added to its diagonal."""
+        """The matrix with (k + n,) added to its diagonal."""
         k = len(self.corner)
         corner = self.corner.copy()
         corner[np.diag_indices(k)] += by[:k]

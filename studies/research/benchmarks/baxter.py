@@ -63,7 +63,7 @@ def benchmark(folder: Path, count: int, seed: int) -> Benchmark:
     """A sample of the scenes, as many of each kind.
 
     Args:
-        folder: in which their files are.
+        folder: the folder with their files.
         count: of each kind.
         seed: of the sample.
 

@@ -41,7 +41,7 @@ def benchmark(folder: Path) -> Benchmark:
     """The carries.
 
     Args:
-        folder: in which their files are.
+        folder: the folder with their files.
 
     Raises:
         SettingsError: they are not there.

@@ -81,7 +81,7 @@ def benchmark(folder: Path) -> Benchmark:
     """The three carries.
 
     Args:
-        folder: in which their files are.
+        folder: the folder with their files.
 
     Raises:
         SettingsError: they are not there, or not those.

@@ -63,7 +63,7 @@ def benchmark(folder: Path) -> Benchmark:
     """The carry, within two kinds of limits.
 
     Args:
-        folder: in which their files are.
+        folder: the folder with their files.
 
     Raises:
         SettingsError: they are not there, or not those.
