@@ -356,7 +356,7 @@ OBJECT = "world: {collision_objects: [{id: a, "
     ("name", "text", "words"),
     [
         ("s.yaml", "a: [", "is not readable YAML"),
-        ("s.yaml", "- 1", "is no planning scene"),
+        ("s.yaml", "- 1", "is no message; allowed is a mapping"),
         ("s.yaml", "world: {}", "has no world.collision_objects"),
         ("s.yaml", "world: {collision_objects: 3}", "allowed is an array of tables"),
         ("s.yaml", f"{OBJECT}primitives: [{{type: 1, dimensions: [1, 2]}}]}}]}}", "of 3 numbers"),
