@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Hashable
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -101,12 +102,13 @@ def functions_of(geometry: CellGeometry, softness: Softness = EXACT) -> dict[str
 
 def model_of(robot: Robot) -> RobotModel:
     """The kinematics of an arm, which its base does not change."""
-    if robot.urdf not in _MODELS:
-        _MODELS[robot.urdf] = build_robot_model(robot)
-    return _MODELS[robot.urdf]
+    known = robot.urdf, robot.chain_root, robot.flange, robot.locked_joints
+    if known not in _MODELS:
+        _MODELS[known] = build_robot_model(robot)
+    return _MODELS[known]
 
 
-_MODELS: dict[Path, RobotModel] = {}
+_MODELS: dict[tuple[Hashable, ...], RobotModel] = {}
 
 
 def whole_geometry_of(name: str, folder: Path = Path()) -> CellGeometry:
