@@ -43,6 +43,15 @@ typedef struct { double x, y, bound; int key; } line; /* x X + y Y <= bound */
 /* The largest use of a kind of limit: over the limit, where, and of which joint or contact. */
 typedef struct { double ratio, parameter; int column; } largest_use;
 
+/* What was found at an interval, after the numbers it was asked for; later sweeps change few. */
+typedef struct {
+  double back[4];       /* ceiling, top and guess of `backward`, and its answer */
+  double ahead[3];      /* x and top of `forward`, and its answer */
+  double judged[2];     /* x and y of what is judged inside */
+  double peak[2];
+  largest_use inside[KINDS];
+} answers;
+
 typedef struct {
   const double* samples;           /* (SAMPLES, SIZE) */
   double force;                    /* largest normal force, infinite without */
@@ -52,6 +61,7 @@ typedef struct {
   double (*tight)[GROUPS];         /* (INTERVALS, GROUPS) divisor of what is left for motion */
   double* top;                     /* (INTERVALS + 1,) largest u'^2 that can be brought to rest */
   double* squared;                 /* (INTERVALS + 1,) u'^2 */
+  answers* known;                  /* (INTERVALS,) */
   const double* held;              /* numbers of what is held */
   const double* cuts;              /* (SAMPLES, CUTS, 3) alpha u'' + beta u'^2 <= bound, infinite
                                       from the last one on */
@@ -355,6 +365,7 @@ static double forward(const problem* p, int interval, double x, double top) {
       if (count) beyond = y;
       else if (worst < -CONFLICT) y = halve(p, interval, x, y, beyond);
     }
+    if (!count && y > 0.0) return y;
     if (!count) break;
     for (int k = 0; k < count; ++k)
       if (rows[k].y > 0.0) next = smaller(next, (rows[k].bound - rows[k].x * x) / rows[k].y);
@@ -378,19 +389,34 @@ static double speed_ceiling(const problem* p, int i) {
   return 1.0 / (tight * demand * demand);
 }
 
+/* Whether an answer is known for other numbers than `asked`, which take their place then. */
+static int differ(double* known, const double* asked, int count) {
+  int found = 0;
+  for (int k = 0; k < count; ++k) {
+    found = found || known[k] != asked[k];
+    known[k] = asked[k];
+  }
+  return found;
+}
+
 /* Both passes; the interval that could not be driven, or -1. */
 static int sweep(problem* p) {
   p->top[INTERVALS] = 0.0;
   for (int i = INTERVALS - 1; i >= 0; --i) {
     const double next = p->top[i + 1];
     const double guess = i < INTERVALS - 1 ? larger(2.0 * next - p->top[i + 2], next) : next;
-    p->top[i] = backward(p, i, speed_ceiling(p, i), next, guess);
+    const double asked[3] = {speed_ceiling(p, i), next, guess};
+    double* back = p->known[i].back;
+    if (differ(back, asked, 3)) back[3] = backward(p, i, asked[0], next, guess);
+    p->top[i] = back[3];
   }
   p->squared[0] = 0.0;
   int repairs = 0;
   for (int i = 0; i < INTERVALS;) {
-    const double y = forward(p, i, p->squared[i], p->top[i + 1]);
-    if (y >= 0.0) { p->squared[++i] = y; continue; }
+    const double asked[2] = {p->squared[i], p->top[i + 1]};
+    double* ahead = p->known[i].ahead;
+    if (differ(ahead, asked, 2)) ahead[2] = forward(p, i, asked[0], asked[1]);
+    if (ahead[2] >= 0.0) { p->squared[++i] = ahead[2]; continue; }
     /* Only limits that are not convex allow x and nothing after it: keep below this x. */
     if (i == 0 || ++repairs > MAX_REPAIRS) return i;
     p->top[i] = 0.998 * p->squared[i];
@@ -502,7 +528,11 @@ static double judge_all(const problem* p, double factor, largest_use* use, doubl
     const double a = HALF * (y - x);
     judge(p, p->samples + 2 * i * SIZE, i / (double)INTERVALS, a, x, 1, use, peak);
     judge(p, p->samples + 2 * (i + 1) * SIZE, (i + 1) / (double)INTERVALS, a, y, 1, use, peak);
-    judge_inside(p, i, factor, use, peak);
+    if (factor < 1.0) { judge_inside(p, i, factor, use, peak); continue; }
+    const answers* known = p->known + i; /* by `tighten` */
+    for (int k = 0; k < 2; ++k) peak[k] = larger(peak[k], known->peak[k]);
+    for (int k = 0; k < KINDS; ++k)
+      note(use, k, known->inside[k].ratio, known->inside[k].parameter, known->inside[k].column);
   }
   return worst_of(use);
 }
@@ -512,11 +542,17 @@ static double judge_all(const problem* p, double factor, largest_use* use, doubl
 static double tighten(problem* p) {
   double largest = 0.0;
   for (int i = 0; i < INTERVALS; ++i) {
-    largest_use use[KINDS];
-    double peak[2], excess[GROUPS] = {1.0, 1.0, 1.0};
-    reset(use, peak);
-    judge_inside(p, i, 1.0, use, peak);
-    largest = larger(largest, worst_of(use));
+    const double asked[2] = {p->squared[i], p->squared[i + 1]};
+    answers* known = p->known + i;
+    const largest_use* use = known->inside;
+    double excess[GROUPS] = {1.0, 1.0, 1.0};
+    if (differ(known->judged, asked, 2)) {
+      reset(known->inside, known->peak);
+      judge_inside(p, i, 1.0, known->inside, known->peak);
+    }
+    const double most = worst_of(use);
+    largest = larger(largest, most);
+    if (most > 1.0 + TIGHTEN) known->back[0] = known->ahead[0] = -1.0; /* for a wider limit */
     for (int k = 0; k < KINDS; ++k)
       if (use[k].ratio > 1.0 + TIGHTEN)
         excess[GROUP[k]] = larger(excess[GROUP[k]], use[k].ratio);
@@ -549,8 +585,10 @@ static int solve(problem* p, largest_use* use, double* peak, double* interval, d
       *interval = k / SIZE / 2;
       return BROKEN;
     }
-  for (int i = 0; i < INTERVALS; ++i)
+  for (int i = 0; i < INTERVALS; ++i) {
     for (int k = 0; k < GROUPS; ++k) p->tight[i][k] = 1.0;
+    p->known[i].back[0] = p->known[i].ahead[0] = p->known[i].judged[0] = -1.0;
+  }
   if (judge_rest(p, use, peak) >= 1.0 - 1e-6) return AT_REST;
   double worst = INFINITY;
   while (*sweeps < MAX_SWEEPS && worst > 1.0 + TIGHTEN) {
@@ -586,7 +624,8 @@ int path_timing(const double** arg, double** res, long long* iw, double* w, int 
   problem p = {
     arg[0], options[0], options[1] > 0.5, options[2] > 0.5, options[3] > 0.5, w,
     w + (INTERVALS + 1) * RATIOS, (double(*)[GROUPS])(w + (INTERVALS + 1) * (RATIOS + 1)),
-    w + (INTERVALS + 1) * (RATIOS + 1 + GROUPS), squared, arg[HELD], CUTS ? arg[2] : 0,
+    w + (INTERVALS + 1) * (RATIOS + 1 + GROUPS), squared,
+    (answers*)(w + (INTERVALS + 1) * (RATIOS + 2 + GROUPS)), arg[HELD], CUTS ? arg[2] : 0,
   };
   (void)iw; (void)mem;
   *interval = *sweeps = *duration = 0.0;
@@ -608,7 +647,8 @@ int path_timing(const double** arg, double** res, long long* iw, double* w, int 
 }
 
 int path_timing_work(long long* arg, long long* res, long long* iw, long long* w) {
-  *arg = HELD + 1; *res = 8; *iw = 0; *w = (INTERVALS + 1) * (RATIOS + 2 + GROUPS);
+  *arg = HELD + 1; *res = 8; *iw = 0;
+  *w = (INTERVALS + 1) * (RATIOS + 2 + GROUPS) + INTERVALS * sizeof(answers) / sizeof(double);
   return 0;
 }
 void path_timing_incref(void) {}
