@@ -47,6 +47,9 @@ typedef struct { double ratio, parameter; int column; } largest_use;
 typedef struct {
   double back[4];       /* ceiling, top and guess of `backward`, and its answer */
   double ahead[3];      /* x and top of `forward`, and its answer */
+  double at[2][2];      /* x and y of `forces` and of `ratios` */
+  double forces[2][2];  /* both normal forces at both ends */
+  double ratios[2][RATIOS];
   double judged[2];     /* x and y of what is judged inside */
   double peak[2];
   largest_use inside[KINDS];
@@ -108,6 +111,35 @@ static double force_slopes(const problem* p, const double* f, double a, double w
   *by_a = each_by_a[k];
   *by_w = each_by_w[k];
   return n[k];
+}
+
+/* Whether an answer is known for other numbers than `asked`, which take their place then. */
+static int differ(double* known, const double* asked, int count) {
+  int found = 0;
+  for (int k = 0; k < count; ++k) {
+    found = found || known[k] != asked[k];
+    known[k] = asked[k];
+  }
+  return found;
+}
+
+/* Both normal forces at both ends of an interval, and what limits as ratios. */
+static double (*end_forces(const problem* p, int interval, double x, double y))[2] {
+  answers* known = p->known + interval;
+  const double asked[2] = {x, y}, *f = p->samples + 2 * interval * SIZE, a = HALF * (y - x);
+  if (differ(known->at[0], asked, 2))
+    for (int end = 0; end < 2; ++end)
+      normal_forces(p, f + 2 * end * SIZE, a, asked[end], known->forces[end]);
+  return known->forces;
+}
+
+static double (*end_ratios(const problem* p, int interval, double x, double y))[RATIOS] {
+  answers* known = p->known + interval;
+  const double asked[2] = {x, y}, *f = p->samples + 2 * interval * SIZE, a = HALF * (y - x);
+  if (differ(known->at[1], asked, 2))
+    for (int end = 0; end < 2; ++end)
+      ratios_at(p, f + 2 * end * SIZE, a, asked[end], known->ratios[end]);
+  return known->ratios;
 }
 
 /* ---- rows of an interval ---- */
@@ -180,10 +212,10 @@ static int convex_rows(const problem* p, int interval, double x, double y, doubl
       count = append(rows, count, interval_row(by_a, by_w, limit, end));
     }
     if (isfinite(p->force)) {
-      double n[2], by_a, by_w;
+      const double* n = end_forces(p, interval, x, y)[end];
+      double by_a, by_w;
       const double rest = p->rest_force[interval + end];
       const double bound = rest + (p->force - rest) / p->tight[interval][FORCE];
-      normal_forces(p, f, a, w, n);
       if (larger(n[0], n[1]) - rest <= (bound - rest) * threshold) continue;
       const double value = force_slopes(p, f, a, w, &by_a, &by_w);
       const double still = value - by_a * a - by_w * w;
@@ -211,14 +243,14 @@ static int linearised_rows(const problem* p, int interval, double x, double y, c
   for (int end = 0; end < 2; ++end) {
     const double* f = p->samples + 2 * (interval + end) * SIZE;
     const double w = end ? y : x;
+    const double* known = end_ratios(p, interval, x, y)[end];
     double r[RATIOS], by_a[RATIOS], by_w[RATIOS];
     int exceeded = 0;
-    ratios_at(p, f, a, w, r);
     for (int k = 0; k < RATIOS; ++k) {
       if (!limited(p, k)) continue;
       const double still = fabs(p->rest[(interval + end) * RATIOS + k]);
       const double bound = still + (1.0 - still) / tight;
-      const double excess = fabs(r[k]) - bound;
+      const double excess = fabs(known[k]) - bound;
       *worst = larger(*worst, excess);
       exceeded = exceeded || excess > RATIO_TOLERANCE || (wanted && wanted[end * RATIOS + k]);
     }
@@ -389,16 +421,6 @@ static double speed_ceiling(const problem* p, int i) {
   return 1.0 / (tight * demand * demand);
 }
 
-/* Whether an answer is known for other numbers than `asked`, which take their place then. */
-static int differ(double* known, const double* asked, int count) {
-  int found = 0;
-  for (int k = 0; k < count; ++k) {
-    found = found || known[k] != asked[k];
-    known[k] = asked[k];
-  }
-  return found;
-}
-
 /* Both passes; the interval that could not be driven, or -1. */
 static int sweep(problem* p) {
   p->top[INTERVALS] = 0.0;
@@ -450,11 +472,10 @@ static void note(largest_use* use, int kind, double ratio, double parameter, int
   use[kind].column = column;
 }
 
-/* Every limited quantity over its limit at one sample, u = parameter, noted in `use`, the ratios
-   only where asked for; `peak` keeps the largest normal forces. */
+/* Every limited quantity over its limit at one sample, u = parameter, noted in `use`, from normal
+   forces n and ratios, where these are given; `peak` keeps the largest normal forces. */
 static void judge(const problem* p, const double* f, double parameter, double a, double w,
-                  int with_ratios, largest_use* use, double* peak) {
-  double ratios[RATIOS], n[2];
+                  const double* n, const double* ratios, largest_use* use, double* peak) {
   const double speed = sqrt(larger(w, 0.0));
   const double *d = f + AT_SPEED, *alpha = f + AT_ACCELERATION, *cones = f + AT_CONE;
   for (int j = 0; j < JOINTS; ++j) {
@@ -474,13 +495,11 @@ static void judge(const problem* p, const double* f, double parameter, double a,
     }
     note(use, BOX_ACCELERATION + cone, sqrt(sum), parameter, 0);
   }
-  normal_forces(p, f, a, w, n);
   for (int k = 0; k < 2; ++k) {
     peak[k] = larger(peak[k], n[k]);
     note(use, NORMAL_FORCE, n[k] / p->force, parameter, k);
   }
-  if (!with_ratios || !(p->torque || p->pressure)) return;
-  ratios_at(p, f, a, w, ratios);
+  if (!ratios) return;
   for (int k = 0; k < RATIOS; ++k) {
     if (!limited(p, k)) continue;
     if (k < JOINTS) note(use, JOINT_TORQUE, fabs(ratios[k]), parameter, k);
@@ -505,17 +524,23 @@ static void judge_inside(const problem* p, int interval, double factor, largest_
                          double* peak) {
   const double x = factor * factor * p->squared[interval];
   const double y = factor * factor * p->squared[interval + 1], a = HALF * (y - x);
-  double f[SIZE];
+  const double *sample = p->samples + (2 * interval + 1) * SIZE, half = 0.5 * (x + y);
+  const int limits_ratios = p->torque || p->pressure;
+  double f[SIZE], n[2], ratios[RATIOS];
   largest_use middle[KINDS] = {{0}};
-  judge(p, p->samples + (2 * interval + 1) * SIZE, (interval + 0.5) / INTERVALS, a, 0.5 * (x + y),
-        1, middle, peak);
+  normal_forces(p, sample, a, half, n);
+  if (limits_ratios) ratios_at(p, sample, a, half, ratios);
+  judge(p, sample, (interval + 0.5) / INTERVALS, a, half, n, limits_ratios ? ratios : 0, middle,
+        peak);
   for (int k = 0; k < KINDS; ++k)
     note(use, k, middle[k].ratio, middle[k].parameter, middle[k].column);
   const int near = larger(middle[JOINT_TORQUE].ratio, middle[PRESSURE].ratio) > NEARLY;
   for (int quarter = 1; quarter <= 3; quarter += 2) {
-    const double share = 0.25 * quarter;
+    const double share = 0.25 * quarter, w = x + share * (y - x);
     between(p, 2.0 * (interval + share), near ? SIZE : AT_TORQUE, f);
-    judge(p, f, (interval + share) / INTERVALS, a, x + share * (y - x), near, use, peak);
+    normal_forces(p, f, a, w, n);
+    if (near) ratios_at(p, f, a, w, ratios);
+    judge(p, f, (interval + share) / INTERVALS, a, w, n, near ? ratios : 0, use, peak);
   }
 }
 
@@ -525,9 +550,11 @@ static double judge_all(const problem* p, double factor, largest_use* use, doubl
   reset(use, peak);
   for (int i = 0; i < INTERVALS; ++i) {
     const double x = factor * factor * p->squared[i], y = factor * factor * p->squared[i + 1];
-    const double a = HALF * (y - x);
-    judge(p, p->samples + 2 * i * SIZE, i / (double)INTERVALS, a, x, 1, use, peak);
-    judge(p, p->samples + 2 * (i + 1) * SIZE, (i + 1) / (double)INTERVALS, a, y, 1, use, peak);
+    const double(*n)[2] = end_forces(p, i, x, y);
+    const double(*ratios)[RATIOS] = p->torque || p->pressure ? end_ratios(p, i, x, y) : 0;
+    for (int end = 0; end < 2; ++end)
+      judge(p, p->samples + 2 * (i + end) * SIZE, (i + end) / (double)INTERVALS, HALF * (y - x),
+            end ? y : x, n[end], ratios ? ratios[end] : 0, use, peak);
     if (factor < 1.0) { judge_inside(p, i, factor, use, peak); continue; }
     const answers* known = p->known + i; /* by `tighten` */
     for (int k = 0; k < 2; ++k) peak[k] = larger(peak[k], known->peak[k]);
@@ -568,10 +595,11 @@ static double judge_rest(problem* p, largest_use* use, double* peak) {
   reset(use, peak);
   for (int i = 0; i <= INTERVALS; ++i) {
     const double* f = p->samples + 2 * i * SIZE;
-    double n[2];
-    judge(p, f, i / (double)INTERVALS, 0.0, 0.0, 1, use, peak);
-    ratios_at(p, f, 0.0, 0.0, p->rest + i * RATIOS);
+    double n[2], *ratios = p->rest + i * RATIOS;
     normal_forces(p, f, 0.0, 0.0, n);
+    ratios_at(p, f, 0.0, 0.0, ratios);
+    judge(p, f, i / (double)INTERVALS, 0.0, 0.0, n, p->torque || p->pressure ? ratios : 0, use,
+          peak);
     p->rest_force[i] = larger(n[0], n[1]);
   }
   return worst_of(use);
@@ -588,6 +616,7 @@ static int solve(problem* p, largest_use* use, double* peak, double* interval, d
   for (int i = 0; i < INTERVALS; ++i) {
     for (int k = 0; k < GROUPS; ++k) p->tight[i][k] = 1.0;
     p->known[i].back[0] = p->known[i].ahead[0] = p->known[i].judged[0] = -1.0;
+    p->known[i].at[0][0] = p->known[i].at[1][0] = -1.0;
   }
   if (judge_rest(p, use, peak) >= 1.0 - 1e-6) return AT_REST;
   double worst = INFINITY;
