@@ -6,16 +6,17 @@ from collections.abc import Mapping, Sequence
 from importlib.resources import files
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from hybrid_opt.bundles.bundle import MANIFEST, TARGETS, read_manifest
-from hybrid_opt.campaign.results import CampaignResults, read_campaign
-from hybrid_opt.carry import Carry
 from hybrid_opt.cell import Cell
 from hybrid_opt.evaluate.objectives import OBJECTIVES, PAPER_OBJECTIVES, Objective
-from hybrid_opt.metaheuristics.registry import names, title
-from hybrid_opt.store.trajectory_file import read_trajectory
 from symbolic.errors import SettingsError
+
+if TYPE_CHECKING:
+    from hybrid_opt.campaign.results import CampaignResults
+    from hybrid_opt.carry import Carry
+
+# What writes bundles and searches takes a second to import and is not needed for an example.
 
 _OPENED: list[TemporaryDirectory[str]] = []
 """What the cells of trajectory files were unpacked into, until the process ends."""
@@ -30,6 +31,10 @@ def load(path: str | Path) -> Cell | Carry | CampaignResults | Mapping[str, Any]
         WorkcellError: the workcell file is wrong.
         ResultsError: there is nothing of the kind, or it is damaged.
     """
+    from hybrid_opt.bundles.bundle import MANIFEST, read_manifest
+    from hybrid_opt.campaign.results import read_campaign
+    from hybrid_opt.store.trajectory_file import read_trajectory
+
     path = Path(path)
     if path.suffix == ".toml":
         return Cell.load(path)
@@ -57,6 +62,8 @@ def example(name: str = "rack", objectives: Sequence[str | Objective] = PAPER_OB
 
 def algorithms() -> dict[str, str]:
     """The searches that `search` knows, by name what they are called in print."""
+    from hybrid_opt.metaheuristics.registry import names, title
+
     return {name: title(name) for name in names()}
 
 
@@ -67,4 +74,6 @@ def objectives() -> dict[str, str]:
 
 def targets() -> dict[str, str]:
     """What `export` writes for, by name how it is run."""
+    from hybrid_opt.bundles.bundle import TARGETS
+
     return {name: target.how_to_run for name, target in TARGETS.items()}

@@ -154,6 +154,8 @@ def warmed(name: str) -> tuple[ho.Cell, ho.Cell, tuple[float, ...]]:
     """A cell and its drivable form, and what both give."""
     cell = shipped(name)
     drivable = cell.drivable()
+    # Start postures may be kept from before, by another compiler: what finds others is compiled.
+    assert all(cell.compiled.model.branches)
     return cell, drivable, asked(cell, drivable, polished(name, cell, drivable))
 
 
