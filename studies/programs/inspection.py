@@ -305,8 +305,8 @@ def draw(
         SettingsError: the folder cannot be made.
     """
     # Not imported at the top: without pictures nothing of it is needed.
-    from studies.report.data import DrawnCarry, reach_map
     from studies.report.drawing import in_style, save, settled
+    from studies.report.drawn import DrawnCarry, reach_map
     from studies.report.pictures_cell import environment, meeting, reachable_regions
 
     _made(output)

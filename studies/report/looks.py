@@ -20,8 +20,9 @@ from hybrid_opt.display.scene import cell_solids, motion_points
 from hybrid_opt.display.view import CarryView
 from studies.errors import ReportError
 from studies.report import PAGE
-from studies.report.data import DrawnCarry, gather_carries
+from studies.report.data import gather_carries
 from studies.report.drawing import ISOMETRIC, CutCell, draw_cell, draw_path, frame_axes, in_style
+from studies.report.drawn import DrawnCarry
 from symbolic.array import Array
 from symbolic.geometry.pairs import CellGeometry
 

@@ -15,8 +15,9 @@ import numpy as np
 from hybrid_opt.campaign.cell_source import cells_of, ready_cells
 from hybrid_opt.display.scene import packed, scene_data
 from hybrid_opt.work.service import Executor, LocalExecutor, Service, answer_all
-from studies.report.data import DrawnCarry, Experiment, ReportData
+from studies.report.data import Experiment, ReportData
 from studies.report.drawing import ARMS, HAND_MADE, MARKED, LineStyle, series, spread
+from studies.report.drawn import DrawnCarry
 from studies.report.page_carries import (
     RECOMMENDED_LABEL,
     DrawnJob,

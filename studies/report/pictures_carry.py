@@ -13,7 +13,7 @@ from matplotlib.ticker import MaxNLocator
 
 from hybrid_opt.robust.force import RobustPrice
 from hybrid_opt.timing.robustness import KILOGRAM_FORCE
-from studies.report.data import DrawnCarry, ReportData
+from studies.report.data import ReportData
 from studies.report.drawing import (
     FULL_WIDTH,
     HAND_MADE,
@@ -28,6 +28,7 @@ from studies.report.drawing import (
     series,
     shortened,
 )
+from studies.report.drawn import DrawnCarry
 from studies.report.page_carries import torque_use
 from symbolic.array import Array
 

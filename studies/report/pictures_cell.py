@@ -16,7 +16,6 @@ from hybrid_opt.display.scene import (
     frame_placements,
     motion_points,
 )
-from studies.report.data import DrawnCarry, ReachMap
 from studies.report.drawing import (
     ARMS,
     FRONT,
@@ -37,6 +36,7 @@ from studies.report.drawing import (
     panel_label,
     shortened,
 )
+from studies.report.drawn import DrawnCarry, ReachMap
 from symbolic.array import Array
 from symbolic.geometry.pairs import CellGeometry
 

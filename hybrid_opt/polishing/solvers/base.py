@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from scipy.optimize import nnls
 
 from symbolic.array import Array, Figure
 
@@ -189,6 +188,9 @@ def estimated(cost: Array, A: Array, slacks: tuple[Array, Array, Array]) -> tupl
     Returns:
         Of the bounds (n,) in CasADi's convention, and of the inequalities (m,), not negative.
     """
+    # Not imported at the top: it takes long, and records of polishes are read without it.
+    from scipy.optimize import nnls
+
     n, m = len(cost), len(A)
     slack = np.concatenate(slacks)
     near = np.flatnonzero(slack < NEAR)

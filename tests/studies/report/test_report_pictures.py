@@ -26,8 +26,9 @@ from hybrid_opt.display.scene import frame_placements
 from studies.errors import ReportError
 from studies.report import PAGE, looks
 from studies.report.__main__ import main
-from studies.report.data import DrawnCarry, ReportData, Run, reach_map
+from studies.report.data import ReportData, Run
 from studies.report.drawing import ARMS, FRONT, HAND_MADE, SERIES, SIDE, in_style, oblique, save
+from studies.report.drawn import DrawnCarry, reach_map
 from studies.report.looks import (
     FRAMES_PER_SECOND,
     Film,
