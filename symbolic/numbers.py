@@ -202,9 +202,13 @@ class WorkcellNumbers:
     def _vectors(self) -> dict[str, Array]:
         return {}
 
-    @cached_property
+    @property
     def digest(self) -> str:
         """Digest of the structure without bodies."""
+        return self._without_arms
+
+    @cached_property
+    def _without_arms(self) -> str:
         return digest_of_parts((self.workcell,))
 
     def symbols(self) -> NumberedWorkcell:
@@ -244,19 +248,16 @@ class CellNumbers(WorkcellNumbers):
     @cached_property
     def digest(self) -> str:
         """Digest of the structure without bodies but the arms' own."""
-        return digest_of_parts((self.workcell, self._arms))
+        arms = tuple(
+            (model.model.saveToString(), model.flange_id, model.redundant, model.pose_size)
+            for model in self.models
+        )
+        return digest_of_parts((self._without_arms, arms))
 
     @cached_property
     def bodies_digest(self) -> str:
         """Digest of the whole structure."""
-        return digest_of_parts((self.workcell, self.screen, self._arms))
-
-    @cached_property
-    def _arms(self) -> tuple[Any, ...]:
-        return tuple(
-            (model.model.saveToString(), model.flange_id, model.redundant, model.pose_size)
-            for model in self.models
-        )
+        return digest_of_parts((self.digest, self.screen))
 
     def symbolic(self, bodies: CellBodies) -> CellModel:
         """The model whose functions take the numbers as inputs.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import Hashable
-from dataclasses import fields, is_dataclass
+from dataclasses import fields
 from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
@@ -29,7 +29,7 @@ def parts(value: Any, folder: Path) -> list[bytes]:
             found.append(value.__name__.encode())
         elif isinstance(value, ContentRecord):
             found.append(value.content.encode())
-        elif is_dataclass(value):
+        elif hasattr(type(value), "__dataclass_fields__"):
             found.append(type(value).__name__.encode())
             for name in _names(value.__class__):
                 add(getattr(value, name))
