@@ -23,13 +23,13 @@ def _add_options(parser: Parser) -> None:
         type=number(0.0, 1e6),
         metavar=("BEGIN", "END"),
         help="from when to when the pads hold the box [s] (default: the carry that the file names, "
-        "else the longest while in which they stand as they hold it)",
+        "else the longest time in which both pads are placed as when they hold it)",
     )
     parser.add_argument(
         "--interpolation",
         choices=stated("hybrid_opt.bundles.job_file.Interpolation"),
-        help="how the controller moves between samples (default: through all that the file tells "
-        "of them: positions, velocities, accelerations)",
+        help="how the controller moves between samples (default: the highest that the file's "
+        "velocities and accelerations allow)",
     )
     add(parser, "--json")
 

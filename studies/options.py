@@ -81,7 +81,7 @@ _SHARED: dict[str, dict[str, Any]] = {
         "action": "store_true",
         "help": "no progress on standard error (default: shown)",
     },
-    "--seed": {"type": seed, "default": 1, "metavar": "N"},
+    "--seed": {"type": seed, "default": 1, "metavar": "N", "help": "of the randomness"},
 }
 
 
@@ -97,8 +97,12 @@ def add(parser: argparse._ActionsContainer, *names: str, **own: Any) -> None:
         parser.add_argument(name.lower(), **(place | _SHARED[name] | own))
 
 
-def add_wishes(parser: argparse._ActionsContainer) -> None:
-    """Add what may be asked of the recommended carry; `Wish` takes it."""
+def add_wishes(parser: argparse._ActionsContainer, more: str = "") -> None:
+    """Add what may be asked of the recommended carry; `Wish` takes it.
+
+    Args:
+        more: what else the program does with a limit of the force.
+    """
     parser.add_argument(
         "--duration",
         type=force,
@@ -109,9 +113,8 @@ def add_wishes(parser: argparse._ActionsContainer) -> None:
     add(
         parser,
         "--force-limit",
-        help="recommend the shortest carry that needs at most N newtons commanded; a study also "
-        "times every selected trajectory with that limit of its planned forces (default: the least "
-        "product of duration and commanded force)",
+        help=f"recommend the shortest carry that needs at most N newtons commanded{more} (default: "
+        "the least product of duration and commanded force)",
     )
     parser.add_argument(
         "--payload",

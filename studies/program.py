@@ -30,14 +30,21 @@ VERBOSE = "--verbose"
 
 
 class _Help(argparse.HelpFormatter):
-    """Tells the default of every option that has one, unless its text does."""
+    """Tells the default of every option, unless its text does; numbers stand as N."""
+
+    def _get_default_metavar_for_optional(self, action: argparse.Action) -> str:
+        if action.type in (None, Path):
+            return super()._get_default_metavar_for_optional(action)
+        return "N"
 
     def _get_help_string(self, action: argparse.Action) -> str:
         # Python 3.11 and 3.12 write the default of --x and --no-x themselves.
         told = (action.help or "").removesuffix(" (default: %(default)s)")
         value = action.default
-        if "(default" in told or value in (None, [], argparse.SUPPRESS):
+        if "(default" in told or value == argparse.SUPPRESS or action.required:
             return told
+        if value in (None, []):
+            return f"{told} (default: none)" if action.option_strings else told
         if isinstance(value, bool):
             value = "yes" if value else "off"
         elif isinstance(value, list | tuple):

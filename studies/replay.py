@@ -20,13 +20,13 @@ def _add_options(parser: Parser) -> None:
     add(
         parser,
         "--force-limit",
-        help="largest normal force of each robot [N], adds the fastest timing below it",
+        help="tell also the fastest timing whose normal forces stay below this [N]",
     )
     parser.add_argument(
         "--force-curve",
         type=int,
         metavar="POINTS",
-        help="durations at this many force limits",
+        help="tell also the durations at this many force limits",
     )
     add(parser, "--json")
 

@@ -1,8 +1,9 @@
 """Forces that hold whatever the case: `python -m studies.robust FILE`.
 
-The least commanded normal forces with which a stored trajectory holds for every case of its
-workcell's [uncertainty], or of a usual set without one, their price, the largest set that the
-reference forces allow, and random cases. Exit code 1 where one of them fails.
+What is commanded of a stored trajectory, driven as its job does, so that it holds in every case of
+its workcell's [uncertainty], or of a usual set without one: what the force is made of, its price,
+the largest set that the reference forces allow, and random cases. Exit code 1 where one of them
+fails.
 """
 
 from __future__ import annotations
@@ -25,8 +26,8 @@ def _add_options(parser: Parser) -> None:
     add(
         parser,
         "--force-limit",
-        help="time the path as fast as forces below this allow, planned ones and those that hold "
-        "in all cases (arm 1 leads)",
+        help="tell also how fast the path can be driven with planned forces below this [N], and "
+        "with forces below it that hold in all cases (arm 1 leads)",
     )
     add(parser, "--seed", help="of the random cases")
 

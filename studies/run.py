@@ -27,7 +27,10 @@ from studies.options import (
 from studies.program import Parser, Program, carry_out, run_program
 from symbolic.errors import SettingsError
 
-DESCRIPTION = "Search for the least-force carries of a dual-arm workcell."
+DESCRIPTION = (
+    "Make a whole study of a dual-arm workcell: search for carries of least force and duration, "
+    "polish them, recommend one to run, and write a report."
+)
 
 KNOWN: tuple[str, ...] = stated("hybrid_opt.metaheuristics.registry.REGISTRY")
 
@@ -157,7 +160,7 @@ def add_options(parser: Parser, output: str) -> None:
         help="independent runs per algorithm of that search (default: as --replicas, at most "
         f"{stated('hybrid_opt.campaign.stages.DRIVABLE_REPLICAS')})",
     )
-    add_wishes(after)
+    add_wishes(after, "; also times every selected carry with that limit of its planned forces")
     after.add_argument(
         "--simulate",
         action="store_true",

@@ -56,7 +56,7 @@ def _add_options(parser: Parser) -> None:
         default=1000,
         help="of the search for the first path",
     )
-    add(parser, "--output", default="results/sweep", help="folder (default: results/sweep)")
+    add(parser, "--output", default="results/sweep", metavar="DIR", help="folder of the results")
     add(parser, "--jobs", "--seed", "--json", "--quiet")
 
 

@@ -44,7 +44,8 @@ from hybrid_opt.job.motions import (
 )
 from hybrid_opt.job.records import Force, Job, Phase, PhaseMotion
 from hybrid_opt.job.smooth import WIDEST, WIDTH, rests_at_ends, without_jumps
-from hybrid_opt.robust.squeeze import SqueezeSettings
+from hybrid_opt.robust.squeeze import Squeeze, SqueezeSettings, commanded_forces
+from hybrid_opt.timing.jerk import kept_jerk
 from hybrid_opt.timing.model import TimingModel
 from hybrid_opt.timing.records import JerkLimits, Timing
 from symbolic.array import Array, interpolated
@@ -293,7 +294,6 @@ class JobModel:
         self.timing = TimingModel(compiled) if timing is None else timing
         self._posture: NumericFunction = compiled.evaluators["posture"]
         self._collisions = JobCollisions(compiled)
-        self._jerk = JerkLimits.of(compiled.workcell)
         self._known: dict[tuple[Handling, bytes], _JobEnds] = {}
 
     def plan(
@@ -334,7 +334,7 @@ class JobModel:
             )
         if not 0.0 <= smoothing <= WIDEST:
             raise SettingsError(f"smoothing over {smoothing:g} s: allowed is 0 to {WIDEST:g} s")
-        jerk = self._jerk if within_jerk else None
+        jerk = kept_jerk(self.workcell, timing.limits) if within_jerk else None
         timing = without_jumps(self.timing, timing, jerk, smoothing)
         carry = timing.carry
         assert carry is not None, "a smoothed timing has a carry"
@@ -475,6 +475,50 @@ def refuse_excess(job: Job) -> None:
                 f"{title}: uses {100.0 * ratio:.1f} % of the limit on {name}; press less "
                 "(squeeze), or choose a slower timing"
             )
+
+
+@dataclass(frozen=True)
+class Pressed:
+    """How hard a timed carry is pressed.
+
+    Attributes:
+        forces: (n, 2) normal forces to command along the carry [N].
+        squeeze: how they came about.
+        job: the whole job around it, whose forces they are; None where none can be planned: then
+            they are the carry's alone.
+        problem: why there is no job, '' where there is one.
+    """
+
+    forces: Array
+    squeeze: Squeeze
+    job: Job | None
+    problem: str = ""
+
+
+def pressed(model: JobModel, timing: Timing, settings: SqueezeSettings | None = None) -> Pressed:
+    """How hard to press along a timed carry, as its job does.
+
+    Args:
+        model: of the carry's workcell.
+        timing: without jumps of acceleration.
+        settings: how hard to press; None for the defaults.
+
+    Raises:
+        SettingsError: the timing failed, or the uncertainty leaves no friction or patch.
+    """
+    settings = settings or SqueezeSettings()
+    try:
+        job = model.plan(timing, settings)
+    except JobError as error:
+        assert timing.carry is not None, "a timing that failed is refused before"
+        forces, squeeze = commanded_forces(model.workcell, timing.carry, settings)
+        return Pressed(forces, squeeze, None, str(error))
+    assert job.timing.carry is not None, "a job has a carry"
+    carried = job.phase("carry")
+    along = (carried.motion.time, carried.force.normal)
+    time = job.timing.carry.time
+    normal = np.column_stack([np.interp(time, along[0], force) for force in along[1].T])
+    return Pressed(normal, job.squeeze, job)
 
 
 _model = kept_per_workcell(JobModel)

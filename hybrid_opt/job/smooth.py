@@ -16,10 +16,10 @@ import numpy as np
 
 from hybrid_opt.carry import Carry
 from hybrid_opt.errors import JobError
-from hybrid_opt.timing.jerk import time_with_jerk
+from hybrid_opt.timing.jerk import kept_jerk, time_with_jerk
 from hybrid_opt.timing.limits import limit_ratios, use_of, worst
 from hybrid_opt.timing.model import TimingModel
-from hybrid_opt.timing.records import Excess, JerkLimits, Timing
+from hybrid_opt.timing.records import Excess, JerkLimits, Timing, TimingLimits
 from hybrid_opt.timing.solve import time_path
 from symbolic.array import Array
 
@@ -91,16 +91,24 @@ def without_jumps(
     return found
 
 
+def driven_limits(model: TimingModel, x: Array) -> TimingLimits:
+    """Limits within which jobs drive a carry x (n_var,): its own force limit where its time law has
+    one, else the reference speeds."""
+    if model.workcell.task.time_law == "optimal":
+        return model.drive_limits(float(x[-1]))
+    return TimingLimits(reference_speed=True)
+
+
 def driven_timing(model: TimingModel, x: Array) -> Timing:
-    """How jobs drive a drivable carry x (n_var,): as fast as all limits allow within its own force
-    limit, without jumps of acceleration.
+    """How jobs drive a carry x (n_var,): as fast as `driven_limits` and all others allow, without
+    jumps of acceleration.
 
     Raises:
         JobError: as of `without_jumps`.
     """
-    timing = time_path(model, x, model.drive_limits(float(x[-1])))
-    jerk = JerkLimits.of(model.workcell) if model.workcell.has_facing_pads else None
-    return without_jumps(model, timing, jerk) if timing.ok else timing
+    limits = driven_limits(model, x)
+    timing = time_path(model, x, limits)
+    return without_jumps(model, timing, kept_jerk(model.workcell, limits)) if timing.ok else timing
 
 
 def smoothed(model: TimingModel, timing: Timing, width: float = WIDTH) -> Timing:

@@ -17,7 +17,7 @@ from hybrid_opt.cell import Cell
 from hybrid_opt.errors import JobError
 from hybrid_opt.evaluate.objectives import ForceKind
 from hybrid_opt.front import Front
-from hybrid_opt.job.plan import JobModel
+from hybrid_opt.job.plan import JobModel, Pressed, pressed
 from hybrid_opt.job.records import Job
 from hybrid_opt.job.smooth import driven_timing
 from hybrid_opt.progress import ShowProgress, counted
@@ -38,8 +38,6 @@ from hybrid_opt.robust.squeeze import (
     DOUBTS,
     MOST,
     Squeeze,
-    SqueezeSettings,
-    commanded_forces,
     largest_commanded,
 )
 from hybrid_opt.shown import Displayable
@@ -196,7 +194,8 @@ def _recommended(
     told()
     carry = timing.carry
     assert carry is not None, "what is driven has a carry"
-    forces, squeeze, job, doubts = _job(cell, timing)
+    held = pressed(JobModel(cell.compiled, cell.timing_model), timing)
+    forces, squeeze, job, doubts = held.forces, held.squeeze, held.job, _doubts(held)
     commanded = np.asarray(forces.max(axis=0)) if job is None else job.peak_normal_force
     allowed = cell.workcell.task.reference_force
     beyond = (commanded > allowed * (1.0 + BETTER)).any()
@@ -273,22 +272,11 @@ def _driven(
     return min(kept or others, key=lambda each: each[0])[1]
 
 
-def _job(cell: Cell, timing: Timing) -> tuple[Array, Squeeze, Job | None, list[str]]:
-    """The forces to command along the carry (n, 2) [N], how they came about, the job, and
-    doubts."""
-    assert timing.carry is not None, "what is driven has a carry"
-    doubts = []
-    try:
-        job = JobModel(cell.compiled, cell.timing_model).plan(timing)
-        squeeze, carried = job.squeeze, job.phase("carry")
-        along = (carried.motion.time, carried.force.normal)
-        forces = np.column_stack(
-            [np.interp(timing.carry.time, along[0], normal) for normal in along[1].T]
-        )
-    except JobError as error:
-        job = None
-        forces, squeeze = commanded_forces(cell.workcell, timing.carry, SqueezeSettings())
-        doubts.append(f"no job can be planned: {error}")
+def _doubts(found: Pressed) -> list[str]:
+    """What speaks against how a carry is pressed."""
+    squeeze, doubts = found.squeeze, []
+    if found.job is None:
+        doubts.append(f"no job can be planned: {found.problem}")
     if squeeze.uncertainty is not None and squeeze.uncertainty.is_empty:
         doubts.append("the cell states that nothing is uncertain: state what may be off")
     if not squeeze.even_pads:
@@ -296,7 +284,7 @@ def _job(cell: Cell, timing: Timing) -> tuple[Array, Squeeze, Job | None, list[s
             "the squeeze holds pads that choose their pressure; pressing evenly, they do not close "
             "their grasp: turn them towards one another, or raise the friction"
         )
-    return forces, squeeze, job, doubts
+    return doubts
 
 
 def _too_weak(workcell: Workcell, carry: Carry, needed: Array, commanded: Array) -> str:

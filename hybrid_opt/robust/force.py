@@ -54,8 +54,8 @@ SCREENED = 0.97
 HOLDS = 1e-6
 """Excess over the commanded force that counts as rounding, as a share of it."""
 
-FACTORS = np.linspace(0.0, 2.0, 9)
-"""Multiples of the set whose forces are given."""
+MOST, POINTS = 2.0, 9
+"""Largest multiple of the set whose force is given, and how many from zero on."""
 
 CASES = 100_000
 """Random cases that every priced carry is held against."""
@@ -465,6 +465,7 @@ def robust_price(
     leader: int = 0,
     cases: int = CASES,
     threads: int = 1,
+    points: int = POINTS,
 ) -> RobustPrice:
     """The cost of robustness against the workcell's set for a carry.
 
@@ -474,6 +475,7 @@ def robust_price(
         leader: index of the arm that keeps its place.
         cases: how many.
         threads: that hold them against the forces, 0 for one per core.
+        points: how many multiples of the set.
 
     Raises:
         SettingsError: the set leaves no friction or patch, or there is no such arm.
@@ -482,7 +484,8 @@ def robust_price(
     uncertainty = workcell.uncertainty
     (_, motion), limit = thinned(carry), workcell.task.reference_force
     force = model.robust_force(motion, uncertainty, leader)
-    factors = FACTORS[allowed_factor(workcell, uncertainty) > FACTORS]
+    factors = np.linspace(0.0, MOST, points)
+    factors = factors[factors < allowed_factor(workcell, uncertainty)]
     peak = model.price(motion, factors, leader, uncertainty)
     held = np.isfinite(peak).all(axis=1)
     return RobustPrice(

@@ -50,6 +50,7 @@ from hybrid_opt.timing.records import (
 )
 from hybrid_opt.timing.solve import LEAST_SPEED, time_path
 from symbolic.array import Array
+from symbolic.records import Workcell
 
 if TYPE_CHECKING:
     from scipy import sparse
@@ -108,13 +109,19 @@ def time_with_jerk(
     return replace(problem.solve(), without=fastest.duration)
 
 
+def kept_jerk(workcell: Workcell, limits: TimingLimits) -> JerkLimits | None:
+    """The cell's limits on jerk that timings within `limits` keep; None where it states none, and
+    where limited robust forces have no slopes."""
+    slopes = is_squeezed(workcell) or not limits.robust
+    return JerkLimits.of(workcell) if slopes else None
+
+
 def drive_with_jerk(model: TimingModel, x: Array) -> JerkTiming | None:
     """A drivable carry x (n_var,) within its own force limit and the cell's limits on jerk; None
-    where the cell limits no jerk, and where limited robust forces have no slopes."""
-    jerk, limits = JerkLimits.of(model.workcell), model.drive_limits(float(x[-1]))
-    if jerk is None or (limits.robust and not is_squeezed(model.workcell)):
-        return None
-    return time_with_jerk(model, x, limits, jerk)
+    where there are none to keep, see `kept_jerk`."""
+    limits = model.drive_limits(float(x[-1]))
+    jerk = kept_jerk(model.workcell, limits)
+    return None if jerk is None else time_with_jerk(model, x, limits, jerk)
 
 
 class _Problem:

@@ -22,8 +22,8 @@ from hybrid_opt.cell import Cell
 from hybrid_opt.errors import WitnessError
 from hybrid_opt.job.smooth import driven_timing, without_jumps
 from hybrid_opt.robust.squeeze import Squeeze, SqueezeSettings, commanded_forces
-from hybrid_opt.timing.analysis import closest_to_reference_timing
-from hybrid_opt.timing.records import JerkLimits, Timing
+from hybrid_opt.timing.jerk import kept_jerk
+from hybrid_opt.timing.records import Timing
 from hybrid_opt.witness.box import refuse_motion_at_ends
 from hybrid_opt.witness.scene import ArmSettings
 from symbolic.array import Array
@@ -379,19 +379,13 @@ def pressed_reference(cell: Cell, carry: Carry, leader: int = 0) -> tuple[Refere
 
 
 def driven_carry(cell: Cell, x: Array) -> Carry:
-    """A decision vector's carry from rest to rest as a job drives it: the fastest within its force
-    limit where it has one, else the closest to the reference speeds, without jumps of acceleration.
+    """A decision vector's carry from rest to rest as a job drives it.
 
     Raises:
         WitnessError: there is none.
-        JobError: there is none without jumps.
+        JobError: there is none without jumps of acceleration.
     """
-    model, workcell = cell.timing_model, cell.workcell
-    if workcell.task.time_law == "optimal":
-        timing = driven_timing(model, x)
-    else:
-        timing = closest_to_reference_timing(model, x)
-    return exported_carry(cell, timing)
+    return exported_carry(cell, driven_timing(cell.timing_model, x))
 
 
 def exported_carry(cell: Cell, timing: Timing) -> Carry:
@@ -403,7 +397,7 @@ def exported_carry(cell: Cell, timing: Timing) -> Carry:
     """
     if not timing.ok or timing.carry is None:
         raise WitnessError(f"the trajectory cannot be driven: {timing.reason}")
-    jerk = JerkLimits.of(cell.workcell) if cell.workcell.has_facing_pads else None
+    jerk = kept_jerk(cell.workcell, timing.limits)
     found = without_jumps(cell.timing_model, timing, jerk).carry
     assert found is not None, "a timing without jumps has a carry"
     return found

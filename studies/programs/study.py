@@ -191,7 +191,7 @@ def study_text(root: Path, with_paper: bool, brief: bool = False) -> str:
     tables = study_tables(
         summary,
         read_summary(root / DRIVABLE) if beside else None,
-        limits_on_jerk(root / DRIVABLE if beside else root),
+        limits_on_jerk(root / DRIVABLE if beside else root, summary.recommendation),
         read_simulations(root),
         with_paper,
     )

@@ -27,18 +27,18 @@ from hybrid_opt.job.compliance import (
     skew_text,
     skewed,
 )
-from hybrid_opt.job.plan import JobModel
+from hybrid_opt.job.plan import JobModel, pressed
 from hybrid_opt.job.records import Job
+from hybrid_opt.job.smooth import driven_limits, driven_timing
 from hybrid_opt.progress import Progress
 from hybrid_opt.robust.force import (
     LARGEST_FACTOR,
     SCREENED,
-    RobustForce,
     RobustModel,
-    allowed_factor,
     pressing_model,
+    robust_price,
 )
-from hybrid_opt.robust.squeeze import SqueezeSettings, commanded_forces
+from hybrid_opt.robust.squeeze import SqueezeSettings
 from hybrid_opt.store.files import read_bytes
 from hybrid_opt.store.json_records import to_json
 from hybrid_opt.store.trajectory_file import Replay, StoredTrajectory, read_trajectory, replay
@@ -134,14 +134,14 @@ def _planned(
 def _chosen(
     model: TimingModel, stored: StoredTrajectory, use: str | None, force: float | None
 ) -> Timing:
-    if force is None and model.workcell.task.time_law == "optimal":
-        force = float(stored.x[-1])  # what the carry was found within
+    force = driven_limits(model, stored.x).force if force is None else force
     chosen = use or ("closest" if force is None else "force")
+    limits = TimingLimits(reference_speed=chosen == "closest")
     if chosen == "force":
         if force is None:
             raise SettingsError("--use force needs --force-limit")
-        return time_path(model, stored.x, model.drive_limits(force))
-    return time_path(model, stored.x, TimingLimits(reference_speed=chosen == "closest"))
+        limits = model.drive_limits(force)
+    return time_path(model, stored.x, limits)
 
 
 def _report(job: Job, stiffness: float) -> str:
@@ -176,50 +176,56 @@ def robust_forces(options: argparse.Namespace) -> int:
 
 
 def _robust_forces(cell: Cell, x: Array, options: argparse.Namespace) -> int:
-    workcell, leader = cell.workcell, options.leader - 1
-    uncertainty, carry = workcell.uncertainty, cell.carry(x)
+    workcell, leader, model = cell.workcell, options.leader - 1, cell.timing_model
+    timing = driven_timing(model, x)
+    if timing.carry is None or not timing.ok:
+        raise SettingsError(f"the trajectory cannot be driven: {timing.reason}")
+    uncertainty = workcell.uncertainty
     named = "the workcell's [uncertainty]" if uncertainty.stated else NOT_STATED
-    print(f"{workcell.name}: arm {options.leader} leads, the other's force is commanded")
+    print(
+        f"{workcell.name}: {timing.duration:.3f} s as robots drive it; arm {options.leader} leads, "
+        "the other's force is commanded"
+    )
     print(f"  the set is {named}: {uncertainty}", flush=True)
-    model = pressing_model(workcell)
-    held = model.robust_force(carry, uncertainty, leader)
-    print(f"  least peak forces, nothing uncertain {_both(held.nominal.max(axis=0))} N")
-    print(f"  peak forces that hold in all cases   {_both(held.peak)} N")
-    print(f"  reference forces                     {_both(workcell.task.reference_force)} N")
-    squeeze = commanded_forces(workcell, carry, SqueezeSettings(leader=leader))[1]
-    print(f"  commanded: {squeeze.account}", flush=True)
+    held = pressed(JobModel(cell.compiled, model), timing, SqueezeSettings(leader=leader))
+    whose = "the whole job" if held.job else f"the carry alone (no whole job: {held.problem})"
+    print(f"  commanded of {whose}: {held.squeeze.account}", flush=True)
     exit_code = 0
     if uncertainty.is_empty:
         print("  nothing is uncertain, so there is nothing to check: state what may be off")
     else:
-        exit_code = _priced(model, carry, held, options)
+        exit_code = _priced(pressing_model(workcell), timing.carry, options)
     for text in [] if options.force_limit is None else _timed(cell, x, options.force_limit):
         print(f"  {text}")
     return exit_code
 
 
-def _priced(
-    model: RobustModel, carry: Carry, held: RobustForce, options: argparse.Namespace
-) -> int:
+def _priced(model: RobustModel, carry: Carry, options: argparse.Namespace) -> int:
     """Print the price of a set that is not empty, and random cases of it; returns the exit code."""
-    reference, leader = model.workcell.task.reference_force, held.leader
-    largest = model.largest_factor(carry, reference, leader)
+    price = robust_price(
+        model,
+        carry,
+        np.random.default_rng(options.seed),
+        options.leader - 1,
+        options.cases,
+        threads=0,
+        points=options.points,
+    )
+    check, largest = price.check, price.largest_factor
     most = f"at least {LARGEST_FACTOR:g}" if largest == LARGEST_FACTOR else f"{largest:.3f}"
-    print(f"  they allow {most} times the set")
-    factors = np.linspace(0.0, 2.0, options.points)
-    factors = factors[factors < allowed_factor(model.workcell, held.uncertainty)]
+    print(f"  peak forces of the carry that hold in all cases: {_both(price.commanded)} N")
+    print(f"  the reference forces {_both(price.limit)} N allow {most} times the set")
     rows = [("times the set", "peak force 1 [N]", "peak force 2 [N]")]
     rows += [
         (number(factor, 2), number(peak[0], 2), number(peak[1], 2))
-        for factor, peak in zip(factors, model.price(carry, factors, leader), strict=True)
+        for factor, peak in zip(price.factors, price.peak, strict=True)
     ]
     print(f"\n{text_table(rows, left=())}")
-    check = model.check(carry, held, options.cases, np.random.default_rng(options.seed), threads=0)
     verdict = "all hold" if check.holds else f"{check.failing} FAIL"
     most = "at most " if check.closest == SCREENED else ""
     print(
         f"\n  {check.cases} random cases (seed {options.seed}): {verdict}; the hardest needs "
-        f"{most}{100.0 * check.closest:.2f} % of the commanded force"
+        f"{most}{100.0 * check.closest:.2f} % of the least force that holds in all cases"
     )
     return 0 if check.holds else EXIT_DOES_NOT_HOLD
 

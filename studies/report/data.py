@@ -32,10 +32,10 @@ from hybrid_opt.metaheuristics.registry import title
 from hybrid_opt.recommending.comparison import level_force
 from hybrid_opt.store.trajectory_file import read_trajectory
 from hybrid_opt.timing.document import TimingDocument, read_timing
-from hybrid_opt.timing.records import Timing, TimingLimits
+from hybrid_opt.timing.records import TimingLimits
 from hybrid_opt.work.service import Executor, LocalExecutor, Service, answer_all, called
 from studies.report.drawn import DrawnCarry, ReachMap, reach_map
-from studies.report.page_carries import RECOMMENDED_LABEL, DrawnJob, drawn_job
+from studies.report.page_carries import RECOMMENDED_LABEL, DrawnJob, drawn_job, recommended_job
 from studies.study.drivable import drivable_root, is_drivable
 from studies.study.simulation import StoredSimulation, read_simulations
 from studies.study.summary import CampaignSummary, ReplicaFigures, read_summary
@@ -160,7 +160,8 @@ class ReportData(Experiment):
         level_force: largest of the forces of `force_kind` that hold the level payload at rest [N].
         drivable: the drivable experiment, None without one.
         recommended: decision vector of the carry to run, None without one.
-        jerk: what limits on jerk cost the selected carries, None without limits.
+        jerk: what limits on jerk cost the selected carries and the recommended one, None without
+            limits.
         branches: how the start branches were decided, None where the workcell decides them.
         simulations: of the carries that were driven in the simulated cell, empty without.
         jobs: the whole jobs around the recommended, the hand-made and the selected trajectories.
@@ -192,16 +193,28 @@ class ReportData(Experiment):
         return (self.initial, *(a.best for a in self.algorithms if a.best is not None))
 
     @property
-    def recommended_timing(self) -> Timing | None:
-        """The recommended carry as its job drives it, None without a job."""
-        return next((job.timing for job in self.jobs if job.label == RECOMMENDED_LABEL), None)
+    def recommended_job(self) -> DrawnJob | None:
+        """The job around the recommended carry; None without such a carry."""
+        return next((job for job in self.jobs if job.label == RECOMMENDED_LABEL), None)
 
     @property
     def recommended_carry(self) -> DrawnCarry | None:
-        """The same as what is drawn of it."""
-        timing = self.recommended_timing
-        carry = None if timing is None else timing.carry
+        """The recommended carry as robots drive it, None where they cannot."""
+        job = self.recommended_job
+        carry = None if job is None or job.timing is None else job.timing.carry
         return None if carry is None else DrawnCarry(RECOMMENDED_LABEL, carry)
+
+    @property
+    def recommended_objectives(self) -> Array | None:
+        """(2,) the first two objectives of the recommended carry as robots drive it; None where
+        they are neither both robots' forces nor time and force."""
+        found, reference = self.summary.recommendation, self.workcell.task.reference_force
+        if found is not None and self.objectives[:2] == PAPER_OBJECTIVES:
+            return np.asarray(found.peak_force / reference)
+        if found is not None and self.alone:
+            force = float((found.limited_force / reference).max())
+            return np.array([found.duration / duration_unit(self.workcell), force])
+        return None
 
 
 def gather(results: CampaignResults, executor: Executor | None = None) -> ReportData:
@@ -221,7 +234,7 @@ def gather(results: CampaignResults, executor: Executor | None = None) -> Report
     drivable, jerk, recommended = None, None, None
     if (place / CONFIGURATION).exists():
         drivable = _experiment(read_campaign(place), select=False)
-        jerk = limits_on_jerk(place)
+        jerk = limits_on_jerk(place, first.summary.recommendation)
     if drivable is not None and first.summary.recommendation is not None:
         recommended = read_trajectory(results.root / RECOMMENDED).x
     if not (results.root / TIMING).exists():
@@ -235,7 +248,7 @@ def gather(results: CampaignResults, executor: Executor | None = None) -> Report
         raise ResultsError(f"{results.root / SUMMARY}: damaged: does not fit the fronts beside it")
     geometry = build_geometry(results.workcell)
     calls: list[Callable[[Sequence[ReadyCell]], Any]] = [partial(_reach, geometry)]
-    calls += _job_requests(carries, recommended, first)
+    calls += _job_requests(carries, recommended)
     alone = results.workcell.task.time_law == "optimal"
     # Jobs are what robots are told: by the cell that they drive.
     cells = cells_of(first.files, results.objectives, alone)
@@ -329,14 +342,16 @@ def _job(label: str, x: Array, limits: TimingLimits, cells: Sequence[ReadyCell])
     return drawn_job(cells[-1].jobs, label, x, limits)
 
 
+def _recommended_job(x: Array, cells: Sequence[ReadyCell]) -> DrawnJob:
+    return recommended_job(cells[-1].jobs, x)
+
+
 def _job_requests(
-    carries: Sequence[DrawnCarry], recommended: Array | None, first: Experiment
+    carries: Sequence[DrawnCarry], recommended: Array | None
 ) -> Iterator[Callable[[Sequence[ReadyCell]], DrawnJob]]:
     """The recommended carry's job, then those of hand-made and selected ones."""
     if recommended is not None:
-        n_var, force = first.workcell.task.n_var, float(recommended[-1])
-        within = TimingLimits(force=force, robust=first.force_kind.robust)
-        yield partial(_job, RECOMMENDED_LABEL, recommended[:n_var], within)
+        yield partial(_recommended_job, recommended)
     limits = TimingLimits(reference_speed=True)
     for carry in carries:
         yield partial(_job, carry.label, carry.x, limits)

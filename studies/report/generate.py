@@ -101,19 +101,21 @@ def report_tables(data: ReportData, with_paper: bool) -> tuple[Table, ...]:
     beside = None if data.drivable is None or data.alone else data.drivable.summary
     found = list(study_tables(data.summary, beside, data.jerk, data.simulations, with_paper))
     robots = data.summary.robots
-    found.append(timings([*data.timings, *_driven(data)], robots))
+    timed = [*data.timings, *_driven(data)]
+    found.append(timings(timed, robots))
     found += [phases(data.jobs, robots)] if data.jobs else []
-    if any(timed.margins for _, timed in data.timings):
-        found.append(margins(data.timings))
+    if any(document.margins for _, document in timed):
+        found.append(margins(timed))
     return tuple(found)
 
 
 def _driven(data: ReportData) -> list[tuple[str, TimingDocument]]:
     """The recommended carry's timing, where it has one."""
-    if data.recommended_timing is None:
+    job = data.recommended_job
+    if job is None or job.timing is None:
         return []
-    found = {"as robots drive it": stored_timing(data.recommended_timing)}
-    return [(RECOMMENDED_LABEL, TimingDocument(math.nan, found, (), None))]
+    found = {"as robots drive it": stored_timing(job.timing)}
+    return [(RECOMMENDED_LABEL, TimingDocument(math.nan, found, job.margins, None))]
 
 
 def insert_tables(root: Path, document: Path) -> None:

@@ -4,7 +4,7 @@ assumed, and what is saved. Each is worked out for itself, in any process."""
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -21,6 +21,7 @@ from hybrid_opt.job.records import Job, Phase
 from hybrid_opt.job.smooth import driven_timing
 from hybrid_opt.timing.analysis import drivable_timing
 from hybrid_opt.timing.records import JerkLimits, Timing, TimingLimits
+from hybrid_opt.timing.robustness import Margin, robustness_margins
 from hybrid_opt.timing.solve import time_path
 from hybrid_opt.work.service import Emit
 from symbolic.array import Array
@@ -54,7 +55,8 @@ class DrawnJob:
             centres of pressure.
         torque_use, contact_torque_use: (joints,) largest use of each joint's torque, of all loads
             and of the contacts alone [-].
-        timing: of its carry.
+        timing: of its carry; of the recommended one also without a job.
+        margins: of the recommended one, how wrong the cell's description may be.
     """
 
     label: str
@@ -67,6 +69,19 @@ class DrawnJob:
     torque_use: Array | None = None
     contact_torque_use: Array | None = None
     timing: Timing | None = None
+    margins: tuple[Margin, ...] = ()
+
+
+def recommended_job(model: JobModel, x: Array) -> DrawnJob:
+    """The job around the recommended carry x (n_var,), and the carry as robots drive it."""
+    try:
+        timing = driven_timing(model.timing, x)
+    except DualArmError as error:
+        return DrawnJob(RECOMMENDED_LABEL, str(error))
+    job = drawn(model, RECOMMENDED_LABEL, timing, within_jerk=True)
+    if timing.carry is None:
+        return job
+    return replace(job, timing=timing, margins=robustness_margins(model.timing, timing.carry))
 
 
 def drawn_job(model: JobModel, label: str, x: Array, limits: TimingLimits) -> DrawnJob:

@@ -13,7 +13,6 @@ from matplotlib.ticker import MaxNLocator
 
 from hybrid_opt.display.table import counted
 from hybrid_opt.evaluate.evaluations import FEASIBLE, REASONS
-from hybrid_opt.evaluate.objectives import PAPER_OBJECTIVES
 from hybrid_opt.indicators.metrics import best_so_far, front_of
 from hybrid_opt.indicators.statistics import attainment_surfaces
 from studies.report.data import AlgorithmRuns, Experiment, ReportData
@@ -38,7 +37,7 @@ QUARTILES = (25.0, 75.0)
 def fronts(data: ReportData) -> Figure:
     """Feasible candidates and non-dominated ones of each algorithm's run with the largest
     hypervolume (paper Figure 7). The cross is the level payload at rest, the star the planned
-    forces of the recommended carry as robots drive it."""
+    forces, or time and force, of the recommended carry as robots drive it."""
     figure = new_figure(FULL_WIDTH, 0.5 * FULL_WIDTH)
     panels = figure.subplots(1, 2)
     found = [a.shown.front.objectives for a in data.solved]
@@ -55,13 +54,11 @@ def fronts(data: ReportData) -> Figure:
     for axes in panels:
         axes.step(*union.T, **joined, label="non-dominated of all")
         _objectives(axes, data)
-    choice = data.summary.recommendation
-    if choice is not None and data.objectives[:2] == PAPER_OBJECTIVES:
-        forces = choice.peak_force / data.workcell.task.reference_force
-        panels[0].plot(*forces, **RECOMMENDED.marks(9.0, MARKED), label="recommended, driven")
+    if not data.alone:
+        _recommended(panels[0], data)
     panel_label(panels[0], "a", "all feasible candidates")
     panel_label(panels[1], "b", "the fronts")
-    _zoom(panels[1], found, data.static)
+    _zoom(panels[1], data, found)
     legend_below(figure, panels[0], 3)
     return figure
 
@@ -93,7 +90,7 @@ def attainment(data: ReportData) -> Figure:
                 )
         _objectives(axes, data)
         panel_label(axes, letter, f"{text}, {counted(max(len(f) for f in group), 'replica')}")
-        _zoom(axes, [points for found in group for points in found], data.static)
+        _zoom(axes, data, [points for found in group for points in found])
     legend_below(figure, panels[0], 3)
     return figure
 
@@ -117,7 +114,7 @@ def polish(data: ReportData) -> Figure:
         look = series(algorithm.index).marks(4.0, opened=not front.polished)
         left.plot(*front.objectives[:, :2].T, **look, label=f"{algorithm.title}: {text}")
     _objectives(left, data)
-    _zoom(left, drawn, data.static)
+    _zoom(left, data, drawn)
     left.legend(loc="upper right")
     panel_label(left, "a", "fronts of the representative runs")
     _paired(right, data.algorithms)
@@ -147,7 +144,8 @@ def _paired(axes: Axes, algorithms: Sequence[AlgorithmRuns]) -> None:
 
 
 def _objectives(axes: Axes, data: ReportData) -> None:
-    """The axes of the first two objectives, with the level payload at rest."""
+    """The axes of the first two objectives, with the level payload at rest, and the recommended
+    carry where its front is drawn."""
     if np.isfinite(data.static[:2]).all():
         look: dict[str, Any] = {
             "color": "black",
@@ -156,17 +154,27 @@ def _objectives(axes: Axes, data: ReportData) -> None:
             "zorder": 5,
         }
         axes.plot(*data.static[:2], "+", **look, label="level payload at rest")
+    if data.alone:
+        _recommended(axes, data)
     axes.set_xlabel(f"{data.objective_titles[0]} [-]")
     axes.set_ylabel(f"{data.objective_titles[1]} [-]")
     # Fronts span little, so that labels are long; steps of 2.5 would make them longer.
     axes.xaxis.set_major_locator(MaxNLocator(8, steps=[1, 2, 5, 10]))
 
 
-def _zoom(axes: Axes, sets: Sequence[Array], static: Array) -> None:
-    """Limits around fronts, their corner at rest included."""
+def _recommended(axes: Axes, data: ReportData) -> None:
+    """The star of the recommended carry, where its objectives are those of the axes."""
+    if (at := data.recommended_objectives) is not None:
+        axes.plot(*at, **RECOMMENDED.marks(9.0, MARKED), label="recommended, driven")
+
+
+def _zoom(axes: Axes, data: ReportData, sets: Sequence[Array]) -> None:
+    """Limits around fronts, their corner at rest and the carry recommended from them included."""
     points = [np.atleast_2d(points)[:, :2] for points in sets if len(points)]
-    if np.isfinite(static[:2]).all():
-        points.append(static[None, :2])
+    if np.isfinite(data.static[:2]).all():
+        points.append(data.static[None, :2])
+    if data.alone and (at := data.recommended_objectives) is not None:
+        points.append(at[None])
     every = np.concatenate(points)
     low, high = every.min(axis=0), every.max(axis=0)
     room = np.maximum(0.07 * (high - low), 1e-4)

@@ -37,6 +37,7 @@ from hybrid_opt.robust.squeeze import Part, account
 from hybrid_opt.store.files import write_json
 from hybrid_opt.store.json_records import read_record, to_json
 from hybrid_opt.store.trajectory_file import write_trajectory
+from hybrid_opt.timing.jerk import kept_jerk
 from hybrid_opt.timing.robustness import Margin
 from hybrid_opt.work.service import (
     LocalExecutor,
@@ -101,6 +102,7 @@ class StoredRecommendation:
         peak_force: largest planned normal force of each robot [N].
         robust_force: likewise in every case of the workcell's uncertainty, where force limits are
             about these; else null.
+        without_jerk: duration without the cell's limits on jerk [s], null where there are none.
         squeeze, squeeze_reason: largest normal force to command of each robot [N], and why.
         payload_limit: payload that the robots bear on the same motion, nothing uncertain [kg].
         rivals: other paths at the same force and in the same time, the hand-made one first.
@@ -134,6 +136,7 @@ class StoredRecommendation:
     durations: ForceTable
     price: RobustPrice | None = None
     robust_force: Pair | None = None
+    without_jerk: Figure = math.nan
 
     @property
     def force_kind(self) -> ForceKind:
@@ -275,7 +278,17 @@ def recommend_from(
         durations=durations,
         price=price,
         robust_force=found.limited_force if found.force_kind.robust else None,
+        without_jerk=_without_jerk(cell, found),
     )
+
+
+def _without_jerk(cell: ho.Cell, found: Recommendation) -> float:
+    """Duration of the recommended path within the same force without limits on jerk [s], NaN where
+    it keeps none."""
+    limits = found.timing.limits
+    if kept_jerk(cell.workcell, limits) is None:
+        return math.nan
+    return ho.time_path(cell, found.x, limits).duration
 
 
 def _hand_made(cell: ho.Cell) -> Array:

@@ -82,7 +82,7 @@ def study_tables(
     Args:
         summary: of its first experiment.
         drivable: of the drivable experiment beside that, None without one.
-        jerk: what limits on jerk cost, see `studies.study.drivable.limits_on_jerk`.
+        jerk: what limits on jerk cost, see `studies.study.timing.limits_on_jerk`.
         simulations: carries in the simulated cell.
         with_paper: whether figures that the paper states of its own rack stand beside ours.
     """
@@ -475,7 +475,9 @@ def margins(timed: LabelledTimings) -> Table:
         "How far assumptions may be off before a carry fails.",
         ("assumption", "nominal", *(label or "limit" for label, _ in judged)),
         tuple(rows),
-        "Under the timing closest to the reference speed. In brackets: what fails beyond that.",
+        "Under the timing closest to the reference speed, the recommended carry's as robots drive "
+        "it; forces allocated anew, up to the reference forces. In brackets: what fails beyond "
+        "that.",
     )
 
 

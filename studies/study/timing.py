@@ -3,6 +3,7 @@ cost those carries."""
 
 from __future__ import annotations
 
+import math
 from functools import partial
 from pathlib import Path
 
@@ -18,9 +19,10 @@ from hybrid_opt.store.files import write_json
 from hybrid_opt.store.json_records import to_json
 from hybrid_opt.store.trajectory_file import read_trajectory
 from hybrid_opt.timing.analysis import timed_trajectory
-from hybrid_opt.timing.document import StoredJerk, TimingDocument, read_timing, timing_document
+from hybrid_opt.timing.document import TimingDocument, read_timing, timing_document
 from hybrid_opt.timing.records import TimingStatus
 from hybrid_opt.work.service import Emit, Service, answer_all
+from studies.study.recommendation import StoredRecommendation
 from studies.study.summary import read_summary
 from symbolic.array import Array
 
@@ -72,38 +74,42 @@ def _document(cells: tuple[ReadyCell, ...], request: Request, emit: Emit) -> Tim
     return timing_document(timed_trajectory(driven, *request, own=own))
 
 
-def limits_on_jerk(root: Path) -> Table | None:
-    """Costs of the cell's limits on jerk for the selected carries, the hand-made one's first; None
-    where no jerk is limited.
+def limits_on_jerk(root: Path, recommended: StoredRecommendation | None) -> Table | None:
+    """Costs of the cell's limits on jerk for the selected carries, the hand-made one's first, and
+    for the recommended one; None where no jerk is limited.
 
     Args:
         root: results folder of the drivable experiment.
+        recommended: the carry to run, None without one.
 
     Raises:
         ResultsError: a timing is damaged.
     """
-    found: dict[str, list[StoredJerk]] = {}
+    found: dict[str, list[tuple[float, float]]] = {}
     for path in sorted((root / TIMING).rglob("*.json")):
         jerk = read_timing(path).jerk
         if jerk is not None and jerk.status == TimingStatus.OK:
-            found.setdefault(file_label(path.relative_to(root / TIMING)), []).append(jerk)
+            label = file_label(path.relative_to(root / TIMING))
+            found.setdefault(label, []).append((jerk.without, jerk.duration))
+    if recommended is not None and math.isfinite(recommended.without_jerk):
+        found["recommended"] = [(recommended.without_jerk, recommended.duration)]
     if not found:
         return None
     rows = []
     for label, timings in found.items():
-        within = np.array([jerk.duration for jerk in timings])
-        without = np.array([jerk.without for jerk in timings])
+        without, within = np.array(timings).T
         cost = 100.0 * (within / without - 1.0)
         durations = (number(float(np.median(each)), 3) for each in (without, within))
         costs = (number(each, 1) for each in (float(np.median(cost)), float(cost.max())))
         rows.append((label, str(len(timings)), *durations, *costs))
     return Table(
         "jerk",
-        "What limits on jerk cost the selected drivable carries.",
+        "What limits on jerk cost the selected drivable carries and the recommended one.",
         ("limits on jerk", "carries", "without [s]", "within [s]", "cost [%]", "at most [%]"),
         tuple(rows),
         "Joints and payload within their largest jerk, at rest without acceleration at both ends. "
-        "Medians over the carries.",
+        "Medians over the carries. The recommended one within as in its job, in whole cycles of "
+        "the controllers.",
     )
 
 

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+import hybrid_opt as ho
 from hybrid_opt.store.trajectory_file import write_trajectory
+from studies import export
 from studies.robust import main
 from symbolic.read.cell import load
 from tests.symbolic.cells import RACK
@@ -45,13 +48,34 @@ def test_tells_forces_price_and_check(tmp_path: Path, capsys: pytest.CaptureFixt
     planned, sure = (float(line.split()[-2]) for line in lines[-2:])
     assert planned < sure
     lines = lines[:-2]
-    nominal, robust = (np.array(line.split()[-4:-1:2], dtype=float) for line in lines[2:4])
-    assert (robust > 1.1 * nominal).all()
-    assert lines[10].split()[-2:] == lines[2].split()[-4:-1:2]
-    assert lines[11].split()[-2:] == lines[3].split()[-4:-1:2]
+    robust = lines[3].split()[-4:-1:2]
+    priced = [line.split() for line in lines if line.split()[:1] in (["0.00"], ["1.00"])]
+    nominal, whole = (np.array(row[1:], dtype=float) for row in priced)
+    assert (whole > 1.1 * nominal).all()
+    assert priced[1][1:] == robust
+    # A job lifts and stops as well, and its forces are smooth.
+    assert float(lines[2].split()[-2]) >= float(robust[1])
     assert "200 random cases (seed 1): all hold" in lines[-1]
     # What is seen to need no more is not looked at closer.
     assert ("needs at most " in lines[-1]) == ("97.00 %" in lines[-1])
+
+
+def test_the_force_is_that_of_the_exported_job(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Timed within its force limit and the cell's limits on jerk, and lifted."""
+    cell = ho.example("rack").drivable()
+    x = cell.initial
+    x[-1] = 60.0
+    path = tmp_path / "t.json"
+    write_trajectory(path, cell.compiled, x, {}, {"algorithm": "hand"})
+    assert main([str(path), "--cases", "10", "--points", "2"]) == 0
+    told = capsys.readouterr().out.splitlines()
+    assert export.main([str(path), "--target", "json", "--output", str(tmp_path)]) == 0
+    (manifest,) = tmp_path.rglob("manifest.json")
+    force = json.loads(manifest.read_text("utf-8"))["squeeze"]["force"]
+    assert told[2].startswith("  commanded of the whole job: ")
+    assert told[2].endswith(f" = {force:.1f} N")
 
 
 def test_without_uncertainty_a_usual_set_is_taken_and_told(

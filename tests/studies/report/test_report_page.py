@@ -283,6 +283,18 @@ def test_the_page_begins_with_the_recommended_carry(
     assert html.escape(words.headline) in text
 
 
+def test_tables_of_carries_have_the_recommended_one(data: ReportData) -> None:
+    tables = {table.name: table for table in report_tables(data, with_paper=False)}
+    found = data.summary.recommendation
+    assert found is not None
+    assert tables["margins"].header[-1] == "recommended"
+    for name in ("table2_selected", "time_against_force", "jerk", "timing", "phases"):
+        assert any(row[0].startswith("recommended") for row in tables[name].rows), name
+    (row,) = (row for row in tables["jerk"].rows if row[0] == "recommended")
+    assert row[1:4] == ("1", f"{found.without_jerk:.3f}", f"{found.duration:.3f}")
+    assert found.without_jerk < found.duration
+
+
 def test_the_first_look_is_not_squashed(document: dict[str, Any], data: ReportData) -> None:
     for view in document["views"]:
         for first, whole in zip(view["first"], view["whole"], strict=True):
