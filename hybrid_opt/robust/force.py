@@ -146,6 +146,12 @@ class SampledCheck:
         """Whether none slips and no centre of pressure leaves its patch."""
         return self.failing == 0
 
+    @property
+    def hardest(self) -> str:
+        """`closest` in words."""
+        most = "at most " if self.closest == SCREENED else ""
+        return f"{most}{100.0 * self.closest:.2f} %"
+
 
 class RobustModel:
     """The compiled function behind robust forces of one workcell's carries.
