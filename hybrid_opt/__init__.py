@@ -12,142 +12,78 @@ Names are imported when they are first used, so that `import hybrid_opt` takes n
 
 from __future__ import annotations
 
+import ast
 from importlib import import_module
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hybrid_opt.shown import shown_by
 
 if TYPE_CHECKING:
     __version__: str
-    from hybrid_opt.branches import search_branches
-    from hybrid_opt.bundles.bundle import Origin, export
-    from hybrid_opt.bundles.job_file import BundleOptions
-    from hybrid_opt.carry import Carry
-    from hybrid_opt.catalogue import algorithms, example, load, objectives, targets
-    from hybrid_opt.cell import Cell
-    from hybrid_opt.door import polish, save, search, time_every_way, time_path, time_with_jerk
-    from hybrid_opt.evaluate.objectives import Objective
-    from hybrid_opt.front import Front
-    from hybrid_opt.gripping import Grip, propose_grip
-    from hybrid_opt.job.plan import plan_job
-    from hybrid_opt.job.records import Job
-    from hybrid_opt.metaheuristics.run import SearchSettings
-    from hybrid_opt.metaheuristics.settings import GeneticSettings, MopsoSettings
-    from hybrid_opt.polishing.settings import PolishSettings
-    from hybrid_opt.proposing.proposal import Proposal, ProposeSettings, propose
-    from hybrid_opt.recommending.choice import Wish
-    from hybrid_opt.recommending.recommendation import Recommendation, recommend
-    from hybrid_opt.robust.squeeze import SqueezeSettings
-    from hybrid_opt.sensitivity import Sensitivities, sensitivities
-    from hybrid_opt.sweeping import Sweep, sweep
-    from hybrid_opt.timing.records import JerkLimits, JerkTiming, Timing, TimingLimits
-    from hybrid_opt.workbench.browser import live
-    from symbolic.errors import DualArmError
-    from symbolic.records import Workcell
-
-__all__ = [
-    "BundleOptions",
-    "Carry",
-    "Cell",
-    "DualArmError",
-    "Front",
-    "GeneticSettings",
-    "Grip",
-    "JerkLimits",
-    "JerkTiming",
-    "Job",
-    "MopsoSettings",
-    "Objective",
-    "Origin",
-    "PolishSettings",
-    "Proposal",
-    "ProposeSettings",
-    "Recommendation",
-    "SearchSettings",
-    "Sensitivities",
-    "SqueezeSettings",
-    "Sweep",
-    "Timing",
-    "TimingLimits",
-    "Wish",
-    "Workcell",
-    "algorithms",
-    "example",
-    "export",
-    "live",
-    "load",
-    "objectives",
-    "plan_job",
-    "polish",
-    "propose",
-    "propose_grip",
-    "recommend",
-    "save",
-    "search",
-    "search_branches",
-    "sensitivities",
-    "sweep",
-    "targets",
-    "time_every_way",
-    "time_path",
-    "time_with_jerk",
-]
+    from hybrid_opt.branches import search_branches as search_branches
+    from hybrid_opt.bundles.bundle import Origin as Origin
+    from hybrid_opt.bundles.bundle import export as export
+    from hybrid_opt.bundles.job_file import BundleOptions as BundleOptions
+    from hybrid_opt.carry import Carry as Carry
+    from hybrid_opt.catalogue import algorithms as algorithms
+    from hybrid_opt.catalogue import example as example
+    from hybrid_opt.catalogue import load as load
+    from hybrid_opt.catalogue import objectives as objectives
+    from hybrid_opt.catalogue import targets as targets
+    from hybrid_opt.cell import Cell as Cell
+    from hybrid_opt.door import polish as polish
+    from hybrid_opt.door import save as save
+    from hybrid_opt.door import search as search
+    from hybrid_opt.door import time_every_way as time_every_way
+    from hybrid_opt.door import time_path as time_path
+    from hybrid_opt.door import time_with_jerk as time_with_jerk
+    from hybrid_opt.evaluate.objectives import Objective as Objective
+    from hybrid_opt.front import Front as Front
+    from hybrid_opt.gripping import Grip as Grip
+    from hybrid_opt.gripping import propose_grip as propose_grip
+    from hybrid_opt.job.plan import plan_job as plan_job
+    from hybrid_opt.job.records import Job as Job
+    from hybrid_opt.metaheuristics.mopso import MopsoSettings as MopsoSettings
+    from hybrid_opt.metaheuristics.registry import GeneticSettings as GeneticSettings
+    from hybrid_opt.metaheuristics.run import SearchSettings as SearchSettings
+    from hybrid_opt.polishing.settings import PolishSettings as PolishSettings
+    from hybrid_opt.proposing.proposal import Proposal as Proposal
+    from hybrid_opt.proposing.proposal import ProposeSettings as ProposeSettings
+    from hybrid_opt.proposing.proposal import propose as propose
+    from hybrid_opt.recommending.choice import Wish as Wish
+    from hybrid_opt.recommending.recommendation import Recommendation as Recommendation
+    from hybrid_opt.recommending.recommendation import recommend as recommend
+    from hybrid_opt.robust.squeeze import SqueezeSettings as SqueezeSettings
+    from hybrid_opt.sensitivity import Sensitivities as Sensitivities
+    from hybrid_opt.sensitivity import sensitivities as sensitivities
+    from hybrid_opt.sweeping import Sweep as Sweep
+    from hybrid_opt.sweeping import sweep as sweep
+    from hybrid_opt.timing.records import JerkLimits as JerkLimits
+    from hybrid_opt.timing.records import JerkTiming as JerkTiming
+    from hybrid_opt.timing.records import Timing as Timing
+    from hybrid_opt.timing.records import TimingLimits as TimingLimits
+    from hybrid_opt.workbench.browser import live as live
+    from symbolic.errors import DualArmError as DualArmError
+    from symbolic.records import Workcell as Workcell
 
 _HOMES = {
-    "BundleOptions": "hybrid_opt.bundles.job_file",
-    "Carry": "hybrid_opt.carry",
-    "Cell": "hybrid_opt.cell",
-    "DualArmError": "symbolic.errors",
-    "Front": "hybrid_opt.front",
-    "GeneticSettings": "hybrid_opt.metaheuristics.settings",
-    "Grip": "hybrid_opt.gripping",
-    "JerkLimits": "hybrid_opt.timing.records",
-    "JerkTiming": "hybrid_opt.timing.records",
-    "Job": "hybrid_opt.job.records",
-    "MopsoSettings": "hybrid_opt.metaheuristics.settings",
-    "Objective": "hybrid_opt.evaluate.objectives",
-    "Origin": "hybrid_opt.bundles.bundle",
-    "PolishSettings": "hybrid_opt.polishing.settings",
-    "Proposal": "hybrid_opt.proposing.proposal",
-    "ProposeSettings": "hybrid_opt.proposing.proposal",
-    "Recommendation": "hybrid_opt.recommending.recommendation",
-    "SearchSettings": "hybrid_opt.metaheuristics.run",
-    "Sensitivities": "hybrid_opt.sensitivity",
-    "SqueezeSettings": "hybrid_opt.robust.squeeze",
-    "Sweep": "hybrid_opt.sweeping",
-    "Timing": "hybrid_opt.timing.records",
-    "TimingLimits": "hybrid_opt.timing.records",
-    "Wish": "hybrid_opt.recommending.choice",
-    "Workcell": "symbolic.records",
-    "algorithms": "hybrid_opt.catalogue",
-    "example": "hybrid_opt.catalogue",
-    "export": "hybrid_opt.bundles.bundle",
-    "live": "hybrid_opt.workbench.browser",
-    "load": "hybrid_opt.catalogue",
-    "objectives": "hybrid_opt.catalogue",
-    "plan_job": "hybrid_opt.job.plan",
-    "polish": "hybrid_opt.door",
-    "propose": "hybrid_opt.proposing.proposal",
-    "propose_grip": "hybrid_opt.gripping",
-    "recommend": "hybrid_opt.recommending.recommendation",
-    "save": "hybrid_opt.door",
-    "search": "hybrid_opt.door",
-    "search_branches": "hybrid_opt.branches",
-    "sensitivities": "hybrid_opt.sensitivity",
-    "sweep": "hybrid_opt.sweeping",
-    "targets": "hybrid_opt.catalogue",
-    "time_every_way": "hybrid_opt.door",
-    "time_path": "hybrid_opt.door",
-    "time_with_jerk": "hybrid_opt.door",
+    each.name: node.module
+    for node in ast.walk(ast.parse(Path(__file__).read_bytes()))
+    if isinstance(node, ast.ImportFrom) and node.module
+    for each in node.names
+    if each.asname
 }
+"""Modules of the names above, which are imported for type checkers only."""
 
+__all__ = sorted(_HOMES)
 
 shown_by(lambda room: import_module(f"hybrid_opt.display.{room}"))
 
 
 def __getattr__(name: str) -> Any:
     if name == "__version__":
-        return import_module("hybrid_opt.version").own_version()
+        return import_module("hybrid_opt.store.files").own_version()
     if name not in _HOMES:
         raise AttributeError(f"module 'hybrid_opt' has no attribute {name!r}")
     value = getattr(import_module(_HOMES[name]), name)

@@ -18,8 +18,7 @@ from math import ceil, log2
 import numpy as np
 
 from hybrid_opt.cell import Cell
-from hybrid_opt.evaluate.evaluation import CandidateEvaluator
-from hybrid_opt.evaluate.evaluations import Evaluations, concatenated
+from hybrid_opt.evaluate.evaluation import CandidateEvaluator, Evaluations, concatenated
 from hybrid_opt.evaluate.objectives import PAPER_OBJECTIVES
 from hybrid_opt.indicators.metrics import REFERENCE_POINT, front_rows, hypervolume
 from hybrid_opt.metaheuristics.run import SearchSettings, search_carries

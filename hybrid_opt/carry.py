@@ -250,7 +250,7 @@ class Carry(Displayable):
         Args:
             height: of the notebook's cell [px].
         """
-        page: Page = display("view").CarryView(self, height)
+        page: Page = display("scene").CarryView(self, height)
         return page
 
 

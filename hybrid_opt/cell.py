@@ -16,8 +16,7 @@ import numpy as np
 
 from hybrid_opt.carry import Carry
 from hybrid_opt.compiled_cell import CompiledCell
-from hybrid_opt.evaluate.evaluation import CandidateEvaluator
-from hybrid_opt.evaluate.evaluations import Evaluations, concatenated
+from hybrid_opt.evaluate.evaluation import CandidateEvaluator, Evaluations, concatenated
 from hybrid_opt.evaluate.objectives import (
     PAPER_OBJECTIVES,
     ForceKind,

@@ -3,9 +3,9 @@
 The path stays, driven by the task's time law or as fast as limits allow. The force is the largest
 to command that holds in every case of the cell's uncertainty, as a recommendation commands it. Its
 derivatives, and those of a time law's duration, are exact by what formulas take
-(`hybrid_opt.robust.slopes`); the fastest duration's follow from what its limits leave at the same
-speeds (`hybrid_opt.timing.nearby`). How formulas' inputs and ratios over limits follow from a
-number of the file is read off two cells nearby.
+(`hybrid_opt.robust.path_force`); the fastest duration's follow from what its limits leave at the
+same speeds (`hybrid_opt.timing.robustness`). How formulas' inputs and ratios over limits follow
+from a number of the file is read off two cells nearby.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from hybrid_opt.compiled_cell import CompiledCell
 from hybrid_opt.progress import ShowProgress, following
 from hybrid_opt.recommending.choice import LEADER
 from hybrid_opt.robust.force import BoxMotion
-from hybrid_opt.robust.slopes import RulingForce
+from hybrid_opt.robust.path_force import RulingForce
 from hybrid_opt.shown import Displayable
 from hybrid_opt.timing.limits import limit_ratios
 from hybrid_opt.timing.model import TimingModel
-from hybrid_opt.timing.nearby import NearTimings
 from hybrid_opt.timing.records import Timing
+from hybrid_opt.timing.robustness import NearTimings
 from symbolic import outside
 from symbolic.array import Array
 from symbolic.errors import SettingsError, WorkcellError

@@ -22,7 +22,7 @@ from codegen.cache import digest
 from hybrid_opt.carry import Carry
 from hybrid_opt.cell import Cell
 from hybrid_opt.door import polish
-from hybrid_opt.evaluate.evaluations import Evaluations
+from hybrid_opt.evaluate.evaluation import Evaluations
 from hybrid_opt.evaluate.objectives import Objective
 from hybrid_opt.front import Front
 from hybrid_opt.polishing.settings import DrivableSettings, PolishSettings

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import argparse
+import json
 import logging
 import os
 import shlex
 import sys
 import threading
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, NoReturn, TextIO
+from typing import TYPE_CHECKING, Any, NoReturn, TextIO
 
 from symbolic import outside
 from symbolic.errors import DualArmError, DualArmWarning, OutsideError, WorkcellError
@@ -22,6 +23,11 @@ from symbolic.records.problems import suggestion
 
 if TYPE_CHECKING:
     from symbolic.records import Workcell
+
+
+class ReportError(DualArmError):
+    """A report, picture or animation cannot be made."""
+
 
 BAD_INPUT = 2
 INTERRUPTED = 130
@@ -276,3 +282,27 @@ class _Warnings:
         self._told.add(text)
         where = "" if issubclass(category, DualArmWarning) else f" ({category.__name__})"
         print(f"warning: {text}{where}", file=file or sys.stderr)
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that a program found out.
+
+    Attributes:
+        values: by name, for JSON; records are left to `dataclasses.asdict`.
+        lines: the same for people.
+    """
+
+    values: Mapping[str, Any]
+    lines: tuple[str, ...] = ()
+
+
+def print_findings(findings: Iterable[Finding], as_json: bool) -> None:
+    """Print each when it is found, or all at once as one JSON object."""
+    values: dict[str, Any] = {}
+    for finding in findings:
+        values |= finding.values
+        for line in () if as_json else finding.lines:
+            print(line, flush=True)
+    if as_json:
+        print(json.dumps(values, default=asdict, indent=2))

@@ -38,7 +38,6 @@ USUAL = "hybrid_opt.campaign.settings.ALGORITHMS"
 
 WORKERS_LOAD = (
     "hybrid_opt.campaign.polish_stage",
-    "studies.study.drivable",
     "studies.study.recommendation",
     "studies.report.generate",
 )

@@ -15,7 +15,6 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from hybrid_opt.bundles.abb import egm_files, rapid_files, require_egm, require_rapid
 from hybrid_opt.bundles.arms import (
     ABB,
     FRANKA,
@@ -37,6 +36,13 @@ from hybrid_opt.bundles.job_file import (
     json_files,
     stop_of,
 )
+from hybrid_opt.bundles.languages import (
+    egm_files,
+    rapid_files,
+    require_egm,
+    require_rapid,
+    urscript_files,
+)
 from hybrid_opt.bundles.ros2 import (
     control_files,
     franka_files,
@@ -44,7 +50,6 @@ from hybrid_opt.bundles.ros2 import (
     require_franka,
     ur_files,
 )
-from hybrid_opt.bundles.urscript import urscript_files
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.job.compliance import (
     SKEWS,
@@ -60,9 +65,8 @@ from hybrid_opt.job.compliance import (
 from hybrid_opt.job.plan import plan_job
 from hybrid_opt.job.records import Job, sample_job
 from hybrid_opt.job.smooth import RESTS, acceleration_at_ends
-from hybrid_opt.store.files import AGAIN, read_bytes, read_document, sha256, storing
+from hybrid_opt.store.files import AGAIN, own_version, read_bytes, read_document, sha256, storing
 from hybrid_opt.timing.records import Timing
-from hybrid_opt.version import own_version
 from symbolic.errors import SettingsError
 from symbolic.replacing import replace_file, sync_folder
 

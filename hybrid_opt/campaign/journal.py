@@ -33,7 +33,7 @@ from hybrid_opt.campaign.folder import (
 )
 from hybrid_opt.campaign.settings import JOURNAL, CampaignSettings
 from hybrid_opt.errors import ResultsError
-from hybrid_opt.evaluate.evaluations import FEASIBLE, REASONS, Evaluations
+from hybrid_opt.evaluate.evaluation import FEASIBLE, REASONS, Evaluations
 from hybrid_opt.progress import Advance, Progress
 from hybrid_opt.store.files import csv_text, read_bytes, storing
 from hybrid_opt.store.json_records import to_json

@@ -16,12 +16,11 @@ from functools import partial
 
 import numpy as np
 
-from hybrid_opt.campaign.cell_source import with_cell
 from hybrid_opt.campaign.folder import CampaignFolder
 from hybrid_opt.campaign.journal import ReplicaLedger, ReplicaRequest
 from hybrid_opt.campaign.results import Replica, is_whole, read_campaign, read_polished
 from hybrid_opt.campaign.settings import JOURNAL, POLISH, polished_folder
-from hybrid_opt.campaign.stages import Stage
+from hybrid_opt.campaign.stages import Stage, with_cell
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.polishing.front import Loss, use_one_thread
 from hybrid_opt.polishing.polisher import Polisher

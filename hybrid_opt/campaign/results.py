@@ -30,7 +30,7 @@ from hybrid_opt.campaign.settings import (
 )
 from hybrid_opt.cell import Cell
 from hybrid_opt.errors import DamagedResultsWarning, ResultsError
-from hybrid_opt.evaluate.evaluations import Evaluations
+from hybrid_opt.evaluate.evaluation import Evaluations
 from hybrid_opt.front import Front
 from hybrid_opt.indicators import metrics
 from hybrid_opt.polishing.records import PolishedFront

@@ -11,7 +11,6 @@ from pathlib import Path
 
 import numpy as np
 
-from hybrid_opt.campaign.cell_source import with_cell
 from hybrid_opt.campaign.folder import CampaignFolder
 from hybrid_opt.campaign.journal import (
     EvaluationTable,
@@ -33,10 +32,9 @@ from hybrid_opt.campaign.settings import (
     FinishedReplica,
     replica_folder,
 )
-from hybrid_opt.campaign.stages import Stage
+from hybrid_opt.campaign.stages import Stage, with_cell
 from hybrid_opt.errors import ResultsError
-from hybrid_opt.evaluate.evaluation import CandidateEvaluator
-from hybrid_opt.evaluate.evaluations import Evaluations
+from hybrid_opt.evaluate.evaluation import CandidateEvaluator, Evaluations
 from hybrid_opt.indicators import metrics
 from hybrid_opt.metaheuristics.run import Evaluator, SearchSettings, disarmed, search_carries
 from hybrid_opt.progress import Progress

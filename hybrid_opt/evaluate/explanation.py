@@ -9,8 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 import pinocchio as pin
 
-from hybrid_opt.evaluate.evaluation import CandidateEvaluator
-from hybrid_opt.evaluate.evaluations import COLLISION, REASONS, Evaluations
+from hybrid_opt.evaluate.evaluation import COLLISION, REASONS, CandidateEvaluator, Evaluations
 from hybrid_opt.evaluate.kernel import reached_samples
 from symbolic.array import Array
 from symbolic.read.arms import arm_model, link_frame, turning_joints
@@ -32,7 +31,7 @@ class Explanation:
     """What is in the way of one candidate where it first fails.
 
     Attributes:
-        reason: one of `hybrid_opt.evaluate.evaluations.REASONS`.
+        reason: one of `hybrid_opt.evaluate.evaluation.REASONS`.
         position: path parameter of the sample.
         sample: its number, from 0.
         pair: names of the bodies that collide there, None for another reason.

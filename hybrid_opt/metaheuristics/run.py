@@ -13,10 +13,9 @@ from numpy.typing import NDArray
 from pymoo.core.algorithm import Algorithm
 from pymoo.core.problem import Problem
 
-from hybrid_opt.evaluate.evaluations import NOT_FINITE, REASONS, Evaluations, concatenated
+from hybrid_opt.evaluate.evaluation import NOT_FINITE, REASONS, Evaluations, concatenated
 from hybrid_opt.metaheuristics.guarded import violation_of
-from hybrid_opt.metaheuristics.registry import make
-from hybrid_opt.metaheuristics.settings import AlgorithmSettings
+from hybrid_opt.metaheuristics.registry import AlgorithmSettings, make
 from symbolic.array import Array, require_allowed
 from symbolic.errors import SettingsError
 from symbolic.path.pieces import same_paths, stated

@@ -18,8 +18,13 @@ from numpy.typing import NDArray
 from hybrid_opt.polishing.carry import CarryReader
 from hybrid_opt.polishing.cell import SmoothCell
 from hybrid_opt.polishing.constraints.active import ActiveSet
-from hybrid_opt.polishing.intervals import IntervalGrid, IntervalValues
-from hybrid_opt.polishing.joint_program import NEGLIGIBLE, JointProgram, Linear
+from hybrid_opt.polishing.intervals import (
+    NEGLIGIBLE,
+    IntervalGrid,
+    IntervalValues,
+    JointProgram,
+    Linear,
+)
 from hybrid_opt.polishing.point import (
     HALVED,
     QUARTERED,
@@ -40,7 +45,6 @@ from hybrid_opt.polishing.solvers.quadratic import (
     convex,
     quadratic_method,
 )
-from hybrid_opt.robust.cases import is_squeezed
 from hybrid_opt.robust.path_force import PathPoints, robust_path
 from hybrid_opt.timing.drive import CandidateDriver
 from symbolic.array import Array
@@ -97,7 +101,7 @@ STILL = 1e-3
 def is_polishable(workcell: Workcell, robust: bool) -> bool:
     """Whether drivable carries of a cell can be polished: those whose planned forces have slopes,
     and where robust ones are limited, of two pads with opposite normals."""
-    return workcell.has_force_slopes and (is_squeezed(workcell) or not robust)
+    return workcell.has_force_slopes and (workcell.has_one_squeeze or not robust)
 
 
 @dataclass(frozen=True)

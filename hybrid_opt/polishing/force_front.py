@@ -24,8 +24,7 @@ from math import ceil
 
 import numpy as np
 
-from hybrid_opt.evaluate.evaluation import CandidateEvaluator
-from hybrid_opt.evaluate.evaluations import Evaluations
+from hybrid_opt.evaluate.evaluation import CandidateEvaluator, Evaluations
 from hybrid_opt.polishing.force import (
     ForceSolver,
     Reach,

@@ -18,8 +18,7 @@ from typing import Any, Generic, TypeVar
 import casadi
 import numpy as np
 
-from hybrid_opt.evaluate.evaluation import CandidateEvaluator
-from hybrid_opt.evaluate.evaluations import FEASIBLE, REASONS, Evaluations
+from hybrid_opt.evaluate.evaluation import FEASIBLE, REASONS, CandidateEvaluator, Evaluations
 from hybrid_opt.indicators import metrics
 from hybrid_opt.polishing.point import Solution
 from hybrid_opt.polishing.records import Aim, PolishOutcome, Status

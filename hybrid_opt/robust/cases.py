@@ -159,7 +159,7 @@ class CaseForces:
         check_pads(workcell)
         self.workcell, self._cache = workcell, cache
         self._general: dict[int, tuple[NumericFunction, NumericFunction]] = {}
-        self._squeezed = is_squeezed(workcell)
+        self._squeezed = workcell.has_one_squeeze
         if self._squeezed:
             self._facing = [
                 held_function(workcell, function.__name__, function, cache, lanes=0)
@@ -233,11 +233,6 @@ class CaseForces:
             )
             self._general[commanded] = first, second
         return self._general[commanded]
-
-
-def is_squeezed(workcell: Workcell) -> bool:
-    """Whether the force of one pad decides that of the other, so that a least squeeze says all."""
-    return workcell.has_one_squeeze
 
 
 def check_pads(workcell: Workcell) -> None:

@@ -11,6 +11,7 @@ import json
 import os
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -160,3 +161,11 @@ def locked(folder: Path) -> Iterator[None]:
         yield
     finally:
         os.close(handle)
+
+
+def own_version() -> str:
+    """As installed; run from its sources alone it has none."""
+    try:
+        return version("dual-arm-carry")
+    except PackageNotFoundError:
+        return "not installed"

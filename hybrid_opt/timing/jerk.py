@@ -29,7 +29,6 @@ from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 
 from hybrid_opt.carry import Carry
-from hybrid_opt.robust.cases import is_squeezed
 from hybrid_opt.timing.limits import (
     NEAR,
     RECOMPUTED_TOLERANCE,
@@ -112,7 +111,7 @@ def time_with_jerk(
 def kept_jerk(workcell: Workcell, limits: TimingLimits) -> JerkLimits | None:
     """The cell's limits on jerk that timings within `limits` keep; None where it states none, and
     where limited robust forces have no slopes."""
-    slopes = is_squeezed(workcell) or not limits.robust
+    slopes = workcell.has_one_squeeze or not limits.robust
     return JerkLimits.of(workcell) if slopes else None
 
 

@@ -8,7 +8,6 @@ from collections.abc import Mapping
 import numpy as np
 
 from hybrid_opt.carry import Carry
-from hybrid_opt.robust.cases import is_squeezed
 from hybrid_opt.robust.force import BoxMotion, robust_model
 from hybrid_opt.robust.path_force import BY_TIMING, PathPoints, robust_path
 from hybrid_opt.timing.model import PathMotion, TimingModel, contact_torque
@@ -45,8 +44,8 @@ FORCE_FLOOR = 1e-9
 class PathLimits:
     """The limits of a path at samples of it, over these limits, as functions of (u'', u'^2).
 
-    Speeds are `squared_speed_limit`; robust forces of pads that are not squeezed (`is_squeezed`),
-    and planned ones without slopes, are among the ratios.
+    Speeds are `squared_speed_limit`; robust forces of pads without one squeeze
+    (`Workcell.has_one_squeeze`), and planned ones without slopes, are among the ratios.
 
     Attributes:
         motion: the path's geometry at the samples.
@@ -55,12 +54,12 @@ class PathLimits:
     def __init__(self, model: TimingModel, motion: PathMotion, limits: TimingLimits) -> None:
         self.motion, self._model, self._limits = motion, model, limits
         workcell = model.workcell
-        self._squeezed = limits.robust and is_squeezed(workcell)
+        self._squeezed = limits.robust and workcell.has_one_squeeze
         self._grasped = limits.robust and not self._squeezed
 
     def joint_accelerations(self) -> tuple[Array, Array]:
         """(n, all joints) by u'' and by u'^2, with limits of both signs."""
-        limit = np.concatenate([robot.acceleration_max for robot in self._model.workcell.robots])
+        limit = self._model.workcell.of_joints("acceleration_max")
         return self.motion.q_first / limit, self.motion.q_second / limit
 
     def accelerations(self) -> tuple[tuple[Array, Array, float], ...]:
@@ -97,7 +96,7 @@ class PathLimits:
         if limits.torque:
             own = m.torque_by_acceleration * a[:, None] + m.torque_by_speed * w[:, None]
             torque = contact_torque(workcell, m.wrench_torque, load) + own + m.torque_at_rest
-            columns.append(torque / np.concatenate([r.torque_max for r in workcell.robots]))
+            columns.append(torque / workcell.of_joints("torque_max"))
         if pressure:
             radius = np.array([contact.patch_radius for contact in workcell.contacts])
             columns.append(load["pressure_shift"] / radius)
@@ -124,8 +123,8 @@ class PathLimits:
 
 def squared_speed_limit(motion: PathMotion, workcell: Workcell, limits: TimingLimits) -> Array:
     """(n,) largest u'^2 by all limits on speeds; infinite where nothing moves."""
-    robots, payload, task = workcell.robots, workcell.payload, workcell.task
-    velocity = np.concatenate([robot.velocity_max for robot in robots])
+    payload, task = workcell.payload, workcell.task
+    velocity = workcell.of_joints("velocity_max")
     linear = np.linalg.norm(motion.pose_first[:, :3], axis=1)
     angular = np.linalg.norm(motion.angular_first, axis=1)
     demands = [
@@ -155,17 +154,15 @@ def limit_ratios(carry: Carry, workcell: Workcell, limits: TimingLimits) -> dict
         By constraint (n, all joints) for joints, (n, 2) for contacts, (n, 1) for the box; only the
         limits that apply.
     """
-    robots, payload, task = workcell.robots, workcell.payload, workcell.task
-
-    def joints(name: str) -> Array:
-        return np.concatenate([getattr(robot, name) for robot in robots])
+    payload, task = workcell.payload, workcell.task
 
     friction = np.array([contact.friction for contact in workcell.contacts])
     radius = np.array([contact.patch_radius for contact in workcell.contacts])
     linear, angular = _norm(carry.rate[:, :3]), _norm(carry.angular_velocity)
     ratios = {
-        "joint velocity": np.abs(carry.side_by_side("q_rate")) / joints("velocity_max"),
-        "joint acceleration": np.abs(carry.side_by_side("q_second")) / joints("acceleration_max"),
+        "joint velocity": np.abs(carry.side_by_side("q_rate")) / workcell.of_joints("velocity_max"),
+        "joint acceleration": np.abs(carry.side_by_side("q_second"))
+        / workcell.of_joints("acceleration_max"),
         "payload velocity": linear / payload.velocity_max,
         "payload acceleration": _norm(carry.second_rate[:, :3]) / payload.acceleration_max,
         "payload angular velocity": angular / payload.angular_velocity_max,
@@ -174,7 +171,7 @@ def limit_ratios(carry: Carry, workcell: Workcell, limits: TimingLimits) -> dict
         "friction": carry.tangential_force / np.maximum(carry.normal_force * friction, FORCE_FLOOR),
     }
     if limits.torque:
-        ratios["joint torque"] = np.abs(carry.torque) / joints("torque_max")
+        ratios["joint torque"] = np.abs(carry.torque) / workcell.of_joints("torque_max")
     if limits_pressure(workcell, limits):
         ratios["pressure shift"] = carry.pressure_shift / radius
     if limits.force is not None:
@@ -197,7 +194,7 @@ def limited_force(carry: Carry, workcell: Workcell, limits: TimingLimits) -> Arr
 def _near_limit(carry: Carry, workcell: Workcell, limits: TimingLimits) -> Array:
     """As `limited_force`; robust ones that are below `EXACT` of the limit, and below the largest of
     the carry, may be told as the planned ones: to see that takes a fraction of the time."""
-    if not limits.robust or limits.force is None or not is_squeezed(workcell):
+    if not limits.robust or limits.force is None or not workcell.has_one_squeeze:
         return limited_force(carry, workcell, limits)
     n = len(carry)
     points = PathPoints(carry.pose, carry.rate, carry.second_rate, np.zeros(n), np.ones(n))
@@ -274,7 +271,7 @@ def joint_use(carry: Carry, workcell: Workcell) -> dict[str, Array]:
     """
     ratios = limit_ratios(carry, workcell, TimingLimits())
     use = {name: ratios[name].max(axis=0) for name in JOINT_CONSTRAINTS}
-    limit = np.concatenate([robot.torque_max for robot in workcell.robots])
+    limit = workcell.of_joints("torque_max")
     return use | {"contact torque": (np.abs(carry.contact_torque) / limit).max(axis=0)}
 
 

@@ -23,7 +23,6 @@ from hybrid_opt.witness.box import (
     HeldBox,
     Outcome,
     Threshold,
-    between,
     bisected,
     mujoco_module,
 )
@@ -42,11 +41,10 @@ from hybrid_opt.witness.scene import (
     cell_text,
     compiled,
     joint_names,
-    joint_torque_max,
     patch_area,
     quaternion,
 )
-from symbolic.array import Array
+from symbolic.array import Array, interpolated
 from symbolic.records import Workcell
 from symbolic.records.poses import box_rotation
 
@@ -215,7 +213,7 @@ class _Run:
         split = len(self._workcell.robots[0].torque_max)
         self._arms = (slice(0, split), slice(split, None))
         self._ticks = _Ticks.of(reference, factor, self._settings)
-        self._limit = joint_torque_max(self._workcell)
+        self._limit = self._workcell.of_joints("torque_max")
         self._torque_use = np.zeros(len(self._limit))
         self._jacobian = np.zeros((6, self._model.nv))
         self._standing = self._place(witness.disturbance)
@@ -363,10 +361,10 @@ class _Ticks:
             time=time,
             q=spline(at),
             q_rate=spline(at, 1),
-            effort=between(
+            effort=interpolated(
                 at, motion.time, reference.effort + motors + more * reference.press_torque
             ),
-            normal_force=factor * between(at, motion.time, reference.normal_force),
+            normal_force=factor * interpolated(at, motion.time, reference.normal_force),
         )
 
 

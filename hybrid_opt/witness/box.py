@@ -31,7 +31,7 @@ from hybrid_opt.witness.scene import (
     tilt_centre,
     tilt_names,
 )
-from symbolic.array import Array
+from symbolic.array import Array, interpolated
 from symbolic.errors import SettingsError
 from symbolic.records import Contact, Workcell
 from symbolic.records.poses import box_rotation
@@ -246,9 +246,9 @@ def drive_of(
     single = np.concatenate([[True], np.diff(carry.time) > SAME_TIME])
     path = CubicHermiteSpline(carry.time[single], carry.pose[single], carry.rate[single])
     rotation = box_rotation(carry.workcell.task.orientation, path(amid))
-    omega = between(clipped, carry.time, carry.angular_velocity)
+    omega = interpolated(clipped, carry.time, carry.angular_velocity)
     acceleration, alpha = (
-        ((amid > begin) & (amid < end))[:, None] * between(amid, carry.time, values)
+        ((amid > begin) & (amid < end))[:, None] * interpolated(amid, carry.time, values)
         for values in (carry.second_rate[:, :3], carry.angular_acceleration)
     )
     slider = carry.workcell.contacts[1 - leader]
@@ -259,7 +259,7 @@ def drive_of(
     tilt = np.zeros((steps, 2, 2))
     for i, contact in enumerate(carry.workcell.contacts if moments is not None else ()):
         assert moments is not None
-        moment = between(clipped, carry.time, moments[1:, i])
+        moment = interpolated(clipped, carry.time, moments[1:, i])
         moment[time < begin] = moments[0, i]
         tilt[:, i] = np.einsum("nji,nj->ni", rotation @ contact.T_box_pad[:3, :2], moment)
     return Drive(
@@ -282,11 +282,6 @@ def refuse_motion_at_ends(carry: Carry) -> None:
     """
     if max(np.abs(carry.rate[[0, -1]]).max(), np.abs(carry.angular_velocity[[0, -1]]).max()) > 1e-3:
         raise SettingsError("the carry does not start and end at rest; give one with a timing")
-
-
-def between(at: Array, time: Array, values: Array) -> Array:
-    """Columns (n, k) at times, interpolated linearly."""
-    return np.column_stack([np.interp(at, time, column) for column in values.T])
 
 
 class Witness:

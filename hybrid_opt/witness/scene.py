@@ -165,11 +165,11 @@ class ArmSettings(ContactSettings):
 
     def joint_stiffness(self, workcell: Workcell) -> Array:
         """(all joints,) of both arms, side by side [N m/rad]."""
-        return self.stiffness * joint_torque_max(workcell)
+        return self.stiffness * workcell.of_joints("torque_max")
 
     def joint_armature(self, workcell: Workcell) -> Array:
         """(all joints,) of both arms, side by side [kg m^2]."""
-        return self.armature * joint_torque_max(workcell)
+        return self.armature * workcell.of_joints("torque_max")
 
 
 def scene_text(
@@ -413,11 +413,6 @@ def quaternion(rotation: Array) -> Array:
 def mjcf_text(values: ArrayLike) -> str:
     """Numbers as an attribute's value."""
     return " ".join(repr(float(value)) for value in np.ravel(values))
-
-
-def joint_torque_max(workcell: Workcell) -> Array:
-    """(all joints,) largest torque of both arms' joints, side by side [N m]."""
-    return np.concatenate([robot.torque_max for robot in workcell.robots])
 
 
 def cell_text(workcell: Workcell, settings: ArmSettings) -> str:

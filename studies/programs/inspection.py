@@ -17,8 +17,7 @@ from hybrid_opt.evaluate.explanation import Explanation, explain, frequent
 from hybrid_opt.front import Front
 from hybrid_opt.indicators.metrics import BindingBound, binding_bounds
 from hybrid_opt.progress import Progress
-from studies.program import load_workcell
-from studies.programs.findings import Finding, print_findings
+from studies.program import Finding, load_workcell, print_findings
 from symbolic.array import Array
 from symbolic.cell_model import CellModel, own_pairs
 from symbolic.errors import SettingsError
@@ -333,7 +332,7 @@ def show(carry: Carry, why: Explanation | None, path: Path) -> str:
         SettingsError: its folder cannot be made.
         DisplayError: it cannot be written.
     """
-    from hybrid_opt.display.view import CarryView, Look
+    from hybrid_opt.display.scene import CarryView, Look
 
     _made(path.parent)
     look = None if why is None else Look(why.sample, str(why), why.pair or ())

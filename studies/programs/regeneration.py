@@ -14,7 +14,7 @@ from codegen.build import FunctionReport, build
 from codegen.cache import Cache, largest_size
 from codegen.interpreted import Agreement, compare
 from hybrid_opt.display.table import text_table
-from studies.programs.findings import Finding, print_findings
+from studies.program import Finding, print_findings
 
 DISAGREES = 1
 

@@ -17,10 +17,14 @@ from hybrid_opt.campaign import (
     run_stages,
     search_stage,
 )
-from hybrid_opt.campaign.cell_source import decided_cell, store_branches
 from hybrid_opt.campaign.polish_stage import polish_stage
 from hybrid_opt.campaign.settings import ALGORITHMS, DRIVABLE, SUMMARY, chosen
-from hybrid_opt.campaign.stages import drivable_settings, drivable_stage
+from hybrid_opt.campaign.stages import (
+    decided_cell,
+    drivable_settings,
+    drivable_stage,
+    store_branches,
+)
 from hybrid_opt.cell import Cell
 from hybrid_opt.display.table import counted
 from hybrid_opt.evaluate.objectives import (
@@ -44,12 +48,15 @@ from studies.options import QUICK_EVALUATIONS, QUICK_REPLICAS
 from studies.program import load_workcell
 from studies.report import PAGE, TABLES
 from studies.report.stage import follow_looks, report_stage
-from studies.study.drivable import is_drivable, known_paths
-from studies.study.recommendation import recommendation_stage
-from studies.study.simulation import read_simulations, simulation_stage
+from studies.study.recommendation import is_drivable, known_paths, recommendation_stage
+from studies.study.simulation import (
+    limits_on_jerk,
+    read_simulations,
+    simulation_stage,
+    timing_stage,
+)
 from studies.study.summary import read_summary, summary_stage
 from studies.study.tables import effort, study_tables
-from studies.study.timing import limits_on_jerk, timing_stage
 from symbolic.array import Array
 from symbolic.records import Workcell
 

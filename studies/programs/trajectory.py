@@ -41,13 +41,11 @@ from hybrid_opt.robust.squeeze import SqueezeSettings
 from hybrid_opt.store.files import read_bytes
 from hybrid_opt.store.json_records import to_json
 from hybrid_opt.store.trajectory_file import Replay, StoredTrajectory, read_trajectory, replay
-from hybrid_opt.timing.analysis import timed_trajectory
-from hybrid_opt.timing.document import timing_document
+from hybrid_opt.timing.analysis import timed_trajectory, timing_document
 from hybrid_opt.timing.model import TimingModel
 from hybrid_opt.timing.records import Timing, TimingLimits
 from hybrid_opt.timing.solve import time_path
-from studies.program import load_workcell
-from studies.programs.findings import Finding, print_findings
+from studies.program import Finding, load_workcell, print_findings
 from studies.study.tables import force_curve, margins, timings
 from symbolic.array import Array
 from symbolic.errors import SettingsError

@@ -12,13 +12,12 @@ from typing import Any
 import numpy as np
 
 from hybrid_opt.branches import BranchCompetition
-from hybrid_opt.campaign.cell_source import ReadyCell, cells_of, read_branches, ready_cells
 from hybrid_opt.campaign.results import CampaignResults, read_campaign
 from hybrid_opt.campaign.settings import CONFIGURATION, HAND_MADE, RECOMMENDED, SUMMARY
+from hybrid_opt.campaign.stages import ReadyCell, cells_of, read_branches, ready_cells
 from hybrid_opt.display.table import Table
 from hybrid_opt.errors import ResultsError
-from hybrid_opt.evaluate.evaluation import CandidateEvaluator
-from hybrid_opt.evaluate.evaluations import Evaluations
+from hybrid_opt.evaluate.evaluation import CandidateEvaluator, Evaluations
 from hybrid_opt.evaluate.objectives import (
     OBJECTIVES,
     PAPER_OBJECTIVES,
@@ -26,20 +25,18 @@ from hybrid_opt.evaluate.objectives import (
     duration_unit,
     force_kind,
 )
-from hybrid_opt.front import Front
-from hybrid_opt.indicators.selection import selected_row
+from hybrid_opt.front import Front, selected_row
 from hybrid_opt.metaheuristics.registry import title
-from hybrid_opt.recommending.comparison import level_force
+from hybrid_opt.recommending.recommendation import level_force
 from hybrid_opt.store.trajectory_file import read_trajectory
-from hybrid_opt.timing.document import TimingDocument, read_timing
+from hybrid_opt.timing.analysis import TimingDocument, read_timing
 from hybrid_opt.timing.records import TimingLimits
 from hybrid_opt.work.service import Executor, LocalExecutor, Service, answer_all, called
 from studies.report.drawn import DrawnCarry, ReachMap, reach_map
 from studies.report.page_carries import RECOMMENDED_LABEL, DrawnJob, drawn_job, recommended_job
-from studies.study.drivable import drivable_root, is_drivable
-from studies.study.simulation import StoredSimulation, read_simulations
+from studies.study.recommendation import drivable_root, is_drivable
+from studies.study.simulation import TIMING, StoredSimulation, limits_on_jerk, read_simulations
 from studies.study.summary import CampaignSummary, ReplicaFigures, read_summary
-from studies.study.timing import TIMING, limits_on_jerk
 from symbolic.array import Array
 from symbolic.geometry.pairs import CellGeometry, build_geometry
 from symbolic.read.cell_files import CellFiles, collect_cell

@@ -27,9 +27,9 @@ from hybrid_opt.display.scene import embedded_json, plotly_js, scene_js, three_j
 from hybrid_opt.display.table import Table, counted, number
 from hybrid_opt.store.files import write_atomically
 from hybrid_opt.store.json_records import to_json
-from hybrid_opt.timing.document import TimingDocument, stored_timing
+from hybrid_opt.timing.analysis import TimingDocument, stored_timing
 from hybrid_opt.work.service import Executor, LocalExecutor, Service, answer_all, called
-from studies.errors import ReportError
+from studies.program import ReportError
 from studies.report import PAGE, PICTURES, TABLES
 from studies.report.data import ReportData
 from studies.report.drawing import files_of

@@ -16,9 +16,8 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from PIL import Image
 
-from hybrid_opt.display.scene import cell_solids, motion_points
-from hybrid_opt.display.view import CarryView
-from studies.errors import ReportError
+from hybrid_opt.display.scene import CarryView, cell_solids, motion_points
+from studies.program import ReportError
 from studies.report import PAGE
 from studies.report.data import gather_carries
 from studies.report.drawing import ISOMETRIC, CutCell, draw_cell, draw_path, frame_axes, in_style

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 import hybrid_opt as ho
 from hybrid_opt.bundles.bundle import phase_documents
-from hybrid_opt.campaign.cell_source import ReadyCell
+from hybrid_opt.campaign.stages import ReadyCell
 from hybrid_opt.display.scene import packed
 from hybrid_opt.display.table import NOTHING, Table, number
 from hybrid_opt.evaluate.objectives import PAPER_OBJECTIVES
@@ -355,7 +355,7 @@ def _motion(name: str, carry: ho.Carry) -> dict[str, Any]:
 
 def torque_use(carry: ho.Carry, torque: Array) -> Array:
     """(all joints,) largest use of each joint's torque (n, all joints) in percent."""
-    limit = np.concatenate([robot.torque_max for robot in carry.workcell.robots])
+    limit = carry.workcell.of_joints("torque_max")
     return np.asarray(100.0 * np.abs(torque).max(axis=0) / limit)
 
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from hybrid_opt.campaign.cell_source import cells_of, ready_cells
+from hybrid_opt.campaign.stages import cells_of, ready_cells
 from hybrid_opt.display.scene import packed, scene_data
 from hybrid_opt.work.service import Executor, LocalExecutor, Service, answer_all
 from studies.report.data import Experiment, ReportData

@@ -42,7 +42,7 @@ def _add_options(parser: Parser) -> None:
     parser.add_argument(
         "--problems",
         nargs="+",
-        default=list(stated("studies.research.analytic_problems.PROBLEMS")),
+        default=list(stated("studies.research.analytic.PROBLEMS")),
         metavar="NAME",
         help="which",
     )

@@ -6,7 +6,7 @@ ways take turns, the compiled one with batches of a search's size, and a ratio i
 the rounds of the ratio within a round. The plain way is the reference that the tests hold the
 evaluator to (`studies.research.plain`). With collisions the same is measured on candidates of a
 search (`studies.research.turns`). `--study` tells instead where the time of a study goes
-(`studies.research.study_costs`).
+(`studies.research.costs`).
 
 The cost against the number of samples and of free waypoints is measured on cells derived from the
 given one: same start, goal and robots, the free waypoints spread along the hand-made trajectory.

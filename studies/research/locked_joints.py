@@ -13,8 +13,7 @@ import numpy as np
 
 from hybrid_opt.cell import Cell
 from hybrid_opt.display.table import counted
-from hybrid_opt.evaluate.evaluation import LockedEvaluator
-from hybrid_opt.evaluate.evaluations import Evaluations
+from hybrid_opt.evaluate.evaluation import Evaluations, LockedEvaluator
 from hybrid_opt.indicators.metrics import front_rows, hypervolume
 from hybrid_opt.metaheuristics.run import SearchSettings, search_carries
 from studies.program import load_workcell

@@ -21,9 +21,8 @@ from codegen.build import load_or_build_program
 from codegen.interpreted import InterpretedFunction
 from codegen.source import dense, operations
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
-from hybrid_opt.metaheuristics.registry import make
+from hybrid_opt.metaheuristics.registry import GeneticSettings, make
 from hybrid_opt.metaheuristics.run import CarryProblem, search
-from hybrid_opt.metaheuristics.settings import GeneticSettings
 from symbolic.array import Array
 from symbolic.cell_model import CellModel
 from symbolic.functions import cell_functions, kernel_functions

@@ -1,4 +1,5 @@
-"""The carry to run: the stage that picks it from the drivable fronts, and its words."""
+"""The drivable fronts with the paths that stand beside them; the carry to run: the stage that picks
+it, and its words."""
 
 from __future__ import annotations
 
@@ -15,23 +16,31 @@ import hybrid_opt as ho
 from codegen.function import available_cores
 from hybrid_opt.campaign import CampaignFolder, Stage
 from hybrid_opt.campaign.results import CampaignResults, read_campaign, union
-from hybrid_opt.campaign.settings import NO_RECOMMENDATION, RECOMMENDATION, RECOMMENDED, STAGES
+from hybrid_opt.campaign.settings import (
+    DRIVABLE,
+    NO_RECOMMENDATION,
+    RECOMMENDATION,
+    RECOMMENDED,
+    STAGES,
+)
 from hybrid_opt.errors import NoCarryError
-from hybrid_opt.evaluate.evaluations import concatenated
+from hybrid_opt.evaluate.evaluation import CandidateEvaluator, concatenated
 from hybrid_opt.evaluate.explanation import explain
-from hybrid_opt.evaluate.objectives import PLANNED_FORCE, ROBUST_FORCE, ForceKind
-from hybrid_opt.front import Front
+from hybrid_opt.evaluate.objectives import DRIVABLE_PAIRS, PLANNED_FORCE, ROBUST_FORCE, ForceKind
+from hybrid_opt.front import Front, select
 from hybrid_opt.progress import Advance, Progress
 from hybrid_opt.recommending.advice import Advice
 from hybrid_opt.recommending.choice import LEADER, DrivenPaths
-from hybrid_opt.recommending.comparison import (
+from hybrid_opt.recommending.recommendation import (
+    HAND_MADE,
+    STEPS,
+    Recommendation,
     Rival,
     front_durations,
     over_replicas,
     spread_rows,
     table_forces,
 )
-from hybrid_opt.recommending.recommendation import HAND_MADE, STEPS, Recommendation
 from hybrid_opt.robust.force import RobustPrice, pressing_model, robust_price
 from hybrid_opt.robust.squeeze import Part, account
 from hybrid_opt.store.files import write_json
@@ -46,12 +55,9 @@ from hybrid_opt.work.service import (
     called,
     nothing,
 )
-from studies.study.drivable import (
-    drivable_root,
-    is_drivable,
-    least_force,
-)
 from symbolic.array import Array, Count, Figure, Pair
+from symbolic.path.pieces import same_paths
+from symbolic.records import Task, Workcell
 
 
 @dataclass(frozen=True)
@@ -477,3 +483,56 @@ def _margins(found: StoredRecommendation) -> list[str]:
         along = ", ".join(f"{1e3 * offs[axis]:.0f} mm along {axis}" for axis in sorted(offs))
         texts.append(f"centre of mass off by {along}")
     return texts
+
+
+LEAST_FORCE = "least-force"
+"""The path that the other experiment ends with, beside which the recommended carry stands."""
+
+
+def known_paths(root: Path, task: Task) -> Array:
+    """Paths (m, n_path) that another experiment ends with: of all polished fronts together the
+    balanced one, of each of them both ends and the middle.
+
+    Args:
+        root: its results folder.
+        task: whose waypoints they are told by.
+
+    Raises:
+        ResultsError: the folder is not complete or damaged.
+    """
+    campaign = read_campaign(root)
+    own, n = campaign.workcell.task, campaign.workcell.task.n_path
+    found = [path[None] for path in least_force(campaign, task).values()]
+    polished = [front for front in campaign.fronts if front.polished and len(front)]
+    found += [same_paths(f.x[[0, len(f) // 2, -1], :n], own, task) for f in polished]
+    return np.unique(np.concatenate(found), axis=0) if found else np.empty((0, task.n_path))
+
+
+def least_force(campaign: CampaignResults, task: Task) -> dict[str, Array]:
+    """The balanced path (n_path,) of all fronts of an experiment, by its label; empty where no
+    carry was found.
+
+    Args:
+        task: the one whose waypoints describe the path.
+    """
+    evaluator = CandidateEvaluator(campaign.workcell, campaign.objectives)
+    chosen = select(evaluator, np.concatenate([front.x for front in campaign.fronts]))
+    if chosen is None:
+        return {}
+    own = campaign.workcell.task
+    return {LEAST_FORCE: same_paths(chosen.carry.x[: own.n_path], own, task)[0]}
+
+
+def is_drivable(workcell: Workcell, objectives: Sequence[str]) -> bool:
+    """Whether an experiment already is the search for carries as robots drive them."""
+    return workcell.task.time_law == "optimal" and tuple(objectives) in DRIVABLE_PAIRS
+
+
+def drivable_root(root: Path, workcell: Workcell, objectives: Sequence[str]) -> Path:
+    """Folder of a study's drivable experiment: one inside, unless it is the only experiment.
+
+    Args:
+        root: the study's results folder.
+        workcell, objectives: of its first experiment.
+    """
+    return root if is_drivable(workcell, objectives) else root / DRIVABLE

@@ -30,9 +30,9 @@ from hybrid_opt.campaign.settings import (
 )
 from hybrid_opt.carry import Carry
 from hybrid_opt.errors import ResultsError
+from hybrid_opt.front import SelectedCarry, select
 from hybrid_opt.indicators import metrics
 from hybrid_opt.indicators.metrics import BindingBound, binding_bounds
-from hybrid_opt.indicators.selection import SelectedCarry, select
 from hybrid_opt.indicators.statistics import (
     RankTest,
     Summary,

@@ -13,8 +13,7 @@ from hybrid_opt.display.table import NOTHING, Quantity, Table, counted, number
 from hybrid_opt.indicators.statistics import summarise
 from hybrid_opt.metaheuristics.registry import title
 from hybrid_opt.robust.force import RobustPrice
-from hybrid_opt.timing.analysis import ForceCurve
-from hybrid_opt.timing.document import StoredTiming, TimingDocument
+from hybrid_opt.timing.analysis import ForceCurve, StoredTiming, TimingDocument
 from hybrid_opt.timing.robustness import KILOGRAM_FORCE
 from studies.study.recommendation import StoredRecommendation
 from studies.study.simulation import StoredSimulation
@@ -82,7 +81,7 @@ def study_tables(
     Args:
         summary: of its first experiment.
         drivable: of the drivable experiment beside that, None without one.
-        jerk: what limits on jerk cost, see `studies.study.timing.limits_on_jerk`.
+        jerk: what limits on jerk cost, see `studies.study.simulation.limits_on_jerk`.
         simulations: carries in the simulated cell.
         with_paper: whether figures that the paper states of its own rack stand beside ours.
     """

@@ -10,7 +10,7 @@ import pytest
 
 from hybrid_opt.branches import BranchCompetition, PairResult, search_branches
 from hybrid_opt.campaign import CampaignSettings, ExecutionSettings
-from hybrid_opt.campaign.cell_source import decided_cell, read_branches, store_branches
+from hybrid_opt.campaign.stages import decided_cell, read_branches, store_branches
 from hybrid_opt.cell import Cell
 from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES
 from hybrid_opt.indicators.metrics import front_rows, hypervolume

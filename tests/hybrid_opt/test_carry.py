@@ -10,7 +10,7 @@ import pytest
 
 from hybrid_opt.carry import Carry
 from hybrid_opt.cell import Cell
-from hybrid_opt.evaluate.evaluations import REASONS
+from hybrid_opt.evaluate.evaluation import REASONS
 from symbolic.read.cell import load
 from tests.hybrid_opt.campaign.fake import RACK
 from tests.hybrid_opt.cells import shipped

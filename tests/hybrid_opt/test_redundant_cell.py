@@ -9,10 +9,9 @@ import hybrid_opt as ho
 from hybrid_opt.bundles.arms import require_axes
 from hybrid_opt.cell import Cell
 from hybrid_opt.collision.certify import SampledPath, configurations
-from hybrid_opt.evaluate.evaluation import LockedEvaluator
-from hybrid_opt.evaluate.evaluations import REASONS
+from hybrid_opt.evaluate.evaluation import REASONS, LockedEvaluator
 from hybrid_opt.evaluate.kernel import one_by_one
-from studies.research.plain.verdict import PlainJudge
+from studies.research.plain.candidate import PlainJudge
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.records.task import extended_waypoints

@@ -21,12 +21,12 @@ from rapidchecker.check import check_format
 from scipy.spatial.transform import Rotation
 
 from hybrid_opt.bundles import TARGETS, BundleOptions
-from hybrid_opt.bundles.abb import rapid_files, require_rapid
 from hybrid_opt.bundles.arms import ABB, UR, require_maker
 from hybrid_opt.bundles.bundle import prepared
 from hybrid_opt.bundles.job_file import pad_places
+from hybrid_opt.bundles.languages import rapid_files, require_rapid
 from hybrid_opt.bundles.programs.carry_job import Job
-from hybrid_opt.bundles.programs.egm_wire import FromRobot, read_robot, to_robot
+from hybrid_opt.bundles.programs.run_egm import FromRobot, read_robot, to_robot
 from hybrid_opt.job.records import HELD, PHASES
 from symbolic.array import Array
 from symbolic.errors import SettingsError
@@ -396,7 +396,7 @@ def program() -> Any:
     """run_egm.py as the bundle has it."""
     folder = Path(__file__).parent
     modules = {}
-    for name in ("carry_job", "egm_wire", "run_egm"):
+    for name in ("carry_job", "run_egm"):
         spec = importlib.util.spec_from_loader(name, None)
         assert spec is not None
         modules[name] = importlib.util.module_from_spec(spec)
@@ -547,4 +547,4 @@ def test_both_tasks_start_egm() -> None:
         for word in ("EGMSetupUC", "EGMActJoint", "EGMRunJoint", "EGM_STOP_HOLD", "EXIT;"):
             assert word in text
         assert " Stop;" not in text
-    assert {"run_egm.py", "egm_wire.py", "carry_job.py", "job.json"} <= set(contents("abb-egm"))
+    assert {"run_egm.py", "carry_job.py", "job.json"} <= set(contents("abb-egm"))

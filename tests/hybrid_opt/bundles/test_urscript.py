@@ -15,7 +15,7 @@ import pytest
 
 from hybrid_opt.bundles import TARGETS, BundleOptions
 from hybrid_opt.bundles.bundle import prepared
-from hybrid_opt.bundles.urscript import urscript_files
+from hybrid_opt.bundles.languages import urscript_files
 from hybrid_opt.job.records import HELD, PHASES
 from symbolic.errors import SettingsError
 from tests.hybrid_opt.bundles.bundles import contents, exported, rack_driven

@@ -20,7 +20,7 @@ from hybrid_opt.campaign import (
     run_stages,
     search_stage,
 )
-from hybrid_opt.evaluate.evaluations import FEASIBLE, REASONS, Evaluations
+from hybrid_opt.evaluate.evaluation import FEASIBLE, REASONS, Evaluations
 from hybrid_opt.progress import Progress
 from symbolic.array import Array
 from symbolic.errors import DualArmError

@@ -24,8 +24,7 @@ from hybrid_opt.collision.certify import (
     configurations,
 )
 from hybrid_opt.collision.checker import CollisionChecker, Touch
-from hybrid_opt.evaluate.evaluation import CandidateEvaluator
-from hybrid_opt.evaluate.evaluations import BETWEEN_SAMPLES, REASONS
+from hybrid_opt.evaluate.evaluation import BETWEEN_SAMPLES, REASONS, CandidateEvaluator
 from hybrid_opt.indicators.metrics import non_dominated
 from hybrid_opt.metaheuristics.run import CarryProblem
 from symbolic.array import Array

@@ -15,8 +15,7 @@ from codegen import compiled as compiled_module
 from hybrid_opt.cell import Cell
 from hybrid_opt.collision.judge import FCL_RESOLUTION
 from hybrid_opt.compiled_cell import CompiledCell
-from hybrid_opt.evaluate.evaluation import CandidateEvaluator
-from hybrid_opt.evaluate.evaluations import FEASIBLE, REASONS, Evaluations
+from hybrid_opt.evaluate.evaluation import FEASIBLE, REASONS, CandidateEvaluator, Evaluations
 from hybrid_opt.evaluate.explanation import Explanation, explain, frequent, missing_reach
 from hybrid_opt.evaluate.kernel import (
     Kernel,
@@ -25,8 +24,8 @@ from hybrid_opt.evaluate.kernel import (
     one_by_one,
     reached_samples,
 )
+from studies.research.plain.candidate import PlainJudge, PlainVerdict
 from studies.research.plain.collisions import PlainCollisionChecker
-from studies.research.plain.verdict import PlainJudge, PlainVerdict
 from symbolic.array import Array
 from symbolic.functions import CONSTRAINTS, SAMPLE_NAMES, force_sizes
 from symbolic.read.cell import load

@@ -12,7 +12,7 @@ from codegen.build import build
 from codegen.interpreted import InterpretedFunction
 from codegen.source import dense
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
-from studies.research.plain.verdict import PlainJudge
+from studies.research.plain.candidate import PlainJudge
 from symbolic.array import Array
 from symbolic.cell_model import build_cell_model
 from symbolic.functions import cell_functions

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from hybrid_opt.campaign.results import Replica
 from hybrid_opt.cell import Cell
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
-from hybrid_opt.indicators.selection import balanced, knee, peak_normal_forces, select, selected_row
+from hybrid_opt.front import balanced, knee, peak_normal_forces, select, selected_row
 from hybrid_opt.static_hold import payload_limit, static_hold
 from symbolic.array import Array
 from symbolic.errors import SettingsError

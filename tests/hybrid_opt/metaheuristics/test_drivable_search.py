@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 import hybrid_opt as ho
-from hybrid_opt.campaign.cell_source import with_cell
 from hybrid_opt.campaign.journal import ReplicaRequest, decode
 from hybrid_opt.campaign.search_stage import run_replica
 from hybrid_opt.campaign.settings import EVALUATIONS as FILE
 from hybrid_opt.campaign.settings import CampaignSettings
+from hybrid_opt.campaign.stages import with_cell
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES
 from hybrid_opt.work.service import LocalExecutor, Service, answer_all

@@ -13,7 +13,7 @@ from pymoo.core.problem import Problem
 from pymoo.problems.multi.tnk import TNK
 from scipy.optimize import minimize
 
-from hybrid_opt.evaluate.evaluations import FEASIBLE, NOT_FINITE, REASONS, Evaluations
+from hybrid_opt.evaluate.evaluation import FEASIBLE, NOT_FINITE, REASONS, Evaluations
 from hybrid_opt.indicators import metrics
 from hybrid_opt.metaheuristics import (
     SearchResult,
@@ -24,7 +24,7 @@ from hybrid_opt.metaheuristics import (
 )
 from hybrid_opt.metaheuristics.guarded import violation_of
 from hybrid_opt.metaheuristics.run import WORST_PENALTY, CarryProblem, SearchSettings, disarmed
-from studies.research import analytic_problems
+from studies.research import analytic
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from tests.hybrid_opt.campaign.fake import OBJECTIVES, verdicts
@@ -345,9 +345,9 @@ KNOWN = {
 }
 
 
-@pytest.mark.parametrize("name", analytic_problems.names())
+@pytest.mark.parametrize("name", analytic.names())
 def test_front_has_its_known_range_and_volume(name: str) -> None:
-    target = analytic_problems.make(name)
+    target = analytic.make(name)
     ideal, nadir, volume = KNOWN[name]
     np.testing.assert_allclose(target.ideal, ideal, rtol=2e-4, atol=5e-5)
     np.testing.assert_allclose(target.nadir, nadir, rtol=2e-4, atol=5e-5)
@@ -360,7 +360,7 @@ def test_front_has_its_known_range_and_volume(name: str) -> None:
 @pytest.mark.parametrize("name", ["tnk", "srn", "osy"])
 def test_front_is_what_a_gradient_solver_finds(name: str) -> None:
     """Least f1 under a bound on f2, by SLSQP from many starts."""
-    target = analytic_problems.make(name)
+    target = analytic.make(name)
     problem = target.problem
     rng = np.random.default_rng(5)
     extent = target.nadir - target.ideal
@@ -391,7 +391,7 @@ def test_front_is_what_a_gradient_solver_finds(name: str) -> None:
 
 
 def test_shifted_zdt_has_its_optimum_inside() -> None:
-    problem = analytic_problems.make("shifted-zdt1").problem
+    problem = analytic.make("shifted-zdt1").problem
     optimum = np.concatenate([[0.25], np.linspace(0.2, 0.5, 29)])
     np.testing.assert_allclose(problem.evaluate(optimum), [0.25, 0.5])
     away = optimum.copy()

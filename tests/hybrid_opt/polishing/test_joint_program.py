@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from hybrid_opt.polishing.carry import CarryReader
-from hybrid_opt.polishing.intervals import IntervalGrid, IntervalValues
-from hybrid_opt.polishing.joint_program import JointProgram
+from hybrid_opt.polishing.intervals import IntervalGrid, IntervalValues, JointProgram
 from hybrid_opt.polishing.polisher import Polisher
 from hybrid_opt.polishing.rows import PlaceRow, Row
 from symbolic.array import Array

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hybrid_opt.evaluate.evaluations import COLLISION, REASONS
+from hybrid_opt.evaluate.evaluation import COLLISION, REASONS
 from hybrid_opt.polishing.force_front import FAR, better_half
 from hybrid_opt.polishing.starts import (
     AWAY,

@@ -13,8 +13,15 @@ import hybrid_opt as ho
 from hybrid_opt.evaluate.objectives import ROBUST_OBJECTIVES
 from hybrid_opt.job.plan import JobModel
 from hybrid_opt.recommending.choice import DrivenPaths
-from hybrid_opt.recommending.comparison import Rival, front_durations, spread_rows, table_forces
-from hybrid_opt.recommending.recommendation import HAND_MADE, STEPS, Recommendation
+from hybrid_opt.recommending.recommendation import (
+    HAND_MADE,
+    STEPS,
+    Recommendation,
+    Rival,
+    front_durations,
+    spread_rows,
+    table_forces,
+)
 from hybrid_opt.robust.cases import random_cases
 from hybrid_opt.robust.force import BoxMotion, RobustModel, pressing_model
 from hybrid_opt.robust.squeeze import DOUBTS, commanded_forces, largest_commanded

@@ -12,8 +12,7 @@ from collections.abc import Callable
 import numpy as np
 
 from hybrid_opt.timing.model import PathMotion, TimingModel
-from studies.research.plain.load import GRAVITY
-from studies.research.plain.motion import angular_rates, rotation
+from studies.research.plain.motion import GRAVITY, angular_rates, rotation
 from symbolic.array import Array
 from symbolic.records import Workcell
 from tests.hybrid_opt.timing.convex_oracle import Affine, Program, Terms

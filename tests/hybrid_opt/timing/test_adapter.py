@@ -7,7 +7,7 @@ import logging
 import numpy as np
 import pytest
 
-from hybrid_opt.timing.adapter import IntervalRows, SolverFailure, fastest_speed
+from hybrid_opt.timing.solve import IntervalRows, SolverFailure, fastest_speed
 
 
 def rows(n: int, *limits: tuple[float, float, float]) -> IntervalRows:

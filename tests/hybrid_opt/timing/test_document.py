@@ -13,8 +13,12 @@ import pytest
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.store.files import write_json
 from hybrid_opt.store.json_records import to_json
-from hybrid_opt.timing.analysis import TimedTrajectory, timed_trajectory
-from hybrid_opt.timing.document import read_timing, timing_document
+from hybrid_opt.timing.analysis import (
+    TimedTrajectory,
+    read_timing,
+    timed_trajectory,
+    timing_document,
+)
 from hybrid_opt.timing.jerk import time_with_jerk
 from hybrid_opt.timing.records import JerkLimits, TimingLimits
 from tests.hybrid_opt.timing.cells import hand_timing, initial

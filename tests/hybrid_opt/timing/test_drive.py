@@ -12,8 +12,7 @@ from codegen.build import build
 from hybrid_opt import metaheuristics
 from hybrid_opt.carry import DRIVE_CONSTRAINTS
 from hybrid_opt.compiled_cell import CompiledCell
-from hybrid_opt.evaluate.evaluation import CandidateEvaluator
-from hybrid_opt.evaluate.evaluations import REASONS
+from hybrid_opt.evaluate.evaluation import REASONS, CandidateEvaluator
 from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES, ROBUST_DRIVABLE_OBJECTIVES
 from hybrid_opt.indicators.metrics import non_dominated
 from hybrid_opt.metaheuristics.run import CarryProblem

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from hybrid_opt.cell import Cell
-from hybrid_opt.evaluate.evaluations import REASONS
+from hybrid_opt.evaluate.evaluation import REASONS
 from studies.programs.inspection import inspected
-from studies.research.plain.verdict import PlainJudge
+from studies.research.plain.candidate import PlainJudge
 from symbolic.array import Array
 from symbolic.cell_model import CellModel, build_cell_model
 from symbolic.functions import candidate_function

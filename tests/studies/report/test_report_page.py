@@ -18,14 +18,14 @@ import pytest
 
 import hybrid_opt as ho
 from hybrid_opt.branches import BranchCompetition, PairResult
-from hybrid_opt.campaign.cell_source import ReadyCell
+from hybrid_opt.campaign.stages import ReadyCell
 from hybrid_opt.cell import Cell
 from hybrid_opt.display.table import NOTHING, Table
 from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES
 from hybrid_opt.indicators.metrics import BindingBound
 from hybrid_opt.job.plan import JobModel
 from hybrid_opt.robust.squeeze import SqueezeSettings
-from studies.errors import ReportError
+from studies.program import ReportError
 from studies.report import page_carries, page_data
 from studies.report.data import ReportData
 from studies.report.generate import BEGIN, END, insert_tables, report_tables, write_report

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageSequence
 
 from hybrid_opt.display.scene import frame_placements
-from studies.errors import ReportError
+from studies.program import ReportError
 from studies.report import PAGE, looks
 from studies.report.__main__ import main
 from studies.report.data import ReportData, Run

@@ -16,10 +16,10 @@ from hybrid_opt.evaluate.objectives import ROBUST_DRIVABLE_OBJECTIVES
 from hybrid_opt.job.smooth import driven_timing
 from hybrid_opt.polishing.settings import DrivableSettings, PolishSettings
 from hybrid_opt.progress import Progress
-from hybrid_opt.recommending.comparison import level_force
+from hybrid_opt.recommending.recommendation import level_force
 from hybrid_opt.robust.force import robust_model
 from hybrid_opt.store.trajectory_file import read_trajectory, replay
-from hybrid_opt.timing.document import read_timing
+from hybrid_opt.timing.analysis import read_timing
 from studies import export
 from studies.programs.study import StudySettings, run_study
 from studies.report.data import ReportData, gather

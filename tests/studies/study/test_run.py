@@ -23,7 +23,7 @@ from hybrid_opt.indicators import metrics
 from hybrid_opt.progress import Progress
 from hybrid_opt.recommending.choice import Wish
 from hybrid_opt.store.trajectory_file import read_trajectory, replay
-from hybrid_opt.timing.document import read_timing
+from hybrid_opt.timing.analysis import read_timing
 from studies import rack, recommend, run
 from studies.programs.study import campaign_settings, polish_settings
 from studies.report import PAGE

@@ -16,8 +16,7 @@ import pytest
 
 from hybrid_opt.campaign import ExecutionSettings, Stage, open_folder, run_stages
 from hybrid_opt.campaign.results import read_campaign
-from hybrid_opt.evaluate.evaluation import CandidateEvaluator
-from hybrid_opt.evaluate.evaluations import REASONS
+from hybrid_opt.evaluate.evaluation import REASONS, CandidateEvaluator
 from hybrid_opt.progress import Progress
 from studies import recommend, run
 from studies.programs.study import campaign_settings

@@ -25,19 +25,18 @@ from hybrid_opt.campaign.settings import (
 )
 from hybrid_opt.cell import Cell
 from hybrid_opt.errors import ResultsError
-from hybrid_opt.evaluate.evaluations import FEASIBLE, REASONS, Evaluations
+from hybrid_opt.evaluate.evaluation import FEASIBLE, REASONS, Evaluations
 from hybrid_opt.indicators.statistics import rank_test
 from hybrid_opt.polishing.records import PolishedFront
 from hybrid_opt.progress import Progress
 from hybrid_opt.static_hold import StaticHold
 from hybrid_opt.store.files import write_json
 from hybrid_opt.store.json_records import from_json, to_json
-from hybrid_opt.timing.analysis import closest_to_reference_timing
-from hybrid_opt.timing.document import read_timing
+from hybrid_opt.timing.analysis import closest_to_reference_timing, read_timing
 from hybrid_opt.timing.solve import time_path
 from studies import run
 from studies.study import simulation as stage
-from studies.study.drivable import known_paths, least_force
+from studies.study.recommendation import known_paths, least_force
 from studies.study.simulation import (
     SimulationRequest,
     StoredSimulation,

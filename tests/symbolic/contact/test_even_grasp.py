@@ -15,8 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from codegen.lanes import lane_text
 from codegen.source import generated_c
-from studies.research.plain.load import GRAVITY
-from studies.research.plain.motion import angular_rates, rotation
+from studies.research.plain.motion import GRAVITY, angular_rates, rotation
 from symbolic.array import Array
 from symbolic.contact.even_patch import EvenPatch
 from symbolic.contact.force_closure import scaled_patch

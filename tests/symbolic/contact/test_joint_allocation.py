@@ -12,8 +12,7 @@ from hypothesis import strategies as st
 
 from codegen.lanes import lane_text
 from codegen.source import generated_c
-from studies.research.plain.load import GRAVITY
-from studies.research.plain.motion import angular_rates, rotation
+from studies.research.plain.motion import GRAVITY, angular_rates, rotation
 from symbolic.array import Array
 from symbolic.contact.central_path import FINAL_WEIGHT, NEAR
 from symbolic.contact.grasp import Objective, balance_of, facing_wrenches

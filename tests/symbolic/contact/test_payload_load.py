@@ -10,9 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import sparse
 
-from studies.research.plain.load import allocate as plain_allocate
-from studies.research.plain.load import sample_load
-from studies.research.plain.motion import angular_rates, rotation
+from studies.research.plain.motion import allocate as plain_allocate
+from studies.research.plain.motion import angular_rates, rotation, sample_load
 from symbolic.array import Array
 from symbolic.contact.load import load_function
 from symbolic.contact.paper import allocate, normal_force_branches, required_force
