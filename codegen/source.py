@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from math import prod
+from types import MappingProxyType
 
 import casadi as ca
 
@@ -56,8 +57,7 @@ def c_source(function: ca.Function, lanes: int = 1, generated: str = "") -> str:
     before = [include, runtime("arithmetic.h")]
     after = [_filled(runtime("driver.c"), signature, generated)]
     if in_lanes is not None:
-        width = f"#define DUAL_ARM_LANES {lanes}\n" if lanes else ""
-        before += [runtime("one_lane.h"), width, runtime("lanes.h")]
+        before += _lanes_header(lanes)
         flags = ", ".join(str(int(k in shared)) for k in range(function.n_in()))
         lane_driver = _filled(runtime("lane_driver.c"), signature).replace("@SHARED@", flags or "0")
         after += [
@@ -68,7 +68,12 @@ def c_source(function: ca.Function, lanes: int = 1, generated: str = "") -> str:
     return generated.replace(include, "".join(before), 1) + "\n" + "".join(after)
 
 
-def handwritten_source(signature: Signature, text: str, helpers: Sequence[ca.Function]) -> str:
+def handwritten_source(
+    signature: Signature,
+    text: str,
+    helpers: Sequence[ca.Function],
+    in_pairs: Mapping[str, ca.Function] = MappingProxyType({}),
+) -> str:
     """C text of a function written by hand, with the batch driver.
 
     Args:
@@ -76,33 +81,43 @@ def handwritten_source(signature: Signature, text: str, helpers: Sequence[ca.Fun
         text: C that defines `NAME` with CasADi's interface (arguments, results and work memory by
             address) and beside it `NAME_work`, `NAME_incref`, `NAME_checkout`, `NAME_release`.
         helpers: dense CasADi functions that the text calls; their C comes before it.
+        in_pairs: functions that it calls in two lanes, by names of their own.
 
     Raises:
-        CodegenError: CasADi cannot write a helper as C.
+        CodegenError: CasADi cannot write a helper as C, or it has no form in lanes.
     """
     include = "#include <math.h>\n"
     generated = generated_c(helpers).replace(include, include + runtime("arithmetic.h"), 1)
-    return generated + text + _filled(runtime("driver.c"), signature)
+    pairs = "".join([*_lanes_header(2), *_lane_functions(in_pairs)]) if in_pairs else ""
+    return generated + pairs + text + _filled(runtime("driver.c"), signature)
 
 
 def program_source(functions: Mapping[str, ca.Function], own: str, lanes: int = 0) -> str:
-    """C text of functions in lanes, with C of our own that calls them.
-
-    It finds, for a function `f` of the program, `f(arg, res, iw, w)` over `lanes_real`, the room
-    that it needs as f_ARG, f_RES, f_IW and f_W, the size of its k-th result as f_OUT_k, and as
-    f_SHARED whether it takes `SHARED` arguments as numbers, not lanes.
+    """C text of functions in lanes (`_lane_functions`), with C of our own that calls them.
 
     Raises:
         CodegenError: CasADi cannot write a function as C, or it has no form in lanes.
     """
     parts = ["#include <math.h>\n#include <stdlib.h>\n#include <string.h>\n"]
-    parts += [runtime("arithmetic.h"), runtime("one_lane.h")]
-    parts += [f"#define DUAL_ARM_LANES {lanes}\n" if lanes else "", runtime("lanes.h")]
+    parts += [runtime("arithmetic.h"), *_lanes_header(lanes)]
     parts.append(
         '#define DUAL_ARM_EXPORT __attribute__((visibility("default")))\n'
         "DUAL_ARM_EXPORT long long dual_arm_lanes(void) { return DUAL_ARM_LANES; }\n"
         "#if DUAL_ARM_LANES > 1\n"
     )
+    return "".join([*parts, *_lane_functions(functions), own, "#endif\n"])
+
+
+def _lanes_header(lanes: int) -> list[str]:
+    """The types of lanes, as many as given, or for 0 as many as suit the machine that compiles."""
+    width = f"#define DUAL_ARM_LANES {lanes}\n" if lanes else ""
+    return [runtime("one_lane.h"), width, runtime("lanes.h")]
+
+
+def _lane_functions(functions: Mapping[str, ca.Function]) -> Iterator[str]:
+    """C of every function `f` as `f(arg, res, iw, w)` over `lanes_real`, with the room that it
+    needs as f_ARG, f_RES, f_IW and f_W, the size of its k-th result as f_OUT_k, and as f_SHARED
+    whether it takes `SHARED` arguments as numbers, not lanes."""
     for name, function in functions.items():
         whole = dense(function)
         shared = shared_inputs(whole)
@@ -110,13 +125,12 @@ def program_source(functions: Mapping[str, ca.Function], own: str, lanes: int = 
         sizes = {"ARG": whole.sz_arg(), "RES": whole.sz_res(), "IW": whole.sz_iw()}
         sizes |= {"W": whole.sz_w(), "SHARED": int(bool(shared))}
         sizes |= {f"OUT_{i}": whole.numel_out(i) for i in range(whole.n_out())}
-        parts += [f"#define {name}_{what} {size}\n" for what, size in sizes.items()]
-        parts.append(found.text)
-        parts.append(
+        yield from (f"#define {name}_{what} {size}\n" for what, size in sizes.items())
+        yield found.text
+        yield (
             f"static int {name}(const lanes_real** arg, lanes_real** res, lanes_int* iw, "
             f"lanes_real* w) {{\n  return {found.entry}(arg, res, iw, w, 0);\n}}\n"
         )
-    return "".join([*parts, own, "#endif\n"])
 
 
 SHARED = "_numbers"

@@ -263,8 +263,8 @@ def force_functions(workcell: Workcell) -> tuple[ca.Function, ca.Function]:
     a, w = ca.SX.sym("a"), ca.SX.sym("w")
     detached: Detached = []
     value = _held(workcell, blocks, a, w, detached).normal
-    inputs = [ca.vertcat(*blocks.values()), a, w, *sx_given(workcell.payload).values()]
-    return _with_slopes(names, value, inputs, detached)
+    sample, held = ca.vertcat(*blocks.values()), sx_given(workcell.payload)
+    return _with_slopes(names, value, sample, (a, w), held, detached)
 
 
 def _load_function(workcell: Workcell) -> ca.Function:
@@ -327,8 +327,9 @@ def ratio_functions(workcell: Workcell) -> tuple[ca.Function, ca.Function]:
     a, w = ca.SX.sym("a"), ca.SX.sym("w")
     detached: Detached = []
     _, ratios = contact_limits(workcell, blocks, (a, w), detached)
-    inputs = [ca.vertcat(*blocks.values()), a, w, *sx_given(workcell.payload).values()]
-    return _with_slopes(("limit_ratios", "limit_slopes"), ratios, inputs, detached)
+    sample, held = ca.vertcat(*blocks.values()), sx_given(workcell.payload)
+    called = "limit_ratios", "limit_slopes"
+    return _with_slopes(called, ratios, sample, (a, w), held, detached)
 
 
 def contact_limits(
@@ -408,15 +409,23 @@ def _program_ratios(workcell: Workcell) -> tuple[ca.Function, ca.Function]:
 
 
 def _with_slopes(
-    names: tuple[str, str], value: ca.SX, inputs: list[ca.SX], detached: Detached
+    names: tuple[str, str],
+    value: ca.SX,
+    sample: ca.SX,
+    timing: tuple[ca.SX, ca.SX],
+    given: dict[str, ca.SX],
+    detached: Detached,
 ) -> tuple[ca.Function, ca.Function]:
     """A function of blocks, u'', u'^2 and numbers, and the same with its derivatives by u'' and
     u'^2."""
-    value = ca.densify(value)
-    outputs = [value, *[ca.densify(ca.jacobian(value, z)) for z in inputs[1:3]]]
+    value, (a, w) = ca.densify(value), timing
+    outputs = [value, *[ca.densify(ca.jacobian(value, z)) for z in timing]]
     for symbol, solved in detached:
         outputs = ca.substitute(outputs, [symbol], [solved])
-    return (
-        ca.Function(names[0], inputs, ca.cse(outputs[:1])),
-        ca.Function(names[1], inputs, ca.cse(outputs)),
+    inputs = {"sample": sample, "acceleration": a, "squared_speed": w, **given}
+    called = ["value", "by_acceleration", "by_squared_speed"]
+    first, second = (
+        ca.Function(name, [*inputs.values()], ca.cse(outputs[:n]), [*inputs], called[:n])
+        for name, n in zip(names, (1, 3), strict=True)
     )
+    return first, second

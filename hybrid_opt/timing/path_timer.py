@@ -567,6 +567,9 @@ def _source(workcell: Workcell, intervals: int, cuts: int) -> tuple[Signature, s
         **{f"AT_{name.upper()}": place for name, place in layout.offsets.items()},
     }
     held = sx_given(workcell.payload)
+    # Both ends of an interval take the time of one; programs of forces are no straight code.
+    pairs = (helpers[0], helpers[2]) if workcell.has_closed_form else ()
+    constants["IN_PAIRS"] = int(bool(pairs))
     text = "".join(
         [
             *[f"#define {name} {value}\n" for name, value in constants.items()],
@@ -584,4 +587,6 @@ def _source(workcell: Workcell, intervals: int, cuts: int) -> tuple[Signature, s
         ),
         ((), (), (), (2,), (len(KINDS), 3), (intervals + 1,), (), ()),
     )
-    return signature, handwritten_source(signature, text, helpers)
+    return signature, handwritten_source(
+        signature, text, helpers, {f"{f.name()}_in_pairs": f for f in pairs}
+    )

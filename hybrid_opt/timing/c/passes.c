@@ -123,22 +123,60 @@ static int differ(double* known, const double* asked, int count) {
   return found;
 }
 
+/* Forces or ratios (count,) of two samples, one after the other in `values`. */
+#if IN_PAIRS
+typedef int pair_function(const lanes_real**, lanes_real**, lanes_int*, lanes_real*);
+
+static void ask_both(pair_function* function, const problem* p, const double* const f[2],
+                     int inputs, double a, const double w[2], double* values, int count) {
+  lanes_real given[SIZE], as = {a, a}, ws = {w[0], w[1]}, found[RATIOS];
+  lanes_real room[limit_forces_in_pairs_W + limit_ratios_in_pairs_W + 1];
+  const lanes_real* arg[limit_ratios_in_pairs_ARG] = {given, &as, &ws, (const lanes_real*)p->held};
+  lanes_real* res[limit_ratios_in_pairs_RES] = {found};
+  lanes_int iw[1];
+  for (int k = 0; k < inputs; ++k) given[k] = (lanes_real){f[0][AT_FORCE + k], f[1][AT_FORCE + k]};
+  function(arg, res, iw, room);
+  for (int k = 0; k < count; ++k) {
+    values[k] = found[k][0];
+    values[count + k] = found[k][1];
+  }
+}
+#endif
+
+static void both_forces(const problem* p, const double* const f[2], double a, const double w[2],
+                        double* n) {
+#if IN_PAIRS
+  ask_both(limit_forces_in_pairs, p, f, AT_TORQUE - AT_FORCE, a, w, n, 2);
+#else
+  for (int k = 0; k < 2; ++k) normal_forces(p, f[k], a, w[k], n + 2 * k);
+#endif
+}
+
+static void both_ratios(const problem* p, const double* const f[2], double a, const double w[2],
+                        double* ratios) {
+#if IN_PAIRS
+  ask_both(limit_ratios_in_pairs, p, f, SIZE - AT_FORCE, a, w, ratios, RATIOS);
+#else
+  for (int k = 0; k < 2; ++k) ratios_at(p, f[k], a, w[k], ratios + RATIOS * k);
+#endif
+}
+
 /* Both normal forces at both ends of an interval, and what limits as ratios. */
 static double (*end_forces(const problem* p, int interval, double x, double y))[2] {
   answers* known = p->known + interval;
-  const double asked[2] = {x, y}, *f = p->samples + 2 * interval * SIZE, a = HALF * (y - x);
+  const double asked[2] = {x, y}, *f = p->samples + 2 * interval * SIZE;
+  const double* const ends[2] = {f, f + 2 * SIZE};
   if (differ(known->at[0], asked, 2))
-    for (int end = 0; end < 2; ++end)
-      normal_forces(p, f + 2 * end * SIZE, a, asked[end], known->forces[end]);
+    both_forces(p, ends, HALF * (y - x), asked, known->forces[0]);
   return known->forces;
 }
 
 static double (*end_ratios(const problem* p, int interval, double x, double y))[RATIOS] {
   answers* known = p->known + interval;
-  const double asked[2] = {x, y}, *f = p->samples + 2 * interval * SIZE, a = HALF * (y - x);
+  const double asked[2] = {x, y}, *f = p->samples + 2 * interval * SIZE;
+  const double* const ends[2] = {f, f + 2 * SIZE};
   if (differ(known->at[1], asked, 2))
-    for (int end = 0; end < 2; ++end)
-      ratios_at(p, f + 2 * end * SIZE, a, asked[end], known->ratios[end]);
+    both_ratios(p, ends, HALF * (y - x), asked, known->ratios[0]);
   return known->ratios;
 }
 
@@ -526,22 +564,24 @@ static void judge_inside(const problem* p, int interval, double factor, largest_
   const double y = factor * factor * p->squared[interval + 1], a = HALF * (y - x);
   const double *sample = p->samples + (2 * interval + 1) * SIZE, half = 0.5 * (x + y);
   const int limits_ratios = p->torque || p->pressure;
-  double f[SIZE], n[2], ratios[RATIOS];
+  double f[2][SIZE], n[2][2], ratios[2][RATIOS];
   largest_use middle[KINDS] = {{0}};
-  normal_forces(p, sample, a, half, n);
-  if (limits_ratios) ratios_at(p, sample, a, half, ratios);
-  judge(p, sample, (interval + 0.5) / INTERVALS, a, half, n, limits_ratios ? ratios : 0, middle,
-        peak);
+  normal_forces(p, sample, a, half, n[0]);
+  if (limits_ratios) ratios_at(p, sample, a, half, ratios[0]);
+  judge(p, sample, (interval + 0.5) / INTERVALS, a, half, n[0], limits_ratios ? ratios[0] : 0,
+        middle, peak);
   for (int k = 0; k < KINDS; ++k)
     note(use, k, middle[k].ratio, middle[k].parameter, middle[k].column);
   const int near = larger(middle[JOINT_TORQUE].ratio, middle[PRESSURE].ratio) > NEARLY;
-  for (int quarter = 1; quarter <= 3; quarter += 2) {
-    const double share = 0.25 * quarter, w = x + share * (y - x);
-    between(p, 2.0 * (interval + share), near ? SIZE : AT_TORQUE, f);
-    normal_forces(p, f, a, w, n);
-    if (near) ratios_at(p, f, a, w, ratios);
-    judge(p, f, (interval + share) / INTERVALS, a, w, n, near ? ratios : 0, use, peak);
-  }
+  const double *quarters[2] = {f[0], f[1]}, shares[2] = {0.25, 0.75};
+  const double w[2] = {x + 0.25 * (y - x), x + 0.75 * (y - x)};
+  for (int k = 0; k < 2; ++k)
+    between(p, 2.0 * (interval + shares[k]), near ? SIZE : AT_TORQUE, f[k]);
+  both_forces(p, quarters, a, w, n[0]);
+  if (near) both_ratios(p, quarters, a, w, ratios[0]);
+  for (int k = 0; k < 2; ++k)
+    judge(p, f[k], (interval + shares[k]) / INTERVALS, a, w[k], n[k], near ? ratios[k] : 0, use,
+          peak);
 }
 
 /* Judges a timing slowed by `factor` at the ends of all intervals and inside them; returns the
