@@ -167,10 +167,11 @@ def resolve_mesh(address: str, urdf: Path, package_dirs: Sequence[Path]) -> Path
 # --- xacro ---
 
 
-XACRO_NAMESPACE = b"http://www.ros.org/wiki/xacro"
 WAIT_SECONDS = 60.0
 """Longest time that an expansion may take; its computing time is bounded more tightly."""
 
+_XACRO = re.compile(rb"xmlns:xacro\s*=")
+"""Its prefix, which is all that xacro looks at: files name its wiki in several ways."""
 _MACRO = re.compile(rb"<xacro:|\$\{|\$\(")
 _MJCF = re.compile(rb"\s*+(?:(?><\?.*?\?>|<!--.*?-->)\s*+)*+<mujoco[\s/>]", re.DOTALL)
 _PROCESS = "symbolic.read.descriptions"
@@ -221,7 +222,7 @@ def is_mjcf(content: bytes) -> bool:
 
 def is_xacro(content: bytes) -> bool:
     """Whether a description holds macros to be expanded; generated URDFs often keep the name."""
-    return XACRO_NAMESPACE in content and _MACRO.search(content) is not None
+    return _XACRO.search(content) is not None and _MACRO.search(content) is not None
 
 
 @lru_cache(maxsize=8)

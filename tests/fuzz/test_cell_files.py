@@ -20,7 +20,6 @@ from symbolic.geometry.hulls import CollisionModelWarning, convex_pieces
 from symbolic.geometry.pairs import build_geometry
 from symbolic.read.arms import arm_model
 from symbolic.read.cell import load
-from symbolic.read.descriptions import XACRO_NAMESPACE
 from symbolic.read.scenes.read import read_scene
 from symbolic.read.tables import Table, read_body
 from symbolic.records import Workcell
@@ -33,8 +32,9 @@ from tests.symbolic.read.test_scenes import FRAMES, MESSAGE, NEW, SAVED, sdf
 FEW, FEW_PROCESSES = 20, 4
 SOUND = RACK.read_bytes().replace(b"../robots/gofa12.urdf", str(GOFA).encode())
 
-ElementTree.register_namespace("xacro", XACRO_NAMESPACE.decode())
-INCLUDED = f"""<robot xmlns:xacro="{XACRO_NAMESPACE.decode()}">
+XACRO_NAMESPACE = "http://www.ros.org/wiki/xacro"
+ElementTree.register_namespace("xacro", XACRO_NAMESPACE)
+INCLUDED = f"""<robot xmlns:xacro="{XACRO_NAMESPACE}">
 <xacro:arg name="tool" default="tool"/><xacro:property name="mass" value="2.5"/>
 <xacro:macro name="part" params="name size:='0.1 0.1 ${{mass / 10}}' *at"><link name="${{name}}">
 <inertial><mass value="${{mass}}"/><inertia ixx="0.1" ixy="0" ixz="0" iyy="0.1" iyz="0" izz="0.1"/>
@@ -46,7 +46,7 @@ XACRO = GOFA.read_text().replace(
     name="$(arg tool)"><origin xyz="0 0 ${mass / 10}"/></xacro:part></xacro:if><joint name="j"
     type="fixed"><parent link="tool0"/><child link="$(arg tool)"/></joint></robot>""",
 )
-XACRO = XACRO.replace("<robot ", f'<robot xmlns:xacro="{XACRO_NAMESPACE.decode()}" ')
+XACRO = XACRO.replace("<robot ", f'<robot xmlns:xacro="{XACRO_NAMESPACE}" ')
 SRDF = b"""<?xml version="1.0"?><robot name="gofa"><group name="arm"><chain base_link="base_link"
 tip_link="tool0"/></group><group_state name="home" group="arm"><joint name="joint_1" value="0"/>
 </group_state><disable_collisions link1="link_1" link2="link_3" reason="Never"/>

@@ -39,6 +39,15 @@ def test_arguments_and_relative_includes(tmp_path: Path, monkeypatch: pytest.Mon
     assert str(tmp_path).encode() not in description_content(path)
 
 
+@pytest.mark.parametrize("wiki", ["www.ros.org/wiki", "wiki.ros.org", "ros.org/wiki"])
+def test_the_wiki_goes_by_several_names(tmp_path: Path, wiki: str) -> None:
+    path = tmp_path / "arm.xacro"
+    path.write_text(
+        f'<robot name="arm" xmlns:xacro="http://{wiki}/xacro"><link name="${{1 + 1}}"/></robot>'
+    )
+    assert '"2"' in read_urdf(path).kinematics
+
+
 def test_a_changed_include_is_seen(tmp_path: Path) -> None:
     write(tmp_path, '<link name="one"/>', "links.xacro")
     path = write(tmp_path, '<xacro:include filename="links.xacro"/>')
