@@ -20,6 +20,7 @@ import numpy as np
 
 from codegen.compiler import find_compiler
 from hybrid_opt.carry import Judgement
+from hybrid_opt.display.table import counted
 from hybrid_opt.errors import NoHoldError, ProposalError
 from hybrid_opt.proposing.bases import base_choices
 from hybrid_opt.proposing.bounds import Bounds, Sampling, find_bounds
@@ -160,7 +161,7 @@ class Proposal:
         spins = " and ".join(f"{np.degrees(spin):.0f}" for spin in self.found.spins)
         where = f" {' and '.join(self.sides)}," if self.sides else ""
         return (
-            f"a carry{where} through {len(self.found.via)} via-points, joints go "
+            f"a carry{where} through {counted(len(self.found.via), 'via-point')}, joints go "
             f"{self.length:.2f} rad, certified; objectives {forces}; "
             f"spins {spins} deg, start branches {self.found.branches[0]} and "
             f"{self.found.branches[1]}; {100.0 * self.feasible_share:.1f} % of "
