@@ -59,7 +59,7 @@ def require_maker(workcell: Workcell, maker: str, language: str, any_arm: bool) 
         any_arm: whether the user wants it all the same.
 
     Raises:
-        SettingsError: an arm's file, its xacro arguments and its links name another make.
+        SettingsError: an arm's file, its name, xacro arguments and links name another make.
     """
     if any_arm:
         return
@@ -107,7 +107,8 @@ def require_address(workcell: Workcell, target: str) -> None:
 
 def described(robot: Robot) -> str:
     """Words about the make in a description, in small letters."""
-    words = [robot.urdf.name, *robot_urdf(robot).links]
+    urdf = robot_urdf(robot)
+    words = [robot.urdf.name, urdf.name, *urdf.links]
     words += [value for _, value in robot.xacro_arguments]
     return " ".join(words).lower().replace("_", " ")
 

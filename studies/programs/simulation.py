@@ -204,9 +204,14 @@ def threshold_text(threshold: Threshold[AnyOutcome], slip: float) -> str:
     slips, holds = threshold.slips, threshold.holds
     return (
         f"  holds from {holds.factor:.4f} times the planned force on, slips at {slips.factor:.4f}: "
-        f"at pad {slips.pad + 1}, beginning {slips.begins(slip):.3f} s, beyond "
+        f"at pad {slips.pad + 1}, beginning {_moment(slips.begins(slip))}, beyond "
         f"{1e3 * slip:g} mm at {slips.time[-1]:.3f} s, turned {slips.turn[-1]:.4f} rad"
     )
+
+
+def _moment(time: float) -> str:
+    """A time of a simulation, which presses before the carry."""
+    return f"{-time:.3f} s before the carry" if time < 0.0 else f"at {time:.3f} s"
 
 
 def worst_friction(workcell: Workcell) -> Array:

@@ -65,6 +65,7 @@ class Urdf:
 
     Attributes:
         file: the file's name, without its folder.
+        name: the robot's.
         links: names, in the order of the file.
         joints: by name, in the order of the file.
         collisions: by link that has any, in the order of the file.
@@ -73,6 +74,7 @@ class Urdf:
     """
 
     file: str
+    name: str
     links: tuple[str, ...]
     joints: Mapping[str, UrdfJoint]
     collisions: Mapping[str, tuple[UrdfCollision, ...]]
@@ -160,6 +162,7 @@ def _read_robot(root: Part, file: str) -> Urdf:
     }
     urdf = Urdf(
         file=file,
+        name=root.element.get("name", ""),
         links=tuple(links),
         joints=MappingProxyType(read),
         collisions=MappingProxyType({name: found for name, found in collisions.items() if found}),

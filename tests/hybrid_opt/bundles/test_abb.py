@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import json
 import math
+import re
 import struct
 import sys
 from collections import Counter, deque
@@ -36,6 +37,7 @@ from tests.hybrid_opt.bundles.bundles import contents, driven, exported, rack_dr
 from tests.hybrid_opt.bundles.mock_rapid import Call, Controller, Module, RapidError, parse
 from tests.hybrid_opt.job.jobs import rack, rack_job
 from tests.robots import ur10_urdf
+from tests.symbolic.cells import GOFA
 
 EGM = ("T_ROB1/CarryEgm1.mod", "T_ROB2/CarryEgm2.mod")
 NAMES = ("T_ROB1/Carry1.mod", "T_ROB2/Carry2.mod")
@@ -204,6 +206,18 @@ def test_arms_of_other_makers_are_refused() -> None:
     with pytest.raises(SettingsError, match="ABB"):
         require_maker(replace(cell, robots=(other, cell.robots[1])), ABB, "RAPID", any_arm=False)
     require_maker(replace(cell, robots=(other, other)), ABB, "RAPID", any_arm=True)
+
+
+def test_the_make_is_in_the_robots_name_where_nothing_else_tells_it(tmp_path: Path) -> None:
+    """As of a xacro file that was expanded to be stored."""
+    path = tmp_path / "arm.urdf"
+    text = GOFA.read_text("utf-8")
+    path.write_text(re.sub(r'<robot name="[^"]*"', '<robot name="ur10e"', text, count=1), "utf-8")
+    first, second = (replace(robot, urdf=path) for robot in rack().workcell.robots)
+    cell = replace(rack().workcell, robots=(first, second))
+    require_maker(cell, UR, "URScript", any_arm=False)
+    with pytest.raises(SettingsError, match="does not look like an arm of ABB"):
+        require_maker(cell, ABB, "RAPID", any_arm=False)
 
 
 def test_names_cannot_leave_a_comment() -> None:
