@@ -51,6 +51,7 @@ if TYPE_CHECKING:
     from hybrid_opt.proposing.proposal import Proposal as Proposal
     from hybrid_opt.proposing.proposal import ProposeSettings as ProposeSettings
     from hybrid_opt.proposing.proposal import propose as propose
+    from hybrid_opt.proposing.proposal import propose_classes as propose_classes
     from hybrid_opt.recommending.choice import Wish as Wish
     from hybrid_opt.recommending.recommendation import Recommendation as Recommendation
     from hybrid_opt.recommending.recommendation import recommend as recommend

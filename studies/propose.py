@@ -84,7 +84,7 @@ def _run(options: argparse.Namespace) -> int:
     import numpy as np
 
     import hybrid_opt as ho
-    from hybrid_opt.proposing.proposal import propose_classes, worked
+    from hybrid_opt.proposing.proposal import worked
 
     problem = options.problem
     output = options.output or problem.with_name(f"{problem.stem}-proposed.toml")
@@ -97,7 +97,7 @@ def _run(options: argparse.Namespace) -> int:
     own = sys.argv[-len(options.arguments) :] == options.arguments
     begun = 0.0 if own else worked()  # of a process of its own imports count
     left = max(options.time - (worked() - begun), 1.0)
-    proposals = propose_classes(
+    proposals = ho.propose_classes(
         problem,
         rng=np.random.default_rng(options.seed),
         settings=ho.ProposeSettings(seconds=left, bases=options.bases, classes=options.classes),

@@ -133,14 +133,14 @@ def build_cell_model(
 
 
 def own_pairs(geometry: CellGeometry, arm: int) -> list[int]:
-    """Active pairs of one arm's bodies with anything but the other arm."""
-    own, other = (f"{geometry.workcell.robots[i].name}/" for i in (arm, 1 - arm))
-    return [
-        k
-        for k, names in enumerate(geometry.pair_names)
-        if any(name.startswith(own) for name in names)
-        and not any(name.startswith(other) for name in names)
+    """Active pairs of one arm's bodies with anything but the other arm; what stands of a machine
+    is of neither."""
+    own, other = (f"robot {i + 1}" for i in (arm, 1 - arm))
+    groups = [
+        {geometry.bodies[body].group for body in (pair.first, pair.second)}
+        for pair in geometry.active
     ]
+    return [k for k, both in enumerate(groups) if own in both and other not in both]
 
 
 def own_clearance(geometry: CellGeometry, arm: int, bounds: Bounds) -> Clearance:

@@ -136,6 +136,14 @@ def _force_imbalance(outputs: Outputs, workcell: Workcell) -> Array:
     return difference / float(workcell.task.reference_force.mean())
 
 
+def _joint_length(outputs: Outputs, workcell: Workcell) -> Array:
+    """Euclidean length of the path of all joints of both arms, over that of their ranges."""
+    steps = [np.diff(outputs[name], axis=1) for name in _JOINTS]
+    length = np.sqrt(sum((step**2).sum(axis=2) for step in steps)).sum(axis=1)
+    ranges = workcell.of_joints("position_upper") - workcell.of_joints("position_lower")
+    return np.asarray(length / np.linalg.norm(ranges), dtype=float)
+
+
 def _friction_use(outputs: Outputs, workcell: Workcell) -> Array:
     """Least friction margin, as the share of friction used at the reference squeeze.
 
@@ -204,6 +212,7 @@ def _polygon_time(workcell: Workcell) -> float:
 
 _FORCE = ("normal_force",)
 _TORQUES = ("joint_torque_1", "joint_torque_2")
+_JOINTS = ("q_1", "q_2")
 
 OBJECTIVES: dict[str, Objective] = {
     objective.name: objective
@@ -218,6 +227,7 @@ OBJECTIVES: dict[str, Objective] = {
         Objective("mean_force", "mean normal force / reference", _mean_force, ("time", *_FORCE)),
         Objective("duration", "duration / twice the initial polygon's time", _duration, ("time",)),
         Objective("peak_torque_use", "peak joint torque / maximum", _peak_torque_use, _TORQUES),
+        Objective("joint_length", "joints' way / that of their ranges", _joint_length, _JOINTS),
         Objective("force_imbalance", "peak |N1 - N2| / reference", _force_imbalance, _FORCE),
         Objective("robust_force", "peak force that holds in all cases / reference", _robust_force),
         Objective(

@@ -76,7 +76,8 @@ class BoxAlone:
 
     def passed(self, path: Array) -> tuple[str, ...]:
         """Sides on which a path (n, 6) passes what the straight motion between its ends meets, such
-        as 'over post' or 'left of post' (looking along the motion); nothing where that is free.
+        as 'over post', 'left of post' (looking along the motion), 'between post and wall' or
+        'through frame'; nothing where that is free.
 
         What the box meets at an end, such as the board that it stands on, does not count.
         """
@@ -84,12 +85,15 @@ class BoxAlone:
         straight = self._boxes(np.linspace(path[0], path[-1], n + 1))
         ends, between = (straight[0], straight[-1]), straight[1:-1]
         way, placed = path[-1, :3] - path[0, :3], self._boxes(path)
-        found = []
+        beside = {
+            name: standing
+            for k, (name, standing) in enumerate(zip(self._names, self._standing, strict=True))
+            if not any(self._meets(box, k) for box in ends)
+        }
+        found: dict[str, None] = {}
         for k, name in enumerate(self._names):
-            if any(self._meets(box, k) for box in ends):
-                continue
-            if any(self._meets(box, k) for box in between):
-                found.append(f"{_side(placed, self._standing[k], way)} {name}")
+            if name in beside and any(self._meets(box, k) for box in between):
+                found[_passage(placed, beside, name, way)] = None
         return tuple(found)
 
     def _boxes(self, path: Array) -> list[tuple[Piece, ...]]:
@@ -100,23 +104,53 @@ class BoxAlone:
         return coal_distance(box, self._standing[k]) <= 0.0
 
 
-def _side(boxes: list[tuple[Piece, ...]], body: tuple[Piece, ...], way: Array) -> str:
-    """The side of a body on which a box passes: the axis across the way (3,) along which the gap is
-    largest while the box is abreast of the body."""
+def _passage(
+    boxes: list[tuple[Piece, ...]], standing: Mapping[str, tuple[Piece, ...]], name: str, way: Array
+) -> str:
+    """How a box passes one of some standing bodies while it is abreast of it: on which side, across
+    the way (3,), the gap is largest; and whether it is between parts of that body, or between it
+    and another one."""
     length = float(np.linalg.norm(way))
     along = way / length if length > 0.0 else np.array([1.0, 0.0, 0.0])
     level = np.array([along[0], along[1], 0.0])
     if np.linalg.norm(level) > LEVEL:
         left = np.cross([0.0, 0.0, 1.0], level / np.linalg.norm(level))
-        sides = {"left of": left, "right of": -left}
         up = np.cross(along, left)
-        sides |= {"over": up, "under": -up}
+        sides = {"left of": left, "right of": -left, "over": up, "under": -up}
     else:
-        sides = {"+x of": np.eye(3)[0], "-x of": -np.eye(3)[0]}
-        sides |= {"+y of": np.eye(3)[1], "-y of": -np.eye(3)[1]}
+        x, y, _ = np.eye(3)
+        sides = {"+x of": x, "-x of": -x, "+y of": y, "-y of": -y}
+    body = standing[name]
     middle = _reach(body, along) - _reach(body, -along)
     abreast = min(boxes, key=lambda box: abs(_reach(box, along) - _reach(box, -along) - middle))
-    return max(sides, key=lambda side: -_reach(abreast, -sides[side]) - _reach(body, sides[side]))
+
+    def faces(other: tuple[Piece, ...], side: Array) -> bool:
+        """Whether the box meets the other body if it moves on to this side."""
+        across = along, np.cross(along, side)
+        return any(
+            _gap(abreast, (piece,), side) >= 0.0
+            and all(
+                max(_gap(abreast, (piece,), d), _gap(abreast, (piece,), -d)) < 0.0 for d in across
+            )
+            for piece in other
+        )
+
+    if any(faces(body, side) and faces(body, -side) for side in sides.values()):
+        return f"through {name}"
+    best = max(sides, key=lambda side: _gap(abreast, body, -sides[side]))
+    opposite = [
+        other for other in standing if other != name and faces(standing[other], sides[best])
+    ]
+    if not opposite:
+        return f"{best} {name}"
+    nearest = min(opposite, key=lambda other: _gap(abreast, standing[other], sides[best]))
+    return "between {} and {}".format(*sorted((name, nearest)))
+
+
+def _gap(box: tuple[Piece, ...], body: tuple[Piece, ...], direction: Array) -> float:
+    """How far a box may move in a direction (3,) before it is abreast of a body [m]; negative where
+    it is already."""
+    return -_reach(body, -direction) - _reach(box, direction)
 
 
 def _reach(pieces: tuple[Piece, ...], direction: Array) -> float:

@@ -2,8 +2,8 @@
 
 Their files are read from a folder, nothing of theirs comes with this project; without `--folder` it
 says how to get them. Every task becomes a problem file, whose first carry is proposed and measured.
-With `--study` a small drivable study follows: the fastest carry whose squeeze holds. Both take
-minutes, most of them for compiling.
+With `--study` a small drivable study follows, for the fastest carry whose squeeze holds, and a
+search for the shortest one. All of it takes minutes, most of them for compiling.
 """
 
 from __future__ import annotations
@@ -55,7 +55,9 @@ def _add_options(parser: Parser) -> None:
         help="scenes of each kind that are drawn for Baxter (default: 10)",
     )
     parser.add_argument(
-        "--study", action="store_true", help="also look for the fastest carry of every task"
+        "--study",
+        action="store_true",
+        help="also look for the fastest and the shortest carry of every task",
     )
     add(parser, "--seed", help="of its randomness")
 

@@ -26,6 +26,9 @@ from symbolic.replacing import replace_file
 EVALUATIONS = 1000
 """Evaluations of the search behind a fastest carry."""
 
+SHORT_EVALUATIONS = 4000
+"""The same behind a shortest one, which no polish follows."""
+
 CHECKS, TOGETHER = 4000, 200
 """Configurations by which the rate of collision checks is measured: in all, and at once."""
 
@@ -124,7 +127,7 @@ class TaskResult:
         workcell: the proposed file, None where there is none.
         certified, seconds: worked until the first certified carry, and until its file was whole.
         first: length of the proposed carry.
-        fastest: of a study, None without.
+        fastest, shortest: of a study, None without.
         duration, force: of the fastest carry [s, N].
     """
 
@@ -136,6 +139,7 @@ class TaskResult:
     seconds: float | None = None
     first: Length | None = None
     fastest: Length | None = None
+    shortest: Length | None = None
     duration: float | None = None
     force: float | None = None
 
@@ -174,12 +178,26 @@ def measured(
         return found
     progress(f"{task.name}: the fastest carry")
     fastest = fastest_carry(ho.Cell.load(workcell), EVALUATIONS, np.random.default_rng(seed))
+    progress(f"{task.name}: the shortest carry")
+    shortest = shortest_carry(workcell, np.random.default_rng(seed))
     return replace(
         found,
-        fastest=length(benchmark, (fastest.arms[0].q, fastest.arms[1].q)),
+        fastest=length(benchmark, _joints(fastest)),
+        shortest=length(benchmark, _joints(shortest)),
         duration=fastest.duration,
         force=float(fastest.peak_normal_force.max()),
     )
+
+
+def shortest_carry(workcell: Path, rng: np.random.Generator) -> ho.Carry:
+    """The carry whose joints move least, as far as one search finds it; it holds, is free of
+    collisions, and keeps the cell's largest force."""
+    cell = ho.Cell.load(workcell, ("joint_length", "peak_force"))
+    return ho.search(cell, evaluations=SHORT_EVALUATIONS, rng=rng).lowest("joint_length")
+
+
+def _joints(carry: ho.Carry) -> tuple[Array, Array]:
+    return carry.arms[0].q, carry.arms[1].q
 
 
 def length(benchmark: Benchmark, q: tuple[Array, Array]) -> Length:
@@ -206,8 +224,8 @@ def checks_per_second(workcell: Path, rng: np.random.Generator) -> float:
 def table(benchmark: Benchmark, found: list[TaskResult], rng: np.random.Generator) -> Table:
     """The figures beside the published ones: work until the first certified carry and until its
     file, its length over all joints and in their coordinates, in these also the straight line
-    between their ends; then the fastest carry. Below how many were found, and the rate of collision
-    checks in the first one's cell."""
+    between their ends; then a study's fastest carry and its shortest one. Below how many were
+    found, and the rate of collision checks in the first one's cell."""
     rows = []
     for one in found:
         first = (None, None) if one.first is None else (one.first.joints, one.first.theirs)
@@ -222,6 +240,8 @@ def table(benchmark: Benchmark, found: list[TaskResult], rng: np.random.Generato
             (one.task.seconds, 2),
             (one.force, 1),
             (None if one.fastest is None else one.fastest.theirs, 2),
+            (None if one.shortest is None else one.shortest.theirs, 2),
+            (None if one.shortest is None else one.shortest.joints, 2),
         )
         rows.append((one.task.name, *(number(value, digits) for value, digits in figures)))
     header = (
@@ -236,6 +256,8 @@ def table(benchmark: Benchmark, found: list[TaskResult], rng: np.random.Generato
         "published [s]",
         "force [N]",
         "its theirs [rad]",
+        "shortest: theirs [rad]",
+        "joints [rad]",
     )
     refused = "".join(f" {one.task.name}: {one.refused}." for one in found if one.refused)
     cell = next((one.workcell for one in found if one.workcell is not None), None)

@@ -6,6 +6,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from functools import cache
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -316,11 +317,27 @@ def test_a_candidate_that_is_no_number_disturbs_no_other() -> None:
 
 @pytest.mark.parametrize(
     "objectives",
-    [("mean_force", "duration"), ("peak_torque_use", "force_imbalance", "friction_use")],
+    [
+        ("mean_force", "duration"),
+        ("peak_torque_use", "force_imbalance", "friction_use"),
+        ("joint_length",),
+    ],
 )
 def test_every_objective_gets_what_it_needs(objectives: tuple[str, ...]) -> None:
     x = mixed(RACK, 30, 6)
     assert_same(fused(RACK, objectives).evaluate(x), stepwise(RACK, objectives).evaluate(x))
+
+
+def test_the_joints_way_is_longer_than_the_straight_one_and_told_over_their_ranges() -> None:
+    cell = shipped("rack")
+    carry = cell.carry(cell.initial)
+    q = np.hstack([arm.q for arm in carry.arms])
+    way = sum(float(np.linalg.norm(after - before)) for before, after in pairwise(q))
+    assert way > np.linalg.norm(q[-1] - q[0])
+    ours = CandidateEvaluator(cell.workcell, ("joint_length",), compiled=cell.compiled)
+    spans = [robot.position_upper - robot.position_lower for robot in cell.workcell.robots]
+    over = way / np.sqrt(sum(float(span @ span) for span in spans))
+    assert ours.evaluate(cell.initial[None]).objectives == pytest.approx(over)
 
 
 @pytest.mark.parametrize("lanes", [0, pytest.param(2, marks=pytest.mark.slow)])

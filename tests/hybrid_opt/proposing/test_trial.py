@@ -8,12 +8,13 @@ from pathlib import Path
 import casadi as ca
 import numpy as np
 import pytest
+import trimesh
 
 from hybrid_opt.errors import JobError
 from hybrid_opt.proposing.problem import read_problem
 from hybrid_opt.proposing.setup import redundancy
 from hybrid_opt.proposing.trial import BoxAlone, Trial, grasp_blocked, judge_of
-from symbolic.cell_model import build_cell_model
+from symbolic.cell_model import build_cell_model, own_pairs
 from symbolic.functions import CONSTRAINTS, candidate_function, motion_function
 from symbolic.geometry.pairs import build_geometry
 from symbolic.read.cell import load
@@ -87,6 +88,51 @@ def test_a_path_says_on_which_side_it_passes_what_is_in_the_way(
     assert box.passed(path) == (), "the straight motion is free there"
 
 
+@pytest.mark.parametrize(
+    ("aside", "told"),
+    [(1.0, "between post and second"), (2.6, "left of post"), (-1.0, "right of post")],
+)
+def test_a_path_between_two_bodies_is_told(aside: float, told: str, tmp_path: Path) -> None:
+    """The second post 0.8 m to the left of the first, which alone is in the way."""
+    post = POST.read_text(encoding="utf-8")
+    second = """
+[[environment]]
+name = "second"
+kind = "cylinder"
+radius = 0.06
+length = 0.60
+xyz = [0.0, 0.8, 0.3]
+"""
+    path = tmp_path / "posts.toml"
+    path.write_text(post + second, encoding="utf-8")
+    box = BoxAlone(read_problem(path).workcell())
+    way = np.zeros((len(WAY), 6))
+    way[:, 0], way[:, 1], way[:, 2] = WAY, 0.8 * aside * BOW, 0.35
+    assert box.passed(way) == (told,)
+    way[:, 2] += 0.5  # above both
+    way[[0, -1], 2] = 0.35
+    assert not box.passed(way)[0].startswith("between")
+
+
+def test_a_path_through_a_frame_is_told(tmp_path: Path) -> None:
+    """An opening of 1 m by 0.7 m in one body, whose lower bar is in the straight way."""
+    bars = [((0.1, 1.6, 0.3), (0.0, 0.0, 0.25)), ((0.1, 1.6, 0.3), (0.0, 0.0, 1.25))]
+    bars += [((0.1, 0.3, 1.3), (0.0, side * 0.65, 0.75)) for side in (-1.0, 1.0)]
+    parts = [trimesh.creation.box(size).apply_translation(at) for size, at in bars]
+    trimesh.util.concatenate(parts).export(tmp_path / "frame.stl")
+    text = POST.read_text(encoding="utf-8")
+    text = text[: text.index("[[environment]]")]
+    frame = '[[environment]]\nname = "frame"\nkind = "mesh"\npath = "frame.stl"\n'
+    path = tmp_path / "frame.toml"
+    path.write_text(text + frame, encoding="utf-8")
+    box = BoxAlone(read_problem(path).workcell())
+    way = np.zeros((len(WAY), 6))
+    way[:, 0], way[:, 2] = WAY, 0.35 + 0.8 * BOW
+    assert box.passed(way) == ("through frame",)
+    way[:, 2] += 2.6 * BOW
+    assert box.passed(way) == ("over frame",)
+
+
 def test_what_the_box_stands_on_is_not_passed(tmp_path: Path) -> None:
     text = POST.read_text(encoding="utf-8").replace("0.35, 0.0, 0.0, 0.0]", "0.115, 0.0, 0.0, 0.0]")
     path = tmp_path / "standing.toml"
@@ -117,6 +163,12 @@ def test_the_torso_counts_for_both_arms_of_a_machine(tmp_path: Path) -> None:
         met.append(named)
     for named in met:
         assert any(name.startswith("left/") and "torso" in name for name in named)
+    names = judge.geometry.pair_names
+    for arm, own in enumerate(("left/", "right/")):
+        with_torso = [names[k] for k in own_pairs(judge.geometry, arm) if "left/torso" in names[k]]
+        moving = {name for pair in with_torso for name in pair} - {"left/torso"}
+        assert moving
+        assert all(name.startswith(own) for name in moving)
 
 
 @pytest.fixture(scope="module")

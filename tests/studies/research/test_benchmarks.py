@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -168,7 +169,9 @@ def test_the_table_has_figures_where_there_are_some(folder: Path) -> None:
     some = TaskResult(given.tasks[0], "", True, None, 12.0, 20.0, Length(3.0, 2.1))
     rows = table(given, [some], RNG).rows
     assert rows[0][:7] == ("top to middle", "12.0", "20.0", "3.00", "2.10", "1.88", "2.09")
-    assert rows[0][7:] == (NOTHING,) * 4
+    assert rows[0][7:] == (NOTHING,) * 6
+    studied = replace(some, fastest=Length(3.2, 2.2), shortest=Length(2.8, 2.0))
+    assert table(given, [studied], RNG).rows[0][10:] == ("2.20", "2.00", "2.80")
     told = solved([some, TaskResult(given.tasks[1], "out of reach", False)])
     assert told.startswith("Of 2 the box can be held at both ends in 1, carried in 1; certified")
 
