@@ -119,7 +119,8 @@ def test_a_path_through_a_frame_is_told(tmp_path: Path) -> None:
     bars = [((0.1, 1.6, 0.3), (0.0, 0.0, 0.25)), ((0.1, 1.6, 0.3), (0.0, 0.0, 1.25))]
     bars += [((0.1, 0.3, 1.3), (0.0, side * 0.65, 0.75)) for side in (-1.0, 1.0)]
     parts = [trimesh.creation.box(size).apply_translation(at) for size, at in bars]
-    trimesh.util.concatenate(parts).export(tmp_path / "frame.stl")
+    frame_mesh = trimesh.util.concatenate(parts)
+    (tmp_path / "frame.stl").write_bytes(trimesh.exchange.stl.export_stl(frame_mesh))
     text = POST.read_text(encoding="utf-8")
     text = text[: text.index("[[environment]]")]
     frame = '[[environment]]\nname = "frame"\nkind = "mesh"\npath = "frame.stl"\n'
