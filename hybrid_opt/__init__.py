@@ -52,6 +52,7 @@ if TYPE_CHECKING:
     from hybrid_opt.proposing.proposal import ProposeSettings as ProposeSettings
     from hybrid_opt.proposing.proposal import propose as propose
     from hybrid_opt.proposing.proposal import propose_classes as propose_classes
+    from hybrid_opt.proposing.reach import plan_reach as plan_reach
     from hybrid_opt.recommending.choice import Wish as Wish
     from hybrid_opt.recommending.recommendation import Recommendation as Recommendation
     from hybrid_opt.recommending.recommendation import recommend as recommend

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -27,16 +27,21 @@ def fastest_carry(cell: Cell, evaluations: int, rng: np.random.Generator) -> Car
 
 
 def compared(
-    proposals: Sequence[Proposal], evaluations: int, rng: np.random.Generator
+    proposals: Sequence[Proposal],
+    evaluations: int,
+    rng: np.random.Generator,
+    tell: Callable[[str], None] = lambda text: None,
 ) -> tuple[list[Proposal], Table]:
     """Proposals with the fastest class first, and what was found of each.
 
     Args:
         evaluations: of the search within each class.
         rng: its only randomness.
+        tell: called with what is being done.
     """
     rows = []
-    for proposal in proposals:
+    for k, proposal in enumerate(proposals, 1):
+        tell(f"study of carry {k} of {len(proposals)}")
         seconds = force = float("inf")
         with TemporaryDirectory() as folder:
             file = Path(folder) / "proposed.toml"

@@ -96,17 +96,19 @@ def _run(options: argparse.Namespace) -> int:
         )
     own = sys.argv[-len(options.arguments) :] == options.arguments
     begun = 0.0 if own else worked()  # of a process of its own imports count
+    tell = (lambda text: None) if options.quiet else _teller(lambda: worked() - begun)
     left = max(options.time - (worked() - begun), 1.0)
     proposals = ho.propose_classes(
         problem,
         rng=np.random.default_rng(options.seed),
         settings=ho.ProposeSettings(seconds=left, bases=options.bases, classes=options.classes),
-        tell=(lambda text: None) if options.quiet else _teller(lambda: worked() - begun),
+        tell=tell,
     )
     if options.study is not None:
         from hybrid_opt.classes import compared
 
-        proposals, table = compared(proposals, options.study, np.random.default_rng(options.seed))
+        rng = np.random.default_rng(options.seed)
+        proposals, table = compared(proposals, options.study, rng, tell)
         print(table.text())
     for k, proposal in enumerate(proposals, 1):
         name = output if k == 1 else output.with_stem(f"{output.stem}-{k}")

@@ -89,14 +89,17 @@ class JobCollisions:
         geometry: bodies and pairs; beside those of the carry, both arms' against the box.
     """
 
-    def __init__(self, compiled: CompiledCell) -> None:
+    def __init__(self, compiled: CompiledCell, everywhere: bool = False) -> None:
         """Load or build the compiled bounds.
+
+        Args:
+            everywhere: whether the pads may come from anywhere; else along their contact normals.
 
         Raises:
             DualArmError: the model cannot be built.
         """
         self._workcell = compiled.workcell
-        self.geometry = job_geometry(compiled.workcell)
+        self.geometry = job_geometry(compiled.workcell, everywhere)
         self._functions = compiled.screening
 
     def standing(self, pose: Array, height: float | None) -> SupportedPose:
@@ -157,8 +160,11 @@ class JobCollisions:
         return found
 
 
-def job_geometry(workcell: Workcell) -> CellGeometry:
+def job_geometry(workcell: Workcell, everywhere: bool = False) -> CellGeometry:
     """Bodies and pairs of a cell whose box is not always held; see the module's contact rules.
+
+    Args:
+        everywhere: whether bodies behind a pad are checked against the box as well.
 
     Raises:
         CollisionModelError: a shape is unusable, or an ignored pair names no body.
@@ -176,7 +182,7 @@ def job_geometry(workcell: Workcell) -> CellGeometry:
             or frozenset((other.name, PAYLOAD)) in ignored
         ):
             excluded.append(pair)
-        elif _behind_pad(other, geometry):
+        elif not everywhere and _behind_pad(other, geometry):
             excluded.append(replace(pair, reason=BEHIND_PAD))
         else:
             active.append(ActivePair(pair.first, pair.second))

@@ -422,7 +422,7 @@ def plan(
     Raises:
         SettingsError: OMPL is not installed.
     """
-    base, geometric = _library(seed)
+    base, geometric = library(seed)
     space = base.RealVectorStateSpace(len(room.lower))
     bounds = base.RealVectorBounds(len(room.lower))
     for k, (low, high) in enumerate(zip(room.lower, room.upper, strict=True)):
@@ -432,8 +432,8 @@ def plan(
     information = base.SpaceInformation(space)
     known = _ReachedStates(chain, room)
     information.setStateValidityChecker(lambda state: True)
-    validator = _validator(base, information, known.joined)
-    information.setMotionValidator(validator)
+    asked = validator(base, information, known.joined)
+    information.setMotionValidator(asked)
     information.setup()
     problem = base.ProblemDefinition(information)
     goals = base.GoalStates(information)
@@ -506,7 +506,9 @@ def same(first: Place, second: Place) -> bool:
     return bool(max(apart) < MATCH)
 
 
-def _validator(base: Any, information: Any, joined: Callable[[Any, Any], bool]) -> Any:
+def validator(base: Any, information: Any, joined: Callable[[Any, Any], bool]) -> Any:
+    """What tells OMPL whether the motion between two states is free."""
+
     class Validator(base.MotionValidator):  # type: ignore[misc]
         """Asks the closed chain."""
 
@@ -516,7 +518,7 @@ def _validator(base: Any, information: Any, joined: Callable[[Any, Any], bool]) 
     return Validator(information)
 
 
-def _library(seed: int) -> tuple[Any, Any]:
+def library(seed: int) -> tuple[Any, Any]:
     """OMPL's modules, its generator of seeds begun anew."""
     try:
         from ompl import base, geometric, util

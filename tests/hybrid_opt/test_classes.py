@@ -40,7 +40,9 @@ def test_the_fastest_class_comes_first(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(classes, "Cell", SimpleNamespace(load=load))
     monkeypatch.setattr(classes, "fastest_carry", fastest)
     given = [proposal(side) for side in ("right of post", "over post", "left of post")]
-    found, table = classes.compared(given, 300, np.random.default_rng(1))
+    told: list[str] = []
+    found, table = classes.compared(given, 300, np.random.default_rng(1), told.append)
+    assert told == [f"study of carry {k} of 3" for k in (1, 2, 3)]
     assert [one.sides[0] for one in found] == ["left of post", "over post", "right of post"]
     assert table.rows[0] == ("left of post", "1 and 0", "4.00", "1.50", "31.2")
     assert table.rows[2][3:] == (NOTHING, NOTHING)
