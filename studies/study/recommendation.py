@@ -376,8 +376,8 @@ def _row(label: str, found: list[Array]) -> StoredDurations:
 
 EXPORT_TARGET = "ros2-control"
 
-ADVICE = 3
-"""Most changes that a terminal lists."""
+ADVICE, NOTICED = 3, 0.05
+"""Most changes that a terminal lists, and the least change of the force by one [N]."""
 
 
 @dataclass(frozen=True)
@@ -418,8 +418,9 @@ def recommendation_text(found: StoredRecommendation, folder: str) -> Recommendat
         *[(rival.label, _rival(rival, found)) for rival in found.rivals],
         ("margins", "; ".join(_margins(found)) or "not known"),
     ]
-    if found.advice:
-        facts.append(("costs most", "; ".join(str(each) for each in found.advice[:ADVICE])))
+    told = [str(each) for each in found.advice if abs(each.force) >= NOTICED][:ADVICE]
+    if told:
+        facts.append(("costs most", "; ".join(told)))
     if found.price is not None:
         facts.append(("holds", _robust(found.price)))
     return RecommendationText(headline, tuple(facts), found.warnings)
