@@ -9,11 +9,17 @@ refused.
 
 from __future__ import annotations
 
+import argparse
+import json
 import sys
 from pathlib import Path
 
 from studies.options import add
-from studies.program import Parser, Program, later, run_program
+from studies.program import Parser, Program, later, load_workcell, run_program
+from symbolic.errors import SettingsError
+from symbolic.replacing import replace_file
+
+REFUSED = 1
 
 
 def _add_options(parser: Parser) -> None:
@@ -30,7 +36,31 @@ def _add_options(parser: Parser) -> None:
     add(parser, "--json")
 
 
-main = Program("calibrate", __doc__, _add_options, later("studies.programs.calibration.calibrate"))
+def calibrate(options: argparse.Namespace) -> int:
+    """Do what the options ask for, and print it; returns the exit code."""
+    from hybrid_opt.calibrating import evidence as found_in
+    from hybrid_opt.calibrating.recording import read_run
+
+    output = options.out
+    if output is not None and not output.resolve().parent.is_dir():
+        raise SettingsError(f"{output.parent} is no folder; make it, or name another --out")
+    if output is not None and output.resolve() == options.workcell.resolve():
+        raise SettingsError(f"{output} is the workcell itself; name another file by --out")
+    workcell = load_workcell(options.workcell)
+    evidence = found_in.calibrate(workcell, [read_run(path, workcell) for path in options.runs])
+    print(json.dumps(evidence.document, indent=2) if options.json else evidence)
+    if output is not None and evidence.changes:
+        text = found_in.calibrated_file(workcell.source, evidence, output.resolve())
+        replace_file(output, text.encode())
+        if not options.json:
+            print(f"written: {output}")
+    elif output is not None:
+        print(f"not written: {output}, because the runs show nothing for it", file=sys.stderr)
+    missed = output is not None and not evidence.changes
+    return REFUSED if missed or any(fault.serious for fault in evidence.faults) else 0
+
+
+main = Program("calibrate", __doc__, _add_options, later("studies.calibrate.calibrate"))
 
 
 if __name__ == "__main__":

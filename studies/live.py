@@ -7,10 +7,12 @@ screen. The result can be saved as a workcell and exported. Only this machine ca
 
 from __future__ import annotations
 
+import argparse
 import sys
+import threading
 
 from studies.options import add, whole
-from studies.program import Parser, Program, later, run_program
+from studies.program import Parser, Program, later, load_workcell, run_program
 
 
 def _add_options(parser: Parser) -> None:
@@ -23,7 +25,26 @@ def _add_options(parser: Parser) -> None:
     )
 
 
-main = Program("live", __doc__, _add_options, later("studies.programs.live.serve"))
+def serve(options: argparse.Namespace) -> int:
+    """Serve a cell until Ctrl-C; returns the exit code.
+
+    Raises:
+        DualArmError: the cell has no drivable form, or viser is missing.
+    """
+    import hybrid_opt as ho
+
+    workcell = load_workcell(options.workcell)
+    print("compiling what is not compiled yet", file=sys.stderr)
+    page = ho.live(ho.Cell(workcell), port=options.port)
+    print(f"Open {page.url} in a browser; Ctrl-C ends it.", file=sys.stderr)
+    try:
+        threading.Event().wait()
+    except KeyboardInterrupt:
+        page.close()
+    return 0
+
+
+main = Program("live", __doc__, _add_options, later("studies.live.serve"))
 
 
 if __name__ == "__main__":
