@@ -8,10 +8,19 @@ body: it is named, with the reason.
 
 from __future__ import annotations
 
+import argparse
 import sys
+from collections.abc import Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from studies.program import Parser, Program, later, run_program
+from symbolic import outside
+from symbolic.errors import OutsideError, SceneError
+from symbolic.replacing import replace_file
+
+if TYPE_CHECKING:
+    from symbolic.read.scenes.bodies import Scene
 
 
 def _add_options(parser: Parser) -> None:
@@ -25,7 +34,60 @@ def _add_options(parser: Parser) -> None:
     )
 
 
-main = Program("scene", __doc__, _add_options, later("studies.programs.scene.add_scene"))
+def add_scene(options: argparse.Namespace) -> int:
+    """Print a scene's bodies, or add them to a file; returns the exit code."""
+    from hybrid_opt.proposing.problem import completed
+    from symbolic.read.scenes.read import read_scene
+
+    scene = read_scene(options.scene)
+    for told in scene.notes:
+        print(f"note: {told}", file=sys.stderr)
+    for told in scene.left_out:
+        print(f"left out: {told}", file=sys.stderr)
+    if options.into:
+        _add(scene, options.into)
+        print(f"{options.into}: {len(scene.bodies)} bodies added to its environment")
+    elif scene.files:
+        raise SceneError(
+            f"{options.scene}: holds meshes of its own, which become files beside a workcell; name "
+            "that by --into"
+        )
+    elif scene.bodies:
+        folder = Path.cwd()
+        print(completed("", {}, {"environment": scene.tables(folder, folder)}), end="")
+    return 1 if scene.left_out else 0
+
+
+def _add(scene: Scene, path: Path) -> None:
+    from hybrid_opt.proposing.problem import extended
+
+    try:
+        content = outside.read_bytes(path, outside.WORKCELL_BYTES)
+        data = outside.toml_tables(content)
+    except OutsideError as error:
+        raise SceneError(f"{path}: {error}") from error
+    meshes = path.absolute().with_name(f"{path.stem}-meshes")
+    tables = scene.tables(path.parent, meshes)
+    taken = {str(each.get("name")) for each in (*_entries(data, "robots"), *_entries(data))}
+    again = sorted(taken & {table["name"] for table in tables})
+    if again:
+        raise SceneError(
+            f"{path}: has bodies or robots called {', '.join(map(repr, again[:5]))} already; "
+            "remove those that came from this scene before, or rename them"
+        )
+    text = extended(content.decode(), data, "environment", tables)
+    for name, mesh in scene.files.items():
+        meshes.mkdir(exist_ok=True)
+        replace_file(meshes / name, mesh)
+    replace_file(path, text.encode())
+
+
+def _entries(data: Mapping[str, Any], key: str = "environment") -> list[Mapping[str, Any]]:
+    found = data.get(key, [])
+    return [each for each in found if isinstance(each, dict)] if isinstance(found, list) else []
+
+
+main = Program("scene", __doc__, _add_options, later("studies.scene.add_scene"))
 
 
 if __name__ == "__main__":

@@ -34,7 +34,8 @@ class Place:
     """Where on the path something happens.
 
     Attributes:
-        constraint: which limit, one of `CONSTRAINTS` or a condition of the path itself.
+        constraint: which limit, as `hybrid_opt.timing.limits.limit_ratios` names it, or a condition
+            of the path itself.
         robot: name of the robot, '' for a limit of the box.
         joint: name of the joint, '' where none is concerned.
         sample: index of the sample, on the grid of whoever reports it.
@@ -50,22 +51,6 @@ class Place:
     def __str__(self) -> str:
         who = " ".join(part for part in (self.robot, self.joint) if part)
         return f"{self.constraint}{f' of {who}' if who else ''} at u = {self.parameter:.4f}"
-
-
-CONSTRAINTS = (
-    "joint velocity",
-    "joint acceleration",
-    "joint torque",
-    "payload velocity",
-    "payload acceleration",
-    "payload angular velocity",
-    "payload angular acceleration",
-    "normal force",
-    "friction",
-    "pressure shift",
-    "path speed",
-)
-"""Limits that a timing has to respect."""
 
 
 @dataclass(frozen=True)

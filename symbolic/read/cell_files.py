@@ -34,7 +34,7 @@ from symbolic.read.descriptions import (
     is_xacro,
     resolve_mesh,
 )
-from symbolic.read.named_robots import with_paths
+from symbolic.read.robots import with_paths
 from symbolic.read.urdf import parse_urdf, read_urdf
 from symbolic.records import Robot, Workcell
 from symbolic.records.problems import shown

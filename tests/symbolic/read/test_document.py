@@ -19,8 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from symbolic.errors import WorkcellError
 from symbolic.read.arms import body_names
-from symbolic.read.cell import changed, load
-from symbolic.read.changes import changed_text
+from symbolic.read.cell import changed, changed_text, load
 from symbolic.read.checks import stretched_length
 from symbolic.read.payload import face_normal, pad_rotation
 from symbolic.records import USUAL, Body, Box, Cylinder, Driver, Sphere, Uncertainty, Workcell

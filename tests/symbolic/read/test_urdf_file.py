@@ -17,7 +17,7 @@ from symbolic.read.arms import arm_model, link_frame, reduced_model
 from symbolic.read.cell import load
 from symbolic.read.cell_files import collect_cell, unpack_cell
 from symbolic.read.descriptions import find_package, further_package_dirs, resolve_mesh
-from symbolic.read.named_robots import named_robot
+from symbolic.read.robots import named_robot
 from symbolic.read.urdf import MOST_LINKS, DisabledPair, UrdfMesh, parse_urdf, read_srdf, read_urdf
 from symbolic.records import Box, Cylinder
 from tests.robots import GOFA_URDF, robot_record, ur10_urdf
