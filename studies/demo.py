@@ -4,12 +4,27 @@ from __future__ import annotations
 
 import argparse
 import sys
+import time
+import webbrowser
+from collections.abc import Iterator
 from pathlib import Path
 
-from studies.options import add
+import hybrid_opt as ho
+from studies.options import QUICK_EVALUATIONS, add
 from studies.program import Parser, Program, later, run_program
+from studies.rack import main as rack
+from studies.report import PAGE
 
 OUTPUT = Path("results/demo")
+
+SHOWN = 5
+"""Carries of the first front that are shown."""
+
+LONGEST = 2.0
+"""Times the shortest duration that a shown carry may take."""
+
+HELD = 0.99
+"""Used so far, a limit holds a carry back."""
 
 
 def _add_options(parser: Parser) -> None:
@@ -22,7 +37,73 @@ def _add_options(parser: Parser) -> None:
     )
 
 
-main = Program("demo", __doc__, _add_options, later("studies.programs.demo.show"))
+def show(options: argparse.Namespace) -> int:
+    """Show a first result, then make the rack's quick study; returns the exit code."""
+    began = time.monotonic()
+    for part in first_result():
+        print(f"{part}\n", flush=True)
+    print(
+        f"So far {time.monotonic() - began:.0f} s. The rest, a quick study with polish, "
+        "recommendation and page, takes a\nminute on two idle cores, longer beside other work or "
+        "where its functions are not compiled yet.\n",
+        flush=True,
+    )
+    begun = ["--resume"] if options.output.exists() else []
+    code = rack(["--quick", "--output", str(options.output), *begun], options.called)
+    page = (options.output / PAGE).resolve()
+    if code == 0 and options.open and webbrowser.open(page.as_uri()):
+        print(f"Opened in your browser: {page}")
+    return code
+
+
+def first_result(evaluations: int = QUICK_EVALUATIONS, seed: int = 1) -> Iterator[str]:
+    """What holds the rack's hand-made carry back, then a first front.
+
+    Args:
+        evaluations: candidates of the search.
+        seed: of its randomness.
+    """
+    import numpy as np
+
+    from hybrid_opt.building import build_study
+    from hybrid_opt.display.table import Table
+    from hybrid_opt.polishing.settings import quick_settings
+    from hybrid_opt.progress import Progress
+
+    whole = ho.example("rack")
+    build_study(whole, Progress())
+    cell = whole.drivable()
+    by_hand = ho.time_path(cell, cell.initial)
+    yield (
+        f"{cell.workcell.name}: a box of {cell.workcell.payload.mass:g} kg, from one board to the "
+        f"next.\nBy hand: {by_hand.duration:.2f} s at least, and {by_hand.peak_force:.1f} N on a "
+        f"pad. It is held back by its {_held(by_hand)}."
+    )
+    rng = np.random.default_rng(seed)
+    front = ho.search(cell, "nsga2", evaluations=evaluations, rng=rng)
+    front = ho.polish(front, rng=rng, settings=quick_settings(), progress=True)
+    carries = sorted(front, key=lambda carry: carry.duration)
+    carries = [carry for carry in carries if carry.duration < LONGEST * carries[0].duration]
+    chosen = np.unique(np.linspace(0, len(carries) - 1, SHOWN).round().astype(int))
+    rows = []
+    for carry in (carries[k] for k in chosen):
+        force = float(carry.peak_normal_force.max())
+        same = ho.time_path(cell, cell.initial, ho.TimingLimits(force=force))
+        hand = f"{same.duration:.2f}" if same.ok else "-"
+        rows.append((f"{force:.1f}", hand, f"{carry.duration:.2f}", _held(same)))
+    header = ("force on a pad [N]", "by hand [s]", "found [s]", "by hand held back by")
+    title = f"The fastest carries at some forces, of {len(front)} found"
+    yield Table("demo", title, header, tuple(rows)).text()
+
+
+def _held(timing: ho.Timing) -> str:
+    """Which limits a carry is at."""
+    if not timing.ok:
+        return timing.reason
+    return ", ".join(name for name, excess in timing.use.items() if excess.ratio > HELD)
+
+
+main = Program("demo", __doc__, _add_options, later("studies.demo.show"))
 
 
 if __name__ == "__main__":

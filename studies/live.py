@@ -11,6 +11,7 @@ import argparse
 import sys
 import threading
 
+import hybrid_opt as ho
 from studies.options import add, whole
 from studies.program import Parser, Program, later, load_workcell, run_program
 
@@ -31,8 +32,6 @@ def serve(options: argparse.Namespace) -> int:
     Raises:
         DualArmError: the cell has no drivable form, or viser is missing.
     """
-    import hybrid_opt as ho
-
     workcell = load_workcell(options.workcell)
     print("compiling what is not compiled yet", file=sys.stderr)
     page = ho.live(ho.Cell(workcell), port=options.port)

@@ -6,7 +6,7 @@ import re
 
 import pytest
 
-from studies.programs.demo import first_result
+from studies.demo import first_result
 
 pytestmark = pytest.mark.heavy
 
