@@ -4,6 +4,7 @@ pads of every kind."""
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -13,6 +14,8 @@ import yaml
 
 from hybrid_opt.bundles import TARGETS, BundleOptions, export
 from hybrid_opt.bundles.bundle import prepared
+from hybrid_opt.cell import Cell
+from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES
 from hybrid_opt.job.plan import JobModel
 from hybrid_opt.job.records import Job
 from hybrid_opt.job.smooth import driven_timing
@@ -77,6 +80,21 @@ def test_every_cell_that_ships_has_a_job(name: str) -> None:
     sooner = largest_commanded(cell.workcell, motion, carry.normal_force[rows], doubt, 0)
     forces = job.phase("carry").force.normal.max(axis=0)
     np.testing.assert_allclose(sooner, forces, rtol=0.01)
+
+
+def test_pads_that_do_not_face_one_another_keep_limits_on_jerk() -> None:
+    shipping = shipped("fork").drivable()
+    first, second = (
+        replace(robot, jerk_max=np.full(6, 50.0)) for robot in shipping.workcell.robots
+    )
+    cell = Cell(replace(shipping.workcell, robots=(first, second)), DRIVABLE_OBJECTIVES)
+    timing = driven_timing(cell.timing_model, cell.initial)
+    assert timing.carry is not None
+    jerk = np.diff(timing.carry.side_by_side("q_second"), axis=0)
+    jerk /= np.diff(timing.carry.time)[:, None]
+    assert 45.0 < np.abs(jerk).max() <= 50.0 * 1.005
+    job = JobModel(cell.compiled, cell.timing_model).plan(timing)
+    assert job.timing is timing
 
 
 @pytest.mark.parametrize("name", CELLS)
