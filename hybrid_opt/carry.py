@@ -9,7 +9,7 @@ of which arms may have different numbers, is in `arms`.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from codegen.function import NumericFunction
 from hybrid_opt.indicators.metrics import excess_above_static
 from hybrid_opt.shown import Displayable, Page, display
 from hybrid_opt.static_hold import payload_limit, static_hold
-from symbolic.array import Array
+from symbolic.array import Array, set_read_only
 from symbolic.path.spline import sample_basis
 from symbolic.records import Workcell
 from symbolic.records.task import waypoints_of
@@ -80,7 +80,7 @@ class ArmMotion:
     own_torque: Array
 
     def __post_init__(self) -> None:
-        _set_read_only(self)
+        set_read_only(self)
 
     @property
     def torque(self) -> Array:
@@ -132,7 +132,7 @@ class Carry(Displayable):
     judgement: Judgement | None = None
 
     def __post_init__(self) -> None:
-        _set_read_only(self)
+        set_read_only(self)
 
     def __len__(self) -> int:
         return len(self.time)
@@ -258,13 +258,6 @@ def joints_of(workcell: Workcell, values: Array) -> tuple[Array, Array]:
     """Columns of both arms (n, all joints), side by side, as (n, n_joints) of each."""
     first = len(workcell.robots[0].velocity_max)
     return values[:, :first], values[:, first:]
-
-
-def _set_read_only(record: object) -> None:
-    for field in fields(record):  # type: ignore[arg-type]
-        value = getattr(record, field.name)
-        if isinstance(value, np.ndarray):
-            value.setflags(write=False)
 
 
 def carry_under_time_law(

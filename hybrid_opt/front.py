@@ -21,7 +21,7 @@ from hybrid_opt.evaluate.evaluation import CandidateEvaluator, Evaluations
 from hybrid_opt.indicators import metrics
 from hybrid_opt.polishing.records import PolishedFront
 from hybrid_opt.shown import Displayable
-from symbolic.array import Array
+from symbolic.array import Array, set_read_only
 from symbolic.errors import SettingsError
 
 
@@ -50,8 +50,7 @@ class Front(Displayable):
     replica: int | None = None
 
     def __post_init__(self) -> None:
-        for array in (self.x, self.objectives):
-            array.setflags(write=False)
+        set_read_only(self)
 
     @classmethod
     def of_search(

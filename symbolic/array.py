@@ -60,6 +60,13 @@ def interpolated(at: Array, along: Array, values: Array) -> Array:
     return found
 
 
+def set_read_only(record: object) -> None:
+    """Refuse changes of the arrays that a record holds itself."""
+    for value in vars(record).values():
+        if isinstance(value, np.ndarray):
+            value.setflags(write=False)
+
+
 def require_allowed(settings: object, whose: str = "") -> None:
     """Refuse a record of settings with a value that its annotations do not allow: another one than
     a `Literal` names, or no number of a `Range`. None is allowed where the annotation has it.

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
 
@@ -36,7 +36,7 @@ from hybrid_opt.indicators import metrics
 from hybrid_opt.polishing.records import PolishedFront
 from hybrid_opt.store.files import read_bytes, read_document, sha256
 from hybrid_opt.store.json_records import from_json, read_record, record_of
-from symbolic.array import Array
+from symbolic.array import Array, set_read_only
 from symbolic.read.cell import load
 from symbolic.records import Workcell
 
@@ -66,9 +66,8 @@ class Replica:
     seconds: float
 
     def __post_init__(self) -> None:
-        arrays = [getattr(self.evaluations, field.name) for field in fields(Evaluations)]
-        for array in (*arrays, self.generation):
-            array.setflags(write=False)
+        set_read_only(self)
+        set_read_only(self.evaluations)
 
     @cached_property
     def front_rows(self) -> NDArray[np.intp]:

@@ -5,7 +5,7 @@ same at even time steps, as robot controllers take it.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.interpolate import CubicHermiteSpline
@@ -15,7 +15,7 @@ from hybrid_opt.display.table import text_table
 from hybrid_opt.robust.squeeze import Squeeze
 from hybrid_opt.shown import Displayable
 from hybrid_opt.timing.records import Timing
-from symbolic.array import Array, interpolated
+from symbolic.array import Array, interpolated, set_read_only
 from symbolic.errors import SettingsError
 from symbolic.records import Workcell
 
@@ -123,11 +123,8 @@ class Phase:
         return self.motion.own_torque + self.motion.contact_effort(self.force.wrench)
 
     def __post_init__(self) -> None:
-        for record in (self.motion, self.force):
-            for field in fields(record):
-                value = getattr(record, field.name)
-                if isinstance(value, np.ndarray):
-                    value.setflags(write=False)
+        set_read_only(self.motion)
+        set_read_only(self.force)
 
 
 def contact_effort(wrench_torque: Array, first: int, wrench: Array) -> Array:
@@ -235,10 +232,7 @@ class SampledJob:
     wrench: Array
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if isinstance(value, np.ndarray):
-                value.setflags(write=False)
+        set_read_only(self)
 
     def span(self, index: int) -> slice:
         """The samples of a phase, both ends included."""

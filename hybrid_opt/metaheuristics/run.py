@@ -16,7 +16,7 @@ from pymoo.core.problem import Problem
 from hybrid_opt.evaluate.evaluation import NOT_FINITE, REASONS, Evaluations, concatenated
 from hybrid_opt.metaheuristics.guarded import violation_of
 from hybrid_opt.metaheuristics.registry import AlgorithmSettings, make
-from symbolic.array import Array, require_allowed
+from symbolic.array import Array, require_allowed, set_read_only
 from symbolic.errors import SettingsError
 from symbolic.path.pieces import same_paths, stated
 from symbolic.records import Task
@@ -163,8 +163,7 @@ class Evaluated:
     generation: NDArray[np.int64]
 
     def __post_init__(self) -> None:
-        for array in (self.decisions, self.objectives, self.violation, self.generation):
-            array.setflags(write=False)
+        set_read_only(self)
 
     def __len__(self) -> int:
         return len(self.violation)
