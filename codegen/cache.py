@@ -34,7 +34,7 @@ import platformdirs
 from codegen.errors import CodegenError
 from symbolic import outside
 from symbolic.errors import OutsideError
-from symbolic.replacing import replace_file
+from symbolic.outside import replace_file
 
 FORMAT = 1
 """Part of every key; rises when what is stored changes its meaning."""

@@ -17,7 +17,7 @@ from pathlib import Path
 from studies.options import add
 from studies.program import Parser, Program, later, load_workcell, run_program
 from symbolic.errors import SettingsError
-from symbolic.replacing import replace_file
+from symbolic.outside import replace_file
 
 REFUSED = 1
 

@@ -15,7 +15,7 @@ from collections.abc import Callable
 from studies.options import add, number, stated, whole
 from studies.program import Parser, Program, run_program
 from symbolic.errors import SettingsError
-from symbolic.replacing import replace_file
+from symbolic.outside import replace_file
 
 
 def _ranges(text: str) -> tuple[tuple[float, float], tuple[float, float]]:

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 from studies.program import Parser, Program, later, run_program
 from symbolic import outside
 from symbolic.errors import OutsideError, SceneError
-from symbolic.replacing import replace_file
+from symbolic.outside import replace_file
 
 if TYPE_CHECKING:
     from symbolic.read.scenes.bodies import Scene

@@ -7,10 +7,13 @@ JSON and TOML are measured (depth, number of values) before a parser builds them
 
 The messages say what was found and what to do, but not in which file: whoever asked knows its
 name and where it was named.
+
+Files are written in one step, by `replace_file`, which every layer's own errors surround.
 """
 
 from __future__ import annotations
 
+import fcntl
 import json
 import math
 import os
@@ -18,9 +21,9 @@ import re
 import stat
 import tomllib
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from symbolic.errors import OutsideError
 
@@ -290,3 +293,65 @@ def _one_line(error: Exception) -> str:
     if found.startswith("Exceeds the limit"):
         return "a whole number of more than 4300 digits"
     return found if len(found) <= 200 else f"{found[:197]}..."
+
+
+def replace_file(path: Path, content: bytes, mode: int = 0o666) -> None:
+    """Replace a file durably: an interruption at any moment leaves the old content or the new one.
+
+    The new content is written beside it first, as `.NAME.draft`; whoever writes the same file
+    meanwhile waits. What an ended process left there is overwritten.
+
+    Args:
+        path: the file, in an existing folder.
+        content: of the file.
+        mode: permissions of the file, as far as the process's mask allows them.
+
+    Raises:
+        OSError: it cannot be written; what was written beside it is removed.
+    """
+    draft = path.with_name(f".{path.name}.draft")
+    with _alone(draft, mode) as file:
+        try:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+            os.replace(draft, path)
+        except OSError:
+            with suppress(OSError):
+                draft.unlink()
+            raise
+    sync_folder(path.parent)
+
+
+def sync_folder(folder: Path) -> None:
+    """Make a folder's entries durable.
+
+    Raises:
+        OSError: there is none, or the disk does not take them.
+    """
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+@contextmanager
+def _alone(draft: Path, mode: int) -> Iterator[BinaryIO]:
+    """A new, empty file that nobody else writes, as far as the file system has locks."""
+    while True:
+        with open(os.open(draft, os.O_WRONLY | os.O_CREAT | os.O_NOFOLLOW, mode), "wb") as file:
+            with suppress(OSError):
+                fcntl.flock(file, fcntl.LOCK_EX)
+            if _is_still(draft, file):
+                file.truncate(0)
+                yield file
+                return
+
+
+def _is_still(draft: Path, file: BinaryIO) -> bool:
+    """False where whoever held the lock before has renamed what was opened: it is theirs."""
+    try:
+        return os.path.samestat(os.fstat(file.fileno()), draft.stat(follow_symlinks=False))
+    except FileNotFoundError:
+        return False

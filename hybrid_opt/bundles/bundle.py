@@ -68,7 +68,7 @@ from hybrid_opt.job.smooth import RESTS, acceleration_at_ends
 from hybrid_opt.store.files import AGAIN, own_version, read_bytes, read_document, sha256, storing
 from hybrid_opt.timing.records import Timing
 from symbolic.errors import SettingsError
-from symbolic.replacing import replace_file, sync_folder
+from symbolic.outside import replace_file, sync_folder
 
 UNITS = {
     "length": "m",

@@ -33,10 +33,10 @@ from hybrid_opt.work.dask_cluster import DaskExecutor
 from hybrid_opt.work.service import Executor, LocalExecutor
 from symbolic.array import Range, require_allowed
 from symbolic.errors import SettingsError
+from symbolic.outside import sync_folder
 from symbolic.read.cell import load
 from symbolic.read.cell_files import CellFiles, collect_cell, unpack_cell
 from symbolic.records import Workcell
-from symbolic.replacing import sync_folder
 
 ExecutorName = Literal["processes", "dask"]
 

@@ -18,8 +18,8 @@ from typing import Any
 from hybrid_opt.errors import ResultsError
 from symbolic import outside
 from symbolic.errors import OutsideError
+from symbolic.outside import replace_file
 from symbolic.records.problems import shown
-from symbolic.replacing import replace_file
 
 LOCK = ".lock"
 

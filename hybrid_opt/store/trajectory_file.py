@@ -26,6 +26,7 @@ from hybrid_opt.store.files import AGAIN, read_document, storing
 from hybrid_opt.store.json_records import from_json
 from symbolic.array import Array
 from symbolic.errors import BundleError
+from symbolic.outside import replace_file
 from symbolic.read.cell_files import (
     CellFiles,
     cell_from_json,
@@ -35,7 +36,6 @@ from symbolic.read.cell_files import (
 )
 from symbolic.records import Workcell
 from symbolic.records.problems import shown, text_problem
-from symbolic.replacing import replace_file
 
 FORMAT = "dual-arm-carry trajectory"
 VERSION = 1

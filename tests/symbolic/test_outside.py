@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 
 from symbolic import outside
 from symbolic.errors import OutsideError
-from symbolic.replacing import replace_file
+from symbolic.outside import replace_file
 from tests.waiting import soon
 
 MOST = 1000

@@ -20,8 +20,8 @@ from hybrid_opt.proposing.via_points import travelled
 from studies.research.turns import progress
 from symbolic.array import Array
 from symbolic.geometry.pairs import build_geometry
+from symbolic.outside import replace_file
 from symbolic.read.cell import load
-from symbolic.replacing import replace_file
 
 EVALUATIONS = 1000
 """Evaluations of the search behind a fastest carry."""
