@@ -14,10 +14,9 @@ import casadi as ca
 import numpy as np
 
 from symbolic.cell_model import CellModel
-from symbolic.contact.closed_form import ContactLoad, HeldLoad, held_by
 from symbolic.contact.force_closure import WRENCH_SIZE
 from symbolic.contact.grasp import Grasp
-from symbolic.contact.load import frictions
+from symbolic.contact.load import ContactLoad, HeldLoad, frictions, held_by
 from symbolic.contact.soft_finger import Detached
 from symbolic.contact.soft_grasp import SoftGrasp
 from symbolic.expression import as_mx, mx_given, number, of, sx_given

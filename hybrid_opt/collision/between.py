@@ -5,7 +5,7 @@ A pair that is c_a and c_b apart at the two ends of an interval keeps a distance
   (c_a + c_b - D) / 2 - K / 8       and of at least       max(c_a, c_b) - D - K / 8
 
 inside it, with D and K the chords and bends of both bodies
-(`symbolic.geometry.motion_bounds`). Where neither exceeds the tolerance, the interval is halved;
+(`symbolic.geometry.clearance`). Where neither exceeds the tolerance, the interval is halved;
 where the compiled clearance does not suffice, a distance proven along FCL's nearest points takes
 its place.
 """

@@ -80,7 +80,7 @@ Separations = dict[tuple[bytes, int], float | None]
 @dataclass(frozen=True)
 class MotionBounds:
     """Chord and bend (n, n_pairs) [m] of every pair between configurations, see
-    `symbolic.geometry.motion_bounds`."""
+    `symbolic.geometry.clearance`."""
 
     chord: Array
     bend: Array

@@ -1,6 +1,6 @@
 """What a candidate is worth.
 
-evaluation: the verdict that searches call. kernel: what the samples of candidates say, in lanes.
-evaluations: verdicts, and what can make a candidate infeasible. objectives: what may be minimised.
-explanation: why a candidate is infeasible.
+evaluation: the verdict that searches call, and what can make a candidate infeasible. kernel: what
+the samples of candidates say, in lanes. objectives: what may be minimised. explanation: why a
+candidate is infeasible.
 """

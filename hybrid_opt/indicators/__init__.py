@@ -1,5 +1,5 @@
 """Figures of fronts.
 
 metrics: hypervolume, IGD, spacing, counts, bounds that decide. statistics: medians, rank tests,
-effect sizes, surfaces over replicas. selection: one carry of a front.
+effect sizes, surfaces over replicas.
 """

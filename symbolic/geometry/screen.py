@@ -1,6 +1,6 @@
 """What bounds of distances and motions are made of, as numbers: covers, obstacles, reach.
 
-NumPy finds it once per cell. `symbolic.geometry.clearance` and `symbolic.geometry.motion_bounds`
+NumPy finds it once per cell. `symbolic.geometry.clearance` and `symbolic.geometry.clearance`
 write expressions of it, whether it holds arrays or symbols in their place
 (`symbolic.numbers.CellNumbers`). Which bound a pair gets depends on numbers, too: that is kept as
 flags.

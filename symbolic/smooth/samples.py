@@ -25,9 +25,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from symbolic.array import Array
-from symbolic.contact.closed_form import ContactLoad, held_by
 from symbolic.contact.grasp import Grasp
-from symbolic.contact.load import frictions, resultant_force
+from symbolic.contact.load import ContactLoad, frictions, held_by, resultant_force
 from symbolic.contact.paper import (
     normal_force_branches,
     required_moment,
