@@ -1,5 +1,5 @@
 """How a carry, a front and a timing look in a terminal and in a notebook.
 
-objects, table: texts and HTML tables. svg: plots as inline pictures. scene: the cell in
-three dimensions, for notebooks and for the report's page. Nothing here needs Matplotlib.
+objects, table: texts and HTML tables, plots as inline pictures. scene: the cell in three
+dimensions, for notebooks and for the report's page. Only the plots need Matplotlib.
 """
