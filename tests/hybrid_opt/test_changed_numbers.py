@@ -23,7 +23,9 @@ from hybrid_opt.polishing.settings import (
     ProbeSettings,
 )
 from hybrid_opt.robust.force import pressing_model
+from symbolic.records import Workcell
 from tests.hybrid_opt.cells import shipped
+from tests.symbolic.cells import rack_cell
 
 SHORT = PolishSettings(
     attempts=1,
@@ -40,9 +42,9 @@ def moved(values: Any, *by: float) -> list[float]:
     return found
 
 
-def changes(cell: ho.Cell) -> dict[str, dict[str, Any]]:
+def changes(known: Workcell) -> dict[str, dict[str, Any]]:
     """By group: none of its numbers is what it was."""
-    known, task = cell.workcell, cell.workcell.task
+    task = known.task
     names = [body.name for body in known.environment]
     pedestal = known.environment[next(k for k, n in enumerate(names) if "pedestal" in n)]
     yaw = float(np.arctan2(*known.robots[1].T_world_base[1::-1, 0]))
@@ -106,7 +108,7 @@ def changes(cell: ho.Cell) -> dict[str, dict[str, Any]]:
     }
 
 
-GROUPS = tuple(changes(shipped("rack")))
+GROUPS = tuple(changes(rack_cell()))
 
 STRUCTURE: dict[str, dict[str, Any]] = {
     "roll and pitch of a base": {"robots[0].base.rpy": [0.01, 0.02, -1.5707963267948966]},
@@ -174,7 +176,7 @@ def needs_no_compiler(name: str, group: str, monkeypatch: pytest.MonkeyPatch) ->
         plainly(self, source, *given, **more)
 
     monkeypatch.setattr(Compiler, "compile", refused)
-    changed = changes(cell)[group]
+    changed = changes(cell.workcell)[group]
     new, driven = cell.changed(changed), drivable.changed(changed)
     found = asked(new, driven, polished(name, new, driven))
     assert (found == warmed(name)[2]) is (group in UNSEEN)
@@ -203,5 +205,5 @@ def test_what_is_structure_has_another_digest(name: str) -> None:
 @pytest.mark.parametrize("group", GROUPS)
 def test_no_number_is_structure(name: str, group: str) -> None:
     cell = shipped(name)
-    changed = cell.changed(changes(cell)[group])
+    changed = cell.changed(changes(cell.workcell)[group])
     assert changed.compiled.numbers.bodies_digest == cell.compiled.numbers.bodies_digest

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import casadi as ca
 import clarabel
 import numpy as np
 from scipy import sparse
@@ -11,7 +12,9 @@ from scipy.spatial.transform import Rotation
 
 from symbolic.array import Array
 from symbolic.contact.force_closure import has_force_closure
+from symbolic.contact.grasp import Grasp, grasp_wrenches
 from symbolic.records import Contact, Workcell
+from tests.symbolic.contact.joint_oracle import cross_matrix, scaled_triangle
 
 TOLERANCES = (1e-11, 1e-10, 1e-9)
 """Of clarabel; the next one where it makes no progress."""
@@ -108,7 +111,7 @@ def _corner_wrench(pad: Contact) -> Array:
     assert pad.half_sides is not None
     x, y = pad.half_sides
     places = [(x, y), (-x, y), (-x, -y), (x, -y)]
-    return np.hstack([np.vstack([np.eye(3), _cross([*place, 0.0])]) for place in places])
+    return np.hstack([np.vstack([np.eye(3), cross_matrix([*place, 0.0])]) for place in places])
 
 
 def _matrix(mu: float, x: Array) -> Array:
@@ -117,24 +120,13 @@ def _matrix(mu: float, x: Array) -> Array:
     n = x[2]
     q = complex(-x[4], x[3])
     t = complex(x[0], x[1]) / mu
-    beside = x[6] + 1j * x[5] / mu
-    hermitian = np.array(
-        [[n, q.conjugate(), t.conjugate()], [q, n, beside.conjugate()], [t, beside, n]]
-    )
-    real = np.block([[hermitian.real, -hermitian.imag], [hermitian.imag, hermitian.real]])
-    return np.array(
-        [real[j, k] * (1.0 if j == k else np.sqrt(2.0)) for k in range(6) for j in range(k + 1)]
-    )
+    return scaled_triangle(n, q, t, x[6] + 1j * x[5] / mu)
 
 
 def in_box(pad: Contact) -> Array:
     """(6, 6) from a wrench about a pad's centre, in its axes, to one about the box frame."""
     R, p = pad.T_box_pad[:3, :3], pad.T_box_pad[:3, 3]
-    return np.block([[R, np.zeros((3, 3))], [_cross(p) @ R, R]])
-
-
-def _cross(v: Array | list[float]) -> Array:
-    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
+    return np.block([[R, np.zeros((3, 3))], [cross_matrix(p) @ R, R]])
 
 
 def random_pad(rng: np.random.Generator, friction: float, kind: str) -> Contact:
@@ -181,3 +173,24 @@ def turned(pad: Contact, rotation: Rotation) -> Contact:
     T = np.eye(4)
     T[:3, :3] = rotation.as_matrix()
     return replace(pad, T_box_pad=T @ pad.T_box_pad)
+
+
+def function_of(cell: Workcell, differentiable: bool = False) -> ca.Function:
+    load, friction = ca.MX.sym("load", 6), ca.MX.sym("friction", 2)
+    found = grasp_wrenches(Grasp(cell), load, friction, differentiable=differentiable)
+    return ca.Function("grasp", [load, friction], [found])
+
+
+def friction_of(cell: Workcell) -> list[float]:
+    return [contact.friction for contact in cell.contacts]
+
+
+def wrenches(cell: Workcell, load: Array, function: ca.Function | None = None) -> Array:
+    """(k, 6) force and moment about the pads' centres, in their axes."""
+    found = np.array((function or function_of(cell))(load, friction_of(cell))).reshape(-1, 6)
+    n, t_x, t_y, q_x, q_y, m = found.T
+    return np.column_stack([t_x, t_y, n, q_y, -q_x, m])
+
+
+def effort(found: Array) -> float:
+    return float(np.sum(found[:, :3] ** 2))

@@ -65,7 +65,7 @@ def _solve(case: Case, size: float, squeeze: bool) -> tuple[Array, float]:
     their multipliers (weak duality)."""
     unit = case.radius.max()
     eye, none = np.eye(3), np.zeros((3, 3))
-    turn = [_cross_matrix(arm) / unit for arm in case.arms]
+    turn = [cross_matrix(arm) / unit for arm in case.arms]
     balance = np.block([[eye, none, eye, none], [turn[0], eye, turn[1], eye]])
     rows = np.hstack([balance, np.zeros((6, 2))])
     right = np.concatenate([case.force, case.moment / unit]) / size
@@ -107,6 +107,11 @@ def cone_matrix(case: Case, i: int, x: Array) -> Array:
     t = complex(force[0], force[1]) / mu
     beside = z + 1j * moment[2] / (mu * r)
     n = sign * force[2]
+    return scaled_triangle(n, q, t, beside)
+
+
+def scaled_triangle(n: float, q: complex, t: complex, beside: complex) -> Array:
+    """(21,) of the real (6, 6) form of the matrix above, as clarabel's cone has it."""
     hermitian = np.array(
         [[n, q.conjugate(), t.conjugate()], [q, n, beside.conjugate()], [t, beside, n]]
     )
@@ -116,5 +121,5 @@ def cone_matrix(case: Case, i: int, x: Array) -> Array:
     )
 
 
-def _cross_matrix(v: Array) -> Array:
+def cross_matrix(v: Array | list[float]) -> Array:
     return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])

@@ -8,8 +8,6 @@ import casadi as ca
 import clarabel
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from scipy import sparse
 from scipy.spatial.transform import Rotation
 
@@ -27,11 +25,13 @@ from symbolic.contact.worst_cases import CASE_SIZE, case_squeeze_function
 from symbolic.records import Contact, Workcell
 from tests.symbolic.cells import call, hand_cell, with_task
 from tests.symbolic.contact.grasp_oracle import (
+    effort,
+    function_of,
     in_box,
     least_wrenches,
     random_grasp,
     random_load,
-    turned,
+    wrenches,
 )
 from tests.symbolic.contact.joint_oracle import Case
 from tests.symbolic.contact.joint_oracle import least_wrenches as joint_wrenches
@@ -48,24 +48,6 @@ KINDS = (
 
 def even_cell() -> Workcell:
     return with_task(hand_cell(), allocation="soft-finger")
-
-
-def function_of(cell: Workcell) -> ca.Function:
-    load, friction = ca.MX.sym("load", 6), ca.MX.sym("friction", 2)
-    found = grasp_wrenches(Grasp(cell), load, friction)
-    return ca.Function("grasp", [load, friction], [found])
-
-
-def wrenches(cell: Workcell, load: Array, function: ca.Function | None = None) -> Array:
-    """(k, 6) force and moment about the pads' centres, in their axes."""
-    friction = [contact.friction for contact in cell.contacts]
-    found = np.array((function or function_of(cell))(load, friction)).reshape(-1, 6)
-    n, t_x, t_y, q_x, q_y, m = found.T
-    return np.column_stack([t_x, t_y, n, q_y, -q_x, m])
-
-
-def effort(found: Array) -> float:
-    return float(np.sum(found[:, :3] ** 2))
 
 
 def points_of(pad: Contact) -> tuple[Array, Array]:
@@ -216,22 +198,6 @@ def test_a_block_on_a_wedge_of_pads_is_held_as_statics_say() -> None:
     share = 40.0 * np.cos(np.arctan(0.5)) / np.cos(np.pi / 4 - np.arctan(0.5))
     np.testing.assert_allclose(found[:2, 2], share, rtol=1e-4)
     assert found[2, 2] < 1e-3
-
-
-@given(seed=st.integers(0, 2**31), kinds=st.sampled_from(KINDS[:3]))
-@settings(max_examples=6, deadline=None)
-def test_turning_all_turns_the_forces(seed: int, kinds: tuple[str, ...]) -> None:
-    rng = np.random.default_rng(seed)
-    cell, load = random_grasp(rng, even_cell(), kinds), random_load(rng)
-    rotation = Rotation.random(random_state=seed)
-    first, last = cell.contacts
-    moved = replace(
-        turned(first, rotation), further=tuple(turned(p, rotation) for p in first.further)
-    )
-    other = replace(cell, contacts=(moved, turned(last, rotation)))
-    there = wrenches(other, np.concatenate([rotation.apply(load[:3]), rotation.apply(load[3:])]))
-    here = wrenches(cell, load)
-    np.testing.assert_allclose(there[:, :3], here[:, :3], atol=1e-4 * np.sqrt(effort(here)))
 
 
 @pytest.mark.parametrize("kinds", KINDS[:3])
