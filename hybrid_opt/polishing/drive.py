@@ -49,7 +49,7 @@ from hybrid_opt.robust.path_force import PathPoints, robust_path
 from hybrid_opt.timing.drive import CandidateDriver
 from symbolic.array import Array
 from symbolic.errors import SettingsError
-from symbolic.path.pieces import by_stated_waypoints, stated, stated_entries
+from symbolic.path.pieces import by_levels, stated_entries
 from symbolic.records import Workcell
 from symbolic.records.task import waypoints_of
 
@@ -67,6 +67,10 @@ NOISE = 5e-4
 CLOSER = 0.1
 """Share of the promised gain that a step has to bring, unless the timing may have rounded it
 off."""
+
+PARTS = (1.0, 0.5, 0.25, 0.125)
+"""Parts of a step that are tried, the first that is closer is taken: judging costs a tenth of a
+round."""
 
 NEWTON = 0.05
 """Steps shorter than this keep the program's squared speeds, longer ones take those of the new
@@ -232,13 +236,12 @@ class DriveWay(Way[DrivePoint, DriveStep]):
         super().__init__(cell, ActiveSet(cell), CarryReader(cell))
         self.driver, self.settings, self._n = driver, settings, task.n_path
         self.half = cell.half[: task.n_path]
-        moving = stated(task) if by_stated else task
-        self._bounds = moving.lower[: moving.n_path], moving.upper[: moving.n_path]
-        self._unit = (self._bounds[1] - self._bounds[0]) / 2.0
-        self._own = stated_entries(task) if by_stated else np.arange(task.n_path)
-        self._spread = (
-            by_stated_waypoints(task) if by_stated else np.eye(task.n_path)
-        ) * self._unit
+        self._own = own = stated_entries(task) if by_stated else np.arange(task.n_path)
+        self._bounds = task.lower[own], task.upper[own]
+        by, square = by_levels(task)
+        self._unit = (self.half * square)[own]
+        self._newton = NEWTON * float(square[own].min())
+        self._spread = by[:, own] * self._unit
         self.paths = PathJudge(driver)
         self._intervals = IntervalGrid(cell.workcell, driver.timer.intervals, driver.robust)
         self._method = quadratic_method(cell.evaluator.compiled.cache)
@@ -263,22 +266,27 @@ class DriveWay(Way[DrivePoint, DriveStep]):
 
     def judge(self, best: DrivePoint, step: DriveStep) -> StepVerdict[DrivePoint]:
         """See `Way`. What the timing rounds off may hide a small gain, but must not add up."""
-        x = self._moved(best.x, step.d)
-        timed = self.paths.timed(x[: self._n], float(x[-1]))
-        gain = 1.0 - timed.duration / best.level
         tiny = step.gain <= NOISE
-        kept = timed.duration <= best.lowest * (1.0 + NOISE)
-        if gain < CLOSER * step.gain and not (tiny and kept):
-            finite = np.isfinite(timed.duration)
-            return StepVerdict(None, closer=False, factor=HALVED if finite else QUARTERED)
-        share = gain / max(step.gain, 1e-300)
-        is_short = step.length <= NEWTON
+        for part in PARTS:
+            x = self._moved(best.x, part * step.d)
+            timed = self.paths.timed(x[: self._n], float(x[-1]))
+            gain = 1.0 - timed.duration / best.level
+            kept = timed.duration <= best.lowest * (1.0 + NOISE)
+            if gain >= CLOSER * part * step.gain or (tiny and kept):
+                break
+            if not np.isfinite(timed.duration):
+                return StepVerdict(None, closer=False, factor=QUARTERED)
+        else:
+            return StepVerdict(None, closer=False, factor=HALVED * part)
+        share = gain / max(part * step.gain, 1e-300)
+        is_short = part == 1.0 and step.length <= self._newton
         squared = step.squared if is_short else timed.squared
         return StepVerdict(
             self._reached(x, timed, squared, best.lowest),
             closer=True,
             kept=max(share, 0.5) if tiny else share,
-            surprising=gain > step.gain and not tiny,
+            part=part,
+            surprising=part == 1.0 and gain > step.gain and not tiny,
             is_short=is_short,
         )
 

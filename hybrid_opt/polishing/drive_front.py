@@ -68,8 +68,14 @@ level."""
 NEARLY = 1e-2
 """Residual of stationarity below which it is."""
 
-BETWEEN = (0.25, 0.5, 0.75)
+BETWEEN = (0.125, 0.25, 0.375, 0.5, 0.625, 0.75, 0.875)
 """Shares of the way from one path of the front to the next that are tried as paths, too."""
+
+FASTEST = 4
+"""Paths that are judged at most before a gap is left: some touch something."""
+
+ONWARD = (0.5, 1.0)
+"""Shares of the way between two refined paths that the next one may start ahead of the second."""
 
 SAME = 0.25
 """Paths nearer than this to one another lie in one basin, in halves of the variables' ranges."""
@@ -88,6 +94,19 @@ class DriveAttempt(Attempt):
 
     rivals: tuple[Array, ...] = ()
     moves: Literal["stated", "all", "none"] = "stated"
+
+
+@dataclass(frozen=True)
+class Gap:
+    """A gap of the front.
+
+    Attributes:
+        force: limit in its middle [N].
+        ends: indices of the points on both sides.
+    """
+
+    force: float
+    ends: tuple[int, int]
 
 
 def best_of(way: DriveWay, starts: Sequence[Array]) -> Solution:
@@ -150,12 +169,15 @@ def distance(path: Array, other: Array, half: Array) -> float:
     return float(np.sqrt(np.mean(((path - other) / half) ** 2)))
 
 
-def second_opinion(driver: CandidateDriver, model: TimingModel, x: Array) -> str:
+def second_opinion(
+    driver: CandidateDriver, model: TimingModel, x: Array, independent: bool = True
+) -> str:
     """Why the timing of a decision vector (n_var,) is not believed, empty where it is: by the
     tenfold grid, and the independent `time_path`.
 
     Args:
         model: of the driver's workcell and intervals.
+        independent: whether `time_path` is asked, too.
     """
     (timing,) = driver.timings(np.asarray(x)[None])
     if not timing.ok:
@@ -164,6 +186,8 @@ def second_opinion(driver: CandidateDriver, model: TimingModel, x: Array) -> str
     driven = drive_path(model, x, timing.grid_speed, limits, motion)
     if not driven.ok:
         return f"on the tenfold grid: {driven.reason}"
+    if not independent:
+        return ""
     other = time_path(model, x, limits, motion)
     if not other.ok:
         return f"the independent timing: {other.reason}"
@@ -179,7 +203,7 @@ class DriveRun(PolishRun[DriveAttempt]):
         self,
         way: DriveWay,
         settings: PolishSettings,
-        doubt: Callable[[Array], str],
+        doubt: Callable[[Array, bool], str],
         archive: GrowingFront,
         recorded: list[PolishOutcome | Loss],
         emit: Callable[[PolishOutcome], None],
@@ -199,12 +223,16 @@ class DriveRun(PolishRun[DriveAttempt]):
         self._tried: set[float] = set()
         self._hand_made = initial_decision(task)[: self._n_path]
         self._paths, self._others, self._largest = paths, paths[:0], self._range[0]
+        if way.stated is not way:
+            self._most = min(self._most, settings.drivable.rough)
 
     def all(self, rng: np.random.Generator) -> None:
         """A tournament, a gentle force, the front's points, ends and gaps, other starts, while
         attempts last; then the best known paths all over the range of forces."""
         rows = self._archive.rows()
-        count = min(len(rows), ceil(self._settings.attempts * OWN_SHARE))
+        refines = self._way.stated is not self._way
+        # What is moved by all waypoints afterwards needs no points of the given front.
+        count = 0 if refines else min(len(rows), ceil(self._settings.attempts * OWN_SHARE))
         forces = [
             self._force(rows[k]) for k in np.linspace(0, len(rows) - 1, count).round().astype(int)
         ]
@@ -214,15 +242,15 @@ class DriveRun(PolishRun[DriveAttempt]):
         self._at("extreme", self._between(self._range[0], self._largest))
         for force in forces:
             self._at("point", force)
-        self._at("extreme", self._range[1])
         self._at("extreme", self._range[0])
+        self._at("extreme", self._range[1])
         while self._left() > 0:
-            middle = self._widest_gap()
-            if middle is None:
+            gap = self._widest_gap()
+            if gap is None:
                 self._elsewhere(rng)
             else:
-                self._at("gap", middle)
-        if self._way.stated is not self._way:
+                self._at("gap", gap.force)
+        if refines:
             self._refine()
         self._spread()
 
@@ -295,37 +323,53 @@ class DriveRun(PolishRun[DriveAttempt]):
 
     def _refine(self) -> None:
         """Points moved by all waypoints, from gentle to fast: what rest holds within one limit is
-        driven within every higher one."""
+        driven within every higher one. The way from one to the next leads on to the one after."""
         count, still = self._settings.drivable.refined, self._range[0] * (1.0 - STILL)
         least = min(max(self._range[0], (1.0 + GENTLE) * still), self._largest)
-        self._most += count
+        self._most = len(self.outcomes) + count
+        task, last = self._way.cell.task, list[Array]()
         for above in np.geomspace(least - still, self._largest - still, count):
             force = float(np.clip(still + above, self._range[0], self._largest))
             paths, durations = self._driven(force)
+            if len(last) > 1:
+                onward = last[-1] + np.outer(ONWARD, last[-1] - last[-2])
+                onward = np.clip(onward, task.lower[:-1], task.upper[:-1])
+                paths = np.vstack([paths, onward])
+                durations = np.append(durations, self._way.paths.durations(onward, force))
             x = np.append(paths[int(np.argmin(durations))], force)
             start = self._evaluator.evaluate(x).objectives[0]
             self._do([DriveAttempt("gap", -1, x, start, moves="all")])
+            if self.outcomes[-1].status == "accepted":
+                last.append(self.outcomes[-1].x[: self._n_path])
 
     def _spread(self) -> None:
-        """Points of the best known paths, and of paths between them, at force limits up to the
-        front's largest."""
-        count = self._settings.drivable.members
-        self._most += count
-        self._others = np.vstack([self._others, self._leading(self._blends(), count)])
-        for force in self._spread_forces(count):
-            paths, durations = self._driven(force)
-            x = np.append(paths[int(np.argmin(durations))], force)
-            found = self._evaluator.evaluate(x)
-            objectives = found.objectives[0]
-            if found.feasible[0] and not self._archive.dominates(objectives):
-                self._do([DriveAttempt("gap", -1, x, objectives, moves="none")])
+        """Points of the best known paths at both ends of the front, then in its largest gaps, there
+        also of paths between both neighbours'."""
+        for force in (self._range[0], self._largest):
+            self._best_known(force, self._others[:0])
+        for _ in range(self._settings.drivable.members):
+            gap = self._widest_gap()
+            if gap is None:
+                break
+            first, second = (self._archive.x[k][: self._n_path] for k in gap.ends)
+            self._best_known(gap.force, first + np.outer(BETWEEN, second - first))
 
-    def _blends(self) -> Array:
-        """(m, n_path) paths between neighbours on the front."""
-        known = np.array([self._archive.x[k][: self._n_path] for k in self._archive.rows()])
-        shares = np.array(BETWEEN)[:, None, None]
-        blends = known[:-1] + shares * np.diff(known, axis=0)
-        return np.unique(blends.reshape(-1, self._n_path), axis=0)
+    def _best_known(self, force: float, paths: Array) -> None:
+        """A point of the fastest path within a force, of all that are known and of others
+        (n, n_path)."""
+        self._tried.add(force)
+        known, durations = self._driven(force)
+        durations = np.append(durations, self._way.paths.durations(paths, force))
+        fastest = np.vstack([known, paths])[np.argsort(durations, kind="stable")[:FASTEST]]
+        x = np.column_stack([fastest, np.full(len(fastest), force)])
+        found = self._evaluator.evaluate(x)
+        for k in np.flatnonzero(found.feasible):
+            if self._archive.dominates(found.objectives[k]):
+                break
+            self._most = len(self.outcomes) + 1
+            self._do([DriveAttempt("gap", -1, x[k], found.objectives[k], moves="none")])
+            if self.outcomes[-1].status == "accepted":
+                break
 
     def _leading(self, paths: Array, count: int) -> Array:
         """Those of some paths (n, n_path) that are feasible when pressed hard enough and are the
@@ -351,8 +395,8 @@ class DriveRun(PolishRun[DriveAttempt]):
         paths = np.unique(np.vstack([*known, self._others]), axis=0)
         return paths, self._way.paths.durations(paths, force)
 
-    def _widest_gap(self) -> float | None:
-        """A force limit in the middle of the largest gap between neighbours; None without any."""
+    def _widest_gap(self) -> Gap | None:
+        """The largest gap between neighbours whose middle was not tried; None without any."""
         # What is not polished yet fills no gap: it is to be improved.
         rows = [k for k in self._archive.rows() if self._archive.polished[k]]
         if len(rows) < 2:
@@ -369,7 +413,7 @@ class DriveRun(PolishRun[DriveAttempt]):
             ends = [max(self._force(rows[k]), self._range[0]) for k in (gap, gap + 1)]
             force = self._between(*ends)
             if force not in self._tried:
-                return force
+                return Gap(force, (rows[gap], rows[gap + 1]))
         return None
 
     def _solution(self, attempt: DriveAttempt) -> Solution:
@@ -389,7 +433,7 @@ class DriveRun(PolishRun[DriveAttempt]):
     ) -> tuple[Status, str, Array]:
         if self._archive.dominates(objectives):
             return self._not_improved(answer, attempt)
-        doubt = self._doubt(answer.x)
+        doubt = self._doubt(answer.x, attempt.moves != "none")
         return ("rejected", doubt, attempt.start) if doubt else ("accepted", "", objectives)
 
     def _take(self, attempt: DriveAttempt, outcome: PolishOutcome) -> None:

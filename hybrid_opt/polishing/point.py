@@ -173,6 +173,7 @@ class StepVerdict(Generic[AnyPoint]):
         closer: whether it comes closer to what is wanted.
         factor: of the radius after a step that comes no closer.
         kept: share of the promised gain, None where nothing was promised.
+        part: of the step that leads there.
         surprising: whether it brought more than promised, so that going farther is worth a look.
         is_short: whether rows that press stay.
     """
@@ -181,6 +182,7 @@ class StepVerdict(Generic[AnyPoint]):
     closer: bool
     factor: float = QUARTERED
     kept: float | None = None
+    part: float = 1.0
     surprising: bool = False
     is_short: bool = False
 
@@ -335,7 +337,9 @@ class Climb(Generic[AnyPoint, AnyStep]):
             for times in self._way.farther:
                 if not self._goes(begin, step, times, judged.is_short):
                     break
-        self._region.taken(step.length, judged.kept)
+        if judged.part < 1.0:
+            self._region.radius = judged.part * step.length
+        self._region.taken(judged.part * step.length, judged.kept)
 
     def _stay(self, step: AnyStep, reached: AnyPoint) -> None:
         """A step that violates nothing came no closer: its program lacked rows, or it ended at an

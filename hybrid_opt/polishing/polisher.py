@@ -76,10 +76,10 @@ class Polisher:
         # At once: the cell's files may be there only for as long as this is made.
         self._timings = TimingModel(evaluator.compiled, self.way.driver.timer.intervals)
 
-    def doubt(self, x: Array) -> str:
+    def doubt(self, x: Array, independent: bool = True) -> str:
         """Why the timing of a drivable decision vector is not believed, see `second_opinion`."""
         assert self.way is not None
-        return second_opinion(self.way.driver, self._timings, x)
+        return second_opinion(self.way.driver, self._timings, x, independent)
 
     def polish(
         self,

@@ -73,6 +73,7 @@ class DrivableSettings:
             goes on for two turns more, and again.
         most_rounds: with such gains.
         turn: rounds of each start in a turn of a tournament of starts.
+        rough: attempts at most that move the stated waypoints in tasks with more of them.
         refined: force limits at which points are moved by all waypoints after the others, in tasks
             with more than the stated ones.
         refining: rounds of each of them.
@@ -84,9 +85,10 @@ class DrivableSettings:
     worth: Small = 5e-4
     most_rounds: Number = 48
     turn: Number = 3
-    refined: NumberOrNone = 12
+    rough: NumberOrNone = 3
+    refined: NumberOrNone = 16
     refining: Number = 5
-    members: NumberOrNone = 20
+    members: NumberOrNone = 36
 
     def __post_init__(self) -> None:
         require_allowed(self, "polish drivable.")

@@ -77,12 +77,33 @@ def stated_entries(task: Task) -> NDArray[np.intp]:
     return np.flatnonzero(task.free_entries[0] % task.pieces == 0)
 
 
-def by_stated_waypoints(task: Task) -> Array:
-    """(n_path, that of the stated task) how a path through stated waypoints moves with them."""
+def by_levels(task: Task) -> tuple[Array, Array]:
+    """How a path's variables follow moves of few waypoints, then of those between them.
+
+    The grid of stated waypoints is refined, by halves as long as that is possible. A move of a
+    waypoint takes along those of finer grids, on the path through the grid where it is first.
+
+    Returns:
+        (n_path, n_path) what each move does, and (n_path,) the square of the spacing of each
+        move's grid, in that of the stated ones: accelerations for equal moves go by its inverse.
+    """
     (rows, columns), m = task.free_entries, len(task.waypoints)
-    own, by = stated_entries(task), _through((m - 1) // task.pieces + 1, m)
-    together = columns[:, None] == columns[own]
-    return np.where(together, by[np.ix_(rows, rows[own] // task.pieces)], 0.0)
+    by, square = np.zeros((task.n_path, task.n_path)), np.zeros(task.n_path)
+    together = columns[:, None] == columns
+    for step in _steps(task.pieces):
+        own = (rows % step == 0) & (square == 0.0)
+        through = _through((m - 1) // step + 1, m)[np.ix_(rows, rows[own] // step)]
+        by[:, own] = np.where(together[:, own], through, 0.0)
+        square[own] = (step / task.pieces) ** 2
+    return by, square
+
+
+def _steps(pieces: int) -> list[int]:
+    """Strides of the grids from the stated waypoints to all."""
+    steps = [pieces]
+    while steps[-1] > 1:
+        steps.append(steps[-1] // 2 if steps[-1] % 2 == 0 else 1)
+    return steps
 
 
 def same_paths(x: Array, source: Task, target: Task) -> Array:

@@ -47,7 +47,7 @@ typedef struct {
   Matrix of;                 /* what is factorised */
   double *pivot, *along;     /* of the chain, L D L^T */
   double *follow, *lower;    /* chain's inverse times beside; of the border, L L^T */
-  double *head;
+  double *head, *minus;      /* to work in; (n,) of -1 */
 } Factors;
 
 /* In so many sums, which compilers put into vectors. */
@@ -63,6 +63,33 @@ static double dot(const double *a, const double *b, integer n) {
 
 static void add(double *restrict to, double by, const double *restrict what, integer n) {
   for (integer i = 0; i < n; i++) to[i] += by * what[i];
+}
+
+/* The lower half of sums of weight * left^T right over rows (m, wide), to a matrix (k, wide), several
+   rows at a time: what is added to goes through memory once for all of them. */
+static void add_products(double *to, const double *weight, const double *left, const double *right,
+                         integer m, integer k, integer wide) {
+  enum { TOGETHER = 8 };
+  integer r = 0;
+  for (; r + TOGETHER <= m; r += TOGETHER) {
+    const double *const from = right + r * wide;
+    for (integer i = 0; i < k; i++) {
+      double by[TOGETHER];
+      for (int q = 0; q < TOGETHER; q++) by[q] = weight[r + q] * left[(r + q) * wide + i];
+      double *const out = to + i * wide;
+      for (integer j = 0; j <= i; j += VECTOR) {
+        double sums[VECTOR];
+        for (int l = 0; l < VECTOR; l++) sums[l] = out[j + l];
+        for (int q = 0; q < TOGETHER; q++)
+          for (int l = 0; l < VECTOR; l++) sums[l] += by[q] * from[q * wide + j + l];
+        for (int l = 0; l < VECTOR; l++) out[j + l] = sums[l];
+      }
+    }
+  }
+  for (; r < m; r++)
+    for (integer i = 0; i < k; i++)
+      add_wide(to + i * wide, weight[r] * left[r * wide + i], right + r * wide,
+               whole_vectors(i + 1));
 }
 
 static void spread(double *to, const double *from, integer rows, integer k, integer wide) {
@@ -123,7 +150,10 @@ static void chain_solve_wide(const Factors *f, double *right) {
   const integer n = f->of.n, wide = f->of.wide;
   for (integer i = 1; i < n; i++)
     add_wide(right + i * wide, -f->along[i - 1], right + (i - 1) * wide, wide);
-  for (integer i = 0; i < n * wide; i++) right[i] /= f->pivot[i / wide];
+  for (integer i = 0; i < n; i++) {
+    const double by = 1.0 / f->pivot[i];
+    for (integer j = i * wide; j < (i + 1) * wide; j++) right[j] *= by;
+  }
   for (integer i = n - 2; i >= 0; i--)
     add_wide(right + i * wide, -f->along[i], right + (i + 1) * wide, wide);
 }
@@ -157,10 +187,9 @@ static int factorise(const Rows *rows, const Matrix *H, Factors *f, const double
   memcpy(a->beside, H->beside, sizeof(double) * n * wide);
   memcpy(a->diagonal, H->diagonal, sizeof(double) * n);
   memcpy(a->off, H->off, sizeof(double) * (n - 1));
+  add_products(a->corner, D, rows->border, rows->border, p->m, k, wide);
   for (integer r = 0; r < p->m; r++) {
     const double *row = rows->border + r * wide, left = p->left[r], right = p->right[r], w = D[r];
-    for (integer i = 0; i < k; i++)
-      add_wide(a->corner + i * wide, w * row[i], row, whole_vectors(i + 1));
     if (left == 0.0 && right == 0.0) continue;
     const integer c = p->column[r];
     add_wide(a->beside + c * wide, w * left, row, wide);
@@ -182,10 +211,7 @@ static int factorise(const Rows *rows, const Matrix *H, Factors *f, const double
   memcpy(f->follow, a->beside, sizeof(double) * n * wide);
   chain_solve_wide(f, f->follow);
   memcpy(f->lower, a->corner, sizeof(double) * k * wide);
-  for (integer i = 0; i < n; i++)
-    for (integer j = 0; j < k; j++)
-      add_wide(f->lower + j * wide, -a->beside[i * wide + j], f->follow + i * wide,
-               whole_vectors(j + 1));
+  add_products(f->lower, f->minus, a->beside, f->follow, n, k, wide);
   for (integer j = 0; j < k; j++) {
     for (integer i = j; i < k; i++)
       f->lower[i * wide + j] -= dot(f->lower + i * wide, f->lower + j * wide, j);
@@ -309,7 +335,7 @@ static State state(double **work, integer all, integer rows) {
 
 OFFERED integer dual_arm_work(integer k, integer n, integer m) {
   const integer all = k + n, rows = m, wide = whole_vectors(k);
-  const integer states = 4 * (3 * all + 2 * rows), matrices = 3 * (k + n) * wide + 4 * n;
+  const integer states = 4 * (3 * all + 2 * rows), matrices = 3 * (k + n) * wide + 5 * n;
   return states + matrices + (m + 2) * wide + 5 * all + 3 * rows;
 }
 
@@ -330,6 +356,8 @@ OFFERED integer dual_arm_quadratic(const Program *p) {
                   take(&work, n)};
   f.pivot = take(&work, n), f.along = take(&work, n);
   f.follow = take(&work, n * wide), f.lower = take(&work, k * wide), f.head = take(&work, wide);
+  f.minus = take(&work, n);
+  for (integer i = 0; i < n; i++) f.minus[i] = -1.0;
   State now = state(&work, all, rows), goal = state(&work, all, rows);
   State first = state(&work, all, rows), second = state(&work, all, rows);
   double *const slope = take(&work, all), *const bend = take(&work, all);

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from symbolic.errors import WorkcellError
-from symbolic.path.pieces import by_stated_waypoints, in_pieces, same_paths, stated, stated_entries
+from symbolic.path.pieces import by_levels, in_pieces, same_paths, stated, stated_entries
 from symbolic.path.spline import path_position
 from symbolic.read.cell import load
 from symbolic.records import Task
@@ -66,8 +66,14 @@ def test_the_stated_task_comes_back(name: str) -> None:
 def test_moves_of_stated_waypoints_are_followed_by_the_others(name: str) -> None:
     coarse, fine = both(name)
     x, n, m = drawn(coarse, 1)[0], coarse.n_path, fine.n_path
-    by = by_stated_waypoints(fine)
-    assert by.shape == (m, n)
+    levels, square = by_levels(fine)
+    assert levels.shape == (m, m)
+    assert np.linalg.matrix_rank(levels) == m
+    own = stated_entries(fine)
+    by, others = levels[:, own], np.setdiff1d(np.arange(m), own)
+    np.testing.assert_array_equal(levels[np.ix_(own, others)], 0.0)
+    np.testing.assert_array_equal(square[own], 1.0)
+    np.testing.assert_allclose(square[others], 1.0 / PIECES**2)
     np.testing.assert_array_equal(by[stated_entries(fine)], np.eye(n))
     step = 1e-3 * np.random.default_rng(3).normal(size=n)
     inside = np.clip(x[:n] + step, coarse.lower[:n], coarse.upper[:n])
