@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -161,7 +162,7 @@ def measured(
         study: whether the fastest carry is looked for as well.
     """
     output.mkdir(parents=True, exist_ok=True)
-    path = output / f"{benchmark.name}-{task.name.replace(' ', '-')}.toml"
+    path = output / f"{benchmark.name}-{re.sub('[ /]', '-', task.name)}.toml"
     replace_file(path, completed("", {}, task.problem).encode())
     progress(f"{task.name}: a first carry")
     try:

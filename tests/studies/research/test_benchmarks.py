@@ -159,6 +159,7 @@ def test_a_task_without_a_carry_says_why(folder: Path) -> None:
     given = shelves.benchmark(folder)
     task = given.tasks[0]
     task.problem["task"]["goal"][2] = 0.3
+    task = replace(task, name="top to middle, 0.1 m/s")  # no folder of that name
     found = measured(given, task, folder / "out", ho.ProposeSettings(), 1, study=False)
     assert "payload meets shelf body shelf at the goal" in found.refused
     assert found.refused in table(given, [found], RNG).note
