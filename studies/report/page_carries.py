@@ -26,6 +26,7 @@ from hybrid_opt.timing.solve import time_path
 from hybrid_opt.work.service import Emit
 from symbolic.array import Array
 from symbolic.errors import DualArmError
+from symbolic.path.pieces import same_paths
 from symbolic.records.poses import box_rotation
 
 RECOMMENDED_LABEL = "recommended"
@@ -300,7 +301,8 @@ def page_trajectory(
     law = cell.workcell.task.time_law
     judged = cell.carry(shown.x)
     assert judged.judgement is not None, "carries of a cell are judged"
-    path = shown.x[: cell.workcell.task.n_path]
+    task = driving.cell.workcell.task
+    path = same_paths(shown.x, cell.workcell.task, task)[0, : task.n_path]
     limits = _limits(cell, shown.x)
     if shown.jerk:
         # The recommended carry is driven as an export does, others without limits on jerk.

@@ -25,6 +25,7 @@ from studies.report.page_carries import (
     page_trajectory,
 )
 from symbolic.array import Array
+from symbolic.path.pieces import same_paths
 from symbolic.read.cell_files import CellFiles, cell_to_json
 from symbolic.records import Workcell
 
@@ -349,7 +350,8 @@ def _drive_groups(data: ReportData, drivable: Experiment, cell: int) -> Iterator
         yield Group(RECOMMENDED, (shown,), RECOMMENDED, CHOICE)
     low, high = drivable.workcell.task.force_limit
     for carry, label, look, curve in curves(data):
-        source, path = _source(data, carry), carry.x[: drivable.workcell.task.n_path]
+        own, task = carry.timed.workcell.task, drivable.workcell.task
+        source, path = _source(data, carry), same_paths(carry.x, own, task)[0, : task.n_path]
         force = curve[spread(len(curve), CURVE_MEMBERS), 0]
         some = tuple(
             PageTrajectory(source, np.append(path, limit), source, cell)
