@@ -355,3 +355,8 @@ def _is_still(draft: Path, file: BinaryIO) -> bool:
         return os.path.samestat(os.fstat(file.fileno()), draft.stat(follow_symlinks=False))
     except FileNotFoundError:
         return False
+
+
+def printable(text: str) -> str:
+    """A foreign text in one line of printable characters."""
+    return " ".join("".join(c if c.isprintable() else " " for c in text).split())

@@ -15,6 +15,7 @@ import numpy as np
 
 from symbolic.array import Array
 from symbolic.errors import OutsideError
+from symbolic.outside import printable
 from symbolic.records.poses import inverse, rpy_from_rotation, transform
 
 NO_READER = "is a file of MuJoCo, whose reader is not installed: pip install 'dual-arm-carry[sim]'"
@@ -34,7 +35,7 @@ def compiled(path: Path) -> Any:
         spec = mujoco.MjSpec.from_file(str(path))
         return mujoco, spec, spec.compile()
     except ValueError as error:
-        raise OutsideError(f"MuJoCo does not take it: {' '.join(str(error).split())}") from error
+        raise OutsideError(f"MuJoCo does not take it: {printable(str(error))}") from error
 
 
 @lru_cache(maxsize=8)

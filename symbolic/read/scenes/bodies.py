@@ -132,22 +132,18 @@ class SceneBuilder:
 
     def leave(self, name: str, why: str) -> None:
         """Something is no body."""
-        self.left_out.append(f"{_printable(name) or 'scene'}: {why}")
+        self.left_out.append(f"{outside.printable(name) or 'scene'}: {why}")
 
     def note(self, name: str, what: str) -> None:
         """Something is taken otherwise than it is."""
-        self.notes.append(f"{_printable(name) or 'scene'}: {what}")
+        self.notes.append(f"{outside.printable(name) or 'scene'}: {what}")
 
     def _name(self, name: str) -> str:
         """One that an environment takes: a key path names bodies, a pattern stands for some."""
-        wanted = re.sub(r"[/.*?\[\]]+", "-", _printable(name)).strip() or "body"
+        wanted = re.sub(r"[/.*?\[\]]+", "-", outside.printable(name)).strip() or "body"
         wanted = wanted[: MAX_NAME_LENGTH - 6].strip()
         free = (wanted if k == 1 else f"{wanted} {k}" for k in range(1, MOST_BODIES + 3))
         return next(each for each in free if each not in self.names)
-
-
-def _printable(name: str) -> str:
-    return " ".join("".join(c if c.isprintable() else " " for c in name).split())
 
 
 def _table(body: Body, folder: Path, meshes: Path) -> dict[str, Any]:
