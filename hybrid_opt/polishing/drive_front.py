@@ -5,9 +5,11 @@ are known, so that what one attempt finds serves the others, from others in basi
 from the hand-made one; a few rounds tell which of them goes on. The first attempt is a tournament
 of more starts, because a search's front often lies in one basin. Then come a gentle force, points
 of the given front, evenly spread; both ends and the widest gaps, and where these are narrow,
-points again from other paths. In the end paths between neighbours on the front join them, which
-cost no attempt, and the best of all becomes a point at force limits all over their range: a path
-that tilts the box until standing still uses its limit up cannot be driven within less.
+points again from other paths. Where the task has more waypoints than its file states, the first
+few of these attempts move the stated ones, and a sweep of force limits then moves all of them. In
+the end the widest gaps get points of known paths, or of paths between both neighbours', which are
+driven but not improved: a path that tilts the box until standing still uses its limit up cannot be
+driven within less.
 
 Of several starts of one goal, all take few rounds, and only the most promising ones go on
 (successive halving, Jamieson and Talwalkar 2016): the half stays that promises more, by what it has

@@ -83,13 +83,16 @@ class TrustRegion:
         if not learned:
             self.radius = HALVED * min(self.radius, length)
 
-    def taken(self, length: float, kept: float | None = None) -> None:
+    def taken(self, length: float, kept: float | None = None, is_part: bool = False) -> None:
         """A step of this length was good.
 
         Args:
             kept: share of the promised gain that it brought, None where nothing was promised: then
                 two good steps in a row count.
+            is_part: whether the whole step was not good: the box becomes as small as this one.
         """
+        if is_part:
+            self.radius = length
         grows = self._was_good if kept is None else kept > GOOD
         if grows and self.holds(length):
             self.radius = min(DOUBLED * self.radius, LARGEST)
@@ -337,9 +340,7 @@ class Climb(Generic[AnyPoint, AnyStep]):
             for times in self._way.farther:
                 if not self._goes(begin, step, times, judged.is_short):
                     break
-        if judged.part < 1.0:
-            self._region.radius = judged.part * step.length
-        self._region.taken(judged.part * step.length, judged.kept)
+        self._region.taken(judged.part * step.length, judged.kept, judged.part < 1.0)
 
     def _stay(self, step: AnyStep, reached: AnyPoint) -> None:
         """A step that violates nothing came no closer: its program lacked rows, or it ended at an

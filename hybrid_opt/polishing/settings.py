@@ -77,8 +77,8 @@ class DrivableSettings:
         refined: force limits at which points are moved by all waypoints after the others, in tasks
             with more than the stated ones.
         refining: rounds of each of them.
-        members: force limits, spread over their range, at which the front gets a point where the
-            best known path wins one.
+        members: gaps of the front, the widest first, that get a point in the end where a known path
+            or one between both neighbours' wins one.
     """
 
     rounds: Number = 24

@@ -47,7 +47,7 @@ typedef struct {
   Matrix of;                 /* what is factorised */
   double *pivot, *along;     /* of the chain, L D L^T */
   double *follow, *lower;    /* chain's inverse times beside; of the border, L L^T */
-  double *head, *minus;      /* to work in; (n,) of -1 */
+  double *head;
 } Factors;
 
 /* In so many sums, which compilers put into vectors. */
@@ -66,7 +66,7 @@ static void add(double *restrict to, double by, const double *restrict what, int
 }
 
 /* The lower half of sums of weight * left^T right over rows (m, wide), to a matrix (k, wide), several
-   rows at a time: what is added to goes through memory once for all of them. */
+   rows at a time: what is added to goes through memory once for all of them. No weights are -1. */
 static void add_products(double *to, const double *weight, const double *left, const double *right,
                          integer m, integer k, integer wide) {
   enum { TOGETHER = 8 };
@@ -75,7 +75,7 @@ static void add_products(double *to, const double *weight, const double *left, c
     const double *const from = right + r * wide;
     for (integer i = 0; i < k; i++) {
       double by[TOGETHER];
-      for (int q = 0; q < TOGETHER; q++) by[q] = weight[r + q] * left[(r + q) * wide + i];
+      for (int q = 0; q < TOGETHER; q++) by[q] = (weight ? weight[r + q] : -1.0) * left[(r + q) * wide + i];
       double *const out = to + i * wide;
       for (integer j = 0; j <= i; j += VECTOR) {
         double sums[VECTOR];
@@ -88,7 +88,7 @@ static void add_products(double *to, const double *weight, const double *left, c
   }
   for (; r < m; r++)
     for (integer i = 0; i < k; i++)
-      add_wide(to + i * wide, weight[r] * left[r * wide + i], right + r * wide,
+      add_wide(to + i * wide, (weight ? weight[r] : -1.0) * left[r * wide + i], right + r * wide,
                whole_vectors(i + 1));
 }
 
@@ -211,7 +211,7 @@ static int factorise(const Rows *rows, const Matrix *H, Factors *f, const double
   memcpy(f->follow, a->beside, sizeof(double) * n * wide);
   chain_solve_wide(f, f->follow);
   memcpy(f->lower, a->corner, sizeof(double) * k * wide);
-  add_products(f->lower, f->minus, a->beside, f->follow, n, k, wide);
+  add_products(f->lower, 0, a->beside, f->follow, n, k, wide);
   for (integer j = 0; j < k; j++) {
     for (integer i = j; i < k; i++)
       f->lower[i * wide + j] -= dot(f->lower + i * wide, f->lower + j * wide, j);
@@ -335,7 +335,7 @@ static State state(double **work, integer all, integer rows) {
 
 OFFERED integer dual_arm_work(integer k, integer n, integer m) {
   const integer all = k + n, rows = m, wide = whole_vectors(k);
-  const integer states = 4 * (3 * all + 2 * rows), matrices = 3 * (k + n) * wide + 5 * n;
+  const integer states = 4 * (3 * all + 2 * rows), matrices = 3 * (k + n) * wide + 4 * n;
   return states + matrices + (m + 2) * wide + 5 * all + 3 * rows;
 }
 
@@ -356,8 +356,6 @@ OFFERED integer dual_arm_quadratic(const Program *p) {
                   take(&work, n)};
   f.pivot = take(&work, n), f.along = take(&work, n);
   f.follow = take(&work, n * wide), f.lower = take(&work, k * wide), f.head = take(&work, wide);
-  f.minus = take(&work, n);
-  for (integer i = 0; i < n; i++) f.minus[i] = -1.0;
   State now = state(&work, all, rows), goal = state(&work, all, rows);
   State first = state(&work, all, rows), second = state(&work, all, rows);
   double *const slope = take(&work, all), *const bend = take(&work, all);
