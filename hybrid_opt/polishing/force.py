@@ -158,33 +158,35 @@ class ForceProgram:
         span, reference = target.span[robot], cell.task.reference_force[robot]
         own = np.eye(2)[:, None]
         coefficients = np.concatenate([cell.coefficients, own], axis=1)
-        mix = coefficients[robot, branch] / (reference * span)[:, None]
+        mix = -coefficients[robot, branch] / (reference * span)[:, None]
         fixed = np.zeros((layout.n_rows, 3))
-        fixed[np.arange(layout.forces.stop), robot] = -1.0
-        fixed[layout.sides, :2], fixed[layout.sides, 2] = np.eye(2), -target.direction
-        self.rows = Rows(cell, layout, carry.q, mix, fixed)
+        fixed[np.arange(layout.forces.stop), robot] = 1.0
+        fixed[layout.sides, :2], fixed[layout.sides, 2] = -np.eye(2), target.direction
+        self._rows = Rows(cell, layout, carry.q, mix, fixed)
         # What the rows lack at the candidate: what the rounded time law takes off, what the joint
         # allocation's barriers add, or what makes planned forces robust ones, with their slopes.
-        self.rows.values(x, np.zeros(3))
-        found = self.rows.forces
+        self._rows.values(x, np.zeros(3))
+        found = self._rows.forces
         if cell.robust is None:
             held = (branch == HELD)[:, None]
             exact = np.where(held, carry.force[sample], carry.split[sample])
             lacking = np.einsum("rk,rk->r", mix, exact - found)
         else:
             force, by_x = cell.robust.first(x)
-            unit = reference * span
+            unit = -reference * span
             lacking = force[sample, robot] / unit - np.einsum("rk,rk->r", mix, found)
             slope = by_x[sample, robot] / unit[:, None]
-            self.rows.correct(slope - np.einsum("rk,rkx->rx", mix, self.rows.force_slopes), x)
+            self._rows.correct(slope - np.einsum("rk,rkx->rx", mix, self._rows.force_slopes), x)
         pressed, at = (
             np.array([getattr(row, name) for row in layout.pressure_rows], dtype=np.intp)
             for name in ("robot", "sample")
         )
-        offset = self.rows.offset
-        offset[layout.forces] = lacking - target.anchor[robot] / span
-        offset[layout.sides] = -target.offset
-        offset[layout.patches] = 1.0 - carry.shift[at, pressed] ** 2 - self.rows.left
+        offset = self._rows.offset
+        offset[layout.forces] = lacking + target.anchor[robot] / span
+        offset[layout.sides] = target.offset
+        offset[layout.patches] = 1.0 - carry.shift[at, pressed] ** 2 - self._rows.left
+        offset[layout.patches] -= [required[row] for row in layout.pressure_rows]
+        offset[layout.places] = [-required[row] / row.constraint.scale for row in layout.place_rows]
 
         phi = (carry.peak - target.anchor) / target.span + SLACK
         xi, low, high = (cell.scaled(v) for v in (x, cell.task.lower, cell.task.upper))
@@ -195,13 +197,6 @@ class ForceProgram:
         self.low, self.high = self._own_bounds.copy()
         self.low[:n] = np.maximum(low, xi - radius)
         self.high[:n] = np.minimum(high, xi + radius)
-        self.below = np.full(layout.n_rows, -np.inf)
-        self.above = np.full(layout.n_rows, np.inf)
-        self.above[: layout.sides.stop] = 0.0
-        self.below[layout.patches] = [required[row] for row in layout.pressure_rows]
-        self.below[layout.places] = [
-            required[row] / row.constraint.scale for row in layout.place_rows
-        ]
         self._known, self._values = b"", offset
         self._jacobian: Array | None = None
 
@@ -209,24 +204,24 @@ class ForceProgram:
         """See `solvers.base.Program`; what was evaluated last is remembered."""
         key = z.tobytes()
         if key != self._known:
-            self._values = self.rows.values(self._cell.unscaled(z[: self._n]), z[self._n :])
+            self._values = self._rows.values(self._cell.unscaled(z[: self._n]), z[self._n :])
             self._known, self._jacobian = key, None
         return self._values
 
-    def constraints(self, z: Array) -> tuple[Array, Array]:
+    def rows(self, z: Array) -> tuple[Array, Array]:
         """See `solvers.base.Program`: what gave the values at z knows its slopes as well."""
         values = self.values(z)
         if self._jacobian is None:
-            self._jacobian = self.rows.slopes()
+            self._jacobian = self._rows.slopes()
             self._jacobian[:, : self._n] *= self._cell.half
         return values, self._jacobian
 
-    def curvature(self, z: Array, multipliers: Array) -> Array:
+    def curvature(self, z: Array, weights: Array) -> Array:
         """See `solvers.base.Program`."""
-        self.constraints(z)
+        self.rows(z)
         n, half = self._n, self._cell.half
         full = np.zeros((n + 3, n + 3))
-        full[:n, :n] = self.rows.curvature(multipliers) * np.outer(half, half)
+        full[:n, :n] = self._rows.curvature(weights) * np.outer(half, half)
         return full
 
     def residuals_at(self, x: Array, carry: PlacedCarry) -> Residuals:

@@ -17,7 +17,7 @@ TOLERANCE = 1e-6
 """Tolerance of the optimality conditions, in a program's scaled rows and variables."""
 
 FEASIBLE = 1e-3
-"""Violation of a scaled row at which an iterate counts as feasible."""
+"""Lack of a scaled row at which an iterate counts as feasible."""
 
 PATIENCE = 3
 """Times the wanted number of iterations that a solve may take to become feasible: cut off wherever
@@ -35,29 +35,26 @@ TURNS = 30
 
 
 class Program(Protocol):
-    """A nonlinear program: minimise cost . z within bounds, constraints within theirs.
+    """A nonlinear program: minimise cost . z within bounds, every row at least zero.
 
     Attributes:
         cost: (n_variables,) gradient of the objective, which is linear.
         start, low, high: (n_variables,).
-        below, above: (n_rows,) bounds of the constraints, infinite where there is none.
     """
 
     cost: Array
     start: Array
     low: Array
     high: Array
-    below: Array
-    above: Array
 
     def values(self, z: Array) -> Array:
-        """(n_rows,) of the constraints at z."""
+        """(n_rows,) of the rows at z."""
 
-    def constraints(self, z: Array) -> tuple[Array, Array]:
-        """Values (n_rows,) and Jacobian (n_rows, n_variables) at z."""
+    def rows(self, z: Array) -> tuple[Array, Array]:
+        """Values (n_rows,) and slopes (n_rows, n_variables) at z."""
 
-    def curvature(self, z: Array, multipliers: Array) -> Array:
-        """(n_variables, n_variables) second derivatives of multipliers . constraints at z."""
+    def curvature(self, z: Array, weights: Array) -> Array:
+        """(n_variables, n_variables) second derivatives of weights . rows at z."""
 
 
 @dataclass(frozen=True)
@@ -106,38 +103,6 @@ Solve = Callable[[Program, int, float], Answer]
 """A solver: from a program, the wanted number of iterations and the barrier at the start."""
 
 
-class Inequalities:
-    """A program's rows as one set h(z) >= 0: the upper sides that have a bound, then the lower.
-
-    Attributes:
-        rows, sign, shift: (m,) each is sign * the program's row + shift.
-    """
-
-    def __init__(self, program: Program) -> None:
-        self._program = program
-        self._upper = np.flatnonzero(np.isfinite(program.above))
-        self._lower = np.flatnonzero(np.isfinite(program.below))
-        self.rows = np.concatenate([self._upper, self._lower])
-        self.sign = np.concatenate([-np.ones(len(self._upper)), np.ones(len(self._lower))])
-        self.shift = np.concatenate([program.above[self._upper], -program.below[self._lower]])
-
-    def values(self, z: Array) -> Array:
-        """(m,) at z."""
-        return np.asarray(self._program.values(z)[self.rows] * self.sign + self.shift)
-
-    def slopes(self, z: Array) -> Array:
-        """(m, n_variables) gradients at z."""
-        return np.asarray(self._program.constraints(z)[1][self.rows] * self.sign[:, None])
-
-    def multipliers(self, y: Array) -> Array:
-        """(n_rows,) multipliers of the rows in CasADi's convention, from those (m,) of the
-        inequalities."""
-        multipliers = np.zeros(len(self._program.below))
-        multipliers[self._upper] = y[: len(self._upper)]
-        multipliers[self._lower] -= y[len(self._upper) :]
-        return multipliers
-
-
 def optimality(program: Program, z: Array, bounds: tuple[Array, Array] | None = None) -> Residuals:
     """Residuals at z with the multipliers that satisfy the conditions best there.
 
@@ -145,36 +110,30 @@ def optimality(program: Program, z: Array, bounds: tuple[Array, Array] | None = 
         bounds: lower and upper (n_variables,) in place of the program's.
     """
     low, high = bounds or (program.low, program.high)
-    rows = Inequalities(program)
-    slacks = np.abs(rows.values(z)), np.abs(z - low), np.abs(high - z)
-    lam_z, y = estimated(program.cost, rows.slopes(z), slacks)
-    return residuals(program, z, lam_z, rows.multipliers(y), (low, high))
+    rows, slopes = program.rows(z)
+    slacks = np.abs(rows), np.abs(z - low), np.abs(high - z)
+    at_bounds, y = estimated(program.cost, slopes, slacks)
+    return residuals(program, z, at_bounds, y, (low, high))
 
 
 def residuals(
-    program: Program, z: Array, lam_z: Array, lam_g: Array, bounds: tuple[Array, Array]
+    program: Program, z: Array, at_bounds: Array, y: Array, bounds: tuple[Array, Array]
 ) -> Residuals:
     """Residuals of the optimality conditions at z with the given multipliers.
 
-    In CasADi's convention: positive multipliers belong to upper bounds, negative to lower ones.
-
     Args:
+        at_bounds: (n_variables,) multipliers of upper bounds, those of lower ones negative.
+        y: (n_rows,) of the rows.
         bounds: of the variables, lower and upper (n_variables,).
     """
-    values, jacobian = program.constraints(z)
-    lagrangian = program.cost + jacobian.T @ lam_g + lam_z
-    low, high = bounds
-    sides = (z, low, high, lam_z), (values, program.below, program.above, lam_g)
-    violation, product = 0.0, 0.0
-    for value, low, high, multiplier in sides:
-        violation = max(
-            violation, np.max(low - value, initial=0.0), np.max(value - high, initial=0.0)
-        )
-        slack = np.where(multiplier > 0.0, high - value, value - low)
-        # A multiplier of an absent bound has nothing to be complementary to: it must vanish.
-        scaled = np.where(np.isfinite(slack), np.abs(slack), 1.0)
-        product = max(product, np.max(np.abs(multiplier) * scaled, initial=0.0))
-    return Residuals(float(np.max(np.abs(lagrangian))), float(violation), float(product))
+    (low, high), (rows, slopes) = bounds, program.rows(z)
+    lagrangian = program.cost - slopes.T @ y + at_bounds
+    lack = -min(rows.min(initial=0.0), (z - low).min(), (high - z).min())
+    slack = np.where(at_bounds > 0.0, high - z, z - low)
+    products = np.concatenate([y * rows, at_bounds * slack])
+    return Residuals(
+        float(np.max(np.abs(lagrangian))), float(max(lack, 0.0)), float(np.abs(products).max())
+    )
 
 
 def estimated(cost: Array, A: Array, slacks: tuple[Array, Array, Array]) -> tuple[Array, Array]:
@@ -186,7 +145,7 @@ def estimated(cost: Array, A: Array, slacks: tuple[Array, Array, Array]) -> tupl
         slacks: of the inequalities (m,), of the lower and of the upper bounds (n,).
 
     Returns:
-        Of the bounds (n,) in CasADi's convention, and of the inequalities (m,), not negative.
+        Of upper bounds (n,), of lower ones negative, and of the inequalities (m,), not negative.
     """
     # Not imported at the top: it takes long, and records of polishes are read without it.
     from scipy.optimize import nnls

@@ -7,18 +7,14 @@
 
 typedef struct {
   integer n, m;           /* variables, inequalities */
-  const integer *row;     /* (m,) the program's row of each inequality */
-  const double *sign;     /* (m,) h = sign row + shift */
-  const double *shift;    /* (m,) */
   const double *cost;     /* (n,) */
   const double *low, *high, *inner_low, *inner_high; /* (n,) */
-  const double *values;   /* (rows,) of the program at the trial */
-  const double *jacobian; /* (rows, n) */
+  const double *values;   /* (m,) of the inequalities at the trial */
   const double *W;        /* (n, n) curvature of the Lagrangian */
   double *z, *slack, *dual, *h; /* the iterate */
   double *A;                    /* (m, wide), filled up with zeros */
   double *trial;          /* (n,) variables */
-  double *ruling;         /* (rows,) multipliers that the curvature is asked for */
+  double *ruling;         /* (m,) weights that the curvature is asked for */
   double *errors;         /* (4,) */
   char *blocking;         /* (m,) rows that shortened the last step */
   double mu;
@@ -59,7 +55,6 @@ typedef struct {
   double *M, *factor;                 /* (n, wide) */
   double *right, *dz;                 /* (wide,) */
   double *change, *by_dual, *reached; /* (m + 2 n,) */
-  double *h;                          /* (m,) at the trial */
 } Work;
 
 static Work parts(const Step *s) {
@@ -68,14 +63,13 @@ static Work parts(const Step *s) {
   Work w;
   w.M = at, w.factor = at + n * wide, at += 2 * n * wide;
   w.right = at, w.dz = at + wide, at += 2 * wide;
-  w.change = at, w.by_dual = at + all, w.reached = at + 2 * all, at += 3 * all;
-  w.h = at;
+  w.change = at, w.by_dual = at + all, w.reached = at + 2 * all;
   return w;
 }
 
 OFFERED integer dual_arm_dense_work(integer n, integer m) {
   const integer wide = whole_vectors(n);
-  return 2 * n * wide + 2 * wide + 3 * (m + 2 * n) + m;
+  return 2 * n * wide + 2 * wide + 3 * (m + 2 * n);
 }
 
 /* In so many sums, which compilers put into vectors; n is a multiple of them. */
@@ -120,14 +114,13 @@ static void place_trial(Step *s, const double *dz) {
     s->trial[i] = fmin(fmax(s->z[i] + s->alpha * dz[i], s->inner_low[i]), s->inner_high[i]);
 }
 
-/* Multipliers, in CasADi's convention, of the rows whose curvature matters to a step. */
+/* Weights of the Lagrangian for the rows whose curvature matters to a step. */
 OFFERED void dual_arm_dense_ruling(const Step *s) {
   double most = 0.0;
   for (integer k = 0; k < s->m; k++) most = fmax(most, s->dual[k]);
-  for (integer k = 0; k < s->m; k++) s->ruling[s->row[k]] = 0.0;
   for (integer k = 0; k < s->m; k++) {
     const double y = s->dual[k];
-    if (y > (s->slack[k] > y ? DISTANT : NEGLIGIBLE) * most) s->ruling[s->row[k]] -= s->sign[k] * y;
+    s->ruling[k] = y > (s->slack[k] > y ? DISTANT : NEGLIGIBLE) * most ? -y : 0.0;
   }
 }
 
@@ -228,8 +221,8 @@ static double until(const Step *s, const Work *w) {
   int any = 0;
   for (integer k = 0; k < s->m; k++) {
     const double value = s->slack[k], change = s->alpha * w->change[k];
-    if (!(s->h[k] >= value) || !(w->h[k] < (1.0 - keep(s)) * value)) continue;
-    const double bend = fmin(w->h[k] - value - change, -1e-300), room = 0.9 * value;
+    if (!(s->h[k] >= value) || !(s->values[k] < (1.0 - keep(s)) * value)) continue;
+    const double bend = fmin(s->values[k] - value - change, -1e-300), room = 0.9 * value;
     first = fmin(first, 2.0 * room / (sqrt(change * change - 4.0 * bend * room) - change));
     s->blocking[k] = any = 1;
   }
@@ -241,10 +234,7 @@ OFFERED integer dual_arm_dense_judge(Step *s) {
   const integer m = s->m;
   Work w = parts(s);
   int is_finite = 1;
-  for (integer k = 0; k < m; k++) {
-    w.h[k] = s->sign[k] * s->values[s->row[k]] + s->shift[k];
-    is_finite &= isfinite(w.h[k]) != 0;
-  }
+  for (integer k = 0; k < m; k++) is_finite &= isfinite(s->values[k]) != 0;
   double share = SHORTENED_LEAST;
   if (is_finite) {
     const double lost = until(s, &w);
@@ -254,9 +244,9 @@ OFFERED integer dual_arm_dense_judge(Step *s) {
       double theta = 0.0;
       for (integer k = 0; k < m; k++) {
         const double kept = s->slack[k];
-        const double slack = s->h[k] >= kept ? w.h[k] : fmax(kept + s->alpha * w.change[k], w.h[k]);
+        const double slack = s->h[k] >= kept ? s->values[k] : fmax(kept + s->alpha * w.change[k], s->values[k]);
         w.reached[k] = fmax(slack, LEAST);
-        theta += fabs(w.h[k] - w.reached[k]);
+        theta += fabs(s->values[k] - w.reached[k]);
       }
       bounds_left(s, s->trial, w.reached);
       const double gain = s->slope * s->alpha;
@@ -280,16 +270,13 @@ OFFERED integer dual_arm_dense_heed(const Step *s) {
   return any;
 }
 
-/* Moves to the trial that was taken, with the rows' slopes there. */
+/* Moves to the trial that was taken; the rows' slopes there are in A already. */
 OFFERED void dual_arm_dense_move(const Step *s) {
-  const integer n = s->n, m = s->m, all = m + 2 * n, wide = whole_vectors(n);
+  const integer n = s->n, m = s->m, all = m + 2 * n;
   const Work w = parts(s);
   memcpy(s->z, s->trial, sizeof(double) * n);
   memcpy(s->slack, w.reached, sizeof(double) * all);
-  memcpy(s->h, w.h, sizeof(double) * m);
-  for (integer k = 0; k < m; k++)
-    for (integer i = 0; i < n; i++)
-      s->A[k * wide + i] = s->sign[k] * s->jacobian[s->row[k] * n + i];
+  memcpy(s->h, s->values, sizeof(double) * m);
   const double share = largest(s->dual, w.by_dual, all, keep(s));
   for (integer i = 0; i < all; i++) {
     const double y = s->dual[i] + share * w.by_dual[i], ideal = s->mu / s->slack[i];

@@ -29,7 +29,6 @@ from hybrid_opt.polishing.solvers.base import (
     PATIENCE,
     TOLERANCE,
     Answer,
-    Inequalities,
     Program,
     Solve,
 )
@@ -81,31 +80,26 @@ class _Solver:
 
     def __init__(self, library: Native, program: Program, barrier: float) -> None:
         self._c, self._program, self._mu = library.functions, program, barrier
-        self._rows, self._renewals = Inequalities(program), 0
+        self._renewals = 0
         # Bounds are a hair wider than they are, so that no rounding puts an iterate on one.
         hair = HAIR * (program.high - program.low)
-        low, high = self._low, self._high = program.low - hair, program.high + hair
+        low, high = program.low - hair, program.high + hair
         push = PUSH * (high - low)
         self.z = np.clip(program.start, low + push, high - push)
-        self.h, A = self._rows.values(self.z), self._rows.slopes(self.z)
+        self.h, A = program.rows(self.z)
         m, n = A.shape
         slack = np.concatenate([np.maximum(self.h, SLACK), self.z - low, high - self.z])
         self.slack, self.dual = slack, barrier / slack
         # Rows filled up with zeros, as C has them.
         wide = np.zeros((m, -(-n // VECTOR) * VECTOR))
         wide[:, :n] = A
-        n_rows = len(program.below)
         self._arrays: dict[str, Any] = {
-            "row": self._rows.rows,
-            "sign": self._rows.sign,
-            "shift": self._rows.shift,
             "cost": program.cost,
             "low": low,
             "high": high,
             "inner_low": low + 1e-3 * hair,
             "inner_high": high - 1e-3 * hair,
-            "values": np.empty(n_rows),
-            "jacobian": np.empty((n_rows, n)),
+            "values": np.empty(m),
             "W": np.empty((n, n)),
             "z": self.z,
             "slack": self.slack,
@@ -113,7 +107,7 @@ class _Solver:
             "h": self.h,
             "A": wide,
             "trial": np.empty(n),
-            "ruling": np.zeros(n_rows),
+            "ruling": np.zeros(m),
             "errors": np.empty(4),
             "blocking": np.zeros(m, dtype=np.int8),
             "work": np.empty(self._c.dual_arm_dense_work(n, m)),
@@ -164,7 +158,8 @@ class _Solver:
         for _ in range(TRIALS):
             arrays["values"][...] = program.values(arrays["trial"])
             if c.dual_arm_dense_judge(step) == c.TAKEN:
-                arrays["jacobian"][...] = program.constraints(arrays["trial"])[1]
+                slopes = program.rows(arrays["trial"])[1]
+                arrays["A"][:, : slopes.shape[1]] = slopes
                 c.dual_arm_dense_move(step)
                 return True
         return bool(c.dual_arm_dense_heed(step))

@@ -89,7 +89,7 @@ def _functions(program: Program, wanted: int) -> tuple[_Callback, dict[str, _Cal
     A solve that is cut off wherever it stands ends in an obstacle more often than not: it ends
     after the wanted number of iterations, as soon as an iterate is feasible.
     """
-    n, m, iterations = len(program.start), len(program.below), 0
+    n, m, iterations = len(program.start), len(program.values(program.start)), 0
     x, p, g = ca.Sparsity.dense(n), ca.Sparsity(0, 0), ca.Sparsity.dense(m)
     one, upper = ca.Sparsity.dense(1), ca.Sparsity.upper(n)
     given, multiplied = {"x": x, "p": p}, {"lam_f": one, "lam_g": g}
@@ -101,7 +101,7 @@ def _functions(program: Program, wanted: int) -> tuple[_Callback, dict[str, _Cal
         return [program.cost @ z, program.cost]
 
     def jacobian(z: Array, _: Array) -> list[Any]:
-        return list(program.constraints(z))
+        return list(program.rows(z))
 
     def hessian(z: Array, _: Array, __: Array, lam_g: Array) -> list[Any]:
         return [ca.triu(ca.DM(program.curvature(z, lam_g)))]
@@ -109,8 +109,7 @@ def _functions(program: Program, wanted: int) -> tuple[_Callback, dict[str, _Cal
     def stop(_: Array, __: Array, g: Array, *___: Array) -> list[Any]:
         nonlocal iterations
         iterations += 1
-        violation = max(np.max(program.below - g), np.max(g - program.above))
-        return [float(iterations > wanted and violation <= FEASIBLE)]
+        return [float(iterations > wanted and g.min() >= -FEASIBLE)]
 
     slopes = {"g": g, "jac_g_x": ca.Sparsity.dense(m, n)}
     bent = {"triu_hess_gamma_x_x": upper}
@@ -133,8 +132,7 @@ def ipopt(program: Program, iterations: int, barrier: float) -> Answer:
             x0=program.start,
             lbx=program.low,
             ubx=program.high,
-            lbg=program.below,
-            ubg=program.above,
+            lbg=0.0,
         )
     except RuntimeError as error:
         # CasADi's way to report that a function failed outright.

@@ -123,18 +123,18 @@ def test_a_whole_turn_more_is_none(path: Path) -> None:
     task, turned = evaluator(path).workcell.task, z.copy()
     turned[5] += 4.0 * np.pi / (task.upper[5] - task.lower[5])
     places = program.layout.places
-    values = program.constraints(z)[0][places].copy()
-    np.testing.assert_allclose(program.constraints(turned)[0][places], values, atol=1e-9)
+    values = program.rows(z)[0][places].copy()
+    np.testing.assert_allclose(program.rows(turned)[0][places], values, atol=1e-9)
 
 
 def require_jacobian(program: ForceProgram, z: Array) -> None:
     """It is that of differences."""
     step = 1e-6
     columns = [
-        (program.constraints(z + step * d)[0] - program.constraints(z - step * d)[0]) / (2 * step)
+        (program.rows(z + step * d)[0] - program.rows(z - step * d)[0]) / (2 * step)
         for d in np.eye(len(z))
     ]
-    exact = program.constraints(z)[1]
+    exact = program.rows(z)[1]
     np.testing.assert_allclose(np.array(columns).T, exact, rtol=1e-5, atol=1e-4)
 
 
@@ -143,7 +143,7 @@ def require_curvature(program: ForceProgram, z: Array) -> None:
     multipliers = np.random.default_rng(1).normal(size=program.layout.n_rows)
 
     def slope(at: Array) -> Array:
-        return program.constraints(at)[1].T @ multipliers
+        return program.rows(at)[1].T @ multipliers
 
     step = 1e-6
     rows = [(slope(z + step * d) - slope(z - step * d)) / (2 * step) for d in np.eye(len(z))]
@@ -157,7 +157,7 @@ def test_rows_of_samples_are_what_the_evaluator_finds(path: Path) -> None:
     program, z = made(path)
     cell, layout = evaluator(path).workcell, program.layout
     found = {k: v[0] for k, v in evaluator(path).outputs(program.candidate(z)[None]).items()}
-    values = program.constraints(z)[0]
+    values = program.rows(z)[0]
 
     leave = [
         1.0
@@ -166,13 +166,13 @@ def test_rows_of_samples_are_what_the_evaluator_finds(path: Path) -> None:
         for row in layout.pressure_rows
     ]
     # The time law's kinks are rounded, which is corrected at the program's candidate alone.
-    np.testing.assert_allclose(values[layout.patches], leave, rtol=1e-6)
+    np.testing.assert_allclose(values[layout.patches] + 0.01, leave, rtol=1e-6)
 
     # The ruling branch is the evaluator's force; the others lie below it.
     highest: dict[tuple[int, int], float] = {}
     for row, value in zip(layout.force_rows, values[layout.forces].tolist(), strict=True):
         key = (row.robot, row.sample)
-        scaled = (value + z[-3:][row.robot]) * TARGET.span[row.robot]
+        scaled = (z[-3:][row.robot] - value) * TARGET.span[row.robot]
         highest[key] = max(highest.get(key, -np.inf), scaled + TARGET.anchor[row.robot])
     forces = [
         found["normal_force"][sample, robot] / cell.task.reference_force[robot]
@@ -184,7 +184,7 @@ def test_rows_of_samples_are_what_the_evaluator_finds(path: Path) -> None:
 def test_rows_at_places_are_in_the_order_of_the_layout() -> None:
     program, z = made(RACK)
     layout = program.layout
-    values = program.constraints(z)[0][layout.places]
+    values = program.rows(z)[0][layout.places]  # less what is required
     box = next(
         row.constraint.pair for row in layout.place_rows if isinstance(row.constraint, Separation)
     )
@@ -203,12 +203,12 @@ def test_rows_at_places_are_in_the_order_of_the_layout() -> None:
             if row.place % grid.per_sample:
                 continue
         elif isinstance(kind, Clearance):
-            assert value * kind.scale <= carry.distances.bounds[row.place, kind.pair] + 1e-9
+            assert value * kind.scale + 0.01 <= carry.distances.bounds[row.place, kind.pair] + 1e-9
             continue
         else:
-            assert value * kind.scale <= carry.distances.bounds[row.place, box] + 0.01
+            assert value * kind.scale + 0.01 <= carry.distances.bounds[row.place, box] + 0.01
             continue
-        assert value * kind.scale == pytest.approx(expected, rel=1e-6)
+        assert value * kind.scale + 0.01 == pytest.approx(expected, rel=1e-6)
         checked += 1
     assert checked >= 6
 

@@ -77,14 +77,14 @@ def test_a_programs_derivatives_are_exact(name: str) -> None:
         rows += [ForceRow(0, CONE_TIGHT, sample) for sample in range(0, task.samples, 7)]
     program = ForceProgram(cell, dict.fromkeys(rows, 0.01), TARGET, carry, x, 1.0)
     z = program.start.copy()
-    values = program.constraints(z)[0][program.layout.forces]
+    values = program.rows(z)[0][program.layout.forces]
     exact = [
         carry.force[row.sample, row.robot] / task.reference_force[row.robot]
         for row in program.layout.force_rows
         if row.branch == HELD
     ]
     scaled = [
-        (value + z[-3:][row.robot]) * TARGET.span[row.robot] + TARGET.anchor[row.robot]
+        (z[-3:][row.robot] - value) * TARGET.span[row.robot] + TARGET.anchor[row.robot]
         for row, value in zip(program.layout.force_rows, values.tolist(), strict=True)
         if row.branch == HELD
     ]

@@ -71,16 +71,16 @@ def test_rows_agree_with_the_robust_forces_to_first_order() -> None:
     np.testing.assert_allclose(carry.peak, judge.evaluate(x).objectives[0], rtol=1e-9)
     rows: list[Row] = [ForceRow(robot, 0, sample) for robot in (0, 1) for sample in (10, 55, 90)]
     program = ForceProgram(cell, dict.fromkeys(rows, 0.0), TARGET, carry, x, 1.0)
-    values, jacobian = program.constraints(program.start)
+    values, jacobian = program.rows(program.start)
     force, slope = robust.first(x)
     for k, row in enumerate(program.layout.force_rows):
         unit = judge.workcell.task.reference_force[row.robot] * TARGET.span[row.robot]
         phi = program.start[-3:][row.robot]
         wanted = force[row.sample, row.robot] / unit
         wanted -= TARGET.anchor[row.robot] / TARGET.span[row.robot] + phi
-        assert values[k] == pytest.approx(wanted, abs=1e-8)
+        assert -values[k] == pytest.approx(wanted, abs=1e-8)
         by_x = slope[row.sample, row.robot] * cell.half / unit
-        np.testing.assert_allclose(jacobian[k, : len(x)], by_x, atol=1e-8)
+        np.testing.assert_allclose(-jacobian[k, : len(x)], by_x, atol=1e-8)
 
 
 def test_a_carry_is_polished_for_its_robust_forces() -> None:
