@@ -73,28 +73,6 @@ class MotionVerdict:
     added: int
 
 
-def check_between(
-    checker: CollisionChecker,
-    configuration: Array,
-    clearance: Array | None = None,
-    depth: int = SEARCH_DEPTH,
-    margin: float = 0.0,
-) -> MotionVerdict:
-    """Whether anything collides between n samples that are themselves free of collisions.
-
-    Args:
-        configuration: (n, 6 + all joints) box poses [m, rad] and both arms' joint positions.
-            Between samples all of them move linearly.
-        clearance: (n, n_pairs) bounds if known already [m].
-        depth: how often an interval is halved before it counts as undecided.
-        margin: distance to be kept beyond the tolerance [m].
-    """
-    if clearance is None:
-        clearance = checker.bounds(*checker.split(configuration))
-    sampled = SampledMotions(configuration, clearance, (len(configuration),), np.array([margin]))
-    return check_all_between(checker, sampled, depth)[0]
-
-
 @dataclass(frozen=True)
 class SampledMotions:
     """Several motions on their samples, one after the other.
@@ -115,7 +93,11 @@ class SampledMotions:
 def check_all_between(
     checker: CollisionChecker, sampled: SampledMotions, depth: int = SEARCH_DEPTH
 ) -> list[MotionVerdict]:
-    """`check_between` for several motions at once: the same verdicts, with fewer calls."""
+    """Whether anything collides between samples that are themselves free of collisions.
+
+    Between samples all of them move linearly. After `depth` halvings an interval counts as
+    undecided.
+    """
     return _Sweep(checker, sampled).run(depth)
 
 

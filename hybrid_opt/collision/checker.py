@@ -199,20 +199,6 @@ class CollisionChecker:
             fcl_calls=self.judge.calls - calls,
         )
 
-    def collision_mask(self, pose: Array, q_1: Array, q_2: Array) -> NDArray[np.bool_]:
-        """(n, n_pairs): FCL's answer for every pair of every sample, without any screening."""
-        self._place(pose, q_1, q_2)
-        return np.array(
-            [
-                [
-                    self._judge_pair(k, pair, pair in self._resting_pairs(pose[k, :3]))
-                    for pair in range(len(self._pairs))
-                ]
-                for k in range(len(pose))
-            ],
-            dtype=bool,
-        ).reshape(len(pose), len(self._pairs))
-
     def collisions(
         self,
         pose: Array,

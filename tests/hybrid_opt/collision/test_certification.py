@@ -14,7 +14,7 @@ from codegen.function import NumericFunction
 from codegen.interpreted import InterpretedFunction
 from codegen.source import dense
 from hybrid_opt import metaheuristics
-from hybrid_opt.collision.between import MotionVerdict, PassingTouch, check_between
+from hybrid_opt.collision.between import MotionVerdict, PassingTouch
 from hybrid_opt.collision.certify import (
     Certificate,
     LostPathError,
@@ -37,6 +37,7 @@ from symbolic.records.poses import inverse, pose_matrix
 from symbolic.records.task import extended_waypoints, initial_decision
 from symbolic.robot.model import build_robot_model
 from tests.hybrid_opt.cells import shipped
+from tests.hybrid_opt.collision.queries import check_between, collision_mask
 from tests.symbolic.geometry.collision_cells import Configurations, functions_of, rack
 from tests.symbolic.read.samples import RACK
 
@@ -377,4 +378,4 @@ def test_a_certified_path_is_free_on_a_fine_grid() -> None:
     judge = checker(thickness=0.001)
     certificate = certify(judge, arc, np.linspace(0.0, 1.0, 8))
     u = np.linspace(0.0, 1.0, 2000)
-    assert certificate.is_free == (not judge.collision_mask(*arc(u)).any())
+    assert certificate.is_free == (not collision_mask(judge, *arc(u)).any())

@@ -19,6 +19,7 @@ from hybrid_opt.collision.checker import RESTING_TOLERANCE, CollisionChecker, sa
 from symbolic.geometry.pairs import CellGeometry, build_geometry, coal_distance, coal_geometry
 from symbolic.geometry.pieces import Piece
 from symbolic.records import AllowedContact, CollisionSettings, Uncertainty, Workcell
+from tests.hybrid_opt.collision.queries import collision_mask
 from tests.symbolic.geometry.collision_cells import (
     Configurations,
     functions_of,
@@ -72,7 +73,7 @@ def assert_agree(name: str, folder: Path, n: int, seed: int) -> None:
     """FCL and Coal differ on no pair, but where the bodies are within their resolution."""
     geometry = geometry_of(name, folder)
     at = random_configurations(geometry, n, np.random.default_rng(seed))
-    ours, theirs = checker(name, folder).collision_mask(*at), coal_mask(geometry, at)
+    ours, theirs = collision_mask(checker(name, folder), *at), coal_mask(geometry, at)
     assert ours.any()
     assert not ours.all()
     for k, i in np.argwhere(ours != theirs):
@@ -97,7 +98,7 @@ def assert_screening_changes_nothing(name: str, folder: Path, n: int, seed: int)
     """Every sample's verdict and every cleared pair, against FCL on all pairs."""
     judge = checker(name, folder)
     at = random_configurations(judge.geometry, n, np.random.default_rng(seed))
-    bounds, mask = judge.bounds(*at), judge.collision_mask(*at)
+    bounds, mask = judge.bounds(*at), collision_mask(judge, *at)
     assert not np.any(mask & (bounds > RESOLUTION))
     time = np.arange(float(n))
     screened = judge.check(*at, time, bounds)
@@ -130,7 +131,7 @@ def test_screening_changes_nothing_in_twenty_thousand_samples(name: str, folder:
 def test_measured_distances_are_those_of_coal(name: str, folder: Path) -> None:
     judge = checker(name, folder)
     at = random_configurations(judge.geometry, 60, np.random.default_rng(34))
-    apart = ~judge.collision_mask(*at)
+    apart = ~collision_mask(judge, *at)
     measured = np.full(apart.shape, -1.0)
     assert judge.measure(*at, measured, apart).max() == -1
     expected = np.array([true_distances(judge.geometry, *row) for row in zip(*at, strict=True)])
@@ -144,7 +145,7 @@ def test_measured_distances_are_those_of_coal(name: str, folder: Path) -> None:
 def test_measuring_stops_at_a_collision() -> None:
     judge = checker("rack")
     at = random_configurations(judge.geometry, 30, np.random.default_rng(36))
-    mask = judge.collision_mask(*at)
+    mask = collision_mask(judge, *at)
     hits = judge.measure(*at, judge.bounds(*at), np.ones(mask.shape, dtype=bool))
     assert (hits >= 0).tolist() == mask.any(axis=1).tolist()
     assert all(mask[k, hit] for k, hit in enumerate(hits) if hit >= 0)
@@ -223,7 +224,7 @@ def test_touching_is_decided_alike_at_any_tilt(
     k = judge.geometry.pair_names.index(("payload", "middle board"))
     pose[0, 2] -= corner[0, k] - gap
     at = (pose, STILL, STILL)
-    assert judge.check(*at, np.zeros(1)).colliding[0] == judge.collision_mask(*at).any()
+    assert judge.check(*at, np.zeros(1)).colliding[0] == collision_mask(judge, *at).any()
 
 
 def resting_cell(departure: float) -> Workcell:

@@ -34,6 +34,7 @@ from symbolic.records import CollisionSettings, Uncertainty, Workcell
 from symbolic.records.poses import box_placement
 from symbolic.records.task import initial_decision, straight_line
 from tests.hybrid_opt.cells import shipped
+from tests.hybrid_opt.collision.queries import collision_mask
 from tests.hybrid_opt.collision.test_checker import checker_of, resting_cell
 from tests.symbolic.geometry.collision_cells import geometry_of, random_configurations
 from tests.symbolic.read.samples import RACK
@@ -137,7 +138,7 @@ def test_the_plain_check_places_what_the_compiled_one_places(
     plain = PlainCollisionChecker(cell)
     plain.pairs = geometry.pair_names
     at = random_configurations(geometry, 40, np.random.default_rng(63))
-    mask = checker_of(geometry).collision_mask(*at)
+    mask = collision_mask(checker_of(geometry), *at)
     found = plain.check(np.arange(40.0), *at)
     expected = [tuple(np.array(geometry.pair_names)[row].tolist()) for row in mask]
     assert [list(map(list, pairs)) for pairs in found.pairs] == list(map(list, expected))
@@ -187,7 +188,7 @@ def test_screening_changes_no_sample_of_random_candidates(n: int) -> None:
     for row in range(n):
         reached = reached_samples(outputs, row)
         pose, q_1, q_2 = (outputs[name][row, :reached] for name in ("pose", "q_1", "q_2"))
-        mask = judge.collision_mask(pose, q_1, q_2)
+        mask = collision_mask(judge, pose, q_1, q_2)
         bounds = judge.bounds(pose, q_1, q_2)
         assert not np.any(mask & (bounds > FCL_RESOLUTION))
         colliding = judge.check(pose, q_1, q_2, outputs["time"][row, :reached], bounds).colliding
@@ -390,7 +391,7 @@ def test_the_straight_line_meets_a_board(cell: Cell) -> None:
     (why,) = explain(cell.evaluator, judged)
     outputs = cell.evaluator.outputs(judged.x)
     at = [outputs[name][0, [why.sample]] for name in ("pose", "q_1", "q_2")]
-    hit = cell.evaluator.checker.collision_mask(*map(np.ascontiguousarray, at))[0]
+    hit = collision_mask(cell.evaluator.checker, *map(np.ascontiguousarray, at))[0]
     names = {cell.geometry.pair_names[k] for k in np.flatnonzero(hit)}
     assert why.pair in names
     assert f"{why.pair[0]} meets {why.pair[1]}" in str(why)

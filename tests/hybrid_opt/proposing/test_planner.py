@@ -13,6 +13,7 @@ from hybrid_opt.proposing.trial import BoxAlone
 from hybrid_opt.proposing.via_points import fit, free_share, joint_length, shortened, straightened
 from symbolic.path.spline import path_basis
 from symbolic.records.poses import pose_matrix
+from tests.hybrid_opt.collision.queries import collision_mask
 from tests.hybrid_opt.proposing.test_proposal import rack_problem
 
 NO_LIMITS = np.empty((0, 2))
@@ -57,7 +58,7 @@ def test_paths_hold_the_box_with_both_arms_and_are_free(rack: Setup, first: list
         assert np.all(q >= rack.workcell.robots[arm].position_lower)
         assert np.all(q <= rack.workcell.robots[arm].position_upper)
     q_1, q_2 = (np.array([place.q[arm] for place in path]) for arm in (0, 1))
-    assert not pair.chain.judge.checker.collision_mask(poses, q_1, q_2).any()
+    assert not collision_mask(pair.chain.judge.checker, poses, q_1, q_2).any()
 
 
 def test_straight_motions_lead_out_of_the_shelf_and_in_again(rack: Setup) -> None:
@@ -71,7 +72,7 @@ def test_straight_motions_lead_out_of_the_shelf_and_in_again(rack: Setup) -> Non
     path = shortened(pair.chain, corners, np.random.default_rng(0))
     poses = np.array([place.extended for place in path])
     q_1, q_2 = (np.array([place.q[arm] for place in path]) for arm in (0, 1))
-    assert not pair.chain.judge.checker.collision_mask(poses, q_1, q_2).any()
+    assert not collision_mask(pair.chain.judge.checker, poses, q_1, q_2).any()
 
 
 def test_where_no_straight_motion_is_free_none_is_made_up(rack: Setup) -> None:
