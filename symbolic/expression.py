@@ -20,6 +20,18 @@ def reciprocal(x: ca.SX) -> ca.SX:
     return 2.0 / (x + x)
 
 
+def named_function(
+    name: str, inputs: Mapping[str, Any], outputs: Mapping[str, Any], cse: bool = True
+) -> ca.Function:
+    """A function by the names of what it takes and gives, in order.
+
+    Args:
+        cse: whether what occurs several times is computed once.
+    """
+    sides = [*inputs.values()], [*outputs.values()], [*inputs], [*outputs]
+    return ca.Function(name, *sides, {"cse": cse})
+
+
 def number(value: Any) -> Any:
     """A number or an array of a record as an expression; symbols as they are."""
     return value if isinstance(value, ca.SX | ca.MX) else ca.DM(value)

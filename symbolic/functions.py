@@ -11,7 +11,7 @@ import casadi as ca
 
 from symbolic.cell_model import CellModel
 from symbolic.contact.load import LOAD_OUTPUTS, load_function, uncertain_load_function
-from symbolic.expression import mx_given, of, repeated, sx_given
+from symbolic.expression import mx_given, named_function, of, repeated, sx_given
 from symbolic.geometry.screen import Screen
 from symbolic.limits import path_force_function
 from symbolic.path.spline import extended_matrix, sample_basis, waypoint_matrix
@@ -102,14 +102,7 @@ def candidate_function(model: CellModel) -> ca.Function:
     outputs["constraint"] = constraint
     outputs["violation"] = _row_max(violated)
     outputs["violation_time"] = ca.mtimes(violated > 0.0, _time_share(path.time).T)
-    return ca.Function(
-        "candidate",
-        list(inputs.values()),
-        list(outputs.values()),
-        list(inputs),
-        list(outputs),
-        {"cse": True},
-    )
+    return named_function("candidate", inputs, outputs)
 
 
 def _all(model: CellModel) -> dict[str, ca.MX]:
@@ -157,10 +150,7 @@ def motion_function(model: CellModel) -> ca.Function:
         "q_2": values["q_2"],
         "violation": _row_max(ca.fmax(constraint, 0.0)),
     }
-    inputs, names = {"x": x} | handed, list(outputs)
-    results = list(outputs.values())
-    given = list(inputs.values()), results, list(inputs), names
-    return ca.Function("motion_alone", *given, {"cse": True})
+    return named_function("motion_alone", {"x": x} | handed, outputs)
 
 
 _LOAD_SIZES = {

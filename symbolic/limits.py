@@ -19,7 +19,7 @@ from symbolic.contact.grasp import Grasp
 from symbolic.contact.load import ContactLoad, HeldLoad, frictions, held_by
 from symbolic.contact.soft_finger import Detached
 from symbolic.contact.soft_grasp import SoftGrasp
-from symbolic.expression import as_mx, mx_given, number, of, sx_given
+from symbolic.expression import as_mx, mx_given, named_function, number, of, sx_given
 from symbolic.path.spline import path_basis, waypoint_matrix
 from symbolic.path_motion import (
     ARM_OUTPUTS,
@@ -148,9 +148,7 @@ def path_function(model: CellModel, samples: int) -> ca.Function:
         outputs[f"q_{i + 1}"] = tracked["q"]
         verdicts |= {f"{name}_{i + 1}": tracked[name] for name in VERDICTS}
     outputs |= verdicts
-    inputs = {"x": x} | handed
-    sides = list(inputs.values()), list(outputs.values()), list(inputs), list(outputs)
-    return ca.Function("path", *sides, {"cse": True})
+    return named_function("path", {"x": x} | handed, outputs)
 
 
 def sample_limits_function(model: CellModel) -> ca.Function:
@@ -203,14 +201,8 @@ def sample_limits_function(model: CellModel) -> ca.Function:
     }
     assert {name: block.shape[0] for name, block in blocks.items()} == layout.sizes
     limits = ca.vertcat(*[ca.densify(blocks[name]) for name in layout.sizes])
-    numbers = limit_numbers(workcell)
-    return ca.Function(
-        "sample_limits",
-        [*given, *q, *numbers.values()],
-        ca.cse([limits]),
-        [*PATH_OUTPUTS, *numbers],
-        ["limits"],
-    )
+    inputs = dict(zip(PATH_OUTPUTS, (*given, *q), strict=True)) | limit_numbers(workcell)
+    return named_function("sample_limits", inputs, {"limits": limits})
 
 
 def limit_numbers(workcell: Workcell) -> dict[str, ca.SX]:
@@ -292,9 +284,10 @@ def path_force_function(workcell: Workcell) -> ca.Function:
     own = [ca.SX(number(workcell.contacts[0].T_box_pad[:3, :3])), ca.DM(GRAVITY) * payload.mass]
     if not closed:
         own = [as_mx(ca.SX(value), sx_given(payload), numbers) for value in own]
-    path = [kind.sym(name, 6) for name in ("pose", "first", "second")]
+    path = {name: kind.sym(name, 6) for name in ("pose", "first", "second")}
     a, w = kind.sym("a"), kind.sym("w")
-    box = dict(zip(BOX_OUTPUTS, box_function(workcell)(*path, *numbers.values()), strict=True))
+    moved = box_function(workcell)(*path.values(), *numbers.values())
+    box = dict(zip(BOX_OUTPUTS, moved, strict=True))
     rotation = ca.reshape(box["rotation"], 3, 3).T
     axes, weight = ca.mtimes(rotation, own[0]), own[1]
     asked = (
@@ -303,11 +296,8 @@ def path_force_function(workcell: Workcell) -> ca.Function:
     )
     blocks = ca.vertcat(*[ca.mtimes(axes.T, part) for part in asked])
     force, by_a, by_w = force_functions(workcell)[1](blocks, a, w, *numbers.values())
-    outputs = [force, ca.vertcat(by_a.T, by_w.T)]
-    inputs = [*path, a, w, *numbers.values()]
-    names = ["pose", "first", "second", "a", "w", *numbers]
-    results = ca.cse(outputs) if closed else outputs
-    return ca.Function("path_force", inputs, results, names, ["normal_force", "slope"])
+    outputs = {"normal_force": force, "slope": ca.vertcat(by_a.T, by_w.T)}
+    return named_function("path_force", {**path, "a": a, "w": w, **numbers}, outputs, cse=closed)
 
 
 def ratio_functions(workcell: Workcell) -> tuple[ca.Function, ca.Function]:

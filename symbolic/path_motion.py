@@ -13,7 +13,7 @@ import numpy as np
 
 from symbolic.cell_model import CellModel
 from symbolic.contact.paper import required_moment
-from symbolic.expression import as_mx, mx_given, number, of, repeated, sx_given
+from symbolic.expression import as_mx, mx_given, named_function, number, of, repeated, sx_given
 from symbolic.path.rotation import angular_acceleration, angular_velocity, rotation_matrix
 from symbolic.path.spline import (
     NONE,
@@ -102,9 +102,7 @@ def path_motion_function(model: CellModel, samples: int) -> ca.Function:
         derivatives = arm.map(samples)(tracked["q"], *moved, *repeated(given, samples))
         derived = dict(zip(ARM_OUTPUTS, derivatives, strict=True))
         outputs |= {f"{name}_{i + 1}": value for name, value in (tracked | derived).items()}
-    inputs = {"x": x} | handed
-    sides = list(inputs.values()), list(outputs.values()), list(inputs), list(outputs)
-    return ca.Function("path_motion", *sides, {"cse": True})
+    return named_function("path_motion", {"x": x} | handed, outputs)
 
 
 def start_posture(model: CellModel, arm: int, handed: Handed) -> ca.MX:
@@ -204,11 +202,5 @@ def arm_derivative_function(
         "torque_at_rest": at_rest,
         "wrench_torque": ca.vec(ca.jacobian(torque, wrench).T),
     }
-    numbers = sx_given(robot)
-    return ca.Function(
-        name,
-        [q, *given, *numbers.values()],
-        ca.cse([ca.densify(outputs[name]) for name in ARM_OUTPUTS]),
-        ["q", *names, *numbers],
-        list(ARM_OUTPUTS),
-    )
+    inputs = {"q": q} | dict(zip(names, given, strict=True)) | sx_given(robot)
+    return named_function(name, inputs, {k: ca.densify(outputs[k]) for k in ARM_OUTPUTS})

@@ -17,7 +17,7 @@ from symbolic.contact.force_closure import WRENCH_SIZE
 from symbolic.contact.grasp import Grasp, balance_of, facing_wrenches, grasp_wrenches
 from symbolic.contact.paper import allocate, pressure_shift, required_force, required_moment
 from symbolic.contact.soft_finger import Detached, SoftPatch, least_soft_squeeze
-from symbolic.expression import Expression, as_mx, mx_given, number, sx_given
+from symbolic.expression import Expression, as_mx, mx_given, named_function, number, sx_given
 from symbolic.path.rotation import angular_acceleration, angular_velocity, rotation_matrix
 from symbolic.records import Allocation, Workcell
 
@@ -309,13 +309,8 @@ def _grasp_load_function(workcell: Workcell) -> ca.Function:
 
 def _named(inputs: dict[str, ca.MX], outputs: dict[str, ca.MX]) -> ca.Function:
     """`uncertain_load_function` from its inputs and outputs."""
-    return ca.Function(
-        "uncertain_load",
-        list(inputs.values()),
-        [outputs[name] for name in LOAD_OUTPUTS],
-        list(inputs),
-        list(LOAD_OUTPUTS),
-    )
+    ordered = {name: outputs[name] for name in LOAD_OUTPUTS}
+    return named_function("uncertain_load", inputs, ordered, cse=False)
 
 
 def _required(

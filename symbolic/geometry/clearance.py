@@ -34,7 +34,7 @@ import casadi as ca
 import numpy as np
 
 from symbolic.array import Array
-from symbolic.expression import number, sx_given
+from symbolic.expression import named_function, number, sx_given
 from symbolic.geometry.bodies import BOX, WORLD, CollisionBody, Frame
 from symbolic.geometry.expressions import EXACT, Softness, clean, quaternion, world_placements
 from symbolic.geometry.pairs import CellGeometry
@@ -430,14 +430,8 @@ def motion_function(
             bends.append(own[i][1] + own[j][1])
     given = sx_given(screen)
     names = [f"{what}_{end}" for end in ("a", "b") for what in ("pose", "q_1", "q_2")]
-    return ca.Function(
-        name,
-        [*inputs_a, *inputs_b, *given.values()],
-        [ca.vertcat(*chords), ca.vertcat(*bends)],
-        [*names, *given],
-        ["chord", "bend"],
-        {"cse": True},
-    )
+    inputs = dict(zip(names, (*inputs_a, *inputs_b), strict=True)) | given
+    return named_function(name, inputs, {"chord": ca.vertcat(*chords), "bend": ca.vertcat(*bends)})
 
 
 def _body_motion(

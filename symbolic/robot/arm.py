@@ -19,7 +19,7 @@ from operator import add
 import casadi as ca
 import numpy as np
 
-from symbolic.expression import Expression, mx_given, number, repeated, sx_given
+from symbolic.expression import Expression, mx_given, named_function, number, repeated, sx_given
 from symbolic.path.rotation import rotation_matrix
 from symbolic.records import Contact, Robot
 from symbolic.records.cell import box_flange, flange_lever
@@ -318,13 +318,10 @@ def posture_function(robots: Arms, models: Models, contacts: Contacts) -> ca.Fun
         postures.append(q)
         residuals.append(pose_error(R_target, p_target, R, p)[1])
     given = sx_given(*robots)
-    return ca.Function(
-        "posture",
-        [pose, *guesses, *given.values()],
-        ca.cse([*postures, *residuals]),
-        ["pose", "guess_1", "guess_2", *given],
-        ["q_1", "q_2", "residual_1", "residual_2"],
-    )
+    inputs = {"pose": pose, "guess_1": guesses[0], "guess_2": guesses[1]} | given
+    names = ("q_1", "q_2", "residual_1", "residual_2")
+    outputs = dict(zip(names, (*postures, *residuals), strict=True))
+    return named_function("posture", inputs, outputs)
 
 
 # --- Newton steps ---

@@ -16,7 +16,7 @@ from symbolic.array import Array
 from symbolic.cell_model import CellModel
 from symbolic.contact.grasp_numbers import LOAD_SIZE
 from symbolic.contact.soft_finger import Detached
-from symbolic.expression import number
+from symbolic.expression import named_function, number
 from symbolic.limits import (
     PATH_OUTPUTS,
     BlockLayout,
@@ -105,9 +105,9 @@ def driven_functions(model: CellModel) -> dict[str, ca.Function]:
     layout = driven_layout(model.workcell)
     names = [*PATH_OUTPUTS, "a", "w"]
     sizes = [layout.pose] * 3 + [*[arm.n_joints for arm in model.robots], 1, 1]
-    inputs = [ca.SX.sym(name, size) for name, size in zip(names, sizes, strict=True)]
+    inputs = {name: ca.SX.sym(name, size) for name, size in zip(names, sizes, strict=True)}
     detached: Detached = []
-    value, y = _value(model, inputs, detached), ca.vertcat(*inputs)
+    value, y = _value(model, [*inputs.values()], detached), ca.vertcat(*inputs.values())
     assert value.shape == (layout.size, 1)
     first = [value, ca.densify(ca.jacobian(value, y).T)]
     weight, direction = ca.SX.sym("weight", layout.size), ca.SX.sym("direction", layout.variables)
@@ -116,21 +116,11 @@ def driven_functions(model: CellModel) -> dict[str, ca.Function]:
     for symbol, solved in detached:
         first, second = (ca.substitute(found, [symbol], [solved]) for found in (first, second))
     given = limit_numbers(model.workcell)
+    values, bent = dict(zip(("value", "slope"), first, strict=True)), {"change": second[0]}
+    along = inputs | {"weight": weight, "direction": direction}
     return {
-        DRIVEN_FIRST: ca.Function(
-            DRIVEN_FIRST,
-            [*inputs, *given.values()],
-            ca.cse(first),
-            [*names, *given],
-            ["value", "slope"],
-        ),
-        DRIVEN_SECOND: ca.Function(
-            DRIVEN_SECOND,
-            [*inputs, weight, direction, *given.values()],
-            ca.cse(second),
-            [*names, "weight", "direction", *given],
-            ["change"],
-        ),
+        DRIVEN_FIRST: named_function(DRIVEN_FIRST, inputs | given, values),
+        DRIVEN_SECOND: named_function(DRIVEN_SECOND, along | given, bent),
     }
 
 

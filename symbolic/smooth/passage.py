@@ -22,7 +22,7 @@ import casadi as ca
 import numpy as np
 
 from symbolic.array import Array
-from symbolic.expression import sx_given
+from symbolic.expression import named_function, sx_given
 from symbolic.geometry.clearance import BOX_NUMBERS
 from symbolic.smooth.places import PlaceConstraint, PlaceSymbols
 
@@ -169,7 +169,5 @@ def gap_function(place: PlaceSymbols) -> ca.Function:
         unit = n / ca.sqrt(ca.fmax(squared, PARALLEL**2))
         along = place.sharp_scene.separation(obstacle, unit)
         found.append(ca.if_else(squared < PARALLEL**2, APART, along))
-    gaps = ca.cse([ca.densify(ca.vertcat(*found))])
-    given = sx_given(place.model.screen)
-    inputs, names = [place.pose, obstacle, *given.values()], ["pose", "obstacle", *given]
-    return ca.Function(GAPS, inputs, gaps, names, ["gaps"])
+    inputs = {"pose": place.pose, "obstacle": obstacle} | sx_given(place.model.screen)
+    return named_function(GAPS, inputs, {"gaps": ca.densify(ca.vertcat(*found))})

@@ -25,7 +25,7 @@ import numpy as np
 
 from symbolic.array import Array
 from symbolic.cell_model import CellBodies, CellModel
-from symbolic.expression import sx_given
+from symbolic.expression import named_function, sx_given
 from symbolic.geometry.clearance import Scene, box_numbers
 from symbolic.geometry.expressions import EXACT, Softness
 from symbolic.path.rotation import rotation_matrix
@@ -269,18 +269,16 @@ def row_function(place: PlaceSymbols, constraint: PlaceConstraint, order: Order)
     arms = constraint.arms(place.model)
     rate = [place.rate] if constraint.moving else []
     y = ca.vertcat(place.pose, *rate, *[place.q[arm] for arm in arms])
-    inputs, names = [place.pose, place.rate, *place.q], ["pose", "rate", "q_1", "q_2"]
+    inputs = {"pose": place.pose, "rate": place.rate, "q_1": place.q[0], "q_2": place.q[1]}
     if numbers.numel():
-        inputs, names = [*inputs, numbers], [*names, "numbers"]
+        inputs["numbers"] = numbers
     name, given = row_name(constraint.family, order), constraint.given(place.model)
     if order == "first":
-        results = ca.cse([value, ca.densify(ca.gradient(value, y))])
-        sides = [*inputs, *given.values()], results, [*names, *given]
-        return ca.Function(name, *sides, ["value", "gradient"])
+        outputs = {"value": value, "gradient": ca.densify(ca.gradient(value, y))}
+        return named_function(name, inputs | given, outputs)
     weight = ca.SX.sym("weight")
-    curvature = ca.cse([ca.densify(weight * ca.hessian(value, y)[0])])
-    sides = [*inputs, weight, *given.values()], curvature, [*names, "weight", *given]
-    return ca.Function(name, *sides, ["hessian"])
+    outputs = {"hessian": ca.densify(weight * ca.hessian(value, y)[0])}
+    return named_function(name, inputs | {"weight": weight} | given, outputs)
 
 
 def closure_functions(model: CellModel, arm: int) -> dict[str, ca.Function]:
@@ -310,21 +308,12 @@ def closure_functions(model: CellModel, arm: int) -> dict[str, ca.Function]:
     for _ in range(SOLVE_STEPS):
         q = newton_step(own, q, *target)
     first, second = closure_name(arm, "first"), closure_name(arm, "second")
-    results = ca.cse([ca.densify(result) for result in (q, *slopes(pose, q, *given.values()))])
+    found = zip(("q", "follow", "pull"), (q, *slopes(pose, q, *given.values())), strict=True)
+    outputs = {name: ca.densify(result) for name, result in found}
     curvature, _ = ca.hessian(ca.dot(nu, closure), ca.vertcat(pose, joints))
+    bent = {"hessian": ca.densify(curvature)}
+    inputs = {"pose": pose, "q_reference": reference} | given
     return {
-        first: ca.Function(
-            first,
-            [pose, reference, *given.values()],
-            results,
-            ["pose", "q_reference", *given],
-            ["q", "follow", "pull"],
-        ),
-        second: ca.Function(
-            second,
-            [pose, joints, nu, *given.values()],
-            ca.cse([ca.densify(curvature)]),
-            ["pose", "q", "nu", *given],
-            ["hessian"],
-        ),
+        first: named_function(first, inputs, outputs),
+        second: named_function(second, {"pose": pose, "q": joints, "nu": nu} | given, bent),
     }

@@ -33,7 +33,7 @@ from symbolic.contact.paper import (
     split_force,
 )
 from symbolic.contact.soft_grasp import SoftGrasp
-from symbolic.expression import mx_given, number, of, repeated, sx_given
+from symbolic.expression import mx_given, named_function, number, of, repeated, sx_given
 from symbolic.path.rotation import angular_acceleration, angular_velocity, rotation_matrix
 from symbolic.path.spline import PathBasis, sample_basis, waypoint_matrix
 from symbolic.path.time_law import timed_path
@@ -300,21 +300,10 @@ def _functions(
     weight, along = symbols.sym("weight", values.numel()), symbols.sym("along", x.numel())
     gradient = ca.jacobian(values, x).T
     curvature = ca.jtimes(ca.gradient(ca.dot(weight, values), x), x, along)
-    results = ca.cse([ca.densify(result) for result in (values, gradient)])
-    names = list(INPUTS)
+    outputs = {"values": ca.densify(values), "gradient": ca.densify(gradient)}
+    bent, own = {"curvature": ca.densify(curvature)}, dict(zip(INPUTS, inputs, strict=True))
+    bending = {**own, "weight": weight, "along": along, **given}
     return {
-        first: ca.Function(
-            first,
-            [*inputs, *given.values()],
-            results,
-            [*names, *given],
-            ["values", "gradient"],
-        ),
-        second: ca.Function(
-            second,
-            [*inputs, weight, along, *given.values()],
-            ca.cse([ca.densify(curvature)]),
-            [*names, "weight", "along", *given],
-            ["curvature"],
-        ),
+        first: named_function(first, {**own, **given}, outputs),
+        second: named_function(second, bending, bent),
     }
