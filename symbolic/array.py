@@ -60,6 +60,11 @@ def interpolated(at: Array, along: Array, values: Array) -> Array:
     return found
 
 
+def evenly(count: int, most: int) -> NDArray[np.intp]:
+    """At most `most` of `count` rows, evenly spread, both ends among them."""
+    return np.linspace(0, count - 1, min(count, most)).round().astype(np.intp)
+
+
 def set_read_only(record: object) -> None:
     """Refuse changes of the arrays that a record holds itself."""
     for value in vars(record).values():

@@ -37,7 +37,7 @@ from hybrid_opt.timing.drive import CandidateDriver
 from hybrid_opt.timing.given import drive_path
 from hybrid_opt.timing.model import TimingModel
 from hybrid_opt.timing.solve import time_path
-from symbolic.array import Array
+from symbolic.array import Array, evenly
 from symbolic.path.pieces import same_paths, stated
 from symbolic.records.task import initial_decision
 
@@ -235,9 +235,7 @@ class DriveRun(PolishRun[DriveAttempt]):
         refines = self._way.stated is not self._way
         # What is moved by all waypoints afterwards needs no points of the given front.
         count = 0 if refines else min(len(rows), ceil(self._settings.attempts * OWN_SHARE))
-        forces = [
-            self._force(rows[k]) for k in np.linspace(0, len(rows) - 1, count).round().astype(int)
-        ]
+        forces = [self._force(rows[k]) for k in evenly(len(rows), count)]
         self._largest = max(*map(self._force, rows), self._range[0])
         self._others = self._leading(np.vstack([self._hand_made, self._paths]), COMPARED)
         self._tournament(self._range[0] + FAST * (self._largest - self._range[0]))

@@ -37,7 +37,7 @@ from hybrid_opt.polishing.point import Solution
 from hybrid_opt.polishing.records import Aim, PolishOutcome
 from hybrid_opt.polishing.settings import PolishSettings
 from hybrid_opt.polishing.starts import Start, kicked, mirror_of, random_starts
-from symbolic.array import Array
+from symbolic.array import Array, evenly
 
 ENOUGH = 0.9
 """Share of the points that a front is to have with which it is left."""
@@ -93,7 +93,7 @@ def points(archive: GrowingFront, settings: PolishSettings) -> list[ForceAttempt
     """Evenly spread points of the front, the balanced one among them."""
     rows = archive.rows()
     count = min(len(rows), ceil(settings.attempts * OWN_SHARE))
-    chosen = {rows[int(k)] for k in np.round(np.linspace(0, len(rows) - 1, count))}
+    chosen = {rows[k] for k in evenly(len(rows), count)}
     middle, _ = archive.best(None)
     if middle not in chosen and count > 2:
         inner = sorted(chosen - {rows[0], rows[-1]}, key=rows.index)

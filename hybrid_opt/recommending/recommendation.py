@@ -49,7 +49,7 @@ from hybrid_opt.static_hold import static_hold
 from hybrid_opt.timing.limits import limited_force
 from hybrid_opt.timing.records import Timing
 from hybrid_opt.timing.robustness import Margin
-from symbolic.array import Array, Figure
+from symbolic.array import Array, Figure, evenly
 from symbolic.errors import SettingsError
 from symbolic.records import Uncertainty, Workcell
 from symbolic.records.cell import RANGES
@@ -413,8 +413,7 @@ def front_durations(paths: DrivenPaths, forces: Array) -> Array:
 def spread_rows(paths: Array) -> NDArray[np.intp]:
     """Rows of at most `MEMBERS` different ones of a front's paths (k, n), both ends among them."""
     different = np.sort(np.unique(paths, axis=0, return_index=True)[1])
-    rows = np.linspace(0, len(different) - 1, min(len(different), MEMBERS)).round().astype(int)
-    return np.asarray(different[np.unique(rows)])
+    return np.asarray(different[evenly(len(different), MEMBERS)])
 
 
 def over_replicas(durations: Sequence[Array]) -> tuple[Array, Array, Array]:

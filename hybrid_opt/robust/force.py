@@ -27,7 +27,7 @@ from hybrid_opt.robust.cases import (
     ruling_cases,
     worst_cases,
 )
-from symbolic.array import Array, Count, Figure, Pair, Row, Shape
+from symbolic.array import Array, Count, Figure, Pair, Row, Shape, evenly
 from symbolic.contact.force_closure import has_force_closure
 from symbolic.contact.worst_cases import least_distance
 from symbolic.errors import SettingsError
@@ -230,7 +230,7 @@ class RobustModel:
         """
         check_set(self.workcell, uncertainty)
         cases, n = worst_cases(self.workcell, uncertainty, leader), len(motion.pose)
-        few = np.unique(np.linspace(0, n - 1, min(n, FEW)).round().astype(int))
+        few = evenly(n, FEW)
         at_few = box_motion(motion).at(few)
         planned = self.nominal(at_few, leader)[:, 1 - leader]
         rows, every = _repeated(at_few, len(cases)), np.repeat(cases, len(few), axis=0)
@@ -239,7 +239,7 @@ class RobustModel:
         needed = self.least_squeeze(motion, cases[ruling], leader)[:, :, 1 - leader]
         force: Array = np.maximum(needed.max(axis=0), above)
         others = np.delete(cases, ruling, axis=0)
-        thin = np.unique(np.linspace(0, n - 1, min(n, SAMPLES)).round().astype(int))
+        thin = evenly(n, SAMPLES)
         held, step, last = force[thin], max(1, BATCH // len(thin)), [others[:0]]
         for start in range(0, len(others), step):
             some = others[start : start + step]
@@ -508,6 +508,5 @@ def robust_price(
 def thinned(carry: Carry) -> tuple[NDArray[np.intp], BoxMotion]:
     """`SAMPLES` evenly spread samples of a carry, and those of its largest normal forces; which
     they are, and their motion."""
-    even = np.linspace(0, len(carry) - 1, min(len(carry), SAMPLES)).round().astype(int)
-    rows = np.union1d(even, carry.normal_force.argmax(axis=0))
+    rows = np.union1d(evenly(len(carry), SAMPLES), carry.normal_force.argmax(axis=0))
     return rows, BoxMotion(carry.pose[rows], carry.rate[rows], carry.second_rate[rows])

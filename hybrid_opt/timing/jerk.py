@@ -33,6 +33,7 @@ from hybrid_opt.timing.limits import (
     NEAR,
     RECOMPUTED_TOLERANCE,
     PathLimits,
+    largest_speed_factor,
     limit_ratios,
     limit_use,
     squared_speed_limit,
@@ -290,12 +291,7 @@ class _Problem:
         """Largest factor on the speeds with which the timing keeps all limits on the finer grid."""
         if max(self._judge(self._fine, c)[1:]) <= 1.0 + RECOMPUTED_TOLERANCE:
             return 1.0
-        low, high = 0.0, 1.0
-        for _ in range(14):
-            factor = 0.5 * (low + high)
-            exceeded = max(self._judge(self._fine, factor**2 * c)[1:]) > 1.0
-            low, high = (low, factor) if exceeded else (factor, high)
-        return low
+        return largest_speed_factor(lambda f: max(self._judge(self._fine, f**2 * c)[1:]) > 1.0)
 
     def _judged(self, c: Array) -> JerkTiming:
         """The timing on the finer grid, slowed down where it exceeds a limit."""

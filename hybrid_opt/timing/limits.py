@@ -3,7 +3,7 @@ carry uses, recomputed from its physical quantities alone."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import numpy as np
 
@@ -30,6 +30,9 @@ NEAR = 0.6
 
 EXACT = 0.98
 """Share of a limit of robust forces above which they are computed exactly."""
+
+SLOWINGS = 14
+"""Bisections of a factor on the speeds."""
 
 SPREAD = 20
 """Stride of the samples whose robust force is computed in the search for the largest."""
@@ -279,6 +282,15 @@ def joint_at(joint_names: tuple[tuple[str, ...], ...], column: int) -> tuple[int
     """Arm and joint of a column, both arms' joints side by side."""
     first = len(joint_names[0])
     return (0, column) if column < first else (1, column - first)
+
+
+def largest_speed_factor(exceeds: Callable[[float], bool]) -> float:
+    """The largest factor on the speeds, at most one, with which nothing is exceeded."""
+    low, high = 0.0, 1.0
+    for _ in range(SLOWINGS):
+        factor = (low + high) / 2.0
+        low, high = (low, factor) if exceeds(factor) else (factor, high)
+    return low
 
 
 def worst(use: dict[str, Excess]) -> Excess:

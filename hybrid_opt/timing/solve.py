@@ -26,6 +26,7 @@ from hybrid_opt.timing.limits import (
     RECOMPUTED_TOLERANCE,
     PathLimits,
     duration_at_speed_limits,
+    largest_speed_factor,
     limit_ratios,
     limit_use,
     squared_speed_limit,
@@ -253,15 +254,12 @@ class _Problem:
         carry = self._refined(squared)
         use = limit_use(carry, workcell, limits, names)
         if worst(use).ratio > 1.0 + RECOMPUTED_TOLERANCE:
-            low, factor = 0.0, 1.0
-            for _ in range(14):
-                middle = (low + factor) / 2.0
-                trial = self._refined(middle**2 * squared)
-                if worst(limit_use(trial, workcell, limits, names)).ratio > 1.0:
-                    factor = middle
-                else:
-                    low = middle
-            factor = low
+
+            def exceeds(slower: float) -> bool:
+                trial = self._refined(slower**2 * squared)
+                return worst(limit_use(trial, workcell, limits, names)).ratio > 1.0
+
+            factor = largest_speed_factor(exceeds)
             squared = factor**2 * squared
             carry = self._refined(squared)
             use = limit_use(carry, workcell, limits, names)

@@ -20,7 +20,7 @@ from matplotlib.figure import Figure
 
 from hybrid_opt.display.scene import Solid, frame_placements
 from hybrid_opt.store.files import write_atomically
-from symbolic.array import Array
+from symbolic.array import Array, evenly
 from symbolic.geometry.bodies import Frame
 from symbolic.geometry.pairs import CellGeometry
 
@@ -124,8 +124,7 @@ def shortened(name: str, length: int = 24) -> str:
 
 def spread(count: int, most: int) -> list[int]:
     """At most `most` of `count` rows, both ends among them."""
-    rows = np.linspace(0, count - 1, min(count, most)).round().astype(int)
-    return [int(row) for row in np.unique(rows)]
+    return [int(row) for row in evenly(count, most)]
 
 
 def new_figure(width: float, height: float) -> Figure:

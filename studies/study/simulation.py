@@ -34,7 +34,7 @@ from hybrid_opt.witness.reference import Control, driven_carry
 from hybrid_opt.work.service import Emit, Service, answer_all, nothing
 from studies.study.recommendation import StoredRecommendation
 from studies.study.summary import read_summary
-from symbolic.array import Array, Figure, Row, Shape
+from symbolic.array import Array, Figure, Row, Shape, evenly
 from symbolic.errors import SettingsError
 
 MOST_SAMPLES = 240
@@ -117,8 +117,7 @@ def stored_simulation(
     )
     begin = float(motion.time[2])
     rows = np.flatnonzero(shown.time >= begin)
-    even = np.linspace(0, len(rows) - 1, min(len(rows), MOST_SAMPLES)).round().astype(int)
-    rows = rows[even] if len(rows) else np.array([len(shown.time) - 1])
+    rows = rows[evenly(len(rows), MOST_SAMPLES)] if len(rows) else np.array([len(shown.time) - 1])
     slipped: dict[str, Any] = {}
     if threshold is not None:
         slips, holds = threshold.slips, threshold.holds
