@@ -1,4 +1,4 @@
-"""The shipped rack in a minute or two: hand-made carry, first front, a quick study, its page."""
+"""The shipped rack in minutes: hand-made carry, first front, a quick study, its page."""
 
 from __future__ import annotations
 
@@ -44,8 +44,8 @@ def show(options: argparse.Namespace) -> int:
         print(f"{part}\n", flush=True)
     print(
         f"So far {time.monotonic() - began:.0f} s. The rest, a quick study with polish, "
-        "recommendation and page, takes a\nminute on two idle cores, longer beside other work or "
-        "where its functions are not compiled yet.\n",
+        "recommendation and page, takes one\nto two minutes on two idle cores, longer beside other "
+        "work or where its functions are not compiled yet.\n",
         flush=True,
     )
     begun = ["--resume"] if options.output.exists() else []
