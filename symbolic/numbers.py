@@ -308,7 +308,8 @@ def _workcell(take: _Take, cell: Workcell) -> NumberedWorkcell:
         facing=cell.has_facing_pads,
         opposite=cell.has_opposite_pads,
         beside=cell.has_pads_beside,
-        grasp=_grasp(take, HELD, "grasp", cell, None) if cell.has_searched_grasp else None,
+        # Also of two facing pads: their polish smooths the program of pads anywhere.
+        grasp=None if cell.has_closed_form else _grasp(take, HELD, "grasp", cell, None),
         squeezes=()
         if cell.has_one_squeeze
         else tuple(_grasp(take, name, name, cell, i) for i, name in enumerate(SQUEEZES)),

@@ -550,12 +550,6 @@ class Workcell:
         return self.has_closed_form or not self.has_facing_pads
 
     @property
-    def has_searched_grasp(self) -> bool:
-        """Whether the contact forces are those of the program of pads anywhere, which starts from
-        an internal squeeze."""
-        return self.has_force_slopes and not self.has_closed_form
-
-    @property
     def has_one_squeeze(self) -> bool:
         """Whether the force of one pad decides that of the other, so that a least squeeze says
         all."""
