@@ -69,6 +69,7 @@ def first_result(evaluations: int = QUICK_EVALUATIONS, seed: int = 1) -> Iterato
     from hybrid_opt.display.table import Table
     from hybrid_opt.polishing.settings import quick_settings
     from hybrid_opt.progress import Progress
+    from symbolic.array import evenly
 
     whole = ho.example("rack")
     build_study(whole, Progress())
@@ -84,9 +85,8 @@ def first_result(evaluations: int = QUICK_EVALUATIONS, seed: int = 1) -> Iterato
     front = ho.polish(front, rng=rng, settings=quick_settings(), progress=True)
     carries = sorted(front, key=lambda carry: carry.duration)
     carries = [carry for carry in carries if carry.duration < LONGEST * carries[0].duration]
-    chosen = np.unique(np.linspace(0, len(carries) - 1, SHOWN).round().astype(int))
     rows = []
-    for carry in (carries[k] for k in chosen):
+    for carry in (carries[k] for k in evenly(len(carries), SHOWN)):
         force = float(carry.peak_normal_force.max())
         same = ho.time_path(cell, cell.initial, ho.TimingLimits(force=force))
         hand = f"{same.duration:.2f}" if same.ok else "-"

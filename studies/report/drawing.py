@@ -20,7 +20,7 @@ from matplotlib.figure import Figure
 
 from hybrid_opt.display.scene import Solid, frame_placements
 from hybrid_opt.store.files import write_atomically
-from symbolic.array import Array, evenly
+from symbolic.array import Array
 from symbolic.geometry.bodies import Frame
 from symbolic.geometry.pairs import CellGeometry
 
@@ -120,11 +120,6 @@ def series(index: int) -> LineStyle:
 def shortened(name: str, length: int = 24) -> str:
     """A name of the workcell that leaves room for the rest of a label."""
     return name if len(name) <= length else f"{name[: length - 1]}\N{HORIZONTAL ELLIPSIS}"
-
-
-def spread(count: int, most: int) -> list[int]:
-    """At most `most` of `count` rows, both ends among them."""
-    return [int(row) for row in evenly(count, most)]
 
 
 def new_figure(width: float, height: float) -> Figure:

@@ -16,7 +16,7 @@ from hybrid_opt.campaign.stages import cells_of, ready_cells
 from hybrid_opt.display.scene import packed, scene_data
 from hybrid_opt.work.service import Executor, LocalExecutor, Service, answer_all
 from studies.report.data import Experiment, ReportData
-from studies.report.drawing import ARMS, HAND_MADE, MARKED, LineStyle, series, spread
+from studies.report.drawing import ARMS, HAND_MADE, MARKED, LineStyle, series
 from studies.report.drawn import DrawnCarry
 from studies.report.page_carries import (
     RECOMMENDED_LABEL,
@@ -24,7 +24,7 @@ from studies.report.page_carries import (
     PageTrajectory,
     page_trajectory,
 )
-from symbolic.array import Array
+from symbolic.array import Array, evenly
 from symbolic.path.pieces import same_paths
 from symbolic.read.cell_files import CellFiles, cell_to_json
 from symbolic.records import Workcell
@@ -87,7 +87,7 @@ def points(label: str, at: Array, members: Sequence[int], texts: Sequence[str], 
 
 def cloud(label: str, at: Array, look: LineStyle) -> Plot:
     """Feasible candidates (n, 2) in the background, thinned out."""
-    at = at[spread(len(at), MAX_CLOUD)]
+    at = at[evenly(len(at), MAX_CLOUD)]
     flat = [{"dtype": "f4", "bdata": packed(column, np.float32)} for column in at.T]
     style = {"color": look.colour, "symbol": SYMBOLS[look.marker], "size": 3, "opacity": 0.25}
     made = _scatter(f"{label}: feasible", at, mode="markers", hoverinfo="skip", marker=style)
@@ -352,7 +352,7 @@ def _drive_groups(data: ReportData, drivable: Experiment, cell: int) -> Iterator
     for carry, label, look, curve in curves(data):
         own, task = carry.timed.workcell.task, drivable.workcell.task
         source, path = _source(data, carry), same_paths(carry.x, own, task)[0, : task.n_path]
-        force = curve[spread(len(curve), CURVE_MEMBERS), 0]
+        force = curve[evenly(len(curve), CURVE_MEMBERS), 0]
         some = tuple(
             PageTrajectory(source, np.append(path, limit), source, cell)
             for limit in force
@@ -362,7 +362,7 @@ def _drive_groups(data: ReportData, drivable: Experiment, cell: int) -> Iterator
     for algorithm, front, opened in drivable.fronts():
         some = tuple(
             PageTrajectory(front.source, front.x[k], front.source, cell)
-            for k in spread(len(front), MAX_FRONT)
+            for k in evenly(len(front), MAX_FRONT)
         )
         yield Group(front.source, some, front.title, marker(series(algorithm.index), opened))
 
@@ -377,7 +377,7 @@ def _search_groups(data: ReportData) -> Iterator[Group]:
     yield Group("Hand-made and selected", tuple(picked))
     two = len(data.objectives) >= 2
     for algorithm, front, opened in data.fronts():
-        rows = spread(len(front), MAX_FRONT)
+        rows = evenly(len(front), MAX_FRONT)
         some = tuple(
             PageTrajectory(front.source, front.x[k], front.source, has_job=False) for k in rows
         )

@@ -66,7 +66,8 @@ static void add(double *restrict to, double by, const double *restrict what, int
 }
 
 /* The lower half of sums of weight * left^T right over rows (m, wide), to a matrix (k, wide), several
-   rows at a time: what is added to goes through memory once for all of them. No weights are -1. */
+   rows at a time: what is added to goes through memory once for all of them. Where `weight` is null,
+   each weight is -1. */
 static void add_products(double *to, const double *weight, const double *left, const double *right,
                          integer m, integer k, integer wide) {
   enum { TOGETHER = 8 };
