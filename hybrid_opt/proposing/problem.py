@@ -341,6 +341,7 @@ class Draft:
         waypoints: (n, 6 + m) extended poses, start and goal included.
         given: what was added to the problem's tables before, such as bases.
         bounds: of the decision vector, None where they are not known yet.
+        stand_off: of the pads [m]; None where the usual one is free, or none that was tried.
     """
 
     workcell: Workcell
@@ -349,6 +350,7 @@ class Draft:
     waypoints: Array
     given: dict[str, Any] = field(default_factory=dict)
     bounds: Bounds | None = None
+    stand_off: float | None = None
 
     @property
     def via(self) -> Array:
@@ -395,9 +397,10 @@ def changes(problem: Problem, found: Draft) -> dict[str, Any]:
                 "spin": round(float(np.remainder(spin + np.pi, 2 * np.pi) - np.pi), 9),
             }
         )
-    whole: dict[str, Any] = merged(
-        found.given, {"robots": robots, "contacts": contacts, "task": task}
-    )
+    chosen: dict[str, Any] = {"robots": robots, "contacts": contacts, "task": task}
+    if found.stand_off is not None:
+        chosen["handling"] = {"stand_off": found.stand_off}
+    whole: dict[str, Any] = merged(found.given, chosen)
     return whole
 
 

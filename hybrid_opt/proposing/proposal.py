@@ -76,6 +76,10 @@ PLANNING = 0.7
 SPINS = 12
 """Spins of a pad that are tried."""
 
+STAND_OFFS = (0.04, 0.03, 0.02, 0.01)
+"""Distances of the pads before and after a carry that are tried where the usual one is blocked [m].
+"""
+
 
 def worked() -> float:
     """Processor time of this process and those it waited for, so far [s]."""
@@ -166,6 +170,11 @@ class Proposal:
             f"spins {spins} deg, start branches {self.found.branches[0]} and "
             f"{self.found.branches[1]}; {100.0 * self.feasible_share:.1f} % of "
             f"{self.candidates} random candidates feasible; {self.seconds:.1f} s"
+            + (
+                f"; stand-off {1e3 * self.found.stand_off:.0f} mm"
+                if self.found.stand_off is not None
+                else ""
+            )
             + (f"; no whole job yet: {self.blocked}" if self.blocked else "")
         )
 
@@ -394,10 +403,10 @@ class _Search:
         outputs = last.evaluator.outputs(last.initial[None])
         self.known.add((id(pair), box.passed(path[:, :POSE_SIZE])))
         self.tell("the pads' way to the box")
-        blocked = "" if self.out_of_time else grasp_blocked(last)
+        blocked, stand_off = ("", None) if self.out_of_time else self._pads_way(last)
         yield Proposal(
             self.problem,
-            replace(moved, branches=last.branches),
+            replace(moved, branches=last.branches, stand_off=stand_off),
             judgement,
             bounds.share,
             bounds.candidates,
@@ -407,6 +416,17 @@ class _Search:
             box.passed(outputs["pose"][0]),
             blocked,
         )
+
+    def _pads_way(self, trial: Trial) -> tuple[str, float | None]:
+        """What blocks the pads before a trial's carry or after it, '' where nothing does, and the
+        stand-off that frees them where that of the cell does not and the file states none [m]."""
+        handling = trial.workcell.handling
+        blocked = grasp_blocked(trial, handling)
+        if blocked and "stand_off" not in self.problem.data.get("handling", {}):
+            for stand_off in STAND_OFFS:
+                if not grasp_blocked(trial, replace(handling, stand_off=stand_off)):
+                    return "", stand_off
+        return blocked, None
 
     def _workcell(self, found: Draft) -> Workcell:
         return self.problem.workcell(changes(self.problem, found))

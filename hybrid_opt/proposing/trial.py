@@ -34,7 +34,7 @@ from symbolic.geometry.bodies import MeshReader, shape_pieces
 from symbolic.geometry.clearance import screening_functions
 from symbolic.geometry.pairs import CellGeometry, coal_distance
 from symbolic.geometry.pieces import Piece, support
-from symbolic.records import PAYLOAD, Workcell
+from symbolic.records import PAYLOAD, Handling, Workcell
 from symbolic.records.poses import box_placement
 from symbolic.records.task import initial_decision
 from symbolic.robot.branches import StartBranch
@@ -433,10 +433,11 @@ class _InterpretedCell(CompiledCell):
         }
 
 
-def grasp_blocked(trial: Trial) -> str:
+def grasp_blocked(trial: Trial, handling: Handling) -> str:
     """What is in the way of the pads' approach before a trial's carry or of their retreat after
-    it, lift and set-down included; '' where nothing is, or where there are no jobs of such pads."""
-    cell = trial.workcell
+    it, lift and set-down included, in the place of the cell's own handling; '' where nothing is, or
+    where there are no jobs of such pads."""
+    cell = replace(trial.workcell, handling=handling)
     if not cell.has_facing_pads:
         return ""
     found = trial.evaluator.outputs(trial.initial[None])

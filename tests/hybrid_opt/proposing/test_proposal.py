@@ -139,6 +139,26 @@ def test_a_wrong_problem_is_told_with_its_key(tmp_path: Path) -> None:
     assert str(path) in str(told.value)
 
 
+@pytest.mark.parametrize(
+    ("stated", "written"),
+    [({}, 0.03), pytest.param({"stand_off": 0.05}, 0.05, marks=pytest.mark.slow)],
+)
+def test_pads_stand_off_less_where_something_is_behind_a_wrist_unless_the_file_says_how_far(
+    stated: dict[str, float], written: float, tmp_path: Path
+) -> None:
+    """A peg 35 mm behind the left wrist at the start."""
+    path = rack_problem(tmp_path, {"handling": stated})
+    peg = "\n[[environment]]\nname = 'peg'\nkind = 'box'\nsize = [0.02, 0.02, 0.02]\n"
+    text = path.read_text(encoding="utf-8") + peg + "xyz = [0.0, 0.663, 0.8]\n"
+    path.write_text(text, encoding="utf-8")
+    found = ho.propose(path, rng=np.random.default_rng(1))
+    assert bool(found.blocked) == bool(stated)
+    assert ("approach: left/link_5 meets peg" in str(found)) == bool(stated)
+    assert ("stand-off 30 mm" in str(found)) != bool(stated)
+    path.write_text(found.text(tmp_path), encoding="utf-8")
+    assert load(path).handling.stand_off == written
+
+
 @pytest.mark.slow
 def test_generated_cells_get_carries(tmp_path: Path) -> None:
     """Of twenty at least sixteen, each within a minute of one core."""

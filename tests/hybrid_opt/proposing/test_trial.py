@@ -190,11 +190,10 @@ def trial() -> Trial:
     ],
 )
 def test_what_blocks_is_what_refuses_the_job(
-    handling: dict[str, float], told: str, trial: Trial, monkeypatch: pytest.MonkeyPatch
+    handling: dict[str, float], told: str, trial: Trial
 ) -> None:
     chosen = Handling(**handling)
-    monkeypatch.setattr(trial, "workcell", replace(trial.workcell, handling=chosen))
-    found = grasp_blocked(trial)
+    found = grasp_blocked(trial, chosen)
     if not told:
         assert found == ""
         rack_jobs().plan(rack_timing(), handling=chosen)
@@ -211,4 +210,4 @@ def test_pads_that_have_no_jobs_are_not_looked_at(
     same = replace(trial.workcell, contacts=(first, first))
     assert not same.has_facing_pads
     monkeypatch.setattr(trial, "workcell", same)
-    assert grasp_blocked(trial) == ""
+    assert grasp_blocked(trial, same.handling) == ""
