@@ -252,14 +252,15 @@ GATE = """<mujoco><include file="workcell.xml"/><worldbody>
 </worldbody></mujoco>"""
 
 
-def test_the_slot_becomes_a_problem_within_both_limits(tmp_path: Path) -> None:
-    """MuJoCo says where the bodies are, Pinocchio that its own postures hold the plate's ends."""
+def test_the_slot_becomes_a_problem_within_their_limits(tmp_path: Path) -> None:
+    """MuJoCo says where the bodies are, Pinocchio that its own postures hold the plate's ends, and
+    that the joints' limits are a margin inside those of the same arm's description."""
     mujoco = pytest.importorskip("mujoco")
     scene = tmp_path / "slot" / "models" / "scene_slot_gate.xml"
     scene.parent.mkdir(parents=True)
     scene.write_text(GATE, encoding="utf-8")
     given = slot.benchmark(tmp_path)
-    assert [task.seconds for task in given.tasks] == [7.60, 8.96]
+    assert [task.seconds for task in given.tasks] == [7.60, 7.60, 8.96]
     model = mujoco.MjModel.from_xml_string(GATE.replace('<include file="workcell.xml"/>', ""))
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
@@ -270,10 +271,15 @@ def test_the_slot_becomes_a_problem_within_both_limits(tmp_path: Path) -> None:
         np.testing.assert_allclose(body["xyz"], data.geom_xpos[k])
         np.testing.assert_allclose(body["size"], 2.0 * model.geom_size[k])
     path = tmp_path / "problem.toml"
-    path.write_text(completed("", {}, given.tasks[1].problem), encoding="utf-8")
+    path.write_text(completed("", {}, given.tasks[2].problem), encoding="utf-8")
     cell = read_problem(path).workcell({})
     assert cell.payload.velocity_max == 0.08
     panda = pin.buildModelFromUrdf(str(cell.robots[0].urdf))
+    for robot in cell.robots:
+        np.testing.assert_allclose(robot.position_lower, panda.lowerPositionLimit[:7] + 0.1)
+        np.testing.assert_allclose(robot.position_upper, panda.upperPositionLimit[:7] - 0.1)
+        np.testing.assert_allclose(robot.velocity_max, panda.velocityLimit[:7])
+        np.testing.assert_allclose(robot.torque_max, panda.effortLimit[:7] - 0.5)
     for robot, contact, q in zip(cell.robots, cell.contacts, GRIPPING, strict=True):
         numbers = panda.createData()
         pin.framesForwardKinematics(panda, numbers, np.array([*q, 0.0, 0.0]))
