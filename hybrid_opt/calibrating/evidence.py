@@ -256,12 +256,10 @@ def _load(sound: Sound, evidence: Evidence) -> Load | None:
         payload["centre_of_mass"] = np.round(load.centre, 5).tolist()
         evidence.doubt("centre_of_mass", np.maximum(SURE * spread, LEAST_CENTRE))
     else:
-        unseen = " ".join(
-            axis for axis, seen in zip("xyz", load.sees_centre, strict=True) if not seen
-        )
+        unseen = [axis for axis, seen in zip("xyz", load.sees_centre, strict=True) if not seen]
         evidence.asks.append(
             f"holds tilted by 14 degrees, either way about both level axes, at three squeezes: the "
-            f"centre of mass along {unseen or 'x y z'} cannot be seen"
+            f"centre of mass cannot be seen along {', '.join(unseen or 'xyz')}"
         )
     if payload:
         evidence.tables["payload"] = payload

@@ -206,7 +206,8 @@ def read_run(path: Path, workcell: Workcell) -> Run:
     try:
         data = outside.toml_tables(outside.read_bytes(outside.resolved(side), 2**20))
     except OutsideError as error:
-        raise WorkcellError(str(side), (f"file: {error}",)) from error
+        told = f"a recording's side file: {error}; docs/calibration.md explains it"
+        raise WorkcellError(str(side), (told,)) from error
     problems = Problems()
     table = Table(data, "", problems)
     labels = _labels(table)
