@@ -1,28 +1,26 @@
 """How far the cell may be off at the commanded force, and what changes of it would change.
 
-The commanded force is in closed form: the worst case at the sample that asks for most. What a small
-change of the cell changes there is its derivative, by differences; what more or less force means in
-time is the path's own duration within other limits of the force.
+The commanded force is that of the worst case where the carry asks for most. What a small change of
+the cell changes there is its derivative, by differences; what more or less force means in time is
+the path's own duration within other limits of the force.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
-from codegen.interpreted import InterpretedFunction
-from codegen.source import dense
 from hybrid_opt.carry import Carry
 from hybrid_opt.cell import Cell
 from hybrid_opt.recommending.choice import LEADER, DrivenPaths, Option
-from hybrid_opt.robust.cases import least_friction, nominal_case, worst_cases
+from hybrid_opt.robust.cases import nominal_case
 from hybrid_opt.robust.force import HOLDS, BoxMotion, pressing_model, thinned
 from hybrid_opt.timing.records import Timing
 from hybrid_opt.timing.robustness import Margin
 from symbolic.array import Array
-from symbolic.contact.worst_cases import case_squeeze_function
 from symbolic.records import Contact, Workcell
 from symbolic.records.poses import box_rotation
 from symbolic.records.task import POSE_SIZE, components
@@ -40,6 +38,9 @@ PITCH = 4
 
 LIMITS = 1.0 + np.array([-0.02, 0.0, 0.02, 0.05, 0.1, 0.2, 0.4, 0.8])
 """Multiples of the force limit at which the path's duration is computed."""
+
+LOOKED_AT = 8
+"""Samples of largest commanded force at which small changes are judged."""
 
 LEAST_HEIGHT = 2e-3
 """Height of the pads over the centre of mass above which the advice mentions it [m]."""
@@ -127,75 +128,76 @@ def advice(cell: Cell, paths: DrivenPaths, option: Option, timing: Timing) -> tu
 
     found = [
         Advice(change, force, in_time(force))
-        for change, force in _of_cell(cell.workcell, timing.carry)
+        for change, force in changes_of_cell(cell.workcell, thinned(timing.carry)[1])
     ]
     found += _of_pitch(cell, paths.x[option.index], option, slope)
     return tuple(sorted(found, key=lambda each: each.force))
 
 
-def _of_cell(workcell: Workcell, carry: Carry) -> Iterator[tuple[str, float]]:
-    """Changes of the cell, and what each adds to the largest commanded force [N]."""
-    model, doubt = pressing_model(workcell), workcell.uncertainty
-    _, motion = thinned(carry)
-    cases = worst_cases(model.workcell, doubt, LEADER)
+def changes_of_cell(workcell: Workcell, motion: BoxMotion) -> Iterator[tuple[str, float]]:
+    """Changes of the cell, and what each adds to the largest force to command along a motion
+    [N]."""
+    doubt = workcell.uncertainty
 
-    def needed(cases: Array, motion: BoxMotion = motion) -> Array:
-        return model.least_squeeze(motion, cases, LEADER)[:, :, 1 - LEADER]
+    def needed(cell: Workcell, motion: BoxMotion) -> Array:
+        return pressing_model(cell).commanded(motion, doubt, LEADER)
 
-    least = needed(cases)
-    ruling, sample = np.unravel_index(int(least.argmax()), least.shape)
-    peak, case = float(least.max()), cases[[ruling]]
-    at = BoxMotion(*[getattr(motion, name)[[sample]] for name in vars(motion)])
-    changed = case.copy()
-    changed[:, 0:2] = least_friction(_with_friction(model.workcell, FRICTION), doubt)
-    yield f"friction {FRICTION:g} higher", float(needed(changed, at).max()) - peak
-    if not workcell.has_opposite_pads:
-        return
+    now = needed(workcell, motion)
+    at = motion.at(np.argsort(-now)[:LOOKED_AT])
     up, height = _height(workcell)
-    changed = case.copy()
-    changed[:, 11:15] -= MILLIMETRE * np.tile(up, 2)
-    yield "pads 1 mm lower", float(needed(changed, at).max()) - peak
+    changes: dict[str, Callable[[Contact], Contact]] = {
+        f"friction {FRICTION:g} higher": _with_friction,
+        "pads 1 mm lower": partial(_moved, by=-MILLIMETRE * up),
+        "patches 1 mm wider to each side": _wider,
+    }
+    for name, change in changes.items():
+        yield name, float(needed(_with_pads(workcell, change), at).max() - now.max())
     if abs(height) > LEAST_HEIGHT:
-        cases[:, 11:15] -= height * np.tile(up, 2)
+        level = _with_pads(workcell, partial(_moved, by=-height * up))
         side = "above" if height > 0.0 else "below"
         yield (
             f"pads at the height of the centre of mass, now {1e3 * abs(height):.0f} mm {side} it",
-            float(needed(cases).max()) - peak,
+            float(needed(level, motion).max() - now.max()),
         )
-    wider = InterpretedFunction(dense(case_squeeze_function(_with_wider(model.workcell))))
-    found = wider(*[getattr(at, name)[0] for name in vars(at)], case[0])["normal_force"]
-    yield "patches 1 mm wider to each side", float(found.ravel()[1 - LEADER]) - peak
 
 
 def _height(workcell: Workcell) -> tuple[Array, float]:
-    """(2,) the way up along the tangents of contact 1, as the box stands at its start, and how high
-    the pads are over the centre of mass that way [m]."""
+    """(3,) the way up in the box frame, as the box stands at its start, and how high the middle of
+    both robots' pads is over the centre of mass [m]."""
     pose = workcell.task.waypoints[0].lower
-    axes = workcell.contacts[0].T_box_pad[:3, :2]
-    up = (box_rotation(workcell.task.orientation, pose) @ axes)[2]
-    places = [contact.T_box_pad[:3, 3] for contact in workcell.contacts]
-    over = axes.T @ (np.mean(places, axis=0) - workcell.payload.centre_of_mass)
-    return up, float(over @ up)
+    up: Array = box_rotation(workcell.task.orientation, pose)[2]
+    middles = [
+        np.mean([pad.T_box_pad[:3, 3] for pad in (contact, *contact.further)], axis=0)
+        for contact in workcell.contacts
+    ]
+    return up, float((np.mean(middles, axis=0) - workcell.payload.centre_of_mass) @ up)
 
 
-def _with_friction(workcell: Workcell, more: float) -> Workcell:
+def _with_pads(workcell: Workcell, change: Callable[[Contact], Contact]) -> Workcell:
+    """The cell with every pad changed."""
     first, second = (
-        replace(contact, friction=contact.friction + more) for contact in workcell.contacts
+        replace(change(contact), further=tuple(change(pad) for pad in contact.further))
+        for contact in workcell.contacts
     )
     return replace(workcell, contacts=(first, second))
 
 
-def _with_wider(workcell: Workcell) -> Workcell:
-    def wider(contact: Contact) -> Contact:
-        sides = contact.half_sides
-        return replace(
-            contact,
-            patch_radius=contact.patch_radius + MILLIMETRE,
-            half_sides=None if sides is None else (sides[0] + MILLIMETRE, sides[1] + MILLIMETRE),
-        )
+def _with_friction(pad: Contact) -> Contact:
+    return replace(pad, friction=pad.friction + FRICTION)
 
-    first, second = (wider(contact) for contact in workcell.contacts)
-    return replace(workcell, contacts=(first, second))
+
+def _moved(pad: Contact, by: Array) -> Contact:
+    """Moved by (3,) in the box frame [m], as far as that leads along its face."""
+    T, normal = pad.T_box_pad.copy(), pad.T_box_pad[:3, 2]
+    T[:3, 3] += by - (by @ normal) * normal
+    return replace(pad, T_box_pad=T)
+
+
+def _wider(pad: Contact) -> Contact:
+    if pad.half_sides is None:
+        return replace(pad, patch_radius=pad.patch_radius + MILLIMETRE)
+    x, y = (side + MILLIMETRE for side in pad.half_sides)
+    return replace(pad, patch_radius=float(np.hypot(x, y)), half_sides=(x, y))
 
 
 def _of_pitch(cell: Cell, path: Array, option: Option, slope: float) -> Iterator[Advice]:

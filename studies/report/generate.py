@@ -25,6 +25,7 @@ from PIL import Image
 
 from hybrid_opt.display.scene import embedded_json, plotly_js, scene_js, three_js
 from hybrid_opt.display.table import Table, counted, number
+from hybrid_opt.robust.squeeze import PADS
 from hybrid_opt.store.files import write_atomically
 from hybrid_opt.store.json_records import to_json
 from hybrid_opt.timing.analysis import TimingDocument, stored_timing
@@ -264,10 +265,19 @@ def _facts(data: ReportData) -> str:
         limit = algorithm.best.sensitivity.payload_limit
         facts.append((f"{limit:.2f} kg", f"payload at the limit, {algorithm.title}"))
     facts.append((f"{number(still.payload_limit)} kg", "payload at the limit, at rest"))
-    return "".join(
+    listed = "".join(
         f"<li><b>{html.escape(value)}</b><span>{html.escape(text)}</span></li>"
         for value, text in facts
     )
+    return f'<ul class="facts">{listed}</ul><p>{html.escape(_assumed(data))}</p>'
+
+
+def _assumed(data: ReportData) -> str:
+    """Which pads the forces of both experiments are of."""
+    said = f"The forces of this experiment are of {PADS[data.workcell.task.allocation]}."
+    if data.drivable is None:
+        return said
+    return f"{said} What robots drive is of {PADS[data.drivable.workcell.task.allocation]}."
 
 
 def _picture(path: Path, caption: str) -> str:

@@ -168,6 +168,9 @@ def test_the_manifest_says_what_it_is(tmp_path: Path) -> None:
     assert squeeze["factor"] is None
     assert squeeze["force"] == pytest.approx(squeeze["peak_normal_force"][1], rel=1e-9)
     assert sum(squeeze["parts"].values()) == pytest.approx(squeeze["force"], rel=1e-9)
+    # The rack's own experiment is the paper's.
+    assert rack_job().workcell.task.allocation == "paper"
+    assert squeeze["assumes"].endswith("by moments commanded at both wrists")
     assert document["units"]["force"] == "N"
     assert document["how_to_run"]
     assert any("tool_load" in warning for warning in document["warnings"])

@@ -281,6 +281,8 @@ def test_the_page_begins_with_the_recommended_carry(
     for _, sentence in words.facts:
         assert html.escape(sentence) in text
     assert html.escape(words.headline) in text
+    assert "The forces of this experiment are of pads that choose their pressure, by" in text
+    assert "What robots drive is of pads that press evenly, on arms that keep" in text
 
 
 def test_tables_of_carries_have_the_recommended_one(data: ReportData) -> None:
