@@ -5,6 +5,7 @@ That is the squeeze to start from, and how wrenches balance a load.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -33,18 +34,41 @@ MOMENT_ARM = 0.1
 """Lever of moments in the load's scale [m]: about half a payload, so they count like forces."""
 
 
+LEAST_NEW = 0.1
+"""Share of a component's effect that no earlier one has, for it to be one that is left."""
+
+
 def left_components(workcell: Workcell) -> tuple[int, ...]:
     """Components of the scaled wrenches that are what the others leave: all of the last pad's, or
-    of pads that press evenly those that the load reaches best, by a QR decomposition with pivots.
+    of pads that press evenly the first ones that reach every load, forces before moments.
+
+    The choice is structure: it knows neither friction nor sizes, and slightly other places of pads
+    do not change it, as they would change pivots that are nearly alike.
     """
     if not presses_evenly(workcell):
         n = WRENCH_SIZE * len(workcell.pads)
         return tuple(range(n - WRENCH_SIZE, n))
-    # Not imported at the top: a warm start makes no grasp.
-    from scipy.linalg import qr
+    effects = np.hstack(balance_maps(workcell, in_units=True)).astype(float)
+    effects[3:LOAD_SIZE] /= MOMENT_ARM
+    effects /= np.linalg.norm(effects, axis=0)
+    moments = np.arange(effects.shape[1]) % len(EVEN) == len(EVEN) - 1
+    order, least = np.argsort(moments, kind="stable").tolist(), LEAST_NEW
+    while len(taken := _new_columns(effects, order, least)) < len(effects) and least > 1e-9:
+        least *= 0.1
+    return tuple(sorted(taken))
 
-    whole = np.hstack(balance_maps(workcell))
-    return tuple(np.sort(qr(whole, pivoting=True)[2][: len(whole)]).tolist())
+
+def _new_columns(matrix: Array, order: Sequence[int], least: float) -> list[int]:
+    """Columns, in an order, of which more than a length is outside the span of those before."""
+    taken: list[int] = []
+    span = np.zeros((len(matrix), 0))
+    for k in order:
+        beyond = matrix[:, k] - span @ (span.T @ matrix[:, k])
+        length = np.linalg.norm(beyond)
+        if length > least and len(taken) < len(matrix):
+            taken.append(k)
+            span = np.column_stack([span, beyond / length])
+    return taken
 
 
 def derived(workcell: Workcell, reach: float = 1.0) -> GraspNumbers:
