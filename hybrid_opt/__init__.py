@@ -38,6 +38,9 @@ if TYPE_CHECKING:
     from hybrid_opt.door import time_every_way as time_every_way
     from hybrid_opt.door import time_path as time_path
     from hybrid_opt.door import time_with_jerk as time_with_jerk
+    from hybrid_opt.errors import JobError as JobError
+    from hybrid_opt.errors import ProposalError as ProposalError
+    from hybrid_opt.errors import ResultsError as ResultsError
     from hybrid_opt.evaluate.objectives import Objective as Objective
     from hybrid_opt.front import Front as Front
     from hybrid_opt.gripping import Grip as Grip
@@ -67,6 +70,8 @@ if TYPE_CHECKING:
     from hybrid_opt.timing.records import TimingLimits as TimingLimits
     from hybrid_opt.workbench.browser import live as live
     from symbolic.errors import DualArmError as DualArmError
+    from symbolic.errors import SettingsError as SettingsError
+    from symbolic.errors import WorkcellError as WorkcellError
     from symbolic.records import Workcell as Workcell
 
 _HOMES = {

@@ -299,6 +299,11 @@ def carry_under_time_law(
     )
 
 
+def decision_of(carry: Carry | Array) -> Array:
+    """(n_var,) decision vector of a carry, or the vector itself."""
+    return carry.x if isinstance(carry, Carry) else carry
+
+
 def _arm(
     workcell: Workcell,
     inverse_dynamics: NumericFunction,

@@ -9,12 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from hybrid_opt.carry import Carry
+from hybrid_opt.carry import Carry, decision_of
 from hybrid_opt.cell import Cell
 from hybrid_opt.front import Front
 from hybrid_opt.metaheuristics.run import SearchSettings, search_carries
-from hybrid_opt.polishing.polisher import Polisher
-from hybrid_opt.polishing.settings import PolishSettings, usual_settings
+from hybrid_opt.polishing.settings import PolishSettings
 from hybrid_opt.progress import ShowProgress, counted
 from hybrid_opt.store.trajectory_file import write_trajectory
 from hybrid_opt.timing.analysis import TimedTrajectory, timed_trajectory
@@ -81,25 +80,7 @@ def polish(
     Raises:
         SettingsError: the cell's objectives are not those of the polish, or a path does not fit.
     """
-    cell, task = front.cell, front.cell.workcell.task
-    settings = settings or usual_settings(task.time_law)
-    polisher = Polisher(cell.evaluator, settings, cell.polish_functions)
-    known = [np.asarray(_decision(path), dtype=float) for path in paths]
-    if known and task.time_law != "optimal":
-        raise SettingsError(
-            f"known paths take part in polishes of drivable carries only; the time law is "
-            f"'{task.time_law}': polish the front of Cell.drivable()"
-        )
-    for path in known:
-        if path.shape not in ((task.n_path,), (task.n_var,)) or not np.isfinite(path).all():
-            raise SettingsError(
-                f"a known path of shape {path.shape}; needs {task.n_path} finite numbers, or "
-                f"{task.n_var} with a force limit"
-            )
-    beside = np.array([path[: task.n_path] for path in known]).reshape(-1, task.n_path)
-    with counted(progress, "polish", settings.attempts) as advance:
-        done = polisher.polish(front.x, rng, emit=lambda outcome: advance(1), paths=beside)
-    return front.after(done)
+    return front.polish(rng=rng, settings=settings, paths=paths, progress=progress)
 
 
 def time_path(cell: Cell, carry: Carry | Array, limits: TimingLimits | None = None) -> Timing:
@@ -113,7 +94,7 @@ def time_path(cell: Cell, carry: Carry | Array, limits: TimingLimits | None = No
     Raises:
         SettingsError: the carry does not fit the cell.
     """
-    return solve_timing(cell.timing_model, _decision(carry), limits)
+    return solve_timing(cell.timing_model, decision_of(carry), limits)
 
 
 def time_with_jerk(
@@ -136,7 +117,7 @@ def time_with_jerk(
         raise SettingsError(
             "the workcell limits no jerk: give ho.JerkLimits, or state jerk_max of its robots"
         )
-    return solve_with_jerk(cell.timing_model, _decision(carry), limits or TimingLimits(), jerk)
+    return solve_with_jerk(cell.timing_model, decision_of(carry), limits or TimingLimits(), jerk)
 
 
 def time_every_way(
@@ -152,7 +133,7 @@ def time_every_way(
         force_limit: normal force [N] of a force-limited timing, None for no such timing.
         curve_points: points of the curve of duration against force limit, None for no curve.
     """
-    return timed_trajectory(cell.timing_model, _decision(carry), force_limit, curve_points)
+    return timed_trajectory(cell.timing_model, decision_of(carry), force_limit, curve_points)
 
 
 def save(carry: Carry, path: str | Path, provenance: Mapping[str, Any] | None = None) -> None:
@@ -166,7 +147,3 @@ def save(carry: Carry, path: str | Path, provenance: Mapping[str, Any] | None = 
         ResultsError: the workcell was changed after reading, or the file cannot be written.
     """
     write_trajectory(path, carry.workcell, carry.x, carry.figures, provenance or {})
-
-
-def _decision(carry: Carry | Array) -> Array:
-    return carry.x if isinstance(carry, Carry) else carry

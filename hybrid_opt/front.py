@@ -9,17 +9,19 @@ fronts reach down to forces at which a carry hardly moves; their knee is selecte
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_opt.carry import Carry
+from hybrid_opt.carry import Carry, decision_of
 from hybrid_opt.cell import Cell
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator, Evaluations
 from hybrid_opt.indicators import metrics
 from hybrid_opt.polishing.records import PolishedFront
+from hybrid_opt.polishing.settings import PolishSettings, usual_settings
+from hybrid_opt.progress import ShowProgress, counted
 from hybrid_opt.shown import Displayable
 from symbolic.array import Array, set_read_only
 from symbolic.errors import SettingsError
@@ -77,6 +79,38 @@ class Front(Displayable):
     def after(self, polish: PolishedFront) -> Front:
         """What a polish made of it."""
         return replace(self, x=polish.x, objectives=polish.objectives, polished=polish)
+
+    def polish(
+        self,
+        *,
+        rng: np.random.Generator,
+        settings: PolishSettings | None = None,
+        paths: Sequence[Carry | Array] = (),
+        progress: ShowProgress = False,
+    ) -> Front:
+        """Improve it, see `hybrid_opt.polish`."""
+        # Not imported at the top: solvers take long to load.
+        from hybrid_opt.polishing.polisher import Polisher
+
+        cell, task = self.cell, self.cell.workcell.task
+        settings = settings or usual_settings(task.time_law)
+        polisher = Polisher(cell.evaluator, settings, cell.polish_functions)
+        known = [np.asarray(decision_of(path), dtype=float) for path in paths]
+        if known and task.time_law != "optimal":
+            raise SettingsError(
+                f"known paths take part in polishes of drivable carries only; the time law is "
+                f"'{task.time_law}': polish the front of Cell.drivable()"
+            )
+        for path in known:
+            if path.shape not in ((task.n_path,), (task.n_var,)) or not np.isfinite(path).all():
+                raise SettingsError(
+                    f"a known path of shape {path.shape}; needs {task.n_path} finite numbers, or "
+                    f"{task.n_var} with a force limit"
+                )
+        beside = np.array([path[: task.n_path] for path in known]).reshape(-1, task.n_path)
+        with counted(progress, "polish", settings.attempts) as advance:
+            done = polisher.polish(self.x, rng, emit=lambda outcome: advance(1), paths=beside)
+        return self.after(done)
 
     @property
     def title(self) -> str:

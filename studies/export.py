@@ -80,6 +80,13 @@ def _add_options(parser: Parser) -> None:
         "(default: what the target leaves to chance, 0 where one clock drives both arms)",
     )
     parser.add_argument(
+        "--address",
+        nargs=2,
+        metavar=("HOST", "HOST"),
+        help="host names or IP addresses of both controllers, in the order of the robots (default: "
+        "those of the workcell)",
+    )
+    parser.add_argument(
         "--any-arm",
         action="store_true",
         help="also write a maker's own language for arms of others",

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 from xml.etree import ElementTree
 
 import numpy as np
@@ -24,6 +25,7 @@ from symbolic.read.arms import (
     robot_urdf,
     turning_joints,
 )
+from symbolic.read.robots import ADDRESS
 from symbolic.read.urdf import Urdf, UrdfMesh
 from symbolic.records import Body, Box, Capsule, Cylinder, Mesh, Robot, Shape, Sphere, Workcell
 from symbolic.records.poses import pose_matrix, rpy_from_rotation
@@ -101,8 +103,23 @@ def require_address(workcell: Workcell, target: str) -> None:
         if not robot.driver.address:
             raise SettingsError(
                 f"{target} has to know where the controller of {robot.name!r} is: write "
-                '[robots.driver] with address = "..." into its section of the workcell'
+                '[robots.driver] with address = "..." into its section of the workcell, or export '
+                "with --address HOST HOST, in the order of the robots"
             )
+
+
+def addressed(workcell: Workcell, addresses: tuple[str, str]) -> Workcell:
+    """The cell with both controllers at these host names or IP addresses.
+
+    Raises:
+        SettingsError: one is neither.
+    """
+    for address in addresses:
+        if not ADDRESS.fullmatch(address):
+            raise SettingsError(f"address {address!r} is no host name or IP address")
+    robots = zip(workcell.robots, addresses, strict=True)
+    first, second = (replace(r, driver=replace(r.driver, address=at)) for r, at in robots)
+    return replace(workcell, robots=(first, second))
 
 
 def described(robot: Robot) -> str:

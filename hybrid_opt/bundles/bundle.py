@@ -11,7 +11,7 @@ import os
 import shutil
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ from hybrid_opt.bundles.arms import (
     SEVEN,
     SIX,
     UR,
+    addressed,
     require_address,
     require_axes,
     require_maker,
@@ -495,6 +496,8 @@ def export(
     options, origin = options or BundleOptions(), origin or Origin()
     found = TARGETS[target]
     whole = job if isinstance(job, Job) else plan_job(job)
+    if options.addresses is not None:
+        whole = replace(whole, workcell=addressed(whole.workcell, options.addresses))
     found.refuse(whole, target, options.any_arm)
     skew = found.skew if options.skew is None else options.skew
     if skew is not None:

@@ -332,12 +332,15 @@ class BundleOptions:
             [N/m].
         skew: between the starts of both arms that the job has to survive [s]; None for what the
             target leaves to chance.
+        addresses: host names or IP addresses of both controllers, in place of those of the
+            workcell; None for those.
     """
 
     step: float | None = None
     any_arm: bool = False
     stiffness: float = 1e4
     skew: float | None = None
+    addresses: tuple[str, str] | None = None
 
     def __post_init__(self) -> None:
         require_stiffness(self.stiffness)

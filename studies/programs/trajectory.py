@@ -109,7 +109,8 @@ def export_file(options: argparse.Namespace) -> int:
     """Write the bundle of a trajectory file and print its job; returns the exit code."""
     path = Path(options.file)
     stored = read_trajectory(path)
-    bundle = BundleOptions(options.step, options.any_arm, options.stiffness, options.skew)
+    hosts = None if options.address is None else (options.address[0], options.address[1])
+    bundle = BundleOptions(options.step, options.any_arm, options.stiffness, options.skew, hosts)
     squeeze = SqueezeSettings(options.squeeze, options.leader - 1)
     with TemporaryDirectory() as folder:
         job = _planned(stored, Path(folder), options, squeeze)
@@ -211,7 +212,7 @@ def _priced(model: RobustModel, carry: Carry, options: argparse.Namespace) -> in
     check, largest = price.check, price.largest_factor
     most = f"at least {LARGEST_FACTOR:g}" if largest == LARGEST_FACTOR else f"{largest:.3f}"
     print(f"  peak forces of the carry that hold in all cases: {_both(price.commanded)} N")
-    print(f"  the reference forces {_both(price.limit)} N allow {most} times the set")
+    print(f"  the reference forces {_both(price.limit)} N hold {most} times the set")
     rows = [("times the set", "peak force 1 [N]", "peak force 2 [N]")]
     rows += [
         (number(factor, 2), number(peak[0], 2), number(peak[1], 2))

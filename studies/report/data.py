@@ -335,10 +335,6 @@ def _reach(geometry: CellGeometry, _: Sequence[ReadyCell]) -> ReachMap:
     return reach_map(geometry, np.random.default_rng(REACH_SEED))
 
 
-def _job(label: str, x: Array, limits: TimingLimits, cells: Sequence[ReadyCell]) -> DrawnJob:
-    return drawn_job(cells[-1].jobs, label, x, limits)
-
-
 def _recommended_job(x: Array, cells: Sequence[ReadyCell]) -> DrawnJob:
     return recommended_job(cells[-1].jobs, x)
 
@@ -351,4 +347,4 @@ def _job_requests(
         yield partial(_recommended_job, recommended)
     limits = TimingLimits(reference_speed=True)
     for carry in carries:
-        yield partial(_job, carry.label, carry.x, limits)
+        yield partial(drawn_job, carry.label, carry.x, limits)

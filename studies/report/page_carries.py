@@ -16,6 +16,7 @@ from hybrid_opt.campaign.stages import ReadyCell
 from hybrid_opt.display.scene import packed
 from hybrid_opt.display.table import NOTHING, Table, number
 from hybrid_opt.evaluate.objectives import PAPER_OBJECTIVES
+from hybrid_opt.job.motions import TICK
 from hybrid_opt.job.plan import JobModel
 from hybrid_opt.job.records import Job, Phase
 from hybrid_opt.job.smooth import driven_timing
@@ -85,11 +86,14 @@ def recommended_job(model: JobModel, x: Array) -> DrawnJob:
     return replace(job, timing=timing, margins=robustness_margins(model.timing, timing.carry))
 
 
-def drawn_job(model: JobModel, label: str, x: Array, limits: TimingLimits) -> DrawnJob:
-    """The job around a path x (n_var,) timed within limits, with the forces that an export commands
-    by default, within the cell's limits on jerk, which takes long."""
+def drawn_job(label: str, x: Array, limits: TimingLimits, cells: Sequence[ReadyCell]) -> DrawnJob:
+    """The job around a path of the first cell, x (n_var,), in the last one: timed within limits,
+    with the forces that an export commands by default, within the cell's limits on jerk, which
+    takes long."""
+    model = cells[-1].jobs
+    (path,) = same_paths(x, cells[0].cell.workcell.task, model.workcell.task)
     try:
-        timing = time_path(model.timing, x, limits)
+        timing = time_path(model.timing, path, limits)
     except DualArmError as error:
         return DrawnJob(label, str(error))
     return drawn(model, label, timing, within_jerk=True)
@@ -212,7 +216,8 @@ def phases(jobs: Sequence[DrawnJob], robots: Sequence[str]) -> Table:
         tuple(rows),
         "Largest commanded normal forces, and largest uses of the limits with them. The "
         "recommended carry within its force, the others closest to the reference speed, as an "
-        "export plans them by default; every phase is certified free of collisions.",
+        "export plans them by default; every phase is certified free of collisions. A carry ends "
+        f"with rest until a cycle of {1e3 * TICK:g} ms is over.",
     )
 
 

@@ -81,7 +81,7 @@ def points(label: str, at: Array, members: Sequence[int], texts: Sequence[str], 
         customdata=list(members),
         text=[plain(text) for text in texts],
         hovertemplate="%{text}<extra></extra>",
-        marker={**look, "line": {"color": "#000", "width": 0.7}},
+        marker={**look, "line": {"color": "#000", "width": 1.2}},
     )
 
 
@@ -89,7 +89,7 @@ def cloud(label: str, at: Array, look: LineStyle) -> Plot:
     """Feasible candidates (n, 2) in the background, thinned out."""
     at = at[evenly(len(at), MAX_CLOUD)]
     flat = [{"dtype": "f4", "bdata": packed(column, np.float32)} for column in at.T]
-    style = {"color": look.colour, "symbol": SYMBOLS[look.marker], "size": 3, "opacity": 0.25}
+    style = {"color": look.colour, "symbol": SYMBOLS[look.marker], "size": 3, "opacity": 0.4}
     made = _scatter(f"{label}: feasible", at, mode="markers", hoverinfo="skip", marker=style)
     return made | {"x": flat[0], "y": flat[1]}
 
@@ -132,7 +132,7 @@ def front_plot(name: str, titles: tuple[str, str], traces: list[Plot], first: Ar
             "margin": {"l": 70, "r": 15, "t": 20},
             "xaxis": {"title": {"text": x_title, "standoff": 8}},
             "yaxis": {"title": {"text": y_title}},
-            "legend": _legend("bottom", 0.01, 11),
+            "legend": _legend("bottom", 0.01, 11) | {"itemsizing": "constant"},
         },
         "first": limits(first),
         "whole": limits(np.concatenate([*whole, np.zeros((0, 2))])),

@@ -43,8 +43,8 @@ def _of(name: str, draw: Callable[..., Figure], *given: Any, caption: str = "") 
 
 def report_pictures(data: ReportData) -> Iterator[ReportPicture]:
     """All pictures that the data allows, in the paper's order, then those beyond the paper."""
-    cell, reach = (data.geometry, data.reach, data.initial), "its collision shapes, and the reach"
-    arm = f"The arm {data.workcell.robots[0].name} as {reach} of its pad (paper Figure 6)."
+    cell, arm = (data.geometry, data.reach, data.initial), data.workcell.robots[0].name
+    arm = f"Collision shapes of the arm {arm!r}, and the reach of its pad (paper Figure 6)."
     yield _of("fig04_reachable_regions", pictures_cell.reachable_regions, *cell)
     yield _of("fig05_cell", pictures_cell.environment, data.geometry, data.initial)
     yield _of("fig06_arm", pictures_cell.arm_and_reach, *cell, caption=arm)
@@ -59,20 +59,22 @@ def report_pictures(data: ReportData) -> Iterator[ReportPicture]:
     yield _of("fig13_paths", pictures_cell.paths, data.geometry, pictures_carry.styled(data))
     paper = " (paper Figures 14 and 15)"
     drawn = [
-        (a.name, a.best, f"selected from {a.best.label}", paper)
+        (a.name, a.best, f"The trajectory selected from {a.best.label},", paper)
         for a in data.algorithms
         if a.best is not None
     ]
     if (driven := data.recommended_carry) is not None:
-        drawn.append((driven.label, driven, "recommended", ""))
+        drawn.append((driven.label, driven, "The recommended carry", ""))
     for name, carry, whose, source in drawn:
-        text = f"The trajectory {whose} at 0, 33, 66 and 100 % of its duration{source}."
+        text = f"{whose} at 0, 33, 66 and 100 % of its duration{source}."
         sequence = pictures_cell.motion_sequence
         yield _of(f"motion_{name}", sequence, data.geometry, carry, caption=text)
     if any(timed.force_curve is not None for _, timed in data.timings):
         text = (
             f"Drivable durations against the {data.force_kind.title}: single paths timed anew at "
-            "every limit, and the members of the drivable fronts. All other limits hold throughout."
+            "every limit, and the members of the drivable fronts, whose lines are the fastest path "
+            "at every force (median and range of the replicas). All other limits hold throughout, "
+            "those on jerk only for the star."
         )
         draw_curves = pictures_fronts.duration_against_force
         yield _of("duration_against_force", draw_curves, data, caption=text)
@@ -82,7 +84,7 @@ def report_pictures(data: ReportData) -> Iterator[ReportPicture]:
         whose = "the workcell's [uncertainty]" if found.stated else "the usual uncertainty"
         text = (
             "The price of robustness: largest normal forces of the recommended carry that hold in "
-            f"every case of {whose} ({found}), times a factor."
+            f"every case of a multiple of {whose} ({found})."
         )
         yield _of("robust_price", pictures_carry.robust_price, data, choice.price, caption=text)
     if any(len(found.time) for found in data.simulations):

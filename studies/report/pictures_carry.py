@@ -211,20 +211,21 @@ def residual_moments(data: ReportData) -> Figure:
 
 
 def robust_price(data: ReportData, price: RobustPrice) -> Figure:
-    """Peak normal forces of the recommended carry against the factor of the set."""
-    figure = new_figure(0.62 * FULL_WIDTH, 0.42 * FULL_WIDTH)
+    """Peak normal forces of the recommended carry against the multiple of the uncertainty."""
+    figure = new_figure(FULL_WIDTH, 0.5 * FULL_WIDTH)
     axes = figure.subplots()
     for i, robot in enumerate(data.workcell.robots):
         look = series(i)
         label = shortened(robot.name)
         axes.plot(price.factors, price.peak[:, i], **look.drawn, marker=look.marker, label=label)
-    axes.axvline(1.0, color="black", linewidth=0.8, linestyle=(0, (2, 2)), label="the set")
+    stated = "stated uncertainty" if price.uncertainty.stated else "usual uncertainty"
+    axes.axvline(1.0, color="black", linewidth=0.8, linestyle=(0, (2, 2)), label=stated)
     if float(price.limit.min()) <= 1.25 * float(price.peak.max()):
         limit_line(axes, float(price.limit.min()), "reference force")
         if 0.0 < price.largest_factor < np.inf:
-            label = f"largest set: {price.largest_factor:.2f}"
+            label = f"largest multiple within it: {price.largest_factor:.2f}"
             axes.axvline(price.largest_factor, color=MARKED, linewidth=0.8, label=label)
-    axes.set_xlabel("multiple of the set [-]")
+    axes.set_xlabel("multiple of the uncertainty [-]")
     axes.set_ylabel("peak normal force [N]")
     axes.legend(loc="upper left")
     return figure

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.path import Path
 from matplotlib.ticker import MaxNLocator
 
 from hybrid_opt.display.table import counted
@@ -25,9 +26,11 @@ from studies.report.drawing import (
     panel_label,
     rest_line,
     series,
+    shortened,
 )
 from studies.report.page_data import curves, drive_look, limits
 from studies.study.recommendation import StoredRecommendation
+from studies.study.tables import constraint_title
 from symbolic.array import Array
 
 QUARTILES = (25.0, 75.0)
@@ -208,12 +211,22 @@ def duration_against_force(data: ReportData) -> Figure:
     rest_line(axes, data.level_force, "at rest", across=False)
     if any(len(found) for found in drawn):
         x_limits, y_limits = limits(drive_look(np.concatenate(drawn), always))
-        axes.set_xlim(*x_limits)
+        at_rest = data.level_force - 0.02 * (x_limits[1] - x_limits[0])
+        axes.set_xlim(min(at_rest, x_limits[0]), x_limits[1])
         axes.set_ylim(*y_limits)
     axes.set_xlabel(f"{data.force_kind.title} [N]")
     axes.set_ylabel("duration [s]")
-    axes.legend(loc="upper right")
+    _forget_unseen(axes)
+    legend_below(figure, axes, 4)
     return figure
+
+
+def _forget_unseen(axes: Axes) -> None:
+    """Take what lies outside the axes' limits out of their legend."""
+    for line in axes.lines:
+        at = line.get_transform().transform(np.column_stack(line.get_data()))
+        if not Path(at[np.isfinite(at).all(axis=1)]).intersects_bbox(axes.bbox, filled=False):
+            line.set_label("_")
 
 
 def _replicas(axes: Axes, drivable: Experiment, choice: StoredRecommendation) -> list[Array]:
@@ -319,7 +332,8 @@ def infeasibility(data: ReportData) -> Figure:
             label=algorithm.title,
             weights=np.full((reason != FEASIBLE).sum(), 100.0 / len(reason)),
         )
-    names = ["feasible", *(REASONS[k].replace("_", " ") for k in present)]
+    robots = data.summary.robots
+    names = ["feasible", *(shortened(constraint_title(REASONS[k], robots)) for k in present)]
     left.set_yticks(np.arange(len(names)), names)
     left.invert_yaxis()
     left.grid(visible=False, axis="y")

@@ -454,8 +454,8 @@ def _robust(price: RobustPrice) -> str:
     slips = "slips" if price.check.failing == 1 else "slip"
     return (
         f"in every case of {named} ({price.uncertainty}), of which the leading arm feels up to "
-        f"{max(price.commanded):.1f} N; the reference forces allow {price.largest_factor:.2f} "
-        f"times the set; {price.check.failing or 'none'} of {price.check.cases} random cases "
+        f"{max(price.commanded):.1f} N; the reference forces would hold {price.largest_factor:.2f} "
+        f"times as much; {price.check.failing or 'none'} of {price.check.cases} random cases "
         f"{slips}"
     )
 

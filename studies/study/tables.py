@@ -274,13 +274,21 @@ def infeasible(summary: CampaignSummary) -> Table:
         ("constraint", *(f"{title(name)} [%]" for name in summary.algorithms)),
         tuple(
             (
-                reason.replace("_", " "),
+                constraint_title(reason, summary.robots),
                 *(share(shares[reason].get(name, 0.0)) for name in summary.algorithms),
             )
             for reason in ranked
         ),
         "The constraint violated first along the path, in percent of all candidates.",
     )
+
+
+def constraint_title(name: str, robots: Sequence[str]) -> str:
+    """A constraint's name as people read it, with the arm's name for its number."""
+    words = name.split("_")
+    if words[-1].isdigit():
+        return f"{' '.join(words[:-1])}, {robots[int(words[-1]) - 1]}"
+    return " ".join(words)
 
 
 def bounds(search: Bounds, drivable: Bounds | None = None) -> Table:
@@ -358,14 +366,14 @@ def robust_price(price: RobustPrice, robots: Sequence[str]) -> Table:
     return Table(
         "robust_price",
         "The price of robustness of the recommended carry.",
-        ("times the set", *(f"peak, {robot} [N]" for robot in robots)),
+        ("multiple of the uncertainty", *(f"peak, {robot} [N]" for robot in robots)),
         tuple(
             (number(factor), *map(FORCE, peak))
             for factor, peak in zip(price.factors, price.peak, strict=True)
         ),
-        f"The set{of}: {price.uncertainty}. The first robot "
+        f"The uncertainty{of}: {price.uncertainty}. The first robot "
         "leads, the force of the second is commanded. The reference forces allow "
-        f"{number(price.largest_factor)} times the set. Of {check.cases} random cases of the set "
+        f"{number(price.largest_factor)} times as much. Of {check.cases} random cases "
         f"{check.failing} slip under its forces; the hardest needs {check.hardest} of them.",
     )
 

@@ -263,6 +263,12 @@ def test_a_driver_has_to_have_an_address(tmp_path: Path) -> None:
     job = driven(rack_job(), replace(DRIVER, address=""))
     with pytest.raises(SettingsError, match=r"ur-ros2 has to know where .* address"):
         export(job, "ur-ros2", tmp_path, options=BundleOptions(any_arm=True))
+    hosts = ("10.0.0.1", "arm-2.local")
+    paths = export(job, "ur-ros2", tmp_path, options=BundleOptions(any_arm=True, addresses=hosts))
+    config = json.loads(next(p for p in paths if p.name == "cell.json").read_text())
+    assert tuple(driver["address"] for driver in config["drivers"]) == hosts
+    with pytest.raises(SettingsError, match="no host name or IP address"):
+        export(job, "ur-ros2", tmp_path, options=BundleOptions(addresses=("a b", "c")))
 
 
 def test_a_timing_is_exported_with_its_job(tmp_path: Path) -> None:

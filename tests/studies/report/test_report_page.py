@@ -18,10 +18,10 @@ import pytest
 
 import hybrid_opt as ho
 from hybrid_opt.branches import BranchCompetition, PairResult
-from hybrid_opt.campaign.stages import ReadyCell
+from hybrid_opt.campaign.stages import ReadyCell, cells_of, ready_cells
 from hybrid_opt.cell import Cell
 from hybrid_opt.display.table import NOTHING, Table
-from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES
+from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES, PAPER_OBJECTIVES
 from hybrid_opt.indicators.metrics import BindingBound
 from hybrid_opt.job.plan import JobModel
 from hybrid_opt.robust.squeeze import SqueezeSettings
@@ -33,6 +33,10 @@ from studies.report.page_carries import DrawnJob, PageTrajectory, page_trajector
 from studies.report.page_data import page_document
 from studies.study import tables
 from studies.study.recommendation import recommendation_text
+from symbolic.read.cell import load
+from symbolic.read.cell_files import collect_cell
+from symbolic.records.task import initial_decision
+from tests.symbolic.cells import RACK
 
 HOSTILE = "</title></script><script>window.broken = 1</script><img src=x onerror=alert(1)>\"'&"
 WINNER = PairResult((2, 0), 2, 120, 0.5, 0.4, 0.6)
@@ -47,6 +51,23 @@ TABLES = (
     "timing",
     "margins",
 )
+
+
+def test_paths_of_few_waypoints_have_jobs_in_a_cell_of_more() -> None:
+    workcell = load(RACK)
+    cells = ready_cells(cells_of(collect_cell(workcell), PAPER_OBJECTIVES, driven=False))
+    assert cells[-1].cell.workcell.task.n_path > workcell.task.n_path
+    x, limits = initial_decision(workcell.task), ho.TimingLimits(reference_speed=True)
+    job = page_carries.drawn_job("hand-made", x, limits, cells)
+    assert not job.problem
+    assert job.samples is not None
+    path = cells[0].cell.carry(x).pose[:, :3]
+    far = np.linalg.norm(job.samples[:, None, 1:4] - path, axis=2).min(axis=1)
+    carried = [phase for phase in job.phases if phase["name"] == "carry"]
+    begin = carried[0]["begin"]
+    during = (job.samples[:, 0] >= begin) & (job.samples[:, 0] <= begin + carried[0]["duration"])
+    # The nearest of the path's samples is at most half a step away.
+    assert far[during].max() < 0.6 * np.linalg.norm(np.diff(path, axis=0), axis=1).max()
 
 
 def with_hostile_names(data: ReportData) -> ReportData:

@@ -230,7 +230,7 @@ def test_the_terminal_shows_the_tables() -> None:
     figures = ["40.00", "41.00", "50.00", "51.25", "0.62", "3.00", "16.50"]
     assert chosen.split()[1:] == figures
     assert lines["collision"].split()[1:] == ["30.0", "30.0"]
-    assert lines["reach 1"].split()[2:] == ["10.0", "10.0"]
+    assert lines["reach, left"].split()[2:] == ["10.0", "10.0"]
     held = ["49.05"] * 4 + ["0.00", "–", "16.96"]
     assert lines["level payload at rest"].split()[4:] == held
 
