@@ -16,7 +16,7 @@ import hybrid_opt as ho
 from hybrid_opt.display.table import NOTHING
 from hybrid_opt.proposing.problem import completed, read_problem
 from hybrid_opt.proposing.via_points import travelled
-from studies.research.benchmarks import baxter, machines, shelves, slot
+from studies.research.benchmarks import baxter, machines, measuring, shelves, slot
 from studies.research.benchmarks.__main__ import main
 from studies.research.benchmarks.measuring import (
     Length,
@@ -27,6 +27,7 @@ from studies.research.benchmarks.measuring import (
     table,
 )
 from symbolic.errors import SettingsError
+from tests.symbolic.cells import RACK
 
 RNG = np.random.default_rng(1)
 
@@ -311,6 +312,19 @@ def test_another_scene_is_refused(tmp_path: Path, text: str, told: str) -> None:
     scene.write_text(text, encoding="utf-8")
     with pytest.raises(SettingsError, match=rf"(?s){told}.*git clone"):
         slot.benchmark(tmp_path)
+
+
+def test_the_shortest_carry_is_shorter_than_the_one_it_began_with_and_certified(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(measuring, "SHORT_EVALUATIONS", 400)
+    cell = ho.Cell.load(RACK)
+    begin = cell.carry(cell.initial)
+    found = measuring.shortest_carry(RACK, np.random.default_rng(1))
+    ways = [travelled(np.hstack([arm.q for arm in carry.arms])) for carry in (begin, found)]
+    assert ways[1] < 0.9 * ways[0]
+    assert cell.certify(found).is_free
+    assert ((found.x >= cell.workcell.task.lower) & (found.x <= cell.workcell.task.upper)).all()
 
 
 def test_collision_checks_are_counted_by_work() -> None:
