@@ -36,8 +36,7 @@ from hybrid_opt.recommending.choice import (
     ranked,
 )
 from hybrid_opt.recommending.recommendation import recommend
-from hybrid_opt.store.files import write_json
-from hybrid_opt.store.json_records import from_json, read_record, to_json
+from hybrid_opt.store.files import from_json, read_record, to_json, write_json
 from hybrid_opt.work.service import Emit, LocalExecutor, Service, give_up
 from symbolic.array import Array, Figure, Row
 from symbolic.errors import DualArmError, SettingsError

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from types import UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
@@ -17,10 +19,47 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Range:
-    """Lowest and highest value of a number."""
+    """What a number may be.
+
+    Attributes:
+        low, high: lowest and highest value.
+        unit: SI unit, empty for a pure number.
+        mistaken: units that people write by mistake, each (name, factor to `unit`).
+    """
 
     low: float
     high: float
+    unit: str = ""
+    mistaken: tuple[tuple[str, float], ...] = ()
+
+    def contains(self, value: float) -> bool:
+        """Whether the value is finite and within the range."""
+        return math.isfinite(value) and self.low <= value <= self.high
+
+    def allowed(self) -> str:
+        """The range in words."""
+        return f"{self.low:g} to {self.high:g} {self.unit}".rstrip()
+
+    def suspicion(self, value: float) -> str:
+        """Which other unit a value outside the range was probably written in, or ''."""
+        for name, factor in self.mistaken:
+            if math.isfinite(value) and value != 0 and self.contains(value * factor):
+                return (
+                    f"; this looks like {name}: {value:g} {name} are "
+                    f"{value * factor:.6g} {self.unit}"
+                )
+        return ""
+
+
+@dataclass(frozen=True)
+class Form:
+    """What a text has to be.
+
+    Attributes:
+        problem: what is wrong with a value, '' where nothing is.
+    """
+
+    problem: Callable[[Any], str]
 
 
 @dataclass(frozen=True)
@@ -29,6 +68,11 @@ class Shape:
 
     sizes: tuple[int | None, ...]
     kind: type = float
+
+
+@dataclass(frozen=True)
+class Filling:
+    """Marks an array for which a single number may stand: all of it are that number."""
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ import pinocchio as pin
 from symbolic.array import Array
 from symbolic.read.arms import held_joints, link_frame, moving_joints, reduced_model
 from symbolic.read.cell import load
-from symbolic.read.payload import face_normal, pad_rotation
+from symbolic.read.payload import pad_rotation
 from symbolic.read.urdf import read_urdf
 from symbolic.records import Workcell
 from symbolic.records.poses import inverse, pose_matrix
@@ -213,7 +213,7 @@ def single_cell(arm: Arm, folder: Path, locked: dict[str, float] | None = None) 
     robots = []
     for name, side in (("left", 1), ("right", -1)):
         T_box_pad = np.eye(4)
-        T_box_pad[:3, :3] = pad_rotation(face_normal(1, side), 0.0)
+        T_box_pad[:3, :3] = pad_rotation(np.array([0.0, -side, 0.0]), 0.0)
         T_box_pad[1, 3] = side * SIZE[1] / 2
         pad = pose_matrix(np.array([0.0, 0.0, 0.05]), np.zeros(3))
         T_world_base = T_box_pad @ inverse(pad) @ inverse(T_root_flange)

@@ -21,7 +21,7 @@ from hybrid_opt.bundles.job_file import pad_places
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.store.files import read_bytes
 from symbolic import outside
-from symbolic.array import Array, interpolated
+from symbolic.array import Array, Range, interpolated
 from symbolic.errors import OutsideError, WorkcellError
 from symbolic.read.arms import arm_model
 from symbolic.read.tables import Table
@@ -29,7 +29,6 @@ from symbolic.records import Workcell
 from symbolic.records import quantities as quantity
 from symbolic.records.poses import inverse, skew
 from symbolic.records.problems import Problems, shown
-from symbolic.records.quantities import Quantity
 
 FRAMES = ("flange", "pad", "base")
 """Frames of a wrench: about the flange or the pad and along its axes, or about the pad along the
@@ -38,9 +37,9 @@ axes of the arm's base, as RTDE does."""
 TARE_TIME = 0.4
 """Time around a tare instant over which readings are averaged [s]."""
 
-TIME = Quantity("s", -1e12, 1e12)
-FORCE_RANGE = Quantity("N", 1.0, 1e6)
-MOMENT_RANGE = Quantity("N m", 0.1, 1e5)
+TIME = Range(-1e12, 1e12, "s")
+FORCE_RANGE = Range(1.0, 1e6, "N")
+MOMENT_RANGE = Range(0.1, 1e5, "N m")
 
 Spans = tuple[tuple[float, float], ...]
 

@@ -27,8 +27,15 @@ from hybrid_opt.campaign.settings import (
 )
 from hybrid_opt.cell import Cell
 from hybrid_opt.errors import ResultsError
-from hybrid_opt.store.files import LOCK, locked, own_version, read_json, storing, write_json
-from hybrid_opt.store.json_records import to_json
+from hybrid_opt.store.files import (
+    LOCK,
+    locked,
+    own_version,
+    read_json,
+    storing,
+    to_json,
+    write_json,
+)
 from hybrid_opt.work.dask_cluster import DaskExecutor
 from hybrid_opt.work.service import Executor, LocalExecutor
 from symbolic.array import Range, require_allowed

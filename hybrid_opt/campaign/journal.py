@@ -35,8 +35,7 @@ from hybrid_opt.campaign.settings import JOURNAL, CampaignSettings
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.evaluate.evaluation import FEASIBLE, REASONS, Evaluations
 from hybrid_opt.progress import Advance, Progress
-from hybrid_opt.store.files import csv_text, read_bytes, storing
-from hybrid_opt.store.json_records import to_json
+from hybrid_opt.store.files import csv_text, read_bytes, storing, to_json
 from hybrid_opt.work.service import Ledger, Service, give_up
 from symbolic.array import Array
 

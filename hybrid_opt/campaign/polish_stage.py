@@ -28,8 +28,7 @@ from hybrid_opt.polishing.records import PolishedFront, PolishOutcome
 from hybrid_opt.polishing.settings import PolishSettings
 from hybrid_opt.polishing.solvers.base import MOST_SECONDS
 from hybrid_opt.progress import Progress
-from hybrid_opt.store.files import json_of, write_json
-from hybrid_opt.store.json_records import from_json, to_json
+from hybrid_opt.store.files import from_json, json_of, to_json, write_json
 from hybrid_opt.work.service import Service, give_up
 from symbolic.array import Array
 from symbolic.read.cell_files import CellFiles

@@ -34,8 +34,14 @@ from hybrid_opt.evaluate.evaluation import Evaluations
 from hybrid_opt.front import Front
 from hybrid_opt.indicators import metrics
 from hybrid_opt.polishing.records import PolishedFront
-from hybrid_opt.store.files import read_bytes, read_document, sha256
-from hybrid_opt.store.json_records import from_json, read_record, record_of
+from hybrid_opt.store.files import (
+    from_json,
+    read_bytes,
+    read_document,
+    read_record,
+    record_of,
+    sha256,
+)
 from symbolic.array import Array, set_read_only
 from symbolic.read.cell import load
 from symbolic.records import Workcell

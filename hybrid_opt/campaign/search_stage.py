@@ -38,8 +38,7 @@ from hybrid_opt.evaluate.evaluation import CandidateEvaluator, Evaluations
 from hybrid_opt.indicators import metrics
 from hybrid_opt.metaheuristics.run import Evaluator, SearchSettings, disarmed, search_carries
 from hybrid_opt.progress import Progress
-from hybrid_opt.store.files import sha256, write_atomically, write_json
-from hybrid_opt.store.json_records import to_json
+from hybrid_opt.store.files import sha256, to_json, write_atomically, write_json
 from hybrid_opt.work.service import Service
 from symbolic.array import Array
 from symbolic.records.task import initial_decision

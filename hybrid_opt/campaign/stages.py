@@ -41,8 +41,7 @@ from hybrid_opt.errors import ResultsError
 from hybrid_opt.evaluate.objectives import force_kind
 from hybrid_opt.job.plan import JobModel
 from hybrid_opt.progress import Progress
-from hybrid_opt.store.files import write_json
-from hybrid_opt.store.json_records import read_record, to_json
+from hybrid_opt.store.files import read_record, to_json, write_json
 from symbolic.read.cell import load
 from symbolic.read.cell_files import CellFiles, drivable_files, unpack_cell
 from symbolic.records import SEARCHED, Workcell

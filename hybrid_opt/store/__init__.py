@@ -1,5 +1,5 @@
-"""Files.
+"""Files, written so that nothing is lost, and read without trust.
 
-trajectory_file: a carry with its whole cell in one file, and evaluated again from it. json_records:
-records as JSON. files: atomic writes.
+files: atomic writes, frozen records as JSON. trajectory_file: a carry with its whole cell in one
+file, and evaluated again from it.
 """

@@ -1,4 +1,8 @@
-"""Writing files so that an interruption at any moment leaves the old content or the new one."""
+"""Files of results: written so that an interruption at any moment leaves the old content or the new
+one, frozen records as JSON in them, checked once when they are read.
+
+The annotations of a record's fields say what is allowed, see `symbolic.read.tables`.
+"""
 
 from __future__ import annotations
 
@@ -8,18 +12,26 @@ import fcntl
 import hashlib
 import io
 import json
+import math
 import os
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import fields, is_dataclass
+from enum import Enum
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
+
+import numpy as np
 
 from hybrid_opt.errors import ResultsError
 from symbolic import outside
 from symbolic.errors import OutsideError
 from symbolic.outside import replace_file
-from symbolic.records.problems import shown
+from symbolic.read.tables import checked
+from symbolic.records.problems import FirstProblem, shown
+
+Record = TypeVar("Record")
 
 LOCK = ".lock"
 
@@ -69,6 +81,62 @@ def write_json(path: Path, document: Any) -> None:
     """Store JSON values, see `write_atomically`; NaN and infinities are refused."""
     text = json.dumps(document, indent=1, allow_nan=False)
     write_atomically(path, (text + "\n").encode())
+
+
+def to_json(value: Any) -> Any:
+    """A record as JSON values.
+
+    Numbers that are not finite become null. Fields without a value that have none by default are
+    left out.
+    """
+    if is_dataclass(value):
+        return {
+            field.name: to_json(getattr(value, field.name))
+            for field in fields(value)
+            if not (field.default is None and getattr(value, field.name) is None)
+        }
+    if isinstance(value, np.ndarray):
+        return to_json(value.tolist())
+    if isinstance(value, Mapping):
+        return {key: to_json(entry) for key, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [to_json(entry) for entry in value]
+    if isinstance(value, Enum):
+        return value.value
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def from_json(kind: type[Record], value: Any, path: Path | str, remedy: str) -> Record:
+    """The record that JSON values describe.
+
+    Args:
+        kind: the record's class.
+        value: the values.
+        path: of the file, or what else they are called in messages.
+        remedy: what to do about a damaged file.
+
+    Raises:
+        ResultsError: they describe none; with the field and what is wrong with it.
+    """
+    try:
+        record: Record = checked(kind, value, "", FirstProblem())
+    except ValueError as error:
+        raise ResultsError(f"{path}: damaged {error}; {remedy}") from error
+    return record
+
+
+def read_record(kind: type[Record], path: Path, remedy: str) -> Record:
+    """Read a file with one record; see `from_json`.
+
+    Raises:
+        ResultsError: it cannot be read or is damaged.
+    """
+    return record_of(kind, read_bytes(path), path, remedy)
+
+
+def record_of(kind: type[Record], content: bytes, path: Path | str, remedy: str) -> Record:
+    """The record in a file's content; see `read_record`."""
+    return from_json(kind, json_of(content, path, remedy), path, remedy)
 
 
 def csv_text(header: Sequence[str], rows: Iterable[Sequence[str | float]]) -> str:

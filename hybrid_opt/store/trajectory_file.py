@@ -22,8 +22,7 @@ from hybrid_opt.cell import Cell
 from hybrid_opt.compiled_cell import CompiledCell
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.evaluate.objectives import OBJECTIVES, PAPER_OBJECTIVES
-from hybrid_opt.store.files import AGAIN, read_document, storing
-from hybrid_opt.store.json_records import from_json
+from hybrid_opt.store.files import AGAIN, from_json, read_document, storing
 from symbolic.array import Array
 from symbolic.errors import BundleError
 from symbolic.outside import replace_file

@@ -11,7 +11,7 @@ from typing import Annotated
 import numpy as np
 
 from hybrid_opt.carry import Carry
-from hybrid_opt.store.json_records import read_record
+from hybrid_opt.store.files import read_record
 from hybrid_opt.timing.given import drive_path, untimed
 from hybrid_opt.timing.jerk import drive_with_jerk
 from hybrid_opt.timing.limits import (

@@ -17,7 +17,7 @@ from hybrid_opt.display.table import NOTHING, Quantity, Table, number
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.indicators.statistics import RankTest, Summary, corrected, rank_test, summarise
 from hybrid_opt.metaheuristics.registry import title
-from hybrid_opt.store.json_records import to_json
+from hybrid_opt.store.files import to_json
 from studies.study.summary import (
     LEAST_TESTED,
     CampaignSummary,

@@ -15,7 +15,7 @@ from hybrid_opt.display.table import Table, number
 from hybrid_opt.door import polish, search
 from hybrid_opt.polishing.settings import usual_settings
 from hybrid_opt.recommending.recommendation import recommend
-from hybrid_opt.store.json_records import to_json
+from hybrid_opt.store.files import to_json
 from hybrid_opt.store.trajectory_file import read_trajectory
 from hybrid_opt.sweeping import Sweep, stored_sweep, sweep
 from hybrid_opt.work.service import warm_up

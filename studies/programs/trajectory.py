@@ -38,8 +38,7 @@ from hybrid_opt.robust.force import (
     robust_price,
 )
 from hybrid_opt.robust.squeeze import SqueezeSettings
-from hybrid_opt.store.files import read_bytes
-from hybrid_opt.store.json_records import to_json
+from hybrid_opt.store.files import read_bytes, to_json
 from hybrid_opt.store.trajectory_file import Replay, StoredTrajectory, read_trajectory, replay
 from hybrid_opt.timing.analysis import timed_trajectory, timing_document
 from hybrid_opt.timing.model import TimingModel

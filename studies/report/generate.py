@@ -26,8 +26,7 @@ from PIL import Image
 from hybrid_opt.display.scene import embedded_json, plotly_js, scene_js, three_js
 from hybrid_opt.display.table import Table, counted, number
 from hybrid_opt.robust.squeeze import PADS
-from hybrid_opt.store.files import write_atomically
-from hybrid_opt.store.json_records import to_json
+from hybrid_opt.store.files import to_json, write_atomically
 from hybrid_opt.timing.analysis import TimingDocument, stored_timing
 from hybrid_opt.work.service import Executor, LocalExecutor, Service, answer_all, called
 from studies.program import ReportError

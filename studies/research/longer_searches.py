@@ -25,7 +25,7 @@ from hybrid_opt.errors import ResultsError
 from hybrid_opt.indicators import metrics
 from hybrid_opt.metaheuristics.registry import title
 from hybrid_opt.progress import Progress
-from hybrid_opt.store.json_records import to_json
+from hybrid_opt.store.files import to_json
 from studies.research.best_front import ReferenceFront, read_reference_front
 from studies.research.control import LONG
 from studies.study.summary import CampaignSummary, read_summary

@@ -15,8 +15,7 @@ from hybrid_opt.carry import Carry
 from hybrid_opt.cell import Cell
 from hybrid_opt.door import search
 from hybrid_opt.errors import WitnessError
-from hybrid_opt.store.files import write_json
-from hybrid_opt.store.json_records import read_record, to_json
+from hybrid_opt.store.files import read_record, to_json, write_json
 from hybrid_opt.timing.solve import time_path
 from hybrid_opt.witness.box import Witness, bisected, drive_of
 from hybrid_opt.witness.scene import SimulationSettings

@@ -43,8 +43,7 @@ from hybrid_opt.recommending.recommendation import (
 )
 from hybrid_opt.robust.force import RobustPrice, pressing_model, robust_price
 from hybrid_opt.robust.squeeze import Part, account
-from hybrid_opt.store.files import write_json
-from hybrid_opt.store.json_records import read_record, to_json
+from hybrid_opt.store.files import read_record, to_json, write_json
 from hybrid_opt.store.trajectory_file import write_trajectory
 from hybrid_opt.timing.jerk import kept_jerk
 from hybrid_opt.timing.robustness import Margin

@@ -19,8 +19,7 @@ from hybrid_opt.display.table import Table, number
 from hybrid_opt.errors import ResultsError, WitnessError
 from hybrid_opt.metaheuristics.registry import title
 from hybrid_opt.progress import Progress
-from hybrid_opt.store.files import read_bytes, sha256, write_json
-from hybrid_opt.store.json_records import read_record, to_json
+from hybrid_opt.store.files import read_bytes, read_record, sha256, to_json, write_json
 from hybrid_opt.store.trajectory_file import StoredTrajectory, read_trajectory
 from hybrid_opt.timing.analysis import (
     TimingDocument,

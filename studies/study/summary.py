@@ -44,8 +44,14 @@ from hybrid_opt.indicators.statistics import (
 from hybrid_opt.polishing.records import PolishEffort
 from hybrid_opt.progress import Progress
 from hybrid_opt.static_hold import StaticHold
-from hybrid_opt.store.files import csv_text, storing, write_atomically, write_json
-from hybrid_opt.store.json_records import read_record, to_json
+from hybrid_opt.store.files import (
+    csv_text,
+    read_record,
+    storing,
+    to_json,
+    write_atomically,
+    write_json,
+)
 from hybrid_opt.store.trajectory_file import write_trajectory
 from studies.study.recommendation import (
     NoRecommendation,

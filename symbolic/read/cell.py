@@ -9,7 +9,7 @@ import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -19,7 +19,7 @@ from symbolic.read.arms import robot_urdf
 from symbolic.read.checks import check_all
 from symbolic.read.descriptions import description_content, resolve_mesh
 from symbolic.read.payload import check_count, read_contact, read_payload
-from symbolic.read.redundancy import read_redundant, with_redundancy
+from symbolic.read.redundancy import with_redundancy
 from symbolic.read.robots import read_robot
 from symbolic.read.tables import Table, read_body
 from symbolic.read.task import read_task, with_force_limit
@@ -29,20 +29,14 @@ from symbolic.records import (
     Body,
     CollisionSettings,
     Handling,
-    IgnoredPair,
     Mesh,
     Payload,
     Robot,
     Uncertainty,
     Workcell,
 )
-from symbolic.records import quantities as quantity
 from symbolic.records.cell import reading_of
 from symbolic.records.problems import Problems, shown
-
-if TYPE_CHECKING:
-    from symbolic.read.tables import Table
-
 
 Check = Callable[[Workcell], Iterable[str]]
 
@@ -118,15 +112,17 @@ def _build(table: Table, source: Path, content: bytes, stored: bool) -> Workcell
     payload = read_payload(table.table("payload"), folder)
     contacts = [read_contact(entry, payload) for entry in table.tables("contacts", exactly=2)]
     check_count(contacts, problems)
-    task_table = table.table("task")
-    task = read_task(task_table)
-    redundant = read_redundant(task_table, len(task.waypoints))
-    task_table.close()
+    task, redundant = read_task(table.table("task"))
     environment = tuple(read_body(entry, folder) for entry in table.tables("environment"))
-    collision = read_collision(table.table("collision", {}))
-    stated = table.has("uncertainty")
-    uncertainty = read_uncertainty(table.table("uncertainty")) if stated else USUAL
-    handling = read_handling(table.table("handling", {}))
+    collision = table.table("collision", {}).record(CollisionSettings)
+    for index, pair in enumerate(collision.ignored):
+        # A pattern may stand against itself: all bodies that it matches against one another.
+        if pair.first and pair.first == pair.second and not set(pair.first) & {"*", "?"}:
+            problems.add(f"collision.ignored[{index}]", f"pairs {pair.first!r} with itself")
+    uncertainty = USUAL
+    if table.has("uncertainty"):
+        uncertainty = table.table("uncertainty").record(Uncertainty, stated=True)
+    handling = table.table("handling", {}).record(Handling)
     table.close()
     if len(robots) != 2 or len(contacts) != 2:
         return None
@@ -233,69 +229,7 @@ def with_branches(content: bytes, data: Mapping[str, Any], decided: tuple[int, i
     return content
 
 
-# --- small sections ---
-
-
-MOST_PIECES = 20_000
-
-
-def read_collision(table: Table) -> CollisionSettings:
-    """How collisions are judged."""
-    tolerance = table.number("tolerance", quantity.TOLERANCE, 0.0)
-    most_pieces = table.integer("most_pieces", 1, MOST_PIECES, CollisionSettings().most_pieces)
-    ignored = []
-    for entry in table.tables("ignored"):
-        pair = IgnoredPair(entry.text("first"), entry.text("second"), entry.text("reason"))
-        entry.close()
-        # A pattern may stand against itself: all bodies that it matches against one another.
-        if pair.first and pair.first == pair.second and not set(pair.first) & {"*", "?"}:
-            entry.problems.add(entry.path, f"pairs {pair.first!r} with itself")
-        ignored.append(pair)
-    table.close()
-    return CollisionSettings(tolerance, tuple(ignored), most_pieces)
-
-
-def read_uncertainty(table: Table) -> Uncertainty:
-    """How far from nominal each quantity may be; what is not told is exact."""
-    none = (0.0, 0.0, 0.0)
-
-    def number(key: str, kind: quantity.Quantity) -> float:
-        return table.number(key, kind, 0.0)
-
-    uncertainty = Uncertainty(
-        friction=number("friction", quantity.SHARE),
-        mass=number("mass", quantity.SHARE),
-        centre_of_mass=table.vector("centre_of_mass", (quantity.DISPLACEMENT,) * 3, none),
-        pad_position=number("pad_position", quantity.DISPLACEMENT),
-        disturbance=table.vector("disturbance", (quantity.DISTURBANCE,) * 3, none),
-        tracking=number("tracking", quantity.SHARE),
-        internal_force=number("internal_force", quantity.INTERNAL_FORCE),
-        tilt=number("tilt", quantity.TILT),
-        relative_position=number("relative_position", quantity.DISPLACEMENT),
-        relative_angle=number("relative_angle", quantity.TILT),
-        stiffness=number("stiffness", quantity.ARM_STIFFNESS),
-    )
-    table.close()
-    return uncertainty
-
-
-def read_handling(table: Table) -> Handling:
-    """How the box is taken hold of and let go, by default as `Handling` says."""
-    usual = Handling()
-
-    def height(key: str) -> float | None:
-        return table.number(key, quantity.LIFT) if table.has(key) else None
-
-    handling = Handling(
-        stand_off=table.number("stand_off", quantity.STAND_OFF, usual.stand_off),
-        pressing_speed=table.number("pressing_speed", quantity.SPEED, usual.pressing_speed),
-        pressing_rate=table.number("pressing_rate", quantity.FORCE_RATE, usual.pressing_rate),
-        lifting_speed=table.number("lifting_speed", quantity.SPEED, usual.lifting_speed),
-        lift_height=height("lift_height"),
-        set_down_height=height("set_down_height"),
-    )
-    table.close()
-    return handling
+# --- other values ---
 
 
 _BARE = re.compile(r"[A-Za-z0-9_-]+")

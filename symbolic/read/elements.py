@@ -8,12 +8,11 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from symbolic.array import Array
+from symbolic.array import Array, Range
 from symbolic.errors import OutsideError
 from symbolic.read.tables import checked_number
 from symbolic.records.poses import read_only
 from symbolic.records.problems import Problems, shown, suggestion
-from symbolic.records.quantities import Quantity
 
 MOST_ELEMENTS = 100_000
 MOST_ATTRIBUTES = 500_000
@@ -170,19 +169,19 @@ class Part:
             return ""
         return value
 
-    def number(self, key: str, allowed: Quantity, default: str | None = None) -> float:
+    def number(self, key: str, allowed: Range, default: str | None = None) -> float:
         """A finite number within the quantity's range."""
         return float(self.numbers(key, (allowed,), default)[0])
 
-    def numbers(self, key: str, allowed: Sequence[Quantity], default: str | None = None) -> Array:
+    def numbers(self, key: str, allowed: Sequence[Range], default: str | None = None) -> Array:
         """Numbers separated by spaces, one quantity each."""
         return self._numbers(f"{self.path} {key}", self.element.get(key, default), allowed)
 
-    def content(self, allowed: Sequence[Quantity]) -> Array:
+    def content(self, allowed: Sequence[Range]) -> Array:
         """The numbers between the element's tags, one quantity each."""
         return self._numbers(self.path, self.element.text, allowed)
 
-    def _numbers(self, path: str, value: str | None, allowed: Sequence[Quantity]) -> Array:
+    def _numbers(self, path: str, value: str | None, allowed: Sequence[Range]) -> Array:
         if value is None:
             self.problems.add(path, "is missing")
             return read_only(np.ones(len(allowed)))

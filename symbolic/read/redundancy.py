@@ -49,20 +49,19 @@ class RedundancyEntry:
 
     path: str
     joint: str
-    lower: Array | None
-    upper: Array | None
-    initial: Array | None
+    lower: Array | None = None
+    upper: Array | None = None
+    initial: Array | None = None
 
 
 def read_redundant(table: Table, n_waypoints: int) -> tuple[RedundancyEntry, ...]:
     """The entries of `task.redundant`."""
     found = []
-    for entry in table.tables("redundant") if table.has("redundant") else ():
+    for entry in table.tables("redundant"):
         values = {
-            key: entry.vector(key, (quantity.LOCKED_POSITION,) * n_waypoints, scalar_fills=True)
-            if entry.has(key)
-            else None
+            key: entry.vector(key, (quantity.LOCKED_POSITION,) * n_waypoints, filling=True)
             for key in ("lower", "upper", "initial")
+            if entry.has(key)
         }
         found.append(RedundancyEntry(entry.path, entry.text("joint"), **values))
         entry.close()
@@ -101,7 +100,7 @@ def with_redundancy(
                 drives = tuple(
                     names[k].index(name) if k == i or name in common else -1 for k in (0, 1)
                 )
-                said = _entry(entries, robot, name) or RedundancyEntry("", name, None, None, None)
+                said = _entry(entries, robot, name) or RedundancyEntry("", name)
                 found.append(_joint(workcell, i, (drives[0], drives[1]), said, path, problems))
     known = {joint.name for joint in found} | {joint.name.split("/")[1] for joint in found}
     known |= {f"{workcell.robots[1].name}/{name}" for name in common}

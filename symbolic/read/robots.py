@@ -12,17 +12,18 @@ import os
 import re
 import sys
 from collections.abc import Collection, Iterator
-from contextlib import redirect_stdout
+from contextlib import contextmanager, redirect_stdout
 from dataclasses import dataclass
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
 
 from symbolic import outside
-from symbolic.array import Array
+from symbolic.array import Array, Range
 from symbolic.errors import OutsideError, RobotModelError, UrdfError
 from symbolic.read.arms import (
     FOLLOWING,
@@ -48,11 +49,9 @@ from symbolic.records import SEARCHED, Driver, Robot, ToolLoad
 from symbolic.records import quantities as quantity
 from symbolic.records.poses import read_only
 from symbolic.records.problems import shown, suggestion
-from symbolic.records.quantities import Quantity
 
 # Joint accelerations are rarely published; this is slow for an arm of this class.
 DEFAULT_ACCELERATION = 5.0  # [rad/s^2]
-DEFAULT_MIN_MANIPULABILITY = 0.005  # [m^3], exceeded by 9 of 10 random poses of a 1.3 m arm
 MAX_START_BRANCH = 1000
 
 
@@ -64,158 +63,100 @@ def read_robot(table: Table, folder: Path, stored: bool = False) -> tuple[Robot,
         folder: what paths are relative to.
         stored: whether the cell was unpacked from an archive, see `symbolic.read.cell.load`.
     """
-    problems = table.problems
     name = table.text("name")
     if "/" in name:
-        problems.add(table.at("name"), f"found {name!r}; allowed is a name without '/'")
-    described, model = read_description(table, folder, stored)
-    limits = _read_limits(table, model)
-    robot = Robot(
-        name=name,
-        urdf=described.urdf,
-        package_dirs=described.package_dirs,
-        flange=described.flange,
-        locked_joints=described.locked_joints,
-        T_world_base=read_pose(table, "base"),
-        T_flange_pad=read_pose(table, "pad"),
-        tool=tuple(read_body(entry, folder) for entry in table.tables("tool")),
-        position_lower=limits["position_lower"],
-        position_upper=limits["position_upper"],
-        velocity_max=limits["velocity_max"],
-        acceleration_max=limits["acceleration_max"],
-        torque_max=limits["torque_max"],
-        min_manipulability=table.number(
-            "min_manipulability", quantity.MANIPULABILITY, DEFAULT_MIN_MANIPULABILITY
-        ),
-        xacro_arguments=described.xacro_arguments,
-        srdf=described.srdf,
-        chain_root=described.chain_root,
-        drop_links=described.drop_links,
-        tool_load=_read_tool_load(table),
-        redundant_joints=_read_redundant(table, model),
-        jerk_max=_read_jerk(table, len(limits["acceleration_max"])),
-        driver=_read_driver(table),
-    )
+        table.add("name", f"found {name!r}; allowed is a name without '/'")
+    described, model = _read_description(table, folder, stored)
     branch = SEARCHED
     if table.raw("start_branch", -1) != "search":
         branch = table.integer("start_branch", -1, MAX_START_BRANCH, -1)
-    table.close()
+    tool_load = None
+    if table.has("tool_load"):
+        inner = table.table("tool_load")
+        mass = inner.number("mass", quantity.MASS)
+        inertia = {}
+        if inner.has("inertia"):
+            inertia["inertia"] = read_inertia(inner, mass * LARGEST_GYRATION**2)
+        tool_load = inner.record(ToolLoad, mass=mass, **inertia)
+    limits = _read_limits(table, model)
+    driver = table.table("driver", {}).record(Driver)
+    robot = table.record(
+        Robot,
+        name=name,
+        T_world_base=read_pose(table, "base"),
+        T_flange_pad=read_pose(table, "pad"),
+        tool=tuple(read_body(entry, folder) for entry in table.tables("tool")),
+        tool_load=tool_load,
+        redundant_joints=_read_redundant(table, model),
+        driver=driver,
+        **described,
+        **limits,
+    )
     return robot, branch
-
-
-def _read_jerk(table: Table, joints: int) -> Array | None:
-    """The joints' largest jerks, where the file states them."""
-    if not table.has("jerk_max"):
-        return None
-    return table.vector("jerk_max", (quantity.ANGULAR_JERK,) * joints, scalar_fills=True)
 
 
 def _read_redundant(table: Table, model: pin.Model | None) -> tuple[str, ...]:
     """The joints beyond six that the file names; () leaves the choice to the tool."""
-    names = read_texts(table, "redundant_joints", "names of joints")
+    names = table.texts("redundant_joints", "names of joints")
     if model is None or not names:
         return names
-    beyond = model.nq - FOLLOWING
-    joints = list(model.names)[1:]
+    beyond, joints = model.nq - FOLLOWING, list(model.names)[1:]
     unknown = [name for name in names if name not in joints]
     if unknown or len(set(names)) != beyond:
         told = f"{unknown[0]!r}, which is none of them" if unknown else f"{len(set(names))} names"
-        table.problems.add(
-            table.at("redundant_joints"),
+        table.add(
+            "redundant_joints",
             f"found {told}; allowed are {beyond} of the {len(joints)} joints: {', '.join(joints)}",
         )
     return names
 
 
-def _read_tool_load(table: Table) -> ToolLoad | None:
-    if not table.has("tool_load"):
-        return None
-    inner = table.table("tool_load")
-    mass = inner.number("mass", quantity.MASS)
-    centre = inner.vector("centre_of_mass", (quantity.POSITION,) * 3, default=(0.0, 0.0, 0.0))
-    inertia = read_only(np.zeros((3, 3)))
-    if inner.has("inertia"):
-        inertia = read_inertia(inner, mass * LARGEST_GYRATION**2)
-    inner.close()
-    return ToolLoad(mass, centre, inertia)
+LIMITS = {
+    "position_lower": ("lowerPositionLimit", quantity.JOINT_POSITION),
+    "position_upper": ("upperPositionLimit", quantity.JOINT_POSITION),
+    "velocity_max": ("velocityLimit", quantity.ANGULAR_SPEED),
+    "torque_max": ("effortLimit", quantity.TORQUE),
+    "acceleration_max": ("", quantity.ANGULAR_ACCELERATION),
+    "jerk_max": ("", quantity.ANGULAR_JERK),
+}
+"""The joints' limits: what Pinocchio calls them, where a description has them, and their range."""
 
 
-ADDRESS = re.compile(r"[A-Za-z0-9](?:[A-Za-z0-9.:-]{0,251}[A-Za-z0-9])?")
-"""Host names, IPv4 and IPv6 addresses; nothing that ends a string of a robot's language."""
-
-PREFIX = re.compile(r"(?:[A-Za-z][A-Za-z0-9_]{0,39})?")
-"""What names of joints may begin with in ROS; '' for nothing."""
-
-
-def _read_driver(table: Table) -> Driver:
-    inner = table.table("driver", {})
-    driver = Driver(
-        address=_matching(inner, "address", ADDRESS, "a host name or an IP address") or "",
-        prefix=_matching(inner, "prefix", PREFIX, "letters, digits, _, with a letter first"),
-        rate=inner.number("rate", quantity.RATE) if inner.has("rate") else None,
-        lag=inner.number("lag", quantity.LAG, 0.0),
-        force_control=inner.flag("force_control"),
-    )
-    inner.close()
-    return driver
-
-
-def _matching(table: Table, key: str, allowed: re.Pattern[str], meaning: str) -> str | None:
-    """A text of a form; None where there is none, or after a problem."""
-    value = table.raw(key, None)
-    if value is None or (isinstance(value, str) and allowed.fullmatch(value)):
-        return value
-    table.problems.add(table.at(key), f"found {shown(value)}; allowed: {meaning}")
-    return None
-
-
-def _read_limits(table: Table, model: pin.Model | None) -> dict[str, Array]:
-    """The limits, from the file or else from the URDF; (n,) each."""
-    n = FOLLOWING if model is None else model.nq
-    from_urdf: dict[str, Array | None] = {
-        "position_lower": None if model is None else model.lowerPositionLimit,
-        "position_upper": None if model is None else model.upperPositionLimit,
-        "velocity_max": None if model is None else model.velocityLimit,
-        "torque_max": None if model is None else model.effortLimit,
-        "acceleration_max": np.full(n, DEFAULT_ACCELERATION),
-    }
-    allowed = {
-        "position_lower": quantity.JOINT_POSITION,
-        "position_upper": quantity.JOINT_POSITION,
-        "velocity_max": quantity.ANGULAR_SPEED,
-        "torque_max": quantity.TORQUE,
-        "acceleration_max": quantity.ANGULAR_ACCELERATION,
-    }
-    limits = {key: _limit(table, key, (allowed[key],) * n, from_urdf[key]) for key in allowed}
-    problems = table.problems
-    if model is not None and problems.clean(table.at("position_lower"), table.at("position_upper")):
-        for joint in range(n):
-            low, high = limits["position_lower"][joint], limits["position_upper"][joint]
+def _read_limits(table: Table, model: pin.Model | None) -> dict[str, Array | None]:
+    """The limits, from the file or else from the description; (n,) each."""
+    n, found = FOLLOWING if model is None else model.nq, dict[str, Array | None]()
+    for key, (own, allowed) in LIMITS.items():
+        if table.has(key):
+            # One number for all joints is right for a bound on magnitude, not for a range's end.
+            filling = not key.startswith("position")
+            found[key] = table.vector(key, (allowed,) * n, filling=filling)
+        elif own and model is not None:
+            found[key] = _described_limit(table, key, allowed, getattr(model, own))
+        else:
+            usual = None if key == "jerk_max" else DEFAULT_ACCELERATION
+            found[key] = None if usual is None else read_only(np.full(n, usual))
+    lower, upper = found["position_lower"], found["position_upper"]
+    if model is not None and table.clean("position_lower", "position_upper"):
+        for joint, (low, high) in enumerate(zip(lower, upper, strict=True)):  # type: ignore[arg-type]
             if low >= high:
-                problems.add(
-                    f"{table.at('position_lower')}[{joint}]",
+                table.add(
+                    f"position_lower[{joint}]",
                     f"found {low:g} rad for joint {model.names[joint + 1]!r}, not below its upper "
                     f"limit {high:g} rad; allowed is lower < upper",
                 )
-    return limits
+    return found
 
 
-def _limit(table: Table, key: str, each: tuple[Quantity, ...], urdf_value: Array | None) -> Array:
-    if table.has(key):
-        # One number for all joints is right for a bound on magnitude, not for a range's end.
-        return table.vector(key, each, scalar_fills=not key.startswith("position"))
-    if urdf_value is None:
-        return read_only(np.ones(len(each)))
-    for joint, (value, allowed) in enumerate(zip(urdf_value, each, strict=True)):
-        if not allowed.contains(float(value)):
-            table.problems.add(
-                table.at(key),
-                f"the description gives {value:g} for joint {joint + 1}; allowed is "
-                f"{allowed.allowed()}{allowed.suspicion(float(value))}; correct it, or give {key} "
-                "here",
+def _described_limit(table: Table, key: str, allowed: Range, values: Array) -> Array:
+    for joint, value in enumerate(values.tolist(), 1):
+        if not allowed.contains(value):
+            table.add(
+                key,
+                f"the description gives {value:g} for joint {joint}; allowed is "
+                f"{allowed.allowed()}{allowed.suspicion(value)}; correct it, or give {key} here",
             )
-            return read_only(np.ones(len(each)))
-    return read_only(urdf_value)
+            return read_only(np.ones(len(values)))
+    return read_only(values)
 
 
 # --- the description that a section names ---
@@ -225,24 +166,11 @@ MOST_FOLDERS = 100
 """Most package folders of a robot: every mesh is looked for in each."""
 
 
-@dataclass(frozen=True)
-class Description:
-    """What a robot's section says of its description; see `symbolic.records.Robot`."""
-
-    urdf: Path
-    xacro_arguments: Arguments
-    package_dirs: tuple[Path, ...]
-    srdf: Path | None
-    chain_root: str
-    flange: str
-    locked_joints: Positions
-    drop_links: tuple[str, ...]
-
-
-def read_description(
+def _read_description(
     table: Table, folder: Path, stored: bool
-) -> tuple[Description, pin.Model | None]:
-    """A robot's description and the arm's model; None after problems.
+) -> tuple[dict[str, Any], pin.Model | None]:
+    """What a robot's section says of its description, as fields of `symbolic.records.Robot`, and
+    the arm's model; None after problems.
 
     Args:
         table: the robot's section.
@@ -250,33 +178,65 @@ def read_description(
         stored: whether the cell was unpacked from an archive, see `symbolic.read.cell.load`.
     """
     package_dirs = _read_folders(table, folder)
-    own = _read_xacro_arguments(table)
+    own = table.table("xacro_arguments", {})
+    arguments = tuple((name, own.text(name)) for name in own)
     if table.has("robot"):
-        found = _read_named(table)
-        path, package_dirs = found.path, package_dirs + found.package_dirs
-        arguments = tuple((dict(found.arguments) | dict(own)).items())
+        named = _read_named(table)
+        path, package_dirs = named.path, package_dirs + named.package_dirs
+        arguments = tuple((dict(named.arguments) | dict(arguments)).items())
     else:
-        path, arguments = _read_described(table, "urdf", folder, package_dirs), own
-    locked = _read_locked(table)
+        path = _read_described(table, "urdf", folder, package_dirs)
+    locked = table.table("locked_joints", {})
+    held = tuple((name, locked.number(name, quantity.LOCKED_POSITION)) for name in locked)
     root, flange = _read_chain(table)
-    drop_links = read_texts(table, "drop_links", "names or patterns of links")
-    urdf = _read_urdf(table, path, arguments, package_dirs)
+    drop_links = table.texts("drop_links", "names or patterns of links")
+    urdf: Urdf | None = None
+    if table.clean("urdf", "xacro_arguments", "package_dirs"):
+        with _told(table, "urdf"):
+            urdf = read_urdf(path, arguments, package_dirs)
     if arguments and urdf is not None and not stored and not is_xacro(path.read_bytes()):
-        told = f"given for {path.name}, which is no xacro file"
-        table.problems.add(table.at("xacro_arguments"), told)
-    urdf = _without(table, urdf, drop_links)
+        table.add("xacro_arguments", f"given for {path.name}, which is no xacro file")
+    if urdf is not None and drop_links:
+        kept, urdf = urdf, None
+        with _told(table, "drop_links"):
+            urdf = without_links(kept, drop_links)
     model = None
     if urdf is not None:
         if not stored:
-            named = (*urdf.collision_meshes, *urdf.visual_meshes)
-            package_dirs += further_package_dirs(named, package_dirs, path)
-        model = _read_model(table, urdf, locked, (root, flange))
+            addresses = (*urdf.collision_meshes, *urdf.visual_meshes)
+            package_dirs += further_package_dirs(addresses, package_dirs, path)
+        if table.clean("locked_joints", "chain"):
+            model = _read_model(table, urdf, held, root, flange)
         _check_meshes(table, urdf, path, package_dirs)
-    srdf = _read_srdf(table, folder, package_dirs)
-    return (
-        Description(path, arguments, package_dirs, srdf, root, flange, locked, drop_links),
-        model,
-    )
+    srdf = None
+    if table.has("srdf"):
+        srdf = _read_described(table, "srdf", folder, package_dirs)
+        if table.clean("srdf"):
+            with _told(table, "srdf"):
+                read_srdf(srdf)
+    described = {
+        "urdf": path,
+        "package_dirs": package_dirs,
+        "xacro_arguments": arguments,
+        "srdf": srdf,
+        "chain_root": root,
+        "flange": flange,
+        "locked_joints": held,
+        "drop_links": drop_links,
+    }
+    return described, model
+
+
+@contextmanager
+def _told(table: Table, key: str) -> Iterator[None]:
+    """Record what is wrong with what a key names."""
+    try:
+        yield
+    except UrdfError as error:
+        for problem in error.problems:
+            table.add(key, f"{error.file}: {problem}")
+    except (RobotModelError, OutsideError) as error:
+        table.add(key, str(error))
 
 
 def _read_named(table: Table) -> NamedRobot:
@@ -284,47 +244,36 @@ def _read_named(table: Table) -> NamedRobot:
     of."""
     name = table.text("robot")
     if table.has("urdf"):
-        table.problems.add(table.at("urdf"), "found beside 'robot'; give one of the two")
+        table.add("urdf", "found beside 'robot'; give one of the two")
     elif not name:
-        table.problems.add(table.at("urdf"), "is missing; 'robot' gives none")
+        table.add("urdf", "is missing; 'robot' gives none")
     else:
         try:
             return named_robot(name)
         except OutsideError as error:
-            table.problems.add(table.at("urdf"), f"robot = {shown(name)} {error}")
+            table.add("urdf", f"robot = {shown(name)} {error}")
     return NamedRobot(Path(), (), ())
 
 
 def _read_folders(table: Table, folder: Path) -> tuple[Path, ...]:
     value = table.raw("package_dirs", [])
-    path = table.at("package_dirs")
     if not isinstance(value, list):
-        table.problems.add(path, f"found {shown(value)}; allowed is an array of folders")
+        table.add("package_dirs", f"found {shown(value)}; allowed is an array of folders")
         return ()
     if len(value) > MOST_FOLDERS:
-        table.problems.add(path, f"found {len(value)} folders; allowed are {MOST_FOLDERS}")
+        table.add("package_dirs", f"found {len(value)} folders; allowed are {MOST_FOLDERS}")
         return ()
     folders = []
     for index, entry in enumerate(value):
-        if not isinstance(entry, str) or not os.path.isdir(folder / entry):
-            table.problems.add(
-                f"{path}[{index}]",
+        if isinstance(entry, str) and os.path.isdir(folder / entry):
+            folders.append((folder / entry).resolve())
+        else:
+            table.add(
+                f"package_dirs[{index}]",
                 f"found {shown(entry)}; allowed is a folder, its path relative to the workcell "
                 "file",
             )
-            continue
-        folders.append((folder / entry).resolve())
     return tuple(folders)
-
-
-def _read_locked(table: Table) -> Positions:
-    inner = table.table("locked_joints", {})
-    return tuple((name, inner.number(name, quantity.LOCKED_POSITION)) for name in inner)
-
-
-def _read_xacro_arguments(table: Table) -> tuple[tuple[str, str], ...]:
-    inner = table.table("xacro_arguments", {})
-    return tuple((name, inner.text(name)) for name in inner)
 
 
 def _read_described(table: Table, key: str, folder: Path, package_dirs: tuple[Path, ...]) -> Path:
@@ -335,8 +284,8 @@ def _read_described(table: Table, key: str, folder: Path, package_dirs: tuple[Pa
     name, _, rest = address.removeprefix(PACKAGE_SCHEME).partition("/")
     package = find_package(name, package_dirs, folder / "workcell")
     if package is None or ".." in rest.split("/"):
-        table.problems.add(
-            table.at(key),
+        table.add(
+            key,
             f"found {shown(address)}, in no package that is found; packages are looked up in "
             "package_dirs, ROS_PACKAGE_PATH, AMENT_PREFIX_PATH and the Python environment",
         )
@@ -345,132 +294,65 @@ def _read_described(table: Table, key: str, folder: Path, package_dirs: tuple[Pa
         path = outside.resolved(package / rest)
         outside.require(path, outside.URDF_BYTES)
     except OutsideError as error:
-        table.problems.add(table.at(key), f"found {shown(address)}, which {error}")
+        table.add(key, f"found {shown(address)}, which {error}")
         return folder
     return path
-
-
-def _read_srdf(table: Table, folder: Path, package_dirs: tuple[Path, ...]) -> Path | None:
-    if not table.has("srdf"):
-        return None
-    path = _read_described(table, "srdf", folder, package_dirs)
-    if table.problems.clean(table.at("srdf")):
-        try:
-            read_srdf(path)
-        except UrdfError as error:
-            _tell(table, "srdf", error)
-    return path
-
-
-def _read_urdf(
-    table: Table, path: Path, arguments: Arguments, package_dirs: tuple[Path, ...]
-) -> Urdf | None:
-    """The robot's description, or recorded problems and None."""
-    parts = ("urdf", "xacro_arguments", "package_dirs")
-    if not table.problems.clean(*(table.at(part) for part in parts)):
-        return None
-    try:
-        return read_urdf(path, arguments, package_dirs)
-    except UrdfError as error:
-        _tell(table, "urdf", error)
-        return None
-
-
-def _tell(table: Table, key: str, error: UrdfError) -> None:
-    for problem in error.problems:
-        table.problems.add(table.at(key), f"{error.file}: {problem}")
 
 
 def _read_chain(table: Table) -> tuple[str, str]:
     """The links that the arm begins and ends at; '' for the first where only a flange is given."""
     if not table.has("chain"):
         return "", table.text("flange")
-    if "flange" in table:
-        table.raw("flange")
-        table.problems.add(
-            table.at("chain"), "found beside 'flange'; the chain's tip is the flange"
-        )
-    links = read_texts(table, "chain", "two links, root and tip")
-    if len(links) != 2 or links[0] == links[-1]:
-        if table.problems.clean(table.at("chain")):
-            table.problems.add(
-                table.at("chain"),
-                f"found {shown(list(links))}; allowed are two links, root and tip",
-            )
-        return "", ""
-    return links[0], links[1]
-
-
-def read_texts(table: Table, key: str, meaning: str) -> tuple[str, ...]:
-    """An array of texts; empty where the key is missing or holds something else."""
-    value = table.raw(key, [])
-    if not isinstance(value, list) or not all(isinstance(x, str) and x for x in value):
-        table.problems.add(
-            table.at(key), f"found {shown(value)}; allowed is an array of texts, {meaning}"
-        )
-        return ()
-    return tuple(value)
-
-
-def _without(table: Table, urdf: Urdf | None, patterns: tuple[str, ...]) -> Urdf | None:
-    if urdf is None or not patterns:
-        return urdf
-    try:
-        return without_links(urdf, patterns)
-    except RobotModelError as error:
-        table.problems.add(table.at("drop_links"), str(error))
-        return None
+    table.refuse("chain", ("flange",))
+    links = table.texts("chain", "two links, root and tip")
+    if len(links) == 2 and links[0] != links[1]:
+        return links[0], links[1]
+    if table.clean("chain"):
+        table.add("chain", f"found {shown(list(links))}; allowed are two links, root and tip")
+    return "", ""
 
 
 def _read_model(
-    table: Table, urdf: Urdf, locked: Positions, chain: tuple[str, str]
+    table: Table, urdf: Urdf, locked: Positions, root: str, flange: str
 ) -> pin.Model | None:
     """The arm's model, or recorded problems and None."""
-    problems, (root, flange) = table.problems, chain
-    if not problems.clean(table.at("locked_joints"), table.at("chain")):
-        return None
-    try:
+    moving: tuple[str, ...] | None = None
+    model: pin.Model | None = None
+    with _told(table, "urdf"):
         reduced_model(urdf)
-    except RobotModelError as error:
-        problems.add(table.at("urdf"), str(error))
+        with _told(table, "chain"):
+            moving = moving_joints(urdf, root, flange, locked)
+    if moving is not None:
+        with _told(table, "locked_joints"):
+            model = reduced_model(urdf, held_joints(urdf, moving, locked))
+    if model is None:
         return None
-    try:
-        moving = moving_joints(urdf, root, flange, locked)
-    except RobotModelError as error:
-        problems.add(table.at("chain"), str(error))
+    if problem := structure_problem(model):
+        table.add("chain" if root else "urdf", problem)
         return None
-    try:
-        model = reduced_model(urdf, held_joints(urdf, moving, locked))
-    except RobotModelError as error:
-        problems.add(table.at("locked_joints"), str(error))
-        return None
-    problem = structure_problem(model)
-    if problem:
-        problems.add(table.at("chain" if root else "urdf"), problem)
-        return None
-    if problems.clean(table.at("flange")):
-        problem = flange_problem(model, flange)
-        if problem:
-            problems.add(table.at("chain" if root else "flange"), problem)
+    if table.clean("flange") and (problem := flange_problem(model, flange)):
+        table.add("chain" if root else "flange", problem)
     return model
 
 
 def _check_meshes(table: Table, urdf: Urdf, file: Path, package_dirs: tuple[Path, ...]) -> None:
     for address in urdf.collision_meshes:
         path = resolve_mesh(address, file, package_dirs)
-        named = f"the collision mesh {shown(address)} that it names"
-        if path is None:
-            table.problems.add(
-                table.at("urdf"),
-                f"{named} does not exist; package:// addresses are looked up in the folders of "
-                "package_dirs, of ROS_PACKAGE_PATH and AMENT_PREFIX_PATH and of the Python "
-                "environment, others beside the URDF",
-            )
-            continue
-        try:
-            outside.require(path, outside.MESH_BYTES)
-        except OutsideError as error:
-            table.problems.add(table.at("urdf"), f"{named} {error}")
+        problem = (
+            "does not exist; package:// addresses are looked up in the folders of package_dirs, of "
+            "ROS_PACKAGE_PATH and AMENT_PREFIX_PATH and of the Python environment, others beside "
+            "the URDF"
+        )
+        if path is not None:
+            try:
+                outside.require(path, outside.MESH_BYTES)
+                continue
+            except OutsideError as error:
+                problem = str(error)
+        table.add("urdf", f"the collision mesh {shown(address)} that it names {problem}")
+
+
+# --- descriptions by name ---
 
 
 MODULES = "robot_descriptions"

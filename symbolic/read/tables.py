@@ -1,8 +1,14 @@
-"""Typed reading of nested tables, and the parts that several sections of a workcell file share.
+"""Nested values of TOML, YAML and JSON to records; what is allowed stands in the annotations of a
+record's fields.
 
-Every problem is gathered, reading does not stop at the first. A getter that meets a problem records
-it and returns a harmless stand-in, so that reading goes on. Stand-ins never escape: whoever reads
-raises when `Problems.found` is not empty.
+`checked` knows `bool`, `int`, `float`, `str`, `Literal`, enumerations, `tuple`,
+`Mapping[str, ...]`, `... | None`, dataclasses, `Any` for values that are only passed on, and
+`Annotated` with what `symbolic.array` has. What a record's own `__post_init__` refuses is wrong as
+well. (msgspec, which was tried, knows neither numbers that may be missing nor shapes of arrays.)
+
+Every problem is gathered, reading does not stop at the first: a wrong value is recorded, and a
+harmless stand-in of its kind takes its place. Stand-ins never escape: whoever reads raises when
+`Problems.found` is not empty. `FirstProblem` stops at once.
 """
 
 from __future__ import annotations
@@ -10,29 +16,45 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import MISSING, fields, is_dataclass
+from enum import Enum
+from functools import cache
 from pathlib import Path
-from typing import Any
+from types import UnionType
+from typing import (
+    Annotated,
+    Any,
+    Literal,
+    TypeVar,
+    Union,
+    cast,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
 
 import numpy as np
 
 from symbolic import outside
-from symbolic.array import Array
-from symbolic.errors import OutsideError
-from symbolic.records import Body, Box, Cylinder, Mesh, Shape, Sphere
+from symbolic.array import Array, Filling, Form, Missing, Range, Shape
+from symbolic.errors import DualArmError, OutsideError
+from symbolic.records import Body, Box, Cylinder, Mesh, Sphere
 from symbolic.records import quantities as quantity
 from symbolic.records.poses import pose_matrix, read_only
-from symbolic.records.problems import MAX_NAME_LENGTH, Problems, shown, suggestion, text_problem
-from symbolic.records.quantities import Quantity
+from symbolic.records.problems import MAX_NAME_LENGTH, Label, Problems, shown, suggestion
 
 MOST_UNKNOWN = 10
 """Most unknown keys of one table that are reported."""
 
+ANY_NUMBER = Range(-math.inf, math.inf)
+
+Record = TypeVar("Record")
 
 _REQUIRED: Any = object()
 
 
 class Table:
-    """One table of the file, read key by key.
+    """A table of a document, read key by key.
 
     Args:
         data: the table's content.
@@ -56,13 +78,21 @@ class Table:
         """The full key path of a key."""
         return f"{self.path}.{key}" if self.path else key
 
+    def add(self, key: str, text: str) -> None:
+        """Record a problem of a key's value."""
+        self.problems.add(self.at(key), text)
+
+    def clean(self, *keys: str) -> bool:
+        """Whether nothing is wrong with the values of these keys."""
+        return self.problems.clean(*map(self.at, keys))
+
     def raw(self, key: str, default: Any = _REQUIRED) -> Any:
         """The value as it stands; a missing required key is a problem and gives None."""
         self._known.add(key)
         if key in self._data:
             return self._data[key]
         if default is _REQUIRED:
-            self.problems.add(self.at(key), "is missing")
+            self.add(key, "is missing")
             return None
         return default
 
@@ -70,89 +100,81 @@ class Table:
         """Whether an optional key is there; it is known either way."""
         return self.raw(key, None) is not None
 
+    def refuse(self, key: str, others: Sequence[str]) -> bool:
+        """Record a problem of a key that excludes others where one of these is there as well."""
+        beside = [other for other in others if other in self._data]
+        self._known.update(others)
+        if beside:
+            listed = " and ".join(map(repr, beside))
+            self.add(key, f"found beside {listed}; allowed is one or the other")
+        return bool(beside)
+
     def close(self) -> None:
         """Record every key that nobody asked for."""
         unknown = [key for key in self._data if key not in self._known]
         allowed = ", ".join(sorted(self._known))
         for key in unknown[:MOST_UNKNOWN]:
             hint = suggestion(key, self._known - set(self._data))
-            self.problems.add(
-                self.at(key if key.isprintable() and len(key) <= MAX_NAME_LENGTH else shown(key)),
-                f"unknown key{hint or f'; allowed keys are {allowed}'}",
-            )
+            name = key if key.isprintable() and len(key) <= MAX_NAME_LENGTH else shown(key)
+            self.add(name, f"unknown key{hint or f'; allowed keys are {allowed}'}")
         if len(unknown) > MOST_UNKNOWN:
             self.problems.add(
                 self.path or "file", f"{len(unknown) - MOST_UNKNOWN} further unknown keys"
             )
 
-    def number(self, key: str, quantity: Quantity, default: float | None = None) -> float:
-        """A finite number within the quantity's range."""
-        value = self.raw(key, _REQUIRED if default is None else default)
-        if value is None:
-            return 1.0
-        return checked_number(value, quantity, self.at(key), self.problems)
+    def value(self, key: str, kind: Any, default: Any = _REQUIRED) -> Any:
+        """A value as an annotation says, see `checked`; the default is taken as it is."""
+        value = self.raw(key, default)
+        if key in self._data and not (value is None and default is not _REQUIRED):
+            return checked(kind, value, self.at(key), self.problems)
+        return _stand_in(kind) if default is _REQUIRED else default
+
+    def number(self, key: str, allowed: Range, default: float | None = None) -> float:
+        """A number within a range."""
+        found: float = self.value(
+            key, Annotated[float, allowed], _REQUIRED if default is None else default
+        )
+        return found
 
     def vector(
         self,
         key: str,
-        quantities: Sequence[Quantity],
+        allowed: Sequence[Range],
         default: Sequence[float] | None = None,
-        scalar_fills: bool = False,
+        filling: bool = False,
     ) -> Array:
-        """An array with one quantity per entry; one number for all where `scalar_fills`."""
+        """An array with one range per entry; one number for all of it where `filling`."""
         value = self.raw(key, _REQUIRED if default is None else list(default))
         if value is None:
-            return read_only(np.ones(len(quantities)))
-        if scalar_fills and not isinstance(value, list):
-            number = checked_number(value, quantities[0], self.at(key), self.problems)
-            return read_only(np.full(len(quantities), number))
-        return checked_vector(value, quantities, self.at(key), self.problems)
+            return read_only(np.ones(len(allowed)) if default is None else default)
+        return checked_vector(value, allowed, self.at(key), self.problems, filling)
 
-    def integer(self, key: str, low: int, high: int, default: int | None = None) -> int:
+    def integer(self, key: str, low: int, high: int, default: int) -> int:
         """A whole number within [low, high]."""
-        value = self.raw(key, _REQUIRED if default is None else default)
-        if value is None:
-            return low
-        if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
-            self.problems.add(
-                self.at(key), f"found {shown(value)}; allowed is a whole number {low} to {high}"
-            )
-            return low
-        return value
+        found: int = self.value(key, Annotated[int, Range(low, high)], default)
+        return found
 
     def choice(self, key: str, allowed: Sequence[str], default: str | None = None) -> str:
         """One of the allowed words; '' after a problem."""
-        value = self.raw(key, _REQUIRED if default is None else default)
-        if value is None:
-            return ""
-        if value not in allowed:
-            hint = suggestion(value, allowed) if isinstance(value, str) else ""
-            self.problems.add(
-                self.at(key),
-                f"found {shown(value)}; allowed is one of "
-                f"{', '.join(repr(word) for word in allowed)}{hint}",
-            )
-            return ""
-        return str(value)
+        usual = _REQUIRED if default is None else default
+        return str(self.value(key, Literal[tuple(allowed)], usual))
 
     def text(self, key: str, default: str | None = None) -> str:
-        """A printable, not empty, single-line text."""
-        value = self.raw(key, _REQUIRED if default is None else default)
-        if value is None:
-            return ""
-        problem = text_problem(value)
-        if problem:
-            self.problems.add(self.at(key), f"found {shown(value)}; {problem}")
-            return ""
-        return str(value)
+        """A printable, not empty, single-line text; '' after a problem."""
+        return str(self.value(key, Label, _REQUIRED if default is None else default))
 
     def flag(self, key: str) -> bool:
         """True or false; false where the key is missing, or after a problem."""
-        value = self.raw(key, False)
-        if not isinstance(value, bool):
-            self.problems.add(self.at(key), f"found {shown(value)}; allowed is true or false")
-            return False
-        return value
+        return bool(self.value(key, bool, False))
+
+    def texts(self, key: str, meaning: str) -> tuple[str, ...]:
+        """An array of texts, which mean something; empty where the key is missing, or after a
+        problem."""
+        value = self.raw(key, [])
+        if isinstance(value, list) and all(isinstance(entry, str) and entry for entry in value):
+            return tuple(value)
+        self.add(key, f"found {shown(value)}; allowed is an array of texts, {meaning}")
+        return ()
 
     def table(self, key: str, default: Mapping[str, Any] | None = None) -> Table:
         """A sub-table; an empty one after a problem, which then reports nothing further."""
@@ -160,7 +182,7 @@ class Table:
         if value is not None and isinstance(value, Mapping):
             return Table(value, self.at(key), self.problems)
         if value is not None:
-            self.problems.add(self.at(key), f"found {shown(value)}; allowed is a table")
+            self.add(key, f"found {shown(value)}; allowed is a table")
         return Table({}, self.at(key), Problems())
 
     def tables(self, key: str, exactly: int | None = None) -> list[Table]:
@@ -173,60 +195,241 @@ class Table:
             return []
         if not isinstance(value, list) or not all(isinstance(entry, Mapping) for entry in value):
             heading = re.sub(r"\[\d+\]", "", self.at(key))
-            self.problems.add(
-                self.at(key),
-                f"found {shown(value)}; allowed is an array of tables, [[{heading}]]",
-            )
+            self.add(key, f"found {shown(value)}; allowed is an array of tables, [[{heading}]]")
             return []
         if exactly is not None and len(value) != exactly:
-            self.problems.add(
-                self.at(key), f"found {len(value)} tables; allowed are exactly {exactly}"
-            )
+            self.add(key, f"found {len(value)} tables; allowed are exactly {exactly}")
         return [
             Table(entry, f"{self.at(key)}[{index}]", self.problems)
             for index, entry in enumerate(value[:exactly])
         ]
 
+    def record(self, kind: type[Record], **given: Any) -> Record:
+        """The record whose fields are the table's keys; fields that are given are none."""
+        found, own_hints = dict(given), _hints(cast("Any", kind))
+        for field in fields(kind):  # type: ignore[arg-type]
+            if field.name in given:
+                continue
+            own = field.default is MISSING and field.default_factory is MISSING
+            if own or field.name in self._data:
+                found[field.name] = self.value(field.name, own_hints[field.name])
+            self._known.add(field.name)
+        if not self.problems.open:
+            self.close()
+        return kind(**found)
 
-def checked_number(value: Any, quantity: Quantity, path: str, problems: Problems) -> float:
-    """The value as a float, or a recorded problem and a stand-in."""
+    def records(self, key: str, kind: type[Record]) -> tuple[Record, ...]:
+        """An array of tables as records."""
+        return tuple(table.record(kind) for table in self.tables(key))
+
+
+@cache
+def _hints(kind: Any) -> dict[str, Any]:
+    return get_type_hints(kind, include_extras=True)
+
+
+# --- values as annotations say ---
+
+
+def checked(kind: Any, value: Any, path: str, problems: Problems) -> Any:
+    """A value that an annotation allows, or a recorded problem and a stand-in.
+
+    Args:
+        kind: the annotation.
+        value: the value as its document has it.
+        path: its key path.
+        problems: where problems go.
+    """
+    marks: tuple[Any, ...] = ()
+    if get_origin(kind) is Annotated:
+        kind, *marks = get_args(kind)  # type: ignore[assignment]
+    origin, arguments = get_origin(kind), get_args(kind)
+    if kind is Any:
+        return value
+    if origin in (Union, UnionType):
+        (kind,) = (choice for choice in arguments if choice is not type(None))
+        return None if value is None else checked(kind, value, path, problems)
+    problem = ""
+    shape = next((mark for mark in marks if isinstance(mark, Shape)), None)
+    if shape is not None:
+        return _array(shape, marks, value, path, problems)
+    if is_dataclass(kind):
+        if isinstance(value, Mapping):
+            return _made(kind, value, path, problems)
+        problem = "allowed is a table"
+    elif origin is tuple:
+        kinds = arguments
+        if isinstance(value, list):
+            kinds = arguments[:1] * len(value) if arguments[-1] is Ellipsis else arguments
+            problem = "" if len(value) == len(kinds) else f"allowed are {len(kinds)} entries"
+        else:
+            problem = "allowed is an array"
+        if not problem:
+            return tuple(
+                checked(each, entry, f"{path}[{k}]", problems)
+                for k, (each, entry) in enumerate(zip(kinds, value, strict=True))
+            )
+    elif isinstance(origin, type) and issubclass(origin, Mapping):
+        if isinstance(value, Mapping):
+            return {
+                checked(str, key, path, problems): checked(
+                    arguments[1], entry, f"{path}.{key}".removeprefix("."), problems
+                )
+                for key, entry in value.items()
+            }
+        problem = "allowed is a table"
+    else:
+        if value is None and any(isinstance(mark, Missing) for mark in marks):
+            return math.nan
+        return _single(kind, marks, value, path, problems)
+    problems.add(path, f"found {shown(value)}; {problem}")
+    return _stand_in(kind)
+
+
+def _made(kind: Any, value: Mapping[str, Any], path: str, problems: Problems) -> Any:
+    try:
+        return Table(value, path, problems).record(kind)
+    except (ValueError, DualArmError) as error:
+        problems.add(path, str(error))
+        return _stand_in(kind)
+
+
+def _single(kind: Any, marks: Sequence[Any], value: Any, path: str, problems: Problems) -> Any:
+    """A number, a text, a word of several, or true or false."""
+    ranges = [mark for mark in marks if isinstance(mark, Range)]
+    if kind is float:
+        return checked_number(value, ranges[0] if ranges else ANY_NUMBER, path, problems)
+    choices: tuple[Any, ...] = ()
+    if isinstance(kind, type) and issubclass(kind, Enum):
+        choices = tuple(member.value for member in kind)
+    elif get_origin(kind) is Literal:
+        choices = get_args(kind)
+    if choices:
+        if value in choices and not isinstance(value, bool):
+            return kind(value) if isinstance(kind, type) else value
+        hint = suggestion(value, choices) if isinstance(value, str) else ""
+        problem = f"allowed is one of {', '.join(map(repr, choices))}{hint}"
+    elif kind is bool:
+        problem = "" if isinstance(value, bool) else "allowed is true or false"
+    elif kind is int:
+        low, high = (ranges[0].low, ranges[0].high) if ranges else (-math.inf, math.inf)
+        is_whole = isinstance(value, int) and not isinstance(value, bool)
+        fits = is_whole and low <= value <= high
+        span = f" {low} to {high}" if ranges else ""
+        problem = "" if fits else f"allowed is a whole number{span}"
+    else:
+        forms = [mark.problem for mark in marks if isinstance(mark, Form)] or [_text_problem]
+        problem = forms[0](value)
+    if not problem:
+        return value
+    problems.add(path, f"found {shown(value)}; {problem}")
+    return _stand_in(Annotated[kind, *marks])
+
+
+def _text_problem(value: Any) -> str:
+    if not isinstance(value, str):
+        return "allowed is a text"
+    if not value.isascii():
+        try:
+            value.encode()
+        except UnicodeEncodeError:
+            return "it holds half a letter (a lone surrogate)"
+    return ""
+
+
+def _stand_in(kind: Any) -> Any:
+    """What takes the place of a wrong or missing value."""
+    marks: Sequence[Any] = ()
+    if get_origin(kind) is Annotated:
+        kind, *marks = get_args(kind)
+    for mark in marks:
+        if isinstance(mark, Shape):
+            return read_only(np.ones([size or 0 for size in mark.sizes]))
+    if kind is int:
+        return next((mark.low for mark in marks if isinstance(mark, Range)), 0)
+    origin = get_origin(kind)
+    if origin is tuple:
+        return ()
+    simple = {float: 1.0, bool: False, str: ""}
+    return "" if origin is Literal else simple.get(kind)
+
+
+def checked_number(value: Any, allowed: Range, path: str, problems: Problems) -> float:
+    """The value as a finite float within a range, or a recorded problem and a stand-in."""
     if isinstance(value, bool) or not isinstance(value, int | float):
-        problems.add(path, f"found {shown(value)}; allowed is a number, {quantity.allowed()}")
+        problems.add(path, f"found {shown(value)}; allowed is a number, {allowed.allowed()}")
         return 1.0
     try:
         number = float(value)
     except OverflowError:
         number = math.inf
-    if not quantity.contains(number):
+    if not allowed.contains(number):
         problems.add(
-            path,
-            f"found {number:.9g}; allowed is {quantity.allowed()}{quantity.suspicion(number)}",
+            path, f"found {number:.9g}; allowed is {allowed.allowed()}{allowed.suspicion(number)}"
         )
         return 1.0
     return number
 
 
 def checked_vector(
-    value: Any, quantities: Sequence[Quantity], path: str, problems: Problems
+    value: Any, allowed: Sequence[Range], path: str, problems: Problems, filling: bool = False
 ) -> Array:
-    """The value as a read-only array, or recorded problems and a stand-in."""
-    if not isinstance(value, list) or len(value) != len(quantities):
-        problems.add(
-            path, f"found {shown(value)}; allowed is an array of {len(quantities)} numbers"
-        )
-        return read_only(np.ones(len(quantities)))
+    """The value as a read-only array, or recorded problems and a stand-in; one number for all of
+    it where `filling`."""
+    if filling and not isinstance(value, list):
+        return read_only(np.full(len(allowed), checked_number(value, allowed[0], path, problems)))
+    if not isinstance(value, list) or len(value) != len(allowed):
+        problems.add(path, f"found {shown(value)}; allowed is an array of {len(allowed)} numbers")
+        return read_only(np.ones(len(allowed)))
     return read_only(
         [
-            checked_number(entry, quantity, f"{path}[{index}]", problems)
-            for index, (entry, quantity) in enumerate(zip(value, quantities, strict=True))
+            checked_number(entry, each, f"{path}[{index}]", problems)
+            for index, (entry, each) in enumerate(zip(value, allowed, strict=True))
         ]
     )
+
+
+def _array(
+    shape: Shape, marks: Sequence[Any], value: Any, path: str, problems: Problems
+) -> np.ndarray[Any, Any]:
+    """A read-only array of numbers, finite unless they may miss."""
+    for mark in marks:
+        if isinstance(mark, Range):
+            filling = any(isinstance(other, Filling) for other in marks)
+            return checked_vector(value, (mark,) * (shape.sizes[0] or 0), path, problems, filling)
+    may_miss = any(isinstance(mark, Missing) for mark in marks)
+    expected = " x ".join("any" if size is None else str(size) for size in shape.sizes)
+    try:
+        found = np.array(value, dtype=float)
+    except (TypeError, ValueError, OverflowError):
+        problems.add(path, f"no numbers of shape {expected}")
+        return np.asarray(_stand_in(Annotated[Any, shape]))
+    if found.size == 0 and shape.sizes[0] is None:
+        found = found.reshape(0, *(size or 0 for size in shape.sizes[1:]))
+    fits = len(found.shape) == len(shape.sizes) and all(
+        wanted in (None, size) for size, wanted in zip(found.shape, shape.sizes, strict=True)
+    )
+    with np.errstate(invalid="ignore"):
+        numbers = found if shape.kind is float else found.astype(shape.kind)
+    problem = ""
+    if not fits:
+        problem = f"found an array of shape {found.shape}; allowed is {expected}"
+    elif np.isinf(found).any() or (np.isnan(found).any() and not may_miss):
+        problem = "holds numbers that are missing or not finite"
+    elif not may_miss and (numbers != found).any():
+        problem = "holds numbers that are not whole, or neither true nor false"
+    if problem:
+        problems.add(path, problem)
+        return np.asarray(_stand_in(Annotated[Any, shape]))
+    numbers.setflags(write=False)
+    return numbers
 
 
 # --- poses, bodies, files, inertias ---
 
 
-SHAPE_KINDS = ("box", "cylinder", "sphere", "mesh")
+SHAPES = {"box": Box, "cylinder": Cylinder, "sphere": Sphere, "mesh": Mesh}
+"""Shapes of a body by their kinds in a file."""
 
 
 def read_pose(table: Table, key: str) -> Array:
@@ -245,25 +448,12 @@ def _xyz_rpy(table: Table) -> Array:
 
 def read_body(table: Table, folder: Path) -> Body:
     """A named collision shape with its pose; mesh paths are relative to `folder`."""
-    name = table.text("name")
-    kind = table.choice("kind", SHAPE_KINDS)
-    pose = _xyz_rpy(table)
-    shape: Shape = Sphere(1.0)
-    if kind == "box":
-        shape = Box(table.vector("size", (quantity.SHAPE_SIZE,) * 3))
-    elif kind == "cylinder":
-        shape = Cylinder(
-            table.number("radius", quantity.SHAPE_SIZE), table.number("length", quantity.SHAPE_SIZE)
-        )
-    elif kind == "sphere":
-        shape = Sphere(table.number("radius", quantity.SHAPE_SIZE))
-    elif kind == "mesh":
-        path = read_file(table, "path", folder, outside.MESH_BYTES)
-        scale = table.vector("scale", (quantity.SCALE,) * 3, (1.0, 1.0, 1.0), scalar_fills=True)
-        shape = Mesh(path, scale)
-    if kind:  # without a kind nobody can say which keys are unknown
-        table.close()
-    return Body(name, shape, pose)
+    name, pose = table.text("name"), _xyz_rpy(table)
+    kind = table.choice("kind", tuple(SHAPES))
+    if not kind:  # without a kind nobody can say which keys are unknown
+        return Body(name, Sphere(1.0), pose)
+    files = {"path": read_file(table, "path", folder, outside.MESH_BYTES)} if kind == "mesh" else {}
+    return Body(name, table.record(SHAPES[kind], **files), pose)
 
 
 def read_file(table: Table, key: str, folder: Path, most: int) -> Path:
@@ -278,15 +468,14 @@ def read_file(table: Table, key: str, folder: Path, most: int) -> Path:
     if value is None:
         return folder
     if not isinstance(value, str) or not value or "\0" in value:
-        table.problems.add(table.at(key), f"found {shown(value)}; allowed is the path of a file")
+        table.add(key, f"found {shown(value)}; allowed is the path of a file")
         return folder
     try:
         path = outside.resolved(folder / value)
         outside.require(path, most)
     except OutsideError as error:
-        table.problems.add(
-            table.at(key),
-            f"found {shown(value)}, which {error}; paths are relative to the workcell file",
+        table.add(
+            key, f"found {shown(value)}, which {error}; paths are relative to the workcell file"
         )
         return folder
     return path
@@ -310,10 +499,8 @@ def read_inertia(table: Table, bound: float, allowed: str = "a 3 x 3 matrix") ->
         for index, row in enumerate(value)
     ]
     inertia = read_only(np.stack(rows))
-    if problems.clean(path):
-        problem = inertia_problem(inertia, bound)
-        if problem:
-            problems.add(path, problem)
+    if problems.clean(path) and (problem := inertia_problem(inertia, bound)):
+        problems.add(path, problem)
     return inertia
 
 
@@ -328,20 +515,15 @@ def inertia_problem(inertia: Array, bound: float) -> str:
     if np.abs(inertia - inertia.T).max() > 1e-9 * scale:
         return "found a matrix that is not symmetric; an inertia is symmetric"
     moments = np.linalg.eigvalsh(inertia)
-    listed = ", ".join(f"{moment:.6g}" for moment in moments)
+    why = ""
     if moments[0] <= 1e-9 * scale:
-        return (
-            f"found principal moments {listed} kg m^2, which is singular or not positive "
-            "definite; allowed are only positive ones"
+        why = "which is singular or not positive definite; allowed are only positive ones"
+    elif moments[2] > (moments[0] + moments[1]) * (1 + 1e-9):
+        why = "but each moment of a body is at most the sum of the other two"
+    elif moments[2] > bound:
+        why = (
+            f"but mass inside the box gives at most {bound:.6g} (are the units kg m^2, about the "
+            "centre of mass?)"
         )
-    if moments[2] > (moments[0] + moments[1]) * (1 + 1e-9):
-        return (
-            f"found principal moments {listed} kg m^2; no body has them: each is at most the "
-            "sum of the other two"
-        )
-    if moments[2] > bound:
-        return (
-            f"found a principal moment of {moments[2]:.6g} kg m^2; mass inside the box gives at "
-            f"most {bound:.6g} kg m^2 (are the units kg m^2, about the centre of mass?)"
-        )
-    return ""
+    listed = ", ".join(f"{moment:.6g}" for moment in moments)
+    return f"found principal moments {listed} kg m^2, {why}" if why else ""

@@ -9,21 +9,17 @@ from typing import cast, get_args
 import numpy as np
 
 from symbolic.array import Array
+from symbolic.read.redundancy import RedundancyEntry, read_redundant
 from symbolic.read.tables import Table, checked_vector
-from symbolic.records import Allocation, AllowedContact, Contact, Payload, Task, TimeLaw, Waypoint
+from symbolic.records import Allocation, Contact, Payload, Task, TimeLaw, Waypoint
 from symbolic.records import quantities as quantity
 from symbolic.records.poses import Orientation, Rotation, read_only, rotation_from_rpy
 from symbolic.records.problems import Problems, shown
 from symbolic.records.quantities import GRAVITY
 from symbolic.records.task import components
 
-MIN_SAMPLES = 5
-MAX_SAMPLES = 2_000
 MAX_WAYPOINTS = 100
 MAX_PIECES = 10
-TIME_LAWS = ("constant", "ramped", "optimal")
-ALLOCATIONS = get_args(Allocation)
-ROTATIONS = ("roll-pitch-yaw", "quaternion")
 
 MOST_TURN = 5.0
 """Largest rotation vector of a waypoint [rad]: a full turn less what the spline may swing out."""
@@ -31,57 +27,47 @@ MOST_TURN = 5.0
 ABOVE_STILL = 1.001
 
 
-def read_task(table: Table) -> Task:
-    """What is to be carried where, and how a candidate is sampled and judged.
-
-    The table stays open for `symbolic.read.redundancy`.
-    """
-    problems, orientation = table.problems, _orientation(table)
+def read_task(table: Table) -> tuple[Task, tuple[RedundancyEntry, ...]]:
+    """What is to be carried where, and how a candidate is sampled and judged; and what is said of
+    redundant joints."""
+    orientation = _orientation(table)
     names = components(orientation)
     start = _fixed(table, "start")
     between = [w for entry in table.tables("waypoints") for w in _waypoints(entry, names)]
-    goal = _fixed(table, "goal")
-    waypoints = (start, *between, goal)
-    if problems.clean(table.at("waypoints")):
+    waypoints = (start, *between, _fixed(table, "goal"))
+    if table.clean("waypoints"):
         if all(waypoint.is_fixed for waypoint in waypoints):
-            problems.add(
-                table.at("waypoints"), "no waypoint is free; allowed is at least one free waypoint"
-            )
+            table.add("waypoints", "no waypoint is free; allowed is at least one free waypoint")
         if len(waypoints) > MAX_WAYPOINTS:
-            problems.add(
-                table.at("waypoints"),
+            table.add(
+                "waypoints",
                 f"found {len(waypoints)} poses with start and goal; allowed are {MAX_WAYPOINTS}",
             )
-    time_law = cast("TimeLaw", table.choice("time_law", TIME_LAWS, "constant"))
+    time_law = cast("TimeLaw", table.choice("time_law", get_args(TimeLaw), "constant"))
     pieces = table.integer("drivable_pieces", 1, MAX_PIECES, 1)
-    task = Task(
+    redundant = read_redundant(table, len(waypoints))
+    task = table.record(
+        Task,
         waypoints=waypoints,
-        samples=table.integer("samples", MIN_SAMPLES, MAX_SAMPLES, 100),
         time_law=time_law,
-        reference_speed=table.number("reference_speed", quantity.SPEED),
-        reference_angular_speed=table.number(
-            "reference_angular_speed", quantity.ANGULAR_SPEED, 0.5
-        ),
-        ramp_time=table.number("ramp_time", quantity.DURATION, 0.5),
-        reference_force=table.vector("reference_force", (quantity.FORCE,) * 2, scalar_fills=True),
         initial=_read_initial(table, [w for w in waypoints if not w.is_fixed], names),
-        allowed_contacts=tuple(_allowed_contact(e) for e in table.tables("allowed_contacts")),
         allocation=_allocation(table, time_law),
         force_limit=_force_limit(table),
+        redundant=(),
         orientation=orientation,
         pieces=pieces if time_law == "optimal" else 1,
     )
     if orientation.is_vector:
-        _check_vectors(task, problems)
-    return task
+        _check_vectors(task, table.problems)
+    return task, redundant
 
 
 def _allocation(table: Table, time_law: TimeLaw) -> Allocation:
     """The allocation of forces. What robots drive is held by soft fingers where nothing else is
     stated."""
-    driven = time_law == "optimal"
-    usual = table.choice("allocation", ALLOCATIONS, "soft-finger" if driven else "paper")
-    own = table.choice("drivable_allocation", ALLOCATIONS, usual)
+    driven, known = time_law == "optimal", get_args(Allocation)
+    usual = table.choice("allocation", known, "soft-finger" if driven else "paper")
+    own = table.choice("drivable_allocation", known, usual)
     return cast("Allocation", own if driven else usual)
 
 
@@ -114,15 +100,13 @@ def with_force_limit(task: Task, payload: Payload, contacts: Sequence[Contact]) 
 
 def _orientation(table: Table) -> Orientation:
     """What the last three numbers of every pose of the task mean."""
-    rotation = cast("Rotation", table.choice("rotation", ROTATIONS, ROTATIONS[0]))
+    known = get_args(Rotation)
+    rotation = cast("Rotation", table.choice("rotation", known, known[0]))
+    rpy = table.vector("rotation_reference", (quantity.ANGLE,) * 3, default=(0.0, 0.0, 0.0))
     if rotation == "roll-pitch-yaw":
         if "rotation_reference" in table:
-            table.raw("rotation_reference")
-            table.problems.add(
-                table.at("rotation_reference"), 'allowed with rotation = "quaternion" only'
-            )
+            table.add("rotation_reference", 'allowed with rotation = "quaternion" only')
         return Orientation(rotation)
-    rpy = table.vector("rotation_reference", (quantity.ANGLE,) * 3, default=(0.0, 0.0, 0.0))
     return Orientation(rotation, read_only(rotation_from_rpy(rpy)))
 
 
@@ -132,8 +116,8 @@ def _force_limit(table: Table) -> tuple[float, float]:
         return (0.0, np.inf)
     low, high = table.vector("force_limit", (quantity.FORCE,) * 2)
     if low > high:
-        table.problems.add(
-            table.at("force_limit"),
+        table.add(
+            "force_limit",
             f"found {low:g} above {high:g}; allowed is the least limit, then the largest",
         )
     return (float(low), float(high))
@@ -146,32 +130,24 @@ def _fixed(table: Table, key: str) -> Waypoint:
 
 def _waypoints(table: Table, names: Sequence[str]) -> list[Waypoint]:
     """One fixed waypoint, or `count` free ones that share their bounds."""
-    problems = table.problems
-    if "fixed" in table:
+    if table.has("fixed"):
         pose = table.vector("fixed", quantity.POSE)
-        beside = [key for key in ("lower", "upper", "count") if key in table]
-        if beside:
-            for key in beside:
-                table.raw(key)
-            listed = " and ".join(map(repr, beside))
-            problems.add(table.at("fixed"), f"found beside {listed}; allowed is one or the other")
+        table.refuse("fixed", ("lower", "upper", "count"))
         table.close()
         return [Waypoint(pose, pose)]
-    lower = table.vector("lower", quantity.POSE)
-    upper = table.vector("upper", quantity.POSE)
+    lower, upper = (table.vector(key, quantity.POSE) for key in ("lower", "upper"))
     count = table.integer("count", 1, MAX_WAYPOINTS, 1)
-    table.raw("fixed", ())
     table.close()
-    if problems.clean(table.path):
+    if table.problems.clean(table.path):
         for index, (component, low, high) in enumerate(zip(names, lower, upper, strict=True)):
             if low > high:
-                problems.add(
-                    f"{table.at('lower')}[{index}]",
+                table.add(
+                    f"lower[{index}]",
                     f"found {low:g} for {component}, above its upper bound {high:g}; allowed is "
                     "lower <= upper",
                 )
         if np.array_equal(lower, upper):
-            problems.add(
+            table.problems.add(
                 table.path, "lower equals upper everywhere; a fixed pose is written fixed = [...]"
             )
     return [Waypoint(lower, upper)] * count
@@ -190,26 +166,20 @@ def _read_initial(table: Table, free: list[Waypoint], names: Sequence[str]) -> A
         checked_vector(row, quantity.POSE, f"{path}[{index}]", problems)
         for index, row in enumerate(value)
     ]
-    if not problems.clean(table.at("waypoints")):
-        return read_only(np.reshape(rows, (-1, 6)))
+    found = read_only(np.reshape(rows, (-1, 6)))
+    if not table.clean("waypoints"):
+        return found
     if len(rows) != len(free):
         problems.add(
             path, f"found {len(rows)} rows; allowed is one per free waypoint, {len(free)} here"
         )
     for row, (values, waypoint) in enumerate(zip(rows, free, strict=False)):
-        if not problems.clean(f"{path}[{row}]"):
-            continue
-        outside = np.flatnonzero((values < waypoint.lower) | (values > waypoint.upper))
-        for column in outside:
+        low, high = waypoint.lower, waypoint.upper
+        sound = problems.clean(f"{path}[{row}]")
+        for column in np.flatnonzero((values < low) | (values > high)) if sound else ():
             problems.add(
                 f"{path}[{row}][{column}]",
                 f"found {values[column]:g} for {names[int(column)]}, outside its bounds; allowed "
-                f"is {waypoint.lower[column]:g} to {waypoint.upper[column]:g}",
+                f"is {low[column]:g} to {high[column]:g}",
             )
-    return read_only(np.reshape(rows, (-1, 6)))
-
-
-def _allowed_contact(table: Table) -> AllowedContact:
-    contact = AllowedContact(table.text("body"), table.number("departure", quantity.DEPARTURE))
-    table.close()
-    return contact
+    return found

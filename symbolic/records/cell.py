@@ -12,36 +12,45 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
-from symbolic.array import Array, Vector
+from symbolic.array import Array, Filling, Range, Vector
+from symbolic.records import quantities as quantity
 from symbolic.records.content import digest_of_parts
-from symbolic.records.poses import inverse
+from symbolic.records.poses import inverse, read_only
+from symbolic.records.problems import Label, form_of
 from symbolic.records.task import Task
+
+
+def _zeros() -> Array:
+    return read_only(np.zeros(3))
 
 
 @dataclass(frozen=True)
 class Box:
     """A cuboid centred at its frame. size: (3,) full edge lengths [m]."""
 
-    size: Array
+    size: Annotated[Vector, quantity.SHAPE_SIZE]
 
 
 @dataclass(frozen=True)
 class Cylinder:
     """A cylinder centred at its frame, axis along z. radius, length [m]."""
 
-    radius: float
-    length: float
+    radius: Annotated[float, quantity.SHAPE_SIZE]
+    length: Annotated[float, quantity.SHAPE_SIZE]
 
 
 @dataclass(frozen=True)
 class Sphere:
     """A sphere centred at its frame. radius [m]."""
 
-    radius: float
+    radius: Annotated[float, quantity.SHAPE_SIZE]
+
+
+Scale = Annotated[Vector, quantity.SCALE, Filling()]
 
 
 @dataclass(frozen=True)
@@ -49,7 +58,7 @@ class Mesh:
     """A triangle mesh file (STL, OBJ, PLY or OFF). scale: (3,) factor per axis."""
 
     path: Path
-    scale: Array
+    scale: Scale = field(default_factory=lambda: read_only(np.ones(3)))
 
 
 Shape = Box | Cylinder | Sphere | Mesh
@@ -78,8 +87,8 @@ class Capsule:
     radius [m]; length between the centres of the end spheres [m].
     """
 
-    radius: float
-    length: float
+    radius: Annotated[float, quantity.SHAPE_SIZE]
+    length: Annotated[float, quantity.SHAPE_SIZE]
 
 
 # --- an arm with its tool ---
@@ -95,9 +104,18 @@ class ToolLoad:
         inertia: (3, 3) about the centre of mass, flange axes [kg m^2].
     """
 
-    mass: float
-    centre_of_mass: Array
-    inertia: Array
+    mass: Annotated[float, quantity.MASS]
+    centre_of_mass: Annotated[Vector, quantity.POSITION] = field(default_factory=_zeros)
+    inertia: Array = field(default_factory=lambda: read_only(np.zeros((3, 3))))
+
+
+ADDRESS = form_of(
+    r"[A-Za-z0-9](?:[A-Za-z0-9.:-]{0,251}[A-Za-z0-9])?", "a host name or an IP address"
+)
+"""Host names, IPv4 and IPv6 addresses; nothing that ends a string of a robot's language."""
+
+PREFIX = form_of(r"(?:[A-Za-z][A-Za-z0-9_]{0,39})?", "letters, digits, _, with a letter first")
+"""What names of joints may begin with in ROS; '' for nothing."""
 
 
 @dataclass(frozen=True)
@@ -113,14 +131,14 @@ class Driver:
             option: a sensor at the flange, and instructions that press with a force.
     """
 
-    address: str = ""
-    prefix: str | None = None
-    rate: float | None = None
-    lag: float = 0.0
+    address: Annotated[str, ADDRESS] = ""
+    prefix: Annotated[str, PREFIX] | None = None
+    rate: Annotated[float, quantity.RATE] | None = None
+    lag: Annotated[float, quantity.LAG] = 0.0
     force_control: bool = False
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Robot:
     """One arm: its model file, where it stands, what it carries and what it may do.
 
@@ -139,7 +157,7 @@ class Robot:
         acceleration_max: (n,) [rad/s^2].
         torque_max: (n,) [N m, or N].
         min_manipulability: least allowed |det J| of the flange-pad Jacobian of the six joints that
-            follow the box [m^3].
+            follow the box [m^3]; 9 of 10 random poses of a 1.3 m arm exceed 0.005.
         xacro_arguments: names and values of the xacro file's arguments.
         srdf: file whose disabled pairs of links are not checked for collision.
         chain_root: link of the URDF that the arm begins at, the flange being its other end; ''
@@ -152,7 +170,7 @@ class Robot:
         driver: of its controller, for bundles.
     """
 
-    name: str
+    name: Label
     urdf: Path
     package_dirs: tuple[Path, ...]
     flange: str
@@ -165,7 +183,7 @@ class Robot:
     velocity_max: Array
     acceleration_max: Array
     torque_max: Array
-    min_manipulability: float
+    min_manipulability: Annotated[float, quantity.MANIPULABILITY] = 0.005
     xacro_arguments: tuple[tuple[str, str], ...] = ()
     srdf: Path | None = None
     chain_root: str = ""
@@ -196,14 +214,14 @@ class Payload:
     """
 
     size: Array
-    mass: float
-    centre_of_mass: Array
+    mass: Annotated[float, quantity.MASS]
+    centre_of_mass: Annotated[Vector, quantity.POSITION]
     inertia: Array
-    velocity_max: float
-    acceleration_max: float
-    angular_velocity_max: float
-    angular_acceleration_max: float
-    jerk_max: float | None = None
+    velocity_max: Annotated[float, quantity.SPEED] = 1.0
+    acceleration_max: Annotated[float, quantity.ACCELERATION] = 5.0
+    angular_velocity_max: Annotated[float, quantity.ANGULAR_SPEED] = 2.0
+    angular_acceleration_max: Annotated[float, quantity.ANGULAR_ACCELERATION] = 10.0
+    jerk_max: Annotated[float, quantity.JERK] | None = None
     shape: Cylinder | Mesh | None = None
 
     @property
@@ -256,17 +274,17 @@ class Uncertainty:
         stated: whether the cell states the set; else it is the usual one.
     """
 
-    friction: float = 0.0
-    mass: float = 0.0
-    centre_of_mass: Vector = field(default_factory=lambda: np.zeros(3))
-    pad_position: float = 0.0
-    disturbance: Vector = field(default_factory=lambda: np.zeros(3))
-    tracking: float = 0.0
-    internal_force: float = 0.0
-    tilt: float = 0.0
-    relative_position: float = 0.0
-    relative_angle: float = 0.0
-    stiffness: float = 0.0
+    friction: Annotated[float, quantity.SHARE] = 0.0
+    mass: Annotated[float, quantity.SHARE] = 0.0
+    centre_of_mass: Annotated[Vector, quantity.DISPLACEMENT] = field(default_factory=_zeros)
+    pad_position: Annotated[float, quantity.DISPLACEMENT] = 0.0
+    disturbance: Annotated[Vector, quantity.DISTURBANCE] = field(default_factory=_zeros)
+    tracking: Annotated[float, quantity.SHARE] = 0.0
+    internal_force: Annotated[float, quantity.INTERNAL_FORCE] = 0.0
+    tilt: Annotated[float, quantity.TILT] = 0.0
+    relative_position: Annotated[float, quantity.DISPLACEMENT] = 0.0
+    relative_angle: Annotated[float, quantity.TILT] = 0.0
+    stiffness: Annotated[float, quantity.ARM_STIFFNESS] = 0.0
     stated: bool = True
 
     @property
@@ -372,12 +390,12 @@ class Handling:
         set_down_height: likewise below the carry's goal.
     """
 
-    stand_off: float = 0.05
-    pressing_speed: float = 0.05
-    pressing_rate: float = 100.0
-    lifting_speed: float = 0.1
-    lift_height: float | None = None
-    set_down_height: float | None = None
+    stand_off: Annotated[float, quantity.STAND_OFF] = 0.05
+    pressing_speed: Annotated[float, quantity.SPEED] = 0.05
+    pressing_rate: Annotated[float, quantity.FORCE_RATE] = 100.0
+    lifting_speed: Annotated[float, quantity.SPEED] = 0.1
+    lift_height: Annotated[float, quantity.LIFT] | None = None
+    set_down_height: Annotated[float, quantity.LIFT] | None = None
 
 
 # --- identity ---
@@ -461,9 +479,9 @@ class IgnoredPair:
         reason: shown wherever pairs are listed.
     """
 
-    first: str
-    second: str
-    reason: str
+    first: Label
+    second: Label
+    reason: Label
 
 
 @dataclass(frozen=True)
@@ -476,9 +494,9 @@ class CollisionSettings:
         most_pieces: most convex pieces of all bodies together that are worked with.
     """
 
-    tolerance: float = 0.0
+    tolerance: Annotated[float, quantity.TOLERANCE] = 0.0
     ignored: tuple[IgnoredPair, ...] = ()
-    most_pieces: int = 500
+    most_pieces: Annotated[int, Range(1, 20_000)] = 500
 
 
 @dataclass(frozen=True)

@@ -34,7 +34,7 @@ class Group:
     symbols: Any
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class NumberedRobot(Robot):
     """An arm.
 
@@ -88,7 +88,7 @@ class NumberedJoint(RedundantJoint):
         return np.array(self.free, dtype=np.bool_)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class NumberedTask(Task):
     """A task. given: its numbers."""
 

@@ -8,7 +8,9 @@ import reprlib
 import unicodedata
 from collections.abc import Iterable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Annotated, Any, ClassVar
+
+from symbolic.array import Form
 
 MAX_NAME_LENGTH = 80
 
@@ -31,6 +33,9 @@ class Problems:
     found: list[tuple[str, str]] = field(default_factory=list)
 
     uncounted: int = 0
+
+    open: ClassVar[bool] = False
+    """Whether keys that nobody asks for are none."""
 
     def add(self, path: str, text: str) -> None:
         """Record that the value at `path` is wrong; `text` says what is found and allowed.
@@ -55,6 +60,20 @@ class Problems:
         """All problems as `key.path: text`, and how many more there are."""
         told = tuple(f"{path}: {text}" for path, text in self.found)
         return (*told, f"and {self.uncounted} more") if self.uncounted else told
+
+
+class FirstProblem(Problems):
+    """Stops at the first problem; keys of a document that nobody asks for are left alone."""
+
+    open = True
+
+    def add(self, path: str, text: str) -> None:
+        """Raise the problem.
+
+        Raises:
+            ValueError: with the place and the text.
+        """
+        raise ValueError(f"{f'at {path}: ' if path else ''}{text}")
 
 
 def _is_within(path: str, prefix: str) -> bool:
@@ -104,6 +123,20 @@ def text_problem(value: Any) -> str:
     if any(unicodedata.category(character).startswith(("C", "Zl", "Zp")) for character in value):
         return "it contains a control character; allowed are printable characters in one line"
     return ""
+
+
+Label = Annotated[str, Form(text_problem)]
+"""A text for people and reports."""
+
+
+def form_of(pattern: str, meaning: str) -> Form:
+    """Texts of a pattern, and what they mean."""
+    form = re.compile(pattern)
+
+    def problem(value: Any) -> str:
+        return "" if isinstance(value, str) and form.fullmatch(value) else f"allowed: {meaning}"
+
+    return Form(problem)
 
 
 # --- patterns that stand for several names ---

@@ -11,13 +11,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from symbolic.array import Array
+from symbolic.array import Array, Filling, Pair, Range
+from symbolic.records import quantities as quantity
 from symbolic.records.poses import Orientation
+from symbolic.records.problems import Label
 
 TimeLaw = Literal["constant", "ramped", "optimal"]
 Allocation = Literal["paper", "joint", "soft-finger"]
@@ -79,11 +81,11 @@ class AllowedContact:
             fixed waypoint at which the payload touches (or is within tolerance of) the body [m].
     """
 
-    body: str
-    departure: float
+    body: Label
+    departure: Annotated[float, quantity.DEPARTURE]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Task:
     """What is to be carried where, and how a candidate is sampled and judged.
 
@@ -108,14 +110,14 @@ class Task:
     """
 
     waypoints: tuple[Waypoint, ...]
-    samples: int
-    time_law: TimeLaw
-    reference_speed: float
-    reference_angular_speed: float
-    ramp_time: float
-    reference_force: Array
+    samples: Annotated[int, Range(5, 2_000)] = 100
+    time_law: TimeLaw = "constant"
+    reference_speed: Annotated[float, quantity.SPEED]
+    reference_angular_speed: Annotated[float, quantity.ANGULAR_SPEED] = 0.5
+    ramp_time: Annotated[float, quantity.DURATION] = 0.5
+    reference_force: Annotated[Pair, quantity.FORCE, Filling()]
     initial: Array
-    allowed_contacts: tuple[AllowedContact, ...]
+    allowed_contacts: tuple[AllowedContact, ...] = ()
     allocation: Allocation = "paper"
     force_limit: tuple[float, float] = (0.0, np.inf)
     redundant: tuple[RedundantJoint, ...] = ()

@@ -18,8 +18,7 @@ from hybrid_opt.campaign.journal import Journal, decode
 from hybrid_opt.campaign.results import read_configuration
 from hybrid_opt.campaign.settings import FinishedReplica, StageMark
 from hybrid_opt.polishing.records import PolishedFront
-from hybrid_opt.store.files import read_bytes
-from hybrid_opt.store.json_records import read_record
+from hybrid_opt.store.files import read_bytes, read_record
 from hybrid_opt.store.trajectory_file import read_trajectory
 from studies.research.best_front import read_reference_front
 from studies.study.summary import CampaignSummary

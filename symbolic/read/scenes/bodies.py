@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from symbolic import outside
-from symbolic.array import Array
+from symbolic.array import Array, Range
 from symbolic.errors import CollisionModelError, OutsideError
 from symbolic.read.descriptions import find_package
 from symbolic.read.elements import parse_elements
@@ -26,14 +26,13 @@ from symbolic.read.tables import Table, read_body
 from symbolic.records import PAYLOAD, Body, Box, Capsule, Cylinder, Mesh, Shape, Sphere
 from symbolic.records.poses import rpy_from_rotation, transform
 from symbolic.records.problems import MAX_NAME_LENGTH, Problems
-from symbolic.records.quantities import Quantity
 
 MOST_BODIES = 5000
 SLAB = (10.0, 10.0, 0.1)
 """What stands for a plane: as wide as a body may be, around its point nearest to the world's origin
 [m]."""
 
-ANY = Quantity("", -1e9, 1e9)
+ANY = Range(-1e9, 1e9)
 """A number that is only read; whether a body may have it is judged with the body."""
 
 DIGITS = 12

@@ -33,7 +33,7 @@ from hybrid_opt.campaign.settings import chosen
 from hybrid_opt.campaign.stages import drivable_settings
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.evaluate.evaluation import REASONS, Evaluations
-from hybrid_opt.store.json_records import from_json, to_json
+from hybrid_opt.store.files import from_json, to_json
 from symbolic.errors import SettingsError
 from tests.hybrid_opt.campaign.fake import OBJECTIVES, verdicts
 

@@ -31,7 +31,7 @@ from hybrid_opt.polishing.records import PolishedFront, PolishOutcome
 from hybrid_opt.polishing.settings import FillSettings, PolishSettings, ProbeSettings
 from hybrid_opt.polishing.solvers.base import Residuals
 from hybrid_opt.progress import Progress
-from hybrid_opt.store.json_records import from_json, to_json
+from hybrid_opt.store.files import from_json, to_json
 from symbolic.array import Array
 from symbolic.read.cell import load
 from tests.symbolic.cells import RACK

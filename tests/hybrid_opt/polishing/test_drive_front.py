@@ -15,7 +15,7 @@ from hybrid_opt.polishing.drive_front import best_of
 from hybrid_opt.polishing.polisher import Polisher
 from hybrid_opt.polishing.records import PolishedFront, PolishOutcome
 from hybrid_opt.polishing.settings import DrivableSettings, PolishSettings
-from hybrid_opt.store.json_records import from_json, to_json
+from hybrid_opt.store.files import from_json, to_json
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.records.task import initial_decision

@@ -28,7 +28,7 @@ from hybrid_opt.polishing.point import Solution
 from hybrid_opt.polishing.polisher import Polisher
 from hybrid_opt.polishing.records import PolishedFront, PolishOutcome
 from hybrid_opt.polishing.settings import FillSettings, PolishSettings
-from hybrid_opt.store.json_records import from_json, to_json
+from hybrid_opt.store.files import from_json, to_json
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.read.cell import load

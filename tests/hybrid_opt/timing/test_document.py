@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 
 from hybrid_opt.errors import ResultsError
-from hybrid_opt.store.files import write_json
-from hybrid_opt.store.json_records import to_json
+from hybrid_opt.store.files import to_json, write_json
 from hybrid_opt.timing.analysis import (
     TimedTrajectory,
     read_timing,

@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hybrid_opt.store.files import write_json
-from hybrid_opt.store.json_records import to_json
+from hybrid_opt.store.files import to_json, write_json
 from hybrid_opt.sweeping import Combination, Sweep, stored_sweep
 from studies.programs.sweeping import _figure, _table
 from studies.sweep import main

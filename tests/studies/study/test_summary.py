@@ -30,8 +30,7 @@ from hybrid_opt.indicators.statistics import rank_test
 from hybrid_opt.polishing.records import PolishedFront
 from hybrid_opt.progress import Progress
 from hybrid_opt.static_hold import StaticHold
-from hybrid_opt.store.files import write_json
-from hybrid_opt.store.json_records import from_json, to_json
+from hybrid_opt.store.files import from_json, to_json, write_json
 from hybrid_opt.timing.analysis import closest_to_reference_timing, read_timing
 from hybrid_opt.timing.solve import time_path
 from studies import run
