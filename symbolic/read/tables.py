@@ -323,7 +323,7 @@ def _single(kind: Any, marks: Sequence[Any], value: Any, path: str, problems: Pr
     if not problem:
         return value
     problems.add(path, f"found {shown(value)}; {problem}")
-    return _stand_in(Annotated[kind, *marks])
+    return _stand_in(kind, marks)
 
 
 def _text_problem(value: Any) -> str:
@@ -337,9 +337,8 @@ def _text_problem(value: Any) -> str:
     return ""
 
 
-def _stand_in(kind: Any) -> Any:
+def _stand_in(kind: Any, marks: Sequence[Any] = ()) -> Any:
     """What takes the place of a wrong or missing value."""
-    marks: Sequence[Any] = ()
     if get_origin(kind) is Annotated:
         kind, *marks = get_args(kind)
     for mark in marks:
@@ -403,7 +402,7 @@ def _array(
         found = np.array(value, dtype=float)
     except (TypeError, ValueError, OverflowError):
         problems.add(path, f"no numbers of shape {expected}")
-        return np.asarray(_stand_in(Annotated[Any, shape]))
+        return np.asarray(_stand_in(Any, (shape,)))
     if found.size == 0 and shape.sizes[0] is None:
         found = found.reshape(0, *(size or 0 for size in shape.sizes[1:]))
     fits = len(found.shape) == len(shape.sizes) and all(
@@ -420,7 +419,7 @@ def _array(
         problem = "holds numbers that are not whole, or neither true nor false"
     if problem:
         problems.add(path, problem)
-        return np.asarray(_stand_in(Annotated[Any, shape]))
+        return np.asarray(_stand_in(Any, (shape,)))
     numbers.setflags(write=False)
     return numbers
 
