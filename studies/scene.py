@@ -20,7 +20,7 @@ from symbolic.errors import OutsideError, SceneError
 from symbolic.outside import replace_file
 
 if TYPE_CHECKING:
-    from symbolic.read.scenes.bodies import Scene
+    from symbolic.read.scene_bodies import Scene
 
 
 def _add_options(parser: Parser) -> None:
@@ -37,7 +37,7 @@ def _add_options(parser: Parser) -> None:
 def add_scene(options: argparse.Namespace) -> int:
     """Print a scene's bodies, or add them to a file; returns the exit code."""
     from hybrid_opt.proposing.problem import completed
-    from symbolic.read.scenes.read import read_scene
+    from symbolic.read.scenes import read_scene
 
     scene = read_scene(options.scene)
     for told in scene.notes:

@@ -10,17 +10,18 @@ a joint of both moves (a lift, a torso) to the first, and what neither moves sta
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from types import MappingProxyType
+from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
 import pinocchio as pin
 
 from symbolic.errors import RobotModelError
-from symbolic.read.urdf import Urdf, UrdfJoint, read_urdf
+from symbolic.read.urdf import Urdf, read_urdf
 from symbolic.records import PAYLOAD, Robot, Workcell
 from symbolic.records.problems import matching, suggestion
 
@@ -41,17 +42,14 @@ def chain_joints(urdf: Urdf, root: str, tip: str) -> tuple[str, ...]:
                 f"found {link!r}, no link of {urdf.file}"
                 f"{suggestion(link, links) or f'; it has {listed(links)}'}"
             )
-    moved_by = {joint.child: name for name, joint in urdf.joints.items()}
-    found: list[str] = []
-    link = tip
-    while link != root:
-        if link not in moved_by:
-            raise RobotModelError(
-                f"{tip!r} does not hang on {root!r}; allowed are two links one behind the other"
-            )
-        found.append(moved_by[link])
-        link = urdf.joints[moved_by[link]].parent
-    return tuple(name for name in reversed(found) if urdf.joints[name].kind != "fixed")
+    way = list(urdf.above(tip))
+    ends = [tip, *(urdf.joints[name].parent for name in way)]
+    if root not in ends:
+        raise RobotModelError(
+            f"{tip!r} does not hang on {root!r}; allowed are two links one behind the other"
+        )
+    below = way[: ends.index(root)]
+    return tuple(name for name in reversed(below) if urdf.joints[name].kind != "fixed")
 
 
 def held_joints(urdf: Urdf, moving: Sequence[str], locked: Positions) -> Positions:
@@ -69,16 +67,20 @@ def held_joints(urdf: Urdf, moving: Sequence[str], locked: Positions) -> Positio
         RobotModelError: a locked joint does not exist, or a joint mimics one that moves.
     """
     given = dict(locked)
+    free = [name for name, joint in urdf.joints.items() if joint.kind != "fixed"]
     for name in given:
-        _require_joint(urdf, name)
-    positions: dict[str, float] = {}
+        if name not in free:
+            hint = suggestion(name, free) or f"; it has {listed(free)}"
+            raise RobotModelError(f"no moving joint {name!r} in {urdf.file}{hint}")
+    for name in moving:
+        if urdf.joints[name].mimics:
+            raise RobotModelError(
+                f"joint {name!r} of the chain mimics {urdf.joints[name].mimics!r}; allowed are "
+                "joints that move by themselves"
+            )
 
     def position(name: str) -> float:
-        if name not in positions:
-            positions[name] = _held_at(name, urdf.joints[name])
-        return positions[name]
-
-    def _held_at(name: str, joint: UrdfJoint) -> float:
+        joint = urdf.joints[name]
         if name in given:
             return given[name]
         if not joint.mimics:
@@ -90,26 +92,7 @@ def held_joints(urdf: Urdf, moving: Sequence[str], locked: Positions) -> Positio
             )
         return joint.multiplier * position(joint.mimics) + joint.offset
 
-    for name in moving:
-        if urdf.joints[name].mimics:
-            raise RobotModelError(
-                f"joint {name!r} of the chain mimics {urdf.joints[name].mimics!r}; allowed are "
-                "joints that move by themselves"
-            )
-    return tuple(
-        (name, position(name))
-        for name, joint in urdf.joints.items()
-        if joint.kind != "fixed" and name not in moving
-    )
-
-
-def _require_joint(urdf: Urdf, name: str) -> None:
-    moving = [other for other, joint in urdf.joints.items() if joint.kind != "fixed"]
-    if name not in moving:
-        raise RobotModelError(
-            f"no moving joint {name!r} in {urdf.file}"
-            f"{suggestion(name, moving) or f'; it has {listed(moving)}'}"
-        )
+    return tuple((name, position(name)) for name in free if name not in moving)
 
 
 def without_links(urdf: Urdf, patterns: tuple[str, ...]) -> Urdf:
@@ -126,17 +109,12 @@ def without_links(urdf: Urdf, patterns: tuple[str, ...]) -> Urdf:
     for pattern in patterns:
         found = matching(pattern, urdf.links)
         if not found:
-            raise RobotModelError(
-                f"found {pattern!r}, which matches no link of {urdf.file}"
-                f"{suggestion(pattern, urdf.links) or f'; it has {listed(urdf.links)}'}"
-            )
+            hint = suggestion(pattern, urdf.links) or f"; it has {listed(urdf.links)}"
+            raise RobotModelError(f"found {pattern!r}, which matches no link of {urdf.file}{hint}")
         dropped.update(found)
-    waiting = list(dropped)
-    while waiting:
-        parent = waiting.pop()
-        behind = {j.child for j in urdf.joints.values() if j.parent == parent} - dropped
-        dropped |= behind
-        waiting += behind
+    for link in urdf.links:
+        if any(urdf.joints[name].parent in dropped for name in urdf.above(link)):
+            dropped.add(link)
     if len(dropped) == len(urdf.links):
         raise RobotModelError(f"every link of {urdf.file} would be dropped; keep the arm")
     joints = {name: joint for name, joint in urdf.joints.items() if joint.child not in dropped}
@@ -145,16 +123,16 @@ def without_links(urdf: Urdf, patterns: tuple[str, ...]) -> Urdf:
         kept = joints.keys() if element.tag == "joint" else set(urdf.links) - dropped
         if element.get("name") not in kept:
             tree.remove(element)
+
+    def left(by_link: Mapping[str, tuple[Any, ...]]) -> Mapping[str, tuple[Any, ...]]:
+        return MappingProxyType({k: found for k, found in by_link.items() if k not in dropped})
+
     return replace(
         urdf,
         links=tuple(link for link in urdf.links if link not in dropped),
         joints=MappingProxyType(joints),
-        collisions=MappingProxyType(
-            {link: found for link, found in urdf.collisions.items() if link not in dropped}
-        ),
-        visuals=MappingProxyType(
-            {link: found for link, found in urdf.visuals.items() if link not in dropped}
-        ),
+        collisions=left(urdf.collisions),
+        visuals=left(urdf.visuals),
         kinematics=ElementTree.tostring(tree, encoding="unicode"),
     )
 
@@ -355,18 +333,22 @@ def arm_links(robots: Arms, i: int) -> ArmLinks:
     Raises:
         RobotModelError: see `arm_model`.
     """
-    moved, still = _sorted_links(robots[i])
+    carried = _carriers(robots[i])
+    still = [link for link in carried if carried[link] == UNMOVED]
+    moved = [link for link in carried if carried[link] != UNMOVED]
     mount = _mount(robots[i], still)
     if one_machine(robots):
-        on_common, for_other = (_moved_by(robots[arm], common_joints(robots)) for arm in (i, 1 - i))
-        shared = [link for link in on_common if link in for_other]
+        common, on_other = common_joints(robots), _carriers(robots[1 - i])
+        on_common = [link for link in moved if carried[link] in common]
+        shared = [link for link in on_common if on_other.get(link) in common]
         mount = _mount(robots[i], (*still, *shared))
-        moved = tuple(
-            link for link in moved if link not in on_common or (i == 0 and link in shared)
-        )
-        _, still_for_other = _sorted_links(robots[1 - i])
-        still = tuple(link for link in still if link in still_for_other) if i == 0 else ()
-    return ArmLinks(moved, still, mount)
+        moved = [x for x in moved if x not in on_common or (i == 0 and x in shared)]
+        still = [link for link in still if i == 0 and on_other.get(link) == UNMOVED]
+    return ArmLinks(tuple(moved), tuple(still), mount)
+
+
+UNMOVED = "universe"
+"""What Pinocchio calls the joint that everything stands on."""
 
 
 def common_joints(robots: Arms) -> tuple[str, ...]:
@@ -425,47 +407,22 @@ def machine_problem(robots: Arms) -> str:
 
 def _is_behind(urdf: Urdf, link: str, joints: Collection[str]) -> bool:
     """Whether a link hangs on one of these joints."""
-    moved_by = {joint.child: other for other, joint in urdf.joints.items()}
-    while link in moved_by:
-        if moved_by[link] in joints:
-            return True
-        link = urdf.joints[moved_by[link]].parent
-    return False
+    return any(name in joints for name in urdf.above(link))
 
 
-def _sorted_links(robot: Robot) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Links with shapes that the arm moves, and those that it does not."""
+def _carriers(robot: Robot) -> dict[str, str]:
+    """The last joint of the arm that moves each link with shapes; 'universe' of one that stands
+    still."""
     model = arm_model(robot)
-    moved: list[str] = []
-    still: list[str] = []
-    for link in robot_urdf(robot).collision_links:
-        is_still = model.frames[link_frame(model, link)].parentJoint == 0
-        (still if is_still else moved).append(link)
-    return tuple(moved), tuple(still)
+    links = robot_urdf(robot).collision_links
+    return {link: model.names[model.frames[link_frame(model, link)].parentJoint] for link in links}
 
 
-def _moved_by(robot: Robot, joints: tuple[str, ...]) -> tuple[str, ...]:
-    """Links with shapes that hang on one of these joints and on no later one of the arm."""
-    if not joints:
-        return ()
-    model = arm_model(robot)
-    return tuple(
-        link
-        for link in robot_urdf(robot).collision_links
-        if model.names[model.frames[link_frame(model, link)].parentJoint] in joints
-    )
-
-
-def _mount(robot: Robot, still: tuple[str, ...]) -> str:
+def _mount(robot: Robot, still: Collection[str]) -> str:
     """The last link with shapes on the way from the root to the arm's first own joint."""
     urdf = robot_urdf(robot)
-    parents = {joint.child: joint.parent for joint in urdf.joints.values()}
-    link = robot.flange
-    while link not in still:
-        if link not in parents:
-            return ""
-        link = parents[link]
-    return link
+    way = (robot.flange, *(urdf.joints[name].parent for name in urdf.above(robot.flange)))
+    return next((link for link in way if link in still), "")
 
 
 # --- names of bodies ---

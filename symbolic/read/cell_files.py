@@ -17,12 +17,13 @@ import posixpath
 import re
 import zlib
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from contextlib import suppress
+from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from itertools import count
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, Literal
 
 from symbolic import outside
 from symbolic.errors import BundleError, DualArmError, OutsideError, RobotModelError
@@ -35,9 +36,10 @@ from symbolic.read.descriptions import (
     resolve_mesh,
 )
 from symbolic.read.robots import with_paths
+from symbolic.read.tables import checked
 from symbolic.read.urdf import parse_urdf, read_urdf
 from symbolic.records import Robot, Workcell
-from symbolic.records.problems import shown
+from symbolic.records.problems import FirstProblem, shown
 
 MAX_FILES = 1000
 MAX_TOTAL_BYTES = outside.CELL_BYTES
@@ -106,23 +108,16 @@ def unpack_cell(stored: CellFiles, folder: Path, check_digest: bool = True) -> W
     root = folder.resolve()
     for name in (*stored.files, *stored.folders, stored.workcell):
         _check_name(name)
-    for name in stored.folders:
-        try:
+    name = ""
+    try:
+        for name in stored.folders:
             (root / name).mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise BundleError(
-                f"stored folder {shown(name)} cannot be unpacked ({error.strerror})"
-            ) from error
-    for name, content in stored.files.items():
-        target = root / name
-        try:
-            target.parent.mkdir(parents=True, exist_ok=True)
-            with target.open("xb") as file:
+        for name, content in stored.files.items():
+            (root / name).parent.mkdir(parents=True, exist_ok=True)
+            with (root / name).open("xb") as file:
                 file.write(content)
-        except OSError as error:
-            raise BundleError(
-                f"stored file {shown(name)} cannot be unpacked ({error.strerror})"
-            ) from error
+    except OSError as error:
+        raise BundleError(f"stored {shown(name)} cannot be unpacked ({error.strerror})") from error
     _check_references(stored, root)
     try:
         workcell = load(root / stored.workcell, stored=True)
@@ -133,13 +128,37 @@ def unpack_cell(stored: CellFiles, folder: Path, check_digest: bool = True) -> W
     return workcell
 
 
+Encoding = Literal["utf-8", "zlib+base64"]
+
+
+@dataclass(frozen=True)
+class StoredFile:
+    """A file as JSON values: text as it is, binary and large files compressed."""
+
+    path: str
+    sha256: str
+    encoding: Encoding
+    content: str
+
+
+@dataclass(frozen=True)
+class StoredFiles:
+    """`CellFiles` as JSON values."""
+
+    workcell: str
+    digest: str
+    folders: tuple[str, ...]
+    files: tuple[StoredFile, ...]
+
+
 def cell_to_json(stored: CellFiles) -> dict[str, Any]:
-    """The files as JSON values: text as it is, binary and large files compressed."""
+    """The files as JSON values, see `StoredFiles`."""
+    files = [asdict(_packed(name, stored.files[name])) for name in sorted(stored.files)]
     return {
         "workcell": stored.workcell,
         "digest": stored.digest,
         "folders": list(stored.folders),
-        "files": [_file_to_json(name, stored.files[name]) for name in sorted(stored.files)],
+        "files": files,
     }
 
 
@@ -149,63 +168,50 @@ def cell_from_json(data: Any) -> CellFiles:
     Raises:
         BundleError: with the field that is wrong.
     """
-    if not isinstance(data, dict) or set(data) != {"workcell", "digest", "folders", "files"}:
-        raise BundleError("cell: expected the keys workcell, digest, folders and files")
-    entries, folders = data["files"], data["folders"]
-    if not isinstance(entries, list) or not 0 < len(entries) <= MAX_FILES:
-        raise BundleError(f"cell.files: expected 1 to {MAX_FILES} files")
-    if not isinstance(folders, list) or not all(isinstance(name, str) for name in folders):
-        raise BundleError("cell.folders: expected texts")
-    if len(folders) > MAX_FILES:
-        raise BundleError(f"cell.folders: expected at most {MAX_FILES} folders")
-    if not isinstance(data["workcell"], str) or not isinstance(data["digest"], str):
-        raise BundleError("cell.workcell and cell.digest: expected texts")
+    try:
+        stored: StoredFiles = checked(StoredFiles, data, "cell", FirstProblem())
+    except ValueError as error:
+        raise BundleError(str(error)) from error
+    for name in ("files", "folders"):
+        if len(getattr(stored, name)) > MAX_FILES:
+            raise BundleError(f"cell.{name}: expected at most {MAX_FILES}")
     files: dict[str, bytes] = {}
     room = MAX_TOTAL_BYTES
-    for index, entry in enumerate(entries):
-        name, content = _file_from_json(entry, index, room)
-        if name in files:
-            raise BundleError(f"cell.files[{index}]: {shown(name)} is stored twice")
-        files[name] = content
-        room -= len(content)
-    if data["workcell"] not in files:
+    for index, entry in enumerate(stored.files):
+        _check_name(entry.path)
+        if entry.path in files:
+            raise BundleError(f"cell.files[{index}]: {shown(entry.path)} is stored twice")
+        files[entry.path] = _unpacked(entry, f"cell.files[{index}]", room)
+        room -= len(files[entry.path])
+    if stored.workcell not in files:
         raise BundleError("cell.workcell: names no stored file")
-    return CellFiles(data["workcell"], files, tuple(folders), data["digest"])
+    return CellFiles(stored.workcell, files, stored.folders, stored.digest)
 
 
-def _file_to_json(name: str, content: bytes) -> dict[str, Any]:
-    entry: dict[str, Any] = {"path": name, "sha256": hashlib.sha256(content).hexdigest()}
+def _packed(name: str, content: bytes) -> StoredFile:
+    checksum = hashlib.sha256(content).hexdigest()
     if len(content) <= MAX_PLAIN_BYTES:
-        try:
-            return entry | {"encoding": "utf-8", "content": content.decode("utf-8")}
-        except UnicodeDecodeError:
-            pass
+        with suppress(UnicodeDecodeError):
+            return StoredFile(name, checksum, "utf-8", content.decode("utf-8"))
     packed = base64.b64encode(zlib.compress(content, 9)).decode("ascii")
-    return entry | {"encoding": "zlib+base64", "content": packed}
+    return StoredFile(name, checksum, "zlib+base64", packed)
 
 
-def _file_from_json(entry: Any, index: int, room: int) -> tuple[str, bytes]:
-    where = f"cell.files[{index}]"
-    keys = ("path", "sha256", "encoding", "content")
-    if not isinstance(entry, dict) or not all(isinstance(entry.get(key), str) for key in keys):
-        raise BundleError(f"{where}: expected texts {', '.join(keys)}")
-    _check_name(entry["path"])
+def _unpacked(entry: StoredFile, where: str, room: int) -> bytes:
     try:
-        if entry["encoding"] == "utf-8":
-            content = entry["content"].encode("utf-8")
-        elif entry["encoding"] == "zlib+base64":
-            packed = base64.b64decode(entry["content"], validate=True)
+        if entry.encoding == "utf-8":
+            content = entry.content.encode("utf-8")
+        else:
+            packed = base64.b64decode(entry.content, validate=True)
             # The limit keeps a small file from unfolding into a huge one.
             content = zlib.decompressobj().decompress(packed, room + 1)
-        else:
-            raise BundleError(f"{where}.encoding: expected utf-8 or zlib+base64")
     except (ValueError, zlib.error) as error:
         raise BundleError(f"{where}.content: cannot be decoded ({error})") from error
     if len(content) > room:
         raise BundleError(f"{where}: the files exceed {MAX_TOTAL_BYTES // 2**20} MiB unpacked")
-    if hashlib.sha256(content).hexdigest() != entry["sha256"]:
-        raise BundleError(f"{where}: the content of {shown(entry['path'])} is damaged")
-    return entry["path"], content
+    if hashlib.sha256(content).hexdigest() != entry.sha256:
+        raise BundleError(f"{where}: the content of {shown(entry.path)} is damaged")
+    return content
 
 
 def _check_name(name: str) -> None:

@@ -61,17 +61,22 @@ def _check_unique(entries: list[tuple[str, str]], problems: Problems) -> None:
 
 def check_contacts(workcell: Workcell, problems: Problems) -> None:
     """The pads can hold the payload whatever the motion asks, as the allocation takes them."""
-    if not problems.clean("contacts", *SHAPE_KEYS):
+    if not problems.clean("contacts", "task.allocation", *SHAPE_KEYS):
         return
-    allocation = workcell.task.allocation
+    allocation, first = workcell.task.allocation, workcell.contacts[0].T_box_pad
     if allocation == "soft-finger" and workcell.has_opposite_pads:
-        if problems.clean("task.allocation"):
-            _check_soft_fingers(workcell, problems)
-    elif allocation != "soft-finger" and workcell.has_facing_pads:
-        if allocation == "joint" and problems.clean("task.allocation"):
-            _check_overlap(workcell, problems)
+        # They carry any moment by pressing harder where the line between them lies well within
+        # their friction cones.
+        apart = first[:3, 3] - workcell.contacts[1].T_box_pad[:3, 3]
+        friction = min(contact.friction for contact in workcell.contacts)
+        room = friction * abs(float(apart @ first[:3, 2]))
+        _check_beside(workcell, room, "friction times the pads' distance", problems)
+    elif allocation == "joint" and workcell.has_facing_pads:
+        # Likewise where the patches overlap, seen along the normal.
+        room = sum(contact.patch_radius for contact in workcell.contacts)
+        _check_beside(workcell, room, "both patch radii together", problems)
     elif allocation == "paper":
-        if problems.clean("task.allocation"):
+        if not workcell.has_facing_pads:
             problems.add("contacts[1].xyz", _paper_problem(workcell))
     elif not has_force_closure(workcell):
         problems.add(
@@ -83,19 +88,15 @@ def check_contacts(workcell: Workcell, problems: Problems) -> None:
         )
 
 
-def _check_soft_fingers(workcell: Workcell, problems: Problems) -> None:
-    """Soft fingers carry any moment by pressing harder where the line between them lies well within
-    their friction cones."""
-    beside, friction = pads_beside(workcell), min(c.friction for c in workcell.contacts)
-    first, second = (contact.T_box_pad for contact in workcell.contacts)
-    apart = abs(float((first[:3, 3] - second[:3, 3]) @ first[:3, 2]))
-    room = PATCH_OVERLAP * friction * apart
+def _check_beside(workcell: Workcell, room: float, meaning: str, problems: Problems) -> None:
+    """Pads lie beside one another by less than most of some room [m]."""
+    beside, room = pads_beside(workcell), PATCH_OVERLAP * room
     if beside >= room:
         problems.add(
             "contacts[1].xyz",
-            f"faces a point {beside:g} m beside contacts[0]; task.allocation = 'soft-finger' "
-            f"allows less than {room:g} m here, {PATCH_OVERLAP:g} of friction times the pads' "
-            "distance",
+            f"faces a point {beside:g} m beside contacts[0]; task.allocation = "
+            f"{workcell.task.allocation!r} allows less than {room:g} m here, {PATCH_OVERLAP:g} of "
+            f"{meaning}",
         )
 
 
@@ -125,19 +126,6 @@ def pads_beside(workcell: Workcell) -> float:
     apart = workcell.contacts[0].T_box_pad[:3, 3] - workcell.contacts[1].T_box_pad[:3, 3]
     normal = workcell.contacts[0].T_box_pad[:3, 2]
     return float(np.linalg.norm(apart - (apart @ normal) * normal))
-
-
-def _check_overlap(workcell: Workcell, problems: Problems) -> None:
-    """The joint allocation carries any moment by pressing harder, which the patches' overlap,
-    seen along the normal, makes possible."""
-    offset = pads_beside(workcell)
-    room = sum(contact.patch_radius for contact in workcell.contacts)
-    if offset >= PATCH_OVERLAP * room:
-        problems.add(
-            "contacts[1].xyz",
-            f"faces a point {offset:g} m beside contacts[0]; task.allocation = 'joint' allows less "
-            f"than {PATCH_OVERLAP:g} of both patch radii together, {PATCH_OVERLAP * room:g} m here",
-        )
 
 
 def check_uncertainty(workcell: Workcell, problems: Problems) -> None:
@@ -174,7 +162,7 @@ def _face_name(inward_normal: Array) -> str:
 def check_shapes(workcell: Workcell, problems: Problems) -> None:
     """There are not more collision shapes than convex pieces allowed; a mesh has at least one."""
     most = workcell.collision.most_pieces
-    if not problems.clean("collision.most_pieces", *(f"robots[{i}].urdf" for i in (0, 1))):
+    if not problems.clean("collision.most_pieces", *_of_robots("urdf")):
         return
     counts = {"environment": len(workcell.environment)}
     for index, robot in enumerate(workcell.robots):
@@ -196,45 +184,46 @@ def check_references(workcell: Workcell, problems: Problems) -> None:
     """Names in allowed contacts and ignored pairs exist."""
     if not problems.clean("environment"):
         return
+
+    def check(path: str, name: str, known: list[str], meaning: str) -> None:
+        if problems.clean(path) and not matching(name, known):
+            hint = suggestion(name, known) or f"; they are {', '.join(known)}"
+            problems.add(path, f"found {name!r}; allowed is {meaning}{hint}")
+
     environment = [body.name for body in workcell.environment]
     for index, contact in enumerate(workcell.task.allowed_contacts):
         path = f"task.allowed_contacts[{index}].body"
-        if problems.clean(path) and contact.body not in environment:
-            hint = suggestion(contact.body, environment) or f"; they are {', '.join(environment)}"
-            problems.add(path, f"found {contact.body!r}; allowed is an environment body{hint}")
-    parts = ("name", "urdf", "chain", "flange", "locked_joints", "drop_links", "tool")
-    if not problems.clean(*(f"robots[{index}].{part}" for index in (0, 1) for part in parts)):
+        check(path, contact.body, environment, "an environment body")
+    if not problems.clean(*_of_robots("name", *ARM_KEYS, "flange", "tool")):
         return
     known = [name for group in body_names(workcell).values() for name in group]
     for index, pair in enumerate(workcell.collision.ignored):
-        for side, name in (("first", pair.first), ("second", pair.second)):
+        for side in ("first", "second"):
             path = f"collision.ignored[{index}].{side}"
-            if problems.clean(path) and not matching(name, known):
-                hint = suggestion(name, known) or f"; they are {', '.join(known)}"
-                problems.add(path, f"found {name!r}; allowed is a body of the cell{hint}")
+            check(path, getattr(pair, side), known, "a body of the cell")
+
+
+ARM_KEYS = ("urdf", "chain", "locked_joints", "drop_links")
+
+
+def _of_robots(*parts: str) -> list[str]:
+    """Keys of both robots."""
+    return [f"robots[{index}].{part}" for index in (0, 1) for part in parts]
 
 
 def check_machine(workcell: Workcell, problems: Problems) -> None:
     """Two arms of one machine move apart from one another, and agree on what stands still."""
-    parts = ("urdf", "chain", "locked_joints", "drop_links")
-    if problems.clean(*(f"robots[{index}].{part}" for index in (0, 1) for part in parts)):
-        problem = machine_problem(workcell.robots)
-        if problem:
-            problems.add("robots[1].chain", problem)
+    if problems.clean(*_of_robots(*ARM_KEYS)) and (problem := machine_problem(workcell.robots)):
+        problems.add("robots[1].chain", problem)
 
 
 def check_speeds(workcell: Workcell, problems: Problems) -> None:
     """The reference speeds are within the payload's own limits."""
-    task, payload = workcell.task, workcell.payload
-    for key, value, limit_key, limit in (
-        ("reference_speed", task.reference_speed, "velocity_max", payload.velocity_max),
-        (
-            "reference_angular_speed",
-            task.reference_angular_speed,
-            "angular_velocity_max",
-            payload.angular_velocity_max,
-        ),
+    for key, limit_key in (
+        ("reference_speed", "velocity_max"),
+        ("reference_angular_speed", "angular_velocity_max"),
     ):
+        value, limit = getattr(workcell.task, key), getattr(workcell.payload, limit_key)
         if problems.clean(f"task.{key}", f"payload.{limit_key}") and value > limit:
             problems.add(
                 f"task.{key}",
@@ -248,9 +237,8 @@ def check_reach(workcell: Workcell, problems: Problems) -> None:
     This is necessary, not sufficient: it costs no inverse kinematics.
     """
     poses = [(path, pose) for path, pose in _fixed_poses(workcell) if problems.clean(path)]
-    parts = ("urdf", "chain", "locked_joints", "drop_links", "flange", "base", "pad")
     for index, (robot, contact) in enumerate(zip(workcell.robots, workcell.contacts, strict=True)):
-        needed = [f"robots[{index}].{part}" for part in parts]
+        needed = [f"robots[{index}].{part}" for part in (*ARM_KEYS, "flange", "base", "pad")]
         if not problems.clean(*SHAPE_KEYS, f"contacts[{index}]", *needed):
             continue
         shoulder, length = stretched_length(robot)

@@ -59,22 +59,25 @@ def find_package(name: str, package_dirs: Sequence[Path], description: Path) -> 
     """
     if len(name) > LONGEST_NAME or not _NAME.fullmatch(name):
         return None
+    return next(_packages(name, package_dirs, description), None)
+
+
+def _packages(name: str, package_dirs: Sequence[Path], description: Path) -> Iterator[Path]:
+    """Folders of a package, the first one first."""
     for folder in package_dirs:
         package = package_in(folder, name)
         if package is not None:
-            return package
+            yield package
     for parent in description.resolve().parents:
         if parent.name == name or _package_name(parent) == name:
-            return parent
-    for prefix in _paths("AMENT_PREFIX_PATH"):
-        if (prefix / "share" / name).is_dir():
-            return prefix / "share" / name
+            yield parent
+    shared = [prefix / "share" / name for prefix in _paths("AMENT_PREFIX_PATH")]
+    yield from filter(Path.is_dir, shared)
     for folder in _paths("ROS_PACKAGE_PATH"):
-        found = _below(folder, name, DEEPEST_PACKAGE)
-        if found is not None:
-            return found
-    installed = (prefix / "share" / name for prefix in _environment_prefixes())
-    return next((folder for folder in installed if folder.is_dir()), None)
+        yield from _below(folder, name, DEEPEST_PACKAGE)
+    site_folders = (*site.getsitepackages(), *filter(None, sys.path))
+    prefixes = (Path(sys.prefix), *(Path(folder) / "cmeel.prefix" for folder in site_folders))
+    yield from filter(Path.is_dir, (prefix / "share" / name for prefix in prefixes))
 
 
 def package_in(folder: Path, name: str) -> Path | None:
@@ -122,29 +125,19 @@ def _paths(variable: str) -> Iterator[Path]:
     return (Path(entry) for entry in os.environ.get(variable, "").split(os.pathsep) if entry)
 
 
-def _below(folder: Path, name: str, levels: int) -> Path | None:
-    """A folder of that name with a package.xml, in a folder or below it."""
-    if folder.name == name and (folder / "package.xml").is_file():
-        return folder
+def _below(folder: Path, name: str, levels: int) -> Iterator[Path]:
+    """Folders of that name with a package.xml, in a folder or below it."""
+    is_package = (folder / "package.xml").is_file()
+    if folder.name == name and is_package:
+        yield folder
     try:
         inner = sorted(entry for entry in folder.iterdir() if entry.is_dir())
     except OSError:
-        return None
-    if levels == 0 or (folder / "package.xml").is_file():  # packages do not hold packages
-        return None
-    searched = (
-        _below(entry, name, levels - 1)
-        for entry in inner
-        if not entry.name.startswith(".") and entry.name not in _SKIPPED
-    )
-    return next((found for found in searched if found is not None), None)
-
-
-def _environment_prefixes() -> Iterator[Path]:
-    yield Path(sys.prefix)
-    for folder in (*site.getsitepackages(), *sys.path):
-        if folder:
-            yield Path(folder) / "cmeel.prefix"
+        return
+    if levels and not is_package:  # packages do not hold packages
+        for entry in inner:
+            if not entry.name.startswith(".") and entry.name not in _SKIPPED:
+                yield from _below(entry, name, levels - 1)
 
 
 def resolve_mesh(address: str, urdf: Path, package_dirs: Sequence[Path]) -> Path | None:
@@ -392,11 +385,19 @@ def _by_package(address: str, packages: Mapping[str, Path]) -> str:
 
 def _refusal(error: BaseException, xacro: Any) -> str:
     """What went wrong, and in which file and macro."""
-    causes = tuple(_causes(error))
-    own = next((cause for cause in causes if isinstance(cause, OutsideError)), None)
-    if own is not None:
-        return str(own)
-    place = _place(xacro)
+    causes = [error]
+    for one in causes:  # an error and those that it was made of
+        inner = (getattr(one, "exc", None), one.__cause__, one.__context__)
+        new = [cause for cause in inner if isinstance(cause, BaseException)]
+        causes += [cause for cause in new if all(cause is not met for met in causes)]
+    for cause in causes:
+        if isinstance(cause, OutsideError):
+            return str(cause)
+    files = [Path(file).name for file in xacro.filestack or () if file is not None]
+    macros = [macro.body.getAttribute("name") for macro in xacro.macrostack or ()]
+    where = [f"file {files[-1]}"] if len(files) > 1 else []
+    where += [f"macro {macros[-1]}"] if macros else []
+    place = f" ({', '.join(where)})" if where else ""
     if any(isinstance(cause, MemoryError) for cause in causes):
         return f"needs too much memory to be expanded{place}; simplify its expressions and macros"
     if any(isinstance(cause, RecursionError) for cause in causes):
@@ -406,26 +407,6 @@ def _refusal(error: BaseException, xacro: Any) -> str:
         )
     reason = " ".join(str(error).split()) or type(error).__name__
     return f"holds xacro macros that cannot be expanded: {reason[:300]}{place}"
-
-
-def _causes(error: BaseException) -> Iterator[BaseException]:
-    """An error and those that it was made of."""
-    left, met = [error], set[int]()
-    while left:
-        one = left.pop()
-        if id(one) not in met:
-            met.add(id(one))
-            yield one
-            inner = (getattr(one, "exc", None), one.__cause__, one.__context__)
-            left += [cause for cause in inner if isinstance(cause, BaseException)]
-
-
-def _place(xacro: Any) -> str:
-    files = [Path(file).name for file in xacro.filestack or () if file is not None]
-    macros = [macro.body.getAttribute("name") for macro in xacro.macrostack or ()]
-    where = [f"file {files[-1]}"] if len(files) > 1 else []
-    where += [f"macro {macros[-1]}"] if macros else []
-    return f" ({', '.join(where)})" if where else ""
 
 
 if __name__ == "__main__":

@@ -10,7 +10,7 @@ import numpy as np
 
 from symbolic.array import Array, Range
 from symbolic.errors import OutsideError
-from symbolic.read.tables import checked_number
+from symbolic.read.tables import checked_number, checked_vector
 from symbolic.records.poses import read_only
 from symbolic.records.problems import Problems, shown, suggestion
 
@@ -78,6 +78,9 @@ def parse_elements(document: str, root_tag: str = "robot") -> ElementTree.Elemen
 class Part:
     """One element with the words by which messages name it.
 
+    Attributes:
+        kept: the element with those of its attributes and inner elements that were read.
+
     Args:
         element: the element.
         path: where it stands, as `link 'arm'/collision[0]`; empty for the root.
@@ -88,22 +91,27 @@ class Part:
         self.element = element
         self.path = path
         self.problems = problems
+        self.kept = ElementTree.Element(element.tag)
 
     @property
     def tag(self) -> str:
         """The element's tag."""
         return self.element.tag
 
+    def at(self, key: str) -> str:
+        """How messages name an attribute."""
+        return f"{self.path} {key}".lstrip()
+
     def named(self, tag: str) -> dict[str, Part]:
         """The inner elements of a tag by their names, which have to differ."""
         found: dict[str, Part] = {}
         for index, element in enumerate(self.element.findall(tag)):
-            part = self._inner(element, f"{tag}[{index}]")
-            name = part.text("name")
-            if name in found:
-                self.problems.add(f"{part.path} name", f"found {name!r} again; names differ")
-            elif name:
-                found[name] = self._inner(element, f"{tag} {name!r}")
+            name = Part(element, f"{self.path}/{tag}[{index}]".lstrip("/"), self.problems)
+            if (called := name.text("name")) in found:
+                self.problems.add(name.at("name"), f"found {called!r} again; names differ")
+            elif called:
+                found[called] = self._inner(element, f"{tag} {called!r}")
+                found[called].text("name")
         return found
 
     def child(self, tag: str) -> Part | None:
@@ -120,9 +128,10 @@ class Part:
         return found
 
     def all(self, tag: str) -> list[Part]:
-        """Every inner element of a tag."""
+        """Every inner element of a tag; none of them is kept."""
+        path = f"{self.path}/{tag}".removeprefix("/")
         return [
-            self._inner(element, f"{tag}[{index}]")
+            Part(element, f"{path}[{index}]", self.problems)
             for index, element in enumerate(self.element.findall(tag))
         ]
 
@@ -139,21 +148,21 @@ class Part:
         """An attribute as written."""
         return self.element.get(key)
 
-    def written(self, *keys: str) -> dict[str, str]:
-        """Those of these attributes that are there, as written."""
-        return {key: self.element.attrib[key] for key in keys if key in self.element.attrib}
+    def inner_text(self, tag: str) -> str:
+        """The text between the tags of the first inner element of a tag; '' where there is none."""
+        return (self.element.findtext(tag) or "").strip()
 
     def text(self, key: str, most: int = MOST_NAME) -> str:
         """A printable text that is not empty; '' after a problem."""
         value = self.raw(key)
         if value is None:
-            self.problems.add(f"{self.path} {key}".lstrip(), "is missing")
+            self.problems.add(self.at(key), "is missing")
         elif not value or len(value) > most or not value.isprintable():
             self.problems.add(
-                f"{self.path} {key}".lstrip(),
-                f"found {shown(value)}; allowed are 1 to {most} printable characters",
+                self.at(key), f"found {shown(value)}; allowed are 1 to {most} printable characters"
             )
         else:
+            self.kept.set(key, value)
             return value
         return ""
 
@@ -163,43 +172,40 @@ class Part:
         if value and value not in allowed:
             hint = suggestion(value, allowed)
             self.problems.add(
-                f"{self.path} {key}",
+                self.at(key),
                 f"found {shown(value)}; allowed is one of {', '.join(allowed)}{hint}",
             )
             return ""
         return value
 
     def number(self, key: str, allowed: Range, default: str | None = None) -> float:
-        """A finite number within the quantity's range."""
+        """A finite number within a range."""
         return float(self.numbers(key, (allowed,), default)[0])
 
     def numbers(self, key: str, allowed: Sequence[Range], default: str | None = None) -> Array:
-        """Numbers separated by spaces, one quantity each."""
-        return self._numbers(f"{self.path} {key}", self.element.get(key, default), allowed)
+        """Numbers separated by spaces, one range each."""
+        if key in self.element.attrib:
+            self.kept.set(key, self.element.attrib[key])
+        return self._numbers(self.at(key), self.element.get(key, default), allowed)
 
     def content(self, allowed: Sequence[Range]) -> Array:
-        """The numbers between the element's tags, one quantity each."""
+        """The numbers between the element's tags, one range each."""
         return self._numbers(self.path, self.element.text, allowed)
 
     def _numbers(self, path: str, value: str | None, allowed: Sequence[Range]) -> Array:
-        if value is None:
-            self.problems.add(path, "is missing")
-            return read_only(np.ones(len(allowed)))
-        words = value.split()
-        count = "a number" if len(allowed) == 1 else f"{len(allowed)} numbers"
+        words = [] if value is None else value.split()
         if len(words) != len(allowed):
-            self.problems.add(path, f"found {shown(value)}; allowed: {count}")
+            count = "a number" if len(allowed) == 1 else f"{len(allowed)} numbers"
+            told = f"found {shown(value)}; allowed: {count}"
+            self.problems.add(path, "is missing" if value is None else told)
             return read_only(np.ones(len(allowed)))
-        found = []
-        for index, (word, kind) in enumerate(zip(words, allowed, strict=True)):
-            place = path if len(allowed) == 1 else f"{path}[{index}]"
-            if _NUMBER.fullmatch(word):
-                found.append(checked_number(float(word), kind, place, self.problems))
-            else:
-                told = f"found {shown(word)}; allowed is a number, {kind.allowed()}"
-                self.problems.add(place, told)
-                found.append(1.0)
-        return read_only(found)
+        # A word that is no number is told as a text that is none.
+        numbers = [float(word) if _NUMBER.fullmatch(word) else word for word in words]
+        if len(allowed) == 1:
+            return read_only([checked_number(numbers[0], allowed[0], path, self.problems)])
+        return checked_vector(numbers, allowed, path, self.problems)
 
     def _inner(self, element: ElementTree.Element, name: str) -> Part:
-        return Part(element, f"{self.path}/{name}".removeprefix("/"), self.problems)
+        found = Part(element, f"{self.path}/{name}".removeprefix("/"), self.problems)
+        self.kept.append(found.kept)
+        return found

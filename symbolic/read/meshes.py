@@ -46,65 +46,69 @@ def read_mesh(path: Path, scale: Array) -> trimesh.Trimesh:
     """A mesh, scaled by (3,) factors, its equal vertices merged.
 
     Raises:
-        CollisionModelError: see `convex_pieces`.
+        CollisionModelError: the file cannot be read, or is empty, flat, too large or too fine.
     """
-    mesh = _read(path)
+    try:
+        return _sound(_read(path), np.asarray(scale, dtype=float))
+    except OutsideError as error:
+        raise CollisionModelError(f"{path}: {error}") from error
+
+
+def _sound(mesh: trimesh.Trimesh, scale: Array) -> trimesh.Trimesh:
+    """A mesh scaled and checked."""
     if not np.all(np.isfinite(mesh.vertices)):
-        raise CollisionModelError(f"{path}: the mesh has vertices that are not finite numbers")
-    if len(mesh.faces) > MOST_FACES:
-        raise CollisionModelError(
-            f"{path}: enormous mesh, {len(mesh.faces)} triangles; at most {MOST_FACES} are "
-            "allowed: simplify it for collision checking"
-        )
+        raise OutsideError("the mesh has vertices that are not finite numbers")
+    _require_few(len(mesh.faces), MOST_FACES, "triangles")
     with np.errstate(over="ignore"):
-        factors = np.asarray(scale, dtype=float) * _collada_unit(mesh)
-        mesh.vertices = np.asarray(mesh.vertices, dtype=float) * factors
+        mesh.vertices = np.asarray(mesh.vertices, dtype=float) * (scale * _collada_unit(mesh))
         largest = np.abs(mesh.vertices).max()
     if np.prod(np.sign(scale)) < 0.0:
         mesh.faces = mesh.faces[:, ::-1]
     if not largest <= LARGEST_EXTENT:
-        raise CollisionModelError(
-            f"{path}: enormous mesh, {largest:g} m from its origin; at most {LARGEST_EXTENT:g} m "
-            "is allowed: is the file in millimetres? Set its scale"
+        raise OutsideError(
+            f"enormous mesh, {largest:g} m from its origin; at most {LARGEST_EXTENT:g} m is "
+            "allowed: is the file in millimetres? Set its scale"
         )
     extents = np.ptp(mesh.vertices, axis=0)
     if extents.min() < SMALLEST_SIZE:
-        raise CollisionModelError(
-            f"{path}: the mesh is flat, extents {np.round(extents, 9).tolist()} m; "
-            "give it a thickness or use a box"
+        raise OutsideError(
+            f"the mesh is flat, extents {np.round(extents, 9).tolist()} m; give it a thickness or "
+            "use a box"
         )
     mesh.merge_vertices()
-    parts = len(
-        trimesh.graph.connected_components(
-            mesh.face_adjacency, nodes=np.arange(len(mesh.faces)), min_len=1
-        )
-    )
-    if parts > MOST_PARTS:
-        raise CollisionModelError(
-            f"{path}: {parts} separate parts; at most {MOST_PARTS} are allowed: simplify the mesh, "
-            "weld its triangles or leave small parts out"
-        )
+    nodes = np.arange(len(mesh.faces))
+    parts = trimesh.graph.connected_components(mesh.face_adjacency, nodes=nodes, min_len=1)
+    _require_few(len(parts), MOST_PARTS, "separate parts")
     return mesh
+
+
+def _require_few(count: int, most: int, meaning: str) -> None:
+    if count > most:
+        raise OutsideError(
+            f"enormous mesh, {count} {meaning}; at most {most} are allowed: simplify it for "
+            "collision checking"
+        )
 
 
 def _read(path: Path) -> trimesh.Trimesh:
     """The triangles of a file, nothing but their number of corners checked."""
     kind = path.suffix.lower().removeprefix(".")
     if kind not in FORMATS:
-        raise CollisionModelError(
-            f"{path}: cannot be read as a mesh; allowed are the formats {', '.join(FORMATS)}"
+        raise OutsideError(
+            f"cannot be read as a mesh; allowed are the formats {', '.join(FORMATS)}"
         )
     try:
         content = outside.read_bytes(path, outside.MESH_BYTES)
+        if kind == "dae":
+            outside.xml_text(content)
     except OutsideError as error:
-        raise CollisionModelError(f"{path}: the mesh {error}; correct its path") from error
+        raise OutsideError(f"the mesh {error}") from error
     if kind == "dae":
-        _require_collada(content, path)
-    elif _is_text(kind, content) and _gaps(content) > MOST_WORDS[kind]:
-        raise CollisionModelError(
-            f"{path}: enormous mesh, more than {MOST_WORDS[kind]} words; simplify it for collision "
-            "checking"
-        )
+        # A meshful of attributes is one element too; its numbers are text in few elements.
+        marks = content.count(b"<") + content.count(b"=")
+        _require_few(marks, MOST_MARKS, "elements and attributes")
+    elif _is_text(kind, content):
+        _require_few(_gaps(content), MOST_WORDS[kind], "words")
     try:
         with warnings.catch_warnings(), np.errstate(all="ignore"):
             warnings.simplefilter("ignore")
@@ -113,29 +117,15 @@ def _read(path: Path) -> trimesh.Trimesh:
                 mesh = mesh.to_mesh()
     except Exception as error:  # trimesh raises whatever its many readers raise
         said = (str(error).splitlines() or [type(error).__name__])[0][:200]
-        raise CollisionModelError(
-            f"{path}: cannot be read as a mesh ({said}); give an STL, DAE, OBJ or PLY file"
+        raise OutsideError(
+            f"cannot be read as a mesh ({said}); give an STL, DAE, OBJ or PLY file"
         ) from error
     if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
-        raise CollisionModelError(f"{path}: the mesh is empty; export triangles")
-    if mesh.vertices.shape[1:] != (3,) or mesh.faces.shape[1:] != (3,):
-        raise CollisionModelError(f"{path}: the mesh's vertices have not three coordinates each")
-    if mesh.faces.min() < 0 or mesh.faces.max() >= len(mesh.vertices):
-        raise CollisionModelError(f"{path}: the mesh has triangles whose corners it does not have")
+        raise OutsideError("the mesh is empty; export triangles")
+    corners = mesh.vertices.shape[1:] == (3,) and mesh.faces.shape[1:] == (3,)
+    if not corners or mesh.faces.min() < 0 or mesh.faces.max() >= len(mesh.vertices):
+        raise OutsideError("the mesh is not made of triangles with three corners of its own")
     return mesh
-
-
-def _require_collada(content: bytes, path: Path) -> None:
-    try:
-        outside.xml_text(content)
-    except OutsideError as error:
-        raise CollisionModelError(f"{path}: the mesh {error}") from error
-    # A meshful of attributes is one element too; its numbers are text in few elements.
-    if content.count(b"<") + content.count(b"=") > MOST_MARKS:
-        raise CollisionModelError(
-            f"{path}: enormous mesh, more than {MOST_MARKS} elements and attributes; simplify it "
-            "for collision checking"
-        )
 
 
 def _is_text(kind: str, content: bytes) -> bool:

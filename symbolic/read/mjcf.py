@@ -16,6 +16,7 @@ import numpy as np
 from symbolic.array import Array
 from symbolic.errors import OutsideError
 from symbolic.outside import printable
+from symbolic.records import Box, Capsule, Cylinder, Sphere
 from symbolic.records.poses import inverse, rpy_from_rotation, transform
 
 NO_READER = "is a file of MuJoCo, whose reader is not installed: pip install 'dual-arm-carry[sim]'"
@@ -36,6 +37,23 @@ def compiled(path: Path) -> Any:
         return mujoco, spec, spec.compile()
     except ValueError as error:
         raise OutsideError(f"MuJoCo does not take it: {printable(str(error))}") from error
+
+
+def geom_shape(
+    mujoco: Any, model: Any, geom: int
+) -> tuple[str, Box | Sphere | Cylinder | Capsule | None]:
+    """The kind of a geom of a compiled model, such as 'box', and its shape where it is one of
+    these."""
+    kind = mujoco.mjtGeom(int(model.geom_type[geom])).name[7:].lower()
+    size = model.geom_size[geom]
+    radius, length = float(size[0]), 2.0 * float(size[1])
+    shapes = {
+        "box": Box(2.0 * size),
+        "sphere": Sphere(radius),
+        "cylinder": Cylinder(radius, length),
+        "capsule": Capsule(radius, length),
+    }
+    return kind, shapes.get(kind)
 
 
 @lru_cache(maxsize=8)
@@ -169,38 +187,29 @@ class _Writer:
         ElementTree.SubElement(element, "inertia", {k: repr(v) for k, v in moments.items()})
 
     def _collision(self, link: ElementTree.Element, geom: int, name: str) -> None:
-        model, kinds = self._model, self._mujoco.mjtGeom
+        model = self._model
         if not model.geom_contype[geom] and not model.geom_conaffinity[geom]:
             return
         pose = self._pose(model.geom_pos[geom], model.geom_quat[geom])
-        size = model.geom_size[geom]
-        round_one = {"radius": repr(float(size[0])), "length": repr(2.0 * float(size[1]))}
-        match kinds(int(model.geom_type[geom])):
-            case kinds.mjGEOM_BOX:
-                tag, said = "box", {"size": _text(2.0 * size)}
-            case kinds.mjGEOM_SPHERE:
-                tag, said = "sphere", {"radius": round_one["radius"]}
-            case kinds.mjGEOM_CYLINDER:
-                tag, said = "cylinder", round_one
-            case kinds.mjGEOM_CAPSULE:
-                tag, said = "capsule", round_one
-            case kinds.mjGEOM_MESH if model.mesh_pathadr[model.geom_dataid[geom]] >= 0:
-                mesh = int(model.geom_dataid[geom])
-                start = int(model.mesh_pathadr[mesh])
-                path = bytes(model.paths[start:]).split(b"\0", 1)[0].decode()
-                tag, said = "mesh", {"filename": path, "scale": _text(model.mesh_scale[mesh])}
-                # MuJoCo turns a mesh to its principal axes, and the geom with it.
-                pose = pose @ inverse(self._pose(model.mesh_pos[mesh], model.mesh_quat[mesh]))
-            case other:
-                scene = "" if model.geom_bodyid[geom] else "; name the robot's file, not a scene's"
-                raise OutsideError(
-                    f"body {name!r} has a shape of the kind {other.name[7:].lower()}; allowed are "
-                    f"boxes, cylinders, spheres, capsules and meshes with a file{scene}"
-                )
+        kind, shape = geom_shape(self._mujoco, model, geom)
+        mesh = int(model.geom_dataid[geom])
+        if shape is not None:
+            said = {key: _text(np.atleast_1d(value)) for key, value in vars(shape).items()}
+        elif kind == "mesh" and model.mesh_pathadr[mesh] >= 0:
+            path = bytes(model.paths[int(model.mesh_pathadr[mesh]) :]).split(b"\0", 1)[0]
+            said = {"filename": path.decode(), "scale": _text(model.mesh_scale[mesh])}
+            # MuJoCo turns a mesh to its principal axes, and the geom with it.
+            pose = pose @ inverse(self._pose(model.mesh_pos[mesh], model.mesh_quat[mesh]))
+        else:
+            scene = "" if model.geom_bodyid[geom] else "; name the robot's file, not a scene's"
+            raise OutsideError(
+                f"body {name!r} has a shape of the kind {kind}; allowed are boxes, cylinders, "
+                f"spheres, capsules and meshes with a file{scene}"
+            )
         element = ElementTree.SubElement(link, "collision")
         _origin(element, pose)
         geometry = ElementTree.SubElement(element, "geometry")
-        ElementTree.SubElement(geometry, tag, said)
+        ElementTree.SubElement(geometry, kind, said)
 
     def _pose(self, place: Array, quaternion: Array) -> Array:
         rotation = np.empty(9)

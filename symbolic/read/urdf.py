@@ -10,9 +10,9 @@ An SRDF, MoveIt's companion of a URDF, says which pairs of links are not checked
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from pathlib import Path
 from types import MappingProxyType
 from xml.etree import ElementTree
@@ -81,6 +81,17 @@ class Urdf:
     visuals: Mapping[str, tuple[str, ...]]
     kinematics: str
 
+    @cached_property
+    def moved_by(self) -> Mapping[str, str]:
+        """The joint by each link that is the child of one."""
+        return {joint.child: name for name, joint in self.joints.items()}
+
+    def above(self, link: str) -> Iterator[str]:
+        """The joints between a link and the root, from the link upwards."""
+        while link in self.moved_by:
+            yield self.moved_by[link]
+            link = self.joints[self.moved_by[link]].parent
+
     @property
     def collision_links(self) -> tuple[str, ...]:
         """Links that have a collision shape."""
@@ -136,38 +147,30 @@ def parse_urdf(content: bytes, file: str) -> Urdf:
 
 
 def _read_robot(root: Part, file: str) -> Urdf:
-    links = root.named("link")
-    joints = root.named("joint")
+    links, joints = root.named("link"), root.named("joint")
     if len(links) > MOST_LINKS:
         raise OutsideError(
             f"has {len(links)} links; allowed are {MOST_LINKS}: remove what the arm does not need"
         )
-    reduced = ElementTree.Element("robot", {"name": "robot"})
-    for name, link in links.items():
-        element = ElementTree.SubElement(reduced, "link", {"name": name})
-        element.extend(_inertial(link))
-    read: dict[str, UrdfJoint] = {}
-    for name, joint in joints.items():
-        element, read[name] = read_joint(joint, name)
-        reduced.append(element)
+    for link in links.values():
+        _check_inertial(link)
+    read = {name: _joint(joint) for name, joint in joints.items()}
     if root.problems.clean():
-        problem = tree_problem(tuple(links), {n: (j.parent, j.child) for n, j in read.items()})
         # Published files name joints to be mimicked that they do not have.
         read = {n: j if j.mimics in read else replace(j, mimics="") for n, j in read.items()}
-        problem = problem or mimic_problem({n: j.mimics for n, j in read.items() if j.mimics})
+        problem = _tree_problem(tuple(links), read) or _mimic_problem(read)
         if problem:
             root.problems.add(*problem)
-    collisions = {
-        name: tuple(map(_collision, link.all("collision"))) for name, link in links.items()
-    }
+    shapes = {name: tuple(map(_collision, link.all("collision"))) for name, link in links.items()}
+    root.kept.set("name", "robot")
     urdf = Urdf(
         file=file,
         name=root.element.get("name", ""),
         links=tuple(links),
         joints=MappingProxyType(read),
-        collisions=MappingProxyType({name: found for name, found in collisions.items() if found}),
+        collisions=MappingProxyType({name: found for name, found in shapes.items() if found}),
         visuals=MappingProxyType({name: _visual_meshes(link) for name, link in links.items()}),
-        kinematics=ElementTree.tostring(reduced, encoding="unicode"),
+        kinematics=ElementTree.tostring(root.kept, encoding="unicode"),
     )
     meshes = len({*urdf.collision_meshes, *urdf.visual_meshes})
     if meshes > MOST_MESHES:
@@ -175,25 +178,18 @@ def _read_robot(root: Part, file: str) -> Urdf:
     return urdf
 
 
-def _inertial(link: Part) -> list[ElementTree.Element]:
-    """The checked inertial element of a link, if it has one."""
+def _check_inertial(link: Part) -> None:
     inertial = link.child("inertial")
     if inertial is None:
-        return []
-    kept = ElementTree.Element("inertial")
-    kept.extend(origin_element(inertial))
-    mass_part = inertial.required("mass")
+        return
+    pose_of(inertial)
+    mass_part, matrix = inertial.required("mass"), inertial.required("inertia")
     mass = mass_part.number("value", quantity.LINK_MASS)
-    matrix = inertial.required("inertia")
-    values = {key: matrix.number(key, quantity.INERTIA) for key in _MOMENTS}
+    xx, xy, xz, yy, yz, zz = (matrix.number(key, quantity.INERTIA) for key in _MOMENTS)
     if inertial.problems.clean(mass_part.path, matrix.path):
-        xx, xy, xz, yy, yz, zz = values.values()
         problem = _inertia_problem(np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]), mass)
         if problem:
             inertial.problems.add(matrix.path, problem)
-    ElementTree.SubElement(kept, "mass", mass_part.written("value"))
-    ElementTree.SubElement(kept, "inertia", matrix.written(*_MOMENTS))
-    return [kept]
 
 
 def _inertia_problem(inertia: Array, mass: float) -> str:
@@ -226,7 +222,7 @@ def _collision(part: Part) -> UrdfCollision:
         case "mesh":
             scale = element.numbers("scale", (quantity.MESH_SCALE,) * 3, "1 1 1")
             if element.problems.clean(element.path) and np.any(scale == 0.0):
-                element.problems.add(f"{element.path} scale", "is zero; allowed is none of it zero")
+                element.problems.add(element.at("scale"), "is zero; allowed is none of it zero")
             shape = UrdfMesh(element.text("filename", most=1000), scale)
     return UrdfCollision(shape, pose)
 
@@ -267,66 +263,44 @@ class UrdfJoint:
     offset: float = 0.0
 
 
-def read_joint(joint: Part, name: str) -> tuple[ElementTree.Element, UrdfJoint]:
-    """The checked element of a joint, and what it says."""
+def _joint(joint: Part) -> UrdfJoint:
     kind = joint.choice("type", JOINT_TYPES)
-    # Pinocchio gives a continuous joint two coordinates; here every moving joint has one.
-    kept = ElementTree.Element(
-        "joint", {"name": name, "type": "revolute" if kind == "continuous" else kind}
-    )
-    parent, child = joint.required("parent"), joint.required("child")
-    kept.extend(origin_element(joint))
-    ElementTree.SubElement(kept, "parent", parent.written("link"))
-    ElementTree.SubElement(kept, "child", child.written("link"))
-    axis = joint.child("axis")
-    if axis is not None and kind not in ("fixed", "floating"):
+    parent, child = (joint.required(tag).text("link") for tag in ("parent", "child"))
+    pose_of(joint)
+    axis = joint.child("axis") if kind not in ("fixed", "floating") else None
+    if axis is not None:
         direction = axis.numbers("xyz", (quantity.DIRECTION,) * 3)
         if axis.problems.clean(axis.path) and np.linalg.norm(direction) < SMALLEST_AXIS:
             axis.problems.add(
-                f"{axis.path} xyz",
+                axis.at("xyz"),
                 f"found {shown(axis.raw('xyz'))}, an axis without length; allowed is a direction "
                 "such as '0 0 1'",
             )
-        ElementTree.SubElement(kept, "axis", axis.written("xyz"))
-    limit = joint.child("limit")
-    if kind in ("revolute", "prismatic"):
-        limit = joint.required("limit")
+    needed = kind in ("revolute", "prismatic")
+    limit = joint.required("limit") if needed else joint.child("limit")
     lower = upper = 0.0
     if limit is not None:
         for key in ("effort", "velocity"):
             limit.number(key, quantity.JOINT_MOST)
         lower, upper = (limit.number(key, quantity.JOINT_LIMIT, "0") for key in ("lower", "upper"))
-    written = {} if limit is None else limit.written("lower", "upper", "effort", "velocity")
     if kind == "continuous":
+        # Pinocchio gives a continuous joint two coordinates; here every moving joint has one.
         lower, upper = -FULL_TURNS, FULL_TURNS
-        written = {"effort": "0", "velocity": "0"} | written
-        written |= {"lower": repr(lower), "upper": repr(upper)}
-    if written:
-        ElementTree.SubElement(kept, "limit", written)
+        none = {"effort": "0", "velocity": "0"}
+        kept = ElementTree.SubElement(joint.kept, "limit", none) if limit is None else limit.kept
+        kept.attrib |= {"lower": repr(lower), "upper": repr(upper)}
+        joint.kept.set("type", "revolute")
     dynamics = joint.child("dynamics")
     if dynamics is not None:
         for key in ("damping", "friction"):
             dynamics.number(key, quantity.JOINT_LIMIT, "0")
-        ElementTree.SubElement(kept, "dynamics", dynamics.written("damping", "friction"))
-    found = UrdfJoint(kind, parent.text("link"), child.text("link"), lower, upper)
-    mimic = joint.child("mimic")
-    if mimic is None:
-        return kept, found
-    return kept, replace(
-        found,
-        mimics=mimic.text("joint"),
-        multiplier=mimic.number("multiplier", quantity.JOINT_LIMIT, "1"),
-        offset=mimic.number("offset", quantity.JOINT_LIMIT, "0"),
-    )
-
-
-def origin_element(part: Part) -> list[ElementTree.Element]:
-    """The checked origin of an element, if it has one."""
-    origin = part.child("origin")
-    if origin is None:
-        return []
-    pose_of(part)
-    return [ElementTree.Element("origin", origin.written("xyz", "rpy"))]
+    found = UrdfJoint(kind, parent, child, lower, upper)
+    for mimic in joint.all("mimic")[:1]:
+        multiplier = mimic.number("multiplier", quantity.JOINT_LIMIT, "1")
+        offset = mimic.number("offset", quantity.JOINT_LIMIT, "0")
+        mimics = mimic.text("joint")
+        found = replace(found, mimics=mimics, multiplier=multiplier, offset=offset)
+    return found
 
 
 def pose_of(part: Part) -> Array:
@@ -339,65 +313,53 @@ def pose_of(part: Part) -> Array:
     return read_only(pose_matrix(xyz, rpy))
 
 
-# --- the tree of links ---
-
-
-def tree_problem(
-    links: tuple[str, ...], joints: Mapping[str, tuple[str, str]]
+def _tree_problem(
+    links: tuple[str, ...], joints: Mapping[str, UrdfJoint]
 ) -> tuple[str, str] | None:
-    """Why links and joints are no tree, as (element, text); None where they are one.
-
-    Args:
-        links: names.
-        joints: parent and child link by joint.
-    """
+    """Why links and joints are no tree, as (element, text); None where they are one."""
     if not links:
         return "robot", "has no links; allowed is a tree of links and joints"
     moved_by: dict[str, str] = {}
-    for joint, ends in joints.items():
-        for role, link in zip(("parent", "child"), ends, strict=True):
-            if link not in links:
+    inner: dict[str, list[str]] = {link: [] for link in links}
+    for name, joint in joints.items():
+        for role, link in (("parent", joint.parent), ("child", joint.child)):
+            if link not in inner:
                 hint = suggestion(link, links)
-                return f"joint {joint!r}/{role} link", f"found {link!r}, no link of the file{hint}"
-        parent, child = ends
-        if parent == child:
-            return f"joint {joint!r}", f"its parent and its child are the same link {child!r}"
-        if child in moved_by:
+                return f"joint {name!r}/{role} link", f"found {link!r}, no link of the file{hint}"
+        if joint.parent == joint.child:
+            same = f"its parent and its child are the same link {joint.child!r}"
+            return f"joint {name!r}", same
+        if joint.child in moved_by:
             return (
-                f"joint {joint!r}/child link",
-                f"found {child!r}, which is the child of joint {moved_by[child]!r} already; "
-                "allowed is a tree",
+                f"joint {name!r}/child link",
+                f"found {joint.child!r}, which is the child of joint {moved_by[joint.child]!r} "
+                "already; allowed is a tree",
             )
-        moved_by[child] = joint
+        moved_by[joint.child] = name
+        inner[joint.parent].append(joint.child)
     roots = [link for link in links if link not in moved_by]
     if not roots:
         return "robot", "every link is the child of a joint, so they form a loop; allowed is a tree"
     if len(roots) > 1:
         listed = ", ".join(map(repr, roots[:5])) + (" ..." if len(roots) > 5 else "")
         return "robot", f"found {len(roots)} links without parent ({listed}); allowed is one root"
-    for start in links:
-        met, link = {start}, start
-        while link in moved_by:
-            link = joints[moved_by[link]][0]
-            if link in met:
-                return f"link {link!r}", "is part of a loop of joints; allowed is a tree"
-            met.add(link)
-    return None
+    met, waiting = set(roots), list(roots)
+    while waiting:
+        met.update(behind := inner[waiting.pop()])
+        waiting += behind
+    lost = next((link for link in links if link not in met), None)
+    return lost and (f"link {lost!r}", "is part of a loop of joints; allowed is a tree")
 
 
-def mimic_problem(mimics: Mapping[str, str]) -> tuple[str, str] | None:
-    """Why joints that follow others follow none, as (element, text); None where all is well.
-
-    Args:
-        mimics: the followed joint by the following one.
-    """
-    for name in mimics:
-        met, followed = {name}, mimics[name]
-        while followed in mimics:
+def _mimic_problem(joints: Mapping[str, UrdfJoint]) -> tuple[str, str] | None:
+    """Which joints follow one another in a circle, as (element, text)."""
+    for name in joints:
+        met, followed = {name}, joints[name].mimics
+        while followed:
             if followed in met:
                 return f"joint {name!r}/mimic joint", "joints follow one another in a circle"
             met.add(followed)
-            followed = mimics[followed]
+            followed = joints[followed].mimics
     return None
 
 

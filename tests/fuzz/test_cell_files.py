@@ -20,7 +20,7 @@ from symbolic.geometry.hulls import CollisionModelWarning, convex_pieces
 from symbolic.geometry.pairs import build_geometry
 from symbolic.read.arms import arm_model
 from symbolic.read.cell import load
-from symbolic.read.scenes.read import read_scene
+from symbolic.read.scenes import read_scene
 from symbolic.read.tables import Table, read_body
 from symbolic.records import Workcell
 from symbolic.records.problems import Problems

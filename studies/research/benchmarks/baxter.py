@@ -20,8 +20,7 @@ from studies.research.benchmarks.measuring import Benchmark, Task, carry_problem
 from symbolic import outside
 from symbolic.array import Array
 from symbolic.errors import OutsideError, SettingsError
-from symbolic.read.scenes.moveit import read_message
-from symbolic.read.scenes.read import read_scene
+from symbolic.read.scenes import read_message, read_scene
 
 ROOM = Path("vamp/resources/baxter")
 

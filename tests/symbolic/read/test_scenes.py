@@ -15,8 +15,8 @@ from scipy.spatial.transform import Rotation
 
 from symbolic.array import Array
 from symbolic.errors import SceneError
-from symbolic.read.scenes.bodies import Scene
-from symbolic.read.scenes.read import read_scene
+from symbolic.read.scene_bodies import Scene
+from symbolic.read.scenes import read_scene
 from symbolic.read.tables import Table, read_body
 from symbolic.records import Body, Box, Cylinder, Mesh, Sphere
 from symbolic.records.problems import Problems

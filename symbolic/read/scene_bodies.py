@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from symbolic import outside
 from symbolic.array import Array, Range
@@ -76,8 +77,15 @@ class SceneBuilder:
     problems: Problems = field(default_factory=Problems)
     names: set[str] = field(default_factory=lambda: {PAYLOAD})
 
-    def add(self, name: str, shape: Shape, pose: Array) -> None:
-        """Take a shape at its pose (4, 4) in the world, unless a workcell would refuse it."""
+    def add(self, name: str, shape: Shape | Capsule, pose: Array) -> None:
+        """Take a shape at its pose (4, 4) in the world, unless a workcell would refuse it; a
+        capsule as a cylinder and the spheres at its ends."""
+        if isinstance(shape, Capsule):
+            self.add(name, Cylinder(shape.radius, shape.length), pose)
+            for end in (-0.5, 0.5):
+                place = transform(np.eye(3), [0.0, 0.0, end * shape.length])
+                self.add(f"{name} end", Sphere(shape.radius), pose @ place)
+            return
         if len(self.bodies) == MOST_BODIES:
             raise OutsideError(f"holds more than {MOST_BODIES} shapes, which is the limit")
         body = Body(self._name(name), shape, pose)
@@ -115,13 +123,6 @@ class SceneBuilder:
             self.bodies[-1] = replace(self.bodies[-1], shape=Mesh(Path(file), np.ones(3)))
             self.files[file] = content
 
-    def capsule(self, name: str, shape: Capsule, pose: Array) -> None:
-        """A capsule is a cylinder and the spheres at its ends."""
-        self.add(name, Cylinder(shape.radius, shape.length), pose)
-        for end in (-0.5, 0.5):
-            place = transform(np.eye(3), [0.0, 0.0, end * shape.length])
-            self.add(f"{name} end", Sphere(shape.radius), pose @ place)
-
     def plane(self, name: str, pose: Array) -> None:
         """The half-space below a frame's x-y plane."""
         normal = pose[:3, 2]
@@ -148,17 +149,13 @@ class SceneBuilder:
 def _table(body: Body, folder: Path, meshes: Path) -> dict[str, Any]:
     """A body as a table of a workcell file, its mesh, one below `meshes`, relative to a folder."""
     table: dict[str, Any] = {"name": body.name, "kind": type(body.shape).__name__.lower()}
-    match body.shape:
-        case Box(size):
-            table["size"] = _plain(size)
-        case Cylinder(radius, length):
-            table |= {"radius": float(radius), "length": float(length)}
-        case Sphere(radius):
-            table["radius"] = float(radius)
-        case Mesh(path, scale):
-            table["path"] = Path(os.path.relpath(meshes / path, folder.absolute())).as_posix()
-            if not np.array_equal(scale, np.ones(3)):
-                table["scale"] = _plain(scale)
+    for key, value in vars(body.shape).items():
+        if key == "path":
+            table[key] = Path(os.path.relpath(meshes / value, folder.absolute())).as_posix()
+        elif key == "size" or (key == "scale" and not np.array_equal(value, np.ones(3))):
+            table[key] = _plain(value)
+        elif key != "scale":
+            table[key] = float(value)
     table["xyz"] = _plain(body.pose[:3, 3])
     rpy = _plain(rpy_from_rotation(body.pose[:3, :3]))
     return table | {"rpy": rpy} if any(rpy) else table
@@ -171,18 +168,11 @@ def _plain(values: Array) -> list[float]:
 def quaternion_pose(xyz: Array, xyzw: Array, at: str, problems: Problems) -> Array:
     """(4, 4) of a position and a quaternion x, y, z, w; of all zeros no rotation, as in MoveIt."""
     length = float(np.linalg.norm(xyzw))
-    if length == 0.0:
-        return transform(np.eye(3), xyz)
-    if abs(length - 1.0) > 1e-2:
+    if length and abs(length - 1.0) > 1e-2:
         problems.add(at, f"found a quaternion of length {length:g}; allowed is 1")
-        return np.eye(4)
-    x, y, z, w = xyzw / length
-    rotation = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-    ]
-    return transform(rotation, xyz)
+    if not length or abs(length - 1.0) > 1e-2:
+        return transform(np.eye(3), xyz)
+    return transform(Rotation.from_quat(xyzw).as_matrix(), xyz)
 
 
 def upwards(normal: Array) -> Array:

@@ -1,1 +1,0 @@
-"""Scenes of other programs to bodies of a cell's environment: SDF, MoveIt, MJCF."""
