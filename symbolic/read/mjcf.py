@@ -47,7 +47,7 @@ def geom_shape(
     kind = mujoco.mjtGeom(int(model.geom_type[geom])).name[7:].lower()
     size = model.geom_size[geom]
     radius, length = float(size[0]), 2.0 * float(size[1])
-    shapes = {
+    shapes: dict[str, Box | Sphere | Cylinder | Capsule] = {
         "box": Box(2.0 * size),
         "sphere": Sphere(radius),
         "cylinder": Cylinder(radius, length),

@@ -347,8 +347,10 @@ def _tree_problem(
     while waiting:
         met.update(behind := inner[waiting.pop()])
         waiting += behind
-    lost = next((link for link in links if link not in met), None)
-    return lost and (f"link {lost!r}", "is part of a loop of joints; allowed is a tree")
+    for link in links:
+        if link not in met:
+            return f"link {link!r}", "is part of a loop of joints; allowed is a tree"
+    return None
 
 
 def _mimic_problem(joints: Mapping[str, UrdfJoint]) -> tuple[str, str] | None:
