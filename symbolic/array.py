@@ -38,6 +38,8 @@ class Range:
 
     def allowed(self) -> str:
         """The range in words."""
+        if self.low == -math.inf and self.high == math.inf:
+            return "any that is finite"
         return f"{self.low:g} to {self.high:g} {self.unit}".rstrip()
 
     def suspicion(self, value: float) -> str:

@@ -19,7 +19,7 @@ from dataclasses import dataclass, fields, is_dataclass, replace
 from functools import cache, cached_property, lru_cache, partial
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Protocol
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -75,27 +75,8 @@ class _Later:
     find: Callable[[], Array]
 
 
-class _Take(Protocol):
-    """What becomes of the numbers of a record."""
-
-    def __call__(self, group: str, key: str, value: Any) -> Any:
-        """A number or an array."""
-
-    def pose(self, rotation: Any, position: Any) -> Any:
-        """A transform whose parts were taken."""
-
-    def upright(self, cosine: Any, sine: Any) -> Any:
-        """A turn about z whose parts were taken."""
-
-    def group(self, name: str) -> Group:
-        """The group of that name, all of whose numbers are taken."""
-
-    def body(self, path: str, body: ScreenBody) -> Any:
-        """A body whose numbers were taken."""
-
-
 class _Collector:
-    """Places in the structure, the values aside."""
+    """Takes numbers: places in the structure, the values aside."""
 
     def __init__(self) -> None:
         self.entries: dict[str, list[tuple[Number, Array | _Later]]] = {}
@@ -122,7 +103,8 @@ class _Collector:
 
 
 class _Symbols:
-    """Slices of one vector of symbols per group, in the order in which they were collected."""
+    """Takes the same numbers: slices of one vector of symbols per group, in the order in which they
+    were collected."""
 
     def __init__(self, sizes: Mapping[str, int]) -> None:
         self._groups = {name: Group(name, ca.SX.sym(name, size)) for name, size in sizes.items()}
@@ -148,6 +130,9 @@ class _Symbols:
 
     def body(self, path: str, body: ScreenBody) -> Any:
         return _body(self, path, body)
+
+
+_Take = _Collector | _Symbols
 
 
 @dataclass(frozen=True)

@@ -319,36 +319,29 @@ class Uncertainty:
         return replace(self, **others)
 
     def __str__(self) -> str:
-        if self.is_empty:
-            return "nothing"
-        parts = [
-            f"friction off by {100.0 * self.friction:g} %" if self.friction else "",
-            f"mass by {100.0 * self.mass:g} %" if self.mass else "",
-            _width("centre of mass", 1e3 * self.centre_of_mass, "mm"),
-            f"pads by {1e3 * self.pad_position:g} mm" if self.pad_position else "",
-            _width("disturbance", self.disturbance, "m/s^2"),
-            f"{100.0 * self.tracking:g} % of the force missing" if self.tracking else "",
-            f"arms against one another by {self.internal_force:g} N" if self.internal_force else "",
-            f"pads tilted by {self.tilt:g} rad" if self.tilt else "",
-            f"arms off by {1e3 * self.relative_position:g} mm" if self.relative_position else "",
-            f"turned by {self.relative_angle:g} rad" if self.relative_angle else "",
-        ]
-        return ", ".join(part for part in parts if part)
+        said = []
+        for name, (words, factor, unit) in RANGES.items():
+            widths = factor * np.atleast_1d(getattr(self, name))
+            same = widths.min() == widths.max()
+            numbers = " / ".join(f"{width:g}" for width in (widths[:1] if same else widths))
+            if widths.any():
+                said.append(words.format(f"{numbers} {unit}"))
+        return ", ".join(said) or "nothing"
 
 
-RANGES = (
-    "friction",
-    "mass",
-    "centre_of_mass",
-    "pad_position",
-    "disturbance",
-    "tracking",
-    "internal_force",
-    "tilt",
-    "relative_position",
-    "relative_angle",
-)
-"""What is uncertain in an `Uncertainty`, by name."""
+RANGES = {
+    "friction": ("friction off by {}", 100.0, "%"),
+    "mass": ("mass by {}", 100.0, "%"),
+    "centre_of_mass": ("centre of mass by {}", 1e3, "mm"),
+    "pad_position": ("pads by {}", 1e3, "mm"),
+    "disturbance": ("disturbance by {}", 1.0, "m/s^2"),
+    "tracking": ("{} of the force missing", 100.0, "%"),
+    "internal_force": ("arms against one another by {}", 1.0, "N"),
+    "tilt": ("pads tilted by {}", 1.0, "rad"),
+    "relative_position": ("arms off by {}", 1e3, "mm"),
+    "relative_angle": ("turned by {}", 1.0, "rad"),
+}
+"""What is uncertain in an `Uncertainty`, by name: words, and the factor to the unit in them."""
 
 USUAL = Uncertainty(
     friction=0.20,  # slips of one pair of surfaces spread by 10 %; twice that for another day
@@ -365,14 +358,6 @@ USUAL = Uncertainty(
 """Taken where a cell states nothing: of a cell that was set up with care. From logs of two UR5e
 that squeeze boxes (adamweinhardt/dual-arm-manipulation, commit 6699139, 206 runs); the tilt there
 contains the arms' relative angle. docs/robust.md says more."""
-
-
-def _width(name: str, values: Array, unit: str) -> str:
-    if not values.any():
-        return ""
-    same = values.min() == values.max()
-    numbers = f"{values[0]:g}" if same else " / ".join(f"{value:g}" for value in values)
-    return f"{name} by {numbers} {unit}"
 
 
 @dataclass(frozen=True)
