@@ -19,10 +19,9 @@ from symbolic.read.arms import robot_urdf
 from symbolic.read.checks import check_all
 from symbolic.read.descriptions import description_content, resolve_mesh
 from symbolic.read.payload import check_count, read_contact, read_payload
-from symbolic.read.redundancy import with_redundancy
 from symbolic.read.robots import read_robot
 from symbolic.read.tables import Table, read_body
-from symbolic.read.task import read_task, with_force_limit
+from symbolic.read.task import read_task, with_force_limit, with_redundancy
 from symbolic.records import (
     SEARCHED,
     USUAL,

@@ -77,7 +77,14 @@ def check_contacts(workcell: Workcell, problems: Problems) -> None:
         _check_beside(workcell, room, "both patch radii together", problems)
     elif allocation == "paper":
         if not workcell.has_facing_pads:
-            problems.add("contacts[1].xyz", _paper_problem(workcell))
+            second = workcell.contacts[1].T_box_pad
+            turned = np.degrees(np.arccos(np.clip(-first[:3, 2] @ second[:3, 2], -1.0, 1.0)))
+            problems.add(
+                "contacts[1].xyz",
+                f"belongs to {len(workcell.pads)} pads, with a normal {turned:.4g} degrees off the "
+                "opposite of contacts[0]; the paper's allocation allows two round pads with "
+                "opposite normals: task.allocation = 'soft-finger' and 'joint' take any",
+            )
     elif not has_force_closure(workcell):
         problems.add(
             "contacts",
@@ -98,27 +105,6 @@ def _check_beside(workcell: Workcell, room: float, meaning: str, problems: Probl
             f"{workcell.task.allocation!r} allows less than {room:g} m here, {PATCH_OVERLAP:g} of "
             f"{meaning}",
         )
-
-
-def _paper_problem(workcell: Workcell) -> str:
-    """Why the paper's allocation has no forces for a cell's pads."""
-    hint = "task.allocation = 'soft-finger' and 'joint' take any"
-    first, second = (contact.T_box_pad[:3, 2] for contact in workcell.contacts)
-    if any(contact.further for contact in workcell.contacts):
-        return f"belongs to more than two pads; allowed are two: {hint}"
-    if any(contact.half_sides for contact in workcell.contacts):
-        return f"belongs to a rectangular patch; allowed are round ones: {hint}"
-    faces = [_face_name(normal) for normal in (first, second)]
-    if all(faces):
-        return (
-            f"lies on the {faces[1]} face, contacts[0] on the {faces[0]} face; allowed are "
-            f"opposite faces, the paper's allocation holds for opposite normals only: {hint}"
-        )
-    turned = np.degrees(np.arccos(np.clip(-first @ second, -1.0, 1.0)))
-    return (
-        f"has a normal {turned:.4g} degrees off the opposite of contacts[0]; allowed are opposite "
-        f"normals, the paper's allocation holds for these only: {hint}"
-    )
 
 
 def pads_beside(workcell: Workcell) -> float:
@@ -149,14 +135,6 @@ def check_uncertainty(workcell: Workcell, problems: Problems) -> None:
             f"found {displaced:g} m; allowed is less than {max(room, 0.0):g} m, beyond which "
             "displaced patches need not face one another",
         )
-
-
-def _face_name(inward_normal: Array) -> str:
-    """'+x' and so on; '' of a normal along no axis."""
-    axis = int(np.argmax(np.abs(inward_normal)))
-    if abs(inward_normal[axis]) < 1.0 - 1e-9:
-        return ""
-    return f"{'-' if inward_normal[axis] > 0 else '+'}{'xyz'[axis]}"
 
 
 def check_shapes(workcell: Workcell, problems: Problems) -> None:

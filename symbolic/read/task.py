@@ -1,19 +1,47 @@
-"""The task section of a workcell file."""
+"""The task section of a workcell file, and the redundant joints: those beyond six, whose paths are
+decided.
+
+Which joints are redundant, and where they may stand to begin with, is read off one posture path
+along the hand-made trajectory: of all joints together, by Newton steps of least norm that drift to
+the middle of the joints' ranges where the box leaves them free (Liegeois, IEEE T-SMC 7(12), 1977).
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
 from typing import cast, get_args
 
 import numpy as np
+import pinocchio as pin
 
 from symbolic.array import Array
-from symbolic.read.redundancy import RedundancyEntry, read_redundant
+from symbolic.read.arms import FOLLOWING, arm_model, common_joints, link_frame, turning_joints
+from symbolic.read.payload import SHAPE_KEYS
 from symbolic.read.tables import Table, checked_vector
-from symbolic.records import Allocation, Contact, Payload, Task, TimeLaw, Waypoint
+from symbolic.records import (
+    POSE_SIZE,
+    Allocation,
+    Contact,
+    Payload,
+    RedundantJoint,
+    Robot,
+    Task,
+    TimeLaw,
+    Waypoint,
+    Workcell,
+)
 from symbolic.records import quantities as quantity
-from symbolic.records.poses import Orientation, Rotation, read_only, rotation_from_rpy
+from symbolic.records.cell import box_flange
+from symbolic.records.poses import (
+    Orientation,
+    Rotation,
+    box_placement,
+    inverse,
+    read_only,
+    rotation_from_rpy,
+)
 from symbolic.records.problems import Problems, shown
 from symbolic.records.quantities import GRAVITY
 from symbolic.records.task import components
@@ -183,3 +211,326 @@ def _read_initial(table: Table, free: list[Waypoint], names: Sequence[str]) -> A
                 f"is {low[column]:g} to {high[column]:g}",
             )
     return found
+
+
+# --- redundant joints ---
+
+
+FULL_TURN = 2.0 * np.pi
+"""Widest default bounds of a joint, about its initial value [rad]: beyond it repeats itself."""
+
+MOST_BEYOND = 6
+"""Most joints beyond six of one arm: the choice among them is made by trying all."""
+
+
+_NEEDED = (
+    *("urdf", "chain", "flange", "locked_joints", "drop_links", "redundant_joints"),
+    *("position_lower", "position_upper", "base", "pad"),
+)
+
+
+@dataclass(frozen=True)
+class RedundancyEntry:
+    """What a file says of a redundant joint; None where it says nothing.
+
+    Attributes:
+        path: of the entry in the file.
+        joint: 'robot/joint', or a joint's name, which stands for that of either robot.
+        lower, upper, initial: (n_waypoints,) [rad or m].
+    """
+
+    path: str
+    joint: str
+    lower: Array | None = None
+    upper: Array | None = None
+    initial: Array | None = None
+
+
+def read_redundant(table: Table, n_waypoints: int) -> tuple[RedundancyEntry, ...]:
+    """The entries of `task.redundant`."""
+    found = []
+    for entry in table.tables("redundant"):
+        values = {
+            key: entry.vector(key, (quantity.LOCKED_POSITION,) * n_waypoints, filling=True)
+            for key in ("lower", "upper", "initial")
+            if entry.has(key)
+        }
+        found.append(RedundancyEntry(entry.path, entry.text("joint"), **values))
+        entry.close()
+    return tuple(found)
+
+
+def with_redundancy(
+    workcell: Workcell, entries: Sequence[RedundancyEntry], problems: Problems
+) -> Workcell:
+    """The workcell with its redundant joints, chosen and placed where its file says nothing."""
+    needed = [f"robots[{i}].{part}" for i in (0, 1) for part in _NEEDED]
+    if not problems.clean(*needed, "task", "contacts", *SHAPE_KEYS):
+        return workcell
+    models = [arm_model(robot) for robot in workcell.robots]
+    names = [tuple(model.names)[1:] for model in models]
+    if not entries and all(len(joints) == FOLLOWING for joints in names):
+        return workcell
+    common = common_joints(workcell.robots)
+    arms, found = [], []
+    for i, robot in enumerate(workcell.robots):
+        if len(names[i]) - FOLLOWING > MOST_BEYOND:
+            told = f"found {len(names[i])} joints that move; allowed are {FOLLOWING + MOST_BEYOND}"
+            problems.add(f"robots[{i}].chain", f"{told}: hold others by locked_joints")
+            return workcell
+        path, redundant = _choice(workcell, i, entries, common)
+        if not set(common) <= set(redundant):
+            problems.add(
+                f"robots[{i}].redundant_joints",
+                f"joint {common[0]!r} moves both arms; allowed are arms with at least six joints "
+                "of their own, and redundant joints that name the common ones",
+            )
+            return workcell
+        arms.append(replace(robot, redundant_joints=redundant))
+        for name in redundant:
+            if i == 0 or name not in common:
+                drives = tuple(
+                    names[k].index(name) if k == i or name in common else -1 for k in (0, 1)
+                )
+                said = _entry(entries, robot, name) or RedundancyEntry("", name)
+                found.append(_joint(workcell, i, (drives[0], drives[1]), said, path, problems))
+    known = {joint.name for joint in found} | {joint.name.split("/")[1] for joint in found}
+    known |= {f"{workcell.robots[1].name}/{name}" for name in common}
+    for entry in entries:
+        if entry.joint not in known:
+            listed = ", ".join(joint.name for joint in found) or "none in this cell"
+            problems.add(
+                f"{entry.path}.joint", f"found {entry.joint!r}; redundant joints are: {listed}"
+            )
+    task = replace(workcell.task, redundant=tuple(found))
+    return replace(workcell, robots=(arms[0], arms[1]), task=task)
+
+
+def _choice(
+    workcell: Workcell, i: int, entries: Sequence[RedundancyEntry], common: tuple[str, ...]
+) -> tuple[PosturePath | None, tuple[str, ...]]:
+    """Arm i's path along the hand-made trajectory, where it is needed, and its redundant joints."""
+    robot = workcell.robots[i]
+    model = arm_model(robot)
+    names, beyond = list(model.names)[1:], model.nq - FOLLOWING
+    chosen = tuple(sorted(robot.redundant_joints, key=names.index))
+    told = [_entry(entries, robot, name) for name in chosen]
+    if not beyond or (chosen and all(entry and entry.initial is not None for entry in told)):
+        return None, chosen
+    held = {}
+    for name in common:
+        joint, entry = names.index(name), _entry(entries, robot, name)
+        middle = (robot.position_lower[joint] + robot.position_upper[joint]) / 2.0
+        held[joint] = float(middle if entry is None or entry.initial is None else entry.initial[0])
+    path = posture_path(robot, workcell.contacts[i], workcell.task, held)
+    if not chosen:
+        sliding = [
+            k for k, turns in enumerate(turning_joints(model)) if not turns and k not in held
+        ]
+        forced = [*held, *sliding][:beyond]
+        chosen = tuple(names[k] for k in best_conditioned(path, model.nq, forced))
+    return path, chosen
+
+
+def _entry(entries: Sequence[RedundancyEntry], robot: Robot, name: str) -> RedundancyEntry | None:
+    """What the file says of a joint; the entry of this robot before one for either."""
+    for wanted in (f"{robot.name}/{name}", name):
+        for entry in entries:
+            if entry.joint == wanted:
+                return entry
+    return None
+
+
+def _joint(
+    workcell: Workcell,
+    i: int,
+    drives: tuple[int, int],
+    said: RedundancyEntry,
+    path: PosturePath | None,
+    problems: Problems,
+) -> RedundantJoint:
+    robot, n = workcell.robots[i], len(workcell.task.waypoints)
+    joint, name = drives[i], said.joint.removeprefix(f"{robot.name}/")
+    least, most = float(robot.position_lower[joint]), float(robot.position_upper[joint])
+    initial = said.initial
+    if initial is None:
+        middle = np.full(n, (least + most) / 2.0)
+        initial = middle if path is None else path.at_waypoints(joint)
+        initial = np.maximum(initial, least if said.lower is None else said.lower)
+        initial = np.minimum(initial, most if said.upper is None else said.upper)
+    reach = np.inf if most - least <= FULL_TURN else FULL_TURN / 2.0
+    lower = np.maximum(least, initial - reach) if said.lower is None else said.lower
+    upper = np.minimum(most, initial + reach) if said.upper is None else said.upper
+    where = said.path or f"robots[{i}].redundant_joints"
+    if np.any(lower < least) or np.any(upper > most):
+        problems.add(where, f"found bounds beyond the joint's limits {least:g} to {most:g}")
+    elif np.any(lower > initial) or np.any(initial > upper):
+        problems.add(where, "allowed is lower <= initial <= upper at every waypoint")
+    first = f"{robot.name}/{name}"
+    return RedundantJoint(first, drives, read_only(lower), read_only(upper), read_only(initial))
+
+
+# --- a posture path along the hand-made trajectory ---
+
+
+SEEDS = 24
+"""Random postures from which the start posture is looked for."""
+
+STEPS = 80
+"""Newton steps to the start posture, and at most to each pose after it."""
+
+BETWEEN = 4
+"""Poses per piece of the path."""
+
+CLOSE = 1e-4
+"""Pose error of a reached posture [m, rad]; the values are only a proposal."""
+
+CENTRING = 0.05
+"""Share of the way to the middle of their ranges that joints go in a step where they are free."""
+
+
+@dataclass(frozen=True)
+class PosturePath:
+    """An arm along the hand-made trajectory.
+
+    Attributes:
+        q: (n, joints) at poses evenly spaced along the path parameter, ends included [rad or m].
+        jacobian: (n, 6, joints) of the flange there.
+    """
+
+    q: Array
+    jacobian: Array
+
+    def at_waypoints(self, joint: int) -> Array:
+        """(n_waypoints,) positions of a joint, to a thousandth."""
+        return np.asarray(np.round(self.q[::BETWEEN, joint], 3))
+
+
+class _Chain:
+    """Numeric kinematics of an arm, some joints held."""
+
+    def __init__(
+        self, robot: Robot, contact: Contact, task: Task, held: Mapping[int, float]
+    ) -> None:
+        self.robot, self.orientation, self.held = robot, task.orientation, dict(held)
+        self.model = arm_model(robot)
+        self.data = self.model.createData()
+        self.flange = link_frame(self.model, robot.flange)
+        self.to_root = inverse(robot.T_world_base)
+        self.T_box_flange = box_flange(robot, contact)
+        self.free = [k for k in range(self.model.nq) if k not in self.held]
+        reach = np.clip([robot.position_lower, robot.position_upper], -np.pi, np.pi)
+        self.low, self.high = np.minimum(reach[0], reach[1]), np.maximum(reach[0], reach[1])
+        self.middle = (self.low + self.high) / 2.0
+
+    def jacobian(self, q: Array) -> Array:
+        """(6, joints), axes of the root."""
+        J: Array = pin.computeFrameJacobian(
+            self.model, self.data, q, self.flange, pin.LOCAL_WORLD_ALIGNED
+        )
+        return J
+
+    def error(self, q: Array, pose: Array) -> Array:
+        """(6,) what is missing to a box pose."""
+        T = self.to_root @ box_placement(self.orientation, pose) @ self.T_box_flange
+        pin.framesForwardKinematics(self.model, self.data, q)
+        here = self.data.oMf[self.flange]
+        turn = pin.log3(T[:3, :3] @ here.rotation.T)
+        return np.concatenate([T[:3, 3] - here.translation, turn])
+
+    def reach(self, q: Array, pose: Array) -> Array | None:
+        """A posture near q that holds the box within the joint limits; None if none is found."""
+        for _ in range(STEPS):
+            error = self.error(q, pose)
+            if np.linalg.norm(error) < CLOSE and self.within(q):
+                return q
+            J = self.jacobian(q)[:, self.free]
+            inverted = J.T @ np.linalg.inv(J @ J.T + 1e-8 * np.eye(6))
+            centring = CENTRING * (self.middle - q)[self.free]
+            step = inverted @ error + centring - inverted @ (J @ centring)
+            q = q.copy()
+            q[self.free] += step * min(1.0, 0.4 / max(float(np.abs(step).max()), 1e-12))
+        return None
+
+    def within(self, q: Array) -> bool:
+        """Whether no joint is beyond its limits."""
+        return bool(np.all((q >= self.robot.position_lower) & (q <= self.robot.position_upper)))
+
+    def starts(self) -> Array:
+        """The middle posture and random ones."""
+        rng = np.random.default_rng(0)
+        q = np.vstack([self.middle, rng.uniform(self.low, self.high, (SEEDS, len(self.low)))])
+        for joint, value in self.held.items():
+            q[:, joint] = value
+        return q
+
+
+def posture_path(
+    robot: Robot, contact: Contact, task: Task, held: Mapping[int, float]
+) -> PosturePath | None:
+    """A path of all joints of an arm along the hand-made trajectory, away from joint limits.
+
+    Args:
+        robot, contact: the arm and what it holds the box by.
+        task: with or without its redundant joints.
+        held: joints that stand still, by their indices [rad or m].
+
+    Returns:
+        None where none is found.
+    """
+    # Not imported at the top: it needs CasADi, which cells of six-joint arms do not to be read.
+    from symbolic.path.spline import path_basis
+
+    chain = _Chain(robot, contact, task, held)
+    points = np.array([waypoint.lower for waypoint in task.waypoints])
+    points[list(task.free_indices)] = task.initial
+    points[:, 3:] = task.orientation.unwrapped(points[:, 3:])
+    u = np.linspace(0.0, 1.0, BETWEEN * (len(points) - 1) + 1)
+    poses = path_basis(len(points), u).position @ points[:, :POSE_SIZE]
+    best, most = None, -np.inf
+    for start in chain.starts():
+        q = chain.reach(start, poses[0])
+        path = []
+        for pose in poses:
+            q = None if q is None else chain.reach(q, pose)
+            if q is None:
+                break
+            path.append(q)
+        if q is None:
+            continue
+        jacobian = np.array([chain.jacobian(each) for each in path])
+        room = np.minimum(np.array(path) - robot.position_lower, robot.position_upper - path)
+        least = np.linalg.svd(jacobian[:, :, chain.free], compute_uv=False)[:, -1].min()
+        score = float(least * room[:, chain.free].min())
+        if score > most:
+            best, most = PosturePath(np.array(path), jacobian), score
+    return best
+
+
+def best_conditioned(
+    path: PosturePath | None, n_joints: int, forced: Sequence[int]
+) -> tuple[int, ...]:
+    """The redundant joints of an arm: those without which the other six are conditioned best.
+
+    Args:
+        path: the arm along the hand-made trajectory; None: the joints next to the root.
+        n_joints: of the arm.
+        forced: indices of joints that are redundant in any case.
+
+    Returns:
+        Indices, ascending, n_joints - 6 of them.
+    """
+    others = [joint for joint in range(n_joints) if joint not in forced]
+    chosen = [
+        tuple(sorted((*forced, *more)))
+        for more in combinations(others, n_joints - FOLLOWING - len(forced))
+    ]
+    if path is None:
+        return chosen[0]
+
+    def condition(joints: tuple[int, ...]) -> float:
+        rest = [joint for joint in range(n_joints) if joint not in joints]
+        singular = np.linalg.svd(path.jacobian[:, :, rest], compute_uv=False)
+        return float(singular[:, -1].min())
+
+    return max(chosen, key=condition)

@@ -125,8 +125,8 @@ CASES: list[tuple[Any, ...]] = [
     ("contacts[0].xyz", [0, 0.25, 0], "0.05 m outside the box"),
     ("contacts[0].xyz", [0.15, 0.20, 0], "on an edge of the box"),
     ("contacts[0].xyz", [0.14, 0.20, 0], "only 0.01 m from the edge"),
-    ("contacts[1].xyz", [0, 0.20, 0], "allowed are opposite faces"),
-    ("contacts[1].xyz", [0.15, 0, 0], "on the +x face, contacts[0] on the +y"),
+    ("contacts[1].xyz", [0, 0.20, 0], "a normal 180 degrees off the opposite"),
+    ("contacts[1].xyz", [0.15, 0, 0], "a normal 90 degrees off the opposite"),
     # task
     ("task.waypoints[1].lower[0]", -0.40, "found -0.4 for x, above its upper bound -0.42"),
     ("task.waypoints", [], "at least one free waypoint"),

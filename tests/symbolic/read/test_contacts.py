@@ -17,7 +17,7 @@ from symbolic.read.arms import arm_model
 from symbolic.read.cell import load, with_branches
 from symbolic.read.cell_files import collect_cell, drivable_files, unpack_cell
 from symbolic.read.payload import pad_rotation
-from symbolic.read.redundancy import best_conditioned, posture_path
+from symbolic.read.task import best_conditioned, posture_path
 from symbolic.records import Cylinder, Mesh, Workcell
 from symbolic.records.task import (
     decision_of,
@@ -163,7 +163,7 @@ def test_a_mesh(tmp_path: Path) -> None:
                 "task": {"allocation": "paper"},
             },
             "contacts[1].xyz",
-            "more than two pads",
+            "belongs to 3 pads",
         ),
         (
             {"payload": {"kind": "drum", "mass": 1.0}},
