@@ -145,7 +145,7 @@ class Table:
     ) -> Array:
         """An array with one range per entry; one number for all of it where `filling`."""
         value = self.raw(key, _REQUIRED if default is None else list(default))
-        if value is None:
+        if value is None and (default is not None or key not in self):
             return read_only(np.ones(len(allowed)) if default is None else default)
         return checked_vector(value, allowed, self.at(key), self.problems, filling)
 
@@ -318,23 +318,12 @@ def _single(kind: Any, marks: Sequence[Any], value: Any, path: str, problems: Pr
         span = f" {low} to {high}" if ranges else ""
         problem = "" if fits else f"allowed is a whole number{span}"
     else:
-        forms = [mark.problem for mark in marks if isinstance(mark, Form)] or [_text_problem]
-        problem = forms[0](value)
+        forms = [mark.problem(value) for mark in marks if isinstance(mark, Form)]
+        problem = "".join(forms) if isinstance(value, str) or forms else "allowed is a text"
     if not problem:
         return value
     problems.add(path, f"found {shown(value)}; {problem}")
     return _stand_in(kind, marks)
-
-
-def _text_problem(value: Any) -> str:
-    if not isinstance(value, str):
-        return "allowed is a text"
-    if not value.isascii():
-        try:
-            value.encode()
-        except UnicodeEncodeError:
-            return "it holds half a letter (a lone surrogate)"
-    return ""
 
 
 def _stand_in(kind: Any, marks: Sequence[Any] = ()) -> Any:
