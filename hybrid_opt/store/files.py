@@ -106,7 +106,9 @@ def to_json(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def from_json(kind: type[Record], value: Any, path: Path | str, remedy: str) -> Record:
+def from_json(
+    kind: type[Record], value: Any, path: Path | str, remedy: str, is_open: bool = True
+) -> Record:
     """The record that JSON values describe.
 
     Args:
@@ -114,12 +116,13 @@ def from_json(kind: type[Record], value: Any, path: Path | str, remedy: str) -> 
         value: the values.
         path: of the file, or what else they are called in messages.
         remedy: what to do about a damaged file.
+        is_open: whether keys that are no fields are left alone.
 
     Raises:
         ResultsError: they describe none; with the field and what is wrong with it.
     """
     try:
-        record: Record = checked(kind, value, "", FirstProblem())
+        record: Record = checked(kind, value, "", FirstProblem(open=is_open))
     except ValueError as error:
         raise ResultsError(f"{path}: damaged {error}; {remedy}") from error
     return record

@@ -8,7 +8,7 @@ import reprlib
 import unicodedata
 from collections.abc import Iterable
 from dataclasses import dataclass, field
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any
 
 from symbolic.array import Form
 
@@ -34,7 +34,7 @@ class Problems:
 
     uncounted: int = 0
 
-    open: ClassVar[bool] = False
+    open: bool = False
     """Whether keys that nobody asks for are none."""
 
     def add(self, path: str, text: str) -> None:
@@ -63,9 +63,7 @@ class Problems:
 
 
 class FirstProblem(Problems):
-    """Stops at the first problem; keys of a document that nobody asks for are left alone."""
-
-    open = True
+    """Stops at the first problem."""
 
     def add(self, path: str, text: str) -> None:
         """Raise the problem.

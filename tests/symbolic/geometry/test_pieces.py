@@ -331,7 +331,10 @@ def write_loose(path: Path, count: int) -> None:
 
 @pytest.mark.parametrize(
     ("count", "message"),
-    [(190_000, "enormous mesh, 190000 triangles"), (3000, "3000 separate parts; at most 400")],
+    [
+        (190_000, "enormous mesh, 190000 triangles"),
+        (3000, "enormous mesh, 3000 separate parts; at most 400"),
+    ],
 )
 def test_more_than_can_be_worked_with_is_told_at_once(
     tmp_path: Path, count: int, message: str
