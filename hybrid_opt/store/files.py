@@ -124,7 +124,8 @@ def from_json(
     try:
         record: Record = checked(kind, value, "", FirstProblem(open=is_open))
     except ValueError as error:
-        raise ResultsError(f"{path}: damaged {error}; {remedy}") from error
+        place = "" if str(error).startswith(": ") else " at "
+        raise ResultsError(f"{path}: damaged{place}{error}; {remedy}") from error
     return record
 
 

@@ -71,7 +71,7 @@ class FirstProblem(Problems):
         Raises:
             ValueError: with the place and the text.
         """
-        raise ValueError(f"{f'at {path}: ' if path else ''}{text}")
+        raise ValueError(f"{path}: {text}")
 
 
 def _is_within(path: str, prefix: str) -> bool:
