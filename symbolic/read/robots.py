@@ -422,12 +422,11 @@ def _downloaded(name: str) -> NamedRobot:
         raise OutsideError(
             f"cannot be downloaded; is the network reachable, and git installed? ({reason})"
         ) from error
-    path = getattr(module, "URDF_PATH", None)
-    arguments = {} if path else getattr(module, "XACRO_ARGS", {})
-    path = path or getattr(module, "XACRO_PATH", None)
-    path = path or getattr(module, "MJCF_PATH", None)
+    found = [getattr(module, f"{kind}_PATH", None) for kind in ("URDF", "XACRO", "MJCF")]
+    path = next(filter(None, found), None)
     if path is None:
         raise OutsideError("has neither URDF nor MJCF; name a description that has")
+    arguments = {} if found[0] else getattr(module, "XACRO_ARGS", {})
     package, repository = Path(module.PACKAGE_PATH), Path(module.REPOSITORY_PATH)
     folders = dict.fromkeys((package.parent, repository, repository.parent))
     named = tuple((str(key), str(value)) for key, value in arguments.items())
