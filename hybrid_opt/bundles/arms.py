@@ -25,9 +25,9 @@ from symbolic.read.arms import (
     robot_urdf,
     turning_joints,
 )
-from symbolic.read.robots import ADDRESS
 from symbolic.read.urdf import Urdf, UrdfMesh
 from symbolic.records import Body, Box, Capsule, Cylinder, Mesh, Robot, Shape, Sphere, Workcell
+from symbolic.records.cell import ADDRESS
 from symbolic.records.poses import pose_matrix, rpy_from_rotation
 
 _LONGEST_COMMENT = 60
@@ -115,7 +115,7 @@ def addressed(workcell: Workcell, addresses: tuple[str, str]) -> Workcell:
         SettingsError: one is neither.
     """
     for address in addresses:
-        if not ADDRESS.fullmatch(address):
+        if ADDRESS.problem(address):
             raise SettingsError(f"address {address!r} is no host name or IP address")
     robots = zip(workcell.robots, addresses, strict=True)
     first, second = (replace(r, driver=replace(r.driver, address=at)) for r, at in robots)
