@@ -101,6 +101,9 @@ def reference() -> Path:
         summary = (inspect.getdoc(thing) or "").split("\n\n")[0].replace("\n", " ")
         kind = "autoclass" if inspect.isclass(thing) else "autofunction"
         target = f"hybrid_opt.{name}"
+        used = [target]
+        if inspect.isclass(thing):  # some are never called but by a method that makes one
+            used += [f"{target}.{key}" for key in vars(thing) if not key.startswith("_")]
         page = "\n".join(
             [
                 name,
@@ -108,7 +111,7 @@ def reference() -> Path:
                 "",
                 f".. {kind}:: {target}",
                 "",
-                f".. minigallery:: {target}",
+                f".. minigallery:: {' '.join(used)}",
                 "   :add-heading: Examples",
                 "",
             ]
@@ -149,3 +152,17 @@ sphinx_gallery_conf: dict[str, Any] = {
     "write_computation_times": False,
     "abort_on_example_error": True,
 }
+
+
+def without_references(*given: Any) -> tuple[str | None, str | None]:
+    """A signature and what it returns, names of types as they are: inside others Sphinx writes the
+    reference that it makes of an alias."""
+    signature, returned = (
+        text and re.sub(r"TypeAliasForwardRef\('(\w+)'\)", r"\1", text) for text in given[-2:]
+    )
+    return signature, returned
+
+
+def setup(app: Any) -> None:
+    """Sphinx calls it."""
+    app.connect("autodoc-process-signature", without_references)

@@ -46,7 +46,8 @@ def add_scene(options: argparse.Namespace) -> int:
         print(f"left out: {told}", file=sys.stderr)
     if options.into:
         _add(scene, options.into)
-        print(f"{options.into}: {len(scene.bodies)} bodies added to its environment")
+        count = len(scene.bodies)
+        print(f"{options.into}: {count} bod{'y' if count == 1 else 'ies'} added to its environment")
     elif scene.files:
         raise SceneError(
             f"{options.scene}: holds meshes of its own, which become files beside a workcell; name "
