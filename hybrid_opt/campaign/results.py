@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_opt.campaign.folder import FORMAT, VERSION
-from hybrid_opt.campaign.journal import EvaluationTable, decode
+from hybrid_opt.campaign.journal import decode
 from hybrid_opt.campaign.settings import (
     CONFIGURATION,
     DONE,
@@ -51,6 +51,9 @@ ANEW = "--resume computes it anew"
 KEPT = 64
 """Tables of candidates, and polished fronts, that are remembered by their content: a study's stages
 read them again and again."""
+
+_decoded = lru_cache(maxsize=KEPT)(decode)
+_record_of = lru_cache(maxsize=KEPT)(record_of)
 
 
 @dataclass(frozen=True)
@@ -232,11 +235,6 @@ def read_replica(root: Path, algorithm: str, number: int, objectives: tuple[str,
     return Replica(algorithm, number, table.evaluations, table.generation, marker.seconds)
 
 
-@lru_cache(maxsize=KEPT)
-def _decoded(content: bytes, path: Path) -> EvaluationTable:
-    return decode(content, path)
-
-
 def is_whole(exists: bool, read: Callable[[], object]) -> bool:
     """Whether what a stage left is there and can be read; damage is reported as a warning.
 
@@ -263,7 +261,7 @@ def read_polished(root: Path, replica: Replica, workcell: Workcell) -> PolishedF
     path = polished_folder(root, replica.algorithm, replica.replica) / POLISH
     if not path.exists():
         return None
-    found, task = _polished(read_bytes(path), path), workcell.task
+    found, task = _record_of(PolishedFront, read_bytes(path), path, ANEW), workcell.task
     problem = ""
     if bool(len(found.x)) != bool(len(replica.front)):
         problem = f"at x: found {len(found.x)} points"
@@ -274,8 +272,3 @@ def read_polished(root: Path, replica: Replica, workcell: Workcell) -> PolishedF
     if problem:
         raise ResultsError(f"{path}: damaged {problem}; {ANEW}")
     return found if len(found.x) else replace(found, x=found.x.reshape(0, task.n_var))
-
-
-@lru_cache(maxsize=KEPT)
-def _polished(content: bytes, path: Path) -> PolishedFront:
-    return record_of(PolishedFront, content, path, ANEW)

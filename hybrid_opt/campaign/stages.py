@@ -190,10 +190,8 @@ def decided_cell(
     """
     if SEARCHED not in workcell.start_branch:
         return workcell, None
-    stored = execution.output / BRANCHES
-    if execution.resume and stored.exists():
-        competition = read_record(BranchCompetition, stored, _ANEW)
-    else:
+    competition = read_branches(execution.output) if execution.resume else None
+    if competition is None:
         require_usable(execution)
         cell = Cell(workcell, settings.objectives)
         rng = np.random.default_rng(settings.seed)

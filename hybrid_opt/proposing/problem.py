@@ -24,6 +24,7 @@ from symbolic.read.descriptions import PACKAGE_SCHEME
 from symbolic.read.robots import read_robot
 from symbolic.read.tables import Table
 from symbolic.records import POSE_SIZE, Robot, Workcell
+from symbolic.records import quantities as quantity
 from symbolic.records.poses import Orientation, box_placement, rotation_from_rpy
 from symbolic.records.problems import Problems
 
@@ -200,66 +201,44 @@ def read_problem(path: str | Path) -> Problem:
         data = outside.toml_tables(text.encode())
     except OutsideError as error:
         raise WorkcellError(str(path), (f"file: {error}",)) from error
-    problems = tuple(_problems(data))
-    if problems:
-        raise WorkcellError(str(path), problems)
+    problems = Problems()
+    _require_known(Table(data, "", problems))
+    if problems.found:
+        raise WorkcellError(str(path), problems.messages())
     text = completed(text, data, {"task": dict.fromkeys(PROPOSED)})
     for key in PROPOSED:
         data["task"].pop(key, None)
     return Problem(source, text, data)
 
 
-def _problems(data: dict[str, Any]) -> list[str]:
-    """Checks of what this module needs; the reader of workcell files checks the rest."""
-    found = []
-    for name, kind in (("task", dict), ("payload", dict), ("robots", list), ("contacts", list)):
-        if not isinstance(data.get(name), kind):
-            found.append(f"{name}: missing; see docs/workcell.md")
-    for name in ("robots", "contacts"):
-        entries = data.get(name)
-        if isinstance(entries, list) and (
-            len(entries) != 2 or not all(isinstance(entry, dict) for entry in entries)
-        ):
-            found.append(f"{name}: allowed are exactly 2 tables")
-    if found:
-        return found
-    task = data["task"]
-    for key in ("start", "goal"):
-        pose = task.get(key)
-        if not isinstance(pose, list) or len(pose) != 6 or not all(map(_is_number, pose)):
-            found.append(f"task.{key}: allowed are 6 numbers: x, y, z, roll, pitch, yaw")
-    if task.get("start") == task.get("goal"):
-        found.append("task.goal: found the start again; allowed is another pose")
-    reference = task.get("rotation_reference", [0.0, 0.0, 0.0])
-    if (
-        not isinstance(reference, list)
-        or len(reference) != 3
-        or not all(map(_is_number, reference))
-    ):
-        found.append("task.rotation_reference: allowed are 3 numbers: roll, pitch, yaw")
-    waypoints = task.get("waypoints", [])
+def _require_known(table: Table) -> None:
+    """Record what this module needs and lacks; the reader of workcell files checks the rest."""
+    task, payload = table.table("task"), table.table("payload")
+    _, contacts = (table.tables(key, exactly=2) for key in ("robots", "contacts"))
+    if table.problems.found:
+        return
+    start, goal = (task.vector(key, quantity.POSE) for key in ("start", "goal"))
+    if task.clean("start", "goal") and np.array_equal(start, goal):
+        task.add("goal", "found the start again; allowed is another pose")
+    task.vector("rotation_reference", (quantity.ANGLE,) * 3, (0.0, 0.0, 0.0))
+    waypoints = task.raw("waypoints", [])
     if isinstance(waypoints, list) and any("fixed" in w for w in waypoints if isinstance(w, dict)):
-        found.append(
-            "task.waypoints: found a fixed one; allowed is a carry from start to goal, put fixed "
-            "poses into the proposed file"
+        task.add(
+            "waypoints",
+            "found a fixed one; allowed is a carry from start to goal, put fixed poses into the "
+            "proposed file",
         )
-    if task.get("time_law") == "optimal":
-        found.append(
-            "task.time_law: found 'optimal'; allowed are 'constant' and 'ramped', change it in the "
-            "proposed file"
+    if task.raw("time_law", None) == "optimal":
+        task.add(
+            "time_law",
+            "found 'optimal'; allowed are 'constant' and 'ramped', change it in the proposed file",
         )
-    size = data["payload"].get("size")
-    if all("xyz" in entry for entry in data["contacts"]):
-        return found
-    if data["payload"].get("kind", "box") != "box":
-        found.append("contacts: xyz is needed for a payload that is no box")
-    elif not isinstance(size, list) or len(size) != 3 or not all(map(_is_number, size)):
-        found.append("payload.size: allowed are 3 numbers")
-    return found
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
+    if all("xyz" in entry for entry in contacts):
+        return
+    if payload.raw("kind", "box") != "box":
+        table.add("contacts", "xyz is needed for a payload that is no box")
+    else:
+        payload.vector("size", (quantity.PAYLOAD_SIZE,) * 3)
 
 
 def _with_paths(data: dict[str, Any], change: Callable[[str], str]) -> dict[str, Any]:

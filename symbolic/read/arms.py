@@ -181,7 +181,8 @@ def _reduced(kinematics: str, file: str, held: Positions) -> pin.Model:
     try:
         model = pin.buildModelFromXML(kinematics)
     except (ValueError, RuntimeError, IndexError) as error:
-        raise RobotModelError(f"Pinocchio cannot read {file}: {_first_line(error)}") from error
+        reason = (str(error).strip().splitlines() or ["no reason given"])[0]
+        raise RobotModelError(f"Pinocchio cannot read {file}: {reason}") from error
     links = {frame.name for frame in model.frames if frame.type == pin.FrameType.BODY}
     for frame in model.frames:
         if frame.type == pin.FrameType.FIXED_JOINT and frame.name in links:
@@ -272,7 +273,8 @@ def structure_problem(model: pin.Model) -> str:
 def flange_problem(model: pin.Model, flange: str) -> str:
     """Why a frame cannot carry the tool, or an empty string."""
     bodies = [frame.name for frame in model.frames if frame.type == pin.FrameType.BODY]
-    last = [frame.name for frame in model.frames if _carried_by_last(model, frame)]
+    tip = model.njoints - 1
+    last = [x for x in bodies if model.frames[link_frame(model, x)].parentJoint == tip]
     if flange not in bodies:
         hint = suggestion(flange, last)
         return f"found {flange!r}, no link of the URDF; allowed are {listed(last)}{hint}"
@@ -284,14 +286,6 @@ def flange_problem(model: pin.Model, flange: str) -> str:
 def link_frame(model: pin.Model, link: str) -> int:
     """Index of a link's frame; a joint may have the same name."""
     return int(model.getFrameId(link, pin.FrameType.BODY))
-
-
-def _carried_by_last(model: pin.Model, frame: pin.Frame) -> bool:
-    return bool(frame.type == pin.FrameType.BODY and frame.parentJoint == model.njoints - 1)
-
-
-def _first_line(error: Exception) -> str:
-    return (str(error).strip().splitlines() or ["no reason given"])[0]
 
 
 # --- machines with two arms ---

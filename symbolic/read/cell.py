@@ -25,12 +25,9 @@ from symbolic.read.task import read_task, with_force_limit, with_redundancy
 from symbolic.records import (
     SEARCHED,
     USUAL,
-    Body,
     CollisionSettings,
     Handling,
     Mesh,
-    Payload,
-    Robot,
     Uncertainty,
     Workcell,
 )
@@ -125,12 +122,6 @@ def _build(table: Table, source: Path, content: bytes, stored: bool) -> Workcell
     table.close()
     if len(robots) != 2 or len(contacts) != 2:
         return None
-    arms = [robot for robot, _ in robots]
-    try:
-        identity = "" if problems.found else digest(content, arms, environment, payload)
-    except OutsideError as error:
-        problems.add("file", str(error))
-        identity = ""
     workcell = Workcell(
         name=name,
         robots=(robots[0][0], robots[1][0]),
@@ -144,6 +135,11 @@ def _build(table: Table, source: Path, content: bytes, stored: bool) -> Workcell
         uncertainty=uncertainty,
         handling=handling,
     )
+    try:
+        identity = "" if problems.found else _digest(content, workcell)
+    except OutsideError as error:
+        problems.add("file", str(error))
+        identity = ""
     check_all(workcell, problems)
     workcell = with_redundancy(workcell, redundant, problems)
     if workcell.task.pieces > 1 and not problems.found:
@@ -154,12 +150,7 @@ def _build(table: Table, source: Path, content: bytes, stored: bool) -> Workcell
     return replace(workcell, reading=reading_of(workcell, identity)) if identity else workcell
 
 
-def digest(
-    content: bytes,
-    robots: Sequence[Robot],
-    environment: Sequence[Body],
-    payload: Payload | None = None,
-) -> str:
+def _digest(content: bytes, workcell: Workcell) -> str:
     """SHA-256 over a workcell file and the content of every file it names.
 
     Where the files stand does not matter, only what is in them: the file's own bytes, per robot
@@ -172,7 +163,7 @@ def digest(
     outer = hashlib.sha256(hashlib.sha256(content).digest())
     room = outside.CELL_BYTES
     # Fixed-length inner digests keep the parts apart.
-    for part in _named(robots, environment, payload):
+    for part in _named(workcell):
         room -= len(part)
         if room < 0:
             raise OutsideError(
@@ -183,32 +174,28 @@ def digest(
     return outer.hexdigest()
 
 
-def _content(path: Path | None, most: int) -> bytes:
-    if path is None:
-        return b""
-    try:
-        return outside.read_bytes(path, most)
-    except OutsideError as error:
-        raise OutsideError(f"names {path.name}, which {error}") from error
-
-
-def _named(
-    robots: Sequence[Robot], environment: Sequence[Body], payload: Payload | None
-) -> Iterator[bytes]:
+def _named(workcell: Workcell) -> Iterator[bytes]:
     """The content of every file that a workcell names, nothing for a missing one."""
-    for robot in robots:
+    for robot in workcell.robots:
         yield description_content(robot.urdf, robot.xacro_arguments, robot.package_dirs)
         urdf = robot_urdf(robot)
         for address in (*urdf.collision_meshes, *urdf.visual_meshes):
             mesh = resolve_mesh(address, robot.urdf, robot.package_dirs)
-            yield _content(mesh, outside.MESH_BYTES)
+            yield b"" if mesh is None else _content(mesh, outside.MESH_BYTES)
         if robot.srdf is not None:
             yield _content(robot.srdf, outside.URDF_BYTES)
-    for body in (*(body for robot in robots for body in robot.tool), *environment):
-        if isinstance(body.shape, Mesh):
-            yield _content(body.shape.path, outside.MESH_BYTES)
-    if payload is not None and isinstance(payload.shape, Mesh):
-        yield _content(payload.shape.path, outside.MESH_BYTES)
+    tools = [body.shape for robot in workcell.robots for body in robot.tool]
+    around = [body.shape for body in workcell.environment]
+    for shape in (*tools, *around, workcell.payload.shape):
+        if isinstance(shape, Mesh):
+            yield _content(shape.path, outside.MESH_BYTES)
+
+
+def _content(path: Path, most: int) -> bytes:
+    try:
+        return outside.read_bytes(path, most)
+    except OutsideError as error:
+        raise OutsideError(f"names {path.name}, which {error}") from error
 
 
 # --- start branches ---

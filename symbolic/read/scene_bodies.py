@@ -26,7 +26,7 @@ from symbolic.read.elements import parse_elements
 from symbolic.read.tables import Table, read_body
 from symbolic.records import PAYLOAD, Body, Box, Capsule, Cylinder, Mesh, Shape, Sphere
 from symbolic.records.poses import rpy_from_rotation, transform
-from symbolic.records.problems import MAX_NAME_LENGTH, Problems
+from symbolic.records.problems import MAX_NAME_LENGTH, Problems, shown
 
 MOST_BODIES = 5000
 SLAB = (10.0, 10.0, 0.1)
@@ -122,6 +122,22 @@ class SceneBuilder:
         if len(self.bodies) > count:
             self.bodies[-1] = replace(self.bodies[-1], shape=Mesh(Path(file), np.ones(3)))
             self.files[file] = content
+
+    def mesh(self, name: str, address: str, file: Path, scale: Array, pose: Array) -> None:
+        """A mesh that a scene's file names by its address."""
+        path = file_at(address, file)
+        if path is None:
+            self.leave(name, f"its mesh {shown(address)} is not found; {WHERE}")
+        else:
+            self.add(name, Mesh(path, scale), pose)
+
+    def half_space(self, name: str, normal: Array, offset: float, pose: Array) -> None:
+        """All x of a frame at a pose (4, 4) for which normal x + offset <= 0."""
+        if np.linalg.norm(normal) < 1e-6:
+            self.problems.add(name, "found a plane without a normal")
+        else:
+            foot = -offset / float(normal @ normal) * normal
+            self.plane(name, pose @ transform(upwards(normal), foot))
 
     def plane(self, name: str, pose: Array) -> None:
         """The half-space below a frame's x-y plane."""

@@ -24,10 +24,9 @@ from symbolic.read.scene_bodies import (
     SceneBuilder,
     file_at,
     quaternion_pose,
-    upwards,
 )
 from symbolic.read.tables import Table
-from symbolic.records import Box, Capsule, Cylinder, Mesh, Sphere
+from symbolic.records import Box, Capsule, Cylinder, Sphere
 from symbolic.records.poses import inverse, pose_matrix, transform
 from symbolic.records.problems import shown, suggestion
 
@@ -251,28 +250,17 @@ class _Sdf:
             case "plane":
                 written = part.child("normal")
                 normal = written.content((ANY,) * 3) if written else np.eye(3)[2]
-                if np.linalg.norm(normal) < 1e-6:
-                    collision.problems.add(part.path, "found a normal without length")
-                else:
-                    self._found.plane(name, pose @ transform(upwards(normal), np.zeros(3)))
+                self._found.half_space(name, normal, 0.0, pose)
+            case "mesh" if part.child("submesh"):
+                self._found.leave(name, "is a part of a mesh; export it alone")
             case "mesh":
-                self._mesh(part, file, name, pose)
+                scale = part.child("scale")
+                factors = scale.content((ANY,) * 3) if scale else np.ones(3)
+                self._found.mesh(name, part.inner_text("uri"), file, factors, pose)
             case "empty":
                 pass
             case other:
                 self._found.leave(name, f"is of the kind {shown(other)}, which no body is")
-
-    def _mesh(self, part: Part, file: Path, name: str, pose: Array) -> None:
-        address = part.inner_text("uri")
-        path = file_at(address, file)
-        scale = part.child("scale")
-        factors = scale.content((ANY,) * 3) if scale else np.ones(3)
-        if path is None:
-            self._found.leave(name, f"its mesh {shown(address)} is not found; {WHERE}")
-        elif part.child("submesh"):
-            self._found.leave(name, f"is a part of the mesh {shown(address)}; export it alone")
-        else:
-            self._found.add(name, Mesh(path, factors), pose)
 
 
 # --- MoveIt ---
@@ -403,12 +391,7 @@ def _primitive(name: str, kind: str, sizes: Array, pose: Array, found: SceneBuil
         case "cylinder":
             found.add(name, Cylinder(float(sizes[1]), float(sizes[0])), pose)
         case "plane":
-            normal, offset = sizes[:3], float(sizes[3])
-            if np.linalg.norm(normal) < 1e-6:
-                found.problems.add(name, "found a plane without a normal")
-            else:
-                foot = -offset / float(normal @ normal) * normal
-                found.plane(name, pose @ transform(upwards(normal), foot))
+            found.half_space(name, sizes[:3], float(sizes[3]), pose)
         case other:
             found.leave(name, f"is a {other}, which no body is")
 
@@ -416,13 +399,8 @@ def _primitive(name: str, kind: str, sizes: Array, pose: Array, found: SceneBuil
 def _moveit_mesh(name: str, table: Table, pose: Array, path: Path, found: SceneBuilder) -> None:
     """A mesh by its address, or by its triangles."""
     if table.has("resource"):
-        address = str(table.raw("resource"))
-        file = file_at(address, path)
         scale = table.vector("dimensions", (ANY,) * 3, (1.0, 1.0, 1.0))
-        if file is None:
-            found.leave(name, f"its mesh {shown(address)} is not found; {WHERE}")
-        else:
-            found.add(name, Mesh(file, scale), pose)
+        found.mesh(name, str(table.raw("resource")), path, scale, pose)
         return
     try:
         faces = [

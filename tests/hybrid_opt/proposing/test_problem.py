@@ -88,7 +88,7 @@ def test_what_is_wrong_is_told_with_its_key_and_the_file(
 def test_missing_sections_are_told(tmp_path: Path) -> None:
     path = tmp_path / "empty.toml"
     path.write_text("name = 'x'\n")
-    with pytest.raises(WorkcellError, match="task: missing"):
+    with pytest.raises(WorkcellError, match="task: is missing"):
         read_problem(path)
     path.write_text(completed("", {"task": {}, "payload": {}, "robots": [], "contacts": [1]}, {}))
     with pytest.raises(WorkcellError, match="exactly 2 tables"):
