@@ -252,7 +252,8 @@ class _Sdf:
                 normal = written.content((ANY,) * 3) if written else np.eye(3)[2]
                 self._found.half_space(name, normal, 0.0, pose)
             case "mesh" if part.child("submesh"):
-                self._found.leave(name, "is a part of a mesh; export it alone")
+                address = shown(part.inner_text("uri"))
+                self._found.leave(name, f"is a part of the mesh {address}; export it alone")
             case "mesh":
                 scale = part.child("scale")
                 factors = scale.content((ANY,) * 3) if scale else np.ones(3)
