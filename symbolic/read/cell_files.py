@@ -245,14 +245,10 @@ def _check_references(stored: CellFiles, root: Path) -> None:
         for address in (*named.collision_meshes, *named.visual_meshes):
             relative = address.removeprefix("package://").removeprefix("file://")
             bases = folders if address.startswith("package://") else [posixpath.dirname(target)]
-            if any(_leads_out(joined(folder, relative)) for folder in bases):
+            if any(f"{joined(folder, relative)}/".startswith(("/", "../")) for folder in bases):
                 raise BundleError(
                     f"the stored {shown(target)} names {shown(address)}, not stored with it"
                 )
-
-
-def _leads_out(path: str) -> bool:
-    return path.startswith(("/", "../")) or path == ".."
 
 
 # --- finding the files ---
@@ -273,9 +269,10 @@ class CellCollector:
     def collect(self, workcell: Workcell) -> None:
         """Add every file that the workcell names."""
         text = self._text.encode("utf-8")
-        text = with_branches(text, parse_toml(text), workcell.start_branch)
-        names = {entry["robot"] for entry in parse_toml(text)["robots"] if "robot" in entry}
-        self._text = with_paths(outside.text(text), names)
+        data = parse_toml(text)
+        settled = with_branches(text, data, workcell.start_branch)
+        names = {entry["robot"] for entry in data["robots"] if "robot" in entry}
+        self._text = with_paths(outside.text(settled), names)
         data = parse_toml(self._text.encode("utf-8"))
         for robot, entry in zip(workcell.robots, data["robots"], strict=True):
             urdf = self._place(str(entry["urdf"]))

@@ -223,12 +223,6 @@ MOST_BEYOND = 6
 """Most joints beyond six of one arm: the choice among them is made by trying all."""
 
 
-_NEEDED = (
-    *("urdf", "chain", "flange", "locked_joints", "drop_links", "redundant_joints"),
-    *("position_lower", "position_upper", "base", "pad"),
-)
-
-
 @dataclass(frozen=True)
 class RedundancyEntry:
     """What a file says of a redundant joint; None where it says nothing.
@@ -264,8 +258,7 @@ def with_redundancy(
     workcell: Workcell, entries: Sequence[RedundancyEntry], problems: Problems
 ) -> Workcell:
     """The workcell with its redundant joints, chosen and placed where its file says nothing."""
-    needed = [f"robots[{i}].{part}" for i in (0, 1) for part in _NEEDED]
-    if not problems.clean(*needed, "task", "contacts", *SHAPE_KEYS):
+    if not problems.clean("robots", "task", "contacts", *SHAPE_KEYS):
         return workcell
     models = [arm_model(robot) for robot in workcell.robots]
     names = [tuple(model.names)[1:] for model in models]
@@ -292,7 +285,7 @@ def with_redundancy(
                 drives = tuple(
                     names[k].index(name) if k == i or name in common else -1 for k in (0, 1)
                 )
-                said = _entry(entries, robot, name) or RedundancyEntry("", name)
+                said = _entry(entries, robot, name)
                 found.append(_joint(workcell, i, (drives[0], drives[1]), said, path, problems))
     known = {joint.name for joint in found} | {joint.name.split("/")[1] for joint in found}
     known |= {f"{workcell.robots[1].name}/{name}" for name in common}
@@ -315,30 +308,26 @@ def _choice(
     names, beyond = list(model.names)[1:], model.nq - FOLLOWING
     chosen = tuple(sorted(robot.redundant_joints, key=names.index))
     told = [_entry(entries, robot, name) for name in chosen]
-    if not beyond or (chosen and all(entry and entry.initial is not None for entry in told)):
+    if not beyond or (chosen and all(entry.initial is not None for entry in told)):
         return None, chosen
     held = {}
     for name in common:
         joint, entry = names.index(name), _entry(entries, robot, name)
         middle = (robot.position_lower[joint] + robot.position_upper[joint]) / 2.0
-        held[joint] = float(middle if entry is None or entry.initial is None else entry.initial[0])
+        held[joint] = float(middle if entry.initial is None else entry.initial[0])
     path = posture_path(robot, workcell.contacts[i], workcell.task, held)
     if not chosen:
-        sliding = [
-            k for k, turns in enumerate(turning_joints(model)) if not turns and k not in held
-        ]
-        forced = [*held, *sliding][:beyond]
+        sliding = [k for k, turns in enumerate(turning_joints(model)) if not turns]
+        forced = list(dict.fromkeys([*held, *sliding]))[:beyond]
         chosen = tuple(names[k] for k in best_conditioned(path, model.nq, forced))
     return path, chosen
 
 
-def _entry(entries: Sequence[RedundancyEntry], robot: Robot, name: str) -> RedundancyEntry | None:
+def _entry(entries: Sequence[RedundancyEntry], robot: Robot, name: str) -> RedundancyEntry:
     """What the file says of a joint; the entry of this robot before one for either."""
-    for wanted in (f"{robot.name}/{name}", name):
-        for entry in entries:
-            if entry.joint == wanted:
-                return entry
-    return None
+    by_name = {entry.joint: entry for entry in reversed(entries)}
+    nothing = RedundancyEntry("", name)
+    return by_name.get(f"{robot.name}/{name}", by_name.get(name, nothing))
 
 
 def _joint(
