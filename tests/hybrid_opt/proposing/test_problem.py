@@ -91,7 +91,7 @@ def test_missing_sections_are_told(tmp_path: Path) -> None:
     with pytest.raises(WorkcellError, match="task: is missing"):
         read_problem(path)
     path.write_text(completed("", {"task": {}, "payload": {}, "robots": [], "contacts": [1]}, {}))
-    with pytest.raises(WorkcellError, match="exactly 2 tables"):
+    with pytest.raises(WorkcellError, match="allowed are exactly 2"):
         read_problem(path)
 
 

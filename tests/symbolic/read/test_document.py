@@ -9,7 +9,7 @@ import re
 import tempfile
 import tomllib
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args, get_type_hints
 
 import numpy as np
 import pytest
@@ -17,12 +17,26 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from symbolic.array import Range
 from symbolic.errors import WorkcellError
 from symbolic.read.arms import body_names
 from symbolic.read.cell import changed, changed_text, load
 from symbolic.read.checks import stretched_length
 from symbolic.read.payload import pad_rotation
-from symbolic.records import USUAL, Body, Box, Cylinder, Driver, Sphere, Uncertainty, Workcell
+from symbolic.records import (
+    USUAL,
+    Body,
+    Box,
+    CollisionSettings,
+    Cylinder,
+    Driver,
+    Handling,
+    Payload,
+    Sphere,
+    Task,
+    Uncertainty,
+    Workcell,
+)
 from symbolic.records.poses import inverse, pose_matrix
 from tests.symbolic.cells import rack_cell
 from tests.symbolic.read.problem_cases import put
@@ -79,6 +93,37 @@ def test_the_messages_shown_are_real(tmp_path: Path) -> None:
     assert len(told) == 2
     for text in told:
         assert f"  - {text}\n" in DOCUMENT
+
+
+def ranges_in(kind: Any) -> list[Range]:
+    if isinstance(kind, Range):
+        return [kind]
+    return [found for inner in get_args(kind) for found in ranges_in(inner)]
+
+
+@pytest.mark.parametrize(
+    ("section", "record"),
+    [
+        ("[payload]", Payload),
+        ("[task]", Task),
+        ("[uncertainty]", Uncertainty),
+        ("[handling]", Handling),
+        ("[collision]", CollisionSettings),
+    ],
+)
+def test_documented_ranges_and_units_are_those_of_the_records(section: str, record: type) -> None:
+    text = DOCUMENT.split(f"## `{section}`")[1].split("\n## ")[0]
+    kinds, compared = get_type_hints(record, include_extras=True), 0
+    for name, kind in kinds.items():
+        row = re.search(rf"^\| `{name}` \|.*$", text, re.MULTILINE)
+        told = row and re.search(r"([\d.e-]+) to ([\d.e]+)", row[0].split("|")[-2])
+        if row is None or told is None:
+            continue
+        for allowed in ranges_in(kind):
+            assert (float(told[1]), float(told[2])) == (allowed.low, allowed.high), name
+            assert f"[{allowed.unit}]" in row[0] or not allowed.unit, name
+            compared += 1
+    assert compared >= 2
 
 
 TEXT = b"""
