@@ -205,7 +205,11 @@ class Table:
         ]
 
     def record(self, kind: type[Record], **given: Any) -> Record:
-        """The record whose fields are the table's keys; fields that are given are none."""
+        """The record whose fields are the table's keys; fields that are given are none.
+
+        Raises:
+            ValueError: the record itself refuses what its fields allow.
+        """
         found, own_hints = dict(given), _hints(cast("Any", kind))
         for field in fields(kind):  # type: ignore[arg-type]
             if field.name in given:
@@ -216,7 +220,10 @@ class Table:
             self._known.add(field.name)
         if not self.problems.open:
             self.close()
-        return kind(**found)
+        try:
+            return kind(**found)
+        except (ValueError, DualArmError) as error:
+            raise ValueError(f"{self.path}: {error}") from error
 
     def records(self, key: str, kind: type[Record]) -> tuple[Record, ...]:
         """An array of tables as records."""
@@ -255,7 +262,7 @@ def checked(kind: Any, value: Any, path: str, problems: Problems) -> Any:
         return _array(shape, marks, value, path, problems)
     if is_dataclass(kind):
         if isinstance(value, Mapping):
-            return _made(kind, value, path, problems)
+            return Table(value, path, problems).record(kind)
         problem = "allowed is a table"
     elif origin is tuple:
         kinds = arguments
@@ -284,14 +291,6 @@ def checked(kind: Any, value: Any, path: str, problems: Problems) -> Any:
         return _single(kind, marks, value, path, problems)
     problems.add(path, f"found {shown(value)}; {problem}")
     return _stand_in(kind)
-
-
-def _made(kind: Any, value: Mapping[str, Any], path: str, problems: Problems) -> Any:
-    try:
-        return Table(value, path, problems).record(kind)
-    except (ValueError, DualArmError) as error:
-        problems.add(path, str(error))
-        return _stand_in(kind)
 
 
 def _single(kind: Any, marks: Sequence[Any], value: Any, path: str, problems: Problems) -> Any:
