@@ -261,7 +261,8 @@ def read_polished(root: Path, replica: Replica, workcell: Workcell) -> PolishedF
     path = polished_folder(root, replica.algorithm, replica.replica) / POLISH
     if not path.exists():
         return None
-    found, task = _record_of(PolishedFront, read_bytes(path), path, ANEW), workcell.task
+    found: PolishedFront = _record_of(PolishedFront, read_bytes(path), path, ANEW)
+    task = workcell.task
     problem = ""
     if bool(len(found.x)) != bool(len(replica.front)):
         problem = f"at x: found {len(found.x)} points"
