@@ -260,7 +260,7 @@ def checked(kind: Any, value: Any, path: str, problems: Problems) -> Any:
     shape = next((mark for mark in marks if isinstance(mark, Shape)), None)
     if shape is not None:
         return _array(shape, marks, value, path, problems)
-    if is_dataclass(kind):
+    if isinstance(kind, type) and is_dataclass(kind):
         if isinstance(value, Mapping):
             return Table(value, path, problems).record(kind)
         problem = "allowed is a table"
