@@ -37,26 +37,23 @@ ROOMS = {
     "heavy": (
         "symbolic/contact/test_even_grasp.py",
         "symbolic/contact/test_grasp.py",
-        "symbolic/contact/test_soft_finger.py",
-        "symbolic/functions/test_redundant_candidate.py",
+        "symbolic/contact/test_joint_allocation.py",
+        "symbolic/contact/test_payload_load.py",
         "symbolic/geometry/test_clearance.py",
         "symbolic/read/test_machines.py",
         "symbolic/robot/test_branches.py",
     ),
 }
 """Files and folders by what their tests need beside this process, or that they take long: whole
-models and conic programs."""
+models and conic programs. Single tests say so themselves."""
 
 PLAIN = (
     "hybrid_opt/calibrating",
     "hybrid_opt/display/test_table.py",
     "hybrid_opt/indicators/test_metrics.py",
-    "hybrid_opt/indicators/test_statistics.py",
     "hybrid_opt/metaheuristics/test_run.py",
     "hybrid_opt/metaheuristics/test_mopso.py",
-    "hybrid_opt/polishing/constraints",
-    "hybrid_opt/polishing/test_point.py",
-    "hybrid_opt/proposing/test_bounds.py",
+    "hybrid_opt/polishing/test_climbing.py",
     "hybrid_opt/proposing/test_problem.py",
     "hybrid_opt/timing/test_adapter.py",
     "studies/test_options.py",

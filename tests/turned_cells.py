@@ -22,26 +22,21 @@ REFERENCE = Orientation("quaternion", rotation_from_rpy([0.0, -QUARTER, 0.0]))
 """Rotation vectors count from a box that lies on its side."""
 
 
-def turned_cell(time_law: TimeLaw = "constant", about_one_axis: bool = False) -> Workcell:
-    """The hand-written cell with the box turned over; waypoints may tilt it as well, or not."""
+def turned_cell(time_law: TimeLaw = "constant") -> Workcell:
+    """The hand-written cell with the box turned over; waypoints may tilt it as well."""
     return with_task(
         hand_cell(),
-        waypoints=_waypoints(QUARTER, 0.0 if about_one_axis else 0.12),
+        waypoints=_waypoints(),
         time_law=time_law,
         orientation=REFERENCE,
         samples=30,
     )
 
 
-def pitched_cell() -> Workcell:
-    """The same carry by roll, pitch and yaw, turned about one axis only."""
-    return with_task(hand_cell(), waypoints=_waypoints(0.0, 0.0), samples=30)
-
-
-def _waypoints(begin: float, tilt: float) -> tuple[Waypoint, ...]:
+def _waypoints() -> tuple[Waypoint, ...]:
     given = hand_cell().task.waypoints
-    half = [0.05, 0.03, 0.05, tilt, 0.1, tilt]
-    poses = [np.array([*(w.lower + w.upper)[:3] / 2.0, 0.0, begin, 0.0]) for w in given]
+    half = [0.05, 0.03, 0.05, 0.12, 0.1, 0.12]
+    poses = [np.array([*(w.lower + w.upper)[:3] / 2.0, 0.0, QUARTER, 0.0]) for w in given]
     for pose, turn in zip(poses, TURNS, strict=True):
         pose[4] += turn
     return (fixed(poses[0]), *(free(pose, half) for pose in poses[1:-1]), fixed(poses[-1]))

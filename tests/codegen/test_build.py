@@ -315,7 +315,9 @@ def caller(name: str, inner: ca.Function) -> ca.Function:
     return ca.Function(name, [x], [inner(inner(x)) + 1.0])
 
 
-@pytest.mark.parametrize("lanes", [1, 2, 4, 0])
+@pytest.mark.parametrize(
+    "lanes", [1, 0, *(pytest.param(n, marks=pytest.mark.slow) for n in (2, 4))]
+)
 def test_parts_give_the_bits_of_the_whole(
     cache: Cache, monkeypatch: pytest.MonkeyPatch, lanes: int
 ) -> None:

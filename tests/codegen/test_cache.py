@@ -59,19 +59,13 @@ def test_damaged_library_is_not_found(cache: Cache, damage: bytes) -> None:
     assert cache.find(KEY) is not None
 
 
-@pytest.mark.parametrize("damage", ["", "{", "[]", '{"facts": {}, "sha256": "0"}', "null", "\xff"])
+@pytest.mark.parametrize("damage", ["{", '{"facts": {}, "sha256": "0"}', "null", "\xff", "mads"])
 def test_damaged_manifest_is_not_found(cache: Cache, damage: str) -> None:
+    """Also one that says something plausible, but not what was written."""
     put(cache)
     manifest = cache.folder / f"{KEY}.json"
-    manifest.write_text(damage, encoding="latin-1")
-    assert cache.find(KEY) is None
-
-
-def test_changed_manifest_is_not_found(cache: Cache) -> None:
-    """A plausible manifest that says something else than was written."""
-    put(cache)
-    manifest = cache.folder / f"{KEY}.json"
-    manifest.write_text(manifest.read_text().replace("made", "mads"))
+    text = manifest.read_text().replace("made", damage) if damage == "mads" else damage
+    manifest.write_text(text, encoding="latin-1")
     assert cache.find(KEY) is None
 
 

@@ -42,7 +42,7 @@ def make(request: pytest.FixtureRequest, cache: Cache) -> Make:
     return lambda function: compile_function(function, cache)
 
 
-@settings(max_examples=6, suppress_health_check=list(HealthCheck))
+@settings(max_examples=3, suppress_health_check=list(HealthCheck))
 @given(seed=st.integers(0, 2**32 - 1), symbol=st.sampled_from([ca.SX, ca.MX]))
 def test_compiled_equals_interpreted(cache: Cache, seed: int, symbol: Any) -> None:
     rng = np.random.default_rng(seed)

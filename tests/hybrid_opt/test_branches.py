@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hybrid_opt.branches import BranchCompetition, PairResult, search_branches
+from hybrid_opt.branches import BranchCompetition, search_branches
 from hybrid_opt.campaign import CampaignSettings, ExecutionSettings
 from hybrid_opt.campaign.stages import decided_cell, read_branches, store_branches
 from hybrid_opt.cell import Cell
@@ -45,26 +45,6 @@ def test_every_pair_is_there_once_and_the_best_wins(cell: Cell, found: BranchCom
     assert found.evaluations == sum(pair.evaluations for pair in found.pairs)
     others = [pair.hypervolume for pair in found.pairs[1:] if pair.rounds]
     assert ("more than branches" in str(found)) == (max(others) > 0.0)
-
-
-def test_who_won_and_by_how_much_is_told() -> None:
-    won = PairResult((2, 0), 2, 120, 0.5, 0.4, 0.6)
-    second = PairResult((1, 1), 1, 80, 0.2, 0.3, 0.7)
-    lost = replace(second, feasible_share=0.0, hypervolume=0.0)
-    out = replace(lost, branches=(0, 0), rounds=0, evaluations=33)
-
-    def told(*pairs: PairResult) -> str:
-        return str(BranchCompetition(pairs, 233, "constant"))
-
-    head = "start branches 2 and 0, best of 2 pairs in 233 evaluations under the time law constant"
-    tried = "those by which 3 pairs were tried out included"
-    assert told(won, second, out) == (
-        f"{head}, {tried}: hypervolume 0.4000, 0.1000 more than branches 1 and 1"
-    )
-    assert told(won, lost, out).endswith("hypervolume 0.4000; the others found no feasible carry")
-    assert told(won, out).endswith("hypervolume 0.4000")
-    nothing = replace(won, feasible_share=0.0, hypervolume=0.0, least_penalty=1.2)
-    assert told(nothing, lost).endswith("no pair found a feasible carry, least penalty 1.2000")
 
 
 def test_halving_gives_the_better_half_more(found: BranchCompetition) -> None:

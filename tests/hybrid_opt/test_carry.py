@@ -1,4 +1,4 @@
-"""The one record of a carry: its figures against the compiled outputs and closed forms."""
+"""The one record of a carry, and carries under the task's own time law."""
 
 from __future__ import annotations
 
@@ -11,9 +11,15 @@ import pytest
 from hybrid_opt.carry import Carry
 from hybrid_opt.cell import Cell
 from hybrid_opt.evaluate.evaluation import REASONS
+from hybrid_opt.timing.analysis import judge_timing
+from hybrid_opt.timing.model import REFINEMENT, TimingModel
+from hybrid_opt.timing.records import TimingStatus
 from symbolic.read.cell import load
+from symbolic.records import TimeLaw
 from tests.hybrid_opt.campaign.fake import RACK
 from tests.hybrid_opt.cells import shipped
+from tests.hybrid_opt.timing.cells import initial, near_initial, timing_of
+from tests.symbolic.cells import hand_cell
 
 
 def cell() -> Cell:
@@ -21,12 +27,12 @@ def cell() -> Cell:
 
 
 @cache
-def initial() -> Carry:
+def held() -> Carry:
     return cell().carry(cell().initial)
 
 
 def test_it_holds_what_the_compiled_function_returned() -> None:
-    carry, outputs = initial(), cell().evaluator.outputs(cell().initial)
+    carry, outputs = held(), cell().evaluator.outputs(cell().initial)
     assert len(carry) == cell().workcell.task.samples
     for name in ("pose", "rate", "second_rate", "normal_force", "pressure_shift"):
         np.testing.assert_array_equal(getattr(carry, name), outputs[name][0])
@@ -42,15 +48,15 @@ def test_its_own_torques_hold_the_arms_up() -> None:
     import pinocchio as pin
 
     models = cell().compiled.model.robots
-    for arm, robot in zip(initial().arms, models, strict=True):
+    for arm, robot in zip(held().arms, models, strict=True):
         data = robot.model.createData()
-        for k in (0, 37, len(initial()) - 1):
+        for k in (0, 37, len(held()) - 1):
             torque = pin.rnea(robot.model, data, arm.q[k], arm.q_rate[k], arm.q_second[k])
             np.testing.assert_allclose(arm.own_torque[k], torque, atol=1e-8)
 
 
 def test_figures_have_closed_forms() -> None:
-    carry, task = initial(), cell().workcell.task
+    carry, task = held(), cell().workcell.task
     still = 9.81 * cell().workcell.payload.mass / (2.0 * cell().workcell.contacts[0].friction)
     np.testing.assert_allclose(
         carry.excess_above_static, 100.0 * (carry.normal_force.max(axis=0) / still - 1.0)
@@ -69,9 +75,9 @@ def test_figures_have_closed_forms() -> None:
 
 def test_a_carry_cannot_be_changed() -> None:
     with pytest.raises(ValueError, match="read-only"):
-        initial().pose[0, 0] = 1.0
+        held().pose[0, 0] = 1.0
     with pytest.raises(ValueError, match="read-only"):
-        initial().arms[0].q[0, 0] = 1.0
+        held().arms[0].q[0, 0] = 1.0
 
 
 def test_the_verdict_is_that_of_the_evaluation() -> None:
@@ -91,15 +97,53 @@ def test_the_verdict_is_that_of_the_evaluation() -> None:
 
 
 def test_it_prints_its_figures() -> None:
-    text = repr(initial())
+    text = repr(held())
     assert "feasible" in text
-    assert f"{initial().payload_limit:.3f} kg" in text
-    page = initial()._repr_html_()
+    assert f"{held().payload_limit:.3f} kg" in text
+    page = held()._repr_html_()
     assert "<svg" in page
     assert "payload limit" in page
 
 
 def test_names_cannot_become_markup() -> None:
     evil = replace(load(RACK), name="<script>alert(1)</script>")
-    carry = replace(initial(), workcell=evil)
+    carry = replace(held(), workcell=evil)
     assert "<script" not in carry._repr_html_()
+
+
+INTERVALS = 20
+
+
+@cache
+def timing(law: TimeLaw) -> TimingModel:
+    """Sampled as densely as the timing recomputes a path."""
+    cell = hand_cell()
+    task = replace(cell.task, time_law=law, samples=REFINEMENT * INTERVALS + 1)
+    return timing_of(replace(cell, task=task), INTERVALS)
+
+
+def test_joint_rates_are_those_of_the_exact_derivatives() -> None:
+    """Of the path's derivatives that the timing model compiles, driven with the box's speed."""
+    model = timing("ramped")
+    carry, motion = model.search_carry(initial()), model.path_motion(initial())
+    np.testing.assert_allclose(carry.parameter, motion.parameter, atol=1e-15)
+    length = (motion.pose_first**2).sum(axis=1)
+    speed = ((carry.rate * motion.pose_first).sum(axis=1) / length)[:, None]
+    bend = carry.second_rate - motion.pose_second * speed**2
+    push = ((bend * motion.pose_first).sum(axis=1) / length)[:, None]
+    q_second = motion.q_second * speed**2 + motion.q_first * push
+    np.testing.assert_allclose(carry.side_by_side("q_rate"), motion.q_first * speed, atol=1e-3)
+    inside = slice(3, -3)
+    second = carry.side_by_side("q_second")
+    np.testing.assert_allclose(second[inside], q_second[inside], atol=5e-3)
+
+
+def test_a_ramped_carry_rests_at_its_ends() -> None:
+    """And is not told that its robots would have to be at speed there."""
+    for x in (initial(), *near_initial(np.random.default_rng(4), 3)):
+        carry = timing("ramped").search_carry(x)
+        for arm in carry.arms:
+            np.testing.assert_allclose(arm.q_rate[[0, -1]], 0.0, atol=1e-6)
+        judged = judge_timing(timing("ramped"), x)
+        assert "at speed" not in judged.reason
+    assert judge_timing(timing("ramped"), initial()).status is TimingStatus.OK

@@ -22,7 +22,6 @@ from hybrid_opt.errors import ResultsError
 from hybrid_opt.indicators import metrics
 from hybrid_opt.polishing.settings import FillSettings
 from hybrid_opt.store.files import sha256
-from hybrid_opt.store.trajectory_file import read_trajectory
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.records import Workcell
@@ -171,15 +170,6 @@ def test_a_carry_is_timed_and_exported(tmp_path: Path) -> None:
     assert told == {name: sha256((folder / name).read_bytes()) for name in told}
     every = ho.time_every_way(cell(), carry.x, force_limit=52.0)
     assert every.timings["force limited"].duration == pytest.approx(timing.duration)
-
-
-def test_a_carry_is_stored_with_its_cell(tmp_path: Path) -> None:
-    carry = front().balanced()
-    ho.save(carry, tmp_path / "carry.json", {"algorithm": "nsga2"})
-    stored = read_trajectory(tmp_path / "carry.json")
-    np.testing.assert_array_equal(stored.x, carry.x)
-    assert stored.figures["payload_limit"] == carry.payload_limit
-    assert stored.unpack(tmp_path).digest == cell().workcell.digest
 
 
 def _height(outputs: Mapping[str, Array], _: Workcell) -> Array:

@@ -1,4 +1,4 @@
-"""Derivatives by a cell's numbers: against the force and duration of carries in changed cells."""
+"""What a cell's numbers do: derivatives, sweeps over them, and better places of pads."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 
 import hybrid_opt as ho
+from hybrid_opt import sweeping
+from hybrid_opt.front import Front
 from hybrid_opt.recommending.choice import LEADER
 from hybrid_opt.robust.cases import worst_cases
 from hybrid_opt.robust.force import pressing_model
@@ -18,7 +20,8 @@ from hybrid_opt.timing.given import drive_path
 from symbolic import outside
 from symbolic.array import Array
 from symbolic.contact.worst_cases import case_grasp_function, case_grasp_gradient_function
-from symbolic.errors import SettingsError
+from symbolic.errors import SettingsError, WorkcellError
+from tests.hybrid_opt.cells import shipped
 from tests.symbolic.cells import RACK
 
 CELLS = RACK.parent
@@ -213,3 +216,118 @@ def test_pads_anywhere() -> None:
     here = in_changed(cell, "payload.mass", 8.0)
     for key in ("payload.mass", "uncertainty.disturbance[0]", "contacts[1].xyz[0]"):
         assert_derivatives(cell, found[key], here)
+
+
+OVER = {"payload.mass": [8.0, 10.0], "contacts.friction": [0.3, 1.0]}
+
+
+@pytest.fixture(scope="module")
+def cell() -> ho.Cell:
+    return ho.Cell.load(RACK).drivable()
+
+
+def test_a_fixed_path_is_what_it_is_in_each_cell(
+    cell: ho.Cell, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = tmp_path / "sweep.json"
+    found = ho.sweep(cell, cell.initial, OVER, fixed=True, file=file)
+    assert [row.values for row in found.rows] == [(8, 0.3), (8, 1), (10, 0.3), (10, 1)]
+    none, light, _, heavy = found.rows
+    assert np.isnan(none.duration)
+    assert "friction" in none.remark
+    assert light.force < heavy.force
+    one = cell.changed({"payload.mass": 8.0, "contacts.friction": 1.0})
+    x = np.append(one.initial[:-1], one.workcell.task.force_limit[1])
+    own = ho.recommend(Front.of_search(one, "given", one.evaluator.certified(one.evaluate(x))))
+    # Around the least product both are exchanged at hardly any cost.
+    least = own.duration * own.force
+    assert light.duration * light.force == pytest.approx(least, rel=1e-2)
+    np.testing.assert_array_equal(light.x[:-1], cell.initial[:-1])
+
+    def again(*_: object) -> None:
+        raise AssertionError("what is stored was computed again")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(sweeping, "_row", again)
+        same = ho.sweep(cell, cell.initial, OVER, fixed=True, file=file)
+    assert repr(same) == repr(found)
+    with pytest.raises(SettingsError, match="another cell, or over other values"):
+        ho.sweep(cell, cell.initial, OVER, file=file)
+
+
+@pytest.mark.slow
+def test_a_polished_path_is_better_than_the_fixed_one(cell: ho.Cell) -> None:
+    over = {"payload.mass": [9.0]}
+    fixed = ho.sweep(cell, cell.initial, over, fixed=True).rows[0]
+    free = ho.sweep(cell, cell.initial, over).rows[0]
+    assert free.duration * free.force < 0.95 * fixed.duration * fixed.force
+    assert not np.array_equal(free.x[:-1], cell.initial[:-1])
+
+
+def test_wrong_sweeps_are_refused(cell: ho.Cell) -> None:
+    with pytest.raises(SettingsError, match="needs keys, and values of each"):
+        ho.sweep(cell, cell.initial, {})
+    with pytest.raises(SettingsError, match="takes a drivable cell"):
+        ho.sweep(ho.Cell.load(RACK), cell.initial[:-1], OVER)
+    with pytest.raises(WorkcellError, match=r"payload\.weight"):
+        ho.sweep(cell, cell.initial, {"payload.weight": [1.0]})
+
+
+LOWEST, HIGHEST = -0.03, 0.006
+
+
+@pytest.fixture(scope="module")
+def grip() -> ho.Grip:
+    told = list[int]()
+    found = ho.propose_grip(
+        shipped("rack"),
+        (LOWEST, HIGHEST),
+        (0.0, 0.0),
+        trials=15,
+        progress=lambda done, total: told.append(done),
+    )
+    assert told == list(range(1, len(told) + 1))
+    assert len(told) >= 10
+    return found
+
+
+def product(up: float) -> float:
+    """Of duration and force to command, of the rack's hand-made path with its pads higher up;
+    infinite where it touches something."""
+    places = {f"contacts[{k}].xyz": [0.0, y, 0.055 + up] for k, y in enumerate((0.2, -0.2))}
+    cell = shipped("rack").changed(places).drivable()
+    x = cell.initial[None]
+    front = Front.of_search(cell, "given", cell.evaluator.certified(cell.evaluate(x)))
+    if not len(front):
+        return np.inf
+    found = ho.recommend(front, alone=True)
+    return found.duration * found.force
+
+
+def test_no_place_of_a_grid_is_better(grip: ho.Grip) -> None:
+    """But for what limits on jerk and whole ticks of a job change."""
+    best = product(grip.up)
+    assert np.isfinite(best)
+    assert best < 0.995 * product(0.0)
+    assert best < 1.02 * min(product(up) for up in (-0.03, -0.02, -0.01))
+    assert grip.duration * grip.force < grip.before
+
+
+def test_the_cell_is_certified_and_differs_in_its_pads_alone(grip: ho.Grip) -> None:
+    cell, given = grip.cell, shipped("rack")
+    assert cell.certify(cell.initial).is_free
+    assert LOWEST <= grip.up <= HIGHEST
+    assert grip.along == 0.0
+    for own, other in zip(cell.workcell.contacts, given.workcell.contacts, strict=True):
+        moved = own.T_box_pad[:3, 3] - other.T_box_pad[:3, 3]
+        np.testing.assert_allclose(moved, [0.0, 0.0, grip.up], atol=1e-9)
+    np.testing.assert_array_equal(cell.initial, given.initial)
+
+
+def test_what_cannot_be_compared_is_told() -> None:
+    with pytest.raises(SettingsError, match="closed form"):
+        ho.propose_grip(shipped("fork"), (0.0, 0.01), (0.0, 0.0))
+    with pytest.raises(SettingsError, match=r"a range from 0\.02 to 0\.01 m"):
+        ho.propose_grip(shipped("rack"), (0.02, 0.01), (0.0, 0.0))
+    with pytest.raises(SettingsError, match="no place of the pads"):
+        ho.propose_grip(shipped("rack"), (0.2, 0.2), (0.0, 0.0))

@@ -12,7 +12,7 @@ import pytest
 
 from studies import export, inspect, recommend, replay, robust, simulate
 from studies.options import force, number, seed, stated, whole
-from studies.research import reference_front, thresholds
+from studies.research import benchmark, reference_front, thresholds
 from tests.symbolic.cells import ROOT
 
 CAMPAIGN = (
@@ -86,6 +86,7 @@ def test_what_the_source_does_not_state_is_an_error() -> None:
         (thresholds.main, ["--seed", "-1"]),
         (inspect.main, ["c.toml", "--candidates", "1000000000000000"]),
         (inspect.main, ["c.toml", "--seed", "x"]),
+        (benchmark.main, ["--repeats", "-1"]),
         (reference_front.main, ["c.toml", "--output", "f.csv", "--starts", "0"]),
         (reference_front.main, ["c.toml", "--output", "f.csv", "--jobs", "-1"]),
         (reference_front.main, ["c.toml", "--output", "f.csv", "--attempts", "-1"]),

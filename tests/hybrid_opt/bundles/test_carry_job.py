@@ -84,19 +84,6 @@ def test_what_is_ahead_is_what_happens() -> None:
     assert list(Clock(1.0, 0.5, 0.0, 1.0).ahead(1.0, 0.3))[-1].s == 1.0
 
 
-def test_a_sound_run_ends() -> None:
-    machine = Machine(job())
-    with pytest.raises(Refused, match="no news from left"):
-        machine.start(Seen())
-    machine.start(Seen(posture(0.0)))
-    time = 0.0
-    while machine.state == "running":
-        machine.tick(0.05, Seen(posture(machine.clock.s)))
-        time += 0.05
-    assert machine.state == "done", machine.told()
-    assert time == pytest.approx(job().end, abs=0.2)
-
-
 def moved(q: list[float] | None, by: float) -> list[float]:
     assert q is not None
     return [value + by for value in q]
@@ -234,11 +221,11 @@ def test_distances_are_bounds() -> None:
 KINDS = ("freeze", "late", "silent", "sensor", "encoder", "asked", "pause")
 
 
-def test_two_hundred_faults_in_all_phases() -> None:
+def test_many_faults_in_all_phases() -> None:
     """Both arms follow, then something happens at a random moment: the job ends held, on its path,
     within the stop that it states, pressing what belongs there. A pause of 50 ms stops nothing."""
     rng = np.random.default_rng(7)
-    for number in range(200):
+    for number in range(70):
         kind, arm = KINDS[number % len(KINDS)], int(rng.integers(2))
         when = float(rng.uniform(0.3, job().end - 2.0))
         machine = running(when - 0.05)

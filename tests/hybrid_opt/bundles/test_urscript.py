@@ -355,20 +355,6 @@ def test_an_arm_elsewhere_is_not_moved_unasked() -> None:
         assert np.ptp(np.array([row[1] for row in arm.record]), axis=0).max() < 1e-12
 
 
-def test_a_broken_program_is_refused() -> None:
-    """The reader closes what was opened, and the arms know the manual's functions alone."""
-    text = str(next(iter(contents("ur-script").values())))
-    last = text.rindex("end")
-    for broken in (text[:last], text.replace("while", "whole", 1), text + "end\n"):
-        with pytest.raises((AssertionError, IndexError, SyntaxError)):
-            as_python(broken)
-    space = Pair([np.zeros(6), np.zeros(6)], {}).arms[0].names()
-    module = as_python(text.replace("set_tcp(", "set_tpc(", 1))
-    exec(compile(module, "script", "exec"), space)
-    with pytest.raises(NameError, match="set_tpc"):
-        space["carry_job"]()
-
-
 def test_other_arms_and_steps_are_refused() -> None:
     with pytest.raises(SettingsError, match="UR e-series"):
         TARGETS["ur-script"].refuse(rack_job(), "ur-script", any_arm=False)

@@ -13,13 +13,10 @@ from hybrid_opt.calibrating.evidence import Evidence, calibrate
 from hybrid_opt.calibrating.recording import Run, places_of
 from studies.research.plain.arm import PlainArm
 from symbolic.array import Array
-from symbolic.records.cell import USUAL
 from tests.hybrid_opt.calibrating.generator import (
     CELL,
     LEVEL,
-    RATE,
     SQUEEZES,
-    TILTED,
     Truth,
     run,
 )
@@ -219,13 +216,6 @@ def test_an_arm_that_moves_late_is_told() -> None:
     assert float(entry.split()[0]) == pytest.approx(0.2, abs=0.02)
 
 
-def test_a_cell_that_states_no_range_keeps_the_usual_ones() -> None:
-    doubt = calibrate(replace(CELL, uncertainty=USUAL), [run(0)]).changes["uncertainty"]
-    assert doubt["friction"] == USUAL.friction
-    assert doubt["tilt"] == USUAL.tilt
-    assert doubt["mass"] != USUAL.mass
-
-
 # --- planted faults ---
 
 
@@ -393,12 +383,3 @@ def test_without_moments_the_centre_of_mass_is_not_written() -> None:
     found = calibrate(CELL, [scaled(made, 1.0, np.nan)])
     assert names(found) == {"moments missing"}
     assert found.changes["payload"] == {"mass": pytest.approx(4.4, rel=0.03)}
-
-
-def test_a_hold_with_a_dropout_is_left_out() -> None:
-    made = run(0)
-    begin, end = made.labels.held[0]
-    found = calibrate(CELL, [replace(made, lost=((begin + 0.2, begin + 0.7),))])
-    assert names(found) == {"dropout"}
-    assert f"from {len(TILTED) * len(SQUEEZES) - 1} holds" in told(found, "mass")
-    assert end - begin > 10.0 / RATE

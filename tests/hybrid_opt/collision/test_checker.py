@@ -17,7 +17,6 @@ from codegen.interpreted import InterpretedFunction
 from codegen.source import dense
 from hybrid_opt.collision.checker import RESTING_TOLERANCE, CollisionChecker, sample_durations
 from symbolic.geometry.pairs import CellGeometry, build_geometry, coal_distance, coal_geometry
-from symbolic.geometry.pieces import Piece
 from symbolic.records import AllowedContact, CollisionSettings, Uncertainty, Workcell
 from tests.hybrid_opt.collision.queries import collision_mask
 from tests.symbolic.geometry.collision_cells import (
@@ -69,10 +68,15 @@ def coal_mask(geometry: CellGeometry, at: Configurations) -> NDArray[np.bool_]:
     return mask
 
 
-def assert_agree(name: str, folder: Path, n: int, seed: int) -> None:
-    """FCL and Coal differ on no pair, but where the bodies are within their resolution."""
+CELLS = pytest.mark.parametrize("name", ["rack", "obstacles", "ur10"])
+
+
+@CELLS
+@pytest.mark.parametrize("n", [250, pytest.param(10_000, marks=pytest.mark.slow)])
+def test_fcl_agrees_with_coal(name: str, n: int, folder: Path) -> None:
+    """They differ on no pair, but where the bodies are within their resolution."""
     geometry = geometry_of(name, folder)
-    at = random_configurations(geometry, n, np.random.default_rng(seed))
+    at = random_configurations(geometry, n, np.random.default_rng(31))
     ours, theirs = collision_mask(checker(name, folder), *at), coal_mask(geometry, at)
     assert ours.any()
     assert not ours.all()
@@ -83,21 +87,12 @@ def assert_agree(name: str, folder: Path, n: int, seed: int) -> None:
         assert abs(gap) < RESOLUTION, (geometry.pair_names[i], gap)
 
 
-@pytest.mark.parametrize("name", ["rack", "obstacles", "ur10"])
-def test_fcl_agrees_with_coal(name: str, folder: Path) -> None:
-    assert_agree(name, folder, 250, 31)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["rack", "obstacles", "ur10"])
-def test_fcl_agrees_with_coal_on_ten_thousand_configurations(name: str, folder: Path) -> None:
-    assert_agree(name, folder, 10_000, 32)
-
-
-def assert_screening_changes_nothing(name: str, folder: Path, n: int, seed: int) -> None:
+@CELLS
+@pytest.mark.parametrize("n", [1500, pytest.param(20_000, marks=pytest.mark.slow)])
+def test_screening_changes_nothing(name: str, n: int, folder: Path) -> None:
     """Every sample's verdict and every cleared pair, against FCL on all pairs."""
     judge = checker(name, folder)
-    at = random_configurations(judge.geometry, n, np.random.default_rng(seed))
+    at = random_configurations(judge.geometry, n, np.random.default_rng(33))
     bounds, mask = judge.bounds(*at), collision_mask(judge, *at)
     assert not np.any(mask & (bounds > RESOLUTION))
     time = np.arange(float(n))
@@ -114,17 +109,6 @@ def assert_screening_changes_nothing(name: str, folder: Path, n: int, seed: int)
     assert touch.sample == np.flatnonzero(mask.any(axis=1))[0]
     assert (touch.first, touch.second) in hit
     assert touch.time == time[touch.sample]
-
-
-@pytest.mark.parametrize("name", ["rack", "obstacles", "ur10"])
-def test_screening_changes_nothing(name: str, folder: Path) -> None:
-    assert_screening_changes_nothing(name, folder, 1500, 33)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["rack", "obstacles", "ur10"])
-def test_screening_changes_nothing_in_twenty_thousand_samples(name: str, folder: Path) -> None:
-    assert_screening_changes_nothing(name, folder, 20_000, 37)
 
 
 @pytest.mark.parametrize("name", ["obstacles", "ur10"])
@@ -294,18 +278,3 @@ def test_unknown_bounds_go_to_fcl() -> None:
     judge = checker_of(only_payload(rack()))
     unknown = np.full((1, 1), np.nan)
     assert judge.check(*above_board([-0.1]), np.zeros(1), unknown).colliding.all()
-
-
-def test_hulls_and_their_pieces_reach_fcl_unchanged() -> None:
-    """Every UR10 mesh piece: FCL and Coal measure the same distance from a far point's ball."""
-    import fcl
-
-    from hybrid_opt.collision.judge import fcl_object
-    from symbolic.geometry.pieces import ball
-
-    probe = ball(np.array([0.7, -0.6, 0.9]), 0.05)
-    for body in geometry_of("ur10").bodies[:8]:
-        for piece in body.pieces:
-            ours = fcl.distance(fcl_object(piece), fcl_object(probe))
-            assert isinstance(piece, Piece)
-            assert ours == pytest.approx(coal_distance((piece,), (probe,)), abs=1e-5)

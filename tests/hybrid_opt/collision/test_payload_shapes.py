@@ -71,20 +71,6 @@ def test_agrees_with_coal_and_bounds_stay_below(kind: str, tmp_path: Path) -> No
         assert (bounds[k] <= apart + RESOLUTION).all()
 
 
-def test_the_mesh_is_more_than_one_piece_and_less_than_its_hull(tmp_path: Path) -> None:
-    cell = geometry("mesh", tmp_path)
-    (payload,) = (body for body in cell.bodies if body.name == "payload")
-    assert len(payload.pieces) == 2
-    corner = np.array([0.1, 0.0, 0.1])  # within the hull of the L, beside its boards
-    inside = [
-        bool((piece.shape.vertices.min(axis=0) < corner).all())
-        and bool((corner < piece.shape.vertices.max(axis=0)).all())
-        for piece in payload.pieces
-        if isinstance(piece.shape, Hull)
-    ]
-    assert inside == [False, False]
-
-
 @given(by=st.floats(1e-4, 5e-3), seed=st.integers(0, 2**31))
 def test_shrinks_on_every_side(by: float, seed: int) -> None:
     """In every direction across a face by the length, or by more."""

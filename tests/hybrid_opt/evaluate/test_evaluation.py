@@ -110,17 +110,6 @@ def test_every_reason_is_the_plain_reference_s_too() -> None:
             assert_agrees(evaluations, k, plain(x[k]))
 
 
-def test_a_batch_is_its_candidates_one_by_one() -> None:
-    """To the bit: results do not depend on how a search groups its candidates."""
-    ours = evaluator(RACK)
-    x = candidates(ours.workcell, 30, 62, 1.5)
-    together = ours.evaluate(x)
-    for k in range(len(x)):
-        alone = ours.evaluate(x[k])
-        for name in vars(together):
-            np.testing.assert_array_equal(getattr(together, name)[k], getattr(alone, name)[0])
-
-
 @pytest.mark.parametrize("name", ["rack", "obstacles", "ur10"])
 @pytest.mark.parametrize(("tolerance", "displaced"), [(0.0, 0.0), (0.01, 0.02)])
 def test_the_plain_check_places_what_the_compiled_one_places(

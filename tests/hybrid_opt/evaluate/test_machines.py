@@ -1,5 +1,4 @@
-"""Robots as their makers describe them: compiled against interpreted, both against the plain
-reference."""
+"""Carries of machines with two arms, and of arms with a seventh joint, evaluated."""
 
 from __future__ import annotations
 
@@ -11,8 +10,10 @@ import pytest
 from codegen.build import build
 from codegen.interpreted import InterpretedFunction
 from codegen.source import dense
+from hybrid_opt.cell import Cell
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from studies.research.plain.candidate import PlainJudge
+from studies.research.turns import interleaved
 from symbolic.array import Array
 from symbolic.cell_model import build_cell_model
 from symbolic.functions import cell_functions
@@ -20,7 +21,8 @@ from symbolic.records import Workcell
 from symbolic.records.task import initial_decision
 from tests.hybrid_opt.evaluate.test_evaluation import assert_agrees
 from tests.machines import MACHINES, SINGLE, cell_of
-from tests.redundant_cells import machine_on_lift, seven_joints
+from tests.redundant_cells import free_pandas, locked_pandas, machine_on_lift, seven_joints
+from tests.symbolic.cells import with_task
 
 pytestmark = pytest.mark.filterwarnings("ignore::symbolic.geometry.hulls.CollisionModelWarning")
 
@@ -96,3 +98,59 @@ def test_every_machine_with_seven_joints(name: str, tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_both_arms_on_one_lift(tmp_path: Path) -> None:
     agree(machine_on_lift(tmp_path, 0.1, free=True))
+
+
+ANGLE = 0.1
+SAMPLES = 100
+MOST_COST = 1.35
+"""Of a seven-joint candidate, in one of six joints."""
+
+DRAWN, BATCH = 2000, 64
+
+
+@pytest.fixture(scope="module")
+def pandas(tmp_path_factory: pytest.TempPathFactory) -> tuple[Cell, Cell]:
+    """With seven joints per arm, and with six."""
+
+    def cell(workcell: Workcell) -> Cell:
+        return Cell(with_task(workcell, samples=SAMPLES))
+
+    free = free_pandas(tmp_path_factory.mktemp("free"), f"initial = {ANGLE}")
+    return cell(free), cell(locked_pandas(tmp_path_factory.mktemp("locked"), ANGLE))
+
+
+def carries(pandas: tuple[Cell, Cell], spread: float) -> tuple[Array, Array]:
+    """Candidates that are feasible in both, the same box paths: every sample of them counts.
+    Redundant joints stray by so much [rad]."""
+    free, locked = pandas
+    rng = np.random.default_rng(2)
+    box = locked.random(DRAWN, rng)
+    more = ANGLE + rng.uniform(-spread, spread, (DRAWN, len(free.initial) - box.shape[1]))
+    whole = np.hstack([box, more])
+    fine = np.flatnonzero(free.evaluate(whole).feasible & locked.evaluate(box).feasible)[:BATCH]
+    assert len(fine) == BATCH
+    return whole[fine], box[fine]
+
+
+@pytest.mark.slow
+def test_held_at_one_position_it_changes_nothing(pandas: tuple[Cell, Cell]) -> None:
+    free, locked = pandas
+    box = locked.random(DRAWN, np.random.default_rng(1))
+    held = np.full((DRAWN, len(free.initial) - box.shape[1]), ANGLE)
+    seven, six = free.evaluate(np.hstack([box, held])), locked.evaluate(box)
+    assert 0.05 < six.feasible.mean() < 0.95
+    np.testing.assert_array_equal(seven.feasible, six.feasible)
+    np.testing.assert_allclose(seven.objectives, six.objectives, atol=1e-9)
+    np.testing.assert_allclose(seven.penalised, six.penalised, atol=1e-9)
+
+
+@pytest.mark.slow
+def test_it_costs_little(pandas: tuple[Cell, Cell]) -> None:
+    x = carries(pandas, 0.05)
+    times = interleaved(
+        {"seven": pandas[0].evaluate, "six": pandas[1].evaluate},
+        {"seven": x[0][None], "six": x[1][None]},
+        30,
+    )
+    cost = float(np.median(times["seven"] / times["six"]))
+    assert cost <= MOST_COST, f"a seven-joint candidate costs {cost:.2f} times one of six joints"

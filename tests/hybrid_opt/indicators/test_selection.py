@@ -22,8 +22,6 @@ from symbolic.records.task import initial_decision
 from tests.hybrid_opt.campaign.fake import RACK
 from tests.hybrid_opt.cells import shipped
 
-CELL = RACK.with_name("transfer.toml")
-
 
 @pytest.fixture(scope="module")
 def evaluator() -> CandidateEvaluator:

@@ -11,9 +11,7 @@ from hybrid_opt.job.compliance import (
     force_margin,
     largest_skew,
     position_control,
-    position_text,
     require_skew,
-    skew_text,
     skewed,
 )
 from symbolic.array import Array
@@ -98,13 +96,3 @@ def test_a_stiffness_is_positive() -> None:
             position_control(rack_job(), stiffness)
         with pytest.raises(SettingsError, match="stiffness"):
             skewed(rack_job(), 0.01, stiffness)
-
-
-def test_a_job_shows_itself() -> None:
-    job = rack_job()
-    text = repr(job)
-    assert repr(job) == text
-    for name in ("approach", "press", "lift", "carry", "set down", "release", "retreat"):
-        assert name in text
-    assert "no" in position_text([position_control(job, 1e6)])
-    assert "SLIPS" in skew_text([skewed(job, 0.05, 1e5)])

@@ -20,7 +20,7 @@ from hybrid_opt.work.service import LocalExecutor, Service, answer_all
 from symbolic.read.cell_files import collect_cell
 from tests.symbolic.read.samples import RACK
 
-QUICK = ("drum", "fork", "rack", "transfer")
+QUICK = ("fork", "rack")
 """Cells that other tests compile as well; the rest takes minutes."""
 
 CELLS = [
@@ -50,7 +50,7 @@ def test_a_worker_elsewhere_searches_without_the_cells_files(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """With the joint allocation paths are timed one by one, which reads the robots' files."""
-    cell = ho.Cell.load(RACK.with_name("drum.toml")).drivable()
+    cell = ho.Cell.load(RACK.with_name("fork.toml")).drivable()
     evaluator = partial(CandidateEvaluator, objectives=DRIVABLE_OBJECTIVES)
     source = partial(with_cell, evaluator, collect_cell(cell.workcell))
     settings = CampaignSettings({"random": {}}, EVALUATIONS, 1, objectives=DRIVABLE_OBJECTIVES)

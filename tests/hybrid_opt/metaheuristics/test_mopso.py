@@ -205,6 +205,7 @@ def test_archive_and_front_respect_the_capacity() -> None:
     assert (constraints <= 0.0).all()
 
 
+@pytest.mark.heavy
 def test_inside_the_bands_at_1000() -> None:
     problems = ("zdt1", "zdt2", "zdt3", "tnk", "srn", "osy")
     result = compare(problems, [1000], ["mopso", "mopso-turbulent"], seeds=10)
@@ -223,6 +224,7 @@ def test_inside_the_bands_of_longer_runs(problem: str, evaluations: int) -> None
     assert row.igd_verdict in ("inside", "better")
 
 
+@pytest.mark.heavy
 def test_level_with_nsga2_where_the_optimum_lies_inside() -> None:
     result = compare(["shifted-zdt1"], [1000], ["mopso", "nsga2"], seeds=20)
     volume, distance = result.tests

@@ -357,6 +357,7 @@ def test_front_has_its_known_range_and_volume(name: str) -> None:
     assert metrics.non_dominated(target.front).all()
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("name", ["tnk", "srn", "osy"])
 def test_front_is_what_a_gradient_solver_finds(name: str) -> None:
     """Least f1 under a bound on f2, by SLSQP from many starts."""

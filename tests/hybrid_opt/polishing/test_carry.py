@@ -1,9 +1,10 @@
-"""A candidate on places: lowest stretches, dips between places, and distances that are measured
-only where they decide, as if all had been measured."""
+"""A candidate on places as if all had been measured, and what programs of a cell share."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,12 +12,20 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from codegen.cache import Cache
+from codegen.compiled import CompiledFunction
+from codegen.interpreted import InterpretedFunction
+from hybrid_opt.compiled_cell import CompiledCell
+from hybrid_opt.polishing import cell as cell_module
 from hybrid_opt.polishing.carry import CarryReader, Distances, dipped, lowest
+from hybrid_opt.polishing.cell import PLACE_SPACING, Grid, PolishFunctions
 from hybrid_opt.polishing.constraints.active import ActiveSet
 from symbolic.array import Array
 from symbolic.records.task import initial_decision
+from symbolic.smooth.places import ORDERS, Clearance, PlaceSymbols, row_function
 from tests.hybrid_opt.polishing.cells import smooth_cell
 from tests.hybrid_opt.polishing.test_force_front import evaluator
+from tests.symbolic.cells import hand_cell, rack_cell
 
 PLACES, PAIRS, LIMIT = 60, 4, 0.02
 
@@ -107,3 +116,42 @@ def test_the_dip_between_two_places_is_that_of_the_lines_from_both_sides() -> No
     assert np.all(low <= height)
     np.testing.assert_array_equal(low[:49], height[:49])
     np.testing.assert_array_equal(low[53:], height[53:])
+
+
+def test_a_row_compiled_on_demand_is_the_interpreted_one_and_is_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    compiled = CompiledCell(rack_cell(), Cache(tmp_path))
+    made = PolishFunctions(compiled, {})
+    pair = next(k for k in range(99) if k not in made.separable)
+    row = Clearance(pair, int(compiled.geometry.columns[pair]))
+    again = PolishFunctions(CompiledCell(rack_cell(), Cache(tmp_path)), {})
+    symbols = PlaceSymbols(compiled.bodies)
+    rng = np.random.default_rng(0)
+    for order in ORDERS:
+        function = made.row(row, order)
+        expected = InterpretedFunction(row_function(symbols, row, order))
+        assert isinstance(function, CompiledFunction)
+        assert made.row(row, order) is function
+        with monkeypatch.context() as patched:
+            patched.setattr(cell_module, "row_function", not_again)
+            assert again.row(row, order).signature == function.signature
+        inputs = [rng.uniform(-1.0, 1.0, (5, *shape)) for shape in function.input_shapes]
+        found, interpreted = function.batch(*inputs), expected.batch(*inputs)
+        for name in function.output_names:
+            np.testing.assert_allclose(found[name], interpreted[name], rtol=1e-9, atol=1e-9)
+
+
+def not_again(*_: Any) -> None:
+    raise AssertionError("its expression was built again")
+
+
+@pytest.mark.parametrize("samples", [20, 50, 100, 200, 400])
+def test_widths_do_not_depend_on_the_number_of_samples(samples: int) -> None:
+    cell = hand_cell()
+    grid = Grid(replace(cell.task, samples=samples))
+    spacing = grid.parameter[1]
+    assert spacing == pytest.approx(PLACE_SPACING, rel=0.35)
+    for width in (0.015, 0.04, 0.08):
+        assert grid.places(width) * spacing == pytest.approx(width, abs=spacing)
+    np.testing.assert_allclose(grid.parameter[:: grid.per_sample], grid.sample_parameter)

@@ -1,5 +1,5 @@
-"""Targets by what they prefer; the assembled program: values against the full model, all
-derivatives against differences."""
+"""Targets by what they prefer; the assembled program: values against the full model and CasADi's
+expressions, all derivatives against differences."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from dataclasses import asdict
 from functools import cache
 from pathlib import Path
 
+import casadi as ca
 import numpy as np
 import pytest
 from hypothesis import given
@@ -22,13 +23,22 @@ from hybrid_opt.polishing.force import (
     extreme,
     pascoletti_serafini,
 )
-from hybrid_opt.polishing.rows import ForceRow, PlaceRow, PressureRow, Row
+from hybrid_opt.polishing.rows import ForceRow, Layout, PlaceRow, PressureRow, Row, Rows
 from hybrid_opt.polishing.settings import FillSettings, PolishSettings
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.records.task import initial_decision
 from symbolic.smooth.passage import Passing, Separation
-from symbolic.smooth.places import Clearance, JointLimit, PlaceConstraint, Reach
+from symbolic.smooth.places import (
+    Clearance,
+    JointLimit,
+    PlaceConstraint,
+    PlaceSymbols,
+    Reach,
+    closure_functions,
+    closure_name,
+    row_function,
+)
 from tests.hybrid_opt.cells import shipped
 from tests.hybrid_opt.polishing.cells import smooth_cell
 from tests.redundant_cells import rack_on_rail
@@ -181,38 +191,6 @@ def test_rows_of_samples_are_what_the_evaluator_finds(path: Path) -> None:
     np.testing.assert_allclose(list(highest.values()), forces, rtol=1e-6)
 
 
-def test_rows_at_places_are_in_the_order_of_the_layout() -> None:
-    program, z = made(RACK)
-    layout = program.layout
-    values = program.rows(z)[0][layout.places]  # less what is required
-    box = next(
-        row.constraint.pair for row in layout.place_rows if isinstance(row.constraint, Separation)
-    )
-    cell = smooth_cell(evaluator(RACK))
-    grid, carry = cell.grid, CarryReader(cell).read(program.candidate(z))
-    checked = 0
-    for row, value in zip(layout.place_rows, values.tolist(), strict=True):
-        kind = row.constraint
-        if isinstance(kind, JointLimit):
-            robot = evaluator(RACK).workcell.robots[kind.arm]
-            q = carry.q[kind.arm][row.place, kind.joint]
-            limit = robot.position_lower if kind.side == "lower" else robot.position_upper
-            expected = abs(q - limit[kind.joint])
-        elif isinstance(kind, Reach):
-            expected = carry.manipulability[row.place, kind.arm] ** 2 - 1.0
-            if row.place % grid.per_sample:
-                continue
-        elif isinstance(kind, Clearance):
-            assert value * kind.scale + 0.01 <= carry.distances.bounds[row.place, kind.pair] + 1e-9
-            continue
-        else:
-            assert value * kind.scale + 0.01 <= carry.distances.bounds[row.place, box] + 0.01
-            continue
-        assert value * kind.scale + 0.01 == pytest.approx(expected, rel=1e-6)
-        checked += 1
-    assert checked >= 6
-
-
 def test_the_box_of_trust_bounds_the_decision_vector() -> None:
     program, _ = made(RACK)
     task = evaluator(RACK).workcell.task
@@ -279,3 +257,56 @@ def test_wrong_settings_are_told(name: str, value: object) -> None:
 def test_settings_are_the_same_after_json() -> None:
     settings = asdict(PolishSettings())
     assert json.loads(json.dumps(settings)) == settings
+
+
+def written(constraint: PlaceConstraint, place: int, x: Array, near: tuple[Array, Array]) -> Array:
+    """A row's value, then its gradient by the decision vector: CasADi's functions one by one,
+    joints following the box by the implicit function.
+
+    Args:
+        near: both arms' joints near those that hold the box there.
+    """
+    cell, model = smooth_cell(evaluator(RACK)), evaluator(RACK).compiled.model
+    points, symbols = cell.waypoints(x), PlaceSymbols(model)
+    pose, rate = (basis[place] @ points for basis in (cell.grid.basis, cell.grid.rate_basis))
+    joints, follow = [], []
+    for arm in (0, 1):
+        closure = closure_functions(model, arm)[closure_name(arm, "first")]
+        q, by_pose, _ = (np.array(out) for out in closure(pose, near[arm]))
+        joints.append(q.ravel())
+        follow.append(by_pose)
+    numbers = [constraint.numbers(symbols)] if constraint.count(symbols) else []
+    value, gradient = row_function(symbols, constraint, "first")(pose, rate, *joints, *numbers)
+    slope = np.array(gradient).ravel()
+    by_pose, at = slope[:6].copy(), 6
+    by_rate = np.zeros(6)
+    if constraint.moving:
+        by_rate, at = slope[6:12], 12
+    for arm in constraint.arms(model):
+        by_pose += follow[arm].T @ slope[at : at + 6]
+        at += 6
+    rows, columns = cell.free
+    by_x = cell.grid.basis[place][rows] * by_pose[columns]
+    by_x += cell.grid.rate_basis[place][rows] * by_rate[columns]
+    return np.append(float(ca.DM(value)), by_x) / constraint.scale
+
+
+def test_values_and_slopes_are_those_of_the_expressions() -> None:
+    cell = smooth_cell(evaluator(RACK))
+    x = initial_decision(cell.task)
+    carry = CarryReader(cell).read(x)
+    box, *_ = sorted(cell.functions.separable)
+    arm = next(k for k in range(99) if k not in cell.functions.separable)
+    column = int(cell.evaluator.checker.geometry.columns[arm])
+    kinds: list[PlaceConstraint] = [Clearance(arm, column), Reach(1), JointLimit(0, 2, "lower")]
+    kinds += [JointLimit(1, 4, "upper"), Separation(box, 3), Passing(box, 5, 0)]
+    listed: list[Row] = [PlaceRow(kind, place) for kind in kinds for place in (60, 150)]
+    layout = Layout(listed)
+    rows = Rows(cell, layout, carry.q)
+    x = x + np.random.default_rng(0).uniform(-0.02, 0.02, len(x))
+    values, slopes = rows.values(x), rows.slopes()
+    for k, row in enumerate(layout.place_rows):
+        near = carry.q[0][row.place], carry.q[1][row.place]
+        wanted = written(row.constraint, row.place, x, near)
+        found = np.append(values[k], slopes[k])
+        np.testing.assert_allclose(found, wanted, rtol=1e-8, atol=1e-8)

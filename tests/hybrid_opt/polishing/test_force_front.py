@@ -4,16 +4,17 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.indicators import metrics
+from hybrid_opt.indicators.metrics import front_of
 from hybrid_opt.polishing import polisher as polisher_module
 from hybrid_opt.polishing.force import ForceSolver, Reach, Target, pascoletti_serafini
 from hybrid_opt.polishing.force_front import (
-    TAIL,
     Chord,
     Edge,
     between,
@@ -29,10 +30,12 @@ from hybrid_opt.polishing.polisher import Polisher
 from hybrid_opt.polishing.records import PolishedFront, PolishOutcome
 from hybrid_opt.polishing.settings import FillSettings, PolishSettings
 from hybrid_opt.store.files import from_json, to_json
+from studies.research.best_front import read_reference_front
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.read.cell import load
 from symbolic.records.task import initial_decision
+from tests.hybrid_opt.cells import shipped
 from tests.hybrid_opt.polishing.cells import smooth_cell
 from tests.symbolic.read.samples import RACK
 
@@ -251,18 +254,6 @@ def test_gaps_are_measured_in_units_of_the_front() -> None:
     assert [gap.width for gap in found] == pytest.approx([(0.25 * 0.75) ** 0.5] * 2)
 
 
-def test_lengths_of_every_front_sum_up_to_two() -> None:
-    rng = np.random.default_rng(2)
-    ends = np.sort(rng.uniform(1.0, 3.0, 9)), -np.sort(-rng.uniform(5.0, 50.0, 9))
-    found = gaps(front(*zip(*(end.tolist() for end in ends), strict=True)))
-    assert sum(gap.length for gap in found) == pytest.approx(2.0)
-
-
-def test_flat_tails_count_by_their_length() -> None:
-    flat, _ = gaps(front((0.0, 1.0), (1e-9, 0.5), (1.0, 0.0)))
-    assert flat.width == pytest.approx(TAIL * 0.5, rel=1e-3)
-
-
 def test_the_widest_gap_is_next_half_way_along_it() -> None:
     archive = front((0.0, 1.0), (0.1, 0.8), (1.0, 0.0))
     found = filling(archive, set(), 10, stride=10.0, far=0.4)
@@ -294,14 +285,6 @@ def test_sides_are_tried_once_each_and_gaps_left_then() -> None:
     far = [(first, second, False) for first, second, _ in near]
     narrow = [_edge(archive, 0, 1), _edge(archive, 1, 0)]
     assert order == near + far + narrow
-
-
-def test_what_is_not_polished_is_no_start() -> None:
-    archive = front((0.0, 1.0), (1.0, 0.0))
-    archive.polished[0] = False
-    found = filling(archive, set(), 10, stride=10.0, far=0.4)
-    assert found is not None
-    assert found.edge == _edge(archive, 1, 0)
 
 
 def test_a_point_beside_the_start_has_crept() -> None:
@@ -339,14 +322,6 @@ def test_the_widest_chords_come_first_and_each_once() -> None:
     assert widths == sorted(widths, reverse=True)
 
 
-def test_points_that_no_solve_made_have_no_chords() -> None:
-    archive = front((0.0, 9.0), (1.0, 4.0), (2.0, 3.0))
-    archive.polished[0] = False
-    gap = widest(archive, set())
-    assert gap is not None
-    assert (gap.first, gap.second) == (1, 2)
-
-
 def test_a_point_on_a_chord_is_feasible_and_wins_area() -> None:
     archive, found = archive_of_polished(), 0
     before = metrics.hypervolume(np.array(archive.objectives))
@@ -372,3 +347,16 @@ def test_a_chord_through_what_is_infeasible_leads_nowhere() -> None:
     archive.x[0], archive.x[1] = evaluator().lower, evaluator().upper
     gap = next(gap for gap in gaps(archive) if {gap.first, gap.second} == {0, 1})
     assert between(evaluator(), archive, gap) is None
+
+
+FRONT = Path(__file__).with_name("rack_reference_front.csv")
+
+
+def test_every_point_is_feasible_certified_and_of_the_stored_value() -> None:
+    front = read_reference_front(FRONT)
+    evaluator = shipped("rack").evaluator
+    assert front.digest == evaluator.workcell.digest
+    found = evaluator.certified(evaluator.evaluate(front.x))
+    assert found.feasible.all()
+    np.testing.assert_allclose(found.objectives, front.objectives, rtol=1e-9)
+    assert len(front_of(front.objectives)) == len(front.objectives)

@@ -1,25 +1,41 @@
-"""The joint program's values against the compiled timing, its derivatives against differences."""
+"""The joint program's values against the compiled timing, its derivatives against differences; also
+of redundant joints and of forces that a program finds."""
 
 from __future__ import annotations
+
+from collections.abc import Iterator
 
 import numpy as np
 import pytest
 
+import hybrid_opt as ho
+from hybrid_opt.compiled_cell import CompiledCell
+from hybrid_opt.evaluate.evaluation import CandidateEvaluator
+from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES
 from hybrid_opt.polishing.carry import CarryReader
+from hybrid_opt.polishing.drive_front import second_opinion
 from hybrid_opt.polishing.intervals import IntervalGrid, IntervalValues, JointProgram
 from hybrid_opt.polishing.polisher import Polisher
 from hybrid_opt.polishing.rows import PlaceRow, Row
+from hybrid_opt.polishing.settings import DrivableSettings, PolishSettings
+from hybrid_opt.timing.model import TimingModel
 from symbolic.array import Array
 from symbolic.records.task import initial_decision
 from symbolic.smooth.places import Reach
 from tests.hybrid_opt.polishing.cells import (
     drivable_rack,
+    driven,
     polisher,
     smooth_cell,
+    solved,
     start,
+    start_in,
     tilted,
     way_of,
 )
+from tests.hybrid_opt.polishing.transcription import without_obstacles
+from tests.redundant_cells import rack_on_rail
+from tests.symbolic.read.samples import RACK
 
 FORCE = 52.0
 ROWS = (PlaceRow(Reach(0), 150), PlaceRow(Reach(1), 250))
@@ -162,3 +178,70 @@ def test_geometry_after_a_step_is_what_its_slopes_do_not_foretell() -> None:
     linear = program.linear(program.near())
     foretold = program.geometry + linear.A.times(d)[-len(ROWS) :]
     np.testing.assert_allclose(program.geometry_after(d), after - foretold, atol=1e-8)
+
+
+FORK_FORCE = 80.0
+
+
+@pytest.fixture(scope="module")
+def fork() -> Iterator[Polisher]:
+    cell = ho.Cell.load(RACK.with_name("fork.toml")).drivable()  # its files last as long
+    yield Polisher(cell.evaluator, PolishSettings(drivable=DrivableSettings(rounds=30)))
+    del cell
+
+
+@pytest.mark.slow
+def test_derivatives_of_found_forces_are_exact(fork: Polisher) -> None:
+    x = start_in(fork.evaluator.workcell, FORK_FORCE, 0)
+    assert_slopes(Programs(x, fork), 0)
+    assert_curvature(Programs(x, fork))
+
+
+@pytest.mark.slow
+def test_a_carry_is_driven_better_believed_and_stationary(fork: Polisher) -> None:
+    evaluator, way = fork.evaluator, way_of(fork)
+    x = start_in(evaluator.workcell, FORK_FORCE, 0)
+    solution = solved(way, x)
+    assert evaluator.certified(evaluator.evaluate(solution.x)).feasible[0]
+    before, after = (way.paths.timed(each[:-1], FORK_FORCE).duration for each in (x, solution.x))
+    assert after < 0.85 * before
+    model = TimingModel(evaluator.compiled, 100)
+    assert evaluator.driver is not None
+    assert second_opinion(evaluator.driver, model, solution.x) == ""
+    assert max(solution.residuals.stationarity, solution.residuals.complementarity) < 1e-3
+
+
+RAIL_FORCE = 52.0
+
+
+@pytest.fixture(scope="module")
+def rail(tmp_path_factory: pytest.TempPathFactory) -> Polisher:
+    """The rack without its obstacles, its left robot on a slide that may move half a metre in all:
+    with them the robot's base, which moves, would touch what it stands on."""
+    cell = without_obstacles(driven(rack_on_rail(tmp_path_factory.mktemp("rail"), 0.4, 0.25)))
+    evaluator = CandidateEvaluator(cell, DRIVABLE_OBJECTIVES, compiled=CompiledCell(cell))
+    settings = PolishSettings(attempts=3, drivable=DrivableSettings(rounds=12))
+    return Polisher(evaluator, settings)
+
+
+@pytest.mark.slow
+def test_derivatives_of_redundant_joints_are_exact(rail: Polisher) -> None:
+    cell = rail.evaluator.workcell
+    x = start_in(cell, RAIL_FORCE, 0)
+    assert Programs(x, rail).at().n_path == 18 + len(cell.task.waypoints)
+    assert_slopes(Programs(x, rail), 0)
+    assert_curvature(Programs(x, rail))
+
+
+@pytest.mark.slow
+def test_a_carry_with_a_redundant_joint_is_driven_better_and_believed(rail: Polisher) -> None:
+    evaluator, way = rail.evaluator, way_of(rail)
+    x = start_in(evaluator.workcell, RAIL_FORCE, 0)
+    begun = way.paths.timed(x[:-1], RAIL_FORCE).duration
+    found = solved(way, x)
+    assert way.paths.timed(found.x[:-1], RAIL_FORCE).duration < 0.9 * begun
+    # The slide's values are used, not only the box's path.
+    assert np.abs(found.x[18:-1] - x[18:-1]).max() > 1e-3
+    assert evaluator.certified(evaluator.evaluate(found.x)).feasible[0]
+    timings = TimingModel(evaluator.compiled, way.driver.timer.intervals)
+    assert second_opinion(way.driver, timings, found.x) == ""

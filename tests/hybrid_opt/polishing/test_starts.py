@@ -116,18 +116,6 @@ def test_an_image_is_as_good_with_exchanged_objectives() -> None:
     )
 
 
-def test_the_image_of_an_image_is_the_original() -> None:
-    mirror = mirror_of(evaluator().workcell)
-    assert mirror is not None
-    x = np.random.default_rng(8).uniform(evaluator().lower, evaluator().upper)
-    image = mirror.image(x)
-    assert image is not None
-    again = mirror.image(image)
-    assert again is not None
-    assert again == pytest.approx(x, abs=1e-12)
-    assert np.abs(image - x).max() > 0.0
-
-
 def test_an_image_beyond_the_bounds_is_none() -> None:
     workcell = evaluator().workcell
     mirror = mirror_of(workcell)

@@ -7,43 +7,28 @@ from pathlib import Path
 
 WORKCELLS = Path("studies/workcells").resolve()
 
-BAXTER = """
+_BAXTER_ARM = """
+[[robots]]
+name = "{side}"
+urdf = "package://example-robot-data/robots/baxter_description/urdf/baxter.urdf"
+srdf = "package://example-robot-data/robots/baxter_description/srdf/baxter_manipulation.srdf"
+chain = ["base", "{side}_hand_link"]
+drop_links = ["{side}_gripper_base_link"]
+base = {{ xyz = [0.0, 0.0, 0.93] }}
+pad = {{ xyz = [0.0, 0.0, 0.08] }}
+min_manipulability = 0.002
+
+[[robots.tool]]
+name = "pad"
+kind = "cylinder"
+radius = 0.03
+length = 0.08
+xyz = [0.0, 0.0, 0.04]
+"""
+
+BAXTER = f"""
 name = "Baxter"
-
-[[robots]]
-name = "left"
-urdf = "package://example-robot-data/robots/baxter_description/urdf/baxter.urdf"
-srdf = "package://example-robot-data/robots/baxter_description/srdf/baxter_manipulation.srdf"
-chain = ["base", "left_hand_link"]
-drop_links = ["left_gripper_base_link"]
-base = { xyz = [0.0, 0.0, 0.93] }
-pad = { xyz = [0.0, 0.0, 0.08] }
-min_manipulability = 0.002
-
-[[robots.tool]]
-name = "pad"
-kind = "cylinder"
-radius = 0.03
-length = 0.08
-xyz = [0.0, 0.0, 0.04]
-
-[[robots]]
-name = "right"
-urdf = "package://example-robot-data/robots/baxter_description/urdf/baxter.urdf"
-srdf = "package://example-robot-data/robots/baxter_description/srdf/baxter_manipulation.srdf"
-chain = ["base", "right_hand_link"]
-drop_links = ["right_gripper_base_link"]
-base = { xyz = [0.0, 0.0, 0.93] }
-pad = { xyz = [0.0, 0.0, 0.08] }
-min_manipulability = 0.002
-
-[[robots.tool]]
-name = "pad"
-kind = "cylinder"
-radius = 0.03
-length = 0.08
-xyz = [0.0, 0.0, 0.04]
-
+{_BAXTER_ARM.format(side="left")}{_BAXTER_ARM.format(side="right")}
 [payload]
 size = [0.2, 0.3, 0.2]
 mass = 2.0

@@ -1,13 +1,28 @@
-"""Ways to hold the box: the kinematics side by side against Pinocchio, spins, and pairs of ways."""
+"""Ways to hold the box and to reach it, and where a machine may stand: Pinocchio and FCL judge."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pinocchio as pin
 import pytest
 
+import hybrid_opt as ho
+from hybrid_opt.errors import JobError
+from hybrid_opt.job.plan import job_geometry
+from hybrid_opt.proposing.bases import (
+    ASIDE,
+    LIFT,
+    POSES,
+    PlaceScorer,
+    base_choices,
+    draft_of,
+    free_detours,
+    machine_places,
+    shared_room,
+)
 from hybrid_opt.proposing.holding import (
     ArmKinematics,
     Hold,
@@ -19,30 +34,37 @@ from hybrid_opt.proposing.holding import (
     possible_spins,
     spun,
 )
+from hybrid_opt.proposing.problem import Problem, read_problem
 from hybrid_opt.proposing.setup import Agreement
 from hybrid_opt.proposing.trial import judge_of
 from symbolic.array import Array
-from symbolic.geometry.pairs import build_geometry
+from symbolic.errors import SettingsError
+from symbolic.geometry.pairs import build_geometry, coal_distance
 from symbolic.read.arms import arm_model
 from symbolic.read.cell import load
 from symbolic.records import Body, Box, Workcell
 from symbolic.records.poses import box_placement, pose_matrix
+from symbolic.robot.branches import inverse_kinematics
+from tests.hybrid_opt.job.jobs import rack, rack_job
+from tests.hybrid_opt.proposing.problems import tiago_problem
+from tests.symbolic.cells import hand_cell
+from tests.symbolic.geometry.collision_cells import placed_pieces
 from tests.symbolic.read.samples import RACK
 
 
 @pytest.fixture(scope="module")
-def rack() -> Workcell:
+def rack_cell() -> Workcell:
     return load(RACK)
 
 
-def test_placements_and_jacobians_are_pinocchios(rack: Workcell) -> None:
-    kinematics = ArmKinematics.of(rack, 0, ())
-    model = arm_model(rack.robots[0])
+def test_placements_and_jacobians_are_pinocchios(rack_cell: Workcell) -> None:
+    kinematics = ArmKinematics.of(rack_cell, 0, ())
+    model = arm_model(rack_cell.robots[0])
     data = model.createData()
     q = np.random.default_rng(0).uniform(-2.0, 2.0, (20, 6))
     frames, T = kinematics.chain(q)
     J = kinematics.jacobian(frames, T)
-    base = rack.robots[0].T_world_base
+    base = rack_cell.robots[0].T_world_base
     for k in range(len(q)):
         pin.computeJointJacobians(model, data, q[k])
         np.testing.assert_allclose(T[k], base @ data.oMi[6].homogeneous, atol=1e-13)
@@ -51,8 +73,8 @@ def test_placements_and_jacobians_are_pinocchios(rack: Workcell) -> None:
         np.testing.assert_allclose(J[k], turned, atol=1e-13)
 
 
-def test_newtons_method_comes_back_to_where_placements_are_from(rack: Workcell) -> None:
-    kinematics = ArmKinematics.of(rack, 1, ())
+def test_newtons_method_comes_back_to_where_placements_are_from(rack_cell: Workcell) -> None:
+    kinematics = ArmKinematics.of(rack_cell, 1, ())
     rng = np.random.default_rng(1)
     q = rng.uniform(-1.5, 1.5, (50, 6))
     _, T = kinematics.chain(q)
@@ -63,8 +85,8 @@ def test_newtons_method_comes_back_to_where_placements_are_from(rack: Workcell) 
     np.testing.assert_allclose(kinematics.chain(found.q)[1], T, atol=1e-5)
 
 
-def test_following_goes_where_the_joints_came_from(rack: Workcell) -> None:
-    kinematics = ArmKinematics.of(rack, 0, ())
+def test_following_goes_where_the_joints_came_from(rack_cell: Workcell) -> None:
+    kinematics = ArmKinematics.of(rack_cell, 0, ())
     begin = np.array([0.2, 0.5, 0.4, 0.3, 0.9, 0.1])
     path = begin + np.linspace(0.0, 0.4, 20)[:, None] * np.array([1, -1, 0.5, 0.2, 0.4, 1.0])
     _, T = kinematics.chain(path)
@@ -73,36 +95,36 @@ def test_following_goes_where_the_joints_came_from(rack: Workcell) -> None:
     np.testing.assert_allclose(found[:, 0], path, atol=1e-6)
 
 
-def test_a_posture_that_does_not_reach_is_told(rack: Workcell) -> None:
-    kinematics = ArmKinematics.of(rack, 0, ())
+def test_a_posture_that_does_not_reach_is_told(rack_cell: Workcell) -> None:
+    kinematics = ArmKinematics.of(rack_cell, 0, ())
     far = pose_matrix(np.array([5.0, 0.0, 0.0]), np.zeros(3))
     _, kept, _ = kinematics.follow(np.zeros((1, 6)), np.array([far, far]))
     assert kept.tolist() == [0]
 
 
-def test_the_spin_turns_the_pad_as_the_file_does(rack: Workcell) -> None:
+def test_the_spin_turns_the_pad_as_the_file_does(rack_cell: Workcell) -> None:
     """A spin of the joint about the pad's axis is one of the pad."""
-    geometry = ArmKinematics.of(rack, 0, ()).geometry
-    contact = rack.contacts[0]
-    plain = box_to_last_joint(rack, geometry, contact, 0)
-    turned = box_to_last_joint(rack, geometry, spun(contact, 0.7), 0)
+    geometry = ArmKinematics.of(rack_cell, 0, ()).geometry
+    contact = rack_cell.contacts[0]
+    plain = box_to_last_joint(rack_cell, geometry, contact, 0)
+    turned = box_to_last_joint(rack_cell, geometry, spun(contact, 0.7), 0)
     np.testing.assert_allclose(plain[:3, 3], turned[:3, 3], atol=1e-12)
     angle = pin.log3(plain[:3, :3].T @ turned[:3, :3])
     assert np.linalg.norm(angle) == pytest.approx(0.7)
     np.testing.assert_allclose(np.linalg.inv(geometry.T_joint_box), plain, atol=1e-12)
 
 
-def test_spins_are_left_out_at_which_the_pad_meets_what_stands(rack: Workcell) -> None:
+def test_spins_are_left_out_at_which_the_pad_meets_what_stands(rack_cell: Workcell) -> None:
     """A bar beside the pad, and a fin on the pad that meets it in one of four turns."""
-    start = np.array(rack.task.waypoints[0].lower)
-    goal, robot = start + 0.05 * np.eye(6)[2], rack.robots[0]
+    start = np.array(rack_cell.task.waypoints[0].lower)
+    goal, robot = start + 0.05 * np.eye(6)[2], rack_cell.robots[0]
     at = pose_matrix(np.array([0.15, 0.0, -0.05]), np.zeros(3))
     fin = Body("fin", Box(np.array([0.3, 0.02, 0.02])), robot.T_flange_pad @ at)
     robot = replace(robot, tool=(fin,))
-    pad = box_placement(rack.task.orientation, start) @ rack.contacts[0].T_box_pad
+    pad = box_placement(rack_cell.task.orientation, start) @ rack_cell.contacts[0].T_box_pad
     at = pose_matrix(np.array([0.22, 0.0, -0.05]), np.zeros(3))
     bar = Body("bar", Box(np.full(3, 0.1)), pad @ at)
-    cell = replace(rack, robots=(robot, rack.robots[1]), environment=(bar,))
+    cell = replace(rack_cell, robots=(robot, rack_cell.robots[1]), environment=(bar,))
     judge = judge_of(build_geometry(cell))
     spins: Array = np.pi / 2.0 * np.arange(4.0)
     query = HoldQuery(cell, start, goal, spins, judge)
@@ -150,7 +172,7 @@ def test_holds_hold_the_box_at_both_ends(cell: Workcell) -> None:
             np.testing.assert_allclose(T, pose_matrix(pose[:3], pose[3:]) @ T_box_joint, atol=1e-5)
 
 
-LIFT = 0
+LIFT_JOINT = 0
 """The lift's index in both arms."""
 
 
@@ -158,7 +180,7 @@ def posture(arm: ArmKinematics, target: Array, lift: float) -> Array:
     """One that holds the box within the limits, the lift at a height [m]."""
     rng = np.random.default_rng(2)
     begin = rng.uniform(arm.lower, arm.upper, (400, len(arm.lower)))
-    begin[:, LIFT] = lift
+    begin[:, LIFT_JOINT] = lift
     found = arm.solve(begin, np.tile(target, (400, 1, 1)), 50, 1e-3)
     inside = np.all((found.q > arm.lower + 0.02) & (found.q < arm.upper - 0.02), axis=1)
     return np.asarray(found.q[(found.residual < 1e-6) & inside & (found.manipulability > 0.01)][0])
@@ -185,8 +207,8 @@ def test_both_arms_end_on_one_lift_and_still_hold_the_box() -> None:
     assert agreed is not None
     for end in ("q_start", "q_goal"):
         first, second = (getattr(hold, end) for hold in agreed)
-        assert first[LIFT] == second[LIFT]
-        assert 0.06 <= first[LIFT] <= 0.10
+        assert first[LIFT_JOINT] == second[LIFT_JOINT]
+        assert 0.06 <= first[LIFT_JOINT] <= 0.10
         for arm, q in enumerate((first, second)):
             placed = arms[arm].chain(q[None])[1][0]
             np.testing.assert_allclose(placed, held(workcell, arm, start), atol=1e-5)
@@ -197,3 +219,155 @@ def test_arms_without_common_joints_stay_as_they_are() -> None:
     start = workcell.task.waypoints[0].lower
     pair = (Hold(0.0, np.zeros(6), np.zeros(6), 1.0), Hold(0.1, np.ones(6), np.ones(6), 1.0))
     assert Agreement(workcell, (start, start)).of(pair) is pair
+
+
+def other_branch(q: Array) -> Array:
+    """Another posture of the first arm with its flange where it is, both arms side by side."""
+    robot, model = rack().workcell.robots[0], rack().compiled.model.robots[0]
+    data = model.model.createData()
+    pin.framesForwardKinematics(model.model, data, q[:6])
+    flange = data.oMf[model.flange_id].homogeneous
+    found = inverse_kinematics(robot, model, flange)
+    return np.concatenate([found[np.argmin(np.abs(found[:, 1] - 0.3))], q[6:]])
+
+
+@pytest.mark.parametrize("after", [False, True])
+def test_an_arm_changes_its_branch_before_it_grips_and_drives_home(after: bool) -> None:
+    job = rack_job()
+    end = job.phases[-1].motion.q[-1] if after else job.phases[0].motion.q[0]
+    pose = job.phases[-1].motion.pose[-1] if after else job.phases[0].motion.pose[0]
+    home = np.array([0.0, 0.0, 0.0, 0.0, 1.57, 0.0] * 2) if after else other_branch(end)
+    way = ho.plan_reach(job, home, rng=np.random.default_rng(1), after=after)
+    ends = (end, home) if after else (home, end)
+    np.testing.assert_array_equal(way[[0, -1]], ends)
+    geometry = job_geometry(job.workcell, everywhere=True)
+    assert len(geometry.active) > len(job_geometry(job.workcell).active), "pads against the box"
+    for first, last in pairwise(way):
+        for q in np.linspace(first, last, 12):
+            pieces = placed_pieces(geometry, pose, q[:6], q[6:])
+            for pair in geometry.active:
+                names = {geometry.bodies[k].group for k in (pair.first, pair.second)}
+                if names != {"payload", "environment"}:  # the box stands
+                    assert coal_distance(pieces[pair.first], pieces[pair.second]) > 0.0
+
+
+def test_what_cannot_be_is_told() -> None:
+    job, rng = rack_job(), np.random.default_rng(1)
+    with pytest.raises(SettingsError, match="needs 12 joint positions"):
+        ho.plan_reach(job, np.zeros(6), rng=rng)
+    held = job.phase("carry").motion.q[0].copy()
+    held[1] += 0.5
+    with pytest.raises(JobError, match="meets"):
+        ho.plan_reach(job, held, rng=rng)
+
+
+pytestmark = pytest.mark.filterwarnings("ignore::symbolic.geometry.hulls.CollisionModelWarning")
+
+
+@pytest.fixture(scope="module")
+def problem(tmp_path_factory: pytest.TempPathFactory) -> Problem:
+    return read_problem(tiago_problem(tmp_path_factory.mktemp("tiago")))
+
+
+def at(x: float) -> Array:
+    return np.array([x, 0.0, 0.0, 0.0, 0.0, 0.0])
+
+
+def test_a_machine_stands_where_its_arms_reach(problem: Problem) -> None:
+    """With its left hand on the left it looks along x, before the tote; else against it."""
+    for side in problem.sides()[2:]:
+        left = np.array(side.contacts[0]["xyz"])
+        assert left[1] != 0.0
+        for base in machine_places(side, draft_of(side)):
+            across = [-np.sin(base[5]), np.cos(base[5]), 0.0]
+            assert left @ across > 0.0
+            ahead = np.array([np.cos(base[5]), np.sin(base[5])])
+            assert (np.array([0.6, 0.0]) - base[:2]) @ ahead > 0.2
+
+
+def test_too_near_there_is_no_room_and_in_the_shelf_no_place(problem: Problem) -> None:
+    (side,) = (s for s in problem.sides() if s.contacts[0]["xyz"] == [0.0, 0.18, 0.0])
+    scorer = PlaceScorer(side, draft_of(side), SPINS, np.random.default_rng(1))
+    rooms = []
+    for x in (0.07, 0.20):
+        arms = [scorer.place(arm, at(x)) for arm in (0, 1)]
+        assert arms[0] is not None
+        assert arms[1] is not None
+        rooms.append(shared_room(arms[0], arms[1]))
+    assert rooms[0] > rooms[1]
+    assert scorer.place(0, at(0.6)) is None
+    assert scorer.place(0, at(-1.5)) is None, "out of reach"
+
+
+@pytest.mark.slow
+def test_a_machine_without_a_place_gets_a_carry(problem: Problem) -> None:
+    """The best places are before the shelf: behind it, its back is in the way."""
+    choices = base_choices(problem, SPINS, np.random.default_rng(1))
+    assert all(-0.1 < choice["robots"][0]["base"]["xyz"][0] < 0.1 for choice in choices[:2])
+    settings = ho.ProposeSettings(bases=True)
+    found = ho.propose(problem.source, rng=np.random.default_rng(1), settings=settings)
+    assert found.judgement.feasible
+    assert found.seconds <= settings.seconds
+
+
+START, GOAL = np.array([0.0, 0, 0.7, 0, 0, 0]), np.array([0.0, 0, 1.1, 0, 0, 0.2])
+SHELF = {
+    "lower board": ([0.0, 0.0, 0.56], [0.3, 0.3, 0.02]),
+    "upper board": ([0.0, 0.0, 0.95], [0.3, 0.3, 0.02]),
+    "back": ([0.25, 0.0, 0.8], [0.02, 0.3, 1.4]),
+}
+"""Middles and edges [m]: open to -x and to both sides."""
+
+
+def cell_with(bodies: dict[str, tuple[list[float], list[float]]]) -> Workcell:
+    environment = tuple(
+        Body(name, Box(np.array(size)), pose_matrix(np.array(middle), np.zeros(3)))
+        for name, (middle, size) in bodies.items()
+    )
+    return replace(hand_cell(), environment=environment)
+
+
+def meets(pose: Array, size: Array) -> bool:
+    """Whether a level box of these edges meets the shelf."""
+    return any(
+        bool(np.all(np.abs(pose[:3] - middle) < (size + edges) / 2.0))
+        for middle, edges in SHELF.values()
+    )
+
+
+def test_without_obstacles_every_detour_is_free() -> None:
+    found = free_detours(cell_with({}), START, GOAL)
+    assert found.shape == (1 + 9 * len(ASIDE), POSES, 6)
+    np.testing.assert_allclose(found[:, 0], np.tile(START, (len(found), 1)))
+    np.testing.assert_allclose(found[:, -1], np.tile(GOAL, (len(found), 1)))
+    away = np.linalg.norm(found[:, :, :2], axis=2).max(axis=1)
+    # Some poses stand a little beside the corner.
+    assert away[0] == 0.0
+    assert away.max() == pytest.approx(max(ASIDE), abs=0.02)
+    assert found[:, :, 2].max() == pytest.approx(GOAL[2] + LIFT + max(ASIDE), abs=0.05)
+
+
+def test_what_is_left_leads_around_the_shelf() -> None:
+    goal = GOAL * [1, 1, 1, 1, 1, 0]  # level, as the oracle wants it
+    cell = cell_with(SHELF)
+    every, found = free_detours(cell_with({}), START, goal), free_detours(cell, START, goal)
+    size = cell.payload.size
+    ends = (START, goal)
+    expected = [
+        path
+        for path in every
+        if not any(
+            meets(pose, size)
+            for pose in path
+            if min(np.abs(pose - end).max() for end in ends) >= LIFT
+        )
+    ]
+    np.testing.assert_array_equal(found, np.array(expected))
+    farthest = found[np.arange(len(found)), np.abs(found[:, :, :2]).sum(axis=2).argmax(axis=1)]
+    assert 0 < len(found) < len(every) / 3
+    assert np.all(farthest[:, 0] < 0.1), "through the back"
+
+
+def test_there_may_be_none() -> None:
+    walls = {"wall": ([0.0, 0.0, 0.9], [2.0, 2.0, 0.02])}
+    assert free_detours(cell_with(walls), START, GOAL).shape == (0, POSES, 6)

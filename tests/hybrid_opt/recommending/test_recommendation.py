@@ -17,7 +17,6 @@ from hybrid_opt.recommending.recommendation import (
     HAND_MADE,
     STEPS,
     Recommendation,
-    Rival,
     front_durations,
     spread_rows,
     table_forces,
@@ -235,16 +234,6 @@ def test_where_nothing_holds_it_is_the_gentlest_and_says_so(
 def _without(name: str) -> Uncertainty:
     """The usual set without one of its doubts."""
     return USUAL.only(set(RANGES) - set(DOUBTS[name]))
-
-
-def test_what_a_rival_cannot_is_told_in_words() -> None:
-    inf = float("inf")
-    assert str(Rival("hand-made", inf, inf)) == (
-        "hand-made: cannot be held with the same force, cannot be driven in the same time"
-    )
-    assert str(Rival("hand-made", 2.0, 55.0)) == (
-        "hand-made: 2.000 s at the same force, 55.0 N in the same time"
-    )
 
 
 def test_wishes_that_nothing_answers_say_what_is_possible(

@@ -6,8 +6,6 @@ from functools import cache
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from hybrid_opt.compiled_cell import CompiledCell
 from hybrid_opt.timing import path_timer
@@ -120,22 +118,6 @@ def test_duration_agrees_with_a_convex_program(seed: int) -> None:
     assert found.duration == pytest.approx(exact, rel=1e-3)
 
 
-@given(st.floats(1.001, 1.6), st.floats(1.0, 1.5), st.integers(0, 2**32 - 1))
-def test_more_force_never_takes_longer(share: float, more: float, seed: int) -> None:
-    (x,) = near_initial(np.random.default_rng(seed), 1)
-    tight, loose = hand_timer().time_all(
-        np.array([x, x]),
-        [TimingLimits(force=share * STATIC), TimingLimits(force=more * share * STATIC)],
-    )
-    if not tight.ok:
-        assert tight.status is TimingStatus.INFEASIBLE_AT_REST
-        return
-    assert loose.ok
-    assert loose.duration <= tight.duration * (1.0 + 1e-3)
-    assert tight.peak_force.max() <= share * STATIC * 1.005
-    assert tight.grid_speed[0] == tight.grid_speed[-1] == 0.0
-
-
 def test_a_tilted_box_is_not_driven_where_it_could_not_rest_within_the_limit() -> None:
     """Hung below its pads it tilts into what accelerates it, as on a waiter's tray: in motion it
     needs less force than it would if it stopped there. Both ways to time it agree."""
@@ -152,20 +134,6 @@ def test_a_tilted_box_is_not_driven_where_it_could_not_rest_within_the_limit() -
     too_low = TimingLimits(force=float(0.999 * still))
     for refused in (timer.time(x.ravel(), too_low), time_path(model, x.ravel(), too_low)):
         assert refused.status is TimingStatus.INFEASIBLE_AT_REST
-
-
-def test_a_batch_gives_what_single_calls_give() -> None:
-    paths = near_initial(np.random.default_rng(8), 3)
-    paths = np.vstack([paths, initial() + np.tile([-2.0, 0, 0, 0, 0, 0], 3)])
-    limits = [TimingLimits(force=force) for force in (50.0, 52.0, None, None)]
-    together = hand_timer().time_all(paths, limits)
-    for x, limit, timing in zip(paths, limits, together, strict=True):
-        alone = hand_timer().time(x, limit)
-        assert alone.status is timing.status
-        assert alone.place == timing.place
-        np.testing.assert_array_equal(alone.grid_speed, timing.grid_speed)
-    assert together[3].status is TimingStatus.OFF_PATH
-    assert together[3].place.robot in ("first", "second")
 
 
 def test_limits_used_up_at_rest_are_named_as_time_path_names_them() -> None:

@@ -12,7 +12,6 @@ from hybrid_opt.carry import Carry
 from hybrid_opt.compiled_cell import CompiledCell
 from hybrid_opt.robust.cases import worst_cases
 from hybrid_opt.robust.force import RobustModel, robust_model
-from hybrid_opt.static_hold import static_hold
 from hybrid_opt.timing.analysis import closest_to_reference_timing
 from hybrid_opt.timing.given import drive_path
 from hybrid_opt.timing.limits import limit_ratios, limit_use
@@ -191,15 +190,6 @@ def by_name(margins: tuple[Margin, ...]) -> dict[str, Margin]:
     return {margin.quantity: margin for margin in margins}
 
 
-def test_static_payload_limit_has_a_closed_form() -> None:
-    # (m g / 2) sqrt(1 + 1 / mu^2) = 12 kgf
-    assert static_hold(hand_cell()).payload_limit == pytest.approx(16.9648, abs=1e-4)
-    for mu in (0.5, 0.8):
-        cell = with_contacts(hand_cell(), friction=(mu, mu))
-        expected = 2.0 * 117.68 / (9.81 * np.sqrt(1.0 + 1.0 / mu**2))
-        assert static_hold(cell).payload_limit == pytest.approx(expected, rel=1e-9)
-
-
 def test_forces_are_proportional_to_the_mass() -> None:
     """The payload at the limit, carried for real: its resultant is the limit."""
     x = near_initial(np.random.default_rng(2), 1)[0]
@@ -212,37 +202,6 @@ def test_forces_are_proportional_to_the_mass() -> None:
     assert sensitivity.force_at(np.array([mass])).max() == pytest.approx(117.68)
     assert (sensitivity.mass_by_normal > sensitivity.mass_by_resultant).all()
     assert mass < sensitivity.static_mass
-
-
-def test_slow_carries_bear_almost_the_static_payload() -> None:
-    model = hand_timing()
-    timing = time_path(model, initial(), model.drive_limits(1.001 * 49.05))
-    assert timing.carry is not None
-    limit = payload_sensitivity(timing.carry).payload_limit
-    static = static_hold(model.workcell).payload_limit
-    assert 0.995 * static < limit < static
-
-
-def test_friction_margin_is_the_normal_force_margin_while_level() -> None:
-    """Level and symmetric: N = F_t / (2 mu) at the peak, so mu may fall to mu N / N_ref."""
-    model = hand_timing()
-    level = carry(model)
-    margin = by_name(robustness_margins(model, level))["friction of both contacts"]
-    assert margin.fails == "normal force"
-    expected = level.normal_force.max() / 117.68
-    # Accelerations along the squeeze axis are zero on the level hand-made path.
-    assert margin.limit == pytest.approx(expected, rel=1e-4)
-
-
-def test_centre_of_mass_margin_is_the_patch_radius_while_level() -> None:
-    model = hand_timing()
-    margins = by_name(robustness_margins(model, carry(model)))
-    radius = hand_cell().contacts[0].patch_radius
-    for sign, name in ((1.0, "+x"), (-1.0, "-x")):
-        margin = margins[f"centre of mass towards {name}"]
-        assert margin.fails == "pressure shift"
-        # Equal tangential forces carry an offset by equal shifts.
-        assert sign * margin.limit == pytest.approx(radius, rel=0.01)
 
 
 def changed(cell: Workcell, margin: Margin, factor: float) -> Workcell:

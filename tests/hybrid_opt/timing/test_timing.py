@@ -30,7 +30,7 @@ from tests.hybrid_opt.timing.cells import (
     timing_of,
     with_robots,
 )
-from tests.symbolic.cells import fixed, hand_cell, with_payload, with_task
+from tests.symbolic.cells import fixed, hand_cell, with_task
 from tests.symbolic.read.samples import RACK
 
 WEIGHT = 98.1
@@ -69,16 +69,6 @@ def test_limits_hold_between_the_grid_points_and_are_reached(
     assert np.mean(use > 0.98) > 0.95
 
 
-def test_random_trajectories_hold_their_limits() -> None:
-    model = hand_timing()
-    for x in near_initial(np.random.default_rng(11), 12):
-        for limits in (TimingLimits(), TimingLimits(reference_speed=True)):
-            timing = time_path(model, x, limits)
-            assert timing.ok, timing.reason
-            assert worst_ratios(model, timing, limits).max() <= 1.005
-            assert timing.use["friction"].ratio <= 1.0 + 1e-6
-
-
 def test_a_carry_starts_and_ends_at_rest_and_its_rates_integrate() -> None:
     carry = time_path(hand_timing(), initial()).carry
     assert carry is not None
@@ -92,25 +82,6 @@ def test_a_carry_starts_and_ends_at_rest_and_its_rates_integrate() -> None:
         np.testing.assert_allclose(integral, value[-1] - value[0], atol=2e-3)
 
 
-def test_contact_forces_balance_the_box_under_real_timing() -> None:
-    cell = hand_cell()
-    for x in near_initial(np.random.default_rng(5), 3):
-        carry = time_path(hand_timing(), x).carry
-        assert carry is not None
-        needed = cell.payload.mass * (carry.second_rate[:, :3] + [0.0, 0.0, 9.81])
-        np.testing.assert_allclose(carry.contact_force.sum(axis=1), needed, atol=1e-8)
-        assert carry.friction_margin.min() > -1e-7
-
-
-def test_force_limit_is_reached_and_never_exceeded() -> None:
-    model = hand_timing()
-    for share in (1.005, 1.02, 1.1):
-        timing = time_path(model, initial(), model.drive_limits(share * STATIC))
-        assert timing.ok, timing.reason
-        assert timing.carry is not None
-        assert timing.carry.normal_force.max() == pytest.approx(share * STATIC, rel=1e-4)
-
-
 def test_duration_falls_with_the_force_limit() -> None:
     curve = duration_against_force_limit(hand_timing(), initial(), points=6)
     assert curve.static_force == pytest.approx(STATIC, rel=1e-9)
@@ -121,35 +92,6 @@ def test_duration_falls_with_the_force_limit() -> None:
     assert curve.duration[-1] == pytest.approx(free, rel=1e-3)
     with pytest.raises(SettingsError, match="at least 2"):
         duration_against_force_limit(hand_timing(), initial(), points=1)
-
-
-def test_the_static_force_itself_is_no_timing() -> None:
-    timing = time_path(hand_timing(), initial(), hand_timing().drive_limits(STATIC))
-    assert timing.status is TimingStatus.INFEASIBLE_AT_REST
-    assert timing.place is not None
-    assert timing.place.constraint == "normal force"
-    assert timing.duration == float("inf")
-
-
-def test_weak_joints_name_constraint_robot_joint_and_place() -> None:
-    timing = time_path(timing_of(with_robots(hand_cell(), torque_max=0.3)), initial())
-    assert timing.status is TimingStatus.INFEASIBLE_AT_REST
-    assert timing.place is not None
-    assert timing.place.constraint == "joint torque"
-    assert timing.place.robot in ("first", "second")
-    assert timing.place.joint.startswith("joint_")
-    assert 0.0 <= timing.place.parameter <= 1.0
-    assert timing.place.joint in timing.reason
-
-
-def test_a_centre_of_mass_beyond_the_patch_cannot_be_held() -> None:
-    cell = with_payload(hand_cell(), centre_of_mass=np.array([0.04, 0.0, 0.0]))
-    timing = time_path(timing_of(cell), initial())
-    assert timing.status is TimingStatus.INFEASIBLE_AT_REST
-    assert timing.place is not None
-    assert timing.place.constraint == "pressure shift"
-    free = time_path(timing_of(cell), initial(), TimingLimits(pressure=False))
-    assert free.ok
 
 
 def test_ten_times_the_reference_speed_is_judged_and_kept_within_limits() -> None:
@@ -193,14 +135,6 @@ def test_the_closest_timing_cruises_at_the_reference_speed() -> None:
     assert (fastest_carry.force_ratio > search.force_ratio).all()
 
 
-def test_a_path_without_motion() -> None:
-    cell = hand_cell()
-    pose = cell.task.waypoints[0].lower
-    still = with_task(cell, waypoints=(fixed(pose), fixed(pose)), initial=np.zeros((0, 6)))
-    timing = time_path(timing_of(still, 20), np.zeros(0))
-    assert timing.status is TimingStatus.NO_MOTION
-
-
 def test_a_zero_length_segment_is_passed() -> None:
     cell = hand_cell()
     points = list(cell.task.waypoints)
@@ -224,34 +158,12 @@ def test_a_pure_rotation_takes_the_time_it_needs() -> None:
     assert timing.use["path speed"].ratio == pytest.approx(1.0, abs=0.005)
 
 
-def test_a_path_near_a_singular_posture_is_refused_with_its_place() -> None:
-    cell = hand_cell()
-    first, second = (replace(robot, min_manipulability=1.0) for robot in cell.robots)
-    strict = replace(cell, robots=(first, second))
-    timing = time_path(timing_of(strict), initial())
-    assert timing.status is TimingStatus.NEAR_SINGULAR
-    assert timing.place is not None
-    assert timing.place.robot == "first"
-
-
 def test_an_arm_that_loses_the_path_is_named() -> None:
     x = initial()
     x[6] = -2.5  # far out of reach
     timing = time_path(hand_timing(), x)
     assert timing.status is TimingStatus.OFF_PATH
     assert "loses the path" in timing.reason
-
-
-def test_leaving_a_joint_range_is_named() -> None:
-    cell = hand_cell()
-    model = hand_timing()
-    q = model.path_motion(initial()).q[:, :6]
-    narrow = replace(
-        cell.robots[0],
-        position_upper=np.minimum(cell.robots[0].position_upper, q.max(axis=0) - 0.05),
-    )
-    timing = time_path(timing_of(replace(cell, robots=(narrow, cell.robots[1]))), initial())
-    assert timing.status is TimingStatus.JOINT_LIMITS
 
 
 @pytest.mark.parametrize("force", [0.0, -1.0, float("nan"), float("inf")])
@@ -265,23 +177,6 @@ def test_decision_vectors_and_intervals_are_checked() -> None:
         time_path(hand_timing(), np.full(18, np.nan))
     with pytest.raises(SettingsError, match="intervals"):
         TimingModel(hand_cell(), intervals=5)
-
-
-def test_scaling_all_rates_scales_the_time() -> None:
-    """Twice the speeds and four times the accelerations halve the time; no gravity is involved."""
-    cell = hand_cell()
-    payload = replace(
-        cell.payload,
-        velocity_max=2.0 * cell.payload.velocity_max,
-        acceleration_max=4.0 * cell.payload.acceleration_max,
-        angular_velocity_max=2.0 * cell.payload.angular_velocity_max,
-        angular_acceleration_max=4.0 * cell.payload.angular_acceleration_max,
-    )
-    quick = replace(with_robots(cell, velocity_max=2.0, acceleration_max=4.0), payload=payload)
-    limits = TimingLimits(torque=False, pressure=False)
-    slow_time = time_path(hand_timing(), initial(), limits).duration
-    quick_time = time_path(timing_of(quick), initial(), limits).duration
-    assert quick_time == pytest.approx(slow_time / 2.0, rel=1e-3)
 
 
 FORCE_SHARES = (None, 1.005, 1.05, 1.2)

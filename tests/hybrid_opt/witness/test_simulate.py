@@ -1,4 +1,5 @@
-"""The witness against closed forms: what holds at rest and in short motions, and what turns."""
+"""The witness against closed forms: at rest and in short motions, also by other pads, what turns,
+and what is said of it."""
 
 from __future__ import annotations
 
@@ -6,24 +7,35 @@ import sys
 from dataclasses import replace
 from functools import partial
 
+import mujoco
 import numpy as np
 import pytest
 
-pytest.importorskip("mujoco")
-
-import mujoco
-
 from hybrid_opt.carry import Carry
+from hybrid_opt.cell import Cell
 from hybrid_opt.errors import WitnessError
 from hybrid_opt.robust.cases import nominal_case
 from hybrid_opt.robust.force import soft_model
+from hybrid_opt.robust.squeeze import SqueezeSettings, commanded_forces
+from hybrid_opt.witness.arms import Account, CellWitness
 from hybrid_opt.witness.box import Witness, bisected, drive_of, workcell_of_case
-from hybrid_opt.witness.scene import SimulationSettings, compiled, patch_area, scene_text
+from hybrid_opt.witness.reference import driven_carry, pressed_reference
+from hybrid_opt.witness.scene import (
+    SimulationSettings,
+    compiled,
+    patch_area,
+    scene_text,
+    tilt_centre,
+)
+from studies.study.simulation import MOST_SAMPLES, stored_simulation
 from symbolic.array import Array
+from symbolic.contact.load import load_function
 from symbolic.errors import SettingsError
-from symbolic.records import Workcell
+from symbolic.read.cell import load
+from symbolic.records import Uncertainty, Workcell
+from symbolic.records.task import initial_decision
 from tests.hybrid_opt.witness.carries import carry_along, least_forces
-from tests.symbolic.cells import hand_cell, with_contacts
+from tests.symbolic.cells import ROOT, call, hand_cell, rack_cell, with_contacts, with_payload
 
 STILL = np.zeros(6)
 DRIVEN = SimulationSettings(pads="driven")
@@ -236,3 +248,102 @@ def test_without_the_simulator_it_is_told(monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setitem(sys.modules, "mujoco", None)
     with pytest.raises(WitnessError, match="pip install"):
         Witness(hand_cell())
+
+
+pytest.importorskip("mujoco")
+
+
+def shipped(name: str) -> Workcell:
+    return load(ROOT / "studies" / "workcells" / f"{name}.toml")
+
+
+def at_rest(cell: Workcell) -> tuple[Carry, Array]:
+    """Level and still, pressed with the planned force, and the planned moments."""
+    still = np.zeros(6)
+    load = call(load_function(cell), still, still, still)
+    carry = carry_along(cell, still, 0.3)
+    carry = replace(carry, normal_force=np.tile(load["normal_force"], (len(carry), 1)))
+    moments = np.empty((len(carry) + 1, 2, 3))
+    for i, contact in enumerate(cell.contacts):
+        wrench, arm = load[f"wrench_{i + 1}"], contact.T_box_pad[:3, :3] @ tilt_centre(contact)
+        moments[:, i] = wrench[3:] - np.cross(arm, wrench[:3])
+    return carry, moments
+
+
+@pytest.mark.parametrize(
+    ("name", "centre_of_mass"),
+    [
+        ("drum", (-0.04, 0.0, 0.0)),
+        ("fork", (0.0, 0.0, 0.0)),
+        # Far off the line between the pads, whose pressures are shared as planned.
+        ("fork", (0.05, 0.0, 0.0)),
+        ("drum", (0.0, 0.0, 0.0)),
+    ],
+)
+def test_the_planned_forces_are_the_least_of_pads_that_the_planned_moments_drive(
+    name: str, centre_of_mass: tuple[float, float, float]
+) -> None:
+    """A drum between pads 30 degrees off opposite; a crate held by three pads."""
+    cell = with_payload(shipped(name), centre_of_mass=np.array(centre_of_mass))
+    carry, moments = at_rest(cell)
+    settings = SimulationSettings(pads="driven")
+    witness, drive = Witness(cell, settings), drive_of(carry, settings, moments=moments)
+    assert not witness.simulate(drive, 0.98).holds
+    assert witness.simulate(drive, 1.02).holds
+
+
+def test_pads_that_press_evenly_need_more_where_a_load_twists() -> None:
+    """A fork needs as much in the middle, and a third more for a load far off it."""
+    found = []
+    for off in (0.0, 0.05):
+        cell = with_payload(shipped("fork"), centre_of_mass=np.array([off, 0.0, 0.0]))
+        drive = drive_of(at_rest(cell)[0], SimulationSettings())
+        found.append([Witness(cell).simulate(drive, factor).holds for factor in (0.98, 1.02, 1.2)])
+    assert found == [[False, True, True], [False, False, False]]
+
+
+def made() -> tuple[Cell, Array]:
+    cell = Cell(rack_cell())
+    return cell, initial_decision(cell.workcell.task)
+
+
+def test_a_carry_is_driven_as_its_time_law_says() -> None:
+    cell, x = made()
+    closest = driven_carry(cell, x)
+    assert np.abs(closest.rate[[0, -1]]).max() < 1e-6
+    with pytest.raises(WitnessError, match="cannot be driven"):
+        driven_carry(cell, x + 5.0)
+
+
+def test_forces_beside_what_was_told_are_stored_from_the_carrys_beginning() -> None:
+    """One short run of the whole cell, pressed as recommended."""
+    cell, x = made()
+    carry = driven_carry(cell, x)
+    pressed, squeeze = pressed_reference(cell, carry)
+    assert squeeze.factor is None
+    shown = CellWitness(cell.workcell).simulate(pressed, "leader")
+    found = stored_simulation(Account(None, "none", pressed, squeeze, shown), "a", "b", "leader")
+    assert found.arrives
+    assert found.duration == pytest.approx(carry.duration)
+    assert 0.0 <= found.time[0] < 0.02
+    assert found.time[-1] == pytest.approx(carry.duration, abs=0.02)
+    assert len(found.time) <= MOST_SAMPLES
+    assert np.isnan(found.factor)
+    assert found.robust
+    told = commanded_forces(cell.workcell, carry, SqueezeSettings())[0].max(axis=0)
+    np.testing.assert_allclose(found.peaks[0], told, rtol=0.01)
+    assert found.largest_error < 0.1
+
+
+def test_an_uncertain_cell_is_pressed_with_its_robust_forces() -> None:
+    cell, x = made()
+    carry = driven_carry(cell, x)
+    unsure = replace(cell.workcell, uncertainty=Uncertainty(friction=0.1))
+    other = Cell(unsure)
+    other.compiled = cell.compiled  # which knows nothing of what is uncertain
+    pressed, squeeze = pressed_reference(other, carry)
+    needed = soft_model(unsure).hold(carry, unsure.uncertainty)[0]
+    assert squeeze.factor is None
+    told = pressed.normal_force[2:, 1]
+    assert (told >= needed - 1e-6).all()
+    assert told.max() == pytest.approx(needed.max(), rel=1e-6)

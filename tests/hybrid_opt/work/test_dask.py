@@ -14,7 +14,7 @@ import pytest
 from hybrid_opt.campaign import CampaignSettings, ExecutionSettings
 from hybrid_opt.errors import WorkerError
 from hybrid_opt.work.dask_cluster import DaskExecutor
-from hybrid_opt.work.service import KILLED, SILENT, LocalExecutor, Service
+from hybrid_opt.work.service import KILLED, SILENT, Service
 from symbolic.errors import DualArmError, SettingsError
 from tests.hybrid_opt.campaign.fake import FakeSource, files_of, logged, run_search
 from tests.hybrid_opt.work import services
@@ -54,6 +54,7 @@ def test_a_killed_worker_changes_nothing(tmp_path: Path, cluster: Any) -> None:
     assert not list(root.glob("replicas/*/*/journal.bin"))
 
 
+@pytest.mark.slow
 def test_what_a_lost_campaign_recorded_is_not_repeated(tmp_path: Path, cluster: Any) -> None:
     settings = replace(SETTINGS, algorithms={"mopso": {}}, replicas=1)
     log = tmp_path / "log"
@@ -86,11 +87,6 @@ def test_messages_come_in_order_and_once(cluster: Any) -> None:
         assert messages == [bytes([number]) for number in range(len(messages))]
 
 
-def test_the_cluster_changes_no_bit(cluster: Any) -> None:
-    here = services.run(LocalExecutor(), services.numbers, [1, 2, 3])
-    assert services.run(executor(cluster), services.numbers, [1, 2, 3]).answers == here.answers
-
-
 def test_errors_arrive_as_they_are(cluster: Any) -> None:
     with pytest.raises(RuntimeError, match="OSError: a file of the request's own"):
         services.run(executor(cluster), services.mistake, [1])
@@ -118,6 +114,7 @@ def test_workers_with_other_software_are_refused(cluster: Any) -> None:
         services.run(executor(cluster, {"numpy": "1.0"}), services.echo, [1])
 
 
+@pytest.mark.slow
 def test_a_lost_scheduler_is_told(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -170,7 +170,9 @@ except KeyboardInterrupt:
 """
 
 
-@pytest.mark.parametrize("moment", [0.0, 0.4, 1.5])
+@pytest.mark.parametrize(
+    "moment", [0.4, *(pytest.param(at, marks=pytest.mark.slow) for at in (0.0, 1.5))]
+)
 def test_ctrl_c_reaches_the_parent_alone(moment: float) -> None:
     process = started()
     time.sleep(moment)

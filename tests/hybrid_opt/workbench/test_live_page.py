@@ -136,6 +136,7 @@ def pressed(browser: webdriver.Chrome, label: str) -> None:
     browser.execute_script("arguments[0].click()", button)
 
 
+@pytest.mark.slow
 def test_what_is_dragged_is_judged_meanwhile_and_made_better(
     browser: webdriver.Chrome, tmp_path: Path
 ) -> None:

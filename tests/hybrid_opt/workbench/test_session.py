@@ -1,7 +1,10 @@
-"""A cell that is changed by hand: handles, verdicts, a better carry, what is saved."""
+"""A cell that is changed by hand: handles, verdicts, a better carry, what is saved; of what a page
+asks for in a row the last counts."""
 
 from __future__ import annotations
 
+import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -9,8 +12,10 @@ import pytest
 
 import hybrid_opt as ho
 from hybrid_opt.errors import ResultsError
+from hybrid_opt.workbench.browser import Workbench
 from hybrid_opt.workbench.session import Session, handles, moved
 from tests.hybrid_opt.cells import shipped
+from tests.waiting import HANGS
 
 PALLET = "environment.pallet in front"
 
@@ -86,3 +91,32 @@ def test_what_is_saved_is_the_cell_on_the_screen(session: Session, tmp_path: Pat
     carry = ho.load(tmp_path / "job" / "carry.json")
     assert isinstance(carry, ho.Carry)
     np.testing.assert_array_equal(carry.x, session.x)
+
+
+@pytest.fixture(scope="module")
+def bench() -> Iterator[Workbench]:
+    page = ho.live(shipped("rack"), port=18080)
+    yield page
+    page.close()
+
+
+def waited(holds: Callable[[], bool], what: str) -> None:
+    end = time.monotonic() + HANGS
+    while not holds():
+        assert time.monotonic() < end, what
+        time.sleep(0.02)
+
+
+def test_dragging_never_queues_and_ends_where_it_was_let_go(bench: Workbench) -> None:
+    (pallet,) = [one for one in handles(bench.session.cell.workcell) if "pallet" in one.key]
+    for k in range(50):
+        z = pallet.pose[2, 3] + 0.001 * k
+        bench.ask({f"{pallet.key}.xyz": [*pallet.pose[:2, 3].tolist(), z]})
+    end = pallet.pose[2, 3] + 0.049
+
+    def there() -> bool:
+        body = next(b for b in bench.session.cell.workcell.environment if b.name == pallet.title)
+        return bool(abs(body.pose[2, 3] - end) < 1e-9)
+
+    waited(there, "the last place")
+    assert np.isfinite(bench.session.verdict.seconds)

@@ -1,9 +1,11 @@
-"""`python -m studies.compare`: figures of two campaigns, tests between them, misuse."""
+"""Results compared, those of two campaigns, and damaged ones refused by every program."""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,8 +18,10 @@ from hybrid_opt.campaign.stages import run_stages
 from hybrid_opt.indicators import metrics
 from hybrid_opt.polishing.settings import FillSettings, PolishSettings, ProbeSettings
 from hybrid_opt.progress import Progress
-from studies.compare import main
+from studies import compare as comparing
 from studies.programs.comparison import compare
+from studies.report import __main__ as report
+from studies.research import control
 from studies.study.summary import summary_stage
 from symbolic.read.cell import load
 from tests.studies.conftest import TRANSFER
@@ -103,13 +107,13 @@ def test_tells_what_was_set_differently(study: Path, other: Path) -> None:
 
 
 def test_prints_text_and_json(study: Path, other: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main([str(study), str(other)]) == 0
+    assert comparing.main([str(study), str(other)]) == 0
     text = capsys.readouterr().out
     assert "NSGA-II, hypervolume" in text
-    assert main([str(study), str(study)]) == 0
+    assert comparing.main([str(study), str(study)]) == 0
     assert "The drivable experiments" in capsys.readouterr().out
     assert "only in B: random search" in text
-    assert main([str(study), str(other), "--json"]) == 0
+    assert comparing.main([str(study), str(other), "--json"]) == 0
     document = json.loads(capsys.readouterr().out, parse_constant=pytest.fail)
     assert document["same_workcell"] is True
 
@@ -117,5 +121,75 @@ def test_prints_text_and_json(study: Path, other: Path, capsys: pytest.CaptureFi
 def test_what_cannot_be_compared_is_told(
     study: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main([str(study), str(tmp_path)]) == 2
+    assert comparing.main([str(study), str(tmp_path)]) == 2
     assert "no results folder" in capsys.readouterr().err
+
+
+PROGRAMS: dict[str, Callable[[Path, Path], int]] = {
+    "report": lambda damaged, whole: report.main([str(damaged), "--quiet"]),
+    "compare": lambda damaged, whole: comparing.main([str(whole), str(damaged)]),
+    "control": lambda damaged, whole: control.main([str(damaged), "--evaluations", "200"]),
+}
+
+
+def put(path: str, value: Any) -> Callable[[Any], Any]:
+    """Puts a value at a dotted path of a document."""
+
+    def change(document: Any) -> Any:
+        *parents, last = path.split(".")
+        place = document
+        for name in parents:
+            place = place[int(name) if isinstance(place, list) else name]
+        place[int(last) if isinstance(place, list) else last] = value
+        return document
+
+    return change
+
+
+FIRST = "algorithms.nsga2.replicas.0"
+
+FAULTS: dict[str, tuple[str, Callable[[Any], Any]]] = {
+    "a list": ("summary.json", lambda document: []),
+    "text for a number": ("summary.json", put(f"{FIRST}.hypervolume", "0.4")),
+    "no replicas": ("summary.json", put("algorithms.nsga2.replicas", [])),
+    "a huge whole number": ("summary.json", put(f"{FIRST}.hypervolume", 10**400)),
+    "half a letter": ("summary.json", put("workcell.name", "\ud800")),
+    "three robots": ("summary.json", put("static_hold.normal_force", [1.0, 2.0, 3.0])),
+    "of another campaign": ("summary.json", put("settings.seed", 99)),
+    "numbers for algorithms": ("configuration.json", put("settings.algorithms", [1, 2])),
+    "unknown handling": ("configuration.json", put("settings.constraint_handling", "prayer")),
+    "no workcell": ("configuration.json", put("workcell", None)),
+}
+"""What is damaged, and how; random damage to every file is that of tests/fuzz."""
+
+
+def damage(path: Path, change: Callable[[Any], Any]) -> None:
+    path.write_text(json.dumps(change(json.loads(path.read_text()))))
+
+
+def told_by(
+    program: str, damaged: Path, whole: Path, file: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert PROGRAMS[program](damaged, whole) == 2
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    assert printed.err.count("\n") == 1
+    assert file in printed.err
+    assert "Traceback" not in printed.err
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_every_program_tells_what_is_damaged(
+    study: Path, own_study: Path, fault: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file, change = FAULTS[fault]
+    damage(own_study / file, change)
+    for program in PROGRAMS:
+        told_by(program, own_study, study, file, capsys)
+
+
+def test_a_damaged_replica_is_told(
+    study: Path, own_study: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    damage(own_study / "replicas/nsga2/01/replica.json", put("seconds", -1.0))
+    told_by("compare", own_study, study, "replicas/nsga2/01", capsys)

@@ -1,8 +1,9 @@
-"""`python -m studies.inspect`, and what the second cell promises."""
+"""Programs about cells: inspected, proposed, completed with another program's scene."""
 
 from __future__ import annotations
 
 import json
+import tomllib
 from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
@@ -17,7 +18,9 @@ from hybrid_opt.display.scene import cell_solids
 from hybrid_opt.evaluate.evaluation import REASONS, CandidateEvaluator
 from hybrid_opt.evaluate.explanation import explain
 from hybrid_opt.indicators.metrics import BindingBound
-from studies.inspect import main
+from hybrid_opt.proposing.problem import completed
+from studies import inspect, propose, scene
+from studies.program import BAD_INPUT
 from studies.programs import inspection
 from studies.programs.inspection import (
     Optimum,
@@ -26,7 +29,7 @@ from studies.programs.inspection import (
 )
 from studies.report.pictures_cell import meeting_place
 from symbolic.read.cell import load
-from symbolic.records import Workcell
+from symbolic.records import Mesh, Workcell
 from symbolic.records.task import straight_line
 from tests.studies.conftest import TRANSFER
 from tests.symbolic.cells import RACK
@@ -59,17 +62,6 @@ def test_the_second_cell_is_worth_searching(found: Inspection) -> None:
     assert 0.02 <= found.feasible_share <= 0.20
 
 
-def test_the_second_cell_is_of_another_kind(transfer: Workcell) -> None:
-    rack = load(RACK)
-    assert transfer.task.time_law != rack.task.time_law
-    assert transfer.task.allowed_contacts
-    assert any(waypoint.is_fixed for waypoint in transfer.task.waypoints[1:-1])
-    assert np.any(transfer.payload.centre_of_mass)
-    kinds = {type(body.shape).__name__ for body in transfer.environment}
-    assert kinds == {"Box", "Cylinder", "Sphere"}
-    assert transfer.contacts[0].friction < rack.contacts[0].friction
-
-
 def test_counts_agree_with_the_evaluator(found: Inspection, transfer: Workcell) -> None:
     evaluator = CandidateEvaluator(transfer)
     x = np.random.default_rng(7).uniform(evaluator.lower, evaluator.upper, (500, evaluator.n_var))
@@ -80,14 +72,6 @@ def test_counts_agree_with_the_evaluator(found: Inspection, transfer: Workcell) 
         assert count == (verdicts.reason == REASONS.index(reason)).sum()
     total = sum(found.infeasible_by_reason.values()) + round(1500 * found.feasible_share)
     assert total == 1500
-
-
-def test_the_static_bound_is_the_closed_form(found: Inspection) -> None:
-    # m g / (2 mu), and (m g / 2) sqrt(1 + 1 / mu^2) at the reference force of 117.68 N.
-    force = 8.0 * 9.81 / (2.0 * 0.8)
-    assert found.static_normal_force == pytest.approx((force, force), rel=1e-12)
-    limit = 117.68 / (9.81 / 2.0 * np.sqrt(1.0 + 1.0 / 0.8**2))
-    assert found.static_payload_limit == pytest.approx(limit, rel=1e-12)
 
 
 def test_every_pair_is_active_or_excluded_with_a_reason(found: Inspection) -> None:
@@ -198,7 +182,7 @@ def test_a_short_polish_tells_how_far_it_is(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(inspection, "POLISH_ATTEMPTS", 1)
-    assert main([str(RACK), "--candidates", "10", "--no-pictures", "--polish"]) == 0
+    assert inspect.main([str(RACK), "--candidates", "10", "--no-pictures", "--polish"]) == 0
     said = capsys.readouterr()
     assert "short polish: 0 of 1 attempts" in said.err
     assert "points of a short polish)" in said.out
@@ -206,32 +190,170 @@ def test_a_short_polish_tells_how_far_it_is(
 
 def test_prints_text_and_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     arguments = [str(TRANSFER), "--candidates", "100", "--no-pictures"]
-    assert main(arguments) == 0
+    assert inspect.main(arguments) == 0
     text = capsys.readouterr().out
     assert "Transfer over a wall" in text
     assert "random candidates" in text
-    assert main([*arguments, "--json"]) == 0
+    assert inspect.main([*arguments, "--json"]) == 0
     document = json.loads(capsys.readouterr().out)
     assert document["candidates"] == 100
     assert f"{100 * document['feasible_share']:.1f} % feasible" in text
     assert not list(tmp_path.iterdir())
 
 
+PROBLEM = Path("studies/problems/past-a-post.toml")
+
+
+def test_the_problem_file_is_not_overwritten(capsys: pytest.CaptureFixture[str]) -> None:
+    assert propose.main([str(PROBLEM), "--output", str(PROBLEM)]) == BAD_INPUT
+    assert "is the problem file" in capsys.readouterr().err
+
+
+def test_a_missing_folder_is_told_before_any_work(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert (
+        propose.main([str(PROBLEM), "--output", str(tmp_path / "none" / "cell.toml")]) == BAD_INPUT
+    )
+    assert "is no folder" in capsys.readouterr().err
+
+
+def test_what_is_in_the_way_is_told_and_nothing_written(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The box stands in the post."""
+    data = tomllib.loads(PROBLEM.read_text(encoding="utf-8"))
+    data["task"]["goal"] = [0.05, 0.0, 0.35, 0.0, 0.0, 0.0]
+    path = tmp_path / "cell.toml"
+    path.write_text(completed("", data, {}), encoding="utf-8")
+    assert propose.main([str(path), "--quiet"]) == BAD_INPUT
+    told = capsys.readouterr()
+    assert "payload meets post at the goal" in told.err
+    assert told.out == ""
+    assert [entry.name for entry in tmp_path.iterdir()] == ["cell.toml"]
+
+
+@pytest.mark.slow
+def test_pads_go_where_the_carry_that_was_found_costs_less(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "cell.toml"
+    given = [str(PROBLEM), "--output", str(file), "--quiet", "--grips=-0.03:0.02,-0.02:0.02"]
+    assert propose.main(given) == 0
+    first, last = capsys.readouterr().out.splitlines()
+    assert "certified" in first
+    before, after = (float(part.split(" N s")[0].split()[-1]) for part in last.split("in place of"))
+    assert before <= after, "the product was larger where the pads were"
+    cell = Cell.load(file)
+    assert cell.evaluator.certified(cell.evaluate(cell.initial)).feasible.all()
+    one, two = (contact.T_box_pad[:3, 3] for contact in cell.workcell.contacts)
+    np.testing.assert_allclose(one[[0, 2]], two[[0, 2]], atol=1e-9)
+    assert -0.03 <= one[2] <= 0.02
+    assert abs(one[0]) <= 0.02
+
+
+@pytest.mark.parametrize("ranges", ["0.02:0.01", "0.01", "0:1,0:1,0:1", "a:b"])
+def test_wrong_ranges_are_refused(ranges: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        propose.main([str(PROBLEM), f"--grips={ranges}"])
+    assert "--grips" in capsys.readouterr().err
+
+
+SHELF = """<sdf version='1.9'><model name='shelf'><static>true</static><link name='board'>
+<collision name='top'><pose>0 0 3 0 0 0</pose>
+<geometry><box><size>1 0.3 0.02</size></box></geometry></collision>
+</link></model></sdf>"""
+BOARD = {"name": "shelf board top", "kind": "box", "size": [1.0, 0.3, 0.02], "xyz": [0.0, 0.0, 3.0]}
+
+
+@pytest.fixture
+def shelf(tmp_path: Path) -> Path:
+    path = tmp_path / "shelf.sdf"
+    path.write_text(SHELF, encoding="utf-8")
+    return path
+
+
+def test_bodies_are_printed(shelf: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert scene.main([str(shelf)]) == 0
+    assert tomllib.loads(capsys.readouterr().out) == {"environment": [BOARD]}
+
+
+def test_bodies_are_added_to_a_cell_that_loads(
+    shelf: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Every line of the file stays; what is there already is not added again."""
+    before = Path("studies/workcells/transfer.toml").read_text(encoding="utf-8")
+    before = before.replace("../robots", str(Path("studies/robots").resolve()))
+    path = shelf.with_name("cell.toml")
+    path.write_text(before, encoding="utf-8")
+    assert scene.main([str(shelf), "--into", str(path)]) == 0
+    after = path.read_text(encoding="utf-8")
+    added = after.splitlines()
+    for line in before.splitlines():
+        added.remove(line)
+    assert tomllib.loads("\n".join(added)) == {"environment": [BOARD]}
+    assert load(path).environment[-1].name == "shelf board top"
+    capsys.readouterr()
+    assert scene.main([str(shelf), "--into", str(path)]) == BAD_INPUT
+    assert "'shelf board top' already" in capsys.readouterr().err
+    assert path.read_text(encoding="utf-8") == after
+
+
+def test_a_file_without_obstacles_gets_some(shelf: Path) -> None:
+    path = shelf.with_name("cell.toml")
+    path.write_text('name = "a"  # of mine\n', encoding="utf-8")
+    assert scene.main([str(shelf), "--into", str(path)]) == 0
+    assert path.read_text(encoding="utf-8").startswith('name = "a"  # of mine\n\n[[environment]]\n')
+
+
+def test_what_is_left_out_is_told_by_the_code(
+    shelf: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shelf.write_text(SHELF.replace("<box><size>1 0.3 0.02</size></box>", "<heightmap/>"))
+    assert scene.main([str(shelf)]) == 1
+    told = capsys.readouterr()
+    assert told.out == ""
+    assert told.err.startswith("left out: shelf board top: ")
+
+
 @pytest.mark.parametrize(
-    ("arguments", "message"),
+    ("cell", "words"),
     [
-        (["--candidates", "0"], "--candidates: found '0'; allowed is a whole number 1 to"),
-        (["--seed", "-1"], "--seed: found '-1'; allowed is a whole number 0 to"),
+        (None, "cell.toml: cannot be read"),
+        ("name = ", "cell.toml: not valid TOML"),
+        ("environment = []\n", "cannot be completed as it is written"),
+        ("environment = 3\n", "cannot be completed as it is written"),
     ],
 )
-def test_misuse_is_one_message(
-    arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]
+def test_a_file_that_takes_none_is_left_alone(
+    shelf: Path, cell: str | None, words: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    with pytest.raises(SystemExit, match="2"):
-        main([str(TRANSFER), *arguments, "--no-pictures"])
-    assert message in capsys.readouterr().err
+    path = shelf.with_name("cell.toml")
+    if cell is not None:
+        path.write_text(cell, encoding="utf-8")
+    assert scene.main([str(shelf), "--into", str(path)]) == BAD_INPUT
+    told = capsys.readouterr().err
+    assert words in told
+    assert len(told.splitlines()) == 1
+    assert (path.read_text() if path.exists() else None) == cell
 
 
-def test_a_missing_cell_is_one_message(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["missing.toml", "--no-pictures"]) == 2
-    assert "missing.toml" in capsys.readouterr().err
+def test_meshes_of_the_scene_become_files(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    corners = "[[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]"
+    faces = "[[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]]"
+    path = tmp_path / "scene.yaml"
+    path.write_text(
+        "world: {collision_objects: [{id: a/b, meshes: "
+        f"[{{vertices: {corners}, triangles: {faces}}}]}}]}}"
+    )
+    assert scene.main([str(path)]) == BAD_INPUT
+    assert "--into" in capsys.readouterr().err
+    before = Path("studies/workcells/transfer.toml").read_text(encoding="utf-8")
+    cell = tmp_path / "cell.toml"
+    cell.write_text(before.replace("../robots", str(Path("studies/robots").resolve())))
+    assert scene.main([str(path), "--into", str(cell)]) == 0
+    shape = load(cell).environment[-1].shape
+    assert isinstance(shape, Mesh)
+    assert shape.path == tmp_path / "cell-meshes" / "1-a-b.stl"

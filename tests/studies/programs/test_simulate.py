@@ -14,7 +14,7 @@ from hybrid_opt.store.trajectory_file import write_trajectory
 from hybrid_opt.witness.reference import CONTROLS
 from studies import simulate
 from studies.research import thresholds
-from tests.studies.programs.test_robust import TABLE, stored
+from tests.studies.programs.test_carries import TABLE, stored
 from tests.symbolic.cells import RACK
 
 pytest.importorskip("mujoco")

@@ -7,7 +7,6 @@ from dataclasses import replace
 from itertools import combinations, pairwise
 from pathlib import Path
 from threading import Thread
-from typing import Any
 
 import imageio_ffmpeg  # type: ignore[import-untyped]
 import matplotlib as mpl
@@ -28,7 +27,7 @@ from studies.report import PAGE, looks
 from studies.report.__main__ import main
 from studies.report.data import ReportData, Run
 from studies.report.drawing import ARMS, FRONT, HAND_MADE, SERIES, SIDE, in_style, oblique, save
-from studies.report.drawn import DrawnCarry, reach_map
+from studies.report.drawn import DrawnCarry
 from studies.report.looks import (
     FRAMES_PER_SECOND,
     Film,
@@ -183,45 +182,6 @@ def clipped(figure: Figure) -> list[str]:
 @pytest.mark.parametrize("name", NAMES)
 def test_no_text_is_clipped(name: str, drawn: Drawn) -> None:
     assert clipped(drawn[name][1]) == []
-
-
-def test_a_clipped_label_would_be_found() -> None:
-    figure = Figure(figsize=(2.0, 1.0), layout="constrained")
-    figure.subplots().set_ylabel("a label that is longer than the figure is high [N m]")
-    FigureCanvasAgg(figure).draw()  # type: ignore[no-untyped-call]
-    assert len(clipped(figure)) == 1
-
-
-def _newtons(force: Any) -> Any:
-    return 9.81 * force
-
-
-def _kilograms(force: Any) -> Any:
-    return force / 9.81
-
-
-def _pixels(canvas: FigureCanvasAgg) -> Array:
-    return np.array(canvas.buffer_rgba())  # type: ignore[no-untyped-call]
-
-
-@pytest.mark.parametrize("top", [12.5, 13.0, 14.5, 15.0, 15.3])
-def test_a_label_beyond_a_second_scale_is_not_drawn(top: float) -> None:
-    """Whatever the forces are: Matplotlib makes ticks beyond both ends, and draws none of them."""
-    figure = Figure(figsize=(4.0, 2.0), layout="constrained")
-    axes = figure.subplots()
-    axes.set_ylim(8.0, top)
-    second = axes.secondary_yaxis("right", functions=(_newtons, _kilograms))
-    canvas = FigureCanvasAgg(figure)
-    canvas.draw()  # type: ignore[no-untyped-call]
-    assert clipped(figure) == []
-    figure.set_layout_engine(None)
-    shown = _pixels(canvas)
-    beyond = [label for label in second.get_yticklabels() if label not in visible_texts(figure)]
-    assert beyond
-    for label in beyond:
-        label.set_visible(False)
-    canvas.draw()  # type: ignore[no-untyped-call]
-    np.testing.assert_array_equal(_pixels(canvas), shown)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -397,11 +357,6 @@ def test_views_are_rotations(view: object) -> None:
     assert np.linalg.det(axes) == pytest.approx(1.0)
 
 
-def test_front_is_seen_from_the_side_of_minus_x() -> None:
-    np.testing.assert_allclose(FRONT.towards, [-1.0, 0.0, 0.0])
-    np.testing.assert_allclose(SIDE.towards, [0.0, -1.0, 0.0])
-
-
 def test_reach_holds_the_carry_and_ends_where_the_arm_does(data: ReportData) -> None:
     reach = data.reach
     for pose in data.initial.timed.pose[::10]:
@@ -417,11 +372,6 @@ def test_reach_holds_the_carry_and_ends_where_the_arm_does(data: ReportData) -> 
         distances = np.linalg.norm(centres - shoulder, axis=1)
         assert distances.max() <= longest
         assert distances.max() >= 0.85 * longest
-
-
-def test_reach_repeats_with_its_seed(geometry: CellGeometry) -> None:
-    first, second = (reach_map(geometry, np.random.default_rng(5)) for _ in range(2))
-    np.testing.assert_array_equal(first.common, second.common)
 
 
 @pytest.fixture(scope="module")
@@ -484,13 +434,6 @@ def test_the_program_animates_a_results_folder(study: Path, tmp_path: Path) -> N
     path = tmp_path / "chosen.gif"
     assert main([str(study), "--animation", str(path)]) == 0
     assert Image.open(path).n_frames > 10  # type: ignore[attr-defined]
-
-
-def test_the_program_tells_what_is_no_results_folder(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main([str(tmp_path)]) == 2
-    assert "configuration.json is missing" in capsys.readouterr().err
 
 
 def test_a_browser_is_given_the_report(own_study: Path) -> None:

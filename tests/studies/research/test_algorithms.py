@@ -1,14 +1,24 @@
-"""`python -m studies.research.algorithms`."""
+"""Research programs: algorithms on analytic problems, reference fronts, locked joints."""
 
 from __future__ import annotations
 
 import json
+from pathlib import Path
 
+import numpy as np
 import pytest
 
+from hybrid_opt.cell import Cell
+from hybrid_opt.errors import ResultsError
 from hybrid_opt.indicators.statistics import summarise
 from studies.research import algorithms
 from studies.research.analytic import judge
+from studies.research.best_front import ReferenceFront, encode, read_reference_front
+from studies.research.locked_joints import as_text, compare, locks
+from symbolic.errors import SettingsError
+from symbolic.read.cell import load
+from tests.redundant_cells import free_pandas
+from tests.symbolic.read.samples import RACK
 
 
 @pytest.mark.parametrize(
@@ -66,3 +76,62 @@ def test_wrong_arguments(
     error = capsys.readouterr().err
     assert message in error
     assert len(error.splitlines()) == 1
+
+
+HEAD = b"# made with: a\n# workcell: b\npeak_force_1,peak_force_2,x_1\n"
+
+
+def test_a_front_comes_back(tmp_path: Path) -> None:
+    rng = np.random.default_rng(1)
+    front = ReferenceFront("0" * 64, rng.random((5, 2)), rng.random((5, 18)))
+    path = tmp_path / "front.csv"
+    path.write_bytes(encode(front, "a command"))
+    found = read_reference_front(path)
+    assert found.digest == front.digest
+    np.testing.assert_array_equal(found.objectives, front.objectives)
+    np.testing.assert_array_equal(found.x, front.x)
+    assert not found.x.flags.writeable
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b"", "index out of range"),
+        (HEAD, "two objectives and a decision"),
+        (HEAD + b"1,2\n", "two objectives and a decision"),
+        (HEAD + b"1,2,3\n4,5\n", "inhomogeneous"),
+        (HEAD + b"1,2,nan\n", "not finite"),
+        (HEAD + b"1,2,1e999\n", "not finite"),
+        (HEAD + b"1,2,a\n", "could not convert"),
+        (HEAD + b"1,2,\xff\n", "can't decode"),
+        (HEAD + b"1,2,3\n" * 400_000, "more than 1000000 values"),
+    ],
+)
+def test_what_is_none_is_told(tmp_path: Path, content: bytes, words: str) -> None:
+    path = tmp_path / "front.csv"
+    path.write_bytes(content)
+    with pytest.raises(ResultsError, match=rf"front.csv: no reference front \(.*{words}") as caught:
+        read_reference_front(path)
+    assert "\n" not in str(caught.value)
+
+
+def test_locks_are_a_grid_within_the_bounds(tmp_path: Path) -> None:
+    task = free_pandas(tmp_path, "initial = 0.1, lower = [-1.0, -0.2, 0.0], upper = 1.0").task
+    found = np.array(locks(task, 16))
+    assert found.shape == (16, 2)
+    np.testing.assert_allclose(np.unique(found[:, 0]), [-0.75, -0.25, 0.25, 0.75])
+    assert len({tuple(row) for row in found.tolist()}) == 16
+    assert len(locks(task, 10)) == 16
+
+
+def test_a_small_comparison(tmp_path: Path) -> None:
+    cell = Cell(free_pandas(tmp_path, "initial = 0.1"))
+    (one,) = compare(cell, 4, 1, 60, 1)
+    assert len(one.locked) == 4
+    assert one.best == locks(cell.workcell.task, 4)[int(np.argmax(one.locked))]
+    assert "free beats the best lock in" in as_text([one])
+
+
+def test_a_cell_without_redundant_joints_has_nothing_to_compare() -> None:
+    with pytest.raises(SettingsError, match="no joint of this cell is redundant"):
+        compare(Cell(load(RACK)), 16, 1, 60, 1)

@@ -111,24 +111,3 @@ def test_measures_the_rack_and_keeps_its_promises(
     assert [entry["waypoints"] for entry in scaling["waypoints"]] == [1, 3]
     assert scaling["samples_line"]["largest_relative_deviation"] < 0.25
     assert report(result).startswith(result["workcell"])
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["--candidates", "0"], "--candidates: found '0'; allowed is a whole number 1 to"),
-        (["--repeats", "-1"], "--repeats: found '-1'; allowed is a whole number 1 to"),
-        (["--seed", "-1"], "--seed: found '-1'; allowed is a whole number 0 to"),
-    ],
-)
-def test_wrong_numbers_give_one_message_and_a_code(
-    arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    with pytest.raises(SystemExit, match="2"):
-        benchmark.main(arguments)
-    assert message in capsys.readouterr().err
-
-
-def test_a_missing_cell_is_told(capsys: pytest.CaptureFixture[str]) -> None:
-    assert benchmark.main(["missing.toml"]) == 2
-    assert "missing.toml" in capsys.readouterr().err

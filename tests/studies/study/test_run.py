@@ -218,11 +218,6 @@ def test_wrong_options_get_one_message(
     assert not (tmp_path / "a").exists()
 
 
-def test_a_missing_workcell_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run.main([str(tmp_path / "no.toml"), "--output", str(tmp_path / "a")]) == 2
-    assert "no.toml: 1 problem" in capsys.readouterr().err
-
-
 def test_a_cell_whose_own_law_is_optimal_has_one_experiment(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -140,14 +140,7 @@ def test_the_hand_made_trajectory_is_feasible(evaluator: CandidateEvaluator) -> 
     np.testing.assert_allclose(excess, 0.029, atol=5e-4)
 
 
-def test_the_straight_line_collides(evaluator: CandidateEvaluator) -> None:
-    task = evaluator.workcell.task
-    share = np.linspace(0.0, 1.0, len(task.waypoints))[1:-1, None]
-    start, goal = task.waypoints[0].lower, task.waypoints[-1].lower
-    verdict = evaluator.evaluate(((1.0 - share) * start + share * goal).reshape(1, -1))
-    assert REASONS[verdict.reason[0]] == "collision"
-
-
+@pytest.mark.slow
 def test_few_random_candidates_are_feasible_and_for_several_reasons(
     evaluator: CandidateEvaluator,
 ) -> None:

@@ -306,20 +306,6 @@ def test_runs_in_lanes() -> None:
     assert lane_text(generated_c([function]), "grasp") is not None
 
 
-def test_derivatives_by_the_motion() -> None:
-    rng = np.random.default_rng(5)
-    function = load_function(held_cell(rng, ("rectangle", "rectangle")))
-    jacobian = function.factory("jacobian", function.name_in(), ["jac:normal_force:second_rate"])
-    pose, rate, second = random_motion(rng)
-    found = np.array(jacobian(pose, rate, second))
-    scale = max(1.0, float(np.abs(found).max()))
-    for k, step in enumerate(1e-4 * np.eye(6)):
-        ends = [
-            call(function, pose, rate, second + sign * step)["normal_force"] for sign in (1.0, -1.0)
-        ]
-        np.testing.assert_allclose(found[:, k], (ends[0] - ends[1]) / 2e-4, atol=1e-3 * scale)
-
-
 def test_opposite_rectangles_keep_the_papers_forces_where_they_suffice() -> None:
     """Bit by bit; where a centre of pressure would leave its rectangle they press harder."""
     rng = np.random.default_rng(2)

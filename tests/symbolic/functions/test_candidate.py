@@ -1,8 +1,9 @@
-"""The whole candidate: against the plain reference, its own differences and physical laws."""
+"""The whole candidate, also of redundant joints and turned boxes: against the plain reference."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import casadi as ca
@@ -11,30 +12,31 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from codegen.build import compile_function
-from studies.research.plain.candidate import PlainCandidate, PlainEvaluator
+from studies.research.plain.candidate import PlainCandidate, PlainEvaluator, evaluate
 from symbolic.array import Array
+from symbolic.cell_model import CellModel, build_cell_model
 from symbolic.functions import CONSTRAINTS, candidate_function
+from symbolic.path_motion import path_motion_function
 from symbolic.records import Robot, Waypoint, Workcell
-from symbolic.records.task import initial_decision
+from symbolic.records.task import TimeLaw, initial_decision
+from tests.redundant_cells import free_pandas, locked_pandas, machine_on_lift, rack_on_rail
 from tests.symbolic.cells import (
-    SEEDS,
-    Evaluator,
+    call,
     fixed,
     hand_cell,
     hand_model,
     interpreted,
     rack_model,
     random_candidates,
+    start_posture,
     with_contacts,
     with_payload,
     with_task,
 )
+from tests.turned_cells import random_x, turned_cell
 
 AGREEMENT = 1e-8
 """Largest difference to the plain reference, absolute or relative, whichever is larger."""
-
-HALF_TURN = np.array([-1.0, -1.0, 1.0, -1.0, -1.0, 1.0])
-"""Pose components under half a turn about z of a cell that this turns onto itself."""
 
 
 def verdict(outputs: dict[str, Array]) -> tuple[tuple[str, ...], str]:
@@ -151,108 +153,6 @@ def test_a_broken_constraint_is_named(constraint: str, cell: Workcell) -> None:
 # --- physics of a whole carry ---
 
 
-@pytest.mark.parametrize("radius", [0.02, 0.03])
-def test_a_patch_carries_an_offset_mass_if_it_is_large_enough(radius: float) -> None:
-    """A weight 25 mm off the pads' line needs shifts of about 25 mm."""
-    cell = with_payload(hand_cell(), centre_of_mass=np.array([0.0, 0.0, 0.0]))
-    cell = with_payload(cell, centre_of_mass=np.array([0.025, 0.0, 0.0]))
-    cell = with_contacts(cell, patch_radius=(radius, radius))
-    # Slow enough to be nearly static.
-    cell = with_task(cell, reference_speed=0.02, time_law="ramped")
-    outputs = interpreted(hand_model(cell))(cell.task.initial.reshape(-1))
-    np.testing.assert_allclose(outputs["pressure_shift"], 0.025, atol=5e-4)
-    violated, _ = verdict(outputs)
-    assert violated == (("pressure_1", "pressure_2") if radius < 0.025 else ())
-
-
-@pytest.mark.parametrize("law", ["constant", "ramped"])
-def test_balance_and_cones_hold_along_every_candidate(law: str) -> None:
-    cell = with_task(odd_cell(), time_law=law)
-    evaluate = interpreted(hand_model(cell))
-    payload = cell.payload
-    for x in random_candidates(cell.task, 10, np.random.default_rng(1)):
-        out = evaluate(x)
-        R = Rotation.from_euler("xyz", out["pose"][:, 3:]).as_matrix()
-        c = R @ payload.centre_of_mass
-        omega, alpha = out["angular_velocity"], out["angular_acceleration"]
-        a = out["second_rate"][:, :3] + np.cross(alpha, c) + np.cross(omega, np.cross(omega, c))
-        forces = out["contact_force"].reshape(-1, 2, 3)
-        needed = payload.mass * (a + np.array([0.0, 0.0, 9.81]))
-        assert np.abs(forces.sum(axis=1) - needed).max() < 1e-9
-        for i, contact in enumerate(cell.contacts):
-            normal = R @ contact.T_box_pad[:3, 2]
-            along = np.sum(forces[:, i] * normal, axis=1)
-            across = np.linalg.norm(forces[:, i] - along[:, None] * normal, axis=1)
-            np.testing.assert_allclose(along, out["normal_force"][:, i], atol=1e-9)
-            assert np.all(across <= contact.friction * along + 1e-8)
-
-
-def turned_about_vertical(cell: Workcell, angle: float) -> Workcell:
-    """Bases and fixed poses turned about the world's z axis."""
-    T = np.eye(4)
-    T[:3, :3] = Rotation.from_euler("z", angle).as_matrix()
-    first, second = (replace(r, T_world_base=T @ r.T_world_base) for r in cell.robots)
-    waypoints = tuple(
-        replace(w, lower=turned_pose(w.lower, angle), upper=turned_pose(w.upper, angle))
-        if w.is_fixed
-        else w
-        for w in cell.task.waypoints
-    )
-    return with_task(replace(cell, robots=(first, second)), waypoints=waypoints)
-
-
-def turned_pose(pose: Array, angle: float) -> Array:
-    R = Rotation.from_euler("z", angle).as_matrix()
-    return np.concatenate([R @ pose[:3], pose[3:] + angle * np.eye(3)[2]])
-
-
-def test_turning_the_whole_cell_about_the_vertical_changes_no_force_and_no_joint() -> None:
-    cell, angle = odd_cell(), 0.9
-    turned = turned_about_vertical(cell, angle)
-    here, there = interpreted(hand_model(cell)), interpreted(hand_model(turned))
-    for x in random_candidates(cell.task, 5, np.random.default_rng(2)):
-        x_turned = np.concatenate([turned_pose(pose, angle) for pose in x.reshape(-1, 6)])
-        expected, actual = here(x), there(x_turned)
-        for name in expected:
-            if name.startswith(("normal", "tangential", "pressure", "q_", "joint", "violation")):
-                np.testing.assert_allclose(actual[name], expected[name], atol=1e-8, err_msg=name)
-
-
-def test_half_a_turn_of_the_carry_exchanges_both_robots_entirely() -> None:
-    """The hand cell turns onto itself: forces, joints and torques change places."""
-    cell = hand_cell()
-    # Both start postures from one, so that joint 1 is not half a turn apart.
-    evaluate = interpreted(hand_model(cell))
-    turned_cell = with_task(
-        cell,
-        waypoints=tuple(
-            replace(w, lower=HALF_TURN * w.lower, upper=HALF_TURN * w.upper) if w.is_fixed else w
-            for w in cell.task.waypoints
-        ),
-    )
-    turned = interpreted(hand_model(turned_cell))
-    full_turn = 2 * np.pi * np.round((SEEDS[0][0] - SEEDS[1][0]) / (2 * np.pi))
-    for x in random_candidates(cell.task, 5, np.random.default_rng(3)):
-        here, there = evaluate(x), turned((x.reshape(-1, 6) * HALF_TURN).reshape(-1))
-        for name in ("normal_force", "tangential_force", "pressure_shift"):
-            np.testing.assert_allclose(there[name], here[name][:, ::-1], atol=1e-8)
-        for name in ("joint_torque", "ik_residual", "manipulability"):
-            np.testing.assert_allclose(there[f"{name}_2"], here[f"{name}_1"], atol=1e-7)
-        joints = there["q_2"] + full_turn * np.eye(6)[0]
-        np.testing.assert_allclose(joints, here["q_1"], atol=1e-8)
-
-
-def test_mirroring_the_carry_exchanges_the_forces() -> None:
-    """Reflection at y = 0; the arms themselves are handed, so their joints are not compared."""
-    mirror = np.array([1.0, -1.0, 1.0, -1.0, 1.0, -1.0])
-    cell = hand_cell()
-    evaluate = interpreted(hand_model(cell))
-    for x in random_candidates(cell.task, 5, np.random.default_rng(4)):
-        here, there = evaluate(x), evaluate((x.reshape(-1, 6) * mirror).reshape(-1))
-        for name in ("normal_force", "tangential_force", "pressure_shift"):
-            np.testing.assert_allclose(there[name], here[name][:, ::-1], atol=1e-8)
-
-
 # --- derivatives ---
 
 SMOOTH = ("time", "normal_force", "pressure_shift", "q_1", "q_2", "joint_torque_1", "constraint")
@@ -293,13 +193,127 @@ def test_derivatives_are_finite_at_the_level_initial_trajectory() -> None:
             assert np.all(np.isfinite(value.full()))
 
 
-def test_more_samples_converge_to_the_same_carry() -> None:
-    """Peak forces of the ramped law settle as the samples are refined."""
-    peaks = []
-    for samples in (50, 100, 200, 400):
-        cell = with_task(hand_cell(), time_law="ramped", samples=samples)
-        evaluate: Evaluator = interpreted(hand_model(cell))
-        peaks.append(evaluate(cell.task.initial.reshape(-1))["normal_force"].max(axis=0))
-    changes = np.abs(np.diff(peaks, axis=0)).max(axis=1)
-    assert changes[2] < 0.1
-    assert changes[2] < changes[0]
+PER_JOINT = ("q_1", "q_2", "joint_torque_1", "joint_torque_2")
+
+
+def nearest(model: CellModel, arm: int, posture: Array) -> int:
+    """The branch of an arm that starts nearest a posture."""
+    return int(np.argmin([np.abs(b.q - posture).max() for b in model.branches[arm]]))
+
+
+@pytest.fixture(scope="module")
+def pandas(tmp_path_factory: pytest.TempPathFactory) -> CellModel:
+    return build_cell_model(free_pandas(tmp_path_factory.mktemp("pandas"), "initial = 0.1"))
+
+
+def test_redundant_candidates_are_those_of_the_plain_reference(pandas: CellModel) -> None:
+    task, rng = pandas.workcell.task, np.random.default_rng(1)
+    assert task.n_var == 6 + 2 * 3
+    for spread in (0.0, 0.3, 0.6):
+        x = initial_decision(task)
+        x[task.n_box :] += rng.uniform(-spread, spread, task.n_var - task.n_box)
+        found = interpreted(pandas)(x)
+        expected = evaluate(pandas.workcell, pandas.start, x).outputs
+        for name, values in expected.items():
+            np.testing.assert_allclose(
+                np.squeeze(found[name]), np.squeeze(values), atol=1e-9, err_msg=name
+            )
+
+
+@pytest.mark.parametrize("angle", [0.1, -0.35])
+def test_a_constant_redundant_joint_is_a_locked_one(tmp_path: Path, angle: float) -> None:
+    free = build_cell_model(free_pandas(tmp_path, f"initial = {angle}"))
+    locked = build_cell_model(locked_pandas(tmp_path, angle))
+    following = [k for k in range(7) if k != 2]
+    for arm in (0, 1):
+        found = [branch.q[following] for branch in free.branches[arm]]
+        expected = [branch.q for branch in locked.branches[arm]]
+        np.testing.assert_allclose(found, expected, atol=1e-9)
+    own = interpreted(free)(initial_decision(free.workcell.task))
+    other = interpreted(locked)(initial_decision(locked.workcell.task))
+    for name, values in other.items():
+        here = own[name][:, following] if name in PER_JOINT else own[name]
+        np.testing.assert_allclose(here, values, atol=1e-9, err_msg=name)
+
+
+def test_an_arm_on_a_slide_is_one_whose_base_stands_there(tmp_path: Path) -> None:
+    moved = build_cell_model(rack_on_rail(tmp_path, 0.3))
+    standing = rack_model()
+    chosen = nearest(moved, 0, np.concatenate([[0.3], standing.start[0]]))
+    assert chosen == 0
+    x = initial_decision(moved.workcell.task)
+    np.testing.assert_array_equal(x, initial_decision(standing.workcell.task))
+    own, other = interpreted(moved)(x), interpreted(standing)(x)
+    np.testing.assert_allclose(own["q_1"][:, 0], 0.3)
+    for name, values in other.items():
+        here = own[name][:, 1:] if name in ("q_1", "joint_torque_1") else own[name]
+        np.testing.assert_allclose(here, values, atol=1e-9, err_msg=name)
+    names = {(a.split("/")[-1], b.split("/")[-1]) for a, b in standing.geometry.pair_names}
+    assert names <= {(a.split("/")[-1], b.split("/")[-1]) for a, b in moved.geometry.pair_names}
+
+
+def test_a_lift_of_both_arms_is_one_joint(tmp_path: Path) -> None:
+    free = build_cell_model(machine_on_lift(tmp_path / "free", 0.1, free=True))
+    locked = build_cell_model(machine_on_lift(tmp_path / "locked", 0.1, free=False))
+    (lift,) = free.workcell.task.redundant
+    assert lift.name == "left/torso_lift_joint"
+    assert lift.drives == (0, 0)
+    assert len(initial_decision(free.workcell.task)) == 6 + 3
+    names = {body.name for body in free.geometry.bodies}
+    assert {name.split("/")[-1] for name in names} == {
+        body.name.split("/")[-1] for body in locked.geometry.bodies
+    }
+    assert len(names) == len(locked.geometry.bodies)
+    same = [
+        free.branches[arm][nearest(free, arm, np.concatenate([[0.1], locked.start[arm]]))].q
+        for arm in (0, 1)
+    ]
+    free = replace(free, start=(same[0], same[1]))
+    own = interpreted(free)(initial_decision(free.workcell.task))
+    other = interpreted(locked)(initial_decision(locked.workcell.task))
+    for name in ("q_1", "q_2", "joint_torque_1", "joint_torque_2"):
+        np.testing.assert_allclose(own[name][:, 1:], other[name], atol=1e-9, err_msg=name)
+    for name in ("manipulability_1", "manipulability_2", "lost_1", "lost_2"):
+        np.testing.assert_allclose(own[name], other[name], atol=1e-9, err_msg=name)
+
+
+def test_a_moving_lift_moves_both_arms_alike(tmp_path: Path) -> None:
+    model = build_cell_model(machine_on_lift(tmp_path, 0.1, free=True))
+    x = initial_decision(model.workcell.task)
+    x[6:] = [0.1, 0.12, 0.08]
+    found = interpreted(model)(x)
+    np.testing.assert_array_equal(found["q_1"][:, 0], found["q_2"][:, 0])
+    assert found["q_1"][-1, 0] == pytest.approx(0.08, abs=1e-12)
+    assert found["lost_1"].max() == found["lost_2"].max() == 0.0
+    expected = evaluate(model.workcell, model.start, x).outputs
+    for name in ("q_1", "q_2", "joint_torque_1"):
+        np.testing.assert_allclose(found[name], expected[name], atol=1e-8, err_msg=name)
+
+
+@pytest.mark.parametrize("time_law", ["constant", "ramped"])
+def test_turned_candidates_are_those_of_the_plain_reference(time_law: TimeLaw) -> None:
+    cell = turned_cell(time_law)
+    plain = PlainEvaluator(cell, start_posture(cell))
+    for seed in (1, 2):
+        x = random_x(cell, seed)
+        found, expected = interpreted(hand_model(cell))(x), plain(x).outputs
+        assert not expected["violation"].any(), "the arms follow the box to its end"
+        for name, values in expected.items():
+            np.testing.assert_allclose(
+                np.squeeze(found[name]), np.squeeze(values), rtol=1e-8, atol=1e-8, err_msg=name
+            )
+
+
+def test_derivatives_along_the_path_are_those_of_differences() -> None:
+    cell, n = turned_cell(), 401
+    motion = call(path_motion_function(hand_model(cell), n), random_x(cell, 3))
+    u = np.linspace(0.0, 1.0, n)
+    turned = motion["rotation"].reshape(n, 3, 3)
+    steps = Rotation.from_matrix(turned[2:] @ np.swapaxes(turned[:-2], 1, 2)).as_rotvec()
+    np.testing.assert_allclose(steps * (n - 1) / 2.0, motion["angular_first"][1:-1], atol=2e-3)
+    inner = slice(2, -2)
+    for first, second in (("angular_first", "angular_second"), ("q_first_1", "q_second_1")):
+        slopes = np.gradient(motion[first], u, axis=0, edge_order=2)
+        np.testing.assert_allclose(motion[second][inner], slopes[inner], atol=0.02)
+    slopes = np.gradient(motion["q_2"], u, axis=0, edge_order=2)
+    np.testing.assert_allclose(motion["q_first_2"][inner], slopes[inner], atol=6e-3)

@@ -13,8 +13,7 @@ from hypothesis import strategies as st
 
 from symbolic.array import Array
 from symbolic.geometry.expressions import EXACT, Softness, clean, quaternion
-from symbolic.path.rotation import rotation_matrix
-from symbolic.records.poses import Orientation, pose_matrix
+from symbolic.records.poses import pose_matrix
 from tests.symbolic.geometry.collision_cells import (
     functions_of,
     placed_pieces,
@@ -63,15 +62,6 @@ def test_bounds_never_exceed_the_distance(name: str, folder: Path) -> None:
         near += int(np.count_nonzero((distance > 0.10) & (bound[k] > 0.0)))
     # A bound that never clears anything would be safe and useless.
     assert near > 0.9 * far
-
-
-@given(st.integers(0, 10_000))
-def test_bounds_of_any_posture_are_safe(seed: int) -> None:
-    geometry = whole_geometry_of("rack")
-    at = random_configurations(geometry, 1, np.random.default_rng(seed))
-    bound = bounds("rack", Path(), *at)[0]
-    distance = np.fmax(true_distances(geometry, *(array[0] for array in at)), 0.0)
-    assert np.all(np.fmax(bound, 0.0) <= distance + COAL_ACCURACY)
 
 
 def test_flush_boxes_are_measured_exactly() -> None:
@@ -206,10 +196,3 @@ def test_soft_operations_err_to_their_side(a: float, b: float, width: float) -> 
     limits = np.array([1.0, 1.0, 0.5, 0.5, 0.5, 0.5, 1.0, 1.0]) * width
     assert np.all(excess >= -1e-12)
     assert np.all(excess <= limits + 1e-12)
-
-
-def test_rotation_matrix_of_the_box_is_the_projects() -> None:
-    rpy = ca.SX.sym("rpy", 3)
-    f = ca.Function("f", [rpy], [rotation_matrix(Orientation(), rpy)])
-    angles = np.array([0.3, -0.5, 0.9])
-    assert np.array(f(angles)) == pytest.approx(pose_matrix(np.zeros(3), angles)[:3, :3])

@@ -31,8 +31,6 @@ from tests.redundant_cells import free_pandas, rack_on_rail
 from tests.studies.conftest import TRANSFER
 from tests.symbolic.read.samples import RACK, sample_data, write
 
-JOINT = {"allocation": "joint"}
-
 
 def cell(folder: Path, **changes: Any) -> Workcell:
     """The sample cell under the joint allocation with other tables; `contacts` one per robot."""
@@ -282,12 +280,6 @@ def test_redundant_joints_are_as_many_as_there_are_beyond_six(tmp_path: Path) ->
         load(path)
     path.write_text(path.read_text().replace('"panda_joint1", "panda_joint3"', '"panda_joint5"'))
     assert load(path).robots[0].redundant_joints == ("panda_joint5",)
-
-
-def test_an_arm_with_five_joints_is_refused(tmp_path: Path) -> None:
-    arm = SINGLE["ur5"]
-    with pytest.raises(WorkcellError, match="allowed are 6 or more"):
-        load(single_cell(replace(arm, locked={}), tmp_path, {"elbow_joint": 1.6}))
 
 
 @pytest.mark.parametrize("path", [RACK, TRANSFER])

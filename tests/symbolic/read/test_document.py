@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import importlib.metadata
-import math
 import re
 import tempfile
 import tomllib
@@ -19,7 +17,6 @@ from scipy.spatial.transform import Rotation
 
 from symbolic.array import Range
 from symbolic.errors import WorkcellError
-from symbolic.read.arms import body_names
 from symbolic.read.cell import changed, changed_text, load
 from symbolic.read.checks import stretched_length
 from symbolic.read.payload import pad_rotation
@@ -37,11 +34,9 @@ from symbolic.records import (
     Uncertainty,
     Workcell,
 )
-from symbolic.records.poses import inverse, pose_matrix
 from tests.symbolic.cells import rack_cell
-from tests.symbolic.read.problem_cases import put
-from tests.symbolic.read.samples import GOFA, RACK, STUDIES, sample_data, write
-from tests.symbolic.read.strategies import cells, numbers, vectors
+from tests.symbolic.read.samples import RACK, STUDIES, cells, numbers, sample_data, write
+from tests.symbolic.read.test_problems import put
 
 DOCUMENT = (STUDIES.parent / "docs" / "workcell.md").read_text(encoding="utf-8")
 SECTIONS = (
@@ -147,10 +142,6 @@ kind = "box"
 
 def read(changes: dict[str, Any]) -> dict[str, Any]:
     return tomllib.loads(changed_text(TEXT, changes, "cell.toml").decode())
-
-
-def test_nothing_changed_reads_the_same() -> None:
-    assert read({}) == tomllib.loads(TEXT.decode())
 
 
 def test_the_rack_reads_the_same() -> None:
@@ -338,12 +329,6 @@ def test_pad_rotation(axis: int, side: int, spin: float) -> None:
     np.testing.assert_allclose(zero_spin[:, 0], expected, atol=1e-14)
 
 
-@given(vectors(-9, 9), vectors(-6, 6))
-def test_inverse_of_a_pose(xyz: list[float], rpy: list[float]) -> None:
-    pose = pose_matrix(xyz, rpy)
-    np.testing.assert_allclose(pose @ inverse(pose), np.eye(4), atol=1e-13)
-
-
 def test_contact_is_moved_onto_its_face(tmp_path: Path) -> None:
     data = sample_data()
     data["contacts"][0]["xyz"] = [0.01, 0.2 + 9e-7, -0.02]
@@ -351,74 +336,9 @@ def test_contact_is_moved_onto_its_face(tmp_path: Path) -> None:
     assert cell.contacts[0].T_box_pad[:3, 3].tolist() == [0.01, 0.2, -0.02]
 
 
-def test_locked_joint_leaves_six(tmp_path: Path) -> None:
-    """A seventh joint, between the base and the first one, is held where the file says."""
-    text = GOFA.read_text(encoding="utf-8")
-    text = text.replace('<parent link="base_link"/>', '<parent link="turntable"/>')
-    text = text.replace(
-        '<link name="tool0"/>',
-        '<link name="tool0"/><link name="turntable"/><joint name="turn" type="revolute">'
-        '<parent link="base_link"/><child link="turntable"/><axis xyz="0 0 1"/>'
-        '<origin xyz="0 0 0.1"/><limit lower="-3" upper="3" velocity="1" effort="500"/></joint>',
-    )
-    (tmp_path / "arm.urdf").write_text(text, encoding="utf-8")
-    data = sample_data()
-    data["robots"][0] |= {"urdf": "arm.urdf", "locked_joints": {"turn": 0.5}}
-    cell = load(write(tmp_path, data))
-    assert cell.robots[0].locked_joints == (("turn", 0.5),)
-    np.testing.assert_allclose(cell.robots[0].torque_max, [390, 400, 160, 60, 60, 60])
-
-
-def test_another_make_of_arm(tmp_path: Path) -> None:
-    """A UR10 with its meshes, as its own package ships it."""
-    files = importlib.metadata.files("example-robot-data") or []
-    (entry,) = (file for file in files if file.name == "ur10_robot.urdf")
-    urdf = Path(str(entry.locate())).resolve()
-    share = next(folder.parent for folder in urdf.parents if folder.name == "example-robot-data")
-    data = sample_data()
-    for robot in data["robots"]:
-        robot |= {"urdf": str(urdf), "package_dirs": [str(share)], "flange": "tool0"}
-    cell = load(write(tmp_path, data))
-    robot = cell.robots[0]
-    np.testing.assert_allclose(robot.torque_max, [330, 330, 150, 54, 54, 54])
-    assert robot.position_upper[2] == pytest.approx(math.pi)
-
-
 @pytest.fixture(scope="module")
 def rack() -> Workcell:
     return load(RACK)
-
-
-def test_contacts_squeeze_the_box(rack: Workcell) -> None:
-    for robot, contact in zip(rack.robots, rack.contacts, strict=True):
-        origin, normal = contact.T_box_pad[:3, 3], contact.T_box_pad[:3, 2]
-        assert abs(origin[1]) == pytest.approx(0.20)
-        # The normal leads from the robot that holds the contact into the box.
-        assert normal @ origin < 0
-        assert normal @ (origin - robot.T_world_base[:3, 3]) > 0
-        assert (contact.friction, contact.patch_radius) == (1.0, 0.0315)
-
-
-def test_boards_from_the_paper(rack: Workcell) -> None:
-    bodies = {body.name: body for body in rack.environment}
-    for name, top in (("bottom board", 0.2), ("middle board", 0.6), ("top board", 1.0)):
-        shape = bodies[name].shape
-        assert isinstance(shape, Box)
-        np.testing.assert_allclose(shape.size[:2], [0.40, 1.00])
-        assert bodies[name].pose[2, 3] + shape.size[2] / 2 == pytest.approx(top)
-    ground = bodies["ground"]
-    assert isinstance(ground.shape, Box)
-    assert ground.pose[2, 3] + ground.shape.size[2] / 2 == pytest.approx(0.0)
-
-
-def test_names_of_bodies(rack: Workcell) -> None:
-    names = body_names(rack)
-    assert names["payload"] == ("payload",)
-    assert names["left"][0] == "left/base_link"
-    assert names["right"][-1] == "right/pad"
-    assert "top board" in names["environment"]
-    flat = [name for group in names.values() for name in group]
-    assert len(set(flat)) == len(flat)
 
 
 def test_stretched_length_is_the_sum_of_the_links(rack: Workcell) -> None:

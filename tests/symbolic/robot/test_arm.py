@@ -1,10 +1,12 @@
-"""One arm: its model against Pinocchio's numbers, and following a path."""
+"""An arm: the bridge and its model against Pinocchio, and following a path."""
 
 from __future__ import annotations
 
+import sys
+from collections.abc import Callable, Iterator
 from dataclasses import replace
-from itertools import pairwise
 from pathlib import Path
+from types import ModuleType, SimpleNamespace
 
 import casadi as ca
 import numpy as np
@@ -16,17 +18,17 @@ from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
 from studies.research.plain.arm import PlainArm
-from studies.research.plain.motion import rotation
 from symbolic.array import Array
-from symbolic.errors import RobotModelError
+from symbolic.errors import BridgeError, RobotModelError
+from symbolic.read.arms import reduced_model
+from symbolic.read.urdf import read_urdf
+from symbolic.robot import bridge
 from symbolic.robot.arm import (
     CHEAP_STEPS,
     MAX_JOINT_STEP,
     NEWTON_STEPS,
     REACH_TOLERANCE,
-    block_step,
     follow_function,
-    joint_torque,
     newton_step,
     pose_error,
     track_function,
@@ -51,17 +53,6 @@ def step_function() -> ca.Function:
     return ca.Function("step", [_q, _R, _p], [result, residual])
 
 
-def box_pose(arm: PlainArm, q: Array) -> Array:
-    """Box pose (6,) whose contact the pad of an arm is at."""
-    world = (
-        pin.SE3(arm.robot.T_world_base)
-        * arm.place(q)
-        * pin.SE3(arm.robot.T_flange_pad)
-        * pin.SE3(arm.contact.T_box_pad).inverse()
-    )
-    return np.concatenate([world.translation, Rotation.from_matrix(world.rotation).as_euler("xyz")])
-
-
 def random_posture(rng: np.random.Generator, margin: float = 0.2) -> Array:
     robot = CELL.robots[0]
     return rng.uniform(robot.position_lower + margin, robot.position_upper - margin)
@@ -75,21 +66,6 @@ def test_residual_vanishes_for_equal_placements_only(axis: int, angle: float, sh
     expected = np.hypot(shift, 2 * np.sin(angle / 2))
     assert float(residual) == pytest.approx(expected, abs=1e-12)
     np.testing.assert_allclose(np.array(right)[3:, 0], np.sin(angle) * np.eye(3)[axis], atol=1e-12)
-
-
-def test_newton_converges_quadratically() -> None:
-    rng = np.random.default_rng(3)
-    model = gofa_model()
-    once = ca.Function("once", [_q, _R, _p], [newton_step(model, _q, _R, _p)])
-    q = np.array([0.3, -0.6, 0.4, 0.5, 1.0, 0.2])
-    target = ARMS[0].place(q).copy()
-    guess, errors = q + 0.02 * rng.normal(size=6), []
-    for _ in range(5):
-        errors.append(np.abs(guess - q).max())
-        guess = np.array(once(guess, target.rotation, target.translation))[:, 0]
-    assert errors[4] < 1e-12
-    for before, after in pairwise(errors):
-        assert after < 5.0 * before**2 + 1e-13
 
 
 def test_a_singular_posture_keeps_its_joints_and_shows_its_residual() -> None:
@@ -122,54 +98,10 @@ def test_ten_thousand_random_poses_are_never_wrongly_reported_as_reached() -> No
         assert actual == pytest.approx(claimed, abs=1e-11, rel=1e-6)
 
 
-@pytest.mark.parametrize("arm", [0, 1])
-def test_joint_torques_do_the_work_of_the_contact_wrench(arm: int) -> None:
-    """Virtual work: tau . dq = f . dp + m . d(angle) of the contact point, by differences."""
-    rng = np.random.default_rng(arm)
-    q_symbol, R_symbol, wrench_symbol = (
-        ca.SX.sym("q", 6),
-        ca.SX.sym("R", 3, 3),
-        ca.SX.sym("wrench", 6),
-    )
-    torque = joint_torque(
-        CELL.robots[arm],
-        CELL.contacts[arm],
-        gofa_model().jacobian(q_symbol),
-        R_symbol,
-        wrench_symbol,
-    )
-    function = ca.Function("torque", [q_symbol, R_symbol, wrench_symbol], [torque])
-    plain = ARMS[arm]
-
-    def contact(q: Array) -> pin.SE3:
-        return pin.SE3(plain.robot.T_world_base) * plain.place(q) * plain.T_flange_pad
-
-    for _ in range(5):
-        q, wrench, h = random_posture(rng), rng.normal(size=6) * 50.0, 1e-6
-        R = rotation(box_pose(plain, q)[3:])
-        tau = np.array(function(q, R, wrench))[:, 0]
-        for joint in range(6):
-            dq = h * np.eye(6)[joint]
-            after, before = contact(q + dq), contact(q - dq)
-            turn = Rotation.from_matrix(after.rotation @ before.rotation.T).as_rotvec()
-            moved = np.concatenate([after.translation - before.translation, turn]) / (2 * h)
-            assert tau[joint] == pytest.approx(wrench @ moved, abs=1e-5)
-
-
 def straight_path(arm: int, end: Array, samples: int = 40) -> tuple[Array, Array]:
     start = CELL.task.waypoints[0].lower
     poses = start + np.linspace(0.0, 1.0, samples)[:, None] * (end - start)
     return start_posture(CELL)[arm], poses
-
-
-@pytest.mark.parametrize("arm", [0, 1])
-def test_follows_a_reachable_path_to_within_its_tolerance(arm: int) -> None:
-    start, poses = straight_path(arm, np.array([-0.4, 0.05, 0.8, 0.1, 0.1, -0.1]))
-    follow = follow_function(CELL.robots[arm], gofa_model(), CELL.contacts[arm], 40, "follow")
-    result = call(follow, start, poses, np.zeros((40, 6)))
-    assert not result["lost"].any()
-    for q, pose in zip(result["q"], poses, strict=True):
-        assert ARMS[arm].residual(q, ARMS[arm].flange_target(pose)) < REACH_TOLERANCE
 
 
 def test_the_first_step_of_a_coarse_path_is_reached_as_well() -> None:
@@ -214,21 +146,6 @@ def test_a_jump_to_another_branch_counts_as_lost() -> None:
     np.testing.assert_array_equal(result["q"], previous)
 
 
-def test_a_step_by_blocks_is_newtons() -> None:
-    model = gofa_model()
-    step, residual = block_step(model, _q, _R, _p)
-    both = ca.Function("both", [_q, _R, _p], [step, residual, newton_step(model, _q, _R, _p)])
-    rng = np.random.default_rng(5)
-    for _ in range(200):
-        q = random_posture(rng)
-        target = ARMS[0].place(q + 0.05 * rng.normal(size=6)).copy()
-        found, before, expected = both(q, target.rotation, target.translation)
-        conditioned = np.linalg.cond(ARMS[0].jacobian(q)) < 1e4
-        if conditioned:
-            np.testing.assert_allclose(found.full(), expected.full(), atol=1e-9)
-        assert float(before) == pytest.approx(ARMS[0].residual(q, target), abs=1e-12)
-
-
 def test_a_sample_that_the_cheap_steps_miss_is_reached_all_the_same() -> None:
     """A wild change of the last change sends the extrapolation astray; the QR steps find back."""
     track = track_function(CELL.robots[0], gofa_model(), CELL.contacts[0], "track")
@@ -247,24 +164,6 @@ def test_a_sample_that_the_cheap_steps_miss_is_reached_all_the_same() -> None:
     assert astray > 5
 
 
-def test_turning_base_and_box_together_changes_nothing_for_the_arm() -> None:
-    turn = 0.7
-    R = Rotation.from_euler("z", turn).as_matrix()
-    robot, contact = CELL.robots[0], CELL.contacts[0]
-    T = np.eye(4)
-    T[:3, :3] = R
-    turned_robot = replace(robot, T_world_base=T @ robot.T_world_base)
-    start, poses = straight_path(0, np.array([-0.4, 0.05, 0.8, 0.1, 0.1, -0.1]))
-    turned_poses = np.column_stack([poses[:, :3] @ R.T, poses[:, 3:] + [0.0, 0.0, turn]])
-    wrenches = np.random.default_rng(0).normal(size=(40, 6)) * 30.0
-    turned_wrenches = (wrenches.reshape(-1, 3) @ R.T).reshape(-1, 6)
-    here = follow_function(robot, gofa_model(), contact, 40, "here")
-    there = follow_function(turned_robot, gofa_model(), contact, 40, "there")
-    expected = call(here, start, poses, wrenches)
-    for name, value in call(there, start, turned_poses, turned_wrenches).items():
-        np.testing.assert_allclose(value, expected[name], atol=1e-9, err_msg=name)
-
-
 angles = st.lists(st.floats(-np.pi, np.pi), min_size=6, max_size=6).map(np.array)
 rates = st.lists(st.floats(-3, 3), min_size=6, max_size=6).map(np.array)
 
@@ -277,38 +176,6 @@ def urdf(request: pytest.FixtureRequest) -> Path:
 @pytest.fixture(scope="module")
 def arm(urdf: Path) -> RobotModel:
     return build_robot_model(robot_record(urdf))
-
-
-@pytest.fixture(scope="module")
-def gofa() -> RobotModel:
-    return build_robot_model(robot_record(GOFA_URDF))
-
-
-def flange_pose(arm: RobotModel, q: Array) -> tuple[Array, Array]:
-    rotation, position = arm.placement(q)
-    return np.array(rotation), np.array(position)[:, 0]
-
-
-@given(q=angles)
-def test_jacobian_is_the_derivative_of_the_placement(arm: RobotModel, q: Array) -> None:
-    step = 1e-6
-    jacobian = np.array(arm.jacobian(q))
-    rotation, _ = flange_pose(arm, q)
-    for joint in range(6):
-        ahead = flange_pose(arm, q + step * np.eye(6)[joint])
-        behind = flange_pose(arm, q - step * np.eye(6)[joint])
-        linear = (ahead[1] - behind[1]) / (2 * step)
-        spin = (ahead[0] - behind[0]) / (2 * step) @ rotation.T
-        angular = [spin[2, 1], spin[0, 2], spin[1, 0]]
-        assert_allclose(jacobian[:, joint], [*linear, *angular], rtol=0, atol=1e-8)
-
-
-@given(q=angles, v=rates)
-def test_drift_is_the_rate_of_the_jacobian(arm: RobotModel, q: Array, v: Array) -> None:
-    step = 1e-6
-    change = np.array(arm.jacobian(q + step * v)) - np.array(arm.jacobian(q - step * v))
-    drift = np.array(arm.drift(q, v))[:, 0]
-    assert_allclose(drift, change / (2 * step) @ v, rtol=0, atol=1e-6)
 
 
 @given(q=angles, v=rates, a=rates, roll=st.floats(-np.pi, np.pi), pitch=st.floats(-1.5, 1.5))
@@ -341,3 +208,167 @@ def test_unknown_flange() -> None:
 def test_missing_urdf() -> None:
     with pytest.raises(RobotModelError, match=r"absent\.urdf"):
         build_robot_model(robot_record(Path("absent.urdf")))
+
+
+# Rounding of some hundred operations on numbers of order 10 (rates) to 1000 (torques).
+TOLERANCE = 1e-12
+
+
+def _random_humanoid() -> pin.Model:
+    """Free flyer, random placements, axes and inertias; nq differs from nv."""
+    pin.seed(0)
+    return pin.buildSampleModelHumanoidRandom()
+
+
+MODELS: dict[str, Callable[[], pin.Model]] = {
+    "gofa12": lambda: reduced_model(read_urdf(GOFA_URDF)),
+    "ur10": lambda: reduced_model(read_urdf(ur10_urdf())),
+    "manipulator": pin.buildSampleModelManipulator,
+    "humanoid": _random_humanoid,
+}
+
+
+class Case:
+    """A model, its last frame, and its functions, built once for all examples."""
+
+    def __init__(self, name: str) -> None:
+        self.model = MODELS[name]()
+        self.data = self.model.createData()
+        self.frame = self.model.nframes - 1
+        self.kinematics = bridge.frame_kinematics(self.model, self.frame)
+        self.drift = bridge.frame_drift(self.model, self.frame)
+        self.joint_placements = bridge.joint_placements(self.model)
+        self.inverse_dynamics = bridge.inverse_dynamics(self.model)
+
+    def state(self, seed: int) -> tuple[Array, Array, Array]:
+        """A random configuration, velocity and acceleration."""
+        rng = np.random.default_rng(seed)
+        q = pin.integrate(
+            self.model, pin.neutral(self.model), rng.uniform(-np.pi, np.pi, self.model.nv)
+        )
+        return q, rng.uniform(-3, 3, self.model.nv), rng.uniform(-10, 10, self.model.nv)
+
+
+@pytest.fixture(scope="module", params=MODELS)
+def case(request: pytest.FixtureRequest) -> Case:
+    return Case(request.param)
+
+
+seeds = st.integers(0, 2**32 - 1)
+
+
+@given(seed=seeds)
+def test_kinematics(case: Case, seed: int) -> None:
+    q, _, _ = case.state(seed)
+    rotation, position, jacobian = (np.array(out) for out in case.kinematics(q))
+    expected = pin.computeFrameJacobian(
+        case.model, case.data, q, case.frame, pin.LOCAL_WORLD_ALIGNED
+    )
+    pin.framesForwardKinematics(case.model, case.data, q)
+    placement = case.data.oMf[case.frame]
+    assert_allclose(rotation, placement.rotation, rtol=0, atol=TOLERANCE)
+    assert_allclose(position[:, 0], placement.translation, rtol=0, atol=TOLERANCE)
+    assert_allclose(jacobian, expected, rtol=0, atol=TOLERANCE)
+
+
+@given(seed=seeds)
+def test_drift_completes_the_classical_acceleration(case: Case, seed: int) -> None:
+    q, v, a = case.state(seed)
+    pin.forwardKinematics(case.model, case.data, q, v, a)
+    pin.updateFramePlacements(case.model, case.data)
+    expected = pin.getFrameClassicalAcceleration(
+        case.model, case.data, case.frame, pin.LOCAL_WORLD_ALIGNED
+    ).vector
+    jacobian = np.array(case.kinematics(q)[2])
+    drift = np.array(case.drift(q, v))[:, 0]
+    scale = 1 + np.abs(expected).max()
+    assert_allclose(jacobian @ a + drift, expected, rtol=0, atol=TOLERANCE * scale)
+
+
+@given(seed=seeds)
+def test_joint_placements(case: Case, seed: int) -> None:
+    q, _, _ = case.state(seed)
+    rotations, positions = (np.array(out) for out in case.joint_placements(q))
+    pin.forwardKinematics(case.model, case.data, q)
+    expected = [case.data.oMi[joint] for joint in range(1, case.model.njoints)]
+    assert_allclose(
+        rotations, np.hstack([pose.rotation for pose in expected]), rtol=0, atol=TOLERANCE
+    )
+    assert_allclose(
+        positions, np.column_stack([pose.translation for pose in expected]), rtol=0, atol=TOLERANCE
+    )
+
+
+@given(seed=seeds)
+def test_inverse_dynamics(case: Case, seed: int) -> None:
+    q, v, a = case.state(seed)
+    torque = np.array(case.inverse_dynamics(q, v, a))[:, 0]
+    expected = pin.rnea(case.model, case.data, q, v, a)
+    scale = 1 + np.abs(expected).max()
+    assert_allclose(torque, expected, rtol=0, atol=TOLERANCE * scale)
+
+
+def test_frame_that_does_not_exist() -> None:
+    model = MODELS["manipulator"]()
+    with pytest.raises(IndexError, match=f"frame 1000 of a model with {model.nframes} frames"):
+        bridge.frame_kinematics(model, 1000)
+
+
+def test_text_that_is_no_model() -> None:
+    with pytest.raises(ValueError, match="not a serialised Pinocchio model"):
+        bridge.inverse_dynamics(SimpleNamespace(saveToString=lambda: "22 nonsense"))
+
+
+@pytest.fixture
+def fresh_extension() -> Iterator[None]:
+    """Have the bridge look for its extension again, during the test and after it."""
+    bridge._extension.cache_clear()
+    yield
+    bridge._extension.cache_clear()
+
+
+@pytest.mark.usefixtures("fresh_extension")
+def test_missing_extension_names_the_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "symbolic.robot.bridge._pinocchio_casadi", None)
+    with pytest.raises(BridgeError, match=r"cannot be loaded .*pip install -e \."):
+        bridge.inverse_dynamics(MODELS["manipulator"]())
+
+
+@pytest.mark.usefixtures("fresh_extension")
+def test_extension_built_for_other_versions(monkeypatch: pytest.MonkeyPatch) -> None:
+    other = ModuleType("symbolic.robot.bridge._pinocchio_casadi")
+    other.PINOCCHIO_VERSION, other.CASADI_VERSION = "3.9.0", "3.7.2"  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, other.__name__, other)
+    with pytest.raises(BridgeError) as caught:
+        bridge.inverse_dynamics(MODELS["manipulator"]())
+    message = str(caught.value)
+    assert f"pinocchio {pin.__version__} is installed, 3.9.0 was compiled against" in message
+    assert "3.7.2 was compiled against" in message
+    assert "pip install -e ." in message
+
+
+@pytest.mark.parametrize(
+    ("built", "installed", "fits"),
+    [
+        ("4.1.0", "4.1.7", True),
+        ("4.1.0", "4.2.0", False),
+        ("4.1.0", "5.1.0", False),
+        ("4.1.0", "4.10.0", False),
+    ],
+)
+def test_only_the_patch_version_may_differ(built: str, installed: str, fits: bool) -> None:
+    versions = {"pinocchio": built}, {"pinocchio": installed}
+    if fits:
+        bridge.require_same_minor(*versions)
+    else:
+        with pytest.raises(BridgeError, match=installed):
+            bridge.require_same_minor(*versions)
+
+
+@pytest.mark.usefixtures("fresh_extension")
+def test_an_installed_pinocchio_casadi_is_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    foreign = ModuleType("pinocchio.casadi")
+    monkeypatch.setitem(sys.modules, "pinocchio.casadi", foreign)
+    monkeypatch.setattr(pin, "casadi", foreign, raising=False)
+    model = MODELS["manipulator"]()
+    assert bridge.joint_placements(model).size1_out("positions") == 3

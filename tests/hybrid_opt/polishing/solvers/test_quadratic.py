@@ -44,20 +44,6 @@ def rows(rng: np.random.Generator, m: int, k: int, n: int) -> BorderedRows:
     return BorderedRows(border, rng.integers(0, n - 1, m), left, right, n)
 
 
-@pytest.mark.parametrize(("k", "n"), [(1, 2), (18, 99), (5, 7)])
-def test_products_are_those_of_the_dense_matrix(k: int, n: int) -> None:
-    rng = np.random.default_rng(k)
-    M, A = matrix(rng, k, n), rows(rng, 4 * n, k, n)
-    d, y, raised = rng.normal(size=k + n), rng.random(4 * n), rng.random(k + n)
-    np.testing.assert_allclose(M.times(d), M.dense() @ d, atol=1e-11)
-    np.testing.assert_allclose(A.times(d), A.dense() @ d, atol=1e-12)
-    np.testing.assert_allclose(A.pulled(y), A.dense().T @ y, atol=1e-12)
-    total = M.plus(A.squares(y), 0.5).raised(raised)
-    wanted = M.dense() + 0.5 * A.dense().T @ np.diag(y) @ A.dense() + np.diag(raised)
-    np.testing.assert_allclose(total.dense(), wanted, atol=1e-10)
-    assert total.largest == pytest.approx(np.abs(wanted).max())
-
-
 def program(seed: int) -> QuadraticProgram:
     """Of random size; some barely convex, with repeated rows or redundant ones."""
     rng = np.random.default_rng(seed)

@@ -1,6 +1,9 @@
-"""A cell with redundant joints through the library: evaluation, certificate, timing."""
+"""Redundant joints, and boxes that are turned over, through the library."""
 
 from __future__ import annotations
+
+import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,13 +12,16 @@ import hybrid_opt as ho
 from hybrid_opt.bundles.arms import require_axes
 from hybrid_opt.cell import Cell
 from hybrid_opt.collision.certify import SampledPath, configurations
+from hybrid_opt.display.scene import frame_placements, scene_data
 from hybrid_opt.evaluate.evaluation import REASONS, LockedEvaluator
-from hybrid_opt.evaluate.kernel import one_by_one
 from studies.research.plain.candidate import PlainJudge
 from symbolic.array import Array
 from symbolic.errors import SettingsError
-from symbolic.records.task import extended_waypoints
+from symbolic.geometry.bodies import Frame
+from symbolic.records.poses import box_rotation
+from symbolic.records.task import extended_waypoints, variable_names
 from tests.redundant_cells import free_pandas
+from tests.turned_cells import turned_transfer
 
 
 @pytest.fixture(scope="module")
@@ -29,15 +35,6 @@ def varied(cell: Cell, count: int, spread: float) -> Array:
     x = np.tile(cell.initial, (count, 1))
     x[:, cell.workcell.task.n_box :] += rng.uniform(-spread, spread, (count, 6))
     return x
-
-
-def test_lanes_give_the_bits_of_one_by_one(cell: Cell) -> None:
-    x = varied(cell, 30, 0.8)
-    found = cell.evaluator.sampled(x)
-    expected = one_by_one(cell.evaluator.outputs(x), cell.evaluator.checker)
-    np.testing.assert_array_equal(found.outputs["violation"], expected.outputs["violation"])
-    np.testing.assert_array_equal(found.colliding, expected.colliding)
-    np.testing.assert_array_equal(found.first_reason, expected.first_reason)
 
 
 def test_verdicts_are_those_of_the_plain_reference(cell: Cell) -> None:
@@ -97,3 +94,50 @@ def test_locking_is_a_constant_path(cell: Cell) -> None:
     )
     with pytest.raises(SettingsError, match="3 positions; needed are 2"):
         LockedEvaluator(cell.evaluator, np.zeros(3))
+
+
+@pytest.fixture(scope="module")
+def turned(tmp_path_factory: pytest.TempPathFactory) -> Cell:
+    return Cell(turned_transfer(tmp_path_factory.mktemp("turned")))
+
+
+def test_most_carries_are_feasible_and_certified(turned: Cell) -> None:
+    found = turned.evaluate(turned.random(40, np.random.default_rng(2)))
+    assert found.feasible.mean() > 0.5
+    initial = turned.evaluate(turned.initial)
+    assert turned.evaluator.certified(initial).feasible.all()
+    assert variable_names(turned.workcell.task)[3] == "waypoint 1, rotation x"
+
+
+@pytest.mark.slow
+def test_the_polish_lowers_the_forces(turned: Cell) -> None:
+    front = ho.search(turned, "nsga2", evaluations=60, rng=np.random.default_rng(3))
+    settings = ho.PolishSettings(attempts=3, rounds=4)
+    polished = ho.polish(front, rng=np.random.default_rng(3), settings=settings)
+    assert polished.objectives.sum(axis=1).min() < front.objectives.sum(axis=1).min()
+
+
+def test_a_timed_carry_turns_as_its_rates_say(turned: Cell, tmp_path: Path) -> None:
+    timing = ho.time_path(turned, turned.initial, ho.TimingLimits())
+    assert timing.ok
+    carry = timing.carry
+    assert carry is not None
+    rotation = box_rotation(turned.workcell.task.orientation, carry.pose)
+    np.testing.assert_allclose(rotation[-1], np.diag([-1.0, 1.0, -1.0]), atol=1e-9)
+    # The turn about y in all, by the integral of the angular velocity.
+    whole = np.trapezoid(carry.angular_velocity[:, 1], carry.time)
+    assert whole == pytest.approx(np.pi, abs=0.02)
+    ho.export(timing, "json", tmp_path)
+    (path,) = (p for p in tmp_path.rglob("*.json") if "box" in json.loads(p.read_text()))
+    box = json.loads(path.read_text())["box"]
+    assert (box["rotation"], box["reference"]) == ("quaternion", np.eye(3).tolist())
+
+
+def test_pictures_show_the_box_as_it_is_turned(turned: Cell) -> None:
+    carry = turned.carry(turned.initial)
+    placed = frame_placements(turned.geometry, carry.pose, carry.q)[Frame("box")]
+    np.testing.assert_array_equal(
+        placed[:, :3, :3], box_rotation(turned.workcell.task.orientation, carry.pose)
+    )
+    told = scene_data(turned.geometry, carry)["orientation"]
+    assert told == {"vector": True, "reference": [0.0, 0.0, 0.0, 1.0]}

@@ -1,16 +1,18 @@
-"""The shipped cells whose pads are not two round ones opposite in the middle: a drum, a crate on a
-fork, pads on adjacent faces, and a load to one side, which only pressing harder can hold."""
+"""The cells that ship whose pads are not two round ones opposite in the middle, and those with
+redundant joints; and a robot as people have it, beside the same cell written plainly."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
+import casadi as ca
 import numpy as np
 import pytest
 
 from hybrid_opt.cell import Cell
-from hybrid_opt.evaluate.evaluation import CandidateEvaluator
+from hybrid_opt.evaluate.evaluation import CandidateEvaluator, LockedEvaluator
 from hybrid_opt.evaluate.objectives import ROBUST_OBJECTIVES
 from hybrid_opt.polishing.polisher import Polisher
 from hybrid_opt.polishing.settings import PolishSettings
@@ -19,13 +21,20 @@ from hybrid_opt.robust.path_force import RobustPath
 from hybrid_opt.timing.model import TimingModel
 from hybrid_opt.timing.records import TimingLimits
 from hybrid_opt.timing.solve import time_path
+from studies.programs.inspection import inspected
+from studies.research.locked_joints import compare, locks
 from studies.research.plain.collisions import PlainCollisionChecker
+from studies.run import main
+from symbolic.array import Array
+from symbolic.cell_model import CellModel, build_cell_model
 from symbolic.contact.load import load_function
 from symbolic.errors import SettingsError
+from symbolic.functions import candidate_function
 from symbolic.read.cell import load
 from symbolic.records import Uncertainty
+from tests.described_cells import SOURCES, described_cell, plain_cell
 from tests.hybrid_opt.cells import shipped
-from tests.symbolic.cells import ROOT, call
+from tests.symbolic.cells import RACK, ROOT, call
 
 WORKCELLS = ROOT / "studies" / "workcells"
 CORNER, UNEVEN = WORKCELLS / "corner.toml", WORKCELLS / "uneven.toml"
@@ -99,13 +108,6 @@ def test_what_knows_closed_forms_only_refuses_it(cell: Cell) -> None:
         RobustPath(cell.workcell)
 
 
-@pytest.mark.parametrize("name", list(PADS))
-def test_it_is_read(name: str) -> None:
-    workcell = load(WORKCELLS / f"{name}.toml")
-    assert not workcell.has_opposite_pads
-    assert len(workcell.pads) == PADS[name]
-
-
 def test_at_rest_both_pads_hold_half_of_the_crate() -> None:
     """Across the edge the forces lie in the line of both pads, at 45 degrees to both normals."""
     workcell = load(CORNER)
@@ -163,3 +165,89 @@ def test_only_the_joint_allocation_holds_a_load_to_one_side(tmp_path: Path) -> N
     assert paper.judgement is not None
     assert paper.judgement.reason.startswith("pressure")
     assert (carry.peak_normal_force > paper.peak_normal_force).all()
+
+
+@pytest.mark.slow
+def test_constant_elbows_ask_for_another_path_of_the_box() -> None:
+    cell = shipped("pandas")
+    x = cell.initial[None, : cell.workcell.task.n_box]
+    tried = [LockedEvaluator(cell.evaluator, np.array(p)) for p in locks(cell.workcell.task, 16)]
+    assert not any(one.evaluate(x).feasible.all() for one in tried)
+    others = cell.random(400, np.random.default_rng(1))[:, : cell.workcell.task.n_box]
+    assert 2 <= sum(one.evaluate(others).feasible.any() for one in tried) <= 8
+
+
+@pytest.mark.slow
+def test_elbows_that_move_beat_the_best_lock() -> None:
+    (found,) = compare(shipped("pandas"), 16, 1, 300, 1)
+    assert found.free > max(found.locked) > 0.3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["pandas", "tiago"])
+def test_the_hand_made_trajectory_is_feasible_and_the_bounds_searchable(name: str) -> None:
+    judged = shipped(name)
+    assert judged.evaluator.certified(judged.evaluate(judged.initial)).feasible.all()
+    share = judged.evaluate(judged.random(1000, np.random.default_rng(1))).feasible.mean()
+    assert 0.02 <= share <= 0.2
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["pandas", "tiago"])
+def test_a_small_study_goes_through(name: str, tmp_path: Path) -> None:
+    output = tmp_path / "results"
+    arguments = [str(RACK.with_name(f"{name}.toml")), "--output", str(output), "--replicas", "1"]
+    arguments += ["--evaluations", "120", "--no-polish", "--no-report", "--no-drivable"]
+    assert main([*arguments, "--jobs", "1", "--quiet"]) == 0
+    assert (output / "summary.json").exists()
+
+
+@pytest.fixture(scope="module")
+def described(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cell]:
+    folder = tmp_path_factory.mktemp("described")
+    with pytest.MonkeyPatch.context() as patch:
+        for variable, name in zip(SOURCES, ("ament", "ros"), strict=True):
+            patch.setenv(variable, str(folder / name))
+        patch.syspath_prepend(str(folder / "site"))
+        yield Cell(described_cell(folder))
+
+
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory: pytest.TempPathFactory) -> CellModel:
+    return build_cell_model(plain_cell(tmp_path_factory.mktemp("plain")))
+
+
+def candidates(cell: Cell) -> Array:
+    """The hand-made trajectory and some around it, of which not all are feasible."""
+    rng = np.random.default_rng(1)
+    near = cell.initial + rng.uniform(-0.06, 0.06, (5, len(cell.initial)))
+    return np.vstack([cell.initial, np.clip(near, cell.lower, cell.upper)])
+
+
+def test_the_model_is_that_of_the_plain_cell(described: Cell, plain: CellModel) -> None:
+    model = described.compiled.model
+    assert model.robots[0].joint_names == plain.robots[0].joint_names
+    found, expected = (set(map(frozenset, m.geometry.pair_names)) for m in (model, plain))
+    assert found == expected
+    assert not any("left/grip" in name for pair in model.geometry.pair_names for name in pair)
+    for x in candidates(described):
+        values = (candidate_function(m)(ca.DM(x)) for m in (model, plain))
+        for value, other in zip(*values, strict=True):
+            np.testing.assert_allclose(np.array(value), np.array(other), atol=1e-9)
+
+
+@pytest.mark.slow
+def test_an_inspection_tells_of_it(described: Cell, tmp_path: Path) -> None:
+    view = tmp_path / "view.html"
+    parts = list(inspected(described.workcell, 40, 1, view=view, pairs=True))
+    text = "\n".join(line for part in parts for line in part.lines)
+    assert "left/link_1 – left/link_4: disabled in gofa.srdf: Never" in text
+    why = {
+        frozenset(pair[:2]): pair[2]
+        for part in parts
+        for pair in part.values.get("excluded_pairs", ())
+    }
+    pair = frozenset(("right/grip_finger", "middle board"))
+    assert why[pair] == "ignored in the file: for the test"
+    assert "left/grip_finger" not in text
+    assert (tmp_path / "view.html").exists()

@@ -1,0 +1,146 @@
+"""What a climb trusts and remembers, and which rows keep a payload from an obstacle."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any, cast
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hybrid_opt.polishing.carry import PlacedCarry
+from hybrid_opt.polishing.constraints.active import KEPT, ActiveSet, LearnedRows
+from hybrid_opt.polishing.constraints.distances import Gaps, edges, passing, separation
+from hybrid_opt.polishing.point import LARGEST, TrustRegion
+from hybrid_opt.polishing.rows import PlaceRow, Row
+from symbolic.smooth.passage import Passing, Separation
+from symbolic.smooth.places import Clearance
+
+LEAST = 1e-3
+
+
+def test_it_grows_after_two_steps_in_a_row_that_it_stopped() -> None:
+    region = TrustRegion(0.5, LEAST)
+    region.taken(0.5)
+    assert region.radius == 0.5
+    region.taken(0.5)
+    assert region.radius == 1.0
+    region.refused(learned=True)
+    region.taken(1.0)
+    assert region.radius == 1.0
+
+
+def test_a_promised_gain_tells_at_once_whether_the_model_holds() -> None:
+    region = TrustRegion(0.5, LEAST)
+    region.taken(0.5, kept=0.5)
+    assert region.radius == 0.5
+    region.taken(0.5, kept=0.9)
+    assert region.radius == 1.0
+    region.taken(0.1, kept=2.0)
+    assert region.radius == 1.0
+    region.taken(0.1, kept=0.1)
+    assert region.radius == 0.5
+
+
+@given(st.lists(st.sampled_from(["lost", "refused", "barren", "taken"]), max_size=40))
+def test_it_never_exceeds_its_largest_and_is_spent_at_last(events: list[str]) -> None:
+    region = TrustRegion(1.0, LEAST)
+    for event in events:
+        match event:
+            case "lost":
+                region.lost()
+            case "refused":
+                region.refused(learned=False)
+            case "barren":
+                region.barren(region.radius / 2.0)
+            case _:
+                region.taken(region.radius)
+        assert 0.0 < region.radius <= LARGEST
+    for _ in range(20):
+        region.lost()
+    assert region.is_spent
+
+
+NOTHING = cast(PlacedCarry, None)
+NEAR, FAR, GAP = (
+    PlaceRow(Clearance(0, 0), 3),
+    PlaceRow(Clearance(0, 0), 9),
+    PlaceRow(Separation(1, 2), 5),
+)
+HALF = np.array([0.5, 2.0])
+HERE, THERE = np.zeros(2), np.array([0.1, 0.0])
+"""A path, and one that is 0.2 half ranges away."""
+
+
+class Rows:
+    """Requires 1 of every row and demands 3; rows of clearances last."""
+
+    def near(self, *_: Any) -> set[Row]:
+        return {NEAR}
+
+    def required(self, carry: PlacedCarry, rows: Iterable[Row], lenient: bool) -> dict[Row, float]:
+        return dict.fromkeys(rows, 1.0)
+
+    def demanded(
+        self, carry: PlacedCarry, known: PlacedCarry, rows: Iterable[Row], before: Mapping[Row, Any]
+    ) -> dict[Row, float]:
+        return dict.fromkeys(rows, 3.0)
+
+    def lasting(self, row: Row) -> bool:
+        return row != GAP
+
+
+def memory() -> LearnedRows:
+    return LearnedRows(cast(ActiveSet, Rows()), HALF)
+
+
+def required(known: LearnedRows, radius: float = 0.2) -> dict[Row, float]:
+    return known.required(NOTHING, (True, True), HERE, radius, lenient=False)
+
+
+@pytest.mark.parametrize(("radius", "share"), [(0.4, 1.0), (0.2, 1.0), (0.1, 0.5), (0.0, 0.0)])
+def test_what_a_step_taught_counts_as_far_as_the_box_reaches(radius: float, share: float) -> None:
+    known = memory()
+    assert known.refuse(NOTHING, NOTHING, THERE, [FAR], {})
+    assert required(known, radius) == pytest.approx({NEAR: 1.0, FAR: 1.0 + 2.0 * share})
+
+
+def test_rows_that_pressed_stay_for_some_programs_while_steps_are_short() -> None:
+    known = memory()
+    known.press([FAR])
+    for _ in range(KEPT - 1):
+        known.press([])
+        known.move(is_short=True)
+        assert set(required(known)) == {NEAR, FAR}
+    known.press([])
+    assert set(required(known)) == {NEAR}
+    known.press([GAP])
+    known.move(is_short=False)
+    assert set(required(known)) == {NEAR}
+
+
+PLACES, LOW = 120, 0.06
+
+
+def v_shape(kink: float, height: float, slope: float = 3e-3) -> Gaps:
+    """Two gaps that cross at a place: one falls, the other rises."""
+    away = np.arange(PLACES) - kink
+    return Gaps.of(np.column_stack([height - slope * away, height + slope * away]))
+
+
+@given(kink=st.floats(20.0, 100.0), height=st.floats(-0.02, LOW - 0.01))
+def test_where_an_edge_is_passed_there_is_one_kink(kink: float, height: float) -> None:
+    gaps = v_shape(kink, height)
+    ((before, place),) = edges(gaps, LOW)
+    assert abs(place - kink) <= 1.0
+    assert before <= kink <= before + 1
+    row = passing(7, gaps, before, place)
+    assert row == PlaceRow(Passing(7, 0, 1), place)
+
+
+def test_a_separation_is_of_the_largest_gap() -> None:
+    gaps = v_shape(50.4, 0.01)
+    assert separation(3, gaps, 20) == PlaceRow(Separation(3, 0), 20)
+    assert separation(3, gaps, 80) == PlaceRow(Separation(3, 1), 80)

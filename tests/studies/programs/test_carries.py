@@ -1,0 +1,279 @@
+"""Programs about stored carries: exported, checked, replayed, their robust forces told."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from functools import cache
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+import pytest
+
+import hybrid_opt as ho
+from hybrid_opt.evaluate.evaluation import CandidateEvaluator
+from hybrid_opt.store.trajectory_file import write_trajectory
+from studies import check, export, replay, robust
+from symbolic.read.cell import load
+from tests.hybrid_opt.job.jobs import rack
+from tests.symbolic.cells import RACK, rack_cell
+
+TABLE = """
+[uncertainty]
+friction = 0.10
+mass = 0.05
+centre_of_mass = [0.005, 0.005, 0.005]
+pad_position = 0.003
+disturbance = [0.2, 0.2, 0.2]
+"""
+
+
+def stored(folder: Path, table: str) -> Path:
+    text, _ = RACK.read_text(encoding="utf-8").split("[uncertainty]")
+    text = text.replace("../robots", str(RACK.parents[1] / "robots"))
+    cell = folder / "cell.toml"
+    cell.write_text(text + table, encoding="utf-8")
+    workcell = load(cell)
+    path = folder / "t.json"
+    write_trajectory(path, workcell, workcell.task.initial.reshape(-1), {}, {"algorithm": "hand"})
+    return path
+
+
+def test_tells_forces_price_and_check(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = ["--cases", "200", "--points", "3", "--force-limit", "66"]
+    assert robust.main([str(stored(tmp_path, TABLE)), *arguments]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert "below 66 N" in lines[-2]
+    planned, sure = (float(line.split()[-2]) for line in lines[-2:])
+    assert planned < sure
+    lines = lines[:-2]
+    sure_forces = lines[3].split()[-4:-1:2]
+    priced = [line.split() for line in lines if line.split()[:1] in (["0.00"], ["1.00"])]
+    nominal, whole = (np.array(row[1:], dtype=float) for row in priced)
+    assert (whole > 1.1 * nominal).all()
+    assert priced[1][1:] == sure_forces
+    # A job lifts and stops as well, and its forces are smooth.
+    assert float(lines[2].split()[-2]) >= float(sure_forces[1])
+    assert "200 random cases (seed 1): all hold" in lines[-1]
+    # What is seen to need no more is not looked at closer.
+    assert ("needs at most " in lines[-1]) == ("97.00 %" in lines[-1])
+
+
+def test_the_force_is_that_of_the_exported_job(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Timed within its force limit and the cell's limits on jerk, and lifted."""
+    cell = ho.example("rack").drivable()
+    x = cell.initial
+    x[-1] = 60.0
+    path = tmp_path / "t.json"
+    write_trajectory(path, cell.compiled, x, {}, {"algorithm": "hand"})
+    assert robust.main([str(path), "--cases", "10", "--points", "2"]) == 0
+    told = capsys.readouterr().out.splitlines()
+    assert export.main([str(path), "--target", "json", "--output", str(tmp_path)]) == 0
+    (manifest,) = tmp_path.rglob("manifest.json")
+    force = json.loads(manifest.read_text("utf-8"))["squeeze"]["force"]
+    assert told[2].startswith("  commanded of the whole job: ")
+    assert told[2].endswith(f" = {force:.1f} N")
+
+
+def test_without_uncertainty_a_usual_set_is_taken_and_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = ["--cases", "10", "--points", "3", "--leader", "2"]
+    (tmp_path / "a").mkdir()
+    assert robust.main([str(stored(tmp_path, "")), *arguments]) == 0
+    without = capsys.readouterr().out
+    assert "arm 2 leads" in without
+    assert "the set is the usual one, because the workcell states no [uncertainty]: fri" in without
+    assert "inf" not in without
+    assert robust.main([str(stored(tmp_path / "a", TABLE)), *arguments]) == 0
+    assert "the set is the workcell's [uncertainty]: fri" in capsys.readouterr().out
+
+
+def test_a_set_that_is_empty_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert robust.main([str(stored(tmp_path, "[uncertainty]\n")), "--cases", "10"]) == 0
+    told = capsys.readouterr().out
+    assert "the set is the workcell's [uncertainty]: nothing" in told
+    assert "nothing to check" in told
+    assert "all hold" not in told
+    assert "times the set" not in told
+
+
+def test_a_file_that_is_none_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert robust.main([str(tmp_path / "none.json")]) == 2
+    assert "none.json" in capsys.readouterr().err
+
+
+@pytest.fixture(scope="module")
+def of_a_study(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A trajectory where a results folder of a study has it."""
+    path = tmp_path_factory.mktemp("r") / "rack" / "selected" / "nsga2" / "02.json"
+    path.parent.mkdir(parents=True)
+    provenance = {"algorithm": "nsga2", "replica": 2, "row": 17}
+    ho.save(rack().carry(rack().initial), path, provenance)
+    return path
+
+
+def test_a_bundle_is_written(
+    of_a_study: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = [str(of_a_study), "--target", "csv", "--output", str(tmp_path)]
+    assert export.main(arguments) == 0
+    text = capsys.readouterr().out
+    for part in ("approach", "set down", "Position control", "Either arm late", "warning"):
+        assert part in text
+    (folder,) = tmp_path.iterdir()
+    assert folder.name.startswith("rack-nsga2-r02-p0017-")
+    manifest = json.loads((folder / "csv" / "manifest.json").read_text())
+    assert manifest["trajectory"]["file"] == "02.json"
+    assert manifest["trajectory"]["replica"] == 2
+    assert export.main([*arguments, "--squeeze", "1.6", "--force-limit", "60"]) == 0
+    assert len(list(tmp_path.iterdir())) == 2
+    (folder / "csv" / "mine.txt").write_text("mine")
+    assert export.main(arguments) == 2
+    assert "mine.txt" in capsys.readouterr().err
+    assert (folder / "csv" / "mine.txt").read_text() == "mine"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--target", "csv", "--step", "0"], "time step"),
+        (["--target", "csv", "--use", "force"], "--force-limit"),
+        (["--target", "csv", "--force-limit", "1"], "no timing to export"),
+        (["--target", "csv", "--squeeze", "0.5"], "allowed is 1 to 10"),
+        (["--target", "csv", "--stiffness", "0"], "stiffness"),
+        (["--target", "csv", "--smoothing", "-1"], "smoothing"),
+        (["--target", "csv", "--smoothing", "nan"], "smoothing"),
+        (["--target", "ur-script"], "--any-arm"),
+        (["--target", "csv", "--skew", "0.02", "--stiffness", "50000"], "a skew of 20 ms"),
+        (["--target", "csv", "--skew", "-1"], "skew"),
+    ],
+)
+def test_wrong_exports_are_told_in_one_line(
+    of_a_study: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    arguments: list[str],
+    message: str,
+) -> None:
+    assert export.main([str(of_a_study), "--output", str(tmp_path), *arguments]) == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert len(error.strip().splitlines()) == 1
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_job_is_judged(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The door of the check; what it finds is tested in tests/hybrid_opt/bundles."""
+    path = tmp_path / "job.csv"
+    path.write_text("time,left_joint_1\n0,0\n")
+    assert check.main([str(RACK), str(path)]) == 2
+    assert "no joint trajectory of both arms" in capsys.readouterr().err
+
+
+@cache
+def stored_text() -> str:
+    cell = rack_cell()
+    x = cell.task.initial.reshape(-1)
+    figures = CandidateEvaluator(cell).carry(x).figures
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "t.json"
+        write_trajectory(path, cell, x, figures, {"algorithm": "hand-made", "seed": 1})
+        return path.read_text(encoding="utf-8")
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    path = tmp_path / "t.json"
+    path.write_text(stored_text(), encoding="utf-8")
+    return path
+
+
+def test_figures_are_reproduced(file: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert replay.main([str(file)]) == 0
+    out = capsys.readouterr().out
+    assert "reproduced" in out
+    assert "DIFFERS" not in out
+    assert "objective_peak_force_1" in out
+
+
+def test_it_needs_nothing_but_the_file(file: Path, tmp_path: Path) -> None:
+    """In another process and folder, without the shipped workcells in reach of the file."""
+    root = Path(__file__).resolve().parents[3]
+    run = subprocess.run(
+        [sys.executable, "-m", "studies.replay", str(file), "--json"],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": str(root)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert run.returncode == 0, run.stderr
+    result = json.loads(run.stdout)
+    assert result["reproduced"] is True
+    assert result["digest"] == rack_cell().digest
+    assert result["provenance"]["seed"] == 1
+    assert all(figure["same"] for figure in result["figures"].values())
+
+
+@pytest.mark.parametrize(
+    ("name", "change"), [("duration", 1e-3), ("peak_normal_force_1", -1e-2), ("feasible", -2.0)]
+)
+def test_differences_are_shown_with_both_values(
+    file: Path, capsys: pytest.CaptureFixture[str], name: str, change: float
+) -> None:
+    data = json.loads(file.read_text(encoding="utf-8"))
+    data["figures"][name] += change
+    file.write_text(json.dumps(data), encoding="utf-8")
+    assert replay.main([str(file)]) == 1
+    (line,) = (row for row in capsys.readouterr().out.splitlines() if "DIFFERS" in row)
+    assert name in line
+
+
+def test_unknown_figures_and_other_postures_are_differences(
+    file: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    data = json.loads(file.read_text(encoding="utf-8"))
+    data["figures"]["made_up"] = 1.0
+    file.write_text(json.dumps(data), encoding="utf-8")
+    assert replay.main([str(file)]) == 1
+    del data["figures"]["made_up"]
+    data["start"][0][0] += 0.01
+    file.write_text(json.dumps(data), encoding="utf-8")
+    assert replay.main([str(file)]) == 1
+    assert "NOT reproduced" in capsys.readouterr().out
+
+
+def test_timing_report(file: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = [str(file), "--force-limit", "60", "--force-curve", "3"]
+    assert replay.main(arguments) == 0
+    text = capsys.readouterr().out
+    for part in (
+        "closest to reference",
+        "force limited",
+        "How far assumptions",
+        "Duration against force",
+    ):
+        assert part in text
+    assert replay.main([*arguments, "--json"]) == 0
+    stored_text = json.loads(capsys.readouterr().out)
+    limited = stored_text["timing"]["timings"]["force limited"]
+    assert limited["status"] == "ok"
+    assert max(limited["peak_normal_force"]) <= 60.0 * 1.005
+    assert len(stored_text["timing"]["force_curve"]["force"]) == 3
+
+
+def test_what_is_wrong_is_told_in_one_line(
+    file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert replay.main([str(file), "--force-curve", "1"]) == 2
+    assert "at least 2" in capsys.readouterr().err
+    path = tmp_path / "odd.json"
+    path.write_text("{}", encoding="utf-8")
+    assert replay.main([str(path)]) == 2
+    assert len(capsys.readouterr().err.strip().splitlines()) == 1
