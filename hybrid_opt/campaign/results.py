@@ -6,6 +6,7 @@ written. docs/results.md describes the folder.
 
 from __future__ import annotations
 
+import html
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -22,6 +23,7 @@ from hybrid_opt.campaign.settings import (
     DONE,
     EVALUATIONS,
     POLISH,
+    RECOMMENDED,
     CampaignSettings,
     Configuration,
     FinishedReplica,
@@ -29,6 +31,7 @@ from hybrid_opt.campaign.settings import (
     replica_folder,
 )
 from hybrid_opt.cell import Cell
+from hybrid_opt.display.table import counted, figures_html, lines
 from hybrid_opt.errors import DamagedResultsWarning, ResultsError
 from hybrid_opt.evaluate.evaluation import Evaluations
 from hybrid_opt.front import Front
@@ -94,7 +97,7 @@ class Replica:
         return self.evaluations.x[self.front_rows]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class CampaignResults:
     """A campaign whose search is complete.
 
@@ -109,6 +112,34 @@ class CampaignResults:
     configuration: Configuration
     cell: Cell
     replicas: tuple[Replica, ...]
+
+    def __repr__(self) -> str:
+        return "\n".join([self._heading, *lines(self._figures)])
+
+    def _repr_html_(self) -> str:
+        return f"<div><p>{html.escape(self._heading)}</p>{figures_html(self._figures)}</div>"
+
+    @property
+    def _heading(self) -> str:
+        settings = self.settings
+        return (
+            f"Study of {self.workcell.name!r} in {self.root}: "
+            f"{counted(settings.replicas, 'replica')} of {settings.evaluations} evaluations, "
+            f"seed {settings.seed}"
+        )
+
+    @property
+    def _figures(self) -> dict[str, str]:
+        """The fronts of each kind, and the file of the carry to run."""
+        sizes: dict[str, list[int]] = {}
+        for front in self.fronts:
+            sizes.setdefault(front.title, []).append(len(front))
+        found = {
+            title: f"{counted(len(each), 'front')}, carries: {min(each)} to {max(each)}"
+            for title, each in sizes.items()
+        }
+        recommended = self.root / RECOMMENDED
+        return found | ({"carry to run": str(recommended)} if recommended.exists() else {})
 
     @property
     def workcell(self) -> Workcell:

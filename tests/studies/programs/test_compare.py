@@ -38,6 +38,19 @@ def other(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
+def test_a_study_tells_its_fronts_instead_of_its_candidates(study: Path) -> None:
+    found = read_campaign(study)
+    lines = repr(found).splitlines()
+    assert str(study) in lines[0]
+    assert "2 replicas of 120 evaluations" in lines[0]
+    for front in found.fronts:
+        (line,) = (line for line in lines if line.startswith(f"  {front.title}  "))
+        least, most = map(int, line.split(": ")[1].split(" to "))
+        assert least <= len(front) <= most
+    assert "array(" not in repr(found)
+    assert lines[1].split("  ")[1] in found._repr_html_()
+
+
 def test_a_campaign_equals_itself(study: Path) -> None:
     found = compare(study, study)
     assert found.same_workcell
