@@ -110,18 +110,13 @@ class CompiledCell:
             return geometry.of_active([f.batch(poses, q_1, q_2)["clearance"] for f in asked])
 
         def search(arm: int) -> ArmSearch:
-            kinematics, follow = (found[f"{name}_{arm + 1}"] for name in ("kinematics", "follow"))
-
-            def flange(q: Array) -> tuple[Array, Array, Array]:
-                values = kinematics.batch(q)
-                R, J = (values[name].transpose(0, 2, 1) for name in ("rotation", "jacobian"))
-                return R, values["position"], J
+            approach, follow = (found[f"{name}_{arm + 1}"] for name in ("approach", "follow"))
 
             def along(starts: Array, extended: Array) -> Mapping[str, Array]:
                 return follow.batch(starts, extended, np.zeros((len(extended), 6)))
 
             postures = self.once(("postures", arm, self.numbers.digest), dict[bytes, Array])
-            return ArmSearch(flange, along, own_clearance(geometry, arm, bounds), postures)
+            return ArmSearch(approach.batch, along, own_clearance(geometry, arm, bounds), postures)
 
         return search(0), search(1)
 

@@ -29,6 +29,7 @@ from symbolic.robot.arm import (
     torque_function,
     track_function,
 )
+from symbolic.robot.branches import approach_function
 
 CONSTRAINTS = (
     "reach_1",
@@ -381,14 +382,14 @@ def cell_functions(model: CellModel) -> dict[str, ca.Function]:
 
 
 def branch_functions(model: CellModel) -> dict[str, ca.Function]:
-    """What start branches are found with, of each arm i = 1, 2: kinematics_i
-    (`symbolic.robot.model`) and follow_i (`symbolic.robot.arm.follow_function`)."""
+    """What start branches are found with, of each arm i = 1, 2: approach_i
+    (`symbolic.robot.branches`) and follow_i (`symbolic.robot.arm.follow_function`)."""
     found: dict[str, ca.Function] = {}
     for i, (robot, contact) in enumerate(
         zip(model.workcell.robots, model.workcell.contacts, strict=True)
     ):
         own, name = model.robots[i], f"follow_{i + 1}"
-        found[f"kinematics_{i + 1}"] = own.kinematics
+        found[f"approach_{i + 1}"] = approach_function(own, f"approach_{i + 1}")
         found[name] = follow_function(robot, own, contact, model.workcell.task.samples, name)
     return found
 

@@ -19,7 +19,7 @@ from symbolic.read.arms import ArmLinks, arm_links, arm_model, link_frame, one_m
 from symbolic.read.descriptions import resolve_mesh
 from symbolic.read.urdf import UrdfMesh
 from symbolic.records import PAYLOAD, Capsule, Mesh, Robot, Shape, Workcell
-from symbolic.records.content import ContentRecord, digest_of_parts
+from symbolic.records.content import CacheKey, ContentRecord, digest_of_parts
 from symbolic.records.problems import shown
 
 Group = Literal["robot 1", "robot 2", "payload", "environment"]
@@ -131,14 +131,20 @@ def collision_bodies(workcell: Workcell) -> tuple[CollisionBody, ...]:
         pieces = shape_pieces(obstacle.shape, obstacle.pose, owner, meshes)
         bodies.append(CollisionBody(obstacle.name, "environment", WORLD, pieces))
     for body in bodies:
-        for piece in body.pieces:
-            check_piece(piece, f"collision body {body.name!r}")
+        _check_body(CacheKey(body, known=body.content))
     _check_effort(bodies, workcell.collision.most_pieces)
     counts = Counter(body.name for body in bodies)
     repeated = sorted(name for name, count in counts.items() if count > 1)
     if repeated:
         raise CollisionModelError(f"collision bodies share the name(s) {repeated}; rename them")
     return tuple(bodies)
+
+
+@lru_cache(maxsize=256)
+def _check_body(seen: CacheKey) -> None:
+    (body,) = seen.given
+    for piece in body.pieces:
+        check_piece(piece, f"collision body {body.name!r}")
 
 
 def arm_geometry(workcell: Workcell, i: int) -> ArmGeometry:

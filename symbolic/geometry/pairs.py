@@ -8,7 +8,7 @@ they touch in every sampled posture, or a bound of their motion proves that they
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, cached_property, lru_cache
 from itertools import combinations, product
 
@@ -163,26 +163,56 @@ def build_geometry(workcell: Workcell) -> CellGeometry:
     arms = (arm_geometry(workcell, 0), arm_geometry(workcell, 1))
     ignored = ignored_pairs(workcell, bodies)
     _check_tools(bodies, arms)
+    held, said = workcell.uncertainty, frozenset(ignored.items())
+    cell = tuple(body.content for body in bodies), tuple(arm.content for arm in arms)
+    known = cell, workcell.collision.tolerance, held.stated, held.pad_position, said
+    found = _sorted_pairs(CacheKey(workcell, bodies, arms, ignored, known=known))
+    return CellGeometry(workcell, bodies, arms, *found)
+
+
+@lru_cache(maxsize=16)
+def _sorted_pairs(
+    given: CacheKey,
+) -> tuple[tuple[ActivePair, ...], tuple[ExcludedPair, ...], tuple[ActivePair, ...], int]:
+    """Active, excluded and possible pairs, and how many of these are near."""
+    workcell, bodies, arms, ignored = given.given
+    # Pairs within an arm are sorted as if its root were the world: where it stands does not matter.
+    at_roots = tuple(b if b.root is None else replace(b, pieces=b.root[1]) for b in bodies)
+    rooted = tuple(replace(arm, T_world_root=np.eye(4)) for arm in arms)
+    views = [
+        (at, of, [body.content for body in at], [arm.content for arm in of])
+        for at, of in ((bodies, arms), (at_roots, rooted))
+    ]
     active: list[ActivePair] = []
     excluded: list[ExcludedPair] = []
     near: list[ActivePair] = []
     far: list[ActivePair] = []
     order = digest_of_parts(tuple((body.group, body.frame.joint) for body in bodies))
+    moving = [frozenset(_arms_of(body)) for body in bodies]
     for i, j in combinations(range(len(bodies)), 2):
         a, b = bodies[i], bodies[j]
-        named = ignored.get(frozenset((a.name, b.name)), "")
-        given = a, b, arms, pair_tolerance(workcell, a, b), bodies
-        of_arms = tuple(arms[k].content for k in sorted({*_arms_of(a), *_arms_of(b)}))
-        known = a.content, b.content, of_arms, given[3], order
-        found = _PairStatus(named, False) if named else _sorted(CacheKey(*given, known=known))
+        found = _PairStatus(ignored.get(frozenset((a.name, b.name)), ""), False)
+        if not found.reason:
+            at, of, contents, places = views[_is_own(a, b)]
+            tolerance, both = pair_tolerance(workcell, a, b), moving[i] | moving[j]
+            known = contents[i], contents[j], *(places[k] for k in both), tolerance, order
+            found = _sorted(CacheKey(at[i], at[j], of, tolerance, bodies, known=known))
         if found.reason:
             excluded.append(ExcludedPair(i, j, found.reason))
         else:
             active.append(ActivePair(i, j))
         if found.possible:
             (far if found.far else near).append(ActivePair(i, j))
-    pairs = tuple(active), tuple(excluded), (*near, *far)
-    return CellGeometry(workcell, bodies, arms, *pairs, len(near))
+    return tuple(active), tuple(excluded), (*near, *far), len(near)
+
+
+def _is_own(a: CollisionBody, b: CollisionBody) -> bool:
+    """Whether a pair is of one arm, or of what one moves and the box, which the other arm may bring
+    near to what stands."""
+    groups = {a.group, b.group}
+    if "payload" in groups and (a.root is not None or b.root is not None):
+        return False
+    return groups - {"payload"} in ({"robot 1"}, {"robot 2"})
 
 
 def _arms_of(body: CollisionBody) -> tuple[int, ...]:
@@ -367,17 +397,30 @@ def out_of_reach(
     margin = tolerance + 1e-3
     if {a.frame.robot, b.frame.robot} == {0, 1}:
         zones = [_zone(body, arms[body.frame.robot], -1) for body in (a, b)]
-        gap = coal_distance((zones[0],), (zones[1],))
+        gap = _gap(zones[0], (zones[1],))
         return f"out of reach: their zones stay {1e3 * gap:.0f} mm apart" if gap > margin else ""
     for robot in (0, 1):
         left, right = anchor(a, arms, robot), anchor(b, arms, robot)
         low, high = sorted((left, right), key=lambda body: body.frame.joint)
         if high.frame.robot != robot or low.frame.robot not in (robot, -1):
             continue
-        gap = coal_distance((_zone(high, arms[robot], low.frame.joint),), low.pieces)
+        gap = _gap(_zone(high, arms[robot], low.frame.joint), low.pieces)
         if gap > margin:
             return f"out of reach: the zone of {high.name} stays {1e3 * gap:.0f} mm away"
     return ""
+
+
+def _gap(zone: Piece, pieces: tuple[Piece, ...]) -> float:
+    """Distance of a zone from pieces [m], 0 where one's centre is in a ball: of most zones."""
+    if isinstance(zone.shape, Sphere):
+        apart = [np.linalg.norm(p.centre - zone.centre) for p in pieces if not _is_hull(p)]
+        if min(apart, default=np.inf) < zone.shape.radius:
+            return 0.0
+    return coal_distance((zone,), pieces)
+
+
+def _is_hull(piece: Piece) -> bool:
+    return isinstance(piece.shape, Hull)
 
 
 def never_meet(
@@ -437,8 +480,16 @@ def _zone(body: CollisionBody, arm: ArmGeometry, below: int) -> Piece:
 @lru_cache(maxsize=256)
 def _zone_of(seen: CacheKey) -> Piece:
     body, arm, below = seen.given
+    zone = _zone_in_root(CacheKey(*seen.given, known=(body.content, arm.chain, below)))
+    return zone.moved(arm.T_world_root) if below < 0 else zone
+
+
+@lru_cache(maxsize=256)
+def _zone_in_root(seen: CacheKey) -> Piece:
+    """The same, seen from the arm's root in place of the world."""
+    body, arm, below = seen.given
     first = below + 1
-    T = arm.T_world_root @ arm.origins[0] if first == 0 else arm.origins[first]
+    T = arm.origins[first]
     if body.frame.joint == first and arm.turning[first]:
         return swept_cylinder(body.pieces, np.zeros(3), arm.axes[first]).moved(T)
     return ball(T[:3, 3], chain_radius(body, arm, first) + float(arm.slides[first]))

@@ -18,22 +18,23 @@ def parts(value: Any, folder: Path) -> list[bytes]:
     found: list[bytes] = []
 
     def add(value: Any) -> None:
-        if isinstance(value, tuple):
+        kind = _kind(value.__class__)
+        if kind == "tuple":
             found.append(f"tuple {len(value)}".encode())
             for entry in value:
                 add(entry)
-        elif isinstance(value, np.ndarray):
-            found.append(f"array {value.dtype} {value.shape}".encode())
+        elif kind == "array":
+            found.append(_array_head(value.dtype, value.shape))
             found.append(value.tobytes())
-        elif isinstance(value, type):
-            found.append(value.__name__.encode())
-        elif isinstance(value, ContentRecord):
+        elif kind == "content":
             found.append(value.content.encode())
-        elif hasattr(type(value), "__dataclass_fields__"):
+        elif kind == "record":
             found.append(type(value).__name__.encode())
             for name in _names(value.__class__):
                 add(getattr(value, name))
-        elif isinstance(value, Path):
+        elif kind == "type":
+            found.append(value.__name__.encode())
+        elif kind == "path":
             found.append(os.path.relpath(value, folder).encode(errors="surrogateescape"))
         else:
             # Numbers come back from their representation to the bit.
@@ -41,6 +42,23 @@ def parts(value: Any, folder: Path) -> list[bytes]:
 
     add(value)
     return found
+
+
+@cache
+def _kind(of: type) -> str:
+    """How values of a type are taken apart: records and arrays are many, and asked often."""
+    known = {tuple: "tuple", np.ndarray: "array", type: "type", ContentRecord: "content"}
+    for base, kind in known.items():
+        if issubclass(of, base):
+            return kind
+    if hasattr(of, "__dataclass_fields__"):
+        return "record"
+    return "path" if issubclass(of, Path) else "value"
+
+
+@cache
+def _array_head(dtype: np.dtype[Any], shape: tuple[int, ...]) -> bytes:
+    return f"array {dtype} {shape}".encode()
 
 
 @cache
@@ -53,11 +71,9 @@ def _names(kind: Hashable) -> tuple[str, ...]:
 
 def digest_of_parts(value: Any, folder: Path = Path()) -> str:
     """SHA-256 over `parts`."""
-    total = hashlib.sha256()
-    for part in parts(value, folder):
-        # The length before each part keeps them apart.
-        total.update(len(part).to_bytes(8, "big") + part)
-    return total.hexdigest()
+    # The length before each part keeps them apart.
+    whole = b"".join(len(part).to_bytes(8, "big") + part for part in parts(value, folder))
+    return hashlib.sha256(whole).hexdigest()
 
 
 class ContentRecord:

@@ -12,21 +12,28 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
 
+import casadi as ca
 import numpy as np
 
 from symbolic.array import Array
+from symbolic.expression import named_function
 from symbolic.path.spline import sample_basis
 from symbolic.records import POSE_SIZE, Contact, Robot, Workcell
 from symbolic.records.cell import box_flange
 from symbolic.records.poses import box_placement, inverse
 from symbolic.records.task import extended_waypoints, initial_decision
-from symbolic.robot.arm import TRACK_OUTPUTS, follow_function
+from symbolic.robot.arm import TRACK_OUTPUTS, follow_function, following_columns, pose_error
 from symbolic.robot.model import RobotModel
 
 N_STARTS = 1024
-"""Starts of the search; a power of two keeps the Sobol points balanced."""
+"""Starts of the search."""
 
-MAX_ITERATIONS = 80
+SPREAD_ROOT = 1.1127756842787055
+"""The root of x^7 = x + 1: multiples of its powers fill six dimensions evenly (Roberts)."""
+
+MOST_STEPS, STEPS = 80, 4
+"""Newton steps from each start, and how many are made at once."""
+
 SOLUTION_TOLERANCE = 1e-10
 """Largest pose residual of a solution [m, rad]."""
 
@@ -73,9 +80,9 @@ class StartBranch:
         return (-float(self.kept), -round(robust, 4), -self.limit_margin * self.manipulability)
 
 
-Kinematics = Callable[[Array], tuple[Array, Array, Array]]
-"""Joints (n, joints) to the flange's rotations (n, 3, 3), positions (n, 3) and Jacobians
-(n, 6, joints), see `RobotModel`."""
+Approach = Callable[[Array, Array, Array], Mapping[str, Array]]
+"""Joints (n, joints), the transpose of the wanted rotation (3, 3) and the position (3,) to the
+outputs (n, ...) of `approach_function`."""
 
 Follow = Callable[[Array, Array], Mapping[str, Array]]
 """Joints (m, joints) at the first of some extended poses (n, 6 + k) to `TRACK_OUTPUTS` (m, n, ...)
@@ -90,11 +97,11 @@ class ArmSearch:
     """What start branches of an arm are found with.
 
     Attributes:
-        kinematics, follow, clearance: see there.
+        approach, follow, clearance: see there.
         found: postures (m, n) by what they were searched for, which others look up.
     """
 
-    kinematics: Kinematics
+    approach: Approach
     follow: Follow
     clearance: Clearance | None = None
     found: dict[bytes, Array] = field(default_factory=dict)
@@ -117,19 +124,53 @@ def interpreted_search(
             for name, values in zip(TRACK_OUTPUTS, outputs, strict=True)
         }
 
-    return ArmSearch(interpreted_kinematics(model), follow, clearance)
+    return ArmSearch(interpreted_approach(model), follow, clearance)
 
 
-def interpreted_kinematics(model: RobotModel) -> Kinematics:
-    """An arm's kinematics by CasADi's interpreter."""
+def interpreted_approach(model: RobotModel) -> Approach:
+    """An arm's `approach_function` by CasADi's interpreter."""
+    function = approach_function(model, "approach")
 
-    def kinematics(q: Array) -> tuple[Array, Array, Array]:
-        n = len(q)
-        R, p, J = model.kinematics.map(n)(q.T)
-        rotation = np.array(R).reshape(3, n, 3).transpose(1, 0, 2)
-        return rotation, np.array(p).T, np.array(J).reshape(6, n, -1).transpose(1, 0, 2)
+    def approach(q: Array, rotation: Array, position: Array) -> Mapping[str, Array]:
+        wanted = (np.tile(each, len(q)) for each in (rotation.T, position[:, None]))
+        reached, residual, following = function.map(len(q))(q.T, *wanted)
+        joints = {"reached": np.array(reached).T, "next": np.array(following).T}
+        return joints | {"residual": np.array(residual)[0]}
 
-    return kinematics
+    return approach
+
+
+def approach_function(model: RobotModel, name: str) -> ca.Function:
+    """Damped Newton steps towards a placement of the flange.
+
+    Inputs: q (n,) [rad, or m where a joint slides]; rotation (3, 3) and position (3,) wanted of the
+    flange in the root. Outputs: reached (n,), joints before the last step; residual, the pose
+    residual there [m, rad]; next (n,), joints after it.
+    """
+    q, R, p = ca.SX.sym("q", model.n_joints), ca.SX.sym("R", 3, 3), ca.SX.sym("p", 3)
+    rotation, position, jacobian = model.kinematics(q)
+    error, residual = pose_error(R, p, rotation, position)
+    J = following_columns(model, jacobian)
+    # Slight damping keeps singular postures finite and vanishes near a solution.
+    damping = 1e-3 * ca.fmin(residual, 1.0) ** 2 + 1e-14
+    normal = ca.mtimes(J.T, J) + damping * ca.SX.eye(6)
+    D, LT, order = ca.ldl(normal, False)
+    solved = ca.ldl_solve(ca.mtimes(J.T, error), D, LT, order)
+    scale = STEP_LIMIT / ca.fmax(ca.norm_inf(solved), STEP_LIMIT)
+    moved = list(ca.vertsplit(q))
+    for k, joint in enumerate(model.following):
+        moved[joint] = q[joint] + scale * solved[k]
+    outputs = ca.cse([residual, ca.vertcat(*moved)])
+    step = ca.Function(f"{name}_step", [q, R, p], outputs)
+    start, R, p = ca.MX.sym("q", model.n_joints), ca.MX.sym("R", 3, 3), ca.MX.sym("p", 3)
+    reached = after = start
+    for _ in range(STEPS):
+        reached, (residual, after) = after, step(after, R, p)
+    return named_function(
+        name,
+        {"q": start, "rotation": R, "position": p},
+        {"reached": reached, "residual": residual, "next": after},
+    )
 
 
 def inverse_kinematics(
@@ -138,49 +179,38 @@ def inverse_kinematics(
     T_root_flange: Array,
     n_starts: int = N_STARTS,
     redundant: Mapping[int, float] = MappingProxyType({}),
-    kinematics: Kinematics | None = None,
+    approach: Approach | None = None,
 ) -> Array:
     """All joint positions found for a flange pose, full turns of a joint counted once.
 
     Args:
         T_root_flange: (4, 4) wanted flange placement in the robot's root frame.
-        n_starts: number of starts of the search, a power of two.
+        n_starts: number of starts of the search.
         redundant: positions of the arm's redundant joints by their indices [rad or m].
-        kinematics: of the arm; None for the interpreted one.
+        approach: of the arm; None for the interpreted one.
 
     Returns:
         (m, n) [rad], sorted lexicographically, each with a residual below `SOLUTION_TOLERANCE`
         and each joint on the turn that is nearest the middle of its range; postures with a joint
         that no turn brings within its limits are left out.
     """
-    # Not imported at the top: it takes long to start, and a model from the cache needs no search.
-    from scipy.stats import qmc
-
-    kinematics = kinematics or interpreted_kinematics(model)
+    approach = approach or interpreted_approach(model)
     following = list(model.following)
     centre = (robot.position_lower + robot.position_upper) / 2.0
     half = np.minimum((robot.position_upper - robot.position_lower) / 2.0, np.pi)[following]
     q = np.tile(centre, (n_starts, 1))
-    q[:, following] += (2.0 * qmc.Sobol(6, scramble=False).random(n_starts) - 1.0) * half
+    q[:, following] += (2.0 * _spread(n_starts) - 1.0) * half
     for joint, value in redundant.items():
         q[:, joint] = value
-    solved = [np.empty((0, model.n_joints))]
-    for _ in range(MAX_ITERATIONS):
-        error, jacobian, residual = _batch_error(kinematics(q), following, T_root_flange)
-        arrived = residual < SOLUTION_TOLERANCE
-        solved.append(q[arrived])
-        q, error, jacobian, residual = (
-            values[~arrived] for values in (q, error, jacobian, residual)
-        )
+    rotation, position = T_root_flange[:3, :3].T, T_root_flange[:3, 3]
+    solved = []
+    for _ in range(0, MOST_STEPS, STEPS):
+        found = approach(q, rotation, position)
+        arrived = found["residual"] < SOLUTION_TOLERANCE
+        solved.append(found["reached"][arrived])
+        q = found["next"][~arrived]
         if len(q) == 0:
             break
-        # Slight damping keeps singular postures finite and vanishes near a solution.
-        damping = (1e-3 * np.minimum(residual, 1.0) ** 2 + 1e-14)[:, None, None] * np.eye(6)
-        normal = np.einsum("nki,nkj->nij", jacobian, jacobian) + damping
-        step = np.linalg.solve(normal, np.einsum("nki,nk->ni", jacobian, error)[..., None])[..., 0]
-        largest = np.maximum(np.abs(step).max(axis=1, keepdims=True), STEP_LIMIT)
-        q = q.copy()
-        q[:, following] += step * (STEP_LIMIT / largest)
     distinct = _distinct(np.concatenate(solved))
     central = distinct + _central_turns(robot, model, distinct, distinct)
     within = (central >= robot.position_lower) & (central <= robot.position_upper)
@@ -188,20 +218,10 @@ def inverse_kinematics(
     return possible[np.lexsort(np.round(possible, 6).T[::-1])]
 
 
-def _batch_error(
-    found: tuple[Array, Array, Array], following: list[int], target: Array
-) -> tuple[Array, Array, Array]:
-    """Newton's right-hand side (n, 6), Jacobian (n, 6, 6) by the joints that follow, and pose
-    residual (n,)."""
-    rotation, position, jacobian = found
-    dR = np.einsum("ij,nkj->nik", target[:3, :3], rotation)
-    axis = np.stack(
-        [dR[:, 2, 1] - dR[:, 1, 2], dR[:, 0, 2] - dR[:, 2, 0], dR[:, 1, 0] - dR[:, 0, 1]], axis=1
-    )
-    dp = target[:3, 3] - position
-    turn_squared = np.sum((target[:3, :3] - rotation) ** 2, axis=(1, 2)) / 2.0
-    residual = np.sqrt(np.sum(dp**2, axis=1) + turn_squared)
-    return np.concatenate([dp, axis / 2.0], axis=1), jacobian[:, :, following], residual
+def _spread(count: int) -> Array:
+    """(count, 6) points that fill the unit cube evenly, the same on every machine."""
+    steps = 1.0 / np.cumprod(np.full(6, SPREAD_ROOT))
+    return np.asarray((0.5 + np.arange(count)[:, None] * steps) % 1.0)
 
 
 def _distinct(q: Array) -> Array:
@@ -245,7 +265,7 @@ def start_branches(
     key = b"".join(values.tobytes() for values in known)
     if key not in search.found:
         search.found[key] = inverse_kinematics(
-            robot, model, target, redundant=start, kinematics=search.kinematics
+            robot, model, target, redundant=start, approach=search.approach
         )
     starts = search.found[key]
     tracked = search.follow(starts, extended) if len(starts) else {}

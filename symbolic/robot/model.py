@@ -60,13 +60,13 @@ class RobotModel:
         """Number of joints."""
         return int(self.model.nq)
 
-    @property
+    @cached_property
     def following(self) -> tuple[int, ...]:
         """The six joints that follow the box, by their indices in q."""
         set_apart = [joint for joint, _ in self.redundant]
         return tuple(k for k in range(self.n_joints) if k not in set_apart)
 
-    @property
+    @cached_property
     def turning(self) -> tuple[bool, ...]:
         """Which joints turn; the others slide."""
         return turning_joints(self.model)

@@ -40,6 +40,7 @@ from symbolic.numbers import HELD, START
 from tests.symbolic.cells import RACK, hand_cell, hand_model, rack_cell
 
 
+@pytest.mark.usefixtures("cache")
 def test_the_model_is_built_once_for_all_functions(monkeypatch: pytest.MonkeyPatch) -> None:
     """As if nothing had been compiled before; only the compiler is left out."""
     models: list[CellModel] = []

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,7 @@ import trimesh
 from symbolic.array import Array
 from symbolic.errors import CollisionModelError
 from symbolic.geometry.bodies import MeshReader, _link_pieces, collision_bodies
-from symbolic.geometry.pairs import build_geometry, coal_distance
+from symbolic.geometry.pairs import _sorted, build_geometry, coal_distance, pair_tolerance
 from symbolic.geometry.pieces import Hull, Piece, farthest_from_axis, skeleton, support
 from symbolic.geometry.screen import reach_about_joints
 from symbolic.read.cell import load
@@ -27,6 +28,8 @@ from symbolic.records import (
     Mesh,
     Sphere,
 )
+from symbolic.records.content import CacheKey
+from tests.symbolic.cells import ROOT
 from tests.symbolic.geometry.collision_cells import (
     functions_of,
     geometry_of,
@@ -227,6 +230,19 @@ def test_a_tool_that_enters_the_payload_is_told_by_name() -> None:
         CollisionModelError, match="'left/pad' enters the payload by more than 1 mm"
     ):
         build_geometry(replace(cell, robots=(replace(left, tool=(longer,)), cell.robots[1])))
+
+
+def test_pairs_within_an_arm_are_sorted_as_where_it_stands() -> None:
+    geometry = build_geometry(load(ROOT / "studies" / "workcells" / "rack.toml"))
+    bodies, arms = geometry.bodies, geometry.arms
+    left_out = {(pair.first, pair.second) for pair in geometry.excluded}
+    possible = {(pair.first, pair.second) for pair in geometry.possible}
+    for i, j in combinations(range(len(bodies)), 2):
+        tolerance = pair_tolerance(geometry.workcell, bodies[i], bodies[j])
+        given = bodies[i], bodies[j], arms, tolerance, bodies
+        found = _sorted(CacheKey(*given, known=(i, j)))
+        assert bool(found.reason) is ((i, j) in left_out)
+        assert found.possible is ((i, j) in possible)
 
 
 def test_a_pattern_stands_for_every_pair_it_matches() -> None:
