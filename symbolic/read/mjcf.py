@@ -91,7 +91,7 @@ class _Writer:
     def urdf(self) -> bytes:
         model = self._model
         for body, name in enumerate(self._names):
-            link = ElementTree.SubElement(self._root, "link", {"name": name})
+            link = _add(self._root, "link", name=name)
             if model.body_mass[body] > 0.0:
                 self._inertial(link, body)
             for geom in np.flatnonzero(model.geom_bodyid == body):
@@ -102,7 +102,7 @@ class _Writer:
         for site in range(model.nsite):
             name = model.site(site).name
             if name and name not in taken:
-                ElementTree.SubElement(self._root, "link", {"name": name})
+                _add(self._root, "link", name=name)
                 parent = self._names[model.site_bodyid[site]]
                 pose = self._pose(model.site_pos[site], model.site_quat[site])
                 self._joint(f"{name}_fixed", "fixed", (parent, name), pose)
@@ -131,14 +131,14 @@ class _Writer:
             last = joint == first + count - 1 and not np.any(model.jnt_pos[joint])
             child = name if last else f"{called}_link"
             if not last:
-                ElementTree.SubElement(self._root, "link", {"name": child})
+                _add(self._root, "link", name=child)
             slides, limited = kind == kinds.mjJNT_SLIDE, bool(model.jnt_limited[joint])
             word = "prismatic" if slides else "revolute" if limited else "continuous"
             element = self._joint(called, word, (parent, child), T_parent_body @ at)
-            ElementTree.SubElement(element, "axis", {"xyz": _text(model.jnt_axis[joint])})
-            lower, upper = model.jnt_range[joint].tolist() if limited else (0.0, 0.0)
-            limit = {"lower": lower, "upper": upper, "effort": self._effort(joint), "velocity": 0.0}
-            ElementTree.SubElement(element, "limit", {k: repr(v) for k, v in limit.items()})
+            _add(element, "axis", xyz=model.jnt_axis[joint])
+            lower, upper = model.jnt_range[joint] if limited else (0.0, 0.0)
+            effort = self._effort(joint)
+            _add(element, "limit", lower=lower, upper=upper, effort=effort, velocity=0.0)
             parent, T_parent_body = child, inverse(at)
         if parent != name:
             self._joint(f"{name}_fixed", "fixed", (parent, name), T_parent_body)
@@ -146,10 +146,9 @@ class _Writer:
     def _joint(
         self, name: str, kind: str, ends: tuple[str, str], pose: Array
     ) -> ElementTree.Element:
-        element = ElementTree.SubElement(self._root, "joint", {"name": name, "type": kind})
-        _origin(element, pose)
+        element = _add(self._root, "joint", pose, name=name, type=kind)
         for tag, link in zip(("parent", "child"), ends, strict=True):
-            ElementTree.SubElement(element, tag, {"link": link})
+            _add(element, tag, link=link)
         return element
 
     def _effort(self, joint: int) -> float:
@@ -178,13 +177,11 @@ class _Writer:
 
     def _inertial(self, link: ElementTree.Element, body: int) -> None:
         model = self._model
-        element = ElementTree.SubElement(link, "inertial")
-        _origin(element, self._pose(model.body_ipos[body], model.body_iquat[body]))
-        ElementTree.SubElement(element, "mass", {"value": repr(float(model.body_mass[body]))})
-        moments = dict.fromkeys(("ixx", "ixy", "ixz", "iyy", "iyz", "izz"), 0.0)
-        keys = ("ixx", "iyy", "izz")
-        moments |= dict(zip(keys, model.body_inertia[body].tolist(), strict=True))
-        ElementTree.SubElement(element, "inertia", {k: repr(v) for k, v in moments.items()})
+        pose = self._pose(model.body_ipos[body], model.body_iquat[body])
+        element = _add(link, "inertial", pose)
+        _add(element, "mass", value=model.body_mass[body])
+        xx, yy, zz = model.body_inertia[body]
+        _add(element, "inertia", ixx=xx, ixy=0.0, ixz=0.0, iyy=yy, iyz=0.0, izz=zz)
 
     def _collision(self, link: ElementTree.Element, geom: int, name: str) -> None:
         model = self._model
@@ -194,10 +191,10 @@ class _Writer:
         kind, shape = geom_shape(self._mujoco, model, geom)
         mesh = int(model.geom_dataid[geom])
         if shape is not None:
-            said = {key: _text(np.atleast_1d(value)) for key, value in vars(shape).items()}
+            said = vars(shape)
         elif kind == "mesh" and model.mesh_pathadr[mesh] >= 0:
             path = bytes(model.paths[int(model.mesh_pathadr[mesh]) :]).split(b"\0", 1)[0]
-            said = {"filename": path.decode(), "scale": _text(model.mesh_scale[mesh])}
+            said = {"filename": path.decode(), "scale": model.mesh_scale[mesh]}
             # MuJoCo turns a mesh to its principal axes, and the geom with it.
             pose = pose @ inverse(self._pose(model.mesh_pos[mesh], model.mesh_quat[mesh]))
         else:
@@ -206,10 +203,7 @@ class _Writer:
                 f"body {name!r} has a shape of the kind {kind}; allowed are boxes, cylinders, "
                 f"spheres, capsules and meshes with a file{scene}"
             )
-        element = ElementTree.SubElement(link, "collision")
-        _origin(element, pose)
-        geometry = ElementTree.SubElement(element, "geometry")
-        ElementTree.SubElement(geometry, kind, said)
+        _add(_add(_add(link, "collision", pose), "geometry"), kind, **said)
 
     def _pose(self, place: Array, quaternion: Array) -> Array:
         rotation = np.empty(9)
@@ -217,10 +211,15 @@ class _Writer:
         return transform(rotation.reshape(3, 3), place)
 
 
-def _origin(element: ElementTree.Element, pose: Array) -> None:
-    said = {"xyz": _text(pose[:3, 3]), "rpy": _text(rpy_from_rotation(pose[:3, :3]))}
-    ElementTree.SubElement(element, "origin", said)
-
-
-def _text(values: Array) -> str:
-    return " ".join(repr(float(value)) for value in values)
+def _add(
+    parent: ElementTree.Element, tag: str, pose: Array | None = None, **said: Any
+) -> ElementTree.Element:
+    """An inner element with its origin, and with texts and numbers as attributes."""
+    written = {
+        key: value if isinstance(value, str) else " ".join(map(repr, np.ravel(value).tolist()))
+        for key, value in said.items()
+    }
+    element = ElementTree.SubElement(parent, tag, written)
+    if pose is not None:
+        _add(element, "origin", xyz=pose[:3, 3], rpy=rpy_from_rotation(pose[:3, :3]))
+    return element
