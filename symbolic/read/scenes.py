@@ -43,7 +43,15 @@ def read_scene(path: Path) -> Scene:
     """
     found = SceneBuilder()
     try:
-        _reader(path)(path, found)
+        text = outside.text(outside.read_bytes(path, outside.URDF_BYTES))
+        head = re.match(r"\s*+(?:(?><\?.*?\?>|<!--.*?-->)\s*+)*+<([A-Za-z]\w*)", text, re.DOTALL)
+        kind = head[1] if head else path.suffix.lower()
+        if kind not in READERS:
+            raise OutsideError(
+                "is no scene that is read; allowed are SDF (<sdf>), MJCF (<mujoco>) and planning "
+                "scenes of MoveIt (.yaml, .scene)"
+            )
+        READERS[kind](path, found)
     except OutsideError as error:
         raise SceneError(f"{path.name}: {error}") from error
     if found.problems.found:
@@ -52,19 +60,6 @@ def read_scene(path: Path) -> Scene:
     if not found.bodies and not found.left_out:
         raise SceneError(f"{path.name}: holds no obstacle")
     return Scene(tuple(found.bodies), tuple(found.left_out), tuple(found.notes), found.files)
-
-
-def _reader(path: Path) -> Callable[[Path, SceneBuilder], None]:
-    """What reads a file, by what is in it."""
-    text = outside.text(outside.read_bytes(path, outside.URDF_BYTES))
-    head = re.match(r"\s*+(?:(?><\?.*?\?>|<!--.*?-->)\s*+)*+<([A-Za-z]\w*)", text, re.DOTALL)
-    kind = head[1] if head else path.suffix.lower()
-    if kind in READERS:
-        return READERS[kind]
-    raise OutsideError(
-        "is no scene that is read; allowed are SDF (<sdf>), MJCF (<mujoco>) and planning scenes of "
-        "MoveIt (.yaml, .scene)"
-    )
 
 
 # --- SDF ---

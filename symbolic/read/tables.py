@@ -100,14 +100,12 @@ class Table:
         """Whether an optional key is there; it is known either way."""
         return self.raw(key, None) is not None
 
-    def refuse(self, key: str, others: Sequence[str]) -> bool:
+    def refuse(self, key: str, others: Sequence[str]) -> None:
         """Record a problem of a key that excludes others where one of these is there as well."""
-        beside = [other for other in others if other in self._data]
+        beside = " and ".join(repr(other) for other in others if other in self._data)
         self._known.update(others)
         if beside:
-            listed = " and ".join(map(repr, beside))
-            self.add(key, f"found beside {listed}; allowed is one or the other")
-        return bool(beside)
+            self.add(key, f"found beside {beside}; allowed is one or the other")
 
     def close(self) -> None:
         """Record every key that nobody asked for."""
@@ -224,10 +222,6 @@ class Table:
             return kind(**found)
         except (ValueError, DualArmError) as error:
             raise ValueError(f"{self.path}: {error}") from error
-
-    def records(self, key: str, kind: type[Record]) -> tuple[Record, ...]:
-        """An array of tables as records."""
-        return tuple(table.record(kind) for table in self.tables(key))
 
 
 @cache
