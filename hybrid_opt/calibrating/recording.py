@@ -12,7 +12,7 @@ import io
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
@@ -38,6 +38,7 @@ TARE_TIME = 0.4
 """Time around a tare instant over which readings are averaged [s]."""
 
 TIME = Range(-1e12, 1e12, "s")
+Instant = Annotated[float, TIME]
 FORCE_RANGE = Range(1.0, 1e6, "N")
 MOMENT_RANGE = Range(0.1, 1e5, "N m")
 
@@ -56,11 +57,11 @@ class Labels:
         slip_at: instants at which it began to slip.
     """
 
-    mass: float | None
-    empty: bool
-    tare: tuple[float, ...]
-    held: Spans
-    slip_at: tuple[float, ...]
+    mass: Annotated[float, quantity.MASS] | None = None
+    empty: bool = False
+    tare: tuple[Instant, ...] = ()
+    held: tuple[tuple[Instant, Instant], ...] = ()
+    slip_at: tuple[Instant, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -209,45 +210,24 @@ def read_run(path: Path, workcell: Workcell) -> Run:
         raise WorkcellError(str(side), (told,)) from error
     problems = Problems()
     table = Table(data, "", problems)
-    labels = _labels(table)
     frame = table.choice("frame", FRAMES, "flange")
     largest = None
     if table.has("sensor_range"):
         largest = table.vector("sensor_range", (FORCE_RANGE, MOMENT_RANGE))
     arms = table.tables("arms", exactly=2)
+    labels = table.record(Labels)
+    if labels.empty and labels.mass is not None:
+        table.add("mass", "is stated for an empty run; leave out one of them")
+    if table.clean("held") and any(begin >= end for begin, end in labels.held):
+        table.add("held", f"found {shown(labels.held)}; allowed are pairs [begin, end] in s")
     if problems.found or len(arms) != 2:
         raise WorkcellError(str(side), problems.messages())
     recorded = [_read_arm(arm, path, workcell, i) for i, arm in enumerate(arms)]
-    for each in (*arms, table):
+    for each in arms:
         each.close()
     if problems.found:
         raise WorkcellError(str(side), problems.messages())
     return together(path.name, (recorded[0], recorded[1]), labels, frame, largest)
-
-
-def _labels(table: Table) -> Labels:
-    mass = table.number("mass", quantity.MASS) if table.has("mass") else None
-    empty = table.flag("empty")
-    if empty and mass is not None:
-        table.problems.add("mass", "is stated for an empty run; leave out one of them")
-    spans = table.raw("held", [])
-    if not isinstance(spans, list) or not all(
-        isinstance(span, list)
-        and len(span) == 2
-        and all(isinstance(value, int | float) for value in span)
-        and span[0] < span[1]
-        for span in spans
-    ):
-        table.problems.add("held", f"found {shown(spans)}; allowed are pairs [begin, end] in s")
-        spans = []
-    held = tuple((float(begin), float(end)) for begin, end in spans)
-    return Labels(mass, empty, _instants(table, "tare"), held, _instants(table, "slip_at"))
-
-
-def _instants(table: Table, key: str) -> tuple[float, ...]:
-    value = table.raw(key, [])
-    count = len(value) if isinstance(value, list) else 1
-    return tuple(table.vector(key, (TIME,) * count, []).tolist())
 
 
 def _read_arm(table: Table, path: Path, workcell: Workcell, arm: int) -> ArmLog:
