@@ -19,6 +19,7 @@ import zlib
 from array import array
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
+from itertools import chain
 from pathlib import Path
 from typing import Any, cast
 
@@ -65,38 +66,37 @@ class EvaluationTable:
     objective_names: tuple[str, ...]
 
 
+def _groups(
+    n_var: int, objective_names: tuple[str, ...], reasons: tuple[str, ...] = REASONS
+) -> dict[str, list[str]]:
+    """Columns of numbers by the field of `Evaluations` that they hold."""
+    return {
+        "x": [f"x_{k + 1}" for k in range(n_var)],
+        "objectives": [f"objective_{name}" for name in objective_names],
+        "penalised": [f"penalised_{name}" for name in objective_names],
+        "violation": [f"violation_{reason}" for reason in reasons],
+        "violation_time": [f"violation_time_{reason}" for reason in reasons],
+    }
+
+
 def columns(
     n_var: int, objective_names: tuple[str, ...], reasons: tuple[str, ...] = REASONS
 ) -> list[str]:
     """The names of all columns."""
-    return [
-        *_FIXED,
-        *(f"x_{k + 1}" for k in range(n_var)),
-        *(f"objective_{name}" for name in objective_names),
-        *(f"penalised_{name}" for name in objective_names),
-        *(f"violation_{reason}" for reason in reasons),
-        *(f"violation_time_{reason}" for reason in reasons),
-    ]
+    return [*_FIXED, *chain(*_groups(n_var, objective_names, reasons).values())]
 
 
 def encode(table: EvaluationTable) -> bytes:
     """The content of the file; the same table always gives the same bytes."""
     found = table.evaluations
     words = {FEASIBLE: "", **dict(enumerate(REASONS))}
-    numbers = np.column_stack(
-        [found.x, found.objectives, found.penalised, found.violation, found.violation_time]
-    ).tolist()
-    lines = [",".join(columns(found.x.shape[1], table.objective_names))]
+    width = found.x.shape[1]
+    groups = _groups(width, table.objective_names)
+    numbers = np.column_stack([getattr(found, name) for name in groups])
+    lines = [",".join(columns(width, table.objective_names))]
+    each = (table.generation, found.feasible, found.reason, found.position, numbers)
     for index, (generation, feasible, reason, position, row) in enumerate(
-        zip(
-            table.generation.tolist(),
-            found.feasible.tolist(),
-            found.reason.tolist(),
-            found.position.tolist(),
-            numbers,
-            strict=True,
-        ),
-        1,
+        zip(*(part.tolist() for part in each), strict=True), 1
     ):
         head = f"{index},{generation},{int(feasible)},{words[reason]},{position!r},"
         lines.append(head + ",".join(map(repr, row)))
@@ -117,7 +117,7 @@ def decode(content: bytes, path: Path) -> EvaluationTable:
         with gzip.open(io.BytesIO(content)) as file:
             names = _text(file.readline(_LONGEST_LINE)).split(",")
             objectives = _between(names, "objective_")
-            n_var, n_obj = len(_between(names, "x_")), len(objectives)
+            n_var = len(_between(names, "x_"))
             # Reasons are only ever added, at the end: older files have the first of them.
             stored = REASONS[: len(_between(names, "violation_time_"))]
             if names != columns(n_var, objectives, stored):
@@ -128,17 +128,13 @@ def decode(content: bytes, path: Path) -> EvaluationTable:
         _check(values, generation, feasible, values[:, 4 : 4 + n_var])
     except (OSError, EOFError, zlib.error, ValueError, KeyError, IndexError) as error:
         raise ResultsError(f"{path}: damaged ({error})") from error
-    widths = np.cumsum([n_var, n_obj, n_obj, len(stored), len(stored)])
-    x, plain, penalised, *violations, _ = np.split(values[:, 4:], widths, axis=1)
-    missing = ((0, 0), (0, len(REASONS) - len(stored)))
-    violation, violation_time = (np.pad(part, missing) for part in violations)
-    return EvaluationTable(
-        Evaluations(
-            x, plain, penalised, feasible == 1.0, reason, position, violation, violation_time
-        ),
-        generation.astype(np.int64),
-        objectives,
-    )
+    groups = _groups(n_var, objectives, stored)
+    ends = np.cumsum([len(group) for group in groups.values()])[:-1]
+    parts = dict(zip(groups, np.split(values[:, 4:], ends, axis=1), strict=True))
+    for name in ("violation", "violation_time"):
+        parts[name] = np.pad(parts[name], ((0, 0), (0, len(REASONS) - len(stored))))
+    found = Evaluations(feasible=feasible == 1.0, reason=reason, position=position, **parts)
+    return EvaluationTable(found, generation.astype(np.int64), objectives)
 
 
 def _text(line: bytes) -> str:
