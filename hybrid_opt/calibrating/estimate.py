@@ -198,16 +198,23 @@ SMOOTHED = 0.05
 LEAST_LIKENESS = 0.5
 """Correlation of two signals' rates from which on one is the other, later."""
 
+CLEARER = 1.05
+"""Multiple of what a delay leaves unlike that is unlike without it: noise alone reaches 1.04."""
 
-def delay(time: Array, first: Array, second: Array, most: float = 1.0) -> float | None:
+
+def delay(
+    time: Array, first: Array, second: Array, most: float = 1.0, apart: float | None = None
+) -> float | None:
     """How much later the second signal (n,) does what the first (n,) does [s]; negative: earlier.
 
     Args:
         time: (n,) [s].
         most: largest delay that is looked for [s].
+        apart: delay that does not count [s], None for none.
 
     Returns:
-        where the rates of both correlate best; None where they hardly do.
+        where the rates of both correlate best; None where they hardly do, or hardly better than
+        with a delay that does not count.
     """
     wide = round(SMOOTHED / STEP)
     if not 4 * wide < (time[-1] - time[0]) / STEP < LARGEST_GRID:
@@ -232,7 +239,13 @@ def delay(time: Array, first: Array, second: Array, most: float = 1.0) -> float 
     size = np.sqrt(own * other)
     near = np.divide(product, size, out=np.zeros(len(lags)), where=size > 0.0)
     best = int(np.argmax(near))
-    return (best - reach) * STEP if near[best] >= LEAST_LIKENESS else None
+    if near[best] < LEAST_LIKENESS:
+        return None
+    if apart is not None:
+        without = near[np.abs(lags) * STEP <= apart].max()
+        if 1.0 - without <= CLEARER * (1.0 - near[best]):
+            return None
+    return (best - reach) * STEP
 
 
 # --- friction ---

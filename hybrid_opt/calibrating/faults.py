@@ -271,7 +271,7 @@ def vanished(normal: Array) -> Array:
 
 
 def _clock_faults(run: Run, places: Places) -> list[Fault]:
-    late = delay(run.time, places.normal[:, 0], places.normal[:, 1], LARGEST_DELAY)
+    late = delay(run.time, places.normal[:, 0], places.normal[:, 1], LARGEST_DELAY, APART)
     if late is None or abs(late) <= APART:
         return []
     text = (
