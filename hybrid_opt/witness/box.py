@@ -316,7 +316,7 @@ class Witness:
         mujoco, model, settings = self._mujoco, self._model(drive.leader), self.settings
         data = mujoco.MjData(model)
         held = HeldBox(model, data, self.workcell)
-        box = int(model.joint("box").qposadr[0])
+        box, moves = (int(getattr(model.joint("box"), at)[0]) for at in ("qposadr", "dofadr"))
         press = int(model.joint("press").dofadr[0])
         driven = (0, 1) if settings.pads == "driven" else ()
         tilts = [[int(model.joint(name).dofadr[0]) for name in tilt_names(i)] for i in driven]
@@ -326,6 +326,9 @@ class Witness:
         time, slip, turn = [], [], []
         for k in range(len(drive.time)):
             data.qpos[:7], data.qvel[:6] = drive.pose[k], drive.velocity[k]
+            if drive.time[k] < drive.time[0] + settings.settle / 4.0:
+                # It stands until the pads press: what hardly holds it does not stop a falling box.
+                data.qvel[moves : moves + 6] = 0.0
             data.qfrc_applied[:6] = CARRIAGE_MASS * drive.acceleration[k]
             data.qfrc_applied[press] = force[k]
             for i in driven:

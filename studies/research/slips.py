@@ -17,7 +17,7 @@ from hybrid_opt.door import search
 from hybrid_opt.errors import WitnessError
 from hybrid_opt.store.files import read_record, to_json, write_json
 from hybrid_opt.timing.solve import time_path
-from hybrid_opt.witness.box import Witness, bisected, drive_of
+from hybrid_opt.witness.box import Outcome, Witness, bisected, drive_of
 from hybrid_opt.witness.scene import SimulationSettings
 from symbolic.array import Array, Figure
 from symbolic.records import Workcell
@@ -47,10 +47,15 @@ FINE_POINTS = 91
 """Points of a patch where normals are not opposite: force rises there by up to five times the share
 by which friction falls, and so does the error of a disc's torsion with 37 points."""
 
-PRESSED_SHARE = 0.95
-"""Share of the holding force that is pressed all along to see where the box slips first: a plan
-often asks for its most for some hundredths of a second, in which a box that lacks less force moves
-by less than it creeps in the rest of the time."""
+PRESSED_SHARE, HOLDING_SHARE = 0.95, 1.05
+"""Shares of the holding force that are pressed all along to see where the box slips first: where it
+moves farther with the first than with the second."""
+
+FARTHER = 2e-5
+"""Slip beyond that of a box that is held, at which the box is said to slip [m]. A plan often asks
+for its most for some hundredths of a second, in which a box that lacks some percent of its force
+moves by no more. Later on a held one may creep as far, and as much again as pads give along the
+normals of others."""
 
 ALLOWED = {"disc": 0.03, "rectangle": 0.05, "fork": 0.05}
 """How far from one a threshold may be, by the kind of pads."""
@@ -69,7 +74,7 @@ class Slip:
         duration, force: of the carry [s], and the largest planned normal force of pad 2 [N].
         threshold: least multiple of the planned force that holds; NaN where there is none.
         begins: when the box slips first under a force that is the same all along and a little
-            below what holds [s]; NaN where it does not.
+            below what holds, see `first_slip` [s]; NaN where it does not.
         planned: when the plan first asks for more than that [s].
     """
 
@@ -177,7 +182,10 @@ def slip_of(
         except WitnessError:
             factor = bisected(simulate, *WIDER, MORE_BISECTIONS).factor
         steady = replace(drive, press=np.full(len(drive.time), needed.max()))
-        begins = witness.simulate(steady, PRESSED_SHARE * factor).begins(settings.slip)
+        lacks, held = (
+            witness.simulate(steady, share * factor) for share in (PRESSED_SHARE, HOLDING_SHARE)
+        )
+        begins = first_slip(lacks, held)
     except WitnessError:
         pass  # stays without a number
     return Slip(
@@ -188,9 +196,17 @@ def slip_of(
         duration=carry.duration,
         force=float(needed.max()),
         threshold=factor,
-        begins=begins if np.isfinite(begins) else float("nan"),
+        begins=begins,
         planned=float(carry.time[needed > PRESSED_SHARE * needed.max()][0]),
     )
+
+
+def first_slip(lacks: Outcome, held: Outcome) -> float:
+    """When a box that lacks force has moved farther in the plane of a pad than the same box that is
+    held by more, by `FARTHER` [s]; NaN where it has not."""
+    n = min(len(lacks.time), len(held.time))
+    beyond = np.flatnonzero((lacks.slip[:n] - held.slip[:n]).max(axis=1) > FARTHER)
+    return float(lacks.time[beyond[0]]) if len(beyond) else float("nan")
 
 
 def pads_of(workcell: Workcell) -> str:

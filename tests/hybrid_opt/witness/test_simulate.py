@@ -151,6 +151,15 @@ def test_statics_of_pads_that_press_evenly(
     assert found == pytest.approx(1.0, abs=0.025)
 
 
+def test_pads_on_adjacent_faces_hold_at_rest_from_the_least_force_on() -> None:
+    """Where little more than the least force would stop a box that falls until they press."""
+    cell = load(ROOT / "studies" / "workcells" / "corner.toml")
+    cell = replace(cell, task=replace(cell.task, allocation="soft-finger"))
+    carry = carry_along(cell, STILL, 0.3)
+    carry = replace(carry, normal_force=soft_model(cell).nominal(carry))
+    assert threshold(carry) == pytest.approx(1.0, abs=0.02)
+
+
 @pytest.mark.parametrize(
     "path", [(0.25, 0.0, 0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.15, 0.0, 0.3, 0.0), (0.1, 0.05) * 3]
 )
