@@ -180,12 +180,8 @@ def test_what_is_damaged_is_sound_at_first(check: Callable[..., None]) -> None:
     assert len(seen) == 1
 
 
+@pytest.mark.parametrize("many", [False, pytest.param(True, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("kind", TESTS)
-def test_damage_is_told(kind: str) -> None:
-    all_kept(TESTS, kind, FEW_PROCESSES if TESTS[kind][0] is xacro else FEW)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", TESTS)
-def test_much_damage_is_told(kind: str) -> None:
-    all_kept(TESTS, kind, MANY)
+def test_damage_is_told(kind: str, many: bool) -> None:
+    few = FEW_PROCESSES if TESTS[kind][0] is xacro else FEW
+    all_kept(TESTS, kind, MANY if many else few)

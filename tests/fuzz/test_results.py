@@ -8,6 +8,7 @@ import hashlib
 import json
 import shutil
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -25,14 +26,11 @@ from studies.programs.study import StudySettings, run_study
 from studies.report.data import gather_carries
 from symbolic.read.cell import load
 from tests.fuzz.damage import Bytes, Tree, byte_damage, tree_damage
-from tests.fuzz.promises import kept
+from tests.fuzz.promises import MANY, kept
 from tests.symbolic.cells import ROOT
 
 TRANSFER = ROOT / "studies" / "workcells" / "transfer.toml"
 EVALUATIONS, MARK = "evaluations.csv.gz", "replica.json"
-
-quick = settings(max_examples=15, suppress_health_check=list(HealthCheck))
-thorough = settings(max_examples=1000, suppress_health_check=list(HealthCheck))
 
 
 @pytest.fixture(scope="module")
@@ -125,16 +123,10 @@ TESTS: dict[str, tuple[Callable[..., None], st.SearchStrategy[Any]]] = {
 }
 
 
+@pytest.mark.parametrize("examples", [15, pytest.param(MANY, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("kind", TESTS)
-def test_damage_is_told(kind: str, damaged_copy: Path, whole: Path) -> None:
+def test_damage_is_told(kind: str, examples: int, damaged_copy: Path, whole: Path) -> None:
     check, strategy = TESTS[kind]
-    quick(given(SHARE, strategy)(lambda share, damage: check(damaged_copy, whole, share, damage)))()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", TESTS)
-def test_much_damage_is_told(kind: str, damaged_copy: Path, whole: Path) -> None:
-    check, strategy = TESTS[kind]
-    thorough(
-        given(SHARE, strategy)(lambda share, damage: check(damaged_copy, whole, share, damage))
-    )()
+    limited = settings(max_examples=examples, suppress_health_check=list(HealthCheck))
+    with_both = partial(check, damaged_copy, whole)
+    limited(given(SHARE, strategy)(lambda share, damage: with_both(share, damage)))()

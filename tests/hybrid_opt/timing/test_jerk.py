@@ -53,7 +53,7 @@ def test_every_limit_holds_and_the_jerk_is_that_of_what_is_driven(size: float) -
     assert max(np.abs(jerk).max() / size, np.linalg.norm(box, axis=1).max() / (0.6 * size)) > 0.95
 
 
-def test_positions_speeds_and_accelerations_belong_together() -> None:
+def test_positions_speeds_and_accelerations_belong_together_and_end_at_rest() -> None:
     carry = timed(40.0).timing.carry
     assert carry is not None
     steps = np.diff(carry.time)[:, None]
@@ -63,6 +63,8 @@ def test_positions_speeds_and_accelerations_belong_together() -> None:
     second = carry.side_by_side("q_second")
     middle = (second[1:] + second[:-1]) / 2.0
     np.testing.assert_allclose(np.diff(rate, axis=0) / steps, middle, atol=2e-2)
+    for values in (rate, second):
+        assert np.abs(values[[0, -1]]).max() < 1e-9
 
 
 def test_a_limit_of_robust_forces_is_kept() -> None:
@@ -83,13 +85,6 @@ def test_a_limit_of_robust_forces_is_kept() -> None:
     # The plan's own timing keeps this limit, so that this is no slower, but for what rounds
     # settle at.
     assert found.without < found.timing.duration <= plain.duration * 1.005
-
-
-def test_both_ends_rest_without_acceleration() -> None:
-    carry = timed(40.0).timing.carry
-    assert carry is not None
-    for name in ("q_rate", "q_second"):
-        assert np.abs(carry.side_by_side(name)[[0, -1]]).max() < 1e-9
 
 
 def test_tighter_jerk_costs_more_and_loose_jerk_next_to_nothing() -> None:

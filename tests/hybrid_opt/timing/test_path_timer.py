@@ -18,7 +18,6 @@ from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.read.cell import load
 from symbolic.records import Workcell
-from tests.hybrid_opt.timing import convex_oracle
 from tests.hybrid_opt.timing.cells import (
     hand_timing,
     initial,
@@ -98,24 +97,6 @@ def test_two_hundred_random_carries_agree_with_time_path(name: str) -> None:
         if timed == 200:
             return
     pytest.fail(f"only {timed} carries could be timed")
-
-
-@pytest.mark.parametrize("seed", range(4))
-def test_duration_agrees_with_a_convex_program(seed: int) -> None:
-    model = hand_timing(INTERVALS)
-    (x,) = near_initial(np.random.default_rng(100 + seed), 1)
-    share = (None, 1.02, 1.1, 1.3)[seed % 4]
-    static = hand_timer().time(x, TimingLimits(force=1.0)).peak_force.max()
-    limits = TimingLimits(
-        force=None if share is None else share * float(static),
-        torque=False,
-        pressure=False,
-        reference_speed=seed % 3 == 0,
-    )
-    found = hand_timer().time(x, limits)
-    exact = convex_oracle.shortest_duration(model, x, limits)
-    # Intervals that exceed a limit between their ends are tightened, which the program does not do.
-    assert found.duration == pytest.approx(exact, rel=1e-3)
 
 
 def test_a_tilted_box_is_not_driven_where_it_could_not_rest_within_the_limit() -> None:

@@ -165,23 +165,6 @@ def test_what_cannot_stand_still_says_with_what_force_it_could() -> None:
     assert at_rest.status is TimingStatus.INFEASIBLE_AT_REST
 
 
-def test_a_batch_gives_what_single_calls_give() -> None:
-    paths = np.vstack([initial(), near_initial(np.random.default_rng(8), 2), initial()])
-    paths[3] += np.tile([-2.0, 0, 0, 0, 0, 0], 3)
-    limits = [
-        TimingLimits(force=64.0, robust=True),
-        TimingLimits(force=60.0),
-        TimingLimits(force=70.0, robust=True),
-        TimingLimits(force=70.0, robust=True),
-    ]
-    together = timer().time_all(paths, limits)
-    for x, limit, timing in zip(paths, limits, together, strict=True):
-        alone = timer().time(x, limit)
-        assert alone.status is timing.status
-        np.testing.assert_allclose(alone.grid_speed, timing.grid_speed, rtol=1e-9)
-    assert together[3].status is TimingStatus.OFF_PATH
-
-
 def carry(model: TimingModel, x: np.ndarray | None = None) -> Carry:
     return model.search_carry(initial() if x is None else x)
 
