@@ -20,8 +20,7 @@ from symbolic.errors import SettingsError
 from symbolic.geometry.bodies import Frame
 from symbolic.records.poses import box_rotation
 from symbolic.records.task import extended_waypoints, variable_names
-from tests.redundant_cells import free_pandas
-from tests.turned_cells import turned_transfer
+from tests.odd_cells import free_pandas, turned_transfer
 
 
 @pytest.fixture(scope="module")

@@ -23,7 +23,7 @@ from symbolic.records import Workcell
 from symbolic.records.poses import inverse, pose_matrix
 from symbolic.records.task import initial_decision
 from symbolic.smooth.places import closure_functions, closure_name
-from tests.redundant_cells import free_pandas
+from tests.odd_cells import free_pandas
 from tests.symbolic.cells import call, hand_cell, hand_model, with_contacts, with_payload
 
 SAMPLES = 401

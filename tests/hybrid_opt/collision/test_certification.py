@@ -37,7 +37,7 @@ from symbolic.records.poses import inverse, pose_matrix
 from symbolic.records.task import extended_waypoints, initial_decision
 from symbolic.robot.model import build_robot_model
 from tests.hybrid_opt.cells import shipped
-from tests.hybrid_opt.collision.queries import check_between, collision_mask
+from tests.hybrid_opt.collision.test_checker import check_between, collision_mask
 from tests.symbolic.geometry.collision_cells import Configurations, functions_of, rack
 from tests.symbolic.read.samples import RACK
 

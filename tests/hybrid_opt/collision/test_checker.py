@@ -15,10 +15,16 @@ from numpy.typing import NDArray
 
 from codegen.interpreted import InterpretedFunction
 from codegen.source import dense
+from hybrid_opt.collision.between import (
+    SEARCH_DEPTH,
+    MotionVerdict,
+    SampledMotions,
+    check_all_between,
+)
 from hybrid_opt.collision.checker import RESTING_TOLERANCE, CollisionChecker, sample_durations
+from symbolic.array import Array
 from symbolic.geometry.pairs import CellGeometry, build_geometry, coal_distance, coal_geometry
 from symbolic.records import AllowedContact, CollisionSettings, Uncertainty, Workcell
-from tests.hybrid_opt.collision.queries import collision_mask
 from tests.symbolic.geometry.collision_cells import (
     Configurations,
     functions_of,
@@ -28,6 +34,26 @@ from tests.symbolic.geometry.collision_cells import (
     random_configurations,
     true_distances,
 )
+
+
+def collision_mask(
+    checker: CollisionChecker, pose: Array, q_1: Array, q_2: Array
+) -> NDArray[np.bool_]:
+    """(n, n_pairs) FCL's answer for every pair of every sample, without any screening."""
+    n, n_pairs = len(pose), len(checker.geometry.active)
+    rows, pairs = np.divmod(np.arange(n * n_pairs), n_pairs)
+    found = checker.collisions(pose, q_1, q_2, rows.tolist(), pairs.tolist())
+    return np.array(found, dtype=bool).reshape(n, n_pairs)
+
+
+def check_between(
+    checker: CollisionChecker, configuration: Array, depth: int = SEARCH_DEPTH
+) -> MotionVerdict:
+    """One motion by its samples (n, 6 + all joints), without a margin."""
+    clearance = checker.bounds(*checker.split(configuration))
+    sampled = SampledMotions(configuration, clearance, (len(configuration),), np.zeros(1))
+    return check_all_between(checker, sampled, depth)[0]
+
 
 pytestmark = pytest.mark.filterwarnings("ignore::symbolic.geometry.hulls.CollisionModelWarning")
 

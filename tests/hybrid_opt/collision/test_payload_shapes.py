@@ -24,8 +24,7 @@ from symbolic.array import Array
 from symbolic.geometry.pairs import CellGeometry, build_geometry
 from symbolic.geometry.pieces import ConvexShape, Hull, Piece, reach, shrunk
 from symbolic.records import AllowedContact, Box, Capsule, Cylinder, Mesh, Sphere, Workcell
-from tests.hybrid_opt.collision.queries import collision_mask
-from tests.hybrid_opt.collision.test_checker import checker_of, coal_mask
+from tests.hybrid_opt.collision.test_checker import checker_of, coal_mask, collision_mask
 from tests.symbolic.geometry.collision_cells import (
     rack,
     random_configurations,

@@ -34,8 +34,7 @@ from symbolic.records import CollisionSettings, Uncertainty, Workcell
 from symbolic.records.poses import box_placement
 from symbolic.records.task import initial_decision, straight_line
 from tests.hybrid_opt.cells import shipped
-from tests.hybrid_opt.collision.queries import collision_mask
-from tests.hybrid_opt.collision.test_checker import checker_of, resting_cell
+from tests.hybrid_opt.collision.test_checker import checker_of, collision_mask, resting_cell
 from tests.symbolic.geometry.collision_cells import geometry_of, random_configurations
 from tests.symbolic.read.samples import RACK
 

@@ -21,7 +21,7 @@ from symbolic.records import Workcell
 from symbolic.records.task import initial_decision
 from tests.hybrid_opt.evaluate.test_evaluation import assert_agrees
 from tests.machines import MACHINES, SINGLE, cell_of
-from tests.redundant_cells import free_pandas, locked_pandas, machine_on_lift, seven_joints
+from tests.odd_cells import free_pandas, locked_pandas, machine_on_lift, seven_joints
 from tests.symbolic.cells import with_task
 
 pytestmark = pytest.mark.filterwarnings("ignore::symbolic.geometry.hulls.CollisionModelWarning")

@@ -41,7 +41,7 @@ from symbolic.smooth.places import (
 )
 from tests.hybrid_opt.cells import shipped
 from tests.hybrid_opt.polishing.cells import smooth_cell
-from tests.redundant_cells import rack_on_rail
+from tests.odd_cells import rack_on_rail
 from tests.symbolic.read.samples import RACK
 
 TRANSFER = RACK.with_name("transfer.toml")

@@ -34,7 +34,7 @@ from tests.hybrid_opt.polishing.cells import (
     way_of,
 )
 from tests.hybrid_opt.polishing.transcription import without_obstacles
-from tests.redundant_cells import rack_on_rail
+from tests.odd_cells import rack_on_rail
 from tests.symbolic.read.samples import RACK
 
 FORCE = 52.0

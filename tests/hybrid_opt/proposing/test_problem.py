@@ -28,8 +28,8 @@ from symbolic.read.cell import load
 from symbolic.records.poses import rotation_from_rpy
 from tests.hybrid_opt.proposing.problems import BAXTER, tiago_problem
 from tests.hybrid_opt.proposing.test_proposal import rack_problem
+from tests.odd_cells import turned_cell
 from tests.symbolic.cells import hand_cell, with_task
-from tests.turned_cells import turned_cell
 
 POST = Path("studies/problems/past-a-post.toml")
 

@@ -24,7 +24,7 @@ from symbolic.path.spline import path_basis
 from symbolic.read.cell import load
 from symbolic.records import Handling
 from symbolic.records.poses import pose_matrix
-from tests.hybrid_opt.collision.queries import collision_mask
+from tests.hybrid_opt.collision.test_checker import collision_mask
 from tests.hybrid_opt.job.jobs import rack, rack_jobs, rack_timing
 from tests.hybrid_opt.proposing.problems import BAXTER
 from tests.hybrid_opt.proposing.test_proposal import rack_problem

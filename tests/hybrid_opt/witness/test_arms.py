@@ -34,7 +34,7 @@ from studies.research.plain.arm import PlainArm
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.records import Workcell
-from tests.redundant_cells import machine_on_lift, rack_on_rail
+from tests.odd_cells import machine_on_lift, rack_on_rail
 from tests.symbolic.cells import hand_cell, rack_cell, start_posture
 
 WEIGHT = 98.1

@@ -17,7 +17,7 @@ from studies.research.best_front import ReferenceFront, encode, read_reference_f
 from studies.research.locked_joints import as_text, compare, locks
 from symbolic.errors import SettingsError
 from symbolic.read.cell import load
-from tests.redundant_cells import free_pandas
+from tests.odd_cells import free_pandas
 from tests.symbolic.read.samples import RACK
 
 

@@ -19,7 +19,14 @@ from symbolic.functions import CONSTRAINTS, candidate_function
 from symbolic.path_motion import path_motion_function
 from symbolic.records import Robot, Waypoint, Workcell
 from symbolic.records.task import TimeLaw, initial_decision
-from tests.redundant_cells import free_pandas, locked_pandas, machine_on_lift, rack_on_rail
+from tests.odd_cells import (
+    free_pandas,
+    locked_pandas,
+    machine_on_lift,
+    rack_on_rail,
+    random_x,
+    turned_cell,
+)
 from tests.symbolic.cells import (
     call,
     fixed,
@@ -33,7 +40,6 @@ from tests.symbolic.cells import (
     with_payload,
     with_task,
 )
-from tests.turned_cells import random_x, turned_cell
 
 AGREEMENT = 1e-8
 """Largest difference to the plain reference, absolute or relative, whichever is larger."""

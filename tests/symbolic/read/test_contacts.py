@@ -27,7 +27,7 @@ from symbolic.records.task import (
     waypoints_of,
 )
 from tests.machines import SINGLE, single_cell
-from tests.redundant_cells import free_pandas, rack_on_rail
+from tests.odd_cells import free_pandas, rack_on_rail
 from tests.studies.conftest import TRANSFER
 from tests.symbolic.read.samples import RACK, sample_data, write
 

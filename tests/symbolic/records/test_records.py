@@ -18,8 +18,8 @@ from symbolic.records import Mesh, Workcell
 from symbolic.records.poses import Orientation, rotation_from_rpy
 from symbolic.records.problems import matching
 from symbolic.records.task import extended_waypoints, variable_names
+from tests.odd_cells import turned_transfer
 from tests.symbolic.read.samples import GOFA, sample_data, write
-from tests.turned_cells import turned_transfer
 
 COLLISION_BOX = '<geometry><box size="0.161 0.093 0.707"/></geometry>'
 FILES = (
