@@ -19,8 +19,6 @@ from hybrid_opt.progress import Progress
 from hybrid_opt.recommending.recommendation import level_force
 from hybrid_opt.robust.force import robust_model
 from hybrid_opt.store.trajectory_file import read_trajectory, replay
-from hybrid_opt.timing.analysis import read_timing
-from studies import export
 from studies.programs.study import StudySettings, run_study
 from studies.report.data import ReportData, gather
 from studies.report.generate import report_tables
@@ -126,33 +124,6 @@ def test_what_is_recommended_holds_in_every_case_within_its_limit(
 def test_its_file_is_reproduced(study: tuple[Path, str], tmp_path: Path) -> None:
     root, _ = study
     assert replay(read_trajectory(root / recommended(root).file), tmp_path).reproduced
-
-
-def test_what_is_selected_is_also_timed_within_jerk_limits(study: tuple[Path, str]) -> None:
-    root, _ = study
-    selected = read_timing(root / "timing" / "nsga2-polished" / "00.json")
-    assert selected.jerk is not None
-    # The search's own timing is the one within robust forces.
-    chosen = read_summary(root).algorithms["nsga2"].replicas[0].polished
-    assert chosen is not None
-    assert chosen.selected is not None
-    assert selected.timings["search"].duration == pytest.approx(chosen.selected.duration)
-
-
-def test_what_is_exported_keeps_the_robust_limit(
-    study: tuple[Path, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    root, _ = study
-    found = recommended(root)
-    file = str(root / found.file)
-    stated = ["--force-limit", repr(found.force_limit)]
-    told = []
-    for name, options in {"own": [], "stated": stated}.items():
-        output = ["--target", "json", "--output", str(tmp_path / name)]
-        assert export.main([file, *options, *output]) == 0
-        told.append(capsys.readouterr().out.partition("files in")[0])
-    assert "carry" in told[0]
-    assert told[0] == told[1]
 
 
 def test_the_table_begins_above_what_holds_still_in_every_case(study: tuple[Path, str]) -> None:
