@@ -248,8 +248,14 @@ def recommend_from(
             ho.Front.of(cell, x), wish, others, progress=lambda done, total: advance(1)
         )
         durations = _force_table(cell, fronts, others, found, advance)
-        price = _price(found.carry, campaign.settings.seed, threads)
+        price, driven = None, found.carry.workcell
+        if not driven.uncertainty.is_empty:
+            rng = np.random.default_rng(campaign.settings.seed)
+            price = robust_price(pressing_model(driven), found.carry, rng, LEADER, threads=threads)
         advance(1)
+        without_jerk = math.nan
+        if kept_jerk(cell.workcell, found.timing.limits) is not None:
+            without_jerk = ho.time_path(cell, found.x, found.timing.limits).duration
     source = sources[found.member]
     provenance = {
         "recommended": str(wish),
@@ -283,17 +289,8 @@ def recommend_from(
         durations=durations,
         price=price,
         robust_force=found.limited_force if found.force_kind.robust else None,
-        without_jerk=_without_jerk(cell, found),
+        without_jerk=without_jerk,
     )
-
-
-def _without_jerk(cell: ho.Cell, found: Recommendation) -> float:
-    """Duration of the recommended path within the same force without limits on jerk [s], NaN where
-    it keeps none."""
-    limits = found.timing.limits
-    if kept_jerk(cell.workcell, limits) is None:
-        return math.nan
-    return ho.time_path(cell, found.x, limits).duration
 
 
 def _hand_made(cell: ho.Cell) -> Array:
@@ -321,14 +318,6 @@ def _why_none(cell: ho.Cell, results: CampaignResults) -> str:
     return f"{told}{hand_made}; a longer search or wider bounds may find one"
 
 
-def _price(carry: ho.Carry, seed: int, threads: int) -> RobustPrice | None:
-    """Cost of robustness for the recommended carry; None where nothing is uncertain."""
-    if carry.workcell.uncertainty.is_empty:
-        return None
-    model, rng = pressing_model(carry.workcell), np.random.default_rng(seed)
-    return robust_price(model, carry, rng, LEADER, threads=threads)
-
-
 def _force_table(
     cell: ho.Cell,
     fronts: Sequence[Front],
@@ -348,29 +337,15 @@ def _force_table(
         return least
 
     paths = {HAND_MADE: cell.initial[: task.n_path], "recommended": found.x[: task.n_path]}
-    paths |= dict(others)
-    rows = [_row(label, [durations(path[None])]) for label, path in paths.items()]
-    rows += [
-        _row(
-            label,
-            [
-                durations(_spread(front.x[:, : task.n_path]))
-                for front in fronts
-                if front.title == label
-            ],
-        )
-        for label in dict.fromkeys(front.title for front in fronts)
-    ]
+    every = {label: [durations(path[None])] for label, path in (paths | dict(others)).items()}
+    for front in fronts:
+        members = front.x[:, : task.n_path]
+        every.setdefault(front.title, []).append(durations(members[spread_rows(members)]))
+    rows = []
+    for label, known in every.items():
+        median, least, largest = (tuple(each.tolist()) for each in over_replicas(known))
+        rows.append(StoredDurations(label, len(known), median, least, largest))
     return ForceTable(tuple(forces.tolist()), tuple(rows))
-
-
-def _spread(paths: Array) -> Array:
-    return np.asarray(paths[spread_rows(paths)])
-
-
-def _row(label: str, found: list[Array]) -> StoredDurations:
-    figures = [tuple(values.tolist()) for values in over_replicas(found)]
-    return StoredDurations(label, len(found), *figures)
 
 
 EXPORT_TARGET = "ros2-control"

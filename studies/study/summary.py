@@ -204,9 +204,6 @@ class Bounds:
     binding: tuple[BindingBound, ...]
 
 
-NO_BOUNDS = Bounds(0, ())
-
-
 @dataclass(frozen=True)
 class CampaignSummary:
     """summary.json.
@@ -230,7 +227,7 @@ class CampaignSummary:
     algorithms: Mapping[str, AlgorithmFigures]
     tests: tuple[RankTest, ...]
     hand_made: SelectedEntry | None = None
-    bounds: Bounds = NO_BOUNDS
+    bounds: Bounds = Bounds(0, ())
     recommendation: StoredRecommendation | None = None
     no_recommendation: str = ""
 
@@ -292,35 +289,16 @@ def read_summary(root: str | Path) -> CampaignSummary:
     return summary
 
 
-FIGURES = (
-    "feasible",
-    "feasible_share",
-    "non_dominated",
-    "hypervolume",
-    "igd",
-    "igd_plus",
-    "spacing",
-    "seconds",
-    "mean_excess_above_static",
-    "payload_limit",
-)
+_OF_FRONT = ("non_dominated", "hypervolume", "igd", "igd_plus", "spacing")
+_OF_CARRY = ("mean_excess_above_static", "payload_limit")
+
+FIGURES = ("feasible", "feasible_share", *_OF_FRONT, "seconds", *_OF_CARRY)
 """Figures of a replica that are summarised over the replicas."""
 
 TESTED = tuple(name for name in FIGURES if name not in ("feasible", "seconds"))
 """Figures that the algorithms are compared by; the count says the same as its share."""
 
-POLISHED_FIGURES = (
-    "non_dominated",
-    "hypervolume",
-    "igd",
-    "igd_plus",
-    "spacing",
-    "seconds",
-    "equivalent_evaluations",
-    "widest_gap",
-    "mean_excess_above_static",
-    "payload_limit",
-)
+POLISHED_FIGURES = (*_OF_FRONT, "seconds", "equivalent_evaluations", "widest_gap", *_OF_CARRY)
 """Figures of a polished front that are summarised over the replicas."""
 
 LEAST_TESTED = 5
@@ -424,40 +402,26 @@ def campaign_summary(
             points=len(reference),
             hypervolume=metrics.hypervolume(reference, corner),
         ),
-        algorithms={
-            name: AlgorithmFigures(
-                representative=_representative(rows),
-                statistics=_statistics(rows, FIGURES),
-                replicas=tuple(rows),
-                polished=_polished_statistics(rows),
-            )
-            for name, rows in entries.items()
-        },
+        algorithms={name: _algorithm_figures(rows) for name, rows in entries.items()},
         tests=_tests(entries),
     )
 
 
-def _statistics(rows: Sequence[FrontFigures], names: Sequence[str]) -> dict[str, Summary]:
-    return {name: summarise([getattr(row, name) for row in rows]) for name in names}
+def _algorithm_figures(rows: Sequence[ReplicaFigures]) -> AlgorithmFigures:
+    def statistics(found: Sequence[FrontFigures], names: Sequence[str]) -> dict[str, Summary]:
+        return {name: summarise([getattr(row, name) for row in found]) for name in names}
 
-
-def _polished_statistics(rows: Sequence[ReplicaFigures]) -> PolishedStatistics | None:
-    """Statistics of the polished fronts, and what they gained; None without a polish."""
-    polished = [row.polished for row in rows if row.polished is not None]
-    if len(polished) < len(rows):
-        return None
-    gains = [after.hypervolume - row.hypervolume for row, after in zip(rows, polished, strict=True)]
-    return PolishedStatistics(
-        statistics=_statistics(polished, POLISHED_FIGURES),
-        hypervolume_gain=summarise(gains),
-        replicas_improved=sum(gain > 0.0 for gain in gains),
-    )
-
-
-def _representative(rows: Sequence[ReplicaFigures]) -> int | None:
-    """The replica with the largest hypervolume, the paper's 'best-performing run'."""
+    # The paper's 'best-performing run'.
     best = max(rows, key=lambda row: row.hypervolume)
-    return None if best.selected is None else best.replica
+    after = [row.polished for row in rows if row.polished is not None]
+    polished = None
+    if len(after) == len(rows):
+        gains = [new.hypervolume - row.hypervolume for row, new in zip(rows, after, strict=True)]
+        better = sum(gain > 0.0 for gain in gains)
+        known = statistics(after, POLISHED_FIGURES)
+        polished = PolishedStatistics(known, summarise(gains), better)
+    representative = None if best.selected is None else best.replica
+    return AlgorithmFigures(representative, statistics(rows, FIGURES), tuple(rows), polished)
 
 
 def _tests(entries: Mapping[str, Sequence[ReplicaFigures]]) -> tuple[RankTest, ...]:
@@ -519,12 +483,19 @@ def _run(folder: CampaignFolder, progress: Progress, not_asked: str) -> None:
                 entry, best[-1] = replace(entry, polished=figures), front.x
             entries[replica.algorithm].append(entry)
             advance(1)
-    _write_points(folder, "reference", results.objectives, reference)
+
+    def write(name: str, header: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
+        write_atomically(folder.root / FRONTS / name, csv_text(header, rows).encode())
+
+    names = results.objectives
+    write(reference_front_file(folder.root).name, names, reference.tolist())
     for name in results.algorithms:
-        union = reference_front([replica.front for replica in results.of(name)])
-        _write_points(folder, name, results.objectives, union)
-        if len(results.objectives) in (2, 3):
-            _write_attainment(folder, name, results)
+        fronts = [replica.front for replica in results.of(name)]
+        write(f"{name}.csv", names, reference_front(fronts).tolist())
+        if len(names) in (2, 3):
+            surfaces = attainment_surfaces(fronts, PERCENTILES)
+            levels = [[f"{p:g}", *row] for p, rows in surfaces.items() for row in rows.tolist()]
+            write(f"{name}-attainment.csv", ["percentile", *names], levels)
     hand_made, members = _store_hand_made(folder), np.concatenate(best)
     choice = read_recommendation(folder.root)
     reason = choice.reason if isinstance(choice, NoRecommendation) else ""
@@ -542,15 +513,9 @@ def _store_hand_made(folder: CampaignFolder) -> SelectedEntry | None:
     """Write the workcell file's own trajectory, feasible or not, beside the selected ones; its
     figures, None where it has not all of them."""
     carry = folder.cell.carry(folder.cell.initial)
-    path = folder.root / SELECTED / HAND_MADE
-    with storing(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
-    provenance = {"source": "the workcell file's initial trajectory"}
-    # An infeasible one may be without some of its figures.
-    figures = carry.figures.items()
-    known = {name: value for name, value in figures if np.isfinite(value)}
-    write_trajectory(path, folder.cell.compiled, carry.x, known, provenance)
-    entry = carry_entry(carry, 0, path.relative_to(folder.root).as_posix())
+    source = {"source": "the workcell file's initial trajectory"}
+    file = _store(folder, folder.root / SELECTED / HAND_MADE, carry, source)
+    entry = carry_entry(carry, 0, file)
     numbers = [entry.objectives, entry.peak_normal_force, entry.minimum_normal_force]
     every = np.concatenate([*numbers, [entry.payload_limit, entry.duration]])
     return entry if np.isfinite(every).all() else None
@@ -562,32 +527,20 @@ def _store_selected(
     """Write a selected trajectory; returns its path in the folder, None where there is none."""
     if selected is None:
         return None
-    with storing(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
     provenance = {
         "algorithm": replica[0],
         "replica": replica[1],
         "row": selected.row,
         "settings": to_json(folder.settings),
     }
-    carry = selected.carry
-    write_trajectory(path, folder.cell.compiled, carry.x, carry.figures, provenance)
+    return _store(folder, path, selected.carry, provenance)
+
+
+def _store(folder: CampaignFolder, path: Path, carry: Carry, provenance: Mapping[str, Any]) -> str:
+    """Write a judged carry; returns its path in the folder."""
+    with storing(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+    # An infeasible one may be without some of its figures.
+    known = {name: value for name, value in carry.figures.items() if np.isfinite(value)}
+    write_trajectory(path, folder.cell.compiled, carry.x, known, provenance)
     return path.relative_to(folder.root).as_posix()
-
-
-def _write_points(
-    folder: CampaignFolder, name: str, objectives: Sequence[str], points: Array
-) -> None:
-    path = reference_front_file(folder.root).with_name(f"{name}.csv")
-    write_atomically(path, csv_text(objectives, points.tolist()).encode())
-
-
-def _write_attainment(folder: CampaignFolder, name: str, results: CampaignResults) -> None:
-    surfaces = attainment_surfaces([replica.front for replica in results.of(name)], PERCENTILES)
-    rows = [
-        [f"{percentile:g}", *row]
-        for percentile, points in surfaces.items()
-        for row in points.tolist()
-    ]
-    path = folder.root / FRONTS / f"{name}-attainment.csv"
-    write_atomically(path, csv_text(["percentile", *results.objectives], rows).encode())

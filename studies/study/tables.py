@@ -6,8 +6,9 @@ The terminal shows some of them, the page all, and `tables/` has them as files.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from hybrid_opt.display.table import NOTHING, Quantity, Table, counted, number
 from hybrid_opt.indicators.statistics import summarise
@@ -115,7 +116,7 @@ def quality(
     rows = []
     for algorithm, entry in summary.algorithms.items():
         for label, figures in _variants(algorithm, entry):
-            rows.append((label, *(_mean(figures, key) for key in _QUALITY)))
+            rows.append((label, *(_over_replicas(figures, key, mean=True) for key in _QUALITY)))
         if with_paper and algorithm in PAPER:
             stated = PAPER[algorithm]
             cells = [str(stated.feasible), f"{stated.feasible / 10.0:.1f}"]
@@ -140,12 +141,27 @@ def _variants(name: str, entry: AlgorithmFigures) -> list[tuple[str, list[FrontF
     return found + ([(f"{title(name)} + polish", list(polished))] if polished else [])
 
 
-def _mean(figures: Sequence[FrontFigures], key: str) -> str:
-    """Mean and standard deviation of a figure over replicas; polished ones lack some."""
+def _over_replicas(figures: Sequence[FrontFigures], key: str, mean: bool = False) -> str:
+    """Median and quartiles of a figure over replicas, or mean and standard deviation; some figures
+    only searched or only polished replicas have."""
     if not hasattr(figures[0], key):
         return NOTHING
-    found = summarise([getattr(row, key) for row in figures])
-    return QUANTITIES[key].mean(found.mean, found.std)
+    found, quantity = summarise([getattr(row, key) for row in figures]), QUANTITIES[key]
+    if mean:
+        return quantity.mean(found.mean, found.std)
+    return quantity.spread(found.median, found.quartile1, found.quartile3)
+
+
+def _table(
+    name: str,
+    heading: str,
+    columns: Mapping[str, Callable[[Any], str]],
+    of: Iterable[Any],
+    note: str,
+) -> Table:
+    """One row per record, by what its columns make of it."""
+    rows = tuple(tuple(told(one) for told in columns.values()) for one in of)
+    return Table(name, heading, tuple(columns), rows, note)
 
 
 def selected(summary: CampaignSummary, with_paper: bool) -> Table:
@@ -204,7 +220,8 @@ def replicas(summary: CampaignSummary) -> Table:
     rows = []
     for name, entry in summary.algorithms.items():
         for label, figures in _variants(name, entry):
-            cells = [_median(figures, key) for key in ("mean_excess_above_static", "payload_limit")]
+            keys = ("mean_excess_above_static", "payload_limit")
+            cells = [_over_replicas(figures, key) for key in keys]
             better, gap = NOTHING, NOTHING
             if entry.polished is not None and label != title(name):
                 better = f"{entry.polished.replicas_improved} of {len(figures)}"
@@ -223,20 +240,13 @@ def replicas(summary: CampaignSummary) -> Table:
 
 def effort(summary: CampaignSummary) -> Table:
     """Time of a replica; only printed and not stored, because times differ from run to run."""
-    rows = []
-    for name, entry in summary.algorithms.items():
-        for label, figures in _variants(name, entry):
-            equal = _median(figures, "equivalent_evaluations")
-            rows.append((label, _median(figures, "seconds"), equal))
+    keys = ("seconds", "equivalent_evaluations")
+    every = [each for name, entry in summary.algorithms.items() for each in _variants(name, entry)]
     return Table(
         "effort",
         "What a replica took.",
-        (
-            "algorithm",
-            QUANTITIES["seconds"].heading(),
-            QUANTITIES["equivalent_evaluations"].heading(),
-        ),
-        tuple(rows),
+        ("algorithm", *(QUANTITIES[key].heading() for key in keys)),
+        tuple((label, *(_over_replicas(row, key) for key in keys)) for label, row in every),
         "Median [quartiles]. Evaluations as long: candidates that are evaluated in the time of a "
         f"polish.{_solvers(summary)}",
     )
@@ -247,14 +257,6 @@ def _solvers(summary: CampaignSummary) -> str:
     rows = [row.polished for entry in summary.algorithms.values() for row in entry.replicas]
     names = sorted({polished.solver for polished in rows if polished is not None})
     return f" Solver of the polish: {' and '.join(names)}." if names else ""
-
-
-def _median(figures: Sequence[FrontFigures], key: str) -> str:
-    """Median and quartiles of a figure over replicas; searched ones lack some."""
-    if not hasattr(figures[0], key):
-        return NOTHING
-    found = summarise([getattr(row, key) for row in figures])
-    return QUANTITIES[key].spread(found.median, found.quartile1, found.quartile3)
 
 
 def infeasible(summary: CampaignSummary) -> Table:
@@ -325,21 +327,18 @@ def bounds(search: Bounds, drivable: Bounds | None = None) -> Table:
 
 def rank_tests(summary: CampaignSummary) -> Table:
     """Mann-Whitney tests between algorithms."""
-    return Table(
+    return _table(
         "tests",
         "Comparison over replicas.",
-        ("pair", "figure", "A12", "effect", "p", "p (Holm)"),
-        tuple(
-            (
-                f"{title(test.first)} / {title(test.second)}",
-                test.figure.replace("_", " "),
-                number(test.a12),
-                test.magnitude,
-                number(test.p, 5),
-                number(test.p_holm, 5),
-            )
-            for test in summary.tests
-        ),
+        {
+            "pair": lambda test: f"{title(test.first)} / {title(test.second)}",
+            "figure": lambda test: test.figure.replace("_", " "),
+            "A12": lambda test: number(test.a12),
+            "effect": lambda test: test.magnitude,
+            "p": lambda test: number(test.p, 5),
+            "p (Holm)": lambda test: number(test.p_holm, 5),
+        },
+        summary.tests,
         "Exact Mann-Whitney tests. A12: chance that the first of the pair has the larger figure.",
     )
 
@@ -380,35 +379,31 @@ def robust_price(price: RobustPrice, robots: Sequence[str]) -> Table:
 
 def simulated(found: Sequence[StoredSimulation]) -> Table:
     """Carries in the simulated cell."""
-    return Table(
+
+    def holds(one: StoredSimulation) -> str:
+        return f"{one.slips:.3f} to {one.holds:.3f}" if math.isfinite(one.holds) else one.problem
+
+    def pressed(one: StoredSimulation) -> str:
+        return "robust forces" if one.robust else f"{number(one.factor, 1)} times the plan"
+
+    return _table(
         "simulation",
         "The selected carries in the simulated cell.",
-        (
-            "carry",
-            DURATION.heading(),
-            "holds from",
-            "slips first",
-            "pressed with",
-            "peak predicted [N]",
-            "peak simulated [N]",
-            "largest error [%]",
-            "slip [mm]",
-            "arrives",
-        ),
-        tuple(
-            (
-                one.label,
-                DURATION(one.duration),
-                f"{one.slips:.3f} to {one.holds:.3f}" if math.isfinite(one.holds) else one.problem,
-                f"pad {one.pad} at {one.begins:.2f} s" if one.pad else NOTHING,
-                "robust forces" if one.robust else f"{number(one.factor, 1)} times the plan",
-                *(" / ".join(map(FORCE, forces)) for forces in one.peaks),
-                number(100.0 * one.largest_error, 1),
-                number(1e3 * one.slip, 3),
-                "yes" if one.arrives else "NO",
-            )
-            for one in found
-        ),
+        {
+            "carry": lambda one: one.label,
+            DURATION.heading(): lambda one: DURATION(one.duration),
+            "holds from": holds,
+            "slips first": lambda one: (
+                f"pad {one.pad} at {one.begins:.2f} s" if one.pad else NOTHING
+            ),
+            "pressed with": pressed,
+            "peak predicted [N]": lambda one: " / ".join(map(FORCE, one.peaks[0])),
+            "peak simulated [N]": lambda one: " / ".join(map(FORCE, one.peaks[1])),
+            "largest error [%]": lambda one: number(100.0 * one.largest_error, 1),
+            "slip [mm]": lambda one: number(1e3 * one.slip, 3),
+            "arrives": lambda one: "yes" if one.arrives else "NO",
+        },
+        found,
         f"MuJoCo, both arms with their links' masses, controller {found[0].controller!r}. Holds "
         "from: multiple of the planned forces, between a run that slips and one that holds. The "
         "other columns: a run pressed as said, forces of both robots, their error over the "
