@@ -25,13 +25,13 @@ from symbolic.read.arms import (
     robot_urdf,
     turning_joints,
 )
-from symbolic.read.urdf import Urdf, UrdfMesh
+from symbolic.read.urdf import UrdfMesh
 from symbolic.records import Body, Box, Capsule, Cylinder, Mesh, Robot, Shape, Sphere, Workcell
 from symbolic.records.cell import ADDRESS
 from symbolic.records.poses import pose_matrix, rpy_from_rotation
 
 _LONGEST_COMMENT = 60
-WORLD = "world"
+WORLD, PAD = "world", "contact_pad"
 PLUGIN = "mock_components/GenericSystem"
 COMMANDS = ("position", "effort")
 STATES = ("position", "velocity", "effort")
@@ -52,55 +52,44 @@ _SIGNS = {
 }
 
 
-def require_maker(workcell: Workcell, maker: str, language: str, any_arm: bool) -> None:
-    """Refuse a language for arms that do not look like its maker's.
+def require_arms(
+    workcell: Workcell,
+    target: str,
+    maker: str,
+    axes: Sequence[int],
+    has_address: bool = False,
+    any_arm: bool = False,
+) -> None:
+    """Refuse a maker's target for arms that it is not for, or that lack what it needs.
 
     Args:
+        target: its name, for the message.
         maker: `ABB`, `FRANKA` or `UR`.
-        language: for the message.
-        any_arm: whether the user wants it all the same.
+        axes: numbers of turning joints that its targets can hold.
+        has_address: whether it has to know where both controllers are.
+        any_arm: whether the user wants it for arms that do not look like the maker's as well.
 
     Raises:
-        SettingsError: an arm's file, its name, xacro arguments and links name another make.
+        SettingsError: an arm's file, its name, xacro arguments and links name another make, it has
+            another number of joints or one that slides, or its driver has no address.
     """
-    if any_arm:
-        return
     for robot in workcell.robots:
-        if not _SIGNS[maker].search(described(robot)):
+        if not any_arm and not _SIGNS[maker].search(described(robot)):
             raise SettingsError(
                 f"robot {robot.name!r} is described by {robot.urdf.name}, which does not look like "
-                f"an arm of {maker}; {language} is theirs: choose another target, or force it "
+                f"an arm of {maker}; {target} is theirs: choose another target, or force it "
                 "(--any-arm) where zero and signs of its joints are the controller's"
             )
-
-
-def require_axes(workcell: Workcell, language: str, allowed: Sequence[int]) -> None:
-    """Refuse a language for arms whose joints its targets cannot hold.
-
-    Args:
-        allowed: numbers of turning joints that they can.
-
-    Raises:
-        SettingsError: an arm has another number of joints, or one that slides.
-    """
     for robot in workcell.robots:
         turning = turning_joints(arm_model(robot))
-        if len(turning) not in allowed or not all(turning):
+        if len(turning) not in axes or not all(turning):
             slide = "" if all(turning) else f", {turning.count(False)} of them sliding"
             raise SettingsError(
-                f"robot {robot.name!r} has {len(turning)} joints{slide}; targets of {language} "
-                f"hold {' or '.join(map(str, allowed))} turning axes, choose another target"
+                f"robot {robot.name!r} has {len(turning)} joints{slide}; targets of {target} "
+                f"hold {' or '.join(map(str, axes))} turning axes, choose another target"
             )
-
-
-def require_address(workcell: Workcell, target: str) -> None:
-    """Refuse a target that has to know where both controllers are.
-
-    Raises:
-        SettingsError: a robot's driver has no address.
-    """
     for robot in workcell.robots:
-        if not robot.driver.address:
+        if has_address and not robot.driver.address:
             raise SettingsError(
                 f"{target} has to know where the controller of {robot.name!r} is: write "
                 '[robots.driver] with address = "..." into its section of the workcell, or export '
@@ -166,7 +155,7 @@ def prefixes(workcell: Workcell) -> tuple[str, str]:
 
 def pad_frame(prefix: str, arm: int) -> str:
     """Name of a pad's frame."""
-    return f"{prefix or f'arm_{arm + 1}_'}contact_pad"
+    return f"{prefix or f'arm_{arm + 1}_'}{PAD}"
 
 
 def description(workcell: Workcell, q: Array) -> str:
@@ -185,7 +174,10 @@ def description(workcell: Workcell, q: Array) -> str:
         if not (shared and arm == 1):
             moving = moving_of_both if shared else set(_moving(robot))
             _add_robot(root, robot, prefix, moving)
-        _add_tool(root, robot, prefix, arm)
+        flange, pad = f"{prefix}{robot.flange}", pad_frame(prefix, arm)
+        _add_fixed(root, flange, f"{pad.removesuffix(PAD)}tool_of_cell", robot.tool)
+        _joint(root, f"{pad}_fixed", flange, pad, robot.T_flange_pad)
+        ElementTree.SubElement(root, "link", {"name": pad})
     for body in workcell.environment:
         _add_fixed(root, WORLD, f"environment_{robot_prefix(body.name)}".rstrip("_"), (body,))
     _add_hardware(root, joints, q)
@@ -207,7 +199,8 @@ def _add_robot(root: ElementTree.Element, robot: Robot, prefix: str, moving: set
         name = element.attrib["name"]
         element.set("name", f"{prefix}{name}")
         if element.tag == "link":
-            _add_shapes(element, urdf, name)
+            for collision in urdf.collisions.get(name, ()):
+                _shapes(element, collision.shape, collision.pose)
         else:
             for end in ("parent", "child"):
                 found = element.find(end)
@@ -238,25 +231,12 @@ def _hold(joint: ElementTree.Element, position: float) -> None:
     _origin(joint, pose_matrix(xyz, rpy) @ moved)
 
 
-def _add_tool(root: ElementTree.Element, robot: Robot, prefix: str, arm: int) -> None:
-    name = prefix or f"arm_{arm + 1}_"
-    flange = f"{prefix}{robot.flange}"
-    _add_fixed(root, flange, f"{name}tool_of_cell", robot.tool)
-    _joint(root, f"{name}contact_pad_fixed", flange, f"{name}contact_pad", robot.T_flange_pad)
-    ElementTree.SubElement(root, "link", {"name": f"{name}contact_pad"})
-
-
 def _add_fixed(root: ElementTree.Element, parent: str, name: str, bodies: Sequence[Body]) -> None:
     """Bodies at their poses on a link, as a link of their own."""
     _joint(root, f"{name}_fixed", parent, name, np.eye(4))
     link = ElementTree.SubElement(root, "link", {"name": name})
     for body in bodies:
         _shapes(link, body.shape, body.pose)
-
-
-def _add_shapes(link: ElementTree.Element, urdf: Urdf, name: str) -> None:
-    for collision in urdf.collisions.get(name, ()):
-        _shapes(link, collision.shape, collision.pose)
 
 
 def _shapes(link: ElementTree.Element, shape: Shape | Capsule | UrdfMesh, pose: Array) -> None:

@@ -22,9 +22,7 @@ from hybrid_opt.bundles.arms import (
     SIX,
     UR,
     addressed,
-    require_address,
-    require_axes,
-    require_maker,
+    require_arms,
 )
 from hybrid_opt.bundles.job_file import (
     BundleOptions,
@@ -181,10 +179,8 @@ class Target:
             SettingsError: the arms are not those that the target is for, or lack what it needs.
         """
         if self.maker:
-            require_maker(job.workcell, self.maker, name, any_arm)
-            require_axes(job.workcell, name, self.axes)
-        if self.has_address:
-            require_address(job.workcell, name)
+            needs = (self.maker, self.axes, self.has_address)
+            require_arms(job.workcell, name, *needs, any_arm=any_arm)
         self.require(job)
 
 
@@ -227,14 +223,7 @@ def manifest(
         "name": origin.name(job),
         "digest": job_digest(job),
         "workcell": {"name": job.workcell.name, "digest": job.workcell.digest},
-        "trajectory": {
-            "file": origin.file,
-            "sha256": origin.sha256,
-            "study": origin.study,
-            "algorithm": origin.algorithm,
-            "replica": origin.replica,
-            "point": origin.point,
-        },
+        "trajectory": {k: v for k, v in vars(origin).items() if k != "provenance"},
         "timing": {"status": job.timing.status.value, "reason": job.timing.reason},
         "duration": job.duration,
         "samples": len(export.sampled.time),

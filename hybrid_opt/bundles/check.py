@@ -174,8 +174,11 @@ def read_trajectory(path: Path, workcell: Workcell) -> JointTrajectory:
         else:
             is_json = path.suffix.lower() == ".json"
             document = json.loads(text) if is_json else yaml.load(text, Loader=yaml.CSafeLoader)
-            columns = _document_columns(document)
-            carry = _carry_of(document)
+            columns, carry = _document_columns(document), None
+            # Before and after the carry of a whole job the box touches what it stands on.
+            for phase in document.get("phases", ()):
+                if phase["name"] == "carry":
+                    carry = document["time"][phase["first"]], document["time"][phase["last"]]
         return replace(_chosen(columns, workcell), carry=carry)
     except (ValueError, KeyError, TypeError, IndexError, yaml.YAMLError, csv.Error) as error:
         raise ResultsError(f"{path}: no joint trajectory of both arms ({error})") from error
@@ -183,7 +186,7 @@ def read_trajectory(path: Path, workcell: Workcell) -> JointTrajectory:
 
 QUANTITIES = ("position", "velocity", "acceleration")
 
-Columns = tuple[Array, dict[str, dict[str, Array]]]
+Columns = tuple[Array, dict[tuple[str, str], Array]]
 """Times (n,); positions, velocities and accelerations (n,) by quantity and the joint's name."""
 
 
@@ -197,13 +200,13 @@ def _csv_columns(text: str) -> tuple[Columns, tuple[float, float] | None]:
     def column(k: int) -> Array:
         return np.array([float(row[k]) for row in body])
 
-    found: dict[str, dict[str, Array]] = {each: {} for each in QUANTITIES}
+    found: dict[tuple[str, str], Array] = {}
     for k, word in enumerate(words):
         name, _, what = word.rpartition(" ")
         if what in QUANTITIES:
-            found[what][name] = column(k)
+            found[what, name] = column(k)
         elif not name and k != at and what != "phase":
-            found["position"][what] = column(k)
+            found["position", what] = column(k)
     time, carry = column(at), None
     if "phase" in words:
         phase = words.index("phase")
@@ -213,33 +216,26 @@ def _csv_columns(text: str) -> tuple[Columns, tuple[float, float] | None]:
 
 
 def _document_columns(document: Any) -> Columns:
-    found: dict[str, dict[str, Array]] = {each: {} for each in QUANTITIES}
     if document.get("format") == CARRY_FORMAT:
         raise ValueError("it is a stored carry: export it first (python -m studies.export)")
     if "robots" in document:
-        for robot in document["robots"]:
-            for what, kept in found.items():
-                for joint, values in zip(robot["joints"], np.array(robot[what]).T, strict=True):
-                    kept[f"{robot['name']}/{joint}"] = values.astype(float)
+        found = {
+            (what, f"{robot['name']}/{joint}"): values.astype(float)
+            for robot in document["robots"]
+            for what in QUANTITIES
+            for joint, values in zip(robot["joints"], np.array(robot[what]).T, strict=True)
+        }
         return np.array(document["time"], dtype=float), found
     for key in ("goal", "joint_trajectory", "trajectory"):
         document = document.get(key, document)
-    names, points = document["joint_names"], document["points"]
+    names, points, found = document["joint_names"], document["points"], {}
     stamps = [point["time_from_start"] for point in points]
     time = np.array([stamp["sec"] + 1e-9 * stamp.get("nanosec", 0) for stamp in stamps])
     for what, plural in zip(QUANTITIES, ("positions", "velocities", "accelerations"), strict=True):
         if what == "position" or all(point.get(plural) for point in points):
             rows = np.array([point[plural] for point in points], dtype=float)
-            found[what] = dict(zip(names, rows.T, strict=True))
+            found |= {(what, name): row for name, row in zip(names, rows.T, strict=True)}
     return time, found
-
-
-def _carry_of(document: Any) -> tuple[float, float] | None:
-    """The carry of a whole job: before and after it the box touches what it stands on."""
-    for phase in document.get("phases", ()):
-        if phase["name"] == "carry":
-            return document["time"][phase["first"]], document["time"][phase["last"]]
-    return None
 
 
 def _chosen(columns: Columns, workcell: Workcell) -> JointTrajectory:
@@ -255,16 +251,16 @@ def _chosen(columns: Columns, workcell: Workcell) -> JointTrajectory:
     for known in names:
         # A name that both arms have says nothing.
         usable = known if plain.count(known[2]) == 1 else known[:2]
-        found = next((name for name in usable if name in values["position"]), None)
+        found = next((name for name in usable if ("position", name) in values), None)
         if found is None:
-            has = ", ".join(values["position"])
+            has = ", ".join(name for what, name in values if what == "position")
             raise ValueError(f"there is no joint {usable[1]!r}; it has {has}")
         picked.append(found)
     tables: list[Array] = []
     for what in QUANTITIES:
-        if not all(name in values[what] for name in picked):
+        if not all((what, name) in values for name in picked):
             break
-        tables.append(np.column_stack([values[what][name] for name in picked]))
+        tables.append(np.column_stack([values[what, name] for name in picked]))
     for rows in tables:
         if len(time) < SHORTEST or rows.shape != (len(time), len(names)):
             raise ValueError(

@@ -27,14 +27,14 @@ import pinocchio as pin
 from scipy.interpolate import BPoly
 
 from hybrid_opt.bundles.arms import prefixes
-from hybrid_opt.bundles.programs.carry_job import Limits
+from hybrid_opt.bundles.programs.carry_job import FORMAT, VERSION, Limits
 from hybrid_opt.compiled_cell import kept_per_workcell
 from hybrid_opt.errors import JobError
 from hybrid_opt.job.compliance import TRACKED, largest_skew, require_delay, require_stiffness
 from hybrid_opt.job.motions import unit_squeeze
-from hybrid_opt.job.records import HELD, Job, SampledJob, contact_effort, sample_job
+from hybrid_opt.job.records import HELD, Job, SampledJob, sample_job
 from hybrid_opt.store.files import csv_text
-from hybrid_opt.timing.model import TimingModel
+from hybrid_opt.timing.model import TimingModel, contact_torque
 from symbolic.array import Array, interpolated
 from symbolic.errors import SettingsError
 from symbolic.read.arms import arm_model, turning_joints
@@ -168,6 +168,19 @@ def pad_places(workcell: Workcell, arm: int, q: Array) -> Array:
     return np.asarray(robot.T_world_base @ found @ robot.T_flange_pad)
 
 
+def pad_jacobians(workcell: Workcell, arm: int, q: Array) -> Array:
+    """(n, 6, n_joints) velocity of an arm's pad and its rotation per way of each joint, along the
+    flange's axes, at its joints (n, n_joints) [m/rad, 1]."""
+    robot, found = workcell.robots[arm], np.empty((len(q), 6, q.shape[1]))
+    model = build_robot_model(robot)
+    data = model.model.createData()
+    for k, row in enumerate(q):
+        J = pin.computeFrameJacobian(model.model, data, row, model.flange_id, pin.LOCAL)
+        J[:3] += np.cross(J[3:].T, robot.T_flange_pad[:3, 3]).T
+        found[k] = J
+    return found
+
+
 STOP_TIMES = (0.1, 0.15, 0.2, 0.3, 0.45, 0.7, 1.0, 1.5, 2.0, 3.0)
 """Times of a stop that are tried, the shortest first [s]."""
 
@@ -201,103 +214,52 @@ class Stop:
     quick: float
 
 
-def bearing_torque(sampled: SampledJob) -> Array:
-    """(n, joints) torques that bear the arms and their tools alone [N m, N]."""
-    found = []
-    for arm, robot in enumerate(sampled.job.workcell.robots):
-        numeric = build_robot_model(robot).model
-        data = numeric.createData()
-        rows = sampled.arm(arm, sampled.q)
-        found.append(np.array([pin.computeGeneralizedGravity(numeric, data, q) for q in rows]))
-    return np.concatenate(found, axis=1)
-
-
-def pressing_torque(sampled: SampledJob) -> Array:
-    """(n, joints) torques that hold the box still at each sample and press as commanded, without
-    gravity of the arms [N m, N]."""
-    model, first = _model(sampled.job.workcell), len(sampled.job.joint_names[0])
-    matrices = model.wrench_torque(np.ascontiguousarray(sampled.q), sampled.pose)
-    return contact_effort(matrices, first, _still_wrench(model, sampled))
-
-
-def _still_wrench(model: TimingModel, sampled: SampledJob) -> Array:
-    """(n, 2, 6) wrenches on the box that hold it still and press as commanded [N, N m]."""
-    wrench = sampled.wrench.copy()
-    for phase in sampled.job.held:
-        span = sampled.span(sampled.job.phases.index(phase))
-        pose = np.ascontiguousarray(sampled.pose[span])
-        load = model.load(pose, np.zeros_like(pose), np.zeros_like(pose))
-        # The leader's force differs from the other's by what the box needs: the mean is squeezed.
-        extra = (sampled.normal_force[span] - load["normal_force"]).mean(axis=1)
-        both = np.stack([load["wrench_1"], load["wrench_2"]], axis=1)
-        squeezed = extra[:, None, None] * unit_squeeze(model.workcell, pose)
-        wrench[span] = both + squeezed
-    return wrench
-
-
 def stop_of(job: Job) -> Stop:
     """The shortest stop along the path that the commanded forces bear.
 
     Raises:
         JobError: none does.
     """
-    path = _Path(job)
-    found = [path.stop(time) for time in STOP_TIMES]
-    bearing = [stop for stop in found if stop.force_use <= 1.0]
+    model, motions = _model(job.workcell), [phase.motion for phase in job.phases]
+    time = np.concatenate([phase.begin + phase.motion.time for phase in job.phases])
+    held = np.concatenate([np.full(len(p.motion.time), float(p.name in HELD)) for p in job.phases])
+    columns = {
+        name: np.concatenate([getattr(motion, name) for motion in motions])
+        for name in ("pose", "rate", "second_rate", "q_rate", "q_second")
+    }
+    columns["force"] = np.concatenate([phase.force.normal for phase in job.phases])
+    places, x = time[::EVERY], np.linspace(0.0, 1.0, INSTANTS)
+
+    def stop(duration: float) -> Stop:
+        """One of a duration [s], tried all along the path."""
+        rate = 1.0 - x**3 * (10.0 - 15.0 * x + 6.0 * x**2)
+        slope = -30.0 * x**2 * (1.0 - x) ** 2 / duration
+        passed = duration * (x - 2.5 * x**4 + 3.0 * x**5 - x**6)
+        s = np.minimum(places[:, None] + passed, time[-1]).ravel()
+        r, change = (np.tile(each, len(places))[:, None] for each in (rate, slope))
+        at = {name: interpolated(s, time, values) for name, values in columns.items()}
+        second = at["q_second"] * r**2 + at["q_rate"] * change
+        joint_use = float((np.abs(second) / job.workcell.of_joints("acceleration_max")).max())
+        # Between two samples of phases that hold the box, pads alone hold it.
+        alone = np.interp(s, time, held) == 1.0
+        box = (at["pose"], at["rate"] * r, at["second_rate"] * r**2 + at["rate"] * change)
+        load = model.load(*(np.ascontiguousarray(values[alone]) for values in box))
+        return Stop(
+            duration, float((load["normal_force"] / at["force"][alone]).max()), joint_use, duration
+        )
+
+    found = [stop(duration) for duration in STOP_TIMES]
+    bearing = [each for each in found if each.force_use <= 1.0]
     if not bearing:
         raise JobError(
             f"a stop along the path within {STOP_TIMES[-1]:g} s asks for "
             f"{100.0 * found[-1].force_use:.1f} % of the commanded forces: press more (squeeze), "
             "or choose a slower timing"
         )
-    gentle = [stop for stop in bearing if stop.joint_use <= JOINT_USE]
+    gentle = [each for each in bearing if each.joint_use <= JOINT_USE]
     return replace(gentle[0] if gentle else bearing[-1], quick=bearing[0].time)
 
 
-class _Path:
-    """The whole job over its planned time, at its own samples."""
-
-    def __init__(self, job: Job) -> None:
-        motions = [phase.motion for phase in job.phases]
-
-        def joined(parts: list[Array]) -> Array:
-            return np.concatenate(parts)
-
-        self._job = job
-        self._model = _model(job.workcell)
-        begins = [phase.begin for phase in job.phases]
-        self._time = joined([m.time + at for m, at in zip(motions, begins, strict=True)])
-        held = [np.full(len(p.motion.time), p.name in HELD) for p in job.phases]
-        self._held = joined(held)
-        self._columns = {
-            name: joined([getattr(motion, name) for motion in motions])
-            for name in ("pose", "rate", "second_rate", "q_rate", "q_second")
-        }
-        self._columns["force"] = joined([phase.force.normal for phase in job.phases])
-
-    def stop(self, duration: float) -> Stop:
-        """A stop of a duration [s], tried all along the path."""
-        x = np.linspace(0.0, 1.0, INSTANTS)
-        rate = 1.0 - x**3 * (10.0 - 15.0 * x + 6.0 * x**2)
-        slope = -30.0 * x**2 * (1.0 - x) ** 2 / duration
-        passed = duration * (x - 2.5 * x**4 + 3.0 * x**5 - x**6)
-        places = self._time[::EVERY]
-        s = np.minimum(places[:, None] + passed, self._time[-1]).ravel()
-        r = np.tile(rate, len(places))[:, None]
-        change = np.tile(slope, len(places))[:, None]
-        at = {k: interpolated(s, self._time, values) for k, values in self._columns.items()}
-        second = at["q_second"] * r**2 + at["q_rate"] * change
-        joint_use = float((np.abs(second) / self._job.workcell.of_joints("acceleration_max")).max())
-        # Between two samples of phases that hold the box, pads alone hold it.
-        held = np.interp(s, self._time, self._held.astype(float)) == 1.0
-        box = (at["rate"] * r, at["second_rate"] * r**2 + at["rate"] * change)
-        load = self._model.load(*(np.ascontiguousarray(v[held]) for v in (at["pose"], *box)))
-        use = load["normal_force"] / at["force"][held]
-        return Stop(duration, float(use.max()), joint_use, duration)
-
-
-JSON_FORMAT = "dual-arm-carry job"
-JSON_VERSION = 2
 SCHEMA = "job.schema.json"
 
 START, PATH = 0.005, 0.02
@@ -392,13 +354,43 @@ class Export:
     @cached_property
     def gravity(self) -> Array:
         """(n, joints) torques that bear the arms and their tools alone [N m, N]."""
-        return bearing_torque(self.sampled)
+        found = []
+        for arm, robot in enumerate(self.workcell.robots):
+            numeric = build_robot_model(robot).model
+            data, rows = numeric.createData(), self.sampled.arm(arm, self.sampled.q)
+            found.append(np.array([pin.computeGeneralizedGravity(numeric, data, q) for q in rows]))
+        return np.concatenate(found, axis=1)
 
     @cached_property
     def holding(self) -> Array:
         """(n, joints) torques that stand still there and press as commanded, with gravity [N m,
         N]."""
-        return self.gravity + pressing_torque(self.sampled)
+        sampled, model = self.sampled, _model(self.workcell)
+        wrench = sampled.wrench.copy()
+        for phase in self.job.held:
+            span = sampled.span(self.job.phases.index(phase))
+            pose = np.ascontiguousarray(sampled.pose[span])
+            load = model.load(pose, np.zeros_like(pose), np.zeros_like(pose))
+            # The leader's force differs from the other's by what the box needs: the mean is
+            # squeezed.
+            extra = (sampled.normal_force[span] - load["normal_force"]).mean(axis=1)
+            both = np.stack([load["wrench_1"], load["wrench_2"]], axis=1)
+            wrench[span] = both + extra[:, None, None] * unit_squeeze(self.workcell, pose)
+        matrices = model.wrench_torque(np.ascontiguousarray(sampled.q), sampled.pose)
+        first = len(self.job.joint_names[0])
+        return self.gravity + contact_torque(first, matrices, np.swapaxes(wrench, 0, 1))
+
+    @property
+    def joint_columns(self) -> dict[str, Array]:
+        """(n, joints) by name what joints do: positions, their derivatives, efforts."""
+        sampled = self.sampled
+        return {
+            "position": sampled.q,
+            "velocity": sampled.q_rate,
+            "acceleration": sampled.q_second,
+            "effort_with_gravity": sampled.effort,
+            "effort_without_gravity": sampled.effort - self.gravity,
+        }
 
     @cached_property
     def limits(self) -> Limits:
@@ -417,6 +409,11 @@ class Export:
             silence=SILENCE,
         )
 
+    def reach(self, arm: int) -> Array:
+        """(n_joints,) largest way of an arm's pad per way of each joint at any sample [m]."""
+        J = pad_jacobians(self.workcell, arm, self.sampled.arm(arm, self.sampled.q))
+        return np.asarray(np.linalg.norm(J[:, :3], axis=1).max(axis=0))
+
     def ros_joints(self, arm: int) -> list[str]:
         """Names of an arm's joints in ROS: each behind its robot's prefix."""
         prefix = prefixes(self.workcell)[arm]
@@ -429,8 +426,8 @@ class Export:
         orientation = self.workcell.task.orientation
         spans = map(sampled.span, range(len(job.phases)))
         return {
-            "format": JSON_FORMAT,
-            "version": JSON_VERSION,
+            "format": FORMAT,
+            "version": VERSION,
             "workcell": self.workcell.name,
             "time": sampled.time.tolist(),
             "phases": [
@@ -449,12 +446,7 @@ class Export:
     def _robot(self, arm: int) -> dict[str, Any]:
         sampled = self.sampled
         robot = self.workcell.robots[arm]
-        rows = {
-            "position": sampled.q,
-            "velocity": sampled.q_rate,
-            "acceleration": sampled.q_second,
-            "effort_with_gravity": sampled.effort,
-            "effort_without_gravity": sampled.effort - self.gravity,
+        rows = self.joint_columns | {
             "hold_effort_with_gravity": self.holding,
             "hold_effort_without_gravity": self.holding - self.gravity,
         }
@@ -463,7 +455,7 @@ class Export:
             "joints": list(self.job.joint_names[arm]),
             "ros_joints": self.ros_joints(arm),
             "force_controlled": arm == self.follower,
-            "reach": reach(self.workcell, arm, sampled.arm(arm, sampled.q)).tolist(),
+            "reach": self.reach(arm).tolist(),
             **{name: sampled.arm(arm, values).tolist() for name, values in rows.items()},
             "normal_force": sampled.normal_force[:, arm].tolist(),
             "wrench": sampled.wrench[:, arm].tolist(),
@@ -487,18 +479,6 @@ class Export:
         return mass, moment / mass if mass else moment
 
 
-def reach(workcell: Workcell, arm: int, q: Array) -> Array:
-    """(n_joints,) largest way of the pad per way of each joint, at joints (n, n_joints) [m]."""
-    robot = workcell.robots[arm]
-    model = build_robot_model(robot)
-    data, found = model.model.createData(), np.zeros(q.shape[1])
-    for row in q:
-        J = pin.computeFrameJacobian(model.model, data, row, model.flange_id, pin.LOCAL)
-        across = np.cross(J[3:].T, robot.T_flange_pad[:3, 3])
-        found = np.maximum(found, np.linalg.norm(J[:3].T + across, axis=1))
-    return found
-
-
 def json_files(export: Export) -> dict[str, str | bytes]:
     """The job in full precision, and its schema."""
     schema = (files("hybrid_opt.bundles") / SCHEMA).read_text("utf-8")
@@ -510,36 +490,22 @@ def job_text(export: Export) -> str:
     return json.dumps(export.document, allow_nan=False, separators=(",", ":")) + "\n"
 
 
-# --- the same as a table ---
-
-
 _POSE_UNITS = ("m",) * 3 + ("rad",) * 3
 _WRENCH = ("fx [N]", "fy [N]", "fz [N]", "mx [N m]", "my [N m]", "mz [N m]")
-_JOINT_QUANTITIES = (
-    ("position", "rad", "m"),
-    ("velocity", "rad/s", "m/s"),
-    ("acceleration", "rad/s^2", "m/s^2"),
-    ("effort with gravity", "N m", "N"),
-    ("effort without gravity", "N m", "N"),
-)
-"""Words for what joints do, units of those that turn and those that slide."""
+_JOINT_UNITS = (("rad", "m"), ("rad/s", "m/s"), ("rad/s^2", "m/s^2"), ("N m", "N"), ("N m", "N"))
+"""Units of `Export.joint_columns` of joints that turn and of those that slide."""
 
 
 def job_table(export: Export) -> str:
     """One row per time step, one column per quantity, named with its unit."""
     job, sampled = export.job, export.sampled
-    values_of = (
-        sampled.q,
-        sampled.q_rate,
-        sampled.q_second,
-        sampled.effort,
-        sampled.effort - export.gravity,
-    )
     robots = [robot.name for robot in job.workcell.robots]
-    names = zip(components(job.workcell.task.orientation), _POSE_UNITS, strict=True)
-    header = ["time [s]", "phase", *(f"box {name} [{unit}]" for name, unit in names)]
+    pose = zip(components(job.workcell.task.orientation), _POSE_UNITS, strict=True)
+    header = ["time [s]", "phase", *(f"box {name} [{unit}]" for name, unit in pose)]
     columns = [sampled.pose]
-    for (word, unit, sliding), values in zip(_JOINT_QUANTITIES, values_of, strict=True):
+    known = zip(export.joint_columns.items(), _JOINT_UNITS, strict=True)
+    for (name, values), (unit, sliding) in known:
+        word = name.replace("_", " ")
         for robot, joints in zip(job.workcell.robots, job.joint_names, strict=True):
             header += [
                 f"{robot.name}/{joint} {word} [{unit if turns else sliding}]"

@@ -29,24 +29,20 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator
-from string import Template
+from collections.abc import Iterator, Sequence
 
 import numpy as np
-import pinocchio as pin
 from scipy.spatial.transform import Rotation
 
 from hybrid_opt.bundles.arms import SEVEN, SIX, comment, robot_prefix
-from hybrid_opt.bundles.job_file import Export, job_text, pad_places
-from hybrid_opt.bundles.programs import program
+from hybrid_opt.bundles.job_file import Export, job_text, pad_jacobians, pad_places
+from hybrid_opt.bundles.programs import filled, program
 from hybrid_opt.bundles.programs.carry_job import PRESSED
 from hybrid_opt.job.motions import TICK
 from hybrid_opt.job.records import HELD, Job
 from symbolic.array import Array
 from symbolic.errors import SettingsError
-from symbolic.records import Workcell
 from symbolic.records.poses import box_rotation, inverse
-from symbolic.robot.model import build_robot_model
 
 TASKS = ("T_ROB1", "T_ROB2")
 TWO_ARMED_TASKS = ("T_ROB_L", "T_ROB_R")
@@ -87,6 +83,9 @@ object, and misses 3.4 % of the normal force there."""
 LEAST_SPEED = 0.1
 """Least speed of a move under force [mm/s], [degrees/s]."""
 
+LEFT_OUT = "\0"
+"""Marks lines of the template that only the pressing arm has, in the other's module."""
+
 
 def require_force_control(job: Job, target: str) -> None:
     """Refuse a job whose pressing arm has no force control.
@@ -107,19 +106,14 @@ def require_force_control(job: Job, target: str) -> None:
 def require_rapid(job: Job) -> None:
     """Refuse a job of arms without Force Control, or that turns the box."""
     require_force_control(job, "abb-rapid")
-    turned = _turned(job)
+    poses = np.concatenate([phase.motion.pose for phase in job.held])
+    rotation = Rotation.from_matrix(box_rotation(job.workcell.task.orientation, poses))
+    turned = float(np.rad2deg((rotation[0].inv() * rotation).magnitude().max()))
     if turned > MOST_TURN:
         raise SettingsError(
             f"the box turns by {turned:.0f} degrees; under abb-rapid the force keeps its direction "
             f"in the room, at most {MOST_TURN:g} degrees are allowed: choose abb-egm"
         )
-
-
-def _turned(job: Job) -> float:
-    """Largest turn of the box against where it is gripped, while it is held [degrees]."""
-    poses = np.concatenate([p.motion.pose for p in job.held])
-    rotation = Rotation.from_matrix(box_rotation(job.workcell.task.orientation, poses))
-    return float(np.rad2deg((rotation[0].inv() * rotation).magnitude().max()))
 
 
 def rapid_files(export: Export) -> dict[str, str | bytes]:
@@ -136,11 +130,7 @@ def rapid_files(export: Export) -> dict[str, str | bytes]:
             f"step of at least {LEAST_MOVE_TIME:g} s that gives at most {MAX_MOVES} moves"
         )
     tasks = tasks_of(export)
-    # RAPID files have Windows line ends.
-    return {
-        f"{tasks[arm]}/Carry{arm + 1}.mod": "\r\n".join(_module(export, arm)) + "\r\n"
-        for arm in (0, 1)
-    }
+    return {f"{tasks[arm]}/Carry{arm + 1}.mod": _module(export, arm) for arm in (0, 1)}
 
 
 def tasks_of(export: Export) -> tuple[str, str]:
@@ -149,111 +139,90 @@ def tasks_of(export: Export) -> tuple[str, str]:
     return TWO_ARMED_TASKS if two_armed else TASKS
 
 
-def _module(export: Export, arm: int) -> Iterator[str]:
-    job, robot, tasks = export.job, export.workcell.robots[arm], tasks_of(export)
-    degrees = np.rad2deg(export.sampled.arm(arm, export.sampled.q))
-    presses = arm == export.follower
-    yield f"MODULE Carry{arm + 1}"
-    yield f"  ! {comment(job.workcell.name)}"
-    yield f"  ! Robot {comment(robot.name)} in task {tasks[arm]}"
-    yield f"  ! {len(degrees)} positions, {float(export.sampled.time[-1]):.3f} s"
-    yield f'  PERS tasks carryTasks{{2}} := [["{tasks[0]}"],["{tasks[1]}"]];'
-    yield f"  PERS tooldata carryPad := {tool_data(export, arm)};"
-    yield f"  PERS loaddata carryHalfBox := {_load_data(export, arm)};"
+def _module(export: Export, arm: int) -> str:
+    job, sampled, robot = export.job, export.sampled, export.workcell.robots[arm]
+    tasks, q = tasks_of(export), sampled.arm(arm, sampled.q)
+    presses, places, grip = arm == export.follower, list[str](), ""
     if presses:
-        pad = pad_places(export.workcell, arm, export.sampled.arm(arm, export.sampled.q))
-        frame = inverse(robot.T_world_base) @ pad[export.sampled.span(1).start]
-        yield f'  PERS wobjdata carryGrip := [FALSE,TRUE,"",{_frame(frame)},{_frame(np.eye(4))}];'
-        yield "  ! 1 or -1: with which sign of Fz FCPress1LStart moves this pad along +z of"
-        yield "  ! carryPad. Find it out in the air, with 5 N; 0 ends the program."
-        yield "  PERS num carrySign := 0;"
-    for number in range(len(job.phases) + 1):
-        yield f"  VAR syncident carryMeet{number + 1};"
-    yield f"  CONST jointtarget carryFirst := {target_text(degrees[0])};"
-    yield ""
-    yield from _main(export, presses)
-    yield from checked_start(degrees.shape[1])
-    places = _places(export, arm) if presses else []
-    for index, phase in enumerate(job.phases):
-        yield f"  PROC Carry_{phase.name}()"
-        yield f"    ! {phase.duration:.3f} s"
-        span = export.sampled.span(index)
-        if presses and phase.name in ("press", "release", *HELD):
-            yield from _pressed(export, arm, index, places)
-        elif phase.name in ("press", "release"):
-            yield f"    WaitTime {phase.duration:.3f};"
-        else:
-            for k in range(span.start + 1, span.stop):
-                zone = ZONE if k < span.stop - 1 else "fine"
-                time = float(export.sampled.time[k] - export.sampled.time[k - 1])
-                yield (
-                    f"    MoveAbsJ {target_text(degrees[k])} \\NoEOffs, v1000 \\T:={time:.6f}, "
-                    f"{zone}, carryPad;"
-                )
-        yield "  ENDPROC"
-        yield ""
-    yield "ENDMODULE"
+        pad = pad_places(export.workcell, arm, q)
+        T_base_grip = inverse(robot.T_world_base) @ pad[sampled.span(1).start]
+        grip = f"{_frame(T_base_grip)},{_frame(np.eye(4))}"
+        places = _places(export, arm)
+    calls, last = [], len(job.phases) + 1
+    for number, phase in enumerate(job.phases, start=1):
+        calls += [_meeting(number)]
+        calls += ["    GripLoad load0;"] if phase.name == "release" else []
+        calls += [f"    Carry_{phase.name};"]
+        calls += ["    GripLoad carryHalfBox;"] if phase.name == "press" else []
+    payload, T_pad_box = export.workcell.payload, inverse(export.workcell.contacts[arm].T_box_pad)
+    # Half of the box about its centre of mass, in the pad's frame.
+    centre = 1e3 * (T_pad_box @ np.append(payload.centre_of_mass, 1.0))[:3]
+    text = filled(
+        "carry.mod",
+        number=arm + 1,
+        cell=comment(job.workcell.name),
+        robot=comment(robot.name),
+        task=tasks[arm],
+        positions=len(q),
+        duration=f"{float(sampled.time[-1]):.3f}",
+        first_task=tasks[0],
+        second_task=tasks[1],
+        tool=tool_data(export, arm),
+        load=_load(payload.mass / 2.0, centre, np.zeros(3)),
+        pressing="" if presses else LEFT_OUT,
+        grip=grip,
+        meetings="\n".join(f"  VAR syncident carryMeet{k};" for k in range(1, last + 1)),
+        first=target_text(np.rad2deg(q[0])),
+        calls="\n".join([*calls, _meeting(last)]),
+        check="\n".join(checked_start(q.shape[1])),
+        phases="\n".join(line for k in range(last - 1) for line in _moves(export, arm, k, places)),
+    )
+    # RAPID files have Windows line ends.
+    return "\r\n".join(line for line in text.split("\n") if LEFT_OUT not in line)
 
 
-def _main(export: Export, presses: bool) -> Iterator[str]:
-    yield "  PROC Carry()"
-    if presses:
-        yield "    IF Abs(carrySign) <> 1 THEN"
-        yield '      TPWrite "Carry: find out carrySign first, see the module.";'
-        yield "      EXIT;"
-        yield "    ENDIF"
-    yield "    CarryCheckStart;"
-    yield "    ConfL \\Off;"
-    if presses:
-        yield "    FCCalib carryPad.tload;"
-    for number, phase in enumerate(export.job.phases, start=1):
-        yield f"    WaitSyncTask \\InPos, carryMeet{number}, carryTasks \\TimeOut:={MEETING};"
-        if phase.name == "release":
-            yield "    GripLoad load0;"
-        yield f"    Carry_{phase.name};"
-        if phase.name == "press":
-            yield "    GripLoad carryHalfBox;"
-    last = len(export.job.phases) + 1
-    yield f"    WaitSyncTask \\InPos, carryMeet{last}, carryTasks \\TimeOut:={MEETING};"
-    yield "  ERROR"
-    yield "    IF ERRNO = ERR_WAITSYNCTASK THEN"
-    yield '      TPWrite "Carry: the other task did not come; this arm holds.";'
-    yield "      EXIT;"
-    yield "    ENDIF"
+def _meeting(number: int) -> str:
+    return f"    WaitSyncTask \\InPos, carryMeet{number}, carryTasks \\TimeOut:={MEETING};"
+
+
+def _moves(export: Export, arm: int, index: int, places: Sequence[str]) -> Iterator[str]:
+    """The procedure of a phase; under force control where the pressing arm has `places`."""
+    sampled, phase = export.sampled, export.job.phases[index]
+    span, force, q = sampled.span(index), sampled.normal_force, sampled.arm(arm, sampled.q)
+    steps, last = np.diff(sampled.time), span.stop - 1
+    tool = "carryPad \\WObj:=carryGrip"
+    yield f"  PROC Carry_{phase.name}()"
+    yield f"    ! {phase.duration:.3f} s"
+    if phase.name in ("press", "release") and not places:
+        yield f"    WaitTime {phase.duration:.3f};"
+    elif phase.name == "press":
+        yield (
+            f"    FCPress1LStart {places[last]}, v5, \\Fz:=carrySign*{force[last, arm]:.3f}, "
+            f"{THRESHOLD} \\PosSupvDist:={SUPERVISED}, fine, {tool};"
+        )
+    elif phase.name == "release":
+        yield f"    FCPressEnd {places[last]}, v5, \\DeactOnly, {tool};"
+    elif phase.name in HELD and places:
+        pad = pad_places(export.workcell, arm, q[span])
+        way = 1e3 * np.linalg.norm(np.diff(pad[:, :3, 3], axis=0), axis=1)
+        rotation = Rotation.from_matrix(pad[:, :3, :3])
+        turn = np.rad2deg((rotation[:-1].inv() * rotation[1:]).magnitude())
+        for j, k in enumerate(range(span.start + 1, span.stop)):
+            speed, spin = (max(each[j] / steps[k - 1], LEAST_SPEED) for each in (way, turn))
+            # Until the next move no less than is needed.
+            newton = force[k - 1 : k + 1, arm].max()
+            yield (
+                f"    FCPressL {places[k]}, [{speed:.3f},{spin:.3f},5000,1000], {newton:.3f}, "
+                f"{ZONE if k < last else 'fine'}, {tool};"
+            )
+    else:
+        for k in range(span.start + 1, span.stop):
+            yield (
+                f"    MoveAbsJ {target_text(np.rad2deg(q[k]))} \\NoEOffs, v1000 "
+                f"\\T:={steps[k - 1]:.6f}, {ZONE if k < last else 'fine'}, carryPad;"
+            )
     yield "  ENDPROC"
     yield ""
-
-
-def _pressed(export: Export, arm: int, index: int, places: list[str]) -> Iterator[str]:
-    """A phase of the pressing arm under force control."""
-    sampled, phase = export.sampled, export.job.phases[index]
-    span, force = sampled.span(index), sampled.normal_force[:, arm]
-    tool = "carryPad \\WObj:=carryGrip"
-    if phase.name == "press":
-        yield (
-            f"    FCPress1LStart {places[span.stop - 1]}, v5, "
-            f"\\Fz:=carrySign*{force[span.stop - 1]:.3f}, {THRESHOLD} "
-            f"\\PosSupvDist:={SUPERVISED}, fine, {tool};"
-        )
-        return
-    if phase.name == "release":
-        yield f"    FCPressEnd {places[span.stop - 1]}, v5, \\DeactOnly, {tool};"
-        return
-    q = sampled.arm(arm, sampled.q)
-    pad = pad_places(export.workcell, arm, q[span.start : span.stop])
-    way = 1e3 * np.linalg.norm(np.diff(pad[:, :3, 3], axis=0), axis=1)
-    rotation = Rotation.from_matrix(pad[:, :3, :3])
-    turn = np.rad2deg((rotation[:-1].inv() * rotation[1:]).magnitude())
-    steps = np.diff(sampled.time[span.start : span.stop])
-    for j, k in enumerate(range(span.start + 1, span.stop)):
-        zone = ZONE if k < span.stop - 1 else "fine"
-        speed, spin = (max(each[j] / steps[j], LEAST_SPEED) for each in (way, turn))
-        # Until the next move no less than is needed.
-        newton = force[k - 1 : k + 1].max()
-        yield (
-            f"    FCPressL {places[k]}, [{speed:.3f},{spin:.3f},5000,1000], "
-            f"{newton:.3f}, {zone}, {tool};"
-        )
 
 
 def _places(export: Export, arm: int) -> list[str]:
@@ -302,13 +271,6 @@ def tool_data(export: Export, arm: int) -> str:
         return f"[TRUE,{frame},{_load(UNKNOWN_TOOL_MASS, middle, np.zeros(3))}]"
     load = robot.tool_load
     return f"[TRUE,{frame},{_load(load.mass, 1e3 * load.centre_of_mass, np.diag(load.inertia))}]"
-
-
-def _load_data(export: Export, arm: int) -> str:
-    """A loaddata: half of the box about its centre of mass, in the pad's frame."""
-    payload, contact = export.workcell.payload, export.workcell.contacts[arm]
-    centre = inverse(contact.T_box_pad) @ np.append(payload.centre_of_mass, 1.0)
-    return _load(payload.mass / 2.0, 1e3 * centre[:3], np.zeros(3))
 
 
 def _load(mass: float, centre: Array, inertia: Array) -> str:
@@ -360,7 +322,10 @@ def require_egm(job: Job) -> None:
 
 def egm_files(export: Export) -> dict[str, str | bytes]:
     """The stream's program, and what starts EGM in both tasks."""
-    robots, follower = export.workcell.robots, export.follower
+    robots, follower, q = export.workcell.robots, export.follower, export.sampled.q
+    J = pad_jacobians(export.workcell, follower, export.sampled.arm(follower, q))
+    # Along the pad's normal, without turning it.
+    way = np.concatenate([robots[follower].T_flange_pad[:3, 2], np.zeros(3)])
     lag = max(LEAST_LAG, robots[follower].driver.lag)
     compliance = 2.0 / export.options.stiffness
     config = {
@@ -374,9 +339,7 @@ def egm_files(export: Export) -> dict[str, str | bytes]:
             "most": MOST_WAY * compliance * float(export.job.peak_normal_force[follower]),
             "speed": PRESS_SPEED,
         },
-        "inward": inward(export.workcell, follower, export.sampled.arm(follower, export.sampled.q))
-        .round(9)
-        .tolist(),
+        "inward": np.array([np.linalg.pinv(each) @ way for each in J]).round(9).tolist(),
     }
     tasks = tasks_of(export)
     modules = {f"{tasks[arm]}/CarryEgm{arm + 1}.mod": _egm_module(export, arm) for arm in (0, 1)}
@@ -388,26 +351,11 @@ def egm_files(export: Export) -> dict[str, str | bytes]:
     }
 
 
-def inward(workcell: Workcell, arm: int, q: Array) -> Array:
-    """(n, n_joints) joints per way of an arm's pad along its normal, without turning it [rad/m].
-
-    Args:
-        q: (n, n_joints) of the arm [rad].
-    """
-    robot, found = workcell.robots[arm], np.empty_like(q)
-    model = build_robot_model(robot)
-    data, T = model.model.createData(), robot.T_flange_pad
-    for k, row in enumerate(q):
-        J = pin.computeFrameJacobian(model.model, data, row, model.flange_id, pin.LOCAL)
-        J[:3] += np.cross(J[3:].T, T[:3, 3]).T
-        found[k] = np.linalg.pinv(J) @ np.concatenate([T[:3, 2], np.zeros(3)])
-    return found
-
-
 def _egm_module(export: Export, arm: int) -> str:
     robot, axes = export.workcell.robots[arm], range(1, SIX + 1)
     first = np.rad2deg(export.sampled.arm(arm, export.sampled.q)[0])
-    text = Template(program("carry_egm.mod")).substitute(
+    text = filled(
+        "carry_egm.mod",
         number=arm + 1,
         cell=comment(export.workcell.name),
         robot=comment(robot.name),
@@ -459,7 +407,8 @@ def _program(export: Export, arm: int) -> str:
     calls = [f"  {phase.name}()" for phase in job.phases]
     release = [phase.name for phase in job.phases].index("release")
     calls.insert(release + 1, "  end_force_mode()")
-    return Template(program("carry.script")).substitute(
+    return filled(
+        "carry.script",
         title=f"{comment(job.workcell.name)}: robot {comment(robot.name)}",
         first=_list(export.sampled.arm(arm, export.sampled.q)[0]),
         tcp=_pose(robot.T_flange_pad),

@@ -116,28 +116,22 @@ class Straight:
         return poses[0], poses[1], poses[2]
 
 
-def lift_line(name: str, begin: Array, end: Array, speed: float) -> Straight:
-    """The held box from a pose (6,) to another of the same orientation."""
-    box = np.array([begin, end])
-    return Straight(name, box, np.array([box, box]), speed)
-
-
-def pad_line(
-    workcell: Workcell, name: str, box: Array, ways: tuple[float, float], speed: float
+def straight(
+    workcell: Workcell, name: str, box: Array, away: tuple[float, float], speed: float
 ) -> Straight:
-    """Both pads along their normals, the box standing still.
+    """The box from a pose to another of the same orientation, with both pads along their normals.
 
     Args:
-        box: (6,) its pose.
-        ways: distances of the pads from the box at beginning and end [m].
+        box: (2, 6) its poses at beginning and end.
+        away: distances of the pads from it then [m].
         speed: largest [m/s].
     """
-    rotation = box_rotation(workcell.task.orientation, box)
-    held = np.tile(box, (2, 2, 1))
+    held = np.array([box, box])
     for arm, contact in enumerate(workcell.contacts):
-        for end, distance in enumerate(ways):
+        for end, distance in enumerate(away):
+            rotation = box_rotation(workcell.task.orientation, box[end])
             held[arm, end, :3] -= distance * (rotation @ contact.T_box_pad[:3, 2])
-    return Straight(name, np.tile(box, (2, 1)), held, speed)
+    return Straight(name, box, held, speed)
 
 
 def lines_around(
@@ -151,12 +145,16 @@ def lines_around(
         pose: (2, 6) of the box where the carry begins and ends.
     """
     away, speed = handling.stand_off, handling.pressing_speed
-    before = [pad_line(workcell, "approach", stands[0], (away, 0.0), speed)]
-    after = [pad_line(workcell, "retreat", stands[1], (0.0, away), speed)]
+    stand, down = (np.tile(box, (2, 1)) for box in stands)
+    before = [straight(workcell, "approach", stand, (away, 0.0), speed)]
+    after = [straight(workcell, "retreat", down, (0.0, away), speed)]
+    held, speed = (0.0, 0.0), handling.lifting_speed
     if not np.array_equal(stands[0], pose[0]):
-        before.insert(0, lift_line("lift", stands[0], pose[0], handling.lifting_speed))
+        box = np.array([stands[0], pose[0]])
+        before.insert(0, straight(workcell, "lift", box, held, speed))
     if not np.array_equal(stands[1], pose[1]):
-        after.insert(0, lift_line("set_down", pose[1], stands[1], handling.lifting_speed))
+        box = np.array([pose[1], stands[1]])
+        after.insert(0, straight(workcell, "set_down", box, held, speed))
     return before, after
 
 
@@ -190,23 +188,17 @@ def followed(
     samples = rise(1.0, SAMPLES).value
     guess = interpolated(samples, ways[: len(reached)], reached)
     q = held_at(workcell, posture, line, share(samples), guess)
-    lost = ~np.isfinite(q).all(axis=1)
-    if lost.any():
-        place = share(samples[lost][0])
-        raise JobError(_unreached(line, float(place), "does not reach"))
     lower, upper = map(workcell.of_joints, ("position_lower", "position_upper"))
     outside = ((q < lower) | (q > upper)).any(axis=1)
-    if outside.any():
-        place = share(samples[outside][0])
-        raise JobError(_unreached(line, float(place), "leaves its joints' range"))
+    lost = ~np.isfinite(q).all(axis=1)
+    for wrong, what in ((lost, "does not reach"), (outside, "leaves its joints' range")):
+        if wrong.any():
+            place = 1e3 * float(share(samples[wrong][0])) * line.length
+            raise JobError(
+                f"{line.name.replace('_', ' ')}: an arm {what} {place:.0f} mm from its beginning; "
+                "change stand_off, lift_height or set_down_height under [handling]"
+            )
     return q[:: -1 if at_end else 1]
-
-
-def _unreached(line: Straight, share: float, what: str) -> str:
-    return (
-        f"{line.name.replace('_', ' ')}: an arm {what} {1e3 * share * line.length:.0f} mm from its "
-        f"beginning; change stand_off, lift_height or set_down_height under [handling]"
-    )
 
 
 def held_at(
@@ -280,55 +272,43 @@ def timed(model: TimingModel, line: Straight, q: Array) -> PhaseMotion:
     )
 
 
-def standing_still(motion: PhaseMotion, sample: int, duration: float) -> PhaseMotion:
-    """The state of a motion at one sample, held for a duration [s]."""
+def standing_still(motion: PhaseMotion, sample: int, time: Array) -> PhaseMotion:
+    """The state of a motion at one sample, held at times (n,) [s]."""
     arrays = {
-        name: np.repeat(values[sample][None], SAMPLES, axis=0)
+        name: np.repeat(values[sample][None], len(time), axis=0)
         for name, values in vars(motion).items()
         if isinstance(values, np.ndarray)
     }
     arrays |= {name: np.zeros_like(arrays[name]) for name in _MOVING}
-    arrays["time"] = np.linspace(0.0, duration, SAMPLES)
-    return PhaseMotion(motion.first, **arrays)
+    return PhaseMotion(motion.first, **arrays | {"time": time})
 
 
 def carry_motion(model: TimingModel, carry: Carry) -> PhaseMotion:
     """The carry as it is timed, then at rest until a whole number of ticks is over."""
-    q = np.ascontiguousarray(carry.q)
-    pose = np.ascontiguousarray(carry.pose)
-    values = {
-        "pose": pose,
-        "rate": carry.rate,
-        "second_rate": carry.second_rate,
-        "q": q,
-        "q_rate": carry.side_by_side("q_rate"),
-        "q_second": carry.side_by_side("q_second"),
-        "own_torque": carry.side_by_side("own_torque"),
-        "wrench_torque": model.wrench_torque(q, pose),
-    }
+    q, pose = np.ascontiguousarray(carry.q), np.ascontiguousarray(carry.pose)
     time = carry.time - carry.time[0]
-    still = _standing_torque(model, q[-1], pose[-1])
-    last = {
-        name: 0.0 * array[-1] if name in _MOVING else array[-1] for name, array in values.items()
-    }
-    last["own_torque"] = still
-    ends = np.array([time[-1], max(at_even_steps(float(time[-1]), TICK), time[-1])])
-    return PhaseMotion(
+    motion = PhaseMotion(
         first=carry.arms[0].q.shape[1],
-        time=np.concatenate([time, ends]),
-        **{
-            name: np.concatenate([array, [last[name]] * len(ends)])
-            for name, array in values.items()
-        },
+        time=time,
+        pose=pose,
+        rate=carry.rate,
+        second_rate=carry.second_rate,
+        q=q,
+        q_rate=carry.side_by_side("q_rate"),
+        q_second=carry.side_by_side("q_second"),
+        own_torque=carry.side_by_side("own_torque"),
+        wrench_torque=model.wrench_torque(q, pose),
     )
-
-
-def _standing_torque(model: TimingModel, q: Array, pose: Array) -> Array:
-    """(joints,) torques that hold the bare arms still [N m]."""
-    still = np.zeros((1, 6))
-    own = joints_of(model.workcell, q[None])
-    parts = [model.arm_motion(arm, own[arm], pose[None], still) for arm in (0, 1)]
-    return np.concatenate([part["torque_at_rest"][0] for part in parts])
+    end = max(at_even_steps(float(time[-1]), TICK), time[-1])
+    still = vars(standing_still(motion, -1, np.array([time[-1], end])))
+    # Torques that hold the bare arms still.
+    arms, zero = joints_of(model.workcell, q[-1:]), np.zeros((1, 6))
+    parts = [model.arm_motion(arm, own, pose[-1:], zero) for arm, own in enumerate(arms)]
+    torque = np.concatenate([part["torque_at_rest"][0] for part in parts])
+    still["own_torque"] = np.array([torque, torque])
+    names = [name for name in still if name != "first"]
+    joined = {name: np.concatenate([getattr(motion, name), still[name]]) for name in names}
+    return PhaseMotion(motion.first, **joined)
 
 
 EXCESS = 1.005
@@ -368,13 +348,18 @@ def holding(
     return [Force(*part) for part in parts], squeeze
 
 
-def pressing(hold: Force, sample: int, rate: float) -> tuple[float, Force]:
-    """Forces that rise from nothing to those of one sample, or fall for the last, and how long [s].
+def pressing(
+    motion: PhaseMotion, hold: Force, sample: int, rate: float
+) -> tuple[PhaseMotion, Force]:
+    """Forces that rise from nothing to those of one sample, or fall for the last, while all stand
+    still there.
 
     The box's weight goes over from what it stands on to the arms with the same profile, so that
     friction is used no more than when the box is held.
 
     Args:
+        motion, hold: a phase of which this is one end.
+        sample: 0 or -1.
         rate: fastest change of a normal force [N/s].
     """
     peak = float(hold.normal[sample].max())
@@ -384,7 +369,8 @@ def pressing(hold: Force, sample: int, rate: float) -> tuple[float, Force]:
     def scaled(values: Array) -> Array:
         return np.asarray(np.multiply.outer(share, values[sample]))
 
-    return duration, Force(scaled(hold.normal), scaled(hold.least), scaled(hold.wrench))
+    force = Force(scaled(hold.normal), scaled(hold.least), scaled(hold.wrench))
+    return standing_still(motion, sample, np.linspace(0.0, duration, SAMPLES)), force
 
 
 def without_force(motion: PhaseMotion) -> Force:
@@ -435,8 +421,12 @@ def phase_use(
     """
 
     effort = motion.own_torque + motion.contact_effort(force.wrench)
-    payload = workcell.payload
-    bounded = {} if jerk is None else _jerk_use(motion, jerk)
+    payload, bounded = workcell.payload, dict[str, float]()
+    if jerk is not None and np.isfinite(jerk.joints).any():
+        bounded["joint jerk"] = _most(_jerk(motion.time, motion.q_second) / jerk.joints)
+    if jerk is not None and np.isfinite(jerk.payload):
+        box = _length(_jerk(motion.time, motion.second_rate))
+        bounded["payload jerk"] = _most(box / jerk.payload)
     return bounded | {
         **joint_use(workcell, motion.q, motion.q_rate, motion.q_second),
         "joint torque": _most(np.abs(effort) / workcell.of_joints("torque_max")),
@@ -454,17 +444,6 @@ def joint_use(workcell: Workcell, q: Array, rate: Array, second: Array) -> dict[
         "joint velocity": _most(np.abs(rate) / workcell.of_joints("velocity_max")),
         "joint acceleration": _most(np.abs(second) / workcell.of_joints("acceleration_max")),
     }
-
-
-def _jerk_use(motion: PhaseMotion, limits: JerkLimits) -> dict[str, float]:
-    joints = _jerk(motion.time, motion.q_second)
-    box = _length(_jerk(motion.time, motion.second_rate))
-    use = {"joint jerk": _most(joints / limits.joints), "payload jerk": _most(box / limits.payload)}
-    limited = {
-        "joint jerk": np.isfinite(limits.joints).any(),
-        "payload jerk": np.isfinite(limits.payload),
-    }
-    return {name: ratio for name, ratio in use.items() if limited[name]}
 
 
 def _jerk(time: Array, second: Array) -> Array:

@@ -38,11 +38,10 @@ from hybrid_opt.job.motions import (
     phase_use,
     pressing,
     rise,
-    standing_still,
     timed,
     without_force,
 )
-from hybrid_opt.job.records import Force, Job, Phase, PhaseMotion
+from hybrid_opt.job.records import Job, Phase, PhaseMotion
 from hybrid_opt.job.smooth import WIDEST, WIDTH, rests_at_ends, without_jumps
 from hybrid_opt.robust.squeeze import Squeeze, SqueezeSettings, commanded_forces
 from hybrid_opt.timing.jerk import kept_jerk
@@ -82,6 +81,21 @@ class SupportedPose:
     bodies: tuple[str, ...]
 
 
+@dataclass(frozen=True)
+class Around:
+    """What comes before a carry and after it.
+
+    Attributes:
+        checker: of the whole job.
+        lines: straight motions before the carry and after it, either from the carry outwards.
+        stands_on: names of what the box stands on before and after.
+    """
+
+    checker: CollisionChecker
+    lines: tuple[list[Straight], list[Straight]]
+    stands_on: tuple[tuple[str, ...], tuple[str, ...]]
+
+
 class JobCollisions:
     """The collision model of one workcell's jobs. Not to be shared between threads.
 
@@ -110,8 +124,13 @@ class JobCollisions:
                 where nothing is found within `LARGEST_DROP`.
         """
         judge = Judge(self.geometry, RESTING_TOLERANCE)
-        payload = self.geometry.index(PAYLOAD)
-        below = self._fixed_bodies(payload)
+        payload, bodies = self.geometry.index(PAYLOAD), self.geometry.bodies
+        pairs = [
+            (p.first, p.second) for p in self.geometry.active if payload in (p.first, p.second)
+        ]
+        others = [first + second - payload for first, second in pairs]
+        # What stands still and the box must not run into.
+        below = [other for other in others if bodies[other].frame.kind == "world"]
         still = [np.zeros((1, len(robot.torque_max))) for robot in self._workcell.robots]
 
         def gaps(drop: float) -> Array:
@@ -129,8 +148,17 @@ class JobCollisions:
                     break
             found = 0.0 if found > LARGEST_DROP else found
         touched = gaps(found) <= RESTING_TOLERANCE if below else np.zeros(0, dtype=bool)
-        names = [self.geometry.bodies[body].name for body in np.array(below)[touched].tolist()]
+        names = [bodies[body].name for body in np.array(below)[touched].tolist()]
         return SupportedPose(_lowered(pose, found), found, tuple(names))
+
+    def around(self, handling: Handling, pose: Array) -> Around:
+        """What is around a carry whose box begins and ends at poses (2, 6)."""
+        heights = (handling.lift_height, handling.set_down_height)
+        before, after = (self.standing(*each) for each in zip(pose, heights, strict=True))
+        stands = (before.pose, after.pose)
+        lines = lines_around(self._workcell, handling, stands, pose)
+        checker = self.checker((before, after))
+        return Around(checker, lines, (before.bodies, after.bodies))
 
     def checker(self, places: Sequence[SupportedPose]) -> CollisionChecker:
         """The checker of a job whose box stands at these places before and after the carry."""
@@ -148,16 +176,6 @@ class JobCollisions:
         )
         cell = replace(self._workcell, task=task)
         return CollisionChecker(replace(self.geometry, workcell=cell), self._functions)
-
-    def _fixed_bodies(self, payload: int) -> list[int]:
-        """Bodies that stand still and that the box must not run into."""
-        found = []
-        for pair in self.geometry.active:
-            if payload in (pair.first, pair.second):
-                other = pair.first + pair.second - payload
-                if self.geometry.bodies[other].frame.kind == "world":
-                    found.append(other)
-        return found
 
 
 def job_geometry(workcell: Workcell, everywhere: bool = False) -> CellGeometry:
@@ -223,22 +241,16 @@ def what_blocks(
         pose: (2, 6) of the box where the carry begins and ends.
         q: (2, joints) of both arms there [rad or m].
     """
-    handling = workcell.handling
-    places = (
-        collisions.standing(pose[0], handling.lift_height),
-        collisions.standing(pose[1], handling.set_down_height),
-    )
-    checker = collisions.checker(places)
+    around = collisions.around(workcell.handling, pose)
     share = rise(1.0, SAMPLES).value[::EVERY]
-    around = lines_around(workcell, handling, (places[0].pose, places[1].pose), pose)
-    for lines, known, end in zip(around, q, (0, -1), strict=True):
+    for lines, known, end in zip(around.lines, q, (0, -1), strict=True):
         for line in lines:
             try:
                 path = followed(workcell, posture, line, known, at_end=end == 0)
             except JobError as error:
                 return str(error)
             poses, joints = line.at(share)[0], joints_of(workcell, path[::EVERY])
-            touch = checker.check(poses, *joints, share).first_touch
+            touch = around.checker.check(poses, *joints, share).first_touch
             if touch is not None:
                 return f"{line.name.replace('_', ' ')}: {touch.first} meets {touch.second}"
             known = path[end]
@@ -256,25 +268,6 @@ _MOST_KNOWN = 8
 
 FIRST_POINTS = 11
 """Grid that the proof of a straight motion starts from."""
-
-
-@dataclass(frozen=True)
-class _Part:
-    """A phase before its forces are known."""
-
-    name: str
-    motion: PhaseMotion
-    proof: Certificate
-
-
-@dataclass(frozen=True)
-class _JobEnds:
-    """The phases around carries that begin and end alike, and their judges."""
-
-    before: tuple[_Part, ...]
-    after: tuple[_Part, ...]
-    stands_on: tuple[tuple[str, ...], tuple[str, ...]]
-    checker: CollisionChecker
 
 
 class JobModel:
@@ -300,7 +293,7 @@ class JobModel:
         self.timing = TimingModel(compiled) if timing is None else timing
         self._posture: NumericFunction = compiled.evaluators["posture"]
         self._collisions = JobCollisions(compiled)
-        self._known: dict[tuple[Handling, bytes], _JobEnds] = {}
+        self._known: dict[tuple[Handling, bytes], tuple[Around, list[Phase], list[Phase]]] = {}
 
     def plan(
         self,
@@ -345,81 +338,49 @@ class JobModel:
         carry = timing.carry
         assert carry is not None, "a smoothed timing has a carry"
         handling = handling or self.workcell.handling
-        around = self._around(carry, handling)
-        before, after = around.before, around.after
-        loaded = [
-            *before[1:],
-            _Part("carry", carry_motion(self.timing, carry), self._proof(around.checker, carry)),
-            *after[:-1],
-        ]
+        around, (*before, first), (*after, last) = self._around(carry, handling)
+        motion = carry_motion(self.timing, carry)
+        middle = Phase(
+            "carry", 0.0, motion, without_force(motion), self._proof(around.checker, carry), {}
+        )
+        loaded = [*before[::-1], middle, *after]
         settings = squeeze or SqueezeSettings()
         forces, chosen = holding(self.timing, settings, [part.motion for part in loaded])
-        first, last = before[0], after[-1]
+        held = [replace(part, force=force) for part, force in zip(loaded, forces, strict=True)]
+        rate, ends = handling.pressing_rate, (("press", first, 0), ("release", last, -1))
         press, release = (
-            (name, *_pressed(motion, force, end, handling.pressing_rate))
-            for name, motion, force, end in (
-                ("press", loaded[0].motion, forces[0], 0),
-                ("release", loaded[-1].motion, forces[-1], -1),
-            )
+            Phase(name, 0.0, *pressing(held[k].motion, held[k].force, k, rate), end.certificate, {})
+            for name, end, k in ends
         )
-        planned = [
-            (first.name, first.motion, without_force(first.motion), first.proof),
-            (*press, first.proof),
-            *(
-                (part.name, part.motion, force, part.proof)
-                for part, force in zip(loaded, forces, strict=True)
-            ),
-            (*release, last.proof),
-            (last.name, last.motion, without_force(last.motion), last.proof),
-        ]
-        job = Job(
+        return Job(
             self.workcell,
             timing,
-            tuple(self._phases(planned, timing, jerk)),
+            tuple(self._phases([first, press, *held, release, last], timing, jerk)),
             chosen,
             around.stands_on,
             self.timing.joint_names,
         )
-        refuse_excess(job)
-        return job
 
-    def _around(self, carry: Carry, handling: Handling) -> _JobEnds:
-        """The phases around a carry, computed once for carries with the same ends."""
+    def _around(self, carry: Carry, handling: Handling) -> tuple[Around, list[Phase], list[Phase]]:
+        """The moving phases before a carry and after it, either from the carry outwards, computed
+        once for carries with the same ends."""
         pose, q = carry.pose[[0, -1]], carry.q[[0, -1]].round(_SAME_POSTURE)
         key = handling, pose.tobytes() + q.tobytes()
-        if key not in self._known:
-            if len(self._known) >= _MOST_KNOWN:
-                self._known.clear()
-            self._known[key] = self._handling(pose, q, handling)
+        if key in self._known:
+            return self._known[key]
+        if len(self._known) >= _MOST_KNOWN:
+            self._known.clear()
+        around = self._collisions.around(handling, pose)
+        found: tuple[list[Phase], list[Phase]] = ([], [])
+        for phases, lines, known, end in zip(found, around.lines, q, (0, -1), strict=True):
+            for line in lines:
+                way = followed(self.workcell, self._posture, line, known, at_end=end == 0)
+                motion = timed(self.timing, line, way)
+                proof = self._free(around.checker, line, motion)
+                phases.append(Phase(line.name, 0.0, motion, without_force(motion), proof, {}))
+                known = motion.q[end]
+        self._known[key] = around, *found
         return self._known[key]
-
-    def _handling(self, pose: Array, known: Array, handling: Handling) -> _JobEnds:
-        """The moving phases before a carry, in order, and after it.
-
-        Args:
-            pose: (2, 6) of the box where the carry begins and ends.
-            known: (2, joints) about where the joints are then [rad].
-        """
-        places = (
-            self._collisions.standing(pose[0], handling.lift_height),
-            self._collisions.standing(pose[1], handling.set_down_height),
-        )
-        checker = self._collisions.checker(places)
-        stands = places[0].pose, places[1].pose
-        lines = lines_around(self.workcell, handling, stands, pose)
-        found: tuple[list[_Part], list[_Part]] = ([], [])
-        for parts, outwards, q, end in zip(found, lines, known, (0, -1), strict=True):
-            for line in outwards:
-                parts.append(self._part(checker, line, q, at_end=end == 0))
-                q = parts[-1].motion.q[end]
-        before, after = found
-        stands_on = (places[0].bodies, places[1].bodies)
-        return _JobEnds(tuple(before[::-1]), tuple(after), stands_on, checker)
-
-    def _part(self, checker: CollisionChecker, line: Straight, known: Array, at_end: bool) -> _Part:
-        q = followed(self.workcell, self._posture, line, known, at_end)
-        motion = timed(self.timing, line, q)
-        return _Part(line.name, motion, self._free(checker, line, motion))
 
     def _proof(self, checker: CollisionChecker, carry: Carry) -> Certificate:
         """The continuous verdict on the carry."""
@@ -441,46 +402,34 @@ class JobModel:
         return certify(checker, at, np.linspace(0.0, 1.0, FIRST_POINTS))
 
     def _phases(
-        self,
-        planned: Sequence[tuple[str, PhaseMotion, Force, Certificate]],
-        timing: Timing,
-        jerk: JerkLimits | None,
+        self, drafts: Sequence[Phase], timing: Timing, jerk: JerkLimits | None
     ) -> Iterator[Phase]:
+        """The phases one after the other, with their uses; none that collides or exceeds a
+        limit."""
         begin = 0.0
-        for name, motion, force, proof in planned:
+        for draft in drafts:
             # Jumps that a carry is to keep are reported elsewhere.
-            jumps = name == "carry" and not rests_at_ends(timing)
-            use = phase_use(self.workcell, motion, force, None if jumps else jerk)
-            if name == "carry":
+            jumps = draft.name == "carry" and not rests_at_ends(timing)
+            kept = None if jumps else jerk
+            use = phase_use(self.workcell, draft.motion, draft.force, kept)
+            if draft.name == "carry":
                 # The box's turning and the contacts, which no other phase uses more.
                 use = {key: excess.ratio for key, excess in timing.use.items()} | use
-            yield Phase(name, begin, motion, force, proof, use)
-            begin += motion.duration
-
-
-def _pressed(motion: PhaseMotion, hold: Force, end: int, rate: float) -> tuple[PhaseMotion, Force]:
-    """The forces of one end of a phase (0 or -1), put on or taken off while all stand still."""
-    duration, force = pressing(hold, end, rate)
-    return standing_still(motion, end, duration), force
-
-
-def refuse_excess(job: Job) -> None:
-    """Raise where a phase collides or exceeds a limit."""
-    for phase in job.phases:
-        title = phase.name.replace("_", " ")
-        found = phase.certificate
-        if not found.is_free:
-            raise JobError(
-                f"{title}: {100.0 * found.at_parameter:.0f} % along its way {found.problem}; "
-                "change stand_off, lift_height or set_down_height under [handling] (a height of 0 "
-                "hands the box over in the air), or choose another carry"
-            )
-        name, ratio = max(phase.use.items(), key=lambda item: item[1])
-        if ratio > EXCESS:
-            raise JobError(
-                f"{title}: uses {100.0 * ratio:.1f} % of the limit on {name}; press less "
-                "(squeeze), or choose a slower timing"
-            )
+            title, found = draft.name.replace("_", " "), draft.certificate
+            if not found.is_free:
+                raise JobError(
+                    f"{title}: {100.0 * found.at_parameter:.0f} % along its way {found.problem}; "
+                    "change stand_off, lift_height or set_down_height under [handling] (a height "
+                    "of 0 hands the box over in the air), or choose another carry"
+                )
+            name, ratio = max(use.items(), key=lambda item: item[1])
+            if ratio > EXCESS:
+                raise JobError(
+                    f"{title}: uses {100.0 * ratio:.1f} % of the limit on {name}; press less "
+                    "(squeeze), or choose a slower timing"
+                )
+            yield replace(draft, begin=begin, use=use)
+            begin += draft.duration
 
 
 @dataclass(frozen=True)

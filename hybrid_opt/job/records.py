@@ -14,6 +14,7 @@ from hybrid_opt.collision.certify import Certificate
 from hybrid_opt.display.table import text_table
 from hybrid_opt.robust.squeeze import Squeeze
 from hybrid_opt.shown import Displayable
+from hybrid_opt.timing.model import contact_torque
 from hybrid_opt.timing.records import Timing
 from symbolic.array import Array, interpolated, set_read_only
 from symbolic.errors import SettingsError
@@ -68,7 +69,7 @@ class PhaseMotion:
 
     def contact_effort(self, wrench: Array) -> Array:
         """(n, joints) joint torques that exert wrenches (n, 2, 6) on the box [N m]."""
-        return contact_effort(self.wrench_torque, self.first, wrench)
+        return contact_torque(self.first, self.wrench_torque, np.swapaxes(wrench, 0, 1))
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,17 +126,6 @@ class Phase:
     def __post_init__(self) -> None:
         set_read_only(self.motion)
         set_read_only(self.force)
-
-
-def contact_effort(wrench_torque: Array, first: int, wrench: Array) -> Array:
-    """(n, joints) joint torques that exert wrenches (n, 2, 6) on the box [N m].
-
-    Args:
-        wrench_torque, first: see `PhaseMotion`.
-    """
-    parts = (wrench_torque[:, :first], wrench_torque[:, first:])
-    torques = [np.einsum("njk,nk->nj", part, wrench[:, arm]) for arm, part in enumerate(parts)]
-    return np.concatenate(torques, axis=1)
 
 
 @dataclass(frozen=True, eq=False, repr=False)

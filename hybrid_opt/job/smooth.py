@@ -14,12 +14,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hybrid_opt.carry import Carry
 from hybrid_opt.errors import JobError
 from hybrid_opt.timing.jerk import kept_jerk, time_with_jerk
-from hybrid_opt.timing.limits import limit_ratios, use_of, worst
+from hybrid_opt.timing.limits import judged, limit_ratios, worst
 from hybrid_opt.timing.model import TimingModel
-from hybrid_opt.timing.records import Excess, JerkLimits, Timing, TimingLimits
+from hybrid_opt.timing.records import JerkLimits, Timing, TimingLimits
 from hybrid_opt.timing.solve import time_path
 from symbolic.array import Array
 
@@ -83,7 +82,7 @@ def without_jumps(
     if width == 0.0 or rests_at_ends(timing):
         return timing
     if jerk is None:
-        return smoothed(model, timing, width)
+        return _smoothed(model, timing, width)
     assert timing.carry is not None, "a timing that is to be driven has a carry"
     found = time_with_jerk(model, timing.carry.x, timing.limits, jerk).timing
     if found.carry is None:
@@ -111,17 +110,8 @@ def driven_timing(model: TimingModel, x: Array) -> Timing:
     return without_jumps(model, timing, kept_jerk(model.workcell, limits)) if timing.ok else timing
 
 
-def smoothed(model: TimingModel, timing: Timing, width: float = WIDTH) -> Timing:
-    """The timing averaged over a window, within the limits that it was found for.
-
-    Args:
-        model: of the timing's workcell.
-        timing: one that robots can drive, with its speeds on the grid.
-        width: half the width of the window [s].
-
-    Raises:
-        JobError: the limits do not hold even at half the speed.
-    """
+def _smoothed(model: TimingModel, timing: Timing, width: float) -> Timing:
+    """The timing averaged over a window, within the limits that it was found for."""
     carry, speed = timing.carry, timing.grid_speed
     assert carry is not None, "a timing that is to be driven has a carry"
     assert speed is not None, "a timing that was found has its speeds"
@@ -133,17 +123,18 @@ def smoothed(model: TimingModel, timing: Timing, width: float = WIDTH) -> Timing
         time = np.asarray(EVERY * STEP / factor * np.arange(len(u)))
         carry = model.carry(motion, time, factor * rate, factor**2 * second)
         ratios = limit_ratios(carry, model.workcell, limits)
-        return _Slowdown(factor, carry, ratios, use_of(ratios, carry, model.joint_names))
+        found = judged(model, carry, limits, ratios)
+        columns = [ratio.ravel() for name, ratio in ratios.items() if name != "friction"]
+        return _Slowdown(factor, found, worst(found.use).ratio - 1.0, np.concatenate(columns))
 
     found = _fastest(driven)
-    place = worst(found.use).place
-    reason = f"{found.carry.duration:.3f} s without jumps of the acceleration; most used: {place}"
+    told = f"{found.timing.duration:.3f} s without jumps of the acceleration; most used: "
     return replace(
         timing,
-        reason=reason,
-        place=place,
-        carry=found.carry,
-        use=found.use,
+        reason=f"{told}{found.timing.place}",
+        place=found.timing.place,
+        carry=found.timing.carry,
+        use=found.timing.use,
         grid_speed=None,
         slowed=timing.slowed * found.factor,
     )
@@ -151,22 +142,13 @@ def smoothed(model: TimingModel, timing: Timing, width: float = WIDTH) -> Timing
 
 @dataclass(frozen=True)
 class _Slowdown:
-    """A timing slowed by a factor, and how far it uses its limits."""
+    """A timing slowed by a factor, and how far it uses its limits: beyond them, and every use but
+    that of friction, which is tight by construction."""
 
     factor: float
-    carry: Carry
-    ratios: dict[str, Array]
-    use: dict[str, Excess]
-
-    @property
-    def excess(self) -> float:
-        return worst(self.use).ratio - 1.0
-
-    @property
-    def columns(self) -> Array:
-        """Every use but that of friction, which is tight by construction."""
-        parts = [ratio.ravel() for name, ratio in self.ratios.items() if name != "friction"]
-        return np.concatenate(parts)
+    timing: Timing
+    excess: float
+    columns: Array
 
 
 def _fastest(driven: Callable[[float], _Slowdown]) -> _Slowdown:

@@ -34,7 +34,7 @@ from hybrid_opt.polishing.records import Aim, PolishOutcome, Status
 from hybrid_opt.polishing.settings import PolishSettings
 from hybrid_opt.polishing.starts import turned
 from hybrid_opt.timing.drive import CandidateDriver
-from hybrid_opt.timing.given import drive_path
+from hybrid_opt.timing.limits import drive_path
 from hybrid_opt.timing.model import TimingModel
 from hybrid_opt.timing.solve import time_path
 from symbolic.array import Array, evenly

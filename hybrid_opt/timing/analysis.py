@@ -12,15 +12,16 @@ import numpy as np
 
 from hybrid_opt.carry import Carry
 from hybrid_opt.store.files import read_record
-from hybrid_opt.timing.given import drive_path, untimed
-from hybrid_opt.timing.jerk import drive_with_jerk
+from hybrid_opt.timing.jerk import kept_jerk, time_with_jerk
 from hybrid_opt.timing.limits import (
     RECOMPUTED_TOLERANCE,
+    drive_path,
     duration_at_speed_limits,
-    joint_at,
     joint_use,
-    limit_use,
+    judged,
     limited_force,
+    place_of,
+    untimed,
     worst,
 )
 from hybrid_opt.timing.model import TimingModel
@@ -70,20 +71,17 @@ def judge_timing(model: TimingModel, x: Array) -> Timing:
     """
     carry = model.search_carry(x)
     failure = untimed(model, model.path_motion(x))
-    use = limit_use(carry, model.workcell, TimingLimits(), model.joint_names)
-    excess = worst(use)
-    status, place = TimingStatus.OK, excess.place
-    reason = f"within all limits; most used: {place}"
-    jump = _jump(model, carry)
-    if excess.ratio > 1.0 + RECOMPUTED_TOLERANCE:
-        status = TimingStatus.EXCEEDED
-        reason = f"uses {100.0 * excess.ratio:.0f} % of the limit: {place}"
-    elif jump is not None:
-        status, place = TimingStatus.EXCEEDED, jump
-        reason = f"the robots would have to be at speed without accelerating: {place}"
+    timing = judged(model, carry, TimingLimits())
     if failure is not None:
-        return replace(failure, carry=carry, use=use)
-    return Timing(status, reason, place, carry, use)
+        return replace(failure, carry=carry, use=timing.use)
+    excess, jump = worst(timing.use), _jump(model, carry)
+    if excess.ratio > 1.0 + RECOMPUTED_TOLERANCE:
+        reason = f"uses {100.0 * excess.ratio:.0f} % of the limit: {excess.place}"
+        return replace(timing, status=TimingStatus.EXCEEDED, reason=reason)
+    if jump is not None:
+        reason = f"the robots would have to be at speed without accelerating: {jump}"
+        return replace(timing, status=TimingStatus.EXCEEDED, reason=reason, place=jump)
+    return replace(timing, reason=f"within all limits; most used: {excess.place}")
 
 
 def _jump(model: TimingModel, carry: Carry) -> Place | None:
@@ -93,15 +91,10 @@ def _jump(model: TimingModel, carry: Carry) -> Place | None:
     if float(ends.max()) < REST_SPEED:
         return None
     end, joint = np.unravel_index(int(np.argmax(ends)), ends.shape)
-    arm, index = joint_at(model.joint_names, int(joint))
     sample = 0 if end == 0 else len(carry.time) - 1
-    return Place(
-        "start from rest" if end == 0 else "stop at rest",
-        model.workcell.robots[arm].name,
-        model.joint_names[arm][index],
-        sample,
-        float(carry.parameter[sample]),
-    )
+    where = int(joint), sample, float(carry.parameter[sample])
+    place = place_of(model.workcell, model.joint_names, "joint velocity", *where)
+    return replace(place, constraint="start from rest" if end == 0 else "stop at rest")
 
 
 def drivable_timing(model: TimingModel, x: Array) -> Timing:
@@ -217,7 +210,11 @@ def timed_trajectory(
     }
     if force_limit is not None:
         timings["force limited"] = time_path(model, x, model.drive_limits(force_limit))
-    jerk = drive_with_jerk(model, x) if len(x) == task.n_var > task.n_path else None
+    jerk = None
+    if len(x) == task.n_var > task.n_path:
+        limits = model.drive_limits(float(x[-1]))
+        kept = kept_jerk(model.workcell, limits)
+        jerk = None if kept is None else time_with_jerk(model, x, limits, kept)
     if jerk is not None:
         timings["within jerk limits"] = jerk.timing
     nominal = TimingLimits(reference_speed=True)
@@ -283,12 +280,6 @@ class StoredJerk:
     joint_use: Figure
     payload_use: Figure
 
-    @classmethod
-    def of(cls, found: JerkTiming) -> StoredJerk:
-        """The record of a timing as it is stored."""
-        timing = found.timing
-        return cls(timing.status, timing.duration, found.without, *found.jerk_use)
-
 
 @dataclass(frozen=True)
 class TimingDocument:
@@ -311,13 +302,13 @@ class TimingDocument:
 
 def timing_document(timed: TimedTrajectory) -> TimingDocument:
     """The record of a timed trajectory."""
-    return TimingDocument(
-        nominal_duration=timed.nominal_duration,
-        timings={name: stored_timing(timing) for name, timing in timed.timings.items()},
-        margins=timed.margins,
-        force_curve=timed.curve,
-        jerk=None if timed.jerk is None else StoredJerk.of(timed.jerk),
-    )
+    jerk = timed.jerk
+    timings = {name: stored_timing(timing) for name, timing in timed.timings.items()}
+    found = TimingDocument(timed.nominal_duration, timings, timed.margins, timed.curve)
+    if jerk is None:
+        return found
+    kept = StoredJerk(jerk.timing.status, jerk.timing.duration, jerk.without, *jerk.jerk_use)
+    return replace(found, jerk=kept)
 
 
 def read_timing(path: Path) -> TimingDocument:
@@ -332,18 +323,15 @@ def read_timing(path: Path) -> TimingDocument:
 
 def stored_timing(timing: Timing) -> StoredTiming:
     """One timing as it is stored."""
-    known = StoredTiming(
-        status=timing.status,
-        reason=timing.reason,
-        duration=timing.duration,
-        iterations=timing.iterations,
-        slowed=timing.slowed,
-        seconds=timing.seconds,
-        use=timing.use,
-    )
+    same = ("status", "reason", "duration", "iterations", "slowed", "seconds", "use")
+    known = StoredTiming(*(getattr(timing, name) for name in same))
     carry = timing.carry
     if carry is None:
         return known
+    points, moments = (
+        float(np.linalg.norm(missing, axis=1).max())
+        for missing in (carry.point_moment_residual, carry.moment_residual)
+    )
     return replace(
         known,
         objectives=carry.force_ratio,
@@ -352,12 +340,7 @@ def stored_timing(timing: Timing) -> StoredTiming:
         peak_resultant_force=carry.peak_resultant_force,
         least_friction_margin=carry.friction_margin.min(axis=0),
         peak_pressure_shift=carry.peak_pressure_shift,
-        peak_point_moment_residual=_largest(carry.point_moment_residual),
-        peak_moment_residual=_largest(carry.moment_residual),
+        peak_point_moment_residual=points,
+        peak_moment_residual=moments,
         joint_use=joint_use(carry, carry.workcell),
     )
-
-
-def _largest(vectors: Array) -> float:
-    """Largest length of vectors (n, 3)."""
-    return float(np.linalg.norm(vectors, axis=1).max())

@@ -33,9 +33,9 @@ from hybrid_opt.timing.limits import (
     NEAR,
     RECOMPUTED_TOLERANCE,
     PathLimits,
+    judged,
     largest_speed_factor,
     limit_ratios,
-    limit_use,
     squared_speed_limit,
     worst,
 )
@@ -116,14 +116,6 @@ def kept_jerk(workcell: Workcell, limits: TimingLimits) -> JerkLimits | None:
     return JerkLimits.of(workcell) if slopes else None
 
 
-def drive_with_jerk(model: TimingModel, x: Array) -> JerkTiming | None:
-    """A drivable carry x (n_var,) within its own force limit and the cell's limits on jerk; None
-    where there are none to keep, see `kept_jerk`."""
-    limits = model.drive_limits(float(x[-1]))
-    jerk = kept_jerk(model.workcell, limits)
-    return None if jerk is None else time_with_jerk(model, x, limits, jerk)
-
-
 class _Problem:
     """One path with one set of limits."""
 
@@ -131,30 +123,14 @@ class _Problem:
         self, model: TimingModel, motion: PathMotion, limits: TimingLimits, jerk: JerkLimits
     ) -> None:
         self._model, self._limits, self._jerk = model, limits, jerk
-        inner = np.linspace(0.0, 1.0, PIECES + 1)
-        self._knots = np.concatenate([np.zeros(3), inner, np.ones(3)])
-        self._motion = motion
-        self._coarse = self._points(np.linspace(0.0, 1.0, PIECES * POINTS + 1))
+        self._coarse = Point.of(motion, PIECES * POINTS)
         self._at = PathLimits(model, self._coarse.motion, limits)
-        self._fine = self._points(np.linspace(0.0, 1.0, PIECES * POINTS * FINER + 1))
-
-    def _points(self, s: Array) -> Point:
-        """Basis of the spline and geometry at some places s."""
-        n = len(self._knots) - 4
-        splines = BSpline(self._knots, np.eye(n), 3)
-        basis = [splines(s), splines.derivative(1)(s), splines.derivative(2)(s)]
-        warp = (
-            30.0 * (s * (1.0 - s)) ** 2,
-            60.0 * s * (1.0 - s) * (1.0 - 2.0 * s),
-            60.0 * (1.0 - 6.0 * s + 6.0 * s**2),
-        )
-        u = np.clip(s**3 * (10.0 - 15.0 * s + 6.0 * s**2), 0.0, 1.0)
-        return Point.of(s, basis, warp, self._motion.between(u), self._motion.third(u))
+        self._fine = Point.of(motion, PIECES * POINTS * FINER)
 
     def solve(self) -> JerkTiming:
         """Rounds until nothing changes; then with less of the limits where the answer exceeds them
         between the points, as often as that helps."""
-        c = np.ones(len(self._knots) - 4)
+        c = np.ones(self._coarse.value.shape[1])
         c, rounds = self._settled(self._slow(c) * c)
         for _ in range(TIGHTENED):
             excess = self._excess(c)
@@ -182,13 +158,13 @@ class _Problem:
     def _step(self, c: Array) -> Array | None:
         """Better coefficients than c (k,), which satisfy all limits at the coarse points; None
         without any."""
-        at, rows = self._coarse, Rows(len(c))
+        at, rows = self._coarse, Program(len(c))
         self._motion_rows(rows)
         self._force_rows(c, rows)
         self._jerk_rows(c, rows)
         rows.below(-np.ones((len(c), 1)), -LEAST_SHARE * c, np.arange(len(c)))
         gradient, H = at.objective(c)
-        answer = rows.assembled().minimised(H, gradient - H @ c, c)
+        answer = rows.minimised(H, gradient - H @ c, c)
         if answer is None:
             return None
         # The quadratic model promises too much far away: c and the answer are both allowed, and so
@@ -198,7 +174,7 @@ class _Problem:
             share *= 0.5
         return np.asarray(c + share * (answer - c))
 
-    def _motion_rows(self, rows: Rows) -> None:
+    def _motion_rows(self, rows: Program) -> None:
         """Speeds and accelerations of joints and box."""
         at, first_basis = self._coarse, self._coarse.first_basis
         squared_by, acceleration_by = at.local(at.squared_by), at.local(at.acceleration_by)
@@ -214,7 +190,7 @@ class _Problem:
             none = np.zeros_like(squared_by)
             rows.within(A / limit, np.zeros((len(at.s), 3)), none, at.keep, first_basis)
 
-    def _force_rows(self, c: Array, rows: Rows) -> None:
+    def _force_rows(self, c: Array, rows: Program) -> None:
         """Normal forces, planned and robust ones, joint torques and shifts of the pressure,
         linearised at c."""
         at = self._coarse
@@ -231,7 +207,7 @@ class _Problem:
         for sign in (1.0, -1.0):
             _linearised(at, c, sign * value[:, near], sign * by, rows)
 
-    def _jerk_rows(self, c: Array, rows: Rows) -> None:
+    def _jerk_rows(self, c: Array, rows: Program) -> None:
         """Jerk over sqrt(v) below the tangent of the limit over sqrt(v) at c."""
         at, jerk, v = self._coarse, self._jerk, self._coarse.value @ c
         # Multiplied by sqrt(v) of the last round, so that rows are of order one.
@@ -259,15 +235,11 @@ class _Problem:
     def _slow(self, c: Array) -> float:
         """Factor on the squared speeds at which everything is used little, as at rest."""
         factor = 1.0
-        rest = max(self._uses(0.0 * c))
+        rest = self._most_used(self._coarse, 0.0 * c)
         allowed = rest + FIRST_USE * (1.0 - rest)
-        while max(self._uses(factor * c)) > allowed:
+        while self._most_used(self._coarse, factor * c) > allowed:
             factor *= 0.5
         return factor
-
-    def _uses(self, c: Array) -> tuple[float, float, float]:
-        """Largest use of the timing's limits, joint jerk and payload jerk at the coarse points."""
-        return self._judge(self._coarse, c)[1:]
 
     def _carry(self, at: Point, c: Array) -> Carry:
         return self._model.carry(at.motion, at.time(c), at.speed(c), at.acceleration(c))
@@ -279,19 +251,16 @@ class _Problem:
         return of_joints, np.linalg.norm(box, axis=1) / self._jerk.payload
 
     def _judge(self, at: Point, c: Array) -> tuple[Timing, float, float, float]:
-        carry = self._carry(at, c)
-        use = limit_use(carry, self._model.workcell, self._limits, self._model.joint_names)
+        timing = judged(self._model, self._carry(at, c), self._limits)
         joint, box = (float(jerk.max()) for jerk in self._jerks(at, c))
-        excess = worst(use)
-        reason = f"{carry.duration:.3f} s; most used: {excess.place}"
-        timing = Timing(TimingStatus.OK, reason, excess.place, carry, use, limits=self._limits)
-        return timing, excess.ratio, joint, box
+        return timing, worst(timing.use).ratio, joint, box
+
+    def _most_used(self, at: Point, c: Array) -> float:
+        return max(self._judge(at, c)[1:])
 
     def _factor(self, c: Array) -> float:
         """Largest factor on the speeds with which the timing keeps all limits on the finer grid."""
-        if max(self._judge(self._fine, c)[1:]) <= 1.0 + RECOMPUTED_TOLERANCE:
-            return 1.0
-        return largest_speed_factor(lambda f: max(self._judge(self._fine, f**2 * c)[1:]) > 1.0)
+        return largest_speed_factor(lambda f: self._most_used(self._fine, f**2 * c))
 
     def _judged(self, c: Array) -> JerkTiming:
         """The timing on the finer grid, slowed down where it exceeds a limit."""
@@ -329,17 +298,20 @@ class Point:
     keep: Array
 
     @classmethod
-    def of(
-        cls,
-        s: Array,
-        basis: list[Array],
-        warp: tuple[Array, Array, Array],
-        motion: PathMotion,
-        third: tuple[Array, Array],
-    ) -> Point:
-        """basis: of v, v' and v''. warp: rho', rho'', rho'''. third: of joints, box by u."""
-        value, first, second = basis
+    def of(cls, motion: PathMotion, intervals: int) -> Point:
+        """Both ends of equal intervals, along a path."""
+        s, inner = np.linspace(0.0, 1.0, intervals + 1), np.linspace(0.0, 1.0, PIECES + 1)
+        knots = np.concatenate([np.zeros(3), inner, np.ones(3)])
+        splines = BSpline(knots, np.eye(len(knots) - 4), 3)
+        value, first, second = splines(s), splines.derivative(1)(s), splines.derivative(2)(s)
+        warp = (
+            30.0 * (s * (1.0 - s)) ** 2,
+            60.0 * s * (1.0 - s) * (1.0 - 2.0 * s),
+            60.0 * (1.0 - 6.0 * s + 6.0 * s**2),
+        )
         one, two, three = (part[:, None] for part in warp)
+        u = np.clip(s**3 * (10.0 - 15.0 * s + 6.0 * s**2), 0.0, 1.0)
+        third, motion = motion.third(u), motion.between(u)
 
         def jerk(by_u: Array, by_uu: Array, by_uuu: Array) -> Array:
             on_value = by_uuu * one**3 + 3.0 * by_uu * one * two + by_u * three
@@ -410,16 +382,20 @@ class Point:
         return gradient, 0.75 * (self.value.T * (weights * v**-2.5)) @ self.value
 
 
-class Rows:
-    """Rows b - A c, at least zero or in second-order cones of four, collected.
+class Program:
+    """Linear rows b - A c >= 0, and second-order cones of four such rows, of which few matter at a
+    time.
 
-    A row has few neighbouring coefficients: A holds those alone, from column `first` on.
+    A row has few neighbouring coefficients: its A holds those alone, from column `first` on.
     """
 
     def __init__(self, k: int) -> None:
+        """Of k coefficients, without any row."""
+        from scipy import sparse
+
         self._k = k
-        self._linear: list[tuple[sparse.csr_array, Array]] = []
-        self._cones: list[tuple[sparse.csr_array, Array]] = []
+        self._linear = [(sparse.csr_array((0, k)), np.zeros(0))]
+        self._cones = [(sparse.csr_array((0, k)), np.zeros((0, 4)))]
 
     def below(self, A: Array, b: Array, first: NDArray[np.intp]) -> None:
         """A c <= b, (n, width) and (n,), columns from first (n,) on."""
@@ -451,35 +427,22 @@ class Rows:
         starts = width * np.arange(n + 1)
         return sparse.csr_array((A.reshape(-1), columns.reshape(-1), starts), shape=(n, self._k))
 
-    def assembled(self) -> Program:
-        """All of them."""
+    @cached_property
+    def rows(self) -> tuple[sparse.csr_array, Array, sparse.csr_array, Array]:
+        """All of them, once no more are added: A and b of the linear ones and of the cones."""
         from scipy import sparse
 
-        none = sparse.csr_array((0, self._k))
-        linear = sparse.vstack([none, *[A for A, _ in self._linear]], format="csr")
-        cones = sparse.vstack([none, *[A for A, _ in self._cones]], format="csr")
-        return Program(
-            linear,
-            np.concatenate([np.zeros(0), *[b for _, b in self._linear]]),
-            cones,
-            np.concatenate([np.zeros((0, 4)), *[b for _, b in self._cones]]),
-        )
-
-
-@dataclass(frozen=True)
-class Program:
-    """Linear rows (n, k), (n,) and cones (4 m, k), (m, 4), of which few matter at a time."""
-
-    A: sparse.csr_array
-    b: Array
-    cone_A: sparse.csr_array
-    cone_b: Array
+        A, b = zip(*self._linear, strict=True)
+        cone_A, cone_b = zip(*self._cones, strict=True)
+        stacked, cones = (sparse.vstack(each, format="csr") for each in (A, cone_A))
+        return stacked, np.concatenate(b), cones, np.concatenate(cone_b)
 
     def used(self, c: Array, share: float) -> tuple[Mask, Mask]:
         """Which linear rows and which cones c uses to more than a share."""
-        inside = self.cone_b - (self.cone_A @ c).reshape(-1, 4)
+        A, b, cone_A, cone_b = self.rows
+        inside = cone_b - (cone_A @ c).reshape(-1, 4)
         lengths = np.linalg.norm(inside[:, 1:], axis=1)
-        return np.asarray(self.A @ c > share * self.b), np.asarray(lengths > share * inside[:, 0])
+        return np.asarray(A @ c > share * b), np.asarray(lengths > share * inside[:, 0])
 
     def minimised(self, H: Array, g: Array, about: Array) -> Array | None:
         """Least c^T H c / 2 + g.c; None without any. Rows that an answer violates are added."""
@@ -500,18 +463,19 @@ class Program:
         import clarabel
         from scipy import sparse
 
+        linear, b, cone_A, cone_b = self.rows
         settings = clarabel.DefaultSettings()
         settings.verbose = False
         kinds: list[Any] = [clarabel.NonnegativeConeT(int(rows.sum()))]
         kinds += [clarabel.SecondOrderConeT(4)] * int(cones.sum())
-        A = sparse.vstack([self.A[rows], self.cone_A[np.repeat(cones, 4)]], format="csc")
+        A = sparse.vstack([linear[rows], cone_A[np.repeat(cones, 4)]], format="csc")
         A.data *= np.repeat(scale, np.diff(A.indptr))
         A.eliminate_zeros()
         found = clarabel.DefaultSolver(
             sparse.csc_matrix(np.triu(H * np.outer(scale, scale))),
             g * scale,
             sparse.csc_matrix(A),
-            np.concatenate([self.b[rows], self.cone_b[cones].reshape(-1)]),
+            np.concatenate([b[rows], cone_b[cones].reshape(-1)]),
             kinds,
             settings,
         ).solve()
@@ -520,7 +484,7 @@ class Program:
         return answer if solved else None
 
 
-def _linearised(at: Point, c: Array, value: Array, by: Array, rows: Rows) -> None:
+def _linearised(at: Point, c: Array, value: Array, by: Array, rows: Program) -> None:
     """Values (n, m) at c over their limits, with derivatives (n, m, k), below one.
 
     What is exceeded between rounds, by what the last one left out, may stay as it is for one.

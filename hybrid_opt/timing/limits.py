@@ -1,18 +1,22 @@
-"""What limits a carry: along a path as functions of its timing, and as shares of each limit that a
-carry uses, recomputed from its physical quantities alone."""
+"""What limits a carry: what forbids any timing of its path, what limits it along the path as
+functions of the timing, and the shares of each limit that a carry uses, recomputed from its
+physical quantities alone."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hybrid_opt.carry import Carry
 from hybrid_opt.robust.force import BoxMotion, robust_model
 from hybrid_opt.robust.path_force import BY_TIMING, PathPoints, robust_path
-from hybrid_opt.timing.model import PathMotion, TimingModel, contact_torque
-from hybrid_opt.timing.records import Excess, Place, TimingLimits
+from hybrid_opt.timing.model import REFINEMENT, PathMotion, TimingModel
+from hybrid_opt.timing.records import Excess, Place, Timing, TimingLimits, TimingStatus
 from symbolic.array import Array
+from symbolic.errors import SettingsError
 from symbolic.functions import TIMING_TOLERANCE
 from symbolic.records import Workcell
 
@@ -42,6 +46,48 @@ AT_A_TIME = 2000
 
 FORCE_FLOOR = 1e-9
 """A contact with less normal force than this carries nothing [N]."""
+
+LEAST_LENGTH = 1e-9
+"""A path along which box and joints move less than this does not move [m, rad]."""
+
+ARM_CHECKS = (
+    (TimingStatus.OFF_PATH, "reach", "loses the path"),
+    (TimingStatus.JOINT_LIMITS, "joint position", "leaves its joint range"),
+    (TimingStatus.NEAR_SINGULAR, "manipulability", "comes too near a singular posture"),
+)
+"""How an arm can fail a path, in the order of reporting: the timing's status, its name in a
+`Place`, and what the robot does, for people."""
+
+
+def path_failure(
+    workcell: Workcell, pose: Array, lost: Array, limit_margin: Array, manipulability: Array
+) -> Timing | None:
+    """Why a path cannot be timed at all, with arm and place, or None.
+
+    Args:
+        pose: (n, 6) box poses at uniform samples.
+        lost, limit_margin, manipulability: (n, 2) by sample and arm, as of
+            `symbolic.robot.arm.TRACK_OUTPUTS`.
+    """
+    if float(np.abs(pose - pose[0]).max()) < LEAST_LENGTH:
+        reason = "all poses of the path are the same: there is nothing to time"
+        return Timing(TimingStatus.NO_MOTION, reason, Place("path length", "", "", 0, 0.0), None)
+    least = [robot.min_manipulability for robot in workcell.robots]
+    found = (lost > 0.5, limit_margin < 0.0, manipulability < least)
+    for failed, (status, constraint, text) in zip(found, ARM_CHECKS, strict=True):
+        if failed.any():
+            sample = int(np.argmax(failed.any(axis=1)))
+            robot = workcell.robots[int(np.argmax(failed[sample]))].name
+            place = Place(constraint, robot, "", sample, sample / (len(pose) - 1))
+            reason = f"robot {robot!r} {text} at u = {place.parameter:.4f}"
+            return Timing(status, reason, place, None)
+    return None
+
+
+def untimed(model: TimingModel, motion: PathMotion) -> Timing | None:
+    """The answer for a path that cannot be timed, None for others."""
+    arms = motion.lost, motion.limit_margin, motion.manipulability
+    return path_failure(model.workcell, motion.pose, *arms)
 
 
 class PathLimits:
@@ -98,7 +144,7 @@ class PathLimits:
         load = self._model.drive(m, np.sqrt(w), a)
         if limits.torque:
             own = m.torque_by_acceleration * a[:, None] + m.torque_by_speed * w[:, None]
-            torque = contact_torque(workcell, m.wrench_torque, load) + own + m.torque_at_rest
+            torque = self._model.contact_torque(m.wrench_torque, load) + own + m.torque_at_rest
             columns.append(torque / workcell.of_joints("torque_max"))
         if pressure:
             radius = np.array([contact.patch_radius for contact in workcell.contacts])
@@ -233,18 +279,22 @@ def limits_pressure(workcell: Workcell, limits: TimingLimits) -> bool:
     return limits.pressure and workcell.task.allocation == "paper"
 
 
-def limit_use(
+def judged(
+    model: TimingModel,
     carry: Carry,
-    workcell: Workcell,
     limits: TimingLimits,
-    joint_names: tuple[tuple[str, ...], tuple[str, ...]],
-) -> dict[str, Excess]:
-    """The largest use of every limit and where, by constraint.
+    ratios: Mapping[str, Array] | None = None,
+) -> Timing:
+    """A carry of a model as a timing with status `OK`, whatever it uses of its limits.
 
     Args:
-        joint_names: names of both arms' joints.
+        ratios: its `limit_ratios`, where they are known.
     """
-    return use_of(limit_ratios(carry, workcell, limits), carry, joint_names)
+    ratios = limit_ratios(carry, model.workcell, limits) if ratios is None else ratios
+    use = use_of(ratios, carry, model.joint_names)
+    place = worst(use).place
+    reason = f"{carry.duration:.3f} s; most used: {place}"
+    return Timing(TimingStatus.OK, reason, place, carry, use, limits=limits)
 
 
 def use_of(
@@ -252,19 +302,38 @@ def use_of(
     carry: Carry,
     joint_names: tuple[tuple[str, ...], tuple[str, ...]],
 ) -> dict[str, Excess]:
-    """`limit_use` where a carry's `limit_ratios` are known."""
+    """The largest use of every limit of a carry and where, by constraint.
+
+    Args:
+        ratios: its `limit_ratios`.
+        joint_names: names of both arms' joints.
+    """
     workcell, use = carry.workcell, {}
     for name, ratio in ratios.items():
         sample, column = np.unravel_index(int(np.argmax(ratio)), ratio.shape)
-        robot, joint = "", ""
-        if name in JOINT_CONSTRAINTS:
-            arm, index = joint_at(joint_names, int(column))
-            robot, joint = workcell.robots[arm].name, joint_names[arm][index]
-        elif name in CONTACT_CONSTRAINTS:
-            robot = workcell.robots[column].name
-        place = Place(name, robot, joint, int(sample), float(carry.parameter[sample]))
+        where = int(sample), float(carry.parameter[sample])
+        place = place_of(workcell, joint_names, name, int(column), *where)
         use[name] = Excess(float(ratio[sample, column]), place)
     return use
+
+
+def place_of(
+    workcell: Workcell,
+    joint_names: tuple[tuple[str, ...], ...],
+    constraint: str,
+    column: int,
+    sample: int,
+    parameter: float,
+) -> Place:
+    """Where a limit is used, by the column of its `limit_ratios`."""
+    robot, joint = "", ""
+    if constraint in JOINT_CONSTRAINTS:
+        arm = int(column >= len(joint_names[0]))
+        joint = joint_names[arm][column - arm * len(joint_names[0])]
+        robot = workcell.robots[arm].name
+    elif constraint in CONTACT_CONSTRAINTS:
+        robot = workcell.robots[column].name
+    return Place(constraint, robot, joint, sample, parameter)
 
 
 def joint_use(carry: Carry, workcell: Workcell) -> dict[str, Array]:
@@ -278,18 +347,15 @@ def joint_use(carry: Carry, workcell: Workcell) -> dict[str, Array]:
     return use | {"contact torque": (np.abs(carry.contact_torque) / limit).max(axis=0)}
 
 
-def joint_at(joint_names: tuple[tuple[str, ...], ...], column: int) -> tuple[int, int]:
-    """Arm and joint of a column, both arms' joints side by side."""
-    first = len(joint_names[0])
-    return (0, column) if column < first else (1, column - first)
-
-
-def largest_speed_factor(exceeds: Callable[[float], bool]) -> float:
-    """The largest factor on the speeds, at most one, with which nothing is exceeded."""
+def largest_speed_factor(use: Callable[[float], float]) -> float:
+    """The largest factor on the speeds, at most one, with which no limit is exceeded, by the
+    largest use of any at a factor; one where none is by more than `RECOMPUTED_TOLERANCE`."""
+    if use(1.0) <= 1.0 + RECOMPUTED_TOLERANCE:
+        return 1.0
     low, high = 0.0, 1.0
     for _ in range(SLOWINGS):
         factor = (low + high) / 2.0
-        low, high = (low, factor) if exceeds(factor) else (factor, high)
+        low, high = (low, factor) if use(factor) > 1.0 else (factor, high)
     return low
 
 
@@ -306,3 +372,89 @@ def worst(use: dict[str, Excess]) -> Excess:
 def _norm(vectors: Array) -> Array:
     length: Array = np.linalg.norm(vectors, axis=1, keepdims=True)
     return length
+
+
+@dataclass(frozen=True)
+class DrivenSpeeds:
+    """Path speeds with constant u'' on intervals, at `REFINEMENT` samples per interval, both ends
+    of every interval included; to be driven along any path.
+
+    Attributes:
+        index: (n,) of the samples among those of a path's motion.
+        time: (n,) [s].
+        share: (n,) how far the samples lie within their intervals.
+        a, w: (n,) u'' and u'^2.
+    """
+
+    index: NDArray[np.intp]
+    time: Array
+    share: Array
+    a: Array
+    w: Array
+
+    @classmethod
+    def of(cls, grid_speed: Array) -> DrivenSpeeds:
+        """grid_speed: (intervals + 1,) path speed u' at the grid points [1/s]."""
+        squared, intervals = grid_speed**2, len(grid_speed) - 1
+        share = np.linspace(0.0, 1.0, REFINEMENT + 1)
+        w = squared[:-1, None] + np.outer(np.diff(squared), share)
+        speed = np.sqrt(np.maximum(w, 0.0))
+        # Average speed over a piece of constant acceleration is that of its ends.
+        total = speed[:, :1] + speed
+        elapsed = 2.0 * share / intervals / np.where(total > 0.0, total, 1.0)
+        starts = np.concatenate([[0.0], np.cumsum(elapsed[:, -1])])[:-1]
+        index = REFINEMENT * np.arange(intervals)[:, None] + np.arange(REFINEMENT + 1)
+        return cls(
+            index.reshape(-1),
+            (starts[:, None] + elapsed).reshape(-1),
+            np.tile(share, intervals),
+            np.repeat(np.diff(squared) * intervals / 2.0, REFINEMENT + 1),
+            w.reshape(-1),
+        )
+
+    def carry(
+        self, model: TimingModel, motion: PathMotion, a: float = 0.0, w: float = 0.0
+    ) -> Carry:
+        """A path driven so, with `a` added to u'' and `w` to u'^2 everywhere."""
+        speed = np.sqrt(np.maximum(self.w + w, 0.0))
+        return model.carry(motion.at(self.index), self.time, speed, self.a + a)
+
+
+def drive_path(
+    model: TimingModel,
+    x: Array,
+    grid_speed: Array,
+    limits: TimingLimits,
+    motion: PathMotion | None = None,
+) -> Timing:
+    """A given timing of a path with its carry, held against every limit.
+
+    Args:
+        model: its intervals are those of the timing.
+        x: (n_var,) decision vector.
+        grid_speed: (intervals + 1,) path speed u' at the grid points [1/s].
+        motion: the path's geometry, where it is known already.
+
+    Returns:
+        Status `OK`, or `EXCEEDED` with the limit and the place; or why the path itself fails.
+
+    Raises:
+        SettingsError: x or the speeds do not fit.
+    """
+    grid_speed = np.asarray(grid_speed, dtype=float)
+    moves = np.all(grid_speed[:-1] + grid_speed[1:] > 0.0) if grid_speed.ndim == 1 else False
+    if grid_speed.shape != (model.intervals + 1,) or not moves:
+        raise SettingsError(
+            f"path speeds of shape {grid_speed.shape}; needs {model.intervals + 1} that never "
+            "stand still over an interval"
+        )
+    motion = model.path_motion(x) if motion is None else motion
+    failure = untimed(model, motion)
+    if failure is not None:
+        return failure
+    timing = judged(model, DrivenSpeeds.of(grid_speed).carry(model, motion), limits)
+    timing, excess = replace(timing, grid_speed=grid_speed), worst(timing.use)
+    if excess.ratio <= 1.0 + RECOMPUTED_TOLERANCE:
+        return timing
+    reason = f"uses {100.0 * excess.ratio:.1f} % of the limit: {excess.place}"
+    return replace(timing, status=TimingStatus.EXCEEDED, reason=reason)

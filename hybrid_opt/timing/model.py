@@ -3,7 +3,7 @@ geometry of a path at samples of its parameter and between them, and its loads."
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -105,17 +105,7 @@ class PathMotion:
 
 SAMPLED = tuple(f.name for f in fields(PathMotion) if f.name not in ("x", "parameter"))
 
-_BOX = (
-    "pose",
-    "pose_first",
-    "pose_second",
-    "angular_first",
-    "angular_second",
-    "normal",
-    "force_by_acceleration",
-    "force_by_speed",
-)
-_ARMS = tuple(name for name in SAMPLED if name not in _BOX)
+_BOX, _ARMS = SAMPLED[: SAMPLED.index("q")], SAMPLED[SAMPLED.index("q") :]
 
 
 class TimingModel:
@@ -175,18 +165,16 @@ class TimingModel:
             x = np.append(x, task.force_limit[1])
         x = self._checked(x)
         if self._latest is None or not np.array_equal(self._latest.x, x):
-            self._latest = self._path_motion(x.copy())
+            out = self._functions["path_motion"](x)
+            n = len(out["pose"])
+            values = {name: out[name] for name in _BOX}
+            for name in _ARMS:
+                both = [out[f"{name}_{arm}"].reshape(n, -1) for arm in (1, 2)]
+                values[name] = np.concatenate(both, axis=1)
+            values["wrench_torque"] = values["wrench_torque"].reshape(n, -1, 6)
+            u = np.linspace(0.0, 1.0, n)
+            self._latest = PathMotion(x=x.copy(), parameter=u, **values)
         return self._latest
-
-    def _path_motion(self, x: Array) -> PathMotion:
-        out = self._functions["path_motion"](x)
-        n = len(out["pose"])
-        values = {name: out[name] for name in _BOX}
-        for name in _ARMS:
-            both = [out[f"{name}_{arm}"].reshape(n, -1) for arm in (1, 2)]
-            values[name] = np.concatenate(both, axis=1)
-        values["wrench_torque"] = values["wrench_torque"].reshape(n, -1, 6)
-        return PathMotion(x=x, parameter=np.linspace(0.0, 1.0, n), **values)
 
     def load(self, pose: Array, rate: Array, second_rate: Array) -> dict[str, Array]:
         """`symbolic.contact.load.LOAD_OUTPUTS` for n samples (n, 6) of the box motion."""
@@ -224,16 +212,9 @@ class TimingModel:
     def wrench_torque(self, q: Array, pose: Array) -> Array:
         """(n, all joints, 6) from contact wrenches to joint torques, at joints (n, all joints) and
         box poses (n, 6)."""
-        n = len(q)
-        still = np.zeros((n, self.workcell.task.extended_size))
-        extended = still.copy()
-        extended[:, :6] = pose  # the redundant joints are in q already
-        matrices = [
-            self._functions[f"arm_{i + 1}"]
-            .batch(np.ascontiguousarray(own), extended, still, still)["wrench_torque"]
-            .reshape(n, -1, 6)
-            for i, own in enumerate(joints_of(self.workcell, q))
-        ]
+        arms, still = joints_of(self.workcell, q), np.zeros_like(pose)
+        found = [self.arm_motion(arm, own, pose, still) for arm, own in enumerate(arms)]
+        matrices = [each["wrench_torque"].reshape(len(q), -1, 6) for each in found]
         return np.concatenate(matrices, axis=1)
 
     def drive(self, motion: PathMotion, speed: Array, acceleration: Array) -> dict[str, Array]:
@@ -244,6 +225,12 @@ class TimingModel:
         )
         return self.load(motion.pose, rate, second)
 
+    def contact_torque(self, wrench_torque: Array, load: Mapping[str, Array]) -> Array:
+        """(n, all joints) joint torques of the contact wrenches of a `load` [N m]; see
+        `contact_torque`."""
+        wrenches = (load["wrench_1"], load["wrench_2"])
+        return contact_torque(len(self.joint_names[0]), wrench_torque, wrenches)
+
     def carry(self, motion: PathMotion, time: Array, speed: Array, acceleration: Array) -> Carry:
         """The carry with the given timing (n,) at the samples of `motion`."""
         load = self.drive(motion, speed, acceleration)
@@ -253,9 +240,11 @@ class TimingModel:
             motion.q,
             motion.q_first * v,
             motion.q_second * w + motion.q_first * a,
-            contact_torque(self.workcell, motion.wrench_torque, load),
+            self.contact_torque(motion.wrench_torque, load),
             own + motion.torque_at_rest,
         )
+        loads = {f.name: load[f.name] for f in fields(Carry) if f.name in load}
+        loads["contact_force"] = loads["contact_force"].reshape(-1, 2, 3)
         split = [joints_of(self.workcell, values) for values in joints]
         return Carry(
             workcell=self.workcell,
@@ -266,7 +255,7 @@ class TimingModel:
             pose=motion.pose,
             rate=motion.pose_first * v,
             second_rate=motion.pose_second * w + motion.pose_first * a,
-            **_loads(load),
+            **loads,
             arms=(
                 ArmMotion(*[first for first, _ in split]),
                 ArmMotion(*[second for _, second in split]),
@@ -324,31 +313,13 @@ def joint_names(robot: Robot) -> tuple[str, ...]:
     return tuple(arm_model(robot).names)[1:]
 
 
-def contact_torque(workcell: Workcell, wrench_torque: Array, load: Mapping[str, Array]) -> Array:
-    """(n, all joints) joint torques of the contact wrenches [N m].
+def contact_torque(first: int, wrench_torque: Array, wrenches: Iterable[Array]) -> Array:
+    """(n, all joints) joint torques that exert wrenches (n, 6) of either robot on the box [N m].
 
     Args:
-        workcell: the cell.
+        first: number of the first arm's joints.
         wrench_torque: (n, all joints, 6) from wrenches to torques, both arms side by side.
-        load: outputs of `symbolic.contact.load`.
     """
-    first = len(workcell.robots[0].torque_max)
     parts = (wrench_torque[:, :first], wrench_torque[:, first:])
-    torques = [
-        np.einsum("njk,nk->nj", part, load[f"wrench_{i}"]) for i, part in enumerate(parts, start=1)
-    ]
-    return np.concatenate(torques, axis=1)
-
-
-def _loads(load: dict[str, Array]) -> dict[str, Array]:
-    names = (
-        "angular_velocity",
-        "angular_acceleration",
-        "normal_force",
-        "tangential_force",
-        "pressure_shift",
-        "point_moment_residual",
-        "moment_residual",
-    )
-    forces = load["contact_force"].reshape(-1, 2, 3)
-    return {name: load[name] for name in names} | {"contact_force": forces}
+    each = zip(parts, wrenches, strict=True)
+    return np.concatenate([np.einsum("njk,nk->nj", part, w) for part, w in each], axis=1)

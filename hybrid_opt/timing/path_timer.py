@@ -24,8 +24,7 @@ from codegen.cache import source_digest
 from codegen.function import NumericFunction, Signature
 from hybrid_opt.compiled_cell import CompiledCell
 from hybrid_opt.robust.path_force import BY_TIMING, PathPoints, RobustPath, robust_path
-from hybrid_opt.timing.given import path_failure
-from hybrid_opt.timing.limits import limited_force
+from hybrid_opt.timing.limits import limited_force, path_failure, place_of
 from hybrid_opt.timing.model import TimingModel, joint_names
 from hybrid_opt.timing.records import Place, TimingLimits, TimingStatus
 from hybrid_opt.timing.solve import time_path
@@ -204,7 +203,16 @@ class PathTimer:
     def failures(self, paths: dict[str, Array]) -> list[PathTiming | None]:
         """Why paths cannot be timed at all, by the answers of `path_limits`; None where they can
         be."""
-        return [self._path_failure(paths, row) for row in range(len(paths["pose"]))]
+        names = ("lost", "limit_margin", "manipulability")
+        sides = [np.stack([paths[f"{name}_{arm}"] for arm in (1, 2)], axis=2) for name in names]
+        found = [
+            path_failure(self.workcell, pose[:, :6], *each)
+            for pose, *each in zip(paths["pose"], *sides, strict=True)
+        ]
+        return [
+            None if why is None or why.place is None else self._failed(why.status, why.place)
+            for why in found
+        ]
 
     def time_known(
         self,
@@ -227,7 +235,9 @@ class PathTimer:
                 continue
             options = np.array([_options(limits[row]) for row in some])
             drive = self._robustly_driven if robust else self._driven
-            for row, timing in zip(some, drive(_rows_of(paths, some), options), strict=True):
+            # All of them without a copy.
+            chosen = paths if len(some) == len(x) else {k: v[some] for k, v in paths.items()}
+            for row, timing in zip(some, drive(chosen, options), strict=True):
                 found[row] = timing
         return [timing for timing in found if timing is not None]
 
@@ -237,41 +247,28 @@ class PathTimer:
         return [self._timing(out, k) for k in range(len(options))]
 
     def _robustly_driven(self, paths: dict[str, Array], options: Array) -> list[PathTiming]:
-        out, peak, still = self._robust.time(paths, options, self._threads)
+        drive = RobustDrive(self._cut_passes, robust_path(self.workcell), paths, options)
+        out, still = drive.time(self._threads)
         found = [self._timing(out, k) for k in range(len(options))]
         for k, rest in enumerate(still):
+            limit, peak = float(options[k, 0]), drive.peak[k]
             if rest is not None:
-                found[k] = self._held_too_weakly(rest, float(options[k, 0]))
-            elif found[k].ok:
-                share = float(peak[k].max() / options[k, 0])
-                use = found[k].use | {"normal force": share}
-                found[k] = replace(found[k], robust_force=peak[k], use=use)
+                peak, sample = rest
+                arm, u = int(peak.argmax()), sample / (2 * self.intervals)
+                where = "normal force", arm, round(u * self.intervals), u
+                place = place_of(self.workcell, self._joint_names, *where)
+                failed = self._failed(TimingStatus.INFEASIBLE_AT_REST, place)
+                found[k] = replace(failed, peak_force=peak)
+            if rest is not None or found[k].ok:
+                use = found[k].use | {"normal force": float(peak.max()) / limit}
+                found[k] = replace(found[k], robust_force=peak, use=use)
         return found
 
-    def _held_too_weakly(self, rest: AtRest, limit: float) -> PathTiming:
-        """Standing still needs more than the limit in some case."""
-        force, sample = rest
-        arm, u = int(force.argmax()), sample / (2 * self.intervals)
-        name = self.workcell.robots[arm].name
-        place = Place("normal force", name, "", round(u * self.intervals), u)
-        failed = self._failed(TimingStatus.INFEASIBLE_AT_REST, place)
-        use = {"normal force": float(force.max()) / limit}
-        return replace(failed, peak_force=force, robust_force=force, use=use)
-
     @cached_property
-    def _robust(self) -> RobustPasses:
+    def _cut_passes(self) -> NumericFunction:
         passes = passes_function(self._compiled, self.intervals, CUTS)
         assert passes is not None, "asked for where the passes are compiled"
-        return RobustPasses(passes, robust_path(self.workcell), self.intervals)
-
-    def _path_failure(self, paths: dict[str, Array], row: int) -> PathTiming | None:
-        """Why a path cannot be timed at all."""
-        sides = [
-            np.stack([paths[f"{name}_{arm}"][row] for arm in (1, 2)], axis=1)
-            for name in ("lost", "limit_margin", "manipulability")
-        ]
-        found = path_failure(self.workcell, paths["pose"][row][:, :6], *sides)
-        return None if found is None else self._failed(found.status, found.place)
+        return passes
 
     def _failed(self, status: TimingStatus, place: Place) -> PathTiming:
         return PathTiming(
@@ -285,7 +282,10 @@ class PathTimer:
             interval = int(out["interval"][k])
             place = Place("path timing", "", "", interval, interval / self.intervals)
         else:
-            place = self._place(int(np.argmax(use[:, 0])), use)
+            kind = int(np.argmax(use[:, 0]))
+            column, parameter = int(use[kind, 2]), float(use[kind, 1])
+            where = KINDS[kind], column, round(parameter * self.intervals), parameter
+            place = place_of(self.workcell, self._joint_names, *where)
         return PathTiming(
             status=status,
             place=place,
@@ -296,26 +296,6 @@ class PathTimer:
             sweeps=int(out["sweeps"][k]),
             slowed=float(out["slowed"][k]),
         )
-
-    def _place(self, kind: int, use: Array) -> Place:
-        """The joint or contact that uses a kind of limit most, and where."""
-        name, column, parameter = KINDS[kind], int(use[kind, 2]), float(use[kind, 1])
-        sample = round(parameter * self.intervals)
-        robots = self.workcell.robots
-        if name.startswith("joint"):
-            arm = int(column >= len(self._joint_names[0]))
-            joint = self._joint_names[arm][column - arm * len(self._joint_names[0])]
-            return Place(name, robots[arm].name, joint, sample, parameter)
-        if name in ("normal force", "pressure shift"):
-            return Place(name, robots[column].name, "", sample, parameter)
-        return Place(name, "", "", sample, parameter)
-
-
-def _rows_of(paths: dict[str, Array], rows: list[int]) -> dict[str, Array]:
-    """Some paths; all of them without a copy."""
-    if len(rows) == len(paths["limits"]):
-        return paths
-    return {name: values[rows] for name, values in paths.items()}
 
 
 def from_time_path(model: TimingModel, x: Array, limits: TimingLimits) -> PathTiming:
@@ -347,93 +327,75 @@ def _options(limits: TimingLimits) -> list[float]:
     return [force, float(limits.torque), float(limits.pressure), float(limits.reference_speed)]
 
 
-@dataclass
-class _Paths:
-    """Some paths with their limits, and the lines that they have so far.
+class RobustDrive:
+    """The passes for n paths, with lines for their robust forces that become more as they run.
 
     Attributes:
-        parts: (n, samples, 6) box poses and their derivatives by u.
-        limit: (n,) [N].
-        cuts: (n, samples, CUTS, 3).
-        count: (n, samples) how many each sample was given.
         peak: (n, 2) largest robust forces of the last timing [N].
     """
 
-    parts: tuple[Array, Array, Array]
-    limit: Array
-    cuts: Array
-    count: NDArray[np.intp]
-    peak: Array
-
-
-class RobustPasses:
-    """The passes of one workcell with lines for its robust forces."""
-
-    def __init__(self, passes: NumericFunction, forces: RobustPath, intervals: int) -> None:
-        """passes: `passes_function` with `CUTS`."""
-        self._passes, self._forces, self._intervals = passes, forces, intervals
-        # Both ends and the middle of every interval, each with its interval's u''.
-        first = 2 * np.arange(intervals)[:, None]
-        self._sample = (first + np.array([0, 1, 2])).reshape(-1)
-        self._share = np.tile([0.0, 0.5, 1.0], intervals)
-
-    def time(
-        self, paths: dict[str, Array], options: Array, threads: int
-    ) -> tuple[dict[str, Array], Array, list[AtRest | None]]:
-        """Drive n paths.
+    def __init__(
+        self,
+        passes: NumericFunction,
+        forces: RobustPath,
+        paths: dict[str, Array],
+        options: Array,
+    ) -> None:
+        """Without any line.
 
         Args:
+            passes: `passes_function` with `CUTS`.
             paths: their `PathTimer.path_limits`.
             options: (n, 4) of the passes, finite force limits first.
-            threads: threads that share a batch.
-
-        Returns:
-            The passes' outputs; (n, 2) largest robust forces [N]; and of each path whether it
-            cannot stand still.
         """
-        n, samples = len(options), 2 * self._intervals + 1
+        n, samples = paths["pose"].shape[:2]
+        self._passes, self._forces, self._options = passes, forces, options
+        self._rows, self._limit = paths["limits"], options[:, 0]
         names = ("pose", "pose_first", "pose_second")
-        parts = [np.ascontiguousarray(paths[name][:, :, :6]) for name in names]
-        cuts = np.zeros((n, samples, CUTS, 3))
-        cuts[..., 2] = np.inf
-        state = _Paths(
-            (parts[0], parts[1], parts[2]),
-            options[:, 0],
-            cuts,
-            np.zeros((n, samples), dtype=np.intp),
-            np.zeros((n, 2)),
-        )
-        still = self._at_rest(state)
-        out = self._passes.batch(paths["limits"], options, state.cuts, threads=threads)
-        left = np.array([k for k in range(n) if still[k] is None], dtype=np.intp)
+        self._parts = [np.ascontiguousarray(paths[name][:, :, :6]) for name in names]
+        # The lines of every sample, and how many it was given.
+        self._cuts = np.zeros((n, samples, CUTS, 3))
+        self._cuts[..., 2] = np.inf
+        self._count, self.peak = np.zeros((n, samples), dtype=np.intp), np.zeros((n, 2))
+        # Both ends and the middle of every interval, each with its interval's u''.
+        self._intervals = samples // 2
+        first = 2 * np.arange(self._intervals)[:, None]
+        self._sample = (first + np.array([0, 1, 2])).reshape(-1)
+        self._share = np.tile([0.0, 0.5, 1.0], self._intervals)
+
+    def time(self, threads: int) -> tuple[dict[str, Array], list[AtRest | None]]:
+        """The passes' outputs, in so many threads, and of each path whether it cannot stand
+        still."""
+        still = self._at_rest()
+        out = self._passes.batch(self._rows, self._options, self._cuts, threads=threads)
+        left = np.array([k for k, rest in enumerate(still) if rest is None], dtype=np.intp)
         for _ in range(ROUNDS):
             left = left[np.isfinite(out["duration"][left])]
-            left = left[self._cut(state, left, out["squared"][left])]
+            left = left[self._cut(left, out["squared"][left])]
             if not len(left):
                 break
-            driven = (paths["limits"][left], options[left], state.cuts[left])
-            fresh = self._passes.batch(*driven, threads=threads)
-            for name, values in fresh.items():
+            driven = (self._rows[left], self._options[left], self._cuts[left])
+            for name, values in self._passes.batch(*driven, threads=threads).items():
                 out[name][left] = values
-        return out, state.peak, still
+        return out, still
 
-    def _at_rest(self, state: _Paths) -> list[AtRest | None]:
+    def _at_rest(self) -> list[AtRest | None]:
         """Which paths cannot stand still; the others get a tangent there."""
-        n, samples = len(state.limit), state.parts[0].shape[1]
+        n, samples = self._count.shape
         found: list[AtRest | None] = [None] * n
         path, sample = np.divmod(np.arange(n * samples), samples)
-        points = self._points(state, path, sample, *np.zeros((2, n * samples)))
-        rows, force, slope = self._forces.beyond(points, NEAR * state.limit[path])
+        points = self._points(path, sample, *np.zeros((2, n * samples)))
+        rows, force, slope = self._forces.beyond(points, NEAR * self._limit[path])
         for k in np.unique(path[rows]):
             own = path[rows] == k
             at = int(force[own].max(axis=1).argmax())
-            if force[own].max() > STILL * state.limit[k]:
+            if force[own].max() > STILL * self._limit[k]:
                 found[k] = force[own].max(axis=0), int(sample[rows][own][at])
         place = (path[rows], sample[rows])
-        self._add(state, place, np.zeros((len(rows), 2)), force, slope[:, :, BY_TIMING])
+        self._add(place, np.zeros((len(rows), 2)), force, slope[:, :, BY_TIMING])
         return found
 
-    def _cut(self, state: _Paths, chosen: NDArray[np.intp], squared: Array) -> NDArray[np.bool_]:
+    def _cut(self, chosen: NDArray[np.intp], squared: Array) -> NDArray[np.bool_]:
         """Add tangents where timings (m, intervals + 1) of the chosen paths come near their limits;
         which of them exceed theirs."""
         m, per = len(chosen), len(self._sample)
@@ -444,26 +406,25 @@ class RobustPasses:
         w = (begin + self._share * rise).reshape(-1)
         a = (rise * self._intervals / 2.0).reshape(-1)
         path, sample = np.repeat(chosen, per), np.tile(self._sample, m)
-        points, limit = self._points(state, path, sample, a, w), state.limit[path]
+        points, limit = self._points(path, sample, a, w), self._limit[path]
         rows, ruling = self._forces.ruling_beyond(points, NEAR * limit)
         force = ruling.force
-        exceeded = np.zeros(len(state.limit), dtype=bool)
+        exceeded = np.zeros(len(self._limit), dtype=bool)
         exceeded[path[rows][force.max(axis=1) > (1.0 + TOLERANCE) * limit[rows]]] = True
-        state.peak[chosen] = 0.0
-        np.maximum.at(state.peak, path[rows], force)
-        for k in chosen[state.peak[chosen].max(axis=1) == 0.0]:
+        self.peak[chosen] = 0.0
+        np.maximum.at(self.peak, path[rows], force)
+        for k in chosen[self.peak[chosen].max(axis=1) == 0.0]:
             own = np.flatnonzero(path == k)
-            state.peak[k] = self._forces.at(points.at(own))[0].max(axis=0)
+            self.peak[k] = self._forces.at(points.at(own))[0].max(axis=0)
         keep = np.flatnonzero(exceeded[path[rows]])
         z = np.stack([a[rows], w[rows]], axis=1)[keep]
         place = (path[rows][keep], sample[rows][keep])
         slope = self._forces.slopes(points.at(rows[keep]), ruling.at(keep))
-        self._add(state, place, z, force[keep], slope[:, :, BY_TIMING])
+        self._add(place, z, force[keep], slope[:, :, BY_TIMING])
         return exceeded[chosen]
 
     def _add(
         self,
-        state: _Paths,
         place: tuple[NDArray[np.intp], NDArray[np.intp]],
         z: Array,
         force: Array,
@@ -471,19 +432,19 @@ class RobustPasses:
     ) -> None:
         """Tangents of the larger force at points z (m, 2) of paths and samples `place`."""
         larger, every = force.argmax(axis=1), np.arange(len(force))
-        limit = state.limit[place[0]]
+        limit = self._limit[place[0]]
         gradient = slope[every, larger] / limit[:, None]
         bound = 1.0 - force[every, larger] / limit + (gradient * z).sum(axis=1)
         lines = np.column_stack([gradient, bound])
         # Ends of neighbouring intervals share a sample: one after the other.
         for path, sample, line in zip(*place, lines, strict=True):
-            state.cuts[path, sample, state.count[path, sample] % CUTS] = line
-            state.count[path, sample] += 1
+            self._cuts[path, sample, self._count[path, sample] % CUTS] = line
+            self._count[path, sample] += 1
 
     def _points(
-        self, state: _Paths, path: NDArray[np.intp], sample: NDArray[np.intp], a: Array, w: Array
+        self, path: NDArray[np.intp], sample: NDArray[np.intp], a: Array, w: Array
     ) -> PathPoints:
-        pose, first, second = (part[path, sample] for part in state.parts)
+        pose, first, second = (part[path, sample] for part in self._parts)
         return PathPoints(pose, first, second, a, w)
 
 

@@ -22,16 +22,14 @@ from scipy.optimize import linprog
 from scipy.sparse import csr_array
 
 from hybrid_opt.carry import Carry
-from hybrid_opt.static_hold import mass_at_reference, static_hold
-from hybrid_opt.timing.given import DrivenSpeeds
-from hybrid_opt.timing.limits import limit_ratios, limits_pressure
-from hybrid_opt.timing.model import REFINEMENT, TimingModel, contact_torque
+from hybrid_opt.static_hold import mass_at_reference
+from hybrid_opt.timing.limits import DrivenSpeeds, limit_ratios, limits_pressure
+from hybrid_opt.timing.model import REFINEMENT, TimingModel
 from hybrid_opt.timing.records import Timing, TimingLimits
 from symbolic.array import Array
 from symbolic.contact.elastic import free_shift, pressure_shifts
 from symbolic.contact.force_closure import presses_evenly
 from symbolic.errors import SettingsError
-from symbolic.records import Workcell
 from symbolic.records.poses import box_rotation
 
 KILOGRAM_FORCE = 9.80665
@@ -52,20 +50,13 @@ class PayloadSensitivity:
     Attributes:
         mass: the workcell's payload [kg].
         resultant: (2,) largest |f_i| of each robot at that mass [N].
-        normal: (2,) largest normal force of each robot at that mass [N].
         mass_by_resultant: (2,) payload at which each robot's |f_i| reaches its reference force
             [kg]; the paper's reading.
-        mass_by_normal: (2,) payload at which each robot's normal force reaches it [kg].
-        static_mass: payload at which the resultant of a robot reaches its reference force in a
-            level box at rest [kg].
     """
 
     mass: float
     resultant: Array
-    normal: Array
     mass_by_resultant: Array
-    mass_by_normal: Array
-    static_mass: float
 
     @property
     def payload_limit(self) -> float:
@@ -99,16 +90,8 @@ class Margin:
 
 def payload_sensitivity(carry: Carry) -> PayloadSensitivity:
     """Forces against payload mass for an unchanged timing."""
-    workcell = carry.workcell
-    resultant, normal = carry.peak_resultant_force, carry.peak_normal_force
-    return PayloadSensitivity(
-        workcell.payload.mass,
-        resultant,
-        normal,
-        mass_at_reference(workcell, resultant),
-        mass_at_reference(workcell, normal),
-        static_hold(workcell).payload_limit,
-    )
+    cell, resultant = carry.workcell, carry.peak_resultant_force
+    return PayloadSensitivity(cell.payload.mass, resultant, mass_at_reference(cell, resultant))
 
 
 def robustness_margins(model: TimingModel, carry: Carry) -> tuple[Margin, ...]:
@@ -119,89 +102,60 @@ def robustness_margins(model: TimingModel, carry: Carry) -> tuple[Margin, ...]:
     its patch, or a joint torque exceeds its maximum. Motion and timing stay as they are. Pads that
     press evenly have a margin until a rim lifts off in place of one of the patch.
     """
-    judge = _Judge(model, carry)
-    names = [robot.name for robot in model.workcell.robots]
-    margins = [
-        _friction_margin(judge, "friction of both contacts", np.array([1.0, 1.0])),
-        _friction_margin(judge, f"friction of {names[0]}", np.array([1.0, 0.0])),
-        _friction_margin(judge, f"friction of {names[1]}", np.array([0.0, 1.0])),
-    ]
-    margins += [_centre_margin(judge, axis, sign) for axis in range(3) for sign in (1.0, -1.0)]
-    return (*margins, *_patch_margins(carry, model.workcell), *_even_margins(model, carry))
+    workcell = model.workcell
+    payload, contacts, task = workcell.payload, workcell.contacts, workcell.task
+    names = [robot.name for robot in workcell.robots]
+    friction = np.array([contact.friction for contact in contacts])
+    radius = np.array([contact.patch_radius for contact in contacts])
+    centre, own_torque = np.array(payload.centre_of_mass), carry.side_by_side("own_torque")
+    wrench_torque = model.wrench_torque(carry.q, carry.pose)
+    has_patches = limits_pressure(workcell, TimingLimits())
 
-
-class _Judge:
-    """Re-evaluates one carry with other friction coefficients and centres of mass.
-
-    Attributes:
-        workcell: the cell.
-        friction: (2,) nominal coefficients.
-        centre: (3,) nominal centre of mass [m].
-    """
-
-    def __init__(self, model: TimingModel, carry: Carry) -> None:
-        self.workcell = model.workcell
-        self.friction = np.array([contact.friction for contact in model.workcell.contacts])
-        self.centre = np.array(model.workcell.payload.centre_of_mass)
-        self._model = model
-        self._carry = carry
-        self._own_torque = carry.side_by_side("own_torque")
-        self._wrench_torque = model.wrench_torque(carry.q, carry.pose)
-        self._torque_max = model.workcell.of_joints("torque_max")
-        self._radius = np.array([contact.patch_radius for contact in model.workcell.contacts])
-
-    def failure(self, friction: Array, centre: Array) -> str:
+    def failure(friction: Array, centre: Array) -> str:
         """Name of the limit that is exceeded most, or '' where everything holds."""
-        load = self._model.uncertain_load(self._carry, friction, centre)
-        torque = contact_torque(self.workcell, self._wrench_torque, load) + self._own_torque
-        reference = self.workcell.task.reference_force
+        load = model.uncertain_load(carry, friction, centre)
+        torque = model.contact_torque(wrench_torque, load) + own_torque
         use = {
-            "normal force": float((load["normal_force"] / reference).max()),
-            "joint torque": float((np.abs(torque) / self._torque_max).max()),
+            "normal force": float((load["normal_force"] / task.reference_force).max()),
+            "joint torque": float((np.abs(torque) / workcell.of_joints("torque_max")).max()),
         }
-        if limits_pressure(self.workcell, TimingLimits()):
-            use["pressure shift"] = float((load["pressure_shift"] / self._radius).max())
+        if has_patches:
+            use["pressure shift"] = float((load["pressure_shift"] / radius).max())
         name = max(use, key=lambda key: use[key])
         return "" if use[name] <= 1.0 else name
 
-
-def _friction_margin(judge: _Judge, name: str, which: Array) -> Margin:
-    """Margin of the coefficients marked by `which` (2,), lowered by the same share."""
-    nominal = float(judge.friction[which > 0.0].min())
-    lost, fails = _last_holding(
-        lambda lost: judge.failure(judge.friction * (1.0 - lost * which), judge.centre),
-        1.0 - LEAST_FRICTION_SHARE,
-    )
-    return Margin(name, "", nominal, nominal * (1.0 - lost), fails)
-
-
-def _centre_margin(judge: _Judge, axis: int, sign: float) -> Margin:
-    """Margin of the centre of mass along one box axis, up to the box's faces."""
-    nominal, direction = float(judge.centre[axis]), sign * np.eye(3)[axis]
-    room = float(judge.workcell.payload.size[axis]) / 2.0 - sign * nominal
-    offset, fails = _last_holding(
-        lambda offset: judge.failure(judge.friction, judge.centre + offset * direction), room
-    )
-    name = f"centre of mass towards {'+' if sign > 0.0 else '-'}{'xyz'[axis]}"
-    return Margin(name, "m", nominal, nominal + sign * offset, fails)
-
-
-def _patch_margins(carry: Carry, workcell: Workcell) -> list[Margin]:
-    """The least patch radius is the largest pressure shift where no force depends on it."""
-    if not limits_pressure(workcell, TimingLimits()):
-        return []
-    return [
-        Margin(
-            f"patch radius of {robot.name}",
-            "m",
-            contact.patch_radius,
-            float(shift),
-            "pressure shift",
+    def lowered(whose: str, which: Array) -> Margin:
+        """The coefficients marked by `which` (2,), lowered by the same share."""
+        nominal = float(friction[which > 0.0].min())
+        lost, fails = _last_holding(
+            lambda lost: failure(friction * (1.0 - lost * which), centre),
+            1.0 - LEAST_FRICTION_SHARE,
         )
-        for robot, contact, shift in zip(
-            workcell.robots, workcell.contacts, carry.peak_pressure_shift, strict=True
+        return Margin(f"friction of {whose}", "", nominal, nominal * (1.0 - lost), fails)
+
+    def shifted(axis: int, sign: float) -> Margin:
+        """The centre of mass along one box axis, up to the box's faces."""
+        nominal, direction = float(centre[axis]), sign * np.eye(3)[axis]
+        offset, fails = _last_holding(
+            lambda offset: failure(friction, centre + offset * direction),
+            float(payload.size[axis]) / 2.0 - sign * nominal,
         )
+        name = f"centre of mass towards {'+' if sign > 0.0 else '-'}{'xyz'[axis]}"
+        return Margin(name, "m", nominal, nominal + sign * offset, fails)
+
+    margins = [
+        lowered("both contacts", np.array([1.0, 1.0])),
+        *(lowered(name, which) for name, which in zip(names, np.eye(2), strict=True)),
+        *(shifted(axis, sign) for axis in range(3) for sign in (1.0, -1.0)),
     ]
+    if has_patches:
+        # The least patch radius is the largest shift where no force depends on it.
+        patches = zip(names, radius.tolist(), carry.peak_pressure_shift.tolist(), strict=True)
+        margins += [
+            Margin(f"patch radius of {name}", "m", nominal, shift, "pressure shift")
+            for name, nominal, shift in patches
+        ]
+    return (*margins, *_even_margins(model, carry))
 
 
 def _even_margins(model: TimingModel, carry: Carry) -> list[Margin]:

@@ -15,21 +15,23 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import Any
 
 import numpy as np
 
 from hybrid_opt.carry import Carry
-from hybrid_opt.timing.given import DrivenSpeeds, untimed
 from hybrid_opt.timing.limits import (
     NEAR,
     RECOMPUTED_TOLERANCE,
+    DrivenSpeeds,
     PathLimits,
     duration_at_speed_limits,
+    judged,
     largest_speed_factor,
     limit_ratios,
-    limit_use,
     squared_speed_limit,
+    untimed,
     worst,
 )
 from hybrid_opt.timing.model import REFINEMENT, PathMotion, TimingModel
@@ -54,8 +56,9 @@ FORCE_SHARPNESS = 0.02
 
 
 @dataclass(frozen=True)
-class PointRows:
-    """Limits at points of the path: alpha u'' + beta u'^2 <= bound, each (points, k)."""
+class Rows:
+    """Limits alpha u'' + beta u'^2 <= bound, each (n, k): at points of the path, or by interval, of
+    its constant u'' and the u'^2 at its beginning."""
 
     alpha: Array
     beta: Array
@@ -92,17 +95,12 @@ def _failure_at_rest(model: TimingModel, motion: PathMotion, limits: TimingLimit
     Where none is exceeded a timing exists: slow enough, every quantity is as close to its value at
     rest as wanted.
     """
-    use = limit_use(model.still(motion), model.workcell, limits, model.joint_names)
-    excess = worst(use)
+    timing = judged(model, model.still(motion), limits)
+    excess = worst(timing.use)
     if excess.ratio < 1.0 - 1e-6:
         return None
-    return Timing(
-        TimingStatus.INFEASIBLE_AT_REST,
-        f"standing still already uses {100.0 * excess.ratio:.1f} % of the limit: {excess.place}",
-        excess.place,
-        None,
-        use,
-    )
+    used = f"standing still already uses {100.0 * excess.ratio:.1f} % of the limit: {excess.place}"
+    return replace(timing, status=TimingStatus.INFEASIBLE_AT_REST, reason=used, carry=None)
 
 
 class _Problem:
@@ -124,37 +122,31 @@ class _Problem:
         self._grid = np.linspace(0.0, self._scale, intervals + 1)
         still = np.zeros(len(index))
         self._rest = self._at.ratios(still, still)
-        self._cuts = [self._linear_rows(), *self._first_cuts()]
-        self._linearised: list[PointRows] = []
+        self._cuts = list(self._first_rows())
+        self._linearised: list[Rows] = []
         self._tightened = np.ones(intervals)
         self._near = np.zeros(self._rest.shape[1], dtype=bool)
         self._duration = np.inf
 
-    def _linear_rows(self) -> PointRows:
-        """The limits that are linear by themselves: on speeds, which bound u'^2 alone, and on joint
-        accelerations."""
+    def _first_rows(self) -> Iterator[Rows]:
+        """The limits that are linear by themselves, on speeds, which bound u'^2 alone, and on joint
+        accelerations; supporting lines of the convex ones before any timing is known."""
         limit = squared_speed_limit(self._at.motion, self._model.workcell, self._limits)
         limit = np.minimum(limit, SPEED_CEILING / self._scale**2)[:, None]
         one, alpha, beta = np.ones_like(limit), *self._at.joint_accelerations()
-        return PointRows(
+        yield Rows(
             np.concatenate([0.0 * one, alpha, -alpha], axis=1),
             np.concatenate([1.0 / limit, beta, -beta], axis=1),
             np.repeat(one, 1 + 2 * alpha.shape[1], axis=1),
         )
-
-    def _first_cuts(self) -> list[PointRows]:
-        """Supporting lines of the convex limits before any timing is known."""
+        for first, second, bound in self._at.accelerations():
+            # Both signs of two orthogonal unit vectors that span both.
+            e = _unit(first)
+            f = _unit(second - np.sum(second * e, axis=1, keepdims=True) * e)
+            yield norm_rows(first, second, bound, np.stack([e, -e, f, -f], axis=1))
         still = np.zeros(len(self._rest))
-        return [
-            *[
-                norm_rows(first, second, limit, spanning_directions(first, second))
-                for first, second, limit in self._at.accelerations()
-            ],
-            *[
-                tangent_rows(*force, _pairs(still, still))
-                for force in self._at.forces(still, still)
-            ],
-        ]
+        for force in self._at.forces(still, still):
+            yield tangent_rows(*force, _pairs(still, still))
 
     def solve(self) -> Timing:
         """Solve linear problems until recomputed limits hold and nothing changes any more."""
@@ -171,7 +163,7 @@ class _Problem:
                 break
         return self._finish(squared, iteration, settled)
 
-    def _interval_rows(self, rows: list[PointRows]) -> IntervalRows:
+    def _interval_rows(self, rows: list[Rows]) -> Rows:
         """The rows of each interval's points in terms of its u'' and its initial u'^2."""
         alpha, beta, bound = (
             np.concatenate([getattr(row, name) for row in rows], axis=1)
@@ -182,7 +174,7 @@ class _Problem:
         progress = np.tile(np.array(INTERVAL_ENDS) * 2.0 * scale / intervals, intervals)[:, None]
         alpha, beta = alpha / scale, beta / scale**2
         shape = (intervals, len(INTERVAL_ENDS) * alpha.shape[1])
-        return IntervalRows(
+        return Rows(
             (alpha + progress * beta).reshape(shape),
             beta.reshape(shape),
             bound.reshape(shape) / self._tightened[:, None],
@@ -249,38 +241,21 @@ class _Problem:
 
     def _finish(self, squared: Array, iterations: int, settled: bool) -> Timing:
         """Recompute on refined samples; slow down uniformly where a limit is still exceeded."""
-        workcell, limits, names = self._model.workcell, self._limits, self._model.joint_names
-        factor = 1.0
-        carry = self._refined(squared)
-        use = limit_use(carry, workcell, limits, names)
-        if worst(use).ratio > 1.0 + RECOMPUTED_TOLERANCE:
 
-            def exceeds(slower: float) -> bool:
-                trial = self._refined(slower**2 * squared)
-                return worst(limit_use(trial, workcell, limits, names)).ratio > 1.0
+        @cache
+        def driven(factor: float) -> Timing:
+            return judged(self._model, self._refined(factor**2 * squared), self._limits)
 
-            factor = largest_speed_factor(exceeds)
-            squared = factor**2 * squared
-            carry = self._refined(squared)
-            use = limit_use(carry, workcell, limits, names)
-        excess = worst(use)
-        status, reason = TimingStatus.OK, f"{carry.duration:.3f} s; most used: {excess.place}"
+        factor = largest_speed_factor(lambda slower: worst(driven(slower).use).ratio)
+        timing = driven(factor)
         if factor < LEAST_SPEED or not settled:
-            status = TimingStatus.NOT_CONVERGED
             reason = (
                 f"the limits hold, but only after slowing to {factor:.3f} of the speed found in "
                 f"{iterations} iterations; the timing is not the fastest"
             )
-        return Timing(
-            status=status,
-            reason=reason,
-            place=excess.place,
-            carry=carry,
-            use=use,
-            grid_speed=np.sqrt(squared) / self._scale,
-            iterations=iterations,
-            slowed=factor,
-        )
+            timing = replace(timing, status=TimingStatus.NOT_CONVERGED, reason=reason)
+        speed = np.sqrt(factor**2 * squared) / self._scale
+        return replace(timing, grid_speed=speed, iterations=iterations, slowed=factor)
 
     def _refined(self, squared: Array) -> Carry:
         speeds = DrivenSpeeds.of(np.sqrt(squared) / self._scale)
@@ -304,26 +279,15 @@ class _Problem:
         )
 
 
-def norm_rows(first: Array, second: Array, limit: float, directions: Array) -> PointRows:
-    """Supporting lines of |first u'' + second u'^2| <= limit.
-
-    Args:
-        first, second: (n, 3).
-        directions: (n, k, 3) unit vectors e; each gives e.(first u'' + second u'^2) <= limit.
-    """
+def norm_rows(first: Array, second: Array, limit: float, directions: Array) -> Rows:
+    """Supporting lines of |first u'' + second u'^2| <= limit, by (n, 3) each: along every unit
+    vector of `directions` (n, k, 3) one."""
     alpha = np.einsum("nkd,nd->nk", directions, first) / limit
     beta = np.einsum("nkd,nd->nk", directions, second) / limit
-    return PointRows(alpha, beta, np.ones_like(alpha))
+    return Rows(alpha, beta, np.ones_like(alpha))
 
 
-def spanning_directions(first: Array, second: Array) -> Array:
-    """(n, 4, 3): both signs of two orthogonal unit vectors that span first and second (n, 3)."""
-    one = _unit(first)
-    two = _unit(second - np.sum(second * one, axis=1, keepdims=True) * one)
-    return np.stack([one, -one, two, -two], axis=1)
-
-
-def tangent_rows(value: Array, gradient: Array, z: Array) -> PointRows:
+def tangent_rows(value: Array, gradient: Array, z: Array) -> Rows:
     """Supporting lines of convex values <= 1, touching them at z.
 
     Args:
@@ -332,10 +296,10 @@ def tangent_rows(value: Array, gradient: Array, z: Array) -> PointRows:
         z: (n, 2).
     """
     bound = 1.0 - value + np.einsum("nkd,nd->nk", gradient, z)
-    return PointRows(gradient[..., 0], gradient[..., 1], bound)
+    return Rows(gradient[..., 0], gradient[..., 1], bound)
 
 
-def linearised_rows(value: Array, gradient: Array, at_rest: Array, z: Array) -> PointRows:
+def linearised_rows(value: Array, gradient: Array, at_rest: Array, z: Array) -> Rows:
     """Linearisation of value <= 1 about z, kept satisfiable at rest.
 
     Where it would forbid rest, which is truly allowed, it follows the value by u'' and the chord to
@@ -352,7 +316,7 @@ def linearised_rows(value: Array, gradient: Array, at_rest: Array, z: Array) -> 
     a, w = z[:, :1], z[:, 1:]
     chord = (value - at_rest - lines.alpha * a) / np.maximum(w, 1e-300)
     forbids = (lines.bound < least) & (w > 0.0)
-    return PointRows(
+    return Rows(
         lines.alpha,
         np.where(forbids, chord, lines.beta),
         np.where(forbids, 1.0 - at_rest, np.maximum(lines.bound, least)),
@@ -379,21 +343,6 @@ and now and then call a feasible interval infeasible."""
 
 
 @dataclass(frozen=True)
-class IntervalRows:
-    """Linear limits on a path's timing: by interval i and row k, a u'' + b u'^2 <= bound.
-
-    u'' is constant on an interval, u'^2 is that at the interval's beginning.
-
-    Attributes:
-        a, b, bound: (intervals, k).
-    """
-
-    a: Array
-    b: Array
-    bound: Array
-
-
-@dataclass(frozen=True)
 class SolverFailure:
     """A failure of toppra: what it could not do, and the interval at which."""
 
@@ -401,7 +350,7 @@ class SolverFailure:
     interval: int
 
 
-def fastest_speed(rows: IntervalRows, grid: Array) -> Array | SolverFailure:
+def fastest_speed(rows: Rows, grid: Array) -> Array | SolverFailure:
     """The fastest motion from rest to rest within linear limits.
 
     Args:
@@ -413,14 +362,14 @@ def fastest_speed(rows: IntervalRows, grid: Array) -> Array | SolverFailure:
     """
     found: Array | SolverFailure = SolverFailure("not tried", 0)
     for factor in RESCALINGS:
-        scaled = IntervalRows(rows.a / factor, rows.b / factor**2, rows.bound)
+        scaled = Rows(rows.alpha / factor, rows.beta / factor**2, rows.bound)
         found = _solve(scaled, factor * grid)
         if not isinstance(found, SolverFailure):
             return found / factor**2
     return found
 
 
-def _solve(rows: IntervalRows, grid: Array) -> Array | SolverFailure:
+def _solve(rows: Rows, grid: Array) -> Array | SolverFailure:
     # Imported late: toppra pulls in plotting.
     from toppra.algorithm import TOPPRA
     from toppra.constraint import LinearConstraint
@@ -440,21 +389,21 @@ def _solve(rows: IntervalRows, grid: Array) -> Array | SolverFailure:
         def __call__(self, path_positions: Any, order: int = 0) -> Any:
             raise NotImplementedError
 
-    class Rows(LinearConstraint):  # type: ignore[misc]
+    class Limits(LinearConstraint):  # type: ignore[misc]
         """All limits as rows F w <= g with w = (u'', u'^2)."""
 
         def compute_constraint_params(self, *_: Any) -> tuple[Any, ...]:
             n = len(grid)
-            f = np.zeros((n, rows.a.shape[1], 2))
-            g = np.ones((n, rows.a.shape[1]))
-            f[:-1, :, 0], f[:-1, :, 1], g[:-1] = rows.a, rows.b, rows.bound
+            f = np.zeros((n, rows.alpha.shape[1], 2))
+            g = np.ones((n, rows.alpha.shape[1]))
+            f[:-1, :, 0], f[:-1, :, 1], g[:-1] = rows.alpha, rows.beta, rows.bound
             ceiling = np.tile([0.0, SPEED_CEILING], (n, 1))
             unit = np.tile([1.0, 0.0], (n, 1))
             return unit, unit[:, ::-1].copy(), np.zeros((n, 2)), f, g, None, ceiling
 
     with _quiet():
         algorithm = TOPPRA(
-            [Rows()],
+            [Limits()],
             Line(),
             gridpoints=grid,
             solver_wrapper="seidel",

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import hybrid_opt as ho
-from hybrid_opt.bundles.arms import require_axes
+from hybrid_opt.bundles.arms import ABB, require_arms
 from hybrid_opt.cell import Cell
 from hybrid_opt.collision.certify import SampledPath, configurations
 from hybrid_opt.display.scene import frame_placements, scene_data
@@ -76,7 +76,7 @@ def test_a_carry_is_timed_and_exported_with_all_joints(cell: Cell) -> None:
         slope = np.diff(arm.q, axis=0)[moving] / steps[moving, None]
         np.testing.assert_allclose(slope, mean, atol=0.02 * np.abs(arm.q_rate).max())
     with pytest.raises(SettingsError, match="7 joints"):
-        require_axes(cell.workcell, "RAPID", (6,))
+        require_arms(cell.workcell, "RAPID", ABB, (6,), any_arm=True)
 
 
 def test_locking_is_a_constant_path(cell: Cell) -> None:

@@ -16,7 +16,7 @@ from hybrid_opt.recommending.choice import LEADER
 from hybrid_opt.robust.cases import worst_cases
 from hybrid_opt.robust.force import pressing_model
 from hybrid_opt.sensitivity import Sensitivity
-from hybrid_opt.timing.given import drive_path
+from hybrid_opt.timing.limits import drive_path
 from symbolic import outside
 from symbolic.array import Array
 from symbolic.contact.worst_cases import case_grasp_function, case_grasp_gradient_function

@@ -13,12 +13,16 @@ from __future__ import annotations
 import json
 from bisect import bisect_right
 from collections.abc import Iterator, Sequence
+from copy import copy
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import islice
 from operator import sub
 from pathlib import Path
 from typing import Any
+
+FORMAT, VERSION = "dual-arm-carry job", 2
+"""Of the file that holds a job."""
 
 HELD = ("lift", "carry", "set_down")
 """Phases in which pads alone hold the box."""
@@ -94,8 +98,8 @@ class Job:
         Raises:
             Refused: it is none, or of another version.
         """
-        if document.get("format") != "dual-arm-carry job" or document.get("version") != 2:
-            raise Refused("this is no job of version 2")
+        if document.get("format") != FORMAT or document.get("version") != VERSION:
+            raise Refused(f"this is no job of version {VERSION}")
         self.document = document
         self.time: list[float] = document["time"]
         self.robots: list[dict[str, Any]] = document["robots"]
@@ -284,9 +288,7 @@ class Clock:
 
     def ahead(self, rate: float, step: float) -> Iterator[Moment]:
         """From now on each step, turning to a rate, until it stands or the path ends."""
-        clock = Clock(self._end, self._stop_time, self.s, self.rate)
-        clock._from, clock._to, clock._since = self._from, self._to, self._since
-        clock._takes = self._takes
+        clock = copy(self)
         clock.turn(rate)
         yield Moment(0.0, clock.s, clock.rate, clock.change)
         last = self._end if rate > 0.0 else 0.0

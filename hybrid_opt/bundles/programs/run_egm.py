@@ -116,7 +116,8 @@ class Stream:
             # About carryPad, whose z axis is the pad's normal.
             self._force[arm] = abs(message.force[2])
         if self.machine.state == "running" and not message.running:
-            self.fault = self.fault or f"the controller of {self._name(arm)} does not follow"
+            name = self.job.robots[arm]["name"]
+            self.fault = self.fault or f"the controller of {name} does not follow"
 
     def tick(self, now: float) -> None:
         """Let time pass."""
@@ -129,8 +130,11 @@ class Stream:
         clock = self.machine.clock
         soon = clock.s + clock.rate * self.config["lags"][self._arm]
         wanted, later = (self.job.force(self._arm, s) for s in (clock.s, soon))
+        own, other = self._force[self._arm], self._force[1 - self._arm]
         # A job that stops may do so because a sensor is wrong: what was integrated stays.
-        felt = self._felt if self.machine.state == "running" else None
+        felt = None
+        if self.machine.state == "running":
+            felt = own if own is not None else other
         self.press.tick(dt, wanted, later, felt)
         if self.machine.state == "held" and self.command in ("continue", "back"):
             direction = 1.0 if self.command == "continue" else -1.0
@@ -142,12 +146,6 @@ class Stream:
                 print(self.machine.told(), file=sys.stderr)
         if before != self.machine.state:
             print(self.machine.told(), file=sys.stderr)
-
-    @property
-    def _felt(self) -> float | None:
-        """What the pressing pad feels, from its own sensor or the other's."""
-        own = self._force[self._arm]
-        return own if own is not None else self._force[1 - self._arm]
 
     def answer(self, arm: int, number: int, now: float) -> bytes:
         """Where an arm has to be, as a message: its lag ahead of the clock."""
@@ -186,9 +184,6 @@ class Stream:
             return degrees, []
         return degrees[:2] + degrees[3:], [degrees[2]]
 
-    def _name(self, arm: int) -> str:
-        return str(self.job.robots[arm]["name"])
-
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Stream the job; returns the exit code: 0 when it is done."""
@@ -199,18 +194,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         job = Job.read(BUNDLE / "job.json")
         config = json.loads((BUNDLE / "config/egm.json").read_text("utf-8"))
         stream = Stream(job, config)
-        sockets = [opened(port) for port in config["ports"]]
+        sockets = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in config["ports"]]
+        for each, port in zip(sockets, config["ports"], strict=True):
+            each.bind(("", port))
         return streamed(stream, sockets, options.check)
     except (OSError, Refused) as error:
         print(error, file=sys.stderr)
         return 2
-
-
-def opened(port: int) -> socket.socket:
-    """A port that a controller writes to."""
-    found = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    found.bind(("", port))
-    return found
 
 
 def streamed(stream: Stream, sockets: Sequence[socket.socket], check: bool) -> int:
@@ -326,7 +316,7 @@ def to_robot(number: int, time: float, joints: Sequence[float], further: Sequenc
 
 def _packed(values: Sequence[float]) -> bytes:
     # Repeated doubles of version 2 are written one by one.
-    return b"".join(_key(1, 1) + struct.pack("<d", value) for value in values)
+    return b"".join(_raw(1 << 3 | 1) + struct.pack("<d", value) for value in values)
 
 
 def _doubles(data: bytes, numbers: tuple[int, ...]) -> tuple[float, ...]:
@@ -367,10 +357,6 @@ def _varint(data: bytes, place: int) -> tuple[int, int]:
     raise ValueError("this is no message of EGM")
 
 
-def _key(field: int, kind: int) -> bytes:
-    return _raw(field << 3 | kind)
-
-
 def _raw(value: int) -> bytes:
     found = b""
     while value >= 0x80:
@@ -380,11 +366,11 @@ def _raw(value: int) -> bytes:
 
 
 def _number(field: int, value: int) -> bytes:
-    return _key(field, 0) + _raw(value)
+    return _raw(field << 3) + _raw(value)
 
 
 def _bytes(field: int, value: bytes) -> bytes:
-    return _key(field, 2) + _raw(len(value)) + value
+    return _raw(field << 3 | 2) + _raw(len(value)) + value
 
 
 if __name__ == "__main__":

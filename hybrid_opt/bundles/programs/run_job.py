@@ -58,14 +58,18 @@ SLOWEST = 0.01
 """Fraction of a speed slider that is nearly none."""
 
 
-class Cell:
-    """Both arms through their controllers, as config/cell.json describes them."""
+class Run:
+    """A run of the job by both arms' controllers, as config/cell.json describes them."""
 
     def __init__(self, node: Any, job: Job, config: dict[str, Any]) -> None:
-        """Subscribe to both arms and find their controllers."""
+        """Subscribe to both arms, with nothing sent."""
         self.node, self.job, self.config = node, job, config
-        self.fault, self.command = "", ""
-        self.lost = False
+        self._stamped = config["stamped"]
+        how: dict[str, Any] = {"lead": LEAD_OF_STOP} if self._stamped else {"waits": True}
+        self.machine = Machine(job, config["lag"], **how)
+        self.fault, self.command, self.lost = "", "", False
+        self._pressed, self._began, self._last = -math.inf, 0.0, 0.0
+        self._presses = False
         self._q: list[dict[str, float]] = [{}, {}]
         self._news = [-math.inf, -math.inf]
         self._force: list[float | None] = [None, None]
@@ -279,72 +283,35 @@ class Cell:
             request = {"mass": mass, "center_of_gravity": dict(zip("xyz", centre, strict=True))}
             self.call(load["name"], load["type"], request)
 
-    def halt(self, takes: float) -> None:
-        """Stop arms whose goals cannot be replaced: slow on the path for a time [s], then whole."""
-        self._goals += 1
-        for slider in self.config["sliders"]:
-            self.call(slider["name"], slider["type"], {"speed_slider_fraction": SLOWEST})
-        self.spin(self.now() + takes)
-        for handle in self._handles:
-            handle.cancel_goal_async()
-
-    def release(self) -> None:
-        """End what presses, once the pads are off the box."""
-        for force in self.config["force"]:
-            self.call(force["end"], TRIGGER, {})
-
-    def full_speed(self) -> None:
-        """Give the speed sliders back what they had."""
-        sliders = self.config["sliders"]
-        calls = [self.call(s["name"], s["type"], {"speed_slider_fraction": 1.0}) for s in sliders]
-        self.wait(calls, "a speed slider")
-
-
-class Run:
-    """One run of the job."""
-
-    def __init__(self, cell: Cell) -> None:
-        """Begin with nothing sent."""
-        self.cell, self.job = cell, cell.job
-        self._stamped = cell.config["stamped"]
-        lag = cell.config["lag"]
-        self.machine = (
-            Machine(self.job, lag, lead=LEAD_OF_STOP)
-            if self._stamped
-            else Machine(self.job, lag, waits=True)
-        )
-        self._pressed, self._began, self._last = -math.inf, 0.0, 0.0
-        self._presses = False
-
     def start(self) -> None:
         """Send the whole job and begin.
 
         Raises:
             Refused: the arms are not ready for it.
         """
-        self.machine.start(self.cell.seen())
-        self._send(1.0)
+        self.machine.start(self.seen())
+        self._begin(1.0)
 
-    def _send(self, rate: float) -> None:
-        moments = list(self.machine.clock.ahead(rate, self.cell.config["step"]))
-        self._began = self.cell.now() + (LEAD if self._stamped else 0.0)
-        self.cell.send(moments, self._began)
-        self.cell.spin(self._began)
+    def _begin(self, rate: float) -> None:
+        moments = list(self.machine.clock.ahead(rate, self.config["step"]))
+        self._began = self.now() + (LEAD if self._stamped else 0.0)
+        self.send(moments, self._began)
+        self.spin(self._began)
         self._last = self._began
 
     def tick(self) -> None:
         """Look at the arms and do what has to be done."""
-        cell, machine = self.cell, self.machine
-        before, now = machine.state, cell.now()
-        machine.tick(now - self._last, cell.seen())
+        machine = self.machine
+        before, now = machine.state, self.now()
+        machine.tick(now - self._last, self.seen())
         self._last = now
         if before == "running" and machine.state in ("stopping", "held"):
             self._stop()
         if before != machine.state:
-            cell.node.get_logger().info(machine.told())
+            self.node.get_logger().info(machine.told())
         self._press()
-        if machine.state == "held" and cell.command in ("continue", "back"):
-            self._resume(1.0 if cell.command == "continue" else -1.0)
+        if machine.state == "held" and self.command in ("continue", "back"):
+            self._resume(1.0 if self.command == "continue" else -1.0)
 
     def stop(self, reason: str) -> None:
         """Stop for a reason of one's own."""
@@ -353,45 +320,76 @@ class Run:
             self._stop()
 
     def _stop(self) -> None:
-        cell = self.cell
         if not self._stamped:
-            cell.halt(self.machine.stop_time)
+            # Goals that cannot be replaced: slow on the path for a time, then whole.
+            self._goals += 1
+            self._slide(SLOWEST)
+            self.spin(self.now() + self.machine.stop_time)
+            for handle in self._handles:
+                handle.cancel_goal_async()
             return
         if self.machine.state == "held":
             # At its end: the controllers hold what they reached.
             return
         # With the start of what is driven now: the new points are a continuation of the old ones,
         # the first of which is over when they arrive, so that nothing is made up in between.
-        gone = cell.now() - self._began
-        ahead = self.machine.clock.ahead(0.0, cell.config["step"])
+        gone = self.now() - self._began
+        ahead = self.machine.clock.ahead(0.0, self.config["step"])
         moments = [Moment(gone + m.time, m.s, m.rate, m.change) for m in ahead]
         try:
-            cell.send(moments, self._began)
+            self.send(moments, self._began)
         except Refused as error:
-            cell.node.get_logger().error(f"{error}; the job goes on to its end as planned")
+            self.node.get_logger().error(f"{error}; the job goes on to its end as planned")
+
+    def _slide(self, fraction: float) -> list[Any]:
+        """Set the speed sliders."""
+        request = {"speed_slider_fraction": fraction}
+        return [self.call(each["name"], each["type"], request) for each in self.config["sliders"]]
 
     def _press(self) -> None:
-        s, now = self.machine.clock.s, self.cell.now()
+        s, now = self.machine.clock.s, self.now()
         touching = self.job.begin("press") < s < self.job.begin("retreat")
-        for force in self.cell.config["force"]:
+        for force in self.config["force"]:
             if touching and now - self._pressed >= force["every"]:
                 self._pressed, self._presses = now, True
-                self.cell.press(s, self.machine.clock.rate)
-                self.cell.bear(s)
+                self.press(s, self.machine.clock.rate)
+                self.bear(s)
         if self._presses and not touching:
+            # The pads are off the box.
             self._presses = False
-            self.cell.release()
+            for force in self.config["force"]:
+                self.call(force["end"], TRIGGER, {})
 
     def _resume(self, direction: float) -> None:
-        cell = self.cell
-        cell.command, cell.fault, cell.lost = "", "", False
+        self.command, self.fault, self.lost = "", "", False
         try:
-            self.machine.resume(direction, cell.seen())
-            cell.full_speed()
-            self._send(direction)
+            self.machine.resume(direction, self.seen())
+            self.wait(self._slide(1.0), "a speed slider")
+            self._begin(direction)
         except Refused as error:
             self.machine.hold(str(error))
-            cell.node.get_logger().error(self.machine.told())
+            self.node.get_logger().error(self.machine.told())
+
+    def interrupt(self, *_: object) -> None:
+        """Ctrl-C stops the job; while it is held, for whatever reason, ends the program."""
+        if self.machine.state == "held":
+            self.command = "leave"
+        self.fault = self.fault or CTRL_C
+
+    def look_after(self) -> int:
+        """Look after a run that has begun, to its end; returns the exit code."""
+        machine = self.machine
+        try:
+            while machine.state != "done":
+                self.spin(self.now() + PERIOD)
+                self.tick()
+                if machine.state == "held" and self.command == "leave":
+                    self.node.get_logger().error(f"left while {machine.told()}")
+                    return 1
+        except BaseException:
+            self.stop("run_job.py has failed")
+            raise
+        return 0 if machine.clock.s > 0.0 else 3
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -404,46 +402,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         job = Job.read(BUNDLE / "job.json")
         config = json.loads((BUNDLE / "config/cell.json").read_text("utf-8"))
-        cell = Cell(node, job, config)
-        run = Run(cell)
+        run = Run(node, job, config)
         for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, lambda *_: interrupted(run))
-        cell.prepare()
-        cell.spin(cell.now() + SETTLE)
+            signal.signal(number, run.interrupt)
+        run.prepare()
+        run.spin(run.now() + SETTLE)
         if options.check:
-            run.machine.start(cell.seen())
+            run.machine.start(run.seen())
             node.get_logger().info("both arms are at their first places")
             return 0
         run.start()
-        return looked_after(run)
+        return run.look_after()
     except Refused as error:
         node.get_logger().error(str(error))
         return 2
     finally:
         rclpy.shutdown()
-
-
-def interrupted(run: Run) -> None:
-    """Ctrl-C stops the job; while it is held, for whatever reason, ends the program."""
-    if run.machine.state == "held":
-        run.cell.command = "leave"
-    run.cell.fault = run.cell.fault or CTRL_C
-
-
-def looked_after(run: Run) -> int:
-    """Look after a run that has begun, to its end; returns the exit code."""
-    cell, machine = run.cell, run.machine
-    try:
-        while machine.state != "done":
-            cell.spin(cell.now() + PERIOD)
-            run.tick()
-            if machine.state == "held" and cell.command == "leave":
-                cell.node.get_logger().error(f"left while {machine.told()}")
-                return 1
-    except BaseException:
-        run.stop("run_job.py has failed")
-        raise
-    return 0 if machine.clock.s > 0.0 else 3
 
 
 if __name__ == "__main__":

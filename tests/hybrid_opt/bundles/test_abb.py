@@ -21,7 +21,7 @@ import pytest
 from rapidchecker.check import check_format
 
 from hybrid_opt.bundles import TARGETS, BundleOptions
-from hybrid_opt.bundles.arms import ABB, UR, require_maker
+from hybrid_opt.bundles.arms import ABB, UR, require_arms
 from hybrid_opt.bundles.bundle import prepared
 from hybrid_opt.bundles.languages import rapid_files, require_rapid
 from hybrid_opt.bundles.programs.carry_job import Job
@@ -104,13 +104,15 @@ def test_tool_and_load_are_declared() -> None:
 
 def test_arms_of_other_makers_are_refused() -> None:
     cell = rack().workcell
-    require_maker(cell, ABB, "RAPID", any_arm=False)
+    require_arms(cell, "RAPID", ABB, (6,), any_arm=False)
     with pytest.raises(SettingsError, match=r"gofa12.urdf.*UR e-series"):
-        require_maker(cell, UR, "URScript", any_arm=False)
+        require_arms(cell, "URScript", UR, (6,), any_arm=False)
     other = replace(cell.robots[0], urdf=ur10_urdf(), chain_root="")
     with pytest.raises(SettingsError, match="ABB"):
-        require_maker(replace(cell, robots=(other, cell.robots[1])), ABB, "RAPID", any_arm=False)
-    require_maker(replace(cell, robots=(other, other)), ABB, "RAPID", any_arm=True)
+        require_arms(
+            replace(cell, robots=(other, cell.robots[1])), "RAPID", ABB, (6,), any_arm=False
+        )
+    require_arms(cell, "URScript", UR, (6,), any_arm=True)
 
 
 def test_the_make_is_in_the_robots_name_where_nothing_else_tells_it(tmp_path: Path) -> None:
@@ -120,9 +122,9 @@ def test_the_make_is_in_the_robots_name_where_nothing_else_tells_it(tmp_path: Pa
     path.write_text(re.sub(r'<robot name="[^"]*"', '<robot name="ur10e"', text, count=1), "utf-8")
     first, second = (replace(robot, urdf=path) for robot in rack().workcell.robots)
     cell = replace(rack().workcell, robots=(first, second))
-    require_maker(cell, UR, "URScript", any_arm=False)
+    require_arms(cell, "URScript", UR, (6,), any_arm=False)
     with pytest.raises(SettingsError, match="does not look like an arm of ABB"):
-        require_maker(cell, ABB, "RAPID", any_arm=False)
+        require_arms(cell, "RAPID", ABB, (6,), any_arm=False)
 
 
 def test_names_cannot_leave_a_comment() -> None:

@@ -255,7 +255,7 @@ def test_a_driver_has_to_have_an_address(tmp_path: Path) -> None:
     hosts = ("10.0.0.1", "arm-2.local")
     paths = export(job, "ur-ros2", tmp_path, options=BundleOptions(any_arm=True, addresses=hosts))
     config = json.loads(next(p for p in paths if p.name == "cell.json").read_text())
-    assert tuple(driver["address"] for driver in config["drivers"]) == hosts
+    assert tuple(each["arguments"]["robot_ip"] for each in config["launch"]) == hosts
     with pytest.raises(SettingsError, match="no host name or IP address"):
         export(job, "ur-ros2", tmp_path, options=BundleOptions(addresses=("a b", "c")))
 

@@ -6,11 +6,16 @@ import ast
 import io
 import json
 import math
+import sys
+import types
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
 import pinocchio as pin
+import pytest
 import yaml
 import yourdfpy
 
@@ -222,3 +227,67 @@ def test_its_programs_are_python() -> None:
             assert not any(module.startswith("hybrid_opt") for module in modules), name
         assert "job.json" in files
     assert math.isfinite(json.loads(text_of("ur-ros2", "config/cell.json"))["step"])
+
+
+def launched(target: str, name: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> list[Any]:
+    """The actions of a bundle's launch file with the namespace of each, by stand-ins for launch."""
+    for file, content in contents(target).items():
+        path = folder / file
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(content if isinstance(content, bytes) else content.encode())
+
+    def action(kind: str) -> Callable[..., Any]:
+        return lambda *positional, **named: (kind, positional, named)
+
+    text = (folder / f"launch/{name}.launch.py").read_text()
+    for node in ast.walk(ast.parse(text)):
+        module = getattr(node, "module", "") or ""
+        if isinstance(node, ast.ImportFrom) and module.startswith("launch"):
+            stub = types.ModuleType(module)
+            vars(stub).update({alias.name: action(alias.name) for alias in node.names})
+            monkeypatch.setitem(sys.modules, module, stub)
+    space: dict[str, Any] = {"__file__": str(folder / f"launch/{name}.launch.py")}
+    exec(compile(text, name, "exec"), space)
+    found = []
+    for kind, positional, named in space["generate_launch_description"]()[1][0]:
+        group = positional[0] if kind == "GroupAction" else [(kind, positional, named)]
+        pushed = next((a[1][0] for a in group if a[0] == "PushRosNamespace"), "")
+        found += [(pushed, *a) for a in group if a[0] != "PushRosNamespace"]
+    return found
+
+
+@pytest.mark.parametrize(
+    ("target", "name", "spaces"),
+    [
+        ("ros2-control", "control", [""] * 3),
+        ("franka-ros2", "franka", ["", "left", "", "right"]),
+        ("ur-ros2", "ur", ["left"] * 3 + ["right"] * 3),
+    ],
+)
+def test_launch_files_start_what_the_programs_ask(
+    target: str, name: str, spaces: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Controllers that actions and services belong to, in the namespaces that these have."""
+    found = launched(target, name, tmp_path, monkeypatch)
+    assert [space for space, *_ in found] == spaces
+    config = json.loads(text_of(target, "config/cell.json"))
+    spawned = {
+        f"{space}/{controller}"
+        for space, kind, _, named in found
+        if kind == "Node" and named["executable"] == "spawner"
+        for controller in named["arguments"]
+    }
+    names = [group["action"] for group in config["groups"]]
+    names += [call["name"] for call in (*config["force"], *config["sliders"])]
+    assert {each.removesuffix(f"/{each.rsplit('/', 1)[1]}").lstrip("/") for each in names} <= {
+        each.lstrip("/") for each in spawned
+    }
+    for _, kind, _, named in found:
+        files: list[str] = []
+        if kind == "IncludeLaunchDescription":
+            arguments = dict(named["launch_arguments"])
+            assert arguments["robot_ip"] == "192.168.0.10"
+            files = [v for v in arguments.values() if v.endswith(".yaml")]
+        elif named["executable"] == "ros2_control_node":
+            files = [each for each in named["parameters"] if isinstance(each, str)]
+        assert all(Path(file).is_file() for file in files)

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from hybrid_opt.job.motions import PEAK_RATE, at_even_steps, rise, unit_squeeze
-from hybrid_opt.job.smooth import acceleration_at_ends, rests_at_ends, smoothed
+from hybrid_opt.job.smooth import acceleration_at_ends, rests_at_ends, without_jumps
 from hybrid_opt.robust.squeeze import pressed_together
 from hybrid_opt.timing.jerk import time_with_jerk
-from hybrid_opt.timing.limits import limit_use, worst
+from hybrid_opt.timing.limits import judged, worst
 from hybrid_opt.timing.records import JerkLimits, Timing, TimingLimits
 from hybrid_opt.timing.solve import time_path
 from symbolic.path.spline import path_basis
@@ -81,7 +81,7 @@ def fast() -> Timing:
 def test_a_time_optimal_timing_loses_its_jumps(width: float) -> None:
     timing = fast()
     assert not rests_at_ends(timing)
-    found = smoothed(rack().timing_model, timing, width)
+    found = without_jumps(rack().timing_model, timing, None, width)
     carry, cell = found.carry, rack().workcell
     assert carry is not None
     assert acceleration_at_ends(found) == 0.0
@@ -114,9 +114,9 @@ def test_a_time_optimal_timing_loses_its_jumps(width: float) -> None:
 def test_it_is_slowed_no_more_than_a_limit_asks_for(force: float, width: float) -> None:
     model, limits = rack().timing_model, TimingLimits(force=force)
     timing = time_path(model, rack().initial, limits)
-    found = smoothed(model, timing, width)
+    found = without_jumps(model, timing, None, width)
     assert found.carry is not None
-    use = limit_use(found.carry, model.workcell, limits, model.joint_names)
+    use = judged(model, found.carry, limits).use
     assert found.use == use
     assert 0.5 * timing.slowed < found.slowed < timing.slowed
     assert 1.0 - 1e-3 < worst(use).ratio <= 1.0

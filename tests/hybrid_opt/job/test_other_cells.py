@@ -144,7 +144,7 @@ def test_franka_takes_the_pandas() -> None:
     sheet = prepared(job, target, BundleOptions(step=0.05))
     files = target.files(sheet)
     config = json.loads(files["config/cell.json"])
-    assert [driver["type"] for driver in config["drivers"]] == ["panda", "panda"]
+    assert [each["arguments"]["robot_type"] for each in config["launch"]] == ["panda", "panda"]
     assert config["effort"] == "without_gravity"
     for arm in (0, 1):
         controllers = yaml.safe_load(files[f"config/controllers_{arm + 1}.yaml"])["/**"]

@@ -10,7 +10,7 @@ import pinocchio as pin
 import pytest
 
 from hybrid_opt.errors import JobError
-from hybrid_opt.job.motions import lift_line, timed
+from hybrid_opt.job.motions import straight, timed
 from hybrid_opt.job.plan import JobModel
 from hybrid_opt.job.records import PHASES, Job, Phase, sample_job
 from hybrid_opt.robust.squeeze import SqueezeSettings
@@ -274,7 +274,7 @@ def test_straight_phases_take_the_time_that_jerk_asks_for() -> None:
     tight = replace(first, jerk_max=np.full(6, 0.5))
     model.workcell = replace(model.workcell, robots=(tight, second))
     old = job.phase("lift")
-    line = lift_line("lift", old.motion.pose[0], old.motion.pose[-1], 0.1)
+    line = straight(model.workcell, "lift", old.motion.pose[[0, -1]], (0.0, 0.0), 0.1)
     motion = timed(model, line, old.motion.q)
     assert motion.duration > old.duration
     joints = np.diff(motion.q_second[:, :6], axis=0) / np.diff(motion.time)[:, None]

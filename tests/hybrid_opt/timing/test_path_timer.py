@@ -9,7 +9,7 @@ import pytest
 
 from hybrid_opt.compiled_cell import CompiledCell
 from hybrid_opt.timing import path_timer
-from hybrid_opt.timing.given import drive_path
+from hybrid_opt.timing.limits import drive_path
 from hybrid_opt.timing.model import TimingModel
 from hybrid_opt.timing.path_timer import PathTimer
 from hybrid_opt.timing.records import TimingLimits, TimingStatus

@@ -12,9 +12,9 @@ from hybrid_opt.carry import Carry
 from hybrid_opt.compiled_cell import CompiledCell
 from hybrid_opt.robust.cases import worst_cases
 from hybrid_opt.robust.force import RobustModel, robust_model
+from hybrid_opt.static_hold import static_hold
 from hybrid_opt.timing.analysis import closest_to_reference_timing
-from hybrid_opt.timing.given import drive_path
-from hybrid_opt.timing.limits import limit_ratios, limit_use
+from hybrid_opt.timing.limits import drive_path, judged, limit_ratios
 from hybrid_opt.timing.model import TimingModel
 from hybrid_opt.timing.path_timer import PathTimer
 from hybrid_opt.timing.records import TimingLimits, TimingStatus
@@ -80,7 +80,7 @@ def test_the_use_of_the_limit_is_that_of_all_cases(share: float) -> None:
     held = RobustModel(model.workcell).robust_force(plain)
     limit = share * float(held.peak.max())
     limits = TimingLimits(force=limit, robust=True)
-    use = limit_use(plain, model.workcell, limits, model.joint_names)["normal force"]
+    use = judged(model, plain, limits).use["normal force"]
     assert use.ratio == pytest.approx(held.peak.max() / limit, rel=1e-6)
     every = limit_ratios(plain, model.workcell, limits)["normal force"].max(axis=1)
     needed = np.maximum(held.commanded, held.leading) / limit
@@ -183,8 +183,7 @@ def test_forces_are_proportional_to_the_mass() -> None:
     force = np.linalg.norm(carry(timing_of(heavy, 20), x).contact_force, axis=2).max()
     assert force == pytest.approx(117.68, rel=1e-9)
     assert sensitivity.force_at(np.array([mass])).max() == pytest.approx(117.68)
-    assert (sensitivity.mass_by_normal > sensitivity.mass_by_resultant).all()
-    assert mass < sensitivity.static_mass
+    assert mass < static_hold(cell).payload_limit
 
 
 def changed(cell: Workcell, margin: Margin, factor: float) -> Workcell:

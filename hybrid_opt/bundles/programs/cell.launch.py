@@ -1,0 +1,51 @@
+"""Both arms' controllers, as `config/cell.json` lists them: ros2 launch launch/NAME.launch.py
+
+Where the description names mock hardware, a simulator's plugin goes in its place.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from launch import LaunchDescription
+from launch.actions import GroupAction, IncludeLaunchDescription
+from launch.launch_description_sources import PythonLaunchDescriptionSource
+from launch.substitutions import PathJoinSubstitution
+from launch_ros.actions import Node, PushRosNamespace
+from launch_ros.substitutions import FindPackageShare
+
+BUNDLE = Path(__file__).resolve().parent.parent
+
+
+def generate_launch_description() -> Any:
+    """What each entry under `launch` asks for."""
+    config = json.loads((BUNDLE / "config/cell.json").read_text())
+    return LaunchDescription([action for each in config["launch"] for action in actions(each)])
+
+
+def actions(each: dict[str, Any]) -> list[Any]:
+    """A driver's launch file or a description, a controller manager, and its controllers."""
+    parameters: list[Any] = [str(BUNDLE / name) for name in each["parameters"]]
+    outside, inside = list[Any](), list[Any]()
+    if each["namespace"]:
+        inside.append(PushRosNamespace(each["namespace"]))
+    if "package" in each:
+        path = PathJoinSubstitution([FindPackageShare(each["package"]), "launch", each["file"]])
+        arguments = {k: v.replace("BUNDLE", str(BUNDLE)) for k, v in each["arguments"].items()}
+        include = IncludeLaunchDescription(
+            PythonLaunchDescriptionSource([path]), launch_arguments=arguments.items()
+        )
+        # Launch files that take a namespace put themselves into it.
+        (outside if "namespace" in arguments else inside).append(include)
+    else:
+        text = {"robot_description": (BUNDLE / "description/cell.urdf").read_text()}
+        parameters.insert(0, text)
+        name = "robot_state_publisher"
+        inside.append(Node(package=name, executable=name, parameters=[text]))
+    package = "controller_manager"
+    if parameters:
+        inside.append(Node(package=package, executable="ros2_control_node", parameters=parameters))
+    inside.append(Node(package=package, executable="spawner", arguments=each["controllers"]))
+    return [*outside, GroupAction(inside)]
