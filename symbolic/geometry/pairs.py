@@ -11,6 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property, lru_cache
 from itertools import combinations, product
+from math import dist
 
 import coal
 import numpy as np
@@ -411,11 +412,15 @@ def out_of_reach(
 
 
 def _gap(zone: Piece, pieces: tuple[Piece, ...]) -> float:
-    """Distance of a zone from pieces [m], 0 where one's centre is in a ball: of most zones."""
+    """Distance of a zone from pieces [m]; of a ball, as most zones are, 0 where it holds the centre
+    of a piece."""
     if isinstance(zone.shape, Sphere):
-        apart = [np.linalg.norm(p.centre - zone.centre) for p in pieces if not _is_hull(p)]
-        if min(apart, default=np.inf) < zone.shape.radius:
+        radius = zone.shape.radius
+        if any(dist(p.centre, zone.centre) < radius for p in pieces if not _is_hull(p)):
             return 0.0
+        shapes = [piece.shape for piece in pieces]
+        if len(shapes) == 1 and isinstance(shapes[0], Sphere):
+            return dist(pieces[0].centre, zone.centre) - radius - shapes[0].radius
     return coal_distance((zone,), pieces)
 
 

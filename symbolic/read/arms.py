@@ -230,16 +230,24 @@ def arm_model(robot: Robot) -> pin.Model:
     """
     urdf = robot_urdf(robot)
     moving = moving_joints(urdf, robot.chain_root, robot.flange, robot.locked_joints)
-    model = reduced_model(urdf, held_joints(urdf, moving, robot.locked_joints))
-    for problem in (structure_problem(model), flange_problem(model, robot.flange)):
-        if problem:
-            raise RobotModelError(f"robot {robot.name!r}: {problem}")
+    held = held_joints(urdf, moving, robot.locked_joints)
+    for problem in _problems(urdf.kinematics, str(urdf.file), tuple(held), robot.flange):
+        raise RobotModelError(f"robot {robot.name!r}: {problem}")
+    model = reduced_model(urdf, held)
     if robot.tool_load is not None:
         load = robot.tool_load
         flange = model.frames[link_frame(model, robot.flange)]
         inertia = pin.Inertia(load.mass, load.centre_of_mass, load.inertia)
         model.appendBodyToJoint(flange.parentJoint, inertia, flange.placement)
     return model
+
+
+@lru_cache(maxsize=16)
+def _problems(kinematics: str, file: str, held: Positions, flange: str) -> tuple[str, ...]:
+    """What keeps a description from being an arm with that flange."""
+    model = _reduced(kinematics, file, held)
+    found = structure_problem(model), flange_problem(model, flange)
+    return tuple(problem for problem in found if problem)
 
 
 def turning_joints(model: pin.Model) -> tuple[bool, ...]:
