@@ -42,7 +42,7 @@ from symbolic.array import Array, Figure, Row
 from symbolic.errors import DualArmError, SettingsError
 from symbolic.records import Workcell
 
-POLISH = PolishSettings(attempts=1, drivable=DrivableSettings(rounds=12, most_rounds=12, members=4))
+POLISH = PolishSettings(attempts=8, drivable=DrivableSettings(first_rounds=12, members=4))
 """Polish of a path that was the best one of a nearby cell."""
 
 _OTHER_FILE = "remove it, or name another file"

@@ -11,9 +11,10 @@ from typing import Any
 from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES, OBJECTIVES, PAPER_OBJECTIVES
 from hybrid_opt.polishing.settings import (
     DRIVABLE_ATTEMPTS,
+    QUICK_ATTEMPTS,
+    QUICK_DRIVABLE_ATTEMPTS,
     SOLVERS,
     PolishSettings,
-    quick_settings,
 )
 from hybrid_opt.work.service import warm_up
 from studies.options import (
@@ -135,8 +136,8 @@ def add_options(parser: Parser, output: str) -> None:
         type=int,
         metavar="N",
         help="attempts that the polish of one front may take before it is filled between its ends "
-        f"(default: {PolishSettings().attempts}, for a drivable one {DRIVABLE_ATTEMPTS}, "
-        f"with --quick {quick_settings().attempts})",
+        f"(default: {PolishSettings().attempts}, with --quick {QUICK_ATTEMPTS}); of a drivable "
+        f"one force limits of its sweep (default: {DRIVABLE_ATTEMPTS}, {QUICK_DRIVABLE_ATTEMPTS})",
     )
     after.add_argument(
         "--polish-solver",

@@ -84,7 +84,7 @@ def without_jumps(
     if jerk is None:
         return _smoothed(model, timing, width)
     assert timing.carry is not None, "a timing that is to be driven has a carry"
-    found = time_with_jerk(model, timing.carry.x, timing.limits, jerk).timing
+    found = time_with_jerk(model, timing.carry.x, timing.limits, jerk, timing).timing
     if found.carry is None:
         raise JobError(f"no timing within the limits on jerk: {found.reason}")
     return found

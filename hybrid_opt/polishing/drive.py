@@ -30,13 +30,11 @@ from hybrid_opt.polishing.point import (
     QUARTERED,
     Climb,
     ClimbPoint,
-    Solution,
     Step,
     StepVerdict,
     Way,
 )
 from hybrid_opt.polishing.rows import Row
-from hybrid_opt.polishing.settings import DrivableSettings
 from hybrid_opt.polishing.solvers.base import Residuals
 from hybrid_opt.polishing.solvers.quadratic import (
     BorderedMatrix,
@@ -83,8 +81,9 @@ its row."""
 STEADINESS = 1.0
 """Curvature by the path of the program that finds multipliers."""
 
-CORRECTIONS, BEND = 3, 0.01
-"""Most corrections of a step for the curvature of geometric rows, and the error that ends them."""
+BEND = 0.01
+"""Error of geometric rows, by their curvature along a step, above which it is corrected, once: two
+more corrections changed no path of the rack's sweep by 1e-4 of its duration."""
 
 FARTHER = (2.0, 4.0, 8.0)
 """Times a step that brought more than it promised: judging costs a tenth of a round."""
@@ -151,6 +150,11 @@ class PathJudge:
         found = self._timer.time_all(np.ascontiguousarray(paths), limits)
         return np.array([t.duration if t.ok else np.inf for t in found])
 
+    def at_rest(self, paths: Array) -> Array:
+        """(n,) [N] what standing still needs of paths (n, n_path), NaN where arms cannot follow."""
+        found = self._timer.time_all(np.ascontiguousarray(paths), [self._limits(0.0)] * len(paths))
+        return np.array([timing.limited_force for timing in found])
+
 
 def force_range(driver: CandidateDriver) -> tuple[float, float]:
     """The task's least and largest force limit [N]; of robust forces the least is at least what
@@ -208,7 +212,6 @@ class DriveWay(Way[DrivePoint, DriveStep]):
 
     Attributes:
         driver, paths: how carries and paths are timed.
-        settings: of the polish of drivable carries.
         stated: the same by moves of the waypoints that the file states, along which the others
             follow; itself where there are no others. Fewer variables take fewer and cheaper rounds.
     """
@@ -216,9 +219,7 @@ class DriveWay(Way[DrivePoint, DriveStep]):
     least_radius, farther = LEAST_RADIUS, FARTHER
     refused_by_length = stays_lenient = True
 
-    def __init__(
-        self, cell: SmoothCell, settings: DrivableSettings, by_stated: bool = False
-    ) -> None:
+    def __init__(self, cell: SmoothCell, by_stated: bool = False) -> None:
         """Prepare programs.
 
         Args:
@@ -234,7 +235,7 @@ class DriveWay(Way[DrivePoint, DriveStep]):
                 "switch the polish off"
             )
         super().__init__(cell, ActiveSet(cell), CarryReader(cell))
-        self.driver, self.settings, self._n = driver, settings, task.n_path
+        self.driver, self._n = driver, task.n_path
         self.half = cell.half[: task.n_path]
         self._own = own = stated_entries(task) if by_stated else np.arange(task.n_path)
         self._bounds = task.lower[own], task.upper[own]
@@ -247,7 +248,7 @@ class DriveWay(Way[DrivePoint, DriveStep]):
         self._method = quadratic_method(cell.evaluator.compiled.cache)
         self.stated = self
         if task.pieces > 1 and not by_stated:
-            self.stated = DriveWay(cell, settings, by_stated=True)
+            self.stated = DriveWay(cell, by_stated=True)
 
     def start(self, x: Array) -> DrivePoint:
         """See `Way`."""
@@ -326,16 +327,9 @@ class DriveWay(Way[DrivePoint, DriveStep]):
             (self._residuals(program, best, found) for found in (first, second)),
             key=lambda known: known.stationarity + known.complementarity,
         )
-        bent = np.zeros(len(program.geometry))
-        for _ in range(CORRECTIONS):
-            change = program.geometry_after(second.answer.d) - bent
-            if np.abs(change).max(initial=0.0) <= BEND:
-                break
-            bent = bent + change
-            corrected = self._solved(program, chosen, model, box, bent)
-            if corrected is None:
-                break
-            second = corrected
+        bent = program.geometry_after(second.answer.d)
+        if np.abs(bent).max(initial=0.0) > BEND:
+            second = self._solved(program, chosen, model, box, bent) or second
         d = second.answer.d
         squared = best.squared.copy()
         squared[1:-1] *= 1.0 + d[program.speeds]
@@ -409,16 +403,6 @@ class DriveWay(Way[DrivePoint, DriveStep]):
     def climb(self, x: Array) -> Climb[DrivePoint, DriveStep]:
         """A climb from a decision vector (n_var,), before its first round."""
         return Climb(self, x, FIRST_RADIUS)
-
-    def finish(self, climb: Climb[DrivePoint, DriveStep]) -> Solution:
-        """The rounds of a point, and more of them while these bring much."""
-        settings, solution = self.settings, climb.go_on(self.settings.rounds)
-        most = solution.rounds - settings.rounds + settings.most_rounds
-        while not climb.ended and climb.last_gain > settings.worth * climb.best.level:
-            if solution.rounds >= most:
-                break
-            climb.go_on(2 * settings.turn)
-        return solution
 
 
 def _is_optimal(residuals: Residuals) -> bool:

@@ -249,7 +249,6 @@ class Climb(Generic[AnyPoint, AnyStep]):
     Attributes:
         solution: what it has come to.
         best: the best candidate so far.
-        last_gain: what the later half of the rounds that were asked for last took off the level.
     """
 
     def __init__(self, way: Way[AnyPoint, AnyStep], x: Array, radius: float) -> None:
@@ -261,7 +260,7 @@ class Climb(Generic[AnyPoint, AnyStep]):
         """
         self._way, task = way, way.cell.task
         self.best = way.start(np.clip(x, task.lower, task.upper))
-        self._first, self._lenient, self.last_gain = self.best.level, True, 0.0
+        self._first, self._lenient = self.best.level, True
         self._region = TrustRegion(radius, way.least_radius)
         self._learned = LearnedRows(way.active, way.half)
         self._last: Step | None = None
@@ -274,14 +273,13 @@ class Climb(Generic[AnyPoint, AnyStep]):
 
     def go_on(self, rounds: int) -> Solution:
         """Some more rounds, fewer where it ends."""
-        solution, before = self.solution, self.best.level
-        for k in range(rounds):
+        solution = self.solution
+        for _ in range(rounds):
             if self.ended:
                 break
-            before = self.best.level if k == rounds // 2 else before
             solution.rounds += 1
             self._round()
-        solution.x, self.last_gain = self.best.x, before - self.best.level
+        solution.x = self.best.x
         if self._last is not None:
             solution.residuals = self._last.residuals(self.best)
             solution.rows = sum(isinstance(row, PlaceRow) for row in self._last.required)

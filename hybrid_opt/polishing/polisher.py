@@ -72,14 +72,14 @@ class Polisher:
         if not driven:
             self.solver = ForceSolver(cell, settings)
             return
-        self.way = DriveWay(cell, settings.drivable)
+        self.way = DriveWay(cell)
         # At once: the cell's files may be there only for as long as this is made.
         self._timings = TimingModel(evaluator.compiled, self.way.driver.timer.intervals)
 
-    def doubt(self, x: Array, independent: bool = True) -> str:
+    def doubt(self, x: Array) -> str:
         """Why the timing of a drivable decision vector is not believed, see `second_opinion`."""
         assert self.way is not None
-        return second_opinion(self.way.driver, self._timings, x, independent)
+        return second_opinion(self.way.driver, self._timings, x)
 
     def polish(
         self,

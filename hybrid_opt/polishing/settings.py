@@ -20,9 +20,11 @@ Number = Annotated[int, Range(1, 10**6)]
 NumberOrNone = Annotated[int, Range(0, 10**6)]
 Small = Annotated[float, Range(1e-12, 1.0)]
 
-DRIVABLE_ATTEMPTS = 10
-"""At a drivable front. With seven, replicas of the rack differ by 1.1 % at 55 N, with ten by 0.4 %
-(docs/measured/drivable-rack.md)."""
+DRIVABLE_ATTEMPTS = 14
+"""Force limits at a drivable front."""
+
+QUICK_ATTEMPTS, QUICK_DRIVABLE_ATTEMPTS = 2, 6
+"""The same of a small study: attempts, and force limits."""
 
 
 @dataclass(frozen=True)
@@ -68,26 +70,14 @@ class DrivableSettings:
     """The polish under the time law 'optimal', see `hybrid_opt.polishing.drive_front`.
 
     Attributes:
-        rounds: steps of one point, unless it ends before.
-        worth: gain of the later half of them, as a share of what is minimised, with which a point
-            goes on for two turns more, and again.
-        most_rounds: with such gains.
-        turn: rounds of each start in a turn of a tournament of starts.
-        rough: attempts at most that move the stated waypoints in tasks with more of them.
-        refined: force limits at which points are moved by all waypoints after the others, in tasks
-            with more than the stated ones.
-        refining: rounds of each of them.
-        members: gaps of the front, the widest first, that get a point in the end where a known path
-            or one between both neighbours' wins one.
+        first_rounds: steps of the first path, unless it ends before.
+        rounds: of each force limit's.
+        members: gaps of the front, the widest first, that get a point in the end where a path
+            between both neighbours' wins one.
     """
 
-    rounds: Number = 24
-    worth: Small = 5e-4
-    most_rounds: Number = 48
-    turn: Number = 3
-    rough: NumberOrNone = 3
-    refined: NumberOrNone = 16
-    refining: Number = 5
+    first_rounds: Number = 24
+    rounds: Number = 5
     members: NumberOrNone = 36
 
     def __post_init__(self) -> None:
@@ -100,7 +90,8 @@ class PolishSettings:
 
     Attributes:
         attempts: that one front may take at its points, ends and middle; probes and
-            those that fill it between them come on top.
+            those that fill it between them come on top. Of drivable carries the force limits of the
+            sweep.
         solver: of the programs of both peak forces: the dense interior-point method of
             `hybrid_opt.polishing.solvers.dense`, or IPOPT.
         rounds: of one point at most; see `hybrid_opt.polishing.point`.
@@ -127,11 +118,10 @@ def usual_settings(time_law: str) -> PolishSettings:
     return PolishSettings(attempts=DRIVABLE_ATTEMPTS) if time_law == "optimal" else PolishSettings()
 
 
-def quick_settings() -> PolishSettings:
-    """Settings of a small study: a third as many points from fewer attempts, and a shorter
-    tournament, after which one replica of eight stayed in a slower basin."""
-    return PolishSettings(
-        attempts=2,
-        fill=FillSettings(solved=16, members=16),
-        drivable=DrivableSettings(turn=1, members=10),
-    )
+def quick_settings(time_law: str) -> PolishSettings:
+    """Settings of a small study: a third as many points from fewer attempts."""
+    if time_law == "optimal":
+        return PolishSettings(
+            attempts=QUICK_DRIVABLE_ATTEMPTS, drivable=DrivableSettings(members=10)
+        )
+    return PolishSettings(attempts=QUICK_ATTEMPTS, fill=FillSettings(solved=16, members=16))

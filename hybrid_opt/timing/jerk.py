@@ -91,18 +91,23 @@ LEAST_SHARE = 0.05
 
 
 def time_with_jerk(
-    model: TimingModel, x: Array, limits: TimingLimits, jerk: JerkLimits
+    model: TimingModel,
+    x: Array,
+    limits: TimingLimits,
+    jerk: JerkLimits,
+    fastest: Timing | None = None,
 ) -> JerkTiming:
     """A fast timing from rest to rest within all limits, whose accelerations do not jump.
 
     Args:
         x: (n_var,) decision vector.
+        fastest: the timing without limits on jerk, where it is known already.
 
     Raises:
         SettingsError: x does not fit the workcell, or limited robust forces have no slopes.
     """
     motion = model.path_motion(x)
-    fastest = time_path(model, x, limits, motion)
+    fastest = fastest or time_path(model, x, limits, motion)
     if not fastest.ok:
         return JerkTiming(fastest, jerk, (np.nan, np.nan), fastest.duration)
     problem = _Problem(model, motion, limits, jerk)

@@ -244,10 +244,10 @@ def make_study(path: Path, options: argparse.Namespace, with_paper: bool) -> Non
         overwrite=options.overwrite,
     )
     study = StudySettings(
-        polish=polish_settings(options, polishable, usual_settings(cell.task.time_law)),
+        polish=polish_settings(options, polishable, cell.task.time_law),
         drivable=options.drivable,
         drivable_replicas=options.drivable_replicas,
-        drivable_polish=polish_settings(options, True, usual_settings("optimal")),
+        drivable_polish=polish_settings(options, True, "optimal"),
         wish=Wish(options.duration, options.force_limit, options.payload),
         simulate=options.simulate,
         report=options.report and not options.recommend_only,
@@ -299,20 +299,20 @@ def campaign_settings(
 
 
 def polish_settings(
-    options: argparse.Namespace, usual: bool, settings: PolishSettings
+    options: argparse.Namespace, usual: bool, time_law: str
 ) -> PolishSettings | None:
     """How the options want fronts polished, None for not at all.
 
     Args:
         usual: whether they are polished where the options do not say.
-        settings: where they say nothing of them.
+        time_law: of the carries.
 
     Raises:
         SettingsError: a value is not allowed.
     """
     if not (usual if options.polish is None else options.polish):
         return None
-    chosen = quick_settings() if options.quick else settings
+    chosen = (quick_settings if options.quick else usual_settings)(time_law)
     asked = options.polish_attempts
     attempts = chosen.attempts if asked is None else asked
     return replace(chosen, attempts=attempts, solver=options.polish_solver)

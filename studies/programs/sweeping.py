@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +12,6 @@ from matplotlib.figure import Figure
 from hybrid_opt.cell import Cell
 from hybrid_opt.display.table import Table, number
 from hybrid_opt.door import polish, search
-from hybrid_opt.polishing.settings import usual_settings
 from hybrid_opt.recommending.recommendation import recommend
 from hybrid_opt.store.files import to_json
 from hybrid_opt.store.trajectory_file import read_trajectory
@@ -23,9 +21,6 @@ from studies.program import load_workcell
 from studies.report.drawing import FULL_WIDTH, in_style, legend_below, new_figure, save, series
 from symbolic.array import Array
 from symbolic.errors import SettingsError
-
-ATTEMPTS = 4
-"""Attempts of the polish that gives the first path."""
 
 
 def sweep_numbers(options: argparse.Namespace) -> int:
@@ -43,8 +38,7 @@ def sweep_numbers(options: argparse.Namespace) -> int:
     else:
         rng = np.random.default_rng(options.seed)
         found = search(cell, evaluations=options.evaluations, rng=rng, progress=shown)
-        settings = replace(usual_settings("optimal"), attempts=ATTEMPTS)
-        best = recommend(polish(found, rng=rng, settings=settings, progress=shown))
+        best = recommend(polish(found, rng=rng, progress=shown))
         x = np.append(best.x[:-1], best.limit)
     over = dict(options.over)
     fixed = options.path is not None

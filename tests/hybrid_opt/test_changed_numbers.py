@@ -34,7 +34,7 @@ SHORT = PolishSettings(
     rounds=1,
     probe=ProbeSettings(starts=0, middle_starts=0, rounds=1),
     fill=FillSettings(solved=0, members=0, attempts=0),
-    drivable=DrivableSettings(rounds=1, most_rounds=1, turn=1, members=1),
+    drivable=DrivableSettings(first_rounds=1, rounds=1, members=1),
 )
 
 

@@ -12,9 +12,13 @@ from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES
 from hybrid_opt.polishing.cell import PolishFunctions, SmoothCell, polish_functions
 from hybrid_opt.polishing.drive import DriveWay
+from hybrid_opt.polishing.drive_front import second_opinion
 from hybrid_opt.polishing.point import Solution
 from hybrid_opt.polishing.polisher import Polisher
 from hybrid_opt.polishing.settings import DrivableSettings, PolishSettings
+from hybrid_opt.timing.drive import CandidateDriver
+from hybrid_opt.timing.model import TimingModel
+from hybrid_opt.timing.solve import time_path
 from symbolic.array import Array
 from symbolic.read.cell import load
 from symbolic.records import Workcell
@@ -49,17 +53,15 @@ def functions() -> PolishFunctions:
 
 
 @cache
-def polisher(rounds: int = 40) -> Polisher:
-    """Of the drivable rack."""
-    settings = PolishSettings(
-        attempts=3, drivable=DrivableSettings(rounds=rounds, most_rounds=rounds, turn=2, members=8)
-    )
-    return Polisher(evaluator(), settings, functions())
+def polisher() -> Polisher:
+    """Of the drivable rack, for small fronts."""
+    settings = DrivableSettings(first_rounds=8, rounds=3, members=8)
+    return Polisher(evaluator(), PolishSettings(attempts=4, drivable=settings), functions())
 
 
-def way(rounds: int = 40) -> DriveWay:
+def way() -> DriveWay:
     """Of the drivable rack."""
-    return way_of(polisher(rounds))
+    return way_of(polisher())
 
 
 def way_of(owner: Polisher) -> DriveWay:
@@ -68,9 +70,19 @@ def way_of(owner: Polisher) -> DriveWay:
     return owner.way
 
 
-def solved(by: DriveWay, x: Array) -> Solution:
-    """All rounds of a point from a decision vector."""
-    return by.finish(by.climb(x))
+def solved(by: DriveWay, x: Array, rounds: int = 40) -> Solution:
+    """Some rounds of a point from a decision vector."""
+    return by.climb(x).go_on(rounds)
+
+
+def disbelieved(driver: CandidateDriver | None, model: TimingModel, x: Array) -> str:
+    """Why the timing of a decision vector is not believed: by the tenfold grid, or by the
+    independent one."""
+    assert driver is not None
+    found, other = driver.timings(x[None])[0], time_path(model, x, driver.limits(float(x[-1])))
+    if not other.ok or abs(found.duration / other.duration - 1.0) > 5e-3:
+        return f"{found.duration:.3f} s, by the independent timing {other.duration:.3f} s"
+    return second_opinion(driver, model, x)
 
 
 def smooth_cell(judge: CandidateEvaluator) -> SmoothCell:

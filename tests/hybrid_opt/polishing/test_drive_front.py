@@ -11,7 +11,6 @@ import hybrid_opt as ho
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES, duration_unit
 from hybrid_opt.indicators import metrics
-from hybrid_opt.polishing.drive_front import best_of
 from hybrid_opt.polishing.polisher import Polisher
 from hybrid_opt.polishing.records import PolishedFront, PolishOutcome
 from hybrid_opt.polishing.settings import DrivableSettings, PolishSettings
@@ -31,9 +30,6 @@ from tests.hybrid_opt.polishing.cells import (
 
 BOUND = np.full(2, 1.1)
 
-ROUNDS = 8
-"""Of each point: enough to get better."""
-
 
 def starts() -> Array:
     return np.array([start(51.0), start(55.0, seed=1)])
@@ -41,7 +37,7 @@ def starts() -> Array:
 
 @cache
 def polished() -> PolishedFront:
-    return polisher(ROUNDS).polish(starts(), np.random.default_rng(0))
+    return polisher().polish(starts(), np.random.default_rng(0))
 
 
 def test_the_front_dominates_more_than_before() -> None:
@@ -56,14 +52,14 @@ def test_the_front_dominates_more_than_before() -> None:
 def test_a_polish_goes_on_where_it_was_interrupted() -> None:
     written = [to_json(outcome) for outcome in polished().outcomes[:2]]
     recorded = [from_json(PolishOutcome, values, "an attempt", "") for values in written]
-    again = polisher(ROUNDS).polish(starts(), np.random.default_rng(0), recorded=recorded)
+    again = polisher().polish(starts(), np.random.default_rng(0), recorded=recorded)
     np.testing.assert_array_equal(again.x, polished().x)
     np.testing.assert_array_equal(again.objectives, polished().objectives)
 
 
 def fastest(paths: Array, forces: Array) -> Array:
     """(n,) [s] of any of some paths (k, n_path) within each force."""
-    judge = way(ROUNDS).paths
+    judge = way().paths
     return np.array([judge.durations(paths, float(force)).min() for force in forces])
 
 
@@ -83,13 +79,13 @@ def test_the_front_reaches_from_the_gentlest_end_and_is_nowhere_behind_the_hand_
 def test_known_paths_take_part() -> None:
     """Given a better path than all others, the front is nowhere behind it; given one that touches
     something, it does not notice."""
-    climb = way(ROUNDS).climb(tilted(55.0))
+    climb = way().climb(tilted(55.0))
     climb.go_on(4)
     known = climb.best.x[None, :-1]
     assert evaluator().evaluate(climb.best.x).feasible[0]
     sunk = known.copy()
     sunk[0, [2, 8, 14]] -= 0.2
-    settings = DrivableSettings(rounds=1, most_rounds=1, turn=1, members=4)
+    settings = DrivableSettings(first_rounds=1, rounds=1, members=4)
     owner = Polisher(evaluator(), PolishSettings(attempts=1, drivable=settings), functions())
     rng = np.random.default_rng
     front = owner.polish(starts(), rng(0), paths=np.vstack([known, sunk]))
@@ -102,7 +98,7 @@ def test_known_paths_take_part() -> None:
 def test_they_do_so_at_the_front_door() -> None:
     """Given as decision vectors, with a force limit or without."""
     settings = PolishSettings(
-        attempts=1, drivable=DrivableSettings(rounds=1, most_rounds=1, turn=1, members=2)
+        attempts=1, drivable=DrivableSettings(first_rounds=1, rounds=1, members=2)
     )
     known, rng = tilted(55.0), np.random.default_rng
     owner = Polisher(evaluator(), settings, functions())
@@ -118,7 +114,7 @@ def test_they_do_so_at_the_front_door() -> None:
 
 
 def test_an_empty_front_stays_empty() -> None:
-    assert len(polisher(ROUNDS).polish(np.empty((0, 19)), np.random.default_rng(0)).x) == 0
+    assert len(polisher().polish(np.empty((0, 19)), np.random.default_rng(0)).x) == 0
 
 
 def test_the_time_law_chooses_the_polish() -> None:
@@ -133,27 +129,3 @@ def test_other_objectives_are_refused() -> None:
     )
     with pytest.raises(SettingsError, match="switch the polish off"):
         Polisher(other, PolishSettings(), functions())
-
-
-def test_a_tournament_is_feasible_and_better_than_any_start_after_a_turn() -> None:
-    """Of an upright path, a tilted one, and a fast one that touches a board and cannot leave it."""
-    by, sunk = way(ROUNDS), tilted(55.0)
-    sunk[[2, 8, 14]] -= 0.2
-    starts = [start(55.0), tilted(55.0), sunk]
-    turn, levels = by.settings.turn, []
-    for x in starts:
-        climb = by.climb(x)
-        climb.go_on(turn)
-        if evaluator().evaluate(climb.best.x).feasible[0]:
-            levels.append(climb.best.level)
-    found = best_of(by, starts)
-    assert evaluator().evaluate(found.x).feasible[0]
-    assert by.paths.timed(found.x[:-1], 55.0).duration <= min(levels)
-    assert 3 * turn <= found.rounds <= 5 * turn + 2 * ROUNDS
-
-
-def test_one_of_two_starts_in_one_basin_goes_on() -> None:
-    by, x = way(ROUNDS), tilted(55.0)
-    nearby = x.copy()
-    nearby[0] += 1e-3
-    assert best_of(by, (x, nearby)).rounds <= 2 * by.settings.turn + ROUNDS

@@ -13,18 +13,18 @@ from hybrid_opt.compiled_cell import CompiledCell
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.evaluate.objectives import ROBUST_DRIVABLE_OBJECTIVES, ROBUST_OBJECTIVES
 from hybrid_opt.polishing.carry import CarryReader
-from hybrid_opt.polishing.drive_front import second_opinion
 from hybrid_opt.polishing.force import ForceProgram, ForceSolver, balance
 from hybrid_opt.polishing.intervals import IntervalGrid
 from hybrid_opt.polishing.polisher import Polisher
 from hybrid_opt.polishing.robust import CASES, ROBUST_ROWS, RobustSamples
 from hybrid_opt.polishing.rows import ForceRow, Row
-from hybrid_opt.polishing.settings import DrivableSettings, PolishSettings
+from hybrid_opt.polishing.settings import PolishSettings
 from hybrid_opt.robust.path_force import PathPoints, robust_path
 from hybrid_opt.timing.model import TimingModel
 from symbolic.records.cell import Uncertainty, Workcell
 from symbolic.records.task import initial_decision
 from tests.hybrid_opt.polishing.cells import (
+    disbelieved,
     drivable_rack,
     functions,
     smooth_cell,
@@ -147,15 +147,14 @@ def test_robust_rows_bend_as_the_planned_force_that_rules() -> None:
 def test_a_point_is_driven_faster_within_robust_forces_and_believed() -> None:
     cell, force = unsure_rack(), 64.15
     evaluator = CandidateEvaluator(cell, ROBUST_DRIVABLE_OBJECTIVES, compiled=CompiledCell(cell))
-    settings = PolishSettings(attempts=1, drivable=DrivableSettings(rounds=16))
-    way = way_of(Polisher(evaluator, settings, functions()))
+    way = way_of(Polisher(evaluator, PolishSettings(), functions()))
     driver = evaluator.driver
     assert driver is not None
     assert 60.0 < way.paths.force_limit[0] < 63.0
     begin = start_in(cell, force, 0)
-    solution = solved(way, begin)
+    solution = solved(way, begin, 24)
     before, after = driver.timings(np.array([begin, solution.x]))
     assert after.duration < 0.8 * before.duration
     assert after.robust_force is not None
     assert after.robust_force.max() == pytest.approx(force, rel=2e-4)
-    assert second_opinion(driver, TimingModel(evaluator.compiled, 100), solution.x) == ""
+    assert disbelieved(driver, TimingModel(evaluator.compiled, 100), solution.x) == ""

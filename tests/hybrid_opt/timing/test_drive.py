@@ -16,7 +16,6 @@ from hybrid_opt.evaluate.evaluation import REASONS, CandidateEvaluator
 from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES, ROBUST_DRIVABLE_OBJECTIVES
 from hybrid_opt.indicators.metrics import non_dominated
 from hybrid_opt.metaheuristics.run import CarryProblem
-from hybrid_opt.polishing.drive_front import AGREEMENT
 from hybrid_opt.robust.force import robust_model
 from hybrid_opt.timing.analysis import drivable_timing
 from hybrid_opt.timing.drive import CandidateDriver
@@ -33,6 +32,9 @@ from tests.hybrid_opt.timing.cells import hand_timing, near_initial, timing_of
 from tests.symbolic.cells import hand_cell, hand_model, with_task
 
 STATIC = 98.1 / 2.0
+
+AGREEMENT = 5e-3
+"""Largest relative difference of the durations of a timing and of the independent one."""
 
 
 def drivable_cell() -> Workcell:

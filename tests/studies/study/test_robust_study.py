@@ -53,7 +53,9 @@ def study(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
         replicas=1,
         seed=3,
     )
-    short = PolishSettings(attempts=1, drivable=DrivableSettings(rounds=2, turn=1, members=2))
+    short = PolishSettings(
+        attempts=2, drivable=DrivableSettings(first_rounds=2, rounds=2, members=2)
+    )
     execution, silent = ExecutionSettings(folder / "results", jobs=1), Progress(shown=False)
     wanted = StudySettings(polish=short, report=False)
     told = run_study(load(driven), settings, execution, silent, wanted)

@@ -281,12 +281,12 @@ def test_help_explains_every_option_with_its_default() -> None:
 
 def test_options_tell_how_fronts_are_polished() -> None:
     parser, usual = rack.main.parser(), ho.PolishSettings()
-    assert polish_settings(parser.parse_args([]), True, usual) == usual
+    assert polish_settings(parser.parse_args([]), True, "constant") == usual
     asked = parser.parse_args(["--polish-solver", "ipopt", "--polish-attempts", "3"])
-    found = polish_settings(asked, True, usual)
+    found = polish_settings(asked, True, "constant")
     assert found is not None
     assert (found.solver, found.attempts) == ("ipopt", 3)
-    assert polish_settings(parser.parse_args(["--no-polish"]), True, usual) is None
+    assert polish_settings(parser.parse_args(["--no-polish"]), True, "constant") is None
 
 
 def test_options_become_settings() -> None:

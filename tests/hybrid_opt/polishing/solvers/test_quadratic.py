@@ -129,7 +129,7 @@ def test_programs_of_a_polish_agree_with_clarabel(monkeypatch: pytest.MonkeyPatc
         return solve_inside(library, of)
 
     monkeypatch.setattr(quadratic, "solve_inside", recorded)
-    solved(way(4), start(52.0))
+    solved(way(), start(52.0), 4)
     assert len(asked) > 10
     for of in asked:
         found, other = inside(of), quadratic.solve_by_clarabel(of)
