@@ -12,6 +12,7 @@ import numpy as np
 from hybrid_opt.carry import Carry, decision_of
 from hybrid_opt.cell import Cell
 from hybrid_opt.front import Front
+from hybrid_opt.metaheuristics.registry import make
 from hybrid_opt.metaheuristics.run import SearchSettings, search_carries
 from hybrid_opt.polishing.settings import PolishSettings
 from hybrid_opt.progress import ShowProgress, counted
@@ -47,8 +48,9 @@ def search(
         SettingsError: an unknown algorithm or a value that is not allowed.
         WorkcellError: the payload cannot be held still, so that there is nothing to search for.
     """
-    cell.require_hold()
     settings = settings or SearchSettings()
+    make(algorithm, settings.algorithm)  # mistakes are told before anything is compiled
+    cell.require_hold()
     if settings.initial is None and algorithm != "random":
         settings = replace(settings, initial=cell.initial[None])
     with counted(progress, algorithm, evaluations) as advance:

@@ -55,6 +55,14 @@ def test_an_unknown_objective_is_refused_where_a_cell_is_loaded() -> None:
         ho.Cell(ho.Cell.load(RACK).workcell, ["duration", "duration"])
 
 
+def test_an_unknown_algorithm_is_told_before_anything_is_compiled(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(ho.Cell, "evaluator", property(lambda cell: pytest.fail("compiled")))
+    with pytest.raises(SettingsError, match="unknown algorithm"):
+        ho.search(ho.example("rack"), "simplex", rng=np.random.default_rng(1))
+
+
 def test_known_paths_are_refused_where_they_take_no_part() -> None:
     with pytest.raises(SettingsError, match=r"Cell\.drivable\(\)"):
         ho.polish(front(), rng=np.random.default_rng(1), paths=[cell().initial])
