@@ -77,7 +77,7 @@ class DrivableSettings:
     """
 
     first_rounds: Number = 24
-    rounds: Number = 5
+    rounds: Number = 6
     members: NumberOrNone = 36
 
     def __post_init__(self) -> None:
