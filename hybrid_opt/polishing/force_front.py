@@ -471,12 +471,14 @@ class ForceRun(PolishRun[ForceAttempt]):
             self._unproven.add(image.tobytes())
 
     def _certify_unproven(self) -> None:
-        """Leave out what no solve made and is not proven free of collisions between the samples."""
-        rows, known = self._archive.rows(), self._unproven
-        standing = [k for k in rows if self._archive.x[k].tobytes() in known]
-        if standing:
+        """Leave out what no solve made and is not proven free of collisions between the samples;
+        then what only that dominated, until all that stand are proven."""
+        while standing := [
+            k for k in self._archive.rows() if self._archive.x[k].tobytes() in self._unproven
+        ]:
             x = np.array([self._archive.x[k] for k in standing])
             proven = self._evaluator.certified(self._evaluator.evaluate(x)).feasible
+            self._unproven -= {row.tobytes() for row in x[proven]}
             self._archive.drop([k for k, good in zip(standing, proven, strict=True) if not good])
 
     def _turn(self, objectives: tuple[int | None, ...], rng: np.random.Generator) -> None:
