@@ -148,7 +148,7 @@ def _preamble(*runtimes: str) -> str:
 
 
 def is_long(body: str) -> bool:
-    """Whether a function has so many lines that it is cut."""
+    """Whether a function is long enough to be cut."""
     return body.count("\n") >= LONG
 
 

@@ -199,7 +199,8 @@ LEAST_LIKENESS = 0.5
 """Correlation of two signals' rates from which on one is the other, later."""
 
 CLEARER = 1.05
-"""Multiple of what a delay leaves unlike that is unlike without it: noise alone reaches 1.04."""
+"""Least ratio of what is unlike without the delay to what is unlike with it. Noise alone reaches
+1.04."""
 
 
 def delay(

@@ -227,7 +227,7 @@ class DriveRun(PolishRun[DriveAttempt]):
         return np.asarray(paths[np.unique(np.argmin(durations, axis=1))])
 
     def _limits(self, least: float, fast: float, count: int) -> list[float]:
-        """So many force limits from one to another [N], and on in equal steps to the front's
+        """`count` force limits from one to another [N], and on in equal steps to the front's
         largest. What a limit leaves above the box at rest decides how long a carry takes."""
         low, high, most = np.array([least, fast, self._largest]) - self._still
         step = np.log(high / low) / max(count - 1, 1)

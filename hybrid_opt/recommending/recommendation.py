@@ -37,7 +37,7 @@ from hybrid_opt.recommending.choice import (
     force_alone,
     refuse,
 )
-from hybrid_opt.robust.force import at_rest, box_motion, robust_model, thinned
+from hybrid_opt.robust.force import at_rest, box_motion, pressing_model, robust_model, thinned
 from hybrid_opt.robust.squeeze import (
     DOUBTS,
     MOST,
@@ -203,12 +203,13 @@ def _recommended(
     forces, squeeze, job, doubts = held.forces, held.squeeze, held.job, _doubts(held)
     commanded = np.asarray(forces.max(axis=0)) if job is None else job.peak_normal_force
     allowed = cell.workcell.task.reference_force
-    beyond = (commanded > allowed * (1.0 + BETTER)).any()
+    needed = np.maximum(commanded, _largest_felt(cell.workcell, carry))
+    beyond = (needed > allowed * (1.0 + BETTER)).any()
     if weak or (beyond and not wish.given):
-        doubts.insert(0, _too_weak(cell.workcell, carry, commanded, forces[:, 1 - LEADER]))
+        doubts.insert(0, _too_weak(cell.workcell, carry, needed, forces[:, 1 - LEADER]))
     elif beyond:
         doubts.append(
-            f"pressing with {commanded.max():.1f} N exceeds the reference force of "
+            f"an arm feels up to {needed.max():.1f} N, which exceeds the reference force of "
             f"{allowed.min():.1f} N; wish for a longer carry or less force"
         )
     told()
@@ -257,10 +258,7 @@ def _driven(
             if not timing.ok or timing.carry is None:
                 reason = timing.reason
                 break
-            carry, doubt = timing.carry, cell.workcell.uncertainty
-            known, motion = thinned(carry)
-            planned = carry.normal_force[known]
-            most = largest_commanded(cell.workcell, motion, planned, doubt, LEADER)
+            most = _largest_felt(cell.workcell, timing.carry)
             late, hard = timing.duration / goal.longest, float((most / goal.hardest).max())
             found = (option, timing)
             if max(late, hard) <= 1.0 + BETTER:
@@ -275,6 +273,16 @@ def _driven(
     if not kept and (wished or not others):
         raise SettingsError(f"no carry of the front can be driven as wished for: {reason}")
     return min(kept or others, key=lambda each: each[0])[1]
+
+
+def _largest_felt(workcell: Workcell, carry: Carry) -> Array:
+    """(2,) largest force [N] that is commanded of one arm, and that the leading one feels in the
+    worst case, as the options are judged."""
+    doubt, (rows, motion) = workcell.uncertainty, thinned(carry)
+    most = largest_commanded(workcell, motion, carry.normal_force[rows], doubt, LEADER)
+    felt = pressing_model(workcell).hold(motion, doubt, LEADER)[1]
+    most[LEADER] = max(most[LEADER], felt.max())
+    return most
 
 
 def _doubts(found: Pressed) -> list[str]:

@@ -395,7 +395,7 @@ class Program:
     """
 
     def __init__(self, k: int) -> None:
-        """Of k coefficients, without any row."""
+        """A program of k coefficients without rows."""
         from scipy import sparse
 
         self._k = k

@@ -364,8 +364,7 @@ class RobustDrive:
         self._share = np.tile([0.0, 0.5, 1.0], self._intervals)
 
     def time(self, threads: int) -> tuple[dict[str, Array], list[AtRest | None]]:
-        """The passes' outputs, in so many threads, and of each path whether it cannot stand
-        still."""
+        """The passes' outputs, and for each path whether it cannot stand still."""
         still = self._at_rest()
         out = self._passes.batch(self._rows, self._options, self._cuts, threads=threads)
         left = np.array([k for k, rest in enumerate(still) if rest is None], dtype=np.intp)

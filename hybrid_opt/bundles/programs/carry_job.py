@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any
 
 FORMAT, VERSION = "dual-arm-carry job", 2
-"""Of the file that holds a job."""
+"""Format of the file that holds a job."""
 
 HELD = ("lift", "carry", "set_down")
 """Phases in which pads alone hold the box."""
@@ -37,8 +37,8 @@ NEAR = 0.002
 """A pad so near to its place is there [m]."""
 
 LEAST_SPEED, SLOW = 0.02, 0.25
-"""Of a pad that begins to move [m/s]; and the share of the fastest below which a posture says too
-little of the coordinate to call an arm late."""
+"""Speed of a pad that begins to move [m/s], and the share of the fastest below which a posture says
+too little of the coordinate to call an arm late."""
 
 WAIT = 3.0
 """Longest time for arms to begin to move [s]."""
@@ -274,12 +274,12 @@ class Clock:
 
     @property
     def _share(self) -> float:
-        """Of the change of the rate that is over."""
+        """Share of the change of the rate that is over."""
         return min(max(self._since / (self._takes * abs(self._to - self._from)), 0.0), 1.0)
 
     @property
     def change(self) -> float:
-        """Of the rate over time [1/s]."""
+        """Derivative of the rate by time [1/s]."""
         if not self.turning:
             return 0.0
         x = self._share

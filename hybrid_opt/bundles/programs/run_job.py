@@ -52,7 +52,7 @@ CTRL_C = "Ctrl-C"
 TRIGGER = "std_srvs/srv/Trigger"
 
 WINDOW = 8
-"""A force reference is the largest of so many until the one after the next."""
+"""Steps ahead within two periods of references, the largest force of which is sent."""
 
 SLOWEST = 0.01
 """Fraction of a speed slider that is nearly none."""

@@ -67,8 +67,8 @@ JOINTS = {
     "acceleration_max": [15.0, 15.0, 15.0, 15.0, 20.0, 20.0, 20.0],
     "torque_max": [86.5, 86.5, 86.5, 86.5, 11.5, 11.5, 11.5],
 }
-"""Of their planner and controller, which stay 0.1 rad and 0.5 N m inside their model's ranges
-[rad, rad/s, rad/s^2, N m]."""
+"""Limits of their planner and controller, which stay 0.1 rad and 0.5 N m inside those of their
+model [rad, rad/s, rad/s^2, N m]."""
 
 NOTE = (
     "Published (docs/trajectory_planning.md there): 15.49 s along straight lines and turns one "

@@ -85,6 +85,19 @@ def test_it_holds_in_random_cases_with_what_is_commanded(
     assert (needed <= phase.force.normal[rows, 1] * (1.0 + 1e-9)).all()
 
 
+@pytest.mark.parametrize("allowed", [98.5, 109.0, 112.5])
+def test_no_arm_feels_more_than_its_reference_force(
+    drivable: ho.Cell, front: ho.Front, allowed: float
+) -> None:
+    """Nor the leading one, which feels disturbances beside what is commanded."""
+    task = replace(drivable.workcell.task, reference_force=np.full(2, allowed))
+    cell = ho.Cell(replace(drivable.workcell, task=task), drivable.objective_names)
+    answer = ho.recommend(ho.Front.of(cell, front.x), alone=True)
+    assert not answer.warnings
+    held = pressing_model(drivable.workcell).hold(answer.carry, drivable.workcell.uncertainty)
+    assert max(each.max() for each in held) <= allowed * 1.003
+
+
 def test_one_duration_and_one_force(drivable: ho.Cell, found: Recommendation) -> None:
     """Those of its job, of one that is planned anew, and of what an export plans from its file."""
     assert found.job is not None
@@ -220,7 +233,9 @@ def test_where_nothing_holds_it_is_the_gentlest_and_says_so(
     assert "reference forces of 117.7 N: this is among the gentlest" in gentle.warnings[0]
     # Every way that is told does.
     (ways,) = re.findall(r"Any of these would do: (.*)", gentle.warnings[0])
-    assert ways.startswith(f"reference forces of {gentle.commanded.max():.1f} N, ")
+    (told,) = re.findall(r"^reference forces of ([0-9.]+) N, ", ways)
+    felt = max(each.max() for each in pressing_model(unsure.workcell).hold(gentle.carry, USUAL))
+    assert float(told) == pytest.approx(felt, rel=5e-3)
     share = float(re.findall(r"an \[uncertainty\] ([0-9.]+) times as wide", ways)[0])
     known = [_without(name) for name in re.findall(r"about the ([^,]+)", ways)]
     assert known
