@@ -30,6 +30,17 @@ OFFERED integer dual_arm_work(integer k, integer n, integer m);
 OFFERED integer dual_arm_quadratic(const Program *p);
 /* ---- within ---- */
 
+/* A vector of any alignment; rows of a register tile; rows that are summed at a time, as many as a
+   first cache holds. */
+typedef double vector __attribute__((vector_size(8 * VECTOR), aligned(8), may_alias));
+
+#ifdef __AVX512F__
+enum { TILE = 8 };
+#else
+enum { TILE = 4 };
+#endif
+enum { AT_A_TIME = 32 };
+
 /* The rows as they are used here. */
 typedef struct {
   const Program *of;
@@ -39,7 +50,7 @@ typedef struct {
 
 typedef struct {
   integer k, n, wide;        /* border, chain, a row with its zeros */
-  double *corner, *beside;   /* (k, wide), (n, wide) */
+  double *corner, *beside;   /* (k, wide), with memory for (wide, wide) where it is summed; (n, wide) */
   double *diagonal, *off;
 } Matrix;
 
@@ -47,7 +58,7 @@ typedef struct {
   Matrix of;                 /* what is factorised */
   double *pivot, *along;     /* of the chain, L D L^T */
   double *follow, *lower;    /* chain's inverse times beside; of the border, L L^T */
-  double *head;
+  double *head, *weighted;   /* (wide,), (AT_A_TIME, wide) to work in */
 } Factors;
 
 /* In so many sums, which compilers put into vectors. */
@@ -65,32 +76,32 @@ static void add(double *restrict to, double by, const double *restrict what, int
   for (integer i = 0; i < n; i++) to[i] += by * what[i];
 }
 
-/* The lower half of sums of weight * left^T right over rows (m, wide), to a matrix (k, wide), several
-   rows at a time: what is added to goes through memory once for all of them. Where `weight` is null,
-   each weight is -1. */
-static void add_products(double *to, const double *weight, const double *left, const double *right,
-                         integer m, integer k, integer wide) {
-  enum { TOGETHER = 8 };
-  integer r = 0;
-  for (; r + TOGETHER <= m; r += TOGETHER) {
-    const double *const from = right + r * wide;
-    for (integer i = 0; i < k; i++) {
-      double by[TOGETHER];
-      for (int q = 0; q < TOGETHER; q++) by[q] = (weight ? weight[r + q] : -1.0) * left[(r + q) * wide + i];
-      double *const out = to + i * wide;
-      for (integer j = 0; j <= i; j += VECTOR) {
-        double sums[VECTOR];
-        for (int l = 0; l < VECTOR; l++) sums[l] = out[j + l];
-        for (int q = 0; q < TOGETHER; q++)
-          for (int l = 0; l < VECTOR; l++) sums[l] += by[q] * from[q * wide + j + l];
-        for (int l = 0; l < VECTOR; l++) out[j + l] = sums[l];
-      }
-    }
+/* TILE rows and one vector of columns of the sum of left^T right over rows (m, wide), in registers. */
+static void add_tile(double *to, const double *left, const double *right, integer m, integer wide) {
+  vector sums[TILE];
+  for (int i = 0; i < TILE; i++) sums[i] = *(const vector *)(to + i * wide);
+  for (integer r = 0; r < m; r++) {
+    const vector from = *(const vector *)(right + r * wide);
+    for (int i = 0; i < TILE; i++) sums[i] += left[r * wide + i] * from;
   }
-  for (; r < m; r++)
-    for (integer i = 0; i < k; i++)
-      add_wide(to + i * wide, (weight ? weight[r] : -1.0) * left[r * wide + i], right + r * wide,
-               whole_vectors(i + 1));
+  for (int i = 0; i < TILE; i++) *(vector *)(to + i * wide) = sums[i];
+}
+
+/* The lower half of sums of weight * left^T right over rows (m, wide), to a matrix (k, wide) that has
+   memory for `wide` rows; what is above is not to be read. Where `weight` is null, each weight is -1.
+   `weighted`: (AT_A_TIME, wide) to work in. */
+static void add_products(double *to, const double *weight, const double *left, const double *right,
+                         integer m, integer k, integer wide, double *weighted) {
+  for (integer r = 0; r < m; r += AT_A_TIME) {
+    const integer rows = m - r < AT_A_TIME ? m - r : AT_A_TIME;
+    for (integer q = 0; q < rows; q++) {
+      const double by = weight ? weight[r + q] : -1.0;
+      for (integer j = 0; j < wide; j++) weighted[q * wide + j] = by * left[(r + q) * wide + j];
+    }
+    for (integer i = 0; i < k; i += TILE)
+      for (integer j = 0; j < i + TILE; j += VECTOR)
+        add_tile(to + i * wide + j, weighted + i, right + r * wide + j, rows, wide);
+  }
 }
 
 static void spread(double *to, const double *from, integer rows, integer k, integer wide) {
@@ -188,7 +199,7 @@ static int factorise(const Rows *rows, const Matrix *H, Factors *f, const double
   memcpy(a->beside, H->beside, sizeof(double) * n * wide);
   memcpy(a->diagonal, H->diagonal, sizeof(double) * n);
   memcpy(a->off, H->off, sizeof(double) * (n - 1));
-  add_products(a->corner, D, rows->border, rows->border, p->m, k, wide);
+  add_products(a->corner, D, rows->border, rows->border, p->m, k, wide, f->weighted);
   for (integer r = 0; r < p->m; r++) {
     const double *row = rows->border + r * wide, left = p->left[r], right = p->right[r], w = D[r];
     if (left == 0.0 && right == 0.0) continue;
@@ -212,7 +223,7 @@ static int factorise(const Rows *rows, const Matrix *H, Factors *f, const double
   memcpy(f->follow, a->beside, sizeof(double) * n * wide);
   chain_solve_wide(f, f->follow);
   memcpy(f->lower, a->corner, sizeof(double) * k * wide);
-  add_products(f->lower, 0, a->beside, f->follow, n, k, wide);
+  add_products(f->lower, 0, a->beside, f->follow, n, k, wide, f->weighted);
   for (integer j = 0; j < k; j++) {
     for (integer i = j; i < k; i++)
       f->lower[i * wide + j] -= dot(f->lower + i * wide, f->lower + j * wide, j);
@@ -336,8 +347,8 @@ static State state(double **work, integer all, integer rows) {
 
 OFFERED integer dual_arm_work(integer k, integer n, integer m) {
   const integer all = k + n, rows = m, wide = whole_vectors(k);
-  const integer states = 4 * (3 * all + 2 * rows), matrices = 3 * (k + n) * wide + 4 * n;
-  return states + matrices + (m + 2) * wide + 5 * all + 3 * rows;
+  const integer states = 4 * (3 * all + 2 * rows), matrices = (3 * n + k + 2 * wide) * wide + 4 * n;
+  return states + matrices + (m + 2 + AT_A_TIME) * wide + 5 * all + 3 * rows;
 }
 
 OFFERED integer dual_arm_quadratic(const Program *p) {
@@ -353,10 +364,11 @@ OFFERED integer dual_arm_quadratic(const Program *p) {
   memset(A.head, 0, sizeof(double) * wide);
   Factors f;
   memset(&f, 0, sizeof f);
-  f.of = (Matrix){k, n, wide, take(&work, k * wide), take(&work, n * wide), take(&work, n),
+  f.of = (Matrix){k, n, wide, take(&work, wide * wide), take(&work, n * wide), take(&work, n),
                   take(&work, n)};
   f.pivot = take(&work, n), f.along = take(&work, n);
-  f.follow = take(&work, n * wide), f.lower = take(&work, k * wide), f.head = take(&work, wide);
+  f.follow = take(&work, n * wide), f.lower = take(&work, wide * wide), f.head = take(&work, wide);
+  f.weighted = take(&work, AT_A_TIME * wide);
   State now = state(&work, all, rows), goal = state(&work, all, rows);
   State first = state(&work, all, rows), second = state(&work, all, rows);
   double *const slope = take(&work, all), *const bend = take(&work, all);
