@@ -77,7 +77,8 @@ def polish(
         paths: carries of the cell whose paths are known to be good, or their decision vectors,
             with or without a force limit; under the time law 'optimal' only. The front is nowhere
             behind them. The hand-made path always takes part.
-        progress: True for a bar, or what takes attempts done and at most.
+        progress: True for a bar, or what takes attempts done and those expected in all: what is
+            left to do shows on the way, and both are equal in the end.
 
     Raises:
         SettingsError: the cell's objectives are not those of the polish, or a path does not fit.
@@ -128,14 +129,18 @@ def time_every_way(
     *,
     force_limit: float | None = None,
     curve_points: int | None = None,
+    progress: ShowProgress = False,
 ) -> TimedTrajectory:
     """The search's timing and the drivable ones of a carry side by side, with margins.
 
     Args:
         force_limit: normal force [N] of a force-limited timing, None for no such timing.
         curve_points: points of the curve of duration against force limit, None for no curve.
+        progress: True for a bar, or what takes timings done and in all, the margins as one.
     """
-    return timed_trajectory(cell.timing_model, decision_of(carry), force_limit, curve_points)
+    return timed_trajectory(
+        cell.timing_model, decision_of(carry), force_limit, curve_points, progress=progress
+    )
 
 
 def save(carry: Carry, path: str | Path, provenance: Mapping[str, Any] | None = None) -> None:

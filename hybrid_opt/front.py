@@ -21,7 +21,7 @@ from hybrid_opt.evaluate.evaluation import CandidateEvaluator, Evaluations
 from hybrid_opt.indicators import metrics
 from hybrid_opt.polishing.records import PolishedFront
 from hybrid_opt.polishing.settings import PolishSettings, usual_settings
-from hybrid_opt.progress import ShowProgress, counted
+from hybrid_opt.progress import ShowProgress, counted, passed_on
 from hybrid_opt.shown import Displayable
 from symbolic.array import Array, set_read_only
 from symbolic.errors import SettingsError
@@ -109,7 +109,7 @@ class Front(Displayable):
                 )
         beside = np.array([path[: task.n_path] for path in known]).reshape(-1, task.n_path)
         with counted(progress, "polish", settings.attempts) as advance:
-            done = polisher.polish(self.x, rng, emit=lambda outcome: advance(1), paths=beside)
+            done = polisher.polish(self.x, rng, paths=beside, tell=passed_on(advance))
         return self.after(done)
 
     @property

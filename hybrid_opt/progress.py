@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import Literal, TypeVar
+from typing import Literal, NoReturn, Protocol, TypeVar
 
 from tqdm import tqdm
 
@@ -15,32 +15,59 @@ ShowProgress = Literal[False, True] | Callable[[int, int], None]
 """Whether to show a bar, or what is called with the units done and those in all."""
 
 
+class Advance(Protocol):
+    """Takes how many more units are done, and those in all where more is known of them now."""
+
+    def __call__(self, count: int, total: int | None = None, /) -> None:
+        """Go on."""
+
+
 @contextmanager
-def counted(progress: ShowProgress, what: str, total: int) -> Iterator[Callable[[int], None]]:
+def counted(progress: ShowProgress, what: str, total: int) -> Iterator[Advance]:
     """Count the units of a call.
 
     Args:
         what: stands before the bar.
         total: units in all.
-
-    Yields:
-        A function that takes how many more units are done.
     """
     if progress is True:
         from tqdm.auto import tqdm
 
         with tqdm(total=total, desc=what, dynamic_ncols=True) as bar:
-            yield lambda count: (bar.update(count), None)[1]
+
+            def show(count: int, total: int | None = None) -> None:
+                _set_total(bar, total)
+                bar.update(count)
+
+            yield show
         return
     done = 0
 
-    def advance(count: int) -> None:
-        nonlocal done
-        done += count
+    def advance(count: int, now: int | None = None) -> None:
+        nonlocal done, total
+        done, total = done + count, total if now is None else now
         if callable(progress):
             progress(done, total)
 
     yield advance
+
+
+def passed_on(advance: Advance) -> Callable[[int, int], None]:
+    """What a call takes as its `progress`, for a count that has begun."""
+    before = 0
+
+    def tell(done: int, total: int) -> None:
+        nonlocal before
+        advance(done - before, total)
+        before = done
+
+    return tell
+
+
+def _set_total(bar: tqdm[NoReturn], total: int | None) -> None:
+    if total is not None and total != bar.total:
+        bar.total = total
+        bar.refresh()
 
 
 def following(progress: ShowProgress, what: str, items: Sequence[T]) -> Iterator[T]:
@@ -50,9 +77,6 @@ def following(progress: ShowProgress, what: str, items: Sequence[T]) -> Iterator
             yield item
             advance(1)
 
-
-Advance = Callable[[int], None]
-"""Takes how many more units are done."""
 
 _QUIET_SECONDS = 10.0
 """Between lines where the terminal is none, as in a log."""
@@ -98,7 +122,8 @@ class Progress:
         )
         with bar:
 
-            def advance(count: int) -> None:
+            def advance(count: int, total: int | None = None) -> None:
+                _set_total(bar, total)
                 if bar.total is not None and bar.n + count > bar.total:
                     bar.total = None  # more than was thought: nobody knows how much is left
                 bar.update(count)

@@ -45,6 +45,9 @@ BETWEEN = (0.125, 0.25, 0.375, 0.5, 0.625, 0.75, 0.875)
 MOST = 10**6
 """Attempts at most: their number follows from the force limits and the gaps."""
 
+ENDS = 2
+"""Of a front."""
+
 FASTEST = 4
 """Paths that are judged at most before a gap is left: some touch something."""
 
@@ -103,6 +106,7 @@ class DriveRun(PolishRun[DriveAttempt]):
         archive: GrowingFront,
         recorded: list[PolishOutcome | Loss],
         emit: Callable[[PolishOutcome], None],
+        tell: Callable[[int, int], None],
         paths: Array,
     ) -> None:
         """Begin.
@@ -111,7 +115,7 @@ class DriveRun(PolishRun[DriveAttempt]):
             doubt: why the timing of a decision vector is not believed, see `second_opinion`.
             paths: (m, n_path) known beside the front.
         """
-        super().__init__(way.cell.evaluator, settings, archive, recorded, emit)
+        super().__init__(way.cell.evaluator, settings, archive, recorded, emit, tell)
         self._most = MOST
         self._way, self._doubt, task = way, doubt, way.cell.task
         self._n_path, self._range = task.n_path, way.paths.force_limit
@@ -135,11 +139,15 @@ class DriveRun(PolishRun[DriveAttempt]):
         self._others = self._leading(np.vstack([self._hand_made, self._paths]))
         least = min(max(self._least, (1.0 + GENTLE) * self._still), fast)
         limits = self._limits(least, fast, self._settings.attempts)
+        ahead = len(limits) + ENDS + self._settings.drivable.members
+        self._expect(1 + ahead)
         paths, durations = self._driven(limits[0])
         self._attempt(paths[int(np.argmin(durations))], limits[0], "stated")
         if self._way.cell.task.allocation != "soft-finger":
             middle = self._between(limits[0], fast)
-            for path in self._turned(middle):
+            turned_paths = self._turned(middle)
+            self._expect(len(turned_paths) + ahead)
+            for path in turned_paths:
                 self._attempt(path, middle, "stated")
         task, last = self._way.cell.task, list[Array]()
         for force in limits:
@@ -190,12 +198,15 @@ class DriveRun(PolishRun[DriveAttempt]):
     def _spread(self) -> None:
         """Points of the best known paths at both ends of the front, then in its largest gaps of
         paths between both neighbours'."""
-        for force in (self._least, self._largest):
+        members = self._settings.drivable.members
+        for ahead, force in ((ENDS, self._least), (ENDS - 1, self._largest)):
+            self._expect(ahead + members)
             self._best_of(self._driven(force)[0], force)
-        for _ in range(self._settings.drivable.members):
+        for ahead in range(members, 0, -1):
             gap = self._widest_gap()
             if gap is None:
                 break
+            self._expect(ahead)
             first, second = (self._archive.x[k][: self._n_path] for k in gap.ends)
             between = first + np.outer(BETWEEN, second - first)
             self._best_of(np.vstack([between, self._others]), gap.force)

@@ -314,8 +314,9 @@ class ForceRun(PolishRun[ForceAttempt]):
         archive: GrowingFront,
         recorded: list[PolishOutcome | Loss],
         emit: Callable[[PolishOutcome], None],
+        tell: Callable[[int, int], None],
     ) -> None:
-        super().__init__(solver.cell.evaluator, settings, archive, recorded, emit)
+        super().__init__(solver.cell.evaluator, settings, archive, recorded, emit, tell)
         self._solver, self._mirror = solver, mirror_of(solver.cell.workcell)
         self._tried: set[tuple[int | None, bytes]] = set()
         self._stalls: dict[int | None, int] = {0: 0, 1: 0, None: 0}
@@ -334,11 +335,16 @@ class ForceRun(PolishRun[ForceAttempt]):
         """The front's points, then probes far from it, then ends and middle in turns while attempts
         last; then what lies between. Mirror images are taken in all the way, and certified together
         with points on chords in the end."""
-        self._do(points(self._archive, self._settings))
-        self._ahead = self._left()
+        first, fill = points(self._archive, self._settings), self._settings.fill
+        self._ahead = max(self._left() - len(first), 0)
         aims = (0, 1, None) if self._mirror is None else (0, None)
+        later = len(aims) + min(fill.solved, fill.attempts * self._settings.attempts)
+        probes = sum(max(2 * self._starts(objective) - 1, 0) for objective in aims)
+        self._expect(self._left() + probes + later)
+        self._do(first)
         for objective in aims:
             self._probe(objective, rng)
+        self._expect(self._left() + later)
         while self._left() > 0:
             self._turn((0, 1), rng)
             if self._stalls[None] < MIDDLE_STALLS:
@@ -347,21 +353,18 @@ class ForceRun(PolishRun[ForceAttempt]):
             self._most += 1
             self._do([finishing(self._archive, objective)])
         probed = self._without_probes()
-        self._fill(self._settings.fill.solved)
+        self._fill(fill.solved)
         self._take_back(probed)
         self._certify_unproven()
-        if len(self._archive.rows()) < ENOUGH * self._settings.fill.members:
+        if len(self._archive.rows()) < ENOUGH * fill.members:
             # Chords lead nowhere, or where nothing is proven.
-            self._fill(self._settings.fill.members)
+            self._fill(fill.members)
             self._certify_unproven()
 
     def _probe(self, objective: int | None, rng: np.random.Generator) -> None:
         """Short solves from random feasible candidates and from the front's best point, then again
-        from the better half of what they reached, until one is left. Never from more starts than
-        twice the attempts that are ahead."""
-        probe = self._settings.probe
-        count = probe.starts if self._mirror is not None else (probe.starts + 1) // 2
-        count = min(2 * self._ahead, probe.middle_starts if objective is None else count)
+        from the better half of what they reached, until one is left."""
+        count = self._starts(objective)
         if not count:
             return
         k = self._archive.best(objective)[0]
@@ -375,6 +378,12 @@ class ForceRun(PolishRun[ForceAttempt]):
             return Start(outcome.x, outcome.objectives, spent=outcome.status != "accepted")
 
         halve(pool, objective, solve)
+
+    def _starts(self, objective: int | None) -> int:
+        """Starts of short solves: never more than twice the attempts that are ahead."""
+        probe = self._settings.probe
+        count = probe.starts if self._mirror is not None else (probe.starts + 1) // 2
+        return min(2 * self._ahead, probe.middle_starts if objective is None else count)
 
     def _without_probes(self) -> list[tuple[Array, Array]]:
         """Take out what probes reached, but for the ends and the middle: cut short on purpose, they
@@ -416,6 +425,7 @@ class ForceRun(PolishRun[ForceAttempt]):
             found = filling(self._archive, tried, solved)
             if found is None:
                 break
+            self._expect(min(self._left(), solved - len(self._archive.rows())))
             tried |= {found.edge, self._reflected(found.edge)}
             self._do([found.attempt])
             outcome = self.outcomes[-1]

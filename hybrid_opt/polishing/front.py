@@ -131,11 +131,12 @@ class PolishRun(ABC, Generic[AnyAttempt]):
         archive: GrowingFront,
         recorded: list[PolishOutcome | Loss],
         emit: Callable[[PolishOutcome], None],
+        tell: Callable[[int, int], None],
     ) -> None:
         self._evaluator, self._settings = evaluator, settings
         self._archive, self._recorded, self._emit = archive, recorded, emit
         self.outcomes: list[PolishOutcome] = []
-        self._most = settings.attempts
+        self._most, self._expected, self._tell = settings.attempts, 0, tell
 
     @abstractmethod
     def all(self, rng: np.random.Generator) -> None:
@@ -148,19 +149,25 @@ class PolishRun(ABC, Generic[AnyAttempt]):
     def _left(self) -> int:
         return self._most - len(self.outcomes)
 
+    def _expect(self, attempts: int) -> None:
+        """Tell how many more there are to be, as far as is known."""
+        self._expected = attempts
+        self._tell(len(self.outcomes), len(self.outcomes) + attempts)
+
     def _do(self, attempts: list[AnyAttempt]) -> None:
         """Solve, judge and take in attempts; those on record are not solved again."""
         for attempt in attempts[: max(0, self._left())]:
             known = self._recorded.pop(0) if self._recorded else None
             if isinstance(known, PolishOutcome):
                 self._take(attempt, known)
-                continue
-            begin = time.perf_counter()
-            answer = known or self._solved_safely(attempt)
-            outcome = self._judged(attempt, answer, begin)
-            self._take(attempt, outcome)
-            if known is None:
-                self._emit(outcome)
+            else:
+                begin = time.perf_counter()
+                answer = known or self._solved_safely(attempt)
+                outcome = self._judged(attempt, answer, begin)
+                self._take(attempt, outcome)
+                if known is None:
+                    self._emit(outcome)
+            self._expect(max(self._expected - 1, 0))
 
     def _solved_safely(self, attempt: AnyAttempt) -> Solution | Loss:
         """The solution, or what was raised instead."""

@@ -88,6 +88,7 @@ class Polisher:
         recorded: Sequence[PolishOutcome | Loss] = (),
         emit: Callable[[PolishOutcome], None] = lambda outcome: None,
         paths: Array | None = None,
+        tell: Callable[[int, int], None] = lambda done, total: None,
     ) -> PolishedFront:
         """Polish a front.
 
@@ -99,6 +100,7 @@ class Polisher:
             emit: takes each new outcome.
             paths: (m, n_path) free waypoints that are known to be good, and need not be on the
                 front; only the polish of drivable carries uses them. None for none.
+            tell: takes attempts done, and those in all as far as is known.
         """
         begin = time.perf_counter()
         x = np.asarray(front_x, dtype=float).reshape(-1, self.evaluator.n_var)
@@ -107,7 +109,7 @@ class Polisher:
         feasible = np.flatnonzero(found.feasible)
         archive = GrowingFront(x[feasible], found.objectives[feasible], feasible.tolist())
         known = np.empty((0, self.evaluator.workcell.task.n_path)) if paths is None else paths
-        given = archive, list(recorded), emit
+        given = archive, list(recorded), emit, tell
         run: PolishRun[Any]
         if self.solver is not None:
             run = ForceRun(self.solver, self.settings, *given)
@@ -117,6 +119,7 @@ class Polisher:
         if len(feasible) and self.settings.attempts:
             with one_thread():
                 run.all(rng)
+        tell(len(run.outcomes), len(run.outcomes))
         rows = archive.rows() if len(feasible) else []
         return PolishedFront(
             x=np.array([archive.x[k] for k in rows]).reshape(-1, self.evaluator.n_var),

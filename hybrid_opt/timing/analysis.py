@@ -3,7 +3,7 @@ margins; and all of them at once, also as the record that `timing/*.json` stores
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
@@ -11,6 +11,7 @@ from typing import Annotated
 import numpy as np
 
 from hybrid_opt.carry import Carry
+from hybrid_opt.progress import ShowProgress, counted
 from hybrid_opt.store.files import read_record
 from hybrid_opt.timing.jerk import kept_jerk, time_with_jerk
 from hybrid_opt.timing.limits import (
@@ -125,10 +126,15 @@ def closest_to_reference_timing(model: TimingModel, x: Array) -> Timing:
     return time_path(model, x, TimingLimits(reference_speed=True))
 
 
-def duration_against_force_limit(model: TimingModel, x: Array, points: int = 12) -> ForceCurve:
+def duration_against_force_limit(
+    model: TimingModel, x: Array, points: int = 12, told: Callable[[], None] = lambda: None
+) -> ForceCurve:
     """Durations of the fastest timings between the least force that holds and the unlimited one.
 
     The limits are spaced evenly in the logarithm of what they leave above the force at rest.
+
+    Args:
+        told: called after every point.
 
     Raises:
         SettingsError: fewer than two points.
@@ -144,7 +150,10 @@ def duration_against_force_limit(model: TimingModel, x: Array, points: int = 12)
     top = _peak_force(model, free.carry)
     first = (NEAREST_FORCE - 1.0) * static
     force = static + np.geomspace(first, max(top - static, 2.0 * first), points)
-    timings = [time_path(model, x, model.drive_limits(float(limit)), motion) for limit in force]
+    timings = []
+    for limit in force:
+        timings.append(time_path(model, x, model.drive_limits(float(limit)), motion))
+        told()
     return ForceCurve(
         force,
         np.array([timing.duration for timing in timings]),
@@ -188,6 +197,7 @@ def timed_trajectory(
     force_limit: float | None = None,
     curve_points: int | None = None,
     own: TimingModel | None = None,
+    progress: ShowProgress = False,
 ) -> TimedTrajectory:
     """Time one decision vector (n_var,) in every way.
 
@@ -196,36 +206,44 @@ def timed_trajectory(
         force_limit: normal force [N] of a force-limited timing, None for no such timing.
         curve_points: points of the curve of duration against force limit, None for no curve.
         own: of the cell that x was found in, None for the same.
+        progress: True for a bar, or what takes timings done and in all, the margins as one.
 
     Raises:
         SettingsError: x does not fit the workcell, or the limit is not a positive force.
     """
     task, found_in = model.workcell.task, own or model
-    timings = {"search": judge_timing(found_in, x)}
-    (x,) = same_paths(x, found_in.workcell.task, task)
-    closest = closest_to_reference_timing(model, x)
-    timings |= {
-        "closest to reference": closest,
-        "fastest": time_path(model, x),
-    }
-    if force_limit is not None:
-        timings["force limited"] = time_path(model, x, model.drive_limits(force_limit))
-    jerk = None
-    if len(x) == task.n_var > task.n_path:
-        limits = model.drive_limits(float(x[-1]))
+    jerk, kept, limits = None, None, TimingLimits()
+    (path,) = same_paths(x, found_in.workcell.task, task)
+    if len(path) == task.n_var > task.n_path:
+        limits = model.drive_limits(float(path[-1]))
         kept = kept_jerk(model.workcell, limits)
-        jerk = None if kept is None else time_with_jerk(model, x, limits, kept)
-    if jerk is not None:
-        timings["within jerk limits"] = jerk.timing
-    nominal = TimingLimits(reference_speed=True)
-    return TimedTrajectory(
-        model.workcell,
-        duration_at_speed_limits(model, model.path_motion(x), nominal),
-        timings,
-        jerk,
-        () if closest.carry is None else robustness_margins(model, closest.carry),
-        None if curve_points is None else duration_against_force_limit(model, x, curve_points),
-    )
+    ways = 4 + (force_limit is not None) + (kept is not None) + (curve_points or 0)
+    with counted(progress, "timings", ways) as advance:
+
+        def told() -> None:
+            advance(1)
+
+        timings = {"search": judge_timing(found_in, x)}
+        told()
+        closest = timings["closest to reference"] = closest_to_reference_timing(model, path)
+        told()
+        timings["fastest"] = time_path(model, path)
+        told()
+        if force_limit is not None:
+            timings["force limited"] = time_path(model, path, model.drive_limits(force_limit))
+            told()
+        if kept is not None:
+            jerk = time_with_jerk(model, path, limits, kept)
+            timings["within jerk limits"] = jerk.timing
+            told()
+        nominal = TimingLimits(reference_speed=True)
+        nominal_duration = duration_at_speed_limits(model, model.path_motion(path), nominal)
+        margins = () if closest.carry is None else robustness_margins(model, closest.carry)
+        told()
+        curve = None
+        if curve_points is not None:
+            curve = duration_against_force_limit(model, path, curve_points, told)
+    return TimedTrajectory(model.workcell, nominal_duration, timings, jerk, margins, curve)
 
 
 @dataclass(frozen=True)

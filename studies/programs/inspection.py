@@ -16,7 +16,7 @@ from hybrid_opt.cell import Cell
 from hybrid_opt.evaluate.explanation import Explanation, explain, frequent
 from hybrid_opt.front import Front
 from hybrid_opt.indicators.metrics import BindingBound, binding_bounds
-from hybrid_opt.progress import Progress
+from hybrid_opt.progress import Progress, passed_on
 from studies.program import Finding, load_workcell, print_findings
 from symbolic.array import Array
 from symbolic.cell_model import CellModel, own_pairs
@@ -198,7 +198,7 @@ def _optimum(cell: Cell, progress: Progress) -> Optimum:
                 Front.of_search(cell, "hand-made", verdicts),
                 rng=np.random.default_rng(0),
                 settings=ho.PolishSettings(attempts=POLISH_ATTEMPTS),
-                progress=lambda done, total: advance(1),
+                progress=passed_on(advance),
             )
     except SettingsError as error:
         return Optimum(0, (), str(error))

@@ -35,9 +35,28 @@ def starts() -> Array:
     return np.array([start(51.0), start(55.0, seed=1)])
 
 
+TOLD: list[tuple[int, int]] = []
+"""Attempts done and in all, as `polished` told them."""
+
+
 @cache
 def polished() -> PolishedFront:
-    return polisher().polish(starts(), np.random.default_rng(0))
+    return polisher().polish(
+        starts(),
+        np.random.default_rng(0),
+        tell=lambda done, total: TOLD.append((done, total)),
+    )
+
+
+def test_attempts_never_exceed_those_that_are_expected() -> None:
+    attempts = len(polished().outcomes)
+    done, total = np.transpose(TOLD)
+    assert np.unique(done).tolist() == list(range(attempts + 1))
+    assert (np.diff(done) >= 0).all()
+    assert (done <= total).all()
+    assert TOLD[-1] == (attempts, attempts)
+    # What is expected at first is of the right size.
+    assert attempts / 2 <= total[0] <= 2 * attempts
 
 
 def test_the_front_dominates_more_than_before() -> None:

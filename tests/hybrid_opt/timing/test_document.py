@@ -22,11 +22,26 @@ from hybrid_opt.timing.jerk import time_with_jerk
 from hybrid_opt.timing.records import JerkLimits, TimingLimits
 from tests.hybrid_opt.timing.cells import hand_timing, initial
 
+TOLD: list[tuple[int, int]] = []
+"""Timings done and in all, as `timed` told them."""
+
 
 @cache
 def timed() -> TimedTrajectory:
     # The limit cannot be kept: that timing has no carry.
-    return timed_trajectory(hand_timing(), initial(), force_limit=1.0, curve_points=3)
+    return timed_trajectory(
+        hand_timing(),
+        initial(),
+        force_limit=1.0,
+        curve_points=3,
+        progress=lambda done, total: TOLD.append((done, total)),
+    )
+
+
+def test_every_timing_is_told() -> None:
+    timed()
+    # Three for every carry, one within the force limit, the margins, three of the curve.
+    assert [(k, 8) for k in range(1, 9)] == TOLD
 
 
 def test_stored_and_read_it_is_the_same(tmp_path: Path) -> None:
