@@ -13,6 +13,7 @@ import os
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from itertools import islice
+from math import ceil
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +21,9 @@ import numpy as np
 
 from codegen.compiler import find_compiler
 from hybrid_opt.carry import Judgement
-from hybrid_opt.display.table import counted
+from hybrid_opt.display import table
 from hybrid_opt.errors import NoHoldError, ProposalError
+from hybrid_opt.progress import ShowProgress, counted, passed_on
 from hybrid_opt.proposing.bases import base_choices
 from hybrid_opt.proposing.bounds import Bounds, Sampling, find_bounds
 from hybrid_opt.proposing.planner import Place, Stray, freedom, plan, straight_paths
@@ -165,7 +167,7 @@ class Proposal:
         spins = " and ".join(f"{np.degrees(spin):.0f}" for spin in self.found.spins)
         where = f" {' and '.join(self.sides)}," if self.sides else ""
         return (
-            f"a carry{where} through {counted(len(self.found.via), 'via-point')}, joints go "
+            f"a carry{where} through {table.counted(len(self.found.via), 'via-point')}, joints go "
             f"{self.length:.2f} rad, certified; objectives {forces}; "
             f"spins {spins} deg, start branches {self.found.branches[0]} and "
             f"{self.found.branches[1]}; {100.0 * self.feasible_share:.1f} % of "
@@ -185,10 +187,11 @@ def propose(
     rng: np.random.Generator,
     settings: ProposeSettings | None = None,
     tell: Callable[[str], None] = lambda text: None,
+    progress: ShowProgress = False,
 ) -> Proposal:
     """Propose a complete workcell for a problem file; of several classes that whose joints go least
     far. Arguments and errors as for `propose_classes`."""
-    return propose_classes(path, rng=rng, settings=settings, tell=tell)[0]
+    return propose_classes(path, rng=rng, settings=settings, tell=tell, progress=progress)[0]
 
 
 def propose_classes(
@@ -197,6 +200,7 @@ def propose_classes(
     rng: np.random.Generator,
     settings: ProposeSettings | None = None,
     tell: Callable[[str], None] = lambda text: None,
+    progress: ShowProgress = False,
 ) -> list[Proposal]:
     """Propose complete workcells whose carries are of different classes, those whose joints go
     least far first: they pass what is in the way on different sides, or hold the box in other
@@ -208,6 +212,8 @@ def propose_classes(
             out.
         settings: how many are looked for, among others; None for the defaults: one.
         tell: called with what is being done.
+        progress: True for a bar, or what takes the seconds worked and those that it may work; most
+            proposals need a part of them.
 
     Raises:
         WorkcellError: the file is wrong.
@@ -216,8 +222,10 @@ def propose_classes(
         CodegenError: there is no C compiler, which the verdict on a proposal needs.
     """
     find_compiler()
-    search = _Search(read_problem(path), rng, settings or ProposeSettings(), tell)
-    return sorted(search.run(), key=lambda one: one.length)
+    settings = settings or ProposeSettings()
+    with counted(progress, "seconds of work", ceil(settings.seconds)) as advance:
+        search = _Search(read_problem(path), rng, settings, tell, passed_on(advance))
+        return sorted(search.run(), key=lambda one: one.length)
 
 
 @dataclass
@@ -238,6 +246,7 @@ class _Search:
     rng: np.random.Generator
     settings: ProposeSettings
     tell: Callable[[str], None]
+    count: Callable[[int, int], None]
     begun: float = 0.0
     refusals: list[str] = field(default_factory=list)
     known: set[tuple[int, tuple[str, ...]]] = field(default_factory=set)
@@ -258,9 +267,15 @@ class _Search:
         """Whether it is too late for another path: bounds and verdicts take time as well."""
         return self.spent > PLANNING * self.settings.seconds
 
+    def _say(self, text: str) -> None:
+        """Say what is being done, and how much of the time is gone."""
+        self.tell(text)
+        limit = ceil(self.settings.seconds)
+        self.count(min(int(self.spent), limit), limit)
+
     def run(self) -> list[Proposal]:
         self.begun = self.settings.clock()
-        self.tell("bases" if self.settings.bases else "ways to hold the box")
+        self._say("bases" if self.settings.bases else "ways to hold the box")
         spins = 2.0 * np.pi * np.arange(SPINS) / SPINS
         choices = base_choices(self.problem, spins, self.rng) if self.settings.bases else [{}]
         setups = [_Lazy(given, spins) for given in choices]
@@ -269,7 +284,7 @@ class _Search:
             for setup in setups:
                 for one in self._round(setup, effort, most):
                     found.append(one)
-                    self.tell(f"carry {len(found)}: {' and '.join(one.sides) or 'straight'}")
+                    self._say(f"carry {len(found)}: {' and '.join(one.sides) or 'straight'}")
                     if len(found) == self.settings.classes:
                         return found
                 if self.too_late:
@@ -281,7 +296,7 @@ class _Search:
     def _round(self, lazy: _Lazy, effort: int, most: int) -> Iterator[Proposal]:
         """One round with one choice of bases."""
         if lazy.setup is None and not lazy.problem:
-            self.tell("ways to hold the box")
+            self._say("ways to hold the box")
             try:
                 lazy.setup = prepare(self.problem, lazy.given, lazy.spins, self.rng)
             except (ProposalError, WorkcellError) as error:
@@ -294,7 +309,7 @@ class _Search:
         for number, pair in enumerate(lazy.setup.pairs[:most]):
             if self.too_late:
                 break
-            self.tell(f"paths of pair {number + 1} of {len(lazy.setup.pairs)}")
+            self._say(f"paths of pair {number + 1} of {len(lazy.setup.pairs)}")
             long: list[Array] = []
             for corners in self._paths(lazy.setup, pair, effort, box):
                 if corners is None or self._is_known(pair, box, along(corners)):
@@ -356,7 +371,7 @@ class _Search:
 
     def _via_points(self, pair: Pair, corners: list[Place]) -> Array | None:
         """The fewest via-points of a path, None where none are found."""
-        self.tell("via-points")
+        self._say("via-points")
         dense = shortened(pair.chain, corners, self.rng)
         for count in range(1, MOST_VIA_POINTS + 1):
             via = fit(pair.chain, dense, count, self.rng)
@@ -376,7 +391,7 @@ class _Search:
         path = path_basis(len(waypoints), np.linspace(0.0, 1.0, LEAST_SAMPLES)).position @ waypoints
         if self._is_known(pair, box, path[:, :POSE_SIZE]):
             return
-        self.tell("the evaluator's verdict")
+        self._say("the evaluator's verdict")
         begun = self.spent
         spins = (pair.holds[0].spin, pair.holds[1].spin)
         found = Draft(setup.workcell, spins, (-1, -1), waypoints, setup.given)
@@ -386,11 +401,11 @@ class _Search:
             self.refusals.append(why)
             return
         certified = self.spent
-        self.tell("bounds")
+        self._say("bounds")
         # The verdict on the file takes about as long as this one did.
         bounds = self._bounds(trial, self.settings.seconds - 1.5 * (self.spent - begun))
         moved = replace(found, bounds=bounds).around(bounds.carry)
-        self.tell("the evaluator's verdict on the file")
+        self._say("the evaluator's verdict on the file")
         try:
             last = Trial(self._workcell(moved), trial.start_of(bounds.carry), trial.bodies)
         except BranchLostError:
@@ -402,7 +417,7 @@ class _Search:
             return
         outputs = last.evaluator.outputs(last.initial[None])
         self.known.add((id(pair), box.passed(path[:, :POSE_SIZE])))
-        self.tell("the pads' way to the box")
+        self._say("the pads' way to the box")
         blocked, stand_off = ("", None) if self.out_of_time else self._pads_way(last)
         yield Proposal(
             self.problem,

@@ -50,10 +50,25 @@ def rack_problem(folder: Path, changes: dict[str, Any] | None = None) -> Path:
     return path
 
 
+TOLD: list[tuple[int, int]] = []
+"""Seconds worked and those that it may work, as `proposal` told them."""
+
+
 @pytest.fixture(scope="module")
 def proposal(tmp_path_factory: pytest.TempPathFactory) -> ho.Proposal:
     path = rack_problem(tmp_path_factory.mktemp("rack"))
-    return ho.propose(path, rng=np.random.default_rng(1))
+    return ho.propose(
+        path,
+        rng=np.random.default_rng(1),
+        progress=lambda done, total: TOLD.append((done, total)),
+    )
+
+
+def test_the_time_that_is_gone_is_told(proposal: ho.Proposal) -> None:
+    seconds, limits = zip(*TOLD, strict=True)
+    assert set(limits) == {ho.ProposeSettings().seconds}
+    assert list(seconds) == sorted(seconds)
+    assert 0.0 < seconds[-1] <= proposal.seconds
 
 
 def test_the_rack_gets_a_certified_carry(proposal: ho.Proposal, tmp_path: Path) -> None:
