@@ -47,7 +47,8 @@ class Scene:
     Attributes:
         bodies: in the world; every name is a body's of an environment, and unique.
         left_out: what is no body of it, each 'NAME: why'.
-        notes: what a body says otherwise than its scene, each 'NAME: what'.
+        notes: what a body says otherwise than its scene, and what is only to be seen there, each
+            'NAME: what'.
         files: meshes that stand in the scene itself, STL by the path that their body names.
     """
 
@@ -143,7 +144,8 @@ class SceneBuilder:
         """The half-space below a frame's x-y plane."""
         normal = pose[:3, 2]
         middle = normal * (normal @ pose[:3, 3] - SLAB[2] / 2.0)
-        self.note(name, f"is a plane; a slab of {SLAB[0]:g} x {SLAB[1]:g} x {SLAB[2]:g} m stands")
+        size = " x ".join(f"{side:g}" for side in SLAB)
+        self.note(name, f"is a plane; a slab of {size} m below it takes its place")
         self.add(name, Box(np.array(SLAB)), transform(pose[:3, :3], middle))
 
     def leave(self, name: str, why: str) -> None:

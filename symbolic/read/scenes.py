@@ -58,7 +58,7 @@ def read_scene(path: Path) -> Scene:
         told = "".join(f"\n  - {problem}" for problem in found.problems.messages())
         raise SceneError(f"{path.name}: cannot be read as a scene{told}")
     if not found.bodies and not found.left_out:
-        raise SceneError(f"{path.name}: holds no obstacle")
+        raise SceneError("; ".join([f"{path.name}: holds no obstacle", *found.notes[:5]]))
     return Scene(tuple(found.bodies), tuple(found.left_out), tuple(found.notes), found.files)
 
 
@@ -224,7 +224,9 @@ class _Sdf:
                     collision, scope.file, f"{name} {link} {each}", T_world_model @ placed @ pose
                 )
             if not collisions and part.child("visual"):
-                self._found.leave(f"{name} {link}", "is only to be seen, without a collision shape")
+                self._found.note(
+                    f"{name} {link}", "is no body, only to be seen: no collision shape"
+                )
         for inner, model in scope.inner.items():
             self._shapes(model, T_world_model @ scope.frame(inner), f"{name} {inner}")
 
@@ -511,7 +513,7 @@ def _read_mjcf(path: Path, found: SceneBuilder) -> None:
             root = int(model.body_rootid[body])
             moving[root] = moving.get(root, 0) + 1
         elif not geom.contype[0] and not geom.conaffinity[0]:
-            found.leave(name, "is only to be seen: its contype and conaffinity are zero")
+            found.note(name, "is no body, only to be seen: its contype and conaffinity are zero")
         elif shape is not None:
             found.add(name, shape, pose)
         elif kind == "plane":

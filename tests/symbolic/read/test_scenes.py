@@ -434,8 +434,20 @@ def test_fixed_shapes_of_mjcf(tmp_path: Path) -> None:
     wedge = trimesh.load_mesh(BytesIO(content), file_type="stl")
     wedge.apply_transform(bodies["board wedge"].pose)
     np.testing.assert_allclose(wedge.bounds, np.array([[0, 1, 0.25], [1, 2, 1.25]]), atol=1e-6)
-    assert [told.partition(":")[0] for told in found.left_out] == ["hills", "ghost", "arm"]
-    assert "2 shapes" in found.left_out[2]
+    assert [told.partition(":")[0] for told in found.left_out] == ["hills", "arm"]
+    assert "2 shapes" in found.left_out[1]
+    assert [told.partition(":")[0] for told in found.notes] == ["floor", "ghost"]
+
+
+def test_a_scene_that_is_only_to_be_seen_says_so(tmp_path: Path) -> None:
+    ghost = '<geom name="ghost" size="0.1" contype="0" conaffinity="0"/>'
+    visual = f"<visual name='v'><geometry>{BALL}</geometry></visual>"
+    for text, told in (
+        (f"<mujoco><worldbody>{ghost}</worldbody></mujoco>", "ghost: is no body, only to be seen"),
+        (sdf(f"<model name='m'><link name='l'>{visual}</link></model>"), "m l: is no body"),
+    ):
+        with pytest.raises(SceneError, match=f"holds no obstacle; (.*; )?{told}"):
+            scene(tmp_path, text, "scene.xml")
 
 
 @pytest.mark.parametrize(
