@@ -284,7 +284,7 @@ def contact_points(
     side = 1.0 if bases is None else float(np.sign(along @ R_world_box[:, axis]) or 1.0)
     point = np.zeros(3)
     point[axis] = side * size[axis] / 2.0
-    return [point.tolist(), (-point).tolist()]
+    return [point.tolist(), (0.0 - point).tolist()]
 
 
 UNIT = np.array([0.10, 0.10, 0.10, 0.08, 0.08, 0.08])
@@ -437,8 +437,8 @@ def _as_waypoints(x: Array, waypoints: Array, m: int) -> Array:
 
 
 def _plain(values: Array) -> Any:
-    """As lists of numbers, to a hundredth of a millimetre."""
-    return np.round(values, 5).tolist()
+    """As lists of numbers, to a hundredth of a millimetre, none of them -0.0."""
+    return (np.round(values, 5) + 0.0).tolist()
 
 
 Changes = Mapping[str, Any]
@@ -539,6 +539,7 @@ def _tables(value: Any) -> bool:
 
 
 def _apply(place: Any, changes: Any) -> None:
+    heading = _cut_heading(place)
     for key, value in changes.items():
         if value is None:
             place.pop(key, None)
@@ -549,6 +550,36 @@ def _apply(place: Any, changes: Any) -> None:
                 _apply(old, new)
         else:
             place[key] = _item(value)
+    items, body = library().items, _last_body(place)
+    while heading and body and isinstance(body[-1][1], items.Whitespace | items.Null):
+        body.pop()  # before a table that is gone, and its place
+    body.extend(heading)
+
+
+def _cut_heading(place: Any) -> list[Any]:
+    """Take away the blank line at a table's end and what follows it: comments there are about the
+    next table, before which new ones go."""
+    body = _last_body(place)
+    blank = end = len(body)
+    while end and body[end - 1][0] is None:
+        end -= 1
+        if isinstance(body[end][1], library().items.Whitespace):
+            blank = end
+    heading = body[blank:]
+    del body[blank:]
+    return heading
+
+
+def _last_body(place: Any) -> list[Any]:
+    """Pairs of keys, None for comments and blank lines, and items of the table that ends a table;
+    none where one is written in one line, or in several places."""
+    items = library().items
+    if isinstance(place, items.AoT):
+        return _last_body(place[-1]) if len(place) else []
+    if not isinstance(place, items.Table | library().TOMLDocument):
+        return []
+    body: list[Any] = (place.value if isinstance(place, items.Table) else place).body
+    return (body and _last_body(body[-1][1])) or body
 
 
 def _item(value: Any) -> Any:

@@ -258,6 +258,21 @@ def test_comments_stay_and_values_are_set() -> None:
     assert said["environment"] == [{"name": "post"}]
 
 
+def test_comments_stay_with_the_table_that_they_are_about() -> None:
+    """Before the heading of what stands there, whichever tables come or go before it."""
+    heading = '\n\n# What stands there.\n[[environment]]\nname = "post"\n'
+    assert TEXT.endswith(heading)
+    waypoints = {"waypoints": [{"lower": [0.0]}, {"lower": [1.0]}]}
+    first = completed(TEXT, tomllib.loads(TEXT), {"task": {"initial": [[2.0]], **waypoints}})
+    allowed = {"allowed_contacts": [{"body": "post"}]}
+    second = completed(first, tomllib.loads(first), {"task": allowed})
+    third = completed(second, tomllib.loads(second), {"task": dict.fromkeys(allowed | waypoints)})
+    assert third == completed(TEXT, tomllib.loads(TEXT), {"task": {"initial": [[2.0]]}})
+    for text in (first, second, third):
+        assert text.endswith(heading)
+    assert "[1.0]\n\n[[task.allowed_contacts]]" in second
+
+
 def test_without_text_all_of_it_is_written() -> None:
     data = tomllib.loads(TEXT)
     assert tomllib.loads(completed("", data, {"task": {"goal": [1.0]}})) == merged(
