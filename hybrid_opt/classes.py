@@ -56,7 +56,7 @@ def compared(
     header = ("passes", "start branches", "joints [rad]", "fastest [s]", "force [N]")
     cells = tuple(
         (
-            " and ".join(proposal.sides) or "straight",
+            proposal.passes,
             "{} and {}".format(*proposal.found.branches),
             number(proposal.length, 2),
             number(seconds, 2),

@@ -154,6 +154,12 @@ class Proposal:
         """How far both arms' joints go together, as the Euclidean length of their path [rad]."""
         return travelled(np.hstack(self.q))
 
+    @property
+    def passes(self) -> str:
+        """What it passes, and on which side; 'nothing' where a straight motion of the box would
+        meet nothing but what it stands on."""
+        return " and ".join(self.sides) or "nothing"
+
     def text(self, folder: Path) -> str:
         """The workcell file, for a folder: the problem file's text, completed.
 
@@ -165,7 +171,7 @@ class Proposal:
     def __str__(self) -> str:
         forces = ", ".join(f"{value:.4f}" for value in self.judgement.objectives.values())
         spins = " and ".join(f"{np.degrees(spin):.0f}" for spin in self.found.spins)
-        where = f" {' and '.join(self.sides)}," if self.sides else ""
+        where = f" {self.passes}," if self.sides else ""
         return (
             f"a carry{where} through {table.counted(len(self.found.via), 'via-point')}, joints go "
             f"{self.length:.2f} rad, certified; objectives {forces}; "
@@ -284,7 +290,7 @@ class _Search:
             for setup in setups:
                 for one in self._round(setup, effort, most):
                     found.append(one)
-                    self._say(f"carry {len(found)}: {' and '.join(one.sides) or 'straight'}")
+                    self._say(f"carry {len(found)} passes {one.passes}")
                     if len(found) == self.settings.classes:
                         return found
                 if self.too_late:

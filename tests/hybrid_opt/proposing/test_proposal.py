@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 import tomllib
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -88,6 +89,15 @@ def test_the_rack_gets_a_certified_carry(proposal: ho.Proposal, tmp_path: Path) 
 def test_comments_of_the_problem_stay(proposal: ho.Proposal, tmp_path: Path) -> None:
     assert "# Two GoFa 12 carry a box" in proposal.text(tmp_path)
     assert "certified" in str(proposal)
+
+
+def test_what_a_carry_passes_is_told(proposal: ho.Proposal) -> None:
+    """A carry that passes nothing need not be straight: the box may leave what it stands on."""
+    assert "-x of top board" in proposal.passes
+    assert f"a carry {proposal.passes}, through" in str(proposal)
+    nothing = replace(proposal, sides=())
+    assert nothing.passes == "nothing"
+    assert "a carry through" in str(nothing)
 
 
 @pytest.mark.parametrize(
