@@ -502,6 +502,7 @@ def _read_mjcf(path: Path, found: SceneBuilder) -> None:
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     moving = dict[int, int]()
+    standing = dict[int, list[str]]()
     for number in range(model.ngeom):
         geom = model.geom(number)
         body = int(geom.bodyid[0])
@@ -509,8 +510,8 @@ def _read_mjcf(path: Path, found: SceneBuilder) -> None:
         name = name.strip() or f"geom {number}"
         pose = transform(data.geom_xmat[number].reshape(3, 3), data.geom_xpos[number])
         kind, shape = geom_shape(mujoco, model, number)
+        root, before = int(model.body_rootid[body]), len(found.bodies)
         if model.body_weldid[body]:
-            root = int(model.body_rootid[body])
             moving[root] = moving.get(root, 0) + 1
         elif not geom.contype[0] and not geom.conaffinity[0]:
             found.note(name, "is no body, only to be seen: its contype and conaffinity are zero")
@@ -525,9 +526,13 @@ def _read_mjcf(path: Path, found: SceneBuilder) -> None:
             found.triangles(name, model.mesh_vert[corners], model.mesh_face[faces], pose)
         else:
             found.leave(name, f"is of the kind {kind}, which no body is")
+        standing.setdefault(root, []).extend(each.name for each in found.bodies[before:])
     for root, count in moving.items():
         name = model.body(root).name or f"body {root}"
         found.leave(name, f"moves, and has {count} shapes that therefore are no fixed body")
+        if standing[root]:
+            bodies = ", ".join(standing[root])
+            found.note(name, f"remove {bodies} if they are the base of a robot that the cell has")
 
 
 READERS: dict[str, Callable[[Path, SceneBuilder], None]] = {

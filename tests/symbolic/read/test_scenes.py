@@ -408,6 +408,9 @@ MJCF = """<mujoco>
     </body>
   </body>
   <body name="arm"><joint/><geom size="0.1"/><body><geom size="0.1"/></body></body>
+  <body name="robot" pos="5 0 0"><geom size="0.1"/>
+    <body><joint/><geom size="0.1"/></body>
+  </body>
 </worldbody></mujoco>"""
 
 
@@ -421,6 +424,7 @@ def test_fixed_shapes_of_mjcf(tmp_path: Path) -> None:
         "board rail end": [1.0, 1.4, 0.25],
         "board rail end 2": [1.0, 1.0, 0.25],
         "board post": [1.0, 1.0, 1.25],
+        "robot": [5.0, 0.0, 0.0],
     }
     assert {name: place for name, place in places(found).items() if "wedge" not in name} == near
     bodies = by_name(found)
@@ -434,9 +438,10 @@ def test_fixed_shapes_of_mjcf(tmp_path: Path) -> None:
     wedge = trimesh.load_mesh(BytesIO(content), file_type="stl")
     wedge.apply_transform(bodies["board wedge"].pose)
     np.testing.assert_allclose(wedge.bounds, np.array([[0, 1, 0.25], [1, 2, 1.25]]), atol=1e-6)
-    assert [told.partition(":")[0] for told in found.left_out] == ["hills", "arm"]
+    assert [told.partition(":")[0] for told in found.left_out] == ["hills", "arm", "robot"]
     assert "2 shapes" in found.left_out[1]
-    assert [told.partition(":")[0] for told in found.notes] == ["floor", "ghost"]
+    assert [told.partition(":")[0] for told in found.notes] == ["floor", "ghost", "robot"]
+    assert "remove robot if" in found.notes[2]
 
 
 def test_a_scene_that_is_only_to_be_seen_says_so(tmp_path: Path) -> None:
