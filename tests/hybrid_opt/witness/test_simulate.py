@@ -35,7 +35,15 @@ from symbolic.read.cell import load
 from symbolic.records import Uncertainty, Workcell
 from symbolic.records.task import initial_decision
 from tests.hybrid_opt.witness.carries import carry_along, least_forces
-from tests.symbolic.cells import ROOT, call, hand_cell, rack_cell, with_contacts, with_payload
+from tests.symbolic.cells import (
+    ROOT,
+    call,
+    hand_cell,
+    rack_cell,
+    with_contacts,
+    with_payload,
+    with_task,
+)
 
 STILL = np.zeros(6)
 DRIVEN = SimulationSettings(pads="driven")
@@ -153,10 +161,7 @@ def test_statics_of_pads_that_press_evenly(
 
 def test_pads_on_adjacent_faces_hold_at_rest_from_the_least_force_on() -> None:
     """Where little more than the least force would stop a box that falls until they press."""
-    cell = load(ROOT / "studies" / "workcells" / "corner.toml")
-    cell = replace(cell, task=replace(cell.task, allocation="soft-finger"))
-    carry = carry_along(cell, STILL, 0.3)
-    carry = replace(carry, normal_force=soft_model(cell).nominal(carry))
+    carry, _ = at_rest(with_task(shipped("corner"), allocation="soft-finger"))
     assert threshold(carry) == pytest.approx(1.0, abs=0.02)
 
 
@@ -299,6 +304,22 @@ def test_the_planned_forces_are_the_least_of_pads_that_the_planned_moments_drive
     witness, drive = Witness(cell, settings), drive_of(carry, settings, moments=moments)
     assert not witness.simulate(drive, 0.98).holds
     assert witness.simulate(drive, 1.02).holds
+
+
+def test_a_box_that_many_points_hold_stays() -> None:
+    """Steps that are not solved to their last digits would let it drift by 0.05 mm."""
+    carry, _ = at_rest(with_task(shipped("fork"), allocation="soft-finger"))
+    witness = Witness(carry.workcell, SimulationSettings(points=91))
+    outcome = witness.simulate(drive_of(carry, witness.settings), 1.2)
+    assert outcome.slip.max() < 1e-5
+
+
+@pytest.mark.parametrize("off", [0.0, 0.025])
+def test_a_fork_is_held_from_the_least_force_on_at_which_its_pads_press_alike(off: float) -> None:
+    """A load beside its middle, too, until the box has turned and the pads press differently."""
+    cell = with_task(shipped("fork"), allocation="soft-finger")
+    carry, _ = at_rest(with_payload(cell, centre_of_mass=np.array([off, 0.0, 0.0])))
+    assert threshold(carry, SimulationSettings(slip=1e-4)) == pytest.approx(0.985, abs=0.025)
 
 
 def test_pads_that_press_evenly_need_more_where_a_load_twists() -> None:
