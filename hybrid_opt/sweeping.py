@@ -102,6 +102,17 @@ def stored_sweep(file: Path) -> Sweep:
     return read_record(Sweep, file, _OTHER_FILE)
 
 
+def require_keys(cell: Cell, over: Mapping[str, Sequence[float]]) -> None:
+    """Refuse a sweep over what a cell does not have, before any work.
+
+    Raises:
+        SettingsError, WorkcellError: as of `sweep`.
+    """
+    if not over or not all(map(len, over.values())):
+        raise SettingsError("a sweep needs keys, and values of each")
+    cell.changed({key: each[0] for key, each in over.items()})
+
+
 def sweep(
     cell: Cell,
     path: Carry | Array,
@@ -135,9 +146,7 @@ def sweep(
             f"{cell.workcell.task.time_law!r}, the path has shape {x.shape} of ({cell.n_var},)"
         )
     values = {key: tuple(map(float, each)) for key, each in over.items()}
-    if not values or not all(values.values()):
-        raise SettingsError("a sweep needs keys, and values of each")
-    cell.changed({key: each[0] for key, each in values.items()})  # keys that lead nowhere
+    require_keys(cell, values)
     about = digest(cell.workcell.digest, *cell.objective_names, str(fixed))
     known, file = Sweep(about, values, x), None if file is None else Path(file)
     if file is not None and file.exists():

@@ -15,19 +15,23 @@ from hybrid_opt.door import polish, search
 from hybrid_opt.recommending.recommendation import recommend
 from hybrid_opt.store.files import to_json
 from hybrid_opt.store.trajectory_file import read_trajectory
-from hybrid_opt.sweeping import Sweep, stored_sweep, sweep
+from hybrid_opt.sweeping import Sweep, require_keys, stored_sweep, sweep
 from hybrid_opt.work.service import warm_up
 from studies.program import load_workcell
 from studies.report.drawing import FULL_WIDTH, in_style, legend_below, new_figure, save, series
 from symbolic.array import Array
-from symbolic.errors import SettingsError
+from symbolic.errors import SettingsError, WorkcellError
 
 
 def sweep_numbers(options: argparse.Namespace) -> int:
     """Sweep, and print and write what was found."""
     if options.jobs != 1:
         warm_up("hybrid_opt.sweeping")  # while this process finds the first path
-    cell = Cell(load_workcell(options.workcell)).drivable()
+    cell, over = Cell(load_workcell(options.workcell)).drivable(), dict(options.over)
+    try:
+        require_keys(cell, over)
+    except WorkcellError as error:  # of the drivable cell, whose file is a temporary one
+        raise WorkcellError(str(options.workcell), error.problems) from error
     file = Path(options.output) / "sweep.json"
     file.parent.mkdir(parents=True, exist_ok=True)
     shown = not options.quiet
@@ -40,7 +44,6 @@ def sweep_numbers(options: argparse.Namespace) -> int:
         found = search(cell, evaluations=options.evaluations, rng=rng, progress=shown)
         best = recommend(polish(found, rng=rng, progress=shown))
         x = np.append(best.x[:-1], best.limit)
-    over = dict(options.over)
     fixed = options.path is not None
     done = sweep(cell, x, over, fixed=fixed, file=file, jobs=options.jobs, progress=shown)
     table = _table(done)

@@ -9,8 +9,10 @@ import pytest
 
 from hybrid_opt.store.files import to_json, write_json
 from hybrid_opt.sweeping import Combination, Sweep, stored_sweep
+from studies.programs import sweeping
 from studies.programs.sweeping import _figure, _table
 from studies.sweep import main
+from symbolic.errors import WorkcellError
 
 
 @pytest.mark.parametrize(
@@ -32,6 +34,18 @@ def test_wrong_values_are_refused(text: str, capsys: pytest.CaptureFixture[str])
     with pytest.raises(SystemExit):
         main.parser().parse_args(["cell.toml", "--over", text])
     assert "allowed is" in capsys.readouterr().err
+
+
+def test_a_key_that_leads_nowhere_is_told_before_the_search(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def work(*given: object, **settings: object) -> None:
+        pytest.fail("searched before the key was looked at")
+
+    monkeypatch.setattr(sweeping, "search", work)
+    begin = ["studies/workcells/rack.toml", "--output", str(tmp_path), "--jobs", "1", "--over"]
+    with pytest.raises(WorkcellError, match=r"^studies/workcells/rack\.toml: [^/]*payload\.weight"):
+        sweeping.sweep_numbers(main.parser().parse_args([*begin, "payload.weight=3"]))
 
 
 def test_a_sweep_is_stored_listed_and_drawn(tmp_path: Path) -> None:
