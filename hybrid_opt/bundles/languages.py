@@ -87,19 +87,28 @@ LEFT_OUT = "\0"
 """Marks lines of the template that only the pressing arm has, in the other's module."""
 
 
+BEFORE_THE_STUDY = "before the study: a stored trajectory keeps the cell that it was found in"
+"""Where a driver's key may be stated."""
+
+
 def require_force_control(job: Job, target: str) -> None:
     """Refuse a job whose pressing arm has no force control.
 
     Raises:
         SettingsError: with the reason.
     """
-    robot = job.workcell.robots[1 - job.squeeze.leader]
+    leader, robots = job.squeeze.leader, job.workcell.robots
+    robot, other = robots[1 - leader], robots[leader]
     if not robot.driver.force_control:
+        remedy = (
+            f"let {other.name!r} press, which has it (--leader {2 - leader})"
+            if other.driver.force_control
+            else "where it has the option and its sensor, write [robots.driver] with "
+            f"force_control = true into its section of the workcell {BEFORE_THE_STUDY}"
+        )
         raise SettingsError(
             f"{target} would not squeeze: positions alone do not press, and {robot.name!r} is not "
-            "said to have ABB's Force Control; where it has the option and its sensor, write "
-            "[robots.driver] with force_control = true into the workcell, or choose the arm that "
-            "keeps its place (--leader)"
+            f"said to have ABB's Force Control; {remedy}"
         )
 
 
@@ -316,7 +325,8 @@ def require_egm(job: Job) -> None:
         if not robot.driver.lag > 0.0:
             raise SettingsError(
                 f"abb-egm compensates the lag of {robot.name!r}, 0.01 to 0.08 s by what others "
-                "measured: write it into the workcell, [robots.driver] with lag = ... in seconds"
+                "measured: write [robots.driver] with lag = ... in seconds into its section of "
+                f"the workcell {BEFORE_THE_STUDY}"
             )
 
 

@@ -235,6 +235,18 @@ def test_a_target_says_what_it_lacks(target: str, tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
+def test_the_other_arm_is_named_where_it_can_press(tmp_path: Path) -> None:
+    job = driven(rack_job(), replace(DRIVER, force_control=False))
+    leader, robots = job.squeeze.leader, list(job.workcell.robots)
+    with pytest.raises(SettingsError, match="before the study"):
+        export(job, "abb-rapid", tmp_path)
+    robots[leader] = replace(robots[leader], driver=DRIVER)
+    job = replace(job, workcell=replace(job.workcell, robots=(robots[0], robots[1])))
+    told = f"let '{robots[leader].name}' press, which has it \\(--leader {2 - leader}\\)"
+    with pytest.raises(SettingsError, match=told):
+        export(job, "abb-rapid", tmp_path)
+
+
 def test_joints_have_names_of_their_own(tmp_path: Path) -> None:
     """As drivers name them: by the robot, or by a prefix that is stated."""
     job = driven(rack_job(), replace(DRIVER, prefix="same_"))
