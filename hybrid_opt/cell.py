@@ -8,6 +8,7 @@ from __future__ import annotations
 import html
 from collections.abc import Mapping, Sequence
 from functools import cached_property
+from multiprocessing import parent_process
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
@@ -53,41 +54,41 @@ class Cell:
     Attributes:
         workcell: the description.
         compiled: its compiled functions, made from one symbolic model.
-        threads: candidates that are evaluated at the same time.
     """
 
     def __init__(
         self,
         workcell: Workcell,
         objectives: Sequence[str | Objective] = PAPER_OBJECTIVES,
-        threads: int = 1,
+        threads: int | None = None,
     ) -> None:
         """Describe a cell; nothing is compiled yet.
 
         Args:
             objectives: what searches minimise: names of `OBJECTIVES`, or records of one's own.
-            threads: for the evaluation of candidates; has no influence on results.
+            threads: for the evaluation of candidates, 0 for one per core; has no influence on
+                results. By default one per core, in a worker process, which shares them, one.
 
         Raises:
             SettingsError: an objective is unknown, or given twice.
         """
         self.workcell = workcell
         self.compiled = CompiledCell(workcell)
-        self.threads = threads
+        self._threads = threads
         select_objectives(objectives)
         self._objectives = tuple(objectives)
         self._folder: TemporaryDirectory[str] | None = None  # of its files
 
     def __reduce__(self) -> tuple[type[Cell], tuple[Any, ...]]:
         """Its description: another process loads its functions anew."""
-        return Cell, (self.workcell, self._objectives, self.threads)
+        return Cell, (self.workcell, self._objectives, self._threads)
 
     @classmethod
     def load(
         cls,
         path: str | Path,
         objectives: Sequence[str | Objective] = PAPER_OBJECTIVES,
-        threads: int = 1,
+        threads: int | None = None,
     ) -> Cell:
         """The cell of a workcell file.
 
@@ -106,7 +107,7 @@ class Cell:
         """
         known = self.workcell
         decided = load(known.source, decided=branches, text=known.text)
-        return Cell(decided, self._objectives, self.threads)
+        return Cell(decided, self._objectives, self._threads)
 
     def changed(self, changes: Mapping[str, Any]) -> Cell:
         """The cell with other numbers, in memory: what is compiled stays the same.
@@ -121,7 +122,7 @@ class Cell:
             WorkcellError: a path leads nowhere, or the changed cell is wrong; the message lists
                 every problem.
         """
-        cell = Cell(changed(self.workcell, changes), self._objectives, self.threads)
+        cell = Cell(changed(self.workcell, changes), self._objectives, self._threads)
         cell.compiled = self.compiled.of_changed(cell.workcell)
         cell._folder = self._folder
         return cell
@@ -139,9 +140,16 @@ class Cell:
         """
         folder = TemporaryDirectory()
         workcell = unpack_cell(drivable_files(collect_cell(self.workcell)), Path(folder.name))
-        cell = Cell(workcell, self.force_kind.drivable, self.threads)
+        cell = Cell(workcell, self.force_kind.drivable, self._threads)
         cell._folder = folder
         return cell
+
+    @property
+    def threads(self) -> int:
+        """Threads that evaluate candidates, 0 for one per core."""
+        if self._threads is not None:
+            return self._threads
+        return 0 if parent_process() is None else 1
 
     @cached_property
     def evaluator(self) -> CandidateEvaluator:

@@ -109,6 +109,9 @@ class CompiledCell:
         def bounds(poses: Array, q_1: Array, q_2: Array) -> Array:
             return geometry.of_active([f.batch(poses, q_1, q_2)["clearance"] for f in asked])
 
+        def poses(waypoints: Array) -> Array:
+            return found["poses"](waypoints)["poses"]
+
         def search(arm: int) -> ArmSearch:
             approach, follow = (found[f"{name}_{arm + 1}"] for name in ("approach", "follow"))
 
@@ -116,7 +119,8 @@ class CompiledCell:
                 return follow.batch(starts, extended, np.zeros((len(extended), 6)))
 
             postures = self.once(("postures", arm, self.numbers.digest), dict[bytes, Array])
-            return ArmSearch(approach.batch, along, own_clearance(geometry, arm, bounds), postures)
+            clearance = own_clearance(geometry, arm, bounds)
+            return ArmSearch(approach.batch, along, poses, clearance, postures)
 
         return search(0), search(1)
 

@@ -382,9 +382,13 @@ def cell_functions(model: CellModel) -> dict[str, ca.Function]:
 
 
 def branch_functions(model: CellModel) -> dict[str, ca.Function]:
-    """What start branches are found with, of each arm i = 1, 2: approach_i
-    (`symbolic.robot.branches`) and follow_i (`symbolic.robot.arm.follow_function`)."""
-    found: dict[str, ca.Function] = {}
+    """What start branches are found with: poses, all samples (6 + m, n) of a path through waypoints
+    (6 + m, w); of each arm i = 1, 2 approach_i (`symbolic.robot.branches`) and follow_i
+    (`symbolic.robot.arm.follow_function`)."""
+    task = model.workcell.task
+    waypoints = ca.SX.sym("waypoints", task.extended_size, len(task.waypoints))
+    poses = waypoints @ ca.DM(sample_basis(task).position.T)
+    found = {"poses": ca.Function("poses", [waypoints], [poses], ["waypoints"], ["poses"])}
     for i, (robot, contact) in enumerate(
         zip(model.workcell.robots, model.workcell.contacts, strict=True)
     ):

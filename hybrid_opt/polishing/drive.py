@@ -45,6 +45,7 @@ from hybrid_opt.polishing.solvers.quadratic import (
 )
 from hybrid_opt.robust.path_force import PathPoints, robust_path
 from hybrid_opt.timing.drive import CandidateDriver
+from hybrid_opt.timing.path_timer import PathTiming
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.path.pieces import by_levels, stated_entries
@@ -130,30 +131,27 @@ class PathJudge:
     """
 
     def __init__(self, driver: CandidateDriver) -> None:
-        self._timer, self._limits, self.force_limit = (
-            driver.timer,
-            driver.limits,
-            force_range(driver),
-        )
+        self._driver, self.force_limit = driver, force_range(driver)
 
-    def timed(self, path: Array, force: float) -> TimedPath:
-        """The fastest timing of free waypoints (n_path,) within a force limit [N]."""
-        known = self._timer.path_limits(path[None])
-        (found,) = self._timer.time_known(path[None], known, [self._limits(force)])
+    def timed(self, x: Array) -> TimedPath:
+        """The fastest timing of a decision vector (n_var,)."""
+        found, known = self._driver.timed(x)
         duration = found.duration if found.ok else float("inf")
         joints = [np.ascontiguousarray(known[f"q_{arm}"][0][::2]) for arm in (1, 2)]
         return TimedPath(duration, found.grid_speed**2, (joints[0], joints[1]))
 
     def durations(self, paths: Array, force: float) -> Array:
         """(n,) [s] of paths (n, n_path) within a force, infinite where there is none."""
-        limits = [self._limits(force)] * len(paths)
-        found = self._timer.time_all(np.ascontiguousarray(paths), limits)
+        found = self._timings(paths, force)
         return np.array([t.duration if t.ok else np.inf for t in found])
 
     def at_rest(self, paths: Array) -> Array:
         """(n,) [N] what standing still needs of paths (n, n_path), NaN where arms cannot follow."""
-        found = self._timer.time_all(np.ascontiguousarray(paths), [self._limits(0.0)] * len(paths))
-        return np.array([timing.limited_force for timing in found])
+        return np.array([timing.limited_force for timing in self._timings(paths, 0.0)])
+
+    def _timings(self, paths: Array, force: float) -> list[PathTiming]:
+        limits = [self._driver.limits(force)] * len(paths)
+        return self._driver.timer.time_all(np.ascontiguousarray(paths), limits)
 
 
 def force_range(driver: CandidateDriver) -> tuple[float, float]:
@@ -252,7 +250,7 @@ class DriveWay(Way[DrivePoint, DriveStep]):
 
     def start(self, x: Array) -> DrivePoint:
         """See `Way`."""
-        timed = self.paths.timed(x[: self._n], float(x[-1]))
+        timed = self.paths.timed(x)
         return self._reached(x, timed, timed.squared, np.inf)
 
     def _reached(self, x: Array, timed: TimedPath, squared: Array, lowest: float) -> DrivePoint:
@@ -270,7 +268,7 @@ class DriveWay(Way[DrivePoint, DriveStep]):
         tiny = step.gain <= NOISE
         for part in PARTS:
             x = self._moved(best.x, part * step.d)
-            timed = self.paths.timed(x[: self._n], float(x[-1]))
+            timed = self.paths.timed(x)
             gain = 1.0 - timed.duration / best.level
             kept = timed.duration <= best.lowest * (1.0 + NOISE)
             if gain >= CLOSER * part * step.gain or (tiny and kept):
@@ -296,7 +294,7 @@ class DriveWay(Way[DrivePoint, DriveStep]):
     ) -> DrivePoint | None:
         """See `Way`."""
         x = self._moved(begin.x, share * step.d)
-        timed = self.paths.timed(x[: self._n], float(x[-1]))
+        timed = self.paths.timed(x)
         if timed.duration >= best.level * (1.0 - NOISE):
             return None
         return self._reached(x, timed, timed.squared, best.lowest)

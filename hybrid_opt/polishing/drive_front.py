@@ -39,6 +39,9 @@ GENTLE, FAST = 0.02, 0.6
 """The least force limit of the sweep, and the one that it reaches at least, as shares above the box
 at rest."""
 
+LEAST_GAIN = 1e-3
+"""Share of the duration that two rounds in a row bring, or the next force limit follows."""
+
 BETWEEN = (0.125, 0.25, 0.375, 0.5, 0.625, 0.75, 0.875)
 """Shares of the way from one path of the front to the next that are tried as paths, too."""
 
@@ -281,7 +284,7 @@ class DriveRun(PolishRun[DriveAttempt]):
             return Solution(attempt.x, usable=True)
         settings = self._settings.drivable
         if attempt.moves == "all":
-            return self._way.climb(attempt.x).go_on(settings.rounds)
+            return self._way.climb(attempt.x).go_on(settings.rounds, LEAST_GAIN)
         return self._way.stated.climb(attempt.x).go_on(settings.first_rounds)
 
     def _verdict(self, attempt: DriveAttempt, answer: Solution | Loss) -> tuple[Status, str, Array]:

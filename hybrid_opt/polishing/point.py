@@ -271,14 +271,21 @@ class Climb(Generic[AnyPoint, AnyStep]):
         """Whether more rounds bring nothing."""
         return self.solution.converged or self._region.is_spent or not self.solution.usable
 
-    def go_on(self, rounds: int) -> Solution:
-        """Some more rounds, fewer where it ends."""
-        solution = self.solution
+    def go_on(self, rounds: int, least_gain: float = 0.0) -> Solution:
+        """Some more rounds, fewer where it ends.
+
+        Args:
+            least_gain: share of the level that two rounds in a row have to bring, or it is left.
+        """
+        solution, levels = self.solution, [self.best.level]
         for _ in range(rounds):
             if self.ended:
                 break
             solution.rounds += 1
             self._round()
+            levels.append(self.best.level)
+            if len(levels) > 3 and levels[-3] - levels[-1] < least_gain * levels[-1]:
+                break
         solution.x = self.best.x
         if self._last is not None:
             solution.residuals = self._last.residuals(self.best)

@@ -76,7 +76,7 @@ class DrivableSettings:
             between both neighbours' wins one.
     """
 
-    first_rounds: Number = 24
+    first_rounds: Number = 16
     rounds: Number = 6
     members: NumberOrNone = 36
 

@@ -36,6 +36,7 @@ class CandidateDriver:
         self._task = timer.workcell.task
         self._threads = threads
         self.timer, self.robust = timer, robust
+        self._last: tuple[bytes, PathTiming, dict[str, Array]] | None = None
 
     def limits(self, force: float) -> TimingLimits:
         """Limits of a candidate whose force limit this is [N]."""
@@ -85,8 +86,21 @@ class CandidateDriver:
 
     def timings(self, x: Array) -> list[PathTiming]:
         """The timing of every decision vector (n, n_var)."""
+        if len(x) == 1:
+            return [self.timed(x[0])[0]]
         limits = [self.limits(float(force)) for force in x[:, -1]]
         return self.timer.time_all(x[:, : self._task.n_path], limits)
+
+    def timed(self, x: Array) -> tuple[PathTiming, dict[str, Array]]:
+        """The timing of one decision vector (n_var,), and `path_limits` of its path. The last ones
+        are kept: a polish asks for those of a carry several times in a row."""
+        key = x.tobytes()
+        if self._last is None or self._last[0] != key:
+            path = np.ascontiguousarray(x[None, : self._task.n_path], dtype=float)
+            known = self.timer.path_limits(path)
+            (timing,) = self.timer.time_known(path, known, [self.limits(float(x[-1]))])
+            self._last = key, timing, known
+        return self._last[1:]
 
 
 def _at(timing: PathTiming, u: Array) -> tuple[Array, Array, Array]:

@@ -220,11 +220,10 @@ class _Problem:
         level = at.keep * (1.5 / root) * root
         head = (at.keep * (0.5 * v**-1.5) * root)[:, None] * at.local(at.value)
         limited = np.isfinite(jerk.joints)
-        joint_jerk_by = at.local(at.joint_jerk_by)[:, limited]
-        by = joint_jerk_by / jerk.joints[limited, None] * root[:, None, None]
+        by = at.joint_jerk_by[:, limited] / jerk.joints[limited, None] * root[:, None, None]
         rows.both_below(by, head[:, None], level, at.first_basis)
         if np.isfinite(jerk.payload):
-            box = at.local(at.box_jerk_by) / jerk.payload * root[:, None, None]
+            box = at.box_jerk_by / jerk.payload * root[:, None, None]
             rows.within(box, np.zeros((len(v), 3)), head, level, at.first_basis)
 
     def _excess(self, c: Array) -> Array:
@@ -265,7 +264,13 @@ class _Problem:
 
     def _factor(self, c: Array) -> float:
         """Largest factor on the speeds with which the timing keeps all limits on the finer grid."""
-        return largest_speed_factor(lambda f: self._most_used(self._fine, f**2 * c))
+        jerk = max(float(jerk.max()) for jerk in self._jerks(self._fine, c))
+
+        def use(f: float) -> float:
+            carry = self._carry(self._fine, f**2 * c)
+            return max(worst(judged(self._model, carry, self._limits).use).ratio, f**3 * jerk)
+
+        return largest_speed_factor(use)
 
     def _judged(self, c: Array) -> JerkTiming:
         """The timing on the finer grid, slowed down where it exceeds a limit."""
@@ -289,7 +294,9 @@ class Point:
         value: (n, k) basis of v.
         squared_by, acceleration_by: (n, k) from coefficients to u'^2 and u''.
         motion: geometry by u.
-        joint_jerk_by, box_jerk_by: (n, joints, k), (n, 3, k) jerk over sqrt(v).
+        columns: (n, SUPPORT) the coefficients that matter at each place.
+        joint_jerk_by, box_jerk_by: (n, joints, SUPPORT), (n, 3, SUPPORT) jerk over sqrt(v), by
+            these coefficients.
         keep: (n,) share of every limit that a program may use.
     """
 
@@ -298,6 +305,7 @@ class Point:
     squared_by: Array
     acceleration_by: Array
     motion: PathMotion
+    columns: NDArray[np.intp]
     joint_jerk_by: Array
     box_jerk_by: Array
     keep: Array
@@ -317,13 +325,16 @@ class Point:
         one, two, three = (part[:, None] for part in warp)
         u = np.clip(s**3 * (10.0 - 15.0 * s + 6.0 * s**2), 0.0, 1.0)
         third, motion = motion.third(u), motion.between(u)
+        begins = np.minimum(np.argmax(value != 0.0, axis=1), value.shape[1] - SUPPORT)
+        columns = begins[:, None] + np.arange(SUPPORT)
+        local = [np.take_along_axis(b, columns, axis=1)[:, None] for b in (value, first, second)]
 
         def jerk(by_u: Array, by_uu: Array, by_uuu: Array) -> Array:
             on_value = by_uuu * one**3 + 3.0 * by_uu * one * two + by_u * three
             on_first = 1.5 * (by_uu * one**2 + by_u * two)
             on_second = 0.5 * by_u * one
-            parts = ((on_value, value), (on_first, first), (on_second, second))
-            return np.asarray(sum(a[:, :, None] * b[:, None, :] for a, b in parts))
+            parts = zip((on_value, on_first, on_second), local, strict=True)
+            return np.asarray(sum(a[:, :, None] * b for a, b in parts))
 
         box = (motion.pose_first[:, :3], motion.pose_second[:, :3])
         return cls(
@@ -332,22 +343,21 @@ class Point:
             one**2 * value,
             two * value + one * first / 2.0,
             motion,
+            columns,
             jerk(motion.q_first, motion.q_second, third[0]),
             jerk(*box, third[1]),
             np.full(len(s), 1.0 - KEPT),
         )
 
-    @cached_property
+    @property
     def first_basis(self) -> NDArray[np.intp]:
-        """(n,) index of the first of the basis functions that are not zero at each place."""
-        first = np.argmax(self.value != 0.0, axis=1)
-        return np.asarray(np.minimum(first, self.value.shape[1] - SUPPORT))
+        """(n,) the first of the coefficients that matter at each place."""
+        return self.columns[:, 0]
 
     def local(self, values: Array) -> Array:
-        """(n, ..., SUPPORT) those of values (n, ..., k) that belong to these functions."""
-        columns = self.first_basis[:, None] + np.arange(SUPPORT)
-        shape = (len(columns), *[1] * (values.ndim - 2), SUPPORT)
-        return np.take_along_axis(values, columns.reshape(shape), axis=-1)
+        """(n, ..., SUPPORT) those of values (n, ..., k) that belong to these coefficients."""
+        shape = (len(self.columns), *[1] * (values.ndim - 2), SUPPORT)
+        return np.take_along_axis(values, self.columns.reshape(shape), axis=-1)
 
     def duration(self, c: Array) -> float:
         """[s] by Simpson's rule: the places are uniform, an odd number of them."""
@@ -378,7 +388,8 @@ class Point:
     def jerk(self, c: Array) -> tuple[Array, Array]:
         """(n, joints) and (n, 3) of the joints and the box's frame [rad/s^3, m/s^3]."""
         root = np.sqrt(np.maximum(self.value @ c, 0.0))[:, None]
-        return root * (self.joint_jerk_by @ c), root * (self.box_jerk_by @ c)
+        own = c[self.columns][:, None]
+        return root * (self.joint_jerk_by * own).sum(-1), root * (self.box_jerk_by * own).sum(-1)
 
     def objective(self, c: Array) -> tuple[Array, Array]:
         """Gradient and Hessian of the duration."""

@@ -35,8 +35,8 @@ NEAR = 0.6
 EXACT = 0.98
 """Share of a limit of robust forces above which they are computed exactly."""
 
-SLOWINGS = 14
-"""Bisections of a factor on the speeds."""
+FACTOR_TOLERANCE = 1e-4
+"""Share of a limit that a factor on the speeds may leave unused."""
 
 SPREAD = 20
 """Stride of the samples whose robust force is computed in the search for the largest."""
@@ -350,12 +350,22 @@ def joint_use(carry: Carry, workcell: Workcell) -> dict[str, Array]:
 def largest_speed_factor(use: Callable[[float], float]) -> float:
     """The largest factor on the speeds, at most one, with which no limit is exceeded, by the
     largest use of any at a factor; one where none is by more than `RECOMPUTED_TOLERANCE`."""
-    if use(1.0) <= 1.0 + RECOMPUTED_TOLERANCE:
+    fast = use(1.0)
+    if fast <= 1.0 + RECOMPUTED_TOLERANCE:
         return 1.0
-    low, high = 0.0, 1.0
-    for _ in range(SLOWINGS):
-        factor = (low + high) / 2.0
-        low, high = (low, factor) if use(factor) > 1.0 else (factor, high)
+    # What limits are about grows about as the square of the speeds does.
+    low, high, slow, turn = 0.0, 1.0, 0.0, 0
+    while slow < 1.0 - FACTOR_TOLERANCE and high - low > FACTOR_TOLERANCE / 2.0:
+        turn += 1
+        share = (1.0 - FACTOR_TOLERANCE / 2.0 - slow) / (fast - slow)
+        factor = np.sqrt(low**2 + share * (high**2 - low**2))
+        # Every third is halfway, in case the guesses come nearer from one side only.
+        factor = float((low + high) / 2.0 if turn % 3 == 0 else factor)
+        found = use(factor)
+        if found > 1.0:
+            high, fast = factor, found
+        else:
+            low, slow = factor, found
     return low
 
 

@@ -167,10 +167,12 @@ class PathTimer:
     def path_limits(self, x: Array) -> dict[str, Array]:
         """Outputs of `symbolic.limits.path_function` and `limits` for waypoints
         (n, n_var), at both ends and in the middle of every interval."""
-        paths = self._path.batch(np.ascontiguousarray(x, dtype=float), threads=self._threads)
+        # One path is not worth a second thread.
+        threads = self._threads if len(x) > 1 else 1
+        paths = self._path.batch(np.ascontiguousarray(x, dtype=float), threads=threads)
         shapes = zip(self._limits.input_names, self._limits.input_shapes, strict=True)
         samples = [paths[name].reshape(-1, *shape) for name, shape in shapes]
-        rows = self._limits.batch(*samples, threads=self._threads)["limits"]
+        rows = self._limits.batch(*samples, threads=threads)["limits"]
         return paths | {"limits": rows.reshape(len(x), 2 * self.intervals + 1, rows.shape[-1])}
 
     def time(self, x: Array, limits: TimingLimits) -> PathTiming:

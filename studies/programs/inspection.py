@@ -21,9 +21,9 @@ from studies.program import Finding, load_workcell, print_findings
 from symbolic.array import Array
 from symbolic.cell_model import CellModel, own_pairs
 from symbolic.errors import SettingsError
-from symbolic.records import POSE_SIZE, Workcell
+from symbolic.records import Workcell
 from symbolic.records.task import straight_line
-from symbolic.robot.branches import StartBranch, initial_poses
+from symbolic.robot.branches import StartBranch
 
 EXPLAINED = 200
 """Most infeasible candidates that are looked at closer."""
@@ -277,7 +277,7 @@ def _clearance_mm(cell: Cell, arm: int, branch: StartBranch) -> float | None:
     own = own_pairs(cell.geometry, arm)
     if not own:
         return None
-    pose = np.ascontiguousarray(initial_poses(cell.workcell)[:kept, :POSE_SIZE])
+    pose = np.ascontiguousarray(cell.carry(cell.initial).pose[:kept])
     path = np.ascontiguousarray(branch.path[:kept])
     absent = np.zeros((kept, cell.geometry.arms[1 - arm].joints))
     joints = (path, absent) if arm == 0 else (absent, path)

@@ -192,8 +192,9 @@ def _sorted_pairs(
     moving = [frozenset(_arms_of(body)) for body in bodies]
     for i, j in combinations(range(len(bodies)), 2):
         a, b = bodies[i], bodies[j]
-        found = _PairStatus(ignored.get(frozenset((a.name, b.name)), ""), False)
-        if not found.reason:
+        said = ignored.get(frozenset((a.name, b.name)), "") if ignored else ""
+        found = _PairStatus(said, False)
+        if not said:
             at, of, contents, places = views[_is_own(a, b)]
             tolerance, both = pair_tolerance(workcell, a, b), moving[i] | moving[j]
             known = contents[i], contents[j], *(places[k] for k in both), tolerance, order

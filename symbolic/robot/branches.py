@@ -88,6 +88,9 @@ Follow = Callable[[Array, Array], Mapping[str, Array]]
 """Joints (m, joints) at the first of some extended poses (n, 6 + k) to `TRACK_OUTPUTS` (m, n, ...)
 of an arm without load."""
 
+Poses = Callable[[Array], Array]
+"""Extended waypoints (w, 6 + k) to all samples (n, 6 + k) of the path through them."""
+
 Clearance = Callable[[Array, Array], float]
 """Box poses (n, 6) and joints (n, joints) to an arm's least clearance bound [m]."""
 
@@ -97,12 +100,13 @@ class ArmSearch:
     """What start branches of an arm are found with.
 
     Attributes:
-        approach, follow, clearance: see there.
+        approach, follow, poses, clearance: see there.
         found: postures (m, n) by what they were searched for, which others look up.
     """
 
     approach: Approach
     follow: Follow
+    poses: Poses
     clearance: Clearance | None = None
     found: dict[bytes, Array] = field(default_factory=dict)
 
@@ -124,7 +128,10 @@ def interpreted_search(
             for name, values in zip(TRACK_OUTPUTS, outputs, strict=True)
         }
 
-    return ArmSearch(interpreted_approach(model), follow, clearance)
+    def poses(waypoints: Array) -> Array:
+        return sample_basis(workcell.task).position @ waypoints
+
+    return ArmSearch(interpreted_approach(model), follow, poses, clearance)
 
 
 def interpreted_approach(model: RobotModel) -> Approach:
@@ -257,7 +264,8 @@ def start_branches(
     """
     robot, contact = workcell.robots[arm], workcell.contacts[arm]
     search = search or interpreted_search(workcell, arm, model)
-    extended = initial_poses(workcell)
+    task = workcell.task
+    extended = search.poses(extended_waypoints(task, initial_decision(task)))
     poses = np.ascontiguousarray(extended[:, :POSE_SIZE])
     target = start_flange(workcell, robot, contact)
     start = {joint: float(extended[0, place]) for joint, place in model.redundant}
@@ -302,9 +310,3 @@ def start_flange(workcell: Workcell, robot: Robot, contact: Contact) -> Array:
     start = workcell.task.waypoints[0].lower
     T_world_box = box_placement(workcell.task.orientation, start)
     return inverse(robot.T_world_base) @ T_world_box @ box_flange(robot, contact)
-
-
-def initial_poses(workcell: Workcell) -> Array:
-    """Sampled extended poses (n, 6 + m) of the hand-made initial trajectory."""
-    task = workcell.task
-    return sample_basis(task).position @ extended_waypoints(task, initial_decision(task))

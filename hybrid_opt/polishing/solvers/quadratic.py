@@ -37,7 +37,7 @@ TOLERANCE = 1e-8
 """Tolerance of the conditions, of their residuals over their terms, and of the objective."""
 
 CHECKED = 1e-6
-"""Tolerance with which an answer is accepted when it is checked."""
+"""Tolerance with which an answer is accepted; of the objective, over its own terms."""
 
 LEAST_CURVATURE = 1e-6
 """Curvature by the path that is left where the Lagrangian has less."""
@@ -210,10 +210,12 @@ class QuadraticAnswer:
         to_low, to_high = self.d - program.low, program.high - self.d
         to_bound = np.where(self.bounds > 0.0, to_high, to_low)
         size = 1.0 + max(float(np.abs(bend).max()), float(np.abs(pull).max()))
+        worth = 1.0 + abs(float(bend @ self.d)) / 2.0 + abs(float(program.g @ self.d))
         violated = max(-min(to_low.min(), to_high.min()), -room.min(initial=0.0))
         products = np.abs(self.rows) @ np.abs(room) + np.abs(self.bounds) @ np.abs(to_bound)
         negative = -self.rows.min(initial=0.0)
-        return bool(max(np.abs(slope).max() / size, violated, products, negative) <= CHECKED)
+        worst = max(np.abs(slope).max() / size, violated, products / worth, negative)
+        return bool(worst <= CHECKED)
 
 
 SolveQuadratic = Callable[[QuadraticProgram], QuadraticAnswer | None]

@@ -54,7 +54,7 @@ class Programs:
         half, self.x = self.cell.half[:-1], x
         own: Array = np.eye(len(half)) if together is None else together
         self.spread: Array = half[:, None] * own
-        self.timed = way_of(owner).paths.timed(x[:-1], float(x[-1]))
+        self.timed = way_of(owner).paths.timed(x)
         self.carry = CarryReader(self.cell).read(x)
         self.intervals = IntervalGrid(self.cell.workcell, 100)
 
@@ -203,7 +203,8 @@ def test_a_carry_is_driven_better_believed_and_stationary(fork: Polisher) -> Non
     x = start_in(evaluator.workcell, FORK_FORCE, 0)
     solution = solved(way, x)
     assert evaluator.certified(evaluator.evaluate(solution.x)).feasible[0]
-    before, after = (way.paths.timed(each[:-1], FORK_FORCE).duration for each in (x, solution.x))
+    driven = (np.append(each[:-1], FORK_FORCE) for each in (x, solution.x))
+    before, after = (way.paths.timed(each).duration for each in driven)
     assert after < 0.85 * before
     model = TimingModel(evaluator.compiled, 100)
     assert disbelieved(evaluator.driver, model, solution.x) == ""
@@ -235,9 +236,9 @@ def test_derivatives_of_redundant_joints_are_exact(rail: Polisher) -> None:
 def test_a_carry_with_a_redundant_joint_is_driven_better_and_believed(rail: Polisher) -> None:
     evaluator, way = rail.evaluator, way_of(rail)
     x = start_in(evaluator.workcell, RAIL_FORCE, 0)
-    begun = way.paths.timed(x[:-1], RAIL_FORCE).duration
+    begun = way.paths.timed(np.append(x[:-1], RAIL_FORCE)).duration
     found = solved(way, x, 16)
-    assert way.paths.timed(found.x[:-1], RAIL_FORCE).duration < 0.9 * begun
+    assert way.paths.timed(np.append(found.x[:-1], RAIL_FORCE)).duration < 0.9 * begun
     # The slide's values are used, not only the box's path.
     assert np.abs(found.x[18:-1] - x[18:-1]).max() > 1e-3
     assert evaluator.certified(evaluator.evaluate(found.x)).feasible[0]
