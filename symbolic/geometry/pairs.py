@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property, lru_cache
 from itertools import combinations, product
-from math import dist
+from math import hypot
 
 import coal
 import numpy as np
@@ -190,12 +190,13 @@ def _sorted_pairs(
     far: list[ActivePair] = []
     order = digest_of_parts(tuple((body.group, body.frame.joint) for body in bodies))
     moving = [frozenset(_arms_of(body)) for body in bodies]
+    belong = [(body.group, body.root is not None) for body in bodies]
     for i, j in combinations(range(len(bodies)), 2):
         a, b = bodies[i], bodies[j]
         said = ignored.get(frozenset((a.name, b.name)), "") if ignored else ""
         found = _PairStatus(said, False)
         if not said:
-            at, of, contents, places = views[_is_own(a, b)]
+            at, of, contents, places = views[_is_own(*belong[i], *belong[j])]
             tolerance, both = pair_tolerance(workcell, a, b), moving[i] | moving[j]
             known = contents[i], contents[j], *(places[k] for k in both), tolerance, order
             found = _sorted(CacheKey(at[i], at[j], of, tolerance, bodies, known=known))
@@ -208,11 +209,12 @@ def _sorted_pairs(
     return tuple(active), tuple(excluded), (*near, *far), len(near)
 
 
-def _is_own(a: CollisionBody, b: CollisionBody) -> bool:
+@cache
+def _is_own(first: str, first_stands: bool, second: str, second_stands: bool) -> bool:
     """Whether a pair is of one arm, or of what one moves and the box, which the other arm may bring
-    near to what stands."""
-    groups = {a.group, b.group}
-    if "payload" in groups and (a.root is not None or b.root is not None):
+    near to what stands; by the groups of both bodies, and whether they stand on an arm's root."""
+    groups = {first, second}
+    if "payload" in groups and (first_stands or second_stands):
         return False
     return groups - {"payload"} in ({"robot 1"}, {"robot 2"})
 
@@ -413,20 +415,29 @@ def out_of_reach(
 
 
 def _gap(zone: Piece, pieces: tuple[Piece, ...]) -> float:
-    """Distance of a zone from pieces [m]; of a ball, as most zones are, 0 where it holds the centre
-    of a piece."""
+    """Distance of a zone from pieces [m], not above 0 where they meet."""
     if isinstance(zone.shape, Sphere):
-        radius = zone.shape.radius
-        if any(dist(p.centre, zone.centre) < radius for p in pieces if not _is_hull(p)):
-            return 0.0
-        shapes = [piece.shape for piece in pieces]
-        if len(shapes) == 1 and isinstance(shapes[0], Sphere):
-            return dist(pieces[0].centre, zone.centre) - radius - shapes[0].radius
+        return min(_from_point(p, zone.centre) for p in pieces) - zone.shape.radius
     return coal_distance((zone,), pieces)
 
 
-def _is_hull(piece: Piece) -> bool:
-    return isinstance(piece.shape, Hull)
+def _from_point(piece: Piece, point: Array) -> float:
+    """Distance of a point from a piece [m], not above 0 inside."""
+    x, y, z = ((point - piece.centre) @ piece.rotation).tolist()
+    shape = piece.shape
+    match shape:
+        case Box():
+            beyond = [abs(v) - size / 2.0 for v, size in zip((x, y, z), shape.size, strict=True)]
+            return hypot(*(max(v, 0.0) for v in beyond))
+        case Cylinder():
+            over = abs(z) - shape.length / 2.0
+            return hypot(max(hypot(x, y) - shape.radius, 0.0), max(over, 0.0))
+        case Capsule():
+            return hypot(x, y, max(abs(z) - shape.length / 2.0, 0.0)) - shape.radius
+        case Sphere():
+            return hypot(x, y, z) - shape.radius
+        case Hull():
+            return coal_distance((ball(point, 0.0),), (piece,))
 
 
 def never_meet(

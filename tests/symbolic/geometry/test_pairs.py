@@ -14,8 +14,8 @@ import trimesh
 from symbolic.array import Array
 from symbolic.errors import CollisionModelError
 from symbolic.geometry.bodies import MeshReader, _link_pieces, collision_bodies
-from symbolic.geometry.pairs import _sorted, build_geometry, coal_distance, pair_tolerance
-from symbolic.geometry.pieces import Hull, Piece, farthest_from_axis, skeleton, support
+from symbolic.geometry.pairs import _gap, _sorted, build_geometry, coal_distance, pair_tolerance
+from symbolic.geometry.pieces import Hull, Piece, ball, farthest_from_axis, skeleton, support
 from symbolic.geometry.screen import reach_about_joints
 from symbolic.read.cell import load
 from symbolic.records import (
@@ -46,6 +46,19 @@ pytestmark = pytest.mark.filterwarnings("ignore::symbolic.geometry.hulls.Collisi
 def directions(n: int) -> Array:
     u = np.random.default_rng(5).normal(size=(n, 3))
     return np.asarray(u / np.linalg.norm(u, axis=1, keepdims=True))
+
+
+@pytest.mark.parametrize(
+    "shape", [Box(np.array([0.3, 0.5, 0.2])), Cylinder(0.2, 0.5), Capsule(0.1, 0.4), Sphere(0.3)]
+)
+def test_distances_of_balls_are_those_of_coal(shape: Box | Cylinder | Capsule | Sphere) -> None:
+    rng = np.random.default_rng(2)
+    for turn, place, centre in rng.normal(size=(200, 3, 3)):
+        T = np.eye(4)
+        T[:3, :3], T[:3, 3] = pin.exp3(turn), place
+        zone, piece = ball(centre, rng.uniform(0.05, 0.5)), Piece(shape, T)
+        found, expected = _gap(zone, (piece,)), coal_distance((zone,), (piece,))
+        assert max(found, 0.0) == pytest.approx(max(expected, 0.0), abs=1e-9)
 
 
 @pytest.mark.parametrize("name", ["rack", "ur10"])
