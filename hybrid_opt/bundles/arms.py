@@ -153,6 +153,18 @@ def prefixes(workcell: Workcell) -> tuple[str, str]:
     return (first, second) if first != second else (f"a_{first}", f"b_{second}")
 
 
+def ros_joints(workcell: Workcell) -> dict[str, int]:
+    """Names in ROS of all joints that the arms move, each once, and its place among both arms'
+    joints side by side: a joint that moves both arms of a machine is the first arm's.
+
+    Raises:
+        SettingsError: see `prefixes`.
+    """
+    both = zip(workcell.robots, prefixes(workcell), strict=True)
+    names = [f"{prefix}{name}" for robot, prefix in both for name in _moving(robot)]
+    return {name: names.index(name) for name in names}
+
+
 def pad_frame(prefix: str, arm: int) -> str:
     """Name of a pad's frame."""
     return f"{prefix or f'arm_{arm + 1}_'}{PAD}"
@@ -167,10 +179,8 @@ def description(workcell: Workcell, q: Array) -> str:
     root = ElementTree.Element("robot", {"name": "cell"})
     ElementTree.SubElement(root, "link", {"name": WORLD})
     shared = one_machine(workcell.robots)
-    joints: list[str] = []
     moving_of_both = {name for robot in workcell.robots for name in _moving(robot)}
     for arm, (robot, prefix) in enumerate(zip(workcell.robots, prefixes(workcell), strict=True)):
-        joints += [f"{prefix}{name}" for name in _moving(robot)]
         if not (shared and arm == 1):
             moving = moving_of_both if shared else set(_moving(robot))
             _add_robot(root, robot, prefix, moving)
@@ -180,7 +190,8 @@ def description(workcell: Workcell, q: Array) -> str:
         ElementTree.SubElement(root, "link", {"name": pad})
     for body in workcell.environment:
         _add_fixed(root, WORLD, f"environment_{robot_prefix(body.name)}".rstrip("_"), (body,))
-    _add_hardware(root, joints, q)
+    joints = ros_joints(workcell)
+    _add_hardware(root, list(joints), q[list(joints.values())])
     ElementTree.indent(root)
     return ElementTree.tostring(root, encoding="unicode") + "\n"
 

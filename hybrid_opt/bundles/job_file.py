@@ -37,7 +37,7 @@ from hybrid_opt.store.files import csv_text
 from hybrid_opt.timing.model import TimingModel, contact_torque
 from symbolic.array import Array, interpolated
 from symbolic.errors import SettingsError
-from symbolic.read.arms import arm_model, turning_joints
+from symbolic.read.arms import arm_model, common_joints, turning_joints
 from symbolic.records import Workcell
 from symbolic.records.poses import inverse
 from symbolic.records.task import components
@@ -376,9 +376,30 @@ class Export:
             extra = (sampled.normal_force[span] - load["normal_force"]).mean(axis=1)
             both = np.stack([load["wrench_1"], load["wrench_2"]], axis=1)
             wrench[span] = both + extra[:, None, None] * unit_squeeze(self.workcell, pose)
+        contact = self._contact(wrench)
+        return self.gravity + contact + self._of_other(contact)
+
+    @cached_property
+    def effort(self) -> Array:
+        """(n, joints) torques of the motion as commanded, with gravity; those of a joint that moves
+        both arms bear the contact of both [N m, N]."""
+        return self.sampled.effort + self._of_other(self._contact(self.sampled.wrench))
+
+    def _contact(self, wrench: Array) -> Array:
+        """(n, joints) torques that exert wrenches (n, 2, 6), each arm its own [N m, N]."""
+        sampled, model = self.sampled, _model(self.workcell)
         matrices = model.wrench_torque(np.ascontiguousarray(sampled.q), sampled.pose)
         first = len(self.job.joint_names[0])
-        return self.gravity + contact_torque(first, matrices, np.swapaxes(wrench, 0, 1))
+        return contact_torque(first, matrices, np.swapaxes(wrench, 0, 1))
+
+    def _of_other(self, contact: Array) -> Array:
+        """(n, joints) the other arm's torques, of torques (n, joints), in joints that move both
+        arms."""
+        found, (own, other) = np.zeros_like(contact), self.job.joint_names
+        for name in common_joints(self.workcell.robots):
+            both = [own.index(name), len(own) + other.index(name)]
+            found[:, both] = contact[:, both[::-1]]
+        return found
 
     @property
     def joint_columns(self) -> dict[str, Array]:
@@ -388,8 +409,8 @@ class Export:
             "position": sampled.q,
             "velocity": sampled.q_rate,
             "acceleration": sampled.q_second,
-            "effort_with_gravity": sampled.effort,
-            "effort_without_gravity": sampled.effort - self.gravity,
+            "effort_with_gravity": self.effort,
+            "effort_without_gravity": self.effort - self.gravity,
         }
 
     @cached_property

@@ -17,7 +17,14 @@ import numpy as np
 import pinocchio as pin
 from scipy.spatial.transform import Rotation
 
-from hybrid_opt.bundles.arms import WORLD, described, description, pad_frame, prefixes
+from hybrid_opt.bundles.arms import (
+    WORLD,
+    described,
+    description,
+    pad_frame,
+    prefixes,
+    ros_joints,
+)
 from hybrid_opt.bundles.job_file import Export, job_text
 from hybrid_opt.bundles.programs import filled, program
 from hybrid_opt.errors import ResultsError
@@ -73,7 +80,7 @@ def control_files(export: Export) -> dict[str, str | bytes]:
         controllers: filled(
             "controllers_control.yaml",
             rate=round(min(rates, default=UPDATE_RATE)),
-            joints=json.dumps([*export.ros_joints(0), *export.ros_joints(1)]),
+            joints=json.dumps(list(ros_joints(export.workcell))),
         ),
     }
 
@@ -257,7 +264,8 @@ def mcap_files(export: Export) -> dict[str, str | bytes]:
 def _messages(export: Export, types: Mapping[str, Any]) -> Iterator[tuple[int, str, Any]]:
     """Every sample's messages, of these types, with their times [ns] and topics."""
     sampled, cell, joined = export.sampled, export.workcell, prefixes(export.workcell)
-    joints = [*export.ros_joints(0), *export.ros_joints(1)]
+    joints = ros_joints(cell)
+    places = list(joints.values())
     wrenches = [pad_wrench(sampled, arm) for arm in (0, 1)]
     begins = {sampled.span(k).start: phase.name for k, phase in enumerate(sampled.job.phases)}
     models = [arm_model(robot) for robot in cell.robots]
@@ -299,8 +307,8 @@ def _messages(export: Export, types: Mapping[str, Any]) -> Iterator[tuple[int, s
             yield stamp, "/phase", of("std_msgs/String", begins[k])
         time = of("builtin_interfaces/Time", *divmod(stamp, 10**9))
         world = of("std_msgs/Header", time, WORLD)
-        rows = (sampled.q[k], sampled.q_rate[k], sampled.effort[k])
-        yield stamp, "/joint_states", of("sensor_msgs/JointState", world, joints, *rows)
+        rows = (each[k, places] for each in (sampled.q, sampled.q_rate, export.effort))
+        yield stamp, "/joint_states", of("sensor_msgs/JointState", world, list(joints), *rows)
         box = of("geometry_msgs/Pose", *placed("Point", boxes[k]))
         yield stamp, "/box_pose", of("geometry_msgs/PoseStamped", world, box)
         for arm, prefix in enumerate(joined):

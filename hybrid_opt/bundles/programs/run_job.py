@@ -225,7 +225,7 @@ class Run:
         return ended
 
     def _goal(self, arms: Sequence[int], moments: Sequence[Moment]) -> dict[str, Any]:
-        names = [name for arm in arms for name in self.job.robots[arm]["ros_joints"]]
+        names = self._joined(arms, [self.job.robots[arm]["ros_joints"] for arm in arms])
         erased = [{"name": name, "position": -1.0} for name in names]
         return {
             "trajectory": {
@@ -237,24 +237,32 @@ class Run:
             "goal_tolerance": erased,
         }
 
+    def _joined(self, arms: Sequence[int], rows: Sequence[Sequence[Any]]) -> list[Any]:
+        """What arms' joints have, side by side; of a joint that moves both arms the first's."""
+        found: dict[str, Any] = {}
+        for arm, row in zip(arms, rows, strict=True):
+            for name, value in zip(self.job.robots[arm]["ros_joints"], row, strict=True):
+                found.setdefault(name, value)
+        return list(found.values())
+
     def _point(self, arms: Sequence[int], at: Moment) -> dict[str, Any]:
         job, r = self.job, at.rate
         rates = [job.linear(arm, "velocity", at.s) for arm in arms]
         seconds = [job.linear(arm, "acceleration", at.s) for arm in arms]
         nanoseconds = round(at.time * 1e9)
         point = {
-            "positions": [v for arm in arms for v in job.position(arm, at.s)],
-            "velocities": [r * v for row in rates for v in row],
+            "positions": self._joined(arms, [job.position(arm, at.s) for arm in arms]),
+            "velocities": [r * v for v in self._joined(arms, rates)],
             "accelerations": [
                 r * r * a + at.change * v
-                for row, second in zip(rates, seconds, strict=True)
-                for v, a in zip(row, second, strict=True)
+                for v, a in zip(self._joined(arms, rates), self._joined(arms, seconds), strict=True)
             ],
             "time_from_start": {"sec": nanoseconds // 10**9, "nanosec": nanoseconds % 10**9},
         }
         if self.config["effort"]:
             gravity = self.config["effort"]
-            point["effort"] = [v for arm in arms for v in job.effort(arm, gravity, at.s, r)]
+            efforts = [job.effort(arm, gravity, at.s, r) for arm in arms]
+            point["effort"] = self._joined(arms, efforts)
         return point
 
     def press(self, s: float, rate: float) -> None:

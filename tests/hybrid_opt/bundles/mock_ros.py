@@ -155,7 +155,7 @@ class Controller:
     def _problem(self, goal: Any) -> str:
         """Why a goal is rejected: `validate_trajectory_msg`."""
         trajectory = goal["trajectory"]
-        if set(trajectory["joint_names"]) != set(self.joints):
+        if sorted(trajectory["joint_names"]) != sorted(self.joints):
             return "joints"
         points = trajectory["points"]
         times = [
@@ -237,25 +237,26 @@ class World:
         self._next_joints = self.now
         self.controllers: dict[str, Controller] = {}
         for group in config["groups"]:
-            joints = [n for arm in group["arms"] for n in self._robots[arm]["ros_joints"]]
-            first = [v for arm in group["arms"] for v in self._robots[arm]["position"][0]]
+            first: dict[str, float] = {}
+            for arm in group["arms"]:
+                robot = self._robots[arm]
+                first |= dict(zip(robot["ros_joints"], robot["position"][0], strict=True))
             passes = "passthrough" in group["action"]
             effort = bool(config["effort"])
             self.controllers[group["action"]] = Controller(
-                self, joints, np.array(first), effort, passes
+                self, list(first), np.array(list(first.values())), effort, passes
             )
 
     def later(self, after: float, what: Callable[[], None]) -> None:
         """Let something happen some time after now [s]."""
         heapq.heappush(self.at, (self.now + after, len(self.at), what))
 
-    def of(self, arm: int) -> tuple[Controller, slice]:
-        """An arm's controller, and the arm's part of its joints."""
+    def of(self, arm: int) -> tuple[Controller, list[int]]:
+        """An arm's controller, and the places of the arm's joints among its own."""
         for group in self._config["groups"]:
             if arm in group["arms"]:
-                count = len(self._robots[arm]["ros_joints"])
-                first = sum(len(self._robots[a]["ros_joints"]) for a in group["arms"] if a < arm)
-                return self.controllers[group["action"]], slice(first, first + count)
+                found = self.controllers[group["action"]]
+                return found, [found.joints.index(n) for n in self._robots[arm]["ros_joints"]]
         raise LookupError(arm)
 
     def q(self, arm: int) -> Array:

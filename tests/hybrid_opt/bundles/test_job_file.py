@@ -9,6 +9,7 @@ import math
 from collections import defaultdict
 from collections.abc import Callable
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import jsonschema
@@ -23,6 +24,7 @@ from scipy.spatial.transform import Rotation
 from hybrid_opt.bundles import TARGETS, BundleOptions
 from hybrid_opt.bundles.bundle import prepared
 from hybrid_opt.bundles.job_file import (
+    Export,
     Interpolation,
     chosen_step,
     gap_of,
@@ -33,8 +35,12 @@ from hybrid_opt.errors import JobError
 from hybrid_opt.job.compliance import TRACKED
 from hybrid_opt.job.records import SampledJob, sample_job
 from symbolic.errors import SettingsError
+from symbolic.read.arms import arm_model
+from symbolic.read.cell import load
+from symbolic.records import Workcell
 from tests.hybrid_opt.bundles.bundles import contents, exported, rack_driven, text_of
 from tests.hybrid_opt.job.jobs import rack, rack_job
+from tests.symbolic.read.samples import RACK
 
 
 def sampled() -> SampledJob:
@@ -60,6 +66,23 @@ def test_samples_lie_on_the_job() -> None:
             expected = phase.motion.q[near] + offset * phase.motion.q_rate[near]
             np.testing.assert_allclose(found.q[k], expected, atol=5e-5)
             np.testing.assert_allclose(found.effort[k], phase.effort[near], atol=1.0)
+
+
+def test_a_joint_that_moves_both_arms_bears_the_contact_of_both() -> None:
+    """The TIAGo's lift, first of each arm's eight joints; without such a joint nothing is added."""
+    cell = load(RACK.with_name("tiago.toml"))
+    names = tuple(tuple(arm_model(robot).names)[1:] for robot in cell.robots)
+    contact = np.random.default_rng(2).normal(size=(3, 16))
+    found = Export._of_other(_of_machine(cell, names), contact)
+    expected = np.zeros((3, 16))
+    expected[:, 0], expected[:, 8] = contact[:, 8], contact[:, 0]
+    np.testing.assert_array_equal(found, expected)
+    np.testing.assert_array_equal(exported("json").effort, exported("json").sampled.effort)
+
+
+def _of_machine(cell: Workcell, names: tuple[tuple[str, ...], ...]) -> Any:
+    """What of an export knows its joints."""
+    return SimpleNamespace(workcell=cell, job=SimpleNamespace(joint_names=names))
 
 
 def test_samples_are_consistent_with_their_derivatives() -> None:

@@ -19,10 +19,13 @@ import pytest
 import yaml
 import yourdfpy
 
+from hybrid_opt.bundles.arms import description, ros_joints
 from hybrid_opt.bundles.job_file import pad_places
+from symbolic.read.cell import load
 from symbolic.records.poses import pose_matrix
 from tests.hybrid_opt.bundles.bundles import contents, exported, text_of
 from tests.hybrid_opt.job.jobs import rack
+from tests.symbolic.read.samples import RACK
 
 JOINTS = [f"{arm}_joint_{k}" for arm in ("left", "right") for k in range(1, 7)]
 
@@ -61,6 +64,25 @@ def judged(parameters: dict[str, Any]) -> None:
         assert set(gains) <= GAINS
     if commands == ["effort"]:
         assert set(parameters.get("gains", {})) == set(parameters["joints"]), "it would fall"
+
+
+def test_a_joint_that_moves_both_arms_is_there_once() -> None:
+    """The lift of the TIAGo: in the hardware of its description and among the controller's joints,
+    with the place of the left arm's."""
+    workcell = load(RACK.with_name("tiago.toml"))
+    joints = ros_joints(workcell)
+    assert len(joints) == 15
+    assert joints["torso_lift_joint"] == 0
+    assert list(joints.values()) == [*range(8), *range(9, 16)]
+    q = np.arange(16.0)
+    q[8] = q[0]
+    (control,) = ElementTree.fromstring(description(workcell, q)).findall("ros2_control")
+    first = {
+        joint.attrib["name"]: float(joint.findtext("state_interface/param", "nan"))
+        for joint in control.findall("joint")
+    }
+    assert first == {name: float(place) for name, place in joints.items()}
+    assert len(control.findall("joint")) == len(joints)
 
 
 def test_controllers_accept_their_parameters() -> None:

@@ -57,6 +57,25 @@ def test_the_job_is_done(target: str, tmp_path: Path) -> None:
     assert time[moved[-1]] - time[moved[0]] == pytest.approx(job.end, abs=0.3)
 
 
+def test_a_joint_that_moves_both_arms_is_commanded_once(tmp_path: Path) -> None:
+    """The first joint of the left arm stands in for a lift of both; it does what the left one's
+    does."""
+    files = files_of("ros2-control")
+    document = json.loads(files["job.json"])
+    left, right = document["robots"]
+    right["ros_joints"][0] = left["ros_joints"][0]
+    for name in ("position", "velocity", "acceleration"):
+        for own, other in zip(right[name], left[name], strict=True):
+            own[0] = other[0]
+    files["job.json"] = json.dumps(document)
+    code, world = run(files, tmp_path, lambda world: None, [])
+    assert code == 0, world.log
+    ((controller, _), _) = world.of(0), world.of(1)
+    assert len(controller.joints) == len(left["joints"]) + len(right["joints"]) - 1
+    last = np.concatenate([left["position"][-1], right["position"][-1]])
+    np.testing.assert_allclose(column(world, 1)[-1], last, atol=1e-6)
+
+
 def test_positions_and_efforts_are_those_of_the_job(tmp_path: Path) -> None:
     """Both arms' commands against the job, by the mock's own interpolation."""
     _, world = run(files_of("franka-ros2"), tmp_path, lambda world: None, [])
