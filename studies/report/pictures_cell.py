@@ -106,6 +106,12 @@ def environment(geometry: CellGeometry, carry: DrawnCarry) -> Figure:
     return figure
 
 
+def facing(way: Array) -> View:
+    """The oblique view in which what goes along a way (3,) comes nearer: an arm is not hidden by
+    the machine that it belongs to."""
+    return max(ISOMETRIC, OTHER_SIDE, key=lambda view: float(way @ view.towards))
+
+
 def arm_and_reach(geometry: CellGeometry, reach: ReachMap, carry: DrawnCarry) -> Figure:
     """The first arm at the start and the region that its pad reaches (paper Figure 6)."""
     figure = new_figure(FULL_WIDTH, 0.5 * FULL_WIDTH)
@@ -114,8 +120,9 @@ def arm_and_reach(geometry: CellGeometry, reach: ReachMap, carry: DrawnCarry) ->
     arm = tuple(s for s in cell_solids(geometry) if s.group == "robot 1")
     pose, q = _start(carry)
     cell = CutCell.of(geometry, arm)
-    draw_cell(left, cell, ISOMETRIC, pose, q)
-    frame_axes(left, ISOMETRIC, extent_points(geometry, arm, pose[None], q[None]))
+    view = facing(pose[:3] - robot.T_world_base[:3, 3])
+    draw_cell(left, cell, view, pose, q)
+    frame_axes(left, view, extent_points(geometry, arm, pose[None], q[None]))
     panel_label(left, "a", f"arm {shortened(robot.name)!r} at the start")
     base = robot.T_world_base[:3, 3]
     index = int((base[0] - reach.lower[0]) / reach.step)

@@ -37,7 +37,7 @@ from studies.report.looks import (
     write_animation,
 )
 from studies.report.pictures import ReportPicture, report_pictures
-from studies.report.pictures_cell import planes
+from studies.report.pictures_cell import facing, planes
 from symbolic.array import Array
 from symbolic.geometry.bodies import Frame
 from symbolic.geometry.pairs import CellGeometry, build_geometry
@@ -112,6 +112,15 @@ def visible_texts(figure: Figure) -> list[Text]:
                     if not low - slack <= place <= high + slack
                 }
     return [text for text in texts if text not in hidden]
+
+
+@pytest.mark.parametrize("name", ["rack", "tiago"])
+def test_the_first_arm_reaches_towards_the_eye(name: str) -> None:
+    """The TIAGo's arms reach ahead; from behind, its torso hides them."""
+    cell = load(TRANSFER.with_name(f"{name}.toml"))
+    way = cell.task.waypoints[0].lower[:3] - cell.robots[0].T_world_base[:3, 3]
+    level = facing(way).towards * (1.0, 1.0, 0.0)
+    assert level @ way > 0.0
 
 
 def box_of(text: Text) -> Bbox:
