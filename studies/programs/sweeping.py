@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -18,9 +19,20 @@ from hybrid_opt.store.trajectory_file import read_trajectory
 from hybrid_opt.sweeping import Sweep, require_keys, stored_sweep, sweep
 from hybrid_opt.work.service import warm_up
 from studies.program import load_workcell
-from studies.report.drawing import FULL_WIDTH, in_style, legend_below, new_figure, save, series
+from studies.report.drawing import (
+    FULL_WIDTH,
+    in_style,
+    legend_below,
+    new_figure,
+    save,
+    series,
+    shortened,
+)
 from symbolic.array import Array
 from symbolic.errors import SettingsError, WorkcellError
+
+REMARK = 60
+"""Characters of a remark that the terminal shows."""
 
 
 def sweep_numbers(options: argparse.Namespace) -> int:
@@ -46,11 +58,15 @@ def sweep_numbers(options: argparse.Namespace) -> int:
         x = np.append(best.x[:-1], best.limit)
     fixed = options.path is not None
     done = sweep(cell, x, over, fixed=fixed, file=file, jobs=options.jobs, progress=shown)
-    table = _table(done)
-    file.with_suffix(".csv").write_text(table.csv())
+    whole = file.with_suffix(".csv")
+    whole.write_text(_table(done).csv())
     with in_style():
         save(_figure(done), file.parent, "sweep")
-    print(json.dumps(to_json(done), indent=2) if options.json else table.text())
+    if options.json:
+        print(json.dumps(to_json(done), indent=2))
+    else:
+        print(_table(done, REMARK).text())
+        print(f"whole remarks in {whole}")
     return 0
 
 
@@ -65,9 +81,15 @@ def _of_file(cell: Cell, path: Path) -> Array:
     return x
 
 
-def _table(done: Sweep) -> Table:
+def _table(done: Sweep, longest: int = sys.maxsize) -> Table:
+    """The table of a sweep, its remarks cut to some length."""
     rows = [
-        (*(f"{v:g}" for v in row.values), number(row.duration, 3), number(row.force, 1), row.remark)
+        (
+            *(f"{v:g}" for v in row.values),
+            number(row.duration, 3),
+            number(row.force, 1),
+            shortened(row.remark.removeprefix("- "), longest),
+        )
         for row in done.rows
     ]
     header = (*done.over, "duration [s]", "force [N]", "remark")
