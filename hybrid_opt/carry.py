@@ -164,7 +164,7 @@ class Carry(Displayable):
 
     @property
     def payload_limit(self) -> float:
-        """Payload at which the first robot's whole force reaches its reference force [kg]."""
+        """Least payload at which a robot's whole force reaches its reference force [kg]."""
         return payload_limit(self.workcell, self.peak_resultant_force)
 
     @property

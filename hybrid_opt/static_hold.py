@@ -76,7 +76,7 @@ def mass_at_reference(workcell: Workcell, force: Array) -> Array:
 
 
 def payload_limit(workcell: Workcell, contact_force: Array) -> float:
-    """Payload [kg] at which the first robot's whole force reaches its reference force.
+    """Least payload [kg] at which a robot's whole force reaches its reference force.
 
     Args:
         workcell: the cell.

@@ -60,7 +60,7 @@ class PayloadSensitivity:
 
     @property
     def payload_limit(self) -> float:
-        """Payload at which the first robot reaches its reference force with |f_i| [kg]."""
+        """Least payload at which a robot reaches its reference force with |f_i| [kg]."""
         return float(self.mass_by_resultant.min())
 
     def force_at(self, masses: Array) -> Array:

@@ -20,6 +20,7 @@ from hybrid_opt.job.motions import TICK
 from hybrid_opt.job.plan import JobModel
 from hybrid_opt.job.records import Job, Phase
 from hybrid_opt.job.smooth import driven_timing
+from hybrid_opt.recommending.choice import LEADER
 from hybrid_opt.timing.analysis import drivable_timing
 from hybrid_opt.timing.records import JerkLimits, Timing, TimingLimits
 from hybrid_opt.timing.robustness import Margin, robustness_margins
@@ -72,6 +73,11 @@ class DrawnJob:
     contact_torque_use: Array | None = None
     timing: Timing | None = None
     margins: tuple[Margin, ...] = ()
+
+    @property
+    def commanded(self) -> float:
+        """Largest force that is commanded of the force-controlled arm [N]."""
+        return self.peaks[1 - LEADER]
 
 
 def recommended_job(model: JobModel, x: Array) -> DrawnJob:
@@ -269,6 +275,7 @@ def _with_job(trajectory: dict[str, Any], job: DrawnJob) -> None:
         {
             "name": WHOLE_JOB,
             "peaks": [round(value, 4) for value in job.peaks],
+            "commanded": round(job.commanded, 4),
             "duration": round(job.duration, 5),
             "payloadLimit": trajectory["motions"][0]["payloadLimit"],
             "torqueUse": (100.0 * job.torque_use).round(3).tolist(),
@@ -377,7 +384,7 @@ def _values(cell: ho.Cell, judged: ho.Carry, timing: ho.Timing, job: DrawnJob | 
     is planned what is commanded."""
     if cell.workcell.task.time_law == "optimal" and job is not None and job.phases:
         carry = next(phase for phase in job.phases if phase["name"] == "carry")
-        return f"{carry['duration']:.2f} s, pressed with {max(job.peaks):.1f} N"
+        return f"{carry['duration']:.2f} s, pressed with {job.commanded:.1f} N"
     if cell.workcell.task.time_law == "optimal":
         if timing.carry is not None:
             return f"{timing.duration:.2f} s, {timing.peak_force:.2f} N"

@@ -197,7 +197,7 @@ def selected(summary: CampaignSummary, with_paper: bool) -> Table:
         ),
         tuple(rows),
         "Selected: least mean peak force of the replica with the largest hypervolume. Above rest: "
-        "mean of both peaks over that of the level payload at rest. Payload: at which the first "
+        "mean of both peaks over that of the level payload at rest. Payload: the least at which a "
         "robot's whole contact force reaches its reference force. Recommended, driven: as robots "
         "drive it, planned forces.",
     )
@@ -435,7 +435,7 @@ def timings(timed: LabelledTimings, robots: Sequence[str]) -> Table:
         ),
         "Judged against joint speed, acceleration and torque, payload speed and acceleration, "
         "friction and pressure shift; drivable timings start and end at rest, in the cell that "
-        "robots drive. At the reference speeds without ramps: "
+        "robots drive. Along the path u goes from 0 to 1. At the reference speeds without ramps: "
         + ", ".join(
             f"{_of(label, '')}{FINE_DURATION(found.nominal_duration)} s"
             for label, found in timed
@@ -468,9 +468,14 @@ def margins(timed: LabelledTimings) -> Table:
     judged = [(label, document.margins) for label, document in timed if document.margins]
     rows = []
     for found in zip(*(margins for _, margins in judged), strict=True):
-        unit = f" [{found[0].unit}]" if found[0].unit else ""
-        cells = [f"{one.limit:.4g}" + (f" ({one.fails})" if one.fails else "") for one in found]
-        rows.append((f"{found[0].quantity}{unit}", f"{found[0].nominal:.4g}", *cells))
+        unit, scale = ("mm", 1e3) if found[0].unit == "m" else (found[0].unit, 1.0)
+        limits = [f"{scale * one.limit:.4g}" for one in found]
+        cells = [
+            limit + (f" ({one.fails})" if one.fails else "")
+            for limit, one in zip(limits, found, strict=True)
+        ]
+        name = f"{found[0].quantity} [{unit}]" if unit else found[0].quantity
+        rows.append((name, f"{scale * found[0].nominal:.4g}", *cells))
     return Table(
         "margins",
         "How far assumptions may be off before a carry fails.",

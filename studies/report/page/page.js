@@ -30,7 +30,7 @@
 
   /* A trace of the fronts in the page's colours where its own would not stand out in the dark. */
   function tinted(trace) {
-    const own = { "#b00020": "--mark", "#555555": "--soft", "#1d2327": "--ink" };
+    const own = { "#b00020": "--mark", "#555555": "--soft", "#1d2327": "--ink", "#000": "--ink" };
     const of = (part) => part && own[part.color] ? { ...part, color: colour(own[part.color]) } : part;
     const marker = trace.marker && { ...of(trace.marker), line: of(trace.marker.line) };
     return { ...trace, ...(marker && { marker }), ...(trace.line && { line: of(trace.line) }) };
@@ -125,8 +125,7 @@
     OVER_TIME.forEach((id) => {
       const { data: traces, layout } = data.plots[id];
       const filled = traces.map((trace) => "level" in trace.meta
-        ? { ...trace, x: [0, samples.end], y: [trace.meta.level, trace.meta.level],
-          line: { ...trace.line, color: colour(trace.line.color === "#000" ? "--ink" : "--mark") } }
+        ? { ...tinted(trace), x: [0, samples.end], y: [trace.meta.level, trace.meta.level] }
         : { ...trace, x: samples.times,
           y: samples.rows.map((row) => trace.meta.scale * row[trace.meta.column]) });
       Plotly.react(id, filled, themed({ ...layout, shapes: marks(motion, 0),
@@ -309,10 +308,9 @@
     return (phases.find((phase) => phase.name === "carry") || carry.motions[0]).duration;
   }
 
-  /* The largest force that its job commands; NaN where none is planned. */
+  /* The largest force that is commanded of the force-controlled arm; NaN without a job. */
   function commanded(carry) {
-    const job = carry.motions.find((motion) => motion.phases);
-    return job ? Math.max(...job.peaks) : NaN;
+    return carry.motions.find((motion) => motion.phases)?.commanded ?? NaN;
   }
 
   const TOLD = [["carry", (c) => c.label.split(": ")[0]], ["time [s]", duration],

@@ -500,10 +500,19 @@ def test_texts_stand_out_and_fields_have_names(
     browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": [feature]})
     opened(browser, report)
     worst, unnamed = browser.execute_script(AUDIT)
+    ink, outlines = browser.execute_script(OUTLINES)
     browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": []})
     assert worst[0] >= 4.5, worst  # WCAG AA
     assert unnamed == []
+    assert set(outlines) == {ink}
 
+
+OUTLINES = """
+const plot = document.getElementById("front-plot");
+return [getComputedStyle(document.documentElement).getPropertyValue("--ink"),
+  plot.data.filter((trace) => trace.customdata).map((trace) => trace.marker.line.color)];
+"""
+"""The colour of texts, and those of the outlines of points that can be clicked."""
 
 AUDIT = """
 const rgb = (text) => text.match(/[\\d.]+/g).map(Number);

@@ -32,6 +32,7 @@ from studies.report.page_carries import DrawnJob, PageTrajectory, page_trajector
 from studies.report.page_data import page_document
 from studies.study import tables
 from studies.study.recommendation import recommendation_text
+from symbolic.contact.elastic import free_shift
 from symbolic.read.cell import load
 from symbolic.read.cell_files import collect_cell
 from symbolic.records.task import initial_decision
@@ -296,7 +297,7 @@ def test_the_page_begins_with_the_recommended_carry(
     assert first["label"].startswith("Recommended")
     # A job's carry takes whole ticks.
     assert first["motions"][0]["duration"] == pytest.approx(found.duration, abs=0.01)
-    assert f"pressed with {found.squeeze.max():.1f} N" in first["label"]
+    assert f"pressed with {found.force:.1f} N" in first["label"]
     words = recommendation_text(found, "")
     for _, sentence in words.facts:
         assert html.escape(sentence) in text
@@ -309,7 +310,13 @@ def test_tables_of_carries_have_the_recommended_one(data: ReportData) -> None:
     tables = {table.name: table for table in report_tables(data, with_paper=False)}
     found = data.summary.recommendation
     assert found is not None
-    assert tables["margins"].header[-1] == "recommended"
+    margins = tables["margins"]
+    assert margins.header[-1] == "recommended"
+    rooms = [row for row in margins.rows if row[0].startswith("room for the pressure of")]
+    assert len(rooms) == 2
+    assert all(row[0].endswith(" [mm]") for row in rooms)
+    patch = data.workcell.contacts[0]
+    assert [float(row[1]) for row in rooms] == [pytest.approx(1e3 * free_shift(patch))] * 2
     for name in ("table2_selected", "time_against_force", "jerk", "timing", "phases"):
         assert any(row[0].startswith("recommended") for row in tables[name].rows), name
     (row,) = (row for row in tables["jerk"].rows if row[0] == "recommended")
