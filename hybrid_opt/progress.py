@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import sys
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Literal, NoReturn, Protocol, TypeVar
 
-from tqdm import tqdm
+from tqdm import TqdmWarning, tqdm
 
 T = TypeVar("T")
 
@@ -31,7 +32,10 @@ def counted(progress: ShowProgress, what: str, total: int) -> Iterator[Advance]:
         total: units in all.
     """
     if progress is True:
-        from tqdm.auto import tqdm
+        with warnings.catch_warnings():
+            # A notebook without ipywidgets gets a bar of text, and needs no advice for it.
+            warnings.simplefilter("ignore", TqdmWarning)
+            from tqdm.auto import tqdm
 
         with tqdm(total=total, desc=what, dynamic_ncols=True) as bar:
 
