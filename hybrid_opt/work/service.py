@@ -122,8 +122,8 @@ def give_up(reason: str) -> NoReturn:
         WorkerError: always.
     """
     what = (
-        f"worker processes died {MAX_DEATHS} times over one task (killed from outside, or out of "
-        "memory?)"
+        f"worker processes died {MAX_DEATHS} times over one task (killed from outside, out of "
+        "memory, or started by a script without `if __name__ == '__main__':`?)"
         if reason == KILLED
         else "a task said nothing for too long and was given up"
     )

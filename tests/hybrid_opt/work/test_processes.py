@@ -73,7 +73,8 @@ def test_a_list_is_answered_in_order_and_every_answer_told() -> None:
 
 
 @pytest.mark.parametrize(
-    ("reason", "text"), [(KILLED, "died 3 times over one task .* --resume"), (SILENT, "too long")]
+    ("reason", "text"),
+    [(KILLED, "died 3 times over one task .*__main__.* --resume"), (SILENT, "too long")],
 )
 def test_what_is_lost_is_told(reason: str, text: str) -> None:
     with pytest.raises(WorkerError, match=text):
