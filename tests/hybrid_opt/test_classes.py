@@ -20,6 +20,7 @@ def proposal(side: str) -> Any:
     """As much of a proposal as is compared; its file says which it is."""
     return SimpleNamespace(
         sides=(side,),
+        passes=side,
         length=4.0,
         found=SimpleNamespace(branches=(1, 0)),
         text=lambda folder: side,
