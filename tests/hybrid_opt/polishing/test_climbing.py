@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
@@ -13,8 +14,18 @@ from hypothesis import strategies as st
 from hybrid_opt.polishing.carry import PlacedCarry
 from hybrid_opt.polishing.constraints.active import KEPT, ActiveSet, LearnedRows
 from hybrid_opt.polishing.constraints.distances import Gaps, edges, passing, separation
-from hybrid_opt.polishing.point import LARGEST, TrustRegion
+from hybrid_opt.polishing.point import (
+    LARGEST,
+    Climb,
+    ClimbPoint,
+    Step,
+    StepVerdict,
+    TrustRegion,
+    Way,
+)
 from hybrid_opt.polishing.rows import PlaceRow, Row
+from hybrid_opt.polishing.solvers.base import UNKNOWN
+from symbolic.array import Array
 from symbolic.smooth.passage import Passing, Separation
 from symbolic.smooth.places import Clearance
 
@@ -90,6 +101,39 @@ class Rows:
 
     def lasting(self, row: Row) -> bool:
         return row != GAP
+
+    def violated(self, carry: Any, known: Any, asked: Any) -> set[Row]:
+        return {FAR} if carry.is_refused else set()
+
+
+class Foretold(Way[ClimbPoint, Step]):
+    """Steps with known gains of a level of 1; without one a step is refused."""
+
+    least_radius = 0.0
+
+    def __init__(self, gains: list[float | None]) -> None:
+        self.half, self.active, self._gains = HALF, cast(ActiveSet, Rows()), iter(gains)
+        self.cell = cast(Any, SimpleNamespace(task=SimpleNamespace(lower=-HALF, upper=HALF)))
+
+    def start(self, x: Array) -> ClimbPoint:
+        return ClimbPoint(x, NOTHING, 1.0)
+
+    def propose(self, best: ClimbPoint, required: Mapping[Row, float], radius: float) -> Step:
+        return Step(length=0.1, required=required, residuals=lambda _: UNKNOWN, iterations=1)
+
+    def judge(self, best: ClimbPoint, step: Step) -> StepVerdict[ClimbPoint]:
+        gain = next(self._gains)
+        carry = cast(PlacedCarry, SimpleNamespace(is_refused=gain is None, is_followed=True))
+        return StepVerdict(ClimbPoint(best.x, carry, best.level - (gain or 0.0)), closer=True)
+
+    def along(self, *_: Any) -> None:
+        return None
+
+
+def test_steps_that_bring_little_end_a_climb_and_refused_ones_do_not() -> None:
+    climb = Climb(Foretold([None, None, None, 0.1, 1e-5, 1e-5, 0.1]), HERE, 0.2)
+    assert climb.go_on(7, least_gain=1e-3).rounds == 6
+    assert climb.best.level == pytest.approx(0.9 - 2e-5)
 
 
 def memory() -> LearnedRows:
