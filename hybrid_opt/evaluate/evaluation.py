@@ -148,6 +148,7 @@ class CandidateEvaluator:
         checker: FCL's verdict on samples.
         n_var, lower, upper: size and bounds of the decision vector.
         driver: what drives candidates of the time law 'optimal', None under the others.
+        threads: threads that share a batch.
     """
 
     def __init__(
@@ -175,7 +176,7 @@ class CandidateEvaluator:
         self.compiled = CompiledCell(workcell) if compiled is None else compiled
         self.objectives = select_objectives(objectives)
         self.objective_names = tuple(objective.name for objective in self.objectives)
-        self._threads = threads
+        self.threads = threads
         self.functions = self.compiled.evaluators if functions is None else functions
         self._candidate = self.functions["candidate"]
         self.checker = CollisionChecker(self.compiled.geometry, self.functions)
@@ -227,7 +228,7 @@ class CandidateEvaluator:
         x = self._checked(x)
         if self.driver is not None:
             return self.driver.outputs(self._candidate, x)
-        return self._candidate.batch(x, threads=self._threads)
+        return self._candidate.batch(x, threads=self.threads)
 
     def evaluate(self, x: Array, with_collisions: bool = True) -> Evaluations:
         """Verdicts on decision vectors (n, n_var).
@@ -253,7 +254,7 @@ class CandidateEvaluator:
         if self._kernel is None:
             return one_by_one(self.outputs(x), self.checker)
         return self._kernel.evaluate(
-            x, self._needs or (), with_collisions, self._threads, self._begin
+            x, self._needs or (), with_collisions, self.threads, self._begin
         )
 
     def carry(self, x: Array) -> Carry:

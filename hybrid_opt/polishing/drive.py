@@ -82,9 +82,8 @@ its row."""
 STEADINESS = 1.0
 """Curvature by the path of the program that finds multipliers."""
 
-BEND = 0.01
-"""Error of geometric rows, by their curvature along a step, above which it is corrected, once: two
-more corrections changed no path of the rack's sweep by 1e-4 of its duration."""
+BEND = 0.2
+"""Error of geometric rows, by their curvature along a step, above which it is corrected, once."""
 
 FARTHER = (2.0, 4.0, 8.0)
 """Times a step that brought more than it promised: judging costs a tenth of a round."""
@@ -242,7 +241,10 @@ class DriveWay(Way[DrivePoint, DriveStep]):
         self._newton = NEWTON * float(square[own].min())
         self._spread = by[:, own] * self._unit
         self.paths = PathJudge(driver)
-        self._intervals = IntervalGrid(cell.workcell, driver.timer.intervals, driver.robust)
+        intervals, threads = driver.timer.intervals, cell.evaluator.threads
+        self._intervals = IntervalGrid(
+            cell.workcell, intervals, self._spread, driver.robust, threads
+        )
         self._method = quadratic_method(cell.evaluator.compiled.cache)
         self.stated = self
         if task.pieces > 1 and not by_stated:
@@ -305,9 +307,7 @@ class DriveWay(Way[DrivePoint, DriveStep]):
         """Form the joint program about the best carry so far, and solve its quadratic model."""
         grid = self._intervals
         values = IntervalValues.at(grid, self.cell.functions, best.x, best.squared, best.joints)
-        program = JointProgram(
-            grid, values, best.x, best.squared, self.cell, required, best.carry, self._spread
-        )
+        program = JointProgram(grid, values, best.x, best.squared, self.cell, required, best.carry)
         box, chosen = self._box(best, radius), program.near()
         steady = np.zeros(program.n)
         steady[: program.n_path] = STEADINESS

@@ -93,52 +93,58 @@ class RowKinds:
 
 
 class IntervalGrid:
-    """What all paths of a workcell share.
+    """What all paths of a workcell share that are moved by the same variables.
 
     Attributes:
         workcell: the cell.
         intervals: pieces of constant u''.
         sample: (points,) grid point of each point.
         moving: entries of the extended pose and its two derivatives, 3 (6 + m).
-        carry_over: (points, moving, n_path) from the path's variables to them.
         kinds: the inequalities of a point.
         robust: robust forces, None where planned ones are limited.
         layout: of the quantities.
         load: place of the load among them.
+        spread: (the path's variables, n_path) how they follow the program's.
+        moved: (points, moving, n_path) how the points do.
+        threads: threads that share a batch of points.
     """
 
-    def __init__(self, workcell: Workcell, intervals: int, robust: bool = False) -> None:
+    def __init__(
+        self,
+        workcell: Workcell,
+        intervals: int,
+        spread: Array,
+        robust: bool = False,
+        threads: int = 1,
+    ) -> None:
         self.workcell, self.intervals = workcell, intervals
+        self.spread, self.threads = spread, threads
         task = workcell.task
         basis = path_basis(len(task.waypoints), np.linspace(0.0, 1.0, intervals + 1))
         self.sample = (np.arange(intervals)[:, None] + np.array([0, 1])).reshape(-1)
         self._bases = (basis.position, basis.first, basis.second)
-        rows, columns = task.free_entries
         self.pose, self.moving = task.extended_size, 3 * task.extended_size
-        self.carry_over = np.zeros((len(self.sample), self.moving, task.n_path))
-        for k, basis_of in enumerate(self._bases):
-            at = (k * self.pose + columns, np.arange(task.n_path))
-            self.carry_over[:, at[0], at[1]] = basis_of[self.sample][:, rows]
+        waypoints = np.zeros((len(task.waypoints), self.pose, spread.shape[1]))
+        waypoints[task.free_entries] = spread
+        moved = [np.tensordot(basis, waypoints, 1)[self.sample] for basis in self._bases]
+        self.moved = np.concatenate(moved, axis=1)
         self.robust = RobustForces(workcell, self.pose) if robust else None
         self.kinds = RowKinds.of(workcell, 0 if self.robust is None else ROBUST_ROWS)
         self.layout = driven_layout(workcell)
         self.load = self.layout.block("load")
 
     def by_path(self, slope: Array, points: NDArray[np.intp]) -> Array:
-        """(rows, n_path) slopes by the path's variables of slopes (rows, moving) at points."""
+        """(rows, n_path) slopes by the program's variables of slopes (rows, moving) at points."""
         rows, columns = self.workcell.task.free_entries
         at = self.sample[points]
-        return sum(
+        by_path = sum(
             (
                 basis[at][:, rows] * slope[:, k * self.pose + columns]
                 for k, basis in enumerate(self._bases)
             ),
             start=np.zeros((len(points), len(rows))),
         )
-
-    def moved(self, step: Array) -> Array:
-        """(points, moving) how a step (n_path,) of the path's variables moves the points."""
-        return np.asarray(self.carry_over @ step)
+        return np.asarray(by_path @ self.spread)
 
     def path(self, x: Array) -> tuple[Array, Array, Array]:
         """Extended pose and both derivatives (intervals + 1, 6 + m) of a decision vector."""
@@ -185,10 +191,14 @@ class IntervalValues:
             near: joints of both arms (intervals + 1, n) near those that hold the box.
         """
         path, s = grid.path(x), grid.sample
-        held = [functions.closure(arm, "first").batch(path[0], near[arm]) for arm in (0, 1)]
+        threads = grid.threads
+        held = [
+            functions.closure(arm, "first").batch(path[0], near[arm], threads=threads)
+            for arm in (0, 1)
+        ]
         a = np.repeat(np.diff(squared) * grid.intervals / 2.0, 2)
         inputs = (*(part[s] for part in path), *(found["q"][s] for found in held), a, squared[s])
-        out = functions.built[DRIVEN_FIRST].batch(*inputs)
+        out = functions.built[DRIVEN_FIRST].batch(*inputs, threads=threads)
         full = out["slope"]
         follow = tuple(found["follow"][s] for found in held)
         slope, value = _followed(grid, full, follow), out["value"]
@@ -220,7 +230,8 @@ class IntervalValues:
         extended pose."""
         begins = [values[::2] for values in self._inputs]
         still, grid = np.zeros(len(begins[-1])), self.grid
-        out = self._functions.built[DRIVEN_FIRST].batch(*begins[:-2], still, still)
+        first = self._functions.built[DRIVEN_FIRST]
+        out = first.batch(*begins[:-2], still, still, threads=grid.threads)
         follow = tuple(along[::2] for along in self._follow)
         paper, by_program = grid.workcell.task.allocation == "paper", grid.layout.by_program
         block = grid.layout.block("pressure" if paper else "load" if by_program else "force")
@@ -265,14 +276,10 @@ class IntervalValues:
             spread[:, :pose, start:stop] = along[at]
             start = stop
         repeated = [np.repeat(values[at], local, axis=0) for values in self._inputs]
-        change = (
-            self._functions.built[DRIVEN_SECOND]
-            .batch(*repeated, np.repeat(weight[at], local, axis=0), spread.reshape(-1, variables))[
-                "change"
-            ]
-            .reshape(n, local, variables)
-        )
-        total = change @ np.swapaxes(spread, 1, 2)
+        along_all = np.repeat(weight[at], local, axis=0), spread.reshape(-1, variables)
+        second = self._functions.built[DRIVEN_SECOND]
+        change = second.batch(*repeated, *along_all, threads=self.grid.threads)["change"]
+        total = change.reshape(n, local, variables) @ np.swapaxes(spread, 1, 2)
         # How the joints' own curvature along the path adds to it, see `symbolic.smooth.places`.
         slope = np.einsum("pk,pkv->pv", weight[at], self._full[at])
         start = moving
@@ -287,8 +294,8 @@ class IntervalValues:
             total[:, :pose, :pose] += follow @ closed @ np.swapaxes(follow, 1, 2)
             start += n_joints
         if self._held is not None:
-            second = self._functions.built[held_name("second")]
-            bent = second.batch(self._held["state"][at], pressing[at])["curvature"]
+            pressed = self._functions.built[held_name("second")]
+            bent = pressed.batch(self._held["state"][at], pressing[at])["curvature"]
             by_motion = self.slope[at][:, self.grid.load]
             total += np.swapaxes(by_motion, 1, 2) @ bent @ by_motion
         return at, (total + np.swapaxes(total, 1, 2)) / 2.0
@@ -378,7 +385,6 @@ class JointProgram:
         cell: SmoothCell,
         required: Mapping[Row, float],
         carry: PlacedCarry,
-        spread: Array,
     ) -> None:
         """Form it.
 
@@ -388,21 +394,24 @@ class JointProgram:
             squared: (intervals + 1,) its u'^2.
             required: geometric rows, and what each has to keep.
             carry: the iterate on places.
-            spread: (the path's variables, n_path) how they follow the program's.
         """
         self._grid, self._values, self._x, self._force = grid, values, x, float(x[-1])
-        self._spread, self.n_path = spread, spread.shape[1]
+        self._spread, self.n_path = grid.spread, grid.spread.shape[1]
         self.n = self.n_path + grid.intervals - 1
         self.speeds = slice(self.n_path, self.n)
         self.scale = np.where(grid.kinds.is_force, self._force, 1.0)
         self.rows = values.rows() / self.scale - 1.0
         layout = Layout(required)
         self.place_rows = layout.place_rows
+        # Slopes of the timing's rows by both parts of z, of those that were chosen so far.
+        self._known = np.zeros(self.rows.shape, dtype=np.bool_)
+        self._by_path = np.empty((*self.rows.shape, self.n_path))
+        self._by_speeds = np.empty((*self.rows.shape, 2))
         scale = np.array([row.constraint.scale for row in self.place_rows])
         self._required = np.array([required[row] for row in self.place_rows]) / scale
         self._places = Rows(cell, layout, carry.q)
         self.geometry = self._required - self._places.values(x)
-        self._geometry_slope = -self._places.slopes()[:, : len(spread)] @ spread
+        self._geometry_slope = -self._places.slopes()[:, : len(grid.spread)] @ grid.spread
         self._still(values)
         self._speeds(squared)
 
@@ -411,7 +420,7 @@ class JointProgram:
         share, slope = values.at_rest(self._force)
         near = np.flatnonzero(share > NEAR)
         begins = 2 * (near // (len(share) // self._grid.intervals))
-        by_path = self._grid.by_path(slope[near], begins) @ self._spread
+        by_path = self._grid.by_path(slope[near], begins)
         self.geometry = np.append(self.geometry, share[near] - 1.0 + REST_MARGIN)
         self._geometry_slope = np.concatenate([self._geometry_slope, by_path])
 
@@ -462,7 +471,7 @@ class JointProgram:
     def predicted(self, d: Array) -> Array:
         """(points, kinds) linear prediction of the timing's rows after a step."""
         omega = d[self.speeds]
-        moved = self._grid.moved(self._spread @ d[: self.n_path])
+        moved = self._grid.moved @ d[: self.n_path]
         beside = np.stack([omega[self._column], omega[self._column + 1]], axis=1)
         speeds = np.matmul(self._local, beside[:, :, None])[:, :, 0]
         change = np.matmul(self._values.slope, np.hstack([moved, speeds])[:, :, None])[:, :, 0]
@@ -474,14 +483,11 @@ class JointProgram:
         Args:
             bent: (geometric rows,) what these lack after a step beyond what is foretold.
         """
+        self._learn(*np.nonzero(chosen & ~self._known))
         point, kind = np.nonzero(chosen)
-        kinds, m, count = self._grid.kinds, len(point), len(self.geometry)
-        local = kinds.slopes(self._values.slope, point, kind) / self.scale[kind, None]
-        moving, n = self._grid.moving, self.n_path
-        by_speed = np.matmul(local[:, None, moving:], self._local[point])[:, 0]
-        border = np.zeros((m + count, self.n_path))
-        border[:m, :n] = self._grid.by_path(local[:, :moving], point) @ self._spread
-        border[m:, :n] = self._geometry_slope
+        m, count = len(point), len(self.geometry)
+        by_speed = self._by_speeds[point, kind]
+        border = np.concatenate([self._by_path[point, kind], self._geometry_slope])
         scale = np.ones(m + count)
         scale[:m] = np.maximum(np.abs(by_speed).max(axis=1, initial=0.0), LEAST_SCALE)
         sides = np.zeros((2, m + count))
@@ -492,6 +498,14 @@ class JointProgram:
         left, right = sides
         A = BorderedRows(border / scale[:, None], column, left, right, len(self.cost))
         return Linear(A, b, scale, point, kind)
+
+    def _learn(self, point: NDArray[np.intp], kind: NDArray[np.intp]) -> None:
+        """Slopes of some of the timing's rows."""
+        kinds, moving = self._grid.kinds, self._grid.moving
+        local = kinds.slopes(self._values.slope, point, kind) / self.scale[kind, None]
+        self._by_path[point, kind] = self._grid.by_path(local[:, :moving], point)
+        self._by_speeds[point, kind] = np.matmul(local[:, None, moving:], self._local[point])[:, 0]
+        self._known[point, kind] = True
 
     def gradient(self) -> Array:
         """(n_variables,) of the objective."""
@@ -516,9 +530,9 @@ class JointProgram:
         timing[linear.point, linear.kind] = np.where(rows > NEGLIGIBLE, unscaled, 0.0)[:count]
         m = self._grid.moving
         at, local = self._values.curvature((timing / self.scale) @ self._grid.kinds.mix)
-        over = self._grid.carry_over[at] @ self._spread
+        over = self._grid.moved[at]
         speeds, column = self._local[at], self._column[at]
-        corner += np.einsum("pia,pij->aj", over, local[:, :m, :m] @ over, optimize=True)
+        corner += np.tensordot(over, local[:, :m, :m] @ over, ([0, 1], [0, 1]))
         mixed = np.swapaxes(speeds, 1, 2) @ local[:, m:, :m] @ over
         own = np.swapaxes(speeds, 1, 2) @ local[:, m:, m:] @ speeds
         for side in (0, 1):

@@ -36,7 +36,7 @@ from symbolic.array import Array
 TOLERANCE = 1e-8
 """Tolerance of the conditions, of their residuals over their terms, and of the objective."""
 
-CHECKED = 1e-6
+CHECKED = 1e-5
 """Tolerance with which an answer is accepted; of the objective, over its own terms."""
 
 LEAST_CURVATURE = 1e-6

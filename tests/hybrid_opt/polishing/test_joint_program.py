@@ -53,23 +53,23 @@ class Programs:
         self.cell = smooth_cell(owner.evaluator)
         half, self.x = self.cell.half[:-1], x
         own: Array = np.eye(len(half)) if together is None else together
-        self.spread: Array = half[:, None] * own
+        spread: Array = half[:, None] * own
         self.timed = way_of(owner).paths.timed(x)
         self.carry = CarryReader(self.cell).read(x)
-        self.intervals = IntervalGrid(self.cell.workcell, 100)
+        self.intervals = IntervalGrid(self.cell.workcell, 100, spread)
 
     def at(self, d: Array | None = None) -> JointProgram:
         """The program after a step d of the scaled variables from the path."""
         x, squared = self.x.copy(), self.timed.squared.copy()
         if d is not None:
-            n, k = self.spread.shape
-            x[:n] += self.spread @ d[:k]
+            spread = self.intervals.spread
+            x[: len(spread)] += spread @ d[: spread.shape[1]]
             squared[1:-1] *= 1.0 + d[-len(squared) + 2 :]
         functions, joints = self.cell.functions, self.timed.joints
         values = IntervalValues.at(self.intervals, functions, x, squared, joints)
         required: dict[Row, float] = dict.fromkeys(ROWS, 0.01)
         grid = self.intervals
-        return JointProgram(grid, values, x, squared, self.cell, required, self.carry, self.spread)
+        return JointProgram(grid, values, x, squared, self.cell, required, self.carry)
 
 
 def direction(program: JointProgram, seed: int) -> Array:

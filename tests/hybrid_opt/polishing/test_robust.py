@@ -106,7 +106,7 @@ def unsure_rack() -> Workcell:
 def programs() -> Programs:
     """The planned forces' timing, its program with the robust forces' rows."""
     found = Programs(start(FORCE))
-    found.intervals = IntervalGrid(unsure_rack(), 100, robust=True)
+    found.intervals = IntervalGrid(unsure_rack(), 100, found.intervals.spread, robust=True)
     return found
 
 
