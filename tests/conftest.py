@@ -49,6 +49,7 @@ models and conic programs. Single tests say so themselves."""
 
 PLAIN = (
     "hybrid_opt/calibrating",
+    "hybrid_opt/display/test_solids.py",
     "hybrid_opt/display/test_table.py",
     "hybrid_opt/indicators/test_metrics.py",
     "hybrid_opt/metaheuristics/test_run.py",

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from hybrid_opt.bundles.bundle import TARGETS
 from hybrid_opt.cell import Cell
-from hybrid_opt.display.scene import Solid, cell_solids, frame_placements, motion_points
+from hybrid_opt.display.solids import Solid, cell_solids, frame_placements, motion_points
 from hybrid_opt.errors import DisplayError
 from hybrid_opt.workbench.session import Handle, Session, Verdict, handles, moved
 from symbolic.array import Array

@@ -12,13 +12,13 @@ from typing import Any
 
 import matplotlib as mpl
 import numpy as np
-import trimesh
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
+from numpy.typing import NDArray
 
-from hybrid_opt.display.scene import Solid, frame_placements
+from hybrid_opt.display.solids import Solid, frame_placements
 from hybrid_opt.store.files import write_atomically
 from symbolic.array import Array
 from symbolic.geometry.bodies import Frame
@@ -165,9 +165,13 @@ def rest_line(axes: Axes, level: float, label: str, across: bool = True) -> None
     draw(level, color="black", linewidth=0.8, linestyle=(0, (7, 2, 1, 2)), label=label)
 
 
-def panel_label(axes: Axes, letter: str, text: str) -> None:
-    """'(a) text' above a panel's left corner."""
-    axes.set_title(f"({letter}) {text}", loc="left")
+def panel_label(axes: Axes, letter: str, text: str, bare: bool = False) -> None:
+    """'(a) text' above a panel's left corner.
+
+    Args:
+        bare: whether nothing else is above the panel: to look for it takes half of a layout.
+    """
+    axes.set_title(f"({letter}) {text}", loc="left", y=1.0 if bare else None)
 
 
 def files_of(figure: Figure, pdf: bool = True) -> dict[str, bytes]:
@@ -277,21 +281,36 @@ class CutCell:
 
 def cut_faces(solids: Sequence[Solid], marked: Collection[str] = ()) -> tuple[Faces, ...]:
     """The solids' triangles cut to `MAX_EDGE`, coloured by the party they belong to."""
+    corners = [solid.vertices[solid.faces] for solid in solids]
+    numbers = np.repeat(np.arange(len(solids)), [len(each) for each in corners])
+    limits = np.array([np.inf if solid.is_ground else MAX_EDGE for solid in solids])
+    small, of = _cut(np.concatenate(corners), numbers, limits)
+    normals = np.cross(small[:, 1] - small[:, 0], small[:, 2] - small[:, 0])
+    length = np.linalg.norm(normals, axis=1)
+    keep = length > 0.0
+    small, of, normals = small[keep], of[keep], normals[keep] / length[keep, None]
     faces = []
-    for solid in solids:
-        vertices, triangles = solid.vertices, solid.faces
-        if not solid.is_ground:
-            vertices, triangles = trimesh.remesh.subdivide_to_size(  # type: ignore[no-untyped-call]
-                vertices, triangles, MAX_EDGE, max_iter=12
-            )
-        corners = vertices[triangles]
-        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        length = np.linalg.norm(normals, axis=1)
-        keep = length > 0.0
-        normals = normals[keep] / length[keep, None]
+    for k, solid in enumerate(solids):
+        own = of == k
         colour = to_rgb(MARKED if solid.name in marked else _colour(solid))
-        faces.append(Faces(solid.frame, corners[keep], normals, colour, solid.is_ground))
+        faces.append(Faces(solid.frame, small[own], normals[own], colour, solid.is_ground))
     return tuple(faces)
+
+
+def _cut(corners: Array, of: NDArray[np.intp], limits: Array) -> tuple[Array, NDArray[np.intp]]:
+    """Triangles (n, 3, 3) halved across their longest edges until none is longer than the limit of
+    what it is of (n,), and of what they are then. Neighbours share the places of their cuts."""
+    while True:
+        lengths = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2)
+        long = lengths.max(axis=1) > limits[of]
+        if not long.any():
+            return corners, of
+        order = (lengths[long].argmax(axis=1)[:, None] + np.arange(3)) % 3
+        a, b, c = np.moveaxis(np.take_along_axis(corners[long], order[:, :, None], 1), 1, 0)
+        middle = (a + b) / 2.0
+        halves = (np.stack([a, middle, c], axis=1), np.stack([middle, b, c], axis=1))
+        corners = np.concatenate([corners[~long], *halves])
+        of = np.concatenate([of[~long], of[long], of[long]])
 
 
 def _colour(solid: Solid) -> str:

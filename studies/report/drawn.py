@@ -4,17 +4,18 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from hybrid_opt.carry import Carry
-from hybrid_opt.timing.robustness import PayloadSensitivity, payload_sensitivity
 from symbolic.array import Array
 from symbolic.geometry.pairs import CellGeometry
 from symbolic.records.poses import skew
+
+if TYPE_CHECKING:
+    from hybrid_opt.timing.robustness import PayloadSensitivity
 
 STEP = 0.05
 """Edge of the cubes [m]: what a drawing of two metres shows."""
@@ -57,8 +58,17 @@ def reach_map(geometry: CellGeometry, rng: np.random.Generator) -> ReachMap:
         reached = np.zeros(shape, dtype=bool)
         index = ((cloud - lower) / STEP).astype(int)
         reached[index[:, 0], index[:, 1], index[:, 2]] = True
-        pads.append(ndimage.binary_closing(reached, iterations=2))
+        pads.append(_closed(reached))
     return ReachMap(lower, STEP, (pads[0], pads[1]), _common(geometry, pads))
+
+
+def _closed(reached: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Cubes that are reached, and holes between them: two layers of neighbours are added and taken
+    away. Around the grid's edge nothing is reached."""
+    for combine in (np.logical_or, np.logical_or, np.logical_and, np.logical_and):
+        beside = [np.roll(reached, step, axis) for axis in range(3) for step in (1, -1)]
+        reached = combine.reduce([reached, *beside])
+    return reached
 
 
 def _pad_points(geometry: CellGeometry, i: int, rng: np.random.Generator) -> NDArray[np.float32]:
@@ -131,4 +141,7 @@ class DrawnCarry:
     @cached_property
     def sensitivity(self) -> PayloadSensitivity:
         """Its forces against the payload's mass."""
+        # Not imported at the top: pictures of a cell need no timing.
+        from hybrid_opt.timing.robustness import payload_sensitivity
+
         return payload_sensitivity(self.timed)

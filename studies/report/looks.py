@@ -16,7 +16,8 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from PIL import Image
 
-from hybrid_opt.display.scene import CarryView, cell_solids, motion_points
+from hybrid_opt.display.scene import CarryView
+from hybrid_opt.display.solids import cell_solids, motion_points
 from studies.program import ReportError
 from studies.report import PAGE
 from studies.report.data import gather_carries

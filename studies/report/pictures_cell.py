@@ -9,7 +9,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
-from hybrid_opt.display.scene import (
+from hybrid_opt.display.solids import (
     Solid,
     cell_solids,
     extent_points,
@@ -58,15 +58,16 @@ def reachable_regions(geometry: CellGeometry, reach: ReachMap, carry: DrawnCarry
     left, right = figure.subplots(1, 2, width_ratios=[aspect(v, corners) for v in (FRONT, SIDE)])
     lowest, highest = (np.array(corners) for corners in zip(*_free_bounds(geometry), strict=True))
     middle = (lowest.min(axis=0) + highest.max(axis=0)) / 2.0
+    fixed = _fixed(geometry)
     for axes, view, across, letter, text in (
         (left, FRONT, 0, "a", f"front view, slice at x = {_metres(middle[0])}"),
         (right, SIDE, 1, "b", f"side view, slice at y = {_metres(middle[1])}"),
     ):
         _draw_reach(axes, reach, view, across, float(middle[across]))
-        draw_cell(axes, _fixed(geometry), view, *_start(carry), hidden=("box",))
+        draw_cell(axes, fixed, view, *_start(carry), hidden=("box",))
         for lower, upper in _free_bounds(geometry):
             draw_box_edges(axes, view, lower, upper, colors="#b00020", linewidths=0.9)
-        panel_label(axes, letter, text)
+        panel_label(axes, letter, text, bare=True)
         frame_axes(axes, view, corners, margin=0.0)
     names = [shortened(robot.name) for robot in geometry.workcell.robots]
     handles = [
@@ -101,7 +102,7 @@ def environment(geometry: CellGeometry, carry: DrawnCarry) -> Figure:
         panels, views, "abc", ("front", "side", "oblique"), strict=True
     ):
         draw_cell(axes, cell, view, pose, q)
-        panel_label(axes, letter, text)
+        panel_label(axes, letter, text, bare=True)
         frame_axes(axes, view, points)
     return figure
 
@@ -123,7 +124,7 @@ def arm_and_reach(geometry: CellGeometry, reach: ReachMap, carry: DrawnCarry) ->
     view = facing(pose[:3] - robot.T_world_base[:3, 3])
     draw_cell(left, cell, view, pose, q)
     frame_axes(left, view, extent_points(geometry, arm, pose[None], q[None]))
-    panel_label(left, "a", f"arm {shortened(robot.name)!r} at the start")
+    panel_label(left, "a", f"arm {shortened(robot.name)!r} at the start", bare=True)
     base = robot.T_world_base[:3, 3]
     index = int((base[0] - reach.lower[0]) / reach.step)
     _draw_slice(right, FRONT, reach, 0, index, reach.pads[0], ARMS[0], HATCHES[0])
@@ -132,7 +133,7 @@ def arm_and_reach(geometry: CellGeometry, reach: ReachMap, carry: DrawnCarry) ->
     occupied = np.flatnonzero(reach.pads[0].any(axis=(0, 2)))
     bounds[:, 1] = reach.lower[1] + reach.step * np.array([occupied[0] - 1, occupied[-1] + 2])
     frame_axes(right, FRONT, box_corners(*bounds), margin=0.0)
-    panel_label(right, "b", f"reach of its pad, slice at x = {_metres(base[0])}")
+    panel_label(right, "b", f"reach of its pad, slice at x = {_metres(base[0])}", bare=True)
     return figure
 
 
@@ -152,7 +153,7 @@ def motion_sequence(geometry: CellGeometry, carry: DrawnCarry, columns: int = 2)
             axes, ISOMETRIC, carry.timed.pose[: sample + 1, :3], color="#b00020", linewidth=1.0
         )
         moment = carry.timed.time[sample]
-        panel_label(axes, letter, f"{100 * share:.0f} % of the time, t = {moment:.2f} s")
+        panel_label(axes, letter, f"{100 * share:.0f} % of the time, t = {moment:.2f} s", bare=True)
         frame_axes(axes, ISOMETRIC, points)
     figure.suptitle(carry.label, fontsize=8)
     return figure
@@ -177,7 +178,7 @@ def paths(geometry: CellGeometry, carries: tuple[tuple[DrawnCarry, LineStyle], .
         ends = view.flat(carries[0][0].timed.pose[[0, -1], :3])
         axes.plot(*ends[0], "o", color="black", zorder=5, label="start")
         axes.plot(*ends[1], "*", color="black", markersize=7, zorder=5, label="goal")
-        panel_label(axes, letter, text)
+        panel_label(axes, letter, text, bare=True)
         frame_axes(axes, view, near)
     handles, labels = panels[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=len(handles))
@@ -292,7 +293,7 @@ def meeting(
     )
     for axes, letter, (text, view, points) in zip(figure.subplots(1, 3), "abc", shown, strict=True):
         draw_cell(axes, whole, view, pose, q)
-        panel_label(axes, letter, text)
+        panel_label(axes, letter, text, bare=True)
         frame_axes(axes, view, points, margin=0.0)
     figure.suptitle(title, fontsize=8)
     return figure

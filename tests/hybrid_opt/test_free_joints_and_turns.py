@@ -12,7 +12,8 @@ import hybrid_opt as ho
 from hybrid_opt.bundles.arms import ABB, require_arms
 from hybrid_opt.cell import Cell
 from hybrid_opt.collision.certify import SampledPath, configurations
-from hybrid_opt.display.scene import frame_placements, scene_data
+from hybrid_opt.display.scene import scene_data
+from hybrid_opt.display.solids import frame_placements
 from hybrid_opt.evaluate.evaluation import REASONS, LockedEvaluator
 from studies.research.plain.candidate import PlainJudge
 from symbolic.array import Array

@@ -14,7 +14,7 @@ import pytest
 from PIL import Image
 
 from hybrid_opt.cell import Cell
-from hybrid_opt.display.scene import cell_solids
+from hybrid_opt.display.solids import cell_solids
 from hybrid_opt.evaluate.evaluation import REASONS, CandidateEvaluator
 from hybrid_opt.evaluate.explanation import explain
 from hybrid_opt.indicators.metrics import BindingBound

@@ -21,7 +21,7 @@ from matplotlib.transforms import Bbox
 from numpy.typing import NDArray
 from PIL import Image, ImageSequence
 
-from hybrid_opt.display.scene import frame_placements
+from hybrid_opt.display.solids import frame_placements
 from studies.program import ReportError
 from studies.report import PAGE, looks
 from studies.report.__main__ import main

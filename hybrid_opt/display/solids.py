@@ -1,0 +1,183 @@
+"""The bodies of a cell as triangle meshes, and where they are along a carry.
+
+Meshes of simple shapes are made here: trimesh, which reads those of files, takes longer to start
+than a picture takes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from symbolic.array import Array
+from symbolic.geometry.bodies import ArmGeometry, Frame
+from symbolic.geometry.pairs import CellGeometry
+from symbolic.geometry.pieces import ConvexShape, Hull, box_corners
+from symbolic.records import Box, Capsule, Cylinder, Sphere
+from symbolic.records.content import CacheKey
+from symbolic.records.poses import box_placement, rotation_from_vector
+
+SECTIONS = 24
+"""Facets around a cylinder."""
+
+GROUND_SIZE = 2.5
+"""Fixed bodies at least this long and wide are ground: drawn behind everything [m]."""
+
+
+@dataclass(frozen=True)
+class Solid:
+    """A body as triangles in the frame that it is fixed to.
+
+    Attributes:
+        name, group: of the collision body.
+        frame: what it is fixed to.
+        vertices: (n, 3) [m].
+        faces: (m, 3) indices, outward.
+        is_ground: whether it is a large fixed plate.
+    """
+
+    name: str
+    group: str
+    frame: Frame
+    vertices: Array
+    faces: NDArray[np.int64]
+    is_ground: bool
+
+
+def cell_solids(geometry: CellGeometry) -> tuple[Solid, ...]:
+    """Every collision body of a cell as triangles."""
+    return tuple(_triangles(CacheKey(body, known=body.content)) for body in geometry.bodies)
+
+
+@lru_cache(maxsize=256)
+def _triangles(seen: CacheKey) -> Solid:
+    (body,) = seen.given
+    meshes = [_mesh(piece.shape) for piece in body.pieces]
+    vertices = np.concatenate(
+        [
+            points @ piece.rotation.T + piece.centre
+            for piece, (points, _) in zip(body.pieces, meshes, strict=True)
+        ]
+    )
+    first = np.cumsum([0, *(len(points) for points, _ in meshes)])
+    faces = np.concatenate([f + k for (_, f), k in zip(meshes, first[:-1], strict=True)])
+    extent = np.sort(np.ptp(vertices, axis=0))[::-1]
+    ground = body.frame.kind == "world" and bool(extent[1] >= GROUND_SIZE)
+    for values in (vertices, faces):
+        values.setflags(write=False)
+    return Solid(body.name, body.group, body.frame, vertices, faces, ground)
+
+
+def _mesh(shape: ConvexShape) -> tuple[Array, NDArray[np.int64]]:
+    """Vertices (n, 3) in the shape's own frame and faces (m, 3), outward."""
+    match shape:
+        case Box():
+            return box_corners(shape.size), _BOX_FACES
+        case Hull():
+            return shape.vertices, shape.faces
+        case Cylinder():
+            across = np.array([0.0, shape.radius, shape.radius, 0.0])
+            along = shape.length / 2.0 * np.array([-1.0, -1.0, 1.0, 1.0])
+        case Sphere():
+            angles = np.linspace(-np.pi / 2.0, np.pi / 2.0, SECTIONS // 2 + 1)
+            across, along = shape.radius * np.cos(angles), shape.radius * np.sin(angles)
+        case Capsule():
+            half = np.linspace(0.0, np.pi / 2.0, SECTIONS // 4 + 1)
+            above = shape.radius * np.sin(half) + shape.length / 2.0
+            across = shape.radius * np.cos(np.concatenate([half[::-1], half]))
+            along = np.concatenate([-above[::-1], above])
+    return _revolved(across, along)
+
+
+_BOX_FACES = np.array(
+    [
+        *([1, 3, 0], [4, 1, 0], [0, 3, 2], [2, 4, 0], [1, 7, 3], [5, 1, 4]),
+        *([5, 7, 1], [3, 7, 2], [6, 4, 2], [2, 7, 6], [6, 5, 4], [7, 5, 6]),
+    ]
+)
+"""Of the corners of `box_corners`."""
+
+
+def _revolved(across: Array, along: Array) -> tuple[Array, NDArray[np.int64]]:
+    """The mesh of a curve turned about z, from its lower to its upper end, both on the axis: its
+    distances (n,) from z and places (n,) along it [m]."""
+    rings, angles = len(across) - 2, np.linspace(0.0, 2.0 * np.pi, SECTIONS + 1)[:-1]
+    circle = np.column_stack([np.cos(angles), np.sin(angles), np.ones(SECTIONS)])
+    scales = np.column_stack([across, across, along])[1:-1]
+    ends = np.zeros((2, 3))
+    ends[:, 2] = along[[0, -1]]
+    vertices = np.concatenate([ends[:1], (scales[:, None] * circle).reshape(-1, 3), ends[1:]])
+    here = np.zeros((rings + 2, SECTIONS), dtype=np.int64)
+    here[1:-1] = 1 + np.arange(rings * SECTIONS).reshape(rings, SECTIONS)
+    here[-1] = len(vertices) - 1
+    there = np.roll(here, -1, axis=1)
+    lower = np.stack([here[:-1], there[:-1], here[1:]], axis=-1)
+    upper = np.stack([here[1:], there[:-1], there[1:]], axis=-1)
+    # At either end one triangle of every pair is a line.
+    faces = np.stack([lower, upper], axis=1).reshape(-1, SECTIONS, 3)[1:-1]
+    return vertices, np.swapaxes(faces, 0, 1).reshape(-1, 3)
+
+
+def joint_placements(arm: ArmGeometry, q: Array) -> Array:
+    """(n, n_joints, 4, 4) of an arm's joint frames in the world at joints q (n, n_joints)."""
+    placed = np.empty((*q.shape, 4, 4))
+    T = np.broadcast_to(arm.T_world_root, (len(q), 4, 4))
+    for j in range(q.shape[1]):
+        moved = np.tile(np.eye(4), (len(q), 1, 1))
+        along = np.outer(q[:, j], arm.axes[j])
+        if arm.turning[j]:
+            moved[:, :3, :3] = rotation_from_vector(along)
+        else:
+            moved[:, :3, 3] = along
+        T = T @ arm.origins[j] @ moved
+        placed[:, j] = T
+    return placed
+
+
+def frame_placements(geometry: CellGeometry, pose: Array, q: Array) -> dict[Frame, Array]:
+    """(n, 4, 4) of every frame in the world along n samples: pose (n, 6), q (n, all joints)."""
+    placed = {
+        Frame("world"): np.broadcast_to(np.eye(4), (len(pose), 4, 4)),
+        Frame("box"): box_placement(geometry.workcell.task.orientation, pose),
+    }
+    first = 0
+    for i, arm in enumerate(geometry.arms):
+        count = len(arm.axes)
+        joints = joint_placements(arm, q[:, first : first + count])
+        placed |= {Frame("link", i, j): joints[:, j] for j in range(count)}
+        first += count
+    return placed
+
+
+def extent_points(
+    geometry: CellGeometry, solids: tuple[Solid, ...], pose: Array, q: Array
+) -> Array:
+    """(k, 3) corners of every solid's own bounding box at n samples, the ground left out.
+
+    They frame what a picture has to show: pose (n, 6), q (n, all joints).
+    """
+    placed = frame_placements(geometry, pose, q)
+    points = []
+    for solid in solids:
+        if solid.is_ground:
+            continue
+        lower, upper = solid.vertices.min(axis=0), solid.vertices.max(axis=0)
+        corners = np.array(list(product(*zip(lower, upper, strict=True))))
+        T = placed[solid.frame]
+        moved = corners @ np.swapaxes(T[:, :3, :3], 1, 2) + T[:, None, :3, 3]
+        points.append(moved.reshape(-1, 3))
+    return np.concatenate(points)
+
+
+_VIEWED = 12
+"""Approximate number of a carry's samples by which the viewpoint of its scene is chosen."""
+
+
+def motion_points(geometry: CellGeometry, pose: Array, q: Array) -> Array:
+    """(k, 3) what a picture of a whole motion has to show, see `extent_points`."""
+    every = slice(None, None, max(1, len(pose) // _VIEWED))
+    return extent_points(geometry, cell_solids(geometry), pose[every], q[every])
