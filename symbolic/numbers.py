@@ -17,6 +17,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, is_dataclass, replace
 from functools import cache, cached_property, lru_cache, partial
+from math import prod
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -112,7 +113,7 @@ class _Symbols:
 
     def __call__(self, group: str, key: str, value: Any) -> Any:
         shape = value.shape if isinstance(value, _Later) else np.shape(value)
-        at, size = self._taken[group], int(np.prod(shape, dtype=int))
+        at, size = self._taken[group], prod(shape)
         self._taken[group] = at + size
         found = self._groups[group].symbols[at : at + size]
         return ca.reshape(found, *shape[::-1]).T if len(shape) == 2 else found
@@ -168,8 +169,7 @@ class WorkcellNumbers:
     def sizes(self) -> dict[str, int]:
         """Numbers per group, but for the start postures."""
         return {
-            name: sum(int(np.prod(each.shape, dtype=int)) for each in found)
-            for name, found in self.layout.items()
+            name: sum(prod(each.shape) for each in found) for name, found in self.layout.items()
         }
 
     def vector(self, name: str) -> Array:

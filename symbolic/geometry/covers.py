@@ -59,13 +59,18 @@ def slab_cover(body: CollisionBody) -> tuple[Piece, ...]:
     Simple shapes stand for themselves; a hull gets its smallest box among a few orientations.
     Pieces inside another are dropped, and pieces that fill a common box nearly are merged.
     """
-    cover = [_simple(piece) for piece in body.pieces]
-    cover = _outermost(cover)
+    return _slab_cover(CacheKey(body.pieces, body.name))
+
+
+@lru_cache(maxsize=256)
+def _slab_cover(seen: CacheKey) -> tuple[Piece, ...]:
+    pieces, name = seen.given
+    cover = _outermost([_simple(piece) for piece in pieces])
     while (merged := _merge_once(cover)) is not None:
         cover = _outermost(merged)
-    for piece in body.pieces:
+    for piece in pieces:
         if not _covered(piece, cover):
-            raise CollisionModelError(f"the cover of {body.name!r} does not contain it")
+            raise CollisionModelError(f"the cover of {name!r} does not contain it")
     return tuple(cover)
 
 

@@ -149,8 +149,12 @@ def pair_tolerance(workcell: Workcell, a: CollisionBody, b: CollisionBody) -> fl
     arms that keep to their paths carry a box that they took hold of elsewhere. Only a set that the
     cell states says so.
     """
-    holds = "box" in (a.frame.kind, b.frame.kind) and workcell.uncertainty.stated
-    return workcell.collision.tolerance + (workcell.uncertainty.pad_position if holds else 0.0)
+    return _tolerance(workcell, "box" in (a.frame.kind, b.frame.kind))
+
+
+def _tolerance(workcell: Workcell, of_payload: bool) -> float:
+    held = of_payload and workcell.uncertainty.stated
+    return workcell.collision.tolerance + (workcell.uncertainty.pad_position if held else 0.0)
 
 
 def build_geometry(workcell: Workcell) -> CellGeometry:
@@ -180,32 +184,35 @@ def _sorted_pairs(
     # Pairs within an arm are sorted as if its root were the world: where it stands does not matter.
     at_roots = tuple(b if b.root is None else replace(b, pieces=b.root[1]) for b in bodies)
     rooted = tuple(replace(arm, T_world_root=np.eye(4)) for arm in arms)
-    views = [
-        (at, of, [body.content for body in at], [arm.content for arm in of])
-        for at, of in ((bodies, arms), (at_roots, rooted))
-    ]
     active: list[ActivePair] = []
     excluded: list[ExcludedPair] = []
     near: list[ActivePair] = []
     far: list[ActivePair] = []
     order = digest_of_parts(tuple((body.group, body.frame.joint) for body in bodies))
-    moving = [frozenset(_arms_of(body)) for body in bodies]
+    views = [
+        # Bodies by their content, and where the arms are that move them.
+        (at, of, ["".join((b.content, *(of[k].content for k in _arms_of(b)), order)) for b in at])
+        for at, of in ((bodies, arms), (at_roots, rooted))
+    ]
+    holds = [body.frame.kind == "box" for body in bodies]
+    tolerances = [_tolerance(workcell, False), _tolerance(workcell, True)]
     belong = [(body.group, body.root is not None) for body in bodies]
     for i, j in combinations(range(len(bodies)), 2):
-        a, b = bodies[i], bodies[j]
-        said = ignored.get(frozenset((a.name, b.name)), "") if ignored else ""
-        found = _PairStatus(said, False)
+        said = ignored.get(frozenset((bodies[i].name, bodies[j].name)), "") if ignored else ""
+        found, pair = _PairStatus(said, False), ActivePair(i, j)
         if not said:
-            at, of, contents, places = views[_is_own(*belong[i], *belong[j])]
-            tolerance, both = pair_tolerance(workcell, a, b), moving[i] | moving[j]
-            known = contents[i], contents[j], *(places[k] for k in both), tolerance, order
-            found = _sorted(CacheKey(at[i], at[j], of, tolerance, bodies, known=known))
+            at, of, known = views[_is_own(*belong[i], *belong[j])]
+            tolerance = tolerances[holds[i] or holds[j]]
+            key = CacheKey(
+                at[i], at[j], of, tolerance, bodies, known=(known[i], known[j], tolerance)
+            )
+            found = _sorted(key)
         if found.reason:
             excluded.append(ExcludedPair(i, j, found.reason))
         else:
-            active.append(ActivePair(i, j))
+            active.append(pair)
         if found.possible:
-            (far if found.far else near).append(ActivePair(i, j))
+            (far if found.far else near).append(pair)
     return tuple(active), tuple(excluded), (*near, *far), len(near)
 
 
@@ -280,6 +287,8 @@ def _check_tools(bodies: tuple[CollisionBody, ...], arms: tuple[ArmGeometry, Arm
 
 def _rigid(a: CollisionBody, b: CollisionBody, arms: tuple[ArmGeometry, ArmGeometry]) -> str:
     """The pair does not move against each other: fixed, or held by the exact grasp."""
+    if a.frame != b.frame and "box" not in (a.frame.kind, b.frame.kind):
+        return ""
     for robot in (0, 1):
         left, right = anchor(a, arms, robot), anchor(b, arms, robot)
         if left.frame == right.frame:
@@ -313,8 +322,8 @@ def _always_touching(
     a: CollisionBody, b: CollisionBody, arms: tuple[ArmGeometry, ArmGeometry]
 ) -> str:
     """A pair within an arm (the box it holds included) that touches in every sampled posture."""
-    for robot, arm in enumerate(arms):
-        left, right = anchor(a, arms, robot), anchor(b, arms, robot)
+    for robot in _movers(a, b):
+        arm, left, right = arms[robot], anchor(a, arms, robot), anchor(b, arms, robot)
         group = f"robot {robot + 1}"
         own = {body.group for body in (a, b) if body.carries is None}
         if group not in own or own - {group, "payload"}:
@@ -391,6 +400,13 @@ def _anchored(seen: CacheKey) -> CollisionBody:
     return CollisionBody(body.name, body.group, Frame("link", robot, arm.joints - 1), pieces)
 
 
+def _movers(a: CollisionBody, b: CollisionBody) -> tuple[int, ...]:
+    """The robots that may move one body against the other; both may hold the payload."""
+    if "box" in (a.frame.kind, b.frame.kind):
+        return (0, 1)
+    return tuple(robot for robot in (0, 1) if robot in (a.frame.robot, b.frame.robot))
+
+
 def out_of_reach(
     a: CollisionBody,
     b: CollisionBody,
@@ -403,9 +419,9 @@ def out_of_reach(
         zones = [_zone(body, arms[body.frame.robot], -1) for body in (a, b)]
         gap = _gap(zones[0], (zones[1],))
         return f"out of reach: their zones stay {1e3 * gap:.0f} mm apart" if gap > margin else ""
-    for robot in (0, 1):
+    for robot in _movers(a, b):
         left, right = anchor(a, arms, robot), anchor(b, arms, robot)
-        low, high = sorted((left, right), key=lambda body: body.frame.joint)
+        low, high = (left, right) if left.frame.joint <= right.frame.joint else (right, left)
         if high.frame.robot != robot or low.frame.robot not in (robot, -1):
             continue
         gap = _gap(_zone(high, arms[robot], low.frame.joint), low.pieces)
@@ -427,7 +443,8 @@ def _from_point(piece: Piece, point: Array) -> float:
     shape = piece.shape
     match shape:
         case Box():
-            beyond = [abs(v) - size / 2.0 for v, size in zip((x, y, z), shape.size, strict=True)]
+            a, b, c = shape.size.tolist()
+            beyond = abs(x) - a / 2.0, abs(y) - b / 2.0, abs(z) - c / 2.0
             return hypot(*(max(v, 0.0) for v in beyond))
         case Cylinder():
             over = abs(z) - shape.length / 2.0
@@ -452,8 +469,8 @@ def never_meet(
     joint's range is cut into intervals, each cleared by the distance at its middle, which is
     more than the body can move within half the interval.
     """
-    for robot, arm in enumerate(arms):
-        left, right = anchor(a, arms, robot), anchor(b, arms, robot)
+    for robot in _movers(a, b):
+        arm, left, right = arms[robot], anchor(a, arms, robot), anchor(b, arms, robot)
         low, high = sorted((left, right), key=lambda body: body.frame.joint)
         own_base = (
             low.frame.robot == robot or low.group == f"robot {robot + 1}" or low.carries is not None

@@ -8,6 +8,7 @@ this file, which are exact or err to the safe side; each says which. Lengths in 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import product
 
 import numpy as np
@@ -42,12 +43,12 @@ class Piece:
         pose.setflags(write=False)
         object.__setattr__(self, "pose", pose)
 
-    @property
+    @cached_property
     def centre(self) -> Array:
         """(3,) origin of the shape's frame in the body's frame."""
         return self.pose[:3, 3]
 
-    @property
+    @cached_property
     def rotation(self) -> Array:
         """(3, 3) axes of the shape's frame in the body's frame, as columns."""
         return self.pose[:3, :3]

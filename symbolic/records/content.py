@@ -6,47 +6,58 @@ import hashlib
 import os
 from collections.abc import Hashable
 from dataclasses import fields
-from functools import cache, cached_property
+from functools import cache, cached_property, lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 
-def parts(value: Any, folder: Path) -> list[bytes]:
-    """The content of a record, piece by piece; paths as seen from a folder."""
+def digest_of_parts(value: Any, folder: Path = Path()) -> str:
+    """SHA-256 over the content of a record, part by part; paths as seen from a folder."""
     found: list[bytes] = []
 
     def add(value: Any) -> None:
         kind = _kind(value.__class__)
         if kind == "tuple":
-            found.append(f"tuple {len(value)}".encode())
+            found.append(_tuple_head(len(value)))
             for entry in value:
                 add(entry)
         elif kind == "array":
             found.append(_array_head(value.dtype, value.shape))
-            found.append(value.tobytes())
+            found.append(_counted(value.tobytes()))
+        elif kind == "plain":
+            found.append(_of_plain(value))
         elif kind == "content":
-            found.append(value.content.encode())
+            found.append(_counted(value.content.encode()))
         elif kind == "record":
-            found.append(type(value).__name__.encode())
-            for name in _names(value.__class__):
+            head, names = _record(value.__class__)
+            found.append(head)
+            for name in names:
                 add(getattr(value, name))
         elif kind == "type":
-            found.append(value.__name__.encode())
+            found.append(_counted(value.__name__.encode()))
         elif kind == "path":
-            found.append(os.path.relpath(value, folder).encode(errors="surrogateescape"))
+            text = os.path.relpath(value, folder)
+            found.append(_counted(text.encode(errors="surrogateescape")))
         else:
             # Numbers come back from their representation to the bit.
-            found.append(f"{type(value).__name__} {value!r}".encode(errors="surrogateescape"))
+            found.append(_of_value(value))
 
     add(value)
-    return found
+    return hashlib.sha256(b"".join(found)).hexdigest()
+
+
+def _counted(part: bytes) -> bytes:
+    """A part after its length, which keeps it apart from others."""
+    return len(part).to_bytes(8, "big") + part
 
 
 @cache
 def _kind(of: type) -> str:
     """How values of a type are taken apart: records and arrays are many, and asked often."""
+    if of in (str, int, bool, type(None)):
+        return "plain"
     known = {tuple: "tuple", np.ndarray: "array", type: "type", ContentRecord: "content"}
     for base, kind in known.items():
         if issubclass(of, base):
@@ -56,24 +67,33 @@ def _kind(of: type) -> str:
     return "path" if issubclass(of, Path) else "value"
 
 
+def _of_value(value: object) -> bytes:
+    text = f"{type(value).__name__} {value!r}"
+    return _counted(text.encode(errors="surrogateescape"))
+
+
+_of_plain = lru_cache(maxsize=4096, typed=True)(_of_value)
+"""Of texts and whole numbers: most are keys, names and indices that come again. Floats are not
+among them, because 0.0 and -0.0 are equal."""
+
+
+@cache
+def _tuple_head(length: int) -> bytes:
+    return _counted(f"tuple {length}".encode())
+
+
 @cache
 def _array_head(dtype: np.dtype[Any], shape: tuple[int, ...]) -> bytes:
-    return f"array {dtype} {shape}".encode()
+    return _counted(f"array {dtype} {shape}".encode())
 
 
 @cache
-def _names(kind: Hashable) -> tuple[str, ...]:
+def _record(kind: Hashable) -> tuple[bytes, tuple[str, ...]]:
+    """What the content of a record begins with, and the names of the fields that belong to it."""
     own: Any = kind
-    return tuple(
-        each.name for each in fields(own) if each.name not in ("source", "reading", "text")
-    )
-
-
-def digest_of_parts(value: Any, folder: Path = Path()) -> str:
-    """SHA-256 over `parts`."""
-    # The length before each part keeps them apart.
-    whole = b"".join(len(part).to_bytes(8, "big") + part for part in parts(value, folder))
-    return hashlib.sha256(whole).hexdigest()
+    names = (each.name for each in fields(own))
+    kept = tuple(name for name in names if name not in ("source", "reading", "text"))
+    return _counted(own.__name__.encode()), kept
 
 
 class ContentRecord:
@@ -83,7 +103,7 @@ class ContentRecord:
     def content(self) -> str:
         """Digest of all of it."""
         kind: Any = type(self)
-        return digest_of_parts((kind, tuple(getattr(self, name) for name in _names(kind))))
+        return digest_of_parts((kind, tuple(getattr(self, name) for name in _record(kind)[1])))
 
 
 class CacheKey:
