@@ -162,7 +162,7 @@ def fcl_object(piece: Piece) -> fcl.CollisionObject:
     shape = piece.shape
     match shape:
         case Box():
-            solid = fcl.Box(*(float(length) for length in shape.size))
+            solid = fcl.Box(*shape.size.tolist())
         case Cylinder():
             solid = fcl.Cylinder(shape.radius, shape.length)
         case Sphere():

@@ -88,15 +88,16 @@ def _chain_cover(seen: CacheKey) -> SphereChain:
 
 def close_pairs(geometry: CellGeometry) -> frozenset[tuple[int, int]]:
     """Pairs within an arm whose chains of spheres cannot be told apart in many postures."""
-    found = []
+    bodies, found = geometry.bodies, []
+    # Where an arm stands does not matter.
+    known = [b.content if b.root is None else digest_of_parts(b.root[1]) for b in bodies]
     for pair in geometry.possible:
-        a, b = geometry.bodies[pair.first], geometry.bodies[pair.second]
+        a, b = bodies[pair.first], bodies[pair.second]
         if a.group != b.group:
             continue
         arm = geometry.arms[b.frame.robot]
-        # Where the arm stands does not matter.
-        first = a.content if a.root is None else digest_of_parts(a.root[1])
-        if _often_close(CacheKey(a, b, arm, known=(first, b.content, arm.chain))):
+        of = known[pair.first], known[pair.second], arm.chain
+        if _often_close(CacheKey(a, b, arm, known=of)):
             found.append((pair.first, pair.second))
     return frozenset(found)
 

@@ -7,7 +7,9 @@ import hashlib
 import json
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from copy import deepcopy
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -236,7 +238,7 @@ def changed_text(content: bytes, changes: Mapping[str, Any], file: str) -> bytes
         WorkcellError: with every path that leads nowhere.
         OutsideError: the content is no TOML.
     """
-    data, problems = outside.toml_tables(content), []
+    data, problems = deepcopy(_tables_of(content)), []
     for path, value in changes.items():
         owners = list(_owners(data, path))
         if not owners:
@@ -248,6 +250,12 @@ def changed_text(content: bytes, changes: Mapping[str, Any], file: str) -> bytes
     if problems:
         raise WorkcellError(file, tuple(problems))
     return "".join(_table(data, "")).encode()
+
+
+@lru_cache(maxsize=4)
+def _tables_of(content: bytes) -> dict[str, Any]:
+    """Its tables, not to be modified: many cells are tried out that differ from one."""
+    return outside.toml_tables(content)
 
 
 def _owners(table: Any, path: str) -> Iterator[tuple[dict[str, Any], str]]:
