@@ -287,8 +287,9 @@ def best_of_paths(
             limits = sorted(other.limit for other in known)
             at = limits.index(option.limit)
             low, high = limits[max(at - 1, 0)], limits[min(at + 1, len(limits) - 1)]
-            for limit in np.linspace(low, high, 5)[1:-1]:
-                known += paths.options(float(limit), [option.index]) if low < high else []
+            if low < high:
+                between = np.linspace(low, high, 5)[1:-1]
+                known += paths.options(between, [option.index] * len(between))
             option = ranked(known, goal)[0]
         yield option
 

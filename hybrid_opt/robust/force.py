@@ -9,6 +9,7 @@ fixed by the motion (and the case), the commanded force decides the squeeze.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
 from typing import Annotated
 
 import numpy as np
@@ -33,6 +34,7 @@ from symbolic.contact.worst_cases import least_distance
 from symbolic.errors import SettingsError
 from symbolic.read.checks import PATCH_OVERLAP, pads_beside
 from symbolic.records import Uncertainty, Workcell
+from symbolic.records.content import CacheKey
 
 BATCH = 100_000
 """Samples that are evaluated at once."""
@@ -169,6 +171,17 @@ class RobustModel:
         """
         self.workcell = workcell
         self._cases = CaseForces(workcell, cache)
+        # Many motions are asked about under a few sets.
+        self._worst = lru_cache(maxsize=8)(self._checked_cases)
+
+    def _worst_cases(self, uncertainty: Uncertainty, leader: int) -> Array:
+        """`worst_cases` of a set that leaves something, see `check_set`; not to be modified."""
+        return self._worst(CacheKey(uncertainty, leader, known=(id(uncertainty), leader)))
+
+    def _checked_cases(self, seen: CacheKey) -> Array:
+        uncertainty, leader = seen.given
+        check_set(self.workcell, uncertainty)
+        return worst_cases(self.workcell, uncertainty, leader)
 
     def least_squeeze(self, motion: HeldMotion, cases: Array, leader: int = 0) -> Array:
         """(k, n, 2) normal forces to command [N] that hold each of k cases (k, 18) at n samples; of
@@ -188,8 +201,11 @@ class RobustModel:
 
     def nominal(self, motion: HeldMotion, leader: int = 0) -> Array:
         """(n, 2) least normal forces of the cell as it is described [N], see `least_squeeze`."""
-        case = nominal_case(self.workcell)[None]
-        return np.asarray(self.least_squeeze(motion, case, leader)[0])
+        return np.asarray(self.least_squeeze(motion, self._nominal[None], leader)[0])
+
+    @cached_property
+    def _nominal(self) -> Array:
+        return nominal_case(self.workcell)
 
     def hold(
         self, motion: HeldMotion, uncertainty: Uncertainty, leader: int = 0
@@ -205,8 +221,7 @@ class RobustModel:
         """
         if leader not in (0, 1):
             raise SettingsError(f"leader {leader}: give 0 or 1, the index of an arm")
-        check_set(self.workcell, uncertainty)
-        worst = self.least_squeeze(motion, worst_cases(self.workcell, uncertainty, leader), leader)
+        worst = self.least_squeeze(motion, self._worst_cases(uncertainty, leader), leader)
         follower, share = 1 - leader, self._cases.leading_share(leader)
         force = ruling_cases(worst, uncertainty, leader, leading_share=share).force
         force[np.isnan(force)] = np.inf
@@ -228,8 +243,7 @@ class RobustModel:
         Args:
             above: (n,) what is commanded anyway, or one for all [N]; less is not told.
         """
-        check_set(self.workcell, uncertainty)
-        cases, n = worst_cases(self.workcell, uncertainty, leader), len(motion.pose)
+        cases, n = self._worst_cases(uncertainty, leader), len(motion.pose)
         few = evenly(n, FEW)
         at_few = box_motion(motion).at(few)
         planned = self.nominal(at_few, leader)[:, 1 - leader]
@@ -282,8 +296,7 @@ class RobustModel:
             raise SettingsError(
                 f"no force was found that holds every case ({chosen}); make its ranges smaller"
             )
-        nominal = self.least_squeeze(motion, nominal_case(self.workcell)[None], leader)[0]
-        return RobustForce(leader, chosen, nominal, commanded, leading)
+        return RobustForce(leader, chosen, self.nominal(motion, leader), commanded, leading)
 
     def check(
         self,
