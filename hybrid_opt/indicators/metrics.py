@@ -6,6 +6,9 @@ everything that is compared.
 
 A bound of a decision variable that an optimum lies on may have decided it: wider ones might allow
 better carries. One that none lies on decided nothing but where the search looked.
+
+moocore and SciPy are imported where they compute: both take long to start, and a carry needs
+neither.
 """
 
 from __future__ import annotations
@@ -13,7 +16,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-import moocore
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -56,6 +58,8 @@ def non_dominated(objectives: ArrayLike, feasible: ArrayLike | None = None) -> M
         objectives: (n, n_obj).
         feasible: (n,) bool, None for all.
     """
+    import moocore
+
     values = np.asarray(objectives, dtype=np.float64)
     candidates = np.isfinite(values).all(axis=1)
     if feasible is not None:
@@ -90,6 +94,8 @@ def hypervolume(front: ArrayLike, reference: ArrayLike = REFERENCE_POINT) -> flo
 
     Source: Zitzler and Thiele 1999; computed by moocore (Fonseca et al. 2006).
     """
+    import moocore
+
     points = np.asarray(front, dtype=np.float64)
     if len(points) == 0:
         return 0.0
@@ -103,6 +109,8 @@ def igd(front: ArrayLike, reference_front: ArrayLike) -> float:
     Source: Coello Coello and Reyes Sierra 2004, with the mean of distances (not the root of
     their squared sum).
     """
+    import moocore
+
     if len(np.asarray(front)) == 0:
         return float("inf")
     return float(
@@ -118,6 +126,8 @@ def igd_plus(front: ArrayLike, reference_front: ArrayLike) -> float:
 
     Source: Ishibuchi, Masuda, Tanigaki and Nojima 2015.
     """
+    import moocore
+
     if len(np.asarray(front)) == 0:
         return float("inf")
     return float(
@@ -135,7 +145,6 @@ def spacing(front: ArrayLike) -> float:
     Says nothing about convergence or extent, so never use it alone.
     Source: Schott 1995.
     """
-    # Not imported at the top: SciPy takes long to start, and evaluations alone do not need it.
     from scipy.spatial import cKDTree
 
     points = np.asarray(front, dtype=np.float64)
