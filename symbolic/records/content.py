@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Hashable
+from collections.abc import Hashable, Iterable
 from dataclasses import fields
 from functools import cache, cached_property, lru_cache
 from pathlib import Path
@@ -17,34 +17,33 @@ def digest_of_parts(value: Any, folder: Path = Path()) -> str:
     """SHA-256 over the content of a record, part by part; paths as seen from a folder."""
     found: list[bytes] = []
 
-    def add(value: Any) -> None:
-        kind = _kind(value.__class__)
-        if kind == "tuple":
-            found.append(_tuple_head(len(value)))
-            for entry in value:
-                add(entry)
-        elif kind == "array":
-            found.append(_array_head(value.dtype, value.shape))
-            found.append(_counted(value.tobytes()))
-        elif kind == "plain":
-            found.append(_of_plain(value))
-        elif kind == "content":
-            found.append(_counted(value.content.encode()))
-        elif kind == "record":
-            head, names = _record(value.__class__)
-            found.append(head)
-            for name in names:
-                add(getattr(value, name))
-        elif kind == "type":
-            found.append(_counted(value.__name__.encode()))
-        elif kind == "path":
-            text = os.path.relpath(value, folder)
-            found.append(_counted(text.encode(errors="surrogateescape")))
-        else:
-            # Numbers come back from their representation to the bit.
-            found.append(_of_value(value))
+    def add(values: Iterable[Any]) -> None:
+        for value in values:
+            kind = _kind(value.__class__)
+            if kind == "plain":
+                found.append(_of_plain(value))
+            elif kind == "tuple":
+                found.append(_tuple_head(len(value)))
+                add(value)
+            elif kind == "array":
+                found.append(_array_head(value.dtype, value.shape))
+                found.append(_counted(value.tobytes()))
+            elif kind == "content":
+                found.append(_counted(value.content.encode()))
+            elif kind == "record":
+                head, names = _record(value.__class__)
+                found.append(head)
+                add([getattr(value, name) for name in names])
+            elif kind == "type":
+                found.append(_counted(value.__name__.encode()))
+            elif kind == "path":
+                text = os.path.relpath(value, folder)
+                found.append(_counted(text.encode(errors="surrogateescape")))
+            else:
+                # Numbers come back from their representation to the bit.
+                found.append(_of_value(value))
 
-    add(value)
+    add((value,))
     return hashlib.sha256(b"".join(found)).hexdigest()
 
 
