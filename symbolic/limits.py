@@ -7,6 +7,7 @@ a sample is a function of (u'', u'^2) whose coefficients lie packed in one vecto
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -211,7 +212,7 @@ def limit_numbers(workcell: Workcell) -> dict[str, ca.SX]:
 
 
 def _held(
-    workcell: Workcell, blocks: dict[str, ca.SX], a: ca.SX, w: ca.SX, detached: Detached
+    workcell: Workcell, blocks: dict[str, ca.SX], a: ca.SX, w: ca.SX, detached: Detached | None
 ) -> HeldLoad:
     """Contact wrenches along the axes of contact 1 from the blocks force and moment."""
     by = [blocks["force"][3 * k : 3 * k + 3] for k in range(3)]
@@ -252,10 +253,10 @@ def force_functions(workcell: Workcell) -> tuple[ca.Function, ca.Function]:
         )
     blocks = {name: ca.SX.sym(name, sizes[name]) for name in ("force", "moment")}
     a, w = ca.SX.sym("a"), ca.SX.sym("w")
-    detached: Detached = []
-    value = _held(workcell, blocks, a, w, detached).normal
     sample, held = ca.vertcat(*blocks.values()), sx_given(workcell.payload)
-    return _with_slopes(names, value, sample, (a, w), held, detached)
+    return _with_slopes(
+        names, lambda d: (_held(workcell, blocks, a, w, d).normal,), sample, (a, w), held
+    )
 
 
 def _load_function(workcell: Workcell) -> ca.Function:
@@ -304,9 +305,9 @@ def ratio_functions(workcell: Workcell) -> tuple[ca.Function, ca.Function]:
     """Limits that are not convex, at one sample, and their derivatives by (u'', u'^2).
 
     Both take force (9,), moment (6,), torque and wrench blocks of `LimitLayout` as one input, then
-    u'' and u'^2. `limit_ratios` gives `contact_limits`' ratios; `limit_slopes` gives the same and
-    their derivatives (joints + 2,) by u'' and by u'^2. Where a program finds the forces, shifts of
-    the pressure are no limit and count as none.
+    u'' and u'^2. `limit_ratios` gives `contact_limits`' ratios, and both normal forces (2,) [N];
+    `limit_slopes` the ratios and their derivatives (joints + 2,) by u'' and by u'^2. Where a
+    program finds the forces, shifts of the pressure are no limit and count as none.
     """
     sizes = limit_layout(workcell).sizes
     names = ("force", "moment", "torque", "wrench")
@@ -314,18 +315,18 @@ def ratio_functions(workcell: Workcell) -> tuple[ca.Function, ca.Function]:
         return _program_ratios(workcell)
     blocks = {name: ca.SX.sym(name, sizes[name]) for name in names}
     a, w = ca.SX.sym("a"), ca.SX.sym("w")
-    detached: Detached = []
-    _, ratios = contact_limits(workcell, blocks, (a, w), detached)
     sample, held = ca.vertcat(*blocks.values()), sx_given(workcell.payload)
     called = "limit_ratios", "limit_slopes"
-    return _with_slopes(called, ratios, sample, (a, w), held, detached)
+    return _with_slopes(
+        called, lambda d: contact_limits(workcell, blocks, (a, w), d), sample, (a, w), held
+    )
 
 
 def contact_limits(
     workcell: Workcell,
     blocks: dict[str, ca.SX],
     timing: tuple[ca.SX, ca.SX],
-    detached: Detached,
+    detached: Detached | None,
 ) -> tuple[ca.SX, ca.SX]:
     """What depends on the contact forces at one sample.
 
@@ -336,8 +337,8 @@ def contact_limits(
         detached: see `symbolic.contact.soft_finger.Detached`.
 
     Returns:
-        Normal forces (2,) [N]; ratios (joints + 2,): joint torques over their limits, signed, then
-        the shifts of both centres of pressure over their patch radii.
+        Ratios (joints + 2,): joint torques over their limits, signed, then the shifts of both
+        centres of pressure over their patch radii; normal forces (2,) [N].
     """
     (a, w), joints = timing, limit_layout(workcell).joints
     held = _held(workcell, blocks, a, w, detached)
@@ -357,7 +358,7 @@ def contact_limits(
         ca.sqrt(ca.sumsqr(moved) + 1e-24) / contact.patch_radius
         for moved, contact in zip((held.shift_1, held.shift_2), workcell.contacts, strict=True)
     ]
-    return held.normal, ca.vertcat(*ratios)
+    return ca.vertcat(*ratios), held.normal
 
 
 def _program_ratios(workcell: Workcell) -> tuple[ca.Function, ca.Function]:
@@ -386,35 +387,38 @@ def _program_ratios(workcell: Workcell) -> tuple[ca.Function, ca.Function]:
         return ca.vertcat(ca.mtimes(arms[0], one), ca.mtimes(arms[1], other))
 
     ratios = ca.mtimes(own, ca.vertcat(*inputs[1:], 1.0))
-    held, by_load = soft.wrenches(slopes=True)(load, *given)
+    held, by_load, _ = soft.wrenches(slopes=True)(load, *given)
     slopes = own[:, :2] + on_joints(ca.mtimes(by_load, by_timing))
-    alone = soft.wrenches(slopes=False)(load, *given)
+    alone, normal = soft.wrenches(slopes=False)(load, *given)
     inputs += given
     whole = [ratios + on_joints(held), *ca.horzsplit(slopes)]
     return (
-        ca.Function("limit_ratios", inputs, [ca.vertcat(ratios + on_joints(alone), none)]),
+        ca.Function("limit_ratios", inputs, [ca.vertcat(ratios + on_joints(alone), none), normal]),
         ca.Function("limit_slopes", inputs, [ca.vertcat(value, none) for value in whole]),
     )
 
 
 def _with_slopes(
     names: tuple[str, str],
-    value: ca.SX,
+    of: Callable[[Detached | None], tuple[ca.SX, ...]],
     sample: ca.SX,
     timing: tuple[ca.SX, ca.SX],
     given: dict[str, ca.SX],
-    detached: Detached,
 ) -> tuple[ca.Function, ca.Function]:
-    """A function of blocks, u'', u'^2 and numbers, and the same with its derivatives by u'' and
-    u'^2."""
-    value, (a, w) = ca.densify(value), timing
-    outputs = [value, *[ca.densify(ca.jacobian(value, z)) for z in timing]]
+    """A function of blocks, u'', u'^2 and numbers, and its first value with the derivatives by u''
+    and u'^2."""
+    detached: Detached = []
+    value, (a, w) = ca.densify(of(detached)[0]), timing
+    slopes = [value, *[ca.densify(ca.jacobian(value, z)) for z in timing]]
     for symbol, solved in detached:
-        outputs = ca.substitute(outputs, [symbol], [solved])
+        slopes = ca.substitute(slopes, [symbol], [solved])
     inputs = {"sample": sample, "acceleration": a, "squared_speed": w, **given}
-    called = ["value", "by_acceleration", "by_squared_speed"]
+    # Values alone do not need the steps that derivatives do.
+    alone = [ca.densify(value) for value in of(None)]
     first, second = (
-        ca.Function(name, [*inputs.values()], ca.cse(outputs[:n]), [*inputs], called[:n])
-        for name, n in zip(names, (1, 3), strict=True)
+        named_function(
+            name, inputs, {f"result_{k}": part for k, part in enumerate(parts)}, cse=True
+        )
+        for name, parts in zip(names, (alone, slopes), strict=True)
     )
     return first, second

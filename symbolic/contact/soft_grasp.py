@@ -91,7 +91,8 @@ class SoftGrasp:
 
     def wrenches(self, slopes: bool) -> ca.Function:
         """load (6,) to wrenches (6 k,) of all pads, see `symbolic.contact.grasp.grasp_wrenches`,
-        and where asked for, to by_load (6 k, 6)."""
+        and where asked for, to by_load (6 k, 6);
+        last, to normal (2,)."""
         load, state = ca.MX.sym("load", LOAD_SIZE), ca.SX.sym("state", self.size)
         handed = mx_symbols(self.given)
         own = wrenches_of(self.grasp, ca.vertsplit(state, self.ends))
@@ -100,6 +101,7 @@ class SoftGrasp:
         if slopes:
             by_state = ca.jacobian(outputs[0], state)
             outputs.append(ca.mtimes(by_state, _Local(self, state).by_load()))
+        outputs.append(ca.mtimes(self.normals, state))
         results = ca.cse([ca.densify(value) for value in outputs])
         whole = ca.Function("whole", [state, *self.given.values()], results)
         found = whole.call([self.solved(load, handed), *handed.values()])

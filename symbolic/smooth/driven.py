@@ -146,7 +146,7 @@ def _value(model: CellModel, inputs: list[ca.SX], detached: Detached) -> ca.SX:
         in_box, centre = ca.mtimes(axes, force), ca.SX(number(payload.centre_of_mass))
         forces, ratios = ca.vertcat(in_box, ca.mtimes(axes, moment) + ca.cross(centre, in_box)), []
     else:
-        forces, found = contact_limits(workcell, block, (a, w), detached)
+        found, forces = contact_limits(workcell, block, (a, w), detached)
         ratios = [found]
     if workcell.task.allocation == "paper":
         tangential = ca.sqrt(force[0] ** 2 + force[1] ** 2 + TANGENT_FLOOR**2)

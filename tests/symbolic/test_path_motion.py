@@ -226,7 +226,7 @@ def test_torques_and_shifts_are_those_of_the_load_and_the_arms() -> None:
     packed = np.hstack([block(name) for name in ("force", "moment", "torque", "wrench")])
     for k in range(PLACES):
         a, w = rng.normal(scale=0.3), rng.uniform(0.0, 0.4)
-        found = np.array(values(packed[k], a, w)).reshape(-1)
+        found, normal = (np.array(part).reshape(-1) for part in values(packed[k], a, w))
         rate = motion["pose_first"][k] * np.sqrt(w)
         second = motion["pose_second"][k] * w + motion["pose_first"][k] * a
         loads = dict(zip(LOAD_OUTPUTS, load(motion["pose"][k], rate, second), strict=True))
@@ -239,13 +239,14 @@ def test_torques_and_shifts_are_those_of_the_load_and_the_arms() -> None:
         shifts = np.array(loads["pressure_shift"]).reshape(-1) / [0.02, 0.04]
         expected = np.concatenate([np.concatenate(torques) / limits_of("torque_max"), shifts])
         np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-8)
+        np.testing.assert_allclose(normal, np.array(loads["normal_force"]).reshape(-1), rtol=1e-9)
 
         same, by_a, by_w = (np.array(part).reshape(-1) for part in slopes(packed[k], a, w))
         np.testing.assert_allclose(same, found, atol=1e-14)
         step = 1e-6
         for slope, da, dw in ((by_a, step, 0.0), (by_w, 0.0, step)):
-            ahead = np.array(values(packed[k], a + da, w + dw)).reshape(-1)
-            behind = np.array(values(packed[k], a - da, w - dw)).reshape(-1)
+            ahead = np.array(values(packed[k], a + da, w + dw)[0]).reshape(-1)
+            behind = np.array(values(packed[k], a - da, w - dw)[0]).reshape(-1)
             np.testing.assert_allclose(slope, (ahead - behind) / (2.0 * step), atol=2e-5)
 
 

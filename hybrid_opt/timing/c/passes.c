@@ -79,17 +79,18 @@ typedef int casadi_function(const double**, double**, long long*, double*, int);
 
 /* One of CasADi's functions of a sample, u'' and u'^2, and its results, unused ones null. */
 static void ask(casadi_function* function, const problem* p, const double* f, double a, double w,
-                double* value, double* by_a, double* by_w) {
+                double* first, double* second, double* third) {
   const double* arg[ROOM_ARG] = {f + AT_FORCE, &a, &w};
-  double *res[ROOM_RES] = {value}, room[ROOM_W];
+  double *res[ROOM_RES] = {first, second, third}, room[ROOM_W];
   long long iw[ROOM_IW];
   arg[3] = p->held;
-  if (by_a) { res[1] = by_a; res[2] = by_w; }
   function(arg, res, iw, room, 0);
 }
 
-static void ratios_at(const problem* p, const double* f, double a, double w, double* ratios) {
-  ask(limit_ratios, p, f, a, w, ratios, 0, 0);
+/* Limits that are not convex, and both normal forces. */
+static void ratios_at(const problem* p, const double* f, double a, double w, double* ratios,
+                      double* n) {
+  ask(limit_ratios, p, f, a, w, ratios, n, 0);
 }
 
 static void slopes_at(const problem* p, const double* f, double a, double w, double* r,
@@ -123,41 +124,50 @@ static int differ(double* known, const double* asked, int count) {
   return found;
 }
 
-/* Forces or ratios (count,) of two samples, one after the other in `values`. */
+/* The same of two samples: (2, 2) normal forces, (2, RATIOS) ratios. */
 #if IN_PAIRS
 typedef int pair_function(const lanes_real**, lanes_real**, lanes_int*, lanes_real*);
 
-static void ask_both(pair_function* function, const problem* p, const double* const f[2],
-                     int inputs, double a, const double w[2], double* values, int count) {
-  lanes_real given[SIZE], as = {a, a}, ws = {w[0], w[1]}, found[RATIOS];
-  lanes_real room[limit_forces_in_pairs_W + limit_ratios_in_pairs_W + 1];
-  const lanes_real* arg[limit_ratios_in_pairs_ARG] = {given, &as, &ws, (const lanes_real*)p->held};
-  lanes_real* res[limit_ratios_in_pairs_RES] = {found};
-  lanes_int iw[1];
-  for (int k = 0; k < inputs; ++k) given[k] = (lanes_real){f[0][AT_FORCE + k], f[1][AT_FORCE + k]};
-  function(arg, res, iw, room);
+static void apart(const lanes_real* found, int count, double* values) {
   for (int k = 0; k < count; ++k) {
     values[k] = found[k][0];
     values[count + k] = found[k][1];
   }
+}
+
+static void ask_both(pair_function* function, const problem* p, const double* const f[2],
+                     int inputs, double a, const double w[2], lanes_real* first,
+                     lanes_real* second) {
+  lanes_real given[SIZE], as = {a, a}, ws = {w[0], w[1]};
+  lanes_real room[limit_forces_in_pairs_W + limit_ratios_in_pairs_W + 1];
+  const lanes_real* arg[limit_ratios_in_pairs_ARG] = {given, &as, &ws, (const lanes_real*)p->held};
+  lanes_real* res[limit_ratios_in_pairs_RES] = {first, second};
+  lanes_int iw[1];
+  for (int k = 0; k < inputs; ++k) given[k] = (lanes_real){f[0][AT_FORCE + k], f[1][AT_FORCE + k]};
+  function(arg, res, iw, room);
 }
 #endif
 
 static void both_forces(const problem* p, const double* const f[2], double a, const double w[2],
                         double* n) {
 #if IN_PAIRS
-  ask_both(limit_forces_in_pairs, p, f, AT_TORQUE - AT_FORCE, a, w, n, 2);
+  lanes_real found[2];
+  ask_both(limit_forces_in_pairs, p, f, AT_TORQUE - AT_FORCE, a, w, found, 0);
+  apart(found, 2, n);
 #else
   for (int k = 0; k < 2; ++k) normal_forces(p, f[k], a, w[k], n + 2 * k);
 #endif
 }
 
 static void both_ratios(const problem* p, const double* const f[2], double a, const double w[2],
-                        double* ratios) {
+                        double* ratios, double* n) {
 #if IN_PAIRS
-  ask_both(limit_ratios_in_pairs, p, f, SIZE - AT_FORCE, a, w, ratios, RATIOS);
+  lanes_real found[RATIOS], normal[2];
+  ask_both(limit_ratios_in_pairs, p, f, SIZE - AT_FORCE, a, w, found, normal);
+  apart(found, RATIOS, ratios);
+  apart(normal, 2, n);
 #else
-  for (int k = 0; k < 2; ++k) ratios_at(p, f[k], a, w[k], ratios + RATIOS * k);
+  for (int k = 0; k < 2; ++k) ratios_at(p, f[k], a, w[k], ratios + RATIOS * k, n + 2 * k);
 #endif
 }
 
@@ -175,8 +185,11 @@ static double (*end_ratios(const problem* p, int interval, double x, double y))[
   answers* known = p->known + interval;
   const double asked[2] = {x, y}, *f = p->samples + 2 * interval * SIZE;
   const double* const ends[2] = {f, f + 2 * SIZE};
-  if (differ(known->at[1], asked, 2))
-    both_ratios(p, ends, HALF * (y - x), asked, known->ratios[0]);
+  if (differ(known->at[1], asked, 2)) {
+    both_ratios(p, ends, HALF * (y - x), asked, known->ratios[0], known->forces[0]);
+    known->at[0][0] = x;
+    known->at[0][1] = y;
+  }
   return known->ratios;
 }
 
@@ -566,8 +579,8 @@ static void judge_inside(const problem* p, int interval, double factor, largest_
   const int limits_ratios = p->torque || p->pressure;
   double f[2][SIZE], n[2][2], ratios[2][RATIOS];
   largest_use middle[KINDS] = {{0}};
-  normal_forces(p, sample, a, half, n[0]);
-  if (limits_ratios) ratios_at(p, sample, a, half, ratios[0]);
+  if (limits_ratios) ratios_at(p, sample, a, half, ratios[0], n[0]);
+  else normal_forces(p, sample, a, half, n[0]);
   judge(p, sample, (interval + 0.5) / INTERVALS, a, half, n[0], limits_ratios ? ratios[0] : 0,
         middle, peak);
   for (int k = 0; k < KINDS; ++k)
@@ -577,8 +590,8 @@ static void judge_inside(const problem* p, int interval, double factor, largest_
   const double w[2] = {x + 0.25 * (y - x), x + 0.75 * (y - x)};
   for (int k = 0; k < 2; ++k)
     between(p, 2.0 * (interval + shares[k]), near ? SIZE : AT_TORQUE, f[k]);
-  both_forces(p, quarters, a, w, n[0]);
-  if (near) both_ratios(p, quarters, a, w, ratios[0]);
+  if (near) both_ratios(p, quarters, a, w, ratios[0], n[0]);
+  else both_forces(p, quarters, a, w, n[0]);
   for (int k = 0; k < 2; ++k)
     judge(p, f[k], (interval + shares[k]) / INTERVALS, a, w[k], n[k], near ? ratios[k] : 0, use,
           peak);
@@ -590,8 +603,8 @@ static double judge_all(const problem* p, double factor, largest_use* use, doubl
   reset(use, peak);
   for (int i = 0; i < INTERVALS; ++i) {
     const double x = factor * factor * p->squared[i], y = factor * factor * p->squared[i + 1];
-    const double(*n)[2] = end_forces(p, i, x, y);
     const double(*ratios)[RATIOS] = p->torque || p->pressure ? end_ratios(p, i, x, y) : 0;
+    const double(*n)[2] = end_forces(p, i, x, y);
     for (int end = 0; end < 2; ++end)
       judge(p, p->samples + 2 * (i + end) * SIZE, (i + end) / (double)INTERVALS, HALF * (y - x),
             end ? y : x, n[end], ratios ? ratios[end] : 0, use, peak);
@@ -636,8 +649,7 @@ static double judge_rest(problem* p, largest_use* use, double* peak) {
   for (int i = 0; i <= INTERVALS; ++i) {
     const double* f = p->samples + 2 * i * SIZE;
     double n[2], *ratios = p->rest + i * RATIOS;
-    normal_forces(p, f, 0.0, 0.0, n);
-    ratios_at(p, f, 0.0, 0.0, ratios);
+    ratios_at(p, f, 0.0, 0.0, ratios, n);
     judge(p, f, i / (double)INTERVALS, 0.0, 0.0, n, p->torque || p->pressure ? ratios : 0, use,
           peak);
     p->rest_force[i] = larger(n[0], n[1]);
