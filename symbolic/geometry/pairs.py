@@ -322,13 +322,12 @@ def _always_touching(
     a: CollisionBody, b: CollisionBody, arms: tuple[ArmGeometry, ArmGeometry]
 ) -> str:
     """A pair within an arm (the box it holds included) that touches in every sampled posture."""
+    own = {body.group for body in (a, b) if body.carries is None}
     for robot in _movers(a, b):
-        arm, left, right = arms[robot], anchor(a, arms, robot), anchor(b, arms, robot)
         group = f"robot {robot + 1}"
-        own = {body.group for body in (a, b) if body.carries is None}
         if group not in own or own - {group, "payload"}:
             continue
-        low, high = sorted((left, right), key=lambda body: body.frame.joint)
+        arm, (low, high) = arms[robot], _ordered(a, b, arms, robot)
         postures = np.random.default_rng(0).uniform(arm.lower, arm.upper, (POSTURES, arm.joints))
         for q in postures:
             T = relative_placement(arm, low.frame.joint, high.frame.joint, q)
@@ -407,6 +406,14 @@ def _movers(a: CollisionBody, b: CollisionBody) -> tuple[int, ...]:
     return tuple(robot for robot in (0, 1) if robot in (a.frame.robot, b.frame.robot))
 
 
+def _ordered(
+    a: CollisionBody, b: CollisionBody, arms: tuple[ArmGeometry, ArmGeometry], robot: int
+) -> tuple[CollisionBody, CollisionBody]:
+    """Both bodies as `anchor` sees them, the one on the later joint last."""
+    left, right = anchor(a, arms, robot), anchor(b, arms, robot)
+    return (left, right) if left.frame.joint <= right.frame.joint else (right, left)
+
+
 def out_of_reach(
     a: CollisionBody,
     b: CollisionBody,
@@ -420,8 +427,7 @@ def out_of_reach(
         gap = _gap(zones[0], (zones[1],))
         return f"out of reach: their zones stay {1e3 * gap:.0f} mm apart" if gap > margin else ""
     for robot in _movers(a, b):
-        left, right = anchor(a, arms, robot), anchor(b, arms, robot)
-        low, high = (left, right) if left.frame.joint <= right.frame.joint else (right, left)
+        low, high = _ordered(a, b, arms, robot)
         if high.frame.robot != robot or low.frame.robot not in (robot, -1):
             continue
         gap = _gap(_zone(high, arms[robot], low.frame.joint), low.pieces)
@@ -470,12 +476,11 @@ def never_meet(
     more than the body can move within half the interval.
     """
     for robot in _movers(a, b):
-        arm, left, right = arms[robot], anchor(a, arms, robot), anchor(b, arms, robot)
-        low, high = sorted((left, right), key=lambda body: body.frame.joint)
-        own_base = (
-            low.frame.robot == robot or low.group == f"robot {robot + 1}" or low.carries is not None
-        )
-        if high.frame.robot != robot or not own_base or high.frame.joint - low.frame.joint != 2:
+        arm, (low, high) = arms[robot], _ordered(a, b, arms, robot)
+        if high.frame.robot != robot or high.frame.joint - low.frame.joint != 2:
+            continue
+        own = low.frame.robot == robot or low.group == f"robot {robot + 1}"
+        if not own and low.carries is None:
             continue
         first = low.frame.joint + 1
         if not all(arm.turning[first : first + 2]):
