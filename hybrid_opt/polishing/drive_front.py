@@ -40,7 +40,7 @@ GENTLE, FAST = 0.02, 0.6
 at rest."""
 
 LEAST_GAIN = 1e-3
-"""Share of the duration that two steps in a row bring, or the next force limit follows."""
+"""Share of the duration that two rounds in a row bring, or the next force limit follows."""
 
 BETWEEN = (0.125, 0.25, 0.375, 0.5, 0.625, 0.75, 0.875)
 """Shares of the way from one path of the front to the next that are tried as paths, too."""

@@ -275,8 +275,8 @@ class Climb(Generic[AnyPoint, AnyStep]):
         """Some more rounds, fewer where it ends.
 
         Args:
-            least_gain: share of the level that two steps in a row have to bring, or it is left.
-                Refused steps teach, and say nothing of gains.
+            least_gain: share of the level that two rounds in a row have to bring once a step was
+                taken, or it is left. Before that, refused steps teach, and say nothing of gains.
         """
         solution, levels = self.solution, [self.best.level]
         for _ in range(rounds):
@@ -284,9 +284,9 @@ class Climb(Generic[AnyPoint, AnyStep]):
                 break
             solution.rounds += 1
             self._round()
-            if self.best.level != levels[-1]:
+            if len(levels) > 1 or self.best.level != levels[0]:
                 levels.append(self.best.level)
-            if len(levels) > 2 and levels[-3] - levels[-1] < least_gain * levels[-1]:
+            if len(levels) > 3 and levels[-3] - levels[-1] < least_gain * levels[-1]:
                 break
         solution.x = self.best.x
         if self._last is not None:

@@ -130,7 +130,7 @@ class Foretold(Way[ClimbPoint, Step]):
         return None
 
 
-def test_steps_that_bring_little_end_a_climb_and_refused_ones_do_not() -> None:
+def test_rounds_that_bring_little_end_a_climb_after_its_first_step() -> None:
     climb = Climb(Foretold([None, None, None, 0.1, 1e-5, 1e-5, 0.1]), HERE, 0.2)
     assert climb.go_on(7, least_gain=1e-3).rounds == 6
     assert climb.best.level == pytest.approx(0.9 - 2e-5)
