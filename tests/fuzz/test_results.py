@@ -27,9 +27,8 @@ from studies.report.data import gather_carries
 from symbolic.read.cell import load
 from tests.fuzz.damage import Bytes, Tree, byte_damage, tree_damage
 from tests.fuzz.promises import MANY, kept
-from tests.symbolic.cells import ROOT
+from tests.symbolic.cells import RACK
 
-TRANSFER = ROOT / "studies" / "workcells" / "transfer.toml"
 EVALUATIONS, MARK = "evaluations.csv.gz", "replica.json"
 
 
@@ -41,7 +40,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     fill, probe = FillSettings(solved=3, members=3, attempts=1), ProbeSettings(1, 1, rounds=1)
     study = StudySettings(PolishSettings(attempts=1, fill=fill, probe=probe), report=False)
     execution = ExecutionSettings(root, jobs=1)
-    run_study(load(TRANSFER), campaign, execution, Progress(shown=False), study)
+    run_study(load(RACK), campaign, execution, Progress(shown=False), study)
     return root
 
 

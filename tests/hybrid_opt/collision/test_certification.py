@@ -149,7 +149,7 @@ def test_what_no_proof_can_show_is_given_up_early(
     # Lowered, the box passes boards so closely that nothing can be proven.
     heights = evaluator.workcell.task.free_entries[1] == 2
     x[:, heights] -= np.linspace(0.0, 0.03, len(x))[:, None]
-    x = x[evaluator.evaluate(x).feasible]
+    x = x[evaluator.evaluate(x).feasible][-30:]
     before = judge.calls
     early = [evaluator.certificate(one) for one in x]
     between = judge.calls
@@ -157,7 +157,7 @@ def test_what_no_proof_can_show_is_given_up_early(
     late = [evaluator.certificate(one) for one in x]
     assert [one.is_free for one in early] == [one.is_free for one in late]
     failed = [pair for pair in zip(early, late, strict=True) if not pair[0].is_free]
-    assert len(failed) >= 3
+    assert 3 <= len(failed) < len(x) / 2
     step = 1.0 / (evaluator.workcell.task.samples - 1)
     assert all(abs(a.at_parameter - b.at_parameter) <= step for a, b in failed)
     assert between - before < 0.5 * (judge.calls - between)
