@@ -69,7 +69,7 @@ def test_the_time_that_is_gone_is_told(proposal: ho.Proposal) -> None:
     seconds, limits = zip(*TOLD, strict=True)
     assert set(limits) == {ho.ProposeSettings().seconds}
     assert list(seconds) == sorted(seconds)
-    assert 0.0 < seconds[-1] <= proposal.seconds
+    assert 0.0 < seconds[-1] <= np.ceil(proposal.seconds)  # the last is told after it was found
 
 
 def test_the_rack_gets_a_certified_carry(proposal: ho.Proposal, tmp_path: Path) -> None:
