@@ -7,7 +7,6 @@ a sample is a function of (u'', u'^2) whose coefficients lie packed in one vecto
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -232,31 +231,36 @@ def force_functions(workcell: Workcell) -> tuple[ca.Function, ca.Function]:
     """Both normal forces at one sample, which are convex in (u'', u'^2), and their slopes.
 
     Both take the force (9,) and moment (6,) blocks of `LimitLayout` as one input, then u'' and
-    u'^2. `limit_forces` gives (2,) [N]; `limit_force_slopes` the same and its derivatives (2,) by
-    u'' and by u'^2. Where a program finds the forces, they are those on its central path
-    (`symbolic.contact.soft_grasp`).
+    u'^2, and the numbers of what is held. `limit_forces` gives (2,) [N], and what was solved for
+    them (k,): the grip of soft fingers, or the state of the program that finds the forces, which
+    then are those on its central path (`symbolic.contact.soft_grasp`). `limit_force_slopes` and
+    `ratio_functions` take it last and solve nothing; `limit_force_slopes` gives the forces and
+    their derivatives (2,) by u'' and by u'^2.
     """
     sizes = limit_layout(workcell).sizes
     names = ("limit_forces", "limit_force_slopes")
     if not workcell.has_closed_form:
-        inputs = [ca.MX.sym("asked", sizes["force"] + sizes["moment"]), *map(ca.MX.sym, "aw")]
         handed = mx_given(workcell.payload)
-        load, by_timing = _load_function(workcell)(*inputs, *handed.values())
+        asked = [ca.MX.sym("asked", sizes["force"] + sizes["moment"]), *map(ca.MX.sym, "aw")]
+        asked += handed.values()
+        load, by_timing = _load_function(workcell)(*asked)
         soft = SoftGrasp(Grasp(workcell), WEIGHT)
-        normal, slope, _ = soft.first()(load, *handed.values())
+        found, state = soft.solved(load, handed), ca.MX.sym("solved", soft.size)
+        normal, slope = soft.slopes()(state, *handed.values())
         slopes = ca.horzsplit(ca.mtimes(slope.T, by_timing))
-        alone = ca.mtimes(soft.normals, soft.solved(load, handed))
-        inputs += handed.values()
+        alone = ca.densify(ca.mtimes(soft.normals, found))
         return (
-            ca.Function(names[0], inputs, [ca.densify(alone)]),
-            ca.Function(names[1], inputs, [normal, *slopes]),
+            ca.Function(names[0], asked, [alone, found]),
+            ca.Function(names[1], [*asked, state], [normal, *slopes]),
         )
     blocks = {name: ca.SX.sym(name, sizes[name]) for name in ("force", "moment")}
-    a, w = ca.SX.sym("a"), ca.SX.sym("w")
-    sample, held = ca.vertcat(*blocks.values()), sx_given(workcell.payload)
-    return _with_slopes(
-        names, lambda d: (_held(workcell, blocks, a, w, d).normal,), sample, (a, w), held
+    inputs, alone, sloping = _inputs(workcell, blocks), Detached(0), Detached(1)
+    value, varied = (
+        _held(workcell, blocks, inputs["a"], inputs["w"], of).normal for of in (alone, sloping)
     )
+    found = alone.replaced([ca.densify(value), alone.symbols])
+    outputs = dict(zip(("value", "solved"), found, strict=True))
+    return named_function(names[0], inputs, outputs), _slopes(names[1], varied, inputs, sloping)
 
 
 def _load_function(workcell: Workcell) -> ca.Function:
@@ -296,7 +300,9 @@ def path_force_function(workcell: Workcell) -> ca.Function:
         *(box["moment_by_acceleration"], box["moment_by_speed"]),
     )
     blocks = ca.vertcat(*[ca.mtimes(axes.T, part) for part in asked])
-    force, by_a, by_w = force_functions(workcell)[1](blocks, a, w, *numbers.values())
+    forces, slopes = force_functions(workcell)
+    _, solved = forces(blocks, a, w, *numbers.values())
+    force, by_a, by_w = slopes(blocks, a, w, *numbers.values(), solved)
     outputs = {"normal_force": force, "slope": ca.vertcat(by_a.T, by_w.T)}
     return named_function("path_force", {**path, "a": a, "w": w, **numbers}, outputs, cse=closed)
 
@@ -305,20 +311,23 @@ def ratio_functions(workcell: Workcell) -> tuple[ca.Function, ca.Function]:
     """Limits that are not convex, at one sample, and their derivatives by (u'', u'^2).
 
     Both take force (9,), moment (6,), torque and wrench blocks of `LimitLayout` as one input, then
-    u'' and u'^2. `limit_ratios` gives `contact_limits`' ratios, and both normal forces (2,) [N];
-    `limit_slopes` the ratios and their derivatives (joints + 2,) by u'' and by u'^2. Where a
-    program finds the forces, shifts of the pressure are no limit and count as none.
+    what else `limit_force_slopes` takes, see `force_functions`. `limit_ratios` gives
+    `contact_limits`' ratios; `limit_slopes` gives the same and their derivatives (joints + 2,) by
+    u'' and by u'^2. Where a program finds the forces, shifts of the pressure are no limit and count
+    as none.
     """
     sizes = limit_layout(workcell).sizes
     names = ("force", "moment", "torque", "wrench")
     if not workcell.has_closed_form:
         return _program_ratios(workcell)
     blocks = {name: ca.SX.sym(name, sizes[name]) for name in names}
-    a, w = ca.SX.sym("a"), ca.SX.sym("w")
-    sample, held = ca.vertcat(*blocks.values()), sx_given(workcell.payload)
-    called = "limit_ratios", "limit_slopes"
-    return _with_slopes(
-        called, lambda d: contact_limits(workcell, blocks, (a, w), d), sample, (a, w), held
+    inputs, alone, sloping = _inputs(workcell, blocks), Detached(0), Detached(1)
+    timing = inputs["a"], inputs["w"]
+    value, varied = (contact_limits(workcell, blocks, timing, of)[0] for of in (alone, sloping))
+    whole = inputs | {"solved": alone.symbols}
+    return (
+        named_function("limit_ratios", whole, {"value": ca.densify(value)}),
+        _slopes("limit_slopes", varied, inputs, sloping),
     )
 
 
@@ -326,7 +335,7 @@ def contact_limits(
     workcell: Workcell,
     blocks: dict[str, ca.SX],
     timing: tuple[ca.SX, ca.SX],
-    detached: Detached | None,
+    detached: Detached,
 ) -> tuple[ca.SX, ca.SX]:
     """What depends on the contact forces at one sample.
 
@@ -377,7 +386,7 @@ def _program_ratios(workcell: Workcell) -> tuple[ca.Function, ca.Function]:
     felt = as_mx(ca.SX(number(grasp.numbers.to_robots)), grasp.given, handed)
     # The pads of the first robot come first.
     others = WRENCH_SIZE * grasp.robots.index(1)
-    load, by_timing = _load_function(workcell)(asked, *inputs[1:], *given)
+    _, by_timing = _load_function(workcell)(asked, *inputs[1:], *given)
     soft, none = SoftGrasp(grasp, WEIGHT), ca.DM.zeros(2, 1)
 
     def on_joints(held: ca.MX) -> ca.MX:
@@ -386,39 +395,26 @@ def _program_ratios(workcell: Workcell) -> tuple[ca.Function, ca.Function]:
         arms = (by_wrench[:first, :], by_wrench[first:, :])
         return ca.vertcat(ca.mtimes(arms[0], one), ca.mtimes(arms[1], other))
 
-    ratios = ca.mtimes(own, ca.vertcat(*inputs[1:], 1.0))
-    held, by_load, _ = soft.wrenches(slopes=True)(load, *given)
+    ratios, state = ca.mtimes(own, ca.vertcat(*inputs[1:], 1.0)), ca.MX.sym("solved", soft.size)
+    held, by_load = soft.wrenches(slopes=True)(state, *given)
     slopes = own[:, :2] + on_joints(ca.mtimes(by_load, by_timing))
-    alone, normal = soft.wrenches(slopes=False)(load, *given)
-    inputs += given
+    alone = soft.wrenches(slopes=False)(state, *given)
+    inputs += [*given, state]
     whole = [ratios + on_joints(held), *ca.horzsplit(slopes)]
     return (
-        ca.Function("limit_ratios", inputs, [ca.vertcat(ratios + on_joints(alone), none), normal]),
+        ca.Function("limit_ratios", inputs, [ca.vertcat(ratios + on_joints(alone), none)]),
         ca.Function("limit_slopes", inputs, [ca.vertcat(value, none) for value in whole]),
     )
 
 
-def _with_slopes(
-    names: tuple[str, str],
-    of: Callable[[Detached | None], tuple[ca.SX, ...]],
-    sample: ca.SX,
-    timing: tuple[ca.SX, ca.SX],
-    given: dict[str, ca.SX],
-) -> tuple[ca.Function, ca.Function]:
-    """A function of blocks, u'', u'^2 and numbers, and its first value with the derivatives by u''
-    and u'^2."""
-    detached: Detached = []
-    value, (a, w) = ca.densify(of(detached)[0]), timing
-    slopes = [value, *[ca.densify(ca.jacobian(value, z)) for z in timing]]
-    for symbol, solved in detached:
-        slopes = ca.substitute(slopes, [symbol], [solved])
-    inputs = {"sample": sample, "acceleration": a, "squared_speed": w, **given}
-    # Values alone do not need the steps that derivatives do.
-    alone = [ca.densify(value) for value in of(None)]
-    first, second = (
-        named_function(
-            name, inputs, {f"result_{k}": part for k, part in enumerate(parts)}, cse=True
-        )
-        for name, parts in zip(names, (alone, slopes), strict=True)
-    )
-    return first, second
+def _inputs(workcell: Workcell, blocks: dict[str, ca.SX]) -> dict[str, ca.SX]:
+    """Those of `limit_forces`, from blocks of a sample."""
+    timing = {name: ca.SX.sym(name) for name in ("a", "w")}
+    return {"sample": ca.vertcat(*blocks.values())} | timing | sx_given(workcell.payload)
+
+
+def _slopes(name: str, value: ca.SX, inputs: dict[str, ca.SX], detached: Detached) -> ca.Function:
+    """A value and its derivatives by u'' and u'^2, from inputs and what was solved for."""
+    value = ca.densify(value)
+    by = {f"by_{z}": ca.densify(ca.jacobian(value, inputs[z])) for z in ("a", "w")}
+    return named_function(name, inputs | {"solved": detached.symbols}, {"value": value} | by)

@@ -516,10 +516,11 @@ def _source(workcell: Workcell, intervals: int, cuts: int) -> tuple[Signature, s
     layout = limit_layout(workcell)
     helpers = (*force_functions(workcell), *ratio_functions(workcell))
     rooms = [(f.sz_arg(), f.sz_res(), f.sz_iw(), f.sz_w()) for f in helpers]
-    # The numbers of what is held come fourth, where a function takes them.
-    most = (max(4, *sizes) for sizes in zip(*rooms, strict=True))
+    # `ask` of the passes hands all of them five arguments.
+    most = (max(5, *sizes) for sizes in zip(*rooms, strict=True))
     constants = {
         **dict(zip(("ROOM_ARG", "ROOM_RES", "ROOM_IW", "ROOM_W"), most, strict=True)),
+        "ROOM_SOLVED": max(1, helpers[0].numel_out(1)),
         "INTERVALS": intervals,
         "JOINTS": layout.joints,
         "SIZE": layout.size,

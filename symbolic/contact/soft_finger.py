@@ -24,7 +24,7 @@ Coordinates: tangents a, b and normal n = a x b of contact 1. Forces in N, lengt
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TypeAlias
 
 import casadi as ca
@@ -37,7 +37,7 @@ from symbolic.records.numbered import NumberedContact
 
 NEWTON_STEPS = 3
 """Newton steps for given tangential forces, from `_first_grip`: relative errors of forces are then
-below 1e-6, of pads of one size 1e-9. One less where derivatives take two more, see `Detached`."""
+below 1e-6, of pads of one size 1e-9. One less where results take two more, see `Detached`."""
 
 LEAST_GRIP = 0.05
 """Least grip that these start from, as a share of what the first pad would need for all torsion:
@@ -65,10 +65,43 @@ Load: TypeAlias = tuple[Expression, Expression, Expression]
 Both: TypeAlias = tuple[Expression, Expression]
 """One value per pad."""
 
-Detached: TypeAlias = list[tuple[ca.SX, ca.SX]]
-"""Receives what was solved for, as a symbol and its value. Results then depend on the symbol, by
-two more steps of Newton's method, so that first and second derivatives are exact although they take
-it for a constant; replace it afterwards."""
+
+@dataclass
+class Detached:
+    """Receives what was solved for, as a symbol and its value. Results then depend on the symbol;
+    replace it afterwards.
+
+    Attributes:
+        steps: of Newton's method from the symbol to what the results depend on. With one, first
+            derivatives are exact although they take the symbol for a constant; with two, second
+            derivatives as well. None for results without derivatives.
+    """
+
+    steps: int = 2
+    _found: list[tuple[ca.SX, ca.SX]] = field(default_factory=list)
+
+    def detach(self, value: ca.SX) -> ca.SX:
+        """The symbol of what was solved for."""
+        symbol = ca.SX.sym("solved")
+        self._found.append((symbol, value))
+        return symbol
+
+    @property
+    def symbols(self) -> ca.SX:
+        """(k,) all symbols."""
+        return ca.vertcat(ca.SX(0, 1), *[symbol for symbol, _ in self._found])
+
+    @property
+    def values(self) -> ca.SX:
+        """(k,) what they stand for."""
+        return ca.vertcat(ca.SX(0, 1), *[value for _, value in self._found])
+
+    def replaced(self, outputs: list[Expression]) -> list[Expression]:
+        """Outputs with what was solved for in the symbols' place."""
+        if not self._found:
+            return outputs
+        found: list[Expression] = ca.substitute(outputs, [self.symbols], [self.values])
+        return list(ca.cse(found))
 
 
 @dataclass(frozen=True)
@@ -261,12 +294,13 @@ def _pressed(
     levers = in_order([patch.twist for patch in patches]), in_order(half)
     beginning = in_order(normal_at(ca.SX(0.0))[0])
     grip = _first_grip(asked, levers, coefficients, needs, beginning)
-    for _ in range(NEWTON_STEPS if detached is None else NEWTON_STEPS - 1):
+    more = detached.steps if detached is not None else 0
+    for _ in range(NEWTON_STEPS - max(0, more - 1)):
         grip = newton(grip)
     if detached is not None:
-        symbol = ca.SX.sym("grip")
-        detached.append((symbol, grip))
-        grip = newton(newton(symbol))
+        grip = detached.detach(grip)
+    for _ in range(more):
+        grip = newton(grip)
     normal, _ = normal_at(grip)
     return normal, ca.vertcat(*capacity_at(normal)[0])
 

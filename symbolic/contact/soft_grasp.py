@@ -65,7 +65,7 @@ class SoftGrasp:
         robots [N], slope (6, 2), their gradients, and state (size,)."""
         load, handed = ca.MX.sym("load", LOAD_SIZE), mx_symbols(self.given)
         state = self.solved(load, handed)
-        outputs = [*self._slopes()(state, *handed.values()), state]
+        outputs = [*self.slopes()(state, *handed.values()), state]
         inputs, names = [load, *handed.values()], ["load", *handed]
         return ca.Function("held_first", inputs, outputs, names, ["normal", "slope", "state"])
 
@@ -90,22 +90,17 @@ class SoftGrasp:
         return state
 
     def wrenches(self, slopes: bool) -> ca.Function:
-        """load (6,) to wrenches (6 k,) of all pads, see `symbolic.contact.grasp.grasp_wrenches`,
-        and where asked for, to by_load (6 k, 6);
-        last, to normal (2,)."""
-        load, state = ca.MX.sym("load", LOAD_SIZE), ca.SX.sym("state", self.size)
-        handed = mx_symbols(self.given)
+        """state (size,) to wrenches (6 k,) of all pads, see
+        `symbolic.contact.grasp.grasp_wrenches`, and where asked for, to by_load (6 k, 6)."""
+        state = ca.SX.sym("state", self.size)
         own = wrenches_of(self.grasp, ca.vertsplit(state, self.ends))
         units = [self.grasp.units(i, self._friction) * wrench for i, wrench in enumerate(own)]
         outputs = [ca.vertcat(*map(whole_wrench, units))]
         if slopes:
             by_state = ca.jacobian(outputs[0], state)
             outputs.append(ca.mtimes(by_state, _Local(self, state).by_load()))
-        outputs.append(ca.mtimes(self.normals, state))
         results = ca.cse([ca.densify(value) for value in outputs])
-        whole = ca.Function("whole", [state, *self.given.values()], results)
-        found = whole.call([self.solved(load, handed), *handed.values()])
-        return ca.Function("held_wrenches", [load, *handed.values()], found)
+        return ca.Function("held_wrenches", [state, *self.given.values()], results)
 
     def second(self) -> ca.Function:
         """state (size,) and weight (2,) to curvature (6, 6), the weighted second derivatives of the
@@ -123,7 +118,7 @@ class SoftGrasp:
             ["curvature"],
         )
 
-    def _slopes(self) -> ca.Function:
+    def slopes(self) -> ca.Function:
         """A state to both normal forces and their gradients by the load (6, 2)."""
         state = ca.SX.sym("state", self.size)
         by_load = _Local(self, state).by_load()

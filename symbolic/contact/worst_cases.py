@@ -102,14 +102,14 @@ def case_gradient_function(workcell: Workcell, numbers: bool = False) -> ca.Func
     kind = _kind(workcell)
     motion = [kind.sym(name, 6) for name in ("pose", "rate", "second_rate")]
     case = kind.sym("case", CASE_SIZE)
-    detached: Detached = []
+    detached = Detached()
     given = _given(workcell)
     # Pads that are moved alone lie beside one another then.
     force = _least_squeeze(workcell, motion, case, given, detached, True, displaced=numbers)
     by = [*motion, case, *given.values()] if numbers else motion
     slope = ca.densify(ca.horzcat(*[ca.jacobian(force, part) for part in by]).T)
     inputs, names = [*motion, case, *given.values()], [*MOTION, "case", *given]
-    found = _solved([force, slope], detached)
+    found = detached.replaced([force, slope])
     return ca.Function("case_gradient", inputs, found, names, ["normal_force", "slope"])
 
 
@@ -123,12 +123,12 @@ def case_slopes_function(workcell: Workcell) -> ca.Function:
     pose, first, second = path
     # A root has no slope at rest, what follows from its square has.
     motion = [pose, first * ca.sqrt(w + SQUARED_SPEED_FLOOR), first * a + second * w]
-    detached: Detached = []
+    detached = Detached()
     given = _given(workcell)
     force = _least_squeeze(workcell, motion, case, given, detached, differentiable=True)
     slope = ca.densify(ca.jacobian(force, ca.vertcat(*path, a, w)).T)
     names = ["pose", "first", "second", "a", "w", "case", *given]
-    found = _solved([force, slope], detached)
+    found = detached.replaced([force, slope])
     inputs, outputs = [*path, a, w, case, *given.values()], ["normal_force", "slope"]
     return ca.Function("case_slopes", inputs, found, names, outputs)
 
@@ -217,13 +217,6 @@ def _against_arms(case: Expression) -> Expression:
     """Normal force that holds the opposed tangential force of a case at either pad [N]."""
     friction, *_, internal = case_parts(case)
     return internal / ca.fmin(friction[0], friction[1])
-
-
-def _solved(outputs: list[Expression], detached: Detached) -> list[Expression]:
-    """Outputs with what was solved for in its place."""
-    for symbol, value in detached:
-        outputs = ca.substitute(outputs, [symbol], [value])
-    return ca.cse(outputs) if detached else outputs
 
 
 def case_parts(case: ca.SX | ca.MX) -> list[ca.SX | ca.MX]:

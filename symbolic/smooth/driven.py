@@ -106,15 +106,14 @@ def driven_functions(model: CellModel) -> dict[str, ca.Function]:
     names = [*PATH_OUTPUTS, "a", "w"]
     sizes = [layout.pose] * 3 + [*[arm.n_joints for arm in model.robots], 1, 1]
     inputs = {name: ca.SX.sym(name, size) for name, size in zip(names, sizes, strict=True)}
-    detached: Detached = []
+    detached = Detached()
     value, y = _value(model, [*inputs.values()], detached), ca.vertcat(*inputs.values())
     assert value.shape == (layout.size, 1)
     first = [value, ca.densify(ca.jacobian(value, y).T)]
     weight, direction = ca.SX.sym("weight", layout.size), ca.SX.sym("direction", layout.variables)
     gradient = ca.gradient(ca.dot(weight, value), y)
     second = [ca.densify(ca.jtimes(gradient, y, direction))]
-    for symbol, solved in detached:
-        first, second = (ca.substitute(found, [symbol], [solved]) for found in (first, second))
+    first, second = map(detached.replaced, (first, second))
     given = limit_numbers(model.workcell)
     values, bent = dict(zip(("value", "slope"), first, strict=True)), {"change": second[0]}
     along = inputs | {"weight": weight, "direction": direction}

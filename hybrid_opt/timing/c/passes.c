@@ -4,7 +4,8 @@
    sample. The text before this file defines INTERVALS, JOINTS, the SIZE of a sample's row, the
    offset of every block (AT_...), RATIOS, CUTS, the lines that a caller gives at every sample, HELD,
    the input with the numbers of what is held, limit_forces, limit_force_slopes, limit_ratios,
-   limit_slopes of CasADi, and the room that each of them needs at most (ROOM_...).
+   limit_slopes of CasADi, and the room that each of them and what the first solves for need at most
+   (ROOM_...).
 
    x and y are the squared speeds u'^2 at the beginning and the end of an interval. There is rest at
    both ends of the path, and standing still is allowed everywhere, so that (0, 0) satisfies every
@@ -43,12 +44,15 @@ typedef struct { double x, y, bound; int key; } line; /* x X + y Y <= bound */
 /* The largest use of a kind of limit: over the limit, where, and of which joint or contact. */
 typedef struct { double ratio, parameter; int column; } largest_use;
 
+/* Both normal forces, and what was solved for them, from which ratios and slopes follow. */
+typedef struct { double n[2], solved[ROOM_SOLVED]; } held_load;
+
 /* What was found at an interval, after the numbers it was asked for; later sweeps change few. */
 typedef struct {
   double back[4];       /* ceiling, top and guess of `backward`, and its answer */
   double ahead[3];      /* x and top of `forward`, and its answer */
-  double at[2][2];      /* x and y of `forces` and of `ratios` */
-  double forces[2][2];  /* both normal forces at both ends */
+  double at[2][2];      /* x and y of `loads` and of `ratios` */
+  held_load loads[2];   /* at both ends */
   double ratios[2][RATIOS];
   double judged[2];     /* x and y of what is judged inside */
   double peak[2];
@@ -79,35 +83,32 @@ typedef int casadi_function(const double**, double**, long long*, double*, int);
 
 /* One of CasADi's functions of a sample, u'' and u'^2, and its results, unused ones null. */
 static void ask(casadi_function* function, const problem* p, const double* f, double a, double w,
-                double* first, double* second, double* third) {
-  const double* arg[ROOM_ARG] = {f + AT_FORCE, &a, &w};
+                const double* solved, double* first, double* second, double* third) {
+  const double* arg[ROOM_ARG] = {f + AT_FORCE, &a, &w, p->held, solved};
   double *res[ROOM_RES] = {first, second, third}, room[ROOM_W];
   long long iw[ROOM_IW];
-  arg[3] = p->held;
   function(arg, res, iw, room, 0);
 }
 
-/* Limits that are not convex, and both normal forces. */
-static void ratios_at(const problem* p, const double* f, double a, double w, double* ratios,
-                      double* n) {
-  ask(limit_ratios, p, f, a, w, ratios, n, 0);
+static void load_at(const problem* p, const double* f, double a, double w, held_load* load) {
+  ask(limit_forces, p, f, a, w, 0, load->n, load->solved, 0);
 }
 
-static void slopes_at(const problem* p, const double* f, double a, double w, double* r,
-                      double* by_a, double* by_w) {
-  ask(limit_slopes, p, f, a, w, r, by_a, by_w);
+static void ratios_at(const problem* p, const double* f, double a, double w, const held_load* load,
+                      double* ratios) {
+  ask(limit_ratios, p, f, a, w, load->solved, ratios, 0, 0);
 }
 
-/* Both normal forces. */
-static void normal_forces(const problem* p, const double* f, double a, double w, double* n) {
-  ask(limit_forces, p, f, a, w, n, 0, 0);
+static void slopes_at(const problem* p, const double* f, double a, double w, const held_load* load,
+                      double* r, double* by_a, double* by_w) {
+  ask(limit_slopes, p, f, a, w, load->solved, r, by_a, by_w);
 }
 
 /* The larger normal force and its slopes by u'' and u'^2. */
-static double force_slopes(const problem* p, const double* f, double a, double w, double* by_a,
-                           double* by_w) {
+static double force_slopes(const problem* p, const double* f, double a, double w,
+                           const held_load* load, double* by_a, double* by_w) {
   double n[2], each_by_a[2], each_by_w[2];
-  ask(limit_force_slopes, p, f, a, w, n, each_by_a, each_by_w);
+  ask(limit_force_slopes, p, f, a, w, load->solved, n, each_by_a, each_by_w);
   const int k = n[1] > n[0];
   *by_a = each_by_a[k];
   *by_w = each_by_w[k];
@@ -124,72 +125,70 @@ static int differ(double* known, const double* asked, int count) {
   return found;
 }
 
-/* The same of two samples: (2, 2) normal forces, (2, RATIOS) ratios. */
+/* The loads of two samples, and their ratios (2, RATIOS). */
 #if IN_PAIRS
 typedef int pair_function(const lanes_real**, lanes_real**, lanes_int*, lanes_real*);
 
-static void apart(const lanes_real* found, int count, double* values) {
-  for (int k = 0; k < count; ++k) {
-    values[k] = found[k][0];
-    values[count + k] = found[k][1];
-  }
-}
-
 static void ask_both(pair_function* function, const problem* p, const double* const f[2],
-                     int inputs, double a, const double w[2], lanes_real* first,
-                     lanes_real* second) {
+                     int inputs, double a, const double w[2], const lanes_real* solved,
+                     lanes_real* first, lanes_real* second) {
   lanes_real given[SIZE], as = {a, a}, ws = {w[0], w[1]};
   lanes_real room[limit_forces_in_pairs_W + limit_ratios_in_pairs_W + 1];
-  const lanes_real* arg[limit_ratios_in_pairs_ARG] = {given, &as, &ws, (const lanes_real*)p->held};
-  lanes_real* res[limit_ratios_in_pairs_RES] = {first, second};
+  const lanes_real* arg[limit_ratios_in_pairs_ARG] = {given, &as, &ws, (const lanes_real*)p->held,
+                                                      solved};
+  lanes_real* res[limit_forces_in_pairs_RES] = {first, second};
   lanes_int iw[1];
   for (int k = 0; k < inputs; ++k) given[k] = (lanes_real){f[0][AT_FORCE + k], f[1][AT_FORCE + k]};
   function(arg, res, iw, room);
 }
-#endif
 
-static void both_forces(const problem* p, const double* const f[2], double a, const double w[2],
-                        double* n) {
-#if IN_PAIRS
-  lanes_real found[2];
-  ask_both(limit_forces_in_pairs, p, f, AT_TORQUE - AT_FORCE, a, w, found, 0);
-  apart(found, 2, n);
-#else
-  for (int k = 0; k < 2; ++k) normal_forces(p, f[k], a, w[k], n + 2 * k);
-#endif
+static void both_loads(const problem* p, const double* const f[2], double a, const double w[2],
+                       held_load* loads) {
+  lanes_real n[2], solved[ROOM_SOLVED] = {{0}};
+  ask_both(limit_forces_in_pairs, p, f, AT_TORQUE - AT_FORCE, a, w, 0, n, solved);
+  for (int lane = 0; lane < 2; ++lane) {
+    for (int k = 0; k < 2; ++k) loads[lane].n[k] = n[k][lane];
+    for (int k = 0; k < ROOM_SOLVED; ++k) loads[lane].solved[k] = solved[k][lane];
+  }
 }
 
 static void both_ratios(const problem* p, const double* const f[2], double a, const double w[2],
-                        double* ratios, double* n) {
-#if IN_PAIRS
-  lanes_real found[RATIOS], normal[2];
-  ask_both(limit_ratios_in_pairs, p, f, SIZE - AT_FORCE, a, w, found, normal);
-  apart(found, RATIOS, ratios);
-  apart(normal, 2, n);
+                        const held_load* loads, double (*ratios)[RATIOS]) {
+  lanes_real found[RATIOS], solved[ROOM_SOLVED];
+  for (int k = 0; k < ROOM_SOLVED; ++k)
+    solved[k] = (lanes_real){loads[0].solved[k], loads[1].solved[k]};
+  ask_both(limit_ratios_in_pairs, p, f, SIZE - AT_FORCE, a, w, solved, found, 0);
+  for (int lane = 0; lane < 2; ++lane)
+    for (int k = 0; k < RATIOS; ++k) ratios[lane][k] = found[k][lane];
+}
 #else
-  for (int k = 0; k < 2; ++k) ratios_at(p, f[k], a, w[k], ratios + RATIOS * k, n + 2 * k);
-#endif
+static void both_loads(const problem* p, const double* const f[2], double a, const double w[2],
+                       held_load* loads) {
+  for (int k = 0; k < 2; ++k) load_at(p, f[k], a, w[k], loads + k);
 }
 
-/* Both normal forces at both ends of an interval, and what limits as ratios. */
-static double (*end_forces(const problem* p, int interval, double x, double y))[2] {
+static void both_ratios(const problem* p, const double* const f[2], double a, const double w[2],
+                        const held_load* loads, double (*ratios)[RATIOS]) {
+  for (int k = 0; k < 2; ++k) ratios_at(p, f[k], a, w[k], loads + k, ratios[k]);
+}
+#endif
+
+/* The loads at both ends of an interval, and what limits as ratios. */
+static held_load* end_loads(const problem* p, int interval, double x, double y) {
   answers* known = p->known + interval;
   const double asked[2] = {x, y}, *f = p->samples + 2 * interval * SIZE;
   const double* const ends[2] = {f, f + 2 * SIZE};
-  if (differ(known->at[0], asked, 2))
-    both_forces(p, ends, HALF * (y - x), asked, known->forces[0]);
-  return known->forces;
+  if (differ(known->at[0], asked, 2)) both_loads(p, ends, HALF * (y - x), asked, known->loads);
+  return known->loads;
 }
 
 static double (*end_ratios(const problem* p, int interval, double x, double y))[RATIOS] {
   answers* known = p->known + interval;
   const double asked[2] = {x, y}, *f = p->samples + 2 * interval * SIZE;
   const double* const ends[2] = {f, f + 2 * SIZE};
-  if (differ(known->at[1], asked, 2)) {
-    both_ratios(p, ends, HALF * (y - x), asked, known->ratios[0], known->forces[0]);
-    known->at[0][0] = x;
-    known->at[0][1] = y;
-  }
+  const held_load* loads = end_loads(p, interval, x, y);
+  if (differ(known->at[1], asked, 2))
+    both_ratios(p, ends, HALF * (y - x), asked, loads, known->ratios);
   return known->ratios;
 }
 
@@ -263,12 +262,12 @@ static int convex_rows(const problem* p, int interval, double x, double y, doubl
       count = append(rows, count, interval_row(by_a, by_w, limit, end));
     }
     if (isfinite(p->force)) {
-      const double* n = end_forces(p, interval, x, y)[end];
+      const held_load* load = end_loads(p, interval, x, y) + end;
       double by_a, by_w;
       const double rest = p->rest_force[interval + end];
       const double bound = rest + (p->force - rest) / p->tight[interval][FORCE];
-      if (larger(n[0], n[1]) - rest <= (bound - rest) * threshold) continue;
-      const double value = force_slopes(p, f, a, w, &by_a, &by_w);
+      if (larger(load->n[0], load->n[1]) - rest <= (bound - rest) * threshold) continue;
+      const double value = force_slopes(p, f, a, w, load, &by_a, &by_w);
       const double still = value - by_a * a - by_w * w;
       const line row = interval_row(by_a / bound, by_w / bound, 1.0 - still / bound, end);
       count = append(rows, count, row);
@@ -306,7 +305,7 @@ static int linearised_rows(const problem* p, int interval, double x, double y, c
       exceeded = exceeded || excess > RATIO_TOLERANCE || (wanted && wanted[end * RATIOS + k]);
     }
     if (!exceeded) continue;
-    slopes_at(p, f, a, w, r, by_a, by_w);
+    slopes_at(p, f, a, w, end_loads(p, interval, x, y) + end, r, by_a, by_w);
     for (int k = 0; k < RATIOS; ++k) {
       if (!limited(p, k)) continue;
       const double still = p->rest[(interval + end) * RATIOS + k];
@@ -577,11 +576,12 @@ static void judge_inside(const problem* p, int interval, double factor, largest_
   const double y = factor * factor * p->squared[interval + 1], a = HALF * (y - x);
   const double *sample = p->samples + (2 * interval + 1) * SIZE, half = 0.5 * (x + y);
   const int limits_ratios = p->torque || p->pressure;
-  double f[2][SIZE], n[2][2], ratios[2][RATIOS];
+  double f[2][SIZE], ratios[2][RATIOS];
+  held_load loads[2];
   largest_use middle[KINDS] = {{0}};
-  if (limits_ratios) ratios_at(p, sample, a, half, ratios[0], n[0]);
-  else normal_forces(p, sample, a, half, n[0]);
-  judge(p, sample, (interval + 0.5) / INTERVALS, a, half, n[0], limits_ratios ? ratios[0] : 0,
+  load_at(p, sample, a, half, loads);
+  if (limits_ratios) ratios_at(p, sample, a, half, loads, ratios[0]);
+  judge(p, sample, (interval + 0.5) / INTERVALS, a, half, loads[0].n, limits_ratios ? ratios[0] : 0,
         middle, peak);
   for (int k = 0; k < KINDS; ++k)
     note(use, k, middle[k].ratio, middle[k].parameter, middle[k].column);
@@ -590,11 +590,11 @@ static void judge_inside(const problem* p, int interval, double factor, largest_
   const double w[2] = {x + 0.25 * (y - x), x + 0.75 * (y - x)};
   for (int k = 0; k < 2; ++k)
     between(p, 2.0 * (interval + shares[k]), near ? SIZE : AT_TORQUE, f[k]);
-  if (near) both_ratios(p, quarters, a, w, ratios[0], n[0]);
-  else both_forces(p, quarters, a, w, n[0]);
+  both_loads(p, quarters, a, w, loads);
+  if (near) both_ratios(p, quarters, a, w, loads, ratios);
   for (int k = 0; k < 2; ++k)
-    judge(p, f[k], (interval + shares[k]) / INTERVALS, a, w[k], n[k], near ? ratios[k] : 0, use,
-          peak);
+    judge(p, f[k], (interval + shares[k]) / INTERVALS, a, w[k], loads[k].n, near ? ratios[k] : 0,
+          use, peak);
 }
 
 /* Judges a timing slowed by `factor` at the ends of all intervals and inside them; returns the
@@ -603,11 +603,11 @@ static double judge_all(const problem* p, double factor, largest_use* use, doubl
   reset(use, peak);
   for (int i = 0; i < INTERVALS; ++i) {
     const double x = factor * factor * p->squared[i], y = factor * factor * p->squared[i + 1];
+    const held_load* loads = end_loads(p, i, x, y);
     const double(*ratios)[RATIOS] = p->torque || p->pressure ? end_ratios(p, i, x, y) : 0;
-    const double(*n)[2] = end_forces(p, i, x, y);
     for (int end = 0; end < 2; ++end)
       judge(p, p->samples + 2 * (i + end) * SIZE, (i + end) / (double)INTERVALS, HALF * (y - x),
-            end ? y : x, n[end], ratios ? ratios[end] : 0, use, peak);
+            end ? y : x, loads[end].n, ratios ? ratios[end] : 0, use, peak);
     if (factor < 1.0) { judge_inside(p, i, factor, use, peak); continue; }
     const answers* known = p->known + i; /* by `tighten` */
     for (int k = 0; k < 2; ++k) peak[k] = larger(peak[k], known->peak[k]);
@@ -648,11 +648,13 @@ static double judge_rest(problem* p, largest_use* use, double* peak) {
   reset(use, peak);
   for (int i = 0; i <= INTERVALS; ++i) {
     const double* f = p->samples + 2 * i * SIZE;
-    double n[2], *ratios = p->rest + i * RATIOS;
-    ratios_at(p, f, 0.0, 0.0, ratios, n);
-    judge(p, f, i / (double)INTERVALS, 0.0, 0.0, n, p->torque || p->pressure ? ratios : 0, use,
-          peak);
-    p->rest_force[i] = larger(n[0], n[1]);
+    double* ratios = p->rest + i * RATIOS;
+    held_load load;
+    load_at(p, f, 0.0, 0.0, &load);
+    ratios_at(p, f, 0.0, 0.0, &load, ratios);
+    judge(p, f, i / (double)INTERVALS, 0.0, 0.0, load.n, p->torque || p->pressure ? ratios : 0,
+          use, peak);
+    p->rest_force[i] = larger(load.n[0], load.n[1]);
   }
   return worst_of(use);
 }
