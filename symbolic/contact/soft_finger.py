@@ -166,11 +166,17 @@ def torsion_capacity(
         tangent: (2,) tangential force [N].
         patch: the pad's.
     """
-    s = grip**2 / (grip**2 + _squared(tangent))
-    half = _half_spread(patch, tangent)
-    bend = BEND * patch.twist
+    return _capacity(grip, _squared(tangent), patch.twist, _half_spread(patch, tangent))
+
+
+def _capacity(
+    grip: Expression, squared: Expression, twist: Expression, half: Expression
+) -> tuple[Expression, Expression]:
+    """The same from the squared tangential force [N^2], c and h / 2 [m]."""
+    s = grip**2 / (grip**2 + squared)
+    bend = BEND * twist
     # h / 2 + s (c - h / 2) - bend s (1 - s)
-    linear = patch.twist - half - bend
+    linear = twist - half - bend
     lever = half + s * (linear + s * bend)
     lever_slope = 2.0 * s * (1.0 - s) * (linear + 2.0 * s * bend)
     return grip * lever, lever + lever_slope
@@ -255,79 +261,76 @@ def _pressed(
         detached: see `Detached`.
     """
     *tangents, torsion = load
-    asked = ca.fabs(torsion)
-    needed = [_squared(tangent) / friction[i] ** 2 for i, tangent in enumerate(tangents)]
+    asked, squares = ca.fabs(torsion), [_squared(tangent) for tangent in tangents]
+    least = [ca.sqrt(square) / friction[i] for i, square in enumerate(squares)]
     # The pad that slips first: what its friction leaves beside the tangential force is solved for.
-    first_binds = ca.sqrt(needed[0]) - difference > ca.sqrt(needed[1])
+    first_binds = least[0] - difference > least[1]
 
     def in_order(of: Sequence[Expression] | Expression) -> Both:
         return ca.if_else(first_binds, of[0], of[1]), ca.if_else(first_binds, of[1], of[0])
 
-    needs, coefficients = in_order(needed), in_order(friction)
-    own, mu = needs[0], coefficients[0]
-    beside = ca.if_else(first_binds, difference, 0.0)
+    halves = [_half_spread(patch, tangents[i]) for i, patch in enumerate(patches)]
+    mu, squared, half = in_order(friction), in_order(squares), in_order(halves)
+    twist = in_order([patch.twist for patch in patches])
+    # How far the other pad's normal force is beyond the first's, and its friction over the first's.
+    beyond = ca.if_else(first_binds, -difference, difference)
+    share, ahead = mu[1] / mu[0], mu[0] * beyond
 
-    def normal_at(grip: Expression) -> tuple[Expression, Expression]:
-        bound = ca.sqrt(own + (grip / mu) ** 2)
-        n_2 = bound - beside
-        return ca.vertcat(n_2 + difference, n_2), bound
-
-    def capacity_at(normal: Expression) -> tuple[list[Expression], Expression]:
-        """Both capacities, and the slope of their sum by the squeeze."""
-        slope, capacity = 0.0, []
-        for i, patch in enumerate(patches):
-            left = ca.fmax(normal[i] ** 2 - needed[i], 0.0) + FORCE_FLOOR**2
-            own_grip = friction[i] * ca.sqrt(left)
-            carried, by_grip = torsion_capacity(own_grip, tangents[i], patch)
-            capacity.append(carried)
-            slope += by_grip * friction[i] ** 2 * normal[i] / own_grip
-        return capacity, slope
+    def other_grip_squared(bound: Expression) -> Expression:
+        """From what the first pad bears by friction [N], mu N."""
+        return ca.fmax((share * (bound + ahead)) ** 2 - squared[1], 0.0) + FORCE_FLOOR**2
 
     def newton(grip: Expression) -> Expression:
-        normal, bound = normal_at(grip)
-        capacity, slope = capacity_at(normal)
-        missing = asked - capacity[0] - capacity[1]
-        by_grip = slope * grip / (mu**2 * bound)
-        return ca.fmax(grip + missing / (by_grip + LEVER_FLOOR), FORCE_FLOOR)
+        bound = ca.sqrt(grip**2 + squared[0])
+        other = ca.sqrt(other_grip_squared(bound))
+        carried, slope = _capacity(grip, squared[0], twist[0], half[0])
+        carried_too, by_other = _capacity(other, squared[1], twist[1], half[1])
+        # The other grip changes by share^2 grip (bound + ahead) / (other bound).
+        below = other * bound
+        slope = slope * below + by_other * share**2 * grip * (bound + ahead)
+        missing = asked - carried - carried_too
+        return ca.fmax(grip + missing * below / (slope + LEVER_FLOOR * below), FORCE_FLOOR)
 
-    half = [_half_spread(patch, tangents[i]) for i, patch in enumerate(patches)]
-    levers = in_order([patch.twist for patch in patches]), in_order(half)
-    beginning = in_order(normal_at(ca.SX(0.0))[0])
-    grip = _first_grip(asked, levers, coefficients, needs, beginning)
     more = detached.steps if detached is not None else 0
+    beginning = other_grip_squared(in_order([ca.sqrt(square) for square in squares])[0])
+    grip = _first_grip(asked, (twist, half), share, squared, beginning)
     for _ in range(NEWTON_STEPS - max(0, more - 1)):
         grip = newton(grip)
     if detached is not None:
         grip = detached.detach(grip)
     for _ in range(more):
         grip = newton(grip)
-    normal, _ = normal_at(grip)
-    return normal, ca.vertcat(*capacity_at(normal)[0])
+    bound = ca.sqrt(grip**2 + squared[0])
+    grips, normal = (grip, ca.sqrt(other_grip_squared(bound))), bound / mu[0]
+    capacities = [_capacity(grips[i], squared[i], twist[i], half[i])[0] for i in (0, 1)]
+    return ca.vertcat(*in_order((normal, normal + beyond))), ca.vertcat(*in_order(capacities))
 
 
 def _first_grip(
-    asked: Expression, levers: tuple[Both, Both], friction: Both, needed: Both, normal: Both
+    asked: Expression,
+    levers: tuple[Both, Both],
+    share: Expression,
+    squared: Both,
+    ahead: Expression,
 ) -> Expression:
     """About the grip of the pad that slips first [N], from levers of torsion that are linear in s.
 
     Args:
         asked: absolute torsion that both pads carry.
         levers: c and h / 2 of both pads; here and in what follows first that which slips first.
-        friction: coefficients.
-        needed: squares of the normal forces that hold without torsion.
-        normal: normal forces with which the first pad begins to slide without torsion.
+        share: friction of the other pad over that of the first.
+        squared: squares of the tangential forces.
+        ahead: square of the other pad's grip when the first begins to slide without torsion.
     """
     twist, half = levers
-    ratio = (friction[1] / friction[0]) ** 2
-    # The other pad's squared grip is ratio g^2 + ahead, where normal forces are equal.
-    ahead = friction[1] ** 2 * ca.fmax(normal[1] ** 2 - needed[1], 0.0)
-    grip, (first, other) = ca.SX(0.0), twist
-    for _ in range(2):
-        # first g + other sqrt(ratio g^2 + ahead) = asked
-        left = ca.fmax(asked**2 - other**2 * ahead, 0.0)
-        root = (first * asked) ** 2 + (other**2 * ratio - first**2) * left
-        grip = left / (first * asked + ca.sqrt(ca.fmax(root, 0.0)) + FORCE_FLOOR**2)
-        squared = grip**2, ratio * grip**2 + ahead
-        s = [g / (g + friction[i] ** 2 * needed[i]) for i, g in enumerate(squared)]
-        first, other = (half[i] + s[i] * (twist[i] - half[i]) for i in (0, 1))
+    # As if the other pad had the same normal force, and the first no tangential force.
+    grip = asked / (twist[0] + share * twist[1])
+    # The other pad's squared grip is share^2 g^2 + ahead, where normal forces are equal.
+    grips = grip**2, (share * grip) ** 2 + ahead
+    s = [g / (g + squared[i]) for i, g in enumerate(grips)]
+    first, other = (half[i] + s[i] * (twist[i] - half[i]) for i in (0, 1))
+    # first g + other sqrt(share^2 g^2 + ahead) = asked
+    left = ca.fmax(asked**2 - other**2 * ahead, 0.0)
+    root = (first * asked) ** 2 + ((other * share) ** 2 - first**2) * left
+    grip = left / (first * asked + ca.sqrt(ca.fmax(root, 0.0)) + FORCE_FLOOR**2)
     return ca.fmax(grip, LEAST_GRIP * asked / twist[0])
