@@ -172,7 +172,8 @@ class CompiledCell:
         values = [self.numbers.vector(name) for name in names]
         chosen = np.array(self.workcell.start_branch), self.geometry.columns
         of = [*values, initial_decision(task), *chosen]
-        key = self.key("start", *[value.tobytes().hex() for value in of])
+        found_by = compiler_of(cache).identity
+        key = self.key("start", found_by, *[value.tobytes().hex() for value in of])
 
         def find() -> tuple[Array, Array]:
             if self._is_changed:  # one of many that are tried out

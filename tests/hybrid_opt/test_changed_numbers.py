@@ -174,8 +174,8 @@ def polished(name: str, cell: ho.Cell, drivable: ho.Cell) -> tuple[ho.Cell, ...]
 def warmed(name: str, polishes: bool = False) -> tuple[float, ...]:
     """What a cell and its drivable form give; afterwards all is compiled."""
     cell, drivable = both(name)
-    # Start postures may be kept from before, by another compiler: what finds others is compiled.
-    assert all(cell.compiled.model.branches)
+    # Start postures may be kept while what finds others was evicted: that is compiled.
+    assert all(each.compiled.model.branches for each in (cell, drivable))
     for each in polished(name, cell, drivable) if polishes else ():
         polish(each)
     return asked(cell, drivable, polished(name, cell, drivable))
