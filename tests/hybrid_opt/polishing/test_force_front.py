@@ -15,6 +15,7 @@ from hybrid_opt.indicators.metrics import front_of
 from hybrid_opt.polishing import polisher as polisher_module
 from hybrid_opt.polishing.force import ForceSolver, Reach, Target, pascoletti_serafini
 from hybrid_opt.polishing.force_front import (
+    FAR,
     Chord,
     Edge,
     between,
@@ -99,6 +100,18 @@ def test_the_front_gets_better_and_no_point_is_lost() -> None:
     for point in before:
         assert np.any(np.all(after <= point, axis=1))
     assert metrics.non_dominated(after).all()
+
+
+def test_what_probes_reach_is_given_up_only_where_the_front_is_nearly_as_good() -> None:
+    probes = [o for o in polished().outcomes if o.aim == "probe"]
+    assert len(probes) > 4
+    accepted = [o for o in probes if o.status == "accepted"]
+    assert accepted
+    front = polished().objectives
+    nearly = FAR * np.ptp(front, axis=0)
+    for outcome in accepted:
+        assert (outcome.start - outcome.objectives).max() > 0.0
+        assert np.any(np.all(front <= outcome.objectives + nearly, axis=1))
 
 
 def test_points_of_the_front_never_get_worse() -> None:

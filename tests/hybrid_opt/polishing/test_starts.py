@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hybrid_opt.evaluate.evaluation import COLLISION, REASONS
-from hybrid_opt.polishing.force_front import FAR, better_half
+from hybrid_opt.polishing.force_front import better_half
 from hybrid_opt.polishing.starts import (
     AWAY,
     LEAST_TURN,
@@ -24,7 +24,7 @@ from hybrid_opt.polishing.starts import (
 )
 from symbolic.records.task import POSE_SIZE, initial_decision
 from tests.hybrid_opt.polishing.cells import drivable_rack, start, way
-from tests.hybrid_opt.polishing.test_force_front import evaluator, polished
+from tests.hybrid_opt.polishing.test_force_front import evaluator
 
 FORCE = 55.0
 
@@ -85,18 +85,6 @@ def test_the_better_half_is_no_worse_than_the_rest(
     rest = [start for start in starts if all(start is not kept for kept in half)]
     for kept in half:
         assert all(kept.value(objective) <= other.value(objective) for other in rest)
-
-
-def test_what_probes_reach_is_given_up_only_where_the_front_is_nearly_as_good() -> None:
-    probes = [o for o in polished().outcomes if o.aim == "probe"]
-    assert len(probes) > 4
-    accepted = [o for o in probes if o.status == "accepted"]
-    assert accepted
-    front = polished().objectives
-    nearly = FAR * np.ptp(front, axis=0)
-    for outcome in accepted:
-        assert (outcome.start - outcome.objectives).max() > 0.0
-        assert np.any(np.all(front <= outcome.objectives + nearly, axis=1))
 
 
 def test_an_image_is_as_good_with_exchanged_objectives() -> None:

@@ -99,7 +99,7 @@ def test_polished_fronts_are_compared_too(own_study: Path, study: Path) -> None:
     settings = CampaignSettings(evaluations=120, replicas=2, seed=3)
     with open_folder(settings, ExecutionSettings(own_study, 1, resume=True), workcell) as folder:
         fill, probe = FillSettings(solved=3, members=3), ProbeSettings(1, 1, rounds=1)
-        polished = polish_stage(PolishSettings(attempts=1, fill=fill, probe=probe))
+        polished = polish_stage(PolishSettings(attempts=1, rounds=2, fill=fill, probe=probe))
         run_stages(folder, (search_stage(), polished, summary_stage()), Progress(shown=False))
     figures = {f.figure: f for f in compare(own_study, own_study).figures if f.algorithm == "nsga2"}
     run = read_campaign(own_study)

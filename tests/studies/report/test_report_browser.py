@@ -20,10 +20,10 @@ from selenium.webdriver.common.keys import Keys
 from selenium.webdriver.support.ui import WebDriverWait
 
 from hybrid_opt.store.trajectory_file import read_trajectory, replay
-from studies.report import page_data
+from studies.report import PAGE
 from studies.report.data import ReportData
-from studies.report.generate import write_report
-from tests.studies.report.test_report_page import HOSTILE, with_hostile_names
+from tests.conftest import Once
+from tests.studies.report.test_report_page import HOSTILE, hostile_page
 
 BROWSER = shutil.which("chromium") or shutil.which("google-chrome")
 DRIVER = shutil.which("chromedriver")
@@ -35,8 +35,8 @@ if not (BROWSER and DRIVER) and not os.environ.get("CI"):
 
 
 @pytest.fixture(scope="module")
-def report(data: ReportData, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_report(tmp_path_factory.mktemp("page"), data, with_paper=False)
+def report(study: Path) -> Path:
+    return study / PAGE
 
 
 @pytest.fixture(scope="module")
@@ -318,10 +318,9 @@ def test_fits_the_window(
 
 
 def test_hostile_names_are_shown_as_text(
-    browser: webdriver.Chrome, data: ReportData, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    browser: webdriver.Chrome, once: Once, data: ReportData
 ) -> None:
-    monkeypatch.setattr(page_data, "MAX_FRONT", 2)
-    hostile = write_report(tmp_path, with_hostile_names(data), with_paper=False)
+    hostile = hostile_page(once, data)
     logged(browser, "browser")
     opened(browser, hostile)
     assert browser.execute_script("return window.broken") is None

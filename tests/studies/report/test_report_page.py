@@ -25,7 +25,7 @@ from hybrid_opt.indicators.metrics import BindingBound
 from hybrid_opt.job.plan import JobModel
 from hybrid_opt.robust.squeeze import SqueezeSettings
 from studies.program import ReportError
-from studies.report import page_carries, page_data
+from studies.report import PAGE, page_carries, page_data
 from studies.report.data import ReportData
 from studies.report.generate import BEGIN, END, insert_tables, report_tables, write_report
 from studies.report.page_carries import DrawnJob, PageTrajectory, page_trajectory, pressure_shift
@@ -36,6 +36,7 @@ from symbolic.contact.elastic import free_shift
 from symbolic.read.cell import load
 from symbolic.read.cell_files import collect_cell
 from symbolic.records.task import initial_decision
+from tests.conftest import Once
 from tests.symbolic.cells import RACK
 
 HOSTILE = "</title></script><script>window.broken = 1</script><img src=x onerror=alert(1)>\"'&"
@@ -79,6 +80,17 @@ def with_hostile_names(data: ReportData) -> ReportData:
     initial = replace(data.initial, label=SHORT)
     changed = replace(data, workcell=workcell, algorithms=algorithms, initial=initial)
     return replace(changed, branches=BranchCompetition((WINNER, SECOND), 200, "constant"))
+
+
+def hostile_page(once: Once, data: ReportData) -> Path:
+    """The page of such a cell, with few trajectories."""
+
+    def make(folder: Path) -> None:
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(page_data, "MAX_FRONT", 2)
+            write_report(folder, with_hostile_names(data), with_paper=False, pdf=False)
+
+    return once("hostile", make) / PAGE
 
 
 @pytest.fixture(scope="module")
@@ -139,11 +151,8 @@ def test_the_policy_allows_exactly_the_pages_scripts(text: str) -> None:
     assert len(scripts) == 5
 
 
-def test_hostile_names_stay_text(
-    data: ReportData, tmp_path: Path, text: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(page_data, "MAX_FRONT", 2)
-    hostile = write_report(tmp_path, with_hostile_names(data), with_paper=False).read_text("utf-8")
+def test_hostile_names_stay_text(once: Once, data: ReportData, text: str) -> None:
+    hostile = hostile_page(once, data).read_text("utf-8")
     assert HOSTILE not in hostile
     assert html.escape(HOSTILE) in hostile
     assert "Start branches 2 and 0, best of 2 pairs" in hostile

@@ -33,7 +33,9 @@ def study(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ExecutionSettings(root, jobs=1),
         Progress(shown=False),
         StudySettings(
-            PolishSettings(attempts=3, fill=FillSettings(attempts=1), probe=ProbeSettings(2, 2)),
+            PolishSettings(
+                attempts=3, rounds=3, fill=FillSettings(4, 4, 1), probe=ProbeSettings(2, 2, 2)
+            ),
             drivable=False,
             report=False,
         ),

@@ -53,10 +53,10 @@ def even_cell() -> Workcell:
 def points_of(pad: Contact) -> tuple[Array, Array]:
     """(m, 2) points of a patch and the shares (m,) of the area that they stand for."""
     if pad.half_sides is not None:
-        along = (np.arange(16) + 0.5) / 8 - 1.0
+        along = (np.arange(12) + 0.5) / 6 - 1.0
         points = np.array(np.meshgrid(*[half * along for half in pad.half_sides]))
-        return points.reshape(2, -1).T, np.full(256, 1.0 / 256)
-    r, angle = np.meshgrid((np.arange(10) + 0.5) / 10, (np.arange(24) + 0.5) * 2.0 * np.pi / 24)
+        return points.reshape(2, -1).T, np.full(144, 1.0 / 144)
+    r, angle = np.meshgrid((np.arange(8) + 0.5) / 8, (np.arange(12) + 0.5) * 2.0 * np.pi / 12)
     at = np.stack([r * np.cos(angle), r * np.sin(angle)], axis=-1)
     return pad.patch_radius * at.reshape(-1, 2), r.ravel() / r.sum()
 

@@ -138,7 +138,7 @@ def caron_rows(pad: Contact, mu: float) -> Array:
     ("allocation", "most"), [("paper", 5), ("soft-finger", 4)], ids=["points", "even pads"]
 )
 @given(seed=st.integers(0, 2**31), chosen=st.integers(0, 4))
-@settings(max_examples=6)
+@settings(max_examples=4)
 def test_turning_all_turns_the_forces(allocation: str, most: int, seed: int, chosen: int) -> None:
     rng, kinds = np.random.default_rng(seed), KINDS[chosen % most]
     base = with_task(hand_cell(), allocation=allocation)
