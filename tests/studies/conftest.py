@@ -14,6 +14,7 @@ import pytest
 from hybrid_opt.campaign.results import read_campaign
 from hybrid_opt.indicators.metrics import non_dominated
 from hybrid_opt.polishing.records import PolishedFront, PolishEffort
+from studies.report import PAGE
 from studies.report.data import ReportData, Run, gather
 from studies.study.simulation import StoredSimulation
 from studies.study.summary import PolishedFigures, front_indicators
@@ -51,6 +52,12 @@ def program_run(once: Once) -> tuple[Path, str]:
 def study(program_run: tuple[Path, str]) -> Path:
     """Results folder of two algorithms, two replicas and 120 evaluations each."""
     return program_run[0]
+
+
+@pytest.fixture(scope="session")
+def report(study: Path) -> Path:
+    """The page of that study's report."""
+    return study / PAGE
 
 
 @pytest.fixture(scope="session")

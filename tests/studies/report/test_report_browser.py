@@ -20,7 +20,6 @@ from selenium.webdriver.common.keys import Keys
 from selenium.webdriver.support.ui import WebDriverWait
 
 from hybrid_opt.store.trajectory_file import read_trajectory, replay
-from studies.report import PAGE
 from studies.report.data import ReportData
 from tests.conftest import Once
 from tests.studies.report.test_report_page import HOSTILE, hostile_page
@@ -32,11 +31,6 @@ SECONDS = 60.0
 
 if not (BROWSER and DRIVER) and not os.environ.get("CI"):
     pytest.skip("chromium and chromium-driver are not installed", allow_module_level=True)
-
-
-@pytest.fixture(scope="module")
-def report(study: Path) -> Path:
-    return study / PAGE
 
 
 @pytest.fixture(scope="module")

@@ -88,14 +88,9 @@ def hostile_page(once: Once, data: ReportData) -> Path:
     def make(folder: Path) -> None:
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(page_data, "MAX_FRONT", 2)
-            write_report(folder, with_hostile_names(data), with_paper=False, pdf=False)
+            write_report(folder, with_hostile_names(data), with_paper=True, pdf=False)
 
     return once("hostile", make) / PAGE
-
-
-@pytest.fixture(scope="module")
-def report(data: ReportData, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_report(tmp_path_factory.mktemp("report"), data, with_paper=True)
 
 
 @pytest.fixture(scope="module")
