@@ -15,7 +15,7 @@ import os
 import platform
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -45,6 +45,9 @@ if TYPE_CHECKING:
 
 HANDWRITTEN_LEVEL = 3
 """Optimisation level of what is written by hand: it is short."""
+
+ATTENTION_SECONDS = 0.5
+"""How long Ctrl-C may go unseen [s]."""
 
 _MAKING = Lock()
 """Sets that are built side by side are made one after the other, so that compilers are busy with
@@ -438,6 +441,9 @@ def _compiled(
             futures = {
                 source.name: _begin(source, compiler, cache, pool, rebuild) for source in sources
             }
+        # In steps: a signal that comes just before a wait is seen when the wait ends.
+        while wait(futures.values(), ATTENTION_SECONDS).not_done:
+            pass
         built = {name: future.result() for name, future in futures.items()}
     key = _compiler_key()
     if not all(found for _, found in built.values()) or cache.read_record(key) is None:
