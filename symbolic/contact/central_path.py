@@ -173,7 +173,7 @@ def _step(program: Program, final_weight: float = FINAL_WEIGHT) -> ca.Function:
     far = _length([step.lowest_of_state for step in first], 1.0)
     final = final_weight * equations.effort
     aimed = ca.fmax((1.0 - far) ** 2 * weight, final)
-    second = steps(aimed, [step.second_order for step in first])
+    second = steps(aimed, [step.second_order() for step in first])
     share = ca.fmin(ca.fmax(STEP_SHARE, 1.0 - APPROACH * weight / equations.effort), LAST_SHARE)
     length = _length([step.lowest for step in second], share)
     change = ca.vertcat(*[step.change for step in second])
@@ -304,8 +304,7 @@ class Equations:
         self._missing = ca.vertcat(*program.balanced(at, cell)) - own
         self._stiff, self._ends = ca.diagcat(*stiff), [0, *accumulate(w.shape[0] for w in wrenches)]
         whole = ca.mtimes([self._by_free.T, self._stiff, self._by_free])
-        size = range(whole.shape[0])
-        self._system = Elimination([[whole[i, j] for j in size] for i in size], len(size))
+        self._system = Elimination.whole(whole)
 
     def downhill(self, pulls: list[ca.SX], changes: list[ca.SX]) -> ca.SX:
         """How fast effort and barriers fall along changes: the decrement's square, times the
@@ -318,8 +317,7 @@ class Equations:
         right = (
             ca.vertcat(*pulls) - ca.vertcat(*self._slopes) - ca.mtimes(self._stiff, self._missing)
         )
-        reduced = self._system.reduced(ca.vertsplit(ca.mtimes(self._by_free.T, right)))
-        free = ca.vertcat(*self._system.first(reduced, []))
+        free = self._system.solved(ca.mtimes(self._by_free.T, right))
         found: list[ca.SX] = ca.vertsplit(
             self._missing + ca.mtimes(self._by_free, free), self._ends
         )

@@ -21,11 +21,12 @@ of theirs.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import casadi as ca
 
 from symbolic.contact.force_closure import EVEN
-from symbolic.contact.patches import BarrierPatch, Elimination, StateStep
+from symbolic.contact.patches import Aim, BarrierPatch, Elimination, StateStep, Step
 from symbolic.contact.soft_finger import SoftPatch, torsion_capacity
 
 DEGREE = 2.0
@@ -137,61 +138,32 @@ class LocalEven:
         self.gap = DEGREE * self.weight
         self.stiffness = self.weight * self.curvature
         off = multiplier / self.weight + self.slope
-        n = range(len(EVEN))
-        system = Elimination([[self.curvature[i, j] for j in n] for i in n], len(n))
-        solved = ca.vertcat(*system.first(system.reduced(ca.vertsplit(off)), []))
+        solved = Elimination.whole(self.curvature).solved(off)
         away = ca.sqrt(ca.fmax(ca.dot(off, solved), 0.0))
         near = (OFF_PATH - away) / (OFF_PATH - NEAR_PATH)
         self.trust = ca.fmin(ca.fmax(near, LEAST_TRUST), 1.0)
 
-    def aim(self, weight: ca.SX, correction: ca.SX) -> EvenAim:
+    def aim(self, weight: ca.SX, correction: ca.SX) -> Aim:
         """See `symbolic.contact.patches.LocalPatch`."""
-        return EvenAim(self, weight, -weight * self.slope - correction)
+        pull = -weight * self.slope - correction
+        return Aim(pull, partial(self._step, pull, weight - self.stored))
 
-    def second_order(self, change: ca.SX) -> ca.SX:
-        """The correction that a whole step leaves out."""
-        bend, *symbols = self._bend
-        (bend,) = ca.substitute([bend], symbols, [self.wrench, change])
-        return self.weight * (bend / 2.0 - ca.mtimes(self.curvature, change))
+    def _step(self, pull: ca.SX, grown: ca.SX, change: ca.SX) -> Step:
+        lowest = self.patch.lowest(self.wrench, change)
+        of_state = lowest / self.trust
+        turned = pull - ca.mtimes(self.stiffness, change) - self.multiplier
 
+        def second_order() -> ca.SX:
+            far = ca.fmin(1.0, -1.0 / of_state)
+            bend, *symbols = self._bend
+            (bend,) = ca.substitute([bend], symbols, [self.wrench, change])
+            return far**2 * (self.weight * (bend / 2.0 - ca.mtimes(self.curvature, change)))
 
-@dataclass
-class EvenAim:
-    """See `symbolic.contact.patches.Aim`."""
+        def gap_after(length: ca.SX) -> ca.SX:
+            state = self.wrench + length * change
+            multiplier = self.multiplier + length * turned
+            return ca.fmax(DEGREE * (self.stored + length * grown), ca.dot(state, multiplier))
 
-    local: LocalEven
-    weight: ca.SX
-    pull: ca.SX
-
-    def step(self, change: ca.SX) -> EvenStep:
-        """See `symbolic.contact.patches.Aim`."""
-        local = self.local
-        lowest = local.patch.lowest(local.wrench, change)
-        after = self.pull - ca.mtimes(local.stiffness, change) - local.multiplier
-        whole = ca.vertcat(change, after, self.weight - local.stored)
-        return EvenStep(self, whole, lowest / local.trust, lowest / SAFE)
-
-
-@dataclass
-class EvenStep:
-    """See `symbolic.contact.patches.Step`."""
-
-    aim: EvenAim
-    change: ca.SX
-    lowest_of_state: ca.SX
-    lowest: ca.SX
-
-    @property
-    def second_order(self) -> ca.SX:
-        """See `symbolic.contact.patches.Step`."""
-        far = ca.fmin(1.0, -1.0 / self.lowest_of_state)
-        return far**2 * self.aim.local.second_order(self.change[: len(EVEN)])
-
-    def gap_after(self, length: ca.SX) -> ca.SX:
-        """See `symbolic.contact.patches.Step`."""
-        local, n = self.aim.local, len(EVEN)
-        state = local.wrench + length * self.change[:n]
-        multiplier = local.multiplier + length * self.change[n:-1]
-        return ca.fmax(
-            DEGREE * (local.stored + length * self.change[-1]), ca.dot(state, multiplier)
+        return Step(
+            ca.vertcat(change, turned, grown), of_state, lowest / SAFE, second_order, gap_after
         )

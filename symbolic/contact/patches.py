@@ -63,10 +63,51 @@ class Patch(Protocol):
         """The barrier at a program's state, of which `centred` has the multipliers."""
 
     def lowest(self, state: ca.SX, change: ca.SX) -> ca.SX:
-        """As `Step.lowest_of_state`, of a change of a program's state."""
+        """As `StateStep.lowest_of_state`, of a change of a program's state."""
 
     def slack(self, state: ca.SX) -> ca.SX:
         """Positive within the cone, not so beyond its boundary; of a program's state."""
+
+
+@dataclass(frozen=True)
+class StateStep:
+    """A step of a patch's state alone.
+
+    Attributes:
+        change: (iterate_size,) of the iterate.
+        lowest_of_state: bound from below of what it adds to the eigenvalues of X, over them.
+    """
+
+    change: ca.SX
+    lowest_of_state: ca.SX
+
+
+@dataclass(frozen=True)
+class Step(StateStep):
+    """A step of state and multipliers.
+
+    Attributes:
+        lowest: the bound for both X and S.
+        second_order: () to (correction_size,) what the whole step leaves out: sym(X^-1 dX dS).
+        gap_after: a share of the step to the pairing of X with S after it.
+    """
+
+    lowest: ca.SX
+    second_order: Callable[[], ca.SX]
+    gap_after: Callable[[ca.SX], ca.SX]
+
+
+@dataclass(frozen=True)
+class Aim:
+    """A weight and a correction that a step is to lead to.
+
+    Attributes:
+        pull: (m,) what the multipliers give to the wrench where that does not change.
+        step: that changes the wrench by (m,).
+    """
+
+    pull: ca.SX
+    step: Callable[[ca.SX], Step]
 
 
 class LocalPatch(Protocol):
@@ -102,48 +143,6 @@ class BarrierPatch:
     step: Callable[[ca.SX], StateStep]
 
 
-@dataclass(frozen=True)
-class StateStep:
-    """A step of a patch's state alone; see `Step`."""
-
-    change: ca.SX
-    lowest_of_state: ca.SX
-
-
-class Aim(Protocol):
-    """A weight and a correction that a step is to lead to.
-
-    Attributes:
-        pull: (m,) what the multipliers give to the wrench where that does not change.
-    """
-
-    pull: ca.SX
-
-    def step(self, change: ca.SX) -> Step:
-        """The step that changes the wrench by `change` (m,)."""
-
-
-class Step(Protocol):
-    """A step.
-
-    Attributes:
-        change: (iterate_size,) of the iterate.
-        lowest_of_state, lowest: bounds from below of what it adds to the eigenvalues of X, and of
-            X and S, over them.
-    """
-
-    change: ca.SX
-    lowest_of_state: ca.SX
-    lowest: ca.SX
-
-    @property
-    def second_order(self) -> ca.SX:
-        """(correction_size,) what the whole step leaves out: sym(X^-1 dX dS)."""
-
-    def gap_after(self, length: ca.SX) -> ca.SX:
-        """Pairing of X with S after a share `length` of the step."""
-
-
 def least(values: list[ca.SX]) -> ca.SX:
     """The least of some values."""
     found = values[0]
@@ -162,7 +161,7 @@ class Elimination:
     """Factors L D L' of the first k rows and columns.
 
     Attributes:
-        left: S, (n - k) rows of (n - k) entries, empty for k = n.
+        left: S (n - k, n - k).
     """
 
     def __init__(self, matrix: Sequence[Numbers], k: int) -> None:
@@ -186,7 +185,9 @@ class Elimination:
             self._factors.append(factor)
             self._over_pivot.append(over)
         size = range(k, n)
-        self.left = [[rows[max(i, j)][min(i, j)] for j in size] for i in size]
+        self.left = ca.vertcat(
+            *[ca.horzcat(*[rows[max(i, j)][min(i, j)] for j in size]) for i in size]
+        )
 
     def reduced(self, right: Numbers) -> list[ca.SX]:
         """f and g (n,) to the first unknowns' part for `first` (k,), and g - B A^-1 f (n - k,)."""
@@ -204,3 +205,13 @@ class Elimination:
             for i, share in enumerate(self._factors[p], start=p + 1):
                 found[p] = found[p] - share * found[i]
         return found[: self._k]
+
+    @classmethod
+    def whole(cls, matrix: ca.SX) -> Elimination:
+        """All unknowns eliminated."""
+        n = range(matrix.shape[0])
+        return cls([[matrix[i, j] for j in n] for i in n], len(n))
+
+    def solved(self, right: ca.SX) -> ca.SX:
+        """x (n,) of A x = f, where all unknowns are eliminated."""
+        return ca.vertcat(*self.first(self.reduced(ca.vertsplit(right)), []))

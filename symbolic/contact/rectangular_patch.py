@@ -14,11 +14,12 @@ and det f = f . J f, and sym(a b c) = a (b . c) + c (a . b) - (a . J c) J b.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import casadi as ca
 
 from symbolic.contact.force_closure import POINT_SIZE, STATE_SIZE, WRENCH_SIZE
-from symbolic.contact.patches import BarrierPatch, Elimination, StateStep, least
+from symbolic.contact.patches import Aim, BarrierPatch, Elimination, StateStep, Step, least
 from symbolic.expression import reciprocal
 
 CORNERS = 4
@@ -71,8 +72,7 @@ class RectangularPatch:
 
     def lowest(self, state: ca.SX, change: ca.SX) -> ca.SX:
         """Exactly: each corner has two eigenvalues."""
-        pairs = zip(self._corners(state), self._corners(change), strict=True)
-        return least([_lowest(f, move) for f, move in pairs])
+        return least(list(map(_lowest, self._corners(state), self._corners(change))))
 
     def slack(self, state: ca.SX) -> ca.SX:
         """What friction leaves at the corner where it leaves least."""
@@ -111,32 +111,49 @@ class LocalRectangle:
 
     def __init__(self, patch: RectangularPatch, iterate: ca.SX) -> None:
         """Inverses of the corners' matrices, and the stiffness left by what moves freely."""
-        self.patch = patch
+        self._patch = patch
         state = iterate[:STATE_SIZE]
         self.wrench = state[:WRENCH_SIZE]
-        self.force = corners_of(patch.waves(state))
-        self.multiplier = list(ca.vertsplit(iterate[STATE_SIZE:], POINT_SIZE))
-        self.inverse = [_inverse(f) for f in self.force]
-        pairs = zip(self.force, self.multiplier, strict=True)
-        self.gap = sum(ca.dot(f, s) for f, s in pairs)
-        pairs = zip(self.multiplier, self.inverse, strict=True)
-        self.stiff = [_both_sides(s, inverse) for s, inverse in pairs]
+        self._force = corners_of(patch.waves(state))
+        self._multiplier = list(ca.vertsplit(iterate[STATE_SIZE:], POINT_SIZE))
+        self._inverse = [_inverse(f) for f in self._force]
+        self.gap = sum(map(ca.dot, self._force, self._multiplier))
+        self._stiff = list(map(_both_sides, self._multiplier, self._inverse))
         self._elimination = Elimination(self._matrix(), STATE_SIZE - WRENCH_SIZE)
-        self.stiffness = ca.vertcat(*[ca.horzcat(*row) for row in self._elimination.left])
+        self.stiffness = self._elimination.left
 
-    def aim(self, weight: ca.SX, correction: ca.SX) -> RectangleAim:
+    def aim(self, weight: ca.SX, correction: ca.SX) -> Aim:
         """See `symbolic.contact.patches.LocalPatch`."""
         corrections = ca.vertsplit(correction, POINT_SIZE)
-        pairs = zip(self.inverse, corrections, strict=True)
-        return RectangleAim(self, [weight * inverse - c for inverse, c in pairs])
+        pairs = zip(self._inverse, corrections, strict=True)
+        given = [weight * inverse - c for inverse, c in pairs]
+        waves = [_wave_sums([g[i] for g in given]) for i in range(POINT_SIZE)]
+        whole = [value * (1.0 / WAVES) for value in self._patch.gathered(waves)]
+        reduced = self._elimination.reduced([*whole[WRENCH_SIZE:], *whole[:WRENCH_SIZE]])
+        return Aim(ca.vertcat(*reduced[WRENCH_SIZE:]), partial(self._step, given, reduced))
 
-    def eliminated(self, right: list[ca.SX]) -> list[ca.SX]:
-        """The part for the wrench of what acts on the state, with the inner entries eliminated."""
-        return self._elimination.reduced([*right[WRENCH_SIZE:], *right[:WRENCH_SIZE]])
+    def _step(self, given: list[ca.SX], reduced: list[ca.SX], change: ca.SX) -> Step:
+        """From what the multipliers become where nothing moves, per corner."""
+        moved = ca.vertcat(change, *self._elimination.first(reduced, ca.vertsplit(change)))
+        force, multiplier = corners_of(self._patch.waves(moved)), self._multiplier
+        corners = zip(given, self._stiff, force, multiplier, strict=True)
+        turned = [g - ca.mtimes(stiff, df) - s for g, stiff, df, s in corners]
+        lowest = least(list(map(_lowest, self._force, force)))
 
-    def inner(self, reduced: list[ca.SX], change: ca.SX) -> list[ca.SX]:
-        """The inner entries' change beside the wrench's (6,)."""
-        return self._elimination.first(reduced, ca.vertsplit(change))
+        def second_order() -> ca.SX:
+            return ca.vertcat(*map(_product, self._inverse, force, turned))
+
+        def gap_after(length: ca.SX) -> ca.SX:
+            moves = zip(self._force, force, multiplier, turned, strict=True)
+            return sum(ca.dot(f + length * df, s + length * ds) for f, df, s, ds in moves)
+
+        return Step(
+            ca.vertcat(moved, *turned),
+            lowest,
+            least([lowest, *map(_lowest, multiplier, turned)]),
+            second_order,
+            gap_after,
+        )
 
     def _matrix(self) -> list[list[ca.SX]]:
         """(12, 12) stiffness of the state, inner entries first.
@@ -145,67 +162,21 @@ class LocalRectangle:
         """
         parts, waves = range(POINT_SIZE), range(WAVES)
         sums = [
-            [_wave_sums([stiff[i, j] * WAVES**-2 for stiff in self.stiff]) for j in range(i + 1)]
+            [_wave_sums([stiff[i, j] * WAVES**-2 for stiff in self._stiff]) for j in range(i + 1)]
             for i in parts
         ]
 
         def column(i: int, wave: int) -> list[ca.SX]:
             entry = [sums[max(i, j)][min(i, j)] for j in parts]
-            return self.patch.gathered([[each[wave ^ other] for other in waves] for each in entry])
+            return self._patch.gathered([[each[wave ^ other] for other in waves] for each in entry])
 
         columns = [[column(i, wave) for wave in waves] for i in parts]
         rows = [
-            self.patch.gathered([[of_wave[k] for of_wave in of_part] for of_part in columns])
+            self._patch.gathered([[of_wave[k] for of_wave in of_part] for of_part in columns])
             for k in range(STATE_SIZE)
         ]
         order = [*range(WRENCH_SIZE, STATE_SIZE), *range(WRENCH_SIZE)]
         return [[rows[i][j] for j in order] for i in order]
-
-
-class RectangleAim:
-    """See `symbolic.contact.patches.Aim`."""
-
-    def __init__(self, local: LocalRectangle, given: list[ca.SX]) -> None:
-        """From what the multipliers become where nothing moves, per corner."""
-        self._local, self._given = local, given
-        waves = [_wave_sums([g[i] for g in given]) for i in range(POINT_SIZE)]
-        whole = [value * (1.0 / WAVES) for value in local.patch.gathered(waves)]
-        self._reduced = local.eliminated(whole)
-        self.pull = ca.vertcat(*self._reduced[WRENCH_SIZE:])
-
-    def step(self, change: ca.SX) -> RectangleStep:
-        """See `symbolic.contact.patches.Aim`."""
-        moved = ca.vertcat(change, *self._local.inner(self._reduced, change))
-        return RectangleStep(self._local, self._given, moved)
-
-
-class RectangleStep:
-    """See `symbolic.contact.patches.Step`; force and multiplier: the corners' changes."""
-
-    def __init__(self, local: LocalRectangle, given: list[ca.SX], moved: ca.SX) -> None:
-        """The corners' steps from the state's."""
-        self.force = corners_of(local.patch.waves(moved))
-        corners = zip(given, local.stiff, self.force, local.multiplier, strict=True)
-        self.multiplier = [g - ca.mtimes(stiff, df) - s for g, stiff, df, s in corners]
-        self.change = ca.vertcat(moved, *self.multiplier)
-        of_force = zip(local.force, self.force, strict=True)
-        of_multiplier = zip(local.multiplier, self.multiplier, strict=True)
-        self.lowest_of_state = least([_lowest(f, df) for f, df in of_force])
-        of_both = [self.lowest_of_state, *[_lowest(s, ds) for s, ds in of_multiplier]]
-        self.lowest = least(of_both)
-        self._local = local
-
-    @property
-    def second_order(self) -> ca.SX:
-        """See `symbolic.contact.patches.Step`."""
-        moves = zip(self._local.inverse, self.force, self.multiplier, strict=True)
-        return ca.vertcat(*[_product(inverse, df, ds) for inverse, df, ds in moves])
-
-    def gap_after(self, length: ca.SX) -> ca.SX:
-        """See `symbolic.contact.patches.Step`."""
-        local = self._local
-        corners = zip(local.force, self.force, local.multiplier, self.multiplier, strict=True)
-        return sum(ca.dot(f + length * df, s + length * ds) for f, df, s, ds in corners)
 
 
 def corners_of(waves: list[list[ca.SX]]) -> list[ca.SX]:

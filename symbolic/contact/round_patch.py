@@ -34,12 +34,12 @@ has nothing real at z's place, so that eight numbers tell it.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 
 import casadi as ca
 
 from symbolic.contact.force_closure import WRENCH_SIZE
-from symbolic.contact.patches import BarrierPatch, Elimination, StateStep
+from symbolic.contact.patches import Aim, BarrierPatch, Elimination, StateStep, Step
 from symbolic.expression import Expression, reciprocal
 
 Complex = tuple[ca.SX, ca.SX]
@@ -256,83 +256,58 @@ class LocalDisc:
     def __init__(self, iterate: ca.SX) -> None:
         """The inverse, and the stiffness left by z."""
         self.wrench = iterate[:WRENCH_SIZE]
-        self.matrix = _matrix(iterate[:FREE_SIZE])
+        self._matrix = _matrix(iterate[:FREE_SIZE])
         numbers = ca.vertsplit(iterate[FREE_SIZE:])
-        self.multiplier = Hermitian.of(ca.vertcat(*numbers[:-1], 0.0, numbers[-1]))
-        self.gap = self.matrix.trace_with(self.multiplier)
-        self.adjugate = self.matrix.adjugate()
-        self.inverse = self.adjugate.scaled(reciprocal(self.matrix.determinant(self.adjugate)))
-        self.multiplier_adjugate = self.multiplier.adjugate()
-        self._elimination = Elimination(_stiffness(self.inverse, self.multiplier), 1)
-        self.stiffness = ca.vertcat(*[ca.horzcat(*row) for row in self._elimination.left])
+        self._multiplier = Hermitian.of(ca.vertcat(*numbers[:-1], 0.0, numbers[-1]))
+        self.gap = self._matrix.trace_with(self._multiplier)
+        self._adjugate = self._matrix.adjugate()
+        over = reciprocal(self._matrix.determinant(self._adjugate))
+        self._inverse = self._adjugate.scaled(over)
+        self._elimination = Elimination(_stiffness(self._inverse, self._multiplier), 1)
+        self.stiffness = self._elimination.left
 
-    def aim(self, weight: ca.SX, correction: ca.SX) -> DiscAim:
+    def aim(self, weight: ca.SX, correction: ca.SX) -> Aim:
         """See `symbolic.contact.patches.LocalPatch`."""
-        return DiscAim(self, self.inverse.scaled(weight).less(Hermitian.of(correction)))
+        given = self._inverse.scaled(weight).less(Hermitian.of(correction))
+        reduced = self._elimination.reduced(ca.vertsplit(_paired(given)))
+        pull = ca.vertcat(*reduced[1:])
+        return Aim(pull, partial(self._step, given, reduced, pull))
 
-    def eliminated(self, right: ca.SX) -> list[ca.SX]:
-        """The part for the wrench of what acts on z and the wrench (7,), with z eliminated."""
-        return self._elimination.reduced(ca.vertsplit(right))
+    def _step(self, given: Hermitian, reduced: list[ca.SX], pull: ca.SX, change: ca.SX) -> Step:
+        """From what the multipliers become where nothing moves.
 
-    def z_change(self, reduced: list[ca.SX], change: ca.SX) -> ca.SX:
-        """The change of z beside the wrench's (6,)."""
-        return self._elimination.first(reduced, ca.vertsplit(change))[0]
-
-
-class DiscAim:
-    """See `symbolic.contact.patches.Aim`."""
-
-    def __init__(self, local: LocalDisc, given: Hermitian) -> None:
-        """From what the multipliers become where nothing moves."""
-        self._local, self._given = local, given
-        self._reduced = local.eliminated(_paired(given))
-        self.pull = ca.vertcat(*self._reduced[1:])
-
-    def step(self, change: ca.SX) -> DiscStep:
-        """See `symbolic.contact.patches.Aim`."""
-        local = self._local
-        z = local.z_change(self._reduced, change)
-        left = self.pull - ca.mtimes(local.stiffness, change)
-        return DiscStep(local, self._given, ca.vertcat(change, z), left)
-
-
-class DiscStep:
-    """See `symbolic.contact.patches.Step`; matrix and multiplier: the changes of X and S."""
-
-    def __init__(self, local: LocalDisc, given: Hermitian, moved: ca.SX, left: ca.SX) -> None:
-        """From wrench's and z's changes and what S + dS is to give to the wrench (6,).
-
-        That tells all of S + dS but how its diagonal is shared.
+        What S + dS is to give to the wrench tells all of it but how its diagonal is shared.
         """
-        self.matrix = _matrix(moved)
-        by_row = local.inverse.product(self.matrix)
+        moved = ca.vertcat(change, self._elimination.first(reduced, ca.vertsplit(change))[0])
+        left = pull - ca.mtimes(self.stiffness, change)
+        matrix, multiplier = _matrix(moved), self._multiplier
+        by_row = self._inverse.product(matrix)
         shares = []
         for k in (0, 1):
-            terms = [times(by_row[k][j], local.multiplier.at(j, k))[0] for j in range(3)]
+            terms = [times(by_row[k][j], multiplier.at(j, k))[0] for j in range(3)]
             shares.append(given.diagonal[k] - sum(terms))
         half = 0.5 * left
         target = Hermitian(
             (shares[0], shares[1], left[0] - shares[0] - shares[1]),
             ((half[3], half[4]), (half[1], half[2]), (ca.SX(0.0), half[5])),
         )
-        self.multiplier = target.less(local.multiplier)
-        self.change = ca.vertcat(moved, *_numbers(self.multiplier))
-        self.lowest_of_state = _lowest(local.matrix, local.adjugate, self.matrix)
-        of_multiplier = _lowest(local.multiplier, local.multiplier_adjugate, self.multiplier)
-        self.lowest = ca.fmin(self.lowest_of_state, of_multiplier)
-        self._local = local
+        turned = target.less(multiplier)
+        lowest = _lowest(self._matrix, self._adjugate, matrix)
 
-    @property
-    def second_order(self) -> ca.SX:
-        """See `symbolic.contact.patches.Step`."""
-        moved = multiplied(self._local.inverse.product(self.matrix), self.multiplier.rows)
-        return ca.vertcat(*hermitian_part(moved).entries)
+        def second_order() -> ca.SX:
+            return ca.vertcat(*hermitian_part(multiplied(by_row, turned.rows)).entries)
 
-    def gap_after(self, length: ca.SX) -> ca.SX:
-        """See `symbolic.contact.patches.Step`."""
-        local = self._local
-        matrix = local.matrix.moved(self.matrix, length)
-        return matrix.trace_with(local.multiplier.moved(self.multiplier, length))
+        def gap_after(length: ca.SX) -> ca.SX:
+            after = self._matrix.moved(matrix, length)
+            return after.trace_with(multiplier.moved(turned, length))
+
+        return Step(
+            ca.vertcat(moved, *_numbers(turned)),
+            lowest,
+            ca.fmin(lowest, _lowest(multiplier, multiplier.adjugate(), turned)),
+            second_order,
+            gap_after,
+        )
 
 
 def _numbers(multiplier: Hermitian) -> list[ca.SX]:

@@ -172,19 +172,18 @@ class _Local:
         patches = zip(program.grasp.patches, self._owns, strict=True)
         slopes, stiff = zip(*[_barrier(patch, own) for patch, own in patches], strict=True)
         self.slope = self._g + program.weight * ca.vertcat(*slopes)
-        # Without g g'.
+        # Without g g', which is left out of the system that is solved as well.
         self._curvature = program.weight * ca.diagcat(*stiff) + self._square / self._effort
         free = program.free
         reduced = ca.mtimes([free.T, self._curvature, free])
-        n = range(reduced.shape[0])
-        self._system = Elimination([[reduced[i, j] for j in n] for i in n], len(n))
+        self._system = Elimination.whole(reduced)
         self._g_free = ca.mtimes(free.T, self._g)
-        self._answer = self._without(self._g_free)
+        self._answer = self._system.solved(self._g_free)
         self._share = 1.0 / (1.0 - ca.dot(self._g_free, self._answer))
 
     def solved(self, right: ca.SX) -> ca.SX:
         """y of Y' F Y y = right, by Sherman and Morrison's formula."""
-        found = self._without(right)
+        found = self._system.solved(right)
         return found + self._answer * (self._share * ca.dot(self._g_free, found))
 
     def by_load(self) -> ca.SX:
@@ -213,10 +212,6 @@ class _Local:
         square = ca.mtimes([by_load.T, self._square, by_load])
         of_effort = 2.0 * size * ca.mtimes(by, by.T) - over * (size * square + both + both.T)
         return self._program.weight * barriers + of_effort
-
-    def _without(self, right: ca.SX) -> ca.SX:
-        """The same without g g'."""
-        return ca.vertcat(*self._system.first(self._system.reduced(ca.vertsplit(right)), []))
 
 
 def _barrier(patch: Patch, at: ca.SX) -> list[ca.SX]:

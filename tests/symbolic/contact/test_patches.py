@@ -81,7 +81,7 @@ def test_a_step_solves_its_equations(patch: Patch) -> None:
     aim = local.aim(ca.SX(0.3), ca.SX.zeros(patch.correction_size))
     step = aim.step(change)
     outputs = [local.gap, local.stiffness, aim.pull, step.change, step.lowest_of_state]
-    outputs += [step.lowest, step.second_order]
+    outputs += [step.lowest, step.second_order()]
     asked = 0.1 * np.random.default_rng(0).normal(size=6)
     run = ca.Function("run", [symbol, change], outputs)
     gap, stiffness, pull, moved, of_state, of_both, second = [
