@@ -230,6 +230,43 @@ class Grasp:
         ]
         return np.array(ca.evalf(ca.horzcat(*parts))).T
 
+    def solved(self, cell: list[ca.MX], given: Sequence[ca.MX], differentiable: bool) -> ca.MX:
+        """What is `told` of the least effort [N, N m], beyond any limit where friction does not
+        close the grasp.
+
+        Args:
+            cell: the inputs, the load in newtons first.
+        """
+        load, *others = cell
+        size = ca.sqrt(ca.sumsqr(load[:3]) + ca.sumsqr(load[3:] / MOMENT_ARM) + SCALE_FLOOR**2)
+        solve = differentiable_least_effort if differentiable else least_effort
+        found = solve(self, load / size, *others, *given)
+        return self._in_newtons()(found, size, *others[: len(SIZES)], *given)
+
+    def _in_newtons(self) -> ca.Function:
+        found, size = ca.SX.sym("w", self._wrench_ends[-1]), ca.SX.sym("s")
+        names = [name for name, _ in self.cell_sizes if name in SIZES]
+        sizes = [ca.SX.sym(name, 2) for name in names]
+        told, beyond = self.told(ca.vertsplit(found, self._wrench_ends), sizes)
+        squeezed = zip(self.patches, self.squeezed(*sizes), strict=True)
+        closes = least([patch.slack(state) for patch, state in squeezed]) > 0.0
+        held = size * ca.if_else(closes, told, beyond)
+        return ca.Function("in_newtons", [found, size, *sizes, *self.given.values()], [held])
+
+    def told(
+        self, wrenches: list[ca.SX], sizes: list[ca.SX]
+    ) -> tuple[ca.SX, ca.SX | ca.DM | float]:
+        """What is asked for, over the load's scale, and what stands for it beyond any limit: all
+        pads' wrenches, see `grasp_wrenches`.
+
+        Args:
+            wrenches: scaled ones.
+            sizes: `SIZES` as far as they are inputs.
+        """
+        whole = [whole_wrench(self.units(i, *sizes) * own) for i, own in enumerate(wrenches)]
+        beyond = ca.DM([BEYOND, 0, 0, 0, 0, 0])
+        return ca.vertcat(*whole), ca.repmat(beyond, len(wrenches), 1)
+
     def units(self, i: int, friction: ca.SX, reach: ca.SX = WHOLE) -> ca.SX:
         """(m,) what the entries of pad i's scaled wrench are multiples of."""
         robot = self.robots[i]
@@ -269,25 +306,7 @@ def grasp_wrenches(
         given: the grasp's given numbers, where they are symbols.
         differentiable: whether first derivatives are wanted.
     """
-    size = ca.sqrt(ca.sumsqr(load[:3]) + ca.sumsqr(load[3:] / MOMENT_ARM) + SCALE_FLOOR**2)
-    solve = differentiable_least_effort if differentiable else least_effort
-    found = solve(grasp, load / size, friction, *given)
-    return _in_newtons(grasp)(found, size, friction, *given)
-
-
-def _in_newtons(grasp: Grasp) -> ca.Function:
-    ends = [0, *accumulate(patch.wrench_size for patch in grasp.patches)]
-    found, size, friction = ca.SX.sym("w", ends[-1]), ca.SX.sym("s"), ca.SX.sym("mu", 2)
-    wrenches = [
-        whole_wrench(grasp.units(i, friction) * own)
-        for i, own in enumerate(ca.vertsplit(found, ends))
-    ]
-    squeezed = zip(grasp.patches, grasp.squeezed(friction), strict=True)
-    closes = least([patch.slack(state) for patch, state in squeezed]) > 0.0
-    beyond = ca.repmat(ca.DM([BEYOND, 0, 0, 0, 0, 0]), len(wrenches), 1)
-    held = size * ca.if_else(closes, ca.vertcat(*wrenches), beyond)
-    inputs = [found, size, friction, *grasp.given.values()]
-    return ca.Function("in_newtons", inputs, [held])
+    return grasp.solved([load, friction], given, differentiable)
 
 
 def whole_wrench(wrench: ca.SX) -> ca.SX:

@@ -24,13 +24,13 @@ does.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from itertools import accumulate
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
-from symbolic.contact.central_path import differentiable_least_effort, least_effort
 from symbolic.contact.force_closure import WRENCH_SIZE, has_force_closure, presses_evenly
 from symbolic.contact.grasp import (
     BEYOND,
@@ -40,12 +40,20 @@ from symbolic.contact.grasp import (
     even_slack,
     facing_wrenches,
 )
-from symbolic.contact.grasp_numbers import LOAD_SIZE, MOMENT_ARM, derived, smaller_patches
+from symbolic.contact.grasp_numbers import LOAD_SIZE, derived, smaller_patches
 from symbolic.contact.load import resultant_force
 from symbolic.contact.paper import required_moment
 from symbolic.contact.patches import least
 from symbolic.contact.soft_finger import Detached, SoftPatch, least_soft_squeeze
-from symbolic.expression import Expression, as_mx, mx_given, mx_symbols, number, of, sx_given
+from symbolic.expression import (
+    Expression,
+    as_mx,
+    mx_given,
+    mx_symbols,
+    named_function,
+    number,
+    sx_given,
+)
 from symbolic.path.rotation import angular_acceleration, angular_velocity, rotation_matrix
 from symbolic.records import Workcell
 from symbolic.records.numbered import NumberedWorkcell
@@ -74,133 +82,168 @@ MOTION = ("pose", "rate", "second_rate")
 """Inputs of functions of cases, before the case."""
 
 
-def case_squeeze_function(workcell: Workcell, displaced: bool = True) -> ca.Function:
+def case_squeeze_function(
+    workcell: Workcell, commanded: int = 1, displaced: bool = True
+) -> ca.Function:
     """pose, rate, second_rate (6,) and a case (18,), see `CASE_SIZES`, to normal_force (2,) [N].
 
-    With the least squeeze the pads can carry the case; with more they can, with less not.
+    Of pads that have one squeeze the least: with more of it they can carry the case, with less not.
+    Of others the least of the commanded robot, and what the other one then presses with.
 
     Args:
-        workcell: with two pads of opposite normals.
+        commanded: index of the robot whose force is commanded.
         displaced: whether cases may displace the pads, which costs soft fingers more.
+
+    Raises:
+        SettingsError: pads anywhere do not close their grasp.
     """
-    kind = _kind(workcell)
-    motion = [kind.sym(name, 6) for name in ("pose", "rate", "second_rate")]
-    case = kind.sym("case", CASE_SIZE)
-    given = _given(workcell)
-    force = _least_squeeze(workcell, motion, case, given, displaced=displaced)
-    inputs, names = [*motion, case, *given.values()], [*MOTION, "case", *given]
-    return ca.Function("case_squeeze", inputs, [force], names, ["normal_force"])
+    squeeze, inputs = _asked(workcell, commanded)
+    force = _least_force(workcell, squeeze, inputs, displaced=displaced)
+    return named_function("case_squeeze", inputs, {"normal_force": force}, cse=False)
 
 
-def case_gradient_function(workcell: Workcell, numbers: bool = False) -> ca.Function:
+def case_gradient_function(
+    workcell: Workcell, commanded: int = 1, numbers: bool = False
+) -> ca.Function:
     """As `case_squeeze_function`, and slope (NumPy shape (2, 18)), of each force by pose, rate and
-    second_rate; of cases without displaced pads.
+    second_rate; of pads that have one squeeze in cases without displaced ones.
 
     Args:
-        numbers: whether slope goes on, by the case (18,) and by the cell's numbers.
+        numbers: whether slope goes on, by the case (18,) and by the cell's numbers; of pads
+            anywhere in place of these by the load (6,) of `case_origin_load_function`.
     """
-    kind = _kind(workcell)
-    motion = [kind.sym(name, 6) for name in ("pose", "rate", "second_rate")]
-    case = kind.sym("case", CASE_SIZE)
-    detached = Detached()
-    given = _given(workcell)
-    # Pads that are moved alone lie beside one another then.
-    force = _least_squeeze(workcell, motion, case, given, detached, True, displaced=numbers)
-    by = [*motion, case, *given.values()] if numbers else motion
-    slope = ca.densify(ca.horzcat(*[ca.jacobian(force, part) for part in by]).T)
-    inputs, names = [*motion, case, *given.values()], [*MOTION, "case", *given]
-    found = detached.replaced([force, slope])
-    return ca.Function("case_gradient", inputs, found, names, ["normal_force", "slope"])
+    squeeze, inputs = _asked(workcell, commanded)
+    by = [*inputs.values()] if numbers else [inputs[name] for name in MOTION]
+    if squeeze is None:
+        detached = Detached()
+        # Pads that are moved alone lie beside one another then.
+        force = _least_force(workcell, None, inputs, detached, True, displaced=numbers)
+        slope = ca.densify(ca.horzcat(*[ca.jacobian(force, part) for part in by]).T)
+        found = detached.replaced([force, slope])
+    else:
+        beside, own = ca.MX.sym("beside", LOAD_SIZE), len(inputs) - len(squeeze.given)
+        force = _least_force(workcell, squeeze, inputs, differentiable=True, beside=beside)
+        slope = ca.horzcat(*[ca.jacobian(force, part) for part in (*by[:own], beside)])
+        asked = [*inputs.values()]
+        function = ca.Function("beside", [*asked, beside], [force, ca.densify(slope.T)])
+        found = function(*asked, ca.DM.zeros(LOAD_SIZE))
+    outputs = dict(zip(("normal_force", "slope"), found, strict=True))
+    return named_function("case_gradient", inputs, outputs, cse=False)
 
 
 def case_slopes_function(workcell: Workcell) -> ca.Function:
     """Box pose and its derivatives by u (6,), u'', u'^2 and a case (18,), see `CASE_SIZES`, to
     normal_force (2,) [N] as of `case_squeeze_function`, and slope (NumPy shape (2, 20)), of each
     force by pose, both derivatives, u'' and u'^2; of cases without displaced pads."""
-    kind = _kind(workcell)
-    path = [kind.sym(name, 6) for name in ("pose", "first", "second")]
-    a, w, case = kind.sym("a"), kind.sym("w"), kind.sym("case", CASE_SIZE)
-    pose, first, second = path
+    _, inputs = _asked(workcell)
+    kind = type(inputs["case"])
+    path = {name: kind.sym(name, 6) for name in ("pose", "first", "second")}
+    path |= {"a": kind.sym("a"), "w": kind.sym("w")}
+    pose, first, second, a, w = path.values()
     # A root has no slope at rest, what follows from its square has.
-    motion = [pose, first * ca.sqrt(w + SQUARED_SPEED_FLOOR), first * a + second * w]
-    detached = Detached()
-    given = _given(workcell)
-    force = _least_squeeze(workcell, motion, case, given, detached, differentiable=True)
-    slope = ca.densify(ca.jacobian(force, ca.vertcat(*path, a, w)).T)
-    names = ["pose", "first", "second", "a", "w", "case", *given]
+    motion = (pose, first * ca.sqrt(w + SQUARED_SPEED_FLOOR), first * a + second * w)
+    detached, driven = Detached(), inputs | dict(zip(MOTION, motion, strict=True))
+    force = _least_force(workcell, None, driven, detached, differentiable=True)
+    slope = ca.densify(ca.jacobian(force, ca.vertcat(*path.values())).T)
     found = detached.replaced([force, slope])
-    inputs, outputs = [*path, a, w, case, *given.values()], ["normal_force", "slope"]
-    return ca.Function("case_slopes", inputs, found, names, outputs)
+    outputs = dict(zip(("normal_force", "slope"), found, strict=True))
+    inputs = path | {name: inputs[name] for name in inputs if name not in MOTION}
+    return named_function("case_slopes", inputs, outputs, cse=False)
 
 
 def case_difference_function(workcell: Workcell) -> ca.Function:
     """pose, rate, second_rate (6,) and a case (18,), see `CASE_SIZES`, to difference N_1 - N_2 [N],
     which no squeeze changes."""
-    motion = [ca.SX.sym(name, 6) for name in ("pose", "rate", "second_rate")]
-    case, given = ca.SX.sym("case", CASE_SIZE), sx_given(workcell.payload)
-    inputs = [*motion, case, *given.values()]
-    difference = ca.cse([_balance_function(workcell)(*inputs)[0]])
-    names = [*MOTION, "case", *given]
-    return ca.Function("case_difference", inputs, difference, names, ["difference"])
+    inputs = _inputs(ca.SX, sx_given(workcell.payload))
+    (difference,) = ca.cse([_balance_function(workcell)(*inputs.values())[0]])
+    return named_function("case_difference", inputs, {"difference": difference}, cse=False)
 
 
-def case_slack_function(workcell: Workcell) -> ca.Function:
-    """pose, rate, second_rate (6,), a case (18,), force [N] and arm to slack.
+def case_slack_function(workcell: Workcell, commanded: int = 1) -> ca.Function:
+    """pose, rate, second_rate (6,), a case (18,) and the commanded force [N] to slack.
 
-    With the force commanded of the arm (0 or 1), a pressure that shares everything evenly holds the
-    case where slack is positive; elsewhere `case_squeeze_function` knows. It takes a
-    thirtieth of that one's time.
+    Where it is positive, one pressure that is known holds the case; elsewhere
+    `case_squeeze_function` knows. It takes a thirtieth of that one's time.
     """
-    motion = [ca.SX.sym(name, 6) for name in ("pose", "rate", "second_rate")]
-    case, force, arm = ca.SX.sym("case", CASE_SIZE), ca.SX.sym("force"), ca.SX.sym("arm")
-    friction, radius, *_ = case_parts(case)
-    given = sx_given(workcell.payload)
-    balance = _balance_function(workcell)(*motion, case, *given.values())
-    n_1 = force + arm * balance[0]
-    if presses_evenly(workcell):
-        slack = [n_1 - _least_squeeze(workcell, motion, case, given)[0]]
+    squeeze = None if workcell.has_one_squeeze else GraspSqueeze(workcell, commanded)
+    given = sx_given(workcell.payload) if squeeze is None else squeeze.given
+    inputs, force = _inputs(ca.SX, given), ca.SX.sym("force")
+    case = inputs["case"]
+    friction, radius, *_, displacement, tracking, internal = case_parts(case)
+    if squeeze is not None:
+        numbers = list(given.values())
+        sizes = _sizes_function(squeeze)(case, *numbers)
+        load = _origin_load(workcell, inputs)
+        left = (1.0 - tracking[commanded]) * force
+        left -= internal * _against_internal(squeeze)(friction, sizes, *numbers)
+        slack = [commanded_slack(squeeze, load, friction, sizes, displacement, left)]
     else:
-        *_, tracking, _ = case_parts(case)
-        lost = tracking[0] * n_1 + tracking[1] * (n_1 - balance[0]) + _against_arms(case)
-        slack = ca.cse([even_slack(balance, friction, radius, n_1 - lost)])
-    inputs = [*motion, case, force, arm, *given.values()]
-    names = [*MOTION, "case", "force", "arm", *given]
-    return ca.Function("case_slack", inputs, slack, names, ["slack"])
+        balance = _balance_function(workcell)(*inputs.values())
+        n_1 = force + balance[0] if commanded == 1 else force
+        if presses_evenly(workcell):
+            slack = [n_1 - _least_force(workcell, None, inputs)[0]]
+        else:
+            lost = tracking[0] * n_1 + tracking[1] * (n_1 - balance[0]) + _against_arms(case)
+            slack = [even_slack(balance, friction, radius, n_1 - lost)]
+    own = {name: inputs[name] for name in (*MOTION, "case")} | {"force": force} | given
+    found = slack if presses_evenly(workcell) and squeeze is None else ca.cse(slack)
+    return named_function("case_slack", own, {"slack": found[0]}, cse=False)
 
 
-def _kind(workcell: Workcell) -> Any:
-    """The kind of expressions that a cell's least squeeze is made of, SX or MX."""
-    return ca.SX if presses_evenly(workcell) else ca.MX
+def _asked(
+    workcell: Workcell, commanded: int = 1
+) -> tuple[GraspSqueeze | None, dict[str, Expression]]:
+    """The program of pads anywhere, and the inputs of functions of a cell's least force."""
+    if workcell.has_one_squeeze:
+        kind, of = (ca.SX, sx_given) if presses_evenly(workcell) else (ca.MX, mx_given)
+        return None, _inputs(kind, of(workcell.payload))
+    squeeze = GraspSqueeze(workcell, commanded)
+    return squeeze, _inputs(ca.MX, mx_symbols(squeeze.given))
 
 
-def _given(workcell: Workcell) -> dict[str, Any]:
-    """The cell's numbers as inputs of such expressions."""
-    of = sx_given if _kind(workcell) is ca.SX else mx_given
-    return dict(of(workcell.payload))
+def _inputs(kind: Any, given: Mapping[str, Expression]) -> dict[str, Expression]:
+    """Motion, case and numbers by name."""
+    motion = {name: kind.sym(name, 6) for name in MOTION}
+    return motion | {"case": kind.sym("case", CASE_SIZE)} | dict(given)
 
 
-def _least_squeeze(
+def _least_force(
     workcell: Workcell,
-    motion: list[Expression],
-    case: Expression,
-    given: dict[str, Any],
+    squeeze: GraspSqueeze | None,
+    inputs: dict[str, Expression],
     detached: Detached | None = None,
     differentiable: bool = False,
     displaced: bool = False,
+    beside: Expression | float = 0.0,
 ) -> Expression:
-    """(2,) N_1 and N_2 to command [N]: of soft fingers where the cell has these, else of pads that
-    choose their pressure, see `symbolic.contact.grasp.facing_wrenches`."""
+    """(2,) normal forces to command [N]: of pads anywhere, of soft fingers where the cell has
+    these, else of pads that choose their pressure (`symbolic.contact.grasp.facing_wrenches`).
+
+    Args:
+        beside: load (6,) about the box frame's origin beside that of the case, of pads anywhere.
+    """
+    case = inputs["case"]
     friction, radius, *_ = case_parts(case)
+    if squeeze is not None:
+        handed = {name: inputs[name] for name in squeeze.given}
+        load = _origin_load(workcell, inputs)
+        load = load if isinstance(beside, float) else load + beside
+        return _to_command_of(squeeze, load, case, handed, differentiable)
     if not presses_evenly(workcell):
-        balance = _balance_function(workcell)(*motion, case, *given.values())
+        balance = _balance_function(workcell)(*inputs.values())
         wrenches = facing_wrenches(balance, friction, radius, "squeeze", differentiable)
         return _to_command(wrenches[::WRENCH_SIZE], case)
     axes = workcell.contacts[0].T_box_pad[:3, :3]
     first, second = (SoftPatch.of(contact, axes) for contact in workcell.contacts)
-    needed = case_in_pad_axes(workcell, motion, case)
-    beside = displaced or workcell.has_pads_beside
-    held = least_soft_squeeze(*needed, friction, (first, second), beside, detached)
+    needed = case_in_pad_axes(workcell, [inputs[name] for name in MOTION], case)
+    offset = displaced or workcell.has_pads_beside
+    held = least_soft_squeeze(*needed, friction, (first, second), offset, detached)
     return ca.densify(_to_command(held.normal, case))
+
+
+def _origin_load(workcell: Workcell, inputs: dict[str, Expression]) -> Expression:
+    names = (*MOTION, "case", *sx_given(workcell.payload))
+    return case_origin_load_function(workcell)(*[inputs[name] for name in names])
 
 
 def _to_command(normal: Expression, case: Expression) -> Expression:
@@ -221,18 +264,13 @@ def _against_arms(case: Expression) -> Expression:
 
 def case_parts(case: ca.SX | ca.MX) -> list[ca.SX | ca.MX]:
     """The parts of a case (18,), see `CASE_SIZES`."""
-    ends = [0]
-    for size in CASE_SIZES.values():
-        ends.append(ends[-1] + size)
-    return list(ca.vertsplit(case, ends))
+    return list(ca.vertsplit(case, [0, *accumulate(CASE_SIZES.values())]))
 
 
 def _balance_function(workcell: Workcell) -> ca.Function:
     """pose, rate, second_rate and a case to what the contacts have to balance (9,)."""
-    motion = [ca.SX.sym(name, 6) for name in ("pose", "rate", "second_rate")]
-    case = ca.SX.sym("case", CASE_SIZE)
-    balance = balance_of(*case_in_pad_axes(workcell, motion, case))
-    inputs = [*motion, case, *sx_given(workcell.payload).values()]
+    inputs = [*_inputs(ca.SX, sx_given(workcell.payload)).values()]
+    balance = balance_of(*case_in_pad_axes(workcell, inputs[:3], inputs[3]))
     return ca.Function("case_balance", inputs, [balance])
 
 
@@ -262,10 +300,10 @@ def case_in_pad_axes(
 def case_load_function(workcell: Workcell) -> ca.Function:
     """pose, rate, second_rate and a case to the force and the moment about the nominal centre of
     mass that the case asks for, (3,) each, box axes."""
-    pose, rate, second = motion = [ca.SX.sym(name, 6) for name in ("pose", "rate", "second_rate")]
-    case = ca.SX.sym("case", CASE_SIZE)
-    _, _, mass, centre, disturbance, *_ = case_parts(case)
     payload = workcell.payload
+    inputs = [*_inputs(ca.SX, sx_given(payload)).values()]
+    pose, rate, second, case, *_ = inputs
+    _, _, mass, centre, disturbance, *_ = case_parts(case)
     turned = workcell.task.orientation
     rotation = rotation_matrix(turned, pose[3:])
     omega = angular_velocity(turned, pose[3:], rate[3:])
@@ -281,50 +319,10 @@ def case_load_function(workcell: Workcell) -> ca.Function:
     turning = required_moment(ca.SX(number(payload.inertia)), rotation, omega, alpha)
     moment = turning + ca.cross(ca.mtimes(rotation, centre - nominal), resultant(nominal))
     parts = [share * ca.mtimes(rotation.T, part) for part in (resultant(centre), moment)]
-    return ca.Function("case_load", [*motion, case, *sx_given(payload).values()], parts)
+    return ca.Function("case_load", inputs, parts)
 
 
 # --- pads anywhere ---
-
-
-def case_grasp_function(workcell: Workcell, commanded: int) -> ca.Function:
-    """pose, rate, second_rate (6,) and a case (18,), see `CASE_SIZES`, to
-    normal_force (2,) [N], see `commanded_forces`.
-
-    Args:
-        commanded: index of the robot whose force is commanded.
-
-    Raises:
-        SettingsError: the pads do not close their grasp.
-    """
-    motion = [ca.MX.sym(name, 6) for name in MOTION]
-    case, squeeze = ca.MX.sym("case", CASE_SIZE), GraspSqueeze(workcell, commanded)
-    handed = mx_symbols(squeeze.given)
-    load = _origin_load(workcell, [*motion, case], handed)
-    force = _to_command_of(squeeze, load, case, handed)
-    inputs, names = [*motion, case, *handed.values()], [*MOTION, "case", *handed]
-    return ca.Function("case_grasp", inputs, [force], names, ["normal_force"])
-
-
-def case_grasp_gradient_function(workcell: Workcell, commanded: int) -> ca.Function:
-    """As `case_grasp_function`, and slope (NumPy shape (2, 42)), of each force by pose, rate and
-    second_rate, by the case and by the load of `case_origin_load_function`."""
-    motion = [ca.MX.sym(name, 6) for name in MOTION]
-    case, beside = ca.MX.sym("case", CASE_SIZE), ca.MX.sym("beside", LOAD_SIZE)
-    squeeze = GraspSqueeze(workcell, commanded)
-    handed = mx_symbols(squeeze.given)
-    load = _origin_load(workcell, [*motion, case], handed) + beside
-    force = _to_command_of(squeeze, load, case, handed, differentiable=True)
-    slope = ca.horzcat(*[ca.jacobian(force, part) for part in (*motion, case, beside)])
-    inputs, names = [*motion, case, *handed.values()], [*MOTION, "case", *handed]
-    found = ca.Function("beside", [*inputs, beside], [force, ca.densify(slope.T)])
-    outputs = found(*inputs, ca.DM.zeros(LOAD_SIZE))
-    return ca.Function("gradient", inputs, outputs, names, ["normal_force", "slope"])
-
-
-def _origin_load(workcell: Workcell, inputs: list[ca.MX], handed: dict[str, ca.MX]) -> ca.MX:
-    own = of(handed, workcell.payload).values()
-    return case_origin_load_function(workcell)(*inputs, *own)
 
 
 def _to_command_of(
@@ -346,25 +344,6 @@ def _to_command_of(
     # One entry after the other: a scalar times a vector repeats it by a form without lanes.
     force += ca.vertcat(*[more * shares[i] for i in (0, 1)])
     return force
-
-
-def case_grasp_slack_function(workcell: Workcell, commanded: int) -> ca.Function:
-    """pose, rate, second_rate (6,), a case (18,) and the commanded force [N] to slack: where it is
-    positive, one pressure that is known holds the case; elsewhere `case_grasp_function` knows."""
-    motion = [ca.SX.sym(name, 6) for name in ("pose", "rate", "second_rate")]
-    case, force = ca.SX.sym("case", CASE_SIZE), ca.SX.sym("force")
-    friction, *_, tracking, internal = case_parts(case)
-    squeeze = GraspSqueeze(workcell, commanded)
-    given = list(squeeze.given.values())
-    sizes = _sizes_function(squeeze)(case, *given)
-    load = case_origin_load_function(workcell)(*motion, case, *sx_given(workcell.payload).values())
-    left = (1.0 - tracking[commanded]) * force
-    left -= internal * _against_internal(squeeze)(friction, sizes, *given)
-    *_, displacement, _, _ = case_parts(case)
-    slack = commanded_slack(squeeze, load, friction, sizes, displacement, left)
-    names = ["pose", "rate", "second_rate", "case", "force", *squeeze.given]
-    inputs = [*motion, case, force, *given]
-    return ca.Function("case_grasp_slack", inputs, ca.cse([slack]), names, ["slack"])
 
 
 def least_distance(workcell: Workcell) -> float:
@@ -391,8 +370,7 @@ def _sizes_function(squeeze: GraspSqueeze) -> ca.Function:
 
 def case_origin_load_function(workcell: Workcell) -> ca.Function:
     """The load about the box frame's origin (6,), box axes."""
-    inputs = [ca.SX.sym(name, 6) for name in ("pose", "rate", "second_rate")]
-    inputs += [ca.SX.sym("case", CASE_SIZE), *sx_given(workcell.payload).values()]
+    inputs = [*_inputs(ca.SX, sx_given(workcell.payload)).values()]
     force, moment = case_load_function(workcell)(*inputs)
     about = moment + ca.cross(ca.SX(number(workcell.payload.centre_of_mass)), force)
     return ca.Function("origin_load", inputs, ca.cse([ca.vertcat(force, about)]))
@@ -473,6 +451,14 @@ class GraspSqueeze(Grasp):
             total += wrench[0] * (1.0 if robot == self.commanded else OTHER_WEIGHT)
         return total
 
+    def told(self, wrenches: list[ca.SX], sizes: list[ca.SX]) -> tuple[ca.SX, ca.SX | float]:
+        """See `Grasp`."""
+        force = [ca.SX(0.0), ca.SX(0.0)]
+        for own, robot in zip(wrenches, self.robots, strict=True):
+            force[robot] += own[0]
+        force[self.commanded] += OTHER_WEIGHT * force[1 - self.commanded]
+        return ca.vertcat(*force), BEYOND
+
 
 def commanded_forces(
     squeeze: GraspSqueeze,
@@ -494,14 +480,10 @@ def commanded_forces(
         handed: the squeeze's given numbers, where they are symbols.
         differentiable: whether first derivatives are wanted.
     """
-    size = ca.sqrt(ca.sumsqr(load[:3]) + ca.sumsqr(load[3:] / MOMENT_ARM) + SCALE_FLOOR**2)
     handed = handed or {}
-    given = list(handed.values())
     reach = share / as_mx(ca.SX(number(squeeze.numbers.reach)), squeeze.given, handed)
-    displaced = [displacement] if squeeze.is_even else []
-    solve = differentiable_least_effort if differentiable else least_effort
-    found = solve(squeeze, load / size, friction, reach, *displaced, *given)
-    return _in_newtons(squeeze)(found, size, friction, reach, *given)
+    cell = [load, friction, reach, *([displacement] if squeeze.is_even else [])]
+    return squeeze.solved(cell, list(handed.values()), differentiable)
 
 
 def commanded_slack(
@@ -543,18 +525,3 @@ def _against_internal(squeeze: GraspSqueeze) -> ca.Function:
     held = ca.fmax(least(left), SCALE_FLOOR)
     inputs = [friction, share, *squeeze.given.values()]
     return ca.Function("against_internal", inputs, [pressed / held])
-
-
-def _in_newtons(squeeze: GraspSqueeze) -> ca.Function:
-    ends = [0, *accumulate(patch.wrench_size for patch in squeeze.patches)]
-    found, size = ca.SX.sym("w", ends[-1]), ca.SX.sym("s")
-    friction, reach = ca.SX.sym("mu", 2), ca.SX.sym("reach", 2)
-    force = [ca.SX(0.0), ca.SX(0.0)]
-    for own, robot in zip(ca.vertsplit(found, ends), squeeze.robots, strict=True):
-        force[robot] += own[0]
-    force[squeeze.commanded] += OTHER_WEIGHT * force[1 - squeeze.commanded]
-    squeezed = zip(squeeze.patches, squeeze.squeezed(friction, reach), strict=True)
-    closes = least([patch.slack(state) for patch, state in squeezed]) > 0.0
-    outputs = size * ca.if_else(closes, ca.vertcat(*force), BEYOND)
-    inputs = [found, size, friction, reach, *squeeze.given.values()]
-    return ca.Function("in_newtons", inputs, [outputs])
