@@ -16,8 +16,8 @@ import numpy as np
 
 from codegen.interpreted import InterpretedFunction
 from hybrid_opt.compiled_cell import held_function
-from hybrid_opt.robust.cases import RulingCases, ruling_cases, worst_cases
-from hybrid_opt.robust.force import BoxMotion, check_set, robust_model
+from hybrid_opt.robust.cases import RulingCases, ruling_cases
+from hybrid_opt.robust.force import BoxMotion, robust_model
 from hybrid_opt.robust.path_force import PathPoints, robust_path
 from symbolic.array import Array
 from symbolic.contact.worst_cases import case_gradient_function
@@ -45,9 +45,8 @@ class RobustSamples:
                 friction or patch.
             DualArmError: a function cannot be built.
         """
-        check_set(workcell, workcell.uncertainty)
         self._workcell, self._model = workcell, robust_model(workcell)
-        self._cases = worst_cases(workcell, workcell.uncertainty)
+        self._cases = self._model.worst_cases(workcell.uncertainty, LEADER)
         self._gradient = held_function(workcell, "case gradient", case_gradient_function)
         self._motion = InterpretedFunction(motion_function(workcell.task))
 

@@ -1,5 +1,5 @@
-"""Cases of an uncertainty set: the worst ones, random ones, the compiled forces that each
-asks for, and the cases that decide both robots' forces.
+"""Cases of an uncertainty set: the worst ones, random ones, and those that decide both robots'
+forces.
 
 Which are worst follows from the least squeeze that a case asks for:
 
@@ -28,24 +28,13 @@ Which are worst follows from the least squeeze that a case asks for:
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property, partial
 from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
 
-from codegen.cache import Cache
-from codegen.function import NumericFunction
-from hybrid_opt.compiled_cell import held_function
 from symbolic.array import Array
 from symbolic.contact.grasp_numbers import least_reaches
-from symbolic.contact.worst_cases import (
-    GraspSqueeze,
-    case_grasp_function,
-    case_grasp_slack_function,
-    case_slack_function,
-    case_squeeze_function,
-)
 from symbolic.errors import SettingsError
 from symbolic.read.checks import PATCH_OVERLAP, pads_beside
 from symbolic.records import Uncertainty, Workcell
@@ -140,99 +129,6 @@ def _in_discs(rng: np.random.Generator, radius: float, n: int, discs: int) -> Ar
     angle = rng.uniform(0.0, 2.0 * np.pi, (n, discs))
     reach = radius * np.sqrt(rng.random((n, discs)))
     return np.stack([reach * np.cos(angle), reach * np.sin(angle)], axis=2)
-
-
-class CaseForces:
-    """Least forces that hold single cases.
-
-    Attributes:
-        workcell: the cell.
-    """
-
-    def __init__(self, workcell: Workcell, cache: Cache | None = None) -> None:
-        """Load or build the functions of facing pads; those of others when first asked.
-
-        Raises:
-            SettingsError: some cases cannot be held, however hard the pads press.
-            DualArmError: a function cannot be built.
-        """
-        check_pads(workcell)
-        self.workcell, self._cache = workcell, cache
-        self._general: dict[int, tuple[NumericFunction, NumericFunction]] = {}
-        self._squeezed = workcell.has_one_squeeze
-        if self._squeezed:
-            self._facing = [
-                held_function(workcell, function.__name__, function, cache, lanes=0)
-                for function in (case_squeeze_function, case_slack_function)
-            ]
-            in_place = partial(case_squeeze_function, displaced=False)
-            name = "undisplaced squeeze"
-            self._in_place = held_function(workcell, name, in_place, cache, lanes=0)
-
-    def least(
-        self,
-        motion: tuple[Array, ...],
-        cases: Array,
-        leader: int,
-        threads: int = 1,
-        displaced: bool = True,
-    ) -> Array:
-        """(m, 2) least normal forces [N]: what is to be commanded of one robot, and what the
-        leading one then presses with.
-
-        Args:
-            motion: poses and their time derivatives (m, 6) each.
-            cases: (m, 18).
-            leader: index of the robot whose force is not commanded.
-            threads: 0 for one per core.
-            displaced: whether any of the cases displaces a pad; without, it is faster.
-        """
-        function = self._functions(1 - leader)[0]
-        if self._squeezed and not displaced:
-            function = self._in_place
-        return function.batch(*motion, cases, threads=threads)["normal_force"]
-
-    def slack(
-        self,
-        motion: tuple[Array, ...],
-        cases: Array,
-        force: Array,
-        leader: int,
-        threads: int = 1,
-    ) -> Array:
-        """(m,) positive where a pressure that is known beforehand holds under commanded forces (m,)
-        [N]; elsewhere another one still may."""
-        slack = self._functions(1 - leader)[1]
-        arm = (float(1 - leader),) if self._squeezed else ()
-        return slack.batch(*motion, cases, force, *arm, threads=threads)["slack"].ravel()
-
-    def leading_share(self, leader: int) -> float:
-        """Rise of the leading robot's force per newton of the commanded one."""
-        if self._squeezed:
-            return 1.0
-        normals = self._squeeze_normals
-        return float(normals[leader] / normals[1 - leader])
-
-    @cached_property
-    def _squeeze_normals(self) -> Array:
-        return GraspSqueeze(self.workcell, 1).squeeze_normals()
-
-    def _functions(self, commanded: int) -> tuple[NumericFunction, NumericFunction]:
-        if self._squeezed:
-            return self._facing[0], self._facing[1]
-        if commanded not in self._general:
-            first, second = (
-                held_function(
-                    self.workcell,
-                    f"{function.__name__} {commanded}",
-                    partial(function, commanded=commanded),
-                    self._cache,
-                    lanes=0,
-                )
-                for function in (case_grasp_function, case_grasp_slack_function)
-            )
-            self._general[commanded] = first, second
-        return self._general[commanded]
 
 
 def check_pads(workcell: Workcell) -> None:

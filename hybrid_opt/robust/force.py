@@ -8,19 +8,21 @@ fixed by the motion (and the case), the commanded force decides the squeeze.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
-from typing import Annotated
+from functools import cached_property, lru_cache, partial
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import brentq
 
 from codegen.cache import Cache
+from codegen.function import NumericFunction
 from hybrid_opt.carry import Carry
-from hybrid_opt.compiled_cell import kept_per_workcell
+from hybrid_opt.compiled_cell import held_function, kept_per_workcell
 from hybrid_opt.robust.cases import (
-    CaseForces,
+    check_pads,
     least_friction,
     nominal_case,
     patches_left,
@@ -30,11 +32,19 @@ from hybrid_opt.robust.cases import (
 )
 from symbolic.array import Array, Count, Figure, Pair, Row, Shape, evenly
 from symbolic.contact.force_closure import has_force_closure
-from symbolic.contact.worst_cases import least_distance
+from symbolic.contact.worst_cases import (
+    GraspSqueeze,
+    case_slack_function,
+    case_squeeze_function,
+    least_distance,
+)
 from symbolic.errors import SettingsError
 from symbolic.read.checks import PATCH_OVERLAP, pads_beside
 from symbolic.records import Uncertainty, Workcell
 from symbolic.records.content import CacheKey
+
+if TYPE_CHECKING:
+    import casadi as ca
 
 BATCH = 100_000
 """Samples that are evaluated at once."""
@@ -74,7 +84,7 @@ class BoxMotion:
     rate: Array
     second_rate: Array
 
-    def at(self, rows: NDArray[np.intp]) -> BoxMotion:
+    def at(self, rows: NDArray[np.intp] | NDArray[np.bool_]) -> BoxMotion:
         """The motion at some of the samples."""
         return BoxMotion(self.pose[rows], self.rate[rows], self.second_rate[rows])
 
@@ -88,9 +98,10 @@ def box_motion(motion: HeldMotion) -> BoxMotion:
     return BoxMotion(motion.pose, motion.rate, motion.second_rate)
 
 
-def _repeated(motion: HeldMotion, times: int) -> tuple[Array, ...]:
-    parts = (motion.pose, motion.rate, motion.second_rate)
-    return tuple(np.tile(values, (times, 1)) for values in parts)
+def repeated(motion: HeldMotion, times: int) -> BoxMotion:
+    """A motion's samples several times, one after the other."""
+    parts = motion.pose, motion.rate, motion.second_rate
+    return BoxMotion(*[np.tile(values, (times, 1)) for values in parts])
 
 
 def at_rest() -> BoxMotion:
@@ -156,25 +167,44 @@ class SampledCheck:
 
 
 class RobustModel:
-    """The compiled function behind robust forces of one workcell's carries.
+    """The compiled functions behind robust forces of one workcell's carries.
 
     Attributes:
         workcell: the cell.
     """
 
     def __init__(self, workcell: Workcell, cache: Cache | None = None) -> None:
-        """Load or build the compiled function.
+        """Load or build the functions of pads that have one squeeze; those of others when first
+        asked.
 
         Raises:
             SettingsError: some cases cannot be held, however hard the pads press.
-            DualArmError: the function cannot be built.
+            DualArmError: a function cannot be built.
         """
-        self.workcell = workcell
-        self._cases = CaseForces(workcell, cache)
+        check_pads(workcell)
+        self.workcell, self._cache = workcell, cache
+        self._functions: dict[tuple[object, ...], NumericFunction] = {}
         # Many motions are asked about under a few sets.
         self._worst = lru_cache(maxsize=8)(self._checked_cases)
+        self._one = workcell.has_one_squeeze
+        if self._one:
+            self._squeeze(1, displaced=True)
+            self._squeeze(1, displaced=False)
+            self._function(case_slack_function, commanded=1)
 
-    def _worst_cases(self, uncertainty: Uncertainty, leader: int) -> Array:
+    def _function(self, make: Callable[..., ca.Function], **given: object) -> NumericFunction:
+        key = (make.__name__, *given.values())
+        if key not in self._functions:
+            name, of = " ".join(map(str, key)), partial(make, **given)
+            self._functions[key] = held_function(self.workcell, name, of, self._cache, lanes=0)
+        return self._functions[key]
+
+    def _squeeze(self, commanded: int, displaced: bool) -> NumericFunction:
+        # Only where there is one squeeze do these make a difference, or none, to the function.
+        commanded, displaced = (1, displaced) if self._one else (commanded, True)
+        return self._function(case_squeeze_function, commanded=commanded, displaced=displaced)
+
+    def worst_cases(self, uncertainty: Uncertainty, leader: int) -> Array:
         """`worst_cases` of a set that leaves something, see `check_set`; not to be modified."""
         return self._worst(CacheKey(uncertainty, leader, known=(id(uncertainty), leader)))
 
@@ -182,6 +212,32 @@ class RobustModel:
         uncertainty, leader = seen.given
         check_set(self.workcell, uncertainty)
         return worst_cases(self.workcell, uncertainty, leader)
+
+    def least(
+        self, motion: HeldMotion, cases: Array, leader: int, threads: int, displaced: bool
+    ) -> Array:
+        """(m, 2) least normal forces [N]: what is to be commanded of one robot, and what the
+        leading one then presses with.
+
+        Args:
+            motion: of m samples.
+            cases: (m, 18), one at each.
+            leader: index of the robot whose force is not commanded.
+            threads: 0 for one per core.
+            displaced: whether any of the cases displaces a pad; without, it is faster.
+        """
+        parts = motion.pose, motion.rate, motion.second_rate
+        function = self._squeeze(1 - leader, displaced)
+        return function.batch(*parts, cases, threads=threads)["normal_force"]
+
+    def slack(
+        self, motion: HeldMotion, cases: Array, force: Array, leader: int, threads: int = 1
+    ) -> Array:
+        """(m,) positive where a pressure that is known beforehand holds under commanded forces (m,)
+        [N]; elsewhere another one still may."""
+        parts = motion.pose, motion.rate, motion.second_rate
+        function = self._function(case_slack_function, commanded=1 - leader)
+        return function.batch(*parts, cases, force, threads=threads)["slack"].ravel()
 
     def least_squeeze(self, motion: HeldMotion, cases: Array, leader: int = 0) -> Array:
         """(k, n, 2) normal forces to command [N] that hold each of k cases (k, 18) at n samples; of
@@ -192,20 +248,22 @@ class RobustModel:
         step = max(1, BATCH // n)
         for start in range(0, len(cases), step):
             some = cases[start : start + step]
-            every = np.repeat(some, n, axis=0)
-            forces = self._cases.least(
-                _repeated(motion, len(some)), every, leader, displaced=displaced
-            )
+            every, moved = np.repeat(some, n, axis=0), repeated(motion, len(some))
+            forces = self.least(moved, every, leader, 1, displaced)
             found[start : start + step] = forces.reshape(len(some), n, 2)
         return found
 
     def nominal(self, motion: HeldMotion, leader: int = 0) -> Array:
         """(n, 2) least normal forces of the cell as it is described [N], see `least_squeeze`."""
-        return np.asarray(self.least_squeeze(motion, self._nominal[None], leader)[0])
+        return np.asarray(self.least_squeeze(motion, nominal_case(self.workcell)[None], leader)[0])
 
     @cached_property
-    def _nominal(self) -> Array:
-        return nominal_case(self.workcell)
+    def _leading_share(self) -> Array:
+        """(2,) rise of each leading robot's force per newton of the other, commanded one."""
+        if self._one:
+            return np.ones(2)
+        normals = GraspSqueeze(self.workcell, 1).squeeze_normals()
+        return normals / normals[::-1]
 
     def hold(
         self, motion: HeldMotion, uncertainty: Uncertainty, leader: int = 0
@@ -217,12 +275,10 @@ class RobustModel:
             leader: index of the arm that keeps its place.
 
         Raises:
-            SettingsError: the set leaves no friction or patch, or there is no such arm.
+            SettingsError: the set leaves no friction or patch.
         """
-        if leader not in (0, 1):
-            raise SettingsError(f"leader {leader}: give 0 or 1, the index of an arm")
-        worst = self.least_squeeze(motion, self._worst_cases(uncertainty, leader), leader)
-        follower, share = 1 - leader, self._cases.leading_share(leader)
+        worst = self.least_squeeze(motion, self.worst_cases(uncertainty, leader), leader)
+        follower, share = 1 - leader, float(self._leading_share[leader])
         force = ruling_cases(worst, uncertainty, leader, leading_share=share).force
         force[np.isnan(force)] = np.inf
         return force[:, follower], force[:, leader]
@@ -243,12 +299,12 @@ class RobustModel:
         Args:
             above: (n,) what is commanded anyway, or one for all [N]; less is not told.
         """
-        cases, n = self._worst_cases(uncertainty, leader), len(motion.pose)
+        cases, n = self.worst_cases(uncertainty, leader), len(motion.pose)
         few = evenly(n, FEW)
         at_few = box_motion(motion).at(few)
         planned = self.nominal(at_few, leader)[:, 1 - leader]
-        rows, every = _repeated(at_few, len(cases)), np.repeat(cases, len(few), axis=0)
-        slack = self._cases.slack(rows, every, np.tile(planned, len(cases)), leader)
+        rows, every = repeated(at_few, len(cases)), np.repeat(cases, len(few), axis=0)
+        slack = self.slack(rows, every, np.tile(planned, len(cases)), leader)
         ruling = np.unique(slack.reshape(len(cases), -1).argsort(axis=0)[:RULING])
         needed = self.least_squeeze(motion, cases[ruling], leader)[:, :, 1 - leader]
         force: Array = np.maximum(needed.max(axis=0), above)
@@ -287,8 +343,7 @@ class RobustModel:
             leader: index of the arm that keeps its place.
 
         Raises:
-            SettingsError: the set leaves no friction or patch, no force holds all of it, or there
-                is no such arm.
+            SettingsError: the set leaves no friction or patch, or no force holds all of it.
         """
         chosen = self.workcell.uncertainty if uncertainty is None else uncertainty
         commanded, leading = self.hold(motion, chosen, leader)
@@ -342,39 +397,20 @@ class RobustModel:
         """(k, n) share of the commanded forces (n,) that each of k cases needs; `screened` for
         less."""
         n, k = len(motion.pose), len(cases)
-        rows = _repeated(motion, k)
-        repeated, commanded = np.repeat(cases, n, axis=0), np.tile(force, k)
-        slack = self._cases.slack(rows, repeated, screened * commanded, leader, threads)
-        left = ~(slack > 0.0)
+        rows = repeated(motion, k)
+        every, commanded = np.repeat(cases, n, axis=0), np.tile(force, k)
+        left = ~(self.slack(rows, every, screened * commanded, leader, threads) > 0.0)
         share = np.full(n * k, screened)
         if left.any():
-            some, displaced = tuple(values[left] for values in rows), bool(cases[:, 11:15].any())
-            needed = self._cases.least(some, repeated[left], leader, threads, displaced)
+            displaced = bool(cases[:, 11:15].any())
+            needed = self.least(rows.at(left), every[left], leader, threads, displaced)
             share[left] = np.maximum(screened, needed[:, 1 - leader] / commanded[left])
         return share.reshape(k, n)
 
-    def price(
-        self,
-        motion: HeldMotion,
-        factors: Array,
-        leader: int = 0,
-        uncertainty: Uncertainty | None = None,
-    ) -> Array:
-        """(k, 2) peak normal forces [N] under a set, by default the workcell's, times each
-        factor (k,)."""
-        chosen = self.workcell.uncertainty if uncertainty is None else uncertainty
-        return np.array([self.peak(motion, chosen.scaled(f), leader) for f in factors])
-
-    def largest_factor(
-        self,
-        motion: HeldMotion,
-        limit: Array,
-        leader: int = 0,
-        uncertainty: Uncertainty | None = None,
-    ) -> float:
-        """Largest multiple of a set, by default the workcell's, whose forces stay within limits
-        (2,) [N], at most `LARGEST_FACTOR`; zero where the nominal forces exceed them."""
-        chosen = self.workcell.uncertainty if uncertainty is None else uncertainty
+    def largest_factor(self, motion: HeldMotion, limit: Array, leader: int = 0) -> float:
+        """Largest multiple of the workcell's set whose forces stay within limits (2,) [N], at most
+        `LARGEST_FACTOR`; zero where the nominal forces exceed them."""
+        chosen = self.workcell.uncertainty
         end = allowed_factor(self.workcell, chosen)
 
         def beyond(factor: float) -> float:
@@ -497,7 +533,7 @@ def robust_price(
         points: how many multiples of the set.
 
     Raises:
-        SettingsError: the set leaves no friction or patch, or there is no such arm.
+        SettingsError: the set leaves no friction or patch.
     """
     workcell = model.workcell
     uncertainty = workcell.uncertainty
@@ -505,7 +541,7 @@ def robust_price(
     force = model.robust_force(motion, uncertainty, leader)
     factors = np.linspace(0.0, MOST, points)
     factors = factors[factors < allowed_factor(workcell, uncertainty)]
-    peak = model.price(motion, factors, leader, uncertainty)
+    peak = np.array([model.peak(motion, uncertainty.scaled(f), leader) for f in factors])
     held = np.isfinite(peak).all(axis=1)
     return RobustPrice(
         uncertainty=uncertainty,
@@ -513,7 +549,7 @@ def robust_price(
         peak=peak[held],
         commanded=force.peak,
         limit=limit,
-        largest_factor=model.largest_factor(motion, limit, leader, uncertainty),
+        largest_factor=model.largest_factor(motion, limit, leader),
         check=model.check(motion, force, cases, rng, threads),
     )
 

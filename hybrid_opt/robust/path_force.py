@@ -6,35 +6,34 @@ In every case the least squeeze is convex in the required force and moment, and 
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
-from typing import Any
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from codegen.cache import Cache
 from codegen.interpreted import InterpretedFunction
 from codegen.source import dense
 from hybrid_opt.carry import Carry
 from hybrid_opt.compiled_cell import bound_to, held_function, kept_per_workcell
 from hybrid_opt.robust.cases import (
     RulingCases,
-    check_pads,
     felt_share,
     ruling_cases,
     worst_cases,
 )
-from hybrid_opt.robust.force import BoxMotion, box_motion, check_set, pressing_model
+from hybrid_opt.robust.force import (
+    BoxMotion,
+    box_motion,
+    pressing_model,
+    repeated,
+    robust_model,
+)
 from symbolic.array import Array
 from symbolic.contact.worst_cases import (
     case_difference_function,
     case_gradient_function,
-    case_grasp_function,
-    case_grasp_gradient_function,
     case_origin_load_function,
-    case_slack_function,
     case_slopes_function,
     case_squeeze_function,
 )
@@ -77,10 +76,11 @@ class PathPoints:
         return self.pose, self.first, self.second, self.a, self.w
 
     @property
-    def motion(self) -> tuple[Array, Array, Array]:
+    def motion(self) -> BoxMotion:
         """Poses and their time derivatives."""
         rate = self.first * np.sqrt(np.maximum(self.w, 0.0))[:, None]
-        return self.pose, rate, self.first * self.a[:, None] + self.second * self.w[:, None]
+        second = self.first * self.a[:, None] + self.second * self.w[:, None]
+        return BoxMotion(self.pose, rate, second)
 
 
 class RobustPath:
@@ -90,7 +90,7 @@ class RobustPath:
         leader: index of the arm that keeps its place.
     """
 
-    def __init__(self, workcell: Workcell, cache: Cache | None = None, leader: int = 0) -> None:
+    def __init__(self, workcell: Workcell, leader: int = 0) -> None:
         """Load or build the compiled functions.
 
         Args:
@@ -106,21 +106,12 @@ class RobustPath:
                 "limits and slopes of robust forces need two round pads that face one another, or "
                 "task.allocation = 'soft-finger' and two pads with opposite normals"
             )
-        check_pads(workcell)
-        check_set(workcell, workcell.uncertainty)
-        self.leader = leader
-        self._cases = worst_cases(workcell, workcell.uncertainty, leader)
-        self._set = workcell.uncertainty
-        makers: dict[str, Callable[[Workcell], Any]] = {
-            "undisplaced squeeze": partial(case_squeeze_function, displaced=False),
-            "case slopes": case_slopes_function,
-            "case slack": case_slack_function,
-            "case difference": case_difference_function,
-        }
-        self._squeeze, self._slopes, self._slack, self._difference = (
-            # Slopes add up in loops, for which there is no form in lanes.
-            held_function(workcell, name, make, cache, int(make is case_slopes_function))
-            for name, make in makers.items()
+        self.leader, self._set, self._model = leader, workcell.uncertainty, robust_model(workcell)
+        self._cases = self._model.worst_cases(self._set, leader)
+        # Slopes add up in loops, for which there is no form in lanes.
+        self._slopes = held_function(workcell, "case slopes", case_slopes_function, lanes=1)
+        self._difference = held_function(
+            workcell, "case difference", case_difference_function, lanes=0
         )
 
     def at(self, points: PathPoints) -> tuple[Array, Array]:
@@ -130,8 +121,8 @@ class RobustPath:
             (n, 2) forces of both robots [N], and (n, 2, 20) their derivatives by pose, its
             derivatives by u, u'' and u'^2.
         """
-        every = np.ones((len(self._cases), len(points)), dtype=bool)
-        ruling = ruling_cases(self._least(points, every), self._set, self.leader)
+        least = self._model.least_squeeze(points.motion, self._cases, self.leader)
+        ruling = ruling_cases(least, self._set, self.leader)
         return ruling.force, self.slopes(points, ruling)
 
     def beyond(self, points: PathPoints, level: Array) -> tuple[NDArray[np.intp], Array, Array]:
@@ -148,15 +139,18 @@ class RobustPath:
         Most cases are seen to need less by a pressure that shares everything evenly.
         """
         n, k, follower = len(points), len(self._cases), 1 - self.leader
-        difference = self._differences(points)
+        every, cases = repeated(points.motion, k), np.repeat(self._cases, n, axis=0)
+        parts = every.pose, every.rate, every.second_rate
+        difference = self._difference.batch(*parts, cases)["difference"].reshape(k, n)
         sign = 1.0 if self.leader == 0 else -1.0
         felt = (felt_share(sign * difference, self._set) * sign * difference).max(axis=0)
         room = level - np.maximum(felt, 0.0)
-        repeated = [np.tile(values, (k, 1)) for values in points.motion]
-        slack = self._slack.batch(
-            *repeated, np.repeat(self._cases, n, axis=0), np.tile(room, k), float(follower)
-        )["slack"]
-        least = self._least(points, ~(slack.reshape(k, n) > 0.0))
+        left = ~(self._model.slack(every, cases, np.tile(room, k), self.leader) > 0.0)
+        found = np.full((k * n, 2), BELOW)
+        if left.any():
+            wanted = every.at(left), cases[left]
+            found[left] = self._model.least(*wanted, self.leader, 1, displaced=False)
+        least = found.reshape(k, n, 2)
         rows = np.flatnonzero(least[:, :, follower].max(axis=0) > room)
         # A case that leaves the force below the level can yet be the one that the leader feels.
         known = least[:, rows]
@@ -174,7 +168,7 @@ class RobustPath:
             (n, 2, count, 20).
         """
         n, leader, follower = len(points), self.leader, 1 - self.leader
-        least = self._least(points, np.ones((len(self._cases), n), dtype=bool))
+        least = self._model.least_squeeze(points.motion, self._cases, leader)
         ruling = ruling_cases(least, self._set, leader)
         first = np.argsort(-least[:, :, follower], axis=0)[:count]
         beyond = ruling.force[:, leader] - ruling.force[:, follower]
@@ -185,22 +179,6 @@ class RobustPath:
             force[:, leader, j] = force[:, follower, j] + beyond
             slope[:, :, j] = self.slopes(points, one)
         return force, slope
-
-    def _differences(self, points: PathPoints) -> Array:
-        """(k, n) N_1 - N_2 of every case."""
-        n, k = len(points), len(self._cases)
-        repeated = [np.tile(values, (k, 1)) for values in points.motion]
-        cases = np.repeat(self._cases, n, axis=0)
-        return self._difference.batch(*repeated, cases)["difference"].reshape(k, n)
-
-    def _least(self, points: PathPoints, wanted: NDArray[np.bool_]) -> Array:
-        """(k, n, 2) least normal forces of the wanted (k, n) cases, `BELOW` for the others."""
-        case, row = np.nonzero(wanted)
-        found = np.full((*wanted.shape, 2), BELOW)
-        if len(row):
-            motion = [values[row] for values in points.motion]
-            found[case, row] = self._squeeze.batch(*motion, self._cases[case])["normal_force"]
-        return found
 
     def slopes(self, points: PathPoints, ruling: RulingCases) -> Array:
         """(n, 2, 20) of the forces that these cases decide."""
@@ -297,7 +275,7 @@ class RulingForce:
             held = WorkcellNumbers(cell).vector(HELD)
             return np.hstack([moved, np.tile(held, (len(moved), 1))])
         if pads:
-            least = case_grasp_function(cell, 1 - self._leader)
+            least = case_squeeze_function(cell, 1 - self._leader)
             rows = [np.split(row, (6, 12, 18)) for row in moved]
             return np.array([[float(least(*row)[1 - self._leader])] for row in rows])
         load, own = case_origin_load_function(cell), self._motion
@@ -310,11 +288,11 @@ class RulingForce:
         one by a trifle: the lower one decides what the opposed force takes."""
         if self._squeezed:
             numbers = WorkcellNumbers(self._workcell)
-            found = case_gradient_function(numbers.symbols(), numbers=True)
-            function = bound_to(InterpretedFunction(dense(found)), numbers)
+            made = case_gradient_function(numbers.symbols(), numbers=True)
+            function = bound_to(InterpretedFunction(dense(made)), numbers)
         else:
-            found = case_grasp_gradient_function(self._workcell, 1 - self._leader)
-            function = InterpretedFunction(dense(found))
+            made = case_gradient_function(self._workcell, 1 - self._leader, numbers=True)
+            function = InterpretedFunction(dense(made))
         own, slopes = self._motion, []
         for arm in (0, 1):
             cases = self._cases.copy()

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_opt.carry import Carry
-from hybrid_opt.robust.force import BoxMotion, robust_model
+from hybrid_opt.robust.force import robust_model
 from hybrid_opt.robust.path_force import BY_TIMING, PathPoints, robust_path
 from hybrid_opt.timing.model import REFINEMENT, PathMotion, TimingModel
 from hybrid_opt.timing.records import Excess, Place, Timing, TimingLimits, TimingStatus
@@ -152,7 +152,7 @@ class PathLimits:
         if force:
             needed = load["normal_force"]
             if self._grasped:
-                moved = BoxMotion(*self._points(a, w).motion)
+                moved = self._points(a, w).motion
                 commanded, leading = robust_model(workcell).hold(moved, workcell.uncertainty)
                 needed = np.stack([leading, commanded], axis=1)
             columns.append(needed / force)

@@ -19,7 +19,7 @@ from hybrid_opt.sensitivity import Sensitivity
 from hybrid_opt.timing.limits import drive_path
 from symbolic import outside
 from symbolic.array import Array
-from symbolic.contact.worst_cases import case_grasp_function, case_grasp_gradient_function
+from symbolic.contact.worst_cases import case_gradient_function, case_squeeze_function
 from symbolic.errors import SettingsError, WorkcellError
 from tests.hybrid_opt.cells import shipped
 from tests.symbolic.cells import RACK
@@ -191,7 +191,7 @@ def test_what_has_no_sensitivities_is_refused() -> None:
 def test_slopes_of_what_pads_anywhere_need() -> None:
     """By motion and case: against differences of the force itself."""
     workcell = pressing_model(ho.Cell.load(CELLS / "fork.toml").workcell).workcell
-    least = case_grasp_function(workcell, 1)
+    least = case_squeeze_function(workcell, 1)
     at = np.random.default_rng(1).normal(scale=0.1, size=18)
     at[2] += 0.8
     case = worst_cases(workcell, workcell.uncertainty)[7]
@@ -201,7 +201,8 @@ def test_slopes_of_what_pads_anywhere_need() -> None:
         return np.array(least(*np.split(values, (6, 12, 18)))).ravel()
 
     point = np.concatenate([at, case])
-    slopes = case_grasp_gradient_function(workcell, 1)(*np.split(point, (6, 12, 18)))[1]
+    function = case_gradient_function(workcell, 1, numbers=True)
+    slopes = function(*np.split(point, (6, 12, 18)))[1]
     for k in (4, 9, 13, 18, 19, 22, 24, 27, 29, 34, 35):
         step = np.zeros(len(point))
         step[k] = 1e-5

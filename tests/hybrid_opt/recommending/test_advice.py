@@ -10,7 +10,8 @@ import pytest
 from hybrid_opt.recommending.advice import changes_of_cell
 from hybrid_opt.robust.force import RobustModel
 from symbolic.read.cell import changed
-from tests.hybrid_opt.robust.test_other_pads import SET, model, motion
+from tests.hybrid_opt.robust.test_force import SMALL as SET
+from tests.hybrid_opt.robust.test_force import model, motion
 
 PLACES: dict[str, dict[str, list[float]]] = {
     "drum": {
@@ -31,7 +32,7 @@ WIDER: dict[str, dict[str, list[float]]] = {
 
 @pytest.mark.parametrize("name", PLACES)
 def test_changes_of_pads_anywhere_are_those_of_the_file(name: str) -> None:
-    workcell, moved = model(name, "soft-finger").workcell, motion(name)
+    workcell, moved = model(f"{name}, even").workcell, motion(name)
     told = dict(changes_of_cell(workcell, moved))
 
     def force(changes: dict[str, Any]) -> float:

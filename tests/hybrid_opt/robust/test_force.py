@@ -8,22 +8,30 @@ from functools import cache
 import numpy as np
 import pytest
 
+from codegen.lanes import lane_text
+from codegen.source import dense, generated_c
 from hybrid_opt.evaluate.objectives import OBJECTIVES
-from hybrid_opt.robust.cases import random_cases, worst_cases
+from hybrid_opt.robust.cases import nominal_case, random_cases, worst_cases
 from hybrid_opt.robust.force import (
     BATCH,
     HOLDS,
+    LARGEST_FACTOR,
+    SAMPLES,
     SCREENED,
     BoxMotion,
     RobustModel,
     allowed_factor,
+    at_rest,
+    closes_evenly,
 )
 from hybrid_opt.robust.path_force import BY_TIMING, PathPoints, RobustPath
 from symbolic.array import Array
+from symbolic.contact.worst_cases import CASE_SIZES, case_squeeze_function
 from symbolic.errors import SettingsError
-from symbolic.records import Uncertainty, Workcell
+from symbolic.read.cell import load
+from symbolic.records import Uncertainty
 from symbolic.records.cell import RANGES
-from tests.symbolic.cells import hand_cell, with_contacts
+from tests.symbolic.cells import RACK, hand_cell, rack_cell, with_contacts, with_task
 from tests.symbolic.contact.test_payload_load import random_motion
 
 SET = Uncertainty(
@@ -38,28 +46,38 @@ SET = Uncertainty(
     relative_position=0.002,
     relative_angle=0.01,
 )
+SMALL = Uncertainty(0.08, 0.05, np.full(3, 0.004), 0.003, np.array([0.2, 0.0, 0.3]))
+WIDE = Uncertainty(0.2, 0.05, np.full(3, 0.01), 0.005, np.full(3, 0.3))
 FRICTION = 0.8
-SAMPLES = 12
+POINTS = 12
 
+SETS = {"hand": SET, "rack, even": WIDE}
+"""Of cells with pads that face one another; others have `SMALL`."""
 
-def cell() -> Workcell:
-    return replace(with_contacts(hand_cell(), friction=(FRICTION, FRICTION)), uncertainty=SET)
+ANYWHERE = ["drum", "fork", pytest.param("corner", marks=pytest.mark.slow)]
 
 
 @cache
-def model() -> RobustModel:
-    return RobustModel(cell())
+def model(name: str = "hand") -> RobustModel:
+    """Of a cell and its set; with `even` of pads that press evenly."""
+    if name == "hand":
+        cell = with_contacts(hand_cell(), friction=(FRICTION, FRICTION))
+    else:
+        file = name.partition(",")[0]
+        cell = rack_cell() if file == "rack" else load(RACK.with_name(f"{file}.toml"))
+        cell = with_task(cell, allocation="soft-finger" if "even" in name else "joint")
+    return RobustModel(replace(cell, uncertainty=SETS.get(name, SMALL)))
 
 
-def motion() -> BoxMotion:
+def motion(name: str = "hand") -> BoxMotion:
     rng = np.random.default_rng(4)
-    parts = [random_motion(rng) for _ in range(SAMPLES)]
-    return BoxMotion(*[np.array(values) for values in zip(*parts, strict=True)])
-
-
-def at_rest() -> BoxMotion:
-    still = np.zeros((1, 6))
-    return BoxMotion(still, still, still)
+    if name in SETS:
+        parts = [random_motion(rng) for _ in range(POINTS)]
+        return BoxMotion(*[np.array(values) for values in zip(*parts, strict=True)])
+    # Around the cell's start pose, gently.
+    task, rng, n = model(name).workcell.task, np.random.default_rng(2), 6
+    pose = np.tile(task.waypoints[0].lower, (n, 1)) + 0.05 * rng.normal(size=(n, 6))
+    return BoxMotion(pose, 0.2 * rng.normal(size=(n, 6)), 0.5 * rng.normal(size=(n, 6)))
 
 
 @pytest.mark.parametrize("leader", [0, 1])
@@ -88,15 +106,37 @@ def test_a_displaced_centre_of_mass_is_held_by_pressing_harder() -> None:
     assert leading[0] == pytest.approx(commanded[0], rel=1e-6)
 
 
-def test_no_random_case_needs_more_and_some_need_nearly_as_much() -> None:
-    rng = np.random.default_rng(1)
-    force = model().robust_force(motion())
-    check = model().check(motion(), force, 3000, rng)
+def test_a_fork_and_a_pad_press_alike() -> None:
+    """Opposite normals: what the motion asks along them is the difference, all else is squeeze."""
+    force = model("fork").robust_force(at_rest(), Uncertainty(friction=0.1))
+    cell = model("fork").workcell
+    least = 9.81 * cell.payload.mass / (2.0 * 0.9 * cell.contacts[0].friction)
+    assert force.leading == pytest.approx(force.commanded, rel=2e-3)
+    assert force.commanded[0] >= least * (1.0 - 1e-6)
+
+
+@pytest.mark.parametrize(
+    ("name", "cases", "share"),
+    [
+        ("hand", 3000, 0.9),
+        ("rack, even", 4000, 0.75),
+        ("drum", 400, 0.85),
+        ("drum, even", 200, 0.85),
+        ("fork", 400, 0.85),
+        pytest.param("corner", 400, 0.85, marks=pytest.mark.slow),
+    ],
+)
+def test_no_random_case_needs_more_and_some_need_nearly_as_much(
+    name: str, cases: int, share: float
+) -> None:
+    moved = motion(name)
+    force = model(name).robust_force(moved)
+    assert (force.commanded > force.nominal[:, 1]).all()
+    check = model(name).check(moved, force, cases, np.random.default_rng(1))
     assert check.holds
-    assert check.cases == 3000
-    assert 0.9 < check.closest <= 1.0
-    weaker = replace(force, commanded=0.9 * force.commanded)
-    assert not model().check(motion(), weaker, 3000, rng).holds
+    assert check.cases == cases
+    weaker = replace(force, commanded=share * force.commanded)
+    assert not model(name).check(moved, weaker, cases, np.random.default_rng(1)).holds
 
 
 @pytest.mark.parametrize("factor", [0.95, 0.92])
@@ -129,112 +169,145 @@ def test_cases_within_the_ranges_lie_below_the_vertices() -> None:
 def test_leading_arm_feels_no_more_than_told() -> None:
     """In every case the leader's force is the commanded one and the motion's difference."""
     force = model().robust_force(motion())
-    rng = np.random.default_rng(5)
-    for _ in range(200):
-        cases = worst_cases(cell(), SET)
-        case = cases[rng.integers(len(cases))].copy()
-        case[4] = 10.0 * rng.uniform(0.95, 1.05)
-        needed = model().least_squeeze(motion(), case[None])[0]
-        felt = force.commanded + needed[:, 0] - needed[:, 1]
-        assert (felt <= force.leading * (1.0 + 1e-9)).all()
+    rng, worst = np.random.default_rng(5), worst_cases(model().workcell, SET)
+    cases = worst[rng.integers(len(worst), size=200)]
+    cases[:, 4] = 10.0 * rng.uniform(0.95, 1.05, 200)
+    needed = model().least_squeeze(motion(), cases)
+    felt = force.commanded + needed[:, :, 0] - needed[:, :, 1]
+    assert (felt <= force.leading * (1.0 + 1e-9)).all()
 
 
-def test_the_price_grows_with_the_set_and_starts_at_the_nominal_forces() -> None:
-    price = model().price(motion(), np.array([0.0, 0.5, 1.0, 1.5]))
+@pytest.mark.parametrize("name", ANYWHERE)
+def test_more_friction_never_needs_more_force(name: str) -> None:
+    """And a force is found wherever friction closes the grasp, far from the cell's own too."""
+    even, shares = model(f"{name}, even"), np.linspace(0.7, 1.3, 61)
+    cases = np.tile(nominal_case(even.workcell), (len(shares), 1))
+    assert next(iter(CASE_SIZES)) == "friction"
+    cases[:, : CASE_SIZES["friction"]] *= shares[:, None]
+    force = even.least_squeeze(motion(name), cases)
+    assert np.isfinite(force).all()
+    assert (np.diff(force, axis=0) < 1e-6 * force[1:]).all()
+
+
+def test_what_is_commanded_is_known_without_every_case() -> None:
+    """Also of more than `SAMPLES` samples: cases that rule at some are asked at all."""
+    even, moved = model("drum, even"), motion("drum")
+    commanded, leading = even.hold(moved, SMALL)
+    np.testing.assert_allclose(even.commanded(moved, SMALL), commanded, rtol=1e-9)
+    above = float(np.median(commanded))
+    found = even.commanded(moved, SMALL, above=above)
+    np.testing.assert_allclose(found, np.maximum(commanded, above), rtol=1e-9)
+    np.testing.assert_allclose(even.peak(moved, SMALL), [leading.max(), commanded.max()], rtol=5e-3)
+    at, share = np.arange(6.0), np.linspace(0.0, 5.0, 2 * SAMPLES)
+    parts = [
+        np.column_stack([np.interp(share, at, column) for column in values.T])
+        for values in vars(moved).values()
+    ]
+    many = BoxMotion(*parts)
+    np.testing.assert_allclose(even.commanded(many, SMALL), even.hold(many, SMALL)[0], rtol=1e-4)
+
+
+def test_pads_that_press_evenly_need_more() -> None:
+    """Than pads that choose their pressure; of functions with a form in lanes: without, a
+    recommendation would take minutes."""
+    even, moved = model("drum, even"), motion("drum")
+    assert (even.nominal(moved)[:, 1] > model("drum").nominal(moved)[:, 1]).all()
+    function = dense(case_squeeze_function(even.workcell))
+    assert lane_text(generated_c([function]), "lanes").entry
+
+
+def test_pads_that_only_choosing_their_pressure_would_close_are_told() -> None:
+    cell = load(RACK.with_name("corner.toml"))
+    assert closes_evenly(cell)
+    assert not closes_evenly(with_contacts(cell, friction=(0.9, 0.9)))
+
+
+def test_the_price_grows_with_the_set_until_it_uses_the_forces_up() -> None:
+    def peak(factor: float) -> Array:
+        return model().peak(motion(), SET.scaled(factor))
+
+    price, force = [peak(factor) for factor in (0.0, 0.5, 1.0, 1.5)], model().robust_force(motion())
     assert (np.diff(price, axis=0) > 0.0).all()
-    force = model().robust_force(motion())
     np.testing.assert_allclose(price[2], force.peak, rtol=1e-12)
-    np.testing.assert_allclose(price[0, 1], force.nominal[:, 1].max(), rtol=1e-7)
-
-
-def test_the_largest_set_uses_the_forces_up() -> None:
-    limit = 1.2 * model().robust_force(motion()).peak
+    np.testing.assert_allclose(price[0][1], force.nominal[:, 1].max(), rtol=1e-7)
+    limit = 1.2 * force.peak
     factor = model().largest_factor(motion(), limit)
-    peak = model().price(motion(), np.array([factor]))[0]
     assert factor > 1.0
-    assert (peak / limit).max() == pytest.approx(1.0, rel=1e-4)
+    assert (peak(factor) / limit).max() == pytest.approx(1.0, rel=1e-4)
     assert model().largest_factor(motion(), 0.1 * limit) == 0.0
-    assert allowed_factor(cell(), SET) == pytest.approx(0.0315 / 0.005)
+    assert allowed_factor(model().workcell, SET) == pytest.approx(0.0315 / 0.005)
 
 
 def test_is_an_objective() -> None:
-    found = motion()
-    outputs: dict[str, Array] = {
-        name: getattr(found, name)[None] for name in ("pose", "rate", "second_rate")
-    }
-    value = OBJECTIVES["robust_force"].evaluate(outputs, cell())
-    expected = (model().robust_force(found).peak / cell().task.reference_force).max()
+    found, cell = motion(), model().workcell
+    outputs: dict[str, Array] = {name: part[None] for name, part in vars(found).items()}
+    value = OBJECTIVES["robust_force"].evaluate(outputs, cell)
+    expected = (model().robust_force(found).peak / cell.task.reference_force).max()
     assert value == pytest.approx([expected])
 
 
-def test_misuse_is_told() -> None:
-    with pytest.raises(SettingsError, match="leader 2"):
-        model().hold(motion(), SET, leader=2)
+def test_a_set_that_nothing_holds_is_told() -> None:
+    """Of the fork nearly no friction is left: its forces are not found."""
     with pytest.raises(SettingsError, match="no friction or no patch"):
         model().hold(motion(), SET.scaled(10.0))
+    lost = replace(hand_cell(), uncertainty=Uncertainty(friction=1.0))
+    with pytest.raises(SettingsError, match="no friction"):
+        RobustPath(lost)
+    even, moved = model("fork, even"), motion("fork")
+    assert 0.0 < even.largest_factor(moved, np.full(2, 1e9)) < LARGEST_FACTOR
+    widest = SMALL.scaled(allowed_factor(even.workcell, SMALL))
+    assert np.isinf(even.peak(moved, widest)).all()
+    with pytest.raises(SettingsError, match="no force was found that holds every case"):
+        even.robust_force(moved, widest)
 
 
 STEP = 1e-4
 
 
+def points_of(seed: int) -> PathPoints:
+    rng = np.random.default_rng(seed)
+    first, second = rng.normal(scale=0.5, size=(2, POINTS, 6))
+    a, w = rng.normal(size=POINTS), rng.uniform(0.1, 1.0, POINTS)
+    return PathPoints(motion().pose, first, second, a, w)
+
+
 @pytest.mark.parametrize("leader", [0, 1])
 def test_forces_and_slopes_are_those_of_the_motion(leader: int) -> None:
-    rng = np.random.default_rng(7)
-    first, second = rng.normal(scale=0.5, size=(2, SAMPLES, 6))
-    a, w = rng.normal(size=SAMPLES), rng.uniform(0.1, 1.0, SAMPLES)
-    pose = motion().pose
-
-    def forces(a: Array, w: Array) -> Array:
-        moving = BoxMotion(pose, first * np.sqrt(w)[:, None], np.outer(a, np.ones(6)) * first)
-        moving.second_rate[:] += second * w[:, None]
-        found = model().robust_force(moving, leader=leader)
-        both = [found.leading, found.commanded]
-        return np.stack(both if leader == 0 else both[::-1], axis=1)
-
-    robust = RobustPath(cell(), leader=leader)
-    points = PathPoints(pose, first, second, a, w)
+    points, cell = points_of(7), model().workcell
+    robust = RobustPath(cell, leader=leader)
     value, whole = robust.at(points)
-    slope = whole[:, :, BY_TIMING]
-    np.testing.assert_allclose(value, forces(a, w), rtol=1e-7)
-    by_a = (forces(a + STEP, w) - forces(a - STEP, w)) / (2.0 * STEP)
-    by_w = (forces(a, w + STEP) - forces(a, w - STEP)) / (2.0 * STEP)
-    np.testing.assert_allclose(slope[..., 0], by_a, atol=1e-3)
-    np.testing.assert_allclose(slope[..., 1], by_w, atol=1e-3)
-    for k, entry in ((0, 0), (1, 4), (2, 2)):
+    needed = model().robust_force(points.motion, leader=leader)
+    both = [needed.leading, needed.commanded]
+    expected = np.stack(both if leader == 0 else both[::-1], axis=1)
+    np.testing.assert_allclose(value, expected, rtol=1e-7)
+    names = ("pose", "first", "second", "a", "w")
+    for k, entry in ((0, [0]), (1, [4]), (2, [2]), (3, []), (4, [])):
         ends = []
         for sign in (1.0, -1.0):
-            moved = [pose.copy(), first.copy(), second.copy()]
-            moved[k][:, entry] += sign * STEP
-            ends.append(robust.at(PathPoints(moved[0], moved[1], moved[2], a, w))[0])
+            moved = getattr(points, names[k]).copy()
+            moved[(..., *entry)] += sign * STEP
+            ends.append(robust.at(replace(points, **{names[k]: moved}))[0])
         difference = (ends[0] - ends[1]) / (2.0 * STEP)
-        np.testing.assert_allclose(whole[:, :, 6 * k + entry], difference, atol=2e-3)
+        column = 6 * k + entry[0] if entry else BY_TIMING.start + k - 3
+        np.testing.assert_allclose(whole[:, :, column], difference, atol=2e-3)
     # Where a force is above a level, the same; nowhere else.
-    level = np.full(SAMPLES, float(np.median(value.max(axis=1))))
+    level = np.full(POINTS, float(np.median(value.max(axis=1))))
     rows, force, beyond = robust.beyond(points, level)
     np.testing.assert_array_equal(rows, np.flatnonzero(value.max(axis=1) > level))
-    assert 0 < len(rows) < SAMPLES
+    assert 0 < len(rows) < POINTS
     np.testing.assert_allclose(force, value[rows], rtol=1e-9)
     np.testing.assert_allclose(beyond, whole[rows], rtol=1e-6, atol=1e-6)
 
 
 def test_they_are_convex_and_have_slopes_at_rest() -> None:
     """Between two places no higher than the line, and never below a tangent."""
-    rng = np.random.default_rng(8)
-    first, second = rng.normal(scale=0.5, size=(2, SAMPLES, 6))
-    forces, pose = RobustPath(cell()), motion().pose
-    still = np.zeros(SAMPLES)
-    a, w = rng.normal(size=SAMPLES), rng.uniform(0.0, 1.0, SAMPLES)
-    begin, whole = forces.at(PathPoints(pose, first, second, still, still))
+    points, forces = points_of(8), RobustPath(model().workcell)
+    a, w = points.a, points.w
+    begin, whole = forces.at(replace(points, a=0.0 * a, w=0.0 * w))
     slope = whole[:, :, BY_TIMING]
-    end, _ = forces.at(PathPoints(pose, first, second, a, w))
-    middle, _ = forces.at(PathPoints(pose, first, second, a / 2.0, w / 2.0))
+    end, _ = forces.at(points)
+    middle, _ = forces.at(replace(points, a=a / 2.0, w=w / 2.0))
     assert np.isfinite(slope).all()
     assert (middle <= (begin + end) / 2.0 + 1e-5).all()
     tangent = begin + slope[..., 0] * a[:, None] + slope[..., 1] * w[:, None]
     assert (end >= tangent - 1e-5).all()
-
-
-def test_a_set_that_nothing_holds_is_refused() -> None:
-    lost = replace(hand_cell(), uncertainty=Uncertainty(friction=1.0))
-    with pytest.raises(SettingsError, match="no friction"):
-        RobustPath(lost)

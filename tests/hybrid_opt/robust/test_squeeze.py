@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from hybrid_opt.carry import Carry
 from hybrid_opt.robust.force import (
     SAMPLES,
     BoxMotion,
@@ -28,8 +29,10 @@ from hybrid_opt.robust.squeeze import (
 )
 from symbolic.array import Array
 from symbolic.errors import SettingsError
+from symbolic.read.cell import load
 from symbolic.records import USUAL, Uncertainty, Workcell
 from tests.hybrid_opt.job.jobs import rack, rack_job, rack_jobs, rack_timing
+from tests.symbolic.cells import RACK
 
 FORCES = st.lists(st.floats(0.0, 200.0), min_size=2, max_size=40)
 
@@ -71,10 +74,15 @@ def test_the_factor_multiplies_the_squeeze() -> None:
             )
 
 
+def rack_carry() -> Carry:
+    carry = rack_job().timing.carry
+    assert carry is not None
+    return carry
+
+
 def pressed(uncertainty: Uncertainty) -> tuple[Workcell, Array, Squeeze]:
     """The rack under a set, what is commanded of arm 2 along its carry, and why."""
-    cell, carry = replace(rack().workcell, uncertainty=uncertainty), rack_job().timing.carry
-    assert carry is not None
+    cell, carry = replace(rack().workcell, uncertainty=uncertainty), rack_carry()
     forces, squeeze = commanded_forces(cell, carry, SqueezeSettings())
     return cell, forces[:, 1], squeeze
 
@@ -86,8 +94,7 @@ SET = Uncertainty(
 
 def test_an_uncertain_cell_is_pressed_for_every_case() -> None:
     cell, commanded, squeeze = pressed(SET)
-    carry = rack_job().timing.carry
-    assert carry is not None
+    carry = rack_carry()
     needed = soft_model(cell).hold(carry, SET)[0]
     assert (commanded >= needed - 1e-6).all()
     assert commanded.max() == pytest.approx(needed.max(), abs=1e-6)
@@ -147,8 +154,7 @@ PRICED = Uncertainty(friction=0.15, centre_of_mass=np.array([0.0, 0.004, 0.0]))
 
 
 def priced(uncertainty: Uncertainty) -> RobustPrice:
-    carry = rack_job().timing.carry
-    assert carry is not None
+    carry = rack_carry()
     carry = replace(carry, workcell=replace(carry.workcell, uncertainty=uncertainty))
     return robust_price(RobustModel(carry.workcell), carry, np.random.default_rng(1), cases=CASES)
 
@@ -169,23 +175,25 @@ def test_a_carry_is_priced_under_its_cells_own_set() -> None:
 
 
 def test_a_cell_that_states_nothing_is_priced_under_a_usual_set() -> None:
-    carry = rack_job().timing.carry
-    assert carry is not None
-    model = RobustModel(replace(carry.workcell, uncertainty=USUAL))
-    found = robust_price(model, carry, np.random.default_rng(1), cases=CASES)
+    found = priced(USUAL)
     assert not found.uncertainty.stated
     assert found.check.holds
 
 
 def test_the_largest_forces_are_among_the_thinned_samples() -> None:
-    carry = rack_job().timing.carry
-    assert carry is not None
+    carry = rack_carry()
     _, motion = thinned(carry)
     assert SAMPLES <= len(motion.pose) <= SAMPLES + 2
     for row in carry.normal_force.argmax(axis=0):
         assert (motion.pose == carry.pose[row]).all(axis=1).any()
 
 
-def test_a_set_that_leaves_no_friction_is_told() -> None:
-    with pytest.raises(SettingsError, match="no friction"):
-        priced(Uncertainty(friction=1.0))
+@pytest.mark.parametrize("settings", [SqueezeSettings(), SqueezeSettings(1.0)])
+@pytest.mark.parametrize("name", ["rack", "corner"])
+def test_what_is_commanded_holds_even_pads(name: str, settings: SqueezeSettings) -> None:
+    """Although the plan, here none at all, asks for less."""
+    cell, still = load(RACK.with_name(f"{name}.toml")), BoxMotion(*[np.zeros((2, 6))] * 3)
+    model, time = soft_model(cell), np.array([0.0, 1.0])
+    extra, squeeze = pressed_beyond(cell, settings, time, still, np.zeros((2, 2)))
+    assert (extra >= model.nominal(still)[:, 1] * (1.0 - 1e-9)).all()
+    assert "press evenly" in str(squeeze)
