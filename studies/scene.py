@@ -36,7 +36,7 @@ def _add_options(parser: Parser) -> None:
 
 def add_scene(options: argparse.Namespace) -> int:
     """Print a scene's bodies, or add them to a file; returns the exit code."""
-    from hybrid_opt.proposing.problem import completed
+    from symbolic.read.editing import completed
     from symbolic.read.scenes import read_scene
 
     scene = read_scene(options.scene)
@@ -60,7 +60,7 @@ def add_scene(options: argparse.Namespace) -> int:
 
 
 def _add(scene: Scene, path: Path) -> None:
-    from hybrid_opt.proposing.problem import extended
+    from symbolic.read.editing import extended
 
     try:
         content = outside.read_bytes(path, outside.WORKCELL_BYTES)

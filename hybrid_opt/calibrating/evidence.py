@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import tomlkit
 
 from hybrid_opt.calibrating.estimate import (
     FrictionRatio,
@@ -28,11 +29,12 @@ from hybrid_opt.calibrating.faults import (
 )
 from hybrid_opt.calibrating.recording import Places, Run, places_of, tared
 from hybrid_opt.display.table import number, text_table
-from hybrid_opt.proposing.problem import Problem, completed, library
+from hybrid_opt.proposing.problem import Problem
 from symbolic import outside
 from symbolic.array import Array
 from symbolic.errors import OutsideError, SettingsError, WorkcellError
 from symbolic.read.cell import load as load_cell
+from symbolic.read.editing import completed
 from symbolic.records import Workcell
 from symbolic.records.cell import RANGES
 from symbolic.records.poses import inverse
@@ -406,7 +408,7 @@ def calibrated_file(source: Path, evidence: Evidence, output: Path) -> str:
         raise WorkcellError(str(source), (f"file: {error}",)) from error
     load_cell(source, text=completed(text, data, evidence.changes).encode())
     changed = Problem(source, text, data).completed(evidence.changes, output.parent)
-    document = library().parse(changed)
+    document = tomlkit.parse(changed)
     told: dict[str, list[str]] = {}
     for entry in evidence.entries:
         told.setdefault(entry.key, []).append(f"{entry.name}: {entry.found}")
@@ -419,4 +421,4 @@ def calibrated_file(source: Path, evidence: Evidence, output: Path) -> str:
     head = [f"# Calibrated from {', '.join(evidence.runs)}:"]
     head += [f"#   {entry.name}: {entry.found}" for entry in evidence.entries]
     head += [f"#   {fault}" for fault in evidence.faults]
-    return "\n".join(head) + "\n\n" + str(library().dumps(document))
+    return "\n".join(head) + "\n\n" + document.as_string()

@@ -23,7 +23,7 @@ from hybrid_opt.proposing.holding import (
     shoulders,
     spun,
 )
-from hybrid_opt.proposing.problem import Problem, merged
+from hybrid_opt.proposing.problem import Problem
 from hybrid_opt.proposing.setup import redundancy
 from hybrid_opt.proposing.trial import BoxAlone
 from symbolic.array import Array
@@ -31,6 +31,7 @@ from symbolic.geometry.bodies import WORLD, MeshReader, collision_bodies, shape_
 from symbolic.geometry.pairs import coal_distance
 from symbolic.geometry.pieces import Piece
 from symbolic.read.checks import stretched_length
+from symbolic.read.editing import merged
 from symbolic.records import Cylinder, Workcell
 from symbolic.records.poses import box_placement, inverse, pose_matrix, transform
 

@@ -1,15 +1,13 @@
-"""The problem file: a workcell file in which a person has left out what is to be proposed; and the
-text of the workcell file that completes it, comments and order as they were."""
+"""The problem file: a workcell file in which a person has left out what is to be proposed; and what
+completes it."""
 
 from __future__ import annotations
 
 import copy
 import os
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -18,9 +16,10 @@ from hybrid_opt.proposing.bounds import Bounds
 from hybrid_opt.proposing.holding import shoulders
 from symbolic import outside
 from symbolic.array import Array
-from symbolic.errors import OutsideError, SettingsError, WorkcellError
+from symbolic.errors import OutsideError, WorkcellError
 from symbolic.read.cell import load
 from symbolic.read.descriptions import PACKAGE_SCHEME
+from symbolic.read.editing import completed, merged, with_paths
 from symbolic.read.robots import read_robot
 from symbolic.read.tables import Table
 from symbolic.records import POSE_SIZE, Robot, Workcell
@@ -143,7 +142,7 @@ class Problem:
         """The workcell with one free waypoint halfway where nothing else is said.
 
         Args:
-            changes: as for `hybrid_opt.proposing.problem.completed`.
+            changes: as for `symbolic.read.editing.completed`.
 
         Raises:
             WorkcellError: with all problems of the file.
@@ -151,9 +150,7 @@ class Problem:
         return self._draft(merged({"contacts": self.contacts}, changes or {}))
 
     def _draft(self, changes: dict[str, Any]) -> Workcell:
-        here = self.source.parent
-        data = merged(self.data, _with_paths(self.data, lambda name: str(here / name)))
-        task = data["task"] = dict(data["task"])
+        task = dict(self.data["task"])
         if "waypoints" not in changes.get("task", {}):
             poses = np.array([task["start"], task["goal"]], dtype=float)
             task["waypoints"] = [
@@ -162,19 +159,14 @@ class Problem:
                     "upper": (poses.max(axis=0) + REACH_OF_DRAFT).tolist(),
                 }
             ]
-        with TemporaryDirectory() as folder:
-            draft = Path(folder) / self.source.name
-            draft.write_text(completed("", data, changes), encoding="utf-8")
-            try:
-                return load(draft)
-            except WorkcellError as error:
-                raise WorkcellError(str(self.source), error.problems) from error
+        text = completed("", self.data | {"task": task}, changes)
+        return load(self.source, text=text.encode())
 
     def completed(self, changes: dict[str, Any], folder: Path) -> str:
         """The file's text, completed, for a folder that paths are then relative to.
 
         Args:
-            changes: as for `hybrid_opt.proposing.problem.completed`.
+            changes: as for `symbolic.read.editing.completed`.
 
         Raises:
             SettingsError: the file is written in a way that cannot be completed.
@@ -182,9 +174,10 @@ class Problem:
         here, there = self.source.parent, folder.resolve()
 
         def moved(name: str) -> str:
-            return name if os.path.isabs(name) else os.path.relpath(here / name, there)
+            is_relative = not os.path.isabs(name) and not name.startswith(PACKAGE_SCHEME)
+            return os.path.relpath(here / name, there) if is_relative else name
 
-        paths = {} if there == here else _with_paths(self.data, moved)
+        paths = {} if there == here else with_paths(self.data, moved)
         return completed(self.text, self.data, merged(paths, changes))
 
 
@@ -239,30 +232,6 @@ def _require_known(table: Table) -> None:
         table.add("contacts", "xyz is needed for a payload that is no box")
     else:
         payload.vector("size", (quantity.PAYLOAD_SIZE,) * 3)
-
-
-def _with_paths(data: dict[str, Any], change: Callable[[str], str]) -> dict[str, Any]:
-    """Changes by which every path in the tables but those of packages is another."""
-
-    def changed(table: Any, *keys: str) -> dict[str, Any]:
-        names = {key: table.get(key) for key in keys} if isinstance(table, dict) else {}
-        return {
-            key: change(name)
-            for key, name in names.items()
-            if isinstance(name, str) and not name.startswith(PACKAGE_SCHEME)
-        }
-
-    found: dict[str, Any] = {"robots": [], "payload": changed(data["payload"], "path")}
-    for robot in data["robots"]:
-        entry: dict[str, Any] = changed(robot, "urdf", "srdf")
-        if isinstance(robot.get("package_dirs"), list):
-            entry["package_dirs"] = [change(str(name)) for name in robot["package_dirs"]]
-        if isinstance(robot.get("tool"), list):
-            entry["tool"] = [changed(body, "path") for body in robot["tool"]]
-        found["robots"].append(entry)
-    if isinstance(data.get("environment"), list):
-        found["environment"] = [changed(body, "path") for body in data["environment"]]
-    return found
 
 
 def contact_points(
@@ -439,185 +408,3 @@ def _as_waypoints(x: Array, waypoints: Array, m: int) -> Array:
 def _plain(values: Array) -> Any:
     """As lists of numbers, to a hundredth of a millimetre, none of them -0.0."""
     return (np.round(values, 5) + 0.0).tolist()
-
-
-Changes = Mapping[str, Any]
-"""Tables and keys to be set: {'task': {'initial': ...}, 'robots': [{...}, {...}]}; a list of tables
-that is there already is changed entry by entry, a key with the value None is removed."""
-
-INLINE = ("base", "pad")
-"""Tables that are written in one line."""
-
-
-def completed(text: str, data: Mapping[str, Any], changes: Changes) -> str:
-    """A workcell file's text with values set.
-
-    Args:
-        text: the file; '' to write `data` without comments.
-        data: what the file holds, without what is replaced.
-        changes: what is set.
-
-    Raises:
-        SettingsError: the file is written in a way that cannot be completed, or TOML Kit is not
-            installed.
-    """
-    tomlkit = library()
-    wanted = merged(data, changes)
-    document = tomlkit.parse(text) if text else tomlkit.document()
-    if not text:
-        for key, value in wanted.items():
-            document[key] = _item(value)
-    else:
-        _apply(document, changes)
-    return _checked(tomlkit.dumps(document), wanted)
-
-
-def extended(text: str, data: Mapping[str, Any], key: str, tables: list[dict[str, Any]]) -> str:
-    """A workcell file's text with tables added behind those of an array, as `[[environment]]`.
-
-    Args:
-        text, data: the file, and what it holds.
-        key: of the array, at the top level; it may be missing.
-        tables: what is added.
-
-    Raises:
-        SettingsError: see `completed`.
-    """
-    tomlkit = library()
-    document = tomlkit.parse(f"{text.rstrip()}\n\n")
-    if key not in document:
-        document[key] = _item(tables)
-    elif isinstance(document[key], tomlkit.items.AoT):
-        for table in map(_item, tables):
-            table.add(tomlkit.nl())
-            document[key].append(table)
-    before = data.get(key, [])
-    wanted = {**data, key: [*(before if isinstance(before, list) else ()), *tables]}
-    return _checked(f"{document.as_string().rstrip()}\n", wanted)
-
-
-def _checked(found: str, wanted: Mapping[str, Any]) -> str:
-    """A text that says what it should."""
-    try:
-        same = _alike(outside.toml_tables(found.encode()), wanted)
-    except OutsideError:
-        same = False
-    if not same:
-        raise SettingsError(
-            "the file cannot be completed as it is written; begin each section with a heading of "
-            "its own ([task], [[contacts]]) and keep what belongs to one together"
-        )
-    return found
-
-
-def _alike(found: Any, wanted: Any) -> bool:
-    """Whether values are equal; what is no number is like itself, and told by the reader."""
-    if isinstance(found, Mapping) and isinstance(wanted, Mapping):
-        return found.keys() == wanted.keys() and all(_alike(found[k], wanted[k]) for k in found)
-    if isinstance(found, list) and isinstance(wanted, list):
-        return len(found) == len(wanted) and all(map(_alike, found, wanted))
-    return bool(found == wanted) or (found != found and wanted != wanted)
-
-
-def merged(data: Any, changes: Any) -> Any:
-    """Content of a file after the changes, as plain values; also changes after further ones."""
-    if isinstance(changes, Mapping) and isinstance(data, Mapping):
-        found = dict(data)
-        for key, value in changes.items():
-            if value is None:
-                found.pop(key, None)
-            else:
-                found[key] = merged(found[key], value) if key in found else value
-        return found
-    if _tables(changes) and _tables(data) and len(changes) == len(data):
-        return [merged(old, new) for old, new in zip(data, changes, strict=True)]
-    return changes
-
-
-def _tables(value: Any) -> bool:
-    return isinstance(value, list) and all(isinstance(entry, Mapping) for entry in value)
-
-
-def _apply(place: Any, changes: Any) -> None:
-    heading = _cut_heading(place)
-    for key, value in changes.items():
-        if value is None:
-            place.pop(key, None)
-        elif isinstance(value, Mapping) and key in place:
-            _apply(place[key], value)
-        elif _tables(value) and key in place and len(value) == len(place[key]):
-            for old, new in zip(place[key], value, strict=True):
-                _apply(old, new)
-        else:
-            place[key] = _item(value)
-    items, body = library().items, _last_body(place)
-    while heading and body and isinstance(body[-1][1], items.Whitespace | items.Null):
-        body.pop()  # before a table that is gone, and its place
-    body.extend(heading)
-
-
-def _cut_heading(place: Any) -> list[Any]:
-    """Take away the blank line at a table's end and what follows it: comments there are about the
-    next table, before which new ones go."""
-    body = _last_body(place)
-    blank = end = len(body)
-    while end and body[end - 1][0] is None:
-        end -= 1
-        if isinstance(body[end][1], library().items.Whitespace):
-            blank = end
-    heading = body[blank:]
-    del body[blank:]
-    return heading
-
-
-def _last_body(place: Any) -> list[Any]:
-    """Pairs of keys, None for comments and blank lines, and items of the table that ends a table;
-    none where one is written in one line, or in several places."""
-    items = library().items
-    if isinstance(place, items.AoT):
-        return _last_body(place[-1]) if len(place) else []
-    if not isinstance(place, items.Table | library().TOMLDocument):
-        return []
-    body: list[Any] = (place.value if isinstance(place, items.Table) else place).body
-    return (body and _last_body(body[-1][1])) or body
-
-
-def _item(value: Any) -> Any:
-    """A value as TOML: tables with headings, rows of numbers one below the other."""
-    tomlkit = library()
-    if isinstance(value, Mapping):
-        table = tomlkit.table()
-        for key, entry in value.items():
-            if key in INLINE and isinstance(entry, Mapping):
-                table[key] = tomlkit.inline_table()
-                table[key].update(entry)
-            else:
-                table[key] = _item(entry)
-        return table
-    if value and _tables(value):
-        tables = tomlkit.aot()
-        for entry in value:
-            tables.append(_item(entry))
-        return tables
-    if isinstance(value, list) and value and isinstance(value[0], list):
-        rows = tomlkit.array()
-        for row in value:
-            rows.append(row)
-        return rows.multiline(True)
-    return value
-
-
-def library() -> Any:
-    """TOML Kit.
-
-    Raises:
-        SettingsError: it is not installed.
-    """
-    try:
-        import tomlkit
-    except ImportError as error:
-        raise SettingsError(
-            "a proposed file is completed by TOML Kit, which is not installed: "
-            'pip install "dual-arm-carry[propose]"'
-        ) from error
-    return tomlkit

@@ -31,12 +31,13 @@ from hybrid_opt.proposing.holding import (
     spun,
 )
 from hybrid_opt.proposing.planner import ClosedChain, Place, Retreats, retreats
-from hybrid_opt.proposing.problem import Problem, merged
+from hybrid_opt.proposing.problem import Problem
 from hybrid_opt.proposing.trial import MARGINS, PoseJudge, judge_of
 from hybrid_opt.static_hold import require_hold
 from symbolic.array import Array
 from symbolic.geometry.pairs import build_geometry
 from symbolic.read.arms import FOLLOWING, arm_model, common_joints, turning_joints
+from symbolic.read.editing import merged
 from symbolic.records import POSE_SIZE, Task, Workcell
 from symbolic.records.poses import box_placement
 

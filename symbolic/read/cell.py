@@ -4,7 +4,6 @@ every key."""
 from __future__ import annotations
 
 import hashlib
-import json
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from copy import deepcopy
@@ -34,7 +33,7 @@ from symbolic.records import (
     Workcell,
 )
 from symbolic.records.cell import reading_of
-from symbolic.records.problems import Problems, shown
+from symbolic.records.problems import Problems
 
 Check = Callable[[Workcell], Iterable[str]]
 
@@ -203,24 +202,34 @@ def _content(path: Path, most: int) -> bytes:
 # --- start branches ---
 
 
-_SEARCH = re.compile(rb"""(\bstart_branch["']?\s*=\s*)(["'])search\2""")
-
-
 def with_branches(content: bytes, data: Mapping[str, Any], decided: tuple[int, int]) -> bytes:
-    """A workcell file's text with start branches in the place of "search", where decided."""
+    """A workcell file's text with start branches in the place of "search", where decided.
+
+    Raises:
+        SettingsError: see `symbolic.read.editing.completed`.
+    """
     robots = data.get("robots")
-    for robot, branch in zip(robots if isinstance(robots, list) else (), decided, strict=False):
-        if not isinstance(robot, Mapping) or robot.get("start_branch") != "search":
-            continue
-        if branch != SEARCHED:
-            content = _SEARCH.sub(rb"\g<1>%d" % branch, content, count=1)
-    return content
+    if not isinstance(robots, list) or len(robots) != len(decided):
+        return content
+    found = [
+        {"start_branch": branch} if asks and branch != SEARCHED else {}
+        for asks, branch in zip(map(_asks_for_search, robots), decided, strict=True)
+    ]
+    if not any(found):
+        return content
+    # Not imported at the top: see the module.
+    from symbolic.read.editing import completed
+
+    return completed(outside.text(content), data, {"robots": found}).encode()
+
+
+def _asks_for_search(robot: Any) -> bool:
+    return isinstance(robot, Mapping) and robot.get("start_branch") == "search"
 
 
 # --- other values ---
 
 
-_BARE = re.compile(r"[A-Za-z0-9_-]+")
 _INDEX = re.compile(r"\[(\d+)\]\.?(.*)", re.DOTALL)
 
 
@@ -249,7 +258,10 @@ def changed_text(content: bytes, changes: Mapping[str, Any], file: str) -> bytes
             table[key] = _plain(value)
     if problems:
         raise WorkcellError(file, tuple(problems))
-    return "".join(_table(data, "")).encode()
+    # Not imported at the top: see the module.
+    from symbolic.read.editing import completed
+
+    return completed("", data, {}).encode()
 
 
 @lru_cache(maxsize=4)
@@ -295,44 +307,3 @@ def _plain(value: Any) -> Any:
     if isinstance(value, Mapping):
         return {str(key): _plain(entry) for key, entry in value.items()}
     return [_plain(entry) for entry in value] if isinstance(value, tuple | list) else value
-
-
-# --- TOML ---
-
-
-def _table(table: Mapping[str, Any], path: str) -> Iterator[str]:
-    """The lines of a table: its own keys, then those of tables within it."""
-    inner = {key: value for key, value in table.items() if _is_section(value)}
-    for key, value in table.items():
-        if key not in inner:
-            yield f"{_key(key)} = {_value(value)}\n"
-    for key, value in inner.items():
-        heading = f"{path}{_key(key)}"
-        for entry in [value] if isinstance(value, Mapping) else value:
-            yield f"\n[{heading}]\n" if entry is value else f"\n[[{heading}]]\n"
-            yield from _table(entry, f"{heading}.")
-
-
-def _is_section(value: Any) -> bool:
-    if isinstance(value, Mapping):
-        return True
-    tables = isinstance(value, list) and value
-    return bool(tables) and all(isinstance(entry, Mapping) for entry in value)
-
-
-def _key(key: str) -> str:
-    return key if _BARE.fullmatch(key) else json.dumps(key, ensure_ascii=False)
-
-
-def _value(value: Any) -> str:
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, int | float):
-        return repr(value)
-    if isinstance(value, str):
-        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
-    if isinstance(value, list):
-        return f"[{', '.join(map(_value, value))}]"
-    if isinstance(value, Mapping):
-        return f"{{{', '.join(f'{_key(k)} = {_value(v)}' for k, v in value.items())}}}"
-    raise WorkcellError("changes", (f"found {shown(value)}; allowed is what TOML knows",))

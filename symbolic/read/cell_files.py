@@ -11,7 +11,6 @@ text with one key changed, comments and all else as they were.
 from __future__ import annotations
 
 import base64
-import copy
 import hashlib
 import posixpath
 import re
@@ -26,7 +25,13 @@ from tempfile import TemporaryDirectory
 from typing import Any, Literal
 
 from symbolic import outside
-from symbolic.errors import BundleError, DualArmError, OutsideError, RobotModelError
+from symbolic.errors import (
+    BundleError,
+    DualArmError,
+    OutsideError,
+    RobotModelError,
+    SettingsError,
+)
 from symbolic.read.cell import load, with_branches
 from symbolic.read.descriptions import (
     PACKAGE_SCHEME,
@@ -35,7 +40,7 @@ from symbolic.read.descriptions import (
     is_xacro,
     resolve_mesh,
 )
-from symbolic.read.robots import with_paths
+from symbolic.read.editing import completed, merged, with_paths
 from symbolic.read.tables import checked
 from symbolic.read.urdf import parse_urdf, read_urdf
 from symbolic.records import Robot, Workcell
@@ -259,21 +264,25 @@ class CellCollector:
 
     def __init__(self, source: Path, text: bytes | None = None) -> None:
         self._source = source
-        content = _content(source, outside.WORKCELL_BYTES) if text is None else text
-        self._text = outside.text(content)
+        self._text = _content(source, outside.WORKCELL_BYTES) if text is None else text
         self._files: dict[str, bytes] = {}
         self._folders: list[str] = []
         self._moved = 0
         self._places: dict[str, str] = {}
 
     def collect(self, workcell: Workcell) -> None:
-        """Add every file that the workcell names."""
-        text = self._text.encode("utf-8")
-        data = parse_toml(text)
-        settled = with_branches(text, data, workcell.start_branch)
-        names = {entry["robot"] for entry in data["robots"] if "robot" in entry}
-        self._text = with_paths(outside.text(settled), names)
-        data = parse_toml(self._text.encode("utf-8"))
+        """Add every file that the workcell names.
+
+        Raises:
+            BundleError: a file cannot be read, or the workcell's text not be changed.
+        """
+        self._text = with_branches(self._text, parse_toml(self._text), workcell.start_branch)
+        stated = parse_toml(self._text)
+        described = [
+            {"robot": None, "urdf": str(robot.urdf)} if "robot" in entry else {}
+            for robot, entry in zip(workcell.robots, stated["robots"], strict=True)
+        ]
+        data = merged(stated, {"robots": described})
         for robot, entry in zip(workcell.robots, data["robots"], strict=True):
             urdf = self._place(str(entry["urdf"]))
             folders = [self._place(str(folder)) for folder in entry.get("package_dirs", [])]
@@ -288,6 +297,11 @@ class CellCollector:
             if package_dirs is None and self._place(reference) not in self._files:
                 content = _content(self._source.parent / reference, outside.MESH_BYTES)
                 self._files[self._place(reference)] = content
+        changes = merged({"robots": described}, with_paths(data, self._address))
+        try:
+            self._text = completed(outside.text(self._text), stated, changes).encode()
+        except SettingsError as error:
+            raise BundleError(f"{self._source.name}: {error}") from error
 
     def layout(self) -> tuple[str, dict[str, bytes], tuple[str, ...]]:
         """Everything collected, moved so that no path leads upwards.
@@ -303,19 +317,21 @@ class CellCollector:
         base = "/".join([level] * depth)
         workcell = joined(base, "workcell.toml" if depth else f"{level}.toml")
         files = {joined(base, name): content for name, content in self._files.items()}
-        files[workcell] = self._text.encode("utf-8")
+        files[workcell] = self._text
         folders = dict.fromkeys(joined(base, name) for name in self._folders)
         return workcell, files, tuple(folders)
 
     def _place(self, reference: str) -> str:
         """The place of a reference of the workcell file, relative to that file."""
+        return posixpath.normpath(self._address(reference))
+
+    def _address(self, reference: str) -> str:
+        """What takes the place of a reference in the stored file; itself where it is relative."""
         if not posixpath.isabs(reference) and not reference.startswith(PACKAGE_SCHEME):
-            return posixpath.normpath(reference)
-        if reference in self._places:  # both robots may name one file
-            return self._places[reference]
-        moved = self._places[reference] = self._new_place(reference)
-        self._text = _replaced(self._text, reference, moved, self._source.name)
-        return moved
+            return reference
+        if reference not in self._places:  # both robots may name one file
+            self._places[reference] = self._new_place(reference)
+        return self._places[reference]
 
     def _new_place(self, reference: str) -> str:
         self._moved += 1
@@ -420,9 +436,6 @@ def _meshes(bodies: Any) -> Iterator[tuple[str, None]]:
 
 
 LAW = "optimal"
-_TASK = re.compile(r"^[ \t]*\[[ \t]*task[ \t]*\][^\n]*$", re.MULTILINE)
-_LAW = re.compile(r"^([ \t]*)time_law[ \t]*=[^\n]*$", re.MULTILINE)
-_TABLE = re.compile(r"^[ \t]*\[{1,2}[ \t]*[A-Za-z_][\w. \t-]*\]{1,2}[ \t]*(#.*)?$", re.MULTILINE)
 
 
 def drivable_files(stored: CellFiles) -> CellFiles:
@@ -433,34 +446,12 @@ def drivable_files(stored: CellFiles) -> CellFiles:
             changed cell is not valid.
     """
     content = stored.files[stored.workcell]
-    wanted = copy.deepcopy(parse_toml(content))
-    if isinstance(wanted.get("task"), dict):
-        wanted["task"]["time_law"] = LAW
-    changed = _with_law(content.decode("utf-8")).encode()
+    law = {"task": {"time_law": LAW}}
     try:
-        as_wanted = parse_toml(changed) == wanted
-    except BundleError:
-        as_wanted = False
-    if not as_wanted:
-        raise BundleError(
-            f"{stored.workcell}: the time law cannot be changed in it; begin its task with a line "
-            "[task], and write time_law = ... on a line of its own"
-        )
+        changed = completed(outside.text(content), parse_toml(content), law).encode()
+    except SettingsError as error:
+        raise BundleError(f"{stored.workcell}: the time law cannot be changed: {error}") from error
     draft = replace(stored, files={**stored.files, stored.workcell: changed}, digest="")
     with TemporaryDirectory() as folder:
         digest = unpack_cell(draft, Path(folder), check_digest=False).digest
     return replace(draft, digest=digest)
-
-
-def _with_law(text: str) -> str:
-    """The text with its task's time law replaced, or written below the task's heading."""
-    heading = _TASK.search(text)
-    if heading is None:
-        return text
-    begin = heading.end()
-    following = _TABLE.search(text, begin)
-    end = following.start() if following else len(text)
-    task, count = _LAW.subn(rf'\1time_law = "{LAW}"', text[begin:end], count=1)
-    if not count:
-        task = f'\ntime_law = "{LAW}"{text[begin:end]}'
-    return text[:begin] + task + text[end:]

@@ -11,7 +11,7 @@ from __future__ import annotations
 import os
 import re
 import sys
-from collections.abc import Collection, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stdout
 from dataclasses import dataclass
 from importlib import import_module
@@ -359,7 +359,6 @@ MODULES = "robot_descriptions"
 FILES = "example-robot-data"
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,99}")
-_KEY = re.compile(r"""(?<![\w.-])robot(\s*=\s*)(["'])([\w-]+)\2""")
 
 
 @dataclass(frozen=True)
@@ -437,18 +436,3 @@ def _modules() -> Iterator[str]:
     """Names of all descriptions of the package."""
     folder = Path(str(find_spec(MODULES).origin)).parent  # type: ignore[union-attr]
     return (path.stem for path in sorted(folder.glob("*_description.py")))
-
-
-def with_paths(text: str, names: Collection[str]) -> str:
-    """A workcell file's text with these robots' names replaced by the paths of their descriptions.
-
-    Raises:
-        OutsideError: see `named_robot`.
-    """
-
-    def address(found: re.Match[str]) -> str:
-        before, quote, name = found.groups()
-        path = named_robot(name).path if name in names else None
-        return f"urdf{before}{quote}{path}{quote}" if path else found[0]
-
-    return _KEY.sub(address, text)

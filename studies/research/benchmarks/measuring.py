@@ -16,7 +16,6 @@ from hybrid_opt.classes import fastest_carry
 from hybrid_opt.display.table import Table, number
 from hybrid_opt.errors import NoHoldError, ProposalError
 from hybrid_opt.evaluate.evaluation import concatenated
-from hybrid_opt.proposing.problem import completed
 from hybrid_opt.proposing.proposal import worked
 from hybrid_opt.proposing.trial import judge_of
 from hybrid_opt.proposing.via_points import travelled
@@ -25,6 +24,7 @@ from symbolic.array import Array
 from symbolic.geometry.pairs import build_geometry
 from symbolic.outside import replace_file
 from symbolic.read.cell import load
+from symbolic.read.editing import completed
 
 EVALUATIONS = 1000
 """Evaluations of the search behind a fastest carry."""

@@ -19,7 +19,7 @@ import numpy as np
 
 import hybrid_opt as ho
 from hybrid_opt.errors import ProposalError
-from hybrid_opt.proposing.problem import completed
+from symbolic.read.editing import completed
 from tests.machines import example_robot
 
 

@@ -16,15 +16,14 @@ from numpy.typing import NDArray
 from hybrid_opt.proposing.bounds import Sampling, find_bounds
 from hybrid_opt.proposing.problem import (
     Problem,
-    completed,
     contact_points,
     decision_bounds,
-    merged,
     read_problem,
 )
 from symbolic.array import Array
 from symbolic.errors import SettingsError, WorkcellError
 from symbolic.read.cell import load
+from symbolic.read.editing import completed, merged
 from symbolic.records.poses import rotation_from_rpy
 from tests.hybrid_opt.proposing.problems import BAXTER, tiago_problem
 from tests.hybrid_opt.proposing.test_proposal import rack_problem
@@ -287,7 +286,7 @@ def test_lists_of_tables_of_another_length_are_replaced() -> None:
 
 def test_text_that_says_something_else_is_refused() -> None:
     with pytest.raises(SettingsError, match="cannot be completed"):
-        completed(TEXT, {"name": "another"}, {})
+        completed(TEXT, {"name": "another"}, {"task": {}})
 
 
 def sampling(n: int, seed: int) -> Sampling:

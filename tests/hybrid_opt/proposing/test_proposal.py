@@ -17,11 +17,11 @@ import pytest
 import hybrid_opt as ho
 from hybrid_opt.errors import NoHoldError, ProposalError
 from hybrid_opt.proposing import setup
-from hybrid_opt.proposing.problem import completed, merged
 from hybrid_opt.proposing.proposal import propose_classes, worked
 from symbolic.array import Array
 from symbolic.errors import SettingsError, WorkcellError
 from symbolic.read.cell import load
+from symbolic.read.editing import completed, merged
 from symbolic.records import Cylinder, Workcell
 from symbolic.records.poses import pose_matrix
 from tests.hybrid_opt.proposing.generated import write_problem

@@ -19,7 +19,6 @@ from hybrid_opt.display.solids import cell_solids
 from hybrid_opt.evaluate.evaluation import REASONS, CandidateEvaluator
 from hybrid_opt.evaluate.explanation import explain
 from hybrid_opt.indicators.metrics import BindingBound
-from hybrid_opt.proposing.problem import completed
 from studies import inspect, propose, scene
 from studies.program import BAD_INPUT
 from studies.programs import inspection
@@ -30,6 +29,7 @@ from studies.programs.inspection import (
 )
 from studies.report.pictures_cell import meeting_place
 from symbolic.read.cell import load
+from symbolic.read.editing import completed
 from symbolic.records import Mesh, Workcell
 from symbolic.records.task import straight_line
 from tests.studies.conftest import TRANSFER

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 import hybrid_opt as ho
 from hybrid_opt.display.table import NOTHING
-from hybrid_opt.proposing.problem import completed, read_problem
+from hybrid_opt.proposing.problem import read_problem
 from hybrid_opt.proposing.via_points import travelled
 from studies.research.benchmarks import baxter, machines, measuring, shelves, slot
 from studies.research.benchmarks.__main__ import main
@@ -27,6 +27,7 @@ from studies.research.benchmarks.measuring import (
     table,
 )
 from symbolic.errors import SettingsError
+from symbolic.read.editing import completed
 from tests.symbolic.cells import RACK
 
 RNG = np.random.default_rng(1)

@@ -1,0 +1,205 @@
+"""The text of a workcell file with other values, comments and order as they were.
+
+TOML Kit takes long to load, so that readers of cells import this module where they change a text.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from typing import Any
+
+import tomlkit
+from tomlkit.exceptions import TOMLKitError
+from tomlkit.items import AoT, Null, Table, Whitespace
+
+from symbolic import outside
+from symbolic.errors import OutsideError, SettingsError
+
+Changes = Mapping[str, Any]
+"""Tables and keys to be set: {'task': {'initial': ...}, 'robots': [{...}, {...}]}; a list of tables
+that is there already is changed entry by entry, a key with the value None is removed."""
+
+INLINE = ("base", "pad")
+"""Tables that are written in one line."""
+
+
+def completed(text: str, data: Mapping[str, Any], changes: Changes) -> str:
+    """A workcell file's text with values set.
+
+    Args:
+        text: the file; '' to write `data` without comments.
+        data: what the file holds, without what is replaced.
+        changes: what is set.
+
+    Raises:
+        SettingsError: the file is written in a way that cannot be completed.
+    """
+    wanted = merged(data, changes)
+    if text and wanted == data:
+        return text
+    return _edited(text, wanted, lambda document: _apply(document, changes if text else wanted))
+
+
+def with_paths(data: Mapping[str, Any], change: Callable[[str], str]) -> Changes:
+    """Changes by which the paths of robots, tools, environment and payload are others.
+
+    Args:
+        data: the tables of a workcell file.
+        change: from a path, or an address of a package, to what takes its place.
+    """
+
+    def changed(table: Any, *keys: str) -> dict[str, Any]:
+        names = {key: table.get(key) for key in keys} if isinstance(table, Mapping) else {}
+        found = {key: change(name) for key, name in names.items() if isinstance(name, str)}
+        return {key: name for key, name in found.items() if name != names[key]}
+
+    found: dict[str, Any] = {"robots": [], "payload": changed(data.get("payload"), "path")}
+    for robot in data["robots"]:
+        entry: dict[str, Any] = changed(robot, "urdf", "srdf")
+        folders = robot.get("package_dirs")
+        if isinstance(folders, list):
+            moved = [change(str(name)) for name in folders]
+            entry |= {"package_dirs": moved} if moved != folders else {}
+        if isinstance(robot.get("tool"), list):
+            entry["tool"] = [changed(body, "path") for body in robot["tool"]]
+        found["robots"].append(entry)
+    if isinstance(data.get("environment"), list):
+        found["environment"] = [changed(body, "path") for body in data["environment"]]
+    return found
+
+
+def extended(text: str, data: Mapping[str, Any], key: str, tables: list[dict[str, Any]]) -> str:
+    """A workcell file's text with tables added behind those of an array, as `[[environment]]`.
+
+    Args:
+        text, data: the file, and what it holds.
+        key: of the array, at the top level; it may be missing.
+        tables: what is added.
+
+    Raises:
+        SettingsError: see `completed`.
+    """
+    before = data.get(key, [])
+    wanted = {**data, key: [*(before if isinstance(before, list) else ()), *tables]}
+
+    def add(document: tomlkit.TOMLDocument) -> None:
+        if key not in document:
+            document[key] = _item(tables)
+        elif isinstance(document[key], AoT):
+            for table in map(_item, tables):
+                table.add(tomlkit.nl())
+                document[key].append(table)
+
+    return _edited(text.rstrip() + "\n\n", wanted, add).rstrip() + "\n"
+
+
+def _edited(
+    text: str, wanted: Mapping[str, Any], edit: Callable[[tomlkit.TOMLDocument], None]
+) -> str:
+    """A text after an edit that has to make it say what is wanted."""
+    with suppress(OutsideError, TOMLKitError, LookupError, TypeError, ValueError):
+        document = tomlkit.parse(text)
+        edit(document)
+        found = document.as_string()
+        if _alike(outside.toml_tables(found.encode()), wanted):
+            return found
+    raise SettingsError(
+        "the file cannot be completed as it is written; begin each section with a heading of "
+        "its own ([task], [[contacts]]) and keep what belongs to one together"
+    )
+
+
+def _alike(found: Any, wanted: Any) -> bool:
+    """Whether values are equal; what is no number is like itself, and told by the reader."""
+    if isinstance(found, Mapping) and isinstance(wanted, Mapping):
+        return found.keys() == wanted.keys() and all(_alike(found[k], wanted[k]) for k in found)
+    if isinstance(found, list) and isinstance(wanted, list):
+        return len(found) == len(wanted) and all(map(_alike, found, wanted))
+    return bool(found == wanted) or (found != found and wanted != wanted)
+
+
+def merged(data: Any, changes: Any) -> Any:
+    """Content of a file after the changes, as plain values; also changes after further ones."""
+    if isinstance(changes, Mapping) and isinstance(data, Mapping):
+        found = dict(data)
+        for key, value in changes.items():
+            if value is None:
+                found.pop(key, None)
+            else:
+                found[key] = merged(found[key], value) if key in found else value
+        return found
+    if _tables(changes) and _tables(data) and len(changes) == len(data):
+        return [merged(old, new) for old, new in zip(data, changes, strict=True)]
+    return changes
+
+
+def _tables(value: Any) -> bool:
+    return isinstance(value, list) and all(isinstance(entry, Mapping) for entry in value)
+
+
+def _apply(place: Any, changes: Any) -> None:
+    heading = _cut_heading(place)
+    for key, value in changes.items():
+        if value is None:
+            place.pop(key, None)
+        elif isinstance(value, Mapping) and key in place:
+            _apply(place[key], value)
+        elif _tables(value) and key in place and len(value) == len(place[key]):
+            for old, new in zip(place[key], value, strict=True):
+                _apply(old, new)
+        else:
+            place[key] = _item(value)
+    body = _last_body(place)
+    while heading and body and isinstance(body[-1][1], Whitespace | Null):
+        body.pop()  # before a table that is gone, and its place
+    body.extend(heading)
+
+
+def _cut_heading(place: Any) -> list[Any]:
+    """Take away the blank line at a table's end and what follows it: comments there are about the
+    next table, before which new ones go."""
+    body = _last_body(place)
+    blank = end = len(body)
+    while end and body[end - 1][0] is None:
+        end -= 1
+        if isinstance(body[end][1], Whitespace):
+            blank = end
+    heading = body[blank:]
+    del body[blank:]
+    return heading
+
+
+def _last_body(place: Any) -> list[Any]:
+    """Pairs of keys, None for comments and blank lines, and items of the table that ends a table;
+    none where one is written in one line, or in several places."""
+    if isinstance(place, AoT):
+        return _last_body(place[-1]) if len(place) else []
+    if not isinstance(place, Table | tomlkit.TOMLDocument):
+        return []
+    body: list[Any] = (place.value if isinstance(place, Table) else place).body
+    return (body and _last_body(body[-1][1])) or body
+
+
+def _item(value: Any) -> Any:
+    """A value as TOML: tables with headings, rows of numbers one below the other."""
+    if isinstance(value, Mapping):
+        table = tomlkit.table()
+        for key, entry in value.items():
+            if key in INLINE and isinstance(entry, Mapping):
+                table[key] = tomlkit.inline_table()
+                table[key].update(entry)
+            else:
+                table[key] = _item(entry)
+        return table
+    if value and _tables(value):
+        tables = tomlkit.aot()
+        for entry in value:
+            tables.append(_item(entry))
+        return tables
+    if isinstance(value, list) and value and isinstance(value[0], list):
+        rows = tomlkit.array()
+        for row in value:
+            rows.append(row)
+        return rows.multiline(True)
+    return value
