@@ -37,7 +37,6 @@ ROOMS = {
     "heavy": (
         "symbolic/contact/test_even_grasp.py",
         "symbolic/contact/test_grasp.py",
-        "symbolic/contact/test_joint_allocation.py",
         "symbolic/contact/test_payload_load.py",
         "symbolic/geometry/test_clearance.py",
         "symbolic/read/test_machines.py",

@@ -16,7 +16,7 @@ from studies.research.plain.motion import GRAVITY, angular_rates, rotation
 from symbolic.array import Array
 from symbolic.records import Workcell
 from tests.hybrid_opt.timing.convex_oracle import Affine, Program, Terms
-from tests.symbolic.contact.joint_oracle import Case, cone_matrix
+from tests.symbolic.contact.oracle import disc
 
 FORCE_UNIT = 50.0
 """[N], so that the program's unknowns are around one."""
@@ -98,8 +98,11 @@ def _held(
             held |= {own + 6 * pad + f: -FORCE_UNIT * turn[f, k] for f in range(3) if turn[f, k]}
         program.zero([(load[3 + k][0] | held, load[3 + k][1])])
     program.zero([({own + 8: 1.0, commanded: 1.0}, 0.0)])  # its normal points against contact 2
-    asked = Case(np.zeros(3), np.zeros(3), arms, case[0:2], case[2:4])
-    for pad in (0, 1):
-        columns = np.column_stack([cone_matrix(asked, pad, one) for one in np.eye(14)])
+    radius = case[2:4] / case[2:4].max()
+    for pad, sign in enumerate((1.0, -1.0)):
+        r, columns = radius[pad], np.zeros((21, 14))
+        units = np.diag([1.0, 1.0, sign, sign / r, sign / r, 1.0 / r, 1.0])
+        places = [*range(6 * pad, 6 * pad + 6), 12 + pad]
+        columns[:, places] = np.column_stack([disc(case[pad], unit) for unit in units])
         rows = [{own + k: row[k] for k in np.flatnonzero(row).tolist()} for row in columns]
         program.semidefinite(rows, 6)
