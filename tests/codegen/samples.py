@@ -1,11 +1,13 @@
-"""Functions to compile: random expression graphs, and a small one."""
+"""Functions to compile, random expression graphs among them, and compilers that are scripts."""
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import casadi as ca
 import numpy as np
+import pytest
 
 BINARY = [
     lambda a, b: a + b,
@@ -40,3 +42,20 @@ def small() -> ca.Function:
     return ca.Function(
         "small", [x, y], [2.0 * y, ca.sumsqr(x) * x, ca.sum1(x)], ["x", "y"], ["a", "b", "c"]
     )
+
+
+def square() -> dict[str, ca.Function]:
+    x = ca.SX.sym("x")
+    return {"square": ca.Function("square", [x], [x**2], ["x"], ["y"])}
+
+
+ASKED = 'case "$*" in -v|*" -E "*) exec gcc "$@" ;; esac\n'
+"""Beginning of a compiler that answers questions as gcc does."""
+
+
+def odd_compiler(folder: Path, monkeypatch: pytest.MonkeyPatch, script: str) -> None:
+    """Let CC name a compiler that is this script."""
+    path = folder / "odd-cc"
+    path.write_text(f"#!/bin/sh\n{script}")
+    path.chmod(0o755)
+    monkeypatch.setenv("CC", str(path))

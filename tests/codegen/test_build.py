@@ -24,33 +24,24 @@ from codegen.errors import CodegenError
 from codegen.function import Signature
 from codegen.parts import PIECE, in_parts, in_pieces
 from codegen.source import c_source, dense, generated_c, handwritten_source
+from tests.codegen.samples import ASKED, odd_compiler, square
 from tests.waiting import HANGS, soon, until
-
-SET = """
-import casadi as ca
-x = ca.MX.sym("x", 4)
-functions = {
-    "square": ca.Function("square", [x], [x**2], ["x"], ["y"]),
-    "norm": ca.Function("norm", [x], [ca.norm_2(x)], ["x"], ["y"]),
-}
-"""
 
 
 def functions() -> dict[str, ca.Function]:
-    scope: dict[str, dict[str, ca.Function]] = {}
-    exec(SET, scope)
-    return scope["functions"]
+    x = ca.MX.sym("x", 4)
+    return {
+        "square": ca.Function("square", [x], [x**2], ["x"], ["y"]),
+        "norm": ca.Function("norm", [x], [ca.norm_2(x)], ["x"], ["y"]),
+    }
 
 
-def run(program: str, *arguments: object, **environment: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-c", program, *map(str, arguments)],
-        env=os.environ | environment,
-        capture_output=True,
-        text=True,
-        timeout=HANGS,
-        check=False,
-    )
+SET = """
+from codegen.build import build, load_or_build
+from tests.codegen.test_build import functions
+found = load_or_build("cell", functions)
+"""
+"""A program that builds or loads them."""
 
 
 def test_second_build_comes_from_the_cache(cache: Cache) -> None:
@@ -124,7 +115,8 @@ found = load_or_build("cell", make)
 assert "casadi" not in sys.modules
 print(found["norm"]([3.0, 4.0, 0.0, 0.0])["y"], *found)
 """
-    done = run(program)
+    command = [sys.executable, "-c", program]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=HANGS, check=False)
     assert done.stderr == ""
     assert done.stdout == "5.0 square norm\n"
     assert cold["norm"].signature == load_or_build("cell", functions, cache)["norm"].signature
@@ -138,26 +130,14 @@ def test_set_with_a_lost_member_is_made_anew(cache: Cache) -> None:
     assert found["norm"]([3.0, 4.0, 0.0, 0.0])["y"] == 5.0
 
 
-def test_two_processes_at_once_build_once(cache: Cache, tmp_path: Path) -> None:
+def test_two_processes_at_once_build_once(
+    cache: Cache, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     log = tmp_path / "log"
-    compiler = tmp_path / "counting-cc"
-    compiler.write_text(
-        f'#!/bin/sh\ncase "$*" in -v|*" -E "*) ;; *) echo "$*" >> "{log}"; sleep 0.3 ;; esac\n'
-        'exec gcc "$@"\n'
-    )
-    compiler.chmod(0o755)
-    program = (
-        SET + "from codegen.build import load_or_build\n"
-        "found = load_or_build('cell', lambda: functions)\n"
-        "print(found['square']([1.0, 2.0, 3.0, 4.0])['y'].tolist())\n"
-    )
-    environment = os.environ | {"CC": str(compiler)}
-    running = [
-        subprocess.Popen(
-            [sys.executable, "-c", program], env=environment, stdout=subprocess.PIPE, text=True
-        )
-        for _ in range(2)
-    ]
+    odd_compiler(tmp_path, monkeypatch, f'{ASKED}echo "$*" >> "{log}"\nsleep 0.3\nexec gcc "$@"\n')
+    program = SET + "print(found['square']([1.0, 2.0, 3.0, 4.0])['y'].tolist())\n"
+    command = [sys.executable, "-c", program]
+    running = [subprocess.Popen(command, stdout=subprocess.PIPE, text=True) for _ in range(2)]
     for process in running:
         assert process.communicate(timeout=HANGS)[0] == "[1.0, 4.0, 9.0, 16.0]\n"
     assert len(log.read_text().splitlines()) == 2  # one per function, not per process
@@ -167,18 +147,9 @@ def test_killed_build_leaves_the_cache_usable(
     cache: Cache, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     started, go_on = tmp_path / "started", tmp_path / "go_on"
-    compiler = tmp_path / "slow-cc"
-    compiler.write_text(
-        '#!/bin/sh\ncase "$*" in -v|*" -E "*) exec gcc "$@" ;; esac\n'
-        f'gcc "$@"\ntouch "{started}"\n'
-        f'while [ ! -e "{go_on}" ]; do sleep 0.05; done\n'
-    )
-    compiler.chmod(0o755)
-    monkeypatch.setenv("CC", str(compiler))
-    program = (
-        SET + "from codegen.build import load_or_build\nload_or_build('cell', lambda: functions)"
-    )
-    process = subprocess.Popen([sys.executable, "-c", program], start_new_session=True)
+    waits = f'gcc "$@"\ntouch "{started}"\nwhile [ ! -e "{go_on}" ]; do sleep 0.05; done\n'
+    odd_compiler(tmp_path, monkeypatch, ASKED + waits)
+    process = subprocess.Popen([sys.executable, "-c", SET], start_new_session=True)
     until(started.exists, process)
     os.killpg(process.pid, signal.SIGKILL)
     process.wait()
@@ -192,6 +163,9 @@ def test_without_a_compiler_nothing_is_made(cache: Cache, monkeypatch: pytest.Mo
     def refuse() -> dict[str, ca.Function]:
         raise AssertionError("made before the compiler was looked for")
 
+    monkeypatch.setenv("CC", "gcc '-O2")
+    with pytest.raises(CodegenError, match=r"CC holds .* which is no command"):
+        compile_function(functions()["norm"], cache)
     monkeypatch.setenv("CC", "/missing/cc")
     with pytest.raises(CodegenError, match=r"no C compiler .*CC names '/missing/cc'"):
         load_or_build("cell", refuse, cache)
@@ -240,20 +214,41 @@ def test_a_compiler_that_is_a_package_is_found_last(
     compiler._find.cache_clear()
 
 
-def test_compiler_that_fails_is_told(
+OUTPUT = 'while [ "$1" != "-o" ]; do shift; done\n'
+FULL = 'echo "cc1: fatal error: No space left on device" >&2\nexit 1\n'
+
+
+@pytest.mark.parametrize(
+    ("script", "words"),
+    [
+        ("exit 0\n", "reported success but made no library"),
+        (OUTPUT + ': > "$2"\n', "reported success but made no library"),
+        (OUTPUT + 'echo nonsense > "$2"\n', "the compiled library cannot be loaded"),
+        (OUTPUT + 'cp /bin/ls "$2"\n', "the compiled library cannot be loaded"),
+        ("kill -9 $$\n", "was ended by signal 9"),
+        ("exit 3\n", r"failed at square\.c: no message"),
+        (FULL, r"square\.c: cc1: .*No space left on device; "),
+    ],
+)
+def test_a_compiler_that_fails_lies_or_dies_is_told(
+    cache: Cache, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, script: str, words: str
+) -> None:
+    odd_compiler(tmp_path, monkeypatch, ASKED + script)
+    for _ in range(2):  # nothing of it may be taken for a library the second time
+        with pytest.raises(CodegenError, match=words) as told:
+            build(square(), cache)
+        assert "\n" not in str(told.value)
+    monkeypatch.delenv("CC")
+    assert build(square(), cache).functions["square"](3.0)["y"] == 9.0
+
+
+def test_a_compiler_that_hangs_is_ended(
     cache: Cache, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    compiler = tmp_path / "full-cc"
-    compiler.write_text(
-        '#!/bin/sh\ncase "$*" in -v|*" -E "*) exec gcc "$@" ;; esac\n'
-        'echo "cc1: fatal error: No space left on device" >&2\nexit 1\n'
-    )
-    compiler.chmod(0o755)
-    monkeypatch.setenv("CC", str(compiler))
-    with pytest.raises(CodegenError, match=r"square\.c: cc1: .*No space left on device; ") as told:
-        build({"square": functions()["square"]}, cache)
-    assert "\n" not in str(told.value)
-    assert list(cache.folder.glob("*.so")) == []
+    monkeypatch.setattr("codegen.compiler.MOST_SECONDS", 0.5)
+    odd_compiler(tmp_path, monkeypatch, f"{ASKED}exec sleep 60\n")
+    with soon(), pytest.raises(CodegenError, match=r"took longer than 0\.5 s over square\.c"):
+        build(square(), cache)
 
 
 def test_function_that_cannot_be_written_as_c_is_told(
@@ -280,11 +275,9 @@ def test_libraries_are_kept_apart_by_instruction_set(
     other = 'case "$*" in *" -E "*) echo "#define __OTHER__ 1" ;; *) exec gcc "$@" ;; esac'
     ignorant = 'case "$*" in *native*) exit 1 ;; *) exec gcc "$@" ;; esac'
     found = []
-    for k, script in enumerate(('exec gcc "$@"', other, ignorant)):
-        compiler = tmp_path / f"cc-{k}"
-        compiler.write_text(f"#!/bin/sh\n{script}\n")
-        compiler.chmod(0o755)
-        monkeypatch.setenv("CC", str(compiler))
+    for script in ('exec gcc "$@"', other, ignorant):
+        odd_compiler(tmp_path, monkeypatch, f"{script}\n")
+        compiler._find.cache_clear()
         assert build(functions(), cache).functions["norm"]([3.0, 4.0, 0.0, 0.0])["y"] == 5.0
         found.append(find_compiler())
     own, of_another, without = found
@@ -358,15 +351,14 @@ def test_a_damaged_object_file_is_made_anew(cache: Cache) -> None:
     assert np.isfinite(next(iter(built.functions["second"](np.ones(4)).values()))).all()
 
 
-def test_what_calls_others_or_is_short_stays(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(parts, "LEAST_BYTES", 0)
+def test_what_calls_others_or_is_short_stays_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
     x = ca.MX.sym("x", 3, 3)
-    matrices = ca.Function("f", [x], [ca.mtimes(x, x) + 1.0])
-    text = c_source(dense(matrices))
-    assert in_parts(text, 1) == (text, ())
-    monkeypatch.setattr(parts, "LEAST_BYTES", 10**9)
-    text = c_source(leaf("inner"))
-    assert in_parts(text, 1) == (text, ())
+    matrices = dense(ca.Function("f", [x], [ca.mtimes(x, x) + 1.0]))
+    for least, function in ((0, matrices), (10**9, leaf("inner"))):
+        monkeypatch.setattr(parts, "LEAST_BYTES", least)
+        text = c_source(function)
+        assert in_parts(text, 1) == (text, ())
+        assert in_pieces(text) == text
 
 
 CUT, LINE = 1000, 300
@@ -416,14 +408,6 @@ def test_every_statement_stays_in_its_order_and_no_piece_is_longer_than_allowed(
     assert max(len(statements(body)) for body in bodies) == PIECE
 
 
-def test_short_functions_and_functions_of_matrices_stay_as_they_are() -> None:
-    x = ca.MX.sym("x", 3, 3)
-    matrices = ca.Function("f", [x], [ca.mtimes(x, x) + 1.0])
-    for function in (long_function(20), dense(matrices)):
-        text = generated_c([function])
-        assert in_pieces(text) == text
-
-
 TEXT = """
 int twice_norm(const double** arg, double** res, long long* iw, double* w, int mem) {
   double length;
@@ -462,11 +446,8 @@ def test_a_batch_calls_its_helper_and_is_found_again(tmp_path: Path) -> None:
     np.testing.assert_allclose(function.batch(x, threads=2)["y"], expected, rtol=1e-15)
     again = load_or_compile("key", refuse, cache)
     np.testing.assert_array_equal(again(x[0])["y"], function(x[0])["y"])
-
-
-def test_text_that_is_no_c_is_told(tmp_path: Path) -> None:
     with pytest.raises(CodegenError, match="twice_norm"):
-        load_or_compile("key", lambda: source("no C at all"), Cache(tmp_path))
+        load_or_compile("other", lambda: source("no C at all"), cache)
 
 
 @pytest.mark.parametrize("to_all", [True, False])
@@ -474,22 +455,21 @@ def test_ctrl_c_ends_the_compilers_and_keeps_what_is_compiled(
     cache: Cache, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, to_all: bool
 ) -> None:
     """As a terminal sends it, to the whole group of processes, and to this process alone."""
-    compiler, left = tmp_path / "slow-cc", tmp_path / "left"
-    compiler.write_text(
-        '#!/bin/sh\ncase "$*" in -v|*" -E "*|*square*) exec gcc "$@" ;; esac\n'
-        f'echo $$ > "{left}"\nsleep 600\n'
-    )
-    compiler.chmod(0o755)
-    monkeypatch.setenv("CC", str(compiler))
-    program = (
-        "import signal\nsignal.signal(signal.SIGINT, signal.default_int_handler)\n"
-        + SET
-        + "from codegen.build import build, load_or_build\n"
-        "build({'square': functions['square']})\n"
-        "try:\n    load_or_build('cell', lambda: functions)\n"
-        "except KeyboardInterrupt:\n    print('interrupted')\n"
-        "print(build({'square': functions['square']}, rebuild=True).reports[0].from_cache)\n"
-    )
+    left, fast = tmp_path / "left", 'case "$*" in *square*) exec gcc "$@" ;; esac\n'
+    odd_compiler(tmp_path, monkeypatch, f'{ASKED}{fast}echo $$ > "{left}"\nsleep 600\n')
+    program = """
+import signal
+signal.signal(signal.SIGINT, signal.default_int_handler)
+from codegen.build import build, load_or_build
+from tests.codegen.test_build import functions
+one = {"square": functions()["square"]}
+build(one)
+try:
+    load_or_build("cell", functions)
+except KeyboardInterrupt:
+    print("interrupted")
+print(build(one, rebuild=True).reports[0].from_cache)
+"""
     process = subprocess.Popen(
         [sys.executable, "-c", program],
         stdout=subprocess.PIPE,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import subprocess
 import sys
@@ -59,13 +60,28 @@ def test_damaged_library_is_not_found(cache: Cache, damage: bytes) -> None:
     assert cache.find(KEY) is not None
 
 
-@pytest.mark.parametrize("damage", ["{", '{"facts": {}, "sha256": "0"}', "null", "\xff", "mads"])
-def test_damaged_manifest_is_not_found(cache: Cache, damage: str) -> None:
+TEXTS = ("{", '{"facts": {}, "sha256": "0"}', "null", "\xff", "mads", "[" * 100_000)
+RECORDS = ({"library": 5}, {"library": "../x", "sha256": ""})
+
+
+@pytest.mark.parametrize("damage", [*TEXTS, *RECORDS, "pipe", "folder"])
+def test_damaged_manifest_is_not_found(cache: Cache, damage: str | dict[str, object]) -> None:
     """Also one that says something plausible, but not what was written."""
     put(cache)
     manifest = cache.folder / f"{KEY}.json"
-    text = manifest.read_text().replace("made", damage) if damage == "mads" else damage
-    manifest.write_text(text, encoding="latin-1")
+    text = manifest.read_text()
+    manifest.unlink()
+    match damage:
+        case "pipe":
+            os.mkfifo(manifest, 0o600)
+        case "folder":
+            manifest.mkdir()
+        case "mads":
+            manifest.write_text(text.replace("made", "mads"))
+        case str():
+            manifest.write_text(damage, encoding="latin-1")
+        case _:
+            cache.write_record(KEY, damage)
     assert cache.find(KEY) is None
 
 
@@ -80,17 +96,35 @@ def test_failed_build_leaves_nothing(cache: Cache) -> None:
     assert list(cache.folder.iterdir()) == []
 
 
-def test_what_killed_builds_left_is_swept_when_old(cache: Cache) -> None:
+@pytest.mark.parametrize("jump", [-2 * 86400.0, 2 * 86400.0])
+def test_what_killed_builds_left_is_swept_when_old(cache: Cache, jump: float) -> None:
+    """But for living builds, whatever the clock says."""
     put(cache)
-    old, young = cache.folder / "build-old", cache.folder / "build-young"
-    for left in (old, young):
-        left.mkdir()
-        (left / "library.so").write_bytes(b"half")
-    two_days_ago = time.time() - 2 * 86400.0
-    os.utime(old, (two_days_ago, two_days_ago))
-    put(cache)
-    assert not old.exists()
+    living, dead, young = (cache.folder / f"build-{name}" for name in ("living", "dead", "young"))
+    for folder in (living, dead, young):
+        folder.mkdir(mode=0o700)
+        (folder / "library.so").write_bytes(b"half")
+        if folder is not young:
+            os.utime(folder, (time.time() + jump,) * 2)
+    handle = os.open(living, os.O_RDONLY)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX)
+        put(cache)
+    finally:
+        os.close(handle)
+    assert living.exists()
+    assert not dead.exists()
     assert young.exists()
+
+
+def test_a_build_holds_its_folder(cache: Cache) -> None:
+    def make(library: Path) -> dict[str, object]:
+        os.utime(library.parent, (0.0, 0.0))
+        put(Cache(cache.folder), key=digest("other"))  # sweeps
+        library.write_bytes(b"made")
+        return {}
+
+    assert cache.store(KEY, make).library.read_bytes() == b"made"
 
 
 @pytest.mark.parametrize("mode", [0o777, 0o770, 0o707, 0o722])
@@ -139,13 +173,14 @@ def test_foreign_folder_is_refused(cache: Cache, monkeypatch: pytest.MonkeyPatch
         cache.find(KEY)
 
 
-def test_not_a_folder_is_told(tmp_path: Path) -> None:
+def test_a_place_that_cannot_hold_it_is_told(tmp_path: Path) -> None:
+    """A file, what is below one, and where nobody may write, not even root."""
     file = tmp_path / "file"
     file.write_text("")
-    with pytest.raises(CodegenError, match="DUAL_ARM_CACHE"):
-        put(Cache(file))
-    with pytest.raises(CodegenError, match="DUAL_ARM_CACHE"):
-        put(Cache(file / "below"))
+    for place in (file, file / "below", Path("/proc/no/cache")):
+        with pytest.raises(CodegenError, match=rf"{place}.*DUAL_ARM_CACHE") as told:
+            put(Cache(place))
+        assert "\n" not in str(told.value)
 
 
 def test_full_disk_is_one_message(tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ from codegen.compiled import CompiledFunction
 from codegen.errors import CodegenError
 from codegen.lanes import FORMS, KEPT, lane_text
 from symbolic.array import Array
-from tests.codegen.samples import random_function
+from tests.codegen.samples import odd_compiler, random_function
 
 WIDTHS = (2, 4, 8)
 
@@ -160,13 +160,8 @@ def test_wrong_code_of_lanes_is_not_used(
     cache: Cache, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     wrong = "s/lanes_sq(lanes_real x) { return x \\* x; }/lanes_sq(lanes_real x) { return x + x; }/"
-    compiler = tmp_path / "cc"
-    compiler.write_text(
-        '#!/bin/sh\nfor file in "$@"; do case "$file" in *.c) '
-        f'sed -i \'{wrong}\' "$file" ;; esac; done\nexec gcc "$@"\n'
-    )
-    compiler.chmod(0o755)
-    monkeypatch.setenv("CC", str(compiler))
+    each = f'case "$file" in *.c) sed -i \'{wrong}\' "$file" ;; esac'
+    odd_compiler(tmp_path, monkeypatch, f'for file in "$@"; do {each}; done\nexec gcc "$@"\n')
     monkeypatch.setattr(compiled_module, "_warned", False)
     x = ca.SX.sym("x", 3)
     square = ca.Function("square", [x], [x**2 + ca.sin(x)], ["x"], ["y"])

@@ -1,27 +1,17 @@
-"""Kill a study at random moments of every stage, resume it, and compare with one left in peace.
-
-`python -m tests.faults.kills --kills 50 --seed 1` does it until it has hit living programs fifty
-times, and tells what it found. Each folder is struck in every stage and before the first, in one of
-the ways a process dies: killed outright, alone or with all it has started, interrupted from the
-keyboard, asked to end, or robbed of a worker.
+"""Studies that are killed at random moments of every stage, resumed, and compared with one that is
+left in peace.
 """
 
 from __future__ import annotations
 
-import argparse
-import itertools
 import json
 import os
 import random
-import shutil
 import signal
 import subprocess
 import sys
-import tempfile
 import time
-from collections import Counter
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -36,10 +26,6 @@ STAGES = ("search", "polish", "drivable", "recommendation", "summary", "timing",
 BEGINNING = "beginning"
 """Before the first stage: the cell is read and its functions are compiled or loaded."""
 
-STRIKES = (BEGINNING, *sorted(2 * STAGES, key=STAGES.index))
-"""Where one folder is struck, in the order in which a study gets there."""
-
-WAYS = ("kill", "kill all", "interrupt", "terminate", "kill a worker")
 TIMES = {
     "seconds",
     "evaluation_seconds",
@@ -52,28 +38,6 @@ ENDS = {0, 2, 130, -signal.SIGINT, -signal.SIGKILL, -signal.SIGTERM}
 PATIENCE = 300.0
 ORPHANS_END = 60.0
 """So many seconds [s] after its parent's death a worker may still be there."""
-
-
-class Broken(AssertionError):
-    """A promise was not kept."""
-
-
-@dataclass
-class Tally:
-    """What was done and found; a hit met a living program, or a living worker of one.
-
-    Attributes:
-        hits: how often programs were struck.
-        misses: how often a program had ended before.
-        ways, stages: hits by the way and by the stage that was running.
-        ends: how programs that were struck ended.
-    """
-
-    hits: int = 0
-    misses: int = 0
-    ways: Counter[str] = field(default_factory=Counter)
-    stages: Counter[str] = field(default_factory=Counter)
-    ends: Counter[str] = field(default_factory=Counter)
 
 
 def study(output: Path, resume: bool, report: bool) -> list[str]:
@@ -111,11 +75,10 @@ def session(leader: int) -> list[int]:
     return found
 
 
-def strike(process: subprocess.Popen[bytes], way: str, rng: random.Random) -> bool:
-    """Let a program die in this way, or lose a worker; whether there was anything to strike."""
-    others = session(process.pid)
+def strike(process: subprocess.Popen[bytes], way: str, rng: random.Random) -> None:
+    """Let a program die in this way, or lose a worker where it has any."""
+    others, number = session(process.pid), signal.SIGKILL
     struck = [process.pid, *others]
-    number = signal.SIGKILL
     match way:
         case "kill":
             struck = [process.pid]
@@ -126,29 +89,20 @@ def strike(process: subprocess.Popen[bytes], way: str, rng: random.Random) -> bo
         case "kill a worker":
             struck = rng.sample(others, min(1, len(others)))
     for one in struck:
-        _signal(one, number)
-    return bool(struck)
-
-
-def _signal(one: int, number: int) -> None:
-    try:
-        os.kill(one, number)
-    except ProcessLookupError:
-        return
+        with suppress(ProcessLookupError):
+            os.kill(one, number)
 
 
 def ended(process: subprocess.Popen[bytes], said: Path) -> int:
     """Wait for a program's end and hold it to its promises; the exit code."""
     code = process.wait(timeout=PATIENCE)
     words = said.read_text(errors="replace")
-    if code not in ENDS or "Traceback" in words:
-        raise Broken(f"exit code {code}, said:\n{words[-4000:]}")
-    if code in (2, 130, -signal.SIGINT) and not words.strip():
-        raise Broken(f"exit code {code} without a message")
+    assert code in ENDS, f"exit code {code}, said:\n{words[-4000:]}"
+    assert "Traceback" not in words, words[-4000:]
+    assert words.strip() or code not in (2, 130, -signal.SIGINT), f"exit code {code}, no message"
     begin = time.monotonic()
-    while left := session(process.pid):
-        if time.monotonic() - begin > ORPHANS_END:
-            raise Broken(f"{len(left)} workers outlive their program")
+    while session(process.pid):
+        assert time.monotonic() - begin < ORPHANS_END, "workers outlive their program"
         time.sleep(0.1)
     return code
 
@@ -159,11 +113,9 @@ def running(output: Path) -> str:
 
 
 def _status(output: Path, stage: str) -> str:
-    try:
-        found = json.loads((output / "stages" / f"{stage}.json").read_text())
-        return str(found["status"])
-    except (OSError, ValueError, KeyError):
-        return ""
+    with suppress(OSError, ValueError, KeyError):
+        return str(json.loads((output / "stages" / f"{stage}.json").read_text())["status"])
+    return ""
 
 
 def wait_for(stage: str, output: Path, process: subprocess.Popen[bytes]) -> None:
@@ -177,16 +129,6 @@ def linger(seconds: float, stage: str, output: Path, process: subprocess.Popen[b
     end = time.monotonic() + seconds
     while time.monotonic() < end and process.poll() is None and _status(output, stage) != "done":
         time.sleep(0.005)
-
-
-def durations(output: Path) -> dict[str, float]:
-    """What each stage took [s]."""
-    found = {}
-    for stage in STAGES:
-        path = output / "stages" / f"{stage}.json"
-        if path.exists():
-            found[stage] = float(json.loads(path.read_text())["seconds"])
-    return found
 
 
 def contents(root: Path) -> dict[str, Any]:
@@ -213,86 +155,11 @@ def differences(first: dict[str, Any], second: dict[str, Any]) -> list[str]:
     )
 
 
-def struck(
-    folder: Path, strikes: Sequence[str], took: dict[str, float], seed: int, tally: Tally
-) -> dict[str, Any]:
-    """The contents of a study that was struck in these stages, in order, and resumed each time."""
-    rng = random.Random(seed)
-    report = "report" in took
-    output, said = folder / "results", folder / "said"
-
-    def start() -> subprocess.Popen[bytes]:
-        return started(study(output, output.exists(), report), said)
-
-    process = start()
-    for stage in strikes:
-        if process.poll() is not None:
-            ended(process, said)
-            process = start()
-        if stage != BEGINNING:
-            wait_for(stage, output, process)
-        # A stage that was resumed has less to do than it had at first.
-        linger(rng.uniform(0.0, 0.7 * took[stage]), stage, output, process)
-        way, at = rng.choice(WAYS), running(output)
-        if process.poll() is not None:
-            tally.misses += 1
-            continue
-        if not strike(process, way, rng):
-            way = "kill"
-            strike(process, way, rng)
-        tally.hits += 1
-        tally.ways[way] += 1
-        tally.stages[BEGINNING if stage == BEGINNING else at] += 1
-        if way != "kill a worker":  # a study goes on without one
-            tally.ends[str(ended(process, said))] += 1
-    ended(process, said)
-    code = ended(start(), said)
-    if code != 0:
-        raise Broken(f"cannot be resumed, exit code {code}:\n{said.read_text(errors='replace')}")
-    return contents(output)
-
-
 def undisturbed(folder: Path, report: bool) -> tuple[dict[str, Any], dict[str, float]]:
     """The contents of a study left in peace, and what its stages took [s]."""
+    folder.mkdir()
     output, said = folder / "results", folder / "said"
-    code = ended(started(study(output, False, report), said), said)
-    if code != 0:
-        raise Broken(f"exit code {code}:\n{said.read_text(errors='replace')}")
-    took = durations(output)
+    assert ended(started(study(output, False, report), said), said) == 0, said.read_text()
+    stages = [path for stage in STAGES if (path := output / "stages" / f"{stage}.json").exists()]
+    took = {path.stem: float(json.loads(path.read_text())["seconds"]) for path in stages}
     return contents(output), took | {BEGINNING: took["search"]}
-
-
-def main() -> int:
-    """Kill, resume, compare until living programs were hit so often; the exit code."""
-    parser = argparse.ArgumentParser(prog="python -m tests.faults.kills", description=__doc__)
-    parser.add_argument("--kills", type=int, default=50)
-    parser.add_argument("--seed", type=int, default=1)
-    options = parser.parse_args()
-    tally, wrong = Tally(), 0
-    with tempfile.TemporaryDirectory() as place:
-        (Path(place) / "peace").mkdir()
-        expected, took = undisturbed(Path(place) / "peace", report=True)
-        print("undisturbed:", {name: round(s, 1) for name, s in took.items()}, flush=True)
-        for number in itertools.count():
-            left = options.kills - tally.hits
-            if left <= 0:
-                break
-            folder = Path(place) / f"struck{number}"
-            folder.mkdir()
-            try:
-                found = struck(folder, STRIKES[:left], took, options.seed * 1000 + number, tally)
-                different = differences(expected, found)
-            except (Broken, subprocess.TimeoutExpired) as error:
-                different = [str(error)]
-            wrong += bool(different)
-            told = f"folder {number}: {tally.hits} hits, {tally.misses} too late:"
-            print(told, different or "same", flush=True)
-            shutil.rmtree(folder)
-    print("ways:", dict(tally.ways))
-    print("stages:", dict(tally.stages))
-    print("exit codes:", dict(tally.ends))
-    return 1 if wrong else 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -100,7 +100,7 @@ def _solve(
                 force = slice(at + 3 * k, at + 3 * k + 3)
                 wrenches[i, :, force] = np.vstack([np.eye(3), cross_matrix([*place, 0.0])])
                 rows = np.zeros((3, count))
-                rows[:, force] = [[0, 0, pad.friction], [1, 0, 0], [0, 1, 0]]
+                rows[:, force] = np.roll(np.diag([1.0, 1.0, pad.friction]), 1, axis=0)
                 blocks.append((-rows, np.zeros(3), [clarabel.SecondOrderConeT(3)]))
         else:
             # A disc's moments in units of its radius, so that all unknowns are about as large.
@@ -109,18 +109,18 @@ def _solve(
             rows[:, at : at + 7] = np.column_stack([disc(pad.friction, x) for x in np.eye(7)])
             blocks.append((-rows, np.zeros(21), [clarabel.PSDTriangleConeT(6)]))
     units = np.repeat([1.0, max(pad.patch_radius for pad in pads)], 3)
-    total = sum(in_box(pad) @ own for pad, own in zip(pads, wrenches, strict=True)) / units[:, None]
+    total = np.hstack([in_box(pad) for pad in pads]) @ wrenches.reshape(-1, count) / units[:, None]
     asked = load / size / units
-    forces, cost = np.vstack(wrenches[:, :3]), np.zeros(count)
+    forces, cost = wrenches[:, :3].reshape(-1, count), np.zeros(count)
     if normal_weights is not None:
         forces, cost = 0.0 * forces, normal_weights @ wrenches[:, 2]
     found = solved(forces.T @ forces, cost, [(total, asked, [clarabel.ZeroConeT(6)]), *blocks])
     if found is None:
         return None
-    x, unsure = found
-    missed = np.abs(total @ x - asked).max()
-    assert missed < 5e-7 * max(1.0, float(np.abs(x).max())) or normal_weights is not None
-    return size * wrenches @ x, size * unsure
+    unknowns, unsure = found
+    missed, most = np.abs(total @ unknowns - asked).max(), float(np.abs(unknowns).max())
+    assert missed < 5e-7 * max(1.0, most) or normal_weights is not None
+    return size * wrenches @ unknowns, size * unsure
 
 
 def disc(mu: float, x: Array) -> Array:
