@@ -227,21 +227,16 @@ def build(
     if key is not None:
         _remember(_set_key(key, levels, lanes, cache), ordered, cache)
     told = ("operations", "c_bytes", "compile_seconds", "level")
-    reports = [
-        FunctionReport(
-            name=name, from_cache=found, **{fact: library.entry.facts[fact] for fact in told}
-        )
-        for name, (library, found) in ordered.items()
-    ]
-    return Build(
-        {name: library.function() for name, (library, _) in ordered.items()},
-        tuple(reports),
-        {name: library.entry.key for name, (library, _) in ordered.items()},
-    )
+    reports, functions, keys = [], {}, {}
+    for name, (library, found) in ordered.items():
+        facts = {fact: library.entry.facts[fact] for fact in told}
+        reports.append(FunctionReport(name=name, from_cache=found, **facts))
+        functions[name], keys[name] = library.function(), library.entry.key
+    return Build(functions, tuple(reports), keys)
 
 
 def load_or_build(
-    key: str | None,
+    key: str,
     make: Callable[[], Mapping[str, ca.Function]],
     cache: Cache | None = None,
     *,
@@ -254,8 +249,7 @@ def load_or_build(
     expressions nor C are made again: `make` is not called and CasADi is not imported.
 
     Args:
-        key: changes with everything that `make` depends on, except the version of CasADi; None
-            where nothing does, and `make` is asked each time.
+        key: changes with everything that `make` depends on, except the version of CasADi.
         make: makes the functions.
         cache: where libraries are kept; by default the user's.
         levels: optimisation level per name, where the default by size is not wanted.
@@ -265,13 +259,13 @@ def load_or_build(
         CodegenError: see `compile_function`; and whatever `make` raises.
     """
     cache = cache or Cache()
-    full = None if key is None else _set_key(key, levels, lanes, cache)
+    full = _set_key(key, levels, lanes, cache)
     libraries = _obtained(full, lambda: _sources_of(make, levels or {}, lanes), cache)
     return {name: library.function() for name, library in libraries.items()}
 
 
 def load_or_compile(
-    key: str | None, make: Callable[[], tuple[Signature, str]], cache: Cache | None = None
+    key: str, make: Callable[[], tuple[Signature, str]], cache: Cache | None = None
 ) -> NumericFunction:
     """A function written in C by hand, by the key of what it is made from.
 
@@ -291,8 +285,7 @@ def load_or_compile(
         yield Source(signature.name, text, HANDWRITTEN_LEVEL, signature=signature)
 
     cache = cache or Cache()
-    full = None if key is None else _set_key(key, None, 1, cache)
-    (library,) = _obtained(full, source, cache).values()
+    (library,) = _obtained(_set_key(key, None, 1, cache), source, cache).values()
     return library.function()
 
 
@@ -387,23 +380,17 @@ def _set_key(key: str, levels: Mapping[str, int] | None, lanes: int, cache: Cach
 
 
 def _obtained(
-    key: str | None, sources: Callable[[], Iterable[Source]], cache: Cache
+    key: str, sources: Callable[[], Iterable[Source]], cache: Cache
 ) -> dict[str, Library]:
     """The libraries of a recipe: those that its record names, or what its sources become."""
-    if key is None:
-        return {name: library for name, (library, _) in _compiled(sources(), cache).items()}
 
     def find() -> dict[str, Library] | None:
         record = cache.read_record(key)
         if record is None:
             return None
-        found: dict[str, Library] = {}
-        for name, member in record["members"].items():
-            library = _loaded(member, cache)
-            if library is None:
-                return None
-            found[name] = library
-        return found
+        found = {name: _loaded(member, cache) for name, member in record["members"].items()}
+        whole = {name: library for name, library in found.items() if library is not None}
+        return whole if len(whole) == len(found) else None
 
     def make() -> dict[str, Library]:
         built = _compiled(sources(), cache)

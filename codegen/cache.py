@@ -307,12 +307,10 @@ class Cache:
 
     def usage(self) -> Usage:
         """What it holds."""
-        files = [file for _, _, files in self._by_use() for file in files]
-        return Usage(
-            sum(file.suffix == ".so" for file in files),
-            len(files),
-            sum(size for _, size, _ in self._by_use()),
-        )
+        kept = self._by_use()
+        files = [file for *_, files in kept for file in files]
+        libraries = sum(file.suffix == ".so" for file in files)
+        return Usage(libraries, len(files), sum(size for _, size, _ in kept))
 
     def trim(self, most: int | None = None) -> int:
         """Remove what was not used for longest until the rest is at most so large [bytes]; None for
@@ -332,9 +330,10 @@ class Cache:
             if size <= most:
                 break
             size -= own
-            for path in files:
-                libraries += path.suffix == ".so"
-                path.unlink(missing_ok=True)
+            libraries += sum(path.suffix == ".so" for path in files)
+            with _writing(self.folder):
+                for path in files:
+                    path.unlink(missing_ok=True)
         return libraries
 
     def _by_use(self) -> list[tuple[float, int, list[Path]]]:
@@ -353,17 +352,9 @@ class Cache:
 
     def clean(self) -> int:
         """Remove everything this cache has stored; the number of libraries removed."""
-        if not self.folder.exists():
-            return 0
-        self._require_safe()
-        libraries = 0
-        with _writing(self.folder):
-            for path in self.folder.iterdir():
-                if path.is_dir() and path.name.startswith("build-"):
-                    shutil.rmtree(path, ignore_errors=True)
-                elif path.suffix in _KEPT:
-                    libraries += path.suffix == ".so"
-                    path.unlink(missing_ok=True)
+        libraries = self.trim(-1)
+        for left in self.folder.glob("build-*"):
+            shutil.rmtree(left, ignore_errors=True)
         return libraries
 
     @contextmanager

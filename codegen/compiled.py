@@ -10,6 +10,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from itertools import accumulate, pairwise
+from math import prod
 from pathlib import Path
 from typing import Any
 
@@ -56,34 +57,29 @@ class CompiledFunction(NumericFunction):
         super().__init__(signature)
         self.library = library
         try:
-            self._run = loaded.dual_arm_run
             loaded.dual_arm_load()
-            sizes = (ctypes.c_longlong * 4)()
-            loaded.dual_arm_sizes(sizes)
+            found = (ctypes.c_longlong * 4)()
+            loaded.dual_arm_sizes(found)
+            sizes, n_ports = list(found), len(signature.input_names) + len(self.output_names)
+            self._one = _Driver(loaded.dual_arm_run, sizes, n_ports)
         except AttributeError as error:
             raise cannot_load(self.name, error) from error
-        self._run.argtypes = [ctypes.c_void_p] * 2 + [ctypes.c_longlong] * 2
-        self._run.restype = ctypes.c_longlong
-        self._work_sizes = tuple(int(size) for size in sizes)
-        self._n_ports = len(signature.input_names) + len(self.output_names)
-        sizes_of = [8 * _size(shape) for shape in self.output_shapes]
+        sizes_of = [8 * prod(shape) for shape in self.output_shapes]
         self._offsets = list(accumulate(sizes_of, initial=0))[:-1]
-        self._idle: deque[_Work] = deque()
-        self._own = threading.local()
         self.lanes, self._shared = 1, [False] * len(signature.input_names)
-        self._run_lanes, self._idle_lanes = self._run, deque[_Work]()
+        self._in_lanes: _Driver | None = None
         if hasattr(loaded, "dual_arm_run_lanes"):
             self._shared = [bool(loaded.dual_arm_shared(k)) for k in range(len(self._shared))]
-            self._run_lanes = loaded.dual_arm_run_lanes
-            self._run_lanes.argtypes = self._run.argtypes
-            self._run_lanes.restype = ctypes.c_longlong
             self.lanes = int(loaded.dual_arm_lanes())
+            entries = sum(map(prod, (*signature.input_shapes, *self.output_shapes)))
+            sizes[3] = (sizes[3] + entries) * self.lanes
+            self._in_lanes = _Driver(loaded.dual_arm_run_lanes, sizes, n_ports)
             if not self._lanes_agree():
                 self.lanes = 1
                 warn_one_lane(self.name, f"lanes and single evaluations differ; {OTHER_COMPILER}")
 
     def _evaluate_block(self, inputs: Sequence[Array], block: NDArray[np.void]) -> None:
-        work = self._take_work()
+        work = self._one.taken()
         ports = work.ports
         slot = 0
         for array in inputs:
@@ -93,9 +89,7 @@ class CompiledFunction(NumericFunction):
         for offset in self._offsets:
             ports[slot] = base + offset
             slot += 2
-        status = self._run(work.ports_address, work.address, 0, 1)
-        self._idle.append(work)
-        self._check(status, "")
+        self._check(self._one.run(work.ports_address, 0, 1, work), "")
 
     def _evaluate_batch(
         self,
@@ -150,9 +144,9 @@ class CompiledFunction(NumericFunction):
                     "give one, or call the function once per value"
                 )
         steps = [
-            _size(shape) if per_candidate else 0
+            prod(shape) if per_candidate else 0
             for shape, per_candidate in zip(self.signature.input_shapes, batched, strict=True)
-        ] + [_size(shape) for shape in self.output_shapes]
+        ] + [prod(shape) for shape in self.output_shapes]
         ports = (ctypes.c_longlong * (2 * len(steps)))()
         for k, (array, step) in enumerate(zip([*inputs, *outputs], steps, strict=True)):
             ports[2 * k] = _address(array)
@@ -172,40 +166,14 @@ class CompiledFunction(NumericFunction):
 
     def _native(self, ports: int) -> NativeCall:
         """Work memory is this thread's own, and stays."""
-        own = self._own.__dict__
-        if not own:
-            own["work"], own["lanes"] = self._take_work(), None
-            if self.lanes > 1:
-                own["lanes"] = self._take_lane_work()
-        one, lanes = (ctypes.cast(f, ctypes.c_void_p).value for f in (self._run, self._run_lanes))
-        if self.lanes == 1:
-            return NativeCall(one or 0, 0, ports, own["work"].address, 0)
-        return NativeCall(one or 0, lanes or 0, ports, own["work"].address, own["lanes"].address)
+        lanes = self._in_lanes if self.lanes > 1 else None
+        own = [0, 0] if lanes is None else [lanes.address, lanes.own.address]
+        return NativeCall(self._one.address, own[0], ports, self._one.own.address, own[1])
 
     def _run_chunk(self, ports_address: int, begin: int, end: int) -> None:
-        if self.lanes > 1 and end - begin > 1:
-            work = self._take_lane_work()
-            status = self._run_lanes(ports_address, work.address, begin, end)
-            self._idle_lanes.append(work)
-        else:
-            work = self._take_work()
-            status = self._run(ports_address, work.address, begin, end)
-            self._idle.append(work)
-        self._check(status, " of the batch")
-
-    def _take_work(self) -> _Work:
-        try:
-            return self._idle.pop()
-        except IndexError:
-            return _Work(self._work_sizes, self._n_ports)
-
-    def _take_lane_work(self) -> _Work:
-        try:
-            return self._idle_lanes.pop()
-        except IndexError:
-            arg, res, iw, w = self._work_sizes
-            w += sum(map(_size, (*self.signature.input_shapes, *self.output_shapes)))
-            return _Work((arg, res, iw, w * self.lanes), self._n_ports)
+        several = self.lanes > 1 and end - begin > 1
+        driver = self._in_lanes if several and self._in_lanes is not None else self._one
+        self._check(driver.run(ports_address, begin, end), " of the batch")
 
     def _lanes_agree(self) -> bool:
         """Whether a ragged batch in lanes gives the bits of single evaluations."""
@@ -231,6 +199,43 @@ class CompiledFunction(NumericFunction):
     def _check(self, status: int, of: str) -> None:
         if status != _SUCCESS:
             raise CodegenError(f"{self.name}: the function failed at candidate {status}{of}")
+
+
+class _Driver:
+    """One of a library's drivers, with work memory that is kept between its calls.
+
+    Attributes:
+        address: of the function.
+    """
+
+    def __init__(self, function: Any, sizes: Sequence[int], n_ports: int) -> None:
+        function.argtypes = [ctypes.c_void_p] * 2 + [ctypes.c_longlong] * 2
+        function.restype = ctypes.c_longlong
+        self._function, self._sizes, self._n_ports = function, tuple(sizes), n_ports
+        self.address = ctypes.cast(function, ctypes.c_void_p).value or 0
+        self._idle, self._own = deque[_Work](), threading.local()
+
+    def taken(self) -> _Work:
+        """Work memory that no other thread uses."""
+        try:
+            return self._idle.pop()
+        except IndexError:
+            return _Work(self._sizes, self._n_ports)
+
+    def run(self, ports_address: int, begin: int, end: int, work: _Work | None = None) -> int:
+        """Evaluate candidates begin to end; the first that failed, or `_SUCCESS`."""
+        work = self.taken() if work is None else work
+        status: int = self._function(ports_address, work.address, begin, end)
+        self._idle.append(work)
+        return status
+
+    @property
+    def own(self) -> _Work:
+        """Work memory of this thread, for good."""
+        if not hasattr(self._own, "work"):
+            self._own.work = self.taken()
+        work: _Work = self._own.work
+        return work
 
 
 class _Work:
@@ -301,10 +306,3 @@ def _same(a: Array, b: Array) -> bool:
     """Whether two arrays hold the same bits, NaN equal to NaN whatever its bits."""
     unlike = a.view(np.int64) != b.view(np.int64)
     return not (unlike & ~(np.isnan(a) & np.isnan(b))).any()
-
-
-def _size(shape: Sequence[int]) -> int:
-    size = 1
-    for length in shape:
-        size *= length
-    return size

@@ -9,11 +9,12 @@ can turn into such an array is converted where that is allowed (`__call__`, `bat
 
 from __future__ import annotations
 
+import json
 import os
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Mapping, Sequence
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
@@ -62,23 +63,12 @@ class Signature:
     @classmethod
     def from_json(cls, stored: Mapping[str, Any]) -> Signature:
         """Read what `to_json` wrote."""
-        return cls(
-            name=stored["name"],
-            input_names=tuple(stored["input_names"]),
-            output_names=tuple(stored["output_names"]),
-            input_shapes=tuple(tuple(shape) for shape in stored["input_shapes"]),
-            output_shapes=tuple(tuple(shape) for shape in stored["output_shapes"]),
-        )
+        return cls(**{name: _as_tuple(value) for name, value in stored.items()})
 
     def to_json(self) -> dict[str, Any]:
         """As plain lists and strings."""
-        return {
-            "name": self.name,
-            "input_names": list(self.input_names),
-            "output_names": list(self.output_names),
-            "input_shapes": [list(shape) for shape in self.input_shapes],
-            "output_shapes": [list(shape) for shape in self.output_shapes],
-        }
+        found: dict[str, Any] = json.loads(json.dumps(asdict(self)))
+        return found
 
     def output_record(self) -> np.dtype[np.void]:
         """Structured type that holds all outputs of one evaluation in one block of memory."""
@@ -88,6 +78,10 @@ class Signature:
                 for name, shape in zip(self.output_names, self.output_shapes, strict=True)
             ]
         )
+
+
+def _as_tuple(value: Any) -> Any:
+    return tuple(map(_as_tuple, value)) if isinstance(value, list) else value
 
 
 def numpy_shape(rows: int, columns: int) -> Shape:

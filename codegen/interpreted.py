@@ -35,9 +35,9 @@ class InterpretedFunction(NumericFunction):
     """
 
     def __init__(self, function: ca.Function) -> None:
-        """Wrap a function whose inputs and outputs are dense (`codegen.source.dense`)."""
+        """Sparse inputs and outputs become dense."""
         super().__init__(Signature.of(function))
-        self.function = function
+        self.function = dense(function)
 
     def _evaluate_block(self, inputs: Sequence[Array], block: NDArray[np.void]) -> None:
         self._into(inputs, [block[name] for name in self.output_names])
@@ -113,10 +113,10 @@ def compare(
         samples: number of random inputs.
         cache: where the compiled derivative is kept.
     """
-    interpreted = InterpretedFunction(dense(function))
+    interpreted = InterpretedFunction(function)
     derivative = directional_derivative(function)
     compiled_derivative = compile_function(derivative, cache)
-    reference_derivative = InterpretedFunction(dense(derivative))
+    reference_derivative = InterpretedFunction(derivative)
     worst, worst_derivative = ("", 0.0), ("", 0.0)
     for _ in range(samples):
         inputs = [

@@ -27,7 +27,7 @@ import numpy as np
 
 from symbolic.array import Array
 from symbolic.cell_model import CellBodies, CellModel
-from symbolic.contact.grasp_numbers import grasp_shapes, left_components
+from symbolic.contact.force_closure import grasp_shapes, left_components
 from symbolic.contact.soft_finger import SoftPatch
 from symbolic.geometry.screen import Base, Screen, ScreenBody
 from symbolic.records import Contact, RedundantJoint, Robot, Task, Waypoint, Workcell

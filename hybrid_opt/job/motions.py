@@ -26,8 +26,8 @@ from hybrid_opt.robust.squeeze import Squeeze, SqueezeSettings, pressed_beyond, 
 from hybrid_opt.timing.model import TimingModel
 from hybrid_opt.timing.records import JerkLimits
 from symbolic.array import Array, interpolated
+from symbolic.contact.force_closure import robot_wrenches
 from symbolic.contact.grasp import Grasp
-from symbolic.contact.grasp_numbers import robot_wrenches
 from symbolic.records import Handling, Workcell
 from symbolic.records.poses import box_rotation
 from symbolic.robot.arm import REACH_TOLERANCE

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from codegen.function import NumericFunction
 from codegen.interpreted import InterpretedFunction
-from codegen.source import dense
 from hybrid_opt.carry import Judgement
 from hybrid_opt.collision.certify import LostPathError
 from hybrid_opt.collision.checker import CollisionChecker
@@ -248,7 +247,7 @@ def judge_of(geometry: CellGeometry) -> PoseJudge:
     models = [build_robot_model(robot) for robot in geometry.workcell.robots]
     made = screening_functions(geometry, (models[0].joint_placements, models[1].joint_placements))
     functions = {
-        name: InterpretedFunction(dense(made[name])) for name in made if not name.endswith("motion")
+        name: InterpretedFunction(made[name]) for name in made if not name.endswith("motion")
     }
     return PoseJudge(geometry, CollisionChecker(geometry, functions), 0.0)
 
@@ -313,13 +312,12 @@ class Trial:
         vars(model)["screening"] = self.bodies.screening  # of the same bodies: not made again
         self.workcell, self.model, self.branches = workcell, model, workcell.start_branch
         functions = {
-            name: InterpretedFunction(dense(function))
-            for name, function in cell_functions(model).items()
+            name: InterpretedFunction(function) for name, function in cell_functions(model).items()
         }
         self.evaluator = CandidateEvaluator(self.workcell, functions=functions)
         # Forces that a solver finds take most of a candidate's time.
         self._solved = not self.workcell.has_closed_form
-        self._motion = InterpretedFunction(dense(motion_function(model))) if self._solved else None
+        self._motion = InterpretedFunction(motion_function(model)) if self._solved else None
 
     @property
     def initial(self) -> Array:
@@ -427,10 +425,7 @@ class _InterpretedCell(CompiledCell):
         levels: Mapping[str, int] | None = None,
         bodies: bool = True,
     ) -> dict[str, NumericFunction]:
-        return {
-            name: InterpretedFunction(dense(function))
-            for name, function in make(self.model).items()
-        }
+        return {name: InterpretedFunction(function) for name, function in make(self.model).items()}
 
 
 def grasp_blocked(trial: Trial, handling: Handling) -> str:

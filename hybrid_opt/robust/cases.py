@@ -34,7 +34,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from symbolic.array import Array
-from symbolic.contact.grasp_numbers import least_reaches
+from symbolic.contact.force_closure import least_reaches
 from symbolic.errors import SettingsError
 from symbolic.read.checks import PATCH_OVERLAP, pads_beside
 from symbolic.records import Uncertainty, Workcell

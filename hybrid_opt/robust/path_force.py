@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from codegen.interpreted import InterpretedFunction
-from codegen.source import dense
 from hybrid_opt.carry import Carry
 from hybrid_opt.compiled_cell import bound_to, held_function, kept_per_workcell
 from hybrid_opt.robust.cases import (
@@ -125,16 +124,11 @@ class RobustPath:
         ruling = ruling_cases(least, self._set, self.leader)
         return ruling.force, self.slopes(points, ruling)
 
-    def beyond(self, points: PathPoints, level: Array) -> tuple[NDArray[np.intp], Array, Array]:
-        """The points where a force of either robot is above a level (n,) [N], their forces and
-        slopes as of `at`."""
-        rows, ruling = self.ruling_beyond(points, level)
-        return rows, ruling.force, self.slopes(points.at(rows), ruling)
-
     def ruling_beyond(
         self, points: PathPoints, level: Array
     ) -> tuple[NDArray[np.intp], RulingCases]:
-        """The same points and the cases that decide there: slopes take as long as forces.
+        """The points where a force of either robot is above a level (n,) [N], and the cases that
+        decide there: slopes take as long as forces.
 
         Most cases are seen to need less by a pressure that shares everything evenly.
         """
@@ -289,10 +283,10 @@ class RulingForce:
         if self._squeezed:
             numbers = WorkcellNumbers(self._workcell)
             made = case_gradient_function(numbers.symbols(), numbers=True)
-            function = bound_to(InterpretedFunction(dense(made)), numbers)
+            function = bound_to(InterpretedFunction(made), numbers)
         else:
             made = case_gradient_function(self._workcell, 1 - self._leader, numbers=True)
-            function = InterpretedFunction(dense(made))
+            function = InterpretedFunction(made)
         own, slopes = self._motion, []
         for arm in (0, 1):
             cases = self._cases.copy()

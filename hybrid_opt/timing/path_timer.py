@@ -386,7 +386,8 @@ class RobustDrive:
         found: list[AtRest | None] = [None] * n
         path, sample = np.divmod(np.arange(n * samples), samples)
         points = self._points(path, sample, *np.zeros((2, n * samples)))
-        rows, force, slope = self._forces.beyond(points, NEAR * self._limit[path])
+        rows, ruling = self._forces.ruling_beyond(points, NEAR * self._limit[path])
+        force, slope = ruling.force, self._forces.slopes(points.at(rows), ruling)
         for k in np.unique(path[rows]):
             own = path[rows] == k
             at = int(force[own].max(axis=1).argmax())

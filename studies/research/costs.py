@@ -27,7 +27,6 @@ import numpy as np
 
 from codegen.build import compile_function
 from codegen.interpreted import InterpretedFunction
-from codegen.source import dense
 from hybrid_opt.cell import Cell
 from hybrid_opt.compiled_cell import CompiledCell
 from hybrid_opt.display.table import number, text_table
@@ -99,7 +98,7 @@ def benchmark(
     evaluator = CandidateEvaluator(workcell, compiled=compiled)
     ways: dict[str, Evaluate] = {
         "compiled": lambda x: evaluator.sampled(x, with_collisions=False),
-        "interpreted": InterpretedFunction(dense(candidate_function(model))),
+        "interpreted": InterpretedFunction(candidate_function(model)),
         "plain": PlainEvaluator(workcell, model.start),
     }
     progress(f"{candidates * repeats} rounds: {', '.join(ways)}")

@@ -19,7 +19,7 @@ import numpy as np
 
 from codegen.build import load_or_build_program
 from codegen.interpreted import InterpretedFunction
-from codegen.source import dense, operations
+from codegen.source import operations
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.metaheuristics.registry import GeneticSettings, make
 from hybrid_opt.metaheuristics.run import CarryProblem, search
@@ -179,7 +179,7 @@ def with_collisions(
     size = (candidates, POPULATION, evaluator.n_var)
     uniform = rng.uniform(evaluator.lower, evaluator.upper, size)
     functions = {
-        name: InterpretedFunction(dense(function))
+        name: InterpretedFunction(function)
         for name, function in cell_functions(evaluator.compiled.model).items()
     }
     interpreted = CandidateEvaluator(workcell, functions=functions)

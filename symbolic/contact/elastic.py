@@ -12,8 +12,8 @@ from __future__ import annotations
 import numpy as np
 
 from symbolic.array import Array
+from symbolic.contact.force_closure import wrench_to_box
 from symbolic.records import Contact, Workcell
-from symbolic.records.poses import skew
 
 SHEAR = 1.0 / 3.0
 """Stiffness of a layer along it over that across it: rubber keeps its volume."""
@@ -29,7 +29,7 @@ def pressure_shifts(workcell: Workcell, load: Array, normal: Array) -> Array:
         normal: (n, 2) normal forces of the robots [N].
     """
     pads, robots = workcell.pads, workcell.pad_robots
-    maps, stiff = [_to_box(pad) for pad in pads], [_stiffness(pad) for pad in pads]
+    maps, stiff = [wrench_to_box(pad) for pad in pads], [_stiffness(pad) for pad in pads]
     whole = sum(A @ K @ A.T for A, K in zip(maps, stiff, strict=True))
     moved = np.linalg.solve(whole, load.T)
     area = np.array([K[2, 2] for K in stiff])
@@ -52,12 +52,6 @@ def free_shift(pad: Contact) -> float:
     if pad.half_sides is None:
         return pad.patch_radius / 4.0
     return min(pad.half_sides) / 3.0
-
-
-def _to_box(pad: Contact) -> Array:
-    """(6, 6) from a wrench about a pad's centre, in its axes, to one about the box frame."""
-    R, p = pad.T_box_pad[:3, :3], pad.T_box_pad[:3, 3]
-    return np.block([[R, np.zeros((3, 3))], [skew(p) @ R, R]])
 
 
 def _stiffness(pad: Contact) -> Array:

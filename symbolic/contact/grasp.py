@@ -33,13 +33,15 @@ from symbolic.contact.central_path import (
 from symbolic.contact.even_patch import EvenPatch
 from symbolic.contact.force_closure import (
     EVEN,
+    LOAD_SIZE,
+    MOMENT_ARM,
     WRENCH_SIZE,
+    derived,
     presses_evenly,
     scaled_patch,
     size_powers,
     tangential,
 )
-from symbolic.contact.grasp_numbers import LOAD_SIZE, MOMENT_ARM, derived
 from symbolic.contact.patches import Patch, least
 from symbolic.contact.rectangular_patch import RectangularPatch
 from symbolic.contact.round_patch import RoundPatch, cross_2, patch_slack

@@ -24,8 +24,8 @@ import casadi as ca
 import numpy as np
 
 from symbolic.contact.central_path import centred, wrenches_of
+from symbolic.contact.force_closure import LOAD_SIZE, MOMENT_ARM
 from symbolic.contact.grasp import SCALE_FLOOR, Grasp, whole_wrench
-from symbolic.contact.grasp_numbers import LOAD_SIZE, MOMENT_ARM
 from symbolic.contact.patches import Elimination, Patch
 from symbolic.expression import as_mx, mx_symbols
 

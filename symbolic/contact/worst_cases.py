@@ -31,7 +31,14 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from symbolic.contact.force_closure import WRENCH_SIZE, has_force_closure, presses_evenly
+from symbolic.contact.force_closure import (
+    LOAD_SIZE,
+    WRENCH_SIZE,
+    derived,
+    has_force_closure,
+    presses_evenly,
+    smaller_patches,
+)
 from symbolic.contact.grasp import (
     BEYOND,
     SCALE_FLOOR,
@@ -40,7 +47,6 @@ from symbolic.contact.grasp import (
     even_slack,
     facing_wrenches,
 )
-from symbolic.contact.grasp_numbers import LOAD_SIZE, derived, smaller_patches
 from symbolic.contact.load import resultant_force
 from symbolic.contact.paper import required_moment
 from symbolic.contact.patches import least

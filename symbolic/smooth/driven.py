@@ -14,7 +14,7 @@ import numpy as np
 
 from symbolic.array import Array
 from symbolic.cell_model import CellModel
-from symbolic.contact.grasp_numbers import LOAD_SIZE
+from symbolic.contact.force_closure import LOAD_SIZE
 from symbolic.contact.soft_finger import Detached
 from symbolic.expression import named_function, number
 from symbolic.limits import (

@@ -27,7 +27,6 @@ from codegen.interpreted import (
     directional_derivative,
     relative_difference,
 )
-from codegen.source import dense
 from symbolic.array import Array
 from tests.codegen.samples import random_function, small
 
@@ -38,7 +37,7 @@ Make = Callable[[ca.Function], NumericFunction]
 def make(request: pytest.FixtureRequest, cache: Cache) -> Make:
     """Make a numeric function of either kind."""
     if request.param == "interpreted":
-        return lambda function: InterpretedFunction(dense(function))
+        return lambda function: InterpretedFunction(function)
     return lambda function: compile_function(function, cache)
 
 

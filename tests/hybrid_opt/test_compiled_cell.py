@@ -22,7 +22,6 @@ from codegen.compiler import Compiler
 from codegen.errors import CodegenError
 from codegen.function import NumericFunction
 from codegen.interpreted import InterpretedFunction
-from codegen.source import dense
 from hybrid_opt import compiled_cell
 from hybrid_opt.building import build_study
 from hybrid_opt.cell import Cell
@@ -52,7 +51,7 @@ def test_the_model_is_built_once_for_all_functions(monkeypatch: pytest.MonkeyPat
     def built(
         key: str, make: Callable[[], Mapping[str, ca.Function]], *_: Any, **__: Any
     ) -> dict[str, NumericFunction]:
-        return {name: InterpretedFunction(dense(function)) for name, function in make().items()}
+        return {name: InterpretedFunction(function) for name, function in make().items()}
 
     def no_program(name: str, key: str, make: Callable[[], Any], *_: Any) -> SimpleNamespace:
         make()

@@ -12,7 +12,6 @@ import pytest
 
 from codegen.function import NumericFunction
 from codegen.interpreted import InterpretedFunction
-from codegen.source import dense
 from hybrid_opt import metaheuristics
 from hybrid_opt.collision.between import MotionVerdict, PassingTouch
 from hybrid_opt.collision.certify import (
@@ -242,7 +241,7 @@ def checker(thickness: float = 0.0, gap: float = 0.0) -> CollisionChecker:
         plates.append(Body("near wall", Box(np.array([0.1, 0.3, 0.3])), at(-offset)))
         plates.append(Body("far wall", Box(np.array([0.1, 0.3, 0.3])), at(offset)))
     geometry = build_geometry(replace(rack(), environment=tuple(plates)))
-    functions = {n: InterpretedFunction(dense(f)) for n, f in functions_of(geometry).items()}
+    functions = {n: InterpretedFunction(f) for n, f in functions_of(geometry).items()}
     return CollisionChecker(geometry, functions)
 
 
@@ -294,7 +293,7 @@ def test_a_link_that_sweeps_through_a_plate_is_found() -> None:
     T = pose_matrix(centre, [0.0, 0.0, 0.0])
     plate = Body("plate", Box(np.array([0.002, 0.002, 0.02])), T)
     geometry = build_geometry(replace(rack(), environment=(plate,)))
-    functions = {n: InterpretedFunction(dense(f)) for n, f in functions_of(geometry).items()}
+    functions = {n: InterpretedFunction(f) for n, f in functions_of(geometry).items()}
     blocked = CollisionChecker(geometry, functions)
     pose, _, q_2 = passing(np.array([0.5, 0.5]))
     samples = (pose, np.stack([start, end]), q_2)

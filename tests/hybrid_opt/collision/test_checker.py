@@ -14,7 +14,6 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from codegen.interpreted import InterpretedFunction
-from codegen.source import dense
 from hybrid_opt.collision.between import (
     SEARCH_DEPTH,
     MotionVerdict,
@@ -66,7 +65,7 @@ STILL = np.zeros((1, 6))
 def checker_of(geometry: CellGeometry) -> CollisionChecker:
     functions = functions_of(geometry)
     return CollisionChecker(
-        geometry, {name: InterpretedFunction(dense(f)) for name, f in functions.items()}
+        geometry, {name: InterpretedFunction(f) for name, f in functions.items()}
     )
 
 

@@ -9,7 +9,6 @@ import pytest
 
 from codegen.build import build
 from codegen.interpreted import InterpretedFunction
-from codegen.source import dense
 from hybrid_opt.cell import Cell
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from studies.research.plain.candidate import PlainJudge
@@ -57,7 +56,7 @@ def agree(workcell: Workcell, fully: bool = True) -> None:
     made = cell_functions(model)
     plainly = None if fully else build(made, levels=dict.fromkeys(made, 0)).functions
     compiled = CandidateEvaluator(workcell, functions=plainly)
-    functions = {name: InterpretedFunction(dense(function)) for name, function in made.items()}
+    functions = {name: InterpretedFunction(function) for name, function in made.items()}
     interpreted = CandidateEvaluator(workcell, functions=functions)
     x = np.vstack([around(workcell, 6, 7, 1.0), around(workcell, 6, 8, 10.0)])
     found, expected = compiled.evaluate(x), interpreted.evaluate(x)

@@ -292,10 +292,11 @@ def test_forces_and_slopes_are_those_of_the_motion(leader: int) -> None:
         np.testing.assert_allclose(whole[:, :, column], difference, atol=2e-3)
     # Where a force is above a level, the same; nowhere else.
     level = np.full(POINTS, float(np.median(value.max(axis=1))))
-    rows, force, beyond = robust.beyond(points, level)
+    rows, ruling = robust.ruling_beyond(points, level)
+    beyond = robust.slopes(points.at(rows), ruling)
     np.testing.assert_array_equal(rows, np.flatnonzero(value.max(axis=1) > level))
     assert 0 < len(rows) < POINTS
-    np.testing.assert_allclose(force, value[rows], rtol=1e-9)
+    np.testing.assert_allclose(ruling.force, value[rows], rtol=1e-9)
     np.testing.assert_allclose(beyond, whole[rows], rtol=1e-6, atol=1e-6)
 
 

@@ -15,9 +15,8 @@ from hypothesis import strategies as st
 
 from symbolic.array import Array
 from symbolic.contact.central_path import FINAL_WEIGHT, NEAR, START_WEIGHT
-from symbolic.contact.force_closure import has_force_closure, state_to_box
+from symbolic.contact.force_closure import has_force_closure, smaller_patches, state_to_box
 from symbolic.contact.grasp import REST_WEIGHT, Grasp, Objective, balance_of, facing_wrenches
-from symbolic.contact.grasp_numbers import smaller_patches
 from symbolic.contact.paper import allocate, normal_force_branches
 from symbolic.contact.soft_grasp import SoftGrasp
 from symbolic.contact.worst_cases import (
