@@ -128,7 +128,8 @@ def polish_functions(compiled: CompiledCell) -> PolishFunctions:
 
     What serves many samples or places at a call is evaluated in lanes, at level 1: higher ones
     compile three times as long and gain nothing (measured on the rack: every function within 5 %,
-    one slower by 40 %). Of the first and the last two samples, only second derivatives do.
+    one slower by 40 %). Of the first and the last two samples, only second derivatives do. Those of
+    whole paths multiply sparse matrices, which have no form in lanes.
 
     Raises:
         DualArmError: the cell's model cannot be built, or its functions not be compiled.
@@ -136,6 +137,7 @@ def polish_functions(compiled: CompiledCell) -> PolishFunctions:
     quantities = quantities_of(compiled.workcell)
     ends = {f"{q}_{block}_first" for q in quantities for block in ("first", "last", "path")}
     levels = dict.fromkeys(sorted(_names(quantities) - ends), 1)
+    wide = levels.keys() - {f"{q}_path_second" for q in quantities}
 
     @cache
     def samples(model: CellModel) -> dict[str, ca.Function]:
@@ -144,10 +146,10 @@ def polish_functions(compiled: CompiledCell) -> PolishFunctions:
         return {name: function for functions in found for name, function in functions.items()}
 
     def in_lanes(model: CellModel) -> dict[str, ca.Function]:
-        return {name: f for name, f in samples(model).items() if name in levels}
+        return {name: f for name, f in samples(model).items() if name in wide}
 
     def one_by_one(model: CellModel) -> dict[str, ca.Function]:
-        return {name: f for name, f in samples(model).items() if name not in levels}
+        return {name: f for name, f in samples(model).items() if name not in wide}
 
     def rows(model: CellModel) -> dict[str, ca.Function]:
         place = PlaceSymbols(model)
@@ -162,7 +164,7 @@ def polish_functions(compiled: CompiledCell) -> PolishFunctions:
     built = compiled.functions(
         "polish in lanes", in_lanes, details, levels=levels, lanes=0, bodies=False
     )
-    built |= compiled.functions("polish", one_by_one, details, bodies=False)
+    built |= compiled.functions("polish", one_by_one, details, levels=levels, bodies=False)
     built |= compiled.functions("polish rows", rows, details, levels=levels, lanes=0)
     if "load" in quantities:
         built |= compiled.functions("held", _held, levels=levels, lanes=0, bodies=False)
