@@ -351,21 +351,17 @@ def contact_limits(
     """
     (a, w), joints = timing, limit_layout(workcell).joints
     held = _held(workcell, blocks, a, w, detached)
-    wrenches = (
-        ca.vertcat(held.force_1, held.moment_1),
-        ca.vertcat(held.force_2, held.moment_2),
-    )
     own = ca.reshape(blocks["torque"], joints, 3)
     wrench_by_joint = ca.reshape(blocks["wrench"], 6, joints).T
     torque, start = own[:, 0] * a + own[:, 1] * w + own[:, 2], 0
     ratios = []
-    for robot, wrench in zip(workcell.robots, wrenches, strict=True):
+    for robot, wrench in zip(workcell.robots, held.wrenches, strict=True):
         stop = start + robot.velocity_max.shape[0]
         ratios.append(torque[start:stop] + ca.mtimes(wrench_by_joint[start:stop, :], wrench))
         start = stop
     ratios += [
         ca.sqrt(ca.sumsqr(moved) + 1e-24) / contact.patch_radius
-        for moved, contact in zip((held.shift_1, held.shift_2), workcell.contacts, strict=True)
+        for moved, contact in zip(held.shifts, workcell.contacts, strict=True)
     ]
     return ca.vertcat(*ratios), held.normal
 

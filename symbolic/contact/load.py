@@ -15,7 +15,7 @@ import casadi as ca
 
 from symbolic.contact.force_closure import WRENCH_SIZE
 from symbolic.contact.grasp import Grasp, balance_of, facing_wrenches, grasp_wrenches
-from symbolic.contact.paper import allocate, pressure_shift, required_force, required_moment
+from symbolic.contact.paper import Both, allocate, pressure_shift, required_force, required_moment
 from symbolic.contact.soft_finger import Detached, SoftPatch, least_soft_squeeze
 from symbolic.expression import Expression, as_mx, mx_given, named_function, number, sx_given
 from symbolic.path.rotation import angular_acceleration, angular_velocity, rotation_matrix
@@ -35,7 +35,7 @@ class ContactLoad:
 
     force: Expression
     moment: Expression
-    arms: tuple[Expression, Expression]
+    arms: Both
     axes: Expression
     friction: Expression
 
@@ -46,23 +46,26 @@ class HeldLoad:
 
     Attributes:
         normal, tangential: (2,) normal forces and magnitudes of the tangential ones [N].
-        force_1, force_2: (3,) on the payload [N].
-        shift_1, shift_2: (3,) of the centres of pressure [m].
-        moment_1, moment_2: (3,) on the payload about the nominal contact points [N m].
+        forces: (3,) each, on the payload [N].
+        shifts: (3,) each, of the centres of pressure [m].
+        moments: (3,) each, on the payload about the nominal contact points [N m].
         point_residual, residual: (3,) moment missing with the forces at the nominal points, and
             with the moments [N m].
     """
 
     normal: Expression
     tangential: Expression
-    force_1: Expression
-    force_2: Expression
-    shift_1: Expression
-    shift_2: Expression
-    moment_1: Expression
-    moment_2: Expression
+    forces: Both
+    shifts: Both
+    moments: Both
     point_residual: Expression
     residual: Expression
+
+    @property
+    def wrenches(self) -> Both:
+        """(6,) each, force and moment."""
+        first, second = (ca.vertcat(*pair) for pair in zip(self.forces, self.moments, strict=True))
+        return first, second
 
 
 def held_by(
@@ -84,20 +87,11 @@ def held_by(
 def _by_paper(asked: ContactLoad) -> HeldLoad:
     """Least forces first; then the least shifts of the pressure that carry the moment."""
     axes, mu = asked.axes, asked.friction
-    forces = allocate(asked.force, axes[:, 2], (mu[0], mu[1]))
-    pushed = (forces.force_1, forces.force_2)
-    shift = pressure_shift(asked.moment, asked.arms, pushed, (axes[:, 0], axes[:, 1]))
-    return HeldLoad(
-        forces.normal,
-        forces.tangential,
-        *pushed,
-        shift.shift_1,
-        shift.shift_2,
-        ca.cross(shift.shift_1, forces.force_1),
-        ca.cross(shift.shift_2, forces.force_2),
-        shift.point_residual,
-        shift.residual,
-    )
+    normal, tangential, forces = allocate(asked.force, axes[:, 2], (mu[0], mu[1]))
+    tangents = axes[:, 0], axes[:, 1]
+    shifts, point, residual = pressure_shift(asked.moment, asked.arms, forces, tangents)
+    moments = ca.cross(shifts[0], forces[0]), ca.cross(shifts[1], forces[1])
+    return HeldLoad(normal, tangential, forces, shifts, moments, point, residual)
 
 
 def _by_soft_fingers(workcell: Workcell, asked: ContactLoad, detached: Detached | None) -> HeldLoad:
@@ -125,12 +119,9 @@ def _by_soft_fingers(workcell: Workcell, asked: ContactLoad, detached: Detached 
     return HeldLoad(
         held.normal,
         ca.vertcat(*tangential),
-        force_1,
-        force_2,
-        none,
-        none,
-        moment_1,
-        moment_2,
+        (force_1, force_2),
+        (none, none),
+        (moment_1, moment_2),
         point,
         point - moment_1 - moment_2,
     )
@@ -184,19 +175,17 @@ def load_function(workcell: Workcell) -> ca.Function:
     Inputs: pose, rate, second_rate (6,) as in `symbolic.path.time_law.TimedPath`.
     Outputs: see `LOAD_OUTPUTS`.
     """
-    closed, payload = workcell.has_closed_form, workcell.payload
-    kind = ca.SX if closed else ca.MX
-    names = ["pose", "rate", "second_rate"]
-    motion = [kind.sym(name, 6) for name in names]
-    own = [frictions(workcell), ca.SX(number(payload.centre_of_mass))]
-    given: dict[str, ca.SX | ca.MX] = sx_given(payload)
-    if not closed:
-        handed = mx_given(payload)
-        own = [as_mx(value, given, handed) for value in own]
-        given = handed
-    outputs = uncertain_load_function(workcell).call([*motion, *own, *given.values()])
-    inputs = [*motion, *given.values()]
-    return ca.Function("load", inputs, outputs, [*names, *given], list(LOAD_OUTPUTS))
+    payload = workcell.payload
+    own: list[Expression] = [frictions(workcell), ca.SX(number(payload.centre_of_mass))]
+    if workcell.has_closed_form:
+        kind, given = ca.SX, sx_given(payload)
+    else:
+        kind, given = ca.MX, mx_given(payload)
+        own = [as_mx(value, sx_given(payload), given) for value in own]
+    inputs = {name: kind.sym(name, 6) for name in ("pose", "rate", "second_rate")}
+    outputs = uncertain_load_function(workcell).call([*inputs.values(), *own, *given.values()])
+    named = dict(zip(LOAD_OUTPUTS, outputs, strict=True))
+    return named_function("load", inputs | given, named, cse=False)
 
 
 def frictions(workcell: Workcell) -> ca.SX:
@@ -237,7 +226,7 @@ def closed_load_function(workcell: Workcell, allocation: Allocation) -> ca.Funct
     inputs = {name: ca.SX.sym(name, size) for name, size in SIZES.items()}
     pose, rate, second, friction, centre_of_mass = inputs.values()
     contacts = workcell.contacts
-    rotation, omega, alpha, force, moment = _required(workcell, pose, rate, second, centre_of_mass)
+    rotation, omega, alpha, force, moment = required(workcell, pose, rate, second, centre_of_mass)
     points = [number(contact.T_box_pad[:3, 3]) for contact in contacts]
     arms = [ca.mtimes(rotation, point - centre_of_mass) for point in points]
     axes = ca.mtimes(rotation, number(contacts[0].T_box_pad[:3, :3]))
@@ -249,14 +238,14 @@ def closed_load_function(workcell: Workcell, allocation: Allocation) -> ca.Funct
         "angular_acceleration": alpha,
         "normal_force": held.normal,
         "tangential_force": held.tangential,
-        "contact_force": ca.vertcat(held.force_1, held.force_2),
-        "pressure_shift": ca.vertcat(_length(held.shift_1), _length(held.shift_2)),
-        "shift_vector": ca.vertcat(held.shift_1, held.shift_2),
+        "contact_force": ca.vertcat(*held.forces),
+        "pressure_shift": ca.vertcat(*map(_length, held.shifts)),
+        "shift_vector": ca.vertcat(*held.shifts),
         "required_moment": moment,
         "point_moment_residual": held.point_residual,
         "moment_residual": held.residual,
-        "wrench_1": ca.vertcat(held.force_1, held.moment_1),
-        "wrench_2": ca.vertcat(held.force_2, held.moment_2),
+        "wrench_1": held.wrenches[0],
+        "wrench_2": held.wrenches[1],
     }
     outputs = {name: ca.densify(value) for name, value in outputs.items()}
     return _named(inputs | sx_given(workcell.payload), outputs)
@@ -297,9 +286,10 @@ def _grasp_load_function(workcell: Workcell) -> ca.Function:
     names = ("angular_velocity", "angular_acceleration", "force", "required_moment")
     given = [ca.SX.sym(name, size) for name, size in SIZES.items() if name != "friction"]
     numbers, handed = sx_given(workcell.payload), mx_given(workcell.payload)
-    required = ca.Function("required", [*given, *numbers.values()], _required(workcell, *given)[1:])
+    of_motion = required(workcell, *given)[1:]
     asked_of = [inputs[name] for name in SIZES if name != "friction"]
-    found = required(*asked_of, *handed.values())
+    function = ca.Function("required", [*given, *numbers.values()], of_motion)
+    found = function(*asked_of, *handed.values())
     outputs = dict(zip(names, found, strict=True))
     asked = (inputs["pose"], outputs["force"], outputs["required_moment"])
     further = (inputs["friction"], inputs["centre_of_mass"], *handed.values())
@@ -313,8 +303,8 @@ def _named(inputs: dict[str, ca.MX], outputs: dict[str, ca.MX]) -> ca.Function:
     return named_function("uncertain_load", inputs, ordered, cse=False)
 
 
-def _required(
-    workcell: Workcell, pose: ca.SX, rate: ca.SX, second: ca.SX, centre_of_mass: ca.SX
+def required(
+    workcell: Workcell, pose: ca.SX, rate: ca.SX, second: ca.SX, centre_of_mass: ca.SX | ca.DM
 ) -> list[ca.SX]:
     """R_world_box (3, 3), the angular velocity and acceleration, and the force and moment about the
     centre of mass that the motion asks for, (3,) each, world."""

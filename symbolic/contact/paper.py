@@ -18,31 +18,16 @@ left over.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import casadi as ca
 
 from symbolic.expression import Expression
 from symbolic.records.quantities import GRAVITY
 
+Both = tuple[Expression, Expression]
+"""One value per contact."""
+
 TANGENT_FLOOR = 1e-9
 """Added in squares below the root of the tangential force [N]: keeps derivatives finite."""
-
-
-@dataclass(frozen=True)
-class ContactForces:
-    """Forces that the robots exert on the box, world frame.
-
-    Attributes:
-        normal: (2,) normal forces N_1, N_2 [N].
-        tangential: (2,) magnitudes of the tangential forces [N].
-        force_1, force_2: (3,) contact forces [N].
-    """
-
-    normal: Expression
-    tangential: Expression
-    force_1: Expression
-    force_2: Expression
 
 
 def required_force(
@@ -86,13 +71,19 @@ def normal_force_branches(
     )
 
 
-def allocate(force: Expression, normal: Expression, friction: tuple[float, float]) -> ContactForces:
+def allocate(
+    force: Expression, normal: Expression, friction: tuple[float, float]
+) -> tuple[Expression, Expression, Both]:
     """Minimum-effort contact forces for a resultant force.
 
     Args:
         force: (3,) resultant force on the box, world frame [N].
         normal: (3,) unit normal of contact 1 in the world frame; contact 2 has its opposite.
         friction: Coulomb coefficients of the two contacts.
+
+    Returns:
+        Normal forces (2,), magnitudes of the tangential ones (2,), and both contact forces (3,),
+        world frame [N].
     """
     f_n, f_t, direction = split_force(force, normal)
     n_2 = ca.mmax(normal_force_branches(f_n, f_t, friction))
@@ -100,12 +91,8 @@ def allocate(force: Expression, normal: Expression, friction: tuple[float, float
     # Equal shares cost least; the friction cones push the share away from one half.
     t_1 = ca.fmin(ca.fmax(f_t / 2.0, f_t - friction[1] * n_2), friction[0] * n_1)
     t_2 = f_t - t_1
-    return ContactForces(
-        normal=ca.vertcat(n_1, n_2),
-        tangential=ca.vertcat(t_1, t_2),
-        force_1=n_1 * normal + t_1 * direction,
-        force_2=-n_2 * normal + t_2 * direction,
-    )
+    forces = n_1 * normal + t_1 * direction, -n_2 * normal + t_2 * direction
+    return ca.vertcat(n_1, n_2), ca.vertcat(t_1, t_2), forces
 
 
 # --- centres of pressure ---
@@ -121,24 +108,6 @@ rounding over the damping is the error that remains.
 REFINEMENTS = 7
 """Repeated solves for what is left (iterated Tikhonov regularisation): they take the damping's
 own error to its eighth power, below rounding wherever a moment can be had at all."""
-
-
-@dataclass(frozen=True)
-class PressureShift:
-    """Shifts of the centres of pressure and the moments around them, world frame.
-
-    Attributes:
-        shift_1, shift_2: (3,) in the tangent planes of the contacts [m].
-        required_moment: (3,) about the centre of mass, needed by the motion [N m].
-        point_residual: (3,) moment missing with the forces at the nominal points [N m].
-        residual: (3,) moment missing with the shifts applied [N m].
-    """
-
-    shift_1: Expression
-    shift_2: Expression
-    required_moment: Expression
-    point_residual: Expression
-    residual: Expression
 
 
 def required_moment(
@@ -162,7 +131,7 @@ def pressure_shift(
     arms: tuple[Expression, Expression],
     forces: tuple[Expression, Expression],
     tangents: tuple[Expression, Expression],
-) -> PressureShift:
+) -> tuple[Both, Expression, Expression]:
     """Least-norm shifts of both centres of pressure (Eqs. 54-59).
 
     Args:
@@ -171,6 +140,10 @@ def pressure_shift(
         forces: (3,) each, contact forces on the box [N].
         tangents: two orthonormal tangent vectors (3, 2) spanning both contact planes, which
             are parallel; the two entries are the columns.
+
+    Returns:
+        Shifts (3,) in the tangent planes [m], and the moment (3,) that is missing with the forces
+        at the nominal points, and with the shifts applied, world frame [N m].
     """
     point_residual = moment - ca.cross(arms[0], forces[0]) - ca.cross(arms[1], forces[1])
     plane = ca.horzcat(*tangents)
@@ -184,13 +157,8 @@ def pressure_shift(
     for _ in range(REFINEMENTS):
         dual += _solve_symmetric_3(damped, point_residual - ca.mtimes(gram, dual))
     shifts = ca.mtimes(lever.T, dual)
-    return PressureShift(
-        shift_1=ca.mtimes(plane, shifts[:2]),
-        shift_2=ca.mtimes(plane, shifts[2:]),
-        required_moment=moment,
-        point_residual=point_residual,
-        residual=point_residual - ca.mtimes(lever, shifts),
-    )
+    moved = ca.mtimes(plane, shifts[:2]), ca.mtimes(plane, shifts[2:])
+    return moved, point_residual, point_residual - ca.mtimes(lever, shifts)
 
 
 def _solve_symmetric_3(matrix: Expression, right: Expression) -> Expression:

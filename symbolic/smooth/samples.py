@@ -26,15 +26,10 @@ from numpy.typing import NDArray
 
 from symbolic.array import Array
 from symbolic.contact.grasp import Grasp
-from symbolic.contact.load import ContactLoad, frictions, held_by, resultant_force
-from symbolic.contact.paper import (
-    normal_force_branches,
-    required_moment,
-    split_force,
-)
+from symbolic.contact.load import ContactLoad, frictions, held_by, required
+from symbolic.contact.paper import normal_force_branches, split_force
 from symbolic.contact.soft_grasp import SoftGrasp
 from symbolic.expression import mx_given, named_function, number, of, repeated, sx_given
-from symbolic.path.rotation import angular_acceleration, angular_velocity, rotation_matrix
 from symbolic.path.spline import PathBasis, sample_basis, waypoint_matrix
 from symbolic.path.time_law import timed_path
 from symbolic.records.cell import Workcell
@@ -59,6 +54,9 @@ corrects at every round's candidate."""
 
 INPUTS = ("x", "basis", "rounding")
 """Inputs of every function of samples."""
+
+MOTION = ("pose", "rate", "second_rate")
+"""Of the box at a sample, (6,) each."""
 
 WINDOW = 5
 """Samples that the motion at one of them depends on with the constant-speed law."""
@@ -202,7 +200,7 @@ def _whole_path(
     x, unused = ca.MX.sym("x", task.n_var), ca.MX.sym("basis", len(task.waypoints), task.samples)
     rounding, handed = ca.MX.sym("rounding"), mx_given(task, workcell.payload)
     every, wrench = tuple(range(task.samples)), _wrench_function(workcell)
-    motion = [ca.SX.sym(name, 6) for name in ("pose", "rate", "second_rate")]
+    motion = [ca.SX.sym(name, 6) for name in MOTION]
     held = sx_given(workcell.payload).values()
     whole = ca.Function("sample", [*motion, *held], [sample(wrench(*motion, *held), *held)])
     waypoints = waypoint_matrix(task, x, of(handed, task))
@@ -233,17 +231,12 @@ def _at_samples(
 def _wrench_function(workcell: Workcell) -> ca.Function:
     """pose, rate, second_rate (6,) of a sample to the required force and moment (6,) about the
     centre of mass, in the box's frame [N, N m]."""
-    pose, rate, second = (ca.SX.sym(name, 6) for name in ("pose", "rate", "second_rate"))
-    payload, turned = workcell.payload, workcell.task.orientation
-    rotation = rotation_matrix(turned, pose[3:])
-    omega = angular_velocity(turned, pose[3:], rate[3:])
-    alpha = angular_acceleration(turned, pose[3:], rate[3:], second[3:])
-    offset = ca.mtimes(rotation, number(payload.centre_of_mass))
-    force = resultant_force(payload.mass, offset, omega, alpha, second[:3])
-    moment = required_moment(ca.SX(number(payload.inertia)), rotation, omega, alpha)
+    payload = workcell.payload
+    pose, rate, second = motion = [ca.SX.sym(name, 6) for name in MOTION]
+    centre = number(payload.centre_of_mass)
+    rotation, *_, force, moment = required(workcell, pose, rate, second, centre)
     wrench = ca.vertcat(ca.mtimes(rotation.T, force), ca.mtimes(rotation.T, moment))
-    given = sx_given(payload).values()
-    return ca.Function("sample_wrench", [pose, rate, second, *given], [wrench])
+    return ca.Function("sample_wrench", [*motion, *sx_given(payload).values()], [wrench])
 
 
 def _margin_function(workcell: Workcell) -> ca.Function:
@@ -251,7 +244,7 @@ def _margin_function(workcell: Workcell) -> ca.Function:
     allocation: where the patches suffice the joint one is the paper's."""
     wrench, contacts = ca.SX.sym("wrench", 6), workcell.contacts
     shift = held_by(workcell, "paper", _asked(workcell, wrench))
-    squares = ca.vertcat(ca.sumsqr(shift.shift_1), ca.sumsqr(shift.shift_2))
+    squares = ca.vertcat(*map(ca.sumsqr, shift.shifts))
     radius = ca.vertcat(*[ca.SX(number(contact.patch_radius)) for contact in contacts])
     given = sx_given(workcell.payload).values()
     return ca.Function("sample_margin", [wrench, *given], [1.0 - squares / radius**2])

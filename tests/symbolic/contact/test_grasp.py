@@ -117,8 +117,8 @@ def slack(case: Case, forces: Array, shifts: Array, torsion: Array) -> tuple[Arr
 
 def regimes(case: Case, forces: Array, shifts: Array, torsion: Array) -> set[str]:
     friction, rim = slack(case, forces, shifts, torsion)
-    by_paper = allocate(ca.DM(case.force), ca.DM([0, 0, 1]), (case.friction[0], case.friction[1]))
-    paper = effort(np.array([by_paper.force_1, by_paper.force_2]).reshape(2, 3))
+    mu = case.friction[0], case.friction[1]
+    paper = effort(np.reshape(allocate(ca.DM(case.force), ca.DM([0, 0, 1]), mu)[2], (2, 3)))
     found = {REGIMES[1] if effort(forces) > (1.0 + 1e-5) * paper else REGIMES[0]}
     for i in (0, 1):
         found |= {f"pressure at the rim {i + 1}"} if rim[i] < 1e-4 else set()

@@ -221,7 +221,7 @@ _shift = pressure_shift(_moment, _arms, _forces, _tangents)
 SHIFT = ca.Function(
     "shift",
     [_moment, *_arms, *_forces, *_tangents],
-    [_shift.shift_1, _shift.shift_2, _shift.point_residual, _shift.residual],
+    [*_shift[0], *_shift[1:]],
     ["moment", "arm_1", "arm_2", "force_1", "force_2", "tangent_1", "tangent_2"],
     ["shift_1", "shift_2", "point_residual", "residual"],
 )
