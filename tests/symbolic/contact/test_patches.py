@@ -213,18 +213,16 @@ def test_barrier_is_the_determinants(seed: int) -> None:
         )
 
 
-_moment = ca.SX.sym("moment", 3)
-_arms = (ca.SX.sym("arm_1", 3), ca.SX.sym("arm_2", 3))
-_forces = (ca.SX.sym("force_1", 3), ca.SX.sym("force_2", 3))
-_tangents = (ca.SX.sym("tangent_1", 3), ca.SX.sym("tangent_2", 3))
-_shift = pressure_shift(_moment, _arms, _forces, _tangents)
-SHIFT = ca.Function(
-    "shift",
-    [_moment, *_arms, *_forces, *_tangents],
-    [*_shift[0], *_shift[1:]],
-    ["moment", "arm_1", "arm_2", "force_1", "force_2", "tangent_1", "tangent_2"],
-    ["shift_1", "shift_2", "point_residual", "residual"],
-)
+def _shift() -> ca.Function:
+    names = ("moment", "arm_1", "arm_2", "force_1", "force_2", "tangent_1", "tangent_2")
+    moment, *pairs = symbols = [ca.SX.sym(name, 3) for name in names]
+    arms, forces, tangents = (tuple(pairs[k : k + 2]) for k in (0, 2, 4))
+    shifts, point, residual = pressure_shift(moment, arms, forces, tangents)
+    outputs = ["shift_1", "shift_2", "point_residual", "residual"]
+    return ca.Function("shift", symbols, [*shifts, point, residual], list(names), outputs)
+
+
+SHIFT = _shift()
 
 
 def random_case(seed: int) -> tuple[list[Array], Array]:
