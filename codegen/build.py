@@ -328,18 +328,9 @@ def load_or_build_program(
     return _obtained(full, source, cache)[name].handle
 
 
-def c_text(package: str, names: Sequence[str], constants: Mapping[str, float] | None = None) -> str:
-    """C files of a package, one after the other, with values in place of every @NAME@.
-
-    Args:
-        package: that they are in.
-        names: of the files, in order.
-        constants: by name.
-    """
-    text = "\n".join(files(package).joinpath(name).read_text() for name in names)
-    for name, value in (constants or {}).items():
-        text = text.replace(f"@{name}@", repr(value))
-    return text
+def c_text(package: str, names: Sequence[str]) -> str:
+    """C files of a package, one after the other."""
+    return "\n".join(files(package).joinpath(name).read_text() for name in names)
 
 
 def load_or_build_library(name: str, text: str, cache: Cache | None = None) -> ctypes.CDLL:

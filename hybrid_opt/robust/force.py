@@ -17,7 +17,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import brentq
 
-from codegen.cache import Cache
 from codegen.function import NumericFunction
 from hybrid_opt.carry import Carry
 from hybrid_opt.compiled_cell import held_function, kept_per_workcell
@@ -173,7 +172,7 @@ class RobustModel:
         workcell: the cell.
     """
 
-    def __init__(self, workcell: Workcell, cache: Cache | None = None) -> None:
+    def __init__(self, workcell: Workcell) -> None:
         """Load or build the functions of pads that have one squeeze; those of others when first
         asked.
 
@@ -182,7 +181,7 @@ class RobustModel:
             DualArmError: a function cannot be built.
         """
         check_pads(workcell)
-        self.workcell, self._cache = workcell, cache
+        self.workcell = workcell
         self._functions: dict[tuple[object, ...], NumericFunction] = {}
         # Many motions are asked about under a few sets.
         self._worst = lru_cache(maxsize=8)(self._checked_cases)
@@ -196,7 +195,7 @@ class RobustModel:
         key = (make.__name__, *given.values())
         if key not in self._functions:
             name, of = " ".join(map(str, key)), partial(make, **given)
-            self._functions[key] = held_function(self.workcell, name, of, self._cache, lanes=0)
+            self._functions[key] = held_function(self.workcell, name, of, lanes=0)
         return self._functions[key]
 
     def _squeeze(self, commanded: int, displaced: bool) -> NumericFunction:

@@ -82,18 +82,15 @@ class PathPoints:
         return BoxMotion(self.pose, rate, second)
 
 
+LEADER, FOLLOWER = 0, 1
+"""The arm that keeps its place along paths, and the other."""
+
+
 class RobustPath:
-    """The compiled functions behind robust forces along paths of one workcell.
+    """The compiled functions behind robust forces along paths of one workcell."""
 
-    Attributes:
-        leader: index of the arm that keeps its place.
-    """
-
-    def __init__(self, workcell: Workcell, leader: int = 0) -> None:
+    def __init__(self, workcell: Workcell) -> None:
         """Load or build the compiled functions.
-
-        Args:
-            leader: index of the arm that keeps its place.
 
         Raises:
             SettingsError: the pads do not face one another, or the workcell's set leaves no
@@ -105,8 +102,8 @@ class RobustPath:
                 "limits and slopes of robust forces need two round pads that face one another, or "
                 "task.allocation = 'soft-finger' and two pads with opposite normals"
             )
-        self.leader, self._set, self._model = leader, workcell.uncertainty, robust_model(workcell)
-        self._cases = self._model.worst_cases(self._set, leader)
+        self._set, self._model = workcell.uncertainty, robust_model(workcell)
+        self._cases = self._model.worst_cases(self._set, LEADER)
         # Slopes add up in loops, for which there is no form in lanes.
         self._slopes = held_function(workcell, "case slopes", case_slopes_function, lanes=1)
         self._difference = held_function(
@@ -120,8 +117,8 @@ class RobustPath:
             (n, 2) forces of both robots [N], and (n, 2, 20) their derivatives by pose, its
             derivatives by u, u'' and u'^2.
         """
-        least = self._model.least_squeeze(points.motion, self._cases, self.leader)
-        ruling = ruling_cases(least, self._set, self.leader)
+        least = self._model.least_squeeze(points.motion, self._cases, LEADER)
+        ruling = ruling_cases(least, self._set, LEADER)
         return ruling.force, self.slopes(points, ruling)
 
     def ruling_beyond(
@@ -132,27 +129,24 @@ class RobustPath:
 
         Most cases are seen to need less by a pressure that shares everything evenly.
         """
-        n, k, follower = len(points), len(self._cases), 1 - self.leader
+        n, k = len(points), len(self._cases)
         every, cases = repeated(points.motion, k), np.repeat(self._cases, n, axis=0)
         parts = every.pose, every.rate, every.second_rate
         difference = self._difference.batch(*parts, cases)["difference"].reshape(k, n)
-        sign = 1.0 if self.leader == 0 else -1.0
-        felt = (felt_share(sign * difference, self._set) * sign * difference).max(axis=0)
+        felt = (felt_share(difference, self._set) * difference).max(axis=0)
         room = level - np.maximum(felt, 0.0)
-        left = ~(self._model.slack(every, cases, np.tile(room, k), self.leader) > 0.0)
+        left = ~(self._model.slack(every, cases, np.tile(room, k), LEADER) > 0.0)
         found = np.full((k * n, 2), BELOW)
         if left.any():
             wanted = every.at(left), cases[left]
-            found[left] = self._model.least(*wanted, self.leader, 1, displaced=False)
+            found[left] = self._model.least(*wanted, LEADER, 1, displaced=False)
         least = found.reshape(k, n, 2)
-        rows = np.flatnonzero(least[:, :, follower].max(axis=0) > room)
+        rows = np.flatnonzero(least[:, :, FOLLOWER].max(axis=0) > room)
         # A case that leaves the force below the level can yet be the one that the leader feels.
         known = least[:, rows]
-        missing = known[:, :, follower] == BELOW
-        known[:, :, self.leader] = np.where(
-            missing, BELOW, known[:, :, follower] + sign * difference[:, rows]
-        )
-        return rows, ruling_cases(known, self._set, self.leader, sign * difference[:, rows])
+        own, beyond = known[:, :, FOLLOWER], difference[:, rows]
+        known[:, :, LEADER] = np.where(own == BELOW, BELOW, own + beyond)
+        return rows, ruling_cases(known, self._set, LEADER, beyond)
 
     def most_demanding(self, points: PathPoints, count: int) -> tuple[Array, Array]:
         """Forces of the cases that ask for most: where they rule in turn, each has its own slope.
@@ -161,16 +155,15 @@ class RobustPath:
             (n, 2, count) forces of both robots [N], the largest first, and their slopes
             (n, 2, count, 20).
         """
-        n, leader, follower = len(points), self.leader, 1 - self.leader
-        least = self._model.least_squeeze(points.motion, self._cases, leader)
-        ruling = ruling_cases(least, self._set, leader)
-        first = np.argsort(-least[:, :, follower], axis=0)[:count]
-        beyond = ruling.force[:, leader] - ruling.force[:, follower]
+        n, least = len(points), self._model.least_squeeze(points.motion, self._cases, LEADER)
+        ruling = ruling_cases(least, self._set, LEADER)
+        first = np.argsort(-least[:, :, FOLLOWER], axis=0)[:count]
+        beyond = ruling.force[:, LEADER] - ruling.force[:, FOLLOWER]
         force, slope = np.empty((n, 2, count)), np.empty((n, 2, count, BY_TIMING.stop))
         for j, case in enumerate(first):
             one = replace(ruling, commanded=case)
-            force[:, follower, j] = least[case, np.arange(n), follower]
-            force[:, leader, j] = force[:, follower, j] + beyond
+            force[:, FOLLOWER, j] = least[case, np.arange(n), FOLLOWER]
+            force[:, LEADER, j] = force[:, FOLLOWER, j] + beyond
             slope[:, :, j] = self.slopes(points, one)
         return force, slope
 

@@ -232,7 +232,9 @@ class Grasp:
         ]
         return np.array(ca.evalf(ca.horzcat(*parts))).T
 
-    def solved(self, cell: list[ca.MX], given: Sequence[ca.MX], differentiable: bool) -> ca.MX:
+    def solved(
+        self, cell: list[ca.MX], given: Sequence[ca.MX], differentiable: bool = False
+    ) -> ca.MX:
         """What is `told` of the least effort [N, N m], beyond any limit where friction does not
         close the grasp.
 
@@ -296,7 +298,6 @@ def grasp_wrenches(
     load: ca.MX,
     friction: ca.MX,
     given: Sequence[ca.MX] = (),
-    differentiable: bool = False,
 ) -> ca.MX:
     """Per pad (6,) side by side: N, T (2,) [N], the first moment N d (2,) and M [N m], of least
     effort, in its pad's axes. Friction that does not close the grasp gives normal forces beyond
@@ -306,9 +307,8 @@ def grasp_wrenches(
         load: (6,) force and moment about the box frame's origin, along the box's axes.
         friction: (2,) Coulomb coefficients of the robots' pads.
         given: the grasp's given numbers, where they are symbols.
-        differentiable: whether first derivatives are wanted.
     """
-    return grasp.solved([load, friction], given, differentiable)
+    return grasp.solved([load, friction], given)
 
 
 def whole_wrench(wrench: ca.SX) -> ca.SX:

@@ -69,9 +69,9 @@ class Hermitian:
         return cls((entries[0], entries[1], entries[2]), (below[0], below[1], below[2]))
 
     @property
-    def entries(self) -> list[ca.SX]:
+    def vector(self) -> ca.SX:
         """What `of` takes."""
-        return [*self.diagonal, *(part for number in self.below for part in number)]
+        return ca.vertcat(*self.diagonal, *(part for number in self.below for part in number))
 
     def at(self, i: int, j: int) -> Complex:
         """One entry."""
@@ -82,15 +82,11 @@ class Hermitian:
 
     def scaled(self, factor: ca.SX) -> Hermitian:
         """Times a real number."""
-        return Hermitian.of(ca.vertcat(*self.entries) * factor)
+        return Hermitian.of(self.vector * factor)
 
     def less(self, other: Hermitian) -> Hermitian:
         """This one less another one."""
-        return Hermitian.of(ca.vertcat(*self.entries) - ca.vertcat(*other.entries))
-
-    def moved(self, change: Hermitian, length: ca.SX) -> Hermitian:
-        """The matrix after a share `length` of a change."""
-        return Hermitian.of(ca.vertcat(*self.entries) + length * ca.vertcat(*change.entries))
+        return Hermitian.of(self.vector - other.vector)
 
     def adjugate(self) -> Hermitian:
         """Whose product with this matrix is the determinant times one."""
@@ -295,11 +291,12 @@ class LocalDisc:
         lowest = _lowest(self._matrix, self._adjugate, matrix)
 
         def second_order() -> ca.SX:
-            return ca.vertcat(*hermitian_part(multiplied(by_row, turned.rows)).entries)
+            return hermitian_part(multiplied(by_row, turned.rows)).vector
 
         def gap_after(length: ca.SX) -> ca.SX:
-            after = self._matrix.moved(matrix, length)
-            return after.trace_with(multiplier.moved(turned, length))
+            after = self._matrix.vector + length * matrix.vector
+            held = Hermitian.of(multiplier.vector + length * turned.vector)
+            return Hermitian.of(after).trace_with(held)
 
         return Step(
             ca.vertcat(moved, *_numbers(turned)),
@@ -312,7 +309,7 @@ class LocalDisc:
 
 def _numbers(multiplier: Hermitian) -> list[ca.SX]:
     """Without what is zero at z's place."""
-    *first, _, last = multiplier.entries
+    *first, _, last = ca.vertsplit(multiplier.vector)
     return [*first, last]
 
 

@@ -271,14 +271,12 @@ def points_of(seed: int) -> PathPoints:
     return PathPoints(motion().pose, first, second, a, w)
 
 
-@pytest.mark.parametrize("leader", [0, 1])
-def test_forces_and_slopes_are_those_of_the_motion(leader: int) -> None:
+def test_forces_and_slopes_are_those_of_the_motion() -> None:
     points, cell = points_of(7), model().workcell
-    robust = RobustPath(cell, leader=leader)
+    robust = RobustPath(cell)
     value, whole = robust.at(points)
-    needed = model().robust_force(points.motion, leader=leader)
-    both = [needed.leading, needed.commanded]
-    expected = np.stack(both if leader == 0 else both[::-1], axis=1)
+    needed = model().robust_force(points.motion)
+    expected = np.stack([needed.leading, needed.commanded], axis=1)
     np.testing.assert_allclose(value, expected, rtol=1e-7)
     names = ("pose", "first", "second", "a", "w")
     for k, entry in ((0, [0]), (1, [4]), (2, [2]), (3, []), (4, [])):

@@ -223,10 +223,9 @@ def random_load(rng: np.random.Generator) -> Array:
     return np.concatenate([force, rng.normal(size=3) * rng.choice([0.1, 1.0, 5.0])])
 
 
-def function_of(cell: Workcell, differentiable: bool = False) -> ca.Function:
+def function_of(cell: Workcell) -> ca.Function:
     load, friction = ca.MX.sym("load", 6), ca.MX.sym("friction", 2)
-    found = grasp_wrenches(Grasp(cell), load, friction, differentiable=differentiable)
-    return ca.Function("grasp", [load, friction], [found])
+    return ca.Function("grasp", [load, friction], [grasp_wrenches(Grasp(cell), load, friction)])
 
 
 def friction_of(cell: Workcell) -> list[float]:
