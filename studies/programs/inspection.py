@@ -304,9 +304,8 @@ def draw(
         SettingsError: the folder cannot be made.
     """
     # Not imported at the top: without pictures nothing of it is needed.
-    from studies.report.drawing import in_style, save, settled
-    from studies.report.drawn import DrawnCarry, reach_map
-    from studies.report.pictures_cell import environment, meeting, reachable_regions
+    from studies.report.drawing import DrawnCarry, in_style, save, settled
+    from studies.report.pictures_cell import environment, meeting, reach_map, reachable_regions
 
     _made(output)
     geometry, initial = cell.geometry, DrawnCarry("", carries["initial"])

@@ -30,9 +30,11 @@ def _add_options(parser: Parser) -> None:
 
 
 def _run(options: argparse.Namespace) -> int:
+    from hybrid_opt.campaign.settings import STAGES
     from hybrid_opt.progress import Progress
-    from hybrid_opt.work.service import warm_up
-    from studies.report.stage import follow_looks, rewrite
+    from hybrid_opt.store.files import read_json
+    from hybrid_opt.work.service import LocalExecutor, warm_up
+    from studies.report.stage import follow_looks, write
 
     if options.into:
         from studies.report.generate import insert_tables
@@ -42,7 +44,12 @@ def _run(options: argparse.Namespace) -> int:
         follow_looks(options.results, options)
     else:
         warm_up("studies.report.generate")
-        rewrite(options.results, Progress(not options.quiet), options.pdf)
+        marker = options.results / STAGES / "report.json"
+        stored = read_json(marker) if marker.exists() else {}
+        made = stored.get("settings", {}) if isinstance(stored, dict) else {}
+        pdf = options.pdf or bool(made.get("pdf", True))
+        settings = {"with_paper": bool(made.get("with_paper")), "pdf": pdf}
+        write(options.results, settings, Progress(not options.quiet), LocalExecutor(0))
         print(f"Report: {options.results / 'report.html'}")
     return 0
 

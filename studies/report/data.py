@@ -17,7 +17,7 @@ from hybrid_opt.campaign.settings import CONFIGURATION, HAND_MADE, RECOMMENDED, 
 from hybrid_opt.campaign.stages import ReadyCell, cells_of, read_branches, ready_cells
 from hybrid_opt.display.table import Table
 from hybrid_opt.errors import ResultsError
-from hybrid_opt.evaluate.evaluation import CandidateEvaluator, Evaluations
+from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.evaluate.objectives import (
     OBJECTIVES,
     PAPER_OBJECTIVES,
@@ -32,8 +32,10 @@ from hybrid_opt.store.trajectory_file import read_trajectory
 from hybrid_opt.timing.analysis import TimingDocument, read_timing
 from hybrid_opt.timing.records import TimingLimits
 from hybrid_opt.work.service import Executor, LocalExecutor, Service, answer_all, called
-from studies.report.drawn import DrawnCarry, ReachMap, reach_map
+from studies.report.drawing import RECOMMENDED as RECOMMENDED_LOOK
+from studies.report.drawing import DrawnCarry, LineStyle, series
 from studies.report.page_carries import RECOMMENDED_LABEL, DrawnJob, drawn_job, recommended_job
+from studies.report.pictures_cell import ReachMap, reach_map
 from studies.study.recommendation import drivable_root, is_drivable
 from studies.study.simulation import TIMING, StoredSimulation, limits_on_jerk, read_simulations
 from studies.study.summary import CampaignSummary, ReplicaFigures, read_summary
@@ -54,16 +56,25 @@ class Run:
     """One replica of one algorithm.
 
     Attributes:
-        evaluations: every candidate that the search evaluated.
         front: what the search found.
         hybrid: what the polish made of it, None without a polish.
         figures: indicators of both, as in summary.json.
     """
 
-    evaluations: Evaluations
     front: Front
     hybrid: Front | None
     figures: ReplicaFigures
+
+    @property
+    def feasible(self) -> Array:
+        """(k, n_obj) objectives of the search's feasible candidates."""
+        found = self.front.evaluations
+        return found.objectives[found.feasible]
+
+    @property
+    def fronts(self) -> tuple[Front, ...]:
+        """What the search found, and what the polish made of it, where it has members."""
+        return (self.front, *([self.hybrid] if self.hybrid else []))
 
 
 @dataclass(frozen=True)
@@ -72,7 +83,7 @@ class AlgorithmRuns:
 
     Attributes:
         name, title: on the command line, and for people.
-        index: its place in the campaign, which decides its look.
+        look: of all that is drawn of it, by its place in the campaign.
         runs: the replicas.
         representative: position in `runs` of the one with the largest hypervolume, which the
             figures of single runs show (the paper's 'best-performing run').
@@ -82,7 +93,7 @@ class AlgorithmRuns:
 
     name: str
     title: str
-    index: int
+    look: LineStyle
     runs: tuple[Run, ...]
     representative: int
     best: DrawnCarry | None
@@ -129,11 +140,8 @@ class Experiment:
     def fronts(self) -> Iterator[tuple[AlgorithmRuns, Front, bool]]:
         """Fronts of the representative runs, and whether a polished one stands beside each."""
         for algorithm in self.solved:
-            run = algorithm.shown
-            polished = run.hybrid if run.hybrid is not None and len(run.hybrid) else None
-            yield algorithm, run.front, polished is not None
-            if polished is not None:
-                yield algorithm, polished, False
+            found = algorithm.shown.fronts
+            yield from ((algorithm, front, front is not found[-1]) for front in found)
 
     def driven(self, objectives: Array) -> Array:
         """(k, 2) force [N] and duration [s] of a drivable experiment's objectives (k, 2)."""
@@ -190,16 +198,21 @@ class ReportData(Experiment):
         return (self.initial, *(a.best for a in self.algorithms if a.best is not None))
 
     @property
-    def recommended_job(self) -> DrawnJob | None:
-        """The job around the recommended carry; None without such a carry."""
-        return next((job for job in self.jobs if job.label == RECOMMENDED_LABEL), None)
+    def drawn(self) -> tuple[DrawnCarry, ...]:
+        """These, and the recommended carry as robots drive it."""
+        recommended = self.recommended_carry
+        return self.carries if recommended is None else (*self.carries, recommended)
+
+    def job(self, label: str) -> DrawnJob | None:
+        """The job around the carry of a label, None where it is not planned."""
+        return next((job for job in self.jobs if job.label == label), None)
 
     @property
     def recommended_carry(self) -> DrawnCarry | None:
         """The recommended carry as robots drive it, None where they cannot."""
-        job = self.recommended_job
+        job = self.job(RECOMMENDED_LABEL)
         carry = None if job is None or job.timing is None else job.timing.carry
-        return None if carry is None else DrawnCarry(RECOMMENDED_LABEL, carry)
+        return None if carry is None else DrawnCarry(RECOMMENDED_LABEL, carry, RECOMMENDED_LOOK)
 
     @property
     def recommended_objectives(self) -> Array | None:
@@ -293,22 +306,15 @@ def _experiment(results: CampaignResults, select: bool = True) -> Experiment:
             front, *polished = (
                 f for f in fronts if (f.algorithm, f.replica) == (name, replica.replica)
             )
-            runs.append(Run(replica.evaluations, front, next(iter(polished), None), figures))
-        representative = entry.representative or 0
-        best = None if evaluator is None else _best(evaluator, runs[representative])
-        algorithms.append(
-            AlgorithmRuns(name, title(name), index, tuple(runs), representative, best)
-        )
+            runs.append(Run(front, next(iter(polished), None), figures))
+        shown, best, look = entry.representative or 0, None, series(index)
+        front = runs[shown].fronts[-1]
+        if evaluator is not None and len(front):
+            x = front.x[selected_row(evaluator, front.x)]
+            best = DrawnCarry(front.title, evaluator.carry(x), look)
+        algorithms.append(AlgorithmRuns(name, title(name), look, tuple(runs), shown, best))
     files = collect_cell(results.workcell)
     return Experiment(results.workcell, files, results.objectives, summary, tuple(algorithms))
-
-
-def _best(evaluator: CandidateEvaluator, run: Run) -> DrawnCarry | None:
-    """The trajectory that stands for a run."""
-    front = run.hybrid if run.hybrid is not None and len(run.hybrid) else run.front
-    if not len(front):
-        return None
-    return DrawnCarry(front.title, evaluator.carry(front.x[selected_row(evaluator, front.x)]))
 
 
 def _hand_made(evaluator: CandidateEvaluator) -> DrawnCarry:
@@ -335,16 +341,12 @@ def _reach(geometry: CellGeometry, _: Sequence[ReadyCell]) -> ReachMap:
     return reach_map(geometry, np.random.default_rng(REACH_SEED))
 
 
-def _recommended_job(x: Array, cells: Sequence[ReadyCell]) -> DrawnJob:
-    return recommended_job(cells[-1].jobs, x)
-
-
 def _job_requests(
     carries: Sequence[DrawnCarry], recommended: Array | None
 ) -> Iterator[Callable[[Sequence[ReadyCell]], DrawnJob]]:
     """The recommended carry's job, then those of hand-made and selected ones."""
     if recommended is not None:
-        yield partial(_recommended_job, recommended)
+        yield partial(recommended_job, recommended)
     limits = TimingLimits(reference_speed=True)
     for carry in carries:
         yield partial(drawn_job, carry.label, carry.x, limits)

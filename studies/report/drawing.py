@@ -7,8 +7,10 @@ import io
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cached_property
+from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import matplotlib as mpl
 import numpy as np
@@ -18,14 +20,17 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from hybrid_opt.carry import Carry
 from hybrid_opt.display.solids import Solid, frame_placements
 from hybrid_opt.store.files import write_atomically
 from symbolic.array import Array
 from symbolic.geometry.bodies import Frame
 from symbolic.geometry.pairs import CellGeometry
 
-MM = 1.0 / 25.4
-FULL_WIDTH = 180.0 * MM
+if TYPE_CHECKING:
+    from hybrid_opt.timing.robustness import PayloadSensitivity
+
+FULL_WIDTH = 180.0 / 25.4
 """Text width of a journal page [inch]."""
 
 PNG_DPI = 200
@@ -202,6 +207,28 @@ LIGHT = np.array([-0.45, 0.35, 0.82]) / np.linalg.norm([-0.45, 0.35, 0.82])
 
 
 @dataclass(frozen=True)
+class DrawnCarry:
+    """One judged trajectory under the search's timing, its label for legends and its look."""
+
+    label: str
+    timed: Carry
+    look: LineStyle = HAND_MADE
+
+    @property
+    def x(self) -> Array:
+        """(n_var,) decision vector."""
+        return self.timed.x
+
+    @cached_property
+    def sensitivity(self) -> PayloadSensitivity:
+        """Its forces against the payload's mass."""
+        # Not imported at the top: pictures of a cell need no timing.
+        from hybrid_opt.timing.robustness import payload_sensitivity
+
+        return payload_sensitivity(self.timed)
+
+
+@dataclass(frozen=True)
 class View:
     """A camera at infinity.
 
@@ -275,26 +302,22 @@ class CutCell:
     def of(
         cls, geometry: CellGeometry, solids: Sequence[Solid], marked: Collection[str] = ()
     ) -> CutCell:
-        """The cell with some of its solids, those of the marked names in red."""
-        return cls(geometry, cut_faces(solids, marked))
-
-
-def cut_faces(solids: Sequence[Solid], marked: Collection[str] = ()) -> tuple[Faces, ...]:
-    """The solids' triangles cut to `MAX_EDGE`, coloured by the party they belong to."""
-    corners = [solid.vertices[solid.faces] for solid in solids]
-    numbers = np.repeat(np.arange(len(solids)), [len(each) for each in corners])
-    limits = np.array([np.inf if solid.is_ground else MAX_EDGE for solid in solids])
-    small, of = _cut(np.concatenate(corners), numbers, limits)
-    normals = np.cross(small[:, 1] - small[:, 0], small[:, 2] - small[:, 0])
-    length = np.linalg.norm(normals, axis=1)
-    keep = length > 0.0
-    small, of, normals = small[keep], of[keep], normals[keep] / length[keep, None]
-    faces = []
-    for k, solid in enumerate(solids):
-        own = of == k
-        colour = to_rgb(MARKED if solid.name in marked else _colour(solid))
-        faces.append(Faces(solid.frame, small[own], normals[own], colour, solid.is_ground))
-    return tuple(faces)
+        """The cell with some of its solids, their triangles cut to `MAX_EDGE`, coloured by the
+        party they belong to, those of the marked names in red."""
+        corners = [solid.vertices[solid.faces] for solid in solids]
+        numbers = np.repeat(np.arange(len(solids)), [len(each) for each in corners])
+        limits = np.array([np.inf if solid.is_ground else MAX_EDGE for solid in solids])
+        small, of = _cut(np.concatenate(corners), numbers, limits)
+        normals = np.cross(small[:, 1] - small[:, 0], small[:, 2] - small[:, 0])
+        length = np.linalg.norm(normals, axis=1)
+        keep = length > 0.0
+        small, of, normals = small[keep], of[keep], normals[keep] / length[keep, None]
+        faces = []
+        for k, solid in enumerate(solids):
+            own = of == k
+            colour = to_rgb(MARKED if solid.name in marked else _colour(solid))
+            faces.append(Faces(solid.frame, small[own], normals[own], colour, solid.is_ground))
+        return cls(geometry, tuple(faces))
 
 
 def _cut(corners: Array, of: NDArray[np.intp], limits: Array) -> tuple[Array, NDArray[np.intp]]:
@@ -381,19 +404,16 @@ def draw_path(axes: Axes, view: View, points: Array, **style: object) -> None:
 def draw_box_edges(axes: Axes, view: View, lower: Array, upper: Array, **style: object) -> None:
     """The twelve edges of a box along the world axes."""
     flat = view.flat(box_corners(lower, upper))
-    edges = [
-        flat[[i, j]]
-        for i in range(8)
-        for j in range(i + 1, 8)
-        if np.abs(np.subtract(_BITS[i], _BITS[j])).sum() == 1
-    ]
+    # Corners whose numbers differ in one bit are neighbours.
+    edges = [flat[[i, i | bit]] for i in range(8) for bit in (1, 2, 4) if not i & bit]
     axes.add_collection(LineCollection(edges, zorder=5.0, **style), autolim=False)
 
 
-_BITS = tuple((i, j, k) for i in (0, 1) for j in (0, 1) for k in (0, 1))
+MARGIN = 0.06
+"""Of a picture around what it shows [m]."""
 
 
-def frame_axes(axes: Axes, view: View, points: Array, margin: float = 0.06) -> None:
+def frame_axes(axes: Axes, view: View, points: Array, margin: float = MARGIN) -> None:
     """Fit the limits to world points (n, 3) at equal scales; world axes get labels."""
     flat = view.flat(points)
     lower, upper = flat.min(axis=0) - margin, flat.max(axis=0) + margin
@@ -422,4 +442,4 @@ def aspect(view: View, points: Array) -> float:
 
 def box_corners(lower: Array, upper: Array) -> Array:
     """(8, 3) corners of a box along the world axes."""
-    return np.array([[(lower, upper)[k][a] for a, k in enumerate(bits)] for bits in _BITS])
+    return np.array(list(product(*zip(lower, upper, strict=True))))

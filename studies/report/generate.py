@@ -11,9 +11,11 @@ import base64
 import gzip
 import hashlib
 import html
+import inspect
 import json
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from functools import partial
 from importlib.resources import files
 from io import BytesIO
@@ -21,21 +23,22 @@ from pathlib import Path
 from string import Template
 from typing import Any
 
+from matplotlib.figure import Figure
 from PIL import Image
 
 from hybrid_opt.display.scene import embedded_json, plotly_js, scene_js, three_js
 from hybrid_opt.display.table import Table, counted, number
+from hybrid_opt.progress import Progress
 from hybrid_opt.robust.squeeze import PADS
 from hybrid_opt.store.files import to_json, write_atomically
 from hybrid_opt.timing.analysis import TimingDocument, stored_timing
 from hybrid_opt.work.service import Executor, LocalExecutor, Service, answer_all, called
 from studies.program import ReportError
-from studies.report import PAGE, PICTURES, TABLES
+from studies.report import PAGE, PICTURES, TABLES, pictures_carry, pictures_cell, pictures_fronts
 from studies.report.data import ReportData
-from studies.report.drawing import files_of
+from studies.report.drawing import files_of, in_style, settled
 from studies.report.page_carries import RECOMMENDED_LABEL, phases
 from studies.report.page_data import page_document
-from studies.report.pictures import ReportPicture, report_pictures
 from studies.study.summary import read_summary
 from studies.study.tables import margins, study_tables, timings
 
@@ -47,49 +50,139 @@ COLOURS = 160
 """Colours of a picture on the page; its file's are reduced to them."""
 
 
+@dataclass(frozen=True)
+class ReportPicture:
+    """One picture of the report.
+
+    Attributes:
+        name: of its files, without suffix.
+        caption: what it shows, one or two sentences of plain text.
+        make: draws it, without style.
+    """
+
+    name: str
+    caption: str
+    make: Callable[[], Figure]
+
+    def draw(self) -> Figure:
+        """The figure in the common style."""
+        with in_style():
+            return settled(self.make())
+
+
+def _of(name: str, draw: Callable[..., Figure], *given: Any, caption: str = "") -> ReportPicture:
+    """A picture whose caption is the docstring of what draws it, where there is no other."""
+    text = caption or inspect.getdoc(draw) or ""
+    return ReportPicture(name, " ".join(text.split()), partial(draw, *given))
+
+
+def report_pictures(data: ReportData) -> Iterator[ReportPicture]:
+    """All pictures that the data allows, in the paper's order, then those beyond the paper."""
+    cell, arm = (data.geometry, data.reach, data.initial), data.workcell.robots[0].name
+    arm = f"Collision shapes of the arm {arm!r}, and the reach of its pad (paper Figure 6)."
+    yield _of("fig04_reachable_regions", pictures_cell.reachable_regions, *cell)
+    yield _of("fig05_cell", pictures_cell.environment, data.geometry, data.initial)
+    yield _of("fig06_arm", pictures_cell.arm_and_reach, *cell, caption=arm)
+    if data.solved:
+        yield from _search_pictures(data)
+    yield _of("infeasibility", pictures_fronts.infeasibility, data)
+    yield _of("fig09_normal_forces", pictures_carry.normal_forces, data)
+    yield _of("fig10_joint_torques", pictures_carry.joint_torques, data)
+    yield _of("fig11_pressure_shift", pictures_carry.pressure_shift, data)
+    yield _of("residual_moments", pictures_carry.residual_moments, data)
+    yield _of("fig12_payload", pictures_carry.payload, data)
+    yield _of("fig13_paths", pictures_cell.paths, data.geometry, data.drawn)
+    paper = " (paper Figures 14 and 15)"
+    drawn = [
+        (a.name, a.best, f"The trajectory selected from {a.best.label},", paper)
+        for a in data.algorithms
+        if a.best is not None
+    ]
+    if (driven := data.recommended_carry) is not None:
+        drawn.append((driven.label, driven, "The recommended carry", ""))
+    for name, carry, whose, source in drawn:
+        text = f"{whose} at 0, 33, 66 and 100 % of its duration{source}."
+        sequence = pictures_cell.motion_sequence
+        yield _of(f"motion_{name}", sequence, data.geometry, carry, caption=text)
+    if any(timed.force_curve is not None for _, timed in data.timings):
+        text = (
+            f"Drivable durations against the {data.force_kind.title}: single paths timed anew at "
+            "every limit, and the members of the drivable fronts, whose lines are the fastest path "
+            "at every force (median and range of the replicas). All other limits hold throughout, "
+            "those on jerk only for the star."
+        )
+        draw_curves = pictures_fronts.duration_against_force
+        yield _of("duration_against_force", draw_curves, data, caption=text)
+    choice = data.summary.recommendation
+    if choice is not None and choice.price is not None:
+        found = choice.price.uncertainty
+        whose = "the workcell's [uncertainty]" if found.stated else "the usual uncertainty"
+        text = (
+            "The price of robustness: largest normal forces of the recommended carry that hold in "
+            f"every case of a multiple of {whose} ({found})."
+        )
+        yield _of("robust_price", pictures_carry.robust_price, data, choice.price, caption=text)
+    if any(len(found.time) for found in data.simulations):
+        yield _of("simulated_forces", pictures_carry.simulated_forces, data)
+
+
+def _search_pictures(data: ReportData) -> Iterator[ReportPicture]:
+    objectives = len(data.objective_titles)
+    if objectives >= 2:
+        yield _of("fig07_fronts", pictures_fronts.fronts, data)
+    yield _of("fig08_best_so_far", pictures_fronts.histories, data)
+    if objectives == 2:
+        yield _of("attainment", pictures_fronts.attainment, data)
+    yield _of("indicators", pictures_fronts.indicators, data)
+    if data.has_hybrid and objectives >= 2:
+        yield _of("polish", pictures_fronts.polish, data)
+
+
 def write_report(
     root: Path,
     data: ReportData,
     with_paper: bool,
     pdf: bool = True,
-    done: Callable[[], None] = lambda: None,
+    progress: Progress | None = None,
     executor: Executor | None = None,
-) -> Path:
-    """Write all files of the report; returns the page.
+) -> None:
+    """Write all files of the report.
 
     Args:
         root: the results folder.
         data: from `studies.report.data.gather`.
         with_paper: whether figures that the paper states of its rack stand beside ours.
         pdf: whether pictures are also written as PDF, which takes as long as to draw them.
-        done: called after every picture and after the page.
+        progress: where to show it.
         executor: who draws, None for this process.
 
     Raises:
         ResultsError: the folder cannot be written.
     """
-    listed = _listed(data)
+    pictures = _listed(data)
     service: Service[Any, Any, dict[str, bytes]] = Service(partial(_listed, data), called)
-    calls = [partial(_drawn, k, pdf) for k in range(len(listed))]
-    drawn = answer_all(executor or LocalExecutor(), service, calls, lambda *_: done())
-    pictures = []
-    for picture, made in zip(listed, drawn, strict=True):
-        for suffix, content in made.items():
-            write_atomically(root / PICTURES / f"{picture.name}.{suffix}", content)
-        pictures.append((root / PICTURES / f"{picture.name}.png", picture.caption))
-    tables = report_tables(data, with_paper)
-    for table in tables:
-        for suffix, text in (
-            ("csv", table.csv()),
-            ("md", table.markdown()),
-            ("tex", table.latex()),
-        ):
-            write_atomically(root / TABLES / f"{table.name}.{suffix}", text.encode())
-    document = page_document(data, executor)
-    page = root / PAGE
-    write_atomically(page, render_page(data, document, tables, pictures).encode())
-    done()
-    return page
+    calls = [partial(_drawn, k, pdf) for k in range(len(pictures))]
+    progress = progress or Progress(shown=False)
+    with progress.stage("report", len(pictures) + 1, "pictures") as advance:
+        workers = executor or LocalExecutor()
+        drawn = answer_all(workers, service, calls, lambda *_: advance(1))
+        for picture, made in zip(pictures, drawn, strict=True):
+            for suffix, content in made.items():
+                write_atomically(root / PICTURES / f"{picture.name}.{suffix}", content)
+        tables = report_tables(data, with_paper)
+        for table in tables:
+            texts = {"csv": table.csv(), "md": table.markdown(), "tex": table.latex()}
+            for suffix, text in texts.items():
+                write_atomically(root / TABLES / f"{table.name}.{suffix}", text.encode())
+        shown = zip(pictures, drawn, strict=True)
+        page = render_page(
+            data,
+            page_document(data, executor),
+            "".join(table.html() for table in tables),
+            "".join(_picture(made["png"], picture.caption) for picture, made in shown),
+        )
+        write_atomically(root / PAGE, page.encode())
+        advance(1)
 
 
 def report_tables(data: ReportData, with_paper: bool) -> tuple[Table, ...]:
@@ -101,21 +194,15 @@ def report_tables(data: ReportData, with_paper: bool) -> tuple[Table, ...]:
     beside = None if data.drivable is None or data.alone else data.drivable.summary
     found = list(study_tables(data.summary, beside, data.jerk, data.simulations, with_paper))
     robots = data.summary.robots
-    timed = [*data.timings, *_driven(data)]
+    timed, job = list(data.timings), data.job(RECOMMENDED_LABEL)
+    if job is not None and job.timing is not None and job.timing.carry is not None:
+        driven = {"as robots drive it": stored_timing(job.timing)}
+        timed.append((job.label, TimingDocument(math.nan, driven, job.margins, None)))
     found.append(timings(timed, robots))
     found += [phases(data.jobs, robots)] if data.jobs else []
     if any(document.margins for _, document in timed):
         found.append(margins(timed))
     return tuple(found)
-
-
-def _driven(data: ReportData) -> list[tuple[str, TimingDocument]]:
-    """The recommended carry's timing, where it has one."""
-    job = data.recommended_job
-    if job is None or job.timing is None:
-        return []
-    found = {"as robots drive it": stored_timing(job.timing)}
-    return [(RECOMMENDED_LABEL, TimingDocument(math.nan, found, job.margins, None))]
 
 
 def insert_tables(root: Path, document: Path) -> None:
@@ -156,19 +243,13 @@ def _drawn(index: int, pdf: bool, pictures: list[ReportPicture]) -> dict[str, by
     return files_of(pictures[index].draw(), pdf)
 
 
-def render_page(
-    data: ReportData,
-    document: dict[str, Any],
-    tables: tuple[Table, ...],
-    pictures: list[tuple[Path, str]],
-) -> str:
+def render_page(data: ReportData, document: dict[str, Any], tables: str, pictures: str) -> str:
     """The page's text.
 
     Args:
         data: the report's data.
         document: what the scripts show, from `page_data`.
-        tables: shown in this order.
-        pictures: PNG file and caption of every figure.
+        tables, pictures: their HTML.
     """
     texts = files("studies.report") / "page"
     boot, own = ((texts / name).read_text("utf-8") for name in ("boot.js", "page.js"))
@@ -182,8 +263,8 @@ def render_page(
         recommendation=_recommendation(data),
         facts=_facts(data),
         style=(texts / "page.css").read_text("utf-8"),
-        tables="".join(table.html() for table in tables),
-        pictures="".join(_picture(path, caption) for path, caption in pictures),
+        tables=tables,
+        pictures=pictures,
         configuration=html.escape(json.dumps(settings, indent=2, ensure_ascii=False)),
         workcell=html.escape(data.workcell.source.read_text("utf-8")),
         blocks="\n".join(
@@ -279,8 +360,8 @@ def _assumed(data: ReportData) -> str:
     return f"{said} What robots drive is of {PADS[data.drivable.workcell.task.allocation]}."
 
 
-def _picture(path: Path, caption: str) -> str:
-    with Image.open(path) as whole:
+def _picture(png: bytes, caption: str) -> str:
+    with Image.open(BytesIO(png)) as whole:
         small, made = whole.convert("RGB").quantize(COLOURS), BytesIO()
     small.save(made, "PNG", optimize=True)
     content = base64.b64encode(made.getvalue()).decode("ascii")

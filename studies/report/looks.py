@@ -21,9 +21,16 @@ from hybrid_opt.display.solids import cell_solids, motion_points
 from studies.program import ReportError
 from studies.report import PAGE
 from studies.report.data import gather_carries
-from studies.report.drawing import ISOMETRIC, CutCell, draw_cell, draw_path, frame_axes, in_style
-from studies.report.drawn import DrawnCarry
-from symbolic.array import Array
+from studies.report.drawing import (
+    ISOMETRIC,
+    CutCell,
+    DrawnCarry,
+    draw_cell,
+    draw_path,
+    frame_axes,
+    in_style,
+)
+from symbolic.array import Array, interpolated
 from symbolic.geometry.pairs import CellGeometry
 
 FRAMES_PER_SECOND = 15
@@ -95,7 +102,7 @@ def frames(geometry: CellGeometry, film: Film) -> Iterator[NDArray[np.uint8]]:
     points = motion_points(geometry, film.pose, film.q)
     count = max(2, round(film.duration * FRAMES_PER_SECOND) + 1)
     moments = np.linspace(film.time[0], film.time[-1], count)
-    pose, q = _at(moments, film.time, film.pose), _at(moments, film.time, film.q)
+    pose, q = (interpolated(moments, film.time, each) for each in (film.pose, film.q))
     for k, moment in enumerate(moments):
         with in_style():
             figure = Figure(figsize=SIZE, dpi=DPI)
@@ -106,11 +113,6 @@ def frames(geometry: CellGeometry, film: Film) -> Iterator[NDArray[np.uint8]]:
             text = f"{film.label}    t = {moment - film.time[0]:5.2f} s"
             figure.text(0.02, 0.95, text, fontsize=10)
             yield _pixels(figure)
-
-
-def _at(moments: Array, time: Array, values: Array) -> Array:
-    """Values (n, k) at times (n,) interpolated to moments (m,)."""
-    return np.stack([np.interp(moments, time, column) for column in values.T], axis=1)
 
 
 def _pixels(figure: Figure) -> NDArray[np.uint8]:

@@ -3,7 +3,7 @@ assumed, and what is saved. Each is worked out for itself, in any process."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 import hybrid_opt as ho
-from hybrid_opt.bundles.bundle import phase_documents
 from hybrid_opt.campaign.stages import ReadyCell
 from hybrid_opt.display.scene import packed
 from hybrid_opt.display.table import NOTHING, Table, number
@@ -29,6 +28,7 @@ from hybrid_opt.work.service import Emit
 from symbolic.array import Array
 from symbolic.errors import DualArmError
 from symbolic.path.pieces import same_paths
+from symbolic.records import Workcell
 from symbolic.records.poses import box_rotation
 
 RECOMMENDED_LABEL = "recommended"
@@ -50,46 +50,27 @@ class DrawnJob:
     Attributes:
         label: whose it is.
         problem: why it cannot be planned, '' where it can.
-        duration: [s].
+        job: None where it cannot be planned.
         remark: how its forces came about, and what its timing leaves out.
-        peaks: (2,) largest commanded normal forces [N].
-        phases: as a bundle's manifest has them, in order.
-        samples: (k, 11 + joints) time, box pose, joints, commanded normal forces and shifts of the
-            centres of pressure.
-        torque_use, contact_torque_use: (joints,) largest use of each joint's torque, of all loads
-            and of the contacts alone [-].
-        timing: of its carry; of the recommended one also without a job.
+        timing: of its path, None where that failed.
         margins: of the recommended one, how wrong the cell's description may be.
     """
 
     label: str
-    problem: str
-    duration: float = 0.0
+    problem: str = ""
+    job: Job | None = None
     remark: str = ""
-    peaks: tuple[float, float] = (0.0, 0.0)
-    phases: tuple[dict[str, Any], ...] = ()
-    samples: Array | None = None
-    torque_use: Array | None = None
-    contact_torque_use: Array | None = None
     timing: Timing | None = None
     margins: tuple[Margin, ...] = ()
 
-    @property
-    def commanded(self) -> float:
-        """Largest force that is commanded of the force-controlled arm [N]."""
-        return self.peaks[1 - LEADER]
 
-
-def recommended_job(model: JobModel, x: Array) -> DrawnJob:
-    """The job around the recommended carry x (n_var,), and the carry as robots drive it."""
-    try:
-        timing = driven_timing(model.timing, x)
-    except DualArmError as error:
-        return DrawnJob(RECOMMENDED_LABEL, str(error))
-    job = drawn(model, RECOMMENDED_LABEL, timing, within_jerk=True)
-    if timing.carry is None:
-        return job
-    return replace(job, timing=timing, margins=robustness_margins(model.timing, timing.carry))
+def recommended_job(x: Array, cells: Sequence[ReadyCell]) -> DrawnJob:
+    """The job around the recommended carry x (n_var,) of the last cell, as robots drive it."""
+    model = cells[-1].jobs
+    found = drawn(model, RECOMMENDED_LABEL, lambda: driven_timing(model.timing, x), True)
+    if found.timing is None or found.timing.carry is None:
+        return found
+    return replace(found, margins=robustness_margins(model.timing, found.timing.carry))
 
 
 def drawn_job(label: str, x: Array, limits: TimingLimits, cells: Sequence[ReadyCell]) -> DrawnJob:
@@ -98,45 +79,33 @@ def drawn_job(label: str, x: Array, limits: TimingLimits, cells: Sequence[ReadyC
     takes long."""
     model = cells[-1].jobs
     (path,) = same_paths(x, cells[0].cell.workcell.task, model.workcell.task)
-    try:
-        timing = time_path(model.timing, path, limits)
-    except DualArmError as error:
-        return DrawnJob(label, str(error))
-    return drawn(model, label, timing, within_jerk=True)
+    return drawn(model, label, lambda: time_path(model.timing, path, limits), True)
 
 
-def drawn(model: JobModel, label: str, timing: Timing, within_jerk: bool = False) -> DrawnJob:
-    """The same around a path that is timed already.
+def drawn(
+    model: JobModel, label: str, timed: Callable[[], Timing], within_jerk: bool = False
+) -> DrawnJob:
+    """The job around a path.
 
     Args:
         label: whose it is.
+        timed: times the path.
         within_jerk: whether within the cell's limits on jerk, too.
     """
+    timing = None
     try:
+        timing = timed()
         job = model.plan(timing, within_jerk=within_jerk)
     except DualArmError as error:
-        return DrawnJob(label, str(error))
-    limit = job.workcell.of_joints("torque_max")
-    contact = [np.abs(p.motion.contact_effort(p.force.wrench)).max(axis=0) for p in job.phases]
-    whole = [np.abs(phase.effort).max(axis=0) for phase in job.phases]
+        return DrawnJob(label, str(error), timing=timing)
     bounded = within_jerk or JerkLimits.of(job.workcell) is None
-    first, second = job.peak_normal_force.tolist()
-    return DrawnJob(
-        label=label,
-        problem="",
-        duration=job.duration,
-        remark=str(job.squeeze) + ("" if bounded else WITHOUT_JERK),
-        peaks=(first, second),
-        phases=tuple(phase_documents(job)),
-        samples=_job_samples(job),
-        torque_use=np.max(whole, axis=0) / limit,
-        contact_torque_use=np.max(contact, axis=0) / limit,
-        timing=job.timing,
-    )
+    remark = str(job.squeeze) + ("" if bounded else WITHOUT_JERK)
+    return DrawnJob(label, "", job, remark, timing)
 
 
-def _job_samples(job: Job) -> Array:
-    """Some samples of each phase, and the peaks of the forces."""
+def job_samples(job: Job) -> Array:
+    """(k, 11 + joints) time, box pose, joints, commanded normal forces and shifts of the centres of
+    pressure: some samples of each phase, and the peaks of the forces."""
     parts = []
     for phase in job.phases:
         motion, force = phase.motion, phase.force.normal
@@ -190,25 +159,23 @@ def phases(jobs: Sequence[DrawnJob], robots: Sequence[str]) -> Table:
         robots: their names.
     """
     rows: list[tuple[str, ...]] = []
-    for job in jobs:
-        if job.problem:
-            rows.append((f"{job.label}: {job.problem}", *[NOTHING] * (4 + len(LIMITS))))
-        rows += [
-            (
-                f"{job.label}: {phase['name'].replace('_', ' ')}",
-                number(phase["begin"]),
-                number(phase["duration"]),
-                *(number(force, 1) for force in phase["peak_normal_force"]),
-                *(number(100.0 * phase["limits"][name], 1) for name in LIMITS),
-            )
-            for phase in job.phases
-        ]
-        if job.phases:
-            forces = [number(force, 1) for force in job.peaks]
-            most = [max(phase["limits"][name] for phase in job.phases) for name in LIMITS]
-            uses = [number(100.0 * value, 1) for value in most]
-            total = number(job.duration)
-            rows.append((f"{job.label}: all, {job.remark}", NOTHING, total, *forces, *uses))
+
+    def add(
+        name: str, begin: float | None, takes: float, force: Array, use: Iterable[float]
+    ) -> None:
+        figures = [*force, *(100.0 * value for value in use)]
+        rows.append((name, number(begin), number(takes), *(number(each, 1) for each in figures)))
+
+    for found in jobs:
+        if found.job is None:
+            rows.append((f"{found.label}: {found.problem}", *[NOTHING] * (4 + len(LIMITS))))
+            continue
+        used = np.array([[phase.use[name] for name in LIMITS] for phase in found.job.phases])
+        for phase, use in zip(found.job.phases, used, strict=True):
+            name = f"{found.label}: {phase.name.replace('_', ' ')}"
+            add(name, phase.begin, phase.duration, phase.force.normal.max(axis=0), use)
+        name, peak = f"{found.label}: all, {found.remark}", found.job.peak_normal_force
+        add(name, None, found.job.duration, peak, used.max(axis=0))
     return Table(
         "phases",
         "Phases of the whole jobs.",
@@ -263,41 +230,45 @@ class PageTrajectory:
     has_job: bool = True
 
 
-def _with_job(trajectory: dict[str, Any], job: DrawnJob) -> None:
+def _with_job(trajectory: dict[str, Any], found: DrawnJob) -> None:
     """Add a planned job as one more motion of a trajectory, or say why there is none."""
-    if job.samples is None:
-        trajectory["jobProblem"] = job.problem
+    job, motions = found.job, trajectory["motions"]
+    if job is None:
+        trajectory["jobProblem"] = found.problem
         return
-    assert job.torque_use is not None, "a planned job uses torques"
-    assert job.contact_torque_use is not None, "a planned job presses"
-    trajectory["motions"].insert(
-        1,
-        {
-            "name": WHOLE_JOB,
-            "peaks": [round(value, 4) for value in job.peaks],
-            "commanded": round(job.commanded, 4),
-            "duration": round(job.duration, 5),
-            "payloadLimit": trajectory["motions"][0]["payloadLimit"],
-            "torqueUse": (100.0 * job.torque_use).round(3).tolist(),
-            "contactTorqueUse": (100.0 * job.contact_torque_use).round(3).tolist(),
-            "data": packed(job.samples, np.float32),
-            "remark": job.remark,
-            "phases": [_phase(phase) for phase in job.phases],
-        },
-    )
-
-
-def _phase(phase: Mapping[str, Any]) -> dict[str, Any]:
-    """A phase of a manifest as the page shows it."""
-    most = phase["most_used"]
-    return {
-        "name": phase["name"].replace("_", " "),
-        "begin": round(phase["begin"], 5),
-        "duration": round(phase["duration"], 5),
-        "peaks": [round(value, 4) for value in phase["peak_normal_force"]],
-        "most": most,
-        "use": round(100.0 * phase["limits"][most], 2),
+    contact = [phase.motion.contact_effort(phase.force.wrench) for phase in job.phases]
+    motion = {
+        "name": WHOLE_JOB,
+        "peaks": _rounded(job.peak_normal_force, 4),
+        "duration": round(job.duration, 5),
+        "payloadLimit": motions[0]["payloadLimit"],
+        **_uses(job.workcell, np.concatenate([p.effort for p in job.phases]), contact),
+        "data": packed(job_samples(job), np.float32),
+        "commanded": round(_commanded(job), 4),
+        "remark": found.remark,
+        "phases": [_phase(phase) for phase in job.phases],
     }
+    motions.insert(1, motion)
+
+
+def _commanded(job: Job) -> float:
+    """Largest force that is commanded of the force-controlled arm [N]."""
+    return float(job.peak_normal_force[1 - LEADER])
+
+
+def _phase(phase: Phase) -> dict[str, Any]:
+    return {
+        "name": phase.name.replace("_", " "),
+        "begin": round(phase.begin, 5),
+        "duration": round(phase.duration, 5),
+        "peaks": _rounded(phase.force.normal.max(axis=0), 4),
+        "most": phase.most_used,
+        "use": round(100.0 * phase.use[phase.most_used], 2),
+    }
+
+
+def _rounded(values: Array, digits: int) -> list[float]:
+    return [round(value, digits) for value in values.tolist()]
 
 
 def page_trajectory(
@@ -351,26 +322,30 @@ def page_trajectory(
     elif not shown.has_job:
         found["jobProblem"] = NO_JOB
     elif timing.ok:
-        _with_job(found, drawn(driving.jobs, shown.label, timing))
+        _with_job(found, drawn(driving.jobs, shown.label, lambda: timing))
     return found
 
 
 def _motion(name: str, carry: ho.Carry) -> dict[str, Any]:
     return {
         "name": name,
-        "peaks": [round(float(value), 4) for value in carry.peak_normal_force],
+        "peaks": _rounded(carry.peak_normal_force, 4),
         "duration": round(carry.duration, 5),
         "payloadLimit": round(carry.payload_limit, 4),
-        "torqueUse": torque_use(carry, carry.torque).round(3).tolist(),
-        "contactTorqueUse": torque_use(carry, carry.contact_torque).round(3).tolist(),
+        **_uses(carry.workcell, carry.torque, [carry.contact_torque]),
         "data": packed(_samples(carry), np.float32),
     }
 
 
-def torque_use(carry: ho.Carry, torque: Array) -> Array:
-    """(all joints,) largest use of each joint's torque (n, all joints) in percent."""
-    limit = carry.workcell.of_joints("torque_max")
-    return np.asarray(100.0 * np.abs(torque).max(axis=0) / limit)
+def _uses(workcell: Workcell, whole: Array, contact: Sequence[Array]) -> dict[str, list[float]]:
+    """Uses of the joints' torques, of all loads and of the contacts alone."""
+    torques = {"torqueUse": whole, "contactTorqueUse": np.concatenate(contact)}
+    return {name: _rounded(torque_use(workcell, each), 3) for name, each in torques.items()}
+
+
+def torque_use(workcell: Workcell, torque: Array) -> Array:
+    """(joints,) largest use of each joint's torque (n, joints) in percent."""
+    return np.asarray(100.0 * np.abs(torque).max(axis=0) / workcell.of_joints("torque_max"))
 
 
 def _limits(cell: ho.Cell, x: Array) -> ho.TimingLimits:
@@ -382,10 +357,10 @@ def _limits(cell: ho.Cell, x: Array) -> ho.TimingLimits:
 def _values(cell: ho.Cell, judged: ho.Carry, timing: ho.Timing, job: DrawnJob | None) -> str:
     """Title of a trajectory: its objectives, forces and times with their units; of one whose job
     is planned what is commanded."""
-    if cell.workcell.task.time_law == "optimal" and job is not None and job.phases:
-        carry = next(phase for phase in job.phases if phase["name"] == "carry")
-        return f"{carry['duration']:.2f} s, pressed with {job.commanded:.1f} N"
     if cell.workcell.task.time_law == "optimal":
+        if job is not None and job.job is not None:
+            duration = job.job.phase("carry").duration
+            return f"{duration:.2f} s, pressed with {_commanded(job.job):.1f} N"
         if timing.carry is not None:
             return f"{timing.duration:.2f} s, {timing.peak_force:.2f} N"
         return f"{judged.duration:.2f} s, {judged.peak_normal_force.max():.2f} N"

@@ -16,17 +16,15 @@ from hybrid_opt.campaign.stages import cells_of, ready_cells
 from hybrid_opt.display.scene import packed, scene_data
 from hybrid_opt.work.service import Executor, LocalExecutor, Service, answer_all
 from studies.report.data import Experiment, ReportData
-from studies.report.drawing import ARMS, HAND_MADE, MARKED, LineStyle, series
-from studies.report.drawn import DrawnCarry
+from studies.report.drawing import ARMS, MARKED, DrawnCarry, LineStyle
 from studies.report.page_carries import (
     RECOMMENDED_LABEL,
-    DrawnJob,
     PageTrajectory,
     page_trajectory,
 )
 from symbolic.array import Array, evenly
 from symbolic.path.pieces import same_paths
-from symbolic.read.cell_files import CellFiles, cell_to_json
+from symbolic.read.cell_files import cell_to_json
 from symbolic.records import Workcell
 
 Plot = dict[str, Any]
@@ -145,16 +143,20 @@ def _legend(edge: str, place: float, size: int) -> Plot:
     return {**row, "font": {"size": size}}
 
 
-def limits(points: Array) -> list[list[float]]:
-    """Limits of both axes around points (k, 2)."""
-    points = np.asarray(points, dtype=float).reshape(-1, 2)
-    points = points[np.isfinite(points).all(axis=1)]
+def limits(points: Array, share: float = ROOM) -> list[list[float]]:
+    """Limits of both axes around points (k, 2), with this share of their range beside them."""
+    points = _finite(points)
     if len(points) == 0:
         return [[0.0, 1.0], [0.0, 1.0]]
     low, high = points.min(axis=0), points.max(axis=0)
-    room = np.maximum(ROOM * (high - low), 1e-4)
+    room = np.maximum(share * (high - low), 1e-4)
     found: list[list[float]] = np.stack([low - room, high + room], axis=1).tolist()
     return found
+
+
+def _finite(points: Array) -> Array:
+    points = np.asarray(points, dtype=float).reshape(-1, 2)
+    return points[np.isfinite(points).all(axis=1)]
 
 
 def drive_look(points: Array, always: Array) -> Array:
@@ -167,8 +169,7 @@ def drive_look(points: Array, always: Array) -> Array:
         points: of the fronts and curves.
         always: (n, 2) what the look has to show besides.
     """
-    points = np.asarray(points, dtype=float).reshape(-1, 2)
-    points = points[np.isfinite(points).all(axis=1)]
+    points = _finite(points)
     if len(points) == 0:
         return always
     force, duration = points.min(axis=0)
@@ -183,80 +184,53 @@ def carry_plots(workcell: Workcell, rest: float | None) -> dict[str, Plot]:
     Args:
         rest: largest normal force of the level payload at rest [N], None where it is not known.
     """
-    first = 7 + sum(len(robot.torque_max) for robot in workcell.robots)
+    joints = [len(robot.torque_max) for robot in workcell.robots]
     radius = 1e3 * min(contact.patch_radius for contact in workcell.contacts)
-    levels = [] if rest is None else [("level payload at rest", rest, "#000")]
-    return {
-        "force-plot": _over_time(workcell, "normal force [N]", first, 1.0, levels),
-        "pressure-plot": _over_time(
-            workcell, "pressure shift [mm]", first + 2, 1e3, [("patch radius", radius, "#000")]
-        ),
-        "torque-plot": _torque(workcell),
-    }
-
-
-def _over_time(
-    workcell: Workcell,
-    title: str,
-    column: int,
-    scale: float,
-    levels: list[tuple[str, float, str]],
-) -> Plot:
-    traces = [
+    force = 7 + sum(joints)
+    curve = {"type": "scatter", "mode": "lines"}
+    plots = {}
+    for name, title, column, scale, label, level in (
+        ("force-plot", "normal force [N]", force, 1.0, "level payload at rest", rest),
+        ("pressure-plot", "pressure shift [mm]", force + 2, 1e3, "patch radius", radius),
+    ):
+        traces = [
+            {
+                **curve,
+                "name": plain(robot.name),
+                "line": {"color": ARMS[i], "dash": DASHES[i], "width": 2},
+                "meta": {"column": column + i, "scale": scale},
+            }
+            for i, robot in enumerate(workcell.robots)
+        ]
+        if level is not None:
+            look = {"color": "#000", "dash": "dot", "width": 1.5}
+            meta = {"level": level}
+            traces.append({**curve, "name": label, "hoverinfo": "name", "line": look, "meta": meta})
+        y = {"title": {"text": title}, "rangemode": "normal"}
+        x = {"title": {"text": "time [s]", "standoff": 6}}
+        plots[name] = _carry_plot(traces, showlegend=True, xaxis=x, yaxis=y)
+    bars = [
         {
-            "type": "scatter",
-            "mode": "lines",
-            "name": plain(robot.name),
-            "line": {"color": ARMS[i], "dash": DASHES[i], "width": 2},
-            "meta": {"column": column + i, "scale": scale},
+            "type": "bar",
+            "name": plain(f"{robot.name}{whose}"),
+            "x": [f"joint {j + 1}" for j in range(joints[i])],
+            "marker": {"color": ARMS[i], "opacity": opacity},
+            "meta": {"use": use, "arm": i},
         }
         for i, robot in enumerate(workcell.robots)
+        for use, whose, opacity in (
+            ("torqueUse", "", 1.0),
+            ("contactTorqueUse", ", load alone", 0.45),
+        )
     ]
-    traces += [
-        {
-            "type": "scatter",
-            "mode": "lines",
-            "name": label,
-            "hoverinfo": "name",
-            "line": {"color": colour, "dash": "dot", "width": 1.5},
-            "meta": {"level": level},
-        }
-        for label, level, colour in levels
-    ]
-    layout = {
-        "margin": {"l": 60, "r": 15, "t": 40, "b": 55},
-        "showlegend": True,
-        "xaxis": {"title": {"text": "time [s]", "standoff": 6}},
-        "yaxis": {"title": {"text": title}, "rangemode": "normal"},
-        "legend": _legend("top", 0.99, 10),
-    }
-    return {"data": traces, "layout": layout}
+    y = {"title": {"text": "largest joint torque [% of maximum]"}, "rangemode": "tozero"}
+    plots["torque-plot"] = _carry_plot(bars, barmode="group", yaxis=y)
+    return plots
 
 
-def _torque(workcell: Workcell) -> Plot:
-    traces = []
-    for i, robot in enumerate(workcell.robots):
-        count = len(robot.torque_max)
-        for use, label, opacity in (
-            ("torqueUse", robot.name, 1.0),
-            ("contactTorqueUse", f"{robot.name}, load alone", 0.45),
-        ):
-            traces.append(
-                {
-                    "type": "bar",
-                    "name": plain(label),
-                    "x": [f"joint {j + 1}" for j in range(count)],
-                    "marker": {"color": ARMS[i], "opacity": opacity},
-                    "meta": {"use": use, "arm": i},
-                }
-            )
-    layout = {
-        "margin": {"l": 60, "r": 15, "t": 40, "b": 55},
-        "barmode": "group",
-        "yaxis": {"title": {"text": "largest joint torque [% of maximum]"}, "rangemode": "tozero"},
-        "legend": _legend("top", 0.99, 10),
-    }
-    return {"data": traces, "layout": layout}
+def _carry_plot(traces: list[Plot], **layout: Any) -> Plot:
+    margin, legend = {"l": 60, "r": 15, "t": 40, "b": 55}, _legend("top", 0.99, 10)
+    return {"data": traces, "layout": {"margin": margin, **layout, "legend": legend}}
 
 
 MAX_FRONT = 40
@@ -322,22 +296,18 @@ def page_document(data: ReportData, executor: Executor | None = None) -> dict[st
     return {
         "joints": [len(robot.torque_max) for robot in data.workcell.robots],
         "robots": [robot.name for robot in data.workcell.robots],
-        "first": _first(data, numbered),
+        # The recommended one, else the first selected one.
+        "first": int(data.drivable is None and len(numbered[0][1]) > 1),
         "trajectories": found,
         "views": views,
         "plots": carry_plots(data.workcell, float(rest.max()) if known else None),
         "lists": [{"label": group.listed, "members": members} for group, members in numbered],
-        "cells": [_cell_json(files) for files, _ in cells],
+        "cells": [
+            cell_to_json(files) if sum(map(len, files.files.values())) <= MAX_CELL_BYTES else None
+            for files, _ in cells
+        ],
         **scene_data(data.geometry, data.carries[-1].timed),
     }
-
-
-def _first(data: ReportData, groups: Sequence[Numbered]) -> int:
-    """The trajectory to begin with: the recommended one, else the first selected one."""
-    members = groups[0][1] if groups else []
-    if data.drivable is None and len(members) > 1:
-        return members[1]
-    return members[0] if members else 0
 
 
 def _drive_groups(data: ReportData, drivable: Experiment, cell: int) -> Iterator[Group]:
@@ -345,11 +315,11 @@ def _drive_groups(data: ReportData, drivable: Experiment, cell: int) -> Iterator
     if data.recommended is not None:
         found = data.summary.recommendation
         source = "" if found is None else found.source
-        title, job = f"{RECOMMENDED} ({source})", _planned(data, RECOMMENDED_LABEL)
+        title, job = f"{RECOMMENDED} ({source})", data.job(RECOMMENDED_LABEL)
         shown = PageTrajectory(title, data.recommended, source, cell, jerk=True, job=job)
         yield Group(RECOMMENDED, (shown,), RECOMMENDED, CHOICE)
     low, high = drivable.workcell.task.force_limit
-    for carry, label, look, curve in curves(data):
+    for carry, label, curve in curves(data):
         own, task = carry.timed.workcell.task, drivable.workcell.task
         source, path = _source(data, carry), same_paths(carry.x, own, task)[0, : task.n_path]
         force = curve[evenly(len(curve), CURVE_MEMBERS), 0]
@@ -358,20 +328,20 @@ def _drive_groups(data: ReportData, drivable: Experiment, cell: int) -> Iterator
             for limit in force
             if low <= limit <= high
         )
-        yield Group(f"{label}, timed", some, f"{label}, timed", marker(look, size=7))
+        yield Group(f"{label}, timed", some, f"{label}, timed", marker(carry.look, size=7))
     for algorithm, front, opened in drivable.fronts():
         some = tuple(
             PageTrajectory(front.source, front.x[k], front.source, cell)
             for k in evenly(len(front), MAX_FRONT)
         )
-        yield Group(front.source, some, front.title, marker(series(algorithm.index), opened))
+        yield Group(front.source, some, front.title, marker(algorithm.look, opened))
 
 
 def _search_groups(data: ReportData) -> Iterator[Group]:
     """Hand-made and selected trajectories, and the fronts of the first experiment."""
     sources = [_source(data, carry) for carry in data.carries]
     picked = [
-        PageTrajectory(source, carry.x, source, job=_planned(data, carry.label))
+        PageTrajectory(source, carry.x, source, job=data.job(carry.label))
         for carry, source in zip(data.carries, sources, strict=True)
     ]
     yield Group("Hand-made and selected", tuple(picked))
@@ -381,21 +351,20 @@ def _search_groups(data: ReportData) -> Iterator[Group]:
         some = tuple(
             PageTrajectory(front.source, front.x[k], front.source, has_job=False) for k in rows
         )
-        look = marker(series(algorithm.index), opened) if two else None
+        look = marker(algorithm.look, opened) if two else None
         yield Group(front.source, some, front.title, look, front.objectives[rows][:, :2])
 
 
-def curves(data: ReportData) -> Iterator[tuple[DrawnCarry, str, LineStyle, Array]]:
-    """Hand-made and selected paths: carry, label, look, and where they can be driven force limits
-    [N] and durations [s] (k, 2)."""
-    looks = [HAND_MADE, *(series(a.index) for a in data.algorithms if a.best is not None)]
-    for carry, (_, timed), look in zip(data.carries, data.timings, looks, strict=True):
+def curves(data: ReportData) -> Iterator[tuple[DrawnCarry, str, Array]]:
+    """Hand-made and selected paths: carry, label, and where they can be driven force limits [N] and
+    durations [s] (k, 2)."""
+    for carry, (_, timed) in zip(data.carries, data.timings, strict=True):
         if timed.force_curve is None:
             continue
         length = len(timed.force_curve.force)
         curve = np.column_stack([timed.force_curve.force, timed.force_curve.duration[:length]])
         label = carry.label if carry is data.initial else f"{carry.label}: least force"
-        yield carry, label, look, curve[np.isfinite(curve[:, 1])]
+        yield carry, label, curve[np.isfinite(curve[:, 1])]
 
 
 def _source(data: ReportData, carry: DrawnCarry) -> str:
@@ -404,11 +373,6 @@ def _source(data: ReportData, carry: DrawnCarry) -> str:
         if carry is algorithm.best:
             return f"{carry.label}, replica {algorithm.shown.front.replica}: least force"
     return carry.label
-
-
-def _planned(data: ReportData, label: str) -> DrawnJob | None:
-    """The job that is planned already, where there is one."""
-    return next((job for job in data.jobs if job.label == label), None)
 
 
 def _traces(groups: Sequence[Numbered], found: Sequence[dict[str, Any]]) -> Iterator[Plot]:
@@ -434,11 +398,11 @@ def _drive_view(
     clouds, lines, drawn = [], [], []
     for algorithm, front, _ in drivable.fronts():
         if not front.polished:
-            run = algorithm.shown.evaluations
-            at = drivable.driven(run.objectives[run.feasible])
-            clouds.append(cloud(front.title, at, series(algorithm.index)))
-    for _, label, look, curve in curves(data):
-        lines.append(line(label, curve, look.colour, "dot" if look is HAND_MADE else "dash"))
+            at = drivable.driven(algorithm.shown.feasible)
+            clouds.append(cloud(front.title, at, algorithm.look))
+    for carry, label, curve in curves(data):
+        dash = "dot" if carry is data.initial else "dash"
+        lines.append(line(label, curve, carry.look.colour, dash))
         drawn.append(curve)
     # The recommended carry is drawn last, above all others.
     shown = sorted(_traces(groups, found), key=lambda trace: trace["name"] == RECOMMENDED)
@@ -461,14 +425,14 @@ def _search_view(
 ) -> Plot:
     """The fronts of the first experiment."""
     titles = [*data.objective_titles, "", ""]
-    selected = np.array([carry.objectives for carry in data.carries])
+    judged = [carry.timed.judgement for carry in data.carries]
+    selected = np.array([list(one.objectives.values()) for one in judged if one is not None])
     searched, two = [selected[1:] if len(selected) > 1 else selected], len(data.objectives) >= 2
     traces, shown = list[Plot](), list(_traces(groups, found))
     for algorithm in data.solved:
         run = algorithm.shown
-        feasible = run.evaluations.objectives[run.evaluations.feasible]
         if two:
-            traces.append(cloud(algorithm.title, feasible[:, :2], series(algorithm.index)))
+            traces.append(cloud(algorithm.title, run.feasible[:, :2], algorithm.look))
         searched.append(run.front.objectives)
     rest = data.static[:2]
     if len(rest) == 2 and np.isfinite(rest).all():
@@ -477,9 +441,3 @@ def _search_view(
     first = np.concatenate([points[:, :2] for points in searched]) if two else np.zeros((0, 2))
     axes = (f"{titles[0]} [-]", f"{titles[1]} [-]")
     return front_plot("The search's objectives", axes, [*traces, *shown], first)
-
-
-def _cell_json(files: CellFiles) -> dict[str, Any] | None:
-    if sum(map(len, files.files.values())) > MAX_CELL_BYTES:
-        return None
-    return cell_to_json(files)

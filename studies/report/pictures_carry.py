@@ -18,8 +18,6 @@ from studies.report.drawing import (
     FULL_WIDTH,
     HAND_MADE,
     MARKED,
-    RECOMMENDED,
-    LineStyle,
     legend_below,
     limit_line,
     new_figure,
@@ -28,20 +26,11 @@ from studies.report.drawing import (
     series,
     shortened,
 )
-from studies.report.drawn import DrawnCarry
 from studies.report.page_carries import torque_use
 from symbolic.array import Array
 
 PREDICTED: dict[str, Any] = {"color": "black", "linestyle": (0, (2, 1.5)), "linewidth": 0.8}
 """Style of the predicted quantities of a simulation."""
-
-
-def styled(data: ReportData) -> tuple[tuple[DrawnCarry, LineStyle], ...]:
-    """The hand-made trajectory, each algorithm's best one and the recommended carry as robots drive
-    it, with their looks."""
-    shown = [(data.initial, HAND_MADE), *((a.best, series(a.index)) for a in data.algorithms)]
-    shown.append((data.recommended_carry, RECOMMENDED))
-    return tuple((carry, look) for carry, look in shown if carry is not None)
 
 
 def _per_robot(
@@ -63,9 +52,9 @@ def normal_forces(data: ReportData) -> Figure:
     """Normal contact forces along the selected trajectories (paper Figure 9)."""
 
     def draw(axes: Axes, i: int) -> None:
-        for carry, look in styled(data):
+        for carry in data.drawn:
             force = carry.timed.normal_force[:, i]
-            axes.plot(carry.timed.time, force, **look.drawn, label=carry.label)
+            axes.plot(carry.timed.time, force, **carry.look.drawn, label=carry.label)
         if np.isfinite(data.static[:2]).all():
             still = data.static[i] * data.workcell.task.reference_force[i]
             rest_line(axes, still, "level payload at rest")
@@ -78,9 +67,9 @@ def pressure_shift(data: ReportData) -> Figure:
     patch (paper Figure 11)."""
 
     def draw(axes: Axes, i: int) -> None:
-        for carry, look in styled(data):
+        for carry in data.drawn:
             shift = 1e3 * carry.timed.pressure_shift[:, i]
-            axes.plot(carry.timed.time, shift, **look.drawn, label=carry.label)
+            axes.plot(carry.timed.time, shift, **carry.look.drawn, label=carry.label)
         limit_line(axes, 1e3 * data.workcell.contacts[i].patch_radius, "patch radius")
         axes.set_ylim(bottom=0.0)
 
@@ -91,16 +80,16 @@ def payload(data: ReportData) -> Figure:
     """Largest contact force of each robot against the payload's mass, for unchanged motion (paper
     Figure 12)."""
     reference = data.workcell.task.reference_force / KILOGRAM_FORCE
-    limits = np.concatenate([c.sensitivity.mass_by_resultant for c, _ in styled(data)])
+    limits = np.concatenate([c.sensitivity.mass_by_resultant for c in data.drawn])
     masses = np.array([0.75 * limits.min(), 1.1 * limits.max()])
 
     def draw(axes: Axes, i: int) -> None:
         known = []
-        for carry, look in styled(data):
+        for carry in data.drawn:
             force = carry.sensitivity.force_at(masses)[:, i] / KILOGRAM_FORCE
             limit = float(carry.sensitivity.mass_by_resultant[i])
-            axes.plot(masses, force, **look.drawn, label=carry.label)
-            axes.plot(limit, reference[i], **look.marks(4.0))
+            axes.plot(masses, force, **carry.look.drawn, label=carry.label)
+            axes.plot(limit, reference[i], **carry.look.marks(4.0))
             known.append(f"{carry.label}: {limit:.2f} kg")
         limit_line(axes, reference[i], "reference force")
         axes.set_xlim(*masses)
@@ -158,9 +147,9 @@ def joint_torques(data: ReportData) -> Figure:
     split = [len(data.workcell.robots[0].torque_max)]
     kinds = (("contact wrench alone", "contact_torque"), ("with the arm", "torque"))
     uses = {
-        (row, carry.label): np.split(torque_use(carry.timed, getattr(carry.timed, name)), split)
+        (row, carry.label): np.split(torque_use(data.workcell, getattr(carry.timed, name)), split)
         for row, (_, name) in enumerate(kinds)
-        for carry, _ in styled(data)
+        for carry in data.drawn
     }
     # One scale for all panels, so that they can be compared.
     top = max(float(use.max()) for both in uses.values() for use in both)
@@ -168,10 +157,10 @@ def joint_torques(data: ReportData) -> Figure:
         for i, robot in enumerate(data.workcell.robots):
             axes, joints = panels[row, i], len(robot.torque_max)
             angles, most = np.linspace(0.0, 2.0 * np.pi, joints + 1), np.zeros(joints)
-            for carry, look in styled(data):
+            for carry in data.drawn:
                 use = uses[row, carry.label][i]
                 most = np.maximum(most, use)
-                looks = {**look.drawn, "marker": look.marker, "markersize": 3}
+                looks = {**carry.look.drawn, "marker": carry.look.marker, "markersize": 3}
                 axes.plot(angles, [*use, use[0]], **looks, label=carry.label)
             axes.set_xticks(angles[:-1], [f"joint {j + 1}" for j in range(joints)])
             axes.tick_params(axis="x", pad=4)
@@ -198,11 +187,11 @@ def residual_moments(data: ReportData) -> Figure:
     pressure shifted."""
     figure = new_figure(FULL_WIDTH, 0.42 * FULL_WIDTH)
     axes = figure.subplots()
-    for carry, look in styled(data):
+    for carry in data.drawn:
         point = np.linalg.norm(carry.timed.point_moment_residual, axis=1)
         shifted = float(np.linalg.norm(carry.timed.moment_residual, axis=1).max())
         label = f"{carry.label} (shifted: at most {shifted:.1e} N m)"
-        axes.plot(carry.timed.time, point, **look.drawn, label=label)
+        axes.plot(carry.timed.time, point, **carry.look.drawn, label=label)
     axes.set_ylim(bottom=0.0)
     axes.set_xlabel("time [s]")
     axes.set_ylabel("residual moment [N m]")

@@ -1,6 +1,11 @@
-"""Pictures of the cell: reachable regions, the environment, the arm, motion sequences."""
+"""Pictures of the cell: reachable regions, the environment, the arm, motion sequences; and where
+the arms reach."""
 
 from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -8,6 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from hybrid_opt.display.solids import (
     Solid,
@@ -21,9 +27,10 @@ from studies.report.drawing import (
     FRONT,
     FULL_WIDTH,
     ISOMETRIC,
+    MARGIN,
     SIDE,
     CutCell,
-    LineStyle,
+    DrawnCarry,
     View,
     aspect,
     box_corners,
@@ -31,14 +38,15 @@ from studies.report.drawing import (
     draw_cell,
     draw_path,
     frame_axes,
+    legend_below,
     new_figure,
     oblique,
     panel_label,
     shortened,
 )
-from studies.report.drawn import DrawnCarry, ReachMap
 from symbolic.array import Array
 from symbolic.geometry.pairs import CellGeometry
+from symbolic.records.poses import skew
 
 _PLAN = View(np.array([0.0, -1.0, 0.0]), np.array([1.0, 0.0, 0.0]), "y [m]", "x [m]", mirrored=True)
 """View from above, the front below."""
@@ -48,6 +56,86 @@ HATCHES = ("////", "\\\\\\\\")
 
 SHARES = (0.0, 0.33, 0.66, 1.0)
 """Shares of a carry's duration, as in the paper's Figures 14 and 15."""
+
+
+STEP = 0.05
+"""Edge of the cubes [m]: what a drawing of two metres shows."""
+
+POSTURES = 300_000
+"""Random postures per arm; some ten per cube of the reach of an arm of 1.3 m."""
+
+
+@dataclass(frozen=True)
+class ReachMap:
+    """Where the arms' pads and the box can be, on a grid of cubes, positions only.
+
+    A cube is reached if a sampled posture within the joint limits puts the pad there.
+
+    Attributes:
+        lower: (3,) corner of the grid in the world [m].
+        step: edge of the cubes [m].
+        pads: per arm a boolean (nx, ny, nz).
+        common: boolean (nx, ny, nz), box centres from which a level box has both its pads in
+            cubes that their arms reach.
+    """
+
+    lower: Array
+    step: float
+    pads: tuple[NDArray[Any], NDArray[Any]]
+    common: NDArray[Any]
+
+
+def reach_map(geometry: CellGeometry, rng: np.random.Generator) -> ReachMap:
+    """Sample both arms' pads over their joint limits.
+
+    Sampling leaves single cubes out; holes of a few cubes are closed.
+    """
+    clouds = [_pad_points(geometry, i, rng) for i in (0, 1)]
+    both = np.concatenate(clouds)
+    lower = np.floor(both.min(axis=0) / STEP - 3.0) * STEP
+    shape = tuple(np.ceil((both.max(axis=0) - lower) / STEP).astype(int) + 4)
+    pads = []
+    for cloud in clouds:
+        reached = np.zeros(shape, dtype=bool)
+        index = ((cloud - lower) / STEP).astype(int)
+        reached[index[:, 0], index[:, 1], index[:, 2]] = True
+        pads.append(ndimage.binary_closing(reached, iterations=2))
+    # The box's centre is where both pads, as far from it as they are, are reached.
+    offsets = [contact.T_box_pad[:3, 3] / STEP for contact in geometry.workcell.contacts]
+    shifted = [
+        ndimage.shift(reached, -np.round(offset), order=0)
+        for reached, offset in zip(pads, offsets, strict=True)
+    ]
+    return ReachMap(lower, STEP, (pads[0], pads[1]), shifted[0] & shifted[1])
+
+
+def _pad_points(geometry: CellGeometry, i: int, rng: np.random.Generator) -> NDArray[np.float32]:
+    """(POSTURES, 3) pad positions in the world, of random postures within the joint limits."""
+    arm, contact = geometry.arms[i], geometry.workcell.contacts[i]
+    pad = (arm.T_joint_box @ contact.T_box_pad)[:3, 3]
+    # Single precision is far more than cubes need, and half the work.
+    span = (arm.upper - arm.lower).astype(np.float32)
+    q = arm.lower[:, None].astype(np.float32) + span[:, None] * rng.random(
+        (arm.joints, POSTURES), dtype=np.float32
+    )
+    # From the pad back to the root: points are a fifth of the work of placements.
+    points = np.tile(pad[:, None].astype(np.float32), POSTURES)
+    for j in reversed(range(arm.joints)):
+        if arm.turning[j]:  # Rodrigues' formula about the joint's axis
+            across = skew(arm.axes[j]).astype(np.float32)
+            points += np.sin(q[j]) * (across @ points) + (1.0 - np.cos(q[j])) * (
+                across @ across @ points
+            )
+        else:
+            points += np.outer(arm.axes[j].astype(np.float32), q[j])
+        points = _seen(arm.origins[j], points)
+    return _seen(arm.T_world_root, points).T
+
+
+def _seen(T: Array, points: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Points (3, n) from the frame that T (4, 4) maps into another, in that one."""
+    placed = T.astype(np.float32)
+    return np.asarray(placed[:3, :3] @ points + placed[:3, 3:])
 
 
 def reachable_regions(geometry: CellGeometry, reach: ReachMap, carry: DrawnCarry) -> Figure:
@@ -98,13 +186,27 @@ def environment(geometry: CellGeometry, carry: DrawnCarry) -> Figure:
     points = extent_points(geometry, solids, pose[None], q[None])
     views = (FRONT, SIDE, ISOMETRIC)
     panels = figure.subplots(1, 3, width_ratios=[aspect(view, points) for view in views])
-    for axes, view, letter, text in zip(
-        panels, views, "abc", ("front", "side", "oblique"), strict=True
-    ):
-        draw_cell(axes, cell, view, pose, q)
-        panel_label(axes, letter, text, bare=True)
-        frame_axes(axes, view, points)
+    shown = [
+        (text, view, points) for text, view in zip(("front", "side", "oblique"), views, strict=True)
+    ]
+    _draw_views(panels, cell, shown, pose, q)
     return figure
+
+
+def _draw_views(
+    panels: Iterable[Axes],
+    cell: CutCell,
+    shown: Iterable[tuple[str, View, Array]],
+    pose: Array,
+    q: Array,
+    hidden: tuple[str, ...] = (),
+    margin: float = MARGIN,
+) -> None:
+    """The cell at one sample in panels: what is above each, its view, and points that it fits."""
+    for axes, letter, (text, view, points) in zip(panels, "abc", shown, strict=True):
+        draw_cell(axes, cell, view, pose, q, hidden)
+        panel_label(axes, letter, text, bare=True)
+        frame_axes(axes, view, points, margin)
 
 
 def facing(way: Array) -> View:
@@ -159,11 +261,11 @@ def motion_sequence(geometry: CellGeometry, carry: DrawnCarry, columns: int = 2)
     return figure
 
 
-def paths(geometry: CellGeometry, carries: tuple[tuple[DrawnCarry, LineStyle], ...]) -> Figure:
+def paths(geometry: CellGeometry, carries: tuple[DrawnCarry, ...]) -> Figure:
     """Paths of the box centre (paper Figure 13)."""
     # A plane that they hardly leave is seen edge-on once.
     cell = _fixed(geometry)
-    points = np.concatenate([carry.timed.pose[:, :3] for carry, _ in carries])
+    points = np.concatenate([carry.timed.pose[:, :3] for carry in carries])
     half = geometry.workcell.payload.size / 2.0
     near = box_corners(points.min(axis=0) - half, points.max(axis=0) + half)
     chosen = planes(points)
@@ -171,17 +273,15 @@ def paths(geometry: CellGeometry, carries: tuple[tuple[DrawnCarry, LineStyle], .
     figure = new_figure(FULL_WIDTH, 0.5 * FULL_WIDTH)
     panels = figure.subplots(1, 3, width_ratios=[aspect(view, near) for view in views])
     texts = (*(text for _, text in chosen), "oblique")
-    for axes, view, letter, text in zip(panels, views, "abc", texts, strict=True):
-        draw_cell(axes, cell, view, *_start(carries[0][0]), hidden=("box", "link"))
-        for carry, look in carries:
-            draw_path(axes, view, carry.timed.pose[:, :3], **look.drawn, label=carry.label)
-        ends = view.flat(carries[0][0].timed.pose[[0, -1], :3])
+    shown = [(text, view, near) for text, view in zip(texts, views, strict=True)]
+    _draw_views(panels, cell, shown, *_start(carries[0]), hidden=("box", "link"))
+    for axes, view in zip(panels, views, strict=True):
+        for carry in carries:
+            draw_path(axes, view, carry.timed.pose[:, :3], **carry.look.drawn, label=carry.label)
+        ends = view.flat(carries[0].timed.pose[[0, -1], :3])
         axes.plot(*ends[0], "o", color="black", zorder=5, label="start")
         axes.plot(*ends[1], "*", color="black", markersize=7, zorder=5, label="goal")
-        panel_label(axes, letter, text, bare=True)
-        frame_axes(axes, view, near)
-    handles, labels = panels[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=len(handles))
+    legend_below(figure, panels[0])
     return figure
 
 
@@ -291,10 +391,7 @@ def meeting(
         ("near by", ISOMETRIC, near),
         ("from behind", OTHER_SIDE, near),
     )
-    for axes, letter, (text, view, points) in zip(figure.subplots(1, 3), "abc", shown, strict=True):
-        draw_cell(axes, whole, view, pose, q)
-        panel_label(axes, letter, text, bare=True)
-        frame_axes(axes, view, points, margin=0.0)
+    _draw_views(figure.subplots(1, 3), whole, shown, pose, q, margin=0.0)
     figure.suptitle(title, fontsize=8)
     return figure
 

@@ -25,7 +25,6 @@ from studies.report.drawing import (
     new_figure,
     panel_label,
     rest_line,
-    series,
     shortened,
 )
 from studies.report.page_data import curves, drive_look, limits
@@ -45,8 +44,7 @@ def fronts(data: ReportData) -> Figure:
     panels = figure.subplots(1, 2)
     found = [a.shown.front.objectives for a in data.solved]
     for algorithm, front in zip(data.solved, found, strict=True):
-        look, run = series(algorithm.index), algorithm.shown
-        cloud = run.evaluations.objectives[run.evaluations.feasible]
+        look, cloud = algorithm.look, algorithm.shown.feasible
         behind = look.marks(2.2) | {"alpha": 0.25, "markeredgewidth": 0, "rasterized": True}
         for axes in panels:
             axes.plot(*cloud[:, :2].T, **behind, label=f"{algorithm.title}: feasible")
@@ -79,7 +77,7 @@ def attainment(data: ReportData) -> Figure:
     panels = figure.subplots(1, len(groups), squeeze=False)[0]
     for axes, letter, (text, group) in zip(panels, "ab", groups.items(), strict=False):
         for algorithm, found in zip(data.algorithms, group, strict=True):
-            look = series(algorithm.index)
+            look = algorithm.look
             surfaces = attainment_surfaces(found, (*QUARTILES, 50.0)) if found else {}
             for percentile, points in surfaces.items():
                 median = percentile not in QUARTILES
@@ -114,7 +112,7 @@ def polish(data: ReportData) -> Figure:
     for algorithm, front, _ in data.fronts():
         text = "polished" if front.polished else "search"
         drawn.append(front.objectives)
-        look = series(algorithm.index).marks(4.0, opened=not front.polished)
+        look = algorithm.look.marks(4.0, opened=not front.polished)
         left.plot(*front.objectives[:, :2].T, **look, label=f"{algorithm.title}: {text}")
     _objectives(left, data)
     _zoom(left, data, drawn)
@@ -130,7 +128,7 @@ def _paired(axes: Axes, algorithms: Sequence[AlgorithmRuns]) -> None:
     """Hypervolumes of all replicas before and after."""
     names = []
     for k, algorithm in enumerate(algorithms):
-        look = series(k)
+        look = algorithm.look
         style: dict[str, Any] = {
             "marker": look.marker,
             "color": look.colour,
@@ -178,11 +176,9 @@ def _zoom(axes: Axes, data: ReportData, sets: Sequence[Array]) -> None:
         points.append(data.static[None, :2])
     if data.alone and (at := data.recommended_objectives) is not None:
         points.append(at[None])
-    every = np.concatenate(points)
-    low, high = every.min(axis=0), every.max(axis=0)
-    room = np.maximum(0.07 * (high - low), 1e-4)
-    axes.set_xlim(low[0] - room[0], high[0] + room[0])
-    axes.set_ylim(low[1] - room[1], high[1] + room[1])
+    x_limits, y_limits = limits(np.concatenate(points), 0.07)
+    axes.set_xlim(*x_limits)
+    axes.set_ylim(*y_limits)
 
 
 def duration_against_force(data: ReportData) -> Figure:
@@ -192,14 +188,14 @@ def duration_against_force(data: ReportData) -> Figure:
     figure = new_figure(FULL_WIDTH, 0.5 * FULL_WIDTH)
     axes = figure.subplots()
     drawn = []
-    for _, label, look, curve in curves(data):
-        marked = "" if data.drivable else look.marker
-        axes.plot(*curve.T, **look.drawn, marker=marked, markersize=3.5, label=label)
+    for carry, label, curve in curves(data):
+        marked = "" if data.drivable else carry.look.marker
+        axes.plot(*curve.T, **carry.look.drawn, marker=marked, markersize=3.5, label=label)
         drawn.append(curve)
     choice = data.summary.recommendation
     if data.drivable is not None:
         for algorithm, front, opened in data.drivable.fronts():
-            found, look = data.drivable.driven(front.objectives), series(algorithm.index)
+            found, look = data.drivable.driven(front.objectives), algorithm.look
             axes.plot(*found.T, **look.marks(4.0, opened=opened), label=front.title)
             drawn.append(found)
         if choice is not None:
@@ -232,7 +228,7 @@ def _forget_unseen(axes: Axes) -> None:
 def _replicas(axes: Axes, drivable: Experiment, choice: StoredRecommendation) -> list[Array]:
     """Durations of the best fronts' paths at the same forces; returns the points of the medians."""
     # Where a front was polished, only the polished one.
-    looks = {f.title: series(a.index) for a, f, opened in drivable.fronts() if not opened}
+    looks = {f.title: a.look for a, f, opened in drivable.fronts() if not opened}
     force, drawn = np.array(choice.durations.forces), []
     for row in choice.durations.rows:
         if row.label not in looks:
@@ -256,9 +252,9 @@ def histories(data: ReportData) -> Figure:
     axes = figure.subplots()
     inset = axes.inset_axes((0.42, 0.47, 0.56, 0.46))
     lines = []
-    for algorithm in data.solved:
-        k, look, run = algorithm.index, series(algorithm.index), algorithm.shown
-        history = best_so_far(run.evaluations.objectives, run.evaluations.feasible)
+    for k, algorithm in enumerate(data.solved):
+        look, found = algorithm.look, algorithm.shown.front.evaluations
+        history = best_so_far(found.objectives, found.feasible)
         number = np.arange(1, len(history) + 1)
         for m, title in enumerate(data.objective_titles[:2]):
             dashes = "-" if m == 0 else (0, (4, 1.5))
@@ -291,8 +287,7 @@ def histories(data: ReportData) -> Figure:
     axes.indicate_inset_zoom(inset, edgecolor="black", alpha=0.4)
     axes.set_xlabel("evaluated candidates [-]")
     axes.set_ylabel("best feasible objective so far [-]")
-    handles, labels = axes.get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=2)
+    legend_below(figure, axes, 2)
     return figure
 
 
@@ -303,13 +298,14 @@ def infeasibility(data: ReportData) -> Figure:
     left, right = figure.subplots(1, 2)
     pooled = []
     for algorithm in data.algorithms:
-        reason = np.concatenate([run.evaluations.reason for run in algorithm.runs])
-        position = np.concatenate([run.evaluations.position for run in algorithm.runs])
-        pooled.append((reason, position))
+        every = [run.front.evaluations for run in algorithm.runs]
+        pooled.append(
+            [np.concatenate([getattr(e, n) for e in every]) for n in ("reason", "position")]
+        )
     present = [k for k in range(len(REASONS)) if any((reason == k).any() for reason, _ in pooled)]
     height = 0.8 / max(len(pooled), 1)
     for n, (algorithm, (reason, position)) in enumerate(zip(data.algorithms, pooled, strict=True)):
-        look = series(n)
+        look = algorithm.look
         shares = [100.0 * float((reason == k).mean()) for k in (FEASIBLE, *present)]
         offsets = np.arange(len(shares)) + (n - (len(pooled) - 1) / 2.0) * height
         left.barh(
@@ -343,8 +339,7 @@ def infeasibility(data: ReportData) -> Figure:
     right.set_ylabel("share of evaluated candidates [%]")
     right.set_xlim(0.0, 1.0)
     panel_label(right, "b", "where on the path")
-    handles, labels = left.get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=len(handles))
+    legend_below(figure, left)
     return figure
 
 
@@ -361,7 +356,7 @@ def indicators(data: ReportData) -> Figure:
         figure.subplots(1, len(shown)), "abcd", shown, strict=True
     ):
         for k, algorithm in enumerate(data.algorithms):
-            look = series(k)
+            look = algorithm.look
             values = np.array([getattr(run.figures, name) for run in algorithm.runs], dtype=float)
             values = values[np.isfinite(values)]
             if len(values):

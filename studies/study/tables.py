@@ -6,8 +6,9 @@ The terminal shows some of them, the page all, and `tables/` has them as files.
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from typing import Any
 
 from hybrid_opt.display.table import NOTHING, Quantity, Table, counted, number
@@ -54,20 +55,10 @@ MOST_BOUNDS = 8
 """Bounds of one experiment that are listed."""
 
 
-@dataclass(frozen=True)
-class PaperFigures:
-    """Figures of the paper's text for an algorithm on its rack; its tables are not reproduced.
-
-    Attributes:
-        feasible: feasible candidates of 1000 (Section 7).
-        payload_limit: payload at which the selected trajectory reaches 12 kgf [kg] (Section 6.3).
-    """
-
-    feasible: int
-    payload_limit: float
-
-
-PAPER = {"nsga2": PaperFigures(694, 16.71), "mopso": PaperFigures(296, 16.06)}
+PAPER = {"nsga2": ("694", "69.4", "16.71"), "mopso": ("296", "29.6", "16.06")}
+"""What the paper's text states of an algorithm on its rack; its tables are not reproduced: feasible
+candidates of 1000, their share [%] (Section 7), and the payload at which the selected trajectory
+reaches 12 kgf [kg] (Section 6.3)."""
 
 
 def study_tables(
@@ -118,9 +109,7 @@ def quality(
         for label, figures in _variants(algorithm, entry):
             rows.append((label, *(_over_replicas(figures, key, mean=True) for key in _QUALITY)))
         if with_paper and algorithm in PAPER:
-            stated = PAPER[algorithm]
-            cells = [str(stated.feasible), f"{stated.feasible / 10.0:.1f}"]
-            rows.append((f"{title(algorithm)}, paper", *cells, *[NOTHING] * 4))
+            rows.append((f"{title(algorithm)}, paper", *PAPER[algorithm][:2], *[NOTHING] * 4))
     settings = summary.settings
     return Table(
         name,
@@ -171,22 +160,19 @@ def selected(summary: CampaignSummary, with_paper: bool) -> Table:
         if entry.representative is None:
             rows.append((f"{title(name)}: no feasible candidate", *[NOTHING] * 7))
         else:
-            best = [entry.replicas[entry.representative]]
-            shown = AlgorithmFigures(0, {}, tuple(best), entry.polished)
-            rows += [_forces(label, row[0].selected) for label, row in _variants(name, shown)]
+            best = replace(
+                entry, representative=0, replicas=(entry.replicas[entry.representative],)
+            )
+            rows += [_forces(label, row[0].selected) for label, row in _variants(name, best)]
         if with_paper and name in PAPER:
-            limit = f"{PAPER[name].payload_limit:.2f}"
-            rows.append((f"{title(name)}, paper", *[NOTHING] * 6, limit))
+            rows.append((f"{title(name)}, paper", *[NOTHING] * 6, PAPER[name][2]))
     still, found = summary.static_hold, summary.recommendation
     if found is not None:
-        peaks = [FORCE(value) for value in found.peak_force]
         excess = 100.0 * float((found.peak_force / still.normal_force).mean() - 1.0)
-        figures = (ABOVE_REST(excess), DURATION(found.duration), PAYLOAD(found.payload_limit))
-        rows.append(("recommended, driven", NOTHING, NOTHING, *peaks, *figures))
-    force = [FORCE(value) for value in still.normal_force]
-    rows.append(
-        ("level payload at rest", *force, *force, "0.00", NOTHING, PAYLOAD(still.payload_limit))
-    )
+        driven = (found.peak_force, excess, found.duration, found.payload_limit)
+        rows.append(_pressed("recommended, driven", (None, None), *driven))
+    force, payload = still.normal_force, still.payload_limit
+    rows.append(_pressed("level payload at rest", force, force, 0.0, None, payload))
     return Table(
         "table2_selected",
         "Table 2. Normal contact forces of the selected trajectories.",
@@ -206,27 +192,34 @@ def selected(summary: CampaignSummary, with_paper: bool) -> Table:
 def _forces(label: str, found: SelectedEntry | None) -> tuple[str, ...]:
     if found is None:
         return (f"{label} (infeasible)", *[NOTHING] * 7)
-    return (
-        label if found.feasible else f"{label} (infeasible)",
-        *(FORCE(value) for value in (*found.minimum_normal_force, *found.peak_normal_force)),
-        ABOVE_REST(found.mean_excess_above_static),
-        DURATION(found.duration),
-        PAYLOAD(found.payload_limit),
-    )
+    label = label if found.feasible else f"{label} (infeasible)"
+    forces = (found.minimum_normal_force, found.peak_normal_force)
+    more = (found.mean_excess_above_static, found.duration, found.payload_limit)
+    return _pressed(label, *forces, *more)
+
+
+def _pressed(
+    label: str,
+    least: Iterable[float | None],
+    peak: Iterable[float],
+    above_rest: float,
+    duration: float | None,
+    payload: float,
+) -> tuple[str, ...]:
+    last = (ABOVE_REST(above_rest), DURATION(duration), PAYLOAD(payload))
+    return (label, *map(FORCE, (*least, *peak)), *last)
 
 
 def replicas(summary: CampaignSummary) -> Table:
     """Selected carries of all replicas, and what the polish made better."""
-    rows = []
+    rows, keys = [], ("mean_excess_above_static", "payload_limit")
     for name, entry in summary.algorithms.items():
         for label, figures in _variants(name, entry):
-            keys = ("mean_excess_above_static", "payload_limit")
-            cells = [_over_replicas(figures, key) for key in keys]
-            better, gap = NOTHING, NOTHING
-            if entry.polished is not None and label != title(name):
-                better = f"{entry.polished.replicas_improved} of {len(figures)}"
-                gap = QUANTITIES["widest_gap"](entry.polished.statistics["widest_gap"].median)
-            rows.append((label, *cells, better, gap))
+            better, gap, polished = NOTHING, NOTHING, entry.polished
+            if polished is not None and label != title(name):
+                better = f"{polished.replicas_improved} of {len(figures)}"
+                gap = QUANTITIES["widest_gap"](polished.statistics["widest_gap"].median)
+            rows.append((label, *(_over_replicas(figures, key) for key in keys), better, gap))
     headings = (ABOVE_REST.heading(), PAYLOAD.heading(), "better in")
     return Table(
         "replicas",
@@ -263,24 +256,20 @@ def infeasible(summary: CampaignSummary) -> Table:
     """What made candidates infeasible."""
     shares: dict[str, dict[str, float]] = {}
     for name, entry in summary.algorithms.items():
+        counts = sum((Counter(row.infeasible_by_reason) for row in entry.replicas), Counter[str]())
         total = sum(row.evaluations for row in entry.replicas)
-        for row in entry.replicas:
-            for reason, count in row.infeasible_by_reason.items():
-                own = shares.setdefault(reason, {})
-                own[name] = own.get(name, 0.0) + count / total
-    ranked = sorted(shares, key=lambda reason: -max(shares[reason].values()))
-    share = Quantity("", "%", 1, 100.0)
+        for reason, count in counts.items():
+            shares.setdefault(reason, {})[name] = count / total
+    share, names = QUANTITIES["feasible_share"], summary.algorithms
+    rows = [
+        (constraint_title(reason, summary.robots), *(share(own.get(name, 0.0)) for name in names))
+        for reason, own in sorted(shares.items(), key=lambda each: -max(each[1].values()))
+    ]
     return Table(
         "infeasibility",
         "What made candidates infeasible.",
-        ("constraint", *(f"{title(name)} [%]" for name in summary.algorithms)),
-        tuple(
-            (
-                constraint_title(reason, summary.robots),
-                *(share(shares[reason].get(name, 0.0)) for name in summary.algorithms),
-            )
-            for reason in ranked
-        ),
+        ("constraint", *(f"{title(name)} [{share.unit}]" for name in names)),
+        tuple(rows),
         "The constraint violated first along the path, in percent of all candidates.",
     )
 
@@ -299,21 +288,15 @@ def bounds(search: Bounds, drivable: Bounds | None = None) -> Table:
     for name, found in (("search", search), ("drivable", drivable)):
         if found is None:
             continue
-        if not found.binding:
-            rows.append((name, "none", NOTHING, f"0 of {found.solutions}"))
+        of = f"of {found.solutions}"
         often = sorted(found.binding, key=lambda bound: -bound.solutions)
-        rows += [
-            (
-                name,
-                f"{bound.side}, {bound.variable}",
-                f"{bound.value:g}",
-                f"{bound.solutions} of {found.solutions}",
-            )
-            for bound in often[:MOST_BOUNDS]
-        ]
-        if left := often[MOST_BOUNDS:]:
-            fewer = f"at most {left[0].solutions} of {found.solutions}"
-            rows.append((name, f"and {counted(len(left), 'further bound')}", NOTHING, fewer))
+        shown, left = often[:MOST_BOUNDS], often[MOST_BOUNDS:]
+        told = [(f"{b.side}, {b.variable}", f"{b.value:g}", f"{b.solutions} {of}") for b in shown]
+        told += [] if often else [("none", NOTHING, f"0 {of}")]
+        if left:
+            further = f"and {counted(len(left), 'further bound')}"
+            told.append((further, NOTHING, f"at most {left[0].solutions} {of}"))
+        rows += [(name, *each) for each in told]
     return Table(
         "bounds",
         "Bounds of the variables that members of the best fronts lie on.",

@@ -84,8 +84,14 @@ def hybrid_data(data: ReportData) -> ReportData:
         hybrid = run.front.after(done)
         return replace(run, hybrid=hybrid, figures=replace(run.figures, polished=figures))
 
+    chosen = data.algorithms[-1].best
+    assert chosen is not None
     algorithms = tuple(
-        replace(algorithm, runs=tuple(map(polished, algorithm.runs)), best=data.algorithms[-1].best)
+        replace(
+            algorithm,
+            runs=tuple(map(polished, algorithm.runs)),
+            best=replace(chosen, look=algorithm.look),
+        )
         for algorithm in data.algorithms
     )
     simulations = tuple(simulation(label) for label in (data.initial.label, "recommended"))

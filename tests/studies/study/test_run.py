@@ -11,8 +11,9 @@ import shutil
 import signal
 import subprocess
 import sys
+from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import numpy as np
 import pytest
@@ -21,7 +22,7 @@ import hybrid_opt as ho
 from hybrid_opt.campaign import ExecutionSettings, Stage, open_folder, run_stages
 from hybrid_opt.campaign.results import read_campaign
 from hybrid_opt.errors import NoCarryError
-from hybrid_opt.evaluate.evaluation import REASONS, CandidateEvaluator
+from hybrid_opt.evaluate.evaluation import REASONS
 from hybrid_opt.indicators import metrics
 from hybrid_opt.progress import Progress
 from hybrid_opt.recommending.choice import Wish
@@ -72,6 +73,15 @@ def test_study_leaves_everything_behind(program_run: tuple[Path, str]) -> None:
         assert entry.payload_limit < summary.static_hold.payload_limit
         rows = list(csv.reader((root / f"fronts/{replica.algorithm}.csv").open()))
         assert rows[0] == ["peak_force_1", "peak_force_2"]
+        # Searches start from the initial trajectory.
+        initial = results.workcell.task.initial.ravel()
+        assert (found.x[0] == initial).all()
+        assert not (found.x[1:40] == initial).all(axis=1).any()
+    reference = np.loadtxt(root / "fronts/reference.csv", delimiter=",", skiprows=1, ndmin=2)
+    union = np.concatenate([replica.front for replica in results.replicas])
+    np.testing.assert_array_equal(reference, metrics.front_of(union))
+    levels = np.loadtxt(root / "fronts/mopso-attainment.csv", delimiter=",", skiprows=1, ndmin=2)
+    assert set(levels[:, 0]) == {25.0, 50.0, 75.0, 100.0}
     assert "Table 1" in printed
     assert "Table 2" not in printed, "the page and tables/ have it"
     assert len(printed.splitlines()) <= 25
@@ -79,7 +89,7 @@ def test_study_leaves_everything_behind(program_run: tuple[Path, str]) -> None:
     assert "paper" not in printed.lower()
 
 
-def test_study_opens_with_a_carry_to_run(program_run: tuple[Path, str]) -> None:
+def test_study_opens_with_a_carry_to_run(program_run: tuple[Path, str], tmp_path: Path) -> None:
     """Terminal, summary.json and the stored trajectory agree; the hand-made one stands beside."""
     root, printed = program_run
     found = read_summary(root).recommendation
@@ -92,6 +102,7 @@ def test_study_opens_with_a_carry_to_run(program_run: tuple[Path, str]) -> None:
     assert f"--target ros2-control --force-limit {found.force_limit:.6g}" in printed
     assert str(root) not in found.export, "it holds wherever the folder is moved"
     stored = read_trajectory(root / found.file)
+    assert replay(stored, tmp_path).reproduced
     assert stored.x[-1] == found.force_limit
     drivable = read_campaign(root / "drivable")
     assert drivable.objectives == ("duration", "peak_force")
@@ -103,19 +114,11 @@ def test_study_opens_with_a_carry_to_run(program_run: tuple[Path, str]) -> None:
     assert labels == ["hand-made", "recommended", "least-force", "NSGA-II", "MOPSO"]
     assert [row.replicas for row in found.durations.rows] == [1, 1, 1, 2, 2]
     for folder, law in ((root, "ramped"), (root / "drivable", "optimal")):
-        hand_made = read_trajectory(folder / "selected/hand-made.json")
-        with TemporaryDirectory() as unpacked:
-            workcell = hand_made.unpack(Path(unpacked))
-        assert workcell.task.time_law == law
-        np.testing.assert_array_equal(
-            hand_made.x[: workcell.task.n_path], load(Path(CELL)).task.initial.ravel()
-        )
+        task, hand_made = read_campaign(folder).workcell.task, folder / "selected/hand-made.json"
+        assert task.time_law == law
+        own = load(TRANSFER).task.initial.ravel()
+        np.testing.assert_array_equal(read_trajectory(hand_made).x[: task.n_path], own)
     assert (root / "timing/hand-made.json").exists()
-
-
-def test_the_recommended_file_is_reproduced(program_run: tuple[Path, str], tmp_path: Path) -> None:
-    root, _ = program_run
-    assert replay(read_trajectory(root / "recommended.json"), tmp_path).reproduced
 
 
 def test_another_wish_needs_no_other_study(
@@ -130,22 +133,6 @@ def test_another_wish_needs_no_other_study(
     assert read_trajectory(file).figures["duration"] < 4.1
     assert recommend.main([str(root), "--duration", "4", "--payload", "9"]) == 2
     assert "give at most one" in capsys.readouterr().err
-
-
-def test_searches_start_from_the_initial_trajectory(program_run: tuple[Path, str]) -> None:
-    for replica in read_campaign(program_run[0]).replicas:
-        initial = load(Path(CELL)).task.initial.ravel()
-        assert (replica.evaluations.x[0] == initial).all()
-        assert not (replica.evaluations.x[1:40] == initial).all(axis=1).any()
-
-
-def test_reference_front_file_is_the_union(program_run: tuple[Path, str]) -> None:
-    root, _ = program_run
-    rows = np.loadtxt(root / "fronts/reference.csv", delimiter=",", skiprows=1, ndmin=2)
-    union = np.concatenate([replica.front for replica in read_campaign(root).replicas])
-    np.testing.assert_array_equal(rows, metrics.front_of(union))
-    levels = np.loadtxt(root / "fronts/mopso-attainment.csv", delimiter=",", skiprows=1, ndmin=2)
-    assert set(levels[:, 0]) == {25.0, 50.0, 75.0, 100.0}
 
 
 def test_a_stored_study_can_be_repeated_from_its_own_workcell(
@@ -175,24 +162,51 @@ def test_resuming_a_finished_study_only_tells(
     assert before == {p: p.stat().st_mtime_ns for p in root.rglob("*.*") if p.name != ".lock"}
 
 
+def interrupted(
+    options: list[str], cache: Path | None, ready: Callable[[], bool], seconds: float = HANGS
+) -> list[str]:
+    """What a study of the cell says when Ctrl-C comes as soon as it is ready: it ends by then."""
+    process = subprocess.Popen(
+        [sys.executable, "-m", "studies.run", CELL, *options],
+        cwd=ROOT,
+        env=os.environ | ({} if cache is None else {"DUAL_ARM_CACHE": str(cache)}),
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    until(ready, process)
+    with soon(seconds):
+        os.killpg(process.pid, signal.SIGINT)
+        message = process.communicate(timeout=HANGS)[1]
+    assert process.returncode == 130
+    assert "Traceback" not in message
+    return message.strip().splitlines()
+
+
+CONTINUED = "interrupted, nothing is lost; continue with: python -m studies.run "
+
+
 def test_interrupt_tells_how_to_go_on(tmp_path: Path) -> None:
     root = tmp_path / "my results"
-    command = [sys.executable, "-m", "studies.run", CELL, "--output", str(root)]
-    command += ["--no-polish", "--no-drivable"]  # what they need is not compiled for it
-    command += ["--evaluations", "20000", "--replicas", "1", "--jobs", "2", "--seed", "5"]
-    process = subprocess.Popen(
-        command, cwd=ROOT, stderr=subprocess.PIPE, text=True, start_new_session=True
-    )
+    options = ["--no-polish", "--no-drivable"]  # what they need is not compiled for it
+    options += ["--evaluations", "20000", "--replicas", "1", "--jobs", "2", "--seed", "5"]
     journals = "replicas/*/*/journal.bin"
-    until(lambda: any(path.stat().st_size > 40 for path in root.glob(journals)), process)
-    os.killpg(process.pid, signal.SIGINT)
-    message = process.communicate(timeout=HANGS)[1]
-    assert process.returncode == 130
-    last = message.strip().splitlines()[-1]
-    assert last.startswith("interrupted, nothing is lost; continue with: python -m studies.run ")
+    last = interrupted(
+        ["--output", str(root), *options],
+        None,
+        lambda: any(path.stat().st_size > 40 for path in root.glob(journals)),
+    )[-1]
+    assert last.startswith(CONTINUED)
     assert f"--output '{root}'" in last
     assert last.endswith("--seed 5 --resume")
-    assert "Traceback" not in message
+
+
+def test_interrupt_while_compiling_ends_at_once(tmp_path: Path) -> None:
+    cache, options = tmp_path / "cache", ["--output", str(tmp_path / "a"), "--quick"]
+    # Some seconds of compilers before Ctrl-C; all take 60 s.
+    lines = interrupted(options, cache, lambda: any(cache.glob("build-*/*.c")), 25.0)
+    (said,) = [line for line in lines if line and "compiling:" not in line]
+    assert said.startswith(CONTINUED)
 
 
 @pytest.mark.parametrize(
@@ -270,59 +284,28 @@ def test_a_study_without_a_recommendation_says_why(
         recommend_from(root, Wish(), tmp_path / "carry.json", Progress(shown=False))
 
 
-def test_help_explains_every_option_with_its_default() -> None:
-    parser = rack.main.parser()
-    options = re.split(r"\n(?=  --)", parser.format_help())[1:]
-    named = [action for action in parser._actions if action.dest != "help"]
-    assert len(options) == len(named)
-    for option in options:
-        assert re.search(r"\(default:", option), option
-
-
-def test_options_tell_how_fronts_are_polished() -> None:
+def test_options_are_explained_and_become_settings() -> None:
     parser, usual = rack.main.parser(), ho.PolishSettings()
+    told = re.split(r"\n(?=  --)", parser.format_help())[1:]
+    assert len(told) == len([action for action in parser._actions if action.dest != "help"])
+    assert all(re.search(r"\(default:", option) for option in told)
     assert polish_settings(parser.parse_args([]), True, "constant") == usual
-    asked = parser.parse_args(["--polish-solver", "ipopt", "--polish-attempts", "3"])
-    found = polish_settings(asked, True, "constant")
-    assert found is not None
-    assert (found.solver, found.attempts) == ("ipopt", 3)
     assert polish_settings(parser.parse_args(["--no-polish"]), True, "constant") is None
-
-
-def test_options_become_settings() -> None:
     arguments = (
         "--algorithm mopso --algorithm random --population mopso=30 --objective duration "
         "--first-generation random --constraint-handling constraints --seed 7 --evaluations 50 "
-        "--replicas 3"
+        "--replicas 3 --polish --polish-solver ipopt --polish-attempts 3"
     )
-    options = rack.main.parser().parse_args(arguments.split())
-    settings = campaign_settings(options)
+    options = parser.parse_args(arguments.split())
+    polish, settings = polish_settings(options, True, "constant"), campaign_settings(options)
+    assert polish is not None
+    assert (polish.solver, polish.attempts) == ("ipopt", 3)
     assert list(settings.algorithms) == ["mopso", "random"]
     assert settings.algorithms["mopso"]["swarm"] == 30
     assert settings.objectives == ("duration",)
     assert settings.constraint_handling == "constraints"
     assert settings.first_generation == "random"
     assert (settings.seed, settings.evaluations, settings.replicas) == (7, 50, 3)
-
-
-def test_interrupt_while_compiling_ends_at_once(tmp_path: Path) -> None:
-    root, cache = tmp_path / "a", tmp_path / "cache"
-    command = [sys.executable, "-m", "studies.run", CELL, "--output", str(root), "--quick"]
-    process = subprocess.Popen(
-        command,
-        cwd=ROOT,
-        env=os.environ | {"DUAL_ARM_CACHE": str(cache)},
-        stderr=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
-    )
-    until(lambda: any(cache.glob("build-*/*.c")), process)
-    with soon(25.0):  # some seconds of them before Ctrl-C; all compilers take 60 s
-        os.killpg(process.pid, signal.SIGINT)
-        message = process.communicate(timeout=HANGS)[1]
-    assert process.returncode == 130
-    (said,) = [line for line in message.splitlines() if line and "compiling:" not in line]
-    assert said.startswith("interrupted, nothing is lost; continue with: python -m studies.run ")
 
 
 def test_what_is_refused_is_refused_before_anything_is_compiled(
@@ -401,29 +384,18 @@ def test_why_carries_are_not_polished_is_told(
     assert "are only searched, not polished: the polish does not" in capsys.readouterr().err
 
 
-@pytest.fixture(scope="module")
-def evaluator() -> CandidateEvaluator:
-    return shipped("rack").evaluator
-
-
-def test_the_hand_made_trajectory_is_feasible(evaluator: CandidateEvaluator) -> None:
-    verdict = evaluator.evaluate(evaluator.workcell.task.initial.reshape(1, -1))
-    assert verdict.feasible.all()
+@pytest.mark.slow
+def test_the_hand_made_trajectory_is_feasible_and_few_random_ones_are() -> None:
+    """20,000 uniform candidates: 2.01 % feasible with this seed when the bounds were chosen."""
+    evaluator, rng = shipped("rack").evaluator, np.random.default_rng(0)
+    hand_made = evaluator.evaluate(evaluator.workcell.task.initial.reshape(1, -1))
+    assert hand_made.feasible.all()
     # 2.9 % above the static hold, the figure of a trial by another program.
     static = evaluator.workcell.payload.mass * 9.81 / 2.0
-    excess = verdict.objectives[0] * evaluator.workcell.task.reference_force / static - 1.0
+    excess = hand_made.objectives[0] * evaluator.workcell.task.reference_force / static - 1.0
     np.testing.assert_allclose(excess, 0.029, atol=5e-4)
-
-
-@pytest.mark.slow
-def test_few_random_candidates_are_feasible_and_for_several_reasons(
-    evaluator: CandidateEvaluator,
-) -> None:
-    """20,000 uniform candidates: 2.01 % feasible with this seed when the bounds were chosen."""
-    rng = np.random.default_rng(0)
-    verdict = evaluator.evaluate(
-        rng.uniform(evaluator.lower, evaluator.upper, (20000, evaluator.n_var))
-    )
+    candidates = rng.uniform(evaluator.lower, evaluator.upper, (20000, evaluator.n_var))
+    verdict = evaluator.evaluate(candidates)
     assert 0.02 <= verdict.feasible.mean() <= 0.20
     violated = {REASONS[k] for k in np.flatnonzero((verdict.violation > 0.0).any(axis=0))}
     assert {"collision", "reach_1", "reach_2", "joint_limits_1", "pressure_1"} <= violated
@@ -432,10 +404,13 @@ def test_few_random_candidates_are_feasible_and_for_several_reasons(
 @pytest.mark.parametrize(
     ("arguments", "started"),
     [
-        (["--quick"], True),
-        (["--executor", "processes"], True),
-        (["--executor", "dask", "--scheduler", "tcp://here:8786"], False),
-        (["--executor=dask"], False),
+        (["cell.toml", "--quick"], True),
+        (["cell.toml", "--executor", "processes"], True),
+        (["cell.toml", "--executor", "dask", "--scheduler", "tcp://here:8786"], False),
+        (["cell.toml", "--executor=dask"], False),
+        (["--help"], False),
+        (["cell.toml", "-h"], False),
+        (["cell.toml", "--qick"], False),
     ],
 )
 def test_workers_are_started_for_work_on_this_machine(
@@ -443,18 +418,7 @@ def test_workers_are_started_for_work_on_this_machine(
 ) -> None:
     loaded: list[tuple[str, ...]] = []
     monkeypatch.setattr(run, "warm_up", lambda *modules: loaded.append(modules))
-    assert run.main([str(tmp_path / "none.toml"), *arguments]) == 2
+    monkeypatch.chdir(tmp_path)
+    with suppress(SystemExit):
+        assert run.main(arguments) == 2
     assert loaded == ([run.WORKERS_LOAD] if started else [])
-
-
-@pytest.mark.parametrize("arguments", [["--help"], ["cell.toml", "-h"], ["cell.toml", "--qick"]])
-def test_none_are_started_without_work(
-    arguments: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def start(*modules: str) -> None:
-        raise AssertionError(modules)
-
-    monkeypatch.setattr(run, "warm_up", start)
-    with pytest.raises(SystemExit):
-        run.main(arguments)
-    assert capsys.readouterr()

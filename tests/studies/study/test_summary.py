@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import shutil
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -52,7 +51,6 @@ from studies.study.summary import (
     SelectedEntry,
     best_steps,
     campaign_summary,
-    reference_front,
     replica_figures,
 )
 from studies.study.tables import PAPER, simulated, study_tables
@@ -115,16 +113,8 @@ def test_figures_of_a_replica_by_hand() -> None:
 
 def test_best_steps_begin_with_the_first_feasible_candidate() -> None:
     history = np.array([[NAN, NAN], [0.5, 0.6], [0.5, 0.6], [0.5, 0.4]])
-    steps = [step.tolist() for step in best_steps(history)]
-    assert steps == [[2, 0.5, 0.6], [4, 0.5, 0.4]]
+    assert [step.tolist() for step in best_steps(history)] == [[2, 0.5, 0.6], [4, 0.5, 0.4]]
     assert best_steps(history[:1]) == ()
-
-
-def test_reference_front_is_the_union() -> None:
-    first = replica([[0.2, 0.8], [0.5, 0.5]], ["", ""])
-    second = replica([[0.8, 0.2], [0.6, 0.6], [0.1, 0.1]], ["", "", "collision"])
-    union = reference_front([first.front, second.front])
-    assert union.tolist() == [[0.2, 0.8], [0.5, 0.5], [0.8, 0.2]]
 
 
 PAIR = np.array([50.0, 51.25])
@@ -182,6 +172,10 @@ def test_statistics_and_tests_of_a_campaign() -> None:
     assert tests["hypervolume"].a12 == 1.0
     assert tests["hypervolume"].p_holm == pytest.approx(len(TESTED) * 2.0 / 252.0)
     assert made.reference_front.hypervolume == pytest.approx(0.7 * 0.5)
+    # It comes back from its file.
+    document = to_json(made)
+    again = from_json(CampaignSummary, json.loads(json.dumps(document)), Path(), "do it again")
+    assert to_json(again) == document
 
 
 def test_few_replicas_are_not_tested() -> None:
@@ -192,13 +186,6 @@ def test_few_replicas_are_not_tested() -> None:
     assert made.tests == ()
     assert "tests" not in {table.name for table in study_tables(made)}
     assert "tests" in {table.name for table in study_tables(summary())}
-
-
-def test_a_summary_comes_back_from_its_file(tmp_path: Path) -> None:
-    made = summary()
-    document = to_json(made)
-    again = from_json(CampaignSummary, json.loads(json.dumps(document)), tmp_path, "do it again")
-    assert to_json(again) == document
 
 
 def test_figures_that_do_not_exist_become_null() -> None:
@@ -244,31 +231,20 @@ def test_the_papers_figures_stand_beside_ours_only_where_it_states_them() -> Non
 
 
 def test_ends_and_middle_of_polished_fronts_and_the_balanced_path_are_known(
-    study: Path, tmp_path: Path
+    own_study: Path,
 ) -> None:
-    root = tmp_path / "results"
-    shutil.copytree(study, root)
-    campaign = read_campaign(root)
-    task = campaign.workcell.task
-    n = task.n_path
+    root, campaign = own_study, read_campaign(own_study)
+    task, n = campaign.workcell.task, campaign.workcell.task.n_path
     (balanced,) = least_force(campaign, task).values()
     np.testing.assert_array_equal(known_paths(root, task), balanced[None])
     replica = max(campaign.replicas, key=lambda one: len(one.front))
-    front = PolishedFront(
-        np.array(replica.front_x),
-        np.array(replica.front),
-        np.full(len(replica.front), -1),
-        np.ones(len(replica.front), dtype=bool),
-        (),
-        1.0,
-        1.0,
-        "quadratic",
-    )
+    x, objectives, n_front = replica.front_x, replica.front, len(replica.front)
+    rows, made = np.full(n_front, -1), np.ones(n_front, dtype=bool)
+    front = PolishedFront(x, objectives, rows, made, (), 1.0, 1.0, "quadratic")
     path = polished_folder(root, replica.algorithm, replica.replica) / POLISH
     path.parent.mkdir(parents=True)
     write_json(path, to_json(front))
-    wanted = replica.front_x[[0, len(replica.front) // 2, -1], :n]
-    both = np.unique(np.vstack([balanced, wanted]), axis=0)
+    both = np.unique(np.vstack([balanced, x[[0, n_front // 2, -1], :n]]), axis=0)
     np.testing.assert_array_equal(known_paths(root, task), both)
 
 
@@ -323,10 +299,12 @@ def test_every_answer_is_kept_and_not_asked_for_again(
     np.testing.assert_array_equal(found[0].simulated, simulation("").simulated)
 
 
-def test_a_damaged_file_is_told_and_simulated_anew(own_study: Path) -> None:
+def test_a_damaged_file_is_simulated_anew_and_what_cannot_be_simulated_is_kept(
+    own_study: Path,
+) -> None:
     one = wanted_carries(own_study)[0]
-    (own_study / SIMULATED).mkdir()
     path = own_study / SIMULATED / f"{one.name}.json"
+    path.parent.mkdir()
     document = to_json(replace(simulation(one.label), trajectory=one.digest))
     write_json(path, document)
     assert is_done(own_study, one)
@@ -334,6 +312,10 @@ def test_a_damaged_file_is_told_and_simulated_anew(own_study: Path) -> None:
     assert not is_done(own_study, one)
     with pytest.raises(ResultsError, match="different lengths"):
         read_simulations(own_study)
+    lost = StoredSimulation(one.label, one.digest, "leader", "joint 'lift' moves both arms")
+    write_json(path, to_json(lost))
+    assert is_done(own_study, one)
+    assert "joint 'lift' moves both arms" in simulated(read_simulations(own_study)).text()
 
 
 def test_the_table_tells_threshold_forces_and_what_became_of_the_box() -> None:
@@ -348,17 +330,6 @@ def test_the_table_tells_threshold_forces_and_what_became_of_the_box() -> None:
     assert first.split()[-1] == "yes"
     assert lost in second
     assert second.split()[-1] == "NO"
-
-
-def test_what_cannot_be_simulated_is_told_and_kept(own_study: Path) -> None:
-    one = wanted_carries(own_study)[0]
-    lost = StoredSimulation(one.label, one.digest, "leader", "joint 'lift' moves both arms")
-    (own_study / SIMULATED).mkdir()
-    write_json(own_study / SIMULATED / f"{one.name}.json", to_json(lost))
-    assert is_done(own_study, one)
-    (row,) = simulated(read_simulations(own_study)).text().splitlines()[3:4]
-    assert "joint 'lift' moves both arms" in row
-    assert row.split()[-1] == "NO"
 
 
 def test_without_the_simulator_it_is_told_before_the_work(
