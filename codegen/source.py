@@ -208,12 +208,9 @@ def _count(function: ca.Function, known: dict[int, int], left_out: frozenset[str
                 total += 1
         return total
     inner = function.find_functions(0)
-    if function.is_a("Map"):
-        return _repeats(function, inner[0]) * _operations(inner[0], known, left_out)
-    return 1 + sum(_operations(f, known, left_out) for f in inner)
-
-
-def _repeats(function: ca.Function, inner: ca.Function) -> int:
-    """How often a map runs its inner function: its arguments and results are that many."""
-    part = inner.nnz_in() + inner.nnz_out()
-    return int((function.nnz_in() + function.nnz_out()) // part) if part else 1
+    total = sum(_operations(f, known, left_out) for f in inner)
+    if not function.is_a("Map"):
+        return 1 + total
+    # Arguments and results of a map are so many times those of its inner function.
+    part = inner[0].nnz_in() + inner[0].nnz_out()
+    return (int((function.nnz_in() + function.nnz_out()) // part) if part else 1) * total

@@ -6,7 +6,6 @@ a sample is a function of (u'', u'^2) whose coefficients lie packed in one vecto
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Any
 
@@ -45,19 +44,16 @@ SPEEDS_OF_BOX = 4
 
 
 @dataclass(frozen=True)
-class BlockLayout(ABC):
+class BlockLayout:
     """Where blocks of numbers lie in a vector, one behind the other.
 
     Attributes:
         joints: of both arms.
+        sizes: numbers per block, in order.
     """
 
     joints: int
-
-    @property
-    @abstractmethod
-    def sizes(self) -> dict[str, int]:
-        """Numbers per block, in order."""
+    sizes: dict[str, int]
 
     @property
     def offsets(self) -> dict[str, int]:
@@ -77,7 +73,7 @@ class BlockLayout(ABC):
         return sum(self.sizes.values())
 
 
-class LimitLayout(BlockLayout):
+def limit_layout(workcell: Workcell) -> BlockLayout:
     """Where the coefficients of limits lie in a sample's vector.
 
     Blocks, in order:
@@ -93,25 +89,9 @@ class LimitLayout(BlockLayout):
     the contact wrench about the nominal point, along the axes of contact 1; both over the torque
     limits.
     """
-
-    @property
-    def sizes(self) -> dict[str, int]:
-        """See `BlockLayout`."""
-        j = self.joints
-        return {
-            "speed": j + SPEEDS_OF_BOX,
-            "acceleration": 2 * j,
-            "cone": 12,
-            "force": 9,
-            "moment": 6,
-            "torque": 3 * j,
-            "wrench": 6 * j,
-        }
-
-
-def limit_layout(workcell: Workcell) -> LimitLayout:
-    """The layout for a workcell's arms."""
-    return LimitLayout(sum(robot.velocity_max.shape[0] for robot in workcell.robots))
+    j = sum(robot.velocity_max.shape[0] for robot in workcell.robots)
+    sizes = {"speed": j + SPEEDS_OF_BOX, "acceleration": 2 * j, "cone": 12, "force": 9, "moment": 6}
+    return BlockLayout(j, sizes | {"torque": 3 * j, "wrench": 6 * j})
 
 
 PATH_OUTPUTS = ("pose", "pose_first", "pose_second", "q_1", "q_2")
@@ -152,7 +132,7 @@ def path_function(model: CellModel, samples: int) -> ca.Function:
 
 
 def sample_limits_function(model: CellModel) -> ca.Function:
-    """`PATH_OUTPUTS` of one sample to its coefficients, limits (size,) by `LimitLayout`."""
+    """`PATH_OUTPUTS` of one sample to its coefficients, limits (size,) by `limit_layout`."""
     workcell = model.workcell
     payload, task, layout = workcell.payload, workcell.task, limit_layout(workcell)
     given = [ca.SX.sym(name, task.extended_size) for name in ("pose", "first", "second")]
@@ -230,7 +210,7 @@ def _held(
 def force_functions(workcell: Workcell) -> tuple[ca.Function, ca.Function]:
     """Both normal forces at one sample, which are convex in (u'', u'^2), and their slopes.
 
-    Both take the force (9,) and moment (6,) blocks of `LimitLayout` as one input, then u'' and
+    Both take the force (9,) and moment (6,) blocks of `limit_layout` as one input, then u'' and
     u'^2, and the numbers of what is held. `limit_forces` gives (2,) [N], and what was solved for
     them (k,): the grip of soft fingers, or the state of the program that finds the forces, which
     then are those on its central path (`symbolic.contact.soft_grasp`). `limit_force_slopes` and
@@ -264,8 +244,8 @@ def force_functions(workcell: Workcell) -> tuple[ca.Function, ca.Function]:
 
 
 def _load_function(workcell: Workcell) -> ca.Function:
-    """Force and moment blocks of `LimitLayout`, u'' and u'^2 to the load (6,) about the box frame's
-    origin, box axes, and its derivatives (6, 2) by u'' and u'^2."""
+    """Blocks force and moment of `limit_layout`, u'' and u'^2 to the load (6,) about the box
+    frame's origin, box axes, and its derivatives (6, 2) by u'' and u'^2."""
     size = limit_layout(workcell).sizes["force"]
     payload = workcell.payload
     axes, centre = number(workcell.contacts[0].T_box_pad[:3, :3]), number(payload.centre_of_mass)
@@ -310,7 +290,7 @@ def path_force_function(workcell: Workcell) -> ca.Function:
 def ratio_functions(workcell: Workcell) -> tuple[ca.Function, ca.Function]:
     """Limits that are not convex, at one sample, and their derivatives by (u'', u'^2).
 
-    Both take force (9,), moment (6,), torque and wrench blocks of `LimitLayout` as one input, then
+    Both take force (9,), moment (6,), torque and wrench blocks of `limit_layout` as one input, then
     what else `limit_force_slopes` takes, see `force_functions`. `limit_ratios` gives
     `contact_limits`' ratios; `limit_slopes` gives the same and their derivatives (joints + 2,) by
     u'' and by u'^2. Where a program finds the forces, shifts of the pressure are no limit and count
@@ -341,7 +321,7 @@ def contact_limits(
 
     Args:
         workcell: the cell.
-        blocks: force, moment, torque and wrench, see `LimitLayout`.
+        blocks: force, moment, torque and wrench, see `limit_layout`.
         timing: u'' and u'^2.
         detached: see `symbolic.contact.soft_finger.Detached`.
 

@@ -479,7 +479,7 @@ def passes_function(
 ) -> NumericFunction | None:
     """The timing of one path from its limits; None where these do not tell the contact wrenches.
 
-    Inputs: samples (2 intervals + 1, `LimitLayout.size`), both ends and the middle of
+    Inputs: samples (2 intervals + 1, `symbolic.limits.limit_layout`), both ends and the middle of
     every interval; options (4,): largest normal force [N],
     infinite for none, then whether torques, pressure shifts and the reference speeds are limited
     (0 or 1); with cuts, cuts (2 intervals + 1, cuts, 3): at every sample lines

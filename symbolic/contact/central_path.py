@@ -93,25 +93,20 @@ class Program(Protocol):
         """Functions are kept by program."""
 
 
-def least_effort(program: Program, *cell: ca.MX) -> ca.MX:
+def least_effort(program: Program, *cell: ca.MX, differentiable: bool = False) -> ca.MX:
     """Scaled wrenches of least effort side by side, in the order of the program's patches.
 
     Args:
         cell: the program's inputs, its given numbers behind them.
-
-    Where derivatives are wanted: `differentiable_least_effort`.
+        differentiable: whether first derivatives are wanted. They are those of the central path, on
+            which the wrenches then lie after some more steps: the last one is differentiated, the
+            iterate it starts from is not. Second ones are not to be had so.
     """
-    return _wrenches(program, central_path(program)(*cell))
-
-
-def differentiable_least_effort(program: Program, *cell: ca.MX) -> ca.MX:
-    """As `least_effort`, on the central path itself; some more steps.
-
-    First derivatives are those of the central path: the last step is differentiated, the
-    iterate it starts from is not. Second ones are not to be had so.
-    """
-    iterate, _ = _barrier_step(program)(centred(program)(*cell), 1.0, *cell)
-    return _wrenches(program, iterate)
+    if differentiable:
+        iterate, _ = _barrier_step(program)(centred(program)(*cell), 1.0, *cell)
+    else:
+        iterate = central_path(program)(*cell)
+    return ca.vertcat(*wrenches_of(program, ca.vertsplit(iterate, ends_of(program))))
 
 
 @lru_cache(PROGRAMS)
@@ -270,10 +265,6 @@ def _newton_step(program: Program, share: float) -> ca.Function:
     return ca.Function(
         "newton_step", [iterate, *cell], [ca.vertcat(*[step.change for step in steps]), length]
     )
-
-
-def _wrenches(program: Program, iterate: ca.MX) -> ca.MX:
-    return ca.vertcat(*wrenches_of(program, ca.vertsplit(iterate, ends_of(program))))
 
 
 # --- Newton's equations ---

@@ -26,7 +26,7 @@ from functools import partial
 import casadi as ca
 
 from symbolic.contact.force_closure import EVEN
-from symbolic.contact.patches import Aim, BarrierPatch, Elimination, StateStep, Step
+from symbolic.contact.patches import Aim, BarrierPatch, Elimination, Patch, StateStep, Step
 from symbolic.contact.soft_finger import SoftPatch, torsion_capacity
 
 DEGREE = 2.0
@@ -50,7 +50,7 @@ SAFE = 0.9
 
 
 @dataclass(frozen=True)
-class EvenPatch:
+class EvenPatch(Patch):
     """A patch that presses evenly.
 
     Attributes:
@@ -58,11 +58,8 @@ class EvenPatch:
     """
 
     shape: SoftPatch
-    wrench_size: int = len(EVEN)
-    iterate_size: int = 2 * len(EVEN) + 1
-    state_size: int = len(EVEN)
-    correction_size: int = len(EVEN)
-    degree: float = DEGREE
+    wrench_size = state_size = correction_size = len(EVEN)
+    iterate_size, degree = 2 * len(EVEN) + 1, DEGREE
 
     def centred(self, state: ca.SX, weight: ca.SX) -> ca.SX:
         """See `symbolic.contact.patches.Patch`."""

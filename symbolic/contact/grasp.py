@@ -27,7 +27,6 @@ from symbolic.array import Array
 from symbolic.contact.central_path import (
     START_WEIGHT,
     central_point,
-    differentiable_least_effort,
     least_effort,
 )
 from symbolic.contact.even_patch import EvenPatch
@@ -243,8 +242,7 @@ class Grasp:
         """
         load, *others = cell
         size = ca.sqrt(ca.sumsqr(load[:3]) + ca.sumsqr(load[3:] / MOMENT_ARM) + SCALE_FLOOR**2)
-        solve = differentiable_least_effort if differentiable else least_effort
-        found = solve(self, load / size, *others, *given)
+        found = least_effort(self, load / size, *others, *given, differentiable=differentiable)
         return self._in_newtons()(found, size, *others[: len(SIZES)], *given)
 
     def _in_newtons(self) -> ca.Function:
@@ -381,13 +379,12 @@ def facing_wrenches(
         friction: (2,) Coulomb coefficients of the contacts.
         radius: (2,) radii of the patches [m].
         objective: what is least.
-        differentiable: whether first derivatives are wanted
-            (`symbolic.contact.central_path.differentiable_least_effort`).
+        differentiable: see `symbolic.contact.central_path.least_effort`.
     """
     scale = ca.sqrt(ca.sumsqr(balance[:3]) + ca.sumsqr(balance[3:5] / balance[8]) + SCALE_FLOOR**2)
     scaled = (ca.vertcat(balance[:6] / scale, balance[6:]), friction, radius)
-    solve = differentiable_least_effort if differentiable else least_effort
-    return _facing_in_newtons()(solve(OppositePads(objective), *scaled), scale, friction, radius)
+    found = least_effort(OppositePads(objective), *scaled, differentiable=differentiable)
+    return _facing_in_newtons()(found, scale, friction, radius)
 
 
 @cache

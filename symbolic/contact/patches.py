@@ -18,53 +18,54 @@ Symmetric positive definite systems whose first unknowns are eliminated are writ
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 import casadi as ca
 
 from symbolic.expression import reciprocal
 
 
-class Patch(Protocol):
-    """A kind of patch."""
+class Patch(ABC):
+    """A kind of patch.
 
-    @property
-    def wrench_size(self) -> int:
-        """Entries m of a scaled wrench: all six, or those that the patch can bear."""
+    Attributes:
+        wrench_size: entries m of a scaled wrench: all six, or those that the patch can bear.
+        state_size: entries of a program's state, with which an iterate begins.
+        iterate_size: entries of an iterate: state, then multipliers.
+        correction_size: entries of a correction.
+        degree: pairing of X with S over the weight on the central path.
+    """
 
-    @property
-    def iterate_size(self) -> int:
-        """Entries of an iterate: state, then multipliers."""
+    wrench_size: ClassVar[int]
+    state_size: ClassVar[int]
+    iterate_size: ClassVar[int]
+    correction_size: ClassVar[int]
+    degree: ClassVar[float]
 
-    @property
-    def state_size(self) -> int:
-        """Entries of a program's state, with which an iterate begins."""
-
-    @property
-    def correction_size(self) -> int:
-        """Entries of a correction."""
-
-    @property
-    def degree(self) -> float:
-        """Pairing of X with S over the weight on the central path."""
-
+    @abstractmethod
     def centred(self, state: ca.SX, weight: ca.SX) -> ca.SX:
         """An iterate whose X S is the weight, from a program's state."""
 
+    @abstractmethod
     def local(self, iterate: ca.SX) -> LocalPatch:
         """What steps from an iterate need."""
 
+    @abstractmethod
     def barrier(self, iterate: ca.SX, weight: ca.SX) -> BarrierPatch:
         """The patch's weighted barrier at an iterate's state, whatever the multipliers."""
 
+    @abstractmethod
     def potential(self, state: ca.SX) -> ca.SX:
         """The barrier at a program's state, of which `centred` has the multipliers."""
 
+    @abstractmethod
     def lowest(self, state: ca.SX, change: ca.SX) -> ca.SX:
         """As `StateStep.lowest_of_state`, of a change of a program's state."""
 
+    @abstractmethod
     def slack(self, state: ca.SX) -> ca.SX:
         """Positive within the cone, not so beyond its boundary; of a program's state."""
 

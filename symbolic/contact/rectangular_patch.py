@@ -19,10 +19,10 @@ from functools import partial
 import casadi as ca
 
 from symbolic.contact.force_closure import POINT_SIZE, STATE_SIZE, WRENCH_SIZE
-from symbolic.contact.patches import Aim, BarrierPatch, Elimination, StateStep, Step, least
+from symbolic.contact.patches import Aim, BarrierPatch, Elimination, Patch, StateStep, Step, least
 from symbolic.expression import reciprocal
 
-CORNERS = 4
+CORNERS = 4.0
 WAVES = 4
 """Ways in which a number varies over the corners: all the same, alternating along x, along y, and
 along both."""
@@ -31,7 +31,7 @@ _J = ca.DM([1.0, -1.0, -1.0])
 
 
 @dataclass(frozen=True)
-class RectangularPatch:
+class RectangularPatch(Patch):
     """A rectangle.
 
     Attributes:
@@ -40,11 +40,8 @@ class RectangularPatch:
 
     half_x: float | ca.SX
     half_y: float | ca.SX
-    wrench_size: int = WRENCH_SIZE
-    iterate_size: int = 2 * STATE_SIZE
-    state_size: int = STATE_SIZE
-    correction_size: int = STATE_SIZE
-    degree: float = CORNERS
+    wrench_size, iterate_size, degree = WRENCH_SIZE, 2 * STATE_SIZE, CORNERS
+    state_size = correction_size = STATE_SIZE
 
     def centred(self, state: ca.SX, weight: ca.SX) -> ca.SX:
         """See `symbolic.contact.patches.Patch`."""

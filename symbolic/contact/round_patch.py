@@ -39,7 +39,7 @@ from functools import cache, partial
 import casadi as ca
 
 from symbolic.contact.force_closure import WRENCH_SIZE
-from symbolic.contact.patches import Aim, BarrierPatch, Elimination, StateStep, Step
+from symbolic.contact.patches import Aim, BarrierPatch, Elimination, Patch, StateStep, Step
 from symbolic.expression import Expression, reciprocal
 
 Complex = tuple[ca.SX, ca.SX]
@@ -198,14 +198,12 @@ LEAST_SPREAD = 1e-60
 
 
 @dataclass(frozen=True)
-class RoundPatch:
+class RoundPatch(Patch):
     """A disc."""
 
-    wrench_size: int = WRENCH_SIZE
-    iterate_size: int = FREE_SIZE + MULTIPLIER_SIZE
-    state_size: int = WRENCH_SIZE
-    correction_size: int = HERMITIAN_SIZE
-    degree: float = 3.0
+    wrench_size = state_size = WRENCH_SIZE
+    iterate_size, correction_size = FREE_SIZE + MULTIPLIER_SIZE, HERMITIAN_SIZE
+    degree = 3.0
 
     def centred(self, state: ca.SX, weight: ca.SX) -> ca.SX:
         """See `symbolic.contact.patches.Patch`."""

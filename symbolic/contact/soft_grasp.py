@@ -50,8 +50,6 @@ class SoftGrasp:
 
     def __init__(self, grasp: Grasp, weight: float) -> None:
         self.grasp, self.weight = grasp, weight
-        self.given = grasp.given
-        self._friction = grasp.friction
         sizes = [patch.state_size for patch in grasp.patches]
         self.ends = [0, *accumulate(sizes)]
         self.size = self.ends[-1]
@@ -63,7 +61,7 @@ class SoftGrasp:
     def first(self) -> ca.Function:
         """load (6,), see `symbolic.contact.grasp.grasp_wrenches`, to normal (2,) forces of the
         robots [N], slope (6, 2), their gradients, and state (size,)."""
-        load, handed = ca.MX.sym("load", LOAD_SIZE), mx_symbols(self.given)
+        load, handed = ca.MX.sym("load", LOAD_SIZE), mx_symbols(self.grasp.given)
         state = self.solved(load, handed)
         outputs = [*self.slopes()(state, *handed.values()), state]
         inputs, names = [load, *handed.values()], ["load", *handed]
@@ -76,7 +74,7 @@ class SoftGrasp:
             handed: the given numbers.
         """
         given = list(handed.values())
-        friction = as_mx(self._friction, self.given, handed)
+        friction = as_mx(self.grasp.friction, self.grasp.given, handed)
         scale = ca.sqrt(ca.sumsqr(load[:3]) + ca.sumsqr(load[3:] / MOMENT_ARM) + SCALE_FLOOR**2)
         iterate = centred(self.grasp, self.weight)(load / scale, friction, *given)
         held, at = [], 0
@@ -94,13 +92,13 @@ class SoftGrasp:
         `symbolic.contact.grasp.grasp_wrenches`, and where asked for, to by_load (6 k, 6)."""
         state = ca.SX.sym("state", self.size)
         own = wrenches_of(self.grasp, ca.vertsplit(state, self.ends))
-        units = [self.grasp.units(i, self._friction) * wrench for i, wrench in enumerate(own)]
+        units = [self.grasp.units(i, self.grasp.friction) * wrench for i, wrench in enumerate(own)]
         outputs = [ca.vertcat(*map(whole_wrench, units))]
         if slopes:
             by_state = ca.jacobian(outputs[0], state)
             outputs.append(ca.mtimes(by_state, _Local(self, state).by_load()))
         results = ca.cse([ca.densify(value) for value in outputs])
-        return ca.Function("held_wrenches", [state, *self.given.values()], results)
+        return ca.Function("held_wrenches", [state, *self.grasp.given.values()], results)
 
     def second(self) -> ca.Function:
         """state (size,) and weight (2,) to curvature (6, 6), the weighted second derivatives of the
@@ -112,9 +110,9 @@ class SoftGrasp:
         curvature = local.third(along, local.by_load())
         return ca.Function(
             "held_second",
-            [state, weight, *self.given.values()],
+            [state, weight, *self.grasp.given.values()],
             [ca.cse(ca.densify(curvature))],
-            ["state", "weight", *self.given],
+            ["state", "weight", *self.grasp.given],
             ["curvature"],
         )
 
@@ -123,7 +121,7 @@ class SoftGrasp:
         state = ca.SX.sym("state", self.size)
         by_load = _Local(self, state).by_load()
         outputs = [ca.mtimes(self.normals, state), ca.mtimes(self.normals, by_load).T]
-        inputs = [state, *self.given.values()]
+        inputs = [state, *self.grasp.given.values()]
         return ca.Function("slopes", inputs, ca.cse([ca.densify(value) for value in outputs]))
 
     def _newton(self) -> ca.Function:
@@ -131,13 +129,13 @@ class SoftGrasp:
         state = ca.SX.sym("state", self.size)
         local = _Local(self, state)
         change = local.solved(-ca.mtimes(self.free.T, local.slope))
-        inputs = [state, *self.given.values()]
+        inputs = [state, *self.grasp.given.values()]
         return ca.Function("newton", inputs, [ca.cse(state + ca.mtimes(self.free, change))])
 
     def effort(self, state: ca.SX) -> ca.SX:
         """Half the sum of all squared forces."""
         wrenches = wrenches_of(self.grasp, ca.vertsplit(state, self.ends))
-        return self.grasp.effort(wrenches, [ca.SX(LOAD_SIZE, 1), self._friction])
+        return self.grasp.effort(wrenches, [ca.SX(LOAD_SIZE, 1), self.grasp.friction])
 
     def _states(self) -> tuple[ca.SX, ca.SX]:
         """Y (n, free) and W (n, 6). What is free: whatever leaves the wrenches as they are, then
@@ -147,7 +145,7 @@ class SoftGrasp:
             ca.SX.sym(f"inner_{i}", p.state_size - p.wrench_size) for i, p in enumerate(patches)
         ]
         load, wrenches = ca.SX.sym("load", LOAD_SIZE), ca.SX.sym("free", self.grasp.free_size)
-        whole = self.grasp.balanced(wrenches, [load, self._friction])
+        whole = self.grasp.balanced(wrenches, [load, self.grasp.friction])
         state = ca.vertcat(*[part for pair in zip(whole, inner, strict=True) for part in pair])
         free = ca.vertcat(*inner, wrenches)
         return ca.jacobian(state, free), ca.jacobian(state, load)

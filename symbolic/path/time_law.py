@@ -87,13 +87,16 @@ def driven_path(
         ca.mtimes(waypoints, ca.DM(matrix.T))
         for matrix in (basis.position, basis.first, basis.second)
     )
-    rows = ca.repmat(1.0, 6, 1)
-    return TimedPath(
-        time=time,
-        pose=pose,
-        rate=first * ca.mtimes(rows, speed),
-        second_rate=second * ca.mtimes(rows, speed**2) + first * ca.mtimes(rows, acceleration),
-    )
+    return _along(time, (pose, first, second), speed, acceleration)
+
+
+def _along(
+    time: ca.MX, path: tuple[ca.MX, ca.MX, ca.MX], speed: ca.MX, acceleration: ca.MX
+) -> TimedPath:
+    """From pose and derivatives by u, u' and u''."""
+    (pose, first, second), rows = path, ca.repmat(1.0, 6, 1)
+    pushed = second * ca.mtimes(rows, speed**2) + first * ca.mtimes(rows, acceleration)
+    return TimedPath(time, pose, first * ca.mtimes(rows, speed), pushed)
 
 
 def _constant(task: Task, pose: ca.MX, rounding: ca.MX | None, handed: Handed) -> TimedPath:
@@ -164,14 +167,7 @@ def _ramped(
     arc = ca.horzcat(0.0, ca.cumsum(pieces, 1))
     time, speed, acceleration = _ramp_function(task).map(n)(arc, ca.repmat(arc[-1], 1, n), *given)
     u_rate = speed / slope
-    u_second = (acceleration - curvature * u_rate**2) / slope
-    rows = ca.repmat(1.0, 6, 1)
-    return TimedPath(
-        time=time - time[0],
-        pose=pose,
-        rate=first * ca.mtimes(rows, u_rate),
-        second_rate=second * ca.mtimes(rows, u_rate**2) + first * ca.mtimes(rows, u_second),
-    )
+    return _along(time - time[0], along, u_rate, (acceleration - curvature * u_rate**2) / slope)
 
 
 def _length_rate_function(task: Task) -> ca.Function:

@@ -25,7 +25,7 @@ from symbolic.limits import (
     limit_numbers,
     sample_limits_function,
 )
-from symbolic.records import POSE_SIZE, Workcell
+from symbolic.records import Workcell
 from symbolic.smooth.samples import branch_coefficients
 
 DRIVEN_FIRST, DRIVEN_SECOND = "driven_first", "driven_second"
@@ -39,8 +39,23 @@ TANGENT_FLOOR = 1e-9
 class DrivenLayout(BlockLayout):
     """Where the quantities at a driven point lie in their vector.
 
-    `pose` counts the entries of the extended pose; `by_program` says that a
-    program finds the forces: then the load stands for them, and torque and pressure are left out.
+    Attributes:
+        pose: entries of the extended pose.
+        by_program: whether a program finds the forces: then the load stands for them, and torque
+            and pressure are left out.
+    """
+
+    pose: int
+    by_program: bool
+
+    @property
+    def variables(self) -> int:
+        """Extended pose and both derivatives, the joints, u'' and u'^2."""
+        return 3 * self.pose + self.joints + 2
+
+
+def driven_layout(workcell: Workcell) -> DrivenLayout:
+    """The layout for a workcell's arms.
 
     Blocks, in order:
     speed (joints + 2): squared speeds over their squared limits: joints, payload, its turning.
@@ -53,34 +68,10 @@ class DrivenLayout(BlockLayout):
     torque (joints): over their limits, signed.
     pressure (2): shifts of the centres of pressure over their patches' radii.
     """
-
-    pose: int = POSE_SIZE
-    by_program: bool = False
-
-    @property
-    def sizes(self) -> dict[str, int]:
-        """See `BlockLayout`."""
-        j, closed = self.joints, 0 if self.by_program else 1
-        return {
-            "speed": j + 2,
-            "acceleration": j,
-            "cone": 2,
-            "force": 2 * closed,
-            "load": LOAD_SIZE * (1 - closed),
-            "torque": j * closed,
-            "pressure": 2 * closed,
-        }
-
-    @property
-    def variables(self) -> int:
-        """Extended pose and both derivatives, the joints, u'' and u'^2."""
-        return 3 * self.pose + self.joints + 2
-
-
-def driven_layout(workcell: Workcell) -> DrivenLayout:
-    """The layout for a workcell's arms."""
-    joints, pose = limit_layout(workcell).joints, workcell.task.extended_size
-    return DrivenLayout(joints, pose, not workcell.has_closed_form)
+    j, closed = limit_layout(workcell).joints, int(workcell.has_closed_form)
+    sizes = {"speed": j + 2, "acceleration": j, "cone": 2, "force": 2 * closed}
+    sizes |= {"load": LOAD_SIZE * (1 - closed), "torque": j * closed, "pressure": 2 * closed}
+    return DrivenLayout(j, sizes, workcell.task.extended_size, not closed)
 
 
 def planned_branches(workcell: Workcell) -> Array:
@@ -124,7 +115,7 @@ def driven_functions(model: CellModel) -> dict[str, ca.Function]:
 
 
 def _value(model: CellModel, inputs: list[ca.SX], detached: Detached) -> ca.SX:
-    """The quantities of `DrivenLayout`."""
+    """The quantities of `driven_layout`."""
     workcell = model.workcell
     limits, joints = limit_layout(workcell), limit_layout(workcell).joints
     *path, a, w = inputs
