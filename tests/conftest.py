@@ -119,6 +119,31 @@ def once(tmp_path_factory: pytest.TempPathFactory) -> Once:
     return made
 
 
+@pytest.fixture(scope="session")
+def polished_study(once: Once) -> Path:
+    """Results folder of a small polished and timed study of the rack, without a report."""
+
+    def make(folder: Path) -> None:
+        # Not imported at the top: the quick tests need none of it.
+        from hybrid_opt.campaign import CampaignSettings, ExecutionSettings
+        from hybrid_opt.polishing.settings import FillSettings, PolishSettings, ProbeSettings
+        from hybrid_opt.progress import Progress
+        from studies.programs.study import StudySettings, run_study
+        from symbolic.read.cell import load
+        from tests.symbolic.cells import RACK
+
+        campaign = CampaignSettings(
+            {"nsga2": {"population": 20}}, evaluations=120, replicas=2, seed=4
+        )
+        fill, probe = FillSettings(solved=4, members=4, attempts=1), ProbeSettings(2, 2, rounds=2)
+        polish = PolishSettings(attempts=3, rounds=3, fill=fill, probe=probe)
+        execution = ExecutionSettings(folder, jobs=1)
+        wanted = StudySettings(polish, drivable_replicas=1, report=False)
+        run_study(load(RACK), campaign, execution, Progress(shown=False), wanted)
+
+    return once("polished", make)
+
+
 @pytest.fixture
 def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Cache:
     """An empty cache of compiled functions, also the default one of the test."""

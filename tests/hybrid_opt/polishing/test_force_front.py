@@ -173,12 +173,12 @@ def test_what_it_cost_is_told_in_evaluations() -> None:
 
 def test_recorded_attempts_are_not_repeated() -> None:
     texts = [to_json(outcome) for outcome in polished().outcomes]
-    recorded = [from_json(PolishOutcome, text, "an attempt", "") for text in texts[:5]]
+    recorded = [from_json(PolishOutcome, text, "an attempt", "") for text in texts[:-2]]
     emitted: list[PolishOutcome] = []
     again = polisher().polish(
         start_front(), np.random.default_rng(0), recorded=recorded, emit=emitted.append
     )
-    assert len(emitted) == len(polished().outcomes) - 5
+    assert len(emitted) == 2
     np.testing.assert_array_equal(again.x, polished().x)
 
 

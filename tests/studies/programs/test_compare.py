@@ -11,12 +11,10 @@ import numpy as np
 import pytest
 
 from hybrid_opt.campaign import CampaignSettings, ExecutionSettings, open_folder
-from hybrid_opt.campaign.polish_stage import polish_stage
 from hybrid_opt.campaign.results import read_campaign
 from hybrid_opt.campaign.search_stage import search_stage
 from hybrid_opt.campaign.stages import run_stages
 from hybrid_opt.indicators import metrics
-from hybrid_opt.polishing.settings import FillSettings, PolishSettings, ProbeSettings
 from hybrid_opt.progress import Progress
 from studies import compare as comparing
 from studies.programs.comparison import compare
@@ -93,23 +91,18 @@ def test_drivable_experiments_are_compared_too(study: Path, other: Path) -> None
     assert compare(study, other).drivable is None
 
 
-def test_polished_fronts_are_compared_too(own_study: Path, study: Path) -> None:
-    """A folder whose fronts were polished a little, beside itself and beside one without."""
-    workcell = load(TRANSFER)
-    settings = CampaignSettings(evaluations=120, replicas=2, seed=3)
-    with open_folder(settings, ExecutionSettings(own_study, 1, resume=True), workcell) as folder:
-        fill, probe = FillSettings(solved=3, members=3), ProbeSettings(1, 1, rounds=1)
-        polished = polish_stage(PolishSettings(attempts=1, rounds=2, fill=fill, probe=probe))
-        run_stages(folder, (search_stage(), polished, summary_stage()), Progress(shown=False))
-    figures = {f.figure: f for f in compare(own_study, own_study).figures if f.algorithm == "nsga2"}
-    run = read_campaign(own_study)
+def test_polished_fronts_are_compared_too(polished_study: Path, study: Path) -> None:
+    """A folder with polished fronts, beside itself and beside one without."""
+    found = compare(polished_study, polished_study)
+    figures = {f.figure: f for f in found.figures if f.algorithm == "nsga2"}
+    run = read_campaign(polished_study)
     fronts = [run.polished(replica) for replica in run.of("nsga2")]
     volumes = [metrics.hypervolume(front.objectives) for front in fronts if front is not None]
     assert len(volumes) == 2
     assert figures["polished_hypervolume"].first.median == pytest.approx(np.median(volumes))
     assert figures["polished_hypervolume"].first.mean >= figures["hypervolume"].first.mean
     assert np.isfinite(figures["polished_payload_limit"].second.median)
-    names = {figure.figure for figure in compare(study, own_study).figures}
+    names = {figure.figure for figure in compare(study, polished_study).figures}
     assert not any(name.startswith("polished_") for name in names)
 
 

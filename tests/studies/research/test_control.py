@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,7 +13,6 @@ from hybrid_opt.campaign import CampaignSettings, ExecutionSettings
 from hybrid_opt.campaign.results import read_campaign
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.indicators import metrics
-from hybrid_opt.polishing.settings import FillSettings, PolishSettings, ProbeSettings
 from hybrid_opt.progress import Progress
 from studies.programs.study import StudySettings, run_study
 from studies.research import longer_searches
@@ -24,23 +24,9 @@ from tests.symbolic.read.samples import RACK
 
 
 @pytest.fixture(scope="module")
-def study(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    root = tmp_path_factory.mktemp("control") / "results"
-    settings = CampaignSettings({"nsga2": {"population": 20}}, evaluations=120, replicas=2, seed=4)
-    run_study(
-        load(RACK),
-        settings,
-        ExecutionSettings(root, jobs=1),
-        Progress(shown=False),
-        StudySettings(
-            PolishSettings(
-                attempts=3, rounds=3, fill=FillSettings(4, 4, 1), probe=ProbeSettings(2, 2, 2)
-            ),
-            drivable=False,
-            report=False,
-        ),
-    )
-    return root
+def study(polished_study: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A copy: longer searches are stored in it."""
+    return Path(shutil.copytree(polished_study, tmp_path_factory.mktemp("control") / "results"))
 
 
 def test_longer_searches_repeat_the_studys_own_settings(study: Path) -> None:
