@@ -101,82 +101,70 @@ class Machine:
     pad: dict[str, list[float]]
 
 
-@dataclass(frozen=True)
-class _Both:
-    """Names for both arms of a machine, {} standing for the side."""
-
-    urdf: str
-    root: str
-    tip: str
-    locked: str
-    drop: str
-
-    def arms(self, words: tuple[str, str], angles: tuple[float, float]) -> tuple[Arm, Arm]:
-        """The left and the right arm."""
-        left, right = (
-            Arm(
-                self.urdf,
-                (self.root, self.tip.format(word)),
-                (),
-                {self.locked.format(word): angle},
-                self.drop.format(word),
-            )
-            for word, angle in zip(words, angles, strict=True)
-        )
-        return left, right
+def _both(
+    urdf: str,
+    names: tuple[str, str, str, str],
+    sides: tuple[str, str],
+    angles: tuple[float, float],
+    box: tuple[float, float, float],
+    spin: float,
+    **pad: list[float],
+) -> Machine:
+    """A machine whose names of root, tip, locked joint and dropped links have {} for the side."""
+    left, right = (
+        Arm(urdf, (root, tip), (), {locked: angle}, drop)
+        for side, angle in zip(sides, angles, strict=True)
+        for root, tip, locked, drop in [[name.format(side) for name in names]]
+    )
+    return Machine(left, right, box, spin, pad)
 
 
-_TIAGO = _Both(
-    "tiago_description/robots/tiago_dual.urdf",
-    "torso_lift_link",
-    "arm_{}_tool_link",
-    "arm_{}_3_joint",
-    "wrist_{}_ft_link",
-)
-_TIAGO_PRO = _Both(
-    "tiago_pro_description/robots/tiago_pro.urdf",
-    "torso_lift_link",
-    "arm_{}_tool_link",
-    "arm_{}_3_joint",
-    "gripper_{}_base_link",
-)
-_TALOS = _Both(
-    "talos_data/robots/talos_reduced.urdf",
-    "torso_2_link",
-    "wrist_{}_ft_tool_link",
-    "arm_{}_3_joint",
-    "gripper_{}_base_link",
-)
-_PR2 = _Both(
-    "pr2_description/urdf/pr2.urdf",
-    "torso_lift_link",
-    "{}_wrist_roll_link",
-    "{}_upper_arm_roll_joint",
-    "{}_gripper_palm_link",
-)
 _SIDES = ("left", "right")
 _TURN = np.pi / 2.0
 MACHINES = {
-    "tiago_dual": Machine(
-        *_TIAGO.arms(_SIDES, (1.2, 1.2)),
+    "tiago_dual": _both(
+        "tiago_description/robots/tiago_dual.urdf",
+        ("torso_lift_link", "arm_{}_tool_link", "arm_{}_3_joint", "wrist_{}_ft_link"),
+        _SIDES,
+        (1.2, 1.2),
         (0.65, 0.0, 0.72),
         -_TURN,
-        {"xyz": [0.05, 0.0, 0.0], "rpy": [0.0, _TURN, 0.0]},
+        xyz=[0.05, 0.0, 0.0],
+        rpy=[0.0, _TURN, 0.0],
     ),
-    "tiago_pro": Machine(
-        *_TIAGO_PRO.arms(_SIDES, (0.6, -0.6)), (0.65, 0.0, 1.2), -_TURN, {"xyz": [0.0, 0.0, 0.05]}
+    "tiago_pro": _both(
+        "tiago_pro_description/robots/tiago_pro.urdf",
+        ("torso_lift_link", "arm_{}_tool_link", "arm_{}_3_joint", "gripper_{}_base_link"),
+        _SIDES,
+        (0.6, -0.6),
+        (0.65, 0.0, 1.2),
+        -_TURN,
+        xyz=[0.0, 0.0, 0.05],
     ),
-    "talos": Machine(
-        *_TALOS.arms(_SIDES, (0.0, 0.0)),
+    "talos": _both(
+        "talos_data/robots/talos_reduced.urdf",
+        ("torso_2_link", "wrist_{}_ft_tool_link", "arm_{}_3_joint", "gripper_{}_base_link"),
+        _SIDES,
+        (0.0, 0.0),
         (0.55, 0.0, 0.2),
         0.0,
-        {"xyz": [0.0, 0.0, -0.05], "rpy": [np.pi, 0.0, 0.0]},
+        xyz=[0.0, 0.0, -0.05],
+        rpy=[np.pi, 0.0, 0.0],
     ),
-    "pr2": Machine(
-        *_PR2.arms(("l", "r"), (0.6, -0.6)),
+    "pr2": _both(
+        "pr2_description/urdf/pr2.urdf",
+        (
+            "torso_lift_link",
+            "{}_wrist_roll_link",
+            "{}_upper_arm_roll_joint",
+            "{}_gripper_palm_link",
+        ),
+        ("l", "r"),
+        (0.6, -0.6),
         (0.65, 0.0, 1.0),
         -_TURN,
-        {"xyz": [0.06, 0.0, 0.0], "rpy": [0.0, _TURN, 0.0]},
+        xyz=[0.06, 0.0, 0.0],
+        rpy=[0.0, _TURN, 0.0],
     ),
 }
 """Machines with both arms in one file, their lift and torso held."""
