@@ -20,7 +20,6 @@ from hybrid_opt.sweeping import Sweep, require_keys, stored_sweep, sweep
 from hybrid_opt.work.service import warm_up
 from studies.program import load_workcell
 from studies.report.drawing import (
-    FULL_WIDTH,
     in_style,
     legend_below,
     new_figure,
@@ -98,7 +97,7 @@ def _table(done: Sweep, longest: int = sys.maxsize) -> Table:
 
 def _figure(done: Sweep) -> Figure:
     """Duration and force over the last key, a line per combination of the others."""
-    figure = new_figure(FULL_WIDTH, 0.45 * FULL_WIDTH)
+    figure = new_figure(0.45)
     panels = figure.subplots(1, 2)
     *outer, last = done.over
     heads = list(dict.fromkeys(row.values[:-1] for row in done.rows))

@@ -258,7 +258,12 @@ def gather(results: CampaignResults, executor: Executor | None = None) -> Report
         raise ResultsError(f"{results.root / SUMMARY}: damaged: does not fit the fronts beside it")
     geometry = build_geometry(results.workcell)
     calls: list[Callable[[Sequence[ReadyCell]], Any]] = [partial(_reach, geometry)]
-    calls += _job_requests(carries, recommended)
+    if recommended is not None:
+        calls.append(partial(recommended_job, recommended))
+    slow = TimingLimits(reference_speed=True)
+    calls += [partial(drawn_job, carry.label, carry.x, slow) for carry in carries]
+    forces = first.summary.static_hold.normal_force / first.summary.reference_force
+    still = dict(zip(PAPER_OBJECTIVES, forces, strict=True))
     alone = results.workcell.task.time_law == "optimal"
     # Jobs are what robots are told: by the cell that they drive.
     cells = cells_of(first.files, results.objectives, alone)
@@ -269,7 +274,7 @@ def gather(results: CampaignResults, executor: Executor | None = None) -> Report
         root=results.root,
         geometry=geometry,
         objective_titles=_titles(results),
-        static=_static(first),
+        static=np.array([still.get(name, np.nan) for name in first.objectives]),
         initial=initial,
         timings=tuple(zip((carry.label for carry in carries), timings, strict=True)),
         reach=reach,
@@ -330,23 +335,5 @@ def _titles(results: CampaignResults) -> tuple[str, ...]:
     return tuple(titles)
 
 
-def _static(first: Experiment) -> Array:
-    """Objectives of the level payload at rest."""
-    still = first.summary.static_hold.normal_force / first.summary.reference_force
-    known = dict(zip(PAPER_OBJECTIVES, still, strict=True))
-    return np.array([known.get(name, np.nan) for name in first.objectives])
-
-
 def _reach(geometry: CellGeometry, _: Sequence[ReadyCell]) -> ReachMap:
     return reach_map(geometry, np.random.default_rng(REACH_SEED))
-
-
-def _job_requests(
-    carries: Sequence[DrawnCarry], recommended: Array | None
-) -> Iterator[Callable[[Sequence[ReadyCell]], DrawnJob]]:
-    """The recommended carry's job, then those of hand-made and selected ones."""
-    if recommended is not None:
-        yield partial(recommended_job, recommended)
-    limits = TimingLimits(reference_speed=True)
-    for carry in carries:
-        yield partial(drawn_job, carry.label, carry.x, limits)

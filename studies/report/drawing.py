@@ -127,9 +127,10 @@ def shortened(name: str, length: int = 24) -> str:
     return name if len(name) <= length else f"{name[: length - 1]}\N{HORIZONTAL ELLIPSIS}"
 
 
-def new_figure(width: float, height: float) -> Figure:
-    """An empty figure of this size [inch]; draw it inside `in_style`."""
-    return Figure(figsize=(width, height), layout="constrained")
+def new_figure(share: float) -> Figure:
+    """An empty figure as wide as a journal's page, its height a share of that; draw it inside
+    `in_style`."""
+    return Figure(figsize=(FULL_WIDTH, share * FULL_WIDTH), layout="constrained")
 
 
 @contextmanager
@@ -158,10 +159,9 @@ def legend_below(figure: Figure, axes: Axes, columns: int = 0) -> None:
     figure.legend(handles, labels, loc="outside lower center", ncols=columns or len(handles))
 
 
-def limit_line(axes: Axes, level: float, label: str | None = None, across: bool = True) -> None:
-    """A limit as a dashed line, across or up the panel."""
-    draw = axes.axhline if across else axes.axvline
-    draw(level, color="black", linestyle="--", linewidth=0.9, label=label)
+def limit_line(axes: Axes, level: float, label: str) -> None:
+    """A limit as a dashed line across the panel."""
+    axes.axhline(level, color="black", linestyle="--", linewidth=0.9, label=label)
 
 
 def rest_line(axes: Axes, level: float, label: str, across: bool = True) -> None:

@@ -32,6 +32,8 @@ from symbolic.records import Workcell
 from symbolic.records.poses import box_rotation
 
 RECOMMENDED_LABEL = "recommended"
+RECOMMENDED = "Recommended"
+"""The carry to run, in lists and pictures of the page."""
 
 CARRY_SAMPLES = 40
 PHASE_SAMPLES = 7
@@ -212,20 +214,19 @@ class PageTrajectory:
     """One trajectory of the page.
 
     Attributes:
-        label: whose it is.
+        source: whose it is, stored with a saved file.
         x: (n_var,) decision vector.
-        provenance: how it came about, stored with a saved file.
         cell: number of its cell among those of the page.
-        jerk: whether it is driven within the cell's limits on jerk, where it has any.
+        recommended: whether it is the carry to run, driven within the cell's limits on jerk, where
+            it has any.
         job: the whole job around it, where it is planned already.
         has_job: whether one is planned where it is not.
     """
 
-    label: str
+    source: str
     x: Array
-    provenance: str
     cell: int = 0
-    jerk: bool = False
+    recommended: bool = False
     job: DrawnJob | None = None
     has_job: bool = True
 
@@ -287,7 +288,7 @@ def page_trajectory(
     task = driving.cell.workcell.task
     path = same_paths(shown.x, cell.workcell.task, task)[0, : task.n_path]
     limits = _limits(cell, shown.x)
-    if shown.jerk:
+    if shown.recommended:
         # The recommended carry is driven as an export does, others without limits on jerk.
         timing = driven_timing(cell.timing_model, shown.x)
     elif limits.robust:
@@ -301,7 +302,9 @@ def page_trajectory(
         motions.append(_motion(f"{ASSUMED}: {LAWS[law]}", judged))
     if not motions:
         motions.append(_motion(ASSUMED, judged))
-    name, values = shown.label, judged.judgement.objectives
+    name, values = shown.source, judged.judgement.objectives
+    if shown.recommended:
+        name = f"{RECOMMENDED} ({name})"
     if not judged.judgement.feasible:
         name = f"{name} (infeasible)"
     figures = judged.figures.items()
@@ -315,14 +318,14 @@ def page_trajectory(
         "decision": shown.x.tolist(),
         "start": [arm.q[0].tolist() for arm in judged.arms],
         "figures": {key: float(value) for key, value in figures if np.isfinite(value)},
-        "provenance": {"source": shown.provenance},
+        "provenance": {"source": shown.source},
     }
     if shown.job is not None:
         _with_job(found, shown.job)
     elif not shown.has_job:
         found["jobProblem"] = NO_JOB
     elif timing.ok:
-        _with_job(found, drawn(driving.jobs, shown.label, lambda: timing))
+        _with_job(found, drawn(driving.jobs, shown.source, lambda: timing))
     return found
 
 

@@ -18,6 +18,7 @@ from hybrid_opt.work.service import Executor, LocalExecutor, Service, answer_all
 from studies.report.data import Experiment, ReportData
 from studies.report.drawing import ARMS, MARKED, DrawnCarry, LineStyle
 from studies.report.page_carries import (
+    RECOMMENDED,
     RECOMMENDED_LABEL,
     PageTrajectory,
     page_trajectory,
@@ -242,8 +243,6 @@ CURVE_MEMBERS = 6
 MAX_CELL_BYTES = 2_000_000
 """A cell whose files are larger is not put into the page, so that nothing can be saved from it."""
 
-RECOMMENDED = "Recommended"
-
 
 @dataclass(frozen=True)
 class Group:
@@ -315,8 +314,9 @@ def _drive_groups(data: ReportData, drivable: Experiment, cell: int) -> Iterator
     if data.recommended is not None:
         found = data.summary.recommendation
         source = "" if found is None else found.source
-        title, job = f"{RECOMMENDED} ({source})", data.job(RECOMMENDED_LABEL)
-        shown = PageTrajectory(title, data.recommended, source, cell, jerk=True, job=job)
+        shown = PageTrajectory(
+            source, data.recommended, cell, recommended=True, job=data.job(RECOMMENDED_LABEL)
+        )
         yield Group(RECOMMENDED, (shown,), RECOMMENDED, CHOICE)
     low, high = drivable.workcell.task.force_limit
     for carry, label, curve in curves(data):
@@ -324,15 +324,14 @@ def _drive_groups(data: ReportData, drivable: Experiment, cell: int) -> Iterator
         source, path = _source(data, carry), same_paths(carry.x, own, task)[0, : task.n_path]
         force = curve[evenly(len(curve), CURVE_MEMBERS), 0]
         some = tuple(
-            PageTrajectory(source, np.append(path, limit), source, cell)
+            PageTrajectory(source, np.append(path, limit), cell)
             for limit in force
             if low <= limit <= high
         )
         yield Group(f"{label}, timed", some, f"{label}, timed", marker(carry.look, size=7))
     for algorithm, front, opened in drivable.fronts():
         some = tuple(
-            PageTrajectory(front.source, front.x[k], front.source, cell)
-            for k in evenly(len(front), MAX_FRONT)
+            PageTrajectory(front.source, front.x[k], cell) for k in evenly(len(front), MAX_FRONT)
         )
         yield Group(front.source, some, front.title, marker(algorithm.look, opened))
 
@@ -341,16 +340,14 @@ def _search_groups(data: ReportData) -> Iterator[Group]:
     """Hand-made and selected trajectories, and the fronts of the first experiment."""
     sources = [_source(data, carry) for carry in data.carries]
     picked = [
-        PageTrajectory(source, carry.x, source, job=data.job(carry.label))
+        PageTrajectory(source, carry.x, job=data.job(carry.label))
         for carry, source in zip(data.carries, sources, strict=True)
     ]
     yield Group("Hand-made and selected", tuple(picked))
     two = len(data.objectives) >= 2
     for algorithm, front, opened in data.fronts():
         rows = evenly(len(front), MAX_FRONT)
-        some = tuple(
-            PageTrajectory(front.source, front.x[k], front.source, has_job=False) for k in rows
-        )
+        some = tuple(PageTrajectory(front.source, front.x[k], has_job=False) for k in rows)
         look = marker(algorithm.look, opened) if two else None
         yield Group(front.source, some, front.title, look, front.objectives[rows][:, :2])
 

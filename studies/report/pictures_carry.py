@@ -15,7 +15,6 @@ from hybrid_opt.robust.force import RobustPrice
 from hybrid_opt.timing.robustness import KILOGRAM_FORCE
 from studies.report.data import ReportData
 from studies.report.drawing import (
-    FULL_WIDTH,
     HAND_MADE,
     MARKED,
     legend_below,
@@ -37,7 +36,7 @@ def _per_robot(
     data: ReportData, titles: tuple[str, str], draw: Callable[[Axes, int], None], columns: int = 0
 ) -> Figure:
     """A panel per robot with common axes, whose titles are given, and one legend."""
-    figure = new_figure(FULL_WIDTH, 0.48 * FULL_WIDTH)
+    figure = new_figure(0.48)
     panels = figure.subplots(1, 2, sharey=True)
     for i, (axes, robot) in enumerate(zip(panels, data.workcell.robots, strict=True)):
         draw(axes, i)
@@ -142,7 +141,7 @@ def simulated_forces(data: ReportData) -> Figure:
 def joint_torques(data: ReportData) -> Figure:
     """Largest joint torque over its maximum: of the contact wrench alone, and with the arm's own
     weight and motion (paper Figure 10)."""
-    figure = new_figure(FULL_WIDTH, 0.98 * FULL_WIDTH)
+    figure = new_figure(0.98)
     panels = figure.subplots(2, 2, subplot_kw={"projection": "polar"})
     split = [len(data.workcell.robots[0].torque_max)]
     kinds = (("contact wrench alone", "contact_torque"), ("with the arm", "torque"))
@@ -185,7 +184,7 @@ def _label_rings(axes: Axes, most: Array, top: float) -> None:
 def residual_moments(data: ReportData) -> Figure:
     """Moment that is missing with forces at the nominal contact points, and with the centres of
     pressure shifted."""
-    figure = new_figure(FULL_WIDTH, 0.42 * FULL_WIDTH)
+    figure = new_figure(0.42)
     axes = figure.subplots()
     for carry in data.drawn:
         point = np.linalg.norm(carry.timed.point_moment_residual, axis=1)
@@ -201,7 +200,7 @@ def residual_moments(data: ReportData) -> Figure:
 
 def robust_price(data: ReportData, price: RobustPrice) -> Figure:
     """Peak normal forces of the recommended carry against the multiple of the uncertainty."""
-    figure = new_figure(FULL_WIDTH, 0.5 * FULL_WIDTH)
+    figure = new_figure(0.5)
     axes = figure.subplots()
     for i, robot in enumerate(data.workcell.robots):
         look = series(i)

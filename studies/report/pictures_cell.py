@@ -25,7 +25,6 @@ from hybrid_opt.display.solids import (
 from studies.report.drawing import (
     ARMS,
     FRONT,
-    FULL_WIDTH,
     ISOMETRIC,
     MARGIN,
     SIDE,
@@ -141,7 +140,7 @@ def _seen(T: Array, points: NDArray[np.float32]) -> NDArray[np.float32]:
 def reachable_regions(geometry: CellGeometry, reach: ReachMap, carry: DrawnCarry) -> Figure:
     """Reach of both pads (positions, sampled within the joint limits), the common region of the box
     centre, and the bounds of the free waypoints (paper Figure 4)."""
-    figure = new_figure(FULL_WIDTH, 0.42 * FULL_WIDTH)
+    figure = new_figure(0.42)
     corners = box_corners(*_reach_bounds(reach))
     left, right = figure.subplots(1, 2, width_ratios=[aspect(v, corners) for v in (FRONT, SIDE)])
     lowest, highest = (np.array(corners) for corners in zip(*_free_bounds(geometry), strict=True))
@@ -179,7 +178,7 @@ def reachable_regions(geometry: CellGeometry, reach: ReachMap, carry: DrawnCarry
 
 def environment(geometry: CellGeometry, carry: DrawnCarry) -> Figure:
     """The cell at the start of the carry (paper Figure 5)."""
-    figure = new_figure(FULL_WIDTH, 0.34 * FULL_WIDTH)
+    figure = new_figure(0.34)
     solids = cell_solids(geometry)
     cell = CutCell.of(geometry, solids)
     pose, q = _start(carry)
@@ -217,7 +216,7 @@ def facing(way: Array) -> View:
 
 def arm_and_reach(geometry: CellGeometry, reach: ReachMap, carry: DrawnCarry) -> Figure:
     """The first arm at the start and the region that its pad reaches (paper Figure 6)."""
-    figure = new_figure(FULL_WIDTH, 0.5 * FULL_WIDTH)
+    figure = new_figure(0.5)
     left, right = figure.subplots(1, 2)
     robot = geometry.workcell.robots[0]
     arm = tuple(s for s in cell_solids(geometry) if s.group == "robot 1")
@@ -239,13 +238,12 @@ def arm_and_reach(geometry: CellGeometry, reach: ReachMap, carry: DrawnCarry) ->
     return figure
 
 
-def motion_sequence(geometry: CellGeometry, carry: DrawnCarry, columns: int = 2) -> Figure:
+def motion_sequence(geometry: CellGeometry, carry: DrawnCarry) -> Figure:
     """The cell at 0, 33, 66 and 100 % of a carry (paper Figures 14 and 15)."""
-    rows = -(-len(SHARES) // columns)
     points = motion_points(geometry, carry.timed.pose, carry.timed.q)
     cell = CutCell.of(geometry, cell_solids(geometry))
-    figure = new_figure(FULL_WIDTH, 0.37 * FULL_WIDTH * rows)
-    panels = figure.subplots(rows, columns, squeeze=False).ravel()
+    figure = new_figure(0.74)
+    panels = figure.subplots(2, 2).ravel()
     time = carry.timed.time
     moments = time[0] + np.array(SHARES) * carry.timed.duration
     samples = [int(np.argmin(np.abs(time - moment))) for moment in moments]
@@ -270,7 +268,7 @@ def paths(geometry: CellGeometry, carries: tuple[DrawnCarry, ...]) -> Figure:
     near = box_corners(points.min(axis=0) - half, points.max(axis=0) + half)
     chosen = planes(points)
     views = (*(view for view, _ in chosen), ISOMETRIC)
-    figure = new_figure(FULL_WIDTH, 0.5 * FULL_WIDTH)
+    figure = new_figure(0.5)
     panels = figure.subplots(1, 3, width_ratios=[aspect(view, near) for view in views])
     texts = (*(text for _, text in chosen), "oblique")
     shown = [(text, view, near) for text, view in zip(texts, views, strict=True)]
@@ -381,7 +379,7 @@ def meeting(
         pose, q: (6,) of the box and (all joints,) where they meet [m, rad].
         title: above it.
     """
-    figure = new_figure(FULL_WIDTH, 0.36 * FULL_WIDTH)
+    figure = new_figure(0.36)
     solids = cell_solids(geometry)
     whole = CutCell.of(geometry, solids, pair)
     place = meeting_place(geometry, solids, pair, pose, q)

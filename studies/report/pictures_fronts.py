@@ -18,7 +18,6 @@ from hybrid_opt.indicators.metrics import best_so_far, front_of
 from hybrid_opt.indicators.statistics import attainment_surfaces
 from studies.report.data import AlgorithmRuns, Experiment, ReportData
 from studies.report.drawing import (
-    FULL_WIDTH,
     MARKED,
     RECOMMENDED,
     legend_below,
@@ -40,7 +39,7 @@ def fronts(data: ReportData) -> Figure:
     """Feasible candidates and non-dominated ones of each algorithm's run with the largest
     hypervolume (paper Figure 7). The cross is the level payload at rest, the star the planned
     forces, or time and force, of the recommended carry as robots drive it."""
-    figure = new_figure(FULL_WIDTH, 0.5 * FULL_WIDTH)
+    figure = new_figure(0.5)
     panels = figure.subplots(1, 2)
     found = [a.shown.front.objectives for a in data.solved]
     for algorithm, front in zip(data.solved, found, strict=True):
@@ -67,7 +66,7 @@ def fronts(data: ReportData) -> Figure:
 def attainment(data: ReportData) -> Figure:
     """Empirical attainment surfaces: what a quarter, half and three quarters of the replicas
     reached or bettered."""
-    figure = new_figure(FULL_WIDTH, 0.48 * FULL_WIDTH)
+    figure = new_figure(0.48)
     groups = {"search": [[run.front.objectives for run in a.runs] for a in data.algorithms]}
     if data.has_hybrid:
         groups["after the polish"] = [
@@ -106,7 +105,7 @@ def _attained(title: str, percentile: float) -> str:
 
 def polish(data: ReportData) -> Figure:
     """Fronts before and after the polish, and the hypervolume of every replica."""
-    figure = new_figure(FULL_WIDTH, 0.5 * FULL_WIDTH)
+    figure = new_figure(0.5)
     left, right = figure.subplots(1, 2)
     drawn = []
     for algorithm, front, _ in data.fronts():
@@ -185,7 +184,7 @@ def duration_against_force(data: ReportData) -> Figure:
     """Durations for each limit on the forces: of single paths, and of the drivable fronts
     where there are any: members at their peak forces, and the fastest of a replica's paths at
     every force (median and range of the replicas)."""
-    figure = new_figure(FULL_WIDTH, 0.5 * FULL_WIDTH)
+    figure = new_figure(0.5)
     axes = figure.subplots()
     drawn = []
     for carry, label, curve in curves(data):
@@ -248,7 +247,7 @@ LATE = 0.5
 def histories(data: ReportData) -> Figure:
     """Best feasible value of each objective so far, in the same runs; the inset enlarges the second
     half (paper Figure 8)."""
-    figure = new_figure(FULL_WIDTH, 0.5 * FULL_WIDTH)
+    figure = new_figure(0.5)
     axes = figure.subplots()
     inset = axes.inset_axes((0.42, 0.47, 0.56, 0.46))
     lines = []
@@ -294,7 +293,7 @@ def histories(data: ReportData) -> Figure:
 def infeasibility(data: ReportData) -> Figure:
     """What made candidates infeasible: the constraint violated first, over all replicas, and where
     on the path."""
-    figure = new_figure(FULL_WIDTH, 0.46 * FULL_WIDTH)
+    figure = new_figure(0.46)
     left, right = figure.subplots(1, 2)
     pooled = []
     for algorithm in data.algorithms:
@@ -345,7 +344,7 @@ def infeasibility(data: ReportData) -> Figure:
 
 def indicators(data: ReportData) -> Figure:
     """Indicators of every replica, with medians and quartiles."""
-    figure = new_figure(FULL_WIDTH, 0.36 * FULL_WIDTH)
+    figure = new_figure(0.36)
     shown = (
         ("hypervolume", "hypervolume [-]"),
         ("igd", "IGD [-]"),

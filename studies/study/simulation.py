@@ -85,11 +85,6 @@ class StoredSimulation:
             raise ValueError("its curves have different lengths")
 
     @property
-    def threshold(self) -> float:
-        """Middle of both multiples, NaN where there is none."""
-        return (self.slips + self.holds) / 2.0
-
-    @property
     def peaks(self) -> Array:
         """(2, 2) largest predicted and simulated force of each robot [N], NaN without any."""
         if not len(self.time):

@@ -14,6 +14,14 @@
   const STAR = "star", NEAR = 12, OVER_TIME = ["force-plot", "pressure-plot"];
   const dark = window.matchMedia("(prefers-color-scheme: dark)");
 
+  function button(parent, text, act) {
+    const made = parent.appendChild(document.createElement("button"));
+    made.type = "button";
+    made.textContent = text;
+    made.addEventListener("click", act);
+    return made;
+  }
+
   function colour(name) {
     return getComputedStyle(document.documentElement).getPropertyValue(name);
   }
@@ -104,19 +112,11 @@
   }
 
   function fillViews() {
-    const button = (text, act) => {
-      const made = document.createElement("button");
-      made.type = "button";
-      made.textContent = text;
-      made.addEventListener("click", act);
-      $("views").appendChild(made);
-      return made;
-    };
     data.views.forEach((view, k) => {
-      const made = button(view.name, () => { state.view = k; state.whole = false; drawFront(); });
+      const made = button($("views"), view.name, () => { state.view = k; state.whole = false; drawFront(); });
       made.dataset.view = String(k);
     });
-    button("Whole fronts", () => { state.whole = !state.whole; drawFront(); }).id = "whole";
+    button($("views"), "Whole fronts", () => { state.whole = !state.whole; drawFront(); }).id = "whole";
   }
 
   /* Both plots over time, with the samples of a motion. */
@@ -133,17 +133,13 @@
     });
   }
 
-  function cursor(time) {
-    return { type: "line", x0: time, x1: time, yref: "paper", y0: 0, y1: 1,
-      line: { color: colour("--mark"), width: 1 } };
-  }
-
   /* The cursor, and where phases begin. */
   function marks(motion, time) {
-    const begins = (motion.phases || []).slice(1).map((phase) => ({ type: "line",
-      x0: phase.begin, x1: phase.begin, yref: "paper", y0: 0, y1: 1, layer: "below",
-      line: { color: colour("--line"), width: 1 } }));
-    return [...begins, cursor(time)];
+    const mark = (x, name, more) => ({ type: "line", x0: x, x1: x, yref: "paper", y0: 0, y1: 1,
+      line: { color: colour(name), width: 1 }, ...more });
+    const begins = (motion.phases || []).slice(1).map((phase) =>
+      mark(phase.begin, "--line", { layer: "below" }));
+    return [...begins, mark(time, "--mark")];
   }
 
   /* The phase of a time, -1 where a motion has none. */
@@ -159,15 +155,12 @@
     const job = carries[state.selected].motions.find((m) => m.phases);
     const phases = job ? job.phases : [];
     const playing = Boolean(shown().phases);
-    $("phases").replaceChildren(...(playing ? phases : []).map((phase) => {
-      const made = document.createElement("button");
-      made.type = "button";
-      made.textContent = phase.name;
+    $("phases").replaceChildren();
+    (playing ? phases : []).forEach((phase) => {
+      const made = button($("phases"), phase.name, () => seek(phase.begin / job.duration));
       made.style.flexGrow = String(phase.duration);
       made.title = `${phase.begin.toFixed(2)} s to ${(phase.begin + phase.duration).toFixed(2)} s`;
-      made.addEventListener("click", () => seek(phase.begin / job.duration));
-      return made;
-    }));
+    });
     $("phase-section").hidden = !phases.length;
     const row = (cells, kind) => {
       const line = document.createElement("tr");
@@ -185,15 +178,11 @@
       `${phase.most} ${phase.use.toFixed(0)} %`], "td")));
   }
 
-  /* One arm's joints of a list of both arms'. */
-  function useOf(use, i) {
-    return i === 0 ? use.slice(0, data.joints[0]) : use.slice(data.joints[0]);
-  }
-
   function drawTorque(motion) {
     const { data: traces, layout } = data.plots["torque-plot"];
+    const [first] = data.joints;
     const filled = traces.map((trace) => ({ ...trace,
-      y: useOf(motion[trace.meta.use], trace.meta.arm) }));
+      y: motion[trace.meta.use].slice(...(trace.meta.arm ? [first] : [0, first])) }));
     Plotly.react("torque-plot", filled, themed(layout), PLAIN);
   }
 
@@ -349,11 +338,7 @@
         const told = of(carries[k]), cell = line.insertCell();
         const text = i ? (told !== told ? "\u2013" : told.toFixed(2)) : (k === recommended ? "\u2605 " : "") + told;
         if (i) { cell.textContent = text; return; }
-        const button = cell.appendChild(document.createElement("button"));
-        button.type = "button";
-        button.textContent = text;
-        button.addEventListener("click", () => select(k));
-        button.addEventListener("focus", () => pictures && mark(k));
+        button(cell, text, () => select(k)).addEventListener("focus", () => pictures && mark(k));
       });
       line.addEventListener("mouseenter", () => pictures && mark(k));
       return line;
@@ -373,17 +358,13 @@
 
   function listCarries() {
     TOLD.forEach(([heading], i) => {
-      const cell = document.createElement("th"), button = document.createElement("button");
+      const cell = $("carry-table").tHead.rows[0].appendChild(document.createElement("th"));
       cell.scope = "col";
-      button.type = "button";
-      button.textContent = heading;
-      button.addEventListener("click", () => {
+      button(cell, heading, () => {
         listing.sign = listing.column === i ? -listing.sign : 1;
         listing.column = i;
         fillTable();
       });
-      cell.appendChild(button);
-      $("carry-table").tHead.rows[0].appendChild(cell);
     });
     const fields = ["filter-text", "filter-time", "filter-force"];
     fields.forEach((id) => $(id).addEventListener("input", filtered));

@@ -229,7 +229,7 @@ def test_every_point_shows_what_robots_drive_and_its_job(
 def test_points_are_named_by_what_was_minimised(data: ReportData) -> None:
     cell = Cell(data.workcell, ("mean_force", "friction_use"))
     ready = ReadyCell(cell, JobModel(cell.compiled, cell.timing_model))
-    trajectory = page_trajectory((ready,), PageTrajectory("NSGA-II, replica 1", data.initial.x, ""))
+    trajectory = page_trajectory((ready,), PageTrajectory("NSGA-II, replica 1", data.initial.x))
     mean, friction = trajectory["objectives"]
     assert trajectory["label"] == (
         f"NSGA-II, replica 1: mean force {mean:.4f}, friction use {friction:.4f}"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import numpy as np
 import pytest
@@ -97,16 +96,16 @@ def test_one_experiment_is_searched_and_polished(study: tuple[Path, str]) -> Non
 
 
 def test_what_is_recommended_holds_in_every_case_within_its_limit(
-    study: tuple[Path, str],
+    study: tuple[Path, str], tmp_path: Path
 ) -> None:
     root, printed = study
     found = recommended(root)
     stored = read_trajectory(root / found.file)
     assert stored.objectives == ROBUST_DRIVABLE_OBJECTIVES
-    with TemporaryDirectory() as folder:
-        cell = stored.open_cell(Path(folder))
-        carry = driven_timing(cell.timing_model, stored.x).carry
+    cell = stored.open_cell(tmp_path / "cell")
+    carry = driven_timing(cell.timing_model, stored.x).carry
     assert carry is not None
+    assert replay(stored, tmp_path).reproduced
     assert found.robust_force is not None
     peak = robust_peak(cell.workcell, carry)
     np.testing.assert_allclose(found.robust_force, peak, rtol=1e-6)
@@ -121,11 +120,6 @@ def test_what_is_recommended_holds_in_every_case_within_its_limit(
     assert f"press with {found.force:.1f} N" in printed
     assert [part.name for part in found.parts] == ["least force", "friction", "mass"]
     assert "Time against robust force" in printed
-
-
-def test_its_file_is_reproduced(study: tuple[Path, str], tmp_path: Path) -> None:
-    root, _ = study
-    assert replay(read_trajectory(root / recommended(root).file), tmp_path).reproduced
 
 
 def test_the_table_begins_above_what_holds_still_in_every_case(study: tuple[Path, str]) -> None:
@@ -153,21 +147,20 @@ def test_the_report_shows_robust_forces(data: ReportData) -> None:
     assert titles["time_against_force"].startswith("Time against robust force")
     page = page_document(data)
     (view,) = page["views"]
+    named = {each["name"]: each for each in view["data"]}
     assert view["layout"]["xaxis"]["title"]["text"] == "largest robust force [N]"
     choice = data.summary.recommendation
     assert choice is not None
-    (group,) = (each for each in view["data"] if each["name"] == "Recommended")
+    group = named["Recommended"]
     assert choice.robust_force is not None
     assert group["x"][0] == pytest.approx(max(choice.robust_force), rel=5e-3)
     assert group["y"][0] == pytest.approx(choice.duration, abs=0.01)
     # Points of the fronts are driven as the search found them.
     assert data.drivable is not None
     _, front, _ = next(data.drivable.fronts())
-    (shown,) = (each for each in view["data"] if each["name"] == front.title)
     cell = Cell(data.drivable.workcell, data.objectives)
     for k in (0, len(front.x) - 1):
-        point = page["trajectories"][shown["customdata"][k]]
-        assert point["motions"][0]["duration"] == pytest.approx(
-            cell.carry(front.x[k]).duration, rel=1e-4
-        )
+        point = page["trajectories"][named[front.title]["customdata"][k]]
+        duration = cell.carry(front.x[k]).duration
+        assert point["motions"][0]["duration"] == pytest.approx(duration, rel=1e-4)
         assert point["force"] <= 1.005 * front.x[k][-1]
