@@ -157,8 +157,8 @@ class ReportData(Experiment):
         root: the results folder.
         geometry: the cell's collision bodies and pairs.
         objective_titles: for axes.
-        static: (n_obj,) the objectives of the level payload at rest, NaN where an objective has
-            no such value.
+        at_rest: (2,) the first two objectives of the level payload at rest; None where they have
+            no such values.
         initial: the hand-made trajectory.
         timings: of the hand-made and the selected trajectories by label, as `carries` has them.
         reach: where the arms reach.
@@ -175,7 +175,7 @@ class ReportData(Experiment):
     root: Path
     geometry: CellGeometry
     objective_titles: tuple[str, ...]
-    static: Array
+    at_rest: Array | None
     initial: DrawnCarry
     timings: tuple[tuple[str, TimingDocument], ...]
     reach: ReachMap
@@ -263,7 +263,8 @@ def gather(results: CampaignResults, executor: Executor | None = None) -> Report
     slow = TimingLimits(reference_speed=True)
     calls += [partial(drawn_job, carry.label, carry.x, slow) for carry in carries]
     forces = first.summary.static_hold.normal_force / first.summary.reference_force
-    still = dict(zip(PAPER_OBJECTIVES, forces, strict=True))
+    known = dict(zip(PAPER_OBJECTIVES, forces, strict=True))
+    still = [known.get(name) for name in first.objectives[:2]]
     alone = results.workcell.task.time_law == "optimal"
     # Jobs are what robots are told: by the cell that they drive.
     cells = cells_of(first.files, results.objectives, alone)
@@ -274,7 +275,7 @@ def gather(results: CampaignResults, executor: Executor | None = None) -> Report
         root=results.root,
         geometry=geometry,
         objective_titles=_titles(results),
-        static=np.array([still.get(name, np.nan) for name in first.objectives]),
+        at_rest=None if None in still or len(still) < 2 else np.array(still),
         initial=initial,
         timings=tuple(zip((carry.label for carry in carries), timings, strict=True)),
         reach=reach,
@@ -316,7 +317,8 @@ def _experiment(results: CampaignResults, select: bool = True) -> Experiment:
         front = runs[shown].fronts[-1]
         if evaluator is not None and len(front):
             x = front.x[selected_row(evaluator, front.x)]
-            best = DrawnCarry(front.title, evaluator.carry(x), look)
+            source = f"{front.source}: least force"
+            best = DrawnCarry(front.title, evaluator.carry(x), look, source)
         algorithms.append(AlgorithmRuns(name, title(name), look, tuple(runs), shown, best))
     files = collect_cell(results.workcell)
     return Experiment(results.workcell, files, results.objectives, summary, tuple(algorithms))
@@ -324,7 +326,8 @@ def _experiment(results: CampaignResults, select: bool = True) -> Experiment:
 
 def _hand_made(evaluator: CandidateEvaluator) -> DrawnCarry:
     task = evaluator.workcell.task
-    return DrawnCarry(INITIAL_LABEL, evaluator.carry(initial_decision(task)))
+    carry = evaluator.carry(initial_decision(task))
+    return DrawnCarry(INITIAL_LABEL, carry, source=INITIAL_LABEL)
 
 
 def _titles(results: CampaignResults) -> tuple[str, ...]:

@@ -208,11 +208,19 @@ LIGHT = np.array([-0.45, 0.35, 0.82]) / np.linalg.norm([-0.45, 0.35, 0.82])
 
 @dataclass(frozen=True)
 class DrawnCarry:
-    """One judged trajectory under the search's timing, its label for legends and its look."""
+    """One judged trajectory under the search's timing.
+
+    Attributes:
+        label: in legends.
+        timed: the trajectory.
+        look: of its lines.
+        source: whose it is, with its replica where there are several.
+    """
 
     label: str
     timed: Carry
     look: LineStyle = HAND_MADE
+    source: str = ""
 
     @property
     def x(self) -> Array:

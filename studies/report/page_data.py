@@ -290,8 +290,7 @@ def page_document(data: ReportData, executor: Executor | None = None) -> dict[st
         views.append(_drive_view(data, data.drivable, numbered[: len(drive)], found))
     if search:
         views.append(_search_view(data, numbered[len(drive) :], found))
-    rest = data.static[:2] * data.workcell.task.reference_force[: len(data.static[:2])]
-    known = len(rest) == 2 and bool(np.isfinite(rest).all())
+    still, force = data.at_rest, data.workcell.task.reference_force
     return {
         "joints": [len(robot.torque_max) for robot in data.workcell.robots],
         "robots": [robot.name for robot in data.workcell.robots],
@@ -299,7 +298,9 @@ def page_document(data: ReportData, executor: Executor | None = None) -> dict[st
         "first": int(data.drivable is None and len(numbered[0][1]) > 1),
         "trajectories": found,
         "views": views,
-        "plots": carry_plots(data.workcell, float(rest.max()) if known else None),
+        "plots": carry_plots(
+            data.workcell, None if still is None else float((still * force).max())
+        ),
         "lists": [{"label": group.listed, "members": members} for group, members in numbered],
         "cells": [
             cell_to_json(files) if sum(map(len, files.files.values())) <= MAX_CELL_BYTES else None
@@ -321,7 +322,7 @@ def _drive_groups(data: ReportData, drivable: Experiment, cell: int) -> Iterator
     low, high = drivable.workcell.task.force_limit
     for carry, label, curve in curves(data):
         own, task = carry.timed.workcell.task, drivable.workcell.task
-        source, path = _source(data, carry), same_paths(carry.x, own, task)[0, : task.n_path]
+        source, path = carry.source, same_paths(carry.x, own, task)[0, : task.n_path]
         force = curve[evenly(len(curve), CURVE_MEMBERS), 0]
         some = tuple(
             PageTrajectory(source, np.append(path, limit), cell)
@@ -338,11 +339,7 @@ def _drive_groups(data: ReportData, drivable: Experiment, cell: int) -> Iterator
 
 def _search_groups(data: ReportData) -> Iterator[Group]:
     """Hand-made and selected trajectories, and the fronts of the first experiment."""
-    sources = [_source(data, carry) for carry in data.carries]
-    picked = [
-        PageTrajectory(source, carry.x, job=data.job(carry.label))
-        for carry, source in zip(data.carries, sources, strict=True)
-    ]
+    picked = [PageTrajectory(c.source, c.x, job=data.job(c.label)) for c in data.carries]
     yield Group("Hand-made and selected", tuple(picked))
     two = len(data.objectives) >= 2
     for algorithm, front, opened in data.fronts():
@@ -362,14 +359,6 @@ def curves(data: ReportData) -> Iterator[tuple[DrawnCarry, str, Array]]:
         curve = np.column_stack([timed.force_curve.force, timed.force_curve.duration[:length]])
         label = carry.label if carry is data.initial else f"{carry.label}: least force"
         yield carry, label, curve[np.isfinite(curve[:, 1])]
-
-
-def _source(data: ReportData, carry: DrawnCarry) -> str:
-    """Source of a trajectory: algorithm and replica, where it is no hand-made one."""
-    for algorithm in data.algorithms:
-        if carry is algorithm.best:
-            return f"{carry.label}, replica {algorithm.shown.front.replica}: least force"
-    return carry.label
 
 
 def _traces(groups: Sequence[Numbered], found: Sequence[dict[str, Any]]) -> Iterator[Plot]:
@@ -431,10 +420,9 @@ def _search_view(
         if two:
             traces.append(cloud(algorithm.title, run.feasible[:, :2], algorithm.look))
         searched.append(run.front.objectives)
-    rest = data.static[:2]
-    if len(rest) == 2 and np.isfinite(rest).all():
-        shown.append(mark("level payload at rest", rest))
-        searched.append(rest[None])
+    if data.at_rest is not None:
+        shown.append(mark("level payload at rest", data.at_rest))
+        searched.append(data.at_rest[None])
     first = np.concatenate([points[:, :2] for points in searched]) if two else np.zeros((0, 2))
     axes = (f"{titles[0]} [-]", f"{titles[1]} [-]")
     return front_plot("The search's objectives", axes, [*traces, *shown], first)

@@ -54,8 +54,8 @@ def normal_forces(data: ReportData) -> Figure:
         for carry in data.drawn:
             force = carry.timed.normal_force[:, i]
             axes.plot(carry.timed.time, force, **carry.look.drawn, label=carry.label)
-        if np.isfinite(data.static[:2]).all():
-            still = data.static[i] * data.workcell.task.reference_force[i]
+        if data.at_rest is not None:
+            still = data.at_rest[i] * data.workcell.task.reference_force[i]
             rest_line(axes, still, "level payload at rest")
 
     return _per_robot(data, ("time [s]", "normal contact force [N]"), draw)

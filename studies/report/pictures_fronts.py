@@ -146,14 +146,14 @@ def _paired(axes: Axes, algorithms: Sequence[AlgorithmRuns]) -> None:
 def _objectives(axes: Axes, data: ReportData) -> None:
     """The axes of the first two objectives, with the level payload at rest, and the recommended
     carry where its front is drawn."""
-    if np.isfinite(data.static[:2]).all():
+    if data.at_rest is not None:
         look: dict[str, Any] = {
             "color": "black",
             "markersize": 7,
             "markeredgewidth": 1.6,
             "zorder": 5,
         }
-        axes.plot(*data.static[:2], "+", **look, label="level payload at rest")
+        axes.plot(*data.at_rest, "+", **look, label="level payload at rest")
     if data.alone:
         _recommended(axes, data)
     axes.set_xlabel(f"{data.objective_titles[0]} [-]")
@@ -171,8 +171,8 @@ def _recommended(axes: Axes, data: ReportData) -> None:
 def _zoom(axes: Axes, data: ReportData, sets: Sequence[Array]) -> None:
     """Limits around fronts, their corner at rest and the carry recommended from them included."""
     points = [np.atleast_2d(points)[:, :2] for points in sets if len(points)]
-    if np.isfinite(data.static[:2]).all():
-        points.append(data.static[None, :2])
+    if data.at_rest is not None:
+        points.append(data.at_rest[None])
     if data.alone and (at := data.recommended_objectives) is not None:
         points.append(at[None])
     x_limits, y_limits = limits(np.concatenate(points), 0.07)
