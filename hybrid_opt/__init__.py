@@ -17,21 +17,17 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hybrid_opt.shown import shown_by
-
 if TYPE_CHECKING:
     __version__: str
     from hybrid_opt.branches import search_branches as search_branches
     from hybrid_opt.bundles.bundle import Origin as Origin
     from hybrid_opt.bundles.bundle import export as export
+    from hybrid_opt.bundles.bundle import targets as targets
     from hybrid_opt.bundles.job_file import BundleOptions as BundleOptions
+    from hybrid_opt.campaign.results import load as load
     from hybrid_opt.carry import Carry as Carry
-    from hybrid_opt.catalogue import algorithms as algorithms
-    from hybrid_opt.catalogue import example as example
-    from hybrid_opt.catalogue import load as load
-    from hybrid_opt.catalogue import objectives as objectives
-    from hybrid_opt.catalogue import targets as targets
     from hybrid_opt.cell import Cell as Cell
+    from hybrid_opt.cell import example as example
     from hybrid_opt.door import polish as polish
     from hybrid_opt.door import save as save
     from hybrid_opt.door import search as search
@@ -42,6 +38,7 @@ if TYPE_CHECKING:
     from hybrid_opt.errors import ProposalError as ProposalError
     from hybrid_opt.errors import ResultsError as ResultsError
     from hybrid_opt.evaluate.objectives import Objective as Objective
+    from hybrid_opt.evaluate.objectives import objectives as objectives
     from hybrid_opt.front import Front as Front
     from hybrid_opt.gripping import Grip as Grip
     from hybrid_opt.gripping import propose_grip as propose_grip
@@ -49,6 +46,7 @@ if TYPE_CHECKING:
     from hybrid_opt.job.records import Job as Job
     from hybrid_opt.metaheuristics.mopso import MopsoSettings as MopsoSettings
     from hybrid_opt.metaheuristics.registry import GeneticSettings as GeneticSettings
+    from hybrid_opt.metaheuristics.registry import algorithms as algorithms
     from hybrid_opt.metaheuristics.run import SearchSettings as SearchSettings
     from hybrid_opt.polishing.settings import PolishSettings as PolishSettings
     from hybrid_opt.proposing.proposal import Proposal as Proposal
@@ -84,8 +82,6 @@ _HOMES = {
 """Modules of the names above, which are imported for type checkers only."""
 
 __all__ = sorted(_HOMES)
-
-shown_by(lambda room: import_module(f"hybrid_opt.display.{room}"))
 
 
 def __getattr__(name: str) -> Any:

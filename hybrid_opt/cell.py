@@ -8,6 +8,7 @@ from __future__ import annotations
 import html
 from collections.abc import Mapping, Sequence
 from functools import cached_property
+from importlib.resources import files
 from multiprocessing import parent_process
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -27,6 +28,7 @@ from hybrid_opt.evaluate.objectives import (
 )
 from hybrid_opt.static_hold import StaticHold, require_hold, static_hold, unheld
 from symbolic.array import Array
+from symbolic.errors import SettingsError
 from symbolic.geometry.pairs import CellGeometry
 from symbolic.path.pieces import same_paths, stated
 from symbolic.read.cell import changed, load
@@ -255,8 +257,8 @@ class Cell:
             SettingsError: x has the wrong shape.
         """
         x = np.atleast_2d(x)
-        parts = [self.evaluator.evaluate(x[k : k + _CHUNK]) for k in range(0, len(x), _CHUNK)]
-        return concatenated(parts) if len(parts) > 1 else self.evaluator.evaluate(x[:_CHUNK])
+        begins = range(0, max(len(x), 1), _CHUNK)
+        return concatenated([self.evaluator.evaluate(x[k : k + _CHUNK]) for k in begins])
 
     def random(self, count: int, rng: np.random.Generator) -> Array:
         """(count, n_var) decision vectors drawn uniformly from within the bounds of the waypoints
@@ -297,3 +299,16 @@ class Cell:
 
     def _repr_html_(self) -> str:
         return f"<p>{html.escape(repr(self))}</p>"
+
+
+def example(name: str = "rack", objectives: Sequence[str | Objective] = PAPER_OBJECTIVES) -> Cell:
+    """A cell that ships with the project.
+
+    Raises:
+        SettingsError: there is none of that name; the message lists them.
+    """
+    folder = Path(str(files("studies"))) / "workcells"
+    known = sorted(path.stem for path in folder.glob("*.toml"))
+    if name not in known:
+        raise SettingsError(f"no cell {name!r} ships; known are {', '.join(known)}")
+    return Cell.load(folder / f"{name}.toml", objectives)

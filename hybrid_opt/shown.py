@@ -1,27 +1,19 @@
 """Objects that show themselves in a terminal and in a notebook.
 
-They know this module only, and not how they look: the front door (`hybrid_opt`) tells where the
-rooms are that do, which are imported when an object is shown.
+They do not know how they look: the rooms of `hybrid_opt.display` do, which are imported when an
+object is shown.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from importlib import import_module
 from pathlib import Path
 from typing import Any, Protocol
 
-_rooms: list[Callable[[str], Any]] = []
-
-
-def shown_by(room: Callable[[str], Any]) -> None:
-    """Tell what gives the module of a name that shows objects: 'objects' as text and HTML, 'view'
-    in three dimensions."""
-    _rooms[:] = [room]
-
 
 def display(room: str) -> Any:
-    """The module of that name."""
-    return _rooms[0](room)
+    """A module that shows objects: 'objects' as text and HTML, 'scene' in three dimensions."""
+    return import_module(f"hybrid_opt.display.{room}")
 
 
 class Displayable:

@@ -65,7 +65,7 @@ def first_result(evaluations: int = QUICK_EVALUATIONS, seed: int = 1) -> Iterato
     """
     import numpy as np
 
-    from hybrid_opt.building import build_study
+    from hybrid_opt.campaign.stages import build_study
     from hybrid_opt.display.table import Table
     from hybrid_opt.polishing.settings import quick_settings
     from hybrid_opt.progress import Progress

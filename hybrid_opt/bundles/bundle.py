@@ -453,6 +453,11 @@ TARGETS: Mapping[str, Target] = {
 """Every target by its name."""
 
 
+def targets() -> dict[str, str]:
+    """What `export` writes for, by name how it is run."""
+    return {name: target.how_to_run for name, target in TARGETS.items()}
+
+
 def export(
     job: Job | Timing,
     target: str,

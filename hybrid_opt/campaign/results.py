@@ -1,4 +1,4 @@
-"""Reading a campaign's results folder back into frozen records.
+"""Reading a campaign's results folder back into frozen records, or what else this project wrote.
 
 Nothing stored is executed, and files are compared with the checksums taken when they were
 written. docs/results.md describes the folder.
@@ -8,10 +8,12 @@ from __future__ import annotations
 
 import html
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +32,7 @@ from hybrid_opt.campaign.settings import (
     polished_folder,
     replica_folder,
 )
+from hybrid_opt.carry import Carry
 from hybrid_opt.cell import Cell
 from hybrid_opt.display.table import counted, figures_html, lines
 from hybrid_opt.errors import DamagedResultsWarning, ResultsError
@@ -46,7 +49,7 @@ from hybrid_opt.store.files import (
     sha256,
 )
 from symbolic.array import Array, set_read_only
-from symbolic.read.cell import load
+from symbolic.read.cell import load as load_workcell
 from symbolic.records import Workcell
 
 ANEW = "--resume computes it anew"
@@ -206,7 +209,7 @@ def read_campaign(root: str | Path) -> CampaignResults:
     path = (root / configuration.workcell.file).resolve()
     if not path.is_relative_to(root.resolve()):
         raise ResultsError(f"{root / CONFIGURATION}: names a workcell outside of the folder")
-    workcell = load(path)
+    workcell = load_workcell(path)
     if workcell.digest != configuration.workcell.digest:
         raise ResultsError(f"{path}: was changed after the campaign began")
     replicas = tuple(
@@ -304,3 +307,32 @@ def read_polished(root: Path, replica: Replica, workcell: Workcell) -> PolishedF
     if problem:
         raise ResultsError(f"{path}: damaged {problem}; {ANEW}")
     return found if len(found.x) else replace(found, x=found.x.reshape(0, task.n_var))
+
+
+_OPENED: list[TemporaryDirectory[str]] = []
+"""What the cells of trajectory files were unpacked into, until the process ends."""
+
+
+def load(path: str | Path) -> Cell | Carry | CampaignResults | Mapping[str, Any]:
+    """Read back what this project wrote: a workcell file as a `Cell`, a trajectory file as a
+    `Carry`, the results folder of a study as its fronts (`.cell`, `.fronts`), a bundle as its
+    manifest.
+
+    Raises:
+        WorkcellError: the workcell file is wrong.
+        ResultsError: there is nothing of the kind, or it is damaged.
+    """
+    # Not imported at the top: what writes bundles takes long to load.
+    from hybrid_opt.bundles.bundle import MANIFEST, read_manifest
+    from hybrid_opt.store.trajectory_file import read_trajectory
+
+    path = Path(path)
+    if path.suffix == ".toml":
+        return Cell.load(path)
+    if not path.is_dir():
+        stored = read_trajectory(path)
+        _OPENED.append(TemporaryDirectory())
+        return stored.open_cell(Path(_OPENED[-1].name)).carry(stored.x)
+    if (path / MANIFEST).exists():
+        return read_manifest(path)
+    return read_campaign(path)

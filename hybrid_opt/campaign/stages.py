@@ -1,5 +1,6 @@
-"""The steps of a study, each carried out once and then remembered as done; and its cells, as values
-that go to any process or machine, with resources made from them there.
+"""The steps of a study, each carried out once and then remembered as done; its cells, as values
+that go to any process or machine, with resources made from them there; and all that is compiled
+for it, built at once on all cores before any of it is needed.
 
 A stage reads what earlier stages left in the results folder and writes files of its own. Its
 marker, `stages/NAME.json`, is written when it begins and again when it is done. If a marker is
@@ -11,15 +12,21 @@ all later ones do too.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
 from dataclasses import dataclass, field, replace
 from functools import partial
+from importlib.metadata import version
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, TypeVar
 
 import numpy as np
 
+from codegen.build import compiler_of
+from codegen.cache import Cache
+from codegen.compiler import interruptible
+from codegen.errors import CodegenError
 from hybrid_opt.branches import BranchCompetition, search_branches
 from hybrid_opt.campaign.folder import (
     CampaignFolder,
@@ -39,9 +46,10 @@ from hybrid_opt.campaign.settings import (
 from hybrid_opt.cell import Cell
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.evaluate.objectives import force_kind
-from hybrid_opt.job.plan import JobModel
+from hybrid_opt.job.plan import JobCollisions, JobModel
 from hybrid_opt.progress import Progress
 from hybrid_opt.store.files import read_record, to_json, write_json
+from symbolic.errors import DualArmError
 from symbolic.read.cell import load
 from symbolic.read.cell_files import CellFiles, drivable_files, unpack_cell
 from symbolic.records import SEARCHED, Workcell
@@ -269,3 +277,100 @@ def cells_of(files: CellFiles, objectives: tuple[str, ...], driven: bool) -> Cel
 def ready_cells(cells: Cells) -> tuple[ReadyCell, ...]:
     """Load the cells' compiled functions, or build them where they are missing; in any process."""
     return tuple(with_cell(partial(ReadyCell.of, names), files) for files, names in cells)
+
+
+# --- what is compiled ---
+
+Maker = Callable[[], object]
+"""Loads or builds functions."""
+
+_TICK = 1.0
+"""Interval at which the elapsed time is shown [s]."""
+
+
+def build_study(cell: Cell, progress: Progress, polish: bool = True, drivable: bool = True) -> None:
+    """Load or build the functions of a study, all compilers side by side.
+
+    What a polish compiles when its solves first ask for it, rows of arms' clearances, is not among
+    them. Where all was built before nothing is done; what cannot be built is left to who asks for
+    it.
+
+    Args:
+        cell: read from a file.
+        progress: where to show it.
+        polish: whether fronts are polished.
+        drivable: whether carries are also searched for as robots drive them.
+    """
+    cache = cell.compiled.cache or Cache()
+    what = (str(cell.force_kind), str(polish), str(drivable), compiler_of(cache).identity)
+    sources = cache.code_digest("codegen", "hybrid_opt")
+    key = cell.compiled.key("study", *what, version("casadi"), sources)
+    if cache.read_record(key) is not None:
+        return
+    # Drivable cells have the longest functions.
+    drivable &= cell.workcell.task.time_law != "optimal"
+    cells = [cell.drivable(), cell] if drivable else [cell]
+    makers = [make for each in cells for make in _makers(each, polish)]
+    failures = build_all(makers, progress)
+    if not any(isinstance(failure, CodegenError) for failure in failures):
+        cache.write_record(key, {"built": True})
+
+
+def build_all(makers: Sequence[Maker], progress: Progress) -> list[DualArmError]:
+    """Load or build functions side by side; what cannot be built is left to who asks for it.
+
+    Ctrl-C ends all compilers and loses nothing that is compiled; the threads that make expressions
+    are not waited for.
+
+    Returns:
+        Why some were not built.
+    """
+    # Each waits for its compilers most of the time; expressions are made by one after the other.
+    pool = ThreadPoolExecutor(len(makers))
+    try:
+        with interruptible(), progress.stage("compiling", len(makers), "sets", delay=_TICK) as told:
+            futures = [pool.submit(make) for make in makers]
+            left = set(futures)
+            while left:
+                done, left = wait(left, _TICK, FIRST_COMPLETED)
+                told(len(done))
+    finally:
+        pool.shutdown(wait=False, cancel_futures=True)
+    failures = []
+    for future in futures:
+        try:
+            future.result()
+        except DualArmError as failure:
+            # Callers that need a function report why a cell cannot have it.
+            failures.append(failure)
+    return failures
+
+
+def _makers(cell: Cell, polish: bool) -> Iterator[Maker]:
+    # Not imported at the top: who builds a few functions needs none of it.
+    from hybrid_opt.polishing.drive import is_polishable
+    from hybrid_opt.polishing.rows import row_library
+    from hybrid_opt.polishing.solvers.dense import dense_method
+    from hybrid_opt.polishing.solvers.quadratic import quadratic_method
+    from hybrid_opt.robust.force import at_rest, pressing_model, robust_model
+    from hybrid_opt.timing.model import TimingModel
+    from hybrid_opt.timing.path_timer import PATH_INTERVALS
+
+    compiled, workcell, cache = cell.compiled, cell.workcell, cell.compiled.cache
+    driven = workcell.task.time_law == "optimal"
+    known = is_polishable(workcell, cell.force_kind.robust) if driven else workcell.has_facing_pads
+    polished = polish and known
+    yield lambda: cell.evaluator
+    if polished:
+        yield lambda: cell.polish_functions
+    if driven:
+        yield lambda: cell.path_timer
+        yield lambda: TimingModel(compiled, PATH_INTERVALS)
+    yield lambda: cell.timing_model
+    yield lambda: JobCollisions(compiled)
+    yield lambda: robust_model(workcell)
+    if driven:
+        yield lambda: pressing_model(workcell).nominal(at_rest())  # built when first asked
+    if polished:
+        yield lambda: (quadratic_method(cache), dense_method(cache))
+        yield lambda: row_library(cache)

@@ -250,6 +250,12 @@ OBJECTIVES: dict[str, Objective] = {
 }
 """All objectives by name."""
 
+
+def objectives() -> dict[str, str]:
+    """The objectives that a `Cell` may minimise, by name what they are."""
+    return {name: objective.title for name, objective in OBJECTIVES.items()}
+
+
 _ROBUST = tuple(OBJECTIVES[name].evaluate for name in ("robust_force", *ROBUST_OBJECTIVES))
 
 

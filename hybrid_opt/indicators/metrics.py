@@ -109,15 +109,7 @@ def igd(front: ArrayLike, reference_front: ArrayLike) -> float:
     Source: Coello Coello and Reyes Sierra 2004, with the mean of distances (not the root of
     their squared sum).
     """
-    import moocore
-
-    if len(np.asarray(front)) == 0:
-        return float("inf")
-    return float(
-        moocore.igd(
-            np.asarray(front, dtype=np.float64), ref=np.asarray(reference_front, dtype=np.float64)
-        )
-    )
+    return _mean_distance("igd", front, reference_front)
 
 
 def igd_plus(front: ArrayLike, reference_front: ArrayLike) -> float:
@@ -126,15 +118,16 @@ def igd_plus(front: ArrayLike, reference_front: ArrayLike) -> float:
 
     Source: Ishibuchi, Masuda, Tanigaki and Nojima 2015.
     """
+    return _mean_distance("igd_plus", front, reference_front)
+
+
+def _mean_distance(of_moocore: str, front: ArrayLike, reference_front: ArrayLike) -> float:
     import moocore
 
-    if len(np.asarray(front)) == 0:
+    points, reference = (np.asarray(each, dtype=float) for each in (front, reference_front))
+    if len(points) == 0:
         return float("inf")
-    return float(
-        moocore.igd_plus(
-            np.asarray(front, dtype=np.float64), ref=np.asarray(reference_front, dtype=np.float64)
-        )
-    )
+    return float(getattr(moocore, of_moocore)(points, ref=reference))
 
 
 def spacing(front: ArrayLike) -> float:

@@ -6,6 +6,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Annotated, Any
 
 from pymoo.algorithms.moo.nsga2 import NSGA2, binary_tournament
@@ -61,38 +62,26 @@ AlgorithmSettings = GeneticSettings | MopsoSettings | RandomSettings
 
 
 class GuardedNsga2(Guarded, NSGA2):  # type: ignore[misc]
-    """NSGA-II (Deb et al. 2002) of pymoo with `Guarded`'s promises."""
+    """NSGA-II (Deb et al. 2002) of pymoo with `Guarded`'s promises; constraint domination where the
+    problem has constraints."""
 
 
 class GuardedSmsEmoa(Guarded, SMSEMOA):  # type: ignore[misc]
-    """SMS-EMOA (Beume et al. 2007) of pymoo, with a whole generation of offspring at a time."""
+    """SMS-EMOA (Beume et al. 2007) of pymoo, with a whole generation of offspring at a time;
+    feasible before infeasible where the problem has constraints."""
 
 
-def _mating(settings: GeneticSettings, compare: Any) -> FillingMating:
-    return FillingMating(
+def _genetic(
+    kind: type[Algorithm], compare: Any, settings: GeneticSettings, initial: Array | None
+) -> Algorithm:
+    """An algorithm that mates the winners of tournaments, who are compared so."""
+    mating = FillingMating(
         TournamentSelection(func_comp=compare),
         SBX(eta=settings.crossover_eta, prob=settings.crossover_probability),
         PM(eta=settings.mutation_eta, prob_var=settings.mutation_probability),
         eliminate_duplicates=DefaultDuplicateElimination(),
     )
-
-
-def nsga2(settings: GeneticSettings, initial: Array | None) -> Algorithm:
-    """NSGA-II; constraint domination where the problem has constraints."""
-    return GuardedNsga2(
-        pop_size=settings.population,
-        sampling=WarmSampling(initial),
-        mating=_mating(settings, binary_tournament),
-    )
-
-
-def sms_emoa(settings: GeneticSettings, initial: Array | None) -> Algorithm:
-    """SMS-EMOA; feasible before infeasible where the problem has constraints."""
-    return GuardedSmsEmoa(
-        pop_size=settings.population,
-        sampling=WarmSampling(initial),
-        mating=_mating(settings, cv_and_dom_tournament),
-    )
+    return kind(pop_size=settings.population, sampling=WarmSampling(initial), mating=mating)
 
 
 class RandomSearch(Guarded, Algorithm):  # type: ignore[misc]
@@ -130,13 +119,16 @@ class _Entry:
     defaults: AlgorithmSettings
 
 
+_NSGA2 = partial(_genetic, GuardedNsga2, binary_tournament)
+_SMS_EMOA = partial(_genetic, GuardedSmsEmoa, cv_and_dom_tournament)
+
 REGISTRY: dict[str, _Entry] = {
-    "nsga2": _Entry("NSGA-II", nsga2, GeneticSettings()),
+    "nsga2": _Entry("NSGA-II", _NSGA2, GeneticSettings()),
     "mopso": _Entry("MOPSO", Mopso, MopsoSettings()),
     "mopso-turbulent": _Entry(
         "MOPSO, turbulent", Mopso, MopsoSettings(inertia=0.45, mutation_share=0.75)
     ),
-    "sms-emoa": _Entry("SMS-EMOA", sms_emoa, GeneticSettings()),
+    "sms-emoa": _Entry("SMS-EMOA", _SMS_EMOA, GeneticSettings()),
     "random": _Entry("random search", RandomSearch, RandomSettings()),
 }
 
@@ -144,6 +136,11 @@ REGISTRY: dict[str, _Entry] = {
 def names() -> tuple[str, ...]:
     """The names that `make` knows."""
     return tuple(REGISTRY)
+
+
+def algorithms() -> dict[str, str]:
+    """The searches that `make` knows, by name what they are called in print."""
+    return {name: entry.title for name, entry in REGISTRY.items()}
 
 
 def title(name: str) -> str:

@@ -153,8 +153,6 @@ class DrivenPaths:
 
         Args:
             timer: of the cell.
-            x: (k, n_path) free waypoints.
-            highest_force: the largest force limit that is tried [N].
             robust: whether limits hold in every case of the cell's uncertainty.
         """
         self.x = np.atleast_2d(np.asarray(x, dtype=float))
@@ -173,35 +171,31 @@ class DrivenPaths:
     def __len__(self) -> int:
         return len(self.x)
 
-    def timings(self, force: Array | float, rows: Sequence[int] | None = None) -> list[PathTiming]:
-        """The fastest timing of every path, or of some, within force limits (k,) or one for all
-        [N]."""
+    def _driven(
+        self, force: Array | float, rows: Sequence[int] | None = None
+    ) -> list[tuple[int, float, PathTiming]]:
+        """Every path, or some, with its force limit (k,) or one for all [N], and its fastest timing
+        within that."""
         chosen = list(range(len(self)) if rows is None else rows)
-        limits = np.broadcast_to(np.asarray(force, dtype=float), (len(chosen),))
+        limits = np.broadcast_to(np.asarray(force, dtype=float), (len(chosen),)).tolist()
         known = self._known
         if rows is not None:
             known = {name: values[chosen] for name, values in known.items()}
-        return self._timer.time_known(
+        timings = self._timer.time_known(
             self.x[chosen],
             known,
-            [TimingLimits(force=float(limit), robust=self._robust) for limit in limits],
+            [TimingLimits(force=limit, robust=self._robust) for limit in limits],
             [self._failures[row] for row in chosen],
         )
+        return list(zip(chosen, limits, timings, strict=True))
 
     def durations(self, force: Array | float) -> Array:
         """(k,) durations [s], infinite where nothing moves within the limit."""
-        return np.array([timing.duration for timing in self.timings(force)])
+        return np.array([timing.duration for _, _, timing in self._driven(force)])
 
     def options(self, force: Array | float, rows: Sequence[int] | None = None) -> list[Option]:
         """Every path, or some, driven within limits (k,) or one for all [N]; those that move."""
-        chosen = list(range(len(self)) if rows is None else rows)
-        limits = np.broadcast_to(np.asarray(force, dtype=float), (len(chosen),)).tolist()
-        timings = self.timings(force, rows)
-        return [
-            self._option(row, limit, timing)
-            for row, limit, timing in zip(chosen, limits, timings, strict=True)
-            if timing.ok
-        ]
+        return [self._option(*each) for each in self._driven(force, rows) if each[2].ok]
 
     def _option(self, row: int, limit: float, timing: PathTiming) -> Option:
         speed = timing.grid_speed
@@ -230,7 +224,7 @@ class DrivenPaths:
         """
         found, limits = self.options(own), []
         if not self._robust and self._timer.compiled:
-            still = np.array([timing.limited_force for timing in self.timings(1e-6)])
+            still = np.array([timing.limited_force for _, _, timing in self._driven(1e-6)])
             least = np.where(np.isfinite(still), still, self.highest_force)
             low = np.minimum((1.0 + LEAST_ABOVE_STILL) * least, self.highest_force)
             # Closer together where force is least and durations change most.

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 import hybrid_opt as ho
-from hybrid_opt.building import Maker, build_all
+from hybrid_opt.campaign.stages import Maker, build_all
 from hybrid_opt.carry import Carry, Judgement
 from hybrid_opt.cell import Cell
 from hybrid_opt.evaluate.explanation import Explanation, explain, frequent

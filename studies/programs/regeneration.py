@@ -52,7 +52,7 @@ def _regenerated(
 
 def _build_study(workcell: Path) -> float:
     """Build all that a study compiles; returns the seconds that it took."""
-    from hybrid_opt.building import build_study
+    from hybrid_opt.campaign.stages import build_study
     from hybrid_opt.cell import Cell
     from hybrid_opt.progress import Progress
 

@@ -6,7 +6,6 @@ import argparse
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from hybrid_opt.building import build_study
 from hybrid_opt.campaign import (
     CampaignFolder,
     CampaignSettings,
@@ -20,6 +19,7 @@ from hybrid_opt.campaign import (
 from hybrid_opt.campaign.polish_stage import polish_stage
 from hybrid_opt.campaign.settings import ALGORITHMS, DRIVABLE, SUMMARY, chosen
 from hybrid_opt.campaign.stages import (
+    build_study,
     decided_cell,
     drivable_settings,
     drivable_stage,

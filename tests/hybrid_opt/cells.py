@@ -12,3 +12,9 @@ from tests.symbolic.cells import RACK
 def shipped(name: str) -> Cell:
     """A cell of `studies/workcells`."""
     return Cell.load(RACK.with_name(f"{name}.toml"))
+
+
+@cache
+def drivable(name: str) -> Cell:
+    """The same as robots drive it."""
+    return shipped(name).drivable()

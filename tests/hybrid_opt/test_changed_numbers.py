@@ -6,6 +6,7 @@ What is built when a solve first asks for it are rows of the distances of single
 
 from __future__ import annotations
 
+import shutil
 from collections import ChainMap
 from collections.abc import Mapping, Sequence
 from functools import cache
@@ -25,9 +26,10 @@ from hybrid_opt.polishing.settings import (
     ProbeSettings,
 )
 from hybrid_opt.robust.force import pressing_model
+from symbolic.numbers import BODIES
 from symbolic.records import Workcell
-from tests.hybrid_opt.cells import shipped
-from tests.symbolic.cells import rack_cell
+from tests.hybrid_opt.cells import drivable, shipped
+from tests.symbolic.cells import RACK, rack_cell
 
 SHORT = PolishSettings(
     attempts=1,
@@ -112,21 +114,15 @@ def changes(known: Workcell) -> dict[str, dict[str, Any]]:
 
 GROUPS = tuple(changes(rack_cell()))
 
-STRUCTURE: dict[str, dict[str, Any]] = {
-    "roll and pitch of a base": {"robots[0].base.rpy": [0.01, 0.02, -1.5707963267948966]},
-    "load of a tool": {"robots[0].tool_load.mass": 1.2},
-    "proportions of a body": {"robots[1].tool.pad.length": 0.09},
-    "samples": {"task.samples": 60},
-    "time law": {"task.time_law": "ramped"},
-    "pads beside one another": {"contacts[0].xyz": [0.01, 0.2, 0.055]},
-}
-"""What is compiled anew, see docs/speed.md."""
-
 UNSEEN = (
     *("place of an obstacle", "size of an obstacle", "size of a tool", "bounds", "margins"),
     *("size", "inertia"),
 )
 """What the hand-made carry, which turns nothing, and its forces do not depend on."""
+
+NO_NUMBERS = ("bounds", "margins", "uncertainty")
+OF_BODIES = ("size of a tool", "place of an obstacle", "size of an obstacle")
+"""What no compiled function takes, and what only those that know the bodies do."""
 
 
 def asked(cell: ho.Cell, drivable: ho.Cell, polishes: Sequence[ho.Cell]) -> tuple[float, ...]:
@@ -158,11 +154,9 @@ def polish(cell: ho.Cell) -> None:
     assert len(ho.polish(first, rng=np.random.default_rng(0), settings=SHORT))
 
 
-@cache
 def both(name: str) -> tuple[ho.Cell, ho.Cell]:
     """A cell and its drivable form."""
-    cell = shipped(name)
-    return cell, cell.drivable()
+    return shipped(name), drivable(name)
 
 
 def polished(name: str, cell: ho.Cell, drivable: ho.Cell) -> tuple[ho.Cell, ...]:
@@ -181,33 +175,83 @@ def warmed(name: str, polishes: bool = False) -> tuple[float, ...]:
     return asked(cell, drivable, polished(name, cell, drivable))
 
 
-def needs_no_compiler(
-    name: str, changed: Mapping[str, Any], monkeypatch: pytest.MonkeyPatch, polishes: bool
-) -> bool:
-    """Whether what is asked of a changed cell, without a compiler, is another answer."""
-    before, (cell, drivable), plainly = warmed(name, polishes), both(name), Compiler.compile
+def refuse_compiler(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever is compiled from here on fails, but for single rows."""
+    plainly = Compiler.compile
 
     def refused(self: Compiler, source: Path, *given: Any, **more: Any) -> None:
         assert source.name.startswith("row_"), f"{source.name} is compiled"
         plainly(self, source, *given, **more)
 
     monkeypatch.setattr(Compiler, "compile", refused)
-    new, driven = cell.changed(changed), drivable.changed(changed)
-    found = asked(new, driven, polished(name, new, driven))
-    for each in polished(name, new, driven) if polishes else ():
+
+
+def changed_both(name: str, changed: Mapping[str, Any]) -> tuple[ho.Cell, ho.Cell]:
+    """A cell and its drivable form with other numbers."""
+    cell, driven = (each.changed(changed) for each in both(name))
+    return cell, driven
+
+
+def needs_no_compiler(
+    name: str, new: tuple[ho.Cell, ho.Cell], monkeypatch: pytest.MonkeyPatch, polishes: bool
+) -> bool:
+    """Whether what is asked of a changed cell, without a compiler, is another answer."""
+    before = warmed(name, polishes)
+    refuse_compiler(monkeypatch)
+    found = asked(*new, polished(name, *new))
+    for each in polished(name, *new) if polishes else ():
         polish(each)
     return found != before
 
 
 @pytest.mark.parametrize("group", GROUPS)
 def test_the_rack_needs_no_compiler(group: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    changed = changes(rack_cell())[group]
-    assert needs_no_compiler("rack", changed, monkeypatch, False) is (group not in UNSEEN)
+    new = changed_both("rack", changes(rack_cell())[group])
+    assert needs_no_compiler("rack", new, monkeypatch, False) is (group not in UNSEEN)
+    ours, other = shipped("rack").compiled.numbers, new[0].compiled.numbers
+    differ = [k for k in ours.sizes if not np.array_equal(ours.vector(k), other.vector(k))]
+    assert (differ == []) == (group in NO_NUMBERS)
+    assert (differ == [BODIES]) == (group in OF_BODIES)
+
+
+ALL = dict(ChainMap(*changes(rack_cell()).values()))
 
 
 def test_nor_does_its_polish_after_all_changes(monkeypatch: pytest.MonkeyPatch) -> None:
-    changed = dict(ChainMap(*changes(rack_cell()).values()))
-    assert needs_no_compiler("rack", changed, monkeypatch, True)
+    assert needs_no_compiler("rack", changed_both("rack", ALL), monkeypatch, True)
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [ALL, *({"robots[0].base.xyz": place} for place in ([-0.15, 1.18, 0.2], [-0.3, 1.0, 0.3]))],
+    ids=["all", "base", "far base"],
+)
+def test_a_changed_cell_is_what_its_file_says(
+    changed: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """To the bit; from other places of its base an arm has other pairs within reach."""
+    cell = shipped("rack")
+    warmed("rack")
+    refuse_compiler(monkeypatch)
+    new = cell.changed(changed)
+    text = new.workcell.text
+    assert text is not None
+    shutil.copytree(RACK.parents[1] / "robots", tmp_path / "robots")
+    (tmp_path / "workcells").mkdir()
+    file = tmp_path / "workcells" / RACK.name
+    file.write_bytes(text)
+    read = ho.Cell.load(file)
+    assert read.workcell.digest == new.workcell.digest
+    spread = np.random.default_rng(1).standard_normal((6, cell.n_var))
+    x = np.clip(cell.initial + 0.05 * spread, cell.lower, cell.upper)
+    ours, theirs = new.evaluate(x), read.evaluate(x)
+    for part in ("penalised", "feasible", "reason", "position", "violation"):
+        np.testing.assert_array_equal(getattr(ours, part), getattr(theirs, part), part)
+    assert new.geometry.active != cell.geometry.active or changed is ALL
+    assert new.geometry.possible == cell.geometry.possible
+    carry, other = new.carry(new.initial), read.carry(read.initial)
+    for part in ("time", "normal_force", "pressure_shift", "pose", "q"):
+        np.testing.assert_array_equal(getattr(carry, part), getattr(other, part), part)
 
 
 @pytest.mark.slow
@@ -216,20 +260,14 @@ def test_nor_does_its_polish_after_all_changes(monkeypatch: pytest.MonkeyPatch) 
 def test_nor_do_polishes_and_pads_anywhere(
     name: str, group: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    changed = changes(both(name)[0].workcell)[group]
-    assert needs_no_compiler(name, changed, monkeypatch, True) is (group not in UNSEEN)
-
-
-@pytest.mark.parametrize("name", list(STRUCTURE))
-def test_what_is_structure_has_another_digest(name: str) -> None:
-    cell = shipped("rack")
-    changed = cell.changed(STRUCTURE[name])
-    assert changed.compiled.numbers.bodies_digest != cell.compiled.numbers.bodies_digest
+    new = changed_both(name, changes(shipped(name).workcell)[group])
+    assert needs_no_compiler(name, new, monkeypatch, True) is (group not in UNSEEN)
 
 
 @pytest.mark.parametrize("name", ["rack", "fork", "corner"])
-@pytest.mark.parametrize("group", GROUPS)
-def test_no_number_is_structure(name: str, group: str) -> None:
-    for cell in both(name):
-        new = cell.changed(changes(cell.workcell)[group]).compiled.numbers
-        assert new.bodies_digest == cell.compiled.numbers.bodies_digest
+def test_no_number_is_structure(name: str) -> None:
+    every = dict(ChainMap(*changes(shipped(name).workcell).values()))
+    for cell, new in zip(both(name), changed_both(name, every), strict=True):
+        ours, other = cell.compiled.numbers, new.compiled.numbers
+        assert other.bodies_digest == ours.bodies_digest
+        assert other.layout == ours.layout

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Mapping
@@ -23,7 +22,7 @@ from codegen.errors import CodegenError
 from codegen.function import NumericFunction
 from codegen.interpreted import InterpretedFunction
 from hybrid_opt import compiled_cell
-from hybrid_opt.building import build_study
+from hybrid_opt.campaign.stages import build_study
 from hybrid_opt.cell import Cell
 from hybrid_opt.compiled_cell import CompiledCell
 from hybrid_opt.evaluate import kernel
@@ -34,7 +33,7 @@ from hybrid_opt.progress import Progress
 from hybrid_opt.robust.force import RobustModel, at_rest, pressing_model
 from hybrid_opt.timing.model import TimingModel
 from symbolic.cell_model import CellModel
-from symbolic.numbers import HELD, START
+from symbolic.numbers import START
 from tests.symbolic.cells import RACK, hand_cell, hand_model, rack_cell
 
 
@@ -86,17 +85,8 @@ def test_keys_tell_sets_and_structures_apart() -> None:
         CompiledCell(cell).key("set", "200"),
         CompiledCell(cell).key("set", bodies=False),
         CompiledCell(replace(cell, task=replace(cell.task, samples=11))).key("set"),
-        CompiledCell(replace(cell, task=replace(cell.task, time_law="ramped"))).key("set"),
-        CompiledCell(replace(cell, environment=cell.environment[1:])).key("set"),
     ]
     assert len(set(keys)) == len(keys)
-
-
-def test_numbers_are_no_part_of_a_key() -> None:
-    cell = rack_cell()
-    heavy = replace(cell, payload=replace(cell.payload, mass=1.5 * cell.payload.mass))
-    assert CompiledCell(heavy).key("set") == CompiledCell(cell).key("set")
-    assert CompiledCell(heavy).vector(HELD).tolist() != CompiledCell(cell).vector(HELD).tolist()
 
 
 def test_a_given_model_has_its_own_start_postures() -> None:
@@ -132,66 +122,6 @@ def test_start_postures_are_those_of_the_interpreted_search() -> None:
         np.testing.assert_allclose(found, interpreted[0].q, atol=1e-9)
 
 
-CHANGES: dict[str, dict[str, Any]] = {
-    "payload": {"payload.mass": 8.0, "payload.centre_of_mass": [0.0, 0.01, 0.0]},
-    "friction": {"contacts.friction": 0.9},
-    "grip": {"contacts[0].xyz": [0.0, 0.2, 0.05], "contacts[1].xyz": [0.0, -0.2, 0.05]},
-    "base": {"robots.left.base.xyz": [-0.15, 1.18, 0.2]},  # other pairs come within reach
-    "far base": {"robots.left.base.xyz": [-0.3, 1.0, 0.3]},
-    "goal": {"task.goal": [0.0, 0.0, 1.15, 0.0, 0.0, 0.0]},
-    "shelf": {"environment.top board.xyz": [0.0, 0.0, 0.985]},
-    "limits": {"robots.acceleration_max": 4.0, "task.reference_speed": 0.3},
-}
-
-
-@pytest.fixture
-def no_compiler(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Whatever is compiled fails."""
-    cell = ho.Cell.load(RACK)
-    cell.carry(cell.initial)  # what the structure needs is built
-
-    def refused(*_: Any, **__: Any) -> None:
-        raise AssertionError("a compiler was asked for")
-
-    monkeypatch.setattr(Compiler, "compile", refused)
-
-
-@pytest.mark.parametrize("name", list(CHANGES))
-@pytest.mark.usefixtures("no_compiler")
-def test_a_changed_number_needs_no_compiler_and_is_what_its_file_says(
-    name: str, tmp_path: Path
-) -> None:
-    cell = ho.Cell.load(RACK)
-    new = cell.changed(CHANGES[name])
-    text = new.workcell.text
-    assert text is not None
-    shutil.copytree(RACK.parents[1] / "robots", tmp_path / "robots")
-    (tmp_path / "workcells").mkdir()
-    file = tmp_path / "workcells" / RACK.name
-    file.write_bytes(text)
-    read = ho.Cell.load(file)
-    assert read.workcell.digest == new.workcell.digest
-    x = np.clip(
-        cell.initial + 0.05 * np.random.default_rng(1).standard_normal((6, cell.n_var)),
-        cell.lower,
-        cell.upper,
-    )
-    ours, theirs = new.evaluate(x), read.evaluate(x)
-    for part in ("penalised", "feasible", "reason", "position", "violation"):
-        np.testing.assert_array_equal(getattr(ours, part), getattr(theirs, part), part)
-    if "base" in name:
-        assert new.geometry.active != cell.geometry.active
-        assert new.geometry.possible == cell.geometry.possible
-    carry, other = new.carry(new.initial), read.carry(read.initial)
-    for part in ("time", "normal_force", "pressure_shift", "pose"):
-        np.testing.assert_array_equal(getattr(carry, part), getattr(other, part), part)
-    np.testing.assert_array_equal(carry.arms[0].q, other.arms[0].q)
-    plain = cell.carry(cell.initial)
-    told = [getattr(plain, part).tolist() for part in ("time", "normal_force", "pose")]
-    if name not in ("grip", "base", "far base", "shelf"):
-        assert told != [getattr(carry, part).tolist() for part in ("time", "normal_force", "pose")]
-
-
 CHANGE = {"payload.mass": 8.0, "robots.left.base.xyz": [-0.15, 1.18, 0.2]}
 
 PROGRAM = f"""
@@ -204,7 +134,7 @@ print(new.carry(new.initial).normal_force.max(), new.evaluate(new.initial).feasi
 
 
 @pytest.mark.process
-def test_nor_does_a_machine_without_one(tmp_path: Path) -> None:
+def test_a_machine_without_a_compiler_takes_changed_numbers(tmp_path: Path) -> None:
     ho.Cell.load(RACK).evaluate(ho.Cell.load(RACK).initial)  # what the structure needs is built
     without = {name: value for name, value in os.environ.items() if name != "CC"} | {"PATH": ""}
     command = [sys.executable, "-c", PROGRAM]
@@ -216,20 +146,6 @@ def test_nor_does_a_machine_without_one(tmp_path: Path) -> None:
     done = subprocess.run(command, env=empty, capture_output=True, text=True, check=False)
     assert done.returncode != 0
     assert "no C compiler that works was found" in done.stderr.splitlines()[-1]
-
-
-def test_a_changed_drivable_cell_needs_no_compiler_either(monkeypatch: pytest.MonkeyPatch) -> None:
-    cell = ho.Cell.load(RACK).drivable()
-    held = cell.carry(cell.initial)
-
-    def refused(*_: Any, **__: Any) -> None:
-        raise AssertionError("a compiler was asked for")
-
-    monkeypatch.setattr(Compiler, "compile", refused)
-    new = cell.changed({"payload.mass": 8.0, "payload.acceleration_max": 4.0})
-    carry = new.carry(new.initial)
-    assert carry.peak_normal_force.max() < held.peak_normal_force.max()
-    assert carry.duration > 0.0
 
 
 @pytest.mark.slow

@@ -9,15 +9,19 @@ from collections.abc import Mapping
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
 import hybrid_opt as ho
+from hybrid_opt import door
 from hybrid_opt.bundles.bundle import read_manifest
 from hybrid_opt.campaign.journal import ReplicaRequest
 from hybrid_opt.campaign.search_stage import run_replica
 from hybrid_opt.campaign.settings import FRONT, CampaignSettings
+from hybrid_opt.display.table import NOTHING
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.indicators import metrics
 from hybrid_opt.polishing.settings import FillSettings
@@ -191,8 +195,6 @@ def test_objectives_of_ones_own() -> None:
     carry = mine.carry(mine.initial)
     assert carry.judgement is not None
     assert carry.judgement.objectives["height"] == carry.pose[:, 2].max() / 2
-    with pytest.raises(SettingsError, match="each once"):
-        ho.Cell.load(RACK, objectives=(tall, tall)).carry(mine.initial)
 
 
 def test_what_there_is_to_choose_from() -> None:
@@ -226,30 +228,48 @@ def test_calls_tell_how_far_they_are(capsys: pytest.CaptureFixture[str]) -> None
     told: list[tuple[int, int]] = []
     ho.search(
         cell(),
-        evaluations=60,
+        "mopso",
+        evaluations=50,
         rng=np.random.default_rng(1),
+        settings=ho.SearchSettings(algorithm=ho.MopsoSettings(swarm=20)),
         progress=lambda done, total: told.append((done, total)),
     )
-    assert told[-1] == (60, 60)
+    assert told == [(20, 50), (40, 50), (50, 50)]
     ho.search(cell(), evaluations=60, rng=np.random.default_rng(1), progress=True)
     assert "nsga2: 100%" in capsys.readouterr().err
 
 
-def test_settings_of_an_algorithm_are_a_record_or_what_differs_from_its_defaults() -> None:
-    fronts = [
-        ho.search(
-            cell(),
-            "mopso",
-            evaluations=60,
-            rng=np.random.default_rng(1),
-            settings=ho.SearchSettings(algorithm=own),
-        )
-        for own in (ho.MopsoSettings(swarm=20), {"swarm": 20})
-    ]
-    np.testing.assert_array_equal(fronts[0].evaluations.x, fronts[1].evaluations.x)
-    with pytest.raises(ho.DualArmError, match=r"nsga2: unknown setting swarm"):
-        ho.search(
-            cell(),
-            rng=np.random.default_rng(1),
-            settings=ho.SearchSettings(algorithm=ho.MopsoSettings()),
-        )
+SECONDS = {"over post": 2.0, "left of post": 1.5, "right of post": None}
+
+
+def proposal(side: str) -> Any:
+    """As much of a proposal as is compared; its file says which it is."""
+    return SimpleNamespace(
+        sides=(side,),
+        passes=side,
+        length=4.0,
+        found=SimpleNamespace(branches=(1, 0)),
+        text=lambda folder: side,
+    )
+
+
+def test_the_fastest_class_comes_first(monkeypatch: pytest.MonkeyPatch) -> None:
+    def load(path: Path) -> str:
+        return path.read_text(encoding="utf-8")
+
+    def fastest(side: str, evaluations: int, rng: np.random.Generator) -> Any:
+        assert evaluations == 300
+        seconds = SECONDS[side]
+        if seconds is None:
+            raise SettingsError("no carry that holds")
+        return SimpleNamespace(duration=seconds, peak_normal_force=np.array([[30.0, 31.25]]))
+
+    monkeypatch.setattr(door, "Cell", SimpleNamespace(load=load))
+    monkeypatch.setattr(door, "fastest_carry", fastest)
+    given = [proposal(side) for side in ("right of post", "over post", "left of post")]
+    told: list[str] = []
+    found, table = door.compared_classes(given, 300, np.random.default_rng(1), told.append)
+    assert told == [f"study of carry {k} of 3" for k in (1, 2, 3)]
+    assert [one.sides[0] for one in found] == ["left of post", "over post", "right of post"]
+    assert table.rows[0] == ("left of post", "1 and 0", "4.00", "1.50", "31.2")
+    assert table.rows[2][3:] == (NOTHING, NOTHING)

@@ -12,8 +12,8 @@ import cma
 import numpy as np
 
 import hybrid_opt as ho
-from hybrid_opt.classes import fastest_carry
 from hybrid_opt.display.table import Table, number
+from hybrid_opt.door import fastest_carry
 from hybrid_opt.errors import NoHoldError, ProposalError
 from hybrid_opt.evaluate.evaluation import concatenated
 from hybrid_opt.proposing.proposal import worked
