@@ -1,8 +1,7 @@
-"""Cells of machines of the wheel `example-robot-data`, as it has them, for tests."""
+"""Robots and cells of machines of the wheel `example-robot-data`, as it has them, for tests."""
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass, field, replace
 from importlib.metadata import distribution
 from pathlib import Path
@@ -16,8 +15,9 @@ from symbolic.read.arms import held_joints, link_frame, moving_joints, reduced_m
 from symbolic.read.cell import load
 from symbolic.read.payload import pad_rotation
 from symbolic.read.urdf import read_urdf
-from symbolic.records import Workcell
+from symbolic.records import Robot, Workcell
 from symbolic.records.poses import inverse, pose_matrix
+from tests.symbolic.read.samples import write
 
 SIZE = (0.30, 0.40, 0.25)
 
@@ -27,6 +27,32 @@ def example_robot(name: str) -> Path:
     wheel = distribution("example-robot-data")
     folder = "cmeel.prefix/share/example-robot-data/robots"
     return Path(str(wheel.locate_file(f"{folder}/{name}")))
+
+
+def ur10_urdf() -> Path:
+    """The UR10."""
+    return example_robot("ur_description/urdf/ur10_robot.urdf")
+
+
+def robot_record(urdf: Path, T_world_base: Array | None = None) -> Robot:
+    """An arm with a bare flange `tool0` and wide limits."""
+    wide = np.full(6, 1e3)
+    return Robot(
+        name=urdf.stem,
+        urdf=urdf,
+        package_dirs=(),
+        flange="tool0",
+        locked_joints=(),
+        T_world_base=np.eye(4) if T_world_base is None else T_world_base,
+        T_flange_pad=np.eye(4),
+        tool=(),
+        position_lower=-wide,
+        position_upper=wide,
+        velocity_max=wide,
+        acceleration_max=wide,
+        torque_max=wide,
+        min_manipulability=0.0,
+    )
 
 
 @dataclass(frozen=True)
@@ -183,7 +209,7 @@ def machine_cell(machine: Machine, folder: Path) -> Path:
         _robot(name, arm, {}) | {"pad": machine.pad}
         for name, arm in (("left", machine.left), ("right", machine.right))
     ]
-    return write_cell(folder, robots, np.array([*machine.box, 0.0, 0.0, 0.0]), machine.spin)
+    return _cell(folder, robots, np.array([*machine.box, 0.0, 0.0, 0.0]), machine.spin)
 
 
 def single_cell(arm: Arm, folder: Path, locked: dict[str, float] | None = None) -> Path:
@@ -209,7 +235,7 @@ def single_cell(arm: Arm, folder: Path, locked: dict[str, float] | None = None) 
         base = {"xyz": T_world_base[:3, 3].tolist(), "rpy": rpy.tolist()}
         cell_arm = arm if locked is None else replace(arm, locked=locked)
         robots.append(_robot(name, cell_arm, base))
-    return write_cell(folder, robots, np.zeros(6))
+    return _cell(folder, robots, np.zeros(6))
 
 
 def _robot(name: str, arm: Arm, base: dict[str, Any]) -> dict[str, Any]:
@@ -225,7 +251,7 @@ def _robot(name: str, arm: Arm, base: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def write_cell(folder: Path, robots: list[dict[str, Any]], start: Array, spin: float = 0.0) -> Path:
+def _cell(folder: Path, robots: list[dict[str, Any]], start: Array, spin: float = 0.0) -> Path:
     """A workcell file in which a box is moved a little from its start."""
     goal = start + np.array([0.02, 0.01, 0.03, 0.0, 0.0, 0.02])
     middle = (start + goal) / 2.0
@@ -251,14 +277,4 @@ def write_cell(folder: Path, robots: list[dict[str, Any]], start: Array, spin: f
             "waypoints": [{"lower": (middle - 0.02).tolist(), "upper": (middle + 0.02).tolist()}],
         },
     }
-    path = folder / "cell.toml"
-    path.write_text("\n".join(f"{key} = {_toml(value)}" for key, value in cell.items()) + "\n")
-    return path
-
-
-def _toml(value: Any) -> str:
-    if isinstance(value, dict):
-        return "{" + ", ".join(f"{json.dumps(k)} = {_toml(v)}" for k, v in value.items()) + "}"
-    if isinstance(value, list | tuple):
-        return "[" + ", ".join(map(_toml, value)) + "]"
-    return json.dumps(value)
+    return write(folder, cell)

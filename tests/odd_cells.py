@@ -25,14 +25,17 @@ def locked_pandas(folder: Path, angle: float) -> Workcell:
     return load(single_cell(SINGLE["panda"], folder, {PANDA_JOINT: angle}))
 
 
+def _redundant(path: Path, *entries: str) -> Workcell:
+    """The cell of a file whose task is told these redundant joints."""
+    given = f'"redundant" = [{", ".join(f"{{joint = {entry}}}" for entry in entries)}]'
+    path.write_text(path.read_text().replace('"samples" =', f'{given}, "samples" ='))
+    return load(path)
+
+
 def free_pandas(folder: Path, entry: str = "") -> Workcell:
     """The same, these joints redundant; `entry` is what the file says of them."""
     path = single_cell(SINGLE["panda"], folder, {})
-    if entry:
-        text = path.read_text()
-        given = f'"redundant" = [{{joint = "{PANDA_JOINT}", {entry}}}], "samples" ='
-        path.write_text(text.replace('"samples" =', given))
-    return load(path)
+    return _redundant(path, f'"{PANDA_JOINT}", {entry}') if entry else load(path)
 
 
 def seven_joints(name: str, folder: Path) -> Workcell:
@@ -53,13 +56,9 @@ def seven_joints(name: str, folder: Path) -> Workcell:
             f'"redundant_joints" = {json.dumps(list(arm.locked))}, ',
             text,
         )
-    given = ", ".join(
-        f'{{joint = "{joint}", initial = {angle}}}'
-        for arm in arms
-        for joint, angle in arm.locked.items()
-    )
-    path.write_text(text.replace('"samples" =', f'"redundant" = [{given}], "samples" ='))
-    return load(path)
+    path.write_text(text)
+    joints = [entry for arm in arms for entry in arm.locked.items()]
+    return _redundant(path, *(f'"{joint}", initial = {angle}' for joint, angle in joints))
 
 
 def rack_on_rail(folder: Path, away: float, room: float = 0.0) -> Workcell:
@@ -96,11 +95,7 @@ def machine_on_lift(folder: Path, height: float, free: bool) -> Workcell:
     x, y, z = machine.box
     lifted = replace(machine, left=arms[0], right=arms[1], box=(x, y, z + height))
     path = machine_cell(lifted, folder)
-    if free:
-        given = f'{{joint = "torso_lift_joint", initial = {height}}}'
-        text = path.read_text()
-        path.write_text(text.replace('"samples" =', f'"redundant" = [{given}], "samples" ='))
-    return load(path)
+    return _redundant(path, f'"torso_lift_joint", initial = {height}') if free else load(path)
 
 
 QUARTER = np.pi / 2.0

@@ -12,14 +12,11 @@ from hybrid_opt.carry import Carry
 from hybrid_opt.cell import Cell
 from hybrid_opt.evaluate.evaluation import REASONS
 from hybrid_opt.timing.analysis import judge_timing
-from hybrid_opt.timing.model import REFINEMENT, TimingModel
 from hybrid_opt.timing.records import TimingStatus
+from symbolic.array import Array
 from symbolic.read.cell import load
-from symbolic.records import TimeLaw
 from tests.hybrid_opt.campaign.fake import RACK
 from tests.hybrid_opt.cells import shipped
-from tests.hybrid_opt.timing.cells import initial, near_initial, timing_of
-from tests.symbolic.cells import hand_cell
 
 
 def cell() -> Cell:
@@ -111,39 +108,35 @@ def test_names_cannot_become_markup() -> None:
     assert "<script" not in carry._repr_html_()
 
 
-INTERVALS = 20
-
-
-@cache
-def timing(law: TimeLaw) -> TimingModel:
-    """Sampled as densely as the timing recomputes a path."""
-    cell = hand_cell()
-    task = replace(cell.task, time_law=law, samples=REFINEMENT * INTERVALS + 1)
-    return timing_of(replace(cell, task=task), INTERVALS)
-
-
 def test_joint_rates_are_those_of_the_exact_derivatives() -> None:
     """Of the path's derivatives that the timing model compiles, driven with the box's speed."""
-    model = timing("ramped")
-    carry, motion = model.search_carry(initial()), model.path_motion(initial())
-    np.testing.assert_allclose(carry.parameter, motion.parameter, atol=1e-15)
-    length = (motion.pose_first**2).sum(axis=1)
-    speed = ((carry.rate * motion.pose_first).sum(axis=1) / length)[:, None]
-    bend = carry.second_rate - motion.pose_second * speed**2
-    push = ((bend * motion.pose_first).sum(axis=1) / length)[:, None]
-    q_second = motion.q_second * speed**2 + motion.q_first * push
-    np.testing.assert_allclose(carry.side_by_side("q_rate"), motion.q_first * speed, atol=1e-3)
+    model, x = shipped("transfer").timing_model, shipped("transfer").initial
+    carry, motion = model.search_carry(x), model.path_motion(x)
+
+    def at_samples(values: Array) -> Array:
+        columns = [np.interp(carry.parameter, motion.parameter, column) for column in values.T]
+        return np.transpose(columns)
+
+    first, second = at_samples(motion.pose_first), at_samples(motion.pose_second)
+    q_first, q_second = at_samples(motion.q_first), at_samples(motion.q_second)
+    length = (first**2).sum(axis=1)
+    speed = ((carry.rate * first).sum(axis=1) / length)[:, None]
+    bend = carry.second_rate - second * speed**2
+    push = ((bend * first).sum(axis=1) / length)[:, None]
+    np.testing.assert_allclose(carry.side_by_side("q_rate"), q_first * speed, atol=1e-3)
     inside = slice(3, -3)
-    second = carry.side_by_side("q_second")
-    np.testing.assert_allclose(second[inside], q_second[inside], atol=5e-3)
+    expected = (q_second * speed**2 + q_first * push)[inside]
+    np.testing.assert_allclose(carry.side_by_side("q_second")[inside], expected, atol=5e-3)
 
 
 def test_a_ramped_carry_rests_at_its_ends() -> None:
     """And is not told that its robots would have to be at speed there."""
-    for x in (initial(), *near_initial(np.random.default_rng(4), 3)):
-        carry = timing("ramped").search_carry(x)
-        for arm in carry.arms:
+    cell = shipped("transfer")
+    model, rng = cell.timing_model, np.random.default_rng(4)
+    near = cell.initial + 0.1 * (cell.upper - cell.lower) * rng.uniform(-1.0, 1.0, cell.n_var)
+    for x in (cell.initial, np.clip(near, cell.lower, cell.upper)):
+        for arm in model.search_carry(x).arms:
             np.testing.assert_allclose(arm.q_rate[[0, -1]], 0.0, atol=1e-6)
-        judged = judge_timing(timing("ramped"), x)
+        judged = judge_timing(model, x)
         assert "at speed" not in judged.reason
-    assert judge_timing(timing("ramped"), initial()).status is TimingStatus.OK
+    assert judge_timing(model, cell.initial).status is TimingStatus.OK

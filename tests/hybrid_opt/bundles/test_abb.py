@@ -33,7 +33,7 @@ from symbolic.robot.model import build_robot_model
 from tests.hybrid_opt.bundles.bundles import contents, driven, exported, rack_driven, text_of
 from tests.hybrid_opt.bundles.mock_rapid import Controller, Module, parse
 from tests.hybrid_opt.job.jobs import rack, rack_job
-from tests.robots import ur10_urdf
+from tests.machines import ur10_urdf
 from tests.symbolic.cells import GOFA
 
 EGM = ("T_ROB1/CarryEgm1.mod", "T_ROB2/CarryEgm2.mod")

@@ -22,13 +22,28 @@ from hybrid_opt.campaign import (
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.progress import Progress
 from symbolic.read.cell import load
-from tests.hybrid_opt.campaign.fake import RACK, run_search
+from tests.hybrid_opt.campaign.fake import RACK
 
 SETTINGS = CampaignSettings(evaluations=200, replicas=2)
 
 
-def refused(message: str, *given: Any) -> None:
-    with pytest.raises(ResultsError, match=message), open_folder(*given):
+def begun(root: Path) -> ExecutionSettings:
+    """A folder in which a campaign began, to be continued."""
+    execution = ExecutionSettings(root, 1, resume=True)
+    with open_folder(SETTINGS, execution, load(RACK)):
+        return execution
+
+
+def refused(
+    message: str,
+    execution: ExecutionSettings,
+    settings: CampaignSettings = SETTINGS,
+    cell: Path = RACK,
+) -> None:
+    with (
+        pytest.raises(ResultsError, match=message),
+        open_folder(settings, execution, load(cell)),
+    ):
         pytest.fail("was opened")
 
 
@@ -49,10 +64,16 @@ def refused(message: str, *given: Any) -> None:
 def test_other_settings_are_never_mixed(
     tmp_path: Path, change: dict[str, Any], message: str
 ) -> None:
-    execution = ExecutionSettings(tmp_path, 1, resume=True)
-    with open_folder(SETTINGS, execution, load(RACK)):
-        pass
-    refused(message, replace(SETTINGS, **change), execution, load(RACK))
+    refused(message, begun(tmp_path), replace(SETTINGS, **change))
+
+
+@pytest.mark.parametrize("key", ["numpy", "sources"])
+def test_other_software_is_never_mixed(tmp_path: Path, key: str) -> None:
+    execution, path = begun(tmp_path), tmp_path / "configuration.json"
+    stored = json.loads(path.read_text())
+    stored["environment"][key] = "0.1"
+    path.write_text(json.dumps(stored))
+    refused(rf'environment.{key}: stored "0.1", now', execution)
 
 
 def changed_cell(folder: Path) -> Path:
@@ -64,27 +85,20 @@ def changed_cell(folder: Path) -> Path:
 
 
 def test_other_workcell_is_never_mixed(tmp_path: Path) -> None:
-    execution = ExecutionSettings(tmp_path / "a", 1, resume=True)
-    with open_folder(SETTINGS, execution, load(RACK)):
-        pass
-    refused("holds results of another workcell", SETTINGS, execution, load(changed_cell(tmp_path)))
+    execution, cell = begun(tmp_path / "a"), changed_cell(tmp_path)
+    refused("holds results of another workcell", execution, cell=cell)
 
 
 def test_results_are_overwritten_where_that_is_asked_for(tmp_path: Path) -> None:
     root = tmp_path / "a"
-    with open_folder(SETTINGS, ExecutionSettings(root, 1), load(RACK)):
-        (root / "stages").mkdir()
-        (root / "stages" / "search.json").write_text("{}")
-        (root / "front.csv").write_text("")
-    other = replace(SETTINGS, seed=7)
-    with open_folder(
-        other, ExecutionSettings(root, 1, overwrite=True), load(changed_cell(tmp_path))
-    ):
-        assert sorted(entry.name for entry in root.iterdir()) == [
-            ".lock",
-            "configuration.json",
-            "workcell",
-        ]
+    begun(root)
+    (root / "stages").mkdir()
+    (root / "stages" / "search.json").write_text("{}")
+    (root / "front.csv").write_text("")
+    execution = ExecutionSettings(root, 1, overwrite=True)
+    with open_folder(replace(SETTINGS, seed=7), execution, load(changed_cell(tmp_path))):
+        names = sorted(entry.name for entry in root.iterdir())
+    assert names == [".lock", "configuration.json", "workcell"]
     assert json.loads((root / "configuration.json").read_text())["settings"]["seed"] == 7
 
 
@@ -92,25 +106,9 @@ def test_results_are_overwritten_where_that_is_asked_for(tmp_path: Path) -> None
 def test_what_is_no_results_folder_is_not_touched(tmp_path: Path, asked: dict[str, Any]) -> None:
     kept = tmp_path / "thesis.tex"
     kept.write_text("years of work")
-    refused(
-        r"is no results folder, but not empty \(thesis.tex\)",
-        SETTINGS,
-        ExecutionSettings(tmp_path, 1, **asked),
-        load(RACK),
-    )
+    execution = ExecutionSettings(tmp_path, 1, **asked)
+    refused(r"is no results folder, but not empty \(thesis.tex\)", execution)
     assert kept.read_text() == "years of work"
-
-
-@pytest.mark.parametrize("key", ["numpy", "sources"])
-def test_other_software_is_never_mixed(tmp_path: Path, key: str) -> None:
-    execution = ExecutionSettings(tmp_path, 1, resume=True)
-    with open_folder(SETTINGS, execution, load(RACK)):
-        pass
-    path = tmp_path / "configuration.json"
-    stored = json.loads(path.read_text())
-    stored["environment"][key] = "0.1"
-    path.write_text(json.dumps(stored))
-    refused(rf'environment.{key}: stored "0.1", now', SETTINGS, execution, load(RACK))
 
 
 def test_the_stored_workcell_does_not_follow_the_file(tmp_path: Path) -> None:
@@ -124,26 +122,20 @@ def test_the_stored_workcell_does_not_follow_the_file(tmp_path: Path) -> None:
 
 
 def test_existing_results_are_not_touched_without_resume(tmp_path: Path) -> None:
-    execution = ExecutionSettings(tmp_path / "a", 1)
-    run_search(replace(SETTINGS, evaluations=40, replicas=1), execution)
-    with pytest.raises(ResultsError, match="holds a campaign already; continue it with --resume"):
-        run_search(replace(SETTINGS, evaluations=40, replicas=1), execution)
+    execution = replace(begun(tmp_path), resume=False)
+    refused("holds a campaign already; continue it with --resume", execution)
 
 
-def test_a_changed_copy_of_the_workcell_is_told(tmp_path: Path) -> None:
-    execution = ExecutionSettings(tmp_path, 1, resume=True)
-    with open_folder(SETTINGS, execution, load(RACK)) as folder:
-        copy = folder.workcell.source
+def test_a_changed_copy_of_the_workcell_is_told_and_a_missing_one_made_again(
+    tmp_path: Path,
+) -> None:
+    execution = begun(tmp_path)
+    copy = next((tmp_path / "workcell").rglob("*.toml"))
     copy.write_text(copy.read_text().replace("mass = 10.0", "mass = 9.0"))
-    refused("was changed after the campaign began", SETTINGS, execution, load(RACK))
-
-
-def test_a_missing_copy_of_the_workcell_is_made_again(tmp_path: Path) -> None:
-    execution = ExecutionSettings(tmp_path, 1, resume=True)
-    for _ in range(2):
-        with open_folder(SETTINGS, execution, load(RACK)) as folder:
-            assert folder.workcell.digest == load(RACK).digest
-        shutil.rmtree(tmp_path / "workcell")
+    refused("was changed after the campaign began", execution)
+    shutil.rmtree(tmp_path / "workcell")
+    with open_folder(SETTINGS, execution, load(RACK)) as folder:
+        assert folder.workcell.digest == load(RACK).digest
 
 
 def run(root: Path, *stages: Stage) -> None:

@@ -7,7 +7,9 @@ import gzip
 import io
 import re
 import tracemalloc
+from collections.abc import Callable
 from dataclasses import fields, replace
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -188,12 +190,8 @@ def test_front_names_its_evaluations() -> None:
     assert float(rows[1]["peak_force_2"]) == before.evaluations.objectives[2, 1]
 
 
-def unpacked(content: bytes) -> bytes:
-    return gzip.decompress(content)
-
-
 def test_a_small_file_does_not_unfold_into_a_huge_one() -> None:
-    header = unpacked(encode(table())).partition(b"\n")[0] + b"\n"
+    header = gzip.decompress(encode(table())).partition(b"\n")[0] + b"\n"
     tracemalloc.start()
     packed = gzip.compress(header + b"0" * 2**28, 1)
     tracemalloc.reset_peak()
@@ -207,79 +205,58 @@ def test_a_small_file_does_not_unfold_into_a_huge_one() -> None:
 @pytest.mark.parametrize(
     "spoil",
     [
-        lambda content: content[:-20],
-        lambda content: b"not gzip",
-        lambda content: gzip.compress(b""),
-        lambda content: gzip.compress(gzip.decompress(content).replace(b"x_1", b"y_1")),
-        lambda content: gzip.compress(
-            gzip.decompress(content).replace(b"collision,", b"luck,", 99)
-        ),
-        lambda content: gzip.compress(gzip.decompress(content).replace(b"\n3,", b"\n4,")),
-        lambda content: gzip.compress(gzip.decompress(content).replace(b"0.", b"zero", 40)),
-        lambda content: gzip.compress(gzip.decompress(content).replace(b"\n3,", b"\n\n3,")),
-        lambda content: gzip.compress(gzip.decompress(content).partition(b"\n")[0] + b"\n"),
-        lambda content: gzip.compress(gzip.decompress(content) + b"31,1,1,,0.0\n"),
-        lambda content: gzip.compress(re.sub(rb"\n1,\d+,", rb"\n1,1e308,", unpacked(content))),
-        lambda content: gzip.compress(re.sub(rb"\n1,(\d+),\d,", rb"\n1,\1,2,", unpacked(content))),
-        lambda content: gzip.compress(re.sub(rb",[^,]*\n2,", rb",x\n2,", unpacked(content))),
+        lambda text: b"",
+        lambda text: text.replace(b"x_1", b"y_1"),
+        lambda text: text.replace(b"collision,", b"luck,", 99),
+        lambda text: text.replace(b"\n3,", b"\n4,"),
+        lambda text: text.replace(b"0.", b"zero", 40),
+        lambda text: text.replace(b"\n3,", b"\n\n3,"),
+        lambda text: text.partition(b"\n")[0] + b"\n",
+        lambda text: text + b"31,1,1,,0.0\n",
+        lambda text: re.sub(rb"\n1,\d+,", rb"\n1,1e308,", text),
+        lambda text: re.sub(rb"\n1,(\d+),\d,", rb"\n1,\1,2,", text),
+        lambda text: re.sub(rb",[^,]*\n2,", rb",x\n2,", text),
     ],
 )
-def test_damage_is_told(spoil: object) -> None:
-    assert callable(spoil)
-    with pytest.raises(ResultsError, match=r"evaluations.csv.gz: damaged"):
-        decode(spoil(encode(table())), PATH)
+def test_damage_is_told(spoil: Callable[[bytes], bytes]) -> None:
+    spoilt = gzip.compress(spoil(gzip.decompress(encode(table()))))
+    for content in (spoilt, encode(table())[:-20], b"not gzip"):
+        with pytest.raises(ResultsError, match=r"evaluations.csv.gz: damaged"):
+            decode(content, PATH)
+
+
+execution = partial(ExecutionSettings, Path("results"))
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
+    ("settings", "given", "message"),
     [
-        ({"evaluations": 0}, "evaluations is 0; allowed are whole numbers 1 to"),
-        ({"evaluations": 10.0}, r"evaluations is 10\.0"),
-        ({"replicas": True}, "replicas is True"),
-        ({"seed": -1}, "seed is -1; allowed are whole numbers 0 to"),
-        ({"algorithms": {}}, "name at least one"),
-        ({"algorithms": {"nsga3": {}}}, "unknown algorithm 'nsga3'; known are"),
-        ({"algorithms": {"nsga2": {"swarm": 10}}}, "nsga2: unknown setting swarm"),
-        ({"algorithms": {"nsga2": {"population": 1}}}, "population is 1; allowed are whole"),
-        ({"objectives": ("speed",)}, "unknown objective speed; known are"),
-        ({"constraint_handling": "hope"}, "'hope'; known are penalty, constraints"),
-        ({"first_generation": "lucky"}, "'lucky'; known are initial, random"),
+        (CampaignSettings, {"evaluations": 0}, "evaluations is 0; allowed are whole numbers 1 to"),
+        (CampaignSettings, {"evaluations": 10.0}, r"evaluations is 10\.0"),
+        (CampaignSettings, {"replicas": True}, "replicas is True"),
+        (CampaignSettings, {"seed": -1}, "seed is -1; allowed are whole numbers 0 to"),
+        (CampaignSettings, {"algorithms": {}}, "name at least one"),
+        (CampaignSettings, {"algorithms": {"nsga3": {}}}, "unknown algorithm 'nsga3'; known are"),
+        (CampaignSettings, {"objectives": ("speed",)}, "unknown objective speed; known are"),
+        (CampaignSettings, {"constraint_handling": "hope"}, "known are penalty, constraints"),
+        (CampaignSettings, {"first_generation": "lucky"}, "'lucky'; known are initial, random"),
+        (chosen, {"names": ()}, "name at least one, each once"),
+        (chosen, {"names": ("nsga2", "nsga2")}, "name at least one, each once"),
+        (chosen, {"names": ("nsga2",), "populations": [("random", 10)]}, r"campaign \(nsga2\)"),
+        (chosen, {"names": ("mopso",), "populations": 2 * [("mopso", 10)]}, "at most once"),
+        (chosen, {"names": ("nsga3",), "populations": [("nsga3", 10)]}, "unknown algorithm"),
+        (execution, {"jobs": -1}, "jobs is -1"),
+        (execution, {"executor": "slurm"}, "'slurm'; known are processes, dask"),
+        (execution, {"executor": "dask"}, "needs a scheduler's address"),
+        (execution, {"scheduler": "tcp://host:8786"}, "needs a scheduler's address"),
+        (execution, {"resume": True, "overwrite": True}, "give one"),
     ],
 )
-def test_wrong_settings_are_told(change: dict[str, Any], message: str) -> None:
-    with pytest.raises(SettingsError, match=message):
-        CampaignSettings(**change)
-
-
-@pytest.mark.parametrize(
-    ("names", "populations", "message"),
-    [
-        ((), (), "name at least one, each once"),
-        (("nsga2", "nsga2"), (), "name at least one, each once"),
-        (("nsga2", "mopso"), (("random", 10),), r"of the campaign \(nsga2, mopso\)"),
-        (("nsga2",), (("nsga2", 10), ("nsga2", 20)), "at most once"),
-        (("nsga3",), (("nsga3", 10),), "unknown algorithm 'nsga3'; known are"),
-    ],
-)
-def test_wrong_algorithms_are_told(
-    names: tuple[str, ...], populations: tuple[tuple[str, int], ...], message: str
+def test_wrong_settings_are_told(
+    settings: Callable[..., Any], given: dict[str, Any], message: str
 ) -> None:
     with pytest.raises(SettingsError, match=message):
-        chosen(names, populations)
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"jobs": -1}, "jobs is -1"),
-        ({"executor": "slurm"}, "'slurm'; known are processes, dask"),
-        ({"executor": "dask"}, "needs a scheduler's address"),
-        ({"scheduler": "tcp://host:8786"}, "needs a scheduler's address"),
-    ],
-)
-def test_wrong_execution_is_told(change: dict[str, Any], message: str) -> None:
-    with pytest.raises(SettingsError, match=message):
-        ExecutionSettings(Path("results"), **change)
+        settings(**given)
 
 
 @pytest.mark.parametrize(

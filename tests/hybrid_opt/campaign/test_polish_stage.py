@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,6 @@ import pytest
 from hybrid_opt.campaign import (
     CampaignSettings,
     ExecutionSettings,
-    Stage,
     open_folder,
     run_stages,
     search_stage,
@@ -37,8 +37,8 @@ from symbolic.read.cell import load
 from tests.symbolic.cells import RACK
 
 SETTINGS = CampaignSettings(algorithms={"nsga2": {}}, evaluations=200, replicas=1, seed=5)
-PROBE = ProbeSettings(starts=2, middle_starts=2)
-POLISHED = PolishSettings(attempts=2, fill=FillSettings(attempts=1), probe=PROBE)
+PROBE = ProbeSettings(starts=2, middle_starts=2, rounds=2)
+POLISHED = PolishSettings(attempts=2, rounds=3, fill=FillSettings(attempts=1), probe=PROBE)
 SILENT = Progress(shown=False)
 
 
@@ -149,47 +149,32 @@ def test_attempts_come_back_from_their_file(finished: Path) -> None:
     document = json.loads((polished_folder(finished, "nsga2", 0) / POLISH).read_text())
     for stored in document["outcomes"]:
         assert to_json(from_json(PolishOutcome, stored, "an attempt", "")) == stored
-    with pytest.raises(ResultsError, match="damaged"):
-        from_json(PolishOutcome, {"aim": "point"}, "an attempt", "")
 
 
-def test_an_interrupted_polish_repeats_no_attempt(
+def test_a_damaged_front_is_polished_anew_and_an_interruption_repeats_no_attempt(
     finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    root = tmp_path / "results"
-    append = Journal.append
-    recorded = []
-
-    def interrupt(journal: Journal, payload: bytes) -> None:
-        append(journal, payload)
-        if journal.path.parent == polished_folder(root, "nsga2", 0):
-            recorded.append(payload)
-            if len(recorded) == 2:
-                raise KeyboardInterrupt
-
-    monkeypatch.setattr(Journal, "append", interrupt)
-    with pytest.raises(KeyboardInterrupt):
-        run(root)
-    interrupted = list(recorded)
-    run(root, resume=True)
-    repeated = [block for block in recorded[2:] if block in interrupted]
-    assert not repeated
-    (replica,) = read_campaign(root).replicas
-    one, other = (read_polished(folder, replica, load(RACK)) for folder in (finished, root))
-    assert one is not None
-    assert other is not None
-    np.testing.assert_array_equal(one.x, other.x)
-    np.testing.assert_array_equal(one.objectives, other.objectives)
-
-
-def test_a_damaged_front_is_polished_anew(finished: Path, tmp_path: Path) -> None:
-    root = tmp_path / "results"
+    root, append = tmp_path / "results", Journal.append
     shutil.copytree(finished, root)
     path = polished_folder(root, "nsga2", 0) / POLISH
     before = json.loads(path.read_text())
     path.write_text("{}")
-    with pytest.warns(DamagedResultsWarning, match=r"polish.json: damaged at x: is missing"):
+    recorded = list[bytes]()
+
+    def interrupt(journal: Journal, payload: bytes) -> None:
+        append(journal, payload)
+        recorded.append(payload)
+        if len(recorded) == 2:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(Journal, "append", interrupt)
+    damaged = r"polish.json: damaged at x: is missing"
+    with pytest.warns(DamagedResultsWarning, match=damaged), pytest.raises(KeyboardInterrupt):
         run(root, resume=True)
+    interrupted = list(recorded)
+    with pytest.warns(DamagedResultsWarning, match=damaged):
+        run(root, resume=True)
+    assert not set(recorded[2:]) & set(interrupted)
     after = json.loads(path.read_text())
     assert [after[key] for key in ("x", "objectives")] == [before["x"], before["objectives"]]
 
@@ -197,72 +182,44 @@ def test_a_damaged_front_is_polished_anew(finished: Path, tmp_path: Path) -> Non
 def test_a_recorded_attempt_of_nonsense_is_told() -> None:
     request = ReplicaRequest(SETTINGS, "nsga2", 0, np.zeros((1, 18)), (b"[]",))
     for block in (b"[]", b"{}", b"\xff", b'{"x": 1e999}', b"[" * 90):
+        recorded = replace(request, recorded=(block,))
         with pytest.raises(ResultsError, match=r"nsga2 replica 0: .*; delete journal.bin in its"):
-            polish_replica(Repeating(), replace(request, recorded=(block,)), lambda message: None)
+            polish_replica(object.__new__(Polisher), recorded, lambda message: None)
 
 
-class Repeating(Polisher):
-    """A polisher that only reads what was recorded."""
-
-    def __init__(self) -> None: ...
-
-    def polish(self, *arguments: object, **recorded: object) -> PolishedFront:
-        raise AssertionError
+def test_its_settings_decide_its_results() -> None:
+    """So that a study is not continued with others, see `test_folder.py`."""
+    assert polish_stage(PolishSettings(attempts=5)).settings != polish_stage(POLISHED).settings
 
 
-def test_other_settings_are_refused(finished: Path) -> None:
-    execution = ExecutionSettings(finished, jobs=1, resume=True)
-    other: Stage = polish_stage(PolishSettings(attempts=5))
-    with (
-        open_folder(SETTINGS, execution, load(RACK)) as folder,
-        pytest.raises(ResultsError, match="polish"),
-    ):
-        run_stages(folder, (search_stage(), other), SILENT)
+DAMAGE: list[tuple[dict[str, Callable[[Any], Any]], str]] = [
+    (
+        dict.fromkeys(("x", "objectives", "parent", "polished"), lambda values: []),
+        "at x: found 0 points",
+    ),
+    ({"x": lambda x: [point[:3] for point in x]}, "at x: found 3 numbers; allowed are 18"),
+    ({"x": lambda x: [x[0][:3], *x[1:]]}, "at x: no numbers of shape any x any"),
+    ({"x": lambda x: x[1:]}, ": its arrays have different lengths"),
+    ({"x": lambda x: [[None, *x[0][1:]], *x[1:]]}, "at x: holds numbers that are missing"),
+    ({"x": lambda x: [[1e308, *x[0][1:]], *x[1:]]}, "at x: is outside"),
+    (
+        {"objectives": lambda values: [["a", "b"], *values[1:]]},
+        "at objectives: no numbers of shape any x 2",
+    ),
+    ({"parent": lambda rows: [0.5, *rows[1:]]}, "at parent: holds numbers that are not whole"),
+]
 
 
-def spoilt(document: Any, fault: str) -> Any:
-    x = document["x"]
-    if fault == "no point":
-        document |= {key: [] for key in ("x", "objectives", "parent", "polished")}
-    elif fault == "too short":
-        document["x"] = [point[:3] for point in x]
-    elif fault == "ragged":
-        x[0] = x[0][:3]
-    elif fault == "fewer":
-        document["x"] = x[1:]
-    elif fault == "missing":
-        x[0][1] = None
-    elif fault == "huge":
-        x[0][1] = 1e308
-    elif fault == "objectives":
-        document["objectives"][0] = ["a", "b"]
-    elif fault == "whole":
-        document["parent"][0] = 0.5
-    else:
-        document = {"x": []}
-    return document
-
-
-@pytest.mark.parametrize(
-    ("fault", "told"),
-    [
-        ("no point", "at x: found 0 points"),
-        ("too short", "at x: found 3 numbers; allowed are 18"),
-        ("ragged", "at x: no numbers of shape any x any"),
-        ("fewer", ": its arrays have different lengths"),
-        ("missing", "at x: holds numbers that are missing"),
-        ("huge", "at x: is outside"),
-        ("objectives", "at objectives: no numbers of shape any x 2"),
-        ("whole", "at parent: holds numbers that are not whole"),
-        ("nothing", "at objectives: is missing"),
-    ],
-)
-def test_a_damaged_file_is_told(finished: Path, tmp_path: Path, fault: str, told: str) -> None:
+@pytest.mark.parametrize(("damage", "told"), DAMAGE)
+def test_a_damaged_file_is_told(
+    finished: Path, tmp_path: Path, damage: dict[str, Callable[[Any], Any]], told: str
+) -> None:
     (replica,) = read_campaign(finished).replicas
     assert read_polished(tmp_path, replica, load(RACK)) is None
     whole = json.loads((polished_folder(finished, "nsga2", 0) / POLISH).read_text())
+    spoilt = whole | {key: change(whole[key]) for key, change in damage.items()}
     path = polished_folder(tmp_path, "nsga2", 0) / POLISH
     path.parent.mkdir(parents=True)
-    path.write_text(json.dumps(spoilt(whole, fault)))
+    path.write_text(json.dumps(spoilt))
     with pytest.raises(ResultsError, match=rf"damaged ?{told}.*; --resume computes it anew"):
         read_polished(tmp_path, replica, load(RACK))

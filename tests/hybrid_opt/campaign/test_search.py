@@ -19,13 +19,21 @@ from typing import Any
 import numpy as np
 import pytest
 
+import hybrid_opt as ho
 from hybrid_opt.campaign import CampaignSettings, ExecutionSettings, open_folder
 from hybrid_opt.campaign.folder import replica_identity
-from hybrid_opt.campaign.journal import Journal, encode_generation
+from hybrid_opt.campaign.journal import Journal, ReplicaRequest, decode, encode_generation
 from hybrid_opt.campaign.results import read_campaign
+from hybrid_opt.campaign.search_stage import run_replica
+from hybrid_opt.campaign.settings import EVALUATIONS
+from hybrid_opt.campaign.stages import with_cell
 from hybrid_opt.errors import DamagedResultsWarning, ResultsError, WorkerError
+from hybrid_opt.evaluate.evaluation import CandidateEvaluator
+from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES
 from hybrid_opt.progress import Progress
+from hybrid_opt.work.service import LocalExecutor, Service, answer_all
 from symbolic.read.cell import load
+from symbolic.read.cell_files import collect_cell
 from tests.hybrid_opt.campaign.fake import (
     RACK,
     ROOT,
@@ -35,6 +43,7 @@ from tests.hybrid_opt.campaign.fake import (
     run_search,
     verdicts,
 )
+from tests.hybrid_opt.cells import drivable
 from tests.waiting import HANGS, until
 
 SETTINGS = CampaignSettings(evaluations=200, replicas=2)
@@ -278,3 +287,52 @@ def test_nothing_is_shown_when_not_wanted(capsys: pytest.CaptureFixture[str]) ->
         with Progress(shown).stage("search", 3, "evaluations", 1) as advance:
             advance(2)
         assert ("search: 3 of 3 evaluations" in capsys.readouterr().err) is shown
+
+
+# --- drivable searches of cells that ship, here and in a worker ---
+
+
+QUICK = ("fork", "rack")
+"""Cells that other tests compile as well; the rest takes minutes."""
+
+CELLS = [
+    pytest.param(name, marks=() if name in QUICK else pytest.mark.slow)
+    for name in sorted(path.stem for path in RACK.parent.glob("*.toml"))
+]
+CANDIDATES = 6
+
+
+@pytest.mark.parametrize("name", CELLS)
+def test_every_cell_that_ships_is_searched(name: str) -> None:
+    cell = drivable(name)
+    rng = np.random.default_rng(1)
+    front = ho.search(cell, "nsga2", evaluations=CANDIDATES, rng=rng)
+    found = front.evaluations
+    assert found is not None
+    assert len(found.x) == CANDIDATES
+    np.testing.assert_array_equal(found.x[0], cell.initial)
+    assert found.feasible[0]
+    duration, force = found.objectives[0]
+    assert 0.0 < duration < np.inf
+    limit = cell.initial[-1] / cell.workcell.task.reference_force.max()
+    assert 0.0 < force <= limit * (1.0 + 1e-3)
+
+
+def test_a_worker_elsewhere_searches_without_the_cells_files(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With the joint allocation paths are timed one by one, which reads the robots' files."""
+    cell = drivable("fork")
+    evaluator = partial(CandidateEvaluator, objectives=DRIVABLE_OBJECTIVES)
+    source = partial(with_cell, evaluator, collect_cell(cell.workcell))
+    settings = CampaignSettings({"random": {}}, CANDIDATES, 1, objectives=DRIVABLE_OBJECTIVES)
+    request = ReplicaRequest(settings, "random", 0, cell.initial[None])
+    monkeypatch.chdir(tmp_path)
+    ((files, _),) = answer_all(
+        LocalExecutor(1, apart=True), Service(source, run_replica), [request]
+    )
+    found = decode(files[EVALUATIONS], tmp_path).evaluations
+    assert len(found.x) == CANDIDATES
+    expected = cell.evaluate(found.x)
+    np.testing.assert_array_equal(found.objectives, expected.objectives)
+    assert np.isfinite(found.objectives).all()

@@ -10,7 +10,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hybrid_opt.campaign.results import Replica
-from hybrid_opt.cell import Cell
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.front import balanced, knee, peak_normal_forces, select, selected_row
 from hybrid_opt.static_hold import payload_limit, static_hold
@@ -20,7 +19,7 @@ from symbolic.read.cell import load
 from symbolic.records import Workcell
 from symbolic.records.task import initial_decision
 from tests.hybrid_opt.campaign.fake import RACK
-from tests.hybrid_opt.cells import shipped
+from tests.hybrid_opt.cells import drivable, shipped
 
 
 @pytest.fixture(scope="module")
@@ -71,7 +70,7 @@ def test_peaks_do_not_depend_on_how_many_are_asked_for(evaluator: CandidateEvalu
 
 
 def test_the_knee_stands_for_drivable_carries() -> None:
-    cell = Cell.load(RACK).drivable()
+    cell = drivable("rack")
     path = initial_decision(cell.workcell.task)[: cell.workcell.task.n_path]
     x = np.array([np.append(path, force) for force in (49.2, 50.0, 52.0, 55.0, 70.0)])
     row = selected_row(cell.evaluator, x)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import fields, replace
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -27,7 +28,7 @@ from hybrid_opt.metaheuristics.run import WORST_PENALTY, CarryProblem, SearchSet
 from studies.research import analytic
 from symbolic.array import Array
 from symbolic.errors import SettingsError
-from tests.hybrid_opt.campaign.fake import OBJECTIVES, verdicts
+from tests.hybrid_opt.campaign.fake import FakeEvaluator, FakeSource, verdicts
 
 NAMES = names()
 
@@ -166,13 +167,16 @@ def test_budget_is_spent_when_only_duplicates_are_left(name: str) -> None:
     assert sum(problem.calls) == 130
 
 
+@cache
+def median_volume(algorithm: str) -> float:
+    """Hypervolume of a short search's front."""
+    fronts = [run(algorithm, TNK(), 600, seed).front.objectives for seed in range(5)]
+    return float(np.median([metrics.hypervolume(front, (1.2, 1.2)) for front in fronts]))
+
+
 @pytest.mark.parametrize("name", [name for name in NAMES if name != "random"])
 def test_search_beats_random(name: str) -> None:
-    def median(algorithm: str) -> float:
-        fronts = [run(algorithm, TNK(), 600, seed).front.objectives for seed in range(5)]
-        return float(np.median([metrics.hypervolume(f, (1.2, 1.2)) for f in fronts]))
-
-    assert median(name) > median("random")
+    assert median_volume(name) > median_volume("random")
 
 
 def test_violation_sums_what_is_exceeded() -> None:
@@ -203,12 +207,6 @@ def test_violation_sums_what_is_exceeded() -> None:
 def test_wrong_settings_are_told(name: str, settings: Any, message: str) -> None:
     with pytest.raises(SettingsError, match=message):
         make(name, settings)
-
-
-def test_settings_override_defaults() -> None:
-    settings = settings_of("mopso", {"swarm": 7})
-    assert settings.swarm == 7  # type: ignore[union-attr]
-    assert settings.inertia == 0.4  # type: ignore[union-attr]
 
 
 def test_an_algorithm_runs_once() -> None:
@@ -246,27 +244,20 @@ BROKEN = (np.nan, np.inf, -np.inf)
 RNG = np.random.default_rng(4)
 
 
-class Stub:
+class Stub(FakeEvaluator):
     """An evaluator whose verdicts may be spoilt."""
 
-    objective_names: tuple[str, ...] = OBJECTIVES
-    n_var = 4
-    lower = np.zeros(4)
-    upper = np.ones(4)
-
     def __init__(self, figure: str = "", value: float = 0.0) -> None:
+        super().__init__(FakeSource())
         self._figure, self._value = figure, value
 
     def evaluate(self, x: Array) -> Evaluations:
-        found = verdicts(x)
+        found = super().evaluate(x)
         if not self._figure:
             return found
         spoilt = getattr(found, self._figure).copy()
         spoilt[::3, -1] = self._value
         return replace(found, **{self._figure: spoilt})
-
-    def certified(self, evaluations: Evaluations) -> Evaluations:
-        return evaluations
 
 
 def evaluate(problem: CarryProblem, x: Array) -> dict[str, Any]:

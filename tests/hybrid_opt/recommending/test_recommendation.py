@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from scipy.optimize import brentq
 import hybrid_opt as ho
 from hybrid_opt.evaluate.objectives import ROBUST_OBJECTIVES
 from hybrid_opt.job.plan import JobModel
+from hybrid_opt.recommending.advice import changes_of_cell
 from hybrid_opt.recommending.choice import DrivenPaths
 from hybrid_opt.recommending.recommendation import (
     HAND_MADE,
@@ -28,9 +30,25 @@ from hybrid_opt.timing.solve import time_path
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.path.pieces import same_paths
+from symbolic.read.cell import changed
 from symbolic.records import USUAL, Contact, Uncertainty
 from symbolic.records.cell import RANGES
+from tests.hybrid_opt import cells
+from tests.hybrid_opt.robust.test_force import SMALL as SET
+from tests.hybrid_opt.robust.test_force import model, motion
 from tests.symbolic.read.samples import RACK
+
+
+@pytest.fixture(scope="module")
+def drivable() -> ho.Cell:
+    """The rack under the time law 'optimal'."""
+    return cells.drivable("rack")
+
+
+@pytest.fixture(scope="module")
+def front(drivable: ho.Cell) -> ho.Front:
+    """What a short search finds there."""
+    return ho.search(drivable, "nsga2", evaluations=160, rng=np.random.default_rng(3))
 
 
 def timed(cell: ho.Cell, path: Array, force: float) -> ho.Timing:
@@ -126,15 +144,15 @@ def test_wishes_are_kept_and_little_is_given_away(
     drivable: ho.Cell, front: ho.Front, found: Recommendation
 ) -> None:
     force = 0.95 * found.force
-    gentle = ho.recommend(front, ho.Wish(force=force))
+    gentle = ho.recommend(front, ho.Wish(force=force), alone=True)
     assert 0.97 * force < gentle.force <= force * 1.002
     assert gentle.duration > found.duration
     asked = 1.2 * found.duration
-    slow = ho.recommend(front, ho.Wish(duration=asked))
+    slow = ho.recommend(front, ho.Wish(duration=asked), alone=True)
     assert slow.wish.duration == asked
     assert 0.97 * asked < slow.duration <= asked * 1.002
     assert slow.force < found.force
-    heavy = ho.recommend(front, ho.Wish(payload=10.4))
+    heavy = ho.recommend(front, ho.Wish(payload=10.4), alone=True)
     box = drivable.workcell.payload
     heavier = replace(box, mass=10.4, inertia=1.04 * box.inertia)
     model = pressing_model(replace(drivable.workcell, payload=heavier))
@@ -147,7 +165,7 @@ def test_the_hand_made_carry_stands_beside_it(drivable: ho.Cell, found: Recommen
     (rival,) = found.rivals
     assert rival.label == HAND_MADE
     path = drivable.initial[:-1]
-    limits = np.linspace(found.limit - 2.0, found.limit + 2.0, 17)
+    limits = np.linspace(found.limit - 2.0, found.limit + 2.0, 9)
     timings = [timed(drivable, path, limit) for limit in limits]
     forces = [held(drivable, timing.carry).max() for timing in timings]
     durations = [timing.duration for timing in timings]
@@ -158,8 +176,7 @@ def test_the_hand_made_carry_stands_beside_it(drivable: ho.Cell, found: Recommen
 
 
 def test_a_better_path_is_warned_of(drivable: ho.Cell, front: ho.Front) -> None:
-    limit = 57.0
-    durations = [timed(drivable, x[:-1], limit).duration for x in front.x]
+    durations = DrivenPaths.of(drivable, front.x[:, :-1]).durations(57.0)
     quick, slow = front.x[int(np.argmin(durations))], front.x[int(np.argmax(durations))]
     assert min(durations) < 0.98 * max(durations)
     alone = ho.recommend(ho.Front.of(drivable, slow[None]), None, {"other": quick[:-1]})
@@ -227,7 +244,7 @@ def test_where_nothing_holds_it_is_the_gentlest_and_says_so(
 ) -> None:
     """The rack's robots are too weak for the usual set."""
     unsure = ho.Cell(replace(drivable.workcell, uncertainty=USUAL), drivable.objective_names)
-    gentle = ho.recommend(ho.Front.of(unsure, front.x[:2]))
+    gentle = ho.recommend(ho.Front.of(unsure, front.x[:2]), alone=True)
     assert "no carry of the front holds in every case" in gentle.warnings[0]
     assert gentle.force > 117.0
     assert "reference forces of 117.7 N: this is among the gentlest" in gentle.warnings[0]
@@ -263,7 +280,7 @@ def test_wishes_that_nothing_answers_say_what_is_possible(
     with pytest.raises(SettingsError, match="empty"):
         ho.recommend(replace(front, x=np.zeros((0, 19))))
     with pytest.raises(SettingsError, match="drivable"):
-        ho.recommend(replace(front, cell=ho.Cell.load(RACK)))
+        ho.recommend(replace(front, cell=cells.shipped("rack")))
 
 
 @pytest.mark.parametrize(
@@ -294,7 +311,7 @@ def test_options_are_those_of_the_independent_timing(drivable: ho.Cell, front: h
 
 
 def test_a_drivable_cell_is_the_same_cell(drivable: ho.Cell) -> None:
-    cell = ho.Cell.load(RACK)
+    cell = cells.shipped("rack")
     assert drivable.objective_names == ("duration", "peak_force")
     own, task = drivable.workcell.task, cell.workcell.task
     (path,) = same_paths(drivable.initial[:-1], own, task)
@@ -302,3 +319,47 @@ def test_a_drivable_cell_is_the_same_cell(drivable: ho.Cell) -> None:
     assert drivable.workcell.source.is_file()
     assert not drivable.force_kind.robust
     assert ho.Cell.load(RACK, ROBUST_OBJECTIVES).drivable().force_kind.robust
+
+
+PLACES: dict[str, dict[str, list[float]]] = {
+    "drum": {
+        "contacts[0].xyz": [-0.0439992377, 0.1642073905, 0.07],
+        "contacts[1].xyz": [-0.0439992377, -0.1642073905, 0.07],
+    },
+    "fork": {
+        "contacts[0].xyz": [-0.08, 0.20, 0.055],
+        "contacts[0].further[0].xyz": [0.08, 0.20, 0.055],
+        "contacts[1].xyz": [0.0, -0.20, 0.055],
+    },
+}
+WIDER: dict[str, dict[str, list[float]]] = {
+    "drum": {"contacts.patch_size": [0.062, 0.032]},
+    "fork": {"contacts[0].patch_size": [0.032, 0.032], "contacts[1].patch_size": [0.052, 0.052]},
+}
+
+
+@pytest.mark.parametrize("name", PLACES)
+def test_changes_of_pads_anywhere_are_those_of_the_file(name: str) -> None:
+    workcell, moved = model(f"{name}, even").workcell, motion(name)
+    told = dict(changes_of_cell(workcell, moved))
+
+    def force(changes: dict[str, Any]) -> float:
+        """Largest that holds every case with other numbers in the file [N]."""
+        cell = changed(workcell, changes | {"task.allocation": "soft-finger"})
+        return float(RobustModel(replace(cell, uncertainty=SET)).hold(moved, SET)[0].max())
+
+    def lower(by: float) -> dict[str, list[float]]:
+        return {path: [x, y, z - by] for path, (x, y, z) in PLACES[name].items()}
+
+    now = force({})
+    files: dict[str, dict[str, Any]] = {
+        "friction 0.05 higher": {"contacts.friction": 0.85},
+        "patches 1 mm wider to each side": dict(WIDER[name]),
+        "pads 1 mm lower": dict(lower(1e-3)),
+    }
+    for change, numbers in files.items():
+        assert told[change] == pytest.approx(force(numbers) - now, rel=1e-3)
+    height = 1e3 * (PLACES[name]["contacts[0].xyz"][2] - workcell.payload.centre_of_mass[2])
+    level = f"pads at the height of the centre of mass, now {height:.0f} mm above it"
+    assert told[level] == pytest.approx(force(lower(height / 1e3)) - now, rel=1e-3)
+    assert all(change < 0.0 for change in told.values())

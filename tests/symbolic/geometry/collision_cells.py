@@ -21,7 +21,7 @@ from symbolic.read.cell import load
 from symbolic.records import Body, Box, Cylinder, Mesh, Robot, Sphere, Workcell
 from symbolic.records.poses import pose_matrix
 from symbolic.robot.model import RobotModel, build_robot_model
-from tests.robots import ur10_urdf
+from tests.machines import ur10_urdf
 
 RACK = Path(__file__).parent / "data" / "plain_rack.toml"
 

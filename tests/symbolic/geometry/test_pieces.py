@@ -35,7 +35,7 @@ from symbolic.geometry.pieces import (
 from symbolic.read.meshes import MOST_FACES
 from symbolic.records import Box, Capsule, Cylinder, Sphere
 from symbolic.records.poses import pose_matrix
-from tests.robots import ur10_urdf
+from tests.machines import ur10_urdf
 from tests.symbolic.geometry.collision_cells import geometry_of
 from tests.waiting import soon
 

@@ -30,7 +30,7 @@ from symbolic.read.descriptions import resolve_mesh
 from symbolic.read.meshes import read_mesh
 from symbolic.read.urdf import FULL_TURNS, Urdf, UrdfMesh, parse_urdf, read_urdf
 from symbolic.records import Robot, ToolLoad
-from tests.robots import GOFA_URDF, robot_record
+from tests.machines import robot_record
 from tests.symbolic.read.samples import GOFA, sample_data, write
 
 ROUNDED = 2e-5
@@ -394,7 +394,7 @@ def test_arms_of_one_machine_agree(tmp_path: Path) -> None:
 
 
 def test_the_tool_weighs_on_the_joints() -> None:
-    bare = robot_record(GOFA_URDF)
+    bare = robot_record(GOFA)
     load = ToolLoad(2.0, np.array([0.0, 0.01, 0.05]), np.diag([0.01, 0.02, 0.03]))
     q, v, a = np.random.default_rng(0).uniform(-1.0, 1.0, (3, 6))
     with_tool = arm_model(replace(bare, tool_load=load))

@@ -20,8 +20,9 @@ from symbolic.read.descriptions import find_package, further_package_dirs, resol
 from symbolic.read.robots import named_robot
 from symbolic.read.urdf import MOST_LINKS, DisabledPair, UrdfMesh, parse_urdf, read_srdf, read_urdf
 from symbolic.records import Box, Cylinder
-from tests.robots import GOFA_URDF, robot_record, ur10_urdf
+from tests.machines import robot_record, ur10_urdf
 from tests.symbolic.cells import RACK
+from tests.symbolic.read.samples import GOFA
 from tests.waiting import soon
 
 
@@ -120,7 +121,7 @@ CASES: list[tuple[Callable[[str], str], str, str]] = [
 ]
 
 
-GOFA = GOFA_URDF.read_text("utf-8")
+TEXT = GOFA.read_text("utf-8")
 EVERY = sorted(ur10_urdf().parents[2].rglob("*.urdf"))
 # A humanoid with inertias below zero, and a file that includes others.
 REFUSED = {"romeo_laas_small.urdf": "allowed are none below zero", "ur3.urdf": "has no links"}
@@ -148,9 +149,9 @@ def test_published_robots_are_read_as_pinocchio_reads_them(path: Path) -> None:
 
 
 def test_shapes_of_the_gofa_are_those_of_pinocchio() -> None:
-    model = pin.buildModelFromUrdf(str(GOFA_URDF))
-    geometry = pin.buildGeomFromUrdf(model, str(GOFA_URDF), pin.GeometryType.COLLISION)
-    urdf = read_urdf(GOFA_URDF)
+    model = pin.buildModelFromUrdf(str(GOFA))
+    geometry = pin.buildGeomFromUrdf(model, str(GOFA), pin.GeometryType.COLLISION)
+    urdf = read_urdf(GOFA)
     seen = 0
     for link, collisions in urdf.collisions.items():
         T_joint_link = model.frames[link_frame(model, link)].placement.homogeneous
@@ -183,7 +184,7 @@ def test_meshes_keep_their_address_and_scale() -> None:
 
 def test_a_joint_may_be_named_as_a_link(tmp_path: Path) -> None:
     path = tmp_path / "arm.urdf"
-    path.write_text(GOFA.replace('joint name="joint_6"', 'joint name="link_6"'))
+    path.write_text(TEXT.replace('joint name="joint_6"', 'joint name="link_6"'))
     model = arm_model(robot_record(path))
     assert model.frames[link_frame(model, "link_6")].type == pin.FrameType.BODY
 
@@ -194,8 +195,8 @@ def test_a_joint_may_be_named_as_a_link(tmp_path: Path) -> None:
     ids=[f"{index}-{words or place}" for index, (_, place, words) in enumerate(CASES)],
 )
 def test_what_is_wrong_is_named(change: Callable[[str], str], place: str, words: str) -> None:
-    changed = change(GOFA)
-    assert changed != GOFA
+    changed = change(TEXT)
+    assert changed != TEXT
     with pytest.raises(UrdfError) as caught:
         parse_urdf(changed.encode(), "arm.urdf")
     assert any(p.startswith(place) and words in p for p in caught.value.problems), caught.value
@@ -203,8 +204,8 @@ def test_what_is_wrong_is_named(change: Callable[[str], str], place: str, words:
 
 
 def test_an_origin_in_millimetres_is_told() -> None:
-    start = GOFA.index('<joint name="joint_3"')
-    changed = GOFA[:start] + GOFA[start:].replace("0 0 0.707", "0 0 707", 1)
+    start = TEXT.index('<joint name="joint_3"')
+    changed = TEXT[:start] + TEXT[start:].replace("0 0 0.707", "0 0 707", 1)
     with pytest.raises(UrdfError, match=r"joint 'joint_3'/origin xyz\[2\].*707 mm are 0.707 m"):
         parse_urdf(changed.encode(), "arm.urdf")
 
@@ -231,10 +232,10 @@ def test_a_long_chain_is_refused_and_does_not_crash(tmp_path: Path) -> None:
 
 def test_nothing_is_said_on_the_terminal(capfd: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     path = tmp_path / "arm.urdf"
-    path.write_text(GOFA.replace("</robot>", LOOP))
+    path.write_text(TEXT.replace("</robot>", LOOP))
     with pytest.raises(UrdfError):
         reduced_model(read_urdf(path))
-    reduced_model(read_urdf(GOFA_URDF))
+    reduced_model(read_urdf(GOFA))
     assert capfd.readouterr() == ("", "")
 
 

@@ -34,8 +34,9 @@ from symbolic.robot.arm import (
     track_function,
 )
 from symbolic.robot.model import RobotModel, build_robot_model
-from tests.robots import GOFA_URDF, robot_record, ur10_urdf
+from tests.machines import robot_record, ur10_urdf
 from tests.symbolic.cells import call, gofa_model, hand_cell, start_posture
+from tests.symbolic.read.samples import GOFA
 
 CELL = hand_cell()
 ARMS = tuple(PlainArm(r, c) for r, c in zip(CELL.robots, CELL.contacts, strict=True))
@@ -170,7 +171,7 @@ rates = st.lists(st.floats(-3, 3), min_size=6, max_size=6).map(np.array)
 
 @pytest.fixture(scope="module", params=["gofa12", "ur10"])
 def urdf(request: pytest.FixtureRequest) -> Path:
-    return GOFA_URDF if request.param == "gofa12" else ur10_urdf()
+    return GOFA if request.param == "gofa12" else ur10_urdf()
 
 
 @pytest.fixture(scope="module")
@@ -184,8 +185,8 @@ def test_torque_on_a_tilted_base(q: Array, v: Array, a: Array, roll: float, pitc
     T_world_base = np.eye(4)
     T_world_base[:3, :3] = pin.rpy.rpyToMatrix(roll, pitch, 0.3)
     T_world_base[:3, 3] = 1.0, -2.0, 0.5
-    arm = build_robot_model(robot_record(GOFA_URDF, T_world_base))
-    upright = build_robot_model(robot_record(GOFA_URDF)).model
+    arm = build_robot_model(robot_record(GOFA, T_world_base))
+    upright = build_robot_model(robot_record(GOFA)).model
     tilted = upright.copy()
     tilted.jointPlacements[1] = pin.SE3(T_world_base) * upright.jointPlacements[1]
     expected = pin.rnea(tilted, tilted.createData(), q, v, a)
@@ -194,13 +195,13 @@ def test_torque_on_a_tilted_base(q: Array, v: Array, a: Array, roll: float, pitc
 
 
 def test_locked_joints_leave_other_than_six() -> None:
-    robot = replace(robot_record(GOFA_URDF), locked_joints=(("joint_6", 0.0),))
+    robot = replace(robot_record(GOFA), locked_joints=(("joint_6", 0.0),))
     with pytest.raises(RobotModelError, match="gofa12"):
         build_robot_model(robot)
 
 
 def test_unknown_flange() -> None:
-    robot = replace(robot_record(GOFA_URDF), flange="tool1")
+    robot = replace(robot_record(GOFA), flange="tool1")
     with pytest.raises(RobotModelError, match=r"'tool1'.*'tool0'"):
         build_robot_model(robot)
 
@@ -221,7 +222,7 @@ def _random_humanoid() -> pin.Model:
 
 
 MODELS: dict[str, Callable[[], pin.Model]] = {
-    "gofa12": lambda: reduced_model(read_urdf(GOFA_URDF)),
+    "gofa12": lambda: reduced_model(read_urdf(GOFA)),
     "ur10": lambda: reduced_model(read_urdf(ur10_urdf())),
     "manipulator": pin.buildSampleModelManipulator,
     "humanoid": _random_humanoid,

@@ -23,16 +23,16 @@ from symbolic.read.urdf import read_urdf
 from symbolic.records import Robot
 from symbolic.robot.branches import inverse_kinematics, start_branches
 from symbolic.robot.model import RobotModel, build_robot_model
-from tests.robots import GOFA_URDF, robot_record, ur10_urdf
+from tests.machines import robot_record, ur10_urdf
 from tests.symbolic.cells import fixed, rack_cell, with_task
 from tests.symbolic.read.samples import GOFA
 
 
 @pytest.fixture(scope="module")
 def gofa() -> tuple[Robot, RobotModel]:
-    model = build_robot_model(robot_record(GOFA_URDF))
+    model = build_robot_model(robot_record(GOFA))
     robot = replace(
-        robot_record(GOFA_URDF),
+        robot_record(GOFA),
         position_lower=np.array(model.model.lowerPositionLimit),
         position_upper=np.array(model.model.upperPositionLimit),
     )
