@@ -30,7 +30,7 @@ from symbolic.array import Array
 from symbolic.geometry.bodies import WORLD, MeshReader, collision_bodies, shape_pieces
 from symbolic.geometry.pairs import coal_distance
 from symbolic.geometry.pieces import Piece
-from symbolic.read.checks import stretched_length
+from symbolic.read.cell import stretched_length
 from symbolic.read.editing import merged
 from symbolic.records import Cylinder, Workcell
 from symbolic.records.poses import box_placement, inverse, pose_matrix, transform

@@ -36,7 +36,7 @@ from numpy.typing import NDArray
 from symbolic.array import Array
 from symbolic.contact.force_closure import least_reaches
 from symbolic.errors import SettingsError
-from symbolic.read.checks import PATCH_OVERLAP, pads_beside
+from symbolic.read.cell import PATCH_OVERLAP
 from symbolic.records import Uncertainty, Workcell
 
 
@@ -140,9 +140,9 @@ def check_pads(workcell: Workcell) -> None:
     if not workcell.has_facing_pads:
         return  # a grasp that is not closed is refused where its squeeze is looked for
     room = PATCH_OVERLAP * sum(contact.patch_radius for contact in workcell.contacts)
-    if pads_beside(workcell) >= room:
+    if workcell.pads_beside >= room:
         raise SettingsError(
-            f"the contacts lie {pads_beside(workcell):g} m beside one another; robust forces "
+            f"the contacts lie {workcell.pads_beside:g} m beside one another; robust forces "
             f"need less than {room:g} m, so that pressing harder holds whatever happens"
         )
 

@@ -38,7 +38,7 @@ from symbolic.contact.worst_cases import (
     least_distance,
 )
 from symbolic.errors import SettingsError
-from symbolic.read.checks import PATCH_OVERLAP, pads_beside
+from symbolic.read.cell import PATCH_OVERLAP
 from symbolic.records import Uncertainty, Workcell
 from symbolic.records.content import CacheKey
 
@@ -458,7 +458,7 @@ def _leaves_something(workcell: Workcell, uncertainty: Uncertainty) -> bool:
         left += [*patches]
         if workcell.has_facing_pads:
             radii = np.array([contact.patch_radius for contact in workcell.contacts])
-            left.append(PATCH_OVERLAP * float(patches @ radii) - pads_beside(workcell))
+            left.append(PATCH_OVERLAP * float(patches @ radii) - workcell.pads_beside)
     return bool(min(left) > 0.0)
 
 

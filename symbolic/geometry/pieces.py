@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from symbolic.array import Array
 from symbolic.errors import CollisionModelError
 from symbolic.records import Box, Capsule, Cylinder, Sphere
+from symbolic.records.poses import axes_with_z, transform
 from symbolic.records.quantities import SMALLEST_SIZE
 
 
@@ -190,10 +191,7 @@ def bounding_box(pieces: tuple[Piece, ...], rotation: Array) -> Piece:
     axes = np.asarray(rotation).T
     upper = np.max([support(piece, axes) for piece in pieces], axis=0)
     lower = -np.max([support(piece, -axes) for piece in pieces], axis=0)
-    pose = np.eye(4)
-    pose[:3, :3] = rotation
-    pose[:3, 3] = rotation @ ((upper + lower) / 2.0)
-    return Piece(Box(upper - lower), pose)
+    return Piece(Box(upper - lower), transform(rotation, rotation @ ((upper + lower) / 2.0)))
 
 
 def edges(pieces: tuple[Piece, ...]) -> Array:
@@ -283,9 +281,7 @@ def sphere_chain(pieces: tuple[Piece, ...], rotation: Array, slenderness: float)
 
 def ball(centre: Array, radius: float) -> Piece:
     """A sphere piece."""
-    pose = np.eye(4)
-    pose[:3, 3] = centre
-    return Piece(Sphere(radius), pose)
+    return Piece(Sphere(radius), transform(np.eye(3), centre))
 
 
 def swept_cylinder(pieces: tuple[Piece, ...], point: Array, axis: Array) -> Piece:
@@ -297,15 +293,5 @@ def swept_cylinder(pieces: tuple[Piece, ...], point: Array, axis: Array) -> Piec
     upper = max(float(support(piece, axis)[0]) for piece in pieces)
     lower = -max(float(support(piece, -np.asarray(axis))[0]) for piece in pieces)
     base = float(np.asarray(axis) @ point)
-    pose = np.eye(4)
-    pose[:3, :3] = axes_with_z(axis)
-    pose[:3, 3] = point + ((upper + lower) / 2.0 - base) * np.asarray(axis)
-    return Piece(Cylinder(radius, upper - lower), pose)
-
-
-def axes_with_z(axis: Array) -> Array:
-    """A rotation (3, 3) whose third column is the unit axis."""
-    helper = np.eye(3)[int(np.argmin(np.abs(axis)))]
-    x = np.cross(helper, axis)
-    x /= np.linalg.norm(x)
-    return np.column_stack([x, np.cross(axis, x), axis])
+    middle = point + ((upper + lower) / 2.0 - base) * np.asarray(axis)
+    return Piece(Cylinder(radius, upper - lower), transform(axes_with_z(axis), middle))

@@ -1,9 +1,8 @@
 """What bounds of distances and motions are made of, as numbers: covers, obstacles, reach.
 
-NumPy finds it once per cell. `symbolic.geometry.clearance` and `symbolic.geometry.clearance`
-write expressions of it, whether it holds arrays or symbols in their place
-(`symbolic.numbers.CellNumbers`). Which bound a pair gets depends on numbers, too: that is kept as
-flags.
+NumPy finds it once per cell. `symbolic.geometry.clearance` writes expressions of it, whether it
+holds arrays or symbols in their place (`symbolic.numbers.CellNumbers`). Which bound a pair gets
+depends on numbers, too: that is kept as flags.
 """
 
 from __future__ import annotations
@@ -26,7 +25,6 @@ from symbolic.geometry.pairs import CellGeometry, chain_radius
 from symbolic.geometry.pieces import (
     Hull,
     Piece,
-    axes_with_z,
     bounding_box,
     edges,
     farthest_from_axis,
@@ -36,6 +34,7 @@ from symbolic.geometry.pieces import (
 from symbolic.records import Box, Capsule, Cylinder, Sphere
 from symbolic.records.content import CacheKey, ContentRecord
 from symbolic.records.numbered import Group
+from symbolic.records.poses import axes_with_z
 
 LONG = 0.25
 """Bodies longer than wide by more than this [m] are also compared along their own axes: across

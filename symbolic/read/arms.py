@@ -6,6 +6,8 @@ joint is held.
 Two robots of a workcell that name one description at one place are the two arms of one machine.
 Every link is then modelled once: behind an arm's first moving joint it belongs to that arm, what
 a joint of both moves (a lift, a torso) to the first, and what neither moves stands still for both.
+
+A description that holds no such arm is a `RobotModelError`.
 """
 
 from __future__ import annotations
@@ -151,12 +153,7 @@ FOLLOWING = 6
 
 
 def robot_urdf(robot: Robot) -> Urdf:
-    """The description of a robot of a workcell, without the links that it drops.
-
-    Raises:
-        RobotModelError: see `symbolic.read.urdf.read_urdf` and
-            `without_links`.
-    """
+    """The description of a robot of a workcell, without the links that it drops."""
     urdf = read_urdf(robot.urdf, robot.xacro_arguments, robot.package_dirs)
     return without_links(urdf, robot.drop_links) if robot.drop_links else urdf
 
@@ -205,9 +202,6 @@ def moving_joints(urdf: Urdf, chain_root: str, flange: str, locked: Positions) -
         chain_root: link that the chain begins at; '' for all joints that are not locked.
         flange: link that the chain ends at.
         locked: joints that the user holds, with their positions.
-
-    Raises:
-        RobotModelError: see `chain_joints`.
     """
     if chain_root:
         found = chain_joints(urdf, chain_root, flange)
@@ -330,11 +324,7 @@ def one_machine(robots: Arms) -> bool:
 
 
 def arm_links(robots: Arms, i: int) -> ArmLinks:
-    """The links that are modelled as arm i's (0 or 1).
-
-    Raises:
-        RobotModelError: see `arm_model`.
-    """
+    """The links that are modelled as arm i's (0 or 1)."""
     carried = _carriers(robots[i])
     still = [link for link in carried if carried[link] == UNMOVED]
     moved = [link for link in carried if carried[link] != UNMOVED]
@@ -354,11 +344,7 @@ UNMOVED = "universe"
 
 
 def common_joints(robots: Arms) -> tuple[str, ...]:
-    """Joints that move both arms of one machine, in their order.
-
-    Raises:
-        RobotModelError: see `arm_model`.
-    """
+    """Joints that move both arms of one machine, in their order."""
     if not one_machine(robots):
         return ()
     first, second = (tuple(arm_model(robot).names)[1:] for robot in robots)
@@ -366,11 +352,7 @@ def common_joints(robots: Arms) -> tuple[str, ...]:
 
 
 def machine_problem(robots: Arms) -> str:
-    """Why two robots cannot be the arms of one machine, or an empty string.
-
-    Raises:
-        RobotModelError: see `arm_model`.
-    """
+    """Why two robots cannot be the arms of one machine, or an empty string."""
     if not one_machine(robots):
         return ""
     chains, held = [], []
@@ -416,7 +398,7 @@ def _carriers(robot: Robot) -> dict[str, str]:
     """The last joint of the arm that moves each link with shapes; 'universe' of one that stands
     still."""
     model = arm_model(robot)
-    links = robot_urdf(robot).collision_links
+    links = robot_urdf(robot).collisions
     return {link: model.names[model.frames[link_frame(model, link)].parentJoint] for link in links}
 
 
@@ -443,9 +425,7 @@ def body_names(workcell: Workcell) -> dict[str, tuple[str, ...]]:
     }
     for i, robot in enumerate(workcell.robots):
         owned = arm_links(workcell.robots, i)
-        links = tuple(
-            x for x in robot_urdf(robot).collision_links if x in owned.moved + owned.still
-        )
+        links = tuple(x for x in robot_urdf(robot).collisions if x in owned.moved + owned.still)
         tools = tuple(body.name for body in robot.tool)
         names[robot.name] = tuple(f"{robot.name}/{name}" for name in (*links, *tools))
     return names

@@ -16,7 +16,7 @@ import posixpath
 import re
 import zlib
 from collections.abc import Iterator, Mapping
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from itertools import count
@@ -25,13 +25,7 @@ from tempfile import TemporaryDirectory
 from typing import Any, Literal
 
 from symbolic import outside
-from symbolic.errors import (
-    BundleError,
-    DualArmError,
-    OutsideError,
-    RobotModelError,
-    SettingsError,
-)
+from symbolic.errors import BundleError, DualArmError, OutsideError
 from symbolic.read.cell import load, with_branches
 from symbolic.read.descriptions import (
     PACKAGE_SCHEME,
@@ -86,10 +80,8 @@ def collect_cell(workcell: Workcell) -> CellFiles:
 def _collected(
     source: Path, digest: str, branches: tuple[int, int], text: bytes | None
 ) -> CellFiles:
-    try:
+    with _told("the workcell cannot be stored:"):
         current = load(source, decided=branches, text=text)
-    except DualArmError as error:
-        raise BundleError(f"the workcell cannot be stored: {error}") from error
     if current.digest != digest:
         raise BundleError(
             f"{source.name} does not describe the workcell in memory (it was changed after "
@@ -124,10 +116,8 @@ def unpack_cell(stored: CellFiles, folder: Path, check_digest: bool = True) -> W
     except OSError as error:
         raise BundleError(f"stored {shown(name)} cannot be unpacked ({error.strerror})") from error
     _check_references(stored, root)
-    try:
+    with _told("the stored workcell is not valid:"):
         workcell = load(root / stored.workcell, stored=True)
-    except DualArmError as error:
-        raise BundleError(f"the stored workcell is not valid: {error}") from error
     if check_digest and workcell.digest != stored.digest:
         raise BundleError("the stored workcell's digest does not match its files")
     return workcell
@@ -237,7 +227,7 @@ def _check_references(stored: CellFiles, root: Path) -> None:
         if package_dirs is None:
             continue
         folders = [joined(base, entry) for entry in package_dirs]
-        try:
+        with _told(f"the stored {shown(target)} is not valid:"):
             if is_xacro(stored.files[target]):
                 raise OutsideError(
                     "holds xacro macros, which are never expanded from a stored cell"
@@ -245,8 +235,6 @@ def _check_references(stored: CellFiles, root: Path) -> None:
             if is_mjcf(stored.files[target]):
                 raise OutsideError("is MJCF, which a stored cell holds as URDF")
             named = read_urdf(root / target)
-        except (OutsideError, RobotModelError) as error:
-            raise BundleError(f"the stored {shown(target)} is not valid: {error}") from error
         for address in (*named.collision_meshes, *named.visual_meshes):
             relative = address.removeprefix("package://").removeprefix("file://")
             bases = folders if address.startswith("package://") else [posixpath.dirname(target)]
@@ -298,10 +286,8 @@ class CellCollector:
                 content = _content(self._source.parent / reference, outside.MESH_BYTES)
                 self._files[self._place(reference)] = content
         changes = merged({"robots": described}, with_paths(data, self._address))
-        try:
+        with _told(f"{self._source.name}:"):
             self._text = completed(outside.text(self._text), stated, changes).encode()
-        except SettingsError as error:
-            raise BundleError(f"{self._source.name}: {error}") from error
 
     def layout(self) -> tuple[str, dict[str, bytes], tuple[str, ...]]:
         """Everything collected, moved so that no path leads upwards.
@@ -340,11 +326,9 @@ class CellCollector:
     def _with_meshes(self, robot: Robot, place: str, packages: list[tuple[Path, str]]) -> bytes:
         """Add the meshes of a URDF; its content with this machine's addresses replaced."""
         path = robot.urdf
-        try:
+        with _told():
             content = description_content(path, robot.xacro_arguments, robot.package_dirs)
             named = parse_urdf(content, path.name)
-        except (OutsideError, RobotModelError) as error:
-            raise BundleError(str(error)) from error
         for address in dict.fromkeys((*named.collision_meshes, *named.visual_meshes)):
             mesh = resolve_mesh(address, path, robot.package_dirs)
             if mesh is None:
@@ -374,10 +358,17 @@ class CellCollector:
 
 
 def _content(path: Path, most: int) -> bytes:
-    try:
+    with _told(str(path)):
         return outside.read_bytes(path, most)
-    except OutsideError as error:
-        raise BundleError(f"{path} {error}") from error
+
+
+@contextmanager
+def _told(subject: str = "") -> Iterator[None]:
+    """Tell what is wrong with something as an error of this module."""
+    try:
+        yield
+    except DualArmError as error:
+        raise BundleError(f"{subject} {error}".lstrip()) from error
 
 
 def _replaced(text: str, reference: str, moved: str, file: str) -> str:
@@ -402,10 +393,8 @@ def parse_toml(content: bytes) -> dict[str, Any]:
     Raises:
         BundleError: it is not TOML.
     """
-    try:
+    with _told("the stored workcell:"):
         return outside.toml_tables(content)
-    except OutsideError as error:
-        raise BundleError(f"the stored workcell: {error}") from error
 
 
 def references(data: Mapping[str, Any]) -> Iterator[tuple[str, list[str] | None]]:
@@ -435,9 +424,6 @@ def _meshes(bodies: Any) -> Iterator[tuple[str, None]]:
 # --- the drivable variant ---
 
 
-LAW = "optimal"
-
-
 def drivable_files(stored: CellFiles) -> CellFiles:
     """The files of a cell (`collect_cell`) under 'optimal'.
 
@@ -446,11 +432,9 @@ def drivable_files(stored: CellFiles) -> CellFiles:
             changed cell is not valid.
     """
     content = stored.files[stored.workcell]
-    law = {"task": {"time_law": LAW}}
-    try:
+    law = {"task": {"time_law": "optimal"}}
+    with _told(f"{stored.workcell}: the time law cannot be changed:"):
         changed = completed(outside.text(content), parse_toml(content), law).encode()
-    except SettingsError as error:
-        raise BundleError(f"{stored.workcell}: the time law cannot be changed: {error}") from error
     draft = replace(stored, files={**stored.files, stored.workcell: changed}, digest="")
     with TemporaryDirectory() as folder:
         digest = unpack_cell(draft, Path(folder), check_digest=False).digest

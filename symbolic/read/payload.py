@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -19,23 +18,6 @@ from symbolic.records.problems import Problems
 KINDS = ("box", "cylinder", "mesh")
 
 
-@dataclass(frozen=True)
-class _Solid:
-    """A homogeneous payload of its shape.
-
-    Attributes:
-        size: (3,) edge lengths of the box about the frame that holds it [m].
-        inertia: (3, 3) about its centre of mass [kg m^2].
-        centre: (3,) centre of mass [m].
-        shape: None for that box itself.
-    """
-
-    size: Array
-    inertia: Array
-    centre: tuple[float, ...] = (0.0, 0.0, 0.0)
-    shape: Cylinder | Mesh | None = None
-
-
 def read_payload(table: Table, folder: Path) -> Payload:
     """What is carried; a mesh's path is relative to `folder`."""
     kind = table.choice("kind", KINDS, "box")
@@ -45,7 +27,7 @@ def read_payload(table: Table, folder: Path) -> Payload:
     else:
         solid = _cylinder(table, mass) if kind == "cylinder" else _box(table, mass)
     half = solid.size / 2
-    centre = table.vector("centre_of_mass", (quantity.POSITION,) * 3, default=solid.centre)
+    centre = table.vector("centre_of_mass", (quantity.POSITION,) * 3, solid.centre_of_mass)
     if table.clean("size", "centre_of_mass"):
         for axis in np.flatnonzero(np.abs(centre) > half):
             table.add(
@@ -53,9 +35,9 @@ def read_payload(table: Table, folder: Path) -> Payload:
                 f"found {centre[axis]:g} m, outside the box; allowed is {-half[axis]:g} to "
                 f"{half[axis]:g} m from its geometric centre",
             )
-    inertia = _read_inertia(table, kind, solid, mass)
+    inertia = _read_inertia(table, kind, solid)
     if not kind:  # without a kind nobody can say which keys are unknown
-        return Payload(solid.size, mass, centre, inertia)
+        return solid
     return table.record(
         Payload,
         size=solid.size,
@@ -72,24 +54,24 @@ def solid_box_inertia(size: Array, mass: float) -> Array:
     return read_only(np.diag(mass / 12 * (squares.sum() - squares)))
 
 
-def _box(table: Table, mass: float) -> _Solid:
+def _box(table: Table, mass: float) -> Payload:
     size = table.vector("size", (quantity.PAYLOAD_SIZE,) * 3)
-    return _Solid(size, solid_box_inertia(size, mass))
+    return Payload(size, mass, np.zeros(3), solid_box_inertia(size, mass))
 
 
-def _cylinder(table: Table, mass: float) -> _Solid:
+def _cylinder(table: Table, mass: float) -> Payload:
     radius, length = (table.number(key, quantity.PAYLOAD_SIZE) for key in ("radius", "length"))
     across = mass / 12 * (3 * radius**2 + length**2)
     inertia = read_only(np.diag([across, across, mass / 2 * radius**2]))
     size = read_only([2.0 * radius, 2.0 * radius, length])
-    return _Solid(size, inertia, shape=Cylinder(radius, length))
+    return Payload(size, mass, np.zeros(3), inertia, shape=Cylinder(radius, length))
 
 
-def _mesh(table: Table, folder: Path, mass: float) -> _Solid:
+def _mesh(table: Table, folder: Path, mass: float) -> Payload:
     """A mesh is as heavy everywhere within its surface, or its hull where that has holes."""
     path = read_file(table, "path", folder, outside.MESH_BYTES)
     scale = table.vector("scale", (quantity.SCALE,) * 3, (1.0, 1.0, 1.0), filling=True)
-    nothing = _Solid(read_only(np.ones(3)), np.eye(3))
+    nothing = Payload(read_only(np.ones(3)), mass, np.zeros(3), np.eye(3))
     if not table.clean("path", "scale"):
         return nothing
     # Not imported at the top: reading meshes takes long to load.
@@ -101,7 +83,8 @@ def _mesh(table: Table, folder: Path, mass: float) -> _Solid:
             mesh = mesh.convex_hull
         size = read_only(2.0 * np.abs(mesh.vertices).max(axis=0))
         inertia = read_only(mass / mesh.volume * mesh.moment_inertia)
-        solid = _Solid(size, inertia, tuple(mesh.center_mass.tolist()), Mesh(path, scale))
+        centre = read_only(mesh.center_mass)
+        solid = Payload(size, mass, centre, inertia, shape=Mesh(path, scale))
     except CollisionModelError as error:
         table.add("path", str(error))
         return nothing
@@ -115,13 +98,13 @@ def _mesh(table: Table, folder: Path, mass: float) -> _Solid:
     return solid
 
 
-def _read_inertia(table: Table, kind: str, solid: _Solid, mass: float) -> Array:
+def _read_inertia(table: Table, kind: str, solid: Payload) -> Array:
     words = ("solid box", "solid") if kind == "box" else ("solid",)
     if table.raw("inertia", "solid") in words:
         return solid.inertia
     # No mass inside the box is farther from any axis through it than the box's diagonal.
     farthest = float(np.sum(solid.size**2)) if table.clean("size", "mass") else np.inf
-    return read_inertia(table, mass * farthest, f"{words[0]!r} or a 3 x 3 matrix")
+    return read_inertia(table, solid.mass * farthest, f"{words[0]!r} or a 3 x 3 matrix")
 
 
 # --- contacts ---

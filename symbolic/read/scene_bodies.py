@@ -25,7 +25,7 @@ from symbolic.read.descriptions import find_package
 from symbolic.read.elements import parse_elements
 from symbolic.read.tables import Table, read_body
 from symbolic.records import PAYLOAD, Body, Box, Capsule, Cylinder, Mesh, Shape, Sphere
-from symbolic.records.poses import rpy_from_rotation, transform
+from symbolic.records.poses import axes_with_z, rpy_from_rotation, transform
 from symbolic.records.problems import MAX_NAME_LENGTH, Problems, shown
 
 MOST_BODIES = 5000
@@ -134,11 +134,12 @@ class SceneBuilder:
 
     def half_space(self, name: str, normal: Array, offset: float, pose: Array) -> None:
         """All x of a frame at a pose (4, 4) for which normal x + offset <= 0."""
-        if np.linalg.norm(normal) < 1e-6:
+        length = float(np.linalg.norm(normal))
+        if length < 1e-6:
             self.problems.add(name, "found a plane without a normal")
         else:
             foot = -offset / float(normal @ normal) * normal
-            self.plane(name, pose @ transform(upwards(normal), foot))
+            self.plane(name, pose @ transform(axes_with_z(normal / length), foot))
 
     def plane(self, name: str, pose: Array) -> None:
         """The half-space below a frame's x-y plane."""
@@ -191,14 +192,6 @@ def quaternion_pose(xyz: Array, xyzw: Array, at: str, problems: Problems) -> Arr
     if not length or abs(length - 1.0) > 1e-2:
         return transform(np.eye(3), xyz)
     return transform(Rotation.from_quat(xyzw).as_matrix(), xyz)
-
-
-def upwards(normal: Array) -> Array:
-    """A rotation (3, 3) whose z axis is along a vector (3,)."""
-    z = np.asarray(normal) / np.linalg.norm(normal)
-    x = np.cross(np.eye(3)[int(np.argmin(np.abs(z)))], z)
-    x /= np.linalg.norm(x)
-    return np.column_stack([x, np.cross(z, x), z])
 
 
 # --- files that a scene names ---

@@ -138,7 +138,7 @@ class Table:
         self,
         key: str,
         allowed: Sequence[Range],
-        default: Sequence[float] | None = None,
+        default: Sequence[float] | Array | None = None,
         filling: bool = False,
     ) -> Array:
         """An array with one range per entry; one number for all of it where `filling`."""
@@ -160,10 +160,6 @@ class Table:
     def text(self, key: str, default: str | None = None) -> str:
         """A printable, not empty, single-line text; '' after a problem."""
         return str(self.value(key, Label, _REQUIRED if default is None else default))
-
-    def flag(self, key: str) -> bool:
-        """True or false; false where the key is missing, or after a problem."""
-        return bool(self.value(key, bool, False))
 
     def texts(self, key: str, meaning: str) -> tuple[str, ...]:
         """An array of texts, which mean something; empty where the key is missing, or after a

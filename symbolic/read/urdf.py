@@ -24,7 +24,7 @@ from symbolic.array import Array
 from symbolic.errors import OutsideError, UrdfError
 from symbolic.read.descriptions import Arguments, description_content
 from symbolic.read.elements import Part, parse_elements
-from symbolic.records import Box, Capsule, Cylinder, Sphere
+from symbolic.records import Box, Capsule, Cylinder, IgnoredPair, Sphere
 from symbolic.records import quantities as quantity
 from symbolic.records.poses import pose_matrix, read_only
 from symbolic.records.problems import Problems, shown, suggestion
@@ -91,11 +91,6 @@ class Urdf:
         while link in self.moved_by:
             yield self.moved_by[link]
             link = self.joints[self.moved_by[link]].parent
-
-    @property
-    def collision_links(self) -> tuple[str, ...]:
-        """Links that have a collision shape."""
-        return tuple(self.collisions)
 
     @property
     def collision_meshes(self) -> tuple[str, ...]:
@@ -368,22 +363,10 @@ def _mimic_problem(joints: Mapping[str, UrdfJoint]) -> tuple[str, str] | None:
 # --- SRDF ---
 
 
-@dataclass(frozen=True)
-class DisabledPair:
-    """Two links that are not checked against one another.
-
-    Attributes:
-        first, second: names of links.
-        reason: the file's, e.g. 'Adjacent' or 'Never'; may be empty.
-    """
-
-    first: str
-    second: str
-    reason: str
-
-
-def read_srdf(path: Path) -> tuple[DisabledPair, ...]:
+def read_srdf(path: Path) -> tuple[IgnoredPair, ...]:
     """The `disable_collisions` elements of an SRDF file, in its order; the rest is not read.
+
+    They are pairs of links with the file's reason, such as 'Adjacent' or 'Never', or none.
 
     Raises:
         UrdfError: the file cannot be read, is no XML, or one of these elements lacks a link.
@@ -395,11 +378,11 @@ def read_srdf(path: Path) -> tuple[DisabledPair, ...]:
 
 
 @lru_cache(maxsize=8)
-def _parse_srdf(content: bytes, file: str) -> tuple[DisabledPair, ...]:
+def _parse_srdf(content: bytes, file: str) -> tuple[IgnoredPair, ...]:
     problems = Problems()
     root = Part(parse_elements(outside.xml_text(content)), "", problems)
     pairs = tuple(
-        DisabledPair(part.text("link1"), part.text("link2"), part.raw("reason") or "")
+        IgnoredPair(part.text("link1"), part.text("link2"), part.raw("reason") or "")
         for part in root.all("disable_collisions")
     )
     if problems.found:

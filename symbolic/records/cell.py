@@ -392,8 +392,10 @@ class Reading:
 
     Attributes:
         files: SHA-256 over the workcell file and the content of every file it names.
-        values: `values_digest` of its records.
-        named: `named` of its records.
+        values: SHA-256 over every value of its records, files by their place beside the workcell
+            file.
+        named: what decides which files describe the cell: the paths in its records, and what each
+            robot's description is expanded with.
     """
 
     files: str
@@ -403,31 +405,9 @@ class Reading:
 
 def reading_of(workcell: Any, files: str) -> Reading:
     """The reading of a workcell as it is now."""
-    return Reading(files, values_digest(workcell), named(workcell))
-
-
-def digest_of(workcell: Any, reading: Reading | None) -> str:
-    """The digest of a workcell; '' where no files, or others than were read, describe it."""
-    if reading is None:
-        return ""
-    values = values_digest(workcell)
-    if values == reading.values:
-        return reading.files
-    if not named(workcell) <= reading.named:
-        return ""
-    return hashlib.sha256(f"{reading.files} {values}".encode()).hexdigest()
-
-
-def values_digest(workcell: Any) -> str:
-    """SHA-256 over every value of the records, files by their place beside the workcell file."""
-    return digest_of_parts(workcell, workcell.source.parent)
-
-
-def named(workcell: Any) -> frozenset[str]:
-    """What decides which files describe the cell: the paths in its records, and what each robot's
-    description is expanded with."""
     arms = [(r.urdf, r.package_dirs, r.xacro_arguments, r.srdf) for r in workcell.robots]
-    return frozenset([*_paths(workcell), *map(repr, arms)])
+    values = digest_of_parts(workcell, workcell.source.parent)
+    return Reading(files, values, frozenset([*_paths(workcell), *map(repr, arms)]))
 
 
 def _paths(value: Any) -> Iterator[str]:
@@ -533,11 +513,16 @@ class Workcell:
         return bool((np.abs(first + second) <= OPPOSITE).all())
 
     @property
-    def has_pads_beside(self) -> bool:
-        """Whether the contacts lie beside one another, seen along the first one's normal."""
+    def pads_beside(self) -> float:
+        """How far the contacts lie beside one another, seen along the first one's normal [m]."""
         first, second = (contact.T_box_pad[:3, 3] for contact in self.contacts)
         normal, apart = self.contacts[0].T_box_pad[:3, 2], first - second
-        return bool(np.linalg.norm(apart - (apart @ normal) * normal) > BESIDE)
+        return float(np.linalg.norm(apart - (apart @ normal) * normal))
+
+    @property
+    def has_pads_beside(self) -> bool:
+        """Whether they lie beside one another at all."""
+        return self.pads_beside > BESIDE
 
     @property
     def has_closed_form(self) -> bool:
@@ -573,7 +558,14 @@ class Workcell:
     def digest(self) -> str:
         """Identifies the cell in caches and results: SHA-256 over the file and every file it names
         (URDF, meshes), and over its values where it was changed in memory; '' without files."""
-        return digest_of(self, self.reading)
+        if self.reading is None:
+            return ""
+        files, now = self.reading.files, reading_of(self, "")
+        if now.values == self.reading.values:
+            return files
+        if not now.named <= self.reading.named:  # other files than were read describe it
+            return ""
+        return hashlib.sha256(f"{files} {now.values}".encode()).hexdigest()
 
 
 def box_flange(robot: Robot, contact: Contact) -> Array:

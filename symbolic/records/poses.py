@@ -131,6 +131,14 @@ def transform(rotation: ArrayLike, translation: ArrayLike) -> Array:
     return matrix
 
 
+def axes_with_z(axis: Array) -> Array:
+    """A rotation (3, 3) whose third column is the unit axis (3,)."""
+    helper = np.eye(3)[int(np.argmin(np.abs(axis)))]
+    x = np.cross(helper, axis)
+    x /= np.linalg.norm(x)
+    return np.column_stack([x, np.cross(axis, x), axis])
+
+
 def inverse(T_a_b: Array) -> Array:
     """The transform T_b_a of a rigid T_a_b, without a general matrix inversion."""
     rotation = T_a_b[:3, :3].T

@@ -7,6 +7,7 @@ convex pieces of a mesh. Shapes and placements are Pinocchio's own reading of th
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import coal
@@ -67,8 +68,12 @@ class PlainCollisionChecker:
             self.bodies[body.name] = _solids(body.shape, pin.SE3(body.pose))
             for solid in self.bodies[body.name]:
                 solid.move(pin.SE3.Identity())
-        self.pairs = build_geometry(workcell).pair_names
         self.resting = self._resting_places()
+
+    @cached_property
+    def pairs(self) -> tuple[tuple[str, str], ...]:
+        """Names of the bodies that are checked against one another."""
+        return build_geometry(self.workcell).pair_names
 
     def check(self, time: Array, pose: Array, q_1: Array, q_2: Array) -> PlainCollisions:
         """Check every pair of n samples: time (n,), box pose and joints (n, 6) each."""

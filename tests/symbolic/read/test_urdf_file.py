@@ -12,16 +12,13 @@ import pinocchio as pin
 import pytest
 from robot_descriptions._repositories import REPOSITORIES
 
-from symbolic.errors import OutsideError, UrdfError, WorkcellError
+from symbolic.errors import OutsideError, UrdfError
 from symbolic.read.arms import arm_model, link_frame, reduced_model
-from symbolic.read.cell import load
-from symbolic.read.cell_files import collect_cell, unpack_cell
 from symbolic.read.descriptions import find_package, further_package_dirs, resolve_mesh
 from symbolic.read.robots import named_robot
-from symbolic.read.urdf import MOST_LINKS, DisabledPair, UrdfMesh, parse_urdf, read_srdf, read_urdf
-from symbolic.records import Box, Cylinder
+from symbolic.read.urdf import MOST_LINKS, parse_urdf, read_srdf, read_urdf
+from symbolic.records import IgnoredPair
 from tests.machines import robot_record, ur10_urdf
-from tests.symbolic.cells import RACK
 from tests.symbolic.read.samples import GOFA
 from tests.waiting import soon
 
@@ -117,6 +114,11 @@ CASES: list[tuple[Callable[[str], str], str, str]] = [
         "joint 'joint_1'/limit velocity",
         "found -1; allowed is 0",
     ),
+    (
+        swap('<origin xyz="0 0 0.707" rpy="0 0 0"/>\n    <axis', '<origin xyz="0 0 707"/><axis'),
+        "joint 'joint_3'/origin xyz[2]",
+        "707 mm are 0.707 m",
+    ),
     (beside("<a/>" * 100_001), "has more than 100000 elements", ""),
 ]
 
@@ -148,40 +150,6 @@ def test_published_robots_are_read_as_pinocchio_reads_them(path: Path) -> None:
     assert np.array_equal(velocity_max, expected.velocityLimit)
 
 
-def test_shapes_of_the_gofa_are_those_of_pinocchio() -> None:
-    model = pin.buildModelFromUrdf(str(GOFA))
-    geometry = pin.buildGeomFromUrdf(model, str(GOFA), pin.GeometryType.COLLISION)
-    urdf = read_urdf(GOFA)
-    seen = 0
-    for link, collisions in urdf.collisions.items():
-        T_joint_link = model.frames[link_frame(model, link)].placement.homogeneous
-        for index, collision in enumerate(collisions):
-            other = geometry.geometryObjects[geometry.getGeometryId(f"{link}_{index}")]
-            np.testing.assert_allclose(
-                T_joint_link @ collision.pose, other.placement.homogeneous, atol=1e-12
-            )
-            shape = collision.shape
-            if isinstance(shape, Box):
-                np.testing.assert_allclose(2.0 * other.geometry.halfSide, shape.size, atol=1e-12)
-            else:
-                assert isinstance(shape, Cylinder)
-                assert other.geometry.radius == pytest.approx(shape.radius, abs=1e-12)
-                assert 2.0 * other.geometry.halfLength == pytest.approx(shape.length, abs=1e-12)
-            seen += 1
-    assert seen == len(geometry.geometryObjects)
-
-
-def test_meshes_keep_their_address_and_scale() -> None:
-    urdf = read_urdf(ur10_urdf())
-    shapes = [found.shape for collisions in urdf.collisions.values() for found in collisions]
-    meshes = [shape for shape in shapes if isinstance(shape, UrdfMesh)]
-    assert len(meshes) == 7
-    assert urdf.collision_meshes == tuple(mesh.address for mesh in meshes)
-    assert all(address.startswith("package://") for address in urdf.collision_meshes)
-    assert all(np.array_equal(mesh.scale, np.ones(3)) for mesh in meshes)
-    assert len(urdf.visual_meshes) == 7
-
-
 def test_a_joint_may_be_named_as_a_link(tmp_path: Path) -> None:
     path = tmp_path / "arm.urdf"
     path.write_text(TEXT.replace('joint name="joint_6"', 'joint name="link_6"'))
@@ -201,13 +169,6 @@ def test_what_is_wrong_is_named(change: Callable[[str], str], place: str, words:
         parse_urdf(changed.encode(), "arm.urdf")
     assert any(p.startswith(place) and words in p for p in caught.value.problems), caught.value
     assert str(caught.value).startswith("arm.urdf: ")
-
-
-def test_an_origin_in_millimetres_is_told() -> None:
-    start = TEXT.index('<joint name="joint_3"')
-    changed = TEXT[:start] + TEXT[start:].replace("0 0 0.707", "0 0 707", 1)
-    with pytest.raises(UrdfError, match=r"joint 'joint_3'/origin xyz\[2\].*707 mm are 0.707 m"):
-        parse_urdf(changed.encode(), "arm.urdf")
 
 
 def chain(links: int) -> str:
@@ -239,7 +200,7 @@ def test_nothing_is_said_on_the_terminal(capfd: pytest.CaptureFixture[str], tmp_
     assert capfd.readouterr() == ("", "")
 
 
-def test_pairs_are_read_in_order_and_the_rest_is_passed_over(tmp_path: Path) -> None:
+def test_pairs_are_read_in_order_and_those_without_a_link_are_told(tmp_path: Path) -> None:
     path = tmp_path / "arm.srdf"
     path.write_text(
         '<robot name="arm"><group name="g"><joint name="j"/></group>'
@@ -247,11 +208,7 @@ def test_pairs_are_read_in_order_and_the_rest_is_passed_over(tmp_path: Path) -> 
         '<disable_collisions link1="a" link2="c"/></robot>',
         encoding="utf-8",
     )
-    assert read_srdf(path) == (DisabledPair("a", "b", "Adjacent"), DisabledPair("a", "c", ""))
-
-
-def test_a_pair_without_a_link_is_told(tmp_path: Path) -> None:
-    path = tmp_path / "arm.srdf"
+    assert read_srdf(path) == (IgnoredPair("a", "b", "Adjacent"), IgnoredPair("a", "c", ""))
     path.write_text('<robot><disable_collisions link1="a"/></robot>', encoding="utf-8")
     with pytest.raises(UrdfError, match=r"arm\.srdf: .*disable_collisions\[0\] link2: is missing"):
         read_srdf(path)
@@ -273,11 +230,16 @@ def package(folder: Path, name: str = "") -> Path:
     return folder
 
 
-def test_given_folders_come_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_given_folders_come_first_and_others_are_added_where_they_lack_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     given, ament = package(tmp_path / "a" / "arm"), package(tmp_path / "b" / "share" / "arm")
+    two = package(tmp_path / "b" / "share" / "two")
     monkeypatch.setenv("AMENT_PREFIX_PATH", f"/nothing:{tmp_path / 'b'}")
     assert find_package("arm", [tmp_path / "a"], NOWHERE) == given
     assert find_package("arm", [], NOWHERE) == ament
+    addresses = ["package://arm/a.stl", "package://two/b.stl", "package://three/c.stl", "d.stl"]
+    assert further_package_dirs(addresses, [tmp_path / "a"], NOWHERE) == (two.parent,)
 
 
 def test_a_workspace_is_searched_below_its_folder(
@@ -292,17 +254,13 @@ def test_a_workspace_is_searched_below_its_folder(
     assert find_package("arm", [], NOWHERE) == deep
 
 
-def test_a_description_lies_in_its_own_package(tmp_path: Path) -> None:
-    own = package(tmp_path / "arm_description")
-    assert find_package("arm_description", [], own / "urdf" / "arm.urdf") == own
-
-
 def test_a_source_folder_may_bear_another_name_than_its_package(tmp_path: Path) -> None:
     """As moveit_resources/panda_description, the package moveit_resources_panda_description."""
     arm = package(tmp_path / "src" / "arm", "vendor_arm")
     (arm / "arm.stl").write_bytes(b"solid")
     assert find_package("vendor_arm", [tmp_path / "src"], NOWHERE) == arm
-    assert find_package("vendor_arm", [], arm / "urdf" / "arm.urdf") == arm
+    for name in ("vendor_arm", "arm"):
+        assert find_package(name, [], arm / "urdf" / "arm.urdf") == arm
     assert find_package("vendor", [tmp_path / "src"], NOWHERE) is None
     address = "package://vendor_arm/arm.stl"
     assert resolve_mesh(address, NOWHERE, [tmp_path / "src"]) == (arm / "arm.stl").resolve()
@@ -311,24 +269,9 @@ def test_a_source_folder_may_bear_another_name_than_its_package(tmp_path: Path) 
     assert find_package("vendor_arm", [tmp_path / "src"], NOWHERE) == arm.with_name("vendor_arm")
 
 
-def test_packages_of_the_python_environment_are_found() -> None:
-    found = find_package("example-robot-data", [], NOWHERE)
-    assert found is not None
-    assert ur10_urdf().is_relative_to(found)
-
-
 @pytest.mark.parametrize("name", ["", "..", "../arm", "/etc", ".", "a" * 100_000])
 def test_no_name_leads_elsewhere(name: str) -> None:
     assert find_package(name, [Path("/")], NOWHERE) is None
-
-
-def test_only_what_is_missing_is_added(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    package(tmp_path / "given" / "one")
-    package(tmp_path / "ament" / "share" / "two")
-    monkeypatch.setenv("AMENT_PREFIX_PATH", str(tmp_path / "ament"))
-    addresses = ["package://one/a.stl", "package://two/b.stl", "package://three/c.stl", "d.stl"]
-    found = further_package_dirs(addresses, [tmp_path / "given"], NOWHERE)
-    assert found == (tmp_path / "ament" / "share",)
 
 
 XACRO = """<robot name="arm" xmlns:xacro="http://www.ros.org/wiki/xacro">
@@ -342,11 +285,6 @@ def no_network(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     monkeypatch.setenv("https_proxy", "http://127.0.0.1:9")
     monkeypatch.delitem(sys.modules, "robot_descriptions.ur10e_description", raising=False)
     return tmp_path
-
-
-def test_files_of_an_installed_wheel() -> None:
-    assert named_robot("ur10_robot").path == ur10_urdf()
-    assert named_robot("ur10").path == ur10_urdf()
 
 
 @pytest.mark.parametrize(
@@ -390,36 +328,3 @@ def test_a_clone_in_the_cache_is_used(no_network: Path, monkeypatch: pytest.Monk
     found = named_robot("ur10e_description")
     # The links are those of the macro with the module's own arguments.
     assert read_urdf(found.path, found.arguments, found.package_dirs).links == ("ur10e",)
-
-
-def by_name(folder: Path, name: str) -> Path:
-    """The rack with robots by name, whatever they are there."""
-    text = RACK.read_text(encoding="utf-8")
-    path = folder / "cell.toml"
-    key = 'urdf = "../robots/gofa12.urdf"'
-    assert text.count(key) == 2
-    path.write_text(text.replace(key, f"robot = '{name}'  # by name"), encoding="utf-8")
-    return path
-
-
-def test_a_cell_is_that_of_the_file_and_travels_without_the_name(tmp_path: Path) -> None:
-    cell = load(by_name(tmp_path, "ur10"))
-    assert cell.robots[0].urdf == ur10_urdf()
-    stored = collect_cell(cell)
-    (tmp_path / "unpacked").mkdir()
-    unpacked = unpack_cell(stored, tmp_path / "unpacked")
-    assert unpacked.robots[0].urdf.is_relative_to(tmp_path)
-    assert b"robot = " not in stored.files[stored.workcell]
-
-
-def test_a_name_that_is_none_is_told_with_its_key(tmp_path: Path) -> None:
-    with pytest.raises(WorkcellError, match=r"robots\[0\].urdf: robot = 'ur11' is the name of no"):
-        load(by_name(tmp_path, "ur11"))
-
-
-def test_a_name_beside_a_file_is_refused(tmp_path: Path) -> None:
-    path = by_name(tmp_path, "ur10")
-    text = path.read_text(encoding="utf-8")
-    path.write_text(text.replace("# by name", "\nurdf = 'a.urdf'", 1), encoding="utf-8")
-    with pytest.raises(WorkcellError, match=r"robots\[0\].urdf: found beside 'robot'"):
-        load(path)
