@@ -32,10 +32,10 @@ def _redundant(path: Path, *entries: str) -> Workcell:
     return load(path)
 
 
-def free_pandas(folder: Path, entry: str = "") -> Workcell:
-    """The same, these joints redundant; `entry` is what the file says of them."""
+def free_pandas(folder: Path, entry: str = "", joint: str = PANDA_JOINT) -> Workcell:
+    """The same, these joints redundant; `entry` is what the file says of them, or of another."""
     path = single_cell(SINGLE["panda"], folder, {})
-    return _redundant(path, f'"{PANDA_JOINT}", {entry}') if entry else load(path)
+    return _redundant(path, f'"{joint}", {entry}') if entry else load(path)
 
 
 def seven_joints(name: str, folder: Path) -> Workcell:

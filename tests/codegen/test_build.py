@@ -70,17 +70,14 @@ def test_what_the_key_depends_on(cache: Cache, monkeypatch: pytest.MonkeyPatch) 
     assert len(set(keys)) == len(keys)
 
 
-@pytest.mark.parametrize("damage", [b"", b"not a library", None])
-def test_damaged_library_is_built_anew(cache: Cache, damage: bytes | None) -> None:
+def test_damaged_library_is_built_anew(cache: Cache) -> None:
     function = compile_function(functions()["square"], cache)
     assert isinstance(function, CompiledFunction)
-    if damage is None:
-        content = bytearray(function.library.read_bytes())
-        content[len(content) // 2] ^= 1
-        damage = bytes(content)
+    content = bytearray(function.library.read_bytes())
+    content[len(content) // 2] ^= 1
     # As a disk would: another file in its place, for the loaded one is mapped into this process.
     replacement = function.library.with_suffix(".damaged")
-    replacement.write_bytes(damage)
+    replacement.write_bytes(content)
     replacement.replace(function.library)
     again = build({"square": functions()["square"]}, cache)
     assert not again.reports[0].from_cache

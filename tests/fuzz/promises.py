@@ -22,11 +22,15 @@ MANY = 1000
 """Damages of one kind in the long tests."""
 
 
-def all_kept(checks: Checks, kind: str, examples: int) -> None:
-    """Run one check with so many examples of its strategies."""
+def all_kept(checks: Checks, kind: str, examples: int, *fixed: Any) -> None:
+    """Run one check with so many examples of its strategies, behind arguments that are fixed."""
     check, strategies = checks[kind]
+
+    def run(damage: tuple[Any, ...]) -> None:
+        check(*fixed, *damage)
+
     limited = settings(max_examples=examples, suppress_health_check=list(HealthCheck))
-    limited(given(*strategies)(check))()
+    limited(given(st.tuples(*strategies))(run))()
 
 
 def kept(read: Callable[[], Any], *names: str) -> Any:

@@ -16,12 +16,11 @@ from codegen.cache import Cache
 from hybrid_opt.bundles.bundle import read_manifest
 from hybrid_opt.campaign.journal import Journal, decode
 from hybrid_opt.campaign.results import read_configuration
-from hybrid_opt.campaign.settings import FinishedReplica, StageMark
+from hybrid_opt.campaign.settings import FinishedReplica
 from hybrid_opt.polishing.records import PolishedFront
 from hybrid_opt.store.files import read_bytes, read_record
 from hybrid_opt.store.trajectory_file import read_trajectory
 from studies.research.best_front import read_reference_front
-from studies.study.summary import CampaignSummary
 from symbolic.errors import DualArmError
 from symbolic.read.cell import load
 from symbolic.read.meshes import read_mesh
@@ -35,10 +34,8 @@ READERS: dict[str, Callable[[Path], Any]] = {
     "mesh": lambda path: read_mesh(path, np.ones(3)),
     "trajectory": read_trajectory,
     "configuration": lambda path: read_configuration(path.parent),
-    "summary": lambda path: read_record(CampaignSummary, path, ""),
     "replica": lambda path: read_record(FinishedReplica, path, ""),
     "polish": lambda path: read_record(PolishedFront, path, ""),
-    "stage": lambda path: read_record(StageMark, path, ""),
     "evaluations": lambda path: decode(read_bytes(path), path),
     "journal": lambda path: Journal(path, b"\0" * 32),
     "manifest": lambda path: read_manifest(path.parent),

@@ -62,16 +62,10 @@ FILES: dict[str, tuple[str, str, Callable[[], bytes]]] = {
     "array": ("workcell", "c.toml", lambda: full(b"a=[", b"[],", b"]", WORKCELL_BYTES)),
     "tables": ("workcell", "c.toml", lambda: named(b"", b"[a%x]\n", b"", 90_000)),
     "robots": ("workcell", "c.toml", lambda: full(b"", b"[[robots]]\n", b"", WORKCELL_BYTES)),
-    "bodies": ("workcell", "c.toml", lambda: full(b"", b"[[environment]]\n", b"", WORKCELL_BYTES)),
     "attributes": (
         "urdf",
         "a.urdf",
         lambda: named(b"<robot><link ", b"a%x='' ", b"/></robot>", MOST_ATTRIBUTES - 1),
-    ),
-    "more attributes": (
-        "urdf",
-        "a.urdf",
-        lambda: named(b"<robot><link ", b"a%x='' ", b"/></robot>", 3 * MOST_ATTRIBUTES),
     ),
     "lines": ("urdf", "a.urdf", lambda: full(b"<robot>", b"\n", b"</robot>", URDF_BYTES)),
     "links": (
@@ -105,7 +99,6 @@ FILES: dict[str, tuple[str, str, Callable[[], bytes]]] = {
         ),
     ),
     "corners": ("mesh", "m.obj", lambda: full(b"v 0 0 0\nf ", b"1 ", b"\n", WORDS["obj"])),
-    "more corners": ("mesh", "m.obj", lambda: full(b"v 0 0 0\nf ", b"1 ", b"\n", MESH_BYTES)),
     "vertices": (
         "mesh",
         "m.off",
@@ -124,7 +117,6 @@ FILES: dict[str, tuple[str, str, Callable[[], bytes]]] = {
         ),
     ),
     "collada": ("mesh", "m.dae", lambda: full(COLLADA, b"<a/>", b"</COLLADA>", 1_900_000)),
-    "more collada": ("mesh", "m.dae", lambda: full(COLLADA, b"<a/>", b"</COLLADA>", MESH_BYTES)),
     "values": ("trajectory", "t.json", lambda: b"[" + b"[]," * (MOST_VALUES // 2 - 9) + b"1]"),
     "letters": (
         "trajectory",
@@ -146,7 +138,6 @@ FILES: dict[str, tuple[str, str, Callable[[], bytes]]] = {
             MOST_VALUES - 10,
         ),
     ),
-    "summary": ("summary", "summary.json", lambda: b"[" + b"{}," * (MOST_VALUES // 2 - 9) + b"1]"),
     "points": (
         "polish",
         "polish.json",
@@ -155,13 +146,6 @@ FILES: dict[str, tuple[str, str, Callable[[], bytes]]] = {
             b',{"objectives":[0,0],"parent":0,"polished":true,"x":[0,0]}',
             b'],"figures":{},"attempts":[]}',
             7_000_000,
-        ),
-    ),
-    "settings": (
-        "stage",
-        "search.json",
-        lambda: named(
-            b'{"status": "done", "seconds": 1, "settings": {"a": 0', b', "%d": []', b"}}", 99_000
         ),
     ),
     "candidates": ("evaluations", "e.csv.gz", lambda: packed(18, 1_000_000)),
@@ -191,7 +175,7 @@ FILES: dict[str, tuple[str, str, Callable[[], bytes]]] = {
         lambda: b'{"facts": [' + b"[]," * 400_000 + b'1], "sha256": "a"}',
     ),
 }
-ALWAYS = ("robots", "more attributes", "corners", "candidates")
+ALWAYS = ("robots", "attributes", "corners")
 
 
 @pytest.mark.parametrize(

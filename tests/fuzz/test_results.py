@@ -7,21 +7,19 @@ import gzip
 import hashlib
 import json
 import shutil
-from collections.abc import Callable, Iterator
-from functools import partial
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from hybrid_opt.campaign.results import read_campaign
 from studies.programs.comparison import compare
 from studies.report.data import gather_carries
 from tests.fuzz.damage import Bytes, Tree, byte_damage, tree_damage
-from tests.fuzz.promises import MANY, kept
+from tests.fuzz.promises import MANY, Checks, all_kept, kept
 
 EVALUATIONS, MARK = "evaluations.csv.gz", "replica.json"
 
@@ -86,7 +84,7 @@ def in_values(root: Path, whole: Path, share: float, damaged: Tree) -> None:
         judged(root, whole)
 
 
-def in_evaluations(root: Path, whole: Path, share: float, damaged: Bytes) -> None:
+def in_evaluations(root: Path, whole: Path, damaged: Bytes) -> None:
     """The table is damaged before it was packed, and its checksum is right."""
     path, *_ = sorted((root / "replicas").rglob(EVALUATIONS))
     table = gzip.compress(damaged(gzip.decompress(path.read_bytes())), mtime=0)
@@ -97,17 +95,14 @@ def in_evaluations(root: Path, whole: Path, share: float, damaged: Bytes) -> Non
 
 
 SHARE = st.floats(0.0, 1.0, exclude_max=True)
-TESTS: dict[str, tuple[Callable[..., None], st.SearchStrategy[Any]]] = {
-    "bytes": (in_bytes, byte_damage()),
-    "values": (in_values, tree_damage()),
-    "evaluations": (in_evaluations, byte_damage()),
+TESTS: Checks = {
+    "bytes": (in_bytes, (SHARE, byte_damage())),
+    "values": (in_values, (SHARE, tree_damage())),
+    "evaluations": (in_evaluations, (byte_damage(),)),
 }
 
 
 @pytest.mark.parametrize("examples", [15, pytest.param(MANY, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("kind", TESTS)
 def test_damage_is_told(kind: str, examples: int, damaged_copy: Path, polished_study: Path) -> None:
-    check, strategy = TESTS[kind]
-    limited = settings(max_examples=examples, suppress_health_check=list(HealthCheck))
-    with_both = partial(check, damaged_copy, polished_study)
-    limited(given(SHARE, strategy)(lambda share, damage: with_both(share, damage)))()
+    all_kept(TESTS, kind, examples, damaged_copy, polished_study)

@@ -62,13 +62,6 @@ def in_values(damaged: Tree) -> None:
     judged(json.dumps(tree).encode("utf-8", "surrogatepass"))
 
 
-def in_one_part(part: str, damaged: Tree) -> None:
-    document = json.loads(sound())
-    document[part] = damaged([document[part]])
-    document[part] = document[part][0] if len(document[part]) == 1 else document[part]
-    judged(json.dumps(document).encode("utf-8", "surrogatepass"))
-
-
 def in_a_file_of_the_cell(index: int, damaged: Bytes) -> None:
     """The file is damaged, its checksum that of the damaged content."""
     document = json.loads(sound())
@@ -78,7 +71,6 @@ def in_a_file_of_the_cell(index: int, damaged: Bytes) -> None:
     judged(json.dumps(document).encode())
 
 
-PARTS = st.sampled_from(["decision", "start", "figures", "provenance", "cell", "version", "format"])
 FILES: dict[str, str | bytes] = {"job.csv": "time\n0.0\n", "goals/1_press.yaml": b"a: 1\n"}
 ABOUT: dict[str, Any] = {
     "target": "csv",
@@ -156,7 +148,6 @@ SHARE = st.floats(0.0, 1.0, exclude_max=True)
 TESTS: Checks = {
     "bytes": (in_bytes, (byte_damage(),)),
     "values": (in_values, (tree_damage(),)),
-    "parts": (in_one_part, (PARTS, tree_damage())),
     "files of the cell": (in_a_file_of_the_cell, (st.integers(0, 9), byte_damage())),
     "bundle, bytes": (of_a_bundle_in_bytes, (SHARE, byte_damage())),
     "bundle, values": (of_a_bundle_in_values, (tree_damage(),)),

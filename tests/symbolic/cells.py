@@ -74,22 +74,14 @@ def hand_cell() -> Workcell:
             mass=10.0,
             centre_of_mass=np.zeros(3),
             inertia=solid_box(10.0, [0.3, 0.4, 0.25]),
-            velocity_max=1.0,
-            acceleration_max=5.0,
-            angular_velocity_max=2.0,
-            angular_acceleration_max=10.0,
         ),
         contacts=(Contact(T_box_pads[0], 1.0, 0.0315), Contact(T_box_pads[1], 1.0, 0.0315)),
         task=Task(
             waypoints=waypoints,
             samples=60,
-            time_law="constant",
             reference_speed=0.25,
-            reference_angular_speed=0.5,
-            ramp_time=0.5,
             reference_force=np.array([117.68, 117.68]),
             initial=np.array([[*centre, 0.0, 0.0, 0.0] for centre in centres]),
-            allowed_contacts=(),
         ),
         environment=(),
     )
@@ -111,7 +103,6 @@ def gofa(name: str, T_world_base: Array) -> Robot:
         velocity_max=np.deg2rad([120.0, 120.0, 125.0, 200.0, 200.0, 200.0]),
         acceleration_max=np.full(6, 5.0),
         torque_max=np.array([390.0, 400.0, 160.0, 60.0, 60.0, 60.0]),
-        min_manipulability=0.005,
     )
 
 

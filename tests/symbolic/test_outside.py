@@ -7,6 +7,7 @@ import math
 import os
 import socket
 import tomllib
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
@@ -75,12 +76,6 @@ def test_what_is_no_regular_file_is_refused_at_once(tmp_path: Path) -> None:
             outside.resolved(path)
 
 
-def test_text_is_utf8() -> None:
-    assert outside.text("ü".encode()) == "ü"
-    with pytest.raises(OutsideError, match="byte 1 is not UTF-8"):
-        outside.text("aü".encode("latin-1"))
-
-
 values = st.recursive(
     st.none()
     | st.booleans()
@@ -122,50 +117,57 @@ def test_the_depth_is_that_of_the_value(value: Any) -> None:
         outside.json_value(json.dumps([nested]).encode())
 
 
+JSON: list[tuple[bytes, str]] = [
+    (b"", "not JSON"),
+    (b"{", "not JSON"),
+    (b"NaN", "NaN is no JSON number"),
+    (b"[1e400]", "1e400 is no finite number"),
+    (b"-Infinity", "no JSON number"),
+    (b"9" * 5000, "whole number of more than 4300 digits"),
+    (b'"\\ud800"', "half a surrogate pair"),
+    (b'{"\\udfff": 1}', "half a surrogate pair"),
+    (b'[[{"a": "x\\uD800y"}]]', "half a surrogate pair"),
+    (b"[" * 100_000, "nested 100000 deep"),
+    (b"[" + b"0," * outside.MOST_VALUES + b"0]", "more than 1000000 values"),
+    (b"[" + b'"",' * 100 + b'"\xff"]', "byte 302 is not UTF-8"),
+]
+TOML: list[tuple[bytes, str]] = [
+    (b"a = ", "not valid TOML"),
+    (b"\xef\xbb\xbfa = 1", "byte order mark"),
+    (b"a.b = 1\na = 2", "not valid TOML"),
+    (b"a = " + b"9" * 5000, "whole number of more than 4300 digits"),
+    (b"a = " + b"[" * 100_000, "nested too deeply"),
+    (b"a = " + b"[" * 60 + b"]" * 60, "nested too deeply; allowed is a depth of 50"),
+    (b"a" + b".a" * 100_000 + b" = 1", "more than 50 parts"),
+    (b"[" + b'"a" . ' * 100_000 + b"a]", "more than 50 parts"),
+    (b"x = {" + b"'a'." * 60 + b"a = 1}", "more than 50 parts"),
+]
+XML: list[tuple[bytes, str]] = [
+    ('<a b="\xe9"/>'.encode("latin-1"), "not UTF-8"),
+    ('<?xml version="1.0" encoding="utf-16"?><a/>'.encode("utf-16"), "not UTF-8"),
+    (b'<?xml version="1.0" encoding="utf-7"?>+ADw-!DOCTYPE a+AD4-<a/>', "'utf-7'; allowed is"),
+    (b"<!DOCTYPE a><a/>", "document type"),
+]
+
+
 @pytest.mark.parametrize(
-    ("content", "words"),
+    ("read", "content", "words"),
     [
-        (b"", "not JSON"),
-        (b"{", "not JSON"),
-        (b"NaN", "NaN is no JSON number"),
-        (b"[1e400]", "1e400 is no finite number"),
-        (b"-Infinity", "no JSON number"),
-        (b"9" * 5000, "whole number of more than 4300 digits"),
-        (b'"\\ud800"', "half a surrogate pair"),
-        (b'{"\\udfff": 1}', "half a surrogate pair"),
-        (b'[[{"a": "x\\uD800y"}]]', "half a surrogate pair"),
-        (b"[" * 100_000, "nested 100000 deep"),
-        (b"[" + b"0," * outside.MOST_VALUES + b"0]", "more than 1000000 values"),
-        (b"[" + b'"",' * 100 + b'"\xff"]', "not UTF-8"),
+        *((outside.json_value, *case) for case in JSON),
+        *((outside.toml_tables, *case) for case in TOML),
+        *((outside.xml_text, *case) for case in XML),
     ],
 )
-def test_other_json_is_refused(content: bytes, words: str) -> None:
-    with pytest.raises(OutsideError, match=words):
-        outside.json_value(content)
+def test_what_is_no_such_document_is_refused(
+    read: Callable[[bytes], Any], content: bytes, words: str
+) -> None:
+    with soon(), pytest.raises(OutsideError, match=words):
+        read(content)
 
 
 def test_whole_surrogate_pairs_and_escaped_ones_are_text() -> None:
     assert outside.json_value(b'"\\ud83d\\ude00"') == "\U0001f600"
     assert outside.json_value(b'"\\\\ud800"') == "\\ud800"
-
-
-@pytest.mark.parametrize(
-    ("content", "words"),
-    [
-        (b"a = ", "not valid TOML"),
-        (b"\xef\xbb\xbfa = 1", "byte order mark"),
-        (b"a.b = 1\na = 2", "not valid TOML"),
-        (b"a = " + b"9" * 5000, "whole number of more than 4300 digits"),
-        (b"a = " + b"[" * 100_000, "nested too deeply"),
-        (b"a = " + b"[" * 60 + b"]" * 60, "nested too deeply; allowed is a depth of 50"),
-        (b"a" + b".a" * 100_000 + b" = 1", "more than 50 parts"),
-        (b"[" + b'"a" . ' * 100_000 + b"a]", "more than 50 parts"),
-        (b"x = {" + b"'a'." * 60 + b"a = 1}", "more than 50 parts"),
-    ],
-)
-def test_other_toml_is_refused(content: bytes, words: str) -> None:
-    with soon(), pytest.raises(OutsideError, match=words):
-        outside.toml_tables(content)
 
 
 def test_toml_comes_in_as_a_plain_reader_has_it() -> None:
@@ -189,20 +191,6 @@ def test_toml_comes_in_as_a_plain_reader_has_it() -> None:
 )
 def test_dots_in_texts_are_no_keys(content: bytes) -> None:
     assert outside.toml_tables(content) == tomllib.loads(content.decode())
-
-
-@pytest.mark.parametrize(
-    ("content", "words"),
-    [
-        ('<a b="\xe9"/>'.encode("latin-1"), "not UTF-8"),
-        ('<?xml version="1.0" encoding="utf-16"?><a/>'.encode("utf-16"), "not UTF-8"),
-        (b'<?xml version="1.0" encoding="utf-7"?>+ADw-!DOCTYPE a+AD4-<a/>', "'utf-7'; allowed is"),
-        (b"<!DOCTYPE a><a/>", "document type"),
-    ],
-)
-def test_other_xml_is_refused(content: bytes, words: str) -> None:
-    with pytest.raises(OutsideError, match=words):
-        outside.xml_text(content)
 
 
 def test_xml_comes_in_without_its_mark() -> None:

@@ -50,7 +50,7 @@ def bounds(name: str, folder: Path, *at: Array, softness: Softness = EXACT) -> A
 @pytest.mark.parametrize("name", ["rack", "obstacles", "ur10"])
 def test_bounds_never_exceed_the_distance(name: str, folder: Path) -> None:
     geometry = whole_geometry_of(name, folder)
-    at = random_configurations(geometry, 120, np.random.default_rng(11))
+    at = random_configurations(geometry, 60, np.random.default_rng(11))
     bound = bounds(name, folder, *at)
     smooth = bounds(name, folder, *at, softness=Softness(WIDTH))
     far = near = 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
@@ -14,7 +15,14 @@ import trimesh
 from symbolic.array import Array
 from symbolic.errors import CollisionModelError
 from symbolic.geometry.bodies import MeshReader, _link_pieces, collision_bodies
-from symbolic.geometry.pairs import _gap, _sorted, build_geometry, coal_distance, pair_tolerance
+from symbolic.geometry.pairs import (
+    CellGeometry,
+    _gap,
+    _sorted,
+    build_geometry,
+    coal_distance,
+    pair_tolerance,
+)
 from symbolic.geometry.pieces import Hull, Piece, ball, farthest_from_axis, skeleton, support
 from symbolic.geometry.screen import reach_about_joints
 from symbolic.read.cell import load
@@ -130,8 +138,7 @@ def test_pairs_that_count_as_touching_do() -> None:
             assert coal_distance(pieces[pair.first], pieces[pair.second]) <= 0.0, pair
 
 
-def reason(first: str, second: str) -> str:
-    geometry = geometry_of("rack")
+def reason(geometry: CellGeometry, first: str, second: str) -> str:
     pair = {geometry.index(first), geometry.index(second)}
     return next((p.reason for p in geometry.excluded if {p.first, p.second} == pair), "")
 
@@ -154,16 +161,22 @@ def reason(first: str, second: str) -> str:
     ],
 )
 def test_reasons_of_the_rack(first: str, second: str, expected: str) -> None:
-    found = reason(first, second)
+    found = reason(geometry_of("rack"), first, second)
     assert found.startswith(expected)
     assert bool(found) == bool(expected)
 
 
-def test_the_user_may_leave_out_a_pair_with_a_reason() -> None:
-    settings = CollisionSettings(ignored=(IgnoredPair("payload", "ground", "never that low"),))
-    geometry = build_geometry(replace(rack(), collision=settings))
-    assert ("payload", "ground") not in geometry.pair_names
-    assert "ignored in the file: never that low" in [pair.reason for pair in geometry.excluded]
+def test_the_user_may_leave_out_pairs_with_a_reason() -> None:
+    """A pattern stands for every pair that it matches."""
+    ignored = (
+        IgnoredPair("payload", "ground", "never that low"),
+        IgnoredPair("left/link_*", "payload", "held"),
+    )
+    geometry = build_geometry(replace(rack(), collision=CollisionSettings(ignored=ignored)))
+    assert reason(geometry, "payload", "ground") == "ignored in the file: never that low"
+    for k in range(1, 7):
+        assert reason(geometry, f"left/link_{k}", "payload").endswith("held")
+    assert "ignored" not in reason(geometry, "right/link_1", "payload")
     wrong = CollisionSettings(ignored=(IgnoredPair("payload", "celing", ""),))
     with pytest.raises(CollisionModelError, match=r"'celing'.*ground"):
         build_geometry(replace(rack(), collision=wrong))
@@ -258,21 +271,6 @@ def test_pairs_within_an_arm_are_sorted_as_where_it_stands() -> None:
         assert found.possible is ((i, j) in possible)
 
 
-def test_a_pattern_stands_for_every_pair_it_matches() -> None:
-    cell = rack()
-    names = {body.name for body in build_geometry(cell).bodies}
-    left = {name for name in names if name.startswith("left/link_")}
-    pattern = IgnoredPair("left/link_*", "payload", "held")
-    geometry = build_geometry(replace(cell, collision=CollisionSettings(ignored=(pattern,))))
-    assert len(left) == 6
-    reasons = {
-        frozenset((geometry.bodies[p.first].name, geometry.bodies[p.second].name)): p.reason
-        for p in geometry.excluded
-    }
-    assert all(reasons[frozenset((name, "payload"))].endswith("held") for name in left)
-    assert "ignored" not in reasons.get(frozenset(("right/link_1", "payload")), "")
-
-
 def test_disabled_pairs_of_an_srdf_are_left_out_for_its_robot(tmp_path: Path) -> None:
     cell = rack()
     free = build_geometry(cell)
@@ -287,10 +285,21 @@ def test_disabled_pairs_of_an_srdf_are_left_out_for_its_robot(tmp_path: Path) ->
     robots = (replace(cell.robots[0], srdf=srdf), cell.robots[1])
     geometry = build_geometry(replace(cell, robots=robots))
     assert set(free.pair_names) - set(geometry.pair_names) == {pair}
-    assert "disabled in arm.srdf: Never" in [pair.reason for pair in geometry.excluded]
+    assert reason(geometry, *pair) == "disabled in arm.srdf: Never"
 
 
 STEPS = 16
+
+
+def motions(count: int, size: float, seed: int) -> Iterator[tuple[Array, Array, Array, Array]]:
+    """Random configurations (18,) of the rack before and after a move, its chord and its bend."""
+    geometry = whole_geometry_of("rack")
+    motion = functions_of(geometry)["motion"]
+    rng = np.random.default_rng(seed)
+    starts = np.hstack(random_configurations(geometry, count, rng))
+    for a, b in zip(starts, starts + rng.uniform(-size, size, starts.shape), strict=True):
+        chord, bend = motion(*np.split(a, 3), *np.split(b, 3))
+        yield a, b, np.ravel(np.array(chord)), np.ravel(np.array(bend))
 
 
 def points_of(pieces: list[tuple[Piece, ...]]) -> list[Array]:
@@ -301,19 +310,11 @@ def points_of(pieces: list[tuple[Piece, ...]]) -> list[Array]:
 def test_no_point_moves_farther_than_the_bound(size: float) -> None:
     """Distances at both ends, chord and bend bound every point's way between."""
     geometry = whole_geometry_of("rack")
-    motion = functions_of(geometry)["motion"]
-    rng = np.random.default_rng(21)
-    starts = np.hstack(random_configurations(geometry, 12, rng))
-    ends = starts + rng.uniform(-size, size, starts.shape)
-    parts = (slice(0, 6), slice(6, 12), slice(12, 18))
-    for a, b in zip(starts, ends, strict=True):
-        chord, bend = (
-            np.ravel(np.array(v)) for v in motion(*[a[p] for p in parts], *[b[p] for p in parts])
-        )
+    for a, b, chord, bend in motions(12, size, 21):
         seen = []
         for s in np.linspace(0.0, 1.0, STEPS + 1):
             c = (1 - s) * a + s * b
-            seen.append(points_of(placed_pieces(geometry, *[c[p] for p in parts])))
+            seen.append(points_of(placed_pieces(geometry, *np.split(c, 3))))
         for k, pair in enumerate(geometry.active):
             first, second = geometry.bodies[pair.first], geometry.bodies[pair.second]
             if first.group == second.group:
@@ -330,23 +331,14 @@ def test_no_point_moves_farther_than_the_bound(size: float) -> None:
 
 def test_links_of_one_arm_approach_no_faster_than_the_bound() -> None:
     geometry = whole_geometry_of("rack")
-    motion = functions_of(geometry)["motion"]
-    rng = np.random.default_rng(22)
-    starts = np.hstack(random_configurations(geometry, 15, rng))
-    ends = starts + rng.uniform(-0.2, 0.2, starts.shape)
-    parts = (slice(0, 6), slice(6, 12), slice(12, 18))
     own = [
         k
         for k, pair in enumerate(geometry.active)
         if geometry.bodies[pair.first].group == geometry.bodies[pair.second].group
     ]
     assert own
-    for a, b in zip(starts, ends, strict=True):
-        chord, bend = (
-            np.ravel(np.array(v)) for v in motion(*[a[p] for p in parts], *[b[p] for p in parts])
-        )
-        before = placed_pieces(geometry, *[a[p] for p in parts])
-        after = placed_pieces(geometry, *[b[p] for p in parts])
+    for a, b, chord, bend in motions(15, 0.2, 22):
+        before, after = (placed_pieces(geometry, *np.split(at, 3)) for at in (a, b))
         for k in own:
             pair = geometry.active[k]
             d_a = max(0.0, coal_distance(before[pair.first], before[pair.second]))

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import zipfile
+from collections.abc import Callable
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
@@ -32,7 +34,6 @@ from symbolic.geometry.pieces import (
     support,
     swept_cylinder,
 )
-from symbolic.read.meshes import MOST_FACES
 from symbolic.records import Box, Capsule, Cylinder, Sphere
 from symbolic.records.poses import pose_matrix
 from tests.machines import ur10_urdf
@@ -275,135 +276,94 @@ def test_a_mesh_with_holes_is_used_as_its_hull_with_a_warning(tmp_path: Path) ->
     assert ConvexHull(hull.vertices).volume == pytest.approx(ConvexHull(mesh.vertices).volume)
 
 
-def write_flat(path: Path) -> None:
-    trimesh.Trimesh([(0, 0, 0), (1, 0, 0), (0, 1, 0)], [(0, 1, 2)]).export(path)
+def stl(mesh: trimesh.Trimesh) -> bytes:
+    return bytes(trimesh.exchange.stl.export_stl(mesh))
 
 
-def write_empty(path: Path) -> None:
-    path.write_text("solid nothing\nendsolid nothing\n")
+def flat() -> bytes:
+    return stl(trimesh.Trimesh([(0, 0, 0), (1, 0, 0), (0, 1, 0)], [(0, 1, 2)]))
 
 
-def write_nonsense(path: Path) -> None:
-    path.write_bytes(b"not a mesh at all")
-
-
-def write_millimetres(path: Path) -> None:
-    trimesh.creation.box((300.0, 200.0, 100.0)).export(path)
-
-
-def write_endless(path: Path) -> None:
-    mesh = trimesh.creation.icosphere(subdivisions=7)
-    assert len(mesh.faces) > MOST_FACES
-    mesh.export(path)
-
-
-@pytest.mark.parametrize(
-    ("write", "message"),
-    [
-        (write_flat, "flat.*give it a thickness"),
-        (write_empty, "cannot be read|empty"),
-        (write_nonsense, "cannot be read|empty"),
-        (write_millimetres, "enormous.*150 m from its origin.*millimetres"),
-        (write_endless, "enormous.*327680 triangles.*simplify"),
-    ],
-)
-def test_unusable_meshes_are_refused(tmp_path: Path, write: object, message: str) -> None:
-    path = tmp_path / "bad.stl"
-    assert callable(write)
-    write(path)
-    with pytest.raises(CollisionModelError, match=message):
-        convex_pieces(path, ONES)
-
-
-def test_a_missing_mesh_is_named(tmp_path: Path) -> None:
-    with pytest.raises(
-        CollisionModelError, match=r"gone\.stl: the mesh cannot be read \(No such file"
-    ):
-        convex_pieces(tmp_path / "gone.stl", ONES)
-
-
-def write_loose(path: Path, count: int) -> None:
+def loose(count: int) -> bytes:
+    """So many triangles, each on its own."""
     rng = np.random.default_rng(5)
     corners = rng.uniform(-0.5, 0.5, (count, 1, 3)) + rng.normal(0.0, 0.01, (count, 3, 3))
     faces = np.arange(3 * count).reshape(-1, 3)
-    trimesh.Trimesh(corners.reshape(-1, 3), faces, process=False).export(path)
+    return stl(trimesh.Trimesh(corners.reshape(-1, 3), faces, process=False))
+
+
+def archive() -> bytes:
+    content = BytesIO()
+    with zipfile.ZipFile(content, "w") as file:
+        file.writestr("box.stl", stl(trimesh.creation.box((0.1, 0.1, 0.1))))
+    return content.getvalue()
+
+
+def promising(kind: str) -> bytes:
+    """A header that promises more than there is."""
+    return (
+        f"ply\nformat {kind} 1.0\nelement vertex 1000000000\nproperty double x\n"
+        "property double y\nproperty double z\nelement face 1000000000\n"
+        "property list uchar int vertex_indices\nend_header\n0 0 0\n"
+    ).encode()
+
+
+def endless(begin: str, piece: str) -> bytes:
+    return (begin + piece * 1_600_000).encode()
+
+
+def encoded(encoding: str) -> bytes:
+    """Entities that an encoding hides."""
+    return f'<?xml version="1.0" encoding="{encoding}"?><!DOCTYPE a><COLLADA/>'.encode(encoding)
+
+
+UNREAD = "cannot be read|empty"
+NO_NUMBER = b"v 0 0 0\nv 1 0 0\nv 0 nan 0\nv 0 0 1\nf 1 2 3\nf 1 2 4\nf 2 3 4\nf 1 3 4\n"
+ENTITY = b'<?xml version="1.0"?><!DOCTYPE a [<!ENTITY b "c">]><COLLADA>&b;</COLLADA>'
+LARGE = trimesh.creation.box((300.0, 200.0, 100.0))
 
 
 @pytest.mark.parametrize(
-    ("count", "message"),
+    ("name", "content", "message"),
     [
-        (190_000, "enormous mesh, 190000 triangles"),
-        (3000, "enormous mesh, 3000 separate parts; at most 400"),
+        ("m.stl", flat, "flat.*give it a thickness"),
+        ("m.stl", lambda: b"solid nothing\nendsolid nothing\n", UNREAD),
+        ("m.stl", lambda: b"not a mesh at all", UNREAD),
+        ("m.stl", lambda: stl(LARGE), "enormous.*150 m from its origin.*millimetres"),
+        ("m.stl", lambda: loose(190_000), "enormous mesh, 190000 triangles.*simplify"),
+        ("m.stl", lambda: loose(3000), "enormous mesh, 3000 separate parts; at most 400.*simplify"),
+        *((f"m.{kind}", archive, UNREAD) for kind in ("zip", "stl", "ply", "glb")),
+        ("m.ply", lambda: promising("ascii"), ""),
+        ("m.ply", lambda: promising("binary_little_endian"), ""),
+        ("m.obj", lambda: NO_NUMBER, "not finite"),
+        ("m.dae", lambda: ENTITY, "the mesh has a document type"),
+        ("m.dae", lambda: encoded("utf-16"), "the mesh byte 0 is"),
+        ("m.dae", lambda: encoded("utf-7"), "the mesh declares the enco"),
+        ("m.obj", lambda: endless("v 0 0 0\n", "f 1 1 1\n"), r"enormous mesh, \d+ words"),
+        ("m.obj", lambda: endless("v 0 0 0\nf ", "1\u00a0"), r"enormous mesh, \d+ words"),
+        ("m.off", lambda: endless("OFF\n9 9 0\n", "0 0 0\n"), r"enormous mesh, \d+ words"),
+        (
+            "m.ply",
+            lambda: endless("ply\nformat ascii 1.0\ncomment binary\n", "0 0 0\n"),
+            r"enormous mesh, \d+ words",
+        ),
+        ("m.dae", lambda: endless("<COLLADA>", "<a/>"), r"enormous mesh, \d+ elements"),
+        ("m.dae", lambda: endless("<COLLADA>", "<a b='' c=''/>"), r"enormous mesh, \d+ elements"),
     ],
 )
-def test_more_than_can_be_worked_with_is_told_at_once(
-    tmp_path: Path, count: int, message: str
+def test_unusable_meshes_are_told_at_once(
+    tmp_path: Path, name: str, content: Callable[[], bytes], message: str
 ) -> None:
-    write_loose(tmp_path / "loose.stl", count)
-    with soon(), pytest.raises(CollisionModelError, match=rf"loose\.stl: {message}.*simplify"):
-        convex_pieces(tmp_path / "loose.stl", ONES)
-
-
-@pytest.mark.parametrize("name", ["mesh.zip", "mesh.stl", "mesh.ply", "mesh.glb"])
-def test_an_archive_is_no_mesh(tmp_path: Path, name: str) -> None:
-    mesh = trimesh.creation.box((0.1, 0.1, 0.1)).export(file_type="stl")
-    with zipfile.ZipFile(tmp_path / name, "w") as archive:
-        archive.writestr("box.stl", mesh)
-    with pytest.raises(CollisionModelError, match=r"cannot be read as a mesh|empty"):
+    (tmp_path / name).write_bytes(content())
+    with soon(), pytest.raises(CollisionModelError, match=rf"{name}: .*({message})"):
         convex_pieces(tmp_path / name, ONES)
 
 
-def test_a_header_that_promises_more_than_there_is(tmp_path: Path) -> None:
-    path = tmp_path / "m.ply"
-    for kind in ("ascii", "binary_little_endian"):
-        path.write_text(
-            f"ply\nformat {kind} 1.0\nelement vertex 1000000000\nproperty double x\n"
-            "property double y\nproperty double z\nelement face 1000000000\n"
-            "property list uchar int vertex_indices\nend_header\n0 0 0\n"
-        )
-        with pytest.raises(CollisionModelError, match=r"m\.ply"):
-            convex_pieces(path, ONES)
-
-
-def test_entities_are_not_unfolded(tmp_path: Path) -> None:
-    path = tmp_path / "m.dae"
-    path.write_text('<?xml version="1.0"?><!DOCTYPE a [<!ENTITY b "c">]><COLLADA>&b;</COLLADA>')
-    with pytest.raises(CollisionModelError, match=r"m\.dae: the mesh has a document type"):
-        convex_pieces(path, ONES)
-
-
-@pytest.mark.parametrize("encoding", ["utf-16", "utf-7"])
-def test_entities_are_not_hidden_by_an_encoding(tmp_path: Path, encoding: str) -> None:
-    path = tmp_path / "m.dae"
-    document = f'<?xml version="1.0" encoding="{encoding}"?><!DOCTYPE a><COLLADA/>'
-    path.write_bytes(document.encode(encoding))
-    with pytest.raises(CollisionModelError, match=r"the mesh (byte 0 is|declares the enco)"):
-        convex_pieces(path, ONES)
-
-
-@pytest.mark.parametrize(
-    ("name", "begin", "piece"),
-    [
-        ("m.obj", "v 0 0 0\n", "f 1 1 1\n"),
-        ("m.obj", "v 0 0 0\nf ", "1\u00a0"),
-        ("m.off", "OFF\n9 9 0\n", "0 0 0\n"),
-        ("m.ply", "ply\nformat ascii 1.0\ncomment binary\n", "0 0 0\n"),
-        ("m.dae", "<COLLADA>", "<a/>"),
-        ("m.dae", "<COLLADA>", "<a b='' c=''/>"),
-    ],
-)
-def test_a_text_without_end_is_not_read(tmp_path: Path, name: str, begin: str, piece: str) -> None:
-    path = tmp_path / name
-    path.write_text(begin + piece * 1_600_000)
-    refused = r"enormous mesh, \d+ (words|elements)"
-    with soon(), pytest.raises(CollisionModelError, match=refused):
-        convex_pieces(path, ONES)
-
-
-def test_a_pipe_is_no_mesh(tmp_path: Path) -> None:
+def test_what_is_missing_or_a_pipe_is_named(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe.stl")
-    with pytest.raises(CollisionModelError, match=r"it is a pipe"):
-        convex_pieces(tmp_path / "pipe.stl", ONES)
+    for name, why in (("gone.stl", "No such file"), ("pipe.stl", "it is a pipe")):
+        with pytest.raises(CollisionModelError, match=rf"{name}: the mesh cannot be read \({why}"):
+            convex_pieces(tmp_path / name, ONES)
 
 
 @pytest.mark.parametrize("scale", [(1e308, 1.0, 1.0), (-1e308, 1e308, 1e308)])
@@ -414,13 +374,6 @@ def test_a_scale_beyond_all_bounds_is_told(
     trimesh.creation.box((20.0, 20.0, 20.0)).export(path)
     with pytest.raises(CollisionModelError, match=r"enormous mesh.*Set its scale"):
         convex_pieces(path, np.array(scale))
-
-
-def test_vertices_that_are_no_numbers_are_refused(tmp_path: Path) -> None:
-    path = tmp_path / "nan.obj"
-    path.write_text("v 0 0 0\nv 1 0 0\nv 0 nan 0\nv 0 0 1\nf 1 2 3\nf 1 2 4\nf 2 3 4\nf 1 3 4\n")
-    with pytest.raises(CollisionModelError, match="not finite"):
-        convex_pieces(path, ONES)
 
 
 COLLADA = """<?xml version="1.0"?>

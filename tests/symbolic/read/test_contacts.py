@@ -15,7 +15,7 @@ from symbolic.errors import BundleError, WorkcellError
 from symbolic.path.pieces import stated
 from symbolic.read.arms import arm_model
 from symbolic.read.cell import load, with_branches
-from symbolic.read.cell_files import collect_cell, drivable_files, unpack_cell
+from symbolic.read.cell_files import CellFiles, collect_cell, drivable_files, unpack_cell
 from symbolic.read.payload import pad_rotation
 from symbolic.read.task import best_conditioned, posture_path
 from symbolic.records import Cylinder, Mesh, Workcell
@@ -27,8 +27,9 @@ from symbolic.records.task import (
     waypoints_of,
 )
 from tests.machines import SINGLE, single_cell
-from tests.odd_cells import free_pandas, rack_on_rail
+from tests.odd_cells import PANDA_JOINT, free_pandas, rack_on_rail
 from tests.studies.conftest import TRANSFER
+from tests.symbolic.cells import rack_cell
 from tests.symbolic.read.samples import RACK, sample_data, write
 
 
@@ -183,27 +184,25 @@ def test_refuses(changes: dict[str, Any], path: str, words: str, tmp_path: Path)
 
 
 @pytest.mark.parametrize(
-    ("robots", "expected"),
+    ("robots", "decided", "expected"),
     [
-        ("[{start_branch = 'search'}, {start_branch=\"search\"}]", [3, 5]),
-        ('[{start_branch = 7}, {"start_branch" = "search"}]', [7, 5]),
-        ('[{start_branch = "search"}, {}]', [3, None]),
-        ("[{}, {}]", [None, None]),
+        ("[{start_branch = 'search'}, {start_branch=\"search\"}]", (3, 5), [3, 5]),
+        ('[{start_branch = "search"}, {start_branch = "search"}]', (-2, 5), ["search", 5]),
+        ('[{start_branch = 7}, {"start_branch" = "search"}]', (3, 5), [7, 5]),
+        ('[{start_branch = "search"}, {}]', (3, 5), [3, None]),
     ],
 )
-def test_each_robot_gets_its_own(robots: str, expected: list[int | None]) -> None:
+def test_each_robot_gets_its_own_branch_where_it_is_decided(
+    robots: str, decided: tuple[int, int], expected: list[int | str | None]
+) -> None:
     text = f"robots = {robots}\n".encode()
-    changed = with_branches(text, tomllib.loads(text.decode()), (3, 5))
+    changed = with_branches(text, tomllib.loads(text.decode()), decided)
     found = tomllib.loads(changed.decode())["robots"]
     assert [robot.get("start_branch") for robot in found] == expected
 
 
-def test_undecided_ones_stay() -> None:
-    text = b'robots = [{start_branch = "search"}, {start_branch = "search"}]'
-    assert with_branches(text, tomllib.loads(text.decode()), (-2, -2)) == text
-
-
-def test_the_tool_chooses_joints_bounds_and_a_path_within_the_limits(tmp_path: Path) -> None:
+def test_the_tool_chooses_what_leaves_the_others_conditioned_best(tmp_path: Path) -> None:
+    """With bounds and a path within the limits."""
     cell = free_pandas(tmp_path)
     assert [joint.drives for joint in cell.task.redundant] == [(2, -1), (-1, 2)]
     for joint, robot in zip(cell.task.redundant, cell.robots, strict=True):
@@ -212,10 +211,6 @@ def test_the_tool_chooses_joints_bounds_and_a_path_within_the_limits(tmp_path: P
         np.testing.assert_array_equal(joint.lower, robot.position_lower[2])
         np.testing.assert_array_equal(joint.upper, robot.position_upper[2])
         assert np.all((joint.lower < joint.initial) & (joint.initial < joint.upper))
-
-
-def test_the_chosen_joint_leaves_the_others_conditioned_best(tmp_path: Path) -> None:
-    cell = free_pandas(tmp_path)
     path = posture_path(cell.robots[0], cell.contacts[0], cell.task, {})
     assert path is not None
     least = [
@@ -250,26 +245,19 @@ def test_a_slide_is_redundant_by_itself(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("entry", "told"),
+    ("joint", "entry", "told"),
     [
-        ("lower = 1.0, upper = 0.5", "lower <= initial <= upper"),
-        ("upper = 3.5", "beyond the joint's limits"),
-        ("initial = [0.1, 0.2]", "array of 3 numbers"),
-        ("joints = 3", "unknown key"),
+        (PANDA_JOINT, "lower = 1.0, upper = 0.5", "lower <= initial <= upper"),
+        (PANDA_JOINT, "upper = 3.5", "beyond the joint's limits"),
+        (PANDA_JOINT, "initial = [0.1, 0.2]", "array of 3 numbers"),
+        (PANDA_JOINT, "joints = 3", "unknown key"),
+        ("elbow", "initial = 0.1", "joints are: left/panda_joint3, right/panda_joint3"),
     ],
 )
-def test_wrong_entries_are_told(tmp_path: Path, entry: str, told: str) -> None:
+def test_wrong_entries_are_told(tmp_path: Path, joint: str, entry: str, told: str) -> None:
     with pytest.raises(WorkcellError, match=r"task\.redundant") as error:
-        free_pandas(tmp_path, entry)
+        free_pandas(tmp_path, entry, joint)
     assert told in str(error.value)
-
-
-def test_an_unknown_joint_is_told_with_those_there_are(tmp_path: Path) -> None:
-    path = single_cell(SINGLE["panda"], tmp_path, {})
-    text = path.read_text()
-    path.write_text(text.replace('"samples" =', '"redundant" = [{joint = "elbow"}], "samples" ='))
-    with pytest.raises(WorkcellError, match="left/panda_joint3, right/panda_joint3"):
-        load(path)
 
 
 def test_redundant_joints_are_as_many_as_there_are_beyond_six(tmp_path: Path) -> None:
@@ -280,6 +268,9 @@ def test_redundant_joints_are_as_many_as_there_are_beyond_six(tmp_path: Path) ->
         load(path)
     path.write_text(path.read_text().replace('"panda_joint1", "panda_joint3"', '"panda_joint5"'))
     assert load(path).robots[0].redundant_joints == ("panda_joint5",)
+
+
+LAW = 'time_law = "constant"\n'
 
 
 @pytest.mark.parametrize("path", [RACK, TRANSFER])
@@ -300,34 +291,24 @@ def test_only_the_time_law_differs(path: Path, tmp_path: Path) -> None:
     np.testing.assert_array_equal(stated(drivable.task).lower[:-1], cell.task.lower)
 
 
-@pytest.mark.parametrize(
-    "rewrite",
-    [
-        lambda text: text.replace('time_law = "constant"\n', ""),
-        lambda text: text.replace("[task]", "[ task ]  # heading"),
-        lambda text: text.replace('time_law = "constant"\n', "").replace(
-            "\n[[task.waypoints]]", '\ntime_law = "constant"\n[[task.waypoints]]', 1
-        ),
-    ],
-)
-def test_the_key_may_stand_anywhere_in_its_table(rewrite: object) -> None:
-    stored = collect_cell(load(RACK))
+def rewritten(old: str, new: str) -> CellFiles:
+    """The rack's files, the workcell's text changed."""
+    stored = collect_cell(rack_cell())
     text = stored.files[stored.workcell].decode()
-    assert callable(rewrite)
-    changed = rewrite(text)
-    assert changed != text
-    variant = replace(stored, files={**stored.files, stored.workcell: changed.encode()})
-    made = drivable_files(variant)
+    assert old in text
+    changed = text.replace(old, new).encode()
+    return replace(stored, files={**stored.files, stored.workcell: changed})
+
+
+@pytest.mark.parametrize(("old", "new"), [(LAW, ""), ("[task]", "[ task ]  # heading")])
+def test_the_key_may_stand_anywhere_in_its_table_or_be_missing(old: str, new: str) -> None:
+    made = drivable_files(rewritten(old, new))
     assert tomllib.loads(made.files[made.workcell].decode())["task"]["time_law"] == "optimal"
 
 
 def test_a_task_written_otherwise_is_refused() -> None:
-    stored = collect_cell(load(RACK))
-    text = stored.files[stored.workcell].decode()
-    odd = text.replace("[task]\n", "", 1).replace("start =", "task.start =", 1)
-    variant = replace(stored, files={**stored.files, stored.workcell: odd.encode()})
     with pytest.raises(BundleError, match="time_law"):
-        drivable_files(variant)
+        drivable_files(rewritten("[task]\nstart =", "task.start ="))
 
 
 @pytest.mark.parametrize(
@@ -342,9 +323,7 @@ def test_a_task_written_otherwise_is_refused() -> None:
 def test_what_robots_drive_has_an_allocation_of_its_own(
     stated: str, usual: str, driven: str, tmp_path: Path
 ) -> None:
-    stored = collect_cell(load(RACK))
-    text = stored.files[stored.workcell].decode().replace("[task]\n", f"[task]\n{stated}")
-    variant = replace(stored, files={**stored.files, stored.workcell: text.encode()})
+    variant = rewritten("[task]\n", f"[task]\n{stated}")
     cell = unpack_cell(variant, tmp_path / "usual", check_digest=False)
     assert cell.task.allocation == usual
     assert unpack_cell(drivable_files(variant), tmp_path / "driven").task.allocation == driven

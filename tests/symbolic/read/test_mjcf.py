@@ -134,10 +134,7 @@ def test_links_move_as_in_mujoco(odd: Path) -> None:
         data.qpos[:] = q
         mujoco.mj_kinematics(other, data)
         found = placements(model, q)
-        for name in ("base", "carriage", "body_3"):
-            body = int(name[-1]) if name == "body_3" else other.body(name).id
-            np.testing.assert_allclose(found[name][:3, 3], data.xpos[body], atol=1e-9)
-            np.testing.assert_allclose(found[name][:3, :3].ravel(), data.xmat[body], atol=1e-9)
+        stand_as_in_mujoco(found, data, "base", "carriage", "body_3")
         np.testing.assert_allclose(found["tool"][:3, 3], data.site("tool").xpos, atol=1e-9)
         T_world_mesh = found["carriage"] @ mesh.pose
         ours = corners @ T_world_mesh[:3, :3].T + T_world_mesh[:3, 3]
@@ -146,6 +143,13 @@ def test_links_move_as_in_mujoco(odd: Path) -> None:
         np.testing.assert_allclose(
             ours[np.lexsort(ours.round(5).T)], theirs[np.lexsort(theirs.round(5).T)], atol=1e-6
         )
+
+
+def stand_as_in_mujoco(found: dict[str, Array], data: mujoco.MjData, *names: str) -> None:
+    for name in names:
+        body = data.body(int(name[5:]) if name.startswith("body_") else name)
+        np.testing.assert_allclose(found[name][:3, 3], body.xpos, atol=1e-9)
+        np.testing.assert_allclose(found[name][:3, :3].ravel(), body.xmat, atol=1e-9)
 
 
 def test_a_floating_base_stands_where_the_file_has_it(tmp_path: Path) -> None:
@@ -160,10 +164,7 @@ def test_a_floating_base_stands_where_the_file_has_it(tmp_path: Path) -> None:
     data = mujoco.MjData(other)
     data.qpos[7] = 0.4
     mujoco.mj_kinematics(other, data)
-    found = placements(model, np.array([0.4]))
-    for name in ("pelvis", "arm"):
-        np.testing.assert_allclose(found[name][:3, 3], data.body(name).xpos, atol=1e-9)
-        np.testing.assert_allclose(found[name][:3, :3].ravel(), data.body(name).xmat, atol=1e-9)
+    stand_as_in_mujoco(placements(model, np.array([0.4])), data, "pelvis", "arm")
 
 
 def test_a_cell_of_mjcf_is_stored_with_its_digest(gofa: Path, tmp_path: Path) -> None:
@@ -307,6 +308,9 @@ def test_everything_else_is_held_and_mimics_follow() -> None:
     assert held["lift"] == 0.0
     assert not set(moving) & set(held)
     assert len(moving) + len(held) == 1 + 2 * 8
+    # Where zero is out of its range, a joint is held at the nearest limit.
+    text = machine().replace('lower="-2" upper="2"', 'lower="0.4" upper="2"', 1)
+    assert dict(held_joints(parse_urdf(text.encode(), "m"), (), ()))["lift"] == 0.4
 
 
 def test_a_fixed_joint_may_bear_a_links_name() -> None:
@@ -320,12 +324,6 @@ def test_a_fixed_joint_may_bear_a_links_name() -> None:
     names = [frame.name for frame in model.frames]
     assert {"left_thumb", "left_plate"} <= set(names)
     assert names.count("left_thumb") == 1
-
-
-def test_a_joint_without_zero_in_its_range_is_held_at_its_nearest_limit() -> None:
-    text = machine().replace('lower="-2" upper="2"', 'lower="0.4" upper="2"', 1)
-    held = dict(held_joints(parse_urdf(text.encode(), "m"), (), ()))
-    assert held["lift"] == 0.4
 
 
 def test_joints_that_cannot_be_held_are_told() -> None:

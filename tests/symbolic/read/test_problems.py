@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -63,6 +62,9 @@ CASES: list[tuple[Any, ...]] = [
     ("robots", [], "found 0 tables; allowed are exactly 2"),
     ("robots[0].package_dirs", ["."] * 101, "found 101 folders"),
     ("robots[0].urdf", "package://" + "a" * 9000, "in no package that is found"),
+    ("robots[0].urdf", "package://example-robot-data/../a.urdf", "in no package that is found"),
+    ("robots[0].robot", "ur10", "found beside 'robot'", "robots[0].urdf"),
+    ("robots[0]", {"robot": "ur11"}, "robot = 'ur11' is the name of no", "robots[0].urdf"),
     ("environment", 3, "allowed is an array of tables, [[environment]]"),
     ("robots[0].locked_joints", 3, "allowed is a table"),
     ("robots[0].package_dirs", "x", "allowed is an array of folders"),
@@ -141,12 +143,14 @@ CASES: list[tuple[Any, ...]] = [
     # robots
     ("robots[0].urdf", "nowhere.urdf", "cannot be read (No such file"),
     ("robots[0].urdf", "a\0b", "allowed is the path of a file"),
+    ("robots[0].urdf", "x" * 5000, "File name too long"),
     ("robots[0].urdf", str(RACK), "not readable XML"),
     ("robots[0].flange", "tool", "did you mean 'tool0'?"),
     ("robots[0].flange", "link_4", "the last joint does not move"),
     ("robots[0].locked_joints.joint_9", 0.0, "no moving joint", "robots[0].locked_joints"),
     ("robots[0].locked_joints.joint_6", 0.0, "found 5 joints", "robots[0].urdf"),
     ("robots[0].package_dirs", ["nowhere"], "allowed is a folder", "robots[0].package_dirs[0]"),
+    ("robots[0].package_dirs", ["x" * 5000], "allowed is a folder", "robots[0].package_dirs[0]"),
     (
         "robots[0].position_lower",
         LOWER,
@@ -184,6 +188,7 @@ def test_problem(tmp_path: Path, case: tuple[Any, ...]) -> None:
     assert any(problem.startswith(f"{told}: ") and words in problem for problem in found), found
     for problem in found:
         assert problem.isprintable(), problem
+        assert len(problem) < 1200, problem
 
 
 def test_one_mistake_is_one_problem(tmp_path: Path) -> None:
@@ -234,15 +239,6 @@ def test_thousands_of_problems_are_counted(tmp_path: Path) -> None:
     assert found[-1].startswith("and ")
 
 
-@pytest.mark.parametrize("key", ["urdf", "package_dirs"])
-def test_names_of_thousands_of_letters(tmp_path: Path, key: str) -> None:
-    data = sample_data()
-    data["robots"][0][key] = "x" * 5000 if key == "urdf" else ["x" * 5000]
-    (told,) = problems_of(write(tmp_path, data))
-    assert told.startswith(f"robots[0].{key}")
-    assert len(told) < 300
-
-
 @pytest.mark.parametrize("kind", ["pipe", "device", "folder", "large"])
 def test_what_is_no_plain_file_is_told(tmp_path: Path, kind: str) -> None:
     data = sample_data()
@@ -269,14 +265,7 @@ def test_what_is_no_plain_file_is_told(tmp_path: Path, kind: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("content", "words"),
-    [
-        (b"name = ", "not valid TOML"),
-        (b"name = 'a'\nname = 'b'", "not valid TOML"),
-        (b"name = '\xff'", "byte 8 is not UTF-8"),
-        (b"a = " + b"[" * 100_000, "nested too deeply"),
-        (b"", "name: is missing"),
-    ],
+    ("content", "words"), [(b"name = ", "not valid TOML"), (b"", "name: is missing")]
 )
 def test_unusable_files(tmp_path: Path, content: bytes, words: str) -> None:
     path = tmp_path / "cell.toml"
@@ -284,67 +273,31 @@ def test_unusable_files(tmp_path: Path, content: bytes, words: str) -> None:
     assert any(words in problem for problem in problems_of(path))
 
 
-UrdfChange = Callable[[str], str]
-URDF_CASES: list[tuple[str, UrdfChange, str, str]] = [
-    ("not xml", lambda text: text[:200], "robots[0].urdf", "not readable XML"),
-    ("no robot", lambda _: "<a/>", "robots[0].urdf", "its root is <a>"),
-    ("no links", lambda _: "<robot name='a'/>", "robots[0].urdf", "has no links"),
-    (
-        "planar",
-        lambda text: text.replace('"joint_4" type="revolute"', '"joint_4" type="planar"'),
-        "robots[0].urdf",
-        "'joint_4' is of kind Planar; allowed are revolute",
-    ),
-    (
-        "branched",
-        lambda text: text.replace('<parent link="link_5"/>', '<parent link="link_4"/>'),
-        "robots[0].urdf",
-        "does not follow the joint before it",
-    ),
-    (
-        "no effort",
-        lambda text: text.replace('effort="390"', 'effort="0"'),
-        "robots[0].torque_max",
-        "the description gives 0 for joint 1",
-    ),
-    (
-        "range reversed",
-        lambda text: text.replace('upper="1.483529864195180"', 'upper="-5"'),
-        "robots[0].position_lower[2]",
-        "not below its upper limit -5 rad",
-    ),
-    (
-        "mesh missing",
-        lambda text: text.replace(
-            '<box size="0.161 0.093 0.707"/>', '<mesh filename="package://a/b.stl"/>'
-        ),
-        "robots[0].urdf",
-        "collision mesh 'package://a/b.stl' that it names does not exist",
-    ),
-    (
-        "mesh missing far away",
-        lambda text: text.replace(
-            '<box size="0.161 0.093 0.707"/>', f'<mesh filename="package://{"a/" * 50}link.stl"/>'
-        ),
-        "robots[0].urdf",
-        "a/a/a/link.stl' that it names does not exist",
-    ),
-]
+REVOLUTE, BOX = '"joint_4" type="revolute"', '<box size="0.161 0.093 0.707"/>'
+FAR = f'<mesh filename="package://{"a/" * 50}link.stl"/>'
 
 
 @pytest.mark.parametrize(
-    ("change", "key_path", "words"),
-    [case[1:] for case in URDF_CASES],
-    ids=[case[0] for case in URDF_CASES],
+    ("old", "new", "key", "words"),
+    [
+        ("<robot", "<a><robot", "urdf", "not readable XML"),
+        ("robot", "arm", "urdf", "its root is <arm>"),
+        (REVOLUTE, REVOLUTE.replace("revolute", "planar"), "urdf", "'joint_4' is of kind Planar;"),
+        ('parent link="link_5"', 'parent link="link_4"', "urdf", "does not follow the joint"),
+        ('effort="390"', 'effort="0"', "torque_max", "the description gives 0 for joint 1"),
+        ('upper="1.483529864195180"', 'upper="-5"', "position_lower[2]", "its upper limit -5 rad"),
+        (BOX, '<mesh filename="package://a/b.stl"/>', "urdf", "'package://a/b.stl' that it names"),
+        (BOX, FAR, "urdf", "a/a/a/link.stl' that it names does not exist"),
+    ],
 )
-def test_unusable_urdf(tmp_path: Path, change: UrdfChange, key_path: str, words: str) -> None:
+def test_unusable_urdf(tmp_path: Path, old: str, new: str, key: str, words: str) -> None:
     text = GOFA.read_text(encoding="utf-8")
-    assert change(text) != text
-    (tmp_path / "arm.urdf").write_text(change(text), encoding="utf-8")
+    assert old in text
+    (tmp_path / "arm.urdf").write_text(text.replace(old, new), encoding="utf-8")
     data = sample_data()
     data["robots"][0]["urdf"] = "arm.urdf"
     found = problems_of(write(tmp_path, data))
-    assert any(p.startswith(f"{key_path}: ") and words in p for p in found), found
+    assert any(p.startswith(f"robots[0].{key}: ") and words in p for p in found), found
 
 
 def test_further_checks_run_on_a_valid_cell_only(tmp_path: Path) -> None:

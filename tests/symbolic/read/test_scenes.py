@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from io import BytesIO
 from pathlib import Path
 
@@ -212,13 +211,18 @@ def test_what_is_no_body_is_told(tmp_path: Path, shape: str, why: str) -> None:
             "scene.sdf includes itself",
         ),
         ("<!DOCTYPE x><sdf/>", "is no scene"),
+        ("<mujoco><world></mujoco>", "MuJoCo does not take it: "),
     ],
 )
 def test_a_broken_scene_is_refused(tmp_path: Path, text: str, words: str) -> None:
-    with pytest.raises(SceneError) as refused:
-        scene(tmp_path, text)
-    assert str(refused.value).startswith("scene.sdf: ")
-    assert words in str(refused.value)
+    refused(tmp_path, "scene.sdf", text, words)
+
+
+def refused(folder: Path, name: str, text: str, words: str) -> None:
+    with pytest.raises(SceneError) as told:
+        scene(folder, text, name)
+    assert str(told.value).startswith(f"{name}: ")
+    assert words in str(told.value)
 
 
 def test_a_missing_scene_is_told(tmp_path: Path) -> None:
@@ -353,39 +357,30 @@ OBJECT = "world: {collision_objects: [{id: a, "
 
 
 @pytest.mark.parametrize(
-    ("name", "text", "words"),
+    ("text", "words"),
     [
-        ("s.yaml", "a: [", "is not readable YAML"),
-        ("s.yaml", "- 1", "is no message; allowed is a mapping"),
-        ("s.yaml", "world: {}", "has no world.collision_objects"),
-        ("s.yaml", "world: {collision_objects: 3}", "allowed is an array of tables"),
-        ("s.yaml", f"{OBJECT}primitives: [{{type: 1, dimensions: [1, 2]}}]}}]}}", "of 3 numbers"),
-        ("s.yaml", f"{OBJECT}primitives: [{{type: 2, dimensions: [.inf]}}]}}]}}", "found inf"),
-        (
-            "s.yaml",
-            f"{OBJECT}primitives: [{{}}], primitive_poses: [{{}}, {{}}]}}]}}",
-            "primitive_poses: found 2; allowed are as many as primitives, 1",
-        ),
-        ("s.yaml", f"{OBJECT}pose: {{position: [0, 0]}}}}]}}", "position: found [0, 0]"),
-        ("s.yaml", f"{OBJECT}meshes: [{{triangles: 3}}]}}]}}", "without triangles"),
-        ("s.yaml", f"{OBJECT}meshes: [{{triangles: [[0, 1]]}}]}}]}}", "are not rows of three"),
-        ("s.yaml", f"{OBJECT}meshes: [{{triangles: [[0, 1, 2]]}}]}}]}}", "it does not have"),
-        ("s.yaml", f"{OBJECT}planes: [{{coef: [0, 0, 0, 1]}}]}}]}}", "a plane without a normal"),
-        ("s.scene", "name\n* a\n1\nbox\n1 2", "it ends too early"),
-        ("s.scene", "name\n* a\n1\nmesh\n-1 0\n", "it counts -1 things"),
-        ("s.scene", "name\n* a\n1\nteapot\n", "of the kind 'teapot'"),
-        ("s.scene", "name\n* a\n1\nsphere\nbig\n", "object 'a' is not as MoveIt writes it"),
-        ("s.scene", "name\n*", "is not as MoveIt writes it"),
-        ("s.scene", "name\n.\n", "holds no obstacle"),
+        ("a: [", "is not readable YAML"),
+        ("- 1", "is no message; allowed is a mapping"),
+        ("world: {}", "has no world.collision_objects"),
+        ("world: {collision_objects: 3}", "allowed is an array of tables"),
+        (f"{OBJECT}primitives: [{{type: 1, dimensions: [1, 2]}}]}}]}}", "of 3 numbers"),
+        (f"{OBJECT}primitives: [{{type: 2, dimensions: [.inf]}}]}}]}}", "found inf"),
+        (f"{OBJECT}primitives: [{{}}], primitive_poses: [{{}}, {{}}]}}]}}", "as primitives, 1"),
+        (f"{OBJECT}pose: {{position: [0, 0]}}}}]}}", "position: found [0, 0]"),
+        (f"{OBJECT}meshes: [{{triangles: 3}}]}}]}}", "without triangles"),
+        (f"{OBJECT}meshes: [{{triangles: [[0, 1]]}}]}}]}}", "are not rows of three"),
+        (f"{OBJECT}meshes: [{{triangles: [[0, 1, 2]]}}]}}]}}", "it does not have"),
+        (f"{OBJECT}planes: [{{coef: [0, 0, 0, 1]}}]}}]}}", "a plane without a normal"),
+        ("name\n* a\n1\nbox\n1 2", "it ends too early"),
+        ("name\n* a\n1\nmesh\n-1 0\n", "it counts -1 things"),
+        ("name\n* a\n1\nteapot\n", "of the kind 'teapot'"),
+        ("name\n* a\n1\nsphere\nbig\n", "object 'a' is not as MoveIt writes it"),
+        ("name\n*", "is not as MoveIt writes it"),
+        ("name\n.\n", "holds no obstacle"),
     ],
 )
-def test_a_broken_planning_scene_is_refused(
-    tmp_path: Path, name: str, text: str, words: str
-) -> None:
-    with pytest.raises(SceneError) as refused:
-        scene(tmp_path, text, name)
-    assert str(refused.value).startswith(f"{name}: ")
-    assert words in str(refused.value)
+def test_a_broken_planning_scene_is_refused(tmp_path: Path, text: str, words: str) -> None:
+    refused(tmp_path, "s.scene" if text.startswith("name") else "s.yaml", text, words)
 
 
 # --- MJCF ---
@@ -453,20 +448,6 @@ def test_a_scene_that_is_only_to_be_seen_says_so(tmp_path: Path) -> None:
     ):
         with pytest.raises(SceneError, match=f"holds no obstacle; (.*; )?{told}"):
             scene(tmp_path, text, "scene.xml")
-
-
-@pytest.mark.parametrize(
-    "text", ["<mujoco><worldbody><geom/></worldbody></mujoco>", "<mujoco><world></mujoco>"]
-)
-def test_what_mujoco_refuses_is_told_in_its_words(tmp_path: Path, text: str) -> None:
-    with pytest.raises(SceneError, match=r"scene\.xml: MuJoCo does not take it: \w+"):
-        scene(tmp_path, text, "scene.xml")
-
-
-def test_mjcf_needs_mujoco(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "mujoco", None)
-    with pytest.raises(SceneError, match=r"pip install 'dual-arm-carry\[sim\]'"):
-        scene(tmp_path, MJCF, "scene.xml")
 
 
 # --- the names and poses that are written ---

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -33,7 +34,7 @@ from symbolic.robot.arm import (
     pose_error,
     track_function,
 )
-from symbolic.robot.model import RobotModel, build_robot_model
+from symbolic.robot.model import build_robot_model
 from tests.machines import robot_record, ur10_urdf
 from tests.symbolic.cells import call, gofa_model, hand_cell, start_posture
 from tests.symbolic.read.samples import GOFA
@@ -169,16 +170,6 @@ angles = st.lists(st.floats(-np.pi, np.pi), min_size=6, max_size=6).map(np.array
 rates = st.lists(st.floats(-3, 3), min_size=6, max_size=6).map(np.array)
 
 
-@pytest.fixture(scope="module", params=["gofa12", "ur10"])
-def urdf(request: pytest.FixtureRequest) -> Path:
-    return GOFA if request.param == "gofa12" else ur10_urdf()
-
-
-@pytest.fixture(scope="module")
-def arm(urdf: Path) -> RobotModel:
-    return build_robot_model(robot_record(urdf))
-
-
 @given(q=angles, v=rates, a=rates, roll=st.floats(-np.pi, np.pi), pitch=st.floats(-1.5, 1.5))
 def test_torque_on_a_tilted_base(q: Array, v: Array, a: Array, roll: float, pitch: float) -> None:
     """The same arm, hung in Pinocchio onto a tilted fixed joint under upright gravity."""
@@ -194,21 +185,17 @@ def test_torque_on_a_tilted_base(q: Array, v: Array, a: Array, roll: float, pitc
     assert_allclose(torque, expected, rtol=0, atol=1e-10)
 
 
-def test_locked_joints_leave_other_than_six() -> None:
-    robot = replace(robot_record(GOFA), locked_joints=(("joint_6", 0.0),))
-    with pytest.raises(RobotModelError, match="gofa12"):
-        build_robot_model(robot)
-
-
-def test_unknown_flange() -> None:
-    robot = replace(robot_record(GOFA), flange="tool1")
-    with pytest.raises(RobotModelError, match=r"'tool1'.*'tool0'"):
-        build_robot_model(robot)
-
-
-def test_missing_urdf() -> None:
-    with pytest.raises(RobotModelError, match=r"absent\.urdf"):
-        build_robot_model(robot_record(Path("absent.urdf")))
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ({"locked_joints": (("joint_6", 0.0),)}, "gofa12.*found 5 joints"),
+        ({"flange": "tool1"}, "'tool1'.*'tool0'"),
+        ({"urdf": Path("absent.urdf")}, r"absent\.urdf"),
+    ],
+)
+def test_what_is_no_arm_is_told(change: dict[str, Any], told: str) -> None:
+    with pytest.raises(RobotModelError, match=told):
+        build_robot_model(replace(robot_record(GOFA), **change))
 
 
 # Rounding of some hundred operations on numbers of order 10 (rates) to 1000 (torques).
@@ -309,13 +296,10 @@ def test_inverse_dynamics(case: Case, seed: int) -> None:
     assert_allclose(torque, expected, rtol=0, atol=TOLERANCE * scale)
 
 
-def test_frame_that_does_not_exist() -> None:
+def test_what_is_no_frame_or_no_model_is_told() -> None:
     model = MODELS["manipulator"]()
     with pytest.raises(IndexError, match=f"frame 1000 of a model with {model.nframes} frames"):
         bridge.frame_kinematics(model, 1000)
-
-
-def test_text_that_is_no_model() -> None:
     with pytest.raises(ValueError, match="not a serialised Pinocchio model"):
         bridge.inverse_dynamics(SimpleNamespace(saveToString=lambda: "22 nonsense"))
 
