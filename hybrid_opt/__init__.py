@@ -66,7 +66,7 @@ if TYPE_CHECKING:
     from hybrid_opt.timing.records import JerkTiming as JerkTiming
     from hybrid_opt.timing.records import Timing as Timing
     from hybrid_opt.timing.records import TimingLimits as TimingLimits
-    from hybrid_opt.workbench.browser import live as live
+    from hybrid_opt.workbench import live as live
     from symbolic.errors import DualArmError as DualArmError
     from symbolic.errors import SettingsError as SettingsError
     from symbolic.errors import WorkcellError as WorkcellError

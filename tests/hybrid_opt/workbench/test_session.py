@@ -12,8 +12,7 @@ import pytest
 
 import hybrid_opt as ho
 from hybrid_opt.errors import ResultsError
-from hybrid_opt.workbench.browser import Workbench
-from hybrid_opt.workbench.session import Session, handles, moved
+from hybrid_opt.workbench import Session, Workbench, handles, moved
 from tests.hybrid_opt.cells import shipped
 from tests.waiting import HANGS
 
