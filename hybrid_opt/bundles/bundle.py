@@ -231,7 +231,18 @@ def manifest(
             {"name": robot.name, "joints": list(joints)}
             for robot, joints in zip(job.workcell.robots, job.joint_names, strict=True)
         ],
-        "phases": phase_documents(job),
+        "phases": [
+            {
+                "name": phase.name,
+                "begin": phase.begin,
+                "duration": phase.duration,
+                "peak_normal_force": phase.force.normal.max(axis=0).tolist(),
+                "free_of_collisions": phase.certificate.is_free,
+                "most_used": phase.most_used,
+                "limits": {name: float(use) for name, use in phase.use.items()},
+            }
+            for phase in job.phases
+        ],
         "stands_on": [list(names) for names in job.stands_on],
         "squeeze": {
             "text": str(job.squeeze),
@@ -264,22 +275,6 @@ def manifest(
         "how_to_run": target.how_to_run,
         "written_by": f"dual-arm-carry {own_version()}",
     }
-
-
-def phase_documents(job: Job) -> list[dict[str, Any]]:
-    """The phases with times, forces, proof and limits, JSON values."""
-    return [
-        {
-            "name": phase.name,
-            "begin": phase.begin,
-            "duration": phase.duration,
-            "peak_normal_force": phase.force.normal.max(axis=0).tolist(),
-            "free_of_collisions": phase.certificate.is_free,
-            "most_used": phase.most_used,
-            "limits": {name: float(use) for name, use in phase.use.items()},
-        }
-        for phase in job.phases
-    ]
 
 
 def warnings_of(job: Job) -> list[str]:

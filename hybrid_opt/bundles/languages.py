@@ -166,25 +166,36 @@ def _module(export: Export, arm: int) -> str:
     payload, T_pad_box = export.workcell.payload, inverse(export.workcell.contacts[arm].T_box_pad)
     # Half of the box about its centre of mass, in the pad's frame.
     centre = 1e3 * (T_pad_box @ np.append(payload.centre_of_mass, 1.0))[:3]
-    text = filled(
+    return _filled_module(
         "carry.mod",
-        number=arm + 1,
-        cell=comment(job.workcell.name),
-        robot=comment(robot.name),
-        task=tasks[arm],
+        export,
+        arm,
         positions=len(q),
         duration=f"{float(sampled.time[-1]):.3f}",
         first_task=tasks[0],
         second_task=tasks[1],
-        tool=tool_data(export, arm),
         load=_load(payload.mass / 2.0, centre, np.zeros(3)),
         pressing="" if presses else LEFT_OUT,
         grip=grip,
         meetings="\n".join(f"  VAR syncident carryMeet{k};" for k in range(1, last + 1)),
-        first=target_text(np.rad2deg(q[0])),
         calls="\n".join([*calls, _meeting(last)]),
-        check="\n".join(checked_start(q.shape[1])),
         phases="\n".join(line for k in range(last - 1) for line in _moves(export, arm, k, places)),
+    )
+
+
+def _filled_module(name: str, export: Export, arm: int, **values: object) -> str:
+    """A module from a template, with values of its own beside those of all."""
+    robot, q = export.workcell.robots[arm], export.sampled.arm(arm, export.sampled.q)
+    text = filled(
+        name,
+        number=arm + 1,
+        cell=comment(export.workcell.name),
+        robot=comment(robot.name),
+        task=tasks_of(export)[arm],
+        tool=_tool(export, arm),
+        first=_target(np.rad2deg(q[0])),
+        check="\n".join(_checked_start(q.shape[1])),
+        **values,
     )
     # RAPID files have Windows line ends.
     return "\r\n".join(line for line in text.split("\n") if LEFT_OUT not in line)
@@ -227,7 +238,7 @@ def _moves(export: Export, arm: int, index: int, places: Sequence[str]) -> Itera
     else:
         for k in range(span.start + 1, span.stop):
             yield (
-                f"    MoveAbsJ {target_text(np.rad2deg(q[k]))} \\NoEOffs, v1000 "
+                f"    MoveAbsJ {_target(np.rad2deg(q[k]))} \\NoEOffs, v1000 "
                 f"\\T:={steps[k - 1]:.6f}, {ZONE if k < last else 'fine'}, carryPad;"
             )
     yield "  ENDPROC"
@@ -244,17 +255,15 @@ def _places(export: Export, arm: int) -> list[str]:
     first, fourth, sixth = (0, 3, 5) if len(robot.torque_max) == SIX else (0, 4, 6)
     found = []
     for T, turns, degrees in zip(grip, quadrant, np.rad2deg(q), strict=True):
-        x, y, z, w = Rotation.from_matrix(T[:3, :3]).as_quat()
         further = "9E9" if len(degrees) == SIX else f"{degrees[EXTRA]:.6f}"
         found.append(
-            f"[{_numbers(1e3 * T[:3, 3])},{_numbers(np.array([w, x, y, z]))},"
-            f"[{turns[first]},{turns[fourth]},{turns[sixth]},0],"
+            f"[{_frame(T)[1:-1]},[{turns[first]},{turns[fourth]},{turns[sixth]},0],"
             f"[{further},9E9,9E9,9E9,9E9,9E9]]"
         )
     return found
 
 
-def checked_start(joints: int) -> Iterator[str]:
+def _checked_start(joints: int) -> Iterator[str]:
     """No move to the first position: the way there is not checked for collisions."""
     axes = [f"robax.rax_{axis}" for axis in range(1, SIX + 1)]
     axes += ["extax.eax_a"] if joints == SEVEN else []
@@ -271,7 +280,7 @@ def checked_start(joints: int) -> Iterator[str]:
     yield ""
 
 
-def tool_data(export: Export, arm: int) -> str:
+def _tool(export: Export, arm: int) -> str:
     """A tooldata: the pad's frame on the flange, and the tool's load where it is known."""
     robot = export.workcell.robots[arm]
     frame = _frame(robot.T_flange_pad)
@@ -289,11 +298,11 @@ def _load(mass: float, centre: Array, inertia: Array) -> str:
 
 def _frame(pose: Array) -> str:
     """A RAPID pose: position [mm] and quaternion, real part first."""
-    x, y, z, w = Rotation.from_matrix(pose[:3, :3]).as_quat()
-    return f"[{_numbers(1e3 * pose[:3, 3])},{_numbers(np.array([w, x, y, z]))}]"
+    turn = Rotation.from_matrix(pose[:3, :3]).as_quat(scalar_first=True)
+    return f"[{_numbers(1e3 * pose[:3, 3])},{_numbers(turn)}]"
 
 
-def target_text(degrees: Array) -> str:
+def _target(degrees: Array) -> str:
     """A jointtarget; a seventh axis is an external one to RAPID, other external axes are unused."""
     if len(degrees) == SIX:
         return f"[{_numbers(degrees)},[9E9,9E9,9E9,9E9,9E9,9E9]]"
@@ -362,21 +371,14 @@ def egm_files(export: Export) -> dict[str, str | bytes]:
 
 
 def _egm_module(export: Export, arm: int) -> str:
-    robot, axes = export.workcell.robots[arm], range(1, SIX + 1)
-    first = np.rad2deg(export.sampled.arm(arm, export.sampled.q)[0])
-    text = filled(
+    axes = range(1, SIX + 1)
+    return _filled_module(
         "carry_egm.mod",
-        number=arm + 1,
-        cell=comment(export.workcell.name),
-        robot=comment(robot.name),
-        task=tasks_of(export)[arm],
-        tool=tool_data(export, arm),
-        first=target_text(first),
+        export,
+        arm,
         criteria=" ".join(f"\\J{axis}:=carryClose" for axis in axes),
         moved=" ".join(f"\\J{axis}" for axis in axes),
-        check="\n".join(checked_start(len(first))),
     )
-    return text.replace("\n", "\r\n")
 
 
 CYCLE = 0.002
