@@ -19,7 +19,7 @@ a wide one was not seen.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import casadi as ca
 import numpy as np
@@ -30,7 +30,6 @@ from symbolic.array import Array
 from symbolic.contact.soft_finger import SoftPatch, torsion_capacity
 from symbolic.records import Workcell
 from symbolic.records.poses import skew
-from symbolic.records.quantities import GRAVITY
 
 NOISE = np.array([0.3] * 3 + [0.03] * 3)
 """Noise of a sensor's mean over a hold, with drift [N, N m]. The fit's residual may raise it."""
@@ -164,16 +163,6 @@ def _balance(hold: Hold) -> tuple[Array, Array, Array]:
         value += to_box @ hold.wrench[i]
         noise += (to_box * NOISE**2) @ to_box.T
     return matrix, value, noise
-
-
-def swapped(hold: Hold) -> Hold:
-    """The hold with the readings of both arms exchanged."""
-    return replace(hold, wrench=hold.wrench[::-1])
-
-
-def gravity_in(T_world_box: Array) -> Array:
-    """(3,) gravity in the frame of a box [m/s^2]."""
-    return np.asarray(T_world_box[:3, :3].T @ GRAVITY)
 
 
 def without_crosstalk(wrench: Array, crosstalk: Array) -> Array:

@@ -17,7 +17,6 @@ from hybrid_opt.calibrating.estimate import (
     Load,
     delay,
     fit_load,
-    gravity_in,
     without_crosstalk,
 )
 from hybrid_opt.calibrating.faults import (
@@ -196,7 +195,8 @@ def _pieces(run: Run, places: Places) -> list[Hold]:
             T_world_box = places.box[middle]
             pads = np.array([inverse(T_world_box) @ pad for pad in places.pads[middle]])
             wrench = np.nan_to_num(places.wrench[inside].mean(axis=0))
-            found.append(Hold(pads, gravity_in(T_world_box), wrench, run.labels.mass))
+            gravity = T_world_box[:3, :3].T @ GRAVITY
+            found.append(Hold(pads, gravity, wrench, run.labels.mass))
     return found
 
 

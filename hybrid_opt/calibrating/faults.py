@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hybrid_opt.calibrating.estimate import Hold, Load, delay, fit_load, swapped
+from hybrid_opt.calibrating.estimate import Hold, Load, delay, fit_load
 from hybrid_opt.calibrating.recording import TARE_TIME, Places, Run, places_of
 from symbolic.array import Array
 from symbolic.records import Workcell
@@ -169,7 +169,8 @@ def _unit_faults(workcell: Workcell, run: Run, places: Places) -> list[Fault]:
 def _force_units(run: Run, places: Places, held: Array) -> list[str]:
     """Forces, of whatever frame, against what is commanded and against those of the other arm."""
     force = np.median(np.linalg.norm(places.wrench[held, :, :3], axis=2), axis=0)
-    asked = np.nanmedian(np.where(run.has_command, run.commanded[held], 0.0), axis=0)
+    commands = np.isfinite(run.commanded).any(axis=0)
+    asked = np.nanmedian(np.where(commands, run.commanded[held], 0.0), axis=0)
     for unit, factor in FORCE_UNITS:
         for i in range(2):
             near = LIKE_UNIT * factor
@@ -290,7 +291,7 @@ def load_faults(holds: list[Hold], load: Load, moments: bool) -> list[Fault]:
     """
     left = LARGEST_RESIDUAL * abs(load.mass * GRAVITY[2])
     if load.residual > left:
-        other = fit_load([swapped(hold) for hold in holds], moments)
+        other = fit_load([replace(hold, wrench=hold.wrench[::-1]) for hold in holds], moments)
         if other.residual < load.residual / 2.0:
             text = (
                 f"with the sensors exchanged {other.residual:.1f} N of the forces are left, as "

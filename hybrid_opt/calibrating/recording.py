@@ -98,11 +98,6 @@ class Run:
         """Whether moments were recorded, of both arms."""
         return bool(np.isfinite(self.wrench[:, :, 3:]).all())
 
-    @property
-    def has_command(self) -> Array:
-        """(2,) for which arms a normal force was commanded at any time."""
-        return np.asarray(np.isfinite(self.commanded).any(axis=0))
-
     def within(self, begin: float, end: float) -> Array:
         """(n,) which samples lie between two instants."""
         return np.asarray((self.time >= begin) & (self.time <= end))

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import CubicHermiteSpline
+from scipy.spatial.transform import Rotation
 
 from hybrid_opt.carry import Carry
 from hybrid_opt.cell import Cell
@@ -27,11 +28,11 @@ from hybrid_opt.witness.box import (
     mujoco_module,
 )
 from hybrid_opt.witness.reference import (
+    ArmController,
     ArmState,
     Control,
     Reference,
     carry_reference,
-    controllers,
     pressed_reference,
 )
 from hybrid_opt.witness.scene import (
@@ -42,7 +43,6 @@ from hybrid_opt.witness.scene import (
     compiled,
     joint_names,
     patch_area,
-    quaternion,
 )
 from symbolic.array import Array, interpolated
 from symbolic.records import Workcell
@@ -217,14 +217,20 @@ class _Run:
         self._torque_use = np.zeros(len(self._limit))
         self._jacobian = np.zeros((6, self._model.nv))
         self._standing = self._place(witness.disturbance)
-        stiffness = self._settings.joint_stiffness(self._workcell)
+        stiffness = self._settings.stiffness * self._limit
         critical = 2.0 * np.sqrt(stiffness * self._joint_inertia())
         damping = self._settings.damping_ratio * critical
-        gains = [(stiffness[arm], damping[arm]) for arm in self._arms]
-        layers = [self._settings.layer * patch_area(c) for c in self._workcell.contacts]
-        self._controllers = controllers(
-            control, reference.leader, self._settings, (gains[0], gains[1]), (layers[0], layers[1])
-        )
+        pressing = {"impedance": (), "leader": (1 - reference.leader,), "both": (0, 1)}[control]
+        self._controllers = [
+            ArmController(
+                self._settings,
+                (stiffness[arm], damping[arm]),
+                self._settings.layer * patch_area(contact),
+                is_force_controlled=i in pressing,
+                drift_stiffness=self._settings.drift_stiffness if self._shares_squeeze else 0.0,
+            )
+            for i, arm, contact in zip((0, 1), self._arms, self._workcell.contacts, strict=True)
+        ]
 
     def outcome(self) -> ArmOutcome:
         """Simulate."""
@@ -285,7 +291,8 @@ class _Run:
         pairs = zip(self._workcell.contacts, self._reference.workcell.contacts, strict=True)
         displaced = np.mean([real.T_box_pad - told.T_box_pad for real, told in pairs], axis=0)
         position = job.start[:3] - rotation @ displaced[:3, 3]
-        standing = np.concatenate([position, quaternion(rotation)])
+        turn = Rotation.from_matrix(rotation).as_quat(scalar_first=True)
+        standing = np.concatenate([position, turn])
         data.qpos[self._pose] = standing
         data.xfrc_applied[self._pads.box, :3] = -self._workcell.payload.mass * disturbance
         self._mujoco.mj_forward(self._model, data)
@@ -355,7 +362,8 @@ class _Ticks:
         at = np.minimum(time, end)
 
         counts = [len(robot.torque_max) for robot in reference.workcell.robots]
-        motors = settings.joint_armature(reference.workcell) * motion.q_second
+        limit = reference.workcell.of_joints("torque_max")
+        motors = settings.armature * limit * motion.q_second
         more = (factor - 1.0) * np.repeat(reference.normal_force, counts, axis=1)
         return cls(
             time=time,

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cache
 from types import ModuleType
 from typing import Any, Generic, TypeVar
 
@@ -25,7 +26,6 @@ from hybrid_opt.witness.scene import (
     PAD_MASS,
     SimulationSettings,
     compiled,
-    quaternion,
     rim,
     scene_text,
     tilt_centre,
@@ -246,6 +246,7 @@ def drive_of(
     single = np.concatenate([[True], np.diff(carry.time) > SAME_TIME])
     path = CubicHermiteSpline(carry.time[single], carry.pose[single], carry.rate[single])
     rotation = box_rotation(carry.workcell.task.orientation, path(amid))
+    turn = Rotation.from_matrix(rotation).as_quat(scalar_first=True)
     omega = interpolated(clipped, carry.time, carry.angular_velocity)
     acceleration, alpha = (
         ((amid > begin) & (amid < end))[:, None] * interpolated(amid, carry.time, values)
@@ -265,7 +266,7 @@ def drive_of(
     return Drive(
         leader=leader,
         time=np.asarray(time),
-        pose=np.column_stack([path(amid)[:, :3], quaternion(rotation)]),
+        pose=np.column_stack([path(amid)[:, :3], turn]),
         velocity=np.column_stack([path(clipped, 1)[:, :3], spin]),
         acceleration=np.column_stack([acceleration, spin_rate]),
         press=np.interp(clipped, carry.time, force),
@@ -309,7 +310,7 @@ class Witness:
         self.settings = settings or SimulationSettings()
         self._mujoco = mujoco_module()
         self._disturbance = disturbance
-        self._models: dict[int, Any] = {}
+        self._model = cache(self._compiled)
 
     def simulate(self, drive: Drive, factor: float = 1.0) -> Outcome:
         """One carry with the pressing force times a factor, up to its end or to a slip."""
@@ -345,11 +346,9 @@ class Witness:
         holds = bool(slip[-1].max() <= settings.slip)
         return Outcome(factor, holds, np.array(time), np.array(slip), np.array(turn))
 
-    def _model(self, leader: int) -> Any:
-        if leader not in self._models:
-            text = scene_text(self.workcell, self.settings, leader, self._disturbance)
-            self._models[leader] = compiled(self._mujoco, text)[0]
-        return self._models[leader]
+    def _compiled(self, leader: int) -> Any:
+        text = scene_text(self.workcell, self.settings, leader, self._disturbance)
+        return compiled(self._mujoco, text)[0]
 
 
 def workcell_of_case(workcell: Workcell, case: Array) -> Workcell:

@@ -12,7 +12,7 @@ each, since nothing else keeps the box in its place between them.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal, get_args
+from typing import Literal
 
 import numpy as np
 import pinocchio as pin
@@ -274,7 +274,6 @@ def _with_rest(values: Array, keep: float) -> Array:
 
 
 Control = Literal["impedance", "leader", "both"]
-CONTROLS: tuple[Control, ...] = get_args(Control)
 
 
 @dataclass(frozen=True, eq=False)
@@ -347,28 +346,6 @@ class ArmController:
         error = state.error - np.linalg.pinv(state.jacobian) @ linear
         sprung: Array = self._stiffness * error + self._damping * state.error_rate
         return effort + sprung + pressed * along
-
-
-def controllers(
-    control: Control,
-    leader: int,
-    settings: ArmSettings,
-    gains: tuple[tuple[Array, Array], tuple[Array, Array]],
-    pad_stiffness: tuple[float, float],
-) -> tuple[ArmController, ArmController]:
-    """One controller per arm.
-
-    Args:
-        leader: index of the arm that keeps its place under `leader`.
-        gains: per arm stiffness and damping of its joints [N m/rad, N m s/rad].
-    """
-
-    def one(i: int) -> ArmController:
-        by_force = control == "both" or (control == "leader" and i != leader)
-        drift = settings.drift_stiffness if control == "both" else 0.0
-        return ArmController(settings, gains[i], pad_stiffness[i], by_force, drift)
-
-    return one(0), one(1)
 
 
 def pressed_reference(cell: Cell, carry: Carry, leader: int = 0) -> tuple[Reference, Squeeze]:

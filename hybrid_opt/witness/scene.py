@@ -167,14 +167,6 @@ class ArmSettings(ContactSettings):
         if not (min(positive) > 0.0 and min(other) >= 0.0):
             raise SettingsError("give positive settings of the controllers")
 
-    def joint_stiffness(self, workcell: Workcell) -> Array:
-        """(all joints,) of both arms, side by side [N m/rad]."""
-        return self.stiffness * workcell.of_joints("torque_max")
-
-    def joint_armature(self, workcell: Workcell) -> Array:
-        """(all joints,) of both arms, side by side [kg m^2]."""
-        return self.armature * workcell.of_joints("torque_max")
-
 
 def scene_text(
     workcell: Workcell, settings: SimulationSettings, leader: int, disturbance: ArrayLike
@@ -409,13 +401,8 @@ def _pad_text(workcell: Workcell, settings: SimulationSettings, i: int, slides: 
 
 def placed(T: Array) -> str:
     """A transform (4, 4) as MJCF's attributes."""
-    return f'pos="{mjcf_text(T[:3, 3])}" quat="{mjcf_text(quaternion(T[:3, :3]))}"'
-
-
-def quaternion(rotation: Array) -> Array:
-    """Unit quaternions (..., 4), real part first, of rotation matrices (..., 3, 3)."""
-    last: Array = Rotation.from_matrix(rotation).as_quat()
-    return last[..., [3, 0, 1, 2]]
+    turn = Rotation.from_matrix(T[:3, :3]).as_quat(scalar_first=True)
+    return f'pos="{mjcf_text(T[:3, 3])}" quat="{mjcf_text(turn)}"'
 
 
 def mjcf_text(values: ArrayLike) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -19,7 +20,6 @@ from hybrid_opt.timing.solve import time_path
 from hybrid_opt.witness.arms import CellWitness
 from hybrid_opt.witness.box import workcell_of_case
 from hybrid_opt.witness.reference import (
-    CONTROLS,
     BoxJob,
     Control,
     JointMotion,
@@ -104,7 +104,7 @@ def test_pads_are_where_the_arms_hold_the_box() -> None:
         np.testing.assert_allclose(data.site(f"pad_{i + 1}").xpos, T_world_pad[:3, 3], atol=1e-9)
 
 
-@pytest.mark.parametrize("control", CONTROLS)
+@pytest.mark.parametrize("control", get_args(Control))
 def test_a_box_at_rest_slips_below_the_least_force(control: Control) -> None:
     """N = m g / (2 mu), arms and controllers included."""
     cell = hand_cell()
@@ -163,7 +163,7 @@ def test_force_control_takes_what_a_wrong_reference_adds() -> None:
     witness = CellWitness(cell)
     excess = {
         control: witness.simulate(nearer, control).normal_force[-1].mean() / (1.5 * LEAST) - 1.0
-        for control in CONTROLS
+        for control in get_args(Control)
     }
     assert excess["impedance"] > 0.05
     assert max(abs(excess["leader"]), abs(excess["both"])) < 0.01

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from PIL import Image, ImageSequence
 from hybrid_opt import recommend, search
 from hybrid_opt.cell import Cell
 from hybrid_opt.store.trajectory_file import write_trajectory
-from hybrid_opt.witness.reference import CONTROLS
+from hybrid_opt.witness.reference import Control
 from studies import simulate
 from studies.research import thresholds
 from tests.studies.programs.test_carries import TABLE, stored
@@ -85,7 +86,7 @@ def recommended(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPat
 @pytest.mark.parametrize(
     ("recommended", "controller"),
     [
-        *(("rack", controller) for controller in [*CONTROLS, "pads"]),
+        *(("rack", controller) for controller in [*get_args(Control), "pads"]),
         *((name, how) for name in ("transfer", "pandas") for how in ("leader", "pads")),
         ("uneven", "pads"),
     ],
