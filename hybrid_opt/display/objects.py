@@ -27,6 +27,7 @@ from hybrid_opt.sensitivity import Sensitivities, Sensitivity
 from hybrid_opt.static_hold import static_hold
 from hybrid_opt.timing.records import Timing
 from symbolic.array import Array
+from symbolic.records import Workcell
 
 MAX_CLOUD = 1500
 """Feasible candidates behind a front."""
@@ -99,14 +100,9 @@ def _(carry: Carry) -> dict[str, str]:
 def _(carry: Carry) -> str:
     still = float(static_hold(carry.workcell).normal_force.max())
     time = carry.time - carry.time[0]
-    series = [
-        Series(robot.name, np.column_stack([time, carry.normal_force[:, i]]), ARMS[i])
-        for i, robot in enumerate(carry.workcell.robots)
-    ]
     rest = np.array([[time[0], still], [time[-1], still]])
-    series.append(Series("level and still", rest, REST, size=0.8))
-    focus = np.concatenate([one.points for one in series])
-    return plot(series, "time [s]", "normal force [N]", focus)
+    level = Series("level and still", rest, REST, size=0.8)
+    return _forces(carry.workcell, time, carry.normal_force, "normal force [N]", level)
 
 
 @picture_of.register
@@ -114,12 +110,16 @@ def _(job: Job) -> str:
     """The commanded normal forces of the whole job."""
     time = np.concatenate([phase.begin + phase.motion.time for phase in job.phases])
     force = np.concatenate([phase.force.normal for phase in job.phases])
+    return _forces(job.workcell, time, force, "commanded normal force [N]")
+
+
+def _forces(workcell: Workcell, time: Array, force: Array, title: str, *more: Series) -> str:
+    """Forces (n, 2) of both arms over time (n,), and more beside them."""
     series = [
         Series(robot.name, np.column_stack([time, force[:, i]]), ARMS[i])
-        for i, robot in enumerate(job.workcell.robots)
-    ]
-    focus = np.concatenate([one.points for one in series])
-    return plot(series, "time [s]", "commanded normal force [N]", focus)
+        for i, robot in enumerate(workcell.robots)
+    ] + list(more)
+    return plot(series, "time [s]", title, np.concatenate([one.points for one in series]))
 
 
 @picture_of.register

@@ -61,23 +61,13 @@ def scene_data(
     }
 
 
-def scene_js() -> str:
-    """The script that draws a scene; it needs three.js before it."""
-    return (files("hybrid_opt.display") / "scene.js").read_text("utf-8")
+THREE, PLOTLY = "vendor/three.min.js", "vendor/plotly-basic.min.js"
+"""What `scene.js` needs before it, and what draws points, lines and bars; with licence lines."""
 
 
-def three_js() -> str:
-    """three.js with its licence line."""
-    return _vendored("three.min.js")
-
-
-def plotly_js() -> str:
-    """plotly.js with its licence line: what draws points, lines and bars."""
-    return _vendored("plotly-basic.min.js")
-
-
-def _vendored(name: str) -> str:
-    return (files("hybrid_opt.display") / "vendor" / name).read_text("utf-8")
+def asset(name: str) -> str:
+    """The text of a script or page that ships with this room."""
+    return (files("hybrid_opt.display") / name).read_text("utf-8")
 
 
 def embedded_json(document: Any) -> str:
@@ -153,13 +143,13 @@ class CarryView:
             "numbers": rows.tolist(),
             "begin": float(carry.time[look.sample] - carry.time[0]),
         }
-        return Template(_own("view.html")).substitute(
+        return Template(asset("view.html")).substitute(
             title=html.escape(heading_of(carry)),
             note=html.escape(look.text),
             data=embedded_json(document),
-            three=three_js().replace("</script", "<\\/script"),
-            scene=scene_js(),
-            player=_own("view.js"),
+            three=asset(THREE).replace("</script", "<\\/script"),
+            scene=asset("scene.js"),
+            player=asset("view.js"),
         )
 
     def save(self, path: str | Path) -> None:
@@ -184,7 +174,3 @@ class CarryView:
             f'<iframe srcdoc="{page}" sandbox="allow-scripts" '
             f'style="width:100%;height:{self.height}px;border:0"></iframe>'
         )
-
-
-def _own(name: str) -> str:
-    return (files("hybrid_opt.display") / name).read_text("utf-8")

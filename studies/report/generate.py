@@ -26,7 +26,7 @@ from typing import Any
 from matplotlib.figure import Figure
 from PIL import Image
 
-from hybrid_opt.display.scene import embedded_json, plotly_js, scene_js, three_js
+from hybrid_opt.display.scene import PLOTLY, THREE, asset, embedded_json
 from hybrid_opt.display.table import Table, counted, number
 from hybrid_opt.progress import Progress
 from hybrid_opt.robust.squeeze import PADS
@@ -253,7 +253,7 @@ def render_page(data: ReportData, document: dict[str, Any], tables: str, picture
     """
     texts = files("studies.report") / "page"
     boot, own = ((texts / name).read_text("utf-8") for name in ("boot.js", "page.js"))
-    scripts = [plotly_js(), three_js(), scene_js(), own]
+    scripts = [asset(PLOTLY), asset(THREE), asset("scene.js"), own]
     shown = ("workcell", "settings", "environment")
     settings = {key: to_json(getattr(data.summary, key)) for key in shown}
     return Template((texts / "page.html").read_text("utf-8")).substitute(
