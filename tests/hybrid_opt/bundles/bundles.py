@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from functools import cache
 
 from hybrid_opt.bundles import TARGETS, BundleOptions
 from hybrid_opt.bundles.bundle import prepared
 from hybrid_opt.bundles.job_file import Contents, Export
+from hybrid_opt.bundles.programs import carry_job as programs
 from hybrid_opt.job.records import Job
 from symbolic.records import Driver
 from tests.hybrid_opt.job.jobs import rack_job
@@ -40,6 +42,12 @@ def exported(target: str, step: float | None = None) -> Export:
 def contents(target: str) -> Contents:
     """The files of a bundle by path."""
     return TARGETS[target].files(exported(target))
+
+
+@cache
+def read_job() -> programs.Job:
+    """The rack's job as all programs read it."""
+    return programs.Job(json.loads(text_of("json", "job.json")))
 
 
 def text_of(target: str, name: str) -> str:

@@ -1,20 +1,17 @@
-"""A parser for the part of RAPID that motion modules use, and a stand-in for the controller that
-runs both tasks, after ABB's reference manual and the manual of Force Control (FC Pressure).
+"""RAPID's motion modules read as the Python that they nearly are, and a stand-in for the controller
+that runs both tasks, after ABB's reference manual and the manual of Force Control (FC Pressure).
 
-The parser knows nothing of the exporter: it reads tokens, declarations, procedures with parameters,
-conditions, assignments and calls with optional arguments (`\\Name` and `\\Name:=value`), and
-returns them as plain records.
-
-The controller runs each task by itself; they wait for one another only where they say so. Robots
-follow at once, along straight lines of the joints (MoveAbsJ) or of the pad (FCPressL). Force rises
-by `FORCE_RATE`, and stays as it was when a task ends.
+Procedures are generators: instructions take their time cycle by cycle. The controller runs each
+task by itself; they wait for one another only where they say so. Robots follow at once, along
+straight lines of the joints (MoveAbsJ) or of the pad (FCPressL). Force rises by `FORCE_RATE`, and
+stays as it was when a task ends.
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any
 
@@ -27,205 +24,86 @@ from symbolic.records import Workcell
 from symbolic.records.poses import inverse
 from symbolic.robot.model import build_robot_model
 
-Value = float | str | list["Value"]
-
-_TOKEN = re.compile(
-    r"(?P<space>[ \t\r\n]+)|(?P<comment>![^\n]*)|(?P<text>\"(?:[^\"\n]|\"\")*\")"
-    r"|(?P<number>[-+]?\d+(?:\.\d+)?(?:E[-+]?\d+)?)|(?P<word>[A-Za-z][A-Za-z0-9_]*)"
-    r"|(?P<mark>:=|<>|<=|>=|[\[\]{},;\\().<>=+*/-])"
-)
-_RESERVED = {
-    *("MODULE", "ENDMODULE", "PROC", "ENDPROC", "ERROR"),
-    *("VAR", "PERS", "CONST", "IF", "ENDIF"),
-}
-MAX_NAME = 32
-
-
-class RapidError(Exception):
-    """The text is not RAPID."""
-
-
-@dataclass
-class Call:
-    """An instruction: its name, positional arguments and, per argument, the optional ones."""
-
-    name: str
-    arguments: list[Value] = field(default_factory=list)
-    optional: dict[str, Value] = field(default_factory=dict)
-
-
-@dataclass
-class Module:
-    """A module: declarations as (storage, type, name, value), procedures and their error handlers
-    by name."""
-
-    name: str
-    declarations: list[tuple[str, str, str, Value | None]] = field(default_factory=list)
-    procedures: dict[str, list[Call]] = field(default_factory=dict)
-    parameters: dict[str, list[tuple[str, str]]] = field(default_factory=dict)
-    handlers: dict[str, list[Call]] = field(default_factory=dict)
-
-
-class _Parser:
-    def __init__(self, text: str) -> None:
-        self.tokens: list[tuple[str, str]] = []
-        position = 0
-        while position < len(text):
-            match = _TOKEN.match(text, position)
-            if match is None:
-                raise RapidError(f"unexpected {text[position]!r} at {position}")
-            kind = str(match.lastgroup)
-            if kind not in ("space", "comment"):
-                self.tokens.append((kind, match.group()))
-            position = match.end()
-        self.at = 0
-
-    def peek(self, ahead: int = 0) -> str:
-        place = self.at + ahead
-        return self.tokens[place][1] if place < len(self.tokens) else ""
-
-    def take(self, expected: str = "") -> str:
-        found = self.peek()
-        if not found or (expected and found != expected):
-            raise RapidError(f"expected {expected!r}, found {found!r}")
-        self.at += 1
-        return found
-
-    def name(self) -> str:
-        kind, found = self.tokens[self.at]
-        if kind != "word" or found in _RESERVED or len(found) > MAX_NAME:
-            raise RapidError(f"{found!r} is no name")
-        self.at += 1
-        return found
-
-    def value(self) -> Value:
-        kind, found = self.tokens[self.at]
-        if found == "[":
-            self.take()
-            items = [self.value()]
-            while self.peek() == ",":
-                self.take()
-                items.append(self.value())
-            self.take("]")
-            return items
-        self.at += 1
-        if kind == "number":
-            return float(found)
-        if kind == "text":
-            return found[1:-1]
-        if kind == "word":
-            # A component, or a product.
-            while self.peek() in (".", "*"):
-                found += self.take() + self.take()
-            return found
-        raise RapidError(f"{found!r} is no value")
-
-    def expression(self, end: str) -> str:
-        """Tokens up to one that ends an expression, whose brackets have to fit."""
-        found, open_brackets = [], 0
-        while self.peek() != end:
-            token = self.take()
-            open_brackets += (token == "(") - (token == ")")
-            if token in (";", ":=") or token in _RESERVED or open_brackets < 0:
-                raise RapidError(f"{token!r} in an expression")
-            found.append(token)
-        if open_brackets or not found:
-            raise RapidError(f"expected an expression before {end!r}")
-        self.take(end)
-        return " ".join(found)
-
-    def call(self) -> Call:
-        call = Call(self.name())
-        self._options(call)
-        while self.peek() != ";":
-            if call.arguments or call.optional:
-                self.take(",")
-            given = len(call.optional)
-            self._options(call)
-            if len(call.optional) > given and self.peek() in (",", ";"):
-                continue
-            call.arguments.append(self.value())
-            self._options(call)
-        self.take(";")
-        return call
-
-    def _options(self, call: Call) -> None:
-        while self.peek() == "\\":
-            self.take()
-            option = self.name()
-            if option in call.optional:
-                raise RapidError(f"\\{option} given twice")
-            call.optional[option] = True if self.peek() != ":=" else self._assigned()
-
-    def _assigned(self) -> Value:
-        self.take(":=")
-        return self.value()
-
-    def statements(self, *ends: str) -> list[Call]:
-        """Statements up to a closing word; what a condition holds follows it, up to ENDIF."""
-        calls = []
-        while self.peek() not in ends:
-            if self.peek() == "IF":
-                self.take()
-                calls.append(Call("IF", [self.expression("THEN")]))
-                calls += [*self.statements("ENDIF"), Call("ENDIF")]
-            elif self.peek(1) == ":=":
-                target = self.name()
-                self.take(":=")
-                calls.append(Call(":=", [target, self.expression(";")]))
-            else:
-                calls.append(self.call())
-        self.take()
-        return calls
-
-    def declared(self) -> tuple[str, str, str, Value | None]:
-        storage, kind, name = self.take(), self.name(), self.name()
-        if self.peek() == "{":
-            self.take()
-            size = self.value()
-            self.take("}")
-            value: Value | None = self._assigned()
-            if not isinstance(value, list) or len(value) != size:
-                raise RapidError(f"{name} has not {size} entries")
-        else:
-            value = self._assigned() if self.peek() == ":=" else None
-        self.take(";")
-        return storage, kind, name, value
-
-    def module(self) -> Module:
-        self.take("MODULE")
-        module = Module(self.name())
-        while self.peek() in ("VAR", "PERS", "CONST"):
-            module.declarations.append(self.declared())
-        while self.peek() == "PROC":
-            self.take()
-            name = self.name()
-            self.take("(")
-            module.parameters[name] = []
-            while self.peek() != ")":
-                module.parameters[name].append((self.name(), self.name()))
-            self.take(")")
-            while self.peek() == "VAR":
-                self.declared()
-            module.procedures[name] = self.statements("ENDPROC", "ERROR")
-            if self.peek(-1) == "ERROR":
-                module.handlers[name] = self.statements("ENDPROC")
-        self.take("ENDMODULE")
-        if self.peek():
-            raise RapidError(f"{self.peek()!r} after the module")
-        return module
-
-
-def parse(text: str) -> Module:
-    """The module that a text holds."""
-    return _Parser(text).module()
-
-
 CYCLE = 0.004
 """Of the controller [s]."""
 
 FORCE_RATE = 100.0
 """Change of a force that is built up [N/s]."""
+
+LONGEST_NAME = 32
+
+DECLARED = re.compile(r"(VAR|PERS|CONST) (\w+) (\w+)(?:\{(\d+)\})?(?: := (.+))?")
+
+HANDLER = "  except TimeoutError:"
+
+VALUES = {name: name for name in ("fine", "v5", "v1000", "z15", "load0", "ERR_WAITSYNCTASK")}
+VALUES["ERRNO"] = "ERR_WAITSYNCTASK"
+"""What a controller knows by itself, as far as modules use it."""
+
+
+@dataclass
+class Module:
+    """A module: by name how something is stored, its type and its value (None where none is given),
+    and its procedures as Python."""
+
+    declared: dict[str, tuple[str, str, Any]]
+    procedures: dict[str, str]
+
+
+def parse(text: str) -> Module:
+    """The module that a text holds, one statement per line."""
+    declared: dict[str, tuple[str, str, Any]] = {}
+    procedures: dict[str, list[str]] = {}
+    body, depth = list[str](), 0
+    for line in text.splitlines():
+        code = re.sub(r'("[^"]*")|!.*', lambda found: found[1] or "", line).strip()
+        unquoted = re.sub(r'"[^"]*"', "", code)
+        assert all(len(word) <= LONGEST_NAME for word in re.findall(r"\w+", unquoted)), code
+        begun = re.fullmatch(r"PROC (\w+)\(\)", code)
+        condition = re.fullmatch(r"IF (.+) THEN", code)
+        if begun:
+            body, depth = procedures.setdefault(begun[1], []), 2
+            body += [f"def {begun[1]}():", f"  begun('{begun[1]}')", "  try:", "    yield from ()"]
+        elif code in ("ERROR", "ENDPROC"):
+            assert depth == 2, "what a condition holds ends within its procedure"
+            if HANDLER not in body:
+                body.append(HANDLER)
+            if code == "ENDPROC":
+                body.append("    raise")
+                depth = 0
+        elif condition:
+            compared = condition[1].replace("<>", "!=")
+            compared = re.sub(r"(?<![<>!=])=", "==", compared).replace("Abs", "abs")
+            body.append(f"{'  ' * depth}if {compared}:")
+            depth += 1
+        elif code == "ENDIF":
+            depth -= 1
+        elif code and code.split()[0] not in ("MODULE", "ENDMODULE"):
+            assert code.endswith(";"), code
+            stated = DECLARED.fullmatch(code[:-1])
+            if stated is None:
+                assert depth >= 2, code
+                body.append("  " * depth + _statement(code[:-1]))
+            elif not depth:
+                value = _value(stated[5] or "None")
+                assert stated[4] is None or len(value) == int(stated[4]), code
+                declared[stated[3]] = stated[1], stated[2], value
+    return Module(declared, {name: "\n".join(lines) for name, lines in procedures.items()})
+
+
+def _value(text: str) -> Any:
+    return eval(text, {"TRUE": True, "FALSE": False})
+
+
+def _statement(code: str) -> str:
+    """An assignment, or an instruction with optional arguments (`\\Name` and `\\Name:=value`)."""
+    if re.match(r"\w+ :=", code):
+        return code.replace(":=", "=")
+    name, _, rest = code.partition(" ")
+    rest = re.sub(r"\\(\w+):=([^,\\]+)", r"\\dict(\1=\2)", rest)
+    rest = re.sub(r"\\([A-Z]\w*)", r"\\dict(\1=True)", rest)
+    arguments = re.sub(r",?\s*\\", ", ", rest).removeprefix(", ")
+    return f"yield from {name}({arguments})"
 
 
 class Exit(Exception):
@@ -233,33 +111,52 @@ class Exit(Exception):
 
 
 class Task:
-    """One task with its robot.
+    """One task with its robot; public methods with capital letters are instructions.
 
     Attributes:
         q: joints [rad].
         force: that the pad presses with; negative where it is drawn off [N].
-        load: half of the box that the controller knows of [kg].
         log: what it wrote, and why it ended.
         runs: whether it still does.
     """
 
     def __init__(self, cell: Controller, arm: int, module: Module, q: Array) -> None:
-        self.arm, self.q, self.force, self.load = arm, q.copy(), 0.0, 0.0
+        self.arm, self.q, self.force = arm, q.copy(), 0.0
         self.log: list[str] = []
         self.runs, self._spare = True, 0.0
         self._cell, self._module = cell, module
         self._robot = cell.workcell.robots[arm]
         self._model = build_robot_model(self._robot)
         self._data = self._model.model.createData()
-        self._names: dict[str, Any] = {"abs": abs, "ERR_WAITSYNCTASK": "ERR_WAITSYNCTASK"}
-        for _, kind, name, value in module.declarations:
+        self._names: dict[str, Any] = dict(VALUES)
+        for name, (_, kind, value) in module.declared.items():
             self._names[name] = _target(value) if kind == "jointtarget" else value
-        self._names["CJointT"] = lambda: _target([np.rad2deg(self.q).tolist(), []])
-        self._body = self._run("Carry")
+            if kind == "tooldata":
+                self._names[name] = SimpleNamespace(tload=value[2])
+            elif kind == "syncident":
+                self._names[name] = name
+        for name in dir(self):
+            if name[0].isupper():
+                self._names[name] = self._instruction(getattr(self, name))
+        self._names |= {
+            "CJointT": lambda: _target([np.rad2deg(self.q).tolist(), []]),
+            "begun": lambda name: cell.begins.__setitem__(name, cell.now),
+        }
+        exec("\n".join(module.procedures.values()), self._names)
+        self._body = self._names["Carry"]()
+
+    def _instruction(self, does: Callable[..., Iterator[None]]) -> Callable[..., Iterator[None]]:
+        """One whose optional arguments may stand anywhere."""
+
+        def done(*given: Any) -> Iterator[None]:
+            named = {k: v for each in given if isinstance(each, dict) for k, v in each.items()}
+            return does(*(each for each in given if not isinstance(each, dict)), **named)
+
+        return done
 
     def set(self, name: str, value: float) -> None:
         """Change a PERS, as someone at the pendant does."""
-        assert any(s == "PERS" and n == name for s, _, n, _ in self._module.declarations)
+        assert self._module.declared[name][0] == "PERS"
         self._names[name] = value
 
     def cycle(self) -> None:
@@ -269,70 +166,37 @@ class Task:
                 next(self._body)
             except StopIteration:
                 self._ended("done")
-            except Exit as error:
+            except (Exit, TimeoutError) as error:
                 self._ended(str(error) or "EXIT")
 
     def _ended(self, told: str) -> None:
         self.runs = False
         self.log.append(told)
 
-    def _run(self, name: str) -> Iterator[None]:
-        self._cell.begins[name] = self._cell.now
-        try:
-            yield from self._statements(self._module.procedures[name])
-        except TimeoutError:
-            self._names["ERRNO"] = "ERR_WAITSYNCTASK"
-            yield from self._statements(self._module.handlers.get(name, []))
-            raise Exit("ERR_WAITSYNCTASK") from None
-
-    def _statements(self, calls: list[Call]) -> Iterator[None]:
-        skipping = False
-        for call in calls:
-            if skipping or call.name == "ENDIF":
-                skipping = skipping and call.name != "ENDIF"
-            elif call.name == "IF":
-                skipping = not self._value(call.arguments[0])
-            elif call.name == ":=":
-                self._names[str(call.arguments[0])] = self._value(call.arguments[1])
-            elif call.name in self._module.procedures:
-                yield from self._run(call.name)
-            else:
-                yield from getattr(self, f"_{call.name}")(call)
-
-    def _value(self, text: Any) -> Any:
-        """What an expression of RAPID comes to."""
-        if not isinstance(text, str):
-            return text
-        spoken = text.replace("<>", "!=").replace("Abs", "abs").replace(" . ", ".")
-        return eval(re.sub(r"(?<![<>!=])=", "==", spoken), {}, self._names)
-
-    def _TPWrite(self, call: Call) -> Iterator[None]:
-        self.log.append(str(call.arguments[0]))
+    def TPWrite(self, text: str) -> Iterator[None]:
+        self.log.append(text)
         yield from ()
 
-    def _EXIT(self, call: Call) -> Iterator[None]:
+    def EXIT(self) -> Iterator[None]:
         raise Exit
         yield
 
-    def _ConfL(self, call: Call) -> Iterator[None]:
+    def ConfL(self, Off: bool) -> Iterator[None]:
         yield from ()
 
-    _FCCalib = _ConfL
-
-    def _GripLoad(self, call: Call) -> Iterator[None]:
-        load = self._names.get(str(call.arguments[0]), [0.0])
-        self.load = float(load[0])
+    def FCCalib(self, load: Any) -> Iterator[None]:
         yield from ()
 
-    def _WaitTime(self, call: Call) -> Iterator[None]:
-        yield from self._moved(float(str(call.arguments[0])), lambda x: None)
+    GripLoad = FCCalib
 
-    def _WaitSyncTask(self, call: Call) -> Iterator[None]:
-        ident = str(call.arguments[0])
+    def WaitTime(self, seconds: float) -> Iterator[None]:
+        yield from self._moved(seconds, lambda x: None)
+
+    def WaitSyncTask(self, ident: str, tasks: Any, InPos: bool, TimeOut: float) -> Iterator[None]:
         begin = self._cell.now
         self._cell.met.setdefault(ident, set()).add(self.arm)
-        while len(self._cell.met[ident]) < 2:
-            if self._cell.now - begin > float(str(call.optional["TimeOut"])):
+        while len(self._cell.met[ident]) < len(tasks):
+            if self._cell.now - begin > TimeOut:
                 raise TimeoutError(ident)
             yield
 
@@ -345,23 +209,28 @@ class Task:
         self._spare = self._cell.now - begin - seconds
         change(1.0)
 
-    def _MoveAbsJ(self, call: Call) -> Iterator[None]:
-        robax: Any = call.arguments[0]
-        begin, end = self.q.copy(), np.deg2rad(np.array(robax[0], dtype=float))
+    def MoveAbsJ(
+        self, target: Any, speed: Any, zone: str, tool: Any, NoEOffs: bool, T: float
+    ) -> Iterator[None]:
+        begin, end = self.q.copy(), np.deg2rad(np.array(target[0], dtype=float))
 
         def change(x: float) -> None:
             self.q = begin + x * (end - begin)
 
-        yield from self._moved(float(str(call.optional["T"])), change)
+        yield from self._moved(T, change)
 
-    def _FCPress1LStart(self, call: Call) -> Iterator[None]:
-        place, _, threshold = call.arguments[:3]
-        newton = self._cell.sign * float(self._value(call.optional["Fz"]))
+    def FCPress1LStart(
+        self, place: Any, speed: Any, threshold: float, *given: Any, Fz: float, **supervised: Any
+    ) -> Iterator[None]:
+        newton = self._cell.sign * Fz
         if newton < 0.0:
             raise Exit("the robot is farther from its path than PosSupvDist")
-        yield from self._pressed(float(str(threshold)) / 100.0 * newton)
-        yield from self._line(place, call, newton)
+        yield from self._pressed(threshold / 100.0 * newton)
+        yield from self.FCPressL(place, speed, newton, WObj=supervised["WObj"])
         yield from self._pressed(newton)
+
+    def FCPressEnd(self, *given: Any, DeactOnly: bool, WObj: Any) -> Iterator[None]:
+        yield from self._pressed(0.0)
 
     def _pressed(self, newton: float) -> Iterator[None]:
         begin = self.force
@@ -371,19 +240,12 @@ class Task:
 
         yield from self._moved(max(CYCLE, abs(newton - begin) / FORCE_RATE), change)
 
-    def _FCPressL(self, call: Call) -> Iterator[None]:
-        yield from self._line(call.arguments[0], call, float(str(call.arguments[2])))
-
-    def _FCPressEnd(self, call: Call) -> Iterator[None]:
-        assert "DeactOnly" in call.optional
-        yield from self._pressed(0.0)
-
-    def _line(self, place: Any, call: Call, newton: float) -> Iterator[None]:
+    def FCPressL(
+        self, place: Any, speed: Any, newton: float, *given: Any, WObj: Any
+    ) -> Iterator[None]:
         """The pad along a line of its work object to a robtarget, with a force."""
-        speed: Any = call.arguments[1]
-        v, spin = (5.0, 500.0) if isinstance(speed, str) else (float(x) for x in speed[:2])
-        wobj = self._names["carryGrip"]
-        T = _frame(wobj[3]) @ _frame(wobj[4]) @ _frame(place)
+        v, spin = (5.0, 500.0) if speed == "v5" else speed[:2]
+        T = _frame(WObj[3]) @ _frame(WObj[4]) @ _frame(place)
         first = self._pad()
         turn = Rotation.from_matrix(np.array([first[:3, :3], T[:3, :3]]))
         way = 1e3 * float(np.linalg.norm(T[:3, 3] - first[:3, 3]))

@@ -10,14 +10,15 @@ from __future__ import annotations
 
 import heapq
 import importlib.util
-import itertools
 import json
+import signal
 import sys
-import types
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future
 from pathlib import Path
-from types import SimpleNamespace
+from types import ModuleType, SimpleNamespace
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 from rosbags.typesys import Stores, get_typestore
@@ -72,29 +73,14 @@ SERVICES: Mapping[str, set[str]] = {
 STORE = get_typestore(Stores.ROS2_JAZZY)
 
 
-class Future:
-    """What is answered later."""
+class Message(dict[str, Any]):
+    """A message or a request by its fields; those that nobody set are empty messages."""
 
-    def __init__(self) -> None:
-        self._value: Any = None
-        self._is_done = False
-        self._told: list[Callable[[Future], None]] = []
+    def __getattr__(self, name: str) -> Any:
+        return self.setdefault(name, Message())
 
-    def set(self, value: Any) -> None:
-        self._value, self._is_done = value, True
-        for each in self._told:
-            each(self)
-
-    def done(self) -> bool:
-        return self._is_done
-
-    def result(self) -> Any:
-        return self._value
-
-    def add_done_callback(self, told: Callable[[Future], None]) -> None:
-        self._told.append(told)
-        if self._is_done:
-            told(self)
+    def __setattr__(self, name: str, value: Any) -> None:
+        self[name] = value
 
 
 class Controller:
@@ -120,31 +106,26 @@ class Controller:
 
     def take(self, goal: Any) -> SimpleNamespace:
         """Accept or refuse a goal."""
-        handle = SimpleNamespace(accepted=not self.refuses and not self._problem(goal))
-        if self.passes and self._handle is not None:
-            handle.accepted = False
+        is_busy = self.passes and self._handle is not None
+        handle = SimpleNamespace(accepted=not (self.refuses or is_busy) and self._takes(goal))
         if not handle.accepted:
             return handle
         if self._handle is not None:
             self._end(ABORTED, "Current goal preempted by new incoming action.")
-        handle.result = Future()
+        handle.result = Future[Any]()
         handle.get_result_async = lambda: handle.result
         handle.cancel_goal_async = lambda: self.cancel(handle)
-        points = goal["trajectory"]["points"]
-        order = [goal["trajectory"]["joint_names"].index(name) for name in self.joints]
+        points, stamp = goal.trajectory.points, goal.trajectory.header.stamp
+        order = [goal.trajectory.joint_names.index(name) for name in self.joints]
 
         def column(name: str) -> Array:
             return np.array([point[name] for point in points], dtype=float)[:, order]
 
-        stamp = goal["trajectory"].get("header", {}).get("stamp", {"sec": 0, "nanosec": 0})
-        begin = stamp["sec"] + 1e-9 * stamp["nanosec"]
-        self._times = np.array(
-            [p["time_from_start"]["sec"] + 1e-9 * p["time_from_start"]["nanosec"] for p in points]
-        )
+        begin, self._times = seconds(stamp), times_of(points)
         known = np.stack([column(n) for n in ("positions", "velocities", "accelerations")], axis=1)
         self._spline = BPoly.from_derivatives(self._times, known)
         self._rows = column("effort") if self.has_effort else None
-        self._start = begin if begin else self.world.now
+        self._start = begin or self.world.now
         if self.passes:
             assert not begin, "the passthrough controller knows no start"
             # One point per two cycles of 500 Hz.
@@ -152,34 +133,22 @@ class Controller:
         self._handle = handle
         return handle
 
-    def _problem(self, goal: Any) -> str:
-        """Why a goal is rejected: `validate_trajectory_msg`."""
-        trajectory = goal["trajectory"]
-        if sorted(trajectory["joint_names"]) != sorted(self.joints):
-            return "joints"
-        points = trajectory["points"]
-        times = [
-            p["time_from_start"]["sec"] + 1e-9 * p["time_from_start"]["nanosec"] for p in points
-        ]
-        if not points or any(b <= a for a, b in itertools.pairwise(times)):
-            return "times"
-        if max(abs(v) for v in points[-1]["velocities"]) > FLOAT_EPSILON:
-            return "ends with a velocity"
-        count = len(trajectory["joint_names"])
-        for point in points:
-            if point.get("effort") and not self.has_effort:
-                return "effort without its interface"
-            if {len(point[k]) for k in ("positions", "velocities", "accelerations")} != {count}:
-                return "sizes"
-        return ""
+    def _takes(self, goal: Any) -> bool:
+        """`validate_trajectory_msg`."""
+        points = goal.trajectory.points
+        known = ("positions", "velocities", "accelerations")
+        return (
+            sorted(goal.trajectory.joint_names) == sorted(self.joints)
+            and bool((np.diff(times_of(points)) > 0.0).all())
+            and max(abs(v) for v in points[-1]["velocities"]) <= FLOAT_EPSILON
+            and all(self.has_effort or not point.get("effort") for point in points)
+            and {len(point[k]) for point in points for k in known} == {len(self.joints)}
+        )
 
-    def cancel(self, handle: SimpleNamespace) -> Future:
-        done = Future()
+    def cancel(self, handle: SimpleNamespace) -> None:
         if self._handle is handle:
             self._end(CANCELED, "")
             self._hold()
-        done.set(None)
-        return done
 
     def _hold(self) -> None:
         """`set_hold_position`: where it is, with the efforts of the last success, or none."""
@@ -189,7 +158,7 @@ class Controller:
         handle, self._handle = self._handle, None
         assert handle is not None
         result = SimpleNamespace(error_code=0, error_string=told)
-        handle.result.set(SimpleNamespace(status=status, result=result))
+        handle.result.set_result(SimpleNamespace(status=status, result=result))
 
     def step(self) -> None:
         if self._spline is None or self.world.now < self._start:
@@ -214,6 +183,14 @@ class Controller:
             self._end(SUCCEEDED, "Goal successfully reached!")
 
 
+def seconds(stamp: Mapping[str, int]) -> float:
+    return stamp.get("sec", 0) + 1e-9 * stamp.get("nanosec", 0)
+
+
+def times_of(points: list[dict[str, Any]]) -> Array:
+    return np.array([seconds(point["time_from_start"]) for point in points])
+
+
 class World:
     """Controllers, services and topics in simulated time.
 
@@ -230,22 +207,22 @@ class World:
         self.at: list[tuple[float, int, Callable[[], None]]] = []
         self.calls: list[tuple[str, dict[str, Any]]] = []
         self.subscriptions: dict[str, list[Callable[[Any], None]]] = {}
-        self.silent, self.pause = [False, False], 0.0
-        self.offset, self.force = [0.0, 0.0], [0.0, 0.0]
+        self.silent, self.offset, self.force = [False, False], [0.0, 0.0], [0.0, 0.0]
         self.signals: dict[int, Callable[..., None]] = {}
         self._config, self._robots = config, job["robots"]
         self._next_joints = self.now
         self.controllers: dict[str, Controller] = {}
+        self._arms: dict[int, tuple[Controller, list[int]]] = {}
         for group in config["groups"]:
+            robots = {arm: self._robots[arm] for arm in group["arms"]}
             first: dict[str, float] = {}
-            for arm in group["arms"]:
-                robot = self._robots[arm]
+            for robot in robots.values():
                 first |= dict(zip(robot["ros_joints"], robot["position"][0], strict=True))
-            passes = "passthrough" in group["action"]
-            effort = bool(config["effort"])
-            self.controllers[group["action"]] = Controller(
-                self, list(first), np.array(list(first.values())), effort, passes
-            )
+            passes, effort = "passthrough" in group["action"], bool(config["effort"])
+            made = Controller(self, list(first), np.array(list(first.values())), effort, passes)
+            self.controllers[group["action"]] = made
+            for arm, robot in robots.items():
+                self._arms[arm] = made, [made.joints.index(name) for name in robot["ros_joints"]]
 
     def later(self, after: float, what: Callable[[], None]) -> None:
         """Let something happen some time after now [s]."""
@@ -253,11 +230,7 @@ class World:
 
     def of(self, arm: int) -> tuple[Controller, list[int]]:
         """An arm's controller, and the places of the arm's joints among its own."""
-        for group in self._config["groups"]:
-            if arm in group["arms"]:
-                found = self.controllers[group["action"]]
-                return found, [found.joints.index(n) for n in self._robots[arm]["ros_joints"]]
-        raise LookupError(arm)
+        return self._arms[arm]
 
     def q(self, arm: int) -> Array:
         controller, part = self.of(arm)
@@ -269,8 +242,6 @@ class World:
 
     def run(self, until: float) -> None:
         """Let time pass."""
-        if self.pause:
-            until, self.pause = until + self.pause, 0.0
         while self.now < until - 1e-9:
             assert self.now < LONGEST, f"not done after {LONGEST:g} s: {self.log}"
             self.now += STEP
@@ -287,9 +258,8 @@ class World:
     def _tell(self) -> None:
         for arm, robot in enumerate(self._robots):
             if not self.silent[arm]:
-                message = SimpleNamespace(
-                    name=robot["ros_joints"], position=(self.q(arm) + self.offset[arm]).tolist()
-                )
+                q = (self.q(arm) + self.offset[arm]).tolist()
+                message = Message(name=robot["ros_joints"], position=q)
                 topics = self._config["joint_states"]
                 for heard in self.subscriptions[topics[arm if len(topics) > 1 else 0]]:
                     heard(message)
@@ -297,22 +267,19 @@ class World:
     def feel(self, arm: int, newton: float) -> None:
         """What a wrist sensor tells of a force along its pad."""
         source = self._config["wrench"][arm]
-        x, y, z = (newton * value for value in source["axis"])
-        force = SimpleNamespace(x=x, y=y, z=z)
+        force = Message(zip("xyz", (newton * value for value in source["axis"]), strict=True))
         for heard in self.subscriptions[source["topic"]]:
-            heard(SimpleNamespace(wrench=SimpleNamespace(force=force)))
+            heard(Message(wrench=Message(force=force)))
 
     def command(self, word: str) -> None:
         for heard in self.subscriptions["/carry/command"]:
-            heard(SimpleNamespace(data=word))
+            heard(Message(data=word))
 
     def interrupt(self) -> None:
         """Ctrl-C."""
-        import signal
-
         self.signals[signal.SIGINT](signal.SIGINT, None)
 
-    def serve(self, name: str, kind: str, request: dict[str, Any]) -> bool:
+    def serve(self, name: str, kind: str, request: dict[str, Any]) -> None:
         """Answer a call; unknown fields are errors."""
         assert set(request) <= SERVICES[kind], (kind, set(request) - SERVICES[kind])
         self.calls.append((name, request))
@@ -326,13 +293,12 @@ class World:
             self.controllers[
                 f"/{space}/passthrough_trajectory_controller/follow_joint_trajectory"
             ].slider = request["speed_slider_fraction"]
-        return True
 
 
-def fill(message: Any, values: Mapping[str, Any]) -> None:
-    """`set_message_fields`, with plain values in place of messages."""
+def fill(message: Message, values: Mapping[str, Any]) -> None:
+    """`set_message_fields`, with plain values in place of deeper messages."""
     for name, value in values.items():
-        message[name] = value
+        message[name] = Message(value) if isinstance(value, dict) else value
     if "trajectory" in values:
         checked(values["trajectory"], "trajectory_msgs/msg/JointTrajectory")
 
@@ -350,26 +316,13 @@ def checked(value: Mapping[str, Any], kind: str) -> None:
                 checked(each, described[0][1])
 
 
-class _Goal(dict[str, Any]):
-    """A goal whose start is written as in a message."""
-
-    @property
-    def trajectory(self) -> Any:
-        stamp = (
-            self["trajectory"]
-            .setdefault("header", {})
-            .setdefault("stamp", {"sec": 0, "nanosec": 0})
-        )
-
-        class Stamp:
-            def __setattr__(self, name: str, value: int) -> None:
-                stamp[name] = value
-
-        return SimpleNamespace(header=SimpleNamespace(stamp=Stamp()))
-
-
-def _modules(world: World) -> dict[str, types.ModuleType]:
+def _modules(world: World) -> dict[str, ModuleType]:
     """What `run_job.py` imports of ROS 2."""
+
+    def answered(answer: Callable[[], Any]) -> Future[Any]:
+        future = Future[Any]()
+        world.later(0.01, lambda: future.set_result(answer()))
+        return future
 
     class Client:
         def __init__(self, kind: str, name: str) -> None:
@@ -378,11 +331,9 @@ def _modules(world: World) -> dict[str, types.ModuleType]:
         def wait_for_service(self, timeout_sec: float) -> bool:
             return True
 
-        def call_async(self, request: dict[str, Any]) -> Future:
-            future = Future()
-            success = world.serve(self.name, self.kind, dict(request))
-            world.later(0.01, lambda: future.set(SimpleNamespace(success=success)))
-            return future
+        def call_async(self, request: dict[str, Any]) -> Future[Any]:
+            world.serve(self.name, self.kind, request)
+            return answered(lambda: SimpleNamespace(success=True))
 
     class Node:
         def create_subscription(self, kind: Any, topic: str, heard: Any, depth: int) -> None:
@@ -405,55 +356,46 @@ def _modules(world: World) -> dict[str, types.ModuleType]:
         def wait_for_server(self, timeout_sec: float) -> bool:
             return True
 
-        def send_goal_async(self, goal: Any) -> Future:
-            future = Future()
-            world.later(0.01, lambda: future.set(self._controller.take(goal)))
-            return future
+        def send_goal_async(self, goal: Any) -> Future[Any]:
+            return answered(lambda: self._controller.take(goal))
 
     def spin_once(node: Any, timeout_sec: float) -> None:
         # Time passes in any case.
         world.run(world.now + min(max(timeout_sec, STEP), 0.01))
 
-    def module(name: str, **content: Any) -> types.ModuleType:
-        made = types.ModuleType(name)
-        vars(made).update(content)
-        return made
-
     def service(kind: str) -> Any:
         assert kind in SERVICES, kind
-        return SimpleNamespace(Request=dict, kind=kind)
+        return SimpleNamespace(Request=Message, kind=kind)
 
-    goal_status = SimpleNamespace(STATUS_SUCCEEDED=SUCCEEDED)
-    return {
-        each.__name__: each
-        for each in (
-            module(
-                "rclpy",
-                init=lambda **_: None,
-                shutdown=lambda: None,
-                create_node=lambda name: Node(),
-                spin_once=spin_once,
-            ),
-            module("rclpy.action", ActionClient=ActionClient),
-            module("rclpy.signals", SignalHandlerOptions=SimpleNamespace(NO=0)),
-            module("rosidl_runtime_py", set_message_fields=fill),
-            module("rosidl_runtime_py.utilities", get_service=service),
-            module("action_msgs"),
-            module("action_msgs.msg", GoalStatus=goal_status),
-            module("control_msgs"),
-            module("control_msgs.action", FollowJointTrajectory=SimpleNamespace(Goal=_Goal)),
-            module("geometry_msgs"),
-            module("geometry_msgs.msg", WrenchStamped=object),
-            module("sensor_msgs"),
-            module("sensor_msgs.msg", JointState=object),
-            module("std_msgs"),
-            module("std_msgs.msg", String=object),
-        )
+    contents: dict[str, dict[str, Any]] = {
+        "rclpy": {
+            "init": lambda **_: None,
+            "shutdown": lambda: None,
+            "create_node": lambda name: Node(),
+            "spin_once": spin_once,
+        },
+        "rclpy.action": {"ActionClient": ActionClient},
+        "rclpy.signals": {"SignalHandlerOptions": SimpleNamespace(NO=0)},
+        "rosidl_runtime_py": {"set_message_fields": fill},
+        "rosidl_runtime_py.utilities": {"get_service": service},
+        "action_msgs.msg": {"GoalStatus": SimpleNamespace(STATUS_SUCCEEDED=SUCCEEDED)},
+        "control_msgs.action": {"FollowJointTrajectory": SimpleNamespace(Goal=Message)},
+        "geometry_msgs.msg": {"WrenchStamped": object},
+        "sensor_msgs.msg": {"JointState": object},
+        "std_msgs.msg": {"String": object},
     }
+    packages = {name.partition(".")[0] for name in contents}
+    found = {name: ModuleType(name) for name in (*packages, *contents)}
+    for name, content in contents.items():
+        vars(found[name]).update(content)
+    return found
 
 
 def run(
-    files: Contents, folder: Path, prepare: Callable[[World], None], arguments: list[str]
+    files: Contents,
+    folder: Path,
+    prepare: Callable[[World], object] = lambda world: None,
+    arguments: Sequence[str] = (),
 ) -> tuple[int, World]:
     """Run a bundle's `run_job.py`, unedited, from its folder; its exit code and its world.
 
@@ -465,26 +407,19 @@ def run(
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(content.encode() if isinstance(content, str) else content)
     world = World(files, json.loads(files["config/cell.json"]))
-    modules = _modules(world)
-    kept = {name: sys.modules.get(name) for name in (*modules, "carry_job")}
-    sys.modules.update(modules)
-    sys.path.insert(0, str(folder))
-    try:
-        spec = importlib.util.spec_from_file_location("run_job_of_bundle", folder / "run_job.py")
-        assert spec is not None
-        assert spec.loader is not None
-        program = importlib.util.module_from_spec(spec)
+    signals = SimpleNamespace(
+        SIGINT=signal.SIGINT, SIGTERM=signal.SIGTERM, signal=world.signals.__setitem__
+    )
+    spec = importlib.util.spec_from_file_location("run_job_of_bundle", folder / "run_job.py")
+    assert spec is not None
+    assert spec.loader is not None
+    program = importlib.util.module_from_spec(spec)
+    with (
+        patch.dict(sys.modules, _modules(world)),
+        patch.object(sys, "path", [str(folder), *sys.path]),
+    ):
+        sys.modules.pop("carry_job", None)
         spec.loader.exec_module(program)
-        signals = SimpleNamespace(
-            SIGINT=2, SIGTERM=15, signal=lambda number, what: world.signals.update({number: what})
-        )
         vars(program)["signal"] = signals
         prepare(world)
         return program.main(arguments), world
-    finally:
-        sys.path.remove(str(folder))
-        for name, before in kept.items():
-            if before is None:
-                sys.modules.pop(name, None)
-            else:
-                sys.modules[name] = before

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import math
 import re
 import struct
-import sys
 from collections import Counter, deque
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -24,16 +23,14 @@ from hybrid_opt.bundles import TARGETS, BundleOptions
 from hybrid_opt.bundles.arms import ABB, UR, require_arms
 from hybrid_opt.bundles.bundle import prepared
 from hybrid_opt.bundles.languages import rapid_files, require_rapid
-from hybrid_opt.bundles.programs.carry_job import Job
-from hybrid_opt.bundles.programs.run_egm import FromRobot, read_robot, to_robot
+from hybrid_opt.bundles.programs.run_egm import FromRobot, Stream, read_robot, to_robot
 from hybrid_opt.job.records import HELD, PHASES
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.robot.model import build_robot_model
-from tests.hybrid_opt.bundles.bundles import contents, driven, exported, rack_driven, text_of
+from tests.hybrid_opt.bundles.bundles import driven, exported, rack_driven, read_job, text_of
 from tests.hybrid_opt.bundles.mock_rapid import Controller, Module, parse
 from tests.hybrid_opt.job.jobs import rack, rack_job
-from tests.machines import ur10_urdf
 from tests.symbolic.cells import GOFA
 
 EGM = ("T_ROB1/CarryEgm1.mod", "T_ROB2/CarryEgm2.mod")
@@ -46,25 +43,22 @@ def modules() -> list[Module]:
 
 def test_others_read_the_modules() -> None:
     """rapidchecker, which refuses broken ones."""
-    for target, names in (("abb-rapid", NAMES), ("abb-egm", EGM)):
-        for name in names:
-            text = shortened(text_of(target, name).replace("\r\n", "\n"))
-            assert not problems(text), problems(text)
-            for broken in (
-                text.replace("ENDPROC", "", 1),
-                text.replace(":=", "=", 1),
-                text.replace(";", "", 1),
-                text.replace("[", "", 1),
-            ):
-                assert problems(broken)
+    texts = [
+        shortened(text_of(target, name).replace("\r\n", "\n"))
+        for target, names in (("abb-rapid", NAMES), ("abb-egm", EGM))
+        for name in names
+    ]
+    for text in texts:
+        assert not problems(text), problems(text)
+    for part, other in (("ENDPROC", ""), (":=", "="), (";", ""), ("[", "")):
+        assert problems(texts[-1].replace(part, other, 1))
 
 
 def shortened(text: str) -> str:
     """Two moves of each kind, because rapidchecker takes a minute for hundreds."""
     lines, seen = [], Counter[str]()
     for line in text.splitlines():
-        words = line.split()
-        name = words[0] if words else ""
+        name = line.split(maxsplit=1)[0] if line.strip() else ""
         seen[name] += name.startswith(("MoveAbsJ", "FCPressL"))
         if seen[name] <= 2:
             lines.append(line)
@@ -83,48 +77,30 @@ def problems(text: str) -> list[str]:
 def test_tool_and_load_are_declared() -> None:
     cell = rack().workcell
     for module in modules():
-        declared = {name: (kind, value) for _, kind, name, value in module.declarations}
-        kind, tool = declared["carryPad"]
-        assert kind == "tooldata"
-        assert isinstance(tool, list)
-        held, place, load = tool
-        assert held == "TRUE"
-        assert isinstance(place, list)
-        assert place[0] == [0.0, 0.0, 190.0]
-        assert place[1] == [1.0, 0.0, 0.0, 0.0]
-        assert isinstance(load, list)
+        _, kind, (held, place, load) = module.declared["carryPad"]
+        assert (kind, held) == ("tooldata", True)
+        assert place == [[0.0, 0.0, 190.0], [1.0, 0.0, 0.0, 0.0]]
         assert len(load) == 6
-        kind, box = declared["carryHalfBox"]
-        assert kind == "loaddata"
-        assert isinstance(box, list)
-        assert box[0] == cell.payload.mass / 2.0
+        _, kind, box = module.declared["carryHalfBox"]
+        assert (kind, box[0]) == ("loaddata", cell.payload.mass / 2.0)
         # The box's centre lies half its width behind the pad and 55 mm below.
-        np.testing.assert_allclose(np.abs(np.array(box[1], dtype=float)), [55.0, 0.0, 200.0])
+        np.testing.assert_allclose(np.abs(box[1]), [55.0, 0.0, 200.0])
 
 
-def test_arms_of_other_makers_are_refused() -> None:
-    cell = rack().workcell
-    require_arms(cell, "RAPID", ABB, (6,), any_arm=False)
-    with pytest.raises(SettingsError, match=r"gofa12.urdf.*UR e-series"):
-        require_arms(cell, "URScript", UR, (6,), any_arm=False)
-    other = replace(cell.robots[0], urdf=ur10_urdf(), chain_root="")
-    with pytest.raises(SettingsError, match="ABB"):
-        require_arms(
-            replace(cell, robots=(other, cell.robots[1])), "RAPID", ABB, (6,), any_arm=False
-        )
-    require_arms(cell, "URScript", UR, (6,), any_arm=True)
-
-
-def test_the_make_is_in_the_robots_name_where_nothing_else_tells_it(tmp_path: Path) -> None:
-    """As of a xacro file that was expanded to be stored."""
+def test_the_make_of_every_arm_counts(tmp_path: Path) -> None:
+    """It is in the robot's name where nothing else tells it, as of a xacro file that was expanded
+    to be stored."""
     path = tmp_path / "arm.urdf"
     text = GOFA.read_text("utf-8")
     path.write_text(re.sub(r'<robot name="[^"]*"', '<robot name="ur10e"', text, count=1), "utf-8")
-    first, second = (replace(robot, urdf=path) for robot in rack().workcell.robots)
-    cell = replace(rack().workcell, robots=(first, second))
-    require_arms(cell, "URScript", UR, (6,), any_arm=False)
-    with pytest.raises(SettingsError, match="does not look like an arm of ABB"):
-        require_arms(cell, "RAPID", ABB, (6,), any_arm=False)
+    cell = rack().workcell
+    ur = tuple(replace(robot, urdf=path) for robot in cell.robots)
+    refused = r"(gofa12|arm)\.urdf, which does not look like an arm of (ABB|UR e-series)"
+    for robots, sound in ((cell.robots, ABB), (ur, UR), ((ur[0], cell.robots[1]), "")):
+        for maker in (ABB, UR):
+            with nullcontext() if maker == sound else pytest.raises(SettingsError, match=refused):
+                there = replace(cell, robots=(robots[0], robots[1]))
+                require_arms(there, "a target", maker, (6,), any_arm=False)
 
 
 def test_names_cannot_leave_a_comment() -> None:
@@ -233,6 +209,9 @@ CYCLE = 0.004
 STIFFNESS = 1e4
 """Of each arm at its pad [N/m]."""
 
+LONGEST = 40.0
+"""A stream that does not come that far waits for ever [s]."""
+
 
 def field(number: int, kind: int, data: bytes) -> bytes:
     """A field of protocol buffers by hand: bytes of one length prefix, or as they are."""
@@ -277,37 +256,20 @@ def test_what_is_no_message_is_refused(data: bytes) -> None:
 
 
 @cache
-def models() -> list[tuple[Any, Any, int]]:
-    found = [build_robot_model(robot) for robot in exported("abb-egm").workcell.robots]
-    return [(each.model, each.model.createData(), each.flange_id) for each in found]
+def models() -> list[tuple[Any, Any]]:
+    found = [build_robot_model(robot) for robot in rack().workcell.robots]
+    return [(each, each.model.createData()) for each in found]
 
 
 def gap(q: Array) -> float:
     """The distance between the pads along the first one's normal less the box between them [m]."""
-    cell, places = exported("abb-egm").workcell, []
-    for arm, (model, data, flange) in enumerate(models()):
-        pin.framesForwardKinematics(model, data, q[6 * arm : 6 * arm + 6])
-        robot = cell.robots[arm]
-        places.append(robot.T_world_base @ data.oMf[flange].homogeneous @ robot.T_flange_pad)
-    one, other = (contact.T_box_pad for contact in cell.contacts)
-    normal = places[0][:3, 2]
-    planned = one[:3, 2] @ (other[:3, 3] - one[:3, 3])
-    return float(normal @ (places[1][:3, 3] - places[0][:3, 3]) - planned)
-
-
-@cache
-def program() -> Any:
-    """run_egm.py as the bundle has it."""
-    folder = Path(__file__).parent
-    modules = {}
-    for name in ("carry_job", "run_egm"):
-        spec = importlib.util.spec_from_loader(name, None)
-        assert spec is not None
-        modules[name] = importlib.util.module_from_spec(spec)
-        modules[name].__file__ = str(folder / f"{name}.py")
-        sys.modules[name] = modules[name]
-        exec(compile(text_of("abb-egm", f"{name}.py"), name, "exec"), vars(modules[name]))
-    return modules["run_egm"]
+    cell, places = rack().workcell, []
+    for robot, (arm, data), own in zip(cell.robots, models(), np.split(q, 2), strict=True):
+        pin.framesForwardKinematics(arm.model, data, own)
+        flange = data.oMf[arm.flange_id].homogeneous
+        places.append(robot.T_world_base @ flange @ robot.T_flange_pad)
+    one, other = (contact.T_box_pad[:3, 3] for contact in cell.contacts)
+    return float(places[0][:3, 2] @ (places[1] - places[0])[:3, 3] - np.linalg.norm(other - one))
 
 
 class Cell:
@@ -319,9 +281,9 @@ class Cell:
     """
 
     def __init__(self) -> None:
-        self.job = Job(json.loads(text_of("abb-egm", "job.json")))
+        self.job = read_job()
         config = json.loads(text_of("abb-egm", "config/egm.json"))
-        self.stream = program().Stream(self.job, config)
+        self.stream = Stream(self.job, config)
         self.now, self.force = 50.0, 0.0
         self.offset, self.silent = 0.0, [False, False]
         self.stands = [False, False]
@@ -352,7 +314,8 @@ class Cell:
             felt = [0.0, 0.0, -(self.force + offset), 0.0, 0.0, 0.0]
             message = read_robot(from_robot(1, degrees, felt, True))
             stream.hear(arm, message, self.now)
-            answer = read_answer(stream.answer(arm, 1, self.now))
+            # EgmSensor's planned has the number of EgmRobot's feedBack.
+            answer = read_robot(stream.answer(arm, 1, self.now)).joints
             self._told[arm].append([math.radians(value) for value in answer])
         stream.tick(self.now)
         if stream.machine.state == "ready":
@@ -360,21 +323,18 @@ class Cell:
         wanted = self.job.force(stream._arm, s)
         self.record.append((self.now, s, self.force, wanted, q))
 
-    def run(self, until: Callable[[Cell], bool], most: float = 40.0) -> None:
-        begin = self.now
-        while not until(self):
+    def run(self, *states: str, middle: float = np.inf) -> str:
+        """Until it is in one of the states, or beyond a coordinate; the state."""
+        machine, begin = self.stream.machine, self.now
+        while machine.state not in states and machine.clock.s <= middle:
             self.cycle()
-            assert self.now - begin < most, self.stream.machine.told()
-
-
-def read_answer(data: bytes) -> tuple[float, ...]:
-    """The joints that a controller is told: EgmSensor's planned has the number of feedBack."""
-    return read_robot(data).joints
+            assert self.now - begin < LONGEST, machine.told()
+        return machine.state
 
 
 def test_the_job_is_done_and_presses() -> None:
     cell = Cell()
-    cell.run(lambda cell: cell.stream.machine.state == "done")
+    cell.run("done")
     time, s, force, wanted = (np.array([row[k] for row in cell.record]) for k in range(4))
     job = cell.job
     held = (s > job.begin("carry")) & (s < job.begin("set_down"))
@@ -408,12 +368,10 @@ def test_faults_hold_both_arms(name: str, phase: str) -> None:
     fault, told = FAULTS[name]
     cell = Cell()
     planned = rack_job().phase(phase)
-    middle = planned.begin + 0.4 * planned.duration
-    cell.run(lambda cell: cell.stream.machine.clock.s > middle)
+    cell.run(middle=planned.begin + 0.4 * planned.duration)
     fault(cell)
-    cell.run(lambda cell: cell.stream.machine.state in ("held", "done"))
     machine = cell.stream.machine
-    if machine.state == "done":
+    if cell.run("held", "done") == "done":
         # It shows only where arms move, or where pads have to press.
         assert name in ("stands", "sensor")
         assert phase in ("release", "retreat")
@@ -429,14 +387,13 @@ def test_faults_hold_both_arms(name: str, phase: str) -> None:
         assert cell.force == pytest.approx(cell.record[-1][3], rel=0.05, abs=1.0)
     if name == "Ctrl-C":
         cell.stream.command = "back"
-        cell.run(lambda cell: cell.stream.machine.state == "done")
+        cell.run("done")
         assert cell.stream.machine.clock.s == 0.0
 
 
 def test_a_pause_of_the_computer_makes_no_arm_jump() -> None:
     cell = Cell()
-    middle = cell.job.begin("carry") + 2.0
-    cell.run(lambda cell: cell.stream.machine.clock.s > middle)
+    cell.run(middle=cell.job.begin("carry") + 2.0)
     cell.now += 0.05
     for _ in range(25):
         cell.cycle()
@@ -446,9 +403,8 @@ def test_a_pause_of_the_computer_makes_no_arm_jump() -> None:
 
 
 def test_both_tasks_start_egm() -> None:
-    for name in ("T_ROB1/CarryEgm1.mod", "T_ROB2/CarryEgm2.mod"):
+    for name in EGM:
         text = text_of("abb-egm", name)
         for word in ("EGMSetupUC", "EGMActJoint", "EGMRunJoint", "EGM_STOP_HOLD", "EXIT;"):
             assert word in text
         assert " Stop;" not in text
-    assert {"run_egm.py", "carry_job.py", "job.json"} <= set(contents("abb-egm"))

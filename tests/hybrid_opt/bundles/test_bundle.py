@@ -3,23 +3,25 @@
 from __future__ import annotations
 
 import errno
+import itertools
 import json
 import os
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from hybrid_opt.bundles import BundleOptions, Origin, export
 from hybrid_opt.bundles.bundle import read_manifest, write_bundle
 from hybrid_opt.errors import JobError, ResultsError
-from hybrid_opt.robust.squeeze import SqueezeSettings
+from hybrid_opt.job.records import Job
 from hybrid_opt.store.files import sha256
-from hybrid_opt.timing.records import TimingLimits
-from hybrid_opt.timing.solve import time_path
+from hybrid_opt.timing.records import Timing
 from symbolic.errors import SettingsError
-from tests.hybrid_opt.bundles.bundles import DRIVER, driven
-from tests.hybrid_opt.job.jobs import rack, rack_job, rack_jobs, rack_timing
+from tests.hybrid_opt.bundles.bundles import DRIVER, driven, rack_driven
+from tests.hybrid_opt.job.jobs import rack_job, rack_jobs, rack_timing
 
 FILES: dict[str, str | bytes] = {"a.txt": "one", "sub/b.bin": b"two"}
 
@@ -81,62 +83,43 @@ def test_a_file_or_link_in_the_way_stays(tmp_path: Path) -> None:
     assert (tmp_path / "file").read_text() == "mine"
 
 
-@pytest.mark.parametrize("code", [errno.ENOSPC, errno.EACCES, errno.EROFS])
+@pytest.mark.parametrize(("call", "code"), [("fsync", errno.ENOSPC), ("rename", errno.EIO)])
 def test_what_cannot_be_written_leaves_what_was_there(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: int
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, call: str, code: int
 ) -> None:
+    """Neither where a file cannot be stored, nor where the exchange of both is interrupted."""
     folder = tmp_path / "bundle"
     write_bundle(folder, FILES, {})
     before = tree(tmp_path)
-    count = 0
+    usual, count = getattr(os, call), itertools.count(1)
 
-    def fsync(handle: int) -> None:
-        nonlocal count
-        count += 1
-        if count == 2:
+    def second_fails(*given: Any) -> None:
+        if next(count) == 2:
             raise OSError(code, os.strerror(code))
+        usual(*given)
 
-    monkeypatch.setattr(os, "fsync", fsync)
+    monkeypatch.setattr(os, call, second_fails)
     with pytest.raises(ResultsError, match=str(folder)):
         write_bundle(folder, {"other.txt": "new"}, {})
     assert tree(tmp_path) == before
 
 
-def test_an_interrupted_exchange_leaves_the_old_bundle(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    folder = tmp_path / "bundle"
-    write_bundle(folder, FILES, {})
-    before = tree(tmp_path)
-    rename, count = os.rename, 0
-
-    def second_fails(source: Path, target: Path) -> None:
-        nonlocal count
-        count += 1
-        if count == 2:
-            raise OSError(errno.EIO, "input/output error")
-        rename(source, target)
-
-    monkeypatch.setattr(os, "rename", second_fails)
-    with pytest.raises(ResultsError):
-        write_bundle(folder, {"other.txt": "new"}, {})
-    assert tree(tmp_path) == before
-
-
 def test_different_carries_never_touch_one_another(tmp_path: Path) -> None:
-    origin = Origin("rack", "nsga2", 3, 12)
-    first = export(rack_job(), "csv", tmp_path, origin=origin)
-    pressed = rack_jobs().plan(rack_timing(), SqueezeSettings(factor=1.5))
-    fast = time_path(rack().timing_model, rack().initial, TimingLimits(force=60.0))
+    """Neither one that presses more, nor another path."""
+    origin, job = Origin("rack", "nsga2", 3, 12), rack_job()
+    more = [replace(p, force=replace(p.force, normal=1.1 * p.force.normal)) for p in job.phases]
+    carry = job.timing.carry
+    assert carry is not None
+    other = replace(job.timing, carry=replace(carry, x=carry.x + 1e-9))
+    how: dict[str, Any] = {"origin": origin, "options": BundleOptions(step=0.1)}
+    first = export(job, "csv", tmp_path, **how)
     before = tree(tmp_path)
     folders = {first[0].parent}
-    for job in (pressed, rack_jobs().plan(fast)):
-        folders.add(export(job, "csv", tmp_path, origin=origin)[0].parent)
+    for each in (replace(job, phases=tuple(more)), replace(job, timing=other)):
+        folders.add(export(each, "csv", tmp_path, **how)[0].parent)
     assert len(folders) == 3
     assert all(folder.parent.name.startswith("rack-nsga2-r03-p0012-") for folder in folders)
-    assert {name: tree(tmp_path)[name] for name in before} == before
-    again = export(rack_job(), "csv", tmp_path, origin=origin)
-    assert again == first
+    assert export(job, "csv", tmp_path, **how) == first
     assert {name: tree(tmp_path)[name] for name in before} == before
 
 
@@ -146,20 +129,25 @@ def test_names_are_names_of_files() -> None:
         assert set(name) <= set("abcdefghijklmnopqrstuvwxyz0123456789-")
         assert len(name) < 120
     selected = Path("results/rack/selected/mopso-polished/07.json")
-    provenance = {"algorithm": "mopso", "replica": 7, "row": 41}
-    name = Origin.of_file(selected, b"", provenance).name(rack_job())
-    assert name.startswith("rack-mopso-polished-r07-p0041-")
-    assert (
-        Origin.of_file(Path("my carry.json"), b"", {"replica": "x"})
-        .name(rack_job())
-        .startswith("my-carry-")
-    )
+    for path, provenance, begin in (
+        (selected, {"replica": 7, "row": 41}, "rack-mopso-polished-r07-p0041-"),
+        (Path("my carry.json"), {"replica": "x"}, "my-carry-"),
+    ):
+        assert Origin.of_file(path, b"", provenance).name(rack_job()).startswith(begin)
+
+
+def written(
+    job: Job | Timing, target: str, folder: Path, name: str = "manifest.json", **options: Any
+) -> Any:
+    """What a bundle's file holds."""
+    paths = export(job, target, folder, options=BundleOptions(**options))
+    return json.loads(next(path for path in paths if path.name == name).read_text())
 
 
 def test_the_manifest_says_what_it_is(tmp_path: Path) -> None:
-    paths = export(rack_job(), "csv", tmp_path, origin=Origin("rack", "nsga2", 0, 5))
-    document = json.loads(paths[0].read_text())
-    assert document["files"]["job.csv"] == sha256(paths[1].read_bytes())
+    document = written(rack_job(), "csv", tmp_path, step=0.1)
+    (table,) = tmp_path.rglob("job.csv")
+    assert document["files"]["job.csv"] == sha256(table.read_bytes())
     assert [phase["name"] for phase in document["phases"]] == [p.name for p in rack_job().phases]
     assert all(phase["free_of_collisions"] for phase in document["phases"])
     worst = max(value for phase in document["phases"] for value in phase["limits"].values())
@@ -174,27 +162,24 @@ def test_the_manifest_says_what_it_is(tmp_path: Path) -> None:
     assert document["units"]["force"] == "N"
     assert document["how_to_run"]
     assert any("tool_load" in warning for warning in document["warnings"])
-    assert not any("acceleration" in warning for warning in document["warnings"])
-    rough = rack_jobs().plan(rack_timing(), smoothing=0.0)
-    warnings = json.loads(export(rough, "csv", tmp_path)[0].read_text())["warnings"]
-    assert any("acceleration" in warning for warning in warnings)
+    rough = written(rack_jobs().plan(rack_timing(), smoothing=0.0), "csv", tmp_path, step=0.1)
+    for found, is_told in ((document, False), (rough, True)):
+        assert any("acceleration" in warning for warning in found["warnings"]) == is_told
     skew = document["start_skew"]
     assert [each["delay"] for each in skew["cases"]] == [0.001, 0.002, 0.005, 0.01, 0.02]
-    assert [each["holds"] for each in skew["cases"]] == [
-        each["delay"] <= skew["survived"] for each in skew["cases"]
-    ]
+    for each in skew["cases"]:
+        assert each["holds"] == (each["delay"] <= skew["survived"])
     assert skew["required"] is None
 
 
 def test_the_manifest_says_how_the_job_stops(tmp_path: Path) -> None:
-    document = json.loads(export(rack_job(), "ros2-control", tmp_path)[0].read_text())
-    machine = document["machine"]
+    document = written(rack_job(), "ros2-control", tmp_path)
+    machine, step = document["machine"], document["time_step"]
     assert set(machine["states"]) == {"ready", "running", "stopping", "held", "done"}
     assert machine["carried_out_by"].startswith("run_job.py")
     assert machine["stop"]["force_use"] <= 1.0
     assert machine["limits"]["stop_time"] == machine["stop"]["time"]
     assert "'back'" in machine["set_down"]
-    step = document["time_step"]
     assert step["interpolation"] == "quintic"
     assert step["share"] <= step["allowed_share"]
     assert step["force"] == pytest.approx(step["stiffness"] / 2.0 * step["along"])
@@ -202,44 +187,56 @@ def test_the_manifest_says_how_the_job_stops(tmp_path: Path) -> None:
 
 def test_two_controllers_have_to_survive_their_skew(tmp_path: Path) -> None:
     """One clock needs nothing; where each arm plans by itself, 10 ms or what is asked for."""
-    job = driven(rack_job())
-    stiff = BundleOptions(step=0.1, stiffness=5e4)
-    document = json.loads(export(job, "ros2-control", tmp_path, options=stiff)[0].read_text())
-    assert document["start_skew"]["required"] == 0.0
-    assert document["start_skew"]["survived"] < 0.01
+    stiff: dict[str, Any] = {"step": 0.1, "stiffness": 5e4}
+    skew = written(rack_driven(), "ros2-control", tmp_path, **stiff)["start_skew"]
+    assert skew["required"] == 0.0
+    assert skew["survived"] < 0.01
     with pytest.raises(JobError, match="a skew of 10 ms"):
-        export(job, "abb-rapid", tmp_path, options=stiff)
+        written(rack_driven(), "abb-rapid", tmp_path, **stiff)
     with pytest.raises(JobError, match="a skew of 20 ms"):
-        export(job, "csv", tmp_path, options=replace(stiff, skew=0.02))
-    reached = replace(stiff, skew=1e-3)
-    document = json.loads(export(job, "abb-rapid", tmp_path, options=reached)[0].read_text())
-    assert document["start_skew"]["required"] == 1e-3
-    with pytest.raises(SettingsError, match="skew"):
-        BundleOptions(skew=-1.0)
+        written(rack_driven(), "csv", tmp_path, skew=0.02, **stiff)
+    skew = written(rack_driven(), "abb-rapid", tmp_path, skew=1e-3, **stiff)["start_skew"]
+    assert skew["required"] == 1e-3
 
 
-REFUSED = {
-    "franka-ros2": (DRIVER, "does not look like an arm of Franka"),
-    "ur-ros2": (DRIVER, "does not look like an arm of UR"),
-    "ur-script": (DRIVER, "does not look like an arm of UR"),
-    "abb-rapid": (replace(DRIVER, force_control=False), "would not squeeze: positions alone"),
-    "abb-egm": (replace(DRIVER, lag=0.0), "compensates the lag of 'left'"),
+def by(**stated: Any) -> Job:
+    """The rack's job by drivers with something else stated."""
+    return driven(rack_job(), replace(DRIVER, **stated))
+
+
+REFUSED: dict[str, tuple[str, Callable[[], Job | Timing], dict[str, Any], str]] = {
+    "not Franka's": ("franka-ros2", by, {}, "does not look like an arm of Franka"),
+    "not UR's": ("ur-ros2", by, {}, "does not look like an arm of UR"),
+    "not UR's language": ("ur-script", by, {}, "does not look like an arm of UR"),
+    "no force": (
+        *("abb-rapid", lambda: by(force_control=False), {}),
+        "would not squeeze: positions.*before the study",
+    ),
+    "no lag": ("abb-egm", lambda: by(lag=0.0), {}, "compensates the lag of 'left'"),
+    "one prefix": ("ros2-control", lambda: by(prefix="same_"), {}, "so that both arms' joints"),
+    "no address": (
+        *("ur-ros2", lambda: by(address=""), {"any_arm": True}),
+        r"ur-ros2 has to know where .* address",
+    ),
+    "bad address": ("ur-ros2", by, {"addresses": ("a b", "c")}, "no host name or IP address"),
+    "target": ("xml", by, {}, "unknown target"),
+    "no timing": ("csv", lambda: replace(rack_timing(), carry=None), {}, "no timing to export"),
+    "step": ("csv", by, {"step": -1.0}, "time step"),
+    "skew": ("csv", by, {"skew": -1.0}, "skew"),
 }
 
 
-@pytest.mark.parametrize("target", REFUSED)
-def test_a_target_says_what_it_lacks(target: str, tmp_path: Path) -> None:
-    driver, told = REFUSED[target]
+@pytest.mark.parametrize("name", REFUSED)
+def test_a_target_says_what_it_lacks(name: str, tmp_path: Path) -> None:
+    target, job, options, told = REFUSED[name]
     with pytest.raises(SettingsError, match=told):
-        export(driven(rack_job(), driver), target, tmp_path)
+        written(job(), target, tmp_path, **options)
     assert not list(tmp_path.iterdir())
 
 
 def test_the_other_arm_is_named_where_it_can_press(tmp_path: Path) -> None:
-    job = driven(rack_job(), replace(DRIVER, force_control=False))
+    job = by(force_control=False)
     leader, robots = job.squeeze.leader, list(job.workcell.robots)
-    with pytest.raises(SettingsError, match="before the study"):
-        export(job, "abb-rapid", tmp_path)
     robots[leader] = replace(robots[leader], driver=DRIVER)
     job = replace(job, workcell=replace(job.workcell, robots=(robots[0], robots[1])))
     told = f"let '{robots[leader].name}' press, which has it \\(--leader {2 - leader}\\)"
@@ -249,35 +246,22 @@ def test_the_other_arm_is_named_where_it_can_press(tmp_path: Path) -> None:
 
 def test_joints_have_names_of_their_own(tmp_path: Path) -> None:
     """As drivers name them: by the robot, or by a prefix that is stated."""
-    job = driven(rack_job(), replace(DRIVER, prefix="same_"))
-    with pytest.raises(SettingsError, match="the prefix 'same_', so that both arms' joints"):
-        export(job, "ros2-control", tmp_path)
+    job = by(prefix="same_")
     first, second = job.workcell.robots
     named = replace(first, driver=replace(DRIVER, prefix="l_"))
-    cell = replace(job.workcell, robots=(named, second))
-    paths = export(replace(job, workcell=cell), "json", tmp_path)
-    robots = json.loads(next(p for p in paths if p.name == "job.json").read_text())["robots"]
+    job = replace(job, workcell=replace(job.workcell, robots=(named, second)))
+    robots = written(job, "json", tmp_path, "job.json", step=0.1)["robots"]
     assert [robot["ros_joints"][0] for robot in robots] == ["l_joint_1", "same_joint_1"]
 
 
 def test_a_driver_has_to_have_an_address(tmp_path: Path) -> None:
-    job = driven(rack_job(), replace(DRIVER, address=""))
-    with pytest.raises(SettingsError, match=r"ur-ros2 has to know where .* address"):
-        export(job, "ur-ros2", tmp_path, options=BundleOptions(any_arm=True))
     hosts = ("10.0.0.1", "arm-2.local")
-    paths = export(job, "ur-ros2", tmp_path, options=BundleOptions(any_arm=True, addresses=hosts))
-    config = json.loads(next(p for p in paths if p.name == "cell.json").read_text())
+    config = written(
+        by(address=""), "ur-ros2", tmp_path, "cell.json", any_arm=True, addresses=hosts
+    )
     assert tuple(each["arguments"]["robot_ip"] for each in config["launch"]) == hosts
-    with pytest.raises(SettingsError, match="no host name or IP address"):
-        export(job, "ur-ros2", tmp_path, options=BundleOptions(addresses=("a b", "c")))
 
 
 def test_a_timing_is_exported_with_its_job(tmp_path: Path) -> None:
-    paths = export(rack_timing(), "json", tmp_path)
-    assert json.loads(paths[1].read_text())["phases"][0]["name"] == "approach"
-    with pytest.raises(SettingsError, match="unknown target"):
-        export(rack_job(), "xml", tmp_path)
-    with pytest.raises(SettingsError, match="no timing to export"):
-        export(replace(rack_timing(), carry=None), "csv", tmp_path)
-    with pytest.raises(SettingsError, match="time step"):
-        export(rack_job(), "csv", tmp_path, options=BundleOptions(step=-1.0))
+    job = written(rack_timing(), "json", tmp_path, "job.json", step=0.1)
+    assert job["phases"][0]["name"] == "approach"

@@ -2,23 +2,18 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
-from functools import cache
 
 import numpy as np
 import pytest
 from scipy.interpolate import CubicHermiteSpline
 
+from hybrid_opt.bundles.job_file import pad_places
 from hybrid_opt.bundles.programs.carry_job import Clock, Job, Machine, Refused, Seen
 from tests.hybrid_opt.bundles.bundles import exported
+from tests.hybrid_opt.bundles.bundles import read_job as job
 
 PERIOD = 0.01
-
-
-@cache
-def job() -> Job:
-    return Job(json.loads(json.dumps(exported("json").document)))
 
 
 def posture(s: float) -> list[list[float] | None]:
@@ -33,6 +28,16 @@ def running(s: float) -> Machine:
     return machine
 
 
+def ticks(machine: Machine, seen: Callable[[float], Seen]) -> int:
+    """How often it looks at what is seen at its coordinate until it is held, at most for three
+    seconds."""
+    count = 0
+    while machine.state != "held" and count < 300:
+        machine.tick(PERIOD, seen(machine.clock.s))
+        count += 1
+    return count
+
+
 def test_a_job_is_between_its_samples() -> None:
     sampled = exported("json").sampled
     spline = CubicHermiteSpline(sampled.time, sampled.q, sampled.q_rate)
@@ -41,11 +46,9 @@ def test_a_job_is_between_its_samples() -> None:
         np.testing.assert_allclose(q, spline(s), atol=1e-12)
         force = np.interp(s, sampled.time, sampled.normal_force[:, 1])
         assert job().force(1, float(s)) == pytest.approx(force, abs=1e-9)
-    names = [phase.name for phase in sampled.job.phases]
-    begins = [phase.begin for phase in sampled.job.phases]
-    for name, begin in zip(names, begins, strict=True):
-        assert job().begin(name) == pytest.approx(begin, abs=1e-9)
-        assert job().phase(begin + 1e-3) == name
+    for phase in sampled.job.phases:
+        assert job().begin(phase.name) == pytest.approx(phase.begin, abs=1e-9)
+        assert job().phase(phase.begin + 1e-3) == phase.name
 
 
 def test_what_moves_goes_with_the_square_of_the_rate() -> None:
@@ -103,15 +106,11 @@ WRONG: dict[str, tuple[Callable[[float], Seen], str]] = {
 def test_what_is_wrong_stops_the_job_on_its_path(name: str) -> None:
     seen, told = WRONG[name]
     machine = running(job().begin("carry") + 2.0)
-    ticks = 0
-    while machine.state != "held":
-        machine.tick(PERIOD, seen(machine.clock.s))
-        ticks += 1
-        assert ticks < 300, machine.told()
+    # Three looks, and the stop.
+    assert ticks(machine, seen) * PERIOD <= job().limits.stop_time + 5.0 * PERIOD
+    assert machine.state == "held"
     assert any(part in machine.reason for part in told.split("|")), machine.reason
     assert machine.clock.rate == 0.0
-    # Three looks, and the stop.
-    assert ticks * PERIOD <= job().limits.stop_time + 5.0 * PERIOD
     stood = machine.clock.s
     machine.tick(1.0, Seen())
     assert machine.clock.s == stood
@@ -125,15 +124,6 @@ def test_what_is_wrong_stops_the_job_on_its_path(name: str) -> None:
     assert (machine.state, machine.clock.s) == ("done", 0.0)
 
 
-def held_after(machine: Machine, seen: Callable[[float], Seen]) -> Machine:
-    """Until it is held, or three seconds have passed."""
-    for _ in range(300):
-        machine.tick(PERIOD, seen(machine.clock.s))
-        if machine.state == "held":
-            break
-    return machine
-
-
 def off(s: float, way: float) -> Seen:
     """The first arm's pad about so far off its place [m]."""
     reach = max(job().robots[0]["reach"])
@@ -143,45 +133,42 @@ def off(s: float, way: float) -> Seen:
     return Seen(q)
 
 
+@pytest.mark.parametrize(
+    ("phase", "after", "state"),
+    [("press", 0.2, "held"), ("carry", 1.0, "running"), ("retreat", 0.2, "held")],
+)
+def test_places_are_kept_where_they_count(phase: str, after: float, state: str) -> None:
+    """12 mm are allowed on the way, not where the box is gripped, nor at the end: an arm that
+    stands elsewhere has not done the job."""
+    machine = running(job().begin(phase) + after if phase != "retreat" else job().end - 0.5)
+    ticks(machine, lambda s: off(s, 0.012))
+    assert machine.state == state
+    assert ("left its path" in machine.reason) == (state == "held")
+
+
 def test_pads_have_to_press_before_the_box_is_lifted() -> None:
-    """12 mm are allowed on the way, not where the box is gripped; nor is half of the force."""
-    lift = job().pressed
-    early = running(job().begin("press") + 0.2)
-    found = held_after(early, lambda s: off(s, 0.012))
-    assert (found.state, "left its path" in found.reason) == ("held", True)
-    found = held_after(running(job().begin("carry") + 1.0), lambda s: off(s, 0.012))
-    assert found.state == "running"
     weak = running(job().begin("press") + 0.2)
-    found = held_after(weak, lambda s: Seen(posture(s), force=[None, 0.5 * job().force(1, s)]))
-    assert "presses" in found.reason
+    ticks(weak, lambda s: Seen(posture(s), force=[None, 0.5 * job().force(1, s)]))
+    assert "presses" in weak.reason
     z = [row[2] for row in job().document["box"]["pose"]]
-    risen = np.interp([found.clock.s, lift], job().time, z)
+    risen = np.interp([weak.clock.s, job().pressed], job().time, z)
     assert risen[0] - risen[1] < 1e-4, "nothing is lifted"
 
 
-def test_an_arm_that_stands_elsewhere_has_not_done_the_job() -> None:
-    found = held_after(running(job().end - 0.5), lambda s: off(s, 0.012))
-    assert (found.state, "left its path" in found.reason) == ("held", True)
-    found = running(job().end - 0.5)
-    for _ in range(60):
-        found.tick(PERIOD, Seen(posture(found.clock.s)))
-    assert found.state == "done"
-
-
-def test_arms_that_stop_by_themselves_are_where_those_on_the_path_are() -> None:
+@pytest.mark.parametrize("wrong", ["silent", "off"])
+def test_arms_that_stop_by_themselves_are_where_those_on_the_path_are(wrong: str) -> None:
     """A silent arm's last posture, or one that is off the path, says nothing of the place."""
     middle = job().begin("carry") + 2.5
-    for wrong in ("silent", "off"):
-        machine = Machine(job(), waits=True)
-        machine.state, machine.clock = "running", Clock(job().end, job().limits.stop_time, middle)
-        machine.stop("asked", quick=True)
-        assert machine.stop_time == job().limits.quick_stop
-        q = posture(middle + 0.1)
-        q[1] = posture(middle - 0.1)[1] if wrong == "silent" else moved(q[1], 0.2)
-        seen = Seen(q, silence=[0.0, 0.3 if wrong == "silent" else 0.0])
-        held_after(machine, lambda _, seen=seen: seen)  # type: ignore[misc]
-        assert machine.state == "held"
-        assert machine.clock.s == pytest.approx(middle + 0.1, abs=5e-3)
+    machine = Machine(job(), waits=True)
+    machine.state, machine.clock = "running", Clock(job().end, job().limits.stop_time, middle)
+    machine.stop("asked", quick=True)
+    assert machine.stop_time == job().limits.quick_stop
+    q = posture(middle + 0.1)
+    q[1] = posture(middle - 0.1)[1] if wrong == "silent" else moved(q[1], 0.2)
+    seen = Seen(q, silence=[0.0, 0.3 if wrong == "silent" else 0.0])
+    ticks(machine, lambda _: seen)
+    assert machine.state == "held"
+    assert machine.clock.s == pytest.approx(middle + 0.1, abs=5e-3)
 
 
 def test_one_strange_look_stops_nothing() -> None:
@@ -205,8 +192,6 @@ def test_a_job_begins_only_in_its_first_places() -> None:
 
 def test_distances_are_bounds() -> None:
     """Of a pad's way between two postures, by Pinocchio's kinematics."""
-    from hybrid_opt.bundles.job_file import pad_places
-
     found, rng = exported("json"), np.random.default_rng(2)
     for arm in (0, 1):
         q = found.sampled.arm(arm, found.sampled.q)
@@ -218,7 +203,15 @@ def test_distances_are_bounds() -> None:
             assert way <= job().distance(arm, other.tolist(), s) + 1e-6
 
 
-KINDS = ("freeze", "late", "silent", "sensor", "encoder", "asked", "pause")
+KINDS: dict[str, Callable[[Seen, int, float, float], object]] = {
+    "freeze": lambda seen, arm, s, when: seen.q.__setitem__(arm, posture(when)[arm]),
+    "late": lambda seen, arm, s, when: seen.q.__setitem__(arm, posture(max(s - 0.15, 0.0))[arm]),
+    "silent": lambda seen, arm, s, when: seen.silence.__setitem__(arm, 0.2),
+    "sensor": lambda seen, arm, s, when: seen.force.__setitem__(arm, job().force(arm, s) + 60.0),
+    "encoder": lambda seen, arm, s, when: seen.q.__setitem__(arm, moved(seen.q[arm], 0.1)),
+    "asked": lambda seen, arm, s, when: setattr(seen, "fault", "Ctrl-C"),
+    "pause": lambda seen, arm, s, when: None,
+}
 
 
 def test_many_faults_in_all_phases() -> None:
@@ -226,33 +219,17 @@ def test_many_faults_in_all_phases() -> None:
     within the stop that it states, pressing what belongs there. A pause of 50 ms stops nothing."""
     rng = np.random.default_rng(7)
     for number in range(70):
-        kind, arm = KINDS[number % len(KINDS)], int(rng.integers(2))
+        kind, arm = list(KINDS)[number % len(KINDS)], int(rng.integers(2))
         when = float(rng.uniform(0.3, job().end - 2.0))
         machine = running(when - 0.05)
-        frozen = posture(when)
         for tick in range(400):
             s, pause = machine.clock.s, 0.05 if kind == "pause" and tick == 6 else 0.0
-            happens = s >= when
-            q = posture(s)
-            force: list[float | None] = [job().force(a, s) for a in (0, 1)]
-            silence, fault = [0.0, 0.0], ""
-            if happens:
-                if kind == "freeze":
-                    q[arm] = frozen[arm]
-                elif kind == "late":
-                    q[arm] = posture(max(s - 0.15, 0.0))[arm]
-                elif kind == "silent":
-                    silence[arm] = 0.2
-                elif kind == "sensor":
-                    force[arm] = job().force(arm, s) + 60.0
-                elif kind == "encoder":
-                    q[arm] = moved(q[arm], 0.1)
-                elif kind == "asked":
-                    fault = "Ctrl-C"
-            machine.tick(PERIOD + pause, Seen(q, force, silence, fault))
-            if machine.state == "stopping":
-                # Nothing that is told moves faster than the job would.
-                assert abs(machine.clock.rate) <= 1.0
+            seen = Seen(posture(s), [job().force(a, s) for a in (0, 1)])
+            if s >= when:
+                KINDS[kind](seen, arm, s, when)
+            machine.tick(PERIOD + pause, seen)
+            # Nothing that is told moves faster than the job would.
+            assert abs(machine.clock.rate) <= 1.0
             if machine.state in ("held", "done"):
                 break
         told = f"{kind} at {when:.2f} s in {job().phase(when)}: {machine.told()}"
@@ -265,8 +242,8 @@ def test_many_faults_in_all_phases() -> None:
             assert machine.state == "held", told
             limits = job().limits
             # To see it: 20 mm of path at most, three looks; then the stop.
-            seen = 20.0 * PERIOD + limits.behind
-            assert machine.clock.s <= when + seen + limits.stop_time / 2.0 + PERIOD, told
+            noticed = 20.0 * PERIOD + limits.behind
+            assert machine.clock.s <= when + noticed + limits.stop_time / 2.0 + PERIOD, told
             assert machine.clock.rate == 0.0
         elif kind == "pause":
             assert machine.state in ("running", "done"), told

@@ -11,7 +11,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -39,8 +38,9 @@ from symbolic.array import Array
 from symbolic.robot.model import build_robot_model
 from tests.hybrid_opt.bundles import test_abb, test_urscript
 from tests.hybrid_opt.bundles.bundles import STEPS, contents
+from tests.hybrid_opt.bundles.bundles import read_job as job
 from tests.hybrid_opt.bundles.mock_ros import World, run
-from tests.hybrid_opt.bundles.test_run_job import FAULTS, begins, column
+from tests.hybrid_opt.bundles.test_run_job import FAULTS, begins, column, leave, sound
 from tests.hybrid_opt.job.jobs import rack, rack_jobs
 
 pytestmark = pytest.mark.slow
@@ -54,20 +54,11 @@ MIDDLE_BOARD, LINER = 0.60, 1.012
 """Heights on which the rack's box stands before and after [m]."""
 
 
-@cache
-def files_of(force: float | None = None) -> Contents:
-    """The bundle of the hand-made trajectory: closest to the reference speed, or below a force."""
-    if force is None:
-        return contents("ros2-control")
-    model = rack().timing_model
-    timing = time_path(model, rack().initial, TimingLimits(force=force))
+def fast_files() -> Contents:
+    """The bundle of the hand-made trajectory below 55 N planned."""
+    timing = time_path(rack().timing_model, rack().initial, TimingLimits(force=55.0))
     target = TARGETS["ros2-control"]
     return target.files(prepared(rack_jobs().plan(timing), target, BundleOptions()))
-
-
-@cache
-def job(force: float | None = None) -> Job:
-    return Job(json.loads(files_of(force)["job.json"]))
 
 
 @cache
@@ -95,11 +86,8 @@ class Commands:
     force: Array | None = None
 
 
-def reference(
-    told: Commands, goal: bool, carried: Job | None = None, delay: float = 0.0
-) -> Reference:
+def reference(told: Commands, goal: bool, carried: Job, delay: float = 0.0) -> Reference:
     """What the simulated arms are told, the second one a delay later [s]."""
-    carried = carried or job()
     workcell, time = rack().workcell, told.time
     where = coordinates(time, told.q, carried)
     force = np.array([[carried.force(arm, s) for arm in (0, 1)] for s in where])
@@ -181,13 +169,11 @@ def of_ur(world: World) -> Commands:
 TOLD = {"ros2-control": commanded, "franka-ros2": of_franka, "ur-ros2": of_ur}
 
 
-def ran(target: str, folder: Path) -> Commands:
-    code, world = run(dict(contents(target)), folder, lambda world: None, [])
-    assert code == 0, world.log
-    return TOLD[target](world)
+def by_ros(target: str) -> Commands:
+    return TOLD[target](sound(target))
 
 
-def by_urscript(folder: Path) -> Commands:
+def by_urscript() -> Commands:
     arms = test_urscript.pair().run().arms
     n = min(len(arm.record) for arm in arms)
     time, first, _ = zip(*arms[0].record[:n], strict=True)
@@ -195,24 +181,24 @@ def by_urscript(folder: Path) -> Commands:
     return Commands(np.array(time), np.hstack([first, second]), force=np.array(force))
 
 
-def by_rapid(folder: Path) -> Commands:
+def by_rapid() -> Commands:
     time, q, force = test_abb.sound().rounded(STEPS["abb-rapid"])
     return Commands(time, q, force=force)
 
 
-def by_egm(folder: Path) -> Commands:
+def by_egm() -> Commands:
     cell = test_abb.Cell()
-    cell.run(lambda cell: cell.stream.machine.state == "done")
+    cell.run("done")
     time, s, _, wanted, q = (np.array(column) for column in zip(*cell.record, strict=True))
     # The way into the box is the simulated force control's own business.
     q[:, 6:] = [job().position(1, each) for each in s]
     return Commands(time - time[0], q, force=wanted)
 
 
-PROGRAMS: dict[str, tuple[Callable[[Path], Commands], Control]] = {
-    "ros2-control": (partial(ran, "ros2-control"), "leader"),
-    "franka-ros2": (partial(ran, "franka-ros2"), "impedance"),
-    "ur-ros2": (partial(ran, "ur-ros2"), "leader"),
+PROGRAMS: dict[str, tuple[Callable[[], Commands], Control]] = {
+    "ros2-control": (partial(by_ros, "ros2-control"), "leader"),
+    "franka-ros2": (partial(by_ros, "franka-ros2"), "impedance"),
+    "ur-ros2": (partial(by_ros, "ur-ros2"), "leader"),
     "ur-script": (by_urscript, "leader"),
     "abb-rapid": (by_rapid, "leader"),
     "abb-egm": (by_egm, "leader"),
@@ -222,20 +208,17 @@ PROGRAMS: dict[str, tuple[Callable[[Path], Commands], Control]] = {
 
 @cache
 def told_by(target: str) -> Commands:
-    with TemporaryDirectory() as folder:
-        return PROGRAMS[target][0](Path(folder))
+    return PROGRAMS[target][0]()
 
 
-@pytest.mark.parametrize("target", PROGRAMS)
-@pytest.mark.parametrize("together", [True, False])
-def test_every_program_carries_the_box(target: str, together: bool) -> None:
+@pytest.mark.parametrize(
+    ("target", "delay"),
+    [(target, delay) for target in PROGRAMS for delay in {0.0, TARGETS[target].skew or 0.0}],
+)
+def test_every_program_carries_the_box(target: str, delay: float) -> None:
     """In step, and with the second arm as late as the target has to reckon with."""
-    skew = TARGETS[target].skew
-    if not together and not skew:
-        pytest.skip("one clock moves both arms")
-    delay = 0.0 if together else float(skew or 0.0)
     told = told_by(target)
-    aims = reference(told, True, delay=delay)
+    aims = reference(told, True, job(), delay)
     found = witness().simulate(aims, PROGRAMS[target][1])
     where = coordinates(told.time, told.q, job())
     within(found, told.time, where, job(), f"{target}, {1e3 * delay:g} ms late")
@@ -272,16 +255,17 @@ def within(found: ArmOutcome, time: Array, where: Array, carried: Job, name: str
     assert (force[inside] / planned).min() > 1.0 - TRACKED
 
 
-@pytest.mark.parametrize("delay", [0.0, 0.01])
-def test_a_fast_carry_is_carried_as_well(delay: float, tmp_path: Path) -> None:
-    """Below 55 N planned, 2.8 s."""
-    code, world = run(dict(files_of(55.0)), tmp_path, lambda world: None, [])
+def test_a_fast_carry_is_carried_as_well(tmp_path: Path) -> None:
+    """In 2.8 s."""
+    files = fast_files()
+    code, world = run(files, tmp_path)
     assert code == 0
-    told, carried = commanded(world), job(55.0)
-    found = witness().simulate(reference(told, True, carried, delay), "leader")
+    told, carried = commanded(world), Job(json.loads(files["job.json"]))
     where = coordinates(told.time, told.q, carried)
-    within(found, told.time, where, carried, f"ros2-control, fast, {delay} s late")
-    judged(found, arrives=True)
+    for delay in (0.0, 0.01):
+        found = witness().simulate(reference(told, True, carried, delay), "leader")
+        within(found, told.time, where, carried, f"ros2-control, fast, {delay} s late")
+        judged(found, arrives=True)
 
 
 STOPPED = (
@@ -304,17 +288,17 @@ def test_a_stopped_job_holds_the_box(target: str, name: str, tmp_path: Path) -> 
 
     def prepare(world: World) -> None:
         world.later(when, lambda: fault(world))
-        for k in range(3):
-            world.later(when + 4.0 + 0.2 * k, world.interrupt)
+        leave(world, when + 4.0)
 
-    code, world = run(dict(contents(target)), tmp_path, prepare, [])
+    code, world = run(contents(target), tmp_path, prepare)
     assert code == 1
-    found = witness().simulate(reference(TOLD[target](world), goal=False), PROGRAMS[target][1])
+    aims = reference(TOLD[target](world), False, job())
+    found = witness().simulate(aims, PROGRAMS[target][1])
     judged(found, arrives=False, slip=2.0 * SLIP)
     apart = pad_errors(rack().workcell, column(world, 1)[-1:])[1]
     print(f"  {target}, {name}: told to be {1e3 * apart[0]:.0f} mm apart")
 
 
 def test_half_the_force_does_not_hold_the_box() -> None:
-    aims = reference(told_by("ros2-control"), goal=True)
+    aims = reference(told_by("ros2-control"), True, job())
     assert not witness().simulate(aims, "leader", 0.5).arrives

@@ -12,10 +12,11 @@ from tempfile import TemporaryDirectory
 import numpy as np
 import pytest
 
-from hybrid_opt.bundles.programs.carry_job import Job
 from symbolic.array import Array
 from tests.hybrid_opt.bundles.bundles import contents
+from tests.hybrid_opt.bundles.bundles import read_job as job
 from tests.hybrid_opt.bundles.mock_ros import World, run
+from tests.hybrid_opt.job.jobs import rack_job
 
 TARGETS = ("ros2-control", "franka-ros2", "ur-ros2")
 SETTLED = 0.5
@@ -24,17 +25,28 @@ SETTLED = 0.5
 Fault = Callable[[World], None]
 
 
-def files_of(target: str) -> dict[str, str | bytes]:
-    """The bundle's files; the GoFas of the rack stand in for the makers' own arms."""
-    return dict(contents(target))
-
-
-def job_of(target: str) -> Job:
-    return Job(json.loads(contents(target)["job.json"]))
+@cache
+def sound(target: str) -> World:
+    """A world in which nothing goes wrong."""
+    with TemporaryDirectory() as folder:
+        code, world = run(contents(target), Path(folder))
+    assert code == 0, world.log
+    return world
 
 
 def column(world: World, index: int) -> Array:
     return np.array([row[index] for row in world.record])
+
+
+def moves(world: World, least: float = 1e-9) -> list[int]:
+    """Numbers of the records after which joints move by more than the least [rad]."""
+    change = np.abs(np.diff(column(world, 1), axis=0)).max(axis=1)
+    return np.flatnonzero(change > least).tolist()
+
+
+def both(s: float) -> Array:
+    """Both arms' planned positions at a coordinate."""
+    return np.concatenate([job().position(arm, s) for arm in (0, 1)])
 
 
 def held_at(world: World) -> float:
@@ -43,24 +55,19 @@ def held_at(world: World) -> float:
     return float(found[-1])
 
 
-@pytest.mark.parametrize("target", ["ros2-control", "ur-ros2"])
-def test_the_job_is_done(target: str, tmp_path: Path) -> None:
-    code, world = run(files_of(target), tmp_path, lambda world: None, [])
-    assert code == 0, world.log
-    job = job_of(target)
-    q = column(world, 1)
-    last = np.concatenate([job.position(arm, job.end) for arm in (0, 1)])
-    np.testing.assert_allclose(q[-1], last, atol=1e-6)
+@pytest.mark.parametrize("target", TARGETS)
+def test_the_job_is_done(target: str) -> None:
+    world = sound(target)
+    np.testing.assert_allclose(column(world, 1)[-1], both(job().end), atol=1e-6)
     assert world.log[-1].startswith("done")
-    moved = np.flatnonzero(np.abs(np.diff(q, axis=0)).max(axis=1) > 1e-9)
-    time = column(world, 0)
-    assert time[moved[-1]] - time[moved[0]] == pytest.approx(job.end, abs=0.3)
+    time, moved = column(world, 0), moves(world)
+    assert time[moved[-1]] - time[moved[0]] == pytest.approx(job().end, abs=0.3)
 
 
 def test_a_joint_that_moves_both_arms_is_commanded_once(tmp_path: Path) -> None:
     """The first joint of the left arm stands in for a lift of both; it does what the left one's
     does."""
-    files = files_of("ros2-control")
+    files = dict(contents("ros2-control"))
     document = json.loads(files["job.json"])
     left, right = document["robots"]
     right["ros_joints"][0] = left["ros_joints"][0]
@@ -68,7 +75,7 @@ def test_a_joint_that_moves_both_arms_is_commanded_once(tmp_path: Path) -> None:
         for own, other in zip(right[name], left[name], strict=True):
             own[0] = other[0]
     files["job.json"] = json.dumps(document)
-    code, world = run(files, tmp_path, lambda world: None, [])
+    code, world = run(files, tmp_path)
     assert code == 0, world.log
     ((controller, _), _) = world.of(0), world.of(1)
     assert len(controller.joints) == len(left["joints"]) + len(right["joints"]) - 1
@@ -76,22 +83,25 @@ def test_a_joint_that_moves_both_arms_is_commanded_once(tmp_path: Path) -> None:
     np.testing.assert_allclose(column(world, 1)[-1], last, atol=1e-6)
 
 
-def test_positions_and_efforts_are_those_of_the_job(tmp_path: Path) -> None:
+def test_positions_and_efforts_are_those_of_the_job() -> None:
     """Both arms' commands against the job, by the mock's own interpolation."""
-    _, world = run(files_of("franka-ros2"), tmp_path, lambda world: None, [])
-    job, time = job_of("franka-ros2"), column(world, 0)
-    q, effort = column(world, 1), column(world, 2)
-    moved = np.flatnonzero(np.abs(np.diff(q, axis=0)).max(axis=1) > 1e-12)
-    begin = time[moved[0]]
-    for k in range(moved[0] + 40, moved[-1] - 40, 97):
-        s = time[k] - begin
-        planned = np.concatenate([job.position(arm, s) for arm in (0, 1)])
+    world = sound("franka-ros2")
+    time, q, effort = (column(world, k) for k in range(3))
+    first, *_, last = moves(world)
+    for k in range(first + 40, last - 40, 97):
+        s = time[k] - time[first]
         # The world's steps are 5 ms apart.
-        speed = max(job.speed(arm, s) for arm in (0, 1))
-        assert np.abs(q[k] - planned).max() < 0.02 * speed + 1e-4
-        wanted = np.concatenate([job.effort(arm, "without_gravity", s, 1.0) for arm in (0, 1)])
+        speed = max(job().speed(arm, s) for arm in (0, 1))
+        assert np.abs(q[k] - both(s)).max() < 0.02 * speed + 1e-4
+        wanted = np.concatenate([job().effort(a, "without_gravity", s, 1.0) for a in (0, 1)])
         assert np.abs(effort[k] - wanted).max() < 3.0
-    assert np.abs(effort[moved[0] + 1000]).max() > 1.0
+    assert np.abs(effort[first + 1000]).max() > 1.0
+
+
+def leave(world: World, when: float) -> None:
+    """Have the program end, some time after it holds the job [s]."""
+    for k in range(3):
+        world.later(when + 0.5 * k, world.interrupt)
 
 
 def freeze(world: World, arm: int) -> None:
@@ -144,14 +154,10 @@ USUAL = (("ros2-control", "one arm stops"), ("ros2-control", "Ctrl-C"), ("ur-ros
 """Faults of the short tests, in the carry; the slow ones inject all of them in all phases."""
 
 
-@cache
 def begins(target: str) -> float:
     """When the arms of a sound run begin to move, from when its program starts [s]."""
-    with TemporaryDirectory() as folder:
-        _, world = run(files_of(target), Path(folder), lambda world: None, [])
-    time = column(world, 0)
-    moved = np.flatnonzero(np.abs(np.diff(column(world, 1), axis=0)).max(axis=1) > 1e-12)
-    return float(time[moved[0]] - time[0])
+    time = column(sound(target), 0)
+    return float(time[moves(sound(target), 1e-12)[0]] - time[0])
 
 
 @pytest.mark.parametrize(
@@ -174,20 +180,14 @@ def test_both_arms_hold_and_press(
     """The arms that still move stop at one place of the path, in the time that the job states; the
     squeeze of that place stays; what happened is told."""
     fault, told = FAULTS[name]
-    job = job_of(target)
-    (first, last) = next(
-        (job.time[p["first"]], job.time[p["last"]])
-        for p in job.document["phases"]
-        if p["name"] == phase
-    )
-    when = begins(target) + first + share * (last - first)
+    planned = rack_job().phase(phase)
+    when = begins(target) + planned.begin + share * planned.duration
 
     def prepare(world: World) -> None:
         world.later(when, lambda: fault(world))
-        for k in range(3):
-            world.later(when + 6.0 + 0.5 * k, world.interrupt)
+        leave(world, when + 6.0)
 
-    code, world = run(files_of(target), tmp_path, prepare, [])
+    code, world = run(contents(target), tmp_path, prepare)
     text = " ".join(world.log)
     assert any(part in text for part in told.split("|")) or (code == 0 and name in UNSEEN), text
     if name in UNSEEN and phase in ("press", "release", "retreat"):
@@ -203,25 +203,24 @@ def test_both_arms_hold_and_press(
     assert np.ptp(q[-200:], axis=0).max() < 1e-9
     if name not in UNSEEN:
         # To see it, to tell it, and the stop itself.
-        moving = np.flatnonzero(np.abs(np.diff(q, axis=0)).max(axis=1) > 1e-9)
-        noticed = 0.1 + job.limits.silence + (0.2 if target == "ur-ros2" else 0.0)
-        assert time[moving[-1] + 1] <= when + noticed + job.limits.stop_time
+        noticed = 0.1 + job().limits.silence + (0.2 if target == "ur-ros2" else 0.0)
+        assert time[moves(world)[-1] + 1] <= when + noticed + job().limits.stop_time
     s = held_at(world)
     stopped = {"one arm stops": {0}, "the other arm stops": {1}}.get(name, set())
     if target == "ur-ros2" and (stopped or name == "a controller gives up"):
         # What is held is the middle of where two that stop by themselves stand.
         stopped = {0, 1}
     for arm in (0, 1):
-        away = job.distance(arm, world.q(arm).tolist(), s)
+        away = job().distance(arm, world.q(arm).tolist(), s)
         # What one that stopped by itself is off: as far as is allowed, and the other's stop.
-        most = job.limits.path + 0.5 * job.fastest * (job.limits.quick_stop + 0.1)
+        most = job().limits.path + 0.5 * job().fastest * (job().limits.quick_stop + 0.1)
         assert away < (most if arm in stopped else NEAR[target]), f"{name} at {s}: {away}"
         gravity = {"ros2-control": "with_gravity", "franka-ros2": "without_gravity"}.get(target)
         if gravity:
-            held = job.effort(arm, gravity, s, 0.0)
+            held = job().effort(arm, gravity, s, 0.0)
             np.testing.assert_allclose(world.effort(arm), held, atol=2.0)
     if target == "ur-ros2":
-        assert world.force[1] == pytest.approx(job.force(1, s), rel=0.1, abs=1.0)
+        assert world.force[1] == pytest.approx(job().force(1, s), rel=0.1, abs=1.0)
 
 
 @pytest.mark.parametrize(
@@ -235,87 +234,59 @@ def test_both_arms_hold_and_press(
     ],
 )
 def test_a_held_job_sets_the_box_down(target: str, word: str, code: int, tmp_path: Path) -> None:
-    job = job_of(target)
-    when = job.begin("carry") + 1.0
+    when = SETTLED + job().begin("carry") + 2.5
 
     def prepare(world: World) -> None:
-        world.later(SETTLED + when + 1.5, world.interrupt)
-        world.later(SETTLED + when + 1.5 + 5.0, lambda: world.command(word))
+        world.later(when, world.interrupt)
+        world.later(when + 5.0, lambda: world.command(word))
 
-    found, world = run(files_of(target), tmp_path, prepare, [])
+    found, world = run(contents(target), tmp_path, prepare)
     assert found == code, world.log
-    end = job.end if word == "continue" else 0.0
-    last = np.concatenate([job.position(arm, end) for arm in (0, 1)])
-    np.testing.assert_allclose(column(world, 1)[-1], last, atol=1e-4)
+    end = job().end if word == "continue" else 0.0
+    np.testing.assert_allclose(column(world, 1)[-1], both(end), atol=1e-4)
     assert np.abs(np.diff(column(world, 1), axis=0)).max() < 0.02, "no arm jumps"
 
 
-def test_nothing_moves_that_should_not(tmp_path: Path) -> None:
-    def elsewhere(world: World) -> None:
-        controller, part = world.of(0)
-        controller.q[part] += 0.05
+def elsewhere(world: World) -> None:
+    controller, part = world.of(0)
+    controller.q[part] += 0.05
 
-    code, world = run(files_of("ros2-control"), tmp_path / "a", elsewhere, [])
+
+REFUSED: dict[str, tuple[str, Fault]] = {
+    "mm from its place": ("ros2-control", elsewhere),
+    "does not take its goal": ("franka-ros2", lambda w: setattr(w.of(1)[0], "refuses", True)),
+    "zero its sensor": ("ur-ros2", lambda w: w.later(0.2, lambda: w.feel(0, 60.0))),
+}
+
+
+@pytest.mark.parametrize("told", REFUSED)
+def test_nothing_moves_that_should_not(told: str, tmp_path: Path) -> None:
+    target, prepare = REFUSED[told]
+    code, world = run(contents(target), tmp_path, prepare)
     assert code == 2
-    assert "mm from its place" in world.log[-1]
-    code, world = run(
-        files_of("franka-ros2"),
-        tmp_path / "b",
-        lambda world: setattr(world.of(1)[0], "refuses", True),
-        [],
-    )
-    assert code == 2
-    assert "does not take its goal" in world.log[-1]
-    moved = np.abs(column(world, 1) - column(world, 1)[0]).max()
-    assert moved < 0.01, "the other goal is taken back before it begins"
-    code, world = run(files_of("ur-ros2"), tmp_path / "c", lambda world: None, ["--check"])
+    assert told in world.log[-1]
+    # A goal that the other controller has taken is taken back before it begins.
+    most = 0.01 if target == "franka-ros2" else 1e-12
+    assert np.ptp(column(world, 1), axis=0).max() < most
+
+
+def test_a_look_at_both_arms_moves_nothing(tmp_path: Path) -> None:
+    code, world = run(contents("ur-ros2"), tmp_path, arguments=["--check"])
     assert code == 0
     assert np.ptp(column(world, 1), axis=0).max() == 0.0
 
 
-def test_a_wrong_force_stops_the_job(tmp_path: Path) -> None:
-    """Sensors that feel what is commanded, until one has an offset in the carry."""
-    job = job_of("ur-ros2")
-    off = [0.0]
-
-    def prepare(world: World) -> None:
-        def feel() -> None:
-            for arm in (0, 1):
-                world.feel(arm, world.force[1] + off[0])
-            world.later(0.01, feel)
-
-        world.later(0.1, feel)
-        world.later(SETTLED + job.begin("carry") + 2.5, lambda: off.__setitem__(0, 40.0))
-        for k in range(3):
-            world.later(SETTLED + job.begin("carry") + 8.0 + k, world.interrupt)
-
-    code, world = run(files_of("ur-ros2"), tmp_path, prepare, [])
-    assert code == 1, world.log
-    assert "instead of" in " ".join(world.log)
-
-
-def test_pads_that_feel_something_already_do_not_begin(tmp_path: Path) -> None:
-    def prepare(world: World) -> None:
-        world.later(0.2, lambda: world.feel(0, 60.0))
-
-    code, world = run(files_of("ur-ros2"), tmp_path, prepare, [])
-    assert code == 2
-    assert "zero its sensor" in world.log[-1]
-
-
-def test_a_ur_presses_before_it_lifts_and_bears_the_box_with_it(tmp_path: Path) -> None:
-    _, world = run(files_of("ur-ros2"), tmp_path, lambda world: None, [])
-    names = [name for name, _ in world.calls]
-    assert names[:4] == [
+def test_a_ur_presses_before_it_lifts_and_bears_the_box_with_it() -> None:
+    world, service = sound("ur-ros2"), "/left/io_and_status_controller/set_payload"
+    assert [name for name, _ in world.calls][:4] == [
         f"/{arm}/io_and_status_controller/{what}"
         for arm in ("left", "right")
         for what in ("set_payload", "zero_ftsensor")
     ]
     force = np.array([row[3][1] for row in world.record])
-    job = job_of("ur-ros2")
-    assert force.max() == pytest.approx(max(job.robots[1]["normal_force"]), rel=0.01)
+    assert force.max() == pytest.approx(max(job().robots[1]["normal_force"]), rel=0.01)
     assert force[-1] == 0.0
-    loads = [r["mass"] for n, r in world.calls if n == "/left/io_and_status_controller/set_payload"]
+    loads = [request["mass"] for name, request in world.calls if name == service]
     assert np.abs(np.diff(loads)).max() < 1.0, "the payload is a ramp"
     assert max(loads) == pytest.approx(5.0, abs=0.01)
     assert loads[-1] < 0.5

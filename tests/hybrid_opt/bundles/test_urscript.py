@@ -5,9 +5,8 @@ from __future__ import annotations
 
 import ast
 import re
-import threading
 from collections.abc import Callable, Iterator
-from functools import cache
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
@@ -17,6 +16,7 @@ from hybrid_opt.bundles import TARGETS, BundleOptions
 from hybrid_opt.bundles.bundle import prepared
 from hybrid_opt.bundles.languages import urscript_files
 from hybrid_opt.job.records import HELD, PHASES
+from symbolic.array import Array
 from symbolic.errors import SettingsError
 from tests.hybrid_opt.bundles.bundles import contents, exported, rack_driven
 from tests.hybrid_opt.job.jobs import rack_job
@@ -25,76 +25,104 @@ BLOCK = re.compile(r"^(\s*)(def|thread|if|while|elif|else)\b.*:$")
 CYCLE = 0.002
 
 
+class _Waiting(ast.NodeTransformer):
+    """Functions as generators, each call of which is waited for."""
+
+    def __init__(self, module: ast.Module) -> None:
+        functions = (node for node in ast.walk(module) if isinstance(node, ast.FunctionDef))
+        self._waited = {"servoj", "sync", *(node.name for node in functions)}
+
+    def visit_FunctionDef(self, node: ast.FunctionDef) -> ast.AST:
+        self.generic_visit(node)
+        node.body[:0] = ast.parse("yield from ()").body
+        return node
+
+    def visit_Call(self, node: ast.Call) -> ast.AST:
+        self.generic_visit(node)
+        is_waited = isinstance(node.func, ast.Name) and node.func.id in self._waited
+        return ast.YieldFrom(node) if is_waited else node
+
+
 def as_python(script: str) -> ast.Module:
-    """The program as Python's parser reads it: blocks end by `end`, poses are lists, threads are
-    generators that yield at `sync()`.
+    """The program as Python's parser reads it: blocks end by `end`, poses are lists.
 
     Every `end` has to stand where the block begins that it closes.
     """
     lines: list[str] = []
-    opened: list[tuple[int, bool]] = []
+    opened: list[int] = []
     for line in script.splitlines():
         code = line.split("#")[0].rstrip()
         found = BLOCK.match(code)
         if found and found[2] in ("elif", "else"):
-            assert len(found[1]) == opened[-1][0]
+            assert len(found[1]) == opened[-1]
         elif found:
-            opened.append((len(found[1]), found[2] == "thread"))
+            opened.append(len(found[1]))
         if code.strip() == "end":
-            assert len(code) - len("end") == opened.pop()[0]
+            assert len(code) - len("end") == opened.pop()
             continue
         code = re.sub(r"\bp\[", "[", code)
         code = re.sub(r"^(\s*)thread ", r"\1def ", code)
         code = re.sub(r"\brun (\w+)\(\)", r"run(\1)", code)
+        code = re.sub(r"^(\s*)halt$", r"\1return 'halt'", code)
         code = re.sub(r"^(\s*)kill (\w+)", r"\1kill(\2)", code)
         code = re.sub(r"^(\s*)global (\w+) = ", r'\1globals()["\2"] = ', code)
-        if any(is_thread for _, is_thread in opened):
-            code = code.replace("sync()", "yield")
         lines.append(code)
     assert not opened
-    return ast.parse("\n".join(lines))
-
-
-class Halted(Exception):
-    """`halt`."""
+    module = ast.parse("\n".join(lines))
+    _Waiting(module).visit(module)
+    return ast.fix_missing_locations(module)
 
 
 class Arm:
     """What a program calls; its joints follow servoj at once."""
 
-    def __init__(self, pair: Pair, start: Any) -> None:
+    def __init__(self, pair: Pair, start: Array, module: ast.Module) -> None:
         self.pair, self.q = pair, np.array(start)
         self.outs, self.buttons = [False] * 8, [False] * 8
         # What the other arm sees: of the last cycle, whichever of both threads runs first.
         self.shown, self.felt = [False] * 8, 0.0
         self.newton, self.offset, self.pressed = 0.0, 0.0, False
         self.log: list[str] = []
-        self.record: list[tuple[float, np.ndarray[Any, Any], float]] = []
+        self.record: list[tuple[float, Array, float]] = []
         self.payload: list[float] = []
         self.threads: dict[int, Iterator[None]] = {}
         self.stopped = self.ended = False
         self._rest = 0.0
+        space = self._names()
+        exec(compile(module, "script", "exec"), space)
+        self._program = space["carry_job"]()
 
     @property
     def other(self) -> Arm:
         first, second = self.pair.arms
         return second if self is first else first
 
-    def cycles(self, seconds: float) -> int:
+    def cycle(self) -> None:
+        """One cycle of its program."""
+        try:
+            next(self._program)
+        except StopIteration as end:
+            self.log.append(end.value or "ended")
+            self.ended = True
+
+    def _cycles(self, seconds: float) -> int:
         self._rest += seconds / CYCLE
         whole = int(self._rest + 1e-9)
         self._rest -= whole
         return whole
 
-    def names(self) -> dict[str, Any]:
-        def servoj(q: list[float], t: float, lookahead_time: float, gain: float) -> None:
+    def _names(self) -> dict[str, Any]:
+        def servoj(q: list[float], t: float, lookahead_time: float, gain: float) -> Iterator[None]:
             assert 0.03 <= lookahead_time <= 0.2
             assert 100 <= gain <= 2000
             assert t >= CYCLE - 1e-9
-            begin, count = self.q.copy(), self.cycles(t)
+            begin, count = self.q.copy(), self._cycles(t)
             for k in range(count):
                 self.q = begin + (np.array(q) - begin) * (k + 1) / count
-                self.pair.cycle(self)
+                yield
+
+        def sync() -> Iterator[None]:
+            yield
 
         def force_mode(frame: Any, selection: Any, wrench: Any, kind: int, limits: Any) -> None:
             assert selection == [0, 0, 1, 0, 0, 0]
@@ -104,7 +132,10 @@ class Arm:
 
         def end_force_mode() -> None:
             self.newton = 0.0
-            self.log.append("end force")
+            self.log.append("end_force_mode")
+
+        def told(name: str) -> Callable[..., None]:
+            return lambda *given, **_: self.log.append(" ".join(map(str, (name, *given))))
 
         def line(number: int) -> bool:
             return self.other.shown[number] if number < 2 else self.buttons[number]
@@ -113,14 +144,12 @@ class Arm:
             self.threads[len(self.threads)] = body()
             return len(self.threads) - 1
 
-        return {
+        only_told = "force_mode_set_damping force_mode_set_gain_scaling zero_ftsensor set_tcp"
+        return {name: told(name) for name in f"{only_told} popup textmsg stopj".split()} | {
             "servoj": servoj,
+            "sync": sync,
             "force_mode": force_mode,
             "end_force_mode": end_force_mode,
-            "force_mode_set_damping": lambda value: self.log.append(f"damping {value}"),
-            "force_mode_set_gain_scaling": lambda value: self.log.append(f"gain {value}"),
-            "zero_ftsensor": lambda: self.log.append("zero"),
-            "set_tcp": lambda pose: self.log.append(f"tcp {len(pose)}"),
             "set_target_payload": lambda mass, centre: self.payload.append(mass),
             "get_actual_joint_positions": lambda: self.q.tolist(),
             "get_actual_tcp_pose": lambda: [0.0] * 6,
@@ -128,9 +157,6 @@ class Arm:
             "get_standard_digital_in": line,
             "force": lambda: max(self.felt, self.other.felt) + self.offset,
             "norm": abs,
-            "popup": lambda text, blocking: self.log.append(f"popup {text}"),
-            "textmsg": self.log.append,
-            "stopj": lambda rate: self.log.append("stop"),
             "run": run,
             "kill": lambda number: self.threads.pop(number),
         }
@@ -142,71 +168,31 @@ class Pair:
     Attributes:
         time: [s].
         at: what happens at which time.
+        most: when it ends at the latest [s].
     """
 
-    def __init__(self, starts: list[Any], at: dict[float, Callable[[Pair], None]]) -> None:
-        self.arms = (Arm(self, starts[0]), Arm(self, starts[1]))
-        self.time, self.at = 0.0, dict(at)
-        self.most = 60.0
-        self._barrier = threading.Barrier(2, action=self._tick)
-
-    def _tick(self) -> None:
-        self.time += CYCLE
-        for arm in self.arms:
-            arm.shown, arm.felt = list(arm.outs), arm.newton
-        for when in [when for when in self.at if when <= self.time]:
-            self.at.pop(when)(self)
-        for arm in self.arms:
-            if not (arm.stopped or arm.ended):
-                for thread in list(arm.threads.values()):
-                    next(thread, None)
-            arm.record.append((self.time, arm.q.copy(), arm.newton))
-
-    def cycle(self, arm: Arm) -> None:
-        """One cycle of an arm's program; a stopped one stays in it."""
-        while True:
-            if self.time > self.most:
-                raise Halted("the time is over")
-            self._barrier.wait()
-            if not arm.stopped:
-                return
+    def __init__(self, starts: list[Array], at: dict[float, Callable[[Pair], None]]) -> None:
+        self.time, self.at, self.most = 0.0, dict(at), 60.0
+        first, second = map(partial(Arm, self), starts, programs())
+        self.arms: tuple[Arm, Arm] = first, second
 
     def run(self) -> Pair:
-        errors: list[BaseException] = []
-
-        def drive(arm: Arm, module: ast.Module) -> None:
-            space = arm.names()
-            try:
-                exec(compile(module, "script", "exec"), space)
-                space["carry_job"]()
-                arm.log.append("ended")
-            except (NameError, Halted) as error:
-                arm.log.append("halt" if "halt" in str(error) else str(error))
-            except threading.BrokenBarrierError:
-                return
-            except BaseException as error:
-                errors.append(error)
-                self._barrier.abort()
-                return
-            arm.ended = True
-            try:
-                while not all(each.ended for each in self.arms):
-                    self._barrier.wait()
-            except threading.BrokenBarrierError:
-                return
-            self._barrier.abort()
-
-        threads = [
-            threading.Thread(target=drive, args=pair)
-            for pair in zip(self.arms, programs(), strict=True)
-        ]
-        for thread in threads:
-            thread.start()
-        for thread in threads:
-            thread.join()
-        if errors:
-            raise errors[0]
+        while not all(arm.ended for arm in self.arms) and self.time <= self.most:
+            for arm in self._running():
+                arm.cycle()
+            self.time += CYCLE
+            for arm in self.arms:
+                arm.shown, arm.felt = list(arm.outs), arm.newton
+            for when in [when for when in self.at if when <= self.time]:
+                self.at.pop(when)(self)
+            for thread in [each for arm in self._running() for each in arm.threads.values()]:
+                next(thread, None)
+            for arm in self.arms:
+                arm.record.append((self.time, arm.q.copy(), arm.newton))
         return self
+
+    def _running(self) -> list[Arm]:
+        return [arm for arm in self.arms if not (arm.stopped or arm.ended)]
 
 
 @cache
@@ -227,7 +213,7 @@ def test_both_programs_stream_the_job_and_press() -> None:
     moved = [np.array([row[1] for row in arm.record]) for arm in found.arms]
     begin = begun(moved[0])
     for arm, q in enumerate(moved):
-        assert found.arms[arm].log[-2:] == ["stop", "ended"], found.arms[arm].log
+        assert found.arms[arm].log[-2:] == ["stopj 2.0", "ended"], found.arms[arm].log
         planned = job.arm(arm, job.q)
         # One point in four cycles of 2 ms.
         for k in range(1, len(planned), 50):
@@ -237,24 +223,20 @@ def test_both_programs_stream_the_job_and_press() -> None:
     newton = np.array([row[2] for row in found.arms[follower].record])
     assert newton.max() == pytest.approx(job.normal_force[:, follower].max(), abs=1.0)
     # Nowhere less than the box needs while it is held, and no more than within 0.1 s of it.
-    wanted = job.normal_force[:, follower]
+    wanted, held = job.normal_force[:, follower], rack_job().held
     for k in range(len(job.time)):
         near = wanted[max(0, k - 12) : k + 13]
         assert newton[begin + 4 * k] <= near.max() + 0.5
         assert newton[begin + 4 * k] >= near.min() - 0.5
-        if in_held(float(job.time[k])):
+        if held[0].begin + 0.1 < job.time[k] < held[-1].begin + held[-1].duration - 0.01:
             assert newton[begin + 4 * k] >= wanted[k] - 0.5
     assert not found.arms[1 - follower].pressed
     log = found.arms[follower].log
-    assert log.index("zero") < log.index("damping 0.1") < log.index("end force")
+    told = ("zero_ftsensor", "force_mode_set_damping 0.1", "end_force_mode")
+    assert [line for line in log if line in told] == list(told)
     for each in found.arms:
         assert np.abs(np.diff(each.payload)).max() < 0.5, "the payload is a ramp"
         assert max(each.payload) == pytest.approx(rack_job().workcell.payload.mass / 2.0, abs=0.01)
-
-
-def in_held(s: float) -> bool:
-    held = rack_job().held
-    return held[0].begin + 0.1 < s < held[-1].begin + held[-1].duration - 0.01
 
 
 def begun(q: Any) -> int:
@@ -274,19 +256,20 @@ def button(number: int, arm: int, level: bool = True) -> Callable[[Pair], None]:
     return lambda pair: pair.arms[arm].buttons.__setitem__(number, level)
 
 
-def protective_stop(arm: int) -> Callable[[Pair], None]:
-    return lambda pair: setattr(pair.arms[arm], "stopped", True)
-
-
-def sensor(arm: int) -> Callable[[Pair], None]:
-    return lambda pair: setattr(pair.arms[arm], "offset", 60.0)
-
-
 FAULTS: dict[str, tuple[Callable[[Pair], None], str]] = {
-    "the leader's protective stop": (protective_stop(0), "the other arm is silent"),
-    "the other's protective stop": (protective_stop(1), "the other arm is silent"),
+    "the leader's protective stop": (
+        lambda pair: setattr(pair.arms[0], "stopped", True),
+        "the other arm is silent",
+    ),
+    "the other's protective stop": (
+        lambda pair: setattr(pair.arms[1], "stopped", True),
+        "the other arm is silent",
+    ),
     "a button": (button(2, 0), "stopped by hand"),
-    "a sensor's offset": (sensor(1), "the force is out of its band"),
+    "a sensor's offset": (
+        lambda pair: setattr(pair.arms[1], "offset", 60.0),
+        "the force is out of its band",
+    ),
 }
 
 
@@ -310,7 +293,7 @@ def test_both_arms_hold_and_press(name: str, phase: str) -> None:
         at = max(at, lift)
     found.most = at + 1.5
     found.run()
-    assert any(told in arm.log for arm in found.arms)
+    assert any(f"textmsg {told}" in arm.log for arm in found.arms)
     last = [np.array([row[1] for row in arm.record[-100:]]) for arm in found.arms]
     assert max(np.ptp(q, axis=0).max() for q in last) < 1e-9, "both stand"
     near = np.abs(job.time - at) < 0.5
@@ -355,9 +338,7 @@ def test_an_arm_elsewhere_is_not_moved_unasked() -> None:
         assert np.ptp(np.array([row[1] for row in arm.record]), axis=0).max() < 1e-12
 
 
-def test_other_arms_and_steps_are_refused() -> None:
-    with pytest.raises(SettingsError, match="UR e-series"):
-        TARGETS["ur-script"].refuse(rack_job(), "ur-script", any_arm=False)
+def test_steps_that_fill_no_phase_are_refused() -> None:
     options = BundleOptions(step=0.05, any_arm=True)
     with pytest.raises(SettingsError, match="time step"):
         urscript_files(prepared(rack_driven(), TARGETS["ur-script"], options))

@@ -124,13 +124,10 @@ def test_a_seventh_axis_is_an_external_one_to_rapid() -> None:
         assert isinstance(text, str)
         module = parse(text)
         degrees = np.rad2deg(sheet.sampled.arm(arm, sheet.sampled.q))
-        (first,) = (value for _, _, name, value in module.declarations if name == "carryFirst")
-        assert isinstance(first, list)
-        robot, external = (np.array(each, dtype=float) for each in first)
+        robot, external = (np.array(each) for each in module.declared["carryFirst"][2])
         np.testing.assert_allclose(robot, degrees[0, [0, 1, 3, 4, 5, 6]], atol=1e-6)
         np.testing.assert_allclose(external, [degrees[0, 2], *[9e9] * 5], atol=1e-6)
-        check = module.procedures["CarryCheckStart"]
-        assert [call.name for call in check].count("EXIT") == 7
+        assert module.procedures["CarryCheckStart"].count("EXIT()") == 7
         assert "here.extax.eax_a" in text
     with pytest.raises(SettingsError, match="7 joints; targets of ur-script hold 6"):
         TARGETS["ur-script"].refuse(job, "ur-script", any_arm=True)
