@@ -3,8 +3,7 @@ asks for in a row the last counts."""
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +13,7 @@ import hybrid_opt as ho
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.workbench import Session, Workbench, handles, moved
 from tests.hybrid_opt.cells import shipped
-from tests.waiting import HANGS
+from tests.waiting import until
 
 PALLET = "environment.pallet in front"
 
@@ -99,13 +98,6 @@ def bench() -> Iterator[Workbench]:
     page.close()
 
 
-def waited(holds: Callable[[], bool], what: str) -> None:
-    end = time.monotonic() + HANGS
-    while not holds():
-        assert time.monotonic() < end, what
-        time.sleep(0.02)
-
-
 def test_dragging_never_queues_and_ends_where_it_was_let_go(bench: Workbench) -> None:
     (pallet,) = [one for one in handles(bench.session.cell.workcell) if "pallet" in one.key]
     for k in range(50):
@@ -117,5 +109,5 @@ def test_dragging_never_queues_and_ends_where_it_was_let_go(bench: Workbench) ->
         body = next(b for b in bench.session.cell.workcell.environment if b.name == pallet.title)
         return bool(abs(body.pose[2, 3] - end) < 1e-9)
 
-    waited(there, "the last place")
+    until(there)
     assert np.isfinite(bench.session.verdict.seconds)
