@@ -1,4 +1,4 @@
-"""What reading one file takes, in a process of its own: `-m tests.fuzz.reading KIND FILE`."""
+"""What reading one file takes, in a process of its own: `-m tests.fuzz.reading FILE`."""
 
 from __future__ import annotations
 
@@ -23,37 +23,37 @@ from hybrid_opt.store.trajectory_file import read_trajectory
 from studies.research.best_front import read_reference_front
 from symbolic.errors import DualArmError
 from symbolic.read.cell import load
-from symbolic.read.meshes import read_mesh
+from symbolic.read.meshes import FORMATS, read_mesh
 from symbolic.read.urdf import read_srdf, read_urdf
 
 READERS: dict[str, Callable[[Path], Any]] = {
-    "workcell": load,
-    "urdf": read_urdf,
-    "xacro": read_urdf,
-    "srdf": read_srdf,
-    "mesh": lambda path: read_mesh(path, np.ones(3)),
-    "trajectory": read_trajectory,
-    "configuration": lambda path: read_configuration(path.parent),
-    "replica": lambda path: read_record(FinishedReplica, path, ""),
-    "polish": lambda path: read_record(PolishedFront, path, ""),
-    "evaluations": lambda path: decode(read_bytes(path), path),
-    "journal": lambda path: Journal(path, b"\0" * 32),
-    "manifest": lambda path: read_manifest(path.parent),
-    "reference front": read_reference_front,
-    "cache": lambda path: Cache(path.parent).find(path.stem),
+    "cell.toml": load,
+    **dict.fromkeys(("arm.urdf", "arm.xacro"), read_urdf),
+    "arm.srdf": read_srdf,
+    **dict.fromkeys([f"m.{kind}" for kind in FORMATS], lambda path: read_mesh(path, np.ones(3))),
+    "trajectory.json": read_trajectory,
+    "configuration.json": lambda path: read_configuration(path.parent),
+    "replica.json": lambda path: read_record(FinishedReplica, path, ""),
+    "polish.json": lambda path: read_record(PolishedFront, path, ""),
+    "candidates.csv.gz": lambda path: decode(read_bytes(path), path),
+    "journal.bin": lambda path: Journal(path, bytes(32)),
+    "manifest.json": lambda path: read_manifest(path.parent),
+    "front.csv": read_reference_front,
+    "key.json": lambda path: Cache(path.parent).find(path.stem),
 }
+"""What reads a file, by its name."""
 
 
 def main() -> None:
     """Read the file and tell, as JSON, what it took."""
-    kind, path = sys.argv[1], Path(sys.argv[2])
+    path = Path(sys.argv[1])
     warnings.simplefilter("ignore")
     # The peak that a process is born with is that of its parent.
     Path("/proc/self/clear_refs").write_text("5")
     before = _status("VmRSS")
     told = ""
     try:
-        READERS[kind](path)
+        READERS[path.name](path)
     except DualArmError as error:
         told = str(error)
     times = os.times()

@@ -128,57 +128,22 @@ def test_a_mesh(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("changes", "path", "words"),
+    ("first", "allocation", "path", "words"),
     [
-        ({"contacts": [contact(normal=[0, 0, 0]), OPPOSITE]}, "contacts[0].normal", "no direction"),
-        (
-            {"contacts": [contact(xyz=[0, 0.9, 0], normal=[0, -1, 0]), OPPOSITE]},
-            "contacts[0].xyz",
-            "at most a diagonal of the payload away",
-        ),
-        (
-            {"contacts": [contact(patch_size=[0.1, 0.1]), OPPOSITE]},
-            "contacts[0].patch_size",
-            "beside",
-        ),
-        (
-            {"contacts": [contact(further=[{"xyz": [0.05, 0.2, 0]}] * 3), OPPOSITE]},
-            "contacts",
-            "found 5 pads; allowed are 4",
-        ),
-        (
-            {"contacts": [contact(xyz=[0.15, 0, 0]), OPPOSITE]},
-            "contacts",
-            "do not close their grasp",
-        ),
-        (
-            {"contacts": [contact(xyz=[0.15, 0, 0]), OPPOSITE], "task": {"allocation": "paper"}},
-            "contacts[1].xyz",
-            "task.allocation = 'soft-finger' and 'joint' take any",
-        ),
-        (
-            {
-                "contacts": [contact(further=[{"xyz": [0.05, 0.2, 0]}]), OPPOSITE],
-                "task": {"allocation": "paper"},
-            },
-            "contacts[1].xyz",
-            "belongs to 3 pads",
-        ),
-        (
-            {"payload": {"kind": "drum", "mass": 1.0}},
-            "payload.kind",
-            "allowed is one of 'box', 'cylinder', 'mesh'",
-        ),
-        (
-            {"payload": {"kind": "cylinder", "radius": 0.25, "length": 0.3, "mass": 6.0}},
-            "contacts[0].xyz",
-            "or a normal of its own",
-        ),
+        ({"normal": [0, 0, 0]}, "joint", "contacts[0].normal", "no direction"),
+        ({"xyz": [0, 0.9, 0], "normal": [0, -1, 0]}, "joint", "contacts[0].xyz", "a diagonal of"),
+        ({"patch_size": [0.1, 0.1]}, "joint", "contacts[0].patch_size", "beside"),
+        ({"further": [{"xyz": [0.05, 0.2, 0]}] * 3}, "joint", "contacts", "found 5 pads; allowed"),
+        ({"xyz": [0.15, 0, 0]}, "joint", "contacts", "do not close their grasp"),
+        ({"xyz": [0.15, 0, 0]}, "paper", "contacts[1].xyz", "'soft-finger' and 'joint' take any"),
+        ({"further": [{"xyz": [0.05, 0.2, 0]}]}, "paper", "contacts[1].xyz", "belongs to 3 pads"),
     ],
 )
-def test_refuses(changes: dict[str, Any], path: str, words: str, tmp_path: Path) -> None:
+def test_refuses(
+    first: dict[str, Any], allocation: str, path: str, words: str, tmp_path: Path
+) -> None:
     with pytest.raises(WorkcellError) as caught:
-        cell(tmp_path, **changes)
+        cell(tmp_path, contacts=[contact(**first), OPPOSITE], task={"allocation": allocation})
     found = [problem for problem in caught.value.problems if problem.startswith(f"{path}: ")]
     assert any(words in problem for problem in found), caught.value.problems
 

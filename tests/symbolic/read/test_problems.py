@@ -16,6 +16,7 @@ from tests.symbolic.read.samples import GOFA, RACK, sample_data, write
 from tests.waiting import soon
 
 DELETE = object()
+DRUM = {"kind": "cylinder", "radius": 0.25, "length": 0.3, "mass": 6.0}
 ZERO_POSE = [0.0] * 6
 LOWER = [0, 0, 2, 0, 0, 0]
 
@@ -105,7 +106,9 @@ CASES: list[tuple[Any, ...]] = [
     ("payload.inertia", [[0.1, 0, 0], [0, 0.1, 0], [0, 0, 0.3]], "the sum of the other two"),
     ("payload.inertia", [[185, 0, 0], [0, 127, 0], [0, 0, 208]], "inside the box gives"),
     ("payload.centre_of_mass", [0, 0.21, 0], "outside the box", "payload.centre_of_mass[1]"),
+    ("payload", {"kind": "drum", "mass": 1.0}, "of 'box', 'cylinder', 'mesh'", "payload.kind"),
     # contacts
+    ("payload", DRUM, "or a normal of its own", "contacts[0].xyz"),
     ("contacts[0].xyz", [0, 0.19, 0], "0.01 m inside the box"),
     ("contacts[0].xyz", [0.15, 0.20, 0], "on an edge of the box"),
     ("contacts[0].xyz", [0.14, 0.20, 0], "only 0.01 m from the edge"),
