@@ -17,21 +17,26 @@ from symbolic.geometry.clearance import screening_functions
 from symbolic.geometry.expressions import EXACT, Softness
 from symbolic.geometry.pairs import CellGeometry, build_geometry, coal_distance
 from symbolic.geometry.pieces import Piece
-from symbolic.read.cell import load
+from symbolic.read.cell import changed_text, load
 from symbolic.records import Body, Box, Cylinder, Mesh, Robot, Sphere, Workcell
 from symbolic.records.poses import pose_matrix
 from symbolic.robot.model import RobotModel, build_robot_model
 from tests.machines import ur10_urdf
-
-RACK = Path(__file__).parent / "data" / "plain_rack.toml"
+from tests.symbolic.read.samples import GOFA, SAMPLE
 
 Configurations = tuple[Array, Array, Array]
 
 
 @cache
 def rack() -> Workcell:
-    """A rack of boards and uprights with two GoFa 12, apart from the cell that is tuned."""
-    return load(RACK)
+    """The sample cell, its tools twice as long: a rack with two GoFa 12, which nobody tunes."""
+    changes = {
+        "robots.urdf": str(GOFA),
+        "robots.pad.xyz": [0.0, 0.0, 0.2],
+        "robots.tool.length": 0.2,
+        "robots.tool.xyz": [0.0, 0.0, 0.1],
+    }
+    return load(SAMPLE, text=changed_text(SAMPLE.read_bytes(), changes, SAMPLE.name))
 
 
 def obstacle_cell(folder: Path) -> Workcell:
