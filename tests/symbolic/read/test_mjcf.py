@@ -357,15 +357,6 @@ def test_dropped_links_take_along_what_hangs_on_them() -> None:
         without_links(urdf(), ("*",))
 
 
-def test_a_held_lift_moves_the_arm(tmp_path: Path) -> None:
-    low, high = (
-        arm_model(replace(arms(tmp_path)[0], locked_joints=(("lift", height),)))
-        for height in (0.0, 0.7)
-    )
-    step = high.jointPlacements[1].translation - low.jointPlacements[1].translation
-    assert step == pytest.approx([0.0, 0.0, 0.7])
-
-
 def test_a_continuous_joint_has_one_coordinate_and_wide_limits() -> None:
     text = machine().replace('"left_3_x" type="revolute"', '"left_3_x" type="continuous"')
     model = reduced_model(parse_urdf(text.encode(), "m"))
