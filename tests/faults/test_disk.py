@@ -16,7 +16,7 @@ from hybrid_opt.campaign.journal import Journal
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.store.files import read_json, sha256, write_atomically, write_json
 from hybrid_opt.store.trajectory_file import read_trajectory, write_trajectory
-from tests.faults.kills import contents, differences, ended, started, study
+from tests.faults.test_kills import contents, differences, ended, started, study
 from tests.symbolic.cells import ROOT, rack_cell
 from tests.waiting import HANGS
 

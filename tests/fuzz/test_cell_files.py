@@ -23,8 +23,17 @@ from symbolic.read.scenes import read_scene
 from symbolic.read.tables import Table, read_body
 from symbolic.records import Workcell
 from symbolic.records.problems import Problems
-from tests.fuzz.damage import Bytes, Tree, byte_damage, tree_damage, xml_damage
-from tests.fuzz.promises import MANY, Checks, all_kept, kept
+from tests.fuzz.damage import (
+    MANY,
+    Bytes,
+    Checks,
+    Tree,
+    all_kept,
+    byte_damage,
+    kept,
+    tree_damage,
+    xml_damage,
+)
 from tests.symbolic.read.samples import GOFA, RACK, sample_data, write
 from tests.symbolic.read.test_scenes import FRAMES, MESSAGE, NEW, SAVED, sdf
 

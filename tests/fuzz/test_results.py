@@ -18,8 +18,7 @@ from hypothesis import strategies as st
 from hybrid_opt.campaign.results import read_campaign
 from studies.programs.comparison import compare
 from studies.report.data import gather_carries
-from tests.fuzz.damage import Bytes, Tree, byte_damage, tree_damage
-from tests.fuzz.promises import MANY, Checks, all_kept, kept
+from tests.fuzz.damage import MANY, Bytes, Checks, Tree, all_kept, byte_damage, kept, tree_damage
 
 EVALUATIONS, MARK = "evaluations.csv.gz", "replica.json"
 

@@ -17,8 +17,7 @@ from hypothesis import strategies as st
 from hybrid_opt.bundles.bundle import MANIFEST, read_manifest, write_bundle
 from hybrid_opt.store.files import sha256
 from hybrid_opt.store.trajectory_file import read_trajectory, write_trajectory
-from tests.fuzz.damage import Bytes, Tree, byte_damage, tree_damage
-from tests.fuzz.promises import MANY, Checks, all_kept, kept
+from tests.fuzz.damage import MANY, Bytes, Checks, Tree, all_kept, byte_damage, kept, tree_damage
 from tests.symbolic.cells import rack_cell
 
 FEW = 30
