@@ -92,15 +92,19 @@ HeldMotion = BoxMotion | Carry
 """A motion whose robust forces can be asked for."""
 
 
+def parts_of(motion: HeldMotion) -> tuple[Array, Array, Array]:
+    """What forces depend on of a motion, as functions take it."""
+    return motion.pose, motion.rate, motion.second_rate
+
+
 def box_motion(motion: HeldMotion) -> BoxMotion:
-    """The part of a motion that forces depend on."""
-    return BoxMotion(motion.pose, motion.rate, motion.second_rate)
+    """The same alone."""
+    return BoxMotion(*parts_of(motion))
 
 
 def repeated(motion: HeldMotion, times: int) -> BoxMotion:
     """A motion's samples several times, one after the other."""
-    parts = motion.pose, motion.rate, motion.second_rate
-    return BoxMotion(*[np.tile(values, (times, 1)) for values in parts])
+    return BoxMotion(*[np.tile(values, (times, 1)) for values in parts_of(motion)])
 
 
 def at_rest() -> BoxMotion:
@@ -166,7 +170,8 @@ class SampledCheck:
 
 
 class RobustModel:
-    """The compiled functions behind robust forces of one workcell's carries.
+    """The compiled functions behind robust forces of one workcell's carries. A `leader` is the
+    index of the arm that keeps its place, whose force is not commanded.
 
     Attributes:
         workcell: the cell.
@@ -204,12 +209,16 @@ class RobustModel:
         return self._function(case_squeeze_function, commanded=commanded, displaced=displaced)
 
     def worst_cases(self, uncertainty: Uncertainty, leader: int) -> Array:
-        """`worst_cases` of a set that leaves something, see `check_set`; not to be modified."""
+        """`worst_cases` of a set that leaves friction, patch and force; not to be modified."""
         return self._worst(CacheKey(uncertainty, leader, known=(id(uncertainty), leader)))
 
     def _checked_cases(self, seen: CacheKey) -> Array:
         uncertainty, leader = seen.given
-        check_set(self.workcell, uncertainty)
+        if not _leaves_something(self.workcell, uncertainty):
+            raise SettingsError(
+                "the uncertainty leaves no friction or no patch; make its shares, tilt or "
+                f"displacements smaller ({uncertainty})"
+            )
         return worst_cases(self.workcell, uncertainty, leader)
 
     def least(
@@ -221,22 +230,20 @@ class RobustModel:
         Args:
             motion: of m samples.
             cases: (m, 18), one at each.
-            leader: index of the robot whose force is not commanded.
             threads: 0 for one per core.
             displaced: whether any of the cases displaces a pad; without, it is faster.
         """
-        parts = motion.pose, motion.rate, motion.second_rate
         function = self._squeeze(1 - leader, displaced)
-        return function.batch(*parts, cases, threads=threads)["normal_force"]
+        return function.batch(*parts_of(motion), cases, threads=threads)["normal_force"]
 
     def slack(
         self, motion: HeldMotion, cases: Array, force: Array, leader: int, threads: int = 1
     ) -> Array:
         """(m,) positive where a pressure that is known beforehand holds under commanded forces (m,)
         [N]; elsewhere another one still may."""
-        parts = motion.pose, motion.rate, motion.second_rate
         function = self._function(case_slack_function, commanded=1 - leader)
-        return function.batch(*parts, cases, force, threads=threads)["slack"].ravel()
+        given = *parts_of(motion), cases, force
+        return function.batch(*given, threads=threads)["slack"].ravel()
 
     def least_squeeze(self, motion: HeldMotion, cases: Array, leader: int = 0) -> Array:
         """(k, n, 2) normal forces to command [N] that hold each of k cases (k, 18) at n samples; of
@@ -269,9 +276,6 @@ class RobustModel:
     ) -> tuple[Array, Array]:
         """Least normal force to command, and the largest that the leader then feels, (n,) [N];
         infinite where none is found that holds every case.
-
-        Args:
-            leader: index of the arm that keeps its place.
 
         Raises:
             SettingsError: the set leaves no friction or patch.
@@ -339,7 +343,6 @@ class RobustModel:
 
         Args:
             uncertainty: the set; the workcell's by default.
-            leader: index of the arm that keeps its place.
 
         Raises:
             SettingsError: the set leaves no friction or patch, or no force holds all of it.
@@ -364,9 +367,7 @@ class RobustModel:
 
         Args:
             motion: whose forces they are.
-            force: what is commanded.
-            n: how many cases.
-            rng: draws them.
+            rng: draws the cases.
             threads: 0 for one per core; has no influence on what is found.
         """
         failing, closest, left = 0, SCREENED, n
@@ -420,19 +421,6 @@ class RobustModel:
         return end if beyond(end) <= 0.0 else float(brentq(beyond, 0.0, end, xtol=FACTOR_ERROR))
 
 
-def check_set(workcell: Workcell, uncertainty: Uncertainty) -> None:
-    """Refuse sets that nothing can hold.
-
-    Raises:
-        SettingsError: the set leaves no friction, no patch or no force.
-    """
-    if not _leaves_something(workcell, uncertainty):
-        raise SettingsError(
-            "the uncertainty leaves no friction or no patch; make its shares, tilt or "
-            f"displacements smaller ({uncertainty})"
-        )
-
-
 def allowed_factor(workcell: Workcell, uncertainty: Uncertainty) -> float:
     """Largest multiple of a set that leaves some friction and patches, at most
     `LARGEST_FACTOR`."""
@@ -466,27 +454,25 @@ robust_model = kept_per_workcell(RobustModel)
 """The model of a workcell, the same one for the same record."""
 
 
-def _soft_model(workcell: Workcell) -> RobustModel:
-    task = replace(workcell.task, allocation="soft-finger")
-    return RobustModel(replace(workcell, task=task))
+def _with_even_pads(workcell: Workcell) -> Workcell:
+    return replace(workcell, task=replace(workcell.task, allocation="soft-finger"))
 
 
-soft_model = kept_per_workcell(_soft_model)
-"""The model of a workcell whose pads press evenly, whatever its own allocation."""
+@kept_per_workcell
+def soft_model(workcell: Workcell) -> RobustModel:
+    """The model of a workcell whose pads press evenly, whatever its own allocation."""
+    return RobustModel(_with_even_pads(workcell))
+
+
+@kept_per_workcell
+def closes_evenly(workcell: Workcell) -> bool:
+    """Whether pads that press evenly hold a workcell's payload whatever the motion asks."""
+    return workcell.has_opposite_pads or has_force_closure(_with_even_pads(workcell))
 
 
 def pressing_model(workcell: Workcell) -> RobustModel:
     """The model of what is commanded: of pads that press evenly where that is known of them."""
     return (soft_model if closes_evenly(workcell) else robust_model)(workcell)
-
-
-def _closes_evenly(workcell: Workcell) -> bool:
-    task = replace(workcell.task, allocation="soft-finger")
-    return workcell.has_opposite_pads or has_force_closure(replace(workcell, task=task))
-
-
-closes_evenly = kept_per_workcell(_closes_evenly)
-"""Whether pads that press evenly hold a workcell's payload whatever the motion asks."""
 
 
 @dataclass(frozen=True)
@@ -526,7 +512,6 @@ def robust_price(
     Args:
         model: of the carry's workcell.
         rng: draws the random cases.
-        leader: index of the arm that keeps its place.
         cases: how many.
         threads: that hold them against the forces, 0 for one per core.
         points: how many multiples of the set.
@@ -557,4 +542,4 @@ def thinned(carry: Carry) -> tuple[NDArray[np.intp], BoxMotion]:
     """`SAMPLES` evenly spread samples of a carry, and those of its largest normal forces; which
     they are, and their motion."""
     rows = np.union1d(evenly(len(carry), SAMPLES), carry.normal_force.argmax(axis=0))
-    return rows, BoxMotion(carry.pose[rows], carry.rate[rows], carry.second_rate[rows])
+    return rows, box_motion(carry).at(rows)

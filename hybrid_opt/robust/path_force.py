@@ -15,15 +15,11 @@ from numpy.typing import NDArray
 from codegen.interpreted import InterpretedFunction
 from hybrid_opt.carry import Carry
 from hybrid_opt.compiled_cell import bound_to, held_function, kept_per_workcell
-from hybrid_opt.robust.cases import (
-    RulingCases,
-    felt_share,
-    ruling_cases,
-    worst_cases,
-)
+from hybrid_opt.robust.cases import RulingCases, felt_share, ruling_cases, worst_cases
 from hybrid_opt.robust.force import (
     BoxMotion,
     box_motion,
+    parts_of,
     pressing_model,
     repeated,
     robust_model,
@@ -131,8 +127,7 @@ class RobustPath:
         """
         n, k = len(points), len(self._cases)
         every, cases = repeated(points.motion, k), np.repeat(self._cases, n, axis=0)
-        parts = every.pose, every.rate, every.second_rate
-        difference = self._difference.batch(*parts, cases)["difference"].reshape(k, n)
+        difference = self._difference.batch(*parts_of(every), cases)["difference"].reshape(k, n)
         felt = (felt_share(difference, self._set) * difference).max(axis=0)
         room = level - np.maximum(felt, 0.0)
         left = ~(self._model.slack(every, cases, np.tile(room, k), LEADER) > 0.0)
@@ -251,13 +246,13 @@ class RulingForce:
         return self._inputs(self._workcell, self._motion, pads=True)
 
     def _inputs(self, cell: Workcell, motion: BoxMotion, pads: bool) -> Array:
-        """(k, m) what the gradient is by; or the force itself, see `change`."""
+        """(k, m) what the gradient is by; or the force itself, see `slopes`."""
         allocation = self._workcell.task.allocation
         cell = replace(cell, task=replace(cell.task, allocation=allocation))
         cases = worst_cases(cell, cell.uncertainty, self._leader)
         assert len(cases) == self._count, "no range of the uncertainty begins or ends"
         cases = cases[self._ruling]
-        moved = np.hstack([motion.pose, motion.rate, motion.second_rate, cases])
+        moved = np.hstack([*parts_of(motion), cases])
         if self._squeezed:
             held = WorkcellNumbers(cell).vector(HELD)
             return np.hstack([moved, np.tile(held, (len(moved), 1))])
@@ -265,8 +260,8 @@ class RulingForce:
             least = case_squeeze_function(cell, 1 - self._leader)
             rows = [np.split(row, (6, 12, 18)) for row in moved]
             return np.array([[float(least(*row)[1 - self._leader])] for row in rows])
-        load, own = case_origin_load_function(cell), self._motion
-        known = zip(own.pose, own.rate, own.second_rate, self._cases, strict=True)
+        load = case_origin_load_function(cell)
+        known = zip(*parts_of(self._motion), self._cases, strict=True)
         return np.hstack([moved, [np.array(load(*row)).ravel() for row in known]])
 
     @cached_property
@@ -280,10 +275,10 @@ class RulingForce:
         else:
             made = case_gradient_function(self._workcell, 1 - self._leader, numbers=True)
             function = InterpretedFunction(made)
-        own, slopes = self._motion, []
+        slopes = []
         for arm in (0, 1):
             cases = self._cases.copy()
             cases[:, arm] *= 1.0 - TRIFLE
-            found = function.batch(own.pose, own.rate, own.second_rate, cases)["slope"]
+            found = function.batch(*parts_of(self._motion), cases)["slope"]
             slopes.append(found[:, 1 - self._leader])
         return np.stack(slopes, axis=1)

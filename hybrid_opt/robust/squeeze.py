@@ -267,15 +267,8 @@ def pressed_together(workcell: Workcell, leader: int) -> Array:
 def commanded_forces(
     workcell: Workcell, carry: Carry, settings: SqueezeSettings, in_parts: bool = True
 ) -> tuple[Array, Squeeze]:
-    """(n, 2) normal forces to command of both robots along a carry [N], and how they came about.
-
-    Args:
-        workcell: states what is uncertain.
-        in_parts: see `pressed_beyond`.
-
-    Raises:
-        SettingsError: the cell's uncertainty leaves no friction or patch.
-    """
+    """(n, 2) normal forces to command of both robots along a carry [N], and how they came about;
+    see `pressed_beyond`."""
     held = carry.normal_force
     extra, squeeze = pressed_beyond(workcell, settings, carry.time, carry, held, in_parts)
     together = pressed_together(workcell, settings.leader)
