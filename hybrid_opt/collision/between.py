@@ -12,45 +12,26 @@ its place.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_opt.collision.checker import CollisionChecker, Separations
+from hybrid_opt.collision.checker import CollisionChecker, Separations, Touch
 from symbolic.array import Array
 
 Status = Literal["free", "collision", "undecided"]
 
-SEARCH_DEPTH = 5
-"""Halvings of an interval in a search."""
-
 HALVING_WINS = 0.06
 """Share of the chord that a clearance must exceed for halving to be cheaper than measuring."""
 
-PROOF_DEPTH = 12
-"""Halvings of an interval in a proof."""
+DEPTH = 12
+"""Halvings of an interval after which it stays undecided."""
 
 HOPELESS_DEPTH = 3
 """Halvings of an interval with an end too near for any proof: they only look for collisions."""
-
-
-@dataclass(frozen=True)
-class PassingTouch:
-    """A collision between samples, or an interval that could not be decided.
-
-    Attributes:
-        interval: index of the sample before it.
-        fraction: where in the interval, 0 to 1.
-        first, second: names of the bodies.
-    """
-
-    interval: int
-    fraction: float
-    first: str
-    second: str
 
 
 @dataclass(frozen=True)
@@ -61,16 +42,10 @@ class MotionVerdict:
         status: 'free' is proven; 'collision' was found by FCL; 'undecided' where a clearance is
             too small for a proof, or to be told at the finest subdivision.
         touch: the earliest collision, else the earliest undecided interval, else None.
-        unsafe: (n - 1,) intervals with a collision or undecided, up to the earliest collision.
-        intervals: intervals examined, halves included.
-        added: configurations added between the samples.
     """
 
     status: Status
-    touch: PassingTouch | None
-    unsafe: NDArray[np.bool_]
-    intervals: int
-    added: int
+    touch: Touch | None
 
 
 @dataclass(frozen=True)
@@ -90,15 +65,10 @@ class SampledMotions:
     margin: Array
 
 
-def check_all_between(
-    checker: CollisionChecker, sampled: SampledMotions, depth: int = SEARCH_DEPTH
-) -> list[MotionVerdict]:
-    """Whether anything collides between samples that are themselves free of collisions.
-
-    Between samples all of them move linearly. After `depth` halvings an interval counts as
-    undecided.
-    """
-    return _Sweep(checker, sampled).run(depth)
+def check_all_between(checker: CollisionChecker, sampled: SampledMotions) -> list[MotionVerdict]:
+    """Whether anything collides between samples that are themselves free of collisions, between
+    which all of them move linearly."""
+    return _Sweep(checker, sampled).run()
 
 
 class _Sweep:
@@ -119,27 +89,23 @@ class _Sweep:
         self.required = checker.geometry.tolerance + sampled.margin[:, None]
         self._separations: Separations = {}
 
-    def run(self, depth: int) -> list[MotionVerdict]:
-        n, n_motions = len(self.owner), len(self.sampled.lengths)
-        unsafe, left = np.zeros(n, dtype=bool), list[PassingTouch]()
-        beyond = np.full(n_motions, n)  # a motion's earliest interval with a collision so far
-        hits: list[PassingTouch] = []
-        examined, added = np.bincount(self.owner, minlength=n_motions), np.zeros(n_motions, int)
+    def run(self) -> list[MotionVerdict]:
+        n_motions = len(self.sampled.lengths)
+        # A motion's earliest interval with a collision so far.
+        beyond = np.full(n_motions, len(self.owner))
+        hits, left = list[Touch](), list[Touch]()
         work = self._first_intervals()
-        for level in range(depth + 1):
+        for level in range(DEPTH + 1):
             if level > 0:
-                examined += self._per_motion(work)
                 work = self._uncleared(work)
             for end, fraction in ((work.a, 0.0), (work.b, 1.0)):
-                hit = self._measure(work, end, level == depth)
+                hit = self._measure(work, end, level == DEPTH)
                 for row in np.flatnonzero(hit >= 0).tolist():
-                    unsafe[work.index[row]] = True
                     hits.append(self._touch(work, row, int(hit[row]), fraction))
                     np.minimum.at(beyond, self.owner[work.index[row]], work.index[row])
             # Samples after a collision say nothing new.
             work = self._uncleared(work[work.index < beyond[self.owner[work.index]]])
-            given_up = self._given_up(work, level, depth)
-            unsafe[work.index[given_up]] = True
+            given_up = self._given_up(work, level)
             left += [
                 self._touch(work, row, int(np.flatnonzero(work.pending[row])[0]), 0.5)
                 for row in np.flatnonzero(given_up).tolist()
@@ -147,41 +113,19 @@ class _Sweep:
             work = work[~given_up]
             if not len(work.index):
                 break
-            added += self._per_motion(work)
             work = self._halves(work)
-        return [
-            self._verdict(k, unsafe, (hits, left), int(examined[k]), int(added[k]))
-            for k in range(n_motions)
-        ]
+        return [self._verdict(motion, hits, left) for motion in range(n_motions)]
 
-    def _per_motion(self, work: Intervals) -> NDArray[np.intp]:
-        """(n_motions,) intervals of each in the work list."""
-        return np.bincount(self.owner[work.index], minlength=len(self.sampled.lengths))
-
-    def _verdict(
-        self,
-        motion: int,
-        unsafe: NDArray[np.bool_],
-        touches: tuple[list[PassingTouch], list[PassingTouch]],
-        examined: int,
-        added: int,
-    ) -> MotionVerdict:
+    def _verdict(self, motion: int, hits: list[Touch], left: list[Touch]) -> MotionVerdict:
         """What was found for one motion, its intervals counted from its own first sample."""
-        first = int(self.first[motion])
-        hits, left = (
-            sorted(
-                (
-                    replace(touch, interval=touch.interval - first)
-                    for touch in found
-                    if self.owner[touch.interval] == motion
-                ),
-                key=lambda touch: (touch.interval, touch.fraction),
-            )
-            for found in touches
-        )
-        status: Status = "collision" if hits else "undecided" if left else "free"
-        earliest = next(iter(hits or left), None)
-        return MotionVerdict(status, earliest, unsafe[self.owner == motion], examined, added)
+        kinds: tuple[tuple[Status, list[Touch]], ...] = (("collision", hits), ("undecided", left))
+        for status, found in kinds:
+            own = [touch for touch in found if self.owner[touch.sample] == motion]
+            if own:
+                earliest = min(own, key=lambda touch: (touch.sample, touch.fraction))
+                sample = earliest.sample - int(self.first[motion])
+                return MotionVerdict(status, replace(earliest, sample=sample))
+        return MotionVerdict("free", None)
 
     def _first_intervals(self) -> Intervals:
         """The intervals between the samples that the motion bound does not clear, found motion by
@@ -198,23 +142,21 @@ class _Sweep:
             )
             index = int(self.first[motion]) + np.arange(count - 1)
             pending = np.ones((count - 1, clearance.shape[1]), dtype=bool)
-            every = self._intervals(index, np.zeros(count - 1), 1.0, a, b, pending)
-            found.append(self._uncleared(every))
-        return joined(found)
+            whole = np.zeros(count - 1), np.ones(count - 1)
+            found.append(self._uncleared(self._intervals(index, *whole, a, b, pending)))
+        return of_rows(np.concatenate, found)
 
     def _intervals(
         self,
         index: NDArray[np.intp],
         start: Array,
-        width: float,
+        width: Array,
         a: End,
         b: End,
         pending: NDArray[np.bool_],
     ) -> Intervals:
-        motion = self.checker.motion(
-            self.checker.split(a.configuration), self.checker.split(b.configuration)
-        )
-        return Intervals(index, start, width, a, b, motion.chord, motion.bend, pending)
+        ends = self.checker.split(a.configuration), self.checker.split(b.configuration)
+        return Intervals(index, start, width, a, b, *self.checker.motion(*ends), pending)
 
     def _uncleared(self, work: Intervals) -> Intervals:
         """The intervals with pairs that the motion bound does not clear."""
@@ -237,11 +179,11 @@ class _Sweep:
             return self.required[owners[:1]]
         return self.required[owners]
 
-    def _given_up(self, work: Intervals, level: int, depth: int) -> NDArray[np.bool_]:
+    def _given_up(self, work: Intervals, level: int) -> NDArray[np.bool_]:
         """(m,) intervals that stay undecided: those with an end from which no shorter one could be
         proven either, at the last level all."""
-        hopeless = np.full(len(work.index), level == depth)
-        if HOPELESS_DEPTH <= level < depth:
+        hopeless = np.full(len(work.index), level == DEPTH)
+        if HOPELESS_DEPTH <= level < DEPTH:
             required = self.required[self.owner[work.index]]
             for end in (work.a, work.b):
                 asked = work.pending & end.measured & ~(end.clearance > required)
@@ -266,23 +208,44 @@ class _Sweep:
         middle = (work.a.configuration + work.b.configuration) / 2.0
         clearance = self.checker.bounds(*self.checker.split(middle))
         new = End(middle, clearance, np.zeros(clearance.shape, dtype=bool))
+        half = work.width / 2.0
         return self._intervals(
             np.repeat(work.index, 2),
-            alternating(work.start, work.start + work.width / 2.0),
-            work.width / 2.0,
-            alternating_ends(work.a, new),
-            alternating_ends(new, work.b),
+            _alternating([work.start, work.start + half]),
+            np.repeat(half, 2),
+            of_rows(_alternating, [work.a, new]),
+            of_rows(_alternating, [new, work.b]),
             np.repeat(work.pending, 2, axis=0),
         )
 
-    def _touch(self, work: Intervals, row: int, pair: int, fraction: float) -> PassingTouch:
-        first, second = self.checker.geometry.pair_names[pair]
-        place = float(work.start[row]) + work.width * fraction
-        return PassingTouch(int(work.index[row]), place, first, second)
+    def _touch(self, work: Intervals, row: int, pair: int, fraction: float) -> Touch:
+        place = float(work.start[row] + work.width[row] * fraction)
+        names = self.checker.geometry.pair_names[pair]
+        return Touch(int(work.index[row]), *names, fraction=place)
+
+
+class Rows:
+    """A record of arrays, and of such records, whose rows belong together."""
+
+    def __getitem__(self, rows: NDArray[np.bool_]) -> Self:
+        return of_rows(lambda values: values[0][rows], [self])
+
+
+AnyRows = TypeVar("AnyRows", bound=Rows)
+
+
+def of_rows(made_of: Callable[[list[Any]], Any], records: Sequence[AnyRows]) -> AnyRows:
+    """A record like the given ones, each of its arrays made of theirs."""
+    parts = zip(*(vars(record).values() for record in records), strict=True)
+    values = [
+        of_rows(made_of, part) if isinstance(part[0], Rows) else made_of(list(part))
+        for part in parts
+    ]
+    return type(records[0])(*values)
 
 
 @dataclass(frozen=True)
-class End:
+class End(Rows):
     """One end of m intervals.
 
     Attributes:
@@ -295,67 +258,21 @@ class End:
     clearance: Array
     measured: NDArray[np.bool_]
 
-    def __getitem__(self, rows: NDArray[np.bool_]) -> End:
-        return End(self.configuration[rows], self.clearance[rows], self.measured[rows])
-
 
 @dataclass(frozen=True)
-class Intervals:
-    """Work list: intervals of equal width, both ends, and the pairs not yet cleared."""
+class Intervals(Rows):
+    """Work list: intervals, both ends, and the pairs not yet cleared."""
 
     index: NDArray[np.intp]
     start: Array
-    width: float
+    width: Array
     a: End
     b: End
     chord: Array
     bend: Array
     pending: NDArray[np.bool_]
 
-    def __getitem__(self, rows: NDArray[np.bool_]) -> Intervals:
-        return Intervals(
-            self.index[rows],
-            self.start[rows],
-            self.width,
-            self.a[rows],
-            self.b[rows],
-            self.chord[rows],
-            self.bend[rows],
-            self.pending[rows],
-        )
 
-
-def joined(parts: Sequence[Intervals]) -> Intervals:
-    """Intervals of one width, one part after the other."""
-
-    def ends(some: Sequence[End]) -> End:
-        return End(
-            np.concatenate([end.configuration for end in some]),
-            np.concatenate([end.clearance for end in some]),
-            np.concatenate([end.measured for end in some]),
-        )
-
-    return Intervals(
-        np.concatenate([part.index for part in parts]),
-        np.concatenate([part.start for part in parts]),
-        parts[0].width,
-        ends([part.a for part in parts]),
-        ends([part.b for part in parts]),
-        np.concatenate([part.chord for part in parts]),
-        np.concatenate([part.bend for part in parts]),
-        np.concatenate([part.pending for part in parts]),
-    )
-
-
-def alternating(first: Array, second: Array) -> Array:
-    """Rows of two arrays in turn."""
-    return np.stack([first, second], axis=1).reshape(-1, *first.shape[1:])
-
-
-def alternating_ends(first: End, second: End) -> End:
-    """Ends of two kinds in turn."""
-    return End(
-        alternating(first.configuration, second.configuration),
-        alternating(first.clearance, second.clearance),
-        np.stack([first.measured, second.measured], axis=1).reshape(-1, first.measured.shape[1]),
-    )
+def _alternating(values: list[Array]) -> Array:
+    """Rows of arrays in turn."""
+    return np.stack(values, axis=1).reshape(-1, *values[0].shape[1:])

@@ -8,7 +8,7 @@ path: `configurations` finds any place of it by Newton's method, `certificates` 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -16,10 +16,11 @@ from numpy.typing import NDArray
 
 from codegen.function import NumericFunction
 from hybrid_opt.collision.between import (
-    PROOF_DEPTH,
     MotionVerdict,
+    Rows,
     SampledMotions,
     check_all_between,
+    of_rows,
 )
 from hybrid_opt.collision.checker import CollisionChecker, Touch
 from symbolic.array import Array
@@ -37,7 +38,7 @@ Configurations = Callable[[NDArray[np.intp], Array], Array]
 box pose, q_1, q_2; NaN where an arm does not follow."""
 
 STRAIGHTNESS = 1e-4
-"""Default for how far two bodies together may be off straight motion between grid points [m]."""
+"""How far two bodies together may be off straight motion between grid points [m]."""
 
 MOST_ROUNDS = 14
 """Halvings of the grid after which a path counts as not smooth."""
@@ -84,18 +85,16 @@ class Certificate:
         if self.lost:
             return "an arm does not follow the path"
         touch = self.at_sample if self.motion is None else self.motion.touch
-        first, second = ("a body", "another") if touch is None else (touch.first, touch.second)
+        assert touch is not None, "a path that is refused is refused for something"
         if self.motion is None or self.motion.status == "collision":
-            return f"{first} meets {second}"
-        return f"{first} comes too near to {second} to prove that they do not meet"
+            return str(touch)
+        return f"{touch.first} comes too near to {touch.second} to prove that they do not meet"
 
 
 def certify(
     checker: CollisionChecker,
     configuration: Configuration,
     parameters: Array,
-    straightness: float = STRAIGHTNESS,
-    depth: int = PROOF_DEPTH,
 ) -> Certificate:
     """`certify_all` for one path.
 
@@ -109,20 +108,18 @@ def certify(
     def one(_: NDArray[np.intp], u: Array) -> Array:
         return np.hstack(configuration(u))
 
-    return certify_all(checker, one, [parameters], straightness, depth)[0]
+    return certify_all(checker, one, [parameters])[0]
 
 
 def certify_all(
     checker: CollisionChecker,
     configurations: Configurations,
     parameters: Sequence[Array],
-    straightness: float = STRAIGHTNESS,
-    depth: int = PROOF_DEPTH,
 ) -> list[Certificate]:
     """Prove that continuous paths are free of collisions, or find where they are not.
 
     The grid of each is refined until no pair of bodies is, both together, farther than
-    `straightness` from straight motion (linear in joints and box pose) in the middle of any
+    `STRAIGHTNESS` from straight motion (linear in joints and box pose) in the middle of any
     interval. The straight motion is then checked by adaptive subdivision with a margin of twice
     that distance. So the proof holds for a path whose largest distance from straight motion in an
     interval is at most twice the one in its middle, as for every path that is smooth on the grid.
@@ -133,7 +130,7 @@ def certify_all(
     Raises:
         SettingsError: a path does not become straight on any grid.
     """
-    grid = _straight_grid(checker, configurations, parameters, straightness)
+    grid = _straight_grid(checker, configurations, parameters)
     clearance = checker.bounds(*checker.split(grid.configuration))
     found: list[Certificate | None] = [None] * len(parameters)
     for path in range(len(parameters)):
@@ -147,7 +144,7 @@ def certify_all(
         motions = SampledMotions(
             grid.configuration[rows], clearance[rows], lengths.tolist(), margin
         )
-        for path, motion in zip(left, check_all_between(checker, motions, depth), strict=True):
+        for path, motion in zip(left, check_all_between(checker, motions), strict=True):
             found[path] = _certificate_of(motion, grid.u[grid.owner == path], grid.deviation[path])
     return [certificate for certificate in found if certificate is not None]
 
@@ -170,7 +167,7 @@ class _Grid:
 
 
 @dataclass(frozen=True)
-class _Stretches:
+class _Stretches(Rows):
     """Intervals of paths with the configurations at both ends."""
 
     owner: NDArray[np.intp]
@@ -179,17 +176,11 @@ class _Stretches:
     a: Array
     b: Array
 
-    def __getitem__(self, rows: NDArray[np.bool_]) -> _Stretches:
-        return _Stretches(
-            self.owner[rows], self.u_a[rows], self.u_b[rows], self.a[rows], self.b[rows]
-        )
-
 
 def _straight_grid(
     checker: CollisionChecker,
     configurations: Configurations,
     parameters: Sequence[Array],
-    straightness: float,
 ) -> _Grid:
     """See `certify_all`. A path that is lost at a place is not refined there."""
     owner = np.repeat(np.arange(len(parameters)), [len(u) for u in parameters])
@@ -204,26 +195,20 @@ def _straight_grid(
         middle = configurations(work.owner, between)
         straight = (work.a + work.b) / 2.0
         off = _farthest(checker, middle, straight)
-        bent, lost = off > straightness, ~np.isfinite(middle).all(axis=1)
-        straight_enough = off <= straightness  # not where an end is lost: nothing is known of it
+        bent, lost = off > STRAIGHTNESS, ~np.isfinite(middle).all(axis=1)
+        straight_enough = off <= STRAIGHTNESS  # not where an end is lost: nothing is known of it
         np.maximum.at(deviation, work.owner[straight_enough], off[straight_enough])
         new = bent | lost
         places.append((work.owner[new], between[new], middle[new]))
         if not bent.any():
             break
         work, between, middle = work[bent], between[bent], middle[bent]
-        work = _Stretches(
-            np.concatenate([work.owner, work.owner]),
-            np.concatenate([work.u_a, between]),
-            np.concatenate([between, work.u_b]),
-            np.concatenate([work.a, middle]),
-            np.concatenate([middle, work.b]),
-        )
+        halves = replace(work, u_b=between, b=middle), replace(work, u_a=between, a=middle)
+        work = of_rows(np.concatenate, halves)
     else:
         raise SettingsError(
             f"the path is still {np.max(off):g} m off straight motion in an interval of length "
-            f"{float(np.min(work.u_b - work.u_a)):g}; it jumps or the straightness of "
-            f"{straightness:g} m is too small"
+            f"{float(np.min(work.u_b - work.u_a)):g}: it jumps; give a continuous one"
         )
     owner, u, placed = (np.concatenate(arrays) for arrays in zip(*places, strict=True))
     order = np.lexsort((u, owner))
@@ -237,7 +222,7 @@ def _farthest(checker: CollisionChecker, configuration: Array, other: Array) -> 
     for start in range(0, len(off), CACHED_ROWS):
         some = slice(start, start + CACHED_ROWS)
         ends = checker.split(configuration[some]), checker.split(other[some])
-        off[some] = np.max(checker.motion(*ends).chord, axis=1, initial=0.0)
+        off[some] = np.max(checker.motion(*ends)[0], axis=1, initial=0.0)
     return off
 
 
@@ -253,7 +238,7 @@ def _failed_on_grid(
     if lost.any():
         place = float(u[int(np.argmax(lost))])
         return Certificate(False, None, place, None, len(u), deviation, lost=True)
-    hit = checker.check(*checker.split(placed), u, clearance[rows]).first_touch
+    hit = checker.check(*checker.split(placed), clearance[rows]).first_touch
     if hit is None:
         return None
     return Certificate(False, hit, float(u[hit.sample]), None, len(u), deviation)
@@ -262,7 +247,7 @@ def _failed_on_grid(
 def _certificate_of(motion: MotionVerdict, u: Array, deviation: float) -> Certificate:
     where = float("nan")
     if motion.touch is not None:
-        k = motion.touch.interval
+        k = motion.touch.sample
         where = float(u[k] + motion.touch.fraction * (u[k + 1] - u[k]))
     return Certificate(motion.status == "free", None, where, motion, len(u), float(deviation))
 
@@ -330,10 +315,3 @@ def certificates(
         samples = [np.linspace(0.0, 1.0, len(path.q_1)) for path in some]
         found += certify_all(checker, partial(configurations, some, posture), samples)
     return found
-
-
-def failed_at(certificate: Certificate) -> float | None:
-    """Path parameter where a carry is not proven free, None where it is throughout."""
-    if certificate.is_free:
-        return None
-    return 0.0 if certificate.lost else certificate.at_parameter

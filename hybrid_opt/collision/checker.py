@@ -22,18 +22,21 @@ from symbolic.records import PAYLOAD
 
 @dataclass(frozen=True)
 class Touch:
-    """Two bodies in collision.
+    """Two bodies in collision, or that come too near to prove that they are not.
 
     Attributes:
-        sample: index of the sample; for a collision between samples, of the one before.
-        time: [s] since the start of the candidate.
+        sample: index of the sample, or of the one before.
         first, second: names of the bodies.
+        fraction: how far from the sample to the next, 0 to 1.
     """
 
     sample: int
-    time: float
     first: str
     second: str
+    fraction: float = 0.0
+
+    def __str__(self) -> str:
+        return f"{self.first} meets {self.second}"
 
 
 @dataclass(frozen=True)
@@ -42,21 +45,11 @@ class Verdict:
 
     Attributes:
         colliding: (n,) samples in collision.
-        collision_time: time that the colliding samples stand for [s]; each stands for half of
-            its two neighbouring steps.
         first_touch: the earliest collision, or None.
-        min_clearance: lower bound of the least distance over all pairs and samples [m]; at most
-            the collision tolerance where something collides or the bounds cannot tell.
-        open_samples: samples that the bounds left to FCL.
-        fcl_calls: FCL queries made.
     """
 
     colliding: NDArray[np.bool_]
-    collision_time: float
     first_touch: Touch | None
-    min_clearance: float
-    open_samples: int
-    fcl_calls: int
 
     @property
     def is_free(self) -> bool:
@@ -64,26 +57,8 @@ class Verdict:
         return self.first_touch is None
 
 
-def sample_durations(time: Array) -> Array:
-    """Time (..., n) [s] that each sample stands for: half of both neighbouring steps."""
-    halves = np.diff(time) / 2.0
-    durations = np.zeros(time.shape)
-    durations[..., :-1] += halves
-    durations[..., 1:] += halves
-    return durations
-
-
 Separations = dict[tuple[bytes, int], float | None]
 """Distance that a pair surely keeps in a configuration [m], None where it collides."""
-
-
-@dataclass(frozen=True)
-class MotionBounds:
-    """Chord and bend (n, n_pairs) [m] of every pair between configurations, see
-    `symbolic.geometry.clearance`."""
-
-    chord: Array
-    bend: Array
 
 
 def by_sample(bounds: Array, unsure: NDArray[np.bool_]) -> dict[int, list[int]]:
@@ -107,30 +82,17 @@ class CollisionChecker:
 
     Attributes:
         geometry: the cell's bodies and pairs.
-        judge: FCL's objects, with counters.
-        resting_tolerance: see `RESTING_TOLERANCE`.
-        functions: of the cell, by name.
+        judge: FCL's objects.
+        functions: those of `symbolic.geometry.clearance.screening_functions`, compiled or
+            interpreted.
         free_beyond: (n_pairs,) bounds above these call a pair free [m].
         resting_places: per allowed contact and fixed pose that touches: pair, box centre (3,),
             departure [m].
     """
 
-    def __init__(
-        self,
-        geometry: CellGeometry,
-        functions: Mapping[str, NumericFunction],
-        resting_tolerance: float = RESTING_TOLERANCE,
-    ) -> None:
-        """Prepare FCL's objects.
-
-        Args:
-            functions: those of
-                `symbolic.geometry.clearance.screening_functions`, compiled or interpreted.
-        """
-        self.geometry = geometry
-        self.resting_tolerance = resting_tolerance
-        self.judge = Judge(geometry, resting_tolerance)
-        self.functions = functions
+    def __init__(self, geometry: CellGeometry, functions: Mapping[str, NumericFunction]) -> None:
+        self.geometry, self.functions = geometry, functions
+        self.judge = Judge(geometry, RESTING_TOLERANCE)
         self.free_beyond = geometry.tolerance + FCL_RESOLUTION
         self._pairs = [(pair.first, pair.second) for pair in geometry.active]
         self._names = geometry.pair_names
@@ -154,50 +116,31 @@ class CollisionChecker:
         asked = [self.functions[f"{block}clearance"] for block in self.geometry.asked]
         return self.geometry.of_active([f.batch(pose, q_1, q_2)["clearance"] for f in asked])
 
-    def check(
-        self,
-        pose: Array,
-        q_1: Array,
-        q_2: Array,
-        time: Array,
-        clearance: Array | None = None,
-        screened: bool = True,
-    ) -> Verdict:
+    def check(self, pose: Array, q_1: Array, q_2: Array, clearance: Array | None = None) -> Verdict:
         """The verdict on n samples.
 
         Args:
             pose: (n, 6) box poses [m, rad].
             q_1, q_2: (n, joints) joint positions [rad].
-            time: (n,) or (n, 1) [s].
             clearance: (n, n_pairs) bounds if known already, else they are computed.
-            screened: False gives every pair of every sample to FCL.
         """
         if clearance is None:
             clearance = self.bounds(pose, q_1, q_2)
-        time = np.ravel(time)
         colliding = np.zeros(len(pose), dtype=bool)
-        calls = self.judge.calls
         # `not >` keeps a NaN bound open.
-        unsure = ~(clearance > self.free_beyond) if screened else np.full(clearance.shape, True)
-        suspects = by_sample(clearance, unsure)
-        first: tuple[int, int] | None = None
+        suspects = by_sample(clearance, ~(clearance > self.free_beyond))
+        first: Touch | None = None
         if suspects:
             rows = list(suspects)
             self._place(pose[rows], q_1[rows], q_2[rows])
             for local, (sample, pairs) in enumerate(suspects.items()):
-                hit = self._first_hit(local, pairs, self._resting_pairs(pose[sample, :3]))
-                if hit >= 0:
+                resting = self._resting_pairs(pose[sample, :3])
+                hits = (p for p in pairs if self._judge_pair(local, p, p in resting))
+                hit = next(hits, None)
+                if hit is not None:
                     colliding[sample] = True
-                    first = first or (sample, hit)
-        durations = sample_durations(time)
-        return Verdict(
-            colliding=colliding,
-            collision_time=float(durations[colliding].sum()),
-            first_touch=None if first is None else self._touch(*first, time),
-            min_clearance=float(np.min(clearance, initial=np.inf)),
-            open_samples=len(suspects),
-            fcl_calls=self.judge.calls - calls,
-        )
+                    first = first or Touch(sample, *self._names[hit])
+        return Verdict(colliding, first)
 
     def collisions(
         self,
@@ -232,14 +175,15 @@ class CollisionChecker:
 
     def motion(
         self, start: tuple[Array, Array, Array], end: tuple[Array, Array, Array]
-    ) -> MotionBounds:
-        """Bounds of every pair's motion between configurations (pose, q_1, q_2), each (n, 6)."""
+    ) -> tuple[Array, Array]:
+        """Chord and bend (n, n_pairs) [m] of every pair between configurations (pose, q_1, q_2),
+        each (n, 6), see `symbolic.geometry.clearance`."""
         asked = [self.functions[f"{block}motion"] for block in self.geometry.asked]
         found = [function.batch(*start, *end) for function in asked]
-        of_active = self.geometry.of_active
-        return MotionBounds(
-            *[of_active([part[name] for part in found]) for name in ("chord", "bend")]
+        chord, bend = (
+            self.geometry.of_active([part[name] for part in found]) for name in ("chord", "bend")
         )
+        return chord, bend
 
     def measure(
         self,
@@ -318,47 +262,30 @@ class CollisionChecker:
                 found[row, pair] = apart <= required[row, pair] - FCL_RESOLUTION
         return found
 
-    def min_distance(
-        self, pose: Array, q_1: Array, q_2: Array, clearance: Array | None = None
-    ) -> tuple[float, Touch | None]:
-        """FCL's least distance [m] over all pairs and samples, and where it occurs.
+    def min_distance(self, pose: Array, q_1: Array, q_2: Array, clearance: Array) -> float:
+        """FCL's least distance over all pairs and samples [m].
 
-        Pairs are measured in the order of their bounds, until no bound is lower than the best
-        distance. `Touch.time` is NaN.
+        Pairs are measured in the order of their bounds (n, n_pairs), until none is lower than the
+        best distance.
         """
-        if clearance is None:
-            clearance = self.bounds(pose, q_1, q_2)
         self._place(pose, q_1, q_2)
-        best, where = np.inf, None
+        best = np.inf
         for flat in np.argsort(clearance, axis=None, kind="stable").tolist():
             sample, pair = divmod(flat, len(self._pairs))
             if clearance[sample, pair] > best:
                 break
-            distance = self.judge.distance(sample, *self._pairs[pair])
-            if distance < best:
-                best, where = distance, self._touch(sample, pair, None)
-        return best, where
+            best = min(best, self.judge.distance(sample, *self._pairs[pair]))
+        return best
 
     def _place(self, pose: Array, q_1: Array, q_2: Array) -> None:
         poses = self.functions["piece_poses"].batch(pose, q_1, q_2)
         self.judge.set_placements(poses["quaternions"], poses["positions"])
-
-    def _first_hit(self, local: int, pairs: list[int], resting: frozenset[int]) -> int:
-        for pair in pairs:
-            if self._judge_pair(local, pair, pair in resting):
-                return pair
-        return -1
 
     def _judge_pair(self, local: int, pair: int, resting: bool) -> bool:
         i, j = self._pairs[pair]
         if not resting:
             return self.judge.collides(local, i, j)
         return self.judge.intersects(local, self.judge.shrunk_payload, j)
-
-    def _touch(self, sample: int, pair: int, time: Array | None) -> Touch:
-        first, second = self._names[pair]
-        moment = float("nan") if time is None else float(time[sample])
-        return Touch(sample, moment, first, second)
 
     def _resting_pairs(self, centre: Array) -> frozenset[int]:
         """Pairs whose contact is allowed with the box centre here."""
@@ -384,7 +311,7 @@ class CollisionChecker:
                 if not waypoint.is_fixed:
                     continue
                 self._place(waypoint.lower[None], *still)
-                reach = self.geometry.tolerance[pair] + self.resting_tolerance
+                reach = self.geometry.tolerance[pair] + RESTING_TOLERANCE
                 if self.judge.distance(0, *self._pairs[pair]) <= reach:
                     found.append((pair, waypoint.lower[:3], allowed.departure))
         return found

@@ -29,14 +29,13 @@ class Judge:
 
     Attributes:
         calls: FCL queries made so far.
-        updates: placements of pieces handed to FCL so far.
         resting_shapes: the payload's pieces, smaller by the resting tolerance on every side.
+        shrunk_payload: index of a body of these.
     """
 
     def __init__(self, geometry: CellGeometry, resting_tolerance: float) -> None:
         self._geometry = geometry
         self.calls = 0
-        self.updates = 0
         self._request = fcl.CollisionRequest()
         self._nearest = fcl.DistanceRequest(enable_nearest_points=True)
         firsts = np.cumsum([0] + [len(body.pieces) for body in geometry.bodies])
@@ -48,7 +47,6 @@ class Judge:
         smaller = tuple(shrunk(p, resting_tolerance) for p in geometry.bodies[payload].pieces)
         self.resting_shapes = tuple(piece.shape for piece in smaller)
         self.shrunk_payload = len(self._bodies)
-        """Index of the payload made smaller by the resting tolerance on every side."""
         self._bodies.append(
             _Objects(CollisionBody("shrunk payload", "payload", BOX, smaller), int(firsts[payload]))
         )
@@ -133,7 +131,6 @@ class Judge:
             for k, item in enumerate(body.objects, start=body.first_piece):
                 item.setQuatRotation(self._quaternions[sample, k].tolist())
                 item.setTranslation(self._positions[sample, k])
-            self.updates += len(body.objects)
         return body.objects
 
 

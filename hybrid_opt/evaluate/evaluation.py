@@ -8,7 +8,7 @@ The same evaluation also returns each constraint's violation for constraint domi
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
@@ -24,7 +24,6 @@ from hybrid_opt.collision.certify import (
     LostPathError,
     SampledPath,
     certificates,
-    failed_at,
 )
 from hybrid_opt.collision.checker import CollisionChecker
 from hybrid_opt.compiled_cell import CompiledCell
@@ -186,7 +185,7 @@ class CandidateEvaluator:
         self.upper = workcell.task.upper
         self._needs = _needs(self.objectives)
         self._begin: Array | None = None
-        self._proofs = KnownProofs()
+        self._proofs: dict[bytes, float | None] = {}
         self._in_lanes = functions is None and self.driver is None
 
     @cached_property
@@ -218,7 +217,7 @@ class CandidateEvaluator:
             )
         other = copy(self)
         other._begin = np.concatenate([q_1, q_2]).astype(float)
-        other._proofs = KnownProofs()
+        other._proofs = {}
         return other
 
     def outputs(self, x: Array) -> dict[str, Array]:
@@ -333,15 +332,20 @@ class CandidateEvaluator:
         )
 
     def _failures_between_samples(self, x: Array) -> list[float | None]:
-        """Path parameter where carries (n, n_var) are not proven free, None where one is."""
-
-        def find(rows: NDArray[np.intp]) -> list[float | None]:
-            paths = self._paths(x[rows])
-            known = [path for path in paths if path is not None]
-            verdicts = iter(certificates(self.checker, self.functions["posture"], known))
-            return [0.0 if path is None else failed_at(next(verdicts)) for path in paths]
-
-        return self._proofs.failures(x[:, : self.workcell.task.n_path], find)
+        """Path parameter where carries (n, n_var) are not proven free, None where one is. Paths are
+        remembered: carries may differ in their force limits alone."""
+        paths = np.ascontiguousarray(x[:, : self.workcell.task.n_path])
+        keys = [path.tobytes() for path in paths]
+        new = {key: row for row, key in enumerate(keys) if key not in self._proofs}
+        if new:
+            sampled = self._paths(x[list(new.values())])
+            followed = [path for path in sampled if path is not None]
+            verdicts = iter(certificates(self.checker, self.functions["posture"], followed))
+            found = [_failure(None if path is None else next(verdicts)) for path in sampled]
+            if len(self._proofs) + len(new) > MOST_KNOWN:
+                self._proofs = {key: self._proofs[key] for key in keys if key in self._proofs}
+            self._proofs.update(zip(new, found, strict=True))
+        return [self._proofs[key] for key in keys]
 
     def _checked(self, x: Array) -> Array:
         x = np.ascontiguousarray(np.atleast_2d(x), dtype=float)
@@ -410,6 +414,14 @@ class CandidateEvaluator:
         )
 
 
+def _failure(certificate: Certificate | None) -> float | None:
+    """Path parameter where a carry is not proven free, None where it is throughout; the start where
+    an arm loses the path, on its samples already without a certificate."""
+    if certificate is not None and certificate.is_free:
+        return None
+    return 0.0 if certificate is None or certificate.lost else certificate.at_parameter
+
+
 def _needs(objectives: Sequence[Objective]) -> tuple[str, ...] | None:
     """What the kernel has to give per sample; None if the objectives need more than it can."""
     wanted: set[str] = set()
@@ -418,30 +430,6 @@ def _needs(objectives: Sequence[Objective]) -> tuple[str, ...] | None:
             return None
         wanted |= set(objective.needs) - {"time"}
     return tuple(sorted(wanted)) if wanted <= SAMPLE_NAMES else None
-
-
-class KnownProofs:
-    """Remembers where paths fail. A resource: one per evaluator and start postures."""
-
-    def __init__(self) -> None:
-        self._known: dict[bytes, float | None] = {}
-
-    def failures(
-        self, paths: Array, find: Callable[[NDArray[np.intp]], list[float | None]]
-    ) -> list[float | None]:
-        """Path parameter where each of some paths (n, n_path) fails, None where none does.
-
-        Args:
-            find: answers for some of their rows, no path twice.
-        """
-        keys = [path.tobytes() for path in np.ascontiguousarray(paths)]
-        new = {key: row for row, key in enumerate(keys) if key not in self._known}
-        if new:
-            found = find(np.array(list(new.values())))
-            if len(self._known) + len(new) > MOST_KNOWN:
-                self._known = {key: self._known[key] for key in keys if key in self._known}
-            self._known.update(zip(new, found, strict=True))
-        return [self._known[key] for key in keys]
 
 
 class LockedEvaluator:

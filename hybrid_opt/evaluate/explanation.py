@@ -100,11 +100,7 @@ def _explained(
     sample = round(position * (n - 1)) if np.isfinite(position) else 0
     kind, _, arm = reason.rpartition("_")
     if reason == COLLISION:
-        reached = reached_samples(outputs, 0)
-        pose, q_1, q_2, time = (
-            outputs[name][0, :reached] for name in ("pose", "q_1", "q_2", "time")
-        )
-        touch = evaluator.checker.check(pose, q_1, q_2, time).first_touch
+        touch = evaluator.checker.check(*reached_samples(outputs, 0)).first_touch
         if touch is not None:
             return Explanation(reason, position, sample, pair=(touch.first, touch.second))
     elif kind == "joint_limits":

@@ -23,7 +23,7 @@ from codegen.build import load_or_build_program
 from codegen.compiled import OTHER_COMPILER, thread_pool, warn_one_lane
 from codegen.errors import CodegenError, FormError
 from codegen.function import available_cores
-from hybrid_opt.collision.checker import CollisionChecker, sample_durations
+from hybrid_opt.collision.checker import CollisionChecker
 from hybrid_opt.collision.judge import FCL_RESOLUTION
 from hybrid_opt.compiled_cell import CompiledCell
 from symbolic.array import Array
@@ -72,10 +72,7 @@ class SampledVerdicts:
 
 
 def one_by_one(outputs: Mapping[str, Array], checker: CollisionChecker) -> SampledVerdicts:
-    """The verdicts from every per-sample output of the candidate function, in NumPy.
-
-    What `hybrid_opt.evaluate.kernel` does in lanes; used where there can be no kernel.
-    """
+    """The verdicts from every per-sample output of the candidate function, in NumPy."""
     violated = np.asarray(outputs["constraint"] > 0.0)
     bad = np.asarray(np.any(violated, axis=2))
     n, samples = bad.shape
@@ -86,24 +83,27 @@ def one_by_one(outputs: Mapping[str, Array], checker: CollisionChecker) -> Sampl
     totals = np.column_stack([outputs["violation"], outputs["time"]])
     finite = np.isfinite(totals).all(axis=1)
     for row in np.flatnonzero(finite).tolist():
-        reached = reached_samples(outputs, row)
-        pose, q_1, q_2, time = (
-            outputs[name][row, :reached] for name in ("pose", "q_1", "q_2", "time")
-        )
-        colliding[row, :reached] = checker.check(pose, q_1, q_2, time).colliding
+        placed = reached_samples(outputs, row)
+        colliding[row, : len(placed[0])] = checker.check(*placed).colliding
     return SampledVerdicts(outputs, first, reason, colliding)
 
 
-def reached_samples(outputs: Mapping[str, Array], row: int) -> int:
-    """Number of samples of a candidate before an arm loses the path: those that can collide."""
+def reached_samples(outputs: Mapping[str, Array], row: int) -> tuple[Array, Array, Array]:
+    """Box poses and both arms' joints at a candidate's samples before an arm loses the path: those
+    that can collide."""
     lost = (outputs["lost_1"][row] > 0.0) | (outputs["lost_2"][row] > 0.0)
-    return int(np.argmax(lost)) if lost.any() else len(lost)
+    reached = int(np.argmax(lost)) if lost.any() else len(lost)
+    pose, q_1, q_2 = (outputs[name][row, :reached] for name in ("pose", "q_1", "q_2"))
+    return pose, q_1, q_2
 
 
 def collision_shares(colliding: NDArray[np.bool_], time: Array) -> Array:
-    """Share (n,) of the duration that the colliding samples (n, samples) stand for."""
-    shares = np.zeros(len(time))
-    durations = sample_durations(time)
+    """Share (n,) of the duration that the colliding samples (n, samples) stand for, each for half
+    of both neighbouring steps; times (n, samples) [s]."""
+    shares, halves = np.zeros(len(time)), np.diff(time) / 2.0
+    durations = np.zeros(time.shape)
+    durations[:, :-1] += halves
+    durations[:, 1:] += halves
     for row in np.flatnonzero(colliding.any(axis=1)).tolist():
         shares[row] = durations[row, colliding[row]].sum() / time[row, -1]
     return shares

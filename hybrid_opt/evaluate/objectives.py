@@ -20,6 +20,9 @@ from symbolic.records.task import initial_decision, waypoints_of
 Outputs = Mapping[str, Array]
 """Batch outputs of the candidate function, each with a leading axis over candidates."""
 
+Evaluate = Callable[[Outputs, Workcell], Array]
+"""From the batch outputs of n candidates and the workcell to (n,) values, or (n, 2) of robots."""
+
 
 @dataclass(frozen=True)
 class Objective:
@@ -28,13 +31,13 @@ class Objective:
     Attributes:
         name: its name on the command line and in results.
         title: what it is, for axes and tables.
-        evaluate: from the batch outputs (n candidates) and the workcell to (n,) values.
+        evaluate: its values (n,).
         needs: the outputs that it uses; evaluation is slower where it is not said (None).
     """
 
     name: str
     title: str
-    evaluate: Callable[[Outputs, Workcell], Array]
+    evaluate: Evaluate
     needs: tuple[str, ...] | None = None
 
 
@@ -89,29 +92,27 @@ DRIVABLE_PAIRS = (DRIVABLE_OBJECTIVES, ROBUST_DRIVABLE_OBJECTIVES)
 """What the drivable experiment may be about."""
 
 
-def _peak_force(robot: int) -> Callable[[Outputs, Workcell], Array]:
-    def evaluate(outputs: Outputs, workcell: Workcell) -> Array:
-        return _peaks(outputs)[:, robot] / float(workcell.task.reference_force[robot])
-
-    return evaluate
+def _of_robot(robot: int, forces: Evaluate) -> Evaluate:
+    return lambda outputs, workcell: forces(outputs, workcell)[:, robot]
 
 
-def _larger_peak_force(outputs: Outputs, workcell: Workcell) -> Array:
-    """The larger of both peak normal forces, each over its reference force."""
-    return np.asarray((_peaks(outputs) / workcell.task.reference_force).max(axis=1))
+def _larger(forces: Evaluate) -> Evaluate:
+    return lambda outputs, workcell: np.asarray(forces(outputs, workcell).max(axis=1), dtype=float)
 
 
-def _peaks(outputs: Outputs) -> Array:
-    """(n, 2) peak normal forces [N]: those of the whole path where a timing tells them."""
-    if "peak_force" in outputs:
-        return outputs["peak_force"]
-    return np.asarray(outputs["normal_force"].max(axis=1))
+def _peak_forces(outputs: Outputs, workcell: Workcell) -> Array:
+    """(n, 2) peak normal forces over the reference forces: those of the whole path where a timing
+    tells them."""
+    known = outputs.get("peak_force")
+    peaks = outputs["normal_force"].max(axis=1) if known is None else known
+    return np.asarray(peaks / workcell.task.reference_force)
 
 
 def _mean_force(outputs: Outputs, workcell: Workcell) -> Array:
     """Time average of both normal forces over the mean reference force."""
-    both = outputs["normal_force"].mean(axis=2)
-    return _time_average(both, outputs["time"]) / float(workcell.task.reference_force.mean())
+    both, time = outputs["normal_force"].mean(axis=2), outputs["time"]
+    mean = np.trapezoid(both, time, axis=1) / (time[:, -1] - time[:, 0])
+    return np.asarray(mean / float(workcell.task.reference_force.mean()), dtype=float)
 
 
 def _duration(outputs: Outputs, workcell: Workcell) -> Array:
@@ -159,18 +160,6 @@ def _friction_use(outputs: Outputs, workcell: Workcell) -> Array:
     return use / min(contact.friction for contact in workcell.contacts)
 
 
-def _robust_force(outputs: Outputs, workcell: Workcell) -> Array:
-    """Larger of both `_robust_forces`."""
-    return np.asarray(_robust_forces(outputs, workcell).max(axis=1), dtype=float)
-
-
-def _robust_force_of(robot: int) -> Callable[[Outputs, Workcell], Array]:
-    def evaluate(outputs: Outputs, workcell: Workcell) -> Array:
-        return _robust_forces(outputs, workcell)[:, robot]
-
-    return evaluate
-
-
 def _robust_forces(outputs: Outputs, workcell: Workcell) -> Array:
     """(n, 2) peaks over the reference force of what the workcell's uncertainty asks of each arm.
 
@@ -190,24 +179,14 @@ def _robust_forces(outputs: Outputs, workcell: Workcell) -> Array:
     return uses
 
 
-def _time_average(values: Array, time: Array) -> Array:
-    """Trapezoidal average over time; values and time (n, samples)."""
-    integral = np.trapezoid(values, time, axis=1)
-    return np.asarray(integral / (time[:, -1] - time[:, 0]), dtype=float)
-
-
 def duration_unit(workcell: Workcell) -> float:
-    """The time [s] that the objective `duration` counts as one."""
-    return 2.0 * _polygon_time(workcell)
-
-
-def _polygon_time(workcell: Workcell) -> float:
-    """Time [s] along the hand-made trajectory's straight pieces at the reference speeds."""
+    """The time [s] that the objective `duration` counts as one: twice that along the hand-made
+    trajectory's straight pieces at the reference speeds."""
     task = workcell.task
     steps = np.diff(waypoints_of(task, initial_decision(task)), axis=0)
     lengths = np.linalg.norm(steps[:, :3], axis=1) / task.reference_speed
     turns = np.linalg.norm(steps[:, 3:], axis=1) / task.reference_angular_speed
-    return float(np.maximum(lengths, turns).sum())
+    return 2.0 * float(np.maximum(lengths, turns).sum())
 
 
 _FORCE = ("normal_force",)
@@ -217,28 +196,35 @@ _JOINTS = ("q_1", "q_2")
 OBJECTIVES: dict[str, Objective] = {
     objective.name: objective
     for objective in (
-        Objective(
-            "peak_force_1", "peak normal force of robot 1 / reference", _peak_force(0), _FORCE
+        *(
+            Objective(
+                f"peak_force_{robot + 1}",
+                f"peak normal force of robot {robot + 1} / reference",
+                _of_robot(robot, _peak_forces),
+                _FORCE,
+            )
+            for robot in (0, 1)
         ),
         Objective(
-            "peak_force_2", "peak normal force of robot 2 / reference", _peak_force(1), _FORCE
+            "peak_force", "larger peak normal force / reference", _larger(_peak_forces), _FORCE
         ),
-        Objective("peak_force", "larger peak normal force / reference", _larger_peak_force, _FORCE),
         Objective("mean_force", "mean normal force / reference", _mean_force, ("time", *_FORCE)),
         Objective("duration", "duration / twice the initial polygon's time", _duration, ("time",)),
         Objective("peak_torque_use", "peak joint torque / maximum", _peak_torque_use, _TORQUES),
         Objective("joint_length", "joints' way / that of their ranges", _joint_length, _JOINTS),
         Objective("force_imbalance", "peak |N1 - N2| / reference", _force_imbalance, _FORCE),
-        Objective("robust_force", "peak force that holds in all cases / reference", _robust_force),
         Objective(
-            "robust_force_1",
-            "peak force of robot 1 that holds in all cases / reference",
-            _robust_force_of(0),
+            "robust_force",
+            "peak force that holds in all cases / reference",
+            _larger(_robust_forces),
         ),
-        Objective(
-            "robust_force_2",
-            "peak force of robot 2 that holds in all cases / reference",
-            _robust_force_of(1),
+        *(
+            Objective(
+                f"robust_force_{robot + 1}",
+                f"peak force of robot {robot + 1} that holds in all cases / reference",
+                _of_robot(robot, _robust_forces),
+            )
+            for robot in (0, 1)
         ),
         Objective(
             "friction_use",

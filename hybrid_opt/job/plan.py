@@ -95,6 +95,24 @@ class Around:
     lines: tuple[list[Straight], list[Straight]]
     stands_on: tuple[tuple[str, ...], tuple[str, ...]]
 
+    def followed(
+        self, workcell: Workcell, posture: NumericFunction, q: Array
+    ) -> Iterator[tuple[int, Straight, Array]]:
+        """Side, line and both arms' joints along it (`SAMPLES`, joints) of every straight motion.
+
+        Args:
+            posture: `symbolic.robot.arm.posture_function`.
+            q: (2, joints) of both arms where the carry begins and ends [rad or m].
+
+        Raises:
+            JobError: an arm does not reach a place within its joint range.
+        """
+        for side, (lines, known) in enumerate(zip(self.lines, q, strict=True)):
+            for line in lines:
+                way = followed(workcell, posture, line, known, at_end=side == 0)
+                yield side, line, way
+                known = way[-side]
+
 
 class JobCollisions:
     """The collision model of one workcell's jobs. Not to be shared between threads.
@@ -243,17 +261,14 @@ def what_blocks(
     """
     around = collisions.around(workcell.handling, pose)
     share = rise(1.0, SAMPLES).value[::EVERY]
-    for lines, known, end in zip(around.lines, q, (0, -1), strict=True):
-        for line in lines:
-            try:
-                path = followed(workcell, posture, line, known, at_end=end == 0)
-            except JobError as error:
-                return str(error)
-            poses, joints = line.at(share)[0], joints_of(workcell, path[::EVERY])
-            touch = around.checker.check(poses, *joints, share).first_touch
+    try:
+        for _, line, way in around.followed(workcell, posture, q):
+            poses, joints = line.at(share)[0], joints_of(workcell, way[::EVERY])
+            touch = around.checker.check(poses, *joints).first_touch
             if touch is not None:
-                return f"{line.name.replace('_', ' ')}: {touch.first} meets {touch.second}"
-            known = path[end]
+                return f"{line.name.replace('_', ' ')}: {touch}"
+    except JobError as error:
+        return str(error)
     return ""
 
 
@@ -282,7 +297,7 @@ class JobModel:
         """Load or build the compiled functions.
 
         Args:
-            cell: the cell; compiled, where others share its functions.
+            cell: compiled, where others share its functions.
             timing: its timing model, where there is one.
 
         Raises:
@@ -325,8 +340,7 @@ class JobModel:
                 "whole jobs are those of pads that press evenly (task.allocation = 'soft-finger'), "
                 "or of two round pads that face one another"
             )
-        carry = timing.carry
-        if carry is None or not timing.ok:
+        if timing.carry is None or not timing.ok:
             raise SettingsError(
                 f"there is no timing to export ({timing.status}: {timing.reason}); export one "
                 "that robots can drive"
@@ -335,8 +349,7 @@ class JobModel:
             raise SettingsError(f"smoothing over {smoothing:g} s: allowed is 0 to {WIDEST:g} s")
         jerk = kept_jerk(self.workcell, timing.limits) if within_jerk else None
         timing = without_jumps(self.timing, timing, jerk, smoothing)
-        carry = timing.carry
-        assert carry is not None, "a smoothed timing has a carry"
+        carry = timing.driven
         handling = handling or self.workcell.handling
         around, (*before, first), (*after, last) = self._around(carry, handling)
         motion = carry_motion(self.timing, carry)
@@ -372,13 +385,10 @@ class JobModel:
             self._known.clear()
         around = self._collisions.around(handling, pose)
         found: tuple[list[Phase], list[Phase]] = ([], [])
-        for phases, lines, known, end in zip(found, around.lines, q, (0, -1), strict=True):
-            for line in lines:
-                way = followed(self.workcell, self._posture, line, known, at_end=end == 0)
-                motion = timed(self.timing, line, way)
-                proof = self._free(around.checker, line, motion)
-                phases.append(Phase(line.name, 0.0, motion, without_force(motion), proof, {}))
-                known = motion.q[end]
+        for side, line, way in around.followed(self.workcell, self._posture, q):
+            motion = timed(self.timing, line, way)
+            proof = self._free(around.checker, line, motion)
+            found[side].append(Phase(line.name, 0.0, motion, without_force(motion), proof, {}))
         self._known[key] = around, *found
         return self._known[key]
 
@@ -465,13 +475,11 @@ def pressed(model: JobModel, timing: Timing, settings: SqueezeSettings | None = 
     try:
         job = model.plan(timing, settings)
     except JobError as error:
-        assert timing.carry is not None, "a timing that failed is refused before"
-        forces, squeeze = commanded_forces(model.workcell, timing.carry, settings)
+        forces, squeeze = commanded_forces(model.workcell, timing.driven, settings)
         return Pressed(forces, squeeze, None, str(error))
-    assert job.timing.carry is not None, "a job has a carry"
     carried = job.phase("carry")
     along = (carried.motion.time, carried.force.normal)
-    time = job.timing.carry.time
+    time = job.timing.driven.time
     normal = np.column_stack([np.interp(time, along[0], force) for force in along[1].T])
     return Pressed(normal, job.squeeze, job)
 

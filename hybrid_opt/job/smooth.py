@@ -57,8 +57,7 @@ def rests_at_ends(timing: Timing) -> bool:
 
 def acceleration_at_ends(timing: Timing) -> float:
     """Largest acceleration of a joint at either end, over its limit."""
-    carry = timing.carry
-    assert carry is not None, "a timing that is to be driven has a carry"
+    carry = timing.driven
     limit = carry.workcell.of_joints("acceleration_max")
     return float((np.abs(carry.side_by_side("q_second")[[0, -1]]) / limit).max())
 
@@ -83,8 +82,7 @@ def without_jumps(
         return timing
     if jerk is None:
         return _smoothed(model, timing, width)
-    assert timing.carry is not None, "a timing that is to be driven has a carry"
-    found = time_with_jerk(model, timing.carry.x, timing.limits, jerk, timing).timing
+    found = time_with_jerk(model, timing.driven.x, timing.limits, jerk, timing).timing
     if found.carry is None:
         raise JobError(f"no timing within the limits on jerk: {found.reason}")
     return found
@@ -112,11 +110,8 @@ def driven_timing(model: TimingModel, x: Array) -> Timing:
 
 def _smoothed(model: TimingModel, timing: Timing, width: float) -> Timing:
     """The timing averaged over a window, within the limits that it was found for."""
-    carry, speed = timing.carry, timing.grid_speed
-    assert carry is not None, "a timing that is to be driven has a carry"
-    assert speed is not None, "a timing that was found has its speeds"
-    u, rate, second = _averaged(speed, width)
-    motion = model.path_motion(carry.x).between(u)
+    u, rate, second = _averaged(timing.grid_speed, width)
+    motion = model.path_motion(timing.driven.x).between(u)
     limits = timing.limits
 
     def driven(factor: float) -> _Slowdown:
@@ -135,7 +130,7 @@ def _smoothed(model: TimingModel, timing: Timing, width: float) -> Timing:
         place=found.timing.place,
         carry=found.timing.carry,
         use=found.timing.use,
-        grid_speed=None,
+        grid_speed=np.zeros(0),
         slowed=timing.slowed * found.factor,
     )
 

@@ -18,10 +18,8 @@ from hybrid_opt.proposing.holding import (
     ArmKinematics,
     Hold,
     HoldQuery,
-    box_to_last_joint,
     find_holds,
     shoulders,
-    spun,
 )
 from hybrid_opt.proposing.problem import Problem
 from hybrid_opt.proposing.setup import redundancy
@@ -206,9 +204,8 @@ def _mean_reach(draft: Workcell, at: list[Array]) -> Array:
     postures of both, in the base frame [m]."""
     rng, reaches = np.random.default_rng(0), []
     for arm in (0, 1):
-        kinematics = ArmKinematics.of(draft, arm, ())
-        low, high = np.maximum(kinematics.lower, -np.pi), np.minimum(kinematics.upper, np.pi)
-        _, T = kinematics.chain(rng.uniform(low, high, (POSTURES, len(low))))
+        kinematics = ArmKinematics(draft, arm)
+        _, T = kinematics.chain(kinematics.drawn(POSTURES, rng))
         own = inverse(draft.robots[arm].T_world_base)
         reaches.append((own @ T.mean(axis=0)[:, 3])[:3] - at[arm])
     return np.asarray((reaches[0] + reaches[1]) / 2.0)
@@ -249,12 +246,8 @@ class PlaceScorer:
         own = [inverse(robot.T_world_base) for robot in draft.robots]
         at = zip(own, shoulders(draft.robots), strict=True)
         self._shoulders = [(T @ np.append(point, 1.0))[:3] for T, point in at]
-        self._queries, self._arms = [], []
-        for arm in (0, 1):
-            joints = tuple(joint for joint, _ in draft.task.redundant_of(arm))
-            self._arms.append(ArmKinematics.of(draft, arm, joints))
-            few = spins[::EVERY_SPIN]
-            self._queries.append(HoldQuery(draft, start, goal, few, None, STARTS, GUIDES_TRIED))
+        self._arms = [ArmKinematics(draft, arm) for arm in (0, 1)]
+        self._query = HoldQuery(start, goal, spins[::EVERY_SPIN], None, STARTS, GUIDES_TRIED)
         meshes = MeshReader()
         self._environment = [
             shape_pieces(body.shape, body.pose, body.name, meshes) for body in draft.environment
@@ -268,12 +261,12 @@ class PlaceScorer:
             return None
         T = pose_matrix(base[:3], base[3:])
         kinematics = self._arms[arm].moved(T)
-        holds = find_holds(self._queries[arm], arm, kinematics, self._rng).holds
+        holds = find_holds(self._query, kinematics, self._rng).holds
         if not holds:
             return None
         hidden = self._hidden(arm, (T @ np.append(self._shoulders[arm], 1.0))[:3])
         value = holds[0].score + 0.05 * len(holds) - HIDDEN * hidden
-        return Base(base, value, self._followed(arm, kinematics, holds))
+        return Base(base, value, self._followed(kinematics, holds))
 
     def _stands_free(self, arm: int, base: Array) -> bool:
         """Whether nothing of the environment is where the robot would stand; its floor may be."""
@@ -281,20 +274,15 @@ class PlaceScorer:
         feet = tuple(piece.moved(T) for piece in self._feet[arm])
         return all(coal_distance(feet, pieces) > 0.0 for pieces in self._environment)
 
-    def _followed(
-        self, arm: int, kinematics: ArmKinematics, holds: Sequence[Hold]
-    ) -> NDArray[np.bool_]:
+    def _followed(self, kinematics: ArmKinematics, holds: Sequence[Hold]) -> NDArray[np.bool_]:
         """(k,) detours along which an arm follows the box in one of these ways to hold, its
         redundant joints where they are."""
-        robot, contact = self._draft.robots[arm], self._draft.contacts[arm]
+        robot = self._draft.robots[kinematics.arm]
         k, m, _ = self._detours.shape
         if not k:
             return np.zeros(0, dtype=bool)
         T_world_box = box_placement(self._draft.task.orientation, self._detours.reshape(k * m, -1))
-        rows = []
-        for hold in holds:
-            T = box_to_last_joint(self._draft, kinematics.geometry, spun(contact, hold.spin), arm)
-            rows.append((T_world_box @ T).reshape(k, m, 4, 4))
+        rows = [(T_world_box @ kinematics.held(hold.spin)).reshape(k, m, 4, 4) for hold in holds]
         targets = np.concatenate(rows).swapaxes(0, 1)
         q = np.repeat([hold.q_start for hold in holds], k, axis=0)
         path, kept, measure = kinematics.follow(q, targets)

@@ -82,81 +82,77 @@ class Sampling:
     high: float
     out_of_time: Callable[[], bool]
 
+    def bounds_around(self, carry: Array) -> Bounds:
+        """Bounds around a feasible carry (n_var,).
 
-def find_bounds(carry: Array, sampling: Sampling) -> Bounds:
-    """Bounds around a feasible carry.
+        Their common factor is bisected. In between they move to the middle of the feasible
+        candidates found, which makes room for wider ones. The carry itself stays, if it is within
+        them: where they move to is longer.
+        """
+        scale, centre = 0.5, carry
+        for _ in range(CENTRING):
+            scale, good = self._bisected(centre, scale)
+            if len(good) < 6 or self.out_of_time():
+                break
+            moved = np.round(good.mean(axis=0), 4)
+            if not self.certain(moved):
+                break
+            centre = moved
+        wanted = 1.3 * self.low, 0.85 * self.high
+        tried: list[tuple[float, float, int]] = []
+        for _ in range(ROUNDS):
+            _, fine = self._judged(centre, scale, CONFIRMED, wanted)
+            share = float(fine.mean())
+            tried.append((scale, share, len(fine)))
+            if wanted[0] <= share <= wanted[1] or self.out_of_time():
+                break
+            step = EMPTY_STEP if share == 0.0 else STEPS[share > self._aim]
+            scale = float(np.clip(step * scale, NARROWEST, WIDEST))
+        scale, share, count = min(tried, key=lambda one: abs(np.log((one[1] + 1e-3) / self._aim)))
+        lower, upper = self._box(centre, scale)
+        near = np.clip(carry, lower, upper)
+        between = (np.round(centre + keep * (near - centre), 4) for keep in KEPT)
+        found = next((x for x in between if self.certain(x)), centre)
+        return Bounds(found, lower, upper, share, count)
 
-    Their common factor is bisected. In between they move to the middle of the feasible candidates
-    found, which makes room for wider ones. The carry itself stays, if it is within them: where they
-    move to is longer.
+    @property
+    def _aim(self) -> float:
+        return float(np.sqrt(self.low * self.high))
 
-    Args:
-        carry: (n_var,) feasible.
-        sampling: how they are measured.
-    """
-    aim = float(np.sqrt(sampling.low * sampling.high))
-    scale, centre = 0.5, carry
-    for _ in range(CENTRING):
-        scale, good = _bisected(centre, scale, aim, sampling)
-        if len(good) < 6 or sampling.out_of_time():
-            break
-        moved = np.round(good.mean(axis=0), 4)
-        if not sampling.certain(moved):
-            break
-        centre = moved
-    wanted = 1.3 * sampling.low, 0.85 * sampling.high
-    tried: list[tuple[float, float, int]] = []
-    for _ in range(ROUNDS):
-        _, fine = _judged(centre, scale, sampling, CONFIRMED, wanted)
-        share = float(fine.mean())
-        tried.append((scale, share, len(fine)))
-        if wanted[0] <= share <= wanted[1] or sampling.out_of_time():
-            break
-        step = EMPTY_STEP if share == 0.0 else STEPS[share > aim]
-        scale = float(np.clip(step * scale, NARROWEST, WIDEST))
-    scale, share, count = min(tried, key=lambda one: abs(np.log((one[1] + 1e-3) / aim)))
-    lower, upper = _box(centre, scale, sampling)
-    near = np.clip(carry, lower, upper)
-    between = (np.round(centre + keep * (near - centre), 4) for keep in KEPT)
-    found = next((x for x in between if sampling.certain(x)), centre)
-    return Bounds(found, lower, upper, share, count)
+    def _bisected(self, centre: Array, scale: float) -> tuple[float, Array]:
+        """The factor at which about the wanted share is feasible, and feasible candidates near
+        it."""
+        low, high, aim = NARROWEST, WIDEST, self._aim
+        good = np.empty((0, len(centre)))
+        for _ in range(ROUNDS):
+            x, fine = self._judged(centre, scale, DRAWN, (0.65 * aim, 1.35 * aim))
+            share = float(fine.mean())
+            if share >= aim:
+                low, good = scale, x[fine]
+            else:
+                high = scale
+            if abs(share - aim) < 0.35 * aim or self.out_of_time():
+                break
+            scale = float(np.sqrt(low * high)) if high < WIDEST else min(2.0 * scale, WIDEST)
+        return scale, good
 
+    def _judged(
+        self, centre: Array, scale: float, most: int, wanted: tuple[float, float]
+    ) -> tuple[Array, NDArray[np.bool_]]:
+        """Candidates (n, n_var) and verdicts (n,): at most `most`, fewer where the share of
+        feasible ones is surely outside the wanted range, or the time is up."""
+        x, fine = np.empty((0, len(centre))), np.empty(0, dtype=bool)
+        bounds = self._box(centre, scale)
+        while len(x) < most:
+            more = self.rng.uniform(*bounds, (min(BATCH, most - len(x)), len(centre)))
+            x, fine = np.vstack([x, more]), np.append(fine, self.feasible(more))
+            found, spread = int(fine.sum()), 2.0 * np.sqrt(fine.sum() + 1.0)
+            beyond = found + spread < wanted[0] * len(x) or found - spread > wanted[1] * len(x)
+            if beyond or self.out_of_time():
+                break
+        return x, fine
 
-def _bisected(centre: Array, scale: float, aim: float, sampling: Sampling) -> tuple[float, Array]:
-    """The factor at which about the wanted share is feasible, and feasible candidates near it."""
-    low, high = NARROWEST, WIDEST
-    good = np.empty((0, len(centre)))
-    for _ in range(ROUNDS):
-        x, fine = _judged(centre, scale, sampling, DRAWN, (0.65 * aim, 1.35 * aim))
-        share = float(fine.mean())
-        if share >= aim:
-            low, good = scale, x[fine]
-        else:
-            high = scale
-        if abs(share - aim) < 0.35 * aim or sampling.out_of_time():
-            break
-        scale = float(np.sqrt(low * high)) if high < WIDEST else min(2.0 * scale, WIDEST)
-    return scale, good
-
-
-def _judged(
-    centre: Array, scale: float, sampling: Sampling, most: int, wanted: tuple[float, float]
-) -> tuple[Array, NDArray[np.bool_]]:
-    """Candidates (n, n_var) and verdicts (n,): at most `most`, fewer where the share of feasible
-    ones is surely outside the wanted range, or the time is up."""
-    x, fine = np.empty((0, len(centre))), np.empty(0, dtype=bool)
-    bounds = _box(centre, scale, sampling)
-    while len(x) < most:
-        more = sampling.rng.uniform(*bounds, (min(BATCH, most - len(x)), len(centre)))
-        x, fine = np.vstack([x, more]), np.append(fine, sampling.feasible(more))
-        found, spread = int(fine.sum()), 2.0 * np.sqrt(fine.sum() + 1.0)
-        beyond = found + spread < wanted[0] * len(x) or found - spread > wanted[1] * len(x)
-        if beyond or sampling.out_of_time():
-            break
-    return x, fine
-
-
-def _box(centre: Array, scale: float, sampling: Sampling) -> tuple[Array, Array]:
-    half = scale * sampling.unit
-    least, most = np.minimum(sampling.limits[0], centre), np.maximum(sampling.limits[1], centre)
-    return np.maximum(centre - half, least), np.minimum(centre + half, most)
+    def _box(self, centre: Array, scale: float) -> tuple[Array, Array]:
+        half = scale * self.unit
+        least, most = np.minimum(self.limits[0], centre), np.maximum(self.limits[1], centre)
+        return np.maximum(centre - half, least), np.minimum(centre + half, most)

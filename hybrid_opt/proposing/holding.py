@@ -60,25 +60,44 @@ class ArmKinematics:
     """One arm of a cell as numbers.
 
     Attributes:
+        workcell: the cell.
+        arm: index of the arm.
         geometry: its joints.
         redundant: indices of the joints that stay where they are; the other six follow the box.
         lower, upper: (joints,) limits [rad or m].
+        least: manipulability of a first path.
     """
 
-    def __init__(self, geometry: ArmGeometry, redundant: tuple[int, ...]) -> None:
-        self.geometry = geometry
-        self.redundant = redundant
-        self.following = [k for k in range(geometry.joints) if k not in redundant]
+    def __init__(self, workcell: Workcell, arm: int, geometry: ArmGeometry | None = None) -> None:
+        self.workcell, self.arm = workcell, arm
+        self.geometry = geometry = geometry or arm_geometry(workcell, arm)
+        self.redundant = tuple(joint for joint, _ in workcell.task.redundant_of(arm))
+        self.following = [k for k in range(geometry.joints) if k not in self.redundant]
         self.lower, self.upper = np.asarray(geometry.lower), np.asarray(geometry.upper)
-
-    @classmethod
-    def of(cls, workcell: Workcell, arm: int, redundant: tuple[int, ...]) -> ArmKinematics:
-        """An arm of a workcell."""
-        return cls(arm_geometry(workcell, arm), redundant)
+        self.least = workcell.robots[arm].min_manipulability * MANIPULABILITY_MARGIN
 
     def moved(self, T_world_root: Array) -> ArmKinematics:
         """The arm at another base."""
-        return ArmKinematics(replace(self.geometry, T_world_root=T_world_root), self.redundant)
+        geometry = replace(self.geometry, T_world_root=T_world_root)
+        return ArmKinematics(self.workcell, self.arm, geometry)
+
+    def held(self, spin: float = 0.0) -> Array:
+        """T_box_joint (4, 4): the arm's last joint in the box that it holds, its pad turned about
+        its normal by an angle [rad]."""
+        contact = self.workcell.contacts[self.arm]
+        # The geometry's own contact is replaced by the one asked for.
+        T_pad_joint = inverse(contact.T_box_pad) @ inverse(self.geometry.T_joint_box)
+        return np.asarray(spun(contact, spin).T_box_pad @ T_pad_joint)
+
+    @property
+    def span(self) -> Array:
+        """(2, joints) the limits, within half a turn either way [rad or m]."""
+        return np.array([np.maximum(self.lower, -np.pi), np.minimum(self.upper, np.pi)])
+
+    def drawn(self, count: int, rng: np.random.Generator) -> Array:
+        """(count, joints) random postures within `span` [rad or m]."""
+        low, high = self.span
+        return rng.uniform(low, high, (count, len(low)))
 
     def chain(self, q: Array) -> tuple[Array, Array]:
         """Origins (n, joints, 3) and axes (n, joints, 3) of the joints, then T (n, 4, 4) of the
@@ -195,13 +214,6 @@ class ArmKinematics:
         return np.asarray(2.0 * np.pi * turns * free)
 
 
-def box_to_last_joint(workcell: Workcell, arm: ArmGeometry, contact: Contact, i: int) -> Array:
-    """T_box_joint (4, 4): the arm's last joint in the box that it holds by a contact."""
-    # The geometry's own contact is replaced by the one asked for.
-    T_pad_joint = inverse(workcell.contacts[i].T_box_pad) @ inverse(arm.T_joint_box)
-    return np.asarray(contact.T_box_pad @ T_pad_joint)
-
-
 def spun(contact: Contact, spin: float) -> Contact:
     """A contact whose pad is turned about its normal by an angle [rad]."""
     turn = pose_matrix(np.zeros(3), np.array([0.0, 0.0, spin]))
@@ -231,7 +243,7 @@ def possible_spins(contact: Contact, spins: Array) -> Array:
     return np.asarray(spins[np.abs(np.sin(spins)) < 1e-9])
 
 
-def clear_spins(query: HoldQuery, arm: int, spins: Array) -> Array:
+def clear_spins(query: HoldQuery, kinematics: ArmKinematics, spins: Array) -> Array:
     """Those of spins (n,) [rad] at which what is fixed to the arm's last joint, hand, tool and pad,
     meets nothing that stands, at the start and at the goal; all of them where none is so.
 
@@ -240,7 +252,7 @@ def clear_spins(query: HoldQuery, arm: int, spins: Array) -> Array:
     if query.judge is None:
         return spins
     geometry = query.judge.geometry
-    last = Frame("link", arm, geometry.arms[arm].joints - 1)
+    last = Frame("link", kinematics.arm, kinematics.geometry.joints - 1)
     bodies = [
         (geometry.bodies[pair.first], geometry.bodies[pair.second]) for pair in geometry.active
     ]
@@ -249,13 +261,15 @@ def clear_spins(query: HoldQuery, arm: int, spins: Array) -> Array:
         for a, b in bodies
         if last in (a.frame, b.frame) and WORLD in (a.frame, b.frame)
     ]
-    ends = box_placement(query.workcell.task.orientation, np.array([query.start, query.goal]))
+    task = kinematics.workcell.task
+    ends = box_placement(task.orientation, np.array([query.start, query.goal]))
 
     def clear(spin: float) -> bool:
-        contact = spun(query.workcell.contacts[arm], spin)
-        T = box_to_last_joint(query.workcell, geometry.arms[arm], contact, arm)
+        T_box_joint = kinematics.held(spin)
         return all(
-            coal_distance(tuple(piece.moved(end @ T) for piece in hand.pieces), standing.pieces)
+            coal_distance(
+                tuple(piece.moved(end @ T_box_joint) for piece in hand.pieces), standing.pieces
+            )
             > 0.0
             for end in ends
             for hand, standing in pairs
@@ -353,20 +367,16 @@ class HoldSearch:
 
     Attributes:
         holds: the best first.
-        reached: postures that reach the contact at the start.
-        within: of these within limits and away from singularities.
+        within: postures that hold the box at the start, within limits and away from singularities.
         free: of these free of collisions.
-        led: of these that a guide leads to the goal.
         joints: how often each joint was beyond its limits, by index.
-        pairs: pairs in the way at the start, or where `led` is 0 at the goal.
+        pairs: pairs in the way at the start, or where none is led to the goal there.
         kept: largest share of the straight line that a free posture follows.
     """
 
     holds: list[Hold] = field(default_factory=list)
-    reached: int = 0
     within: int = 0
     free: int = 0
-    led: int = 0
     joints: Counter[int] = field(default_factory=Counter)
     pairs: Counter[tuple[str, str]] = field(default_factory=Counter)
     kept: float = 0.0
@@ -377,7 +387,6 @@ class HoldQuery:
     """What an arm has to hold.
 
     Attributes:
-        workcell: the cell.
         start, goal: (6,) box poses.
         spins: of the pad beside that of the file [rad].
         judge: of collisions; None: they do not count.
@@ -385,7 +394,6 @@ class HoldQuery:
         guides: how many of `GUIDES` are tried.
     """
 
-    workcell: Workcell
     start: Array
     goal: Array
     spins: Array
@@ -394,17 +402,12 @@ class HoldQuery:
     guides: int = len(GUIDES)
 
 
-def find_holds(
-    query: HoldQuery, arm: int, kinematics: ArmKinematics, rng: np.random.Generator
-) -> HoldSearch:
+def find_holds(query: HoldQuery, kinematics: ArmKinematics, rng: np.random.Generator) -> HoldSearch:
     """The ways in which an arm can hold the box from start to goal, the other arm left out."""
-    finder = _Finder(query, arm, kinematics, rng)
-    found, contact = finder.found, query.workcell.contacts[arm]
-    spins = clear_spins(query, arm, possible_spins(contact, query.spins))
-    T_box_joint = [
-        box_to_last_joint(query.workcell, kinematics.geometry, spun(contact, spin), arm)
-        for spin in spins
-    ]
+    finder = _Finder(query, kinematics, rng)
+    found, contact = finder.found, kinematics.workcell.contacts[kinematics.arm]
+    spins = clear_spins(query, kinematics, possible_spins(contact, query.spins))
+    T_box_joint = [kinematics.held(spin) for spin in spins]
     q, which = finder.start_postures(T_box_joint)
     if not len(q):
         return found
@@ -413,7 +416,7 @@ def find_holds(
     found.free = len(q)
     finder.lead(spins[which], np.array(T_box_joint)[which], q)
     found.holds.sort(key=lambda hold: -hold.score)
-    compared = kinematics.geometry.joints - spins_the_pad(query.workcell, arm, kinematics)
+    compared = kinematics.geometry.joints - spins_the_pad(kinematics)
     found.holds = _diverse(found.holds, compared)[:MOST_HOLDS]
     return found
 
@@ -426,16 +429,16 @@ class _Finder:
     """
 
     def __init__(
-        self, query: HoldQuery, arm: int, kinematics: ArmKinematics, rng: np.random.Generator
+        self, query: HoldQuery, kinematics: ArmKinematics, rng: np.random.Generator
     ) -> None:
-        self.query, self.arm, self.kinematics, self.rng = query, arm, kinematics, rng
+        self.query, self.kinematics, self.rng = query, kinematics, rng
         self.found = HoldSearch()
-        self._least = query.workcell.robots[arm].min_manipulability * MANIPULABILITY_MARGIN
+        self._orientation = kinematics.workcell.task.orientation
 
     def start_postures(self, T_box_joint: Sequence[Array]) -> tuple[Array, NDArray[np.intp]]:
         """Distinct postures at the start and the index of each one's spin."""
         kinematics, found, start = self.kinematics, self.found, self.query.start
-        T_world_box = box_placement(self.query.workcell.task.orientation, start)
+        T_world_box = box_placement(self._orientation, start)
         which = np.arange(self.query.starts) % len(T_box_joint)
         targets = np.array([T_world_box @ T for T in T_box_joint])[which]
         centre = (kinematics.lower + kinematics.upper) / 2.0
@@ -448,11 +451,10 @@ class _Finder:
         if not len(q):
             return q, which
         q = q + np.vstack([kinematics.central(row[None, None])[0] for row in q])
-        found.reached = len(q)
         beyond = (q < kinematics.lower + LIMIT_MARGIN) | (q > kinematics.upper - LIMIT_MARGIN)
         for joint in np.flatnonzero(beyond.any(axis=0)).tolist():
             found.joints[joint] = int(beyond[:, joint].sum())
-        fine = ~beyond.any(axis=1) & (measure >= self._least)
+        fine = ~beyond.any(axis=1) & (measure >= kinematics.least)
         q, which = q[fine], which[fine]
         kept: list[int] = []
         same = SAME_REDUNDANT if kinematics.redundant else SAME_POSTURE
@@ -465,7 +467,7 @@ class _Finder:
 
     def colliding(self, pose: Array, q: Array) -> NDArray[np.bool_]:
         """(n,) of postures (n, joints) that hold the box at a pose; counts what they meet."""
-        judge, arm = self.query.judge, self.arm
+        judge, arm = self.query.judge, self.kinematics.arm
         if judge is None or not len(q):
             return np.zeros(len(q), dtype=bool)
         hit = judge.arm_colliding(arm, np.tile(pose, (len(q), 1)), q)
@@ -489,8 +491,7 @@ class _Finder:
         for bow in GUIDES[: self.query.guides]:
             if not len(waiting) or len(self.found.holds) >= ENOUGH_HOLDS:
                 return
-            orientation = self.query.workcell.task.orientation
-            T_world_box = box_placement(orientation, guide(start, goal, bow))
+            T_world_box = box_placement(self._orientation, guide(start, goal, bow))
             targets = T_world_box[:, None] @ T_box_joint[waiting]
             arrived, path, score = self._followed(targets, q[waiting])
             left = np.setdiff1d(np.arange(len(waiting)), arrived)
@@ -505,7 +506,6 @@ class _Finder:
                 value = float(score[at] + SPIN_OF_FILE * (spin[row] == 0.0))
                 hold = Hold(float(spin[row]), path[0, at], path[-1, at], value)
                 self.found.holds.append(hold)
-            self.found.led += int((~hit).sum())
             waiting = np.delete(waiting, arrived)
 
     def _followed(self, targets: Array, q: Array) -> tuple[NDArray[np.intp], Array, Array]:
@@ -521,7 +521,7 @@ class _Finder:
         path, kept, measure = kinematics.follow(q, targets, ends)
         path = path + kinematics.central(path)
         room = self._room(path)
-        fine = (room >= LIMIT_MARGIN) & (measure >= self._least)
+        fine = (room >= LIMIT_MARGIN) & (measure >= kinematics.least)
         until = np.where(fine.all(axis=0), len(targets), np.argmin(fine, axis=0))
         share = np.minimum(kept, until)
         self.found.kept = max(self.found.kept, float(share.max(initial=0)) / len(targets))
@@ -534,7 +534,7 @@ class _Finder:
         path, kept, measure = self.kinematics.follow(q, targets, resolved=True)
         room = self._room(path)
         self.found.kept = max(self.found.kept, float(kept.max(initial=0)) / len(targets))
-        fine = (room[-1] >= LIMIT_MARGIN) & (measure[-1] >= self._least)
+        fine = (room[-1] >= LIMIT_MARGIN) & (measure[-1] >= self.kinematics.least)
         arrived = np.flatnonzero((kept == len(targets)) & fine)
         return arrived, path, self._score(path, room, measure)
 
@@ -546,7 +546,7 @@ class _Finder:
     def _score(self, path: Array, room: Array, measure: Array) -> Array:
         """(n,) how far from limits and singular postures, and how short between the ends."""
         comfort = np.clip(room.min(axis=0), 0.0, 0.6) / 0.6
-        away = np.minimum(measure.min(axis=0) / (4.0 * self._least), 1.0)
+        away = np.minimum(measure.min(axis=0) / (4.0 * self.kinematics.least), 1.0)
         apart = np.linalg.norm(path[-1] - path[0], axis=1)
         return np.asarray(comfort + away - LENGTH_COST * apart)
 
@@ -573,10 +573,10 @@ def _diverse(holds: Sequence[Hold], compared: int) -> list[Hold]:
     return first + later
 
 
-def spins_the_pad(workcell: Workcell, arm: int, kinematics: ArmKinematics) -> bool:
+def spins_the_pad(kinematics: ArmKinematics) -> bool:
     """Whether the arm's last joint turns the pad about its normal, as a spin does."""
-    geometry = kinematics.geometry
-    T_joint_pad = geometry.T_joint_box @ workcell.contacts[arm].T_box_pad
+    geometry, contact = kinematics.geometry, kinematics.workcell.contacts[kinematics.arm]
+    T_joint_pad = geometry.T_joint_box @ contact.T_box_pad
     axis = geometry.axes[-1]
     aside = T_joint_pad[:3, 3] - (T_joint_pad[:3, 3] @ axis) * axis
     parallel = abs(float(T_joint_pad[:3, 2] @ axis)) > 1.0 - 1e-6

@@ -14,7 +14,7 @@ that an arm never changes its branch.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise, product
 from typing import Any
@@ -26,13 +26,10 @@ from numpy.typing import NDArray
 from hybrid_opt.proposing.holding import (
     JUMP,
     LIMIT_MARGIN,
-    MANIPULABILITY_MARGIN,
     REACHED,
     TRACKING_STEPS,
     ArmKinematics,
     Hold,
-    box_to_last_joint,
-    spun,
 )
 from hybrid_opt.proposing.trial import BoxAlone, PoseJudge
 from symbolic.array import Array
@@ -74,25 +71,16 @@ class Place:
 class _Follower:
     """One arm with pinocchio's numbers."""
 
-    def __init__(
-        self, workcell: Workcell, judge: PoseJudge, arm: int, hold: Hold, model: pin.Model
-    ) -> None:
-        robot, geometry = workcell.robots[arm], judge.geometry.arms[arm]
-        self.name = robot.name
-        self.model = model
+    def __init__(self, many: ArmKinematics, hold: Hold, model: pin.Model) -> None:
+        robot = many.workcell.robots[many.arm]
+        self.name, self.model, self.many = robot.name, model, many
         self.data = self.model.createData()
         self.names = list(self.model.names)[1:]
         self.last = self.model.njoints - 1
-        self.redundant = workcell.task.redundant_of(arm)
-        apart = [joint for joint, _ in self.redundant]
-        self.following = [k for k in range(self.model.nq) if k not in apart]
-        contact = spun(workcell.contacts[arm], hold.spin)
-        self.T_box_joint = box_to_last_joint(workcell, geometry, contact, arm)
+        self.redundant = many.workcell.task.redundant_of(many.arm)
+        self.T_box_joint = many.held(hold.spin)
         self.T_root_world = inverse(robot.T_world_base)
-        self.many = ArmKinematics(geometry, tuple(apart))
-        self.lower = np.asarray(robot.position_lower) + LIMIT_MARGIN
-        self.upper = np.asarray(robot.position_upper) - LIMIT_MARGIN
-        self.least = robot.min_manipulability * MANIPULABILITY_MARGIN
+        self.lower, self.upper = many.lower + LIMIT_MARGIN, many.upper - LIMIT_MARGIN
 
     def close(self, T_world_box: Array, extended: Array, q: Array) -> Array | str:
         """The joints near q that hold the box there, or what is in the way."""
@@ -106,7 +94,7 @@ class _Follower:
             turn = pin.log3(target[:3, :3] @ here.rotation.T)
             error = np.concatenate([target[:3, 3] - here.translation, turn])
             J = pin.getJointJacobian(self.model, self.data, self.last, pin.LOCAL_WORLD_ALIGNED)[
-                :, self.following
+                :, self.many.following
             ]
             if error @ error < CLOSED**2:
                 break
@@ -116,7 +104,7 @@ class _Follower:
                 return f"{self.name} is singular"
             if np.abs(step).max() > JUMP:
                 return f"{self.name} does not reach"
-            q[self.following] += step
+            q[self.many.following] += step
         else:
             return f"{self.name} does not reach"
         if np.abs(q - before).max() > JUMP:
@@ -124,7 +112,7 @@ class _Follower:
         beyond = np.flatnonzero((q < self.lower) | (q > self.upper))
         if len(beyond):
             return f"{self.name}/{self.names[beyond[0]]} is at its limit"
-        if abs(np.linalg.det(J)) < self.least:
+        if abs(np.linalg.det(J)) < self.many.least:
             return f"{self.name} is near a singular posture"
         return q
 
@@ -149,14 +137,15 @@ class ClosedChain:
 
         Args:
             workcell: with its redundant joints chosen.
-            judge, holds: see the class.
             models: of both arms (`symbolic.read.arms.arm_model`).
         """
-        self.judge = judge
+        self.judge, self.looked = judge, 0
         self._orientation = workcell.task.orientation
-        self.looked = 0
         self.refused: Counter[str] = Counter()
-        self._arms = [_Follower(workcell, judge, arm, holds[arm], models[arm]) for arm in (0, 1)]
+        self._arms = [
+            _Follower(ArmKinematics(workcell, arm, judge.geometry.arms[arm]), hold, model)
+            for arm, (hold, model) in enumerate(zip(holds, models, strict=True))
+        ]
 
     def close(self, extended: Array, q: tuple[Array, Array]) -> Place | None:
         """The configuration near given joints; collisions do not count."""
@@ -189,7 +178,7 @@ class ClosedChain:
             for joint, place in arm.redundant:
                 guess[:, joint] = extended[:, place]
             there = arm.many.solve(guess, T_world_box @ arm.T_box_joint, TRACKING_STEPS)
-            closed &= (there.residual <= REACHED) & (there.manipulability >= arm.least)
+            closed &= (there.residual <= REACHED) & (there.manipulability >= arm.many.least)
             closed &= np.all((there.q >= arm.lower) & (there.q <= arm.upper), axis=1)
             found.append(there.q)
         return (found[0], found[1]), closed
@@ -422,45 +411,37 @@ def plan(
     Raises:
         SettingsError: OMPL is not installed.
     """
-    base, geometric = library(seed)
-    space = base.RealVectorStateSpace(len(room.lower))
-    bounds = base.RealVectorBounds(len(room.lower))
-    for k, (low, high) in enumerate(zip(room.lower, room.upper, strict=True)):
-        bounds.setLow(k, float(low))
-        bounds.setHigh(k, float(high))
-    space.setBounds(bounds)
-    information = base.SpaceInformation(space)
-    known = _ReachedStates(chain, room)
-    information.setStateValidityChecker(lambda state: True)
-    asked = validator(base, information, known.joined)
-    information.setMotionValidator(asked)
-    information.setup()
-    problem = base.ProblemDefinition(information)
-    goals = base.GoalStates(information)
-    last = chain.looked + most
-    ways: dict[tuple[float, ...], Place] = {}
-    for ways_out, add in zip(out, (problem.addStartState, goals.addState), strict=True):
+    places: dict[State, Place] = {}
+    ways: dict[State, Place] = {}
+    ends: tuple[list[State], list[State]] = ([], [])
+    for states, ways_out in zip(ends, out, strict=True):
         place = ways_out[0][0]
         for stop in (place, *_usable([way[-1] for way in ways_out], place, room)):
-            state = space.allocState()
-            for k, value in enumerate(room.coordinates(stop.extended)):
-                state[k] = float(value)
-            key = known.key(state)
-            known.places[key], ways[key] = stop, place
-            add(state)
-    problem.setGoal(goals)
-    planner = geometric.RRTConnect(information)
-    planner.setRange(room.range)
-    planner.setProblemDefinition(problem)
-    planner.setup()
-    planner.solve(base.PlannerTerminationCondition(lambda: chain.looked >= last or out_of_time()))
-    if not problem.hasExactSolution():
+            state: State = tuple(room.coordinates(stop.extended).tolist())
+            places[state], ways[state] = stop, place
+            states.append(state)
+
+    def joined(first: State, second: State) -> bool:
+        """Whether a straight motion between two states is free, one of them reached before."""
+        if first not in places:
+            first, second = second, first
+        if first not in places:
+            return False
+        found = chain.reach(places[first], room.extended(np.array(second)))
+        return found is not None and same(places.setdefault(second, found), found)
+
+    last = chain.looked + most
+    path = connected(
+        (room.lower, room.upper),
+        room.range,
+        joined,
+        ends,
+        lambda: chain.looked >= last or out_of_time(),
+        seed,
+    )
+    if path is None or any(state not in places for state in path):
         return None
-    path = problem.getSolutionPath()
-    keys = [known.key(path.getState(k)) for k in range(path.getStateCount())]
-    if any(key not in known.places for key in keys):
-        return None
-    found = [ways[keys[0]], *(known.places[key] for key in keys), ways[keys[-1]]]
+    found = [ways[path[0]], *(places[state] for state in path), ways[path[-1]]]
     return [place for k, place in enumerate(found) if k == 0 or place is not found[k - 1]]
 
 
@@ -475,51 +456,37 @@ def _usable(stops: list[Place], place: Place, room: Freedom) -> list[Place]:
     ]
 
 
-class _ReachedStates:
-    """The configurations of all states that the planner has reached."""
-
-    def __init__(self, chain: ClosedChain, room: Freedom) -> None:
-        self.chain, self.room = chain, room
-        self.places: dict[tuple[float, ...], Place] = {}
-
-    def key(self, state: Any) -> tuple[float, ...]:
-        return tuple(state[k] for k in range(len(self.room.lower)))
-
-    def joined(self, first: Any, second: Any) -> bool:
-        """Whether a straight motion between two states is free, one of them known."""
-        keys = self.key(first), self.key(second)
-        if keys[0] not in self.places:
-            keys = keys[1], keys[0]
-        begin = self.places.get(keys[0])
-        if begin is None:
-            return False
-        found = self.chain.reach(begin, self.room.extended(np.array(keys[1])))
-        if found is None:
-            return False
-        there = self.places.setdefault(keys[1], found)
-        return same(there, found)
-
-
 def same(first: Place, second: Place) -> bool:
     """Whether both arms stand on the same branches and turns."""
     apart = [np.abs(a - b).max() for a, b in zip(first.q, second.q, strict=True)]
     return bool(max(apart) < MATCH)
 
 
-def validator(base: Any, information: Any, joined: Callable[[Any, Any], bool]) -> Any:
-    """What tells OMPL whether the motion between two states is free."""
-
-    class Validator(base.MotionValidator):  # type: ignore[misc]
-        """Asks the closed chain."""
-
-        def checkMotion(self, first: Any, second: Any) -> bool:
-            return joined(first, second)
-
-    return Validator(information)
+State = tuple[float, ...]
+"""Coordinates that the planner moves in."""
 
 
-def library(seed: int) -> tuple[Any, Any]:
-    """OMPL's modules, its generator of seeds begun anew."""
+def connected(
+    bounds: tuple[Array, Array],
+    longest: float,
+    joined: Callable[[State, State], bool],
+    ends: Sequence[Sequence[State]],
+    ended: Callable[[], bool],
+    seed: int,
+) -> list[State] | None:
+    """States of a path that RRT-Connect finds, None if it finds none.
+
+    Args:
+        bounds: least and largest states (d,).
+        longest: motion that the planner's trees grow by.
+        joined: whether the straight motion between two states is free.
+        ends: states to begin with, and to end with, one of each.
+        ended: whether to come to an end.
+        seed: of its randomness, at least 1.
+
+    Raises:
+        SettingsError: OMPL is not installed.
+    """
     try:
         from ompl import base, geometric, util
     except ImportError as error:
@@ -529,4 +496,41 @@ def library(seed: int) -> tuple[Any, Any]:
         ) from error
     util.setLogLevel(util.LogLevel.LOG_NONE)  # also says that seeds were drawn before
     util.RNG.setSeed(seed)
-    return base, geometric
+    size = len(bounds[0])
+
+    def values(state: Any) -> State:
+        return tuple(state[k] for k in range(size))
+
+    class Validator(base.MotionValidator):  # type: ignore[misc]
+        """Asks whether motions are free."""
+
+        def checkMotion(self, first: Any, second: Any) -> bool:
+            return joined(values(first), values(second))
+
+    space, limits = base.RealVectorStateSpace(size), base.RealVectorBounds(size)
+    for k, (low, high) in enumerate(zip(*bounds, strict=True)):
+        limits.setLow(k, float(low))
+        limits.setHigh(k, float(high))
+    space.setBounds(limits)
+    information = base.SpaceInformation(space)
+    information.setStateValidityChecker(lambda state: True)
+    asked = Validator(information)
+    information.setMotionValidator(asked)
+    information.setup()
+    problem, goals = base.ProblemDefinition(information), base.GoalStates(information)
+    for states, add in zip(ends, (problem.addStartState, goals.addState), strict=True):
+        for known in states:
+            state = space.allocState()
+            for k, value in enumerate(known):
+                state[k] = value
+            add(state)
+    problem.setGoal(goals)
+    planner = geometric.RRTConnect(information)
+    planner.setRange(longest)
+    planner.setProblemDefinition(problem)
+    planner.setup()
+    planner.solve(base.PlannerTerminationCondition(ended))
+    if not problem.hasExactSolution():
+        return None
+    path = problem.getSolutionPath()
+    return [values(path.getState(k)) for k in range(path.getStateCount())]

@@ -98,7 +98,11 @@ class Problem:
         bases = np.array(found, dtype=float) if known else None
         if known and self.is_machine:
             bases = shoulders(self._robots())
-        return self._faces(bases)
+        start, goal = self.poses
+        size = np.array(self.data["payload"]["size"], dtype=float)
+        R_world_box = box_placement(self.orientation, start)[:3, :3]
+        points = contact_points(size, np.array([start, goal]), R_world_box, bases)
+        return [{"xyz": point} for point in points]
 
     def _robots(self) -> tuple[Robot, Robot]:
         """The robots alone, wherever the box is."""
@@ -108,14 +112,6 @@ class Problem:
         if problems.found:
             raise WorkcellError(str(self.source), problems.messages())
         return found[0], found[1]
-
-    def _faces(self, bases: Array | None) -> list[dict[str, Any]]:
-        """Middles of faces, see `contact_points`."""
-        start, goal = self.poses
-        size = np.array(self.data["payload"]["size"], dtype=float)
-        way = np.array([start, goal])
-        points = contact_points(size, way, box_placement(self.orientation, start)[:3, :3], bases)
-        return [{"xyz": point} for point in points]
 
     def sides(self) -> list[Problem]:
         """The same problem with each pair of upright faces that the pads may press where its
@@ -147,9 +143,7 @@ class Problem:
         Raises:
             WorkcellError: with all problems of the file.
         """
-        return self._draft(merged({"contacts": self.contacts}, changes or {}))
-
-    def _draft(self, changes: dict[str, Any]) -> Workcell:
+        changes = merged({"contacts": self.contacts}, changes or {})
         task = dict(self.data["task"])
         if "waypoints" not in changes.get("task", {}):
             poses = np.array([task["start"], task["goal"]], dtype=float)

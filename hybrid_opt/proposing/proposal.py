@@ -25,7 +25,7 @@ from hybrid_opt.display import table
 from hybrid_opt.errors import NoHoldError, ProposalError
 from hybrid_opt.progress import ShowProgress, counted, passed_on
 from hybrid_opt.proposing.bases import base_choices
-from hybrid_opt.proposing.bounds import Bounds, Sampling, find_bounds
+from hybrid_opt.proposing.bounds import Bounds, Sampling
 from hybrid_opt.proposing.planner import Place, Stray, freedom, plan, straight_paths
 from hybrid_opt.proposing.problem import Draft, Problem, changes, decision_bounds, read_problem
 from hybrid_opt.proposing.setup import Pair, Setup, no_path, prepare
@@ -466,4 +466,4 @@ class _Search:
             high,
             lambda: self.spent > until,
         )
-        return find_bounds(trial.initial, sampling)
+        return sampling.bounds_around(trial.initial)

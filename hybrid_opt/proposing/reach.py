@@ -10,7 +10,6 @@ out what they can, and every line is proven free of collisions.
 from __future__ import annotations
 
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 
@@ -21,7 +20,7 @@ from hybrid_opt.compiled_cell import CompiledCell, kept_per_workcell
 from hybrid_opt.errors import JobError
 from hybrid_opt.job.plan import JobCollisions, SupportedPose
 from hybrid_opt.job.records import Job
-from hybrid_opt.proposing.planner import library, validator
+from hybrid_opt.proposing.planner import connected
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 
@@ -100,15 +99,15 @@ class _Lines:
 
     def touched(self, q: Array) -> str:
         """What collides at joints (joints,), '' where nothing does."""
-        touch = self._checker.check(*self._placed(q[None]), np.zeros(1)).first_touch
-        return "" if touch is None else f"{touch.first} meets {touch.second}"
+        touch = self._checker.check(*self._placed(q[None])).first_touch
+        return "" if touch is None else str(touch)
 
     def free(self, first: Array, second: Array) -> bool:
         """Whether no configuration looked at on a line collides."""
         n = int(np.ceil(np.abs(second - first).max() / STEP)) + 1
         q = np.linspace(first, second, n + 1)[1:]
         self.looked += len(q)
-        return self._checker.check(*self._placed(q), np.arange(len(q), dtype=float)).is_free
+        return self._checker.check(*self._placed(q)).is_free
 
     def proven(self, first: Array, second: Array) -> bool:
         """Whether the whole line is free."""
@@ -128,42 +127,20 @@ def _connected(
     Raises:
         JobError: it finds none.
     """
-    base, geometric = library(seed)
-    space = base.RealVectorStateSpace(len(q))
-    limits = base.RealVectorBounds(len(q))
-    for k, (low, high) in enumerate(zip(*bounds, strict=True)):
-        limits.setLow(k, float(low))
-        limits.setHigh(k, float(high))
-    space.setBounds(limits)
-
-    def joints(state: Any) -> Array:
-        return np.array([state[k] for k in range(len(q))])
-
-    information = base.SpaceInformation(space)
-    information.setStateValidityChecker(lambda state: True)
-    asked = validator(base, information, lambda a, b: lines.free(joints(a), joints(b)))
-    information.setMotionValidator(asked)
-    information.setup()
-    problem, ends = base.ProblemDefinition(information), []
-    for values in (q, end):
-        state = space.allocState()
-        for k, value in enumerate(values):
-            state[k] = float(value)
-        ends.append(state)
-    problem.setStartAndGoalStates(*ends)
-    planner = geometric.RRTConnect(information)
-    planner.setRange(RANGE)
-    planner.setProblemDefinition(problem)
-    planner.setup()
     last = lines.looked + MOST_LOOKED
-    planner.solve(base.PlannerTerminationCondition(lambda: lines.looked >= last))
-    if not problem.hasExactSolution():
+    path = connected(
+        bounds,
+        RANGE,
+        lambda first, second: lines.free(np.array(first), np.array(second)),
+        [[tuple(q.tolist())], [tuple(end.tolist())]],
+        lambda: lines.looked >= last,
+        seed,
+    )
+    if path is None:
         raise JobError(
             f"no way of the arms was found among {MOST_LOOKED} configurations; {_CLOSER}"
         )
-    path = problem.getSolutionPath()
-    between = [joints(path.getState(k)) for k in range(1, path.getStateCount() - 1)]
-    return [q, *between, end]
+    return [q, *map(np.array, path[1:-1]), end]
 
 
 def _shortened(lines: _Lines, corners: list[Array]) -> list[Array]:

@@ -17,14 +17,12 @@ from hybrid_opt.evaluate.explanation import missing_reach
 from hybrid_opt.proposing.holding import (
     GUIDES,
     LIMIT_MARGIN,
-    MANIPULABILITY_MARGIN,
     REACHED,
     SEARCH_DAMPING,
     ArmKinematics,
     Hold,
     HoldQuery,
     HoldSearch,
-    box_to_last_joint,
     find_holds,
     guide,
     possible_spins,
@@ -38,7 +36,7 @@ from symbolic.array import Array
 from symbolic.geometry.pairs import build_geometry
 from symbolic.read.arms import FOLLOWING, arm_model, common_joints, turning_joints
 from symbolic.read.editing import merged
-from symbolic.records import POSE_SIZE, Task, Workcell
+from symbolic.records import POSE_SIZE, Robot, Task, Workcell
 from symbolic.records.poses import box_placement
 
 GUIDES_TRIED = 3
@@ -62,14 +60,12 @@ class Pair:
         holds: of both arms.
         start, goal: the closed chain at both ends.
         chain: it, with a judge that keeps as much clearance as both ends do.
-        free_share: of the freest guide from start to goal.
     """
 
     holds: tuple[Hold, Hold]
     start: Place
     goal: Place
     chain: ClosedChain
-    free_share: float
 
     @cached_property
     def retreats(self) -> Retreats:
@@ -104,8 +100,8 @@ def ranked_pairs(
         )
         if wide is not None:
             chain = ClosedChain(workcell, wide, pair, models)
-            share = _free_share(chain, start, goal)
-            found.append((share + 0.1 * score, Pair(pair, start, goal, chain, share)))
+            rank = _free_share(chain, start, goal) + 0.1 * score
+            found.append((rank, Pair(pair, start, goal, chain)))
     found.sort(key=lambda item: -item[0])
     return [pair for _, pair in found]
 
@@ -151,15 +147,11 @@ class Agreement:
             ends: start and goal poses of the box (6,).
         """
         task = workcell.task
-        self._workcell = workcell
         self._common = np.array(
             [joint.drives for joint in task.redundant if min(joint.drives) >= 0], dtype=np.intp
         ).reshape(-1, 2)
         self._T_world_box = [box_placement(task.orientation, end) for end in ends]
-        self._arms = [
-            ArmKinematics.of(workcell, arm, tuple(joint for joint, _ in task.redundant_of(arm)))
-            for arm in (0, 1)
-        ]
+        self._arms = [ArmKinematics(workcell, arm) for arm in (0, 1)]
 
     def of(self, holds: tuple[Hold, Hold]) -> tuple[Hold, Hold] | None:
         """Both arms' ways to hold with the same values of the joints that move both, None where
@@ -188,17 +180,14 @@ class Agreement:
         values = own[0] + SHARES[:, None] * (own[1] - own[0])
         moved, fine = [], np.ones(len(SHARES), dtype=bool)
         for arm, kinematics in enumerate(self._arms):
-            contact = spun(self._workcell.contacts[arm], spins[arm])
-            T = box_to_last_joint(self._workcell, kinematics.geometry, contact, arm)
             begin = np.tile(q[arm], (len(SHARES), 1))
             begin[:, self._common[:, arm]] = values
-            target = np.tile(self._T_world_box[end] @ T, (len(SHARES), 1, 1))
-            found = kinematics.solve(begin, target, STEPS)
-            least = self._workcell.robots[arm].min_manipulability * MANIPULABILITY_MARGIN
+            T_world_joint = self._T_world_box[end] @ kinematics.held(spins[arm])
+            found = kinematics.solve(begin, np.tile(T_world_joint, (len(SHARES), 1, 1)), STEPS)
             inside = (found.q >= kinematics.lower + LIMIT_MARGIN) & (
                 found.q <= kinematics.upper - LIMIT_MARGIN
             )
-            fine &= (found.residual <= REACHED) & (found.manipulability >= least)
+            fine &= (found.residual <= REACHED) & (found.manipulability >= kinematics.least)
             fine &= inside.all(axis=1)
             moved.append(found.q)
         if not fine.any():
@@ -262,12 +251,13 @@ def prepare(
     blocked = box_blocked(judge, start, goal)
     if blocked:
         raise ProposalError(blocked)
-    query = HoldQuery(workcell, start, goal, spins, judge)
-    searches: list[HoldSearch] = []
-    for arm in (0, 1):
-        redundant = tuple(joint for joint, _ in workcell.task.redundant_of(arm))
-        searches.append(find_holds(query, arm, ArmKinematics.of(workcell, arm, redundant), rng))
-    told = [_arm_missing(query, arm, one) for arm, one in enumerate(searches) if not one.holds]
+    query = HoldQuery(start, goal, spins, judge)
+    searches = [find_holds(query, ArmKinematics(workcell, arm), rng) for arm in (0, 1)]
+    told = [
+        _arm_missing(robot, one)
+        for robot, one in zip(workcell.robots, searches, strict=True)
+        if not one.holds
+    ]
     if told:
         raise ProposalError("; ".join(told))
     pairs = ranked_pairs(workcell, judge, [found.holds for found in searches], (start, goal))
@@ -307,9 +297,8 @@ def redundant_joints(workcell: Workcell, arm: int, common: tuple[str, ...]) -> t
     held = [names.index(name) for name in common]
     sliding = [k for k, turns in enumerate(turning_joints(model)) if not turns and k not in held]
     forced = [*held, *sliding][:beyond]
-    kinematics = ArmKinematics.of(workcell, arm, ())
-    low, high = np.maximum(kinematics.lower, -np.pi), np.minimum(kinematics.upper, np.pi)
-    q = np.random.default_rng(0).uniform(low, high, (POSTURES, len(low)))
+    kinematics = ArmKinematics(workcell, arm)
+    q = kinematics.drawn(POSTURES, np.random.default_rng(0))
     jacobian = kinematics.jacobian(*kinematics.chain(q))
 
     def condition(joints: tuple[int, ...]) -> float:
@@ -338,19 +327,22 @@ def reach_missing(workcell: Workcell, ends: tuple[Array, Array], spins: Array) -
     found = []
     for arm, (name, pose) in product((0, 1), zip(("start", "goal"), ends, strict=True)):
         robot, contact = workcell.robots[arm], workcell.contacts[arm]
-        redundant = tuple(joint for joint, _ in workcell.task.redundant_of(arm))
-        kinematics = ArmKinematics.of(workcell, arm, redundant)
+        kinematics = ArmKinematics(workcell, arm)
         T_world_box = box_placement(workcell.task.orientation, pose)
-        held = [spun(contact, spin) for spin in possible_spins(contact, spins)]
-        T = [T_world_box @ box_to_last_joint(workcell, kinematics.geometry, c, arm) for c in held]
-        which = np.arange(POSTURES) % len(held)
-        low, high = np.maximum(kinematics.lower, -np.pi), np.minimum(kinematics.upper, np.pi)
-        q = np.random.default_rng(0).uniform(low, high, (POSTURES, len(low)))
-        near = kinematics.solve(q, np.array(T)[which], REACH_STEPS, SEARCH_DAMPING)
+        possible = possible_spins(contact, spins)
+        T = np.array([T_world_box @ kinematics.held(spin) for spin in possible])
+        which = np.arange(POSTURES) % len(possible)
+        q = kinematics.drawn(POSTURES, np.random.default_rng(0))
+        near = kinematics.solve(q, T[which], REACH_STEPS, SEARCH_DAMPING)
         if near.residual.min() <= REACHED:
             continue
         missing = min(
-            missing_reach(robot, held[which[k]], T_world_box, np.clip(near.q[k], low, high))
+            missing_reach(
+                robot,
+                spun(contact, possible[which[k]]),
+                T_world_box,
+                np.clip(near.q[k], *kinematics.span),
+            )
             for k in np.argsort(near.residual)[:NEAREST]
         )
         if missing > MISSING:
@@ -358,8 +350,7 @@ def reach_missing(workcell: Workcell, ends: tuple[Array, Array], spins: Array) -
     return "; ".join(found)
 
 
-def _arm_missing(query: HoldQuery, arm: int, search: HoldSearch) -> str:
-    robot = query.workcell.robots[arm]
+def _arm_missing(robot: Robot, search: HoldSearch) -> str:
     names = list(arm_model(robot).names)[1:]
     if not search.within:
         joints = ", ".join(names[joint] for joint, _ in search.joints.most_common(TOLD))

@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -197,7 +197,7 @@ class PoseJudge:
 
     def colliding(self, pose: Array, q_1: Array, q_2: Array) -> NDArray[np.bool_]:
         """(n,) of box poses (n, 6) and both arms' joints (n, joints)."""
-        found = self.checker.check(pose, q_1, q_2, np.arange(len(pose), dtype=float))
+        found = self.checker.check(pose, q_1, q_2)
         if found.first_touch is not None:
             self.met[found.first_touch.first, found.first_touch.second] += 1
         return found.colliding
@@ -208,8 +208,7 @@ class PoseJudge:
         q_1, q_2 = (q, absent) if arm == 0 else (absent, q)
         bounds = self.checker.bounds(pose, q_1, q_2)
         bounds[:, self._others[arm]] = np.inf
-        times = np.arange(len(pose), dtype=float)
-        return self.checker.check(pose, q_1, q_2, times, bounds).colliding
+        return self.checker.check(pose, q_1, q_2, bounds).colliding
 
     def resting(self, pose: Array) -> list[tuple[str, bool]]:
         """What stands where the box (6,) is to be: environment bodies, and whether the box enters
@@ -234,7 +233,7 @@ class PoseJudge:
         bounds = self.checker.bounds(pose, q_1, q_2)
         if arm is not None:
             bounds[:, self._others[arm]] = np.inf
-        touch = self.checker.check(pose, q_1, q_2, np.zeros(1), bounds).first_touch
+        touch = self.checker.check(pose, q_1, q_2, bounds).first_touch
         return None if touch is None else (touch.first, touch.second)
 
 
@@ -262,7 +261,7 @@ COARSE = 9
 LOOKED = (1, 3)
 """Samples, nearest first, that are checked in the first batch, and by the end of the second."""
 
-_PLACED = ("pose", "q_1", "q_2", "time")
+_PLACED = ("pose", "q_1", "q_2")
 
 CHUNK = 32
 """Candidates whose samples are held at once."""
@@ -366,27 +365,27 @@ class Trial:
         outputs = self.evaluator.outputs(x) if self._motion is None else self._motion.batch(x)
         fine = _satisfied(outputs)
         for k in np.flatnonzero(fine).tolist():
-            fine[k] = not self._collides({name: outputs[name][k] for name in _PLACED})
+            fine[k] = not self._collides([outputs[name][k] for name in _PLACED])
         if self._motion is not None and fine.any():
             fine[fine] = _satisfied(self.evaluator.outputs(x[fine]))
         return fine
 
-    def _collides(self, placed: dict[str, Array]) -> bool:
+    def _collides(self, placed: list[Array]) -> bool:
         """Whether a carry collides at a sample."""
-        last = len(placed["pose"]) - 1
+        last = len(placed[0]) - 1
         coarse = np.arange(last, -1, -COARSE)
         return self._hit(placed, coarse) or self._hit(
             placed, np.setdiff1d(np.arange(last + 1), coarse)
         )
 
-    def _hit(self, placed: dict[str, Array], rows: NDArray[np.intp]) -> bool:
+    def _hit(self, placed: list[Array], rows: NDArray[np.intp]) -> bool:
         """Whether one of these samples collides; those with the least bounds are judged first."""
         checker = self.evaluator.checker
-        pose, q_1, q_2, time = (np.ascontiguousarray(placed[name][rows]) for name in _PLACED)
+        pose, q_1, q_2 = (np.ascontiguousarray(values[rows]) for values in placed)
         bounds = checker.bounds(pose, q_1, q_2)
         order = np.argsort((bounds - checker.free_beyond).min(axis=1, initial=np.inf))
         return any(
-            checker.check(pose[few], q_1[few], q_2[few], time[few], bounds[few]).colliding.any()
+            checker.check(pose[few], q_1[few], q_2[few], bounds[few]).colliding.any()
             for few in np.split(order, LOOKED)
         )
 
@@ -421,9 +420,7 @@ class _InterpretedCell(CompiledCell):
         name: str,
         make: Callable[[CellModel], Mapping[str, ca.Function]],
         *details: str,
-        lanes: int = 1,
-        levels: Mapping[str, int] | None = None,
-        bodies: bool = True,
+        **choices: Any,
     ) -> dict[str, NumericFunction]:
         return {name: InterpretedFunction(function) for name, function in make(self.model).items()}
 

@@ -18,7 +18,7 @@ _AT_REST = {"normal force": FORCE_LIMIT, "joint torque": JOINT_TORQUE}
 
 
 class CandidateDriver:
-    """Drives candidates of one workcell.
+    """Drives candidates of one workcell, whose time law is 'optimal'.
 
     Attributes:
         timer: what times their paths.
@@ -26,13 +26,7 @@ class CandidateDriver:
     """
 
     def __init__(self, timer: PathTimer, threads: int = 1, robust: bool = False) -> None:
-        """Drive with a timer.
-
-        Args:
-            timer: of a workcell whose time law is 'optimal'.
-            threads: threads that share a batch of candidates.
-            robust: whether force limits hold in every case of the workcell's uncertainty.
-        """
+        """Drive with a timer, and so many threads that share a batch of candidates."""
         self._task = timer.workcell.task
         self._threads = threads
         self.timer, self.robust = timer, robust

@@ -291,30 +291,15 @@ def judged(
         ratios: its `limit_ratios`, where they are known.
     """
     ratios = limit_ratios(carry, model.workcell, limits) if ratios is None else ratios
-    use = use_of(ratios, carry, model.joint_names)
+    use = dict[str, Excess]()
+    for name, ratio in ratios.items():
+        sample, column = np.unravel_index(int(np.argmax(ratio)), ratio.shape)
+        where = int(column), int(sample), float(carry.parameter[sample])
+        place = place_of(model.workcell, model.joint_names, name, *where)
+        use[name] = Excess(float(ratio[sample, column]), place)
     place = worst(use).place
     reason = f"{carry.duration:.3f} s; most used: {place}"
     return Timing(TimingStatus.OK, reason, place, carry, use, limits=limits)
-
-
-def use_of(
-    ratios: Mapping[str, Array],
-    carry: Carry,
-    joint_names: tuple[tuple[str, ...], tuple[str, ...]],
-) -> dict[str, Excess]:
-    """The largest use of every limit of a carry and where, by constraint.
-
-    Args:
-        ratios: its `limit_ratios`.
-        joint_names: names of both arms' joints.
-    """
-    workcell, use = carry.workcell, {}
-    for name, ratio in ratios.items():
-        sample, column = np.unravel_index(int(np.argmax(ratio)), ratio.shape)
-        where = int(sample), float(carry.parameter[sample])
-        place = place_of(workcell, joint_names, name, int(column), *where)
-        use[name] = Excess(float(ratio[sample, column]), place)
-    return use
 
 
 def place_of(

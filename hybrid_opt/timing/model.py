@@ -126,16 +126,14 @@ class TimingModel:
         """Load or build the compiled functions.
 
         Args:
-            cell: the cell; compiled, where others share its functions.
-            intervals: pieces of constant path acceleration.
+            cell: compiled, where others share its functions.
             robust: whether force limits hold in every case of the workcell's uncertainty.
 
         Raises:
             SettingsError: the number of intervals is out of range.
             DualArmError: the model or its code cannot be built.
         """
-        if not 10 <= intervals <= 2000:
-            raise SettingsError(f"{intervals} intervals; allowed are 10 to 2000")
+        require_intervals(intervals)
         self._compiled = CompiledCell.of(cell)
         self.workcell = workcell = self._compiled.workcell
         self.intervals, self._robust = intervals, robust
@@ -226,8 +224,7 @@ class TimingModel:
         return self.load(motion.pose, rate, second)
 
     def contact_torque(self, wrench_torque: Array, load: Mapping[str, Array]) -> Array:
-        """(n, all joints) joint torques of the contact wrenches of a `load` [N m]; see
-        `contact_torque`."""
+        """`contact_torque` of the wrenches of a `load`."""
         wrenches = (load["wrench_1"], load["wrench_2"])
         return contact_torque(len(self.joint_names[0]), wrench_torque, wrenches)
 
@@ -306,6 +303,12 @@ class TimingModel:
         if x.shape != (n_var,) or not np.isfinite(x).all():
             raise SettingsError(f"decision vector of shape {x.shape}; needs {n_var} finite numbers")
         return x
+
+
+def require_intervals(intervals: int) -> None:
+    """Refuse a number of intervals that is out of range."""
+    if not 10 <= intervals <= 2000:
+        raise SettingsError(f"{intervals} intervals; allowed are 10 to 2000")
 
 
 def joint_names(robot: Robot) -> tuple[str, ...]:

@@ -25,7 +25,7 @@ from codegen.function import NumericFunction, Signature
 from hybrid_opt.compiled_cell import CompiledCell
 from hybrid_opt.robust.path_force import BY_TIMING, PathPoints, RobustPath, robust_path
 from hybrid_opt.timing.limits import limited_force, path_failure, place_of
-from hybrid_opt.timing.model import TimingModel, joint_names
+from hybrid_opt.timing.model import TimingModel, joint_names, require_intervals
 from hybrid_opt.timing.records import Place, TimingLimits, TimingStatus
 from hybrid_opt.timing.solve import time_path
 from symbolic.array import Array
@@ -123,8 +123,7 @@ class PathTimer:
         """Load or build the compiled functions.
 
         Args:
-            cell: the cell; compiled, where others share its functions.
-            intervals: pieces of constant path acceleration.
+            cell: compiled, where others share its functions.
             threads: threads that share a batch.
             lanes: paths of a batch that run side by side; 0 for what suits the machine. One lane
                 builds faster.
@@ -133,8 +132,7 @@ class PathTimer:
             SettingsError: the number of intervals is out of range.
             DualArmError: the model or its code cannot be built.
         """
-        if not 10 <= intervals <= 2000:
-            raise SettingsError(f"{intervals} intervals; allowed are 10 to 2000")
+        require_intervals(intervals)
         self._compiled = compiled = CompiledCell.of(cell)
         self.workcell = workcell = compiled.workcell
         self.intervals = intervals
@@ -211,10 +209,7 @@ class PathTimer:
             path_failure(self.workcell, pose[:, :6], *each)
             for pose, *each in zip(paths["pose"], *sides, strict=True)
         ]
-        return [
-            None if why is None or why.place is None else self._failed(why.status, why.place)
-            for why in found
-        ]
+        return [None if why is None else self._failed(why.status, why.place) for why in found]
 
     def time_known(
         self,
@@ -310,14 +305,13 @@ def from_time_path(model: TimingModel, x: Array, limits: TimingLimits) -> PathTi
         force = carry.peak_normal_force
         if limits.robust:
             robust = limited_force(carry, model.workcell, limits).max(axis=0)
-    speed = np.zeros(0) if timing.grid_speed is None else timing.grid_speed
     return PathTiming(
         status=timing.status,
-        place=timing.place or Place("path timing", "", "", 0, 0.0),
+        place=timing.place,
         duration=timing.duration,
         peak_force=force,
         use={name: excess.ratio for name, excess in timing.use.items()},
-        grid_speed=speed,
+        grid_speed=timing.grid_speed,
         sweeps=timing.iterations,
         slowed=timing.slowed,
         robust_force=robust,
@@ -491,8 +485,6 @@ def passes_function(
     use are those of standing still.
 
     Args:
-        compiled: the cell.
-        intervals: pieces of constant path acceleration.
         cuts: lines at every sample that the caller gives.
     """
     workcell, cache = compiled.workcell, compiled.cache

@@ -130,7 +130,8 @@ class Timing(Displayable):
         place: where it fails, or the most used limit.
         carry: the carry under this timing, re-sampled; None without a timing.
         use: largest value over its limit, by constraint, recomputed on `carry`.
-        grid_speed: (intervals + 1,) path speed u' at the grid points [1/s]; empty without a timing.
+        grid_speed: (intervals + 1,) path speed u' at the grid points [1/s]; empty without a timing,
+            and where u'' is not constant between them.
         iterations: linear problems solved.
         slowed: uniform factor on the path speed that made recomputed limits hold, 1 normally.
         seconds: computing time.
@@ -139,10 +140,10 @@ class Timing(Displayable):
 
     status: TimingStatus
     reason: str
-    place: Place | None
+    place: Place
     carry: Carry | None
     use: dict[str, Excess] = field(default_factory=dict)
-    grid_speed: Array | None = None
+    grid_speed: Array = field(default_factory=lambda: np.zeros(0))
     iterations: int = 0
     slowed: float = 1.0
     seconds: float = 0.0
@@ -152,6 +153,12 @@ class Timing(Displayable):
     def ok(self) -> bool:
         """Whether the timing respects every limit."""
         return self.status is TimingStatus.OK
+
+    @property
+    def driven(self) -> Carry:
+        """The carry of a timing that was found."""
+        assert self.carry is not None, self.reason
+        return self.carry
 
     @property
     def duration(self) -> float:
@@ -174,7 +181,7 @@ class JerkTiming:
     """A timing within jerk limits, and what they cost.
 
     Attributes:
-        timing: without `grid_speed`: its u'' is not constant on intervals.
+        timing: with it.
         limits: the jerk limits.
         jerk_use: largest joint jerk and payload jerk over their limits.
         without: duration of the fastest timing without jerk limits [s].

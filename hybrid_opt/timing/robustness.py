@@ -230,7 +230,7 @@ class NearTimings:
         Raises:
             SettingsError: there is no timing, or it is not the fastest.
         """
-        if timing.carry is None or timing.grid_speed is None:
+        if timing.carry is None or not len(timing.grid_speed):
             raise SettingsError(f"there is no timing: {timing.reason}")
         self.speeds = at = DrivenSpeeds.of(timing.grid_speed)
         motion, intervals = model.path_motion(timing.carry.x), model.intervals

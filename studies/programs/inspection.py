@@ -283,7 +283,7 @@ def _clearance_mm(cell: Cell, arm: int, branch: StartBranch) -> float | None:
     joints = (path, absent) if arm == 0 else (absent, path)
     bounds = np.full((kept, len(cell.geometry.active)), np.inf)
     bounds[:, own] = checker.bounds(pose, *joints)[:, own]
-    return 1e3 * checker.min_distance(pose, joints[0], joints[1], bounds)[0]
+    return 1e3 * checker.min_distance(pose, joints[0], joints[1], bounds)
 
 
 def draw(

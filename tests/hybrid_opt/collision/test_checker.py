@@ -15,12 +15,11 @@ from numpy.typing import NDArray
 
 from codegen.interpreted import InterpretedFunction
 from hybrid_opt.collision.between import (
-    SEARCH_DEPTH,
     MotionVerdict,
     SampledMotions,
     check_all_between,
 )
-from hybrid_opt.collision.checker import RESTING_TOLERANCE, CollisionChecker, sample_durations
+from hybrid_opt.collision.checker import RESTING_TOLERANCE, CollisionChecker, Verdict
 from symbolic.array import Array
 from symbolic.geometry.pairs import CellGeometry, build_geometry, coal_distance, coal_geometry
 from symbolic.records import AllowedContact, CollisionSettings, Uncertainty, Workcell
@@ -45,13 +44,16 @@ def collision_mask(
     return np.array(found, dtype=bool).reshape(n, n_pairs)
 
 
-def check_between(
-    checker: CollisionChecker, configuration: Array, depth: int = SEARCH_DEPTH
-) -> MotionVerdict:
+def unscreened(checker: CollisionChecker, at: Configurations) -> Verdict:
+    """The verdict where no bound calls a pair free."""
+    return checker.check(*at, np.minimum(checker.bounds(*at), checker.free_beyond))
+
+
+def check_between(checker: CollisionChecker, configuration: Array) -> MotionVerdict:
     """One motion by its samples (n, 6 + all joints), without a margin."""
     clearance = checker.bounds(*checker.split(configuration))
     sampled = SampledMotions(configuration, clearance, (len(configuration),), np.zeros(1))
-    return check_all_between(checker, sampled, depth)[0]
+    return check_all_between(checker, sampled)[0]
 
 
 pytestmark = pytest.mark.filterwarnings("ignore::symbolic.geometry.hulls.CollisionModelWarning")
@@ -120,20 +122,17 @@ def test_screening_changes_nothing(name: str, n: int, folder: Path) -> None:
     at = random_configurations(judge.geometry, n, np.random.default_rng(33))
     bounds, mask = judge.bounds(*at), collision_mask(judge, *at)
     assert not np.any(mask & (bounds > RESOLUTION))
-    time = np.arange(float(n))
-    screened = judge.check(*at, time, bounds)
-    plain = judge.check(*at, time, bounds, screened=False)
+    before, screened = judge.judge.calls, judge.check(*at, bounds)
+    between, plain = judge.judge.calls, unscreened(judge, at)
     assert screened.colliding.tolist() == plain.colliding.tolist() == mask.any(axis=1).tolist()
     assert screened.first_touch == plain.first_touch
-    assert screened.collision_time == plain.collision_time
-    assert screened.fcl_calls < 0.2 * plain.fcl_calls
+    assert between - before < 0.2 * (judge.judge.calls - between)
     touch = screened.first_touch
     assert touch is not None
     names = judge.geometry.pair_names
     hit = [names[i] for i in np.flatnonzero(mask[touch.sample])]
     assert touch.sample == np.flatnonzero(mask.any(axis=1))[0]
     assert (touch.first, touch.second) in hit
-    assert touch.time == time[touch.sample]
 
 
 @pytest.mark.parametrize("name", ["obstacles", "ur10"])
@@ -163,17 +162,13 @@ def test_measuring_stops_at_a_collision() -> None:
 def test_the_least_distance_is_found_past_the_bounds() -> None:
     judge = checker("rack")
     at = random_configurations(judge.geometry, 200, np.random.default_rng(35))
-    free = ~judge.check(*at, np.arange(200.0)).colliding
+    free = ~judge.check(*at).colliding
     apart = (at[0][free], at[1][free], at[2][free])
     assert len(apart[0])
-    distance, where = judge.min_distance(*apart)
+    bounds = judge.bounds(*apart)
     expected = np.array([true_distances(judge.geometry, *row) for row in zip(*apart, strict=True)])
-    assert distance == pytest.approx(expected.min(), abs=RESOLUTION)
-    assert where is not None
-    k, i = np.unravel_index(np.argmin(expected), expected.shape)
-    assert (where.first, where.second) == judge.geometry.pair_names[i]
-    assert where.sample == k
-    assert judge.check(*apart, np.arange(float(len(apart[0])))).min_clearance <= distance
+    assert judge.min_distance(*apart, bounds) == pytest.approx(expected.min(), abs=RESOLUTION)
+    assert np.argmin(bounds) != np.argmin(expected)
 
 
 def above_board(gaps: list[float]) -> Configurations:
@@ -205,9 +200,8 @@ def test_the_tolerance_is_decided_alike_with_and_without_screening(
     judge = checker_of(only_payload(cell))
     offsets = [s * d for d in (1e-3, 2e-5, 1e-5, 1e-6, 1e-8, 0.0) for s in (-1.0, 1.0)]
     at = above_board([tolerance + displaced + offset for offset in offsets])
-    time = np.arange(float(len(offsets)))
-    screened = judge.check(*at, time).colliding
-    assert screened.tolist() == judge.check(*at, time, screened=False).colliding.tolist()
+    screened = judge.check(*at).colliding
+    assert screened.tolist() == unscreened(judge, at).colliding.tolist()
     for offset, hit in zip(offsets, screened, strict=True):
         if abs(offset) > RESOLUTION:
             assert hit == (offset < 0.0)
@@ -233,7 +227,7 @@ def test_touching_is_decided_alike_at_any_tilt(
     k = judge.geometry.pair_names.index(("payload", "middle board"))
     pose[0, 2] -= corner[0, k] - gap
     at = (pose, STILL, STILL)
-    assert judge.check(*at, np.zeros(1)).colliding[0] == collision_mask(judge, *at).any()
+    assert judge.check(*at).colliding[0] == collision_mask(judge, *at).any()
 
 
 def resting_cell(departure: float) -> Workcell:
@@ -248,22 +242,14 @@ def resting_cell(departure: float) -> Workcell:
     return replace(cell, task=replace(cell.task, waypoints=waypoints, allowed_contacts=allowed))
 
 
-def test_a_resting_box_is_no_collision_but_a_sunken_one_is() -> None:
+def test_a_box_may_rest_near_its_place_but_not_sink_in() -> None:
     judge = checker_of(only_payload(resting_cell(0.03)))
     depth = RESTING_TOLERANCE
-    gaps = [0.0, -0.5 * depth, -depth + 1e-5, -depth - 1e-5, -0.01, 0.01, 0.04]
-    at = above_board(gaps)
-    verdict = judge.check(*at, np.arange(float(len(gaps))))
-    assert verdict.colliding.tolist() == [False, False, False, True, True, False, False]
-    unscreened = judge.check(*at, np.arange(float(len(gaps))), screened=False)
-    assert unscreened.colliding.tolist() == verdict.colliding.tolist()
-
-
-def test_away_from_the_resting_place_touching_is_a_collision() -> None:
-    judge = checker_of(only_payload(resting_cell(0.03)))
-    pose, q_1, q_2 = above_board([-0.0005, -0.0005, -0.0005])
-    pose[:, 0] = [0.0, 0.029, 0.031]
-    assert judge.check(pose, q_1, q_2, np.arange(3.0)).colliding.tolist() == [False, False, True]
+    at = above_board([0.0, -depth + 1e-5, -depth - 1e-5, -0.01, 0.01, 0.04, *[-0.5 * depth] * 3])
+    at[0][-3:, 0] = [0.0, 0.029, 0.031]
+    collides = [False, False, True, True, False, False, False, False, True]
+    assert judge.check(*at).colliding.tolist() == collides
+    assert unscreened(judge, at).colliding.tolist() == collides
 
 
 def test_a_body_not_touched_at_a_fixed_pose_gets_no_allowance() -> None:
@@ -271,35 +257,12 @@ def test_a_body_not_touched_at_a_fixed_pose_gets_no_allowance() -> None:
     allowed = (AllowedContact("middle board", 0.5),)
     cell = replace(cell, task=replace(cell.task, allowed_contacts=allowed))
     judge = checker_of(only_payload(cell))
-    assert judge.check(*above_board([-0.0005]), np.zeros(1)).colliding.all()
+    assert judge.check(*above_board([-0.0005])).colliding.all()
 
 
-def test_collision_time_is_what_the_colliding_samples_stand_for() -> None:
-    judge = checker_of(only_payload(rack()))
-    time = np.array([0.0, 1.0, 1.5, 3.5, 4.0])
-    verdict = judge.check(*above_board([-0.1, 0.1, -0.1, -0.1, 0.1]), time)
-    assert verdict.colliding.tolist() == [True, False, True, True, False]
-    assert verdict.collision_time == pytest.approx(0.5 + 1.25 + 1.25)
-    assert sample_durations(time).sum() == pytest.approx(4.0)
-    assert verdict.first_touch is not None
-    assert (verdict.first_touch.sample, verdict.first_touch.time) == (0, 0.0)
-    assert (verdict.first_touch.first, verdict.first_touch.second) == (
-        "payload",
-        "middle board",
-    )
-    assert not verdict.is_free
-    assert verdict.min_clearance == pytest.approx(-0.1)
-
-
-def test_no_samples_are_free_of_collisions() -> None:
+def test_no_samples_are_free_and_unknown_bounds_go_to_fcl() -> None:
     """An arm that loses the path at once leaves nothing to check."""
-    verdict = checker("rack").check(*above_board([]), np.zeros(0))
-    assert verdict.is_free
-    assert (verdict.collision_time, verdict.fcl_calls) == (0.0, 0)
-    assert verdict.min_clearance == np.inf
-
-
-def test_unknown_bounds_go_to_fcl() -> None:
     judge = checker_of(only_payload(rack()))
+    assert judge.check(*above_board([])).is_free
     unknown = np.full((1, 1), np.nan)
-    assert judge.check(*above_board([-0.1]), np.zeros(1), unknown).colliding.all()
+    assert judge.check(*above_board([-0.1]), unknown).colliding.all()

@@ -1,100 +1,55 @@
-"""Problems of cells with random shelves, posts and goals, and what `ho.propose` makes of them.
-
-    python -m tests.hybrid_opt.proposing.generated --cells 20 --time 60 --folder FOLDER
-
-The time is the process's own, so that other work on the machine does not count. Whether a problem
-can be solved at all is found by the same program with much more time (`--time`).
-"""
+"""Problems of cells with random shelves, posts and goals."""
 
 from __future__ import annotations
 
-import argparse
-import resource
-import time
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-import hybrid_opt as ho
-from hybrid_opt.errors import ProposalError
 from symbolic.read.editing import completed
 from tests.machines import example_robot
 
-
-@dataclass(frozen=True)
-class ArmType:
-    """An arm of `example-robot-data` and a cell's size that suits it.
-
-    Attributes:
-        urdf: path below the folder `robots`.
-        chain: root and tip.
-        drop: links that are left out.
-        apart: distance of each base from the middle of the cell [m].
-        size: edges of the box [m].
-        mass: of the box [kg].
-        reach: half of the length of the carry [m].
-        height: of the box's centre at the start [m].
-        force: reference force [N].
-        pedestal: height of the bases [m].
-        pad: its pose in the flange frame, and the tool's body.
-    """
-
-    urdf: str
-    chain: tuple[str, str]
-    drop: tuple[str, ...]
-    apart: float
-    size: tuple[float, float, float]
-    mass: float
-    reach: float
-    height: float
-    force: float
-    pedestal: float
-    pad: dict[str, list[float]]
-    tool: dict[str, Any]
-
-
-UR10 = ArmType(
-    "ur_description/urdf/ur10_robot.urdf",
-    ("base_link", "tool0"),
-    (),
-    0.95,
-    (0.30, 0.40, 0.25),
-    6.0,
-    0.45,
-    0.55,
-    98.1,
-    0.0,
-    {"xyz": [0.0, 0.0, 0.10]},
-    {"kind": "cylinder", "radius": 0.035, "length": 0.10, "xyz": [0.0, 0.0, 0.05]},
-)
-PANDA = ArmType(
-    "panda_description/urdf/panda.urdf",
-    ("panda_link0", "panda_link8"),
-    ("panda_hand",),
-    0.72,
-    (0.20, 0.28, 0.16),
-    2.0,
-    0.28,
-    0.35,
-    30.0,
-    0.0,
-    {"xyz": [0.04, 0.0, 0.10], "rpy": [0.0, np.pi / 2.0, 0.0]},
-    {"kind": "box", "size": [0.04, 0.09, 0.14], "xyz": [0.02, 0.0, 0.07]},
-)
+UR10: dict[str, Any] = {
+    "urdf": "ur_description/urdf/ur10_robot.urdf",
+    "chain": ["base_link", "tool0"],
+    "drop_links": [],
+    "apart": 0.95,
+    "size": [0.30, 0.40, 0.25],
+    "mass": 6.0,
+    "reach": 0.45,
+    "height": 0.55,
+    "force": 98.1,
+    "pad": {"xyz": [0.0, 0.0, 0.10]},
+    "tool": {"kind": "cylinder", "radius": 0.035, "length": 0.10, "xyz": [0.0, 0.0, 0.05]},
+}
+PANDA: dict[str, Any] = {
+    "urdf": "panda_description/urdf/panda.urdf",
+    "chain": ["panda_link0", "panda_link8"],
+    "drop_links": ["panda_hand"],
+    "apart": 0.72,
+    "size": [0.20, 0.28, 0.16],
+    "mass": 2.0,
+    "reach": 0.28,
+    "height": 0.35,
+    "force": 30.0,
+    "pad": {"xyz": [0.04, 0.0, 0.10], "rpy": [0.0, np.pi / 2.0, 0.0]},
+    "tool": {"kind": "box", "size": [0.04, 0.09, 0.14], "xyz": [0.02, 0.0, 0.07]},
+}
+"""Arms of `example-robot-data`, and a cell that suits them: distance of each base from the middle,
+edges and mass of the box, half the carry's length, and height of its start [m, kg]."""
 
 
 def problem(seed: int) -> dict[str, Any]:
     """A problem's tables: even seeds have UR10, odd ones Pandas; posts, shelves or both."""
     rng = np.random.default_rng([14, seed])
     arm = (UR10, PANDA)[seed % 2]
-    size = np.array(arm.size)
+    size = np.array(arm["size"])
     side = float(rng.choice([-1.0, 1.0]))
-    start = np.array([-side * arm.reach * rng.uniform(0.8, 1.1), rng.uniform(-0.05, 0.05), 0.0])
-    goal = np.array([side * arm.reach * rng.uniform(0.6, 1.1), rng.uniform(-0.08, 0.08), 0.0])
-    start[2] = arm.height + rng.uniform(-0.05, 0.10)
-    goal[2] = arm.height + rng.uniform(-0.05, 0.30)
+    start = np.array([-side * arm["reach"] * rng.uniform(0.8, 1.1), rng.uniform(-0.05, 0.05), 0.0])
+    goal = np.array([side * arm["reach"] * rng.uniform(0.6, 1.1), rng.uniform(-0.08, 0.08), 0.0])
+    start[2] = arm["height"] + rng.uniform(-0.05, 0.10)
+    goal[2] = arm["height"] + rng.uniform(-0.05, 0.30)
     yaw = float(rng.uniform(-0.25, 0.25))
     environment = [_box("ground", (4.0, 4.0, 0.1), (0.0, 0.0, -0.06))]
     kind = seed // 2 % 3
@@ -126,33 +81,33 @@ def problem(seed: int) -> dict[str, Any]:
     return {
         "name": f"Generated cell {seed}",
         "robots": [_robot(arm, 1.0), _robot(arm, -1.0)],
-        "payload": {"size": list(arm.size), "mass": arm.mass},
+        "payload": {"size": arm["size"], "mass": arm["mass"]},
         "contacts": [
-            {"xyz": [0.0, s * arm.size[1] / 2.0, 0.0], "friction": 0.8, "patch_radius": 0.04}
+            {"xyz": [0.0, s * arm["size"][1] / 2.0, 0.0], "friction": 0.8, "patch_radius": 0.04}
             for s in (1.0, -1.0)
         ],
         "task": {
             "start": [*np.round(start, 4).tolist(), 0.0, 0.0, 0.0],
             "goal": [*np.round(goal, 4).tolist(), 0.0, 0.0, round(yaw, 4)],
             "reference_speed": 0.25,
-            "reference_force": arm.force,
+            "reference_force": arm["force"],
         },
         "environment": environment,
     }
 
 
-def _robot(arm: ArmType, side: float) -> dict[str, Any]:
+def _robot(arm: dict[str, Any], side: float) -> dict[str, Any]:
     return {
         "name": "north" if side > 0.0 else "south",
-        "urdf": str(example_robot(arm.urdf)),
-        "chain": list(arm.chain),
-        "drop_links": list(arm.drop),
+        "urdf": str(example_robot(arm["urdf"])),
+        "chain": arm["chain"],
+        "drop_links": arm["drop_links"],
         "base": {
-            "xyz": [0.0, side * arm.apart, arm.pedestal],
+            "xyz": [0.0, side * arm["apart"], 0.0],
             "rpy": [0.0, 0.0, -side * np.pi / 2],
         },
-        "pad": arm.pad,
-        "tool": [{"name": "pad", **arm.tool}],
+        "pad": arm["pad"],
+        "tool": [{"name": "pad", **arm["tool"]}],
     }
 
 
@@ -170,32 +125,3 @@ def write_problem(seed: int, folder: Path) -> Path:
     path = folder / f"cell{seed:02d}.toml"
     path.write_text(completed("", problem(seed), {}), encoding="utf-8")
     return path
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--cells", type=int, default=20)
-    parser.add_argument("--first", type=int, default=0)
-    parser.add_argument("--time", type=float, default=60.0)
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--folder", type=Path, default=Path())
-    options = parser.parse_args()
-    solved = 0
-    for cell in range(options.first, options.first + options.cells):
-        path, begun = write_problem(cell, options.folder), time.monotonic()
-        used = resource.getrusage(resource.RUSAGE_SELF).ru_utime
-        try:
-            settings = ho.ProposeSettings(seconds=options.time)
-            rng = np.random.default_rng(options.seed)
-            found = ho.propose(path, rng=rng, settings=settings)
-            path.with_name(f"cell{cell:02d}-proposed.toml").write_text(found.text(path.parent))
-            text, solved = str(found), solved + 1
-        except ProposalError as error:
-            text = str(error)
-        used = resource.getrusage(resource.RUSAGE_SELF).ru_utime - used
-        print(f"{cell:2d} {time.monotonic() - begun:5.1f} s, {used:5.1f} s CPU: {text}", flush=True)
-    print(f"{solved} of {options.cells}")
-
-
-if __name__ == "__main__":
-    main()

@@ -27,12 +27,9 @@ from hybrid_opt.proposing.holding import (
     ArmKinematics,
     Hold,
     HoldQuery,
-    HoldSearch,
-    box_to_last_joint,
     clear_spins,
     find_holds,
     possible_spins,
-    spun,
 )
 from hybrid_opt.proposing.problem import Problem, read_problem
 from hybrid_opt.proposing.setup import Agreement
@@ -51,6 +48,8 @@ from tests.symbolic.cells import hand_cell
 from tests.symbolic.geometry.collision_cells import placed_pieces
 from tests.symbolic.read.samples import RACK
 
+SPINS: Array = 2.0 * np.pi * np.arange(12.0) / 12.0
+
 
 @pytest.fixture(scope="module")
 def rack_cell() -> Workcell:
@@ -58,7 +57,7 @@ def rack_cell() -> Workcell:
 
 
 def test_placements_and_jacobians_are_pinocchios(rack_cell: Workcell) -> None:
-    kinematics = ArmKinematics.of(rack_cell, 0, ())
+    kinematics = ArmKinematics(rack_cell, 0)
     model = arm_model(rack_cell.robots[0])
     data = model.createData()
     q = np.random.default_rng(0).uniform(-2.0, 2.0, (20, 6))
@@ -74,7 +73,7 @@ def test_placements_and_jacobians_are_pinocchios(rack_cell: Workcell) -> None:
 
 
 def test_newtons_method_comes_back_to_where_placements_are_from(rack_cell: Workcell) -> None:
-    kinematics = ArmKinematics.of(rack_cell, 1, ())
+    kinematics = ArmKinematics(rack_cell, 1)
     rng = np.random.default_rng(1)
     q = rng.uniform(-1.5, 1.5, (50, 6))
     _, T = kinematics.chain(q)
@@ -86,17 +85,13 @@ def test_newtons_method_comes_back_to_where_placements_are_from(rack_cell: Workc
 
 
 def test_following_goes_where_the_joints_came_from(rack_cell: Workcell) -> None:
-    kinematics = ArmKinematics.of(rack_cell, 0, ())
+    kinematics = ArmKinematics(rack_cell, 0)
     begin = np.array([0.2, 0.5, 0.4, 0.3, 0.9, 0.1])
     path = begin + np.linspace(0.0, 0.4, 20)[:, None] * np.array([1, -1, 0.5, 0.2, 0.4, 1.0])
     _, T = kinematics.chain(path)
     found, kept, _ = kinematics.follow(begin[None], T)
     assert kept.tolist() == [20]
     np.testing.assert_allclose(found[:, 0], path, atol=1e-6)
-
-
-def test_a_posture_that_does_not_reach_is_told(rack_cell: Workcell) -> None:
-    kinematics = ArmKinematics.of(rack_cell, 0, ())
     far = pose_matrix(np.array([5.0, 0.0, 0.0]), np.zeros(3))
     _, kept, _ = kinematics.follow(np.zeros((1, 6)), np.array([far, far]))
     assert kept.tolist() == [0]
@@ -104,14 +99,13 @@ def test_a_posture_that_does_not_reach_is_told(rack_cell: Workcell) -> None:
 
 def test_the_spin_turns_the_pad_as_the_file_does(rack_cell: Workcell) -> None:
     """A spin of the joint about the pad's axis is one of the pad."""
-    geometry = ArmKinematics.of(rack_cell, 0, ()).geometry
-    contact = rack_cell.contacts[0]
-    plain = box_to_last_joint(rack_cell, geometry, contact, 0)
-    turned = box_to_last_joint(rack_cell, geometry, spun(contact, 0.7), 0)
+    kinematics = ArmKinematics(rack_cell, 0)
+    plain, turned = kinematics.held(), kinematics.held(0.7)
     np.testing.assert_allclose(plain[:3, 3], turned[:3, 3], atol=1e-12)
     angle = pin.log3(plain[:3, :3].T @ turned[:3, :3])
     assert np.linalg.norm(angle) == pytest.approx(0.7)
-    np.testing.assert_allclose(np.linalg.inv(geometry.T_joint_box), plain, atol=1e-12)
+    T_box_joint = np.linalg.inv(kinematics.geometry.T_joint_box)
+    np.testing.assert_allclose(T_box_joint, plain, atol=1e-12)
 
 
 def test_spins_are_left_out_at_which_the_pad_meets_what_stands(rack_cell: Workcell) -> None:
@@ -125,51 +119,32 @@ def test_spins_are_left_out_at_which_the_pad_meets_what_stands(rack_cell: Workce
     at = pose_matrix(np.array([0.22, 0.0, -0.05]), np.zeros(3))
     bar = Body("bar", Box(np.full(3, 0.1)), pad @ at)
     cell = replace(rack_cell, robots=(robot, rack_cell.robots[1]), environment=(bar,))
-    judge = judge_of(build_geometry(cell))
-    spins: Array = np.pi / 2.0 * np.arange(4.0)
-    query = HoldQuery(cell, start, goal, spins, judge)
-    np.testing.assert_allclose(clear_spins(query, 0, spins), spins[1:])
-    np.testing.assert_array_equal(clear_spins(query, 0, spins[:1]), spins[:1])
-    np.testing.assert_array_equal(clear_spins(replace(query, judge=None), 0, spins), spins)
+    judge, arm = judge_of(build_geometry(cell)), ArmKinematics(cell, 0)
+    spins = SPINS[::3]
+    query = HoldQuery(start, goal, spins, judge)
+    np.testing.assert_allclose(clear_spins(query, arm, spins), spins[1:])
+    np.testing.assert_array_equal(clear_spins(query, arm, spins[:1]), spins[:1])
+    np.testing.assert_array_equal(clear_spins(replace(query, judge=None), arm, spins), spins)
 
 
 def test_pads_that_stand_rigidly_beside_one_another_are_not_spun() -> None:
-    spins = 2.0 * np.pi * np.arange(12) / 12
     fork, round_pad = load("studies/workcells/fork.toml").contacts, load(RACK).contacts[0]
-    np.testing.assert_array_equal(possible_spins(round_pad, spins), spins)
+    np.testing.assert_array_equal(possible_spins(round_pad, SPINS), SPINS)
     assert fork[0].further
-    assert possible_spins(fork[0], spins).tolist() == [0.0]
+    assert possible_spins(fork[0], SPINS).tolist() == [0.0]
     # A rectangle covers the same patch after half a turn only.
-    np.testing.assert_allclose(possible_spins(fork[1], spins), [0.0, np.pi])
+    np.testing.assert_allclose(possible_spins(fork[1], SPINS), [0.0, np.pi])
 
 
-SPINS: Array = 2.0 * np.pi * np.arange(12.0) / 12.0
-
-
-@pytest.fixture(scope="module")
-def cell() -> Workcell:
-    return load(RACK)
-
-
-def ends(cell: Workcell) -> tuple[Array, Array]:
-    return cell.task.waypoints[0].lower, cell.task.waypoints[-1].lower
-
-
-def found(cell: Workcell) -> HoldSearch:
-    query = HoldQuery(cell, *ends(cell), SPINS, None)
-    return find_holds(query, 0, ArmKinematics.of(cell, 0, ()), np.random.default_rng(1))
-
-
-def test_holds_hold_the_box_at_both_ends(cell: Workcell) -> None:
-    holds = found(cell).holds
+def test_holds_hold_the_box_at_both_ends(rack_cell: Workcell) -> None:
+    ends = start, goal = rack_cell.task.waypoints[0].lower, rack_cell.task.waypoints[-1].lower
+    kinematics, query = ArmKinematics(rack_cell, 0), HoldQuery(start, goal, SPINS, None)
+    holds = find_holds(query, kinematics, np.random.default_rng(1)).holds
     assert len(holds) > 1
-    kinematics = ArmKinematics.of(cell, 0, ())
     for hold in holds:
-        contact = spun(cell.contacts[0], hold.spin)
-        T_box_joint = box_to_last_joint(cell, kinematics.geometry, contact, 0)
-        for pose, q in zip(ends(cell), (hold.q_start, hold.q_goal), strict=True):
-            T = kinematics.chain(q[None])[1][0]
-            np.testing.assert_allclose(T, pose_matrix(pose[:3], pose[3:]) @ T_box_joint, atol=1e-5)
+        for pose, q in zip(ends, (hold.q_start, hold.q_goal), strict=True):
+            T, T_world_box = kinematics.chain(q[None])[1][0], pose_matrix(pose[:3], pose[3:])
+            np.testing.assert_allclose(T, T_world_box @ kinematics.held(hold.spin), atol=1e-5)
 
 
 LIFT_JOINT = 0
@@ -186,22 +161,15 @@ def posture(arm: ArmKinematics, target: Array, lift: float) -> Array:
     return np.asarray(found.q[(found.residual < 1e-6) & inside & (found.manipulability > 0.01)][0])
 
 
-def held(workcell: Workcell, arm: int, pose: Array) -> Array:
-    """Where the arm's last joint has to be (4, 4)."""
-    kinematics = ArmKinematics.of(workcell, arm, ())
-    T = box_to_last_joint(workcell, kinematics.geometry, workcell.contacts[arm], arm)
-    return np.asarray(pose_matrix(pose[:3], pose[3:]) @ T)
-
-
 def test_both_arms_end_on_one_lift_and_still_hold_the_box() -> None:
     workcell = load(RACK.with_name("tiago.toml"))
     start = workcell.task.waypoints[0].lower
-    arms, holds = [], []
-    for arm, lift in enumerate((0.06, 0.10)):
-        redundant = tuple(joint for joint, _ in workcell.task.redundant_of(arm))
-        kinematics = ArmKinematics.of(workcell, arm, redundant)
-        q = posture(kinematics, held(workcell, arm, start), lift)
-        arms.append(kinematics)
+    T_world_box = pose_matrix(start[:3], start[3:])
+    arms = [ArmKinematics(workcell, arm) for arm in (0, 1)]
+    held = [T_world_box @ arm.held() for arm in arms]
+    holds = []
+    for arm, target, lift in zip(arms, held, (0.06, 0.10), strict=True):
+        q = posture(arm, target, lift)
         holds.append(Hold(0.0, q, q, 1.0))
     agreed = Agreement(workcell, (start, start)).of((holds[0], holds[1]))
     assert agreed is not None
@@ -209,16 +177,10 @@ def test_both_arms_end_on_one_lift_and_still_hold_the_box() -> None:
         first, second = (getattr(hold, end) for hold in agreed)
         assert first[LIFT_JOINT] == second[LIFT_JOINT]
         assert 0.06 <= first[LIFT_JOINT] <= 0.10
-        for arm, q in enumerate((first, second)):
-            placed = arms[arm].chain(q[None])[1][0]
-            np.testing.assert_allclose(placed, held(workcell, arm, start), atol=1e-5)
-
-
-def test_arms_without_common_joints_stay_as_they_are() -> None:
-    workcell = load(RACK)
-    start = workcell.task.waypoints[0].lower
-    pair = (Hold(0.0, np.zeros(6), np.zeros(6), 1.0), Hold(0.1, np.ones(6), np.ones(6), 1.0))
-    assert Agreement(workcell, (start, start)).of(pair) is pair
+        for arm, target, q in zip(arms, held, (first, second), strict=True):
+            np.testing.assert_allclose(arm.chain(q[None])[1][0], target, atol=1e-5)
+    pair = holds[0], holds[1]
+    assert Agreement(load(RACK), (start, start)).of(pair) is pair, "no joints in common"
 
 
 def other_branch(q: Array) -> Array:
@@ -269,25 +231,35 @@ def problem(tmp_path_factory: pytest.TempPathFactory) -> Problem:
     return read_problem(tiago_problem(tmp_path_factory.mktemp("tiago")))
 
 
+@pytest.fixture(scope="module")
+def drafted(problem: Problem) -> tuple[Problem, Workcell]:
+    """Its left hand on the left, and the cell of that."""
+    (side,) = (s for s in problem.sides() if s.contacts[0]["xyz"] == [0.0, 0.18, 0.0])
+    return side, draft_of(side)
+
+
 def at(x: float) -> Array:
     return np.array([x, 0.0, 0.0, 0.0, 0.0, 0.0])
 
 
-def test_a_machine_stands_where_its_arms_reach(problem: Problem) -> None:
+def test_a_machine_stands_where_its_arms_reach(
+    problem: Problem, drafted: tuple[Problem, Workcell]
+) -> None:
     """With its left hand on the left it looks along x, before the tote; else against it."""
     for side in problem.sides()[2:]:
         left = np.array(side.contacts[0]["xyz"])
         assert left[1] != 0.0
-        for base in machine_places(side, draft_of(side)):
+        for base in machine_places(side, drafted[1]):
             across = [-np.sin(base[5]), np.cos(base[5]), 0.0]
             assert left @ across > 0.0
             ahead = np.array([np.cos(base[5]), np.sin(base[5])])
             assert (np.array([0.6, 0.0]) - base[:2]) @ ahead > 0.2
 
 
-def test_too_near_there_is_no_room_and_in_the_shelf_no_place(problem: Problem) -> None:
-    (side,) = (s for s in problem.sides() if s.contacts[0]["xyz"] == [0.0, 0.18, 0.0])
-    scorer = PlaceScorer(side, draft_of(side), SPINS, np.random.default_rng(1))
+def test_too_near_there_is_no_room_and_in_the_shelf_no_place(
+    drafted: tuple[Problem, Workcell],
+) -> None:
+    scorer = PlaceScorer(*drafted, SPINS, np.random.default_rng(1))
     rooms = []
     for x in (0.07, 0.20):
         arms = [scorer.place(arm, at(x)) for arm in (0, 1)]
@@ -345,6 +317,8 @@ def test_without_obstacles_every_detour_is_free() -> None:
     assert away[0] == 0.0
     assert away.max() == pytest.approx(max(ASIDE), abs=0.02)
     assert found[:, :, 2].max() == pytest.approx(GOAL[2] + LIFT + max(ASIDE), abs=0.05)
+    wall = {"wall": ([0.0, 0.0, 0.9], [2.0, 2.0, 0.02])}
+    assert free_detours(cell_with(wall), START, GOAL).shape == (0, POSES, 6)
 
 
 def test_what_is_left_leads_around_the_shelf() -> None:
@@ -366,8 +340,3 @@ def test_what_is_left_leads_around_the_shelf() -> None:
     farthest = found[np.arange(len(found)), np.abs(found[:, :, :2]).sum(axis=2).argmax(axis=1)]
     assert 0 < len(found) < len(every) / 3
     assert np.all(farthest[:, 0] < 0.1), "through the back"
-
-
-def test_there_may_be_none() -> None:
-    walls = {"wall": ([0.0, 0.0, 0.9], [2.0, 2.0, 0.02])}
-    assert free_detours(cell_with(walls), START, GOAL).shape == (0, POSES, 6)

@@ -84,10 +84,7 @@ def test_the_rack_gets_a_certified_carry(proposal: ho.Proposal, tmp_path: Path) 
     found = cell.evaluate(cell.random(2000, np.random.default_rng(5)))
     assert 0.02 <= found.feasible.mean() <= 0.20
     assert proposal.feasible_share == pytest.approx(found.feasible.mean(), abs=0.06)
-
-
-def test_comments_of_the_problem_stay(proposal: ho.Proposal, tmp_path: Path) -> None:
-    assert "# Two GoFa 12 carry a box" in proposal.text(tmp_path)
+    assert "# Two GoFa 12 carry a box" in path.read_text(encoding="utf-8"), "comments stay"
     assert "certified" in str(proposal)
 
 
@@ -157,20 +154,14 @@ def test_what_the_start_collides_with_is_named(tmp_path: Path) -> None:
         ho.propose(path, rng=np.random.default_rng(1))
 
 
-def test_a_wrong_problem_is_told_with_its_key(tmp_path: Path) -> None:
-    path = rack_problem(tmp_path, {"task": {"goal": [0.0, 0.0]}})
-    with pytest.raises(WorkcellError, match=r"task\.goal"):
-        ho.propose(path, rng=np.random.default_rng(1))
+def test_a_wrong_problem_is_told_before_any_work(tmp_path: Path) -> None:
     path = rack_problem(tmp_path, {"task": {"reference_speed": -1.0}})
-    with pytest.raises(WorkcellError, match=r"task\.reference_speed") as told:
+    with pytest.raises(WorkcellError, match=r"task\.reference_speed"):
         ho.propose(path, rng=np.random.default_rng(1))
-    assert str(path) in str(told.value)
 
 
-@pytest.mark.parametrize(
-    ("stated", "written"),
-    [({}, 0.03), pytest.param({"stand_off": 0.05}, 0.05, marks=pytest.mark.slow)],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("stated", "written"), [({}, 0.03), ({"stand_off": 0.05}, 0.05)])
 def test_pads_stand_off_less_where_something_is_behind_a_wrist_unless_the_file_says_how_far(
     stated: dict[str, float], written: float, tmp_path: Path
 ) -> None:
@@ -269,10 +260,9 @@ def test_carries_of_other_classes_are_found_beside_the_first(tmp_path: Path) -> 
     assert len({one.sides for one in found}) >= 2
 
 
-def test_settings_are_checked() -> None:
-    with pytest.raises(SettingsError, match="classes"):
-        ho.ProposeSettings(classes=0)
-    with pytest.raises(SettingsError, match="seconds"):
-        ho.ProposeSettings(seconds=0.0)
-    with pytest.raises(SettingsError, match="feasible"):
-        ho.ProposeSettings(feasible=(0.3, 0.2))
+@pytest.mark.parametrize(
+    "wrong", [{"classes": 0}, {"seconds": 0.0}, {"feasible": (0.3, 0.2)}], ids=str
+)
+def test_settings_are_checked(wrong: dict[str, Any]) -> None:
+    with pytest.raises(SettingsError, match=next(iter(wrong))):
+        ho.ProposeSettings(**wrong)

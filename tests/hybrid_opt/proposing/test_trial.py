@@ -11,23 +11,28 @@ import pytest
 import trimesh
 
 from hybrid_opt.errors import JobError
-from hybrid_opt.proposing.holding import ArmKinematics, box_to_last_joint, spun
+from hybrid_opt.proposing.holding import ArmKinematics
 from hybrid_opt.proposing.planner import Place, Stray, freedom, plan, straight, straight_paths
-from hybrid_opt.proposing.problem import read_problem
+from hybrid_opt.proposing.problem import Draft, changes, read_problem
+from hybrid_opt.proposing.proposal import ProposeSettings
+from hybrid_opt.proposing.proposal import _Search as Search
 from hybrid_opt.proposing.setup import Setup, prepare, redundancy
 from hybrid_opt.proposing.trial import BoxAlone, Trial, grasp_blocked, judge_of
 from hybrid_opt.proposing.via_points import fit, free_share, joint_length, shortened, straightened
+from symbolic.array import Array
 from symbolic.cell_model import build_cell_model, own_pairs
 from symbolic.functions import CONSTRAINTS, candidate_function, motion_function
 from symbolic.geometry.pairs import build_geometry
+from symbolic.geometry.pieces import support
 from symbolic.path.spline import path_basis
 from symbolic.read.cell import load
-from symbolic.records import Handling
+from symbolic.records import Body, Box, Handling
 from symbolic.records.poses import pose_matrix
 from tests.hybrid_opt.collision.test_checker import collision_mask
 from tests.hybrid_opt.job.jobs import rack, rack_jobs, rack_timing
 from tests.hybrid_opt.proposing.problems import BAXTER
 from tests.hybrid_opt.proposing.test_proposal import rack_problem
+from tests.symbolic.geometry.collision_cells import placed_pieces
 from tests.symbolic.read.samples import RACK
 
 POST = Path("studies/problems/past-a-post.toml")
@@ -66,31 +71,37 @@ WAY = np.linspace(-0.45, 0.45, 41)
 BOW = 0.5 * np.cos(np.pi * WAY / 0.9)
 
 
+def box_among(more: str, folder: Path, before: str | None = None) -> BoxAlone:
+    """The box among what stands in the problem with a post, up to a word where one is given, and
+    more."""
+    text = POST.read_text(encoding="utf-8")
+    path = folder / "problem.toml"
+    path.write_text(text[: None if before is None else text.index(before)] + more)
+    return BoxAlone(read_problem(path).workcell())
+
+
+def way_by(y: float = 0.0, z: float = 0.0, height: float = 0.35) -> Array:
+    """Box poses from -x to x that bow out in the middle by so much [m]."""
+    way = np.zeros((len(WAY), 6))
+    way[:, 0], way[:, 1], way[:, 2] = WAY, y * BOW, height + z * BOW
+    return way
+
+
 @pytest.mark.parametrize(
-    ("aside", "sides"),
+    ("y", "z", "forth", "back"),
     [
-        ((0.0, 0.0, 0.0), ("over post",)),
-        ((0.0, 1.0, 0.0), ("left of post",)),
-        ((0.0, -1.0, 0.0), ("right of post",)),
-        ((0.0, 0.3, 1.0), ("over post",)),
+        (1.0, 0.0, "left of post", "right of post"),
+        (-1.0, 0.0, "right of post", "left of post"),
+        (0.3, 1.0, "over post", "over post"),
     ],
 )
-@pytest.mark.parametrize("forth", [True, False])
 def test_a_path_says_on_which_side_it_passes_what_is_in_the_way(
-    aside: tuple[float, float, float], sides: tuple[str, ...], forth: bool
+    y: float, z: float, forth: str, back: str, tmp_path: Path
 ) -> None:
     """A post from 0 to 0.6 m, a box that would meet it; left and right change with the way."""
-    box = BoxAlone(read_problem(POST).workcell())
-    path = np.zeros((len(WAY), 6))
-    path[:, 0], path[:, 2] = WAY, 0.35
-    path[:, :3] += BOW[:, None] * aside
-    if aside == (0.0, 0.0, 0.0):
-        path[10:31, 2] = 0.75
-    if not forth:
-        path = path[::-1]
-        swapped = {"left of post": "right of post", "right of post": "left of post"}
-        sides = tuple(swapped.get(side, side) for side in sides)
-    assert box.passed(path) == sides
+    box, path = box_among("", tmp_path), way_by(y, z)
+    assert box.passed(path) == (forth,)
+    assert box.passed(path[::-1]) == (back,)
     path[:, 2] += 0.5
     assert box.passed(path) == (), "the straight motion is free there"
 
@@ -101,7 +112,6 @@ def test_a_path_says_on_which_side_it_passes_what_is_in_the_way(
 )
 def test_a_path_between_two_bodies_is_told(aside: float, told: str, tmp_path: Path) -> None:
     """The second post 0.8 m to the left of the first, which alone is in the way."""
-    post = POST.read_text(encoding="utf-8")
     second = """
 [[environment]]
 name = "second"
@@ -110,14 +120,9 @@ radius = 0.06
 length = 0.60
 xyz = [0.0, 0.8, 0.3]
 """
-    path = tmp_path / "posts.toml"
-    path.write_text(post + second, encoding="utf-8")
-    box = BoxAlone(read_problem(path).workcell())
-    way = np.zeros((len(WAY), 6))
-    way[:, 0], way[:, 1], way[:, 2] = WAY, 0.8 * aside * BOW, 0.35
+    box, way = box_among(second, tmp_path), way_by(0.8 * aside)
     assert box.passed(way) == (told,)
-    way[:, 2] += 0.5  # above both
-    way[[0, -1], 2] = 0.35
+    way[1:-1, 2] += 0.5  # above both
     assert not box.passed(way)[0].startswith("between")
 
 
@@ -128,27 +133,14 @@ def test_a_path_through_a_frame_is_told(tmp_path: Path) -> None:
     parts = [trimesh.creation.box(size).apply_translation(at) for size, at in bars]
     frame_mesh = trimesh.util.concatenate(parts)
     (tmp_path / "frame.stl").write_bytes(trimesh.exchange.stl.export_stl(frame_mesh))
-    text = POST.read_text(encoding="utf-8")
-    text = text[: text.index("[[environment]]")]
     frame = '[[environment]]\nname = "frame"\nkind = "mesh"\npath = "frame.stl"\n'
-    path = tmp_path / "frame.toml"
-    path.write_text(text + frame, encoding="utf-8")
-    box = BoxAlone(read_problem(path).workcell())
-    way = np.zeros((len(WAY), 6))
-    way[:, 0], way[:, 2] = WAY, 0.35 + 0.8 * BOW
-    assert box.passed(way) == ("through frame",)
-    way[:, 2] += 2.6 * BOW
-    assert box.passed(way) == ("over frame",)
+    box = box_among(frame, tmp_path, before="[[environment]]")
+    assert box.passed(way_by(z=0.8)) == ("through frame",)
+    assert box.passed(way_by(z=3.4)) == ("over frame",)
 
 
 def test_what_the_box_stands_on_is_not_passed(tmp_path: Path) -> None:
-    text = POST.read_text(encoding="utf-8").replace("0.35, 0.0, 0.0, 0.0]", "0.115, 0.0, 0.0, 0.0]")
-    path = tmp_path / "standing.toml"
-    path.write_text(text, encoding="utf-8")
-    box = BoxAlone(read_problem(path).workcell())
-    way = np.zeros((len(WAY), 6))
-    way[:, 0], way[:, 1], way[:, 2] = WAY, BOW, 0.115
-    assert box.passed(way) == ("left of post",)
+    assert box_among("", tmp_path).passed(way_by(1.0, height=0.115)) == ("left of post",)
 
 
 def test_the_torso_counts_for_both_arms_of_a_machine(tmp_path: Path) -> None:
@@ -188,7 +180,6 @@ def trial() -> Trial:
 @pytest.mark.parametrize(
     ("handling", "told"),
     [
-        ({}, ""),
         ({"lift_height": 0.0, "set_down_height": 0.0}, ""),
         ({"set_down_height": 0.02}, "set down: payload meets liner"),
         ({"lift_height": 0.03}, "lift: payload meets middle board"),
@@ -208,6 +199,28 @@ def test_what_blocks_is_what_refuses_the_job(
     assert found.startswith(told)
     with pytest.raises(JobError):
         rack_jobs().plan(rack_timing(), handling=chosen)
+
+
+@pytest.mark.parametrize(
+    ("stated", "blocked", "stand_off"),
+    [({}, "", 0.03), ({"stand_off": 0.05}, "approach: left/link_5 meets peg", None)],
+)
+def test_pads_stand_off_less_where_something_is_behind_unless_the_file_says_how_far(
+    stated: dict[str, float], blocked: str, stand_off: float | None, trial: Trial, tmp_path: Path
+) -> None:
+    """A peg 35 mm behind the left wrist at the start."""
+    cell, outputs = trial.workcell, trial.evaluator.outputs(trial.initial[None])
+    at = (outputs[name][0, 0] for name in ("pose", "q_1", "q_2"))
+    link, back = rack().geometry.index("left/link_5"), np.array([0.0, 1.0, 0.0])
+    piece = max(placed_pieces(rack().geometry, *at)[link], key=lambda p: support(p, back)[0])
+    place = piece.centre + (float(support(piece, back)[0]) - piece.centre[1] + 0.045) * back
+    peg = Body("peg", Box(np.full(3, 0.02)), pose_matrix(place, np.zeros(3)))
+    cell = replace(cell, environment=(*cell.environment, peg))
+    problem = read_problem(rack_problem(tmp_path, {"handling": stated}))
+    search = Search(problem, np.random.default_rng(1), ProposeSettings(), print, lambda *_: None)
+    assert search._pads_way(Trial(cell, trial.model.start)) == (blocked, stand_off)
+    draft = Draft(cell, (0.0, 0.0), (-1, -1), np.zeros((3, 6)), stand_off=stand_off)
+    assert ("handling" in changes(problem, draft)) == (stand_off is not None)
 
 
 def test_pads_that_have_no_jobs_are_not_looked_at(
@@ -230,11 +243,16 @@ def shelf(tmp_path_factory: pytest.TempPathFactory) -> Setup:
     return prepare(problem, {}, SPINS, np.random.default_rng(3))
 
 
-def planned(setup: Setup, seed: int) -> list[Place]:
+def found_in(setup: Setup, seed: int, out_of_time: bool = False) -> list[Place] | None:
     pair = setup.pairs[0]
     ends = pair.start.extended, pair.goal.extended
     room = freedom(*ends, Stray(0.0, 0.15, 0.8), NO_LIMITS)
-    found = plan(pair.chain, pair.retreats, room, most=20_000, out_of_time=lambda: False, seed=seed)
+    until = {"most": 20_000, "out_of_time": lambda: out_of_time}
+    return plan(pair.chain, pair.retreats, room, **until, seed=seed)  # type: ignore[arg-type]
+
+
+def planned(setup: Setup, seed: int) -> list[Place]:
+    found = found_in(setup, seed)
     assert found is not None
     return found
 
@@ -244,39 +262,41 @@ def first(shelf: Setup) -> list[Place]:
     return planned(shelf, 1)
 
 
-def test_paths_hold_the_box_with_both_arms_and_are_free(shelf: Setup, first: list[Place]) -> None:
-    pair = shelf.pairs[0]
-    path = shortened(pair.chain, first, np.random.default_rng(0))
+def shortened_path(setup: Setup, corners: list[Place]) -> list[Place]:
+    """Places along corners without needless ones; FCL without screening finds them free."""
+    pair = setup.pairs[0]
+    path = shortened(pair.chain, corners, np.random.default_rng(0))
     np.testing.assert_array_equal(path[0].extended, pair.start.extended)
     np.testing.assert_allclose(path[-1].extended, pair.goal.extended, atol=1e-12)
     poses = np.array([place.extended for place in path])
+    q_1, q_2 = (np.array([place.q[arm] for place in path]) for arm in (0, 1))
+    assert not collision_mask(pair.chain.judge.checker, poses, q_1, q_2).any()
+    return path
+
+
+def test_paths_hold_the_box_with_both_arms_and_are_free(shelf: Setup, first: list[Place]) -> None:
+    pair, path = shelf.pairs[0], shortened_path(shelf, first)
+    poses = np.array([place.extended for place in path])
     for arm in (0, 1):
-        kinematics = ArmKinematics.of(shelf.workcell, arm, ())
+        kinematics = ArmKinematics(shelf.workcell, arm)
         q = np.array([place.q[arm] for place in path])
-        contact = spun(shelf.workcell.contacts[arm], pair.holds[arm].spin)
-        T_box_joint = box_to_last_joint(shelf.workcell, kinematics.geometry, contact, arm)
+        T_box_joint = kinematics.held(pair.holds[arm].spin)
         _, T = kinematics.chain(q)
         wanted = np.array([pose_matrix(pose[:3], pose[3:]) @ T_box_joint for pose in poses])
         np.testing.assert_allclose(T, wanted, atol=1e-5)
         assert np.abs(np.diff(q, axis=0)).max() < 0.5
         assert np.all(q >= shelf.workcell.robots[arm].position_lower)
         assert np.all(q <= shelf.workcell.robots[arm].position_upper)
-    q_1, q_2 = (np.array([place.q[arm] for place in path]) for arm in (0, 1))
-    assert not collision_mask(pair.chain.judge.checker, poses, q_1, q_2).any()
 
 
 def test_straight_motions_lead_out_of_the_shelf_and_in_again(shelf: Setup) -> None:
-    """Of three: away from the rack, up beside it, back; collisions are FCL's without screening."""
+    """Of three: away from the rack, up beside it, back."""
     pair = shelf.pairs[0]
     corners = next(straight_paths(pair.chain, pair.retreats, BoxAlone(shelf.workcell)))
     out, over = (corners[k + 1].extended - corners[k].extended for k in (0, 1))
     assert out[0] < -0.2
     assert over[2] > 0.3
-    np.testing.assert_allclose(corners[-1].extended, pair.goal.extended)
-    path = shortened(pair.chain, corners, np.random.default_rng(0))
-    poses = np.array([place.extended for place in path])
-    q_1, q_2 = (np.array([place.q[arm] for place in path]) for arm in (0, 1))
-    assert not collision_mask(pair.chain.judge.checker, poses, q_1, q_2).any()
+    shortened_path(shelf, corners)
 
 
 def test_where_no_straight_motion_is_free_none_is_made_up(shelf: Setup) -> None:
@@ -306,12 +326,18 @@ def test_shortcuts_make_the_way_of_the_joints_shorter(shelf: Setup) -> None:
     assert max(abs(place.extended[1]) for place in short) < 0.04
 
 
-def test_a_spline_is_straightened_as_far_as_it_stays_free(shelf: Setup, first: list[Place]) -> None:
+def test_few_via_points_follow_a_path_and_are_straightened(
+    shelf: Setup, first: list[Place]
+) -> None:
+    """As far as the spline stays free."""
     pair, rng = shelf.pairs[0], np.random.default_rng(0)
     path = shortened(pair.chain, first, rng)
-    found = [fit(pair.chain, path, count, rng) for count in (1, 2, 3, 4, 5)]
-    via = next(each for each in found if each is not None)
-    whole = np.vstack([pair.start.extended, via, pair.goal.extended])
+    straight = np.array([pair.start.extended, pair.goal.extended])
+    assert free_share(pair.chain, pair.start, straight) < 1.0
+    fits = (fit(pair.chain, path, count, rng) for count in (1, 2, 3, 4, 5))
+    via = next(each for each in fits if each is not None)
+    whole = np.vstack([straight[:1], via, straight[1:]])
+    assert free_share(pair.chain, pair.start, whole) == 1.0
     short = straightened(pair.chain, pair.start, whole, rng)
     np.testing.assert_array_equal(short[[0, -1]], whole[[0, -1]])
     assert free_share(pair.chain, pair.start, short) == 1.0
@@ -323,32 +349,12 @@ def test_a_spline_is_straightened_as_far_as_it_stays_free(shelf: Setup, first: l
 
 
 def test_the_same_seed_gives_the_same_path(shelf: Setup, first: list[Place]) -> None:
-    again, other = (planned(shelf, seed) for seed in (1, 2))
-    assert len(first) == len(again)
-    for a, b in zip(first, again, strict=True):
+    for a, b in zip(first, planned(shelf, 1), strict=True):
         np.testing.assert_array_equal(a.extended, b.extended)
-    assert len(other) != len(first) or any(
-        np.any(a.extended != b.extended) for a, b in zip(first, other, strict=True)
-    )
-
-
-def test_few_via_points_follow_a_path(shelf: Setup, first: list[Place]) -> None:
-    pair, rng = shelf.pairs[0], np.random.default_rng(0)
-    path = shortened(pair.chain, first, rng)
-    straight = np.array([pair.start.extended, pair.goal.extended])
-    assert free_share(pair.chain, pair.start, straight) < 1.0
-    found = [fit(pair.chain, path, count, rng) for count in (1, 2, 3, 4, 5)]
-    via = next(each for each in found if each is not None)
-    whole = np.vstack([straight[:1], via, straight[1:]])
-    assert free_share(pair.chain, pair.start, whole) == 1.0
 
 
 def test_what_may_be_spent_on_a_path_is_kept(shelf: Setup) -> None:
-    pair = shelf.pairs[0]
-    ends = pair.start.extended, pair.goal.extended
-    room = freedom(*ends, Stray(0.0, 0.15, 0.8), NO_LIMITS)
-    out = pair.retreats
-    assert plan(pair.chain, out, room, most=10**9, out_of_time=lambda: True, seed=1) is None
+    assert found_in(shelf, 1, out_of_time=True) is None
 
 
 def test_a_tilted_path_may_turn_and_a_level_one_may_not() -> None:
