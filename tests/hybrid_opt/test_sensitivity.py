@@ -178,7 +178,6 @@ def test_what_has_no_sensitivities_is_refused() -> None:
     robust = replace(timing, limits=ho.TimingLimits(force=150.0, robust=True))
     with pytest.raises(SettingsError, match="robust forces"):
         ho.sensitivities(robust)
-    assert timing.grid_speed is not None
     slower = drive_path(cell.timing_model, cell.initial, 0.9 * timing.grid_speed, timing.limits)
     with pytest.raises(SettingsError, match="not the fastest"):
         ho.sensitivities(slower)

@@ -1,4 +1,4 @@
-"""The rack's job around the hand-made trajectory, planned once per test process."""
+"""Jobs around hand-made trajectories, planned once per test process."""
 
 from __future__ import annotations
 
@@ -12,21 +12,34 @@ from hybrid_opt.timing.solve import time_path
 from tests.hybrid_opt.cells import shipped
 
 
+@cache
+def timed(name: str) -> Timing:
+    """A cell's hand-made trajectory at the reference speeds."""
+    cell = shipped(name)
+    return time_path(cell.timing_model, cell.initial, TimingLimits(reference_speed=True))
+
+
+@cache
+def jobs_of(name: str) -> JobModel:
+    return JobModel(shipped(name).compiled, shipped(name).timing_model)
+
+
+@cache
+def planned(name: str) -> Job:
+    return jobs_of(name).plan(timed(name))
+
+
 def rack() -> Cell:
     return shipped("rack")
 
 
-@cache
 def rack_timing() -> Timing:
-    model = rack().timing_model
-    return time_path(model, rack().initial, TimingLimits(reference_speed=True))
+    return timed("rack")
 
 
-@cache
 def rack_jobs() -> JobModel:
-    return JobModel(rack().compiled, rack().timing_model)
+    return jobs_of("rack")
 
 
-@cache
 def rack_job() -> Job:
-    return rack_jobs().plan(rack_timing())
+    return planned("rack")

@@ -14,7 +14,7 @@ from hybrid_opt.job.compliance import (
     require_skew,
     skewed,
 )
-from symbolic.array import Array
+from studies.research.plain.motion import angular_rates
 from symbolic.errors import SettingsError
 from symbolic.records.poses import pose_matrix
 from tests.hybrid_opt.job.jobs import rack_job
@@ -52,7 +52,8 @@ def test_the_worse_of_both_arms_counts() -> None:
             T = pose_matrix(motion.pose[k, :3], motion.pose[k, 3:])
             rotation = T[:3, :3]
             # The pad's point moves like the box; it lags by its velocity times the delay.
-            velocity, spin = motion.rate[k, :3], angular_velocity(motion.pose[k], motion.rate[k])
+            velocity = motion.rate[k, :3]
+            spin, _ = angular_rates(motion.pose[k, 3:], motion.rate[k, 3:], np.zeros(3))
             lag = -delay * (velocity + np.cross(spin, rotation @ contact.T_box_pad[:3, 3]))
             normal = rotation @ contact.T_box_pad[:3, 2]
             along = float(lag @ normal)
@@ -64,14 +65,6 @@ def test_the_worse_of_both_arms_counts() -> None:
     found = skewed(job, delay, stiffness)
     assert found.late == index
     assert found.margin == pytest.approx(worst, abs=0.3)
-
-
-def angular_velocity(pose: Array, rate: Array) -> Array:
-    """(3,) of a pose by differences, world frame [rad/s]."""
-    h = 1e-6
-    now, then = (pose_matrix(p[:3], p[3:])[:3, :3] for p in (pose, pose + h * rate))
-    turn = (then - now) / h @ now.T
-    return np.array([turn[2, 1], turn[0, 2], turn[1, 0]])
 
 
 def test_a_skew_that_breaks_the_squeeze_is_refused_with_a_figure() -> None:
@@ -88,11 +81,8 @@ def test_a_skew_that_breaks_the_squeeze_is_refused_with_a_figure() -> None:
     for delay in (-1e-3, 1.0, float("nan")):
         with pytest.raises(SettingsError, match="skew"):
             skewed(job, delay, stiffness)
-
-
-def test_a_stiffness_is_positive() -> None:
     for stiffness in (0.0, -1.0, float("nan"), float("inf")):
         with pytest.raises(SettingsError, match="stiffness"):
-            position_control(rack_job(), stiffness)
+            position_control(job, stiffness)
         with pytest.raises(SettingsError, match="stiffness"):
-            skewed(rack_job(), 0.01, stiffness)
+            skewed(job, 0.01, stiffness)

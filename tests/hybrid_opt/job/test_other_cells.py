@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
-from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -17,19 +16,17 @@ from hybrid_opt.bundles.bundle import prepared
 from hybrid_opt.cell import Cell
 from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES
 from hybrid_opt.job.plan import JobModel
-from hybrid_opt.job.records import Job
-from hybrid_opt.job.smooth import driven_timing
+from hybrid_opt.job.smooth import driven_timing, without_jumps
 from hybrid_opt.robust.force import thinned
 from hybrid_opt.robust.squeeze import largest_commanded
-from hybrid_opt.timing.records import TimingLimits
-from hybrid_opt.timing.solve import time_path
+from hybrid_opt.timing.records import JerkLimits
 from symbolic.errors import SettingsError
 from tests.hybrid_opt.bundles.bundles import driven
 from tests.hybrid_opt.bundles.mock_rapid import parse
 from tests.hybrid_opt.cells import shipped
+from tests.hybrid_opt.job.jobs import planned
 from tests.symbolic.cells import RACK
 
-CELLS = ["transfer", "pandas"]
 QUICK = ("fork",)
 """Of `SHIPPED` what the default run looks at; others compile for minutes. The rack has tests of its
 own."""
@@ -41,32 +38,6 @@ FREE = ("csv", "json", "ros2-control", "mcap")
 """Targets that are nobody's own."""
 
 
-@cache
-def planned(name: str) -> Job:
-    cell = shipped(name)
-    timing = time_path(cell.timing_model, cell.initial, TimingLimits(reference_speed=True))
-    return JobModel(cell.compiled, cell.timing_model).plan(timing)
-
-
-@pytest.mark.parametrize("name", CELLS)
-def test_the_job_is_whole(name: str) -> None:
-    job = planned(name)
-    names = [phase.name for phase in job.phases]
-    # The transfer's conveyors carry the box at its start and goal; the Pandas' box is handed over.
-    assert names == ["approach", "press", "carry", "release", "retreat"]
-    stands = {"transfer": (("pick conveyor",), ("place conveyor",)), "pandas": ((), ())}
-    assert job.stands_on == stands[name]
-    for one, other in zip(job.phases[:-1], job.phases[1:], strict=True):
-        np.testing.assert_allclose(one.motion.q[-1], other.motion.q[0], atol=1e-6)
-        np.testing.assert_allclose(one.force.normal[-1], other.force.normal[0], atol=1e-9)
-        np.testing.assert_allclose(one.effort[-1], other.effort[0], atol=1e-3)
-    for phase in job.phases:
-        assert phase.certificate.is_free
-        assert max(phase.use.values()) <= 1.005
-        np.testing.assert_allclose(phase.motion.q_rate[[0, -1]], 0.0, atol=1e-9)
-        np.testing.assert_allclose(phase.motion.q_second[[0, -1]], 0.0, atol=1e-9)
-
-
 @pytest.mark.parametrize("name", SHIPPED)
 def test_every_cell_that_ships_has_a_job(name: str) -> None:
     """With the forces that a recommendation knows sooner."""
@@ -74,8 +45,7 @@ def test_every_cell_that_ships_has_a_job(name: str) -> None:
     timing = driven_timing(cell.timing_model, cell.initial)
     job = JobModel(cell.compiled, cell.timing_model).plan(timing)
     assert all(phase.certificate.is_free for phase in job.phases)
-    carry, doubt = timing.carry, cell.workcell.uncertainty
-    assert carry is not None
+    carry, doubt = timing.driven, cell.workcell.uncertainty
     rows, motion = thinned(carry)
     sooner = largest_commanded(cell.workcell, motion, carry.normal_force[rows], doubt, 0)
     forces = job.phase("carry").force.normal.max(axis=0)
@@ -89,15 +59,14 @@ def test_pads_that_do_not_face_one_another_keep_limits_on_jerk() -> None:
     )
     cell = Cell(replace(shipping.workcell, robots=(first, second)), DRIVABLE_OBJECTIVES)
     timing = driven_timing(cell.timing_model, cell.initial)
-    assert timing.carry is not None
-    jerk = np.diff(timing.carry.side_by_side("q_second"), axis=0)
-    jerk /= np.diff(timing.carry.time)[:, None]
+    jerk = np.diff(timing.driven.side_by_side("q_second"), axis=0)
+    jerk /= np.diff(timing.driven.time)[:, None]
     assert 45.0 < np.abs(jerk).max() <= 50.0 * 1.005
-    job = JobModel(cell.compiled, cell.timing_model).plan(timing)
-    assert job.timing is timing
+    jerk_limits = JerkLimits.of(cell.workcell)
+    assert without_jumps(cell.timing_model, timing, jerk_limits) is timing, "as jobs drive it"
 
 
-@pytest.mark.parametrize("name", CELLS)
+@pytest.mark.parametrize("name", ["transfer", "pandas"])
 def test_bundles_hold_every_joint(name: str, tmp_path: Path) -> None:
     job = planned(name)
     joints = sum(map(len, job.joint_names))

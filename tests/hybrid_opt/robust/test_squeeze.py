@@ -14,7 +14,6 @@ from hybrid_opt.robust.force import (
     SAMPLES,
     BoxMotion,
     RobustModel,
-    RobustPrice,
     robust_price,
     soft_model,
     thinned,
@@ -75,8 +74,7 @@ def test_the_factor_multiplies_the_squeeze() -> None:
 
 
 def rack_carry() -> Carry:
-    carry = rack_job().timing.carry
-    assert carry is not None
+    carry = rack_job().timing.driven
     return carry
 
 
@@ -153,14 +151,10 @@ CASES = 2000
 PRICED = Uncertainty(friction=0.15, centre_of_mass=np.array([0.0, 0.004, 0.0]))
 
 
-def priced(uncertainty: Uncertainty) -> RobustPrice:
-    carry = rack_carry()
-    carry = replace(carry, workcell=replace(carry.workcell, uncertainty=uncertainty))
-    return robust_price(RobustModel(carry.workcell), carry, np.random.default_rng(1), cases=CASES)
-
-
 def test_a_carry_is_priced_under_its_cells_own_set() -> None:
-    found = priced(PRICED)
+    cell = replace(rack().workcell, uncertainty=PRICED)
+    carry = replace(rack_carry(), workcell=cell)
+    found = robust_price(RobustModel(cell), carry, np.random.default_rng(1), cases=CASES)
     assert found.uncertainty is PRICED
     at_one = found.peak[found.factors == 1.0][0]
     np.testing.assert_allclose(found.commanded, at_one)
@@ -172,12 +166,6 @@ def test_a_carry_is_priced_under_its_cells_own_set() -> None:
     below = found.factors <= found.largest_factor
     assert (found.peak[below] <= found.limit).all()
     assert not (found.peak[~below] <= found.limit).all(axis=1).any()
-
-
-def test_a_cell_that_states_nothing_is_priced_under_a_usual_set() -> None:
-    found = priced(USUAL)
-    assert not found.uncertainty.stated
-    assert found.check.holds
 
 
 def test_the_largest_forces_are_among_the_thinned_samples() -> None:

@@ -21,25 +21,25 @@ def duration(squared: np.ndarray, grid: np.ndarray) -> float:
     return float(np.sum(2.0 * np.diff(grid) / (speed[:-1] + speed[1:])))
 
 
-def test_bounded_acceleration_takes_the_time_of_a_triangle() -> None:
-    grid = np.linspace(0.0, 2.0, 201)
-    found = fastest_speed(rows(200, (1.0, 0.0, 3.0), (-1.0, 0.0, 3.0)), grid)
-    assert isinstance(found, np.ndarray)
-    assert duration(found, grid) == pytest.approx(2.0 * np.sqrt(2.0 / 3.0), rel=1e-4)
+ACCELERATION = (1.0, 0.0, 3.0), (-1.0, 0.0, 3.0)
 
 
-def test_bounded_speed_takes_the_time_of_a_trapezoid() -> None:
+@pytest.mark.parametrize(
+    ("speed", "time"), [((), 2.0 * np.sqrt(2.0 / 3.0)), (((0.0, 1.0, 1.0),), 2.0 + 1.0 / 3.0)]
+)
+def test_bounded_motion_takes_the_time_of_a_triangle_or_trapezoid(
+    speed: tuple[tuple[float, float, float], ...], time: float
+) -> None:
     grid = np.linspace(0.0, 2.0, 401)
-    limits = rows(400, (1.0, 0.0, 3.0), (-1.0, 0.0, 3.0), (0.0, 1.0, 1.0))
-    found = fastest_speed(limits, grid)
+    found = fastest_speed(rows(400, *ACCELERATION, *speed), grid)
     assert isinstance(found, np.ndarray)
-    assert duration(found, grid) == pytest.approx(2.0 + 1.0 / 3.0, rel=1e-3)
+    assert duration(found, grid) == pytest.approx(time, rel=1e-3 if speed else 1e-4)
 
 
 def test_contradicting_rows_fail_at_their_interval(
     caplog: pytest.LogCaptureFixture, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    limits = rows(50, (1.0, 0.0, 3.0), (-1.0, 0.0, 3.0))
+    limits = rows(50, *ACCELERATION)
     limits.bound[20, 0] = -4.0  # at most -4 and at least -3
     with caplog.at_level(logging.DEBUG):
         found = fastest_speed(limits, np.linspace(0.0, 1.0, 51))
@@ -48,9 +48,5 @@ def test_contradicting_rows_fail_at_their_interval(
     assert "no speed" in found.reason
     assert caplog.records == []
     assert capfd.readouterr().err == ""
-
-
-def test_a_path_that_cannot_be_left_is_a_failure() -> None:
-    limits = rows(50, (1.0, 0.0, 3.0), (-1.0, 0.0, 3.0), (0.0, -1.0, -0.5))
-    found = fastest_speed(limits, np.linspace(0.0, 1.0, 51))
-    assert isinstance(found, SolverFailure)
+    limits = rows(50, *ACCELERATION, (0.0, -1.0, -0.5))  # cannot be left from rest
+    assert isinstance(fastest_speed(limits, np.linspace(0.0, 1.0, 51)), SolverFailure)

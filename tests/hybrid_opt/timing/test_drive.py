@@ -20,7 +20,7 @@ from hybrid_opt.robust.force import robust_model
 from hybrid_opt.timing.analysis import drivable_timing
 from hybrid_opt.timing.drive import CandidateDriver
 from hybrid_opt.timing.path_timer import PATH_INTERVALS, PathTimer
-from hybrid_opt.timing.records import TimingLimits
+from hybrid_opt.timing.records import TimingLimits, TimingStatus
 from hybrid_opt.timing.solve import time_path
 from symbolic.array import Array
 from symbolic.functions import candidate_function
@@ -42,13 +42,9 @@ def drivable_cell() -> Workcell:
     return replace(cell, uncertainty=Uncertainty(friction=0.1))
 
 
-def evaluator() -> CandidateEvaluator:
-    """The drivable hand cell, its functions compiled as a file's would be."""
-    return evaluator_of(DRIVABLE_OBJECTIVES)
-
-
 @cache
-def evaluator_of(objectives: tuple[str, ...]) -> CandidateEvaluator:
+def evaluator(objectives: tuple[str, ...] = DRIVABLE_OBJECTIVES) -> CandidateEvaluator:
+    """The drivable hand cell, its functions compiled as a file's would be."""
     cell = drivable_cell()
     model = hand_model(cell)
     placements = (model.robots[0].joint_placements, model.robots[1].joint_placements)
@@ -60,11 +56,8 @@ def evaluator_of(objectives: tuple[str, ...]) -> CandidateEvaluator:
         f"inverse_dynamics_{i + 1}": robot.inverse_dynamics for i, robot in enumerate(model.robots)
     }
     functions = build(made).functions
-    timer, robust = (
-        PathTimer(CompiledCell(cell, model=model), lanes=1),
-        "robust_force" in objectives,
-    )
-    driver = CandidateDriver(timer, robust=robust)
+    timer = PathTimer(CompiledCell(cell, model=model), lanes=1)
+    driver = CandidateDriver(timer, robust="robust_force" in objectives)
     return CandidateEvaluator(cell, objectives, functions=functions, driver=driver)
 
 
@@ -91,20 +84,24 @@ def test_objectives_are_those_of_time_path_at_the_candidates_force() -> None:
     for k, row in enumerate(x):
         timing = time_path(hand_timing(100), row[:-1], TimingLimits(force=float(row[-1])))
         assert timing.ok, timing.reason
-        assert timing.carry is not None
         assert outputs["time"][k, -1] == pytest.approx(timing.duration, rel=2e-3)
-        peak = timing.carry.peak_normal_force.max() / 117.68
+        peak = timing.driven.peak_normal_force.max() / 117.68
         assert found.objectives[k, 1] == pytest.approx(peak, rel=2e-3)
         # The samples lie on the timing: their time and forces are those of the recomputed carry.
         u = np.linspace(0.0, 1.0, 60)
-        time = np.interp(u, timing.carry.parameter, timing.carry.time)
+        time = np.interp(u, timing.driven.parameter, timing.driven.time)
         np.testing.assert_allclose(outputs["time"][k], time, atol=0.01 * timing.duration)
+        pose, rate = outputs["pose"][k], outputs["rate"][k]
+        np.testing.assert_allclose(rate[[0, -1]], 0.0, atol=1e-9)
+        steps = np.diff(outputs["time"][k])[:, None]
+        travelled = np.cumsum(steps * (rate[1:] + rate[:-1]) / 2.0, axis=0)
+        np.testing.assert_allclose(travelled, pose[1:] - pose[0], atol=6e-3)
         assert outputs["normal_force"][k].max() <= row[-1] * 1.005
 
 
 def test_force_limits_hold_in_every_case_where_robust_forces_are_minimised() -> None:
     """Friction a tenth less at most: nearly a tenth more force."""
-    x, robust = candidates(2), evaluator_of(ROBUST_DRIVABLE_OBJECTIVES)
+    x, robust = candidates(2), evaluator(ROBUST_DRIVABLE_OBJECTIVES)
     unsure = replace(hand_cell(), uncertainty=drivable_cell().uncertainty)
     x[:, -1] = 59.0
     found, planned = robust.evaluate(x), evaluator().evaluate(x)
@@ -113,8 +110,7 @@ def test_force_limits_hold_in_every_case_where_robust_forces_are_minimised() -> 
         limits = TimingLimits(force=59.0, robust=True)
         timing = time_path(timing_of(unsure, 100), row[:-1], limits)
         assert timing.ok, timing.reason
-        assert timing.carry is not None
-        peak = robust_model(unsure).robust_force(timing.carry).peak.max()
+        peak = robust_model(unsure).robust_force(timing.driven).peak.max()
         assert found.objectives[k, 1] == pytest.approx(peak / 117.68, rel=2e-3)
         outputs = robust.outputs(row)
         assert outputs["time"][0, -1] == pytest.approx(timing.duration, rel=2e-3)
@@ -122,16 +118,6 @@ def test_force_limits_hold_in_every_case_where_robust_forces_are_minimised() -> 
     x[:, -1] = 52.0
     names = [REASONS[code] for code in robust.evaluate(x).reason]
     assert names == ["force_limit"] * 2
-
-
-def test_the_motion_is_the_derivative_of_the_path() -> None:
-    (x,) = candidates(1)
-    outputs = evaluator().outputs(x)
-    time, pose, rate = (outputs[name][0] for name in ("time", "pose", "rate"))
-    step = np.diff(time)[:, None]
-    np.testing.assert_allclose(rate[[0, -1]], 0.0, atol=1e-9)
-    travelled = np.cumsum(step * (rate[1:] + rate[:-1]) / 2.0, axis=0)
-    np.testing.assert_allclose(travelled, pose[1:] - pose[0], atol=6e-3)
 
 
 def test_paths_that_cannot_be_driven_say_why_and_where() -> None:
@@ -153,11 +139,9 @@ def test_paths_that_cannot_be_driven_say_why_and_where() -> None:
     assert found.violation[2, -len(DRIVE_CONSTRAINTS) :].max() == 0.0
 
 
-@pytest.mark.parametrize("name", ["nsga2", "mopso"])
-def test_searches_find_fronts_that_time_path_confirms(name: str) -> None:
+def test_a_search_finds_a_front_that_time_path_confirms() -> None:
     problem = CarryProblem(evaluator(), "penalty")
-    size = {"swarm": 20} if name == "mopso" else {"population": 20}
-    algorithm = metaheuristics.make(name, size, candidates(4))
+    algorithm = metaheuristics.make("nsga2", {"population": 20}, candidates(4))
     metaheuristics.search(problem, algorithm, 60, np.random.default_rng(2))
     found = problem.evaluations
     rows = np.flatnonzero(non_dominated(found.objectives, found.feasible))
@@ -184,16 +168,11 @@ def test_a_drivable_carry_is_timed_as_the_search_found_it() -> None:
     for x in candidates(3):
         timing, (found,) = drivable_timing(model, x), driver.timings(x[None])
         assert timing.ok
-        assert timing.carry is not None
         assert timing.duration == pytest.approx(found.duration, rel=1e-9)
-        assert timing.carry.normal_force.max() <= 1.005 * x[-1]
+        assert timing.driven.normal_force.max() <= 1.005 * x[-1]
         assert timing.iterations == 0, "time_path was asked"
         other = time_path(model, x, TimingLimits(force=float(x[-1])))
         assert timing.duration == pytest.approx(other.duration, rel=AGREEMENT)
-
-
-def test_what_the_search_cannot_drive_is_told_by_time_path() -> None:
-    model = timing_of(drivable_cell(), 2 * PATH_INTERVALS)
-    x = np.append(candidates(1)[0][:-1], 0.9 * STATIC)
-    assert drivable_timing(model, x).status is time_path(model, x, model.drive_limits(x[-1])).status
-    assert not drivable_timing(model, x).ok
+    # What the search cannot drive is told by `time_path`.
+    x = np.append(x[:-1], 0.9 * STATIC)
+    assert drivable_timing(model, x).status is TimingStatus.INFEASIBLE_AT_REST

@@ -40,9 +40,8 @@ def timed(size: float, force: float | None = FORCE) -> JerkTiming:
 @pytest.mark.parametrize("size", [10.0, 40.0])
 def test_every_limit_holds_and_the_jerk_is_that_of_what_is_driven(size: float) -> None:
     found = timed(size)
-    carry = found.timing.carry
+    carry = found.timing.driven
     assert found.timing.ok
-    assert carry is not None
     assert max(excess.ratio for excess in found.timing.use.values()) <= 1.005
     # Differences of the joints' accelerations over time, an independent way to their jerk.
     acceleration, time = carry.side_by_side("q_second"), carry.time
@@ -54,8 +53,7 @@ def test_every_limit_holds_and_the_jerk_is_that_of_what_is_driven(size: float) -
 
 
 def test_positions_speeds_and_accelerations_belong_together_and_end_at_rest() -> None:
-    carry = timed(40.0).timing.carry
-    assert carry is not None
+    carry = timed(40.0).timing.driven
     steps = np.diff(carry.time)[:, None]
     q, rate = carry.side_by_side("q"), carry.side_by_side("q_rate")
     middle = (rate[1:] + rate[:-1]) / 2.0
@@ -71,15 +69,13 @@ def test_a_limit_of_robust_forces_is_kept() -> None:
     """At what the planned timing needs in every case, so that both are allowed much the same."""
     cell = replace(hand_cell(), uncertainty=Uncertainty(friction=0.1, mass=0.05))
     model, forces = timing_of(cell), robust_model(cell)
-    plain = timed(40.0).timing.carry
-    assert plain is not None
+    plain = timed(40.0).timing.driven
     needed = float(forces.robust_force(plain).peak.max())
     limits = TimingLimits(force=needed, robust=True)
     found = time_with_jerk(model, initial(), limits, jerk_limits(40.0))
     assert found.timing.ok
     assert found.timing.limits == limits
-    assert found.timing.carry is not None
-    peak = float(forces.robust_force(found.timing.carry).peak.max())
+    peak = float(forces.robust_force(found.timing.driven).peak.max())
     assert 0.99 * needed < peak <= needed * 1.005
     assert found.timing.peak_force == pytest.approx(peak)
     # The plan's own timing keeps this limit, so that this is no slower, but for what rounds
@@ -99,7 +95,7 @@ def test_tighter_jerk_costs_more_and_loose_jerk_next_to_nothing() -> None:
 
 @pytest.mark.parametrize(
     ("speed", "acceleration", "jerk"),
-    [(0.3, 1.0, 5.0), (1.0, 1.0, 5.0), (1.0, 5.0, 5.0), (0.2, 5.0, 4.0), (0.5, 2.0, 50.0)],
+    [(0.3, 1.0, 5.0), (1.0, 1.0, 5.0), (1.0, 5.0, 5.0), (0.2, 5.0, 4.0)],
 )
 def test_a_straight_way_takes_the_time_of_the_s_curve(
     speed: float, acceleration: float, jerk: float
@@ -162,13 +158,10 @@ def test_a_workcell_states_limits() -> None:
     assert box is not None
     assert box.payload == 30.0
     assert np.isinf(box.joints).all()
+    with pytest.raises(SettingsError, match="positive"):
+        JerkLimits(np.zeros(JOINTS), 1.0)
 
 
 def test_a_path_that_no_timing_drives_says_so() -> None:
     found = time_with_jerk(hand_timing(), initial(), TimingLimits(force=20.0), jerk_limits(40.0))
     assert found.timing.status is TimingStatus.INFEASIBLE_AT_REST
-
-
-def test_jerk_limits_are_positive() -> None:
-    with pytest.raises(SettingsError, match="positive"):
-        JerkLimits(np.zeros(JOINTS), 1.0)
