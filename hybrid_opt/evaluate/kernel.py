@@ -134,8 +134,7 @@ class Kernel:
         self._samples = workcell.task.samples
         self._sizes = sample_sizes(workcell)
         self._open_pair = open_pair(workcell)
-        self._keep = judge_arrays(checker)
-        self._judge = judge_data(checker, self._keep)
+        self._judge, self._kept = _judge_data(checker)
         self._room = self.lanes * self._samples * len(checker.geometry.possible) + _LEAST_ROOM
 
     def evaluate(
@@ -428,13 +427,14 @@ class BatchData(ctypes.Structure):
     ]
 
 
-def judge_arrays(checker: CollisionChecker) -> dict[str, NDArray[Any]]:
-    """The memory that `judge_data` points into, to be kept as long as it."""
+def _judge_data(checker: CollisionChecker) -> tuple[JudgeData, dict[str, NDArray[Any]]]:
+    """Pairs, shapes and margins of a cell, and the memory that they point into, to be kept as long
+    as they."""
     geometry = checker.geometry
     bodies = [body.pieces for body in geometry.bodies]
     shapes = [piece.shape for pieces in bodies for piece in pieces]
     table, vertices = shape_table([*shapes, *checker.judge.resting_shapes])
-    return {
+    arrays = {
         "pairs": np.array([(p.first, p.second) for p in geometry.active], dtype=np.int64),
         "columns": geometry.columns.astype(np.int64),
         "first_piece": np.cumsum([0] + [len(pieces) for pieces in bodies], dtype=np.int64),
@@ -444,6 +444,18 @@ def judge_arrays(checker: CollisionChecker) -> dict[str, NDArray[Any]]:
         "free_beyond": np.ascontiguousarray(checker.free_beyond),
         "tolerance": np.ascontiguousarray(geometry.tolerance),
     }
+    first_piece = arrays["first_piece"]
+    data = JudgeData(
+        n_pairs=len(arrays["pairs"]),
+        has_far=len(geometry.asked) > 1,
+        n_resting=len(arrays["resting"]),
+        payload_piece=int(first_piece[geometry.index(PAYLOAD)]),
+        resting_piece=int(first_piece[-1]),
+        apart=PROOF_MARGIN,
+        overlap=PROOF_MARGIN,
+        **{name: array.ctypes.data for name, array in arrays.items()},
+    )
+    return data, arrays
 
 
 def shape_table(shapes: Sequence[ConvexShape]) -> tuple[NDArray[np.void], Array]:
@@ -456,21 +468,6 @@ def shape_table(shapes: Sequence[ConvexShape]) -> tuple[NDArray[np.void], Array]
             row["first"], row["count"] = sum(map(len, vertices)), len(shape.vertices)
             vertices.append(shape.vertices)
     return table, np.concatenate(vertices)
-
-
-def judge_data(checker: CollisionChecker, arrays: Mapping[str, NDArray[Any]]) -> JudgeData:
-    """Pairs, shapes and margins of a cell."""
-    first_piece = arrays["first_piece"]
-    return JudgeData(
-        n_pairs=len(arrays["pairs"]),
-        has_far=len(checker.geometry.asked) > 1,
-        n_resting=len(arrays["resting"]),
-        payload_piece=int(first_piece[checker.geometry.index(PAYLOAD)]),
-        resting_piece=int(first_piece[-1]),
-        apart=PROOF_MARGIN,
-        overlap=PROOF_MARGIN,
-        **{name: array.ctypes.data for name, array in arrays.items()},
-    )
 
 
 def _measures(shape: ConvexShape) -> tuple[int, tuple[float, float, float]]:
