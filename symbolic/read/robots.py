@@ -290,13 +290,7 @@ def _read_described(table: Table, key: str, folder: Path, package_dirs: tuple[Pa
             "package_dirs, ROS_PACKAGE_PATH, AMENT_PREFIX_PATH and the Python environment",
         )
         return folder
-    try:
-        path = outside.resolved(package / rest)
-        outside.require(path, outside.URDF_BYTES)
-    except OutsideError as error:
-        table.add(key, f"found {shown(address)}, which {error}")
-        return folder
-    return path
+    return read_file(table, key, folder, outside.URDF_BYTES, package / rest)
 
 
 def _read_chain(table: Table) -> tuple[str, str]:

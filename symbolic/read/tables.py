@@ -433,13 +433,14 @@ def read_body(table: Table, folder: Path) -> Body:
     return Body(name, table.record(SHAPES[kind], **files), pose)
 
 
-def read_file(table: Table, key: str, folder: Path, most: int) -> Path:
+def read_file(table: Table, key: str, folder: Path, most: int, at: Path | None = None) -> Path:
     """The absolute path of a file named relative to `folder`; it has to be readable.
 
     Args:
         table, key: where it is named.
         folder: what its path is relative to.
         most: its largest size [bytes].
+        at: where it is, if its name is no path but an address.
     """
     value = table.raw(key)
     if value is None:
@@ -448,12 +449,11 @@ def read_file(table: Table, key: str, folder: Path, most: int) -> Path:
         table.add(key, f"found {shown(value)}; allowed is the path of a file")
         return folder
     try:
-        path = outside.resolved(folder / value)
+        path = outside.resolved(at or folder / value)
         outside.require(path, most)
     except OutsideError as error:
-        table.add(
-            key, f"found {shown(value)}, which {error}; paths are relative to the workcell file"
-        )
+        hint = "" if at else "; paths are relative to the workcell file"
+        table.add(key, f"found {shown(value)}, which {error}{hint}")
         return folder
     return path
 
