@@ -15,7 +15,7 @@ from symbolic.records.problems import suggestion
 COMMAND = "dual-arm-carry"
 """The command that `pyproject.toml` installs."""
 
-START = "sys.exit(run_program(main))"
+START = "main.start()"
 """Last line of every program."""
 
 
@@ -26,7 +26,7 @@ def programs() -> dict[str, tuple[str, str]]:
     doors = ("*.py", "*/*.py", "*/*/__main__.py")
     for path in sorted(path for door in doors for path in folder.glob(door)):
         text = path.read_text("utf-8")
-        if path == Path(__file__) or not text.rstrip().endswith(START):
+        if not text.rstrip().endswith(START):
             continue
         parts = path.relative_to(folder).with_suffix("").parts
         name = ".".join(part for part in parts if part != "__main__")

@@ -15,11 +15,9 @@ import sys
 from pathlib import Path
 
 from studies.options import add
-from studies.program import Parser, Program, later, load_workcell, run_program
+from studies.program import FAULT, Parser, Program, load_workcell
 from symbolic.errors import SettingsError
 from symbolic.outside import replace_file
-
-REFUSED = 1
 
 
 def _add_options(parser: Parser) -> None:
@@ -57,11 +55,11 @@ def calibrate(options: argparse.Namespace) -> int:
     elif output is not None:
         print(f"not written: {output}, because the runs show nothing for it", file=sys.stderr)
     missed = output is not None and not evidence.changes
-    return REFUSED if missed or any(fault.serious for fault in evidence.faults) else 0
+    return FAULT if missed or any(fault.serious for fault in evidence.faults) else 0
 
 
-main = Program("calibrate", __doc__, _add_options, later("studies.calibrate.calibrate"))
+main = Program("calibrate", __doc__, _add_options, "studies.calibrate.calibrate")
 
 
 if __name__ == "__main__":
-    sys.exit(run_program(main))
+    main.start()

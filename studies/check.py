@@ -7,11 +7,10 @@ uses, collisions and the forces that the box needs. Exit code 1 where it cannot 
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 from studies.options import add, number, stated
-from studies.program import Parser, Program, later, run_program
+from studies.program import Parser, Program
 
 
 def _add_options(parser: Parser) -> None:
@@ -34,8 +33,8 @@ def _add_options(parser: Parser) -> None:
     add(parser, "--json")
 
 
-main = Program("check", __doc__, _add_options, later("studies.programs.trajectory.check_file"))
+main = Program("check", __doc__, _add_options, "studies.programs.trajectory.check_file")
 
 
 if __name__ == "__main__":
-    sys.exit(run_program(main))
+    main.start()

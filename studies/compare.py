@@ -8,11 +8,10 @@ depend on a reference front are computed anew against the union of both.
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 from studies.options import add
-from studies.program import Parser, Program, later, run_program
+from studies.program import Parser, Program
 
 
 def _add_options(parser: Parser) -> None:
@@ -21,10 +20,8 @@ def _add_options(parser: Parser) -> None:
     add(parser, "--json")
 
 
-main = Program(
-    "compare", __doc__, _add_options, later("studies.programs.comparison.compare_folders")
-)
+main = Program("compare", __doc__, _add_options, "studies.programs.comparison.compare_folders")
 
 
 if __name__ == "__main__":
-    sys.exit(run_program(main))
+    main.start()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 import time
 import webbrowser
 from collections.abc import Iterator
@@ -11,7 +10,7 @@ from pathlib import Path
 
 import hybrid_opt as ho
 from studies.options import QUICK_EVALUATIONS, add
-from studies.program import Parser, Program, later, run_program
+from studies.program import Parser, Program
 from studies.rack import main as rack
 from studies.report import PAGE
 
@@ -103,8 +102,8 @@ def _held(timing: ho.Timing) -> str:
     return ", ".join(name for name, excess in timing.use.items() if excess.ratio > HELD)
 
 
-main = Program("demo", __doc__, _add_options, later("studies.demo.show"))
+main = Program("demo", __doc__, _add_options, "studies.demo.show")
 
 
 if __name__ == "__main__":
-    sys.exit(run_program(main))
+    main.start()

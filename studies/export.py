@@ -6,11 +6,10 @@ and writes it as one bundle with a manifest, in a folder of its own below DIR.
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 from studies.options import add, stated
-from studies.program import Parser, Program, later, run_program
+from studies.program import Parser, Program
 
 TIMINGS = ("closest", "fastest", "force")
 
@@ -93,8 +92,8 @@ def _add_options(parser: Parser) -> None:
     )
 
 
-main = Program("export", __doc__, _add_options, later("studies.programs.trajectory.export_file"))
+main = Program("export", __doc__, _add_options, "studies.programs.trajectory.export_file")
 
 
 if __name__ == "__main__":
-    sys.exit(run_program(main))
+    main.start()

@@ -10,10 +10,8 @@ fail; with --view writes a page that shows the hand-made one at any sample.
 
 from __future__ import annotations
 
-import sys
-
 from studies.options import add, whole
-from studies.program import Parser, Program, later, run_program
+from studies.program import Parser, Program
 
 
 def _add_options(parser: Parser) -> None:
@@ -47,8 +45,8 @@ def _add_options(parser: Parser) -> None:
     add(parser, "--json")
 
 
-main = Program("inspect", __doc__, _add_options, later("studies.programs.inspection.inspect"))
+main = Program("inspect", __doc__, _add_options, "studies.programs.inspection.inspect")
 
 
 if __name__ == "__main__":
-    sys.exit(run_program(main))
+    main.start()

@@ -13,7 +13,7 @@ import threading
 
 import hybrid_opt as ho
 from studies.options import add, whole
-from studies.program import Parser, Program, later, load_workcell, run_program
+from studies.program import Parser, Program, load_workcell
 
 
 def _add_options(parser: Parser) -> None:
@@ -43,8 +43,8 @@ def serve(options: argparse.Namespace) -> int:
     return 0
 
 
-main = Program("live", __doc__, _add_options, later("studies.live.serve"))
+main = Program("live", __doc__, _add_options, "studies.live.serve")
 
 
 if __name__ == "__main__":
-    sys.exit(run_program(main))
+    main.start()

@@ -62,6 +62,7 @@ _SHARED: dict[str, dict[str, Any]] = {
     "PROBLEM": {"type": Path, "help": "the problem file"},
     "RESULTS": {"type": Path, "help": "results folder of a study"},
     "FILE": {"help": "a trajectory file"},
+    "--classes": {"type": whole(1, 100), "default": 1, "metavar": "N"},
     "--force-limit": {"type": force, "metavar": "N"},
     "--jobs": {
         "type": whole(0, 4096),
@@ -82,6 +83,7 @@ _SHARED: dict[str, dict[str, Any]] = {
         "help": "no progress on standard error (default: shown)",
     },
     "--seed": {"type": seed, "default": 1, "metavar": "N", "help": "of the randomness"},
+    "--time": {"type": number(1.0, 1e6), "metavar": "S"},
 }
 
 

@@ -15,7 +15,7 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn, TextIO
+from typing import TYPE_CHECKING, Any, NoReturn
 
 from symbolic import outside
 from symbolic.errors import DualArmError, DualArmWarning, OutsideError, WorkcellError
@@ -29,8 +29,8 @@ class ReportError(DualArmError):
     """A report, picture or animation cannot be made."""
 
 
-BAD_INPUT = 2
-INTERRUPTED = 130
+FAULT, BAD_INPUT, INTERRUPTED = 1, 2, 130
+"""Exit codes: of programs that find what is not as it should be; of wrong input; after Ctrl-C."""
 
 VERBOSE = "--verbose"
 
@@ -85,14 +85,15 @@ class Parser(argparse.ArgumentParser):
 class Program:
     """A program: `python -m studies.NAME`, or `dual-arm-carry NAME`.
 
-    What its work needs is imported by `run`, so that `--help` and a mistyped option are answered
-    at once.
+    What its work needs is imported when it is done, so that `--help` and a mistyped option are
+    answered at once.
 
     Attributes:
         name: below `studies`.
         description: what it does, for its help.
         add_options: adds its options; `--verbose` is there.
-        run: does its work with the options, returns the exit code. Beside the options it finds
+        run: does its work with the options, returns the exit code; or the name, with its module's,
+            of a function that does, its libraries in one thread. Beside the options it finds
             `called`, as the program was called, and `arguments`, the words of its command line.
         interrupted: what to say after Ctrl-C.
     """
@@ -100,7 +101,7 @@ class Program:
     name: str
     description: str | None
     add_options: Callable[[Parser], None]
-    run: Callable[[argparse.Namespace], int]
+    run: Callable[[argparse.Namespace], int] | str
     interrupted: str = "interrupted"
 
     @property
@@ -136,9 +137,24 @@ class Program:
         def work() -> int:
             options = parser.parse_args(given)
             options.called, options.arguments = parser.prog, given
-            return self.run(options)
+            return _done(self.run, options) if isinstance(self.run, str) else self.run(options)
 
         return carry_out(parser.prog, work, self.interrupted)
+
+    def start(self) -> NoReturn:
+        """Run it as a process of its own."""
+        sys.exit(run_program(self))
+
+
+def _done(name: str, options: argparse.Namespace) -> int:
+    """Import a function and do its work, the libraries in one thread; returns the exit code."""
+    from hybrid_opt.work.service import one_thread
+
+    module, _, function = name.rpartition(".")
+    work = getattr(import_module(module), function)
+    with one_thread():
+        code: int = work(options)
+    return code
 
 
 def load_workcell(path: Path) -> Workcell:
@@ -163,33 +179,13 @@ def load_workcell(path: Path) -> Workcell:
         raise
 
 
-def later(work: str) -> Callable[[argparse.Namespace], int]:
-    """What a program does, imported when it is done.
-
-    Args:
-        work: the function's name with its module's; it takes the options, returns the exit code.
-    """
-
-    def run(options: argparse.Namespace) -> int:
-        from hybrid_opt.work.service import one_thread
-
-        module, _, name = work.rpartition(".")
-        do = getattr(import_module(module), name)
-        with one_thread():
-            code: int = do(options)
-        return code
-
-    return run
-
-
 def run_program(main: Callable[[], int]) -> int:
     """Run a program's main function as a process of its own; returns the exit code.
 
     Warnings of this project are told once, in one line; those of libraries (divisions by zero,
     deprecations) only with `--verbose`, also in the processes that this one starts.
     """
-    told = _Warnings(verbose=VERBOSE in sys.argv[1:])
-    told.install()
+    _show_warnings(verbose=VERBOSE in sys.argv[1:])
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):  # names of files may hold what no terminal shows
             stream.reconfigure(errors="backslashreplace")
@@ -211,10 +207,8 @@ def run_program(main: Callable[[], int]) -> int:
         print(error, file=sys.stderr)
         return BAD_INPUT
     except MemoryError:
-        print(
-            "out of memory; give the process more, or use smaller files or fewer --jobs",
-            file=sys.stderr,
-        )
+        advice = "give the process more, or use smaller files or fewer --jobs"
+        print(f"out of memory; {advice}", file=sys.stderr)
         return BAD_INPUT
     except OSError as error:
         name = f"{error.filename}: " if error.filename else ""
@@ -249,39 +243,26 @@ def carry_out(program: str, work: Callable[[], int], interrupted: str = "interru
         return INTERRUPTED
 
 
-class _Warnings:
-    """Shows every warning of this project once, and all others if it is verbose."""
+def _show_warnings(verbose: bool) -> None:
+    """Tell every warning of this project once, and all others if verbose, in place of Python's way,
+    which prints a line of source code."""
+    told: set[str] = set()
 
-    def __init__(self, verbose: bool) -> None:
-        self._verbose = verbose
-        self._told: set[str] = set()
-
-    def install(self) -> None:
-        """Take over from Python's way, which prints a line of source code."""
-        warnings.simplefilter("always" if self._verbose else "ignore")
-        warnings.filterwarnings("always", category=DualArmWarning)
-        warnings.showwarning = self._show
-        if self._verbose:
-            logging.basicConfig(format="%(name)s: %(message)s")
-        else:
-            os.environ["PYTHONWARNINGS"] = "ignore"
-            logging.getLogger().addHandler(logging.NullHandler())
-
-    def _show(
-        self,
-        message: Warning | str,
-        category: type[Warning],
-        filename: str,
-        lineno: int,
-        file: TextIO | None = None,
-        line: str | None = None,
-    ) -> None:
+    def show(message: Warning | str, category: type[Warning], *_: object, **__: object) -> None:
         text = " ".join(str(message).split())
-        if text in self._told:
-            return
-        self._told.add(text)
-        where = "" if issubclass(category, DualArmWarning) else f" ({category.__name__})"
-        print(f"warning: {text}{where}", file=file or sys.stderr)
+        if text not in told:
+            told.add(text)
+            where = "" if issubclass(category, DualArmWarning) else f" ({category.__name__})"
+            print(f"warning: {text}{where}", file=sys.stderr)
+
+    warnings.simplefilter("always" if verbose else "ignore")
+    warnings.filterwarnings("always", category=DualArmWarning)
+    warnings.showwarning = show
+    if verbose:
+        logging.basicConfig(format="%(name)s: %(message)s")
+    else:
+        os.environ["PYTHONWARNINGS"] = "ignore"
+        logging.getLogger().addHandler(logging.NullHandler())
 
 
 @dataclass(frozen=True)

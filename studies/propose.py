@@ -13,7 +13,7 @@ import sys
 from collections.abc import Callable
 
 from studies.options import add, number, stated, whole
-from studies.program import Parser, Program, run_program
+from studies.program import Parser, Program
 from symbolic.errors import SettingsError
 from symbolic.outside import replace_file
 
@@ -45,11 +45,9 @@ def _add_options(parser: Parser) -> None:
         action="store_true",
         help="propose where the robots stand as well; only the height of their bases counts then",
     )
-    parser.add_argument(
+    add(
+        parser,
         "--classes",
-        type=whole(1, 100),
-        default=1,
-        metavar="N",
         help="look for up to N carries that pass what is in the way on different sides, or hold "
         "the box in other postures; the first goes into the workcell file, the others into files "
         "whose names end in -2 and so on",
@@ -69,11 +67,10 @@ def _add_options(parser: Parser) -> None:
         help="how far the pads may go from there upwards, and along their faces [m], for the carry "
         "that was found: compiles, and takes its time beside --time; write --grips=-0.04:0.01",
     )
-    parser.add_argument(
+    add(
+        parser,
         "--time",
-        type=number(1.0, 1e6),
         default=stated("hybrid_opt.proposing.proposal.ProposeSettings.seconds"),
-        metavar="S",
         help="seconds that it may work, its start included, whatever else the machine does",
     )
     add(parser, "--seed", help="of its randomness")
@@ -138,4 +135,4 @@ main = Program("propose", __doc__, _add_options, _run, "interrupted; nothing was
 
 
 if __name__ == "__main__":
-    sys.exit(run_program(main))
+    main.start()

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from functools import partial
 from importlib.resources import as_file, files
 
-from studies.program import Program, run_program
+from studies.program import Program
 from studies.run import DESCRIPTION, add_options, study_of
 
 
@@ -20,4 +19,4 @@ main = Program("rack", DESCRIPTION, partial(add_options, output="results/rack"),
 
 
 if __name__ == "__main__":
-    sys.exit(run_program(main))
+    main.start()

@@ -7,10 +7,9 @@ recommendation stays as it is.
 from __future__ import annotations
 
 import argparse
-import sys
 
 from studies.options import add, add_wishes
-from studies.program import Parser, Program, run_program
+from studies.program import Parser, Program
 
 
 def _add_options(parser: Parser) -> None:
@@ -42,4 +41,4 @@ main = Program("recommend", __doc__, _add_options, _run)
 
 
 if __name__ == "__main__":
-    sys.exit(run_program(main))
+    main.start()

@@ -7,10 +7,9 @@ folder).
 from __future__ import annotations
 
 import argparse
-import sys
 
 from studies.options import add, whole
-from studies.program import Parser, Program, run_program
+from studies.program import Parser, Program
 
 
 def _add_options(parser: Parser) -> None:
@@ -55,4 +54,4 @@ main = Program("regenerate", __doc__, _add_options, _run)
 
 
 if __name__ == "__main__":
-    sys.exit(run_program(main))
+    main.start()

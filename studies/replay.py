@@ -6,10 +6,8 @@ for them). Exit code 1 where a figure differs.
 
 from __future__ import annotations
 
-import sys
-
 from studies.options import add
-from studies.program import Parser, Program, later, run_program
+from studies.program import Parser, Program
 
 
 def _add_options(parser: Parser) -> None:
@@ -31,8 +29,8 @@ def _add_options(parser: Parser) -> None:
     add(parser, "--json")
 
 
-main = Program("replay", __doc__, _add_options, later("studies.programs.trajectory.replay_file"))
+main = Program("replay", __doc__, _add_options, "studies.programs.trajectory.replay_file")
 
 
 if __name__ == "__main__":
-    sys.exit(run_program(main))
+    main.start()

@@ -8,10 +8,8 @@ fails.
 
 from __future__ import annotations
 
-import sys
-
 from studies.options import add, whole
-from studies.program import Parser, Program, later, run_program
+from studies.program import Parser, Program
 
 
 def _add_options(parser: Parser) -> None:
@@ -32,8 +30,8 @@ def _add_options(parser: Parser) -> None:
     add(parser, "--seed", help="of the random cases")
 
 
-main = Program("robust", __doc__, _add_options, later("studies.programs.trajectory.robust_forces"))
+main = Program("robust", __doc__, _add_options, "studies.programs.trajectory.robust_forces")
 
 
 if __name__ == "__main__":
-    sys.exit(run_program(main))
+    main.start()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import shlex
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +24,7 @@ from studies.options import (
     add_wishes,
     stated,
 )
-from studies.program import Parser, Program, carry_out, run_program
+from studies.program import Parser, Program, carry_out
 from symbolic.errors import SettingsError
 
 DESCRIPTION = (
@@ -207,12 +206,8 @@ def add_options(parser: Parser, output: str) -> None:
 
 
 def study_of(workcell: Path, options: argparse.Namespace, with_paper: bool = False) -> int:
-    """Make the study of a workcell that the options ask for; returns the exit code.
-
-    Args:
-        workcell: its file.
-        with_paper: whether the paper's figures stand beside those of the study.
-    """
+    """Make the study of a workcell's file that the options ask for, with the paper's figures beside
+    its own where they are wanted; returns the exit code."""
     again = [part for part in options.arguments if part not in ("--resume", "--overwrite")]
     command = " ".join([options.called, shlex.join([*again, "--resume"])])
 
@@ -253,4 +248,4 @@ main = Program(
 
 
 if __name__ == "__main__":
-    sys.exit(run_program(main))
+    main.start()

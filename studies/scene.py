@@ -14,7 +14,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from studies.program import Parser, Program, later, run_program
+from studies.program import FAULT, Parser, Program
 from symbolic import outside
 from symbolic.errors import OutsideError, SceneError
 from symbolic.outside import replace_file
@@ -56,7 +56,7 @@ def add_scene(options: argparse.Namespace) -> int:
     elif scene.bodies:
         folder = Path.cwd()
         print(completed("", {}, {"environment": scene.tables(folder, folder)}), end="")
-    return 1 if scene.left_out else 0
+    return FAULT if scene.left_out else 0
 
 
 def _add(scene: Scene, path: Path) -> None:
@@ -88,8 +88,8 @@ def _entries(data: Mapping[str, Any], key: str = "environment") -> list[Mapping[
     return [each for each in found if isinstance(each, dict)] if isinstance(found, list) else []
 
 
-main = Program("scene", __doc__, _add_options, later("studies.scene.add_scene"))
+main = Program("scene", __doc__, _add_options, "studies.scene.add_scene")
 
 
 if __name__ == "__main__":
-    sys.exit(run_program(main))
+    main.start()

@@ -7,10 +7,8 @@ robust forces.
 
 from __future__ import annotations
 
-import sys
-
 from studies.options import PADS, add, number, stated, whole
-from studies.program import Parser, Program, later, run_program
+from studies.program import Parser, Program
 
 
 def _add_options(parser: Parser) -> None:
@@ -69,10 +67,8 @@ def _add_options(parser: Parser) -> None:
     )
 
 
-main = Program(
-    "simulate", __doc__, _add_options, later("studies.programs.simulation.simulate_file")
-)
+main = Program("simulate", __doc__, _add_options, "studies.programs.simulation.simulate_file")
 
 
 if __name__ == "__main__":
-    sys.exit(run_program(main))
+    main.start()

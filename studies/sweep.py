@@ -9,10 +9,9 @@ from __future__ import annotations
 
 import argparse
 import math
-import sys
 
 from studies.options import add, number, whole
-from studies.program import Parser, Program, later, run_program
+from studies.program import Parser, Program
 
 MOST_VALUES = 1000
 
@@ -60,8 +59,8 @@ def _add_options(parser: Parser) -> None:
     add(parser, "--jobs", "--seed", "--json", "--quiet")
 
 
-main = Program("sweep", __doc__, _add_options, later("studies.programs.sweeping.sweep_numbers"))
+main = Program("sweep", __doc__, _add_options, "studies.programs.sweeping.sweep_numbers")
 
 
 if __name__ == "__main__":
-    sys.exit(run_program(main))
+    main.start()

@@ -7,11 +7,10 @@ They are copied to FOLDER/studies and run in FOLDER as they do in the repository
 from __future__ import annotations
 
 import argparse
-import sys
 from importlib.resources import files
 from pathlib import Path
 
-from studies.program import Parser, Program, run_program
+from studies.program import Parser, Program
 
 SHIPPED = ("examples/[0-9]*.py", "problems/*.toml", "robots/*.urdf", "workcells/*.toml")
 """What is copied, below `studies`."""
@@ -46,4 +45,4 @@ main = Program("examples", __doc__, _add_options, _copy)
 
 
 if __name__ == "__main__":
-    sys.exit(run_program(main))
+    main.start()

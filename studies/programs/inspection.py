@@ -19,7 +19,7 @@ from hybrid_opt.indicators.metrics import BindingBound, binding_bounds
 from hybrid_opt.progress import Progress, passed_on
 from studies.program import Finding, load_workcell, print_findings
 from symbolic.array import Array
-from symbolic.cell_model import CellModel, own_pairs
+from symbolic.cell_model import own_pairs
 from symbolic.errors import SettingsError
 from symbolic.records import Workcell
 from symbolic.records.task import straight_line
@@ -140,11 +140,15 @@ def _at_rest(cell: Cell) -> Finding:
 def _postures(cell: Cell) -> Finding:
     """Per robot's name its postures at the start, best first."""
     robots = cell.workcell.robots
-    branches = {robot.name: branches_of(cell, i) for i, robot in enumerate(robots)}
+    found = cell.compiled.model.branches
+    branches = {
+        robot.name: tuple(_branch(cell, i, branch) for branch in found[i])
+        for i, robot in enumerate(robots)
+    }
     lines = ["", "Postures at the start, best first (* used), along the hand-made trajectory"]
-    for robot, found in branches.items():
-        lines.append(f"  {robot}")
-        lines += [f"  {'*' if b.chosen else ' '} {_branch_text(b)}" for b in found]
+    for name, own in branches.items():
+        lines.append(f"  {name}")
+        lines += [f"  {'*' if b.chosen else ' '} {_branch_text(b)}" for b in own]
     return Finding({"branches": branches}, tuple(lines))
 
 
@@ -248,13 +252,8 @@ class Branch:
     chosen: bool
 
 
-def branches_of(cell: Cell, arm: int) -> tuple[Branch, ...]:
-    """The postures of one arm (0 or 1) at the start, best first."""
+def _branch(cell: Cell, arm: int, branch: StartBranch) -> Branch:
     model = cell.compiled.model
-    return tuple(_branch(cell, model, arm, branch) for branch in model.branches[arm])
-
-
-def _branch(cell: Cell, model: CellModel, arm: int, branch: StartBranch) -> Branch:
     robot, units = cell.workcell.robots[arm], np.where(model.robots[arm].turning, "deg", "mm")
     factor = np.where(units == "deg", np.degrees(1.0), 1e3)
     path = branch.path[: max(branch.kept, 1)]
@@ -292,13 +291,8 @@ def draw(
     explained: Mapping[str, Explanation],
     output: Path,
 ) -> tuple[str, ...]:
-    """The paper's Figures 4 and 5 as files, and each carry's first collision; their names.
-
-    Args:
-        cell: the cell.
-        carries: by their names, 'initial' among them.
-        explained: what is in the way of those that fail.
-        output: folder.
+    """The paper's Figures 4 and 5 as files in a folder, and the first collision of each carry that
+    fails, by its name; 'initial' is among them. The files' names.
 
     Raises:
         SettingsError: the folder cannot be made.

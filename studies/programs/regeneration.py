@@ -14,16 +14,14 @@ from codegen.build import FunctionReport, build
 from codegen.cache import Cache, largest_size
 from codegen.interpreted import Agreement, compare
 from hybrid_opt.display.table import text_table
-from studies.program import Finding, print_findings
-
-DISAGREES = 1
+from studies.program import FAULT, Finding, print_findings
 
 
 def regenerate(options: argparse.Namespace) -> int:
     """Do what the options ask for, and print it; returns the exit code."""
     cache, found = Cache(), list[Agreement]()
     print_findings(_regenerated(cache, options, found), options.json)
-    return 0 if all(comparison.agrees for comparison in found) else DISAGREES
+    return 0 if all(comparison.agrees for comparison in found) else FAULT
 
 
 def _regenerated(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -72,11 +73,9 @@ def simulate_arms(
     _tell(found.shown, carry)
     if found.squeeze.uncertainty is not None:
         _cases(cell, found.reference, settings, options)
-        rubs_less = CellWitness(workcell_of_case(workcell, worst_friction(workcell)), settings)
-        tracked = 1.0 - workcell.uncertainty.tracking
-        worst = rubs_less.simulate(found.reference, control, tracked)
-        tell_worst(worst, tracked)
-        tell_least(rubs_less.simulate(reference, control))
+        rubs_less = CellWitness(worst_friction(workcell), settings)
+        pressed = partial(rubs_less.simulate, found.reference, control)
+        _tell_worst(pressed, partial(rubs_less.simulate, reference, control), workcell)
     if options.film:
         _film(cell, found.shown, Path(options.film))
     return witness.text
@@ -170,10 +169,8 @@ def simulate_pads(
         f"  pressed up to {forces[:, 0].max():.2f} / {forces[:, 1].max():.2f} N, {squeeze}: {held} "
         f"of {len(cases)} random cases hold (seed {options.seed})"
     )
-    rubs_less = Witness(workcell_of_case(workcell, worst_friction(workcell)), settings)
-    tracked = 1.0 - workcell.uncertainty.tracking
-    tell_worst(rubs_less.simulate(pressed, tracked), tracked)
-    tell_least(rubs_less.simulate(drive))
+    rubs_less = Witness(worst_friction(workcell), settings).simulate
+    _tell_worst(partial(rubs_less, pressed), partial(rubs_less, drive), workcell)
 
 
 def _swept(step: float) -> tuple[float, float]:
@@ -185,17 +182,18 @@ def _tell_sweep(step: float, threshold: Threshold[AnyOutcome]) -> None:
     print(f"  with a time step of {step:g} s: {threshold.factor:.4f}")
 
 
-def tell_worst(outcome: Outcome, tracked: float) -> None:
-    """What becomes of a box where least friction and least force come together."""
+def _tell_worst(
+    pressed: Callable[[float], Outcome], planned: Callable[[], Outcome], workcell: Workcell
+) -> None:
+    """What becomes of a box between pads that rub least: pressed with the least of what is
+    commanded, and with its least forces."""
+    tracked = 1.0 - workcell.uncertainty.tracking
+    outcome = pressed(tracked)
     print(
         f"  with the set's worst friction and {100.0 * tracked:g} % of the force it "
         f"{'holds' if outcome.holds else 'SLIPS'}: slip up to {1e3 * outcome.slip.max():.3f} mm"
     )
-
-
-def tell_least(outcome: Outcome) -> None:
-    """What becomes of a box under its least forces."""
-    word = "hold" if outcome.holds else "slip"
+    word = "hold" if planned().holds else "slip"
     print(f"  least forces with the set's worst friction: {word}")
 
 
@@ -214,11 +212,11 @@ def _moment(time: float) -> str:
     return f"{-time:.3f} s before the carry" if time < 0.0 else f"at {time:.3f} s"
 
 
-def worst_friction(workcell: Workcell) -> Array:
-    """(18,) the nominal case with the set's worst friction."""
+def worst_friction(workcell: Workcell) -> Workcell:
+    """The nominal case with the set's worst friction."""
     case = nominal_case(workcell)
     case[0:2] *= 1.0 - workcell.uncertainty.friction
-    return case
+    return workcell_of_case(workcell, case)
 
 
 def simulate_file(options: argparse.Namespace) -> int:

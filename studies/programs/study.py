@@ -12,6 +12,7 @@ from hybrid_opt.campaign import (
     ExecutionSettings,
     Stage,
     check_stages,
+    executor_for,
     open_folder,
     run_stages,
     search_stage,
@@ -47,7 +48,6 @@ from hybrid_opt.witness.box import mujoco_module
 from studies.options import QUICK_EVALUATIONS, QUICK_REPLICAS
 from studies.program import load_workcell
 from studies.report import PAGE, TABLES
-from studies.report.stage import follow_looks, report_stage
 from studies.study.recommendation import is_drivable, known_paths, recommendation_stage
 from studies.study.simulation import (
     limits_on_jerk,
@@ -126,6 +126,19 @@ def stages(study: StudySettings, alone: bool = False) -> tuple[Stage, ...]:
     return tuple(every)
 
 
+def report_stage(with_paper: bool, pdf: bool) -> Stage:
+    """The stage that writes pictures, tables and the page; settings as of `StudySettings`."""
+    settings = {"with_paper": with_paper, "pdf": pdf}
+
+    def run(folder: CampaignFolder, progress: Progress) -> None:
+        # Drawing libraries are heavy: they are imported when something is drawn.
+        from studies.report.generate import make_report
+
+        make_report(folder.root, settings, progress, executor_for(folder.execution))
+
+    return Stage("report", run, settings)
+
+
 def _paths_beside(folder: CampaignFolder) -> Array:
     """Paths that a study's first experiment ended with; the drivable one lies in its folder."""
     return known_paths(folder.root.parent, folder.workcell.task)
@@ -138,14 +151,8 @@ def run_study(
     progress: Progress,
     study: StudySettings,
 ) -> str:
-    """Carry out all stages that are not done, and return the figures as text.
-
-    Args:
-        workcell: the cell, read from its file.
-        settings: what to compute.
-        execution: how.
-        progress: where to show it.
-        study: what is made of the results.
+    """Carry out all stages that are not done, and return the figures as text; the cell is read from
+    its file.
 
     Raises:
         DualArmError: the workcell, a setting or the results folder is wrong, or work failed.
@@ -180,11 +187,8 @@ def run_study(
 
 
 def study_text(root: Path, with_paper: bool, brief: bool = False) -> str:
-    """The figures of a finished study for a terminal, the carry to run first.
-
-    Args:
-        with_paper: whether to print what the paper states.
-        brief: whether only the carry to run is printed, where there is one.
+    """The figures of a finished study for a terminal, the carry to run first; only that where there
+    is one and it is to be brief.
 
     Raises:
         ResultsError: the folder is not complete or damaged.
@@ -215,11 +219,7 @@ def study_text(root: Path, with_paper: bool, brief: bool = False) -> str:
 
 
 def make_study(path: Path, options: argparse.Namespace, with_paper: bool) -> None:
-    """Make a study, print its figures, and show what was asked for.
-
-    Args:
-        path: the workcell's file.
-        with_paper: whether the paper's figures stand beside its own.
+    """Make a study of a workcell's file, print its figures, and show what was asked for.
 
     Raises:
         DualArmError: the workcell, an option or the results folder is wrong, or work failed.
@@ -258,7 +258,10 @@ def make_study(path: Path, options: argparse.Namespace, with_paper: bool) -> Non
     print(run_study(cell, settings, execution, Progress(not options.quiet), study))
     if study.report:
         print(f"Report: {execution.output / PAGE}; all tables: {execution.output / TABLES}")
-    follow_looks(execution.output, options)
+    if options.animation or options.view:
+        from studies.report.looks import follow_looks
+
+        follow_looks(execution.output, options)
 
 
 def campaign_settings(

@@ -44,16 +44,10 @@ from hybrid_opt.timing.analysis import timed_trajectory, timing_document
 from hybrid_opt.timing.model import TimingModel
 from hybrid_opt.timing.records import Timing, TimingLimits
 from hybrid_opt.timing.solve import time_path
-from studies.program import Finding, load_workcell, print_findings
+from studies.program import FAULT, Finding, load_workcell, print_findings
 from studies.study.tables import force_curve, margins, timings
 from symbolic.array import Array
 from symbolic.errors import SettingsError
-
-EXIT_DIFFERENT = 1
-"""Where a replayed figure differs."""
-
-EXIT_DOES_NOT_HOLD = 1
-"""Where a random case fails."""
 
 NOT_STATED = "the usual one, because the workcell states no [uncertainty]"
 
@@ -64,7 +58,7 @@ def replay_file(options: argparse.Namespace) -> int:
     with TemporaryDirectory() as folder:
         replayed = replay(stored, Path(folder))
         print_findings(_replayed(stored, replayed, options), options.json)
-    return 0 if replayed.reproduced else EXIT_DIFFERENT
+    return 0 if replayed.reproduced else FAULT
 
 
 def _replayed(
@@ -112,20 +106,15 @@ def export_file(options: argparse.Namespace) -> int:
     bundle = BundleOptions(options.step, options.any_arm, options.stiffness, options.skew, hosts)
     squeeze = SqueezeSettings(options.squeeze, options.leader - 1)
     with TemporaryDirectory() as folder:
-        job = _planned(stored, Path(folder), options, squeeze)
+        cell = stored.open_cell(Path(folder))
+        timing = _chosen(cell.timing_model, stored, options.use, options.force_limit)
+        jobs = JobModel(cell.compiled, cell.timing_model)
+        job = jobs.plan(timing, squeeze, options.smoothing)
         origin = Origin.of_file(path, read_bytes(path), stored.provenance)
         files = export(job, options.target, options.output, origin=origin, options=bundle)
         print(_report(job, options.stiffness))
     print(f"\n{len(files)} files in {files[0].parent}")
     return 0
-
-
-def _planned(
-    stored: StoredTrajectory, folder: Path, options: argparse.Namespace, squeeze: SqueezeSettings
-) -> Job:
-    cell = stored.open_cell(folder)
-    timing = _chosen(cell.timing_model, stored, options.use, options.force_limit)
-    return JobModel(cell.compiled, cell.timing_model).plan(timing, squeeze, options.smoothing)
 
 
 def _chosen(
@@ -162,7 +151,7 @@ def check_file(options: argparse.Namespace) -> int:
     held = None if options.held is None else (options.held[0], options.held[1])
     found = check(cell, trajectory, held, options.interpolation)
     print(json.dumps(as_document(found), indent=1) if options.json else found)
-    return EXIT_DIFFERENT if found.problems else 0
+    return FAULT if found.problems else 0
 
 
 def robust_forces(options: argparse.Namespace) -> int:
@@ -223,7 +212,7 @@ def _priced(model: RobustModel, carry: Carry, options: argparse.Namespace) -> in
         f"\n  {check.cases} random cases (seed {options.seed}): {verdict}; the hardest needs "
         f"{check.hardest} of the least force that holds in all cases"
     )
-    return 0 if check.holds else EXIT_DOES_NOT_HOLD
+    return 0 if check.holds else FAULT
 
 
 def _timed(cell: Cell, x: Array, limit: float) -> list[str]:

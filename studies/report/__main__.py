@@ -6,11 +6,10 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from pathlib import Path
 
 from studies.options import add, add_looks
-from studies.program import Parser, Program, run_program
+from studies.program import Parser, Program
 
 
 def _add_options(parser: Parser) -> None:
@@ -34,22 +33,25 @@ def _run(options: argparse.Namespace) -> int:
     from hybrid_opt.progress import Progress
     from hybrid_opt.store.files import read_json
     from hybrid_opt.work.service import LocalExecutor, warm_up
-    from studies.report.stage import follow_looks, write
 
     if options.into:
         from studies.report.generate import insert_tables
 
         insert_tables(options.results, options.into)
     elif options.animation or options.view:
+        from studies.report.looks import follow_looks
+
         follow_looks(options.results, options)
     else:
         warm_up("studies.report.generate")
+        from studies.report.generate import make_report
+
         marker = options.results / STAGES / "report.json"
         stored = read_json(marker) if marker.exists() else {}
         made = stored.get("settings", {}) if isinstance(stored, dict) else {}
         pdf = options.pdf or bool(made.get("pdf", True))
         settings = {"with_paper": bool(made.get("with_paper")), "pdf": pdf}
-        write(options.results, settings, Progress(not options.quiet), LocalExecutor(0))
+        make_report(options.results, settings, Progress(not options.quiet), LocalExecutor(0))
         print(f"Report: {options.results / 'report.html'}")
     return 0
 
@@ -58,4 +60,4 @@ main = Program("report", __doc__, _add_options, _run)
 
 
 if __name__ == "__main__":
-    sys.exit(run_program(main))
+    main.start()

@@ -14,7 +14,7 @@ import html
 import inspect
 import json
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 from importlib.resources import files
@@ -26,6 +26,7 @@ from typing import Any
 from matplotlib.figure import Figure
 from PIL import Image
 
+from hybrid_opt.campaign.results import read_campaign
 from hybrid_opt.display.scene import PLOTLY, THREE, asset, embedded_json
 from hybrid_opt.display.table import Table, counted, number
 from hybrid_opt.progress import Progress
@@ -35,7 +36,7 @@ from hybrid_opt.timing.analysis import TimingDocument, stored_timing
 from hybrid_opt.work.service import Executor, LocalExecutor, Service, answer_all, called
 from studies.program import ReportError
 from studies.report import PAGE, PICTURES, TABLES, pictures_carry, pictures_cell, pictures_fronts
-from studies.report.data import ReportData
+from studies.report.data import ReportData, gather
 from studies.report.drawing import files_of, in_style, settled
 from studies.report.page_carries import RECOMMENDED_LABEL, phases
 from studies.report.page_data import page_document
@@ -138,6 +139,21 @@ def _search_pictures(data: ReportData) -> Iterator[ReportPicture]:
         yield _of("polish", pictures_fronts.polish, data)
 
 
+def make_report(
+    root: Path, settings: Mapping[str, bool], progress: Progress, executor: Executor
+) -> None:
+    """Write the report of a results folder.
+
+    Args:
+        settings: of `write_report`.
+
+    Raises:
+        DualArmError: the folder is not complete, or cannot be written.
+    """
+    data = gather(read_campaign(root), executor)
+    write_report(root, data, **settings, progress=progress, executor=executor)
+
+
 def write_report(
     root: Path,
     data: ReportData,
@@ -149,8 +165,6 @@ def write_report(
     """Write all files of the report.
 
     Args:
-        root: the results folder.
-        data: from `studies.report.data.gather`.
         with_paper: whether figures that the paper states of its rack stand beside ours.
         pdf: whether pictures are also written as PDF, which takes as long as to draw them.
         progress: where to show it.
@@ -186,11 +200,7 @@ def write_report(
 
 
 def report_tables(data: ReportData, with_paper: bool) -> tuple[Table, ...]:
-    """All tables of a report.
-
-    Args:
-        with_paper: whether figures that the paper states of its own rack stand beside ours.
-    """
+    """All tables of a report, see `study_tables`."""
     beside = None if data.drivable is None or data.alone else data.drivable.summary
     found = list(study_tables(data.summary, beside, data.jerk, data.simulations, with_paper))
     robots = data.summary.robots
@@ -244,13 +254,7 @@ def _drawn(index: int, pdf: bool, pictures: list[ReportPicture]) -> dict[str, by
 
 
 def render_page(data: ReportData, document: dict[str, Any], tables: str, pictures: str) -> str:
-    """The page's text.
-
-    Args:
-        data: the report's data.
-        document: what the scripts show, from `page_data`.
-        tables, pictures: their HTML.
-    """
+    """The page's text: what its scripts show, from `page_data`, and tables and pictures as HTML."""
     texts = files("studies.report") / "page"
     boot, own = ((texts / name).read_text("utf-8") for name in ("boot.js", "page.js"))
     scripts = [asset(PLOTLY), asset(THREE), asset("scene.js"), own]

@@ -3,6 +3,7 @@ through imageio's ffmpeg), or a browser, served on this machine alone."""
 
 from __future__ import annotations
 
+import argparse
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -72,14 +73,25 @@ class Film:
         return float(self.time[-1] - self.time[0])
 
 
-def animate(root: Path, path: Path) -> None:
-    """Write the best selected trajectory of the first algorithm that has one.
+def follow_looks(root: Path, options: argparse.Namespace) -> None:
+    """Do what `studies.options.add_looks` lets a user ask for: write the best selected trajectory
+    of the first algorithm that has one; serve the report until Ctrl-C, without a report a page that
+    plays the best selected trajectory.
 
     Raises:
-        DualArmError: the results, the suffix or a library do not fit.
+        DualArmError: the results, a suffix or a library do not fit, or no port is free.
     """
-    geometry, carries = gather_carries(root)
-    write_animation(geometry, Film.of(carries[min(1, len(carries) - 1)]), path)
+    if options.animation:
+        geometry, carries = gather_carries(root)
+        write_animation(geometry, Film.of(carries[min(1, len(carries) - 1)]), options.animation)
+    if options.view:
+        server = page_server(page_of(root), options.port)
+        told = f"Open http://{HOST}:{server.server_port} in a browser; Ctrl-C ends it."
+        print(told, file=sys.stderr)
+        try:
+            server.serve_forever()
+        except KeyboardInterrupt:
+            server.server_close()
 
 
 def write_animation(geometry: CellGeometry, film: Film, path: Path) -> None:
@@ -158,24 +170,6 @@ def _write_mp4(pictures: Iterator[NDArray[np.uint8]], path: Path) -> None:
 HOST = "127.0.0.1"
 
 
-def watch(root: Path, port: int) -> None:
-    """Serve the report of a results folder until Ctrl-C; without a report, a page that plays its
-    best selected trajectory.
-
-    Args:
-        port: where to listen; another free one is taken if it is in use.
-
-    Raises:
-        DualArmError: the results are incomplete, or no port is free.
-    """
-    server = page_server(page_of(root), port)
-    print(f"Open http://{HOST}:{server.server_port} in a browser; Ctrl-C ends it.", file=sys.stderr)
-    try:
-        server.serve_forever()
-    except KeyboardInterrupt:
-        server.server_close()
-
-
 def page_of(root: Path) -> bytes:
     """The page of a results folder.
 
@@ -189,7 +183,8 @@ def page_of(root: Path) -> bytes:
 
 
 def page_server(page: bytes, port: int) -> ThreadingHTTPServer:
-    """What gives a page to a browser of this machine, listening already.
+    """What gives a page to a browser of this machine, listening already at a port, or at another
+    free one if that is in use.
 
     Raises:
         ReportError: no port is free.

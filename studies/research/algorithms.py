@@ -8,10 +8,8 @@ the hypervolume's reference point is (1.1, 1.1); IGD is the mean Euclidean dista
 
 from __future__ import annotations
 
-import sys
-
 from studies.options import add, stated
-from studies.program import Parser, Program, later, run_program
+from studies.program import Parser, Program
 
 BAND_POPULATION = 100
 """Swarm that the figures of a correct MOPSO hold for."""
@@ -52,10 +50,8 @@ def _add_options(parser: Parser) -> None:
     add(parser, "--json", help="print JSON instead of the table")
 
 
-main = Program(
-    "research.algorithms", __doc__, _add_options, later("studies.research.analytic.algorithms")
-)
+main = Program("research.algorithms", __doc__, _add_options, "studies.research.analytic.algorithms")
 
 
 if __name__ == "__main__":
-    sys.exit(run_program(main))
+    main.start()

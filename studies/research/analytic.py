@@ -361,7 +361,7 @@ class AnalyticProblem:
     """A test problem and its true front.
 
     Attributes:
-        name: as in `names()`.
+        name: as in `PROBLEMS`.
         problem: for pymoo.
         front: (n, 2) reference front, evenly spaced.
         ideal, nadir: (2,) least and greatest value of each objective on the front; they
@@ -377,11 +377,6 @@ class AnalyticProblem:
     def normalise(self, objectives: Array) -> Array:
         """Map the front's range onto the unit square."""
         return normalise(objectives, self.ideal, self.nadir)
-
-
-def names() -> tuple[str, ...]:
-    """The problems that `make` knows."""
-    return tuple(PROBLEMS)
 
 
 def make(name: str) -> AnalyticProblem:

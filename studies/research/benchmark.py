@@ -14,10 +14,8 @@ given one: same start, goal and robots, the free waypoints spread along the hand
 
 from __future__ import annotations
 
-import sys
-
 from studies.options import add, whole
-from studies.program import Parser, Program, later, run_program
+from studies.program import Parser, Program
 
 
 def _add_options(parser: Parser) -> None:
@@ -33,10 +31,8 @@ def _add_options(parser: Parser) -> None:
     )
 
 
-main = Program(
-    "research.benchmark", __doc__, _add_options, later("studies.research.costs.benchmark_cell")
-)
+main = Program("research.benchmark", __doc__, _add_options, "studies.research.costs.benchmark_cell")
 
 
 if __name__ == "__main__":
-    sys.exit(run_program(main))
+    main.start()

@@ -9,11 +9,10 @@ told.
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 from studies.options import add
-from studies.program import Parser, Program, later, run_program
+from studies.program import Parser, Program
 
 LONG = 20_000
 """Evaluations of the far longer search."""
@@ -43,10 +42,10 @@ main = Program(
     "research.control",
     __doc__,
     _add_options,
-    later("studies.research.longer_searches.control"),
+    "studies.research.longer_searches.control",
     "interrupted, nothing is lost; the same command continues",
 )
 
 
 if __name__ == "__main__":
-    sys.exit(run_program(main))
+    main.start()

@@ -1,5 +1,4 @@
-"""Cost of one candidate, compiled, interpreted and plain, and how it grows with the cell; and the
-core-seconds of a study by part of search, polish and timing.
+"""Cost of one candidate and how it grows with the cell; core-seconds of a study by part.
 
 A study runs in this process, one stage after the other, under Python's profiler, on functions that
 are compiled before. What Python's functions and the libraries' own ones take themselves is summed
@@ -75,12 +74,8 @@ def _workcell(path: Path | None) -> Workcell:
 def benchmark(
     workcell: Workcell, candidates: int = 10, repeats: int = 3, seed: int = 0
 ) -> dict[str, Any]:
-    """Measure one cell; every time is in milliseconds per candidate.
-
-    Args:
-        candidates: number of decision vectors, uniform within the bounds.
-        repeats: rounds with each of them.
-        seed: of the decision vectors.
+    """Measure one cell with decision vectors uniform within the bounds, in some rounds with each of
+    them; every time is in milliseconds per candidate.
 
     Raises:
         CodegenError: there is no compiler.

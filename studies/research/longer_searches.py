@@ -57,12 +57,8 @@ class LongerSearch:
 def controls(
     root: Path, evaluations: Sequence[int], jobs: int, progress: Progress
 ) -> list[LongerSearch]:
-    """Run the longer searches, in `ROOT/control/EVALUATIONS`, and compare.
-
-    Args:
-        root: results folder of a polished study.
-        evaluations: budgets of the longer searches; empty for that of equal time and `LONG`.
-        jobs: worker processes, 0 for one per core.
+    """Run longer searches of a polished study, in `ROOT/control/EVALUATIONS`, and compare; without
+    budgets, with that of equal time and `LONG`.
 
     Raises:
         ResultsError: the study is not complete, or was not polished.

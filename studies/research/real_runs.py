@@ -9,10 +9,9 @@ tells what the model asks for beside what was measured, and what happened to the
 from __future__ import annotations
 
 import argparse
-import sys
 from pathlib import Path
 
-from studies.program import Parser, Program, run_program
+from studies.program import Parser, Program
 
 
 def _add_options(parser: Parser) -> None:
@@ -39,4 +38,4 @@ main = Program("research.real_runs", __doc__, _add_options, _run)
 
 
 if __name__ == "__main__":
-    sys.exit(run_program(main))
+    main.start()

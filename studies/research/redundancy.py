@@ -6,10 +6,8 @@ positions within their bounds, with the same number of evaluations each.
 
 from __future__ import annotations
 
-import sys
-
 from studies.options import add, whole
-from studies.program import Parser, Program, later, run_program
+from studies.program import Parser, Program
 
 
 def _add_options(parser: Parser) -> None:
@@ -27,9 +25,9 @@ def _add_options(parser: Parser) -> None:
 
 
 main = Program(
-    "research.redundancy", __doc__, _add_options, later("studies.research.locked_joints.redundancy")
+    "research.redundancy", __doc__, _add_options, "studies.research.locked_joints.redundancy"
 )
 
 
 if __name__ == "__main__":
-    sys.exit(run_program(main))
+    main.start()

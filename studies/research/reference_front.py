@@ -9,10 +9,8 @@ proven one. `tests/hybrid_opt/polishing/rack_reference_front.csv` was made with
 
 from __future__ import annotations
 
-import sys
-
 from studies.options import add, whole
-from studies.program import Parser, Program, later, run_program
+from studies.program import Parser, Program
 
 
 def _add_options(parser: Parser) -> None:
@@ -27,12 +25,9 @@ def _add_options(parser: Parser) -> None:
 
 
 main = Program(
-    "research.reference_front",
-    __doc__,
-    _add_options,
-    later("studies.research.best_front.reference_front"),
+    "research.reference_front", __doc__, _add_options, "studies.research.best_front.reference_front"
 )
 
 
 if __name__ == "__main__":
-    sys.exit(run_program(main))
+    main.start()

@@ -165,11 +165,8 @@ def summary(found: Sequence[Slip]) -> str:
 def slip_of(
     name: str, candidate: str, carry: Carry, layer: float = SimulationSettings.layer
 ) -> Slip:
-    """Simulate one carry whose forces are planned, and see where it slips first.
-
-    Args:
-        layer: stiffness of the pads' layers [N/m^3].
-    """
+    """Simulate one carry whose forces are planned, and see where it slips first; layer: stiffness
+    of the pads' layers [N/m^3]."""
     needed, settings = carry.normal_force[:, 1], SimulationSettings(layer=layer)
     if not carry.workcell.has_opposite_pads:
         settings = replace(settings, points=FINE_POINTS)

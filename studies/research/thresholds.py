@@ -8,11 +8,10 @@ same command goes on from there.
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 from studies.options import add, number, stated, whole
-from studies.program import Parser, Program, later, run_program
+from studies.program import Parser, Program
 
 
 def _add_options(parser: Parser) -> None:
@@ -40,10 +39,8 @@ def _add_options(parser: Parser) -> None:
     )
 
 
-main = Program(
-    "research.thresholds", __doc__, _add_options, later("studies.research.slips.thresholds")
-)
+main = Program("research.thresholds", __doc__, _add_options, "studies.research.slips.thresholds")
 
 
 if __name__ == "__main__":
-    sys.exit(run_program(main))
+    main.start()

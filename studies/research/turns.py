@@ -1,9 +1,7 @@
 """Ways of evaluating candidates that take turns on one core, and what they cost.
 
-Times are the thread's own processor time, so that waiting for a busy machine does not count. With
-collisions the compiled way is the evaluator that the searches call, with batches of a search's
-population, on candidates of a search and on random ones; the plain way is the tests' reference:
-every pair of every sample goes to FCL.
+With collisions the compiled way is the evaluator that the searches call; in the plain way, the
+tests' reference, every pair of every sample goes to FCL.
 """
 
 from __future__ import annotations
@@ -202,10 +200,13 @@ def with_collisions(
         for name in times.keys() & in_batches:
             times[name] /= POPULATION
         verdicts = evaluator.evaluate(np.concatenate(batches))
+        averages = summary(times, np.mean)
+        if "paper" in times:
+            ratio = np.mean(times["compiled"] / times["paper"])
+            averages["compiled_over_paper"] = float(ratio)
         figures.append(
             {
-                **summary(times, np.mean),
-                **over_paper(times),
+                **averages,
                 "feasible_share": float(verdicts.feasible.mean()),
                 "shares": shares(evaluator, batches[:SHARED], repeats),
             }
@@ -215,14 +216,6 @@ def with_collisions(
     ours["operations_per_second"] = per_second
     ours["share_of_peak"] = per_second / peak if peak else None
     return {"evaluations": EVALUATIONS, "population": POPULATION, **ours, "random": random}
-
-
-def over_paper(times: Mapping[str, Array]) -> dict[str, float]:
-    """Cost of the joint allocation's candidates over the same ones under the paper's, where that
-    was measured."""
-    if "paper" not in times:
-        return {}
-    return {"compiled_over_paper": float(np.mean(times["compiled"] / times["paper"]))}
 
 
 def shares(evaluator: CandidateEvaluator, batches: Array, repeats: int) -> dict[str, float]:

@@ -379,14 +379,8 @@ def campaign_summary(
     static: StaticHold,
     entries: Mapping[str, Sequence[ReplicaFigures]],
 ) -> CampaignSummary:
-    """The figures of the search and of the polish.
-
-    Args:
-        results: the campaign.
-        reference: its reference front.
-        static: forces of the payload held still.
-        entries: per algorithm those of `replica_figures`.
-    """
+    """The figures of the search and of the polish, with the reference front (k, n_obj) and per
+    algorithm the entries of `replica_figures`."""
     configuration = results.configuration
     corner = metrics.reference_point(len(results.objectives))
     return CampaignSummary(

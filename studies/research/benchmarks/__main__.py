@@ -9,13 +9,10 @@ search for the shortest one. All of it takes minutes, most of them for compiling
 from __future__ import annotations
 
 import argparse
-import sys
-from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 
-from studies.options import add, number, stated, whole
-from studies.program import Parser, Program, run_program
+from studies.options import add, stated, whole
+from studies.program import Parser, Program
 from symbolic.errors import SettingsError
 
 
@@ -33,18 +30,15 @@ def _add_options(parser: Parser) -> None:
         default=Path("results/benchmarks"),
         help="for problem files and proposed workcells",
     )
-    parser.add_argument(
+    add(
+        parser,
         "--time",
-        type=number(1.0, 1e6),
         default=stated("hybrid_opt.proposing.proposal.ProposeSettings.seconds"),
-        metavar="S",
         help="seconds that a proposal may work",
     )
-    parser.add_argument(
+    add(
+        parser,
         "--classes",
-        type=whole(1, 100),
-        default=1,
-        metavar="N",
         help="number of classes of carries to look for; the carry whose joints move least is taken",
     )
     parser.add_argument(
@@ -67,25 +61,24 @@ def _run(options: argparse.Namespace) -> int:
 
     from hybrid_opt.proposing.proposal import ProposeSettings
     from studies.research.benchmarks import baxter, machines, shelves, slot
-    from studies.research.benchmarks.measuring import Benchmark, measured, table
+    from studies.research.benchmarks.measuring import measured, table
 
-    scenes = partial(baxter.benchmark, count=options.sample, seed=options.seed)
-    known: dict[str, tuple[str, Callable[[Path], Benchmark]]] = {
-        "shelves": (shelves.HOW, shelves.benchmark),
-        "slot": (slot.HOW, slot.benchmark),
-        "machines": (machines.HOW, machines.benchmark),
-        "baxter": (baxter.HOW, scenes),
+    known = {
+        "shelves": shelves.SOURCE,
+        "slot": slot.SOURCE,
+        "machines": machines.SOURCE,
+        "baxter": baxter.source(options.sample, options.seed),
     }
     if options.name not in ("", *known):
         raise SettingsError(f"no benchmark {options.name!r}; there are {', '.join(known)}")
     chosen = {name: known[name] for name in known if options.name in ("", name)}
     if options.folder is None:
-        for name, (how, _) in chosen.items():
-            print(f"{name}: get its files, then name FOLDER by --folder\n{how}")
+        for name, source in chosen.items():
+            print(f"{name}: get its files, then name FOLDER by --folder\n{source.how}")
         return 0
     settings = ProposeSettings(seconds=options.time, classes=options.classes)
-    for _, benchmark in chosen.values():
-        given = benchmark(options.folder)
+    for source in chosen.values():
+        given = source.benchmark(options.folder)
         found = [
             measured(given, task, options.output, settings, options.seed, options.study)
             for task in given.tasks
@@ -98,4 +91,4 @@ main = Program("research.benchmarks", __doc__, _add_options, _run)
 
 
 if __name__ == "__main__":
-    sys.exit(run_program(main))
+    main.start()

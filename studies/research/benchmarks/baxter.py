@@ -16,10 +16,10 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from studies.research.benchmarks.measuring import Benchmark, Task, carry_problem
+from studies.research.benchmarks.measuring import Benchmark, Source, Task, carry_problem
 from symbolic import outside
 from symbolic.array import Array
-from symbolic.errors import OutsideError, SettingsError
+from symbolic.errors import OutsideError
 from symbolic.read.scenes import read_message, read_scene
 
 ROOM = Path("vamp/resources/baxter")
@@ -58,29 +58,25 @@ NOTE = (
 )
 
 
-def benchmark(folder: Path, count: int, seed: int) -> Benchmark:
-    """A sample of the scenes, as many of each kind.
+def source(count: int, seed: int) -> Source:
+    """A sample of the scenes.
 
     Args:
-        folder: the folder with their files.
         count: of each kind.
         seed: of the sample.
-
-    Raises:
-        SettingsError: they are not there, or not those.
     """
-    there, rng = folder / ROOM, np.random.default_rng(seed)
-    tasks = []
-    try:
+
+    def benchmark(there: Path) -> Benchmark:
+        tasks, rng = [], np.random.default_rng(seed)
         outside.require(there / "baxter.urdf", outside.URDF_BYTES)
         hands = Hands(there / "baxter.urdf")
         for kind in KINDS:
             scenes = there / "problems" / f"bookshelf_tall_both_arms_{kind}_baxter"
             chosen = np.sort(rng.choice(SCENES, count, replace=False) + 1).tolist()
             tasks += [_task(there, scenes, f"{kind} {k}", k, hands) for k in chosen]
-    except OutsideError as error:
-        raise SettingsError(f"{there}: {error}; get the files by\n{HOW}") from error
-    return Benchmark("baxter", "Baxter before bookshelves", tuple(tasks), NOTE)
+        return Benchmark("baxter", "Baxter before bookshelves", tuple(tasks), NOTE)
+
+    return Source(HOW, ROOM, benchmark)
 
 
 class Hands:

@@ -10,17 +10,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from studies.research.benchmarks.measuring import Benchmark, Task, carry_problem
-from symbolic.errors import SettingsError
+from studies.research.benchmarks.measuring import Benchmark, Source, Task, carry_problem
+from symbolic.errors import OutsideError
 
 UR10E = Path("curobo/curobo/content/assets/robot/ur_description/dual_ur10e.urdf")
 PANDAS = Path("moveit_resources/dual_arm_panda_moveit_config/config/panda.urdf.xacro")
-
-HOW = """\
-git clone https://github.com/NVlabs/curobo FOLDER/curobo
-git -C FOLDER/curobo checkout a35a708
-git clone https://github.com/moveit/moveit_resources FOLDER/moveit_resources
-git -C FOLDER/moveit_resources checkout ef5836d"""
 
 PAD = 0.12
 """Distance from a flange to its pad [m]."""
@@ -38,17 +32,10 @@ NOTE = "Nothing was published: the makers plan for each arm by itself."
 
 
 def benchmark(folder: Path) -> Benchmark:
-    """The carries.
-
-    Args:
-        folder: the folder with their files.
-
-    Raises:
-        SettingsError: they are not there.
-    """
+    """The carries of both folders in this one."""
     for file in (UR10E, PANDAS):
         if not (folder / file).is_file():
-            raise SettingsError(f"{folder / file} is not there; get the files by\n{HOW}")
+            raise OutsideError(f"{file} is not there")
     tasks = [_two_ur10e(folder / UR10E, height) for height in POSTS]
     tasks.append(_two_pandas(folder / PANDAS))
     return Benchmark("machines", "Two arms on one base and a post", tuple(tasks), NOTE)
@@ -108,3 +95,14 @@ def _pad(radius: float) -> dict[str, Any]:
 
 def _post(size: list[float], xyz: list[float]) -> dict[str, Any]:
     return {"name": "post", "kind": "box", "size": size, "xyz": xyz}
+
+
+SOURCE = Source(
+    """\
+git clone https://github.com/NVlabs/curobo FOLDER/curobo
+git -C FOLDER/curobo checkout a35a708
+git clone https://github.com/moveit/moveit_resources FOLDER/moveit_resources
+git -C FOLDER/moveit_resources checkout ef5836d""",
+    Path(),
+    benchmark,
+)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -21,6 +22,7 @@ from hybrid_opt.proposing.trial import judge_of
 from hybrid_opt.proposing.via_points import travelled
 from studies.research.turns import progress
 from symbolic.array import Array
+from symbolic.errors import OutsideError, SettingsError
 from symbolic.geometry.pairs import build_geometry
 from symbolic.outside import replace_file
 from symbolic.read.cell import load
@@ -80,6 +82,34 @@ class Benchmark:
     coordinates: Callable[[Array, Array], Array] = lambda q_1, q_2: np.hstack([q_1, q_2])
 
 
+@dataclass(frozen=True)
+class Source:
+    """Files of others, and the benchmark that they become.
+
+    Attributes:
+        how: commands that fetch them, where FOLDER is what the command line names.
+        room: their folder in that.
+        make: the benchmark of that folder; an `OutsideError` tells what of it is not there, or not
+            theirs.
+    """
+
+    how: str
+    room: Path
+    make: Callable[[Path], Benchmark]
+
+    def benchmark(self, folder: Path) -> Benchmark:
+        """The benchmark.
+
+        Raises:
+            SettingsError: the files are not in FOLDER, or not those.
+        """
+        there = folder / self.room
+        try:
+            return self.make(there)
+        except OutsideError as error:
+            raise SettingsError(f"{there}: {error}; get the files by\n{self.how}") from error
+
+
 def carry_problem(
     name: str,
     robots: list[dict[str, Any]],
@@ -89,15 +119,9 @@ def carry_problem(
     scene: list[dict[str, Any]],
     **task: float,
 ) -> dict[str, Any]:
-    """The tables of a problem file: a carry that begins and ends in the air.
-
-    Args:
-        name: of the cell.
-        robots, payload, scene: `[[robots]]`, `[payload]` and `[[environment]]`.
-        pads: `[[contacts]]`, friction aside.
-        ends: start and goal of the box.
-        task: further keys of `[task]`.
-    """
+    """The tables of a problem file: a carry that begins and ends in the air. `scene` is its
+    `[[environment]]`, `pads` are its `[[contacts]]` without friction, `ends` start and goal of the
+    box, `task` further keys of `[task]`."""
     return {
         "name": name,
         "robots": robots,
@@ -111,15 +135,15 @@ def carry_problem(
 
 @dataclass(frozen=True)
 class Length:
-    """Length of a carry.
+    """Length of a carry, not finite where there is none.
 
     Attributes:
         joints: over all joints of both arms [rad].
         theirs: in the coordinates of those who published the task [rad].
     """
 
-    joints: float
-    theirs: float
+    joints: float = math.nan
+    theirs: float = math.nan
 
 
 @dataclass(frozen=True)
@@ -133,7 +157,7 @@ class TaskResult:
         workcell: the proposed file, None where there is none.
         certified, seconds: worked until the first certified carry, and until its file was whole.
         first: length of the proposed carry.
-        fastest, shortest: of a study, None without.
+        fastest, shortest: of a study.
         duration, force: of the fastest carry [s, N].
     """
 
@@ -143,9 +167,9 @@ class TaskResult:
     workcell: Path | None = None
     certified: float | None = None
     seconds: float | None = None
-    first: Length | None = None
-    fastest: Length | None = None
-    shortest: Length | None = None
+    first: Length = Length()
+    fastest: Length = Length()
+    shortest: Length = Length()
     duration: float | None = None
     force: float | None = None
 
@@ -158,14 +182,8 @@ def measured(
     seed: int,
     study: bool,
 ) -> TaskResult:
-    """Propose a carry for one task, and study it where that is asked for.
-
-    Args:
-        output: folder for the problem file and the workcell.
-        settings: of the proposal.
-        seed: of the randomness.
-        study: whether the fastest carry is looked for as well.
-    """
+    """Propose a carry for one task, and look for the fastest and the shortest one where a study is
+    asked for; problem file and workcell go to the folder `output`."""
     output.mkdir(parents=True, exist_ok=True)
     path = output / f"{benchmark.name}-{re.sub('[ /]', '-', task.name)}.toml"
     replace_file(path, completed("", {}, task.problem).encode())
@@ -245,49 +263,38 @@ def checks_per_second(workcell: Path, rng: np.random.Generator) -> float:
     return CHECKS / (worked() - begun)
 
 
+FIGURES: tuple[tuple[str, Callable[[TaskResult], float | None], int], ...] = (
+    ("certified [s]", lambda one: one.certified, 1),
+    ("file [s]", lambda one: one.seconds, 1),
+    ("joints [rad]", lambda one: one.first.joints, 2),
+    ("theirs [rad]", lambda one: one.first.theirs, 2),
+    ("straight [rad]", lambda one: one.task.straight, 2),
+    ("published [rad]", lambda one: one.task.length, 2),
+    ("fastest [s]", lambda one: one.duration, 2),
+    ("published [s]", lambda one: one.task.seconds, 2),
+    ("force [N]", lambda one: one.force, 1),
+    ("its theirs [rad]", lambda one: one.fastest.theirs, 2),
+    ("shortest: theirs [rad]", lambda one: one.shortest.theirs, 2),
+    ("joints [rad]", lambda one: one.shortest.joints, 2),
+)
+"""Headings, figures and their digits: of the proposal, of what was published, of a study."""
+
+
 def table(benchmark: Benchmark, found: list[TaskResult], rng: np.random.Generator) -> Table:
     """The figures beside the published ones: work until the first certified carry and until its
     file, its length over all joints and in their coordinates, in these also the straight line
     between their ends; then a study's fastest carry and its shortest one. Below how many were
     found, and the rate of collision checks in the first one's cell."""
-    rows = []
-    for one in found:
-        first = (None, None) if one.first is None else (one.first.joints, one.first.theirs)
-        figures = (
-            (one.certified, 1),
-            (one.seconds, 1),
-            (first[0], 2),
-            (first[1], 2),
-            (one.task.straight, 2),
-            (one.task.length, 2),
-            (one.duration, 2),
-            (one.task.seconds, 2),
-            (one.force, 1),
-            (None if one.fastest is None else one.fastest.theirs, 2),
-            (None if one.shortest is None else one.shortest.theirs, 2),
-            (None if one.shortest is None else one.shortest.joints, 2),
-        )
-        rows.append((one.task.name, *(number(value, digits) for value, digits in figures)))
-    header = (
-        "task",
-        "certified [s]",
-        "file [s]",
-        "joints [rad]",
-        "theirs [rad]",
-        "straight [rad]",
-        "published [rad]",
-        "fastest [s]",
-        "published [s]",
-        "force [N]",
-        "its theirs [rad]",
-        "shortest: theirs [rad]",
-        "joints [rad]",
+    rows = tuple(
+        (one.task.name, *(number(figure(one), digits) for _, figure, digits in FIGURES))
+        for one in found
     )
     refused = "".join(f" {one.task.name}: {one.refused}." for one in found if one.refused)
     cell = next((one.workcell for one in found if one.workcell is not None), None)
     rate = "" if cell is None else f" {checks_per_second(cell, rng):.0f} collision checks a second."
     note = f"{solved(found)}{rate} {benchmark.note}{refused}"
-    return Table(benchmark.name, benchmark.title, header, tuple(rows), note)
+    headings = ("task", *(heading for heading, _, _ in FIGURES))
+    return Table(benchmark.name, benchmark.title, headings, rows, note)
 
 
 def solved(found: list[TaskResult]) -> str:

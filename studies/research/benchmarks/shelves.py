@@ -17,18 +17,14 @@ import numpy as np
 import pinocchio as pin
 from pinocchio.utils import rotate
 
-from studies.research.benchmarks.measuring import Benchmark, Task, carry_problem
+from studies.research.benchmarks.measuring import Benchmark, Source, Task, carry_problem
 from symbolic import outside
 from symbolic.array import Array
-from symbolic.errors import OutsideError, SettingsError
+from symbolic.errors import OutsideError
 from symbolic.read.scenes import read_scene
 
 PACKAGE = "bimanual"
 """What their URDF calls the folder."""
-
-HOW = f"""\
-git clone https://github.com/cohnt/constrained-bimanual-planning-example FOLDER/{PACKAGE}
-git -C FOLDER/{PACKAGE} checkout aca3cbd"""
 
 APART = 0.765
 """Distance between both bases, along y [m]."""
@@ -77,20 +73,9 @@ NOTE = (
 )
 
 
-def benchmark(folder: Path) -> Benchmark:
-    """The three carries.
-
-    Args:
-        folder: the folder with their files.
-
-    Raises:
-        SettingsError: they are not there, or not those.
-    """
-    there = folder / PACKAGE
-    try:
-        given = postures(outside.read_bytes(there / "notebooks/main.ipynb", outside.WORKCELL_BYTES))
-    except OutsideError as error:
-        raise SettingsError(f"{there}: {error}; get the files by\n{HOW}") from error
+def benchmark(there: Path) -> Benchmark:
+    """The three carries of their folder."""
+    given = postures(outside.read_bytes(there / "notebooks/main.ipynb", outside.WORKCELL_BYTES))
     urdf = there / "models/iiwa14_convex_decimated_collision.urdf"
     model = pin.buildModelFromUrdf(str(urdf))
     poses = {name: _box(model, q[:7]) for name, q in given.items()}
@@ -99,7 +84,7 @@ def benchmark(folder: Path) -> Benchmark:
     for start, goal, length in CARRIES:
         problem = carry_problem(
             f"Shelves, {start} to {goal}",
-            [_robot("left", urdf, folder, 0.0), _robot("right", urdf, folder, APART)],
+            [_robot("left", urdf, there.parent, 0.0), _robot("right", urdf, there.parent, APART)],
             {"size": list(BOX), "mass": 2.0},
             [
                 {"xyz": [0.0, side * BOX[1] / 2.0, 0.0], "patch_radius": 0.03}
@@ -192,3 +177,12 @@ def _scene(models: Path) -> list[dict[str, Any]]:
         for name, at in STANDING.items()
         for table in read_scene(models / name).tables(models, models)
     ]
+
+
+SOURCE = Source(
+    f"""\
+git clone https://github.com/cohnt/constrained-bimanual-planning-example FOLDER/{PACKAGE}
+git -C FOLDER/{PACKAGE} checkout aca3cbd""",
+    Path(PACKAGE),
+    benchmark,
+)

@@ -16,16 +16,10 @@ from typing import Any
 
 import numpy as np
 
-from studies.research.benchmarks.measuring import Benchmark, Task, carry_problem
+from studies.research.benchmarks.measuring import Benchmark, Source, Task, carry_problem
 from symbolic import outside
-from symbolic.errors import OutsideError, SettingsError
+from symbolic.errors import OutsideError
 from symbolic.read.elements import parse_elements
-
-FOLDER = "slot"
-
-HOW = f"""\
-git clone https://github.com/haot1an/dual-arm-cooperative-manipulation FOLDER/{FOLDER}
-git -C FOLDER/{FOLDER} checkout ed943f0"""
 
 PLATE = (0.6, 0.2, 0.02)
 
@@ -80,21 +74,10 @@ NOTE = (
 )
 
 
-def benchmark(folder: Path) -> Benchmark:
-    """The carry, within three kinds of limits.
-
-    Args:
-        folder: the folder with their files.
-
-    Raises:
-        SettingsError: they are not there, or not those.
-    """
-    there = folder / FOLDER
-    try:
-        content = outside.read_bytes(there / "models/scene_slot_gate.xml", outside.URDF_BYTES)
-        scene = [TABLE, *bodies(outside.text(content))]
-    except OutsideError as error:
-        raise SettingsError(f"{there}: {error}; get the files by\n{HOW}") from error
+def benchmark(there: Path) -> Benchmark:
+    """The carry of their folder, within three kinds of limits."""
+    content = outside.read_bytes(there / "models/scene_slot_gate.xml", outside.URDF_BYTES)
+    scene = [TABLE, *bodies(outside.text(content))]
     tasks = []
     for name, limits, seconds in LIMITS:
         problem = carry_problem(
@@ -177,3 +160,12 @@ def _robot(name: str) -> dict[str, Any]:
             },
         ],
     }
+
+
+SOURCE = Source(
+    """\
+git clone https://github.com/haot1an/dual-arm-cooperative-manipulation FOLDER/slot
+git -C FOLDER/slot checkout ed943f0""",
+    Path("slot"),
+    benchmark,
+)

@@ -78,7 +78,9 @@ class PlainEvaluator:
         outputs["violation_time"] = np.array(
             [np.trapezoid((column > 0.0).astype(float), time) / time[-1] for column in violated.T]
         )
-        return PlainCandidate(outputs, *_verdict(constraint))
+        here = _violated(constraint)
+        names = tuple(name for name in CONSTRAINTS if any(name in each for each in here))
+        return PlainCandidate(outputs, names, next((each[0] for each in here if each), ""))
 
     def _constraints(self, outputs: dict[str, Array], k: int) -> list[float]:
         """Values of `CONSTRAINTS` at sample k."""
@@ -105,14 +107,12 @@ class PlainEvaluator:
         return [float(values[name]) for name in CONSTRAINTS]
 
 
-def _verdict(constraint: Array) -> tuple[tuple[str, ...], str]:
-    """The violated constraints, and the first of them along the path."""
-    reason, violated = "", set()
-    for values in constraint:
-        here = [name for name, value in zip(CONSTRAINTS, values, strict=True) if value > 0.0]
-        violated.update(here)
-        reason = reason or (here[0] if here else "")
-    return tuple(name for name in CONSTRAINTS if name in violated), reason
+def _violated(constraint: Array) -> list[list[str]]:
+    """Per sample the violated constraints, in order."""
+    return [
+        [name for name, value in zip(CONSTRAINTS, values, strict=True) if value > 0.0]
+        for values in constraint
+    ]
 
 
 def evaluate(workcell: Workcell, start: tuple[Array, Array], x: Array) -> PlainCandidate:
@@ -170,12 +170,7 @@ class PlainJudge:
             *(outputs[name][:reached] for name in ("time", "pose", "q_1", "q_2"))
         )
         reason, position = "", float("nan")
-        for k in range(n):
-            here = [
-                name
-                for name, value in zip(CONSTRAINTS, outputs["constraint"][k], strict=True)
-                if value > 0.0
-            ]
+        for k, here in enumerate(_violated(outputs["constraint"])):
             if k < reached and collisions.colliding[k]:
                 here.append("collision")
             if here:

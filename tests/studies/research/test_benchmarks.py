@@ -20,6 +20,7 @@ from studies.research.benchmarks import baxter, machines, measuring, shelves, sl
 from studies.research.benchmarks.__main__ import main
 from studies.research.benchmarks.measuring import (
     Length,
+    Source,
     TaskResult,
     checks_per_second,
     measured,
@@ -87,8 +88,18 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
+GATE = """<mujoco><include file="workcell.xml"/><worldbody>
+<body name="slot" pos="0 -0.65 0.75"><geom name="base" size="0.32 0.07 0.1" pos="0 0 0.1"/>
+<geom name="wall" size="0.32 0.025 0.025" pos="0 -0.045 0.225"/></body>
+<body name="gate" pos="0 -0.465 1.385"><geom name="gate" type="box" size="0.32 0.015 0.215"/></body>
+<body name="plate" pos="0 -0.45 0.876"><freejoint/><geom size="0.3 0.1 0.01"/></body>
+</worldbody></mujoco>"""
+
+SLOT = "models/scene_slot_gate.xml"
+
+
 def test_the_shelves_become_problems_of_this_project(folder: Path) -> None:
-    given = shelves.benchmark(folder)
+    given = shelves.SOURCE.benchmark(folder)
     assert [task.name for task in given.tasks] == [
         "top to middle",
         "middle to bottom",
@@ -137,14 +148,33 @@ def test_the_elbow_turns_about_shoulder_and_wrist() -> None:
         assert travelled(path) == pytest.approx(abs(angle), abs=1e-8)
 
 
-def test_what_is_not_theirs_is_refused(folder: Path) -> None:
-    notebook = folder / "bimanual" / "notebooks" / "main.ipynb"
-    for text in ("{", '{"cells": 3}', '{"cells": [{"source": ["q_tilde_top = np.array([1])"]}]}'):
-        notebook.write_text(text, encoding="utf-8")
-        with pytest.raises(SettingsError, match=r"(?s)main.ipynb .*git clone"):
-            shelves.benchmark(folder)
-    with pytest.raises(SettingsError, match="git clone"):
-        shelves.benchmark(folder / "nowhere")
+@pytest.mark.parametrize(
+    ("source", "file", "text", "told"),
+    [
+        (shelves.SOURCE, "notebooks/main.ipynb", "{", "main.ipynb "),
+        (shelves.SOURCE, "notebooks/main.ipynb", '{"cells": 3}', "main.ipynb "),
+        (
+            shelves.SOURCE,
+            "notebooks/main.ipynb",
+            '{"cells": [{"source": ["q_tilde_top = np.array([1])"]}]}',
+            "main.ipynb ",
+        ),
+        (shelves.SOURCE, "notebooks/other.ipynb", "{}", "bimanual"),
+        (slot.SOURCE, SLOT, "<mujoco><worldbody/></mujoco>", "no bodies that stand"),
+        (slot.SOURCE, SLOT, GATE.replace("0.32 0.07 0.1", "0.32 x"), "three numbers"),
+        (slot.SOURCE, SLOT, "<mujoco", "slot"),
+        (machines.SOURCE, "none", "", "dual_ur10e.urdf is not there"),
+        (baxter.source(1, 3), "none", "", "baxter: cannot be read"),
+    ],
+)
+def test_what_is_not_theirs_is_refused(
+    source: Source, file: str, text: str, told: str, tmp_path: Path
+) -> None:
+    path = tmp_path / source.room / file
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(SettingsError, match=rf"(?s){told}.*\ngit clone"):
+        source.benchmark(tmp_path)
 
 
 def test_the_program_says_how_to_get_files(capsys: pytest.CaptureFixture[str]) -> None:
@@ -158,7 +188,7 @@ def test_the_program_says_how_to_get_files(capsys: pytest.CaptureFixture[str]) -
 
 
 def test_a_task_without_a_carry_says_why(folder: Path) -> None:
-    given = shelves.benchmark(folder)
+    given = shelves.SOURCE.benchmark(folder)
     task = given.tasks[0]
     task.problem["task"]["goal"][2] = 0.3
     task = replace(task, name="top to middle, 0.1 m/s")  # no folder of that name
@@ -168,7 +198,7 @@ def test_a_task_without_a_carry_says_why(folder: Path) -> None:
 
 
 def test_the_table_has_figures_where_there_are_some(folder: Path) -> None:
-    given = shelves.benchmark(folder)
+    given = shelves.SOURCE.benchmark(folder)
     some = TaskResult(given.tasks[0], "", True, None, 12.0, 20.0, Length(3.0, 2.1))
     rows = table(given, [some], RNG).rows
     assert rows[0][:7] == ("top to middle", "12.0", "20.0", "3.00", "2.10", "1.88", "2.09")
@@ -180,12 +210,10 @@ def test_the_table_has_figures_where_there_are_some(folder: Path) -> None:
 
 
 def test_machines_are_problems_whose_box_stands_clear_of_the_post(tmp_path: Path) -> None:
-    with pytest.raises(SettingsError, match=r"dual_ur10e.urdf is not there; .*\ngit clone"):
-        machines.benchmark(tmp_path)
     for file in (machines.UR10E, machines.PANDAS):
         (tmp_path / file).parent.mkdir(parents=True)
         (tmp_path / file).touch()
-    given = machines.benchmark(tmp_path)
+    given = machines.SOURCE.benchmark(tmp_path)
     assert len(given.tasks) == 4
     for task in given.tasks:
         half = np.array(task.problem["payload"]["size"]) / 2.0
@@ -235,7 +263,7 @@ def test_baxters_box_ends_on_the_board_that_the_left_hand_reaches_over(
     (scenes / "scene0001.yaml").write_text(SCENE)
     monkeypatch.setattr(baxter, "SCENES", 1)
     monkeypatch.setattr(baxter, "KINDS", ("easy",))
-    (task,) = baxter.benchmark(tmp_path, 1, 3).tasks
+    (task,) = baxter.source(1, 3).benchmark(tmp_path).tasks
     begins, ends = (task.problem["task"][end][:3] for end in ("start", "goal"))
     np.testing.assert_allclose(begins, [baxter.BEFORE[0], 0.1, baxter.BEFORE[1]])
     np.testing.assert_allclose(ends, [0.8 + 0.05, 0.1, 0.04 + 0.05 + baxter.AIR], atol=1e-4)
@@ -243,15 +271,7 @@ def test_baxters_box_ends_on_the_board_that_the_left_hand_reaches_over(
     assert names == ["Can2", "shelf_low", "shelf_high"]
     (scenes / "request0001.yaml").write_text("start_state: 3")
     with pytest.raises(SettingsError, match=r"(?s)lacks start and goal.*git clone"):
-        baxter.benchmark(tmp_path, 1, 3)
-
-
-GATE = """<mujoco><include file="workcell.xml"/><worldbody>
-<body name="slot" pos="0 -0.65 0.75"><geom name="base" size="0.32 0.07 0.1" pos="0 0 0.1"/>
-<geom name="wall" size="0.32 0.025 0.025" pos="0 -0.045 0.225"/></body>
-<body name="gate" pos="0 -0.465 1.385"><geom name="gate" type="box" size="0.32 0.015 0.215"/></body>
-<body name="plate" pos="0 -0.45 0.876"><freejoint/><geom size="0.3 0.1 0.01"/></body>
-</worldbody></mujoco>"""
+        baxter.source(1, 3).benchmark(tmp_path)
 
 
 def test_the_slot_becomes_a_problem_within_their_limits(tmp_path: Path) -> None:
@@ -261,7 +281,7 @@ def test_the_slot_becomes_a_problem_within_their_limits(tmp_path: Path) -> None:
     scene = tmp_path / "slot" / "models" / "scene_slot_gate.xml"
     scene.parent.mkdir(parents=True)
     scene.write_text(GATE, encoding="utf-8")
-    given = slot.benchmark(tmp_path)
+    given = slot.SOURCE.benchmark(tmp_path)
     assert [task.seconds for task in given.tasks] == [7.60, 7.60, 8.96]
     model = mujoco.MjModel.from_xml_string(GATE.replace('<include file="workcell.xml"/>', ""))
     data = mujoco.MjData(model)
@@ -297,22 +317,6 @@ GRIPPING = (
     (-0.871891, 0.618396, 0.323701, -2.24691, 1.18778, 1.63681, -0.439111),
 )
 """Postures that the scene's file states for the plate on its riser [rad]."""
-
-
-@pytest.mark.parametrize(
-    ("text", "told"),
-    [
-        ("<mujoco><worldbody/></mujoco>", "no bodies that stand"),
-        (GATE.replace("0.32 0.07 0.1", "0.32 x"), "three numbers"),
-        ("<mujoco", "slot"),
-    ],
-)
-def test_another_scene_is_refused(tmp_path: Path, text: str, told: str) -> None:
-    scene = tmp_path / "slot" / "models" / "scene_slot_gate.xml"
-    scene.parent.mkdir(parents=True)
-    scene.write_text(text, encoding="utf-8")
-    with pytest.raises(SettingsError, match=rf"(?s){told}.*git clone"):
-        slot.benchmark(tmp_path)
 
 
 def test_the_shortest_carry_is_shorter_than_the_one_it_began_with_and_certified(
