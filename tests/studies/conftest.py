@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 import shutil
 import subprocess
 import sys
@@ -61,9 +62,15 @@ def report(study: Path) -> Path:
 
 
 @pytest.fixture(scope="session")
-def data(study: Path) -> ReportData:
+def data(study: Path, once: Once) -> ReportData:
     """What a report of that study shows."""
-    return gather(read_campaign(study))
+
+    def make(folder: Path) -> None:
+        folder.mkdir()
+        (folder / "data").write_bytes(pickle.dumps(gather(read_campaign(study))))
+
+    found: ReportData = pickle.loads((once("data", make) / "data").read_bytes())
+    return found
 
 
 @pytest.fixture(scope="session")
@@ -103,25 +110,11 @@ def simulation(label: str) -> StoredSimulation:
     time = np.linspace(0.0, 2.0, 21)
     predicted = np.full((21, 2), 50.0)
     simulated = predicted + np.outer(np.sin(time), [0.5, -0.5])
-    return StoredSimulation(
-        label=label,
-        trajectory="0",
-        controller="leader",
-        duration=2.0,
-        slips=1.0,
-        holds=1.004,
-        pad=2,
-        begins=0.5,
-        problem="",
-        robust=True,
-        factor=1.0,
-        arrives=True,
-        slip=1e-4,
-        misses=2e-4,
-        time=time,
-        predicted=predicted,
-        simulated=simulated,
+    carry = StoredSimulation(
+        label, "0", "leader", "", 2.0, slips=1.0, holds=1.004, pad=2, begins=0.5
     )
+    carry = replace(carry, time=time, predicted=predicted, simulated=simulated)
+    return replace(carry, robust=True, arrives=True, slip=1e-4, misses=2e-4)
 
 
 @pytest.fixture

@@ -120,29 +120,20 @@ def test_pages_show_the_first(page: str) -> None:
     assert code_of(EXAMPLES[0]) in blocks((ROOT / page).read_text("utf-8"))
 
 
-def test_every_example_is_explained() -> None:
-    for path in EXAMPLES:
-        words = ast.get_docstring(ast.parse(path.read_text("utf-8"))) or ""
-        title, _, text = words.partition("\n\n")
-        assert title.endswith("."), path
-        assert text, path
-
-
 def test_every_public_name_is_used_in_an_example() -> None:
     used = set(re.findall(r"\bho\.(\w+)", "".join(code_of(path) for path in EXAMPLES)))
     assert set(ho.__all__) <= used
 
 
-def test_the_first_is_short_and_imports_one_thing_of_ours() -> None:
-    lines = [line for line in code_of(EXAMPLES[0]).splitlines() if line.strip()]
-    assert len(lines) <= TEN_LINES
-    assert [line for line in lines if "import" in line] == [
-        "import numpy as np",
-        "import hybrid_opt as ho",
-    ]
-
-
-def test_examples_are_numbered_and_short() -> None:
+def test_examples_are_numbered_short_and_explained() -> None:
     assert [int(name[:2]) for name in NAMES] == list(range(len(NAMES)))
     for path in EXAMPLES:
+        words = ast.get_docstring(ast.parse(path.read_text("utf-8"))) or ""
+        title, _, text = words.partition("\n\n")
+        assert title.endswith("."), path
+        assert text, path
         assert len(code_of(path).splitlines()) <= 20
+    first = [line for line in code_of(EXAMPLES[0]).splitlines() if line.strip()]
+    assert len(first) <= TEN_LINES
+    imports = [line for line in first if "import" in line]
+    assert imports == ["import numpy as np", "import hybrid_opt as ho"]

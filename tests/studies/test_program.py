@@ -11,7 +11,7 @@ from importlib import import_module
 
 import pytest
 
-from studies.__main__ import command, programs
+from studies.__main__ import command, main, programs
 from studies.program import Program, carry_out
 from symbolic.errors import DualArmError
 from tests.symbolic.cells import ROOT
@@ -99,7 +99,11 @@ def test_output_that_nobody_reads_is_no_error() -> None:
     assert (done.returncode, done.stdout, done.stderr) == (0, "x", "")
 
 
-@pytest.mark.parametrize("module", ["studies", "numpy", "casadi", "hybrid_opt.campaign"])
+@pytest.mark.parametrize(
+    "module",
+    ["numpy", "hybrid_opt.campaign"]
+    + [pytest.param(name, marks=pytest.mark.slow) for name in ("studies", "casadi")],
+)
 def test_an_interrupt_during_the_start_is_no_traceback(module: str) -> None:
     process = subprocess.Popen(
         [sys.executable, "-X", "importtime", "-m", "studies.run", "nowhere.toml"],
@@ -118,13 +122,6 @@ def test_an_interrupt_during_the_start_is_no_traceback(module: str) -> None:
     assert process.returncode in (2, 130, -signal.SIGINT)
 
 
-@pytest.mark.parametrize("name", PROGRAMS)
-def test_every_program_knows_verbose(name: str, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit):
-        import_module(PROGRAMS[name][0]).main(["--help"])
-    assert "--verbose" in capsys.readouterr().out
-
-
 def test_help_imports_nothing_heavy() -> None:
     """Of any program; what it would tell of heavy modules is read from their source."""
     text = (
@@ -132,7 +129,7 @@ def test_help_imports_nothing_heavy() -> None:
         "from importlib import import_module\n"
         "from studies.__main__ import programs\n"
         "for module, _ in programs().values():\n"
-        "    import_module(module).main.parser().format_help()\n"
+        "    assert '--verbose' in import_module(module).main.parser().format_help()\n"
         "print(len(programs()), *sorted(sys.modules))\n"
     )
     done = subprocess.run(
@@ -155,21 +152,32 @@ def test_the_installed_command_runs_every_program(
             command()
         assert end.value.code == 2
         assert capsys.readouterr().err.startswith(f"dual-arm-carry {name}: ")
-    for words, said in (
-        (["rnu"], "dual-arm-carry: rnu is no program of it; did you mean 'run'?\n"),
-        (["inspect", "none.toml"], "dual-arm-carry inspect: none.toml: "),
-    ):
-        monkeypatch.setattr(sys, "argv", ["dual-arm-carry", *words])
-        with pytest.raises(SystemExit) as end:
-            command()
-        assert end.value.code == 2
-        assert capsys.readouterr().err.startswith(said)
-    monkeypatch.setattr(sys, "argv", ["dual-arm-carry"])
+    monkeypatch.setattr(sys, "argv", ["dual-arm-carry", "inspect", "none.toml"])
     with pytest.raises(SystemExit) as end:
         command()
-    assert end.value.code == 0
-    listed = capsys.readouterr().out.splitlines()[2:]
-    assert [line.split()[:2] for line in listed] == [["dual-arm-carry", name] for name in PROGRAMS]
+    assert end.value.code == 2
+    assert capsys.readouterr().err.startswith("dual-arm-carry inspect: none.toml: ")
+
+
+@pytest.mark.parametrize(
+    ("called", "prefix"),
+    [("dual-arm-carry", "dual-arm-carry "), ("python -m studies", "python -m studies.")],
+)
+def test_every_program_is_listed(
+    called: str, prefix: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for words in ([], ["--help"]):
+        assert main(words, called) == 0
+        listed = capsys.readouterr().out.splitlines()[2:]
+        assert [line.removeprefix(prefix).split()[0] for line in listed] == list(PROGRAMS)
+        assert all(line.startswith(prefix) and len(line) < 140 for line in listed)
+        assert all(len(line.removeprefix(prefix).split()) > 3 for line in listed)
+    named = set(re.findall(r"`python -m studies\.([\w.]+)", (ROOT / "README.md").read_text()))
+    assert set(PROGRAMS) >= named | {"report"}
+    assert main(["rnu"], called) == 2
+    told = capsys.readouterr().err
+    assert told.startswith(f"{called}: rnu is no program of it; did you mean '")
+    assert told.endswith("run'?\n")
 
 
 @pytest.mark.parametrize(
@@ -192,19 +200,6 @@ def test_a_mistyped_option_gets_a_suggestion(
     assert told.startswith(f"python -m studies.{name}: unrecognized arguments: ")
     assert words in told
     assert len(told.splitlines()) == 1
-
-
-def test_every_program_is_listed(capsys: pytest.CaptureFixture[str]) -> None:
-    listing = import_module("studies.__main__")
-    assert listing.main([]) == 0
-    listed = capsys.readouterr().out.splitlines()[2:]
-    named = set(re.findall(r"`python -m (studies\.[\w.]+)", (ROOT / "README.md").read_text()))
-    assert {line.split()[2] for line in listed} >= named | {"studies.report"}
-    assert all(len(line.split()) > 5 and len(line) < 140 for line in listed)
-    assert listing.main(["--help"]) == 0
-    assert capsys.readouterr().out.splitlines()[2:] == listed
-    assert listing.main(["rnu"]) == 2
-    assert "did you mean 'studies.run'?" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("name", ["run", "inspect"])

@@ -29,6 +29,12 @@ ROOT = Path(__file__).resolve().parents[2]
 GOFA = ROOT / "studies" / "robots" / "gofa12.urdf"
 RACK = ROOT / "studies" / "workcells" / "rack.toml"
 
+
+def standing_text(path: Path = RACK) -> str:
+    """The text of a shipped cell's file, which may stand in any folder."""
+    return path.read_text("utf-8").replace("../robots", str(path.parents[1] / "robots"))
+
+
 SEEDS = ((3.14, -1.6, 0.4, 0.0, -1.9, 0.0), (-3.14, -1.6, 0.4, 0.0, -1.9, 0.0))
 """Rough postures of the two arms from which Newton's method finds the hand cell's start."""
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from hybrid_opt.cell import Cell
-from hybrid_opt.evaluate.evaluation import CandidateEvaluator, LockedEvaluator
+from hybrid_opt.evaluate.evaluation import REASONS, CandidateEvaluator, LockedEvaluator
 from hybrid_opt.evaluate.objectives import ROBUST_OBJECTIVES
 from hybrid_opt.polishing.polisher import Polisher
 from hybrid_opt.polishing.settings import PolishSettings
@@ -25,7 +25,6 @@ from studies.programs.inspection import inspected
 from studies.research.locked_joints import compare, locks
 from studies.research.plain.collisions import PlainCollisionChecker
 from studies.run import main
-from symbolic.array import Array
 from symbolic.cell_model import CellModel, build_cell_model
 from symbolic.contact.load import load_function
 from symbolic.errors import SettingsError
@@ -34,7 +33,7 @@ from symbolic.read.cell import load
 from symbolic.records import Uncertainty
 from tests.described_cells import SOURCES, described_cell, plain_cell
 from tests.hybrid_opt.cells import shipped
-from tests.symbolic.cells import RACK, ROOT, call
+from tests.symbolic.cells import RACK, ROOT, call, standing_text
 
 WORKCELLS = ROOT / "studies" / "workcells"
 CORNER, UNEVEN = WORKCELLS / "corner.toml", WORKCELLS / "uneven.toml"
@@ -81,9 +80,12 @@ def test_its_carry_is_feasible_certified_and_drivable_and_pads_hold_it(name: str
     assert_driven_pads_hold(cell, slow.carry)
 
 
+UNSURE = Uncertainty(0.08, 0.05, np.full(3, 0.004), 0.002)
+
+
 @pytest.mark.slow
 def test_robust_forces_keep_to_a_limit_and_hold_random_cases(cell: Cell) -> None:
-    unsure = replace(cell.workcell, uncertainty=Uncertainty(0.08, 0.05, np.full(3, 0.004), 0.002))
+    unsure = replace(cell.workcell, uncertainty=UNSURE)
     model, forces = TimingModel(unsure, 40), RobustModel(unsure)
     still = BoxMotion(
         *[np.tile(part, (1, 1)) for part in (unsure.task.waypoints[0].lower, *np.zeros((2, 6)))]
@@ -101,7 +103,7 @@ def test_robust_forces_keep_to_a_limit_and_hold_random_cases(cell: Cell) -> None
 
 @pytest.mark.slow
 def test_what_knows_closed_forms_only_refuses_it(cell: Cell) -> None:
-    unsure = replace(cell.workcell, uncertainty=Uncertainty(0.08, 0.05, np.full(3, 0.004), 0.002))
+    unsure = replace(cell.workcell, uncertainty=UNSURE)
     with pytest.raises(SettingsError, match="face one another"):
         Polisher(CandidateEvaluator(unsure, ROBUST_OBJECTIVES), PolishSettings())
     with pytest.raises(SettingsError, match="face one another"):
@@ -158,9 +160,8 @@ def test_only_the_joint_allocation_holds_a_load_to_one_side(tmp_path: Path) -> N
     radius = cell.workcell.contacts[0].patch_radius
     assert carry.peak_pressure_shift == pytest.approx([radius, radius], rel=1e-3)
     assert np.abs(carry.moment_residual).max() < 1e-9
-    text = UNEVEN.read_text(encoding="utf-8").replace('allocation = "joint"\n', "")
     path = tmp_path / "paper.toml"
-    path.write_text(text.replace("../robots", str(UNEVEN.parents[1] / "robots")), encoding="utf-8")
+    path.write_text(standing_text(UNEVEN).replace('allocation = "joint"\n', ""), encoding="utf-8")
     paper = CandidateEvaluator(load(path)).carry(cell.initial)
     assert paper.judgement is not None
     assert paper.judgement.reason.startswith("pressure")
@@ -184,12 +185,25 @@ def test_elbows_that_move_beat_the_best_lock() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["pandas", "tiago"])
-def test_the_hand_made_trajectory_is_feasible_and_the_bounds_searchable(name: str) -> None:
+@pytest.mark.parametrize(
+    ("name", "drawn", "seed"), [("rack", 20_000, 0), ("pandas", 1000, 1), ("tiago", 1000, 1)]
+)
+def test_the_hand_made_trajectory_is_feasible_and_few_random_ones_are(
+    name: str, drawn: int, seed: int
+) -> None:
+    """Of the rack 2.01 % were feasible with this seed when the bounds were chosen."""
     judged = shipped(name)
-    assert judged.evaluator.certified(judged.evaluate(judged.initial)).feasible.all()
-    share = judged.evaluate(judged.random(1000, np.random.default_rng(1))).feasible.mean()
-    assert 0.02 <= share <= 0.2
+    hand_made = judged.evaluate(judged.initial)
+    assert judged.evaluator.certified(hand_made).feasible.all()
+    found = judged.evaluate(judged.random(drawn, np.random.default_rng(seed)))
+    assert 0.02 <= found.feasible.mean() <= 0.2
+    if name == "rack":
+        # 2.9 % above the static hold, the figure of a trial by another program.
+        static = judged.workcell.payload.mass * 9.81 / 2.0
+        excess = hand_made.objectives[0] * judged.workcell.task.reference_force / static - 1.0
+        np.testing.assert_allclose(excess, 0.029, atol=5e-4)
+        violated = {REASONS[k] for k in np.flatnonzero((found.violation > 0.0).any(axis=0))}
+        assert {"collision", "reach_1", "reach_2", "joint_limits_1", "pressure_1"} <= violated
 
 
 @pytest.mark.slow
@@ -217,20 +231,15 @@ def plain(tmp_path_factory: pytest.TempPathFactory) -> CellModel:
     return build_cell_model(plain_cell(tmp_path_factory.mktemp("plain")))
 
 
-def candidates(cell: Cell) -> Array:
-    """The hand-made trajectory and some around it, of which not all are feasible."""
-    rng = np.random.default_rng(1)
-    near = cell.initial + rng.uniform(-0.06, 0.06, (5, len(cell.initial)))
-    return np.vstack([cell.initial, np.clip(near, cell.lower, cell.upper)])
-
-
 def test_the_model_is_that_of_the_plain_cell(described: Cell, plain: CellModel) -> None:
     model = described.compiled.model
     assert model.robots[0].joint_names == plain.robots[0].joint_names
     found, expected = (set(map(frozenset, m.geometry.pair_names)) for m in (model, plain))
     assert found == expected
     assert not any("left/grip" in name for pair in model.geometry.pair_names for name in pair)
-    for x in candidates(described):
+    shifts = np.random.default_rng(1).uniform(-0.06, 0.06, (2, len(described.initial)))
+    near = np.clip(described.initial + shifts, described.lower, described.upper)
+    for x in (described.initial, *near):
         values = (candidate_function(m)(ca.DM(x)) for m in (model, plain))
         for value, other in zip(*values, strict=True):
             np.testing.assert_allclose(np.array(value), np.array(other), atol=1e-9)

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from hybrid_opt.calibrating.recording import Run
 from studies.calibrate import main
 from symbolic.read.cell import load
 from symbolic.records.cell import USUAL
@@ -21,7 +23,7 @@ from tests.hybrid_opt.calibrating.generator import (
     write,
     write_bag,
 )
-from tests.symbolic.cells import RACK
+from tests.symbolic.cells import RACK, standing_text
 
 
 def test_a_written_cell_loads_and_has_the_values(
@@ -78,8 +80,7 @@ def test_a_file_per_arm_and_columns_by_name(tmp_path: Path) -> None:
 
 
 def test_a_cell_without_ranges_gets_them_all(tmp_path: Path) -> None:
-    text = RACK.read_text().replace("../robots", str(RACK.parents[1] / "robots"))
-    before, _, after = text.partition("[uncertainty]")
+    before, _, after = standing_text().partition("[uncertainty]")
     cell, out = tmp_path / "plain.toml", tmp_path / "cell.toml"
     cell.write_text(before + after[after.find("\n[") :] if "\n[" in after else before)
     assert not load(cell).uncertainty.stated
@@ -132,85 +133,73 @@ def test_a_recording_of_ros_2(
     assert "lag of the force, arm 1" not in names
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "message"),
-    [
-        ("/1/wrench", "/3/wrench", "no topic '/3/wrench'; it has /1/wrench"),
-        ('"/1/wrench"', '"/1/wrench"\njoints = ["a", "b", "c", "d", "e", "f"]', "no joint 'a'"),
-        ('"/1/wrench"', '"/1/wrench"\njoints = ["a"]', "names of 6 joints"),
-    ],
-)
-def test_what_is_wrong_with_a_recording_of_ros_2_is_told(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], old: str, new: str, message: str
-) -> None:
-    recording = write_bag(run(0, LEVEL, SQUEEZES[:1]), tmp_path)
-    side = recording.with_suffix(".toml")
-    side.write_text(side.read_text().replace(old, new))
-    assert main([str(RACK), str(recording)]) == 2
-    assert message in capsys.readouterr().err
-
-
-def test_a_damaged_recording_of_ros_2_is_told(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    recording = write_bag(run(0, LEVEL, SQUEEZES[:1]), tmp_path)
-    (file,) = recording.glob("*.mcap")
-    file.write_bytes(file.read_bytes()[:5000])
-    assert main([str(RACK), str(recording)]) == 2
-    assert "no recording that can be read" in capsys.readouterr().err
-
-
 def test_refusals_end_with_code_one(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    made = run(0)
-    made = replace(made, labels=replace(made.labels, tare=()))
+    made, short = run(0), run(0, LEVEL, SQUEEZES[:1])
     out = tmp_path / "cell.toml"
-    assert main([str(RACK), str(write(made, tmp_path)), "--out", str(out)]) == 1
-    assert "refused: run.csv: missing tare" in capsys.readouterr().out
-    assert not out.exists()
+    untared = replace(made, labels=replace(made.labels, tare=()))
+    unheld = replace(short, labels=replace(short.labels, held=((900.0, 902.0),)))
+    for recorded, said in (
+        (untared, "refused: run.csv: missing tare"),
+        (unheld, "dropout: both arms recorded from 0.00 to"),
+    ):
+        assert main([str(RACK), str(write(recorded, tmp_path)), "--out", str(out)]) == 1
+        told = capsys.readouterr()
+        assert said in told.out
+        assert not out.exists()
+    assert f"not written: {out}" in told.err
 
 
-def test_a_cell_that_is_not_written_is_told(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    made = run(0, LEVEL, SQUEEZES[:1])
-    made = replace(made, labels=replace(made.labels, held=((900.0, 902.0),)))
-    out = tmp_path / "cell.toml"
-    assert main([str(RACK), str(write(made, tmp_path)), "--out", str(out)]) == 1
-    said = capsys.readouterr()
-    assert "warning: run.csv: dropout: both arms recorded from 0.00 to" in said.out
-    assert f"not written: {out}" in said.err
-    assert not out.exists()
+Edit = Callable[[str], str]
+
+
+def put(old: str, new: str) -> Edit:
+    return lambda text: text.replace(old, new, 1)
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
+    ("write", "change", "message"),
     [
-        (lambda text: text.replace("tare", "tara", 1), "tara: unknown key; did you mean 'tare'"),
-        (lambda text: text.replace('"w1_"', '"f1_"'), "no column 'f1_0'"),
-        (lambda text: "mass = -1\n" + text, "mass: found -1"),
-        (lambda text: text.replace('"pad"', '"tool"'), "frame: found 'tool'"),
-        (lambda text: text.rpartition("[[arms]]")[0], "arms: found 1 tables"),
-        (lambda text: text.replace("held = [[", "held = [[9e9, 1], ["), "pairs [begin, end]"),
-        (lambda text: text.replace('joints = "q1_"', "joints = [1, 2]"), "names of 6 columns"),
+        (write, put("tare", "tara"), "tara: unknown key; did you mean 'tare'"),
+        (write, lambda text: text.replace('"w1_"', '"f1_"'), "no column 'f1_0'"),
+        (write, lambda text: "mass = -1\n" + text, "mass: found -1"),
+        (write, lambda text: text.replace('"pad"', '"tool"'), "frame: found 'tool'"),
+        (write, lambda text: text.rpartition("[[arms]]")[0], "arms: found 1 tables"),
+        (write, put("held = [[", "held = [[9e9, 1], ["), "pairs [begin, end]"),
+        (write, put('joints = "q1_"', "joints = [1, 2]"), "names of 6 columns"),
+        (write_bag, put("/1/wrench", "/3/wrench"), "no topic '/3/wrench'; it has /1/wrench"),
+        (
+            write_bag,
+            put('"/1/wrench"', '"/1/wrench"\njoints = ["a", "b", "c", "d", "e", "f"]'),
+            "no joint 'a'",
+        ),
+        (write_bag, put('"/1/wrench"', '"/1/wrench"\njoints = ["a"]'), "names of 6 joints"),
     ],
 )
 def test_what_is_wrong_with_a_side_file_is_told(
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
-    change: object,
+    write: Callable[[Run, Path], Path],
+    change: Edit,
     message: str,
 ) -> None:
     recording = write(run(0, LEVEL, SQUEEZES[:1]), tmp_path)
     side = recording.with_suffix(".toml")
-    side.write_text(change(side.read_text()))  # type: ignore[operator]
+    side.write_text(change(side.read_text()))
     assert main([str(RACK), str(recording)]) == 2
     assert message in capsys.readouterr().err
 
 
-def test_what_is_no_table_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    recording = write(run(0, LEVEL, SQUEEZES[:1]), tmp_path)
-    recording.write_text("time,a\n1,b\n")
-    assert main([str(RACK), str(recording)]) == 2
-    assert "no table of numbers" in capsys.readouterr().err
-    assert main([str(RACK), str(recording), "--out", str(RACK)]) == 2
-    assert "workcell itself" in capsys.readouterr().err
+def test_damaged_recordings_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    made = run(0, LEVEL, SQUEEZES[:1])
+    (tmp_path / "bag").mkdir()
+    table, bag = write(made, tmp_path), write_bag(made, tmp_path / "bag")
+    table.write_text("time,a\n1,b\n")
+    (file,) = bag.glob("*.mcap")
+    file.write_bytes(file.read_bytes()[:5000])
+    for arguments, message in (
+        ([table], "no table of numbers"),
+        ([bag], "no recording that can be read"),
+        ([table, "--out", RACK], "workcell itself"),
+    ):
+        assert main([str(RACK), *map(str, arguments)]) == 2
+        assert message in capsys.readouterr().err

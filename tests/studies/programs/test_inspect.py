@@ -22,18 +22,14 @@ from hybrid_opt.indicators.metrics import BindingBound
 from studies import inspect, propose, scene
 from studies.program import BAD_INPUT
 from studies.programs import inspection
-from studies.programs.inspection import (
-    Optimum,
-    inspected,
-    show,
-)
+from studies.programs.inspection import Optimum, inspected, show
 from studies.report.pictures_cell import meeting_place
 from symbolic.read.cell import load
 from symbolic.read.editing import completed
 from symbolic.records import Mesh, Workcell
 from symbolic.records.task import straight_line
 from tests.studies.conftest import TRANSFER
-from tests.symbolic.cells import RACK
+from tests.symbolic.cells import RACK, standing_text
 
 
 @pytest.fixture(scope="module")
@@ -57,22 +53,19 @@ def found(transfer: Workcell, tmp_path_factory: pytest.TempPathFactory) -> Inspe
     return find(transfer, 1500, 7, folder, view=folder / "new" / "view.html")
 
 
-def test_the_second_cell_is_worth_searching(found: Inspection) -> None:
+def test_the_second_cell_is_worth_searching_and_counts_are_the_evaluators(
+    found: Inspection, transfer: Workcell
+) -> None:
     assert found.initial.feasible
     assert not found.straight_line.feasible
     assert 0.02 <= found.feasible_share <= 0.20
-
-
-def test_counts_agree_with_the_evaluator(found: Inspection, transfer: Workcell) -> None:
     evaluator = CandidateEvaluator(transfer)
-    x = np.random.default_rng(7).uniform(evaluator.lower, evaluator.upper, (500, evaluator.n_var))
-    again = find(transfer, 500, 7)
+    x = np.random.default_rng(7).uniform(evaluator.lower, evaluator.upper, (1500, evaluator.n_var))
     verdicts = evaluator.evaluate(x)
-    assert again.feasible_share == pytest.approx(verdicts.feasible.mean())
-    for reason, count in again.infeasible_by_reason.items():
+    assert found.feasible_share == pytest.approx(verdicts.feasible.mean())
+    for reason, count in found.infeasible_by_reason.items():
         assert count == (verdicts.reason == REASONS.index(reason)).sum()
-    total = sum(found.infeasible_by_reason.values()) + round(1500 * found.feasible_share)
-    assert total == 1500
+    assert sum(found.infeasible_by_reason.values()) == (~verdicts.feasible).sum()
 
 
 def test_every_pair_is_active_or_excluded_with_a_reason(found: Inspection) -> None:
@@ -108,40 +101,30 @@ def test_the_view_plays_the_hand_made_trajectory(found: Inspection) -> None:
     assert f"View: {found.view} (open it in a browser)" in found.lines
 
 
-def test_the_view_of_a_carry_that_fails_begins_there(
+def test_the_view_of_a_carry_that_fails_begins_there_and_so_does_the_picture(
     transfer: Workcell, found: Inspection, tmp_path: Path
 ) -> None:
-    cell = Cell(transfer)
-    (why,) = explain(cell.evaluator, cell.evaluate(straight_line(transfer.task)))
+    cell, x = Cell(transfer), straight_line(transfer.task)
+    (why,) = explain(cell.evaluator, cell.evaluate(x))
     assert str(why) == found.explained["straight_line"]
-    carry = cell.carry(straight_line(transfer.task))
+    carry, geometry = cell.carry(x), cell.geometry
     page = Path(show(carry, why, tmp_path / "view.html")).read_text("utf-8")
     assert f'<div id="note">{why}</div>' in page
     assert f'"begin":{float(carry.time[why.sample])!r}' in page
     assert page.count('"group":"marked"') == 2
-
-
-def test_bodies_meet_where_the_picture_looks(transfer: Workcell) -> None:
-    cell = Cell(transfer)
-    (why,) = explain(cell.evaluator, cell.evaluate(straight_line(transfer.task)))
-    assert why.pair is not None
-    carry, geometry = cell.carry(straight_line(transfer.task)), cell.geometry
+    assert why.pair == ("payload", "wall")
     at = carry.pose[why.sample], carry.q[why.sample]
     place = meeting_place(geometry, cell_solids(geometry), why.pair, *at)
     # The wall, that the payload meets, is 40 mm thick, 0.5 m wide and 0.87 m high.
-    assert why.pair == ("payload", "wall")
     assert np.all(np.abs(place - [0.0, 0.0, 0.435]) < [0.021, 0.26, 0.44])
     assert np.all(np.abs(place - at[0][:3]) < [0.2, 0.2, 0.2])
 
 
 def test_the_straight_line_is_straight(transfer: Workcell) -> None:
-    rack = load(RACK)
-    for workcell in (transfer, rack):
-        start, goal = workcell.task.waypoints[0].lower, workcell.task.waypoints[-1].lower
-        rows = straight_line(workcell.task).reshape(-1, 6)
-        fixed = [w.lower for w in workcell.task.waypoints[1:-1] if w.is_fixed]
-        corners = [start, *fixed, goal]
-        for row in rows:
+    for task in (transfer.task, load(RACK).task):
+        start, goal = task.waypoints[0].lower, task.waypoints[-1].lower
+        corners = [start, *(w.lower for w in task.waypoints[1:-1] if w.is_fixed), goal]
+        for row in straight_line(task).reshape(-1, 6):
             gaps = [
                 np.linalg.norm(row - a) + np.linalg.norm(b - row) - np.linalg.norm(b - a)
                 for a, b in pairwise(corners)
@@ -155,7 +138,7 @@ def test_verdicts_are_told_before_what_takes_longer(monkeypatch: pytest.MonkeyPa
 
     for name in ("_optimum", "draw", "show", "frequent"):
         monkeypatch.setattr(inspection, name, later)
-    parts = inspected(load(TRANSFER), 10, 1, Path("pictures"), polish=True, view=Path("view"))
+    parts = inspected(load(RACK), 10, 1, Path("pictures"), polish=True, view=Path("view"))
     lines: list[str] = []
     with pytest.raises(AssertionError, match="too early"):
         lines.extend(line for part in parts for line in part.lines)
@@ -164,14 +147,23 @@ def test_verdicts_are_told_before_what_takes_longer(monkeypatch: pytest.MonkeyPa
         assert words in text
 
 
-def test_a_short_polish_tells_how_far_it_is_and_which_bounds_bind(
+def test_text_and_json_say_the_same_of_a_short_polish_too(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(inspection, "POLISH_ATTEMPTS", 1)
-    assert inspect.main([str(RACK), "--candidates", "10", "--no-pictures", "--polish"]) == 0
+    arguments = [str(RACK), "--candidates", "100", "--no-pictures"]
+    assert inspect.main([*arguments, "--polish"]) == 0
     said = capsys.readouterr()
     assert "short polish: 0 of 1 attempts" in said.err
     assert re.search(r"\([1-9]\d* points of a short polish\)", said.out)
+    assert inspect.main([*arguments, "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document["candidates"] == 100
+    assert said.out.startswith(document["name"])
+    assert f"{100 * document['feasible_share']:.1f} % feasible" in said.out
+
+
+def test_bounds_that_bind_are_named() -> None:
     bound = BindingBound("waypoint 2, yaw", "upper", 0.4, 3)
     for optimum, words in (
         (Optimum(5, (bound,)), "upper bound of waypoint 2, yaw, 0.4: 3 of 5"),
@@ -181,34 +173,17 @@ def test_a_short_polish_tells_how_far_it_is_and_which_bounds_bind(
         assert words in "\n".join(inspection._optimum_lines(optimum))
 
 
-def test_prints_text_and_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    arguments = [str(TRANSFER), "--candidates", "100", "--no-pictures"]
-    assert inspect.main(arguments) == 0
-    text = capsys.readouterr().out
-    assert "Transfer over a wall" in text
-    assert "random candidates" in text
-    assert inspect.main([*arguments, "--json"]) == 0
-    document = json.loads(capsys.readouterr().out)
-    assert document["candidates"] == 100
-    assert f"{100 * document['feasible_share']:.1f} % feasible" in text
-    assert not list(tmp_path.iterdir())
-
-
 PROBLEM = Path("studies/problems/past-a-post.toml")
 
 
-def test_the_problem_file_is_not_overwritten(capsys: pytest.CaptureFixture[str]) -> None:
-    assert propose.main([str(PROBLEM), "--output", str(PROBLEM)]) == BAD_INPUT
-    assert "is the problem file" in capsys.readouterr().err
-
-
-def test_a_missing_folder_is_told_before_any_work(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize(
+    ("output", "told"), [(PROBLEM, "is the problem file"), ("none/cell.toml", "is no folder")]
+)
+def test_a_wrong_output_is_told_before_any_work(
+    output: Path | str, told: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert (
-        propose.main([str(PROBLEM), "--output", str(tmp_path / "none" / "cell.toml")]) == BAD_INPUT
-    )
-    assert "is no folder" in capsys.readouterr().err
+    assert propose.main([str(PROBLEM), "--output", str(output)]) == BAD_INPUT
+    assert told in capsys.readouterr().err
 
 
 def test_what_is_in_the_way_is_told_and_nothing_written(
@@ -274,9 +249,8 @@ def test_bodies_are_printed(shelf: Path, capsys: pytest.CaptureFixture[str]) -> 
 def test_bodies_are_added_to_a_cell_that_loads(
     shelf: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Every line of the file stays; what is there already is not added again."""
-    before = Path("studies/workcells/transfer.toml").read_text(encoding="utf-8")
-    before = before.replace("../robots", str(Path("studies/robots").resolve()))
+    """Or to a file without any; every line of it stays, what is there is not added again."""
+    before = standing_text(TRANSFER)
     path = shelf.with_name("cell.toml")
     path.write_text(before, encoding="utf-8")
     assert scene.main([str(shelf), "--into", str(path)]) == 0
@@ -290,10 +264,6 @@ def test_bodies_are_added_to_a_cell_that_loads(
     assert scene.main([str(shelf), "--into", str(path)]) == BAD_INPUT
     assert "'shelf board top' already" in capsys.readouterr().err
     assert path.read_text(encoding="utf-8") == after
-
-
-def test_a_file_without_obstacles_gets_some(shelf: Path) -> None:
-    path = shelf.with_name("cell.toml")
     path.write_text('name = "a"  # of mine\n', encoding="utf-8")
     assert scene.main([str(shelf), "--into", str(path)]) == 0
     assert path.read_text(encoding="utf-8").startswith('name = "a"  # of mine\n\n[[environment]]\n')
@@ -343,9 +313,8 @@ def test_meshes_of_the_scene_become_files(
     )
     assert scene.main([str(path)]) == BAD_INPUT
     assert "--into" in capsys.readouterr().err
-    before = Path("studies/workcells/transfer.toml").read_text(encoding="utf-8")
     cell = tmp_path / "cell.toml"
-    cell.write_text(before.replace("../robots", str(Path("studies/robots").resolve())))
+    cell.write_text(standing_text(TRANSFER))
     assert scene.main([str(path), "--into", str(cell)]) == 0
     shape = load(cell).environment[-1].shape
     assert isinstance(shape, Mesh)

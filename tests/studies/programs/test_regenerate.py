@@ -3,171 +3,146 @@
 from __future__ import annotations
 
 import json
-import os
-import subprocess
-import sys
-from collections.abc import Sequence
+import re
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
+import casadi as ca
+import numpy as np
+import pytest
+
+from codegen import source
 from codegen.cache import Cache
-from tests.waiting import HANGS
-
-# The command with a cell of one function in place of the workcell's file and evaluators.
-PROGRAM = """
-import sys, types
-import casadi as ca, numpy as np
+from studies.regenerate import main
 from symbolic.errors import WorkcellError
 
-def load(path):
+Run = Callable[..., tuple[int, str, str]]
+
+
+class TinyCell:
+    """In place of a `CompiledCell`."""
+
+    symbols = SimpleNamespace(screening={})
+
+    def __init__(self, workcell: object, cache: Cache) -> None:
+        pass
+
+    def key(self, name: str, bodies: bool = True) -> str:
+        return f"{name} of a tiny cell"
+
+    def vector(self, name: str) -> np.ndarray:
+        return np.zeros(0)
+
+
+def tiny(path: Path) -> Any:
     if path.name != "cell.toml":
         raise WorkcellError(str(path), ("file: missing; name a workcell",))
-    task = types.SimpleNamespace(
-        lower=np.full(3, 2.0), upper=np.full(3, 5.0), time_law="constant"
-    )
-    return types.SimpleNamespace(digest="tiny", task=task)
+    return SimpleNamespace(task=SimpleNamespace(lower=np.full(3, 2.0), upper=np.full(3, 5.0)))
 
-def arm_functions(model):
+
+def functions(_: object) -> dict[str, ca.Function]:
     x, p = ca.MX.sym("x", 3), ca.MX.sym("p", 2, 2)
     # NaN outside the bounds of x.
     return {"roots": ca.Function("roots", [x, p], [ca.sqrt(x - 2), p @ p], ["x", "p"], ["y", "z"])}
 
-class CompiledCell:
-    EVALUATORS, SCREENING, EVALUATOR_LANES = "evaluators", "screening", 0
-    symbols = types.SimpleNamespace(screening={})
 
-    def __init__(self, workcell, cache):
-        pass
+@pytest.fixture
+def run(cache: Cache, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Run:
+    """The program with a cell of one function in place of the file's; code, output and messages."""
+    monkeypatch.setattr("hybrid_opt.compiled_cell.CompiledCell", TinyCell)
+    monkeypatch.setattr("symbolic.read.cell.load", tiny)
+    monkeypatch.setattr("symbolic.functions.arm_functions", functions)
 
-    def key(self, name, bodies=True):
-        return f"{name} of a tiny cell"
+    def ended(*arguments: str) -> tuple[int, str, str]:
+        code = main(arguments)
+        return code, *capsys.readouterr()
 
-    def vector(self, name):
-        return np.zeros(0)
-
-compiled = {"CompiledCell": CompiledCell, **vars(CompiledCell)}
-faked = {
-    "symbolic.functions": {"arm_functions": arm_functions},
-    "symbolic.read.cell": {"load": load},
-    "hybrid_opt.compiled_cell": compiled,
-}
-for name, content in faked.items():
-    sys.modules[name] = types.ModuleType(name)
-    for key in content:
-        if not key.startswith("__"):
-            setattr(sys.modules[name], key, content[key])
-EDIT
-from studies.regenerate import main
-sys.exit(main(sys.argv[1:]))
-"""
+    return ended
 
 
-def run(arguments: Sequence[str], edit: str = "") -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-c", PROGRAM.replace("EDIT", edit), *arguments],
-        env=os.environ | {"COLUMNS": "100"},
-        capture_output=True,
-        text=True,
-        timeout=HANGS,
-        check=False,
-    )
-
-
-def test_table(cache: Cache) -> None:
-    first, second = run(["cell.toml"]), run(["cell.toml"])
-    assert first.returncode == second.returncode == 0
-    headings, rule, row = first.stdout.splitlines()
+def test_functions_are_made_kept_made_anew_and_removed(run: Run, cache: Cache) -> None:
+    code, first, _ = run("cell.toml")
+    assert code == 0
+    headings, rule, row = first.splitlines()
     for heading in ("function", "operations", "C size", "compile time", "from cache"):
         assert heading in headings
     assert set(rule) == {"-"}
     assert row.startswith("roots")
     assert row.endswith(" no")
     assert "kB" in row
-    assert second.stdout.splitlines()[2].endswith(" yes")
-
-
-def test_json_and_check(cache: Cache) -> None:
-    done = run(["cell.toml", "--check", "--json", "--samples", "5"])
-    assert done.returncode == 0, done.stderr
-    result = json.loads(done.stdout)
+    assert run("cell.toml")[1].splitlines()[2].endswith(" yes")
+    code, said, _ = run("cell.toml", "--check", "--json", "--samples", "5")
+    assert code == 0
+    result = json.loads(said)
     assert result["cache"] == str(cache.folder)
     (function,) = result["functions"]
     assert function["name"] == "roots"
-    assert function["operations"] > 0
-    assert function["c_bytes"] > 0
-    assert function["compile_seconds"] > 0.0
+    assert min(function[name] for name in ("operations", "c_bytes", "compile_seconds")) > 0
     assert function["from_cache"] is False
     (check,) = result["check"]
-    assert check["agrees"] is True
-    assert check["samples"] == 5
-    assert check["outputs"] <= 1e-10
-    assert check["derivatives"] <= 1e-10
-
-
-def test_check_compiles_anew(cache: Cache) -> None:
-    run(["cell.toml"])
-    done = run(["cell.toml", "--check", "--json"])
-    assert json.loads(done.stdout)["functions"][0]["from_cache"] is False
-
-
-def test_check_finds_a_difference(cache: Cache) -> None:
-    """A compiler that rounds differently by one part in 1e9 is caught, with the output's name."""
-    edit = """
-import re
-import codegen.source as source
-plain = source.c_source
-rounded = lambda text: re.sub(r"\\bsqrt\\(", "1.000000001 * sqrt(", text)
-source.c_source = lambda f, *more: rounded(plain(f, *more))
-"""
-    done = run(["cell.toml", "--check"], edit)
-    assert done.returncode == 1, done.stdout + done.stderr
-    assert "NO: " in done.stdout
-
-
-def test_what_the_cache_holds_is_said(cache: Cache) -> None:
-    cache.write_record("0" * 64, {"kept": True})
-    done = run(["--cache", "--json"])
-    size = (cache.folder / f"{'0' * 64}.json").stat().st_size
-    assert json.loads(done.stdout)["usage"] == {"libraries": 0, "files": 1, "size": size}
-
-
-def test_clean(cache: Cache) -> None:
-    run(["cell.toml"])
-    assert list(cache.folder.glob("*.so"))
-    done = run(["--clean"])
-    assert done.returncode == 0
-    assert done.stdout == f"1 libraries removed from {cache.folder}\n"
+    assert (check["agrees"], check["samples"]) == (True, 5)
+    assert max(check["outputs"], check["derivatives"]) <= 1e-10
+    kept = len(list(cache.folder.glob("*.so")))
+    assert kept > 0
+    assert run("--clean")[:2] == (0, f"{kept} libraries removed from {cache.folder}\n")
     assert list(cache.folder.iterdir()) == []
-    again = run(["cell.toml", "--clean", "--json"])
-    assert json.loads(again.stdout)["removed"] == 0
+    assert json.loads(run("cell.toml", "--clean", "--json")[1])["removed"] == 0
 
 
-def test_bad_input_is_one_message_and_code_2(cache: Cache) -> None:
-    missing = run(["other.toml"])
-    assert missing.returncode == 2
-    assert missing.stdout == ""
-    assert "file: missing; name a workcell" in missing.stderr
-    assert "Traceback" not in missing.stderr
-    cache.folder.mkdir()
-    cache.folder.chmod(0o777)
-    unsafe = run(["cell.toml"])
-    assert unsafe.returncode == 2
-    assert len(unsafe.stderr.splitlines()) == 1
-    assert "others can write to it" in unsafe.stderr
+def test_check_finds_a_difference(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A compiler that rounds differently by one part in 1e9 is caught, with the output's name."""
+    plain = source.c_source
+
+    def rounded(*given: Any) -> str:
+        return re.sub(r"\bsqrt\(", "1.000000001 * sqrt(", plain(*given))
+
+    monkeypatch.setattr(source, "c_source", rounded)
+    code, said, _ = run("cell.toml", "--check")
+    assert code == 1
+    assert "NO: " in said
 
 
-def test_wrong_options_are_told(cache: Cache) -> None:
-    for arguments, message in (
+def test_what_the_cache_holds_is_said(run: Run, cache: Cache) -> None:
+    cache.write_record("0" * 64, {"kept": True})
+    size = (cache.folder / f"{'0' * 64}.json").stat().st_size
+    usage = json.loads(run("--cache", "--json")[1])["usage"]
+    assert usage == {"libraries": 0, "files": 1, "size": size}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
         ([], "name a workcell file, --cache or --clean"),
         (["cell.toml", "--samples", "0"], "--samples: found '0'; allowed is a whole number 1 to"),
         (["cell.toml", "--seed", "-1"], "--seed: found '-1'; allowed is a whole number 0 to"),
-    ):
-        done = run(arguments)
-        assert done.returncode == 2
-        assert message in done.stderr
-
-
-def test_without_a_compiler_nothing_is_begun(cache: Cache) -> None:
-    done = run(["cell.toml"], "import os; os.environ['CC'] = '/missing/cc'")
-    assert done.returncode == 2
-    assert "no C compiler that works was found (CC names '/missing/cc')" in done.stderr
-    assert len(done.stderr.splitlines()) == 1
+        (["other.toml"], "file: missing; name a workcell"),
+        (["cell.toml"], "no C compiler that works was found (CC names '/missing/cc')"),
+    ],
+)
+def test_bad_input_is_one_message_and_nothing_is_begun(
+    run: Run,
+    cache: Cache,
+    arguments: list[str],
+    message: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setenv("CC", "/missing/cc")
+    try:
+        code, said, told = run(*arguments)
+    except SystemExit as end:
+        code, (said, told) = int(end.code or 0), capsys.readouterr()
+    assert (code, said) == (2, "")
+    assert message in told
     assert not cache.folder.exists()
+
+
+def test_a_cache_that_others_can_write_to_is_refused(run: Run, cache: Cache) -> None:
+    cache.folder.mkdir()
+    cache.folder.chmod(0o777)
+    code, _, told = run("cell.toml")
+    assert code == 2
+    assert len(told.splitlines()) == 1
+    assert "others can write to it" in told

@@ -8,7 +8,7 @@ import os
 import shutil
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -113,13 +113,19 @@ def browser() -> Iterator[webdriver.Chrome]:
 
 
 @pytest.fixture
-def page(browser: webdriver.Chrome, report: Path) -> Page:
-    """The report of the shared study, opened anew."""
+def closed(browser: webdriver.Chrome, report: Path) -> Page:
+    """The report of the shared study, not yet opened."""
     found = Page(browser, report)
     found.logged("browser")
     found.logged("performance")
-    found.open()
     return found
+
+
+@pytest.fixture
+def page(closed: Page) -> Page:
+    """The report, opened anew."""
+    closed.open()
+    return closed
 
 
 def test_loads_without_errors_or_requests_and_offers_no_way_out(page: Page) -> None:
@@ -230,9 +236,14 @@ def test_pictures_and_timings_can_be_switched(page: Page) -> None:
     assert "as the search assumed" in page.one("figures-of-choice").text
 
 
-def test_plays_pauses_and_scrubs_to_the_goal(page: Page) -> None:
-    still = page.scene
-    page.one("play").click()
+def test_turns_plays_pauses_and_scrubs_to_the_goal(page: Page) -> None:
+    scene, still = page.one("scene"), page.scene
+    scene.send_keys(Keys.ARROW_LEFT)
+    assert page.scene != still
+    scene.send_keys(Keys.HOME)
+    assert page.scene == still
+    scene.send_keys(Keys.SPACE)
+    assert page("report.state.playing")
     page.until(lambda: page("report.state.share") > 0.1)
     page.one("play").click()
     assert not page("report.state.playing")
@@ -298,7 +309,8 @@ def test_joints_and_arrows_move_as_in_python(page: Page, data: ReportData) -> No
 
 
 @pytest.mark.parametrize("size", [WIDE, (1100, 1000), NARROW])
-def test_fits_the_window_and_cuts_nothing(page: Page, size: tuple[int, int]) -> None:
+def test_fits_the_window_and_cuts_nothing(closed: Page, size: tuple[int, int]) -> None:
+    page = closed
     page.open(size)
     width, inner = page("['scrollWidth', 'clientWidth'].map((k) => document.documentElement[k])")
     assert width <= inner
@@ -315,14 +327,11 @@ def test_fits_the_window_and_cuts_nothing(page: Page, size: tuple[int, int]) -> 
     assert [name for name, hidden in shown if hidden > 1] == []
 
 
-def test_hostile_names_are_shown_as_text(
-    browser: webdriver.Chrome, once: Once, data: ReportData
-) -> None:
-    page = Page(browser, hostile_page(once, data))
-    page.logged("browser")
+def test_hostile_names_are_shown_as_text(closed: Page, once: Once, data: ReportData) -> None:
+    page = replace(closed, report=hostile_page(once, data))
     page.open()
     assert page("window.broken") is None
-    assert browser.title == HOSTILE
+    assert page.browser.title == HOSTILE
     assert page.all("h1")[0].text == HOSTILE
     assert page.all("img[onerror], img[src='x']") == []
     assert page.complaints() == []
@@ -398,18 +407,9 @@ def test_a_box_drawn_in_the_picture_filters_the_table(page: Page) -> None:
     assert 0 < len(listed) < page("report.data.trajectories.length")
 
 
-def test_keys_turn_and_play_the_scene(page: Page) -> None:
-    scene, before = page.one("scene"), page.scene
-    scene.send_keys(Keys.ARROW_LEFT)
-    assert page.scene != before
-    scene.send_keys(Keys.HOME)
-    assert page.scene == before
-    scene.send_keys(Keys.SPACE)
-    assert page("report.state.playing")
-
-
 @pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_texts_stand_out_and_fields_have_names(page: Page, scheme: str) -> None:
+def test_texts_stand_out_and_fields_have_names(closed: Page, scheme: str) -> None:
+    page = closed
     feature = {"name": "prefers-color-scheme", "value": scheme}
     page.browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": [feature]})
     page.open()

@@ -6,14 +6,17 @@ import base64
 import gzip
 import hashlib
 import html
+import json
 import re
 from dataclasses import replace
 from html.parser import HTMLParser
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 
 import hybrid_opt as ho
 from hybrid_opt.branches import BranchCompetition, PairResult
@@ -25,10 +28,10 @@ from hybrid_opt.indicators.metrics import BindingBound
 from hybrid_opt.job.plan import JobModel
 from hybrid_opt.robust.squeeze import SqueezeSettings
 from studies.program import ReportError
-from studies.report import PAGE, page_carries, page_data
+from studies.report import PAGE, generate, page_carries, page_data
 from studies.report.data import ReportData
 from studies.report.generate import BEGIN, END, insert_tables, report_tables, write_report
-from studies.report.page_carries import DrawnJob, PageTrajectory, page_trajectory, pressure_shift
+from studies.report.page_carries import PageTrajectory, page_trajectory, pressure_shift
 from studies.report.page_data import page_document
 from studies.study import tables
 from studies.study.recommendation import recommendation_text
@@ -74,11 +77,14 @@ def with_hostile_names(data: ReportData) -> ReportData:
 
 
 def hostile_page(once: Once, data: ReportData) -> Path:
-    """The page of such a cell, with few trajectories."""
+    """The page of such a cell, with few trajectories and pictures of one point."""
 
     def make(folder: Path) -> None:
+        point = BytesIO()
+        Image.new("RGB", (1, 1)).save(point, "PNG")
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(page_data, "MAX_FRONT", 2)
+            patch.setattr(generate, "files_of", lambda *_: {"png": point.getvalue()})
             write_report(folder, with_hostile_names(data), with_paper=True, pdf=False)
 
     return once("hostile", make) / PAGE
@@ -148,8 +154,11 @@ def test_hostile_names_stay_text(once: Once, data: ReportData, text: str) -> Non
 
 
 @pytest.fixture(scope="module")
-def document(data: ReportData) -> dict[str, Any]:
-    return page_document(data)
+def document(text: str) -> dict[str, Any]:
+    """What the scripts of the study's page show."""
+    (block,) = re.findall(r"id='report-data'>([^<]+)<", text)
+    found: dict[str, Any] = json.loads(gzip.decompress(base64.b64decode(block)))
+    return found
 
 
 def samples(motion: dict[str, Any]) -> Array:
@@ -177,6 +186,11 @@ def test_data_of_the_page_are_the_trajectories(data: ReportData, document: dict[
     np.testing.assert_allclose(shown[0, 1:7], data.workcell.task.waypoints[0].lower, atol=1e-6)
     assert np.all(np.diff(shown[:, 0]) > 0.0)
     assert len(shown) <= 70
+    best = data.solved[0].best
+    assert best is not None
+    # In both pictures: once as it was selected, and at some of the forces of its curve.
+    name = f"{best.label}, replica {front.replica}: least force: "
+    assert sum(one["label"].startswith(name) for one in document["trajectories"]) >= 2
 
 
 def test_every_point_shows_what_robots_drive_and_its_job(
@@ -229,22 +243,12 @@ def test_every_point_shows_what_robots_drive_and_its_job(
 def test_points_are_named_by_what_was_minimised(data: ReportData) -> None:
     cell = Cell(data.workcell, ("mean_force", "friction_use"))
     ready = ReadyCell(cell, JobModel(cell.compiled, cell.timing_model))
-    trajectory = page_trajectory((ready,), PageTrajectory("NSGA-II, replica 1", data.initial.x))
+    shown = PageTrajectory("NSGA-II, replica 1", data.initial.x, has_job=False)
+    trajectory = page_trajectory((ready,), shown)
     mean, friction = trajectory["objectives"]
     assert trajectory["label"] == (
         f"NSGA-II, replica 1: mean force {mean:.4f}, friction use {friction:.4f}"
     )
-
-
-def test_selected_trajectories_name_their_replica(
-    data: ReportData, document: dict[str, Any]
-) -> None:
-    best = data.solved[0].best
-    assert best is not None
-    name = f"{best.label}, replica {data.solved[0].shown.front.replica}: least force: "
-    labels = [trajectory["label"] for trajectory in document["trajectories"]]
-    # In both pictures: once as it was selected, and at some of the forces of its curve.
-    assert sum(label.startswith(name) for label in labels) >= 2
 
 
 def test_pressure_shifts_are_those_of_the_plan(data: ReportData) -> None:
@@ -314,10 +318,9 @@ def test_the_first_look_is_not_squashed(document: dict[str, Any], data: ReportDa
 def test_polished_fronts_stand_beside_the_searchs(
     hybrid_data: ReportData, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    no_job = DrawnJob("", "not what is looked at")
-    monkeypatch.setattr(page_carries, "drawn", lambda *_: no_job)
-    document = page_document(hybrid_data)
-    groups = points(document["views"][1])
+    named = {"label": "", "problem": "", "force": 1.0, "motions": [{"duration": 1.0}]}
+    monkeypatch.setattr(page_data, "page_trajectory", lambda *_: named)
+    groups = points(page_document(hybrid_data)["views"][1])
     assert [group["name"] for group in groups] == [
         f"{title}{stage}" for title in ("NSGA-II", "MOPSO") for stage in ("", ", polished")
     ]
@@ -327,22 +330,18 @@ def test_polished_fronts_stand_beside_the_searchs(
 
 
 def test_every_file_of_the_report_is_written(data: ReportData, report: Path, text: str) -> None:
-    figures = {path.stem for path in (report.parent / "figures").glob("*.png")}
-    assert figures == {path.stem for path in (report.parent / "figures").glob("*.pdf")}
-    assert text.count("<figure>") == len(figures)
-    tables = report_tables(data, with_paper=False)
-    files = {path.name for path in (report.parent / "tables").iterdir()}
-    assert files == {
-        f"{table.name}.{suffix}" for table in tables for suffix in ("csv", "md", "tex")
+    drawn, folder = report.parent / "figures", report.parent / "tables"
+    pictures = {path.stem for path in drawn.glob("*.png")}
+    assert pictures == {path.stem for path in drawn.glob("*.pdf")}
+    assert text.count("<figure>") == len(pictures)
+    found = {table.name: table for table in report_tables(data, with_paper=False)}
+    suffixes = ("csv", "md", "tex")
+    assert {path.name for path in folder.iterdir()} == {
+        f"{name}.{suffix}" for name in found for suffix in suffixes
     }
-    assert {table.name for table in tables} >= {
-        "table1_quality",
-        "robust_price",
-        "bounds",
-        "margins",
-    }
-    for table in tables:
-        assert len(table.rows) > 0
+    assert set(found) >= {"table1_quality", "robust_price", "bounds", "margins"}
+    for table in found.values():
+        assert table.rows
         assert all(len(row) == len(table.header) for row in table.rows)
 
 

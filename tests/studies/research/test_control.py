@@ -9,53 +9,49 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hybrid_opt.campaign import CampaignSettings, ExecutionSettings
 from hybrid_opt.campaign.results import read_campaign
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.indicators import metrics
 from hybrid_opt.progress import Progress
-from studies.programs.study import StudySettings, run_study
 from studies.research import longer_searches
 from studies.research.best_front import ReferenceFront
 from studies.research.control import main
 from studies.study.summary import read_summary
-from symbolic.read.cell import load
-from tests.symbolic.read.samples import RACK
 
 
 @pytest.fixture(scope="module")
-def study(polished_study: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def polished(polished_study: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A copy: longer searches are stored in it."""
     return Path(shutil.copytree(polished_study, tmp_path_factory.mktemp("control") / "results"))
 
 
-def test_longer_searches_repeat_the_studys_own_settings(study: Path) -> None:
-    (found,) = longer_searches.controls(study, [160], 1, Progress(shown=False))
-    longer = read_campaign(study / "control" / "160")
-    own = read_campaign(study)
+def test_longer_searches_repeat_the_studys_own_settings(polished: Path) -> None:
+    (found,) = longer_searches.controls(polished, [160], 1, Progress(shown=False))
+    longer = read_campaign(polished / "control" / "160")
+    own = read_campaign(polished)
     stored, wanted = longer.settings, own.settings
     assert stored == replace(wanted, evaluations=160)
     # The same seed: the longer search begins as the shorter one, up to its cut last generation.
     first, second = longer.replicas[0].evaluations.x, own.replicas[0].evaluations.x
     assert (first[:120] == second).all()
-    rows = read_summary(study).algorithms["nsga2"].replicas
+    rows = read_summary(polished).algorithms["nsga2"].replicas
     alone = [metrics.hypervolume(r.front, metrics.REFERENCE_POINT) for r in longer.replicas]
     after = [row.polished.hypervolume for row in rows if row.polished is not None]
     wins = sum(mine > theirs for mine, theirs in zip(after, alone, strict=True))
     assert (found.polished_wins, found.replicas, found.evaluations) == (wins, 2, 160)
     # A second call reads what the first one computed.
-    assert longer_searches.controls(study, [160], 1, Progress(shown=False)) == [found]
+    assert longer_searches.controls(polished, [160], 1, Progress(shown=False)) == [found]
     assert "NSGA-II, 160 evaluations" in longer_searches.as_text([found])
 
 
-def test_distance_to_a_reference_front(study: Path) -> None:
-    own = read_campaign(study)
-    polished = [own.polished(replica) for replica in own.replicas]
-    fronts = [found.objectives for found in polished if found is not None]
+def test_distance_to_a_reference_front(polished: Path) -> None:
+    own = read_campaign(polished)
+    found_fronts = [own.polished(replica) for replica in own.replicas]
+    fronts = [found.objectives for found in found_fronts if found is not None]
     assert len(fronts) == 2
     union = metrics.front_of(np.concatenate(fronts))
     reference = ReferenceFront(own.workcell.digest, union, np.empty((len(union), 0)))
-    (found,) = longer_searches.approaches(study, reference)
+    (found,) = longer_searches.approaches(polished, reference)
     gaps = [metrics.hypervolume(union) - metrics.hypervolume(r.front) for r in own.replicas]
     assert found.search_gap == pytest.approx(np.median(gaps))
     assert 0.0 <= found.polished_gap < found.search_gap
@@ -64,25 +60,13 @@ def test_distance_to_a_reference_front(study: Path) -> None:
     assert "NSGA-II" in longer_searches.approaches_text([found])
     searched = metrics.front_of(np.concatenate([r.front for r in own.replicas[:1]]))
     own_front = ReferenceFront(own.workcell.digest, searched, np.empty((len(searched), 0)))
-    assert longer_searches.approaches(study, own_front)  # the gap to it may be none
+    assert longer_searches.approaches(polished, own_front)  # the gap to it may be none
     with pytest.raises(ResultsError, match="another workcell"):
         longer_searches.approaches(
-            study, ReferenceFront("0" * 64, union, np.empty((len(union), 0)))
+            polished, ReferenceFront("0" * 64, union, np.empty((len(union), 0)))
         )
 
 
-def test_a_study_without_a_polish_is_told(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    settings = CampaignSettings(algorithms={"random": {}}, evaluations=60, replicas=1)
-    root = tmp_path / "results"
-    execution = ExecutionSettings(root, jobs=1)
-    run_study(
-        load(RACK),
-        settings,
-        execution,
-        Progress(shown=False),
-        StudySettings(drivable=False, report=False),
-    )
-    assert main([str(root)]) == 2
+def test_a_study_without_a_polish_is_told(study: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([str(study)]) == 2
     assert "not polished; run the study with --polish" in capsys.readouterr().err

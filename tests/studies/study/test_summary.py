@@ -15,18 +15,15 @@ import pytest
 from hybrid_opt.campaign import CampaignFolder, ExecutionSettings
 from hybrid_opt.campaign.results import CampaignResults, Replica, read_campaign
 from hybrid_opt.campaign.settings import (
-    POLISH,
     SIMULATED,
     CampaignSettings,
     Configuration,
     StoredCell,
-    polished_folder,
 )
 from hybrid_opt.cell import Cell
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.evaluate.evaluation import FEASIBLE, REASONS, Evaluations
 from hybrid_opt.indicators.statistics import rank_test
-from hybrid_opt.polishing.records import PolishedFront
 from hybrid_opt.progress import Progress
 from hybrid_opt.static_hold import StaticHold
 from hybrid_opt.store.files import from_json, to_json, write_json
@@ -231,21 +228,17 @@ def test_the_papers_figures_stand_beside_ours_only_where_it_states_them() -> Non
 
 
 def test_ends_and_middle_of_polished_fronts_and_the_balanced_path_are_known(
-    own_study: Path,
+    study: Path, polished_study: Path
 ) -> None:
-    root, campaign = own_study, read_campaign(own_study)
-    task, n = campaign.workcell.task, campaign.workcell.task.n_path
-    (balanced,) = least_force(campaign, task).values()
-    np.testing.assert_array_equal(known_paths(root, task), balanced[None])
-    replica = max(campaign.replicas, key=lambda one: len(one.front))
-    x, objectives, n_front = replica.front_x, replica.front, len(replica.front)
-    rows, made = np.full(n_front, -1), np.ones(n_front, dtype=bool)
-    front = PolishedFront(x, objectives, rows, made, (), 1.0, 1.0, "quadratic")
-    path = polished_folder(root, replica.algorithm, replica.replica) / POLISH
-    path.parent.mkdir(parents=True)
-    write_json(path, to_json(front))
-    both = np.unique(np.vstack([balanced, x[[0, n_front // 2, -1], :n]]), axis=0)
-    np.testing.assert_array_equal(known_paths(root, task), both)
+    for root, fronts in ((study, 0), (polished_study, 2)):
+        campaign = read_campaign(root)
+        task, n = campaign.workcell.task, campaign.workcell.task.n_path
+        (balanced,) = least_force(campaign, task).values()
+        polished = [front.x for front in campaign.fronts if front.polished]
+        assert len(polished) == fronts
+        ends = [x[[0, len(x) // 2, -1], :n] for x in polished]
+        expected = np.unique(np.vstack([balanced, *ends]), axis=0)
+        np.testing.assert_array_equal(known_paths(root, task), expected)
 
 
 def test_paths_are_timed_in_the_cell_that_robots_drive(study: Path) -> None:
@@ -264,10 +257,6 @@ def test_paths_are_timed_in_the_cell_that_robots_drive(study: Path) -> None:
     assert found["closest to reference"].duration == pytest.approx(closest.duration, rel=1e-9)
 
 
-def same(_: None, one: SimulationRequest, emit: object) -> StoredSimulation:
-    return replace(simulation(one.label), trajectory=one.digest)
-
-
 def test_every_answer_is_kept_and_not_asked_for_again(
     own_study: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -280,7 +269,7 @@ def test_every_answer_is_kept_and_not_asked_for_again(
         asked.append(one.label)
         if one.label == "recommended" and len(asked) == 4:
             raise KeyboardInterrupt
-        return same(_, one, emit)
+        return replace(simulation(one.label), trajectory=one.digest)
 
     monkeypatch.setattr(stage, "_simulated", few)
     results, silent = read_campaign(own_study), Progress(shown=False)
@@ -319,10 +308,9 @@ def test_a_damaged_file_is_simulated_anew_and_what_cannot_be_simulated_is_kept(
 
 
 def test_the_table_tells_threshold_forces_and_what_became_of_the_box() -> None:
-    nan, lost = float("nan"), "the box slips at 1.5 times the force; give other factors"
-    slips = replace(
-        simulation("slippery"), slips=nan, holds=nan, problem=lost, pad=0, arrives=False
-    )
+    lost = "the box slips at 1.5 times the force; give other factors"
+    slips = replace(simulation("slippery"), slips=NAN, holds=NAN, problem=lost, pad=0)
+    slips = replace(slips, arrives=False)
     first, second = simulated((simulation("good"), slips)).text().splitlines()[3:5]
     assert "1.000 to 1.004" in first
     assert "pad 2 at 0.50 s" in first
