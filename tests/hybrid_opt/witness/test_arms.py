@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import get_args
+from typing import Any, get_args
 
 import numpy as np
 import pytest
@@ -13,7 +13,6 @@ pytest.importorskip("mujoco")
 
 import mujoco
 
-from hybrid_opt.cell import Cell
 from hybrid_opt.robust.cases import nominal_case
 from hybrid_opt.timing.records import TimingLimits
 from hybrid_opt.timing.solve import time_path
@@ -34,8 +33,9 @@ from studies.research.plain.arm import PlainArm
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.records import Workcell
+from tests.hybrid_opt.cells import shipped
 from tests.odd_cells import machine_on_lift, rack_on_rail
-from tests.symbolic.cells import hand_cell, rack_cell, start_posture
+from tests.symbolic.cells import hand_cell, start_posture
 
 WEIGHT = 98.1
 LEAST = WEIGHT / 2.0
@@ -67,12 +67,18 @@ def standing(
     return replace(reference, effort=reference.effort + np.concatenate(lifting))
 
 
-def pad_jacobian(cell: Workcell, witness: CellWitness, q: Array, pad: int, axis: int = 2) -> Array:
-    """(all joints,) of the pad's motion along one of its axes."""
+def placed(witness: CellWitness, q: Array) -> Any:
+    """The simulator's data where both arms' joints are at q (all joints,) [rad]."""
     data = mujoco.MjData(witness.model)
-    for name, value in zip(joint_names(cell), q, strict=True):
+    for name, value in zip(joint_names(witness.workcell), q, strict=True):
         data.joint(name).qpos = value
     mujoco.mj_forward(witness.model, data)
+    return data
+
+
+def pad_jacobian(cell: Workcell, witness: CellWitness, q: Array, pad: int, axis: int = 2) -> Array:
+    """(all joints,) of the pad's motion along one of its axes."""
+    data = placed(witness, q)
     linear, angular = np.zeros((2, 3, witness.model.nv))
     site = witness.model.site(f"pad_{pad + 1}").id
     mujoco.mj_jacSite(witness.model, data, linear, angular, site)
@@ -91,12 +97,8 @@ def test_pads_press_with_the_torques_of_the_simulators_jacobian() -> None:
 
 def test_pads_are_where_the_arms_hold_the_box() -> None:
     cell = hand_cell()
-    witness = CellWitness(cell)
-    data = mujoco.MjData(witness.model)
     posture = start_posture(cell)
-    for name, value in zip(joint_names(cell), np.concatenate(posture), strict=True):
-        data.joint(name).qpos = value
-    mujoco.mj_kinematics(witness.model, data)
+    data = placed(CellWitness(cell), np.concatenate(posture))
     for i, (robot, contact) in enumerate(zip(cell.robots, cell.contacts, strict=True)):
         in_root = PlainArm(robot, contact).place(posture[i]).homogeneous
         T_world_flange = robot.T_world_base @ in_root
@@ -230,7 +232,7 @@ def test_arms_that_push_against_one_another_do_so_along_the_faces() -> None:
 def test_a_carrys_references_are_the_planners_torques_but_for_moments() -> None:
     """The torques of the timing's compiled functions without what the wrenches' moments take of
     them, and what pressing harder adds."""
-    cell = Cell(rack_cell())
+    cell = shipped("rack")
     carry = time_path(cell.timing_model, cell.initial, TimingLimits()).carry
     assert carry is not None
     planned = carry_reference(cell, carry)

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import sys
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 
 import mujoco
 import numpy as np
@@ -32,13 +32,11 @@ from symbolic.array import Array
 from symbolic.contact.load import load_function
 from symbolic.errors import SettingsError
 from symbolic.records import Uncertainty, Workcell
-from symbolic.records.task import initial_decision
 from tests.hybrid_opt.cells import shipped
 from tests.hybrid_opt.witness.carries import carry_along, least_forces
 from tests.symbolic.cells import (
     call,
     hand_cell,
-    rack_cell,
     with_contacts,
     with_payload,
     with_task,
@@ -319,23 +317,23 @@ def test_pads_that_press_evenly_need_more_where_a_load_twists() -> None:
     assert found == [[False, True, True], [False, False, False]]
 
 
-def made() -> tuple[Cell, Array]:
-    cell = Cell(rack_cell())
-    return cell, initial_decision(cell.workcell.task)
+@cache
+def hand_made() -> tuple[Cell, Carry]:
+    """The rack, and its carry as a job drives it."""
+    cell = shipped("rack")
+    return cell, driven_carry(cell, cell.initial)
 
 
 def test_a_carry_is_driven_as_its_time_law_says() -> None:
-    cell, x = made()
-    closest = driven_carry(cell, x)
+    cell, closest = hand_made()
     assert np.abs(closest.rate[[0, -1]]).max() < 1e-6
     with pytest.raises(WitnessError, match="cannot be driven"):
-        driven_carry(cell, x + 5.0)
+        driven_carry(cell, cell.initial + 5.0)
 
 
 def test_forces_beside_what_was_told_are_stored_from_the_carrys_beginning() -> None:
     """One short run of the whole cell, pressed as recommended."""
-    cell, x = made()
-    carry = driven_carry(cell, x)
+    cell, carry = hand_made()
     pressed, squeeze = pressed_reference(cell, carry)
     assert squeeze.factor is None
     shown = CellWitness(cell.workcell).simulate(pressed, "leader")
@@ -353,8 +351,7 @@ def test_forces_beside_what_was_told_are_stored_from_the_carrys_beginning() -> N
 
 
 def test_an_uncertain_cell_is_pressed_with_its_robust_forces() -> None:
-    cell, x = made()
-    carry = driven_carry(cell, x)
+    cell, carry = hand_made()
     unsure = replace(cell.workcell, uncertainty=Uncertainty(friction=0.1))
     other = Cell(unsure)
     other.compiled = cell.compiled  # which knows nothing of what is uncertain
