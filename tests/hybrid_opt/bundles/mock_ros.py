@@ -24,6 +24,7 @@ import numpy as np
 from rosbags.typesys import Stores, get_typestore
 from scipy.interpolate import BPoly
 
+from hybrid_opt.bundles.bundle import write_bundle
 from hybrid_opt.bundles.job_file import Contents
 from symbolic.array import Array
 
@@ -402,10 +403,7 @@ def run(
     Args:
         prepare: what is to happen in the world.
     """
-    for name, content in files.items():
-        path = folder / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(content.encode() if isinstance(content, str) else content)
+    write_bundle(folder, files, {})
     world = World(files, json.loads(files["config/cell.json"]))
     signals = SimpleNamespace(
         SIGINT=signal.SIGINT, SIGTERM=signal.SIGTERM, signal=world.signals.__setitem__
