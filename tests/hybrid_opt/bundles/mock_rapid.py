@@ -34,6 +34,8 @@ LONGEST_NAME = 32
 
 DECLARED = re.compile(r"(VAR|PERS|CONST) (\w+) (\w+)(?:\{(\d+)\})?(?: := (.+))?")
 
+OPTION = re.compile(r",?\s*\\(\w+)(?::=([^,\\]+))?")
+
 HANDLER = "  except TimeoutError:"
 
 VALUES = {name: name for name in ("fine", "v5", "v1000", "z15", "load0", "ERR_WAITSYNCTASK")}
@@ -85,14 +87,10 @@ def parse(text: str) -> Module:
                 assert depth >= 2, code
                 body.append("  " * depth + _statement(code[:-1]))
             elif not depth:
-                value = _value(stated[5] or "None")
+                value = eval(stated[5] or "None", {"TRUE": True, "FALSE": False})
                 assert stated[4] is None or len(value) == int(stated[4]), code
                 declared[stated[3]] = stated[1], stated[2], value
     return Module(declared, {name: "\n".join(lines) for name, lines in procedures.items()})
-
-
-def _value(text: str) -> Any:
-    return eval(text, {"TRUE": True, "FALSE": False})
 
 
 def _statement(code: str) -> str:
@@ -100,10 +98,9 @@ def _statement(code: str) -> str:
     if re.match(r"\w+ :=", code):
         return code.replace(":=", "=")
     name, _, rest = code.partition(" ")
-    rest = re.sub(r"\\(\w+):=([^,\\]+)", r"\\dict(\1=\2)", rest)
-    rest = re.sub(r"\\([A-Z]\w*)", r"\\dict(\1=True)", rest)
-    arguments = re.sub(r",?\s*\\", ", ", rest).removeprefix(", ")
-    return f"yield from {name}({arguments})"
+    options = [f"{option}={value or True}" for option, value in OPTION.findall(rest)]
+    given = OPTION.sub("", rest).strip(", ")
+    return f"yield from {name}({', '.join(filter(None, [given, *options]))})"
 
 
 class Exit(Exception):
@@ -135,24 +132,13 @@ class Task:
                 self._names[name] = SimpleNamespace(tload=value[2])
             elif kind == "syncident":
                 self._names[name] = name
-        for name in dir(self):
-            if name[0].isupper():
-                self._names[name] = self._instruction(getattr(self, name))
+        self._names |= {name: getattr(self, name) for name in dir(self) if name[0].isupper()}
         self._names |= {
             "CJointT": lambda: _target([np.rad2deg(self.q).tolist(), []]),
             "begun": lambda name: cell.begins.__setitem__(name, cell.now),
         }
         exec("\n".join(module.procedures.values()), self._names)
         self._body = self._names["Carry"]()
-
-    def _instruction(self, does: Callable[..., Iterator[None]]) -> Callable[..., Iterator[None]]:
-        """One whose optional arguments may stand anywhere."""
-
-        def done(*given: Any) -> Iterator[None]:
-            named = {k: v for each in given if isinstance(each, dict) for k, v in each.items()}
-            return does(*(each for each in given if not isinstance(each, dict)), **named)
-
-        return done
 
     def set(self, name: str, value: float) -> None:
         """Change a PERS, as someone at the pendant does."""
