@@ -37,10 +37,10 @@ from hybrid_opt.witness.reference import (
 from symbolic.array import Array
 from symbolic.robot.model import build_robot_model
 from tests.hybrid_opt.bundles import test_abb, test_urscript
-from tests.hybrid_opt.bundles.bundles import STEPS, contents
+from tests.hybrid_opt.bundles.bundles import STEPS
 from tests.hybrid_opt.bundles.bundles import read_job as job
 from tests.hybrid_opt.bundles.mock_ros import World, run
-from tests.hybrid_opt.bundles.test_run_job import FAULTS, begins, column, leave, sound
+from tests.hybrid_opt.bundles.test_run_job import begins, column, sound, with_fault
 from tests.hybrid_opt.job.jobs import rack, rack_jobs
 
 pytestmark = pytest.mark.slow
@@ -283,14 +283,8 @@ STOPPED = (
 @pytest.mark.parametrize(("target", "name"), STOPPED)
 def test_a_stopped_job_holds_the_box(target: str, name: str, tmp_path: Path) -> None:
     """Also where one arm stands at once, and the other comes to rest 50 mm farther: arms give."""
-    fault: Callable[[World], Any] = FAULTS[name][0]
     when = begins(target) + job().begin("carry") + 2.5
-
-    def prepare(world: World) -> None:
-        world.later(when, lambda: fault(world))
-        leave(world, when + 4.0)
-
-    code, world = run(contents(target), tmp_path, prepare)
+    code, world = with_fault(target, name, when, tmp_path, hold=4.0)
     assert code == 1
     aims = reference(TOLD[target](world), False, job())
     found = witness().simulate(aims, PROGRAMS[target][1])

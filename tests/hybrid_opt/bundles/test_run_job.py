@@ -98,12 +98,6 @@ def test_positions_and_efforts_are_those_of_the_job() -> None:
     assert np.abs(effort[first + 1000]).max() > 1.0
 
 
-def leave(world: World, when: float) -> None:
-    """Have the program end, some time after it holds the job [s]."""
-    for k in range(3):
-        world.later(when + 0.5 * k, world.interrupt)
-
-
 def freeze(world: World, arm: int) -> None:
     """An arm's drives stop."""
     controller, part = world.of(arm)
@@ -160,6 +154,19 @@ def begins(target: str) -> float:
     return float(time[moves(sound(target), 1e-12)[0]] - time[0])
 
 
+def with_fault(
+    target: str, name: str, when: float, folder: Path, hold: float = 6.0
+) -> tuple[int, World]:
+    """A run in which something happens at a time, and that is left some time after that [s]."""
+
+    def prepare(world: World) -> None:
+        world.later(when, lambda: FAULTS[name][0](world))
+        for k in range(3):
+            world.later(when + hold + 0.5 * k, world.interrupt)
+
+    return run(contents(target), folder, prepare)
+
+
 @pytest.mark.parametrize(
     ("target", "name", "phase", "share"),
     [
@@ -179,15 +186,9 @@ def test_both_arms_hold_and_press(
 ) -> None:
     """The arms that still move stop at one place of the path, in the time that the job states; the
     squeeze of that place stays; what happened is told."""
-    fault, told = FAULTS[name]
-    planned = rack_job().phase(phase)
+    told, planned = FAULTS[name][1], rack_job().phase(phase)
     when = begins(target) + planned.begin + share * planned.duration
-
-    def prepare(world: World) -> None:
-        world.later(when, lambda: fault(world))
-        leave(world, when + 6.0)
-
-    code, world = run(contents(target), tmp_path, prepare)
+    code, world = with_fault(target, name, when, tmp_path)
     text = " ".join(world.log)
     assert any(part in text for part in told.split("|")) or (code == 0 and name in UNSEEN), text
     if name in UNSEEN and phase in ("press", "release", "retreat"):
