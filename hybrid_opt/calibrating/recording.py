@@ -132,13 +132,6 @@ class ArmLog:
     commanded: Array
     lost: Spans
 
-    def at(self, time: Array) -> ArmLog:
-        """Between its samples."""
-
-        own = (self.joints, self.wrench, self.commanded)
-        joints, wrench, commanded = (interpolated(time, self.time, each) for each in own)
-        return ArmLog(time, joints, wrench, commanded, self.lost)
-
 
 def lost_spans(time: Array, values: Array) -> Spans:
     """Spans without samples, or with the very same values (m, k) in all of them."""
@@ -175,14 +168,18 @@ def together(
             f"{name}: both arms recorded at the same time on {len(time)} samples; allowed are 10 "
             f"and more, on one clock in s (usual steps are {steps[0]:g} and {steps[1]:g})"
         )
-    both = [each.at(time) for each in recorded]
+
+    def of_both(name: str) -> tuple[Array, Array]:
+        one, two = (interpolated(time, log.time, getattr(log, name)) for log in recorded)
+        return one, two
+
     return Run(
         name=name,
         time=time,
         steps=steps,
-        joints=(both[0].joints, both[1].joints),
-        wrench=np.stack([each.wrench for each in both], axis=1),
-        commanded=np.stack([each.commanded for each in both], axis=1),
+        joints=of_both("joints"),
+        wrench=np.stack(of_both("wrench"), axis=1),
+        commanded=np.stack(of_both("commanded"), axis=1),
         lost=tuple(sorted({*first.lost, *second.lost})),
         frame=frame,
         largest=np.full(2, np.inf) if largest is None else np.asarray(largest),
