@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -24,9 +25,9 @@ from tests.hybrid_opt.calibrating.generator import (
 QUIET = Truth(force_noise=1e-6, moment_noise=1e-7)
 
 
-def errors(seed: int) -> list[float]:
+def errors(changes: dict[str, Any]) -> list[float]:
     """Of the mass, as a share, and of the centre of mass [m]."""
-    truth, found = Truth(), calibrate(CELL, [run(seed)]).changes["payload"]
+    truth, found = Truth(), changes["payload"]
     centre = np.array(found["centre_of_mass"]) - truth.centre
     return [found["mass"] / truth.mass - 1.0, *centre.tolist()]
 
@@ -52,27 +53,21 @@ def test_without_noise_the_truth_is_found() -> None:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_tilts_and_three_squeezes_show_the_load(seed: int) -> None:
-    mass, *centre = errors(seed)
-    assert abs(mass) < 3 * 0.007
-    assert np.abs(centre).max() < 3 * 1.6e-3
+    """Within the ranges that are told."""
+    changes = calibrate(CELL, [run(seed)]).changes
+    (mass, *centre), doubt = errors(changes), changes["uncertainty"]
+    assert abs(mass) < min(3 * 0.007, doubt["mass"])
+    assert (np.abs(centre) < np.minimum(3 * 1.6e-3, doubt["centre_of_mass"])).all()
+    # What nobody measured keeps what the cell says.
+    assert "tilt" not in doubt or doubt["tilt"] == CELL.uncertainty.tilt
 
 
 @pytest.mark.slow
 def test_over_thirty_seeds_the_load_is_as_near_as_promised() -> None:
-    mass, *centre = np.sqrt(np.mean(np.square([errors(seed) for seed in range(30)]), axis=0))
+    every = [errors(calibrate(CELL, [run(seed)]).changes) for seed in range(30)]
+    mass, *centre = np.sqrt(np.mean(np.square(every), axis=0))
     assert mass < 0.007
     assert max(centre) < 1.6e-3
-
-
-def test_ranges_cover_the_truth() -> None:
-    found = [calibrate(CELL, [run(seed)]).changes for seed in range(3)]
-    for changes in found:
-        doubt, payload = changes["uncertainty"], changes["payload"]
-        assert abs(payload["mass"] - 4.4) < doubt["mass"] * 4.4
-        off = np.abs(np.array(payload["centre_of_mass"]) - Truth().centre)
-        assert (off < doubt["centre_of_mass"]).all()
-        # What nobody measured keeps what the cell says.
-        assert "tilt" not in doubt or doubt["tilt"] == CELL.uncertainty.tilt
 
 
 def test_level_holds_at_one_squeeze_show_neither_mass_nor_centre() -> None:
