@@ -26,7 +26,7 @@ from symbolic.records.poses import rotation_from_rpy
 from symbolic.robot.branches import inverse_kinematics, start_branches
 from symbolic.robot.model import RobotModel, build_robot_model
 from tests.machines import robot_record, ur10_urdf
-from tests.symbolic.cells import fixed, rack_cell, with_task
+from tests.symbolic.cells import fixed, rack_cell, rack_model, with_task
 from tests.symbolic.read.samples import GOFA
 
 
@@ -102,8 +102,7 @@ def test_an_unreachable_pose_has_no_branch(gofa: tuple[Robot, RobotModel]) -> No
 
 
 def test_start_branches_are_ranked_and_hold_the_start() -> None:
-    workcell = rack_cell()
-    model = build_cell_model(workcell)
+    workcell, model = rack_cell(), rack_model()
     for arm in (0, 1):
         ranks = [branch.rank for branch in model.branches[arm]]
         assert ranks == sorted(ranks)
