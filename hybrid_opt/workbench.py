@@ -263,9 +263,6 @@ COLOURS = {"robot": (148, 156, 166), "payload": (222, 158, 64), "environment": (
 FRAME = 0.04
 """Time between two frames of a carry that plays [s]."""
 
-NUMBERS = {"payload.mass": "mass [kg]", "contacts.friction": "friction"}
-"""Fields, by key path of the workcell file."""
-
 
 class Workbench:
     """A cell in a browser, served on this machine alone.
@@ -341,12 +338,11 @@ class Workbench:
         choice = gui.add_dropdown("drag", ["nothing", *known], initial_value="nothing")
         choice.on_update(lambda _: self._grasp(known.get(choice.value)))
         self._gizmo: Any = None
-        starts = {
-            "payload.mass": workcell.payload.mass,
-            "contacts.friction": workcell.contacts[0].friction,
-        }
-        for key, label in NUMBERS.items():
-            self._field(key, gui.add_number(label, starts[key], min=1e-3, step=0.01))
+        for key, label, start in (
+            ("payload.mass", "mass [kg]", workcell.payload.mass),
+            ("contacts.friction", "friction", workcell.contacts[0].friction),
+        ):
+            self._field(key, gui.add_number(label, start, min=1e-3, step=0.01))
         low, high = workcell.task.force_limit
         limit = gui.add_slider("force limit [N]", low, high, 0.1, float(self.session.x[-1]))
         limit.on_update(lambda _: self.ask({"force_limit": limit.value}))

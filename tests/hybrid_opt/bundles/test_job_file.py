@@ -37,10 +37,9 @@ from hybrid_opt.job.compliance import TRACKED
 from hybrid_opt.job.records import SampledJob, sample_job
 from symbolic.errors import SettingsError
 from symbolic.read.arms import arm_model
-from symbolic.read.cell import load
 from tests.hybrid_opt.bundles.bundles import contents, exported, text_of
+from tests.hybrid_opt.cells import shipped
 from tests.hybrid_opt.job.jobs import rack, rack_job
-from tests.symbolic.read.samples import RACK
 
 
 def sampled() -> SampledJob:
@@ -69,7 +68,7 @@ def test_samples_lie_on_the_job() -> None:
 
 def test_a_joint_that_moves_both_arms_bears_the_contact_of_both() -> None:
     """The TIAGo's lift, first of each arm's eight joints; without such a joint nothing is added."""
-    cell = load(RACK.with_name("tiago.toml"))
+    cell = shipped("tiago").workcell
     names = tuple(tuple(arm_model(robot).names)[1:] for robot in cell.robots)
     contact = np.random.default_rng(2).normal(size=(3, 16))
     knows: Any = SimpleNamespace(workcell=cell, job=SimpleNamespace(joint_names=names))

@@ -21,11 +21,10 @@ import yourdfpy
 from hybrid_opt.bundles.arms import description, ros_joints
 from hybrid_opt.bundles.bundle import write_bundle
 from hybrid_opt.bundles.job_file import pad_places
-from symbolic.read.cell import load
 from symbolic.records.poses import pose_matrix
 from tests.hybrid_opt.bundles.bundles import contents, exported, text_of
+from tests.hybrid_opt.cells import shipped
 from tests.hybrid_opt.job.jobs import rack
-from tests.symbolic.read.samples import RACK
 
 JOINTS = [f"{arm}_joint_{k}" for arm in ("left", "right") for k in range(1, 7)]
 
@@ -69,7 +68,7 @@ def judged(parameters: dict[str, Any]) -> None:
 def test_a_joint_that_moves_both_arms_is_there_once() -> None:
     """The lift of the TIAGo: in the hardware of its description and among the controller's joints,
     with the place of the left arm's."""
-    workcell = load(RACK.with_name("tiago.toml"))
+    workcell = shipped("tiago").workcell
     joints = ros_joints(workcell)
     assert len(joints) == 15
     assert joints["torso_lift_joint"] == 0
