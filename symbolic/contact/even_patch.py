@@ -21,12 +21,11 @@ of theirs.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import partial
 
 import casadi as ca
 
+from symbolic.contact.central_path import Factors, Patch, Step
 from symbolic.contact.force_closure import EVEN
-from symbolic.contact.patches import Aim, BarrierPatch, Elimination, Patch, StateStep, Step
 from symbolic.contact.soft_finger import SoftPatch, torsion_capacity
 
 DEGREE = 2.0
@@ -62,31 +61,21 @@ class EvenPatch(Patch):
     iterate_size, degree = 2 * len(EVEN) + 1, DEGREE
 
     def centred(self, state: ca.SX, weight: ca.SX) -> ca.SX:
-        """See `symbolic.contact.patches.Patch`."""
-        return ca.vertcat(state, -weight * LocalEven(self, state, state, weight).slope, weight)
+        """See `symbolic.contact.central_path.Patch`."""
+        return ca.vertcat(state, -weight * self.barrier(state)[0], weight)
 
     def local(self, iterate: ca.SX) -> LocalEven:
-        """See `symbolic.contact.patches.Patch`."""
-        return LocalEven(self, iterate[: len(EVEN)], iterate[len(EVEN) : -1], iterate[-1])
-
-    def barrier(self, iterate: ca.SX, weight: ca.SX) -> BarrierPatch:
-        """See `symbolic.contact.patches.Patch`."""
-        local = self.local(iterate)
-
-        def step(change: ca.SX) -> StateStep:
-            whole = ca.vertcat(change, ca.SX.zeros(len(EVEN) + 1))
-            return StateStep(whole, self.lowest(local.wrench, change))
-
-        return BarrierPatch(weight * local.curvature, -weight * local.slope, step)
+        """See `symbolic.contact.central_path.Patch`."""
+        return LocalEven(self, iterate)
 
     def potential(self, state: ca.SX) -> ca.SX:
-        """See `symbolic.contact.patches.Patch`."""
+        """See `symbolic.contact.central_path.Patch`."""
         grip = ca.sqrt(self._grip_squared(state))
         return -ca.log(torsion_capacity(grip, state[1:3], self.shape)[0] ** 2 - state[3] ** 2)
 
     def lowest(self, state: ca.SX, change: ca.SX) -> ca.SX:
-        """See `symbolic.contact.patches.Patch`: minus one over a length of the change that surely
-        stays within the cone, nearly the longest."""
+        """Minus one over a length of the change that surely stays within the cone, nearly the
+        longest."""
         # Where friction ends: the lower eigenvalue of (N, T), as of a corner's force.
         square = self._grip_squared(state)
         mean = (state[0] * change[0] - ca.dot(state[1:3], change[1:3])) / square
@@ -114,7 +103,7 @@ class EvenPatch(Patch):
 
 
 class LocalEven:
-    """See `symbolic.contact.patches.LocalPatch`.
+    """See `symbolic.contact.central_path.LocalPatch`.
 
     Attributes:
         slope, curvature: (4,) and (4, 4) of the barrier.
@@ -122,42 +111,41 @@ class LocalEven:
         trust: share of the way to the boundary that a step's aim may rely on.
     """
 
-    def __init__(self, patch: EvenPatch, state: ca.SX, multiplier: ca.SX, weight: ca.SX) -> None:
+    def __init__(self, patch: EvenPatch, iterate: ca.SX) -> None:
         """The barrier's derivatives; the weight is at least what the multipliers say."""
-        self.patch, self.wrench, self.multiplier = patch, state, multiplier
-        symbol, along = ca.SX.sym("s", len(EVEN)), ca.SX.sym("d", len(EVEN))
-        curvature, slope = ca.hessian(patch.potential(symbol), symbol)
-        bend = ca.jtimes(ca.mtimes(curvature, along), symbol, along)
-        self.slope, self.curvature = ca.substitute([slope, curvature], [symbol], [state])
-        self._bend = bend, symbol, along
+        self.patch = patch
+        self.state, self.multiplier, weight = ca.vertsplit(
+            iterate, [0, len(EVEN), 2 * len(EVEN), patch.iterate_size]
+        )
+        self.slope, self.curvature = patch.barrier(self.state)
         self.stored = weight
-        self.weight = ca.fmax(weight, ca.dot(state, multiplier) / DEGREE)
+        self.weight = ca.fmax(weight, ca.dot(self.state, self.multiplier) / DEGREE)
         self.gap = DEGREE * self.weight
         self.stiffness = self.weight * self.curvature
-        off = multiplier / self.weight + self.slope
-        solved = Elimination.whole(self.curvature).solved(off)
-        away = ca.sqrt(ca.fmax(ca.dot(off, solved), 0.0))
+        off = self.multiplier / self.weight + self.slope
+        factors = Factors(self.curvature)
+        away = ca.sqrt(ca.fmax(ca.dot(off, factors.solved(factors.reduced(off))), 0.0))
         near = (OFF_PATH - away) / (OFF_PATH - NEAR_PATH)
         self.trust = ca.fmin(ca.fmax(near, LEAST_TRUST), 1.0)
 
-    def aim(self, weight: ca.SX, correction: ca.SX) -> Aim:
-        """See `symbolic.contact.patches.LocalPatch`."""
-        pull = -weight * self.slope - correction
-        return Aim(pull, partial(self._step, pull, weight - self.stored))
+    def pull(self, weight: ca.SX, correction: ca.SX) -> ca.SX:
+        """See `symbolic.contact.central_path.LocalPatch`."""
+        return -weight * self.slope - correction
 
-    def _step(self, pull: ca.SX, grown: ca.SX, change: ca.SX) -> Step:
-        lowest = self.patch.lowest(self.wrench, change)
+    def step(self, weight: ca.SX, correction: ca.SX, change: ca.SX) -> Step:
+        """See `symbolic.contact.central_path.LocalPatch`."""
+        lowest, grown = self.patch.lowest(self.state, change), weight - self.stored
         of_state = lowest / self.trust
-        turned = pull - ca.mtimes(self.stiffness, change) - self.multiplier
+        left = self.pull(weight, correction) - ca.mtimes(self.stiffness, change)
+        turned = left - self.multiplier
 
         def second_order() -> ca.SX:
             far = ca.fmin(1.0, -1.0 / of_state)
-            bend, *symbols = self._bend
-            (bend,) = ca.substitute([bend], symbols, [self.wrench, change])
-            return far**2 * (self.weight * (bend / 2.0 - ca.mtimes(self.curvature, change)))
+            turning = self.patch.third(self.state, change, change)
+            return far**2 * (self.weight * (turning / 2.0 - ca.mtimes(self.curvature, change)))
 
         def gap_after(length: ca.SX) -> ca.SX:
-            state = self.wrench + length * change
+            state = self.state + length * change
             multiplier = self.multiplier + length * turned
             return ca.fmax(DEGREE * (self.stored + length * grown), ca.dot(state, multiplier))
 

@@ -24,11 +24,7 @@ import casadi as ca
 import numpy as np
 
 from symbolic.array import Array
-from symbolic.contact.central_path import (
-    START_WEIGHT,
-    central_point,
-    least_effort,
-)
+from symbolic.contact.central_path import START_WEIGHT, Patch, central_point, least, least_effort
 from symbolic.contact.even_patch import EvenPatch
 from symbolic.contact.force_closure import (
     EVEN,
@@ -41,7 +37,6 @@ from symbolic.contact.force_closure import (
     size_powers,
     tangential,
 )
-from symbolic.contact.patches import Patch, least
 from symbolic.contact.rectangular_patch import RectangularPatch
 from symbolic.contact.round_patch import RoundPatch, cross_2, patch_slack
 from symbolic.contact.soft_finger import SoftPatch
@@ -184,14 +179,9 @@ class Grasp:
         inputs = [self.numbers.load_at_rest, *map(np.array, self._nominal())]
         load, *sizes = [ca.SX(ca.DM(value)) for value in inputs][: 1 + len(SIZES)]
         asked, given = self.asked(load, *sizes), self.squeezed(*sizes)
-        press = self._pressed(given, asked)
-        pairs = zip(asked, given, strict=True)
-        states = [np.array(ca.evalf(a + press * s)).ravel() for a, s in pairs]
-        iterate, slope = central_point(self, states, inputs, REST_WEIGHT)
-        starts = np.cumsum([0, *[patch.iterate_size for patch in self.patches]])
-        at = [k + np.arange(len(own)) for k, own in zip(starts, states, strict=False)]
-        rows = np.concatenate(at)
-        return replace(self.numbers, rest=iterate[rows], rest_slopes=slope[rows])
+        held = ca.vertcat(*asked) + self._pressed(given, asked) * ca.vertcat(*given)
+        rest, slopes = central_point(self, np.array(ca.evalf(held)), inputs, REST_WEIGHT)
+        return replace(self.numbers, rest=rest, rest_slopes=slopes)
 
     def _nominal(self) -> tuple[list[float], ...]:
         """The cell's own numbers for the inputs after the load."""

@@ -14,12 +14,11 @@ and det f = f . J f, and sym(a b c) = a (b . c) + c (a . b) - (a . J c) J b.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import partial
 
 import casadi as ca
 
+from symbolic.contact.central_path import Patch, Step, least
 from symbolic.contact.force_closure import POINT_SIZE, STATE_SIZE, WRENCH_SIZE
-from symbolic.contact.patches import Aim, BarrierPatch, Elimination, Patch, StateStep, Step, least
 from symbolic.expression import reciprocal
 
 CORNERS = 4.0
@@ -44,28 +43,21 @@ class RectangularPatch(Patch):
     state_size = correction_size = STATE_SIZE
 
     def centred(self, state: ca.SX, weight: ca.SX) -> ca.SX:
-        """See `symbolic.contact.patches.Patch`."""
+        """See `symbolic.contact.central_path.Patch`."""
         return ca.vertcat(state, *[weight * _inverse(f) for f in self._corners(state)])
 
     def local(self, iterate: ca.SX) -> LocalRectangle:
-        """See `symbolic.contact.patches.Patch`."""
+        """See `symbolic.contact.central_path.Patch`."""
         return LocalRectangle(self, iterate)
 
-    def barrier(self, iterate: ca.SX, weight: ca.SX) -> BarrierPatch:
-        """See `symbolic.contact.patches.Patch`."""
-        local = self.local(self.centred(iterate[:STATE_SIZE], weight))
-        aim = local.aim(weight, ca.SX.zeros(self.correction_size))
-
-        def step(change: ca.SX) -> StateStep:
-            whole = aim.step(change)
-            alone = ca.vertcat(whole.change[:STATE_SIZE], ca.SX.zeros(STATE_SIZE))
-            return StateStep(alone, whole.lowest_of_state)
-
-        return BarrierPatch(local.stiffness, aim.pull, step)
-
     def potential(self, state: ca.SX) -> ca.SX:
-        """See `symbolic.contact.patches.Patch`."""
+        """See `symbolic.contact.central_path.Patch`."""
         return -0.5 * sum(ca.log(_determinant(f)) for f in self._corners(state))
+
+    def barrier(self, state: ca.SX) -> tuple[ca.SX, ca.SX]:
+        """See `symbolic.contact.central_path.Patch`; shorter than what CasADi derives."""
+        local, one = self.local(self.centred(state, ca.SX(1.0))), ca.SX(1.0)
+        return -local.pull(one, ca.SX.zeros(STATE_SIZE)), local.stiffness
 
     def lowest(self, state: ca.SX, change: ca.SX) -> ca.SX:
         """Exactly: each corner has two eigenvalues."""
@@ -104,35 +96,34 @@ class RectangularPatch(Patch):
 
 
 class LocalRectangle:
-    """See `symbolic.contact.patches.LocalPatch`."""
+    """See `symbolic.contact.central_path.LocalPatch`."""
 
     def __init__(self, patch: RectangularPatch, iterate: ca.SX) -> None:
-        """Inverses of the corners' matrices, and the stiffness left by what moves freely."""
+        """Inverses of the corners' matrices, and the stiffness."""
         self._patch = patch
-        state = iterate[:STATE_SIZE]
-        self.wrench = state[:WRENCH_SIZE]
-        self._force = corners_of(patch.waves(state))
+        self.state = iterate[:STATE_SIZE]
+        self._force = corners_of(patch.waves(self.state))
         self._multiplier = list(ca.vertsplit(iterate[STATE_SIZE:], POINT_SIZE))
         self._inverse = [_inverse(f) for f in self._force]
         self.gap = sum(map(ca.dot, self._force, self._multiplier))
         self._stiff = list(map(_both_sides, self._multiplier, self._inverse))
-        self._elimination = Elimination(self._matrix(), STATE_SIZE - WRENCH_SIZE)
-        self.stiffness = self._elimination.left
+        self.stiffness = self._matrix()
 
-    def aim(self, weight: ca.SX, correction: ca.SX) -> Aim:
-        """See `symbolic.contact.patches.LocalPatch`."""
-        corrections = ca.vertsplit(correction, POINT_SIZE)
-        pairs = zip(self._inverse, corrections, strict=True)
-        given = [weight * inverse - c for inverse, c in pairs]
+    def pull(self, weight: ca.SX, correction: ca.SX) -> ca.SX:
+        """See `symbolic.contact.central_path.LocalPatch`."""
+        given = self._given(weight, correction)
         waves = [_wave_sums([g[i] for g in given]) for i in range(POINT_SIZE)]
-        whole = [value * (1.0 / WAVES) for value in self._patch.gathered(waves)]
-        reduced = self._elimination.reduced([*whole[WRENCH_SIZE:], *whole[:WRENCH_SIZE]])
-        return Aim(ca.vertcat(*reduced[WRENCH_SIZE:]), partial(self._step, given, reduced))
+        return ca.vertcat(*self._patch.gathered(waves)) * (1.0 / WAVES)
 
-    def _step(self, given: list[ca.SX], reduced: list[ca.SX], change: ca.SX) -> Step:
-        """From what the multipliers become where nothing moves, per corner."""
-        moved = ca.vertcat(change, *self._elimination.first(reduced, ca.vertsplit(change)))
-        force, multiplier = corners_of(self._patch.waves(moved)), self._multiplier
+    def _given(self, weight: ca.SX, correction: ca.SX) -> list[ca.SX]:
+        """What the multipliers become where nothing moves, per corner."""
+        corrections = ca.vertsplit(correction, POINT_SIZE)
+        return [weight * own - c for own, c in zip(self._inverse, corrections, strict=True)]
+
+    def step(self, weight: ca.SX, correction: ca.SX, change: ca.SX) -> Step:
+        """See `symbolic.contact.central_path.LocalPatch`."""
+        given = self._given(weight, correction)
+        force, multiplier = corners_of(self._patch.waves(change)), self._multiplier
         corners = zip(given, self._stiff, force, multiplier, strict=True)
         turned = [g - ca.mtimes(stiff, df) - s for g, stiff, df, s in corners]
         lowest = least(list(map(_lowest, self._force, force)))
@@ -145,15 +136,15 @@ class LocalRectangle:
             return sum(ca.dot(f + length * df, s + length * ds) for f, df, s, ds in moves)
 
         return Step(
-            ca.vertcat(moved, *turned),
+            ca.vertcat(change, *turned),
             lowest,
             least([lowest, *map(_lowest, multiplier, turned)]),
             second_order,
             gap_after,
         )
 
-    def _matrix(self) -> list[list[ca.SX]]:
-        """(12, 12) stiffness of the state, inner entries first.
+    def _matrix(self) -> ca.SX:
+        """(12, 12) stiffness of the state.
 
         Of two waves it is the sum over the corners with both waves' signs: that of a third one.
         """
@@ -172,8 +163,7 @@ class LocalRectangle:
             self._patch.gathered([[of_wave[k] for of_wave in of_part] for of_part in columns])
             for k in range(STATE_SIZE)
         ]
-        order = [*range(WRENCH_SIZE, STATE_SIZE), *range(WRENCH_SIZE)]
-        return [[rows[i][j] for j in order] for i in order]
+        return ca.vertcat(*[ca.horzcat(*row) for row in rows])
 
 
 def corners_of(waves: list[list[ca.SX]]) -> list[ca.SX]:

@@ -34,12 +34,11 @@ has nothing real at z's place, so that eight numbers tell it.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cache, partial
 
 import casadi as ca
 
+from symbolic.contact.central_path import Patch, Step, symmetric
 from symbolic.contact.force_closure import WRENCH_SIZE
-from symbolic.contact.patches import Aim, BarrierPatch, Elimination, Patch, StateStep, Step
 from symbolic.expression import Expression, reciprocal
 
 Complex = tuple[ca.SX, ca.SX]
@@ -175,15 +174,6 @@ def patch_potential(wrench: Expression) -> Expression:
     return ca.log(wrench[0]) - ca.log(patch_slack(wrench))
 
 
-@cache
-def patch_barrier() -> ca.Function:
-    """Gradient (6,) and Hessian (6, 6) of the barrier at a scaled wrench."""
-    wrench = ca.SX.sym("wrench", WRENCH_SIZE)
-    gradient = ca.gradient(patch_potential(wrench), wrench)
-    hessian = ca.densify(ca.jacobian(gradient, wrench))
-    return ca.Function("patch_barrier", [wrench], ca.cse([gradient, hessian]))
-
-
 # --- the method's patch ---
 
 
@@ -206,7 +196,7 @@ class RoundPatch(Patch):
     degree = 3.0
 
     def centred(self, state: ca.SX, weight: ca.SX) -> ca.SX:
-        """See `symbolic.contact.patches.Patch`."""
+        """See `symbolic.contact.central_path.Patch`."""
         moment, tangent = state[3:5], state[1:3]
         # The z with the largest determinant.
         matrix = _matrix(ca.vertcat(state, ca.dot(moment, tangent) / state[0]))
@@ -215,27 +205,20 @@ class RoundPatch(Patch):
         return ca.vertcat(state, ca.dot(moment, tangent) / state[0], *_numbers(inverse))
 
     def local(self, iterate: ca.SX) -> LocalDisc:
-        """See `symbolic.contact.patches.Patch`."""
+        """See `symbolic.contact.central_path.Patch`."""
         return LocalDisc(iterate)
 
-    def barrier(self, iterate: ca.SX, weight: ca.SX) -> BarrierPatch:
-        """See `symbolic.contact.patches.Patch`; more exact than by way of the inverse."""
-        slope, curvature = patch_barrier()(iterate[:WRENCH_SIZE])
-        rest = ca.SX.zeros(self.iterate_size - WRENCH_SIZE)
-
-        def step(change: ca.SX) -> StateStep:
-            return StateStep(ca.vertcat(change, rest), _mean_bound(slope, curvature, change))
-
-        return BarrierPatch(weight * curvature, -weight * slope, step)
-
     def potential(self, state: ca.SX) -> ca.SX:
-        """See `symbolic.contact.patches.Patch`."""
+        """See `symbolic.contact.central_path.Patch`."""
         return patch_potential(state)
 
     def lowest(self, state: ca.SX, change: ca.SX) -> ca.SX:
-        """See `symbolic.contact.patches.Patch`."""
-        slope, curvature = patch_barrier()(state)
-        return _mean_bound(slope, curvature, change)
+        """By Samuelson's inequality: no eigenvalue of three lies below their mean less sqrt(2) of
+        their deviation; the barrier's derivatives along the change are their sums."""
+        slope, curvature = self.barrier(state)
+        mean = -ca.dot(slope, change) / 3.0
+        variance = ca.dot(change, ca.mtimes(curvature, change)) / 3.0 - mean**2
+        return mean - ca.sqrt(2.0 * ca.fmax(variance, 0.0))
 
     def slack(self, state: ca.SX) -> ca.SX:
         """The least of what pressure, friction and both leave."""
@@ -245,36 +228,33 @@ class RoundPatch(Patch):
 
 
 class LocalDisc:
-    """See `symbolic.contact.patches.LocalPatch`."""
+    """See `symbolic.contact.central_path.LocalPatch`."""
 
     def __init__(self, iterate: ca.SX) -> None:
-        """The inverse, and the stiffness left by z."""
-        self.wrench = iterate[:WRENCH_SIZE]
-        self._matrix = _matrix(iterate[:FREE_SIZE])
+        """The inverse, and the stiffness."""
+        self.state = iterate[:FREE_SIZE]
+        self._matrix = _matrix(self.state)
         numbers = ca.vertsplit(iterate[FREE_SIZE:])
         self._multiplier = Hermitian.of(ca.vertcat(*numbers[:-1], 0.0, numbers[-1]))
         self.gap = self._matrix.trace_with(self._multiplier)
         self._adjugate = self._matrix.adjugate()
         over = reciprocal(self._matrix.determinant(self._adjugate))
         self._inverse = self._adjugate.scaled(over)
-        self._elimination = Elimination(_stiffness(self._inverse, self._multiplier), 1)
-        self.stiffness = self._elimination.left
+        self.stiffness = _stiffness(self._inverse, self._multiplier)
 
-    def aim(self, weight: ca.SX, correction: ca.SX) -> Aim:
-        """See `symbolic.contact.patches.LocalPatch`."""
-        given = self._inverse.scaled(weight).less(Hermitian.of(correction))
-        reduced = self._elimination.reduced(ca.vertsplit(_paired(given)))
-        pull = ca.vertcat(*reduced[1:])
-        return Aim(pull, partial(self._step, given, reduced, pull))
+    def pull(self, weight: ca.SX, correction: ca.SX) -> ca.SX:
+        """See `symbolic.contact.central_path.LocalPatch`."""
+        return _paired(self._given(weight, correction))
 
-    def _step(self, given: Hermitian, reduced: list[ca.SX], pull: ca.SX, change: ca.SX) -> Step:
-        """From what the multipliers become where nothing moves.
+    def _given(self, weight: ca.SX, correction: ca.SX) -> Hermitian:
+        """What the multipliers become where nothing moves."""
+        return self._inverse.scaled(weight).less(Hermitian.of(correction))
 
-        What S + dS is to give to the wrench tells all of it but how its diagonal is shared.
-        """
-        moved = ca.vertcat(change, self._elimination.first(reduced, ca.vertsplit(change))[0])
-        left = pull - ca.mtimes(self.stiffness, change)
-        matrix, multiplier = _matrix(moved), self._multiplier
+    def step(self, weight: ca.SX, correction: ca.SX, change: ca.SX) -> Step:
+        """What S + dS is to give to the wrench tells all of it but how its diagonal is shared."""
+        given = self._given(weight, correction)
+        left = _paired(given) - ca.mtimes(self.stiffness, change)
+        matrix, multiplier = _matrix(change), self._multiplier
         by_row = self._inverse.product(matrix)
         shares = []
         for k in (0, 1):
@@ -297,7 +277,7 @@ class LocalDisc:
             return Hermitian.of(after).trace_with(held)
 
         return Step(
-            ca.vertcat(moved, *_numbers(turned)),
+            ca.vertcat(change, *_numbers(turned)),
             lowest,
             ca.fmin(lowest, _lowest(multiplier, multiplier.adjugate(), turned)),
             second_order,
@@ -318,17 +298,17 @@ def _matrix(free: ca.SX) -> Hermitian:
 
 
 def _paired(matrix: Hermitian) -> ca.SX:
-    """(7,) what a matrix of multipliers does to z and the wrench."""
+    """(7,) what a matrix of multipliers does to the wrench and z."""
     q, t, c = matrix.below
     trace = sum(matrix.diagonal)
-    return ca.vertcat(2.0 * c[0], trace, *[2.0 * part for part in (*t, *q, c[1])])
+    return ca.vertcat(trace, *[2.0 * part for part in (*t, *q, c[1], c[0])])
 
 
-def _stiffness(inverse: Hermitian, multiplier: Hermitian) -> list[list[ca.SX]]:
-    """(7, 7) Re tr(A_i X^-1 A_j S) for z and the wrench; A is what an entry adds to the matrix."""
+def _stiffness(inverse: Hermitian, multiplier: Hermitian) -> ca.SX:
+    """(7, 7) Re tr(A_i X^-1 A_j S) for the wrench and z; A is what an entry adds to the matrix."""
     # An entry's slot, and whether it is imaginary there.
     q, t, c = SLOTS
-    entries = [(c, 0), None, (t, 0), (t, 1), (q, 0), (q, 1), (c, 1)]
+    entries = [None, (t, 0), (t, 1), (q, 0), (q, 1), (c, 1), (c, 0)]
     product = multiplier.product(inverse)
 
     def pair(one: tuple[int, int], two: tuple[int, int]) -> list[list[ca.SX]]:
@@ -353,7 +333,7 @@ def _stiffness(inverse: Hermitian, multiplier: Hermitian) -> list[list[ca.SX]]:
             i_1, i_2 = SLOTS.index(slot), SLOTS.index(other)
             row.append(pairs[i_1, i_2][part][its] if i_1 >= i_2 else pairs[i_2, i_1][its][part])
         rows.append(row)
-    return rows
+    return symmetric(rows)
 
 
 def _with_normal(product: list[list[Complex]], entry: tuple[tuple[int, int], int] | None) -> ca.SX:
@@ -363,14 +343,6 @@ def _with_normal(product: list[list[Complex]], entry: tuple[tuple[int, int], int
     (i, j), imaginary = entry
     above, below = product[j][i], product[i][j]
     return below[1] - above[1] if imaginary else above[0] + below[0]
-
-
-def _mean_bound(slope: ca.SX, curvature: ca.SX, change: ca.SX) -> ca.SX:
-    """A bound from below by Samuelson's inequality: no eigenvalue of three lies below their mean
-    less sqrt(2) of their deviation; the barrier's derivatives along the change are their sums."""
-    mean = -ca.dot(slope, change) / 3.0
-    variance = ca.dot(change, ca.mtimes(curvature, change)) / 3.0 - mean**2
-    return mean - ca.sqrt(2.0 * ca.fmax(variance, 0.0))
 
 
 def _lowest(matrix: Hermitian, adjugate: Hermitian, change: Hermitian) -> ca.SX:

@@ -18,15 +18,12 @@ Y' F Y is positive definite for every mu > 0, whether the least effort is unique
 
 from __future__ import annotations
 
-from itertools import accumulate
-
 import casadi as ca
 import numpy as np
 
-from symbolic.contact.central_path import centred, wrenches_of
+from symbolic.contact.central_path import against_barriers, centred, state_ends, wrenches_of
 from symbolic.contact.force_closure import LOAD_SIZE, MOMENT_ARM
 from symbolic.contact.grasp import SCALE_FLOOR, Grasp, whole_wrench
-from symbolic.contact.patches import Elimination, Patch
 from symbolic.expression import as_mx, mx_symbols
 
 POLISH_STEPS = 2
@@ -44,16 +41,13 @@ class SoftGrasp:
         grasp: the pads.
         weight: mu.
         size, ends: of the states of all patches together, and where each begins.
-        free, loaded: Y (size, .) and W (size, 6).
         normals: C (2, size).
     """
 
     def __init__(self, grasp: Grasp, weight: float) -> None:
         self.grasp, self.weight = grasp, weight
-        sizes = [patch.state_size for patch in grasp.patches]
-        self.ends = [0, *accumulate(sizes)]
+        self.ends = state_ends(grasp)
         self.size = self.ends[-1]
-        self.free, self.loaded = self._states()
         normals = np.zeros((ROBOTS, self.size))
         normals[list(grasp.robots), self.ends[:-1]] = 1.0
         self.normals = ca.sparsify(ca.DM(normals))
@@ -76,12 +70,7 @@ class SoftGrasp:
         given = list(handed.values())
         friction = as_mx(self.grasp.friction, self.grasp.given, handed)
         scale = ca.sqrt(ca.sumsqr(load[:3]) + ca.sumsqr(load[3:] / MOMENT_ARM) + SCALE_FLOOR**2)
-        iterate = centred(self.grasp, self.weight)(load / scale, friction, *given)
-        held, at = [], 0
-        for patch in self.grasp.patches:
-            held.append(iterate[at : at + patch.state_size])
-            at += patch.iterate_size
-        state = scale * ca.vertcat(*held)
+        state = scale * centred(self.grasp, self.weight)(load / scale, friction, *given)
         step = self._newton()
         for _ in range(POLISH_STEPS):
             state = step(state, *given)
@@ -105,8 +94,7 @@ class SoftGrasp:
         normal forces by the load."""
         state, weight = ca.SX.sym("state", self.size), ca.SX.sym("weight", ROBOTS)
         local = _Local(self, state)
-        pulled = -ca.mtimes([self.free.T, self.normals.T, weight])
-        along = ca.mtimes(self.free, local.solved(pulled))
+        along = local.pulled(-ca.mtimes(self.normals.T, weight))
         curvature = local.third(along, local.by_load())
         return ca.Function(
             "held_second",
@@ -128,27 +116,8 @@ class SoftGrasp:
         """A state to the next one, under the same load."""
         state = ca.SX.sym("state", self.size)
         local = _Local(self, state)
-        change = local.solved(-ca.mtimes(self.free.T, local.slope))
         inputs = [state, *self.grasp.given.values()]
-        return ca.Function("newton", inputs, [ca.cse(state + ca.mtimes(self.free, change))])
-
-    def effort(self, state: ca.SX) -> ca.SX:
-        """Half the sum of all squared forces."""
-        wrenches = wrenches_of(self.grasp, ca.vertsplit(state, self.ends))
-        return self.grasp.effort(wrenches, [ca.SX(LOAD_SIZE, 1), self.grasp.friction])
-
-    def _states(self) -> tuple[ca.SX, ca.SX]:
-        """Y (n, free) and W (n, 6). What is free: whatever leaves the wrenches as they are, then
-        the wrenches' components that are free."""
-        patches = self.grasp.patches
-        inner = [
-            ca.SX.sym(f"inner_{i}", p.state_size - p.wrench_size) for i, p in enumerate(patches)
-        ]
-        load, wrenches = ca.SX.sym("load", LOAD_SIZE), ca.SX.sym("free", self.grasp.free_size)
-        whole = self.grasp.balanced(wrenches, [load, self.grasp.friction])
-        state = ca.vertcat(*[part for pair in zip(whole, inner, strict=True) for part in pair])
-        free = ca.vertcat(*inner, wrenches)
-        return ca.jacobian(state, free), ca.jacobian(state, load)
+        return ca.Function("newton", inputs, [ca.cse(state + local.pulled(-local.slope))])
 
 
 class _Local:
@@ -160,48 +129,41 @@ class _Local:
     """
 
     def __init__(self, program: SoftGrasp, state: ca.SX) -> None:
-        self._program, self._ends = program, program.ends
-        symbol = ca.SX.sym("s", program.size)
-        effort = program.effort(symbol)
-        by = [effort, *ca.hessian(effort, symbol)[::-1]]
-        self._effort, self._by_effort, self._square = ca.substitute(by, [symbol], [state])
-        self._g = self._by_effort / self._effort
-        self._owns = ca.vertsplit(state, self._ends)
-        patches = zip(program.grasp.patches, self._owns, strict=True)
-        slopes, stiff = zip(*[_barrier(patch, own) for patch, own in patches], strict=True)
-        self.slope = self._g + program.weight * ca.vertcat(*slopes)
-        # Without g g', which is left out of the system that is solved as well.
-        self._curvature = program.weight * ca.diagcat(*stiff) + self._square / self._effort
-        free = program.free
-        reduced = ca.mtimes([free.T, self._curvature, free])
-        self._system = Elimination.whole(reduced)
-        self._g_free = ca.mtimes(free.T, self._g)
-        self._answer = self._system.solved(self._g_free)
-        self._share = 1.0 / (1.0 - ca.dot(self._g_free, self._answer))
+        self._program, grasp = program, program.grasp
+        self._owns, load = ca.vertsplit(state, program.ends), ca.SX.sym("load", LOAD_SIZE)
+        _, pulls, equations = against_barriers(
+            grasp, self._owns, [load, grasp.friction], program.weight
+        )
+        self._equations, self._effort = equations, equations.effort
+        self._g, self._square = equations.slope / self._effort, equations.curvature
+        self.slope = self._g - ca.vertcat(*pulls) / self._effort
+        self._loaded = ca.jacobian(equations.missing, load)
+        # The equations are those of f times the effort, without g g'.
+        self._answer = self._effort * equations.pulled(self._g)
+        self._share = 1.0 / (1.0 - ca.dot(self._g, self._answer))
 
-    def solved(self, right: ca.SX) -> ca.SX:
-        """y of Y' F Y y = right, by Sherman and Morrison's formula."""
-        found = self._system.solved(right)
-        return found + self._answer * (self._share * ca.dot(self._g_free, found))
+    def pulled(self, pull: ca.SX) -> ca.SX:
+        """Y y (n,) of Y' F Y y = Y' pull."""
+        return self._with_g(self._effort * self._equations.pulled(pull))
 
     def by_load(self) -> ca.SX:
         """U (n, 6)."""
-        program = self._program
-        right = ca.mtimes([program.free.T, self._curvature, program.loaded])
-        right -= ca.mtimes(self._g_free, ca.mtimes(self._g.T, program.loaded))
-        columns = [self.solved(-right[:, k]) for k in range(LOAD_SIZE)]
-        return ca.mtimes(program.free, ca.horzcat(*columns)) + program.loaded
+        return self._with_g(self._equations.settled(self._loaded))
+
+    def _with_g(self, found: ca.SX) -> ca.SX:
+        """From what holds without g g' (n, k), by Sherman and Morrison's formula."""
+        return found + ca.mtimes(self._answer, self._share * ca.mtimes(self._g.T, found))
 
     def third(self, along: ca.SX, by_load: ca.SX) -> ca.SX:
         """U' T[d] U for a direction d (n,)."""
         rows = zip(
             self._program.grasp.patches,
             self._owns,
-            ca.vertsplit(along, self._ends),
-            ca.vertsplit(by_load, self._ends),
+            ca.vertsplit(along, self._program.ends),
+            ca.vertsplit(by_load, self._program.ends),
             strict=True,
         )
-        barriers = sum(ca.mtimes(u.T, _third(patch, own, d, u)) for patch, own, d, u in rows)
+        barriers = sum(ca.mtimes(u.T, patch.third(own, d, u)) for patch, own, d, u in rows)
         # Derivatives of log effort.
         over = 1.0 / self._effort
         turned = ca.mtimes(self._square, along)
@@ -210,21 +172,3 @@ class _Local:
         square = ca.mtimes([by_load.T, self._square, by_load])
         of_effort = 2.0 * size * ca.mtimes(by, by.T) - over * (size * square + both + both.T)
         return self._program.weight * barriers + of_effort
-
-
-def _barrier(patch: Patch, at: ca.SX) -> list[ca.SX]:
-    """The barrier's gradient and Hessian at a state."""
-    state = ca.SX.sym("state", patch.state_size)
-    hessian, gradient = ca.hessian(patch.potential(state), state)
-    found: list[ca.SX] = ca.substitute([ca.densify(gradient), hessian], [state], [at])
-    return found
-
-
-def _third(patch: Patch, at: ca.SX, along: ca.SX, columns: ca.SX) -> ca.SX:
-    """The barrier's third derivative at a state, along a direction and each of some columns
-    (., 6)."""
-    state, direction = (ca.SX.sym(name, patch.state_size) for name in ("state", "along"))
-    others = ca.SX.sym("columns", patch.state_size, LOAD_SIZE)
-    moved = ca.jtimes(ca.gradient(patch.potential(state), state), state, direction)
-    bent = ca.jtimes(moved, state, others)
-    return ca.substitute([bent], [state, direction, others], [at, along, ca.densify(columns)])[0]

@@ -31,6 +31,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from symbolic.contact.central_path import least
 from symbolic.contact.force_closure import (
     LOAD_SIZE,
     WRENCH_SIZE,
@@ -49,7 +50,6 @@ from symbolic.contact.grasp import (
 )
 from symbolic.contact.load import resultant_force
 from symbolic.contact.paper import required_moment
-from symbolic.contact.patches import least
 from symbolic.contact.soft_finger import Detached, SoftPatch, least_soft_squeeze
 from symbolic.expression import (
     Expression,

@@ -14,12 +14,12 @@ from scipy.optimize import minimize_scalar
 from scipy.spatial.transform import Rotation
 
 from symbolic.array import Array
+from symbolic.contact.central_path import Patch
 from symbolic.contact.elastic import SHEAR, free_shift, pressure_shifts
 from symbolic.contact.force_closure import corner_modes
 from symbolic.contact.paper import pressure_shift, required_moment
-from symbolic.contact.patches import Patch
 from symbolic.contact.rectangular_patch import RectangularPatch
-from symbolic.contact.round_patch import RoundPatch, patch_barrier, patch_slack
+from symbolic.contact.round_patch import RoundPatch, patch_slack
 from symbolic.records import Workcell
 from tests.symbolic.cells import call, hand_cell, solid_box
 
@@ -74,20 +74,23 @@ def iterate_of(patch: Patch) -> Array:
 
 @pytest.mark.parametrize("patch", STATES, ids=["disc", "rectangle"])
 def test_a_step_solves_its_equations(patch: Patch) -> None:
-    """S + dS = weight / X - sym(X^-1 dX S), paired with everything but the wrench it is zero."""
+    """S + dS = weight / X - sym(X^-1 dX S); paired with a disc's z it is zero, as S is."""
     size, iterate = len(STATES[patch]), iterate_of(patch)
-    symbol, change = ca.SX.sym("iterate", patch.iterate_size), ca.SX.sym("change", 6)
+    symbol, change = ca.SX.sym("iterate", patch.iterate_size), ca.SX.sym("change", size)
     local = patch.local(symbol)
-    aim = local.aim(ca.SX(0.3), ca.SX.zeros(patch.correction_size))
-    step = aim.step(change)
-    outputs = [local.gap, local.stiffness, aim.pull, step.change, step.lowest_of_state]
+    aim = ca.SX(0.3), ca.SX.zeros(patch.correction_size)
+    step = local.step(*aim, change)
+    outputs = [local.gap, local.stiffness, local.pull(*aim), step.change, step.lowest_of_state]
     outputs += [step.lowest, step.second_order()]
-    asked = 0.1 * np.random.default_rng(0).normal(size=6)
-    run = ca.Function("run", [symbol, change], outputs)
-    gap, stiffness, pull, moved, of_state, of_both, second = [
+    run, asked = ca.Function("run", [symbol, change], outputs), np.zeros(size)
+    stiffness, pull = (np.array(value).squeeze() for value in run(iterate, asked)[1:3])
+    asked = 0.1 * np.random.default_rng(0).normal(size=size)
+    if patch is DISC:
+        asked[6] = (pull[6] - stiffness[6, :6] @ asked[:6]) / stiffness[6, 6]
+    gap, _, _, moved, of_state, of_both, second = [
         np.array(value).squeeze() for value in run(iterate, asked)
     ]
-    np.testing.assert_allclose(moved[:6], asked)
+    np.testing.assert_allclose(moved[:size], asked)
     X, S = matrix_of(patch, iterate[:size]), multipliers(patch, iterate)
     dX, dS = matrix_of(patch, moved[:size]), multipliers(patch, moved)
     inverse, share = np.linalg.inv(X), PAIRING[patch]
@@ -96,8 +99,7 @@ def test_a_step_solves_its_equations(patch: Patch) -> None:
     np.testing.assert_allclose(S + dS, 0.3 * inverse - (both + both.conj().T) / 2, atol=1e-12)
     units = [matrix_of(patch, unit) for unit in np.eye(size)]
     given = share * np.array([np.trace(A @ (S + dS)).real for A in units])
-    np.testing.assert_allclose(given[:6], pull - stiffness @ asked, atol=1e-12)
-    np.testing.assert_allclose(given[6:], 0.0, atol=1e-12)
+    np.testing.assert_allclose(given, pull - stiffness @ asked, atol=1e-12)
     exact = [float(eigh(change, of)[0].min()) for change, of in ((dX, X), (dS, S))]
     assert exact[0] - 1e-3 * abs(exact[0]) <= of_state <= exact[0] + 1e-12
     assert min(exact) - 1e-3 <= of_both <= min(exact) + 1e-12
@@ -195,12 +197,29 @@ def barrier(wrench: Array) -> float:
     return -float(np.log(-best.fun))
 
 
+def barrier_of(patch: Patch) -> ca.Function:
+    """A state to the barrier's gradient and Hessian."""
+    state = ca.SX.sym("state", patch.state_size)
+    return ca.Function("barrier", [state], [*patch.barrier(state)])
+
+
+BARRIERS = {patch: barrier_of(patch) for patch in STATES}
+
+
+def test_the_barrier_of_a_rectangle_is_its_potentials() -> None:
+    state = ca.SX.sym("state", 12)
+    derived = ca.Function("derived", [state], [*Patch.barrier(RECTANGLE, state)])
+    found, expected = (f(STATES[RECTANGLE]) for f in (BARRIERS[RECTANGLE], derived))
+    for one, other in zip(found, expected, strict=True):
+        np.testing.assert_allclose(one, other, atol=1e-13)
+
+
 @given(seed=st.integers(0, 2**31))
 def test_barrier_is_the_determinants(seed: int) -> None:
     rng = np.random.default_rng(seed)
     wrench = inner_wrench(rng)
     wrench /= wrench[0]
-    gradient, hessian = (np.array(v) for v in patch_barrier()(wrench))
+    gradient, hessian = (np.array(v) for v in BARRIERS[DISC](wrench))
     h = 1e-4
     size = max(1.0, float(np.abs(gradient).max()), float(np.abs(hessian).max()))
     for direction in np.eye(6):
