@@ -444,15 +444,16 @@ class OppositePads:
             over_mu_1 + over_mu_2 + lever**2
         )
         lighter = ca.fmax(balance[0], 0.0)
-        asked = [_length(wrench[1:]) for wrench in _shared(cell, tangent, lighter)]
+        asked = [ca.norm_2(wrench[1:]) for wrench in _shared(cell, tangent, lighter)]
         # The squeeze itself tilts the box where the pads do not face one another.
-        overlap = 1.0 - _length(balance[6:8]) / ca.sum1(radius)
+        overlap = 1.0 - ca.norm_2(balance[6:8]) / ca.sum1(radius)
         pressed = LOWEST * ca.fmax(*asked) / (START_SHARE * overlap) + START_FLOOR
         return _shared(cell, tangent, pressed + lighter), ca.SX(START_WEIGHT)
 
 
 def even_slack(balance: ca.SX, friction: ca.SX, radius: ca.SX, n_1: ca.SX) -> ca.SX:
-    """Whether wrenches hold that share everything evenly, if contact 1 presses with n_1 [N].
+    """Whether wrenches hold that share everything evenly, tangential forces in proportion to
+    friction, if contact 1 presses with n_1 [N].
 
     Positive where both lie within their cones: then the patches carry what is asked. Where it is
     not, another pressure still may.
@@ -460,8 +461,8 @@ def even_slack(balance: ca.SX, friction: ca.SX, radius: ca.SX, n_1: ca.SX) -> ca
     Args:
         balance, friction, radius: as in `facing_wrenches`.
     """
-    left = []
-    for wrench in _evenly([balance, friction, radius], n_1):
+    left, tangent = [], friction[0] / ca.sum1(friction) * balance[1:3]
+    for wrench in _shared([balance, friction, radius], tangent, n_1):
         normal = wrench[0]
         left += [
             normal,
@@ -470,12 +471,6 @@ def even_slack(balance: ca.SX, friction: ca.SX, radius: ca.SX, n_1: ca.SX) -> ca
             patch_slack(wrench) / normal**4,
         ]
     return ca.mmin(ca.vertcat(*left))
-
-
-def _evenly(cell: list[ca.SX], n_1: ca.SX) -> list[ca.SX]:
-    """`_shared` with tangential forces in proportion to friction."""
-    balance, friction, _ = cell
-    return _shared(cell, friction[0] / ca.sum1(friction) * balance[1:3], n_1)
 
 
 def _shared(cell: list[ca.SX], tangent: ca.SX, n_1: ca.SX) -> list[ca.SX]:
@@ -492,7 +487,3 @@ def _shared(cell: list[ca.SX], tangent: ca.SX, n_1: ca.SX) -> list[ca.SX]:
         about_n / ca.sum1(friction * radius),
     )
     return OppositePads("effort").balanced(first, cell)
-
-
-def _length(vector: ca.SX) -> ca.SX:
-    return ca.sqrt(ca.sumsqr(vector))

@@ -48,8 +48,7 @@ from symbolic.contact.grasp import (
     even_slack,
     facing_wrenches,
 )
-from symbolic.contact.load import resultant_force
-from symbolic.contact.paper import required_moment
+from symbolic.contact.load import required
 from symbolic.contact.soft_finger import Detached, SoftPatch, least_soft_squeeze
 from symbolic.expression import (
     Expression,
@@ -60,7 +59,6 @@ from symbolic.expression import (
     number,
     sx_given,
 )
-from symbolic.path.rotation import angular_acceleration, angular_velocity, rotation_matrix
 from symbolic.records import Workcell
 from symbolic.records.numbered import NumberedWorkcell
 
@@ -310,21 +308,14 @@ def case_load_function(workcell: Workcell) -> ca.Function:
     inputs = [*_inputs(ca.SX, sx_given(payload)).values()]
     pose, rate, second, case, *_ = inputs
     _, _, mass, centre, disturbance, *_ = case_parts(case)
-    turned = workcell.task.orientation
-    rotation = rotation_matrix(turned, pose[3:])
-    omega = angular_velocity(turned, pose[3:], rate[3:])
-    alpha = angular_acceleration(turned, pose[3:], rate[3:], second[3:])
-    share = mass / payload.mass
     nominal = number(payload.centre_of_mass)
-    pulled = second[:3] + disturbance
-
-    def resultant(offset: ca.SX | ca.DM) -> ca.SX:
-        return resultant_force(payload.mass, ca.mtimes(rotation, offset), omega, alpha, pulled)
-
+    pushed = ca.vertcat(second[:3] + disturbance, second[3:])
+    at_nominal = required(workcell, pose, rate, pushed, nominal)[3]
+    rotation, *_, force, turning = required(workcell, pose, rate, pushed, centre)
     # About the nominal centre of mass; the true one's distance turns the force on a mass there.
-    turning = required_moment(ca.SX(number(payload.inertia)), rotation, omega, alpha)
-    moment = turning + ca.cross(ca.mtimes(rotation, centre - nominal), resultant(nominal))
-    parts = [share * ca.mtimes(rotation.T, part) for part in (resultant(centre), moment)]
+    moment = turning + ca.cross(ca.mtimes(rotation, centre - nominal), at_nominal)
+    share = mass / payload.mass
+    parts = ca.cse([share * ca.mtimes(rotation.T, part) for part in (force, moment)])
     return ca.Function("case_load", inputs, parts)
 
 

@@ -46,13 +46,15 @@ def even_cell() -> Workcell:
 # --- pads anywhere ---
 
 
-def points_of(pad: Contact) -> tuple[Array, Array]:
-    """(m, 2) points of a patch and the shares (m,) of the area that they stand for."""
+def points_of(pad: Contact, radii: int = 8, around: int = 12) -> tuple[Array, Array]:
+    """(m, 2) points of a patch and the shares (m,) of the area that they stand for: as many rings
+    of a disc and points on each, or as many points along both sides of a rectangle."""
     if pad.half_sides is not None:
-        along = (np.arange(12) + 0.5) / 6 - 1.0
+        along = (np.arange(around) + 0.5) / around * 2.0 - 1.0
         points = np.array(np.meshgrid(*[half * along for half in pad.half_sides]))
-        return points.reshape(2, -1).T, np.full(144, 1.0 / 144)
-    r, angle = np.meshgrid((np.arange(8) + 0.5) / 8, (np.arange(12) + 0.5) * 2.0 * np.pi / 12)
+        return points.reshape(2, -1).T, np.full(around**2, around**-2.0)
+    angles = np.arange(around) + 0.5
+    r, angle = np.meshgrid((np.arange(radii) + 0.5) / radii, angles * 2.0 * np.pi / around)
     at = np.stack([r * np.cos(angle), r * np.sin(angle)], axis=-1)
     return pad.patch_radius * at.reshape(-1, 2), r.ravel() / r.sum()
 
@@ -216,16 +218,7 @@ def sliding(contact: Contact, way: float) -> Array:
     Args:
         way: angle of the tangential force from the pad's x axis [rad].
     """
-    if contact.half_sides is None:
-        r, angle = np.meshgrid((np.arange(200) + 0.5) / 200, np.arange(256) * 2.0 * np.pi / 256)
-        at = np.stack([r * np.cos(angle), r * np.sin(angle)], axis=-1)
-        points = contact.patch_radius * at.reshape(-1, 2)
-        weight = r.ravel() / r.sum()
-    else:
-        x, y = contact.half_sides
-        along = (np.arange(160) + 0.5) / 80 - 1.0
-        points = np.array(np.meshgrid(x * along, y * along)).reshape(2, -1).T
-        weight = np.full(len(points), 1.0 / len(points))
+    points, weight = points_of(contact, 200, 160 if contact.half_sides else 256)
     found = []
     size = np.linalg.norm(points, axis=1).max()
     for distance in [0.0, *np.geomspace(0.03, 30.0, 40)]:

@@ -178,19 +178,12 @@ def test_torsion_about_the_centre_of_pressure_follows_the_ellipse(seed: int) -> 
         assert slack(boundary) < 0.0
 
 
-def hermitian(wrench: Array, z: float) -> Array:
-    n, t, q = wrench[0], complex(*wrench[1:3]), complex(*wrench[3:5])
-    low = np.array([[n, 0, 0], [q, n, 0], [t, z + 1j * wrench[5], n]])
-    matrix: Array = low + np.tril(low, -1).conj().T
-    return matrix
-
-
 def barrier(wrench: Array) -> float:
     """-log det of the matrix whose determinant is largest over z, up to a constant."""
     bound = float(wrench[0])
 
     def minus_determinant(z: float) -> float:
-        values = np.linalg.eigvalsh(hermitian(wrench, z))
+        values = np.linalg.eigvalsh(disc_matrix(np.append(wrench, z)))
         return -float(values.prod()) if values[0] > 0.0 else -float(values[0] * bound**2)
 
     best = minimize_scalar(minus_determinant, bounds=(-bound, bound), options={"xatol": 1e-12})
