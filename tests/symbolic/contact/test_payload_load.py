@@ -144,7 +144,7 @@ def test_contact_forces_and_gravity_move_the_box_as_newton_and_euler_say(seed: i
 
 
 BRANCHES = ("both cones tight", "2 unloaded", "1 unloaded", "cone 2 tight", "cone 1 tight")
-CASES = 1500
+CASES = 800
 
 
 def _allocation() -> ca.Function:
@@ -216,7 +216,7 @@ def test_agrees_with_a_conic_solver_on_every_branch(equal: bool) -> None:
         hits[BRANCHES[int(np.argmax(values))]] += 1
     assert worst_effort < 1e-8
     assert worst_force < 1e-6
-    assert min(hits.values()) >= 20, hits
+    assert min(hits.values()) >= 10, hits
 
 
 @given(f_n=st.floats(-200.0, 200.0), f_t=st.floats(0.01, 200.0), mu=st.floats(0.05, 3.0))
