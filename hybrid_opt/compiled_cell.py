@@ -326,7 +326,6 @@ def held_function(
     workcell: Workcell,
     name: str,
     make: Callable[[Workcell], ca.Function],
-    cache: Cache | None = None,
     lanes: int = 1,
 ) -> NumericFunction:
     """A function of what is held and how, with a cell's numbers, from the cache where one of the
@@ -340,7 +339,7 @@ def held_function(
     Raises:
         DualArmError: its code cannot be built.
     """
-    numbers, cache = _held_numbers(workcell), cache or Cache()
+    numbers, cache = _held_numbers(workcell), Cache()
     key = key_of(
         name,
         structure=numbers.digest,

@@ -156,7 +156,7 @@ def _cost(drivable: Cell, changes: dict[str, Any]) -> tuple[float, float, float]
             return none
     except DualArmError:
         return none
-    paths = DrivenPaths.of(cell, cell.initial[None, :-1])
+    paths = DrivenPaths(cell, cell.initial[None, :-1])
     options = paths.all_options(cell.workcell.task.force_limit[1])
     goal = Goal(np.inf, np.full(2, np.inf), Goal.of(Wish(), cell.workcell).cost)
     if not ranked(options, goal):

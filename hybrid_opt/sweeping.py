@@ -248,7 +248,7 @@ def _tried(cell: Cell, near: Sequence[Array], fixed: bool) -> Evaluations:
     """Verdicts on paths, and on the hand-made one where they may change, each within the limit that
     suits it best."""
     x = np.array([x[:-1] for x in (near if fixed else [*near, cell.initial])])
-    paths = DrivenPaths.of(cell, x)
+    paths = DrivenPaths(cell, x)
     options = paths.all_options(cell.workcell.task.force_limit[1])
     goal = Goal.of(Wish(), cell.workcell)
     if not ranked(options, goal):

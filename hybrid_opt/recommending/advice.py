@@ -213,7 +213,7 @@ def _of_pitch(cell: Cell, path: Array, option: Option, slope: float) -> Iterator
             varied.append(other)
             name = components(task.orientation)[PITCH]
             names.append(f"{sign:+.0f} degree of {name} at via-point {place + 1}")
-    for one in DrivenPaths.of(cell, np.array(varied)).options(option.limit):
+    for one in DrivenPaths(cell, np.array(varied)).options(option.limit):
         harder = one.commanded - option.commanded
         longer = one.duration - option.duration - slope * harder
         if longer < 0.0:

@@ -17,7 +17,7 @@ import numpy as np
 from hybrid_opt.cell import Cell
 from hybrid_opt.robust.cases import least_friction
 from hybrid_opt.robust.force import BoxMotion, pressing_model
-from hybrid_opt.timing.path_timer import PathTimer, PathTiming
+from hybrid_opt.timing.path_timer import PathTiming
 from hybrid_opt.timing.records import TimingLimits
 from symbolic.array import Array
 from symbolic.errors import SettingsError
@@ -139,34 +139,22 @@ def force_alone(duration: float, force: float) -> float:
 
 
 class DrivenPaths:
-    """Paths of one cell with their geometry, so that each further timing is cheap.
+    """Paths of one cell with their geometry, so that each further timing is cheap; driven within
+    the limits of the cell's drivable carries.
 
     Attributes:
         x: (k, n_path) free waypoints.
         highest_force: the largest force limit that is tried [N].
     """
 
-    def __init__(
-        self, timer: PathTimer, x: Array, highest_force: float, robust: bool = False
-    ) -> None:
-        """Compute the geometry of the paths.
-
-        Args:
-            timer: of the cell.
-            robust: whether limits hold in every case of the cell's uncertainty.
-        """
+    def __init__(self, cell: Cell, x: Array) -> None:
+        """Compute the geometry of the paths."""
         self.x = np.atleast_2d(np.asarray(x, dtype=float))
-        self._model = pressing_model(timer.workcell)
-        self.highest_force = highest_force
-        self._timer, self._robust = timer, robust
-        self._known = timer.path_limits(self.x)
-        self._failures = timer.failures(self._known)
-
-    @classmethod
-    def of(cls, cell: Cell, x: Array) -> DrivenPaths:
-        """Paths of a cell within the limits of its drivable carries."""
-        highest = cell.workcell.task.force_limit[1]
-        return cls(cell.path_timer, x, highest, cell.force_kind.robust)
+        self._model = pressing_model(cell.workcell)
+        self.highest_force = cell.workcell.task.force_limit[1]
+        self._timer, self._robust = cell.path_timer, cell.force_kind.robust
+        self._known = self._timer.path_limits(self.x)
+        self._failures = self._timer.failures(self._known)
 
     def __len__(self) -> int:
         return len(self.x)

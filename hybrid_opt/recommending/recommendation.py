@@ -186,7 +186,7 @@ def _recommended(
 ) -> Recommendation:
     cell, given = front.cell, front.x
     rows = spread_rows(given[:, :-1])
-    paths = DrivenPaths.of(cell, given[rows, :-1])
+    paths = DrivenPaths(cell, given[rows, :-1])
     options = paths.all_options(given[rows, -1], told)
     goal = Goal.of(wish, cell.workcell)
     weak = not wish.given and not any((each.force <= goal.hardest).all() for each in options)
@@ -380,7 +380,7 @@ class Rival:
 def rival(cell: Cell, label: str, path: Array, timing: Timing, force: float) -> Rival:
     """A path (n_path,) beside a recommended carry: its timing, and the force to command [N]."""
     assert timing.limits.force is not None, "drivable carries have a force limit"
-    paths = DrivenPaths.of(cell, path)
+    paths = DrivenPaths(cell, path)
     options = paths.all_options(timing.limits.force)
     goal = Goal(np.inf, commanded_at_most(force), duration_alone)
     found = next(best_of_paths(paths, options, goal, 1), None)

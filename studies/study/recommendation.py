@@ -332,7 +332,7 @@ def _force_table(
     def durations(paths: Array) -> Array:
         least = np.full(len(forces), np.inf)
         if len(paths):
-            least = front_durations(DrivenPaths.of(cell, paths), forces)
+            least = front_durations(DrivenPaths(cell, paths), forces)
         advance(1)
         return least
 

@@ -24,7 +24,7 @@ from hybrid_opt.campaign.settings import FRONT, CampaignSettings
 from hybrid_opt.display.table import NOTHING
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.indicators import metrics
-from hybrid_opt.polishing.settings import FillSettings
+from hybrid_opt.polishing.settings import FillSettings, ProbeSettings
 from hybrid_opt.store.files import sha256
 from symbolic.array import Array
 from symbolic.errors import SettingsError
@@ -47,9 +47,9 @@ def front() -> ho.Front:
 
 @cache
 def polished() -> ho.Front:
-    rng = np.random.default_rng(1)
-    fill = FillSettings(attempts=1)
-    return ho.polish(front(), rng=rng, settings=ho.PolishSettings(attempts=2, fill=fill))
+    fill, probe = FillSettings(attempts=1), ProbeSettings(starts=2, middle_starts=2)
+    settings = ho.PolishSettings(attempts=2, rounds=3, fill=fill, probe=probe)
+    return ho.polish(front(), rng=np.random.default_rng(1), settings=settings)
 
 
 def test_an_unknown_objective_is_refused_where_a_cell_is_loaded() -> None:

@@ -176,7 +176,7 @@ def test_the_hand_made_carry_stands_beside_it(drivable: ho.Cell, found: Recommen
 
 
 def test_a_better_path_is_warned_of(drivable: ho.Cell, front: ho.Front) -> None:
-    durations = DrivenPaths.of(drivable, front.x[:, :-1]).durations(57.0)
+    durations = DrivenPaths(drivable, front.x[:, :-1]).durations(57.0)
     quick, slow = front.x[int(np.argmin(durations))], front.x[int(np.argmax(durations))]
     assert min(durations) < 0.98 * max(durations)
     alone = ho.recommend(ho.Front.of(drivable, slow[None]), None, {"other": quick[:-1]})
@@ -213,7 +213,7 @@ def test_advice_is_what_changes_of_the_cell_change(
     assert level is found.advice[0]  # it costs most
     # No carry takes less than no time, however much force a change saves.
     assert all(each.duration > -found.timing.duration for each in found.advice)
-    paths = DrivenPaths.of(drivable, found.x[:-1])
+    paths = DrivenPaths(drivable, found.x[:-1])
     (own,) = paths.options(found.limit)
 
     def beyond(limit: float) -> float:
@@ -295,14 +295,14 @@ def test_a_front_is_as_fast_as_its_fastest_member(drivable: ho.Cell, front: ho.F
     forces = table_forces(drivable.workcell)
     assert forces == pytest.approx(np.array([1.02, 1.04, 1.06, 1.08, 1.12, 1.2]) * 49.05)
     members = front.x[spread_rows(front.x[:, :-1])]
-    paths = DrivenPaths(drivable.path_timer, members[:, :-1], 117.0)
+    paths = DrivenPaths(drivable, members[:, :-1])
     every = np.array([paths.durations(force) for force in forces])
     np.testing.assert_array_equal(front_durations(paths, forces), every.min(axis=1))
     np.testing.assert_array_equal(members[[0, -1]], front.x[[0, -1]])
 
 
 def test_options_are_those_of_the_independent_timing(drivable: ho.Cell, front: ho.Front) -> None:
-    paths = DrivenPaths.of(drivable, front.x[:2, :-1])
+    paths = DrivenPaths(drivable, front.x[:2, :-1])
     option = paths.options(57.0, [1])[0]
     timing = timed(drivable, front.x[1, :-1], 57.0)
     assert (option.index, option.limit) == (1, 57.0)
@@ -338,7 +338,7 @@ WIDER: dict[str, dict[str, list[float]]] = {
 }
 
 
-@pytest.mark.parametrize("name", PLACES)
+@pytest.mark.parametrize("name", ["fork", pytest.param("drum", marks=pytest.mark.slow)])
 def test_changes_of_pads_anywhere_are_those_of_the_file(name: str) -> None:
     workcell, moved = model(f"{name}, even").workcell, motion(name)
     told = dict(changes_of_cell(workcell, moved))

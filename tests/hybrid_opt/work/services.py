@@ -14,6 +14,11 @@ from hybrid_opt.work.service import Emit, Executor, Service
 from symbolic.errors import DualArmError
 
 
+def machine() -> dict[str, str]:
+    """What a worker's environment has to be."""
+    return {"numpy": np.__version__}
+
+
 def context() -> dict[str, int]:
     return {"requests": 0}
 
