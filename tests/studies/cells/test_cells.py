@@ -31,8 +31,8 @@ from symbolic.errors import SettingsError
 from symbolic.functions import candidate_function
 from symbolic.read.cell import load
 from symbolic.records import Uncertainty
-from tests.described_cells import SOURCES, described_cell, plain_cell
 from tests.hybrid_opt.cells import shipped
+from tests.odd_cells import SOURCES, described_cell, plain_cell
 from tests.symbolic.cells import RACK, ROOT, call, standing_text
 
 WORKCELLS = ROOT / "studies" / "workcells"
