@@ -100,11 +100,8 @@ def add(parser: argparse._ActionsContainer, *names: str, **own: Any) -> None:
 
 
 def add_wishes(parser: argparse._ActionsContainer, more: str = "") -> None:
-    """Add what may be asked of the recommended carry; `Wish` takes it.
-
-    Args:
-        more: what else the program does with a limit of the force.
-    """
+    """Add what may be asked of the recommended carry; `Wish` takes it. `more` says what else the
+    program does with a limit of the force."""
     parser.add_argument(
         "--duration",
         type=force,

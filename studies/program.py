@@ -110,11 +110,7 @@ class Program:
         return f"studies.{self.name}"
 
     def parser(self, called: str = "") -> Parser:
-        """The parser of its options.
-
-        Args:
-            called: how it is called, '' for `python -m`.
-        """
+        """The parser of its options; `called` says how it is called, '' for `python -m`."""
         parser = Parser(prog=called or f"python -m {self.module}", description=self.description)
         self.add_options(parser)
         parser.add_argument(
@@ -125,12 +121,7 @@ class Program:
         return parser
 
     def __call__(self, arguments: Sequence[str] | None = None, called: str = "") -> int:
-        """Run it; returns the exit code.
-
-        Args:
-            arguments: the command line, None for the process's own.
-            called: how it is called, '' for `python -m`.
-        """
+        """Run it with a command line, None for the process's own; returns the exit code."""
         parser = self.parser(called)
         given = list(sys.argv[1:] if arguments is None else arguments)
 

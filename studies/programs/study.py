@@ -98,11 +98,8 @@ class StudySettings:
 
 
 def stages(study: StudySettings, alone: bool = False) -> tuple[Stage, ...]:
-    """The stages of a study, in order.
-
-    Args:
-        alone: whether its first experiment is the drivable one already, so that it has no other.
-    """
+    """The stages of a study, in order; alone, its first experiment is the drivable one already, so
+    that it has no other."""
     every = [search_stage()]
     if study.polish is not None:
         every.append(polish_stage(study.polish))
@@ -267,13 +264,8 @@ def make_study(path: Path, options: argparse.Namespace, with_paper: bool) -> Non
 def campaign_settings(
     options: argparse.Namespace, objectives: tuple[str, ...] = PAPER_OBJECTIVES
 ) -> CampaignSettings:
-    """The settings that the options give.
-
-    Args:
-        objectives: what is minimised where the options do not say.
-
-    Returns:
-        Those of the drivable experiment where only a recommendation is asked for.
+    """The settings that the options give, with these objectives where they name none; those of the
+    drivable experiment where only a recommendation is asked for.
 
     Raises:
         SettingsError: a value is not allowed.
@@ -304,11 +296,8 @@ def campaign_settings(
 def polish_settings(
     options: argparse.Namespace, usual: bool, time_law: str
 ) -> PolishSettings | None:
-    """How the options want fronts polished, None for not at all.
-
-    Args:
-        usual: whether they are polished where the options do not say.
-        time_law: of the carries.
+    """How the options want fronts under a time law polished, None for not at all; `usual` decides
+    where they do not say.
 
     Raises:
         SettingsError: a value is not allowed.

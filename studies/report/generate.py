@@ -142,10 +142,7 @@ def _search_pictures(data: ReportData) -> Iterator[ReportPicture]:
 def make_report(
     root: Path, settings: Mapping[str, bool], progress: Progress, executor: Executor
 ) -> None:
-    """Write the report of a results folder.
-
-    Args:
-        settings: of `write_report`.
+    """Write the report of a results folder; settings as `write_report` has them.
 
     Raises:
         DualArmError: the folder is not complete, or cannot be written.

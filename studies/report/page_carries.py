@@ -87,13 +87,7 @@ def drawn_job(label: str, x: Array, limits: TimingLimits, cells: Sequence[ReadyC
 def drawn(
     model: JobModel, label: str, timed: Callable[[], Timing], within_jerk: bool = False
 ) -> DrawnJob:
-    """The job around a path.
-
-    Args:
-        label: whose it is.
-        timed: times the path.
-        within_jerk: whether within the cell's limits on jerk, too.
-    """
+    """The job around a path that is timed here, also within the cell's limits on jerk if wanted."""
     timing = None
     try:
         timing = timed()
@@ -155,11 +149,7 @@ LIMITS = (
 
 
 def phases(jobs: Sequence[DrawnJob], robots: Sequence[str]) -> Table:
-    """The phases of whole jobs.
-
-    Args:
-        robots: their names.
-    """
+    """The phases of whole jobs, with the names of the robots."""
     rows: list[tuple[str, ...]] = []
 
     def add(

@@ -267,11 +267,7 @@ Numbered = tuple[Group, list[int]]
 
 
 def page_document(data: ReportData, executor: Executor | None = None) -> dict[str, Any]:
-    """The page's data as JSON values.
-
-    Args:
-        executor: who works out the trajectories, None for this process.
-    """
+    """The page's data as JSON values; without an executor this process works them out."""
     # Where the cell itself is drivable there is one experiment.
     cells = [] if data.alone else [(data.files, data.objectives)]
     drive, search = list[Group](), [] if data.alone else list(_search_groups(data))

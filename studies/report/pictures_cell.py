@@ -374,10 +374,8 @@ def meeting(
     """The cell with both bodies in red: all of it, and what is near them from two sides.
 
     Args:
-        geometry: the cell.
         pair: names of the bodies.
         pose, q: (6,) of the box and (all joints,) where they meet [m, rad].
-        title: above it.
     """
     figure = new_figure(0.36)
     solids = cell_solids(geometry)

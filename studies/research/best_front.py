@@ -67,9 +67,7 @@ def compute_reference_front(
         evaluator: with the paper's objectives.
         starts: random feasible candidates to start from, the hand-made trajectory besides.
         attempts: of the final polish of the union.
-        rng: draws the candidates.
         jobs: worker processes, 0 for one per core; has no influence on the result.
-        tell: takes a line of progress.
 
     Raises:
         SettingsError: too few random candidates are feasible.

@@ -213,17 +213,12 @@ def read_recommendation(root: Path) -> StoredRecommendation | NoRecommendation |
 def recommend_from(
     root: Path, wish: ho.Wish, path: Path, progress: Progress, threads: int = 0
 ) -> StoredRecommendation:
-    """Recommend a carry of a study's drivable fronts, and store it.
+    """Recommend a carry of a study's drivable fronts, and store it; returns what is said of it.
 
     Args:
         root: the results folder, its drivable experiment done.
-        wish: what is asked for.
         path: the trajectory file to write.
-        progress: where to show it.
         threads: threads that time carries, 0 for one per core; results do not depend on it.
-
-    Returns:
-        What is said of it.
 
     Raises:
         NoCarryError: no drivable carry was found; the text says why.
@@ -465,15 +460,11 @@ LEAST_FORCE = "least-force"
 
 
 def known_paths(root: Path, task: Task) -> Array:
-    """Paths (m, n_path) that another experiment ends with: of all polished fronts together the
-    balanced one, of each of them both ends and the middle.
-
-    Args:
-        root: its results folder.
-        task: whose waypoints they are told by.
+    """Paths (m, n_path) that another experiment ends with, told by the waypoints of a task: of all
+    polished fronts together the balanced one, of each of them both ends and the middle.
 
     Raises:
-        ResultsError: the folder is not complete or damaged.
+        ResultsError: the experiment's folder is not complete or damaged.
     """
     campaign = read_campaign(root)
     own, n = campaign.workcell.task, campaign.workcell.task.n_path
@@ -484,12 +475,8 @@ def known_paths(root: Path, task: Task) -> Array:
 
 
 def least_force(campaign: CampaignResults, task: Task) -> dict[str, Array]:
-    """The balanced path (n_path,) of all fronts of an experiment, by its label; empty where no
-    carry was found.
-
-    Args:
-        task: the one whose waypoints describe the path.
-    """
+    """The balanced path (n_path,) of all fronts of an experiment, told by the waypoints of a task,
+    by its label; empty where no carry was found."""
     evaluator = CandidateEvaluator(campaign.workcell, campaign.objectives)
     chosen = select(evaluator, np.concatenate([front.x for front in campaign.fronts]))
     if chosen is None:
@@ -504,10 +491,6 @@ def is_drivable(workcell: Workcell, objectives: Sequence[str]) -> bool:
 
 
 def drivable_root(root: Path, workcell: Workcell, objectives: Sequence[str]) -> Path:
-    """Folder of a study's drivable experiment: one inside, unless it is the only experiment.
-
-    Args:
-        root: the study's results folder.
-        workcell, objectives: of its first experiment.
-    """
+    """Folder of a study's drivable experiment: one inside, unless the study's first experiment, of
+    this cell and these objectives, is the only one."""
     return root if is_drivable(workcell, objectives) else root / DRIVABLE

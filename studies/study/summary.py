@@ -262,12 +262,8 @@ class CampaignSummary:
         return files
 
     def words(self, folder: str) -> RecommendationText | None:
-        """What a study opens with: the carry to run, or why there is none; None where nothing is
-        known of either.
-
-        Args:
-            folder: as for `recommendation_text`.
-        """
+        """What a study opens with: the carry to run, or why there is none, with its folder as for
+        `recommendation_text`; None where nothing is known of either."""
         if self.recommendation is not None:
             return recommendation_text(self.recommendation, folder)
         if not self.no_recommendation:
@@ -445,11 +441,8 @@ PERCENTILES = (25.0, 50.0, 75.0, 100.0)
 
 
 def summary_stage(not_asked: str = "") -> Stage:
-    """The stage that computes the figures of a finished search.
-
-    Args:
-        not_asked: why the study recommends no carry, where it was not asked for one.
-    """
+    """The stage that computes the figures of a finished search; `not_asked` says why the study
+    recommends no carry, where it was not asked for one."""
 
     return Stage("summary", partial(_run, not_asked=not_asked))
 
