@@ -243,21 +243,6 @@ def passing(xs: Array, roll: float = 0.0) -> Configurations:
     return pose, np.tile(BENT, (n, 1)), np.tile(BENT, (n, 1))
 
 
-def test_a_thin_plate_between_two_samples_is_found() -> None:
-    """Samples on both sides of a plate are free; the box passes through it between them."""
-    judge = checker(thickness=0.001)
-    samples = passing(np.array([-0.6, -0.2, 0.2, 0.6]))
-    assert judge.check(*samples).is_free
-    verdict = check_between(judge, np.hstack(samples))
-    assert verdict.status == "collision"
-    touch = verdict.touch
-    assert touch is not None
-    assert (touch.sample, touch.first, touch.second) == (1, "payload", "plate")
-    assert abs(-0.2 + 0.4 * touch.fraction) <= 0.15 + 0.001
-    without = check_between(checker(), np.hstack(samples))
-    assert (without.status, without.touch) == ("free", None)
-
-
 def test_a_link_that_sweeps_through_a_plate_is_found() -> None:
     """The forearm swings by a large joint step; only the space between is blocked."""
     start, end = BENT.copy(), BENT.copy()
@@ -297,15 +282,6 @@ def test_a_slit_is_passed_if_the_clearance_can_be_told(gap: float, status: str) 
         assert verdict.touch.second in ("near wall", "far wall")
 
 
-def test_colliding_samples_are_not_missed() -> None:
-    verdict = check_between(
-        checker(thickness=0.001), np.hstack(passing(np.array([-0.6, 0.1, 0.6])))
-    )
-    assert verdict.status == "collision"
-    assert verdict.touch is not None
-    assert verdict.touch.sample + verdict.touch.fraction == 1.0
-
-
 def line(u: Array) -> Configurations:
     return passing(1.2 * u - 0.6)
 
@@ -318,13 +294,19 @@ def arc(u: Array) -> Configurations:
     return pose, q_1, q_2 + 0.1 * np.sin(np.pi * u)[:, None] * np.ones((n, 6))
 
 
-def test_a_path_through_the_plate_is_refused_with_its_place() -> None:
-    certificate = certify(checker(thickness=0.001), line, np.linspace(0.0, 1.0, 4))
+def test_a_path_through_a_thin_plate_is_refused_with_its_place() -> None:
+    """Samples on both sides of the plate are free; the box passes through it between them."""
+    grid = np.linspace(0.0, 1.0, 4)
+    certificate = certify(checker(thickness=0.001), line, grid)
     assert not certificate.is_free
     assert certificate.at_sample is None
     assert certificate.motion is not None
+    touch = certificate.motion.touch
+    assert touch is not None
     assert certificate.motion.status == "collision"
+    assert (touch.first, touch.second) == ("payload", "plate")
     assert abs(1.2 * certificate.at_parameter - 0.6) <= 0.151
+    assert certify(checker(), line, grid).is_free
 
 
 def test_a_collision_on_the_grid_is_named() -> None:

@@ -17,13 +17,12 @@ from hypothesis import strategies as st
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
-from hybrid_opt.collision.checker import RESTING_TOLERANCE
 from hybrid_opt.collision.judge import fcl_object
 from hybrid_opt.evaluate.kernel import PROOF_MARGIN, shape_table
 from symbolic.array import Array
 from symbolic.geometry.pairs import CellGeometry, build_geometry
 from symbolic.geometry.pieces import ConvexShape, Hull, Piece, reach, shrunk
-from symbolic.records import AllowedContact, Box, Capsule, Cylinder, Mesh, Sphere, Workcell
+from symbolic.records import Box, Capsule, Cylinder, Mesh, Sphere, Workcell
 from tests.hybrid_opt.collision.test_checker import checker_of, coal_mask, collision_mask
 from tests.symbolic.geometry.collision_cells import (
     rack,
@@ -86,31 +85,6 @@ def test_shrinks_on_every_side(by: float, seed: int) -> None:
     drum = Cylinder(0.1, 0.2)
     less = reach(drum, axes) - reach(shrunk(Piece(drum, np.eye(4)), by).shape, axes)
     np.testing.assert_allclose(less, by, rtol=1e-9)
-
-
-@pytest.mark.parametrize("kind", SHAPES)
-def test_may_rest_where_it_is_allowed_to(kind: str, tmp_path: Path) -> None:
-    """The payload stands with its lowest face on a board."""
-    cell = geometry(kind, tmp_path).workcell
-    board = cell.environment[0].name
-    body = next(b for b in cell.environment if b.name == board)
-    assert isinstance(body.shape, Box)
-    standing = np.zeros(6)
-    standing[:3] = body.pose[:3, 3]
-    standing[2] += body.shape.size[2] / 2.0 + 0.125
-    task = cell.task
-    start = replace(task.waypoints[0], lower=standing, upper=standing)
-    task = replace(
-        task,
-        waypoints=(start, *task.waypoints[1:]),
-        allowed_contacts=(AllowedContact(board, 0.05),),
-    )
-    judge = checker_of(build_geometry(replace(cell, task=task)))
-    pair = judge.geometry.pair_names.index(("payload", board))
-    still = np.zeros((2, 6))
-    deep = standing - [0.0, 0.0, 2.0 * RESTING_TOLERANCE, 0.0, 0.0, 0.0]
-    found = judge.collisions(np.array([standing, deep]), still, still, [0, 1], [pair, pair])
-    assert found == [False, True]
 
 
 APART, OPEN, INTERSECTING = 1, 0, -1
