@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache, partial
-from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,8 +14,6 @@ from symbolic.array import Array
 from symbolic.records.task import POSE_SIZE, extended_waypoints, place_redundant
 from symbolic.robot.arm import REACH_TOLERANCE
 from symbolic.smooth.places import Reach
-
-_Value = TypeVar("_Value")
 
 SHARPENED_BELOW = 0.1
 """Bounds of the payload's distances that are lower are raised by the gaps across its edges [m]."""
@@ -64,19 +61,11 @@ class PlacedCarry:
     shift: Array
     distances: Distances = field(repr=False)
     gaps: Callable[[int], Array] = field(repr=False)
-    _known: dict[object, Any] = field(default_factory=dict, repr=False)
 
     @property
     def is_followed(self) -> bool:
         """Whether both arms reach all places."""
         return self.reached == len(self.pose)
-
-    def once(self, key: object, find: Callable[[], _Value]) -> _Value:
-        """What several kinds of constraints want to know of this candidate, found by the first."""
-        if key not in self._known:
-            self._known[key] = find()
-        found: _Value = self._known[key]
-        return found
 
 
 def lowest(values: Array, limit: float, stride: int | None = None) -> list[int]:

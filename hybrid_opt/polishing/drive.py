@@ -306,7 +306,7 @@ class DriveWay(Way[DrivePoint, DriveStep]):
     ) -> DriveStep | None:
         """Form the joint program about the best carry so far, and solve its quadratic model."""
         grid = self._intervals
-        values = IntervalValues.at(grid, self.cell.functions, best.x, best.squared, best.joints)
+        values = IntervalValues(grid, self.cell.functions, best.x, best.squared, best.joints)
         program = JointProgram(grid, values, best.x, best.squared, self.cell, required, best.carry)
         box, chosen = self._box(best, radius), program.near()
         steady = np.zeros(program.n)

@@ -9,7 +9,7 @@ interval: u'' = (w_end - w_begin) n / 2, u'^2 = w.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -153,36 +153,23 @@ class IntervalGrid:
         return first, second, third
 
 
-@dataclass(frozen=True)
 class IntervalValues:
     """The limited quantities of one driven path with their derivatives.
 
     Attributes:
-        grid: what the path shares with others.
         value: (points, quantities), robust forces or those of a program behind them.
         slope: (points, quantities, moving + 2) by the extended pose and its derivatives, u'' and
             u'^2, the joints following.
     """
 
-    grid: IntervalGrid
-    value: Array
-    slope: Array
-    _inputs: tuple[Array, ...]
-    _full: Array
-    _follow: tuple[Array, Array]
-    _pull: tuple[Array, Array]
-    _functions: PolishFunctions
-    _held: Mapping[str, Array] | None
-
-    @classmethod
-    def at(
-        cls,
+    def __init__(
+        self,
         grid: IntervalGrid,
         functions: PolishFunctions,
         x: Array,
         squared: Array,
         near: tuple[Array, Array],
-    ) -> IntervalValues:
+    ) -> None:
         """Evaluate.
 
         Args:
@@ -190,49 +177,41 @@ class IntervalValues:
             squared: (intervals + 1,) u'^2 at the grid points.
             near: joints of both arms (intervals + 1, n) near those that hold the box.
         """
-        path, s = grid.path(x), grid.sample
-        threads = grid.threads
+        self._grid, self._functions = grid, functions
+        path, s, threads = grid.path(x), grid.sample, grid.threads
         held = [
             functions.closure(arm, "first").batch(path[0], near[arm], threads=threads)
             for arm in (0, 1)
         ]
         a = np.repeat(np.diff(squared) * grid.intervals / 2.0, 2)
-        inputs = (*(part[s] for part in path), *(found["q"][s] for found in held), a, squared[s])
-        out = functions.built[DRIVEN_FIRST].batch(*inputs, threads=threads)
-        full = out["slope"]
-        follow = tuple(found["follow"][s] for found in held)
-        slope, value = _followed(grid, full, follow), out["value"]
+        at_points = [part[s] for part in path]
+        self._inputs = (*at_points, *(found["q"][s] for found in held), a, squared[s])
+        out = functions.built[DRIVEN_FIRST].batch(*self._inputs, threads=threads)
+        self._full = out["slope"]
+        self._follow, self._pull = (
+            [found[name][s] for found in held] for name in ("follow", "pull")
+        )
+        slope, value = _followed(grid, self._full, self._follow), out["value"]
         if grid.robust is not None:
-            force, by_motion = grid.robust.at(inputs[:3], a, squared[s])
+            force, by_motion = grid.robust.at(at_points, a, squared[s])
             value = np.hstack([value, force])
             slope = np.concatenate([slope, by_motion], axis=1)
-        pressed = None
+        self._held: Mapping[str, Array] | None = None
         if grid.layout.by_program:
-            pressed = functions.built[held_name("first")].batch(value[:, grid.load])
-            value = np.hstack([value, pressed["normal"]])
-            slope = np.concatenate([slope, _by_load(pressed, slope[:, grid.load])], axis=1)
-        pull = tuple(found["pull"][s] for found in held)
-        return cls(
-            grid,
-            value,
-            slope,
-            inputs,
-            full,
-            (follow[0], follow[1]),
-            (pull[0], pull[1]),
-            functions,
-            pressed,
-        )
+            self._held = functions.built[held_name("first")].batch(value[:, grid.load])
+            value = np.hstack([value, self._held["normal"]])
+            slope = np.concatenate([slope, _by_load(self._held, slope[:, grid.load])], axis=1)
+        self.value, self.slope = value, slope
 
     def at_rest(self, force: float) -> tuple[Array, Array]:
         """Shares (rows,) of what standing still uses at every interval's beginning: of the patches,
         or of a force limit [N] where pads press evenly; and their slopes (rows, moving) by the
         extended pose."""
         begins = [values[::2] for values in self._inputs]
-        still, grid = np.zeros(len(begins[-1])), self.grid
+        still, grid = np.zeros(len(begins[-1])), self._grid
         first = self._functions.built[DRIVEN_FIRST]
         out = first.batch(*begins[:-2], still, still, threads=grid.threads)
-        follow = tuple(along[::2] for along in self._follow)
+        follow = [along[::2] for along in self._follow]
         paper, by_program = grid.workcell.task.allocation == "paper", grid.layout.by_program
         block = grid.layout.block("pressure" if paper else "load" if by_program else "force")
         value, slope = out["value"][:, block], out["slope"][:, block]
@@ -245,7 +224,7 @@ class IntervalValues:
 
     def rows(self) -> Array:
         """(points, kinds) mix . quantities of every inequality."""
-        return self.value @ self.grid.kinds.mix.T
+        return np.asarray(self.value @ self._grid.kinds.mix.T)
 
     def curvature(self, weight: Array) -> tuple[NDArray[np.intp], Array]:
         """Second derivatives of weight . value.
@@ -256,16 +235,16 @@ class IntervalValues:
         Returns:
             The points (m,) with any weight, and (m, moving + 2, moving + 2) of each.
         """
-        if self.grid.robust is not None:
-            weight = self.grid.robust.as_planned(weight, self.value)
+        if self._grid.robust is not None:
+            weight = self._grid.robust.as_planned(weight, self.value)
         pressing = np.zeros((len(weight), 0))
         if self._held is not None:
-            weight, pressing = np.hsplit(weight, [self.grid.layout.size])
+            weight, pressing = np.hsplit(weight, [self._grid.layout.size])
             weight = weight.copy()
-            weight[:, self.grid.load] += np.einsum("prl,pr->pl", self._held["slope"], pressing)
+            weight[:, self._grid.load] += np.einsum("prl,pr->pl", self._held["slope"], pressing)
         at = np.flatnonzero(np.abs(weight).max(axis=1) > 0.0)
-        n, variables = len(at), self.grid.layout.variables
-        pose, moving = self.grid.pose, self.grid.moving
+        n, variables = len(at), self._grid.layout.variables
+        pose, moving = self._grid.pose, self._grid.moving
         local = moving + 2
         spread = np.zeros((n, local, variables))
         spread[:, np.arange(moving), np.arange(moving)] = 1.0
@@ -278,7 +257,7 @@ class IntervalValues:
         repeated = [np.repeat(values[at], local, axis=0) for values in self._inputs]
         along_all = np.repeat(weight[at], local, axis=0), spread.reshape(-1, variables)
         second = self._functions.built[DRIVEN_SECOND]
-        change = second.batch(*repeated, *along_all, threads=self.grid.threads)["change"]
+        change = second.batch(*repeated, *along_all, threads=self._grid.threads)["change"]
         total = change.reshape(n, local, variables) @ np.swapaxes(spread, 1, 2)
         # How the joints' own curvature along the path adds to it, see `symbolic.smooth.places`.
         slope = np.einsum("pk,pkv->pv", weight[at], self._full[at])
@@ -296,7 +275,7 @@ class IntervalValues:
         if self._held is not None:
             pressed = self._functions.built[held_name("second")]
             bent = pressed.batch(self._held["state"][at], pressing[at])["curvature"]
-            by_motion = self.slope[at][:, self.grid.load]
+            by_motion = self.slope[at][:, self._grid.load]
             total += np.swapaxes(by_motion, 1, 2) @ bent @ by_motion
         return at, (total + np.swapaxes(total, 1, 2)) / 2.0
 
@@ -306,7 +285,7 @@ def _by_load(pressed: Mapping[str, Array], slope: Array) -> Array:
     return np.asarray(pressed["slope"] @ slope)
 
 
-def _followed(grid: IntervalGrid, full: Array, follow: tuple[Array, ...]) -> Array:
+def _followed(grid: IntervalGrid, full: Array, follow: Sequence[Array]) -> Array:
     """Slopes by pose, derivatives, u'' and u'^2 where the joints follow the pose."""
     slope = np.concatenate([full[:, :, : grid.moving], full[:, :, -2:]], axis=2)
     start = grid.moving

@@ -10,7 +10,7 @@ other forbids.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -83,7 +83,7 @@ class RobustForces:
         self._forces, self._pose = robust_path(workcell), pose
         self._branches = planned_branches(workcell)
 
-    def at(self, path: tuple[Array, ...], a: Array, w: Array) -> tuple[Array, Array]:
+    def at(self, path: Sequence[Array], a: Array, w: Array) -> tuple[Array, Array]:
         """(points, ROBUST_ROWS) [N], and their slopes (points, ROBUST_ROWS, 3 pose + 2) by the
         extended pose and its derivatives, u'' and u'^2.
 

@@ -89,13 +89,8 @@ class DistanceKind(Kind[PlaceRow]):
 
     def violations(self, carry: PlacedCarry) -> dict[int, Array]:
         """(reached,) distances of every pair that comes too close [m], by pair."""
-        return carry.once("violations", lambda: self._violations(carry))
-
-    def _violations(self, carry: PlacedCarry) -> dict[int, Array]:
         close = carry.distances.lowered < self.least
         pairs = np.flatnonzero(close.any(axis=0)).tolist()
-        if not pairs:
-            return {}
         truth = carry.distances.at(close)
         return {pair: truth[:, pair].copy() for pair in pairs}
 
@@ -240,7 +235,7 @@ def near_gaps(kind: DistanceKind, carry: PlacedCarry) -> Iterable[tuple[int, Gap
     """Every separable pair that comes near, and its gaps."""
     for pair in np.flatnonzero(carry.distances.bounds.min(axis=0) < FAR_GAP_DISTANCE).tolist():
         if pair in kind.separable:
-            yield pair, gaps_of(kind, carry, pair)
+            yield pair, Gaps.of(carry.gaps(pair))
 
 
 def violated_passages(
@@ -251,16 +246,7 @@ def violated_passages(
     for pair, distance in kind.violations(carry).items():
         if pair not in kind.separable:
             continue
-        gaps = gaps_of(kind, known, pair)
+        gaps = Gaps.of(known.gaps(pair))
         kinks = edges(gaps, KINK_DISTANCE)
         for place in lowest(distance, float(kind.least[pair])):
             yield pair, gaps, place, [k for k in kinks if abs(k[1] - place) <= window]
-
-
-def gaps_of(kind: DistanceKind, carry: PlacedCarry, pair: int) -> Gaps:
-    """Gaps of a separable pair at the places of a carry."""
-
-    def find() -> Gaps:
-        return Gaps.of(carry.gaps(pair))
-
-    return carry.once(("gaps", pair), find)

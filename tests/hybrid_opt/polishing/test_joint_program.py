@@ -66,7 +66,7 @@ class Programs:
             x[: len(spread)] += spread @ d[: spread.shape[1]]
             squared[1:-1] *= 1.0 + d[-len(squared) + 2 :]
         functions, joints = self.cell.functions, self.timed.joints
-        values = IntervalValues.at(self.intervals, functions, x, squared, joints)
+        values = IntervalValues(self.intervals, functions, x, squared, joints)
         required: dict[Row, float] = dict.fromkeys(ROWS, 0.01)
         grid = self.intervals
         return JointProgram(grid, values, x, squared, self.cell, required, self.carry)
