@@ -1,11 +1,10 @@
 """From functions and C text to loaded libraries: found in the cache, else compiled side by side.
 
 There is one way for all of them. A `Source` is C to compile: of one CasADi function with its
-driver, of one that is written by hand, of a program (`load_or_build_program`) or of our own C alone
-(`load_or_build_library`). Its library is kept under a key of the text and of what compiles it;
-long functions in it are parts, object files under keys of their own. What sources are made from has
-a key as well, a recipe's: under it the cache holds the keys of the libraries, so that a warm start
-makes neither expressions nor C.
+driver, of one that is written by hand, or of a program (`load_or_build_program`). Its library is
+kept under a key of the text and of what compiles it; long functions in it are parts, object files
+under keys of their own. What sources are made from has a key as well, a recipe's: under it the
+cache holds the keys of the libraries, so that a warm start makes neither expressions nor C.
 """
 
 from __future__ import annotations
@@ -14,12 +13,11 @@ import ctypes
 import os
 import platform
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from functools import partial
-from importlib.resources import files
 from pathlib import Path
 from threading import Lock
 from typing import TYPE_CHECKING, Any
@@ -326,25 +324,6 @@ def load_or_build_program(
     cache = cache or Cache()
     full = key_of("program", name=name, of=_set_key(key, None, lanes, cache), own=own)
     return _obtained(full, source, cache)[name].handle
-
-
-def c_text(package: str, names: Sequence[str]) -> str:
-    """C files of a package, one after the other."""
-    return "\n".join(files(package).joinpath(name).read_text() for name in names)
-
-
-def load_or_build_library(name: str, text: str, cache: Cache | None = None) -> ctypes.CDLL:
-    """A library of our own C alone, from the cache where it was built before.
-
-    Args:
-        name: for messages.
-        text: self-contained C (`c_text`); what it offers is visible by attribute.
-        cache: where libraries are kept; by default the user's.
-
-    Raises:
-        CodegenError: there is no C compiler; or it cannot be compiled, cached or loaded.
-    """
-    return _compiled([Source(name, text, HANDWRITTEN_LEVEL)], cache or Cache())[name][0].handle
 
 
 def _sources_of(

@@ -54,7 +54,7 @@ class SceneError(DualArmError):
 
 
 class BridgeError(DualArmError):
-    """The compiled Pinocchio-CasADi bridge is missing or was built for other versions."""
+    """What installing compiles is missing, or was built for other versions."""
 
 
 class CollisionModelError(DualArmError):

@@ -349,19 +349,15 @@ def build_all(makers: Sequence[Maker], progress: Progress) -> list[DualArmError]
 def _makers(cell: Cell, polish: bool) -> Iterator[Maker]:
     # Not imported at the top: who builds a few functions needs none of it.
     from hybrid_opt.polishing.drive import is_polishable
-    from hybrid_opt.polishing.rows import row_library
-    from hybrid_opt.polishing.solvers.dense import dense_method
-    from hybrid_opt.polishing.solvers.quadratic import quadratic_method
     from hybrid_opt.robust.force import at_rest, pressing_model, robust_model
     from hybrid_opt.timing.model import TimingModel
     from hybrid_opt.timing.path_timer import PATH_INTERVALS
 
-    compiled, workcell, cache = cell.compiled, cell.workcell, cell.compiled.cache
+    compiled, workcell = cell.compiled, cell.workcell
     driven = workcell.task.time_law == "optimal"
     known = is_polishable(workcell, cell.force_kind.robust) if driven else workcell.has_facing_pads
-    polished = polish and known
     yield lambda: cell.evaluator
-    if polished:
+    if polish and known:
         yield lambda: cell.polish_functions
     if driven:
         yield lambda: cell.path_timer
@@ -371,6 +367,3 @@ def _makers(cell: Cell, polish: bool) -> Iterator[Maker]:
     yield lambda: robust_model(workcell)
     if driven:
         yield lambda: pressing_model(workcell).nominal(at_rest())  # built when first asked
-    if polished:
-        yield lambda: (quadratic_method(cache), dense_method(cache))
-        yield lambda: row_library(cache)

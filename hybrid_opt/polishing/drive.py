@@ -41,7 +41,7 @@ from hybrid_opt.polishing.solvers.quadratic import (
     QuadraticAnswer,
     QuadraticProgram,
     convex,
-    quadratic_method,
+    solve_quadratic,
 )
 from hybrid_opt.robust.path_force import PathPoints, robust_path
 from hybrid_opt.timing.drive import CandidateDriver
@@ -245,7 +245,6 @@ class DriveWay(Way[DrivePoint, DriveStep]):
         self._intervals = IntervalGrid(
             cell.workcell, intervals, self._spread, driver.robust, threads
         )
-        self._method = quadratic_method(cell.evaluator.compiled.cache)
         self.stated = self
         if task.pieces > 1 and not by_stated:
             self.stated = DriveWay(cell, by_stated=True)
@@ -360,10 +359,10 @@ class DriveWay(Way[DrivePoint, DriveStep]):
         for left in reversed(range(ROW_ROUNDS)):
             linear = program.linear(chosen, bent)
             asked = QuadraticProgram(model[0], g, linear.A, linear.b, *box)
-            answer = self._method(asked)
+            answer = solve_quadratic(asked)
             if answer is None:
                 # Rows that the box has no room for are asked for as far as they are kept now.
-                answer = self._method(replace(asked, b=np.maximum(linear.b, 0.0)))
+                answer = solve_quadratic(replace(asked, b=np.maximum(linear.b, 0.0)))
             if answer is None:
                 return None
             found = _StepAnswer(answer, linear)

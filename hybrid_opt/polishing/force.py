@@ -31,7 +31,7 @@ from hybrid_opt.polishing.point import Climb, ClimbPoint, Solution, Step, StepVe
 from hybrid_opt.polishing.rows import HELD, Layout, Row, Rows
 from hybrid_opt.polishing.settings import PolishSettings
 from hybrid_opt.polishing.solvers.base import Residuals, Solve, optimality
-from hybrid_opt.polishing.solvers.dense import dense_method
+from hybrid_opt.polishing.solvers.dense import dense
 from hybrid_opt.polishing.solvers.ipopt import ipopt
 from symbolic.array import Array
 
@@ -314,8 +314,7 @@ class ForceSolver:
     def __init__(self, cell: SmoothCell, settings: PolishSettings) -> None:
         self.cell, self._settings = cell, settings
         self.active, self.reader = ActiveSet(cell), CarryReader(cell)
-        cache = cell.evaluator.compiled.cache
-        self.method: Solve = ipopt if settings.solver == "ipopt" else dense_method(cache)
+        self.method: Solve = ipopt if settings.solver == "ipopt" else dense
 
     def solve(self, x: Array, target: Target, radius: float, reach: Reach = "usual") -> Solution:
         """Improve a feasible decision vector (n_var,) towards a target.

@@ -4,7 +4,7 @@ A row stands at a sample or at a place of the path. Forces and pressure at sampl
 the decision vector; what stands at a place depends on the box pose there, on its rate, which are
 linear in the decision vector, and on the joints that hold the box (`symbolic.smooth.places` has the
 formulas). Functions of CasADi give values and derivatives of many samples or places at a call; here
-the arrays that they work on are laid out, and `rows.c` calls them and puts rows together: what
+the arrays that they work on are laid out, and `rows.cpp` calls them and puts rows together: what
 NumPy does between them, in many small arrays, takes longer than the functions themselves.
 """
 
@@ -12,18 +12,17 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
 
-from codegen.cache import Cache
-from codegen.errors import CodegenError
+from codegen.function import NumericFunction, PreparedBatch
 from hybrid_opt.polishing.cell import Indices, PolishFunctions, SmoothCell
-from hybrid_opt.polishing.native import Native, Records, native
+from hybrid_opt.polishing.native import native
 from symbolic.array import Array
 from symbolic.records.task import POSE_SIZE
-from symbolic.smooth.places import PlaceConstraint
+from symbolic.smooth.places import ORDERS, PlaceConstraint
 from symbolic.smooth.samples import WIDTHS, Quantity, held_name, sample_name
 
 HELD = 5
@@ -91,34 +90,17 @@ class Layout:
         self.n_rows = int(self.places.stop)
 
 
-NEGLIGIBLE = 1e-7
-"""Share of the largest weight below which second derivatives are left out: those of rows that are
-far from ruling, whose multipliers vanish. It changes steps by as much, no solution."""
-
-INPUTS = ("pose", "rate", "q_1", "q_2", "numbers", "weight")
-"""Inputs of functions of rows at places, in their order in a record."""
-
-_FORCES, _LOADS, _PRESSURE, _ARMS, _GROUPS = 1, 51, 101, 201, 301
-"""As in `rows.c`: from where what has to be prepared is counted."""
-
-
 class _SampleRows:
     """Some values of each of some samples, from the decision vector.
 
     Attributes:
         column: (n_samples,) position of a sample among the values, -1 where it has none.
-        x: (n_var,) where they are evaluated.
-        found, gradients: (count, width), (count, width, n_var) there.
-        record: for C.
+        found, gradients: (count, width), (count, width, n_var) where they were evaluated last.
+        given: to `rows.cpp`.
     """
 
     def __init__(
-        self,
-        cell: SmoothCell,
-        quantity: Quantity,
-        wanted: Collection[int],
-        memory: Records,
-        beyond: int = 0,
+        self, cell: SmoothCell, quantity: Quantity, wanted: Collection[int], beyond: int = 0
     ) -> None:
         """A program's samples.
 
@@ -126,7 +108,7 @@ class _SampleRows:
             wanted: samples without which a call is left out.
             beyond: samples whose values follow, which others find.
         """
-        self._memory, self._quantity, self._functions = memory, quantity, cell.functions
+        built = cell.functions.built
         chosen = [
             block.samples[np.isin(block.samples, list(wanted)).any(axis=1)] for block in cell.blocks
         ]
@@ -135,65 +117,39 @@ class _SampleRows:
         last = max(int(block.samples.max(initial=0)) for block in cell.blocks)
         self.column = np.full(1 + last, -1)
         self.column[served] = np.arange(len(served))
-        self.x, self.found = np.zeros(n_var), np.zeros((count, width))
+        x, self.found = np.zeros(n_var), np.zeros((count, width))
         self.gradients = np.zeros((count, width, n_var))
-        self._names, records, start = list[str](), list[Any](), 0
+        blocks, start = list[dict[str, Any]](), 0
         for block, samples in zip(cell.blocks, chosen, strict=True):
             if not len(samples):
                 continue
             rows, n = slice(start, start + samples.size), len(samples)
             given = {
-                "x": self.x,
+                "x": x,
                 "values": self.found[rows].reshape(n, -1),
                 "gradient": self.gradients[rows].reshape(n, -1, n_var),
             }
-            first = cell.functions.built[sample_name(quantity, block.block, "first")]
-            batch = first.prepared(n, ("x", "rounding"), given)
+            orders = (built[sample_name(quantity, block.block, order)] for order in ORDERS)
+            function, second = orders
+            first = function.prepared(n, ("x", "rounding"), given)
             basis = block.basis[np.isin(block.samples, samples).all(axis=1)]
-            batch.inputs["basis"][...] = basis
-            batch.inputs["rounding"][...] = ROUNDING
-            records.append(
-                memory.new(
-                    "Block",
-                    served=samples.shape[1],
-                    n=n,
-                    start=start,
-                    window=basis[0].size,
-                    first=memory.call(batch),
-                    basis=basis,
-                )
+            first.inputs["basis"][...] = basis
+            first.inputs["rounding"][...] = ROUNDING
+            along = partial(_along_all, second, n, n_var)
+            blocks.append(
+                {"start": start, "served": samples.shape[1], "basis": basis}
+                | {"first": first, "second": along}
             )
-            self._names.append(sample_name(quantity, block.block, "second"))
             start = rows.stop
-        self._blocks = memory.array("Block", records)
-        self.record = memory.new(
-            "Samples",
-            count=count,
-            blocks=len(records),
-            width=width,
-            block=self._blocks,
-            x=self.x,
-            values=self.found,
-            gradients=self.gradients,
-            weight=np.empty((count, width)),
-        )
+        self.given = {"x": x, "values": self.found, "gradients": self.gradients, "blocks": blocks}
 
-    def prepare(self, k: int) -> None:
-        """The second derivatives of a function along every direction of x: each of its samples is
-        evaluated n_var times. Most programs need those of few."""
-        block, n_var = self._blocks + k, len(self.x)
-        second = self._functions.built[self._names[k]]
-        batch = second.prepared(block.n * n_var, ("x", "rounding"))
-        batch.inputs["rounding"][...] = ROUNDING
-        batch.inputs["along"][...] = np.tile(np.eye(n_var), (block.n, 1))
-        self._memory.fill(
-            block,
-            second=self._memory.call(batch),
-            x=batch.inputs["x"],
-            columns=batch.inputs["basis"],
-            weight=batch.inputs["weight"],
-            curvature=batch.outputs["curvature"],
-        )
+
+def _along_all(second: NumericFunction, n: int, n_var: int) -> PreparedBatch:
+    """Second derivatives along every direction of x: each sample is evaluated n_var times."""
+    batch = second.prepared(n * n_var, ("x", "rounding"))
+    batch.inputs["rounding"][...] = ROUNDING
+    batch.inputs["along"][...] = np.tile(np.eye(n_var), (n, 1))
+    return batch
 
 
 class Rows:
@@ -226,115 +182,66 @@ class Rows:
         Raises:
             DualArmError: a function cannot be built.
         """
-        library, n_var = row_library(cell.evaluator.compiled.cache), cell.task.n_var
-        self._cell, self._c, self._memory = cell, library.functions, Records(library)
-        n_rows = layout.n_rows
-        mix = np.zeros((0, 2)) if mix is None else mix
-        fixed = np.zeros((n_rows, 0)) if fixed is None else fixed
-        self._x, self._tail = np.empty(n_var), np.empty(fixed.shape[1])
-        self.offset, self._values = np.zeros(n_rows), np.empty(n_rows)
-        self._jacobian = np.hstack([np.zeros((n_rows, n_var)), fixed])
-        self._points, self._multipliers = cell.still.copy(), np.empty(n_rows)
-        self._curvature = np.empty((n_var, n_var))
-        sampled = self._lay_out_samples(layout)
-        self._program = self._memory.new(
-            "Program",
-            n_var=n_var,
-            n_path=len(cell.free[0]),
-            n_rows=n_rows,
-            width=self._jacobian.shape[1],
-            first_patch=layout.patches.start,
-            first_place=layout.places.start,
-            waypoints=len(cell.still),
-            negligible=NEGLIGIBLE,
-            **sampled,
-            **self._lay_out_places(layout.place_rows, q),
-            x=self._x,
-            tail=self._tail,
-            fixed=fixed,
-            offset=self.offset,
-            mix=mix,
-            free_row=cell.free[0],
-            free_column=cell.free[1],
-            still=cell.still,
-            points=self._points,
-            values=self._values,
-            jacobian=self._jacobian,
-            curvature=self._curvature,
-            multipliers=self._multipliers,
+        self._cell, self.offset = cell, np.zeros(layout.n_rows)
+        self._native = native().Rows(
+            mix=np.zeros((0, 2)) if mix is None else mix,
+            fixed=np.zeros((layout.n_rows, 0)) if fixed is None else fixed,
+            **self._lay_out_samples(layout),
+            **self._lay_out_places(layout, q),
         )
 
     def _lay_out_samples(self, layout: Layout) -> dict[str, Any]:
         """Forces and pressure. Where forces are no branches, they come from what a sample's load
         asks of the pads (`symbolic.smooth.samples.held_functions`); derivatives by the decision
         vector follow by the chain rule, so that no load is solved for twice at a place."""
-        cell, memory = self._cell, self._memory
-        rows = layout.force_rows
-        held = sorted({row.sample for row in rows if row.branch == HELD})
+        cell, rows = self._cell, layout.force_rows
+        own = sorted({row.sample for row in rows if row.branch == HELD})
         split = {row.sample for row in rows if row.branch != HELD}
-        forces = _SampleRows(cell, "force", split, memory, beyond=len(held))
+        self._forces = _SampleRows(cell, "force", split, beyond=len(own))
         pressed = {row.sample for row in layout.pressure_rows}
-        patches = _SampleRows(cell, "pressure", pressed, memory)
-        self._sampled = {_FORCES: forces, _PRESSURE: patches}
-        record = dict[str, Any]()
-        column = forces.column
-        by_load = np.full(len(column), -1)
-        if held:
-            start = len(forces.found) - len(held)
-            by_load[held] = start + np.arange(len(held))
-            loads = self._sampled[_LOADS] = _SampleRows(cell, "load", set(held), memory)
-            record["held"] = self._lay_out_held(loads, held, forces.found[start:])
+        self._patches = _SampleRows(cell, "pressure", pressed)
+        by_load, held = np.full(len(self._forces.column), -1), None
+        if own:
+            start = len(self._forces.found) - len(own)
+            by_load[own] = start + np.arange(len(own))
+            loads = _SampleRows(cell, "load", set(own))
+            function, second = (cell.functions.built[held_name(order)] for order in ORDERS)
+            held = {
+                "start": start,
+                "at": loads.column[own],
+                "loads": loads.given,
+                "first": function.prepared(len(own), given={"normal": self._forces.found[start:]}),
+                "second": partial(second.prepared, len(own)),
+            }
+        columns = ((by_load if row.branch == HELD else self._forces.column) for row in rows)
         self._column = np.array(
-            [(by_load if row.branch == HELD else column)[row.sample] for row in rows], dtype=np.intp
+            [column[row.sample] for column, row in zip(columns, rows, strict=True)], dtype=np.intp
         )
-        self._pressed = np.array([row.robot for row in layout.pressure_rows], dtype=np.intp)
-        sample = np.array([row.sample for row in layout.pressure_rows], dtype=np.intp)
-        self._pressed_column = patches.column[sample]
+        robot, sample = (
+            np.array([getattr(row, name) for row in layout.pressure_rows], dtype=np.intp)
+            for name in ("robot", "sample")
+        )
+        self._pressed = 2 * self._patches.column[sample] + robot
         return {
-            "forces": len(rows),
-            "pressed": len(self._pressed),
-            "samples": forces.record,
-            "patches": patches.record,
-            "force_column": self._column,
-            "pressed_column": self._pressed_column,
-            "pressed_robot": self._pressed,
-            **record,
+            "samples": self._forces.given,
+            "patches": self._patches.given,
+            "held": held,
+            "column": self._column,
+            "pressed": self._pressed,
+            "first_patch": layout.patches.start,
         }
 
-    def _lay_out_held(self, loads: _SampleRows, held: list[int], normal: Array) -> Any:
-        """Samples whose normal forces (n, 2) come from their loads."""
-        memory, built, at = self._memory, self._cell.functions.built, loads.column[held]
-        first = built[held_name("first")].prepared(len(held), given={"normal": normal})
-        second = built[held_name("second")].prepared(len(held))
-        return memory.new(
-            "Held",
-            count=len(held),
-            start=len(self._sampled[_FORCES].found) - len(held),
-            size=first.outputs["state"].shape[1],
-            loads=loads.record,
-            first=memory.call(first),
-            second=memory.call(second),
-            at=at,
-            active=np.empty(len(held), dtype=np.intp),
-            load=first.inputs["load"],
-            slope=first.outputs["slope"],
-            state=first.outputs["state"],
-            states=second.inputs["state"],
-            weight=second.inputs["weight"],
-            curvature=second.outputs["curvature"],
-        )
-
-    def _lay_out_places(self, rows: Sequence[PlaceRow], q: tuple[Array, Array]) -> dict[str, Any]:
+    def _lay_out_places(self, layout: Layout, q: tuple[Array, Array]) -> dict[str, Any]:
         """Inside, rows at places stand family by family; the joints of every place that needs them
         are solved once."""
-        cell, memory = self._cell, self._memory
+        cell, rows = self._cell, layout.place_rows
         members: dict[str, list[int]] = {}
         for k, row in enumerate(rows):
             members.setdefault(row.constraint.family, []).append(k)
         order = np.array([k for own in members.values() for k in own], dtype=np.intp)
         there = np.unique(np.array([row.place for row in rows], dtype=np.intp))
         at = np.searchsorted(there, np.array([rows[k].place for k in order], dtype=np.intp))
-        n, (free_row, _) = len(rows), cell.free
+        n, (free_row, free_column) = len(rows), cell.free
         basis, rate_basis = cell.grid.basis[there], cell.grid.rate_basis[there]
         shared = {
             "pose": np.zeros((n, POSE_SIZE)),
@@ -343,90 +250,65 @@ class Rows:
             "q_2": np.zeros((n, q[1].shape[1])),
             "value": np.zeros(n),
         }
-        groups, start = [], 0
-        needed: tuple[list[Indices], list[Indices]] = ([], [])
-        self._families = list[PlaceConstraint]()
+        groups, start = list[dict[str, Any]](), 0
+        needed: tuple[list[Indices], list[Indices]] = ([at[:0]], [at[:0]])
         for own in members.values():
-            constraints, stop = [rows[k].constraint for k in own], start + len(own)
-            group = self._lay_out_group(constraints, slice(start, stop), shared)
-            for arm in constraints[0].arms(cell.functions.model):
+            stop = start + len(own)
+            given = {name: array[start:stop] for name, array in shared.items()}
+            group = self._lay_out_group([rows[k].constraint for k in own], given)
+            for arm in group["arms"]:
                 needed[arm].append(at[start:stop])
-            groups.append(group)
+            groups.append({"start": start, **group})
             start = stop
-        self._groups = memory.array("Group", groups)
         arms = []
         for arm, own_places in enumerate(needed):
-            places = np.unique(np.concatenate([np.empty(0, dtype=np.intp), *own_places]))
-            arms.append(self._lay_out_arm(arm, places, at, basis, q[arm][there]))
-            memory.fill(arms[-1], rows=shared[f"q_{arm + 1}"])
-        self._arms = memory.array("Arm", arms)
+            places = np.unique(np.concatenate(own_places))
+            position = np.zeros(len(there), dtype=np.intp)
+            position[places] = np.arange(len(places))
+            function, second = (cell.functions.closure(arm, order) for order in ORDERS)
+            first = function.prepared(max(1, len(places)))
+            first.inputs["q_reference"][: len(places)] = q[arm][there[places]]
+            arms.append(
+                {
+                    "place": places,
+                    "at": position[at],
+                    "basis": basis[places],
+                    "rows": shared[f"q_{arm + 1}"],
+                    "first": first,
+                    "second": partial(second.prepared, len(places)),
+                }
+            )
         scale = np.array([row.constraint.scale for row in rows], dtype=float)
         return {
-            "n": n,
             "size": cell.task.extended_size,
-            "groups": len(groups),
-            "group": self._groups,
-            "arm": self._arms,
-            "order": order,
+            "groups": groups,
+            "arms": arms,
+            "order": layout.places.start + order,
             "place": at,
-            "scale": scale,
+            "scale": scale[order],
             "whole": basis[at],
             "whole_rate": rate_basis[at],
             "free": basis[:, free_row],
             "free_rate": rate_basis[:, free_row],
+            "free_column": free_column,
             **{name: shared[name] for name in ("pose", "rate", "value")},
         }
 
     def _lay_out_group(
-        self, constraints: Sequence[PlaceConstraint], rows: slice, shared: dict[str, Array]
-    ) -> Any:
-        """Rows of one family; what second derivatives need is filled in when they are asked for:
-        most rows never rule."""
-        functions, one, memory = self._cell.functions, constraints[0], self._memory
-        given = {name: array[rows] for name, array in shared.items()}
+        self, constraints: Sequence[PlaceConstraint], given: dict[str, Array]
+    ) -> dict[str, Any]:
+        """Rows of one family."""
+        functions, one = self._cell.functions, constraints[0]
         first = functions.row(one, "first").prepared(len(constraints), given=given)
         if "numbers" in first.inputs:
             first.inputs["numbers"][...] = row_numbers(constraints, functions)[0]
-        self._families.append(one)
-        gradient = first.outputs["gradient"]
-        record = memory.new(
-            "Group",
-            start=rows.start,
-            stop=rows.stop,
-            moving=one.moving,
-            arms=sum(1 << arm for arm in one.arms(functions.model)),
-            width=gradient.shape[1],
-            first=memory.call(first),
-            gradient=gradient,
-        )
-        for k, name in enumerate(INPUTS):
-            if name in first.inputs:
-                memory.point(record.given, k, first.inputs[name])
-                record.sizes[k] = first.inputs[name][0].size
-        return record
-
-    def _lay_out_arm(self, arm: int, places: Indices, at: Indices, basis: Array, q: Array) -> Any:
-        """An arm at the places where rows need it."""
-        memory, position = self._memory, np.zeros(len(basis), dtype=np.intp)
-        position[places] = np.arange(len(places))
-        first = self._cell.functions.closure(arm, "first").prepared(max(1, len(places)))
-        first.inputs["q_reference"][: len(places)] = q[places]
-        found = first.outputs
-        return memory.new(
-            "Arm",
-            places=len(places),
-            joints=q.shape[1],
-            first=memory.call(first),
-            place=places,
-            at=position[at],
-            active=np.empty(len(places), dtype=np.intp),
-            basis=basis[places],
-            pose=first.inputs["pose"],
-            q=found["q"],
-            follow=found["follow"],
-            pull=found["pull"],
-            pulls=np.empty((len(places), q.shape[1])),
-        )
+        return {
+            "moving": one.moving,
+            "arms": np.array(one.arms(functions.model), dtype=np.intp),
+            "first": first,
+            # Not even compiled before: most rows never rule.
+            "second": lambda: functions.row(one, "second").prepared(len(constraints)),
+        }
 
     def values(self, x: Array, tail: Array | None = None) -> Array:
         """(n_rows,) at x and the further variables.
@@ -434,92 +316,41 @@ class Rows:
         Raises:
             CodegenError: a function failed.
         """
-        self._x[...] = x
-        if tail is not None:
-            self._tail[...] = tail
-        status = self._c.dual_arm_rows_values(self._program, 0)
-        if status == self._c.UNWRAP:
-            # Angles that go the long way.
-            self._points[...] = self._cell.waypoints(x)
-            status = self._c.dual_arm_rows_values(self._program, 1)
-        self._require_done(status)
-        return self._values.copy()
+        further = np.empty(0) if tail is None else tail
+        found = self._native.values(x, further, self._cell.waypoints(x))
+        return np.asarray(self.offset + found)
 
     def slopes(self) -> Array:
         """(n_rows, n_var + k) by all variables where the values were found last."""
-        self._c.dual_arm_rows_slopes(self._program)
-        return self._jacobian.copy()
+        return np.asarray(self._native.slopes())
 
     def curvature(self, multipliers: Array) -> Array:
         """(n_var, n_var) second derivatives of (n_rows,) multipliers . values by x where the slopes
-        were found last; overwritten.
+        were found last.
 
         Raises:
             CodegenError: a function failed.
         """
-        self._multipliers[...] = multipliers
-        while (status := self._c.dual_arm_rows_curvature(self._program)) > 0:
-            self._prepare(status)
-        self._require_done(status)
-        return self._curvature
+        return np.asarray(self._native.curvature(multipliers))
 
     @property
     def forces(self) -> Array:
         """(n_forces, 2) both values of each force row's sample where they were found last."""
-        return self._sampled[_FORCES].found[self._column]
+        return self._forces.found[self._column]
 
     @property
     def force_slopes(self) -> Array:
         """(n_forces, 2, n_var) of these by x; not of joint allocation's."""
-        return self._sampled[_FORCES].gradients[self._column]
+        return self._forces.gradients[self._column]
 
     @property
     def left(self) -> Array:
         """(n_patches,) what is left of the patches where it was found last."""
-        return np.asarray(self._sampled[_PRESSURE].found[self._pressed_column, self._pressed])
+        return self._patches.found.ravel()[self._pressed]
 
     def correct(self, slope: Array, x: Array) -> None:
         """Add (n_forces, n_var) to the slopes of forces, and to values what that makes beside x."""
-        self._memory.fill(self._program, lacking_slope=slope, x_0=x)
-
-    def _prepare(self, which: int) -> None:
-        """The second derivatives that are asked for the first time."""
-        memory, functions = self._memory, self._cell.functions
-        if which >= _GROUPS:
-            group = self._groups + which - _GROUPS
-            second = functions.row(self._families[which - _GROUPS], "second")
-            batch = second.prepared(group.stop - group.start)
-            for k, name in enumerate(INPUTS):
-                if name in batch.inputs:
-                    memory.point(group.inputs, k, batch.inputs[name])
-            memory.fill(group, second=memory.call(batch), hessian=batch.outputs["hessian"])
-        elif which >= _ARMS:
-            arm = self._arms + which - _ARMS
-            batch = functions.closure(which - _ARMS, "second").prepared(arm.places)
-            memory.fill(
-                arm,
-                second=memory.call(batch),
-                hessian=batch.outputs["hessian"],
-                poses=batch.inputs["pose"],
-                joint=batch.inputs["q"],
-                nu=batch.inputs["nu"],
-            )
-        else:
-            first = max(first for first in self._sampled if first <= which)
-            self._sampled[first].prepare(which - first)
-
-    def _require_done(self, status: int) -> None:
-        if status != self._c.DONE:
-            raise CodegenError("a function of the polish's rows failed")
-
-
-def row_library(kept: Cache | None = None) -> Native:
-    """`rows.c`, from a cache where it was built before.
-
-    Raises:
-        CodegenError: it cannot be compiled, cached or loaded.
-    """
-    return native("rows.c", kept)
+        self._native.correct(slope, x)
 
 
 def row_numbers(

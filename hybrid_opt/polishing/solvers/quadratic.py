@@ -4,9 +4,9 @@
 
 The first variables, the border, meet all others. Those behind them are a chain, which meets its
 neighbours only: the waypoints of a path and the squared speeds along it. Such a symmetric matrix
-is a tridiagonal block with a border, factorised in a time that is linear in the chain. The method,
-in `quadratic.c`, is Mehrotra's predictor and corrector (Nocedal and Wright 2006, chapter 16.6) with
-slacks s of the rows and multipliers y, z_low, z_high, until with mu -> 0
+is a tridiagonal block with a border, factorised in a time that is linear in the chain. The method
+is Mehrotra's predictor and corrector (Nocedal and Wright 2006, chapter 16.6), in `quadratic.cpp`,
+with slacks s of the rows and multipliers y, z_low, z_high, until with mu -> 0
 
     H d + g + A^T y - z_low + z_high = 0,   A d + s = b,
     y s = z_low (d - low) = z_high (high - d) = mu.
@@ -19,18 +19,16 @@ are too large, which is rare, Clarabel is asked.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal, get_args
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 from scipy.linalg import eigvalsh_tridiagonal, lapack
 
-from codegen.cache import Cache
-from hybrid_opt.polishing.native import Native, Records, native
+from hybrid_opt.polishing.native import native
 from symbolic.array import Array
 
 TOLERANCE = 1e-8
@@ -218,45 +216,24 @@ class QuadraticAnswer:
         return bool(worst <= CHECKED)
 
 
-SolveQuadratic = Callable[[QuadraticProgram], QuadraticAnswer | None]
-"""A solver of quadratic programs: their least value, None where there is none."""
-
-
-def quadratic_method(cache: Cache | None = None) -> SolveQuadratic:
-    """The method, Clarabel's where its answer does not hold.
-
-    Args:
-        cache: where its library is kept; by default the user's.
+def solve_quadratic(program: QuadraticProgram) -> QuadraticAnswer | None:
+    """The least value, by Clarabel where the own method's answer does not hold; None where there is
+    none.
 
     Raises:
-        CodegenError: it cannot be compiled, cached or loaded.
+        BridgeError: the compiled part is missing.
     """
-    library = native("solvers/quadratic.c", cache)
-
-    def solve(program: QuadraticProgram) -> QuadraticAnswer | None:
-        found = solve_inside(library, program)
-        if found.ending == "infeasible":
-            return None
-        if not found.holds(program):
-            found = solve_by_clarabel(program)
-        return found if found.holds(program) else None
-
-    return solve
+    found = solve_inside(program)
+    if found.ending == "infeasible":
+        return None
+    if not found.holds(program):
+        found = solve_by_clarabel(program)
+    return found if found.holds(program) else None
 
 
-def solve_inside(library: Native, program: QuadraticProgram) -> QuadraticAnswer:
+def solve_inside(program: QuadraticProgram) -> QuadraticAnswer:
     """Iterate until the conditions hold, or multipliers prove that they never do."""
-    H, A, c = program.H, program.A, library.functions
-    k, n, m = len(H.corner), len(H.diagonal), len(A)
-    d, rows, bounds = np.empty(k + n), np.empty(m), np.empty(k + n)
-    records = Records(library)
-    asked = records.new("Program", k=k, n=n, m=m, tolerance=TOLERANCE, **vars(H))
-    given = {name: getattr(A, name) for name in ("border", "column", "left", "right")}
-    records.fill(asked, **given, g=program.g, b=program.b, low=program.low, high=program.high)
-    work = np.empty(c.dual_arm_work(k, n, m))
-    records.fill(asked, d=d, rows=rows, bounds=bounds, work=work)
-    ending: Ending = get_args(Ending)[c.dual_arm_quadratic(asked)]
-    return QuadraticAnswer(d, rows, bounds, ending)
+    return QuadraticAnswer(*native().quadratic(program, TOLERANCE))
 
 
 def solve_by_clarabel(program: QuadraticProgram) -> QuadraticAnswer:

@@ -24,7 +24,7 @@ import pinocchio
 
 from symbolic.errors import BridgeError
 
-_REMEDY = "run `pip install -e .` in the project's folder to compile it for this environment"
+REMEDY = "run `pip install -e .` in the project's folder to compile it for this environment"
 
 
 def frame_kinematics(model: pinocchio.Model, frame: int) -> casadi.Function:
@@ -78,7 +78,7 @@ def require_same_minor(built: dict[str, str], installed: dict[str, str]) -> None
     ]
     if different:
         raise BridgeError(
-            f"the Pinocchio-CasADi bridge does not fit: {'; '.join(different)}; {_REMEDY}"
+            f"the Pinocchio-CasADi bridge does not fit: {'; '.join(different)}; {REMEDY}"
         )
 
 
@@ -89,7 +89,7 @@ def _extension() -> ModuleType:
         extension = import_module("symbolic.robot.bridge._pinocchio_casadi")
     except ImportError as error:
         raise BridgeError(
-            f"the Pinocchio-CasADi bridge cannot be loaded ({error}); {_REMEDY}"
+            f"the Pinocchio-CasADi bridge cannot be loaded ({error}); {REMEDY}"
         ) from error
     require_same_minor(
         {"pinocchio": extension.PINOCCHIO_VERSION, "casadi": extension.CASADI_VERSION},

@@ -19,17 +19,13 @@ from hybrid_opt.polishing.solvers.base import (
     optimality,
     residuals,
 )
-from hybrid_opt.polishing.solvers.dense import dense_method
+from hybrid_opt.polishing.solvers.dense import dense
 from hybrid_opt.polishing.solvers.ipopt import ipopt
 from symbolic.array import Array
 
 Solver = Callable[[Program, int, float], Answer]
 
 BARRIER, LONG = 3e-4, 200
-
-
-def dense(program: Program, iterations: int, barrier: float) -> Answer:
-    return dense_method()(program, iterations, barrier)
 
 
 SOLVERS = pytest.mark.parametrize("solve", [ipopt, dense])

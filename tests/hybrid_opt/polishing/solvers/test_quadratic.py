@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import sys
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from hybrid_opt.polishing.native import Native, native
+from hybrid_opt.polishing.native import native
 from hybrid_opt.polishing.solvers import quadratic
 from hybrid_opt.polishing.solvers.quadratic import (
     BorderedMatrix,
@@ -15,16 +17,12 @@ from hybrid_opt.polishing.solvers.quadratic import (
     QuadraticAnswer,
     QuadraticProgram,
     convex,
-    quadratic_method,
     solve_inside,
+    solve_quadratic,
 )
 from symbolic.array import Array
+from symbolic.errors import BridgeError
 from tests.hybrid_opt.polishing.cells import solved, start, way
-
-
-def inside(of: QuadraticProgram) -> QuadraticAnswer:
-    """By the own method alone."""
-    return solve_inside(native("solvers/quadratic.c"), of)
 
 
 def matrix(rng: np.random.Generator, k: int, n: int) -> BorderedMatrix:
@@ -84,13 +82,28 @@ def assert_optimal(of: QuadraticProgram, found: QuadraticAnswer) -> None:
 @pytest.mark.parametrize("seed", range(40))
 def test_random_programs_agree_with_clarabel(seed: int) -> None:
     of = program(seed)
-    found = quadratic_method()(of)
+    found = solve_quadratic(of)
     assert found is not None
     assert_optimal(of, found)
 
 
+@pytest.fixture
+def fresh_native() -> Iterator[None]:
+    """Have the compiled part looked for again, during the test and after it."""
+    native.cache_clear()
+    yield
+    native.cache_clear()
+
+
+@pytest.mark.usefixtures("fresh_native")
+def test_a_missing_module_names_the_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "hybrid_opt.polishing._native", None)
+    with pytest.raises(BridgeError, match=r"cannot be loaded .*pip install -e \."):
+        solve_quadratic(program(1))
+
+
 def test_clarabel_is_hardly_ever_needed() -> None:
-    endings = [inside(program(seed)).ending for seed in range(60)]
+    endings = [solve_inside(program(seed)).ending for seed in range(60)]
     assert endings.count("solved") == 60
 
 
@@ -113,26 +126,26 @@ def test_what_is_impossible_is_proven_so(seed: int) -> None:
     short = float(rng.uniform(1e-4, 0.3)) * np.abs(entries).sum()
     of = replace(of, A=against, b=np.append(of.b, -of.b[row] - short))
     assert quadratic.solve_by_clarabel(of).ending == "failed"
-    found = inside(of)
+    found = solve_inside(of)
     assert found.ending == "infeasible"
     pull = of.A.pulled(found.rows)
     assert (found.rows >= 0.0).all()
     assert np.minimum(pull * of.low, pull * of.high).sum() > of.b @ found.rows
-    assert quadratic_method()(of) is None
+    assert solve_quadratic(of) is None
 
 
 def test_programs_of_a_polish_agree_with_clarabel(monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[QuadraticProgram] = []
 
-    def recorded(library: Native, of: QuadraticProgram) -> QuadraticAnswer:
+    def recorded(of: QuadraticProgram) -> QuadraticAnswer:
         asked.append(of)
-        return solve_inside(library, of)
+        return solve_inside(of)
 
     monkeypatch.setattr(quadratic, "solve_inside", recorded)
     solved(way(), start(52.0), 4)
     assert len(asked) > 10
     for of in asked:
-        found, other = inside(of), quadratic.solve_by_clarabel(of)
+        found, other = solve_inside(of), quadratic.solve_by_clarabel(of)
         assert (found.ending == "solved") == (other.ending == "solved")
         if found.ending == "solved":
             assert found.holds(of)
@@ -141,17 +154,17 @@ def test_programs_of_a_polish_agree_with_clarabel(monkeypatch: pytest.MonkeyPatc
 
 def test_clarabel_answers_where_the_own_method_does_not(monkeypatch: pytest.MonkeyPatch) -> None:
     of = program(1)
-    whole = inside(of)
+    whole = solve_inside(of)
     cut_off = replace(whole, d=whole.d + 1e-3, ending="failed")
     monkeypatch.setattr(quadratic, "solve_inside", lambda *_: cut_off)
-    found = quadratic_method()(of)
+    found = solve_quadratic(of)
     assert found is not None
     np.testing.assert_allclose(found.d, whole.d, atol=1e-4)
 
 
 def test_wrong_answers_are_not_believed() -> None:
     of = program(1)
-    found = inside(of)
+    found = solve_inside(of)
     assert found.holds(of)
     for wrong in (
         replace(found, d=found.d + 1e-3),
