@@ -85,6 +85,17 @@ def disbelieved(driver: CandidateDriver | None, model: TimingModel, x: Array) ->
     return second_opinion(driver, model, x)
 
 
+def require_told(told: list[tuple[int, int]], attempts: int) -> None:
+    """Attempts done and in all as a polish tells them: never more than are expected, each once."""
+    done, total = np.transpose(told)
+    assert np.unique(done).tolist() == list(range(attempts + 1))
+    assert (np.diff(done) >= 0).all()
+    assert (done <= total).all()
+    assert told[-1] == (attempts, attempts)
+    # What is expected at first is of the right size.
+    assert attempts / 2 <= total[0] <= 2 * attempts
+
+
 def smooth_cell(judge: CandidateEvaluator) -> SmoothCell:
     """What programs of an evaluator's cell share."""
     return SmoothCell(judge, polish_functions(judge.compiled), PolishSettings().clearance)

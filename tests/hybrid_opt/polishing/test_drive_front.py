@@ -23,6 +23,7 @@ from tests.hybrid_opt.polishing.cells import (
     evaluator,
     functions,
     polisher,
+    require_told,
     start,
     tilted,
     way,
@@ -49,14 +50,7 @@ def polished() -> PolishedFront:
 
 
 def test_attempts_never_exceed_those_that_are_expected() -> None:
-    attempts = len(polished().outcomes)
-    done, total = np.transpose(TOLD)
-    assert np.unique(done).tolist() == list(range(attempts + 1))
-    assert (np.diff(done) >= 0).all()
-    assert (done <= total).all()
-    assert TOLD[-1] == (attempts, attempts)
-    # What is expected at first is of the right size.
-    assert attempts / 2 <= total[0] <= 2 * attempts
+    require_told(TOLD, len(polished().outcomes))
 
 
 def test_the_front_dominates_more_than_before() -> None:
@@ -134,12 +128,6 @@ def test_they_do_so_at_the_front_door() -> None:
 
 def test_an_empty_front_stays_empty() -> None:
     assert len(polisher().polish(np.empty((0, 19)), np.random.default_rng(0)).x) == 0
-
-
-def test_the_time_law_chooses_the_polish() -> None:
-    found = Polisher(evaluator(), PolishSettings(attempts=1), functions())
-    assert found.way is not None
-    assert found.solver is None
 
 
 def test_other_objectives_are_refused() -> None:
