@@ -20,15 +20,23 @@ constexpr double NEGLIGIBLE = 1e-7;
 using Map = Eigen::Map<Matrix>;
 using Chosen = std::vector<Index>;
 
+using Numbers = py::array_t<double, py::array::c_style>;
+
+// An array of NumPy itself, never a copy.
+Numbers itself(const py::handle &array) {
+  if (!py::isinstance<Numbers>(array)) throw py::type_error("an array of rows is not contiguous");
+  return py::reinterpret_borrow<Numbers>(array);
+}
+
 // An array of NumPy where it is, by rows of `width` numbers.
 Map shared(const py::handle &array, Index width) {
-  auto found = py::cast<py::array_t<double, py::array::c_style>>(array);
+  Numbers found = itself(array);
   return {found.mutable_data(), found.size() / width, width};
 }
 
 // The same by its first index.
 Map by_rows(const py::handle &array) {
-  auto found = py::cast<py::array_t<double, py::array::c_style>>(array);
+  Numbers found = itself(array);
   Index width = 1;
   for (Index axis = 1; axis < found.ndim(); axis++) width *= found.shape(axis);
   return {found.mutable_data(), found.shape(0), width};
