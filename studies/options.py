@@ -6,7 +6,7 @@ import argparse
 import ast
 from collections.abc import Callable
 from functools import cache
-from importlib.resources import files
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -156,7 +156,10 @@ def stated(name: str) -> Any:
         LookupError: the source states no such value.
     """
     package, *parts = name.split(".")
-    place = Path(str(files(package)))
+    spec = find_spec(package)
+    if spec is None or spec.origin is None:
+        raise LookupError(f"there is no package {package}")
+    place = Path(spec.origin).parent
     while (place / parts[0]).is_dir():
         place /= parts.pop(0)
     names = _statements(place / f"{parts.pop(0)}.py")

@@ -15,6 +15,7 @@ import numpy as np
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.records import Workcell
+from symbolic.records.problems import shown
 from symbolic.records.task import initial_decision, waypoints_of
 
 Outputs = Mapping[str, Array]
@@ -266,7 +267,7 @@ def select_objectives(wanted: Sequence[str | Objective]) -> tuple[Objective, ...
     unknown = [name for name in wanted if isinstance(name, str) and name not in OBJECTIVES]
     if unknown:
         raise SettingsError(
-            f"unknown objective {', '.join(unknown)}; known are {', '.join(OBJECTIVES)}"
+            f"unknown objective {', '.join(map(shown, unknown))}; known are {', '.join(OBJECTIVES)}"
         )
     found = tuple(OBJECTIVES[entry] if isinstance(entry, str) else entry for entry in wanted)
     names = [objective.name for objective in found]

@@ -22,6 +22,7 @@ from hybrid_opt.metaheuristics.guarded import FillingMating, Guarded, WarmSampli
 from hybrid_opt.metaheuristics.mopso import Mopso, MopsoSettings, Points, Share
 from symbolic.array import Array, Range, require_allowed
 from symbolic.errors import SettingsError
+from symbolic.records.problems import shown
 
 Index = Annotated[float, Range(1.0, 1000.0)]
 
@@ -155,7 +156,7 @@ def settings_of(name: str, overrides: Mapping[str, object] | None = None) -> Alg
         SettingsError: unknown algorithm or setting, or a value outside its range.
     """
     if name not in REGISTRY:
-        raise SettingsError(f"unknown algorithm '{name}'; known are {', '.join(REGISTRY)}")
+        raise SettingsError(f"unknown algorithm {shown(name)}; known are {', '.join(REGISTRY)}")
     defaults = REGISTRY[name].defaults
     known = [field.name for field in dataclasses.fields(defaults)]
     unknown = [key for key in overrides or {} if key not in known]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -17,6 +18,7 @@ import pytest
 
 import hybrid_opt as ho
 import symbolic.cell_model
+from codegen.build import compile_function
 from codegen.compiler import Compiler
 from codegen.errors import CodegenError
 from codegen.function import NumericFunction
@@ -136,6 +138,9 @@ print(new.carry(new.initial).normal_force.max(), new.evaluate(new.initial).feasi
 @pytest.mark.process
 def test_a_machine_without_a_compiler_takes_changed_numbers(tmp_path: Path) -> None:
     ho.Cell.load(RACK).evaluate(ho.Cell.load(RACK).initial)  # what the structure needs is built
+    # The compiler that was used last is the one whose libraries are looked for.
+    x = ca.SX.sym("x")
+    compile_function(ca.Function("anew", [x], [x + time.time_ns() % 10**6]))
     without = {name: value for name, value in os.environ.items() if name != "CC"} | {"PATH": ""}
     command = [sys.executable, "-c", PROGRAM]
     done = subprocess.run(command, env=without, capture_output=True, text=True, check=True)

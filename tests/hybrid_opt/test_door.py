@@ -53,7 +53,7 @@ def polished() -> ho.Front:
 
 
 def test_an_unknown_objective_is_refused_where_a_cell_is_loaded() -> None:
-    with pytest.raises(SettingsError, match="unknown objective speed; known are peak_force_1"):
+    with pytest.raises(SettingsError, match="unknown objective 'speed'; known are peak_force_1"):
         ho.Cell.load(RACK, ["speed"])
     with pytest.raises(SettingsError, match="each once"):
         ho.Cell(ho.Cell.load(RACK).workcell, ["duration", "duration"])

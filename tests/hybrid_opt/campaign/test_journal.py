@@ -237,7 +237,7 @@ execution = partial(ExecutionSettings, Path("results"))
         (CampaignSettings, {"seed": -1}, "seed is -1; allowed are whole numbers 0 to"),
         (CampaignSettings, {"algorithms": {}}, "name at least one"),
         (CampaignSettings, {"algorithms": {"nsga3": {}}}, "unknown algorithm 'nsga3'; known are"),
-        (CampaignSettings, {"objectives": ("speed",)}, "unknown objective speed; known are"),
+        (CampaignSettings, {"objectives": ("speed",)}, "unknown objective 'speed'; known are"),
         (CampaignSettings, {"constraint_handling": "hope"}, "known are penalty, constraints"),
         (CampaignSettings, {"first_generation": "lucky"}, "'lucky'; known are initial, random"),
         (chosen, {"names": ()}, "name at least one, each once"),

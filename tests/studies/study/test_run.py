@@ -217,7 +217,7 @@ def test_interrupt_while_compiling_ends_at_once(tmp_path: Path) -> None:
         (["--evaluations", "many"], "argument --evaluations: invalid int value: 'many'"),
         (["--evaluations", "0"], "evaluations is 0; allowed are whole numbers 1 to"),
         (["--algorithm", "nsga3"], "unknown algorithm 'nsga3'; known are nsga2, mopso"),
-        (["--objective", "speed"], "unknown objective speed; known are peak_force_1"),
+        (["--objective", "speed"], "unknown objective 'speed'; known are peak_force_1"),
         (["--constraint-handling", "hope"], "invalid choice: 'hope'"),
         (["--first-generation", "lucky"], "invalid choice: 'lucky'"),
         (["--population", "nsga2"], "found 'nsga2'; allowed is NAME=N"),
