@@ -250,7 +250,8 @@ class PolishRun(ABC, Generic[AnyAttempt]):
 
 def use_one_thread() -> None:
     """Keep IPOPT's BLAS from spinning on cores that other workers use: its matrices are too small
-    for threads. It is loaded with the first solve, too late for `hybrid_opt.work.threads`."""
+    for threads. It is loaded with the first solve, too late for
+    `hybrid_opt.work.service.one_thread`."""
     for library in Path(casadi.__file__).parent.glob("*openblas*.so*"):
         with suppress(OSError, AttributeError):
             ctypes.CDLL(str(library)).openblas_set_num_threads(1)

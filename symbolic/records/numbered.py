@@ -107,7 +107,7 @@ class GraspNumbers:
         load_to_left, free_to_left: (b, 6) and (b, m - b), what the load and the free components
             leave to the others, in units of `symbolic.contact.grasp.Grasp.units`.
         to_robots: (6, 6 k) from all pads' wrenches to force and moment of the robot that has the
-            pad, see `symbolic.contact.grasp.robot_wrenches`.
+            pad, see `symbolic.contact.force_closure`.
         shapes: per pad what its cone depends on, its lengths over its radius; () of a disc.
         load_at_rest: (6,) direction of the load at the start.
         rest, rest_slopes: (n,) and (n, 6) states on the central path there, and their slopes.
