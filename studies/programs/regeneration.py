@@ -4,17 +4,22 @@ from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
-from pathlib import Path
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
 from codegen.build import FunctionReport, build
 from codegen.cache import Cache, largest_size
 from codegen.interpreted import Agreement, compare
+from hybrid_opt.compiled_cell import EVALUATOR_LANES, EVALUATORS, SCREENING, CompiledCell
 from hybrid_opt.display.table import text_table
-from studies.program import FAULT, Finding, print_findings
+from studies.program import FAULT, Finding, load_workcell, print_findings
+from symbolic.records import Workcell
+
+if TYPE_CHECKING:
+    import casadi as ca
 
 
 def regenerate(options: argparse.Namespace) -> int:
@@ -27,58 +32,79 @@ def regenerate(options: argparse.Namespace) -> int:
 def _regenerated(
     cache: Cache, options: argparse.Namespace, found: list[Agreement]
 ) -> Iterator[Finding]:
-    """What is done, one after the other; comparisons are added to `found`."""
+    """Yield one finding per action; comparisons are added to `found`.
+
+    The workcell is read and its expressions are made before `--clean` removes anything.
+    """
+    largest = largest_size()
+    cell = (
+        None if options.workcell is None else CompiledCell(load_workcell(options.workcell), cache)
+    )
+    sets = [] if cell is None or (options.study and not options.clean) else _function_sets(cell)
     yield Finding({"cache": str(cache.folder)})
     if options.clean:
         removed = cache.clean()
         said = f"{removed} libraries removed from {cache.folder}"
         yield Finding({"removed": removed}, (said,))
-    if options.study and options.workcell is not None:
-        seconds = _build_study(options.workcell)
+    if cell is not None and options.study:
+        seconds = _build_study(cell.workcell)
         said = f"what a study needs is in {cache.folder}, after {seconds:.1f} s"
         yield Finding({"seconds": seconds}, (said,))
-    elif options.workcell is not None:
-        yield from _built(cache, options, found)
+    elif cell is not None:
+        yield from _built(cell, sets, cache, options, found)
     if options.cache:
         usage = cache.usage()
         said = (
             f"{cache.folder} holds {usage.libraries} libraries in {usage.files} files, "
-            f"{usage.size / 2**30:.2f} of {largest_size() / 2**30:g} GiB"
+            f"{usage.size / 2**30:.2f} of {largest / 2**30:g} GiB"
         )
         yield Finding({"usage": usage}, (said,))
 
 
-def _build_study(workcell: Path) -> float:
+FunctionSets: TypeAlias = "list[tuple[Mapping[str, ca.Function], str]]"
+"""Functions by name, and the key of their set."""
+
+
+def _function_sets(cell: CompiledCell) -> FunctionSets:
+    """Make the expressions of the evaluator."""
+    from symbolic.functions import arm_functions
+
+    symbols = cell.symbols
+    return [
+        (arm_functions(symbols), cell.key(EVALUATORS, bodies=False)),
+        (symbols.screening, cell.key(SCREENING)),
+    ]
+
+
+def _build_study(workcell: Workcell) -> float:
     """Build all that a study compiles; returns the seconds that it took."""
     from hybrid_opt.campaign.stages import build_study
     from hybrid_opt.cell import Cell
     from hybrid_opt.progress import Progress
 
     begin = time.perf_counter()
-    build_study(Cell.load(workcell), Progress())
+    build_study(Cell(workcell), Progress())
     return time.perf_counter() - begin
 
 
-def _built(cache: Cache, options: argparse.Namespace, found: list[Agreement]) -> Iterator[Finding]:
-    """The functions of the evaluator, and how they compare with the interpreted ones."""
-    from hybrid_opt.compiled_cell import EVALUATOR_LANES, EVALUATORS, SCREENING, CompiledCell
-    from symbolic.functions import arm_functions
+def _built(
+    cell: CompiledCell,
+    sets: FunctionSets,
+    cache: Cache,
+    options: argparse.Namespace,
+    found: list[Agreement],
+) -> Iterator[Finding]:
+    """Compile the functions of the evaluator, and compare them with the interpreted ones."""
     from symbolic.numbers import GROUPS
-    from symbolic.read.cell import load
 
-    workcell = load(options.workcell)
-    cell = CompiledCell(workcell, cache)
+    task = cell.workcell.task
     how = {"rebuild": options.check, "lanes": EVALUATOR_LANES}
-    sets = [
-        (arm_functions(cell.symbols), cell.key(EVALUATORS, bodies=False)),
-        (cell.symbols.screening, cell.key(SCREENING)),
-    ]
     builds = [build(functions, cache, key=key, **how) for functions, key in sets]
     reports = [report for each in builds for report in each.reports]
     yield Finding({"functions": reports}, (_report_table(reports),))
     if not options.check:
         return
-    bounds = {"x": (workcell.task.lower, workcell.task.upper)}
+    bounds = {"x": (task.lower, task.upper)}
     # The cell's own numbers, whatever is drawn.
     bounds |= {name: (cell.vector(name),) * 2 for name in GROUPS}
     rng = np.random.default_rng(options.seed)

@@ -167,18 +167,20 @@ def run_study(
             f"the drivable carries of this cell are only searched, not polished: {UNPOLISHABLE}"
         )
         study = replace(study, drivable_polish=None, polish=None if alone else study.polish)
+    whole = Cell(cell, settings.objectives)
+
+    def prepare() -> None:
+        polish = study.polish is not None or study.drivable_polish is not None
+        build_study(whole, progress, polish, drivable=study.drivable and not alone)
+        whole.require_hold()
+
+    if execution.overwrite:  # a cell that cannot be computed costs no results
+        prepare()
     with open_folder(settings, execution, cell) as folder:
         told = store_branches(folder.root, competition)
         every = stages(study, alone)
         check_stages(folder, every)
-        whole = Cell(cell, settings.objectives)
-        build_study(
-            whole,
-            progress,
-            polish=study.polish is not None or study.drivable_polish is not None,
-            drivable=study.drivable and not alone,
-        )
-        whole.require_hold()
+        prepare()
         run_stages(folder, every, progress)
         return told + study_text(folder.root, study.with_paper, study.recommend_only)
 

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from codegen import source
+from codegen.build import compiler_of
 from codegen.cache import Cache
 from studies.regenerate import main
 from symbolic.errors import WorkcellError
@@ -27,7 +28,8 @@ class TinyCell:
     symbols = SimpleNamespace(screening={})
 
     def __init__(self, workcell: object, cache: Cache) -> None:
-        pass
+        compiler_of(cache)
+        self.workcell = workcell
 
     def key(self, name: str, bodies: bool = True) -> str:
         return f"{name} of a tiny cell"
@@ -51,7 +53,7 @@ def functions(_: object) -> dict[str, ca.Function]:
 @pytest.fixture
 def run(cache: Cache, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Run:
     """The program with a cell of one function in place of the file's; code, output and messages."""
-    monkeypatch.setattr("hybrid_opt.compiled_cell.CompiledCell", TinyCell)
+    monkeypatch.setattr("studies.programs.regeneration.CompiledCell", TinyCell)
     monkeypatch.setattr("symbolic.read.cell.load", tiny)
     monkeypatch.setattr("symbolic.functions.arm_functions", functions)
 
@@ -137,6 +139,28 @@ def test_bad_input_is_one_message_and_nothing_is_begun(
     assert (code, said) == (2, "")
     assert message in told
     assert not cache.folder.exists()
+
+
+@pytest.mark.parametrize("study", [[], ["--study"]])
+@pytest.mark.parametrize("wrong", ["file", "model", "limit", "compiler"])
+def test_nothing_is_removed_before_all_is_checked(
+    run: Run, cache: Cache, wrong: str, study: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cache.write_record("0" * 64, {"kept": True})
+    before = sorted(cache.folder.iterdir())
+    if wrong == "model":
+
+        def refused(_: object) -> None:
+            raise WorkcellError("cell.toml", ("robots: cannot be modelled",))
+
+        monkeypatch.setattr("symbolic.functions.arm_functions", refused)
+    if wrong == "limit":
+        monkeypatch.setenv("DUAL_ARM_CACHE_LIMIT", "much")
+    if wrong == "compiler":
+        monkeypatch.setenv("CC", "/missing/cc")
+    file = "other.toml" if wrong == "file" else "cell.toml"
+    code, _, told = run(file, "--clean", *study)
+    assert (code, sorted(cache.folder.iterdir())) == (2, before), told
 
 
 def test_a_cache_that_others_can_write_to_is_refused(run: Run, cache: Cache) -> None:
