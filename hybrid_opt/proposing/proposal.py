@@ -26,8 +26,9 @@ from hybrid_opt.errors import NoHoldError, ProposalError
 from hybrid_opt.progress import ShowProgress, counted, passed_on
 from hybrid_opt.proposing.bases import base_choices
 from hybrid_opt.proposing.bounds import Bounds, Sampling
+from hybrid_opt.proposing.draft import Draft, changes, decision_bounds
 from hybrid_opt.proposing.planner import Place, Stray, freedom, plan, straight_paths
-from hybrid_opt.proposing.problem import Draft, Problem, changes, decision_bounds, read_problem
+from hybrid_opt.proposing.problem import Problem, read_problem
 from hybrid_opt.proposing.setup import Pair, Setup, no_path, prepare
 from hybrid_opt.proposing.trial import BoxAlone, BranchLostError, Trial, grasp_blocked
 from hybrid_opt.proposing.via_points import (

@@ -45,7 +45,7 @@ MAX_TOTAL_BYTES = outside.CELL_BYTES
 MAX_PLAIN_BYTES = 256 * 2**10
 """Text up to this size is stored as it is, anything else compressed."""
 
-_SAFE_PART = re.compile(r"[^\x00-\x1f\x7f/\\:]+")
+_UNSAFE = r"[\x00-\x1f\x7f/\\:]"
 
 
 @dataclass(frozen=True)
@@ -103,8 +103,10 @@ def unpack_cell(stored: CellFiles, folder: Path, check_digest: bool = True) -> W
             workcell is not the one that was stored.
     """
     root = folder.resolve()
-    for name in (*stored.files, *stored.folders, stored.workcell):
-        _check_name(name)
+    named = {"files": stored.files, "folders": stored.folders, "workcell": (stored.workcell,)}
+    for key, names in named.items():
+        for name in names:
+            _check_name(name, f"cell.{key}")
     name = ""
     try:
         for name in stored.folders:
@@ -173,7 +175,7 @@ def cell_from_json(data: Any) -> CellFiles:
     files: dict[str, bytes] = {}
     room = MAX_TOTAL_BYTES
     for index, entry in enumerate(stored.files):
-        _check_name(entry.path)
+        _check_name(entry.path, f"cell.files[{index}].path")
         if entry.path in files:
             raise BundleError(f"cell.files[{index}]: {shown(entry.path)} is stored twice")
         files[entry.path] = _unpacked(entry, f"cell.files[{index}]", room)
@@ -209,12 +211,16 @@ def _unpacked(entry: StoredFile, where: str, room: int) -> bytes:
     return content
 
 
-def _check_name(name: str) -> None:
-    parts = name.split("/")
-    if not all(_SAFE_PART.fullmatch(part) and part not in (".", "..") for part in parts):
+def _check_name(name: str, key: str) -> None:
+    if not _is_plain(name) or ".." in name.split("/"):
         raise BundleError(
-            f"stored path {shown(name)} is not allowed; only plain relative paths are"
+            f"{key}: stored path {shown(name)} is not allowed; only plain relative paths are"
         )
+
+
+def _is_plain(name: str) -> bool:
+    """Return True if every system can hold a normalised relative path; it may lead upwards."""
+    return all(part not in ("", ".") and not re.search(_UNSAFE, part) for part in name.split("/"))
 
 
 def _check_references(stored: CellFiles, root: Path) -> None:
@@ -305,6 +311,7 @@ class CellCollector:
         files = {joined(base, name): content for name, content in self._files.items()}
         files[workcell] = self._text
         folders = dict.fromkeys(joined(base, name) for name in self._folders)
+        folders.pop(".", None)  # the workcell file's own folder exists in any case
         return workcell, files, tuple(folders)
 
     def _place(self, reference: str) -> str:
@@ -312,16 +319,20 @@ class CellCollector:
         return posixpath.normpath(self._address(reference))
 
     def _address(self, reference: str) -> str:
-        """What takes the place of a reference in the stored file; itself where it is relative."""
-        if not posixpath.isabs(reference) and not reference.startswith(PACKAGE_SCHEME):
-            return reference
+        """Return the stored file's reference: the same if it is relative and any system can hold
+        it."""
+        place = posixpath.normpath(reference)
+        if not reference.startswith(PACKAGE_SCHEME) and (place == "." or _is_plain(place)):
+            turns_back = reference.split("/").count("..") > place.split("/").count("..")
+            return place if turns_back else reference  # the folder in between is not stored
         if reference not in self._places:  # both robots may name one file
             self._places[reference] = self._new_place(reference)
         return self._places[reference]
 
     def _new_place(self, reference: str) -> str:
         self._moved += 1
-        return f"embedded/{self._moved}/{posixpath.basename(reference) or 'folder'}"
+        name = re.sub(_UNSAFE, "_", posixpath.basename(posixpath.normpath(reference)))
+        return f"embedded/{self._moved}/{name or 'folder'}"
 
     def _with_meshes(self, robot: Robot, place: str, packages: list[tuple[Path, str]]) -> bytes:
         """Add the meshes of a URDF; its content with this machine's addresses replaced."""
@@ -334,7 +345,7 @@ class CellCollector:
             if mesh is None:
                 continue
             target = self._own_place(address, path, place, packages)
-            if target is None:
+            if target is None or not _is_plain(target):
                 # Below the URDF's folder, whose own name the address need not know.
                 relative = self._new_place(mesh.as_posix())
                 target = joined(posixpath.dirname(place), relative)

@@ -17,7 +17,6 @@ from hybrid_opt.proposing.bounds import Sampling
 from hybrid_opt.proposing.problem import (
     Problem,
     contact_points,
-    decision_bounds,
     read_problem,
 )
 from symbolic.array import Array
@@ -27,8 +26,6 @@ from symbolic.read.editing import completed, merged
 from symbolic.records.poses import rotation_from_rpy
 from tests.hybrid_opt.proposing.problems import BAXTER, tiago_problem
 from tests.hybrid_opt.proposing.test_proposal import rack_problem
-from tests.odd_cells import turned_cell
-from tests.symbolic.cells import hand_cell, with_task
 
 POST = Path("studies/problems/past-a-post.toml")
 
@@ -306,25 +303,3 @@ def test_when_time_is_up_the_best_bounds_so_far_are_taken(calls: int) -> None:
     found = replace(how, out_of_time=out_of_time).bounds_around(np.full(6, 0.2))
     assert found.candidates >= 32
     assert how.feasible(found.carry[None])[0]
-
-
-@pytest.mark.parametrize("pitch", [-3.0, 0.0, 1.4, 2.0, 3.1])
-def test_limits_hold_a_box_at_any_pitch(pitch: float) -> None:
-    cell = with_task(hand_cell(), initial=np.array([[0.0, 0.0, 1.0, 0.1, pitch, -0.2]] * 3))
-    unit, limits = decision_bounds(cell)
-    x = cell.task.initial.ravel()
-    assert unit.shape == x.shape
-    assert np.all(limits[0] < x)
-    assert np.all(limits[1] > x)
-    assert np.abs(limits[:, 4]).max() <= 6.28
-
-
-@pytest.mark.parametrize("length", [0.0, 2.0, 4.5])
-def test_corners_of_limits_are_rotation_vectors_that_files_may_hold(length: float) -> None:
-    pose = np.array([0.0, 0.0, 1.0, 0.0, length, 0.0])
-    cell = turned_cell()
-    _, limits = decision_bounds(with_task(cell, initial=np.array([pose] * 3)))
-    farthest = np.abs(limits[:, 3:6]).max(axis=0)
-    assert np.linalg.norm(farthest) <= 5.0
-    assert np.all(limits[0, 3:6] <= pose[3:])
-    assert np.all(limits[1, 3:6] >= pose[3:])

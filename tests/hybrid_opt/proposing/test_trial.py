@@ -11,9 +11,10 @@ import pytest
 import trimesh
 
 from hybrid_opt.errors import JobError
+from hybrid_opt.proposing.draft import Draft, changes
 from hybrid_opt.proposing.holding import ArmKinematics
 from hybrid_opt.proposing.planner import Place, Stray, freedom, plan, straight, straight_paths
-from hybrid_opt.proposing.problem import Draft, changes, read_problem
+from hybrid_opt.proposing.problem import read_problem
 from hybrid_opt.proposing.proposal import ProposeSettings
 from hybrid_opt.proposing.proposal import _Search as Search
 from hybrid_opt.proposing.setup import Setup, prepare, redundancy

@@ -1,0 +1,97 @@
+"""Decimal numbers for proposed files: rounded outwards, within what the reader allows."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from symbolic.array import Array
+from symbolic.read.task import MOST_TURN
+from symbolic.records import POSE_SIZE, Workcell
+from symbolic.records.poses import Orientation
+
+UNITS = 1e4
+"""Reciprocal of the unit that bounds are rounded to [1/m, 1/rad]."""
+
+ROUNDING = 6
+"""Decimals of a number in these units that count; the rest is floating-point error."""
+
+USUAL_POSE = np.array([10.0, 10.0, 10.0, 3.14, 1.57, 3.14])
+"""Bounds of a pose that need no excess: the file's for positions, one turn for angles [m, rad]."""
+
+ANGLE_ROOM = 0.5
+"""Range of angles about a carry beyond `USUAL_POSE` [rad]."""
+
+ANGLE_LIMIT = 6.28
+"""Largest angle of a bound: the file's limit is a full turn [rad]."""
+
+VECTOR_LIMIT = MOST_TURN - 0.01
+"""Largest rotation vector of a bound, if the carry itself has none larger [rad]."""
+
+LEAST_ROOM = 1e-3
+"""Range about a rotation vector at its limit, towards zero [rad]."""
+
+
+def pose_limits(pose: Array, orientation: Orientation) -> Array:
+    """Compute the limits (2, 6) of bounds around a pose (6,), which lies between them."""
+    high = USUAL_POSE.copy()
+    low = -high
+    if orientation.is_vector:  # the farthest corner of such a cube is no longer than allowed
+        vector = pose[3:]
+        room = max((VECTOR_LIMIT - float(np.linalg.norm(vector))) / np.sqrt(3.0), 0.0)
+        inwards = np.maximum(room, np.minimum(LEAST_ROOM, np.abs(vector)))
+        low[3:] = vector - np.where(vector > 0.0, inwards, room)
+        high[3:] = vector + np.where(vector < 0.0, inwards, room)
+        return np.array([low, high])
+    low[3:] = np.maximum(np.minimum(low[3:], pose[3:] - ANGLE_ROOM), -ANGLE_LIMIT)
+    high[3:] = np.minimum(np.maximum(high[3:], pose[3:] + ANGLE_ROOM), ANGLE_LIMIT)
+    return np.array([np.minimum(low, pose), np.maximum(high, pose)])
+
+
+def joint_limits(workcell: Workcell) -> Array:
+    """Return the limits (2, m) of the redundant joints; of both arms where a joint moves both."""
+    found = []
+    for joint in workcell.task.redundant:
+        driven = [
+            (robot.position_lower[index], robot.position_upper[index])
+            for robot, index in zip(workcell.robots, joint.drives, strict=True)
+            if index >= 0
+        ]
+        found.append((max(low for low, _ in driven), min(high for _, high in driven)))
+    return np.reshape(found, (-1, 2)).T
+
+
+def limits_around(workcell: Workcell, waypoints: Array) -> Array:
+    """Compute the limits (2, n, 6 + m) of bounds around extended poses (n, 6 + m)."""
+    orientation, joints = workcell.task.orientation, joint_limits(workcell)
+    return np.array(
+        [np.hstack([pose_limits(row[:POSE_SIZE], orientation), joints]) for row in waypoints]
+    ).swapaxes(0, 1)
+
+
+def rounded_outwards(bounds: Array, limits: Array) -> Array:
+    """Round bounds (2, ...) to decimals, the lower down and the upper up, but not beyond limits.
+
+    A decimal times `UNITS` may lie beside the whole number that it stands for: 1e4 * 2.8065 is
+    28065.000000000004.
+    """
+    low, high = np.round(UNITS * bounds, ROUNDING)
+    return np.array(
+        [
+            np.maximum(np.floor(low) / UNITS, limits[0]),
+            np.minimum(np.ceil(high) / UNITS, limits[1]),
+        ]
+    )
+
+
+def readable_turns(poses: Array, orientation: Orientation) -> Array:
+    """Return poses (n, 6) with every angle that a file may not hold turned back by whole turns.
+
+    The reader unwraps angles along the path, so the path stays the same.
+    """
+    if orientation.is_vector:
+        return poses
+    found = poses.copy()
+    beyond = np.abs(poses[:, 3:]) > ANGLE_LIMIT
+    turns = np.round(poses[:, 3:] / (2.0 * np.pi))
+    found[:, 3:] -= np.where(beyond, 2.0 * np.pi * turns, 0.0)
+    return found
