@@ -19,7 +19,7 @@ from hybrid_opt.metaheuristics.run import SearchSettings, search_carries
 from hybrid_opt.polishing.settings import PolishSettings
 from hybrid_opt.progress import ShowProgress, counted
 from hybrid_opt.store.trajectory_file import write_trajectory
-from hybrid_opt.timing.analysis import TimedTrajectory, timed_trajectory
+from hybrid_opt.timing.analysis import TimedTrajectory, time_trajectory
 from hybrid_opt.timing.jerk import time_with_jerk as solve_with_jerk
 from hybrid_opt.timing.records import JerkLimits, JerkTiming, Timing, TimingLimits
 from hybrid_opt.timing.solve import time_path as solve_timing
@@ -120,7 +120,7 @@ def time_with_jerk(
     Raises:
         SettingsError: the carry does not fit the cell, or no jerk is limited.
     """
-    jerk = jerk or JerkLimits.of(cell.workcell)
+    jerk = jerk or JerkLimits.from_workcell(cell.workcell)
     if jerk is None:
         raise SettingsError(
             "the workcell limits no jerk: give ho.JerkLimits, or state jerk_max of its robots"
@@ -143,7 +143,7 @@ def time_every_way(
         curve_points: points of the curve of duration against force limit, None for no curve.
         progress: True for a bar, or what takes timings done and in all, the margins as one.
     """
-    return timed_trajectory(
+    return time_trajectory(
         cell.timing_model, decision_of(carry), force_limit, curve_points, progress=progress
     )
 

@@ -20,7 +20,7 @@ from hybrid_opt.cell import Cell
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator, Evaluations
 from hybrid_opt.indicators import metrics
 from hybrid_opt.polishing.records import PolishedFront
-from hybrid_opt.polishing.settings import PolishSettings, usual_settings
+from hybrid_opt.polishing.settings import PolishSettings, default_settings
 from hybrid_opt.progress import ShowProgress, counted, passed_on
 from hybrid_opt.shown import Displayable
 from symbolic.array import Array, set_read_only
@@ -93,7 +93,7 @@ class Front(Displayable):
         from hybrid_opt.polishing.polisher import Polisher
 
         cell, task = self.cell, self.cell.workcell.task
-        settings = settings or usual_settings(task.time_law)
+        settings = settings or default_settings(task.time_law)
         polisher = Polisher(cell.evaluator, settings, cell.polish_functions)
         known = [np.asarray(decision_of(path), dtype=float) for path in paths]
         if known and task.time_law != "optimal":
@@ -109,7 +109,7 @@ class Front(Displayable):
                 )
         beside = np.array([path[: task.n_path] for path in known]).reshape(-1, task.n_path)
         with counted(progress, "polish", settings.attempts) as advance:
-            done = polisher.polish(self.x, rng, paths=beside, tell=passed_on(advance))
+            done = polisher.polish(self.x, rng, paths=beside, on_progress=passed_on(advance))
         return self.after(done)
 
     @property

@@ -28,7 +28,7 @@ from hybrid_opt.shown import Displayable
 from hybrid_opt.timing.limits import limit_ratios
 from hybrid_opt.timing.model import TimingModel
 from hybrid_opt.timing.records import Timing
-from hybrid_opt.timing.robustness import NearTimings
+from hybrid_opt.timing.robustness import TimingSensitivity
 from symbolic import outside
 from symbolic.array import Array
 from symbolic.errors import SettingsError, WorkcellError
@@ -303,7 +303,7 @@ class _Fastest:
         self.carry, self._limits = timing.carry, timing.limits
         self._compiled = CompiledCell(self.carry.workcell)
         self._digest = WorkcellNumbers(self.carry.workcell).digest
-        self._near = NearTimings(TimingModel(self._compiled), timing)
+        self._near = TimingSensitivity(TimingModel(self._compiled), timing)
 
     def moved_by(self, number: _Number) -> bool:
         """See `_Law`."""

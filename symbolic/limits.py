@@ -32,10 +32,10 @@ from symbolic.records import Workcell
 from symbolic.records.quantities import GRAVITY
 from symbolic.robot.arm import TRACK_OUTPUTS, follow_function
 
-VERDICTS = ("ik_residual", "lost", "limit_margin", "manipulability")
+ARM_CHECK_OUTPUTS = ("ik_residual", "lost", "limit_margin", "manipulability")
 """Outputs of `symbolic.robot.arm.TRACK_OUTPUTS` beside an arm's joints."""
 
-WEIGHT = 1e-6
+TIMING_BARRIER_WEIGHT = 1e-6
 """Weight of the barriers where a program finds the forces (`symbolic.contact.soft_grasp`): they
 exceed the least ones by less than what timings are exact to."""
 
@@ -126,7 +126,7 @@ def path_function(model: CellModel, samples: int) -> ca.Function:
         results = follow(start, outputs["pose"], no_wrench, *of(handed, robot).values())
         tracked = dict(zip(TRACK_OUTPUTS, results, strict=True))
         outputs[f"q_{i + 1}"] = tracked["q"]
-        verdicts |= {f"{name}_{i + 1}": tracked[name] for name in VERDICTS}
+        verdicts |= {f"{name}_{i + 1}": tracked[name] for name in ARM_CHECK_OUTPUTS}
     outputs |= verdicts
     return named_function("path", {"x": x} | handed, outputs)
 
@@ -224,7 +224,7 @@ def force_functions(workcell: Workcell) -> tuple[ca.Function, ca.Function]:
         asked = [ca.MX.sym("asked", sizes["force"] + sizes["moment"]), *map(ca.MX.sym, "aw")]
         asked += handed.values()
         load, by_timing = _load_function(workcell)(*asked)
-        soft = SoftGrasp(Grasp(workcell), WEIGHT)
+        soft = SoftGrasp(Grasp(workcell), TIMING_BARRIER_WEIGHT)
         found, state = soft.solved(load, handed), ca.MX.sym("solved", soft.size)
         normal, slope = soft.slopes()(state, *handed.values())
         slopes = ca.horzsplit(ca.mtimes(slope.T, by_timing))
@@ -363,7 +363,7 @@ def _program_ratios(workcell: Workcell) -> tuple[ca.Function, ca.Function]:
     # The pads of the first robot come first.
     others = WRENCH_SIZE * grasp.robots.index(1)
     _, by_timing = _load_function(workcell)(asked, *inputs[1:], *given)
-    soft, none = SoftGrasp(grasp, WEIGHT), ca.DM.zeros(2, 1)
+    soft, none = SoftGrasp(grasp, TIMING_BARRIER_WEIGHT), ca.DM.zeros(2, 1)
 
     def on_joints(held: ca.MX) -> ca.MX:
         one = ca.mtimes(felt[:, :others], held[:others, :])

@@ -22,11 +22,11 @@ from hybrid_opt.campaign.results import Replica, is_whole, read_campaign, read_p
 from hybrid_opt.campaign.settings import JOURNAL, POLISH, polished_folder
 from hybrid_opt.campaign.stages import Stage, with_cell
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
-from hybrid_opt.polishing.front import Loss, use_one_thread
+from hybrid_opt.polishing.front import FailedAttempt, use_one_thread
 from hybrid_opt.polishing.polisher import Polisher
 from hybrid_opt.polishing.records import PolishedFront, PolishOutcome
 from hybrid_opt.polishing.settings import PolishSettings
-from hybrid_opt.polishing.solvers.base import MOST_SECONDS
+from hybrid_opt.polishing.solvers.base import MOST_SOLVE_SECONDS
 from hybrid_opt.progress import Progress
 from hybrid_opt.store.files import from_json, json_of, to_json, write_json
 from hybrid_opt.work.service import Service, give_up
@@ -89,16 +89,16 @@ def polish_replica(
         request.x,
         rng,
         recorded=[_from_block(block, request) for block in request.recorded],
-        emit=lambda outcome: emit(json.dumps(to_json(outcome)).encode()),
+        on_outcome=lambda outcome: emit(json.dumps(to_json(outcome)).encode()),
         paths=request.paths,
     )
 
 
-def _from_block(block: bytes, request: ReplicaRequest) -> PolishOutcome | Loss:
+def _from_block(block: bytes, request: ReplicaRequest) -> PolishOutcome | FailedAttempt:
     of = f"{request.algorithm} replica {request.replica}: a recorded attempt of the polish"
     values = json_of(block, of, _ANEW)
     if isinstance(values, dict) and "lost" in values:
-        return Loss(str(values["lost"]))
+        return FailedAttempt(str(values["lost"]))
     return from_json(PolishOutcome, values, of, _ANEW)
 
 
@@ -124,7 +124,7 @@ class PolishLedger(ReplicaLedger):
         """Polish all open fronts."""
         objectives = self.folder.settings.objectives
         source = polisher_source(self.folder.files, objectives, self._settings)
-        service = Service(source, polish_replica, patience=MOST_SECONDS + JUDGING_SECONDS)
+        service = Service(source, polish_replica, patience=MOST_SOLVE_SECONDS + JUDGING_SECONDS)
         with closing(self):
             done = self._all - len(self)
             self.work(service, progress, ("polish", "fronts"), self._all, done)

@@ -244,7 +244,7 @@ def timed(model: TimingModel, line: Straight, q: Array) -> PhaseMotion:
     joint_speed, joint_acceleration = map(
         model.workcell.of_joints, ("velocity_max", "acceleration_max")
     )
-    jerk = JerkLimits.of(model.workcell) or JerkLimits(np.full(q.shape[1], np.inf))
+    jerk = JerkLimits.from_workcell(model.workcell) or JerkLimits(np.full(q.shape[1], np.inf))
     gentle = min(payload.acceleration_max, LIFTING_ACCELERATION)
     most = float(np.abs(unit.third).max())
     duration = max(

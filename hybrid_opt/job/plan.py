@@ -44,7 +44,7 @@ from hybrid_opt.job.motions import (
 from hybrid_opt.job.records import Job, Phase, PhaseMotion
 from hybrid_opt.job.smooth import WIDEST, WIDTH, rests_at_ends, without_jumps
 from hybrid_opt.robust.squeeze import Squeeze, SqueezeSettings, commanded_forces
-from hybrid_opt.timing.jerk import kept_jerk
+from hybrid_opt.timing.jerk import applicable_jerk_limits
 from hybrid_opt.timing.model import TimingModel
 from hybrid_opt.timing.records import JerkLimits, Timing
 from symbolic.array import Array, interpolated
@@ -347,7 +347,7 @@ class JobModel:
             )
         if not 0.0 <= smoothing <= WIDEST:
             raise SettingsError(f"smoothing over {smoothing:g} s: allowed is 0 to {WIDEST:g} s")
-        jerk = kept_jerk(self.workcell, timing.limits) if within_jerk else None
+        jerk = applicable_jerk_limits(self.workcell, timing.limits) if within_jerk else None
         timing = without_jumps(self.timing, timing, jerk, smoothing)
         carry = timing.driven
         handling = handling or self.workcell.handling

@@ -15,8 +15,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hybrid_opt.errors import JobError
-from hybrid_opt.timing.jerk import kept_jerk, time_with_jerk
-from hybrid_opt.timing.limits import judged, limit_ratios, worst
+from hybrid_opt.timing.jerk import applicable_jerk_limits, time_with_jerk
+from hybrid_opt.timing.limits import check_limits, limit_ratios, most_used
 from hybrid_opt.timing.model import TimingModel
 from hybrid_opt.timing.records import JerkLimits, Timing, TimingLimits
 from hybrid_opt.timing.solve import time_path
@@ -105,22 +105,26 @@ def driven_timing(model: TimingModel, x: Array) -> Timing:
     """
     limits = driven_limits(model, x)
     timing = time_path(model, x, limits)
-    return without_jumps(model, timing, kept_jerk(model.workcell, limits)) if timing.ok else timing
+    return (
+        without_jumps(model, timing, applicable_jerk_limits(model.workcell, limits))
+        if timing.ok
+        else timing
+    )
 
 
 def _smoothed(model: TimingModel, timing: Timing, width: float) -> Timing:
     """The timing averaged over a window, within the limits that it was found for."""
     u, rate, second = _averaged(timing.grid_speed, width)
-    motion = model.path_motion(timing.driven.x).between(u)
+    motion = model.path_motion(timing.driven.x).interpolate(u)
     limits = timing.limits
 
     def driven(factor: float) -> _Slowdown:
         time = np.asarray(EVERY * STEP / factor * np.arange(len(u)))
         carry = model.carry(motion, time, factor * rate, factor**2 * second)
         ratios = limit_ratios(carry, model.workcell, limits)
-        found = judged(model, carry, limits, ratios)
+        found = check_limits(model, carry, limits, ratios)
         columns = [ratio.ravel() for name, ratio in ratios.items() if name != "friction"]
-        return _Slowdown(factor, found, worst(found.use).ratio - 1.0, np.concatenate(columns))
+        return _Slowdown(factor, found, most_used(found.use).ratio - 1.0, np.concatenate(columns))
 
     found = _fastest(driven)
     told = f"{found.timing.duration:.3f} s without jumps of the acceleration; most used: "

@@ -13,15 +13,15 @@ from hybrid_opt.polishing.cell import SmoothCell
 from symbolic.array import Array
 from symbolic.records.task import POSE_SIZE, extended_waypoints, place_redundant
 from symbolic.robot.arm import REACH_TOLERANCE
-from symbolic.smooth.places import Reach
+from symbolic.smooth.places import ManipulabilityLimit
 
-SHARPENED_BELOW = 0.1
+SEPARATING_AXES_BELOW = 0.1
 """Bounds of the payload's distances that are lower are raised by the gaps across its edges [m]."""
 
-DIPS_BELOW = 0.1
+MINIMA_BELOW = 0.1
 """Pairs that stay farther apart than this are not looked at between places [m]."""
 
-AT_ONCE = 8
+MEASURED_TOGETHER = 8
 """Distances that are measured together where the first low one ends a search."""
 
 Stretch = tuple[slice, int]
@@ -53,7 +53,7 @@ class PlacedCarry:
     rate: Array
     q: tuple[Array, Array]
     reached: int
-    stranded: tuple[int, ...]
+    unreachable_arms: tuple[int, ...]
     manipulability: Array
     split: Array
     force: Array
@@ -63,12 +63,12 @@ class PlacedCarry:
     gaps: Callable[[int], Array] = field(repr=False)
 
     @property
-    def is_followed(self) -> bool:
+    def is_reachable(self) -> bool:
         """Whether both arms reach all places."""
         return self.reached == len(self.pose)
 
 
-def lowest(values: Array, limit: float, stride: int | None = None) -> list[int]:
+def local_minima_below(values: Array, limit: float, stride: int | None = None) -> list[int]:
     """The lowest place of every stretch below the limit, and those by the stride from it."""
     below = values < limit
     if not below.any():
@@ -86,7 +86,7 @@ def lowest(values: Array, limit: float, stride: int | None = None) -> list[int]:
     return places
 
 
-def dipped(clearance: Array) -> Array:
+def interpolate_minima(clearance: Array) -> Array:
     """Clearances (n, k) with the dips between places: where an edge is passed, the clearance falls
     steadily up to a kink and rises steadily from there, so the lines from both sides meet at the
     least value in between, which then counts at both places."""
@@ -127,28 +127,28 @@ class Distances:
         return self._find()
 
     @cached_property
-    def lowered(self) -> Array:
+    def interpolated_clearance(self) -> Array:
         """See the class."""
-        near = self.bounds.min(axis=0, initial=np.inf) < DIPS_BELOW
-        lowered = self.bounds.copy()
-        lowered[:, near] = dipped(self.bounds[:, near])
-        return lowered
+        near = self.bounds.min(axis=0, initial=np.inf) < MINIMA_BELOW
+        interpolated_clearance = self.bounds.copy()
+        interpolated_clearance[:, near] = interpolate_minima(self.bounds[:, near])
+        return interpolated_clearance
 
     @cached_property
-    def _found(self) -> Array:
-        return self.lowered.copy()
+    def _values(self) -> Array:
+        return self.interpolated_clearance.copy()
 
     @cached_property
-    def _unknown(self) -> NDArray[np.bool_]:
+    def _unmeasured(self) -> NDArray[np.bool_]:
         return np.ones(self.bounds.shape, dtype=np.bool_)
 
     def at(self, wanted: NDArray[np.bool_]) -> Array:
-        """(n, n_pairs) as `lowered`, those wanted raised by what FCL's distance exceeds the bound
-        where nothing touches [m]."""
-        self._learn(*(wanted & self._unknown).nonzero())
-        return self._found
+        """Return distances (n, n_pairs) [m]: measured by FCL where wanted, else
+        `interpolated_clearance`."""
+        self._measure_pairs(*(wanted & self._unmeasured).nonzero())
+        return self._values
 
-    def _learn(self, places: NDArray[np.intp], pairs: NDArray[np.intp]) -> None:
+    def _measure_pairs(self, places: NDArray[np.intp], pairs: NDArray[np.intp]) -> None:
         """Measure pairs at places, side by side."""
         if not len(places):
             return
@@ -157,8 +157,8 @@ class Distances:
         wanted[local, pairs] = True
         raised = self.bounds[rows]
         self._measure(rows, raised, wanted)
-        self._found[places, pairs] += raised[local, pairs] - self.bounds[places, pairs]
-        self._unknown[places, pairs] = False
+        self._values[places, pairs] += raised[local, pairs] - self.bounds[places, pairs]
+        self._unmeasured[places, pairs] = False
 
     def least(self, stretches: Sequence[Stretch], below: float) -> list[float]:
         """The least distance in each stretch, measured where bounds are below a limit [m]. No
@@ -169,25 +169,25 @@ class Distances:
             lowest = dict[int, tuple[int, int]]()
             for k in open_:
                 where, pair = stretches[k]
-                place = where.start + int(self._found[where, pair].argmin())
-                found[k] = float(self._found[place, pair])
-                if self._unknown[place, pair] and self.bounds[place, pair] < below:
+                place = where.start + int(self._values[where, pair].argmin())
+                found[k] = float(self._values[place, pair])
+                if self._unmeasured[place, pair] and self.bounds[place, pair] < below:
                     lowest[k] = place, pair
             chosen = np.array(sorted(set(lowest.values())), dtype=np.intp).reshape(-1, 2)
-            self._learn(chosen[:, 0], chosen[:, 1])
+            self._measure_pairs(chosen[:, 0], chosen[:, 1])
             open_ = list(lowest)
         return found
 
-    def keep(self, limits: Array) -> bool:
+    def exceed(self, limits: Array) -> bool:
         """Whether every pair keeps its limit (n_pairs,) at all places [m]. The lowest are measured
         first: the first that does not keep its limit tells."""
-        places, pairs = (self.lowered < limits).nonzero()
-        order = np.argsort(self.lowered[places, pairs], kind="stable")
-        for first in range(0, len(order), AT_ONCE):
-            some = order[first : first + AT_ONCE]
-            fresh = some[self._unknown[places[some], pairs[some]]]
-            self._learn(places[fresh], pairs[fresh])
-            if (self._found[places[some], pairs[some]] < limits[pairs[some]]).any():
+        places, pairs = (self.interpolated_clearance < limits).nonzero()
+        order = np.argsort(self.interpolated_clearance[places, pairs], kind="stable")
+        for first in range(0, len(order), MEASURED_TOGETHER):
+            some = order[first : first + MEASURED_TOGETHER]
+            fresh = some[self._unmeasured[places[some], pairs[some]]]
+            self._measure_pairs(places[fresh], pairs[fresh])
+            if (self._values[places[some], pairs[some]] < limits[pairs[some]]).any():
                 return False
         return True
 
@@ -223,7 +223,10 @@ class CarryReader:
         q_1, q_2 = posture["q_1"], posture["q_2"]
         rate = np.ascontiguousarray((grid.rate_basis @ waypoints)[:, :POSE_SIZE])
         squares = [
-            1.0 + self._functions.row(Reach(arm), "first").batch(pose, rate, q_1, q_2)["value"]
+            1.0
+            + self._functions.row(ManipulabilityLimit(arm), "first").batch(pose, rate, q_1, q_2)[
+                "value"
+            ]
             for arm in (0, 1)
         ]
         force = found["normal_force"]
@@ -235,14 +238,14 @@ class CarryReader:
             rate=rate,
             q=(q_1, q_2),
             reached=reached,
-            stranded=tuple(np.flatnonzero(~followed.all(axis=0)).tolist()),
+            unreachable_arms=tuple(np.flatnonzero(~followed.all(axis=0)).tolist()),
             manipulability=np.sqrt(np.maximum(np.column_stack(squares), 0.0))[:reached],
             split=self._split(found),
             force=minimised,
             peak=minimised.max(axis=0) / task.reference_force,
             shift=found["pressure_shift"] / self._radii,
             distances=Distances(
-                lambda: self._sharpened(evaluator.checker.bounds(*held), gaps),
+                lambda: self._raised_by_gaps(evaluator.checker.bounds(*held), gaps),
                 lambda rows, raised, wanted: evaluator.checker.measure(
                     held[0][rows], held[1][rows], held[2][rows], raised, wanted
                 ),
@@ -262,9 +265,9 @@ class CarryReader:
         square = (whole**2).sum(axis=1) - along**2
         return np.column_stack([along, np.sqrt(np.maximum(square, 0.0))])
 
-    def _sharpened(self, bounds: Array, gaps: Callable[[int], Array]) -> Array:
+    def _raised_by_gaps(self, bounds: Array, gaps: Callable[[int], Array]) -> Array:
         """Bounds (n, n_pairs), those of the payload from a box raised to the largest gap."""
-        near = bounds.min(axis=0, initial=np.inf) < SHARPENED_BELOW
+        near = bounds.min(axis=0, initial=np.inf) < SEPARATING_AXES_BELOW
         for pair in self._functions.separable.intersection(np.flatnonzero(near).tolist()):
             np.maximum(bounds[:, pair], gaps(pair).max(axis=1), out=bounds[:, pair])
         return bounds

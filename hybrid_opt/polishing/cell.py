@@ -16,19 +16,19 @@ from hybrid_opt.evaluate.objectives import ROBUST_OBJECTIVES
 from hybrid_opt.polishing.robust import RobustSamples
 from symbolic.array import Array
 from symbolic.cell_model import CellBodies, CellModel
-from symbolic.limits import WEIGHT as TIMING_WEIGHT
+from symbolic.limits import TIMING_BARRIER_WEIGHT
 from symbolic.path.spline import path_basis
 from symbolic.records.cell import Workcell
 from symbolic.records.task import POSE_SIZE, Task, extended_waypoints
 from symbolic.smooth.driven import driven_functions
-from symbolic.smooth.passage import GAPS, Passing, Separation, gap_function
+from symbolic.smooth.passage import GAPS, AxisSwitchGap, SeparatingAxisGap, gap_function
 from symbolic.smooth.places import (
     ORDERS,
     JointLimit,
+    ManipulabilityLimit,
     Order,
-    PlaceConstraint,
-    PlaceSymbols,
-    Reach,
+    PathConstraint,
+    PathPointSymbols,
     closure_functions,
     closure_name,
     row_function,
@@ -36,18 +36,18 @@ from symbolic.smooth.places import (
 )
 from symbolic.smooth.samples import (
     Quantity,
-    branch_coefficients,
-    held_functions,
-    held_name,
+    force_branches,
+    grasp_force_functions,
+    grasp_force_name,
     sample_blocks,
     sample_functions,
 )
 
-COMPILED = (
-    Reach(0),
-    Reach(1),
-    Separation(0, 0),
-    Passing(0, 0, 1),
+PRECOMPILED = (
+    ManipulabilityLimit(0),
+    ManipulabilityLimit(1),
+    SeparatingAxisGap(0, 0),
+    AxisSwitchGap(0, 0, 1),
     JointLimit(0, 0, "lower"),
     JointLimit(1, 0, "lower"),
 )
@@ -57,7 +57,7 @@ these are compiled when a solve first asks for them, and kept."""
 
 ARMS = (0, 1)
 
-LATER_LEVELS: dict[Order, int] = {"first": 1, "second": 0}
+DEFERRED_LEVELS: dict[Order, int] = {"first": 1, "second": 0}
 """Optimisation levels of what is compiled when it is asked for: 0.1 and 0.2 s each on the rack. Few
 second derivatives of clearances are ever needed."""
 
@@ -82,7 +82,7 @@ class PolishFunctions:
 
     def __init__(self, compiled: CompiledCell, built: Mapping[str, NumericFunction]) -> None:
         self.model, self.built, self._cell = compiled.bodies, dict(built), compiled
-        self._place, self._symbols = PlaceSymbols(self.model), cache(PlaceSymbols)
+        self._place, self._symbols = PathPointSymbols(self.model), cache(PathPointSymbols)
         self.numbers = lru_cache(maxsize=None)(self._numbers)
         self._obstacle = lru_cache(maxsize=None)(self._place.obstacle)
         self.separable = frozenset(self._place.separable())
@@ -91,7 +91,7 @@ class PolishFunctions:
         """How an arm's joints follow the box."""
         return self.built[closure_name(arm, order)]
 
-    def row(self, constraint: PlaceConstraint, order: Order) -> NumericFunction:
+    def row(self, constraint: PathConstraint, order: Order) -> NumericFunction:
         """See `symbolic.smooth.places.row_function`."""
         name = row_name(constraint.family, order)
         if name not in self.built:
@@ -99,12 +99,12 @@ class PolishFunctions:
             def make(model: CellBodies) -> dict[str, ca.Function]:
                 return {name: row_function(self._symbols(model), constraint, order)}
 
-            level = {name: LATER_LEVELS[order]}
+            level = {name: DEFERRED_LEVELS[order]}
             self.built |= self._cell.functions(f"polish {name}", make, str(level), levels=level)
         return self.built[name]
 
-    def _numbers(self, constraint: PlaceConstraint) -> Array:
-        """See `PlaceConstraint.numbers`."""
+    def _numbers(self, constraint: PathConstraint) -> Array:
+        """See `PathConstraint.numbers`."""
         return constraint.numbers(self._place)
 
     def gaps(self, pair: int, pose: Array) -> Array:
@@ -112,7 +112,7 @@ class PolishFunctions:
         return self.built[GAPS].batch(pose, self._obstacle(pair))["gaps"]
 
 
-def quantities_of(workcell: Workcell) -> tuple[Quantity, ...]:
+def sample_quantities(workcell: Workcell) -> tuple[Quantity, ...]:
     """What a cell's programs ask at samples. What is driven has limits at the intervals of its
     timing, not at samples; pads that press jointly keep their pressure, and where they do not face
     one another nothing is in closed form."""
@@ -134,7 +134,7 @@ def polish_functions(compiled: CompiledCell) -> PolishFunctions:
     Raises:
         DualArmError: the cell's model cannot be built, or its functions not be compiled.
     """
-    quantities = quantities_of(compiled.workcell)
+    quantities = sample_quantities(compiled.workcell)
     ends = {f"{q}_{block}_first" for q in quantities for block in ("first", "last", "path")}
     levels = dict.fromkeys(sorted(_names(quantities) - ends), 1)
     wide = levels.keys() - {f"{q}_path_second" for q in quantities}
@@ -145,26 +145,26 @@ def polish_functions(compiled: CompiledCell) -> PolishFunctions:
         found += [closure_functions(model, arm) for arm in ARMS]
         return {name: function for functions in found for name, function in functions.items()}
 
-    def in_lanes(model: CellModel) -> dict[str, ca.Function]:
+    def lane_functions(model: CellModel) -> dict[str, ca.Function]:
         return {name: f for name, f in samples(model).items() if name in wide}
 
-    def one_by_one(model: CellModel) -> dict[str, ca.Function]:
+    def scalar_functions(model: CellModel) -> dict[str, ca.Function]:
         return {name: f for name, f in samples(model).items() if name not in wide}
 
     def rows(model: CellModel) -> dict[str, ca.Function]:
-        place = PlaceSymbols(model)
+        place = PathPointSymbols(model)
         found = {
             row_name(constraint.family, order): row_function(place, constraint, order)
-            for constraint in COMPILED
+            for constraint in PRECOMPILED
             for order in ORDERS
         }
         return found | {GAPS: gap_function(place)}
 
     details = str(levels)
     built = compiled.functions(
-        "polish in lanes", in_lanes, details, levels=levels, lanes=0, bodies=False
+        "polish in lanes", lane_functions, details, levels=levels, lanes=0, bodies=False
     )
-    built |= compiled.functions("polish", one_by_one, details, levels=levels, bodies=False)
+    built |= compiled.functions("polish", scalar_functions, details, levels=levels, bodies=False)
     built |= compiled.functions("polish rows", rows, details, levels=levels, lanes=0)
     if "load" in quantities:
         built |= compiled.functions("held", _held, levels=levels, lanes=0, bodies=False)
@@ -178,12 +178,12 @@ def polish_functions(compiled: CompiledCell) -> PolishFunctions:
 
 
 def _held(model: CellModel) -> dict[str, ca.Function]:
-    return held_functions(model.workcell)
+    return grasp_force_functions(model.workcell)
 
 
 def _driven_held(model: CellModel) -> dict[str, ca.Function]:
     """The forces that timings know, which judge what is driven."""
-    return held_functions(model.workcell, TIMING_WEIGHT)
+    return grasp_force_functions(model.workcell, TIMING_BARRIER_WEIGHT)
 
 
 def _names(quantities: tuple[Quantity, ...]) -> set[str]:
@@ -192,9 +192,9 @@ def _names(quantities: tuple[Quantity, ...]) -> set[str]:
     return {
         GAPS,
         *(f"{q}_{block}_{order}" for q in quantities for block in blocks for order in ORDERS),
-        *(held_name(order) for order in ORDERS),
+        *(grasp_force_name(order) for order in ORDERS),
         *(closure_name(arm, order) for arm in ARMS for order in ORDERS),
-        *(row_name(constraint.family, order) for constraint in COMPILED for order in ORDERS),
+        *(row_name(constraint.family, order) for constraint in PRECOMPILED for order in ORDERS),
     }
 
 
@@ -248,7 +248,7 @@ class SmoothCell:
             [-1, 1]; half is 1 where a variable is fixed.
         free: rows and columns of the variables among the extended waypoints.
         blocks: how samples are divided among functions.
-        coefficients: (2, branches, 2) those of `branch_coefficients`.
+        coefficients: (2, branches, 2) those of `force_branches`.
         still: (n_waypoints, 6 + m) extended waypoints without the variables.
     """
 
@@ -269,7 +269,7 @@ class SmoothCell:
         self.centre = (self.task.upper + self.task.lower) / 2.0
         self.half = np.where(half > 0.0, half, 1.0)
         self.blocks = sample_blocks(self.task)
-        self.coefficients = branch_coefficients(self.workcell)
+        self.coefficients = force_branches(self.workcell)
         self.free = self.task.free_entries
         self._n_path = self.task.n_path
         fixed = [waypoint.lower for waypoint in self.task.waypoints]

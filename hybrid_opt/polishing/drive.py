@@ -17,22 +17,22 @@ from numpy.typing import NDArray
 
 from hybrid_opt.polishing.carry import CarryReader
 from hybrid_opt.polishing.cell import SmoothCell
-from hybrid_opt.polishing.constraints.active import ActiveSet
+from hybrid_opt.polishing.constraints.active import RowSelector
 from hybrid_opt.polishing.intervals import (
-    NEGLIGIBLE,
+    NEGLIGIBLE_MULTIPLIER,
     IntervalGrid,
     IntervalValues,
-    JointProgram,
-    Linear,
+    LinearisedRows,
+    PathTimingProgram,
 )
 from hybrid_opt.polishing.point import (
     HALVED,
     QUARTERED,
-    Climb,
-    ClimbPoint,
+    Iterate,
     Step,
-    StepVerdict,
-    Way,
+    StepEvaluation,
+    StepMethod,
+    TrustRegionSolve,
 )
 from hybrid_opt.polishing.rows import Row
 from hybrid_opt.polishing.solvers.base import Residuals
@@ -40,7 +40,7 @@ from hybrid_opt.polishing.solvers.quadratic import (
     BorderedMatrix,
     QuadraticAnswer,
     QuadraticProgram,
-    convex,
+    convexify,
     solve_quadratic,
 )
 from hybrid_opt.robust.path_force import PathPoints, robust_path
@@ -52,26 +52,26 @@ from symbolic.path.pieces import by_levels, stated_entries
 from symbolic.records import Workcell
 from symbolic.records.task import waypoints_of
 
-FIRST_RADIUS, LEAST_RADIUS = 0.3, 1e-4
+FIRST_DRIVE_RADIUS, LEAST_DRIVE_RADIUS = 0.3, 1e-4
 """Radii of the box of trust, in half ranges of the waypoints; below the least a point is
 left."""
 
-STATIONARY, FEASIBLE = 1e-4, 5e-3
+STATIONARITY_TOLERANCE, FEASIBILITY_TOLERANCE = 1e-4, 5e-3
 """Residuals of stationarity and of complementarity, and of feasibility, at which a point counts as
 optimal: what is asked of distances moves with the path."""
 
-NOISE = 5e-4
+TIMING_NOISE = 5e-4
 """Relative change of a timing that counts as none: what the timing rounds off."""
 
-CLOSER = 0.1
+LEAST_REDUCTION_RATIO = 0.1
 """Share of the promised gain that a step has to bring, unless the timing may have rounded it
 off."""
 
-PARTS = (1.0, 0.5, 0.25, 0.125)
+DRIVE_BACKTRACKING = (1.0, 0.5, 0.25, 0.125)
 """Parts of a step that are tried, the first that is closer is taken: judging costs a tenth of a
 round."""
 
-NEWTON = 0.05
+NEWTON_STEP = 0.05
 """Steps shorter than this keep the program's squared speeds, longer ones take those of the new
 timing."""
 
@@ -79,13 +79,13 @@ ROW_ROUNDS, ROW_TOLERANCE = 3, 1e-6
 """Times that rows are added to one quadratic program, and the predicted excess of a limit that adds
 its row."""
 
-STEADINESS = 1.0
+MULTIPLIER_CURVATURE = 1.0
 """Curvature by the path of the program that finds multipliers."""
 
-BEND = 0.2
+LARGEST_NONLINEARITY = 0.2
 """Error of geometric rows, by their curvature along a step, above which it is corrected, once."""
 
-FARTHER = (2.0, 4.0, 8.0)
+DRIVE_EXTRAPOLATION = (2.0, 4.0, 8.0)
 """Times a step that brought more than it promised: judging costs a tenth of a round."""
 
 LEAST_SQUARED, LARGEST_SQUARED = 0.9, 3.0
@@ -97,7 +97,7 @@ UNPOLISHABLE = (
 )
 """Why a cell is not `is_polishable`."""
 
-STILL = 1e-3
+REST_FORCE_MARGIN = 1e-3
 """The least force limit is this share above the force that holds the box at rest."""
 
 
@@ -108,7 +108,7 @@ def is_polishable(workcell: Workcell, robust: bool) -> bool:
 
 
 @dataclass(frozen=True)
-class TimedPath:
+class EvaluatedPath:
     """A path with its fastest timing within a force limit.
 
     Attributes:
@@ -122,7 +122,7 @@ class TimedPath:
     joints: tuple[Array, Array]
 
 
-class PathJudge:
+class PathEvaluator:
     """Times paths by the compiled passes.
 
     Attributes:
@@ -132,12 +132,12 @@ class PathJudge:
     def __init__(self, driver: CandidateDriver) -> None:
         self._driver, self.force_limit = driver, force_range(driver)
 
-    def timed(self, x: Array) -> TimedPath:
+    def fastest_timing(self, x: Array) -> EvaluatedPath:
         """The fastest timing of a decision vector (n_var,)."""
-        found, known = self._driver.timed(x)
+        found, known = self._driver.time_candidate(x)
         duration = found.duration if found.ok else float("inf")
         joints = [np.ascontiguousarray(known[f"q_{arm}"][0][::2]) for arm in (1, 2)]
-        return TimedPath(duration, found.grid_speed**2, (joints[0], joints[1]))
+        return EvaluatedPath(duration, found.grid_speed**2, (joints[0], joints[1]))
 
     def durations(self, paths: Array, force: float) -> Array:
         """(n,) [s] of paths (n, n_path) within a force, infinite where there is none."""
@@ -162,12 +162,12 @@ def force_range(driver: CandidateDriver) -> tuple[float, float]:
         ends = waypoints_of(workcell.task, workcell.task.lower)[[0, -1]]
         (first, second), (a, w) = np.zeros((2, 2, 6)), np.zeros((2, 2))
         held, _ = robust_path(workcell).at(PathPoints(ends, first, second, a, w))
-        least = max(least, (1.0 + STILL) * float(held.max()))
+        least = max(least, (1.0 + REST_FORCE_MARGIN) * float(held.max()))
     return least, most
 
 
 @dataclass(frozen=True)
-class DrivePoint(ClimbPoint):
+class DriveIterate(Iterate):
     """A carry whose level is its duration [s].
 
     Attributes:
@@ -178,7 +178,7 @@ class DrivePoint(ClimbPoint):
 
     joints: tuple[Array, Array]
     squared: Array
-    lowest: float
+    best_level: float
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -201,10 +201,10 @@ class _StepAnswer:
     """A quadratic program's answer, and the rows that it was given."""
 
     answer: QuadraticAnswer
-    linear: Linear
+    linear: LinearisedRows
 
 
-class DriveWay(Way[DrivePoint, DriveStep]):
+class DriveStepMethod(StepMethod[DriveIterate, DriveStep]):
     """The least duration within the force limit of the start. A resource: one per process.
 
     Attributes:
@@ -213,10 +213,10 @@ class DriveWay(Way[DrivePoint, DriveStep]):
             follow; itself where there are no others. Fewer variables take fewer and cheaper rounds.
     """
 
-    least_radius, farther = LEAST_RADIUS, FARTHER
-    refused_by_length = stays_lenient = True
+    least_radius, extrapolation = LEAST_DRIVE_RADIUS, DRIVE_EXTRAPOLATION
+    shrinks_below_step = relaxes_until_improved = True
 
-    def __init__(self, cell: SmoothCell, by_stated: bool = False) -> None:
+    def __init__(self, cell: SmoothCell, is_coarse: bool = False) -> None:
         """Prepare programs.
 
         Args:
@@ -231,32 +231,36 @@ class DriveWay(Way[DrivePoint, DriveStep]):
                 f"the polish of drivable carries needs the time law 'optimal'; {UNPOLISHABLE}: "
                 "switch the polish off"
             )
-        super().__init__(cell, ActiveSet(cell), CarryReader(cell))
+        super().__init__(cell, RowSelector(cell), CarryReader(cell))
         self.driver, self._n = driver, task.n_path
         self.half = cell.half[: task.n_path]
-        self._own = own = stated_entries(task) if by_stated else np.arange(task.n_path)
+        self._own = own = stated_entries(task) if is_coarse else np.arange(task.n_path)
         self._bounds = task.lower[own], task.upper[own]
         by, square = by_levels(task)
         self._unit = (self.half * square)[own]
-        self._newton = NEWTON * float(square[own].min())
+        self._newton = NEWTON_STEP * float(square[own].min())
         self._spread = by[:, own] * self._unit
-        self.paths = PathJudge(driver)
+        self.paths = PathEvaluator(driver)
         intervals, threads = driver.timer.intervals, cell.evaluator.threads
         self._intervals = IntervalGrid(
             cell.workcell, intervals, self._spread, driver.robust, threads
         )
-        self.stated = self
-        if task.pieces > 1 and not by_stated:
-            self.stated = DriveWay(cell, by_stated=True)
+        self.coarse = self
+        if task.pieces > 1 and not is_coarse:
+            self.coarse = DriveStepMethod(cell, is_coarse=True)
 
-    def start(self, x: Array) -> DrivePoint:
-        """See `Way`."""
-        timed = self.paths.timed(x)
-        return self._reached(x, timed, timed.squared, np.inf)
+    def evaluate(self, x: Array) -> DriveIterate:
+        """See `StepMethod`."""
+        timed = self.paths.fastest_timing(x)
+        return self._iterate(x, timed, timed.squared, np.inf)
 
-    def _reached(self, x: Array, timed: TimedPath, squared: Array, lowest: float) -> DrivePoint:
-        lowest = min(lowest, timed.duration)
-        return DrivePoint(x, self.reader.read(x), timed.duration, timed.joints, squared, lowest)
+    def _iterate(
+        self, x: Array, timed: EvaluatedPath, squared: Array, best_level: float
+    ) -> DriveIterate:
+        best_level = min(best_level, timed.duration)
+        return DriveIterate(
+            x, self.reader.read(x), timed.duration, timed.joints, squared, best_level
+        )
 
     def _moved(self, x: Array, d: Array) -> Array:
         """(n_var,) after a scaled step of the path."""
@@ -264,59 +268,62 @@ class DriveWay(Way[DrivePoint, DriveStep]):
         moved = x[:n] + self._spread @ d
         return np.append(np.clip(moved, task.lower[:n], task.upper[:n]), x[n:])
 
-    def judge(self, best: DrivePoint, step: DriveStep) -> StepVerdict[DrivePoint]:
-        """See `Way`. What the timing rounds off may hide a small gain, but must not add up."""
-        tiny = step.gain <= NOISE
-        for part in PARTS:
-            x = self._moved(best.x, part * step.d)
-            timed = self.paths.timed(x)
+    def evaluate_step(self, best: DriveIterate, step: DriveStep) -> StepEvaluation[DriveIterate]:
+        """Evaluate a step by its timing; rounding may hide a small gain, but must not
+        accumulate."""
+        tiny = step.gain <= TIMING_NOISE
+        for fraction in DRIVE_BACKTRACKING:
+            x = self._moved(best.x, fraction * step.d)
+            timed = self.paths.fastest_timing(x)
             gain = 1.0 - timed.duration / best.level
-            kept = timed.duration <= best.lowest * (1.0 + NOISE)
-            if gain >= CLOSER * part * step.gain or (tiny and kept):
+            is_no_worse = timed.duration <= best.best_level * (1.0 + TIMING_NOISE)
+            if gain >= LEAST_REDUCTION_RATIO * fraction * step.gain or (tiny and is_no_worse):
                 break
             if not np.isfinite(timed.duration):
-                return StepVerdict(None, closer=False, factor=QUARTERED)
+                return StepEvaluation(None, improved=False, factor=QUARTERED)
         else:
-            return StepVerdict(None, closer=False, factor=HALVED * part)
-        share = gain / max(part * step.gain, 1e-300)
-        is_short = part == 1.0 and step.length <= self._newton
-        squared = step.squared if is_short else timed.squared
-        return StepVerdict(
-            self._reached(x, timed, squared, best.lowest),
-            closer=True,
-            kept=max(share, 0.5) if tiny else share,
-            part=part,
-            surprising=part == 1.0 and gain > step.gain and not tiny,
-            is_short=is_short,
+            return StepEvaluation(None, improved=False, factor=HALVED * fraction)
+        share = gain / max(fraction * step.gain, 1e-300)
+        keep_active_set = fraction == 1.0 and step.length <= self._newton
+        squared = step.squared if keep_active_set else timed.squared
+        return StepEvaluation(
+            self._iterate(x, timed, squared, best.best_level),
+            improved=True,
+            reduction_ratio=max(share, 0.5) if tiny else share,
+            fraction=fraction,
+            exceeds_prediction=fraction == 1.0 and gain > step.gain and not tiny,
+            keep_active_set=keep_active_set,
         )
 
-    def along(
-        self, begin: DrivePoint, best: DrivePoint, step: DriveStep, share: float
-    ) -> DrivePoint | None:
-        """See `Way`."""
+    def evaluate_fraction(
+        self, begin: DriveIterate, best: DriveIterate, step: DriveStep, share: float
+    ) -> DriveIterate | None:
+        """See `StepMethod`."""
         x = self._moved(begin.x, share * step.d)
-        timed = self.paths.timed(x)
-        if timed.duration >= best.level * (1.0 - NOISE):
+        timed = self.paths.fastest_timing(x)
+        if timed.duration >= best.level * (1.0 - TIMING_NOISE):
             return None
-        return self._reached(x, timed, timed.squared, best.lowest)
+        return self._iterate(x, timed, timed.squared, best.best_level)
 
-    def propose(
-        self, best: DrivePoint, required: Mapping[Row, float], radius: float
+    def propose_step(
+        self, best: DriveIterate, required: Mapping[Row, float], radius: float
     ) -> DriveStep | None:
         """Form the joint program about the best carry so far, and solve its quadratic model."""
         grid = self._intervals
         values = IntervalValues(grid, self.cell.functions, best.x, best.squared, best.joints)
-        program = JointProgram(grid, values, best.x, best.squared, self.cell, required, best.carry)
-        box, chosen = self._box(best, radius), program.near()
+        program = PathTimingProgram(
+            grid, values, best.x, best.squared, self.cell, required, best.carry
+        )
+        box, chosen = self._box(best, radius), program.near_rows()
         steady = np.zeros(program.n)
-        steady[: program.n_path] = STEADINESS
-        plain = program.curvature().raised(steady)
+        steady[: program.n_path] = MULTIPLIER_CURVATURE
+        plain = program.curvature().add_diagonal(steady)
         first = self._solved(program, chosen, (plain, np.zeros(program.n)), box)
         if first is None:
             return None
         H = program.curvature(first.linear, first.answer.rows)
-        active = first.answer.rows > NEGLIGIBLE
-        model = convex(H, first.linear.A.of(active), first.linear.b[active])
+        active = first.answer.rows > NEGLIGIBLE_MULTIPLIER
+        model = convexify(H, first.linear.A.select(active), first.linear.b[active])
         second = self._solved(program, chosen, model, box)
         if second is None:
             return None
@@ -325,21 +332,23 @@ class DriveWay(Way[DrivePoint, DriveStep]):
             key=lambda known: known.stationarity + known.complementarity,
         )
         bent = program.geometry_after(second.answer.d)
-        if np.abs(bent).max(initial=0.0) > BEND:
+        if np.abs(bent).max(initial=0.0) > LARGEST_NONLINEARITY:
             second = self._solved(program, chosen, model, box, bent) or second
         d = second.answer.d
         squared = best.squared.copy()
         squared[1:-1] *= 1.0 + d[program.speeds]
         rows = program.place_rows
-        presses = second.answer.rows[len(second.linear.point) :][: len(rows)] > NEGLIGIBLE
+        is_active = (
+            second.answer.rows[len(second.linear.point) :][: len(rows)] > NEGLIGIBLE_MULTIPLIER
+        )
         path = d[: program.n_path]
         return DriveStep(
             length=float(np.abs(path).max()),
             required=required,
             residuals=lambda _: residuals,
             iterations=1,
-            is_end=_is_optimal(residuals),
-            pressing=tuple(row for row, own in zip(rows, presses, strict=True) if own),
+            is_stationary=_is_optimal(residuals),
+            active_rows=tuple(row for row, own in zip(rows, is_active, strict=True) if own),
             d=path,
             squared=squared,
             gain=max(program.gain(d), 0.0),
@@ -347,7 +356,7 @@ class DriveWay(Way[DrivePoint, DriveStep]):
 
     def _solved(
         self,
-        program: JointProgram,
+        program: PathTimingProgram,
         chosen: NDArray[np.bool_],
         model: tuple[BorderedMatrix, Array],
         box: tuple[Array, Array],
@@ -374,7 +383,7 @@ class DriveWay(Way[DrivePoint, DriveStep]):
                 chosen &= ~fresh
         return found
 
-    def _box(self, best: DrivePoint, radius: float) -> tuple[Array, Array]:
+    def _box(self, best: DriveIterate, radius: float) -> tuple[Array, Array]:
         """Bounds of a step."""
         (lower, upper), xi = self._bounds, best.x[self._own]
         speeds = np.ones(self._intervals.intervals - 1)
@@ -385,7 +394,9 @@ class DriveWay(Way[DrivePoint, DriveStep]):
             np.concatenate([high, LARGEST_SQUARED * speeds]),
         )
 
-    def _residuals(self, program: JointProgram, best: DrivePoint, found: _StepAnswer) -> Residuals:
+    def _residuals(
+        self, program: PathTimingProgram, best: DriveIterate, found: _StepAnswer
+    ) -> Residuals:
         """Residuals of the program at its iterate, with a step's multipliers. Bounds count where
         they are the variables' own, not the box of trust's."""
         (lower, upper), n, answer = self._bounds, program.n_path, found.answer
@@ -397,14 +408,14 @@ class DriveWay(Way[DrivePoint, DriveStep]):
         bounds[:n] = np.where(at_low | at_high, own, 0.0)
         return program.residuals(bounds, found.linear, answer.rows)
 
-    def climb(self, x: Array) -> Climb[DrivePoint, DriveStep]:
+    def solve_from(self, x: Array) -> TrustRegionSolve[DriveIterate, DriveStep]:
         """A climb from a decision vector (n_var,), before its first round."""
-        return Climb(self, x, FIRST_RADIUS)
+        return TrustRegionSolve(self, x, FIRST_DRIVE_RADIUS)
 
 
 def _is_optimal(residuals: Residuals) -> bool:
     return (
-        residuals.stationarity <= STATIONARY
-        and residuals.complementarity <= STATIONARY
-        and residuals.feasibility <= FEASIBLE
+        residuals.stationarity <= STATIONARITY_TOLERANCE
+        and residuals.complementarity <= STATIONARITY_TOLERANCE
+        and residuals.feasibility <= FEASIBILITY_TOLERANCE
     )

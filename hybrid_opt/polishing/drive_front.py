@@ -16,12 +16,12 @@ from typing import Literal
 
 import numpy as np
 
-from hybrid_opt.polishing.drive import STILL, DriveWay
-from hybrid_opt.polishing.front import LEAST_SPAN, Attempt, GrowingFront, Loss, PolishRun
+from hybrid_opt.polishing.drive import REST_FORCE_MARGIN, DriveStepMethod
+from hybrid_opt.polishing.front import LEAST_SPAN, Attempt, FailedAttempt, ParetoArchive, PolishRun
 from hybrid_opt.polishing.point import Solution
 from hybrid_opt.polishing.records import PolishOutcome, Status
 from hybrid_opt.polishing.settings import PolishSettings
-from hybrid_opt.polishing.starts import turned
+from hybrid_opt.polishing.starts import rotated_starts
 from hybrid_opt.timing.drive import CandidateDriver
 from hybrid_opt.timing.limits import drive_path
 from hybrid_opt.timing.model import TimingModel
@@ -32,29 +32,29 @@ from symbolic.records.task import initial_decision
 LEAST_GAP = 0.02
 """Gaps narrower than this are left, in units of the front's extent."""
 
-COMPARED = 8
+COMPARED_LIMITS = 8
 """Force limits at which paths from beside the front are compared."""
 
-GENTLE, FAST = 0.02, 0.6
+FIRST_SWEEP_MARGIN, LAST_SWEEP_MARGIN = 0.02, 0.6
 """The least force limit of the sweep, and the one that it reaches at least, as shares above the box
 at rest."""
 
 LEAST_GAIN = 1e-3
 """Share of the duration that two rounds in a row bring, or the next force limit follows."""
 
-BETWEEN = (0.125, 0.25, 0.375, 0.5, 0.625, 0.75, 0.875)
+INTERPOLATED_SHARES = (0.125, 0.25, 0.375, 0.5, 0.625, 0.75, 0.875)
 """Shares of the way from one path of the front to the next that are tried as paths, too."""
 
-MOST = 10**6
+MOST_DRIVE_ATTEMPTS = 10**6
 """Attempts at most: their number follows from the force limits and the gaps."""
 
-ENDS = 2
+FRONT_ENDS = 2
 """Of a front."""
 
-FASTEST = 4
+MOST_PATHS_TRIED = 4
 """Paths that are judged at most before a gap is left: some touch something."""
 
-ONWARD = (0.5, 1.0)
+EXTRAPOLATED_SHARES = (0.5, 1.0)
 """Shares of the way between two paths of the sweep that the next one may start ahead of the
 second."""
 
@@ -71,7 +71,7 @@ class DriveAttempt(Attempt):
 
 
 @dataclass(frozen=True)
-class Gap:
+class DriveGap:
     """A gap of the front.
 
     Attributes:
@@ -83,7 +83,7 @@ class Gap:
     ends: tuple[int, int]
 
 
-def second_opinion(driver: CandidateDriver, model: TimingModel, x: Array) -> str:
+def recheck_timing(driver: CandidateDriver, model: TimingModel, x: Array) -> str:
     """Why the timing of a decision vector (n_var,) is not believed, empty where it is: recomputed
     on a tenfold grid.
 
@@ -103,141 +103,145 @@ class DriveRun(PolishRun[DriveAttempt]):
 
     def __init__(
         self,
-        way: DriveWay,
+        drive_method: DriveStepMethod,
         settings: PolishSettings,
-        doubt: Callable[[Array], str],
-        archive: GrowingFront,
-        recorded: list[PolishOutcome | Loss],
-        emit: Callable[[PolishOutcome], None],
-        tell: Callable[[int, int], None],
+        recheck: Callable[[Array], str],
+        archive: ParetoArchive,
+        recorded: list[PolishOutcome | FailedAttempt],
+        on_outcome: Callable[[PolishOutcome], None],
+        on_progress: Callable[[int, int], None],
         paths: Array,
     ) -> None:
         """Begin.
 
         Args:
-            doubt: why the timing of a decision vector is not believed, see `second_opinion`.
+            doubt: why the timing of a decision vector is not believed, see `recheck_timing`.
             paths: (m, n_path) known beside the front.
         """
-        super().__init__(way.cell.evaluator, settings, archive, recorded, emit, tell)
-        self._most = MOST
-        self._way, self._doubt, task = way, doubt, way.cell.task
-        self._n_path, self._range = task.n_path, way.paths.force_limit
+        super().__init__(
+            drive_method.cell.evaluator, settings, archive, recorded, on_outcome, on_progress
+        )
+        self._most_attempts = MOST_DRIVE_ATTEMPTS
+        self._method, self._recheck, task = drive_method, recheck, drive_method.cell.task
+        self._n_path, self._range = task.n_path, drive_method.paths.force_limit
         self._reference = float(task.reference_force.min())
         self._by_force = 1 - self._evaluator.objective_names.index("duration")
         self._tried: set[float] = set()
         self._hand_made = initial_decision(task)[: self._n_path]
         self._paths, self._others, self._largest = paths, paths[:0], self._range[0]
         known = [x[: self._n_path] for x in archive.x]
-        rest = way.paths.at_rest(np.vstack([*known, self._hand_made, paths]))
+        rest = drive_method.paths.at_rest(np.vstack([*known, self._hand_made, paths]))
         # No known path can be held still with less.
         least = np.nanmin(rest, initial=self._range[1])
-        self._least = min(max(self._range[0], (1.0 + STILL) * float(least)), self._range[1])
-        self._still = self._least / (1.0 + STILL)
+        self._least = min(
+            max(self._range[0], (1.0 + REST_FORCE_MARGIN) * float(least)), self._range[1]
+        )
+        self._still = self._least / (1.0 + REST_FORCE_MARGIN)
 
-    def all(self, rng: np.random.Generator) -> None:
+    def run(self, rng: np.random.Generator) -> None:
         """One path by its stated waypoints, a sweep by all, then what lies between."""
-        forces = map(self._force, self._archive.rows())
-        fast = min((1.0 + FAST) * self._still, self._range[1])
+        forces = map(self._used_force, self._archive.front_indices())
+        fast = min((1.0 + LAST_SWEEP_MARGIN) * self._still, self._range[1])
         self._largest = max(*forces, fast, self._least)
-        self._others = self._leading(np.vstack([self._hand_made, self._paths]))
-        least = min(max(self._least, (1.0 + GENTLE) * self._still), fast)
+        self._others = self._fastest_paths(np.vstack([self._hand_made, self._paths]))
+        least = min(max(self._least, (1.0 + FIRST_SWEEP_MARGIN) * self._still), fast)
         limits = self._limits(least, fast, self._settings.attempts)
-        ahead = len(limits) + ENDS + self._settings.drivable.members
-        self._expect(1 + ahead)
-        paths, durations = self._driven(limits[0])
+        ahead = len(limits) + FRONT_ENDS + self._settings.drivable.members
+        self._announce(1 + ahead)
+        paths, durations = self._known_paths(limits[0])
         self._attempt(paths[int(np.argmin(durations))], limits[0], "stated")
-        if self._way.cell.task.allocation != "soft-finger":
-            middle = self._between(limits[0], fast)
-            turned_paths = self._turned(middle)
-            self._expect(len(turned_paths) + ahead)
+        if self._method.cell.task.allocation != "soft-finger":
+            middle = self._intermediate_force(limits[0], fast)
+            turned_paths = self._rotated(middle)
+            self._announce(len(turned_paths) + ahead)
             for path in turned_paths:
                 self._attempt(path, middle, "stated")
-        task, last = self._way.cell.task, list[Array]()
+        task, last = self._method.cell.task, list[Array]()
         for force in limits:
-            paths, durations = self._driven(force)
+            paths, durations = self._known_paths(force)
             if len(last) > 1:
-                onward = last[-1] + np.outer(ONWARD, last[-1] - last[-2])
+                onward = last[-1] + np.outer(EXTRAPOLATED_SHARES, last[-1] - last[-2])
                 onward = np.clip(onward, task.lower[:-1], task.upper[:-1])
                 paths = np.vstack([paths, onward])
-                durations = np.append(durations, self._way.paths.durations(onward, force))
+                durations = np.append(durations, self._method.paths.durations(onward, force))
             if self._attempt(paths[int(np.argmin(durations))], force, "all"):
                 last.append(self.outcomes[-1].x[: self._n_path])
-        self._spread()
+        self._fill_gaps()
 
     def _attempt(self, path: Array, force: float, moves: Literal["stated", "all"]) -> bool:
         """An attempt at a force limit from a path (n_path,); whether it is accepted."""
         x = np.append(path, force)
         start = self._evaluator.evaluate(x).objectives[0]
-        self._do([DriveAttempt("gap", -1, x, start, moves)])
+        self._process([DriveAttempt("gap", -1, x, start, moves)])
         return self.outcomes[-1].status == "accepted"
 
-    def _turned(self, force: float) -> list[Array]:
+    def _rotated(self, force: float) -> list[Array]:
         """The best known path and the hand-made one, turned in every sense by their stated
         waypoints. Where pads choose their pressure, tilting is free within the patches, and decides
         the basin of a path."""
-        paths, durations = self._driven(force)
+        paths, durations = self._known_paths(force)
         best = paths[int(np.argmin(durations))]
-        task, own = self._way.cell.task, stated(self._way.cell.task)
+        task, own = self._method.cell.task, stated(self._method.cell.task)
 
         def durations_of(turned_paths: Array) -> Array:
-            return self._way.paths.durations(same_paths(turned_paths, own, task), force)
+            return self._method.paths.durations(same_paths(turned_paths, own, task), force)
 
         return [
             same_paths(path, own, task)[0]
             for base in same_paths(np.array([best, self._hand_made]), task, own)
-            for path in turned(own, base, durations_of)
+            for path in rotated_starts(own, base, durations_of)
         ]
 
-    def _force(self, index: int) -> float:
+    def _used_force(self, index: int) -> float:
         """Force limit of a known carry that it uses fully [N]."""
         share = float(self._archive.objectives[index][self._by_force])
         return min(float(self._archive.x[index][-1]), share * self._reference)
 
-    def _between(self, first: float, second: float) -> float:
+    def _intermediate_force(self, first: float, second: float) -> float:
         """A force limit between two: durations go by what a limit leaves above the box at rest."""
         above = np.sqrt((first - self._still) * (second - self._still))
         return float(self._still + above)
 
-    def _spread(self) -> None:
+    def _fill_gaps(self) -> None:
         """Points of the best known paths at both ends of the front, then in its largest gaps of
         paths between both neighbours'."""
         members = self._settings.drivable.members
-        for ahead, force in ((ENDS, self._least), (ENDS - 1, self._largest)):
-            self._expect(ahead + members)
-            self._best_of(self._driven(force)[0], force)
+        for ahead, force in ((FRONT_ENDS, self._least), (FRONT_ENDS - 1, self._largest)):
+            self._announce(ahead + members)
+            self._add_fastest(self._known_paths(force)[0], force)
         for ahead in range(members, 0, -1):
             gap = self._widest_gap()
             if gap is None:
                 break
-            self._expect(ahead)
+            self._announce(ahead)
             first, second = (self._archive.x[k][: self._n_path] for k in gap.ends)
-            between = first + np.outer(BETWEEN, second - first)
-            self._best_of(np.vstack([between, self._others]), gap.force)
+            between = first + np.outer(INTERPOLATED_SHARES, second - first)
+            self._add_fastest(np.vstack([between, self._others]), gap.force)
 
-    def _best_of(self, paths: Array, force: float) -> None:
+    def _add_fastest(self, paths: Array, force: float) -> None:
         """A point of the fastest of some paths (n, n_path) within a force."""
         self._tried.add(force)
-        durations = self._way.paths.durations(paths, force)
-        for k in np.argsort(durations, kind="stable")[:FASTEST]:
+        durations = self._method.paths.durations(paths, force)
+        for k in np.argsort(durations, kind="stable")[:MOST_PATHS_TRIED]:
             x = np.append(paths[k], force)
             found = self._evaluator.evaluate(x)
             if not found.feasible[0]:
                 continue
             if self._archive.dominates(found.objectives[0]):
                 break
-            self._do([DriveAttempt("gap", -1, x, found.objectives[0], "none")])
+            self._process([DriveAttempt("gap", -1, x, found.objectives[0], "none")])
             if self.outcomes[-1].status == "accepted":
                 break
 
-    def _leading(self, paths: Array) -> Array:
+    def _fastest_paths(self, paths: Array) -> Array:
         """Those of some paths (n, n_path) that are feasible when pressed hard enough and are the
         fastest within some force."""
         x = np.hstack([paths, np.full((len(paths), 1), self._range[1])])
         paths = paths[self._evaluator.evaluate(x).feasible]
         if not len(paths):
             return paths
-        limits = self._limits(self._least, self._largest, COMPARED)
-        durations = [self._way.paths.durations(paths, force) for force in limits]
+        limits = self._limits(self._least, self._largest, COMPARED_LIMITS)
+        durations = [self._method.paths.durations(paths, force) for force in limits]
         return np.asarray(paths[np.unique(np.argmin(durations, axis=1))])
 
     def _limits(self, least: float, fast: float, count: int) -> list[float]:
@@ -251,19 +255,19 @@ class DriveRun(PolishRun[DriveAttempt]):
         limits: list[float] = np.clip(self._still + above, least, self._largest).tolist()
         return sorted(set(limits))
 
-    def _driven(self, force: float) -> tuple[Array, Array]:
+    def _known_paths(self, force: float) -> tuple[Array, Array]:
         """Paths of the front and those beside it (n, n_path), and how long they take within a
         force."""
-        known = [self._archive.x[k][: self._n_path] for k in self._archive.rows()]
+        known = [self._archive.x[k][: self._n_path] for k in self._archive.front_indices()]
         paths = np.unique(np.vstack([*known, self._others]), axis=0)
-        return paths, self._way.paths.durations(paths, force)
+        return paths, self._method.paths.durations(paths, force)
 
-    def _widest_gap(self) -> Gap | None:
+    def _widest_gap(self) -> DriveGap | None:
         """The largest gap between neighbours whose middle was not tried; None without any."""
         # What is not polished yet fills no gap: it is to be improved.
-        rows = [k for k in self._archive.rows() if self._archive.polished[k]]
+        rows = [k for k in self._archive.front_indices() if self._archive.polished[k]]
         if len(rows) < 2:
-            rows = self._archive.rows()
+            rows = self._archive.front_indices()
         # By speed and by shares of force: a second matters less to a slow carry than to a fast one.
         values = np.array([self._archive.objectives[k] for k in rows])
         values[:, 1 - self._by_force] **= -1.0
@@ -273,34 +277,36 @@ class DriveRun(PolishRun[DriveAttempt]):
         for gap in np.argsort(-areas, kind="stable").tolist():
             if areas[gap] <= LEAST_GAP**2:
                 return None
-            ends = [max(self._force(rows[k]), self._least) for k in (gap, gap + 1)]
-            force = self._between(*ends)
+            ends = [max(self._used_force(rows[k]), self._least) for k in (gap, gap + 1)]
+            force = self._intermediate_force(*ends)
             if force not in self._tried:
-                return Gap(force, (rows[gap], rows[gap + 1]))
+                return DriveGap(force, (rows[gap], rows[gap + 1]))
         return None
 
-    def _solution(self, attempt: DriveAttempt) -> Solution:
+    def _solve(self, attempt: DriveAttempt) -> Solution:
         if attempt.moves == "none":
             return Solution(attempt.x, usable=True)
         settings = self._settings.drivable
         if attempt.moves == "all":
-            return self._way.climb(attempt.x).go_on(settings.rounds, LEAST_GAIN)
-        return self._way.stated.climb(attempt.x).go_on(settings.first_rounds)
+            return self._method.solve_from(attempt.x).run(settings.rounds, LEAST_GAIN)
+        return self._method.coarse.solve_from(attempt.x).run(settings.first_rounds)
 
-    def _verdict(self, attempt: DriveAttempt, answer: Solution | Loss) -> tuple[Status, str, Array]:
+    def _status(
+        self, attempt: DriveAttempt, answer: Solution | FailedAttempt
+    ) -> tuple[Status, str, Array]:
         if attempt.moves == "none" and isinstance(answer, Solution):
-            return self._recomputed(attempt, answer)
-        return super()._verdict(attempt, answer)
+            return self._verify(attempt, answer)
+        return super()._status(attempt, answer)
 
-    def _worth(
+    def _classify(
         self, attempt: DriveAttempt, answer: Solution, objectives: Array
     ) -> tuple[Status, str, Array]:
         if self._archive.dominates(objectives):
             return self._not_improved(answer, attempt)
-        doubt = self._doubt(answer.x)
-        return ("rejected", doubt, attempt.start) if doubt else ("accepted", "", objectives)
+        recheck = self._recheck(answer.x)
+        return ("rejected", recheck, attempt.start) if recheck else ("accepted", "", objectives)
 
-    def _take(self, attempt: DriveAttempt, outcome: PolishOutcome) -> None:
+    def _record(self, attempt: DriveAttempt, outcome: PolishOutcome) -> None:
         self.outcomes.append(outcome)
         if outcome.status == "accepted":
             self._archive.add(outcome.x, outcome.objectives)

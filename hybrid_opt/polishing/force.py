@@ -25,35 +25,42 @@ import numpy as np
 
 from hybrid_opt.polishing.carry import CarryReader, PlacedCarry
 from hybrid_opt.polishing.cell import SmoothCell
-from hybrid_opt.polishing.constraints.active import ActiveSet
-from hybrid_opt.polishing.constraints.kinds import Limits
-from hybrid_opt.polishing.point import Climb, ClimbPoint, Solution, Step, StepVerdict, Way
-from hybrid_opt.polishing.rows import HELD, Layout, Row, Rows
+from hybrid_opt.polishing.constraints.active import RowSelector
+from hybrid_opt.polishing.constraints.kinds import MinimisedForces
+from hybrid_opt.polishing.point import (
+    Iterate,
+    Solution,
+    Step,
+    StepEvaluation,
+    StepMethod,
+    TrustRegionSolve,
+)
+from hybrid_opt.polishing.rows import PROGRAM_BRANCH, ConstraintRows, Row, RowLayout
 from hybrid_opt.polishing.settings import PolishSettings
-from hybrid_opt.polishing.solvers.base import Residuals, Solve, optimality
+from hybrid_opt.polishing.solvers.base import Residuals, Solve, optimality_residuals
 from hybrid_opt.polishing.solvers.dense import dense
 from hybrid_opt.polishing.solvers.ipopt import ipopt
 from symbolic.array import Array
 
-NO_LIMIT = 1e3
+UNBOUNDED_OFFSET = 1e3
 """Offset that leaves an objective free, in units of the range."""
 
-LARGER = 0.5
+LARGER_WEIGHT = 0.5
 """Weight of the larger objective beside the sum of both in the balanced middle."""
 
-TIE = 1e-4
+TIE_WEIGHT = 1e-4
 """Weight of the sum of both objectives beside the level: excludes weakly efficient points."""
 
-SLACK = 0.1
+EPIGRAPH_SLACK = 0.1
 """What the epigraph variables start above the peak forces, in units of the span."""
 
 LEVEL_BOUND = 2e3
 """Bound of |phi| and |a|; beyond anything the targets ask for."""
 
-LEAST_RADIUS = 1e-3
+LEAST_FORCE_RADIUS = 1e-3
 """Radius of the box of trust below which a point is left."""
 
-PARTS = (3 / 4, 2 / 4, 1 / 4)
+FORCE_BACKTRACKING = (3 / 4, 2 / 4, 1 / 4)
 """Shares of a step that violates something, which are judged in its place."""
 
 BARRIER, WIDE_BARRIER, NEAR_BARRIER = 3e-4, 3e-2, 1e-5
@@ -63,14 +70,14 @@ multipliers; solves that look for other basins first go to the middle of what is
 NEAR_ROUNDS, NEAR_ITERATIONS = 12, 30
 """Rounds of a start that is nearly an optimum, and the solver's iterations in each."""
 
-Reach = Literal["usual", "wide", "near", "brief"]
+SolveMode = Literal["usual", "wide", "near", "brief"]
 """usual. wide: whether to look farther than the nearest optimum. near: the start is nearly an
 optimum of the target, as a neighbour on the front is. brief: to end after
 `ProbeSettings.rounds`."""
 
 
 @dataclass(frozen=True)
-class Target:
+class Scalarisation:
     """Target of one solve; see the module; all (2,) but cost (3,): of the level and both
     peaks."""
 
@@ -81,12 +88,12 @@ class Target:
     cost: Array
 
     @property
-    def limits(self) -> Limits:
-        """See `Limits`."""
-        first, second = (self.offset < NO_LIMIT).tolist()
+    def limits(self) -> MinimisedForces:
+        """See `MinimisedForces`."""
+        first, second = (self.offset < UNBOUNDED_OFFSET).tolist()
         return first, second
 
-    def needed(self, phi: Array) -> float:
+    def least_level(self, phi: Array) -> float:
         """The least level a that scaled peak forces (2,) allow."""
         ahead = self.direction > 0.0
         return float(np.max((phi - self.offset)[ahead] / self.direction[ahead]))
@@ -94,49 +101,57 @@ class Target:
     def level(self, peak: Array) -> float:
         """What the smooth problem minimises, at given peak forces (2,) over their references."""
         phi = (peak - self.anchor) / self.span
-        return float(self.cost @ np.concatenate([[self.needed(phi)], phi]))
+        return float(self.cost @ np.concatenate([[self.least_level(phi)], phi]))
 
 
-def pascoletti_serafini(anchor: Array, span: Array) -> Target:
+def pascoletti_serafini(anchor: Array, span: Array) -> Scalarisation:
     """Go from the anchor along the diagonal as far as possible, never above either side.
 
     Args:
         anchor, span: (2,) point started from, and the scale of each objective.
     """
-    return Target(anchor, span, np.ones(2), np.zeros(2), np.array([1.0, TIE, TIE]))
+    return Scalarisation(
+        anchor, span, np.ones(2), np.zeros(2), np.array([1.0, TIE_WEIGHT, TIE_WEIGHT])
+    )
 
 
-def extreme(anchor: Array, span: Array, objective: int) -> Target:
+def extreme_scalarisation(anchor: Array, span: Array, objective: int) -> Scalarisation:
     """Minimise one objective; the other only breaks ties."""
-    free = np.where(np.arange(2) == objective, 0.0, NO_LIMIT)
-    return Target(anchor, span, np.eye(2)[objective], free, np.array([1.0, TIE, TIE]))
+    free = np.where(np.arange(2) == objective, 0.0, UNBOUNDED_OFFSET)
+    return Scalarisation(
+        anchor, span, np.eye(2)[objective], free, np.array([1.0, TIE_WEIGHT, TIE_WEIGHT])
+    )
 
 
-def balance(anchor: Array, span: Array) -> Target:
+def balanced_scalarisation(anchor: Array, span: Array) -> Scalarisation:
     """Minimise the sum of both objectives and half of the larger one: where one robot can relieve
     the other at little cost, both carry alike, which leaves most room for payload."""
     middle = np.full(2, anchor.mean())
-    return Target(middle, span, np.ones(2), np.zeros(2), np.array([LARGER, 1.0, 1.0]))
+    return Scalarisation(middle, span, np.ones(2), np.zeros(2), np.array([LARGER_WEIGHT, 1.0, 1.0]))
 
 
-def aimed(anchor: Array, span: Array, objective: int | None) -> Target:
+def scalarisation_for(anchor: Array, span: Array, objective: int | None) -> Scalarisation:
     """Target at an end of a front, or at its balanced middle."""
-    return balance(anchor, span) if objective is None else extreme(anchor, span, objective)
+    return (
+        balanced_scalarisation(anchor, span)
+        if objective is None
+        else extreme_scalarisation(anchor, span, objective)
+    )
 
 
 class ForceProgram:
-    """The program of a set of rows near one candidate; attributes as of `solvers.base.Program`,
-    and:
+    """Nonlinear program of a set of rows near one candidate; see the module.
 
     Attributes:
-        layout: where rows stand.
+        layout: order of the rows.
+        cost, start, low, high: as of `solvers.base.NonlinearProgram`.
     """
 
     def __init__(
         self,
         cell: SmoothCell,
         required: Mapping[Row, float],
-        target: Target,
+        target: Scalarisation,
         carry: PlacedCarry,
         x: Array,
         radius: float,
@@ -149,7 +164,7 @@ class ForceProgram:
             radius: half the width of the box of trust, in halves of the variables' ranges.
         """
         self._cell, self._target, self._n = cell, target, cell.task.n_var
-        self.layout = layout = Layout(required, sides=2)
+        self.layout = layout = RowLayout(required, sides=2)
         n, n_z = self._n, self._n + 3
         robot, branch, sample = (
             np.array([getattr(row, name) for row in layout.force_rows], dtype=np.intp)
@@ -162,13 +177,13 @@ class ForceProgram:
         fixed = np.zeros((layout.n_rows, 3))
         fixed[np.arange(layout.forces.stop), robot] = 1.0
         fixed[layout.sides, :2], fixed[layout.sides, 2] = -np.eye(2), target.direction
-        self._rows = Rows(cell, layout, carry.q, mix, fixed)
+        self._rows = ConstraintRows(cell, layout, carry.q, mix, fixed)
         # What the rows lack at the candidate: what the rounded time law takes off, what the joint
         # allocation's barriers add, or what makes planned forces robust ones, with their slopes.
         self._rows.values(x, np.zeros(3))
         found = self._rows.forces
         if cell.robust is None:
-            held = (branch == HELD)[:, None]
+            held = (branch == PROGRAM_BRANCH)[:, None]
             exact = np.where(held, carry.force[sample], carry.split[sample])
             lacking = np.einsum("rk,rk->r", mix, exact - found)
         else:
@@ -176,7 +191,9 @@ class ForceProgram:
             unit = -reference * span
             lacking = force[sample, robot] / unit - np.einsum("rk,rk->r", mix, found)
             slope = by_x[sample, robot] / unit[:, None]
-            self._rows.correct(slope - np.einsum("rk,rkx->rx", mix, self._rows.force_slopes), x)
+            self._rows.correct_forces(
+                slope - np.einsum("rk,rkx->rx", mix, self._rows.force_slopes), x
+            )
         pressed, at = (
             np.array([getattr(row, name) for row in layout.pressure_rows], dtype=np.intp)
             for name in ("robot", "sample")
@@ -188,10 +205,10 @@ class ForceProgram:
         offset[layout.patches] -= [required[row] for row in layout.pressure_rows]
         offset[layout.places] = [-required[row] / row.constraint.scale for row in layout.place_rows]
 
-        phi = (carry.peak - target.anchor) / target.span + SLACK
+        phi = (carry.peak - target.anchor) / target.span + EPIGRAPH_SLACK
         xi, low, high = (cell.scaled(v) for v in (x, cell.task.lower, cell.task.upper))
         self.cost = np.concatenate([np.zeros(n), target.cost[1:], target.cost[:1]])
-        self.start = np.concatenate([xi, phi, [target.needed(phi) + SLACK]])
+        self.start = np.concatenate([xi, phi, [target.least_level(phi) + EPIGRAPH_SLACK]])
         self._own_bounds = np.full((2, n_z), LEVEL_BOUND) * np.array([[-1.0], [1.0]])
         self._own_bounds[:, :n] = low, high
         self.low, self.high = self._own_bounds.copy()
@@ -201,7 +218,7 @@ class ForceProgram:
         self._jacobian: Array | None = None
 
     def values(self, z: Array) -> Array:
-        """See `solvers.base.Program`; what was evaluated last is remembered."""
+        """See `solvers.base.NonlinearProgram`; what was evaluated last is remembered."""
         key = z.tobytes()
         if key != self._known:
             self._values = self._rows.values(self._cell.unscaled(z[: self._n]), z[self._n :])
@@ -209,7 +226,7 @@ class ForceProgram:
         return self._values
 
     def rows(self, z: Array) -> tuple[Array, Array]:
-        """See `solvers.base.Program`: what gave the values at z knows its slopes as well."""
+        """Return values and slopes at z, the slopes from the same evaluation as the values."""
         values = self.values(z)
         if self._jacobian is None:
             self._jacobian = self._rows.slopes()
@@ -217,7 +234,7 @@ class ForceProgram:
         return values, self._jacobian
 
     def curvature(self, z: Array, weights: Array) -> Array:
-        """See `solvers.base.Program`."""
+        """See `solvers.base.NonlinearProgram`."""
         self.rows(z)
         n, half = self._n, self._cell.half
         full = np.zeros((n + 3, n + 3))
@@ -230,9 +247,9 @@ class ForceProgram:
         to be won."""
         target = self._target
         phi = (carry.peak - target.anchor) / target.span
-        z = np.concatenate([self._cell.scaled(x), phi, [target.needed(phi)]])
+        z = np.concatenate([self._cell.scaled(x), phi, [target.least_level(phi)]])
         low, high = self._own_bounds
-        return optimality(self, z, (low, high))
+        return optimality_residuals(self, z, (low, high))
 
     def candidate(self, z: Array) -> Array:
         """(n_var,) the decision vector at z, within its bounds and the box of trust."""
@@ -247,15 +264,15 @@ class ForceStep(Step):
     x: Array
 
 
-class ForceWay(Way[ClimbPoint, ForceStep]):
+class ForceStepMethod(StepMethod[Iterate, ForceStep]):
     """Towards one target."""
 
-    least_radius, parts = LEAST_RADIUS, PARTS
+    least_radius, backtracking = LEAST_FORCE_RADIUS, FORCE_BACKTRACKING
 
     def __init__(
         self,
         solver: ForceSolver,
-        target: Target,
+        target: Scalarisation,
         iterations: int,
         barrier: float,
     ) -> None:
@@ -263,13 +280,13 @@ class ForceWay(Way[ClimbPoint, ForceStep]):
         self._solve, self._target, self.limits = solver.method, target, target.limits
         self._iterations, self._barrier = iterations, barrier
 
-    def start(self, x: Array) -> ClimbPoint:
-        """See `Way`."""
+    def evaluate(self, x: Array) -> Iterate:
+        """See `StepMethod`."""
         carry = self.reader.read(x)
-        return ClimbPoint(x, carry, self._target.level(carry.peak))
+        return Iterate(x, carry, self._target.level(carry.peak))
 
-    def propose(
-        self, best: ClimbPoint, required: Mapping[Row, float], radius: float
+    def propose_step(
+        self, best: Iterate, required: Mapping[Row, float], radius: float
     ) -> ForceStep | None:
         """Solve the program in the box."""
         program = ForceProgram(self.cell, required, self._target, best.carry, best.x, radius)
@@ -286,21 +303,21 @@ class ForceWay(Way[ClimbPoint, ForceStep]):
             x=x,
         )
 
-    def judge(self, best: ClimbPoint, step: ForceStep) -> StepVerdict[ClimbPoint]:
-        """See `Way`."""
-        reached = self.start(step.x)
-        return StepVerdict(reached, reached.level < best.level)
+    def evaluate_step(self, best: Iterate, step: ForceStep) -> StepEvaluation[Iterate]:
+        """See `StepMethod`."""
+        trial = self.evaluate(step.x)
+        return StepEvaluation(trial, trial.level < best.level)
 
-    def along(
-        self, begin: ClimbPoint, best: ClimbPoint, step: ForceStep, share: float
-    ) -> ClimbPoint | None:
-        """See `Way`."""
-        reached = self.start(begin.x + share * (step.x - begin.x))
-        return reached if reached.level < best.level else None
+    def evaluate_fraction(
+        self, begin: Iterate, best: Iterate, step: ForceStep, share: float
+    ) -> Iterate | None:
+        """See `StepMethod`."""
+        trial = self.evaluate(begin.x + share * (step.x - begin.x))
+        return trial if trial.level < best.level else None
 
-    def missing(self, reached: ClimbPoint) -> set[Row]:
+    def missing_rows(self, trial: Iterate) -> set[Row]:
         """Rows at peaks that are higher than the program foresaw."""
-        return set(self.active.forces.higher(reached.carry, self.limits))
+        return set(self.active.forces.peak_rows(trial.carry, self.limits))
 
 
 class ForceSolver:
@@ -313,21 +330,23 @@ class ForceSolver:
 
     def __init__(self, cell: SmoothCell, settings: PolishSettings) -> None:
         self.cell, self._settings = cell, settings
-        self.active, self.reader = ActiveSet(cell), CarryReader(cell)
+        self.active, self.reader = RowSelector(cell), CarryReader(cell)
         self.method: Solve = ipopt if settings.solver == "ipopt" else dense
 
-    def solve(self, x: Array, target: Target, radius: float, reach: Reach = "usual") -> Solution:
+    def solve(
+        self, x: Array, target: Scalarisation, radius: float, mode: SolveMode = "usual"
+    ) -> Solution:
         """Improve a feasible decision vector (n_var,) towards a target.
 
         Args:
             radius: of the first box of trust, in halves of the decision variables' ranges.
         """
         rounds, iterations, barrier = self._settings.rounds, self._settings.max_iterations, BARRIER
-        if reach == "near":
+        if mode == "near":
             rounds, iterations, barrier = NEAR_ROUNDS, NEAR_ITERATIONS, NEAR_BARRIER
-        elif reach == "brief":
+        elif mode == "brief":
             rounds = self._settings.probe.rounds
-        elif reach == "wide":
+        elif mode == "wide":
             barrier = WIDE_BARRIER
-        way = ForceWay(self, target, iterations, barrier)
-        return Climb(way, x, radius).go_on(rounds)
+        step_method = ForceStepMethod(self, target, iterations, barrier)
+        return TrustRegionSolve(step_method, x, radius).run(rounds)

@@ -27,22 +27,29 @@ import numpy as np
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator, Evaluations
 from hybrid_opt.polishing.force import (
     ForceSolver,
-    Reach,
-    Target,
-    aimed,
+    Scalarisation,
+    SolveMode,
     pascoletti_serafini,
+    scalarisation_for,
 )
-from hybrid_opt.polishing.front import LEAST_SPAN, OWN_SHARE, Attempt, GrowingFront, Loss, PolishRun
+from hybrid_opt.polishing.front import (
+    LEAST_SPAN,
+    OWN_SHARE,
+    Attempt,
+    FailedAttempt,
+    ParetoArchive,
+    PolishRun,
+)
 from hybrid_opt.polishing.point import Solution
 from hybrid_opt.polishing.records import Aim, PolishOutcome
 from hybrid_opt.polishing.settings import PolishSettings
-from hybrid_opt.polishing.starts import Start, kicked, mirror_of, random_starts
+from hybrid_opt.polishing.starts import Start, mirror_of, perturb_start, random_starts
 from symbolic.array import Array, evenly
 
-ENOUGH = 0.9
+LEAST_MEMBER_SHARE = 0.9
 """Share of the points that a front is to have with which it is left."""
 
-PROGRESS = 2e-5
+LEAST_PROGRESS = 2e-5
 """Least gain of an attempt that counts as coming further, in units of the reference force."""
 
 MIDDLE_STALLS = 1
@@ -56,13 +63,13 @@ STRIDE = 0.2
 """From the neighbour that an attempt starts from, along both objectives, at most, in units of the
 front's extent."""
 
-FAR = 0.1
+FAR_GAP = 0.1
 """Width beyond which a gap that no neighbour leads into is looked at from afar."""
 
 TAIL = 0.125
 """Share of its length that a gap is wide at least."""
 
-CREEP = 0.3
+LITTLE_PROGRESS = 0.3
 """Share of its step that an attempt has to come along the front."""
 
 CHORD = 16
@@ -75,7 +82,7 @@ stays near."""
 Chord = tuple[bytes, bytes]
 """Its ends, by increasing first objective: decision vectors as bytes."""
 
-Kick = Callable[[Array, int], tuple[Array, Array] | None]
+Perturbation = Callable[[Array, int], tuple[Array, Array] | None]
 """From a decision vector and the objective that matters to another start and its objectives; None
 where none was found."""
 
@@ -84,14 +91,14 @@ where none was found."""
 class ForceAttempt(Attempt):
     """An attempt at a target; see `hybrid_opt.polishing.force.ForceSolver.solve`."""
 
-    target: Target
+    target: Scalarisation
     radius: float = RADIUS
-    reach: Reach = "usual"
+    mode: SolveMode = "usual"
 
 
-def points(archive: GrowingFront, settings: PolishSettings) -> list[ForceAttempt]:
+def front_attempts(archive: ParetoArchive, settings: PolishSettings) -> list[ForceAttempt]:
     """Evenly spread points of the front, the balanced one among them."""
-    rows = archive.rows()
+    rows = archive.front_indices()
     count = min(len(rows), ceil(settings.attempts * OWN_SHARE))
     chosen = {rows[k] for k in evenly(len(rows), count)}
     middle, _ = archive.best(None)
@@ -108,12 +115,12 @@ def points(archive: GrowingFront, settings: PolishSettings) -> list[ForceAttempt
     return attempts
 
 
-def further(
-    archive: GrowingFront,
+def extreme_attempt(
+    archive: ParetoArchive,
     objective: int | None,
     tried: Collection[tuple[int | None, bytes]],
     stalled: bool,
-    kick: Kick,
+    perturb: Perturbation,
     rng: np.random.Generator,
 ) -> ForceAttempt:
     """An attempt at an end of the front or at its balanced middle.
@@ -130,39 +137,41 @@ def further(
     radius, k = RADIUS, archive.best(objective)[0]
     fresh = [row for row, x in enumerate(archive.x) if (objective, x.tobytes()) not in tried]
     span, away = np.full(2, LEAST_SPAN), stalled or k not in fresh
-    if away and objective is not None and (found := kick(archive.x[k], objective)) is not None:
+    if away and objective is not None and (found := perturb(archive.x[k], objective)) is not None:
         x, start = found
-        return ForceAttempt("extreme", -1, x, start, aimed(start, span, objective))
+        return ForceAttempt("extreme", -1, x, start, scalarisation_for(start, span, objective))
     if away and fresh:
         k = fresh[int(rng.integers(len(fresh)))]
     elif not fresh:
         radius = SMALL_RADIUS
     x, start = archive.x[k], archive.objectives[k]
-    target = aimed(start, span, objective)
+    target = scalarisation_for(start, span, objective)
     if objective is None:
         return ForceAttempt("balance", -1, x, start, target, radius)
     return ForceAttempt("extreme", -1, x, start, target, radius, "wide" if away else "usual")
 
 
-def finishing(archive: GrowingFront, objective: int | None) -> ForceAttempt:
+def refinement_attempt(archive: ParetoArchive, objective: int | None) -> ForceAttempt:
     """An attempt from the best point at an end, or at the balanced middle, to the last digits."""
     k, span = archive.best(objective)[0], archive.span()
     x, start = archive.x[k], archive.objectives[k]
-    target = aimed(start, span, objective)
+    target = scalarisation_for(start, span, objective)
     aim: Aim = "balance" if objective is None else "extreme"
     return ForceAttempt(aim, -1, x, start, target, NEAR_RADIUS, "near")
 
 
-def probing(start: Start, objective: int | None) -> ForceAttempt:
+def probe_attempt(start: Start, objective: int | None) -> ForceAttempt:
     """A short solve from a start towards an end of the front, or its balanced middle."""
-    target = aimed(start.objectives, np.full(2, LEAST_SPAN), objective)
-    return ForceAttempt("probe", -1, start.x, start.objectives, target, reach="brief")
+    target = scalarisation_for(start.objectives, np.full(2, LEAST_SPAN), objective)
+    return ForceAttempt("probe", -1, start.x, start.objectives, target, mode="brief")
 
 
-def halve(pool: list[Start], objective: int | None, solve: Callable[[Start], Start]) -> None:
+def successive_halving(
+    pool: list[Start], objective: int | None, solve: Callable[[Start], Start]
+) -> None:
     """Solve from all starts, then from the better half of what was reached, until one is left."""
     while pool:
-        reached = [start if start.spent else solve(start) for start in pool]
+        reached = [start if start.is_exhausted else solve(start) for start in pool]
         pool = better_half(reached, objective)
 
 
@@ -173,7 +182,7 @@ def better_half(reached: list[Start], objective: int | None) -> list[Start]:
 
 
 @dataclass(frozen=True)
-class Filling:
+class GapAttempt:
     """An attempt in a gap.
 
     Attributes:
@@ -188,7 +197,7 @@ class Filling:
 
 
 @dataclass(frozen=True)
-class Gap:
+class ForceGap:
     """Neighbours on a front: indices into the archive, and how far apart they are.
 
     Attributes:
@@ -203,25 +212,25 @@ class Gap:
     length: float
 
 
-def gaps(archive: GrowingFront) -> list[Gap]:
+def gaps(archive: ParetoArchive) -> list[ForceGap]:
     """All of a front, in its order."""
-    rows = archive.rows()
+    rows = archive.front_indices()
     scaled = np.array([archive.objectives[k] for k in rows]) / archive.span()
     sides = np.abs(np.diff(scaled, axis=0))
     lengths = sides.sum(axis=1)
     widths = np.maximum(np.sqrt(sides.prod(axis=1)), TAIL * lengths)
     ends = zip(rows[:-1], rows[1:], widths.tolist(), lengths.tolist(), strict=True)
-    return [Gap(*gap) for gap in ends]
+    return [ForceGap(*gap) for gap in ends]
 
 
-def filling(
-    archive: GrowingFront,
+def gap_attempt(
+    archive: ParetoArchive,
     tried: Collection[Edge],
     solved: int,
     *,
     stride: float = STRIDE,
-    far: float = FAR,
-) -> Filling | None:
+    far: float = FAR_GAP,
+) -> GapAttempt | None:
     """An attempt in the widest gap, from the side that was not tried.
 
     Where both sides' continuations failed, because the front jumps there, a gap that is far too
@@ -231,7 +240,7 @@ def filling(
         archive: the front so far.
         tried: sides of gaps that attempts started from.
         solved: points with which the front has enough.
-        stride, far: see `STRIDE` and `FAR`.
+        stride, far: see `STRIDE` and `FAR_GAP`.
 
     Returns:
         The attempt; None where the front has enough points, or no side of a gap is left.
@@ -253,42 +262,44 @@ def filling(
                 target = _target(archive, start, sign * step)
                 radius = NEAR_RADIUS if near else RADIUS
                 x, objectives = archive.x[start], archive.objectives[start]
-                reach: Reach = "near" if near else "usual"
-                attempt = ForceAttempt("gap", -1, x, objectives, target, radius, reach)
-                return Filling(attempt, edge, step)
+                mode: SolveMode = "near" if near else "usual"
+                attempt = ForceAttempt("gap", -1, x, objectives, target, radius, mode)
+                return GapAttempt(attempt, edge, step)
     return None
 
 
-def crept(archive: GrowingFront, filling: Filling, objectives: Array) -> bool:
+def made_little_progress(
+    archive: ParetoArchive, gap_attempt: GapAttempt, objectives: Array
+) -> bool:
     """Whether what an attempt found is hardly farther along the front than where it started."""
-    moved = np.abs(objectives - filling.attempt.start) / archive.span()
-    return float(moved.sum()) < CREEP * filling.step
+    moved = np.abs(objectives - gap_attempt.attempt.start) / archive.span()
+    return float(moved.sum()) < LITTLE_PROGRESS * gap_attempt.step
 
 
-def _target(archive: GrowingFront, k: int, step: float) -> Target:
+def _target(archive: ParetoArchive, k: int, step: float) -> Scalarisation:
     """From a member to a distance along the front."""
     span = archive.span()
     aside = np.array([0.5, -0.5]) * step * span
     return pascoletti_serafini(archive.objectives[k] + aside, span)
 
 
-def widest(archive: GrowingFront, tried: Collection[Chord]) -> Gap | None:
+def widest_untried_gap(archive: ParetoArchive, tried: Collection[Chord]) -> ForceGap | None:
     """The widest gap whose chord was not tried; None where none is left. Points of the given front
     have no chords."""
     for gap in sorted(gaps(archive), key=lambda gap: -gap.width):
         is_polished = archive.polished[gap.first] and archive.polished[gap.second]
-        if is_polished and chord_of(archive, gap) not in tried:
+        if is_polished and chord_across(archive, gap) not in tried:
             return gap
     return None
 
 
-def chord_of(archive: GrowingFront, gap: Gap) -> Chord:
+def chord_across(archive: ParetoArchive, gap: ForceGap) -> Chord:
     """The chord across a gap."""
     return archive.x[gap.first].tobytes(), archive.x[gap.second].tobytes()
 
 
-def between(
-    evaluator: CandidateEvaluator, archive: GrowingFront, gap: Gap
+def best_on_chord(
+    evaluator: CandidateEvaluator, archive: ParetoArchive, gap: ForceGap
 ) -> tuple[Array, Array] | None:
     """The feasible point on a chord that wins most area from its gap: decision vector (n_var,) and
     objectives (2,); None where every one is dominated or infeasible."""
@@ -311,12 +322,14 @@ class ForceRun(PolishRun[ForceAttempt]):
         self,
         solver: ForceSolver,
         settings: PolishSettings,
-        archive: GrowingFront,
-        recorded: list[PolishOutcome | Loss],
-        emit: Callable[[PolishOutcome], None],
-        tell: Callable[[int, int], None],
+        archive: ParetoArchive,
+        recorded: list[PolishOutcome | FailedAttempt],
+        on_outcome: Callable[[PolishOutcome], None],
+        on_progress: Callable[[int, int], None],
     ) -> None:
-        super().__init__(solver.cell.evaluator, settings, archive, recorded, emit, tell)
+        super().__init__(
+            solver.cell.evaluator, settings, archive, recorded, on_outcome, on_progress
+        )
         self._solver, self._mirror = solver, mirror_of(solver.cell.workcell)
         self._tried: set[tuple[int | None, bytes]] = set()
         self._stalls: dict[int | None, int] = {0: 0, 1: 0, None: 0}
@@ -324,39 +337,39 @@ class ForceRun(PolishRun[ForceAttempt]):
         self._probed = set[bytes]()
         self._ahead = 0
 
-    def _solution(self, attempt: ForceAttempt) -> Solution:
-        found = self._solver.solve(attempt.x, attempt.target, attempt.radius, attempt.reach)
+    def _solve(self, attempt: ForceAttempt) -> Solution:
+        found = self._solver.solve(attempt.x, attempt.target, attempt.radius, attempt.mode)
         # Ends and middles have a finer scale of their own.
         unit = float((attempt.target.span / self._archive.span()).max())
         found.residuals = found.residuals.scaled(unit)
         return found
 
-    def all(self, rng: np.random.Generator) -> None:
+    def run(self, rng: np.random.Generator) -> None:
         """The front's points, then probes far from it, then ends and middle in turns while attempts
         last; then what lies between. Mirror images are taken in all the way, and certified together
         with points on chords in the end."""
-        first, fill = points(self._archive, self._settings), self._settings.fill
-        self._ahead = max(self._left() - len(first), 0)
+        first, fill = front_attempts(self._archive, self._settings), self._settings.fill
+        self._ahead = max(self._attempts_left() - len(first), 0)
         aims = (0, 1, None) if self._mirror is None else (0, None)
         later = len(aims) + min(fill.solved, fill.attempts * self._settings.attempts)
         probes = sum(max(2 * self._starts(objective) - 1, 0) for objective in aims)
-        self._expect(self._left() + probes + later)
-        self._do(first)
+        self._announce(self._attempts_left() + probes + later)
+        self._process(first)
         for objective in aims:
             self._probe(objective, rng)
-        self._expect(self._left() + later)
-        while self._left() > 0:
-            self._turn((0, 1), rng)
+        self._announce(self._attempts_left() + later)
+        while self._attempts_left() > 0:
+            self._attempt_ends((0, 1), rng)
             if self._stalls[None] < MIDDLE_STALLS:
-                self._turn((None,), rng)
+                self._attempt_ends((None,), rng)
         for objective in aims:
-            self._most += 1
-            self._do([finishing(self._archive, objective)])
-        probed = self._without_probes()
+            self._most_attempts += 1
+            self._process([refinement_attempt(self._archive, objective)])
+        probed = self._remove_probes()
         self._fill(fill.solved)
-        self._take_back(probed)
+        self._restore_probes(probed)
         self._certify_unproven()
-        if len(self._archive.rows()) < ENOUGH * fill.members:
+        if len(self._archive.front_indices()) < LEAST_MEMBER_SHARE * fill.members:
             # Chords lead nowhere, or where nothing is proven.
             self._fill(fill.members)
             self._certify_unproven()
@@ -372,12 +385,12 @@ class ForceRun(PolishRun[ForceAttempt]):
         pool += random_starts(self._evaluator, count - 1, rng)
 
         def solve(start: Start) -> Start:
-            self._most += 1
-            self._do([probing(start, objective)])
+            self._most_attempts += 1
+            self._process([probe_attempt(start, objective)])
             outcome = self.outcomes[-1]
-            return Start(outcome.x, outcome.objectives, spent=outcome.status != "accepted")
+            return Start(outcome.x, outcome.objectives, is_exhausted=outcome.status != "accepted")
 
-        halve(pool, objective, solve)
+        successive_halving(pool, objective, solve)
 
     def _starts(self, objective: int | None) -> int:
         """Starts of short solves: never more than twice the attempts that are ahead."""
@@ -385,7 +398,7 @@ class ForceRun(PolishRun[ForceAttempt]):
         count = probe.starts if self._mirror is not None else (probe.starts + 1) // 2
         return min(2 * self._ahead, probe.middle_starts if objective is None else count)
 
-    def _without_probes(self) -> list[tuple[Array, Array]]:
+    def _remove_probes(self) -> list[tuple[Array, Array]]:
         """Take out what probes reached, but for the ends and the middle: cut short on purpose, they
         would stand where a gap is to be filled."""
         archive = self._archive
@@ -396,7 +409,7 @@ class ForceRun(PolishRun[ForceAttempt]):
         archive.drop(left)
         return found
 
-    def _take_back(self, probed: list[tuple[Array, Array]]) -> None:
+    def _restore_probes(self, probed: list[tuple[Array, Array]]) -> None:
         """What lies in gaps that stayed far too wide is not given up, nor what a front lacks."""
         for x, objectives in probed:
             wanted = self._is_short or self._is_far(objectives)
@@ -406,45 +419,47 @@ class ForceRun(PolishRun[ForceAttempt]):
     @property
     def _is_short(self) -> bool:
         """Whether the front has fewer points than it is to have."""
-        return len(self._archive.rows()) < self._settings.fill.members
+        return len(self._archive.front_indices()) < self._settings.fill.members
 
     def _is_far(self, objectives: Array) -> bool:
         """Whether a point lies beyond the ends of the front, or in a gap that is far too wide."""
-        f = [self._archive.objectives[k][0] for k in self._archive.rows()]
+        f = [self._archive.objectives[k][0] for k in self._archive.front_indices()]
         place = int(np.searchsorted(f, objectives[0]))
         if place in (0, len(f)):
             return True
-        return gaps(self._archive)[place - 1].width > FAR
+        return gaps(self._archive)[place - 1].width > FAR_GAP
 
     def _fill(self, solved: int) -> None:
         """Attempts between the ends, until the front has its points or no side of a gap is left;
         then points on chords between neighbours."""
         tried: set[Edge] = set()
-        self._most += self._settings.fill.attempts * self._settings.attempts
-        while self._left() > 0:
-            found = filling(self._archive, tried, solved)
+        self._most_attempts += self._settings.fill.attempts * self._settings.attempts
+        while self._attempts_left() > 0:
+            found = gap_attempt(self._archive, tried, solved)
             if found is None:
                 break
-            self._expect(min(self._left(), solved - len(self._archive.rows())))
+            self._announce(min(self._attempts_left(), solved - len(self._archive.front_indices())))
             tried |= {found.edge, self._reflected(found.edge)}
-            self._do([found.attempt])
+            self._process([found.attempt])
             outcome = self.outcomes[-1]
-            if outcome.status == "accepted" and crept(self._archive, found, outcome.objectives):
+            if outcome.status == "accepted" and made_little_progress(
+                self._archive, found, outcome.objectives
+            ):
                 edge = outcome.x.tobytes(), *found.edge[1:]
                 tried |= {edge, self._reflected(edge)}
         self._fill_by_chords()
 
     def _fill_by_chords(self) -> None:
         archive, tried = self._archive, set[Chord]()
-        while self._is_short and (gap := widest(archive, tried)) is not None:
-            first, second = chord_of(archive, gap)
+        while self._is_short and (gap := widest_untried_gap(archive, tried)) is not None:
+            first, second = chord_across(archive, gap)
             image = self._reflected_bytes(second), self._reflected_bytes(first)
             tried |= {(first, second), image}
-            found = between(self._evaluator, archive, gap)
+            found = best_on_chord(self._evaluator, archive, gap)
             if found is not None:
                 archive.add(*found)
                 self._unproven.add(found[0].tobytes())
-                self._take_image(found[0])
+                self._add_image(found[0])
 
     def _reflected(self, edge: Edge) -> Edge:
         """The mirror image of a side of a gap, itself where it has none."""
@@ -458,21 +473,21 @@ class ForceRun(PolishRun[ForceAttempt]):
     def _image(self, x: Array) -> Array | None:
         return None if self._mirror is None else self._mirror.image(x)
 
-    def _take(self, attempt: ForceAttempt, outcome: PolishOutcome) -> None:
-        super()._take(attempt, outcome)
+    def _record(self, attempt: ForceAttempt, outcome: PolishOutcome) -> None:
+        super()._record(attempt, outcome)
         if outcome.status == "accepted":
-            if attempt.reach == "brief":
+            if attempt.mode == "brief":
                 self._unproven.add(outcome.x.tobytes())
                 self._probed |= {outcome.x.tobytes(), self._reflected_bytes(outcome.x.tobytes())}
-            self._take_image(outcome.x)
+            self._add_image(outcome.x)
 
-    def _evaluated(self, attempt: ForceAttempt, x: Array) -> Evaluations:
+    def _evaluate(self, attempt: ForceAttempt, x: Array) -> Evaluations:
         """Most of what probes reach is dominated soon: what then stands is certified in the end."""
-        if attempt.reach == "brief":
+        if attempt.mode == "brief":
             return self._evaluator.evaluate(x)
-        return super()._evaluated(attempt, x)
+        return super()._evaluate(attempt, x)
 
-    def _take_image(self, x: Array) -> None:
+    def _add_image(self, x: Array) -> None:
         if (image := self._image(x)) is None:
             return
         found = self._evaluator.evaluate(image)
@@ -484,22 +499,26 @@ class ForceRun(PolishRun[ForceAttempt]):
         """Leave out what no solve made and is not proven free of collisions between the samples;
         then what only that dominated, until all that stand are proven."""
         while standing := [
-            k for k in self._archive.rows() if self._archive.x[k].tobytes() in self._unproven
+            k
+            for k in self._archive.front_indices()
+            if self._archive.x[k].tobytes() in self._unproven
         ]:
             x = np.array([self._archive.x[k] for k in standing])
             proven = self._evaluator.certified(self._evaluator.evaluate(x)).feasible
             self._unproven -= {row.tobytes() for row in x[proven]}
             self._archive.drop([k for k, good in zip(standing, proven, strict=True) if not good])
 
-    def _turn(self, objectives: tuple[int | None, ...], rng: np.random.Generator) -> None:
+    def _attempt_ends(self, objectives: tuple[int | None, ...], rng: np.random.Generator) -> None:
         """An attempt at each of some aims, and whether it came further."""
-        kick = partial(kicked, self._evaluator, rng=rng)
+        perturb = partial(perturb_start, self._evaluator, rng=rng)
         for objective in objectives:
             before, stalls = self._archive.best(objective)[1], self._stalls[objective]
-            attempt = further(self._archive, objective, self._tried, stalls > 0, kick, rng)
+            attempt = extreme_attempt(
+                self._archive, objective, self._tried, stalls > 0, perturb, rng
+            )
             self._tried.add((objective, attempt.x.tobytes()))
             if (image := self._image(attempt.x)) is not None:
                 self._tried.add((None if objective is None else 1 - objective, image.tobytes()))
-            self._do([attempt])
-            gained = self._archive.best(objective)[1] < before - PROGRESS
+            self._process([attempt])
+            gained = self._archive.best(objective)[1] < before - LEAST_PROGRESS
             self._stalls[objective] = 0 if gained else stalls + 1

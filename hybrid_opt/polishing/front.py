@@ -31,16 +31,16 @@ LEAST_SPAN = 2e-3
 OWN_SHARE = 1.0 / 8.0
 """Share of the attempts that go to points of the given front."""
 
-TOLERANCE = 1e-6
+IMPROVEMENT_TOLERANCE = 1e-6
 """Improvement of an objective below which a point counts as optimal already."""
 
-OPTIMAL = 1e-3
+OPTIMAL_STATIONARITY = 1e-3
 """Residual of stationarity below which a point that could not be improved counts as optimal."""
 
 NO_SOLUTION = Solution(np.empty(0))
 
 
-class GrowingFront:
+class ParetoArchive:
     """The points that stand so far: rows of the given front, and new ones."""
 
     def __init__(self, x: Array, objectives: Array, parent: list[int]) -> None:
@@ -69,7 +69,7 @@ class GrowingFront:
         for values in lists:
             values[:] = [value for k, value in enumerate(values) if k not in indices]
 
-    def rows(self) -> list[int]:
+    def front_indices(self) -> list[int]:
         """Indices of the non-dominated points by increasing first objective."""
         values = np.array(self.objectives)
         kept = np.flatnonzero(metrics.non_dominated(values))
@@ -78,18 +78,18 @@ class GrowingFront:
     def best(self, objective: int | None) -> tuple[int, float]:
         """The point that is the lowest in an objective, or in the sum of both, and its value."""
         wanted = np.ones(2) if objective is None else np.eye(2)[objective]
-        values = {k: float(wanted @ self.objectives[k]) for k in self.rows()}
+        values = {k: float(wanted @ self.objectives[k]) for k in self.front_indices()}
         index = min(values, key=lambda k: values[k])
         return index, values[index]
 
     def span(self) -> Array:
         """(2,) the scale of each objective."""
-        values = np.array(self.objectives)[self.rows()]
+        values = np.array(self.objectives)[self.front_indices()]
         return np.asarray(np.maximum(np.ptp(values, axis=0), LEAST_SPAN))
 
 
 @dataclass(frozen=True)
-class Loss:
+class FailedAttempt:
     """An attempt without a solution; reason: killed, timeout, or what was raised.
 
     An exception is caught here. What ends or blocks the process, a crash or a hang, is noticed by
@@ -128,55 +128,55 @@ class PolishRun(ABC, Generic[AnyAttempt]):
         self,
         evaluator: CandidateEvaluator,
         settings: PolishSettings,
-        archive: GrowingFront,
-        recorded: list[PolishOutcome | Loss],
-        emit: Callable[[PolishOutcome], None],
-        tell: Callable[[int, int], None],
+        archive: ParetoArchive,
+        recorded: list[PolishOutcome | FailedAttempt],
+        on_outcome: Callable[[PolishOutcome], None],
+        on_progress: Callable[[int, int], None],
     ) -> None:
         self._evaluator, self._settings = evaluator, settings
-        self._archive, self._recorded, self._emit = archive, recorded, emit
+        self._archive, self._recorded, self._on_outcome = archive, recorded, on_outcome
         self.outcomes: list[PolishOutcome] = []
-        self._most, self._expected, self._tell = settings.attempts, 0, tell
+        self._most_attempts, self._expected, self._on_progress = settings.attempts, 0, on_progress
 
     @abstractmethod
-    def all(self, rng: np.random.Generator) -> None:
+    def run(self, rng: np.random.Generator) -> None:
         """Every attempt."""
 
     @abstractmethod
-    def _solution(self, attempt: AnyAttempt) -> Solution:
+    def _solve(self, attempt: AnyAttempt) -> Solution:
         """Solution of an attempt."""
 
-    def _left(self) -> int:
-        return self._most - len(self.outcomes)
+    def _attempts_left(self) -> int:
+        return self._most_attempts - len(self.outcomes)
 
-    def _expect(self, attempts: int) -> None:
+    def _announce(self, attempts: int) -> None:
         """Tell how many more there are to be, as far as is known."""
         self._expected = attempts
-        self._tell(len(self.outcomes), len(self.outcomes) + attempts)
+        self._on_progress(len(self.outcomes), len(self.outcomes) + attempts)
 
-    def _do(self, attempts: list[AnyAttempt]) -> None:
+    def _process(self, attempts: list[AnyAttempt]) -> None:
         """Solve, judge and take in attempts; those on record are not solved again."""
-        for attempt in attempts[: max(0, self._left())]:
+        for attempt in attempts[: max(0, self._attempts_left())]:
             known = self._recorded.pop(0) if self._recorded else None
             if isinstance(known, PolishOutcome):
-                self._take(attempt, known)
+                self._record(attempt, known)
             else:
                 begin = time.perf_counter()
-                answer = known or self._solved_safely(attempt)
-                outcome = self._judged(attempt, answer, begin)
-                self._take(attempt, outcome)
+                answer = known or self._solve_guarded(attempt)
+                outcome = self._outcome(attempt, answer, begin)
+                self._record(attempt, outcome)
                 if known is None:
-                    self._emit(outcome)
-            self._expect(max(self._expected - 1, 0))
+                    self._on_outcome(outcome)
+            self._announce(max(self._expected - 1, 0))
 
-    def _solved_safely(self, attempt: AnyAttempt) -> Solution | Loss:
+    def _solve_guarded(self, attempt: AnyAttempt) -> Solution | FailedAttempt:
         """The solution, or what was raised instead."""
         try:
-            return self._solution(attempt)
+            return self._solve(attempt)
         except Exception as error:
-            return Loss(f"{type(error).__name__}: {error}".splitlines()[0])
+            return FailedAttempt(f"{type(error).__name__}: {error}".splitlines()[0])
 
-    def _take(self, attempt: AnyAttempt, outcome: PolishOutcome) -> None:
+    def _record(self, attempt: AnyAttempt, outcome: PolishOutcome) -> None:
         self.outcomes.append(outcome)
         if outcome.status != "accepted":
             return
@@ -185,65 +185,69 @@ class PolishRun(ABC, Generic[AnyAttempt]):
         else:
             self._archive.add(outcome.x, outcome.objectives)
 
-    def _judged(self, attempt: AnyAttempt, answer: Solution | Loss, begin: float) -> PolishOutcome:
-        status, reason, objectives = self._verdict(attempt, answer)
-        told = answer if isinstance(answer, Solution) else NO_SOLUTION
+    def _outcome(
+        self, attempt: AnyAttempt, answer: Solution | FailedAttempt, begin: float
+    ) -> PolishOutcome:
+        status, reason, objectives = self._status(attempt, answer)
+        solution = answer if isinstance(answer, Solution) else NO_SOLUTION
         return PolishOutcome(
             aim=attempt.aim,
             parent=attempt.parent,
             status=status,
             reason=reason,
-            x=told.x if status == "accepted" else attempt.x,
+            x=solution.x if status == "accepted" else attempt.x,
             start=attempt.start,
             objectives=objectives,
-            residuals=told.residuals,
-            iterations=told.iterations,
-            rounds=told.rounds,
-            rows=told.rows,
+            residuals=solution.residuals,
+            iterations=solution.iterations,
+            rounds=solution.rounds,
+            rows=solution.rows,
             seconds=time.perf_counter() - begin,
         )
 
-    def _verdict(self, attempt: AnyAttempt, answer: Solution | Loss) -> tuple[Status, str, Array]:
-        if isinstance(answer, Loss):
+    def _status(
+        self, attempt: AnyAttempt, answer: Solution | FailedAttempt
+    ) -> tuple[Status, str, Array]:
+        if isinstance(answer, FailedAttempt):
             return "failed", answer.reason, attempt.start
         if not answer.usable:
             return "failed", answer.message, attempt.start
         if np.array_equal(answer.x, attempt.x):
             return self._not_improved(answer, attempt)
-        return self._recomputed(attempt, answer)
+        return self._verify(attempt, answer)
 
-    def _recomputed(self, attempt: AnyAttempt, answer: Solution) -> tuple[Status, str, Array]:
+    def _verify(self, attempt: AnyAttempt, answer: Solution) -> tuple[Status, str, Array]:
         """Verdict of the full evaluator and the certificate between the samples on an answer."""
-        found = self._evaluated(attempt, answer.x)
+        found = self._evaluate(attempt, answer.x)
         reason = int(found.reason[0])
         if reason != FEASIBLE:
             return "rejected", REASONS[reason], attempt.start
-        return self._worth(attempt, answer, found.objectives[0])
+        return self._classify(attempt, answer, found.objectives[0])
 
-    def _evaluated(self, attempt: AnyAttempt, x: Array) -> Evaluations:
+    def _evaluate(self, attempt: AnyAttempt, x: Array) -> Evaluations:
         """Verdict of the full evaluator and the certificate between the samples on x (n_var,)."""
         return self._evaluator.certified(self._evaluator.evaluate(x))
 
-    def _worth(
+    def _classify(
         self, attempt: AnyAttempt, answer: Solution, objectives: Array
     ) -> tuple[Status, str, Array]:
         """Whether a feasible answer is taken in."""
         gain = attempt.start - objectives
         if attempt.aim == "point":
-            if gain.min() < -TOLERANCE:
+            if gain.min() < -IMPROVEMENT_TOLERANCE:
                 return "rejected", "an objective became worse", attempt.start
-            if gain.max() <= TOLERANCE:
+            if gain.max() <= IMPROVEMENT_TOLERANCE:
                 return self._not_improved(answer, attempt)
         elif attempt.aim == "probe":
             # Dominated or not: it tells what lies there, and may be continued.
-            if gain.max() <= TOLERANCE:
+            if gain.max() <= IMPROVEMENT_TOLERANCE:
                 return self._not_improved(answer, attempt)
         elif self._archive.dominates(objectives):
             return "rejected", "dominated", attempt.start
         return "accepted", "", objectives
 
     def _not_improved(self, answer: Solution, attempt: AnyAttempt) -> tuple[Status, str, Array]:
-        if answer.converged or answer.residuals.stationarity <= OPTIMAL:
+        if answer.converged or answer.residuals.stationarity <= OPTIMAL_STATIONARITY:
             return "optimal", "not improved", attempt.start
         return "failed", f"not improved: {answer.message}", attempt.start
 

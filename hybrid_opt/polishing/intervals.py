@@ -19,7 +19,7 @@ from scipy.linalg import block_diag
 from hybrid_opt.polishing.carry import PlacedCarry
 from hybrid_opt.polishing.cell import PolishFunctions, SmoothCell
 from hybrid_opt.polishing.robust import ROBUST_ROWS, RobustForces
-from hybrid_opt.polishing.rows import Layout, Row, Rows
+from hybrid_opt.polishing.rows import ConstraintRows, Row, RowLayout
 from hybrid_opt.polishing.solvers.base import Residuals
 from hybrid_opt.polishing.solvers.quadratic import BorderedMatrix, BorderedRows
 from symbolic.array import Array
@@ -32,14 +32,14 @@ from symbolic.smooth.driven import (
     driven_layout,
     planned_branches,
 )
-from symbolic.smooth.samples import held_name
+from symbolic.smooth.samples import grasp_force_name
 
 GRASP_ROWS = 2
 """Forces that a program finds, those of both robots."""
 
 
 @dataclass(frozen=True)
-class RowKinds:
+class PointInequalities:
     """Inequalities of one point, mix . quantities <= bound, as (k, ...) arrays.
 
     Attributes:
@@ -54,7 +54,7 @@ class RowKinds:
     weight: Array
 
     @classmethod
-    def of(cls, workcell: Workcell, robust: int = 0) -> RowKinds:
+    def from_workcell(cls, workcell: Workcell, robust: int = 0) -> PointInequalities:
         """Rows of a workcell: both signs where a quantity has one, all branches of the forces.
 
         Args:
@@ -129,7 +129,9 @@ class IntervalGrid:
         moved = [np.tensordot(basis, waypoints, 1)[self.sample] for basis in self._bases]
         self.moved = np.concatenate(moved, axis=1)
         self.robust = RobustForces(workcell, self.pose) if robust else None
-        self.kinds = RowKinds.of(workcell, 0 if self.robust is None else ROBUST_ROWS)
+        self.kinds = PointInequalities.from_workcell(
+            workcell, 0 if self.robust is None else ROBUST_ROWS
+        )
         self.layout = driven_layout(workcell)
         self.load = self.layout.block("load")
 
@@ -198,7 +200,7 @@ class IntervalValues:
             slope = np.concatenate([slope, by_motion], axis=1)
         self._held: Mapping[str, Array] | None = None
         if grid.layout.by_program:
-            self._held = functions.built[held_name("first")].batch(value[:, grid.load])
+            self._held = functions.built[grasp_force_name("first")].batch(value[:, grid.load])
             value = np.hstack([value, self._held["normal"]])
             slope = np.concatenate([slope, _by_load(self._held, slope[:, grid.load])], axis=1)
         self.value, self.slope = value, slope
@@ -217,7 +219,7 @@ class IntervalValues:
         value, slope = out["value"][:, block], out["slope"][:, block]
         slope = _followed(grid, slope, follow)[:, :, : grid.moving]
         if by_program:
-            pressed = self._functions.built[held_name("first")].batch(value)
+            pressed = self._functions.built[grasp_force_name("first")].batch(value)
             value, slope = pressed["normal"], _by_load(pressed, slope)
         whole = 1.0 if paper else force
         return value.reshape(-1) / whole, slope.reshape(-1, grid.moving) / whole
@@ -236,7 +238,7 @@ class IntervalValues:
             The points (m,) with any weight, and (m, moving + 2, moving + 2) of each.
         """
         if self._grid.robust is not None:
-            weight = self._grid.robust.as_planned(weight, self.value)
+            weight = self._grid.robust.planned_weights(weight, self.value)
         pressing = np.zeros((len(weight), 0))
         if self._held is not None:
             weight, pressing = np.hsplit(weight, [self._grid.layout.size])
@@ -273,7 +275,7 @@ class IntervalValues:
             total[:, :pose, :pose] += follow @ closed @ np.swapaxes(follow, 1, 2)
             start += n_joints
         if self._held is not None:
-            pressed = self._functions.built[held_name("second")]
+            pressed = self._functions.built[grasp_force_name("second")]
             bent = pressed.batch(self._held["state"][at], pressing[at])["curvature"]
             by_motion = self.slope[at][:, self._grid.load]
             total += np.swapaxes(by_motion, 1, 2) @ bent @ by_motion
@@ -296,17 +298,17 @@ def _followed(grid: IntervalGrid, full: Array, follow: Sequence[Array]) -> Array
     return slope
 
 
-NEAR = 0.85
+NEARLY_USED = 0.85
 """Limits used this far have a row from the start."""
 
-NEAR_FORCE = 0.6
+NEARLY_USED_FORCE = 0.6
 """The same for the normal forces, of what the limit leaves above the force at rest."""
 
 REST_MARGIN = 2e-3
 """Share of the patches, or of the force limit, that is kept free standing still: only the
 intervals' beginnings have rows, and where rest uses all of it there is no timing at all."""
 
-NEGLIGIBLE = 1e-8
+NEGLIGIBLE_MULTIPLIER = 1e-8
 """Scaled multipliers below this count as none."""
 
 LEAST_SCALE = 1e-2
@@ -314,7 +316,7 @@ LEAST_SCALE = 1e-2
 
 
 @dataclass(frozen=True)
-class Linear:
+class LinearisedRows:
     """Rows A d <= b: the chosen ones of the timing, then the geometric ones.
 
     Attributes:
@@ -330,7 +332,7 @@ class Linear:
     kind: NDArray[np.intp]
 
 
-class JointProgram:
+class PathTimingProgram:
     """The program about one iterate.
 
     Variables z = (xi, omega): the waypoints that are moved, scaled to [-1, 1] by their bounds, and
@@ -380,7 +382,7 @@ class JointProgram:
         self.speeds = slice(self.n_path, self.n)
         self.scale = np.where(grid.kinds.is_force, self._force, 1.0)
         self.rows = values.rows() / self.scale - 1.0
-        layout = Layout(required)
+        layout = RowLayout(required)
         self.place_rows = layout.place_rows
         # Slopes of the timing's rows by both parts of z, of those that were chosen so far.
         self._known = np.zeros(self.rows.shape, dtype=np.bool_)
@@ -388,7 +390,7 @@ class JointProgram:
         self._by_speeds = np.empty((*self.rows.shape, 2))
         scale = np.array([row.constraint.scale for row in self.place_rows])
         self._required = np.array([required[row] for row in self.place_rows]) / scale
-        self._places = Rows(cell, layout, carry.q)
+        self._places = ConstraintRows(cell, layout, carry.q)
         self.geometry = self._required - self._places.values(x)
         self._geometry_slope = -self._places.slopes()[:, : len(grid.spread)] @ grid.spread
         self._still(values)
@@ -397,7 +399,7 @@ class JointProgram:
     def _still(self, values: IntervalValues) -> None:
         """Rows of what rest uses, after the geometric ones; they bend little."""
         share, slope = values.at_rest(self._force)
-        near = np.flatnonzero(share > NEAR)
+        near = np.flatnonzero(share > NEARLY_USED)
         begins = 2 * (near // (len(share) // self._grid.intervals))
         by_path = self._grid.by_path(slope[near], begins)
         self.geometry = np.append(self.geometry, share[near] - 1.0 + REST_MARGIN)
@@ -440,11 +442,11 @@ class JointProgram:
         beyond[: len(lacking)] = lacking - foretold[: len(lacking)]
         return beyond
 
-    def near(self) -> NDArray[np.bool_]:
+    def near_rows(self) -> NDArray[np.bool_]:
         """(points, kinds) rows that the iterate uses far."""
         rest = min(self._grid.workcell.task.force_limit[0] / self._force, 1.0)
-        for_forces = (1.0 - NEAR_FORCE) * (rest - 1.0)
-        threshold = np.where(self._grid.kinds.is_force, for_forces, NEAR - 1.0)
+        for_forces = (1.0 - NEARLY_USED_FORCE) * (rest - 1.0)
+        threshold = np.where(self._grid.kinds.is_force, for_forces, NEARLY_USED - 1.0)
         return np.asarray(self.rows > threshold)
 
     def predicted(self, d: Array) -> Array:
@@ -456,7 +458,7 @@ class JointProgram:
         change = np.matmul(self._values.slope, np.hstack([moved, speeds])[:, :, None])[:, :, 0]
         return np.asarray(self.rows + change @ self._grid.kinds.mix.T / self.scale)
 
-    def linear(self, chosen: NDArray[np.bool_], bent: Array | float = 0.0) -> Linear:
+    def linear(self, chosen: NDArray[np.bool_], bent: Array | float = 0.0) -> LinearisedRows:
         """Chosen rows of the timing (points, kinds), and all others.
 
         Args:
@@ -476,7 +478,7 @@ class JointProgram:
         b = -np.concatenate([self.rows[point, kind], self.geometry + bent]) / scale
         left, right = sides
         A = BorderedRows(border / scale[:, None], column, left, right, len(self.cost))
-        return Linear(A, b, scale, point, kind)
+        return LinearisedRows(A, b, scale, point, kind)
 
     def _learn(self, point: NDArray[np.intp], kind: NDArray[np.intp]) -> None:
         """Slopes of some of the timing's rows."""
@@ -496,7 +498,9 @@ class JointProgram:
         bent = self.cost_diagonal @ omega**2 / 2.0 + self.cost_beside @ (omega[:-1] * omega[1:])
         return -float(self.cost @ omega + bent)
 
-    def curvature(self, linear: Linear | None = None, rows: Array | None = None) -> BorderedMatrix:
+    def curvature(
+        self, linear: LinearisedRows | None = None, rows: Array | None = None
+    ) -> BorderedMatrix:
         """Second derivatives of the duration, or of the Lagrangian with multipliers (rows,) of a
         step's rows."""
         n_path, n = self.n_path, len(self.cost)
@@ -506,7 +510,9 @@ class JointProgram:
             return BorderedMatrix(corner, beside, diagonal, off)
         unscaled, count = rows / linear.scale, len(linear.point)
         timing = np.zeros(self.rows.shape)
-        timing[linear.point, linear.kind] = np.where(rows > NEGLIGIBLE, unscaled, 0.0)[:count]
+        timing[linear.point, linear.kind] = np.where(rows > NEGLIGIBLE_MULTIPLIER, unscaled, 0.0)[
+            :count
+        ]
         m = self._grid.moving
         at, local = self._values.curvature((timing / self.scale) @ self._grid.kinds.mix)
         over = self._grid.moved[at]
@@ -525,7 +531,7 @@ class JointProgram:
             corner -= self._spread.T @ second @ self._spread
         return BorderedMatrix(corner, beside, diagonal, off)
 
-    def residuals(self, bounds: Array, linear: Linear, multipliers: Array) -> Residuals:
+    def residuals(self, bounds: Array, linear: LinearisedRows, multipliers: Array) -> Residuals:
         """How well the iterate satisfies the optimality conditions with a step's multipliers.
 
         Args:
@@ -533,7 +539,7 @@ class JointProgram:
             linear: the step's rows at the iterate.
             multipliers: (rows,) theirs.
         """
-        lagrangian = self.gradient() + linear.A.pulled(multipliers) + bounds
+        lagrangian = self.gradient() + linear.A.transpose_times(multipliers) + bounds
         products = multipliers * linear.b
         worst = float(max(self.rows.max(), self.geometry.max(initial=-1.0), 0.0))
         product = float(np.abs(products).max(initial=0.0))

@@ -1,14 +1,16 @@
-"""One point's polish, in one page: the only loop.
+"""A trust-region method for one point of a front.
 
-Each round gathers the rows that are near the best candidate so far, takes a step in a box of trust
-about it, and has the full model judge where that leads. What the step violates is learned: its rows
-are added, or asked for more strictly, and where that is nothing new, the box is halved. A step that
-violates nothing and comes closer to what is wanted is taken, so that the answer is never worse than
-the start. The polish ends at an optimum inside the box.
+Each iteration collects the rows near the best candidate, proposes a step within a box (the trust
+region) about it, and has the full model evaluate the candidate that it leads to. Rows that the step
+violates enter the working set or get a tighter bound; if none of them is new, the radius is halved.
+A step that violates nothing and improves the level is accepted, so the answer is never worse than
+the start. The solve ends at a stationary point inside the box.
 
-How a step is proposed and judged is a `Way`: that of both peak forces, one nonlinear program per
-step (`hybrid_opt.polishing.force`), and that of path and timing together, a quadratic model judged
+A `StepMethod` proposes and evaluates steps: for both peak forces it solves one nonlinear program
+per step (`hybrid_opt.polishing.force`), for path and timing together a quadratic model, evaluated
 by the compiled timing (`hybrid_opt.polishing.drive`).
+
+Source: Conn, Gould and Toint, Trust-Region Methods (2000).
 """
 
 from __future__ import annotations
@@ -22,97 +24,100 @@ import numpy as np
 
 from hybrid_opt.polishing.carry import CarryReader, PlacedCarry
 from hybrid_opt.polishing.cell import SmoothCell
-from hybrid_opt.polishing.constraints.active import ActiveSet, LearnedRows
-from hybrid_opt.polishing.constraints.kinds import Limits
-from hybrid_opt.polishing.rows import PlaceRow, Row
+from hybrid_opt.polishing.constraints.active import RowSelector, WorkingSet
+from hybrid_opt.polishing.constraints.kinds import MinimisedForces
+from hybrid_opt.polishing.rows import PathRow, Row
 from hybrid_opt.polishing.solvers.base import UNKNOWN, Residuals
 from symbolic.array import Array
 
-SETTLING = 5e-4
-"""Units of the level by which an optimum that keeps all that is asked for may be worse than the
-best candidate, which may keep less, and is taken in its place."""
+OPTIMUM_TOLERANCE = 5e-4
+"""Units of the level by which an optimum that satisfies all rows may be worse than the best
+candidate, which may satisfy fewer, and still replaces it."""
 
 HALVED, QUARTERED, DOUBLED = 0.5, 0.25, 2.0
 """Factors of the radius."""
 
-LARGEST = 2.0
-"""Largest radius, in halves of the decision variables' ranges."""
+LARGEST_RADIUS = 2.0
+"""Largest radius [half ranges of the decision variables]."""
 
-INSIDE = 0.9
-"""Steps shorter than this share of the radius were not stopped by the box."""
+BOUNDED_SHARE = 0.9
+"""Steps shorter than this share of the radius were not bounded by the box."""
 
-GOOD, POOR = 0.7, 0.3
-"""Shares of a promised gain above which the box may grow, and below which it shrinks."""
+HIGH_RATIO, LOW_RATIO = 0.7, 0.3
+"""Reduction ratios above which the radius may grow, and below which it shrinks."""
 
 
 class TrustRegion:
-    """The box of trust: half its width, and its policy.
+    """Radius of the trust region and its update rule.
 
-    A trust region in the sense of Conn, Gould and Toint (2000), with the box in place of the ball
-    so that it is nothing but bounds. What a step taught counts before the ratio of its gains: a
-    step that violated something new is repeated with that in the program, at the same radius.
+    The region is a box, so that it adds only bounds to a program. New rows count before the
+    reduction ratio: a step that violated a new row is repeated at the same radius with that row in
+    the program.
 
     Attributes:
-        radius: half the width, in halves of the decision variables' ranges.
+        radius: half the width of the box [half ranges of the decision variables].
     """
 
     def __init__(self, radius: float, least: float) -> None:
-        """least: below it a point is left."""
+        """Start with a radius; below `least` the region is exhausted."""
         self.radius, self._least, self._was_good = radius, least, False
 
     @property
-    def is_spent(self) -> bool:
-        """Whether it has become too small to go on."""
+    def is_exhausted(self) -> bool:
+        """Return True if the radius is below its least value."""
         return self.radius < self._least
 
-    def holds(self, length: float) -> bool:
-        """Whether the box stopped a step of this length."""
-        return length >= INSIDE * self.radius
+    def is_step_bounded(self, length: float) -> bool:
+        """Return True if the box bounded a step of this length."""
+        return length >= BOUNDED_SHARE * self.radius
 
-    def lost(self) -> None:
-        """There was no step."""
+    def on_failed_subproblem(self) -> None:
+        """Shrink the radius after a subproblem without a solution."""
         self.radius *= QUARTERED
 
-    def barren(self, length: float, factor: float = QUARTERED) -> None:
-        """A step of this length brought nothing."""
+    def on_no_improvement(self, length: float, factor: float = QUARTERED) -> None:
+        """Shrink the radius after a step of this length without improvement."""
         self.radius = min(self.radius, length) * factor
 
-    def refused(self, learned: bool, length: float = np.inf) -> None:
-        """A step violated something; where that was asked for already, the box was too large."""
+    def on_reject(self, is_new: bool, length: float = np.inf) -> None:
+        """Shrink the radius after a rejected step, unless a violated row is new: then the model,
+        not the radius, was wrong."""
         self._was_good = False
-        if not learned:
+        if not is_new:
             self.radius = HALVED * min(self.radius, length)
 
-    def taken(self, length: float, kept: float | None = None, is_part: bool = False) -> None:
-        """A step of this length was good.
+    def on_accept(
+        self, length: float, reduction_ratio: float | None = None, is_partial: bool = False
+    ) -> None:
+        """Update the radius after an accepted step of this length.
 
         Args:
-            kept: share of the promised gain that it brought, None where nothing was promised: then
-                two good steps in a row count.
-            is_part: whether the whole step was not good: the box becomes as small as this one.
+            reduction_ratio: actual over predicted reduction; None without a prediction: two
+                accepted steps in a row count then.
+            is_partial: only a fraction of the step was accepted: the radius becomes its length.
         """
-        if is_part:
+        if is_partial:
             self.radius = length
-        grows = self._was_good if kept is None else kept > GOOD
-        if grows and self.holds(length):
-            self.radius = min(DOUBLED * self.radius, LARGEST)
-        elif kept is not None and kept <= POOR:
+        grows = self._was_good if reduction_ratio is None else reduction_ratio > HIGH_RATIO
+        if grows and self.is_step_bounded(length):
+            self.radius = min(DOUBLED * self.radius, LARGEST_RADIUS)
+        elif reduction_ratio is not None and reduction_ratio <= LOW_RATIO:
             self.radius *= HALVED
         self._was_good = True
 
 
 @dataclass
 class Solution:
-    """Result of a climb, not yet verified.
+    """Result of a trust-region solve, not yet verified.
 
     Attributes:
-        x: (n_var,) the best candidate, the start where nothing was gained.
-        message: how it ended.
-        converged: whether it ended at an optimum, by the solver's word.
-        usable: whether the start could be worked on.
-        residuals: at x, in the program of the last round.
-        iterations, rounds: in total.
-        rows: constraints at places of the path in the round of the residuals.
+        x: (n_var,) best candidate; the start without improvement.
+        message: how the solve ended.
+        converged: whether it ended at a stationary point, as the solver reports.
+        usable: whether the start could be evaluated.
+        residuals: at x, of the last iteration's program.
+        iterations, rounds: solver iterations and trust-region iterations in total.
+        rows: rows at places of the path in the program of the residuals.
     """
 
     x: Array
@@ -126,13 +131,13 @@ class Solution:
 
 
 @dataclass(frozen=True)
-class ClimbPoint:
-    """A candidate that the full model has judged.
+class Iterate:
+    """A candidate evaluated by the full model.
 
     Attributes:
-        x: (n_var,).
-        carry: on places.
-        level: what is minimised.
+        x: (n_var,) decision vector.
+        carry: the candidate at places of the path.
+        level: minimised value.
     """
 
     x: Array
@@ -142,235 +147,251 @@ class ClimbPoint:
 
 @dataclass(frozen=True, kw_only=True)
 class Step:
-    """A step that a way proposes.
+    """A step proposed by a `StepMethod`.
 
     Attributes:
         length: largest change of a scaled variable.
-        required: the rows of its program, and what each had to keep.
-        residuals: tells those at a candidate.
-        iterations: of the solver.
-        is_end: whether where it starts is an optimum already.
-        converged: whether it leads to an optimum of its program, by the solver's word.
-        pressing: rows at places that have multipliers.
+        required: rows of the program, and the value that each has to exceed.
+        residuals: function of an iterate that returns its optimality residuals.
+        iterations: solver iterations.
+        is_stationary: whether the iterate that it starts from is stationary.
+        converged: whether the program was solved to optimality, as the solver reports.
+        active_rows: rows at places with a multiplier.
     """
 
     length: float
     required: Mapping[Row, float]
-    residuals: Callable[[ClimbPoint], Residuals] = field(repr=False)
+    residuals: Callable[[Iterate], Residuals] = field(repr=False)
     iterations: int
-    is_end: bool = False
+    is_stationary: bool = False
     converged: bool = False
-    pressing: tuple[PlaceRow, ...] = ()
+    active_rows: tuple[PathRow, ...] = ()
 
 
-AnyPoint = TypeVar("AnyPoint", bound=ClimbPoint)
+AnyIterate = TypeVar("AnyIterate", bound=Iterate)
 AnyStep = TypeVar("AnyStep", bound=Step)
 
 
 @dataclass(frozen=True)
-class StepVerdict(Generic[AnyPoint]):
-    """Verdict of the full model on a step.
+class StepEvaluation(Generic[AnyIterate]):
+    """Evaluation of a step by the full model.
 
     Attributes:
-        reached: where it leads; None where that is no closer and teaches nothing.
-        closer: whether it comes closer to what is wanted.
-        factor: of the radius after a step that comes no closer.
-        kept: share of the promised gain, None where nothing was promised.
-        part: of the step that leads there.
-        surprising: whether it brought more than promised, so that going farther is worth a look.
-        is_short: whether rows that press stay.
+        trial: iterate that the step leads to; None if it is no improvement and adds no row.
+        improved: whether it reduces the level.
+        factor: factor of the radius after a step without improvement.
+        reduction_ratio: actual over predicted reduction, None without a prediction.
+        fraction: evaluated fraction of the step.
+        exceeds_prediction: the reduction is larger than predicted: longer steps are worth trying.
+        keep_active_set: keep the active set for the next subproblem.
     """
 
-    reached: AnyPoint | None
-    closer: bool
+    trial: AnyIterate | None
+    improved: bool
     factor: float = QUARTERED
-    kept: float | None = None
-    part: float = 1.0
-    surprising: bool = False
-    is_short: bool = False
+    reduction_ratio: float | None = None
+    fraction: float = 1.0
+    exceeds_prediction: bool = False
+    keep_active_set: bool = False
 
 
-class Way(ABC, Generic[AnyPoint, AnyStep]):
-    """What one polish wants, and how its steps are proposed and judged.
+class StepMethod(ABC, Generic[AnyIterate, AnyStep]):
+    """Objective of a solve: proposes steps and evaluates them.
 
     Attributes:
-        cell, active, reader: rows, and candidates with their places.
+        cell, active, reader: model, row selection and evaluation at places of the path.
         half: (n,) half ranges of the variables that steps move.
-        limits: see `Limits`.
-        least_radius: of the box of trust, below which a point is left.
-        refused_by_length: whether a refused step shrinks the box to less than its own length.
-        stays_lenient: whether rows ask for no more than the candidate keeps until a step comes
-            closer; otherwise only in the first round. A start may be nearer to obstacles than is
-            wanted, and to get away from them must not cost what no step can bring.
-        parts: shares of a refused step that are tried in its place, the longest first.
-        farther: times a surprising step that are tried after it, the shortest first.
+        limits: see `MinimisedForces`.
+        least_radius: radius below which the solve ends.
+        shrinks_below_step: whether a rejected step reduces the radius below its own length.
+        relaxes_until_improved: whether rows require no more than the iterate satisfies until a step
+            improves; otherwise only in the first iteration. A start may be nearer to obstacles than
+            the wanted clearance.
+        backtracking: fractions of a rejected step that are tried instead, the longest first.
+        extrapolation: multiples of a step that exceeded its prediction that are tried next, the
+            shortest first.
     """
 
-    limits: Limits = (True, True)
+    limits: MinimisedForces = (True, True)
     least_radius: float
-    refused_by_length: bool = False
-    stays_lenient: bool = False
-    parts: tuple[float, ...] = ()
-    farther: tuple[float, ...] = ()
+    shrinks_below_step: bool = False
+    relaxes_until_improved: bool = False
+    backtracking: tuple[float, ...] = ()
+    extrapolation: tuple[float, ...] = ()
 
-    def __init__(self, cell: SmoothCell, active: ActiveSet, reader: CarryReader) -> None:
+    def __init__(self, cell: SmoothCell, active: RowSelector, reader: CarryReader) -> None:
         self.cell, self.active, self.reader = cell, active, reader
         self.half = cell.half
 
     @abstractmethod
-    def start(self, x: Array) -> AnyPoint:
-        """Where a climb begins."""
+    def evaluate(self, x: Array) -> AnyIterate:
+        """Evaluate a candidate (n_var,)."""
 
     @abstractmethod
-    def propose(
-        self, best: AnyPoint, required: Mapping[Row, float], radius: float
+    def propose_step(
+        self, best: AnyIterate, required: Mapping[Row, float], radius: float
     ) -> AnyStep | None:
-        """A step within the box of trust about the best candidate; None where there is none."""
+        """Propose a step within the box about the best iterate; None if the subproblem has no
+        solution."""
 
     @abstractmethod
-    def judge(self, best: AnyPoint, step: AnyStep) -> StepVerdict[AnyPoint]:
-        """Where a step leads."""
+    def evaluate_step(self, best: AnyIterate, step: AnyStep) -> StepEvaluation[AnyIterate]:
+        """Evaluate the candidate that a step leads to."""
 
     @abstractmethod
-    def along(
-        self, begin: AnyPoint, best: AnyPoint, step: AnyStep, share: float
-    ) -> AnyPoint | None:
-        """Where a share of a step from its beginning leads; None where that is no closer than the
-        best candidate."""
+    def evaluate_fraction(
+        self, begin: AnyIterate, best: AnyIterate, step: AnyStep, share: float
+    ) -> AnyIterate | None:
+        """Evaluate a fraction of a step from its start; None if that does not improve the best
+        iterate."""
 
-    def missing(self, reached: AnyPoint) -> set[Row]:
-        """Rows that a program lacked whose step came no closer."""
+    def missing_rows(self, trial: AnyIterate) -> set[Row]:
+        """Return rows missing in the program of a step without improvement."""
         return set()
 
 
-class Climb(Generic[AnyPoint, AnyStep]):
-    """One point's polish, which may be left and gone on with.
+class TrustRegionSolve(Generic[AnyIterate, AnyStep]):
+    """A trust-region solve from one start; it can be continued.
 
     Attributes:
-        solution: what it has come to.
-        best: the best candidate so far.
+        solution: the result so far.
+        best: the best iterate so far.
     """
 
-    def __init__(self, way: Way[AnyPoint, AnyStep], x: Array, radius: float) -> None:
-        """Judge the start.
+    def __init__(self, method: StepMethod[AnyIterate, AnyStep], x: Array, radius: float) -> None:
+        """Evaluate the start.
 
         Args:
-            x: (n_var,) feasible decision vector to start from.
-            radius: of the first box of trust.
+            x: (n_var,) feasible decision vector.
+            radius: of the first trust region.
         """
-        self._way, task = way, way.cell.task
-        self.best = way.start(np.clip(x, task.lower, task.upper))
-        self._first, self._lenient = self.best.level, True
-        self._region = TrustRegion(radius, way.least_radius)
-        self._learned = LearnedRows(way.active, way.half)
-        self._last: Step | None = None
+        self._method, task = method, method.cell.task
+        self.best = method.evaluate(np.clip(x, task.lower, task.upper))
+        self._start_level, self._is_relaxed = self.best.level, True
+        self._region = TrustRegion(radius, method.least_radius)
+        self._working_set = WorkingSet(method.active, method.half)
+        self._last_step: Step | None = None
         self.solution = Solution(self.best.x, usable=bool(np.isfinite(self.best.level)))
 
     @property
-    def ended(self) -> bool:
-        """Whether more rounds bring nothing."""
-        return self.solution.converged or self._region.is_spent or not self.solution.usable
+    def is_finished(self) -> bool:
+        """Return True if further iterations change nothing."""
+        return self.solution.converged or self._region.is_exhausted or not self.solution.usable
 
-    def go_on(self, rounds: int, least_gain: float = 0.0) -> Solution:
-        """Some more rounds, fewer where it ends.
+    def run(self, rounds: int, least_gain: float = 0.0) -> Solution:
+        """Iterate, at most `rounds` times.
 
         Args:
-            least_gain: share of the level that two rounds in a row have to bring once a step was
-                taken, or it is left. Before that, refused steps teach, and say nothing of gains.
+            least_gain: share of the level that two iterations in a row have to gain after the first
+                accepted step, or the solve is left. Before that, rejected steps add rows and say
+                nothing of gains.
         """
         solution, levels = self.solution, [self.best.level]
         for _ in range(rounds):
-            if self.ended:
+            if self.is_finished:
                 break
             solution.rounds += 1
-            self._round()
+            self._iterate()
             if len(levels) > 1 or self.best.level != levels[0]:
                 levels.append(self.best.level)
             if len(levels) > 3 and levels[-3] - levels[-1] < least_gain * levels[-1]:
                 break
         solution.x = self.best.x
-        if self._last is not None:
-            solution.residuals = self._last.residuals(self.best)
-            solution.rows = sum(isinstance(row, PlaceRow) for row in self._last.required)
+        if self._last_step is not None:
+            solution.residuals = self._last_step.residuals(self.best)
+            solution.rows = sum(isinstance(row, PathRow) for row in self._last_step.required)
         if not solution.usable:
             solution.message = "the start cannot be judged"
         elif solution.converged:
             solution.message = "stationary"
         else:
-            solution.message = "the box of trust is spent" if self.ended else "out of rounds"
+            solution.message = "the box of trust is spent" if self.is_finished else "out of rounds"
         return solution
 
-    def _round(self) -> None:
-        way, best, region = self._way, self.best, self._region
-        lenient, self._lenient = self._lenient, self._lenient and way.stays_lenient
-        required = self._learned.required(best.carry, way.limits, best.x, region.radius, lenient)
-        step = way.propose(best, required, region.radius)
+    def _iterate(self) -> None:
+        method, best, region = self._method, self.best, self._region
+        is_relaxed, self._is_relaxed = (
+            self._is_relaxed,
+            self._is_relaxed and method.relaxes_until_improved,
+        )
+        required = self._working_set.required_values(
+            best.carry, method.limits, best.x, region.radius, is_relaxed
+        )
+        step = method.propose_step(best, required, region.radius)
         if step is None:
-            region.lost()
+            region.on_failed_subproblem()
             return
-        self._last = step
+        self._last_step = step
         self.solution.iterations += step.iterations
-        self._learned.press(step.pressing)
-        if step.is_end:
+        self._working_set.mark_active(step.active_rows)
+        if step.is_stationary:
             self.solution.converged = True
             return
-        judged = way.judge(best, step)
-        self._lenient = way.stays_lenient and not judged.closer
-        if judged.reached is None:
-            region.barren(step.length, judged.factor)
-        elif not self._refuses(step, judged.reached):
-            if judged.closer:
-                self._take(step, judged, judged.reached)
+        evaluation = method.evaluate_step(best, step)
+        self._is_relaxed = method.relaxes_until_improved and not evaluation.improved
+        if evaluation.trial is None:
+            region.on_no_improvement(step.length, evaluation.factor)
+        elif not self._reject_violating(step, evaluation.trial):
+            if evaluation.improved:
+                self._accept(step, evaluation, evaluation.trial)
             else:
-                self._stay(step, judged.reached)
+                self._keep_best(step, evaluation.trial)
 
-    def _refuses(self, step: AnyStep, reached: AnyPoint) -> bool:
-        """Learn from what a step violates, if it does; the longest part of it that violates nothing
-        and comes closer is taken, if there is one."""
-        best, carry = self.best, reached.carry
-        violated = self._way.active.violated(carry, best.carry, step.required)
-        if not violated and carry.is_followed:
+    def _reject_violating(self, step: AnyStep, trial: AnyIterate) -> bool:
+        """Add violated rows to the working set and try fractions of the step; return False if the
+        step violates nothing."""
+        best, carry = self.best, trial.carry
+        violated = self._method.active.violated_rows(carry, best.carry, step.required)
+        if not violated and carry.is_reachable:
             return False
-        learned = self._learned.refuse(carry, best.carry, reached.x, violated, step.required)
-        length = step.length if self._way.refused_by_length else np.inf
-        self._region.refused(learned and carry.is_followed, length)
-        for share in self._way.parts:
-            if self._goes(best, step, share):
+        is_new = self._working_set.learn_from_rejection(
+            carry, best.carry, trial.x, violated, step.required
+        )
+        length = step.length if self._method.shrinks_below_step else np.inf
+        self._region.on_reject(is_new and carry.is_reachable, length)
+        for share in self._method.backtracking:
+            if self._try_fraction(best, step, share):
                 break
         return True
 
-    def _take(self, step: AnyStep, judged: StepVerdict[AnyPoint], reached: AnyPoint) -> None:
+    def _accept(
+        self, step: AnyStep, evaluation: StepEvaluation[AnyIterate], trial: AnyIterate
+    ) -> None:
         begin = self.best
-        self._move(reached, judged.is_short)
-        self.solution.converged = step.converged and not self._region.holds(step.length)
-        if judged.surprising:
-            for times in self._way.farther:
-                if not self._goes(begin, step, times, judged.is_short):
+        self._set_best(trial, evaluation.keep_active_set)
+        self.solution.converged = step.converged and not self._region.is_step_bounded(step.length)
+        if evaluation.exceeds_prediction:
+            for times in self._method.extrapolation:
+                if not self._try_fraction(begin, step, times, evaluation.keep_active_set):
                     break
-        self._region.taken(judged.part * step.length, judged.kept, judged.part < 1.0)
+        self._region.on_accept(
+            evaluation.fraction * step.length, evaluation.reduction_ratio, evaluation.fraction < 1.0
+        )
 
-    def _stay(self, step: AnyStep, reached: AnyPoint) -> None:
-        """A step that violates nothing came no closer: its program lacked rows, or it ended at an
-        optimum, or the box is too large."""
-        asked = self._way.missing(reached) - step.required.keys()
-        self._learned.ask(asked, reached.x)
-        if step.converged and not asked and not self._region.holds(step.length):
+    def _keep_best(self, step: AnyStep, trial: AnyIterate) -> None:
+        """Handle a feasible step without improvement: rows were missing, or the iterate is optimal,
+        or the radius is too large."""
+        asked = self._method.missing_rows(trial) - step.required.keys()
+        self._working_set.add(asked, trial.x)
+        if step.converged and not asked and not self._region.is_step_bounded(step.length):
             self.solution.converged = True
-            if reached.level < min(self._first, self.best.level + SETTLING):
-                self._move(reached)
+            if trial.level < min(self._start_level, self.best.level + OPTIMUM_TOLERANCE):
+                self._set_best(trial)
         elif not asked:
-            self._region.barren(step.length)
+            self._region.on_no_improvement(step.length)
 
-    def _goes(self, begin: AnyPoint, step: AnyStep, share: float, is_short: bool = False) -> bool:
-        """Go to a share of a step if that is closer and violates nothing; whether it is."""
-        reached = self._way.along(begin, self.best, step, share)
-        if reached is None or not reached.carry.is_followed:
+    def _try_fraction(
+        self, begin: AnyIterate, step: AnyStep, share: float, keep_active_set: bool = False
+    ) -> bool:
+        """Move to a fraction of a step if it improves and violates nothing; return True if so."""
+        trial = self._method.evaluate_fraction(begin, self.best, step, share)
+        if trial is None or not trial.carry.is_reachable:
             return False
-        if self._way.active.violates(reached.carry, self.best.carry, step.required):
+        if self._method.active.has_violation(trial.carry, self.best.carry, step.required):
             return False
-        self._move(reached, is_short)
+        self._set_best(trial, keep_active_set)
         return True
 
-    def _move(self, reached: AnyPoint, is_short: bool = False) -> None:
-        self.best = reached
-        self._learned.move(is_short)
+    def _set_best(self, trial: AnyIterate, keep_active_set: bool = False) -> None:
+        self.best = trial
+        self._working_set.on_new_best(keep_active_set)

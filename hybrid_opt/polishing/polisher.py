@@ -12,11 +12,11 @@ import numpy as np
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.evaluate.objectives import DRIVABLE_PAIRS, FORCE_PAIRS, ROBUST_OBJECTIVES
 from hybrid_opt.polishing.cell import PolishFunctions, SmoothCell, polish_functions
-from hybrid_opt.polishing.drive import DriveWay
-from hybrid_opt.polishing.drive_front import DriveRun, second_opinion
+from hybrid_opt.polishing.drive import DriveStepMethod
+from hybrid_opt.polishing.drive_front import DriveRun, recheck_timing
 from hybrid_opt.polishing.force import ForceSolver
 from hybrid_opt.polishing.force_front import ForceRun
-from hybrid_opt.polishing.front import GrowingFront, Loss, PolishRun
+from hybrid_opt.polishing.front import FailedAttempt, ParetoArchive, PolishRun
 from hybrid_opt.polishing.records import PolishedFront, PolishOutcome
 from hybrid_opt.polishing.settings import PolishSettings
 from hybrid_opt.timing.model import TimingModel
@@ -30,7 +30,7 @@ TIMED_EVALUATIONS = 32
 """Candidates whose evaluation is timed, to express the polish in their unit."""
 
 
-def knows_forces(workcell: Workcell, objectives: Sequence[str]) -> bool:
+def has_polishable_forces(workcell: Workcell, objectives: Sequence[str]) -> bool:
     """Whether the pads' forces are known: planned ones of any pads, robust ones of two round pads
     that face one another."""
     return workcell.has_facing_pads or tuple(objectives) != ROBUST_OBJECTIVES
@@ -47,7 +47,7 @@ class Polisher:
     """
 
     solver: ForceSolver | None = None
-    way: DriveWay | None = None
+    drive_method: DriveStepMethod | None = None
 
     def __init__(
         self,
@@ -72,23 +72,23 @@ class Polisher:
         if not driven:
             self.solver = ForceSolver(cell, settings)
             return
-        self.way = DriveWay(cell)
+        self.drive_method = DriveStepMethod(cell)
         # At once: the cell's files may be there only for as long as this is made.
-        self._timings = TimingModel(evaluator.compiled, self.way.driver.timer.intervals)
+        self._timings = TimingModel(evaluator.compiled, self.drive_method.driver.timer.intervals)
 
-    def doubt(self, x: Array) -> str:
-        """Why the timing of a drivable decision vector is not believed, see `second_opinion`."""
-        assert self.way is not None
-        return second_opinion(self.way.driver, self._timings, x)
+    def recheck(self, x: Array) -> str:
+        """Why the timing of a drivable decision vector is not believed, see `recheck_timing`."""
+        assert self.drive_method is not None
+        return recheck_timing(self.drive_method.driver, self._timings, x)
 
     def polish(
         self,
         front_x: Array,
         rng: np.random.Generator,
-        recorded: Sequence[PolishOutcome | Loss] = (),
-        emit: Callable[[PolishOutcome], None] = lambda outcome: None,
+        recorded: Sequence[PolishOutcome | FailedAttempt] = (),
+        on_outcome: Callable[[PolishOutcome], None] = lambda outcome: None,
         paths: Array | None = None,
-        tell: Callable[[int, int], None] = lambda done, total: None,
+        on_progress: Callable[[int, int], None] = lambda done, total: None,
     ) -> PolishedFront:
         """Polish a front.
 
@@ -96,7 +96,7 @@ class Polisher:
             front_x: (k, n_var) decision vectors; k may be 0.
             rng: spreads the starts of attempts at the balanced middle.
             recorded: outcomes of an earlier, interrupted polish of the same front, not repeated;
-                `Loss` for an attempt that ended its process.
+                `FailedAttempt` for an attempt that ended its process.
             emit: takes each new outcome.
             paths: (m, n_path) free waypoints that are known to be good, and need not be on the
                 front; only the polish of drivable carries uses them. None for none.
@@ -107,20 +107,20 @@ class Polisher:
         unit = self._evaluation_seconds(x)
         found = self.evaluator.certified(self.evaluator.evaluate(x))
         feasible = np.flatnonzero(found.feasible)
-        archive = GrowingFront(x[feasible], found.objectives[feasible], feasible.tolist())
+        archive = ParetoArchive(x[feasible], found.objectives[feasible], feasible.tolist())
         known = np.empty((0, self.evaluator.workcell.task.n_path)) if paths is None else paths
-        given = archive, list(recorded), emit, tell
+        given = archive, list(recorded), on_outcome, on_progress
         run: PolishRun[Any]
         if self.solver is not None:
             run = ForceRun(self.solver, self.settings, *given)
         else:
-            assert self.way is not None
-            run = DriveRun(self.way, self.settings, self.doubt, *given, known)
+            assert self.drive_method is not None
+            run = DriveRun(self.drive_method, self.settings, self.recheck, *given, known)
         if len(feasible) and self.settings.attempts:
             with one_thread():
-                run.all(rng)
-        tell(len(run.outcomes), len(run.outcomes))
-        rows = archive.rows() if len(feasible) else []
+                run.run(rng)
+        on_progress(len(run.outcomes), len(run.outcomes))
+        rows = archive.front_indices() if len(feasible) else []
         return PolishedFront(
             x=np.array([archive.x[k] for k in rows]).reshape(-1, self.evaluator.n_var),
             objectives=np.array([archive.objectives[k] for k in rows]).reshape(-1, 2),
@@ -154,7 +154,7 @@ def _require_objectives(
             f"{'under the time law optimal ' if driven else ''}the polish minimises {named}; the "
             f"objectives are {', '.join(names)}: switch the polish off for them"
         )
-    if not knows_forces(evaluator.workcell, names):
+    if not has_polishable_forces(evaluator.workcell, names):
         raise SettingsError(
             "the polish of robust forces knows two round pads that face one another, and no "
             "others: switch it off"

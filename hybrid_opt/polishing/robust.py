@@ -28,10 +28,10 @@ from symbolic.smooth.samples import motion_function
 LEADER = 0
 """The arm that keeps its place, as in the objectives."""
 
-CASES = 3
+GOVERNING_CASES = 3
 """Cases per robot and point of a driven path."""
 
-ROBUST_ROWS = 2 * CASES
+ROBUST_ROWS = 2 * GOVERNING_CASES
 
 
 class RobustSamples:
@@ -91,7 +91,9 @@ class RobustForces:
             path: extended poses and their derivatives by u (points, pose).
         """
         pose, first, second = (np.ascontiguousarray(part[:, :6]) for part in path)
-        force, slope = self._forces.most_demanding(PathPoints(pose, first, second, a, w), CASES)
+        force, slope = self._forces.most_demanding(
+            PathPoints(pose, first, second, a, w), GOVERNING_CASES
+        )
         n = len(a)
         found = np.zeros((n, ROBUST_ROWS, 3 * self._pose + 2))
         by = slope.reshape(n, ROBUST_ROWS, -1)
@@ -100,7 +102,7 @@ class RobustForces:
         found[:, :, -2:] = by[:, :, -2:]
         return force.reshape(n, ROBUST_ROWS), found
 
-    def as_planned(self, weight: Array, value: Array) -> Array:
+    def planned_weights(self, weight: Array, value: Array) -> Array:
         """Weights (points, quantities) that bend the planned forces as those of robust ones, given
         behind them, are taken to bend.
 
@@ -109,7 +111,7 @@ class RobustForces:
         """
         size = weight.shape[1] - ROBUST_ROWS
         found = weight[:, :size].copy()
-        shares = weight[:, size:].reshape(-1, 2, CASES).sum(axis=2)
+        shares = weight[:, size:].reshape(-1, 2, GOVERNING_CASES).sum(axis=2)
         for arm, branches in enumerate(self._branches):
             ruling = branches[np.argmax(value[:, :size] @ branches.T, axis=1)]
             found += shares[:, arm, None] * ruling

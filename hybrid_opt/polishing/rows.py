@@ -22,20 +22,20 @@ from hybrid_opt.polishing.cell import Indices, PolishFunctions, SmoothCell
 from hybrid_opt.polishing.native import native
 from symbolic.array import Array
 from symbolic.records.task import POSE_SIZE
-from symbolic.smooth.places import ORDERS, PlaceConstraint
-from symbolic.smooth.samples import WIDTHS, Quantity, held_name, sample_name
+from symbolic.smooth.places import ORDERS, PathConstraint
+from symbolic.smooth.samples import QUANTITY_WIDTHS, Quantity, grasp_force_name, sample_name
 
-HELD = 5
+PROGRAM_BRANCH = 5
 """Branch of a force row that is the joint allocation's, after the paper's five."""
 
-ROUNDING = 1e-3
+TIME_LAW_ROUNDING = 1e-3
 """Share of a step's duration by which the paper's time law is rounded where rotation takes over
 from translation: the least forces at the ends of a path lie in that kink."""
 
 
 @dataclass(frozen=True, order=True)
 class ForceRow:
-    """One branch of `normal_force_branches` of one robot at a sample, or `HELD`, to stay below its
+    """One branch of one robot's normal force at a sample, or `PROGRAM_BRANCH`, bounded by its
     peak."""
 
     robot: int
@@ -52,22 +52,22 @@ class PressureRow:
 
 
 @dataclass(frozen=True)
-class PlaceRow:
+class PathRow:
     """One constraint at one place of the path."""
 
-    constraint: PlaceConstraint
+    constraint: PathConstraint
     place: int
 
 
-Row = ForceRow | PressureRow | PlaceRow
+Row = ForceRow | PressureRow | PathRow
 
 
 @cache
-def _name(constraint: PlaceConstraint) -> str:
+def _name(constraint: PathConstraint) -> str:
     return repr(constraint)
 
 
-class Layout:
+class RowLayout:
     """The blocks of rows of one program, in their order, each in an order of its own: forces, the
     sides of objectives, patches, places.
 
@@ -81,7 +81,7 @@ class Layout:
         listed = list(rows)
         self.force_rows = sorted(row for row in listed if isinstance(row, ForceRow))
         self.pressure_rows = sorted(row for row in listed if isinstance(row, PressureRow))
-        places = [row for row in listed if isinstance(row, PlaceRow)]
+        places = [row for row in listed if isinstance(row, PathRow)]
         self.place_rows = sorted(places, key=lambda row: (_name(row.constraint), row.place))
         self.forces = slice(0, len(self.force_rows))
         self.sides = slice(self.forces.stop, self.forces.stop + sides)
@@ -113,7 +113,7 @@ class _SampleRows:
             block.samples[np.isin(block.samples, list(wanted)).any(axis=1)] for block in cell.blocks
         ]
         served = np.concatenate([samples.ravel() for samples in chosen])
-        count, width, n_var = len(served) + beyond, WIDTHS[quantity], cell.task.n_var
+        count, width, n_var = len(served) + beyond, QUANTITY_WIDTHS[quantity], cell.task.n_var
         last = max(int(block.samples.max(initial=0)) for block in cell.blocks)
         self.column = np.full(1 + last, -1)
         self.column[served] = np.arange(len(served))
@@ -134,8 +134,8 @@ class _SampleRows:
             first = function.prepared(n, ("x", "rounding"), given)
             basis = block.basis[np.isin(block.samples, samples).all(axis=1)]
             first.inputs["basis"][...] = basis
-            first.inputs["rounding"][...] = ROUNDING
-            along = partial(_along_all, second, n, n_var)
+            first.inputs["rounding"][...] = TIME_LAW_ROUNDING
+            along = partial(_all_directions, second, n, n_var)
             blocks.append(
                 {"start": start, "served": samples.shape[1], "basis": basis}
                 | {"first": first, "second": along}
@@ -144,15 +144,15 @@ class _SampleRows:
         self.given = {"x": x, "values": self.found, "gradients": self.gradients, "blocks": blocks}
 
 
-def _along_all(second: NumericFunction, n: int, n_var: int) -> PreparedBatch:
+def _all_directions(second: NumericFunction, n: int, n_var: int) -> PreparedBatch:
     """Second derivatives along every direction of x: each sample is evaluated n_var times."""
     batch = second.prepared(n * n_var, ("x", "rounding"))
-    batch.inputs["rounding"][...] = ROUNDING
+    batch.inputs["rounding"][...] = TIME_LAW_ROUNDING
     batch.inputs["along"][...] = np.tile(np.eye(n_var), (n, 1))
     return batch
 
 
-class Rows:
+class ConstraintRows:
     """The rows of one program as functions of the decision vector x (n_var,), and of further
     variables on which they depend linearly. A resource of one thread.
 
@@ -166,7 +166,7 @@ class Rows:
     def __init__(
         self,
         cell: SmoothCell,
-        layout: Layout,
+        layout: RowLayout,
         q: tuple[Array, Array],
         mix: Array | None = None,
         fixed: Array | None = None,
@@ -190,13 +190,16 @@ class Rows:
             **self._lay_out_places(layout, q),
         )
 
-    def _lay_out_samples(self, layout: Layout) -> dict[str, Any]:
-        """Forces and pressure. Where forces are no branches, they come from what a sample's load
-        asks of the pads (`symbolic.smooth.samples.held_functions`); derivatives by the decision
-        vector follow by the chain rule, so that no load is solved for twice at a place."""
+    def _lay_out_samples(self, layout: RowLayout) -> dict[str, Any]:
+        """Lay out forces and pressure.
+
+        Forces without branches follow from a sample's load
+        (`symbolic.smooth.samples.grasp_force_functions`); their derivatives by the decision vector
+        follow by the chain rule, so that each load is solved for once.
+        """
         cell, rows = self._cell, layout.force_rows
-        own = sorted({row.sample for row in rows if row.branch == HELD})
-        split = {row.sample for row in rows if row.branch != HELD}
+        own = sorted({row.sample for row in rows if row.branch == PROGRAM_BRANCH})
+        split = {row.sample for row in rows if row.branch != PROGRAM_BRANCH}
         self._forces = _SampleRows(cell, "force", split, beyond=len(own))
         pressed = {row.sample for row in layout.pressure_rows}
         self._patches = _SampleRows(cell, "pressure", pressed)
@@ -205,7 +208,7 @@ class Rows:
             start = len(self._forces.found) - len(own)
             by_load[own] = start + np.arange(len(own))
             loads = _SampleRows(cell, "load", set(own))
-            function, second = (cell.functions.built[held_name(order)] for order in ORDERS)
+            function, second = (cell.functions.built[grasp_force_name(order)] for order in ORDERS)
             held = {
                 "start": start,
                 "at": loads.column[own],
@@ -213,7 +216,9 @@ class Rows:
                 "first": function.prepared(len(own), given={"normal": self._forces.found[start:]}),
                 "second": partial(second.prepared, len(own)),
             }
-        columns = ((by_load if row.branch == HELD else self._forces.column) for row in rows)
+        columns = (
+            (by_load if row.branch == PROGRAM_BRANCH else self._forces.column) for row in rows
+        )
         self._column = np.array(
             [column[row.sample] for column, row in zip(columns, rows, strict=True)], dtype=np.intp
         )
@@ -231,7 +236,7 @@ class Rows:
             "first_patch": layout.patches.start,
         }
 
-    def _lay_out_places(self, layout: Layout, q: tuple[Array, Array]) -> dict[str, Any]:
+    def _lay_out_places(self, layout: RowLayout, q: tuple[Array, Array]) -> dict[str, Any]:
         """Inside, rows at places stand family by family; the joints of every place that needs them
         are solved once."""
         cell, rows = self._cell, layout.place_rows
@@ -295,7 +300,7 @@ class Rows:
         }
 
     def _lay_out_group(
-        self, constraints: Sequence[PlaceConstraint], given: dict[str, Array]
+        self, constraints: Sequence[PathConstraint], given: dict[str, Array]
     ) -> dict[str, Any]:
         """Rows of one family."""
         functions, one = self._cell.functions, constraints[0]
@@ -348,13 +353,13 @@ class Rows:
         """(n_patches,) what is left of the patches where it was found last."""
         return self._patches.found.ravel()[self._pressed]
 
-    def correct(self, slope: Array, x: Array) -> None:
+    def correct_forces(self, slope: Array, x: Array) -> None:
         """Add (n_forces, n_var) to the slopes of forces, and to values what that makes beside x."""
         self._native.correct(slope, x)
 
 
 def row_numbers(
-    constraints: Sequence[PlaceConstraint], functions: PolishFunctions
+    constraints: Sequence[PathConstraint], functions: PolishFunctions
 ) -> tuple[Array, ...]:
     """(rows, n) numbers of constraints of one family, in a tuple; an empty one without any."""
     numbers = np.array([functions.numbers(constraint) for constraint in constraints])

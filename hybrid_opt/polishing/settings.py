@@ -113,7 +113,7 @@ class PolishSettings:
         require_allowed(self, "polish ")
 
 
-def usual_settings(time_law: str) -> PolishSettings:
+def default_settings(time_law: str) -> PolishSettings:
     """The settings where nothing else is asked for."""
     return PolishSettings(attempts=DRIVABLE_ATTEMPTS) if time_law == "optimal" else PolishSettings()
 

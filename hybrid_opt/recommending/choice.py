@@ -154,7 +154,7 @@ class DrivenPaths:
         self.highest_force = cell.workcell.task.force_limit[1]
         self._timer, self._robust = cell.path_timer, cell.force_kind.robust
         self._known = self._timer.path_limits(self.x)
-        self._failures = self._timer.failures(self._known)
+        self._failures = self._timer.path_errors(self._known)
 
     def __len__(self) -> int:
         return len(self.x)
@@ -169,7 +169,7 @@ class DrivenPaths:
         known = self._known
         if rows is not None:
             known = {name: values[chosen] for name, values in known.items()}
-        timings = self._timer.time_known(
+        timings = self._timer.time_from_coefficients(
             self.x[chosen],
             known,
             [TimingLimits(force=limit, robust=self._robust) for limit in limits],

@@ -13,20 +13,27 @@ import numpy as np
 from hybrid_opt.carry import Carry
 from hybrid_opt.progress import ShowProgress, counted
 from hybrid_opt.store.files import read_record
-from hybrid_opt.timing.jerk import kept_jerk, time_with_jerk
+from hybrid_opt.timing.jerk import applicable_jerk_limits, time_with_jerk
 from hybrid_opt.timing.limits import (
     RECOMPUTED_TOLERANCE,
+    check_limits,
     drive_path,
     duration_at_speed_limits,
     joint_use,
-    judged,
     limited_force,
+    most_used,
+    path_error,
     place_of,
-    untimed,
-    worst,
 )
 from hybrid_opt.timing.model import TimingModel
-from hybrid_opt.timing.records import Excess, JerkTiming, Place, Timing, TimingLimits, TimingStatus
+from hybrid_opt.timing.records import (
+    JerkTiming,
+    Place,
+    Timing,
+    TimingLimits,
+    TimingStatus,
+    Utilisation,
+)
 from hybrid_opt.timing.robustness import Margin, robustness_margins
 from hybrid_opt.timing.solve import time_path
 from symbolic.array import Array, Count, Figure, Missing, Pair, Row, Shape
@@ -34,7 +41,7 @@ from symbolic.errors import SettingsError
 from symbolic.path.pieces import same_paths
 from symbolic.records import Workcell
 
-NEAREST_FORCE = 1.001
+LEAST_FORCE_RATIO = 1.001
 """Least force limit of the curve, over the force at rest: below, the motion has to creep."""
 
 
@@ -62,7 +69,7 @@ class ForceCurve:
     unlimited_force: Figure
 
 
-def judge_timing(model: TimingModel, x: Array) -> Timing:
+def check_search_timing(model: TimingModel, x: Array) -> Timing:
     """The search's own timing (the task's time law) held against every limit of the workcell:
     status `OK` or `EXCEEDED`, also for a carry that starts or ends at speed, or why the path itself
     fails; with every limit's use.
@@ -71,11 +78,11 @@ def judge_timing(model: TimingModel, x: Array) -> Timing:
         SettingsError: x does not fit the workcell.
     """
     carry = model.search_carry(x)
-    failure = untimed(model, model.path_motion(x))
-    timing = judged(model, carry, TimingLimits())
+    failure = path_error(model, model.path_motion(x))
+    timing = check_limits(model, carry, TimingLimits())
     if failure is not None:
         return replace(failure, carry=carry, use=timing.use)
-    excess, jump = worst(timing.use), _jump(model, carry)
+    excess, jump = most_used(timing.use), _jump(model, carry)
     if excess.ratio > 1.0 + RECOMPUTED_TOLERANCE:
         reason = f"uses {100.0 * excess.ratio:.0f} % of the limit: {excess.place}"
         return replace(timing, status=TimingStatus.EXCEEDED, reason=reason)
@@ -127,7 +134,7 @@ def closest_to_reference_timing(model: TimingModel, x: Array) -> Timing:
 
 
 def duration_against_force_limit(
-    model: TimingModel, x: Array, points: int = 12, told: Callable[[], None] = lambda: None
+    model: TimingModel, x: Array, points: int = 12, on_timing: Callable[[], None] = lambda: None
 ) -> ForceCurve:
     """Durations of the fastest timings between the least force that holds and the unlimited one.
 
@@ -148,12 +155,12 @@ def duration_against_force_limit(
     if free.carry is None:
         return ForceCurve(np.zeros(0), np.zeros(0), (free.status,), static, float("nan"))
     top = _peak_force(model, free.carry)
-    first = (NEAREST_FORCE - 1.0) * static
+    first = (LEAST_FORCE_RATIO - 1.0) * static
     force = static + np.geomspace(first, max(top - static, 2.0 * first), points)
     timings = []
     for limit in force:
         timings.append(time_path(model, x, model.drive_limits(float(limit)), motion))
-        told()
+        on_timing()
     return ForceCurve(
         force,
         np.array([timing.duration for timing in timings]),
@@ -175,7 +182,7 @@ class TimedTrajectory:
     Attributes:
         workcell: the cell.
         nominal_duration: at the reference speeds without ramps [s].
-        timings: by name: the search's first (`judge_timing`), then the drivable ones.
+        timings: by name: the search's first (`check_search_timing`), then the drivable ones.
         jerk: of a drivable carry within its force limit and the cell's limits on jerk; None under
             other time laws, and without such limits.
         margins: how wrong the cell's description may be under the timing closest to the reference
@@ -191,7 +198,7 @@ class TimedTrajectory:
     curve: ForceCurve | None
 
 
-def timed_trajectory(
+def time_trajectory(
     model: TimingModel,
     x: Array,
     force_limit: float | None = None,
@@ -216,33 +223,33 @@ def timed_trajectory(
     (path,) = same_paths(x, found_in.workcell.task, task)
     if len(path) == task.n_var > task.n_path:
         limits = model.drive_limits(float(path[-1]))
-        kept = kept_jerk(model.workcell, limits)
+        kept = applicable_jerk_limits(model.workcell, limits)
     ways = 4 + (force_limit is not None) + (kept is not None) + (curve_points or 0)
     with counted(progress, "timings", ways) as advance:
 
-        def told() -> None:
+        def on_timing() -> None:
             advance(1)
 
-        timings = {"search": judge_timing(found_in, x)}
-        told()
+        timings = {"search": check_search_timing(found_in, x)}
+        on_timing()
         closest = timings["closest to reference"] = closest_to_reference_timing(model, path)
-        told()
+        on_timing()
         timings["fastest"] = time_path(model, path)
-        told()
+        on_timing()
         if force_limit is not None:
             timings["force limited"] = time_path(model, path, model.drive_limits(force_limit))
-            told()
+            on_timing()
         if kept is not None:
             jerk = time_with_jerk(model, path, limits, kept)
             timings["within jerk limits"] = jerk.timing
-            told()
+            on_timing()
         nominal = TimingLimits(reference_speed=True)
         nominal_duration = duration_at_speed_limits(model, model.path_motion(path), nominal)
         margins = () if closest.carry is None else robustness_margins(model, closest.carry)
-        told()
+        on_timing()
         curve = None
         if curve_points is not None:
-            curve = duration_against_force_limit(model, path, curve_points, told)
+            curve = duration_against_force_limit(model, path, curve_points, on_timing)
     return TimedTrajectory(model.workcell, nominal_duration, timings, jerk, margins, curve)
 
 
@@ -269,7 +276,7 @@ class StoredTiming:
     iterations: Count
     slowed: Figure
     seconds: Figure
-    use: Mapping[str, Excess]
+    use: Mapping[str, Utilisation]
     objectives: Pair | None = None
     payload_limit: float | None = None
     peak_normal_force: Pair | None = None

@@ -53,7 +53,9 @@ class CandidateDriver:
         timings = self.timings(x)
         u = np.linspace(0.0, 1.0, self._task.samples)
         # An axis of three that no candidates leave empty, too.
-        driven = np.array([_at(timing, u) for timing in timings]).reshape(len(x), 3, len(u))
+        driven = np.array([_speed_profile_at(timing, u) for timing in timings]).reshape(
+            len(x), 3, len(u)
+        )
         time, speed, acceleration = np.swapaxes(driven, 0, 1)
         outputs = candidate.batch(x, time, speed, acceleration, threads=self._threads)
         forces = {"peak_force": [timing.peak_force for timing in timings]}
@@ -81,23 +83,23 @@ class CandidateDriver:
     def timings(self, x: Array) -> list[PathTiming]:
         """The timing of every decision vector (n, n_var)."""
         if len(x) == 1:
-            return [self.timed(x[0])[0]]
+            return [self.time_candidate(x[0])[0]]
         limits = [self.limits(float(force)) for force in x[:, -1]]
         return self.timer.time_all(x[:, : self._task.n_path], limits)
 
-    def timed(self, x: Array) -> tuple[PathTiming, dict[str, Array]]:
+    def time_candidate(self, x: Array) -> tuple[PathTiming, dict[str, Array]]:
         """The timing of one decision vector (n_var,), and `path_limits` of its path. The last ones
         are kept: a polish asks for those of a carry several times in a row."""
         key = x.tobytes()
         if self._last is None or self._last[0] != key:
             path = np.ascontiguousarray(x[None, : self._task.n_path], dtype=float)
             known = self.timer.path_limits(path)
-            (timing,) = self.timer.time_known(path, known, [self.limits(float(x[-1]))])
+            (timing,) = self.timer.time_from_coefficients(path, known, [self.limits(float(x[-1]))])
             self._last = key, timing, known
         return self._last[1:]
 
 
-def _at(timing: PathTiming, u: Array) -> tuple[Array, Array, Array]:
+def _speed_profile_at(timing: PathTiming, u: Array) -> tuple[Array, Array, Array]:
     """Time, u' and u'' at path parameters u; u'' is that of the interval that begins there."""
     if not np.isfinite(timing.duration):
         return u, np.zeros_like(u), np.zeros_like(u)

@@ -30,14 +30,14 @@ from scipy.interpolate import BSpline
 
 from hybrid_opt.carry import Carry
 from hybrid_opt.timing.limits import (
-    NEAR,
+    LINEARISED_ABOVE,
     RECOMPUTED_TOLERANCE,
     PathLimits,
-    judged,
+    check_limits,
     largest_speed_factor,
     limit_ratios,
+    most_used,
     squared_speed_limit,
-    worst,
 )
 from hybrid_opt.timing.model import PathMotion, TimingModel
 from hybrid_opt.timing.records import (
@@ -48,7 +48,7 @@ from hybrid_opt.timing.records import (
     TimingLimits,
     TimingStatus,
 )
-from hybrid_opt.timing.solve import LEAST_SPEED, time_path
+from hybrid_opt.timing.solve import LEAST_SPEED_FACTOR, time_path
 from symbolic.array import Array
 from symbolic.records import Workcell
 
@@ -57,36 +57,36 @@ if TYPE_CHECKING:
 
 Mask = NDArray[np.bool_]
 
-SUPPORT = 4
+SPLINE_SUPPORT = 4
 """Functions of a cubic spline's basis that are not zero at a place; they are neighbours."""
 
-PIECES = 60
+SPLINE_PIECES = 60
 """Pieces of the spline of squared speeds."""
 
-POINTS = 4
+POINTS_PER_PIECE = 4
 """Per piece, at which limits are imposed."""
 
-FINER = 10
+CHECKS_PER_POINT = 10
 """Points per imposed one at which the answer is judged."""
 
-MAX_ROUNDS = 40
-SETTLED = 1e-4
+MAX_JERK_ITERATIONS = 40
+DURATION_TOLERANCE = 1e-4
 """Relative change of the duration at which rounds end."""
 
-TIGHTENED = 4
+MAX_TIGHTENINGS = 4
 """Times that a timing is found anew with less of the limits where they were exceeded."""
 
-FIRST_USE = 0.5
+START_UTILISATION = 0.5
 """Largest use of a limit by the slow start that the rounds begin with."""
 
-KEPT = 1e-4
+SOLVER_MARGIN = 1e-4
 """Share of every limit that the program leaves unused: what the solver rounds off."""
 
-FIRST_ROWS = 0.95
-"""Rows that the last coefficients use to more than this share enter a program at once. With 0.4 in
-its place, under a force limit, which most cones are near, a timing took three times as long."""
+NEAR_ACTIVE_SHARE = 0.95
+"""Rows that the last coefficients use beyond this share enter a program at once. With 0.4 in its
+place a timing under a force limit, to which most cones are near, took three times as long."""
 
-LEAST_SHARE = 0.05
+LEAST_COEFFICIENT_SHARE = 0.05
 """Least share of its last value that a coefficient keeps."""
 
 
@@ -110,66 +110,70 @@ def time_with_jerk(
     fastest = fastest or time_path(model, x, limits, motion)
     if not fastest.ok:
         return JerkTiming(fastest, jerk, (np.nan, np.nan), fastest.duration)
-    problem = _Problem(model, motion, limits, jerk)
+    problem = _JerkProblem(model, motion, limits, jerk)
     return replace(problem.solve(), without=fastest.duration)
 
 
-def kept_jerk(workcell: Workcell, limits: TimingLimits) -> JerkLimits | None:
+def applicable_jerk_limits(workcell: Workcell, limits: TimingLimits) -> JerkLimits | None:
     """The cell's limits on jerk that timings within `limits` keep; None where it states none, and
     where limited robust forces have no slopes."""
     slopes = workcell.has_one_squeeze or not limits.robust
-    return JerkLimits.of(workcell) if slopes else None
+    return JerkLimits.from_workcell(workcell) if slopes else None
 
 
-class _Problem:
+class _JerkProblem:
     """One path with one set of limits."""
 
     def __init__(
         self, model: TimingModel, motion: PathMotion, limits: TimingLimits, jerk: JerkLimits
     ) -> None:
         self._model, self._limits, self._jerk = model, limits, jerk
-        self._coarse = Point.of(motion, PIECES * POINTS)
+        self._coarse = WarpedPath.from_motion(motion, SPLINE_PIECES * POINTS_PER_PIECE)
         self._at = PathLimits(model, self._coarse.motion, limits)
-        self._fine = Point.of(motion, PIECES * POINTS * FINER)
+        self._fine = WarpedPath.from_motion(
+            motion, SPLINE_PIECES * POINTS_PER_PIECE * CHECKS_PER_POINT
+        )
 
     def solve(self) -> JerkTiming:
         """Rounds until nothing changes; then with less of the limits where the answer exceeds them
         between the points, as often as that helps."""
         c = np.ones(self._coarse.value.shape[1])
-        c, rounds = self._settled(self._slow(c) * c)
-        for _ in range(TIGHTENED):
+        c, rounds = self._iterate(self._start_factor(c) * c)
+        for _ in range(MAX_TIGHTENINGS):
             excess = self._excess(c)
             if excess.max() <= 1.0 + RECOMPUTED_TOLERANCE:
                 break
             keep = self._coarse.keep / np.where(excess > 1.0, excess, 1.0)
             self._coarse = replace(self._coarse, keep=keep)
-            c, more = self._settled(self._factor(c) ** 2 * c)
+            c, more = self._iterate(self._feasible_speed_factor(c) ** 2 * c)
             rounds += more
-        return replace(self._judged(c), rounds=rounds)
+        return replace(self._checked_timing(c), rounds=rounds)
 
-    def _settled(self, c: Array) -> tuple[Array, int]:
+    def _iterate(self, c: Array) -> tuple[Array, int]:
         """Rounds from coefficients that keep the limits, and how many."""
         duration = self._coarse.duration(c)
-        for rounds in range(1, MAX_ROUNDS + 1):
+        for rounds in range(1, MAX_JERK_ITERATIONS + 1):
             found = self._step(c)
             if found is None:
                 return c, rounds
             c, before = found, duration
             duration = self._coarse.duration(c)
-            if abs(duration / before - 1.0) < SETTLED:
+            if abs(duration / before - 1.0) < DURATION_TOLERANCE:
                 break
         return c, rounds
 
     def _step(self, c: Array) -> Array | None:
         """Better coefficients than c (k,), which satisfy all limits at the coarse points; None
         without any."""
-        at, rows = self._coarse, Program(len(c))
+        at, rows = self._coarse, JerkProgram(len(c))
         self._motion_rows(rows)
         self._force_rows(c, rows)
         self._jerk_rows(c, rows)
-        rows.below(-np.ones((len(c), 1)), -LEAST_SHARE * c, np.arange(len(c)))
+        rows.add_upper_bounds(
+            -np.ones((len(c), 1)), -LEAST_COEFFICIENT_SHARE * c, np.arange(len(c))
+        )
         gradient, H = at.objective(c)
-        answer = rows.minimised(H, gradient - H @ c, c)
+        answer = rows.minimise(H, gradient - H @ c, c)
         if answer is None:
             return None
         # The quadratic model promises too much far away: c and the answer are both allowed, and so
@@ -179,40 +183,40 @@ class _Problem:
             share *= 0.5
         return np.asarray(c + share * (answer - c))
 
-    def _motion_rows(self, rows: Program) -> None:
+    def _motion_rows(self, rows: JerkProgram) -> None:
         """Speeds and accelerations of joints and box."""
         at, first_basis = self._coarse, self._coarse.first_basis
         squared_by, acceleration_by = at.local(at.squared_by), at.local(at.acceleration_by)
         most = squared_speed_limit(at.motion, self._model.workcell, self._limits)
-        rows.below(squared_by / np.minimum(most, 1e6)[:, None], at.keep, first_basis)
+        rows.add_upper_bounds(squared_by / np.minimum(most, 1e6)[:, None], at.keep, first_basis)
         alpha, beta = self._at.joint_accelerations()
         by = alpha[:, :, None] * acceleration_by[:, None, :]
         by = by + beta[:, :, None] * squared_by[:, None, :]
-        rows.both_below(by, 0.0, at.keep, first_basis)
+        rows.add_two_sided_bounds(by, 0.0, at.keep, first_basis)
         for first, second, limit in self._at.accelerations():
             A = first[:, :, None] * acceleration_by[:, None]
             A = A + second[:, :, None] * squared_by[:, None]
             none = np.zeros_like(squared_by)
-            rows.within(A / limit, np.zeros((len(at.s), 3)), none, at.keep, first_basis)
+            rows.add_norm_bounds(A / limit, np.zeros((len(at.s), 3)), none, at.keep, first_basis)
 
-    def _force_rows(self, c: Array, rows: Program) -> None:
+    def _force_rows(self, c: Array, rows: JerkProgram) -> None:
         """Normal forces, planned and robust ones, joint torques and shifts of the pressure,
         linearised at c."""
         at = self._coarse
         a, w = at.acceleration_by @ c, np.maximum(at.squared_by @ c, 0.0)
         along = np.stack([at.acceleration_by, at.squared_by], axis=1)[:, None]
         for force, slope in self._at.forces(a, w):
-            _linearised(at, c, force, (slope[..., None] * along).sum(axis=2), rows)
+            _add_linearised(at, c, force, (slope[..., None] * along).sum(axis=2), rows)
         value = self._at.ratios(a, w)
-        near = (np.abs(value) > NEAR).any(axis=0)
+        near = (np.abs(value) > LINEARISED_ABOVE).any(axis=0)
         if not near.any():
             return
         slope = self._at.ratio_slopes(value, a, w)[:, near]
         by = (slope[..., None] * along).sum(axis=2)
         for sign in (1.0, -1.0):
-            _linearised(at, c, sign * value[:, near], sign * by, rows)
+            _add_linearised(at, c, sign * value[:, near], sign * by, rows)
 
-    def _jerk_rows(self, c: Array, rows: Program) -> None:
+    def _jerk_rows(self, c: Array, rows: JerkProgram) -> None:
         """Jerk over sqrt(v) below the tangent of the limit over sqrt(v) at c."""
         at, jerk, v = self._coarse, self._jerk, self._coarse.value @ c
         # Multiplied by sqrt(v) of the last round, so that rows are of order one.
@@ -221,10 +225,10 @@ class _Problem:
         head = (at.keep * (0.5 * v**-1.5) * root)[:, None] * at.local(at.value)
         limited = np.isfinite(jerk.joints)
         by = at.joint_jerk_by[:, limited] / jerk.joints[limited, None] * root[:, None, None]
-        rows.both_below(by, head[:, None], level, at.first_basis)
+        rows.add_two_sided_bounds(by, head[:, None], level, at.first_basis)
         if np.isfinite(jerk.payload):
             box = at.box_jerk_by / jerk.payload * root[:, None, None]
-            rows.within(box, np.zeros((len(v), 3)), head, level, at.first_basis)
+            rows.add_norm_bounds(box, np.zeros((len(v), 3)), head, level, at.first_basis)
 
     def _excess(self, c: Array) -> Array:
         """(coarse points,) largest use of a limit at the finer points around each."""
@@ -233,50 +237,52 @@ class _Problem:
         del ratios["friction"]
         joint, box = self._jerks(self._fine, c)
         use = np.max([*[ratio.max(axis=1) for ratio in ratios.values()], joint, box], axis=0)
-        between = use[1:].reshape(-1, FINER).max(axis=1)
+        between = use[1:].reshape(-1, CHECKS_PER_POINT).max(axis=1)
         return np.asarray(np.maximum(np.append(use[0], between), np.append(between, use[-1])))
 
-    def _slow(self, c: Array) -> float:
+    def _start_factor(self, c: Array) -> float:
         """Factor on the squared speeds at which everything is used little, as at rest."""
         factor = 1.0
         rest = self._most_used(self._coarse, 0.0 * c)
-        allowed = rest + FIRST_USE * (1.0 - rest)
+        allowed = rest + START_UTILISATION * (1.0 - rest)
         while self._most_used(self._coarse, factor * c) > allowed:
             factor *= 0.5
         return factor
 
-    def _carry(self, at: Point, c: Array) -> Carry:
+    def _carry(self, at: WarpedPath, c: Array) -> Carry:
         return self._model.carry(at.motion, at.time(c), at.speed(c), at.acceleration(c))
 
-    def _jerks(self, at: Point, c: Array) -> tuple[Array, Array]:
+    def _jerks(self, at: WarpedPath, c: Array) -> tuple[Array, Array]:
         """(n,) largest joint jerk and payload jerk over their limits."""
         joint, box = at.jerk(c)
         of_joints = (np.abs(joint) / self._jerk.joints).max(axis=1)
         return of_joints, np.linalg.norm(box, axis=1) / self._jerk.payload
 
-    def _judge(self, at: Point, c: Array) -> tuple[Timing, float, float, float]:
-        timing = judged(self._model, self._carry(at, c), self._limits)
+    def _check(self, at: WarpedPath, c: Array) -> tuple[Timing, float, float, float]:
+        timing = check_limits(self._model, self._carry(at, c), self._limits)
         joint, box = (float(jerk.max()) for jerk in self._jerks(at, c))
-        return timing, worst(timing.use).ratio, joint, box
+        return timing, most_used(timing.use).ratio, joint, box
 
-    def _most_used(self, at: Point, c: Array) -> float:
-        return max(self._judge(at, c)[1:])
+    def _most_used(self, at: WarpedPath, c: Array) -> float:
+        return max(self._check(at, c)[1:])
 
-    def _factor(self, c: Array) -> float:
+    def _feasible_speed_factor(self, c: Array) -> float:
         """Largest factor on the speeds with which the timing keeps all limits on the finer grid."""
         jerk = max(float(jerk.max()) for jerk in self._jerks(self._fine, c))
 
         def use(f: float) -> float:
             carry = self._carry(self._fine, f**2 * c)
-            return max(worst(judged(self._model, carry, self._limits).use).ratio, f**3 * jerk)
+            return max(
+                most_used(check_limits(self._model, carry, self._limits).use).ratio, f**3 * jerk
+            )
 
         return largest_speed_factor(use)
 
-    def _judged(self, c: Array) -> JerkTiming:
+    def _checked_timing(self, c: Array) -> JerkTiming:
         """The timing on the finer grid, slowed down where it exceeds a limit."""
-        factor = self._factor(c)
-        timing, *uses = self._judge(self._fine, factor**2 * c)
-        status = TimingStatus.OK if factor >= LEAST_SPEED else TimingStatus.NOT_CONVERGED
+        factor = self._feasible_speed_factor(c)
+        timing, *uses = self._check(self._fine, factor**2 * c)
+        status = TimingStatus.OK if factor >= LEAST_SPEED_FACTOR else TimingStatus.NOT_CONVERGED
         place = timing.place
         if max(uses[1:]) > uses[0]:
             joint = uses[1] >= uses[2]
@@ -286,7 +292,7 @@ class _Problem:
 
 
 @dataclass(frozen=True)
-class Point:
+class WarpedPath:
     """Places along the warped path; all arrays by place.
 
     Attributes:
@@ -311,9 +317,9 @@ class Point:
     keep: Array
 
     @classmethod
-    def of(cls, motion: PathMotion, intervals: int) -> Point:
+    def from_motion(cls, motion: PathMotion, intervals: int) -> WarpedPath:
         """Both ends of equal intervals, along a path."""
-        s, inner = np.linspace(0.0, 1.0, intervals + 1), np.linspace(0.0, 1.0, PIECES + 1)
+        s, inner = np.linspace(0.0, 1.0, intervals + 1), np.linspace(0.0, 1.0, SPLINE_PIECES + 1)
         knots = np.concatenate([np.zeros(3), inner, np.ones(3)])
         splines = BSpline(knots, np.eye(len(knots) - 4), 3)
         value, first, second = splines(s), splines.derivative(1)(s), splines.derivative(2)(s)
@@ -324,9 +330,9 @@ class Point:
         )
         one, two, three = (part[:, None] for part in warp)
         u = np.clip(s**3 * (10.0 - 15.0 * s + 6.0 * s**2), 0.0, 1.0)
-        third, motion = motion.third(u), motion.between(u)
-        begins = np.minimum(np.argmax(value != 0.0, axis=1), value.shape[1] - SUPPORT)
-        columns = begins[:, None] + np.arange(SUPPORT)
+        third, motion = motion.third_derivatives(u), motion.interpolate(u)
+        begins = np.minimum(np.argmax(value != 0.0, axis=1), value.shape[1] - SPLINE_SUPPORT)
+        columns = begins[:, None] + np.arange(SPLINE_SUPPORT)
         local = [np.take_along_axis(b, columns, axis=1)[:, None] for b in (value, first, second)]
 
         def jerk(by_u: Array, by_uu: Array, by_uuu: Array) -> Array:
@@ -346,7 +352,7 @@ class Point:
             columns,
             jerk(motion.q_first, motion.q_second, third[0]),
             jerk(*box, third[1]),
-            np.full(len(s), 1.0 - KEPT),
+            np.full(len(s), 1.0 - SOLVER_MARGIN),
         )
 
     @property
@@ -356,7 +362,7 @@ class Point:
 
     def local(self, values: Array) -> Array:
         """(n, ..., SUPPORT) those of values (n, ..., k) that belong to these coefficients."""
-        shape = (len(self.columns), *[1] * (values.ndim - 2), SUPPORT)
+        shape = (len(self.columns), *[1] * (values.ndim - 2), SPLINE_SUPPORT)
         return np.take_along_axis(values, self.columns.reshape(shape), axis=-1)
 
     def duration(self, c: Array) -> float:
@@ -398,7 +404,7 @@ class Point:
         return gradient, 0.75 * (self.value.T * (weights * v**-2.5)) @ self.value
 
 
-class Program:
+class JerkProgram:
     """Linear rows b - A c >= 0, and second-order cones of four such rows, of which few matter at a
     time.
 
@@ -413,29 +419,29 @@ class Program:
         self._linear = [(sparse.csr_array((0, k)), np.zeros(0))]
         self._cones = [(sparse.csr_array((0, k)), np.zeros((0, 4)))]
 
-    def below(self, A: Array, b: Array, first: NDArray[np.intp]) -> None:
+    def add_upper_bounds(self, A: Array, b: Array, first: NDArray[np.intp]) -> None:
         """A c <= b, (n, width) and (n,), columns from first (n,) on."""
-        self._linear.append((self._placed(A, first), b))
+        self._linear.append((self._sparse_rows(A, first), b))
 
-    def both_below(
+    def add_two_sided_bounds(
         self, A: Array, head: Array | float, bound: Array, first: NDArray[np.intp]
     ) -> None:
         """A c + head c and -A c + head c below bound, by (n, m, width), (n, 1, width), (n,)."""
         _, m, width = A.shape
         for sign in (1.0, -1.0):
             each = (sign * A + head).reshape(-1, width)
-            self.below(each, np.repeat(bound, m), np.repeat(first, m))
+            self.add_upper_bounds(each, np.repeat(bound, m), np.repeat(first, m))
 
-    def within(
+    def add_norm_bounds(
         self, A: Array, b: Array, head: Array, bound: Array, first: NDArray[np.intp]
     ) -> None:
         """|A c + b| <= bound - head c, by (n, 3, width), (n, 3), (n, width), (n,), columns from
         first (n,) on."""
         rows = np.concatenate([head[:, None], -A], axis=1).reshape(-1, A.shape[2])
-        placed = self._placed(rows, np.repeat(first, 4))
+        placed = self._sparse_rows(rows, np.repeat(first, 4))
         self._cones.append((placed, np.column_stack([bound, b])))
 
-    def _placed(self, A: Array, first: NDArray[np.intp]) -> sparse.csr_array:
+    def _sparse_rows(self, A: Array, first: NDArray[np.intp]) -> sparse.csr_array:
         from scipy import sparse
 
         n, width = A.shape
@@ -460,20 +466,23 @@ class Program:
         lengths = np.linalg.norm(inside[:, 1:], axis=1)
         return np.asarray(A @ c > share * b), np.asarray(lengths > share * inside[:, 0])
 
-    def minimised(self, H: Array, g: Array, about: Array) -> Array | None:
-        """Least c^T H c / 2 + g.c; None without any. Rows that an answer violates are added."""
-        rows, cones = self.used(about, FIRST_ROWS)
+    def minimise(self, H: Array, g: Array, about: Array) -> Array | None:
+        """Minimise c^T H c / 2 + g.c; rows that an answer violates are added. None without an
+        answer."""
+        rows, cones = self.used(about, NEAR_ACTIVE_SHARE)
         while True:
-            c = self._solved(H, g, about, rows, cones)
+            c = self._solve_subset(H, g, about, rows, cones)
             if c is None:
                 return None
-            more_rows, more_cones = self.used(c, 1.0 + KEPT / 2.0)
+            more_rows, more_cones = self.used(c, 1.0 + SOLVER_MARGIN / 2.0)
             fresh = (more_rows & ~rows).any() or (more_cones & ~cones).any()
             if not fresh:
                 return c
             rows, cones = rows | more_rows, cones | more_cones
 
-    def _solved(self, H: Array, g: Array, scale: Array, rows: Mask, cones: Mask) -> Array | None:
+    def _solve_subset(
+        self, H: Array, g: Array, scale: Array, rows: Mask, cones: Mask
+    ) -> Array | None:
         """The same with some of the rows; variables are scaled to be around one."""
         # Not imported at the top: only jerk limits need it.
         import clarabel
@@ -500,7 +509,7 @@ class Program:
         return answer if solved else None
 
 
-def _linearised(at: Point, c: Array, value: Array, by: Array, rows: Program) -> None:
+def _add_linearised(at: WarpedPath, c: Array, value: Array, by: Array, rows: JerkProgram) -> None:
     """Values (n, m) at c over their limits, with derivatives (n, m, k), below one.
 
     What is exceeded between rounds, by what the last one left out, may stay as it is for one.
@@ -508,4 +517,4 @@ def _linearised(at: Point, c: Array, value: Array, by: Array, rows: Program) -> 
     bound = np.maximum(at.keep[:, None], value) - value + by @ c
     A = at.local(by)
     first = np.repeat(at.first_basis, by.shape[1])
-    rows.below(A.reshape(-1, A.shape[2]), bound.reshape(-1), first)
+    rows.add_upper_bounds(A.reshape(-1, A.shape[2]), bound.reshape(-1), first)

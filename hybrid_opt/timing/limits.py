@@ -14,7 +14,7 @@ from hybrid_opt.carry import Carry
 from hybrid_opt.robust.force import robust_model
 from hybrid_opt.robust.path_force import BY_TIMING, PathPoints, robust_path
 from hybrid_opt.timing.model import REFINEMENT, PathMotion, TimingModel
-from hybrid_opt.timing.records import Excess, Place, Timing, TimingLimits, TimingStatus
+from hybrid_opt.timing.records import Place, Timing, TimingLimits, TimingStatus, Utilisation
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.functions import TIMING_TOLERANCE
@@ -29,25 +29,25 @@ FRICTION_ROUNDING = 1e-6
 RECOMPUTED_TOLERANCE = TIMING_TOLERANCE
 """Largest excess of a recomputed limit, as a share of it."""
 
-NEAR = 0.6
+LINEARISED_ABOVE = 0.6
 """Torques and shifts that stay below this share of their limit enter no program."""
 
-EXACT = 0.98
+EXACT_FORCE_ABOVE = 0.98
 """Share of a limit of robust forces above which they are computed exactly."""
 
 FACTOR_TOLERANCE = 1e-4
 """Share of a limit that a factor on the speeds may leave unused."""
 
-SPREAD = 20
+PEAK_SEARCH_STRIDE = 20
 """Stride of the samples whose robust force is computed in the search for the largest."""
 
-AT_A_TIME = 2000
+ROBUST_BATCH = 2000
 """Samples of a carry whose cases are held in memory together."""
 
-FORCE_FLOOR = 1e-9
+LEAST_NORMAL_FORCE = 1e-9
 """A contact with less normal force than this carries nothing [N]."""
 
-LEAST_LENGTH = 1e-9
+LEAST_MOTION = 1e-9
 """A path along which box and joints move less than this does not move [m, rad]."""
 
 ARM_CHECKS = (
@@ -59,7 +59,7 @@ ARM_CHECKS = (
 `Place`, and what the robot does, for people."""
 
 
-def path_failure(
+def arm_path_error(
     workcell: Workcell, pose: Array, lost: Array, limit_margin: Array, manipulability: Array
 ) -> Timing | None:
     """Why a path cannot be timed at all, with arm and place, or None.
@@ -69,7 +69,7 @@ def path_failure(
         lost, limit_margin, manipulability: (n, 2) by sample and arm, as of
             `symbolic.robot.arm.TRACK_OUTPUTS`.
     """
-    if float(np.abs(pose - pose[0]).max()) < LEAST_LENGTH:
+    if float(np.abs(pose - pose[0]).max()) < LEAST_MOTION:
         reason = "all poses of the path are the same: there is nothing to time"
         return Timing(TimingStatus.NO_MOTION, reason, Place("path length", "", "", 0, 0.0), None)
     least = [robot.min_manipulability for robot in workcell.robots]
@@ -84,10 +84,10 @@ def path_failure(
     return None
 
 
-def untimed(model: TimingModel, motion: PathMotion) -> Timing | None:
+def path_error(model: TimingModel, motion: PathMotion) -> Timing | None:
     """The answer for a path that cannot be timed, None for others."""
     arms = motion.lost, motion.limit_margin, motion.manipulability
-    return path_failure(model.workcell, motion.pose, *arms)
+    return arm_path_error(model.workcell, motion.pose, *arms)
 
 
 class PathLimits:
@@ -136,7 +136,7 @@ class PathLimits:
     def ratios(self, a: Array, w: Array) -> Array:
         """Limits that are not convex, signed (n, k)."""
         m, workcell, limits = self.motion, self._model.workcell, self._limits
-        pressure = limits_pressure(workcell, limits)
+        pressure = has_pressure_limit(workcell, limits)
         force = None if workcell.has_force_slopes and not self._grasped else limits.force
         columns = [np.zeros((len(a), 0))]
         if not (limits.torque or pressure or force):
@@ -217,11 +217,12 @@ def limit_ratios(carry: Carry, workcell: Workcell, limits: TimingLimits) -> dict
         "payload angular velocity": angular / payload.angular_velocity_max,
         "payload angular acceleration": _norm(carry.angular_acceleration)
         / payload.angular_acceleration_max,
-        "friction": carry.tangential_force / np.maximum(carry.normal_force * friction, FORCE_FLOOR),
+        "friction": carry.tangential_force
+        / np.maximum(carry.normal_force * friction, LEAST_NORMAL_FORCE),
     }
     if limits.torque:
         ratios["joint torque"] = np.abs(carry.torque) / workcell.of_joints("torque_max")
-    if limits_pressure(workcell, limits):
+    if has_pressure_limit(workcell, limits):
         ratios["pressure shift"] = carry.pressure_shift / radius
     if limits.force is not None:
         ratios["normal force"] = _near_limit(carry, workcell, limits) / limits.force
@@ -241,28 +242,31 @@ def limited_force(carry: Carry, workcell: Workcell, limits: TimingLimits) -> Arr
 
 
 def _near_limit(carry: Carry, workcell: Workcell, limits: TimingLimits) -> Array:
-    """As `limited_force`; robust ones that are below `EXACT` of the limit, and below the largest of
-    the carry, may be told as the planned ones: to see that takes a fraction of the time."""
+    """Compute `limited_force`, exactly only where it matters.
+
+    Robust forces below `EXACT_FORCE_ABOVE` of the limit and below the carry's largest are replaced
+    by the planned ones, which takes a fraction of the time.
+    """
     if not limits.robust or limits.force is None or not workcell.has_one_squeeze:
         return limited_force(carry, workcell, limits)
     n = len(carry)
     points = PathPoints(carry.pose, carry.rate, carry.second_rate, np.zeros(n), np.ones(n))
     found = carry.normal_force.copy()
-    if _tell_above(EXACT * limits.force, points, workcell, found):
+    if _robust_forces_above(EXACT_FORCE_ABOVE * limits.force, points, workcell, found):
         return found
     # Nearly the largest one is among a few; only what exceeds that can be larger.
-    _tell_above(0.0, points, workcell, found, every=SPREAD)
-    _tell_above(float(found.max()), points, workcell, found)
+    _robust_forces_above(0.0, points, workcell, found, every=PEAK_SEARCH_STRIDE)
+    _robust_forces_above(float(found.max()), points, workcell, found)
     return found
 
 
-def _tell_above(
+def _robust_forces_above(
     level: float, points: PathPoints, workcell: Workcell, found: Array, every: int = 1
 ) -> bool:
     """Write the robust forces above a level [N], of every so manieth point, into forces (n, 2);
     whether there are any."""
     known, rows = False, np.arange(0, len(points), every)
-    for part in np.array_split(rows, -(-len(rows) // AT_A_TIME)):
+    for part in np.array_split(rows, -(-len(rows) // ROBUST_BATCH)):
         least = np.full(len(part), level)
         above, ruling = robust_path(workcell).ruling_beyond(points.at(part), least)
         found[part[above]] = np.maximum(found[part[above]], ruling.force)
@@ -270,7 +274,7 @@ def _tell_above(
     return known
 
 
-def limits_pressure(workcell: Workcell, limits: TimingLimits) -> bool:
+def has_pressure_limit(workcell: Workcell, limits: TimingLimits) -> bool:
     """Whether the pressure's shift is a limit.
 
     The joint allocation keeps it within the patches by pressing harder: there it is no limit, but
@@ -279,7 +283,7 @@ def limits_pressure(workcell: Workcell, limits: TimingLimits) -> bool:
     return limits.pressure and workcell.task.allocation == "paper"
 
 
-def judged(
+def check_limits(
     model: TimingModel,
     carry: Carry,
     limits: TimingLimits,
@@ -291,13 +295,13 @@ def judged(
         ratios: its `limit_ratios`, where they are known.
     """
     ratios = limit_ratios(carry, model.workcell, limits) if ratios is None else ratios
-    use = dict[str, Excess]()
+    use = dict[str, Utilisation]()
     for name, ratio in ratios.items():
         sample, column = np.unravel_index(int(np.argmax(ratio)), ratio.shape)
         where = int(column), int(sample), float(carry.parameter[sample])
         place = place_of(model.workcell, model.joint_names, name, *where)
-        use[name] = Excess(float(ratio[sample, column]), place)
-    place = worst(use).place
+        use[name] = Utilisation(float(ratio[sample, column]), place)
+    place = most_used(use).place
     reason = f"{carry.duration:.3f} s; most used: {place}"
     return Timing(TimingStatus.OK, reason, place, carry, use, limits=limits)
 
@@ -354,7 +358,7 @@ def largest_speed_factor(use: Callable[[float], float]) -> float:
     return low
 
 
-def worst(use: dict[str, Excess]) -> Excess:
+def most_used(use: dict[str, Utilisation]) -> Utilisation:
     """The limit with the largest use; friction, tight by construction, counts only when broken."""
     candidates = [
         excess
@@ -370,7 +374,7 @@ def _norm(vectors: Array) -> Array:
 
 
 @dataclass(frozen=True)
-class DrivenSpeeds:
+class SpeedProfile:
     """Path speeds with constant u'' on intervals, at `REFINEMENT` samples per interval, both ends
     of every interval included; to be driven along any path.
 
@@ -388,7 +392,7 @@ class DrivenSpeeds:
     w: Array
 
     @classmethod
-    def of(cls, grid_speed: Array) -> DrivenSpeeds:
+    def from_grid_speed(cls, grid_speed: Array) -> SpeedProfile:
         """grid_speed: (intervals + 1,) path speed u' at the grid points [1/s]."""
         squared, intervals = grid_speed**2, len(grid_speed) - 1
         share = np.linspace(0.0, 1.0, REFINEMENT + 1)
@@ -444,11 +448,13 @@ def drive_path(
             "stand still over an interval"
         )
     motion = model.path_motion(x) if motion is None else motion
-    failure = untimed(model, motion)
+    failure = path_error(model, motion)
     if failure is not None:
         return failure
-    timing = judged(model, DrivenSpeeds.of(grid_speed).carry(model, motion), limits)
-    timing, excess = replace(timing, grid_speed=grid_speed), worst(timing.use)
+    timing = check_limits(
+        model, SpeedProfile.from_grid_speed(grid_speed).carry(model, motion), limits
+    )
+    timing, excess = replace(timing, grid_speed=grid_speed), most_used(timing.use)
     if excess.ratio <= 1.0 + RECOMPUTED_TOLERANCE:
         return timing
     reason = f"uses {100.0 * excess.ratio:.1f} % of the limit: {excess.place}"

@@ -73,17 +73,17 @@ class PathMotion:
         sampled = {f.name: getattr(self, f.name)[samples] for f in fields(self) if f.name != "x"}
         return PathMotion(self.x, **sampled)
 
-    def between(self, u: Array) -> PathMotion:
+    def interpolate(self, u: Array) -> PathMotion:
         """The geometry at parameters u (n,) in [0, 1], by cubic splines through the samples."""
         spline, parts = self._spline
         values = np.split(spline(u), parts, axis=1)
         shaped = {
             name: value.reshape(len(u), *getattr(self, name).shape[1:])
-            for name, value in zip(SAMPLED, values, strict=True)
+            for name, value in zip(SAMPLED_FIELDS, values, strict=True)
         }
         return PathMotion(self.x, u, **shaped)
 
-    def third(self, u: Array) -> tuple[Array, Array]:
+    def third_derivatives(self, u: Array) -> tuple[Array, Array]:
         """Third derivatives by the parameter at u (n,): joints (n, joints), box position (n, 3)."""
         joints = self.q_second.shape[1]
         both = self._third(u)
@@ -93,7 +93,9 @@ class PathMotion:
     def _spline(self) -> tuple[CubicSpline, Array]:
         """One spline through all quantities side by side, and where each but the first begins."""
         u = self.parameter[::_SPLINE_EVERY]
-        columns = [getattr(self, name)[::_SPLINE_EVERY].reshape(len(u), -1) for name in SAMPLED]
+        columns = [
+            getattr(self, name)[::_SPLINE_EVERY].reshape(len(u), -1) for name in SAMPLED_FIELDS
+        ]
         parts = np.cumsum([column.shape[1] for column in columns])[:-1]
         return CubicSpline(u, np.concatenate(columns, axis=1)), parts
 
@@ -103,9 +105,12 @@ class PathMotion:
         return CubicSpline(self.parameter, both).derivative()
 
 
-SAMPLED = tuple(f.name for f in fields(PathMotion) if f.name not in ("x", "parameter"))
+SAMPLED_FIELDS = tuple(f.name for f in fields(PathMotion) if f.name not in ("x", "parameter"))
 
-_BOX, _ARMS = SAMPLED[: SAMPLED.index("q")], SAMPLED[SAMPLED.index("q") :]
+_BOX, _ARMS = (
+    SAMPLED_FIELDS[: SAMPLED_FIELDS.index("q")],
+    SAMPLED_FIELDS[SAMPLED_FIELDS.index("q") :],
+)
 
 
 class TimingModel:

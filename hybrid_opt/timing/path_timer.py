@@ -24,7 +24,7 @@ from codegen.cache import source_digest
 from codegen.function import NumericFunction, Signature
 from hybrid_opt.compiled_cell import CompiledCell
 from hybrid_opt.robust.path_force import BY_TIMING, PathPoints, RobustPath, robust_path
-from hybrid_opt.timing.limits import limited_force, path_failure, place_of
+from hybrid_opt.timing.limits import arm_path_error, limited_force, place_of
 from hybrid_opt.timing.model import TimingModel, joint_names, require_intervals
 from hybrid_opt.timing.records import Place, TimingLimits, TimingStatus
 from hybrid_opt.timing.solve import time_path
@@ -40,19 +40,19 @@ if TYPE_CHECKING:
 PATH_INTERVALS = 100
 """Pieces of constant path acceleration."""
 
-CUTS = 24
+CUTS_PER_SAMPLE = 24
 """Supporting lines that a sample has room for; the oldest make room for new ones."""
 
-ROUNDS = 20
+MAX_CUT_ITERATIONS = 20
 """Times that paths are driven anew with more lines."""
 
-TOLERANCE = 1e-4
+CUT_TOLERANCE = 1e-4
 """Excess over the limit that counts as none, as a share of it."""
 
-NEAR = 0.98
+CUT_ABOVE = 0.98
 """Forces above this share of the limit have a tangent in advance."""
 
-STILL = 1.0 - 1e-6
+REST_UTILISATION = 1.0 - 1e-6
 """Share of the limit that standing still may use, as in the passes."""
 
 
@@ -152,7 +152,7 @@ class PathTimer:
             "path limits", make, str(intervals), lanes=lanes, bodies=False
         )
         self._path, self._limits = functions["path"], functions["sample_limits"]
-        self._passes = passes_function(compiled, intervals)
+        self._passes = forward_backward_passes(compiled, intervals)
         # Made here: the cell's files may be gone when the first path is timed.
         knows_all = self._passes is not None and workcell.has_one_squeeze
         self._model = None if knows_all else TimingModel(compiled, intervals)
@@ -198,29 +198,28 @@ class PathTimer:
             raise SettingsError(
                 f"waypoints of shape {x.shape}; needs {len(limits)} rows of {n_var} finite numbers"
             )
-        return self.time_known(x, self.path_limits(x), limits)
+        return self.time_from_coefficients(x, self.path_limits(x), limits)
 
-    def failures(self, paths: dict[str, Array]) -> list[PathTiming | None]:
+    def path_errors(self, paths: dict[str, Array]) -> list[PathTiming | None]:
         """Why paths cannot be timed at all, by the answers of `path_limits`; None where they can
         be."""
         names = ("lost", "limit_margin", "manipulability")
         sides = [np.stack([paths[f"{name}_{arm}"] for arm in (1, 2)], axis=2) for name in names]
         found = [
-            path_failure(self.workcell, pose[:, :6], *each)
+            arm_path_error(self.workcell, pose[:, :6], *each)
             for pose, *each in zip(paths["pose"], *sides, strict=True)
         ]
-        return [None if why is None else self._failed(why.status, why.place) for why in found]
+        return [None if why is None else self._failure(why.status, why.place) for why in found]
 
-    def time_known(
+    def time_from_coefficients(
         self,
         x: Array,
         paths: dict[str, Array],
         limits: list[TimingLimits],
-        failures: Sequence[PathTiming | None] | None = None,
+        path_errors: Sequence[PathTiming | None] | None = None,
     ) -> list[PathTiming]:
-        """As `time_all`, with the answers of `path_limits` known already, and of `failures` where
-        they are given."""
-        found = list(self.failures(paths) if failures is None else failures)
+        """Time paths as `time_all` does, from known answers of `path_limits` and `path_errors`."""
+        found = list(self.path_errors(paths) if path_errors is None else path_errors)
         rows = [row for row, failure in enumerate(found) if failure is None]
         for robust in (False, True):
             some = [row for row in rows if limits[row].robust is robust]
@@ -231,20 +230,20 @@ class PathTimer:
                     found[row] = from_time_path(self._model, x[row], limits[row])
                 continue
             options = np.array([_options(limits[row]) for row in some])
-            drive = self._robustly_driven if robust else self._driven
+            drive = self._time_robust if robust else self._time_planned
             # All of them without a copy.
             chosen = paths if len(some) == len(x) else {k: v[some] for k, v in paths.items()}
             for row, timing in zip(some, drive(chosen, options), strict=True):
                 found[row] = timing
         return [timing for timing in found if timing is not None]
 
-    def _driven(self, paths: dict[str, Array], options: Array) -> list[PathTiming]:
+    def _time_planned(self, paths: dict[str, Array], options: Array) -> list[PathTiming]:
         assert self._passes is not None, "asked for where the passes are compiled"
         out = self._passes.batch(paths["limits"], options, threads=self._threads)
         return [self._timing(out, k) for k in range(len(options))]
 
-    def _robustly_driven(self, paths: dict[str, Array], options: Array) -> list[PathTiming]:
-        drive = RobustDrive(self._cut_passes, robust_path(self.workcell), paths, options)
+    def _time_robust(self, paths: dict[str, Array], options: Array) -> list[PathTiming]:
+        drive = RobustCuttingPlanes(self._cut_passes, robust_path(self.workcell), paths, options)
         out, still = drive.time(self._threads)
         found = [self._timing(out, k) for k in range(len(options))]
         for k, rest in enumerate(still):
@@ -254,7 +253,7 @@ class PathTimer:
                 arm, u = int(peak.argmax()), sample / (2 * self.intervals)
                 where = "normal force", arm, round(u * self.intervals), u
                 place = place_of(self.workcell, self._joint_names, *where)
-                failed = self._failed(TimingStatus.INFEASIBLE_AT_REST, place)
+                failed = self._failure(TimingStatus.INFEASIBLE_AT_REST, place)
                 found[k] = replace(failed, peak_force=peak)
             if rest is not None or found[k].ok:
                 use = found[k].use | {"normal force": float(peak.max()) / limit}
@@ -263,17 +262,17 @@ class PathTimer:
 
     @cached_property
     def _cut_passes(self) -> NumericFunction:
-        passes = passes_function(self._compiled, self.intervals, CUTS)
+        passes = forward_backward_passes(self._compiled, self.intervals, CUTS_PER_SAMPLE)
         assert passes is not None, "asked for where the passes are compiled"
         return passes
 
-    def _failed(self, status: TimingStatus, place: Place) -> PathTiming:
+    def _failure(self, status: TimingStatus, place: Place) -> PathTiming:
         return PathTiming(
             status, place, float("inf"), np.full(2, np.nan), {}, np.zeros(self.intervals + 1)
         )
 
     def _timing(self, out: dict[str, Array], k: int) -> PathTiming:
-        status = OUTCOMES[int(out["status"][k])]
+        status = PASS_STATUSES[int(out["status"][k])]
         use = out["use"][k]
         if status is TimingStatus.SOLVER_FAILED:
             interval = int(out["interval"][k])
@@ -281,14 +280,14 @@ class PathTimer:
         else:
             kind = int(np.argmax(use[:, 0]))
             column, parameter = int(use[kind, 2]), float(use[kind, 1])
-            where = KINDS[kind], column, round(parameter * self.intervals), parameter
+            where = LIMIT_NAMES[kind], column, round(parameter * self.intervals), parameter
             place = place_of(self.workcell, self._joint_names, *where)
         return PathTiming(
             status=status,
             place=place,
             duration=float(out["duration"][k]),
             peak_force=out["peak"][k],
-            use=dict(zip(KINDS, use[:, 0].tolist(), strict=True)),
+            use=dict(zip(LIMIT_NAMES, use[:, 0].tolist(), strict=True)),
             grid_speed=np.sqrt(out["squared"][k]),
             sweeps=int(out["sweeps"][k]),
             slowed=float(out["slowed"][k]),
@@ -323,7 +322,7 @@ def _options(limits: TimingLimits) -> list[float]:
     return [force, float(limits.torque), float(limits.pressure), float(limits.reference_speed)]
 
 
-class RobustDrive:
+class RobustCuttingPlanes:
     """The passes for n paths, with lines for their robust forces that become more as they run.
 
     Attributes:
@@ -340,7 +339,7 @@ class RobustDrive:
         """Without any line.
 
         Args:
-            passes: `passes_function` with `CUTS`.
+            passes: `forward_backward_passes` with `CUTS_PER_SAMPLE`.
             paths: their `PathTimer.path_limits`.
             options: (n, 4) of the passes, finite force limits first.
         """
@@ -350,7 +349,7 @@ class RobustDrive:
         names = ("pose", "pose_first", "pose_second")
         self._parts = [np.ascontiguousarray(paths[name][:, :, :6]) for name in names]
         # The lines of every sample, and how many it was given.
-        self._cuts = np.zeros((n, samples, CUTS, 3))
+        self._cuts = np.zeros((n, samples, CUTS_PER_SAMPLE, 3))
         self._cuts[..., 2] = np.inf
         self._count, self.peak = np.zeros((n, samples), dtype=np.intp), np.zeros((n, 2))
         # Both ends and the middle of every interval, each with its interval's u''.
@@ -364,7 +363,7 @@ class RobustDrive:
         still = self._at_rest()
         out = self._passes.batch(self._rows, self._options, self._cuts, threads=threads)
         left = np.array([k for k, rest in enumerate(still) if rest is None], dtype=np.intp)
-        for _ in range(ROUNDS):
+        for _ in range(MAX_CUT_ITERATIONS):
             left = left[np.isfinite(out["duration"][left])]
             left = left[self._cut(left, out["squared"][left])]
             if not len(left):
@@ -380,12 +379,12 @@ class RobustDrive:
         found: list[AtRest | None] = [None] * n
         path, sample = np.divmod(np.arange(n * samples), samples)
         points = self._points(path, sample, *np.zeros((2, n * samples)))
-        rows, ruling = self._forces.ruling_beyond(points, NEAR * self._limit[path])
+        rows, ruling = self._forces.ruling_beyond(points, CUT_ABOVE * self._limit[path])
         force, slope = ruling.force, self._forces.slopes(points.at(rows), ruling)
         for k in np.unique(path[rows]):
             own = path[rows] == k
             at = int(force[own].max(axis=1).argmax())
-            if force[own].max() > STILL * self._limit[k]:
+            if force[own].max() > REST_UTILISATION * self._limit[k]:
                 found[k] = force[own].max(axis=0), int(sample[rows][own][at])
         place = (path[rows], sample[rows])
         self._add(place, np.zeros((len(rows), 2)), force, slope[:, :, BY_TIMING])
@@ -403,10 +402,10 @@ class RobustDrive:
         a = (rise * self._intervals / 2.0).reshape(-1)
         path, sample = np.repeat(chosen, per), np.tile(self._sample, m)
         points, limit = self._points(path, sample, a, w), self._limit[path]
-        rows, ruling = self._forces.ruling_beyond(points, NEAR * limit)
+        rows, ruling = self._forces.ruling_beyond(points, CUT_ABOVE * limit)
         force = ruling.force
         exceeded = np.zeros(len(self._limit), dtype=bool)
-        exceeded[path[rows][force.max(axis=1) > (1.0 + TOLERANCE) * limit[rows]]] = True
+        exceeded[path[rows][force.max(axis=1) > (1.0 + CUT_TOLERANCE) * limit[rows]]] = True
         self.peak[chosen] = 0.0
         np.maximum.at(self.peak, path[rows], force)
         for k in chosen[self.peak[chosen].max(axis=1) == 0.0]:
@@ -434,7 +433,7 @@ class RobustDrive:
         lines = np.column_stack([gradient, bound])
         # Ends of neighbouring intervals share a sample: one after the other.
         for path, sample, line in zip(*place, lines, strict=True):
-            self._cuts[path, sample, self._count[path, sample] % CUTS] = line
+            self._cuts[path, sample, self._count[path, sample] % CUTS_PER_SAMPLE] = line
             self._count[path, sample] += 1
 
     def _points(
@@ -444,7 +443,7 @@ class RobustDrive:
         return PathPoints(pose, first, second, a, w)
 
 
-KINDS = (
+LIMIT_NAMES = (
     "joint velocity",
     "payload velocity",
     "payload angular velocity",
@@ -458,7 +457,7 @@ KINDS = (
 )
 """Limits as `c/passes.c` numbers them."""
 
-OUTCOMES = (
+PASS_STATUSES = (
     TimingStatus.OK,
     TimingStatus.INFEASIBLE_AT_REST,
     TimingStatus.SOLVER_FAILED,
@@ -468,24 +467,28 @@ OUTCOMES = (
 """Meanings of its statuses."""
 
 
-def passes_function(
+def forward_backward_passes(
     compiled: CompiledCell, intervals: int, cuts: int = 0
 ) -> NumericFunction | None:
-    """The timing of one path from its limits; None where these do not tell the contact wrenches.
+    """Load or build the timing of one path from its limits by a backward and a forward pass.
 
-    Inputs: samples (2 intervals + 1, `symbolic.limits.limit_layout`), both ends and the middle of
-    every interval; options (4,): largest normal force [N],
-    infinite for none, then whether torques, pressure shifts and the reference speeds are limited
-    (0 or 1); with cuts, cuts (2 intervals + 1, cuts, 3): at every sample lines
-    alpha u'' + beta u'^2 <= bound that hold as well, positive bounds, infinite ones from the last
-    line on. Outputs: status, index into `OUTCOMES`; interval of a failure; duration [s], infinite
-    without a timing; peak (2,) normal forces [N]; use (len(KINDS), 3): largest share of each limit,
-    path parameter and joint or contact there; squared (intervals + 1,) u'^2 at the grid points;
-    sweeps, how often both passes ran; slowed, the factor on the speed. Without a timing peak and
-    use are those of standing still.
+    Inputs: samples (2 intervals + 1, `symbolic.limits.limit_layout`) at both ends and the middle of
+    every interval; options (4,): largest normal force [N], infinite for none, then 0 or 1 each for
+    limits on torques, pressure shifts and the reference speeds; with cuts, cuts (2 intervals + 1,
+    cuts, 3): at every sample lines alpha u'' + beta u'^2 <= bound with positive bounds, infinite
+    after the last line.
+
+    Outputs: status, index into `PASS_STATUSES`; interval of a failure; duration [s], infinite
+    without a timing; peak (2,) normal forces [N]; use (len(LIMIT_NAMES), 3): largest share of each
+    limit, path parameter and joint or contact there; squared (intervals + 1,) u'^2 at the grid
+    points; sweeps, iterations of both passes; slowed, factor on the speed. Without a timing, peak
+    and use are those at rest.
 
     Args:
-        cuts: lines at every sample that the caller gives.
+        cuts: lines per sample that the caller adds.
+
+    Returns:
+        The function; None if limits do not determine the contact wrenches.
     """
     workcell, cache = compiled.workcell, compiled.cache
     if workcell.has_opposite_pads and not workcell.has_closed_form:
@@ -541,7 +544,7 @@ def _source(workcell: Workcell, intervals: int, cuts: int) -> tuple[Signature, s
             *(((2 * intervals + 1, cuts, 3),) if cuts else ()),
             *((int(symbols.numel()),) for symbols in held.values()),
         ),
-        ((), (), (), (2,), (len(KINDS), 3), (intervals + 1,), (), ()),
+        ((), (), (), (2,), (len(LIMIT_NAMES), 3), (intervals + 1,), (), ()),
     )
     return signature, handwritten_source(
         signature, text, helpers, {f"{f.name()}_in_pairs": f for f in pairs}

@@ -101,7 +101,7 @@ class JerkLimits:
             raise SettingsError("jerk limits: give positive ones [rad/s^3, m/s^3]")
 
     @classmethod
-    def of(cls, workcell: Workcell) -> JerkLimits | None:
+    def from_workcell(cls, workcell: Workcell) -> JerkLimits | None:
         """Limits that a workcell states, None where it states none."""
         joints = [
             np.full(len(robot.torque_max), np.inf) if robot.jerk_max is None else robot.jerk_max
@@ -113,7 +113,7 @@ class JerkLimits:
 
 
 @dataclass(frozen=True)
-class Excess:
+class Utilisation:
     """How far a limit is used: the largest value over its limit, and where."""
 
     ratio: Figure
@@ -142,7 +142,7 @@ class Timing(Displayable):
     reason: str
     place: Place
     carry: Carry | None
-    use: dict[str, Excess] = field(default_factory=dict)
+    use: dict[str, Utilisation] = field(default_factory=dict)
     grid_speed: Array = field(default_factory=lambda: np.zeros(0))
     iterations: int = 0
     slowed: float = 1.0

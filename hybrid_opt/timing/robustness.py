@@ -23,7 +23,7 @@ from scipy.sparse import csr_array
 
 from hybrid_opt.carry import Carry
 from hybrid_opt.static_hold import mass_at_reference
-from hybrid_opt.timing.limits import DrivenSpeeds, limit_ratios, limits_pressure
+from hybrid_opt.timing.limits import SpeedProfile, has_pressure_limit, limit_ratios
 from hybrid_opt.timing.model import REFINEMENT, TimingModel
 from hybrid_opt.timing.records import Timing, TimingLimits
 from symbolic.array import Array
@@ -38,7 +38,7 @@ KILOGRAM_FORCE = 9.80665
 SCAN_STEPS = 16
 """Steps of the scan that brackets where a carry fails."""
 
-BISECTIONS = 20
+MARGIN_BISECTIONS = 20
 LEAST_FRICTION_SHARE = 0.02
 """The scan of friction ends at this share of the nominal coefficient."""
 
@@ -109,7 +109,7 @@ def robustness_margins(model: TimingModel, carry: Carry) -> tuple[Margin, ...]:
     radius = np.array([contact.patch_radius for contact in contacts])
     centre, own_torque = np.array(payload.centre_of_mass), carry.side_by_side("own_torque")
     wrench_torque = model.wrench_torque(carry.q, carry.pose)
-    has_patches = limits_pressure(workcell, TimingLimits())
+    has_patches = has_pressure_limit(workcell, TimingLimits())
 
     def failure(friction: Array, centre: Array) -> str:
         """Name of the limit that is exceeded most, or '' where everything holds."""
@@ -127,7 +127,7 @@ def robustness_margins(model: TimingModel, carry: Carry) -> tuple[Margin, ...]:
     def lowered(whose: str, which: Array) -> Margin:
         """The coefficients marked by `which` (2,), lowered by the same share."""
         nominal = float(friction[which > 0.0].min())
-        lost, fails = _last_holding(
+        lost, fails = _largest_feasible_change(
             lambda lost: failure(friction * (1.0 - lost * which), centre),
             1.0 - LEAST_FRICTION_SHARE,
         )
@@ -136,7 +136,7 @@ def robustness_margins(model: TimingModel, carry: Carry) -> tuple[Margin, ...]:
     def shifted(axis: int, sign: float) -> Margin:
         """The centre of mass along one box axis, up to the box's faces."""
         nominal, direction = float(centre[axis]), sign * np.eye(3)[axis]
-        offset, fails = _last_holding(
+        offset, fails = _largest_feasible_change(
             lambda offset: failure(friction, centre + offset * direction),
             float(payload.size[axis]) / 2.0 - sign * nominal,
         )
@@ -181,7 +181,7 @@ def _even_margins(model: TimingModel, carry: Carry) -> list[Margin]:
     return found
 
 
-def _last_holding(failure: Callable[[float], str], end: float) -> tuple[float, str]:
+def _largest_feasible_change(failure: Callable[[float], str], end: float) -> tuple[float, str]:
     """Largest change in [0, end] up to which nothing fails, and what fails beyond it.
 
     A scan brackets the first failure, so that a carry that fails and recovers is not misjudged.
@@ -193,7 +193,7 @@ def _last_holding(failure: Callable[[float], str], end: float) -> tuple[float, s
         fails = failure(high)
         if not fails:
             continue
-        for _ in range(BISECTIONS):
+        for _ in range(MARGIN_BISECTIONS):
             middle = (low + high) / 2.0
             reason = failure(middle)
             low, high, fails = (low, middle, reason) if reason else (middle, high, fails)
@@ -201,23 +201,23 @@ def _last_holding(failure: Callable[[float], str], end: float) -> tuple[float, s
     return end, ""
 
 
-USED = 0.97
+LINEARISED_UTILISATION = 0.97
 """Share of a limit from which on a change of the timing could exceed it."""
 
-REACH = 0.02
+TRUST_RADIUS = 0.02
 """Share of every squared speed that a timing nearby may have more or less."""
 
-FASTEST = 5e-3
+OPTIMALITY_GAP = 5e-3
 """Share of the duration that a fastest timing may have left to gain."""
 
-CHANGE, NOTHING = 1e-4, 1e-10
+EXTRAPOLATED_CHANGE, NEGLIGIBLE_CHANGE = 1e-4, 1e-10
 """Share of a limit by which changes are extrapolated, and from which on they count as any."""
 
-STEP = 1e-6
+DIFFERENCE_STEP = 1e-6
 """Share of the largest value by which ratios are differenced."""
 
 
-class NearTimings:
+class TimingSensitivity:
     """Timings near the fastest one of a path, as a linear program.
 
     Attributes:
@@ -232,7 +232,7 @@ class NearTimings:
         """
         if timing.carry is None or not len(timing.grid_speed):
             raise SettingsError(f"there is no timing: {timing.reason}")
-        self.speeds = at = DrivenSpeeds.of(timing.grid_speed)
+        self.speeds = at = SpeedProfile.from_grid_speed(timing.grid_speed)
         motion, intervals = model.path_motion(timing.carry.x), model.intervals
 
         def ratios(**more: float) -> dict[str, Array]:
@@ -241,11 +241,13 @@ class NearTimings:
 
         here = ratios()
         del here["friction"]  # tight by construction
-        self._used = {name: np.nonzero(ratio >= USED) for name, ratio in here.items()}
-        used = self._at_used(here)
-        step_a, step_w = (STEP * float(np.abs(part).max()) for part in (at.a, at.w))
-        by_a = (self._at_used(ratios(a=step_a)) - used) / step_a
-        by_w = (self._at_used(ratios(w=step_w)) - used) / step_w
+        self._used = {
+            name: np.nonzero(ratio >= LINEARISED_UTILISATION) for name, ratio in here.items()
+        }
+        used = self._select_used(here)
+        step_a, step_w = (DIFFERENCE_STEP * float(np.abs(part).max()) for part in (at.a, at.w))
+        by_a = (self._select_used(ratios(a=step_a)) - used) / step_a
+        by_w = (self._select_used(ratios(w=step_w)) - used) / step_w
         sample = np.concatenate([rows for rows, _ in self._used.values()])
         # Within an interval w = s_0 + share (s_1 - s_0) and a = (s_1 - s_0) / (2 width).
         turn, share, interval = by_a * intervals / 2.0, at.share[sample], sample // (REFINEMENT + 1)
@@ -258,35 +260,35 @@ class NearTimings:
         scale = speed[1:-1] ** 2  # shares of these are around one
         self._slope, self._matrix = slope * scale, matrix * scale[None, :]
         self._left = np.maximum(1.0 - used, 0.0)
-        self._least = self._program(self._left)
-        if not self._least > -FASTEST * timing.duration:
+        self._least = self._least_change(self._left)
+        if not self._least > -OPTIMALITY_GAP * timing.duration:
             raise SettingsError("the timing is not the fastest within its limits; time it again")
 
     def changes(self, low: dict[str, Array], high: dict[str, Array]) -> tuple[float, float]:
         """What the duration changes by towards the higher, and towards the lower of two cells as
         far to either side, whose ratios at `speeds` are known [s]; NaN where no timing is near."""
-        more = (self._at_used(high) - self._at_used(low)) / 2.0
+        more = (self._select_used(high) - self._select_used(low)) / 2.0
         largest = float(np.abs(more).max(initial=0.0))
-        if largest < NOTHING:
+        if largest < NEGLIGIBLE_CHANGE:
             return 0.0, 0.0
         # Large enough for the program's tolerance.
-        times = CHANGE / largest
+        times = EXTRAPOLATED_CHANGE / largest
         rise, fall = (
-            (self._program(self._left - sign * times * more) - self._least) / times
+            (self._least_change(self._left - sign * times * more) - self._least) / times
             for sign in (1.0, -1.0)
         )
         return rise, fall
 
-    def _at_used(self, ratios: dict[str, Array]) -> Array:
+    def _select_used(self, ratios: dict[str, Array]) -> Array:
         return np.concatenate([ratios[name][places] for name, places in self._used.items()])
 
-    def _program(self, left: Array) -> float:
+    def _least_change(self, left: Array) -> float:
         """The least change of the duration [s] with what is `left` (m,) of the limits."""
         found = linprog(
             self._slope,
             A_ub=self._matrix,
             b_ub=left,
-            bounds=(-REACH, REACH),
+            bounds=(-TRUST_RADIUS, TRUST_RADIUS),
             method="highs",
             options={"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10},
         )

@@ -22,27 +22,27 @@ import numpy as np
 
 from hybrid_opt.carry import Carry
 from hybrid_opt.timing.limits import (
-    NEAR,
+    LINEARISED_ABOVE,
     RECOMPUTED_TOLERANCE,
-    DrivenSpeeds,
     PathLimits,
+    SpeedProfile,
+    check_limits,
     duration_at_speed_limits,
-    judged,
     largest_speed_factor,
     limit_ratios,
+    most_used,
+    path_error,
     squared_speed_limit,
-    untimed,
-    worst,
 )
 from hybrid_opt.timing.model import REFINEMENT, PathMotion, TimingModel
 from hybrid_opt.timing.records import Place, Timing, TimingLimits, TimingStatus
 from symbolic.array import Array
 
 MAX_ITERATIONS = 25
-SETTLED = 2e-4
+SETTLED_CHANGE = 2e-4
 """Relative change of duration below which linearised limits count as settled."""
 
-LEAST_SPEED = 0.98
+LEAST_SPEED_FACTOR = 0.98
 """A timing that needs more slowing than this to hold its limits has not converged."""
 
 INTERVAL_ENDS = (0.0, 1.0)
@@ -56,7 +56,7 @@ FORCE_SHARPNESS = 0.02
 
 
 @dataclass(frozen=True)
-class Rows:
+class LinearLimits:
     """Limits alpha u'' + beta u'^2 <= bound, each (n, k): at points of the path, or by interval, of
     its constant u'' and the u'^2 at its beginning."""
 
@@ -83,8 +83,8 @@ def time_path(
     """
     begin, limits = time.perf_counter(), limits or TimingLimits()
     motion = model.path_motion(x) if motion is None else motion
-    timing = untimed(model, motion) or _failure_at_rest(model, motion, limits)
-    timing = timing or _Problem(model, motion, limits).solve()
+    timing = path_error(model, motion) or _failure_at_rest(model, motion, limits)
+    timing = timing or _CuttingPlaneProblem(model, motion, limits).solve()
     seconds = time.perf_counter() - begin
     return replace(timing, seconds=seconds, limits=limits)
 
@@ -95,15 +95,15 @@ def _failure_at_rest(model: TimingModel, motion: PathMotion, limits: TimingLimit
     Where none is exceeded a timing exists: slow enough, every quantity is as close to its value at
     rest as wanted.
     """
-    timing = judged(model, model.still(motion), limits)
-    excess = worst(timing.use)
+    timing = check_limits(model, model.still(motion), limits)
+    excess = most_used(timing.use)
     if excess.ratio < 1.0 - 1e-6:
         return None
     used = f"standing still already uses {100.0 * excess.ratio:.1f} % of the limit: {excess.place}"
     return replace(timing, status=TimingStatus.INFEASIBLE_AT_REST, reason=used, carry=None)
 
 
-class _Problem:
+class _CuttingPlaneProblem:
     """One path with one set of limits: linear problems from one timing to the next.
 
     `_tightened` (intervals,) divides an interval's bounds, above one where a limit is exceeded
@@ -123,18 +123,18 @@ class _Problem:
         still = np.zeros(len(index))
         self._rest = self._at.ratios(still, still)
         self._cuts = list(self._first_rows())
-        self._linearised: list[Rows] = []
+        self._linearised: list[LinearLimits] = []
         self._tightened = np.ones(intervals)
         self._near = np.zeros(self._rest.shape[1], dtype=bool)
         self._duration = np.inf
 
-    def _first_rows(self) -> Iterator[Rows]:
+    def _first_rows(self) -> Iterator[LinearLimits]:
         """The limits that are linear by themselves, on speeds, which bound u'^2 alone, and on joint
         accelerations; supporting lines of the convex ones before any timing is known."""
         limit = squared_speed_limit(self._at.motion, self._model.workcell, self._limits)
         limit = np.minimum(limit, SPEED_CEILING / self._scale**2)[:, None]
         one, alpha, beta = np.ones_like(limit), *self._at.joint_accelerations()
-        yield Rows(
+        yield LinearLimits(
             np.concatenate([0.0 * one, alpha, -alpha], axis=1),
             np.concatenate([1.0 / limit, beta, -beta], axis=1),
             np.repeat(one, 1 + 2 * alpha.shape[1], axis=1),
@@ -163,7 +163,7 @@ class _Problem:
                 break
         return self._finish(squared, iteration, settled)
 
-    def _interval_rows(self, rows: list[Rows]) -> Rows:
+    def _interval_rows(self, rows: list[LinearLimits]) -> LinearLimits:
         """The rows of each interval's points in terms of its u'' and its initial u'^2."""
         alpha, beta, bound = (
             np.concatenate([getattr(row, name) for row in rows], axis=1)
@@ -174,7 +174,7 @@ class _Problem:
         progress = np.tile(np.array(INTERVAL_ENDS) * 2.0 * scale / intervals, intervals)[:, None]
         alpha, beta = alpha / scale, beta / scale**2
         shape = (intervals, len(INTERVAL_ENDS) * alpha.shape[1])
-        return Rows(
+        return LinearLimits(
             (alpha + progress * beta).reshape(shape),
             beta.reshape(shape),
             bound.reshape(shape) / self._tightened[:, None],
@@ -198,7 +198,7 @@ class _Problem:
         self._duration = duration
         if ratios.size:
             excess = max(excess, float(np.abs(ratios).max()) - 1.0)
-            self._near |= (np.abs(ratios) > NEAR).any(axis=0)
+            self._near |= (np.abs(ratios) > LINEARISED_ABOVE).any(axis=0)
         if not self._near.any():
             return excess <= POINT_TOLERANCE
         near, z = self._near, _pairs(a, w)
@@ -207,7 +207,7 @@ class _Problem:
         self._linearised = [
             linearised_rows(sign * value, sign * gradient, sign * rest, z) for sign in (1.0, -1.0)
         ]
-        return excess <= POINT_TOLERANCE and change <= SETTLED
+        return excess <= POINT_TOLERANCE and change <= SETTLED_CHANGE
 
     def _cut(self, a: Array, w: Array) -> float:
         """Add supporting lines of the convex limits that a timing exceeds; the largest excess."""
@@ -244,11 +244,11 @@ class _Problem:
 
         @cache
         def driven(factor: float) -> Timing:
-            return judged(self._model, self._refined(factor**2 * squared), self._limits)
+            return check_limits(self._model, self._refined(factor**2 * squared), self._limits)
 
-        factor = largest_speed_factor(lambda slower: worst(driven(slower).use).ratio)
+        factor = largest_speed_factor(lambda slower: most_used(driven(slower).use).ratio)
         timing = driven(factor)
-        if factor < LEAST_SPEED or not settled:
+        if factor < LEAST_SPEED_FACTOR or not settled:
             reason = (
                 f"the limits hold, but only after slowing to {factor:.3f} of the speed found in "
                 f"{iterations} iterations; the timing is not the fastest"
@@ -258,7 +258,7 @@ class _Problem:
         return replace(timing, grid_speed=speed, iterations=iterations, slowed=factor)
 
     def _refined(self, squared: Array) -> Carry:
-        speeds = DrivenSpeeds.of(np.sqrt(squared) / self._scale)
+        speeds = SpeedProfile.from_grid_speed(np.sqrt(squared) / self._scale)
         return speeds.carry(self._model, self._motion)
 
     def _solver_failure(self, failure: SolverFailure, iterations: int) -> Timing:
@@ -279,15 +279,15 @@ class _Problem:
         )
 
 
-def norm_rows(first: Array, second: Array, limit: float, directions: Array) -> Rows:
+def norm_rows(first: Array, second: Array, limit: float, directions: Array) -> LinearLimits:
     """Supporting lines of |first u'' + second u'^2| <= limit, by (n, 3) each: along every unit
     vector of `directions` (n, k, 3) one."""
     alpha = np.einsum("nkd,nd->nk", directions, first) / limit
     beta = np.einsum("nkd,nd->nk", directions, second) / limit
-    return Rows(alpha, beta, np.ones_like(alpha))
+    return LinearLimits(alpha, beta, np.ones_like(alpha))
 
 
-def tangent_rows(value: Array, gradient: Array, z: Array) -> Rows:
+def tangent_rows(value: Array, gradient: Array, z: Array) -> LinearLimits:
     """Supporting lines of convex values <= 1, touching them at z.
 
     Args:
@@ -296,10 +296,10 @@ def tangent_rows(value: Array, gradient: Array, z: Array) -> Rows:
         z: (n, 2).
     """
     bound = 1.0 - value + np.einsum("nkd,nd->nk", gradient, z)
-    return Rows(gradient[..., 0], gradient[..., 1], bound)
+    return LinearLimits(gradient[..., 0], gradient[..., 1], bound)
 
 
-def linearised_rows(value: Array, gradient: Array, at_rest: Array, z: Array) -> Rows:
+def linearised_rows(value: Array, gradient: Array, at_rest: Array, z: Array) -> LinearLimits:
     """Linearisation of value <= 1 about z, kept satisfiable at rest.
 
     Where it would forbid rest, which is truly allowed, it follows the value by u'' and the chord to
@@ -316,7 +316,7 @@ def linearised_rows(value: Array, gradient: Array, at_rest: Array, z: Array) -> 
     a, w = z[:, :1], z[:, 1:]
     chord = (value - at_rest - lines.alpha * a) / np.maximum(w, 1e-300)
     forbids = (lines.bound < least) & (w > 0.0)
-    return Rows(
+    return LinearLimits(
         lines.alpha,
         np.where(forbids, chord, lines.beta),
         np.where(forbids, 1.0 - at_rest, np.maximum(lines.bound, least)),
@@ -350,7 +350,7 @@ class SolverFailure:
     interval: int
 
 
-def fastest_speed(rows: Rows, grid: Array) -> Array | SolverFailure:
+def fastest_speed(rows: LinearLimits, grid: Array) -> Array | SolverFailure:
     """The fastest motion from rest to rest within linear limits.
 
     Args:
@@ -362,14 +362,14 @@ def fastest_speed(rows: Rows, grid: Array) -> Array | SolverFailure:
     """
     found: Array | SolverFailure = SolverFailure("not tried", 0)
     for factor in RESCALINGS:
-        scaled = Rows(rows.alpha / factor, rows.beta / factor**2, rows.bound)
+        scaled = LinearLimits(rows.alpha / factor, rows.beta / factor**2, rows.bound)
         found = _solve(scaled, factor * grid)
         if not isinstance(found, SolverFailure):
             return found / factor**2
     return found
 
 
-def _solve(rows: Rows, grid: Array) -> Array | SolverFailure:
+def _solve(rows: LinearLimits, grid: Array) -> Array | SolverFailure:
     # Imported late: toppra pulls in plotting.
     from toppra.algorithm import TOPPRA
     from toppra.constraint import LinearConstraint

@@ -22,7 +22,7 @@ from hybrid_opt.cell import Cell
 from hybrid_opt.errors import WitnessError
 from hybrid_opt.job.smooth import driven_timing, without_jumps
 from hybrid_opt.robust.squeeze import Squeeze, SqueezeSettings, commanded_forces
-from hybrid_opt.timing.jerk import kept_jerk
+from hybrid_opt.timing.jerk import applicable_jerk_limits
 from hybrid_opt.timing.records import Timing
 from hybrid_opt.witness.box import refuse_motion_at_ends
 from hybrid_opt.witness.scene import ArmSettings
@@ -374,7 +374,7 @@ def exported_carry(cell: Cell, timing: Timing) -> Carry:
     """
     if not timing.ok or timing.carry is None:
         raise WitnessError(f"the trajectory cannot be driven: {timing.reason}")
-    jerk = kept_jerk(cell.workcell, timing.limits)
+    jerk = applicable_jerk_limits(cell.workcell, timing.limits)
     found = without_jumps(cell.timing_model, timing, jerk).carry
     assert found is not None, "a timing without jumps has a carry"
     return found

@@ -35,11 +35,11 @@ from hybrid_opt.evaluate.objectives import (
     force_kind,
 )
 from hybrid_opt.polishing.drive import UNPOLISHABLE, is_polishable
-from hybrid_opt.polishing.polisher import knows_forces
+from hybrid_opt.polishing.polisher import has_polishable_forces
 from hybrid_opt.polishing.settings import (
     PolishSettings,
+    default_settings,
     quick_settings,
-    usual_settings,
 )
 from hybrid_opt.progress import Progress
 from hybrid_opt.recommending.choice import Wish
@@ -157,7 +157,7 @@ def run_study(
     require_hold(workcell)  # before any work
     cell, competition = decided_cell(workcell, settings, execution)
     alone = is_drivable(cell, settings.objectives)
-    if not alone and not knows_forces(cell, settings.objectives):
+    if not alone and not has_polishable_forces(cell, settings.objectives):
         progress.note("the polish of robust forces knows two round pads that face one another: off")
         study = replace(study, polish=None)
     polish = study.polish if alone else study.drivable_polish
@@ -306,7 +306,7 @@ def polish_settings(
     """
     if not (usual if options.polish is None else options.polish):
         return None
-    chosen = (quick_settings if options.quick else usual_settings)(time_law)
+    chosen = (quick_settings if options.quick else default_settings)(time_law)
     asked = options.polish_attempts
     attempts = chosen.attempts if asked is None else asked
     return replace(chosen, attempts=attempts, solver=options.polish_solver)

@@ -40,7 +40,7 @@ from hybrid_opt.robust.force import (
 from hybrid_opt.robust.squeeze import SqueezeSettings
 from hybrid_opt.store.files import read_bytes, to_json
 from hybrid_opt.store.trajectory_file import Replay, StoredTrajectory, read_trajectory, replay
-from hybrid_opt.timing.analysis import timed_trajectory, timing_document
+from hybrid_opt.timing.analysis import time_trajectory, timing_document
 from hybrid_opt.timing.model import TimingModel
 from hybrid_opt.timing.records import Timing, TimingLimits
 from hybrid_opt.timing.solve import time_path
@@ -90,7 +90,7 @@ def _replayed(
     asked = (options.force_limit, options.force_curve)
     if options.timing or any(option is not None for option in asked):
         Progress().note("timing it, which takes some seconds")
-        timing = timing_document(timed_trajectory(replayed.cell.timing_model, stored.x, *asked))
+        timing = timing_document(time_trajectory(replayed.cell.timing_model, stored.x, *asked))
         found = [timings([("", timing)], [robot.name for robot in workcell.robots])]
         found += [margins([("", timing)])] if timing.margins else []
         found += [force_curve(timing.force_curve)] if timing.force_curve is not None else []

@@ -94,7 +94,7 @@ def drawn(
         job = model.plan(timing, within_jerk=within_jerk)
     except DualArmError as error:
         return DrawnJob(label, str(error), timing=timing)
-    bounded = within_jerk or JerkLimits.of(job.workcell) is None
+    bounded = within_jerk or JerkLimits.from_workcell(job.workcell) is None
     remark = str(job.squeeze) + ("" if bounded else WITHOUT_JERK)
     return DrawnJob(label, "", job, remark, timing)
 

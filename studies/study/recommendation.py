@@ -45,7 +45,7 @@ from hybrid_opt.robust.force import RobustPrice, pressing_model, robust_price
 from hybrid_opt.robust.squeeze import Part, account
 from hybrid_opt.store.files import read_record, to_json, write_json
 from hybrid_opt.store.trajectory_file import write_trajectory
-from hybrid_opt.timing.jerk import kept_jerk
+from hybrid_opt.timing.jerk import applicable_jerk_limits
 from hybrid_opt.timing.robustness import Margin
 from hybrid_opt.work.service import (
     LocalExecutor,
@@ -249,7 +249,7 @@ def recommend_from(
             price = robust_price(pressing_model(driven), found.carry, rng, LEADER, threads=threads)
         advance(1)
         without_jerk = math.nan
-        if kept_jerk(cell.workcell, found.timing.limits) is not None:
+        if applicable_jerk_limits(cell.workcell, found.timing.limits) is not None:
             without_jerk = ho.time_path(cell, found.x, found.timing.limits).duration
     source = sources[found.member]
     provenance = {

@@ -24,7 +24,7 @@ from hybrid_opt.store.trajectory_file import StoredTrajectory, read_trajectory
 from hybrid_opt.timing.analysis import (
     TimingDocument,
     read_timing,
-    timed_trajectory,
+    time_trajectory,
     timing_document,
 )
 from hybrid_opt.timing.records import TimingStatus
@@ -275,7 +275,7 @@ def timing_stage(
 
 def _document(cells: tuple[ReadyCell, ...], request: Request, emit: Emit) -> TimingDocument:
     own, driven = cells[0].jobs.timing, cells[-1].jobs.timing
-    return timing_document(timed_trajectory(driven, *request, own=own))
+    return timing_document(time_trajectory(driven, *request, own=own))
 
 
 def limits_on_jerk(root: Path, recommended: StoredRecommendation | None) -> Table | None:

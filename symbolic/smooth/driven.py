@@ -26,12 +26,12 @@ from symbolic.limits import (
     sample_limits_function,
 )
 from symbolic.records import Workcell
-from symbolic.smooth.samples import branch_coefficients
+from symbolic.smooth.samples import force_branches
 
 DRIVEN_FIRST, DRIVEN_SECOND = "driven_first", "driven_second"
 """Names of the functions."""
 
-TANGENT_FLOOR = 1e-9
+TANGENTIAL_SMOOTHING = 1e-9
 """Keeps the tangential force's magnitude smooth at zero [N]."""
 
 
@@ -77,7 +77,7 @@ def driven_layout(workcell: Workcell) -> DrivenLayout:
 def planned_branches(workcell: Workcell) -> Array:
     """(2, branches, quantities) both planned normal forces' branches as sums of a point's
     quantities; none where a program finds them."""
-    layout, own = driven_layout(workcell), branch_coefficients(workcell)
+    layout, own = driven_layout(workcell), force_branches(workcell)
     if layout.by_program:
         return np.zeros((2, 0, layout.size))
     forces = np.zeros((2, own.shape[1], layout.size))
@@ -139,7 +139,7 @@ def _value(model: CellModel, inputs: list[ca.SX], detached: Detached) -> ca.SX:
         found, forces = contact_limits(workcell, block, (a, w), detached)
         ratios = [found]
     if workcell.task.allocation == "paper":
-        tangential = ca.sqrt(force[0] ** 2 + force[1] ** 2 + TANGENT_FLOOR**2)
+        tangential = ca.sqrt(force[0] ** 2 + force[1] ** 2 + TANGENTIAL_SMOOTHING**2)
         forces = ca.vertcat(force[2], tangential)
     return ca.vertcat(
         block["speed"][:joints] ** 2 * w,

@@ -24,15 +24,15 @@ import numpy as np
 from symbolic.array import Array
 from symbolic.expression import named_function, sx_given
 from symbolic.geometry.clearance import BOX_NUMBERS
-from symbolic.smooth.places import PlaceConstraint, PlaceSymbols
+from symbolic.smooth.places import PathConstraint, PathPointSymbols
 
 GAPS = "gaps"
 """Name of `gap_function`."""
 
-PARALLEL = 0.1
+PARALLEL_SINE = 0.1
 """Sine of the angle between two edges below which no direction across both is looked at."""
 
-APART = -1e3
+PARALLEL_GAP = -1e3
 """Gap along such a direction: it never is the largest [m]."""
 
 
@@ -58,7 +58,7 @@ def _directions() -> Array:
 
 _SHARES = _directions()
 
-DIRECTIONS = len(_SHARES)
+SEPARATING_DIRECTIONS = len(_SHARES)
 """Both ways along three axes of the obstacle and three of the payload, and across each edge of one
 and each of the other: of two boxes that are apart, one of these separates them."""
 
@@ -71,7 +71,7 @@ def direction_numbers(obstacle: Array, k: int) -> Array:
     return np.concatenate([turned[0], along_payload, turned[1], other])
 
 
-def direction(place: PlaceSymbols, numbers: ca.SX) -> ca.SX:
+def direction(place: PathPointSymbols, numbers: ca.SX) -> ca.SX:
     """(3,) not normalised: the sum of a fixed vector, one of the payload, and the product of a
     fixed edge and one of the payload. All but one are zero.
 
@@ -83,14 +83,14 @@ def direction(place: PlaceSymbols, numbers: ca.SX) -> ca.SX:
     return fixed + turned[:, 0] + ca.cross(edge, turned[:, 1])
 
 
-def gap(place: PlaceSymbols, obstacle: ca.SX, numbers: ca.SX) -> ca.SX:
+def gap(place: PathPointSymbols, obstacle: ca.SX, numbers: ca.SX) -> ca.SX:
     """The gap along a direction, its kinks rounded [m]."""
     n = direction(place, numbers)
     return place.scene.separation(obstacle, n / ca.norm_2(n))
 
 
 @dataclass(frozen=True, order=True)
-class Separation(PlaceConstraint):
+class SeparatingAxisGap(PathConstraint):
     """Gap of a separable pair along one direction [m]."""
 
     pair: int
@@ -103,22 +103,22 @@ class Separation(PlaceConstraint):
         """All pairs and directions."""
         return "separation"
 
-    def expression(self, place: PlaceSymbols, numbers: ca.SX) -> ca.SX:
+    def expression(self, place: PathPointSymbols, numbers: ca.SX) -> ca.SX:
         """The gap."""
         return gap(place, numbers[:BOX_NUMBERS], numbers[BOX_NUMBERS:])
 
-    def count(self, place: PlaceSymbols) -> int:
+    def count(self, place: PathPointSymbols) -> int:
         """Numbers of the obstacle and of the direction."""
         return BOX_NUMBERS + DIRECTION_NUMBERS
 
-    def numbers(self, place: PlaceSymbols) -> Array:
+    def numbers(self, place: PathPointSymbols) -> Array:
         """The obstacle, and the direction."""
         obstacle = place.obstacle(self.pair)
         return np.concatenate([obstacle, direction_numbers(obstacle, self.direction)])
 
 
 @dataclass(frozen=True, order=True)
-class Passing(PlaceConstraint):
+class AxisSwitchGap(PathConstraint):
     """Height of the kink from one direction of a separable pair to another [m]."""
 
     pair: int
@@ -133,7 +133,7 @@ class Passing(PlaceConstraint):
         """All pairs and directions."""
         return "passing"
 
-    def expression(self, place: PlaceSymbols, numbers: ca.SX) -> ca.SX:
+    def expression(self, place: PathPointSymbols, numbers: ca.SX) -> ca.SX:
         """Where the lines of both gaps meet."""
         obstacle, both = (
             numbers[:BOX_NUMBERS],
@@ -143,18 +143,18 @@ class Passing(PlaceConstraint):
         falls, rises = (ca.jtimes(one, place.pose, place.rate) for one in (before, after))
         return (rises * before - falls * after) / (rises - falls)
 
-    def count(self, place: PlaceSymbols) -> int:
+    def count(self, place: PathPointSymbols) -> int:
         """Numbers of the obstacle and of both directions."""
         return BOX_NUMBERS + 2 * DIRECTION_NUMBERS
 
-    def numbers(self, place: PlaceSymbols) -> Array:
+    def numbers(self, place: PathPointSymbols) -> Array:
         """The obstacle, and both directions."""
         obstacle = place.obstacle(self.pair)
         both = [direction_numbers(obstacle, k) for k in (self.before, self.after)]
         return np.concatenate([obstacle, *both])
 
 
-def gap_function(place: PlaceSymbols) -> ca.Function:
+def gap_function(place: PathPointSymbols) -> ca.Function:
     """pose (6,), obstacle (BOX_NUMBERS,) -> gaps (DIRECTIONS,) along single directions, with their
     kinks [m]. The largest is positive where the payload, a box, and the obstacle are apart, and
     never more than their distance then; but for edges that are nearly parallel."""
@@ -166,8 +166,8 @@ def gap_function(place: PlaceSymbols) -> ca.Function:
         turned = ca.vertcat(ca.mtimes(rotation, fixed), own, ca.mtimes(rotation, edge), other)
         n = direction(place, turned)
         squared = ca.sumsqr(n)
-        unit = n / ca.sqrt(ca.fmax(squared, PARALLEL**2))
+        unit = n / ca.sqrt(ca.fmax(squared, PARALLEL_SINE**2))
         along = place.sharp_scene.separation(obstacle, unit)
-        found.append(ca.if_else(squared < PARALLEL**2, APART, along))
+        found.append(ca.if_else(squared < PARALLEL_SINE**2, PARALLEL_GAP, along))
     inputs = {"pose": place.pose, "obstacle": obstacle} | sx_given(place.model.screen)
     return named_function(GAPS, inputs, {"gaps": ca.densify(ca.vertcat(*found))})

@@ -47,16 +47,16 @@ Side = Literal["lower", "upper"]
 SOLVE_STEPS = 5
 """Newton steps from the reference joints, which the solver renews in every round."""
 
-WIDTH = 2e-4
+KINK_WIDTH = 2e-4
 """Width of the smoothed kinks of clearances [m]; what the smooth bounds fall short is made up for
 by measured distances (`hybrid_opt.polishing.constraints`)."""
 
-TURN = 3e-3
+PARALLEL_WIDTH = 3e-3
 """Width of the kinks where a face of a box becomes parallel to another [1]: the best carries lie
 in these kinks, and a solver that sees them sharp creeps along."""
 
 
-class PlaceSymbols:
+class PathPointSymbols:
     """The symbols of one place and what is built from them once.
 
     Attributes:
@@ -80,7 +80,7 @@ class PlaceSymbols:
     @cached_property
     def scene(self) -> Scene:
         """The bodies, with the kinks of their distances rounded."""
-        return self._scene(Softness(WIDTH, TURN))
+        return self._scene(Softness(KINK_WIDTH, PARALLEL_WIDTH))
 
     @cached_property
     def sharp_scene(self) -> Scene:
@@ -104,7 +104,7 @@ class PlaceSymbols:
 
 
 @dataclass(frozen=True)
-class PlaceConstraint(ABC):
+class PathConstraint(ABC):
     """One kind of row at a place.
 
     Constraints of one family share their functions and differ by the numbers handed to them.
@@ -124,14 +124,14 @@ class PlaceConstraint(ABC):
         """Name of those that share their functions."""
 
     @abstractmethod
-    def expression(self, place: PlaceSymbols, numbers: ca.SX) -> ca.SX:
+    def expression(self, place: PathPointSymbols, numbers: ca.SX) -> ca.SX:
         """The value, by the numbers (n,) of a member of the family."""
 
-    def count(self, place: PlaceSymbols) -> int:
+    def count(self, place: PathPointSymbols) -> int:
         """How many numbers the family's functions take."""
         return 0
 
-    def numbers(self, place: PlaceSymbols) -> Array:
+    def numbers(self, place: PathPointSymbols) -> Array:
         """(count,) numbers that distinguish this one from others of its family."""
         return np.zeros(0)
 
@@ -145,7 +145,7 @@ class PlaceConstraint(ABC):
 
 
 @dataclass(frozen=True, order=True)
-class Clearance(PlaceConstraint):
+class Clearance(PathConstraint):
     """Smooth lower bound of the distance of an active pair [m]. column: among the possible ones,
     which is the same with other numbers."""
 
@@ -159,7 +159,7 @@ class Clearance(PlaceConstraint):
         """Every pair is its own."""
         return f"clearance_{self.column}"
 
-    def expression(self, place: PlaceSymbols, numbers: ca.SX) -> ca.SX:
+    def expression(self, place: PathPointSymbols, numbers: ca.SX) -> ca.SX:
         """The bound of `symbolic.geometry.clearance`, its kinks rounded."""
         return place.scene.bound(self.column)
 
@@ -172,7 +172,7 @@ class Clearance(PlaceConstraint):
 
 
 @dataclass(frozen=True, order=True)
-class JointLimit(PlaceConstraint):
+class JointLimit(PathConstraint):
     """Distance of a joint to its lower or upper limit [rad]."""
 
     arm: int
@@ -186,15 +186,15 @@ class JointLimit(PlaceConstraint):
         """All limits of one arm."""
         return f"joint_limit_{self.arm + 1}"
 
-    def expression(self, place: PlaceSymbols, numbers: ca.SX) -> ca.SX:
+    def expression(self, place: PathPointSymbols, numbers: ca.SX) -> ca.SX:
         """The margin, negative beyond the limit."""
         return numbers[0] + ca.dot(numbers[1:], place.q[self.arm])
 
-    def count(self, place: PlaceSymbols) -> int:
+    def count(self, place: PathPointSymbols) -> int:
         """A margin and a slope per joint."""
         return 1 + int(place.q[self.arm].numel())
 
-    def numbers(self, place: PlaceSymbols) -> Array:
+    def numbers(self, place: PathPointSymbols) -> Array:
         """The margin at zero joints, and its gradient."""
         robot = place.model.workcell.robots[self.arm]
         slope = np.zeros(robot.position_lower.shape[0])
@@ -212,7 +212,7 @@ class JointLimit(PlaceConstraint):
 
 
 @dataclass(frozen=True, order=True)
-class Reach(PlaceConstraint):
+class ManipulabilityLimit(PathConstraint):
     """(|det J| / least)^2 - 1 of an arm.
 
     The square matters: at the edge of the reach the determinant falls like a root of the
@@ -228,7 +228,7 @@ class Reach(PlaceConstraint):
         """Every arm is its own."""
         return f"reach_{self.arm + 1}"
 
-    def expression(self, place: PlaceSymbols, numbers: ca.SX) -> ca.SX:
+    def expression(self, place: PathPointSymbols, numbers: ca.SX) -> ca.SX:
         """Zero at the least manipulability that the workcell allows."""
         least = place.model.workcell.robots[self.arm].min_manipulability
         model = place.model.robots[self.arm]
@@ -254,7 +254,7 @@ def closure_name(arm: int, order: Order) -> str:
     return f"closure_{arm + 1}_{order}"
 
 
-def row_function(place: PlaceSymbols, constraint: PlaceConstraint, order: Order) -> ca.Function:
+def row_function(place: PathPointSymbols, constraint: PathConstraint, order: Order) -> ca.Function:
     """The value and gradient, or the Hessian, of a constraint's family by what it depends on.
 
     With y = pose, then the rate where it is `moving`, then the joints of its `arms`:

@@ -6,7 +6,7 @@ normal component F_n and the tangential magnitude F_t of the required force
 differentiated; those of soft fingers are differentiated themselves. How much of each patch the
 shift of the centre of pressure leaves is differentiated as it is: its kinks are those of the
 forces. Where forces are allocated jointly, what they have to hold is differentiated here, and from
-there the forces by `held_functions`.
+there the forces by `grasp_force_functions`.
 
 With the constant-speed law the motion at a sample depends on a window of five neighbouring
 samples alone (two finite differences). One small function serves all inner samples, its window's
@@ -41,13 +41,13 @@ Quantity = Literal["force", "pressure", "load"]
 radius)^2 of contacts 1 and 2. load: force and moment about the box frame's origin, along the box's
 axes [N, N m]."""
 
-WIDTHS: Mapping[Quantity, int] = {"force": 2, "pressure": 2, "load": 6}
+QUANTITY_WIDTHS: Mapping[Quantity, int] = {"force": 2, "pressure": 2, "load": 6}
 """Values of each sample."""
 
 Block = Literal["inner", "first", "last", "path"]
 """Inner samples, one at a call; the first two; the last two; all of another time law."""
 
-WEIGHT = 1e-4
+SAMPLE_BARRIER_WEIGHT = 1e-4
 """Weight of the joint allocation's barriers, see `symbolic.contact.soft_grasp`. Forces exceed the
 least ones by a share of about this times the number of constraints that bind, which the polish
 corrects at every round's candidate."""
@@ -55,10 +55,10 @@ corrects at every round's candidate."""
 INPUTS = ("x", "basis", "rounding")
 """Inputs of every function of samples."""
 
-MOTION = ("pose", "rate", "second_rate")
+MOTION_INPUTS = ("pose", "rate", "second_rate")
 """Of the box at a sample, (6,) each."""
 
-WINDOW = 5
+DIFFERENCE_WINDOW = 5
 """Samples that the motion at one of them depends on with the constant-speed law."""
 
 
@@ -67,8 +67,8 @@ def sample_name(quantity: Quantity, block: Block, order: Order) -> str:
     return f"{quantity}_{block}_{order}"
 
 
-def held_name(order: Order) -> str:
-    """Name of a function of `held_functions`."""
+def grasp_force_name(order: Order) -> str:
+    """Name of a function of `grasp_force_functions`."""
     return f"held_{order}"
 
 
@@ -94,16 +94,16 @@ def sample_blocks(task: Task) -> tuple[SampleBlock, ...]:
         return (SampleBlock("path", np.arange(n)[None, :], position[None]),)
     inner = np.arange(2, n - 2)
     windows = np.array([position[k - 2 : k + 3] for k in inner]).reshape(
-        -1, WINDOW, position.shape[1]
+        -1, DIFFERENCE_WINDOW, position.shape[1]
     )
     return (
         SampleBlock("inner", inner[:, None], windows),
-        SampleBlock("first", np.array([[0, 1]]), position[None, :WINDOW]),
-        SampleBlock("last", np.array([[n - 2, n - 1]]), position[None, -WINDOW:]),
+        SampleBlock("first", np.array([[0, 1]]), position[None, :DIFFERENCE_WINDOW]),
+        SampleBlock("last", np.array([[n - 2, n - 1]]), position[None, -DIFFERENCE_WINDOW:]),
     )
 
 
-def branch_coefficients(workcell: Workcell) -> Array:
+def force_branches(workcell: Workcell) -> Array:
     """(2, branches, 2): per robot and branch the coefficients of both force quantities of
     `_force_function` in a normal force, which is the largest of its branches."""
     if workcell.task.allocation == "soft-finger":
@@ -141,7 +141,9 @@ def sample_functions(workcell: Workcell, quantity: Quantity) -> dict[str, ca.Fun
     return functions
 
 
-def held_functions(workcell: Workcell, weight: float = WEIGHT) -> dict[str, ca.Function]:
+def grasp_force_functions(
+    workcell: Workcell, weight: float = SAMPLE_BARRIER_WEIGHT
+) -> dict[str, ca.Function]:
     """Normal forces as smooth convex functions of a sample's load where they have no closed form,
     see `symbolic.contact.soft_grasp.SoftGrasp.first` and `second`, at a weight of the barriers:
 
@@ -152,7 +154,7 @@ def held_functions(workcell: Workcell, weight: float = WEIGHT) -> dict[str, ca.F
         SettingsError: the pads do not close their grasp.
     """
     soft = SoftGrasp(Grasp(workcell), weight)
-    return {held_name("first"): soft.first(), held_name("second"): soft.second()}
+    return {grasp_force_name("first"): soft.first(), grasp_force_name("second"): soft.second()}
 
 
 def motion_function(task: Task) -> ca.Function:
@@ -177,12 +179,12 @@ def _window_functions(
 ) -> dict[str, ca.Function]:
     task = workcell.task
     n_waypoints = len(task.waypoints)
-    x, basis = ca.MX.sym("x", task.n_var), ca.MX.sym("basis", n_waypoints, WINDOW)
+    x, basis = ca.MX.sym("x", task.n_var), ca.MX.sym("basis", n_waypoints, DIFFERENCE_WINDOW)
     rounding, handed = ca.MX.sym("rounding"), mx_given(task, workcell.payload)
     # The window's poses are handed to the time law as waypoints of an identity basis.
-    identity = np.eye(WINDOW)
+    identity = np.eye(DIFFERENCE_WINDOW)
     window = ca.mtimes(waypoint_matrix(task, x, of(handed, task)), basis)
-    own = PathBasis(np.linspace(0.0, 1.0, WINDOW), identity, identity, identity)
+    own = PathBasis(np.linspace(0.0, 1.0, DIFFERENCE_WINDOW), identity, identity, identity)
     wrench = _wrench_function(workcell)
     wrenches = _at_samples(workcell, wrench, (own, window, rounding), columns, handed)
     flat = ca.Function("wrenches", [x, basis, rounding, *handed.values()], [wrenches]).expand()
@@ -200,7 +202,7 @@ def _whole_path(
     x, unused = ca.MX.sym("x", task.n_var), ca.MX.sym("basis", len(task.waypoints), task.samples)
     rounding, handed = ca.MX.sym("rounding"), mx_given(task, workcell.payload)
     every, wrench = tuple(range(task.samples)), _wrench_function(workcell)
-    motion = [ca.SX.sym(name, 6) for name in MOTION]
+    motion = [ca.SX.sym(name, 6) for name in MOTION_INPUTS]
     held = sx_given(workcell.payload).values()
     whole = ca.Function("sample", [*motion, *held], [sample(wrench(*motion, *held), *held)])
     waypoints = waypoint_matrix(task, x, of(handed, task))
@@ -232,7 +234,7 @@ def _wrench_function(workcell: Workcell) -> ca.Function:
     """pose, rate, second_rate (6,) of a sample to the required force and moment (6,) about the
     centre of mass, in the box's frame [N, N m]."""
     payload = workcell.payload
-    pose, rate, second = motion = [ca.SX.sym(name, 6) for name in MOTION]
+    pose, rate, second = motion = [ca.SX.sym(name, 6) for name in MOTION_INPUTS]
     centre = number(payload.centre_of_mass)
     rotation, *_, force, moment = required(workcell, pose, rate, second, centre)
     wrench = ca.vertcat(ca.mtimes(rotation.T, force), ca.mtimes(rotation.T, moment))
@@ -243,7 +245,7 @@ def _margin_function(workcell: Workcell) -> ca.Function:
     """Force and moment (6,) in the box's frame to 1 - (shift / patch radius)^2 (2,), by the paper's
     allocation: where the patches suffice the joint one is the paper's."""
     wrench, contacts = ca.SX.sym("wrench", 6), workcell.contacts
-    shift = held_by(workcell, "paper", _asked(workcell, wrench))
+    shift = held_by(workcell, "paper", _contact_load(workcell, wrench))
     squares = ca.vertcat(*map(ca.sumsqr, shift.shifts))
     radius = ca.vertcat(*[ca.SX(number(contact.patch_radius)) for contact in contacts])
     given = sx_given(workcell.payload).values()
@@ -260,11 +262,11 @@ def _load_function(workcell: Workcell) -> ca.Function:
 
 def _force_function(workcell: Workcell) -> ca.Function:
     """Force and moment (6,) in the box's frame to the two quantities whose linear branches are the
-    normal forces (`branch_coefficients`): both normal forces of soft fingers, which have one branch
+    normal forces (`force_branches`): both normal forces of soft fingers, which have one branch
     each, otherwise F_n and F_t. Another contact model in closed form is plugged in at these two."""
     wrench = ca.SX.sym("wrench", 6)
     if workcell.task.allocation == "soft-finger":
-        quantities = held_by(workcell, "soft-finger", _asked(workcell, wrench)).normal
+        quantities = held_by(workcell, "soft-finger", _contact_load(workcell, wrench)).normal
     else:
         normal = ca.SX(number(workcell.contacts[0].T_box_pad[:3, 2]))
         quantities = ca.vertcat(*split_force(wrench[:3], normal)[:2])
@@ -272,7 +274,7 @@ def _force_function(workcell: Workcell) -> ca.Function:
     return ca.Function("sample_split", [wrench, *given], [quantities])
 
 
-def _asked(workcell: Workcell, wrench: ca.SX) -> ContactLoad:
+def _contact_load(workcell: Workcell, wrench: ca.SX) -> ContactLoad:
     """What force and moment (6,) in the box's frame ask of the contacts."""
     contacts, centre = workcell.contacts, workcell.payload.centre_of_mass
     first, second = (ca.SX(number(c.T_box_pad[:3, 3] - centre)) for c in contacts)

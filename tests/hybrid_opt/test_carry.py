@@ -11,7 +11,7 @@ import pytest
 from hybrid_opt.carry import Carry
 from hybrid_opt.cell import Cell
 from hybrid_opt.evaluate.evaluation import REASONS
-from hybrid_opt.timing.analysis import judge_timing
+from hybrid_opt.timing.analysis import check_search_timing
 from hybrid_opt.timing.records import TimingStatus
 from symbolic.array import Array
 from symbolic.read.cell import load
@@ -137,6 +137,6 @@ def test_a_ramped_carry_rests_at_its_ends() -> None:
     for x in (cell.initial, np.clip(near, cell.lower, cell.upper)):
         for arm in model.search_carry(x).arms:
             np.testing.assert_allclose(arm.q_rate[[0, -1]], 0.0, atol=1e-6)
-        judged = judge_timing(model, x)
+        judged = check_search_timing(model, x)
         assert "at speed" not in judged.reason
-    assert judge_timing(model, cell.initial).status is TimingStatus.OK
+    assert check_search_timing(model, cell.initial).status is TimingStatus.OK

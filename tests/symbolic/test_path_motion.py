@@ -30,7 +30,7 @@ from tests.odd_cells import free_pandas
 from tests.symbolic.cells import call, hand_cell, hand_model, with_contacts, with_payload
 
 SAMPLES = 401
-WEIGHT = np.array([0.0, 0.0, -9.81])
+TIMING_BARRIER_WEIGHT = np.array([0.0, 0.0, -9.81])
 
 
 @cache
@@ -158,7 +158,7 @@ def test_affine_force_and_moment_agree_with_the_timed_load() -> None:
         force = (
             m["force_by_acceleration"][k] * acceleration
             + m["force_by_speed"][k] * speed**2
-            - cell.payload.mass * WEIGHT
+            - cell.payload.mass * TIMING_BARRIER_WEIGHT
         )
         np.testing.assert_allclose(force, total, atol=1e-8)
         moment = m["moment_by_acceleration"][k] * acceleration + m["moment_by_speed"][k] * speed**2

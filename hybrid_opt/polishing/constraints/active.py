@@ -22,32 +22,32 @@ import numpy as np
 from hybrid_opt.polishing.carry import PlacedCarry
 from hybrid_opt.polishing.cell import SmoothCell
 from hybrid_opt.polishing.constraints.distances import (
+    AxisSwitchGaps,
     Clearances,
-    DistanceKind,
-    Passings,
-    Separations,
+    DistanceConstraintKind,
+    SeparatingAxisGaps,
 )
 from hybrid_opt.polishing.constraints.kinds import (
+    ConstraintKind,
     Forces,
     JointLimits,
-    Kind,
-    Limits,
+    ManipulabilityLimits,
+    MinimisedForces,
     Pressure,
-    Reaches,
 )
-from hybrid_opt.polishing.rows import ForceRow, PlaceRow, PressureRow, Row
+from hybrid_opt.polishing.rows import ForceRow, PathRow, PressureRow, Row
 from symbolic.array import Array
-from symbolic.smooth.passage import Passing, Separation
-from symbolic.smooth.places import Clearance, JointLimit, Reach
+from symbolic.smooth.passage import AxisSwitchGap, SeparatingAxisGap
+from symbolic.smooth.places import Clearance, JointLimit, ManipulabilityLimit
 
-STRICTER = 1e-4
+LEAST_TIGHTENING = 1e-4
 """Least rise of a required value that counts as a new demand [m, rad, 1]."""
 
-KEPT = 3
+ACTIVE_ROW_LIFETIME = 3
 """Programs that a row stays in after it pressed last."""
 
 
-class ActiveSet:
+class RowSelector:
     """Chooses rows for candidates of one evaluator.
 
     Carries under the time law 'optimal' have no rows at samples: `hybrid_opt.polishing.drive` has
@@ -58,81 +58,85 @@ class ActiveSet:
         self.forces = Forces(cell)
         self._movable = cell.grid.movable
         self._distances = Clearances(cell)
-        sampled: dict[type, Kind[Any]] = {ForceRow: self.forces}
+        sampled: dict[type, ConstraintKind[Any]] = {ForceRow: self.forces}
         if cell.task.allocation == "paper":
             sampled[PressureRow] = Pressure(cell)
         driven = cell.task.time_law == "optimal"
-        self._kinds: dict[type, Kind[Any]] = ({} if driven else sampled) | {
+        self._kinds: dict[type, ConstraintKind[Any]] = ({} if driven else sampled) | {
             Clearance: self._distances,
-            Separation: Separations(cell),
-            Passing: Passings(cell),
+            SeparatingAxisGap: SeparatingAxisGaps(cell),
+            AxisSwitchGap: AxisSwitchGaps(cell),
             JointLimit: JointLimits(cell),
-            Reach: Reaches(cell),
+            ManipulabilityLimit: ManipulabilityLimits(cell),
         }
 
-    def near(self, carry: PlacedCarry, limits: Limits) -> set[Row]:
+    def near_rows(self, carry: PlacedCarry, limits: MinimisedForces) -> set[Row]:
         """Rows of everything near a candidate."""
-        return self._rows(lambda kind: kind.near(carry, limits))
+        return self._rows(lambda kind: kind.near_rows(carry, limits))
 
-    def violated(self, carry: PlacedCarry, known: PlacedCarry, asked: Collection[Row]) -> set[Row]:
+    def violated_rows(
+        self, carry: PlacedCarry, known: PlacedCarry, program_rows: Collection[Row]
+    ) -> set[Row]:
         """Rows of everything that a step from a known candidate violates.
 
         Args:
             asked: rows of the program that led there. Its forces are no violation: they raise the
                 peaks.
         """
-        violated = self._rows(lambda kind: kind.violated(carry, known))
-        return {row for row in violated if row not in asked or not isinstance(row, ForceRow)}
+        violated = self._rows(lambda kind: kind.violated_rows(carry, known))
+        return {row for row in violated if row not in program_rows or not isinstance(row, ForceRow)}
 
-    def violates(self, carry: PlacedCarry, known: PlacedCarry, asked: Collection[Row]) -> bool:
+    def has_violation(
+        self, carry: PlacedCarry, known: PlacedCarry, program_rows: Collection[Row]
+    ) -> bool:
         """Whether a step violates anything, as `violated` has it; distances, the dearest, last and
         only until one is too small."""
         return any(
-            row not in asked or not isinstance(row, ForceRow)
+            row not in program_rows or not isinstance(row, ForceRow)
             for kind in self._kinds.values()
-            if not isinstance(kind, DistanceKind)
-            for row in kind.violated(carry, known)
+            if not isinstance(kind, DistanceConstraintKind)
+            for row in kind.violated_rows(carry, known)
             if self._counts(row)
-        ) or not carry.distances.keep(self._distances.least)
+        ) or not carry.distances.exceed(self._distances.least)
 
-    def required(
-        self, carry: PlacedCarry, rows: Iterable[Row], lenient: bool = False
+    def required_values(
+        self, carry: PlacedCarry, rows: Iterable[Row], is_relaxed: bool = False
     ) -> dict[Row, float]:
-        """The value that each row has to keep, as learned from a candidate, see `Kind`."""
-        return self._by_kind(rows, lambda kind, own: kind.required(carry, own, lenient))
+        """Return the required value of each row at a candidate; see `ConstraintKind`."""
+        return self._by_kind(rows, lambda kind, own: kind.required_values(carry, own, is_relaxed))
 
-    def demanded(
+    def tightened_bounds(
         self,
         carry: PlacedCarry,
         known: PlacedCarry,
         rows: Iterable[Row],
         before: Mapping[Row, float],
     ) -> dict[Row, float]:
-        """The value that rows have to keep that a step violates, see `Kind`."""
+        """The value that rows have to keep that a step violates, see `ConstraintKind`."""
 
-        def asked(kind: Kind[Any], own: list[Row]) -> list[float]:
-            return kind.demanded(carry, known, own, [before.get(row, 0.0) for row in own])
+        def program_rows(kind: ConstraintKind[Any], own: list[Row]) -> list[float]:
+            return kind.tightened_bounds(carry, known, own, [before.get(row, 0.0) for row in own])
 
-        return self._by_kind(rows, asked)
+        return self._by_kind(rows, program_rows)
 
-    def lasting(self, row: Row) -> bool:
+    def persists(self, row: Row) -> bool:
         """Whether what a row has to keep outlasts the candidate that it was learned from."""
-        return self._kind_of(row).lasting
+        return self._kind_of(row).persists
 
-    def _kind_of(self, row: Row) -> Kind[Any]:
-        return self._kinds[type(row.constraint) if isinstance(row, PlaceRow) else type(row)]
+    def _kind_of(self, row: Row) -> ConstraintKind[Any]:
+        return self._kinds[type(row.constraint) if isinstance(row, PathRow) else type(row)]
 
-    def _rows(self, ask: Callable[[Kind[Any]], Iterable[Row]]) -> set[Row]:
+    def _rows(self, ask: Callable[[ConstraintKind[Any]], Iterable[Row]]) -> set[Row]:
         kinds = self._kinds.values()
         return {row for kind in kinds for row in ask(kind) if self._counts(row)}
 
     def _counts(self, row: Row) -> bool:
-        return not isinstance(row, PlaceRow) or self._movable(row.place)
+        return not isinstance(row, PathRow) or self._movable(row.place)
 
     def _by_kind(
-        self, rows: Iterable[Row], ask: Callable[[Kind[Any], list[Row]], list[float]]
+        self, rows: Iterable[Row], ask: Callable[[ConstraintKind[Any], list[Row]], list[float]]
     ) -> dict[Row, float]:
-        groups: dict[Kind[Any], list[Row]] = {}
+        groups: dict[ConstraintKind[Any], list[Row]] = {}
         for row in rows:
             groups.setdefault(self._kind_of(row), []).append(row)
         return {
@@ -142,11 +146,11 @@ class ActiveSet:
         }
 
 
-class LearnedRows:
+class WorkingSet:
     """Rows learned by the steps of one climb, beside those near its candidate, and the value that
     each has to keep from then on. It grows with refused steps."""
 
-    def __init__(self, active: ActiveSet, half: Array) -> None:
+    def __init__(self, active: RowSelector, half: Array) -> None:
         """Nothing is learned yet.
 
         Args:
@@ -154,11 +158,11 @@ class LearnedRows:
             half: (n,) half ranges of the variables that steps move.
         """
         self._active, self._half = active, half
-        self._taught: dict[Row, tuple[float, Array]] = {}
-        self._pressed: dict[Row, int] = {}
+        self._tightened: dict[Row, tuple[float, Array]] = {}
+        self._active_for: dict[Row, int] = {}
 
-    def required(
-        self, carry: PlacedCarry, limits: Limits, x: Array, radius: float, lenient: bool
+    def required_values(
+        self, carry: PlacedCarry, limits: MinimisedForces, x: Array, radius: float, is_relaxed: bool
     ) -> dict[Row, float]:
         """The rows of the next program about a candidate, and what each of them has to keep.
 
@@ -166,18 +170,20 @@ class LearnedRows:
             carry: the candidate's.
             x: its variables, (n,) or more.
             radius: half the width of the box of trust.
-            lenient: see `Kind.required`.
+            lenient: see `ConstraintKind.required`.
         """
-        rows = self._active.near(carry, limits) | self._taught.keys() | self._pressed.keys()
-        required = self._active.required(carry, rows, lenient)
-        for row, (value, taught_by) in self._taught.items():
+        rows = (
+            self._active.near_rows(carry, limits) | self._tightened.keys() | self._active_for.keys()
+        )
+        required = self._active.required_values(carry, rows, is_relaxed)
+        for row, (value, tightened_at) in self._tightened.items():
             n = len(self._half)
-            far = float(np.abs((taught_by[:n] - x[:n]) / self._half).max())
+            far = float(np.abs((tightened_at[:n] - x[:n]) / self._half).max())
             share = min(1.0, radius / max(far, 1e-300))
             required[row] += share * max(value - required[row], 0.0)
         return required
 
-    def refuse(
+    def learn_from_rejection(
         self,
         carry: PlacedCarry,
         known: PlacedCarry,
@@ -191,26 +197,28 @@ class LearnedRows:
             carry, known: after the step, and before.
             required: what the program asked for that led there.
         """
-        stricter = False
-        for row, value in self._active.demanded(carry, known, violated, required).items():
-            taught = self._taught[row][0] if row in self._taught else -np.inf
-            stricter |= value > max(required.get(row, -np.inf), taught) + STRICTER
-            if value > taught:
-                self._taught[row] = value, x
-        return stricter
+        is_new = False
+        for row, value in self._active.tightened_bounds(carry, known, violated, required).items():
+            tightened = self._tightened[row][0] if row in self._tightened else -np.inf
+            is_new |= value > max(required.get(row, -np.inf), tightened) + LEAST_TIGHTENING
+            if value > tightened:
+                self._tightened[row] = value, x
+        return is_new
 
-    def ask(self, rows: Iterable[Row], x: Array) -> None:
+    def add(self, rows: Iterable[Row], x: Array) -> None:
         """Ask that rows hold, as a step to x showed."""
-        self._taught.update(dict.fromkeys(rows, (-np.inf, x)))
+        self._tightened.update(dict.fromkeys(rows, (-np.inf, x)))
 
-    def press(self, rows: Iterable[Row]) -> None:
+    def mark_active(self, rows: Iterable[Row]) -> None:
         """Note the rows that have multipliers in an answer."""
-        left = {row: count - 1 for row, count in self._pressed.items() if count > 1}
-        self._pressed = left | dict.fromkeys(rows, KEPT)
+        left = {row: count - 1 for row, count in self._active_for.items() if count > 1}
+        self._active_for = left | dict.fromkeys(rows, ACTIVE_ROW_LIFETIME)
 
-    def move(self, is_short: bool = False) -> None:
+    def on_new_best(self, keep_active_set: bool = False) -> None:
         """Forget what was asked relative to a candidate that is left behind, and after a long step
         also what pressed there."""
-        if not is_short:
-            self._pressed = {}
-        self._taught = {row: v for row, v in self._taught.items() if self._active.lasting(row)}
+        if not keep_active_set:
+            self._active_for = {}
+        self._tightened = {
+            row: v for row, v in self._tightened.items() if self._active.persists(row)
+        }

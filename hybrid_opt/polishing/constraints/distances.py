@@ -18,12 +18,17 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_opt.polishing.carry import PlacedCarry, lowest
+from hybrid_opt.polishing.carry import PlacedCarry, local_minima_below
 from hybrid_opt.polishing.cell import SmoothCell
-from hybrid_opt.polishing.constraints.kinds import MARGIN, Kind, Limits, smooth_values
-from hybrid_opt.polishing.rows import PlaceRow
+from hybrid_opt.polishing.constraints.kinds import (
+    PATCH_MARGIN,
+    ConstraintKind,
+    MinimisedForces,
+    smooth_values,
+)
+from hybrid_opt.polishing.rows import PathRow
 from symbolic.array import Array
-from symbolic.smooth.passage import Passing, Separation
+from symbolic.smooth.passage import AxisSwitchGap, SeparatingAxisGap
 from symbolic.smooth.places import Clearance
 
 BODY_DISTANCE = 0.03
@@ -52,7 +57,7 @@ KINK_WINDOW = 0.04
 """Distance from a kink within which its height is measured."""
 
 
-class DistanceKind(Kind[PlaceRow]):
+class DistanceConstraintKind(ConstraintKind[PathRow]):
     """A kind whose values are distances of a pair; `window` is where a row's is measured.
 
     Attributes:
@@ -71,17 +76,17 @@ class DistanceKind(Kind[PlaceRow]):
         self.separable = cell.functions.separable
         self._columns = cell.evaluator.checker.geometry.columns.tolist()
 
-    def required(
-        self, carry: PlacedCarry, rows: Sequence[PlaceRow], lenient: bool = False
+    def required_values(
+        self, carry: PlacedCarry, rows: Sequence[PathRow], is_relaxed: bool = False
     ) -> list[float]:
         """See the module; the margin where no arm gets to."""
-        values = np.full(len(rows), MARGIN)
+        values = np.full(len(rows), PATCH_MARGIN)
         chosen = [k for k, row in enumerate(rows) if row.place < carry.reached]
         if not chosen:
             return values.tolist()
         truth = self._measured(carry, [rows[k] for k in chosen])
         wanted = self.wanted[[pair_of(rows[k]) for k in chosen]]
-        if lenient:
+        if is_relaxed:
             wanted = np.where(truth > 0.0, np.minimum(wanted, truth), wanted)
         smooth = smooth_values(self.cell, carry, [rows[k] for k in chosen])
         values[chosen] = wanted - (truth - smooth)
@@ -89,12 +94,12 @@ class DistanceKind(Kind[PlaceRow]):
 
     def violations(self, carry: PlacedCarry) -> dict[int, Array]:
         """(reached,) distances of every pair that comes too close [m], by pair."""
-        close = carry.distances.lowered < self.least
+        close = carry.distances.interpolated_clearance < self.least
         pairs = np.flatnonzero(close.any(axis=0)).tolist()
         truth = carry.distances.at(close)
         return {pair: truth[:, pair].copy() for pair in pairs}
 
-    def _measured(self, carry: PlacedCarry, rows: Sequence[PlaceRow]) -> Array:
+    def _measured(self, carry: PlacedCarry, rows: Sequence[PathRow]) -> Array:
         """Least distance in the window of each row."""
         stretches = [
             (slice(max(0, row.place - self.window), row.place + self.window + 1), pair_of(row))
@@ -103,41 +108,41 @@ class DistanceKind(Kind[PlaceRow]):
         return np.array(carry.distances.least(stretches, MEASURED_BELOW))
 
 
-def pair_of(row: PlaceRow) -> int:
+def pair_of(row: PathRow) -> int:
     """The active pair of a row whose value is a distance."""
-    assert isinstance(row.constraint, Clearance | Separation | Passing)
+    assert isinstance(row.constraint, Clearance | SeparatingAxisGap | AxisSwitchGap)
     return row.constraint.pair
 
 
-class Clearances(DistanceKind):
+class Clearances(DistanceConstraintKind):
     """Rows at the lowest places of every pair that comes near."""
 
-    lasting = True
+    persists = True
 
-    def near(self, carry: PlacedCarry, limits: Limits) -> Iterable[PlaceRow]:
+    def near_rows(self, carry: PlacedCarry, limits: MinimisedForces) -> Iterable[PathRow]:
         """Pairs whose bound is small."""
         for pair in np.flatnonzero(carry.distances.bounds.min(axis=0) < BODY_DISTANCE).tolist():
             if pair not in self.separable:
-                for place in lowest(carry.distances.bounds[:, pair], BODY_DISTANCE):
-                    yield PlaceRow(Clearance(pair, self._columns[pair]), place)
+                for place in local_minima_below(carry.distances.bounds[:, pair], BODY_DISTANCE):
+                    yield PathRow(Clearance(pair, self._columns[pair]), place)
 
-    def violated(self, carry: PlacedCarry, known: PlacedCarry) -> Iterable[PlaceRow]:
+    def violated_rows(self, carry: PlacedCarry, known: PlacedCarry) -> Iterable[PathRow]:
         """Pairs that come too close: at the lowest place and around it; a dip counts at two
         neighbours."""
         width = self.grid.places(BESIDE_CLEARANCE)
         for pair, distance in self.violations(carry).items():
             if pair in self.separable:
                 continue
-            lows = lowest(distance, float(self.least[pair]))
+            lows = local_minima_below(distance, float(self.least[pair]))
             for place in sorted({k + beside for k in lows for beside in (0, 1, -width, width)}):
                 if place < carry.reached:
-                    yield PlaceRow(Clearance(pair, self._columns[pair]), place)
+                    yield PathRow(Clearance(pair, self._columns[pair]), place)
 
 
-class Separations(DistanceKind):
+class SeparatingAxisGaps(DistanceConstraintKind):
     """Rows of single gaps between the payload and a box, away from kinks."""
 
-    def near(self, carry: PlacedCarry, limits: Limits) -> Iterable[PlaceRow]:
+    def near_rows(self, carry: PlacedCarry, limits: MinimisedForces) -> Iterable[PathRow]:
         """Rows along every stretch where the payload is near, at a few places each."""
         grid = self.grid
         beside = grid.places(BESIDE_KINK)
@@ -150,13 +155,13 @@ class Separations(DistanceKind):
             places = {
                 place
                 for distance, stride in stretches
-                for place in lowest(gaps.height, distance, stride)
+                for place in local_minima_below(gaps.height, distance, stride)
                 if all(abs(place - kink) >= beside for kink in kinks)
             }
             for place in sorted(places):
                 yield separation(pair, gaps, place)
 
-    def violated(self, carry: PlacedCarry, known: PlacedCarry) -> Iterable[PlaceRow]:
+    def violated_rows(self, carry: PlacedCarry, known: PlacedCarry) -> Iterable[PathRow]:
         """Around places that are too close and far from every kink of the known candidate, in
         whose directions the rows are."""
         half = self.grid.places(KINK_WINDOW) // 2
@@ -167,20 +172,20 @@ class Separations(DistanceKind):
                         yield separation(pair, gaps, k)
 
 
-class Passings(DistanceKind):
+class AxisSwitchGaps(DistanceConstraintKind):
     """Rows of the kinks where the payload passes an edge."""
 
     def __init__(self, cell: SmoothCell) -> None:
         super().__init__(cell)
         self.window = cell.grid.places(KINK_WINDOW)
 
-    def near(self, carry: PlacedCarry, limits: Limits) -> Iterable[PlaceRow]:
+    def near_rows(self, carry: PlacedCarry, limits: MinimisedForces) -> Iterable[PathRow]:
         """Kinks that are low."""
         for pair, gaps in near_gaps(self, carry):
             for kink, place in edges(gaps, KINK_DISTANCE):
                 yield passing(pair, gaps, kink, place)
 
-    def violated(self, carry: PlacedCarry, known: PlacedCarry) -> Iterable[PlaceRow]:
+    def violated_rows(self, carry: PlacedCarry, known: PlacedCarry) -> Iterable[PathRow]:
         """Kinks of the known candidate near places that are too close."""
         for pair, gaps, _, near in violated_passages(self, carry, known):
             for kink, place in near:
@@ -202,7 +207,7 @@ class Gaps:
     height: Array
 
     @classmethod
-    def of(cls, along: Array) -> Gaps:
+    def from_values(cls, along: Array) -> Gaps:
         """From the gaps along all directions (m, n) [m]."""
         best = along.argmax(axis=1)
         return cls(along, best, along[np.arange(len(best)), best])
@@ -220,33 +225,33 @@ def edges(gaps: Gaps, limit: float) -> list[tuple[int, int]]:
     ]
 
 
-def passing(pair: int, gaps: Gaps, kink: int, place: int) -> PlaceRow:
+def passing(pair: int, gaps: Gaps, kink: int, place: int) -> PathRow:
     """The row of a kink of `edges`."""
     before, after = (int(gaps.best[k]) for k in (kink, kink + 1))
-    return PlaceRow(Passing(pair, before, after), place)
+    return PathRow(AxisSwitchGap(pair, before, after), place)
 
 
-def separation(pair: int, gaps: Gaps, place: int) -> PlaceRow:
+def separation(pair: int, gaps: Gaps, place: int) -> PathRow:
     """The row of the largest gap at a place."""
-    return PlaceRow(Separation(pair, int(gaps.best[place])), place)
+    return PathRow(SeparatingAxisGap(pair, int(gaps.best[place])), place)
 
 
-def near_gaps(kind: DistanceKind, carry: PlacedCarry) -> Iterable[tuple[int, Gaps]]:
+def near_gaps(kind: DistanceConstraintKind, carry: PlacedCarry) -> Iterable[tuple[int, Gaps]]:
     """Every separable pair that comes near, and its gaps."""
     for pair in np.flatnonzero(carry.distances.bounds.min(axis=0) < FAR_GAP_DISTANCE).tolist():
         if pair in kind.separable:
-            yield pair, Gaps.of(carry.gaps(pair))
+            yield pair, Gaps.from_values(carry.gaps(pair))
 
 
 def violated_passages(
-    kind: DistanceKind, carry: PlacedCarry, known: PlacedCarry
+    kind: DistanceConstraintKind, carry: PlacedCarry, known: PlacedCarry
 ) -> Iterable[tuple[int, Gaps, int, list[tuple[int, int]]]]:
     """Places that are too close: pair, gaps of the known candidate, place, its kinks nearby."""
     window = kind.grid.places(KINK_WINDOW)
     for pair, distance in kind.violations(carry).items():
         if pair not in kind.separable:
             continue
-        gaps = Gaps.of(known.gaps(pair))
+        gaps = Gaps.from_values(known.gaps(pair))
         kinks = edges(gaps, KINK_DISTANCE)
-        for place in lowest(distance, float(kind.least[pair])):
+        for place in local_minima_below(distance, float(kind.least[pair])):
             yield pair, gaps, place, [k for k in kinks if abs(k[1] - place) <= window]

@@ -13,23 +13,23 @@ from typing import Generic, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_opt.polishing.carry import PlacedCarry, lowest
+from hybrid_opt.polishing.carry import PlacedCarry, local_minima_below
 from hybrid_opt.polishing.cell import SmoothCell
-from hybrid_opt.polishing.rows import HELD, ForceRow, PlaceRow, PressureRow, row_numbers
+from hybrid_opt.polishing.rows import PROGRAM_BRANCH, ForceRow, PathRow, PressureRow, row_numbers
 from symbolic.array import Array
-from symbolic.smooth.places import JointLimit, Reach, Side
+from symbolic.smooth.places import JointLimit, ManipulabilityLimit, Side
 
-MARGIN = 1e-6
+PATCH_MARGIN = 1e-6
 """Kept from the rims of patches, in the square of the shift over the radius."""
 
-BETWEEN = 2e-3
+SAMPLING_MARGIN = 2e-3
 """Kept from joint limits [rad] and, in the square of |det J| over its least value, from
 singularities: they are judged at places and hold between them as well."""
 
 CONE_TIGHT = 0
 """Branch of the normal force that rules unless the box is accelerated across by nearly 1 g."""
 
-HARDER = 1e-6
+FORCE_ROUNDING = 1e-6
 """Share by which a force exceeds the paper's that is not rounding."""
 
 FORCE_STRIDE = 0.02
@@ -47,29 +47,29 @@ BRANCH_SHARE = 0.02
 PRESSURE_SHARE = 0.7
 """Shifts of the centre of pressure beyond this share of the patch get rows."""
 
-BESIDE_PRESSURE = 0.04
+PRESSURE_STRIDE = 0.04
 """This far beside the farthest shift there are rows, too."""
 
 JOINT_DISTANCE = 0.05
 """Joints nearer than this to a limit get a row [rad]."""
 
-REACH_SHARE, REACH_STRIDE = 0.9, 0.02
+MANIPULABILITY_SHARE, MANIPULABILITY_STRIDE = 0.9, 0.02
 """Where |det J| is below this share of its median along the path, every such stretch gets a row: it
 bounds the reach, beyond which nothing is defined."""
 
-EDGE, EDGE_STRIDE = 1.1, 0.005
+SINGULAR_RATIO, SINGULAR_STRIDE = 1.1, 0.005
 """The same below this multiple of the least |det J|, more densely."""
 
-LOST = 0.04
+LOST_ARM_STRIDE = 0.04
 """This far after the loss of an arm, and twice as far, there are rows, too."""
 
-Limits = tuple[bool, bool]
+MinimisedForces = tuple[bool, bool]
 """Per robot whether its force matters for more than ties."""
 
-AnyRow = TypeVar("AnyRow", ForceRow, PressureRow, PlaceRow)
+AnyRow = TypeVar("AnyRow", ForceRow, PressureRow, PathRow)
 
 
-class Kind(ABC, Generic[AnyRow]):
+class ConstraintKind(ABC, Generic[AnyRow]):
     """A kind of constraint.
 
     Attributes:
@@ -78,30 +78,30 @@ class Kind(ABC, Generic[AnyRow]):
             asked of others is relative to the candidate that is left behind.
     """
 
-    lasting: bool = False
+    persists: bool = False
 
     def __init__(self, cell: SmoothCell) -> None:
         self.cell, self.grid = cell, cell.grid
 
     @abstractmethod
-    def near(self, carry: PlacedCarry, limits: Limits) -> Iterable[AnyRow]:
+    def near_rows(self, carry: PlacedCarry, limits: MinimisedForces) -> Iterable[AnyRow]:
         """Rows of what is near at a candidate."""
 
     @abstractmethod
-    def violated(self, carry: PlacedCarry, known: PlacedCarry) -> Iterable[AnyRow]:
+    def violated_rows(self, carry: PlacedCarry, known: PlacedCarry) -> Iterable[AnyRow]:
         """Rows of what a step violates that was made from a known candidate."""
 
-    def required(
-        self, carry: PlacedCarry, rows: Sequence[AnyRow], lenient: bool = False
+    def required_values(
+        self, carry: PlacedCarry, rows: Sequence[AnyRow], is_relaxed: bool = False
     ) -> list[float]:
         """The value that each row has to keep, as learned from a candidate.
 
         Args:
             lenient: ask for no more than the candidate keeps already, where it is free.
         """
-        return [MARGIN] * len(rows)
+        return [PATCH_MARGIN] * len(rows)
 
-    def demanded(
+    def tightened_bounds(
         self, carry: PlacedCarry, known: PlacedCarry, rows: Sequence[AnyRow], before: list[float]
     ) -> list[float]:
         """The value that rows which a step violates have to keep from now on.
@@ -111,16 +111,16 @@ class Kind(ABC, Generic[AnyRow]):
             known: where it came from.
             before: what the rows had to keep, the margin where they were none.
         """
-        return self.required(carry, rows)
+        return self.required_values(carry, rows)
 
 
-class Forces(Kind[ForceRow]):
+class Forces(ConstraintKind[ForceRow]):
     """Rows of the branch with tight cones along the whole path, of others where they nearly rule.
 
     The required value has no meaning: a force stays below the peak, which is a variable.
     """
 
-    lasting = True
+    persists = True
 
     def __init__(self, cell: SmoothCell) -> None:
         super().__init__(cell)
@@ -132,7 +132,7 @@ class Forces(Kind[ForceRow]):
         self._joint = cell.robust is None and not cell.workcell.has_closed_form
         self._facing = cell.workcell.has_facing_pads
 
-    def near(self, carry: PlacedCarry, limits: Limits) -> Iterable[ForceRow]:
+    def near_rows(self, carry: PlacedCarry, limits: MinimisedForces) -> Iterable[ForceRow]:
         """Rows at every few samples, at the highest and beside them, where the sample decides."""
         samples = self._every | self._ends | self._peaks(carry)
         main = self._main(carry)
@@ -141,11 +141,11 @@ class Forces(Kind[ForceRow]):
                 yield ForceRow(robot, main[sample], sample)
         yield from self._other_branches(carry)
 
-    def violated(self, carry: PlacedCarry, known: PlacedCarry) -> Iterable[ForceRow]:
+    def violated_rows(self, carry: PlacedCarry, known: PlacedCarry) -> Iterable[ForceRow]:
         """Other branches that rule."""
         return self._other_branches(carry)
 
-    def higher(self, carry: PlacedCarry, limits: Limits) -> set[ForceRow]:
+    def peak_rows(self, carry: PlacedCarry, limits: MinimisedForces) -> set[ForceRow]:
         """Rows at the peaks of a candidate whose forces are higher than the program foresaw."""
         main = self._main(carry)
         return {
@@ -161,13 +161,16 @@ class Forces(Kind[ForceRow]):
 
     def _main(self, carry: PlacedCarry) -> list[int]:
         """Per sample the branch that has a row wherever forces matter."""
-        return [HELD if held else CONE_TIGHT for held in self._is_held(carry).tolist()]
+        return [
+            PROGRAM_BRANCH if held else CONE_TIGHT
+            for held in self._is_found_by_program(carry).tolist()
+        ]
 
-    def _is_held(self, carry: PlacedCarry) -> NDArray[np.bool_]:
+    def _is_found_by_program(self, carry: PlacedCarry) -> NDArray[np.bool_]:
         """(samples,) whether the joint allocation's forces are, or are nearly, not the paper's."""
         if not self._joint or not self._facing:
             return np.full(len(carry.split), self._joint)
-        harder = carry.force > (1.0 + HARDER) * self._values(carry).max(axis=2)
+        harder = carry.force > (1.0 + FORCE_ROUNDING) * self._values(carry).max(axis=2)
         near = carry.shift > PRESSURE_SHARE
         return np.asarray((harder | near).any(axis=1))
 
@@ -191,54 +194,54 @@ class Forces(Kind[ForceRow]):
         force = self._values(carry)
         share = 1.0 - BRANCH_SHARE
         near = force >= share * force.max(axis=2, keepdims=True)
-        near[:, :, CONE_TIGHT] = near[self._is_held(carry)] = False
+        near[:, :, CONE_TIGHT] = near[self._is_found_by_program(carry)] = False
         return [
             ForceRow(robot, branch, sample) for sample, robot, branch in np.argwhere(near).tolist()
         ]
 
 
-class Pressure(Kind[PressureRow]):
+class Pressure(ConstraintKind[PressureRow]):
     """Rows at the farthest shift of every stretch near the rim of a patch, and beside it."""
 
-    lasting = True
+    persists = True
 
-    def near(self, carry: PlacedCarry, limits: Limits) -> Iterable[PressureRow]:
+    def near_rows(self, carry: PlacedCarry, limits: MinimisedForces) -> Iterable[PressureRow]:
         """Rows of shifts beyond a share of the patch's radius."""
         return self._beyond(carry, PRESSURE_SHARE)
 
-    def violated(self, carry: PlacedCarry, known: PlacedCarry) -> Iterable[PressureRow]:
+    def violated_rows(self, carry: PlacedCarry, known: PlacedCarry) -> Iterable[PressureRow]:
         """At the rim: half of the margin is left to what the solver rounds off."""
-        return self._beyond(carry, (1.0 - MARGIN / 2.0) ** 0.5)
+        return self._beyond(carry, (1.0 - PATCH_MARGIN / 2.0) ** 0.5)
 
     def _beyond(self, carry: PlacedCarry, share: float) -> Iterable[PressureRow]:
         last = len(carry.shift) - 1
-        width = self.grid.samples(BESIDE_PRESSURE)
+        width = self.grid.samples(PRESSURE_STRIDE)
         for robot in (0, 1):
-            for sample in lowest(-carry.shift[:, robot], -share):
+            for sample in local_minima_below(-carry.shift[:, robot], -share):
                 for beside in (-width, -1, 0, 1, width):
                     yield PressureRow(robot, min(max(0, sample + beside), last))
 
 
-class JointLimits(Kind[PlaceRow]):
+class JointLimits(ConstraintKind[PathRow]):
     """Rows at the tightest places of every joint that comes near a limit."""
 
-    lasting = True
+    persists = True
 
-    def near(self, carry: PlacedCarry, limits: Limits) -> Iterable[PlaceRow]:
+    def near_rows(self, carry: PlacedCarry, limits: MinimisedForces) -> Iterable[PathRow]:
         """Joints near a limit."""
         return self._below(carry, JOINT_DISTANCE)
 
-    def violated(self, carry: PlacedCarry, known: PlacedCarry) -> Iterable[PlaceRow]:
+    def violated_rows(self, carry: PlacedCarry, known: PlacedCarry) -> Iterable[PathRow]:
         """Joints beyond a limit, or nearer than half of what is kept from it."""
-        return self._below(carry, BETWEEN / 2.0)
+        return self._below(carry, SAMPLING_MARGIN / 2.0)
 
-    def required(
-        self, carry: PlacedCarry, rows: Sequence[PlaceRow], lenient: bool = False
+    def required_values(
+        self, carry: PlacedCarry, rows: Sequence[PathRow], is_relaxed: bool = False
     ) -> list[float]:
         """What lets a limit hold between places as well."""
-        return [BETWEEN] * len(rows)
+        return [SAMPLING_MARGIN] * len(rows)
 
-    def _below(self, carry: PlacedCarry, limit: float) -> Iterable[PlaceRow]:
+    def _below(self, carry: PlacedCarry, limit: float) -> Iterable[PathRow]:
         for arm, robot in enumerate(self.cell.workcell.robots):
             q = carry.q[arm][: carry.reached]
             margins: tuple[tuple[Side, Array], ...] = (
@@ -247,56 +250,56 @@ class JointLimits(Kind[PlaceRow]):
             )
             for side, margin in margins:
                 for joint in range(q.shape[1]):
-                    for place in lowest(margin[:, joint], limit):
-                        yield PlaceRow(JointLimit(arm, joint, side), place)
+                    for place in local_minima_below(margin[:, joint], limit):
+                        yield PathRow(JointLimit(arm, joint, side), place)
 
 
-class Reaches(Kind[PlaceRow]):
+class ManipulabilityLimits(ConstraintKind[PathRow]):
     """Rows where |det J| is low: beyond the edge of the reach nothing else is defined."""
 
-    lasting = True
+    persists = True
 
-    def near(self, carry: PlacedCarry, limits: Limits) -> Iterable[PlaceRow]:
+    def near_rows(self, carry: PlacedCarry, limits: MinimisedForces) -> Iterable[PathRow]:
         """Below a share of the median along the path, every few places; more densely where there is
         little left, so that the least does not move between two rows."""
         places = self.grid.places
         for arm in (0, 1):
             measure = carry.manipulability[:, arm]
-            least = max(1.0, REACH_SHARE * float(np.median(measure)))
-            chosen = {*lowest(measure, least, places(REACH_STRIDE))}
-            chosen |= {*lowest(measure, EDGE, places(EDGE_STRIDE))}
+            least = max(1.0, MANIPULABILITY_SHARE * float(np.median(measure)))
+            chosen = {*local_minima_below(measure, least, places(MANIPULABILITY_STRIDE))}
+            chosen |= {*local_minima_below(measure, SINGULAR_RATIO, places(SINGULAR_STRIDE))}
             for place in sorted(chosen):
-                yield PlaceRow(Reach(arm), place)
+                yield PathRow(ManipulabilityLimit(arm), place)
 
-    def violated(self, carry: PlacedCarry, known: PlacedCarry) -> Iterable[PlaceRow]:
+    def violated_rows(self, carry: PlacedCarry, known: PlacedCarry) -> Iterable[PathRow]:
         """Below the least value and half of what is kept beyond it; and where an arm loses the path
         and after it: at the edge of its reach it is stretched, and so singular."""
-        least = (1.0 + BETWEEN / 2.0) ** 0.5
+        least = (1.0 + SAMPLING_MARGIN / 2.0) ** 0.5
         for arm in (0, 1):
-            for place in lowest(carry.manipulability[:, arm], least):
-                yield PlaceRow(Reach(arm), place)
-        for arm in carry.stranded:
-            width = self.grid.places(LOST)
+            for place in local_minima_below(carry.manipulability[:, arm], least):
+                yield PathRow(ManipulabilityLimit(arm), place)
+        for arm in carry.unreachable_arms:
+            width = self.grid.places(LOST_ARM_STRIDE)
             for later in (0, width, 2 * width):
-                yield PlaceRow(Reach(arm), carry.reached + later)
+                yield PathRow(ManipulabilityLimit(arm), carry.reached + later)
 
-    def required(
-        self, carry: PlacedCarry, rows: Sequence[PlaceRow], lenient: bool = False
+    def required_values(
+        self, carry: PlacedCarry, rows: Sequence[PathRow], is_relaxed: bool = False
     ) -> list[float]:
         """What lets the measure hold between places as well."""
-        return [BETWEEN] * len(rows)
+        return [SAMPLING_MARGIN] * len(rows)
 
-    def demanded(
-        self, carry: PlacedCarry, known: PlacedCarry, rows: Sequence[PlaceRow], before: list[float]
+    def tightened_bounds(
+        self, carry: PlacedCarry, known: PlacedCarry, rows: Sequence[PathRow], before: list[float]
     ) -> list[float]:
         """Where an arm lost the path: half way to what the known candidate has there."""
-        if not carry.stranded:
-            return self.required(carry, rows)
+        if not carry.unreachable_arms:
+            return self.required_values(carry, rows)
         has = smooth_values(self.cell, known, rows)
         return [(old + new) / 2.0 for old, new in zip(before, has.tolist(), strict=True)]
 
 
-def smooth_values(cell: SmoothCell, carry: PlacedCarry, rows: Sequence[PlaceRow]) -> Array:
+def smooth_values(cell: SmoothCell, carry: PlacedCarry, rows: Sequence[PathRow]) -> Array:
     """The rows' values as the smooth problem sees them."""
     values = np.empty(len(rows))
     groups: dict[str, list[int]] = {}

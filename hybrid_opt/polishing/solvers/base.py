@@ -1,6 +1,6 @@
 """What is solved, and what comes of it, whichever solver is chosen.
 
-A solver's word is not trusted: `optimality` recomputes residuals from the program.
+A solver's word is not trusted: `optimality_residuals` recomputes residuals from the program.
 """
 
 from __future__ import annotations
@@ -13,28 +13,28 @@ import numpy as np
 
 from symbolic.array import Array, Figure
 
-TOLERANCE = 1e-6
+OPTIMALITY_TOLERANCE = 1e-6
 """Tolerance of the optimality conditions, in a program's scaled rows and variables."""
 
-FEASIBLE = 1e-3
+FEASIBLE_ROW = 1e-3
 """Lack of a scaled row at which an iterate counts as feasible."""
 
-PATIENCE = 3
+FEASIBILITY_PATIENCE = 3
 """Times the wanted number of iterations that a solve may take to become feasible: cut off wherever
 it stands, it ends in an obstacle more often than not."""
 
-MOST_SECONDS = 60.0
+MOST_SOLVE_SECONDS = 60.0
 """Wall time after which a solve is given up. Generous, because a result that depends on it cannot
 be repeated."""
 
-NEAR = 0.1
+ACTIVE_SLACK = 0.1
 """Slack of inequalities that may have a multiplier."""
 
-TURNS = 30
+NNLS_ITERATIONS = 30
 """Iterations of the least squares for every inequality."""
 
 
-class Program(Protocol):
+class NonlinearProgram(Protocol):
     """A nonlinear program: minimise cost . z within bounds, every row at least zero.
 
     Attributes:
@@ -99,11 +99,13 @@ class Answer:
     iterations: int
 
 
-Solve = Callable[[Program, int, float], Answer]
+Solve = Callable[[NonlinearProgram, int, float], Answer]
 """A solver: from a program, the wanted number of iterations and the barrier at the start."""
 
 
-def optimality(program: Program, z: Array, bounds: tuple[Array, Array] | None = None) -> Residuals:
+def optimality_residuals(
+    program: NonlinearProgram, z: Array, bounds: tuple[Array, Array] | None = None
+) -> Residuals:
     """Residuals at z with the multipliers that satisfy the conditions best there.
 
     Args:
@@ -112,12 +114,12 @@ def optimality(program: Program, z: Array, bounds: tuple[Array, Array] | None = 
     low, high = bounds or (program.low, program.high)
     rows, slopes = program.rows(z)
     slacks = np.abs(rows), np.abs(z - low), np.abs(high - z)
-    at_bounds, y = estimated(program.cost, slopes, slacks)
+    at_bounds, y = estimate_multipliers(program.cost, slopes, slacks)
     return residuals(program, z, at_bounds, y, (low, high))
 
 
 def residuals(
-    program: Program, z: Array, at_bounds: Array, y: Array, bounds: tuple[Array, Array]
+    program: NonlinearProgram, z: Array, at_bounds: Array, y: Array, bounds: tuple[Array, Array]
 ) -> Residuals:
     """Residuals of the optimality conditions at z with the given multipliers.
 
@@ -136,7 +138,9 @@ def residuals(
     )
 
 
-def estimated(cost: Array, A: Array, slacks: tuple[Array, Array, Array]) -> tuple[Array, Array]:
+def estimate_multipliers(
+    cost: Array, A: Array, slacks: tuple[Array, Array, Array]
+) -> tuple[Array, Array]:
     """Multipliers that satisfy the conditions of optimality best, in least squares: better than
     an iteration's own where it was cut off.
 
@@ -152,7 +156,7 @@ def estimated(cost: Array, A: Array, slacks: tuple[Array, Array, Array]) -> tupl
 
     n, m = len(cost), len(A)
     slack = np.concatenate(slacks)
-    near = np.flatnonzero(slack < NEAR)
+    near = np.flatnonzero(slack < ACTIVE_SLACK)
     found = np.zeros(len(slack))
     if not len(near):
         # Nothing can have a multiplier; SciPy ends the process at a matrix without columns.
@@ -161,7 +165,7 @@ def estimated(cost: Array, A: Array, slacks: tuple[Array, Array, Array]) -> tupl
     conditions = np.vstack([slopes, np.diag(np.abs(slack[near]))])
     try:
         right = np.concatenate([cost, np.zeros(len(near))])
-        found[near], _ = nnls(conditions, right, maxiter=TURNS * len(near))
+        found[near], _ = nnls(conditions, right, maxiter=NNLS_ITERATIONS * len(near))
     except RuntimeError:
         # Its iterations ran out: no multipliers, which the residuals tell.
         pass

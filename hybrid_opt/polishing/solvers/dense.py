@@ -22,21 +22,21 @@ import numpy as np
 
 from hybrid_opt.polishing.native import native
 from hybrid_opt.polishing.solvers.base import (
-    FEASIBLE,
-    PATIENCE,
-    TOLERANCE,
+    FEASIBILITY_PATIENCE,
+    FEASIBLE_ROW,
+    OPTIMALITY_TOLERANCE,
     Answer,
-    Program,
+    NonlinearProgram,
 )
 
 
-def dense(program: Program, iterations: int, barrier: float) -> Answer:
+def dense(program: NonlinearProgram, iterations: int, barrier: float) -> Answer:
     """Solve a program, see `solvers.base.Solve`.
 
     Raises:
         BridgeError: the compiled part is missing.
     """
-    given = program, barrier, iterations, PATIENCE, TOLERANCE, FEASIBLE
+    given = program, barrier, iterations, FEASIBILITY_PATIENCE, OPTIMALITY_TOLERANCE, FEASIBLE_ROW
     z, message, taken = native().dense(*given)
     z = np.clip(z, program.low, program.high)
     usable = bool(np.isfinite(z).all())

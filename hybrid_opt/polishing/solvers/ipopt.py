@@ -9,12 +9,12 @@ import casadi as ca
 import numpy as np
 
 from hybrid_opt.polishing.solvers.base import (
-    FEASIBLE,
-    MOST_SECONDS,
-    PATIENCE,
-    TOLERANCE,
+    FEASIBILITY_PATIENCE,
+    FEASIBLE_ROW,
+    MOST_SOLVE_SECONDS,
+    OPTIMALITY_TOLERANCE,
     Answer,
-    Program,
+    NonlinearProgram,
 )
 from symbolic.array import Array
 
@@ -36,8 +36,8 @@ OPTIONS: dict[str, Any] = {
     "calc_f": False,
     "calc_g": False,
     "error_on_fail": False,
-    "ipopt.tol": TOLERANCE,
-    "ipopt.max_wall_time": MOST_SECONDS,
+    "ipopt.tol": OPTIMALITY_TOLERANCE,
+    "ipopt.max_wall_time": MOST_SOLVE_SECONDS,
 }
 
 Shapes = Mapping[str, ca.Sparsity]
@@ -83,7 +83,7 @@ class _Callback(ca.Callback):  # type: ignore[misc]  # CasADi has no types
         return self._evaluate(*[argument.full().ravel() for argument in arguments])
 
 
-def _functions(program: Program, wanted: int) -> tuple[_Callback, dict[str, _Callback]]:
+def _functions(program: NonlinearProgram, wanted: int) -> tuple[_Callback, dict[str, _Callback]]:
     """A program as nlpsol wants it, and its derivatives with what ends a solve.
 
     A solve that is cut off wherever it stands ends in an obstacle more often than not: it ends
@@ -109,7 +109,7 @@ def _functions(program: Program, wanted: int) -> tuple[_Callback, dict[str, _Cal
     def stop(_: Array, __: Array, g: Array, *___: Array) -> list[Any]:
         nonlocal iterations
         iterations += 1
-        return [float(iterations > wanted and g.min() >= -FEASIBLE)]
+        return [float(iterations > wanted and g.min() >= -FEASIBLE_ROW)]
 
     slopes = {"g": g, "jac_g_x": ca.Sparsity.dense(m, n)}
     bent = {"triu_hess_gamma_x_x": upper}
@@ -122,10 +122,10 @@ def _functions(program: Program, wanted: int) -> tuple[_Callback, dict[str, _Cal
     }
 
 
-def ipopt(program: Program, iterations: int, barrier: float) -> Answer:
+def ipopt(program: NonlinearProgram, iterations: int, barrier: float) -> Answer:
     """Solve a program with IPOPT; arguments as of `solvers.base.Solve`."""
     nlp, functions = _functions(program, iterations)
-    limits = {"ipopt.mu_init": barrier, "ipopt.max_iter": PATIENCE * iterations}
+    limits = {"ipopt.mu_init": barrier, "ipopt.max_iter": FEASIBILITY_PATIENCE * iterations}
     solver = ca.nlpsol("polish", "ipopt", nlp, OPTIONS | functions | limits)
     try:
         found = solver(

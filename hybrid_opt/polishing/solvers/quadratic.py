@@ -31,16 +31,16 @@ from scipy.linalg import eigvalsh_tridiagonal, lapack
 from hybrid_opt.polishing.native import native
 from symbolic.array import Array
 
-TOLERANCE = 1e-8
+QUADRATIC_TOLERANCE = 1e-8
 """Tolerance of the conditions, of their residuals over their terms, and of the objective."""
 
-CHECKED = 1e-5
+ACCEPTED_RESIDUAL = 1e-5
 """Tolerance with which an answer is accepted; of the objective, over its own terms."""
 
 LEAST_CURVATURE = 1e-6
 """Curvature by the path that is left where the Lagrangian has less."""
 
-TURNED = 0.1
+NEGATIVE_CURVATURE_SHARE = 0.1
 """Share of a negative curvature that is kept, positive: enough to be convex, and little enough that
 the box of trust ends steps along it."""
 
@@ -71,7 +71,7 @@ class BorderedMatrix:
             self.off + weight * other.off,
         )
 
-    def raised(self, by: Array) -> BorderedMatrix:
+    def add_diagonal(self, by: Array) -> BorderedMatrix:
         """The matrix with (k + n,) added to its diagonal."""
         k = len(self.corner)
         corner = self.corner.copy()
@@ -119,7 +119,7 @@ class BorderedRows:
     def __len__(self) -> int:
         return len(self.border)
 
-    def of(self, chosen: NDArray[np.bool_] | NDArray[np.intp]) -> BorderedRows:
+    def select(self, chosen: NDArray[np.bool_] | NDArray[np.intp]) -> BorderedRows:
         """Some of the rows."""
         border, left, right = (part[chosen] for part in (self.border, self.left, self.right))
         return BorderedRows(border, self.column[chosen], left, right, self.n_chain)
@@ -138,7 +138,7 @@ class BorderedRows:
         beside = self.left * chain[self.column] + self.right * chain[self.column + 1]
         return np.asarray(self.border @ border + beside)
 
-    def pulled(self, y: Array) -> Array:
+    def transpose_times(self, y: Array) -> Array:
         """(k + n,) A^T y."""
         n = self.n_chain
         chain = _summed(self.column, self.left * y, n)
@@ -198,11 +198,11 @@ class QuadraticAnswer:
     bounds: Array
     ending: Ending
 
-    def holds(self, program: QuadraticProgram) -> bool:
+    def satisfies_optimality(self, program: QuadraticProgram) -> bool:
         """Whether it satisfies the conditions of optimality, recomputed."""
         if not all(np.isfinite(part).all() for part in (self.d, self.rows, self.bounds)):
             return False
-        bend, pull = program.H.times(self.d), program.A.pulled(self.rows)
+        bend, pull = program.H.times(self.d), program.A.transpose_times(self.rows)
         slope = bend + program.g + pull + self.bounds
         room = program.b - program.A.times(self.d)
         to_low, to_high = self.d - program.low, program.high - self.d
@@ -213,7 +213,7 @@ class QuadraticAnswer:
         products = np.abs(self.rows) @ np.abs(room) + np.abs(self.bounds) @ np.abs(to_bound)
         negative = -self.rows.min(initial=0.0)
         worst = max(np.abs(slope).max() / size, violated, products / worth, negative)
-        return bool(worst <= CHECKED)
+        return bool(worst <= ACCEPTED_RESIDUAL)
 
 
 def solve_quadratic(program: QuadraticProgram) -> QuadraticAnswer | None:
@@ -223,17 +223,17 @@ def solve_quadratic(program: QuadraticProgram) -> QuadraticAnswer | None:
     Raises:
         BridgeError: the compiled part is missing.
     """
-    found = solve_inside(program)
+    found = solve_interior_point(program)
     if found.ending == "infeasible":
         return None
-    if not found.holds(program):
+    if not found.satisfies_optimality(program):
         found = solve_by_clarabel(program)
-    return found if found.holds(program) else None
+    return found if found.satisfies_optimality(program) else None
 
 
-def solve_inside(program: QuadraticProgram) -> QuadraticAnswer:
+def solve_interior_point(program: QuadraticProgram) -> QuadraticAnswer:
     """Iterate until the conditions hold, or multipliers prove that they never do."""
-    return QuadraticAnswer(*native().quadratic(program, TOLERANCE))
+    return QuadraticAnswer(*native().quadratic(program, QUADRATIC_TOLERANCE))
 
 
 def solve_by_clarabel(program: QuadraticProgram) -> QuadraticAnswer:
@@ -246,7 +246,7 @@ def solve_by_clarabel(program: QuadraticProgram) -> QuadraticAnswer:
     rows = sparse.vstack([sparse.csc_matrix(A), eye, -eye], format="csc")
     settings = clarabel.DefaultSettings()
     settings.verbose = False
-    settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = TOLERANCE
+    settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = QUADRATIC_TOLERANCE
     settings.max_iter = 60
     found = clarabel.DefaultSolver(
         sparse.csc_matrix(np.triu(program.H.dense())),
@@ -262,7 +262,7 @@ def solve_by_clarabel(program: QuadraticProgram) -> QuadraticAnswer:
     return QuadraticAnswer(np.array(found.x), z[:m], bounds, "solved" if solved else "failed")
 
 
-def convex(H: BorderedMatrix, A: BorderedRows, b: Array) -> tuple[BorderedMatrix, Array]:
+def convexify(H: BorderedMatrix, A: BorderedRows, b: Array) -> tuple[BorderedMatrix, Array]:
     """A convex model of a Lagrangian that agrees with it where active rows hold.
 
     Active rows are added as squares (A d - b)^2 until the block of the chain is definite, and what
@@ -287,13 +287,15 @@ def convex(H: BorderedMatrix, A: BorderedRows, b: Array) -> tuple[BorderedMatrix
     else:
         weight /= 10.0
         lift = np.full(len(total.diagonal), 1e-6 * scale - min(lowest, 0.0))
-        total = total.raised(np.concatenate([np.zeros(len(total.corner)), lift]))
+        total = total.add_diagonal(np.concatenate([np.zeros(len(total.corner)), lift]))
     *chain, _ = lapack.dpttrf(total.diagonal, total.off)
     follow = np.asarray(lapack.dpttrs(*chain, total.beside)[0])
     reduced = total.corner - total.beside.T @ follow
     values, vectors = np.linalg.eigh((reduced + reduced.T) / 2.0)
-    lifted = np.maximum(np.where(values < 0.0, -TURNED * values, values), LEAST_CURVATURE)
+    lifted = np.maximum(
+        np.where(values < 0.0, -NEGATIVE_CURVATURE_SHARE * values, values), LEAST_CURVATURE
+    )
     corner = total.corner + (vectors * (lifted - values)) @ vectors.T
     corner = (corner + corner.T) / 2.0
     model = BorderedMatrix(corner, total.beside, total.diagonal, total.off)
-    return model, -weight * A.pulled(b)
+    return model, -weight * A.transpose_times(b)

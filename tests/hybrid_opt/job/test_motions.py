@@ -12,7 +12,7 @@ from hybrid_opt.job.motions import PEAK_RATE, at_even_steps, rise, unit_squeeze
 from hybrid_opt.job.smooth import acceleration_at_ends, rests_at_ends, without_jumps
 from hybrid_opt.robust.squeeze import pressed_together
 from hybrid_opt.timing.jerk import time_with_jerk
-from hybrid_opt.timing.limits import judged, worst
+from hybrid_opt.timing.limits import check_limits, most_used
 from hybrid_opt.timing.records import JerkLimits, Timing, TimingLimits
 from hybrid_opt.timing.solve import time_path
 from symbolic.path.spline import path_basis
@@ -111,14 +111,14 @@ def test_it_is_slowed_no_more_than_a_limit_asks_for(force: float, width: float) 
     model, limits = rack().timing_model, TimingLimits(force=force)
     timing = fast(force)
     found = without_jumps(model, timing, None, width)
-    use = judged(model, found.driven, limits).use
+    use = check_limits(model, found.driven, limits).use
     assert found.use == use
     assert 0.5 * timing.slowed < found.slowed < timing.slowed
-    assert 1.0 - 1e-3 < worst(use).ratio <= 1.0
+    assert 1.0 - 1e-3 < most_used(use).ratio <= 1.0
 
 
 def test_a_timing_at_rest_stays_as_it_is() -> None:
-    limits = JerkLimits.of(rack().workcell)
+    limits = JerkLimits.from_workcell(rack().workcell)
     assert limits is not None
     once = time_with_jerk(
         rack().timing_model, rack().initial, TimingLimits(reference_speed=True), limits

@@ -62,7 +62,7 @@ def test_pads_that_do_not_face_one_another_keep_limits_on_jerk() -> None:
     jerk = np.diff(timing.driven.side_by_side("q_second"), axis=0)
     jerk /= np.diff(timing.driven.time)[:, None]
     assert 45.0 < np.abs(jerk).max() <= 50.0 * 1.005
-    jerk_limits = JerkLimits.of(cell.workcell)
+    jerk_limits = JerkLimits.from_workcell(cell.workcell)
     assert without_jumps(cell.timing_model, timing, jerk_limits) is timing, "as jobs drive it"
 
 

@@ -11,8 +11,8 @@ from hybrid_opt.compiled_cell import CompiledCell
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES
 from hybrid_opt.polishing.cell import PolishFunctions, SmoothCell, polish_functions
-from hybrid_opt.polishing.drive import DriveWay
-from hybrid_opt.polishing.drive_front import second_opinion
+from hybrid_opt.polishing.drive import DriveStepMethod
+from hybrid_opt.polishing.drive_front import recheck_timing
 from hybrid_opt.polishing.point import Solution
 from hybrid_opt.polishing.polisher import Polisher
 from hybrid_opt.polishing.settings import DrivableSettings, PolishSettings
@@ -59,20 +59,20 @@ def polisher() -> Polisher:
     return Polisher(evaluator(), PolishSettings(attempts=4, drivable=settings), functions())
 
 
-def way() -> DriveWay:
+def drive_method() -> DriveStepMethod:
     """Of the drivable rack."""
-    return way_of(polisher())
+    return drive_method_of(polisher())
 
 
-def way_of(owner: Polisher) -> DriveWay:
+def drive_method_of(owner: Polisher) -> DriveStepMethod:
     """How a polisher of drivable carries polishes one."""
-    assert owner.way is not None
-    return owner.way
+    assert owner.drive_method is not None
+    return owner.drive_method
 
 
-def solved(by: DriveWay, x: Array, rounds: int = 40) -> Solution:
+def solved(by: DriveStepMethod, x: Array, rounds: int = 40) -> Solution:
     """Some rounds of a point from a decision vector."""
-    return by.climb(x).go_on(rounds)
+    return by.solve_from(x).run(rounds)
 
 
 def disbelieved(driver: CandidateDriver | None, model: TimingModel, x: Array) -> str:
@@ -82,10 +82,10 @@ def disbelieved(driver: CandidateDriver | None, model: TimingModel, x: Array) ->
     found, other = driver.timings(x[None])[0], time_path(model, x, driver.limits(float(x[-1])))
     if not other.ok or abs(found.duration / other.duration - 1.0) > 5e-3:
         return f"{found.duration:.3f} s, by the independent timing {other.duration:.3f} s"
-    return second_opinion(driver, model, x)
+    return recheck_timing(driver, model, x)
 
 
-def require_told(told: list[tuple[int, int]], attempts: int) -> None:
+def require_progress(told: list[tuple[int, int]], attempts: int) -> None:
     """Attempts done and in all as a polish tells them: never more than are expected, each once."""
     done, total = np.transpose(told)
     assert np.unique(done).tolist() == list(range(attempts + 1))

@@ -17,12 +17,17 @@ from codegen.compiled import CompiledFunction
 from codegen.interpreted import InterpretedFunction
 from hybrid_opt.compiled_cell import CompiledCell
 from hybrid_opt.polishing import cell as cell_module
-from hybrid_opt.polishing.carry import CarryReader, Distances, dipped, lowest
+from hybrid_opt.polishing.carry import (
+    CarryReader,
+    Distances,
+    interpolate_minima,
+    local_minima_below,
+)
 from hybrid_opt.polishing.cell import PLACE_SPACING, Grid, PolishFunctions
-from hybrid_opt.polishing.constraints.active import ActiveSet
+from hybrid_opt.polishing.constraints.active import RowSelector
 from symbolic.array import Array
 from symbolic.records.task import initial_decision
-from symbolic.smooth.places import ORDERS, Clearance, PlaceSymbols, row_function
+from symbolic.smooth.places import ORDERS, Clearance, PathPointSymbols, row_function
 from tests.hybrid_opt.polishing.cells import smooth_cell
 from tests.hybrid_opt.polishing.test_force_front import evaluator
 from tests.symbolic.cells import hand_cell, rack_cell
@@ -72,25 +77,25 @@ def test_limits_are_kept_as_all_distances_say(seed: int, limit: float) -> None:
     judge, lazy = DistanceOracle(seed), DistanceOracle(seed)
     limits = np.full(PAIRS, limit)
     distances = judge.distances()
-    close = distances.lowered < limits
+    close = distances.interpolated_clearance < limits
     kept = not (distances.at(close)[close] < limit).any()
-    assert lazy.distances().keep(limits) == kept
+    assert lazy.distances().exceed(limits) == kept
     assert lazy.asked <= judge.asked
 
 
 @pytest.mark.parametrize("spread", [0.01, 0.05, 0.2])
 def test_a_step_violates_something_where_violated_rows_say_so(spread: float) -> None:
     cell = smooth_cell(evaluator())
-    task, active, reader = cell.task, ActiveSet(cell), CarryReader(cell)
+    task, active, reader = cell.task, RowSelector(cell), CarryReader(cell)
     known, rng = reader.read(initial_decision(task)), np.random.default_rng(7)
     verdicts = set()
     for _ in range(12):
         away = rng.uniform(-spread, spread, task.n_var) * (task.upper - task.lower)
         x = np.clip(initial_decision(task) + away, task.lower, task.upper)
         step = reader.read(x)
-        if step.is_followed:
-            violates = active.violates(step, known, ())
-            assert violates == bool(active.violated(reader.read(x), known, ()))
+        if step.is_reachable:
+            violates = active.has_violation(step, known, ())
+            assert violates == bool(active.violated_rows(reader.read(x), known, ()))
             verdicts.add(violates)
     assert verdicts
 
@@ -100,7 +105,7 @@ def test_strided_places_are_below_the_limit_and_hold_the_lowest(
     stride: int, values: list[float]
 ) -> None:
     array = np.array(values)
-    least, strided = lowest(array, 0.0), lowest(array, 0.0, stride)
+    least, strided = local_minima_below(array, 0.0), local_minima_below(array, 0.0, stride)
     assert np.all(array[strided] < 0.0)
     assert set(least) <= set(strided)
     assert bool(least) == bool((array < 0.0).any())
@@ -110,7 +115,7 @@ def test_strided_places_are_below_the_limit_and_hold_the_lowest(
 
 def test_the_dip_between_two_places_is_that_of_the_lines_from_both_sides() -> None:
     height = 0.001 + 3e-3 * np.abs(np.arange(120) - 50.4)
-    low = dipped(height[:, None])[:, 0]
+    low = interpolate_minima(height[:, None])[:, 0]
     np.testing.assert_allclose(low[50:52], 0.001, atol=1e-12)
     # Next to the kink the estimate errs to the safe side.
     assert np.all(low <= height)
@@ -126,7 +131,7 @@ def test_a_row_compiled_on_demand_is_the_interpreted_one_and_is_kept(
     pair = next(k for k in range(99) if k not in made.separable)
     row = Clearance(pair, int(compiled.geometry.columns[pair]))
     again = PolishFunctions(CompiledCell(rack_cell(), Cache(tmp_path)), {})
-    symbols = PlaceSymbols(compiled.bodies)
+    symbols = PathPointSymbols(compiled.bodies)
     rng = np.random.default_rng(0)
     for order in ORDERS:
         function = made.row(row, order)

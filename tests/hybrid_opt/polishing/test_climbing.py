@@ -12,21 +12,21 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hybrid_opt.polishing.carry import PlacedCarry
-from hybrid_opt.polishing.constraints.active import KEPT, ActiveSet, LearnedRows
+from hybrid_opt.polishing.constraints.active import ACTIVE_ROW_LIFETIME, RowSelector, WorkingSet
 from hybrid_opt.polishing.constraints.distances import Gaps, edges, passing, separation
 from hybrid_opt.polishing.point import (
-    LARGEST,
-    Climb,
-    ClimbPoint,
+    LARGEST_RADIUS,
+    Iterate,
     Step,
-    StepVerdict,
+    StepEvaluation,
+    StepMethod,
     TrustRegion,
-    Way,
+    TrustRegionSolve,
 )
-from hybrid_opt.polishing.rows import PlaceRow, Row
+from hybrid_opt.polishing.rows import PathRow, Row
 from hybrid_opt.polishing.solvers.base import UNKNOWN
 from symbolic.array import Array
-from symbolic.smooth.passage import Passing, Separation
+from symbolic.smooth.passage import AxisSwitchGap, SeparatingAxisGap
 from symbolic.smooth.places import Clearance
 
 LEAST = 1e-3
@@ -34,24 +34,24 @@ LEAST = 1e-3
 
 def test_it_grows_after_two_steps_in_a_row_that_it_stopped() -> None:
     region = TrustRegion(0.5, LEAST)
-    region.taken(0.5)
+    region.on_accept(0.5)
     assert region.radius == 0.5
-    region.taken(0.5)
+    region.on_accept(0.5)
     assert region.radius == 1.0
-    region.refused(learned=True)
-    region.taken(1.0)
+    region.on_reject(is_new=True)
+    region.on_accept(1.0)
     assert region.radius == 1.0
 
 
 def test_a_promised_gain_tells_at_once_whether_the_model_holds() -> None:
     region = TrustRegion(0.5, LEAST)
-    region.taken(0.5, kept=0.5)
+    region.on_accept(0.5, reduction_ratio=0.5)
     assert region.radius == 0.5
-    region.taken(0.5, kept=0.9)
+    region.on_accept(0.5, reduction_ratio=0.9)
     assert region.radius == 1.0
-    region.taken(0.1, kept=2.0)
+    region.on_accept(0.1, reduction_ratio=2.0)
     assert region.radius == 1.0
-    region.taken(0.1, kept=0.1)
+    region.on_accept(0.1, reduction_ratio=0.1)
     assert region.radius == 0.5
 
 
@@ -61,107 +61,109 @@ def test_it_never_exceeds_its_largest_and_is_spent_at_last(events: list[str]) ->
     for event in events:
         match event:
             case "lost":
-                region.lost()
+                region.on_failed_subproblem()
             case "refused":
-                region.refused(learned=False)
+                region.on_reject(is_new=False)
             case "barren":
-                region.barren(region.radius / 2.0)
+                region.on_no_improvement(region.radius / 2.0)
             case _:
-                region.taken(region.radius)
-        assert 0.0 < region.radius <= LARGEST
+                region.on_accept(region.radius)
+        assert 0.0 < region.radius <= LARGEST_RADIUS
     for _ in range(20):
-        region.lost()
-    assert region.is_spent
+        region.on_failed_subproblem()
+    assert region.is_exhausted
 
 
 NOTHING = cast(PlacedCarry, None)
 NEAR, FAR, GAP = (
-    PlaceRow(Clearance(0, 0), 3),
-    PlaceRow(Clearance(0, 0), 9),
-    PlaceRow(Separation(1, 2), 5),
+    PathRow(Clearance(0, 0), 3),
+    PathRow(Clearance(0, 0), 9),
+    PathRow(SeparatingAxisGap(1, 2), 5),
 )
 HALF = np.array([0.5, 2.0])
 HERE, THERE = np.zeros(2), np.array([0.1, 0.0])
 """A path, and one that is 0.2 half ranges away."""
 
 
-class Rows:
+class RowsOfOne:
     """Requires 1 of every row and demands 3; rows of clearances last."""
 
-    def near(self, *_: Any) -> set[Row]:
+    def near_rows(self, *_: Any) -> set[Row]:
         return {NEAR}
 
-    def required(self, carry: PlacedCarry, rows: Iterable[Row], lenient: bool) -> dict[Row, float]:
+    def required_values(
+        self, carry: PlacedCarry, rows: Iterable[Row], is_relaxed: bool
+    ) -> dict[Row, float]:
         return dict.fromkeys(rows, 1.0)
 
-    def demanded(
+    def tightened_bounds(
         self, carry: PlacedCarry, known: PlacedCarry, rows: Iterable[Row], before: Mapping[Row, Any]
     ) -> dict[Row, float]:
         return dict.fromkeys(rows, 3.0)
 
-    def lasting(self, row: Row) -> bool:
+    def persists(self, row: Row) -> bool:
         return row != GAP
 
-    def violated(self, carry: Any, known: Any, asked: Any) -> set[Row]:
+    def violated_rows(self, carry: Any, known: Any, asked: Any) -> set[Row]:
         return {FAR} if carry.is_refused else set()
 
 
-class Foretold(Way[ClimbPoint, Step]):
+class Foretold(StepMethod[Iterate, Step]):
     """Steps with known gains of a level of 1; without one a step is refused."""
 
     least_radius = 0.0
 
     def __init__(self, gains: list[float | None]) -> None:
-        self.half, self.active, self._gains = HALF, cast(ActiveSet, Rows()), iter(gains)
+        self.half, self.active, self._gains = HALF, cast(RowSelector, RowsOfOne()), iter(gains)
         self.cell = cast(Any, SimpleNamespace(task=SimpleNamespace(lower=-HALF, upper=HALF)))
 
-    def start(self, x: Array) -> ClimbPoint:
-        return ClimbPoint(x, NOTHING, 1.0)
+    def evaluate(self, x: Array) -> Iterate:
+        return Iterate(x, NOTHING, 1.0)
 
-    def propose(self, best: ClimbPoint, required: Mapping[Row, float], radius: float) -> Step:
+    def propose_step(self, best: Iterate, required: Mapping[Row, float], radius: float) -> Step:
         return Step(length=0.1, required=required, residuals=lambda _: UNKNOWN, iterations=1)
 
-    def judge(self, best: ClimbPoint, step: Step) -> StepVerdict[ClimbPoint]:
+    def evaluate_step(self, best: Iterate, step: Step) -> StepEvaluation[Iterate]:
         gain = next(self._gains)
-        carry = cast(PlacedCarry, SimpleNamespace(is_refused=gain is None, is_followed=True))
-        return StepVerdict(ClimbPoint(best.x, carry, best.level - (gain or 0.0)), closer=True)
+        carry = cast(PlacedCarry, SimpleNamespace(is_refused=gain is None, is_reachable=True))
+        return StepEvaluation(Iterate(best.x, carry, best.level - (gain or 0.0)), improved=True)
 
-    def along(self, *_: Any) -> None:
+    def evaluate_fraction(self, *_: Any) -> None:
         return None
 
 
 def test_rounds_that_bring_little_end_a_climb_after_its_first_step() -> None:
-    climb = Climb(Foretold([None, None, None, 0.1, 1e-5, 1e-5, 0.1]), HERE, 0.2)
-    assert climb.go_on(7, least_gain=1e-3).rounds == 6
+    climb = TrustRegionSolve(Foretold([None, None, None, 0.1, 1e-5, 1e-5, 0.1]), HERE, 0.2)
+    assert climb.run(7, least_gain=1e-3).rounds == 6
     assert climb.best.level == pytest.approx(0.9 - 2e-5)
 
 
-def memory() -> LearnedRows:
-    return LearnedRows(cast(ActiveSet, Rows()), HALF)
+def memory() -> WorkingSet:
+    return WorkingSet(cast(RowSelector, RowsOfOne()), HALF)
 
 
-def required(known: LearnedRows, radius: float = 0.2) -> dict[Row, float]:
-    return known.required(NOTHING, (True, True), HERE, radius, lenient=False)
+def required(known: WorkingSet, radius: float = 0.2) -> dict[Row, float]:
+    return known.required_values(NOTHING, (True, True), HERE, radius, is_relaxed=False)
 
 
 @pytest.mark.parametrize(("radius", "share"), [(0.4, 1.0), (0.2, 1.0), (0.1, 0.5), (0.0, 0.0)])
 def test_what_a_step_taught_counts_as_far_as_the_box_reaches(radius: float, share: float) -> None:
     known = memory()
-    assert known.refuse(NOTHING, NOTHING, THERE, [FAR], {})
+    assert known.learn_from_rejection(NOTHING, NOTHING, THERE, [FAR], {})
     assert required(known, radius) == pytest.approx({NEAR: 1.0, FAR: 1.0 + 2.0 * share})
 
 
 def test_rows_that_pressed_stay_for_some_programs_while_steps_are_short() -> None:
     known = memory()
-    known.press([FAR])
-    for _ in range(KEPT - 1):
-        known.press([])
-        known.move(is_short=True)
+    known.mark_active([FAR])
+    for _ in range(ACTIVE_ROW_LIFETIME - 1):
+        known.mark_active([])
+        known.on_new_best(keep_active_set=True)
         assert set(required(known)) == {NEAR, FAR}
-    known.press([])
+    known.mark_active([])
     assert set(required(known)) == {NEAR}
-    known.press([GAP])
-    known.move(is_short=False)
+    known.mark_active([GAP])
+    known.on_new_best(keep_active_set=False)
     assert set(required(known)) == {NEAR}
 
 
@@ -171,7 +173,7 @@ PLACES, LOW = 120, 0.06
 def v_shape(kink: float, height: float, slope: float = 3e-3) -> Gaps:
     """Two gaps that cross at a place: one falls, the other rises."""
     away = np.arange(PLACES) - kink
-    return Gaps.of(np.column_stack([height - slope * away, height + slope * away]))
+    return Gaps.from_values(np.column_stack([height - slope * away, height + slope * away]))
 
 
 @given(kink=st.floats(20.0, 100.0), height=st.floats(-0.02, LOW - 0.01))
@@ -181,10 +183,10 @@ def test_where_an_edge_is_passed_there_is_one_kink(kink: float, height: float) -
     assert abs(place - kink) <= 1.0
     assert before <= kink <= before + 1
     row = passing(7, gaps, before, place)
-    assert row == PlaceRow(Passing(7, 0, 1), place)
+    assert row == PathRow(AxisSwitchGap(7, 0, 1), place)
 
 
 def test_a_separation_is_of_the_largest_gap() -> None:
     gaps = v_shape(50.4, 0.01)
-    assert separation(3, gaps, 20) == PlaceRow(Separation(3, 0), 20)
-    assert separation(3, gaps, 80) == PlaceRow(Separation(3, 1), 80)
+    assert separation(3, gaps, 20) == PathRow(SeparatingAxisGap(3, 0), 20)
+    assert separation(3, gaps, 80) == PathRow(SeparatingAxisGap(3, 1), 80)

@@ -11,7 +11,7 @@ import pytest
 from hybrid_opt.compiled_cell import CompiledCell
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES
-from hybrid_opt.polishing.drive import DriveWay
+from hybrid_opt.polishing.drive import DriveStepMethod
 from hybrid_opt.polishing.point import Solution
 from hybrid_opt.polishing.polisher import Polisher
 from hybrid_opt.polishing.settings import PolishSettings
@@ -22,12 +22,12 @@ from symbolic.array import Array
 from tests.hybrid_opt.polishing.cells import (
     disbelieved,
     drivable_rack,
+    drive_method,
+    drive_method_of,
     evaluator,
     solved,
     start,
     start_in,
-    way,
-    way_of,
 )
 from tests.hybrid_opt.polishing.transcription import (
     INTERVALS,
@@ -39,7 +39,7 @@ from tests.hybrid_opt.polishing.transcription import (
 
 @cache
 def answer(force: float) -> Solution:
-    return solved(way(), start(force))
+    return solved(drive_method(), start(force))
 
 
 @cache
@@ -81,18 +81,18 @@ def test_most_points_end_stationary() -> None:
 
 def test_a_start_that_cannot_be_driven_is_told() -> None:
     x = np.append(evaluator().lower[:-1], 52.0)
-    assert not np.isfinite(way().paths.timed(np.append(x[:-1], 52.0)).duration)
-    solution = solved(way(), x)
+    assert not np.isfinite(drive_method().paths.fastest_timing(np.append(x[:-1], 52.0)).duration)
+    solution = solved(drive_method(), x)
     assert not solution.usable
     assert solution.message == "the start cannot be judged"
     np.testing.assert_array_equal(solution.x, x)
 
 
 def test_a_climb_that_is_left_goes_on_as_if_it_had_not_been() -> None:
-    whole, parts = way().climb(start(55.0)), way().climb(start(55.0))
-    whole.go_on(6)
-    parts.go_on(2)
-    parts.go_on(4)
+    whole, parts = drive_method().solve_from(start(55.0)), drive_method().solve_from(start(55.0))
+    whole.run(6)
+    parts.run(2)
+    parts.run(4)
     np.testing.assert_array_equal(whole.best.x, parts.best.x)
     assert whole.solution.rounds == parts.solution.rounds
 
@@ -110,9 +110,9 @@ def compiled() -> CompiledCell:
 
 
 @cache
-def open_way() -> DriveWay:
+def open_way() -> DriveStepMethod:
     evaluator = CandidateEvaluator(compiled().workcell, DRIVABLE_OBJECTIVES, compiled=compiled())
-    return way_of(Polisher(evaluator, PolishSettings()))
+    return drive_method_of(Polisher(evaluator, PolishSettings()))
 
 
 @cache
@@ -136,7 +136,7 @@ def guess(x: Array, force: float) -> Guess:
 
 def compiled_duration(path: Array, force: float) -> float:
     """Of the compiled timing with every limit, on its finer grid."""
-    return open_way().paths.timed(np.append(path, force)).duration
+    return open_way().paths.fastest_timing(np.append(path, force)).duration
 
 
 @pytest.mark.slow

@@ -20,13 +20,13 @@ from symbolic.errors import SettingsError
 from symbolic.records.task import initial_decision
 from tests.hybrid_opt.polishing.cells import (
     drivable_rack,
+    drive_method,
     evaluator,
     functions,
     polisher,
-    require_told,
+    require_progress,
     start,
     tilted,
-    way,
 )
 
 BOUND = np.full(2, 1.1)
@@ -45,12 +45,12 @@ def polished() -> PolishedFront:
     return polisher().polish(
         starts(),
         np.random.default_rng(0),
-        tell=lambda done, total: TOLD.append((done, total)),
+        on_progress=lambda done, total: TOLD.append((done, total)),
     )
 
 
 def test_attempts_never_exceed_those_that_are_expected() -> None:
-    require_told(TOLD, len(polished().outcomes))
+    require_progress(TOLD, len(polished().outcomes))
 
 
 def test_the_front_dominates_more_than_before() -> None:
@@ -72,7 +72,7 @@ def test_a_polish_goes_on_where_it_was_interrupted() -> None:
 
 def fastest(paths: Array, forces: Array) -> Array:
     """(n,) [s] of any of some paths (k, n_path) within each force."""
-    judge = way().paths
+    judge = drive_method().paths
     return np.array([judge.durations(paths, float(force)).min() for force in forces])
 
 
@@ -92,8 +92,8 @@ def test_the_front_reaches_from_the_gentlest_end_and_is_nowhere_behind_the_hand_
 def test_known_paths_take_part() -> None:
     """Given a better path than all others, the front is nowhere behind it; given one that touches
     something, it does not notice."""
-    climb = way().climb(tilted(55.0))
-    climb.go_on(4)
+    climb = drive_method().solve_from(tilted(55.0))
+    climb.run(4)
     known = climb.best.x[None, :-1]
     assert evaluator().evaluate(climb.best.x).feasible[0]
     sunk = known.copy()

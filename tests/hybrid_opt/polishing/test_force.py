@@ -18,23 +18,23 @@ from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.polishing.carry import CarryReader
 from hybrid_opt.polishing.force import (
     ForceProgram,
-    Target,
-    balance,
-    extreme,
+    Scalarisation,
+    balanced_scalarisation,
+    extreme_scalarisation,
     pascoletti_serafini,
 )
-from hybrid_opt.polishing.rows import ForceRow, Layout, PlaceRow, PressureRow, Row, Rows
+from hybrid_opt.polishing.rows import ConstraintRows, ForceRow, PathRow, PressureRow, Row, RowLayout
 from hybrid_opt.polishing.settings import FillSettings, PolishSettings
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.records.task import initial_decision
-from symbolic.smooth.passage import Passing, Separation
+from symbolic.smooth.passage import AxisSwitchGap, SeparatingAxisGap
 from symbolic.smooth.places import (
     Clearance,
     JointLimit,
-    PlaceConstraint,
-    PlaceSymbols,
-    Reach,
+    ManipulabilityLimit,
+    PathConstraint,
+    PathPointSymbols,
     closure_functions,
     closure_name,
     row_function,
@@ -46,7 +46,7 @@ from tests.symbolic.read.samples import RACK
 
 TRANSFER = RACK.with_name("transfer.toml")
 
-TARGET = Target(
+TARGET = Scalarisation(
     anchor=np.array([0.42, 0.43]),
     span=np.array([0.01, 0.02]),
     direction=np.array([1.0, 0.7]),
@@ -96,12 +96,17 @@ def program_of(judge: CandidateEvaluator) -> tuple[ForceProgram, Array]:
         PressureRow(1, 40),
         PressureRow(0, task.samples - 1),
     ]
-    kinds: list[PlaceConstraint] = [
+    kinds: list[PathConstraint] = [
         Clearance(pair, int(columns[pair])) for pair in (arms[0], arms[len(arms) // 2], arms[-1])
     ]
-    kinds += [Separation(box, 3), Passing(box, 5, 0), Reach(0), Reach(1)]
+    kinds += [
+        SeparatingAxisGap(box, 3),
+        AxisSwitchGap(box, 5, 0),
+        ManipulabilityLimit(0),
+        ManipulabilityLimit(1),
+    ]
     kinds += [JointLimit(0, 2, "lower"), JointLimit(1, 4, "upper")]
-    rows += [PlaceRow(kind, place) for kind in kinds for place in (44, 120, 222)]
+    rows += [PathRow(kind, place) for kind in kinds for place in (44, 120, 222)]
     program = ForceProgram(cell, dict.fromkeys(rows, 0.01), TARGET, carry, x, 1.0)
     z = program.start.copy()
     z[: task.n_var] += np.random.default_rng(0).uniform(-0.05, 0.05, task.n_var)
@@ -211,13 +216,13 @@ def test_pascoletti_serafini_is_better_only_where_neither_side_is_worse(shift: n
     if better:
         assert np.all(shift <= 0.0)
     # The level is the larger of both scaled shifts.
-    assert target.needed(shift / SPAN) == pytest.approx(float(np.max(shift / SPAN)))
+    assert target.least_level(shift / SPAN) == pytest.approx(float(np.max(shift / SPAN)))
 
 
 @given(shifts, shifts)
 def test_an_end_compares_one_objective_and_breaks_ties(a: np.ndarray, b: np.ndarray) -> None:
     for objective in (0, 1):
-        target = extreme(ANCHOR, SPAN, objective)
+        target = extreme_scalarisation(ANCHOR, SPAN, objective)
         if a[objective] < b[objective] - 1e-4:
             assert target.level(ANCHOR + a) < target.level(ANCHOR + b)
         a_tied = a.copy()
@@ -227,7 +232,7 @@ def test_an_end_compares_one_objective_and_breaks_ties(a: np.ndarray, b: np.ndar
 
 @given(shifts, shifts)
 def test_the_middle_compares_sums_and_the_larger(a: np.ndarray, b: np.ndarray) -> None:
-    target = balance(ANCHOR, np.full(2, 0.01))
+    target = balanced_scalarisation(ANCHOR, np.full(2, 0.01))
     first, second = ANCHOR + a, ANCHOR + b
     if a.sum() < b.sum() - 1e-4 and first.max() <= second.max():
         assert target.level(first) < target.level(second)
@@ -259,7 +264,7 @@ def test_settings_are_the_same_after_json() -> None:
     assert json.loads(json.dumps(settings)) == settings
 
 
-def written(constraint: PlaceConstraint, place: int, x: Array, near: tuple[Array, Array]) -> Array:
+def written(constraint: PathConstraint, place: int, x: Array, near: tuple[Array, Array]) -> Array:
     """A row's value, then its gradient by the decision vector: CasADi's functions one by one,
     joints following the box by the implicit function.
 
@@ -267,8 +272,10 @@ def written(constraint: PlaceConstraint, place: int, x: Array, near: tuple[Array
         near: both arms' joints near those that hold the box there.
     """
     cell, model = smooth_cell(evaluator(RACK)), evaluator(RACK).compiled.model
-    points, symbols = cell.waypoints(x), PlaceSymbols(model)
-    pose, rate = (basis[place] @ points for basis in (cell.grid.basis, cell.grid.rate_basis))
+    front_attempts, symbols = cell.waypoints(x), PathPointSymbols(model)
+    pose, rate = (
+        basis[place] @ front_attempts for basis in (cell.grid.basis, cell.grid.rate_basis)
+    )
     joints, follow = [], []
     for arm in (0, 1):
         closure = closure_functions(model, arm)[closure_name(arm, "first")]
@@ -298,11 +305,15 @@ def test_values_and_slopes_are_those_of_the_expressions() -> None:
     box, *_ = sorted(cell.functions.separable)
     arm = next(k for k in range(99) if k not in cell.functions.separable)
     column = int(cell.evaluator.checker.geometry.columns[arm])
-    kinds: list[PlaceConstraint] = [Clearance(arm, column), Reach(1), JointLimit(0, 2, "lower")]
-    kinds += [JointLimit(1, 4, "upper"), Separation(box, 3), Passing(box, 5, 0)]
-    listed: list[Row] = [PlaceRow(kind, place) for kind in kinds for place in (60, 150)]
-    layout = Layout(listed)
-    rows = Rows(cell, layout, carry.q)
+    kinds: list[PathConstraint] = [
+        Clearance(arm, column),
+        ManipulabilityLimit(1),
+        JointLimit(0, 2, "lower"),
+    ]
+    kinds += [JointLimit(1, 4, "upper"), SeparatingAxisGap(box, 3), AxisSwitchGap(box, 5, 0)]
+    listed: list[Row] = [PathRow(kind, place) for kind in kinds for place in (60, 150)]
+    layout = RowLayout(listed)
+    rows = ConstraintRows(cell, layout, carry.q)
     x = x + np.random.default_rng(0).uniform(-0.02, 0.02, len(x))
     values, slopes = rows.values(x), rows.slopes()
     for k, row in enumerate(layout.place_rows):

@@ -13,19 +13,24 @@ from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.indicators import metrics
 from hybrid_opt.indicators.metrics import front_of
 from hybrid_opt.polishing import polisher as polisher_module
-from hybrid_opt.polishing.force import ForceSolver, Reach, Target, pascoletti_serafini
+from hybrid_opt.polishing.force import ForceSolver, Scalarisation, SolveMode, pascoletti_serafini
 from hybrid_opt.polishing.force_front import (
-    FAR,
+    FAR_GAP,
     Chord,
     Edge,
-    between,
-    chord_of,
-    crept,
-    filling,
+    best_on_chord,
+    chord_across,
+    gap_attempt,
     gaps,
-    widest,
+    made_little_progress,
+    widest_untried_gap,
 )
-from hybrid_opt.polishing.front import OPTIMAL, TOLERANCE, GrowingFront, Loss
+from hybrid_opt.polishing.front import (
+    IMPROVEMENT_TOLERANCE,
+    OPTIMAL_STATIONARITY,
+    FailedAttempt,
+    ParetoArchive,
+)
 from hybrid_opt.polishing.point import Solution
 from hybrid_opt.polishing.polisher import Polisher
 from hybrid_opt.polishing.records import PolishedFront, PolishOutcome
@@ -37,7 +42,7 @@ from symbolic.errors import SettingsError
 from symbolic.read.cell import load
 from symbolic.records.task import initial_decision
 from tests.hybrid_opt.cells import shipped
-from tests.hybrid_opt.polishing.cells import require_told, smooth_cell
+from tests.hybrid_opt.polishing.cells import require_progress, smooth_cell
 from tests.symbolic.read.samples import RACK
 
 SETTINGS = PolishSettings(attempts=7, fill=FillSettings(attempts=1))
@@ -75,12 +80,12 @@ def polished() -> PolishedFront:
     return polisher().polish(
         start_front(),
         np.random.default_rng(0),
-        tell=lambda done, total: TOLD.append((done, total)),
+        on_progress=lambda done, total: TOLD.append((done, total)),
     )
 
 
 def test_attempts_never_exceed_those_that_are_expected() -> None:
-    require_told(TOLD, len(polished().outcomes))
+    require_progress(TOLD, len(polished().outcomes))
 
 
 def objectives_of(x: Array) -> Array:
@@ -101,7 +106,7 @@ def test_what_probes_reach_is_given_up_only_where_the_front_is_nearly_as_good() 
     accepted = [o for o in probes if o.status == "accepted"]
     assert accepted
     front = polished().objectives
-    nearly = FAR * np.ptp(front, axis=0)
+    nearly = FAR_GAP * np.ptp(front, axis=0)
     for outcome in accepted:
         assert (outcome.start - outcome.objectives).max() > 0.0
         assert np.any(np.all(front <= outcome.objectives + nearly, axis=1))
@@ -111,7 +116,7 @@ def test_points_of_the_front_never_get_worse() -> None:
     own = [o for o in polished().outcomes if o.aim == "point"]
     assert own
     for outcome in own:
-        assert np.all(outcome.objectives <= outcome.start + TOLERANCE)
+        assert np.all(outcome.objectives <= outcome.start + IMPROVEMENT_TOLERANCE)
     assert sum(o.status in ("accepted", "optimal") for o in own) >= 0.9 * len(own)
     assert polished().effort.success_share == pytest.approx(
         np.mean([o.status in ("accepted", "optimal") for o in own])
@@ -148,7 +153,7 @@ def test_with_time_most_points_become_stationary() -> None:
         residuals = solver.solve(x, target, radius=1.0).residuals
         found.append((residuals.stationarity, residuals.feasibility, residuals.complementarity))
     assert len(found) == 5
-    assert np.all(np.median(found, axis=0) < [1e-4, 1e-6, OPTIMAL])
+    assert np.all(np.median(found, axis=0) < [1e-4, 1e-6, OPTIMAL_STATIONARITY])
 
 
 def test_what_it_cost_is_told_in_evaluations() -> None:
@@ -169,7 +174,7 @@ def test_recorded_attempts_are_not_repeated() -> None:
     recorded = [from_json(PolishOutcome, text, "an attempt", "") for text in texts[:-2]]
     emitted: list[PolishOutcome] = []
     again = polisher().polish(
-        start_front(), np.random.default_rng(0), recorded=recorded, emit=emitted.append
+        start_front(), np.random.default_rng(0), recorded=recorded, on_outcome=emitted.append
     )
     assert len(emitted) == 2
     np.testing.assert_array_equal(again.x, polished().x)
@@ -177,10 +182,13 @@ def test_recorded_attempts_are_not_repeated() -> None:
 
 @pytest.mark.slow
 def test_an_attempt_that_ended_its_process_costs_itself_alone() -> None:
-    recorded: list[PolishOutcome | Loss] = [*polished().outcomes[:2], Loss("killed")]
+    recorded: list[PolishOutcome | FailedAttempt] = [
+        *polished().outcomes[:2],
+        FailedAttempt("killed"),
+    ]
     emitted: list[PolishOutcome] = []
     again = polisher().polish(
-        start_front(), np.random.default_rng(0), recorded=recorded, emit=emitted.append
+        start_front(), np.random.default_rng(0), recorded=recorded, on_outcome=emitted.append
     )
     assert (again.outcomes[2].status, again.outcomes[2].reason) == ("failed", "killed")
     assert again.outcomes[2] not in emitted
@@ -240,8 +248,10 @@ def test_other_objectives_are_refused() -> None:
 class Broken(ForceSolver):
     """A solver whose attempts end in every bad way in turn."""
 
-    def solve(self, x: Array, target: Target, radius: float, reach: Reach = "usual") -> Solution:
-        found = super().solve(x, target, radius, reach)
+    def solve(
+        self, x: Array, target: Scalarisation, radius: float, mode: SolveMode = "usual"
+    ) -> Solution:
+        found = super().solve(x, target, radius, mode)
         mood = int(1e6 * x[0]) % 3
         if mood == 0:
             raise FloatingPointError("broken\nall over")
@@ -264,10 +274,10 @@ def test_a_broken_solver_loses_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
         np.testing.assert_array_equal(outcome.objectives, outcome.start)
 
 
-def front(*objectives: tuple[float, float]) -> GrowingFront:
+def front(*objectives: tuple[float, float]) -> ParetoArchive:
     """All polished; each decision vector is its index."""
     x = np.arange(float(len(objectives)))[:, None]
-    archive = GrowingFront(x, np.array(objectives), list(range(len(objectives))))
+    archive = ParetoArchive(x, np.array(objectives), list(range(len(objectives))))
     archive.polished = [True] * len(objectives)
     return archive
 
@@ -281,10 +291,10 @@ def test_gaps_are_measured_in_units_of_the_front() -> None:
 
 def test_the_widest_gap_is_next_half_way_along_it() -> None:
     archive = front((0.0, 1.0), (0.1, 0.8), (1.0, 0.0))
-    found = filling(archive, set(), 10, stride=10.0, far=0.4)
+    found = gap_attempt(archive, set(), 10, stride=10.0, far=0.4)
     assert found is not None
     attempt = found.attempt
-    assert attempt.reach == "near"
+    assert attempt.mode == "near"
     assert found.edge == _edge(archive, 1, 2)
     np.testing.assert_array_equal(attempt.start, [0.1, 0.8])
     # The target's diagonal meets the chord half way: its difference of objectives is the mean.
@@ -294,7 +304,7 @@ def test_the_widest_gap_is_next_half_way_along_it() -> None:
 
 def test_a_stride_is_never_longer_than_asked() -> None:
     archive = front((0.0, 1.0), (1.0, 0.0))
-    found = filling(archive, set(), 32, stride=0.3)
+    found = gap_attempt(archive, set(), 32, stride=0.3)
     assert found is not None
     anchor = found.attempt.target.anchor
     assert (anchor[0] - anchor[1]) - (0.0 - 1.0) == pytest.approx(0.3)
@@ -303,7 +313,7 @@ def test_a_stride_is_never_longer_than_asked() -> None:
 def test_sides_are_tried_once_each_and_gaps_left_then() -> None:
     archive, tried = front((0.0, 1.0), (0.2, 0.3), (1.0, 0.0)), set[Edge]()
     order = []
-    while (found := filling(archive, tried, 10, stride=10.0, far=0.4)) is not None:
+    while (found := gap_attempt(archive, tried, 10, stride=10.0, far=0.4)) is not None:
         tried.add(found.edge)
         order.append(found.edge)
     near = [_edge(archive, 1, 2), _edge(archive, 2, 1)]
@@ -314,34 +324,34 @@ def test_sides_are_tried_once_each_and_gaps_left_then() -> None:
 
 def test_a_point_beside_the_start_has_crept() -> None:
     archive = front((0.0, 1.0), (1.0, 0.0))
-    found = filling(archive, set(), 32, stride=0.4)
+    found = gap_attempt(archive, set(), 32, stride=0.4)
     assert found is not None
-    assert crept(archive, found, np.array([0.05, 0.95]))
-    assert not crept(archive, found, np.array([0.1, 0.8]))
+    assert made_little_progress(archive, found, np.array([0.05, 0.95]))
+    assert not made_little_progress(archive, found, np.array([0.1, 0.8]))
 
 
 def test_enough_points_are_enough() -> None:
-    assert filling(front((0.0, 1.0), (1.0, 0.0)), set(), 2) is None
-    assert filling(front((0.0, 1.0)), set(), 10) is None
+    assert gap_attempt(front((0.0, 1.0), (1.0, 0.0)), set(), 2) is None
+    assert gap_attempt(front((0.0, 1.0)), set(), 10) is None
 
 
-def _edge(archive: GrowingFront, start: int, across: int) -> Edge:
+def _edge(archive: ParetoArchive, start: int, across: int) -> Edge:
     vectors: list[Array] = archive.x
     return vectors[start].tobytes(), vectors[across].tobytes(), True
 
 
-def archive_of_polished() -> GrowingFront:
+def archive_of_polished() -> ParetoArchive:
     """Every fourth member of a polished front."""
     x, objectives = polished().x[::4], polished().objectives[::4]
-    archive = GrowingFront(x, objectives, list(range(len(x))))
+    archive = ParetoArchive(x, objectives, list(range(len(x))))
     archive.polished = [True] * len(x)
     return archive
 
 
 def test_the_widest_chords_come_first_and_each_once() -> None:
     archive, tried, widths = front((0.0, 9.0), (1.0, 4.0), (2.0, 3.0), (9.0, 0.0)), set[Chord](), []
-    while (gap := widest(archive, tried)) is not None:
-        tried.add(chord_of(archive, gap))
+    while (gap := widest_untried_gap(archive, tried)) is not None:
+        tried.add(chord_across(archive, gap))
         widths.append(gap.width)
     assert len(widths) == 3
     assert widths == sorted(widths, reverse=True)
@@ -351,7 +361,7 @@ def test_a_point_on_a_chord_is_feasible_and_wins_area() -> None:
     archive, found = archive_of_polished(), 0
     before = metrics.hypervolume(np.array(archive.objectives))
     for gap in gaps(archive):
-        point = between(evaluator(), archive, gap)
+        point = best_on_chord(evaluator(), archive, gap)
         if point is None:
             continue
         x, objectives = point
@@ -359,10 +369,10 @@ def test_a_point_on_a_chord_is_feasible_and_wins_area() -> None:
         assert judged.feasible[0]
         np.testing.assert_array_equal(judged.objectives[0], objectives)
         assert metrics.hypervolume(np.array([*archive.objectives, objectives])) > before
-        way = archive.x[gap.second] - archive.x[gap.first]
-        share = (x - archive.x[gap.first]) @ way / (way @ way)
+        drive_method = archive.x[gap.second] - archive.x[gap.first]
+        share = (x - archive.x[gap.first]) @ drive_method / (drive_method @ drive_method)
         assert 0.0 < share < 1.0
-        np.testing.assert_allclose(x, archive.x[gap.first] + share * way, atol=1e-12)
+        np.testing.assert_allclose(x, archive.x[gap.first] + share * drive_method, atol=1e-12)
         found += 1
     assert found > 0
 
@@ -371,7 +381,7 @@ def test_a_chord_through_what_is_infeasible_leads_nowhere() -> None:
     archive = archive_of_polished()
     archive.x[0], archive.x[1] = evaluator().lower, evaluator().upper
     gap = next(gap for gap in gaps(archive) if {gap.first, gap.second} == {0, 1})
-    assert between(evaluator(), archive, gap) is None
+    assert best_on_chord(evaluator(), archive, gap) is None
 
 
 FRONT = Path(__file__).with_name("rack_reference_front.csv")

@@ -15,14 +15,19 @@ from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.polishing.carry import CarryReader
 from hybrid_opt.polishing.constraints.kinds import CONE_TIGHT, PRESSURE_SHARE, Forces
 from hybrid_opt.polishing.force import ForceProgram
-from hybrid_opt.polishing.rows import HELD, ForceRow, Row
+from hybrid_opt.polishing.rows import PROGRAM_BRANCH, ForceRow, Row
 from hybrid_opt.polishing.settings import FillSettings, PolishSettings
 from studies.run import main
 from symbolic.functions import candidate_function
 from symbolic.read.cell import load
 from symbolic.records.cell import Workcell
 from symbolic.records.task import initial_decision
-from symbolic.smooth.samples import held_functions, held_name, sample_functions, sample_name
+from symbolic.smooth.samples import (
+    grasp_force_functions,
+    grasp_force_name,
+    sample_functions,
+    sample_name,
+)
 from tests.hybrid_opt.polishing.cells import smooth_cell
 from tests.hybrid_opt.polishing.test_force import TARGET, require_curvature, require_jacobian
 from tests.symbolic.cells import ROOT, hand_cell, hand_model
@@ -44,7 +49,7 @@ def test_forces_are_the_evaluators_but_for_the_barriers() -> None:
     cell = jointly(hand_cell(), 0.02, [0.01, 0.03, -0.02])
     cell = replace(cell, task=replace(cell.task, samples=7, time_law="ramped"))
     loads = sample_functions(cell, "load")[sample_name("load", "path", "first")]
-    held = held_functions(cell)[held_name("first")]
+    held = grasp_force_functions(cell)[grasp_force_name("first")]
     evaluate = candidate_function(hand_model(cell))
     for seed in range(3):
         x = np.random.default_rng(seed).uniform(cell.task.lower, cell.task.upper)
@@ -72,7 +77,9 @@ def test_a_programs_derivatives_are_exact(name: str) -> None:
     x = initial_decision(task)
     carry = CarryReader(cell).read(x)
     every = range(0, task.samples, 3)
-    rows: list[Row] = [ForceRow(robot, HELD, sample) for sample in every for robot in (0, 1)]
+    rows: list[Row] = [
+        ForceRow(robot, PROGRAM_BRANCH, sample) for sample in every for robot in (0, 1)
+    ]
     if judge.workcell.has_facing_pads:
         rows += [ForceRow(0, CONE_TIGHT, sample) for sample in range(0, task.samples, 7)]
     program = ForceProgram(cell, dict.fromkeys(rows, 0.01), TARGET, carry, x, 1.0)
@@ -81,12 +88,12 @@ def test_a_programs_derivatives_are_exact(name: str) -> None:
     exact = [
         carry.force[row.sample, row.robot] / task.reference_force[row.robot]
         for row in program.layout.force_rows
-        if row.branch == HELD
+        if row.branch == PROGRAM_BRANCH
     ]
     scaled = [
         (z[-3:][row.robot] - value) * TARGET.span[row.robot] + TARGET.anchor[row.robot]
         for row, value in zip(program.layout.force_rows, values.tolist(), strict=True)
-        if row.branch == HELD
+        if row.branch == PROGRAM_BRANCH
     ]
     np.testing.assert_allclose(scaled, exact, rtol=1e-9)
     z[: task.n_var] += np.random.default_rng(0).uniform(-0.05, 0.05, task.n_var)
@@ -102,8 +109,8 @@ def test_rows_are_the_papers_where_patches_suffice_and_joint_ones_elsewhere() ->
     # Some of it is turned so much that the patches do not suffice.
     x = np.random.default_rng(0).uniform(judge.lower, judge.upper)
     carry = CarryReader(cell).read(x)
-    rows = set(Forces(cell).near(carry, TARGET.limits))
-    held = {row.sample for row in rows if row.branch == HELD}
+    rows = set(Forces(cell).near_rows(carry, TARGET.limits))
+    held = {row.sample for row in rows if row.branch == PROGRAM_BRANCH}
     closed = {row.sample for row in rows if row.branch == CONE_TIGHT}
     assert held
     assert closed

@@ -13,17 +13,18 @@ from hybrid_opt.compiled_cell import CompiledCell
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES
 from hybrid_opt.polishing.carry import CarryReader
-from hybrid_opt.polishing.intervals import IntervalGrid, IntervalValues, JointProgram
+from hybrid_opt.polishing.intervals import IntervalGrid, IntervalValues, PathTimingProgram
 from hybrid_opt.polishing.polisher import Polisher
-from hybrid_opt.polishing.rows import PlaceRow, Row
+from hybrid_opt.polishing.rows import PathRow, Row
 from hybrid_opt.polishing.settings import PolishSettings
 from hybrid_opt.timing.model import TimingModel
 from symbolic.array import Array
 from symbolic.records.task import initial_decision
-from symbolic.smooth.places import Reach
+from symbolic.smooth.places import ManipulabilityLimit
 from tests.hybrid_opt.polishing.cells import (
     disbelieved,
     drivable_rack,
+    drive_method_of,
     driven,
     polisher,
     smooth_cell,
@@ -31,14 +32,13 @@ from tests.hybrid_opt.polishing.cells import (
     start,
     start_in,
     tilted,
-    way_of,
 )
 from tests.hybrid_opt.polishing.transcription import without_obstacles
 from tests.odd_cells import rack_on_rail
 from tests.symbolic.read.samples import RACK
 
 FORCE = 52.0
-ROWS = (PlaceRow(Reach(0), 150), PlaceRow(Reach(1), 250))
+ROWS = (PathRow(ManipulabilityLimit(0), 150), PathRow(ManipulabilityLimit(1), 250))
 
 
 class Programs:
@@ -54,11 +54,11 @@ class Programs:
         half, self.x = self.cell.half[:-1], x
         own: Array = np.eye(len(half)) if together is None else together
         spread: Array = half[:, None] * own
-        self.timed = way_of(owner).paths.timed(x)
+        self.timed = drive_method_of(owner).paths.fastest_timing(x)
         self.carry = CarryReader(self.cell).read(x)
         self.intervals = IntervalGrid(self.cell.workcell, 100, spread)
 
-    def at(self, d: Array | None = None) -> JointProgram:
+    def at(self, d: Array | None = None) -> PathTimingProgram:
         """The program after a step d of the scaled variables from the path."""
         x, squared = self.x.copy(), self.timed.squared.copy()
         if d is not None:
@@ -69,10 +69,10 @@ class Programs:
         values = IntervalValues(self.intervals, functions, x, squared, joints)
         required: dict[Row, float] = dict.fromkeys(ROWS, 0.01)
         grid = self.intervals
-        return JointProgram(grid, values, x, squared, self.cell, required, self.carry)
+        return PathTimingProgram(grid, values, x, squared, self.cell, required, self.carry)
 
 
-def direction(program: JointProgram, seed: int) -> Array:
+def direction(program: PathTimingProgram, seed: int) -> Array:
     rng = np.random.default_rng(seed)
     d: Array = rng.normal(size=program.n)
     d[: program.n_path] *= 0.1
@@ -109,7 +109,7 @@ def assert_slopes(programs: Programs, seed: int) -> None:
     difference = (programs.at(h * d).rows - programs.at(-h * d).rows) / (2.0 * h)
     foretold = program.predicted(d) - program.rows
     assert np.abs(difference - foretold).max() < 1e-6 * np.abs(foretold).max()
-    chosen = program.near()
+    chosen = program.near_rows()
     linear = program.linear(chosen)
     rows = linear.A.times(d) * linear.scale
     m = int(chosen.sum())
@@ -123,7 +123,7 @@ def test_pressure_at_rest_has_rows_with_exact_slopes() -> None:
     program, h = programs.at(), 1e-6
     assert len(program.geometry) > len(ROWS)
     d = direction(program, 2)
-    chosen = program.near()
+    chosen = program.near_rows()
     linear = program.linear(chosen)
     rows = (linear.A.times(d) * linear.scale)[int(chosen.sum()) :]
     difference = (programs.at(h * d).geometry - programs.at(-h * d).geometry) / (2.0 * h)
@@ -134,7 +134,7 @@ def test_slopes_exist_where_the_box_does_not_turn() -> None:
     x = initial_decision(drivable_rack().task)
     x[-1] = FORCE
     program = Programs(x).at()
-    assert np.isfinite(program.linear(program.near()).A.dense()).all()
+    assert np.isfinite(program.linear(program.near_rows()).A.dense()).all()
 
 
 def test_the_lagrangian_has_exact_curvature() -> None:
@@ -144,7 +144,7 @@ def test_the_lagrangian_has_exact_curvature() -> None:
 def assert_curvature(programs: Programs) -> None:
     """Gradients by differences along a random direction."""
     program = programs.at()
-    chosen = program.near()
+    chosen = program.near_rows()
     step = program.linear(chosen)
     multipliers = np.random.default_rng(3).random(len(step.b))
     # Rows of the pressure at rest count as straight.
@@ -175,7 +175,7 @@ def test_geometry_after_a_step_is_what_its_slopes_do_not_foretell() -> None:
     program = programs.at()
     d = 0.1 * direction(program, 1)
     after = programs.at(d).geometry
-    linear = program.linear(program.near())
+    linear = program.linear(program.near_rows())
     foretold = program.geometry + linear.A.times(d)[-len(ROWS) :]
     np.testing.assert_allclose(program.geometry_after(d), after - foretold, atol=1e-8)
 
@@ -199,12 +199,12 @@ def test_derivatives_of_found_forces_are_exact(fork: Polisher) -> None:
 
 @pytest.mark.slow
 def test_a_carry_is_driven_better_believed_and_stationary(fork: Polisher) -> None:
-    evaluator, way = fork.evaluator, way_of(fork)
+    evaluator, drive_method = fork.evaluator, drive_method_of(fork)
     x = start_in(evaluator.workcell, FORK_FORCE, 0)
-    solution = solved(way, x)
+    solution = solved(drive_method, x)
     assert evaluator.certified(evaluator.evaluate(solution.x)).feasible[0]
     driven = (np.append(each[:-1], FORK_FORCE) for each in (x, solution.x))
-    before, after = (way.paths.timed(each).duration for each in driven)
+    before, after = (drive_method.paths.fastest_timing(each).duration for each in driven)
     assert after < 0.85 * before
     model = TimingModel(evaluator.compiled, 100)
     assert disbelieved(evaluator.driver, model, solution.x) == ""
@@ -234,13 +234,16 @@ def test_derivatives_of_redundant_joints_are_exact(rail: Polisher) -> None:
 
 @pytest.mark.slow
 def test_a_carry_with_a_redundant_joint_is_driven_better_and_believed(rail: Polisher) -> None:
-    evaluator, way = rail.evaluator, way_of(rail)
+    evaluator, drive_method = rail.evaluator, drive_method_of(rail)
     x = start_in(evaluator.workcell, RAIL_FORCE, 0)
-    begun = way.paths.timed(np.append(x[:-1], RAIL_FORCE)).duration
-    found = solved(way, x, 16)
-    assert way.paths.timed(np.append(found.x[:-1], RAIL_FORCE)).duration < 0.9 * begun
+    begun = drive_method.paths.fastest_timing(np.append(x[:-1], RAIL_FORCE)).duration
+    found = solved(drive_method, x, 16)
+    assert (
+        drive_method.paths.fastest_timing(np.append(found.x[:-1], RAIL_FORCE)).duration
+        < 0.9 * begun
+    )
     # The slide's values are used, not only the box's path.
     assert np.abs(found.x[18:-1] - x[18:-1]).max() > 1e-3
     assert evaluator.certified(evaluator.evaluate(found.x)).feasible[0]
-    timings = TimingModel(evaluator.compiled, way.driver.timer.intervals)
-    assert disbelieved(way.driver, timings, found.x) == ""
+    timings = TimingModel(evaluator.compiled, drive_method.driver.timer.intervals)
+    assert disbelieved(drive_method.driver, timings, found.x) == ""

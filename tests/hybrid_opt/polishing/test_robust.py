@@ -13,10 +13,10 @@ from hybrid_opt.compiled_cell import CompiledCell
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.evaluate.objectives import ROBUST_DRIVABLE_OBJECTIVES, ROBUST_OBJECTIVES
 from hybrid_opt.polishing.carry import CarryReader
-from hybrid_opt.polishing.force import ForceProgram, ForceSolver, balance
+from hybrid_opt.polishing.force import ForceProgram, ForceSolver, balanced_scalarisation
 from hybrid_opt.polishing.intervals import IntervalGrid
 from hybrid_opt.polishing.polisher import Polisher
-from hybrid_opt.polishing.robust import CASES, ROBUST_ROWS, RobustSamples
+from hybrid_opt.polishing.robust import GOVERNING_CASES, ROBUST_ROWS, RobustSamples
 from hybrid_opt.polishing.rows import ForceRow, Row
 from hybrid_opt.polishing.settings import PolishSettings
 from hybrid_opt.robust.path_force import PathPoints, robust_path
@@ -26,12 +26,12 @@ from symbolic.records.task import initial_decision
 from tests.hybrid_opt.polishing.cells import (
     disbelieved,
     drivable_rack,
+    drive_method_of,
     functions,
     smooth_cell,
     solved,
     start,
     start_in,
-    way_of,
 )
 from tests.hybrid_opt.polishing.test_force import TARGET, evaluator
 from tests.hybrid_opt.polishing.test_joint_program import Programs, direction
@@ -89,7 +89,7 @@ def test_a_carry_is_polished_for_its_robust_forces() -> None:
     solver = ForceSolver(smooth_cell(judge), PolishSettings(rounds=6))
     x = initial_decision(judge.workcell.task)
     start = judge.evaluate(x).objectives[0]
-    target = balance(start, np.full(2, 0.01))
+    target = balanced_scalarisation(start, np.full(2, 0.01))
     found = solver.solve(x, target, 1.0)
     after = judge.evaluate(found.x)
     assert after.feasible[0]
@@ -119,7 +119,7 @@ def test_rows_are_those_of_the_robust_forces_with_their_slopes() -> None:
     a = np.diff(made.timed.squared) * len(begins) / 2.0
     pose, first, second = (np.ascontiguousarray(part[:-1, :6]) for part in path)
     force, _ = robust_path(unsure_rack()).at(PathPoints(pose, first, second, a, begins))
-    largest = program.rows[::2, rows].reshape(-1, 2, CASES).max(axis=2)
+    largest = program.rows[::2, rows].reshape(-1, 2, GOVERNING_CASES).max(axis=2)
     np.testing.assert_allclose(largest, force / FORCE - 1.0, atol=1e-6)
     difference = (made.at(h * d).rows - made.at(-h * d).rows)[:, rows] / (2.0 * h)
     foretold = (program.predicted(d) - program.rows)[:, rows]
@@ -135,7 +135,7 @@ def test_robust_rows_bend_as_the_planned_force_that_rules() -> None:
     value = np.random.default_rng(1).normal(size=(4, made.intervals.layout.size + ROBUST_ROWS))
     weight = np.zeros_like(value)
     weight[2, -1] = 0.7
-    found = forces.as_planned(weight, value)
+    found = forces.planned_weights(weight, value)
     branches = made.intervals.kinds.mix[made.intervals.kinds.is_force][5:10]
     branches = branches[:, : made.intervals.layout.size]
     ruling = branches[np.argmax(branches @ value[2, :-ROBUST_ROWS])]
@@ -147,12 +147,12 @@ def test_robust_rows_bend_as_the_planned_force_that_rules() -> None:
 def test_a_point_is_driven_faster_within_robust_forces_and_believed() -> None:
     cell, force = unsure_rack(), 64.15
     evaluator = CandidateEvaluator(cell, ROBUST_DRIVABLE_OBJECTIVES, compiled=CompiledCell(cell))
-    way = way_of(Polisher(evaluator, PolishSettings(), functions()))
+    drive_method = drive_method_of(Polisher(evaluator, PolishSettings(), functions()))
     driver = evaluator.driver
     assert driver is not None
-    assert 60.0 < way.paths.force_limit[0] < 63.0
+    assert 60.0 < drive_method.paths.force_limit[0] < 63.0
     begin = start_in(cell, force, 0)
-    solution = solved(way, begin, 24)
+    solution = solved(drive_method, begin, 24)
     before, after = driver.timings(np.array([begin, solution.x]))
     assert after.duration < 0.8 * before.duration
     assert after.robust_force is not None

@@ -12,18 +12,18 @@ from hypothesis import strategies as st
 from hybrid_opt.evaluate.evaluation import COLLISION, REASONS
 from hybrid_opt.polishing.force_front import better_half
 from hybrid_opt.polishing.starts import (
-    AWAY,
-    LEAST_TURN,
-    TURNED,
+    LEAST_CHANGE,
+    LEAST_ROTATION,
+    ROTATION_SHARES,
     Start,
     first_feasible,
-    kicked,
     mirror_of,
+    perturb_start,
     random_starts,
-    turned,
+    rotated_starts,
 )
 from symbolic.records.task import POSE_SIZE, initial_decision
-from tests.hybrid_opt.polishing.cells import drivable_rack, start, way
+from tests.hybrid_opt.polishing.cells import drivable_rack, drive_method, start
 from tests.hybrid_opt.polishing.test_force_front import evaluator
 
 FORCE = 55.0
@@ -32,8 +32,8 @@ FORCE = 55.0
 def test_a_kick_is_feasible_far_away_and_the_same_for_the_same_seed() -> None:
     x = initial_decision(evaluator().workcell.task)
     for objective in (0, 1):
-        found = kicked(evaluator(), x, objective, np.random.default_rng(3), candidates=400)
-        again = kicked(evaluator(), x, objective, np.random.default_rng(3), candidates=400)
+        found = perturb_start(evaluator(), x, objective, np.random.default_rng(3), candidates=400)
+        again = perturb_start(evaluator(), x, objective, np.random.default_rng(3), candidates=400)
         assert found is not None
         assert again is not None
         candidate, objectives = found
@@ -42,7 +42,7 @@ def test_a_kick_is_feasible_far_away_and_the_same_for_the_same_seed() -> None:
         assert judged.feasible[0]
         np.testing.assert_array_equal(judged.objectives[0], objectives)
         moved = np.abs(candidate - x) / (evaluator().upper - evaluator().lower)
-        assert moved.max() > AWAY
+        assert moved.max() > LEAST_CHANGE
         assert (moved == 0.0).sum() > evaluator().n_var / 2
 
 
@@ -135,8 +135,8 @@ def test_cells_without_a_plane_have_no_image() -> None:
 
 
 def test_each_is_driven_and_turned_about_one_axis_by_one_share() -> None:
-    task, judge, path = drivable_rack().task, way().paths, start(FORCE)[:-1]
-    found = turned(task, path, lambda paths: judge.durations(paths, FORCE))
+    task, judge, path = drivable_rack().task, drive_method().paths, start(FORCE)[:-1]
+    found = rotated_starts(task, path, lambda paths: judge.durations(paths, FORCE))
     assert np.isfinite(judge.durations(np.array(found), FORCE)).all()
     columns, senses = task.free_entries[1], set()
     for other in found:
@@ -148,12 +148,12 @@ def test_each_is_driven_and_turned_about_one_axis_by_one_share() -> None:
         bound = (task.upper if up else task.lower)[changed]
         shares = (other - path)[changed] / (bound - path[changed])
         np.testing.assert_allclose(shares, shares[0])
-        assert np.isclose(shares[0], TURNED).any()
-        assert np.abs(bound - path[changed]).mean() >= LEAST_TURN
+        assert np.isclose(shares[0], ROTATION_SHARES).any()
+        assert np.abs(bound - path[changed]).mean() >= LEAST_ROTATION
         senses.add((axis, up))
     assert len(senses) == len(found) >= 2
 
 
 def test_a_path_that_nothing_can_drive_has_no_turned_ones() -> None:
-    task, judge = drivable_rack().task, way().paths
-    assert turned(task, start(FORCE)[:-1], lambda paths: judge.durations(paths, 1.0)) == []
+    task, judge = drivable_rack().task, drive_method().paths
+    assert rotated_starts(task, start(FORCE)[:-1], lambda paths: judge.durations(paths, 1.0)) == []

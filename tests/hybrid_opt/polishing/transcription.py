@@ -66,10 +66,10 @@ class Transcription:
         task = cell.task
         x, w = ca.MX.sym("x", task.n_path), ca.MX.sym("w", n - 1)
         arms = ca.MX.sym("arms", 36, n + 1)
-        points = ca.MX(np.array([waypoint.lower for waypoint in task.waypoints]))
+        front_attempts = ca.MX(np.array([waypoint.lower for waypoint in task.waypoints]))
         for k, row in enumerate(task.free_indices):
-            points[row, :] = x[6 * k : 6 * k + 6].T
-        along = ca.vertcat(*[ca.mtimes(basis, points).T for basis in self._bases])
+            front_attempts[row, :] = x[6 * k : 6 * k + 6].T
+        along = ca.vertcat(*[ca.mtimes(basis, front_attempts).T for basis in self._bases])
         held = self._held.map(n + 1)(along, arms)
         squared = ca.vertcat(0.0, w, 0.0)
         second = (squared[1:] - squared[:-1]) * n / 2.0

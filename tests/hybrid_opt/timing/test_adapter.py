@@ -7,13 +7,13 @@ import logging
 import numpy as np
 import pytest
 
-from hybrid_opt.timing.solve import Rows, SolverFailure, fastest_speed
+from hybrid_opt.timing.solve import LinearLimits, SolverFailure, fastest_speed
 
 
-def rows(n: int, *limits: tuple[float, float, float]) -> Rows:
+def rows(n: int, *limits: tuple[float, float, float]) -> LinearLimits:
     """The same rows a u'' + b u'^2 <= bound on every interval."""
     a, b, bound = (np.tile(column, (n, 1)) for column in np.array(limits).T)
-    return Rows(a, b, bound)
+    return LinearLimits(a, b, bound)
 
 
 def duration(squared: np.ndarray, grid: np.ndarray) -> float:

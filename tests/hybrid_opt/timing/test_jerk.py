@@ -147,14 +147,14 @@ def test_no_transcription_in_time_finds_a_shorter_one(
 
 def test_a_workcell_states_limits() -> None:
     cell = hand_cell()
-    assert JerkLimits.of(cell) is None
+    assert JerkLimits.from_workcell(cell) is None
     first, second = cell.robots
     one = replace(cell, robots=(replace(first, jerk_max=np.full(6, 40.0)), second))
-    limits = JerkLimits.of(one)
+    limits = JerkLimits.from_workcell(one)
     assert limits is not None
     np.testing.assert_array_equal(limits.joints, [40.0] * 6 + [np.inf] * 6)
     assert limits.payload == np.inf
-    box = JerkLimits.of(with_payload(cell, jerk_max=30.0))
+    box = JerkLimits.from_workcell(with_payload(cell, jerk_max=30.0))
     assert box is not None
     assert box.payload == 30.0
     assert np.isinf(box.joints).all()

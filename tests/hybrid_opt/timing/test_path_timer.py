@@ -56,11 +56,11 @@ def assert_agrees(timer: PathTimer, model: TimingModel, x: Array, limits: Timing
         assert found.status is expected.status
         return
     assert found.duration == pytest.approx(expected.duration, rel=2e-3)
-    judged = drive_path(model, x, found.grid_speed, limits)
-    assert judged.ok, judged.reason
-    assert judged.duration == pytest.approx(found.duration, rel=1e-9)
+    check_limits = drive_path(model, x, found.grid_speed, limits)
+    assert check_limits.ok, check_limits.reason
+    assert check_limits.duration == pytest.approx(found.duration, rel=1e-9)
     np.testing.assert_allclose(
-        judged.driven.normal_force.max(axis=0), found.peak_force, rtol=1e-3, atol=0.01
+        check_limits.driven.normal_force.max(axis=0), found.peak_force, rtol=1e-3, atol=0.01
     )
 
 
@@ -181,5 +181,5 @@ def test_misuse_is_refused() -> None:
     with pytest.raises(SettingsError, match="path speeds"):
         drive_path(hand_timing(INTERVALS), initial(), np.zeros(INTERVALS + 1), TimingLimits())
     too_fast = np.sin(np.linspace(0.0, np.pi, INTERVALS + 1))
-    judged = drive_path(hand_timing(INTERVALS), initial(), 10.0 * too_fast, TimingLimits())
-    assert judged.status is TimingStatus.EXCEEDED
+    check_limits = drive_path(hand_timing(INTERVALS), initial(), 10.0 * too_fast, TimingLimits())
+    assert check_limits.status is TimingStatus.EXCEEDED

@@ -14,7 +14,7 @@ from hybrid_opt.robust.cases import worst_cases
 from hybrid_opt.robust.force import robust_model
 from hybrid_opt.static_hold import static_hold
 from hybrid_opt.timing.analysis import closest_to_reference_timing
-from hybrid_opt.timing.limits import DrivenSpeeds, drive_path, judged, limit_ratios
+from hybrid_opt.timing.limits import SpeedProfile, check_limits, drive_path, limit_ratios
 from hybrid_opt.timing.model import TimingModel
 from hybrid_opt.timing.path_timer import PathTimer
 from hybrid_opt.timing.records import TimingLimits, TimingStatus
@@ -80,7 +80,7 @@ def test_the_use_of_the_limit_is_that_of_all_cases(share: float) -> None:
     held = robust_model(model.workcell).robust_force(plain())
     limit = share * float(held.peak.max())
     limits = TimingLimits(force=limit, robust=True)
-    use = judged(model, plain(), limits).use["normal force"]
+    use = check_limits(model, plain(), limits).use["normal force"]
     assert use.ratio == pytest.approx(held.peak.max() / limit, rel=1e-6)
     every = limit_ratios(plain(), model.workcell, limits)["normal force"].max(axis=1)
     needed = np.maximum(held.commanded, held.leading) / limit
@@ -110,9 +110,9 @@ def test_they_agree_with_time_path_and_keep_the_limit_on_the_tenfold_grid() -> N
         expected = time_path(model, x, limit)
         assert found.ok, (found.status, expected.reason)
         assert found.duration == pytest.approx(expected.duration, rel=1e-3)
-        judged = drive_path(model, x, found.grid_speed, limit)
-        assert judged.ok, judged.reason
-        peak = robust_model(model.workcell).robust_force(judged.driven).peak
+        check_limits = drive_path(model, x, found.grid_speed, limit)
+        assert check_limits.ok, check_limits.reason
+        peak = robust_model(model.workcell).robust_force(check_limits.driven).peak
         assert (peak <= 1.005 * (limit.force or 0.0)).all()
         assert found.robust_force == pytest.approx(peak, rel=1e-3)
         assert found.robust_force is not None
@@ -198,17 +198,17 @@ def test_margins_are_where_a_full_model_of_the_changed_cell_fails(quantity: str)
     timed = closest_to_reference_timing(model, x)
     margin = by_name(robustness_margins(model, timed.driven))[quantity]
     assert margin.fails in ("normal force", "pressure shift", "joint torque")
-    speeds, held = DrivenSpeeds.of(timed.grid_speed), []
+    speeds, held = SpeedProfile.from_grid_speed(timed.grid_speed), []
     for factor in (0.99, 1.01):
         other = timing_of(changed(cell, margin, factor))
         used = speeds.carry(other, other.path_motion(x))
         limit = np.concatenate([robot.torque_max for robot in cell.robots])
-        worst = max(
+        most_used = max(
             float(used.normal_force.max() / 117.68),
             float(used.pressure_shift.max() / cell.contacts[0].patch_radius),
             float((np.abs(used.torque) / limit).max()),
         )
-        held.append(worst <= 1.0)
+        held.append(most_used <= 1.0)
     assert held == [True, False]
 
 

@@ -14,11 +14,11 @@ from hybrid_opt.errors import ResultsError
 from hybrid_opt.store.files import to_json, write_json
 from hybrid_opt.timing.analysis import (
     TimedTrajectory,
+    check_search_timing,
     closest_to_reference_timing,
     duration_against_force_limit,
-    judge_timing,
     read_timing,
-    timed_trajectory,
+    time_trajectory,
     timing_document,
 )
 from hybrid_opt.timing.jerk import time_with_jerk
@@ -51,8 +51,8 @@ def worst_ratios(model: TimingModel, timing: Timing, limits: TimingLimits) -> Ar
     ratios = limit_ratios(timing.driven, model.workcell, limits)
     del ratios["friction"]
     use = np.max([ratio.max(axis=1) for ratio in ratios.values()], axis=0)
-    worst: Array = use.reshape(model.intervals, -1).max(axis=1)
-    return worst
+    most_used: Array = use.reshape(model.intervals, -1).max(axis=1)
+    return most_used
 
 
 @pytest.mark.parametrize(
@@ -105,9 +105,9 @@ def test_ten_times_the_reference_speed_is_judged_and_kept_within_limits() -> Non
     cell = hand_cell()
     fast = with_task(cell, reference_speed=10.0 * cell.task.reference_speed)
     model = timing_of(fast)
-    judged = judge_timing(model, initial())
-    assert judged.status is TimingStatus.EXCEEDED
-    assert max(excess.ratio for excess in judged.use.values()) > 2.0
+    check_limits = check_search_timing(model, initial())
+    assert check_limits.status is TimingStatus.EXCEEDED
+    assert max(excess.ratio for excess in check_limits.use.values()) > 2.0
     closest = closest_to_reference_timing(model, initial())
     assert closest.ok
     # So fast a reference never binds.
@@ -115,10 +115,10 @@ def test_ten_times_the_reference_speed_is_judged_and_kept_within_limits() -> Non
 
 
 def test_the_search_timing_starts_at_speed_and_is_told_so() -> None:
-    judged = judge_timing(hand_timing(), initial())
-    assert judged.status is TimingStatus.EXCEEDED
-    assert judged.place.constraint == "start from rest"
-    assert np.abs(judged.driven.side_by_side("q_rate")[0]).max() > 0.05
+    check_limits = check_search_timing(hand_timing(), initial())
+    assert check_limits.status is TimingStatus.EXCEEDED
+    assert check_limits.place.constraint == "start from rest"
+    assert np.abs(check_limits.driven.side_by_side("q_rate")[0]).max() > 0.05
 
 
 def test_the_closest_timing_cruises_at_the_reference_speed() -> None:
@@ -286,7 +286,7 @@ TOLD: list[tuple[int, int]] = []
 @cache
 def timed() -> TimedTrajectory:
     # The limit cannot be kept: that timing has no carry.
-    return timed_trajectory(
+    return time_trajectory(
         hand_timing(),
         initial(),
         force_limit=1.0,

@@ -23,27 +23,27 @@ from symbolic.records.poses import Orientation
 from symbolic.records.task import Allocation, TimeLaw
 from symbolic.robot.arm import flange_target, manipulability, pose_error
 from symbolic.smooth.passage import (
-    APART,
-    DIRECTIONS,
-    PARALLEL,
-    Passing,
-    Separation,
+    PARALLEL_GAP,
+    PARALLEL_SINE,
+    SEPARATING_DIRECTIONS,
+    AxisSwitchGap,
+    SeparatingAxisGap,
     gap_function,
 )
 from symbolic.smooth.places import (
-    TURN,
+    PARALLEL_WIDTH,
     Clearance,
     JointLimit,
-    PlaceConstraint,
-    PlaceSymbols,
-    Reach,
+    ManipulabilityLimit,
+    PathConstraint,
+    PathPointSymbols,
     closure_functions,
     closure_name,
     row_function,
 )
 from symbolic.smooth.samples import (
     Quantity,
-    branch_coefficients,
+    force_branches,
     sample_blocks,
     sample_functions,
     sample_name,
@@ -55,11 +55,11 @@ STILL = np.zeros(6)
 
 
 @cache
-def place() -> PlaceSymbols:
-    return PlaceSymbols(rack_model())
+def place() -> PathPointSymbols:
+    return PathPointSymbols(rack_model())
 
 
-def value_of(constraint: PlaceConstraint, *at: Array) -> float:
+def value_of(constraint: PathConstraint, *at: Array) -> float:
     """A row's value at pose, rate and joints."""
     numbers = [constraint.numbers(place())] if constraint.count(place()) else []
     return float(row_function(place(), constraint, "first")(*at, *numbers)[0])
@@ -120,7 +120,7 @@ def test_clearances_lie_about_the_sharp_bound() -> None:
             assert bounds[index] - 0.1 <= smooth <= bounds[index] + 1e-12
         for index in place().separable():
             gaps = gaps_at(index, pose)
-            assert len(gaps) == DIRECTIONS
+            assert len(gaps) == SEPARATING_DIRECTIONS
             assert bounds[columns[index]] <= gaps.max() + 1e-12
 
 
@@ -145,7 +145,7 @@ def test_one_direction_separates_boxes_that_are_apart(
     placed = np.eye(4)
     placed[:3, :3], placed[:3, 3] = np.array(ca.DM(rotation)), pose[:3]
     edges = np.array(ca.DM(rotation)), obstacle.pose[:3, :3]
-    assume(np.abs(edges[1].T @ edges[0]).max() < (1.0 - PARALLEL**2) ** 0.5 - 1e-6)
+    assume(np.abs(edges[1].T @ edges[0]).max() < (1.0 - PARALLEL_SINE**2) ** 0.5 - 1e-6)
     distance = coal_distance((replace(payload, pose=placed @ payload.pose),), (obstacle,))
     assume(abs(distance) > 1e-6)
     largest = gaps_at(index, pose).max()
@@ -160,11 +160,11 @@ def test_a_row_of_a_gap_falls_short_of_it_by_what_its_kinks_are_rounded() -> Non
     for index in place().separable():
         size = sizes[rack_model().geometry.pair_names[index][1]]
         # Each rounded kink of a rotation's entry takes TURN of half an edge at most.
-        rounded = TURN * (workcell.payload.size.sum() + size.sum()) / 2.0
+        rounded = PARALLEL_WIDTH * (workcell.payload.size.sum() + size.sum()) / 2.0
         gaps = gaps_at(index, pose)
-        assert (gaps > APART).sum() >= 12
-        for direction in np.flatnonzero(gaps > APART).tolist():
-            value = value_of(Separation(index, direction), pose, STILL, STILL, STILL)
+        assert (gaps > PARALLEL_GAP).sum() >= 12
+        for direction in np.flatnonzero(gaps > PARALLEL_GAP).tolist():
+            value = value_of(SeparatingAxisGap(index, direction), pose, STILL, STILL, STILL)
             assert gaps[direction] - rounded <= value <= gaps[direction] + 1e-12
 
 
@@ -174,16 +174,16 @@ def test_a_passing_row_is_the_height_at_which_the_gaps_meet() -> None:
     )
     pose = np.array([-0.34, 0.01, 0.86, 0.01, 0.05, 0.02])
     rate = np.array([-2e-3, 1e-4, 2e-3, 1e-4, -2e-4, 1e-4])
-    apart = np.flatnonzero(gaps_at(index, pose) > APART)
+    apart = np.flatnonzero(gaps_at(index, pose) > PARALLEL_GAP)
 
     def along(steps: float) -> Array:
         at = pose + steps * rate, STILL, STILL, STILL
-        return np.array([value_of(Separation(index, int(k)), *at) for k in apart])
+        return np.array([value_of(SeparatingAxisGap(index, int(k)), *at) for k in apart])
 
     slopes = (along(1e-4) - along(-1e-4)) / 2e-4
     before, after = int(np.argmin(slopes)), int(np.argmax(slopes))
     meeting = (along(0.0)[before] - along(0.0)[after]) / (slopes[after] - slopes[before])
-    row = Passing(index, int(apart[before]), int(apart[after]))
+    row = AxisSwitchGap(index, int(apart[before]), int(apart[after]))
     height = value_of(row, pose, rate, STILL, STILL)
     assert height == pytest.approx(along(0.0)[before] + meeting * slopes[before], abs=1e-7)
 
@@ -200,7 +200,7 @@ def test_joint_rows_are_their_definitions(arm: int) -> None:
         assert upper == pytest.approx(robot.position_upper[joint] - q[arm][joint])
     jacobian = np.array(rack_model().robots[arm].jacobian(q[arm]))
     share = abs(np.linalg.det(jacobian)) / robot.min_manipulability
-    value = value_of(Reach(arm), pose, STILL, *q)
+    value = value_of(ManipulabilityLimit(arm), pose, STILL, *q)
     assert value == pytest.approx(share**2 - 1.0, rel=1e-9)
     assert float(manipulability(jacobian)) == pytest.approx(abs(np.linalg.det(jacobian)))
 
@@ -236,7 +236,7 @@ def test_the_largest_branch_is_the_evaluators_normal_force(
 ) -> None:
     cell = cell_with(time_law, samples, allocation)
     evaluate = candidate_function(hand_model(cell))
-    coefficients, functions = branch_coefficients(cell), sample_functions(cell, "force")
+    coefficients, functions = force_branches(cell), sample_functions(cell, "force")
     for seed in range(5):
         x = random_x(cell, seed)
         outputs = dict(zip(evaluate.name_out(), evaluate(x), strict=True))

@@ -11,19 +11,19 @@ import numpy as np
 import pytest
 
 from hybrid_opt.polishing.solvers.base import (
-    FEASIBLE,
-    PATIENCE,
+    FEASIBILITY_PATIENCE,
+    FEASIBLE_ROW,
     Answer,
-    Program,
-    estimated,
-    optimality,
+    NonlinearProgram,
+    estimate_multipliers,
+    optimality_residuals,
     residuals,
 )
 from hybrid_opt.polishing.solvers.dense import dense
 from hybrid_opt.polishing.solvers.ipopt import ipopt
 from symbolic.array import Array
 
-Solver = Callable[[Program, int, float], Answer]
+Solver = Callable[[NonlinearProgram, int, float], Answer]
 
 BARRIER, LONG = 3e-4, 200
 
@@ -71,7 +71,7 @@ def test_it_finds_the_optimum_of_a_convex_program(solve: Solver) -> None:
     answer = solve(disc(), LONG, BARRIER)
     assert answer.converged
     np.testing.assert_allclose(answer.z, np.full(2, 0.5**0.5), atol=1e-5)
-    found = optimality(disc(), answer.z)
+    found = optimality_residuals(disc(), answer.z)
     assert max(found.stationarity, found.feasibility, found.complementarity) < 1e-5
 
 
@@ -82,7 +82,7 @@ def test_bounds_hold_and_have_multipliers(solve: Solver) -> None:
     answer = solve(program, LONG, BARRIER)
     assert answer.converged
     np.testing.assert_allclose(answer.z, [0.5, 0.75**0.5], atol=1e-5)
-    assert optimality(program, answer.z).stationarity < 1e-5
+    assert optimality_residuals(program, answer.z).stationarity < 1e-5
 
 
 @SOLVERS
@@ -122,7 +122,7 @@ def test_an_impossible_program_is_told(solve: Solver) -> None:
     program = written(lambda z: ca.vertcat(z[0] + 1.0, 1.0 - z[0]), [1.0, 1.0], [0.0, 0.0])
     answer = solve(program, LONG, BARRIER)
     assert not answer.converged
-    assert optimality(program, answer.z).feasibility > 0.5
+    assert optimality_residuals(program, answer.z).feasibility > 0.5
 
 
 def rough(z: ca.SX) -> ca.SX:
@@ -140,8 +140,8 @@ def test_the_dense_method_agrees_with_ipopt() -> None:
     answer, other = dense(program, LONG, BARRIER), ipopt(program, LONG, BARRIER)
     assert answer.converged
     assert other.converged
-    assert optimality(program, answer.z).stationarity < 1e-5
-    assert optimality(program, answer.z).feasibility < 1e-6
+    assert optimality_residuals(program, answer.z).stationarity < 1e-5
+    assert optimality_residuals(program, answer.z).feasibility < 1e-6
     assert float(program.cost @ answer.z) == pytest.approx(float(program.cost @ other.z), abs=1e-4)
 
 
@@ -169,11 +169,11 @@ def test_ipopt_is_not_cut_off_where_it_violates_something() -> None:
         np.full(2, 5.0),
     )
     cut = ipopt(program, 1, BARRIER)
-    assert cut.iterations <= PATIENCE
-    assert optimality(program, cut.z).feasibility > FEASIBLE
+    assert cut.iterations <= FEASIBILITY_PATIENCE
+    assert optimality_residuals(program, cut.z).feasibility > FEASIBLE_ROW
     patient = ipopt(program, 3, BARRIER)
-    assert 3 < patient.iterations < 3 * PATIENCE
-    assert optimality(program, patient.z).feasibility <= FEASIBLE
+    assert 3 < patient.iterations < 3 * FEASIBILITY_PATIENCE
+    assert optimality_residuals(program, patient.z).feasibility <= FEASIBLE_ROW
 
 
 def test_the_dense_method_keeps_what_holds_wherever_it_is_cut_off() -> None:
@@ -185,7 +185,7 @@ def test_the_dense_method_keeps_what_holds_wherever_it_is_cut_off() -> None:
     for iterations in (1, 2, 4, 8, 16):
         answer = dense(program, iterations, BARRIER)
         assert answer.iterations <= iterations
-        assert optimality(program, answer.z).feasibility == 0.0
+        assert optimality_residuals(program, answer.z).feasibility == 0.0
         costs.append(float(program.cost @ answer.z))
     assert costs[-1] < costs[1] < costs[0]
 
@@ -209,7 +209,7 @@ def test_multipliers_of_an_optimum_are_found() -> None:
     cost = np.array([-1.0, -2.0])
     A = np.array([[-1.0, -1.0], [1.0, 0.0]])
     slacks = (np.array([0.0, 3.0]), np.array([5.75, 5.25]), np.array([4.25, 0.0]))
-    bounds, y = estimated(cost, A, slacks)
+    bounds, y = estimate_multipliers(cost, A, slacks)
     np.testing.assert_allclose(y, [1.0, 0.0], atol=1e-9)
     np.testing.assert_allclose(bounds, [0.0, 1.0], atol=1e-9)
     np.testing.assert_allclose(cost - A.T @ y + bounds, 0.0, atol=1e-9)

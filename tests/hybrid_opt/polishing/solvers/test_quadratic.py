@@ -16,13 +16,13 @@ from hybrid_opt.polishing.solvers.quadratic import (
     BorderedRows,
     QuadraticAnswer,
     QuadraticProgram,
-    convex,
-    solve_inside,
+    convexify,
+    solve_interior_point,
     solve_quadratic,
 )
 from symbolic.array import Array
 from symbolic.errors import BridgeError
-from tests.hybrid_opt.polishing.cells import solved, start, way
+from tests.hybrid_opt.polishing.cells import drive_method, solved, start
 
 
 def matrix(rng: np.random.Generator, k: int, n: int) -> BorderedMatrix:
@@ -52,7 +52,7 @@ def program(seed: int) -> QuadraticProgram:
         H = BorderedMatrix(H.corner, 0.0 * H.beside, 0.0 * H.diagonal, 0.0 * H.off)
     if seed % 4 == 0:
         twice = np.concatenate([np.arange(m), rng.integers(0, m, m)])
-        A = A.of(twice)
+        A = A.select(twice)
     inside = 0.3 * rng.uniform(-1.0, 1.0, k + n)
     b = A.times(inside) + rng.exponential(0.2, len(A)) * (rng.random(len(A)) > 0.2)
     low, high = np.full(k + n, -0.3), np.full(k + n, 0.4)
@@ -65,7 +65,7 @@ def value(of: QuadraticProgram, d: Array) -> float:
 
 def assert_optimal(of: QuadraticProgram, found: QuadraticAnswer) -> None:
     """By its own conditions, and no worse than Clarabel's answer."""
-    slope = of.H.dense() @ found.d + of.g + of.A.pulled(found.rows) + found.bounds
+    slope = of.H.dense() @ found.d + of.g + of.A.transpose_times(found.rows) + found.bounds
     room = of.b - of.A.times(found.d)
     size = 1.0 + np.abs(of.H.dense()).max()
     assert np.abs(slope).max() < 1e-6 * size
@@ -103,7 +103,7 @@ def test_a_missing_module_names_the_remedy(monkeypatch: pytest.MonkeyPatch) -> N
 
 
 def test_clarabel_is_hardly_ever_needed() -> None:
-    endings = [solve_inside(program(seed)).ending for seed in range(60)]
+    endings = [solve_interior_point(program(seed)).ending for seed in range(60)]
     assert endings.count("solved") == 60
 
 
@@ -126,9 +126,9 @@ def test_what_is_impossible_is_proven_so(seed: int) -> None:
     short = float(rng.uniform(1e-4, 0.3)) * np.abs(entries).sum()
     of = replace(of, A=against, b=np.append(of.b, -of.b[row] - short))
     assert quadratic.solve_by_clarabel(of).ending == "failed"
-    found = solve_inside(of)
+    found = solve_interior_point(of)
     assert found.ending == "infeasible"
-    pull = of.A.pulled(found.rows)
+    pull = of.A.transpose_times(found.rows)
     assert (found.rows >= 0.0).all()
     assert np.minimum(pull * of.low, pull * of.high).sum() > of.b @ found.rows
     assert solve_quadratic(of) is None
@@ -139,22 +139,22 @@ def test_programs_of_a_polish_agree_with_clarabel(monkeypatch: pytest.MonkeyPatc
 
     def recorded(of: QuadraticProgram) -> QuadraticAnswer:
         asked.append(of)
-        return solve_inside(of)
+        return solve_interior_point(of)
 
     monkeypatch.setattr(quadratic, "solve_inside", recorded)
-    solved(way(), start(52.0), 4)
+    solved(drive_method(), start(52.0), 4)
     assert len(asked) > 10
     for of in asked:
-        found, other = solve_inside(of), quadratic.solve_by_clarabel(of)
+        found, other = solve_interior_point(of), quadratic.solve_by_clarabel(of)
         assert (found.ending == "solved") == (other.ending == "solved")
         if found.ending == "solved":
-            assert found.holds(of)
+            assert found.satisfies_optimality(of)
             assert value(of, found.d) == pytest.approx(value(of, other.d), abs=1e-6, rel=1e-6)
 
 
 def test_clarabel_answers_where_the_own_method_does_not(monkeypatch: pytest.MonkeyPatch) -> None:
     of = program(1)
-    whole = solve_inside(of)
+    whole = solve_interior_point(of)
     cut_off = replace(whole, d=whole.d + 1e-3, ending="failed")
     monkeypatch.setattr(quadratic, "solve_inside", lambda *_: cut_off)
     found = solve_quadratic(of)
@@ -164,8 +164,8 @@ def test_clarabel_answers_where_the_own_method_does_not(monkeypatch: pytest.Monk
 
 def test_wrong_answers_are_not_believed() -> None:
     of = program(1)
-    found = solve_inside(of)
-    assert found.holds(of)
+    found = solve_interior_point(of)
+    assert found.satisfies_optimality(of)
     for wrong in (
         replace(found, d=found.d + 1e-3),
         replace(found, rows=found.rows + 1e-3),
@@ -173,7 +173,7 @@ def test_wrong_answers_are_not_believed() -> None:
         replace(found, bounds=found.bounds + 1e-2),
         replace(found, d=np.full(len(found.d), np.nan)),
     ):
-        assert not wrong.holds(of)
+        assert not wrong.satisfies_optimality(of)
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -185,7 +185,7 @@ def test_a_convex_model_keeps_curvature_along_active_rows(seed: int) -> None:
     inside = matrix(rng, k, n)
     H = inside.plus(A.squares(np.full(active, -3.0)))
     g = rng.normal(size=k + n)
-    model, shift = convex(H, A, b)
+    model, shift = convexify(H, A, b)
     assert np.linalg.eigvalsh(model.dense())[0] > 0.0
     matrix_of_rows = A.dense()
     null = np.linalg.svd(matrix_of_rows)[2][np.linalg.matrix_rank(matrix_of_rows) :].T
