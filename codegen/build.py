@@ -432,6 +432,7 @@ def _begin(
         done: Future[tuple[Library, bool]] = Future()
         done.set_result((known, True))
         return done
+    _require_sound(compiler, cache)
     longest_first = sorted(parts, key=lambda part: -len(part.text))
     objects = [pool.submit(_object, part, compiler, cache) for part in longest_first]
     file = source.name if source.signature is None else source.signature.name
@@ -458,6 +459,22 @@ def _begin(
             raise cannot_load(file, error) from error
 
     return pool.submit(cache.obtain, key, find, make, anew=rebuild)
+
+
+def _require_sound(compiler: Compiler, cache: Cache) -> None:
+    """Test a compiler before it compiles anything else; once per cache.
+
+    Raises:
+        CodegenError: it does not work, see `Compiler.self_test`.
+    """
+    key = key_of("compiler test", compiler=compiler.identity, flags=(*FLAGS, *LANE_FLAGS))
+
+    def test() -> None:
+        with cache.build_folder() as scratch:
+            compiler.self_test(scratch)
+        cache.write_record(key, {"works": True})
+
+    cache.obtain(key, lambda: cache.read_record(key), test)
 
 
 def _object(part: Part, compiler: Compiler, cache: Cache) -> Path:

@@ -211,7 +211,7 @@ class Cache:
         Raises:
             CodegenError: the folder is unsafe or cannot be written to.
         """
-        with self._build_folder() as scratch:
+        with self.build_folder() as scratch:
             built = scratch / f"library{suffix}"
             with _writing(self.folder):
                 facts = dict(make(built))
@@ -358,7 +358,12 @@ class Cache:
         return libraries
 
     @contextmanager
-    def _build_folder(self) -> Iterator[Path]:
+    def build_folder(self) -> Iterator[Path]:
+        """Make a folder for files of a build, locked against sweeping, and remove it afterwards.
+
+        Raises:
+            CodegenError: the cache is unsafe or cannot be written to.
+        """
         self._make_folder()
         self._sweep()
         with _writing(self.folder):

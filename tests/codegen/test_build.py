@@ -136,7 +136,8 @@ def test_two_processes_at_once_build_once(
     running = [subprocess.Popen(command, stdout=subprocess.PIPE, text=True) for _ in range(2)]
     for process in running:
         assert process.communicate(timeout=HANGS)[0] == "[1.0, 4.0, 9.0, 16.0]\n"
-    assert len(log.read_text().splitlines()) == 2  # one per function, not per process
+    made = re.findall(r"(square|norm)\.c", log.read_text())
+    assert sorted(made) == ["norm", "square"]  # one per function, not per process
 
 
 def test_killed_build_leaves_the_cache_usable(
@@ -189,28 +190,31 @@ def test_compilers_are_tried_in_order(tmp_path: Path, monkeypatch: pytest.Monkey
             find_compiler()
 
 
-def test_a_compiler_that_is_a_package_is_found_last(
+def test_the_compiler_of_a_package_is_found_last_and_works(
     cache: Cache, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A package as `ziglang` is one, which runs the system's compiler here."""
-    gcc = shutil.which("gcc")
-    (tmp_path / "packaged_cc").mkdir()
-    (tmp_path / "packaged_cc" / "__init__.py").touch()
-    run = f"import os, sys\nos.environ['PATH'] = '/usr/bin:/bin'\nos.execv({gcc!r}, sys.argv[1:])\n"
-    (tmp_path / "packaged_cc" / "__main__.py").write_text(run)
-    monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    monkeypatch.setattr(compiler, "PACKAGED", "packaged_cc")
+    """The package `ziglang` itself, with parts at each level in one library."""
     monkeypatch.delenv("CC", raising=False)
     monkeypatch.setenv("PATH", "")
     compiler._find.cache_clear()
-    assert find_compiler().command == (sys.executable, "-m", "packaged_cc", "cc")
-    compiled = compile_function(functions()["norm"], cache)
-    np.testing.assert_allclose(compiled(np.full(4, 1.5))["y"], 3.0)
+    found = find_compiler()
+    assert found.command == (sys.executable, "-m", "ziglang", "cc", *compiler.ZIG_FLAGS)
+    for level in compiler.LEVELS:
+        compiled = compile_function(functions()["norm"], cache, level=level)
+        assert compiled(np.full(4, 1.5))["y"] == 3.0
+    # Without the flag a part at -O0 needs handlers that nobody links.
+    bare = replace(found, command=found.command[:-1])
+    with pytest.raises(CodegenError, match=r"at -O1 that cannot be loaded: .*ubsan"):
+        bare.self_test(tmp_path)
+    monkeypatch.setenv("CC", f"{sys.executable} -m ziglang cc")
+    assert find_compiler() == found
     compiler._find.cache_clear()
 
 
 OUTPUT = 'while [ "$1" != "-o" ]; do shift; done\n'
+WRONG = """exec gcc '-Dsqrt(x)=fabs(x)' "$@"\n"""
+SMALL = 'case "$*" in *part_*|*whole*) exec gcc "$@" ;; esac\n'
+"""Beginning of a compiler that passes its self-test."""
 FULL = 'echo "cc1: fatal error: No space left on device" >&2\nexit 1\n'
 
 
@@ -219,11 +223,14 @@ FULL = 'echo "cc1: fatal error: No space left on device" >&2\nexit 1\n'
     [
         ("exit 0\n", "reported success but made no library"),
         (OUTPUT + ': > "$2"\n', "reported success but made no library"),
-        (OUTPUT + 'echo nonsense > "$2"\n', "the compiled library cannot be loaded"),
-        (OUTPUT + 'cp /bin/ls "$2"\n', "the compiled library cannot be loaded"),
+        (OUTPUT + 'echo nonsense > "$2"\n', r"a library at -O0 that cannot be loaded: .*too short"),
+        (OUTPUT + 'cp /bin/ls "$2"\n', r"a library at -O0 that cannot be loaded: .*position"),
+        (WRONG, r"makes wrong code at -O0: a sum is 2470\.0 in place of 190\.0"),
         ("kill -9 $$\n", "was ended by signal 9"),
-        ("exit 3\n", r"failed at square\.c: no message"),
-        (FULL, r"square\.c: cc1: .*No space left on device; "),
+        ("exit 3\n", r"failed at part_0\.c: no message"),
+        (FULL, r"part_0\.c: cc1: .*No space left on device; "),
+        (SMALL + OUTPUT + 'echo nonsense > "$2"\n', "the compiled library cannot be loaded"),
+        (f"{SMALL}exit 3\n", r"failed at square\.c: no message"),
     ],
 )
 def test_a_compiler_that_fails_lies_or_dies_is_told(
@@ -242,7 +249,7 @@ def test_a_compiler_that_hangs_is_ended(
     cache: Cache, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("codegen.compiler.MOST_SECONDS", 0.5)
-    odd_compiler(tmp_path, monkeypatch, f"{ASKED}exec sleep 60\n")
+    odd_compiler(tmp_path, monkeypatch, f"{ASKED}{SMALL}exec sleep 60\n")
     with soon(), pytest.raises(CodegenError, match=r"took longer than 0\.5 s over square\.c"):
         build(square(), cache)
 
@@ -443,7 +450,7 @@ def test_ctrl_c_ends_the_compilers_and_keeps_what_is_compiled(
     cache: Cache, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, to_all: bool
 ) -> None:
     """As a terminal sends it, to the whole group of processes, and to this process alone."""
-    left, fast = tmp_path / "left", 'case "$*" in *square*) exec gcc "$@" ;; esac\n'
+    left, fast = tmp_path / "left", f'{SMALL}case "$*" in *square*) exec gcc "$@" ;; esac\n'
     odd_compiler(tmp_path, monkeypatch, f'{ASKED}{fast}echo $$ > "{left}"\nsleep 600\n')
     program = """
 import signal
