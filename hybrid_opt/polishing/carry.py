@@ -1,4 +1,4 @@
-"""A candidate as the polish sees it: on the task's samples, and on places between them."""
+"""Evaluation of a candidate for the polish: on the task's samples and at places between them."""
 
 from __future__ import annotations
 
@@ -16,37 +16,36 @@ from symbolic.robot.arm import REACH_TOLERANCE
 from symbolic.smooth.places import ManipulabilityLimit
 
 SEPARATING_AXES_BELOW = 0.1
-"""Bounds of the payload's distances that are lower are raised by the gaps across its edges [m]."""
+"""Lower bounds of the payload's distances below this are raised by separating-axis gaps [m]."""
 
 MINIMA_BELOW = 0.1
-"""Pairs that stay farther apart than this are not looked at between places [m]."""
+"""Pairs that stay farther apart get no interpolated minima [m]."""
 
 MEASURED_TOGETHER = 8
-"""Distances that are measured together where the first low one ends a search."""
+"""Distances that are measured together in a search for the first violation."""
 
 Stretch = tuple[slice, int]
-"""Places of the path, from a start that is given, and a pair."""
+"""Places of the path, with a stated start, and a pair."""
 
 
 @dataclass(frozen=True)
 class PlacedCarry:
-    """A candidate on m places.
+    """A candidate at m places.
 
     Attributes:
-        pose, rate: (m, 6) box poses [m, rad], and their first derivative with respect to the
-            path parameter.
-        q: both arms' joint positions, (m, n) each [rad]; beyond `reached` without meaning.
-        reached: places before the first that an arm does not reach.
-        stranded: the arms that do not reach all places.
+        pose, rate: (m, 6) box poses [m, rad], and their first derivative by the path parameter.
+        q: joint positions of both arms, (m, n) each [rad]; undefined from `reached` on.
+        reached: places before the first one out of an arm's reach.
+        unreachable_arms: arms that do not reach all places.
         manipulability: (reached, 2) |det J| over its least value.
-        split: (n, 2) on samples: what normal forces are made of, see `symbolic.smooth.samples`: of
-            soft fingers themselves, otherwise normal component and tangential magnitude of the
-            required force [N]; without meaning where the pads do not face one another.
-        force: (n, 2) on samples: the normal forces that are minimised, planned or robust ones [N].
-        peak: (2,) their peaks over their references.
-        shift: (n, 2) on samples: shifts of the centres of pressure over their patches' radii.
-        distances: of every active pair at the places that are reached.
-        gaps: (reached, DIRECTIONS) of a pair that `symbolic.smooth.passage` separates [m].
+        split: (n, 2) on samples: components of the normal forces, see `symbolic.smooth.samples`: of
+            soft fingers the forces themselves, otherwise normal component and tangential magnitude
+            of the required force [N]; undefined if the pads do not face one another.
+        force: (n, 2) on samples: minimised normal forces, planned or robust [N].
+        peak: (2,) their peaks over the reference forces.
+        shift: (n, 2) on samples: shifts of the centres of pressure over the patch radii.
+        distances: of every active pair at the places within reach.
+        gaps: function of a separable pair to its gaps (reached, SEPARATING_DIRECTIONS) [m].
     """
 
     pose: Array
@@ -64,12 +63,12 @@ class PlacedCarry:
 
     @property
     def is_reachable(self) -> bool:
-        """Whether both arms reach all places."""
+        """Return True if both arms reach all places."""
         return self.reached == len(self.pose)
 
 
 def local_minima_below(values: Array, limit: float, stride: int | None = None) -> list[int]:
-    """The lowest place of every stretch below the limit, and those by the stride from it."""
+    """Return the lowest place of every stretch below a limit, and places at a stride from it."""
     below = values < limit
     if not below.any():
         return []
@@ -87,9 +86,11 @@ def local_minima_below(values: Array, limit: float, stride: int | None = None) -
 
 
 def interpolate_minima(clearance: Array) -> Array:
-    """Clearances (n, k) with the dips between places: where an edge is passed, the clearance falls
-    steadily up to a kink and rises steadily from there, so the lines from both sides meet at the
-    least value in between, which then counts at both places."""
+    """Interpolate the minima of clearances (n, k) between places.
+
+    Where an edge is passed, the clearance falls linearly to a kink and rises linearly after it. The
+    lines from both sides meet at the minimum, which then counts at both neighbouring places.
+    """
     low = clearance.copy()
     if len(clearance) < 4:
         return low
@@ -105,11 +106,11 @@ def interpolate_minima(clearance: Array) -> Array:
 
 
 class Distances:
-    """Distances of one candidate; each is measured when it is first asked for, and kept.
+    """Distances of one candidate; each is measured on first use and stored.
 
     Attributes:
-        bounds, lowered: (n, n_pairs) lower bounds [m], the latter with the dips that are to be
-            expected beside each place.
+        bounds, interpolated_clearance: (n, n_pairs) lower bounds [m], without and with interpolated
+            minima.
     """
 
     def __init__(
@@ -117,18 +118,22 @@ class Distances:
         find: Callable[[], Array],
         measure: Callable[[NDArray[np.intp], Array, NDArray[np.bool_]], object],
     ) -> None:
-        """find: gives the bounds; measure: raises those of some places (k,), (k, n_pairs), where
-        wanted. Neither is done before it is needed."""
+        """Prepare without any evaluation.
+
+        Args:
+            find: returns the bounds.
+            measure: raises the bounds (k, n_pairs) of some places (k,) to distances where wanted.
+        """
         self._find, self._measure = find, measure
 
     @cached_property
     def bounds(self) -> Array:
-        """See the class."""
+        """Return lower bounds (n, n_pairs) [m]."""
         return self._find()
 
     @cached_property
     def interpolated_clearance(self) -> Array:
-        """See the class."""
+        """Return lower bounds (n, n_pairs) with interpolated minima [m]."""
         near = self.bounds.min(axis=0, initial=np.inf) < MINIMA_BELOW
         interpolated_clearance = self.bounds.copy()
         interpolated_clearance[:, near] = interpolate_minima(self.bounds[:, near])
@@ -149,7 +154,6 @@ class Distances:
         return self._values
 
     def _measure_pairs(self, places: NDArray[np.intp], pairs: NDArray[np.intp]) -> None:
-        """Measure pairs at places, side by side."""
         if not len(places):
             return
         rows, local = np.unique(places, return_inverse=True)
@@ -161,9 +165,11 @@ class Distances:
         self._unmeasured[places, pairs] = False
 
     def least(self, stretches: Sequence[Stretch], below: float) -> list[float]:
-        """The least distance in each stretch, measured where bounds are below a limit [m]. No
-        distance is below its bound: of each stretch the lowest is measured until that is one that
-        is known."""
+        """Return the least distance in each stretch, measured where bounds are below a limit [m].
+
+        No distance is below its bound: the lowest unmeasured value of each stretch is measured
+        until the lowest one is measured already.
+        """
         open_, found = list(range(len(stretches))), [np.inf] * len(stretches)
         while open_:
             lowest = dict[int, tuple[int, int]]()
@@ -179,8 +185,8 @@ class Distances:
         return found
 
     def exceed(self, limits: Array) -> bool:
-        """Whether every pair keeps its limit (n_pairs,) at all places [m]. The lowest are measured
-        first: the first that does not keep its limit tells."""
+        """Return True if every pair exceeds its limit (n_pairs,) at all places [m]. The lowest are
+        measured first, until one violates its limit."""
         places, pairs = (self.interpolated_clearance < limits).nonzero()
         order = np.argsort(self.interpolated_clearance[places, pairs], kind="stable")
         for first in range(0, len(order), MEASURED_TOGETHER):
@@ -193,7 +199,7 @@ class Distances:
 
 
 class CarryReader:
-    """Evaluates candidates of one cell on the places of a grid."""
+    """Evaluates candidates of one cell at places along the path."""
 
     def __init__(self, cell: SmoothCell) -> None:
         self._evaluator, self._grid, self._robust = cell.evaluator, cell.grid, cell.robust
@@ -254,8 +260,8 @@ class CarryReader:
         )
 
     def _split(self, found: Mapping[str, Array]) -> Array:
-        """See `PlacedCarry.split`. By the paper's allocation both tangential forces point the same
-        way."""
+        """Return `PlacedCarry.split`. By the paper's allocation both tangential forces have the
+        same direction."""
         if self._evaluator.workcell.task.allocation == "soft-finger":
             return found["normal_force"]
         along = found["normal_force"][:, 0] - found["normal_force"][:, 1]
@@ -266,7 +272,7 @@ class CarryReader:
         return np.column_stack([along, np.sqrt(np.maximum(square, 0.0))])
 
     def _raised_by_gaps(self, bounds: Array, gaps: Callable[[int], Array]) -> Array:
-        """Bounds (n, n_pairs), those of the payload from a box raised to the largest gap."""
+        """Raise bounds (n, n_pairs) of the payload from a box to the largest gap."""
         near = bounds.min(axis=0, initial=np.inf) < SEPARATING_AXES_BELOW
         for pair in self._functions.separable.intersection(np.flatnonzero(near).tolist()):
             np.maximum(bounds[:, pair], gaps(pair).max(axis=1), out=bounds[:, pair])

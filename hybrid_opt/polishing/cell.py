@@ -1,4 +1,4 @@
-"""What all programs of a cell share: compiled functions, places of the path, scaled variables."""
+"""Shared data of a cell's programs: compiled functions, places of the path, scaled variables."""
 
 from __future__ import annotations
 
@@ -51,33 +51,32 @@ PRECOMPILED = (
     JointLimit(0, 0, "lower"),
     JointLimit(1, 0, "lower"),
 )
-"""Members of the families whose functions are compiled at once: nearly every solve has them. Every
-clearance of an arm is a family of its own, of which a cell has hundreds and a solve needs a few:
-these are compiled when a solve first asks for them, and kept."""
+"""Members of the families whose functions are compiled at once: nearly every solve needs them.
+Every clearance of an arm is a family of its own, of which a cell has hundreds and a solve needs
+few: these are compiled on first use and cached."""
 
 ARMS = (0, 1)
 
 DEFERRED_LEVELS: dict[Order, int] = {"first": 1, "second": 0}
-"""Optimisation levels of what is compiled when it is asked for: 0.1 and 0.2 s each on the rack. Few
-second derivatives of clearances are ever needed."""
+"""Optimisation levels of functions that are compiled on first use: 0.1 and 0.2 s each on the rack.
+Few second derivatives of clearances are ever needed."""
 
 PLACE_SPACING = 0.0025
-"""Wanted distance of neighbouring places in the path parameter. What dips between two places is
-covered by the distance kept from obstacles, and in the end certified."""
+"""Approximate distance of neighbouring places in the path parameter. The clearance covers minima
+between two places; certification checks them in the end."""
 
 Indices = NDArray[np.intp]
 
 
 class PolishFunctions:
-    """What the programs of a workcell are assembled from.
+    """Compiled functions of a workcell's programs.
 
     Attributes:
-        built: by name; see `symbolic.smooth`: forces and pressure at samples, the inverse
-            kinematics of both arms, under the time law 'optimal' limits along a driven path; and
-            constraints at places of the path, of which those that are not known are built when they
-            are first asked for.
-        model: of the cell's bodies.
-        separable: the pairs whose gaps are known, see `gaps`.
+        built: by name; see `symbolic.smooth`: forces and pressure at samples, inverse kinematics of
+            both arms, under the time law 'optimal' limits along a driven path; rows at places of
+            the path, missing ones compiled on first use.
+        model: arms and bodies of the cell.
+        separable: pairs with known gaps; see `gaps`.
     """
 
     def __init__(self, compiled: CompiledCell, built: Mapping[str, NumericFunction]) -> None:
@@ -88,11 +87,11 @@ class PolishFunctions:
         self.separable = frozenset(self._place.separable())
 
     def closure(self, arm: int, order: Order) -> NumericFunction:
-        """How an arm's joints follow the box."""
+        """Return an arm's joints as a function of the box pose; see `symbolic.smooth.places`."""
         return self.built[closure_name(arm, order)]
 
     def row(self, constraint: PathConstraint, order: Order) -> NumericFunction:
-        """See `symbolic.smooth.places.row_function`."""
+        """Return a family's row function; see `symbolic.smooth.places.row_function`."""
         name = row_name(constraint.family, order)
         if name not in self.built:
 
@@ -104,18 +103,21 @@ class PolishFunctions:
         return self.built[name]
 
     def _numbers(self, constraint: PathConstraint) -> Array:
-        """See `PathConstraint.numbers`."""
         return constraint.numbers(self._place)
 
     def gaps(self, pair: int, pose: Array) -> Array:
-        """(n, DIRECTIONS) gaps [m] of a separable pair at box poses (n, 6)."""
+        """Evaluate the gaps (n, SEPARATING_DIRECTIONS) [m] of a separable pair at box poses (n,
+        6)."""
         return self.built[GAPS].batch(pose, self._obstacle(pair))["gaps"]
 
 
 def sample_quantities(workcell: Workcell) -> tuple[Quantity, ...]:
-    """What a cell's programs ask at samples. What is driven has limits at the intervals of its
-    timing, not at samples; pads that press jointly keep their pressure, and where they do not face
-    one another nothing is in closed form."""
+    """Return the quantities that a cell's programs evaluate at samples.
+
+    Driven carries have limits at the intervals of their timing, not at samples; jointly allocated
+    forces satisfy the pressure limit by themselves, and pads that do not face one another have no
+    closed form.
+    """
     if workcell.task.time_law == "optimal":
         return ()
     if workcell.has_closed_form:
@@ -126,13 +128,13 @@ def sample_quantities(workcell: Workcell) -> tuple[Quantity, ...]:
 def polish_functions(compiled: CompiledCell) -> PolishFunctions:
     """Load or build the functions of a workcell's programs.
 
-    What serves many samples or places at a call is evaluated in lanes, at level 1: higher ones
-    compile three times as long and gain nothing (measured on the rack: every function within 5 %,
-    one slower by 40 %). Of the first and the last two samples, only second derivatives do. Those of
-    whole paths multiply sparse matrices, which have no form in lanes.
+    Functions of many samples or places per call are evaluated in lanes at optimisation level 1:
+    higher levels compile three times as long and gain nothing (measured on the rack: every function
+    within 5 %, one slower by 40 %). Of the first and the last two samples, only second derivatives
+    are. Functions of whole paths multiply sparse matrices, which have no form in lanes.
 
     Raises:
-        DualArmError: the cell's model cannot be built, or its functions not be compiled.
+        DualArmError: the cell's model cannot be built, or its functions cannot be compiled.
     """
     quantities = sample_quantities(compiled.workcell)
     ends = {f"{q}_{block}_first" for q in quantities for block in ("first", "last", "path")}
@@ -182,12 +184,12 @@ def _held(model: CellModel) -> dict[str, ca.Function]:
 
 
 def _driven_held(model: CellModel) -> dict[str, ca.Function]:
-    """The forces that timings know, which judge what is driven."""
+    """Return the force functions with the timing's barrier weight, so that both agree."""
     return grasp_force_functions(model.workcell, TIMING_BARRIER_WEIGHT)
 
 
 def _names(quantities: tuple[Quantity, ...]) -> set[str]:
-    """Names of all functions that `polish_functions` makes."""
+    """Return the names of all functions that `polish_functions` makes."""
     blocks = ("inner", "first", "last", "path")
     return {
         GAPS,
@@ -199,14 +201,14 @@ def _names(quantities: tuple[Quantity, ...]) -> set[str]:
 
 
 class Grid:
-    """Places along one task's path: its samples and some between them, closer than either matters.
+    """Places along one task's path: its samples, and places between them.
 
     Attributes:
         per_sample: places per interval between samples.
         parameter: (m,) of all places, in [0, 1].
         sample_parameter: (n,) of the samples.
-        basis, rate_basis: (m, n_waypoints): poses = basis @ waypoints, and their first
-            derivative with respect to the path parameter.
+        basis, rate_basis: (m, n_waypoints): poses = basis @ waypoints, and their first derivative
+            by the path parameter.
     """
 
     def __init__(self, task: Task) -> None:
@@ -218,47 +220,47 @@ class Grid:
         self.basis, self.rate_basis = along.position, along.first
 
     def places(self, width: float) -> int:
-        """How many places lie in a width of the path parameter, at least one."""
+        """Return the number of places in a width of the path parameter, at least one."""
         return max(1, round(width * (len(self.parameter) - 1)))
 
     def samples(self, width: float) -> int:
-        """How many samples lie in a width of the path parameter, at least one."""
+        """Return the number of samples in a width of the path parameter, at least one."""
         return max(1, round(width * (len(self.sample_parameter) - 1)))
 
     def between(self, values: Array) -> Array:
-        """Values (n, k) on samples, interpolated to all places (m, k)."""
+        """Interpolate values (n, k) on samples to all places (m, k)."""
         return np.column_stack(
             [np.interp(self.parameter, self.sample_parameter, column) for column in values.T]
         )
 
     def movable(self, place: int) -> bool:
-        """Whether a place is not one of both ends, which are fixed."""
+        """Return True if a place is not one of the two fixed ends."""
         return 0 < place < len(self.parameter) - 1
 
 
 class SmoothCell:
-    """What all programs of a cell share.
+    """Shared data of all programs of a cell.
 
     Attributes:
-        evaluator, functions: the full model, and what programs are assembled from.
-        workcell, task, grid: the evaluator's.
-        clearance: to be kept from obstacles beyond the checker's tolerance [m].
-        robust: robust forces at samples where they are minimised, None for the planned ones.
+        evaluator, functions: full model, and the programs' functions.
+        workcell, task, grid: of the evaluator.
+        clearance: distance to obstacles beyond the checker's tolerance [m].
+        robust: robust forces at samples if they are minimised, None for planned ones.
         centre, half: (n_var,) x = centre + half * xi scales the decision vector by its bounds to
-            [-1, 1]; half is 1 where a variable is fixed.
+            [-1, 1]; half is 1 for a fixed variable.
         free: rows and columns of the variables among the extended waypoints.
-        blocks: how samples are divided among functions.
-        coefficients: (2, branches, 2) those of `force_branches`.
+        blocks: division of the samples among functions.
+        coefficients: (2, branches, 2) of `force_branches`.
         still: (n_waypoints, 6 + m) extended waypoints without the variables.
     """
 
     def __init__(
         self, evaluator: CandidateEvaluator, functions: PolishFunctions, clearance: float
     ) -> None:
-        """Read what is shared.
+        """Collect the shared data.
 
         Raises:
-            SettingsError: robust forces are minimised, and there are none of the cell's pads.
+            SettingsError: robust forces are minimised, but the cell's pads have none.
         """
         self.evaluator, self.functions, self.clearance = evaluator, functions, clearance
         self.workcell, self.task = evaluator.workcell, evaluator.workcell.task
@@ -276,20 +278,20 @@ class SmoothCell:
         self.still = np.column_stack([fixed, *[joint.lower for joint in self.task.redundant]])
 
     def scaled(self, x: Array) -> Array:
-        """Scaled variables xi of x."""
+        """Return scaled variables xi of x."""
         return (x - self.centre) / self.half
 
     def unscaled(self, xi: Array) -> Array:
-        """Variables x of scaled ones xi."""
+        """Return variables x of scaled ones xi."""
         return self.centre + self.half * xi
 
     def step(self, start: Array, end: Array) -> float:
-        """Largest change of a scaled variable between two decision vectors."""
+        """Return the largest change of a scaled variable between two decision vectors."""
         return float(np.max(np.abs(end - start) / self.half))
 
     def waypoints(self, x: Array) -> Array:
-        """As `extended_waypoints`, which looks up what is known here and unwraps what need not
-        be."""
+        """Return `extended_waypoints`, from stored data and without unwrapping where no angle
+        wraps."""
         points = self.still.copy()
         points[self.free] = x[: self._n_path]
         turns = points[1:, 3:POSE_SIZE] - points[:-1, 3:POSE_SIZE]

@@ -1,7 +1,7 @@
-"""The polish's C++: `rows.cpp`, `solvers/dense.cpp`, `solvers/quadratic.cpp`, beside their Python.
+"""Loader of the polish's C++: `rows.cpp`, `solvers/dense.cpp`, `solvers/quadratic.cpp`.
 
-It is the same for every cell and compiled when the project is installed, for every processor of the
-machine's kind.
+It is the same for every cell and compiled at installation, for every processor of the machine's
+kind.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from symbolic.robot.bridge import REMEDY
 
 @cache
 def native() -> Any:
-    """The module.
+    """Return the compiled module.
 
     Raises:
         BridgeError: it is missing or cannot be loaded.

@@ -1,5 +1,4 @@
-"""The polish of fronts: by the cell's time law of both peak forces, or of path and timing
-together."""
+"""Polish of fronts, by the cell's time law: of both peak forces, or of path and timing together."""
 
 from __future__ import annotations
 
@@ -27,23 +26,23 @@ from symbolic.records.cell import Workcell
 from symbolic.records.task import initial_decision
 
 TIMED_EVALUATIONS = 32
-"""Candidates whose evaluation is timed, to express the polish in their unit."""
+"""Candidates whose evaluation is timed, as the unit of the polish's cost."""
 
 
 def has_polishable_forces(workcell: Workcell, objectives: Sequence[str]) -> bool:
-    """Whether the pads' forces are known: planned ones of any pads, robust ones of two round pads
-    that face one another."""
+    """Return True if the polish has the pads' forces: planned ones of any pads, robust ones of two
+    round pads that face one another."""
     return workcell.has_facing_pads or tuple(objectives) != ROBUST_OBJECTIVES
 
 
 class Polisher:
-    """Polishes fronts of one evaluator. A resource: keep it for several fronts.
+    """Polishes fronts of one evaluator. A resource: reuse it for several fronts.
 
     Attributes:
-        evaluator: judges what is found.
+        evaluator: full model.
         settings: effort and tolerances.
         solver: of both peak forces; None under the time law 'optimal'.
-        way: how drivable carries are polished; None under other time laws.
+        drive_method: step method of drivable carries; None under other time laws.
     """
 
     solver: ForceSolver | None = None
@@ -77,7 +76,8 @@ class Polisher:
         self._timings = TimingModel(evaluator.compiled, self.drive_method.driver.timer.intervals)
 
     def recheck(self, x: Array) -> str:
-        """Why the timing of a drivable decision vector is not believed, see `recheck_timing`."""
+        """Return why a drivable decision vector's timing fails on the finer grid, else ''; see
+        `recheck_timing`."""
         assert self.drive_method is not None
         return recheck_timing(self.drive_method.driver, self._timings, x)
 
@@ -94,13 +94,13 @@ class Polisher:
 
         Args:
             front_x: (k, n_var) decision vectors; k may be 0.
-            rng: spreads the starts of attempts at the balanced middle.
-            recorded: outcomes of an earlier, interrupted polish of the same front, not repeated;
-                `FailedAttempt` for an attempt that ended its process.
-            emit: takes each new outcome.
-            paths: (m, n_path) free waypoints that are known to be good, and need not be on the
-                front; only the polish of drivable carries uses them. None for none.
-            tell: takes attempts done, and those in all as far as is known.
+            rng: draws the starts of attempts at the balanced middle.
+            recorded: outcomes of an earlier, interrupted polish of the same front, which are not
+                repeated; `FailedAttempt` for an attempt that ended its process.
+            on_outcome: receives each new outcome.
+            paths: (m, n_path) known good free waypoints, not necessarily on the front; only the
+                polish of drivable carries uses them. None for none.
+            on_progress: receives attempts done, and the expected total.
         """
         begin = time.perf_counter()
         x = np.asarray(front_x, dtype=float).reshape(-1, self.evaluator.n_var)
@@ -135,7 +135,7 @@ class Polisher:
         )
 
     def _evaluation_seconds(self, x: Array) -> float:
-        """Time of one candidate evaluation; the initial trajectory's for an empty front."""
+        """Measure one candidate evaluation; the initial trajectory's for an empty front."""
         sample = x if len(x) else initial_decision(self.evaluator.workcell.task)[None]
         batch = np.resize(sample, (TIMED_EVALUATIONS, self.evaluator.n_var))
         begin = time.perf_counter()

@@ -1,4 +1,4 @@
-"""What the polish reports."""
+"""Records that the polish returns and stores."""
 
 from __future__ import annotations
 
@@ -23,18 +23,18 @@ class PolishOutcome:
 
     Attributes:
         aim: 'point' improves a point of the given front; 'extreme', 'balance' and 'gap' look for
-            new ones; 'probe' is a short solve that tells where to look.
-        parent: row of the given front that is to be replaced, -1 for a new point.
-        status: accepted; optimal (not improved by more than the tolerance: the original stays);
-            rejected by the re-evaluation; failed in the solver.
-        reason: why it was not accepted, empty if it was.
-        x: (n_var,) the new decision vector if accepted, otherwise the one started from.
-        start, objectives: (2,) before and after; equal where nothing was accepted.
-        residuals: of the solver's last answer, whatever became of it.
-        iterations: of the solver, over all rounds.
-        rounds: solves, one more for every time that constraints were added.
-        rows: constraints at places of the path in the last round.
-        seconds: spent on this attempt, re-evaluation and certification included.
+            new ones; 'probe' is a short solve that chooses where to look.
+        parent: row of the given front to replace, -1 for a new point.
+        status: accepted; optimal (no improvement beyond the tolerance: the original stays);
+            rejected by the full evaluation; failed in the solver.
+        reason: why it was not accepted, else empty.
+        x: (n_var,) new decision vector if accepted, otherwise the start.
+        start, objectives: (2,) before and after; equal if nothing was accepted.
+        residuals: of the solver's last answer, accepted or not.
+        iterations: of the solver, over all trust-region iterations.
+        rounds: trust-region iterations.
+        rows: rows at places of the path in the last program.
+        seconds: wall time of the attempt, full evaluation and certification included.
     """
 
     aim: Aim
@@ -56,16 +56,17 @@ class PolishEffort:
     """Effort and success of a polish.
 
     Attributes:
-        solver: what solved its programs: 'dense', 'ipopt', or 'quadratic' for drivable carries.
+        solver: of its programs: 'dense', 'ipopt', or 'quadratic' for drivable carries.
         attempts: solves.
         counts: attempts by status, and those not accepted also by 'status: reason'.
-        success_share: of the attempted points of the given front, those accepted or optimal.
-        seconds, median_attempt_seconds: spent in total and per attempt.
+        success_share: share of the attempted points of the given front that are accepted or
+            optimal.
+        seconds, median_attempt_seconds: in total and per attempt.
         equivalent_evaluations: candidate evaluations that take as long.
-        widest_gap: share of the front's length, along both objectives, between the neighbours that
-            are farthest apart; NaN for fewer than two points.
+        widest_gap: largest distance of neighbours, as a share of the front's length along both
+            objectives; NaN for fewer than two points.
         worst_stationarity, worst_feasibility, median_stationarity: residuals of the points that a
-            solve made and that stand on the front in the end.
+            solve made and that are on the front in the end.
     """
 
     solver: str
@@ -83,16 +84,16 @@ class PolishEffort:
 
 @dataclass(frozen=True)
 class PolishedFront:
-    """A front after the polish, as it is stored; arrays are read-only.
+    """A polished front as it is stored; arrays are read-only.
 
     Attributes:
         x: (k, n_var) non-dominated decision vectors, by increasing first objective.
-        objectives: (k, 2) as the full evaluator gives them.
-        parent: (k,) row of the given front that the point replaced or still is, -1 for a new one.
+        objectives: (k, 2) by the full evaluator.
+        parent: (k,) row of the given front that the point is or replaced, -1 for a new one.
         polished: (k,) whether the polish made the point.
-        outcomes: every attempt, in order.
-        solver: what solved its programs: 'dense', 'ipopt', or 'quadratic' for drivable carries.
-        seconds: spent in total.
+        outcomes: all attempts, in order.
+        solver: of its programs: 'dense', 'ipopt', or 'quadratic' for drivable carries.
+        seconds: in total.
         evaluation_seconds: measured for one candidate evaluation, the unit of the search.
     """
 
@@ -106,7 +107,11 @@ class PolishedFront:
     solver: str
 
     def __post_init__(self) -> None:
-        """Make the arrays read-only; refuse those of different lengths."""
+        """Make the arrays read-only.
+
+        Raises:
+            ValueError: their lengths differ.
+        """
         arrays = (self.x, self.objectives, self.parent, self.polished)
         if len({len(array) for array in arrays}) > 1:
             raise ValueError("its arrays have different lengths")
@@ -115,7 +120,7 @@ class PolishedFront:
 
     @property
     def widest_gap(self) -> float:
-        """See `PolishEffort`."""
+        """Return the widest gap; see `PolishEffort`."""
         if len(self.objectives) < 2:
             return float("nan")
         sides = np.abs(np.diff(self.objectives, axis=0))
@@ -123,14 +128,14 @@ class PolishedFront:
 
     @property
     def counts(self) -> dict[str, int]:
-        """Attempts by status, and those not accepted also by 'status: reason'."""
+        """Count attempts by status, and those not accepted also by 'status: reason'."""
         listed = Counter[str](outcome.status for outcome in self.outcomes)
         listed.update(f"{o.status}: {o.reason}" for o in self.outcomes if o.reason)
         return dict(listed)
 
     @property
     def effort(self) -> PolishEffort:
-        """Effort that it took."""
+        """Summarise effort and success."""
         own = [o.status in ("accepted", "optimal") for o in self.outcomes if o.aim == "point"]
         # Others were judged as they are, without a solver.
         solved = [o for o in self.outcomes if o.rounds or o.status == "failed"]

@@ -1,11 +1,11 @@
 """Robust forces in the polish: at the samples of a carry, and along a driven path.
 
-The smooth problem knows planned forces with two derivatives. Of robust ones it takes the values and
-slopes at the candidate of each round, exact for the cases that rule, and bends them as planned
-forces bend: every round's model agrees with the truth to first order, so that where rounds come to
-rest the true first-order conditions hold. At every point of a driven path the cases that ask for
-most have a row each: where two cases rule in turn one row alone would let a step through that the
-other forbids.
+The smooth model has planned forces with two derivatives. Of robust ones it takes values and slopes
+at the candidate of each iteration, exact for the governing cases, and the curvature of planned
+forces. So every iteration's model agrees with the truth to first order, and at a stationary point
+of the iteration the true first-order conditions hold. At every point of a driven path the most
+demanding cases have a row each: if two cases govern alternately, one row alone would admit a step
+that the other forbids.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from symbolic.smooth.driven import planned_branches
 from symbolic.smooth.samples import motion_function
 
 LEADER = 0
-"""The arm that keeps its place, as in the objectives."""
+"""Arm that holds its position, as in the objectives."""
 
 GOVERNING_CASES = 3
 """Cases per robot and point of a driven path."""
@@ -41,8 +41,8 @@ class RobustSamples:
         """Load or build the compiled functions.
 
         Raises:
-            SettingsError: there are no robust forces of its pads, or its uncertainty leaves no
-                friction or patch.
+            SettingsError: its pads have no robust forces, or its uncertainty leaves no friction or
+                patch.
             DualArmError: a function cannot be built.
         """
         self._workcell, self._model = workcell, robust_model(workcell)
@@ -51,12 +51,13 @@ class RobustSamples:
         self._motion = InterpretedFunction(motion_function(workcell.task))
 
     def forces(self, found: Mapping[str, Array]) -> Array:
-        """(n, 2) normal forces [N] from the evaluator's outputs for one candidate."""
+        """Compute normal forces (n, 2) [N] from the evaluator's outputs for one candidate."""
         motion = BoxMotion(*[found[name] for name in ("pose", "rate", "second_rate")])
         return self._ruling(motion).force
 
     def first(self, x: Array) -> tuple[Array, Array]:
-        """Forces (n, 2) [N] of a decision vector (n_var,) and their derivatives (n, 2, n_var)."""
+        """Compute forces (n, 2) [N] of a decision vector (n_var,) and their derivatives (n, 2,
+        n_var)."""
         out = self._motion.batch(np.ascontiguousarray(x)[None])
         rows = out["motion"][0]
         by_x = out["slope"][0].reshape(*rows.shape, len(x))
@@ -76,16 +77,16 @@ class RobustSamples:
 
 
 class RobustForces:
-    """Robust forces at driven points of one workcell, robot by robot."""
+    """Robust forces at driven points of one workcell, by robot."""
 
     def __init__(self, workcell: Workcell, pose: int) -> None:
-        """pose: entries of the extended pose."""
+        """Prepare for an extended pose of `pose` entries."""
         self._forces, self._pose = robust_path(workcell), pose
         self._branches = planned_branches(workcell)
 
     def at(self, path: Sequence[Array], a: Array, w: Array) -> tuple[Array, Array]:
-        """(points, ROBUST_ROWS) [N], and their slopes (points, ROBUST_ROWS, 3 pose + 2) by the
-        extended pose and its derivatives, u'' and u'^2.
+        """Compute forces (points, ROBUST_ROWS) [N] and their slopes (points, ROBUST_ROWS, 3 pose +
+        2) by the extended pose and its derivatives, u'' and u'^2.
 
         Args:
             path: extended poses and their derivatives by u (points, pose).
@@ -103,8 +104,8 @@ class RobustForces:
         return force.reshape(n, ROBUST_ROWS), found
 
     def planned_weights(self, weight: Array, value: Array) -> Array:
-        """Weights (points, quantities) that bend the planned forces as those of robust ones, given
-        behind them, are taken to bend.
+        """Return weights (points, quantities) that give robust forces the curvature of planned
+        ones.
 
         Args:
             weight, value: (points, quantities and robust forces).

@@ -1,11 +1,11 @@
-"""Rows of a smooth program: what they are, and their values, slopes and weighted curvature.
+"""Rows of a smooth program: their values, slopes and weighted curvature.
 
-A row stands at a sample or at a place of the path. Forces and pressure at samples are functions of
-the decision vector; what stands at a place depends on the box pose there, on its rate, which are
-linear in the decision vector, and on the joints that hold the box (`symbolic.smooth.places` has the
-formulas). Functions of CasADi give values and derivatives of many samples or places at a call; here
-the arrays that they work on are laid out, and `rows.cpp` calls them and puts rows together: what
-NumPy does between them, in many small arrays, takes longer than the functions themselves.
+A row belongs to a sample or to a place of the path. Forces and pressure at samples are functions of
+the decision vector; rows at a place depend on the box pose and its rate there, which are linear in
+the decision vector, and on the joints that hold the box (`symbolic.smooth.places` has the
+formulas). CasADi functions give values and derivatives of many samples or places per call. Here
+their arrays are laid out; `rows.cpp` calls the functions and assembles the rows: in NumPy, with
+many small arrays, the assembly takes longer than the functions themselves.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ from symbolic.smooth.places import ORDERS, PathConstraint
 from symbolic.smooth.samples import QUANTITY_WIDTHS, Quantity, grasp_force_name, sample_name
 
 PROGRAM_BRANCH = 5
-"""Branch of a force row that is the joint allocation's, after the paper's five."""
+"""Branch of a force row that a grasp's program finds, after the paper's five."""
 
 TIME_LAW_ROUNDING = 1e-3
 """Share of a step's duration by which the paper's time law is rounded where rotation takes over
-from translation: the least forces at the ends of a path lie in that kink."""
+from translation: the least forces at the ends of a path are in that kink."""
 
 
 @dataclass(frozen=True, order=True)
@@ -45,7 +45,7 @@ class ForceRow:
 
 @dataclass(frozen=True, order=True)
 class PressureRow:
-    """Margin of a robot's shift of the centre of pressure within its patch at a sample."""
+    """Margin of a robot's centre of pressure to the rim of its patch at a sample."""
 
     robot: int
     sample: int
@@ -68,13 +68,12 @@ def _name(constraint: PathConstraint) -> str:
 
 
 class RowLayout:
-    """The blocks of rows of one program, in their order, each in an order of its own: forces, the
-    sides of objectives, patches, places.
+    """Order of a program's rows: forces, objectives, patches, places, each block sorted.
 
     Attributes:
-        force_rows, pressure_rows, place_rows: the rows of each block.
-        forces, sides, patches, places: where the blocks are.
-        n_rows: all of them.
+        force_rows, pressure_rows, place_rows: rows of each block.
+        forces, sides, patches, places: slices of the blocks.
+        n_rows: total.
     """
 
     def __init__(self, rows: Iterable[Row], sides: int = 0) -> None:
@@ -91,22 +90,22 @@ class RowLayout:
 
 
 class _SampleRows:
-    """Some values of each of some samples, from the decision vector.
+    """Values of some samples as functions of the decision vector.
 
     Attributes:
-        column: (n_samples,) position of a sample among the values, -1 where it has none.
-        found, gradients: (count, width), (count, width, n_var) where they were evaluated last.
-        given: to `rows.cpp`.
+        column: (n_samples,) position of a sample among the values, -1 without.
+        found, gradients: (count, width), (count, width, n_var) of the last evaluation.
+        given: arguments of `rows.cpp`.
     """
 
     def __init__(
         self, cell: SmoothCell, quantity: Quantity, wanted: Collection[int], beyond: int = 0
     ) -> None:
-        """A program's samples.
+        """Lay out a program's samples.
 
         Args:
-            wanted: samples without which a call is left out.
-            beyond: samples whose values follow, which others find.
+            wanted: needed samples; calls without any of them are left out.
+            beyond: number of samples that another source writes behind them.
         """
         built = cell.functions.built
         chosen = [
@@ -145,7 +144,7 @@ class _SampleRows:
 
 
 def _all_directions(second: NumericFunction, n: int, n_var: int) -> PreparedBatch:
-    """Second derivatives along every direction of x: each sample is evaluated n_var times."""
+    """Prepare second derivatives along every direction of x: n_var evaluations per sample."""
     batch = second.prepared(n * n_var, ("x", "rounding"))
     batch.inputs["rounding"][...] = TIME_LAW_ROUNDING
     batch.inputs["along"][...] = np.tile(np.eye(n_var), (n, 1))
@@ -153,11 +152,11 @@ def _all_directions(second: NumericFunction, n: int, n_var: int) -> PreparedBatc
 
 
 class ConstraintRows:
-    """The rows of one program as functions of the decision vector x (n_var,), and of further
-    variables on which they depend linearly. A resource of one thread.
+    """Rows of one program as functions of x (n_var,), and of further variables on which they depend
+    linearly. For one thread.
 
-    value_r = offset_r + fixed_r . tail + what the row asks for: mix_r . (the two values of its
-    sample), what is left of a patch, or what a constraint is at its place, over its scale.
+    value_r = offset_r + fixed_r . tail + own value: mix_r . (the two values of its sample), the
+    remaining patch, or a constraint at its place over its scale.
 
     Attributes:
         offset: (n_rows,) to be written.
@@ -175,9 +174,9 @@ class ConstraintRows:
 
         Args:
             q: both arms' joints at all places (m, n) near those that hold the box [rad].
-            mix: (n_forces, 2) what each force row takes of its sample's values: F_n and F_t for
-                the paper's branches, both normal forces for joint allocation.
-            fixed: (n_rows, k) the columns of the further variables.
+            mix: (n_forces, 2) coefficients of each force row's sample values: F_n and F_t for the
+                paper's branches, both normal forces for a grasp's program.
+            fixed: (n_rows, k) columns of the further variables.
 
         Raises:
             DualArmError: a function cannot be built.
@@ -237,8 +236,7 @@ class ConstraintRows:
         }
 
     def _lay_out_places(self, layout: RowLayout, q: tuple[Array, Array]) -> dict[str, Any]:
-        """Inside, rows at places stand family by family; the joints of every place that needs them
-        are solved once."""
+        """Sort rows at places by family; the joints of every place are solved once."""
         cell, rows = self._cell, layout.place_rows
         members: dict[str, list[int]] = {}
         for k, row in enumerate(rows):
@@ -302,7 +300,6 @@ class ConstraintRows:
     def _lay_out_group(
         self, constraints: Sequence[PathConstraint], given: dict[str, Array]
     ) -> dict[str, Any]:
-        """Rows of one family."""
         functions, one = self._cell.functions, constraints[0]
         first = functions.row(one, "first").prepared(len(constraints), given=given)
         if "numbers" in first.inputs:
@@ -316,7 +313,7 @@ class ConstraintRows:
         }
 
     def values(self, x: Array, tail: Array | None = None) -> Array:
-        """(n_rows,) at x and the further variables.
+        """Evaluate all rows (n_rows,) at x and the further variables.
 
         Raises:
             CodegenError: a function failed.
@@ -326,12 +323,12 @@ class ConstraintRows:
         return np.asarray(self.offset + found)
 
     def slopes(self) -> Array:
-        """(n_rows, n_var + k) by all variables where the values were found last."""
+        """Return the slopes (n_rows, n_var + k) by all variables at the last evaluation."""
         return np.asarray(self._native.slopes())
 
     def curvature(self, multipliers: Array) -> Array:
-        """(n_var, n_var) second derivatives of (n_rows,) multipliers . values by x where the slopes
-        were found last.
+        """Return second derivatives (n_var, n_var) of (n_rows,) multipliers . values by x at the
+        last slopes.
 
         Raises:
             CodegenError: a function failed.
@@ -340,27 +337,30 @@ class ConstraintRows:
 
     @property
     def forces(self) -> Array:
-        """(n_forces, 2) both values of each force row's sample where they were found last."""
+        """Return both values (n_forces, 2) of each force row's sample at the last evaluation."""
         return self._forces.found[self._column]
 
     @property
     def force_slopes(self) -> Array:
-        """(n_forces, 2, n_var) of these by x; not of joint allocation's."""
+        """Return the slopes (n_forces, 2, n_var) of `forces` by x; undefined for a grasp's
+        program."""
         return self._forces.gradients[self._column]
 
     @property
     def left(self) -> Array:
-        """(n_patches,) what is left of the patches where it was found last."""
+        """Return the remaining patches (n_patches,) at the last evaluation."""
         return self._patches.found.ravel()[self._pressed]
 
     def correct_forces(self, slope: Array, x: Array) -> None:
-        """Add (n_forces, n_var) to the slopes of forces, and to values what that makes beside x."""
+        """Add (n_forces, n_var) to the slopes of forces, and the corresponding change away from x
+        to their values."""
         self._native.correct(slope, x)
 
 
 def row_numbers(
     constraints: Sequence[PathConstraint], functions: PolishFunctions
 ) -> tuple[Array, ...]:
-    """(rows, n) numbers of constraints of one family, in a tuple; an empty one without any."""
+    """Return the numbers (rows, n) of constraints of one family in a tuple; an empty tuple without
+    any."""
     numbers = np.array([functions.numbers(constraint) for constraint in constraints])
     return (numbers,) if numbers.shape[1] else ()

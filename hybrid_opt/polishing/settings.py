@@ -1,9 +1,8 @@
-"""What a user may decide of a polish. Everything else is a constant beside its use; docs/polish.md
-explains it.
+"""Settings of a polish. All other numbers are constants beside their use; docs/polish.md explains
+it.
 
-Wherever widths along the path are given, they are in its parameter (the whole path is 1), distances
-in metres, steps in halves of the decision variables' ranges: none of them changes its meaning with
-the samples.
+Widths along the path are in the path parameter (the whole path is 1), distances in metres, steps in
+half ranges of the decision variables: none of them changes its meaning with the number of samples.
 """
 
 from __future__ import annotations
@@ -21,19 +20,19 @@ NumberOrNone = Annotated[int, Range(0, 10**6)]
 Small = Annotated[float, Range(1e-12, 1.0)]
 
 DRIVABLE_ATTEMPTS = 14
-"""Force limits at a drivable front."""
+"""Force limits on a drivable front."""
 
 QUICK_ATTEMPTS, QUICK_DRIVABLE_ATTEMPTS = 2, 6
-"""The same of a small study: attempts, and force limits."""
+"""Attempts, and force limits, of a small study."""
 
 
 @dataclass(frozen=True)
 class ProbeSettings:
-    """How basins far from the front are looked for, see `hybrid_opt.polishing.starts`.
+    """Search for basins far from the front; see `hybrid_opt.polishing.starts`.
 
     Attributes:
-        starts: of an end of the front; both ends share them unless one is the other's mirror image.
-        middle_starts: of its balanced middle.
+        starts: at an end of the front; both ends share them unless one is the other's mirror image.
+        middle_starts: at its balanced middle.
         rounds: of each short solve.
     """
 
@@ -47,14 +46,13 @@ class ProbeSettings:
 
 @dataclass(frozen=True)
 class FillSettings:
-    """How a front is filled once its ends are known, see `hybrid_opt.polishing.force_front`.
+    """Filling of a front between its ends; see `hybrid_opt.polishing.force_front`.
 
     Attributes:
         solved: points up to which gaps are filled by solves.
-        members: points that the front is to have; beyond those, the rest lies on chords between
-            neighbours.
-        attempts: at most, for each of `PolishSettings.attempts`; twice as many where the front
-            stays short.
+        members: wanted points of the front; the rest lies on chords between neighbours.
+        attempts: at most, for each of `PolishSettings.attempts`; twice as many if the front stays
+            short.
     """
 
     solved: NumberOrNone = 32
@@ -67,13 +65,13 @@ class FillSettings:
 
 @dataclass(frozen=True)
 class DrivableSettings:
-    """The polish under the time law 'optimal', see `hybrid_opt.polishing.drive_front`.
+    """Polish under the time law 'optimal'; see `hybrid_opt.polishing.drive_front`.
 
     Attributes:
-        first_rounds: steps of the first path, unless it ends before.
-        rounds: of each force limit's.
-        members: gaps of the front, the widest first, that get a point in the end where a path
-            between both neighbours' wins one.
+        first_rounds: trust-region iterations of the first path at most.
+        rounds: trust-region iterations at each force limit.
+        members: gaps of the front, the widest first, that get a point in the end if a path between
+            both neighbours improves the front.
     """
 
     first_rounds: Number = 16
@@ -86,18 +84,17 @@ class DrivableSettings:
 
 @dataclass(frozen=True)
 class PolishSettings:
-    """What decides the results of a polish.
+    """All settings that decide the results of a polish.
 
     Attributes:
-        attempts: that one front may take at its points, ends and middle; probes and
-            those that fill it between them come on top. Of drivable carries the force limits of the
-            sweep.
+        attempts: at points, ends and middle of a front; probes and attempts between them are extra.
+            For drivable carries the force limits of the sweep.
         solver: of the programs of both peak forces: the dense interior-point method of
             `hybrid_opt.polishing.solvers.dense`, or IPOPT.
-        rounds: of one point at most; see `hybrid_opt.polishing.point`.
-        max_iterations: of the solver in one round; see `PATIENCE` of `solvers.base`.
-        clearance: distance kept from obstacles [m]; lets the motion between samples be certified.
-        probe, fill, drivable: the parts' own.
+        rounds: trust-region iterations of one point at most; see `hybrid_opt.polishing.point`.
+        max_iterations: of the solver per program; see `FEASIBILITY_PATIENCE` of `solvers.base`.
+        clearance: distance to obstacles [m] that lets the motion between samples be certified.
+        probe, fill, drivable: settings of the parts.
     """
 
     attempts: NumberOrNone = 8
@@ -114,12 +111,12 @@ class PolishSettings:
 
 
 def default_settings(time_law: str) -> PolishSettings:
-    """The settings where nothing else is asked for."""
+    """Return the settings of a full study under a time law."""
     return PolishSettings(attempts=DRIVABLE_ATTEMPTS) if time_law == "optimal" else PolishSettings()
 
 
 def quick_settings(time_law: str) -> PolishSettings:
-    """Settings of a small study: a third as many points from fewer attempts."""
+    """Return settings of a small study: a third as many points from fewer attempts."""
     if time_law == "optimal":
         return PolishSettings(
             attempts=QUICK_DRIVABLE_ATTEMPTS, drivable=DrivableSettings(members=10)

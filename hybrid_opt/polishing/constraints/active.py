@@ -1,15 +1,14 @@
-"""All kinds of constraints together: which rows a program gets, and what they have to keep.
+"""Selection of rows for a program, and the working set of a solve.
 
-What rows ask for that a refused step taught was measured where the step led: bounds of distances
-are not smooth, and a step that is much shorter need not keep it. So of what a row asks beyond what
-it has to keep at the best candidate, the share counts that the box of trust reaches of the way to
-the candidate that taught it. Asked in full within a small box, nothing was left to do but to go
-there.
+A bound that a rejected step tightened was measured where that step led. Bounds of distances are not
+smooth, and a much shorter step need not satisfy them. So only the share of the tightening counts
+that the trust region reaches of the way to the candidate that caused it. With the full tightening
+in a small region the only feasible step would be to that candidate.
 
-Rows stand at the lowest places of a path. Where two places are equally low, each step raises the
-one that has a row and lowers the other, for ever: in the polish of drivable carries rows that
-pressed lately stay, while steps are short. After a long one they would hold the payload on its old
-side of an edge.
+Rows are at local minima along the path. Where two minima are equally low, each step raises the one
+with a row and lowers the other, without end. Therefore, in the polish of drivable carries, active
+rows stay in the working set while steps are short. After a long step they would hold the payload on
+its former side of an edge.
 """
 
 from __future__ import annotations
@@ -41,17 +40,17 @@ from symbolic.smooth.passage import AxisSwitchGap, SeparatingAxisGap
 from symbolic.smooth.places import Clearance, JointLimit, ManipulabilityLimit
 
 LEAST_TIGHTENING = 1e-4
-"""Least rise of a required value that counts as a new demand [m, rad, 1]."""
+"""Least rise of a required value that counts as new [m, rad, 1]."""
 
 ACTIVE_ROW_LIFETIME = 3
-"""Programs that a row stays in after it pressed last."""
+"""Programs for which a row stays after it was active last."""
 
 
 class RowSelector:
-    """Chooses rows for candidates of one evaluator.
+    """Selects the rows of a program for candidates of one evaluator.
 
-    Carries under the time law 'optimal' have no rows at samples: `hybrid_opt.polishing.drive` has
-    their forces.
+    Carries under the time law 'optimal' have no rows at samples: `hybrid_opt.polishing.drive`
+    limits their forces.
     """
 
     def __init__(self, cell: SmoothCell) -> None:
@@ -71,17 +70,16 @@ class RowSelector:
         }
 
     def near_rows(self, carry: PlacedCarry, limits: MinimisedForces) -> set[Row]:
-        """Rows of everything near a candidate."""
+        """Return rows of all constraints near their bounds at a candidate."""
         return self._rows(lambda kind: kind.near_rows(carry, limits))
 
     def violated_rows(
         self, carry: PlacedCarry, known: PlacedCarry, program_rows: Collection[Row]
     ) -> set[Row]:
-        """Rows of everything that a step from a known candidate violates.
+        """Return rows of all constraints that a step from a known candidate violates.
 
         Args:
-            asked: rows of the program that led there. Its forces are no violation: they raise the
-                peaks.
+            program_rows: rows of the program. Their forces are no violation: they raise the peaks.
         """
         violated = self._rows(lambda kind: kind.violated_rows(carry, known))
         return {row for row in violated if row not in program_rows or not isinstance(row, ForceRow)}
@@ -89,8 +87,8 @@ class RowSelector:
     def has_violation(
         self, carry: PlacedCarry, known: PlacedCarry, program_rows: Collection[Row]
     ) -> bool:
-        """Whether a step violates anything, as `violated` has it; distances, the dearest, last and
-        only until one is too small."""
+        """Return True if a step violates anything; distances, the most expensive, are checked last
+        and only until one is too small."""
         return any(
             row not in program_rows or not isinstance(row, ForceRow)
             for kind in self._kinds.values()
@@ -112,7 +110,7 @@ class RowSelector:
         rows: Iterable[Row],
         before: Mapping[Row, float],
     ) -> dict[Row, float]:
-        """The value that rows have to keep that a step violates, see `ConstraintKind`."""
+        """Return the required values of violated rows; see `ConstraintKind`."""
 
         def program_rows(kind: ConstraintKind[Any], own: list[Row]) -> list[float]:
             return kind.tightened_bounds(carry, known, own, [before.get(row, 0.0) for row in own])
@@ -120,7 +118,7 @@ class RowSelector:
         return self._by_kind(rows, program_rows)
 
     def persists(self, row: Row) -> bool:
-        """Whether what a row has to keep outlasts the candidate that it was learned from."""
+        """Return True if a row's tightened bound stays valid at other candidates."""
         return self._kind_of(row).persists
 
     def _kind_of(self, row: Row) -> ConstraintKind[Any]:
@@ -147,14 +145,13 @@ class RowSelector:
 
 
 class WorkingSet:
-    """Rows learned by the steps of one climb, beside those near its candidate, and the value that
-    each has to keep from then on. It grows with refused steps."""
+    """Rows added by the steps of one solve, with the value that each has to exceed."""
 
     def __init__(self, active: RowSelector, half: Array) -> None:
-        """Nothing is learned yet.
+        """Start empty.
 
         Args:
-            active: chooses rows.
+            active: selects rows.
             half: (n,) half ranges of the variables that steps move.
         """
         self._active, self._half = active, half
@@ -164,13 +161,13 @@ class WorkingSet:
     def required_values(
         self, carry: PlacedCarry, limits: MinimisedForces, x: Array, radius: float, is_relaxed: bool
     ) -> dict[Row, float]:
-        """The rows of the next program about a candidate, and what each of them has to keep.
+        """Return the rows of the next program about a candidate, and their required values.
 
         Args:
             carry: the candidate's.
             x: its variables, (n,) or more.
-            radius: half the width of the box of trust.
-            lenient: see `ConstraintKind.required`.
+            radius: of the trust region.
+            is_relaxed: see `ConstraintKind.required_values`.
         """
         rows = (
             self._active.near_rows(carry, limits) | self._tightened.keys() | self._active_for.keys()
@@ -191,11 +188,11 @@ class WorkingSet:
         violated: Iterable[Row],
         required: Mapping[Row, float],
     ) -> bool:
-        """Take in what a step to x violated; whether it asks for anything new.
+        """Add the rows that a step to x violated; return True if any is new or tighter.
 
         Args:
             carry, known: after the step, and before.
-            required: what the program asked for that led there.
+            required: rows of the program and their required values.
         """
         is_new = False
         for row, value in self._active.tightened_bounds(carry, known, violated, required).items():
@@ -206,17 +203,17 @@ class WorkingSet:
         return is_new
 
     def add(self, rows: Iterable[Row], x: Array) -> None:
-        """Ask that rows hold, as a step to x showed."""
+        """Add rows that a step to x showed to be missing, with their usual bounds."""
         self._tightened.update(dict.fromkeys(rows, (-np.inf, x)))
 
     def mark_active(self, rows: Iterable[Row]) -> None:
-        """Note the rows that have multipliers in an answer."""
+        """Keep rows with multipliers for the next `ACTIVE_ROW_LIFETIME` programs."""
         left = {row: count - 1 for row, count in self._active_for.items() if count > 1}
         self._active_for = left | dict.fromkeys(rows, ACTIVE_ROW_LIFETIME)
 
     def on_new_best(self, keep_active_set: bool = False) -> None:
-        """Forget what was asked relative to a candidate that is left behind, and after a long step
-        also what pressed there."""
+        """Discard bounds relative to the former candidate, and after a long step the active
+        rows."""
         if not keep_active_set:
             self._active_for = {}
         self._tightened = {

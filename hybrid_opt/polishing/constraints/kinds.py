@@ -1,7 +1,6 @@
-"""Kinds of constraints: what each calls near, requires and finds violated.
+"""Kinds of constraints: rows near their bounds, their required values, and violated rows.
 
-A kind answers for its rows. To add one is to write a class here and to list it in
-`hybrid_opt.polishing.constraints.active`.
+To add a kind, write a class here and list it in `hybrid_opt.polishing.constraints.active`.
 """
 
 from __future__ import annotations
@@ -20,62 +19,62 @@ from symbolic.array import Array
 from symbolic.smooth.places import JointLimit, ManipulabilityLimit, Side
 
 PATCH_MARGIN = 1e-6
-"""Kept from the rims of patches, in the square of the shift over the radius."""
+"""Margin to the rims of patches, in the square of shift over radius."""
 
 SAMPLING_MARGIN = 2e-3
-"""Kept from joint limits [rad] and, in the square of |det J| over its least value, from
-singularities: they are judged at places and hold between them as well."""
+"""Margin to joint limits [rad] and, in the square of |det J| over its least value, to
+singularities: it covers the path between places."""
 
 CONE_TIGHT = 0
-"""Branch of the normal force that rules unless the box is accelerated across by nearly 1 g."""
+"""Branch of the normal force that governs unless the box is accelerated across by nearly 1 g."""
 
 FORCE_ROUNDING = 1e-6
-"""Share by which a force exceeds the paper's that is not rounding."""
+"""Share by which a force may exceed the paper's by rounding."""
 
 FORCE_STRIDE = 0.02
-"""Distance of force rows: forces are smooth along the path."""
+"""Distance of force rows along the path: forces are smooth there."""
 
 TIE_STRIDE = 0.06
-"""The same for a robot whose force only breaks ties."""
+"""Distance of force rows of a robot whose force only breaks ties."""
 
 PEAK_SHARE = 0.98
 """Local maxima of the force above this share of the highest get rows."""
 
 BRANCH_SHARE = 0.02
-"""Branches within this share of the ruling one get rows."""
+"""Branches within this share of the governing one get rows."""
 
 PRESSURE_SHARE = 0.7
 """Shifts of the centre of pressure beyond this share of the patch get rows."""
 
 PRESSURE_STRIDE = 0.04
-"""This far beside the farthest shift there are rows, too."""
+"""Distance of further rows on both sides of the largest shift."""
 
 JOINT_DISTANCE = 0.05
-"""Joints nearer than this to a limit get a row [rad]."""
+"""Joints nearer to a limit get a row [rad]."""
 
 MANIPULABILITY_SHARE, MANIPULABILITY_STRIDE = 0.9, 0.02
-"""Where |det J| is below this share of its median along the path, every such stretch gets a row: it
-bounds the reach, beyond which nothing is defined."""
+"""Stretches of the path with |det J| below this share of its median get rows: low values bound the
+reach, beyond which nothing is defined."""
 
 SINGULAR_RATIO, SINGULAR_STRIDE = 1.1, 0.005
-"""The same below this multiple of the least |det J|, more densely."""
+"""Stretches below this multiple of the least |det J| get denser rows."""
 
 LOST_ARM_STRIDE = 0.04
-"""This far after the loss of an arm, and twice as far, there are rows, too."""
+"""Rows follow the loss of an arm at this distance and at twice this distance."""
 
 MinimisedForces = tuple[bool, bool]
-"""Per robot whether its force matters for more than ties."""
+"""Per robot whether its force is minimised, not only used to break ties."""
 
 AnyRow = TypeVar("AnyRow", ForceRow, PressureRow, PathRow)
 
 
 class ConstraintKind(ABC, Generic[AnyRow]):
-    """A kind of constraint.
+    """One kind of constraint.
 
     Attributes:
-        cell, grid: what it reads.
-        lasting: whether its rows are kept where the solve moves on to another candidate. What is
-            asked of others is relative to the candidate that is left behind.
+        cell, grid: the model and the places along its path.
+        persists: whether tightened bounds stay valid at other candidates. Those of other kinds are
+            relative to the candidate that they were measured at.
     """
 
     persists: bool = False
@@ -85,39 +84,40 @@ class ConstraintKind(ABC, Generic[AnyRow]):
 
     @abstractmethod
     def near_rows(self, carry: PlacedCarry, limits: MinimisedForces) -> Iterable[AnyRow]:
-        """Rows of what is near at a candidate."""
+        """Return rows near their bounds at a candidate."""
 
     @abstractmethod
     def violated_rows(self, carry: PlacedCarry, known: PlacedCarry) -> Iterable[AnyRow]:
-        """Rows of what a step violates that was made from a known candidate."""
+        """Return rows that a step from a known candidate violates."""
 
     def required_values(
         self, carry: PlacedCarry, rows: Sequence[AnyRow], is_relaxed: bool = False
     ) -> list[float]:
-        """The value that each row has to keep, as learned from a candidate.
+        """Return the value that each row has to exceed, by a candidate.
 
         Args:
-            lenient: ask for no more than the candidate keeps already, where it is free.
+            is_relaxed: require no more than a feasible candidate satisfies.
         """
         return [PATCH_MARGIN] * len(rows)
 
     def tightened_bounds(
         self, carry: PlacedCarry, known: PlacedCarry, rows: Sequence[AnyRow], before: list[float]
     ) -> list[float]:
-        """The value that rows which a step violates have to keep from now on.
+        """Return the values that violated rows have to exceed from now on.
 
         Args:
-            carry: where the step led.
-            known: where it came from.
-            before: what the rows had to keep, the margin where they were none.
+            carry: after the step.
+            known: before the step.
+            before: required values of the rows so far, the margin for new ones.
         """
         return self.required_values(carry, rows)
 
 
 class Forces(ConstraintKind[ForceRow]):
-    """Rows of the branch with tight cones along the whole path, of others where they nearly rule.
+    """Rows of the branch with tight cones along the whole path, and of other branches that nearly
+    govern.
 
-    The required value has no meaning: a force stays below the peak, which is a variable.
+    Required values have no meaning: a force stays below its peak, which is a variable.
     """
 
     persists = True
@@ -133,7 +133,7 @@ class Forces(ConstraintKind[ForceRow]):
         self._facing = cell.workcell.has_facing_pads
 
     def near_rows(self, carry: PlacedCarry, limits: MinimisedForces) -> Iterable[ForceRow]:
-        """Rows at every few samples, at the highest and beside them, where the sample decides."""
+        """Return rows at every few samples, at the peaks and beside them."""
         samples = self._every | self._ends | self._peaks(carry)
         main = self._main(carry)
         for robot, limited in enumerate(limits):
@@ -142,11 +142,11 @@ class Forces(ConstraintKind[ForceRow]):
         yield from self._other_branches(carry)
 
     def violated_rows(self, carry: PlacedCarry, known: PlacedCarry) -> Iterable[ForceRow]:
-        """Other branches that rule."""
+        """Return rows of other branches that govern."""
         return self._other_branches(carry)
 
     def peak_rows(self, carry: PlacedCarry, limits: MinimisedForces) -> set[ForceRow]:
-        """Rows at the peaks of a candidate whose forces are higher than the program foresaw."""
+        """Return rows at peaks that the program underestimated."""
         main = self._main(carry)
         return {
             ForceRow(robot, main[sample], sample)
@@ -156,18 +156,19 @@ class Forces(ConstraintKind[ForceRow]):
         }
 
     def _values(self, carry: PlacedCarry) -> Array:
-        """(samples, 2, branches) of the paper's [N]."""
+        """Compute the paper's branches (samples, 2, branches) [N]."""
         return np.asarray(np.einsum("rbk,nk->nrb", self.cell.coefficients, carry.split))
 
     def _main(self, carry: PlacedCarry) -> list[int]:
-        """Per sample the branch that has a row wherever forces matter."""
+        """Return per sample the branch that has a row where forces matter."""
         return [
             PROGRAM_BRANCH if held else CONE_TIGHT
             for held in self._is_found_by_program(carry).tolist()
         ]
 
     def _is_found_by_program(self, carry: PlacedCarry) -> NDArray[np.bool_]:
-        """(samples,) whether the joint allocation's forces are, or are nearly, not the paper's."""
+        """Return (samples,) whether the joint allocation's forces differ, or nearly differ, from
+        the paper's."""
         if not self._joint or not self._facing:
             return np.full(len(carry.split), self._joint)
         harder = carry.force > (1.0 + FORCE_ROUNDING) * self._values(carry).max(axis=2)
@@ -175,7 +176,7 @@ class Forces(ConstraintKind[ForceRow]):
         return np.asarray((harder | near).any(axis=1))
 
     def _peaks(self, carry: PlacedCarry) -> set[int]:
-        """Samples at and beside local maxima of either robot's normal force."""
+        """Return samples at and beside local maxima of either robot's normal force."""
         is_paper = self.cell.robust is None and not self._joint
         force = self._values(carry).max(axis=2) if is_paper else carry.force
         inner = force[1:-1]
@@ -185,9 +186,9 @@ class Forces(ConstraintKind[ForceRow]):
         return {int(k) for k in (tops[:, None] + np.array([-1, 0, 1])).ravel()}
 
     def _other_branches(self, carry: PlacedCarry) -> list[ForceRow]:
-        """Force rows of other branches than the tight cones' that rule, or nearly do.
+        """Return rows of branches other than the tight cones' that govern, or nearly do.
 
-        Robust forces have one row at a sample, of the case that rules there.
+        Robust forces have one row per sample, of the governing case.
         """
         if self.cell.robust is not None:
             return []
@@ -201,16 +202,16 @@ class Forces(ConstraintKind[ForceRow]):
 
 
 class Pressure(ConstraintKind[PressureRow]):
-    """Rows at the farthest shift of every stretch near the rim of a patch, and beside it."""
+    """Rows at and beside the largest shift of every stretch near the rim of a patch."""
 
     persists = True
 
     def near_rows(self, carry: PlacedCarry, limits: MinimisedForces) -> Iterable[PressureRow]:
-        """Rows of shifts beyond a share of the patch's radius."""
+        """Return rows of shifts beyond a share of the patch radius."""
         return self._beyond(carry, PRESSURE_SHARE)
 
     def violated_rows(self, carry: PlacedCarry, known: PlacedCarry) -> Iterable[PressureRow]:
-        """At the rim: half of the margin is left to what the solver rounds off."""
+        """Return rows of shifts at the rim; half of the margin is left to the solver's rounding."""
         return self._beyond(carry, (1.0 - PATCH_MARGIN / 2.0) ** 0.5)
 
     def _beyond(self, carry: PlacedCarry, share: float) -> Iterable[PressureRow]:
@@ -223,22 +224,22 @@ class Pressure(ConstraintKind[PressureRow]):
 
 
 class JointLimits(ConstraintKind[PathRow]):
-    """Rows at the tightest places of every joint that comes near a limit."""
+    """Rows at the local minima of every joint's distance to its limits."""
 
     persists = True
 
     def near_rows(self, carry: PlacedCarry, limits: MinimisedForces) -> Iterable[PathRow]:
-        """Joints near a limit."""
+        """Return rows of joints near a limit."""
         return self._below(carry, JOINT_DISTANCE)
 
     def violated_rows(self, carry: PlacedCarry, known: PlacedCarry) -> Iterable[PathRow]:
-        """Joints beyond a limit, or nearer than half of what is kept from it."""
+        """Return rows of joints within half of the margin to a limit, or beyond it."""
         return self._below(carry, SAMPLING_MARGIN / 2.0)
 
     def required_values(
         self, carry: PlacedCarry, rows: Sequence[PathRow], is_relaxed: bool = False
     ) -> list[float]:
-        """What lets a limit hold between places as well."""
+        """Return the margin that covers the path between places."""
         return [SAMPLING_MARGIN] * len(rows)
 
     def _below(self, carry: PlacedCarry, limit: float) -> Iterable[PathRow]:
@@ -255,13 +256,13 @@ class JointLimits(ConstraintKind[PathRow]):
 
 
 class ManipulabilityLimits(ConstraintKind[PathRow]):
-    """Rows where |det J| is low: beyond the edge of the reach nothing else is defined."""
+    """Rows where |det J| is low: beyond the reach nothing else is defined."""
 
     persists = True
 
     def near_rows(self, carry: PlacedCarry, limits: MinimisedForces) -> Iterable[PathRow]:
-        """Below a share of the median along the path, every few places; more densely where there is
-        little left, so that the least does not move between two rows."""
+        """Return rows every few places below a share of the median along the path, and denser ones
+        near the least value, so that the minimum does not move between two rows."""
         places = self.grid.places
         for arm in (0, 1):
             measure = carry.manipulability[:, arm]
@@ -272,8 +273,8 @@ class ManipulabilityLimits(ConstraintKind[PathRow]):
                 yield PathRow(ManipulabilityLimit(arm), place)
 
     def violated_rows(self, carry: PlacedCarry, known: PlacedCarry) -> Iterable[PathRow]:
-        """Below the least value and half of what is kept beyond it; and where an arm loses the path
-        and after it: at the edge of its reach it is stretched, and so singular."""
+        """Return rows below the least value and half of the margin; and where an arm loses the path
+        and after it: there it is stretched out and so singular."""
         least = (1.0 + SAMPLING_MARGIN / 2.0) ** 0.5
         for arm in (0, 1):
             for place in local_minima_below(carry.manipulability[:, arm], least):
@@ -286,13 +287,14 @@ class ManipulabilityLimits(ConstraintKind[PathRow]):
     def required_values(
         self, carry: PlacedCarry, rows: Sequence[PathRow], is_relaxed: bool = False
     ) -> list[float]:
-        """What lets the measure hold between places as well."""
+        """Return the margin that covers the path between places."""
         return [SAMPLING_MARGIN] * len(rows)
 
     def tightened_bounds(
         self, carry: PlacedCarry, known: PlacedCarry, rows: Sequence[PathRow], before: list[float]
     ) -> list[float]:
-        """Where an arm lost the path: half way to what the known candidate has there."""
+        """Return, where an arm lost the path, the middle of the old bound and the known candidate's
+        value."""
         if not carry.unreachable_arms:
             return self.required_values(carry, rows)
         has = smooth_values(self.cell, known, rows)
@@ -300,7 +302,7 @@ class ManipulabilityLimits(ConstraintKind[PathRow]):
 
 
 def smooth_values(cell: SmoothCell, carry: PlacedCarry, rows: Sequence[PathRow]) -> Array:
-    """The rows' values as the smooth problem sees them."""
+    """Evaluate rows in the smooth model."""
     values = np.empty(len(rows))
     groups: dict[str, list[int]] = {}
     for k, row in enumerate(rows):
