@@ -1,7 +1,7 @@
-"""What bounds the timing of a path, as coefficients that compiled passes read.
+"""Limits on the timing of a path, as coefficients for the compiled passes.
 
-`symbolic.path_motion` gives a carry's geometry in physical quantities. Here every limit at
-a sample is a function of (u'', u'^2) whose coefficients lie packed in one vector of numbers.
+`symbolic.path_motion` gives a carry's geometry in physical quantities. Here every limit at a sample
+is a function of (u'', u'^2) with its coefficients packed in one vector.
 """
 
 from __future__ import annotations
@@ -33,23 +33,23 @@ from symbolic.records.quantities import GRAVITY
 from symbolic.robot.arm import TRACK_OUTPUTS, follow_function
 
 ARM_CHECK_OUTPUTS = ("ik_residual", "lost", "limit_margin", "manipulability")
-"""Outputs of `symbolic.robot.arm.TRACK_OUTPUTS` beside an arm's joints."""
+"""Outputs of `symbolic.robot.arm.TRACK_OUTPUTS` about an arm's errors."""
 
 TIMING_BARRIER_WEIGHT = 1e-6
-"""Weight of the barriers where a program finds the forces (`symbolic.contact.soft_grasp`): they
-exceed the least ones by less than what timings are exact to."""
+"""Weight of the barriers if a program finds the forces (`symbolic.contact.soft_grasp`): these
+exceed the least ones by less than the accuracy of timings."""
 
 SPEEDS_OF_BOX = 4
-"""Payload, payload turning, reference, reference turning."""
+"""Speeds of the box: payload, payload rotation, reference, reference rotation."""
 
 
 @dataclass(frozen=True)
 class BlockLayout:
-    """Where blocks of numbers lie in a vector, one behind the other.
+    """Layout of blocks of coefficients in a vector, one behind the other.
 
     Attributes:
         joints: of both arms.
-        sizes: numbers per block, in order.
+        sizes: entries per block, in order.
     """
 
     joints: int
@@ -57,34 +57,39 @@ class BlockLayout:
 
     @property
     def offsets(self) -> dict[str, int]:
-        """First place of each block."""
+        """Return the first entry of each block."""
         sizes = self.sizes
         ends = np.cumsum([0, *sizes.values()]).tolist()
         return dict(zip(sizes, ends, strict=False))
 
     def block(self, name: str) -> slice:
-        """Place of a block."""
+        """Return the slice of a block."""
         start = self.offsets[name]
         return slice(start, start + self.sizes[name])
 
     @property
     def size(self) -> int:
-        """All numbers."""
+        """Return the number of all entries."""
         return sum(self.sizes.values())
 
 
 def limit_layout(workcell: Workcell) -> BlockLayout:
-    """Where the coefficients of limits lie in a sample's vector.
+    """Return the layout of the limits' coefficients in a sample's vector.
 
     Blocks, in order:
-    speed (joints + 4): demands d, each |d u'| <= 1: joints, payload, payload turning, and the
-    reference speeds of both, which hold only on request.
+
+    speed (joints + 4): demands d, each |d u'| <= 1: joints, payload, payload rotation, and the
+    reference speeds of both, which apply on request only.
+
     acceleration (2, joints): alpha, beta of |alpha u'' + beta u'^2| <= 1.
-    cone (2, 2, 3): payload's acceleration and angular acceleration, each
-    |first u'' + second u'^2| <= 1.
-    force (3, 3): required force by u'', by u'^2 and at rest, along the axes of contact 1, whose
-    third is the normal [N]. moment (2, 3): required moment about the centre of mass by u'' and by
+
+    cone (2, 2, 3): payload's acceleration and angular acceleration, each |first u'' + second u'^2|
+    <= 1.
+
+    force (3, 3): required force by u'', by u'^2 and at rest, along the axes of contact 1, the third
+    being the normal [N]. moment (2, 3): required moment about the centre of mass by u'' and by
     u'^2, likewise [N m].
+
     torque (3, joints): the arms' own torques by u'', by u'^2 and at rest; wrench (joints, 6): from
     the contact wrench about the nominal point, along the axes of contact 1; both over the torque
     limits.
@@ -100,11 +105,11 @@ redundant joints."""
 
 
 def path_function(model: CellModel, samples: int) -> ca.Function:
-    """The path's variables x (n_path,) to box and arms at uniform samples of u in [0, 1].
+    """Return the path's variables x (n_path,) -> box and arms at uniform samples of u in [0, 1].
 
     Outputs (NumPy shapes, n samples): those of `PATH_OUTPUTS`: the extended pose and its
-    derivatives by u (n, 6 + m), and both arms' joints (n, joints of the arm); then per arm
-    i = 1, 2 ik_residual_i, lost_i, limit_margin_i, manipulability_i (n,) as in
+    derivatives by u (n, 6 + m), and both arms' joints (n, joints of the arm); then per arm i = 1, 2
+    ik_residual_i, lost_i, limit_margin_i, manipulability_i (n,) as in
     `symbolic.robot.arm.TRACK_OUTPUTS`.
 
     Args:
@@ -132,7 +137,7 @@ def path_function(model: CellModel, samples: int) -> ca.Function:
 
 
 def sample_limits_function(model: CellModel) -> ca.Function:
-    """`PATH_OUTPUTS` of one sample to its coefficients, limits (size,) by `limit_layout`."""
+    """Return `PATH_OUTPUTS` of one sample -> its coefficients, limits (size,) by `limit_layout`."""
     workcell = model.workcell
     payload, task, layout = workcell.payload, workcell.task, limit_layout(workcell)
     given = [ca.SX.sym(name, task.extended_size) for name in ("pose", "first", "second")]
@@ -186,14 +191,14 @@ def sample_limits_function(model: CellModel) -> ca.Function:
 
 
 def limit_numbers(workcell: Workcell) -> dict[str, ca.SX]:
-    """The numbers that `sample_limits_function` takes behind its other inputs."""
+    """Return the parameters that `sample_limits_function` takes after its other inputs."""
     return sx_given(workcell.task, *workcell.robots, workcell.payload)
 
 
 def _held(
     workcell: Workcell, blocks: dict[str, ca.SX], a: ca.SX, w: ca.SX, detached: Detached | None
 ) -> HeldLoad:
-    """Contact wrenches along the axes of contact 1 from the blocks force and moment."""
+    """Return contact wrenches along the axes of contact 1 from the blocks force and moment."""
     by = [blocks["force"][3 * k : 3 * k + 3] for k in range(3)]
     axes, centre = workcell.contacts[0].T_box_pad[:3, :3], workcell.payload.centre_of_mass
     arms = [ca.SX(number(axes.T @ (c.T_box_pad[:3, 3] - centre))) for c in workcell.contacts]
@@ -208,12 +213,12 @@ def _held(
 
 
 def force_functions(workcell: Workcell) -> tuple[ca.Function, ca.Function]:
-    """Both normal forces at one sample, which are convex in (u'', u'^2), and their slopes.
+    """Return both normal forces at one sample, which are convex in (u'', u'^2), and their slopes.
 
     Both take the force (9,) and moment (6,) blocks of `limit_layout` as one input, then u'' and
-    u'^2, and the numbers of what is held. `limit_forces` gives (2,) [N], and what was solved for
-    them (k,): the grip of soft fingers, or the state of the program that finds the forces, which
-    then are those on its central path (`symbolic.contact.soft_grasp`). `limit_force_slopes` and
+    u'^2, and the payload's parameters. `limit_forces` gives (2,) [N], and the solved variables
+    (k,): the grip of soft fingers, or the state of the program that finds the forces, which then
+    are those on its central path (`symbolic.contact.soft_grasp`). `limit_force_slopes` and
     `ratio_functions` take it last and solve nothing; `limit_force_slopes` gives the forces and
     their derivatives (2,) by u'' and by u'^2.
     """
@@ -244,7 +249,7 @@ def force_functions(workcell: Workcell) -> tuple[ca.Function, ca.Function]:
 
 
 def _load_function(workcell: Workcell) -> ca.Function:
-    """Blocks force and moment of `limit_layout`, u'' and u'^2 to the load (6,) about the box
+    """Return blocks force and moment of `limit_layout`, u'' and u'^2 -> the load (6,) about the box
     frame's origin, box axes, and its derivatives (6, 2) by u'' and u'^2."""
     size = limit_layout(workcell).sizes["force"]
     payload = workcell.payload
@@ -261,8 +266,8 @@ def _load_function(workcell: Workcell) -> ca.Function:
 
 
 def path_force_function(workcell: Workcell) -> ca.Function:
-    """Box pose and its derivatives by u (6,), u'' and u'^2 to normal_force (2,) [N] and slope
-    (2, 2), of each force by u'' and by u'^2."""
+    """Return box pose and its derivatives by u (6,), u'' and u'^2 -> normal_force (2,) [N] and
+    slope (2, 2), of each force by u'' and by u'^2."""
     closed, payload = workcell.has_closed_form, workcell.payload
     kind, given = (ca.SX, sx_given) if closed else (ca.MX, mx_given)
     numbers: dict[str, Any] = dict(given(payload))
@@ -288,13 +293,13 @@ def path_force_function(workcell: Workcell) -> ca.Function:
 
 
 def ratio_functions(workcell: Workcell) -> tuple[ca.Function, ca.Function]:
-    """Limits that are not convex, at one sample, and their derivatives by (u'', u'^2).
+    """Return limits that are not convex, at one sample, and their derivatives by (u'', u'^2).
 
     Both take force (9,), moment (6,), torque and wrench blocks of `limit_layout` as one input, then
-    what else `limit_force_slopes` takes, see `force_functions`. `limit_ratios` gives
+    the other inputs of `limit_force_slopes`; see `force_functions`. `limit_ratios` gives
     `contact_limits`' ratios; `limit_slopes` gives the same and their derivatives (joints + 2,) by
-    u'' and by u'^2. Where a program finds the forces, shifts of the pressure are no limit and count
-    as none.
+    u'' and by u'^2. If a program finds the forces, shifts of the pressure are no limit and count as
+    zero.
     """
     sizes = limit_layout(workcell).sizes
     names = ("force", "moment", "torque", "wrench")
@@ -317,11 +322,11 @@ def contact_limits(
     timing: tuple[ca.SX, ca.SX],
     detached: Detached,
 ) -> tuple[ca.SX, ca.SX]:
-    """What depends on the contact forces at one sample.
+    """Return limits on the contact forces at one sample.
 
     Args:
         workcell: the cell.
-        blocks: force, moment, torque and wrench, see `limit_layout`.
+        blocks: force, moment, torque and wrench; see `limit_layout`.
         timing: u'' and u'^2.
         detached: see `symbolic.contact.soft_finger.Detached`.
 
@@ -347,7 +352,7 @@ def contact_limits(
 
 
 def _program_ratios(workcell: Workcell) -> tuple[ca.Function, ca.Function]:
-    """See `ratio_functions`."""
+    """Return `ratio_functions` if a program finds the forces."""
     layout = limit_layout(workcell)
     sizes, joints = layout.sizes, layout.joints
     names = ("force", "moment", "torque", "wrench")
@@ -384,13 +389,13 @@ def _program_ratios(workcell: Workcell) -> tuple[ca.Function, ca.Function]:
 
 
 def _inputs(workcell: Workcell, blocks: dict[str, ca.SX]) -> dict[str, ca.SX]:
-    """Those of `limit_forces`, from blocks of a sample."""
+    """Return the inputs of `limit_forces`, from blocks of a sample."""
     timing = {name: ca.SX.sym(name) for name in ("a", "w")}
     return {"sample": ca.vertcat(*blocks.values())} | timing | sx_given(workcell.payload)
 
 
 def _slopes(name: str, value: ca.SX, inputs: dict[str, ca.SX], detached: Detached) -> ca.Function:
-    """A value and its derivatives by u'' and u'^2, from inputs and what was solved for."""
+    """Return a value and its derivatives by u'' and u'^2, from inputs and solved variables."""
     value = ca.densify(value)
     by = {f"by_{z}": ca.densify(ca.jacobian(value, inputs[z])) for z in ("a", "w")}
     return named_function(name, inputs | {"solved": detached.symbols}, {"value": value} | by)

@@ -1,9 +1,9 @@
-"""The carry as geometry: everything along the path that does not depend on its timing.
+"""Geometry of a carry: all quantities along the path that do not depend on its timing.
 
 With the path parameter u driven as u(t), every velocity is its derivative by u times u', and every
 acceleration is affine in (u'', u'^2). So are the force and the moment that the box needs and the
-torque that moves an arm; what time-optimal path parameterisation needs are the coefficients
-(Verscheure et al., IEEE TAC 54(10), 2009; Pham and Pham, IEEE T-RO 34(3), 2018).
+torque that moves an arm; time-optimal path parameterisation needs the coefficients (Verscheure et
+al., IEEE TAC 54(10), 2009; Pham and Pham, IEEE T-RO 34(3), 2018).
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ ARM_OUTPUTS = (
     "torque_at_rest",
     "wrench_torque",
 )
-"""Per sample and arm, beside those of `symbolic.robot.arm.TRACK_OUTPUTS` without its joint torque.
+"""Per sample and arm, in addition to `symbolic.robot.arm.TRACK_OUTPUTS` without its joint torque.
 
 q_first, q_second (n,): derivatives of the joints by u [rad or m]. torque_by_... and torque_at_rest
 (n,): the bare arm's inverse dynamics is torque_by_acceleration u'' + torque_by_speed u'^2 +
@@ -65,12 +65,12 @@ torque_at_rest [N m]. wrench_torque (6 n,): the (n, 6) matrix, row by row, from 
 
 
 def path_motion_function(model: CellModel, samples: int) -> ca.Function:
-    """Decision vector x (n_var,) to the geometry of the carry at uniform samples of u in [0, 1].
+    """Return decision vector x (n_var,) -> geometry of the carry at uniform samples of u in [0, 1].
 
     Outputs (NumPy shapes, n samples): pose, pose_first, pose_second (n, 6), the box pose and its
     derivatives by u; those of `BOX_OUTPUTS`; and per arm i = 1, 2 those of
-    `symbolic.robot.arm.TRACK_OUTPUTS` without the joint torque and of `ARM_OUTPUTS`, as q_i
-    (n, joints) and so on.
+    `symbolic.robot.arm.TRACK_OUTPUTS` without the joint torque and of `ARM_OUTPUTS`, as q_i (n,
+    joints) and so on.
 
     Args:
         samples: number of samples, at least 3.
@@ -106,7 +106,7 @@ def path_motion_function(model: CellModel, samples: int) -> ca.Function:
 
 
 def start_posture(model: CellModel, arm: int, handed: Handed) -> ca.MX:
-    """(n,) joints of an arm where the path begins."""
+    """Return the joints (n,) of an arm at the start of the path."""
     start = model.start[arm]
     return as_mx(start, sx_given(model), of(handed, model)) if handed else ca.MX(ca.DM(start))
 
@@ -114,13 +114,13 @@ def start_posture(model: CellModel, arm: int, handed: Handed) -> ca.MX:
 def extended_motion(
     task: Task, x: ca.MX, basis: PathBasis, waypoints: ca.MX, handed: Handed = NONE
 ) -> list[ca.MX]:
-    """Extended poses and their first and second derivative by u (6 + m, n), at the samples of a
-    basis.
+    """Return extended poses and their first and second derivative by u (6 + m, n), at the samples
+    of a basis.
 
     Args:
         x: (n_var,) decision vector.
         waypoints: (6, n_waypoints) of the box.
-        handed: the task's numbers.
+        handed: parameters of the task.
     """
     whole = extended_matrix(task, x, waypoints, handed)
     matrices = (basis.position, basis.first, basis.second)
@@ -128,7 +128,7 @@ def extended_motion(
 
 
 def box_function(workcell: Workcell) -> ca.Function:
-    """`BOX_OUTPUTS` of one sample from the box pose and its derivatives by u."""
+    """Return `BOX_OUTPUTS` of one sample by the box pose and its derivatives by u."""
     pose, first, second = (ca.SX.sym(name, 6) for name in ("pose", "first", "second"))
     payload = workcell.payload
     turned = workcell.task.orientation
@@ -155,7 +155,7 @@ def box_function(workcell: Workcell) -> ca.Function:
 def arm_derivative_function(
     robot: Robot, model: RobotModel, contact: Contact, name: str
 ) -> ca.Function:
-    """`ARM_OUTPUTS` of one sample.
+    """Return `ARM_OUTPUTS` of one sample.
 
     Inputs: q (n,) that holds the box at the pose; pose, first, second (6 + m,): the extended pose
     and its derivatives by u.

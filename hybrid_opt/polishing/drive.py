@@ -1,10 +1,10 @@
-"""The step and the judge of drivable carries: a quadratic model of path and timing together.
+"""Step method of drivable carries: a quadratic model of path and timing together.
 
-First a program without the Lagrangian's curvature finds multipliers: they owe nothing to earlier
-rounds, which may have been elsewhere. With them the quadratic model is formed and solved, and where
-geometric rows bend along the step, it is corrected for that. The judge is the compiled timing of
-the path that the step leads to, not the program: a path that is driven no better is refused before
-its geometry is looked at. The polish ends where the program's optimality conditions hold.
+A first program without the Lagrangian's curvature finds multipliers, which so do not depend on
+earlier iterations elsewhere. With them the quadratic model is formed and solved. If geometric rows
+are strongly nonlinear along the step, it is corrected to second order. The compiled timing of the
+resulting path evaluates the step, not the program: a path without a faster timing is rejected
+before its geometry is evaluated. The solve ends where the program's optimality conditions hold.
 """
 
 from __future__ import annotations
@@ -53,57 +53,54 @@ from symbolic.records import Workcell
 from symbolic.records.task import waypoints_of
 
 FIRST_DRIVE_RADIUS, LEAST_DRIVE_RADIUS = 0.3, 1e-4
-"""Radii of the box of trust, in half ranges of the waypoints; below the least a point is
-left."""
+"""Radii of the trust region [half ranges of the waypoints]: the first, and the one below which a
+solve ends."""
 
 STATIONARITY_TOLERANCE, FEASIBILITY_TOLERANCE = 1e-4, 5e-3
-"""Residuals of stationarity and of complementarity, and of feasibility, at which a point counts as
-optimal: what is asked of distances moves with the path."""
+"""Residuals of stationarity and complementarity, and of feasibility, at which a point counts as
+optimal: required distances change with the path."""
 
 TIMING_NOISE = 5e-4
-"""Relative change of a timing that counts as none: what the timing rounds off."""
+"""Relative change of a duration below which it may be rounding of the timing."""
 
 LEAST_REDUCTION_RATIO = 0.1
-"""Share of the promised gain that a step has to bring, unless the timing may have rounded it
-off."""
+"""Least accepted reduction ratio, unless rounding of the timing may hide the reduction."""
 
 DRIVE_BACKTRACKING = (1.0, 0.5, 0.25, 0.125)
-"""Parts of a step that are tried, the first that is closer is taken: judging costs a tenth of a
-round."""
+"""Fractions of a step in the order of trial: an evaluation costs a tenth of an iteration."""
 
 NEWTON_STEP = 0.05
-"""Steps shorter than this keep the program's squared speeds, longer ones take those of the new
-timing."""
+"""Shorter steps keep the program's squared speeds, longer ones take those of the new timing."""
 
 ROW_ROUNDS, ROW_TOLERANCE = 3, 1e-6
 """Times that rows are added to one quadratic program, and the predicted excess of a limit that adds
 its row."""
 
 MULTIPLIER_CURVATURE = 1.0
-"""Curvature by the path of the program that finds multipliers."""
+"""Curvature by the path in the program that finds multipliers."""
 
 LARGEST_NONLINEARITY = 0.2
-"""Error of geometric rows, by their curvature along a step, above which it is corrected, once."""
+"""Nonlinearity of geometric rows along a step that triggers one second-order correction."""
 
 DRIVE_EXTRAPOLATION = (2.0, 4.0, 8.0)
-"""Times a step that brought more than it promised: judging costs a tenth of a round."""
+"""Multiples of a step that exceeded its prediction: an evaluation costs a tenth of an iteration."""
 
 LEAST_SQUARED, LARGEST_SQUARED = 0.9, 3.0
-"""How far a squared speed may fall and rise in a step, as shares of it."""
+"""Largest relative fall and rise of a squared speed in a step."""
 
 UNPOLISHABLE = (
     "the polish does not know the allocation 'joint' of two pads that face one another, nor robust "
     "forces of pads whose normals are not opposite"
 )
-"""Why a cell is not `is_polishable`."""
+"""Reason why a cell is not `is_polishable`."""
 
 REST_FORCE_MARGIN = 1e-3
-"""The least force limit is this share above the force that holds the box at rest."""
+"""Share by which the least force limit exceeds the force that holds the box at rest."""
 
 
 def is_polishable(workcell: Workcell, robust: bool) -> bool:
-    """Whether drivable carries of a cell can be polished: those whose planned forces have slopes,
-    and where robust ones are limited, of two pads with opposite normals."""
+    """Return True if drivable carries of a cell can be polished: its planned forces have slopes,
+    and if robust ones are limited, it has two pads with opposite normals."""
     return workcell.has_force_slopes and (workcell.has_one_squeeze or not robust)
 
 
@@ -112,7 +109,7 @@ class EvaluatedPath:
     """A path with its fastest timing within a force limit.
 
     Attributes:
-        duration: [s], infinite where there is none.
+        duration: [s], infinite without a timing.
         squared: (intervals + 1,) u'^2 at the grid points.
         joints: of both arms at the grid points (intervals + 1, n) [rad].
     """
@@ -133,19 +130,21 @@ class PathEvaluator:
         self._driver, self.force_limit = driver, force_range(driver)
 
     def fastest_timing(self, x: Array) -> EvaluatedPath:
-        """The fastest timing of a decision vector (n_var,)."""
+        """Compute the fastest timing of a decision vector (n_var,)."""
         found, known = self._driver.time_candidate(x)
         duration = found.duration if found.ok else float("inf")
         joints = [np.ascontiguousarray(known[f"q_{arm}"][0][::2]) for arm in (1, 2)]
         return EvaluatedPath(duration, found.grid_speed**2, (joints[0], joints[1]))
 
     def durations(self, paths: Array, force: float) -> Array:
-        """(n,) [s] of paths (n, n_path) within a force, infinite where there is none."""
+        """Compute durations (n,) [s] of paths (n, n_path) within a force limit [N], infinite
+        without a timing."""
         found = self._timings(paths, force)
         return np.array([t.duration if t.ok else np.inf for t in found])
 
     def at_rest(self, paths: Array) -> Array:
-        """(n,) [N] what standing still needs of paths (n, n_path), NaN where arms cannot follow."""
+        """Compute the forces (n,) [N] that paths (n, n_path) need at rest, NaN if the arms cannot
+        follow."""
         return np.array([timing.limited_force for timing in self._timings(paths, 0.0)])
 
     def _timings(self, paths: Array, force: float) -> list[PathTiming]:
@@ -154,8 +153,8 @@ class PathEvaluator:
 
 
 def force_range(driver: CandidateDriver) -> tuple[float, float]:
-    """The task's least and largest force limit [N]; of robust forces the least is at least what
-    holds the box at both ends of every path."""
+    """Return the task's least and largest force limit [N]; the least robust one at least holds the
+    box at both ends of every path."""
     workcell = driver.timer.workcell
     least, most = workcell.task.force_limit
     if driver.robust:
@@ -168,12 +167,12 @@ def force_range(driver: CandidateDriver) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class DriveIterate(Iterate):
-    """A carry whose level is its duration [s].
+    """An iterate whose level is its duration [s].
 
     Attributes:
-        joints: as of its timing.
-        squared: (intervals + 1,) u'^2, its timing's or those that a program promised.
-        lowest: the least level so far: what the timing rounds off must not add up.
+        joints: at the grid points of its timing.
+        squared: (intervals + 1,) u'^2 of its timing, or predicted by a program.
+        best_level: least level so far: rounding of the timing must not accumulate.
     """
 
     joints: tuple[Array, Array]
@@ -183,12 +182,12 @@ class DriveIterate(Iterate):
 
 @dataclass(frozen=True, kw_only=True)
 class DriveStep(Step):
-    """A step of a path.
+    """A step of path and speeds.
 
     Attributes:
-        d: scaled, of the waypoints that are moved.
-        squared: (intervals + 1,) u'^2 that its program promises.
-        gain: the share of the duration that it promises to take off.
+        d: scaled change of the moved waypoints.
+        squared: (intervals + 1,) predicted u'^2.
+        gain: predicted relative reduction of the duration.
     """
 
     d: Array
@@ -198,19 +197,19 @@ class DriveStep(Step):
 
 @dataclass(frozen=True)
 class _StepAnswer:
-    """A quadratic program's answer, and the rows that it was given."""
+    """Answer of a quadratic program, and its rows."""
 
     answer: QuadraticAnswer
     linear: LinearisedRows
 
 
 class DriveStepMethod(StepMethod[DriveIterate, DriveStep]):
-    """The least duration within the force limit of the start. A resource: one per process.
+    """Minimise the duration within the force limit of the start. A resource: one per process.
 
     Attributes:
-        driver, paths: how carries and paths are timed.
-        stated: the same by moves of the waypoints that the file states, along which the others
-            follow; itself where there are no others. Fewer variables take fewer and cheaper rounds.
+        driver, paths: timings of carries and paths.
+        coarse: the same method in the waypoints of the file, which the intermediate ones follow;
+            itself without intermediate ones. Fewer variables need fewer and cheaper iterations.
     """
 
     least_radius, extrapolation = LEAST_DRIVE_RADIUS, DRIVE_EXTRAPOLATION
@@ -220,7 +219,7 @@ class DriveStepMethod(StepMethod[DriveIterate, DriveStep]):
         """Prepare programs.
 
         Args:
-            by_stated: whether moves are those of the stated waypoints.
+            is_coarse: move the waypoints of the file only.
 
         Raises:
             SettingsError: the time law is not 'optimal', or forces have no closed form.
@@ -250,7 +249,7 @@ class DriveStepMethod(StepMethod[DriveIterate, DriveStep]):
             self.coarse = DriveStepMethod(cell, is_coarse=True)
 
     def evaluate(self, x: Array) -> DriveIterate:
-        """See `StepMethod`."""
+        """Evaluate a candidate and its fastest timing."""
         timed = self.paths.fastest_timing(x)
         return self._iterate(x, timed, timed.squared, np.inf)
 
@@ -263,7 +262,7 @@ class DriveStepMethod(StepMethod[DriveIterate, DriveStep]):
         )
 
     def _moved(self, x: Array, d: Array) -> Array:
-        """(n_var,) after a scaled step of the path."""
+        """Return the decision vector (n_var,) after a scaled step of the path."""
         n, task = self._n, self.cell.task
         moved = x[:n] + self._spread @ d
         return np.append(np.clip(moved, task.lower[:n], task.upper[:n]), x[n:])
@@ -298,7 +297,7 @@ class DriveStepMethod(StepMethod[DriveIterate, DriveStep]):
     def evaluate_fraction(
         self, begin: DriveIterate, best: DriveIterate, step: DriveStep, share: float
     ) -> DriveIterate | None:
-        """See `StepMethod`."""
+        """Evaluate a fraction of a step; see `StepMethod`."""
         x = self._moved(begin.x, share * step.d)
         timed = self.paths.fastest_timing(x)
         if timed.duration >= best.level * (1.0 - TIMING_NOISE):
@@ -308,7 +307,7 @@ class DriveStepMethod(StepMethod[DriveIterate, DriveStep]):
     def propose_step(
         self, best: DriveIterate, required: Mapping[Row, float], radius: float
     ) -> DriveStep | None:
-        """Form the joint program about the best carry so far, and solve its quadratic model."""
+        """Solve the quadratic model of path and timing about the best iterate."""
         grid = self._intervals
         values = IntervalValues(grid, self.cell.functions, best.x, best.squared, best.joints)
         program = PathTimingProgram(
@@ -362,7 +361,7 @@ class DriveStepMethod(StepMethod[DriveIterate, DriveStep]):
         box: tuple[Array, Array],
         bent: Array | float = 0.0,
     ) -> _StepAnswer | None:
-        """Solve a quadratic model; rows that its answer violates are added. `chosen` grows."""
+        """Solve a quadratic model, adding violated rows to it and to `chosen`."""
         g = program.gradient() + model[1]
         found: _StepAnswer | None = None
         for left in reversed(range(ROW_ROUNDS)):
@@ -384,7 +383,6 @@ class DriveStepMethod(StepMethod[DriveIterate, DriveStep]):
         return found
 
     def _box(self, best: DriveIterate, radius: float) -> tuple[Array, Array]:
-        """Bounds of a step."""
         (lower, upper), xi = self._bounds, best.x[self._own]
         speeds = np.ones(self._intervals.intervals - 1)
         low = np.maximum((lower - xi) / self._unit, -radius)
@@ -397,8 +395,8 @@ class DriveStepMethod(StepMethod[DriveIterate, DriveStep]):
     def _residuals(
         self, program: PathTimingProgram, best: DriveIterate, found: _StepAnswer
     ) -> Residuals:
-        """Residuals of the program at its iterate, with a step's multipliers. Bounds count where
-        they are the variables' own, not the box of trust's."""
+        """Compute the program's residuals at its iterate with a step's multipliers. Bounds count if
+        they are the variables' own, not the trust region's."""
         (lower, upper), n, answer = self._bounds, program.n_path, found.answer
         edge, own = 1e-6 * self._unit, answer.bounds[:n]
         reached = best.x[self._own] + self._unit * answer.d[:n]
@@ -409,7 +407,7 @@ class DriveStepMethod(StepMethod[DriveIterate, DriveStep]):
         return program.residuals(bounds, found.linear, answer.rows)
 
     def solve_from(self, x: Array) -> TrustRegionSolve[DriveIterate, DriveStep]:
-        """A climb from a decision vector (n_var,), before its first round."""
+        """Return the solve from a decision vector (n_var,), before its first iteration."""
         return TrustRegionSolve(self, x, FIRST_DRIVE_RADIUS)
 
 

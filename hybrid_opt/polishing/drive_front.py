@@ -1,10 +1,10 @@
-"""The front of drivable carries: duration against force.
+"""Front of drivable carries: duration against force.
 
-One path is polished at a gentle force limit, by moves of the waypoints that the task's file states.
-A sweep of force limits goes on from there, from gentle to fast, and moves all waypoints a few
-rounds at each: what rest holds within one limit is driven within every higher one. Each starts from
-the fastest path of all that are known, so that better ones in other basins take over. In the end
-the widest gaps get points of paths between their neighbours, which are driven but not improved.
+One path is polished at a low force limit, by moves of the waypoints in the task's file. A sweep of
+increasing force limits continues from there and moves all waypoints for a few iterations at each: a
+path that holds at rest within one limit can be driven within every higher one. Each starts from the
+fastest known path, so that better basins take over. In the end the widest gaps get points of paths
+between their neighbours, which are timed but not improved.
 """
 
 from __future__ import annotations
@@ -30,33 +30,34 @@ from symbolic.path.pieces import same_paths, stated
 from symbolic.records.task import initial_decision
 
 LEAST_GAP = 0.02
-"""Gaps narrower than this are left, in units of the front's extent."""
+"""Narrower gaps are left [front's extent]."""
 
 COMPARED_LIMITS = 8
-"""Force limits at which paths from beside the front are compared."""
+"""Force limits at which known paths that are not on the front are compared."""
 
 FIRST_SWEEP_MARGIN, LAST_SWEEP_MARGIN = 0.02, 0.6
-"""The least force limit of the sweep, and the one that it reaches at least, as shares above the box
+"""First force limit of the sweep, and the one that it reaches at least, as shares above the force
 at rest."""
 
 LEAST_GAIN = 1e-3
-"""Share of the duration that two rounds in a row bring, or the next force limit follows."""
+"""Relative reduction of the duration by two iterations in a row, below which the sweep continues
+with the next force limit."""
 
 INTERPOLATED_SHARES = (0.125, 0.25, 0.375, 0.5, 0.625, 0.75, 0.875)
-"""Shares of the way from one path of the front to the next that are tried as paths, too."""
+"""Positions between two paths of the front, as shares of their distance, that are tried as
+paths."""
 
 MOST_DRIVE_ATTEMPTS = 10**6
-"""Attempts at most: their number follows from the force limits and the gaps."""
+"""Attempts at most: their number follows from force limits and gaps."""
 
 FRONT_ENDS = 2
-"""Of a front."""
+"""Ends of a front."""
 
 MOST_PATHS_TRIED = 4
-"""Paths that are judged at most before a gap is left: some touch something."""
+"""Paths that are evaluated per gap at most: some collide."""
 
 EXTRAPOLATED_SHARES = (0.5, 1.0)
-"""Shares of the way between two paths of the sweep that the next one may start ahead of the
-second."""
+"""Shares of the step between the last two paths of the sweep by which a start is extrapolated."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +65,8 @@ class DriveAttempt(Attempt):
     """An attempt at the force limit of its decision vector.
 
     Attributes:
-        moves: which waypoints improve x: the stated ones, all, or none where it is judged as it is.
+        moves: moved waypoints: those of the file ('stated'), 'all', or 'none' to evaluate x as it
+            is.
     """
 
     moves: Literal["stated", "all", "none"] = "stated"
@@ -84,8 +86,8 @@ class DriveGap:
 
 
 def recheck_timing(driver: CandidateDriver, model: TimingModel, x: Array) -> str:
-    """Why the timing of a decision vector (n_var,) is not believed, empty where it is: recomputed
-    on a tenfold grid.
+    """Recompute the timing of a decision vector (n_var,) on a tenfold grid; return why it fails,
+    else ''.
 
     Args:
         model: of the driver's workcell and intervals.
@@ -99,7 +101,7 @@ def recheck_timing(driver: CandidateDriver, model: TimingModel, x: Array) -> str
 
 
 class DriveRun(PolishRun[DriveAttempt]):
-    """One polish in progress."""
+    """One polish of drivable carries in progress."""
 
     def __init__(
         self,
@@ -112,11 +114,12 @@ class DriveRun(PolishRun[DriveAttempt]):
         on_progress: Callable[[int, int], None],
         paths: Array,
     ) -> None:
-        """Begin.
+        """Collect the known paths.
 
         Args:
-            doubt: why the timing of a decision vector is not believed, see `recheck_timing`.
-            paths: (m, n_path) known beside the front.
+            recheck: returns why a decision vector's timing fails on the finer grid; see
+                `recheck_timing`.
+            paths: (m, n_path) known paths that are not on the front.
         """
         super().__init__(
             drive_method.cell.evaluator, settings, archive, recorded, on_outcome, on_progress
@@ -139,7 +142,8 @@ class DriveRun(PolishRun[DriveAttempt]):
         self._still = self._least / (1.0 + REST_FORCE_MARGIN)
 
     def run(self, rng: np.random.Generator) -> None:
-        """One path by its stated waypoints, a sweep by all, then what lies between."""
+        """Polish one path by the waypoints of the file, sweep the force limits with all, then fill
+        gaps."""
         forces = map(self._used_force, self._archive.front_indices())
         fast = min((1.0 + LAST_SWEEP_MARGIN) * self._still, self._range[1])
         self._largest = max(*forces, fast, self._least)
@@ -169,16 +173,17 @@ class DriveRun(PolishRun[DriveAttempt]):
         self._fill_gaps()
 
     def _attempt(self, path: Array, force: float, moves: Literal["stated", "all"]) -> bool:
-        """An attempt at a force limit from a path (n_path,); whether it is accepted."""
+        """Process an attempt at a force limit from a path (n_path,); return True if it is
+        accepted."""
         x = np.append(path, force)
         start = self._evaluator.evaluate(x).objectives[0]
         self._process([DriveAttempt("gap", -1, x, start, moves)])
         return self.outcomes[-1].status == "accepted"
 
     def _rotated(self, force: float) -> list[Array]:
-        """The best known path and the hand-made one, turned in every sense by their stated
-        waypoints. Where pads choose their pressure, tilting is free within the patches, and decides
-        the basin of a path."""
+        """Rotate the best known path and the hand-made one in every direction by the waypoints of
+        the file. Where pads choose their pressure, tilting is free within the patches and decides
+        the basin."""
         paths, durations = self._known_paths(force)
         best = paths[int(np.argmin(durations))]
         task, own = self._method.cell.task, stated(self._method.cell.task)
@@ -193,18 +198,19 @@ class DriveRun(PolishRun[DriveAttempt]):
         ]
 
     def _used_force(self, index: int) -> float:
-        """Force limit of a known carry that it uses fully [N]."""
+        """Return the force limit that a known carry uses fully [N]."""
         share = float(self._archive.objectives[index][self._by_force])
         return min(float(self._archive.x[index][-1]), share * self._reference)
 
     def _intermediate_force(self, first: float, second: float) -> float:
-        """A force limit between two: durations go by what a limit leaves above the box at rest."""
+        """Return the force limit between two [N]: durations depend on the square root of the force
+        above rest."""
         above = np.sqrt((first - self._still) * (second - self._still))
         return float(self._still + above)
 
     def _fill_gaps(self) -> None:
-        """Points of the best known paths at both ends of the front, then in its largest gaps of
-        paths between both neighbours'."""
+        """Add points of known paths at both ends of the front, then of interpolated paths in its
+        widest gaps."""
         members = self._settings.drivable.members
         for ahead, force in ((FRONT_ENDS, self._least), (FRONT_ENDS - 1, self._largest)):
             self._announce(ahead + members)
@@ -219,7 +225,7 @@ class DriveRun(PolishRun[DriveAttempt]):
             self._add_fastest(np.vstack([between, self._others]), gap.force)
 
     def _add_fastest(self, paths: Array, force: float) -> None:
-        """A point of the fastest of some paths (n, n_path) within a force."""
+        """Add a point of the fastest of some paths (n, n_path) within a force limit."""
         self._tried.add(force)
         durations = self._method.paths.durations(paths, force)
         for k in np.argsort(durations, kind="stable")[:MOST_PATHS_TRIED]:
@@ -234,8 +240,8 @@ class DriveRun(PolishRun[DriveAttempt]):
                 break
 
     def _fastest_paths(self, paths: Array) -> Array:
-        """Those of some paths (n, n_path) that are feasible when pressed hard enough and are the
-        fastest within some force."""
+        """Return those of some paths (n, n_path) that are feasible at the largest force limit and
+        the fastest at some limit."""
         x = np.hstack([paths, np.full((len(paths), 1), self._range[1])])
         paths = paths[self._evaluator.evaluate(x).feasible]
         if not len(paths):
@@ -245,8 +251,8 @@ class DriveRun(PolishRun[DriveAttempt]):
         return np.asarray(paths[np.unique(np.argmin(durations, axis=1))])
 
     def _limits(self, least: float, fast: float, count: int) -> list[float]:
-        """`count` force limits from one to another [N], and on in equal steps to the front's
-        largest. What a limit leaves above the box at rest decides how long a carry takes."""
+        """Return `count` force limits from one to another [N], continued in equal steps to the
+        front's largest, geometric in the force above rest, which decides the duration."""
         low, high, most = np.array([least, fast, self._largest]) - self._still
         step = np.log(high / low) / max(count - 1, 1)
         if most > high and step > 0.0:
@@ -256,14 +262,13 @@ class DriveRun(PolishRun[DriveAttempt]):
         return sorted(set(limits))
 
     def _known_paths(self, force: float) -> tuple[Array, Array]:
-        """Paths of the front and those beside it (n, n_path), and how long they take within a
-        force."""
+        """Return known paths (n, n_path) and their durations within a force limit."""
         known = [self._archive.x[k][: self._n_path] for k in self._archive.front_indices()]
         paths = np.unique(np.vstack([*known, self._others]), axis=0)
         return paths, self._method.paths.durations(paths, force)
 
     def _widest_gap(self) -> DriveGap | None:
-        """The largest gap between neighbours whose middle was not tried; None without any."""
+        """Return the largest gap between neighbours with an untried middle; None without any."""
         # What is not polished yet fills no gap: it is to be improved.
         rows = [k for k in self._archive.front_indices() if self._archive.polished[k]]
         if len(rows) < 2:

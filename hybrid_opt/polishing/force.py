@@ -1,8 +1,8 @@
-"""The step and the judge of both peak forces: one nonlinear program with exact derivatives.
+"""Step method of both peak forces: one nonlinear program with exact derivatives.
 
 Variables z = (xi, phi, a): the decision vector scaled to [-1, 1] by its bounds, both robots' peak
-forces f (the epigraph of the paper's Eq. 60) as phi = (f - anchor) / span, and a level. With the
-target's anchor, span, direction, offset and cost,
+forces f (the epigraph of the paper's Eq. 60) as phi = (f - anchor) / span, and a level. With
+anchor, span, direction, offset and cost of the scalarisation,
 
     minimise    cost . (a, phi_1, phi_2)
     subject to  (N_i,k(x) / N_ref,i - anchor_i) / span_i <= phi_i    chosen samples k, robot i
@@ -10,9 +10,9 @@ target's anchor, span, direction, offset and cost,
                 1 - (shift_i,k(x) / patch radius_i)^2 >= margin      chosen robots and samples
                 c_r(x) / scale_r >= required_r / scale_r             chosen rows at chosen places.
 
-With a direction of ones that is the scalarisation of Pascoletti and Serafini (1984). Another set
-of rows costs no more than choosing them. Joints as variables with closure constraints lead to the
-same optima and take four times as long.
+A direction of ones is the scalarisation of Pascoletti and Serafini (1984). Another set of rows
+costs only its choice. Joints as variables with closure constraints have the same optima and take
+four times as long.
 """
 
 from __future__ import annotations
@@ -43,42 +43,42 @@ from hybrid_opt.polishing.solvers.ipopt import ipopt
 from symbolic.array import Array
 
 UNBOUNDED_OFFSET = 1e3
-"""Offset that leaves an objective free, in units of the range."""
+"""Offset that leaves an objective unbounded [spans]."""
 
 LARGER_WEIGHT = 0.5
-"""Weight of the larger objective beside the sum of both in the balanced middle."""
+"""Weight of the larger objective relative to the sum of both in the balanced middle."""
 
 TIE_WEIGHT = 1e-4
-"""Weight of the sum of both objectives beside the level: excludes weakly efficient points."""
+"""Weight of the sum of both objectives relative to the level: excludes weakly efficient points."""
 
 EPIGRAPH_SLACK = 0.1
-"""What the epigraph variables start above the peak forces, in units of the span."""
+"""Difference of the epigraph variables to the peak forces at the start [spans]."""
 
 LEVEL_BOUND = 2e3
-"""Bound of |phi| and |a|; beyond anything the targets ask for."""
+"""Bound of |phi| and |a|, beyond any scalarisation."""
 
 LEAST_FORCE_RADIUS = 1e-3
-"""Radius of the box of trust below which a point is left."""
+"""Radius of the trust region below which a solve ends."""
 
 FORCE_BACKTRACKING = (3 / 4, 2 / 4, 1 / 4)
-"""Shares of a step that violates something, which are judged in its place."""
+"""Fractions of a rejected step that are tried instead."""
 
 BARRIER, WIDE_BARRIER, NEAR_BARRIER = 3e-4, 3e-2, 1e-5
-"""Barriers of the solver at the start. A search's point is near the solution but has no
-multipliers; solves that look for other basins first go to the middle of what is feasible."""
+"""First barriers of the solver. A search's point is near the solution but has no multipliers;
+solves that look for other basins first move to the middle of the feasible set."""
 
 NEAR_ROUNDS, NEAR_ITERATIONS = 12, 30
-"""Rounds of a start that is nearly an optimum, and the solver's iterations in each."""
+"""Trust-region iterations from a nearly optimal start, and the solver's iterations in each."""
 
 SolveMode = Literal["usual", "wide", "near", "brief"]
-"""usual. wide: whether to look farther than the nearest optimum. near: the start is nearly an
-optimum of the target, as a neighbour on the front is. brief: to end after
+"""usual: improve a search's point. wide: look beyond the nearest optimum. near: the start is nearly
+an optimum of the scalarisation, as a neighbour on the front is. brief: end after
 `ProbeSettings.rounds`."""
 
 
 @dataclass(frozen=True)
 class Scalarisation:
-    """Target of one solve; see the module; all (2,) but cost (3,): of the level and both
+    """Objective of one solve; see the module. All (2,) but cost (3,): of the level and both
     peaks."""
 
     anchor: Array
@@ -89,26 +89,26 @@ class Scalarisation:
 
     @property
     def limits(self) -> MinimisedForces:
-        """See `MinimisedForces`."""
+        """Return the robots with a bounded objective; see `MinimisedForces`."""
         first, second = (self.offset < UNBOUNDED_OFFSET).tolist()
         return first, second
 
     def least_level(self, phi: Array) -> float:
-        """The least level a that scaled peak forces (2,) allow."""
+        """Return the least level a for scaled peak forces (2,)."""
         ahead = self.direction > 0.0
         return float(np.max((phi - self.offset)[ahead] / self.direction[ahead]))
 
     def level(self, peak: Array) -> float:
-        """What the smooth problem minimises, at given peak forces (2,) over their references."""
+        """Compute the minimised value from peak forces (2,) over their references."""
         phi = (peak - self.anchor) / self.span
         return float(self.cost @ np.concatenate([[self.least_level(phi)], phi]))
 
 
 def pascoletti_serafini(anchor: Array, span: Array) -> Scalarisation:
-    """Go from the anchor along the diagonal as far as possible, never above either side.
+    """Move from the anchor along the diagonal as far as possible, bounded on both sides.
 
     Args:
-        anchor, span: (2,) point started from, and the scale of each objective.
+        anchor, span: (2,) start, and scale of each objective.
     """
     return Scalarisation(
         anchor, span, np.ones(2), np.zeros(2), np.array([1.0, TIE_WEIGHT, TIE_WEIGHT])
@@ -131,7 +131,7 @@ def balanced_scalarisation(anchor: Array, span: Array) -> Scalarisation:
 
 
 def scalarisation_for(anchor: Array, span: Array, objective: int | None) -> Scalarisation:
-    """Target at an end of a front, or at its balanced middle."""
+    """Return the scalarisation of an end of a front, or of its balanced middle for None."""
     return (
         balanced_scalarisation(anchor, span)
         if objective is None
@@ -218,7 +218,7 @@ class ForceProgram:
         self._jacobian: Array | None = None
 
     def values(self, z: Array) -> Array:
-        """See `solvers.base.NonlinearProgram`; what was evaluated last is remembered."""
+        """Return the rows (n_rows,) at z; the last evaluation is cached."""
         key = z.tobytes()
         if key != self._known:
             self._values = self._rows.values(self._cell.unscaled(z[: self._n]), z[self._n :])
@@ -234,7 +234,7 @@ class ForceProgram:
         return values, self._jacobian
 
     def curvature(self, z: Array, weights: Array) -> Array:
-        """See `solvers.base.NonlinearProgram`."""
+        """Return second derivatives (n_variables, n_variables) of weights . rows at z."""
         self.rows(z)
         n, half = self._n, self._cell.half
         full = np.zeros((n + 3, n + 3))
@@ -242,9 +242,9 @@ class ForceProgram:
         return full
 
     def residuals_at(self, x: Array, carry: PlacedCarry) -> Residuals:
-        """Residuals at a candidate x, with the multipliers that satisfy the conditions best there.
-        Only the variables' own bounds count: those of the box of trust would take up what is left
-        to be won."""
+        """Compute residuals at a candidate x with the least-squares multipliers there. Only the
+        variables' own bounds count: those of the trust region would absorb the remaining reduction.
+        """
         target = self._target
         phi = (carry.peak - target.anchor) / target.span
         z = np.concatenate([self._cell.scaled(x), phi, [target.least_level(phi)]])
@@ -252,20 +252,20 @@ class ForceProgram:
         return optimality_residuals(self, z, (low, high))
 
     def candidate(self, z: Array) -> Array:
-        """(n_var,) the decision vector at z, within its bounds and the box of trust."""
+        """Return the decision vector (n_var,) at z, within its bounds and the trust region."""
         n = self._n
         return self._cell.unscaled(np.clip(z[:n], self.low[:n], self.high[:n]))
 
 
 @dataclass(frozen=True, kw_only=True)
 class ForceStep(Step):
-    """x: (n_var,) where it leads."""
+    """A step to x (n_var,)."""
 
     x: Array
 
 
 class ForceStepMethod(StepMethod[Iterate, ForceStep]):
-    """Towards one target."""
+    """Minimise one scalarisation."""
 
     least_radius, backtracking = LEAST_FORCE_RADIUS, FORCE_BACKTRACKING
 
@@ -281,14 +281,14 @@ class ForceStepMethod(StepMethod[Iterate, ForceStep]):
         self._iterations, self._barrier = iterations, barrier
 
     def evaluate(self, x: Array) -> Iterate:
-        """See `StepMethod`."""
+        """Evaluate a candidate (n_var,)."""
         carry = self.reader.read(x)
         return Iterate(x, carry, self._target.level(carry.peak))
 
     def propose_step(
         self, best: Iterate, required: Mapping[Row, float], radius: float
     ) -> ForceStep | None:
-        """Solve the program in the box."""
+        """Solve the nonlinear program within the trust region."""
         program = ForceProgram(self.cell, required, self._target, best.carry, best.x, radius)
         answer = self._solve(program, self._iterations, self._barrier)
         if not answer.usable:
@@ -304,19 +304,19 @@ class ForceStepMethod(StepMethod[Iterate, ForceStep]):
         )
 
     def evaluate_step(self, best: Iterate, step: ForceStep) -> StepEvaluation[Iterate]:
-        """See `StepMethod`."""
+        """Evaluate the candidate of a step."""
         trial = self.evaluate(step.x)
         return StepEvaluation(trial, trial.level < best.level)
 
     def evaluate_fraction(
         self, begin: Iterate, best: Iterate, step: ForceStep, share: float
     ) -> Iterate | None:
-        """See `StepMethod`."""
+        """Evaluate a fraction of a step; see `StepMethod`."""
         trial = self.evaluate(begin.x + share * (step.x - begin.x))
         return trial if trial.level < best.level else None
 
     def missing_rows(self, trial: Iterate) -> set[Row]:
-        """Rows at peaks that are higher than the program foresaw."""
+        """Return rows at peaks that the program underestimated."""
         return set(self.active.forces.peak_rows(trial.carry, self.limits))
 
 
@@ -324,8 +324,8 @@ class ForceSolver:
     """Solves for one evaluator's cell. A resource: one per process.
 
     Attributes:
-        cell, active, reader: what all its solves share.
-        method: solves programs.
+        cell, active, reader: shared by all solves.
+        method: solver of the programs.
     """
 
     def __init__(self, cell: SmoothCell, settings: PolishSettings) -> None:
@@ -336,10 +336,11 @@ class ForceSolver:
     def solve(
         self, x: Array, target: Scalarisation, radius: float, mode: SolveMode = "usual"
     ) -> Solution:
-        """Improve a feasible decision vector (n_var,) towards a target.
+        """Improve a feasible decision vector (n_var,) by a scalarisation.
 
         Args:
-            radius: of the first box of trust, in halves of the decision variables' ranges.
+            radius: of the first trust region [half ranges of the decision variables].
+            mode: effort and barrier; see `SolveMode`.
         """
         rounds, iterations, barrier = self._settings.rounds, self._settings.max_iterations, BARRIER
         if mode == "near":

@@ -1,18 +1,17 @@
-"""The front of both peak forces: its points, its ends, its middle and its gaps.
+"""Front of both peak forces: its points, its ends, its middle and its gaps.
 
-Points of the front are improved first, each against its own start, so that neither objective gets
-worse. From the improved ones the solver goes on to the ends of the front and to its balanced
+Points of the front are improved first, each relative to its own start, so that neither objective
+gets worse. From the improved ones solves continue to the ends of the front and to its balanced
 middle, and then along the front into the widest gaps between neighbours.
 
-What a gap between neighbours is worth is the root of the area between them that a point could still
-win, in units of the front's extent; along flat tails, where that is next to nothing, at least a
-share of its length. In the widest gap a point is found by Pascoletti and Serafini's method, along
-the diagonal through a point beside a neighbour that is nearly there: a continuation along the
-front, each attempt the corrector of the last. Sequential quadratic programming from a neighbour's
-solution and multipliers finds the same points in about three times the time. The best carries of
-one basin hardly bend away from the straight line between two neighbours' decision vectors, the
-chord: the error grows with the square of its length. What the full model finds on a chord is nearly
-as good as what a solve would find there, and costs a fiftieth.
+The width of a gap is the root of the area between its neighbours that a point can still dominate
+[front's extent]; along flat tails, where that is next to nothing, at least a share of its length.
+In the widest gap the scalarisation of Pascoletti and Serafini finds a point along the diagonal,
+from a neighbour: a continuation along the front, each attempt the corrector of the last. Sequential
+quadratic programming from a neighbour's solution and multipliers finds the same points in about
+three times the time. The best carries of one basin hardly deviate from the straight line between
+two neighbours' decision vectors, the chord: the error grows with the square of its length. The full
+model's points on a chord are nearly as good as those of a solve, and cost a fiftieth.
 """
 
 from __future__ import annotations
@@ -47,49 +46,48 @@ from hybrid_opt.polishing.starts import Start, mirror_of, perturb_start, random_
 from symbolic.array import Array, evenly
 
 LEAST_MEMBER_SHARE = 0.9
-"""Share of the points that a front is to have with which it is left."""
+"""Share of the wanted members at which a front is complete."""
 
 LEAST_PROGRESS = 2e-5
-"""Least gain of an attempt that counts as coming further, in units of the reference force."""
+"""Least gain of an attempt that counts as progress [reference force]."""
 
 MIDDLE_STALLS = 1
-"""Attempts at the balanced middle in a row that came no further, after which it is left."""
+"""Attempts at the balanced middle in a row without progress after which it is left."""
 
 RADIUS, SMALL_RADIUS, NEAR_RADIUS = 1.0, 0.1, 0.4
-"""First boxes of trust: usually, where an attempt goes on where the last came no further, and of
-one from a neighbour on the front, in halves of the decision variables' ranges."""
+"""First radii of trust regions: usually, after an attempt without progress, and from a neighbour on
+the front [half ranges of the decision variables]."""
 
 STRIDE = 0.2
-"""From the neighbour that an attempt starts from, along both objectives, at most, in units of the
-front's extent."""
+"""Largest distance along both objectives from a neighbour to the aim of an attempt [front's
+extent]."""
 
 FAR_GAP = 0.1
-"""Width beyond which a gap that no neighbour leads into is looked at from afar."""
+"""Width above which a gap that no neighbour leads into is tried from far away."""
 
 TAIL = 0.125
-"""Share of its length that a gap is wide at least."""
+"""Least width of a gap as a share of its length."""
 
 LITTLE_PROGRESS = 0.3
-"""Share of its step that an attempt has to come along the front."""
+"""Share of its step along the front below which an attempt made little progress."""
 
 CHORD = 16
 """Points that are evaluated on each chord."""
 
 Edge = tuple[bytes, bytes, bool]
-"""A gap as seen from one side: decision vectors there and across, as bytes, and whether an attempt
-stays near."""
+"""A gap from one side: decision vectors there and across, as bytes, and whether the attempt is
+near."""
 
 Chord = tuple[bytes, bytes]
-"""Its ends, by increasing first objective: decision vectors as bytes."""
+"""Ends of a chord by increasing first objective: decision vectors as bytes."""
 
 Perturbation = Callable[[Array, int], tuple[Array, Array] | None]
-"""From a decision vector and the objective that matters to another start and its objectives; None
-where none was found."""
+"""From a decision vector and an objective to another start and its objectives; None without any."""
 
 
 @dataclass(frozen=True)
 class ForceAttempt(Attempt):
-    """An attempt at a target; see `hybrid_opt.polishing.force.ForceSolver.solve`."""
+    """An attempt with a scalarisation; see `hybrid_opt.polishing.force.ForceSolver.solve`."""
 
     target: Scalarisation
     radius: float = RADIUS
@@ -97,7 +95,7 @@ class ForceAttempt(Attempt):
 
 
 def front_attempts(archive: ParetoArchive, settings: PolishSettings) -> list[ForceAttempt]:
-    """Evenly spread points of the front, the balanced one among them."""
+    """Return attempts at evenly spread points of the front, the balanced one among them."""
     rows = archive.front_indices()
     count = min(len(rows), ceil(settings.attempts * OWN_SHARE))
     chosen = {rows[k] for k in evenly(len(rows), count)}
@@ -123,16 +121,16 @@ def extreme_attempt(
     perturb: Perturbation,
     rng: np.random.Generator,
 ) -> ForceAttempt:
-    """An attempt at an end of the front or at its balanced middle.
+    """Return an attempt at an end of the front or at its balanced middle.
 
-    It goes on from the best point. Where that was tried, or came no further, ends start from a kick
-    away from it: they lie in several basins. The middle starts from any other point then, those
-    that are dominated by now included.
+    It continues from the best point. If that was tried, or brought no progress, ends start from a
+    perturbation of it: they lie in several basins. The middle then starts from any other point,
+    also a dominated one.
 
     Args:
-        objective: whose end of the front; None for its balanced middle.
+        objective: of the end of the front; None for its balanced middle.
         tried: all attempts so far, as objective and bytes of the start.
-        stalled: whether the last attempt came no further.
+        stalled: whether the last attempt brought no progress.
     """
     radius, k = RADIUS, archive.best(objective)[0]
     fresh = [row for row, x in enumerate(archive.x) if (objective, x.tobytes()) not in tried]
@@ -152,7 +150,8 @@ def extreme_attempt(
 
 
 def refinement_attempt(archive: ParetoArchive, objective: int | None) -> ForceAttempt:
-    """An attempt from the best point at an end, or at the balanced middle, to the last digits."""
+    """Return an attempt from the best point of an end, or of the balanced middle, to high
+    accuracy."""
     k, span = archive.best(objective)[0], archive.span()
     x, start = archive.x[k], archive.objectives[k]
     target = scalarisation_for(start, span, objective)
@@ -161,7 +160,7 @@ def refinement_attempt(archive: ParetoArchive, objective: int | None) -> ForceAt
 
 
 def probe_attempt(start: Start, objective: int | None) -> ForceAttempt:
-    """A short solve from a start towards an end of the front, or its balanced middle."""
+    """Return a short solve from a start towards an end of the front, or its balanced middle."""
     target = scalarisation_for(start.objectives, np.full(2, LEAST_SPAN), objective)
     return ForceAttempt("probe", -1, start.x, start.objectives, target, mode="brief")
 
@@ -169,14 +168,14 @@ def probe_attempt(start: Start, objective: int | None) -> ForceAttempt:
 def successive_halving(
     pool: list[Start], objective: int | None, solve: Callable[[Start], Start]
 ) -> None:
-    """Solve from all starts, then from the better half of what was reached, until one is left."""
+    """Solve from all starts, then from the better half of the results, until one is left."""
     while pool:
         reached = [start if start.is_exhausted else solve(start) for start in pool]
         pool = better_half(reached, objective)
 
 
 def better_half(reached: list[Start], objective: int | None) -> list[Start]:
-    """Starts that go on, the best first; none after the last."""
+    """Return the better half of the starts, the best first; none of the last."""
     ranked = sorted(reached, key=lambda start: start.value(objective))
     return ranked[: len(reached) // 2]
 
@@ -186,9 +185,9 @@ class GapAttempt:
     """An attempt in a gap.
 
     Attributes:
-        attempt: what it is.
-        edge: the side that it starts from.
-        step: how far along the front it aims, in units of its extent.
+        attempt: the solve.
+        edge: the gap from the side of the start.
+        step: distance of the aim along the front [front's extent].
     """
 
     attempt: ForceAttempt
@@ -198,12 +197,12 @@ class GapAttempt:
 
 @dataclass(frozen=True)
 class ForceGap:
-    """Neighbours on a front: indices into the archive, and how far apart they are.
+    """Neighbours on a front: indices into the archive, and their distance.
 
     Attributes:
         first, second: by increasing first objective.
         width: see the module.
-        length: sum of the differences of both objectives, in units of the front's extent.
+        length: sum of the differences of both objectives [front's extent].
     """
 
     first: int
@@ -213,7 +212,7 @@ class ForceGap:
 
 
 def gaps(archive: ParetoArchive) -> list[ForceGap]:
-    """All of a front, in its order."""
+    """Return all gaps of a front, in order."""
     rows = archive.front_indices()
     scaled = np.array([archive.objectives[k] for k in rows]) / archive.span()
     sides = np.abs(np.diff(scaled, axis=0))
@@ -231,19 +230,19 @@ def gap_attempt(
     stride: float = STRIDE,
     far: float = FAR_GAP,
 ) -> GapAttempt | None:
-    """An attempt in the widest gap, from the side that was not tried.
+    """Return an attempt in the widest gap, from an untried side.
 
-    Where both sides' continuations failed, because the front jumps there, a gap that is far too
-    wide is aimed at half way, without staying near.
+    If the continuations from both sides failed, because the front jumps there, a far too wide gap
+    is aimed at half way with a large radius.
 
     Args:
         archive: the front so far.
         tried: sides of gaps that attempts started from.
-        solved: points with which the front has enough.
+        solved: points with which the front is complete.
         stride, far: see `STRIDE` and `FAR_GAP`.
 
     Returns:
-        The attempt; None where the front has enough points, or no side of a gap is left.
+        The attempt; None if the front is complete, or no side of a gap is left.
     """
     found = gaps(archive)
     if len(found) + 1 >= solved:
@@ -271,21 +270,20 @@ def gap_attempt(
 def made_little_progress(
     archive: ParetoArchive, gap_attempt: GapAttempt, objectives: Array
 ) -> bool:
-    """Whether what an attempt found is hardly farther along the front than where it started."""
+    """Return True if an attempt's result is hardly farther along the front than its start."""
     moved = np.abs(objectives - gap_attempt.attempt.start) / archive.span()
     return float(moved.sum()) < LITTLE_PROGRESS * gap_attempt.step
 
 
 def _target(archive: ParetoArchive, k: int, step: float) -> Scalarisation:
-    """From a member to a distance along the front."""
+    """Return the scalarisation from a member to a distance along the front."""
     span = archive.span()
     aside = np.array([0.5, -0.5]) * step * span
     return pascoletti_serafini(archive.objectives[k] + aside, span)
 
 
 def widest_untried_gap(archive: ParetoArchive, tried: Collection[Chord]) -> ForceGap | None:
-    """The widest gap whose chord was not tried; None where none is left. Points of the given front
-    have no chords."""
+    """Return the widest gap with an untried chord between polished points; None without any."""
     for gap in sorted(gaps(archive), key=lambda gap: -gap.width):
         is_polished = archive.polished[gap.first] and archive.polished[gap.second]
         if is_polished and chord_across(archive, gap) not in tried:
@@ -294,15 +292,19 @@ def widest_untried_gap(archive: ParetoArchive, tried: Collection[Chord]) -> Forc
 
 
 def chord_across(archive: ParetoArchive, gap: ForceGap) -> Chord:
-    """The chord across a gap."""
+    """Return the chord across a gap."""
     return archive.x[gap.first].tobytes(), archive.x[gap.second].tobytes()
 
 
 def best_on_chord(
     evaluator: CandidateEvaluator, archive: ParetoArchive, gap: ForceGap
 ) -> tuple[Array, Array] | None:
-    """The feasible point on a chord that wins most area from its gap: decision vector (n_var,) and
-    objectives (2,); None where every one is dominated or infeasible."""
+    """Return the feasible point on a chord that dominates most area of its gap.
+
+    Returns:
+        Decision vector (n_var,) and objectives (2,); None if all points are dominated or
+        infeasible.
+    """
     share = np.arange(1, CHORD + 1)[:, None] / (CHORD + 1)
     x = (1.0 - share) * archive.x[gap.first] + share * archive.x[gap.second]
     found = evaluator.evaluate(x)
@@ -316,7 +318,7 @@ def best_on_chord(
 
 
 class ForceRun(PolishRun[ForceAttempt]):
-    """The polish of both peak forces."""
+    """One polish of both peak forces in progress."""
 
     def __init__(
         self,
@@ -345,9 +347,9 @@ class ForceRun(PolishRun[ForceAttempt]):
         return found
 
     def run(self, rng: np.random.Generator) -> None:
-        """The front's points, then probes far from it, then ends and middle in turns while attempts
-        last; then what lies between. Mirror images are taken in all the way, and certified together
-        with points on chords in the end."""
+        """Process the front's points, then probes far from it, then ends and middle in turns while
+        attempts last, then gaps. Mirror images are added throughout, and certified together with
+        points on chords in the end."""
         first, fill = front_attempts(self._archive, self._settings), self._settings.fill
         self._ahead = max(self._attempts_left() - len(first), 0)
         aims = (0, 1, None) if self._mirror is None else (0, None)
@@ -375,8 +377,8 @@ class ForceRun(PolishRun[ForceAttempt]):
             self._certify_unproven()
 
     def _probe(self, objective: int | None, rng: np.random.Generator) -> None:
-        """Short solves from random feasible candidates and from the front's best point, then again
-        from the better half of what they reached, until one is left."""
+        """Solve briefly from random feasible candidates and from the front's best point, by
+        successive halving."""
         count = self._starts(objective)
         if not count:
             return
@@ -393,14 +395,14 @@ class ForceRun(PolishRun[ForceAttempt]):
         successive_halving(pool, objective, solve)
 
     def _starts(self, objective: int | None) -> int:
-        """Starts of short solves: never more than twice the attempts that are ahead."""
+        """Return the number of starts of short solves: at most twice the attempts ahead."""
         probe = self._settings.probe
         count = probe.starts if self._mirror is not None else (probe.starts + 1) // 2
         return min(2 * self._ahead, probe.middle_starts if objective is None else count)
 
     def _remove_probes(self) -> list[tuple[Array, Array]]:
-        """Take out what probes reached, but for the ends and the middle: cut short on purpose, they
-        would stand where a gap is to be filled."""
+        """Remove results of probes, except the ends and the middle, and return them: they are
+        deliberately unfinished and would stand in gaps that are to be filled."""
         archive = self._archive
         kept = {archive.best(objective)[0] for objective in (0, 1, None)}
         probed = [k for k, x in enumerate(archive.x) if x.tobytes() in self._probed]
@@ -410,7 +412,7 @@ class ForceRun(PolishRun[ForceAttempt]):
         return found
 
     def _restore_probes(self, probed: list[tuple[Array, Array]]) -> None:
-        """What lies in gaps that stayed far too wide is not given up, nor what a front lacks."""
+        """Add results of probes in gaps that stayed far too wide, or if the front stayed short."""
         for x, objectives in probed:
             wanted = self._is_short or self._is_far(objectives)
             if wanted and not self._archive.dominates(objectives):
@@ -418,11 +420,11 @@ class ForceRun(PolishRun[ForceAttempt]):
 
     @property
     def _is_short(self) -> bool:
-        """Whether the front has fewer points than it is to have."""
+        """Return True if the front has fewer points than wanted."""
         return len(self._archive.front_indices()) < self._settings.fill.members
 
     def _is_far(self, objectives: Array) -> bool:
-        """Whether a point lies beyond the ends of the front, or in a gap that is far too wide."""
+        """Return True if a point is beyond the ends of the front, or in a far too wide gap."""
         f = [self._archive.objectives[k][0] for k in self._archive.front_indices()]
         place = int(np.searchsorted(f, objectives[0]))
         if place in (0, len(f)):
@@ -430,8 +432,8 @@ class ForceRun(PolishRun[ForceAttempt]):
         return gaps(self._archive)[place - 1].width > FAR_GAP
 
     def _fill(self, solved: int) -> None:
-        """Attempts between the ends, until the front has its points or no side of a gap is left;
-        then points on chords between neighbours."""
+        """Process attempts in gaps until the front is complete or no side of a gap is left; then
+        add points on chords."""
         tried: set[Edge] = set()
         self._most_attempts += self._settings.fill.attempts * self._settings.attempts
         while self._attempts_left() > 0:
@@ -462,7 +464,7 @@ class ForceRun(PolishRun[ForceAttempt]):
                 self._add_image(found[0])
 
     def _reflected(self, edge: Edge) -> Edge:
-        """The mirror image of a side of a gap, itself where it has none."""
+        """Reflect a side of a gap; return the side itself without a mirror image."""
         start, across, near = edge
         return self._reflected_bytes(start), self._reflected_bytes(across), near
 
@@ -482,7 +484,7 @@ class ForceRun(PolishRun[ForceAttempt]):
             self._add_image(outcome.x)
 
     def _evaluate(self, attempt: ForceAttempt, x: Array) -> Evaluations:
-        """Most of what probes reach is dominated soon: what then stands is certified in the end."""
+        """Evaluate x (n_var,); results of probes are certified only if they stay on the front."""
         if attempt.mode == "brief":
             return self._evaluator.evaluate(x)
         return super()._evaluate(attempt, x)
@@ -496,8 +498,8 @@ class ForceRun(PolishRun[ForceAttempt]):
             self._unproven.add(image.tobytes())
 
     def _certify_unproven(self) -> None:
-        """Leave out what no solve made and is not proven free of collisions between the samples;
-        then what only that dominated, until all that stand are proven."""
+        """Certify points that no solve made, and remove those with collisions between the samples,
+        until all points of the front are certified."""
         while standing := [
             k
             for k in self._archive.front_indices()
@@ -509,7 +511,7 @@ class ForceRun(PolishRun[ForceAttempt]):
             self._archive.drop([k for k, good in zip(standing, proven, strict=True) if not good])
 
     def _attempt_ends(self, objectives: tuple[int | None, ...], rng: np.random.Generator) -> None:
-        """An attempt at each of some aims, and whether it came further."""
+        """Process one attempt per objective, and count those without progress."""
         perturb = partial(perturb_start, self._evaluator, rng=rng)
         for objective in objectives:
             before, stalls = self._archive.best(objective)[1], self._stalls[objective]

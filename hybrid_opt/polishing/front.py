@@ -1,7 +1,7 @@
-"""A front in the course of its polish: its points so far, and what is done with every attempt.
+"""A front during its polish: its archive, and the processing of every attempt.
 
-Attempts are solved, judged and taken in, one after the other. Every answer is judged by the full
-evaluator and certified between the samples before it is believed.
+Attempts are solved, evaluated and recorded one after the other. The full evaluator checks every
+answer and certifies it between the samples before it is accepted.
 """
 
 from __future__ import annotations
@@ -26,74 +26,75 @@ from hybrid_opt.polishing.settings import PolishSettings
 from symbolic.array import Array
 
 LEAST_SPAN = 2e-3
-"""Least scale of an objective: of a front of one point, or one that is nearly flat."""
+"""Least scale of an objective: of a front of one point, or of a nearly flat one."""
 
 OWN_SHARE = 1.0 / 8.0
-"""Share of the attempts that go to points of the given front."""
+"""Share of the attempts at points of the given front."""
 
 IMPROVEMENT_TOLERANCE = 1e-6
 """Improvement of an objective below which a point counts as optimal already."""
 
 OPTIMAL_STATIONARITY = 1e-3
-"""Residual of stationarity below which a point that could not be improved counts as optimal."""
+"""Stationarity residual below which a point without improvement counts as optimal."""
 
 NO_SOLUTION = Solution(np.empty(0))
 
 
 class ParetoArchive:
-    """The points that stand so far: rows of the given front, and new ones."""
+    """Points of a front during its polish: rows of the given front, and new ones."""
 
     def __init__(self, x: Array, objectives: Array, parent: list[int]) -> None:
         self.x, self.objectives = list(x), list(objectives)
         self.parent, self.polished = list(parent), [False] * len(x)
 
     def replace(self, parent: int, x: Array, objectives: Array) -> None:
-        """Put a polished point in the place of a row of the given front."""
+        """Replace a row of the given front by a polished point."""
         index = self.parent.index(parent)
         self.x[index], self.objectives[index], self.polished[index] = x, objectives, True
 
     def dominates(self, objectives: Array) -> bool:
-        """Whether a point is as good in both objectives."""
+        """Return True if a point is at least as good in both objectives."""
         return bool(np.any(np.all(np.array(self.objectives) <= objectives, axis=1)))
 
     def add(self, x: Array, objectives: Array) -> None:
-        """Take in a new point."""
+        """Add a new point."""
         self.x.append(x)
         self.objectives.append(objectives)
         self.parent.append(-1)
         self.polished.append(True)
 
     def drop(self, indices: Sequence[int]) -> None:
-        """Take out points; the others' indices change."""
+        """Remove points; indices of the others change."""
         lists: tuple[list[Any], ...] = (self.x, self.objectives, self.parent, self.polished)
         for values in lists:
             values[:] = [value for k, value in enumerate(values) if k not in indices]
 
     def front_indices(self) -> list[int]:
-        """Indices of the non-dominated points by increasing first objective."""
+        """Return indices of the non-dominated points by increasing first objective."""
         values = np.array(self.objectives)
         kept = np.flatnonzero(metrics.non_dominated(values))
         return [int(k) for k in kept[np.lexsort(values[kept].T[::-1])]]
 
     def best(self, objective: int | None) -> tuple[int, float]:
-        """The point that is the lowest in an objective, or in the sum of both, and its value."""
+        """Return the point that is the lowest in an objective, or in the sum of both for None, and
+        its value."""
         wanted = np.ones(2) if objective is None else np.eye(2)[objective]
         values = {k: float(wanted @ self.objectives[k]) for k in self.front_indices()}
         index = min(values, key=lambda k: values[k])
         return index, values[index]
 
     def span(self) -> Array:
-        """(2,) the scale of each objective."""
+        """Return the scale (2,) of each objective."""
         values = np.array(self.objectives)[self.front_indices()]
         return np.asarray(np.maximum(np.ptp(values, axis=0), LEAST_SPAN))
 
 
 @dataclass(frozen=True)
 class FailedAttempt:
-    """An attempt without a solution; reason: killed, timeout, or what was raised.
+    """An attempt without a solution; reason: killed, timeout, or an exception's message.
 
-    An exception is caught here. What ends or blocks the process, a crash or a hang, is noticed by
-    those who gave it the work (`hybrid_opt.work`), who go on after it.
+    Exceptions are caught here. The owner of the process notices crashes and hangs
+    (`hybrid_opt.work`) and continues after them.
     """
 
     reason: str
@@ -105,7 +106,7 @@ class Attempt:
 
     Attributes:
         aim, parent, start: as in `hybrid_opt.polishing.records.PolishOutcome`.
-        x: (n_var,) decision vector to start from.
+        x: (n_var,) decision vector of the start.
     """
 
     aim: Aim
@@ -140,22 +141,22 @@ class PolishRun(ABC, Generic[AnyAttempt]):
 
     @abstractmethod
     def run(self, rng: np.random.Generator) -> None:
-        """Every attempt."""
+        """Process all attempts."""
 
     @abstractmethod
     def _solve(self, attempt: AnyAttempt) -> Solution:
-        """Solution of an attempt."""
+        """Solve an attempt."""
 
     def _attempts_left(self) -> int:
         return self._most_attempts - len(self.outcomes)
 
     def _announce(self, attempts: int) -> None:
-        """Tell how many more there are to be, as far as is known."""
+        """Report the expected number of further attempts."""
         self._expected = attempts
         self._on_progress(len(self.outcomes), len(self.outcomes) + attempts)
 
     def _process(self, attempts: list[AnyAttempt]) -> None:
-        """Solve, judge and take in attempts; those on record are not solved again."""
+        """Solve, evaluate and record attempts; recorded ones are not solved again."""
         for attempt in attempts[: max(0, self._attempts_left())]:
             known = self._recorded.pop(0) if self._recorded else None
             if isinstance(known, PolishOutcome):
@@ -170,7 +171,7 @@ class PolishRun(ABC, Generic[AnyAttempt]):
             self._announce(max(self._expected - 1, 0))
 
     def _solve_guarded(self, attempt: AnyAttempt) -> Solution | FailedAttempt:
-        """The solution, or what was raised instead."""
+        """Solve an attempt; return an exception as a failed attempt."""
         try:
             return self._solve(attempt)
         except Exception as error:
@@ -217,7 +218,8 @@ class PolishRun(ABC, Generic[AnyAttempt]):
         return self._verify(attempt, answer)
 
     def _verify(self, attempt: AnyAttempt, answer: Solution) -> tuple[Status, str, Array]:
-        """Verdict of the full evaluator and the certificate between the samples on an answer."""
+        """Return the status of an answer after full evaluation and certification between the
+        samples."""
         found = self._evaluate(attempt, answer.x)
         reason = int(found.reason[0])
         if reason != FEASIBLE:
@@ -225,13 +227,13 @@ class PolishRun(ABC, Generic[AnyAttempt]):
         return self._classify(attempt, answer, found.objectives[0])
 
     def _evaluate(self, attempt: AnyAttempt, x: Array) -> Evaluations:
-        """Verdict of the full evaluator and the certificate between the samples on x (n_var,)."""
+        """Evaluate x (n_var,) in full and certify it between the samples."""
         return self._evaluator.certified(self._evaluator.evaluate(x))
 
     def _classify(
         self, attempt: AnyAttempt, answer: Solution, objectives: Array
     ) -> tuple[Status, str, Array]:
-        """Whether a feasible answer is taken in."""
+        """Return the status of a feasible answer: accepted, optimal or rejected."""
         gain = attempt.start - objectives
         if attempt.aim == "point":
             if gain.min() < -IMPROVEMENT_TOLERANCE:
@@ -253,8 +255,8 @@ class PolishRun(ABC, Generic[AnyAttempt]):
 
 
 def use_one_thread() -> None:
-    """Keep IPOPT's BLAS from spinning on cores that other workers use: its matrices are too small
-    for threads. It is loaded with the first solve, too late for
+    """Limit IPOPT's BLAS to one thread, so that it does not spin on cores of other workers: its
+    matrices are too small for threads. It is loaded with the first solve, too late for
     `hybrid_opt.work.service.one_thread`."""
     for library in Path(casadi.__file__).parent.glob("*openblas*.so*"):
         with suppress(OSError, AttributeError):

@@ -1,10 +1,9 @@
-"""Path and speed profile as one program: limits at both ends of every interval, by waypoints and
-squared speeds, and the quadratic model about an iterate.
+"""Path and speed profile as one program, and its quadratic model about an iterate.
 
-An interval is a piece of the path with constant u''. Its two ends are two points, so that n
-intervals have 2 n points, both of one interval in a row. What is limited at a point depends on the
-waypoints, which are linear in pose and derivatives, and on the squared speeds at both ends of the
-interval: u'' = (w_end - w_begin) n / 2, u'^2 = w.
+An interval is a piece of the path with constant u''. Both of its ends are points of their own, so n
+intervals have 2 n points, two neighbouring ones per interval. Limits apply at every point. They
+depend on the waypoints, which are linear in pose and derivatives, and on the squared speeds at both
+ends of the interval: u'' = (w_end - w_begin) n / 2, u'^2 = w.
 """
 
 from __future__ import annotations
@@ -35,7 +34,7 @@ from symbolic.smooth.driven import (
 from symbolic.smooth.samples import grasp_force_name
 
 GRASP_ROWS = 2
-"""Forces that a program finds, those of both robots."""
+"""Forces of a grasp's program, one per robot."""
 
 
 @dataclass(frozen=True)
@@ -44,8 +43,8 @@ class PointInequalities:
 
     Attributes:
         mix: (k, quantities) coefficients.
-        is_force: (k,) whether the bound is the force limit; it is 1 otherwise.
-        where, weight: (k, terms) the coefficients that are not zero.
+        is_force: (k,) whether the bound is the force limit; otherwise it is 1.
+        where, weight: (k, terms) nonzero coefficients.
     """
 
     mix: Array
@@ -55,11 +54,12 @@ class PointInequalities:
 
     @classmethod
     def from_workcell(cls, workcell: Workcell, robust: int = 0) -> PointInequalities:
-        """Rows of a workcell: both signs where a quantity has one, all branches of the forces.
+        """Return a workcell's inequalities: both signs of signed quantities, all branches of the
+        forces.
 
         Args:
-            robust: further forces behind the quantities, each with a row of its own, as both of a
-                program have.
+            robust: further forces behind the quantities, one row each, as for both forces of a
+                grasp's program.
         """
         layout = driven_layout(workcell)
         eye = np.eye(layout.size)
@@ -83,8 +83,8 @@ class PointInequalities:
         return cls(mix, is_force, where, np.take_along_axis(mix, where, axis=1))
 
     def slopes(self, slope: Array, point: NDArray[np.intp], kind: NDArray[np.intp]) -> Array:
-        """(rows, ...) of some inequalities at some points, from those of the quantities
-        (points, quantities, ...)."""
+        """Return slopes (rows, ...) of some inequalities at some points, from those of the
+        quantities (points, quantities, ...)."""
         terms = zip(self.where.T, self.weight.T, strict=True)
         return sum(
             (slope[point, where[kind]] * weight[kind, None] for where, weight in terms),
@@ -93,19 +93,19 @@ class PointInequalities:
 
 
 class IntervalGrid:
-    """What all paths of a workcell share that are moved by the same variables.
+    """Shared data of all paths of a workcell with the same variables.
 
     Attributes:
         workcell: the cell.
         intervals: pieces of constant u''.
         sample: (points,) grid point of each point.
         moving: entries of the extended pose and its two derivatives, 3 (6 + m).
-        kinds: the inequalities of a point.
-        robust: robust forces, None where planned ones are limited.
+        kinds: inequalities of a point.
+        robust: robust forces, None if planned ones are limited.
         layout: of the quantities.
-        load: place of the load among them.
-        spread: (the path's variables, n_path) how they follow the program's.
-        moved: (points, moving, n_path) how the points do.
+        load: slice of the load among them.
+        spread: (variables of the path, n_path) path by the program's variables.
+        moved: (points, moving, n_path) poses and derivatives by the program's variables.
         threads: threads that share a batch of points.
     """
 
@@ -136,7 +136,8 @@ class IntervalGrid:
         self.load = self.layout.block("load")
 
     def by_path(self, slope: Array, points: NDArray[np.intp]) -> Array:
-        """(rows, n_path) slopes by the program's variables of slopes (rows, moving) at points."""
+        """Return slopes (rows, n_path) by the program's variables from slopes (rows, moving) at
+        points."""
         rows, columns = self.workcell.task.free_entries
         at = self.sample[points]
         by_path = sum(
@@ -149,19 +150,20 @@ class IntervalGrid:
         return np.asarray(by_path @ self.spread)
 
     def path(self, x: Array) -> tuple[Array, Array, Array]:
-        """Extended pose and both derivatives (intervals + 1, 6 + m) of a decision vector."""
+        """Return the extended pose and both derivatives (intervals + 1, 6 + m) of a decision
+        vector."""
         waypoints = extended_waypoints(self.workcell.task, x)
         first, second, third = (np.ascontiguousarray(b @ waypoints) for b in self._bases)
         return first, second, third
 
 
 class IntervalValues:
-    """The limited quantities of one driven path with their derivatives.
+    """Limited quantities of one driven path and their derivatives.
 
     Attributes:
-        value: (points, quantities), robust forces or those of a program behind them.
+        value: (points, quantities), then robust forces or those of a grasp's program.
         slope: (points, quantities, moving + 2) by the extended pose and its derivatives, u'' and
-            u'^2, the joints following.
+            u'^2, with dependent joints.
     """
 
     def __init__(
@@ -206,9 +208,12 @@ class IntervalValues:
         self.value, self.slope = value, slope
 
     def at_rest(self, force: float) -> tuple[Array, Array]:
-        """Shares (rows,) of what standing still uses at every interval's beginning: of the patches,
-        or of a force limit [N] where pads press evenly; and their slopes (rows, moving) by the
-        extended pose."""
+        """Compute the utilisation at rest.
+
+        Returns:
+            At every interval's beginning shares (rows,) of the patches, or of a force limit [N] for
+            pads with uniform pressure, and their slopes (rows, moving) by the extended pose.
+        """
         begins = [values[::2] for values in self._inputs]
         still, grid = np.zeros(len(begins[-1])), self._grid
         first = self._functions.built[DRIVEN_FIRST]
@@ -225,17 +230,19 @@ class IntervalValues:
         return value.reshape(-1) / whole, slope.reshape(-1, grid.moving) / whole
 
     def rows(self) -> Array:
-        """(points, kinds) mix . quantities of every inequality."""
+        """Return mix . quantities of every inequality (points, kinds)."""
         return np.asarray(self.value @ self._grid.kinds.mix.T)
 
     def curvature(self, weight: Array) -> tuple[NDArray[np.intp], Array]:
-        """Second derivatives of weight . value.
+        """Compute second derivatives of weight . value.
 
         Args:
-            weight: (points, quantities and further forces); robust ones bend as planned ones do.
+            weight: (points, quantities and further forces); robust forces have the curvature of
+                planned ones.
 
         Returns:
-            The points (m,) with any weight, and (m, moving + 2, moving + 2) of each.
+            Points (m,) with a nonzero weight, and their second derivatives (m, moving + 2, moving +
+            2).
         """
         if self._grid.robust is not None:
             weight = self._grid.robust.planned_weights(weight, self.value)
@@ -283,12 +290,14 @@ class IntervalValues:
 
 
 def _by_load(pressed: Mapping[str, Array], slope: Array) -> Array:
-    """Slopes (points, 2, ...) of a program's forces, from those of their load (points, 6, ...)."""
+    """Return slopes (points, 2, ...) of a program's forces from those of their load (points, 6,
+    ...)."""
     return np.asarray(pressed["slope"] @ slope)
 
 
 def _followed(grid: IntervalGrid, full: Array, follow: Sequence[Array]) -> Array:
-    """Slopes by pose, derivatives, u'' and u'^2 where the joints follow the pose."""
+    """Eliminate the joints from slopes: by pose, derivatives, u'' and u'^2 with dependent
+    joints."""
     slope = np.concatenate([full[:, :, : grid.moving], full[:, :, -2:]], axis=2)
     start = grid.moving
     for along in follow:
@@ -299,30 +308,31 @@ def _followed(grid: IntervalGrid, full: Array, follow: Sequence[Array]) -> Array
 
 
 NEARLY_USED = 0.85
-"""Limits used this far have a row from the start."""
+"""Limits with a larger utilisation have a row from the start."""
 
 NEARLY_USED_FORCE = 0.6
-"""The same for the normal forces, of what the limit leaves above the force at rest."""
+"""Normal forces beyond this share of the difference between the limit and rest have a row from the
+start."""
 
 REST_MARGIN = 2e-3
-"""Share of the patches, or of the force limit, that is kept free standing still: only the
-intervals' beginnings have rows, and where rest uses all of it there is no timing at all."""
+"""Share of the patches, or of the force limit, that rest leaves unused: only the intervals'
+beginnings have rows, and where rest uses all there is no timing."""
 
 NEGLIGIBLE_MULTIPLIER = 1e-8
-"""Scaled multipliers below this count as none."""
+"""Scaled multipliers below this count as zero."""
 
 LEAST_SCALE = 1e-2
-"""A row's slope by the squared speeds below which it is not scaled up further."""
+"""Least slope by the squared speeds by which a row is scaled."""
 
 
 @dataclass(frozen=True)
 class LinearisedRows:
-    """Rows A d <= b: the chosen ones of the timing, then the geometric ones.
+    """Rows A d <= b: chosen ones of the timing, then geometric ones.
 
     Attributes:
         A, b: the rows.
-        scale: (rows,) what they were divided by.
-        point, kind: (timing rows,) which ones they are.
+        scale: (rows,) divisors of the rows.
+        point, kind: (timing rows,) indices.
     """
 
     A: BorderedRows
@@ -333,28 +343,28 @@ class LinearisedRows:
 
 
 class PathTimingProgram:
-    """The program about one iterate.
+    """Program of path and timing about one iterate.
 
     Variables z = (xi, omega): the waypoints that are moved, scaled to [-1, 1] by their bounds, and
-    the squared speeds at the grid points between both ends as u'^2_i = w_i (1 + omega_i). With T
-    the duration, F the force limit, and all of it about the iterate (xi, w) with duration T_0,
+    the squared speeds at the inner grid points as u'^2_i = w_i (1 + omega_i). With the duration T,
+    the force limit F, and the iterate (xi, w) with duration T_0,
 
         minimise    T / T_0
         subject to  every limit at both ends of every interval <= 1, normal forces <= F
                     c_r(x) / scale_r >= required_r / scale_r   chosen geometric rows, as in
                     `hybrid_opt.polishing.force`.
 
-    Derivatives are exact, first and second. Rows of the timing are scaled so that their slope by
-    omega is around one. Every row holds the speeds of one interval only, so that matrices are those
-    of `hybrid_opt.polishing.solvers.quadratic`, the speeds being the chain.
+    First and second derivatives are exact. Rows of the timing are scaled so that their slope by
+    omega is around one. Every row has the speeds of one interval only, so matrices have the
+    structure of `hybrid_opt.polishing.solvers.quadratic`, with the speeds as the chain.
 
     Attributes:
-        place_rows: the geometric rows, in their order.
+        place_rows: geometric rows, in order.
         n, n_path: variables, and those that move the path.
-        speeds: place of the squared speeds among the variables.
+        speeds: slice of the squared speeds among the variables.
         total: duration of the iterate [s].
         rows: (points, kinds) values of the timing's rows less their bounds, unscaled.
-        geometry: (geometric rows,) what they lack.
+        geometry: (geometric rows,) violations.
     """
 
     def __init__(
@@ -367,14 +377,14 @@ class PathTimingProgram:
         required: Mapping[Row, float],
         carry: PlacedCarry,
     ) -> None:
-        """Form it.
+        """Form the program.
 
         Args:
             values: at the iterate.
             x: (n_var,) decision vector of the iterate, the force limit last.
             squared: (intervals + 1,) its u'^2.
-            required: geometric rows, and what each has to keep.
-            carry: the iterate on places.
+            required: geometric rows and their required values.
+            carry: the iterate at places of the path.
         """
         self._grid, self._values, self._x, self._force = grid, values, x, float(x[-1])
         self._spread, self.n_path = grid.spread, grid.spread.shape[1]
@@ -397,7 +407,8 @@ class PathTimingProgram:
         self._speeds(squared)
 
     def _still(self, values: IntervalValues) -> None:
-        """Rows of what rest uses, after the geometric ones; they bend little."""
+        """Append rows of the utilisation at rest to the geometric ones; their curvature is
+        small."""
         share, slope = values.at_rest(self._force)
         near = np.flatnonzero(share > NEARLY_USED)
         begins = 2 * (near // (len(share) // self._grid.intervals))
@@ -406,7 +417,8 @@ class PathTimingProgram:
         self._geometry_slope = np.concatenate([self._geometry_slope, by_path])
 
     def _speeds(self, w: Array) -> None:
-        """Duration with its derivatives, and what u'' and u'^2 of each point are by omega."""
+        """Set the duration with its derivatives, and the slopes of u'' and u'^2 at each point by
+        omega."""
         n = self._grid.intervals
         root = np.sqrt(w)
         pair = root[:-1] + root[1:]
@@ -433,7 +445,8 @@ class PathTimingProgram:
         self._column = np.clip(np.repeat(np.arange(n), 2) - 1, 0, n - 3)
 
     def geometry_after(self, d: Array) -> Array:
-        """(geometric rows,) what they lack after a step, beyond what their slopes foretell."""
+        """Compute the nonlinearity (geometric rows,) of a step: violations after it less their
+        linear prediction."""
         x, step = self._x.copy(), d[: self.n_path]
         x[: len(self._spread)] += self._spread @ step
         lacking = self._required - self._places.values(x)
@@ -443,14 +456,14 @@ class PathTimingProgram:
         return beyond
 
     def near_rows(self) -> NDArray[np.bool_]:
-        """(points, kinds) rows that the iterate uses far."""
+        """Return (points, kinds) whether the iterate nearly uses a limit."""
         rest = min(self._grid.workcell.task.force_limit[0] / self._force, 1.0)
         for_forces = (1.0 - NEARLY_USED_FORCE) * (rest - 1.0)
         threshold = np.where(self._grid.kinds.is_force, for_forces, NEARLY_USED - 1.0)
         return np.asarray(self.rows > threshold)
 
     def predicted(self, d: Array) -> Array:
-        """(points, kinds) linear prediction of the timing's rows after a step."""
+        """Predict the timing's rows (points, kinds) after a step, linearly."""
         omega = d[self.speeds]
         moved = self._grid.moved @ d[: self.n_path]
         beside = np.stack([omega[self._column], omega[self._column + 1]], axis=1)
@@ -459,10 +472,10 @@ class PathTimingProgram:
         return np.asarray(self.rows + change @ self._grid.kinds.mix.T / self.scale)
 
     def linear(self, chosen: NDArray[np.bool_], bent: Array | float = 0.0) -> LinearisedRows:
-        """Chosen rows of the timing (points, kinds), and all others.
+        """Linearise chosen rows of the timing (points, kinds), and all geometric rows.
 
         Args:
-            bent: (geometric rows,) what these lack after a step beyond what is foretold.
+            bent: (geometric rows,) nonlinearity to correct for.
         """
         self._learn(*np.nonzero(chosen & ~self._known))
         point, kind = np.nonzero(chosen)
@@ -481,7 +494,7 @@ class PathTimingProgram:
         return LinearisedRows(A, b, scale, point, kind)
 
     def _learn(self, point: NDArray[np.intp], kind: NDArray[np.intp]) -> None:
-        """Slopes of some of the timing's rows."""
+        """Compute and store slopes of some of the timing's rows."""
         kinds, moving = self._grid.kinds, self._grid.moving
         local = kinds.slopes(self._values.slope, point, kind) / self.scale[kind, None]
         self._by_path[point, kind] = self._grid.by_path(local[:, :moving], point)
@@ -489,11 +502,11 @@ class PathTimingProgram:
         self._known[point, kind] = True
 
     def gradient(self) -> Array:
-        """(n_variables,) of the objective."""
+        """Return the gradient (n_variables,) of the objective."""
         return np.concatenate([np.zeros(self.n_path), self.cost])
 
     def gain(self, d: Array) -> float:
-        """Reduction of the objective that a step promises, as a share of it."""
+        """Return the predicted reduction of a step, as a share of the objective."""
         omega = d[self.speeds]
         bent = self.cost_diagonal @ omega**2 / 2.0 + self.cost_beside @ (omega[:-1] * omega[1:])
         return -float(self.cost @ omega + bent)
@@ -501,7 +514,7 @@ class PathTimingProgram:
     def curvature(
         self, linear: LinearisedRows | None = None, rows: Array | None = None
     ) -> BorderedMatrix:
-        """Second derivatives of the duration, or of the Lagrangian with multipliers (rows,) of a
+        """Return the Hessian of the duration, or of the Lagrangian with multipliers (rows,) of a
         step's rows."""
         n_path, n = self.n_path, len(self.cost)
         corner, beside = np.zeros((n_path, n_path)), np.zeros((n, n_path))
@@ -532,12 +545,12 @@ class PathTimingProgram:
         return BorderedMatrix(corner, beside, diagonal, off)
 
     def residuals(self, bounds: Array, linear: LinearisedRows, multipliers: Array) -> Residuals:
-        """How well the iterate satisfies the optimality conditions with a step's multipliers.
+        """Compute the iterate's optimality residuals with a step's multipliers.
 
         Args:
-            bounds: (n_variables,) multipliers of the path's own bounds, signed.
+            bounds: (n_variables,) signed multipliers of the path's own bounds.
             linear: the step's rows at the iterate.
-            multipliers: (rows,) theirs.
+            multipliers: (rows,) of these rows.
         """
         lagrangian = self.gradient() + linear.A.transpose_times(multipliers) + bounds
         products = multipliers * linear.b

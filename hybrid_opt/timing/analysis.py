@@ -1,5 +1,5 @@
-"""Questions about a trajectory's timing, one function each: the search's timing, drivable ones, the
-margins; and all of them at once, also as the record that `timing/*.json` stores."""
+"""Timings of a trajectory: the search's, drivable ones, margins; and all of them as the record that
+`timing/*.json` stores."""
 
 from __future__ import annotations
 
@@ -42,23 +42,23 @@ from symbolic.path.pieces import same_paths
 from symbolic.records import Workcell
 
 LEAST_FORCE_RATIO = 1.001
-"""Least force limit of the curve, over the force at rest: below, the motion has to creep."""
+"""Least force limit of the curve over the force at rest: below, the motion has to creep."""
 
 
 REST_SPEED = 1e-3
-"""Joint speed over its limit below which an arm counts as standing still."""
+"""Joint speed over its limit below which an arm counts as at rest."""
 
 
 @dataclass(frozen=True)
 class ForceCurve:
-    """Duration of the fastest timing against the limit on the normal forces, on robust ones where
-    the model limits these.
+    """Duration of the fastest timing against the limit on the normal forces, robust ones if the
+    model limits these.
 
     Attributes:
         force: (n,) limits [N].
-        duration: (n,) [s], infinite where there is no timing.
+        duration: (n,) [s], infinite without a timing.
         status: outcome per limit.
-        static_force: largest limited force standing still anywhere on the path [N].
+        static_force: largest limited force at rest anywhere on the path [N].
         unlimited_force: largest limited force of the fastest timing without force limit [N].
     """
 
@@ -70,9 +70,11 @@ class ForceCurve:
 
 
 def check_search_timing(model: TimingModel, x: Array) -> Timing:
-    """The search's own timing (the task's time law) held against every limit of the workcell:
-    status `OK` or `EXCEEDED`, also for a carry that starts or ends at speed, or why the path itself
-    fails; with every limit's use.
+    """Check the search's own timing (the task's time law) against every limit of the workcell.
+
+    Returns:
+        Status `OK` or `EXCEEDED`, the latter also for a carry that starts or ends at speed, or the
+        path's own error; with the utilisation of every limit.
 
     Raises:
         SettingsError: x does not fit the workcell.
@@ -93,7 +95,8 @@ def check_search_timing(model: TimingModel, x: Array) -> Timing:
 
 
 def _jump(model: TimingModel, carry: Carry) -> Place | None:
-    """The joint that moves fastest, for its limit, at the carry's ends; None where all rest."""
+    """Return the joint with the largest relative speed at the carry's ends; None if all are at
+    rest."""
     limit = model.workcell.of_joints("velocity_max")
     ends = np.abs(carry.side_by_side("q_rate")[[0, -1]]) / limit
     if float(ends.max()) < REST_SPEED:
@@ -125,23 +128,21 @@ def drivable_timing(model: TimingModel, x: Array) -> Timing:
 
 
 def closest_to_reference_timing(model: TimingModel, x: Array) -> Timing:
-    """The timing from rest to rest that keeps to the reference speeds as far as limits allow.
-
-    It is the fastest of those that never exceed the task's reference speeds, so that the box moves
-    at a reference speed wherever no limit forbids it.
-    """
+    """Compute the fastest timing from rest to rest that never exceeds the task's reference speeds,
+    so that the box moves at a reference speed wherever limits allow it."""
     return time_path(model, x, TimingLimits(reference_speed=True))
 
 
 def duration_against_force_limit(
     model: TimingModel, x: Array, points: int = 12, on_timing: Callable[[], None] = lambda: None
 ) -> ForceCurve:
-    """Durations of the fastest timings between the least force that holds and the unlimited one.
+    """Compute durations of the fastest timings between the least feasible force and the unlimited
+    one.
 
-    The limits are spaced evenly in the logarithm of what they leave above the force at rest.
+    The limits are spaced evenly in the logarithm of the force above rest.
 
     Args:
-        told: called after every point.
+        on_timing: called after every point.
 
     Raises:
         SettingsError: fewer than two points.
@@ -171,23 +172,23 @@ def duration_against_force_limit(
 
 
 def _peak_force(model: TimingModel, carry: Carry) -> float:
-    """The largest of the forces that the model limits [N]."""
+    """Return the largest force that the model limits [N]."""
     return float(limited_force(carry, model.workcell, model.drive_limits(1.0)).max())
 
 
 @dataclass(frozen=True)
 class TimedTrajectory:
-    """A trajectory under the search's timing and under timings that robots can drive.
+    """A trajectory under the search's timing and under drivable timings.
 
     Attributes:
         workcell: the cell.
         nominal_duration: at the reference speeds without ramps [s].
-        timings: by name: the search's first (`check_search_timing`), then the drivable ones.
+        timings: by name: the search's first (`check_search_timing`), then drivable ones.
         jerk: of a drivable carry within its force limit and the cell's limits on jerk; None under
             other time laws, and without such limits.
-        margins: how wrong the cell's description may be under the timing closest to the reference
+        margins: largest errors of the cell's description under the timing closest to the reference
             speeds; empty without that timing.
-        curve: duration against force limit, None where it was not asked for.
+        curve: duration against force limit, None if not computed.
     """
 
     workcell: Workcell
@@ -209,11 +210,12 @@ def time_trajectory(
     """Time one decision vector (n_var,) in every way.
 
     Args:
-        model: of the cell that robots drive.
+        model: of the driven cell.
         force_limit: normal force [N] of a force-limited timing, None for no such timing.
         curve_points: points of the curve of duration against force limit, None for no curve.
         own: of the cell that x was found in, None for the same.
-        progress: True for a bar, or what takes timings done and in all, the margins as one.
+        progress: True for a bar, or a function of finished and all timings, with the margins as
+            one.
 
     Raises:
         SettingsError: x does not fit the workcell, or the limit is not a positive force.
@@ -255,19 +257,19 @@ def time_trajectory(
 
 @dataclass(frozen=True)
 class StoredTiming:
-    """One `Timing`. What follows `use` is that of its carry, None without one.
+    """One stored `Timing`. Fields after `use` belong to its carry, None without one.
 
     Attributes:
-        status, reason, iterations, slowed, seconds: as there.
+        status, reason, iterations, slowed, seconds: as of `Timing`.
         duration: [s], NaN without a timing.
         use: by limit.
         objectives: (2,) largest normal forces over the reference forces.
         payload_limit: [kg].
         peak_normal_force, peak_resultant_force: (2,) [N].
-        least_friction_margin: (2,) least share of the friction that is left.
+        least_friction_margin: (2,) least unused share of the friction.
         peak_pressure_shift: (2,) [m].
         peak_point_moment_residual, peak_moment_residual: [N m].
-        joint_use: (n joints,) largest use of each joint by limit, both arms in order.
+        joint_use: (n joints,) largest utilisation of each joint by limit, both arms in order.
     """
 
     status: TimingStatus
@@ -290,12 +292,12 @@ class StoredTiming:
 
 @dataclass(frozen=True)
 class StoredJerk:
-    """A carry's timing within limits on jerk, see `hybrid_opt.timing.records.JerkTiming`.
+    """A stored timing within limits on jerk; see `hybrid_opt.timing.records.JerkTiming`.
 
     Attributes:
         status: of its timing.
         duration: [s].
-        without: the same without limits on jerk [s]; both NaN where there is no timing.
+        without: duration without limits on jerk [s]; both NaN without a timing.
         joint_use, payload_use: largest jerks over their limits.
     """
 
@@ -308,14 +310,14 @@ class StoredJerk:
 
 @dataclass(frozen=True)
 class TimingDocument:
-    """All that timing says of one trajectory, see `TimedTrajectory`.
+    """All timings of one trajectory; see `TimedTrajectory`.
 
     Attributes:
         nominal_duration: at the reference speeds without ramps [s].
         timings: by name, the search's first.
-        margins: how wrong the cell's description may be.
-        force_curve: duration against force limit, None where it was not asked for.
-        jerk: what the cell's limits on jerk make of a drivable carry, None without.
+        margins: largest errors of the cell's description.
+        force_curve: duration against force limit, None if not computed.
+        jerk: timing of a drivable carry within the cell's limits on jerk, None without.
     """
 
     nominal_duration: Figure
@@ -326,7 +328,7 @@ class TimingDocument:
 
 
 def timing_document(timed: TimedTrajectory) -> TimingDocument:
-    """The record of a timed trajectory."""
+    """Return the record of a timed trajectory."""
     jerk = timed.jerk
     timings = {name: stored_timing(timing) for name, timing in timed.timings.items()}
     found = TimingDocument(timed.nominal_duration, timings, timed.margins, timed.curve)
@@ -347,7 +349,7 @@ def read_timing(path: Path) -> TimingDocument:
 
 
 def stored_timing(timing: Timing) -> StoredTiming:
-    """One timing as it is stored."""
+    """Return the record of one timing."""
     same = ("status", "reason", "duration", "iterations", "slowed", "seconds", "use")
     known = StoredTiming(*(getattr(timing, name) for name in same))
     carry = timing.carry

@@ -1,7 +1,8 @@
-"""Candidates of the time law 'optimal': how their paths are driven, and what no timing can drive.
+"""Candidates of the time law 'optimal': the timing of their paths, and the violations of paths
+without one.
 
-A candidate is a path and a force limit. Its timing is the fastest from rest to rest within that
-force and all limits of robots, payload and contacts (`hybrid_opt.timing.path_timer`).
+A candidate is a path and a force limit. Its timing is the fastest from rest to rest within this
+limit and all limits of robots, payload and contacts (`hybrid_opt.timing.path_timer`).
 """
 
 from __future__ import annotations
@@ -18,36 +19,35 @@ _AT_REST = {"normal force": FORCE_LIMIT, "joint torque": JOINT_TORQUE}
 
 
 class CandidateDriver:
-    """Drives candidates of one workcell, whose time law is 'optimal'.
+    """Times candidates of one workcell with the time law 'optimal'.
 
     Attributes:
-        timer: what times their paths.
-        robust: whether their force limits hold in every case of the workcell's uncertainty.
+        timer: times their paths.
+        robust: whether force limits apply to every case of the workcell's uncertainty.
     """
 
     def __init__(self, timer: PathTimer, threads: int = 1, robust: bool = False) -> None:
-        """Drive with a timer, and so many threads that share a batch of candidates."""
+        """Drive with a timer; so many threads share a batch of candidates."""
         self._task = timer.workcell.task
         self._threads = threads
         self.timer, self.robust = timer, robust
         self._last: tuple[bytes, PathTiming, dict[str, Array]] | None = None
 
     def limits(self, force: float) -> TimingLimits:
-        """Limits of a candidate whose force limit this is [N]."""
+        """Return the limits of a candidate with a force limit [N]."""
         return TimingLimits(force=max(force, 1e-9), robust=self.robust)
 
     def outputs(self, candidate: NumericFunction, x: Array) -> dict[str, Array]:
-        """Every per-sample output of decision vectors (n, n_var), driven.
+        """Compute every per-sample output of decision vectors (n, n_var) under their timings.
 
         Args:
             candidate: compiled `symbolic.functions.candidate_function`.
-            x: decision vectors. A path without a timing stands still, its samples one second apart
-                in all.
+            x: decision vectors. A path without a timing stands still for one second.
 
         Returns:
-            Its outputs; peak_force (n, 2), the largest normal forces [N]; drive_violation
-            (n, len(DRIVE_CONSTRAINTS)), and drive_position (n,), its path parameter, NaN without
-            one. With robust limits robust_force (n, 2) as well, the largest in every case of the
+            Its outputs; peak_force (n, 2), the largest normal forces [N]; drive_violation (n,
+            len(DRIVE_CONSTRAINTS)), and drive_position (n,), its path parameter, NaN without one.
+            With robust limits robust_force (n, 2) as well, the largest in every case of the
             workcell's uncertainty.
         """
         timings = self.timings(x)
@@ -81,15 +81,15 @@ class CandidateDriver:
         return outputs | {"drive_violation": violation, "drive_position": position}
 
     def timings(self, x: Array) -> list[PathTiming]:
-        """The timing of every decision vector (n, n_var)."""
+        """Compute the timing of every decision vector (n, n_var)."""
         if len(x) == 1:
             return [self.time_candidate(x[0])[0]]
         limits = [self.limits(float(force)) for force in x[:, -1]]
         return self.timer.time_all(x[:, : self._task.n_path], limits)
 
     def time_candidate(self, x: Array) -> tuple[PathTiming, dict[str, Array]]:
-        """The timing of one decision vector (n_var,), and `path_limits` of its path. The last ones
-        are kept: a polish asks for those of a carry several times in a row."""
+        """Compute the timing of one decision vector (n_var,), and `path_limits` of its path. The
+        last result is cached: a polish needs it several times in a row."""
         key = x.tobytes()
         if self._last is None or self._last[0] != key:
             path = np.ascontiguousarray(x[None, : self._task.n_path], dtype=float)
@@ -100,7 +100,8 @@ class CandidateDriver:
 
 
 def _speed_profile_at(timing: PathTiming, u: Array) -> tuple[Array, Array, Array]:
-    """Time, u' and u'' at path parameters u; u'' is that of the interval that begins there."""
+    """Return time, u' and u'' at path parameters u; u'' is that of the interval that begins
+    there."""
     if not np.isfinite(timing.duration):
         return u, np.zeros_like(u), np.zeros_like(u)
     squared = timing.grid_speed**2

@@ -1,4 +1,4 @@
-"""Records of the timing: limits, statuses, places on the path, and a timing itself."""
+"""Records of the timing: limits, statuses, places on the path, and timings."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from symbolic.records import Workcell
 
 
 class TimingStatus(StrEnum):
-    """The outcome of timing a path."""
+    """Outcome of timing a path."""
 
     OK = "ok"
     EXCEEDED = "limits exceeded"
@@ -31,14 +31,14 @@ class TimingStatus(StrEnum):
 
 @dataclass(frozen=True)
 class Place:
-    """Where on the path something happens.
+    """Limit and position on the path of an event.
 
     Attributes:
-        constraint: which limit, as `hybrid_opt.timing.limits.limit_ratios` names it, or a condition
-            of the path itself.
+        constraint: limit, as `hybrid_opt.timing.limits.limit_ratios` names it, or condition of the
+            path itself.
         robot: name of the robot, '' for a limit of the box.
-        joint: name of the joint, '' where none is concerned.
-        sample: index of the sample, on the grid of whoever reports it.
+        joint: name of the joint, '' without one.
+        sample: index of the sample, on the reporting function's grid.
         parameter: path parameter u in [0, 1].
     """
 
@@ -55,15 +55,15 @@ class Place:
 
 @dataclass(frozen=True)
 class TimingLimits:
-    """Limits beyond the workcell's own speeds and accelerations, which always hold.
+    """Limits in addition to the workcell's speeds and accelerations, which always apply.
 
     Attributes:
         force: largest normal force of each robot [N], or None for no limit.
         torque: whether joint torques (arm and contact wrench together) are limited.
         pressure: whether the centres of pressure have to stay within their patches.
         reference_speed: whether the box stays at or below the task's reference speeds.
-        robust: whether the force limit holds in every case of the workcell's uncertainty, the first
-            arm leading (`hybrid_opt.robust`), and not only for the planned forces.
+        robust: whether the force limit applies to every case of the workcell's uncertainty, the
+            first arm leading (`hybrid_opt.robust`), not only to the planned forces.
     """
 
     force: float | None = None
@@ -84,15 +84,15 @@ class JerkLimits:
     """Largest jerks.
 
     Attributes:
-        joints: (all joints,) both arms' in order [rad/s^3], infinite where there is no limit.
-        payload: of the box's frame [m/s^3], likewise.
+        joints: (all joints,) of both arms in order [rad/s^3], infinite without a limit.
+        payload: of the box frame [m/s^3], likewise.
     """
 
     joints: Array
     payload: float = float("inf")
 
     def __post_init__(self) -> None:
-        """Check them.
+        """Check the limits.
 
         Raises:
             SettingsError: a limit is not positive.
@@ -102,7 +102,7 @@ class JerkLimits:
 
     @classmethod
     def from_workcell(cls, workcell: Workcell) -> JerkLimits | None:
-        """Limits that a workcell states, None where it states none."""
+        """Return the limits in a workcell's file, None without any."""
         joints = [
             np.full(len(robot.torque_max), np.inf) if robot.jerk_max is None else robot.jerk_max
             for robot in workcell.robots
@@ -114,7 +114,7 @@ class JerkLimits:
 
 @dataclass(frozen=True)
 class Utilisation:
-    """How far a limit is used: the largest value over its limit, and where."""
+    """Largest value of a limited quantity over its limit, and its place."""
 
     ratio: Figure
     place: Place
@@ -122,20 +122,20 @@ class Utilisation:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Timing(Displayable):
-    """A timing of a path, or why there is none.
+    """A timing of a path, or the reason why there is none.
 
     Attributes:
         status: the outcome.
         reason: one sentence for people.
-        place: where it fails, or the most used limit.
-        carry: the carry under this timing, re-sampled; None without a timing.
+        place: of the failure, or of the most used limit.
+        carry: the carry under this timing, resampled; None without a timing.
         use: largest value over its limit, by constraint, recomputed on `carry`.
         grid_speed: (intervals + 1,) path speed u' at the grid points [1/s]; empty without a timing,
-            and where u'' is not constant between them.
-        iterations: linear problems solved.
-        slowed: uniform factor on the path speed that made recomputed limits hold, 1 normally.
+            and if u'' is not constant between them.
+        iterations: of the timing method.
+        slowed: uniform factor on the path speed by which recomputed limits hold, 1 normally.
         seconds: computing time.
-        limits: that it was found for, beyond the workcell's own.
+        limits: limits in addition to the workcell's.
     """
 
     status: TimingStatus
@@ -151,24 +151,24 @@ class Timing(Displayable):
 
     @property
     def ok(self) -> bool:
-        """Whether the timing respects every limit."""
+        """Return True if the timing respects every limit."""
         return self.status is TimingStatus.OK
 
     @property
     def driven(self) -> Carry:
-        """The carry of a timing that was found."""
+        """Return the carry of a timing that exists."""
         assert self.carry is not None, self.reason
         return self.carry
 
     @property
     def duration(self) -> float:
-        """Duration [s], infinite without a timing."""
+        """Return the duration [s], infinite without a timing."""
         return self.carry.duration if self.carry is not None else float("inf")
 
     @property
     def peak_force(self) -> float:
-        """Largest of the normal forces that its limits are about [N], robust ones where these are
-        limited; NaN without a timing."""
+        """Return the largest limited normal force [N], robust if robust forces are limited; NaN
+        without a timing."""
         if self.carry is None:
             return float("nan")
         if self.limits.force is None:
@@ -178,10 +178,10 @@ class Timing(Displayable):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class JerkTiming:
-    """A timing within jerk limits, and what they cost.
+    """A timing within jerk limits, and their cost.
 
     Attributes:
-        timing: with it.
+        timing: within them.
         limits: the jerk limits.
         jerk_use: largest joint jerk and payload jerk over their limits.
         without: duration of the fastest timing without jerk limits [s].
@@ -196,7 +196,7 @@ class JerkTiming:
 
     @property
     def cost(self) -> float:
-        """Share of the duration that the jerk limits add."""
+        """Return the share of the duration that the jerk limits add."""
         return self.timing.duration / self.without - 1.0
 
     def __repr__(self) -> str:

@@ -1,14 +1,14 @@
-"""How much a carry could bear: heavier payloads, less friction, wrong centres of mass; and what
-limits cost a fastest timing.
+"""Margins of a carry: heavier payloads, less friction, wrong centres of mass; and the cost of
+limits in a fastest timing.
 
-Margins judge a `Carry`, under the search's timing or under a drivable one.
+Margins apply to a `Carry`, under the search's timing or under a drivable one.
 
-A timing is squared path speeds s at grid points. To first order the fastest one near it is a linear
-program: least slope of the duration times ds, within what is left of every limit that s nearly
-uses. Where a number of the cell makes a ratio of a limited quantity over its limit greater by dr at
-the same speeds, that much less is left, and the program says what it costs: dr times the limit's
-multiplier, and where limits rule together, as both arms' of a symmetric cell, what the directional
-derivative is (the envelope theorem). Neither the timing nor what it uses is found again.
+A timing is a vector s of squared path speeds at grid points. To first order the fastest timing near
+it is a linear program: minimise the slope of the duration times ds, within the slack of every limit
+that s nearly uses. Where a parameter of the cell raises the ratio of a quantity to its limit by dr
+at the same speeds, the slack falls by dr. The program gives the cost: dr times the limit's
+multiplier, and where limits are active together, as for both arms of a symmetric cell, the
+directional derivative (the envelope theorem). Neither the timing nor its utilisation is recomputed.
 """
 
 from __future__ import annotations
@@ -36,22 +36,22 @@ KILOGRAM_FORCE = 9.80665
 """[N] per kgf."""
 
 SCAN_STEPS = 16
-"""Steps of the scan that brackets where a carry fails."""
+"""Steps of the scan that brackets a carry's failure."""
 
 MARGIN_BISECTIONS = 20
 LEAST_FRICTION_SHARE = 0.02
-"""The scan of friction ends at this share of the nominal coefficient."""
+"""Share of the nominal friction coefficient at the end of its scan."""
 
 
 @dataclass(frozen=True)
 class PayloadSensitivity:
-    """Forces against payload mass (paper Figure 12); they grow in proportion to it.
+    """Forces against payload mass (paper Figure 12); they are proportional to it.
 
     Attributes:
         mass: the workcell's payload [kg].
         resultant: (2,) largest |f_i| of each robot at that mass [N].
         mass_by_resultant: (2,) payload at which each robot's |f_i| reaches its reference force
-            [kg]; the paper's reading.
+            [kg]; the paper's definition.
     """
 
     mass: float
@@ -60,25 +60,25 @@ class PayloadSensitivity:
 
     @property
     def payload_limit(self) -> float:
-        """Least payload at which a robot reaches its reference force with |f_i| [kg]."""
+        """Return the least payload at which a robot reaches its reference force with |f_i| [kg]."""
         return float(self.mass_by_resultant.min())
 
     def force_at(self, masses: Array) -> Array:
-        """(n, 2) largest |f_i| [N] at payload masses (n,) [kg]."""
+        """Return the largest |f_i| (n, 2) [N] at payload masses (n,) [kg]."""
         forces: Array = np.asarray(masses)[:, None] / self.mass * self.resultant
         return forces
 
 
 @dataclass(frozen=True)
 class Margin:
-    """How wrong one assumption may be before the carry fails.
+    """Largest error of one assumption that a carry tolerates.
 
     Attributes:
-        quantity: what is wrong.
+        quantity: name of the assumption.
         unit: of the values, '' for a pure number.
-        nominal: what the workcell assumes.
-        limit: the last value at which the carry holds, found to a 1e-7 of the scanned range.
-        fails: what fails beyond it, '' where nothing does within the scanned range.
+        nominal: value in the workcell.
+        limit: last value at which the carry holds, within 1e-7 of the scanned range.
+        fails: failure beyond it, '' without one in the scanned range.
     """
 
     quantity: str
@@ -89,18 +89,18 @@ class Margin:
 
 
 def payload_sensitivity(carry: Carry) -> PayloadSensitivity:
-    """Forces against payload mass for an unchanged timing."""
+    """Return forces against payload mass for an unchanged timing."""
     cell, resultant = carry.workcell, carry.peak_resultant_force
     return PayloadSensitivity(cell.payload.mass, resultant, mass_at_reference(cell, resultant))
 
 
 def robustness_margins(model: TimingModel, carry: Carry) -> tuple[Margin, ...]:
-    """How far friction, centre of mass and patch size may be off before the carry fails.
+    """Compute the largest errors of friction, centre of mass and patch size that a carry tolerates.
 
-    The forces are allocated anew for the changed values (the robots squeeze as hard as it takes);
-    the carry fails when a normal force exceeds its reference force, a centre of pressure leaves
-    its patch, or a joint torque exceeds its maximum. Motion and timing stay as they are. Pads that
-    press evenly have a margin until a rim lifts off in place of one of the patch.
+    The forces are allocated anew for the changed values (the robots squeeze as hard as necessary).
+    The carry fails if a normal force exceeds its reference force, a centre of pressure leaves its
+    patch, or a joint torque exceeds its maximum. Motion and timing stay the same. Pads with uniform
+    pressure have a margin until a rim lifts off instead of one of the patch.
     """
     workcell = model.workcell
     payload, contacts, task = workcell.payload, workcell.contacts, workcell.task
@@ -159,8 +159,8 @@ def robustness_margins(model: TimingModel, carry: Carry) -> tuple[Margin, ...]:
 
 
 def _even_margins(model: TimingModel, carry: Carry) -> list[Margin]:
-    """The shift of the pressure that has to be free before an elastic pad lifts off at a rim is the
-    largest one of the carry."""
+    """Return the margins until an elastic pad lifts off at a rim: the largest shift of the pressure
+    on the carry."""
     workcell = model.workcell
     if not presses_evenly(workcell):
         return []
@@ -182,9 +182,9 @@ def _even_margins(model: TimingModel, carry: Carry) -> list[Margin]:
 
 
 def _largest_feasible_change(failure: Callable[[float], str], end: float) -> tuple[float, str]:
-    """Largest change in [0, end] up to which nothing fails, and what fails beyond it.
+    """Return the largest change in [0, end] without failure, and the failure beyond it.
 
-    A scan brackets the first failure, so that a carry that fails and recovers is not misjudged.
+    A scan brackets the first failure, so that a later recovery does not hide it.
     """
     fails = failure(0.0)
     if fails:
@@ -202,23 +202,24 @@ def _largest_feasible_change(failure: Callable[[float], str], end: float) -> tup
 
 
 LINEARISED_UTILISATION = 0.97
-"""Share of a limit from which on a change of the timing could exceed it."""
+"""Utilisation from which on a change of the timing may exceed a limit."""
 
 TRUST_RADIUS = 0.02
-"""Share of every squared speed that a timing nearby may have more or less."""
+"""Largest relative change of every squared speed in a nearby timing."""
 
 OPTIMALITY_GAP = 5e-3
-"""Share of the duration that a fastest timing may have left to gain."""
+"""Relative reduction of the duration up to which a timing counts as the fastest."""
 
 EXTRAPOLATED_CHANGE, NEGLIGIBLE_CHANGE = 1e-4, 1e-10
-"""Share of a limit by which changes are extrapolated, and from which on they count as any."""
+"""Largest change of a ratio in a program, by scaling, and changes that count as zero [share of a
+limit]."""
 
 DIFFERENCE_STEP = 1e-6
-"""Share of the largest value by which ratios are differenced."""
+"""Step of finite differences, relative to the largest value."""
 
 
 class TimingSensitivity:
-    """Timings near the fastest one of a path, as a linear program.
+    """Linear program of timings near the fastest one of a path.
 
     Attributes:
         speeds: of the fastest one.
@@ -265,8 +266,14 @@ class TimingSensitivity:
             raise SettingsError("the timing is not the fastest within its limits; time it again")
 
     def changes(self, low: dict[str, Array], high: dict[str, Array]) -> tuple[float, float]:
-        """What the duration changes by towards the higher, and towards the lower of two cells as
-        far to either side, whose ratios at `speeds` are known [s]; NaN where no timing is near."""
+        """Compute the changes of the duration [s] towards two cells.
+
+        Args:
+            low, high: ratios at `speeds` of two cells at the same distance below and above.
+
+        Returns:
+            Towards the higher and towards the lower cell; NaN without a timing nearby.
+        """
         more = (self._select_used(high) - self._select_used(low)) / 2.0
         largest = float(np.abs(more).max(initial=0.0))
         if largest < NEGLIGIBLE_CHANGE:
@@ -283,7 +290,7 @@ class TimingSensitivity:
         return np.concatenate([ratios[name][places] for name, places in self._used.items()])
 
     def _least_change(self, left: Array) -> float:
-        """The least change of the duration [s] with what is `left` (m,) of the limits."""
+        """Return the least change of the duration [s] with slacks (m,) of the limits."""
         found = linprog(
             self._slope,
             A_ub=self._matrix,

@@ -1,1 +1,2 @@
-"""The polish's smooth problem as expressions: samples, places, passages, and driven points."""
+"""Smooth model of the polish as expressions: samples, places, separating axes, and driven
+points."""

@@ -1,4 +1,5 @@
-"""What the polish of drivable carries asks at a point of a driven path, with exact derivatives.
+"""Limited quantities at a point of a driven path, with exact derivatives, for the polish of
+drivable carries.
 
 Path and timing are variables together: at a point of the path every limited quantity follows from
 the box pose, its first and second derivative along the path, the joints that hold the box there,
@@ -32,17 +33,17 @@ DRIVEN_FIRST, DRIVEN_SECOND = "driven_first", "driven_second"
 """Names of the functions."""
 
 TANGENTIAL_SMOOTHING = 1e-9
-"""Keeps the tangential force's magnitude smooth at zero [N]."""
+"""Smooths the tangential force's magnitude at zero [N]."""
 
 
 @dataclass(frozen=True)
 class DrivenLayout(BlockLayout):
-    """Where the quantities at a driven point lie in their vector.
+    """Layout of the quantities at a driven point in their vector.
 
     Attributes:
         pose: entries of the extended pose.
-        by_program: whether a program finds the forces: then the load stands for them, and torque
-            and pressure are left out.
+        by_program: whether a program finds the forces: then the vector has the load in their place,
+            and neither torque nor pressure.
     """
 
     pose: int
@@ -50,22 +51,30 @@ class DrivenLayout(BlockLayout):
 
     @property
     def variables(self) -> int:
-        """Extended pose and both derivatives, the joints, u'' and u'^2."""
+        """Return the number of variables: extended pose and both derivatives, the joints, u'' and
+        u'^2."""
         return 3 * self.pose + self.joints + 2
 
 
 def driven_layout(workcell: Workcell) -> DrivenLayout:
-    """The layout for a workcell's arms.
+    """Return the layout for a workcell's arms.
 
     Blocks, in order:
-    speed (joints + 2): squared speeds over their squared limits: joints, payload, its turning.
+
+    speed (joints + 2): squared speeds over their squared limits: joints, payload, its rotation.
+
     acceleration (joints): of the joints over their limits, signed.
+
     cone (2): squared length of the payload's acceleration and angular acceleration, likewise.
-    force (2): normal component and tangential magnitude of the required force, of which the
-    paper's normal forces are made (`planned_branches`), or both normal forces of soft fingers [N].
+
+    force (2): normal component and tangential magnitude of the required force, from which the
+    paper's normal forces follow (`planned_branches`), or both normal forces of soft fingers [N].
+
     load (6): force and moment that the pads have to balance, as
     `symbolic.contact.grasp.grasp_wrenches` takes it [N, N m].
+
     torque (joints): over their limits, signed.
+
     pressure (2): shifts of the centres of pressure over their patches' radii.
     """
     j, closed = limit_layout(workcell).joints, int(workcell.has_closed_form)
@@ -75,8 +84,8 @@ def driven_layout(workcell: Workcell) -> DrivenLayout:
 
 
 def planned_branches(workcell: Workcell) -> Array:
-    """(2, branches, quantities) both planned normal forces' branches as sums of a point's
-    quantities; none where a program finds them."""
+    """Return the branches of both planned normal forces as sums of a point's quantities (2,
+    branches, quantities); none if a program finds the forces."""
     layout, own = driven_layout(workcell), force_branches(workcell)
     if layout.by_program:
         return np.zeros((2, 0, layout.size))
@@ -86,12 +95,13 @@ def planned_branches(workcell: Workcell) -> Array:
 
 
 def driven_functions(model: CellModel) -> dict[str, ca.Function]:
-    """Limited quantities at a driven point, with y = (pose, first, second, q_1, q_2, a, w), a = u''
-    and w = u'^2:
+    """Return limited quantities at a driven point, with y = (pose, first, second, q_1, q_2, a, w),
+    a = u'' and w = u'^2:
 
-    driven_first: y's parts -> value (size,), slope (size, variables).
-    driven_second: y's parts, weight (size,), direction (variables,) -> change (variables,): the
-        Hessian of weight . value times the direction.
+    driven_first: parts of y -> value (size,), slope (size, variables).
+
+    driven_second: parts of y, weight (size,), direction (variables,) -> change (variables,): the
+    Hessian of weight . value times the direction.
     """
     layout = driven_layout(model.workcell)
     names = [*PATH_OUTPUTS, "a", "w"]
@@ -115,7 +125,7 @@ def driven_functions(model: CellModel) -> dict[str, ca.Function]:
 
 
 def _value(model: CellModel, inputs: list[ca.SX], detached: Detached) -> ca.SX:
-    """The quantities of `driven_layout`."""
+    """Return the quantities of `driven_layout`."""
     workcell = model.workcell
     limits, joints = limit_layout(workcell), limit_layout(workcell).joints
     *path, a, w = inputs

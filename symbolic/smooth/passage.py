@@ -1,12 +1,11 @@
-"""How the payload passes an obstacle: along one direction, or over the edge between two.
+"""Separating-axis gaps between the payload and an obstacle, and the height of the kink between two.
 
 The clearance of the payload from a box is the largest gap along one of a few directions: the axes
-of both, and those across an edge of each (the separating axis theorem, Gottschalk, Lin and Manocha
-1996). A row that holds one of these gaps is smooth. Where the payload passes an edge, another
-direction separates the two after it than before, and the clearance has a kink between. Rows that
-held the larger of both gaps would tie each place of the path to its side of the edge. So the height
-of the kink is a row of its own: with the gaps g, before and after, and their rates g' along the
-path, both taken at a place near the kink,
+of both, and the cross products of an edge of each (the separating axis theorem, Gottschalk, Lin and
+Manocha 1996). A row with one of these gaps is smooth. Where the payload passes an edge, the
+separating direction changes, and the clearance has a kink. Rows with the larger of both gaps would
+tie each place of the path to its side of the edge. So the height of the kink is a row of its own:
+with the gaps g, before and after, and their rates g' along the path, both at a place near the kink,
 
     height = (g_after' g_before - g_before' g_after) / (g_after' - g_before'),
 
@@ -30,7 +29,8 @@ GAPS = "gaps"
 """Name of `gap_function`."""
 
 PARALLEL_SINE = 0.1
-"""Sine of the angle between two edges below which no direction across both is looked at."""
+"""Sine of the angle between two edges below which their cross product is no separating
+direction."""
 
 PARALLEL_GAP = -1e3
 """Gap along such a direction: it never is the largest [m]."""
@@ -41,7 +41,8 @@ DIRECTION_NUMBERS = 12
 
 
 def _directions() -> Array:
-    """(DIRECTIONS, DIRECTION_NUMBERS) shares of the axes that make up each, see `direction`."""
+    """Return coefficients (SEPARATING_DIRECTIONS, DIRECTION_NUMBERS) of the axes; see
+    `direction`."""
     found = []
     for first, axes in ((0, 1), (3, 1), (6, 3)):
         for k in range(3):
@@ -59,12 +60,13 @@ def _directions() -> Array:
 _SHARES = _directions()
 
 SEPARATING_DIRECTIONS = len(_SHARES)
-"""Both ways along three axes of the obstacle and three of the payload, and across each edge of one
-and each of the other: of two boxes that are apart, one of these separates them."""
+"""Both signs of three axes of the obstacle, three of the payload, and the cross products of each
+edge of one and each of the other: one of these separates two disjoint boxes."""
 
 
 def direction_numbers(obstacle: Array, k: int) -> Array:
-    """(DIRECTION_NUMBERS,) of direction k from an obstacle (BOX_NUMBERS,), for `direction`."""
+    """Return the parameters (DIRECTION_NUMBERS,) of direction k from an obstacle (BOX_NUMBERS,),
+    for `direction`."""
     along_obstacle, along_payload, edge, other = _SHARES[k].reshape(4, 3)
     rotation = obstacle[:9].reshape(3, 3)
     turned = rotation @ along_obstacle, rotation @ edge
@@ -72,8 +74,8 @@ def direction_numbers(obstacle: Array, k: int) -> Array:
 
 
 def direction(place: PathPointSymbols, numbers: ca.SX) -> ca.SX:
-    """(3,) not normalised: the sum of a fixed vector, one of the payload, and the product of a
-    fixed edge and one of the payload. All but one are zero.
+    """Return a direction (3,), not normalised: the sum of a fixed vector, one of the payload, and
+    the cross product of a fixed edge and one of the payload. All but one are zero.
 
     Args:
         numbers: (DIRECTION_NUMBERS,) these four, two in the world and two in the payload's axes.
@@ -84,7 +86,7 @@ def direction(place: PathPointSymbols, numbers: ca.SX) -> ca.SX:
 
 
 def gap(place: PathPointSymbols, obstacle: ca.SX, numbers: ca.SX) -> ca.SX:
-    """The gap along a direction, its kinks rounded [m]."""
+    """Return the gap along a direction, with rounded kinks [m]."""
     n = direction(place, numbers)
     return place.scene.separation(obstacle, n / ca.norm_2(n))
 
@@ -100,26 +102,26 @@ class SeparatingAxisGap(PathConstraint):
 
     @property
     def family(self) -> str:
-        """All pairs and directions."""
+        """Return the family of all pairs and directions."""
         return "separation"
 
     def expression(self, place: PathPointSymbols, numbers: ca.SX) -> ca.SX:
-        """The gap."""
+        """Return the gap."""
         return gap(place, numbers[:BOX_NUMBERS], numbers[BOX_NUMBERS:])
 
     def count(self, place: PathPointSymbols) -> int:
-        """Numbers of the obstacle and of the direction."""
+        """Count the parameters of the obstacle and of the direction."""
         return BOX_NUMBERS + DIRECTION_NUMBERS
 
     def numbers(self, place: PathPointSymbols) -> Array:
-        """The obstacle, and the direction."""
+        """Return the parameters of the obstacle and of the direction."""
         obstacle = place.obstacle(self.pair)
         return np.concatenate([obstacle, direction_numbers(obstacle, self.direction)])
 
 
 @dataclass(frozen=True, order=True)
 class AxisSwitchGap(PathConstraint):
-    """Height of the kink from one direction of a separable pair to another [m]."""
+    """Height of the kink where the separating direction of a pair changes [m]."""
 
     pair: int
     before: int
@@ -130,11 +132,11 @@ class AxisSwitchGap(PathConstraint):
 
     @property
     def family(self) -> str:
-        """All pairs and directions."""
+        """Return the family of all pairs and directions."""
         return "passing"
 
     def expression(self, place: PathPointSymbols, numbers: ca.SX) -> ca.SX:
-        """Where the lines of both gaps meet."""
+        """Return the height at which the lines of both gaps meet."""
         obstacle, both = (
             numbers[:BOX_NUMBERS],
             ca.vertsplit(numbers[BOX_NUMBERS:], DIRECTION_NUMBERS),
@@ -144,20 +146,23 @@ class AxisSwitchGap(PathConstraint):
         return (rises * before - falls * after) / (rises - falls)
 
     def count(self, place: PathPointSymbols) -> int:
-        """Numbers of the obstacle and of both directions."""
+        """Count the parameters of the obstacle and of both directions."""
         return BOX_NUMBERS + 2 * DIRECTION_NUMBERS
 
     def numbers(self, place: PathPointSymbols) -> Array:
-        """The obstacle, and both directions."""
+        """Return the parameters of the obstacle and of both directions."""
         obstacle = place.obstacle(self.pair)
         both = [direction_numbers(obstacle, k) for k in (self.before, self.after)]
         return np.concatenate([obstacle, *both])
 
 
 def gap_function(place: PathPointSymbols) -> ca.Function:
-    """pose (6,), obstacle (BOX_NUMBERS,) -> gaps (DIRECTIONS,) along single directions, with their
-    kinks [m]. The largest is positive where the payload, a box, and the obstacle are apart, and
-    never more than their distance then; but for edges that are nearly parallel."""
+    """Return pose (6,), obstacle (BOX_NUMBERS,) -> gaps (SEPARATING_DIRECTIONS,) along single
+    directions, with sharp kinks [m].
+
+    The largest is positive if the payload, a box, and the obstacle are disjoint, and never above
+    their distance then; except for nearly parallel edges.
+    """
     obstacle = ca.SX.sym("obstacle", BOX_NUMBERS)
     rotation = ca.reshape(obstacle[:9], 3, 3).T
     found = []

@@ -1,16 +1,16 @@
-"""Rows at places of the path: what each kind asks for, and how joints follow the box there.
+"""Rows at places of the path: their constraints, and joints that follow the box.
 
-A row holds one value above a required one. The value depends on the box pose, where the payload
-passes an edge (`symbolic.smooth.passage`) also on the pose's rate along the path, and on the joints
-that hold the box there. With the closure F(pose, q) = 0, zero where the joints hold the box at the
-pose, the joints follow the pose by the implicit function, and a row c(pose, q) has the derivatives
+A row is one value above a required one. The value depends on the box pose, where the separating
+direction changes (`symbolic.smooth.passage`) also on the pose's rate along the path, and on the
+joints that hold the box there. With the closure F(pose, q) = 0, the joints follow the pose by the
+implicit function theorem, and a row c(pose, q) has the derivatives
 
     dq/dpose = -F_q^-1 F_pose,     nu = -F_q^-T c_q,     T = [I; dq/dpose],
     grad = T^T c_y,                Hessian = T^T (c_yy + sum_k nu_k F_k,yy) T,     y = (pose, q),
 
-where pose stands for the extended pose and F for as many equations as there are joints: six hold
-the box, one more ties each redundant joint to its value. They hold at a solution of F only: no
-derivative is taken through Newton's steps, so the joints only need to be right, not differentiable.
+where pose is the extended pose and F has as many equations as there are joints: six hold the box,
+one more ties each redundant joint to its value. They hold at a solution of F only: no derivative
+passes through Newton's steps, so the joints have to be accurate, not differentiable.
 """
 
 from __future__ import annotations
@@ -45,25 +45,25 @@ ORDERS: tuple[Order, ...] = ("first", "second")
 Side = Literal["lower", "upper"]
 
 SOLVE_STEPS = 5
-"""Newton steps from the reference joints, which the solver renews in every round."""
+"""Newton steps from the reference joints, which the solver renews in every iteration."""
 
 KINK_WIDTH = 2e-4
-"""Width of the smoothed kinks of clearances [m]; what the smooth bounds fall short is made up for
-by measured distances (`hybrid_opt.polishing.constraints`)."""
+"""Width of the smoothed kinks of clearances [m]; measured distances correct the smooth bounds
+(`hybrid_opt.polishing.constraints`)."""
 
 PARALLEL_WIDTH = 3e-3
-"""Width of the kinks where a face of a box becomes parallel to another [1]: the best carries lie
-in these kinks, and a solver that sees them sharp creeps along."""
+"""Width of the kinks where a face of a box becomes parallel to another [1]: the best carries lie in
+these kinks, and a solver makes little progress along sharp ones."""
 
 
 class PathPointSymbols:
-    """The symbols of one place and what is built from them once.
+    """Symbols of one place, and expressions that are built from them once.
 
     Attributes:
-        model: of the cell's arms and bodies.
+        model: arms and bodies of the cell.
         pose: (6,) of the box [m, rad].
-        rate: (6,) change of the pose with the path parameter.
-        q: both arms' joints, (n,) each [rad].
+        rate: (6,) derivative of the pose by the path parameter.
+        q: joints of both arms, (n,) each [rad].
     """
 
     def __init__(self, model: CellBodies) -> None:
@@ -74,17 +74,17 @@ class PathPointSymbols:
 
     @cached_property
     def rotation(self) -> ca.SX:
-        """(3, 3) of the box in the world."""
+        """Return the rotation (3, 3) of the box in the world."""
         return rotation_matrix(self.model.workcell.task.orientation, self.pose[3:])
 
     @cached_property
     def scene(self) -> Scene:
-        """The bodies, with the kinks of their distances rounded."""
+        """Return the bodies, with rounded kinks of their distances."""
         return self._scene(Softness(KINK_WIDTH, PARALLEL_WIDTH))
 
     @cached_property
     def sharp_scene(self) -> Scene:
-        """The bodies as they are."""
+        """Return the bodies with exact distances."""
         return self._scene(EXACT)
 
     def _scene(self, softness: Softness) -> Scene:
@@ -93,25 +93,25 @@ class PathPointSymbols:
         return Scene(self.model.screen, *at, softness)
 
     def obstacle(self, pair: int) -> Array:
-        """The numbers of the box of a separable pair."""
+        """Return the parameters of the box of a separable pair."""
         geometry = self.model.geometry
         return box_numbers(geometry.bodies[geometry.active[pair].second])
 
     def separable(self) -> tuple[int, ...]:
-        """The active pairs of the payload and an obstacle of one box."""
+        """Return the active pairs of the payload and an obstacle of one box."""
         columns = enumerate(self.model.geometry.columns.tolist())
         return tuple(pair for pair, column in columns if self.scene.separable(column))
 
 
 @dataclass(frozen=True)
 class PathConstraint(ABC):
-    """One kind of row at a place.
+    """One constraint at a place.
 
-    Constraints of one family share their functions and differ by the numbers handed to them.
+    Constraints of one family share their functions and differ by the parameters of these.
 
     Attributes:
-        scale: what the value is divided by, so that 1 matters [m, rad, 1]: a solver that sees
-            metres takes a centimetre for a trifle.
+        scale: divisor of the value, so that 1 is significant [m, rad, 1]: in metres a solver would
+            neglect a centimetre.
         moving: whether the value depends on the rate.
     """
 
@@ -121,33 +121,37 @@ class PathConstraint(ABC):
     @property
     @abstractmethod
     def family(self) -> str:
-        """Name of those that share their functions."""
+        """Return the name of the constraints that share their functions."""
 
     @abstractmethod
     def expression(self, place: PathPointSymbols, numbers: ca.SX) -> ca.SX:
-        """The value, by the numbers (n,) of a member of the family."""
+        """Return the value, by the parameters (n,) of a member of the family."""
 
     def count(self, place: PathPointSymbols) -> int:
-        """How many numbers the family's functions take."""
+        """Count the parameters of the family's functions."""
         return 0
 
     def numbers(self, place: PathPointSymbols) -> Array:
-        """(count,) numbers that distinguish this one from others of its family."""
+        """Return the parameters (count,) of this member."""
         return np.zeros(0)
 
     def arms(self, model: CellBodies) -> tuple[int, ...]:
-        """The arms whose joints the value depends on."""
+        """Return the arms on whose joints the value depends."""
         return ()
 
     def given(self, model: CellBodies) -> dict[str, ca.SX]:
-        """The cell's numbers that the value depends on: by default those of its bodies."""
+        """Return the cell's parameters in the value: by default those of its bodies."""
         return sx_given(model.screen)
 
 
 @dataclass(frozen=True, order=True)
 class Clearance(PathConstraint):
-    """Smooth lower bound of the distance of an active pair [m]. column: among the possible ones,
-    which is the same with other numbers."""
+    """Smooth lower bound of the distance of an active pair [m].
+
+    Attributes:
+        pair: index among the active pairs.
+        column: index among the possible pairs, which does not change with the cell's parameters.
+    """
 
     pair: int
     column: int
@@ -156,15 +160,15 @@ class Clearance(PathConstraint):
 
     @property
     def family(self) -> str:
-        """Every pair is its own."""
+        """Return the family of this pair alone."""
         return f"clearance_{self.column}"
 
     def expression(self, place: PathPointSymbols, numbers: ca.SX) -> ca.SX:
-        """The bound of `symbolic.geometry.clearance`, its kinks rounded."""
+        """Return the bound of `symbolic.geometry.clearance`, with rounded kinks."""
         return place.scene.bound(self.column)
 
     def arms(self, model: CellBodies) -> tuple[int, ...]:
-        """The arms whose links are in the pair."""
+        """Return the arms with links in the pair."""
         geometry = model.geometry
         bodies = geometry.possible[self.column]
         frames = [geometry.bodies[body].frame for body in (bodies.first, bodies.second)]
@@ -183,19 +187,19 @@ class JointLimit(PathConstraint):
 
     @property
     def family(self) -> str:
-        """All limits of one arm."""
+        """Return the family of all limits of one arm."""
         return f"joint_limit_{self.arm + 1}"
 
     def expression(self, place: PathPointSymbols, numbers: ca.SX) -> ca.SX:
-        """The margin, negative beyond the limit."""
+        """Return the margin, negative beyond the limit."""
         return numbers[0] + ca.dot(numbers[1:], place.q[self.arm])
 
     def count(self, place: PathPointSymbols) -> int:
-        """A margin and a slope per joint."""
+        """Count a margin, and a slope per joint."""
         return 1 + int(place.q[self.arm].numel())
 
     def numbers(self, place: PathPointSymbols) -> Array:
-        """The margin at zero joints, and its gradient."""
+        """Return the margin at zero joints, and its gradient."""
         robot = place.model.workcell.robots[self.arm]
         slope = np.zeros(robot.position_lower.shape[0])
         slope[self.joint] = 1.0 if self.side == "lower" else -1.0
@@ -203,11 +207,11 @@ class JointLimit(PathConstraint):
         return np.concatenate([[-slope[self.joint] * limit[self.joint]], slope])
 
     def arms(self, model: CellBodies) -> tuple[int, ...]:
-        """The joint's own."""
+        """Return the joint's arm."""
         return (self.arm,)
 
     def given(self, model: CellBodies) -> dict[str, ca.SX]:
-        """None: a limit is a number of its own."""
+        """Return nothing: the limit is a parameter of the row itself."""
         return {}
 
 
@@ -215,8 +219,8 @@ class JointLimit(PathConstraint):
 class ManipulabilityLimit(PathConstraint):
     """(|det J| / least)^2 - 1 of an arm.
 
-    The square matters: at the edge of the reach the determinant falls like a root of the
-    distance, its square evenly.
+    The square matters: at the edge of the reach the determinant falls like a root of the distance,
+    its square linearly.
     """
 
     arm: int
@@ -225,44 +229,45 @@ class ManipulabilityLimit(PathConstraint):
 
     @property
     def family(self) -> str:
-        """Every arm is its own."""
+        """Return the family of this arm alone."""
         return f"reach_{self.arm + 1}"
 
     def expression(self, place: PathPointSymbols, numbers: ca.SX) -> ca.SX:
-        """Zero at the least manipulability that the workcell allows."""
+        """Return the value, zero at the least manipulability of the workcell."""
         least = place.model.workcell.robots[self.arm].min_manipulability
         model = place.model.robots[self.arm]
         jacobian = following_columns(model, model.jacobian(place.q[self.arm]))
         return (manipulability(jacobian) / least) ** 2 - 1.0
 
     def arms(self, model: CellBodies) -> tuple[int, ...]:
-        """The one."""
+        """Return the arm."""
         return (self.arm,)
 
     def given(self, model: CellBodies) -> dict[str, ca.SX]:
-        """Symbols of the arm."""
+        """Return the symbols of the arm."""
         return sx_given(model.workcell.robots[self.arm])
 
 
 def row_name(family: str, order: Order) -> str:
-    """Name of a `row_function`."""
+    """Return the name of a `row_function`."""
     return f"row_{family}_{order}"
 
 
 def closure_name(arm: int, order: Order) -> str:
-    """Name of one of `closure_functions`."""
+    """Return the name of one of `closure_functions`."""
     return f"closure_{arm + 1}_{order}"
 
 
 def row_function(place: PathPointSymbols, constraint: PathConstraint, order: Order) -> ca.Function:
-    """The value and gradient, or the Hessian, of a constraint's family by what it depends on.
+    """Return the value and gradient, or the Hessian, of a constraint's family by its variables.
 
-    With y = pose, then the rate where it is `moving`, then the joints of its `arms`:
+    With y = pose, then the rate if it is `moving`, then the joints of its `arms`:
 
     first: pose, rate, q_1, q_2, numbers -> value, gradient (n_y,).
+
     second: pose, rate, q_1, q_2, numbers, weight -> weight times the Hessian (n_y, n_y).
 
-    Where the family has one member, there are no numbers. The cell's own follow.
+    A family with one member has no numbers. The cell's own parameters follow.
     """
     numbers = ca.SX.sym("numbers", constraint.count(place))
     value = constraint.expression(place, numbers)
@@ -282,10 +287,11 @@ def row_function(place: PathPointSymbols, constraint: PathConstraint, order: Ord
 
 
 def closure_functions(model: CellModel, arm: int) -> dict[str, ca.Function]:
-    """An arm's joints from a box pose, with what the derivatives of rows need.
+    """Return an arm's joints by the box pose, and the matrices for derivatives of rows.
 
-    first: pose (6 + m,), q_reference (n,) -> q (n,) that hold the box; follow dq/dpose
-        (n, 6 + m); pull -F_q^-1 (n, n), so that nu = pull^T c_q.
+    first: pose (6 + m,), q_reference (n,) -> q (n,) that hold the box; follow dq/dpose (n, 6 + m);
+    pull -F_q^-1 (n, n), so that nu = pull^T c_q.
+
     second: pose, q, nu (n,) -> hessian (6 + m + n, 6 + m + n) of nu . F by (pose, q).
     """
     own = model.robots[arm]

@@ -1,17 +1,17 @@
-"""What the smooth problem asks at samples: forces and pressure, with exact derivatives.
+"""Forces and pressure at samples, with exact derivatives.
 
 By the paper's allocation all normal forces are the largest of functions that are linear in the
 normal component F_n and the tangential magnitude F_t of the required force
 (`symbolic.contact.paper.normal_force_branches`), so that these two, and not the kinked forces, are
-differentiated; those of soft fingers are differentiated themselves. How much of each patch the
-shift of the centre of pressure leaves is differentiated as it is: its kinks are those of the
-forces. Where forces are allocated jointly, what they have to hold is differentiated here, and from
-there the forces by `grasp_force_functions`.
+differentiated; those of soft fingers are differentiated themselves. The share of each patch that
+the shift of the centre of pressure leaves is differentiated directly: its kinks are those of the
+forces. For jointly allocated forces the load is differentiated here, and the forces by the load in
+`grasp_force_functions`.
 
-With the constant-speed law the motion at a sample depends on a window of five neighbouring
-samples alone (two finite differences). One small function serves all inner samples, its window's
-basis rows being an argument; the first two and the last two samples, with their one-sided
-differences, have one function per end. Any other time law is differentiated as a whole.
+With the constant-speed law the motion at a sample depends on a window of five neighbouring samples
+alone (two finite differences). One small function serves all inner samples, with its window's basis
+rows as an argument; the first two and the last two samples, with their one-sided differences, have
+one function per end. Any other time law is differentiated as a whole.
 """
 
 from __future__ import annotations
@@ -37,38 +37,38 @@ from symbolic.records.task import Task
 from symbolic.smooth.places import ORDERS, Order
 
 Quantity = Literal["force", "pressure", "load"]
-"""force: what normal forces are made of, see `_force_function` [N]. pressure: 1 - (shift / patch
+"""force: components of the normal forces, see `_force_function` [N]. pressure: 1 - (shift / patch
 radius)^2 of contacts 1 and 2. load: force and moment about the box frame's origin, along the box's
 axes [N, N m]."""
 
 QUANTITY_WIDTHS: Mapping[Quantity, int] = {"force": 2, "pressure": 2, "load": 6}
-"""Values of each sample."""
+"""Values per sample."""
 
 Block = Literal["inner", "first", "last", "path"]
-"""Inner samples, one at a call; the first two; the last two; all of another time law."""
+"""Inner samples, one per call; the first two; the last two; all samples of another time law."""
 
 SAMPLE_BARRIER_WEIGHT = 1e-4
-"""Weight of the joint allocation's barriers, see `symbolic.contact.soft_grasp`. Forces exceed the
-least ones by a share of about this times the number of constraints that bind, which the polish
-corrects at every round's candidate."""
+"""Weight of the joint allocation's barriers; see `symbolic.contact.soft_grasp`. Forces exceed the
+least ones by a share of about this times the number of active constraints, which the polish
+corrects at every iterate."""
 
 INPUTS = ("x", "basis", "rounding")
 """Inputs of every function of samples."""
 
 MOTION_INPUTS = ("pose", "rate", "second_rate")
-"""Of the box at a sample, (6,) each."""
+"""Motion of the box at a sample, (6,) each."""
 
 DIFFERENCE_WINDOW = 5
-"""Samples that the motion at one of them depends on with the constant-speed law."""
+"""Samples on which the motion at one sample depends with the constant-speed law."""
 
 
 def sample_name(quantity: Quantity, block: Block, order: Order) -> str:
-    """Name of a function of `sample_functions`."""
+    """Return the name of a function of `sample_functions`."""
     return f"{quantity}_{block}_{order}"
 
 
 def grasp_force_name(order: Order) -> str:
-    """Name of a function of `grasp_force_functions`."""
+    """Return the name of a function of `grasp_force_functions`."""
     return f"held_{order}"
 
 
@@ -77,8 +77,8 @@ class SampleBlock:
     """Samples that share one function.
 
     Attributes:
-        block: which function serves them.
-        samples: (calls, k) the k samples that each call serves.
+        block: name of the function's block.
+        samples: (calls, k) the k samples of each call.
         basis: (calls, width, n_waypoints) basis rows of each call's window.
     """
 
@@ -88,7 +88,7 @@ class SampleBlock:
 
 
 def sample_blocks(task: Task) -> tuple[SampleBlock, ...]:
-    """How the task's samples are divided among functions."""
+    """Divide the task's samples among functions."""
     n, position = task.samples, sample_basis(task).position
     if task.time_law != "constant":
         return (SampleBlock("path", np.arange(n)[None, :], position[None]),)
@@ -104,7 +104,7 @@ def sample_blocks(task: Task) -> tuple[SampleBlock, ...]:
 
 
 def force_branches(workcell: Workcell) -> Array:
-    """(2, branches, 2): per robot and branch the coefficients of both force quantities of
+    """Return coefficients (2, branches, 2), per robot and branch, of both force quantities of
     `_force_function` in a normal force, which is the largest of its branches."""
     if workcell.task.allocation == "soft-finger":
         return np.eye(2)[:, None]
@@ -116,19 +116,20 @@ def force_branches(workcell: Workcell) -> Array:
 
 
 def sample_functions(workcell: Workcell, quantity: Quantity) -> dict[str, ca.Function]:
-    """w = WIDTHS[quantity] values of each sample and their derivatives, for every block of
-    `sample_blocks`.
+    """Return values of each sample, w = QUANTITY_WIDTHS[quantity], and their derivatives, for every
+    block of `sample_blocks`.
 
-    For a block that serves k samples, with x (n_var,) and basis (n_waypoints, width) of the
-    window and rounding (see `timed_path`), both without effect where the block is the whole path:
+    For a block of k samples, with x (n_var,), basis (n_waypoints, width) of the window and rounding
+    (see `timed_path`), the latter two without effect if the block is the whole path:
 
-    first: x, basis, rounding -> values (w k,), all of the first sample, all of the second, ...,
-        and gradient (n_var, w k), one column for each value.
+    first: x, basis, rounding -> values (w k,), all of the first sample, all of the second, ..., and
+    gradient (n_var, w k), one column per value.
+
     second: x, basis, rounding, weight (w k,), along (n_var,) -> curvature (n_var,), the Hessian of
-        weight . values times along.
+    weight . values times along.
 
-    One direction at a call keeps the second derivatives' code a tenth as long as a whole Hessian's:
-    lanes take its columns side by side, and it stays in the processor's cache.
+    With one direction per call the code of second derivatives is a tenth as long as a whole
+    Hessian's: lanes evaluate its columns side by side, and it stays in the processor's cache.
     """
     makers = {"force": _force_function, "pressure": _margin_function, "load": _load_function}
     sample = makers[quantity](workcell)
@@ -144,10 +145,11 @@ def sample_functions(workcell: Workcell, quantity: Quantity) -> dict[str, ca.Fun
 def grasp_force_functions(
     workcell: Workcell, weight: float = SAMPLE_BARRIER_WEIGHT
 ) -> dict[str, ca.Function]:
-    """Normal forces as smooth convex functions of a sample's load where they have no closed form,
-    see `symbolic.contact.soft_grasp.SoftGrasp.first` and `second`, at a weight of the barriers:
+    """Return normal forces without closed form as smooth convex functions of a sample's load, at a
+    weight of the barriers; see `symbolic.contact.soft_grasp.SoftGrasp.first` and `second`:
 
-    first: load (6,) -> normal (2,) [N], slope (6, 2), state (n,), whatever the second takes.
+    first: load (6,) -> normal (2,) [N], slope (6, 2), state (n,) for the second.
+
     second: state, weight (2,) -> curvature (6, 6), the Hessian of weight . normal by the load.
 
     Raises:
@@ -158,8 +160,8 @@ def grasp_force_functions(
 
 
 def motion_function(task: Task) -> ca.Function:
-    """x (n_var,) to motion (n, 18), box pose, rate and second rate at every sample, and slope
-    (18 n, n_var), of its entries row by row; NumPy shapes."""
+    """Return x (n_var,) -> motion (n, 18), box pose, rate and second rate at every sample, and
+    slope (18 n, n_var), of its entries row by row; NumPy shapes."""
     x = ca.MX.sym("x", task.n_var)
     path = timed_path(task, sample_basis(task), waypoint_matrix(task, x))
     motion = ca.vertcat(path.pose, path.rate, path.second_rate)
@@ -217,12 +219,11 @@ def _at_samples(
     columns: tuple[int, ...],
     handed: dict[str, ca.MX],
 ) -> ca.MX:
-    """What a function makes of the motion at the chosen columns of the timed path, one after the
-    other.
+    """Evaluate a function of the motion at the chosen columns of the timed path.
 
     Args:
         along: basis, waypoints and rounding of `timed_path`.
-        handed: the numbers of task and payload.
+        handed: parameters of task and payload.
     """
     path, at = timed_path(workcell.task, *along, of(handed, workcell.task)), list(columns)
     held = repeated(of(handed, workcell.payload), len(at))
@@ -231,8 +232,8 @@ def _at_samples(
 
 
 def _wrench_function(workcell: Workcell) -> ca.Function:
-    """pose, rate, second_rate (6,) of a sample to the required force and moment (6,) about the
-    centre of mass, in the box's frame [N, N m]."""
+    """Return pose, rate, second_rate (6,) of a sample -> required force and moment (6,) about the
+    centre of mass, in the box frame [N, N m]."""
     payload = workcell.payload
     pose, rate, second = motion = [ca.SX.sym(name, 6) for name in MOTION_INPUTS]
     centre = number(payload.centre_of_mass)
@@ -242,8 +243,8 @@ def _wrench_function(workcell: Workcell) -> ca.Function:
 
 
 def _margin_function(workcell: Workcell) -> ca.Function:
-    """Force and moment (6,) in the box's frame to 1 - (shift / patch radius)^2 (2,), by the paper's
-    allocation: where the patches suffice the joint one is the paper's."""
+    """Return force and moment (6,) in the box frame -> 1 - (shift / patch radius)^2 (2,), by the
+    paper's allocation, which equals the joint one if the patches suffice."""
     wrench, contacts = ca.SX.sym("wrench", 6), workcell.contacts
     shift = held_by(workcell, "paper", _contact_load(workcell, wrench))
     squares = ca.vertcat(*map(ca.sumsqr, shift.shifts))
@@ -253,7 +254,8 @@ def _margin_function(workcell: Workcell) -> ca.Function:
 
 
 def _load_function(workcell: Workcell) -> ca.Function:
-    """Force and moment (6,) about the centre of mass to those about the box frame's origin."""
+    """Return force and moment (6,) about the centre of mass -> those about the box frame's
+    origin."""
     wrench, centre = ca.SX.sym("wrench", 6), number(workcell.payload.centre_of_mass)
     about = wrench[3:] + ca.cross(ca.SX(centre), wrench[:3])
     given = sx_given(workcell.payload).values()
@@ -261,9 +263,9 @@ def _load_function(workcell: Workcell) -> ca.Function:
 
 
 def _force_function(workcell: Workcell) -> ca.Function:
-    """Force and moment (6,) in the box's frame to the two quantities whose linear branches are the
-    normal forces (`force_branches`): both normal forces of soft fingers, which have one branch
-    each, otherwise F_n and F_t. Another contact model in closed form is plugged in at these two."""
+    """Return force and moment (6,) in the box frame -> the two quantities whose linear branches are
+    the normal forces (`force_branches`): both normal forces of soft fingers, with one branch each,
+    otherwise F_n and F_t. Another contact model in closed form is added in these two functions."""
     wrench = ca.SX.sym("wrench", 6)
     if workcell.task.allocation == "soft-finger":
         quantities = held_by(workcell, "soft-finger", _contact_load(workcell, wrench)).normal
@@ -275,7 +277,7 @@ def _force_function(workcell: Workcell) -> ca.Function:
 
 
 def _contact_load(workcell: Workcell, wrench: ca.SX) -> ContactLoad:
-    """What force and moment (6,) in the box's frame ask of the contacts."""
+    """Return the contact load of a force and moment (6,) in the box frame."""
     contacts, centre = workcell.contacts, workcell.payload.centre_of_mass
     first, second = (ca.SX(number(c.T_box_pad[:3, 3] - centre)) for c in contacts)
     axes = ca.SX(number(contacts[0].T_box_pad[:3, :3]))
@@ -289,7 +291,6 @@ def _functions(
     quantity: Quantity,
     block: Block,
 ) -> dict[str, ca.Function]:
-    """See `sample_functions`."""
     first, second = (sample_name(quantity, block, order) for order in ORDERS)
     x, symbols = inputs[0], type(inputs[0])
     weight, along = symbols.sym("weight", values.numel()), symbols.sym("along", x.numel())

@@ -1,6 +1,6 @@
-"""What is solved, and what comes of it, whichever solver is chosen.
+"""Interface of nonlinear programs and their solvers.
 
-A solver's word is not trusted: `optimality_residuals` recomputes residuals from the program.
+Optimality is not taken from a solver: `optimality_residuals` recomputes it from the program.
 """
 
 from __future__ import annotations
@@ -14,31 +14,31 @@ import numpy as np
 from symbolic.array import Array, Figure
 
 OPTIMALITY_TOLERANCE = 1e-6
-"""Tolerance of the optimality conditions, in a program's scaled rows and variables."""
+"""Tolerance of the optimality conditions, in scaled rows and variables."""
 
 FEASIBLE_ROW = 1e-3
-"""Lack of a scaled row at which an iterate counts as feasible."""
+"""Violation of a scaled row at which an iterate counts as feasible."""
 
 FEASIBILITY_PATIENCE = 3
-"""Times the wanted number of iterations that a solve may take to become feasible: cut off wherever
-it stands, it ends in an obstacle more often than not."""
+"""Multiple of the wanted iterations after which a solve ends without a feasible iterate: stopped
+earlier, it ends in an obstacle more often than not."""
 
 MOST_SOLVE_SECONDS = 60.0
-"""Wall time after which a solve is given up. Generous, because a result that depends on it cannot
-be repeated."""
+"""Wall time after which a solve is stopped. Large, because a result that depends on it is not
+reproducible."""
 
 ACTIVE_SLACK = 0.1
-"""Slack of inequalities that may have a multiplier."""
+"""Slack below which an inequality may have a multiplier."""
 
 NNLS_ITERATIONS = 30
-"""Iterations of the least squares for every inequality."""
+"""Iterations of the least squares per inequality."""
 
 
 class NonlinearProgram(Protocol):
-    """A nonlinear program: minimise cost . z within bounds, every row at least zero.
+    """A nonlinear program: minimise cost . z within bounds, with every row at least zero.
 
     Attributes:
-        cost: (n_variables,) gradient of the objective, which is linear.
+        cost: (n_variables,) gradient of the linear objective.
         start, low, high: (n_variables,).
     """
 
@@ -48,23 +48,23 @@ class NonlinearProgram(Protocol):
     high: Array
 
     def values(self, z: Array) -> Array:
-        """(n_rows,) of the rows at z."""
+        """Return the rows (n_rows,) at z."""
 
     def rows(self, z: Array) -> tuple[Array, Array]:
-        """Values (n_rows,) and slopes (n_rows, n_variables) at z."""
+        """Return values (n_rows,) and slopes (n_rows, n_variables) at z."""
 
     def curvature(self, z: Array, weights: Array) -> Array:
-        """(n_variables, n_variables) second derivatives of weights . rows at z."""
+        """Return second derivatives (n_variables, n_variables) of weights . rows at z."""
 
 
 @dataclass(frozen=True)
 class Residuals:
-    """How well a solution satisfies the optimality conditions of its program.
+    """Residuals of the optimality conditions of a program.
 
     Attributes:
         stationarity: largest entry of the Lagrangian's gradient (scaled variables).
-        feasibility: largest violation of a constraint or bound.
-        complementarity: largest product of a multiplier and its constraint's slack.
+        feasibility: largest violation of a row or bound.
+        complementarity: largest product of a multiplier and its slack.
     """
 
     stationarity: Figure
@@ -72,12 +72,12 @@ class Residuals:
     complementarity: Figure
 
     def scaled(self, unit: float) -> Residuals:
-        """The same with the objective in units that are `unit` times smaller."""
+        """Return residuals of the objective in units that are `unit` times smaller."""
         return Residuals(unit * self.stationarity, self.feasibility, unit * self.complementarity)
 
 
 UNKNOWN = Residuals(np.nan, np.nan, np.nan)
-"""Residuals of a solve that returned nothing."""
+"""Residuals of a solve without an answer."""
 
 
 @dataclass(frozen=True)
@@ -85,11 +85,11 @@ class Answer:
     """Answer of a solver of nonlinear programs.
 
     Attributes:
-        z: (n_variables,) where it ended.
+        z: (n_variables,) last iterate.
         message: its status.
-        converged: whether it claims an optimum.
+        converged: whether the solver reports an optimum.
         usable: whether z is finite.
-        iterations: its own.
+        iterations: of the solver.
     """
 
     z: Array
@@ -100,16 +100,16 @@ class Answer:
 
 
 Solve = Callable[[NonlinearProgram, int, float], Answer]
-"""A solver: from a program, the wanted number of iterations and the barrier at the start."""
+"""A solver: function of a program, the wanted number of iterations and the first barrier."""
 
 
 def optimality_residuals(
     program: NonlinearProgram, z: Array, bounds: tuple[Array, Array] | None = None
 ) -> Residuals:
-    """Residuals at z with the multipliers that satisfy the conditions best there.
+    """Compute residuals at z with the least-squares multipliers there.
 
     Args:
-        bounds: lower and upper (n_variables,) in place of the program's.
+        bounds: lower and upper (n_variables,) instead of the program's.
     """
     low, high = bounds or (program.low, program.high)
     rows, slopes = program.rows(z)
@@ -121,10 +121,10 @@ def optimality_residuals(
 def residuals(
     program: NonlinearProgram, z: Array, at_bounds: Array, y: Array, bounds: tuple[Array, Array]
 ) -> Residuals:
-    """Residuals of the optimality conditions at z with the given multipliers.
+    """Compute residuals of the optimality conditions at z with given multipliers.
 
     Args:
-        at_bounds: (n_variables,) multipliers of upper bounds, those of lower ones negative.
+        at_bounds: (n_variables,) multipliers of upper bounds, negative for lower ones.
         y: (n_rows,) of the rows.
         bounds: of the variables, lower and upper (n_variables,).
     """
@@ -141,15 +141,15 @@ def residuals(
 def estimate_multipliers(
     cost: Array, A: Array, slacks: tuple[Array, Array, Array]
 ) -> tuple[Array, Array]:
-    """Multipliers that satisfy the conditions of optimality best, in least squares: better than
-    an iteration's own where it was cut off.
+    """Estimate multipliers by nonnegative least squares of the optimality conditions: better than
+    an iteration's own after an early stop.
 
     Args:
         cost, A: gradients of the objective (n,) and of the inequalities (m, n).
         slacks: of the inequalities (m,), of the lower and of the upper bounds (n,).
 
     Returns:
-        Of upper bounds (n,), of lower ones negative, and of the inequalities (m,), not negative.
+        Of upper bounds (n,), negative for lower ones, and of the inequalities (m,), nonnegative.
     """
     # Not imported at the top: it takes long, and records of polishes are read without it.
     from scipy.optimize import nnls

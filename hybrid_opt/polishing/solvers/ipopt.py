@@ -44,7 +44,8 @@ Shapes = Mapping[str, ca.Sparsity]
 
 
 class _Callback(ca.Callback):  # type: ignore[misc]  # CasADi has no types
-    """A Python function of vectors (n,) as CasADi calls it; the first methods are its questions."""
+    """A Python function of vectors (n,) as CasADi calls it; the first methods answer its
+    queries."""
 
     def __init__(
         self, name: str, inputs: Shapes, outputs: Shapes, evaluate: Callable[..., list[Any]]
@@ -84,10 +85,10 @@ class _Callback(ca.Callback):  # type: ignore[misc]  # CasADi has no types
 
 
 def _functions(program: NonlinearProgram, wanted: int) -> tuple[_Callback, dict[str, _Callback]]:
-    """A program as nlpsol wants it, and its derivatives with what ends a solve.
+    """Return a program for nlpsol, and its derivatives with the stopping rule.
 
-    A solve that is cut off wherever it stands ends in an obstacle more often than not: it ends
-    after the wanted number of iterations, as soon as an iterate is feasible.
+    A solve that is stopped at an arbitrary iterate ends in an obstacle more often than not. It
+    stops after the wanted number of iterations at the first feasible iterate.
     """
     n, m, iterations = len(program.start), len(program.values(program.start)), 0
     x, p, g = ca.Sparsity.dense(n), ca.Sparsity(0, 0), ca.Sparsity.dense(m)
@@ -123,7 +124,7 @@ def _functions(program: NonlinearProgram, wanted: int) -> tuple[_Callback, dict[
 
 
 def ipopt(program: NonlinearProgram, iterations: int, barrier: float) -> Answer:
-    """Solve a program with IPOPT; arguments as of `solvers.base.Solve`."""
+    """Solve a program with IPOPT; see `solvers.base.Solve`."""
     nlp, functions = _functions(program, iterations)
     limits = {"ipopt.mu_init": barrier, "ipopt.max_iter": FEASIBILITY_PATIENCE * iterations}
     solver = ca.nlpsol("polish", "ipopt", nlp, OPTIONS | functions | limits)

@@ -32,24 +32,24 @@ from hybrid_opt.polishing.native import native
 from symbolic.array import Array
 
 QUADRATIC_TOLERANCE = 1e-8
-"""Tolerance of the conditions, of their residuals over their terms, and of the objective."""
+"""Tolerance of the conditions, relative to their terms, and of the objective."""
 
 ACCEPTED_RESIDUAL = 1e-5
-"""Tolerance with which an answer is accepted; of the objective, over its own terms."""
+"""Residual at which an answer is accepted; of the objective, relative to its own terms."""
 
 LEAST_CURVATURE = 1e-6
-"""Curvature by the path that is left where the Lagrangian has less."""
+"""Least curvature by the path in the convex model."""
 
 NEGATIVE_CURVATURE_SHARE = 0.1
-"""Share of a negative curvature that is kept, positive: enough to be convex, and little enough that
-the box of trust ends steps along it."""
+"""Factor of the absolute value of a negative curvature in the convex model: positive, and small
+enough that the trust region bounds steps along it."""
 
 Ending = Literal["solved", "infeasible", "failed"]
 
 
 @dataclass(frozen=True)
 class BorderedMatrix:
-    """A symmetric matrix.
+    """A symmetric matrix: a tridiagonal block with a border.
 
     Attributes:
         corner: (k, k) of the border.
@@ -63,7 +63,7 @@ class BorderedMatrix:
     off: Array
 
     def plus(self, other: BorderedMatrix, weight: float = 1.0) -> BorderedMatrix:
-        """The sum with a multiple of another one."""
+        """Add a multiple of another matrix."""
         return BorderedMatrix(
             self.corner + weight * other.corner,
             self.beside + weight * other.beside,
@@ -72,14 +72,14 @@ class BorderedMatrix:
         )
 
     def add_diagonal(self, by: Array) -> BorderedMatrix:
-        """The matrix with (k + n,) added to its diagonal."""
+        """Return the matrix with (k + n,) added to its diagonal."""
         k = len(self.corner)
         corner = self.corner.copy()
         corner[np.diag_indices(k)] += by[:k]
         return BorderedMatrix(corner, self.beside, self.diagonal + by[k:], self.off)
 
     def times(self, d: Array) -> Array:
-        """The product with (k + n,)."""
+        """Multiply by (k + n,)."""
         k = len(self.corner)
         border, chain = d[:k], d[k:]
         product = self.beside @ border + self.diagonal * chain
@@ -88,25 +88,25 @@ class BorderedMatrix:
         return np.concatenate([self.corner @ border + chain @ self.beside, product])
 
     def dense(self) -> Array:
-        """(k + n, k + n)."""
+        """Return the dense matrix (k + n, k + n)."""
         chain = np.diag(self.diagonal) + np.diag(self.off, 1) + np.diag(self.off, -1)
         return np.block([[self.corner, self.beside.T], [self.beside, chain]])
 
     @property
     def largest(self) -> float:
-        """Largest absolute entry."""
+        """Return the largest absolute entry."""
         parts = (self.corner, self.beside, self.diagonal, self.off)
         return float(max(np.abs(part).max(initial=0.0) for part in parts))
 
 
 @dataclass(frozen=True)
 class BorderedRows:
-    """Rows A that hold at most two neighbours of the chain.
+    """Rows A with entries in the border and in at most two neighbours of the chain.
 
     Attributes:
         border: (rows, k).
-        column: (rows,) the first of the two neighbours.
-        left, right: (rows,) the entries there.
+        column: (rows,) first of the two neighbours.
+        left, right: (rows,) entries there.
         n_chain: variables of the chain.
     """
 
@@ -120,33 +120,33 @@ class BorderedRows:
         return len(self.border)
 
     def select(self, chosen: NDArray[np.bool_] | NDArray[np.intp]) -> BorderedRows:
-        """Some of the rows."""
+        """Return some of the rows."""
         border, left, right = (part[chosen] for part in (self.border, self.left, self.right))
         return BorderedRows(border, self.column[chosen], left, right, self.n_chain)
 
     @cached_property
     def _spread(self) -> sparse.csr_array:
-        """(n, rows) the chain's part, transposed."""
+        """Return the chain's part (n, rows), transposed."""
         entries = np.concatenate([self.left, self.right])
         where = np.concatenate([self.column, self.column + 1]), np.tile(np.arange(len(self)), 2)
         return sparse.csr_array((entries, where), shape=(self.n_chain, len(self)))
 
     def times(self, d: Array) -> Array:
-        """(rows,) A d."""
+        """Return A d (rows,)."""
         k = self.border.shape[1]
         border, chain = d[:k], d[k:]
         beside = self.left * chain[self.column] + self.right * chain[self.column + 1]
         return np.asarray(self.border @ border + beside)
 
     def transpose_times(self, y: Array) -> Array:
-        """(k + n,) A^T y."""
+        """Return A^T y (k + n,)."""
         n = self.n_chain
         chain = _summed(self.column, self.left * y, n)
         chain += _summed(self.column + 1, self.right * y, n)
         return np.concatenate([y @ self.border, chain])
 
     def squares(self, weight: Array) -> BorderedMatrix:
-        """A^T diag(weight) A."""
+        """Return A^T diag(weight) A."""
         n, weighted = self.n_chain, self.border * weight[:, None]
         by_left, by_right = weight * self.left, weight * self.right
         diagonal = _summed(self.column, by_left * self.left, n)
@@ -155,23 +155,23 @@ class BorderedRows:
         return BorderedMatrix(self.border.T @ weighted, self._spread @ weighted, diagonal, off)
 
     def dense(self) -> Array:
-        """(rows, k + n)."""
+        """Return the dense matrix (rows, k + n)."""
         return np.hstack([self.border, self._spread.T.toarray()])
 
 
 def _summed(column: NDArray[np.intp], values: Array, n: int) -> Array:
-    """(n,) sums of values by column."""
+    """Sum values by column (n,)."""
     return np.asarray(np.bincount(column, values, n), dtype=float)
 
 
 @dataclass(frozen=True)
 class QuadraticProgram:
-    """A program.
+    """A convex quadratic program; see the module.
 
     Attributes:
         H, g: of the objective.
         A, b: of the rows.
-        low, high: (n,) finite, each pair apart.
+        low, high: (n,) finite, low < high.
     """
 
     H: BorderedMatrix
@@ -184,13 +184,13 @@ class QuadraticProgram:
 
 @dataclass(frozen=True)
 class QuadraticAnswer:
-    """What a solve ends with.
+    """Answer of a solver of quadratic programs.
 
     Attributes:
         d: (n,).
-        rows: (rows,) multipliers, at least zero.
-        bounds: (n,) of the bounds, positive above, negative below.
-        ending: 'infeasible' where multipliers prove it.
+        rows: (rows,) nonnegative multipliers.
+        bounds: (n,) multipliers of the bounds, positive for upper, negative for lower ones.
+        ending: 'infeasible' if multipliers prove it.
     """
 
     d: Array
@@ -199,7 +199,7 @@ class QuadraticAnswer:
     ending: Ending
 
     def satisfies_optimality(self, program: QuadraticProgram) -> bool:
-        """Whether it satisfies the conditions of optimality, recomputed."""
+        """Return True if the recomputed optimality conditions hold."""
         if not all(np.isfinite(part).all() for part in (self.d, self.rows, self.bounds)):
             return False
         bend, pull = program.H.times(self.d), program.A.transpose_times(self.rows)
@@ -217,8 +217,8 @@ class QuadraticAnswer:
 
 
 def solve_quadratic(program: QuadraticProgram) -> QuadraticAnswer | None:
-    """The least value, by Clarabel where the own method's answer does not hold; None where there is
-    none.
+    """Solve a program, by Clarabel if the own method's answer is not optimal; None without a
+    solution.
 
     Raises:
         BridgeError: the compiled part is missing.
@@ -232,12 +232,12 @@ def solve_quadratic(program: QuadraticProgram) -> QuadraticAnswer | None:
 
 
 def solve_interior_point(program: QuadraticProgram) -> QuadraticAnswer:
-    """Iterate until the conditions hold, or multipliers prove that they never do."""
+    """Iterate until the conditions hold, or multipliers prove infeasibility."""
     return QuadraticAnswer(*native().quadratic(program, QUADRATIC_TOLERANCE))
 
 
 def solve_by_clarabel(program: QuadraticProgram) -> QuadraticAnswer:
-    """The same program by the solver Clarabel."""
+    """Solve a program by Clarabel."""
     # Not imported at the top: it is hardly ever needed.
     import clarabel
 
@@ -263,16 +263,17 @@ def solve_by_clarabel(program: QuadraticProgram) -> QuadraticAnswer:
 
 
 def convexify(H: BorderedMatrix, A: BorderedRows, b: Array) -> tuple[BorderedMatrix, Array]:
-    """A convex model of a Lagrangian that agrees with it where active rows hold.
+    """Return a convex model of a Lagrangian that agrees with it where active rows hold with
+    equality.
 
-    Active rows are added as squares (A d - b)^2 until the block of the chain is definite, and what
-    the rest lacks is added by the eigenvalues of the border's Schur complement.
+    Active rows are added as squares (A d - b)^2 until the block of the chain is positive definite.
+    The eigenvalues of the border's Schur complement correct the rest.
 
     Args:
-        A, b: (rows,) that are to hold with equality.
+        A, b: (rows,) active rows.
 
     Returns:
-        The matrix, positive definite, and what the squares add to the gradient.
+        The positive definite matrix, and the squares' contribution to the gradient.
     """
     scale = max(1e-3, H.largest)
     square, weight = A.squares(np.ones(len(A))), scale
