@@ -113,6 +113,11 @@ class Front(Displayable):
         return self.after(done)
 
     @property
+    def key(self) -> tuple[str, int]:
+        """What found it, and the number of its replica, 0 where it is of none."""
+        return self.algorithm, self.replica or 0
+
+    @property
     def title(self) -> str:
         """The algorithm's, and whether polished."""
         # Not imported at the top: the searches take long to load.

@@ -1,6 +1,10 @@
-"""The stage of a study that polishes every replica's front, and the files it leaves.
+"""The stage of a study that polishes its fronts, and the files it leaves.
 
-Per replica a folder `polished/ALGORITHM/NN`: `polish.json`, written last, holds the front, every
+Fronts of both peak forces are polished replica by replica. Drivable fronts are polished as one,
+their union: the polish begins with the best of all known paths, so the polished fronts of two
+replicas would share most of their points.
+
+Per front a folder `polished/ALGORITHM/NN`: `polish.json`, written last, holds the front, every
 attempt and what it took; `journal.bin` holds the attempts of a polish in progress, so that an
 interrupted one repeats none.
 """
@@ -18,10 +22,11 @@ import numpy as np
 
 from hybrid_opt.campaign.folder import CampaignFolder
 from hybrid_opt.campaign.journal import ReplicaLedger, ReplicaRequest
-from hybrid_opt.campaign.results import Replica, is_whole, read_campaign, read_polished
+from hybrid_opt.campaign.results import is_whole, read_campaign, read_polished
 from hybrid_opt.campaign.settings import JOURNAL, POLISH, polished_folder
 from hybrid_opt.campaign.stages import Stage, with_cell
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
+from hybrid_opt.front import Front
 from hybrid_opt.polishing.front import FailedAttempt, use_one_thread
 from hybrid_opt.polishing.polisher import Polisher
 from hybrid_opt.polishing.records import PolishedFront, PolishOutcome
@@ -57,7 +62,7 @@ def _polisher(objectives: tuple[str, ...], settings: PolishSettings, cell: Workc
 def polish_stage(
     settings: PolishSettings, known: Callable[[CampaignFolder], Array] | None = None
 ) -> Stage:
-    """The stage that polishes the fronts of all replicas.
+    """The stage that polishes the fronts of `CampaignResults.to_polish`.
 
     Args:
         known: paths (m, n_path) that are known beside the fronts; None for none.
@@ -68,16 +73,15 @@ def polish_stage(
 
     def whole(folder: CampaignFolder) -> bool:
         # A front that cannot be read is the search's to compute anew.
-        replicas = read_campaign(folder.root).replicas
-        return all(_is_polished(folder, replica) for replica in replicas)
+        return all(_is_polished(folder, front) for front in read_campaign(folder.root).to_polish)
 
     return Stage("polish", run, asdict(settings), whole)
 
 
-def _is_polished(folder: CampaignFolder, replica: Replica) -> bool:
+def _is_polished(folder: CampaignFolder, front: Front) -> bool:
     """Whether a front's polish is there; a damaged one is computed anew."""
-    path = polished_folder(folder.root, replica.algorithm, replica.replica) / POLISH
-    return is_whole(path.exists(), lambda: read_polished(folder.root, replica, folder.workcell))
+    path = polished_folder(folder.root, *front.key) / POLISH
+    return is_whole(path.exists(), lambda: read_polished(folder.root, front))
 
 
 def polish_replica(
@@ -111,11 +115,10 @@ class PolishLedger(ReplicaLedger):
         settings: PolishSettings,
         known: Callable[[CampaignFolder], Array] | None,
     ) -> None:
-        replicas = read_campaign(folder.root).replicas
-        self._all, self._settings = len(replicas), settings
-        self._open = [replica for replica in replicas if not _is_polished(folder, replica)]
-        keys = [(replica.algorithm, replica.replica) for replica in self._open]
-        left = {key: polished_folder(folder.root, *key) for key in keys}
+        fronts = read_campaign(folder.root).to_polish
+        self._all, self._settings = len(fronts), settings
+        self._open = [front for front in fronts if not _is_polished(folder, front)]
+        left = {front.key: polished_folder(folder.root, *front.key) for front in self._open}
         super().__init__(folder, left, polish=asdict(settings))
         self._losses = Counter[int]()
         self._paths = known(folder) if known is not None and self._open else None
@@ -131,7 +134,7 @@ class PolishLedger(ReplicaLedger):
 
     def request(self, index: int) -> ReplicaRequest:
         """See `hybrid_opt.work.service.Ledger`."""
-        return self.replica_request(index, np.array(self._open[index].front_x), self._paths)
+        return self.replica_request(index, np.array(self._open[index].x), self._paths)
 
     def lost(self, index: int, reason: str) -> None:
         """A solver that crashes or hangs costs the attempt at hand only."""

@@ -26,6 +26,7 @@ from hybrid_opt.campaign.settings import (
     EVALUATIONS,
     POLISH,
     RECOMMENDED,
+    UNION,
     CampaignSettings,
     Configuration,
     FinishedReplica,
@@ -36,7 +37,7 @@ from hybrid_opt.carry import Carry
 from hybrid_opt.cell import Cell
 from hybrid_opt.display.table import counted, figures_html, lines
 from hybrid_opt.errors import DamagedResultsWarning, ResultsError
-from hybrid_opt.evaluate.evaluation import Evaluations
+from hybrid_opt.evaluate.evaluation import Evaluations, concatenated
 from hybrid_opt.front import Front
 from hybrid_opt.indicators import metrics
 from hybrid_opt.polishing.records import PolishedFront
@@ -168,24 +169,47 @@ class CampaignResults:
         """The replicas of one algorithm."""
         return tuple(found for found in self.replicas if found.algorithm == algorithm)
 
-    def polished(self, replica: Replica) -> PolishedFront | None:
-        """See `read_polished`."""
-        return read_polished(self.root, replica, self.workcell)
+    @cached_property
+    def searched(self) -> tuple[Front, ...]:
+        """The fronts of all replicas as searched."""
+        return tuple(
+            Front.of_search(self.cell, found.algorithm, found.evaluations, found.replica)
+            for found in self.replicas
+        )
+
+    @cached_property
+    def to_polish(self) -> tuple[Front, ...]:
+        """The fronts that a polish begins with: every replica's, of a drivable experiment the
+        `UNION` of all."""
+        if self.workcell.task.time_law != "optimal":
+            return self.searched
+        every = concatenated([found.evaluations for found in self.replicas])
+        return (Front.of_search(self.cell, UNION, every),)
 
     @property
     def fronts(self) -> tuple[Front, ...]:
-        """The fronts of all replicas: each as searched, then as polished where it was polished.
+        """The fronts of all replicas as searched, each with its polished one after it, and the
+        polished union.
 
         Raises:
             ResultsError: a polished one is damaged.
         """
-        found = []
-        for replica in self.replicas:
-            of = replica.algorithm, replica.evaluations, replica.replica
-            found.append(Front.of_search(self.cell, *of))
-            polished = self.polished(replica)
-            found += [] if polished is None else [found[-1].after(polished)]
-        return tuple(found)
+        found = list[Front | None]()
+        for front in self.searched:
+            found += [front, self.polished(*front.key)]
+        return tuple(front for front in (*found, self.polished(UNION)) if front is not None)
+
+    def polished(self, algorithm: str, replica: int = 0) -> Front | None:
+        """The polished front of a replica, or of the `UNION`; None where it was not polished.
+
+        Raises:
+            ResultsError: it is damaged.
+        """
+        for front in self.to_polish:
+            if front.key == (algorithm, replica):
+                found = read_polished(self.root, front)
+                return None if found is None else front.after(found)
+        return None
 
 
 def union(fronts: Sequence[Front]) -> list[tuple[Front, int]]:
@@ -286,19 +310,19 @@ def is_whole(exists: bool, read: Callable[[], object]) -> bool:
     return exists
 
 
-def read_polished(root: Path, replica: Replica, workcell: Workcell) -> PolishedFront | None:
-    """The polished front of a replica; None where it was not polished.
+def read_polished(root: Path, front: Front) -> PolishedFront | None:
+    """What a polish made of a front; None where it was not polished.
 
     Raises:
         ResultsError: the file is damaged.
     """
-    path = polished_folder(root, replica.algorithm, replica.replica) / POLISH
+    path = polished_folder(root, *front.key) / POLISH
     if not path.exists():
         return None
     found: PolishedFront = _record_of(PolishedFront, read_bytes(path), path, ANEW)
-    task = workcell.task
+    task = front.cell.workcell.task
     problem = ""
-    if bool(len(found.x)) != bool(len(replica.front)):
+    if bool(len(found.x)) != bool(len(front)):
         problem = f"at x: found {len(found.x)} points"
     elif len(found.x) and found.x.shape[1] != task.n_var:
         problem = f"at x: found {found.x.shape[1]} numbers; allowed are {task.n_var}"

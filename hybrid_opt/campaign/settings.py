@@ -195,6 +195,11 @@ JOURNAL = "journal.bin"
 POLISH = "polish.json"
 
 
+UNION = "union"
+"""Name of the non-dominated candidates of all searches together, where others have an algorithm's:
+the one front of a drivable experiment that is polished."""
+
+
 def replica_folder(root: Path, algorithm: str, replica: int) -> Path:
     """Folder of one replica, counted from 0."""
     return root / REPLICAS / algorithm / f"{replica:02d}"

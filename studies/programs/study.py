@@ -108,14 +108,14 @@ def stages(study: StudySettings, alone: bool = False) -> tuple[Stage, ...]:
         if study.drivable_polish is not None:
             beside = _paths_beside if study.polish is not None else None
             inner.append(polish_stage(study.drivable_polish, beside))
-        driven = [search_stage(), *inner, summary_stage(), timing_stage(last=True, curves=False)]
+        driven = [search_stage(), *inner, summary_stage(), timing_stage(curves=False)]
         every.append(drivable_stage(driven, study.drivable_replicas))
     if study.drivable:
         every.append(recommendation_stage(study.wish))
     every.append(summary_stage("" if study.drivable else NOT_ASKED))
     if study.recommend_only:
         return tuple(every)
-    every.append(timing_stage(study.wish.force, last=alone))
+    every.append(timing_stage(study.wish.force))
     if study.simulate:
         every.append(simulation_stage())
     if study.report:

@@ -13,7 +13,7 @@ import numpy as np
 
 from hybrid_opt.branches import BranchCompetition
 from hybrid_opt.campaign.results import CampaignResults, read_campaign
-from hybrid_opt.campaign.settings import CONFIGURATION, HAND_MADE, RECOMMENDED, SUMMARY
+from hybrid_opt.campaign.settings import CONFIGURATION, HAND_MADE, RECOMMENDED, SUMMARY, UNION
 from hybrid_opt.campaign.stages import ReadyCell, cells_of, read_branches, ready_cells
 from hybrid_opt.display.table import Table
 from hybrid_opt.errors import ResultsError
@@ -114,6 +114,7 @@ class Experiment:
         objectives: names of what the search minimised.
         summary: the content of summary.json.
         algorithms: in the campaign's order.
+        union: of a drivable experiment the polished union of all fronts, None without a polish.
     """
 
     workcell: Workcell
@@ -121,6 +122,7 @@ class Experiment:
     objectives: tuple[str, ...]
     summary: CampaignSummary
     algorithms: tuple[AlgorithmRuns, ...]
+    union: Front | None
 
     @property
     def force_kind(self) -> ForceKind:
@@ -137,11 +139,15 @@ class Experiment:
         """Whether fronts were polished."""
         return any(run.hybrid is not None for a in self.algorithms for run in a.runs)
 
-    def fronts(self) -> Iterator[tuple[AlgorithmRuns, Front, bool]]:
-        """Fronts of the representative runs, and whether a polished one stands beside each."""
+    def fronts(self) -> Iterator[tuple[LineStyle, Front, bool]]:
+        """Fronts of the representative runs with their looks, and whether a polished one stands
+        beside each; then the polished union."""
         for algorithm in self.solved:
             found = algorithm.shown.fronts
-            yield from ((algorithm, front, front is not found[-1]) for front in found)
+            after = found[-1] if self.union is None else self.union
+            yield from ((algorithm.look, front, front is not after) for front in found)
+        if self.union is not None:
+            yield series(len(self.algorithms)), self.union, False
 
     def driven(self, objectives: Array) -> Array:
         """(k, 2) force [N] and duration [s] of a drivable experiment's objectives (k, 2)."""
@@ -304,6 +310,7 @@ def gather_carries(root: Path) -> tuple[CellGeometry, tuple[DrawnCarry, ...]]:
 def _experiment(results: CampaignResults, select: bool = True) -> Experiment:
     """One experiment; its best trajectories are selected where that is wanted."""
     summary, fronts = read_summary(results.root), results.fronts
+    union = next((front for front in fronts if front.algorithm == UNION), None)
     evaluator = results.cell.evaluator if select else None
     algorithms = []
     for index, name in enumerate(results.algorithms):
@@ -321,7 +328,9 @@ def _experiment(results: CampaignResults, select: bool = True) -> Experiment:
             best = DrawnCarry(front.title, evaluator.carry(x), look, source)
         algorithms.append(AlgorithmRuns(name, title(name), look, tuple(runs), shown, best))
     files = collect_cell(results.workcell)
-    return Experiment(results.workcell, files, results.objectives, summary, tuple(algorithms))
+    return Experiment(
+        results.workcell, files, results.objectives, summary, tuple(algorithms), union
+    )
 
 
 def _hand_made(evaluator: CandidateEvaluator) -> DrawnCarry:

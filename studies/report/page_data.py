@@ -326,11 +326,11 @@ def _drive_groups(data: ReportData, drivable: Experiment, cell: int) -> Iterator
             if low <= limit <= high
         )
         yield Group(f"{label}, timed", some, f"{label}, timed", marker(carry.look, size=7))
-    for algorithm, front, opened in drivable.fronts():
+    for look, front, opened in drivable.fronts():
         some = tuple(
             PageTrajectory(front.source, front.x[k], cell) for k in evenly(len(front), MAX_FRONT)
         )
-        yield Group(front.source, some, front.title, marker(algorithm.look, opened))
+        yield Group(front.source, some, front.title, marker(look, opened))
 
 
 def _search_groups(data: ReportData) -> Iterator[Group]:
@@ -338,10 +338,10 @@ def _search_groups(data: ReportData) -> Iterator[Group]:
     picked = [PageTrajectory(c.source, c.x, job=data.job(c.label)) for c in data.carries]
     yield Group("Hand-made and selected", tuple(picked))
     two = len(data.objectives) >= 2
-    for algorithm, front, opened in data.fronts():
+    for style, front, opened in data.fronts():
         rows = evenly(len(front), MAX_FRONT)
         some = tuple(PageTrajectory(front.source, front.x[k], has_job=False) for k in rows)
-        look = marker(algorithm.look, opened) if two else None
+        look = marker(style, opened) if two else None
         yield Group(front.source, some, front.title, look, front.objectives[rows][:, :2])
 
 
@@ -378,10 +378,9 @@ def _drive_view(
 ) -> Plot:
     """Time against force of hand-made path, the other experiment's optimum and the fronts."""
     clouds, lines, drawn = [], [], []
-    for algorithm, front, _ in drivable.fronts():
-        if not front.polished:
-            at = drivable.driven(algorithm.shown.feasible)
-            clouds.append(cloud(front.title, at, algorithm.look))
+    for algorithm in drivable.solved:
+        at = drivable.driven(algorithm.shown.feasible)
+        clouds.append(cloud(algorithm.title, at, algorithm.look))
     for carry, label, curve in curves(data):
         dash = "dot" if carry is data.initial else "dash"
         lines.append(line(label, curve, carry.look.colour, dash))

@@ -108,11 +108,10 @@ def polish(data: ReportData) -> Figure:
     figure = new_figure(0.5)
     left, right = figure.subplots(1, 2)
     drawn = []
-    for algorithm, front, _ in data.fronts():
-        text = "polished" if front.polished else "search"
+    for look, front, opened in data.fronts():
         drawn.append(front.objectives)
-        look = algorithm.look.marks(4.0, opened=not front.polished)
-        left.plot(*front.objectives[:, :2].T, **look, label=f"{algorithm.title}: {text}")
+        style = look.marks(4.0, opened=opened)
+        left.plot(*front.objectives[:, :2].T, **style, label=front.title)
     _objectives(left, data)
     _zoom(left, data, drawn)
     left.legend(loc="upper right")
@@ -193,8 +192,8 @@ def duration_against_force(data: ReportData) -> Figure:
         drawn.append(curve)
     choice = data.summary.recommendation
     if data.drivable is not None:
-        for algorithm, front, opened in data.drivable.fronts():
-            found, look = data.drivable.driven(front.objectives), algorithm.look
+        for look, front, opened in data.drivable.fronts():
+            found = data.drivable.driven(front.objectives)
             axes.plot(*found.T, **look.marks(4.0, opened=opened), label=front.title)
             drawn.append(found)
         if choice is not None:
@@ -227,12 +226,14 @@ def _forget_unseen(axes: Axes) -> None:
 def _replicas(axes: Axes, drivable: Experiment, choice: StoredRecommendation) -> list[Array]:
     """Durations of the best fronts' paths at the same forces; returns the points of the medians."""
     # Where a front was polished, only the polished one.
-    looks = {f.title: a.look for a, f, opened in drivable.fronts() if not opened}
+    looks = {front.title: look for look, front, opened in drivable.fronts() if not opened}
     force, drawn = np.array(choice.durations.forces), []
     for row in choice.durations.rows:
         if row.label not in looks:
             continue
-        colour, label = looks[row.label].colour, f"{row.label}: {counted(row.replicas, 'replica')}"
+        colour, label = looks[row.label].colour, f"{row.label}: fastest path"
+        if row.replicas > 1:
+            label = f"{row.label}: {counted(row.replicas, 'replica')}"
         axes.plot(force, row.median, color=colour, linestyle="-", linewidth=0.9, label=label)
         axes.fill_between(force, row.least, row.largest, color=colour, alpha=0.2, linewidth=0.0)
         median = np.array(row.median)

@@ -157,7 +157,7 @@ def approaches(root: Path, reference: ReferenceFront) -> list[Gap]:
     for name in study.algorithms:
         searched, polished = [], []
         for replica in study.of(name):
-            front = study.polished(replica)
+            front = study.polished(name, replica.replica)
             if front is None:
                 raise ResultsError(f"{root}: replica {replica.replica} of {name} is not polished")
             searched.append(replica.front)

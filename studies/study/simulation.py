@@ -13,7 +13,14 @@ from typing import Annotated, Any
 import numpy as np
 
 from hybrid_opt.campaign import CampaignFolder, Stage, executor_for
-from hybrid_opt.campaign.settings import POLISHED_SUFFIX, RECOMMENDED, SELECTED, SIMULATED
+from hybrid_opt.campaign.settings import (
+    POLISHED_SUFFIX,
+    RECOMMENDED,
+    SELECTED,
+    SIMULATED,
+    UNION,
+    polished_selected_file,
+)
 from hybrid_opt.campaign.stages import ReadyCell, cells_of, ready_cells
 from hybrid_opt.display.table import Table, number
 from hybrid_opt.errors import ResultsError, WitnessError
@@ -240,26 +247,26 @@ Request = tuple[Array, float | None, int | None]
 """Decision vector, force limit [N], points of the curve."""
 
 
-def timing_stage(
-    force_limit: float | None = None, last: bool = False, curves: bool = True
-) -> Stage:
-    """The stage that writes `timing/`: one document per selected trajectory.
+def timing_stage(force_limit: float | None = None, curves: bool = True) -> Stage:
+    """The stage that writes `timing/`: one document per selected trajectory, but where the union of
+    all fronts was polished only for its own and those that a report shows.
 
     Args:
         force_limit: normal force [N] of an additional, force-limited timing.
-        last: whether of replicas that were polished only the polished one is timed.
         curves: whether those that a report shows are also timed at many force limits.
     """
 
     def run(folder: CampaignFolder, progress: Progress) -> None:
         selected = folder.root / SELECTED
         files = sorted(path.relative_to(selected) for path in selected.rglob("*.json"))
-        if last:
-            known = {str(path) for path in files}
-            files = [f for f in files if f"{f.parent}{POLISHED_SUFFIX}/{f.name}" not in known]
-        shown = set(read_summary(folder.root).shown_files.values()) if curves else set[Path]()
+        summary = read_summary(folder.root)
+        shown = set(summary.shown_files.values())
+        if summary.union is not None:
+            union = polished_selected_file(Path(), UNION, 0).relative_to(SELECTED)
+            files = [file for file in files if file in {*shown, union}]
+        timed = shown if curves else set[Path]()
         requests = [
-            (read_trajectory(selected / f).x, force_limit, CURVE_POINTS if f in shown else None)
+            (read_trajectory(selected / f).x, force_limit, CURVE_POINTS if f in timed else None)
             for f in files
         ]
         driven = folder.workcell.task.time_law == "optimal"

@@ -21,6 +21,7 @@ from hybrid_opt.campaign.settings import (
     SELECTED,
     STAGES,
     SUMMARY,
+    UNION,
     CampaignSettings,
     Seconds,
     StoredCell,
@@ -30,7 +31,7 @@ from hybrid_opt.campaign.settings import (
 )
 from hybrid_opt.carry import Carry
 from hybrid_opt.errors import ResultsError
-from hybrid_opt.front import SelectedCarry, select
+from hybrid_opt.front import Front, SelectedCarry, select
 from hybrid_opt.indicators import metrics
 from hybrid_opt.indicators.metrics import BindingBound, binding_bounds
 from hybrid_opt.indicators.statistics import (
@@ -120,7 +121,7 @@ class FrontFigures:
 
 @dataclass(frozen=True)
 class PolishedFigures(PolishEffort, FrontFigures):
-    """A replica's polished front, and the effort."""
+    """A polished front, and the effort."""
 
 
 @dataclass(frozen=True)
@@ -133,7 +134,7 @@ class ReplicaFigures(FrontFigures):
         seconds: what the search took.
         infeasible_by_reason: candidates by what made them infeasible.
         best_so_far: evaluations at which the best of an objective changed: number, then the best.
-        polished: None without a polish.
+        polished: None where the replica's front was not polished.
     """
 
     replica: Count
@@ -163,7 +164,7 @@ class AlgorithmFigures:
         representative: the replica with the largest hypervolume, None if it found nothing.
         statistics: by figure, over the replicas.
         replicas: in order.
-        polished: None without a polish.
+        polished: None where the replicas' fronts were not polished.
     """
 
     representative: int | None
@@ -196,7 +197,8 @@ class Bounds:
     """Bounds of the decision variables on which members of the best fronts lie.
 
     Attributes:
-        solutions: members of these fronts, polished where they were.
+        solutions: members of these fronts: of the polished union, else of all replicas' fronts,
+            polished where they were.
         binding: the bounds that some of them lie on.
     """
 
@@ -211,6 +213,7 @@ class CampaignSummary:
     Attributes:
         robots: their names, in the order of all pairs.
         hand_made: the workcell file's own trajectory, None where it has no forces.
+        union: of a drivable experiment the polished union of all fronts, None without a polish.
         recommendation: the carry to run, None where the study has none.
         no_recommendation: why it has none, '' where it has one or where the study is part of
             another, which recommends.
@@ -227,6 +230,7 @@ class CampaignSummary:
     algorithms: Mapping[str, AlgorithmFigures]
     tests: tuple[RankTest, ...]
     hand_made: SelectedEntry | None = None
+    union: PolishedFigures | None = None
     bounds: Bounds = Bounds(0, ())
     recommendation: StoredRecommendation | None = None
     no_recommendation: str = ""
@@ -460,14 +464,10 @@ def _run(folder: CampaignFolder, progress: Progress, not_asked: str) -> None:
             file = _store_selected(folder, selected_file(folder.root, *key), key, selected)
             entry = replica_figures(replica, reference, selected, file)
             best.append(replica.front_x)
-            front = results.polished(replica)
-            if front is not None:
-                chosen = select(evaluator, front.x)
-                path = polished_selected_file(folder.root, *key)
-                file = _store_selected(folder, path, key, chosen)
-                found = front_indicators(front.objectives, reference, chosen, file)
-                figures = PolishedFigures(**found, **vars(front.effort))
-                entry, best[-1] = replace(entry, polished=figures), front.x
+            polished = results.polished(*key)
+            if polished is not None:
+                entry = replace(entry, polished=_polished_figures(folder, polished, reference))
+                best[-1] = polished.x
             entries[replica.algorithm].append(entry)
             advance(1)
 
@@ -483,17 +483,30 @@ def _run(folder: CampaignFolder, progress: Progress, not_asked: str) -> None:
             surfaces = attainment_surfaces(fronts, PERCENTILES)
             levels = [[f"{p:g}", *row] for p, rows in surfaces.items() for row in rows.tolist()]
             write(f"{name}-attainment.csv", ["percentile", *names], levels)
-    hand_made, members = _store_hand_made(folder), np.concatenate(best)
+    union = results.polished(UNION)
+    hand_made = _store_hand_made(folder)
+    members = np.concatenate(best) if union is None else union.x
     choice = read_recommendation(folder.root)
     reason = choice.reason if isinstance(choice, NoRecommendation) else ""
     summary = replace(
         campaign_summary(results, reference, folder.cell.static_hold, entries),
         hand_made=hand_made,
+        union=None if union is None else _polished_figures(folder, union, reference),
         bounds=Bounds(len(members), binding_bounds(folder.workcell.task, members)),
         recommendation=None if isinstance(choice, NoRecommendation) else choice,
         no_recommendation=reason if choice else not_asked,
     )
     write_json(folder.root / SUMMARY, to_json(summary))
+
+
+def _polished_figures(folder: CampaignFolder, front: Front, reference: Array) -> PolishedFigures:
+    """The figures of a polished front, whose selected trajectory is stored."""
+    assert front.polished is not None
+    chosen = select(folder.cell.evaluator, front.x)
+    path = polished_selected_file(folder.root, *front.key)
+    file = _store_selected(folder, path, front.key, chosen)
+    found = front_indicators(front.objectives, reference, chosen, file)
+    return PolishedFigures(**found, **vars(front.polished.effort))
 
 
 def _store_hand_made(folder: CampaignFolder) -> SelectedEntry | None:

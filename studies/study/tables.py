@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
+from hybrid_opt.campaign.settings import UNION
 from hybrid_opt.display.table import NOTHING, Quantity, Table, counted, number
 from hybrid_opt.indicators.statistics import summarise
 from hybrid_opt.metaheuristics.registry import title
@@ -110,6 +111,8 @@ def quality(
             rows.append((label, *(_over_replicas(figures, key, mean=True) for key in _QUALITY)))
         if with_paper and algorithm in PAPER:
             rows.append((f"{title(algorithm)}, paper", *PAPER[algorithm][:2], *[NOTHING] * 4))
+    for label, figures in _polished_union(summary):
+        rows.append((label, *(_over_replicas(figures, key) for key in _QUALITY)))
     settings = summary.settings
     return Table(
         name,
@@ -119,6 +122,7 @@ def quality(
         f"Mean ± standard deviation of {counted(settings.replicas, 'replica')} of "
         f"{settings.evaluations} evaluations. Hypervolume: reference 1.1 in every objective. "
         "IGD: mean distance to the non-dominated union of the campaign. Spacing: Schott's."
+        + ("" if summary.union is None else f" {_OF_UNION}")
         + (" The paper's rows hold what its text states." if with_paper else ""),
     )
 
@@ -128,6 +132,14 @@ def _variants(name: str, entry: AlgorithmFigures) -> list[tuple[str, list[FrontF
     found: list[tuple[str, list[FrontFigures]]] = [(title(name), list(entry.replicas))]
     polished = [row.polished for row in entry.replicas if row.polished is not None]
     return found + ([(f"{title(name)} + polish", list(polished))] if polished else [])
+
+
+_OF_UNION = "Union: the non-dominated candidates of all replicas, polished as one front."
+
+
+def _polished_union(summary: CampaignSummary) -> list[tuple[str, list[FrontFigures]]]:
+    """The polished union of a drivable experiment's fronts, where there is one."""
+    return [] if summary.union is None else [(f"{UNION} + polish", [summary.union])]
 
 
 def _over_replicas(figures: Sequence[FrontFigures], key: str, mean: bool = False) -> str:
@@ -220,6 +232,10 @@ def replicas(summary: CampaignSummary) -> Table:
                 better = f"{polished.replicas_improved} of {len(figures)}"
                 gap = QUANTITIES["widest_gap"](polished.statistics["widest_gap"].median)
             rows.append((label, *(_over_replicas(figures, key) for key in keys), better, gap))
+    for label, figures in _polished_union(summary):
+        found = (_over_replicas(figures, key) for key in (*keys, "widest_gap"))
+        mean, payload, gap = found
+        rows.append((label, mean, payload, NOTHING, gap))
     headings = (ABOVE_REST.heading(), PAYLOAD.heading(), "better in")
     return Table(
         "replicas",
@@ -235,6 +251,7 @@ def effort(summary: CampaignSummary) -> Table:
     """Time of a replica; only printed and not stored, because times differ from run to run."""
     keys = ("seconds", "equivalent_evaluations")
     every = [each for name, entry in summary.algorithms.items() for each in _variants(name, entry)]
+    every += _polished_union(summary)
     return Table(
         "effort",
         "What a replica took.",
@@ -248,6 +265,7 @@ def effort(summary: CampaignSummary) -> Table:
 def _solvers(summary: CampaignSummary) -> str:
     """The solvers of the polish in a sentence, '' without one."""
     rows = [row.polished for entry in summary.algorithms.values() for row in entry.replicas]
+    rows.append(summary.union)
     names = sorted({polished.solver for polished in rows if polished is not None})
     return f" Solver of the polish: {' and '.join(names)}." if names else ""
 
@@ -338,7 +356,7 @@ def time_against_force(found: StoredRecommendation) -> Table:
             for row in table.rows
         ),
         "Every path timed anew at the force. Of fronts the fastest member: median over the "
-        "replicas [least, most].",
+        "replicas [least, most]. Union: of all replicas' fronts, polished as one.",
     )
 
 

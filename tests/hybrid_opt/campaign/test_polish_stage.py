@@ -56,15 +56,15 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_polished_front_is_feasible_certified_and_better(finished: Path) -> None:
-    (replica,) = read_campaign(finished).replicas
-    polished = read_polished(finished, replica, load(RACK))
+    (front,) = read_campaign(finished).searched
+    polished = read_polished(finished, front)
     assert polished is not None
     evaluator = CandidateEvaluator(load(RACK))
     again = evaluator.certified(evaluator.evaluate(polished.x))
     assert again.feasible.all()
     np.testing.assert_array_equal(again.objectives, polished.objectives)
     corner = metrics.REFERENCE_POINT
-    before = metrics.hypervolume(replica.front, corner)
+    before = metrics.hypervolume(front.objectives, corner)
     assert metrics.hypervolume(polished.objectives, corner) > before
     assert polished.polished.any()
     # Probes of one end and of the middle, the better of two of which goes on.
@@ -214,12 +214,12 @@ DAMAGE: list[tuple[dict[str, Callable[[Any], Any]], str]] = [
 def test_a_damaged_file_is_told(
     finished: Path, tmp_path: Path, damage: dict[str, Callable[[Any], Any]], told: str
 ) -> None:
-    (replica,) = read_campaign(finished).replicas
-    assert read_polished(tmp_path, replica, load(RACK)) is None
+    (front,) = read_campaign(finished).searched
+    assert read_polished(tmp_path, front) is None
     whole = json.loads((polished_folder(finished, "nsga2", 0) / POLISH).read_text())
     spoilt = whole | {key: change(whole[key]) for key, change in damage.items()}
     path = polished_folder(tmp_path, "nsga2", 0) / POLISH
     path.parent.mkdir(parents=True)
     path.write_text(json.dumps(spoilt))
     with pytest.raises(ResultsError, match=rf"damaged ?{told}.*; --resume computes it anew"):
-        read_polished(tmp_path, replica, load(RACK))
+        read_polished(tmp_path, front)

@@ -98,8 +98,8 @@ def test_polished_fronts_are_compared_too(polished_study: Path, study: Path) -> 
     found = compare(polished_study, polished_study)
     figures = {f.figure: f for f in found.figures if f.algorithm == "nsga2"}
     run = read_campaign(polished_study)
-    fronts = [run.polished(replica) for replica in run.of("nsga2")]
-    volumes = [metrics.hypervolume(front.objectives) for front in fronts if front is not None]
+    fronts = [front for front in run.fronts if front.polished and front.algorithm == "nsga2"]
+    volumes = [metrics.hypervolume(front.objectives) for front in fronts]
     assert len(volumes) == 2
     assert figures["polished_hypervolume"].first.median == pytest.approx(np.median(volumes))
     assert figures["polished_hypervolume"].first.mean >= figures["hypervolume"].first.mean

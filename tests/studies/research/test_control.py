@@ -46,8 +46,7 @@ def test_longer_searches_repeat_the_studys_own_settings(polished: Path) -> None:
 
 def test_distance_to_a_reference_front(polished: Path) -> None:
     own = read_campaign(polished)
-    found_fronts = [own.polished(replica) for replica in own.replicas]
-    fronts = [found.objectives for found in found_fronts if found is not None]
+    fronts = [front.objectives for front in own.fronts if front.polished]
     assert len(fronts) == 2
     union = metrics.front_of(np.concatenate(fronts))
     reference = ReferenceFront(own.workcell.digest, union, np.empty((len(union), 0)))

@@ -122,6 +122,21 @@ def test_study_opens_with_a_carry_to_run(program_run: tuple[Path, str], tmp_path
     assert max(jerk.joint_use, jerk.payload_use) == pytest.approx(1.0, abs=0.01)
 
 
+def test_drivable_fronts_are_polished_as_one_and_others_replica_by_replica(study: Path) -> None:
+    """Polishes of drivable fronts begin with the same best path: they would compare it with
+    itself."""
+    paper, drivable = read_campaign(study), read_campaign(study / "drivable")
+    replicas = [("nsga2", 0), ("nsga2", 1), ("mopso", 0), ("mopso", 1)]
+    assert [front.key for front in paper.to_polish] == replicas
+    (union,) = drivable.to_polish
+    assert union.key == ("union", 0)
+    points = np.concatenate([replica.front for replica in drivable.replicas])
+    np.testing.assert_array_equal(union.objectives, metrics.front_of(points))
+    every = np.concatenate([replica.front_x for replica in drivable.replicas])
+    assert (union.x[:, None] == every).all(axis=2).any(axis=1).all()
+    assert drivable.cell.evaluate(union.x).feasible.all()
+
+
 def test_another_wish_needs_no_other_study(
     program_run: tuple[Path, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
