@@ -64,6 +64,7 @@ class ArmKinematics:
         arm: index of the arm.
         geometry: its joints.
         redundant: indices of the joints that stay where they are; the other six follow the box.
+        common: indices of those that move the other arm too, in the order of the task.
         lower, upper: (joints,) limits [rad or m].
         least: manipulability of a first path.
     """
@@ -72,6 +73,7 @@ class ArmKinematics:
         self.workcell, self.arm = workcell, arm
         self.geometry = geometry = geometry or arm_geometry(workcell, arm)
         self.redundant = tuple(joint for joint, _ in workcell.task.redundant_of(arm))
+        self.common = [joint.drives[arm] for joint in workcell.task.redundant if joint.is_common]
         self.following = [k for k in range(geometry.joints) if k not in self.redundant]
         self.lower, self.upper = np.asarray(geometry.lower), np.asarray(geometry.upper)
         self.least = workcell.robots[arm].min_manipulability * MANIPULABILITY_MARGIN
@@ -148,22 +150,25 @@ class ArmKinematics:
             q[:, self.following] += move * (STEP_LIMIT / most)
         return Postures(q, residual, np.abs(np.linalg.det(J)))
 
-    def track(self, q: Array, target: Array) -> Postures:
-        """The next posture (n, joints) at placements (n, 4, 4), all joints moving: steps of least
-        norm that drift to the middle of the joints' ranges where the box leaves them free."""
+    def track(self, q: Array, target: Array, held: Sequence[int] = ()) -> Postures:
+        """Find the next posture (n, joints) at placements (n, 4, 4), all joints but those held
+        moving: steps of least norm that drift to the middle of the joints' ranges where the box
+        leaves them free."""
         q = np.array(q, dtype=float)
         middle = (self.lower + self.upper) / 2.0
+        moving = np.isin(np.arange(q.shape[1]), held, invert=True)
         for step in range(TRACKING_STEPS + 1):
             frames, T = self.chain(q)
             J = self.jacobian(frames, T)
             error, residual = _error(target, T)
             if step == TRACKING_STEPS:
                 break
-            inverted = J.transpose(0, 2, 1) @ np.linalg.inv(
-                J @ J.transpose(0, 2, 1) + 1e-9 * np.eye(6)
+            own = J * moving
+            inverted = own.transpose(0, 2, 1) @ np.linalg.inv(
+                own @ own.transpose(0, 2, 1) + 1e-9 * np.eye(6)
             )
-            drift = CENTRING * (middle - q) if step == 0 else np.zeros_like(q)
-            missing = error - np.einsum("nij,nj->ni", J, drift)
+            drift = CENTRING * (middle - q) * moving if step == 0 else np.zeros_like(q)
+            missing = error - np.einsum("nij,nj->ni", own, drift)
             q += drift + np.einsum("nij,nj->ni", inverted, missing)
         measure = np.abs(np.linalg.det(J[:, :, self.following]))
         return Postures(q, residual, measure)
@@ -176,7 +181,8 @@ class ArmKinematics:
         Args:
             targets: one path for all, or one for each, (m, n, 4, 4).
             ends: (n, redundant) where the redundant joints are at the end; None: they stay.
-            resolved: whether they go where the joints keep to the middle of their ranges.
+            resolved: whether they go where the joints keep to the middle of their ranges instead;
+                common ones only without `ends`.
 
         Returns:
             Joint paths (m, n, joints); of each posture the number of placements that it reached
@@ -193,9 +199,13 @@ class ArmKinematics:
                 begin = q[alive][:, redundant]
                 guess[:, redundant] = begin + (ends[alive] - begin) * (k / max(m - 1, 1))
             there = np.broadcast_to(target, (n, 4, 4))[alive]
-            found = (
-                self.track(before, there) if resolved else self.solve(guess, there, TRACKING_STEPS)
-            )
+            if resolved:
+                held = [] if ends is None else self.common
+                placed = before.copy()
+                placed[:, held] = guess[:, held]
+                found = self.track(placed, there, held)
+            else:
+                found = self.solve(guess, there, TRACKING_STEPS)
             near = np.abs(found.q - before).max(axis=1) <= JUMP
             on = (found.residual <= REACHED) & near
             alive, change = alive[on], found.q[on] - before[on] if k else change[on]
@@ -392,6 +402,8 @@ class HoldQuery:
         judge: of collisions; None: they do not count.
         starts: random starts of the search for postures.
         guides: how many of `GUIDES` are tried.
+        common: (2, k) joints that move both arms, at the start and at the goal [rad or m]; None:
+            they are free, as the other redundant ones.
     """
 
     start: Array
@@ -400,6 +412,7 @@ class HoldQuery:
     judge: PoseJudge | None
     starts: int = STARTS
     guides: int = len(GUIDES)
+    common: Array | None = None
 
 
 def find_holds(query: HoldQuery, kinematics: ArmKinematics, rng: np.random.Generator) -> HoldSearch:
@@ -445,6 +458,8 @@ class _Finder:
         half = (kinematics.upper - kinematics.lower) / 2.0
         half = np.where(kinematics.geometry.turning, np.minimum(half, np.pi), half)
         q = centre + half * self.rng.uniform(-1.0, 1.0, (self.query.starts, len(half)))
+        if self.query.common is not None:
+            q[:, kinematics.common] = self.query.common[0]
         solved = kinematics.solve(q, targets, SEARCH_STEPS, SEARCH_DAMPING)
         good = solved.residual <= REACHED
         q, which, measure = solved.q[good], which[good], solved.manipulability[good]
@@ -518,6 +533,7 @@ class _Finder:
             moving = self.rng.random(len(q)) < 0.5
             drawn = self.rng.uniform(low + LIMIT_MARGIN, high - LIMIT_MARGIN, ends.shape)
             ends[moving] = np.clip(drawn, ends - 2.0, ends + 2.0)[moving]
+            self._place_common(ends)
         path, kept, measure = kinematics.follow(q, targets, ends)
         path = path + kinematics.central(path)
         room = self._room(path)
@@ -531,12 +547,22 @@ class _Finder:
     def _resolved(self, targets: Array, q: Array) -> tuple[NDArray[np.intp], Array, Array]:
         """As `_followed`, the redundant joints where the others are best off; only the ends count,
         because what is planned between them need not follow the same path."""
-        path, kept, measure = self.kinematics.follow(q, targets, resolved=True)
+        ends = None
+        if self.query.common is not None:
+            ends = q[:, list(self.kinematics.redundant)]
+            self._place_common(ends)
+        path, kept, measure = self.kinematics.follow(q, targets, ends, resolved=True)
         room = self._room(path)
         self.found.kept = max(self.found.kept, float(kept.max(initial=0)) / len(targets))
         fine = (room[-1] >= LIMIT_MARGIN) & (measure[-1] >= self.kinematics.least)
         arrived = np.flatnonzero((kept == len(targets)) & fine)
         return arrived, path, self._score(path, room, measure)
+
+    def _place_common(self, ends: Array) -> None:
+        """Set the common joints among the redundant ones (n, redundant) to where they end."""
+        if self.query.common is not None:
+            columns = [self.kinematics.redundant.index(k) for k in self.kinematics.common]
+            ends[:, columns] = self.query.common[1]
 
     def _room(self, path: Array) -> Array:
         """(m, n) least distance to a joint limit of joint paths (m, n, joints)."""

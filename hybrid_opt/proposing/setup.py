@@ -7,16 +7,16 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
-from itertools import combinations, product
+from itertools import combinations, islice, product
 from typing import Any
 
 import numpy as np
 
 from hybrid_opt.errors import ProposalError
 from hybrid_opt.evaluate.explanation import missing_reach
+from hybrid_opt.proposing.common import common_positions
 from hybrid_opt.proposing.holding import (
     GUIDES,
-    LIMIT_MARGIN,
     REACHED,
     SEARCH_DAMPING,
     ArmKinematics,
@@ -45,11 +45,11 @@ GUIDES_TRIED = 3
 MOST_PAIRS = 32
 """Pairs that are looked at closer, the best of both arms' own scores."""
 
-SHARES = np.array([0.5, 0.25, 0.75, 0.0, 1.0])
-"""Shares of the way from the first arm's value to the second's, in the order they are tried."""
+ENOUGH_PAIRS = 4
+"""Pairs after which no further position of the joints that move both arms is tried."""
 
-STEPS = 15
-"""Newton steps from each arm's own posture."""
+MOST_POSITIONS = 6
+"""Most positions of these that are tried."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,12 +60,14 @@ class Pair:
         holds: of both arms.
         start, goal: the closed chain at both ends.
         chain: it, with a judge that keeps as much clearance as both ends do.
+        promise: larger is better.
     """
 
     holds: tuple[Hold, Hold]
     start: Place
     goal: Place
     chain: ClosedChain
+    promise: float
 
     @cached_property
     def retreats(self) -> Retreats:
@@ -76,34 +78,29 @@ class Pair:
 def ranked_pairs(
     workcell: Workcell, judge: PoseJudge, holds: Sequence[Sequence[Hold]], ends: tuple[Array, Array]
 ) -> list[Pair]:
-    """The pairs whose arms do not meet at start and goal, the most promising first.
+    """Return the pairs whose arms do not meet at start and goal, the most promising first.
 
     Args:
         workcell: with its redundant joints chosen.
         judge: of collisions, with nothing to spare.
-        holds: per arm.
+        holds: per arm, with the same positions of the joints that move both.
         ends: start and goal poses of the box (6,).
     """
     scored = [(a.score + b.score, (a, b)) for a in holds[0] for b in holds[1]]
     scored.sort(key=lambda item: -item[0])
     judges = cache(judge.with_margin)
     models = (arm_model(workcell.robots[0]), arm_model(workcell.robots[1]))
-    agreement = Agreement(workcell, ends)
-    found: list[tuple[float, Pair]] = []
-    for score, alone in scored[:MOST_PAIRS]:
-        pair = agreement.of(alone)
-        if pair is None:
-            continue
+    found: list[Pair] = []
+    for score, pair in scored[:MOST_PAIRS]:
         start, goal = (_place(workcell.task, pose, pair, k) for k, pose in enumerate(ends))
         wide = next(
             (judges(margin) for margin in MARGINS if _free(judges(margin), start, goal)), None
         )
         if wide is not None:
             chain = ClosedChain(workcell, wide, pair, models)
-            rank = _free_share(chain, start, goal) + 0.1 * score
-            found.append((rank, Pair(pair, start, goal, chain)))
-    found.sort(key=lambda item: -item[0])
-    return [pair for _, pair in found]
+            promise = _free_share(chain, start, goal) + 0.1 * score
+            found.append(Pair(pair, start, goal, chain, promise))
+    return sorted(found, key=lambda pair: -pair.promise)
 
 
 def _place(task: Task, pose: Array, holds: tuple[Hold, Hold], end: int) -> Place:
@@ -134,66 +131,6 @@ def _free_share(chain: ClosedChain, start: Place, goal: Place) -> float:
         back = sum(1 for _ in chain.along(goal, path[::-1])) if forth < len(path) else forth
         best = max(best, (forth + back) / (2 * len(path)))
     return best
-
-
-class Agreement:
-    """Moves the joints that move both arms to values that suit both."""
-
-    def __init__(self, workcell: Workcell, ends: tuple[Array, Array]) -> None:
-        """Prepare both arms.
-
-        Args:
-            workcell: with its redundant joints chosen.
-            ends: start and goal poses of the box (6,).
-        """
-        task = workcell.task
-        self._common = np.array(
-            [joint.drives for joint in task.redundant if min(joint.drives) >= 0], dtype=np.intp
-        ).reshape(-1, 2)
-        self._T_world_box = [box_placement(task.orientation, end) for end in ends]
-        self._arms = [ArmKinematics(workcell, arm) for arm in (0, 1)]
-
-    def of(self, holds: tuple[Hold, Hold]) -> tuple[Hold, Hold] | None:
-        """Both arms' ways to hold with the same values of the joints that move both, None where
-        no tried values suit both."""
-        if not len(self._common):
-            return holds
-        ends = [
-            self._agreed(end, (q_1, q_2), (holds[0].spin, holds[1].spin))
-            for end, (q_1, q_2) in enumerate(
-                ((holds[0].q_start, holds[1].q_start), (holds[0].q_goal, holds[1].q_goal))
-            )
-        ]
-        if ends[0] is None or ends[1] is None:
-            return None
-        first, second = (
-            replace(hold, q_start=ends[0][arm], q_goal=ends[1][arm])
-            for arm, hold in enumerate(holds)
-        )
-        return first, second
-
-    def _agreed(
-        self, end: int, q: tuple[Array, Array], spins: tuple[float, float]
-    ) -> tuple[Array, Array] | None:
-        """Both arms' postures at the start (0) or the goal (1)."""
-        own = [q[arm][self._common[:, arm]] for arm in (0, 1)]
-        values = own[0] + SHARES[:, None] * (own[1] - own[0])
-        moved, fine = [], np.ones(len(SHARES), dtype=bool)
-        for arm, kinematics in enumerate(self._arms):
-            begin = np.tile(q[arm], (len(SHARES), 1))
-            begin[:, self._common[:, arm]] = values
-            T_world_joint = self._T_world_box[end] @ kinematics.held(spins[arm])
-            found = kinematics.solve(begin, np.tile(T_world_joint, (len(SHARES), 1, 1)), STEPS)
-            inside = (found.q >= kinematics.lower + LIMIT_MARGIN) & (
-                found.q <= kinematics.upper - LIMIT_MARGIN
-            )
-            fine &= (found.residual <= REACHED) & (found.manipulability >= kinematics.least)
-            fine &= inside.all(axis=1)
-            moved.append(found.q)
-        if not fine.any():
-            return None
-        at = int(np.argmax(fine))
-        return moved[0][at], moved[1][at]
 
 
 POSTURES = 200
@@ -252,18 +189,24 @@ def prepare(
     if blocked:
         raise ProposalError(blocked)
     query = HoldQuery(start, goal, spins, judge)
-    searches = [find_holds(query, ArmKinematics(workcell, arm), rng) for arm in (0, 1)]
-    told = [
-        _arm_missing(robot, one)
-        for robot, one in zip(workcell.robots, searches, strict=True)
-        if not one.holds
-    ]
-    if told:
-        raise ProposalError("; ".join(told))
-    pairs = ranked_pairs(workcell, judge, [found.holds for found in searches], (start, goal))
+    arms = [ArmKinematics(workcell, arm) for arm in (0, 1)]
+    pairs: list[Pair] = []
+    tried: list[list[HoldSearch]] = []
+    for common in islice(common_positions(arms, query, rng), MOST_POSITIONS):
+        at = replace(query, common=common)
+        searches = [find_holds(at, arm, rng) for arm in arms]
+        tried.append(searches)
+        pairs += ranked_pairs(workcell, judge, [found.holds for found in searches], (start, goal))
+        if len(pairs) >= ENOUGH_PAIRS:
+            break
     if not pairs:
-        raise ProposalError(no_pair(query, judge, searches))
-    return Setup(given, workcell, pairs)
+        raise ProposalError(_no_pair(query, judge, max(tried, key=_progress)))
+    return Setup(given, workcell, sorted(pairs, key=lambda pair: -pair.promise))
+
+
+def _progress(searches: Sequence[HoldSearch]) -> tuple[float, ...]:
+    """Order searches of both arms by how far the arm that comes less far comes."""
+    return min((len(one.holds), one.kept, one.free, one.within) for one in searches)
 
 
 def redundancy(problem: Problem, workcell: Workcell) -> dict[str, Any]:
@@ -372,8 +315,15 @@ def _arm_missing(robot: Robot, search: HoldSearch) -> str:
     )
 
 
-def no_pair(query: HoldQuery, judge: PoseJudge, searches: Sequence[HoldSearch]) -> str:
-    """Which bodies of the two arms meet where each alone is free."""
+def _no_pair(query: HoldQuery, judge: PoseJudge, searches: Sequence[HoldSearch]) -> str:
+    """Say which arm cannot hold the box, or which bodies meet where either arm alone is free."""
+    told = [
+        _arm_missing(robot, one)
+        for robot, one in zip(judge.geometry.workcell.robots, searches, strict=True)
+        if not one.holds
+    ]
+    if told:
+        return "; ".join(told)
     met: Counter[tuple[str, str]] = Counter()
     for end, pose in enumerate((query.start, query.goal)):
         for a in searches[0].holds[:8]:

@@ -55,8 +55,8 @@ class CollisionBody(ContentRecord):
         frame: what it is fixed to.
         pieces: its convex pieces, in that frame.
         is_tool: whether it is part of a robot's tool.
-        carries: robots (0, 1) that are mounted on this link of a machine; None for a body that
-            is neither a standing part of one nor moved by both.
+        carries: arms (0, 1) of a machine that have this link as their mount, see
+            `symbolic.read.arms.ArmLinks`; None of a body that is no link, or has no such part.
         root: of a robot's link that stands, the robot and the pieces in its root; else None.
     """
 

@@ -304,7 +304,8 @@ class ArmLinks:
         moved: links behind the arm's first moving joint; those that only common joints move are
             listed with the first arm alone.
         still: links that stand still, listed with one arm only.
-        mount: the link with shapes that the arm is mounted on; '' where there is none.
+        mount: the last link with shapes before those of `moved` on the way to the flange: one that
+            stands still, or of the second arm one that common joints move; '' if there is none.
     """
 
     moved: tuple[str, ...]
@@ -333,7 +334,7 @@ def arm_links(robots: Arms, i: int) -> ArmLinks:
         common, on_other = common_joints(robots), _carriers(robots[1 - i])
         on_common = [link for link in moved if carried[link] in common]
         shared = [link for link in on_common if on_other.get(link) in common]
-        mount = _mount(robots[i], (*still, *shared))
+        mount = _mount(robots[i], (*still, *shared) if i else still)
         moved = [x for x in moved if x not in on_common or (i == 0 and x in shared)]
         still = [link for link in still if i == 0 and on_other.get(link) == UNMOVED]
     return ArmLinks(tuple(moved), tuple(still), mount)

@@ -66,6 +66,11 @@ class RedundantJoint:
     initial: Array
 
     @property
+    def is_common(self) -> bool:
+        """Whether it moves both arms."""
+        return min(self.drives) >= 0
+
+    @property
     def moving(self) -> NDArray[np.bool_]:
         """(n_waypoints,) where its value is a decision variable."""
         return np.asarray(self.lower < self.upper)

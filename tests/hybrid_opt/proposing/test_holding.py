@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import pairwise
+from itertools import islice, pairwise
+from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
@@ -23,22 +24,23 @@ from hybrid_opt.proposing.bases import (
     machine_places,
     shared_room,
 )
+from hybrid_opt.proposing.common import common_positions
 from hybrid_opt.proposing.holding import (
     ArmKinematics,
-    Hold,
     HoldQuery,
     clear_spins,
     find_holds,
     possible_spins,
 )
 from hybrid_opt.proposing.problem import Problem, read_problem
-from hybrid_opt.proposing.setup import Agreement
+from hybrid_opt.proposing.setup import Setup, prepare
 from hybrid_opt.proposing.trial import judge_of
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.geometry.pairs import build_geometry, coal_distance
 from symbolic.read.arms import arm_model
 from symbolic.read.cell import load
+from symbolic.read.editing import merged
 from symbolic.records import Body, Box, Workcell
 from symbolic.records.poses import box_placement, pose_matrix
 from symbolic.robot.branches import inverse_kinematics
@@ -47,6 +49,7 @@ from tests.hybrid_opt.proposing.problems import tiago_problem
 from tests.symbolic.cells import hand_cell
 from tests.symbolic.geometry.collision_cells import placed_pieces
 from tests.symbolic.read.samples import RACK
+from tests.torso import Torso
 
 SPINS: Array = 2.0 * np.pi * np.arange(12.0) / 12.0
 
@@ -147,40 +150,59 @@ def test_holds_hold_the_box_at_both_ends(rack_cell: Workcell) -> None:
             np.testing.assert_allclose(T, T_world_box @ kinematics.held(hold.spin), atol=1e-5)
 
 
-LIFT_JOINT = 0
-"""The lift's index in both arms."""
+@pytest.fixture(scope="module")
+def machine(tmp_path_factory: pytest.TempPathFactory) -> Setup:
+    """A machine with a waist that moves both arms, ready for a path."""
+    problem = read_problem(Torso().problem(tmp_path_factory.mktemp("waist")))
+    return prepare(problem, {}, SPINS, np.random.default_rng(1))
 
 
-def posture(arm: ArmKinematics, target: Array, lift: float) -> Array:
-    """One that holds the box within the limits, the lift at a height [m]."""
-    rng = np.random.default_rng(2)
-    begin = rng.uniform(arm.lower, arm.upper, (400, len(arm.lower)))
-    begin[:, LIFT_JOINT] = lift
-    found = arm.solve(begin, np.tile(target, (400, 1, 1)), 50, 1e-3)
-    inside = np.all((found.q > arm.lower + 0.02) & (found.q < arm.upper - 0.02), axis=1)
-    return np.asarray(found.q[(found.residual < 1e-6) & inside & (found.manipulability > 0.01)][0])
+def test_a_free_waist_leaves_what_a_held_one_allows(machine: Setup, tmp_path: Path) -> None:
+    """The position at which a locked joint is held comes first, before any other is compared."""
+    held = {"robots": [{"locked_joints": {"torso_joint_0": 0.0}}] * 2}
+    path = Torso().problem(tmp_path)
+    problem = read_problem(path)
+    problem = replace(problem, data=merged(problem.data, held))
+    assert prepare(problem, {}, SPINS, np.random.default_rng(1)).pairs
+    assert any(pair.start.q[0][0] == 0.0 == pair.goal.q[0][0] for pair in machine.pairs)
 
 
-def test_both_arms_end_on_one_lift_and_still_hold_the_box() -> None:
-    workcell = load(RACK.with_name("tiago.toml"))
-    start = workcell.task.waypoints[0].lower
-    T_world_box = pose_matrix(start[:3], start[3:])
+def test_both_arms_of_a_pair_hold_the_box_with_one_waist(machine: Setup) -> None:
+    workcell = machine.workcell
     arms = [ArmKinematics(workcell, arm) for arm in (0, 1)]
-    held = [T_world_box @ arm.held() for arm in arms]
-    holds = []
-    for arm, target, lift in zip(arms, held, (0.06, 0.10), strict=True):
-        q = posture(arm, target, lift)
-        holds.append(Hold(0.0, q, q, 1.0))
-    agreed = Agreement(workcell, (start, start)).of((holds[0], holds[1]))
-    assert agreed is not None
-    for end in ("q_start", "q_goal"):
-        first, second = (getattr(hold, end) for hold in agreed)
-        assert first[LIFT_JOINT] == second[LIFT_JOINT]
-        assert 0.06 <= first[LIFT_JOINT] <= 0.10
-        for arm, target, q in zip(arms, held, (first, second), strict=True):
-            np.testing.assert_allclose(arm.chain(q[None])[1][0], target, atol=1e-5)
-    pair = holds[0], holds[1]
-    assert Agreement(load(RACK), (start, start)).of(pair) is pair, "no joints in common"
+    assert [arm.common for arm in arms] == [[0], [0]]
+    task = workcell.task
+    for pair in machine.pairs:
+        for place, pose in (
+            (pair.start, task.waypoints[0].lower),
+            (pair.goal, task.waypoints[-1].lower),
+        ):
+            assert place.q[0][0] == place.q[1][0]
+            T_world_box = box_placement(task.orientation, pose)
+            for arm, hold, q in zip(arms, pair.holds, place.q, strict=True):
+                target = T_world_box @ arm.held(hold.spin)
+                np.testing.assert_allclose(arm.chain(q[None])[1][0], target, atol=1e-5)
+
+
+def test_a_waist_turns_where_the_box_is_beside_the_machine(machine: Setup) -> None:
+    """Compared by the postures that reach; the start and the goal lie at 50 and -50 degrees."""
+    task = machine.workcell.task
+    turned = [
+        np.array([0.40 * np.cos(a), 0.40 * np.sin(a), 0.85, 0.0, 0.0, a]) for a in (0.9, -0.9)
+    ]
+    arms = [ArmKinematics(machine.workcell, arm) for arm in (0, 1)]
+    query = HoldQuery(turned[0], turned[1], SPINS, None)
+    found = list(islice(common_positions(arms, query, np.random.default_rng(1)), 4))
+    assert found[0] is not None
+    np.testing.assert_array_equal(found[0], np.zeros((2, 1)))
+    for common in found[1:]:
+        assert common is not None
+        assert common[0, 0] > 0.3
+        assert common[1, 0] < -0.3
+    assert len(task.redundant) == 1
+    rack = load(RACK)
+    alone = [ArmKinematics(rack, arm) for arm in (0, 1)]
+    assert list(common_positions(alone, query, np.random.default_rng(1))) == [None]
 
 
 def other_branch(q: Array) -> Array:

@@ -12,6 +12,7 @@ import pinocchio as pin
 import pytest
 import trimesh
 
+from hybrid_opt.proposing.problem import read_problem
 from symbolic.array import Array
 from symbolic.errors import CollisionModelError
 from symbolic.geometry.bodies import MeshReader, _link_pieces, collision_bodies
@@ -47,6 +48,7 @@ from tests.symbolic.geometry.collision_cells import (
     whole_geometry_of,
 )
 from tests.symbolic.read.samples import RACK
+from tests.torso import Torso
 
 pytestmark = pytest.mark.filterwarnings("ignore::symbolic.geometry.hulls.CollisionModelWarning")
 
@@ -164,6 +166,29 @@ def test_reasons_of_the_rack(first: str, second: str, expected: str) -> None:
     found = reason(geometry_of("rack"), first, second)
     assert found.startswith(expected)
     assert bool(found) == bool(expected)
+
+
+@pytest.mark.parametrize("joints", [1, 2, 3])
+@pytest.mark.parametrize("held", [False, True])
+def test_links_on_either_side_of_any_joint_are_neighbours(
+    joints: int, held: bool, tmp_path: Path
+) -> None:
+    """Every link with the next one above it that has a shape, the pillar that stands included."""
+    torso = Torso(axes=("0 0 1", "0 1 0", "1 0 0")[:joints])
+    locked = {"locked_joints": {f"torso_joint_{k}": 0.0 for k in range(joints)}} if held else {}
+    geometry = build_geometry(read_problem(torso.problem(tmp_path, robots=[locked] * 2)).workcell())
+    found = {
+        frozenset(geometry.bodies[k].name.split("/")[1] for k in (pair.first, pair.second))
+        for pair in geometry.excluded
+        if "overlap at their joint" in pair.reason
+    }
+    above = {"chest": "torso_1" if joints > 2 else "torso_0" if joints > 1 else "pillar"}
+    above |= {"torso_1": "torso_0", "torso_0": "pillar"}
+    above = {} if held else {k: v for k, v in above.items() if k == "chest" or int(k[-1]) < joints}
+    above.pop(f"torso_{joints - 1}", None)
+    for side in ("left", "right"):
+        above |= {f"{side}_1": "chest", f"{side}_3": f"{side}_1", f"{side}_5": f"{side}_3"}
+    assert found == {frozenset(pair) for pair in above.items()}
 
 
 def test_the_user_may_leave_out_pairs_with_a_reason() -> None:
