@@ -9,7 +9,7 @@ from functools import partial
 from importlib import import_module
 from pathlib import Path
 
-from studies.program import BAD_INPUT, run_program
+from studies.program import BAD_INPUT, print_version, run_program
 from symbolic.records.problems import suggestion
 
 COMMAND = "dual-arm-carry"
@@ -46,6 +46,11 @@ def main(arguments: Sequence[str] | None = None, called: str = "python -m studie
     """
     known = programs()
     given = list(sys.argv[1:] if arguments is None else arguments)
+    if given[:1] == ["--version"]:
+        print_version()
+        return 0
+    if given[:1] == ["help"]:  # of a program, or the list
+        given = [*given[1:2], "--help"]
     if given and given[0] in known:
         module, _ = known[given[0]]
         code: int = import_module(module).main(given[1:], f"{called} {given[0]}")
@@ -56,7 +61,7 @@ def main(arguments: Sequence[str] | None = None, called: str = "python -m studie
         print(f"{called}: {word} is no program of it{meant}", file=sys.stderr)
         return BAD_INPUT
     front, width = f"{called} " if called == COMMAND else "python -m studies.", max(map(len, known))
-    print("Programs; each explains itself with --help.\n")
+    print("Programs; each explains itself with --help. --version prints the version.\n")
     for name, (_, told) in known.items():
         print(f"{front}{name:<{width}}  {told}")
     return 0

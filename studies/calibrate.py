@@ -12,23 +12,21 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from pathlib import Path
 
-from studies.options import add
+from studies.options import INPUT, OUTPUT_FILE, add
 from studies.program import FAULT, Parser, Program, load_workcell
 from symbolic.errors import SettingsError
-from symbolic.outside import replace_file
 
 
 def _add_options(parser: Parser) -> None:
     add(parser, "WORKCELL")
     parser.add_argument(
-        "runs", metavar="RUN", type=Path, nargs="+", help="a recording, RUN.toml beside it"
+        "runs", metavar="RUN", type=INPUT, nargs="+", help="a recording, RUN.toml beside it"
     )
     parser.add_argument(
         "--out",
         metavar="FILE",
-        type=Path,
+        type=OUTPUT_FILE,
         help="the workcell file to write (default: none is written)",
     )
     add(parser, "--json")
@@ -38,10 +36,9 @@ def calibrate(options: argparse.Namespace) -> int:
     """Do what the options ask for, and print it; returns the exit code."""
     from hybrid_opt.calibrating import evidence as found_in
     from hybrid_opt.calibrating.recording import read_run
+    from hybrid_opt.store.files import AGAIN, write_atomically
 
     output = options.out
-    if output is not None and not output.resolve().parent.is_dir():
-        raise SettingsError(f"{output.parent} is no folder; make it, or name another --out")
     if output is not None and output.resolve() == options.workcell.resolve():
         raise SettingsError(f"{output} is the workcell itself; name another file by --out")
     workcell = load_workcell(options.workcell)
@@ -49,7 +46,7 @@ def calibrate(options: argparse.Namespace) -> int:
     print(json.dumps(evidence.document, indent=2) if options.json else evidence)
     if output is not None and evidence.changes:
         text = found_in.calibrated_file(workcell.source, evidence, output.resolve())
-        replace_file(output, text.encode())
+        write_atomically(output, text.encode(), AGAIN)
         if not options.json:
             print(f"written: {output}")
     elif output is not None:

@@ -7,15 +7,15 @@ uses, collisions and the forces that the box needs. Exit code 1 where it cannot 
 
 from __future__ import annotations
 
-from pathlib import Path
-
-from studies.options import add, number, stated
+from studies.options import INPUT_FILE, add, number, stated
 from studies.program import Parser, Program
 
 
 def _add_options(parser: Parser) -> None:
     add(parser, "WORKCELL")
-    parser.add_argument("trajectory", metavar="TRAJECTORY", type=Path, help="the file to judge")
+    parser.add_argument(
+        "trajectory", metavar="TRAJECTORY", type=INPUT_FILE, help="the file to judge"
+    )
     parser.add_argument(
         "--held",
         nargs=2,

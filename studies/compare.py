@@ -8,15 +8,15 @@ depend on a reference front are computed anew against the union of both.
 
 from __future__ import annotations
 
-from pathlib import Path
-
-from studies.options import add
+from studies.options import RESULTS_FOLDER, add
 from studies.program import Parser, Program
 
 
 def _add_options(parser: Parser) -> None:
-    parser.add_argument("run_a", type=Path, metavar="RUN_A", help="a results folder")
-    parser.add_argument("run_b", type=Path, metavar="RUN_B", help="another results folder")
+    parser.add_argument("run_a", type=RESULTS_FOLDER, metavar="RUN_A", help="a results folder")
+    parser.add_argument(
+        "run_b", type=RESULTS_FOLDER, metavar="RUN_B", help="another results folder"
+    )
     add(parser, "--json")
 
 

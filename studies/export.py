@@ -6,9 +6,10 @@ and writes it as one bundle with a manifest, in a folder of its own below DIR.
 
 from __future__ import annotations
 
+import argparse
 from pathlib import Path
 
-from studies.options import add, stated
+from studies.options import add, require_extra, stated
 from studies.program import Parser, Program
 
 TIMINGS = ("closest", "fastest", "force")
@@ -92,7 +93,14 @@ def _add_options(parser: Parser) -> None:
     )
 
 
-main = Program("export", __doc__, _add_options, "studies.programs.trajectory.export_file")
+def _complete(options: argparse.Namespace) -> None:
+    if options.target == "mcap":
+        require_extra("ros", "a bundle for mcap")
+
+
+main = Program(
+    "export", __doc__, _add_options, "studies.programs.trajectory.export_file", complete=_complete
+)
 
 
 if __name__ == "__main__":

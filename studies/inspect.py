@@ -10,6 +10,9 @@ fail; with --view writes a page that shows the hand-made one at any sample.
 
 from __future__ import annotations
 
+import argparse
+from pathlib import Path
+
 from studies.options import add, whole
 from studies.program import Parser, Program
 
@@ -45,7 +48,17 @@ def _add_options(parser: Parser) -> None:
     add(parser, "--json")
 
 
-main = Program("inspect", __doc__, _add_options, "studies.programs.inspection.inspect")
+def _complete(options: argparse.Namespace) -> None:
+    options.output = options.output or Path("inspect") / options.workcell.stem
+
+
+main = Program(
+    "inspect",
+    __doc__,
+    _add_options,
+    "studies.programs.inspection.inspect",
+    complete=_complete,
+)
 
 
 if __name__ == "__main__":

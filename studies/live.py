@@ -12,7 +12,7 @@ import sys
 import threading
 
 import hybrid_opt as ho
-from studies.options import add, whole
+from studies.options import add, require_extra, whole
 from studies.program import Parser, Program, load_workcell
 
 
@@ -43,7 +43,13 @@ def serve(options: argparse.Namespace) -> int:
     return 0
 
 
-main = Program("live", __doc__, _add_options, "studies.live.serve")
+main = Program(
+    "live",
+    __doc__,
+    _add_options,
+    "studies.live.serve",
+    complete=lambda options: require_extra("live", "the live view"),
+)
 
 
 if __name__ == "__main__":

@@ -1,14 +1,24 @@
-"""Options of the programs: each is described once, what a number may be is said before any work."""
+"""Options of the programs, each described once; numbers, paths, extras are checked before work.
+
+Nothing heavy is imported here, so that a mistyped name is answered at once.
+"""
 
 from __future__ import annotations
 
 import argparse
 import ast
+import os
+import re
 from collections.abc import Callable
-from functools import cache
+from dataclasses import dataclass
+from functools import cache, partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, TypeVar
+
+from symbolic import outside
+from symbolic.errors import OutsideError, SettingsError, WorkcellError
+from symbolic.records.problems import suggestion
 
 LARGEST_SEED = 2**63 - 1
 
@@ -57,11 +67,185 @@ force = number(1e-3, 1e6)
 """The type of normal forces [N], and of durations [s] and masses [kg] that are wished for."""
 
 
+@dataclass(frozen=True)
+class PathType:
+    """The type of an argument that is a path.
+
+    Attributes:
+        check: raises a `DualArmError` where the path is not as the program needs it; called once
+            the whole command line is parsed.
+    """
+
+    check: Callable[[Path], None]
+
+    def __call__(self, text: str) -> Path:
+        """Convert the argument."""
+        return Path(text)
+
+
+WORKCELL, TRAJECTORY, RESULTS = "a workcell file", "a trajectory file", "a results folder"
+"""Kinds of inputs that are recognised by their content."""
+
+_HEAD_BYTES = 4096
+"""Part of a JSON file in which its format is looked for."""
+
+_FORMAT = re.compile(rb'"format"\s*:\s*"dual-arm-carry trajectory"')
+_SECTION = re.compile(rb"^\s*\[+\s*(task|payload|robots|contacts)\b", re.MULTILINE)
+
+
+def _kind_of(path: Path) -> str:
+    """Name what a path holds; '' where that is unknown."""
+    if path.is_dir():
+        is_study = (path / stated("hybrid_opt.campaign.settings.CONFIGURATION")).exists()
+        return RESULTS if is_study else "a folder"
+    try:
+        with open(path, "rb") as file:
+            head = file.read(_HEAD_BYTES)
+            if head.lstrip()[:1] == b"{":
+                return TRAJECTORY if _FORMAT.search(head) else ""
+            return WORKCELL if _SECTION.search(head + file.read(outside.WORKCELL_BYTES)) else ""
+    except OSError:
+        return ""
+
+
+def _require_file(path: Path, kind: str = "") -> None:
+    """Refuse what cannot be read as a file, or is recognised as something other than `kind`."""
+    try:
+        outside.require(path, outside.MOST_BYTES)
+    except OutsideError as error:
+        raise SettingsError(f"{path}: {error}{_expected(path, kind)}") from error
+    found = _kind_of(path)
+    if kind and found not in ("", kind):
+        raise SettingsError(f"{path}: is {found}{_expected(path, kind)}")
+
+
+def _expected(path: Path, kind: str) -> str:
+    """What a message ends with: the kind that is expected, and where one may lie."""
+    expected = f"; expected is {kind}" if kind else ""
+    if not path.exists():
+        folder = path.parent
+        names = [each.name for each in folder.iterdir()] if folder.is_dir() else []
+        return f"{expected}{suggestion(path.name, names)}"
+    if kind == TRAJECTORY:
+        name = stated("hybrid_opt.campaign.settings.RECOMMENDED")
+        known = path / name if (path / name).exists() else f"results/NAME/{name}"
+        return f"{expected}, as studies write it: {known}"
+    return expected
+
+
+def _require_workcell(path: Path) -> None:
+    _require_file(path, WORKCELL)
+    try:
+        outside.toml_tables(outside.read_bytes(path, outside.WORKCELL_BYTES))
+    except OutsideError as error:
+        raise WorkcellError(str(path), (f"file: {error}",)) from error
+
+
+def _require_folder(path: Path, kind: str = "a folder") -> None:
+    if not path.exists():
+        raise SettingsError(f"{path}: does not exist{_expected(path, kind)}")
+    if not path.is_dir():
+        raise SettingsError(f"{path}: is {_kind_of(path) or 'a file'}{_expected(path, kind)}")
+
+
+def _require_results(path: Path) -> None:
+    _require_folder(path, RESULTS)
+    name = stated("hybrid_opt.campaign.settings.CONFIGURATION")
+    if not os.path.lexists(path / name):
+        raise SettingsError(f"{path}: is no results folder, {name} is missing")
+
+
+def _require_any(path: Path) -> None:
+    if not path.exists():
+        raise SettingsError(f"{path}: does not exist{_expected(path, '')}")
+
+
+def _require_place(path: Path) -> None:
+    """Refuse a path that cannot be written or made by this user."""
+    existing = next(each for each in (path, *path.absolute().parents) if each.exists())
+    if existing != path and not existing.is_dir():
+        raise SettingsError(f"{path}: cannot be made, {existing} is a file")
+    if not os.access(existing, os.W_OK | (os.X_OK if existing.is_dir() else 0)):
+        raise SettingsError(f"{path}: cannot be written, {existing} is read-only for this user")
+
+
+def _require_output_file(path: Path) -> None:
+    if path.is_dir():
+        raise SettingsError(f"{path}: is a folder; name a file")
+    _require_place(path)
+
+
+def _require_output_folder(path: Path) -> None:
+    if path.exists() and not path.is_dir():
+        raise SettingsError(f"{path}: is a file; name a folder")
+    _require_place(path)
+
+
+def _require_film(path: Path) -> None:
+    if path.suffix.lower() not in (".gif", ".mp4"):
+        raise SettingsError(f"{path}: the name of an animation must end in .gif or .mp4")
+    if path.suffix.lower() == ".mp4":
+        require_extra("video", "an MP4 (a .gif needs nothing)")
+    _require_output_file(path)
+
+
+WORKCELL_FILE = PathType(_require_workcell)
+TRAJECTORY_FILE = PathType(partial(_require_file, kind=TRAJECTORY))
+INPUT_FILE = PathType(_require_file)
+INPUT_FOLDER = PathType(_require_folder)
+INPUT = PathType(_require_any)
+RESULTS_FOLDER = PathType(_require_results)
+OUTPUT_FILE = PathType(_require_output_file)
+OUTPUT_FOLDER = PathType(_require_output_folder)
+FILM_FILE = PathType(_require_film)
+"""What programs read and write. Folders of outputs are made where they are missing."""
+
+
+def check_paths(parser: argparse.ArgumentParser, options: argparse.Namespace) -> None:
+    """Check every path of a command line, inputs first in the order of the help.
+
+    Raises:
+        DualArmError: one is not as the program needs it.
+    """
+    for action in parser._actions:
+        value = getattr(options, action.dest, None)
+        if isinstance(action.type, PathType) and value is not None:
+            for path in value if isinstance(value, list) else [value]:
+                action.type.check(path)
+
+
+EXTRAS = {
+    "dask": ("distributed",),
+    "live": ("viser",),
+    "propose": ("cma", "ompl"),
+    "ros": ("mcap", "rosbags"),
+    "sim": ("mujoco",),
+    "video": ("imageio_ffmpeg",),
+}
+"""Modules of the extras of `pyproject.toml` that a program or an option cannot do without."""
+
+
+def require_extra(extra: str, use: str) -> None:
+    """Refuse what needs an extra that is not installed; nothing of it is imported.
+
+    Args:
+        extra: of `EXTRAS`.
+        use: what needs it, for the message.
+
+    Raises:
+        SettingsError: a module of it is missing.
+    """
+    missing = [name for name in EXTRAS[extra] if find_spec(name) is None]
+    if missing:
+        command = f"pip install 'dual-arm-carry[{extra}]'"
+        raise SettingsError(f"{use} needs {' and '.join(missing)}: {command}")
+
+
 _SHARED: dict[str, dict[str, Any]] = {
-    "WORKCELL": {"type": Path, "help": "the workcell file"},
-    "PROBLEM": {"type": Path, "help": "the problem file"},
-    "RESULTS": {"type": Path, "help": "results folder of a study"},
-    "FILE": {"help": "a trajectory file"},
+    "WORKCELL": {"type": WORKCELL_FILE, "help": "the workcell file"},
+    "PROBLEM": {"type": WORKCELL_FILE, "help": "the problem file"},
+    "RESULTS": {"type": RESULTS_FOLDER, "help": "results folder of a study"},
+    "FILE": {"type": TRAJECTORY_FILE, "help": "a trajectory file"},
     "--classes": {"type": whole(1, 100), "default": 1, "metavar": "N"},
     "--force-limit": {"type": force, "metavar": "N"},
     "--jobs": {
@@ -77,7 +261,7 @@ _SHARED: dict[str, dict[str, Any]] = {
         "default": 1,
         "help": "the arm that keeps its place",
     },
-    "--output": {"type": Path},
+    "--output": {"type": OUTPUT_FOLDER},
     "--quiet": {
         "action": "store_true",
         "help": "no progress on standard error (default: shown)",
@@ -130,7 +314,7 @@ def add_looks(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("looking at a trajectory")
     group.add_argument(
         "--animation",
-        type=Path,
+        type=FILM_FILE,
         metavar="FILE",
         help="write the selected trajectory as FILE.gif or FILE.mp4 (default: none)",
     )

@@ -17,6 +17,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
+from studies.options import PathType, check_paths
 from symbolic import outside
 from symbolic.errors import DualArmError, DualArmWarning, OutsideError, WorkcellError
 from symbolic.records.problems import suggestion
@@ -39,7 +40,7 @@ class _Help(argparse.HelpFormatter):
     """Tells the default of every option, unless its text does; numbers stand as N."""
 
     def _get_default_metavar_for_optional(self, action: argparse.Action) -> str:
-        if action.type in (None, Path):
+        if action.type is None or isinstance(action.type, PathType):
             return super()._get_default_metavar_for_optional(action)
         return "N"
 
@@ -81,6 +82,24 @@ class Parser(argparse.ArgumentParser):
         self.exit(BAD_INPUT, f"{self.prog}: {message}{''.join(meant)}; see --help\n")
 
 
+class _Version(argparse.Action):
+    """Looks the version up only where it is asked for."""
+
+    def __init__(self, option_strings: Sequence[str], dest: str, help: str) -> None:
+        super().__init__(option_strings, argparse.SUPPRESS, nargs=0, help=help)
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
+        print_version()
+        parser.exit()
+
+
+def print_version() -> None:
+    """Print the installed version of the project."""
+    from hybrid_opt import __version__
+
+    print(f"dual-arm-carry {__version__}")
+
+
 @dataclass(frozen=True)
 class Program:
     """A program: `python -m studies.NAME`, or `dual-arm-carry NAME`.
@@ -96,6 +115,8 @@ class Program:
             of a function that does, its libraries in one thread. Beside the options it finds
             `called`, as the program was called, and `arguments`, the words of its command line.
         interrupted: what to say after Ctrl-C.
+        complete: fills in places that follow from other options and requires the extras that the
+            options need; called before paths are checked.
     """
 
     name: str
@@ -103,6 +124,7 @@ class Program:
     add_options: Callable[[Parser], None]
     run: Callable[[argparse.Namespace], int] | str
     interrupted: str = "interrupted"
+    complete: Callable[[argparse.Namespace], None] = lambda options: None
 
     @property
     def module(self) -> str:
@@ -113,6 +135,7 @@ class Program:
         """The parser of its options; `called` says how it is called, '' for `python -m`."""
         parser = Parser(prog=called or f"python -m {self.module}", description=self.description)
         self.add_options(parser)
+        parser.add_argument("--version", action=_Version, help="print the version and end")
         parser.add_argument(
             VERBOSE,
             action="store_true",
@@ -128,6 +151,8 @@ class Program:
         def work() -> int:
             options = parser.parse_args(given)
             options.called, options.arguments = parser.prog, given
+            self.complete(options)
+            check_paths(parser, options)
             return _done(self.run, options) if isinstance(self.run, str) else self.run(options)
 
         return carry_out(parser.prog, work, self.interrupted)

@@ -12,10 +12,9 @@ import argparse
 import sys
 from collections.abc import Callable
 
-from studies.options import add, number, stated, whole
+from studies.options import OUTPUT_FILE, add, number, require_extra, stated, whole
 from studies.program import Parser, Program
 from symbolic.errors import SettingsError
-from symbolic.outside import replace_file
 
 
 def _ranges(text: str) -> tuple[tuple[float, float], tuple[float, float]]:
@@ -37,6 +36,7 @@ def _add_options(parser: Parser) -> None:
     add(
         parser,
         "--output",
+        type=OUTPUT_FILE,
         metavar="FILE",
         help="the workcell file (default: NAME-proposed.toml beside the problem file)",
     )
@@ -82,15 +82,9 @@ def _run(options: argparse.Namespace) -> int:
 
     import hybrid_opt as ho
     from hybrid_opt.proposing.proposal import worked
+    from hybrid_opt.store.files import AGAIN, write_atomically
 
-    problem = options.problem
-    output = options.output or problem.with_name(f"{problem.stem}-proposed.toml")
-    if output.resolve() == problem.resolve():
-        raise SettingsError(f"{output} is the problem file; name another one by --output")
-    if not output.parent.is_dir():
-        raise SettingsError(
-            f"{output.parent} is no folder; make it, or name another one by --output"
-        )
+    problem, output = options.problem, options.output
     own = sys.argv[-len(options.arguments) :] == options.arguments
     begun = 0.0 if own else worked()  # of a process of its own imports count
     tell = (lambda text: None) if options.quiet else _teller(lambda: worked() - begun)
@@ -109,12 +103,12 @@ def _run(options: argparse.Namespace) -> int:
         print(table.text())
     for k, proposal in enumerate(proposals, 1):
         name = output if k == 1 else output.with_stem(f"{output.stem}-{k}")
-        replace_file(name, proposal.text(name.parent).encode())
+        write_atomically(name, proposal.text(name.parent).encode(), AGAIN)
         print(f"{name}: {proposal}")
     if options.grips is not None:
         grip = ho.propose_grip(ho.Cell.load(output), *options.grips)
         assert grip.cell.workcell.text is not None, "it was read from a file"
-        replace_file(output, grip.cell.workcell.text)
+        write_atomically(output, grip.cell.workcell.text, AGAIN)
         print(f"{output}: {grip}")
     return 0
 
@@ -131,7 +125,17 @@ def _teller(worked: Callable[[], float]) -> Callable[[str], None]:
     return tell
 
 
-main = Program("propose", __doc__, _add_options, _run, "interrupted; nothing was written")
+def _complete(options: argparse.Namespace) -> None:
+    problem = options.problem
+    options.output = options.output or problem.with_name(f"{problem.stem}-proposed.toml")
+    if options.output.resolve() == problem.resolve():
+        raise SettingsError(f"{options.output} is the problem file; name another one by --output")
+    require_extra("propose", "a proposal")
+
+
+main = Program(
+    "propose", __doc__, _add_options, _run, "interrupted; nothing was written", _complete
+)
 
 
 if __name__ == "__main__":

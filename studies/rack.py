@@ -7,7 +7,7 @@ from functools import partial
 from importlib.resources import as_file, files
 
 from studies.program import Program
-from studies.run import DESCRIPTION, add_options, study_of
+from studies.run import DESCRIPTION, add_options, complete, study_of
 
 
 def _run(options: argparse.Namespace) -> int:
@@ -15,7 +15,13 @@ def _run(options: argparse.Namespace) -> int:
         return study_of(folder / "workcells" / "rack.toml", options, with_paper=True)
 
 
-main = Program("rack", DESCRIPTION, partial(add_options, output="results/rack"), _run)
+main = Program(
+    "rack",
+    DESCRIPTION,
+    partial(add_options, output="results/rack"),
+    _run,
+    complete=partial(complete, name="rack"),
+)
 
 
 if __name__ == "__main__":

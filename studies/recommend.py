@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import argparse
 
-from studies.options import add, add_wishes
+from studies.options import OUTPUT_FILE, add, add_wishes
 from studies.program import Parser, Program
 
 
@@ -18,6 +18,7 @@ def _add_options(parser: Parser) -> None:
     add(
         parser,
         "--output",
+        type=OUTPUT_FILE,
         metavar="FILE",
         help="the trajectory file (default: recommended-WISH.json in RESULTS)",
     )
@@ -30,14 +31,20 @@ def _run(options: argparse.Namespace) -> int:
     from studies.study.recommendation import recommend_from, recommendation_text
 
     wish, root = Wish(options.duration, options.force_limit, options.payload), options.results
-    named = "-".join(f"{name}-{value:g}" for name, value in wish.given.items()) or "least-product"
-    path = options.output or root / f"recommended-{named}.json"
-    found = recommend_from(root, wish, path, Progress(not options.quiet))
+    found = recommend_from(root, wish, options.output, Progress(not options.quiet))
     print(recommendation_text(found, str(root)).terminal())
     return 0
 
 
-main = Program("recommend", __doc__, _add_options, _run)
+def _complete(options: argparse.Namespace) -> None:
+    wishes = {"duration": options.duration, "force": options.force_limit}
+    wishes["payload"] = options.payload
+    named = "-".join(f"{name}-{value:g}" for name, value in wishes.items() if value is not None)
+    file = f"recommended-{named or 'least-product'}.json"
+    options.output = options.output or options.results / file
+
+
+main = Program("recommend", __doc__, _add_options, _run, complete=_complete)
 
 
 if __name__ == "__main__":

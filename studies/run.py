@@ -22,6 +22,7 @@ from studies.options import (
     add,
     add_looks,
     add_wishes,
+    require_extra,
     stated,
 )
 from studies.program import Parser, Program, carry_out
@@ -242,8 +243,22 @@ def _add_options(parser: Parser) -> None:
     add_options(parser, "results/WORKCELL")
 
 
+def complete(options: argparse.Namespace, name: str) -> None:
+    """Fill in the results folder of a study of this name, and require the extras it needs."""
+    ending = "-recommended" if options.recommend_only else ""
+    options.output = options.output or Path("results") / f"{name}{ending}"
+    if options.simulate:
+        require_extra("sim", "--simulate")
+    if options.executor == "dask":
+        require_extra("dask", "--executor dask")
+
+
 main = Program(
-    "run", DESCRIPTION, _add_options, lambda options: study_of(options.workcell, options)
+    "run",
+    DESCRIPTION,
+    _add_options,
+    lambda options: study_of(options.workcell, options),
+    complete=lambda options: complete(options, options.workcell.stem),
 )
 
 

@@ -14,6 +14,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from studies.options import INPUT_FILE
 from studies.program import FAULT, Parser, Program
 from symbolic import outside
 from symbolic.errors import OutsideError, SceneError
@@ -24,11 +25,11 @@ if TYPE_CHECKING:
 
 
 def _add_options(parser: Parser) -> None:
-    parser.add_argument("scene", metavar="SCENE", type=Path, help="the scene's file")
+    parser.add_argument("scene", metavar="SCENE", type=INPUT_FILE, help="the scene's file")
     parser.add_argument(
         "--into",
         metavar="WORKCELL",
-        type=Path,
+        type=INPUT_FILE,
         help="the workcell or problem file that gets the bodies (default: they are printed, meshes "
         "relative to this folder)",
     )

@@ -7,7 +7,7 @@ robust forces.
 
 from __future__ import annotations
 
-from studies.options import PADS, add, number, stated, whole
+from studies.options import FILM_FILE, OUTPUT_FILE, PADS, add, number, require_extra, stated, whole
 from studies.program import Parser, Program
 
 
@@ -60,14 +60,26 @@ def _add_options(parser: Parser) -> None:
         "--sweep", action="store_true", help="the threshold at half and twice the time step, too"
     )
     parser.add_argument(
-        "--film", metavar="FILE", help="write the simulated motion, .gif or .mp4 (with arms)"
+        "--film",
+        type=FILM_FILE,
+        metavar="FILE",
+        help="write the simulated motion, .gif or .mp4 (with arms)",
     )
     parser.add_argument(
-        "--mjcf", metavar="FILE", help="write the simulated cell as MuJoCo reads it (with arms)"
+        "--mjcf",
+        type=OUTPUT_FILE,
+        metavar="FILE",
+        help="write the simulated cell as MuJoCo reads it (with arms)",
     )
 
 
-main = Program("simulate", __doc__, _add_options, "studies.programs.simulation.simulate_file")
+main = Program(
+    "simulate",
+    __doc__,
+    _add_options,
+    "studies.programs.simulation.simulate_file",
+    complete=lambda options: require_extra("sim", "a simulation"),
+)
 
 
 if __name__ == "__main__":

@@ -10,7 +10,7 @@ from __future__ import annotations
 import argparse
 import math
 
-from studies.options import add, number, whole
+from studies.options import TRAJECTORY_FILE, add, number, whole
 from studies.program import Parser, Program
 
 MOST_VALUES = 1000
@@ -45,6 +45,7 @@ def _add_options(parser: Parser) -> None:
     )
     parser.add_argument(
         "--path",
+        type=TRAJECTORY_FILE,
         metavar="FILE",
         help="keep the path of this trajectory file throughout (default: the path that is "
         "recommended for the cell, polished in every changed cell)",

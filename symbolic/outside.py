@@ -35,6 +35,9 @@ MESH_BYTES = 64 * MEBIBYTE
 CELL_BYTES = 128 * MEBIBYTE
 """Largest workcell file, URDF, mesh, and sum of all files that one workcell names."""
 
+MOST_BYTES = 512 * MEBIBYTE
+"""Largest file that is read, whatever it is."""
+
 MOST_VALUES = 1_000_000
 """Most values of one JSON document: each takes up to about 200 bytes once it is read."""
 

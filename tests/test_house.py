@@ -13,6 +13,8 @@ from pathlib import Path
 
 import pytest
 
+from studies.options import EXTRAS
+
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("symbolic", "codegen", "hybrid_opt", "studies")
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
@@ -86,7 +88,9 @@ def test_build_and_run_time_versions_agree() -> None:
 def test_messages_name_extras_as_a_user_of_the_wheel_installs_them() -> None:
     texts = [path.read_text("utf-8") for name in PACKAGES for path in (ROOT / name).rglob("*.py")]
     named = [found for text in texts for found in re.findall(r"pip install [^\n`]*\[.*?\]", text)]
-    extras = [re.search(r"dual-arm-carry\[(\w+)\]", each) for each in named]
+    extras = [re.search(r"dual-arm-carry\[\{?(\w+)\}?\]", each) for each in named]
     assert len(named) >= 8
     assert all(extras), named
-    assert {each[1] for each in extras if each} <= set(PROJECT["project"]["optional-dependencies"])
+    known = set(PROJECT["project"]["optional-dependencies"])
+    assert {each[1] for each in extras if each} - {"extra"} <= known
+    assert set(EXTRAS) <= known

@@ -251,6 +251,8 @@ def read_configuration(root: str | Path) -> Configuration:
         ResultsError: the folder holds none, a damaged one, or one of another version.
     """
     path = Path(root) / CONFIGURATION
+    if not path.parent.exists():
+        raise ResultsError(f"{root}: does not exist; name the results folder of a study")
     if not path.exists():
         raise ResultsError(f"{root}: is no results folder, {CONFIGURATION} is missing")
     remedy = "run the study again into another --output"

@@ -35,9 +35,6 @@ Record = TypeVar("Record")
 
 LOCK = ".lock"
 
-MOST_BYTES = 512 * outside.MEBIBYTE
-"""Largest file of a results folder that is read."""
-
 RESUME = "make room and continue with --resume"
 AGAIN = "make room and try again"
 """Advice about a full disk: for a study's own files, and for any other."""
@@ -195,10 +192,10 @@ def read_bytes(path: Path) -> bytes:
     """A file's content.
 
     Raises:
-        ResultsError: it cannot be read, is no regular file, or larger than `MOST_BYTES`.
+        ResultsError: it cannot be read, is no regular file, or larger than `outside.MOST_BYTES`.
     """
     try:
-        return outside.read_bytes(path, MOST_BYTES)
+        return outside.read_bytes(path, outside.MOST_BYTES)
     except OutsideError as error:
         raise ResultsError(f"{path}: {error}") from error
 

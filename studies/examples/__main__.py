@@ -10,6 +10,7 @@ import argparse
 from importlib.resources import files
 from pathlib import Path
 
+from studies.options import OUTPUT_FOLDER
 from studies.program import Parser, Program
 
 SHIPPED = ("examples/[0-9]*.py", "problems/*.toml", "robots/*.urdf", "workcells/*.toml")
@@ -20,7 +21,7 @@ def _add_options(parser: Parser) -> None:
     parser.add_argument(
         "folder",
         metavar="FOLDER",
-        type=Path,
+        type=OUTPUT_FOLDER,
         nargs="?",
         default=Path("."),
         help="a folder without a folder studies in it (default: this one)",

@@ -387,7 +387,7 @@ def inspect(options: argparse.Namespace) -> int:
     Raises:
         DualArmError: the workcell is wrong, or a picture cannot be written.
     """
-    output = options.output or Path("inspect") / options.workcell.stem
+    output = options.output
     findings = inspected(
         load_workcell(options.workcell),
         options.candidates,

@@ -44,7 +44,6 @@ from hybrid_opt.polishing.settings import (
 from hybrid_opt.progress import Progress
 from hybrid_opt.recommending.choice import Wish
 from hybrid_opt.static_hold import require_hold
-from hybrid_opt.witness.box import mujoco_module
 from studies.options import QUICK_EVALUATIONS, QUICK_REPLICAS
 from studies.program import load_workcell
 from studies.report import PAGE, TABLES
@@ -223,8 +222,6 @@ def make_study(path: Path, options: argparse.Namespace, with_paper: bool) -> Non
     Raises:
         DualArmError: the workcell, an option or the results folder is wrong, or work failed.
     """
-    if options.simulate:
-        mujoco_module()  # a missing simulator is reported before hours of work
     cell = load_workcell(path)
     if options.recommend_only:
         drivable = Cell(cell).drivable()  # keeps the file of its workcell
@@ -233,9 +230,8 @@ def make_study(path: Path, options: argparse.Namespace, with_paper: bool) -> Non
     settings = campaign_settings(options, DRIVABLE_OBJECTIVES if driven else PAPER_OBJECTIVES)
     alone = is_drivable(cell, settings.objectives)
     polishable = alone or (not driven and settings.objectives in FORCE_PAIRS)
-    name = f"{path.stem}-recommended" if options.recommend_only else path.stem
     execution = ExecutionSettings(
-        output=options.output or Path("results") / name,
+        output=options.output,
         jobs=options.jobs,
         executor=options.executor,
         scheduler=options.scheduler,

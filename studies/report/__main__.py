@@ -6,9 +6,8 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 
-from studies.options import add, add_looks
+from studies.options import INPUT_FILE, add, add_looks
 from studies.program import Parser, Program
 
 
@@ -16,7 +15,7 @@ def _add_options(parser: Parser) -> None:
     add(parser, "RESULTS", "--quiet")
     parser.add_argument(
         "--into",
-        type=Path,
+        type=INPUT_FILE,
         metavar="FILE",
         help="put Tables 1 and 2 between the markers of this Markdown file (default: none)",
     )

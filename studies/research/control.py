@@ -9,9 +9,7 @@ told.
 
 from __future__ import annotations
 
-from pathlib import Path
-
-from studies.options import add
+from studies.options import INPUT_FILE, add
 from studies.program import Parser, Program
 
 LONG = 20_000
@@ -31,7 +29,7 @@ def _add_options(parser: Parser) -> None:
     add(parser, "--jobs")
     parser.add_argument(
         "--reference",
-        type=Path,
+        type=INPUT_FILE,
         metavar="FILE",
         help="tell the distance to this reference front instead of searching (default: none)",
     )

@@ -9,14 +9,14 @@ tells what the model asks for beside what was measured, and what happened to the
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 
+from studies.options import INPUT_FOLDER
 from studies.program import Parser, Program
 
 
 def _add_options(parser: Parser) -> None:
     parser.add_argument(
-        "--folder", metavar="FOLDER", type=Path, help="of the repository that was fetched"
+        "--folder", metavar="FOLDER", type=INPUT_FOLDER, help="of the repository that was fetched"
     )
     parser.add_argument(
         "--markdown", action="store_true", help="print the table as the documentation has it"

@@ -9,13 +9,20 @@ proven one. `tests/hybrid_opt/polishing/rack_reference_front.csv` was made with
 
 from __future__ import annotations
 
-from studies.options import add, whole
+from studies.options import OUTPUT_FILE, add, whole
 from studies.program import Parser, Program
 
 
 def _add_options(parser: Parser) -> None:
     add(parser, "WORKCELL")
-    add(parser, "--output", required=True, metavar="FILE", help="the CSV file to write")
+    add(
+        parser,
+        "--output",
+        type=OUTPUT_FILE,
+        required=True,
+        metavar="FILE",
+        help="the CSV file to write",
+    )
     parser.add_argument("--starts", type=whole(1, 10**4), default=24, help="random starts")
     parser.add_argument(
         "--attempts", type=whole(0, 10**5), default=60, help="attempts of the final polish"

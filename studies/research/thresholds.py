@@ -10,13 +10,17 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from studies.options import add, number, stated, whole
+from studies.options import OUTPUT_FILE, WORKCELL_FILE, add, number, require_extra, stated, whole
 from studies.program import Parser, Program
 
 
 def _add_options(parser: Parser) -> None:
     parser.add_argument(
-        "cells", nargs="*", type=Path, metavar="WORKCELL", help="(default: the shipped ones)"
+        "cells",
+        nargs="*",
+        type=WORKCELL_FILE,
+        metavar="WORKCELL",
+        help="(default: the shipped ones)",
     )
     parser.add_argument(
         "--carries", type=whole(1, 10**6), default=60, help="how many, of all cells in turn"
@@ -24,6 +28,7 @@ def _add_options(parser: Parser) -> None:
     add(
         parser,
         "--output",
+        type=OUTPUT_FILE,
         default=Path("results/thresholds.json"),
         metavar="FILE",
         help="where they are stored (default: results/thresholds.json)",
@@ -39,7 +44,13 @@ def _add_options(parser: Parser) -> None:
     )
 
 
-main = Program("research.thresholds", __doc__, _add_options, "studies.research.slips.thresholds")
+main = Program(
+    "research.thresholds",
+    __doc__,
+    _add_options,
+    "studies.research.slips.thresholds",
+    complete=lambda options: require_extra("sim", "a simulation"),
+)
 
 
 if __name__ == "__main__":

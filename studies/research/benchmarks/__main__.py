@@ -11,7 +11,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from studies.options import add, stated, whole
+from studies.options import INPUT_FOLDER, OUTPUT_FOLDER, add, stated, whole
 from studies.program import Parser, Program
 from symbolic.errors import SettingsError
 
@@ -21,12 +21,12 @@ def _add_options(parser: Parser) -> None:
         "name", metavar="NAME", nargs="?", default="", help="the benchmark (default: all)"
     )
     parser.add_argument(
-        "--folder", metavar="FOLDER", type=Path, help="with the files of others, as it says"
+        "--folder", metavar="FOLDER", type=INPUT_FOLDER, help="with the files of others, as it says"
     )
     parser.add_argument(
         "--output",
         metavar="FOLDER",
-        type=Path,
+        type=OUTPUT_FOLDER,
         default=Path("results/benchmarks"),
         help="for problem files and proposed workcells",
     )

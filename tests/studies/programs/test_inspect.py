@@ -176,16 +176,6 @@ def test_bounds_that_bind_are_named() -> None:
 PROBLEM = Path("studies/problems/past-a-post.toml")
 
 
-@pytest.mark.parametrize(
-    ("output", "told"), [(PROBLEM, "is the problem file"), ("none/cell.toml", "is no folder")]
-)
-def test_a_wrong_output_is_told_before_any_work(
-    output: Path | str, told: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert propose.main([str(PROBLEM), "--output", str(output)]) == BAD_INPUT
-    assert told in capsys.readouterr().err
-
-
 def test_what_is_in_the_way_is_told_and_nothing_written(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

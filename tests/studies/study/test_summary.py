@@ -326,5 +326,5 @@ def test_without_the_simulator_it_is_told_before_the_work(
     monkeypatch.setitem(sys.modules, "mujoco", None)
     output = tmp_path / "results"
     assert run.main([str(RACK), "--simulate", "--output", str(output)]) == 2
-    assert "MuJoCo is not installed" in capsys.readouterr().err
+    assert "--simulate needs mujoco" in capsys.readouterr().err
     assert not output.exists()
