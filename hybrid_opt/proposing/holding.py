@@ -382,6 +382,8 @@ class HoldSearch:
         joints: how often each joint was beyond its limits, by index.
         pairs: pairs in the way at the start, or where none is led to the goal there.
         kept: largest share of the straight line that a free posture follows.
+        stopped: why that one goes no farther.
+        manipulability: largest at the start among postures within limits [m^3].
     """
 
     holds: list[Hold] = field(default_factory=list)
@@ -390,6 +392,8 @@ class HoldSearch:
     joints: Counter[int] = field(default_factory=Counter)
     pairs: Counter[tuple[str, str]] = field(default_factory=Counter)
     kept: float = 0.0
+    stopped: str = ""
+    manipulability: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -469,7 +473,9 @@ class _Finder:
         beyond = (q < kinematics.lower + LIMIT_MARGIN) | (q > kinematics.upper - LIMIT_MARGIN)
         for joint in np.flatnonzero(beyond.any(axis=0)).tolist():
             found.joints[joint] = int(beyond[:, joint].sum())
-        fine = ~beyond.any(axis=1) & (measure >= kinematics.least)
+        inside = ~beyond.any(axis=1)
+        found.manipulability = float(measure[inside].max(initial=0.0))
+        fine = inside & (measure >= kinematics.least)
         q, which = q[fine], which[fine]
         kept: list[int] = []
         same = SAME_REDUNDANT if kinematics.redundant else SAME_POSTURE
@@ -540,9 +546,29 @@ class _Finder:
         fine = (room >= LIMIT_MARGIN) & (measure >= kinematics.least)
         until = np.where(fine.all(axis=0), len(targets), np.argmin(fine, axis=0))
         share = np.minimum(kept, until)
-        self.found.kept = max(self.found.kept, float(share.max(initial=0)) / len(targets))
+        farthest = int(np.argmax(share))
+        at = int(share[farthest])
+        if at > self.found.kept * len(targets):
+            self.found.kept = at / len(targets)
+            if at < len(targets):
+                reaches = bool(at < kept[farthest])
+                where = path[at, farthest], float(measure[at, farthest])
+                self.found.stopped = self._stop(*where, reaches)
         arrived = np.flatnonzero(share == len(targets))
         return arrived, path, self._score(path, room, measure)
+
+    def _stop(self, q: Array, measure: float, reaches: bool) -> str:
+        """Say why a posture (joints,) is not part of a path."""
+        kinematics = self.kinematics
+        if not reaches:
+            return "it does not reach farther in one motion"
+        if measure < kinematics.least:
+            return told_manipulability(kinematics, f"is {measure:.2g} m^3 there")
+        room = np.minimum(q - kinematics.lower, kinematics.upper - q)
+        joint = list(arm_model(kinematics.workcell.robots[kinematics.arm]).names)[1:][
+            int(np.argmin(room))
+        ]
+        return f"{joint} is at its limit there"
 
     def _resolved(self, targets: Array, q: Array) -> tuple[NDArray[np.intp], Array, Array]:
         """As `_followed`, the redundant joints where the others are best off; only the ends count,
@@ -575,6 +601,15 @@ class _Finder:
         away = np.minimum(measure.min(axis=0) / (4.0 * self.kinematics.least), 1.0)
         apart = np.linalg.norm(path[-1] - path[0], axis=1)
         return np.asarray(comfort + away - LENGTH_COST * apart)
+
+
+def told_manipulability(kinematics: ArmKinematics, found: str) -> str:
+    """Say that the manipulability found is too small, with the key that decides."""
+    robot = kinematics.workcell.robots[kinematics.arm]
+    return (
+        f"abs(det J) {found}, too near a singular posture; allowed is {MANIPULABILITY_MARGIN:g} "
+        f"times robots[{kinematics.arm}].min_manipulability = {robot.min_manipulability:g} m^3"
+    )
 
 
 def _diverse(holds: Sequence[Hold], compared: int) -> list[Hold]:

@@ -80,6 +80,8 @@ class _Follower:
         self.redundant = many.workcell.task.redundant_of(many.arm)
         self.T_box_joint = many.held(hold.spin)
         self.T_root_world = inverse(robot.T_world_base)
+        key = f"robots[{many.arm}].min_manipulability = {robot.min_manipulability:g} m^3"
+        self.singular = f"{robot.name} is near a singular posture ({key})"
         self.lower, self.upper = many.lower + LIMIT_MARGIN, many.upper - LIMIT_MARGIN
 
     def close(self, T_world_box: Array, extended: Array, q: Array) -> Array | str:
@@ -101,7 +103,7 @@ class _Follower:
             try:
                 step = np.linalg.solve(J, error)
             except np.linalg.LinAlgError:
-                return f"{self.name} is singular"
+                return self.singular
             if np.abs(step).max() > JUMP:
                 return f"{self.name} does not reach"
             q[self.many.following] += step
@@ -113,7 +115,7 @@ class _Follower:
         if len(beyond):
             return f"{self.name}/{self.names[beyond[0]]} is at its limit"
         if abs(np.linalg.det(J)) < self.many.least:
-            return f"{self.name} is near a singular posture"
+            return self.singular
         return q
 
 

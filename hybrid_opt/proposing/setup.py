@@ -27,6 +27,7 @@ from hybrid_opt.proposing.holding import (
     guide,
     possible_spins,
     spun,
+    told_manipulability,
 )
 from hybrid_opt.proposing.planner import ClosedChain, Place, Retreats, retreats
 from hybrid_opt.proposing.problem import Problem
@@ -36,7 +37,7 @@ from symbolic.array import Array
 from symbolic.geometry.pairs import build_geometry
 from symbolic.read.arms import FOLLOWING, arm_model, common_joints, turning_joints
 from symbolic.read.editing import merged
-from symbolic.records import POSE_SIZE, Robot, Task, Workcell
+from symbolic.records import POSE_SIZE, Task, Workcell
 from symbolic.records.poses import box_placement
 
 GUIDES_TRIED = 3
@@ -293,11 +294,14 @@ def reach_missing(workcell: Workcell, ends: tuple[Array, Array], spins: Array) -
     return "; ".join(found)
 
 
-def _arm_missing(robot: Robot, search: HoldSearch) -> str:
+def _arm_missing(kinematics: ArmKinematics, search: HoldSearch) -> str:
+    robot = kinematics.workcell.robots[kinematics.arm]
     names = list(arm_model(robot).names)[1:]
     if not search.within:
         joints = ", ".join(names[joint] for joint, _ in search.joints.most_common(TOLD))
-        told = f"beyond limits are most often {joints}" if joints else "all are near singular"
+        told = f"beyond limits are most often {joints}"
+        if search.manipulability or not joints:  # some are within limits
+            told = told_manipulability(kinematics, f"is at most {search.manipulability:.2g} m^3")
         return f"{robot.name} has no usable posture at the start: {told}"
     if not search.free:
         return (
@@ -310,16 +314,16 @@ def _arm_missing(robot: Robot, search: HoldSearch) -> str:
             f"{_pairs(search.pairs)}"
         )
     return (
-        f"{robot.name} follows at most {100.0 * search.kept:.0f} % of the way to the goal in any "
-        "posture within its limits and away from singular ones"
+        f"{robot.name} follows at most {100.0 * search.kept:.0f} % of the way to the goal: "
+        f"{search.stopped}"
     )
 
 
 def _no_pair(query: HoldQuery, judge: PoseJudge, searches: Sequence[HoldSearch]) -> str:
     """Say which arm cannot hold the box, or which bodies meet where either arm alone is free."""
     told = [
-        _arm_missing(robot, one)
-        for robot, one in zip(judge.geometry.workcell.robots, searches, strict=True)
+        _arm_missing(ArmKinematics(judge.geometry.workcell, arm), one)
+        for arm, one in enumerate(searches)
         if not one.holds
     ]
     if told:

@@ -22,6 +22,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pinocchio as pin
 
+from symbolic.array import Array
 from symbolic.errors import RobotModelError
 from symbolic.read.urdf import Urdf, read_urdf
 from symbolic.records import PAYLOAD, Robot, Workcell
@@ -288,6 +289,29 @@ def flange_problem(model: pin.Model, flange: str) -> str:
 def link_frame(model: pin.Model, link: str) -> int:
     """Index of a link's frame; a joint may have the same name."""
     return int(model.getFrameId(link, pin.FrameType.BODY))
+
+
+def link_lengths(model: pin.Model, flange: str) -> Array:
+    """Compute the distances (n,) from each joint of an arm to the next one, the last to the flange
+    [m]."""
+    offsets = [model.jointPlacements[joint].translation for joint in range(2, model.njoints)]
+    offsets.append(model.frames[link_frame(model, flange)].placement.translation)
+    return np.asarray(np.linalg.norm(offsets, axis=1))
+
+
+MANIPULABILITY_SHARE = 1e-3
+"""Default of `min_manipulability` over the cube of an arm's length: 2 to 24 % of random postures of
+thirteen arms of 0.74 to 1.75 m are below it, 6 % of a GoFa 12's."""
+
+
+def usual_manipulability(model: pin.Model, flange: str) -> float:
+    """Compute the default of `min_manipulability` [m^3], to two digits.
+
+    It scales with the cube of the arm's length, as abs(det J) does. The length is that of the last
+    seven joints: what moves a whole arm, such as a lift, is not part of it.
+    """
+    length = float(link_lengths(model, flange)[-FOLLOWING - 1 :].sum())
+    return float(f"{MANIPULABILITY_SHARE * length**3:.1e}")
 
 
 # --- machines with two arms ---

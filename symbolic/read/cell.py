@@ -21,7 +21,7 @@ from symbolic.errors import OutsideError, RobotModelError, WorkcellError
 from symbolic.read.arms import (
     arm_model,
     body_names,
-    link_frame,
+    link_lengths,
     machine_problem,
     robot_urdf,
     turning_joints,
@@ -538,8 +538,6 @@ def stretched_length(robot: Robot) -> tuple[Array, float]:
     """
     model = arm_model(robot)
     shoulder = robot.T_world_base @ np.append(model.jointPlacements[1].translation, 1.0)
-    flange = model.frames[link_frame(model, robot.flange)].placement.translation
-    offsets = [model.jointPlacements[joint].translation for joint in range(2, model.njoints)]
     slides = sum(
         max(abs(low), abs(high))
         for turns, low, high in zip(
@@ -547,8 +545,7 @@ def stretched_length(robot: Robot) -> tuple[Array, float]:
         )
         if not turns
     )
-    stretched = sum(np.linalg.norm(offset) for offset in [*offsets, flange])
-    return shoulder[:3], float(stretched + slides)
+    return shoulder[:3], float(link_lengths(model, robot.flange).sum() + slides)
 
 
 def _fixed_poses(workcell: Workcell) -> Iterator[tuple[str, Array]]:

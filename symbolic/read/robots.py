@@ -33,6 +33,7 @@ from symbolic.read.arms import (
     moving_joints,
     reduced_model,
     structure_problem,
+    usual_manipulability,
     without_links,
 )
 from symbolic.read.descriptions import (
@@ -80,6 +81,11 @@ def read_robot(table: Table, folder: Path, stored: bool = False) -> tuple[Robot,
         tool_load = inner.record(ToolLoad, mass=mass, **inertia)
     limits = _read_limits(table, model)
     driver = table.table("driver", {}).record(Driver)
+    usual = {}
+    if not table.has("min_manipulability"):
+        is_arm = model is not None and table.clean("chain", "flange")
+        flange = described["flange"]
+        usual["min_manipulability"] = usual_manipulability(model, flange) if is_arm else 1.0
     robot = table.record(
         Robot,
         name=name,
@@ -91,6 +97,7 @@ def read_robot(table: Table, folder: Path, stored: bool = False) -> tuple[Robot,
         driver=driver,
         **described,
         **limits,
+        **usual,
     )
     return robot, branch
 

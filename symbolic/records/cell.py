@@ -157,7 +157,7 @@ class Robot:
         acceleration_max: (n,) [rad/s^2].
         torque_max: (n,) [N m, or N].
         min_manipulability: least allowed |det J| of the flange-pad Jacobian of the six joints that
-            follow the box [m^3]; 9 of 10 random poses of a 1.3 m arm exceed 0.005.
+            follow the box [m^3].
         xacro_arguments: names and values of the xacro file's arguments.
         srdf: file whose disabled pairs of links are not checked for collision.
         chain_root: link of the URDF that the arm begins at, the flange being its other end; ''
@@ -183,7 +183,7 @@ class Robot:
     velocity_max: Array
     acceleration_max: Array
     torque_max: Array
-    min_manipulability: Annotated[float, quantity.MANIPULABILITY] = 0.005
+    min_manipulability: Annotated[float, quantity.MANIPULABILITY]
     xacro_arguments: tuple[tuple[str, str], ...] = ()
     srdf: Path | None = None
     chain_root: str = ""

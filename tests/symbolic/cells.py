@@ -109,6 +109,7 @@ def gofa(name: str, T_world_base: Array) -> Robot:
         velocity_max=np.deg2rad([120.0, 120.0, 125.0, 200.0, 200.0, 200.0]),
         acceleration_max=np.full(6, 5.0),
         torque_max=np.array([390.0, 400.0, 160.0, 60.0, 60.0, 60.0]),
+        min_manipulability=0.005,
     )
 
 

@@ -11,7 +11,7 @@ import pinocchio as pin
 import pytest
 
 import hybrid_opt as ho
-from hybrid_opt.errors import JobError
+from hybrid_opt.errors import JobError, ProposalError
 from hybrid_opt.job.plan import job_geometry
 from hybrid_opt.proposing.bases import (
     ASIDE,
@@ -203,6 +203,35 @@ def test_a_waist_turns_where_the_box_is_beside_the_machine(machine: Setup) -> No
     rack = load(RACK)
     alone = [ArmKinematics(rack, arm) for arm in (0, 1)]
     assert list(common_positions(alone, query, np.random.default_rng(1))) == [None]
+
+
+def test_an_arm_that_comes_near_a_singular_posture_is_told_with_the_key(tmp_path: Path) -> None:
+    too_much = {"robots": [{"min_manipulability": 0.05}, {}]}
+    problem = read_problem(Torso().problem(tmp_path, **too_much))
+    told = (
+        r"left has no usable posture .*: abs\(det J\) is at most 0\.0\d+ m\^3, .*"
+        r"1\.1 times robots\[0\]\.min_manipulability = 0\.05 m\^3"
+    )
+    with pytest.raises(ProposalError, match=told):
+        prepare(problem, {}, SPINS, np.random.default_rng(1))
+
+
+@pytest.mark.parametrize(
+    ("least", "told"),
+    [(0.03, "does not reach farther"), (0.15, "robots[0].min_manipulability = 0.15 m^3")],
+)
+def test_what_ends_the_way_to_a_goal_out_of_reach_is_told(
+    rack_cell: Workcell, least: float, told: str
+) -> None:
+    start, goal = rack_cell.task.waypoints[0].lower, rack_cell.task.waypoints[-1].lower
+    far = goal + np.array([0.0, -2.0, 0.0, 0.0, 0.0, 0.0])
+    robot = replace(rack_cell.robots[0], min_manipulability=least)
+    cell = replace(rack_cell, robots=(robot, rack_cell.robots[1]))
+    query, rng = HoldQuery(start, far, SPINS, None), np.random.default_rng(1)
+    found = find_holds(query, ArmKinematics(cell, 0), rng)
+    assert not found.holds
+    assert 0.0 < found.kept < 1.0
+    assert told in found.stopped
 
 
 def other_branch(q: Array) -> Array:

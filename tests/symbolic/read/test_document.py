@@ -228,7 +228,8 @@ def assert_same_cell(cell: Workcell, data: dict[str, Any]) -> None:
         others = {"urdf", "T_world_base", "T_flange_pad", "tool", "driver"}
         described = {"velocity_max", "torque_max", "position_lower", "position_upper"}
         described |= {"package_dirs", "locked_joints"}
-        assert_same(robot, {"acceleration_max": 5.0} | entry, *others, *(described - entry.keys()))
+        usual = {"acceleration_max": 5.0, "min_manipulability": 3.2e-3}
+        assert_same(robot, usual | entry, *others, *(described - entry.keys()))
         assert_same(robot.driver, entry.get("driver", {}))
         for tool, tool_entry in zip(robot.tool, entry["tool"], strict=True):
             assert_same_body(tool, tool_entry)
