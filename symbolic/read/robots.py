@@ -121,7 +121,7 @@ def _read_redundant(table: Table, model: pin.Model | None) -> tuple[str, ...]:
 LIMITS = {
     "position_lower": ("lowerPositionLimit", quantity.JOINT_POSITION),
     "position_upper": ("upperPositionLimit", quantity.JOINT_POSITION),
-    "velocity_max": ("velocityLimit", quantity.ANGULAR_SPEED),
+    "velocity_max": ("velocityLimit", quantity.JOINT_SPEED),
     "torque_max": ("effortLimit", quantity.TORQUE),
     "acceleration_max": ("", quantity.ANGULAR_ACCELERATION),
     "jerk_max": ("", quantity.ANGULAR_JERK),
@@ -396,11 +396,21 @@ def _installed(name: str) -> NamedRobot:
             f"_description are those of {MODULES}"
         )
     known = {path.stem: path for path in sorted((folder / "robots").rglob("*.urdf"))}
-    path = known.get(name) or known.get(f"{name}_robot")
+    named = [known[stem] for stem in (name, f"{name}_robot") if stem in known]
+    path = next(filter(_has_links, named), None)
     if path is None:
-        meant = suggestion(name, known) or f"; {FILES} has {', '.join(known)}"
+        meant = (
+            "; the file of this name has no links"
+            if named
+            else suggestion(name, known) or f"; {FILES} has {', '.join(known)}"
+        )
         raise OutsideError(f"is the name of no description{meant}")
     return NamedRobot(path, (), (folder.parent,))
+
+
+def _has_links(path: Path) -> bool:
+    """Return True if a file describes anything; some packages ship files without content."""
+    return b"<link" in outside.read_bytes(path, outside.URDF_BYTES)
 
 
 def _downloaded(name: str) -> NamedRobot:

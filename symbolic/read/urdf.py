@@ -271,18 +271,21 @@ def _joint(joint: Part) -> UrdfJoint:
                 f"found {shown(axis.raw('xyz'))}, an axis without length; allowed is a direction "
                 "such as '0 0 1'",
             )
-    needed = kind in ("revolute", "prismatic")
-    limit = joint.required("limit") if needed else joint.child("limit")
+    # Limits of joints that an arm moves are checked where it is known which these are.
+    limit = joint.child("limit")
     lower = upper = 0.0
     if limit is not None:
         for key in ("effort", "velocity"):
-            limit.number(key, quantity.JOINT_MOST)
+            limit.number(key, quantity.JOINT_MOST, "0")
+            limit.kept.attrib.setdefault(key, "0")  # Pinocchio's reader requires them
         lower, upper = (limit.number(key, quantity.JOINT_LIMIT, "0") for key in ("lower", "upper"))
+    if limit is None and kind in ("revolute", "prismatic", "continuous"):
+        none = dict.fromkeys(("effort", "velocity", "lower", "upper"), "0")
+        kept = ElementTree.SubElement(joint.kept, "limit", none)
     if kind == "continuous":
         # Pinocchio gives a continuous joint two coordinates; here every moving joint has one.
         lower, upper = -FULL_TURNS, FULL_TURNS
-        none = {"effort": "0", "velocity": "0"}
-        kept = ElementTree.SubElement(joint.kept, "limit", none) if limit is None else limit.kept
+        kept = kept if limit is None else limit.kept
         kept.attrib |= {"lower": repr(lower), "upper": repr(upper)}
         joint.kept.set("type", "revolute")
     dynamics = joint.child("dynamics")

@@ -94,8 +94,8 @@ CASES: list[tuple[Any, ...]] = [
     ("payload.mass", 10_000, "looks like g: 10000 g are 10 kg"),
     ("robots[0].base.rpy[2]", -90.0, "-90 deg are -1.5708 rad"),
     ("contacts[0].friction", 60, "looks like %"),
-    ("task.reference_force", 12, "12 kgf are 117.68 N"),
-    ("task.reference_force", [117.7, 12], "looks like kgf", "task.reference_force[1]"),
+    ("task.reference_force", 0.5, "0.5 kgf are 4.90332 N"),
+    ("task.reference_force", [117.7, 0.5], "looks like kgf", "task.reference_force[1]"),
     ("task.reference_angular_speed", 30, "looks like deg/s"),
     ("payload.jerk_max", 30_000, "30000 mm/s^3 are 30 m/s^3"),
     # inertia

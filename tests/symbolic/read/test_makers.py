@@ -1,0 +1,92 @@
+"""What makers' descriptions hold beside the arms, and arms that are fast, light or without data."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hybrid_opt.proposing.problem import read_problem
+from symbolic.errors import OutsideError, WorkcellError
+from symbolic.read.robots import named_robot
+from symbolic.records import Workcell
+from tests.torso import Torso
+
+WHEEL = """
+<link name="wheel"/>
+<joint name="wheel_joint" type="{kind}">
+  <parent link="foot"/><child link="wheel"/><origin xyz="0.2 0.3 0.1"/><axis xyz="0 1 0"/>{limit}
+</joint>
+"""
+
+
+def cell(torso: Torso, folder: Path, **changes: Any) -> Workcell:
+    return read_problem(torso.problem(folder, **changes)).workcell()
+
+
+@pytest.mark.parametrize(
+    ("kind", "limit"),
+    [
+        ("continuous", '<limit velocity="5"/>'),
+        ("continuous", ""),
+        ("revolute", '<limit lower="-1" upper="1"/>'),
+        ("prismatic", ""),
+    ],
+)
+def test_joints_that_no_arm_moves_need_no_limits(kind: str, limit: str, tmp_path: Path) -> None:
+    found = cell(Torso(more=WHEEL.format(kind=kind, limit=limit)), tmp_path)
+    assert [len(robot.torque_max) for robot in found.robots] == [7, 7]
+
+
+def test_joints_that_arms_move_need_theirs(tmp_path: Path) -> None:
+    text = Torso().urdf()
+    limit = '<limit lower="-3.0" upper="3.0" effort="15.0" velocity="2.5"/>'
+    assert text.count(limit) == 2
+    path = Torso().problem(tmp_path)
+    for wanted, told in (
+        ('<limit lower="-3.0" upper="3.0" velocity="2.5"/>', r"torque_max: .* gives 0 for joint 5"),
+        ("", r"position_lower\[4\]: found 0 rad for joint 'left_joint_3', not below"),
+    ):
+        (tmp_path / "torso.urdf").write_text(text.replace(limit, wanted), encoding="utf-8")
+        with pytest.raises(WorkcellError, match=told):
+            read_problem(path).workcell()
+
+
+def test_fast_wrists_and_light_squeezes_are_no_other_units(tmp_path: Path) -> None:
+    """200 revolutions a minute; arms that press with 15 N."""
+    speed = 200.0 * 2.0 * np.pi / 60.0
+    found = cell(Torso(wrist_speed=speed), tmp_path, task={"reference_force": 15.0})
+    assert found.robots[0].velocity_max[-1] == pytest.approx(speed)
+    assert found.task.reference_force.tolist() == [15.0, 15.0]
+
+
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        ({"robots": [{"velocity_max": 120.0}, {}]}, r"120 deg/s are 2\.0944 rad/s"),
+        ({"robots": [{"velocity_max": 5000.0}, {}]}, r"allowed is 0\.001 to 50 rad/s$"),
+        ({"task": {"reference_force": 0.5}}, r"0\.5 kgf are 4\.90332 N"),
+        ({"task": {"reference_force": 0.05}}, r"allowed is 1 to 100000 N$"),
+    ],
+)
+def test_hints_stand_where_the_other_unit_is_plausible(
+    changes: dict[str, Any], told: str, tmp_path: Path
+) -> None:
+    with pytest.raises(WorkcellError) as error:
+        cell(Torso(), tmp_path, **changes)
+    lines = str(error.value).splitlines()
+    assert any(_ends(line, told) for line in lines), lines
+
+
+def _ends(line: str, told: str) -> bool:
+    text = told.replace("\\", "")
+    return line.endswith(text[:-1]) if text.endswith("$") else text in line
+
+
+def test_a_file_without_links_is_passed_over() -> None:
+    assert named_robot("ur3").path.name == "ur3_robot.urdf"
+    assert named_robot("ur5").path.name == "ur5_robot.urdf"
+    with pytest.raises(OutsideError, match="is the name of no description"):
+        named_robot("ur4")
