@@ -6,8 +6,7 @@ A pair that is c_a and c_b apart at the two ends of an interval keeps a distance
 
 inside it, with D and K the chords and bends of both bodies
 (`symbolic.geometry.clearance`). Where neither exceeds the tolerance, the interval is halved;
-where the compiled clearance does not suffice, a distance proven along FCL's nearest points takes
-its place.
+where the compiled clearance does not suffice, a measured distance takes its place.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ from typing import Any, Literal, Self, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_opt.collision.checker import CollisionChecker, Separations, Touch
+from hybrid_opt.collision.checker import CollisionChecker, Touch
 from symbolic.array import Array
 
 Status = Literal["free", "collision", "undecided"]
@@ -87,7 +86,6 @@ class _Sweep:
         self.owner = np.repeat(np.arange(len(intervals)), intervals)
         self.first = np.cumsum(intervals) - intervals
         self.required = checker.geometry.tolerance + sampled.margin[:, None]
-        self._separations: Separations = {}
 
     def run(self) -> list[MotionVerdict]:
         n_motions = len(self.sampled.lengths)
@@ -199,9 +197,7 @@ class _Sweep:
         hopeless = ~(beyond > HALVING_WINS * work.chord)
         wanted = work.pending & (hopeless | last) & ~end.measured
         end.measured[wanted] = True
-        return self.checker.measure(
-            *self.checker.split(end.configuration), end.clearance, wanted, self._separations
-        )
+        return self.checker.measure(*self.checker.split(end.configuration), end.clearance, wanted)
 
     def _halves(self, work: Intervals) -> Intervals:
         """Both halves of every interval, the earlier first."""

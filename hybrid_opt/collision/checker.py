@@ -1,19 +1,20 @@
-"""The collision verdict on a candidate: compiled bounds first, FCL where they leave it open.
+"""The collision verdict on a candidate: compiled bounds, proofs, and FCL where they leave it open.
 
-One rule on both sides of the tolerance: bodies collide if their distance is at most the
-tolerance, as FCL finds it. The bounds may only call a pair free beyond the tolerance by more
-than FCL's own resolution, so near the tolerance FCL alone decides, screened or not.
+One rule on both sides of the tolerance: bodies collide if FCL finds an intersection, or if their
+distance is at most the tolerance. Bounds and proofs only decide what is farther from that than
+FCL's own resolution, so near contact FCL alone decides, screened or not.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from codegen.function import NumericFunction
+from hybrid_opt.collision.distances import INTERSECTING, OPEN, BodyDistances
 from hybrid_opt.collision.judge import FCL_RESOLUTION, Judge
 from symbolic.array import Array
 from symbolic.geometry.pairs import CellGeometry
@@ -57,24 +58,14 @@ class Verdict:
         return self.first_touch is None
 
 
-Separations = dict[tuple[bytes, int], float | None]
-"""Distance that a pair surely keeps in a configuration [m], None where it collides."""
-
-
-def by_sample(bounds: Array, unsure: NDArray[np.bool_]) -> dict[int, list[int]]:
-    """The pairs of each sample that has open ones: least bound first, ties in order."""
-    # Flat indices: much faster to find than those of two axes.
-    open_pairs = np.flatnonzero(unsure)
-    samples, pairs = np.divmod(open_pairs, unsure.shape[1])
-    order = np.lexsort((bounds.ravel()[open_pairs], samples))
-    found: dict[int, list[int]] = {}
-    for sample, pair in zip(samples[order].tolist(), pairs[order].tolist(), strict=True):
-        found.setdefault(sample, []).append(pair)
-    return found
-
-
 RESTING_TOLERANCE = 1e-3
 """How deep the payload may sink into a body that it is allowed to rest on [m]."""
+
+PROOF_MARGIN = 5 * FCL_RESOLUTION
+"""How clearly two shapes must be apart or intersect to be decided without FCL [m]."""
+
+MEASURED_TOGETHER = 64
+"""Pairs that `CollisionChecker.min_distance` measures before it compares with the next bound."""
 
 
 class CollisionChecker:
@@ -82,6 +73,7 @@ class CollisionChecker:
 
     Attributes:
         geometry: the cell's bodies and pairs.
+        distances: of the same bodies.
         judge: FCL's objects.
         functions: those of `symbolic.geometry.clearance.screening_functions`, compiled or
             interpreted.
@@ -92,22 +84,23 @@ class CollisionChecker:
 
     def __init__(self, geometry: CellGeometry, functions: Mapping[str, NumericFunction]) -> None:
         self.geometry, self.functions = geometry, functions
-        self.judge = Judge(geometry, RESTING_TOLERANCE)
+        self.distances = BodyDistances(geometry, RESTING_TOLERANCE)
+        self.judge = Judge(self.distances)
         self.free_beyond = geometry.tolerance + FCL_RESOLUTION
-        self._pairs = [(pair.first, pair.second) for pair in geometry.active]
+        self._pairs = np.array([(p.first, p.second) for p in geometry.active]).reshape(-1, 2)
         self._names = geometry.pair_names
         self.resting_places = self._find_resting()
 
     def split(self, configuration: Array) -> tuple[Array, Array, Array]:
-        """Box poses (n, 6) and both arms' joints (n, joints) from configurations (n, 6 + all
-        joints), each contiguous."""
+        """Split configurations (n, 6 + all joints) into box poses (n, 6) and both arms' joints
+        (n, joints), each contiguous."""
         at = 6 + self.geometry.arms[0].joints
         parts = (configuration[:, :6], configuration[:, 6:at], configuration[:, at:])
         first, second, third = map(np.ascontiguousarray, parts)
         return first, second, third
 
     def bounds(self, pose: Array, q_1: Array, q_2: Array) -> Array:
-        """Lower bounds (n, n_pairs) of every active pair's distance [m].
+        """Bound the distance of every active pair from below, (n, n_pairs) [m].
 
         Args:
             pose: (n, 6) box poses [m, rad].
@@ -117,7 +110,7 @@ class CollisionChecker:
         return self.geometry.of_active([f.batch(pose, q_1, q_2)["clearance"] for f in asked])
 
     def check(self, pose: Array, q_1: Array, q_2: Array, clearance: Array | None = None) -> Verdict:
-        """The verdict on n samples.
+        """Check n samples.
 
         Args:
             pose: (n, 6) box poses [m, rad].
@@ -128,18 +121,18 @@ class CollisionChecker:
             clearance = self.bounds(pose, q_1, q_2)
         colliding = np.zeros(len(pose), dtype=bool)
         # `not >` keeps a NaN bound open.
-        suspects = by_sample(clearance, ~(clearance > self.free_beyond))
-        first: Touch | None = None
-        if suspects:
-            rows = list(suspects)
-            self._place(pose[rows], q_1[rows], q_2[rows])
-            for local, (sample, pairs) in enumerate(suspects.items()):
-                resting = self._resting_pairs(pose[sample, :3])
-                hits = (p for p in pairs if self._judge_pair(local, p, p in resting))
-                hit = next(hits, None)
-                if hit is not None:
-                    colliding[sample] = True
-                    first = first or Touch(sample, *self._names[hit])
+        rows, pairs = np.nonzero(~(clearance > self.free_beyond))
+        if not len(rows):
+            return Verdict(colliding, None)
+        # The pair that is named is the one with the least bound.
+        order = np.lexsort((clearance[rows, pairs], rows))
+        rows, pairs = rows[order], pairs[order]
+        hits = self.collisions(pose, q_1, q_2, rows, pairs)
+        colliding[rows[hits]] = True
+        first = None
+        if hits.any():
+            k = int(np.argmax(hits))
+            first = Touch(int(rows[k]), *self._names[pairs[k]])
         return Verdict(colliding, first)
 
     def collisions(
@@ -147,31 +140,33 @@ class CollisionChecker:
         pose: Array,
         q_1: Array,
         q_2: Array,
-        rows: Sequence[int],
-        pairs: Sequence[int],
-    ) -> list[bool]:
-        """FCL's answer for single pairs of n configurations.
+        rows: NDArray[np.intp],
+        pairs: NDArray[np.intp],
+    ) -> NDArray[np.bool_]:
+        """Decide for single pairs of n samples whether they collide.
 
         Args:
-            rows: the configuration of each query, those of one side by side.
-            pairs: its pair.
+            rows: (m,) the sample of each query, increasing.
+            pairs: (m,) its pair.
+
+        Returns:
+            (m,)
         """
-        self._place(pose, q_1, q_2)
-        resting = [self._resting_pairs(centre) for centre in pose[:, :3]]
-        return [
-            self._judge_pair(row, pair, pair in resting[row])
-            for row, pair in zip(rows, pairs, strict=True)
-        ]
+        samples, rows = np.unique(rows, return_inverse=True)
+        pose = pose[samples]
+        placed = self._place(pose, q_1[samples], q_2[samples])
+        return self._decide(placed, rows, pairs, self._resting(pose, rows, pairs))
 
     def enters(self, pose: Array, pair: int) -> bool:
-        """Whether the box at (6,) enters a body of the environment deeper than one that rests may.
+        """Return True if the box at (6,) enters a body of the environment deeper than one that
+        rests may.
 
         Args:
             pair: of payload and body.
         """
-        still = [np.zeros((1, arm.joints)) for arm in self.geometry.arms]
-        self._place(pose[None], *still)
-        return self._judge_pair(0, pair, resting=True)
+        placed = self._place(pose[None], *self._still())
+        zero = np.zeros(1, dtype=np.intp)
+        return bool(self._decide(placed, zero, zero + pair, np.ones(1, dtype=bool))[0])
 
     def motion(
         self, start: tuple[Array, Array, Array], end: tuple[Array, Array, Array]
@@ -186,65 +181,41 @@ class CollisionChecker:
         return chord, bend
 
     def measure(
-        self,
-        pose: Array,
-        q_1: Array,
-        q_2: Array,
-        clearance: Array,
-        wanted: NDArray[np.bool_],
-        known: Separations | None = None,
+        self, pose: Array, q_1: Array, q_2: Array, clearance: Array, wanted: NDArray[np.bool_]
     ) -> NDArray[np.intp]:
         """Raise the bounds (n, n_pairs) of wanted pairs, in place, to a proven distance [m].
 
-        See `Judge.separation`; a bound that is higher already stays. For a payload that
-        may rest on a body, the distance of the payload smaller by the resting tolerance counts, and
-        the pair's own tolerance beside it: it may come nearer than that.
-
-        Args:
-            known: what was measured before, to be looked up and added to: a place where two
-                intervals meet is an end of both.
+        A bound that is higher already stays. For a payload that may rest on a body, the distance of
+        the payload smaller by the resting tolerance counts, and the pair's own tolerance beside it:
+        it may come nearer than that.
 
         Returns:
-            (n,) the first wanted pair of each sample that collides, or -1.
+            (n,) the first wanted pair of each sample that collides, whose bound stays, or -1.
         """
         hits = np.full(len(pose), -1)
-        known = {} if known is None else known
-        queries: dict[int, list[int]] = {}
-        for k, pair in np.argwhere(wanted).tolist():
-            queries.setdefault(k, []).append(pair)
-        places = {k: np.hstack([pose[k], q_1[k], q_2[k]]).tobytes() for k in queries}
-        new = [k for k, pairs in queries.items() if any((places[k], p) not in known for p in pairs)]
-        if new:
-            self._place(pose[new], q_1[new], q_2[new])
-        at = {k: local for local, k in enumerate(new)}
-        for k, pairs in queries.items():
-            resting_pairs = self._resting_pairs(pose[k, :3])
-            for pair in pairs:
-                name = places[k], pair
-                if name not in known:
-                    known[name] = self._separation(at[k], pair, pair in resting_pairs)
-                apart = known[name]
-                if apart is None:
-                    hits[k] = pair
-                    break
-                clearance[k, pair] = np.fmax(clearance[k, pair], apart)
+        rows, pairs = np.nonzero(wanted)
+        if not len(rows):
+            return hits
+        samples, local = np.unique(rows, return_inverse=True)
+        placed = self._place(pose[samples], q_1[samples], q_2[samples])
+        resting = self._resting(pose[samples], local, pairs)
+        lower, _ = self.distances.bounds(placed, local, *self._bodies(pairs, resting))
+        apart = np.maximum(lower, 0.0) + np.where(resting, self.geometry.tolerance[pairs], 0.0)
+        near = apart <= self.free_beyond[pairs]
+        hit = np.zeros(len(rows), dtype=bool)
+        if near.any():
+            hit[near] = self._decide(placed, local[near], pairs[near], resting[near])
+        hits[rows[hit][::-1]] = pairs[hit][::-1]
+        free = ~hit
+        rows, pairs = rows[free], pairs[free]
+        clearance[rows, pairs] = np.fmax(clearance[rows, pairs], apart[free])
         return hits
-
-    def _separation(self, local: int, pair: int, resting: bool) -> float | None:
-        """A distance that a pair surely keeps, or None where it collides."""
-        i, j = self._pairs[pair]
-        first = self.judge.shrunk_payload if resting else i
-        nearer = float(self.geometry.tolerance[pair]) if resting else 0.0
-        apart = self.judge.separation(local, first, j) + nearer
-        if apart <= self.free_beyond[pair] and self._judge_pair(local, pair, resting):
-            return None
-        return apart
 
     def too_near(
         self, configuration: Array, wanted: NDArray[np.bool_], required: Array
     ) -> NDArray[np.bool_]:
-        """Which wanted pairs of n configurations nothing can prove to be farther apart than
-        required: FCL's distance, never more than micrometres below the truth, is not either.
+        """Find wanted pairs of n configurations that nothing can prove to be farther apart than
+        required, because they are not.
 
         Args:
             configuration: (n, 6 + all joints).
@@ -252,57 +223,92 @@ class CollisionChecker:
                 body nothing is said.
         """
         found = np.zeros(wanted.shape, dtype=bool)
-        rows = np.flatnonzero(wanted.any(axis=1))
+        rows, pairs = np.nonzero(wanted)
         if len(rows):
-            self._place(*self.split(configuration[rows]))
-        for local, row in enumerate(rows.tolist()):
-            resting = self._resting_pairs(configuration[row, :3])
-            for pair in set(np.flatnonzero(wanted[row]).tolist()) - resting:
-                apart = self.judge.distance(local, *self._pairs[pair])
-                found[row, pair] = apart <= required[row, pair] - FCL_RESOLUTION
+            samples, local = np.unique(rows, return_inverse=True)
+            pose, q_1, q_2 = self.split(configuration[samples])
+            _, upper = self._bounds_of_pairs(self._place(pose, q_1, q_2), local, pairs)
+            near = upper <= required[rows, pairs] - FCL_RESOLUTION
+            found[rows, pairs] = near & ~self._resting(pose, local, pairs)
         return found
 
     def min_distance(self, pose: Array, q_1: Array, q_2: Array, clearance: Array) -> float:
-        """FCL's least distance over all pairs and samples [m].
+        """Find the least distance over all pairs and samples, 0 where bodies intersect [m].
 
         Pairs are measured in the order of their bounds (n, n_pairs), until none is lower than the
         best distance.
         """
-        self._place(pose, q_1, q_2)
+        placed = self._place(pose, q_1, q_2)
+        order = np.argsort(clearance, axis=None, kind="stable")
         best = np.inf
-        for flat in np.argsort(clearance, axis=None, kind="stable").tolist():
-            sample, pair = divmod(flat, len(self._pairs))
-            if clearance[sample, pair] > best:
+        for start in range(0, len(order), MEASURED_TOGETHER):
+            some = order[start : start + MEASURED_TOGETHER]
+            if clearance.flat[some[0]] > best:
                 break
-            best = min(best, self.judge.distance(sample, *self._pairs[pair]))
-        return best
+            _, upper = self._bounds_of_pairs(placed, *np.divmod(some, len(self._pairs)))
+            best = min(best, float(upper.min()))
+        return max(best, 0.0)
 
-    def _place(self, pose: Array, q_1: Array, q_2: Array) -> None:
-        poses = self.functions["piece_poses"].batch(pose, q_1, q_2)
-        self.judge.set_placements(poses["quaternions"], poses["positions"])
+    def _place(self, pose: Array, q_1: Array, q_2: Array) -> Mapping[str, Array]:
+        return self.functions["piece_poses"].batch(pose, q_1, q_2)
 
-    def _judge_pair(self, local: int, pair: int, resting: bool) -> bool:
-        i, j = self._pairs[pair]
-        if not resting:
-            return self.judge.collides(local, i, j)
-        return self.judge.intersects(local, self.judge.shrunk_payload, j)
+    def _still(self) -> tuple[Array, Array]:
+        """Joints of both arms at one sample that only the box matters in."""
+        first, second = (np.zeros((1, arm.joints)) for arm in self.geometry.arms)
+        return first, second
 
-    def _resting_pairs(self, centre: Array) -> frozenset[int]:
-        """Pairs whose contact is allowed with the box centre here."""
-        if not self.resting_places:
-            return frozenset()
-        return frozenset(
-            pair
-            for pair, place, departure in self.resting_places
-            if float(np.linalg.norm(centre - place)) <= departure
+    def _bodies(
+        self, pairs: NDArray[np.intp], resting: NDArray[np.bool_]
+    ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Both bodies of each pair (m,); the smaller payload where it rests."""
+        first, second = self._pairs[pairs].T
+        return np.where(resting, self.distances.shrunk_payload, first), second
+
+    def _bounds_of_pairs(
+        self, placed: Mapping[str, Array], rows: NDArray[np.intp], pairs: NDArray[np.intp]
+    ) -> tuple[Array, Array]:
+        return self.distances.bounds(placed, rows, *self._pairs[pairs].T)
+
+    def _decide(
+        self,
+        placed: Mapping[str, Array],
+        rows: NDArray[np.intp],
+        pairs: NDArray[np.intp],
+        resting: NDArray[np.bool_],
+    ) -> NDArray[np.bool_]:
+        """Decide which pairs collide (m,): by proof, by FCL where there is none."""
+        first, second = self._bodies(pairs, resting)
+        # A resting payload may come nearer than the tolerance; it only must not intersect.
+        tolerance = np.where(resting, 0.0, self.geometry.tolerance[pairs])
+        verdicts = self.distances.decide(
+            placed, rows, first, second, PROOF_MARGIN + tolerance, PROOF_MARGIN - tolerance
         )
+        hits: NDArray[np.bool_] = verdicts == INTERSECTING
+        left = np.flatnonzero(verdicts == OPEN)
+        if not len(left):
+            return hits
+        _, upper = self.distances.bounds(placed, rows[left], first[left], second[left])
+        for k, distance in zip(left.tolist(), upper.tolist(), strict=True):
+            hits[k] = tolerance[k] > 0.0 and distance <= tolerance[k]
+            hits[k] |= self.judge.intersects(placed, int(rows[k]), int(first[k]), int(second[k]))
+        return hits
+
+    def _resting(
+        self, pose: Array, rows: NDArray[np.intp], pairs: NDArray[np.intp]
+    ) -> NDArray[np.bool_]:
+        """Find queries (m,) whose contact is allowed with the box where it is."""
+        found = np.zeros(len(pairs), dtype=bool)
+        for pair, place, departure in self.resting_places:
+            near = np.linalg.norm(pose[:, :3] - place, axis=1) <= departure
+            found |= (pairs == pair) & near[rows]
+        return found
 
     def _find_resting(self) -> list[tuple[int, Array, float]]:
         """See `resting_places`."""
         task = self.geometry.workcell.task
         pairs = {names: k for k, names in enumerate(self._names)}
-        still = [np.zeros((1, arm.joints)) for arm in self.geometry.arms]
         found = []
+        zero = np.zeros(1, dtype=np.intp)
         for allowed in task.allowed_contacts:
             pair = pairs.get((PAYLOAD, allowed.body))
             if pair is None:
@@ -310,8 +316,8 @@ class CollisionChecker:
             for waypoint in task.waypoints:
                 if not waypoint.is_fixed:
                     continue
-                self._place(waypoint.lower[None], *still)
-                reach = self.geometry.tolerance[pair] + RESTING_TOLERANCE
-                if self.judge.distance(0, *self._pairs[pair]) <= reach:
+                placed = self._place(waypoint.lower[None], *self._still())
+                _, upper = self._bounds_of_pairs(placed, zero, zero + pair)
+                if upper[0] <= self.geometry.tolerance[pair] + RESTING_TOLERANCE:
                     found.append((pair, waypoint.lower[:3], allowed.departure))
         return found

@@ -1,8 +1,8 @@
 /* Candidates in lanes, from the decision vector to the verdict on every sample.
 
    Behind the cell's functions `path`, `start`, `predict`, `sample`, `clearance` and `piece_poses` in
-   lanes (symbolic.functions) and the shapes' proofs (hybrid_opt/collision/prejudge.c). The numbers in
-   capitals are defined by hybrid_opt/evaluate/kernel.py, and per function f of the above the macro
+   lanes (symbolic.functions). Proofs of pairs that the bounds leave open come from a function that the
+   caller hands over (hybrid_opt/collision/distances.cpp). The numbers in capitals are defined by hybrid_opt/evaluate/kernel.py, and per function f of the above the macro
    f_GIVEN, which puts the cell's numbers behind its other arguments: as they are where f_SHARED. */
 
 /* A pair of one sample that neither bounds nor proofs decide. */
@@ -13,16 +13,24 @@ typedef struct {
 
 typedef struct { long long pair; double place[3], departure; } resting_place;
 
-/* The cell's shapes: piece k of body b for first_piece[b] <= k < first_piece[b + 1]; a further
-   body is the payload that may rest, whose pieces are placed as the payload's. */
+/* Proves that two bodies are farther apart than `apart` or intersect deeper than `overlap`. Poses of
+   all pieces: quaternions and positions, their numbers `stride` apart. direction: from the first body
+   towards the second, zero at first; the next query begins with it. */
+enum { APART = 1, OPEN = 0, INTERSECTING = -1 };
+typedef int (*decide_pair)(const void* bodies, const double* quaternions, const double* positions,
+                           long long stride, long long first, long long second, double apart,
+                           double overlap, double* direction);
+
+/* The cell's pairs. columns: of each among all bounds; shrunk_payload: a further body, for the
+   payload where it rests. */
 typedef struct {
-  const long long *pairs, *columns, *first_piece; /* columns: of each pair among all bounds */
-  const shape* shapes;
-  const double* vertices;
+  const long long *pairs, *columns;
   const resting_place* resting;
   const double *free_beyond, *tolerance; /* of each pair */
-  long long n_pairs, has_far, n_resting, payload_piece, resting_piece;
-  double apart, overlap;
+  long long n_pairs, has_far, n_resting, shrunk_payload;
+  double margin;
+  const void* bodies;
+  decide_pair decide;
 } judge_data;
 
 /* Results of n candidates, an axis over them first. wanted: per output of `sample`, (n, samples,
@@ -68,6 +76,7 @@ typedef struct {
       outputs[SAMPLE_SIZE], begin[2][MOST_JOINTS], numbers[N_NUMBERS + 1],
       clearance[N_PAIRS + 1], quaternions[4 * N_PIECES], positions[3 * N_PIECES],
       w[MOST_OF_ALL(W) + 1];
+  double direction[N_PAIRS + 1][DUAL_ARM_LANES][3];
   const lanes_real* arg[MOST_OF_ALL(ARG) + 8];
   lanes_real* res[MOST_OF_ALL(RES) + 64];
   lanes_int iw[MOST_OF_ALL(IW) + 1];
@@ -219,16 +228,6 @@ static int press_all(const batch_data* batch, long long first, int m) {
 }
 #endif
 
-static placed piece_place(long long piece, int l) {
-  const scratch* s = own;
-  const lanes_real *q = s->quaternions + 4 * piece, *p = s->positions + 3 * piece;
-  double w = lane_of(q, l), x = lane_of(q + 1, l), y = lane_of(q + 2, l), z = lane_of(q + 3, l);
-  return (placed){{1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w),
-                   2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w),
-                   2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)},
-                  {lane_of(p, l), lane_of(p + 1, l), lane_of(p + 2, l)}};
-}
-
 /* Whether a pair is allowed to touch here; OPEN where rounding could tell otherwise. */
 static int rests(const judge_data* judge, long long pair, int k, int l) {
   for (long long i = 0; i < judge->n_resting; ++i) {
@@ -246,30 +245,23 @@ static int rests(const judge_data* judge, long long pair, int k, int l) {
   return 0;
 }
 
-static int prejudge(const judge_data* judge, long long pair, int k, int l) {
-  const long long *bodies = judge->pairs + 2 * pair, *first = judge->first_piece;
-  int resting = rests(judge, pair, k, l), found = APART;
+static int decide(const judge_data* judge, long long pair, int k, int l) {
+  scratch* s = own;
+  int resting = rests(judge, pair, k, l);
   if (resting < 0) return OPEN;
   /* A resting payload may come nearer than the tolerance; it only must not intersect. */
-  double apart = judge->apart + (resting ? 0.0 : judge->tolerance[pair]);
-  long long begin = resting ? judge->resting_piece : first[bodies[0]];
-  long long end = begin + first[bodies[0] + 1] - first[bodies[0]];
-  for (long long i = begin; i < end; ++i) {
-    placed a = piece_place(resting ? judge->payload_piece + i - begin : i, l);
-    for (long long j = first[bodies[1]]; j < first[bodies[1] + 1]; ++j) {
-      placed b = piece_place(j, l);
-      int one = prejudge_shapes(judge->shapes + i, &a, judge->shapes + j, &b, judge->vertices,
-                                apart, judge->overlap);
-      if (one == INTERSECTING) return INTERSECTING;
-      if (one == OPEN) found = OPEN;
-    }
-  }
-  return found;
+  double tolerance = resting ? 0.0 : judge->tolerance[pair];
+  const long long* bodies = judge->pairs + 2 * pair;
+  return judge->decide(judge->bodies, (const double*)s->quaternions + l,
+                       (const double*)s->positions + l, DUAL_ARM_LANES,
+                       resting ? judge->shrunk_payload : bodies[0], bodies[1],
+                       judge->margin + tolerance, judge->margin - tolerance, s->direction[pair][l]);
 }
 
 /* Which samples of the candidates collide, and which pairs are still to be judged. */
 static int collide(batch_data* batch, const judge_data* judge, long long first, int m) {
   scratch* s = own;
+  memset(s->direction, 0, sizeof s->direction);
   for (int k = 0; k < N_SAMPLES; ++k) {
     unsigned alive = 0, placed_already = 0;
     lanes_real sum = lanes_all_equal(0.0);
@@ -311,7 +303,7 @@ static int collide(batch_data* batch, const judge_data* judge, long long first, 
       }
       for (int l = 0; l < m; ++l) {
         if (!(bits >> l & 1u)) continue;
-        int found = prejudge(judge, pair, k, l);
+        int found = decide(judge, pair, k, l);
         if (found == INTERSECTING) colliding |= 1u << l;
         if (found != OPEN) continue;
         open_pair* one = batch->open + batch->n_open++;

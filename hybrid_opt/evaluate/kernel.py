@@ -1,7 +1,7 @@
 """What the samples of candidates say: constraints and collisions, before objectives are known.
 
 Whole evaluations run in lanes: `kernel.c` calls the cell's functions sample by sample, several
-candidates side by side, sums up the violations, bounds every pair's distance, and proves of most
+candidates side by side, sums up the violations, bounds every pair's distance, and has Coal prove of
 pairs that the bounds leave open that they are apart or intersect; the rest is left to FCL.
 Quantities per sample leave it only where they are asked for. `one_by_one` says the same in NumPy,
 from the outputs of the candidate function: the kernel's oracle, and what judges candidates of the
@@ -23,8 +23,8 @@ from codegen.build import load_or_build_program
 from codegen.compiled import OTHER_COMPILER, thread_pool, warn_one_lane
 from codegen.errors import CodegenError, FormError
 from codegen.function import available_cores
-from hybrid_opt.collision.checker import CollisionChecker
-from hybrid_opt.collision.judge import FCL_RESOLUTION
+from hybrid_opt.collision.checker import PROOF_MARGIN, CollisionChecker
+from hybrid_opt.collision.distances import compiled_distances
 from hybrid_opt.compiled_cell import CompiledCell
 from symbolic.array import Array
 from symbolic.functions import (
@@ -37,18 +37,11 @@ from symbolic.functions import (
     sample_sizes,
 )
 from symbolic.geometry.pairs import CellGeometry
-from symbolic.geometry.pieces import ConvexShape, Hull
-from symbolic.records import PAYLOAD, POSE_SIZE, Box, Capsule, Cylinder, Sphere, Workcell
+from symbolic.records import POSE_SIZE, Workcell
 
 _LEAST_ROOM = 4096
 """Open pairs that are collected before they are handed on, beside those of one pass."""
 
-PROOF_MARGIN = 5 * FCL_RESOLUTION
-"""How clearly two shapes must be apart or intersect to be decided without FCL [m]."""
-
-_SHAPE = np.dtype(
-    [("kind", np.int64), ("first", np.int64), ("count", np.int64), ("size", np.float64, 3)]
-)
 _RESTING = np.dtype([("pair", np.int64), ("place", np.float64, 3), ("departure", np.float64)])
 
 
@@ -242,14 +235,9 @@ class Kernel:
         return found
 
     def _judged(self, left: NDArray[np.void]) -> NDArray[np.bool_]:
-        """FCL's word on open pairs, at least one."""
-        # Pairs of one sample lie side by side: placed once.
-        place = left["candidate"] * self._samples + left["sample"]
-        new = np.concatenate([[True], place[1:] != place[:-1]])
-        configuration = left["configuration"][new]
-        pose, q_1, q_2 = self._checker.split(configuration)
-        rows = (np.cumsum(new) - 1).tolist()
-        return np.array(self._checker.collisions(pose, q_1, q_2, rows, left["pair"].tolist()))
+        """Have the checker decide open pairs, at least one."""
+        configuration = self._checker.split(left["configuration"])
+        return self._checker.collisions(*configuration, np.arange(len(left)), left["pair"])
 
 
 def load_kernel(
@@ -277,10 +265,7 @@ def load_kernel(
     own = (
         _definitions(checker.geometry)
         + _given(compiled)
-        + "".join(
-            files("hybrid_opt").joinpath(*path).read_text()
-            for path in (("collision", "prejudge.c"), ("evaluate", "kernel.c"))
-        )
+        + files("hybrid_opt").joinpath("evaluate", "kernel.c").read_text()
     )
     try:
         library = compiled.once(
@@ -406,11 +391,12 @@ class JudgeData(ctypes.Structure):
     """`judge_data` of kernel.c."""
 
     _fields_ = [
-        *((name, ctypes.c_void_p) for name in ("pairs", "columns", "first_piece", "shapes")),
-        *((name, ctypes.c_void_p) for name in ("vertices", "resting", "free_beyond", "tolerance")),
+        *((name, ctypes.c_void_p) for name in ("pairs", "columns")),
+        *((name, ctypes.c_void_p) for name in ("resting", "free_beyond", "tolerance")),
         *((name, ctypes.c_longlong) for name in ("n_pairs", "has_far", "n_resting")),
-        *((name, ctypes.c_longlong) for name in ("payload_piece", "resting_piece")),
-        *((name, ctypes.c_double) for name in ("apart", "overlap")),
+        ("shrunk_payload", ctypes.c_longlong),
+        ("margin", ctypes.c_double),
+        *((name, ctypes.c_void_p) for name in ("bodies", "decide")),
     ]
 
 
@@ -428,59 +414,24 @@ class BatchData(ctypes.Structure):
 
 
 def _judge_data(checker: CollisionChecker) -> tuple[JudgeData, dict[str, NDArray[Any]]]:
-    """Pairs, shapes and margins of a cell, and the memory that they point into, to be kept as long
-    as they."""
+    """Pairs and margins of a cell, and the memory that they point into, to be kept as long as
+    they, and as the checker, which has the bodies."""
     geometry = checker.geometry
-    bodies = [body.pieces for body in geometry.bodies]
-    shapes = [piece.shape for pieces in bodies for piece in pieces]
-    table, vertices = shape_table([*shapes, *checker.judge.resting_shapes])
     arrays = {
         "pairs": np.array([(p.first, p.second) for p in geometry.active], dtype=np.int64),
         "columns": geometry.columns.astype(np.int64),
-        "first_piece": np.cumsum([0] + [len(pieces) for pieces in bodies], dtype=np.int64),
-        "shapes": table,
-        "vertices": vertices,
         "resting": np.array(checker.resting_places, dtype=_RESTING),
         "free_beyond": np.ascontiguousarray(checker.free_beyond),
         "tolerance": np.ascontiguousarray(geometry.tolerance),
     }
-    first_piece = arrays["first_piece"]
     data = JudgeData(
         n_pairs=len(arrays["pairs"]),
         has_far=len(geometry.asked) > 1,
         n_resting=len(arrays["resting"]),
-        payload_piece=int(first_piece[geometry.index(PAYLOAD)]),
-        resting_piece=int(first_piece[-1]),
-        apart=PROOF_MARGIN,
-        overlap=PROOF_MARGIN,
+        shrunk_payload=checker.distances.shrunk_payload,
+        margin=PROOF_MARGIN,
+        bodies=checker.distances.native.address,
+        decide=compiled_distances().DECIDE,
         **{name: array.ctypes.data for name, array in arrays.items()},
     )
     return data, arrays
-
-
-def shape_table(shapes: Sequence[ConvexShape]) -> tuple[NDArray[np.void], Array]:
-    """`shape` of prejudge.c for each, and the vertices (n, 3) [m] of those that are hulls."""
-    table = np.zeros(len(shapes), _SHAPE)
-    vertices = [np.zeros((0, 3))]
-    for row, shape in zip(table, shapes, strict=True):
-        row["kind"], row["size"] = _measures(shape)
-        if isinstance(shape, Hull):
-            row["first"], row["count"] = sum(map(len, vertices)), len(shape.vertices)
-            vertices.append(shape.vertices)
-    return table, np.concatenate(vertices)
-
-
-def _measures(shape: ConvexShape) -> tuple[int, tuple[float, float, float]]:
-    """Kind and size of a shape as prejudge.c counts them."""
-    match shape:
-        case Box():
-            x, y, z = (float(length) / 2.0 for length in shape.size)
-            return 0, (x, y, z)
-        case Cylinder():
-            return 1, (shape.radius, shape.length / 2.0, 0.0)
-        case Sphere():
-            return 2, (shape.radius, 0.0, 0.0)
-        case Capsule():
-            return 3, (shape.radius, shape.length / 2.0, 0.0)
-        case Hull():
-            return 4, (0.0, 0.0, 0.0)

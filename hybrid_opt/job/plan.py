@@ -23,7 +23,8 @@ from codegen.function import NumericFunction
 from hybrid_opt.carry import Carry, joints_of
 from hybrid_opt.collision.certify import Certificate, SampledPath, certificates, certify
 from hybrid_opt.collision.checker import RESTING_TOLERANCE, CollisionChecker
-from hybrid_opt.collision.judge import FCL_RESOLUTION, Judge
+from hybrid_opt.collision.distances import BodyDistances
+from hybrid_opt.collision.judge import FCL_RESOLUTION
 from hybrid_opt.compiled_cell import CompiledCell, kept_per_workcell
 from hybrid_opt.errors import JobError
 from hybrid_opt.job.motions import (
@@ -141,32 +142,35 @@ class JobCollisions:
             height: how far below [m]; None to lower it until it touches something, and not at all
                 where nothing is found within `LARGEST_DROP`.
         """
-        judge = Judge(self.geometry, RESTING_TOLERANCE)
+        distances = BodyDistances(self.geometry, RESTING_TOLERANCE)
         payload, bodies = self.geometry.index(PAYLOAD), self.geometry.bodies
         pairs = [
             (p.first, p.second) for p in self.geometry.active if payload in (p.first, p.second)
         ]
         others = [first + second - payload for first, second in pairs]
         # What stands still and the box must not run into.
-        below = [other for other in others if bodies[other].frame.kind == "world"]
+        below = np.array(
+            [other for other in others if bodies[other].frame.kind == "world"], dtype=np.intp
+        )
         still = [np.zeros((1, len(robot.torque_max))) for robot in self._workcell.robots]
 
         def gaps(drop: float) -> Array:
             lowered = _lowered(pose, drop)
             placed = self._functions["piece_poses"].batch(lowered[None], *still)
-            judge.set_placements(placed["quaternions"], placed["positions"])
-            return np.array([judge.separation(0, payload, body) for body in below])
+            one = np.zeros(len(below), dtype=np.intp)
+            lower, _ = distances.bounds(placed, one, one + payload, below)
+            return np.maximum(lower, 0.0)
 
         found = 0.0 if height is None else height
-        if height is None and below:
+        if height is None and len(below):
             for _ in range(MOST_STEPS):
                 gap = float(gaps(found).min())
                 found += gap
                 if gap <= FCL_RESOLUTION or found > LARGEST_DROP:
                     break
             found = 0.0 if found > LARGEST_DROP else found
-        touched = gaps(found) <= RESTING_TOLERANCE if below else np.zeros(0, dtype=bool)
-        names = [bodies[body].name for body in np.array(below)[touched].tolist()]
+        touched = gaps(found) <= RESTING_TOLERANCE
+        names = [bodies[body].name for body in below[touched].tolist()]
         return SupportedPose(_lowered(pose, found), found, tuple(names))
 
     def around(self, handling: Handling, pose: Array) -> Around:

@@ -215,13 +215,14 @@ class PoseJudge:
         them by more than what rests on something may."""
         names = [(k, pair) for k, pair in enumerate(self.geometry.pair_names) if PAYLOAD in pair]
         standing = {body.name for body in self.geometry.workcell.environment}
-        joints = [np.zeros((1, arm.joints)) for arm in self.geometry.arms]
+        q_1, q_2 = (np.zeros((1, arm.joints)) for arm in self.geometry.arms)
         found = []
         for number, pair in names:
             other = next(name for name in pair if name != PAYLOAD)
-            if other in standing and self.checker.collisions(
-                pose[None], joints[0], joints[1], [0], [number]
-            ) == [True]:
+            if other not in standing:
+                continue
+            at, pair_number = np.zeros(1, dtype=np.intp), np.full(1, number)
+            if self.checker.collisions(pose[None], q_1, q_2, at, pair_number)[0]:
                 found.append((other, self.checker.enters(pose, number)))
         return found
 

@@ -37,11 +37,25 @@ from tests.symbolic.geometry.collision_cells import (
 def collision_mask(
     checker: CollisionChecker, pose: Array, q_1: Array, q_2: Array
 ) -> NDArray[np.bool_]:
-    """(n, n_pairs) FCL's answer for every pair of every sample, without any screening."""
-    n, n_pairs = len(pose), len(checker.geometry.active)
-    rows, pairs = np.divmod(np.arange(n * n_pairs), n_pairs)
-    found = checker.collisions(pose, q_1, q_2, rows.tolist(), pairs.tolist())
-    return np.array(found, dtype=bool).reshape(n, n_pairs)
+    """(n, n_pairs) FCL's answer for every pair of every sample, without screening and proofs;
+    within a tolerance Coal's distance counts as well."""
+    geometry = checker.geometry
+    placed = checker.functions["piece_poses"].batch(pose, q_1, q_2)
+    found = np.zeros((len(pose), len(geometry.active)), dtype=bool)
+    for k, row in enumerate(zip(pose, q_1, q_2, strict=True)):
+        resting = {
+            pair
+            for pair, place, departure in checker.resting_places
+            if np.linalg.norm(pose[k, :3] - place) <= departure
+        }
+        for i, pair in enumerate(geometry.active):
+            first = checker.distances.shrunk_payload if i in resting else pair.first
+            found[k, i] = checker.judge.intersects(placed, k, first, pair.second)
+        if geometry.tolerance.any():
+            near = true_distances(geometry, *row) <= geometry.tolerance
+            near[list(resting)] = False
+            found[k] |= near
+    return found
 
 
 def unscreened(checker: CollisionChecker, at: Configurations) -> Verdict:
@@ -122,11 +136,11 @@ def test_screening_changes_nothing(name: str, n: int, folder: Path) -> None:
     at = random_configurations(judge.geometry, n, np.random.default_rng(33))
     bounds, mask = judge.bounds(*at), collision_mask(judge, *at)
     assert not np.any(mask & (bounds > RESOLUTION))
-    before, screened = judge.judge.calls, judge.check(*at, bounds)
-    between, plain = judge.judge.calls, unscreened(judge, at)
+    before = judge.judge.calls
+    screened, plain = judge.check(*at, bounds), unscreened(judge, at)
     assert screened.colliding.tolist() == plain.colliding.tolist() == mask.any(axis=1).tolist()
     assert screened.first_touch == plain.first_touch
-    assert between - before < 0.2 * (judge.judge.calls - between)
+    assert judge.judge.calls - before < 1e-3 * mask.size
     touch = screened.first_touch
     assert touch is not None
     names = judge.geometry.pair_names
@@ -143,10 +157,8 @@ def test_measured_distances_are_those_of_coal(name: str, folder: Path) -> None:
     measured = np.full(apart.shape, -1.0)
     assert judge.measure(*at, measured, apart).max() == -1
     expected = np.array([true_distances(judge.geometry, *row) for row in zip(*at, strict=True)])
-    error = (measured - expected)[apart]
-    # Never above the distance, and almost always close to it.
-    assert error.max() <= 1e-6
-    assert np.quantile(error, 0.02) >= -1e-3
+    # Coal's own tolerance is 1e-6 of the distance.
+    np.testing.assert_allclose(measured[apart], expected[apart], rtol=2e-6, atol=2e-6)
     assert np.all(measured[~apart] == -1.0)
 
 

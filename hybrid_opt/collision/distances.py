@@ -1,0 +1,160 @@
+"""Distances of a cell's bodies by Coal, proven by their shapes (`distances.cpp`).
+
+A lower bound is the gap between both bodies along a direction that Coal's GJK proposes. It never
+exceeds their distance, whatever the solver says, and is within 1e-8 m of it where GJK converges.
+An upper bound below zero is the radius of a ball inside the Minkowski difference, so the depth of
+an intersection is at least as large.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import cache
+from importlib import import_module
+from typing import Any
+
+import coal  # loads the library that the compiled module needs
+import numpy as np
+from numpy.typing import NDArray
+
+from symbolic.array import Array
+from symbolic.errors import BridgeError
+from symbolic.geometry.bodies import BOX, CollisionBody
+from symbolic.geometry.pairs import CellGeometry
+from symbolic.geometry.pieces import ConvexShape, Hull, shrunk
+from symbolic.records import PAYLOAD, Box, Capsule, Cylinder, Sphere
+from symbolic.robot.bridge import REMEDY, require_same_minor
+
+INTERSECTING, OPEN, APART = -1, 0, 1
+"""Verdicts of `BodyDistances.decide`."""
+
+
+@cache
+def compiled_distances() -> Any:
+    """Load the compiled module.
+
+    Raises:
+        BridgeError: it is missing, cannot be loaded, or was compiled against another Coal.
+    """
+    try:
+        found = import_module("hybrid_opt.collision._distances")
+    except ImportError as error:
+        raise BridgeError(
+            f"the compiled part of collision checking cannot be loaded ({error}); {REMEDY}"
+        ) from error
+    require_same_minor({"coal": found.COAL_VERSION}, {"coal": coal.__version__})
+    return found
+
+
+class BodyDistances:
+    """Answer queries of pairs of bodies at many placements in one call.
+
+    Queries of one pair start from the direction of the query before: order them by samples. Safe to
+    share between threads.
+
+    Attributes:
+        bodies: those of the geometry, then the payload smaller by the resting tolerance.
+        first_piece: (n_bodies + 1,) of each body, the index of its first piece among all.
+        poses: (n_pieces,) of each piece, the index of its pose in the cell's `piece_poses`.
+        shrunk_payload: index of the smaller payload.
+        native: the compiled object; `address` is what C code passes to `decide_pair`.
+    """
+
+    def __init__(self, geometry: CellGeometry, resting_tolerance: float) -> None:
+        """Prepare the shapes.
+
+        Args:
+            resting_tolerance: by how much the smaller payload is smaller on every side [m].
+        """
+        payload = geometry.index(PAYLOAD)
+        smaller = tuple(shrunk(p, resting_tolerance) for p in geometry.bodies[payload].pieces)
+        resting = CollisionBody("shrunk payload", "payload", BOX, smaller)
+        self.bodies = (*geometry.bodies, resting)
+        self.shrunk_payload = len(geometry.bodies)
+        counts = [len(body.pieces) for body in self.bodies]
+        self.first_piece = np.concatenate([[0], np.cumsum(counts)])
+        self.poses = np.arange(self.first_piece[-1])
+        self.poses[self.first_piece[-2] :] = self.first_piece[payload] + np.arange(len(smaller))
+        shapes = [piece.shape for body in self.bodies for piece in body.pieces]
+        self.native = compiled_distances().Bodies(
+            *shape_table(shapes), self.first_piece, self.poses
+        )
+
+    def bounds(
+        self,
+        placed: Mapping[str, Array],
+        rows: NDArray[np.intp],
+        first: NDArray[np.intp],
+        second: NDArray[np.intp],
+    ) -> tuple[Array, Array]:
+        """Bound the distances of m pairs of bodies.
+
+        Args:
+            placed: outputs of the function `piece_poses` for n samples.
+            rows: (m,) the sample of each query.
+            first, second: (m,) both bodies.
+
+        Returns:
+            lower, upper: (m,) [m]; negative where the bodies intersect, -inf and inf at a pose that
+            is not finite.
+        """
+        lower, upper = self.native.distances(*_poses(placed), rows, first, second)
+        return lower, upper
+
+    def decide(
+        self,
+        placed: Mapping[str, Array],
+        rows: NDArray[np.intp],
+        first: NDArray[np.intp],
+        second: NDArray[np.intp],
+        apart: Array,
+        overlap: Array,
+    ) -> NDArray[np.int8]:
+        """Prove of m pairs that they are apart or intersect.
+
+        Args:
+            placed, rows, first, second: see `bounds`.
+            apart: (m,) distance that `APART` proves to be exceeded [m].
+            overlap: (m,) depth that `INTERSECTING` proves to be exceeded [m]; where it is negative,
+                a distance that is not reached.
+
+        Returns:
+            (m,) the verdicts; `OPEN` where neither is proven.
+        """
+        found: NDArray[np.int8] = self.native.decide(
+            *_poses(placed), rows, first, second, apart, overlap
+        )
+        return found
+
+
+def _poses(placed: Mapping[str, Array]) -> tuple[Array, Array]:
+    return placed["quaternions"], placed["positions"]
+
+
+def shape_table(
+    shapes: Sequence[ConvexShape],
+) -> tuple[NDArray[np.int64], Array, NDArray[np.int64], Array]:
+    """Return kinds (n,), sizes (n, 3), numbers of corners (n,), and the corners (m, 3) of hulls.
+
+    They are the first arguments of the compiled `Bodies`; sizes are those of `distances.cpp` [m].
+    """
+    kinds, sizes = zip(*(_measures(shape) for shape in shapes), strict=True)
+    corners = [s.vertices if isinstance(s, Hull) else np.zeros((0, 3)) for s in shapes]
+    counts = np.array([len(each) for each in corners])
+    return np.array(kinds), np.array(sizes), counts, np.concatenate(corners)
+
+
+def _measures(shape: ConvexShape) -> tuple[int, tuple[float, float, float]]:
+    """Kind and size of a shape as `distances.cpp` counts them."""
+    match shape:
+        case Box():
+            x, y, z = (float(length) / 2.0 for length in shape.size)
+            return 0, (x, y, z)
+        case Cylinder():
+            return 1, (shape.radius, shape.length / 2.0, 0.0)
+        case Sphere():
+            return 2, (shape.radius, 0.0, 0.0)
+        case Capsule():
+            return 3, (shape.radius, shape.length / 2.0, 0.0)
+        case Hull():
+            return 4, (0.0, 0.0, 0.0)
