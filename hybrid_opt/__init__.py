@@ -57,6 +57,8 @@ if TYPE_CHECKING:
     from hybrid_opt.recommending.choice import Wish as Wish
     from hybrid_opt.recommending.recommendation import Recommendation as Recommendation
     from hybrid_opt.recommending.recommendation import recommend as recommend
+    from hybrid_opt.robust.budget import GripBudget as GripBudget
+    from hybrid_opt.robust.budget import grip_budget as grip_budget
     from hybrid_opt.robust.squeeze import SqueezeSettings as SqueezeSettings
     from hybrid_opt.sensitivity import Sensitivities as Sensitivities
     from hybrid_opt.sensitivity import sensitivities as sensitivities
@@ -70,6 +72,7 @@ if TYPE_CHECKING:
     from symbolic.errors import DualArmError as DualArmError
     from symbolic.errors import SettingsError as SettingsError
     from symbolic.errors import WorkcellError as WorkcellError
+    from symbolic.records import Uncertainty as Uncertainty
     from symbolic.records import Workcell as Workcell
 
 _HOMES = {

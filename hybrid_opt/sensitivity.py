@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from hybrid_opt.carry import Carry
 from hybrid_opt.compiled_cell import CompiledCell
 from hybrid_opt.progress import ShowProgress, following
-from hybrid_opt.recommending.choice import LEADER
+from hybrid_opt.robust.cases import LEADER
 from hybrid_opt.robust.force import BoxMotion
 from hybrid_opt.robust.path_force import RulingForce
 from hybrid_opt.shown import Displayable

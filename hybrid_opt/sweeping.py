@@ -241,7 +241,8 @@ def _row(
             numbers, np.nan, np.nan, np.zeros(0), str(error).splitlines()[-1].strip()
         )
     best = np.append(front.x[found.member, :-1], found.limit)
-    return Combination(numbers, found.duration, found.force, best, "; ".join(found.warnings))
+    told = "; ".join([*([] if found.fits else [found.objection]), *found.warnings])
+    return Combination(numbers, found.duration, found.force, best, told)
 
 
 def _tried(cell: Cell, near: Sequence[Array], fixed: bool) -> Evaluations:

@@ -64,7 +64,7 @@ seed = whole(0, LARGEST_SEED)
 
 
 force = number(1e-3, 1e6)
-"""The type of normal forces [N], and of durations [s] and masses [kg] that are wished for."""
+"""The type of normal forces [N], and of durations [s] and masses [kg] of wishes."""
 
 
 @dataclass(frozen=True)
@@ -303,9 +303,8 @@ def add_wishes(parser: argparse._ActionsContainer, more: str = "") -> None:
         "--payload",
         type=force,
         metavar="KG",
-        help="recommend the shortest carry on whose motion the robots would hold a box of KG "
-        "kilograms in every case of the uncertainty (default: the least product of duration and "
-        "commanded force)",
+        help="recommend for a box of KG kilograms: forces, timing and job are those that it takes "
+        "(default: the mass of the workcell)",
     )
 
 

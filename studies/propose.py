@@ -82,6 +82,7 @@ def _run(options: argparse.Namespace) -> int:
 
     import hybrid_opt as ho
     from hybrid_opt.proposing.proposal import worked
+    from hybrid_opt.robust.budget import budget_text
     from hybrid_opt.store.files import AGAIN, write_atomically
 
     problem, output = options.problem, options.output
@@ -105,6 +106,8 @@ def _run(options: argparse.Namespace) -> int:
         name = output if k == 1 else output.with_stem(f"{output.stem}-{k}")
         write_atomically(name, proposal.text(name.parent).encode(), AGAIN)
         print(f"{name}: {proposal}")
+    if not ho.grip_budget(proposals[0].found.workcell).fits:
+        print(f"WARNING: {budget_text(proposals[0].found.workcell)}")
     if options.grips is not None:
         grip = ho.propose_grip(ho.Cell.load(output), *options.grips)
         assert grip.cell.workcell.text is not None, "it was read from a file"

@@ -1,20 +1,34 @@
-"""Another carry of a finished study: `python -m studies.recommend RESULTS --force-limit 52`.
+"""Recommend another carry of a study: `python -m studies.recommend RESULTS --force-limit 52`.
 
-Recommends a carry of its drivable fronts, and stores its trajectory. The study's own
-recommendation stays as it is.
+Times, presses and plans the paths of its drivable fronts anew, for another payload, reference force
+or uncertainty where these are given, and stores the trajectory. The study's own recommendation
+stays as it is.
 """
 
 from __future__ import annotations
 
 import argparse
 
-from studies.options import OUTPUT_FILE, add, add_wishes
+from studies.options import OUTPUT_FILE, add, add_wishes, force, number
 from studies.program import Parser, Program
 
 
 def _add_options(parser: Parser) -> None:
     add(parser, "RESULTS")
     add_wishes(parser)
+    parser.add_argument(
+        "--reference-force",
+        type=force,
+        metavar="N",
+        help="largest normal force of both robots (default: that of the workcell)",
+    )
+    parser.add_argument(
+        "--uncertainty",
+        type=_uncertainty,
+        metavar="SET",
+        help="a factor on every range of the uncertainty, or ranges as friction=0.1,mass=0.02 in "
+        "place of the workcell's (default: the workcell's)",
+    )
     add(
         parser,
         "--output",
@@ -25,12 +39,30 @@ def _add_options(parser: Parser) -> None:
     add(parser, "--quiet")
 
 
+def _uncertainty(text: str) -> float | dict[str, float]:
+    """Read a factor, or ranges by their names in a workcell file."""
+    if "=" not in text:
+        return number(0.0, 20.0)(text)
+    read, found = number(0.0, 1e7), {}
+    for part in text.split(","):
+        name, _, value = part.partition("=")
+        found[name.strip()] = read(value)
+    return found
+
+
 def _run(options: argparse.Namespace) -> int:
+    from hybrid_opt.campaign.results import read_campaign
     from hybrid_opt.progress import Progress
     from hybrid_opt.recommending.choice import Wish
     from studies.study.recommendation import recommend_from, recommendation_text
 
-    wish, root = Wish(options.duration, options.force_limit, options.payload), options.results
+    root, doubt = options.results, None
+    if options.uncertainty is not None:
+        known = read_campaign(root).workcell.uncertainty
+        doubt = known.changed(options.uncertainty)
+    wish = Wish(
+        options.duration, options.force_limit, options.payload, options.reference_force, doubt
+    )
     found = recommend_from(root, wish, options.output, Progress(not options.quiet))
     print(recommendation_text(found, str(root)).terminal())
     return 0
@@ -38,8 +70,10 @@ def _run(options: argparse.Namespace) -> int:
 
 def _complete(options: argparse.Namespace) -> None:
     wishes = {"duration": options.duration, "force": options.force_limit}
-    wishes["payload"] = options.payload
-    named = "-".join(f"{name}-{value:g}" for name, value in wishes.items() if value is not None)
+    wishes |= {"payload": options.payload, "reference-force": options.reference_force}
+    parts = [f"{name}-{value:g}" for name, value in wishes.items() if value is not None]
+    parts += ["uncertainty"] if options.uncertainty is not None else []
+    named = "-".join(parts)
     file = f"recommended-{named or 'least-product'}.json"
     options.output = options.output or options.results / file
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import re
+import shlex
 import subprocess
 import sys
 from functools import cache
@@ -108,6 +109,24 @@ def test_what_is_broken_would_be_found(tmp_path: Path) -> None:
     assert found == ["gone.md", "#another", "http://x", "https://x"]
     assert commands("`python -m studies.rack --jobs 2`") == [("studies.rack", ["--jobs"])]
     assert "--no-such-option" not in OPTION.findall(help_of("studies.rack"))
+
+
+@pytest.mark.slow
+def test_the_lines_for_a_cell_of_ones_own_end_without_a_warning(tmp_path: Path) -> None:
+    """As README has them, but for the installation; in a folder that has the checkout's studies."""
+    section = (ROOT / "README.md").read_text("utf-8").split("## Your own cell")[1]
+    install, *lines = re.findall(r"```sh\n(.*?)```", section, flags=re.DOTALL)[0].splitlines()
+    assert install.startswith("pip install")
+    assert len(lines) == 3
+    (tmp_path / "studies").symlink_to(ROOT / "studies")
+    for line in lines:
+        words = shlex.split(line)
+        words[0] = sys.executable if words[0] == "python" else words[0]
+        done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stderr
+        assert "WARNING" not in done.stdout + done.stderr, done.stdout
+    assert done.stdout.startswith("Run this carry: ")
+    assert "grip at rest, with the usual uncertainty: 96.4 N of 120.0 N" in done.stderr
 
 
 def test_the_index_lists_every_page() -> None:

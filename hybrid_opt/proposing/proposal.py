@@ -305,7 +305,7 @@ class _Search:
         if lazy.setup is None and not lazy.problem:
             self._say("ways to hold the box")
             try:
-                lazy.setup = prepare(self.problem, lazy.given, lazy.spins, self.rng)
+                lazy.setup = prepare(self.problem, lazy.given, lazy.spins, self.rng, self._say)
             except (ProposalError, WorkcellError) as error:
                 if isinstance(error, WorkcellError) and not lazy.given:
                     raise  # the file is wrong, not the bases that were tried

@@ -4,7 +4,7 @@ and, where one of these is missing, why."""
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from itertools import combinations, islice, product
@@ -32,6 +32,7 @@ from hybrid_opt.proposing.holding import (
 from hybrid_opt.proposing.planner import ClosedChain, Place, Retreats, retreats
 from hybrid_opt.proposing.problem import Problem
 from hybrid_opt.proposing.trial import MARGINS, PoseJudge, judge_of
+from hybrid_opt.robust.budget import budget_text
 from hybrid_opt.static_hold import require_hold
 from symbolic.array import Array
 from symbolic.geometry.pairs import build_geometry
@@ -166,13 +167,18 @@ class Setup:
 
 
 def prepare(
-    problem: Problem, given: dict[str, Any], spins: Array, rng: np.random.Generator
+    problem: Problem,
+    given: dict[str, Any],
+    spins: Array,
+    rng: np.random.Generator,
+    tell: Callable[[str], None] = lambda text: None,
 ) -> Setup:
     """Find all ways to hold.
 
     Args:
         given: added to the problem's tables.
         spins: of both pads that are tried [rad].
+        tell: called with the budget of the grip, before any search.
 
     Raises:
         ProposalError: an arm cannot hold the box at start and goal; the text says why.
@@ -182,6 +188,7 @@ def prepare(
     given = merged(given, redundancy(problem, problem.workcell(given)))
     workcell = problem.workcell(given)
     require_hold(workcell)
+    tell(budget_text(workcell))
     lacking = reach_missing(workcell, (start, goal), spins)
     if lacking:
         raise ProposalError(lacking)

@@ -15,8 +15,8 @@ import numpy as np
 
 from hybrid_opt.carry import Carry
 from hybrid_opt.cell import Cell
-from hybrid_opt.recommending.choice import LEADER, DrivenPaths, Option
-from hybrid_opt.robust.cases import nominal_case
+from hybrid_opt.recommending.choice import DrivenPaths, Option
+from hybrid_opt.robust.cases import LEADER, nominal_case
 from hybrid_opt.robust.force import HOLDS, BoxMotion, pressing_model, thinned
 from hybrid_opt.timing.records import Timing
 from hybrid_opt.timing.robustness import Margin

@@ -1,8 +1,8 @@
 """The carry that a wish names among the paths of a drivable front.
 
 Every path is driven within several limits of the planned force. Each is an option: how long the
-carry takes, and how hard to press so that it holds in every case of the cell's uncertainty. Wishes
-are about these two.
+carry takes, and how hard to press so that it holds in every case of the cell's uncertainty. Targets
+of wishes are about these two; a wish may also replace numbers of the cell.
 """
 
 from __future__ import annotations
@@ -10,23 +10,24 @@ from __future__ import annotations
 import math
 import operator
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from hybrid_opt.cell import Cell
-from hybrid_opt.robust.cases import least_friction
+from hybrid_opt.robust.budget import GripBudget
+from hybrid_opt.robust.cases import LEADER
 from hybrid_opt.robust.force import BoxMotion, pressing_model
+from hybrid_opt.static_hold import unheld
 from hybrid_opt.timing.path_timer import PathTiming
 from hybrid_opt.timing.records import TimingLimits
 from symbolic.array import Array
 from symbolic.errors import SettingsError
-from symbolic.records import Workcell
+from symbolic.records import Uncertainty, Workcell
+from symbolic.records.cell import RANGES
 
-_UNITS = {"duration": "s", "force": "N", "payload": "kg"}
-
-LEADER = 0
-"""The arm that keeps its place; the other's force is commanded."""
+_UNITS = {"duration": "s", "force": "N", "payload": "kg", "reference_force": "N"}
 
 FORCES = 10
 """Limits that every path is driven within at first, and by how much they are refined."""
@@ -42,49 +43,100 @@ LOOKED_AT = 32
 
 @dataclass(frozen=True)
 class Wish:
-    """At most one of three wishes. Without any, the least product of duration and commanded force
-    is meant.
+    """Target of a recommendation, and what of the cell is replaced for it.
+
+    With neither a duration nor a force the least product of duration and commanded force is sought.
 
     Attributes:
         duration: longest time of the carry, limits on jerk kept; the least force is sought [s].
-        force: no more may be commanded; asked for is the shortest duration [N].
-        payload: so heavy a box has to hold on the same motion within the reference forces; asked
-            for is the shortest duration [kg].
+        force: largest force to command; the shortest duration is sought [N].
+        payload: mass in place of the cell's; the inertia grows with it [kg].
+        reference_force: of both robots, in place of the cell's [N].
+        uncertainty: in place of the cell's.
     """
 
     duration: float | None = None
     force: float | None = None
     payload: float | None = None
+    reference_force: float | None = None
+    uncertainty: Uncertainty | None = None
 
     def __post_init__(self) -> None:
-        """Refuse more than one wish, and what is no positive number.
+        """Refuse two targets, and values that are not positive.
 
         Raises:
             SettingsError: with what was found.
         """
-        given = self.given
-        if len(given) > 1:
-            raise SettingsError(f"{' and '.join(given)} are wished for; give at most one of them")
-        for name, value in given.items():
+        if self.duration is not None and self.force is not None:
+            raise SettingsError("duration and force are wished for; give at most one of them")
+        for name, value in self.numbers.items():
             if not 0.0 < value < math.inf:
                 raise SettingsError(
                     f"{name} {value:g} {_UNITS[name]}: allowed are positive finite numbers"
                 )
 
     @property
-    def given(self) -> dict[str, float]:
-        """The wishes by name."""
-        values = {field.name: getattr(self, field.name) for field in fields(self)}
+    def numbers(self) -> dict[str, float]:
+        """The values that are given, without the uncertainty, by name."""
+        values = {name: getattr(self, name) for name in _UNITS}
         return {name: value for name, value in values.items() if value is not None}
 
-    def __str__(self) -> str:
-        for name, value in self.given.items():
-            return {
-                "duration": f"the least force of all carries of at most {value:g} s",
-                "force": f"the shortest of all carries that need at most {value:g} N commanded",
-                "payload": f"the shortest of all carries that would hold {value:g} kg",
-            }[name]
+    @property
+    def has_target(self) -> bool:
+        """Return True if a duration or a force is given."""
+        return self.duration is not None or self.force is not None
+
+    @property
+    def target(self) -> str:
+        """What is sought, in words."""
+        if self.duration is not None:
+            return f"the least force of all carries of at most {self.duration:g} s"
+        if self.force is not None:
+            return f"the shortest of all carries that need at most {self.force:g} N commanded"
         return "least product of duration and commanded force"
+
+    def __str__(self) -> str:
+        replaced = [
+            *([] if self.payload is None else [f"a payload of {self.payload:g} kg"]),
+            *(
+                []
+                if self.reference_force is None
+                else [f"reference forces of {self.reference_force:g} N"]
+            ),
+            *([] if self.uncertainty is None else [f"the uncertainty {self.uncertainty}"]),
+        ]
+        return f"{self.target}{', with ' if replaced else ''}{' and '.join(replaced)}"
+
+
+def wished_cell(cell: Cell, wish: Wish) -> Cell:
+    """Return the cell with the payload, reference forces and uncertainty of a wish.
+
+    Raises:
+        SettingsError: robots and pads cannot hold the payload still.
+        WorkcellError: the cell with these values is wrong.
+    """
+    known, changes = cell.workcell, dict[str, Any]()
+    if wish.payload is not None and wish.payload != known.payload.mass:
+        inertia = wish.payload / known.payload.mass * known.payload.inertia
+        changes |= {"payload.mass": wish.payload, "payload.inertia": inertia}
+    force = wish.reference_force
+    if force is not None and (known.task.reference_force != force).any():
+        changes["task.reference_force"] = force
+    if wish.uncertainty is not None:
+        ranges = {name: getattr(wish.uncertainty, name) for name in (*RANGES, "stiffness")}
+        if any(np.any(value != getattr(known.uncertainty, name)) for name, value in ranges.items()):
+            changes |= {f"uncertainty.{name}": value for name, value in ranges.items()}
+    if not changes:
+        return cell
+    found = cell.changed(changes)
+    reason = unheld(found.workcell)
+    if reason:
+        raise SettingsError(f"{_listed(wish)}: {reason}")
+    return found
+
+
+def _listed(wish: Wish) -> str:
+    return ", ".join(f"{name} {value:g} {_UNITS[name]}" for name, value in wish.numbers.items())
 
 
 @dataclass(frozen=True)
@@ -108,13 +160,6 @@ class Goal:
         cost: Callable[[float, float], float] = operator.mul
         if wish.force is not None:
             allowed, cost = commanded_at_most(wish.force, allowed), duration_alone
-        elif wish.payload is not None:
-            doubt = workcell.uncertainty
-            friction = least_friction(pressing_model(workcell).workcell, doubt)
-            opposed, share = doubt.opposed_force / friction, 1.0 - doubt.tracking
-            heavier = wish.payload / workcell.payload.mass
-            allowed = ((share * allowed - opposed) / heavier + opposed) / share
-            cost = duration_alone
         elif wish.duration is not None:
             longest, cost = wish.duration, force_alone
         return cls(longest, allowed, cost)
@@ -276,7 +321,7 @@ def best_of_paths(
         yield option
 
 
-def refuse(options: Sequence[Option], wish: Wish, goal: Goal) -> None:
+def refuse(options: Sequence[Option], wish: Wish, goal: Goal, budget: GripBudget) -> None:
     """Say what is possible where nothing keeps to a wish.
 
     Raises:
@@ -294,8 +339,9 @@ def refuse(options: Sequence[Option], wish: Wish, goal: Goal) -> None:
     if not options:
         raise SettingsError("no carry of the front can be driven: it cannot even be held still")
     least = min(option.commanded for option in options)
-    asked = ", ".join(f"{name} {value:g} {_UNITS[name]}" for name, value in wish.given.items())
+    remedies = f". {budget.advice}" if budget.advice else ""
     raise SettingsError(
-        f"{asked}: no carry of the front holds within {goal.hardest.min():.1f} N in every case of "
-        f"the cell's uncertainty; the gentlest needs {least:.1f} N commanded"
+        f"{_listed(wish)}: no carry of the front holds within {goal.hardest.min():.1f} N in every "
+        f"case of {budget.uncertainty.title}; the gentlest needs {least:.1f} N commanded; "
+        f"{budget}{remedies}"
     )

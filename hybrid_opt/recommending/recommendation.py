@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import brentq
 
 from hybrid_opt.carry import Carry
 from hybrid_opt.cell import Cell
@@ -26,7 +25,6 @@ from hybrid_opt.progress import ShowProgress, counted
 from hybrid_opt.recommending.advice import Advice, advice, commanded_margins
 from hybrid_opt.recommending.choice import (
     FORCES,
-    LEADER,
     DrivenPaths,
     Goal,
     Option,
@@ -36,14 +34,18 @@ from hybrid_opt.recommending.choice import (
     duration_alone,
     force_alone,
     refuse,
+    wished_cell,
 )
+from hybrid_opt.robust.budget import (
+    GripBudget,
+    Remedy,
+    cheapest_remedies,
+    grip_budget,
+    remedies_text,
+)
+from hybrid_opt.robust.cases import LEADER
 from hybrid_opt.robust.force import at_rest, box_motion, pressing_model, robust_model, thinned
-from hybrid_opt.robust.squeeze import (
-    DOUBTS,
-    MOST,
-    Squeeze,
-    largest_commanded,
-)
+from hybrid_opt.robust.squeeze import MOST, Squeeze, largest_commanded
 from hybrid_opt.shown import Displayable
 from hybrid_opt.static_hold import static_hold
 from hybrid_opt.timing.limits import limited_force
@@ -51,8 +53,7 @@ from hybrid_opt.timing.records import Timing
 from hybrid_opt.timing.robustness import Margin
 from symbolic.array import Array, Figure, evenly
 from symbolic.errors import SettingsError
-from symbolic.records import Uncertainty, Workcell
-from symbolic.records.cell import RANGES
+from symbolic.records import Workcell
 
 HAND_MADE = "hand-made"
 """Name of the workcell file's own trajectory."""
@@ -63,12 +64,6 @@ the whole force keep to it as well."""
 
 TRIED = 3
 """Paths that are driven within limits on jerk before the best of them is chosen."""
-
-PRECISE = 1e-3
-"""Tolerance of the multiple of an uncertainty set that would do."""
-
-GENTLE = 1.02
-"""Limit over the least commanded force, where no carry keeps to the reference forces."""
 
 STEPS = 4 + FORCES
 """Steps of a recommendation; each rival adds one."""
@@ -93,6 +88,11 @@ class Recommendation(Displayable):
         rivals: the hand-made path, and others, at the same commanded force and in the same time.
         advice: what changes of the cell would change.
         warnings: what speaks against it, sentences; empty where nothing does.
+        required: (2,) largest force of each robot in any case, commanded or felt [N].
+        budget: what holding still takes of the reference forces.
+        remedies: where the reference forces do not allow it, the smallest changes of the cell with
+            which they do.
+        why: what it was chosen by.
     """
 
     wish: Wish
@@ -108,6 +108,22 @@ class Recommendation(Displayable):
     rivals: tuple[Rival, ...]
     advice: tuple[Advice, ...]
     warnings: tuple[str, ...]
+    required: Array
+    budget: GripBudget
+    remedies: tuple[Remedy, ...]
+    why: str
+
+    @property
+    def fits(self) -> bool:
+        """Return True if it holds in every case within the reference forces."""
+        return is_within(self.required, self.budget.allowed)
+
+    @property
+    def objection(self) -> str:
+        """Why it must not be run as it is, and what would do; '' where it fits."""
+        if self.fits:
+            return ""
+        return f"no carry fits: {self.budget}; {remedies_text(self.remedies, 'for this carry')}"
 
     @property
     def carry(self) -> Carry:
@@ -132,11 +148,12 @@ class Recommendation(Displayable):
 
     def __repr__(self) -> str:
         job = "" if self.job is None else f", the job takes {self.job.duration:.2f} s"
-        lines = [
-            f"Recommended: {self.duration:.3f} s, press with {self.force:.1f} N{job}",
-            f"  {self.wish}",
-            f"  {self.squeeze}: {self.squeeze.account}",
-        ]
+        found = f"{self.duration:.3f} s, press with {self.force:.1f} N{job}"
+        lines = [f"Recommended: {found}"]
+        if not self.fits:
+            objection = f"N{self.objection[1:]}"
+            lines = [objection, f"If you allow {self.required.max():.1f} N: {found}"]
+        lines += [f"  {self.why}", f"  {self.squeeze}: {self.squeeze.account}"]
         lines += [f"  {each}" for each in (*self.rivals, *self.advice)]
         return "\n".join(lines + [f"  warning: {text}" for text in self.warnings])
 
@@ -151,11 +168,13 @@ def recommend(
     """The carry to run of a drivable front.
 
     It holds over the cell's whole uncertainty within the robots' reference forces, and has the
-    least product of duration and commanded force of all that do.
+    least product of duration and commanded force of all that do. Where none does, the least product
+    of all is given, with what would have to change (`Recommendation.objection`).
 
     Args:
         front: of a cell under the time law 'optimal', see `Cell.drivable`.
-        wish: what is asked for instead of the least product.
+        wish: another target, or other numbers of the cell: paths are timed, pressed and planned
+            for these.
         others: (n_path,) paths by label, beside which the answer stands; the hand-made one always
             is.
         progress: True for a bar, or what takes steps done and in all.
@@ -164,8 +183,10 @@ def recommend(
     Raises:
         SettingsError: the cell has another time law, the front is empty, no member can do what is
             wished for, or the uncertainty leaves no friction or patch.
+        WorkcellError: the cell with the numbers that are wished for is wrong.
     """
-    cell, wish = front.cell, wish or Wish()
+    wish = wish or Wish()
+    cell = wished_cell(front.cell, wish)
     if cell.workcell.task.time_law != "optimal":
         raise SettingsError(
             f"the cell's time law is {cell.workcell.task.time_law!r}, which no robot drives; give "
@@ -178,40 +199,42 @@ def recommend(
         )
     named: dict[str, Array] = {} if alone else {HAND_MADE: cell.initial[:-1]} | dict(others or {})
     with counted(progress, "recommendation", STEPS + len(named)) as advance:
-        return _recommended(front, wish, named, lambda: advance(1), alone)
+        return _recommended(cell, front.x, wish, named, lambda: advance(1), alone)
 
 
 def _recommended(
-    front: Front, wish: Wish, named: Mapping[str, Array], told: Callable[[], None], alone: bool
+    cell: Cell,
+    given: Array,
+    wish: Wish,
+    named: Mapping[str, Array],
+    told: Callable[[], None],
+    alone: bool,
 ) -> Recommendation:
-    cell, given = front.cell, front.x
     rows = spread_rows(given[:, :-1])
     paths = DrivenPaths(cell, given[rows, :-1])
     options = paths.all_options(given[rows, -1], told)
-    goal = Goal.of(wish, cell.workcell)
-    weak = not wish.given and not any((each.force <= goal.hardest).all() for each in options)
-    if weak and options:
-        # A little more than the gentlest asks for: its last newtons take most of its time.
-        gentle = np.full(2, GENTLE * min(float(each.force.max()) for each in options))
-        goal = replace(goal, hardest=gentle)
-    refuse(options, wish, goal)
-    option, timing = _driven(cell, paths, options, goal, bool(wish.given))
+    goal, budget = Goal.of(wish, cell.workcell), grip_budget(cell.workcell)
+    why = str(wish)
+    if not wish.has_target and not any((each.force <= goal.hardest).all() for each in options):
+        goal = replace(goal, hardest=np.full(2, np.inf))
+        why = f"{wish}, of carries that all exceed the reference force"
+    refuse(options, wish, goal, budget)
+    option, timing, is_kept = _driven(cell, paths, options, goal, wish.has_target)
+    if not is_kept:
+        why = "least excess over the reference force of the carries that were driven"
     told()
     carry = timing.carry
-    assert carry is not None, "what is driven has a carry"
+    assert carry is not None, "what is recommended has a timing"
     held = pressed(JobModel(cell.compiled, cell.timing_model), timing)
     forces, squeeze, job, doubts = held.forces, held.squeeze, held.job, _doubts(held)
     commanded = np.asarray(forces.max(axis=0)) if job is None else job.peak_normal_force
-    allowed = cell.workcell.task.reference_force
-    needed = np.maximum(commanded, _largest_felt(cell.workcell, carry))
-    beyond = (needed > allowed * (1.0 + BETTER)).any()
-    if weak or (beyond and not wish.given):
-        doubts.insert(0, _too_weak(cell.workcell, carry, needed, forces[:, 1 - LEADER]))
-    elif beyond:
-        doubts.append(
-            f"an arm feels up to {needed.max():.1f} N, which exceeds the reference force of "
-            f"{allowed.min():.1f} N; wish for a longer carry or less force"
-        )
+    allowed, remedies = cell.workcell.task.reference_force, tuple[Remedy, ...]()
+    required = np.maximum(commanded, _largest_felt(cell.workcell, carry))
+    if not is_within(required, allowed):
+        largest = carry.normal_force[:, 1 - LEADER], forces[:, 1 - LEADER]
+        most = np.union1d(*[np.argsort(-each)[:MOST] for each in largest])
+        model = pressing_model(cell.workcell)
+        remedies = cheapest_remedies(model, box_motion(carry).at(most), required, allowed)
     told()
     beside = []
     for label, path in named.items():
@@ -235,14 +258,18 @@ def _recommended(
         rivals=tuple(beside),
         advice=hints,
         warnings=(*doubts, *_better(beside, timing, squeeze.force)),
+        required=required,
+        budget=budget,
+        remedies=remedies,
+        why=why,
     )
 
 
 def _driven(
     cell: Cell, paths: DrivenPaths, options: Sequence[Option], goal: Goal, wished: bool
-) -> tuple[Option, Timing]:
-    """The best of the best paths as robots drive them; where none keeps to the goal and nothing was
-    wished for, the one that asks for least force."""
+) -> tuple[Option, Timing, bool]:
+    """The best of the best paths as robots drive them, and whether it keeps to the goal; where none
+    does and no target was wished for, the one that exceeds it least."""
     kept, others, reason, model = [], [], "", cell.timing_model
     for first in best_of_paths(paths, options, goal, TRIED):
         own, asked = [option for option in options if option.index == first.index], goal
@@ -272,7 +299,7 @@ def _driven(
             option = next(best_of_paths(paths, own, asked, 1), None)
     if not kept and (wished or not others):
         raise SettingsError(f"no carry of the front can be driven as wished for: {reason}")
-    return min(kept or others, key=lambda each: each[0])[1]
+    return *min(kept or others, key=lambda each: each[0])[1], bool(kept)
 
 
 def _largest_felt(workcell: Workcell, carry: Carry) -> Array:
@@ -300,34 +327,9 @@ def _doubts(found: Pressed) -> list[str]:
     return doubts
 
 
-def _too_weak(workcell: Workcell, carry: Carry, needed: Array, commanded: Array) -> str:
-    """Says that the reference forces do not reach the commanded forces (2,) [N], along the
-    carry (n,), and what would do."""
-    doubt, allowed = workcell.uncertainty, workcell.task.reference_force.min()
-    planned, pressed = carry.normal_force, np.argsort(-commanded)[:MOST]
-    rows = np.union1d(np.argsort(-planned[:, 1 - LEADER])[:MOST], pressed)
-    motion, planned = box_motion(carry).at(rows), planned[rows]
-
-    def share(known: Uncertainty) -> float:
-        """Commanded over reference force of the robot that presses harder."""
-        force = largest_commanded(workcell, motion, planned, known, LEADER).max()
-        return float(force * harder / allowed)
-
-    harder = 1.0
-    harder = needed.max() / (share(doubt) * allowed)
-    ways, least = [f"reference forces of {needed.max():.1f} N"], share(doubt.only(()))
-    if least < 1.0 < share(doubt):
-        most = brentq(lambda factor: share(doubt.scaled(factor)) - 1.0, 0.0, 1.0, xtol=PRECISE)
-        ways.append(f"an [uncertainty] {np.floor(100.0 * most) / 100.0:.2f} times as wide")
-    for name, ranges in DOUBTS.items():
-        others = doubt.only([each for each in RANGES if each not in ranges])
-        if not doubt.only(ranges).is_empty and share(others) <= 1.0:
-            ways.append(f"no doubt about the {name}")
-    return (
-        "no carry of the front holds in every case of the cell's uncertainty within the reference "
-        f"forces of {allowed:.1f} N: this is among the gentlest; with nothing uncertain it needs "
-        f"{least * allowed:.1f} N. Any of these would do: {', '.join(ways)}"
-    )
+def is_within(required: Array, allowed: Array) -> bool:
+    """Return True if forces (2,) [N] are within limits, as exactly as carries are timed."""
+    return bool((required <= allowed * (1.0 + BETTER)).all())
 
 
 def _better(beside: Sequence[Rival], timing: Timing, force: float) -> Iterator[str]:

@@ -39,6 +39,9 @@ from symbolic.errors import SettingsError
 from symbolic.read.cell import PATCH_OVERLAP
 from symbolic.records import Uncertainty, Workcell
 
+LEADER, FOLLOWER = 0, 1
+"""The arm that keeps its place, and the other, whose force is commanded."""
+
 
 def nominal_case(workcell: Workcell) -> Array:
     """(18,) the case that the workcell describes, laid out by `worst_cases.CASE_SIZES`."""

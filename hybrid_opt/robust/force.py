@@ -9,6 +9,7 @@ fixed by the motion (and the case), the commanded force decides the squeeze.
 from __future__ import annotations
 
 from collections.abc import Callable
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache, partial
 from typing import TYPE_CHECKING, Annotated
@@ -177,9 +178,14 @@ class RobustModel:
         workcell: the cell.
     """
 
-    def __init__(self, workcell: Workcell) -> None:
+    def __init__(
+        self, workcell: Workcell, load: Callable[..., NumericFunction] = held_function
+    ) -> None:
         """Load or build the functions of pads that have one squeeze; those of others when first
         asked.
+
+        Args:
+            load: makes a function as `held_function` does.
 
         Raises:
             SettingsError: some cases cannot be held, however hard the pads press.
@@ -187,6 +193,7 @@ class RobustModel:
         """
         check_pads(workcell)
         self.workcell = workcell
+        self._load = load
         self._functions: dict[tuple[object, ...], NumericFunction] = {}
         # Many motions are asked about under a few sets.
         self._worst = lru_cache(maxsize=8)(self._checked_cases)
@@ -196,11 +203,22 @@ class RobustModel:
             self._squeeze(1, displaced=False)
             self._function(case_slack_function, commanded=1)
 
+    def with_workcell(self, workcell: Workcell) -> RobustModel:
+        """Return a model with the same functions.
+
+        Args:
+            workcell: differs from this one in what cases state: friction, mass, uncertainty.
+        """
+        other = copy(self)
+        other.workcell = workcell
+        other._worst = lru_cache(maxsize=8)(other._checked_cases)
+        return other
+
     def _function(self, make: Callable[..., ca.Function], **given: object) -> NumericFunction:
         key = (make.__name__, *given.values())
         if key not in self._functions:
             name, of = " ".join(map(str, key)), partial(make, **given)
-            self._functions[key] = held_function(self.workcell, name, of, lanes=0)
+            self._functions[key] = self._load(self.workcell, name, of, lanes=0)
         return self._functions[key]
 
     def _squeeze(self, commanded: int, displaced: bool) -> NumericFunction:
@@ -272,19 +290,37 @@ class RobustModel:
         return normals / normals[::-1]
 
     def hold(
-        self, motion: HeldMotion, uncertainty: Uncertainty, leader: int = 0
+        self,
+        motion: HeldMotion,
+        uncertainty: Uncertainty,
+        leader: int = 0,
+        rows: NDArray[np.intp] | None = None,
     ) -> tuple[Array, Array]:
         """Least normal force to command, and the largest that the leader then feels, (n,) [N];
         infinite where none is found that holds every case.
 
+        Args:
+            rows: of the worst cases, those that are considered; None for all.
+
         Raises:
             SettingsError: the set leaves no friction or patch.
         """
-        worst = self.least_squeeze(motion, self.worst_cases(uncertainty, leader), leader)
+        cases = self.worst_cases(uncertainty, leader)
+        worst = self.least_squeeze(motion, cases if rows is None else cases[rows], leader)
         follower, share = 1 - leader, float(self._leading_share[leader])
         force = ruling_cases(worst, uncertainty, leader, leading_share=share).force
         force[np.isnan(force)] = np.inf
         return force[:, follower], force[:, leader]
+
+    def governing_rows(
+        self, motion: HeldMotion, uncertainty: Uncertainty, leader: int = 0
+    ) -> NDArray[np.intp]:
+        """Rows of the worst cases that require most at any sample, `RULING` for the command and
+        as many for what the leader feels beyond it."""
+        worst = self.least_squeeze(motion, self.worst_cases(uncertainty, leader), leader)
+        command = worst[:, :, 1 - leader]
+        beyond = worst[:, :, leader] - float(self._leading_share[leader]) * command
+        return np.unique([(-each).argsort(axis=0)[:RULING] for each in (command, beyond)])
 
     def commanded(
         self,
@@ -473,6 +509,20 @@ def closes_evenly(workcell: Workcell) -> bool:
 def pressing_model(workcell: Workcell) -> RobustModel:
     """The model of what is commanded: of pads that press evenly where that is known of them."""
     return (soft_model if closes_evenly(workcell) else robust_model)(workcell)
+
+
+def interpreted_pressing_model(workcell: Workcell) -> RobustModel:
+    """Return the model of what is commanded without compiling it, for a few samples."""
+    # Not imported at the top: what is compiled already needs no CasADi.
+    from codegen.interpreted import InterpretedFunction
+
+    def load(
+        cell: Workcell, name: str, make: Callable[[Workcell], ca.Function], lanes: int
+    ) -> NumericFunction:
+        return InterpretedFunction(make(cell))
+
+    chosen = _with_even_pads(workcell) if closes_evenly(workcell) else workcell
+    return RobustModel(chosen, load)
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,14 @@ from numpy.typing import NDArray
 from codegen.interpreted import InterpretedFunction
 from hybrid_opt.carry import Carry
 from hybrid_opt.compiled_cell import bound_to, held_function, kept_per_workcell
-from hybrid_opt.robust.cases import RulingCases, felt_share, ruling_cases, worst_cases
+from hybrid_opt.robust.cases import (
+    FOLLOWER,
+    LEADER,
+    RulingCases,
+    felt_share,
+    ruling_cases,
+    worst_cases,
+)
 from hybrid_opt.robust.force import (
     BoxMotion,
     box_motion,
@@ -76,10 +83,6 @@ class PathPoints:
         rate = self.first * np.sqrt(np.maximum(self.w, 0.0))[:, None]
         second = self.first * self.a[:, None] + self.second * self.w[:, None]
         return BoxMotion(self.pose, rate, second)
-
-
-LEADER, FOLLOWER = 0, 1
-"""The arm that keeps its place along paths, and the other."""
 
 
 class RobustPath:

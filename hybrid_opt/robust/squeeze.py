@@ -148,8 +148,7 @@ class Squeeze:
             return f"{self.factor:g} times the least that holds {pads}"
         if self.uncertainty.is_empty:
             return f"the least that holds {pads}: the cell states that nothing is uncertain"
-        named = "the cell's [uncertainty]" if self.uncertainty.stated else "the usual uncertainty"
-        return f"holds {pads} in every case of {named}"
+        return f"holds {pads} in every case of {self.uncertainty.title}"
 
 
 def pressed_beyond(

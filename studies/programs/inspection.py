@@ -17,6 +17,7 @@ from hybrid_opt.evaluate.explanation import Explanation, explain, frequent
 from hybrid_opt.front import Front
 from hybrid_opt.indicators.metrics import BindingBound, binding_bounds
 from hybrid_opt.progress import Progress, passed_on
+from hybrid_opt.robust.budget import budget_text
 from studies.program import Finding, load_workcell, print_findings
 from symbolic.array import Array
 from symbolic.cell_model import own_pairs
@@ -128,11 +129,13 @@ def _at_rest(cell: Cell) -> Finding:
         f"reference force {hold.payload_limit:.2f} kg"
     ]
     lines += [f"Infeasible, whatever the path: {unheld}"] if unheld else []
+    lines.append(f"G{budget_text(cell.workcell)[1:]}")
     values = {
         "static_normal_force": tuple(force.tolist()),
         "static_objectives": tuple(share.tolist()),
         "static_payload_limit": hold.payload_limit,
         "unheld": unheld,
+        "grip": lines[-1],
     }
     return Finding(values, tuple(lines))
 

@@ -43,6 +43,7 @@ from hybrid_opt.polishing.settings import (
 )
 from hybrid_opt.progress import Progress
 from hybrid_opt.recommending.choice import Wish
+from hybrid_opt.robust.budget import budget_text
 from hybrid_opt.static_hold import require_hold
 from studies.options import QUICK_EVALUATIONS, QUICK_REPLICAS
 from studies.program import load_workcell
@@ -154,6 +155,7 @@ def run_study(
         DualArmError: the workcell, a setting or the results folder is wrong, or work failed.
     """
     require_hold(workcell)  # before any work
+    progress.note(budget_text(workcell))
     cell, competition = decided_cell(workcell, settings, execution)
     alone = is_drivable(cell, settings.objectives)
     if not alone and not has_polishable_forces(cell, settings.objectives):

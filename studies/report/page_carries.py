@@ -19,7 +19,7 @@ from hybrid_opt.job.motions import TICK
 from hybrid_opt.job.plan import JobModel
 from hybrid_opt.job.records import Job, Phase
 from hybrid_opt.job.smooth import driven_timing
-from hybrid_opt.recommending.choice import LEADER
+from hybrid_opt.robust.cases import LEADER
 from hybrid_opt.timing.analysis import drivable_timing
 from hybrid_opt.timing.records import JerkLimits, Timing, TimingLimits
 from hybrid_opt.timing.robustness import Margin, robustness_margins

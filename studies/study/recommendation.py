@@ -30,7 +30,7 @@ from hybrid_opt.evaluate.objectives import DRIVABLE_PAIRS, PLANNED_FORCE, ROBUST
 from hybrid_opt.front import Front, select
 from hybrid_opt.progress import Advance, Progress
 from hybrid_opt.recommending.advice import Advice
-from hybrid_opt.recommending.choice import LEADER, DrivenPaths
+from hybrid_opt.recommending.choice import DrivenPaths, wished_cell
 from hybrid_opt.recommending.recommendation import (
     HAND_MADE,
     STEPS,
@@ -41,6 +41,8 @@ from hybrid_opt.recommending.recommendation import (
     spread_rows,
     table_forces,
 )
+from hybrid_opt.robust.budget import Remedy
+from hybrid_opt.robust.cases import LEADER
 from hybrid_opt.robust.force import RobustPrice, pressing_model, robust_price
 from hybrid_opt.robust.squeeze import Part, account
 from hybrid_opt.store.files import read_record, to_json, write_json
@@ -117,6 +119,10 @@ class StoredRecommendation:
         considered: carries that it was chosen from.
         durations: how long all fronts take at the same forces.
         price: of robustness, null where no set leaves friction and patches.
+        required: largest force that either arm presses with or feels in any case [N].
+        allowed: the robots' reference forces [N].
+        at_rest: what holding still takes of them, in words.
+        remedies: where they do not allow the carry, the smallest changes with which they do.
     """
 
     wish: ho.Wish
@@ -142,6 +148,10 @@ class StoredRecommendation:
     price: RobustPrice | None = None
     robust_force: Pair | None = None
     without_jerk: Figure = math.nan
+    required: Figure = math.nan
+    allowed: Pair | None = None
+    at_rest: str = ""
+    remedies: tuple[Remedy, ...] = ()
 
     @property
     def force_kind(self) -> ForceKind:
@@ -184,7 +194,7 @@ def recommendation_stage(wish: ho.Wish) -> Stage:
         (folder.root / other).unlink(missing_ok=True)
         write_json(folder.root / written, to_json(found))
 
-    return Stage("recommendation", run, dict(wish.given))
+    return Stage("recommendation", run, to_json(wish))
 
 
 def _recommended(
@@ -228,7 +238,7 @@ def recommend_from(
     campaign = read_campaign(root)
     drivable = read_campaign(drivable_root(root, campaign.workcell, campaign.objectives))
     threads = threads or available_cores()
-    cell = ho.Cell(drivable.workcell, drivable.objectives, threads)
+    cell = wished_cell(ho.Cell(drivable.workcell, drivable.objectives, threads), wish)
     own, best, fronts = _hand_made(cell), union(drivable.fronts), drivable.fronts
     x = np.vstack([*(front.x[row, None] for front, row in best), own])
     sources = [*(front.source for front, _ in best), *[HAND_MADE] * len(own)]
@@ -263,7 +273,7 @@ def recommend_from(
     file = path.resolve().relative_to(root.resolve()).as_posix() if inside else str(path)
     return StoredRecommendation(
         wish=found.wish,
-        why=str(found.wish),
+        why=found.why,
         source=source,
         file=file,
         export=export_command(Path(file), found.limit),
@@ -285,6 +295,10 @@ def recommend_from(
         price=price,
         robust_force=found.limited_force if found.force_kind.robust else None,
         without_jerk=without_jerk,
+        required=float(found.required.max()),
+        allowed=found.budget.allowed,
+        at_rest=str(found.budget),
+        remedies=found.remedies,
     )
 
 
@@ -378,14 +392,22 @@ def recommendation_text(found: StoredRecommendation, folder: str) -> Recommendat
         folder: of the results, in front of the files' names; '' where the reader is in it.
     """
     job = f", the whole job {found.job_duration:.1f} s" if math.isfinite(found.job_duration) else ""
-    headline = f"Run this carry: {found.duration:.2f} s, press with {found.force:.1f} N{job}"
-    facts = [
+    carry = f"{found.duration:.2f} s, press with {found.force:.1f} N{job}"
+    headline, facts = f"Run this carry: {carry}", list[tuple[str, str]]()
+    if found.remedies:
+        headline = f"No carry fits: {found.at_rest}"
+        facts = [
+            ("what would do", ", or ".join(map(str, found.remedies))),
+            (f"if you allow {found.required:.1f} N", carry),
+        ]
+    facts += [
         ("why", f"{found.why}; of {found.considered} drivable carries, from {found.source}"),
         ("file", str(Path(folder) / found.file)),
         ("export", export_command(Path(folder) / found.file, found.force_limit)),
         ("the force", f"{account(found.parts)}; {found.squeeze_reason}"),
         *[(rival.label, _rival(rival, found)) for rival in found.rivals],
         ("margins", "; ".join(_margins(found)) or "not known"),
+        *([("grip", found.at_rest)] if found.at_rest and not found.remedies else []),
     ]
     told = [str(each) for each in found.advice if abs(each.force) >= NOTICED][:ADVICE]
     if told:
@@ -419,13 +441,12 @@ def _rival(rival: Rival, found: StoredRecommendation) -> str:
 
 def _robust(price: RobustPrice) -> str:
     """What the set is, the largest multiple of it that the arms allow, and random cases."""
-    named = "[uncertainty]" if price.uncertainty.stated else "the usual uncertainty"
     slips = "slips" if price.check.failing == 1 else "slip"
     return (
-        f"in every case of {named} ({price.uncertainty}), of which the leading arm feels up to "
-        f"{max(price.commanded):.1f} N; the reference forces would hold {price.largest_factor:.2f} "
-        f"times as much; {price.check.failing or 'none'} of {price.check.cases} random cases "
-        f"{slips}"
+        f"in every case of {price.uncertainty.title} ({price.uncertainty}), of which the leading "
+        f"arm feels up to {max(price.commanded):.1f} N; the reference forces would hold "
+        f"{price.largest_factor:.2f} times as much; "
+        f"{price.check.failing or 'none'} of {price.check.cases} random cases {slips}"
     )
 
 

@@ -8,7 +8,7 @@ is kept under a digest belongs to another cell.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -17,6 +17,7 @@ from typing import Annotated, Any
 import numpy as np
 
 from symbolic.array import Array, Filling, Range, Vector
+from symbolic.errors import SettingsError
 from symbolic.records import quantities as quantity
 from symbolic.records.content import digest_of_parts
 from symbolic.records.poses import inverse, read_only
@@ -293,6 +294,11 @@ class Uncertainty:
         return not any(np.any(getattr(self, name)) for name in RANGES)
 
     @property
+    def title(self) -> str:
+        """Name of the set in messages."""
+        return "the cell's [uncertainty]" if self.stated else "the usual uncertainty"
+
+    @property
     def opposed_force(self) -> float:
         """Tangential force of either arm against the other [N]: both arms are springs in series."""
         return self.internal_force + self.stiffness * self.relative_position / 2.0
@@ -311,6 +317,26 @@ class Uncertainty:
     def scaled(self, factor: float) -> Uncertainty:
         """All ranges times a factor."""
         return replace(self, **{name: factor * getattr(self, name) for name in RANGES})
+
+    def changed(self, by: float | Mapping[str, float]) -> Uncertainty:
+        """Return the set with every range times a factor, or with some ranges replaced; one number
+        stands for all three axes.
+
+        Raises:
+            SettingsError: there is no range of a name.
+        """
+        if not isinstance(by, Mapping):
+            return self.scaled(by)
+        unknown = by.keys() - RANGES.keys() - {"stiffness"}
+        if unknown:
+            raise SettingsError(
+                f"uncertainty: no range {', '.join(sorted(unknown))}; known are {', '.join(RANGES)}"
+            )
+        ranges: dict[str, Any] = {
+            name: np.broadcast_to(value, 3) if np.ndim(getattr(self, name)) else value
+            for name, value in by.items()
+        }
+        return replace(self, **ranges)
 
     def only(self, names: Iterable[str]) -> Uncertainty:
         """The set with some of its ranges alone."""

@@ -13,8 +13,7 @@ import pytest
 import hybrid_opt as ho
 from hybrid_opt import sweeping
 from hybrid_opt.front import Front
-from hybrid_opt.recommending.choice import LEADER
-from hybrid_opt.robust.cases import worst_cases
+from hybrid_opt.robust.cases import LEADER, worst_cases
 from hybrid_opt.robust.force import pressing_model
 from hybrid_opt.sensitivity import Sensitivity
 from hybrid_opt.timing.limits import drive_path

@@ -147,8 +147,14 @@ def test_another_wish_needs_no_other_study(
     assert "the least force of all carries of at most 4 s" in printed
     assert str(file) in printed
     assert read_trajectory(file).figures["duration"] < 4.1
-    assert recommend.main([str(root), "--duration", "4", "--payload", "9"]) == 2
+    assert recommend.main([str(root), "--duration", "4", "--force-limit", "90"]) == 2
     assert "give at most one" in capsys.readouterr().err
+    other = ["--payload", "6", "--reference-force", "115", "--uncertainty", "friction=0.01"]
+    assert recommend.main([str(root), *other, "--output", str(file)]) == 0
+    assert "with a payload of 6 kg and reference forces of 115 N" in capsys.readouterr().out
+    cell = read_trajectory(file).open_cell(tmp_path / "cell").workcell
+    assert (cell.payload.mass, cell.uncertainty.friction) == (6.0, 0.01)
+    assert cell.task.reference_force.tolist() == [115.0, 115.0]
 
 
 def test_a_stored_study_can_be_repeated_from_its_own_workcell(

@@ -1,0 +1,257 @@
+"""The budget of a grip: the force that holds the payload still in every case of the uncertainty,
+against what the robots may press with, and the smallest changes of the cell with which it fits."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from functools import partial
+from math import ceil, copysign, floor, log10
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import brentq
+
+from hybrid_opt.robust.cases import LEADER
+from hybrid_opt.robust.force import (
+    BoxMotion,
+    HeldMotion,
+    RobustModel,
+    interpreted_pressing_model,
+    stopped,
+)
+from hybrid_opt.robust.squeeze import DOUBTS
+from symbolic.array import Array, Figure, Pair
+from symbolic.errors import SettingsError
+from symbolic.records import Uncertainty, Workcell
+from symbolic.records.quantities import FRICTION
+
+LISTED = 3
+"""Remedies that are listed, the smallest changes first."""
+
+PRECISION = 1e-4
+"""Error of the factor of a remedy, on the safe side."""
+
+UNBOUNDED = 1e3
+"""Excess that stands for cases that no force holds: roots are bracketed by finite numbers."""
+
+NARROWEST = 1e-6
+"""Factor that stands for a range without width: with none there would be fewer worst cases."""
+
+LEAST_MASS = 1e-3
+"""Share of the mass down to which a lighter payload is considered."""
+
+ROUNDING = 1e-6
+"""Share by which a force may exceed a limit that it meets exactly."""
+
+
+@dataclass(frozen=True)
+class Remedy:
+    """A change of the cell with which the required forces fit.
+
+    Attributes:
+        change: the quantity with its new value.
+        share: relative change of that value.
+    """
+
+    change: str
+    share: Figure
+
+    def __str__(self) -> str:
+        return f"{self.change} ({100.0 * self.share:+.1f} %)"
+
+
+@dataclass(frozen=True)
+class GripBudget:
+    """The forces that hold the payload still in every case, against the reference forces.
+
+    Attributes:
+        required: (2,) largest force of each robot at either end of the path, infinite where no
+            force holds every case [N].
+        allowed: (2,) reference forces [N].
+        uncertainty: the set of cases.
+        remedies: the smallest changes with which it fits, empty where it does.
+    """
+
+    required: Pair
+    allowed: Pair
+    uncertainty: Uncertainty
+    remedies: tuple[Remedy, ...]
+
+    @property
+    def fits(self) -> bool:
+        """Return True if both robots hold the payload within their reference forces."""
+        return bool((self.required <= self.allowed * (1.0 + ROUNDING)).all())
+
+    def __str__(self) -> str:
+        arm = int(np.argmax(self.required / self.allowed))
+        required, allowed = self.required[arm], self.allowed[arm]
+        force = f"{required:.1f} N of {allowed:.1f} N"
+        if self.fits:
+            force += f", {100.0 * (1.0 - required / allowed):.0f} % left for the motion"
+        if not np.isfinite(required):
+            force = f"no force holds every case, {allowed:.1f} N are allowed"
+        return f"at rest, with {self.uncertainty.title}: {force}"
+
+    @property
+    def advice(self) -> str:
+        """The remedies as a sentence, '' where none are needed or known."""
+        return remedies_text(self.remedies, "to hold it still; a motion takes more")
+
+
+def budget_text(workcell: Workcell) -> str:
+    """State the budget of a cell, with what would do where it is exceeded, for a terminal."""
+    try:
+        budget = grip_budget(workcell)
+    except SettingsError as error:
+        return f"grip at rest: {error}"
+    if budget.fits:
+        return f"grip {budget}"
+    return f"grip {budget}, which no carry can do; {budget.advice or 'no single change would do'}"
+
+
+def remedies_text(remedies: tuple[Remedy, ...], purpose: str) -> str:
+    """Return alternatives as a sentence, '' without any."""
+    if not remedies:
+        return ""
+    return f"{', or '.join(map(str, remedies))}: any of these would do {purpose}"
+
+
+def grip_budget(workcell: Workcell) -> GripBudget:
+    """Compute what holding the payload still at both ends of its path takes. Nothing is compiled.
+
+    Raises:
+        SettingsError: some cases cannot be held, however hard the pads press, or the uncertainty
+            leaves no friction or patch.
+    """
+    model, allowed = interpreted_pressing_model(workcell), workcell.task.reference_force
+    waypoints = workcell.task.waypoints
+    poses = np.array([waypoints[0].lower, waypoints[-1].lower])
+    motion = BoxMotion(poses, np.zeros_like(poses), np.zeros_like(poses))
+    required = largest_forces(model, motion)
+    budget = GripBudget(required, allowed, workcell.uncertainty, ())
+    if budget.fits:
+        return budget
+    return replace(budget, remedies=cheapest_remedies(model, motion, required, allowed))
+
+
+def largest_forces(
+    model: RobustModel, motion: HeldMotion, rows: NDArray[np.intp] | None = None
+) -> Array:
+    """Compute the largest force (2,) [N] that holds a motion, and the same poses at rest, in every
+    case: what is commanded of one robot, and what the leading one feels.
+
+    Args:
+        rows: of the worst cases, those that are considered; None for all.
+
+    Raises:
+        SettingsError: the uncertainty leaves no friction or patch.
+    """
+    doubt, forces = model.workcell.uncertainty, np.zeros(2)
+    for each in (motion, stopped(motion)):
+        command, felt = model.hold(each, doubt, LEADER, rows)
+        forces = np.maximum(forces, np.array([felt.max(), command.max()]))
+    return forces
+
+
+def cheapest_remedies(
+    model: RobustModel,
+    motion: HeldMotion,
+    required: Array,
+    allowed: Array,
+    most: int = LISTED,
+) -> tuple[Remedy, ...]:
+    """Find the changes of reference forces, mass, friction or uncertainty, each with all else as it
+    is, with which forces along a motion fit.
+
+    Args:
+        model: of what is commanded.
+        motion: samples at which most is required.
+        required: (2,) largest force of each robot, of which the model may know a part [N].
+        allowed: (2,) [N].
+        most: how many.
+
+    Returns:
+        The smallest relative changes first.
+    """
+    known = largest_forces(model, motion)
+    rows = model.governing_rows(motion, model.workcell.uncertainty, LEADER)
+    # What a command holds beyond its motion, as by smoothing, stays in proportion.
+    scale = required / known if np.isfinite(required).all() else np.ones(2)
+
+    def excess(changed: Workcell) -> float:
+        try:
+            force = largest_forces(model.with_workcell(changed), motion, rows)
+        except SettingsError:
+            return UNBOUNDED
+        return min(float((scale * force / allowed).max()) - 1.0, UNBOUNDED)
+
+    found = [*_stronger(required, allowed), *_of_cell(model.workcell, excess)]
+    return tuple(sorted(found, key=lambda each: abs(each.share))[:most])
+
+
+def _stronger(required: Array, allowed: Array) -> Iterator[Remedy]:
+    if np.isfinite(required).all():
+        least = required if len({*allowed.tolist()}) > 1 else required.max()
+        forces = np.maximum(allowed, np.ceil(10.0 * least) / 10.0)
+        named = " and ".join(f"{force:.1f}" for force in sorted({*forces.tolist()}))
+        yield Remedy(f"a reference force of {named} N", float((forces / allowed).max() - 1.0))
+
+
+def _of_cell(workcell: Workcell, excess: Callable[[Workcell], float]) -> Iterator[Remedy]:
+    """Yield what mass, friction and uncertainty would have to be."""
+    payload, contacts, doubt = workcell.payload, workcell.contacts, workcell.uncertainty
+
+    def with_mass(factor: float) -> Workcell:
+        inertia = factor * payload.inertia
+        lighter = replace(payload, mass=factor * payload.mass, inertia=inertia)
+        return replace(workcell, payload=lighter)
+
+    def with_friction(factor: float) -> Workcell:
+        first, second = (replace(pad, friction=factor * pad.friction) for pad in contacts)
+        return replace(workcell, contacts=(first, second))
+
+    lighter = _smallest_change(lambda factor: excess(with_mass(factor)), LEAST_MASS)
+    if lighter is not None:
+        mass = _three_digits(lighter * payload.mass, floor)
+        yield Remedy(f"a mass of {mass:g} kg", mass / payload.mass - 1.0)
+    coefficients = sorted({pad.friction for pad in contacts})
+    rougher = _smallest_change(
+        lambda factor: excess(with_friction(factor)), FRICTION.high / coefficients[-1]
+    )
+    if rougher is not None:
+        rounded = [_three_digits(rougher * value, ceil) for value in coefficients]
+        named = " and ".join(f"{value:g}" for value in rounded)
+        yield Remedy(f"friction of {named}", rounded[0] / coefficients[0] - 1.0)
+
+    def with_ranges(names: tuple[str, ...], factor: float) -> Uncertainty:
+        return replace(doubt, **{name: factor * getattr(doubt, name) for name in names})
+
+    def excess_within(names: tuple[str, ...], factor: float) -> float:
+        return excess(replace(workcell, uncertainty=with_ranges(names, factor)))
+
+    every = tuple(name for names in DOUBTS.values() for name in names)
+    for names in (every, *DOUBTS.values()):
+        if doubt.only(names).is_empty:
+            continue
+        narrower = _smallest_change(partial(excess_within, names), NARROWEST)
+        if narrower is not None:
+            factor = floor(100.0 * narrower) / 100.0
+            change = f"[uncertainty] with {with_ranges(names, factor).only(names)}"
+            if names == every:
+                change = f"every range of the uncertainty {factor:g} times as wide"
+            yield Remedy(change, factor - 1.0)
+
+
+def _smallest_change(excess: Callable[[float], float], far: float) -> float | None:
+    """Return the factor nearest to one without excess, None where even `far` has some."""
+    if excess(far) > 0.0:
+        return None
+    root = float(brentq(excess, 1.0, far, xtol=PRECISION))
+    low, high = sorted((1.0, far))
+    return min(max(root + copysign(2.0 * PRECISION, far - 1.0), low), high)
+
+
+def _three_digits(value: float, rounded: Callable[[float], int]) -> float:
+    unit = 10.0 ** (floor(log10(value)) - 2)
+    return float(round(rounded(value / unit) * unit, 12))
