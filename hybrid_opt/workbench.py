@@ -371,7 +371,7 @@ class Workbench:
         gui.add_button("save the cell").on_click(
             lambda _: self.do(lambda: self._told(f"saved: {self.session.save(folder.value)}"))
         )
-        target = gui.add_dropdown("target", list(TARGETS), initial_value="ros2-control")
+        target = gui.add_dropdown("target", list(TARGETS), initial_value="torque")
         gui.add_button("export the job").on_click(
             lambda _: self.do(
                 lambda: self._told(

@@ -19,7 +19,7 @@ def _add_options(parser: Parser) -> None:
     add(parser, "FILE")
     parser.add_argument(
         "--target",
-        choices=stated("hybrid_opt.bundles.bundle.TARGETS"),
+        metavar="{" + ",".join(stated("hybrid_opt.bundles.bundle.TARGETS")) + "}",
         required=True,
         help="what is to run it",
     )
@@ -68,9 +68,9 @@ def _add_options(parser: Parser) -> None:
     parser.add_argument(
         "--stiffness",
         type=float,
-        default=stated("hybrid_opt.bundles.job_file.BundleOptions.stiffness"),
         metavar="N/m",
-        help="of each arm at its pad, for what a late arm and the time step do",
+        help="of each arm at its pad along the normal, for what a late arm and the time step do "
+        "(default: that of [robots.driver], or of the gains that the bundle has)",
     )
     parser.add_argument(
         "--skew",

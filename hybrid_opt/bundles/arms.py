@@ -1,5 +1,5 @@
-"""Both arms of a cell as bundles name them: their makers and joints, and one URDF of both with mock
-hardware for ros2_control.
+"""Both arms of a cell as bundles name them: their makers and joints, and one URDF of both with a
+simulator's hardware for ros2_control.
 
 Links and joints of a robot bear its prefix; the arms of one machine share its description and need
 none. Joints that the workcell holds are fixed where it holds them.
@@ -32,8 +32,8 @@ from symbolic.records.poses import pose_matrix, rpy_from_rotation
 
 _LONGEST_COMMENT = 60
 WORLD, PAD = "world", "contact_pad"
-PLUGIN = "mock_components/GenericSystem"
-COMMANDS = ("position", "effort")
+PLUGIN = "gz_ros2_control/GazeboSimSystem"
+COMMANDS = ("effort",)
 STATES = ("position", "velocity", "effort")
 
 ABB = "ABB"
@@ -174,7 +174,7 @@ def description(workcell: Workcell, q: Array) -> str:
     """The cell's URDF.
 
     Args:
-        q: (joints,) where the mock hardware's joints begin, both arms side by side [rad].
+        q: (joints,) where the simulator's joints begin, both arms side by side [rad].
     """
     root = ElementTree.Element("robot", {"name": "cell"})
     ElementTree.SubElement(root, "link", {"name": WORLD})
@@ -192,6 +192,10 @@ def description(workcell: Workcell, q: Array) -> str:
         _add_fixed(root, WORLD, f"environment_{robot_prefix(body.name)}".rstrip("_"), (body,))
     joints = ros_joints(workcell)
     _add_hardware(root, list(joints), q[list(joints.values())])
+    # Robots compensate their own weight; a simulator leaves it out.
+    for link in root.findall("link"):
+        weightless = ElementTree.SubElement(root, "gazebo", {"reference": link.attrib["name"]})
+        ElementTree.SubElement(weightless, "gravity").text = "false"
     ElementTree.indent(root)
     return ElementTree.tostring(root, encoding="unicode") + "\n"
 
@@ -278,7 +282,7 @@ def _shapes(link: ElementTree.Element, shape: Shape | Capsule | UrdfMesh, pose: 
 
 
 def _add_hardware(root: ElementTree.Element, joints: Sequence[str], q: Array) -> None:
-    control = ElementTree.SubElement(root, "ros2_control", {"name": "mock_cell", "type": "system"})
+    control = ElementTree.SubElement(root, "ros2_control", {"name": "cell", "type": "system"})
     hardware = ElementTree.SubElement(control, "hardware")
     ElementTree.SubElement(hardware, "plugin").text = PLUGIN
     for name, position in zip(joints, q.tolist(), strict=True):

@@ -15,15 +15,9 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from hybrid_opt.bundles.arms import (
-    ABB,
-    FRANKA,
-    SEVEN,
-    SIX,
-    UR,
-    addressed,
-    require_arms,
-)
+from hybrid_opt.bundles.arms import ABB, SEVEN, SIX, UR, addressed, require_arms
+from hybrid_opt.bundles.data import data_files
+from hybrid_opt.bundles.egm import egm_files, require_egm
 from hybrid_opt.bundles.job_file import (
     BundleOptions,
     Contents,
@@ -31,24 +25,10 @@ from hybrid_opt.bundles.job_file import (
     Interpolation,
     chosen_step,
     gap_of,
-    job_table,
-    json_files,
     stop_of,
 )
-from hybrid_opt.bundles.languages import (
-    egm_files,
-    rapid_files,
-    require_egm,
-    require_rapid,
-    urscript_files,
-)
-from hybrid_opt.bundles.ros2 import (
-    control_files,
-    franka_files,
-    mcap_files,
-    require_franka,
-    ur_files,
-)
+from hybrid_opt.bundles.torque import STEPS, driver_of, pad_stiffness, require_torque, torque_files
+from hybrid_opt.bundles.urscript import require_followed, urscript_files
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.job.compliance import (
     SKEWS,
@@ -69,6 +49,7 @@ from hybrid_opt.store.files import AGAIN, own_version, read_bytes, read_document
 from hybrid_opt.timing.records import Timing
 from symbolic.errors import SettingsError
 from symbolic.outside import replace_file, sync_folder
+from symbolic.records import Workcell
 
 UNITS = {
     "length": "m",
@@ -155,6 +136,8 @@ class Target:
         axes: numbers of turning joints that a maker's targets can hold.
         has_address: whether it has to know where the controllers are.
         require: refuses a job before it is sampled, for further reasons.
+        stiffness: where that of the arms comes from: 'stated' by the cell, required; 'gains' that
+            the bundle writes; '' if the target does not depend on it.
     """
 
     files: Callable[[Export], Contents]
@@ -168,6 +151,7 @@ class Target:
     axes: tuple[int, ...] = (SIX,)
     has_address: bool = False
     require: Callable[[Job], None] = lambda job: None
+    stiffness: str = ""
 
     def refuse(self, job: Job, name: str, any_arm: bool) -> None:
         """Refuse a job that is not for this target of a name, before it is sampled.
@@ -182,6 +166,31 @@ class Target:
             needs = (self.maker, self.axes, self.has_address)
             require_arms(job.workcell, name, *needs, any_arm=any_arm)
         self.require(job)
+
+    def stiffness_of(self, job: Job, name: str) -> float | None:
+        """Return the stiffness of each arm at its pad [N/m]; None if nothing depends on it.
+
+        Both arms hold the box in series: of k_1 and k_2 it is 2 / (1 / k_1 + 1 / k_2).
+
+        Raises:
+            SettingsError: the target depends on it, and nobody has measured it.
+        """
+        if self.stiffness == "gains":
+            return pad_stiffness(job)
+        first, second = (robot.driver.stiffness for robot in job.workcell.robots)
+        if first is not None and second is not None:
+            return 2.0 / (1.0 / first + 1.0 / second)
+        if self.stiffness != "stated":
+            return None
+        unknown = next(r.name for r in job.workcell.robots if r.driver.stiffness is None)
+        raise SettingsError(
+            f"{name} presses as hard as the stiffness of {unknown!r} at its pad makes it, and "
+            "nobody states that. Measure it: press both pads against one another, move one by 0.1 "
+            "mm a step along the normal and read the force; equal arms have twice its slope. "
+            "Then write [robots.driver] with stiffness = ... in N/m into the workcell's section of "
+            "each robot before the study, because a stored trajectory keeps its cell, or export "
+            "with --stiffness"
+        )
 
 
 STATES = {
@@ -217,7 +226,14 @@ def manifest(
     Args:
         skew: between the starts of both arms that the job was asked to survive [s].
     """
-    job, stiffness = export.job, export.options.stiffness
+    job, k = export.job, export.stiffness
+    step: dict[str, Any] = {"step": export.step}
+    if export.gap is not None:
+        step = asdict(export.gap) | {"stiffness": k, "allowed_share": TRACKED}
+    skews: dict[str, Any] = {"how": target.start, "required": skew, "stiffness": k}
+    if k is not None:
+        skews |= {"survived": largest_skew(job, k)}
+        skews |= {"cases": [_skew(skewed(job, delay, k)) for delay in SKEWS]}
     return {
         "target": name,
         "name": origin.name(job),
@@ -261,15 +277,9 @@ def manifest(
             "limits": asdict(export.limits),
             "set_down": SET_DOWN,
         },
-        "time_step": asdict(export.gap) | {"stiffness": stiffness, "allowed_share": TRACKED},
+        "time_step": step,
         "position_control": [_position(position_control(job, k)) for k in STIFFNESSES],
-        "start_skew": {
-            "how": target.start,
-            "required": skew,
-            "survived": largest_skew(job, stiffness),
-            "stiffness": stiffness,
-            "cases": [_skew(skewed(job, delay, stiffness)) for delay in SKEWS],
-        },
+        "start_skew": skews,
         "warnings": warnings_of(job),
         "units": UNITS,
         "how_to_run": target.how_to_run,
@@ -352,71 +362,45 @@ VERSION = 2
 
 RUN = "run_job.py looks at both arms a hundred times a second and replaces their goals"
 
+CYCLE_SKEW = 0.002
+"""Skew of two drivers whose goals bear one start: a cycle of the slower one [s]."""
+
+_TORQUE = Target(
+    torque_files,
+    STEPS,
+    "quintic",
+    "start your simulator with description/cell.urdf, ros2 launch launch/simulation.launch.py, "
+    "then python3 run_job.py",
+    RUN,
+    "one controller drives all joints: both arms start in the same cycle",
+    0.0,
+    require=require_torque,
+    stiffness="gains",
+)
+
+_DRIVEN = replace(
+    _TORQUE,
+    start="the goals of both controllers bear one start time of one computer's clock",
+    skew=CYCLE_SKEW,
+)
+
+TORQUE: Mapping[str, Target] = {
+    "simulation": _TORQUE,
+    "franka": replace(
+        _DRIVEN,
+        how_to_run="no end effector in Desk; ros2 launch launch/franka.launch.py, then python3 "
+        "run_job.py",
+    ),
+    "ur": replace(
+        _DRIVEN,
+        how_to_run="PolyScope 5.25.1 or 10.12.1, no TCP offset; power both arms on and release "
+        "their brakes; ros2 launch launch/ur.launch.py, then python3 run_job.py",
+    ),
+}
+"""The torque target by its drivers."""
+
 TARGETS: Mapping[str, Target] = {
-    "ros2-control": Target(
-        control_files,
-        (0.02, 0.01, 0.005),
-        "quintic",
-        "ros2 launch launch/control.launch.py, then python3 run_job.py; mock hardware until "
-        "description/cell.urdf names your simulator's",
-        RUN,
-        "one controller drives all joints: both arms start in the same cycle",
-        0.0,
-    ),
-    "franka-ros2": Target(
-        franka_files,
-        (0.02, 0.01, 0.005),
-        "quintic",
-        "no end effector in Desk; ros2 launch launch/franka.launch.py, then python3 run_job.py",
-        RUN,
-        "the goals of both controllers bear one start time of one computer's clock",
-        0.002,
-        FRANKA,
-        (SEVEN,),
-        has_address=True,
-        require=require_franka,
-    ),
-    "ur-ros2": Target(
-        ur_files,
-        (0.04, 0.02, 0.01),
-        "quintic",
-        "power both arms on and release their brakes; ros2 launch launch/ur.launch.py, then "
-        "python3 run_job.py",
-        "run_job.py slows both arms down along their paths by their speed sliders, then cancels "
-        "their goals; force mode presses on",
-        "both controllers get their goals at once and begin when they have them",
-        SKEW,
-        UR,
-        has_address=True,
-    ),
-    "ur-script": Target(
-        urscript_files,
-        (0.008, 0.004, 0.002),
-        "linear",
-        "wire digital outputs 0 and 1 of each arm to inputs 0 and 1 of the other, move both arms "
-        "to the first position, run one program on each; first without the box",
-        "either program stretches the time of its points until it stands, servoj and force mode "
-        "hold; so does the other's as soon as the heartbeat on output 1 stops",
-        "both programs meet before the job over a digital line each way: what remains is a cycle "
-        "and the lines' latency",
-        SKEW,
-        UR,
-    ),
-    "abb-rapid": Target(
-        rapid_files,
-        (0.2, 0.1, 0.05, 0.02),
-        "linear",
-        "load T_ROB1/Carry1.mod and T_ROB2/Carry2.mod, jog both robots to carryFirst, run Carry "
-        "in both tasks; first without the box, and slowly",
-        "the controller stops both tasks at once; force control keeps its last reference where "
-        "the controller leaves it active",
-        "both tasks meet before every phase (WaitSyncTask): what remains is the difference of "
-        "two planners within a phase",
-        SKEW,
-        ABB,
-        (SIX, SEVEN),
-        require=require_rapid,
-    ),
+    "torque": _TORQUE,
     "abb-egm": Target(
         egm_files,
         (0.02, 0.01, 0.005),
@@ -428,23 +412,64 @@ TARGETS: Mapping[str, Target] = {
         0.004,
         ABB,
         (SIX, SEVEN),
+        has_address=True,
         require=require_egm,
+        stiffness="stated",
     ),
-    "mcap": Target(
-        mcap_files,
-        (0.02,),
-        "cubic",
-        "open job.mcap in Foxglove, or play it: ros2 bag play job.mcap",
+    "ur-script": Target(
+        urscript_files,
+        (0.008, 0.004, 0.002),
+        "linear",
+        "a draft that nobody has run on a controller: wire digital outputs 0 and 1 of each arm to "
+        "inputs 0 and 1 of the other, move both arms to the first position, run one program on "
+        "each; first without the box",
+        "either program stretches the time of its points until it stands, servoj and force mode "
+        "hold; so does the other's as soon as the heartbeat on output 1 stops",
+        "both programs meet before the job over a digital line each way: what remains is a cycle "
+        "and the lines' latency",
+        SKEW,
+        UR,
+        require=require_followed,
+        stiffness="stated",
     ),
-    "csv": Target(
-        lambda export: {"job.csv": job_table(export)},
+    "data": Target(
+        data_files,
         (0.008,),
         "cubic",
-        "one row per time step; read it with anything",
+        "read job.csv with anything; job.schema.json describes job.json; open job.mcap in "
+        "Foxglove, or play it: ros2 bag play job.mcap",
     ),
-    "json": Target(json_files, (0.008,), "cubic", "job.schema.json describes job.json"),
 }
-"""Every target by its name."""
+"""Every target by its name; `TORQUE` has the drivers of torque."""
+
+GONE = {
+    "ros2-control": "torque",
+    "franka-ros2": "torque",
+    "ur-ros2": "torque (direct torque from PolyScope 5.23 or 10.10), or the draft ur-script",
+    "abb-rapid": "abb-egm",
+    "csv": "data",
+    "json": "data",
+    "mcap": "data",
+}
+"""Targets of earlier versions, and what is to be used instead; docs/export.md says why."""
+
+
+def require_target(name: str) -> None:
+    """Refuse an unknown target, and one that is no longer written."""
+    if name in GONE:
+        raise SettingsError(f"target {name!r} is no longer written; use {GONE[name]}")
+    if name not in TARGETS:
+        raise SettingsError(f"unknown target {name!r}; known are {', '.join(TARGETS)}")
+
+
+def target_for(name: str, workcell: Workcell) -> Target:
+    """Return the target of a name, with the driver that the cell's arms have.
+
+    Raises:
+        SettingsError: the name is unknown, or no driver takes torques for these arms.
+    """
+    require_target(name)
+    return TORQUE[driver_of(workcell)] if name == "torque" else TARGETS[name]
 
 
 def targets() -> dict[str, str]:
@@ -479,37 +504,45 @@ def export(
         JobError: the job cannot be done, a stop or the skew between both arms breaks its squeeze.
         ResultsError: the bundle cannot be written, or something else is in its place.
     """
-    if target not in TARGETS:
-        raise SettingsError(f"unknown target {target!r}; known are {', '.join(TARGETS)}")
     options, origin = options or BundleOptions(), origin or Origin()
-    found = TARGETS[target]
     whole = job if isinstance(job, Job) else plan_job(job)
     if options.addresses is not None:
         whole = replace(whole, workcell=addressed(whole.workcell, options.addresses))
+    found = target_for(target, whole.workcell)
     found.refuse(whole, target, options.any_arm)
     skew = found.skew if options.skew is None else options.skew
+    sheet = prepared(whole, target, options)
     if skew is not None:
-        require_skew(whole, skew, options.stiffness)
-    sheet = prepared(whole, found, options)
+        if sheet.stiffness is None:
+            raise SettingsError(
+                "what a skew does depends on the stiffness of the arms: --stiffness"
+            )
+        require_skew(whole, skew, sheet.stiffness)
     contents = found.files(sheet)
     document = manifest(sheet, target, found, origin, skew)
     return write_bundle(Path(folder) / document["name"] / target, contents, document)
 
 
-def prepared(job: Job, target: Target, options: BundleOptions) -> Export:
-    """A job sampled as a target wants it: at the step asked for, or at the longest of the target's
-    steps that keeps the forces.
+def prepared(job: Job, name: str, options: BundleOptions) -> Export:
+    """Return a job sampled at the requested step, or at the longest step that keeps the forces.
+
+    Args:
+        name: of the target, which has the steps.
 
     Raises:
-        SettingsError: the step is out of range, or none keeps the forces.
-        JobError: no stop along the path does.
+        SettingsError: the step is out of range, none keeps the forces, or the target needs a
+            stiffness that nobody states.
+        JobError: no stop along the path keeps the forces.
     """
-    step, stiffness = options.step, options.stiffness
+    target, step, k = target_for(name, job.workcell), options.step, options.stiffness
+    k = target.stiffness_of(job, name) if k is None else k
     if step is None:
-        step = chosen_step(job, target.steps, target.interpolation, stiffness)
+        step = target.steps[0]
+        if k is not None:
+            step = chosen_step(job, target.steps, target.interpolation, k)
     sampled = sample_job(job, step)
-    gap = gap_of(sampled, target.interpolation, stiffness)
-    return Export(sampled, options, gap, stop_of(job))
+    gap = None if k is None else gap_of(sampled, target.interpolation, k)
+    return Export(sampled, k, gap, stop_of(job))
 
 
 def write_bundle(folder: Path, contents: Contents, manifest: Mapping[str, Any]) -> tuple[Path, ...]:

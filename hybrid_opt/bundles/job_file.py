@@ -1,4 +1,4 @@
-"""A job on its way into a bundle, the file that all programs read: job.json, and a table of it.
+"""A job on its way into a bundle, and the file that all programs read: job.json.
 
 `job.schema.json` describes the file for others; its version rises with every change that breaks a
 reader.
@@ -19,7 +19,6 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
-from importlib.resources import files
 from typing import Any, Literal
 
 import numpy as np
@@ -33,14 +32,11 @@ from hybrid_opt.errors import JobError
 from hybrid_opt.job.compliance import TRACKED, largest_skew, require_delay, require_stiffness
 from hybrid_opt.job.motions import unit_squeeze
 from hybrid_opt.job.records import HELD, Job, SampledJob, sample_job
-from hybrid_opt.store.files import csv_text
 from hybrid_opt.timing.model import TimingModel, contact_torque
 from symbolic.array import Array, interpolated
 from symbolic.errors import SettingsError
-from symbolic.read.arms import arm_model, common_joints, turning_joints
+from symbolic.read.arms import common_joints
 from symbolic.records import Workcell
-from symbolic.records.poses import inverse
-from symbolic.records.task import components
 from symbolic.robot.model import build_robot_model
 
 Interpolation = Literal["linear", "cubic", "quintic"]
@@ -96,7 +92,7 @@ def chosen_step(
         f"with {interpolation} motion between samples {1e3 * steps[-1]:g} ms apart the gap of the "
         f"pads is wrong by {1e3 * found.along:.2f} mm; arms of {stiffness:g} N/m then miss their "
         f"force by {found.force:.1f} N, {100.0 * found.share:.0f} %: choose a slower timing, "
-        "another target, or state the stiffness that your arms have (--stiffness)"
+        "or another target"
     )
 
 
@@ -260,8 +256,6 @@ def stop_of(job: Job) -> Stop:
     return replace(gentle[0] if gentle else bearing[-1], quick=bearing[0].time)
 
 
-SCHEMA = "job.schema.json"
-
 START, PATH = 0.005, 0.02
 """Largest distance of a pad from its first place and from its path [m]."""
 
@@ -290,8 +284,8 @@ class BundleOptions:
     Attributes:
         step: time between samples [s]; None for the longest that keeps the forces.
         any_arm: write a maker's own language for arms that do not look like that maker's.
-        stiffness: of each arm at its pad, for what a skew, a time step and position control do
-            [N/m].
+        stiffness: of each arm at its pad along the normal [N/m]; None for that of the cell's
+            drivers, or of the gains where the target has gains.
         skew: between the starts of both arms that the job has to survive [s]; None for what the
             target leaves to chance.
         addresses: host names or IP addresses of both controllers, in place of those of the
@@ -300,12 +294,13 @@ class BundleOptions:
 
     step: float | None = None
     any_arm: bool = False
-    stiffness: float = 1e4
+    stiffness: float | None = None
     skew: float | None = None
     addresses: tuple[str, str] | None = None
 
     def __post_init__(self) -> None:
-        require_stiffness(self.stiffness)
+        if self.stiffness is not None:
+            require_stiffness(self.stiffness)
         if self.skew is not None:
             require_delay(self.skew)
 
@@ -316,14 +311,14 @@ class Export:
 
     Attributes:
         sampled: the job at the target's time steps.
-        options: how it is written.
-        gap: what the time steps do to the pads.
+        stiffness: of each arm at its pad along the normal [N/m]; None if nothing depends on it.
+        gap: what the time steps do to the pads; None without a stiffness.
         stop: how it stops along the path.
     """
 
     sampled: SampledJob
-    options: BundleOptions
-    gap: Gap
+    stiffness: float | None
+    gap: Gap | None
     stop: Stop
 
     @property
@@ -418,7 +413,8 @@ class Export:
         """When programs stop."""
         held = [phase.force for phase in self.job.held]
         spare = min(float(((f.normal - f.least) / f.normal).min()) for f in held)
-        survived = largest_skew(self.job, self.options.stiffness)
+        k = self.stiffness
+        survived = LEAST_SKEW if k is None else largest_skew(self.job, k)
         return Limits(
             stop_time=self.stop.time,
             quick_stop=self.stop.quick,
@@ -482,60 +478,12 @@ class Export:
             "wrench": sampled.wrench[:, arm].tolist(),
         }
 
-    def carried(self, arm: int, loaded: bool) -> tuple[float, Array]:
-        """Load on an arm's flange: mass [kg] and centre of mass (3,) in its frame [m].
-
-        Args:
-            loaded: whether half of the box is part of it.
-        """
-        robot, payload = self.workcell.robots[arm], self.workcell.payload
-        mass, moment = 0.0, np.zeros(3)
-        if robot.tool_load is not None:
-            mass = robot.tool_load.mass
-            moment = mass * robot.tool_load.centre_of_mass
-        if loaded:
-            T_flange_box = robot.T_flange_pad @ inverse(self.workcell.contacts[arm].T_box_pad)
-            centre = (T_flange_box @ np.append(payload.centre_of_mass, 1.0))[:3]
-            mass, moment = mass + payload.mass / 2.0, moment + payload.mass / 2.0 * centre
-        return mass, moment / mass if mass else moment
-
-
-def json_files(export: Export) -> dict[str, str | bytes]:
-    """The job in full precision, and its schema."""
-    schema = (files("hybrid_opt.bundles") / SCHEMA).read_text("utf-8")
-    return {"job.json": job_text(export), SCHEMA: schema}
+    def tool_load(self, arm: int) -> tuple[float, Array]:
+        """Return the tool's mass [kg] and its centre (3,) in the flange's frame [m]."""
+        load = self.workcell.robots[arm].tool_load
+        return (0.0, np.zeros(3)) if load is None else (load.mass, load.centre_of_mass)
 
 
 def job_text(export: Export) -> str:
-    """The text of job.json."""
+    """Return the text of job.json."""
     return json.dumps(export.document, allow_nan=False, separators=(",", ":")) + "\n"
-
-
-_POSE_UNITS = ("m",) * 3 + ("rad",) * 3
-_WRENCH = ("fx [N]", "fy [N]", "fz [N]", "mx [N m]", "my [N m]", "mz [N m]")
-_JOINT_UNITS = (("rad", "m"), ("rad/s", "m/s"), ("rad/s^2", "m/s^2"), ("N m", "N"), ("N m", "N"))
-"""Units of `Export.joint_columns` of joints that turn and of those that slide."""
-
-
-def job_table(export: Export) -> str:
-    """One row per time step, one column per quantity, named with its unit."""
-    job, sampled = export.job, export.sampled
-    robots = [robot.name for robot in job.workcell.robots]
-    pose = zip(components(job.workcell.task.orientation), _POSE_UNITS, strict=True)
-    header = ["time [s]", "phase", *(f"box {name} [{unit}]" for name, unit in pose)]
-    columns = [sampled.pose]
-    known = zip(export.joint_columns.items(), _JOINT_UNITS, strict=True)
-    for (name, values), (unit, sliding) in known:
-        word = name.replace("_", " ")
-        for robot, joints in zip(job.workcell.robots, job.joint_names, strict=True):
-            header += [
-                f"{robot.name}/{joint} {word} [{unit if turns else sliding}]"
-                for joint, turns in zip(joints, turning_joints(arm_model(robot)), strict=True)
-            ]
-        columns.append(values)
-    header += [f"{robot} normal force [N]" for robot in robots]
-    header += [f"{robot} wrench {name}" for robot in robots for name in _WRENCH]
-    columns += [sampled.normal_force, sampled.wrench.reshape(len(sampled.time), -1)]
-    table = np.concatenate(columns, axis=1).tolist()
-    rows = zip(sampled.time.tolist(), sampled.phase_names, table, strict=True)
-    return csv_text(header, ([time, phase, *row] for time, phase, row in rows))

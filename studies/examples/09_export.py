@@ -12,8 +12,7 @@ carry = cell.carry(cell.initial)
 timing = ho.time_path(cell, carry, ho.TimingLimits(reference_speed=True))
 job: ho.Job = ho.plan_job(timing, ho.SqueezeSettings(factor=1.3))
 print(job)
-options = ho.BundleOptions(stiffness=2e4)
-for target in ("csv", "json", "ros2-control", "mcap"):
-    print(*ho.export(job, target, "out", origin=ho.Origin("first"), options=options))
+for target in ("data", "torque"):
+    print(*ho.export(job, target, "out", origin=ho.Origin("first")))
 ho.save(carry, "out/carry.json", {"by": "hand"})
 print(ho.load("out/carry.json"))

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from hybrid_opt.bundles import BundleOptions, Origin, export
-from hybrid_opt.bundles.bundle import warnings_of
+from hybrid_opt.bundles.bundle import read_manifest, require_target, warnings_of
 from hybrid_opt.bundles.check import as_document, check
 from hybrid_opt.bundles.check import read_trajectory as joint_trajectory
 from hybrid_opt.carry import Carry
@@ -100,6 +100,7 @@ def _replayed(
 
 def export_file(options: argparse.Namespace) -> int:
     """Write the bundle of a trajectory file and print its job; returns the exit code."""
+    require_target(options.target)
     path = Path(options.file)
     stored = read_trajectory(path)
     hosts = None if options.address is None else (options.address[0], options.address[1])
@@ -112,7 +113,8 @@ def export_file(options: argparse.Namespace) -> int:
         job = jobs.plan(timing, squeeze, options.smoothing)
         origin = Origin.of_file(path, read_bytes(path), stored.provenance)
         files = export(job, options.target, options.output, origin=origin, options=bundle)
-        print(_report(job, options.stiffness))
+        document = read_manifest(files[0].parent)
+        print(_report(job, document["start_skew"]["stiffness"]))
     print(f"\n{len(files)} files in {files[0].parent}")
     return 0
 
@@ -130,16 +132,19 @@ def _chosen(
     return time_path(model, stored.x, limits)
 
 
-def _report(job: Job, stiffness: float) -> str:
+def _report(job: Job, stiffness: float | None) -> str:
     """The job's phases, what position control and a late arm do, and warnings."""
     parts = [
         repr(job),
         "\nPosition control, by the arms' stiffness at their pads",
         position_text([position_control(job, each) for each in STIFFNESSES]),
-        f"\nEither arm late, at {stiffness:g} N/m: up to "
-        f"{1e3 * largest_skew(job, stiffness):.1f} ms are survived",
-        skew_text([skewed(job, delay, stiffness) for delay in SKEWS]),
     ]
+    if stiffness is not None:
+        parts += [
+            f"\nEither arm late, at {stiffness:.6g} N/m: up to "
+            f"{1e3 * largest_skew(job, stiffness):.1f} ms are survived",
+            skew_text([skewed(job, delay, stiffness) for delay in SKEWS]),
+        ]
     parts += [f"\nwarning: {warning}" for warning in warnings_of(job)]
     return "\n".join(parts)
 

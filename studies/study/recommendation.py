@@ -357,7 +357,7 @@ def _force_table(
     return ForceTable(tuple(forces.tolist()), tuple(rows))
 
 
-EXPORT_TARGET = "ros2-control"
+EXPORT_TARGET = "torque"
 
 ADVICE, NOTICED = 3, 0.05
 """Most changes that a terminal lists, and the least change of the force by one [N]."""

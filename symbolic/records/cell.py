@@ -130,6 +130,8 @@ class Driver:
         lag: delay of the arm behind its command [s].
         force_control: whether the controller has its maker's force control, where that is an
             option: a sensor at the flange, and instructions that press with a force.
+        stiffness: of the arm under its controller, at the pad along its normal [N/m]; None if
+            nobody measured it.
     """
 
     address: Annotated[str, ADDRESS] = ""
@@ -137,6 +139,7 @@ class Driver:
     rate: Annotated[float, quantity.RATE] | None = None
     lag: Annotated[float, quantity.LAG] = 0.0
     force_control: bool = False
+    stiffness: Annotated[float, quantity.PAD_STIFFNESS] | None = None
 
 
 @dataclass(frozen=True, kw_only=True)

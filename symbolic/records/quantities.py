@@ -52,6 +52,7 @@ DISTURBANCE = Range(0.0, 50.0, "m/s^2", mistaken=(("mm/s^2", 1e-3),))
 INTERNAL_FORCE = Range(0.0, 1e4, "N")
 TILT = Range(0.0, 0.5, "rad", mistaken=_DEGREES)
 ARM_STIFFNESS = Range(0.0, 1e7, "N/m")
+PAD_STIFFNESS = Range(100.0, 1e7, "N/m", mistaken=(("N/mm", 1e3),))
 
 JOINT_POSITION = Range(-4 * math.pi, 4 * math.pi, "rad", mistaken=_DEGREES)
 LOCKED_POSITION = Range(-4 * math.pi, 4 * math.pi, "rad or m")

@@ -72,7 +72,7 @@ def in_a_file_of_the_cell(index: int, damaged: Bytes) -> None:
 
 FILES: dict[str, str | bytes] = {"job.csv": "time\n0.0\n", "goals/1_press.yaml": b"a: 1\n"}
 ABOUT: dict[str, Any] = {
-    "target": "csv",
+    "target": "data",
     "name": "rack-00000000",
     "duration": 7.25,
     "phases": [{"name": "press", "peak_normal_force": [61.5, 60.25], "limits": {"torque": 0.75}}],

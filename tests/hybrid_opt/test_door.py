@@ -174,7 +174,7 @@ def test_a_carry_is_timed_and_exported(tmp_path: Path) -> None:
     np.testing.assert_array_equal(timing.carry.x, carry.x)
     assert "joint acceleration" in repr(timing)
     assert "<table" in timing._repr_html_()
-    files = ho.export(timing, "ros2-control", tmp_path)
+    files = ho.export(timing, "torque", tmp_path)
     assert {"manifest.json", "job.json"} <= {file.name for file in files}
     (folder,) = {file.parent for file in files if file.name == "manifest.json"}
     told = read_manifest(folder)["files"]
@@ -200,7 +200,7 @@ def test_objectives_of_ones_own() -> None:
 def test_what_there_is_to_choose_from() -> None:
     assert ho.algorithms()["nsga2"] == "NSGA-II"
     assert set(cell().objective_names) <= set(ho.objectives())
-    assert {"ros2-control", "csv"} <= set(ho.targets())
+    assert {"torque", "data"} <= set(ho.targets())
     assert repr(ho.example("rack")) == repr(ho.Cell.load(RACK))
     with pytest.raises(SettingsError, match="no cell 'shelf' ships; known are corner, drum"):
         ho.example("shelf")
@@ -214,8 +214,8 @@ def test_what_was_stored_is_read_back(tmp_path: Path) -> None:
     assert isinstance(again, ho.Carry)
     np.testing.assert_array_equal(again.normal_force, carry.normal_force)
     ho.save(again, tmp_path / "again.json")  # its cell's files are still there
-    ho.export(ho.time_path(cell(), carry), "csv", tmp_path)
-    (bundle,) = tmp_path.glob("*/csv")
+    ho.export(ho.time_path(cell(), carry), "data", tmp_path)
+    (bundle,) = tmp_path.glob("*/data")
     manifest = ho.load(bundle)
     assert isinstance(manifest, Mapping)
     assert manifest["written_by"].endswith(ho.__version__)

@@ -77,7 +77,7 @@ def test_a_carry_is_timed_and_exported_with_all_joints(cell: Cell) -> None:
         slope = np.diff(arm.q, axis=0)[moving] / steps[moving, None]
         np.testing.assert_allclose(slope, mean, atol=0.02 * np.abs(arm.q_rate).max())
     with pytest.raises(SettingsError, match="7 joints"):
-        require_arms(cell.workcell, "RAPID", ABB, (6,), any_arm=True)
+        require_arms(cell.workcell, "abb-egm", ABB, (6,), any_arm=True)
 
 
 def test_locking_is_a_constant_path(cell: Cell) -> None:
@@ -127,8 +127,8 @@ def test_a_timed_carry_turns_as_its_rates_say(turned: Cell, tmp_path: Path) -> N
     # The turn about y in all, by the integral of the angular velocity.
     whole = np.trapezoid(carry.angular_velocity[:, 1], carry.time)
     assert whole == pytest.approx(np.pi, abs=0.02)
-    ho.export(timing, "json", tmp_path)
-    (path,) = (p for p in tmp_path.rglob("*.json") if "box" in json.loads(p.read_text()))
+    ho.export(timing, "data", tmp_path)
+    (path,) = (p for p in tmp_path.rglob("job.json") if "box" in json.loads(p.read_text()))
     box = json.loads(path.read_text())["box"]
     assert (box["rotation"], box["reference"]) == ("quaternion", np.eye(3).tolist())
 

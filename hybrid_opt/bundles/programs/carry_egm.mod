@@ -14,7 +14,7 @@ MODULE CarryEgm$number
       \CommTimeout:=1;
     EGMActJoint carryEgm \Tool:=carryPad $criteria
       \LpFilter:=0 \SampleRate:=4
-      \MaxSpeedDeviation:=20;
+      \MaxSpeedDeviation:=$deviation;
     ! For a day: a job that is held stands still for as long as it takes.
     EGMRunJoint carryEgm, EGM_STOP_HOLD $moved \CondTime:=86400;
     EGMReset carryEgm;

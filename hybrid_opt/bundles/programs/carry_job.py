@@ -16,8 +16,6 @@ from collections.abc import Iterator, Sequence
 from copy import copy
 from dataclasses import dataclass, field
 from functools import cached_property
-from itertools import islice
-from operator import sub
 from pathlib import Path
 from typing import Any
 
@@ -36,18 +34,16 @@ SEARCH_STEP = 0.004
 NEAR = 0.002
 """A pad so near to its place is there [m]."""
 
-LEAST_SPEED, SLOW = 0.02, 0.25
-"""Speed of a pad that begins to move [m/s], and the share of the fastest below which a posture says
-too little of the coordinate to call an arm late."""
-
-WAIT = 3.0
-"""Longest time for arms to begin to move [s]."""
+SLOW = 0.25
+"""Share of the fastest speed below which a posture says too little of the coordinate to call an arm
+late."""
 
 PRESSED = 0.98
 """Share of the force with which the box is lifted from which on the pads have to press."""
 
-RESTS = 2e-4
-"""Change of a joint from look to look below which an arm stands [rad, m]."""
+UNLOADED = 0.07
+"""Largest force before the first contact, over the largest commanded one: an offset of the sensor
+becomes an error of the squeeze."""
 
 STRIKES = 3
 """Looks in a row at which something has to be wrong, beside a stop that is asked for."""
@@ -69,7 +65,7 @@ class Limits:
         behind: how far an arm may lag behind its reference [s].
         skew: how far both arms may be apart along the path [s].
         force: share by which a measured force may miss its reference while the box is held.
-        silence: longest time without news from an arm [s].
+        silence: largest age of a measurement [s].
     """
 
     stop_time: float
@@ -306,14 +302,14 @@ class Seen:
     Attributes:
         q: measured joint positions of each arm; None where there are none [rad, m].
         force: measured normal force of each pad; None where nobody measures it [N].
-        silence: time since the last news from each arm [s].
+        age: time since each arm's posture was measured [s].
         fault: why to stop; '' for no reason.
         lost: whether that is an arm that does not do what it is told.
     """
 
     q: list[list[float] | None] = field(default_factory=lambda: [None, None])
     force: list[float | None] = field(default_factory=lambda: [None, None])
-    silence: list[float] = field(default_factory=lambda: [0.0, 0.0])
+    age: list[float] = field(default_factory=lambda: [0.0, 0.0])
     fault: str = ""
     lost: bool = False
 
@@ -328,47 +324,55 @@ class Machine:
         stop_time: of the stop that runs, or of the last one [s].
     """
 
-    def __init__(self, job: Job, lag: float = 0.0, lead: float = 0.0, waits: bool = False) -> None:
+    def __init__(
+        self,
+        job: Job,
+        lag: float = 0.0,
+        lead: float = 0.0,
+        sensors: Sequence[bool] = (False, False),
+    ) -> None:
         """Stand at the beginning.
 
         Args:
-            lag: by which the arms follow what they are told in any case [s].
-            lead: from the decision to stop to what the arms hear of it [s].
-            waits: whether arms begin to move some time after they are told, so that the clock has
-                to wait for them.
+            lag: by which the arms follow their commands in any case [s].
+            lead: from the decision to stop to its effect on the commands [s].
+            sensors: per arm, True if its force has to be measured.
         """
-        self.job, self.lag, self.lead = job, lag, lead
+        self.job, self.lag, self.lead, self._sensors = job, lag, lead, sensors
         self.state, self.reason = "ready", ""
         self.clock, self.stop_time = Clock(job.end, job.limits.stop_time), job.limits.stop_time
-        self._waits, self._expected = waits, list[Moment]()
-        self._strikes, self._waited = 0, 0.0
-        self._stood: list[list[float] | None] = []
+        self._strikes, self._silent = 0, list[str]()
 
     def start(self, seen: Seen) -> None:
         """Begin the job.
 
         Raises:
-            Refused: someone or something asks to stop, an arm is silent or not at its first place,
-                or a pad is pressed.
+            Refused: a stop is requested, an arm is silent or not at its first place, a sensor gives
+                no reading, or a pad is pressed.
         """
+        self.check(seen)
+        self.state = "running"
+        self.clock = Clock(self.job.end, self.job.limits.stop_time, 0.0, 1.0)
+
+    def check(self, seen: Seen) -> None:
+        """Refuse arms that are not ready for the job; see `start`."""
         if seen.fault:
             raise Refused(seen.fault)
         self._require_places(seen, self.job.limits.start)
         for arm, force in enumerate(seen.force):
-            most = 0.2 * max(self.job.robots[arm]["normal_force"])
+            if self._sensors[arm] and force is None:
+                raise Refused(self._no_force(arm))
+            most = UNLOADED * max(self.job.robots[arm]["normal_force"])
             if force is not None and abs(force) > most:
                 raise Refused(
                     f"{self._name(arm)} feels {force:.1f} N before it touches the box: zero its "
-                    "sensor, state its tool_load"
+                    f"sensor and state its tool_load; allowed are {most:.1f} N"
                 )
-        self.state = "running"
-        self.clock = Clock(self.job.end, self.job.limits.stop_time, 0.0, 1.0)
-        self._wait(1.0)
 
     def hold(self, reason: str) -> None:
         """Hold where the arms were told to be, because they cannot go on."""
         self.clock = Clock(self.job.end, self.job.limits.stop_time, self.clock.s)
-        self.state, self.reason, self._expected = "held", reason, []
+        self.state, self.reason = "held", reason
 
     def resume(self, direction: float, seen: Seen) -> None:
         """Go on from where it is held: 1 to the end of the job, -1 back to its beginning.
@@ -382,15 +386,13 @@ class Machine:
             raise Refused(seen.fault)
         self._require_places(seen, self.job.limits.path)
         self.state, self._strikes = "running", 0
-        self._wait(direction)
         self.clock.turn(direction)
 
     def tick(self, dt: float, seen: Seen) -> None:
         """Let time pass and look at the arms."""
-        if self._expected and self.state == "running":
-            self._meet(dt, seen)
-            return
         self.clock.advance(dt)
+        limit = self.job.limits.silence
+        self._silent = [self._name(arm) for arm, age in enumerate(seen.age) if age > limit]
         if self.state == "running":
             if not self.clock.turning and (
                 (self.clock.rate > 0.0 and self.clock.s >= self.job.end)
@@ -407,54 +409,12 @@ class Machine:
             if seen.fault or self._strikes >= STRIKES:
                 self.stop(seen.fault or wrong, quick=seen.lost or not seen.fault)
         elif self.state == "stopping" and not self.clock.turning:
-            if self._waits and not self._rests(dt, seen):
-                return
             self.state = "held"
-            if self._waits:
-                self._locate(seen)
-
-    def _rests(self, dt: float, seen: Seen) -> bool:
-        """Whether arms that stop by themselves have come to rest since the last look."""
-        before, self._stood = self._stood, list(seen.q)
-        self._waited += dt
-        return (
-            self._waited > WAIT
-            or before == self._stood
-            or all(
-                now is not None and then is not None and max(map(abs, map(sub, now, then))) < RESTS
-                for now, then in zip(self._stood, before or [None], strict=False)
-            )
-        )
-
-    def _wait(self, rate: float) -> None:
-        if self._waits:
-            moments = self.clock.ahead(rate, SEARCH_STEP)
-            self._expected = list(islice(moments, round(WAIT / SEARCH_STEP)))
-            self._waited = 0.0
-
-    def _meet(self, dt: float, seen: Seen) -> None:
-        """Let the clock begin where arms are that have begun to move."""
-        self._waited += dt
-        found = []
-        for arm, q in enumerate(seen.q):
-            if q is not None:
-                row: list[float] = q
-                near = [self.job.distance(arm, row, m.s) for m in self._expected]
-                found.append(min(range(len(near)), key=lambda k: round(near[k], 7)))
-        begun = [self._expected[k] for k in found]
-        if len(begun) == 2 and all(
-            abs(m.rate) * self.job.speed(arm, m.s) > LEAST_SPEED for arm, m in enumerate(begun)
-        ):
-            self._expected = []
-            self.clock.advance(min(m.time for m in begun) + self.lag)
-        elif seen.fault or self._waited > WAIT:
-            self.hold(seen.fault or "the arms do not begin to move")
 
     def stop(self, reason: str, quick: bool = False) -> None:
         """Stop along the path and hold; quickly where an arm does not do what it is told."""
         if self.state == "running":
             self.state, self.reason = "stopping", reason
-            self._expected, self._stood, self._waited = [], [], 0.0
             limits = self.job.limits
             self.stop_time = limits.quick_stop if quick else limits.stop_time
             self.clock.turn(0.0, self.lead, self.stop_time)
@@ -463,32 +423,24 @@ class Machine:
         """What has happened, and how to go on."""
         where = f"{self.job.phase(self.clock.s)}, {self.clock.s:.3f} s"
         if self.state in ("stopping", "held"):
+            known = (
+                f"{' and '.join(self._silent)} is silent: look whether it still holds"
+                if self._silent
+                else "Both arms report and are commanded to hold their places and press"
+            )
             return (
-                f"{self.state} in {where}: {self.reason}. Both arms hold their places and press. "
-                "To set the box down: 'continue' to the end of the job, or 'back' to where the "
-                "box stood"
+                f"{self.state} in {where}: {self.reason}. {known}. To set the box down: 'continue' "
+                "to the end of the job, or 'back' to where the box stood"
             )
         return f"{self.state} ({where})"
-
-    def _locate(self, seen: Seen) -> None:
-        """Stand where arms are that came to rest by themselves, of those that are on the path."""
-        limits, found = self.job.limits, list[float]()
-        reach = limits.stop_time + self.lag
-        for arm, q in enumerate(seen.q):
-            if q is not None and seen.silence[arm] <= limits.silence:
-                at = self.job.coordinate(arm, q, self.clock.s, (-reach, reach))
-                found += [at] if self.job.distance(arm, q, at) <= limits.path else []
-        if found:
-            s = sum(found) / len(found)
-            self.clock = Clock(self.job.end, self.job.limits.stop_time, s)
 
     def _name(self, arm: int) -> str:
         return str(self.job.robots[arm]["name"])
 
     def _require_places(self, seen: Seen, most: float) -> None:
         for arm, q in enumerate(seen.q):
-            if q is None or seen.silence[arm] > self.job.limits.silence:
-                raise Refused(f"there is no news from {self._name(arm)}")
+            if q is None or seen.age[arm] > self.job.limits.silence:
+                raise Refused(self._no_news(arm, seen))
             away = self.job.distance(arm, q, self.clock.s)
             if away > most:
                 raise Refused(
@@ -504,12 +456,14 @@ class Machine:
         most = limits.path / 2.0 if stands else limits.path
         coordinates = []
         direction = 1.0 if self.clock.rate >= 0.0 else -1.0
-        told = s - direction * self.lag
         for arm, q in enumerate(seen.q):
-            if seen.silence[arm] > limits.silence:
-                return f"no news from {self._name(arm)} for {seen.silence[arm]:.2f} s"
+            if seen.age[arm] > limits.silence:
+                return self._no_news(arm, seen)
             if q is None:
                 continue
+            # Where the arm had to be when its posture was measured.
+            since = self.clock.rate * seen.age[arm]
+            told = s - direction * self.lag - since
             # Twice as far behind as is allowed, and a little ahead.
             far, near = -2.0 * direction * limits.behind, direction * limits.behind / 2.0
             at = self.job.coordinate(arm, q, told, (min(far, near), max(far, near)))
@@ -520,7 +474,7 @@ class Machine:
                 if direction * (told - at) > limits.behind:
                     late = 1e3 * direction * (told - at)
                     return f"{self._name(arm)} is {late:.0f} ms behind its reference"
-                coordinates.append(at)
+                coordinates.append(at + since)
         if len(coordinates) == 2:
             # What counts is how far the pads are apart: at low speed, time says little.
             apart = abs(coordinates[0] - coordinates[1])
@@ -531,6 +485,8 @@ class Machine:
     def _wrong_force(self, seen: Seen) -> str:
         s, lift = self.clock.s, self.job.pressed
         for arm, measured in enumerate(seen.force):
+            if self._sensors[arm] and measured is None:
+                return self._no_force(arm)
             wanted = self.job.force(arm, s)
             # Before the box is lifted the pads have to press.
             pressed = s <= lift and wanted >= PRESSED * self.job.force(arm, lift)
@@ -539,3 +495,14 @@ class Machine:
             if measured is not None and abs(measured - wanted) > self.job.limits.force * wanted:
                 return f"{self._name(arm)} presses {measured:.1f} N instead of {wanted:.1f} N"
         return ""
+
+    def _no_news(self, arm: int, seen: Seen) -> str:
+        if seen.q[arm] is None:
+            return f"no news from {self._name(arm)}: is its controller launched?"
+        return (
+            f"no news from {self._name(arm)} for {seen.age[arm]:.2f} s, by the stamps of its joint "
+            "states"
+        )
+
+    def _no_force(self, arm: int) -> str:
+        return f"no force is measured at the pad of {self._name(arm)}: is its sensor published?"

@@ -1,6 +1,7 @@
 """Both arms' controllers, as `config/cell.json` lists them: ros2 launch launch/NAME.launch.py
 
-Where the description names mock hardware, a simulator's plugin goes in its place.
+carry_controller stays inactive: run_job.py activates it once the arms know their loads. A simulator
+brings its own controller manager, with config/controllers.yaml.
 """
 
 from __future__ import annotations
@@ -41,11 +42,12 @@ def actions(each: dict[str, Any]) -> list[Any]:
         (outside if "namespace" in arguments else inside).append(include)
     else:
         text = {"robot_description": (BUNDLE / "description/cell.urdf").read_text()}
-        parameters.insert(0, text)
         name = "robot_state_publisher"
         inside.append(Node(package=name, executable=name, parameters=[text]))
     package = "controller_manager"
     if parameters:
         inside.append(Node(package=package, executable="ros2_control_node", parameters=parameters))
-    inside.append(Node(package=package, executable="spawner", arguments=each["controllers"]))
+    for names in (each["controllers"], ["carry_controller", "--inactive"]):
+        if names:
+            inside.append(Node(package=package, executable="spawner", arguments=names))
     return [*outside, GroupAction(inside)]

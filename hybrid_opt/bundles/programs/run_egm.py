@@ -25,6 +25,7 @@ import sys
 import time
 from bisect import bisect_left
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -39,6 +40,9 @@ PATIENCE = 30.0
 LONGEST_TICK = 0.02
 """At most so much of the job passes between two messages [s]: a pause of this computer does not
 make the arms jump."""
+
+MOST_PRESSED = 1.2
+"""Measured over commanded force beyond which the pad goes no farther into the box."""
 
 CTRL_C = "Ctrl-C"
 
@@ -71,6 +75,9 @@ class Press:
             self._missing += self._gain * (wanted - felt) * dt
         target = self._compliance * max(soon, 0.0) + self._missing
         target = min(max(target, -self._most), self._most)
+        if felt is not None and felt > MOST_PRESSED * max(wanted, soon):
+            # Stiffer than measured, or not where it should be: no farther into it.
+            target = min(target, self.way)
         step = self._speed * dt
         self.way += min(max(target - self.way, -step), step)
 
@@ -81,7 +88,7 @@ class Stream:
     def __init__(self, job: Job, config: dict[str, Any]) -> None:
         """Wait for both controllers."""
         self.job, self.config = job, config
-        self.machine = Machine(job)
+        self.machine = Machine(job, 0.0, sensors=config["sensors"])
         self.press = Press(config["press"])
         self.fault, self.command = "", ""
         self._arm: int = config["press"]["arm"]
@@ -90,10 +97,13 @@ class Stream:
         self._force: list[float | None] = [None, None]
         self._news = [-math.inf, -math.inf]
         self._last: float | None = None
+        # A name that is no address is looked up once, before the stream.
+        self._hosts = [socket.gethostbyname(host) for host in config["addresses"]]
+        self.dropped = 0
 
     def seen(self, now: float) -> Seen:
         """What is known of the arms."""
-        silence = [now - then for then in self._news]
+        age = [now - then for then in self._news]
         q = list(self._q)
         pressing = q[self._arm]
         if pressing is not None:
@@ -102,7 +112,7 @@ class Stream:
             way = self.press.way
             q[self._arm] = [a - way * slope for a, slope in zip(pressing, inward, strict=True)]
         lost = self.fault not in ("", CTRL_C)
-        return Seen(q=q, force=list(self._force), silence=silence, fault=self.fault, lost=lost)
+        return Seen(q=q, force=list(self._force), age=age, fault=self.fault, lost=lost)
 
     def hear(self, arm: int, message: FromRobot, now: float) -> None:
         """Take a message of an arm's controller."""
@@ -118,6 +128,19 @@ class Stream:
         if self.machine.state == "running" and not message.running:
             name = self.job.robots[arm]["name"]
             self.fault = self.fault or f"the controller of {name} does not follow"
+
+    def read(self, arm: int, data: bytes, host: str) -> FromRobot | None:
+        """Read a packet; drop and count one that another host sent or that is damaged."""
+        if host == self._hosts[arm]:
+            with suppress(ValueError, struct.error):
+                return read_robot(data)
+        self.dropped += 1
+        return None
+
+    def told(self) -> str:
+        """What has happened."""
+        strange = f" {self.dropped} packets were dropped, from other hosts or damaged."
+        return self.machine.told() + (strange if self.dropped else "")
 
     def tick(self, now: float) -> None:
         """Let time pass."""
@@ -143,9 +166,9 @@ class Stream:
                 self.machine.resume(direction, self.seen(now))
             except Refused as error:
                 self.machine.hold(str(error))
-                print(self.machine.told(), file=sys.stderr)
+                print(self.told(), file=sys.stderr)
         if before != self.machine.state:
-            print(self.machine.told(), file=sys.stderr)
+            print(self.told(), file=sys.stderr)
 
     def answer(self, arm: int, number: int, now: float) -> bytes:
         """Where an arm has to be, as a message: its lag ahead of the clock."""
@@ -226,7 +249,9 @@ def streamed(stream: Stream, sockets: Sequence[socket.socket], check: bool) -> i
         for arm, source in enumerate(sockets):
             if source in ready:
                 data, address = source.recvfrom(4096)
-                message = read_robot(data)
+                message = stream.read(arm, data, address[0])
+                if message is None:
+                    continue
                 stream.hear(arm, message, now)
                 source.sendto(stream.answer(arm, message.number, now), address)
         if sys.stdin in ready:
@@ -242,7 +267,7 @@ def streamed(stream: Stream, sockets: Sequence[socket.socket], check: bool) -> i
         if stream.machine.state == "ready" and now - begin > PATIENCE:
             raise Refused("a controller is silent: is CarryEgm running in both tasks?")
         if stream.machine.state == "held" and stream.command == "leave":
-            print(f"left while {stream.machine.told()}", file=sys.stderr)
+            print(f"left while {stream.told()}", file=sys.stderr)
             return 1
     return 0 if stream.machine.clock.s > 0.0 else 3
 

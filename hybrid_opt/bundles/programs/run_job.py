@@ -14,6 +14,7 @@ import math
 import signal
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,8 @@ from action_msgs.msg import GoalStatus
 from control_msgs.action import FollowJointTrajectory
 from geometry_msgs.msg import WrenchStamped
 from rclpy.action import ActionClient
+from rclpy.parameter import Parameter
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 from rosidl_runtime_py import set_message_fields
 from rosidl_runtime_py.utilities import get_service
@@ -36,7 +39,7 @@ PERIOD = 0.01
 """Between two looks at the arms [s]."""
 
 LEAD = 0.5
-"""From sending a goal to its start, where goals bear a start [s]."""
+"""From building the goals to their common start [s]."""
 
 PATIENCE = 10.0
 """Longest wait for something of the controllers [s]."""
@@ -49,13 +52,8 @@ SETTLE = 0.5
 
 CTRL_C = "Ctrl-C"
 
-TRIGGER = "std_srvs/srv/Trigger"
-
-WINDOW = 8
-"""Steps ahead within two periods of references, the largest force of which is sent."""
-
-SLOWEST = 0.01
-"""Fraction of a speed slider that is nearly none."""
+NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
+"""Of measurements: hears reliable publishers and those of best effort, keeps no queue."""
 
 
 class Run:
@@ -64,21 +62,19 @@ class Run:
     def __init__(self, node: Any, job: Job, config: dict[str, Any]) -> None:
         """Subscribe to both arms, with nothing sent."""
         self.node, self.job, self.config = node, job, config
-        self._stamped = config["stamped"]
-        how: dict[str, Any] = {"lead": LEAD_OF_STOP} if self._stamped else {"waits": True}
-        self.machine = Machine(job, config["lag"], **how)
+        sensors = [source is not None for source in config["wrench"]]
+        self.machine = Machine(job, config["lag"], LEAD_OF_STOP, sensors)
         self.fault, self.command, self.lost = "", "", False
-        self._pressed, self._began, self._last = -math.inf, 0.0, 0.0
-        self._presses = False
+        self._began, self._last = 0.0, 0.0
         self._q: list[dict[str, float]] = [{}, {}]
-        self._news = [-math.inf, -math.inf]
+        self._measured = [-math.inf, -math.inf]
         self._force: list[float | None] = [None, None]
-        self._handles: list[Any] = []
+        self._felt = [-math.inf, -math.inf]
         self._goals = 0
         self._calls: list[tuple[str, Any]] = []
         self._clients: dict[str, Any] = {}
         for topic in config["joint_states"]:
-            node.create_subscription(JointState, topic, self._joints, 10)
+            node.create_subscription(JointState, topic, self._joints, NEWEST)
         for arm, source in enumerate(config["wrench"]):
             if source is not None:
                 self._listen(arm, source)
@@ -92,7 +88,12 @@ class Run:
             known = dict(zip(message.name, message.position, strict=False))
             if all(name in known for name in robot["ros_joints"]):
                 self._q[arm] = known
-                self._news[arm] = self.now()
+                self._measured[arm] = self._stamp(message)
+
+    def _stamp(self, message: Any) -> float:
+        """Return when a message was measured [s]; its arrival where it bears no stamp."""
+        stamp = message.header.stamp
+        return stamp.sec + 1e-9 * stamp.nanosec or self.now()
 
     def _listen(self, arm: int, source: dict[str, Any]) -> None:
         axis = source["axis"]
@@ -100,9 +101,9 @@ class Run:
         def heard(message: Any) -> None:
             force = message.wrench.force
             along = axis[0] * force.x + axis[1] * force.y + axis[2] * force.z
-            self._force[arm] = abs(along)
+            self._force[arm], self._felt[arm] = abs(along), self._stamp(message)
 
-        self.node.create_subscription(WrenchStamped, source["topic"], heard, 10)
+        self.node.create_subscription(WrenchStamped, source["topic"], heard, NEWEST)
 
     def _commanded(self, message: Any) -> None:
         self.command = message.data.strip()
@@ -114,23 +115,26 @@ class Run:
     def seen(self) -> Seen:
         """What is known of the arms now."""
         for name, future in [call for call in self._calls if call[1].done()]:
-            if future.result() is None or not getattr(future.result(), "success", True):
-                self.fault = self.fault or f"{name} was refused"
+            answer = future.result()
+            if not getattr(answer, "ok", getattr(answer, "success", answer is not None)):
+                reason = getattr(answer, "error", getattr(answer, "message", ""))
+                self.fault = self.fault or f"{name} was refused: {reason or 'without a reason'}"
         self._calls = [call for call in self._calls if not call[1].done()]
-        now = self.now()
+        now, silence = self.now(), self.job.limits.silence
+        felt = zip(self._force, self._felt, strict=True)
         return Seen(
             q=[
                 [known[name] for name in robot["ros_joints"]] if known else None
                 for known, robot in zip(self._q, self.job.robots, strict=True)
             ],
-            force=list(self._force),
-            silence=[now - then for then in self._news],
+            force=[force if now - then <= silence else None for force, then in felt],
+            age=[max(0.0, now - then) for then in self._measured],
             fault=self.fault,
             lost=self.lost,
         )
 
     def spin(self, until: float) -> None:
-        """Handle what comes in until a time."""
+        """Handle what comes in until a time [s]."""
         while (left := until - self.now()) > 0.0:
             rclpy.spin_once(self.node, timeout_sec=left)
 
@@ -147,10 +151,24 @@ class Run:
             rclpy.spin_once(self.node, timeout_sec=PERIOD)
         return [future.result() for future in futures]
 
-    def call(self, name: str, kind: str, request: dict[str, Any]) -> Any:
-        """Call a service; a refusal becomes a fault when it arrives."""
-        message = get_service(kind).Request()
-        set_message_fields(message, request)
+    def call(self, name: str, kind: str, requests: Sequence[dict[str, Any]]) -> Any:
+        """Call a service; a refusal becomes a fault when it arrives.
+
+        Args:
+            requests: the same one as versions of the driver define it; the first that fits is sent.
+
+        Raises:
+            Refused: none fits.
+        """
+        for request in requests:
+            message = get_service(kind).Request()
+            try:
+                set_message_fields(message, request)
+            except AttributeError:
+                continue
+            break
+        else:
+            raise Refused(f"{name}: this driver defines another {kind}")
         future = self._clients[name].call_async(message)
         self._calls.append((name, future))
         return future
@@ -162,24 +180,33 @@ class Run:
             raise Refused(f"{name} is not there; are the controllers launched?")
 
     def prepare(self) -> None:
-        """Whatever the arms need before they move, one after the other.
+        """Make the arms ready: look at them, then call what config/cell.json lists, in its order.
 
         Raises:
-            Refused: something is not there, or says no.
+            Refused: something is not there or says no, or an arm is not at its first place.
         """
         for group, client in zip(self.config["groups"], self._actions, strict=True):
             if not client.wait_for_server(timeout_sec=PATIENCE):
                 raise Refused(f"{group['action']} is not there; are the controllers launched?")
         for call in self.config["prepare"]:
             self._find(call["name"], call["kind"])
-        for each in (*self.config["force"], *self.config["payload"], *self.config["sliders"]):
-            self._find(each["name"], each["type"])
-        for force in self.config["force"]:
-            self._find(force["end"], TRIGGER)
+        self.check()
         for call in self.config["prepare"]:
             self.wait([self.call(**call)], call["name"])
             if self.seen().fault:
                 raise Refused(self.fault)
+
+    def check(self) -> None:
+        """Look at both arms.
+
+        Raises:
+            Refused: they are not ready for the job.
+        """
+        while self.now() == 0.0:
+            # A simulator's clock is not there yet.
+            rclpy.spin_once(self.node, timeout_sec=PERIOD)
+        self.spin(self.now() + SETTLE)
+        self.machine.check(self.seen())
 
     def send(self, moments: Sequence[Moment], begin: float) -> None:
         """Send every group its part of the path, and hear whether it is accepted.
@@ -190,27 +217,21 @@ class Run:
         Raises:
             Refused: a controller does not take it.
         """
-        sent = []
-        for group, client in zip(self.config["groups"], self._actions, strict=True):
-            goal = FollowJointTrajectory.Goal()
-            set_message_fields(goal, self._goal(group["arms"], moments))
-            if self.config["stamped"]:
-                goal.trajectory.header.stamp.sec = int(begin)
-                goal.trajectory.header.stamp.nanosec = int((begin - int(begin)) * 1e9)
-            sent.append(client.send_goal_async(goal))
+        goals = []
+        for group in self.config["groups"]:
+            goals.append(FollowJointTrajectory.Goal())
+            set_message_fields(goals[-1], self._goal(group["arms"], moments))
+            goals[-1].trajectory.header.stamp.sec = int(begin)
+            goals[-1].trajectory.header.stamp.nanosec = int((begin - int(begin)) * 1e9)
+        # Large goals take long to build: none is sent before all are there.
+        both = zip(self._actions, goals, strict=True)
+        sent = [client.send_goal_async(goal) for client, goal in both]
         self._goals += 1
         handles = self.wait(sent, "a controller")
-        if not all(handle.accepted for handle in handles):
-            for handle in handles:
-                if handle.accepted:
-                    handle.cancel_goal_async()
-            refusing = [
-                g["action"]
-                for g, h in zip(self.config["groups"], handles, strict=True)
-                if not h.accepted
-            ]
-            raise Refused(f"{refusing[0]} does not take its goal; nothing moves on")
-        self._handles = handles
+        taken = dict(zip((g["action"] for g in self.config["groups"]), handles, strict=True))
+        refusing = [action for action, handle in taken.items() if not handle.accepted]
+        if refusing:
+            raise Refused(f"{' and '.join(refusing)} does not take its goal")
         for group, handle in zip(self.config["groups"], handles, strict=True):
             handle.get_result_async().add_done_callback(self._ended(group["action"], self._goals))
 
@@ -225,16 +246,14 @@ class Run:
         return ended
 
     def _goal(self, arms: Sequence[int], moments: Sequence[Moment]) -> dict[str, Any]:
-        names = self._joined(arms, [self.job.robots[arm]["ros_joints"] for arm in arms])
-        erased = [{"name": name, "position": -1.0} for name in names]
+        # Without tolerances: a controller that gives up by itself drops the squeeze.
         return {
             "trajectory": {
-                "joint_names": names,
+                "joint_names": self._joined(
+                    arms, [self.job.robots[arm]["ros_joints"] for arm in arms]
+                ),
                 "points": [self._point(arms, moment) for moment in moments],
-            },
-            # A controller that gives up by itself drops the squeeze: this program looks after both.
-            "path_tolerance": erased,
-            "goal_tolerance": erased,
+            }
         }
 
     def _joined(self, arms: Sequence[int], rows: Sequence[Sequence[Any]]) -> list[Any]:
@@ -250,46 +269,17 @@ class Run:
         rates = [job.linear(arm, "velocity", at.s) for arm in arms]
         seconds = [job.linear(arm, "acceleration", at.s) for arm in arms]
         nanoseconds = round(at.time * 1e9)
-        point = {
+        efforts = [job.effort(arm, "without_gravity", at.s, r) for arm in arms]
+        return {
             "positions": self._joined(arms, [job.position(arm, at.s) for arm in arms]),
             "velocities": [r * v for v in self._joined(arms, rates)],
             "accelerations": [
                 r * r * a + at.change * v
                 for v, a in zip(self._joined(arms, rates), self._joined(arms, seconds), strict=True)
             ],
+            "effort": self._joined(arms, efforts),
             "time_from_start": {"sec": nanoseconds // 10**9, "nanosec": nanoseconds % 10**9},
         }
-        if self.config["effort"]:
-            gravity = self.config["effort"]
-            efforts = [job.effort(arm, gravity, at.s, r) for arm in arms]
-            point["effort"] = self._joined(arms, efforts)
-        return point
-
-    def press(self, s: float, rate: float) -> None:
-        """Tell force controllers what to press from a coordinate on, at a rate."""
-        for force in self.config["force"]:
-            arm, every = force["arm"], force["every"]
-            ahead = (s + rate * 2.0 * every * k / WINDOW for k in range(WINDOW))
-            newton = max(self.job.force(arm, each) for each in ahead)
-            request = json.loads(json.dumps(force["request"]))
-            request["wrench"] = {"force": {"z": newton}}
-            self.call(force["name"], force["type"], request)
-
-    def bear(self, s: float) -> None:
-        """Tell the arms what they carry, as the pads take the box over."""
-        for load in self.config["payload"]:
-            arm = load["arm"]
-            peak = self.job.force(arm, self.job.pressed)
-            share = min(1.0, self.job.force(arm, s) / peak) if peak > 0.0 else 0.0
-            first, second = load["empty"], load["loaded"]
-            mass = (1.0 - share) * first["mass"] + share * second["mass"]
-            moment = [
-                (1.0 - share) * first["mass"] * a + share * second["mass"] * b
-                for a, b in zip(first["centre"], second["centre"], strict=True)
-            ]
-            centre = [m / mass if mass else 0.0 for m in moment]
-            request = {"mass": mass, "center_of_gravity": dict(zip("xyz", centre, strict=True))}
-            self.call(load["name"], load["type"], request)
 
     def start(self) -> None:
         """Send the whole job and begin.
@@ -302,8 +292,15 @@ class Run:
 
     def _begin(self, rate: float) -> None:
         moments = list(self.machine.clock.ahead(rate, self.config["step"]))
-        self._began = self.now() + (LEAD if self._stamped else 0.0)
-        self.send(moments, self._began)
+        self._began = self.now() + LEAD
+        try:
+            self.send(moments, self._began)
+        except Refused as error:
+            # A controller that has taken its goal does not begin alone: it holds what it holds.
+            self.machine.hold(str(error))
+            with suppress(Refused):
+                self.send([Moment(0.0, self.machine.clock.s, 0.0, 0.0)], self._began)
+            raise
         self.spin(self._began)
         self._last = self._began
 
@@ -317,7 +314,6 @@ class Run:
             self._stop()
         if before != machine.state:
             self.node.get_logger().info(machine.told())
-        self._press()
         if machine.state == "held" and self.command in ("continue", "back"):
             self._resume(1.0 if self.command == "continue" else -1.0)
 
@@ -328,14 +324,6 @@ class Run:
             self._stop()
 
     def _stop(self) -> None:
-        if not self._stamped:
-            # Goals that cannot be replaced: slow on the path for a time, then whole.
-            self._goals += 1
-            self._slide(SLOWEST)
-            self.spin(self.now() + self.machine.stop_time)
-            for handle in self._handles:
-                handle.cancel_goal_async()
-            return
         if self.machine.state == "held":
             # At its end: the controllers hold what they reached.
             return
@@ -349,30 +337,10 @@ class Run:
         except Refused as error:
             self.node.get_logger().error(f"{error}; the job goes on to its end as planned")
 
-    def _slide(self, fraction: float) -> list[Any]:
-        """Set the speed sliders."""
-        request = {"speed_slider_fraction": fraction}
-        return [self.call(each["name"], each["type"], request) for each in self.config["sliders"]]
-
-    def _press(self) -> None:
-        s, now = self.machine.clock.s, self.now()
-        touching = self.job.begin("press") < s < self.job.begin("retreat")
-        for force in self.config["force"]:
-            if touching and now - self._pressed >= force["every"]:
-                self._pressed, self._presses = now, True
-                self.press(s, self.machine.clock.rate)
-                self.bear(s)
-        if self._presses and not touching:
-            # The pads are off the box.
-            self._presses = False
-            for force in self.config["force"]:
-                self.call(force["end"], TRIGGER, {})
-
     def _resume(self, direction: float) -> None:
         self.command, self.fault, self.lost = "", "", False
         try:
             self.machine.resume(direction, self.seen())
-            self.wait(self._slide(1.0), "a speed slider")
             self._begin(direction)
         except Refused as error:
             self.machine.hold(str(error))
@@ -406,19 +374,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--check", action="store_true", help="look at both arms and move nothing")
     options = parser.parse_args(arguments)
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
-    node = rclpy.create_node("run_job")
+    config = json.loads((BUNDLE / "config/cell.json").read_text("utf-8"))
+    clock = Parameter("use_sim_time", value=config["simulated"])
+    node = rclpy.create_node("run_job", parameter_overrides=[clock])
     try:
-        job = Job.read(BUNDLE / "job.json")
-        config = json.loads((BUNDLE / "config/cell.json").read_text("utf-8"))
-        run = Run(node, job, config)
+        run = Run(node, Job.read(BUNDLE / "job.json"), config)
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, run.interrupt)
-        run.prepare()
-        run.spin(run.now() + SETTLE)
         if options.check:
-            run.machine.start(run.seen())
+            run.check()
             node.get_logger().info("both arms are at their first places")
             return 0
+        run.prepare()
+        run.check()
         run.start()
         return run.look_after()
     except Refused as error:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from functools import cache
+from unittest.mock import patch
 
 from hybrid_opt.bundles import TARGETS, BundleOptions
 from hybrid_opt.bundles.bundle import prepared
@@ -14,10 +15,10 @@ from hybrid_opt.job.records import Job
 from symbolic.records import Driver
 from tests.hybrid_opt.job.jobs import rack_job
 
-DRIVER = Driver("192.168.0.10", None, None, 0.03, force_control=True)
+DRIVER = Driver("192.168.0.10", None, None, 0.03, force_control=True, stiffness=1e4)
 """What every target is content with."""
 
-STEPS = {"ur-script": 0.008, "abb-rapid": 0.1}
+STEPS = {"ur-script": 0.008}
 
 
 def driven(job: Job, driver: Driver = DRIVER) -> Job:
@@ -32,25 +33,31 @@ def rack_driven() -> Job:
 
 
 @cache
-def exported(target: str, step: float | None = None) -> Export:
-    """The rack's job as a target takes it, at 0.05 s steps where the target allows that."""
-    options = BundleOptions(step=step or STEPS.get(target, 0.05), any_arm=True)
-    return prepared(rack_driven(), TARGETS[target], options)
+def exported(target: str, driver: str = "simulation") -> Export:
+    """The rack's job as a target takes it, at 0.05 s steps where the target allows that.
+
+    Args:
+        driver: of the target torque, whatever the makers of the arms.
+    """
+    options = BundleOptions(step=STEPS.get(target, 0.05), any_arm=True)
+    with patch("hybrid_opt.bundles.bundle.driver_of", return_value=driver):
+        return prepared(rack_driven(), target, options)
 
 
 @cache
-def contents(target: str) -> Contents:
+def contents(target: str, driver: str = "simulation") -> Contents:
     """The files of a bundle by path."""
-    return TARGETS[target].files(exported(target))
+    with patch("hybrid_opt.bundles.torque.driver_of", return_value=driver):
+        return TARGETS[target].files(exported(target, driver))
 
 
 @cache
 def read_job() -> programs.Job:
     """The rack's job as all programs read it."""
-    return programs.Job(json.loads(text_of("json", "job.json")))
+    return programs.Job(json.loads(text_of("data", "job.json")))
 
 
-def text_of(target: str, name: str) -> str:
-    found = contents(target)[name]
+def text_of(target: str, name: str, driver: str = "simulation") -> str:
+    found = contents(target, driver)[name]
     assert isinstance(found, str)
     return found

@@ -1,9 +1,11 @@
 """A stand-in for ROS 2 in which `run_job.py` runs as it is: controllers in simulated time.
 
-Controllers after their sources and pages: joint_trajectory_controller of ros2_controllers
-(`validate_trajectory_msg`, `Trajectory::sample`, `set_success_trajectory_point`,
-`set_hold_position`), the passthrough trajectory and force mode controllers of ur_controllers
-("Action interface", "Service interface"). Arms follow their commands at once.
+Rules after their sources: joint_trajectory_controller of ros2_controllers jazzy
+(joint_trajectory_controller.cpp: goals of an inactive controller are rejected, :1401; what is
+validated, :1740; a hold has no effort, :2083; trajectory.cpp: efforts are linear between points,
+:296), libfranka (a load is set only while no motion runs), rosidl_runtime_py (set_message.py:
+messages take the place of a list's dictionaries in the list itself). Arms follow their commands at
+once; their sensors feel what the job's nearest sample presses.
 """
 
 from __future__ import annotations
@@ -42,24 +44,21 @@ SUCCEEDED, CANCELED, ABORTED = 4, 5, 6
 
 FLOAT_EPSILON = 1.1920929e-07
 
-SERVICES: Mapping[str, set[str]] = {
+SERVICES: dict[str, set[str]] = {
     "std_srvs/srv/Trigger": set(),
+    "controller_manager_msgs/srv/SwitchController": {
+        "activate_controllers",
+        "deactivate_controllers",
+        "strictness",
+        "activate_asap",
+        "timeout",
+    },
+    # ur_msgs as driver 3.8 has it; that of 7.0 has a geometry_msgs/Inertia in place of the fields.
     "ur_msgs/srv/SetPayload": {
         "mass",
         "center_of_gravity",
         *(f"i{a}" for a in ("xx", "yy", "zz", "xy", "xz", "yz")),
         "transition_time",
-    },
-    "ur_msgs/srv/SetSpeedSliderFraction": {"speed_slider_fraction"},
-    "ur_msgs/srv/SetForceMode": {
-        "task_frame",
-        *(f"selection_vector_{axis}" for axis in ("x", "y", "z", "rx", "ry", "rz")),
-        "wrench",
-        "type",
-        "speed_limits",
-        "deviation_limits",
-        "damping_factor",
-        "gain_scaling",
     },
     "franka_msgs/srv/SetLoad": {"mass", "center_of_mass", "load_inertia"},
     "franka_msgs/srv/SetFullCollisionBehavior": {
@@ -85,16 +84,12 @@ class Message(dict[str, Any]):
 
 
 class Controller:
-    """A joint trajectory controller; `passes` for one that passes its goal through to a UR."""
+    """A joint trajectory controller that commands efforts."""
 
-    def __init__(
-        self, world: World, joints: list[str], q: Array, effort: bool, passes: bool
-    ) -> None:
-        self.world, self.joints, self.passes = world, joints, passes
-        self.has_effort = effort
+    def __init__(self, world: World, joints: list[str], q: Array) -> None:
+        self.world, self.joints = world, joints
         self.q, self.effort = q.copy(), np.zeros(len(q))
-        self.held_effort = np.zeros(len(q))
-        self.refuses = False
+        self.is_active = self.refuses = False
         self.aborts_at: float | None = None
         self.stands = np.zeros(len(q), dtype=bool)
         self._spline: BPoly | None = None
@@ -102,17 +97,14 @@ class Controller:
         self._rows: Array | None = None
         self._start = 0.0
         self._handle: SimpleNamespace | None = None
-        self._passed, self.slider = 0.0, 1.0
-        self._scale = 1.0
 
     def take(self, goal: Any) -> SimpleNamespace:
         """Accept or refuse a goal."""
-        is_busy = self.passes and self._handle is not None
-        handle = SimpleNamespace(accepted=not (self.refuses or is_busy) and self._takes(goal))
+        handle = SimpleNamespace(accepted=self.is_active and not self.refuses and self._takes(goal))
         if not handle.accepted:
             return handle
         if self._handle is not None:
-            self._end(ABORTED, "Current goal preempted by new incoming action.")
+            self._end(CANCELED, "Current goal cancelled due to new incoming action.")
         handle.result = Future[Any]()
         handle.get_result_async = lambda: handle.result
         handle.cancel_goal_async = lambda: self.cancel(handle)
@@ -122,27 +114,27 @@ class Controller:
         def column(name: str) -> Array:
             return np.array([point[name] for point in points], dtype=float)[:, order]
 
-        begin, self._times = seconds(stamp), times_of(points)
+        self._start, times = seconds(stamp) or self.world.now, times_of(points)
         known = np.stack([column(n) for n in ("positions", "velocities", "accelerations")], axis=1)
-        self._spline = BPoly.from_derivatives(self._times, known)
-        self._rows = column("effort") if self.has_effort else None
-        self._start = begin or self.world.now
-        if self.passes:
-            assert not begin, "the passthrough controller knows no start"
-            # One point per two cycles of 500 Hz.
-            self._start, self._passed = self.world.now + 0.004 * len(points), 0.0
+        rows = column("effort")
+        if len(times) == 1:
+            # From where it is to a single point.
+            here = np.stack([self.q, *np.zeros((2, len(self.q)))])
+            times = np.array([self.world.now - self._start, *times])
+            known, rows = np.stack([here, *known]), np.stack([self.effort, *rows])
+        self._times, self._rows = times, rows
+        self._spline = BPoly.from_derivatives(times, known)
         self._handle = handle
         return handle
 
     def _takes(self, goal: Any) -> bool:
         """`validate_trajectory_msg`."""
         points = goal.trajectory.points
-        known = ("positions", "velocities", "accelerations")
+        known = ("positions", "velocities", "accelerations", "effort")
         return (
             sorted(goal.trajectory.joint_names) == sorted(self.joints)
             and bool((np.diff(times_of(points)) > 0.0).all())
             and max(abs(v) for v in points[-1]["velocities"]) <= FLOAT_EPSILON
-            and all(self.has_effort or not point.get("effort") for point in points)
             and {len(point[k]) for point in points for k in known} == {len(self.joints)}
         )
 
@@ -152,8 +144,8 @@ class Controller:
             self._hold()
 
     def _hold(self) -> None:
-        """`set_hold_position`: where it is, with the efforts of the last success, or none."""
-        self._spline, self.effort = None, self.held_effort.copy()
+        """`set_hold_position`: where it is, without effort."""
+        self._spline, self.effort = None, np.zeros(len(self.q))
 
     def _end(self, status: int, told: str) -> None:
         handle, self._handle = self._handle, None
@@ -162,7 +154,7 @@ class Controller:
         handle.result.set_result(SimpleNamespace(status=status, result=result))
 
     def step(self) -> None:
-        if self._spline is None or self.world.now < self._start:
+        if self._spline is None or self.world.now < self._start + self._times[0]:
             return
         if self.aborts_at is not None and self.world.now >= self.aborts_at:
             self.aborts_at = None
@@ -170,17 +162,12 @@ class Controller:
             self._hold()
             return
         time = self.world.now - self._start
-        if self.passes:
-            self._scale += np.clip(self.slider - self._scale, -STEP / 0.2, STEP / 0.2)
-            self._passed += STEP * self._scale
-            time = self._passed
         place = float(np.clip(time, self._times[0], self._times[-1]))
         wanted = np.asarray(self._spline(place))
         self.q = np.where(self.stands, self.q, wanted)
         if self._rows is not None:
             self.effort = np.array([np.interp(place, self._times, c) for c in self._rows.T])
         if time >= self._times[-1] and self._handle is not None:
-            self.held_effort = self.effort.copy()
             self._end(SUCCEEDED, "Goal successfully reached!")
 
 
@@ -199,7 +186,7 @@ class World:
         now: [s].
         log: what the program told.
         at: what happens at which time: functions by time.
-        record: per step the time and both arms' positions, efforts and force mode references.
+        record: per step the time and both arms' positions and efforts.
     """
 
     def __init__(self, files: Contents, config: dict[str, Any]) -> None:
@@ -208,7 +195,11 @@ class World:
         self.at: list[tuple[float, int, Callable[[], None]]] = []
         self.calls: list[tuple[str, dict[str, Any]]] = []
         self.subscriptions: dict[str, list[Callable[[Any], None]]] = {}
-        self.silent, self.offset, self.force = [False, False], [0.0, 0.0], [0.0, 0.0]
+        self.silent, self.offset = [False, False], [0.0, 0.0]
+        self.felt: list[float | None] = [0.0, 0.0]
+        """Offset of each sensor [N]; None for one that is silent."""
+        self.lateness = 0.0
+        """Time between a measurement and its arrival [s]."""
         self.signals: dict[int, Callable[..., None]] = {}
         self._config, self._robots = config, job["robots"]
         self._next_joints = self.now
@@ -219,11 +210,14 @@ class World:
             first: dict[str, float] = {}
             for robot in robots.values():
                 first |= dict(zip(robot["ros_joints"], robot["position"][0], strict=True))
-            passes, effort = "passthrough" in group["action"], bool(config["effort"])
-            made = Controller(self, list(first), np.array(list(first.values())), effort, passes)
+            made = Controller(self, list(first), np.array(list(first.values())))
             self.controllers[group["action"]] = made
             for arm, robot in robots.items():
                 self._arms[arm] = made, [made.joints.index(name) for name in robot["ros_joints"]]
+        self._samples = [
+            (np.array(robot["position"]), np.array(robot["hold_effort_without_gravity"]))
+            for robot in self._robots
+        ]
 
     def later(self, after: float, what: Callable[[], None]) -> None:
         """Let something happen some time after now [s]."""
@@ -251,26 +245,42 @@ class World:
             for controller in self.controllers.values():
                 controller.step()
             both = [np.concatenate([each(0), each(1)]) for each in (self.q, self.effort)]
-            self.record.append((self.now, *both, list(self.force)))
+            self.record.append((self.now, *both))
             if self.now >= self._next_joints:
                 self._next_joints += JOINTS_EVERY
                 self._tell()
 
     def _tell(self) -> None:
+        nanoseconds = round(self.now * 1e9)
+        stamp = Message(sec=nanoseconds // 10**9, nanosec=nanoseconds % 10**9)
+        told = list[tuple[str, Message]]()
         for arm, robot in enumerate(self._robots):
+            header = Message(stamp=stamp)
+            topics, source = self._config["joint_states"], self._config["wrench"][arm]
             if not self.silent[arm]:
                 q = (self.q(arm) + self.offset[arm]).tolist()
-                message = Message(name=robot["ros_joints"], position=q)
-                topics = self._config["joint_states"]
-                for heard in self.subscriptions[topics[arm if len(topics) > 1 else 0]]:
+                message = Message(header=header, name=robot["ros_joints"], position=q)
+                told.append((topics[arm if len(topics) > 1 else 0], message))
+            offset = self.felt[arm]
+            if source is not None and offset is not None:
+                newton = self.pressed(arm) + offset
+                xyz = zip("xyz", (newton * value for value in source["axis"]), strict=True)
+                wrench = Message(force=Message(xyz))
+                told.append((source["topic"], Message(header=header, wrench=wrench)))
+
+        def arrive() -> None:
+            for topic, message in told:
+                for heard in self.subscriptions.get(topic, []):
                     heard(message)
 
-    def feel(self, arm: int, newton: float) -> None:
-        """What a wrist sensor tells of a force along its pad."""
-        source = self._config["wrench"][arm]
-        force = Message(zip("xyz", (newton * value for value in source["axis"]), strict=True))
-        for heard in self.subscriptions[source["topic"]]:
-            heard(Message(wrench=Message(force=force)))
+        self.later(self.lateness, arrive)
+
+    def pressed(self, arm: int) -> float:
+        """Normal force [N] of the job's sample whose posture and effort are the nearest."""
+        q, effort = self._samples[arm]
+        far = np.abs(q - self.q(arm)).max(axis=1) * 1e3
+        far += np.abs(effort - self.effort(arm)).max(axis=1)
+        return float(self._robots[arm]["normal_force"][int(np.argmin(far))])
 
     def command(self, word: str) -> None:
         for heard in self.subscriptions["/carry/command"]:
@@ -280,26 +290,43 @@ class World:
         """Ctrl-C."""
         self.signals[signal.SIGINT](signal.SIGINT, None)
 
-    def serve(self, name: str, kind: str, request: dict[str, Any]) -> None:
+    def serve(self, name: str, kind: str, request: dict[str, Any]) -> SimpleNamespace:
         """Answer a call; unknown fields are errors."""
         assert set(request) <= SERVICES[kind], (kind, set(request) - SERVICES[kind])
         self.calls.append((name, request))
-        if kind.endswith("SetForceMode"):
-            arm = self._config["force"][0]["arm"]
-            self.force[arm] = request["wrench"]["force"]["z"]
-        if name.endswith("stop_force_mode"):
-            self.force = [0.0, 0.0]
-        if kind.endswith("SliderFraction"):
-            space = name.split("/")[1]
-            self.controllers[
-                f"/{space}/passthrough_trajectory_controller/follow_joint_trajectory"
-            ].slider = request["speed_slider_fraction"]
+        space = name.split("/")[1]
+        own = [c for action, c in self.controllers.items() if action.startswith(f"/{space}/")]
+        own = own or list(self.controllers.values())
+        if kind.endswith("SwitchController"):
+            for controller in own:
+                controller.is_active = bool(request.get("activate_controllers"))
+            return SimpleNamespace(ok=True)
+        if kind.endswith("SetLoad") and any(controller.is_active for controller in own):
+            return SimpleNamespace(success=False, error="command rejected: motion running")
+        return SimpleNamespace(success=True)
 
 
-def fill(message: Message, values: Mapping[str, Any]) -> None:
-    """`set_message_fields`, with plain values in place of deeper messages."""
+def fill(message: Message, values: dict[str, Any]) -> None:
+    """`set_message_fields`: messages take the place of a list's dictionaries in the list itself."""
+    known = SERVICES.get(getattr(message, "kind", "")) if "kind" in message else None
     for name, value in values.items():
-        message[name] = Message(value) if isinstance(value, dict) else value
+        if known is not None and name not in known:
+            raise AttributeError(name)
+        if isinstance(value, Message):
+            raise TypeError(f"{name} is a message already: it was filled from these values before")
+        if isinstance(value, list):
+            for k, each in enumerate(value):
+                if isinstance(each, Message):
+                    raise TypeError(f"{name}[{k}] was filled from these values before")
+                if isinstance(each, dict):
+                    value[k] = Message()
+                    fill(value[k], each)
+            message[name] = value
+        elif isinstance(value, dict):
+            message[name] = Message()
+            fill(message[name], value)
+        else:
+            message[name] = value
     if "trajectory" in values:
         checked(values["trajectory"], "trajectory_msgs/msg/JointTrajectory")
 
@@ -333,11 +360,11 @@ def _modules(world: World) -> dict[str, ModuleType]:
             return True
 
         def call_async(self, request: dict[str, Any]) -> Future[Any]:
-            world.serve(self.name, self.kind, request)
-            return answered(lambda: SimpleNamespace(success=True))
+            kind = request.pop("kind")
+            return answered(lambda: world.serve(self.name, kind, request))
 
     class Node:
-        def create_subscription(self, kind: Any, topic: str, heard: Any, depth: int) -> None:
+        def create_subscription(self, kind: Any, topic: str, heard: Any, quality: Any) -> None:
             world.subscriptions.setdefault(topic, []).append(heard)
 
         def create_client(self, service: Any, name: str) -> Client:
@@ -366,16 +393,21 @@ def _modules(world: World) -> dict[str, ModuleType]:
 
     def service(kind: str) -> Any:
         assert kind in SERVICES, kind
-        return SimpleNamespace(Request=Message, kind=kind)
+        return SimpleNamespace(Request=lambda: Message(kind=kind), kind=kind)
 
     contents: dict[str, dict[str, Any]] = {
         "rclpy": {
             "init": lambda **_: None,
             "shutdown": lambda: None,
-            "create_node": lambda name: Node(),
+            "create_node": lambda name, parameter_overrides: Node(),
             "spin_once": spin_once,
         },
         "rclpy.action": {"ActionClient": ActionClient},
+        "rclpy.parameter": {"Parameter": lambda name, value: (name, value)},
+        "rclpy.qos": {
+            "QoSProfile": SimpleNamespace,
+            "ReliabilityPolicy": SimpleNamespace(BEST_EFFORT="best effort"),
+        },
         "rclpy.signals": {"SignalHandlerOptions": SimpleNamespace(NO=0)},
         "rosidl_runtime_py": {"set_message_fields": fill},
         "rosidl_runtime_py.utilities": {"get_service": service},

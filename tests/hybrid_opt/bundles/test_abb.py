@@ -1,4 +1,4 @@
-"""The RAPID modules, read by a parser that knows nothing of what writes them."""
+"""The EGM modules and the program that streams both arms, against controllers that follow late."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import json
 import math
 import re
 import struct
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import replace
@@ -19,50 +19,31 @@ import pinocchio as pin
 import pytest
 from rapidchecker.check import check_format
 
-from hybrid_opt.bundles import TARGETS, BundleOptions
+from hybrid_opt.bundles import BundleOptions
 from hybrid_opt.bundles.arms import ABB, UR, require_arms
 from hybrid_opt.bundles.bundle import prepared
-from hybrid_opt.bundles.languages import rapid_files, require_rapid
+from hybrid_opt.bundles.egm import egm_files
+from hybrid_opt.bundles.job_file import Contents
+from hybrid_opt.bundles.programs.carry_job import Job
 from hybrid_opt.bundles.programs.run_egm import FromRobot, Stream, read_robot, to_robot
 from hybrid_opt.job.records import HELD, PHASES
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.robot.model import build_robot_model
-from tests.hybrid_opt.bundles.bundles import driven, exported, rack_driven, read_job, text_of
-from tests.hybrid_opt.bundles.mock_rapid import Controller, Module, parse
+from tests.hybrid_opt.bundles.bundles import driven, exported, rack_driven, text_of
 from tests.hybrid_opt.job.jobs import rack, rack_job
 from tests.symbolic.cells import GOFA
 
 EGM = ("T_ROB1/CarryEgm1.mod", "T_ROB2/CarryEgm2.mod")
-NAMES = ("T_ROB1/Carry1.mod", "T_ROB2/Carry2.mod")
-
-
-def modules() -> list[Module]:
-    return [parse(text_of("abb-rapid", name).encode("ascii").decode("ascii")) for name in NAMES]
 
 
 def test_others_read_the_modules() -> None:
     """rapidchecker, which refuses broken ones."""
-    texts = [
-        shortened(text_of(target, name).replace("\r\n", "\n"))
-        for target, names in (("abb-rapid", NAMES), ("abb-egm", EGM))
-        for name in names
-    ]
+    texts = [text_of("abb-egm", name).replace("\r\n", "\n") for name in EGM]
     for text in texts:
         assert not problems(text), problems(text)
     for part, other in (("ENDPROC", ""), (":=", "="), (";", ""), ("[", "")):
         assert problems(texts[-1].replace(part, other, 1))
-
-
-def shortened(text: str) -> str:
-    """Two moves of each kind, because rapidchecker takes a minute for hundreds."""
-    lines, seen = [], Counter[str]()
-    for line in text.splitlines():
-        name = line.split(maxsplit=1)[0] if line.strip() else ""
-        seen[name] += name.startswith(("MoveAbsJ", "FCPressL"))
-        if seen[name] <= 2:
-            lines.append(line)
-    return "\n".join(lines) + "\n"
 
 
 def problems(text: str) -> list[str]:
@@ -72,19 +53,6 @@ def problems(text: str) -> list[str]:
     except Exception as error:
         return [str(error)]
     return [str(each) for each in found if "indent" not in str(each).lower()]
-
-
-def test_tool_and_load_are_declared() -> None:
-    cell = rack().workcell
-    for module in modules():
-        _, kind, (held, place, load) = module.declared["carryPad"]
-        assert (kind, held) == ("tooldata", True)
-        assert place == [[0.0, 0.0, 190.0], [1.0, 0.0, 0.0, 0.0]]
-        assert len(load) == 6
-        _, kind, box = module.declared["carryHalfBox"]
-        assert (kind, box[0]) == ("loaddata", cell.payload.mass / 2.0)
-        # The box's centre lies half its width behind the pad and 55 mm below.
-        np.testing.assert_allclose(np.abs(box[1]), [55.0, 0.0, 200.0])
 
 
 def test_the_make_of_every_arm_counts(tmp_path: Path) -> None:
@@ -108,99 +76,21 @@ def test_names_cannot_leave_a_comment() -> None:
     robot, other = job.workcell.robots
     robots = (replace(robot, name="räbot \n"), other)
     evil = replace(job.workcell, name="x\r\n  EXIT;\n", robots=robots)
-    sheet = prepared(
-        driven(replace(job, workcell=evil)), TARGETS["abb-rapid"], BundleOptions(step=0.1)
-    )
-    text = rapid_files(sheet)[NAMES[0]]
+    sheet = prepared(driven(replace(job, workcell=evil)), "abb-egm", BundleOptions())
+    text = egm_files(sheet)[EGM[0]]
     assert isinstance(text, str)
-    assert "x" not in parse(text.encode("ascii").decode("ascii")).procedures
-    assert text.count("EXIT;") == text_of("abb-rapid", NAMES[0]).count("EXIT;") + 1
+    assert text.count("EXIT;") == text_of("abb-egm", EGM[0]).count("EXIT;") + 1
     assert "! x??  EXIT;?" in text
 
 
-def test_steps_that_no_controller_plans_are_refused() -> None:
-    with pytest.raises(SettingsError, match="RAPID"):
-        rapid_files(prepared(rack_driven(), TARGETS["abb-rapid"], BundleOptions(step=0.004)))
-
-
-def test_a_box_that_turns_is_refused() -> None:
-    """The force keeps its direction in the room."""
-    carry = rack_job().phase("carry")
-    pose = carry.motion.pose.copy()
-    pose[:, 5] += np.linspace(0.0, 0.5, len(pose))
-    turned = replace(carry, motion=replace(carry.motion, pose=pose))
-    phases = tuple(turned if p.name == "carry" else p for p in rack_job().phases)
-    with pytest.raises(SettingsError, match="the box turns by 29 degrees"):
-        require_rapid(replace(rack_driven(), phases=phases))
-
-
-def controller(sign: float = 1.0, away: float = 0.0, acts: int = 1) -> Controller:
-    """Both tasks; `sign` as someone wrote it down, `acts` as the robot takes it."""
-    sheet = exported("abb-rapid")
-    q = sheet.sampled.q[0].copy()
-    q[0] += away
-    found = Controller(sheet.workcell, [text_of("abb-rapid", name) for name in NAMES], q, acts)
-    found.tasks[1].set("carrySign", sign)
-    return found
-
-
-def test_both_tasks_carry_out_the_job() -> None:
-    """Both robots are where the job has them, the leader by its own clock, the other by speeds; the
-    pad presses no less than the job asks for."""
-    found, sheet = controller().run(), exported("abb-rapid")
-    assert [task.log for task in found.tasks] == [["done"], ["done"]]
-    job = sheet.sampled
-    time, q, force = (np.array(column) for column in zip(*found.record, strict=True))
-    np.testing.assert_allclose(q[-1], job.q[-1], atol=2e-5)
-    carry = job.span(3)
-    middle = int(np.abs(q - job.q[carry.start + 20]).max(axis=1).argmin())
-    for k in range(carry.start + 5, carry.stop - 5):
-        at = middle + round((job.time[k] - job.time[carry.start + 20]) / CYCLE)
-        # In step to three cycles, although nothing but the phase's beginning is common.
-        near = 3.0 * CYCLE * np.abs(job.q_rate[k]) + 1e-4
-        assert (np.abs(q[at] - job.q[k]) <= near).all(), k
-        assert force[at] >= job.normal_force[k - 1 : k + 2, 1].min() - 1.0
-    assert force[-1] == 0.0
-    assert time[-1] == pytest.approx(job.time[-1], abs=1.0)
-
-
-def test_a_sign_that_nobody_found_out_moves_nothing() -> None:
-    for sign, acts, told in ((0.0, 1, "carrySign first"), (1.0, -1, "PosSupvDist")):
-        found = controller(sign, acts=acts).run()
-        assert any(told in line for line in found.tasks[1].log)
-        assert any("did not come" in line for line in found.tasks[0].log), "and the other gives up"
-        q = np.array([row[1] for row in found.record])
-        job = exported("abb-rapid").sampled
-        most = np.abs(job.q[: job.span(1).stop] - job.q[0]).max()
-        assert np.abs(q - q[0]).max() <= (most + 1e-6 if sign else 0.0), "nothing is lifted"
-    found = controller(away=0.05).run()
-    assert any("jog the robot" in line for line in found.tasks[0].log)
-    assert np.ptp(np.array([row[1] for row in found.record]), axis=0).max() == 0.0
-
-
-@pytest.mark.parametrize("gone", [0, 1])
-@pytest.mark.parametrize("phase", PHASES)
-def test_a_task_that_does_not_come_is_not_waited_for(phase: str, gone: int) -> None:
-    """It ends in a phase: the other ends before the next, keeps its place and its force."""
-    whole = sound()
-    begin = whole.begins[f"Carry_{phase}"]
-
-    def end(cell: Controller) -> None:
-        cell.tasks[gone].runs = False
-
-    found = controller().run({begin + 0.2: end})
-    left = found.tasks[1 - gone]
-    assert any("did not come" in line for line in left.log), left.log
-    pressed = found.record[-1][2]
-    if phase in ("lift", "carry", "set_down"):
-        assert pressed > 90.0
-    q = np.array([row[1] for row in found.record[-1000:]])
-    assert np.ptp(q, axis=0).max() < 1e-9
-
-
-@cache
-def sound() -> Controller:
-    return controller().run()
+def test_the_tool_and_the_largest_speed_are_those_of_the_job() -> None:
+    job = exported("abb-egm").sampled
+    for arm, name in enumerate(EGM):
+        text = text_of("abb-egm", name)
+        assert "carryPad := [TRUE,[[0.000000,0.000000,190.000000],[1.000000," in text
+        (deviation,) = re.findall(r"MaxSpeedDeviation:=(\d+);", text)
+        fastest = np.rad2deg(np.abs(job.arm(arm, job.q_rate)).max())
+        assert 1.1 * fastest < float(deviation) < 1.2 * fastest + 1.0
 
 
 CYCLE = 0.004
@@ -272,6 +162,12 @@ def gap(q: Array) -> float:
     return float(places[0][:3, 2] @ (places[1] - places[0])[:3, 3] - np.linalg.norm(other - one))
 
 
+@cache
+def files_for(stiffness: float) -> Contents:
+    options = BundleOptions(stiffness=stiffness)
+    return egm_files(prepared(rack_driven(), "abb-egm", options))
+
+
 class Cell:
     """Two controllers that follow late, and a box between two springs.
 
@@ -280,9 +176,11 @@ class Cell:
         record: per cycle time, coordinate of the stream, force, its reference, both arms' joints.
     """
 
-    def __init__(self) -> None:
-        self.job = read_job()
-        config = json.loads(text_of("abb-egm", "config/egm.json"))
+    def __init__(self, planned: float = STIFFNESS, real: float = STIFFNESS) -> None:
+        """Arms of a real stiffness, in a bundle for a planned one [N/m]."""
+        files, self.stiffness = files_for(planned), real
+        self.job = Job(json.loads(files["job.json"]))
+        config = json.loads(files["config/egm.json"])
         self.stream = Stream(self.job, config)
         self.now, self.force = 50.0, 0.0
         self.offset, self.silent = 0.0, [False, False]
@@ -304,7 +202,7 @@ class Cell:
         along = gap(q)
         s = stream.machine.clock.s
         touches = self.job.begin("press") < s < self.job.begin("retreat")
-        self.force = max(0.0, -STIFFNESS / 2.0 * along) if touches else 0.0
+        self.force = max(0.0, -self.stiffness / 2.0 * along) if touches else 0.0
         for arm in (0, 1):
             if self.silent[arm]:
                 continue
@@ -389,6 +287,36 @@ def test_faults_hold_both_arms(name: str, phase: str) -> None:
         cell.stream.command = "back"
         cell.run("done")
         assert cell.stream.machine.clock.s == 0.0
+
+
+@pytest.mark.parametrize("stiffness", [1e4, 3e4, 1e5, 3e5])
+def test_arms_as_stiff_as_measured_keep_their_force(stiffness: float) -> None:
+    cell = Cell(stiffness, stiffness)
+    assert cell.run("done", "held") == "done", cell.stream.machine.told()
+    force, wanted = (np.array([row[k] for row in cell.record]) for k in (2, 3))
+    assert force.max() < 1.5 * wanted.max()
+
+
+@pytest.mark.parametrize("real", [3e4, 1e5, 3e5])
+def test_arms_stiffer_than_measured_do_not_press_beyond_bounds(real: float) -> None:
+    cell = Cell(STIFFNESS, real)
+    cell.run("done", "held")
+    for _ in range(500):
+        cell.cycle()
+    force = np.array([row[2] for row in cell.record])
+    assert force.max() < 1.5 * max(cell.job.robots[cell.stream._arm]["normal_force"])
+
+
+def test_packets_of_others_and_broken_ones_are_dropped_and_counted() -> None:
+    stream = Cell().stream
+    host = json.loads(text_of("abb-egm", "config/egm.json"))["addresses"][0]
+    sound = from_robot(1, [0.0] * 6, [0.0] * 6, True)
+    assert stream.read(0, sound, host) is not None
+    assert stream.read(0, sound, "192.168.0.99") is None
+    for data in (b"\xff" * 8, b"\x0b", sound[:-3], b"\x12\x05\x0a\x03\x09\x01"):
+        assert stream.read(0, data, host) is None
+    assert stream.dropped == 5
+    assert "5 packets were dropped" in stream.told()
 
 
 def test_a_pause_of_the_computer_makes_no_arm_jump() -> None:

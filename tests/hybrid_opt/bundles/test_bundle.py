@@ -112,14 +112,14 @@ def test_different_carries_never_touch_one_another(tmp_path: Path) -> None:
     assert carry is not None
     other = replace(job.timing, carry=replace(carry, x=carry.x + 1e-9))
     how: dict[str, Any] = {"origin": origin, "options": BundleOptions(step=0.1)}
-    first = export(job, "csv", tmp_path, **how)
+    first = export(job, "data", tmp_path, **how)
     before = tree(tmp_path)
     folders = {first[0].parent}
     for each in (replace(job, phases=tuple(more)), replace(job, timing=other)):
-        folders.add(export(each, "csv", tmp_path, **how)[0].parent)
+        folders.add(export(each, "data", tmp_path, **how)[0].parent)
     assert len(folders) == 3
     assert all(folder.parent.name.startswith("rack-nsga2-r03-p0012-") for folder in folders)
-    assert export(job, "csv", tmp_path, **how) == first
+    assert export(job, "data", tmp_path, **how) == first
     assert {name: tree(tmp_path)[name] for name in before} == before
 
 
@@ -145,7 +145,7 @@ def written(
 
 
 def test_the_manifest_says_what_it_is(tmp_path: Path) -> None:
-    document = written(rack_job(), "csv", tmp_path, step=0.1)
+    document = written(rack_job(), "data", tmp_path, step=0.1)
     (table,) = tmp_path.rglob("job.csv")
     assert document["files"]["job.csv"] == sha256(table.read_bytes())
     assert [phase["name"] for phase in document["phases"]] == [p.name for p in rack_job().phases]
@@ -162,10 +162,16 @@ def test_the_manifest_says_what_it_is(tmp_path: Path) -> None:
     assert document["units"]["force"] == "N"
     assert document["how_to_run"]
     assert any("tool_load" in warning for warning in document["warnings"])
-    rough = written(rack_jobs().plan(rack_timing(), smoothing=0.0), "csv", tmp_path, step=0.1)
+    rough = written(rack_jobs().plan(rack_timing(), smoothing=0.0), "data", tmp_path, step=0.1)
     for found, is_told in ((document, False), (rough, True)):
         assert any("acceleration" in warning for warning in found["warnings"]) == is_told
-    skew = document["start_skew"]
+    assert document["start_skew"] == {
+        "how": "up to what plays the file",
+        "required": None,
+        "stiffness": None,
+    }
+    assert document["time_step"] == {"step": pytest.approx(0.1, rel=0.1)}
+    skew = written(rack_driven(), "data", tmp_path, step=0.1)["start_skew"]
     assert [each["delay"] for each in skew["cases"]] == [0.001, 0.002, 0.005, 0.01, 0.02]
     for each in skew["cases"]:
         assert each["holds"] == (each["delay"] <= skew["survived"])
@@ -173,7 +179,7 @@ def test_the_manifest_says_what_it_is(tmp_path: Path) -> None:
 
 
 def test_the_manifest_says_how_the_job_stops(tmp_path: Path) -> None:
-    document = written(rack_job(), "ros2-control", tmp_path)
+    document = written(rack_job(), "torque", tmp_path)
     machine, step = document["machine"], document["time_step"]
     assert set(machine["states"]) == {"ready", "running", "stopping", "held", "done"}
     assert machine["carried_out_by"].startswith("run_job.py")
@@ -188,15 +194,24 @@ def test_the_manifest_says_how_the_job_stops(tmp_path: Path) -> None:
 def test_two_controllers_have_to_survive_their_skew(tmp_path: Path) -> None:
     """One clock needs nothing; where each arm plans by itself, 10 ms or what is asked for."""
     stiff: dict[str, Any] = {"step": 0.1, "stiffness": 5e4}
-    skew = written(rack_driven(), "ros2-control", tmp_path, **stiff)["start_skew"]
+    skew = written(rack_job(), "torque", tmp_path, **stiff)["start_skew"]
     assert skew["required"] == 0.0
     assert skew["survived"] < 0.01
-    with pytest.raises(JobError, match="a skew of 10 ms"):
-        written(rack_driven(), "abb-rapid", tmp_path, **stiff)
     with pytest.raises(JobError, match="a skew of 20 ms"):
-        written(rack_driven(), "csv", tmp_path, skew=0.02, **stiff)
-    skew = written(rack_driven(), "abb-rapid", tmp_path, skew=1e-3, **stiff)["start_skew"]
+        written(rack_driven(), "data", tmp_path, skew=0.02, **stiff)
+    skew = written(rack_driven(), "data", tmp_path, skew=1e-3, **stiff)["start_skew"]
     assert skew["required"] == 1e-3
+    with pytest.raises(SettingsError, match="depends on the stiffness of the arms"):
+        written(rack_job(), "data", tmp_path, skew=1e-3)
+
+
+def test_arms_in_series_have_the_mean_compliance(tmp_path: Path) -> None:
+    job = rack_driven()
+    first, second = job.workcell.robots
+    stiff = replace(second, driver=replace(DRIVER, stiffness=3e4))
+    job = replace(job, workcell=replace(job.workcell, robots=(first, stiff)))
+    found = written(job, "data", tmp_path, step=0.1)["start_skew"]["stiffness"]
+    assert found == pytest.approx(2.0 * (1e4 * 3e4) / (1e4 + 3e4))
 
 
 def by(**stated: Any) -> Job:
@@ -205,24 +220,31 @@ def by(**stated: Any) -> Job:
 
 
 REFUSED: dict[str, tuple[str, Callable[[], Job | Timing], dict[str, Any], str]] = {
-    "not Franka's": ("franka-ros2", by, {}, "does not look like an arm of Franka"),
-    "not UR's": ("ur-ros2", by, {}, "does not look like an arm of UR"),
+    "nobody's torques": ("torque", by, {}, "driven by abb-egm"),
     "not UR's language": ("ur-script", by, {}, "does not look like an arm of UR"),
     "no force": (
-        *("abb-rapid", lambda: by(force_control=False), {}),
+        *("abb-egm", lambda: by(force_control=False), {}),
         "would not squeeze: positions.*before the study",
     ),
     "no lag": ("abb-egm", lambda: by(lag=0.0), {}, "compensates the lag of 'left'"),
-    "one prefix": ("ros2-control", lambda: by(prefix="same_"), {}, "so that both arms' joints"),
-    "no address": (
-        *("ur-ros2", lambda: by(address=""), {"any_arm": True}),
-        r"ur-ros2 has to know where .* address",
+    "no stiffness": (
+        *("abb-egm", lambda: by(stiffness=None), {}),
+        "stiffness of 'left' at its pad .*Measure it: press both pads against one another",
     ),
-    "bad address": ("ur-ros2", by, {"addresses": ("a b", "c")}, "no host name or IP address"),
+    "one prefix": (
+        *("torque", lambda: by(prefix="same_", address=""), {}),
+        "so that both arms' joints",
+    ),
+    "no address": (
+        *("abb-egm", lambda: by(address=""), {}),
+        r"abb-egm has to know where .* address",
+    ),
+    "bad address": ("abb-egm", by, {"addresses": ("a b", "c")}, "no host name or IP address"),
     "target": ("xml", by, {}, "unknown target"),
-    "no timing": ("csv", lambda: replace(rack_timing(), carry=None), {}, "no timing to export"),
-    "step": ("csv", by, {"step": -1.0}, "time step"),
-    "skew": ("csv", by, {"skew": -1.0}, "skew"),
+    "gone": ("abb-rapid", by, {}, "no longer written; use abb-egm"),
+    "no timing": ("data", lambda: replace(rack_timing(), carry=None), {}, "no timing to export"),
+    "step": ("data", by, {"step": -1.0}, "time step"),
+    "skew": ("data", by, {"skew": -1.0}, "skew"),
 }
 
 
@@ -241,7 +263,7 @@ def test_the_other_arm_is_named_where_it_can_press(tmp_path: Path) -> None:
     job = replace(job, workcell=replace(job.workcell, robots=(robots[0], robots[1])))
     told = f"let '{robots[leader].name}' press, which has it \\(--leader {2 - leader}\\)"
     with pytest.raises(SettingsError, match=told):
-        export(job, "abb-rapid", tmp_path)
+        export(job, "abb-egm", tmp_path)
 
 
 def test_joints_have_names_of_their_own(tmp_path: Path) -> None:
@@ -250,18 +272,16 @@ def test_joints_have_names_of_their_own(tmp_path: Path) -> None:
     first, second = job.workcell.robots
     named = replace(first, driver=replace(DRIVER, prefix="l_"))
     job = replace(job, workcell=replace(job.workcell, robots=(named, second)))
-    robots = written(job, "json", tmp_path, "job.json", step=0.1)["robots"]
+    robots = written(job, "data", tmp_path, "job.json", step=0.1)["robots"]
     assert [robot["ros_joints"][0] for robot in robots] == ["l_joint_1", "same_joint_1"]
 
 
 def test_a_driver_has_to_have_an_address(tmp_path: Path) -> None:
     hosts = ("10.0.0.1", "arm-2.local")
-    config = written(
-        by(address=""), "ur-ros2", tmp_path, "cell.json", any_arm=True, addresses=hosts
-    )
-    assert tuple(each["arguments"]["robot_ip"] for each in config["launch"]) == hosts
+    config = written(by(address=""), "abb-egm", tmp_path, "egm.json", addresses=hosts)
+    assert tuple(config["addresses"]) == hosts
 
 
 def test_a_timing_is_exported_with_its_job(tmp_path: Path) -> None:
-    job = written(rack_timing(), "json", tmp_path, "job.json", step=0.1)
+    job = written(rack_timing(), "data", tmp_path, "job.json", step=0.1)
     assert job["phases"][0]["name"] == "approach"

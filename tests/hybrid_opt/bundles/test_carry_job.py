@@ -22,7 +22,7 @@ def posture(s: float) -> list[list[float] | None]:
 
 def running(s: float) -> Machine:
     """A machine that runs at a coordinate."""
-    machine = Machine(job())
+    machine = Machine(job(), 0.0)
     machine.start(Seen(posture(0.0)))
     machine.clock = Clock(job().end, job().limits.stop_time, s, 1.0)
     return machine
@@ -39,7 +39,7 @@ def ticks(machine: Machine, seen: Callable[[float], Seen]) -> int:
 
 
 def test_a_job_is_between_its_samples() -> None:
-    sampled = exported("json").sampled
+    sampled = exported("data").sampled
     spline = CubicHermiteSpline(sampled.time, sampled.q, sampled.q_rate)
     for s in np.random.default_rng(1).uniform(0.0, job().end, 50):
         q = np.concatenate([job().position(arm, float(s)) for arm in (0, 1)])
@@ -96,7 +96,7 @@ WRONG: dict[str, tuple[Callable[[float], Seen], str]] = {
     "off its path": (lambda s: Seen([moved(posture(s)[0], 0.05), posture(s)[1]]), "left its path"),
     "late": (lambda s: Seen([posture(s - 0.08)[0], posture(s - 0.08)[1]]), "behind"),
     "apart": (lambda s: Seen([posture(s)[0], posture(s - 0.08)[1]]), "apart|behind"),
-    "silent": (lambda s: Seen(posture(s), silence=[0.0, 0.3]), "no news from right for 0.30 s"),
+    "silent": (lambda s: Seen(posture(s), age=[0.0, 0.3]), "no news from right for 0.30 s"),
     "weak": (lambda s: Seen(posture(s), force=[None, 10.0]), "right presses 10.0 N instead of"),
     "told": (lambda s: Seen(posture(s), fault="the door opens"), "the door opens"),
 }
@@ -155,20 +155,31 @@ def test_pads_have_to_press_before_the_box_is_lifted() -> None:
     assert risen[0] - risen[1] < 1e-4, "nothing is lifted"
 
 
-@pytest.mark.parametrize("wrong", ["silent", "off"])
-def test_arms_that_stop_by_themselves_are_where_those_on_the_path_are(wrong: str) -> None:
-    """A silent arm's last posture, or one that is off the path, says nothing of the place."""
-    middle = job().begin("carry") + 2.5
-    machine = Machine(job(), waits=True)
-    machine.state, machine.clock = "running", Clock(job().end, job().limits.stop_time, middle)
-    machine.stop("asked", quick=True)
-    assert machine.stop_time == job().limits.quick_stop
-    q = posture(middle + 0.1)
-    q[1] = posture(middle - 0.1)[1] if wrong == "silent" else moved(q[1], 0.2)
-    seen = Seen(q, silence=[0.0, 0.3 if wrong == "silent" else 0.0])
-    ticks(machine, lambda _: seen)
-    assert machine.state == "held"
-    assert machine.clock.s == pytest.approx(middle + 0.1, abs=5e-3)
+@pytest.mark.parametrize("age", [0.0, 0.03, 0.09])
+def test_postures_are_compared_when_they_were_measured(age: float) -> None:
+    """A late message of an arm in its place stops nothing; one of an arm that is late does."""
+    s = job().begin("carry") + 2.0
+    for late, state in ((0.0, "running"), (0.08, "held")):
+        machine = running(s)
+        ticks(machine, lambda s, late=late: Seen(posture(s - age - late), age=[age, age]))
+        assert machine.state == state, machine.told()
+
+
+def test_both_arms_are_compared_at_one_time() -> None:
+    machine = running(job().begin("carry") + 2.0)
+    first, second = 0.0, 0.08
+    ticks(
+        machine,
+        lambda s: Seen([posture(s - first)[0], posture(s - second)[1]], age=[first, second]),
+    )
+    assert machine.state == "running", machine.told()
+
+
+def test_nothing_is_said_of_arms_that_are_silent() -> None:
+    machine = running(job().begin("carry") + 2.0)
+    ticks(machine, lambda s: Seen(posture(s), age=[0.0, 0.3]))
+    assert "right is silent" in machine.told()
+    assert "Both arms" not in machine.told()
 
 
 def test_one_strange_look_stops_nothing() -> None:
@@ -182,9 +193,12 @@ def test_one_strange_look_stops_nothing() -> None:
 
 def test_a_job_begins_only_in_its_first_places() -> None:
     with pytest.raises(Refused, match="the pad of left is up to"):
-        Machine(job()).start(Seen([moved(posture(0.0)[0], 0.02), posture(0.0)[1]]))
-    with pytest.raises(Refused, match="zero its sensor"):
-        Machine(job()).start(Seen(posture(0.0), force=[0.0, 50.0]))
+        Machine(job(), 0.0).start(Seen([moved(posture(0.0)[0], 0.02), posture(0.0)[1]]))
+    for force in (0.1 * max(job().robots[1]["normal_force"]), 50.0):
+        with pytest.raises(Refused, match="zero its sensor"):
+            Machine(job(), 0.0).start(Seen(posture(0.0), force=[0.0, force]))
+    with pytest.raises(Refused, match="no force is measured at the pad of right"):
+        Machine(job(), 0.0, sensors=(False, True)).start(Seen(posture(0.0)))
     for document in ({}, {"format": "dual-arm-carry job", "version": 1}):
         with pytest.raises(Refused, match="no job of version 2"):
             Job(document)
@@ -192,7 +206,7 @@ def test_a_job_begins_only_in_its_first_places() -> None:
 
 def test_distances_are_bounds() -> None:
     """Of a pad's way between two postures, by Pinocchio's kinematics."""
-    found, rng = exported("json"), np.random.default_rng(2)
+    found, rng = exported("data"), np.random.default_rng(2)
     for arm in (0, 1):
         q = found.sampled.arm(arm, found.sampled.q)
         for k in range(0, len(q), 200):
@@ -206,7 +220,7 @@ def test_distances_are_bounds() -> None:
 KINDS: dict[str, Callable[[Seen, int, float, float], object]] = {
     "freeze": lambda seen, arm, s, when: seen.q.__setitem__(arm, posture(when)[arm]),
     "late": lambda seen, arm, s, when: seen.q.__setitem__(arm, posture(max(s - 0.15, 0.0))[arm]),
-    "silent": lambda seen, arm, s, when: seen.silence.__setitem__(arm, 0.2),
+    "silent": lambda seen, arm, s, when: seen.age.__setitem__(arm, 0.2),
     "sensor": lambda seen, arm, s, when: seen.force.__setitem__(arm, job().force(arm, s) + 60.0),
     "encoder": lambda seen, arm, s, when: seen.q.__setitem__(arm, moved(seen.q[arm], 0.1)),
     "asked": lambda seen, arm, s, when: setattr(seen, "fault", "Ctrl-C"),

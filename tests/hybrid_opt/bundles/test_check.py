@@ -25,7 +25,7 @@ JOINTS = [f"{arm}_joint_{j}" for arm in ("left", "right") for j in range(1, 7)]
 
 def carried() -> tuple[Array, Array, Array, Array]:
     """Of the carry, at 50 ms: times (n,) [s], joints, rates (n, joints), poses (n, 6)."""
-    job = exported("json", 0.05).sampled
+    job = exported("torque").sampled
     span = job.span(rack_job().phases.index(rack_job().phase("carry")))
     return job.time[span] - job.time[span.start], job.q[span], job.q_rate[span], job.pose[span]
 
@@ -53,8 +53,8 @@ def judged(
 
 
 def test_our_own_job_passes(tmp_path: Path) -> None:
-    whole = judged(tmp_path / "job.json", text_of("json", "job.json"))
-    again = judged(tmp_path / "job.csv", text_of("csv", "job.csv"))
+    whole = judged(tmp_path / "job.json", text_of("data", "job.json"))
+    again = judged(tmp_path / "job.csv", text_of("data", "job.csv"))
     told = judged(tmp_path / "job.yaml", ros(*carried()[:3]))
     for found in (whole, again, told):
         assert not found.problems, found

@@ -43,7 +43,7 @@ from tests.hybrid_opt.job.jobs import rack, rack_job
 
 
 def sampled() -> SampledJob:
-    return exported("csv").sampled
+    return exported("data").sampled
 
 
 def test_samples_lie_on_the_job() -> None:
@@ -76,7 +76,7 @@ def test_a_joint_that_moves_both_arms_bears_the_contact_of_both() -> None:
     expected = np.zeros((3, 16))
     expected[:, 0], expected[:, 8] = contact[:, 8], contact[:, 0]
     np.testing.assert_array_equal(found, expected)
-    np.testing.assert_array_equal(exported("json").effort, exported("json").sampled.effort)
+    np.testing.assert_array_equal(exported("data").effort, exported("data").sampled.effort)
 
 
 def test_samples_are_consistent_with_their_derivatives() -> None:
@@ -86,11 +86,11 @@ def test_samples_are_consistent_with_their_derivatives() -> None:
 
 
 def test_csv_read_back() -> None:
-    rows = list(csv.DictReader(io.StringIO(text_of("csv", "job.csv"))))
+    rows = list(csv.DictReader(io.StringIO(text_of("data", "job.csv"))))
     job = sampled()
     assert [row["phase"] for row in rows] == list(job.phase_names)
     assert len(rows[0]) == 2 + 6 + 60 + 2 + 12
-    less = job.effort[:, 1] - exported("csv").gravity[:, 1]
+    less = job.effort[:, 1] - exported("data").gravity[:, 1]
     for name, values in (
         ("time [s]", job.time),
         ("right/joint_4 position [rad]", job.q[:, 9]),
@@ -106,7 +106,7 @@ def test_csv_read_back() -> None:
 
 
 def test_json_read_back() -> None:
-    document, job = json.loads(text_of("json", "job.json")), sampled()
+    document, job = json.loads(text_of("data", "job.json")), sampled()
     assert document["format"] == "dual-arm-carry job"
     np.testing.assert_array_equal(document["time"], job.time)
     np.testing.assert_array_equal(document["box"]["pose"], job.pose)
@@ -136,10 +136,10 @@ def short(value: Any) -> Any:
 
 
 def test_the_schema_describes_the_file() -> None:
-    schema = json.loads(text_of("json", "job.schema.json"))
+    schema = json.loads(text_of("data", "job.schema.json"))
     jsonschema.Draft202012Validator.check_schema(schema)
     judge = jsonschema.Draft202012Validator(schema)
-    document = json.loads(text_of("json", "job.json"))
+    document = json.loads(text_of("data", "job.json"))
     assert judge.is_valid(document)
     assert judge.is_valid(short(document))
     broken: list[Callable[[Any], object]] = [
@@ -167,13 +167,13 @@ def test_time_steps_are_checked(step: float) -> None:
 
 
 def described() -> tuple[Any, Any]:
-    model = pin.buildModelFromXML(text_of("ros2-control", "description/cell.urdf"))
+    model = pin.buildModelFromXML(text_of("torque", "description/cell.urdf"))
     return model, model.createData()
 
 
 def test_gravity_is_that_of_the_description() -> None:
     """The bundle's own URDF, read by Pinocchio."""
-    (model, data), found = described(), exported("ros2-control")
+    (model, data), found = described(), exported("torque")
     for k in range(0, len(found.sampled.time), 20):
         gravity = pin.computeGeneralizedGravity(model, data, found.sampled.q[k])
         np.testing.assert_allclose(found.gravity[k], gravity, atol=1e-2)
@@ -182,7 +182,7 @@ def test_gravity_is_that_of_the_description() -> None:
 def test_holding_bears_half_of_the_box_each_and_presses() -> None:
     """Virtual work: what holding efforts beside gravity do along each joint is what the pad's
     wrench does along the pad's way; both wrenches together bear the box."""
-    found = exported("ros2-control")
+    found = exported("torque")
     sampled, cell = found.sampled, rack().workcell
     load = found.holding - found.gravity
     model, data = described()
@@ -292,7 +292,7 @@ TYPES = {
 @cache
 def decoded() -> dict[str, list[tuple[int, Any]]]:
     """Messages by topic with their times, by mcap's own decoder; ROS 2's own types decode all."""
-    content, store = contents("mcap")["job.mcap"], get_typestore(Stores.ROS2_JAZZY)
+    content, store = contents("data")["job.mcap"], get_typestore(Stores.ROS2_JAZZY)
     assert isinstance(content, bytes)
     reader = make_reader(io.BytesIO(content), decoder_factories=[DecoderFactory()])
     assert reader.get_header().profile == "ros2"
@@ -313,7 +313,7 @@ def test_the_job_is_read_back() -> None:
     assert set(found) == set(TYPES)
     assert [message.data for _, message in found["/phase"]] == [p.name for p in rack_job().phases]
     ((_, described),) = found["/robot_description"]
-    assert described.data == text_of("ros2-control", "description/cell.urdf")
+    assert described.data == text_of("torque", "description/cell.urdf")
     assert len(found["/joint_states"]) == len(job.time)
     for k, (stamp, state) in enumerate(found["/joint_states"]):
         assert stamp == pytest.approx(1e9 * job.time[k], abs=1.0)

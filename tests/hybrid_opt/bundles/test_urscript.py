@@ -6,16 +6,17 @@ from __future__ import annotations
 import ast
 import re
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from functools import cache, partial
 from typing import Any
 
 import numpy as np
 import pytest
 
-from hybrid_opt.bundles import TARGETS, BundleOptions
+from hybrid_opt.bundles import BundleOptions
 from hybrid_opt.bundles.bundle import prepared
-from hybrid_opt.bundles.languages import urscript_files
-from hybrid_opt.job.records import HELD, PHASES
+from hybrid_opt.bundles.urscript import FOLLOWED, normal_speed, require_followed, urscript_files
+from hybrid_opt.job.records import HELD, PHASES, Job
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from tests.hybrid_opt.bundles.bundles import contents, exported, rack_driven
@@ -84,7 +85,8 @@ class Arm:
         self.newton, self.offset, self.pressed = 0.0, 0.0, False
         self.log: list[str] = []
         self.record: list[tuple[float, Array, float]] = []
-        self.payload: list[float] = []
+        # Masses, and the force at which each was set.
+        self.payload: list[tuple[float, float]] = []
         self.threads: dict[int, Iterator[None]] = {}
         self.stopped = self.ended = False
         self._rest = 0.0
@@ -150,7 +152,7 @@ class Arm:
             "sync": sync,
             "force_mode": force_mode,
             "end_force_mode": end_force_mode,
-            "set_target_payload": lambda mass, centre: self.payload.append(mass),
+            "set_target_payload": lambda mass, centre: self.payload.append((mass, self.newton)),
             "get_actual_joint_positions": lambda: self.q.tolist(),
             "get_actual_tcp_pose": lambda: [0.0] * 6,
             "set_standard_digital_out": self.outs.__setitem__,
@@ -235,8 +237,7 @@ def test_both_programs_stream_the_job_and_press() -> None:
     told = ("zero_ftsensor", "force_mode_set_damping 0.1", "end_force_mode")
     assert [line for line in log if line in told] == list(told)
     for each in found.arms:
-        assert np.abs(np.diff(each.payload)).max() < 0.5, "the payload is a ramp"
-        assert max(each.payload) == pytest.approx(rack_job().workcell.payload.mass / 2.0, abs=0.01)
+        assert each.payload == [(0.0, 0.0)], "each change zeroes the force sensor"
 
 
 def begun(q: Any) -> int:
@@ -341,4 +342,26 @@ def test_an_arm_elsewhere_is_not_moved_unasked() -> None:
 def test_steps_that_fill_no_phase_are_refused() -> None:
     options = BundleOptions(step=0.05, any_arm=True)
     with pytest.raises(SettingsError, match="time step"):
-        urscript_files(prepared(rack_driven(), TARGETS["ur-script"], options))
+        urscript_files(prepared(rack_driven(), "ur-script", options))
+
+
+def along_the_normals(speed: float) -> Job:
+    """The rack's job, its box moved along the normals at a speed in the carry [m/s]."""
+    job = rack_job()
+    carry = job.phase("carry")
+    normal = job.workcell.contacts[0].T_box_pad[:3, 2]
+    pose = carry.motion.pose.copy()
+    pose[:, 3:] = 0.0
+    pose[:, :3] = pose[0, :3] + np.outer(carry.motion.time * speed, normal)
+    moved = replace(carry, motion=replace(carry.motion, pose=pose))
+    return replace(job, phases=tuple(moved if p.name == "carry" else p for p in job.phases))
+
+
+def test_a_carry_along_the_normals_is_refused() -> None:
+    """Force mode does not execute motion along its compliant axis."""
+    require_followed(rack_job())
+    assert normal_speed(along_the_normals(0.179), 0) == pytest.approx(0.179, rel=1e-6)
+    require_followed(along_the_normals(0.9 * FOLLOWED))
+    told = r"0.179 m/s along its normal.*slow the carry down 3.6 times, or choose the target torque"
+    with pytest.raises(SettingsError, match=told):
+        require_followed(along_the_normals(0.179))

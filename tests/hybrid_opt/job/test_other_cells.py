@@ -4,6 +4,7 @@ pads of every kind."""
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,7 +13,7 @@ import pytest
 import yaml
 
 from hybrid_opt.bundles import TARGETS, BundleOptions, export
-from hybrid_opt.bundles.bundle import prepared
+from hybrid_opt.bundles.bundle import prepared, target_for
 from hybrid_opt.cell import Cell
 from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES
 from hybrid_opt.job.plan import JobModel
@@ -22,7 +23,6 @@ from hybrid_opt.robust.squeeze import largest_commanded
 from hybrid_opt.timing.records import JerkLimits
 from symbolic.errors import SettingsError
 from tests.hybrid_opt.bundles.bundles import driven
-from tests.hybrid_opt.bundles.mock_rapid import parse
 from tests.hybrid_opt.cells import shipped
 from tests.hybrid_opt.job.jobs import planned
 from tests.symbolic.cells import RACK
@@ -34,7 +34,7 @@ SHIPPED = [
     pytest.param(path.stem, marks=() if path.stem in QUICK else pytest.mark.slow)
     for path in sorted(RACK.parent.glob("*.toml"))
 ]
-FREE = ("csv", "json", "ros2-control", "mcap")
+FREE = ("data", "torque")
 """Targets that are nobody's own."""
 
 
@@ -71,7 +71,7 @@ def test_bundles_hold_every_joint(tmp_path: Path) -> None:
     joints = sum(map(len, job.joint_names))
     for target in FREE:
         assert export(job, target, tmp_path, options=BundleOptions(step=0.1))[0].exists()
-    document = prepared(job, TARGETS["json"], BundleOptions(step=0.1)).document
+    document = prepared(job, "data", BundleOptions(step=0.1)).document
     assert len({n for robot in document["robots"] for n in robot["ros_joints"]}) == joints
     for robot in document["robots"]:
         for name in ("position", "velocity", "effort_with_gravity", "hold_effort_with_gravity"):
@@ -80,39 +80,47 @@ def test_bundles_hold_every_joint(tmp_path: Path) -> None:
 
 def test_a_seventh_axis_is_an_external_one_to_rapid() -> None:
     """ABB counts the axes of a YuMi 1, 2, 7, 3, 4, 5, 6 along its chain."""
-    job, target = driven(planned("pandas")), TARGETS["abb-rapid"]
+    job, target = driven(planned("pandas")), TARGETS["abb-egm"]
     with pytest.raises(SettingsError, match=r"panda.urdf, which does not look like an arm of ABB"):
-        target.refuse(job, "abb-rapid", any_arm=False)
-    options = BundleOptions(step=0.1, any_arm=True)
-    target.refuse(job, "abb-rapid", any_arm=True)
-    sheet = prepared(job, target, options)
+        target.refuse(job, "abb-egm", any_arm=False)
+    target.refuse(job, "abb-egm", any_arm=True)
+    sheet = prepared(job, "abb-egm", BundleOptions(step=0.02, any_arm=True))
     files = target.files(sheet)
-    assert set(files) == {"T_ROB_L/Carry1.mod", "T_ROB_R/Carry2.mod"}
-    for arm, text in enumerate(files.values()):
-        assert isinstance(text, str)
-        module = parse(text)
+    names = ("T_ROB_L/CarryEgm1.mod", "T_ROB_R/CarryEgm2.mod")
+    assert set(names) < set(files)
+    for arm, name in enumerate(names):
+        text = str(files[name])
+        (first,) = re.findall(r"jointtarget carryFirst := (\S+);", text)
+        robot, external = map(np.array, json.loads(first))
         degrees = np.rad2deg(sheet.sampled.arm(arm, sheet.sampled.q))
-        robot, external = (np.array(each) for each in module.declared["carryFirst"][2])
         np.testing.assert_allclose(robot, degrees[0, [0, 1, 3, 4, 5, 6]], atol=1e-6)
         np.testing.assert_allclose(external, [degrees[0, 2], *[9e9] * 5], atol=1e-6)
-        assert module.procedures["CarryCheckStart"].count("EXIT()") == 7
-        assert "here.extax.eax_a" in text
+        check = text.split("PROC CarryCheckStart")[1]
+        assert check.count("EXIT;") == 7
+        assert "here.extax.eax_a" in check
     with pytest.raises(SettingsError, match="7 joints; targets of ur-script hold 6"):
         TARGETS["ur-script"].refuse(job, "ur-script", any_arm=True)
 
 
 def test_franka_takes_the_pandas() -> None:
-    job, target = driven(planned("pandas")), TARGETS["franka-ros2"]
-    target.refuse(job, "franka-ros2", any_arm=False)
-    with pytest.raises(SettingsError, match=r"has to know where the controller of 'north' is"):
-        target.refuse(planned("pandas"), "franka-ros2", any_arm=False)
-    sheet = prepared(job, target, BundleOptions(step=0.05))
+    """Called as franka_ros2 calls them."""
+    job = driven(planned("pandas"))
+    renamed = tuple(tuple(n.replace("panda", "fr3") for n in own) for own in job.joint_names)
+    job = replace(job, joint_names=renamed)
+    target = target_for("torque", job.workcell)
+    target.refuse(job, "torque", any_arm=False)
+    sheet = prepared(job, "torque", BundleOptions(step=0.05))
     files = target.files(sheet)
     config = json.loads(files["config/cell.json"])
-    assert [each["arguments"]["robot_type"] for each in config["launch"]] == ["panda", "panda"]
-    assert config["effort"] == "without_gravity"
-    for arm in (0, 1):
+    arguments = [each["arguments"] for each in config["launch"]]
+    assert [each["robot_type"] for each in arguments] == ["fr3", "fr3"]
+    for arm, name in enumerate(("north", "south")):
+        # franka_description puts an underscore behind the prefix.
+        assert arguments[arm]["arm_prefix"] == name
         controllers = yaml.safe_load(files[f"config/controllers_{arm + 1}.yaml"])["/**"]
-        parameters = controllers["carry_controller"]["ros__parameters"]
-        assert parameters["command_interfaces"] == ["effort"]
-        assert list(parameters["gains"]) == parameters["joints"] == sheet.ros_joints(arm)
+        known = controllers["carry_controller"]["ros__parameters"]
+        assert known["command_interfaces"] == ["effort"]
+        assert list(known["gains"]) == known["joints"] == sheet.ros_joints(arm)
+        assert known["joints"][0] == f"{name}_fr3_joint1"
+        state = controllers["franka_robot_state_broadcaster"]["ros__parameters"]
+        assert state == {"robot_type": "fr3", "arm_prefix": name}

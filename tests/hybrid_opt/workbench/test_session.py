@@ -84,7 +84,7 @@ def test_what_is_saved_is_the_cell_on_the_screen(session: Session, tmp_path: Pat
     np.testing.assert_allclose(again.drivable().initial[:-1], session.x[:-1], atol=1e-12)
     with pytest.raises(ResultsError, match="is not empty"):
         session.save(tmp_path / "mine")
-    written = session.export("csv", tmp_path / "job")
+    written = session.export("data", tmp_path / "job")
     assert all(file.exists() for file in written)
     carry = ho.load(tmp_path / "job" / "carry.json")
     assert isinstance(carry, ho.Carry)

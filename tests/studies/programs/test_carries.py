@@ -73,7 +73,7 @@ def test_the_force_is_that_of_the_exported_job(
     write_trajectory(path, cell.compiled, x, {}, {"algorithm": "hand"})
     assert robust.main([str(path), "--cases", "10", "--points", "2"]) == 0
     told = capsys.readouterr().out.splitlines()
-    assert export.main([str(path), "--target", "json", "--output", str(tmp_path)]) == 0
+    assert export.main([str(path), "--target", "data", "--output", str(tmp_path)]) == 0
     (manifest,) = tmp_path.rglob("manifest.json")
     force = json.loads(manifest.read_text("utf-8"))["squeeze"]["force"]
     assert told[2].startswith("  commanded of the whole job: ")
@@ -116,37 +116,40 @@ def of_a_study(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_bundle_is_written(
     of_a_study: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    arguments = [str(of_a_study), "--target", "csv", "--output", str(tmp_path)]
+    arguments = [str(of_a_study), "--target", "data", "--output", str(tmp_path)]
     assert export.main(arguments) == 0
     text = capsys.readouterr().out
-    for part in ("approach", "set down", "Position control", "Either arm late", "warning"):
+    for part in ("approach", "set down", "Position control", "warning"):
         assert part in text
     (folder,) = tmp_path.iterdir()
     assert folder.name.startswith("rack-nsga2-r02-p0017-")
-    manifest = json.loads((folder / "csv" / "manifest.json").read_text())
+    manifest = json.loads((folder / "data" / "manifest.json").read_text())
     assert manifest["trajectory"]["file"] == "02.json"
     assert manifest["trajectory"]["replica"] == 2
+    assert export.main([*arguments, "--stiffness", "1e4"]) == 0
+    assert "Either arm late, at 10000 N/m" in capsys.readouterr().out
     assert export.main([*arguments, "--squeeze", "1.6", "--force-limit", "60"]) == 0
     assert len(list(tmp_path.iterdir())) == 2
-    (folder / "csv" / "mine.txt").write_text("mine")
+    (folder / "data" / "mine.txt").write_text("mine")
     assert export.main(arguments) == 2
     assert "mine.txt" in capsys.readouterr().err
-    assert (folder / "csv" / "mine.txt").read_text() == "mine"
+    assert (folder / "data" / "mine.txt").read_text() == "mine"
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--target", "csv", "--step", "0"], "time step"),
-        (["--target", "csv", "--use", "force"], "--force-limit"),
-        (["--target", "csv", "--force-limit", "1"], "no timing to export"),
-        (["--target", "csv", "--squeeze", "0.5"], "allowed is 1 to 10"),
-        (["--target", "csv", "--stiffness", "0"], "stiffness"),
-        (["--target", "csv", "--smoothing", "-1"], "smoothing"),
-        (["--target", "csv", "--smoothing", "nan"], "smoothing"),
+        (["--target", "data", "--step", "0"], "time step"),
+        (["--target", "data", "--use", "force"], "--force-limit"),
+        (["--target", "data", "--force-limit", "1"], "no timing to export"),
+        (["--target", "data", "--squeeze", "0.5"], "allowed is 1 to 10"),
+        (["--target", "data", "--stiffness", "0"], "stiffness"),
+        (["--target", "data", "--smoothing", "-1"], "smoothing"),
+        (["--target", "data", "--smoothing", "nan"], "smoothing"),
         (["--target", "ur-script"], "--any-arm"),
-        (["--target", "csv", "--skew", "0.02", "--stiffness", "50000"], "a skew of 20 ms"),
-        (["--target", "csv", "--skew", "-1"], "skew"),
+        (["--target", "ros2-control"], "no longer written; use torque"),
+        (["--target", "data", "--skew", "0.02", "--stiffness", "50000"], "a skew of 20 ms"),
+        (["--target", "data", "--skew", "-1"], "skew"),
     ],
 )
 def test_wrong_exports_are_told_in_one_line(

@@ -96,7 +96,7 @@ def test_study_opens_with_a_carry_to_run(program_run: tuple[Path, str], tmp_path
     assert f"Run this carry: {found.duration:.2f} s, press with {found.force:.1f} N" in printed
     assert sum(part.force for part in found.parts) == pytest.approx(found.force)
     assert f"= {found.force:.1f} N; holds pads that press evenly in every case" in printed
-    assert f"--target ros2-control --force-limit {found.force_limit:.6g}" in printed
+    assert f"--target torque --force-limit {found.force_limit:.6g}" in printed
     assert str(root) not in found.export, "it holds wherever the folder is moved"
     stored = read_trajectory(root / found.file)
     assert replay(stored, tmp_path).reproduced

@@ -101,6 +101,7 @@ def robots(draw: st.DrawFn, name: str) -> dict[str, Any]:
                 "rate": numbers(10.0, 8000.0),
                 "lag": numbers(0.0, 0.5),
                 "force_control": st.booleans(),
+                "stiffness": numbers(1e3, 1e6),
             },
         ),
     }

@@ -1,4 +1,4 @@
-"""Files of the ROS 2 targets: descriptions by Pinocchio, parameters by controllers' rules."""
+"""Files of the torque target: descriptions by Pinocchio, parameters by controllers' rules."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import json
 import sys
 import types
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -19,12 +20,14 @@ import yaml
 import yourdfpy
 
 from hybrid_opt.bundles.arms import description, ros_joints
-from hybrid_opt.bundles.bundle import write_bundle
+from hybrid_opt.bundles.bundle import target_for, write_bundle
 from hybrid_opt.bundles.job_file import pad_places
+from hybrid_opt.bundles.torque import driver_of, joint_inertia, joint_stiffness, pad_stiffness
+from symbolic.errors import SettingsError
 from symbolic.records.poses import pose_matrix
-from tests.hybrid_opt.bundles.bundles import contents, exported, text_of
+from tests.hybrid_opt.bundles.bundles import DRIVER, contents, driven, exported, text_of
 from tests.hybrid_opt.cells import shipped
-from tests.hybrid_opt.job.jobs import rack
+from tests.hybrid_opt.job.jobs import planned, rack
 
 JOINTS = [f"{arm}_joint_{k}" for arm in ("left", "right") for k in range(1, 7)]
 
@@ -84,18 +87,63 @@ def test_a_joint_that_moves_both_arms_is_there_once() -> None:
     assert len(control.findall("joint")) == len(joints)
 
 
+def parameters(driver: str = "simulation", arm: str = "") -> Any:
+    """All parameters of a driver's controllers, by controller."""
+    text = text_of("torque", f"config/controllers{arm}.yaml", driver)
+    return {n: v["ros__parameters"] for n, v in yaml.safe_load(text)["/**"].items()}
+
+
 def cell_controller() -> Any:
-    document = yaml.safe_load(text_of("ros2-control", "config/controllers.yaml"))
-    return document["carry_controller"]["ros__parameters"]
+    return parameters()["carry_controller"]
 
 
 def test_controllers_accept_their_parameters() -> None:
     judged(cell_controller())
     assert cell_controller()["joints"] == JOINTS
-    for arm in (1, 2):
-        franka = yaml.safe_load(text_of("franka-ros2", f"config/controllers_{arm}.yaml"))["/**"]
-        judged(franka["carry_controller"]["ros__parameters"])
-        assert franka["controller_manager"]["ros__parameters"]["update_rate"] == 1000
+    for driver, rate in (("franka", 1000), ("ur", 500)):
+        for arm in (0, 1):
+            known = parameters(driver, f"_{arm + 1}")
+            judged(known["carry_controller"])
+            assert known["carry_controller"]["joints"] == JOINTS[6 * arm : 6 * arm + 6]
+            assert known["controller_manager"]["update_rate"] == rate
+            # Every one has a type.
+            assert set(known) - {"controller_manager"} <= set(known["controller_manager"])
+
+
+def test_gains_are_those_of_damped_soft_joints() -> None:
+    """Each joint of the arm alone, held by its gains, against its own inertia: a damping ratio of
+    0.7, and far from what a sampled derivative makes unstable."""
+    job = exported("torque").job
+    inertia, gains = joint_inertia(job), cell_controller()["gains"]
+    torque = job.workcell.of_joints("torque_max")
+    for k, joint in enumerate(JOINTS):
+        p, d = gains[joint]["p"], gains[joint]["d"]
+        assert p <= 7.0 * torque[k] + 1e-9
+        poles = np.roots([inertia[k], d, p])
+        np.testing.assert_allclose(-poles.real / np.abs(poles), 0.7, atol=1e-9)
+        # Semi-implicit Euler at 500 Hz, which needs no more of a joint than its inertia.
+        step = np.array([[1.0 - 0.002 * d / inertia[k], -0.002 * p / inertia[k]], [0.002, 1.0]])
+        step[1] += 0.002 * (step[0] - [1.0, 0.0])
+        assert np.abs(np.linalg.eigvals(step)).max() < 1.0
+
+
+def test_the_pads_are_as_stiff_as_the_gains_make_them() -> None:
+    """By differences: the displacement of both pads along the normal under opposite forces."""
+    job = exported("torque").job
+    first = len(job.joint_names[0])
+    stiff = 0.0
+    for phase in job.held:
+        for q in phase.motion.q[::10]:
+            apart = 0.0
+            for arm, span in enumerate((slice(0, first), slice(first, None))):
+                gains, h = joint_stiffness(job)[span], 1e-6
+                own = q[span]
+                moved = np.array([own, *(own + h * np.eye(len(own)))])
+                pads = pad_places(job.workcell, arm, moved)
+                along = (pads[1:, :3, 3] - pads[0, :3, 3]) @ pads[0, :3, 2] / h
+                apart += float((along**2 / gains).sum())
+            stiff = max(stiff, 2.0 / apart)
+    assert pad_stiffness(job) == pytest.approx(stiff, rel=1e-4)
 
 
 def by_yourdfpy(text: str) -> yourdfpy.URDF:
@@ -109,10 +157,10 @@ def by_yourdfpy(text: str) -> yourdfpy.URDF:
 
 def test_the_description_places_both_pads_on_the_box() -> None:
     """Read by Pinocchio and by yourdfpy: joints in the job's order lead both pads to the box."""
-    text = text_of("ros2-control", "description/cell.urdf")
+    text = text_of("torque", "description/cell.urdf")
     model, other = pin.buildModelFromXML(text), by_yourdfpy(text)
     assert list(model.names)[1:] == list(other.actuated_joint_names) == JOINTS
-    data, job = model.createData(), exported("ros2-control").sampled
+    data, job = model.createData(), exported("torque").sampled
     for k in range(job.span(1).start, job.span(5).stop, 15):
         pin.framesForwardKinematics(model, data, job.q[k])
         other.update_cfg(job.q[k])
@@ -125,8 +173,8 @@ def test_the_description_places_both_pads_on_the_box() -> None:
 
 
 def test_the_description_weighs_what_the_efforts_hold() -> None:
-    model = pin.buildModelFromXML(text_of("ros2-control", "description/cell.urdf"))
-    data, job = model.createData(), exported("ros2-control").sampled
+    model = pin.buildModelFromXML(text_of("torque", "description/cell.urdf"))
+    data, job = model.createData(), exported("torque").sampled
     for k in (0, 5, len(job.time) - 3):  # the pads touch nothing
         torque = pin.rnea(model, data, job.q[k], job.q_rate[k], job.q_second[k])
         np.testing.assert_allclose(job.effort[k], torque, atol=0.01)
@@ -156,75 +204,56 @@ def judged_hardware(element: ElementTree.Element) -> None:
         judged_hardware(child)
 
 
-def test_mock_hardware_begins_at_the_first_position() -> None:
-    root = ElementTree.fromstring(text_of("ros2-control", "description/cell.urdf"))
+def test_simulated_hardware_begins_at_the_first_position() -> None:
+    root = ElementTree.fromstring(text_of("torque", "description/cell.urdf"))
     (control,) = root.findall("ros2_control")
     judged_hardware(control)
-    assert control.findtext("hardware/plugin") == "mock_components/GenericSystem"
+    assert control.findtext("hardware/plugin") == "gz_ros2_control/GazeboSimSystem"
+    weightless = {each.get("reference") for each in root.findall("gazebo[gravity='false']")}
+    assert weightless == {link.get("name") for link in root.findall("link")}
     joints = control.findall("joint")
     assert [joint.get("name") for joint in joints] == JOINTS
     values = [joint.findtext("state_interface/param") for joint in joints]
-    first = exported("ros2-control").sampled.q[0]
+    first = exported("torque").sampled.q[0]
     np.testing.assert_array_equal([float(value or "nan") for value in values], first)
     commands = [each.get("name") for each in joints[0].findall("command_interface")]
-    assert cell_controller()["command_interfaces"] == commands == ["position", "effort"]
+    assert cell_controller()["command_interfaces"] == commands == ["effort"]
 
 
-def config_of(target: str) -> Any:
-    return json.loads(text_of(target, "config/cell.json"))
-
-
-@pytest.mark.parametrize(
-    ("target", "gravity"),
-    [("ros2-control", "with_gravity"), ("franka-ros2", "without_gravity"), ("ur-ros2", "")],
-)
-def test_efforts_say_whose_gravity_they_hold(target: str, gravity: str) -> None:
-    """A simulator needs the whole torque, Franka adds gravity by itself, UR takes no torques."""
-    assert config_of(target)["effort"] == gravity
+def config_of(driver: str) -> Any:
+    return json.loads(text_of("torque", "config/cell.json", driver))
 
 
 def test_frankas_know_their_tool_and_what_is_no_collision() -> None:
-    calls = config_of("franka-ros2")["prepare"]
-    assert [call["name"].rsplit("/", 1)[1] for call in calls] == [
-        "set_load",
-        "set_full_collision_behavior",
-    ] * 2
-    found = exported("franka-ros2")
-    for arm, call in enumerate(calls[1::2]):
-        torque = np.array(call["request"]["upper_torque_thresholds_nominal"])
+    calls = config_of("franka")["prepare"]
+    # libfranka sets a load only while no motion runs.
+    order = ["switch_controller", "set_load", "set_full_collision_behavior", "switch_controller"]
+    assert [call["name"].rsplit("/", 1)[1] for call in calls] == 2 * order
+    found = exported("torque", "franka")
+    for arm, call in enumerate(calls[2::4]):
+        (request,) = call["requests"]
+        torque = np.array(request["upper_torque_thresholds_nominal"])
         contact = found.holding - found.gravity
         assert (torque > np.abs(found.sampled.arm(arm, contact)).max(axis=0)).all()
-        force = call["request"]["upper_force_thresholds_nominal"]
+        force = request["upper_force_thresholds_nominal"]
         assert min(force[:3]) > found.sampled.normal_force[:, arm].max()
     rate = np.diff(found.sampled.effort - found.gravity, axis=0)
     assert np.abs(rate / np.diff(found.sampled.time)[:, None]).max() < 1000.0
 
 
-def test_force_mode_presses_into_the_box() -> None:
-    """Its task frame on the flange is the pad's, whose z axis points into the box."""
-    (force,) = config_of("ur-ros2")["force"]
-    found, arm, request = exported("ur-ros2"), force["arm"], force["request"]
-    assert arm == found.follower
-    pose = request["task_frame"]["pose"]
-    T = np.eye(4)
-    x, y, z, w = (pose["orientation"][k] for k in "xyzw")
-    T[:3, :3] = pin.Quaternion(w, x, y, z).toRotationMatrix()
-    T[:3, 3] = [pose["position"][k] for k in "xyz"]
-    robot = found.workcell.robots[arm]
-    np.testing.assert_allclose(T, robot.T_flange_pad, atol=1e-12)
-    assert request["task_frame"]["header"]["frame_id"] == f"right_{robot.flange}"
-    sampled = found.sampled
-    first = sampled.span(3).start
-    (pad,) = pad_places(found.workcell, arm, sampled.arm(arm, sampled.q)[[first]])
-    towards = sampled.pose[first, :3] - pad[:3, 3]
-    assert pad[:3, 2] @ towards > 0.0
-    selected = [axis for axis in ("x", "y", "z", "rx") if request[f"selection_vector_{axis}"]]
-    assert selected == ["z"]
-    assert 0.0 <= request["damping_factor"] <= 1.0
-    assert 0.0 < request["gain_scaling"] <= 1.0
+def test_forces_are_read_where_drivers_publish_them() -> None:
+    """force_torque_sensor_broadcaster on `~/wrench` on all branches, franka_ros2's broadcaster."""
+    topics = {
+        "ur": "/{}/force_torque_sensor_broadcaster/wrench",
+        "franka": "/{}/franka_robot_state_broadcaster/external_wrench_in_stiffness_frame",
+    }
+    for driver, topic in topics.items():
+        wrench = config_of(driver)["wrench"]
+        assert [each["topic"] for each in wrench] == [topic.format(n) for n in ("left", "right")]
+    assert config_of("simulation")["wrench"] == [None, None]
 
 
-@pytest.mark.parametrize("target", ["ros2-control", "franka-ros2", "ur-ros2", "abb-egm"])
+@pytest.mark.parametrize("target", ["torque", "abb-egm"])
 def test_programs_need_nothing_of_this_project(target: str) -> None:
     program = "run_egm.py" if target == "abb-egm" else "run_job.py"
     assert {program, "carry_job.py", "job.json"} <= set(contents(target))
@@ -234,9 +263,10 @@ def test_programs_need_nothing_of_this_project(target: str) -> None:
         assert not any(module.startswith("hybrid_opt") for module in modules), name
 
 
-def launched(target: str, name: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> list[Any]:
+def launched(driver: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     """The actions of a bundle's launch file with the namespace of each, by stand-ins for launch."""
-    write_bundle(folder, contents(target), {})
+    write_bundle(folder, contents("torque", driver), {})
+    name = driver
 
     def action(kind: str) -> Callable[..., Any]:
         return lambda *positional, **named: (kind, positional, named)
@@ -259,30 +289,31 @@ def launched(target: str, name: str, folder: Path, monkeypatch: pytest.MonkeyPat
 
 
 @pytest.mark.parametrize(
-    ("target", "name", "spaces"),
+    ("driver", "spaces"),
     [
-        ("ros2-control", "control", [""] * 3),
-        ("franka-ros2", "franka", ["", "left", "", "right"]),
-        ("ur-ros2", "ur", ["left"] * 3 + ["right"] * 3),
+        ("simulation", [""] * 3),
+        ("franka", ["", "left", "", "right"]),
+        ("ur", ["left"] * 4 + ["right"] * 4),
     ],
 )
 def test_launch_files_start_what_the_programs_ask(
-    target: str, name: str, spaces: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    driver: str, spaces: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Controllers that actions and services belong to, in the namespaces that these have."""
-    found = launched(target, name, tmp_path, monkeypatch)
+    """Controllers that actions and services belong to, in the namespaces that these have; the one
+    that drives the arms inactive, until the program activates it."""
+    found = launched(driver, tmp_path, monkeypatch)
     assert [space for space, *_ in found] == spaces
-    config = config_of(target)
+    config = config_of(driver)
     spawned = {
-        f"{space}/{controller}"
+        f"{space}/{controller}".lstrip("/"): "--inactive" in named["arguments"]
         for space, kind, _, named in found
         if kind == "Node" and named["executable"] == "spawner"
         for controller in named["arguments"]
+        if controller != "--inactive"
     }
-    names = [group["action"] for group in config["groups"]]
-    names += [call["name"] for call in (*config["force"], *config["sliders"])]
-    assert {each.removesuffix(f"/{each.rsplit('/', 1)[1]}").lstrip("/") for each in names} <= {
-        each.lstrip("/") for each in spawned
+    driving = [g["action"].removesuffix("/follow_joint_trajectory") for g in config["groups"]]
+    assert {name for name, inactive in spawned.items() if inactive} == {
+        name.lstrip("/") for name in driving
     }
     for _, kind, _, named in found:
         files: list[str] = []
@@ -293,3 +324,34 @@ def test_launch_files_start_what_the_programs_ask(
         elif named["executable"] == "ros2_control_node":
             files = [each for each in named["parameters"] if isinstance(each, str)]
         assert all(Path(file).is_file() for file in files)
+
+
+def by(name: str, joints: str = "", **stated: Any) -> Any:
+    """A cell's job with something stated of its drivers, its joints called otherwise."""
+    job = driven(planned(name), replace(DRIVER, **stated))
+    if joints:
+        renamed = tuple(tuple(n.replace("panda", joints) for n in own) for own in job.joint_names)
+        job = replace(job, joint_names=renamed)
+    return job
+
+
+@pytest.mark.parametrize(
+    ("job", "told"),
+    [
+        (lambda: by("pandas"), "of fer, fp3, fr3, fr3v2"),
+        (lambda: by("pandas", "fr3", prefix="l"), "has to end with '_'"),
+        (lambda: by("rack"), "driven by abb-egm"),
+    ],
+)
+def test_drivers_know_their_arms(job: Callable[[], Any], told: str) -> None:
+    with pytest.raises(SettingsError, match=told):
+        target_for("torque", job().workcell).refuse(job(), "torque", any_arm=False)
+
+
+def test_arms_without_addresses_are_simulated() -> None:
+    assert driver_of(by("rack", address="").workcell) == "simulation"
+    assert driver_of(by("pandas").workcell) == "franka"
+    first, second = by("rack").workcell.robots
+    lone = replace(second, driver=replace(DRIVER, address=""))
+    with pytest.raises(SettingsError, match="only one of both arms has an address"):
+        driver_of(replace(by("rack").workcell, robots=(first, lone)))
