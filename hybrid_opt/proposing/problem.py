@@ -136,6 +136,8 @@ class Problem:
     def workcell(self, changes: dict[str, Any] | None = None) -> Workcell:
         """Read the workcell, with one free waypoint halfway unless `changes` has waypoints.
 
+        Reach is not checked: spins and bases are chosen later.
+
         Args:
             changes: as for `symbolic.read.editing.completed`.
 
@@ -154,7 +156,7 @@ class Problem:
                 }
             ]
         text = completed("", self.data | {"task": task}, changes)
-        return load(self.source, text=text.encode())
+        return load(self.source, text=text.encode(), reach=False)
 
     def completed(self, changes: dict[str, Any], folder: Path) -> str:
         """The file's text, completed, for a folder that paths are then relative to.

@@ -12,9 +12,10 @@ A description that holds no such arm is a `RobotModelError`.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cache, lru_cache
 from types import MappingProxyType
 from typing import Any
 from xml.etree import ElementTree
@@ -23,7 +24,7 @@ import numpy as np
 import pinocchio as pin
 
 from symbolic.array import Array
-from symbolic.errors import RobotModelError
+from symbolic.errors import DualArmWarning, RobotModelError
 from symbolic.read.urdf import Urdf, read_urdf
 from symbolic.records import PAYLOAD, Robot, Workcell
 from symbolic.records.problems import matching, suggestion
@@ -67,7 +68,8 @@ def held_joints(urdf: Urdf, moving: Sequence[str], locked: Positions) -> Positio
         locked: joints and positions that the user gives [rad or m].
 
     Raises:
-        RobotModelError: a locked joint does not exist, or a joint mimics one that moves.
+        RobotModelError: a locked joint does not exist, or a joint mimics one that moves and bears
+            a shape or a mass.
     """
     given = dict(locked)
     free = [name for name, joint in urdf.joints.items() if joint.kind != "fixed"]
@@ -88,6 +90,9 @@ def held_joints(urdf: Urdf, moving: Sequence[str], locked: Positions) -> Positio
             return given[name]
         if not joint.mimics:
             return float(np.clip(0.0, joint.lower, joint.upper))
+        if joint.mimics in moving and _is_empty_behind(urdf, name):
+            _warn_left_out(urdf.file, name, joint.mimics)
+            return joint.offset
         if joint.mimics in moving:
             raise RobotModelError(
                 f"joint {name!r} mimics {joint.mimics!r}, which moves; hold it (locked_joints) or "
@@ -96,6 +101,34 @@ def held_joints(urdf: Urdf, moving: Sequence[str], locked: Positions) -> Positio
         return joint.multiplier * position(joint.mimics) + joint.offset
 
     return tuple((name, position(name)) for name in free if name not in moving)
+
+
+class RobotModelWarning(DualArmWarning):
+    """A part of a description is left out."""
+
+
+@cache
+def _warn_left_out(file: str, joint: str, mimicked: str) -> None:
+    """Say once that a joint does not follow another."""
+    warnings.warn(
+        f"{file}: joint {joint!r} does not follow {mimicked!r}, which moves; what hangs on it has "
+        "neither shape nor mass",
+        RobotModelWarning,
+        stacklevel=2,
+    )
+
+
+def _is_empty_behind(urdf: Urdf, joint: str) -> bool:
+    """Return True if no link that hangs on a joint has a collision shape or a mass."""
+    behind = {link for link in urdf.links if joint in urdf.above(link)}
+    tree = ElementTree.fromstring(urdf.kinematics)
+    heavy = {link.get("name") for link in tree.iter("link") if _mass(link) > 0.0}
+    return not behind & (heavy | urdf.collisions.keys())
+
+
+def _mass(link: ElementTree.Element) -> float:
+    mass = link.find("inertial/mass")
+    return 0.0 if mass is None else float(mass.get("value", "0"))
 
 
 def without_links(urdf: Urdf, patterns: tuple[str, ...]) -> Urdf:

@@ -55,8 +55,9 @@ def load(
     stored: bool = False,
     decided: tuple[int, int] = (SEARCHED, SEARCHED),
     text: bytes | None = None,
+    reach: bool = True,
 ) -> Workcell:
-    """The workcell that a TOML file describes.
+    """Read the workcell that a TOML file describes.
 
     Args:
         path: the file; every path inside it is relative to its folder.
@@ -66,6 +67,8 @@ def load(
             not looked for on this machine, and xacro files were expanded before.
         decided: per robot the start branch that takes the place of "search" in the file.
         text: what to read in the place of the file's content, as if it stood there.
+        reach: whether fixed poses have to be within the arms' reach; False where spins of pads or
+            bases are still to be chosen.
 
     Raises:
         WorkcellError: with all problems of the file, each with its key path.
@@ -81,7 +84,7 @@ def load(
     except OutsideError as error:
         raise WorkcellError(str(path), (f"file: {error}",)) from error
     problems = Problems()
-    workcell = _build(Table(data, "", problems), source, content, stored)
+    workcell = _build(Table(data, "", problems), source, content, stored, reach)
     if workcell is None or problems.found:
         raise WorkcellError(str(path), problems.messages())
     further = tuple(problem for check in checks for problem in check(workcell))
@@ -112,7 +115,9 @@ def changed(workcell: Workcell, changes: Mapping[str, Any]) -> Workcell:
     return load(source, text=content)
 
 
-def _build(table: Table, source: Path, content: bytes, stored: bool) -> Workcell | None:
+def _build(
+    table: Table, source: Path, content: bytes, stored: bool, reach: bool
+) -> Workcell | None:
     """The records, as far as they can be built; None where a section has the wrong count."""
     problems, folder = table.problems, source.parent
     name = table.text("name")
@@ -152,7 +157,7 @@ def _build(table: Table, source: Path, content: bytes, stored: bool) -> Workcell
     except OutsideError as error:
         problems.add("file", str(error))
         identity = ""
-    check_all(workcell, problems)
+    check_all(workcell, problems, reach)
     workcell = with_redundancy(workcell, redundant, problems)
     if workcell.task.pieces > 1 and not problems.found:
         # Not imported at the top: it needs CasADi.
@@ -557,9 +562,9 @@ def _fixed_poses(workcell: Workcell) -> Iterator[tuple[str, Array]]:
     yield "task.goal", waypoints[-1].lower
 
 
-def check_all(workcell: Workcell, problems: Problems) -> None:
-    """Every check across sections that needs no inverse kinematics."""
-    for check in (
+def check_all(workcell: Workcell, problems: Problems, reach: bool) -> None:
+    """Make every check across sections that needs no inverse kinematics; `reach` as of `load`."""
+    checks: tuple[Callable[[Workcell, Problems], None], ...] = (
         check_machine,
         check_shapes,
         check_names,
@@ -567,8 +572,8 @@ def check_all(workcell: Workcell, problems: Problems) -> None:
         check_uncertainty,
         check_references,
         check_speeds,
-        check_reach,
-    ):
+    )
+    for check in (*checks, check_reach) if reach else checks:
         try:
             check(workcell, problems)
         except RobotModelError as error:  # pragma: no cover - the robots section reports it first

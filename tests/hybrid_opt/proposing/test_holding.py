@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tomllib
 from dataclasses import replace
 from itertools import islice, pairwise
 from pathlib import Path
@@ -33,14 +34,14 @@ from hybrid_opt.proposing.holding import (
     possible_spins,
 )
 from hybrid_opt.proposing.problem import Problem, read_problem
-from hybrid_opt.proposing.setup import Setup, prepare
+from hybrid_opt.proposing.setup import Setup, prepare, reach_missing
 from hybrid_opt.proposing.trial import judge_of
 from symbolic.array import Array
-from symbolic.errors import SettingsError
+from symbolic.errors import SettingsError, WorkcellError
 from symbolic.geometry.pairs import build_geometry, coal_distance
 from symbolic.read.arms import arm_model
 from symbolic.read.cell import load
-from symbolic.read.editing import merged
+from symbolic.read.editing import completed, merged
 from symbolic.records import Body, Box, Workcell
 from symbolic.records.poses import box_placement, pose_matrix
 from symbolic.robot.branches import inverse_kinematics
@@ -51,6 +52,7 @@ from tests.symbolic.geometry.collision_cells import placed_pieces
 from tests.symbolic.read.samples import RACK
 from tests.torso import Torso
 
+POST = Path("studies/problems/past-a-post.toml")
 SPINS: Array = 2.0 * np.pi * np.arange(12.0) / 12.0
 
 
@@ -214,6 +216,30 @@ def test_an_arm_that_comes_near_a_singular_posture_is_told_with_the_key(tmp_path
     )
     with pytest.raises(ProposalError, match=told):
         prepare(problem, {}, SPINS, np.random.default_rng(1))
+
+
+def test_spins_are_chosen_before_reach_is_checked(tmp_path: Path) -> None:
+    """Side tools that reach at some spins only; with the spin of the file the cell is refused."""
+    tool = {"pad": {"xyz": [0.0, 0.14, 0.22], "rpy": [-1.5707963267948966, 0.0, 0.0]}, "tool": []}
+    ends = {"start": [0.66, 0.0, 0.30, 0, 0, 0], "goal": [0.66, 0.0, 0.45, 0, 0, 0]}
+    data = tomllib.loads(POST.read_text(encoding="utf-8"))
+    bases = [{"base": {"xyz": [-0.35, side * 0.45, 0.0]}} for side in (1.0, -1.0)]
+    robots = [{"robot": "ur5", "chain": ["base_link", "tool0"], **base, **tool} for base in bases]
+    changes = {"robots": robots, "task": ends, "environment": None}
+    path = tmp_path / "side.toml"
+    path.write_text(completed("", data, changes), encoding="utf-8")
+    problem = read_problem(path)
+    found = problem.workcell()
+    assert not reach_missing(found, problem.poses, SPINS)
+    with pytest.raises(WorkcellError, match="out of reach"):
+        load(path, text=completed("", merged(data, changes), _draft(problem)).encode())
+
+
+def _draft(problem: Problem) -> dict[str, object]:
+    """What a problem lacks to be a cell, as the file has it: no spin."""
+    start, goal = problem.poses
+    bounds = {"lower": (start - 0.1).tolist(), "upper": (goal + 0.1).tolist()}
+    return {"contacts": problem.contacts, "task": {"waypoints": [bounds]}}
 
 
 @pytest.mark.parametrize(

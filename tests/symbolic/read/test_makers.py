@@ -10,6 +10,7 @@ import pytest
 
 from hybrid_opt.proposing.problem import read_problem
 from symbolic.errors import OutsideError, WorkcellError
+from symbolic.read.arms import RobotModelWarning, _warn_left_out
 from symbolic.read.robots import named_robot
 from symbolic.records import Workcell
 from tests.torso import Torso
@@ -52,6 +53,38 @@ def test_joints_that_arms_move_need_theirs(tmp_path: Path) -> None:
         (tmp_path / "torso.urdf").write_text(text.replace(limit, wanted), encoding="utf-8")
         with pytest.raises(WorkcellError, match=told):
             read_problem(path).workcell()
+
+
+MIMIC = """
+<link name="marker">{inertial}</link>
+<joint name="marker_joint" type="revolute">
+  <parent link="{parent}"/><child link="marker"/><axis xyz="0 0 1"/>
+  <limit lower="-3" upper="3" effort="1" velocity="1"/>
+  <mimic joint="torso_joint_0" multiplier="-1" offset="0.25"/>
+</joint>
+"""
+INERTIAL = """<inertial><mass value="0.1"/>
+<inertia ixx="1e-3" ixy="0" ixz="0" iyy="1e-3" iyz="0" izz="1e-3"/></inertial>"""
+
+
+@pytest.mark.parametrize("parent", ["chest", "foot"])
+def test_empty_links_that_mimic_a_moving_joint_are_left_out_with_a_note(
+    parent: str, tmp_path: Path
+) -> None:
+    """In front of the joint and behind it; each is said once."""
+    _warn_left_out.cache_clear()
+    torso = Torso(more=MIMIC.format(parent=parent, inertial=""))
+    with pytest.warns(RobotModelWarning, match="'marker_joint' does not follow 'torso_joint_0'"):
+        found = cell(torso, tmp_path)
+    plain = cell(Torso(), tmp_path)
+    for robot, other in zip(found.robots, plain.robots, strict=True):
+        np.testing.assert_array_equal(robot.position_upper, other.position_upper)
+
+
+def test_links_with_mass_that_mimic_a_moving_joint_are_refused(tmp_path: Path) -> None:
+    torso = Torso(more=MIMIC.format(parent="chest", inertial=INERTIAL))
+    with pytest.raises(WorkcellError, match="'marker_joint' mimics 'torso_joint_0', which moves"):
+        cell(torso, tmp_path)
 
 
 def test_fast_wrists_and_light_squeezes_are_no_other_units(tmp_path: Path) -> None:
