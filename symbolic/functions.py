@@ -13,7 +13,7 @@ from symbolic.cell_model import CellModel
 from symbolic.contact.load import LOAD_OUTPUTS, load_function, uncertain_load_function
 from symbolic.expression import mx_given, named_function, of, repeated, sx_given
 from symbolic.geometry.screen import Screen
-from symbolic.limits import path_force_function
+from symbolic.limit_coefficients import path_force_function
 from symbolic.path.spline import extended_matrix, sample_basis, waypoint_matrix
 from symbolic.path.time_law import driven_path, timed_path
 from symbolic.path_motion import arm_derivative_function, path_motion_function, start_posture
@@ -415,7 +415,7 @@ def timing_functions(model: CellModel, samples: int) -> dict[str, ca.Function]:
     path_motion: see `symbolic.path_motion`, at that many samples. load, uncertain_load: see
     `symbolic.contact.load`. arm_i per arm i = 1, 2: see
     `symbolic.path_motion.arm_derivative_function`. path_force, where the normal forces have slopes:
-    see `symbolic.limits.path_force_function`.
+    see `symbolic.limit_coefficients.path_force_function`.
     """
     workcell = model.workcell
     functions = {

@@ -1,43 +1,203 @@
-"""Limits on the timing of a path, as coefficients for the compiled passes.
+"""The limits on the timing of a path: one table, and the layout of their coefficients.
 
-`symbolic.path_motion` gives a carry's geometry in physical quantities. Here every limit at a sample
-is a function of (u'', u'^2) with its coefficients packed in one vector.
+Rows of timings and of the polish, ratios of a carry, messages, margins and the enumeration of the
+compiled passes follow from `LIMITS`. With the path parameter u driven as u(t), every limit is a
+bound on a function of u'' and u'^2 whose coefficients `symbolic.limit_coefficients` computes.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Literal
 
-import casadi as ca
 import numpy as np
 
-from symbolic.cell_model import CellModel
-from symbolic.contact.force_closure import WRENCH_SIZE
-from symbolic.contact.grasp import Grasp
-from symbolic.contact.load import ContactLoad, HeldLoad, frictions, held_by
-from symbolic.contact.soft_finger import Detached
-from symbolic.contact.soft_grasp import SoftGrasp
-from symbolic.expression import as_mx, mx_given, named_function, number, of, sx_given
-from symbolic.path.spline import path_basis, waypoint_matrix
-from symbolic.path_motion import (
-    ARM_OUTPUTS,
-    BOX_OUTPUTS,
-    arm_derivative_function,
-    box_function,
-    extended_motion,
-    start_posture,
-)
 from symbolic.records import Workcell
-from symbolic.records.quantities import GRAVITY
-from symbolic.robot.arm import TRACK_OUTPUTS, follow_function
 
-ARM_CHECK_OUTPUTS = ("ik_residual", "lost", "limit_margin", "manipulability")
-"""Outputs of `symbolic.robot.arm.TRACK_OUTPUTS` about an arm's errors."""
+Scope = Literal["joint", "payload", "robot"]
+"""One value per joint of both arms, one of the payload, or one per robot."""
 
-TIMING_BARRIER_WEIGHT = 1e-6
-"""Weight of the barriers if a program finds the forces (`symbolic.contact.soft_grasp`): these
-exceed the least ones by less than the accuracy of timings."""
+SlackGroup = Literal["motion", "force", "ratio"]
+"""Limits that are tightened together between grid points: on motion alone, on the convex normal
+forces, and on ratios of the contact forces, which are not convex."""
+
+
+@dataclass(frozen=True)
+class Limit:
+    """One limit on the timing of a path.
+
+    Attributes:
+        name: in messages, records and `hybrid_opt.timing.limits.limit_ratios`.
+        symbol: in the compiled passes.
+        unit: of the limited quantity.
+        expression: the limited ratio; its limit is 1.
+        group: limits that are tightened together.
+        scope: number of its values.
+        block: of `limit_layout` and of `symbolic.smooth.driven.driven_layout`.
+        option: field of `hybrid_opt.timing.records.TimingLimits` that switches it on, else ''.
+        path: quantity of the path whose first and, for accelerations, second derivative by u it
+            bounds: q, pose or angular of `symbolic.path_motion`; '' for a limit on forces.
+        carry: the quantity of a carry.
+        bound: field of the robots or of the payload with the largest value.
+    """
+
+    name: str
+    symbol: str
+    unit: str
+    expression: str
+    group: SlackGroup
+    scope: Scope
+    block: str
+    option: str = ""
+    path: str = ""
+    carry: str = ""
+    bound: str = ""
+
+    @property
+    def is_signed(self) -> bool:
+        """Return True if its quantity has both signs, each with the same limit."""
+        return self.block in ("acceleration", "torque")
+
+
+LIMITS = (
+    Limit(
+        "joint velocity",
+        "JOINT_SPEED",
+        "rad/s",
+        "|q_u u'| / velocity_max",
+        group="motion",
+        scope="joint",
+        block="speed",
+        path="q",
+        carry="q_rate",
+        bound="velocity_max",
+    ),
+    Limit(
+        "payload velocity",
+        "BOX_SPEED",
+        "m/s",
+        "|p_u u'| / velocity_max",
+        group="motion",
+        scope="payload",
+        block="speed",
+        path="pose",
+        carry="rate",
+        bound="velocity_max",
+    ),
+    Limit(
+        "payload angular velocity",
+        "BOX_TURN",
+        "rad/s",
+        "|omega_u u'| / angular_velocity_max",
+        group="motion",
+        scope="payload",
+        block="speed",
+        path="angular",
+        carry="angular_velocity",
+        bound="angular_velocity_max",
+    ),
+    Limit(
+        "path speed",
+        "PATH_SPEED",
+        "1",
+        "max(|p_u u'| / reference_speed, |omega_u u'| / reference_angular_speed)",
+        group="motion",
+        scope="payload",
+        block="speed",
+        option="reference_speed",
+    ),
+    Limit(
+        "joint acceleration",
+        "JOINT_ACCELERATION",
+        "rad/s^2",
+        "|q_u u'' + q_uu u'^2| / acceleration_max",
+        group="motion",
+        scope="joint",
+        block="acceleration",
+        path="q",
+        carry="q_second",
+        bound="acceleration_max",
+    ),
+    Limit(
+        "payload acceleration",
+        "BOX_ACCELERATION",
+        "m/s^2",
+        "|p_u u'' + p_uu u'^2| / acceleration_max",
+        group="motion",
+        scope="payload",
+        block="cone",
+        path="pose",
+        carry="second_rate",
+        bound="acceleration_max",
+    ),
+    Limit(
+        "payload angular acceleration",
+        "BOX_TURN_ACCELERATION",
+        "rad/s^2",
+        "|omega_u u'' + omega_uu u'^2| / angular_acceleration_max",
+        group="motion",
+        scope="payload",
+        block="cone",
+        path="angular",
+        carry="angular_acceleration",
+        bound="angular_acceleration_max",
+    ),
+    Limit(
+        "normal force",
+        "NORMAL_FORCE",
+        "N",
+        "N_i(u'', u'^2) / force",
+        group="force",
+        scope="robot",
+        block="force",
+        option="force",
+    ),
+    Limit(
+        "joint torque",
+        "JOINT_TORQUE",
+        "N m",
+        "|tau(u'', u'^2)| / torque_max",
+        group="ratio",
+        scope="joint",
+        block="torque",
+        option="torque",
+        carry="torque",
+        bound="torque_max",
+    ),
+    Limit(
+        "pressure shift",
+        "PRESSURE",
+        "m",
+        "|d_i(u'', u'^2)| / patch radius",
+        group="ratio",
+        scope="robot",
+        block="pressure",
+        option="pressure",
+        carry="pressure_shift",
+        bound="patch_radius",
+    ),
+)
+"""All limits on timings, in the order of the compiled passes: speeds, accelerations, forces."""
+
+LIMIT_NAMES = tuple(limit.name for limit in LIMITS)
+
+
+def limits_of_block(block: str) -> tuple[Limit, ...]:
+    """Return the limits of a block, in the order of its coefficients."""
+    return tuple(limit for limit in LIMITS if limit.block == block)
+
+
+def passes_enumeration() -> str:
+    """Return the C declarations of the limits and of their slack groups."""
+    groups = list(dict.fromkeys(limit.group for limit in LIMITS))
+    names = ", ".join(limit.symbol for limit in LIMITS)
+    own = ", ".join(limit.group.upper() for limit in LIMITS)
+    return (
+        f"enum {{ {names}, KINDS }};\n"
+        f"enum {{ {', '.join(group.upper() for group in groups)}, GROUPS }};\n"
+        f"static const int GROUP[KINDS] = {{{own}}};\n"
+    )
+
 
 SPEEDS_OF_BOX = 4
 """Speeds of the box: payload, payload rotation, reference, reference rotation."""
@@ -97,305 +257,3 @@ def limit_layout(workcell: Workcell) -> BlockLayout:
     j = sum(robot.velocity_max.shape[0] for robot in workcell.robots)
     sizes = {"speed": j + SPEEDS_OF_BOX, "acceleration": 2 * j, "cone": 12, "force": 9, "moment": 6}
     return BlockLayout(j, sizes | {"torque": 3 * j, "wrench": 6 * j})
-
-
-PATH_OUTPUTS = ("pose", "pose_first", "pose_second", "q_1", "q_2")
-"""Outputs of `path_function` that `sample_limits_function` takes; poses are extended by the
-redundant joints."""
-
-
-def path_function(model: CellModel, samples: int) -> ca.Function:
-    """Return the path's variables x (n_path,) -> box and arms at uniform samples of u in [0, 1].
-
-    Outputs (NumPy shapes, n samples): those of `PATH_OUTPUTS`: the extended pose and its
-    derivatives by u (n, 6 + m), and both arms' joints (n, joints of the arm); then per arm i = 1, 2
-    ik_residual_i, lost_i, limit_margin_i, manipulability_i (n,) as in
-    `symbolic.robot.arm.TRACK_OUTPUTS`.
-
-    Args:
-        model: the cell.
-        samples: number of samples, at least 3.
-    """
-    workcell = model.workcell
-    x, task = ca.MX.sym("x", workcell.task.n_path), workcell.task
-    handed = mx_given(task, *workcell.robots, model)
-    waypoints = waypoint_matrix(task, x, of(handed, task))
-    basis = path_basis(len(task.waypoints), np.linspace(0.0, 1.0, samples))
-    moved = extended_motion(task, x, basis, waypoints, of(handed, task))
-    outputs = dict(zip(PATH_OUTPUTS, moved, strict=False))
-    no_wrench = ca.DM.zeros(6, samples)
-    verdicts: dict[str, ca.MX] = {}
-    for i, (robot, contact) in enumerate(zip(workcell.robots, workcell.contacts, strict=True)):
-        follow = follow_function(robot, model.robots[i], contact, samples, f"limits_arm_{i + 1}")
-        start = start_posture(model, i, handed)
-        results = follow(start, outputs["pose"], no_wrench, *of(handed, robot).values())
-        tracked = dict(zip(TRACK_OUTPUTS, results, strict=True))
-        outputs[f"q_{i + 1}"] = tracked["q"]
-        verdicts |= {f"{name}_{i + 1}": tracked[name] for name in ARM_CHECK_OUTPUTS}
-    outputs |= verdicts
-    return named_function("path", {"x": x} | handed, outputs)
-
-
-def sample_limits_function(model: CellModel) -> ca.Function:
-    """Return `PATH_OUTPUTS` of one sample -> its coefficients, limits (size,) by `limit_layout`."""
-    workcell = model.workcell
-    payload, task, layout = workcell.payload, workcell.task, limit_layout(workcell)
-    given = [ca.SX.sym(name, task.extended_size) for name in ("pose", "first", "second")]
-    pose, first, second = (values[:6] for values in given)
-    held = sx_given(payload).values()
-    box = dict(zip(BOX_OUTPUTS, box_function(workcell)(pose, first, second, *held), strict=True))
-    rotation = ca.reshape(box["rotation"], 3, 3).T
-    axes = ca.mtimes(rotation, number(workcell.contacts[0].T_box_pad[:3, :3]))
-    q, speed, by_a, by_w, torque, wrench = [], [], [], [], [], []
-    for i, (robot, contact) in enumerate(zip(workcell.robots, workcell.contacts, strict=True)):
-        q.append(ca.SX.sym(f"q_{i + 1}", robot.velocity_max.shape[0]))
-        derivatives = arm_derivative_function(robot, model.robots[i], contact, f"limits_of_{i + 1}")
-        own_numbers = sx_given(robot).values()
-        arm = dict(zip(ARM_OUTPUTS, derivatives(q[i], *given, *own_numbers), strict=True))
-        torque_max = number(robot.torque_max)
-        speed.append(arm["q_first"] / number(robot.velocity_max))
-        by_a.append(arm["q_first"] / number(robot.acceleration_max))
-        by_w.append(arm["q_second"] / number(robot.acceleration_max))
-        own = ("torque_by_acceleration", "torque_by_speed", "torque_at_rest")
-        torque.append(ca.horzcat(*[arm[name] / torque_max for name in own]))
-        world = ca.reshape(arm["wrench_torque"], 6, robot.velocity_max.shape[0]).T
-        turned = ca.mtimes(world, ca.diagcat(axes, axes))
-        wrench.append(ca.mtimes(ca.diag(1.0 / torque_max), turned))
-    linear, angular = ca.norm_2(first[:3]), ca.norm_2(box["angular_first"])
-    weight = ca.DM(GRAVITY) * payload.mass
-    forces = (box["force_by_acceleration"], box["force_by_speed"], -weight)
-    moments = (box["moment_by_acceleration"], box["moment_by_speed"])
-    blocks = {
-        "speed": ca.vertcat(
-            *speed,
-            linear / payload.velocity_max,
-            angular / payload.angular_velocity_max,
-            linear / task.reference_speed,
-            angular / task.reference_angular_speed,
-        ),
-        "acceleration": ca.vertcat(*by_a, *by_w),
-        "cone": ca.vertcat(
-            ca.vertcat(first[:3], second[:3]) / payload.acceleration_max,
-            ca.vertcat(box["angular_first"], box["angular_second"])
-            / payload.angular_acceleration_max,
-        ),
-        "force": ca.vertcat(*[ca.mtimes(axes.T, force) for force in forces]),
-        "moment": ca.vertcat(*[ca.mtimes(axes.T, moment) for moment in moments]),
-        "torque": ca.vec(ca.vertcat(*torque)),
-        "wrench": ca.vec(ca.vertcat(*wrench).T),
-    }
-    assert {name: block.shape[0] for name, block in blocks.items()} == layout.sizes
-    limits = ca.vertcat(*[ca.densify(blocks[name]) for name in layout.sizes])
-    inputs = dict(zip(PATH_OUTPUTS, (*given, *q), strict=True)) | limit_numbers(workcell)
-    return named_function("sample_limits", inputs, {"limits": limits})
-
-
-def limit_numbers(workcell: Workcell) -> dict[str, ca.SX]:
-    """Return the parameters that `sample_limits_function` takes after its other inputs."""
-    return sx_given(workcell.task, *workcell.robots, workcell.payload)
-
-
-def _held(
-    workcell: Workcell, blocks: dict[str, ca.SX], a: ca.SX, w: ca.SX, detached: Detached | None
-) -> HeldLoad:
-    """Return contact wrenches along the axes of contact 1 from the blocks force and moment."""
-    by = [blocks["force"][3 * k : 3 * k + 3] for k in range(3)]
-    axes, centre = workcell.contacts[0].T_box_pad[:3, :3], workcell.payload.centre_of_mass
-    arms = [ca.SX(number(axes.T @ (c.T_box_pad[:3, 3] - centre))) for c in workcell.contacts]
-    asked = ContactLoad(
-        by[0] * a + by[1] * w + by[2],
-        blocks["moment"][:3] * a + blocks["moment"][3:] * w,
-        (arms[0], arms[1]),
-        ca.SX(ca.DM.eye(3)),
-        frictions(workcell),
-    )
-    return held_by(workcell, workcell.task.allocation, asked, detached)
-
-
-def force_functions(workcell: Workcell) -> tuple[ca.Function, ca.Function]:
-    """Return both normal forces at one sample, which are convex in (u'', u'^2), and their slopes.
-
-    Both take the force (9,) and moment (6,) blocks of `limit_layout` as one input, then u'' and
-    u'^2, and the payload's parameters. `limit_forces` gives (2,) [N], and the solved variables
-    (k,): the grip of soft fingers, or the state of the program that finds the forces, which then
-    are those on its central path (`symbolic.contact.soft_grasp`). `limit_force_slopes` and
-    `ratio_functions` take it last and solve nothing; `limit_force_slopes` gives the forces and
-    their derivatives (2,) by u'' and by u'^2.
-    """
-    sizes = limit_layout(workcell).sizes
-    names = ("limit_forces", "limit_force_slopes")
-    if not workcell.has_closed_form:
-        handed = mx_given(workcell.payload)
-        asked = [ca.MX.sym("asked", sizes["force"] + sizes["moment"]), *map(ca.MX.sym, "aw")]
-        asked += handed.values()
-        load, by_timing = _load_function(workcell)(*asked)
-        soft = SoftGrasp(Grasp(workcell), TIMING_BARRIER_WEIGHT)
-        found, state = soft.solved(load, handed), ca.MX.sym("solved", soft.size)
-        normal, slope = soft.slopes()(state, *handed.values())
-        slopes = ca.horzsplit(ca.mtimes(slope.T, by_timing))
-        alone = ca.densify(ca.mtimes(soft.normals, found))
-        return (
-            ca.Function(names[0], asked, [alone, found]),
-            ca.Function(names[1], [*asked, state], [normal, *slopes]),
-        )
-    blocks = {name: ca.SX.sym(name, sizes[name]) for name in ("force", "moment")}
-    inputs, alone, sloping = _inputs(workcell, blocks), Detached(0), Detached(1)
-    value, varied = (
-        _held(workcell, blocks, inputs["a"], inputs["w"], of).normal for of in (alone, sloping)
-    )
-    found = alone.replaced([ca.densify(value), alone.symbols])
-    outputs = dict(zip(("value", "solved"), found, strict=True))
-    return named_function(names[0], inputs, outputs), _slopes(names[1], varied, inputs, sloping)
-
-
-def _load_function(workcell: Workcell) -> ca.Function:
-    """Return blocks force and moment of `limit_layout`, u'' and u'^2 -> the load (6,) about the box
-    frame's origin, box axes, and its derivatives (6, 2) by u'' and u'^2."""
-    size = limit_layout(workcell).sizes["force"]
-    payload = workcell.payload
-    axes, centre = number(workcell.contacts[0].T_box_pad[:3, :3]), number(payload.centre_of_mass)
-    asked = ca.SX.sym("asked", size + limit_layout(workcell).sizes["moment"])
-    timing = ca.SX.sym("timing", 2)
-    factors = ca.vertcat(timing, 1.0)
-    force = ca.mtimes(axes, ca.mtimes(ca.reshape(asked[:size], 3, 3), factors))
-    about = ca.mtimes(axes, ca.mtimes(ca.reshape(asked[size:], 3, 2), timing))
-    load = ca.vertcat(force, about + ca.cross(ca.SX(centre), force))
-    outputs = [load, ca.densify(ca.jacobian(load, timing))]
-    inputs = [asked, timing[0], timing[1], *sx_given(payload).values()]
-    return ca.Function("load", inputs, ca.cse(outputs))
-
-
-def path_force_function(workcell: Workcell) -> ca.Function:
-    """Return box pose and its derivatives by u (6,), u'' and u'^2 -> normal_force (2,) [N] and
-    slope (2, 2), of each force by u'' and by u'^2."""
-    closed, payload = workcell.has_closed_form, workcell.payload
-    kind, given = (ca.SX, sx_given) if closed else (ca.MX, mx_given)
-    numbers: dict[str, Any] = dict(given(payload))
-    own = [ca.SX(number(workcell.contacts[0].T_box_pad[:3, :3])), ca.DM(GRAVITY) * payload.mass]
-    if not closed:
-        own = [as_mx(ca.SX(value), sx_given(payload), numbers) for value in own]
-    path = {name: kind.sym(name, 6) for name in ("pose", "first", "second")}
-    a, w = kind.sym("a"), kind.sym("w")
-    moved = box_function(workcell)(*path.values(), *numbers.values())
-    box = dict(zip(BOX_OUTPUTS, moved, strict=True))
-    rotation = ca.reshape(box["rotation"], 3, 3).T
-    axes, weight = ca.mtimes(rotation, own[0]), own[1]
-    asked = (
-        *(box["force_by_acceleration"], box["force_by_speed"], -weight),
-        *(box["moment_by_acceleration"], box["moment_by_speed"]),
-    )
-    blocks = ca.vertcat(*[ca.mtimes(axes.T, part) for part in asked])
-    forces, slopes = force_functions(workcell)
-    _, solved = forces(blocks, a, w, *numbers.values())
-    force, by_a, by_w = slopes(blocks, a, w, *numbers.values(), solved)
-    outputs = {"normal_force": force, "slope": ca.vertcat(by_a.T, by_w.T)}
-    return named_function("path_force", {**path, "a": a, "w": w, **numbers}, outputs, cse=closed)
-
-
-def ratio_functions(workcell: Workcell) -> tuple[ca.Function, ca.Function]:
-    """Return limits that are not convex, at one sample, and their derivatives by (u'', u'^2).
-
-    Both take force (9,), moment (6,), torque and wrench blocks of `limit_layout` as one input, then
-    the other inputs of `limit_force_slopes`; see `force_functions`. `limit_ratios` gives
-    `contact_limits`' ratios; `limit_slopes` gives the same and their derivatives (joints + 2,) by
-    u'' and by u'^2. If a program finds the forces, shifts of the pressure are no limit and count as
-    zero.
-    """
-    sizes = limit_layout(workcell).sizes
-    names = ("force", "moment", "torque", "wrench")
-    if not workcell.has_closed_form:
-        return _program_ratios(workcell)
-    blocks = {name: ca.SX.sym(name, sizes[name]) for name in names}
-    inputs, alone, sloping = _inputs(workcell, blocks), Detached(0), Detached(1)
-    timing = inputs["a"], inputs["w"]
-    value, varied = (contact_limits(workcell, blocks, timing, of)[0] for of in (alone, sloping))
-    whole = inputs | {"solved": alone.symbols}
-    return (
-        named_function("limit_ratios", whole, {"value": ca.densify(value)}),
-        _slopes("limit_slopes", varied, inputs, sloping),
-    )
-
-
-def contact_limits(
-    workcell: Workcell,
-    blocks: dict[str, ca.SX],
-    timing: tuple[ca.SX, ca.SX],
-    detached: Detached,
-) -> tuple[ca.SX, ca.SX]:
-    """Return limits on the contact forces at one sample.
-
-    Args:
-        workcell: the cell.
-        blocks: force, moment, torque and wrench; see `limit_layout`.
-        timing: u'' and u'^2.
-        detached: see `symbolic.contact.soft_finger.Detached`.
-
-    Returns:
-        Ratios (joints + 2,): joint torques over their limits, signed, then the shifts of both
-        centres of pressure over their patch radii; normal forces (2,) [N].
-    """
-    (a, w), joints = timing, limit_layout(workcell).joints
-    held = _held(workcell, blocks, a, w, detached)
-    own = ca.reshape(blocks["torque"], joints, 3)
-    wrench_by_joint = ca.reshape(blocks["wrench"], 6, joints).T
-    torque, start = own[:, 0] * a + own[:, 1] * w + own[:, 2], 0
-    ratios = []
-    for robot, wrench in zip(workcell.robots, held.wrenches, strict=True):
-        stop = start + robot.velocity_max.shape[0]
-        ratios.append(torque[start:stop] + ca.mtimes(wrench_by_joint[start:stop, :], wrench))
-        start = stop
-    ratios += [
-        ca.sqrt(ca.sumsqr(moved) + 1e-24) / contact.patch_radius
-        for moved, contact in zip(held.shifts, workcell.contacts, strict=True)
-    ]
-    return ca.vertcat(*ratios), held.normal
-
-
-def _program_ratios(workcell: Workcell) -> tuple[ca.Function, ca.Function]:
-    """Return `ratio_functions` if a program finds the forces."""
-    layout = limit_layout(workcell)
-    sizes, joints = layout.sizes, layout.joints
-    names = ("force", "moment", "torque", "wrench")
-    ends = np.cumsum([0, sizes["force"] + sizes["moment"], sizes["torque"], sizes["wrench"]])
-    inputs = [ca.MX.sym("blocks", sum(sizes[name] for name in names)), *map(ca.MX.sym, "aw")]
-    asked, torque, wrench = ca.vertsplit(inputs[0], ends.tolist())
-    own, by_wrench = ca.reshape(torque, joints, 3), ca.reshape(wrench, 6, joints).T
-    # Each arm's joints feel its own wrench.
-    first, grasp = workcell.robots[0].velocity_max.shape[0], Grasp(workcell)
-    handed = mx_given(workcell.payload)
-    given = list(handed.values())
-    felt = as_mx(ca.SX(number(grasp.numbers.to_robots)), grasp.given, handed)
-    # The pads of the first robot come first.
-    others = WRENCH_SIZE * grasp.robots.index(1)
-    _, by_timing = _load_function(workcell)(asked, *inputs[1:], *given)
-    soft, none = SoftGrasp(grasp, TIMING_BARRIER_WEIGHT), ca.DM.zeros(2, 1)
-
-    def on_joints(held: ca.MX) -> ca.MX:
-        one = ca.mtimes(felt[:, :others], held[:others, :])
-        other = ca.mtimes(felt[:, others:], held[others:, :])
-        arms = (by_wrench[:first, :], by_wrench[first:, :])
-        return ca.vertcat(ca.mtimes(arms[0], one), ca.mtimes(arms[1], other))
-
-    ratios, state = ca.mtimes(own, ca.vertcat(*inputs[1:], 1.0)), ca.MX.sym("solved", soft.size)
-    held, by_load = soft.wrenches(slopes=True)(state, *given)
-    slopes = own[:, :2] + on_joints(ca.mtimes(by_load, by_timing))
-    alone = soft.wrenches(slopes=False)(state, *given)
-    inputs += [*given, state]
-    whole = [ratios + on_joints(held), *ca.horzsplit(slopes)]
-    return (
-        ca.Function("limit_ratios", inputs, [ca.vertcat(ratios + on_joints(alone), none)]),
-        ca.Function("limit_slopes", inputs, [ca.vertcat(value, none) for value in whole]),
-    )
-
-
-def _inputs(workcell: Workcell, blocks: dict[str, ca.SX]) -> dict[str, ca.SX]:
-    """Return the inputs of `limit_forces`, from blocks of a sample."""
-    timing = {name: ca.SX.sym(name) for name in ("a", "w")}
-    return {"sample": ca.vertcat(*blocks.values())} | timing | sx_given(workcell.payload)
-
-
-def _slopes(name: str, value: ca.SX, inputs: dict[str, ca.SX], detached: Detached) -> ca.Function:
-    """Return a value and its derivatives by u'' and u'^2, from inputs and solved variables."""
-    value = ca.densify(value)
-    by = {f"by_{z}": ca.densify(ca.jacobian(value, inputs[z])) for z in ("a", "w")}
-    return named_function(name, inputs | {"solved": detached.symbols}, {"value": value} | by)

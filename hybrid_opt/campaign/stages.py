@@ -250,11 +250,14 @@ class ReadyCell:
     @classmethod
     def of(cls, objectives: tuple[str, ...], workcell: Workcell) -> ReadyCell:
         """Load what is loaded when it is first needed: the cell's files are there only now."""
+        # Not imported at the top: other stages time nothing.
+        from hybrid_opt.timing.drive import search_carry, search_timing
+
         cell = Cell(workcell, objectives)
         cell.carry(cell.initial)
-        cell.timing_model.search_carry(cell.initial)
+        search_carry(cell.timing_model, cell.initial)
         if workcell.task.time_law == "optimal" and cell.force_kind.robust:
-            cell.timing_model.search_timing(cell.initial)
+            search_timing(cell.timing_model, cell.initial)
         return cls(cell, JobModel(cell.compiled, cell.timing_model))
 
 

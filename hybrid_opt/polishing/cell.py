@@ -16,7 +16,7 @@ from hybrid_opt.evaluate.objectives import ROBUST_OBJECTIVES
 from hybrid_opt.polishing.robust import RobustSamples
 from symbolic.array import Array
 from symbolic.cell_model import CellBodies, CellModel
-from symbolic.limits import TIMING_BARRIER_WEIGHT
+from symbolic.limit_coefficients import TIMING_BARRIER_WEIGHT
 from symbolic.path.spline import path_basis
 from symbolic.records.cell import Workcell
 from symbolic.records.task import POSE_SIZE, Task, extended_waypoints

@@ -45,7 +45,7 @@ from hybrid_opt.polishing.solvers.quadratic import (
 )
 from hybrid_opt.robust.path_force import PathPoints, robust_path
 from hybrid_opt.timing.drive import CandidateDriver
-from hybrid_opt.timing.path_timer import PathTiming
+from hybrid_opt.timing.records import PathTiming
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.path.pieces import by_levels, stated_entries

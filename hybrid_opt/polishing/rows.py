@@ -63,8 +63,9 @@ Row = ForceRow | PressureRow | PathRow
 
 
 @cache
-def _name(constraint: PathConstraint) -> str:
-    return repr(constraint)
+def _sort_key(constraint: PathConstraint) -> tuple[str, str]:
+    """Sort by kind, then by the fields' text."""
+    return constraint.family.rstrip("_0123456789"), repr(constraint)
 
 
 class RowLayout:
@@ -81,7 +82,7 @@ class RowLayout:
         self.force_rows = sorted(row for row in listed if isinstance(row, ForceRow))
         self.pressure_rows = sorted(row for row in listed if isinstance(row, PressureRow))
         places = [row for row in listed if isinstance(row, PathRow)]
-        self.place_rows = sorted(places, key=lambda row: (_name(row.constraint), row.place))
+        self.place_rows = sorted(places, key=lambda row: (_sort_key(row.constraint), row.place))
         self.forces = slice(0, len(self.force_rows))
         self.sides = slice(self.forces.stop, self.forces.stop + sides)
         self.patches = slice(self.sides.stop, self.sides.stop + len(self.pressure_rows))

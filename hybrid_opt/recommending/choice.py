@@ -20,8 +20,7 @@ from hybrid_opt.robust.budget import GripBudget
 from hybrid_opt.robust.cases import LEADER
 from hybrid_opt.robust.force import BoxMotion, pressing_model
 from hybrid_opt.static_hold import unheld
-from hybrid_opt.timing.path_timer import PathTiming
-from hybrid_opt.timing.records import TimingLimits
+from hybrid_opt.timing.records import PathTiming, TimingLimits
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.records import Uncertainty, Workcell
@@ -256,7 +255,7 @@ class DrivenPaths:
             told: called `FORCES` times as the work goes on.
         """
         found, limits = self.options(own), []
-        if not self._robust and self._timer.compiled:
+        if not self._robust and self._timer.passes.supports(TimingLimits()):
             still = np.array([timing.limited_force for _, _, timing in self._driven(1e-6)])
             least = np.where(np.isfinite(still), still, self.highest_force)
             low = np.minimum((1.0 + LEAST_ABOVE_STILL) * least, self.highest_force)

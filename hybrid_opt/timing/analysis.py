@@ -13,6 +13,7 @@ import numpy as np
 from hybrid_opt.carry import Carry
 from hybrid_opt.progress import ShowProgress, counted
 from hybrid_opt.store.files import read_record
+from hybrid_opt.timing.drive import search_carry, search_timing
 from hybrid_opt.timing.jerk import applicable_jerk_limits, time_with_jerk
 from hybrid_opt.timing.limits import (
     RECOMPUTED_TOLERANCE,
@@ -23,7 +24,6 @@ from hybrid_opt.timing.limits import (
     limited_force,
     most_used,
     path_error,
-    place_of,
 )
 from hybrid_opt.timing.model import TimingModel
 from hybrid_opt.timing.records import (
@@ -33,6 +33,7 @@ from hybrid_opt.timing.records import (
     TimingLimits,
     TimingStatus,
     Utilisation,
+    limit_place,
 )
 from hybrid_opt.timing.robustness import Margin, robustness_margins
 from hybrid_opt.timing.solve import time_path
@@ -79,7 +80,7 @@ def check_search_timing(model: TimingModel, x: Array) -> Timing:
     Raises:
         SettingsError: x does not fit the workcell.
     """
-    carry = model.search_carry(x)
+    carry = search_carry(model, x)
     failure = path_error(model, model.path_motion(x))
     timing = check_limits(model, carry, TimingLimits())
     if failure is not None:
@@ -104,7 +105,7 @@ def _jump(model: TimingModel, carry: Carry) -> Place | None:
     end, joint = np.unravel_index(int(np.argmax(ends)), ends.shape)
     sample = 0 if end == 0 else len(carry.time) - 1
     where = int(joint), sample, float(carry.parameter[sample])
-    place = place_of(model.workcell, model.joint_names, "joint velocity", *where)
+    place = limit_place(model.workcell, model.joint_names, "joint velocity", *where)
     return replace(place, constraint="start from rest" if end == 0 else "stop at rest")
 
 
@@ -115,7 +116,7 @@ def drivable_timing(model: TimingModel, x: Array) -> Timing:
     Raises:
         SettingsError: x does not fit the workcell.
     """
-    found, limits = model.search_timing(x), model.drive_limits(float(x[-1]))
+    found, limits = search_timing(model, x), model.drive_limits(float(x[-1]))
     pieces = model.intervals / max(len(found.grid_speed) - 1, 1)
     if found.ok and pieces.is_integer():
         # Within an interval u'^2 is linear, so that its pieces are driven as it is.

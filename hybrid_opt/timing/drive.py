@@ -7,12 +7,22 @@ limit and all limits of robots, payload and contacts (`hybrid_opt.timing.path_ti
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 
 from codegen.function import NumericFunction
-from hybrid_opt.carry import DRIVE_CONSTRAINTS, FORCE_LIMIT, JOINT_TORQUE, NO_TIMING
-from hybrid_opt.timing.path_timer import PathTimer, PathTiming
-from hybrid_opt.timing.records import TimingLimits, TimingStatus
+from hybrid_opt.carry import (
+    DRIVE_CONSTRAINTS,
+    FORCE_LIMIT,
+    JOINT_TORQUE,
+    NO_TIMING,
+    Carry,
+    carry_under_time_law,
+)
+from hybrid_opt.timing.model import TimingModel
+from hybrid_opt.timing.path_timer import PathTimer
+from hybrid_opt.timing.records import PathTiming, TimingLimits, TimingStatus
 from symbolic.array import Array
 
 _AT_REST = {"normal force": FORCE_LIMIT, "joint torque": JOINT_TORQUE}
@@ -116,3 +126,33 @@ def _speed_profile_at(timing: PathTiming, u: Array) -> tuple[Array, Array, Array
     total = timing.grid_speed[interval] + speed
     time = begins[interval] + 2.0 * into / np.where(total > 0.0, total, 1.0)
     return time, speed, acceleration[interval]
+
+
+def search_timing(model: TimingModel, x: Array) -> PathTiming:
+    """Compute how a search drives a drivable carry x (n_var,) within its own force limit.
+
+    Raises:
+        SettingsError: x does not fit the workcell.
+    """
+    (found,) = _driver_of(model).timings(model.checked(x)[None])
+    return found
+
+
+def search_carry(model: TimingModel, x: Array) -> Carry:
+    """Compute the carry x (n_var,) under the task's own time law; see `hybrid_opt.carry`.
+
+    Raises:
+        SettingsError: x does not fit the workcell.
+    """
+    x = model.checked(x)
+    functions = model.compiled.evaluators
+    if model.workcell.task.time_law != "optimal":
+        return carry_under_time_law(model.workcell, functions, x, functions["candidate"](x))
+    outputs = _driver_of(model).outputs(functions["candidate"], x[None])
+    single = {name: values[0] for name, values in outputs.items()}
+    return carry_under_time_law(model.workcell, functions, x, single)
+
+
+@lru_cache(maxsize=2)
+def _driver_of(model: TimingModel) -> CandidateDriver:
+    return CandidateDriver(PathTimer(model.compiled), robust=model.is_robust)

@@ -30,6 +30,7 @@ from scipy.interpolate import BSpline
 
 from hybrid_opt.carry import Carry
 from hybrid_opt.timing.limits import (
+    LEAST_SPEED_FACTOR,
     LINEARISED_ABOVE,
     RECOMPUTED_TOLERANCE,
     PathLimits,
@@ -41,6 +42,7 @@ from hybrid_opt.timing.limits import (
 )
 from hybrid_opt.timing.model import PathMotion, TimingModel
 from hybrid_opt.timing.records import (
+    FRICTION,
     JerkLimits,
     JerkTiming,
     Place,
@@ -48,7 +50,7 @@ from hybrid_opt.timing.records import (
     TimingLimits,
     TimingStatus,
 )
-from hybrid_opt.timing.solve import LEAST_SPEED_FACTOR, time_path
+from hybrid_opt.timing.solve import time_path
 from symbolic.array import Array
 from symbolic.records import Workcell
 
@@ -234,7 +236,7 @@ class _JerkProblem:
         """(coarse points,) largest use of a limit at the finer points around each."""
         carry = self._carry(self._fine, c)
         ratios = limit_ratios(carry, self._model.workcell, self._limits)
-        del ratios["friction"]
+        del ratios[FRICTION]
         joint, box = self._jerks(self._fine, c)
         use = np.max([*[ratio.max(axis=1) for ratio in ratios.values()], joint, box], axis=0)
         between = use[1:].reshape(-1, CHECKS_PER_POINT).max(axis=1)

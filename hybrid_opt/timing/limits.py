@@ -14,20 +14,30 @@ from hybrid_opt.carry import Carry
 from hybrid_opt.robust.force import robust_model
 from hybrid_opt.robust.path_force import BY_TIMING, PathPoints, robust_path
 from hybrid_opt.timing.model import REFINEMENT, PathMotion, TimingModel
-from hybrid_opt.timing.records import Place, Timing, TimingLimits, TimingStatus, Utilisation
+from hybrid_opt.timing.records import (
+    FRICTION,
+    PER_JOINT,
+    Place,
+    Timing,
+    TimingLimits,
+    TimingStatus,
+    Utilisation,
+    limit_place,
+)
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.functions import TIMING_TOLERANCE
+from symbolic.limits import LIMITS, Limit, limits_of_block
 from symbolic.records import Workcell
-
-JOINT_CONSTRAINTS = ("joint velocity", "joint acceleration", "joint torque")
-CONTACT_CONSTRAINTS = ("normal force", "friction", "pressure shift")
 
 FRICTION_ROUNDING = 1e-6
 """The least-effort forces lie on the friction cones; this much beyond them is rounding."""
 
 RECOMPUTED_TOLERANCE = TIMING_TOLERANCE
 """Largest excess of a recomputed limit, as a share of it."""
+
+LEAST_SPEED_FACTOR = 0.98
+"""A timing that has to be slowed further to satisfy its limits has not converged."""
 
 LINEARISED_ABOVE = 0.6
 """Torques and shifts that stay below this share of their limit enter no program."""
@@ -107,17 +117,25 @@ class PathLimits:
         self._grasped = limits.robust and not self._squeezed
 
     def joint_accelerations(self) -> tuple[Array, Array]:
-        """(n, all joints) by u'' and by u'^2, with limits of both signs."""
-        limit = self._model.workcell.of_joints("acceleration_max")
-        return self.motion.q_first / limit, self.motion.q_second / limit
+        """Return the joint accelerations (n, all joints) by u'' and by u'^2, over their limits,
+        which apply to both signs."""
+        (limit,) = limits_of_block("acceleration")
+        first, second = self._derivatives(limit)
+        bound = bound_of(limit, self._model.workcell)
+        return first / bound, second / bound
 
-    def accelerations(self) -> tuple[tuple[Array, Array, float], ...]:
-        """The box's two accelerations (n, 3) by u'' and by u'^2, and the limit on their length."""
-        m, payload = self.motion, self._model.workcell.payload
-        return (
-            (m.pose_first[:, :3], m.pose_second[:, :3], payload.acceleration_max),
-            (m.angular_first, m.angular_second, payload.angular_acceleration_max),
-        )
+    def accelerations(self) -> list[tuple[Array, Array, float]]:
+        """Return the payload's accelerations (n, 3) by u'' and by u'^2, and the limits on their
+        lengths."""
+        return [
+            (first[:, :3], second[:, :3], float(bound_of(limit, self._model.workcell)))
+            for limit in limits_of_block("cone")
+            for first, second in [self._derivatives(limit)]
+        ]
+
+    def _derivatives(self, limit: Limit) -> tuple[Array, Array]:
+        m, name = self.motion, limit.path
+        return getattr(m, f"{name}_first"), getattr(m, f"{name}_second")
 
     def forces(self, a: Array, w: Array) -> list[tuple[Array, Array]]:
         """Normal forces (n, 2) that are convex in (u'', u'^2), and their slopes (n, 2, 2), at
@@ -172,21 +190,23 @@ class PathLimits:
 
 def squared_speed_limit(motion: PathMotion, workcell: Workcell, limits: TimingLimits) -> Array:
     """(n,) largest u'^2 by all limits on speeds; infinite where nothing moves."""
-    payload, task = workcell.payload, workcell.task
-    velocity = workcell.of_joints("velocity_max")
-    linear = np.linalg.norm(motion.pose_first[:, :3], axis=1)
-    angular = np.linalg.norm(motion.angular_first, axis=1)
-    demands = [
-        (np.abs(motion.q_first) / velocity).max(axis=1),
-        linear / payload.velocity_max,
-        angular / payload.angular_velocity_max,
-    ]
+    task = workcell.task
+    demands = []
+    for limit in limits_of_block("speed"):
+        if limit.path:
+            values = getattr(motion, f"{limit.path}_first")
+            values = np.abs(values) if limit.scope == "joint" else _norm(values[:, :3])
+            demands.append((values / bound_of(limit, workcell)).max(axis=1))
     if limits.reference_speed:
-        demands += [linear / task.reference_speed, angular / task.reference_angular_speed]
+        linear, angular = _norm(motion.pose_first[:, :3]), _norm(motion.angular_first)
+        demands += [
+            linear[:, 0] / task.reference_speed,
+            angular[:, 0] / task.reference_angular_speed,
+        ]
     demand = np.max(demands, axis=0)
     with np.errstate(divide="ignore"):
-        limit: Array = 1.0 / demand**2
-    return limit
+        squared: Array = 1.0 / demand**2
+    return squared
 
 
 def duration_at_speed_limits(model: TimingModel, motion: PathMotion, limits: TimingLimits) -> float:
@@ -197,40 +217,53 @@ def duration_at_speed_limits(model: TimingModel, motion: PathMotion, limits: Tim
 
 
 def limit_ratios(carry: Carry, workcell: Workcell, limits: TimingLimits) -> dict[str, Array]:
-    """Every limited quantity over its limit at every sample.
+    """Compute every limited quantity over its limit at every sample.
 
     Returns:
-        By constraint (n, all joints) for joints, (n, 2) for contacts, (n, 1) for the box; only the
-        limits that apply.
+        By name of `symbolic.limits.LIMITS`, and friction: (n, all joints) for joints, (n, 2) for
+        robots, (n, 1) for the payload; only the limits that apply.
     """
-    payload, task = workcell.payload, workcell.task
-
     friction = np.array([contact.friction for contact in workcell.contacts])
-    radius = np.array([contact.patch_radius for contact in workcell.contacts])
-    linear, angular = _norm(carry.rate[:, :3]), _norm(carry.angular_velocity)
-    ratios = {
-        "joint velocity": np.abs(carry.side_by_side("q_rate")) / workcell.of_joints("velocity_max"),
-        "joint acceleration": np.abs(carry.side_by_side("q_second"))
-        / workcell.of_joints("acceleration_max"),
-        "payload velocity": linear / payload.velocity_max,
-        "payload acceleration": _norm(carry.second_rate[:, :3]) / payload.acceleration_max,
-        "payload angular velocity": angular / payload.angular_velocity_max,
-        "payload angular acceleration": _norm(carry.angular_acceleration)
-        / payload.angular_acceleration_max,
-        "friction": carry.tangential_force
-        / np.maximum(carry.normal_force * friction, LEAST_NORMAL_FORCE),
-    }
-    if limits.torque:
-        ratios["joint torque"] = np.abs(carry.torque) / workcell.of_joints("torque_max")
-    if has_pressure_limit(workcell, limits):
-        ratios["pressure shift"] = carry.pressure_shift / radius
-    if limits.force is not None:
-        ratios["normal force"] = _near_limit(carry, workcell, limits) / limits.force
-    if limits.reference_speed:
-        ratios["path speed"] = np.maximum(
-            linear / task.reference_speed, angular / task.reference_angular_speed
-        )
+    bound = np.maximum(carry.normal_force * friction, LEAST_NORMAL_FORCE)
+    ratios = {FRICTION: carry.tangential_force / bound}
+    for limit in LIMITS:
+        if not applies(limit, workcell, limits):
+            continue
+        if limit.block == "force":
+            assert limits.force is not None
+            ratios[limit.name] = _near_limit(carry, workcell, limits) / limits.force
+        elif not limit.carry:
+            # The reference speeds: of the two limits on the payload's speed.
+            task = workcell.task
+            ratios[limit.name] = np.maximum(
+                _norm(carry.rate[:, :3]) / task.reference_speed,
+                _norm(carry.angular_velocity) / task.reference_angular_speed,
+            )
+        elif limit.scope == "joint":
+            ratios[limit.name] = np.abs(carry.side_by_side(limit.carry)) / bound_of(limit, workcell)
+        elif limit.scope == "payload":
+            vector = getattr(carry, limit.carry)[:, :3]
+            ratios[limit.name] = _norm(vector) / bound_of(limit, workcell)
+        else:
+            ratios[limit.name] = getattr(carry, limit.carry) / bound_of(limit, workcell)
     return ratios
+
+
+def applies(limit: Limit, workcell: Workcell, limits: TimingLimits) -> bool:
+    """Return True if one of `LIMITS` applies."""
+    if limit.option == "pressure":
+        return has_pressure_limit(workcell, limits)
+    return not limit.option or bool(getattr(limits, limit.option))
+
+
+def bound_of(limit: Limit, workcell: Workcell) -> Array:
+    """Return the largest values of a limited quantity: (all joints,), (2,) robots, or of the
+    payload."""
+    if limit.scope == "joint":
+        return workcell.of_joints(limit.bound)
+    if limit.scope == "payload":
+        return np.asarray(getattr(workcell.payload, limit.bound), dtype=float)
+    return np.array([getattr(contact, limit.bound) for contact in workcell.contacts])
 
 
 def limited_force(carry: Carry, workcell: Workcell, limits: TimingLimits) -> Array:
@@ -299,30 +332,11 @@ def check_limits(
     for name, ratio in ratios.items():
         sample, column = np.unravel_index(int(np.argmax(ratio)), ratio.shape)
         where = int(column), int(sample), float(carry.parameter[sample])
-        place = place_of(model.workcell, model.joint_names, name, *where)
+        place = limit_place(model.workcell, model.joint_names, name, *where)
         use[name] = Utilisation(float(ratio[sample, column]), place)
     place = most_used(use).place
     reason = f"{carry.duration:.3f} s; most used: {place}"
     return Timing(TimingStatus.OK, reason, place, carry, use, limits=limits)
-
-
-def place_of(
-    workcell: Workcell,
-    joint_names: tuple[tuple[str, ...], ...],
-    constraint: str,
-    column: int,
-    sample: int,
-    parameter: float,
-) -> Place:
-    """Where a limit is used, by the column of its `limit_ratios`."""
-    robot, joint = "", ""
-    if constraint in JOINT_CONSTRAINTS:
-        arm = int(column >= len(joint_names[0]))
-        joint = joint_names[arm][column - arm * len(joint_names[0])]
-        robot = workcell.robots[arm].name
-    elif constraint in CONTACT_CONSTRAINTS:
-        robot = workcell.robots[column].name
-    return Place(constraint, robot, joint, sample, parameter)
 
 
 def joint_use(carry: Carry, workcell: Workcell) -> dict[str, Array]:
@@ -331,7 +345,7 @@ def joint_use(carry: Carry, workcell: Workcell) -> dict[str, Array]:
     Beside the three limits, `contact torque` is the share of the contact wrench alone.
     """
     ratios = limit_ratios(carry, workcell, TimingLimits())
-    use = {name: ratios[name].max(axis=0) for name in JOINT_CONSTRAINTS}
+    use = {name: ratios[name].max(axis=0) for name in PER_JOINT}
     limit = workcell.of_joints("torque_max")
     return use | {"contact torque": (np.abs(carry.contact_torque) / limit).max(axis=0)}
 
@@ -363,7 +377,7 @@ def most_used(use: dict[str, Utilisation]) -> Utilisation:
     candidates = [
         excess
         for name, excess in use.items()
-        if name != "friction" or excess.ratio > 1.0 + FRICTION_ROUNDING
+        if name != FRICTION or excess.ratio > 1.0 + FRICTION_ROUNDING
     ]
     return max(candidates, key=lambda excess: excess.ratio)
 

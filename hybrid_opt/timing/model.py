@@ -12,15 +12,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
-from hybrid_opt.carry import ArmMotion, Carry, carry_under_time_law, joints_of
+from codegen.function import NumericFunction
+from hybrid_opt.carry import ArmMotion, Carry, joints_of
 from hybrid_opt.compiled_cell import CompiledCell
+from hybrid_opt.timing.passes import ForwardBackwardPasses
 from hybrid_opt.timing.records import TimingLimits
 from symbolic.array import Array
 from symbolic.cell_model import CellModel
 from symbolic.errors import SettingsError
 from symbolic.functions import timing_functions
-from symbolic.read.arms import arm_model
-from symbolic.records import Robot, Workcell
+from symbolic.records import Workcell
 
 INTERVALS = 200
 """Pieces of constant path acceleration."""
@@ -33,9 +34,6 @@ _SPLINE_EVERY = 2
 
 if TYPE_CHECKING:
     import casadi as ca
-
-    from hybrid_opt.timing.drive import CandidateDriver
-    from hybrid_opt.timing.path_timer import PathTiming
 
 
 @dataclass(frozen=True)
@@ -118,7 +116,10 @@ class TimingModel:
 
     Attributes:
         workcell: the cell.
+        compiled: the same with its compiled functions.
         intervals: pieces of constant path acceleration.
+        is_robust: whether force limits apply to every case of the workcell's uncertainty.
+        passes: the compiled timing at these intervals.
         joint_names: names of both arms' joints.
     """
 
@@ -139,17 +140,19 @@ class TimingModel:
             DualArmError: the model or its code cannot be built.
         """
         require_intervals(intervals)
-        self._compiled = CompiledCell.of(cell)
-        self.workcell = workcell = self._compiled.workcell
-        self.intervals, self._robust = intervals, robust
-        self.joint_names = (joint_names(workcell.robots[0]), joint_names(workcell.robots[1]))
+        self.compiled = compiled = CompiledCell.of(cell)
+        self.workcell = compiled.workcell
+        self.intervals, self.is_robust = intervals, robust
+        self.passes = ForwardBackwardPasses(compiled, intervals)
+        self.joint_names = self.passes.joint_names
+        self._sample_limits = sample_limits_set(compiled, lanes=1)
         samples = REFINEMENT * intervals + 1
         self._latest: PathMotion | None = None
 
         def make(model: CellModel) -> dict[str, ca.Function]:
             return timing_functions(model, samples)
 
-        self._functions = self._compiled.functions("timing", make, str(samples), bodies=False)
+        self._functions = compiled.functions("timing", make, str(samples), bodies=False)
 
     def path_motion(self, x: Array) -> PathMotion:
         """The geometry at `REFINEMENT` samples per interval, uniform in u.
@@ -166,7 +169,7 @@ class TimingModel:
         task = self.workcell.task
         if np.shape(x) == (task.n_path,) and task.n_path < task.n_var:
             x = np.append(x, task.force_limit[1])
-        x = self._checked(x)
+        x = self.checked(x)
         if self._latest is None or not np.array_equal(self._latest.x, x):
             out = self._functions["path_motion"](x)
             n = len(out["pose"])
@@ -178,6 +181,24 @@ class TimingModel:
             u = np.linspace(0.0, 1.0, n)
             self._latest = PathMotion(x=x.copy(), parameter=u, **values)
         return self._latest
+
+    def path_coefficients(self, motion: PathMotion) -> dict[str, Array]:
+        """Return the passes' input for one path: the coefficients of its limits, and its poses, at
+        both ends and in the middle of every interval."""
+        task, some = self.workcell.task, slice(None, None, REFINEMENT // 2)
+        box = (motion.pose, motion.pose_first, motion.pose_second)
+        joints = (motion.q, motion.q_first, motion.q_second)
+        extended = [np.zeros((len(pose[some]), task.extended_size)) for pose in box]
+        for values, pose, moved in zip(extended, box, joints, strict=True):
+            values[:, :6] = pose[some]
+            for arm, own in enumerate(joints_of(self.workcell, moved[some])):
+                for joint, place in task.redundant_of(arm):
+                    values[:, place] = own[:, joint]
+        q = map(np.ascontiguousarray, joints_of(self.workcell, motion.q[some]))
+        rows = self._sample_limits.batch(*extended, *q)["limits"]
+        names = ("pose", "pose_first", "pose_second")
+        poses = {name: values[None] for name, values in zip(names, extended, strict=True)}
+        return {"limits": rows[None]} | poses
 
     def load(self, pose: Array, rate: Array, second_rate: Array) -> dict[str, Array]:
         """`symbolic.contact.load.LOAD_OUTPUTS` for n samples (n, 6) of the box motion."""
@@ -273,36 +294,14 @@ class TimingModel:
     def drive_limits(self, force: float) -> TimingLimits:
         """The limits of drivable carries whose force limit this is [N], one of robust forces where
         the model limits these."""
-        return TimingLimits(force=force, robust=self._robust)
+        return TimingLimits(force=force, robust=self.is_robust)
 
-    def search_timing(self, x: Array) -> PathTiming:
-        """How a search drives a drivable carry x (n_var,) within its own force limit.
+    def checked(self, x: Array) -> Array:
+        """Return a decision vector (n_var,) as an array.
 
         Raises:
-            SettingsError: x does not fit the workcell.
+            SettingsError: it does not fit the workcell.
         """
-        (found,) = self._driver.timings(self._checked(x)[None])
-        return found
-
-    def search_carry(self, x: Array) -> Carry:
-        """The carry under the task's own time law, see `hybrid_opt.carry`."""
-        x = self._checked(x)
-        functions = self._compiled.evaluators
-        if self.workcell.task.time_law != "optimal":
-            return carry_under_time_law(self.workcell, functions, x, functions["candidate"](x))
-        outputs = self._driver.outputs(functions["candidate"], x[None])
-        single = {name: values[0] for name, values in outputs.items()}
-        return carry_under_time_law(self.workcell, functions, x, single)
-
-    @cached_property
-    def _driver(self) -> CandidateDriver:
-        # Not imported at the top: it is built on this module.
-        from hybrid_opt.timing.drive import CandidateDriver
-        from hybrid_opt.timing.path_timer import PathTimer
-
-        return CandidateDriver(PathTimer(self._compiled), robust=self._robust)
-
-    def _checked(self, x: Array) -> Array:
         x = np.ascontiguousarray(x, dtype=float)
         n_var = self.workcell.task.n_var
         if x.shape != (n_var,) or not np.isfinite(x).all():
@@ -310,15 +309,22 @@ class TimingModel:
         return x
 
 
+def sample_limits_set(compiled: CompiledCell, lanes: int) -> NumericFunction:
+    """Load or build `symbolic.limit_coefficients.sample_limits_function`."""
+
+    def make(model: CellModel) -> dict[str, ca.Function]:
+        # Not imported at the top: a warm start needs no CasADi.
+        from symbolic.limit_coefficients import sample_limits_function
+
+        return {"sample_limits": sample_limits_function(model)}
+
+    return compiled.functions("sample limits", make, lanes=lanes, bodies=False)["sample_limits"]
+
+
 def require_intervals(intervals: int) -> None:
     """Refuse a number of intervals that is out of range."""
     if not 10 <= intervals <= 2000:
         raise SettingsError(f"{intervals} intervals; allowed are 10 to 2000")
-
-
-def joint_names(robot: Robot) -> tuple[str, ...]:
-    """The joints of a robot in the order of q."""
-    return tuple(arm_model(robot).names)[1:]
 
 
 def contact_torque(first: int, wrench_torque: Array, wrenches: Iterable[Array]) -> Array:

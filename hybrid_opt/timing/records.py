@@ -12,7 +12,14 @@ from hybrid_opt.carry import Carry
 from hybrid_opt.shown import Displayable
 from symbolic.array import Array, Count, Figure, Range
 from symbolic.errors import SettingsError
+from symbolic.limits import LIMITS
 from symbolic.records import Workcell
+
+FRICTION = "friction"
+"""Ratio of a carry that limits no timing: the allocation of the contact forces satisfies it."""
+
+PER_JOINT = tuple(limit.name for limit in LIMITS if limit.scope == "joint")
+PER_ROBOT = (FRICTION, *(limit.name for limit in LIMITS if limit.scope == "robot"))
 
 
 class TimingStatus(StrEnum):
@@ -51,6 +58,25 @@ class Place:
     def __str__(self) -> str:
         who = " ".join(part for part in (self.robot, self.joint) if part)
         return f"{self.constraint}{f' of {who}' if who else ''} at u = {self.parameter:.4f}"
+
+
+def limit_place(
+    workcell: Workcell,
+    joint_names: tuple[tuple[str, ...], ...],
+    constraint: str,
+    column: int,
+    sample: int,
+    parameter: float,
+) -> Place:
+    """Return the place of a limit's use, by the column of its `limits.limit_ratios`."""
+    robot, joint = "", ""
+    if constraint in PER_JOINT:
+        arm = int(column >= len(joint_names[0]))
+        joint = joint_names[arm][column - arm * len(joint_names[0])]
+        robot = workcell.robots[arm].name
+    elif constraint in PER_ROBOT:
+        robot = workcell.robots[column].name
+    return Place(constraint, robot, joint, sample, parameter)
 
 
 @dataclass(frozen=True)
@@ -205,3 +231,50 @@ class JerkTiming:
             f"{100.0 * self.jerk_use[1]:.1f} % of their limits; without these {self.without:.3f} s "
             f"({100.0 * self.cost:+.1f} %)"
         )
+
+
+@dataclass(frozen=True)
+class PathTiming:
+    """The fastest timing of one path within limits, or why there is none.
+
+    Attributes:
+        status: the outcome.
+        place: where it fails, or the most used limit.
+        duration: [s], infinite without a timing.
+        peak_force: (2,) largest normal forces [N]; standing still without a timing, NaN where
+            the path itself fails.
+        use: largest share of each limit by name of the constraint, likewise; empty where the path
+            itself fails.
+        grid_speed: (intervals + 1,) path speed u' at the grid points [1/s], zero without a timing.
+        sweeps: how often both passes ran.
+        slowed: uniform factor on the path speed that made the limits hold, 1 normally.
+        robust_force: (2,) as peak_force, in every case of the workcell's uncertainty; None where
+            no limit asks for them.
+    """
+
+    status: TimingStatus
+    place: Place
+    duration: float
+    peak_force: Array
+    use: dict[str, float]
+    grid_speed: Array
+    sweeps: int = 0
+    slowed: float = 1.0
+    robust_force: Array | None = None
+
+    @property
+    def ok(self) -> bool:
+        """Whether there is a timing that respects every limit."""
+        return self.status is TimingStatus.OK
+
+    @property
+    def limited_force(self) -> float:
+        """Largest of the normal forces that its limits are about [N], see `peak_force`."""
+        known = self.peak_force if self.robust_force is None else self.robust_force
+        return float(known.max())
+
+
+def failed_timing(status: TimingStatus, place: Place, intervals: int) -> PathTiming:
+    """Return the answer for a path without a timing."""
+    speed = np.zeros(intervals + 1)
+    return PathTiming(status, place, float("inf"), np.full(2, np.nan), {}, speed)

@@ -18,14 +18,13 @@ from symbolic.cell_model import CellModel
 from symbolic.contact.force_closure import LOAD_SIZE
 from symbolic.contact.soft_finger import Detached
 from symbolic.expression import named_function, number
-from symbolic.limits import (
+from symbolic.limit_coefficients import (
     PATH_OUTPUTS,
-    BlockLayout,
     contact_limits,
-    limit_layout,
     limit_numbers,
     sample_limits_function,
 )
+from symbolic.limits import BlockLayout, limit_layout
 from symbolic.records import Workcell
 from symbolic.smooth.samples import force_branches
 

@@ -12,6 +12,7 @@ from hybrid_opt.carry import Carry
 from hybrid_opt.cell import Cell
 from hybrid_opt.evaluate.evaluation import REASONS
 from hybrid_opt.timing.analysis import check_search_timing
+from hybrid_opt.timing.drive import search_carry
 from hybrid_opt.timing.records import TimingStatus
 from symbolic.array import Array
 from symbolic.read.cell import load
@@ -111,7 +112,7 @@ def test_names_cannot_become_markup() -> None:
 def test_joint_rates_are_those_of_the_exact_derivatives() -> None:
     """Of the path's derivatives that the timing model compiles, driven with the box's speed."""
     model, x = shipped("transfer").timing_model, shipped("transfer").initial
-    carry, motion = model.search_carry(x), model.path_motion(x)
+    carry, motion = search_carry(model, x), model.path_motion(x)
 
     def at_samples(values: Array) -> Array:
         columns = [np.interp(carry.parameter, motion.parameter, column) for column in values.T]
@@ -135,7 +136,7 @@ def test_a_ramped_carry_rests_at_its_ends() -> None:
     model, rng = cell.timing_model, np.random.default_rng(4)
     near = cell.initial + 0.1 * (cell.upper - cell.lower) * rng.uniform(-1.0, 1.0, cell.n_var)
     for x in (cell.initial, np.clip(near, cell.lower, cell.upper)):
-        for arm in model.search_carry(x).arms:
+        for arm in search_carry(model, x).arms:
             np.testing.assert_allclose(arm.q_rate[[0, -1]], 0.0, atol=1e-6)
         judged = check_search_timing(model, x)
         assert "at speed" not in judged.reason

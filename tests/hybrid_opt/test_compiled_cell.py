@@ -32,6 +32,7 @@ from hybrid_opt.polishing.polisher import Polisher
 from hybrid_opt.polishing.settings import PolishSettings
 from hybrid_opt.progress import Progress
 from hybrid_opt.robust.force import RobustModel, at_rest, pressing_model
+from hybrid_opt.timing.drive import search_carry
 from hybrid_opt.timing.model import TimingModel
 from symbolic.cell_model import CellModel
 from symbolic.numbers import START
@@ -63,7 +64,7 @@ def test_the_model_is_built_once_for_all_functions(monkeypatch: pytest.MonkeyPat
     cell = Cell(rack_cell())
     assert not models
     assert cell.evaluator.functions is cell.compiled.evaluators
-    assert cell.timing_model.search_carry(cell.initial).workcell is cell.workcell
+    assert search_carry(cell.timing_model, cell.initial).workcell is cell.workcell
     assert cell.polish_functions.model is cell.compiled.bodies
     assert len(models) <= 1
 

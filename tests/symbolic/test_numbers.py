@@ -15,7 +15,7 @@ from symbolic.array import Array
 from symbolic.cell_model import CellBodies, CellModel, build_cell_bodies
 from symbolic.contact.load import load_function
 from symbolic.functions import arm_functions, sample_functions
-from symbolic.limits import path_force_function, sample_limits_function
+from symbolic.limit_coefficients import path_force_function, sample_limits_function
 from symbolic.numbers import GROUPS, HELD, START, TASK, CellNumbers
 from symbolic.read.cell import changed, load
 from symbolic.records import Workcell

@@ -13,14 +13,14 @@ import pytest
 from symbolic.array import Array
 from symbolic.cell_model import CellModel, build_cell_model
 from symbolic.contact.load import LOAD_OUTPUTS, load_function
-from symbolic.limits import (
+from symbolic.limit_coefficients import (
     PATH_OUTPUTS,
     force_functions,
-    limit_layout,
     path_function,
     ratio_functions,
     sample_limits_function,
 )
+from symbolic.limits import limit_layout
 from symbolic.path_motion import path_motion_function
 from symbolic.records import Allocation, Workcell
 from symbolic.records.poses import pose_matrix

@@ -1,27 +1,17 @@
 /* The fastest timing of one path by a backward and a forward pass over intervals of constant u''.
 
-   docs/timing.md explains the method; `symbolic.limits.LimitLayout` the numbers at a
-   sample. The text before this file defines INTERVALS, JOINTS, the SIZE of a sample's row, the
-   offset of every block (AT_...), RATIOS, CUTS, the lines that a caller gives at every sample, HELD,
-   the input with the numbers of what is held, limit_forces, limit_force_slopes, limit_ratios,
-   limit_slopes of CasADi, and the room that each of them and what the first solves for need at most
-   (ROOM_...).
+   docs/timing.md explains the method; `symbolic.limits.limit_layout` the coefficients at a sample.
+   The text before this file defines INTERVALS, JOINTS, the SIZE of a sample's row, the offset of
+   every block (AT_...), RATIOS, CUTS, the lines per sample that a caller adds, HELD, the input with
+   the payload's parameters, the enumerations of the limits and of their slack groups (`LIMITS` of
+   `symbolic.limits`), limit_forces, limit_force_slopes, limit_ratios, limit_slopes of CasADi, and
+   the largest size of their work arrays and of the solved variables (ROOM_...).
 
    x and y are the squared speeds u'^2 at the beginning and the end of an interval. There is rest at
    both ends of the path, and standing still is allowed everywhere, so that (0, 0) satisfies every
    row that is made here. */
 
 enum { REACHED, AT_REST, STUCK, SLOWED, BROKEN };
-
-enum {
-  JOINT_SPEED, BOX_SPEED, BOX_TURN, PATH_SPEED, JOINT_ACCELERATION, BOX_ACCELERATION,
-  BOX_TURN_ACCELERATION, NORMAL_FORCE, JOINT_TORQUE, PRESSURE, KINDS
-};
-
-/* Groups of limits that are tightened together. */
-enum { MOTION, FORCE, RATIO, GROUPS };
-static const int GROUP[KINDS] = {MOTION, MOTION, MOTION, MOTION, MOTION, MOTION, MOTION, FORCE,
-                                 RATIO, RATIO};
 
 #define SAMPLES (2 * INTERVALS + 1)  /* of the path: the ends of the intervals and their middles */
 #define HALF (0.5 * INTERVALS)       /* u'' = HALF (y - x) */

@@ -18,11 +18,11 @@ from hybrid_opt.polishing.polisher import Polisher
 from hybrid_opt.polishing.settings import DrivableSettings, PolishSettings
 from hybrid_opt.timing.drive import CandidateDriver
 from hybrid_opt.timing.model import TimingModel
-from hybrid_opt.timing.solve import time_path
 from symbolic.array import Array
 from symbolic.read.cell import load
 from symbolic.records import Workcell
 from symbolic.records.task import initial_decision
+from tests.hybrid_opt.timing.cells import by_toppra
 from tests.symbolic.read.samples import RACK
 
 
@@ -79,7 +79,7 @@ def disbelieved(driver: CandidateDriver | None, model: TimingModel, x: Array) ->
     """Why the timing of a decision vector is not believed: by the tenfold grid, or by the
     independent one."""
     assert driver is not None
-    found, other = driver.timings(x[None])[0], time_path(model, x, driver.limits(float(x[-1])))
+    found, other = driver.timings(x[None])[0], by_toppra(model, x, driver.limits(float(x[-1])))
     if not other.ok or abs(found.duration / other.duration - 1.0) > 5e-3:
         return f"{found.duration:.3f} s, by the independent timing {other.duration:.3f} s"
     return recheck_timing(driver, model, x)

@@ -17,7 +17,6 @@ from hybrid_opt.polishing.polisher import Polisher
 from hybrid_opt.polishing.settings import PolishSettings
 from hybrid_opt.timing.model import REFINEMENT, TimingModel
 from hybrid_opt.timing.records import TimingLimits
-from hybrid_opt.timing.solve import time_path
 from symbolic.array import Array
 from tests.hybrid_opt.polishing.cells import (
     disbelieved,
@@ -35,6 +34,7 @@ from tests.hybrid_opt.polishing.transcription import (
     Transcription,
     without_obstacles,
 )
+from tests.hybrid_opt.timing.cells import by_toppra
 
 
 @cache
@@ -48,7 +48,7 @@ def timing_model() -> TimingModel:
 
 
 def duration(x: np.ndarray) -> float:
-    return time_path(timing_model(), x, TimingLimits(force=float(x[-1]))).duration
+    return by_toppra(timing_model(), x, TimingLimits(force=float(x[-1]))).duration
 
 
 def test_the_least_duration_at_a_force_is_far_below_the_hand_made() -> None:
@@ -128,7 +128,7 @@ def transcription() -> Transcription:
 def guess(x: Array, force: float) -> Guess:
     """A driven path on the coarse grid, slower than it is driven."""
     motion = coarse().path_motion(x)
-    driven = time_path(coarse(), x, TimingLimits(force=force), motion).grid_speed
+    driven = by_toppra(coarse(), x, TimingLimits(force=force)).grid_speed
     assert driven is not None
     at = motion.at(np.arange(0, len(motion.parameter), REFINEMENT))
     return Guess(x, 0.9 * driven, at.q, at.q_first, at.q_second)
@@ -151,5 +151,5 @@ def test_least_duration_at_a_force(force: float, seed: int, polished_first: bool
     ours = compiled_duration(polished[:-1], force)
     assert ours < 0.9 * compiled_duration(x[:-1], force)
     assert compiled_duration(other.path, force) > ours * (1.0 - GAIN)
-    on_coarse = time_path(coarse(), polished, TimingLimits(force=force)).duration
+    on_coarse = by_toppra(coarse(), polished, TimingLimits(force=force)).duration
     assert other.duration == pytest.approx(on_coarse, rel=COARSE)

@@ -9,6 +9,9 @@ import numpy as np
 
 from hybrid_opt.compiled_cell import CompiledCell
 from hybrid_opt.timing.model import TimingModel
+from hybrid_opt.timing.records import Timing, TimingLimits, TimingStatus
+from hybrid_opt.timing.solve import time_path
+from hybrid_opt.timing.topp_ra import toppra_timing
 from symbolic.array import Array
 from symbolic.records import Workcell
 from tests.symbolic.cells import hand_cell, hand_model
@@ -52,3 +55,12 @@ def near_initial(rng: np.random.Generator, count: int, size: float = 1.0) -> Arr
         if not motion.lost.any() and motion.manipulability.min() > 0.01:
             found.append(x)
     return np.array(found)
+
+
+def by_toppra(model: TimingModel, x: Array, limits: TimingLimits) -> Timing:
+    """The fastest timing by TOPP-RA, which shares no method with the passes; errors of the path and
+    at rest are those of `time_path`."""
+    timing = time_path(model, x, limits)
+    if timing.ok or timing.status in (TimingStatus.SOLVER_FAILED, TimingStatus.NOT_CONVERGED):
+        return toppra_timing(model, model.path_motion(x), limits)
+    return timing

@@ -7,7 +7,7 @@ import logging
 import numpy as np
 import pytest
 
-from hybrid_opt.timing.solve import LinearLimits, SolverFailure, fastest_speed
+from hybrid_opt.timing.topp_ra import LinearLimits, SolverFailure, fastest_speed
 
 
 def rows(n: int, *limits: tuple[float, float, float]) -> LinearLimits:

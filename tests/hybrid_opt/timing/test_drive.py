@@ -21,14 +21,13 @@ from hybrid_opt.timing.analysis import drivable_timing
 from hybrid_opt.timing.drive import CandidateDriver
 from hybrid_opt.timing.path_timer import PATH_INTERVALS, PathTimer
 from hybrid_opt.timing.records import TimingLimits, TimingStatus
-from hybrid_opt.timing.solve import time_path
 from symbolic.array import Array
 from symbolic.functions import candidate_function
 from symbolic.geometry.clearance import screening_functions
 from symbolic.records import Uncertainty, Workcell
 from symbolic.records.task import initial_decision, waypoints_of
 from symbolic.robot.arm import posture_function
-from tests.hybrid_opt.timing.cells import hand_timing, near_initial, timing_of
+from tests.hybrid_opt.timing.cells import by_toppra, hand_timing, near_initial, timing_of
 from tests.symbolic.cells import hand_cell, hand_model, with_task
 
 STATIC = 98.1 / 2.0
@@ -82,7 +81,7 @@ def test_objectives_are_those_of_time_path_at_the_candidates_force() -> None:
     found = evaluator().evaluate(x)
     outputs = evaluator().outputs(x)
     for k, row in enumerate(x):
-        timing = time_path(hand_timing(100), row[:-1], TimingLimits(force=float(row[-1])))
+        timing = by_toppra(hand_timing(100), row[:-1], TimingLimits(force=float(row[-1])))
         assert timing.ok, timing.reason
         assert outputs["time"][k, -1] == pytest.approx(timing.duration, rel=2e-3)
         peak = timing.driven.peak_normal_force.max() / 117.68
@@ -108,7 +107,7 @@ def test_force_limits_hold_in_every_case_where_robust_forces_are_minimised() -> 
     for k, row in enumerate(x):
         assert found.feasible[k] == planned.feasible[k]
         limits = TimingLimits(force=59.0, robust=True)
-        timing = time_path(timing_of(unsure, 100), row[:-1], limits)
+        timing = by_toppra(timing_of(unsure, 100), row[:-1], limits)
         assert timing.ok, timing.reason
         peak = robust_model(unsure).robust_force(timing.driven).peak.max()
         assert found.objectives[k, 1] == pytest.approx(peak / 117.68, rel=2e-3)
@@ -147,7 +146,7 @@ def test_a_search_finds_a_front_that_time_path_confirms() -> None:
     rows = np.flatnonzero(non_dominated(found.objectives, found.feasible))
     assert len(rows) > 0
     best = found[rows[[int(np.argmin(found.objectives[rows, 0]))]]]
-    timing = time_path(hand_timing(100), best.x[0, :-1], TimingLimits(force=float(best.x[0, -1])))
+    timing = by_toppra(hand_timing(100), best.x[0, :-1], TimingLimits(force=float(best.x[0, -1])))
     assert timing.ok, timing.reason
     slowest = evaluator().outputs(best.x)["time"][0, -1]
     assert slowest == pytest.approx(timing.duration, rel=2e-3)
@@ -171,7 +170,7 @@ def test_a_drivable_carry_is_timed_as_the_search_found_it() -> None:
         assert timing.duration == pytest.approx(found.duration, rel=1e-9)
         assert timing.driven.normal_force.max() <= 1.005 * x[-1]
         assert timing.iterations == 0, "time_path was asked"
-        other = time_path(model, x, TimingLimits(force=float(x[-1])))
+        other = by_toppra(model, x, TimingLimits(force=float(x[-1])))
         assert timing.duration == pytest.approx(other.duration, rel=AGREEMENT)
     # What the search cannot drive is told by `time_path`.
     x = np.append(x[:-1], 0.9 * STATIC)

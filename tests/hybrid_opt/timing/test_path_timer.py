@@ -1,4 +1,4 @@
-"""Compiled timings against `time_path`, a convex program, their limits and their laws."""
+"""Compiled timings against TOPP-RA, a convex program, their limits and their laws."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ import numpy as np
 import pytest
 
 from hybrid_opt.compiled_cell import CompiledCell
-from hybrid_opt.timing import path_timer
+from hybrid_opt.timing import passes
 from hybrid_opt.timing.limits import drive_path
 from hybrid_opt.timing.model import TimingModel
 from hybrid_opt.timing.path_timer import PathTimer
 from hybrid_opt.timing.records import TimingLimits, TimingStatus
-from hybrid_opt.timing.solve import time_path
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.read.cell import load
 from symbolic.records import Workcell
 from tests.hybrid_opt.timing.cells import (
+    by_toppra,
     hand_timing,
     initial,
     near_initial,
@@ -49,8 +49,8 @@ def some_paths() -> Array:
 
 
 def assert_agrees(timer: PathTimer, model: TimingModel, x: Array, limits: TimingLimits) -> None:
-    """Duration within 0.2 % of `time_path`, limits within 0.5 % on the tenfold grid."""
-    found, expected = timer.time(x, limits), time_path(model, x, limits)
+    """Duration within 0.2 % of TOPP-RA, limits within 0.5 % on the tenfold grid."""
+    found, expected = timer.time(x, limits), by_toppra(model, x, limits)
     assert found.ok == expected.ok, (found.status, found.place, expected.reason)
     if not expected.ok:
         assert found.status is expected.status
@@ -67,7 +67,7 @@ def assert_agrees(timer: PathTimer, model: TimingModel, x: Array, limits: Timing
 @pytest.mark.parametrize(
     ("share", "factor"), [(None, 0.6), (None, 1.0), (1.01, 1.0), (1.05, 0.6), (1.3, 1.0)]
 )
-def test_durations_agree_with_time_path_and_limits_hold(share: float | None, factor: float) -> None:
+def test_durations_agree_with_toppra_and_limits_hold(share: float | None, factor: float) -> None:
     cell = with_contacts(
         with_robots(hand_cell(), torque_max=factor), patch_radius=(0.0315 * factor, 0.0315)
     )
@@ -79,7 +79,7 @@ def test_durations_agree_with_time_path_and_limits_hold(share: float | None, fac
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["rack", "transfer"])
-def test_two_hundred_random_carries_agree_with_time_path(name: str) -> None:
+def test_two_hundred_random_carries_agree_with_by_toppra(name: str) -> None:
     """At 200 intervals: at 100 some of the sharpest exceed a joint's acceleration between the
     points by 1.2 %."""
     cell = load(RACK.with_name(f"{name}.toml"))
@@ -111,11 +111,11 @@ def test_a_tilted_box_is_not_driven_where_it_could_not_rest_within_the_limit() -
     model, timer = timing_of(cell, 100), timer_of(cell, 100)
     still = model.still(model.path_motion(x.ravel())).peak_normal_force.max()
     limits = TimingLimits(force=float(1.001 * still))
-    found, other = timer.time(x.ravel(), limits), time_path(model, x.ravel(), limits)
+    found, other = timer.time(x.ravel(), limits), by_toppra(model, x.ravel(), limits)
     assert found.ok
     assert found.duration == pytest.approx(other.duration, rel=3e-3)
     too_low = TimingLimits(force=float(0.999 * still))
-    for refused in (timer.time(x.ravel(), too_low), time_path(model, x.ravel(), too_low)):
+    for refused in (timer.time(x.ravel(), too_low), by_toppra(model, x.ravel(), too_low)):
         assert refused.status is TimingStatus.INFEASIBLE_AT_REST
 
 
@@ -131,7 +131,7 @@ def test_limits_used_up_at_rest_are_named_as_time_path_names_them() -> None:
     )
     for cell, limits in cases:
         found = timer_of(cell).time(initial(), limits)
-        expected = time_path(timing_of(cell, INTERVALS), initial(), limits)
+        expected = by_toppra(timing_of(cell, INTERVALS), initial(), limits)
         assert found.status is expected.status is TimingStatus.INFEASIBLE_AT_REST
         assert found.place.constraint == expected.place.constraint
         assert found.place.joint == expected.place.joint
@@ -156,14 +156,14 @@ def test_paths_that_fail_before_any_timing() -> None:
     assert timer_of(tight).time(initial(), TimingLimits()).status is TimingStatus.JOINT_LIMITS
 
 
-def test_where_the_passes_know_no_allocation_time_path_answers(
+def test_limits_that_the_passes_do_not_support_are_timed_by_toppra(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     limits, less = TimingLimits(force=1.05 * STATIC), TimingLimits(force=0.5 * STATIC)
     compiled, still = timer_of(hand_cell(), 30).time_all(np.array([initial()] * 2), [limits, less])
-    monkeypatch.setattr(path_timer, "passes_function", lambda *_: None)
+    monkeypatch.setattr(passes, "forward_backward_passes", lambda *_: None)
     timer = timer_of(hand_cell(), 30)
-    assert not timer.compiled
+    assert not timer.passes.supports(limits)
     found = timer.time(initial(), limits)
     assert found.ok
     assert found.duration == pytest.approx(compiled.duration, rel=2e-3)

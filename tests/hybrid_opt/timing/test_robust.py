@@ -14,6 +14,7 @@ from hybrid_opt.robust.cases import worst_cases
 from hybrid_opt.robust.force import robust_model
 from hybrid_opt.static_hold import static_hold
 from hybrid_opt.timing.analysis import closest_to_reference_timing
+from hybrid_opt.timing.drive import search_carry
 from hybrid_opt.timing.limits import SpeedProfile, check_limits, drive_path, limit_ratios
 from hybrid_opt.timing.model import TimingModel
 from hybrid_opt.timing.path_timer import PathTimer
@@ -170,10 +171,10 @@ def test_forces_are_proportional_to_the_mass() -> None:
     """The payload at the limit, carried for real: its resultant is the limit."""
     x = near_initial(np.random.default_rng(2), 1)[0]
     cell = hand_cell()
-    sensitivity = payload_sensitivity(hand_timing().search_carry(x))
+    sensitivity = payload_sensitivity(search_carry(hand_timing(), x))
     mass = sensitivity.payload_limit
     heavy = with_payload(cell, mass=mass, inertia=cell.payload.inertia * mass / cell.payload.mass)
-    force = timing_of(heavy, 20).search_carry(x).peak_resultant_force.max()
+    force = search_carry(timing_of(heavy, 20), x).peak_resultant_force.max()
     assert force == pytest.approx(117.68, rel=1e-9)
     assert sensitivity.force_at(np.array([mass])).max() == pytest.approx(117.68)
     assert mass < static_hold(cell).payload_limit
@@ -215,14 +216,14 @@ def test_margins_are_where_a_full_model_of_the_changed_cell_fails(quantity: str)
 def test_a_carry_that_fails_already_has_no_margin() -> None:
     cell = with_payload(hand_cell(), centre_of_mass=np.array([0.05, 0.0, 0.0]))
     model = timing_of(cell, 20)
-    for margin in robustness_margins(model, model.search_carry(initial()))[:3]:
+    for margin in robustness_margins(model, search_carry(model, initial()))[:3]:
         assert margin.limit == margin.nominal
         assert margin.fails == "pressure shift"
 
 
 def test_least_patch_radius_is_the_largest_shift() -> None:
     model = hand_timing()
-    tilted = model.search_carry(near_initial(np.random.default_rng(9), 1)[0])
+    tilted = search_carry(model, near_initial(np.random.default_rng(9), 1)[0])
     margins = by_name(robustness_margins(model, tilted))
     for i, name in enumerate(("first", "second")):
         assert margins[f"patch radius of {name}"].limit == tilted.pressure_shift[:, i].max()

@@ -26,7 +26,8 @@ from hybrid_opt.timing.limits import limit_ratios
 from hybrid_opt.timing.model import TimingModel
 from hybrid_opt.timing.records import JerkLimits, Timing, TimingLimits, TimingStatus
 from hybrid_opt.timing.robustness import robustness_margins
-from hybrid_opt.timing.solve import linearised_rows, time_path
+from hybrid_opt.timing.solve import time_path
+from hybrid_opt.timing.topp_ra import linearised_rows
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.read.cell import load

@@ -1,0 +1,379 @@
+"""Fastest timings of paths by a compiled backward and forward pass; docs/timing.md explains it.
+
+At a point of the path every limit bounds a function of u'' and u'^2 (`symbolic.limits`). Robust
+forces are convex in (u'', u'^2) (`hybrid_opt.robust.path_force`), but take an interior-point method
+per case. So they enter as supporting lines: the passes time the paths, where the forces come near
+the limit their tangents are added, and the passes run again (Kelley's cutting planes).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import cached_property
+from importlib.resources import files
+
+import numpy as np
+from numpy.typing import NDArray
+
+from codegen.build import load_or_compile
+from codegen.cache import source_digest
+from codegen.function import NumericFunction, Signature
+from hybrid_opt.compiled_cell import CompiledCell
+from hybrid_opt.robust.path_force import BY_TIMING, PathPoints, RobustPath, robust_path
+from hybrid_opt.timing.records import (
+    PathTiming,
+    Place,
+    TimingLimits,
+    TimingStatus,
+    failed_timing,
+    limit_place,
+)
+from symbolic.array import Array
+from symbolic.limits import LIMIT_NAMES, limit_layout, passes_enumeration
+from symbolic.read.arms import arm_model
+from symbolic.records import Robot, Workcell
+
+CUTS_PER_SAMPLE = 24
+"""Supporting lines that a sample has room for; the oldest make room for new ones."""
+
+MAX_CUT_ITERATIONS = 20
+"""Times that paths are driven anew with more lines."""
+
+CUT_TOLERANCE = 1e-4
+"""Excess over the limit that counts as none, as a share of it."""
+
+CUT_ABOVE = 0.98
+"""Forces above this share of the limit have a tangent in advance."""
+
+REST_UTILISATION = 1.0 - 1e-6
+"""Share of the limit that standing still may use, as in the passes."""
+
+
+AtRest = tuple[Array, int]
+"""Where standing still needs more than the limit: largest robust forces (2,) of both robots there
+[N], and the sample where the larger of them is."""
+
+
+class ForwardBackwardPasses:
+    """The compiled passes of one workcell.
+
+    Attributes:
+        workcell: the cell.
+        intervals: pieces of constant path acceleration.
+        joint_names: of both arms' joints.
+    """
+
+    def __init__(self, compiled: CompiledCell, intervals: int, threads: int = 1) -> None:
+        """Load or build the passes; so many threads share a batch of paths.
+
+        Raises:
+            DualArmError: the code cannot be built.
+        """
+        self._compiled, self._threads = compiled, threads
+        self.workcell, self.intervals = compiled.workcell, intervals
+        first, second = compiled.workcell.robots
+        self.joint_names = (joint_names(first), joint_names(second))
+        self._passes = forward_backward_passes(compiled, intervals)
+
+    def supports(self, limits: TimingLimits) -> bool:
+        """Return True if the passes impose these limits: they need contact wrenches that follow
+        from the load alone, and for robust forces pads with one squeeze."""
+        return self._passes is not None and (self.workcell.has_one_squeeze or not limits.robust)
+
+    def time(self, paths: Mapping[str, Array], limits: Sequence[TimingLimits]) -> list[PathTiming]:
+        """Compute the fastest timings of paths, each within its own limits.
+
+        Args:
+            paths: by name: limits (n, 2 intervals + 1, `symbolic.limits.limit_layout`), and for
+                robust limits pose, pose_first, pose_second (n, 2 intervals + 1, 6 or more).
+            limits: (n,) that the passes support.
+        """
+        found: list[PathTiming | None] = [None] * len(limits)
+        for robust, run in ((False, self._time_planned), (True, self._time_robust)):
+            some = [row for row, each in enumerate(limits) if each.robust is robust]
+            if not some:
+                continue
+            options = np.array([_options(limits[row]) for row in some])
+            # All of them without a copy.
+            chosen = paths if len(some) == len(limits) else {k: v[some] for k, v in paths.items()}
+            for row, timing in zip(some, run(chosen, options), strict=True):
+                found[row] = timing
+        return [timing for timing in found if timing is not None]
+
+    def _time_planned(self, paths: Mapping[str, Array], options: Array) -> list[PathTiming]:
+        assert self._passes is not None, "see `supports`"
+        out = self._passes.batch(paths["limits"], options, threads=self._threads)
+        return [self._timing(out, k) for k in range(len(options))]
+
+    def _time_robust(self, paths: Mapping[str, Array], options: Array) -> list[PathTiming]:
+        drive = RobustCuttingPlanes(self._cut_passes, robust_path(self.workcell), paths, options)
+        out, still = drive.time(self._threads)
+        found = [self._timing(out, k) for k in range(len(options))]
+        for k, rest in enumerate(still):
+            limit, peak = float(options[k, 0]), drive.peak[k]
+            if rest is not None:
+                peak, sample = rest
+                arm, u = int(peak.argmax()), sample / (2 * self.intervals)
+                where = "normal force", arm, round(u * self.intervals), u
+                place = limit_place(self.workcell, self.joint_names, *where)
+                failed = failed_timing(TimingStatus.INFEASIBLE_AT_REST, place, self.intervals)
+                found[k] = replace(failed, peak_force=peak)
+            if rest is not None or found[k].ok:
+                use = found[k].use | {"normal force": float(peak.max()) / limit}
+                found[k] = replace(found[k], robust_force=peak, use=use)
+        return found
+
+    @cached_property
+    def _cut_passes(self) -> NumericFunction:
+        passes = forward_backward_passes(self._compiled, self.intervals, CUTS_PER_SAMPLE)
+        assert passes is not None, "see `supports`"
+        return passes
+
+    def _timing(self, out: dict[str, Array], k: int) -> PathTiming:
+        status = PASS_STATUSES[int(out["status"][k])]
+        use = out["use"][k]
+        if status is TimingStatus.SOLVER_FAILED:
+            interval = int(out["interval"][k])
+            place = Place("path timing", "", "", interval, interval / self.intervals)
+        else:
+            kind = int(np.argmax(use[:, 0]))
+            column, parameter = int(use[kind, 2]), float(use[kind, 1])
+            where = LIMIT_NAMES[kind], column, round(parameter * self.intervals), parameter
+            place = limit_place(self.workcell, self.joint_names, *where)
+        return PathTiming(
+            status=status,
+            place=place,
+            duration=float(out["duration"][k]),
+            peak_force=out["peak"][k],
+            use=dict(zip(LIMIT_NAMES, use[:, 0].tolist(), strict=True)),
+            grid_speed=np.sqrt(out["squared"][k]),
+            sweeps=int(out["sweeps"][k]),
+            slowed=float(out["slowed"][k]),
+        )
+
+
+def _options(limits: TimingLimits) -> list[float]:
+    force = float("inf") if limits.force is None else limits.force
+    return [force, float(limits.torque), float(limits.pressure), float(limits.reference_speed)]
+
+
+class RobustCuttingPlanes:
+    """The passes for n paths, with lines for their robust forces that become more as they run.
+
+    Attributes:
+        peak: (n, 2) largest robust forces of the last timing [N].
+    """
+
+    def __init__(
+        self,
+        passes: NumericFunction,
+        forces: RobustPath,
+        paths: Mapping[str, Array],
+        options: Array,
+    ) -> None:
+        """Without any line.
+
+        Args:
+            passes: `forward_backward_passes` with `CUTS_PER_SAMPLE`.
+            paths: their `PathTimer.path_limits`.
+            options: (n, 4) of the passes, finite force limits first.
+        """
+        n, samples = paths["pose"].shape[:2]
+        self._passes, self._forces, self._options = passes, forces, options
+        self._rows, self._limit = paths["limits"], options[:, 0]
+        names = ("pose", "pose_first", "pose_second")
+        self._parts = [np.ascontiguousarray(paths[name][:, :, :6]) for name in names]
+        # The lines of every sample, and how many it was given.
+        self._cuts = np.zeros((n, samples, CUTS_PER_SAMPLE, 3))
+        self._cuts[..., 2] = np.inf
+        self._count, self.peak = np.zeros((n, samples), dtype=np.intp), np.zeros((n, 2))
+        # Both ends and the middle of every interval, each with its interval's u''.
+        self._intervals = samples // 2
+        first = 2 * np.arange(self._intervals)[:, None]
+        self._sample = (first + np.array([0, 1, 2])).reshape(-1)
+        self._share = np.tile([0.0, 0.5, 1.0], self._intervals)
+
+    def time(self, threads: int) -> tuple[dict[str, Array], list[AtRest | None]]:
+        """The passes' outputs, and for each path whether it cannot stand still."""
+        still = self._at_rest()
+        out = self._passes.batch(self._rows, self._options, self._cuts, threads=threads)
+        left = np.array([k for k, rest in enumerate(still) if rest is None], dtype=np.intp)
+        for _ in range(MAX_CUT_ITERATIONS):
+            left = left[np.isfinite(out["duration"][left])]
+            left = left[self._cut(left, out["squared"][left])]
+            if not len(left):
+                break
+            driven = (self._rows[left], self._options[left], self._cuts[left])
+            for name, values in self._passes.batch(*driven, threads=threads).items():
+                out[name][left] = values
+        return out, still
+
+    def _at_rest(self) -> list[AtRest | None]:
+        """Which paths cannot stand still; the others get a tangent there."""
+        n, samples = self._count.shape
+        found: list[AtRest | None] = [None] * n
+        path, sample = np.divmod(np.arange(n * samples), samples)
+        points = self._points(path, sample, *np.zeros((2, n * samples)))
+        rows, ruling = self._forces.ruling_beyond(points, CUT_ABOVE * self._limit[path])
+        force, slope = ruling.force, self._forces.slopes(points.at(rows), ruling)
+        for k in np.unique(path[rows]):
+            own = path[rows] == k
+            at = int(force[own].max(axis=1).argmax())
+            if force[own].max() > REST_UTILISATION * self._limit[k]:
+                found[k] = force[own].max(axis=0), int(sample[rows][own][at])
+        place = (path[rows], sample[rows])
+        self._add(place, np.zeros((len(rows), 2)), force, slope[:, :, BY_TIMING])
+        return found
+
+    def _cut(self, chosen: NDArray[np.intp], squared: Array) -> NDArray[np.bool_]:
+        """Add tangents where timings (m, intervals + 1) of the chosen paths come near their limits;
+        which of them exceed theirs."""
+        m, per = len(chosen), len(self._sample)
+        if not m:
+            return np.zeros(0, dtype=bool)
+        begin = np.repeat(squared[:, :-1], 3, axis=1)
+        rise = np.repeat(np.diff(squared, axis=1), 3, axis=1)
+        w = (begin + self._share * rise).reshape(-1)
+        a = (rise * self._intervals / 2.0).reshape(-1)
+        path, sample = np.repeat(chosen, per), np.tile(self._sample, m)
+        points, limit = self._points(path, sample, a, w), self._limit[path]
+        rows, ruling = self._forces.ruling_beyond(points, CUT_ABOVE * limit)
+        force = ruling.force
+        exceeded = np.zeros(len(self._limit), dtype=bool)
+        exceeded[path[rows][force.max(axis=1) > (1.0 + CUT_TOLERANCE) * limit[rows]]] = True
+        self.peak[chosen] = 0.0
+        np.maximum.at(self.peak, path[rows], force)
+        for k in chosen[self.peak[chosen].max(axis=1) == 0.0]:
+            own = np.flatnonzero(path == k)
+            self.peak[k] = self._forces.at(points.at(own))[0].max(axis=0)
+        keep = np.flatnonzero(exceeded[path[rows]])
+        z = np.stack([a[rows], w[rows]], axis=1)[keep]
+        place = (path[rows][keep], sample[rows][keep])
+        slope = self._forces.slopes(points.at(rows[keep]), ruling.at(keep))
+        self._add(place, z, force[keep], slope[:, :, BY_TIMING])
+        return exceeded[chosen]
+
+    def _add(
+        self,
+        place: tuple[NDArray[np.intp], NDArray[np.intp]],
+        z: Array,
+        force: Array,
+        slope: Array,
+    ) -> None:
+        """Tangents of the larger force at points z (m, 2) of paths and samples `place`."""
+        larger, every = force.argmax(axis=1), np.arange(len(force))
+        limit = self._limit[place[0]]
+        gradient = slope[every, larger] / limit[:, None]
+        bound = 1.0 - force[every, larger] / limit + (gradient * z).sum(axis=1)
+        lines = np.column_stack([gradient, bound])
+        # Ends of neighbouring intervals share a sample: one after the other.
+        for path, sample, line in zip(*place, lines, strict=True):
+            self._cuts[path, sample, self._count[path, sample] % CUTS_PER_SAMPLE] = line
+            self._count[path, sample] += 1
+
+    def _points(
+        self, path: NDArray[np.intp], sample: NDArray[np.intp], a: Array, w: Array
+    ) -> PathPoints:
+        pose, first, second = (part[path, sample] for part in self._parts)
+        return PathPoints(pose, first, second, a, w)
+
+
+PASS_STATUSES = (
+    TimingStatus.OK,
+    TimingStatus.INFEASIBLE_AT_REST,
+    TimingStatus.SOLVER_FAILED,
+    TimingStatus.NOT_CONVERGED,
+    TimingStatus.SOLVER_FAILED,
+)
+"""Meanings of its statuses."""
+
+
+def forward_backward_passes(
+    compiled: CompiledCell, intervals: int, cuts: int = 0
+) -> NumericFunction | None:
+    """Load or build the timing of one path from its limits by a backward and a forward pass.
+
+    Inputs: samples (2 intervals + 1, `symbolic.limits.limit_layout`) at both ends and the middle of
+    every interval; options (4,): largest normal force [N], infinite for none, then 0 or 1 each for
+    limits on torques, pressure shifts and the reference speeds; with cuts, cuts (2 intervals + 1,
+    cuts, 3): at every sample lines alpha u'' + beta u'^2 <= bound with positive bounds, infinite
+    after the last line.
+
+    Outputs: status, index into `PASS_STATUSES`; interval of a failure; duration [s], infinite
+    without a timing; peak (2,) normal forces [N]; use (len(LIMIT_NAMES), 3): largest share of each
+    limit, path parameter and joint or contact there; squared (intervals + 1,) u'^2 at the grid
+    points; sweeps, iterations of both passes; slowed, factor on the speed. Without a timing, peak
+    and use are those at rest.
+
+    Args:
+        cuts: lines per sample that the caller adds.
+
+    Returns:
+        The function; None if limits do not determine the contact wrenches.
+    """
+    workcell, cache = compiled.workcell, compiled.cache
+    if workcell.has_opposite_pads and not workcell.has_closed_form:
+        return None  # among wrenches of the same effort the load function keeps the paper's
+    details = (str(intervals), str(cuts), source_digest(__name__, "symbolic.limits"), _passes_c())
+    key = compiled.key("path timing", *details, bodies=False)
+    made = load_or_compile(key, lambda: _source(compiled.symbols.workcell, intervals, cuts), cache)
+    return compiled.bound(made)
+
+
+def _passes_c() -> str:
+    return files("hybrid_opt.timing").joinpath("c/passes.c").read_text()
+
+
+def _source(workcell: Workcell, intervals: int, cuts: int) -> tuple[Signature, str]:
+    # Not imported at the top: a warm start needs no CasADi.
+    from codegen.source import handwritten_source
+    from symbolic.expression import sx_given
+    from symbolic.limit_coefficients import force_functions, ratio_functions
+
+    layout = limit_layout(workcell)
+    helpers = (*force_functions(workcell), *ratio_functions(workcell))
+    rooms = [(f.sz_arg(), f.sz_res(), f.sz_iw(), f.sz_w()) for f in helpers]
+    # `ask` of the passes hands all of them five arguments.
+    most = (max(5, *sizes) for sizes in zip(*rooms, strict=True))
+    constants = {
+        **dict(zip(("ROOM_ARG", "ROOM_RES", "ROOM_IW", "ROOM_W"), most, strict=True)),
+        "ROOM_SOLVED": max(1, helpers[0].numel_out(1)),
+        "INTERVALS": intervals,
+        "JOINTS": layout.joints,
+        "SIZE": layout.size,
+        "RATIOS": layout.joints + 2,
+        "CUTS": cuts,
+        "HELD": 3 if cuts else 2,
+        **{f"AT_{name.upper()}": place for name, place in layout.offsets.items()},
+    }
+    held = sx_given(workcell.payload)
+    # Both ends of an interval take the time of one; programs of forces are no straight code.
+    pairs = (helpers[0], helpers[2]) if workcell.has_closed_form else ()
+    constants["IN_PAIRS"] = int(bool(pairs))
+    text = "".join(
+        [
+            *[f"#define {name} {value}\n" for name, value in constants.items()],
+            passes_enumeration(),
+            _passes_c(),
+        ]
+    )
+    signature = Signature(
+        "path_timing",
+        ("samples", "options", *(("cuts",) if cuts else ()), *held),
+        ("status", "interval", "duration", "peak", "use", "squared", "sweeps", "slowed"),
+        (
+            *((2 * intervals + 1, layout.size), (4,)),
+            *(((2 * intervals + 1, cuts, 3),) if cuts else ()),
+            *((int(symbols.numel()),) for symbols in held.values()),
+        ),
+        ((), (), (), (2,), (len(LIMIT_NAMES), 3), (intervals + 1,), (), ()),
+    )
+    return signature, handwritten_source(
+        signature, text, helpers, {f"{f.name()}_in_pairs": f for f in pairs}
+    )
+
+
+def joint_names(robot: Robot) -> tuple[str, ...]:
+    """Return the joints of a robot in the order of q."""
+    return tuple(arm_model(robot).names)[1:]

@@ -1,0 +1,442 @@
+"""Validation of timings by TOPP-RA: a sequence of its linear programs. docs/timing.md explains it.
+
+At a point of the path every limit reads alpha u'' + beta u'^2 <= bound. Joint speeds and
+accelerations do so exactly. Limits that are convex in (u'', u'^2) enter as supporting lines, added
+where the last timing exceeds them: the sequence approaches the exact limit from outside (Kelley's
+cutting planes). Joint torques and pressure shifts depend on the least-effort forces in a way that
+is not convex; they are linearised about the last timing and solved again until recomputed values
+hold. toppra logs its failures and returns None or NaN: they become records with the reason.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from functools import cache
+from typing import Any
+
+import numpy as np
+
+from hybrid_opt.carry import Carry
+from hybrid_opt.timing.limits import (
+    LEAST_SPEED_FACTOR,
+    LINEARISED_ABOVE,
+    RECOMPUTED_TOLERANCE,
+    PathLimits,
+    SpeedProfile,
+    check_limits,
+    duration_at_speed_limits,
+    largest_speed_factor,
+    limit_ratios,
+    most_used,
+    squared_speed_limit,
+)
+from hybrid_opt.timing.model import REFINEMENT, PathMotion, TimingModel
+from hybrid_opt.timing.records import FRICTION, Place, Timing, TimingLimits, TimingStatus
+from symbolic.array import Array
+from symbolic.errors import SettingsError
+
+MAX_ITERATIONS = 25
+SETTLED_CHANGE = 2e-4
+"""Relative change of duration below which linearised limits count as settled."""
+
+AGREEMENT = 5e-3
+"""Largest difference of a confirmed timing from TOPP-RA's, as a share of the duration."""
+
+INTERVAL_ENDS = (0.0, 1.0)
+"""Places within an interval at which limits are imposed, as a share of its length."""
+
+POINT_TOLERANCE = 1e-3
+"""Largest excess at the points where limits are imposed, as a share of the limit."""
+
+FORCE_SHARPNESS = 0.02
+"""Tolerance of the normal force as a share of `POINT_TOLERANCE`."""
+
+
+@dataclass(frozen=True)
+class LinearLimits:
+    """Limits alpha u'' + beta u'^2 <= bound, each (n, k): at points of the path, or by interval, of
+    its constant u'' and the u'^2 at its beginning."""
+
+    alpha: Array
+    beta: Array
+    bound: Array
+
+
+@dataclass(frozen=True)
+class Validation:
+    """Durations of one path within the same limits, of a timing and by TOPP-RA.
+
+    Attributes:
+        duration, reference: of the timing, and by TOPP-RA [s]; infinite without a timing.
+    """
+
+    duration: float
+    reference: float
+
+    @property
+    def ratio(self) -> float:
+        """Return the timing's duration over TOPP-RA's."""
+        return self.duration / self.reference
+
+    @property
+    def is_confirmed(self) -> bool:
+        """Return True if both agree within `AGREEMENT`."""
+        return abs(self.ratio - 1.0) <= AGREEMENT
+
+
+def validate_timing(model: TimingModel, timing: Timing) -> Validation:
+    """Time the path of a timing of `time_path` again by TOPP-RA, within the same limits.
+
+    Raises:
+        SettingsError: there is no timing.
+    """
+    if timing.carry is None:
+        raise SettingsError(f"there is no timing to validate: {timing.reason}")
+    motion = model.path_motion(timing.carry.x)
+    return Validation(timing.duration, toppra_timing(model, motion, timing.limits).duration)
+
+
+def toppra_timing(model: TimingModel, motion: PathMotion, limits: TimingLimits) -> Timing:
+    """Compute the fastest timing by a sequence of TOPP-RA's linear programs.
+
+    Args:
+        motion: of a path that both arms follow and that can be held at rest.
+    """
+    return _CuttingPlaneProblem(model, motion, limits).solve()
+
+
+class _CuttingPlaneProblem:
+    """One path with one set of limits: linear problems from one timing to the next.
+
+    `_tightened` (intervals,) divides an interval's bounds, above one where a limit is exceeded
+    between the points at which it is imposed; `_near` says which of the limits that are not convex
+    came near their bound so far.
+    """
+
+    def __init__(self, model: TimingModel, motion: PathMotion, limits: TimingLimits) -> None:
+        self._model, self._motion, self._limits = model, motion, limits
+        intervals = model.intervals
+        offsets = np.array([round(REFINEMENT * share) for share in INTERVAL_ENDS])
+        index = (REFINEMENT * np.arange(intervals)[:, None] + offsets).reshape(-1)
+        self._at = PathLimits(model, motion.at(index), limits)
+        # The solver's path coordinate is scale times u, so that speeds are around one.
+        self._scale = duration_at_speed_limits(model, motion, limits)
+        self._grid = np.linspace(0.0, self._scale, intervals + 1)
+        still = np.zeros(len(index))
+        self._rest = self._at.ratios(still, still)
+        self._cuts = list(self._first_rows())
+        self._linearised: list[LinearLimits] = []
+        self._tightened = np.ones(intervals)
+        self._near = np.zeros(self._rest.shape[1], dtype=bool)
+        self._duration = np.inf
+
+    def _first_rows(self) -> Iterator[LinearLimits]:
+        """The limits that are linear by themselves, on speeds, which bound u'^2 alone, and on joint
+        accelerations; supporting lines of the convex ones before any timing is known."""
+        limit = squared_speed_limit(self._at.motion, self._model.workcell, self._limits)
+        limit = np.minimum(limit, SPEED_CEILING / self._scale**2)[:, None]
+        one, alpha, beta = np.ones_like(limit), *self._at.joint_accelerations()
+        yield LinearLimits(
+            np.concatenate([0.0 * one, alpha, -alpha], axis=1),
+            np.concatenate([1.0 / limit, beta, -beta], axis=1),
+            np.repeat(one, 1 + 2 * alpha.shape[1], axis=1),
+        )
+        for first, second, bound in self._at.accelerations():
+            # Both signs of two orthogonal unit vectors that span both.
+            e = _unit(first)
+            f = _unit(second - np.sum(second * e, axis=1, keepdims=True) * e)
+            yield norm_rows(first, second, bound, np.stack([e, -e, f, -f], axis=1))
+        still = np.zeros(len(self._rest))
+        for force in self._at.forces(still, still):
+            yield tangent_rows(*force, _pairs(still, still))
+
+    def solve(self) -> Timing:
+        """Solve linear problems until recomputed limits hold and nothing changes any more."""
+        squared = np.zeros(0)
+        settled = False
+        for iteration in range(1, MAX_ITERATIONS + 1):
+            linear = self._interval_rows([*self._cuts, *self._linearised])
+            found = fastest_speed(linear, self._grid)
+            if isinstance(found, SolverFailure):
+                return self._solver_failure(found, iteration)
+            squared = found
+            settled = self._advance(squared) and not self._tighten(squared)
+            if settled:
+                break
+        return self._finish(squared, iteration, settled)
+
+    def _interval_rows(self, rows: list[LinearLimits]) -> LinearLimits:
+        """The rows of each interval's points in terms of its u'' and its initial u'^2."""
+        alpha, beta, bound = (
+            np.concatenate([getattr(row, name) for row in rows], axis=1)
+            for name in ("alpha", "beta", "bound")
+        )
+        intervals, scale = self._model.intervals, self._scale
+        # Within an interval u'^2 = u'^2_0 + 2 share length u''.
+        progress = np.tile(np.array(INTERVAL_ENDS) * 2.0 * scale / intervals, intervals)[:, None]
+        alpha, beta = alpha / scale, beta / scale**2
+        shape = (intervals, len(INTERVAL_ENDS) * alpha.shape[1])
+        return LinearLimits(
+            (alpha + progress * beta).reshape(shape),
+            beta.reshape(shape),
+            bound.reshape(shape) / self._tightened[:, None],
+        )
+
+    def _at_points(self, squared: Array) -> tuple[Array, Array]:
+        """u'' and u'^2 (points,) of a timing (intervals + 1,) in the scaled coordinate."""
+        slope = np.diff(squared)
+        w = squared[:-1, None] + np.outer(slope, INTERVAL_ENDS)
+        a = np.repeat(slope / (2.0 * np.diff(self._grid)), len(INTERVAL_ENDS))
+        return a / self._scale, w.reshape(-1) / self._scale**2
+
+    def _advance(self, squared: Array) -> bool:
+        """Add or renew rows about a timing; whether it already holds and has settled."""
+        a, w = self._at_points(squared)
+        excess = self._cut(a, w)
+        ratios = self._at.ratios(a, w)
+        speed = np.sqrt(squared)
+        duration = float(np.sum(2.0 * np.diff(self._grid) / (speed[:-1] + speed[1:])))
+        change = abs(duration / self._duration - 1.0)
+        self._duration = duration
+        if ratios.size:
+            excess = max(excess, float(np.abs(ratios).max()) - 1.0)
+            self._near |= (np.abs(ratios) > LINEARISED_ABOVE).any(axis=0)
+        if not self._near.any():
+            return excess <= POINT_TOLERANCE
+        near, z = self._near, _pairs(a, w)
+        gradient = self._at.ratio_slopes(ratios, a, w)[:, near]
+        value, rest = ratios[:, near], self._rest[:, near]
+        self._linearised = [
+            linearised_rows(sign * value, sign * gradient, sign * rest, z) for sign in (1.0, -1.0)
+        ]
+        return excess <= POINT_TOLERANCE and change <= SETTLED_CHANGE
+
+    def _cut(self, a: Array, w: Array) -> float:
+        """Add supporting lines of the convex limits that a timing exceeds; the largest excess."""
+        worst_excess = -1.0
+        for first, second, limit in self._at.accelerations():
+            vector = first * a[:, None] + second * w[:, None]
+            length = np.linalg.norm(vector, axis=1, keepdims=True)
+            excess = float(length.max()) / limit - 1.0
+            worst_excess = max(worst_excess, excess)
+            if excess > POINT_TOLERANCE:
+                direction = vector / np.maximum(length, 1e-12)
+                self._cuts.append(norm_rows(first, second, limit, direction[:, None, :]))
+        forces = self._at.forces(a, w)
+        excess = max((float(force.max()) for force, _ in forces), default=0.0) - 1.0
+        worst_excess = max(worst_excess, excess)
+        # What the force limit leaves for the motion is small, so the whole of it counts.
+        if excess > POINT_TOLERANCE * FORCE_SHARPNESS:
+            self._cuts += [tangent_rows(*force, _pairs(a, w)) for force in forces]
+            worst_excess = max(worst_excess, 2.0 * POINT_TOLERANCE)
+        return worst_excess
+
+    def _tighten(self, squared: Array) -> bool:
+        """Tighten the intervals that exceed a limit between their points; whether there are any."""
+        ratios = limit_ratios(self._refined(squared), self._model.workcell, self._limits)
+        del ratios[FRICTION]
+        use = np.max([ratio.max(axis=1) for ratio in ratios.values()], axis=0)
+        excess = use.reshape(self._model.intervals, -1).max(axis=1)
+        exceeded = excess > 1.0 + RECOMPUTED_TOLERANCE / 2.0
+        self._tightened = np.where(exceeded, self._tightened * excess, self._tightened)
+        return bool(exceeded.any())
+
+    def _finish(self, squared: Array, iterations: int, settled: bool) -> Timing:
+        """Recompute on refined samples; slow down uniformly where a limit is still exceeded."""
+
+        @cache
+        def driven(factor: float) -> Timing:
+            return check_limits(self._model, self._refined(factor**2 * squared), self._limits)
+
+        factor = largest_speed_factor(lambda slower: most_used(driven(slower).use).ratio)
+        timing = driven(factor)
+        if factor < LEAST_SPEED_FACTOR or not settled:
+            reason = (
+                f"the limits hold, but only after slowing to {factor:.3f} of the speed found in "
+                f"{iterations} iterations; the timing is not the fastest"
+            )
+            timing = replace(timing, status=TimingStatus.NOT_CONVERGED, reason=reason)
+        speed = np.sqrt(factor**2 * squared) / self._scale
+        return replace(timing, grid_speed=speed, iterations=iterations, slowed=factor)
+
+    def _refined(self, squared: Array) -> Carry:
+        speeds = SpeedProfile.from_grid_speed(np.sqrt(squared) / self._scale)
+        return speeds.carry(self._model, self._motion)
+
+    def _solver_failure(self, failure: SolverFailure, iterations: int) -> Timing:
+        point = len(INTERVAL_ENDS) * failure.interval
+        columns = self._rest[point]
+        parameter = float(self._at.motion.parameter[point])
+        place = Place("path timing", "", "", failure.interval, parameter)
+        detail = ""
+        if columns.size:
+            detail = f" (at rest there, limits are used to {100.0 * np.abs(columns).max():.1f} %)"
+        return Timing(
+            TimingStatus.SOLVER_FAILED,
+            f"{failure.reason}: interval {failure.interval} of {self._model.intervals}, "
+            f"u = {place.parameter:.4f}{detail}",
+            place,
+            None,
+            iterations=iterations,
+        )
+
+
+def norm_rows(first: Array, second: Array, limit: float, directions: Array) -> LinearLimits:
+    """Supporting lines of |first u'' + second u'^2| <= limit, by (n, 3) each: along every unit
+    vector of `directions` (n, k, 3) one."""
+    alpha = np.einsum("nkd,nd->nk", directions, first) / limit
+    beta = np.einsum("nkd,nd->nk", directions, second) / limit
+    return LinearLimits(alpha, beta, np.ones_like(alpha))
+
+
+def tangent_rows(value: Array, gradient: Array, z: Array) -> LinearLimits:
+    """Supporting lines of convex values <= 1, touching them at z.
+
+    Args:
+        value: (n, k) at z.
+        gradient: (n, k, 2) by (u'', u'^2).
+        z: (n, 2).
+    """
+    bound = 1.0 - value + np.einsum("nkd,nd->nk", gradient, z)
+    return LinearLimits(gradient[..., 0], gradient[..., 1], bound)
+
+
+def linearised_rows(value: Array, gradient: Array, at_rest: Array, z: Array) -> LinearLimits:
+    """Linearisation of value <= 1 about z, kept satisfiable at rest.
+
+    Where it would forbid rest, which is truly allowed, it follows the value by u'' and the chord to
+    rest by u'^2: a row whose bound is raised instead cuts off nothing, not even z.
+
+    Args:
+        value: (n, k) at z.
+        gradient: (n, k, 2) by (u'', u'^2).
+        at_rest: (n, k) at u'' = u'^2 = 0, below one.
+        z: (n, 2) the point of linearisation.
+    """
+    lines = tangent_rows(value, gradient, z)
+    least = (1.0 - at_rest) / 2.0
+    a, w = z[:, :1], z[:, 1:]
+    chord = (value - at_rest - lines.alpha * a) / np.maximum(w, 1e-300)
+    forbids = (lines.bound < least) & (w > 0.0)
+    return LinearLimits(
+        lines.alpha,
+        np.where(forbids, chord, lines.beta),
+        np.where(forbids, 1.0 - at_rest, np.maximum(lines.bound, least)),
+    )
+
+
+def _unit(vectors: Array) -> Array:
+    length = np.linalg.norm(vectors, axis=1, keepdims=True)
+    unit: Array = np.where(length > 1e-12, vectors / np.maximum(length, 1e-12), 0.0)
+    return unit
+
+
+def _pairs(a: Array, w: Array) -> Array:
+    return np.stack([a, w], axis=1)
+
+
+SPEED_CEILING = 1e4
+"""Largest squared path speed that toppra's solver admits, in its scaled path coordinate."""
+
+
+RESCALINGS = (1.0, 0.4, 2.5)
+"""Factors on the path coordinate, tried in turn: toppra's linear programs use absolute tolerances
+and now and then call a feasible interval infeasible."""
+
+
+@dataclass(frozen=True)
+class SolverFailure:
+    """A failure of toppra: what it could not do, and the interval at which."""
+
+    reason: str
+    interval: int
+
+
+def fastest_speed(rows: LinearLimits, grid: Array) -> Array | SolverFailure:
+    """The fastest motion from rest to rest within linear limits.
+
+    Args:
+        rows: the limits.
+        grid: (intervals + 1,) increasing path coordinate, scaled so that speeds are around one.
+
+    Returns:
+        (intervals + 1,) squared path speed at the grid points, zero at both ends, or a failure.
+    """
+    found: Array | SolverFailure = SolverFailure("not tried", 0)
+    for factor in RESCALINGS:
+        scaled = LinearLimits(rows.alpha / factor, rows.beta / factor**2, rows.bound)
+        found = _solve(scaled, factor * grid)
+        if not isinstance(found, SolverFailure):
+            return found / factor**2
+    return found
+
+
+def _solve(rows: LinearLimits, grid: Array) -> Array | SolverFailure:
+    # Imported late: toppra pulls in plotting.
+    from toppra.algorithm import TOPPRA
+    from toppra.constraint import LinearConstraint
+    from toppra.interpolator import AbstractGeometricPath
+
+    class Line(AbstractGeometricPath):  # type: ignore[misc]
+        """The path coordinate itself; the limits carry all geometry."""
+
+        @property
+        def dof(self) -> int:
+            return 1
+
+        @property
+        def path_interval(self) -> Array:
+            return grid[[0, -1]]
+
+        def __call__(self, path_positions: Any, order: int = 0) -> Any:
+            raise NotImplementedError
+
+    class Limits(LinearConstraint):  # type: ignore[misc]
+        """All limits as rows F w <= g with w = (u'', u'^2)."""
+
+        def compute_constraint_params(self, *_: Any) -> tuple[Any, ...]:
+            n = len(grid)
+            f = np.zeros((n, rows.alpha.shape[1], 2))
+            g = np.ones((n, rows.alpha.shape[1]))
+            f[:-1, :, 0], f[:-1, :, 1], g[:-1] = rows.alpha, rows.beta, rows.bound
+            ceiling = np.tile([0.0, SPEED_CEILING], (n, 1))
+            unit = np.tile([1.0, 0.0], (n, 1))
+            return unit, unit[:, ::-1].copy(), np.zeros((n, 2)), f, g, None, ceiling
+
+    with _quiet():
+        algorithm = TOPPRA(
+            [Limits()],
+            Line(),
+            gridpoints=grid,
+            solver_wrapper="seidel",
+            parametrizer="ParametrizeConstAccel",
+        )
+        _, speed, _, controllable = algorithm.compute_parameterization(0.0, 0.0, return_data=True)
+    if np.isnan(controllable).any():
+        interval = int(np.flatnonzero(np.isnan(controllable).any(axis=1))[-1])
+        return SolverFailure("no speed at this place lets the path be finished", interval)
+    if speed is None:
+        return SolverFailure("the path cannot be started from rest", 0)
+    if not np.isfinite(speed).all():
+        interval = int(np.argmin(np.isfinite(speed)))
+        return SolverFailure("the forward pass broke down", min(interval, len(grid) - 2))
+    squared: Array = np.asarray(speed, dtype=float) ** 2
+    if np.any(squared[:-1] + squared[1:] <= 0.0):
+        interval = int(np.argmax(squared[:-1] + squared[1:] <= 0.0))
+        return SolverFailure("the motion comes to a standstill", interval)
+    return squared
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """toppra's log lines become statuses; nothing is printed."""
+    logger = logging.getLogger("toppra")
+    level = logger.level
+    logger.setLevel(logging.CRITICAL + 1)
+    try:
+        yield
+    finally:
+        logger.setLevel(level)
