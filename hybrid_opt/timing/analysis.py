@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -33,10 +33,12 @@ from hybrid_opt.timing.records import (
     TimingLimits,
     TimingStatus,
     Utilisation,
+    Validation,
     limit_place,
 )
 from hybrid_opt.timing.robustness import Margin, robustness_margins
 from hybrid_opt.timing.solve import time_path
+from hybrid_opt.timing.topp_ra import validate_timing
 from symbolic.array import Array, Count, Figure, Missing, Pair, Row, Shape
 from symbolic.errors import SettingsError
 from symbolic.path.pieces import same_paths
@@ -190,6 +192,7 @@ class TimedTrajectory:
         margins: largest errors of the cell's description under the timing closest to the reference
             speeds; empty without that timing.
         curve: duration against force limit, None if not computed.
+        validations: by name, of the timings of `time_path` by TOPP-RA.
     """
 
     workcell: Workcell
@@ -198,6 +201,7 @@ class TimedTrajectory:
     jerk: JerkTiming | None
     margins: tuple[Margin, ...]
     curve: ForceCurve | None
+    validations: Mapping[str, Validation]
 
 
 def time_trajectory(
@@ -227,7 +231,7 @@ def time_trajectory(
     if len(path) == task.n_var > task.n_path:
         limits = model.drive_limits(float(path[-1]))
         kept = applicable_jerk_limits(model.workcell, limits)
-    ways = 4 + (force_limit is not None) + (kept is not None) + (curve_points or 0)
+    ways = 5 + (force_limit is not None) + (kept is not None) + (curve_points or 0)
     with counted(progress, "timings", ways) as advance:
 
         def on_timing() -> None:
@@ -242,6 +246,12 @@ def time_trajectory(
         if force_limit is not None:
             timings["force limited"] = time_path(model, path, model.drive_limits(force_limit))
             on_timing()
+        validations = {
+            name: validate_timing(model, timing)
+            for name, timing in timings.items()
+            if name != "search" and timing.ok
+        }
+        on_timing()
         if kept is not None:
             jerk = time_with_jerk(model, path, limits, kept)
             timings["within jerk limits"] = jerk.timing
@@ -253,7 +263,9 @@ def time_trajectory(
         curve = None
         if curve_points is not None:
             curve = duration_against_force_limit(model, path, curve_points, on_timing)
-    return TimedTrajectory(model.workcell, nominal_duration, timings, jerk, margins, curve)
+    return TimedTrajectory(
+        model.workcell, nominal_duration, timings, jerk, margins, curve, validations
+    )
 
 
 @dataclass(frozen=True)
@@ -319,6 +331,7 @@ class TimingDocument:
         margins: largest errors of the cell's description.
         force_curve: duration against force limit, None if not computed.
         jerk: timing of a drivable carry within the cell's limits on jerk, None without.
+        validations: by name, of timings by TOPP-RA.
     """
 
     nominal_duration: Figure
@@ -326,13 +339,20 @@ class TimingDocument:
     margins: tuple[Margin, ...]
     force_curve: ForceCurve | None
     jerk: StoredJerk | None = None
+    validations: Mapping[str, Validation] = field(default_factory=dict)
 
 
 def timing_document(timed: TimedTrajectory) -> TimingDocument:
     """Return the record of a timed trajectory."""
     jerk = timed.jerk
     timings = {name: stored_timing(timing) for name, timing in timed.timings.items()}
-    found = TimingDocument(timed.nominal_duration, timings, timed.margins, timed.curve)
+    found = TimingDocument(
+        timed.nominal_duration,
+        timings,
+        timed.margins,
+        timed.curve,
+        validations=timed.validations,
+    )
     if jerk is None:
         return found
     kept = StoredJerk(jerk.timing.status, jerk.timing.duration, jerk.without, *jerk.jerk_use)

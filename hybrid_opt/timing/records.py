@@ -202,6 +202,33 @@ class Timing(Displayable):
         return self.use["normal force"].ratio * self.limits.force
 
 
+AGREEMENT = 5e-3
+"""Largest difference of a confirmed timing from TOPP-RA's, as a share of the duration."""
+
+
+@dataclass(frozen=True)
+class Validation:
+    """Durations of one path within the same limits.
+
+    Attributes:
+        duration: of a timing [s].
+        reference: by TOPP-RA [s], infinite if it finds none.
+    """
+
+    duration: Figure
+    reference: Figure
+
+    @property
+    def ratio(self) -> float:
+        """Return the timing's duration over TOPP-RA's."""
+        return self.duration / self.reference
+
+    @property
+    def is_confirmed(self) -> bool:
+        """Return True if both agree within `AGREEMENT`."""
+        return abs(self.ratio - 1.0) <= AGREEMENT
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class JerkTiming:
     """A timing within jerk limits, and their cost.

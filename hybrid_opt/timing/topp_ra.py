@@ -34,16 +34,20 @@ from hybrid_opt.timing.limits import (
     squared_speed_limit,
 )
 from hybrid_opt.timing.model import REFINEMENT, PathMotion, TimingModel
-from hybrid_opt.timing.records import FRICTION, Place, Timing, TimingLimits, TimingStatus
+from hybrid_opt.timing.records import (
+    FRICTION,
+    Place,
+    Timing,
+    TimingLimits,
+    TimingStatus,
+    Validation,
+)
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 
 MAX_ITERATIONS = 25
 SETTLED_CHANGE = 2e-4
 """Relative change of duration below which linearised limits count as settled."""
-
-AGREEMENT = 5e-3
-"""Largest difference of a confirmed timing from TOPP-RA's, as a share of the duration."""
 
 INTERVAL_ENDS = (0.0, 1.0)
 """Places within an interval at which limits are imposed, as a share of its length."""
@@ -63,28 +67,6 @@ class LinearLimits:
     alpha: Array
     beta: Array
     bound: Array
-
-
-@dataclass(frozen=True)
-class Validation:
-    """Durations of one path within the same limits, of a timing and by TOPP-RA.
-
-    Attributes:
-        duration, reference: of the timing, and by TOPP-RA [s]; infinite without a timing.
-    """
-
-    duration: float
-    reference: float
-
-    @property
-    def ratio(self) -> float:
-        """Return the timing's duration over TOPP-RA's."""
-        return self.duration / self.reference
-
-    @property
-    def is_confirmed(self) -> bool:
-        """Return True if both agree within `AGREEMENT`."""
-        return abs(self.ratio - 1.0) <= AGREEMENT
 
 
 def validate_timing(model: TimingModel, timing: Timing) -> Validation:

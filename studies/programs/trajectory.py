@@ -94,7 +94,13 @@ def _replayed(
         found = [timings([("", timing)], [robot.name for robot in workcell.robots])]
         found += [margins([("", timing)])] if timing.margins else []
         found += [force_curve(timing.force_curve)] if timing.force_curve is not None else []
-        texts = (f"\n{table.text()}" for table in found)
+        texts = [f"\n{table.text()}" for table in found]
+        texts += [
+            f"TOPP-RA confirms {name}: {check.duration:.3f} s against {check.reference:.3f} s"
+            if check.is_confirmed
+            else f"TOPP-RA disagrees on {name}: {check.duration:.3f} s, {check.reference:.3f} s"
+            for name, check in timing.validations.items()
+        ]
         yield Finding({"timing": to_json(timing)}, tuple(texts))
 
 

@@ -27,7 +27,7 @@ from hybrid_opt.timing.model import TimingModel
 from hybrid_opt.timing.records import JerkLimits, Timing, TimingLimits, TimingStatus
 from hybrid_opt.timing.robustness import robustness_margins
 from hybrid_opt.timing.solve import time_path
-from hybrid_opt.timing.topp_ra import linearised_rows
+from hybrid_opt.timing.topp_ra import linearised_rows, validate_timing
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.read.cell import load
@@ -352,3 +352,21 @@ def test_damage_is_told_with_its_place(
     path.write_text(json.dumps(to_json(timing_document(timed())) | change), encoding="utf-8")
     with pytest.raises(ResultsError, match=told):
         read_timing(path)
+
+
+@pytest.mark.parametrize(
+    "limits", [TimingLimits(), TimingLimits(force=60.0), TimingLimits(reference_speed=True)]
+)
+def test_toppra_confirms_the_timings_of_the_passes(limits: TimingLimits) -> None:
+    timing = time_path(hand_timing(), initial(), limits)
+    found = validate_timing(hand_timing(), timing)
+    assert found.duration == timing.duration
+    assert found.ratio == pytest.approx(1.0, abs=2e-3)
+    assert found.is_confirmed
+    assert not replace(found, duration=1.01 * found.duration).is_confirmed
+
+
+def test_a_path_without_timing_cannot_be_validated() -> None:
+    refused = time_path(hand_timing(), initial(), TimingLimits(force=30.0))
+    with pytest.raises(SettingsError, match="no timing to validate"):
+        validate_timing(hand_timing(), refused)

@@ -141,7 +141,7 @@ def test_programs_of_a_polish_agree_with_clarabel(monkeypatch: pytest.MonkeyPatc
         asked.append(of)
         return solve_interior_point(of)
 
-    monkeypatch.setattr(quadratic, "solve_inside", recorded)
+    monkeypatch.setattr(quadratic, "solve_interior_point", recorded)
     solved(drive_method(), start(52.0), 4)
     assert len(asked) > 10
     for of in asked:
@@ -156,7 +156,7 @@ def test_clarabel_answers_where_the_own_method_does_not(monkeypatch: pytest.Monk
     of = program(1)
     whole = solve_interior_point(of)
     cut_off = replace(whole, d=whole.d + 1e-3, ending="failed")
-    monkeypatch.setattr(quadratic, "solve_inside", lambda *_: cut_off)
+    monkeypatch.setattr(quadratic, "solve_interior_point", lambda *_: cut_off)
     found = solve_quadratic(of)
     assert found is not None
     np.testing.assert_allclose(found.d, whole.d, atol=1e-4)

@@ -1,0 +1,87 @@
+"""How many files of the project one operation runs through, and how deep its calls are nested: each
+count may fall, and no change may raise it."""
+
+from __future__ import annotations
+
+import sys
+import threading
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+import numpy as np
+import pytest
+
+import hybrid_opt as ho
+
+ROOT = str(Path(ho.__file__).resolve().parents[1])
+
+
+def traced(call: Callable[[], Any]) -> tuple[int, int]:
+    """Files of the project that a call runs through, and the depth of its frames there, after the
+    call has run once: then nothing is built or loaded any more."""
+    call()
+    files, deepest, local = set[str](), [0], threading.local()
+
+    def profile(frame: FrameType, event: str, _: Any) -> None:
+        name = frame.f_code.co_filename
+        if not name.startswith(ROOT) or ".venv" in name or "/tests/" in name:
+            return
+        depth = getattr(local, "depth", 0)
+        if event == "call":
+            files.add(name)
+            local.depth = depth + 1
+            deepest[0] = max(deepest[0], depth + 1)
+        elif event == "return":
+            local.depth = max(depth - 1, 0)
+
+    threading.setprofile(profile)
+    sys.setprofile(profile)
+    try:
+        call()
+    finally:
+        sys.setprofile(None)
+        threading.setprofile(None)
+    return len(files), deepest[0]
+
+
+@cache
+def cell() -> ho.Cell:
+    return ho.example("rack")
+
+
+@cache
+def front() -> ho.Front:
+    rng = np.random.default_rng(1)
+    return ho.search(cell().drivable(), "nsga2", evaluations=300, rng=rng)
+
+
+@cache
+def polished() -> ho.Front:
+    settings = ho.PolishSettings(attempts=1)
+    return ho.polish(front(), rng=np.random.default_rng(2), settings=settings)
+
+
+def search() -> ho.Front:
+    rng = np.random.default_rng(3)
+    return ho.search(cell().drivable(), "nsga2", evaluations=80, rng=rng)
+
+
+@pytest.mark.parametrize(
+    ("operation", "files", "depth"),
+    [
+        (lambda: cell().evaluate(cell().initial), 6, 8),
+        (lambda: ho.time_path(cell(), cell().initial, ho.TimingLimits(force=60.0)), 13, 12),
+        pytest.param(search, 35, 17, marks=pytest.mark.slow),
+        pytest.param(lambda: polished.__wrapped__(), 52, 27, marks=pytest.mark.slow),
+        pytest.param(lambda: ho.recommend(polished()), 44, 26, marks=pytest.mark.slow),
+    ],
+)
+def test_an_operation_runs_through_few_files(
+    operation: Callable[[], Any], files: int, depth: int
+) -> None:
+    found = traced(operation)
+    assert found[0] <= files
+    assert found[1] <= depth
