@@ -363,7 +363,7 @@ def _of(
         for name in key.split("."):
             stated = stated.get(name) if isinstance(stated, Mapping) else None
         value = getattr(record, key, None) if stated is None else stated
-        if value is None:
+        if value is None or isinstance(value, str):  # such as torques that are unknown
             continue
         if np.ndim(value) == 0:
             yield _Number(f"{path}.{key}", None, float(value), str(unit), value)

@@ -164,8 +164,13 @@ class CellWitness:
                 world frame [m/s^2].
 
         Raises:
-            WitnessError: MuJoCo is not installed.
+            WitnessError: MuJoCo is not installed, or torques are unknown.
         """
+        if not np.isfinite(workcell.of_joints("torque_max")).all():
+            raise WitnessError(
+                "controllers of simulated arms are scaled by torque_max, which is unknown here; "
+                "give torques of all joints"
+            )
         self.workcell = workcell
         self.settings = settings or ArmSettings()
         self.disturbance = np.asarray(disturbance, dtype=float)

@@ -11,9 +11,11 @@ from __future__ import annotations
 import os
 import re
 import sys
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stdout
 from dataclasses import dataclass
+from functools import cache
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
@@ -28,6 +30,7 @@ from symbolic.errors import OutsideError, RobotModelError, UrdfError
 from symbolic.read.arms import (
     FOLLOWING,
     Positions,
+    RobotModelWarning,
     flange_problem,
     held_joints,
     moving_joints,
@@ -129,11 +132,29 @@ LIMITS = {
 """The joints' limits: what Pinocchio calls them, where a description has them, and their range."""
 
 
+UNKNOWN = "unknown"
+"""The value of `torque_max` that stands for torques that nobody published."""
+
+
+@cache
+def _warn_unjudged(robot: str) -> None:
+    """Say once that a robot's torques limit nothing."""
+    warnings.warn(
+        f'robot {robot!r} has torque_max = "{UNKNOWN}": no carry, timing or job is judged by the '
+        "torques of its joints, and their use is shown as 0 %",
+        RobotModelWarning,
+        stacklevel=2,
+    )
+
+
 def _read_limits(table: Table, model: pin.Model | None) -> dict[str, Array | None]:
     """The limits, from the file or else from the description; (n,) each."""
     n, found = FOLLOWING if model is None else model.nq, dict[str, Array | None]()
     for key, (own, allowed) in LIMITS.items():
-        if table.has(key):
+        if key == "torque_max" and table.raw(key, None) == UNKNOWN:
+            found[key] = read_only(np.full(n, np.inf))
+            _warn_unjudged(table.text("name"))
+        elif table.has(key):
             # One number for all joints is right for a bound on magnitude, not for a range's end.
             filling = not key.startswith("position")
             found[key] = table.vector(key, (allowed,) * n, filling=filling)
@@ -157,10 +178,12 @@ def _read_limits(table: Table, model: pin.Model | None) -> dict[str, Array | Non
 def _described_limit(table: Table, key: str, allowed: Range, values: Array) -> Array:
     for joint, value in enumerate(values.tolist(), 1):
         if not allowed.contains(value):
+            more = f', or {key} = "{UNKNOWN}" to judge without torques' * (key == "torque_max")
             table.add(
                 key,
                 f"the description gives {value:g} for joint {joint}; allowed is "
-                f"{allowed.allowed()}{allowed.suspicion(value)}; correct it, or give {key} here",
+                f"{allowed.allowed()}{allowed.suspicion(value)}; correct it, or give {key} here"
+                f"{more}",
             )
             return read_only(np.ones(len(values)))
     return read_only(values)

@@ -159,7 +159,7 @@ class Robot:
         position_lower, position_upper: (n,) joint limits [rad, or m where a joint slides].
         velocity_max: (n,) [rad/s].
         acceleration_max: (n,) [rad/s^2].
-        torque_max: (n,) [N m, or N].
+        torque_max: (n,) [N m, or N]; infinite where it is unknown.
         min_manipulability: least allowed |det J| of the flange-pad Jacobian of the six joints that
             follow the box [m^3].
         xacro_arguments: names and values of the xacro file's arguments.

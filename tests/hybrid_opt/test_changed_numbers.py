@@ -271,3 +271,16 @@ def test_no_number_is_structure(name: str) -> None:
         ours, other = cell.compiled.numbers, new.compiled.numbers
         assert other.bodies_digest == ours.bodies_digest
         assert other.layout == ours.layout
+
+
+@pytest.mark.filterwarnings("ignore::symbolic.read.arms.RobotModelWarning")
+def test_unknown_torques_limit_no_timing() -> None:
+    """As large torques that no carry uses up; a third of the rack's torques makes it slower."""
+    cell = ho.example("rack").drivable()
+    torques = cell.workcell.robots[0].torque_max
+    durations = {}
+    for name, value in (("unknown", "unknown"), ("large", 1e5), ("small", 0.35 * torques)):
+        timing = ho.time_path(cell.changed({"robots.torque_max": value}), cell.initial)
+        durations[name] = np.inf if timing.carry is None else timing.carry.duration
+    assert durations["unknown"] == durations["large"]
+    assert durations["small"] > durations["large"]

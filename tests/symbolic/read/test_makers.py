@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from hybrid_opt.errors import WitnessError
 from hybrid_opt.proposing.problem import read_problem
+from hybrid_opt.witness.arms import CellWitness
 from symbolic.errors import OutsideError, WorkcellError
 from symbolic.read.arms import RobotModelWarning, _warn_left_out
-from symbolic.read.robots import named_robot
+from symbolic.read.cell import load
+from symbolic.read.robots import _warn_unjudged, named_robot
 from symbolic.records import Workcell
+from tests.symbolic.cells import RACK
 from tests.torso import Torso
 
 WHEEL = """
@@ -85,6 +90,26 @@ def test_links_with_mass_that_mimic_a_moving_joint_are_refused(tmp_path: Path) -
     torso = Torso(more=MIMIC.format(parent="chest", inertial=INERTIAL))
     with pytest.raises(WorkcellError, match="'marker_joint' mimics 'torso_joint_0', which moves"):
         cell(torso, tmp_path)
+
+
+def test_efforts_of_zero_are_no_torques_until_the_file_says_unknown(tmp_path: Path) -> None:
+    torso = Torso(effort=0.0)
+    told = r'torque_max: .* gives 0 for joint 2.* torque_max = "unknown" to judge without torques'
+    with pytest.raises(WorkcellError, match=told):
+        cell(torso, tmp_path)
+    _warn_unjudged.cache_clear()
+    with pytest.warns(RobotModelWarning, match="'left' has torque_max"):
+        found = cell(torso, tmp_path, robots=[{"torque_max": "unknown"}] * 2)
+    for robot in found.robots:
+        np.testing.assert_array_equal(robot.torque_max, np.full(7, np.inf))
+
+
+def test_arms_of_unknown_torques_are_not_simulated() -> None:
+    cell = load(RACK)
+    unknown = [replace(robot, torque_max=np.full(6, np.inf)) for robot in cell.robots]
+    free = replace(cell, robots=(unknown[0], unknown[1]))
+    with pytest.raises(WitnessError, match="torque_max, which is unknown"):
+        CellWitness(free)
 
 
 def test_fast_wrists_and_light_squeezes_are_no_other_units(tmp_path: Path) -> None:
