@@ -38,6 +38,9 @@ DEEPEST_PACKAGE = 4
 
 LONGEST_NAME = 200
 
+RELATIVE = ("./", "../")
+"""Begin of a xacro argument that is a path relative to the workcell file."""
+
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
 _PACKAGE = re.compile(rb"<name>\s*([^<\s]+)\s*</name>")
 _SKIPPED = ("build", "devel", "install", "log")

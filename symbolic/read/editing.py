@@ -15,6 +15,7 @@ from tomlkit.items import AoT, Null, Table, Whitespace
 
 from symbolic import outside
 from symbolic.errors import OutsideError, SettingsError
+from symbolic.read.descriptions import RELATIVE
 
 Changes = Mapping[str, Any]
 """Tables and keys to be set: {'task': {'initial': ...}, 'robots': [{...}, {...}]}; a list of tables
@@ -57,6 +58,11 @@ def with_paths(data: Mapping[str, Any], change: Callable[[str], str]) -> Changes
     found: dict[str, Any] = {"robots": [], "payload": changed(data.get("payload"), "path")}
     for robot in data["robots"]:
         entry: dict[str, Any] = changed(robot, "urdf", "srdf")
+        arguments = robot.get("xacro_arguments")
+        if isinstance(arguments, Mapping):
+            paths = {k: v for k, v in arguments.items() if str(v).startswith(RELATIVE)}
+            moved = {key: f"./{path}" for key, path in changed(paths, *paths).items()}
+            entry |= {"xacro_arguments": moved} if moved else {}
         folders = robot.get("package_dirs")
         if isinstance(folders, list):
             moved = [change(str(name)) for name in folders]

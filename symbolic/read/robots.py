@@ -41,6 +41,7 @@ from symbolic.read.arms import (
 )
 from symbolic.read.descriptions import (
     PACKAGE_SCHEME,
+    RELATIVE,
     Arguments,
     find_package,
     further_package_dirs,
@@ -209,7 +210,7 @@ def _read_description(
     """
     package_dirs = _read_folders(table, folder)
     own = table.table("xacro_arguments", {})
-    arguments = tuple((name, own.text(name)) for name in own)
+    arguments = tuple((name, _argument(own.text(name), folder)) for name in own)
     if table.has("robot"):
         named = _read_named(table)
         path, package_dirs = named.path, package_dirs + named.package_dirs
@@ -255,6 +256,11 @@ def _read_description(
         "drop_links": drop_links,
     }
     return described, model
+
+
+def _argument(value: str, folder: Path) -> str:
+    """Return a xacro file's argument; a relative path as one that holds in any folder."""
+    return str((folder / value).resolve()) if value.startswith(RELATIVE) else value
 
 
 @contextmanager

@@ -9,8 +9,13 @@ import pytest
 
 from symbolic.errors import OutsideError, UrdfError
 from symbolic.read import descriptions
+from symbolic.read.cell import load
+from symbolic.read.cell_files import collect_cell, unpack_cell
 from symbolic.read.descriptions import description_content, is_xacro
+from symbolic.read.editing import completed, with_paths
 from symbolic.read.urdf import read_urdf
+from tests.symbolic.cells import GOFA
+from tests.symbolic.read.samples import sample_data
 
 HEAD = '<robot name="arm" xmlns:xacro="http://www.ros.org/wiki/xacro">'
 LINK = '<link name="{name}"><collision><geometry><mesh filename="{mesh}"/></geometry></collision>'
@@ -172,3 +177,36 @@ def test_generated_urdfs_that_keep_the_namespace_are_read_as_they_are(tmp_path: 
     path = write(tmp_path, '<link name="base"/>', "arm.urdf")
     assert not is_xacro(path.read_bytes())
     assert description_content(path) == path.read_bytes()
+
+
+def test_paths_in_arguments_are_relative_to_the_workcell_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Wherever the program is started, and after the cell's file moves to another folder."""
+    (tmp_path / "robots").mkdir()
+    (tmp_path / "cells").mkdir()
+    gofa = GOFA.read_text(encoding="utf-8")
+    body = gofa[gofa.index(">", gofa.index("<robot")) + 1 : gofa.rindex("</robot>")]
+    write(tmp_path / "robots", body, "joints.xacro")
+    main = '<xacro:arg name="joints" default=""/><xacro:include filename="$(arg joints)"/>'
+    write(tmp_path / "robots", main)
+    data = sample_data()
+    for robot in data["robots"]:
+        robot |= {
+            "urdf": "../robots/arm.urdf.xacro",
+            "xacro_arguments": {"joints": "../robots/joints.xacro"},
+        }
+    path = tmp_path / "cells" / "cell.toml"
+    path.write_text(completed("", data, {}), encoding="utf-8")
+    monkeypatch.chdir("/")
+    cell = load(path)
+    assert [len(robot.torque_max) for robot in cell.robots] == [6, 6]
+
+    def moved(name: str) -> str:
+        return os.path.relpath(path.parent / name, tmp_path)
+
+    other = tmp_path / "cell.toml"
+    other.write_text(completed("", data, with_paths(data, moved)), encoding="utf-8")
+    assert load(other).robots[0].xacro_arguments == cell.robots[0].xacro_arguments
+    stored = unpack_cell(collect_cell(cell), tmp_path / "there")
+    assert stored.robots[0].flange == cell.robots[0].flange
