@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import ast
 from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -74,6 +75,29 @@ if TYPE_CHECKING:
     from symbolic.errors import WorkcellError as WorkcellError
     from symbolic.records import Uncertainty as Uncertainty
     from symbolic.records import Workcell as Workcell
+
+
+def _require_own(package: str, member: str) -> None:
+    """Refuse a package of this name from another project, which hides the one that is needed.
+
+    Raises:
+        ImportError: the package has no such member.
+    """
+    try:
+        found = find_spec(f"{package}.{member}")
+    except ModuleNotFoundError:
+        found = None
+    if found is None:
+        spec = find_spec(package)
+        where = "missing" if spec is None else f"another project's, in {spec.origin}"
+        raise ImportError(
+            f"dual-arm-carry needs its own package '{package}', but the one that is found is "
+            f"{where}; install dual-arm-carry into a virtual environment of its own"
+        )
+
+
+_require_own("symbolic", "outside")
+_require_own("codegen", "compiled")
 
 _HOMES = {
     each.name: node.module

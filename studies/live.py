@@ -32,9 +32,13 @@ def serve(options: argparse.Namespace) -> int:
     Raises:
         DualArmError: the cell has no drivable form, or viser is missing.
     """
+    from hybrid_opt.campaign.stages import build_study
+    from hybrid_opt.progress import Progress
+
     workcell = load_workcell(options.workcell)
-    print("compiling what is not compiled yet", file=sys.stderr)
-    page = ho.live(ho.Cell(workcell), port=options.port)
+    cell = ho.Cell(workcell)
+    build_study(cell.drivable(), Progress(), polish=False)
+    page = ho.live(cell, port=options.port)
     print(f"Open {page.url} in a browser; Ctrl-C ends it.", file=sys.stderr)
     try:
         threading.Event().wait()

@@ -89,11 +89,15 @@ def _run(options: argparse.Namespace) -> int:
     own = sys.argv[-len(options.arguments) :] == options.arguments
     begun = 0.0 if own else worked()  # of a process of its own imports count
     tell = (lambda text: None) if options.quiet else _teller(lambda: worked() - begun)
-    left = max(options.time - (worked() - begun), 1.0)
     proposals = ho.propose_classes(
         problem,
         rng=np.random.default_rng(options.seed),
-        settings=ho.ProposeSettings(seconds=left, bases=options.bases, classes=options.classes),
+        settings=ho.ProposeSettings(
+            seconds=options.time,
+            bases=options.bases,
+            classes=options.classes,
+            used=worked() - begun,
+        ),
         tell=tell,
     )
     if options.study is not None:

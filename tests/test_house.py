@@ -4,7 +4,10 @@ repository, and only they are shipped."""
 from __future__ import annotations
 
 import ast
+import os
 import re
+import subprocess
+import sys
 import tomllib
 from collections.abc import Iterator
 from importlib import import_module
@@ -14,6 +17,7 @@ from pathlib import Path
 import pytest
 
 from studies.options import EXTRAS
+from tests.waiting import HANGS
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("symbolic", "codegen", "hybrid_opt", "studies")
@@ -94,3 +98,24 @@ def test_messages_name_extras_as_a_user_of_the_wheel_installs_them() -> None:
     known = set(PROJECT["project"]["optional-dependencies"])
     assert {each[1] for each in extras if each} - {"extra"} <= known
     assert set(EXTRAS) <= known
+
+
+@pytest.mark.parametrize("package", ["symbolic", "codegen"])
+@pytest.mark.parametrize("file", ["{}.py", "{}/__init__.py"])
+def test_another_projects_package_is_named(tmp_path: Path, package: str, file: str) -> None:
+    foreign = tmp_path / file.format(package)
+    foreign.parent.mkdir(exist_ok=True)
+    foreign.touch()
+    for started in ("hybrid_opt", "studies.__main__"):
+        done = subprocess.run(
+            # Without site-packages, whose editable installs come before every path.
+            [sys.executable, "-S", "-c", f"import {started}"],
+            cwd=tmp_path,
+            env=os.environ | {"PYTHONPATH": f"{tmp_path}:{ROOT}"},
+            capture_output=True,
+            text=True,
+            timeout=HANGS,
+        )
+        last = done.stderr.splitlines()[-1]
+        assert last.startswith(f"ImportError: dual-arm-carry needs its own package '{package}'")
+        assert str(foreign) in last

@@ -101,6 +101,7 @@ class ProposeSettings:
             counts.
         classes: carries of different classes that are looked for, as far as the time goes.
         clock: what seconds are counted by; other programs' work does not count.
+        used: seconds that were used before, such as by a program's start.
     """
 
     seconds: float = 120.0
@@ -108,6 +109,7 @@ class ProposeSettings:
     bases: bool = False
     classes: int = 1
     clock: Callable[[], float] = worked
+    used: float = 0.0
 
     def __post_init__(self) -> None:
         if not 1.0 <= self.seconds <= 1e6:
@@ -262,7 +264,7 @@ class _Search:
     @property
     def spent(self) -> float:
         """Seconds so far."""
-        return self.settings.clock() - self.begun
+        return self.settings.used + self.settings.clock() - self.begun
 
     @property
     def out_of_time(self) -> bool:

@@ -80,12 +80,12 @@ def inspected(
         {"name": workcell.name, "facts": facts},
         (workcell.name, "", *(f"  {heading}: {text}" for heading, text in facts.items()), ""),
     )
-    yield _at_rest(cell)
     makers: list[Maker] = [lambda: cell.evaluator]
     if polish:
         makers.append(lambda: cell.polish_functions)
     # Whoever needs what cannot be compiled reports it.
     build_all(makers, progress)
+    yield _at_rest(cell)
     carries = {
         "initial": cell.carry(cell.initial),
         "straight_line": cell.carry(straight_line(workcell.task)),

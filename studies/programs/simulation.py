@@ -12,9 +12,11 @@ from tempfile import TemporaryDirectory
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from hybrid_opt.campaign.stages import build_study
 from hybrid_opt.carry import Carry
 from hybrid_opt.cell import Cell
 from hybrid_opt.errors import WitnessError
+from hybrid_opt.progress import Progress
 from hybrid_opt.robust.cases import nominal_case, random_cases
 from hybrid_opt.robust.squeeze import SqueezeSettings, commanded_forces
 from hybrid_opt.store.files import AGAIN, storing
@@ -102,10 +104,12 @@ def _cases(
     workcell, rng, leader = cell.workcell, np.random.default_rng(options.seed), options.leader - 1
     control: Control = options.controller
     outcomes = []
-    for case in random_cases(workcell, workcell.uncertainty, options.runs, rng, leader):
-        witness = CellWitness(workcell_of_case(workcell, case), settings, case[8:11])
-        told = with_tracking_error(pressed, options.tracking_error, rng, float(case[17]))
-        outcomes.append(witness.simulate(told, control, tracked_share(case, leader)))
+    with Progress().stage("random cases", options.runs, "simulations") as advance:
+        for case in random_cases(workcell, workcell.uncertainty, options.runs, rng, leader):
+            witness = CellWitness(workcell_of_case(workcell, case), settings, case[8:11])
+            told = with_tracking_error(pressed, options.tracking_error, rng, float(case[17]))
+            outcomes.append(witness.simulate(told, control, tracked_share(case, leader)))
+            advance(1)
     arrived = sum(outcome.arrives for outcome in outcomes)
     slip = max((outcome.slip.max() for outcome in outcomes), default=0.0)
     print(
@@ -238,13 +242,17 @@ def simulate_file(options: argparse.Namespace) -> int:
                 "pads that are driven by planned moments are what the allocations 'paper' and "
                 "'joint' assume; this carry's pads press evenly: give another --controller"
             )
+        progress = Progress()
+        build_study(cell, progress, polish=False, drivable=False)
         carry = _timed(cell, stored.x, options)
         peak = carry.peak_normal_force
         print(
             f"{cell.workcell.name}: {carry.duration:.2f} s, planned normal forces up to "
             f"{peak[0]:.2f} / {peak[1]:.2f} N; controller {options.controller}, arm "
-            f"{options.leader} leads"
+            f"{options.leader} leads",
+            flush=True,
         )
+        progress.note("simulating: the least force that holds, then random cases")
         if alone:
             simulate_pads(cell, carry, settings, options)
             return 0

@@ -15,6 +15,7 @@ from hybrid_opt.bundles import BundleOptions, Origin, export
 from hybrid_opt.bundles.bundle import read_manifest, require_target, warnings_of
 from hybrid_opt.bundles.check import as_document, check
 from hybrid_opt.bundles.check import read_trajectory as joint_trajectory
+from hybrid_opt.campaign.stages import build_all, build_study
 from hybrid_opt.carry import Carry
 from hybrid_opt.cell import Cell
 from hybrid_opt.display.table import number, text_table
@@ -114,6 +115,7 @@ def export_file(options: argparse.Namespace) -> int:
     squeeze = SqueezeSettings(options.squeeze, options.leader - 1)
     with TemporaryDirectory() as folder:
         cell = stored.open_cell(Path(folder))
+        build_study(cell, Progress(), polish=False, drivable=False)
         timing = _chosen(cell.timing_model, stored, options.use, options.force_limit)
         jobs = JobModel(cell.compiled, cell.timing_model)
         job = jobs.plan(timing, squeeze, options.smoothing)
@@ -158,6 +160,7 @@ def _report(job: Job, stiffness: float | None) -> str:
 def check_file(options: argparse.Namespace) -> int:
     """Print what a joint trajectory does in a cell; returns the exit code."""
     cell = Cell(load_workcell(options.workcell)).drivable()
+    build_all([lambda: cell.evaluator, lambda: cell.timing_model], Progress())
     trajectory = joint_trajectory(options.trajectory, cell.workcell)
     held = None if options.held is None else (options.held[0], options.held[1])
     found = check(cell, trajectory, held, options.interpolation)
@@ -169,7 +172,9 @@ def robust_forces(options: argparse.Namespace) -> int:
     """Print the forces that hold for a trajectory file; returns the exit code."""
     stored = read_trajectory(options.file)
     with TemporaryDirectory() as folder:
-        return _robust_forces(stored.open_cell(Path(folder)), stored.x, options)
+        cell = stored.open_cell(Path(folder))
+        build_study(cell, Progress(), polish=False, drivable=False)
+        return _robust_forces(cell, stored.x, options)
 
 
 def _robust_forces(cell: Cell, x: Array, options: argparse.Namespace) -> int:
