@@ -60,36 +60,36 @@ if TYPE_CHECKING:
 Mask = NDArray[np.bool_]
 
 SPLINE_SUPPORT = 4
-"""Functions of a cubic spline's basis that are not zero at a place; they are neighbours."""
+"""Nonzero basis functions of a cubic spline at a place; they are neighbours."""
 
 SPLINE_PIECES = 60
 """Pieces of the spline of squared speeds."""
 
 POINTS_PER_PIECE = 4
-"""Per piece, at which limits are imposed."""
+"""Points per piece at which limits apply."""
 
 CHECKS_PER_POINT = 10
-"""Points per imposed one at which the answer is judged."""
+"""Points per imposed one at which the answer is checked."""
 
 MAX_JERK_ITERATIONS = 40
 DURATION_TOLERANCE = 1e-4
-"""Relative change of the duration at which rounds end."""
+"""Relative change of the duration at which iterations end."""
 
 MAX_TIGHTENINGS = 4
-"""Times that a timing is found anew with less of the limits where they were exceeded."""
+"""Times that a timing is recomputed with tighter limits where it exceeded them."""
 
 START_UTILISATION = 0.5
-"""Largest use of a limit by the slow start that the rounds begin with."""
+"""Largest utilisation of a limit by the slow first timing."""
 
 SOLVER_MARGIN = 1e-4
-"""Share of every limit that the program leaves unused: what the solver rounds off."""
+"""Share of every limit that the program leaves unused for the solver's rounding."""
 
 NEAR_ACTIVE_SHARE = 0.95
 """Rows that the last coefficients use beyond this share enter a program at once. With 0.4 in its
 place a timing under a force limit, to which most cones are near, took three times as long."""
 
 LEAST_COEFFICIENT_SHARE = 0.05
-"""Least share of its last value that a coefficient keeps."""
+"""Least share of its last value of a coefficient."""
 
 
 def time_with_jerk(
@@ -99,11 +99,11 @@ def time_with_jerk(
     jerk: JerkLimits,
     fastest: Timing | None = None,
 ) -> JerkTiming:
-    """A fast timing from rest to rest within all limits, whose accelerations do not jump.
+    """Compute a fast timing from rest to rest within all limits, with continuous accelerations.
 
     Args:
         x: (n_var,) decision vector.
-        fastest: the timing without limits on jerk, where it is known already.
+        fastest: the timing without limits on jerk, if known.
 
     Raises:
         SettingsError: x does not fit the workcell, or limited robust forces have no slopes.
@@ -117,14 +117,14 @@ def time_with_jerk(
 
 
 def applicable_jerk_limits(workcell: Workcell, limits: TimingLimits) -> JerkLimits | None:
-    """The cell's limits on jerk that timings within `limits` keep; None where it states none, and
-    where limited robust forces have no slopes."""
+    """Return the cell's limits on jerk for timings within `limits`; None without any, or if limited
+    robust forces have no slopes."""
     slopes = workcell.has_one_squeeze or not limits.robust
     return JerkLimits.from_workcell(workcell) if slopes else None
 
 
 class _JerkProblem:
-    """One path with one set of limits."""
+    """Timing of one path with one set of limits."""
 
     def __init__(
         self, model: TimingModel, motion: PathMotion, limits: TimingLimits, jerk: JerkLimits
@@ -137,8 +137,8 @@ class _JerkProblem:
         )
 
     def solve(self) -> JerkTiming:
-        """Rounds until nothing changes; then with less of the limits where the answer exceeds them
-        between the points, as often as that helps."""
+        """Iterate until the duration settles; then with tighter limits where the answer exceeds
+        them between the points, as often as that helps."""
         c = np.ones(self._coarse.value.shape[1])
         c, rounds = self._iterate(self._start_factor(c) * c)
         for _ in range(MAX_TIGHTENINGS):
@@ -152,7 +152,7 @@ class _JerkProblem:
         return replace(self._checked_timing(c), rounds=rounds)
 
     def _iterate(self, c: Array) -> tuple[Array, int]:
-        """Rounds from coefficients that keep the limits, and how many."""
+        """Iterate from feasible coefficients; return the last ones and the number of iterations."""
         duration = self._coarse.duration(c)
         for rounds in range(1, MAX_JERK_ITERATIONS + 1):
             found = self._step(c)
@@ -165,7 +165,7 @@ class _JerkProblem:
         return c, rounds
 
     def _step(self, c: Array) -> Array | None:
-        """Better coefficients than c (k,), which satisfy all limits at the coarse points; None
+        """Return better coefficients than c (k,) that satisfy all limits at the coarse points; None
         without any."""
         at, rows = self._coarse, JerkProgram(len(c))
         self._motion_rows(rows)
@@ -186,7 +186,7 @@ class _JerkProblem:
         return np.asarray(c + share * (answer - c))
 
     def _motion_rows(self, rows: JerkProgram) -> None:
-        """Speeds and accelerations of joints and box."""
+        """Add limits on speeds and accelerations of joints and box."""
         at, first_basis = self._coarse, self._coarse.first_basis
         squared_by, acceleration_by = at.local(at.squared_by), at.local(at.acceleration_by)
         most = squared_speed_limit(at.motion, self._model.workcell, self._limits)
@@ -202,8 +202,8 @@ class _JerkProblem:
             rows.add_norm_bounds(A / limit, np.zeros((len(at.s), 3)), none, at.keep, first_basis)
 
     def _force_rows(self, c: Array, rows: JerkProgram) -> None:
-        """Normal forces, planned and robust ones, joint torques and shifts of the pressure,
-        linearised at c."""
+        """Add limits on normal forces, planned and robust, joint torques and shifts of the
+        pressure, linearised at c."""
         at = self._coarse
         a, w = at.acceleration_by @ c, np.maximum(at.squared_by @ c, 0.0)
         along = np.stack([at.acceleration_by, at.squared_by], axis=1)[:, None]
@@ -219,7 +219,7 @@ class _JerkProblem:
             _add_linearised(at, c, sign * value[:, near], sign * by, rows)
 
     def _jerk_rows(self, c: Array, rows: JerkProgram) -> None:
-        """Jerk over sqrt(v) below the tangent of the limit over sqrt(v) at c."""
+        """Add jerk over sqrt(v) below the tangent of the limit over sqrt(v) at c."""
         at, jerk, v = self._coarse, self._jerk, self._coarse.value @ c
         # Multiplied by sqrt(v) of the last round, so that rows are of order one.
         root = np.sqrt(v)
@@ -233,7 +233,7 @@ class _JerkProblem:
             rows.add_norm_bounds(box, np.zeros((len(v), 3)), head, level, at.first_basis)
 
     def _excess(self, c: Array) -> Array:
-        """(coarse points,) largest use of a limit at the finer points around each."""
+        """Return the largest utilisation (coarse points,) at the finer points around each."""
         carry = self._carry(self._fine, c)
         ratios = limit_ratios(carry, self._model.workcell, self._limits)
         del ratios[FRICTION]
@@ -243,7 +243,7 @@ class _JerkProblem:
         return np.asarray(np.maximum(np.append(use[0], between), np.append(between, use[-1])))
 
     def _start_factor(self, c: Array) -> float:
-        """Factor on the squared speeds at which everything is used little, as at rest."""
+        """Return a factor on the squared speeds with low utilisation, as at rest."""
         factor = 1.0
         rest = self._most_used(self._coarse, 0.0 * c)
         allowed = rest + START_UTILISATION * (1.0 - rest)
@@ -255,7 +255,7 @@ class _JerkProblem:
         return self._model.carry(at.motion, at.time(c), at.speed(c), at.acceleration(c))
 
     def _jerks(self, at: WarpedPath, c: Array) -> tuple[Array, Array]:
-        """(n,) largest joint jerk and payload jerk over their limits."""
+        """Return the largest joint jerk and payload jerk (n,) over their limits."""
         joint, box = at.jerk(c)
         of_joints = (np.abs(joint) / self._jerk.joints).max(axis=1)
         return of_joints, np.linalg.norm(box, axis=1) / self._jerk.payload
@@ -269,7 +269,8 @@ class _JerkProblem:
         return max(self._check(at, c)[1:])
 
     def _feasible_speed_factor(self, c: Array) -> float:
-        """Largest factor on the speeds with which the timing keeps all limits on the finer grid."""
+        """Return the largest factor on the speeds with which the timing satisfies all limits on the
+        finer grid."""
         jerk = max(float(jerk.max()) for jerk in self._jerks(self._fine, c))
 
         def use(f: float) -> float:
@@ -281,7 +282,7 @@ class _JerkProblem:
         return largest_speed_factor(use)
 
     def _checked_timing(self, c: Array) -> JerkTiming:
-        """The timing on the finer grid, slowed down where it exceeds a limit."""
+        """Return the timing on the finer grid, slowed down if it exceeds a limit."""
         factor = self._feasible_speed_factor(c)
         timing, *uses = self._check(self._fine, factor**2 * c)
         status = TimingStatus.OK if factor >= LEAST_SPEED_FACTOR else TimingStatus.NOT_CONVERGED
@@ -302,9 +303,9 @@ class WarpedPath:
         value: (n, k) basis of v.
         squared_by, acceleration_by: (n, k) from coefficients to u'^2 and u''.
         motion: geometry by u.
-        columns: (n, SUPPORT) the coefficients that matter at each place.
-        joint_jerk_by, box_jerk_by: (n, joints, SUPPORT), (n, 3, SUPPORT) jerk over sqrt(v), by
-            these coefficients.
+        columns: (n, SPLINE_SUPPORT) coefficients with influence at each place.
+        joint_jerk_by, box_jerk_by: (n, joints, SPLINE_SUPPORT), (n, 3, SPLINE_SUPPORT) jerk over
+            sqrt(v), by these coefficients.
         keep: (n,) share of every limit that a program may use.
     """
 
@@ -320,7 +321,7 @@ class WarpedPath:
 
     @classmethod
     def from_motion(cls, motion: PathMotion, intervals: int) -> WarpedPath:
-        """Both ends of equal intervals, along a path."""
+        """Sample both ends of equal intervals along a path."""
         s, inner = np.linspace(0.0, 1.0, intervals + 1), np.linspace(0.0, 1.0, SPLINE_PIECES + 1)
         knots = np.concatenate([np.zeros(3), inner, np.ones(3)])
         splines = BSpline(knots, np.eye(len(knots) - 4), 3)
@@ -359,16 +360,18 @@ class WarpedPath:
 
     @property
     def first_basis(self) -> NDArray[np.intp]:
-        """(n,) the first of the coefficients that matter at each place."""
+        """Return the first coefficient (n,) with influence at each place."""
         return self.columns[:, 0]
 
     def local(self, values: Array) -> Array:
-        """(n, ..., SUPPORT) those of values (n, ..., k) that belong to these coefficients."""
+        """Select the entries (n, ..., SPLINE_SUPPORT) of values (n, ..., k) that belong to these
+        coefficients."""
         shape = (len(self.columns), *[1] * (values.ndim - 2), SPLINE_SUPPORT)
         return np.take_along_axis(values, self.columns.reshape(shape), axis=-1)
 
     def duration(self, c: Array) -> float:
-        """[s] by Simpson's rule: the places are uniform, an odd number of them."""
+        """Return the duration [s] by Simpson's rule: the places are uniform, an odd number of
+        them."""
         return float(self._weights() @ (1.0 / np.sqrt(np.maximum(self.value @ c, 1e-300))))
 
     def _weights(self) -> Array:
@@ -377,7 +380,7 @@ class WarpedPath:
         return weights / (3.0 * (len(self.s) - 1))
 
     def time(self, c: Array) -> Array:
-        """(n,) [s]; standing still, places are a second apart in all."""
+        """Return times (n,) [s]; at rest, the path takes a second."""
         v = self.value @ c
         if not v.any():
             return self.s
@@ -386,35 +389,34 @@ class WarpedPath:
         return np.concatenate([[0.0], np.cumsum(steps)])
 
     def speed(self, c: Array) -> Array:
-        """(n,) u' [1/s]."""
+        """Return u' (n,) [1/s]."""
         return np.sqrt(np.maximum(self.squared_by @ c, 0.0))
 
     def acceleration(self, c: Array) -> Array:
-        """(n,) u'' [1/s^2]."""
+        """Return u'' (n,) [1/s^2]."""
         return np.asarray(self.acceleration_by @ c)
 
     def jerk(self, c: Array) -> tuple[Array, Array]:
-        """(n, joints) and (n, 3) of the joints and the box's frame [rad/s^3, m/s^3]."""
+        """Return jerks (n, joints) and (n, 3) of the joints and the box frame [rad/s^3, m/s^3]."""
         root = np.sqrt(np.maximum(self.value @ c, 0.0))[:, None]
         own = c[self.columns][:, None]
         return root * (self.joint_jerk_by * own).sum(-1), root * (self.box_jerk_by * own).sum(-1)
 
     def objective(self, c: Array) -> tuple[Array, Array]:
-        """Gradient and Hessian of the duration."""
+        """Return gradient and Hessian of the duration."""
         v, weights = self.value @ c, self._weights()
         gradient = -0.5 * self.value.T @ (weights * v**-1.5)
         return gradient, 0.75 * (self.value.T * (weights * v**-2.5)) @ self.value
 
 
 class JerkProgram:
-    """Linear rows b - A c >= 0, and second-order cones of four such rows, of which few matter at a
-    time.
+    """Linear rows b - A c >= 0, and second-order cones of four such rows, few of which are active.
 
-    A row has few neighbouring coefficients: its A holds those alone, from column `first` on.
+    A row depends on few neighbouring coefficients: its A has those alone, from column `first` on.
     """
 
     def __init__(self, k: int) -> None:
-        """A program of k coefficients without rows."""
+        """Start a program of k coefficients without rows."""
         from scipy import sparse
 
         self._k = k
@@ -422,13 +424,13 @@ class JerkProgram:
         self._cones = [(sparse.csr_array((0, k)), np.zeros((0, 4)))]
 
     def add_upper_bounds(self, A: Array, b: Array, first: NDArray[np.intp]) -> None:
-        """A c <= b, (n, width) and (n,), columns from first (n,) on."""
+        """Add A c <= b, (n, width) and (n,), columns from first (n,) on."""
         self._linear.append((self._sparse_rows(A, first), b))
 
     def add_two_sided_bounds(
         self, A: Array, head: Array | float, bound: Array, first: NDArray[np.intp]
     ) -> None:
-        """A c + head c and -A c + head c below bound, by (n, m, width), (n, 1, width), (n,)."""
+        """Add A c + head c and -A c + head c below bound, by (n, m, width), (n, 1, width), (n,)."""
         _, m, width = A.shape
         for sign in (1.0, -1.0):
             each = (sign * A + head).reshape(-1, width)
@@ -437,7 +439,7 @@ class JerkProgram:
     def add_norm_bounds(
         self, A: Array, b: Array, head: Array, bound: Array, first: NDArray[np.intp]
     ) -> None:
-        """|A c + b| <= bound - head c, by (n, 3, width), (n, 3), (n, width), (n,), columns from
+        """Add |A c + b| <= bound - head c, by (n, 3, width), (n, 3), (n, width), (n,), columns from
         first (n,) on."""
         rows = np.concatenate([head[:, None], -A], axis=1).reshape(-1, A.shape[2])
         placed = self._sparse_rows(rows, np.repeat(first, 4))
@@ -453,7 +455,7 @@ class JerkProgram:
 
     @cached_property
     def rows(self) -> tuple[sparse.csr_array, Array, sparse.csr_array, Array]:
-        """All of them, once no more are added: A and b of the linear ones and of the cones."""
+        """Return all rows: A and b of the linear ones and of the cones."""
         from scipy import sparse
 
         A, b = zip(*self._linear, strict=True)
@@ -462,7 +464,7 @@ class JerkProgram:
         return stacked, np.concatenate(b), cones, np.concatenate(cone_b)
 
     def used(self, c: Array, share: float) -> tuple[Mask, Mask]:
-        """Which linear rows and which cones c uses to more than a share."""
+        """Return the linear rows and the cones that c uses beyond a share."""
         A, b, cone_A, cone_b = self.rows
         inside = cone_b - (cone_A @ c).reshape(-1, 4)
         lengths = np.linalg.norm(inside[:, 1:], axis=1)
@@ -485,7 +487,7 @@ class JerkProgram:
     def _solve_subset(
         self, H: Array, g: Array, scale: Array, rows: Mask, cones: Mask
     ) -> Array | None:
-        """The same with some of the rows; variables are scaled to be around one."""
+        """Minimise with some of the rows; variables are scaled to be around one."""
         # Not imported at the top: only jerk limits need it.
         import clarabel
         from scipy import sparse
@@ -512,9 +514,9 @@ class JerkProgram:
 
 
 def _add_linearised(at: WarpedPath, c: Array, value: Array, by: Array, rows: JerkProgram) -> None:
-    """Values (n, m) at c over their limits, with derivatives (n, m, k), below one.
+    """Add values (n, m) at c over their limits, with derivatives (n, m, k), below one.
 
-    What is exceeded between rounds, by what the last one left out, may stay as it is for one.
+    An excess between iterations, where the last one had no row, may remain for one iteration.
     """
     bound = np.maximum(at.keep[:, None], value) - value + by @ c
     A = at.local(by)

@@ -1,6 +1,5 @@
-"""What limits a carry: what forbids any timing of its path, what limits it along the path as
-functions of the timing, and the shares of each limit that a carry uses, recomputed from its
-physical quantities alone."""
+"""Limits of a carry: errors of its path, limits along the path as functions of the timing, and the
+utilisation of each limit, recomputed from physical quantities alone."""
 
 from __future__ import annotations
 
@@ -31,48 +30,48 @@ from symbolic.limits import LIMITS, Limit, limits_of_block
 from symbolic.records import Workcell
 
 FRICTION_ROUNDING = 1e-6
-"""The least-effort forces lie on the friction cones; this much beyond them is rounding."""
+"""The least-effort forces are on the friction cones; an excess up to this is rounding."""
 
 RECOMPUTED_TOLERANCE = TIMING_TOLERANCE
-"""Largest excess of a recomputed limit, as a share of it."""
+"""Largest accepted excess of a recomputed limit, as a share of it."""
 
 LEAST_SPEED_FACTOR = 0.98
 """A timing that has to be slowed further to satisfy its limits has not converged."""
 
 LINEARISED_ABOVE = 0.6
-"""Torques and shifts that stay below this share of their limit enter no program."""
+"""Torques and shifts below this share of their limit enter no program."""
 
 EXACT_FORCE_ABOVE = 0.98
-"""Share of a limit of robust forces above which they are computed exactly."""
+"""Robust forces above this share of a limit are computed exactly."""
 
 FACTOR_TOLERANCE = 1e-4
 """Share of a limit that a factor on the speeds may leave unused."""
 
 PEAK_SEARCH_STRIDE = 20
-"""Stride of the samples whose robust force is computed in the search for the largest."""
+"""Stride of the samples in the search for the largest robust force."""
 
 ROBUST_BATCH = 2000
-"""Samples of a carry whose cases are held in memory together."""
+"""Samples of a carry whose cases are in memory together."""
 
 LEAST_NORMAL_FORCE = 1e-9
-"""A contact with less normal force than this carries nothing [N]."""
+"""A contact with less normal force carries nothing [N]."""
 
 LEAST_MOTION = 1e-9
-"""A path along which box and joints move less than this does not move [m, rad]."""
+"""A path along which box and joints move less does not move [m, rad]."""
 
 ARM_CHECKS = (
     (TimingStatus.OFF_PATH, "reach", "loses the path"),
     (TimingStatus.JOINT_LIMITS, "joint position", "leaves its joint range"),
     (TimingStatus.NEAR_SINGULAR, "manipulability", "comes too near a singular posture"),
 )
-"""How an arm can fail a path, in the order of reporting: the timing's status, its name in a
-`Place`, and what the robot does, for people."""
+"""Errors of an arm along a path, in the order of reporting: the timing's status, its name in a
+`Place`, and the robot's failure, for people."""
 
 
 def arm_path_error(
     workcell: Workcell, pose: Array, lost: Array, limit_margin: Array, manipulability: Array
 ) -> Timing | None:
-    """Why a path cannot be timed at all, with arm and place, or None.
+    """Return the error of a path without feasible timing, with arm and place, else None.
 
     Args:
         pose: (n, 6) box poses at uniform samples.
@@ -95,19 +94,19 @@ def arm_path_error(
 
 
 def path_error(model: TimingModel, motion: PathMotion) -> Timing | None:
-    """The answer for a path that cannot be timed, None for others."""
+    """Return the error of a path without feasible timing, else None."""
     arms = motion.lost, motion.limit_margin, motion.manipulability
     return arm_path_error(model.workcell, motion.pose, *arms)
 
 
 class PathLimits:
-    """The limits of a path at samples of it, over these limits, as functions of (u'', u'^2).
+    """Limits of a path at samples, as functions of (u'', u'^2) over the limits.
 
-    Speeds are `squared_speed_limit`; robust forces of pads without one squeeze
+    Speeds are in `squared_speed_limit`. Robust forces of pads without one squeeze
     (`Workcell.has_one_squeeze`), and planned ones without slopes, are among the ratios.
 
     Attributes:
-        motion: the path's geometry at the samples.
+        motion: geometry of the path at the samples.
     """
 
     def __init__(self, model: TimingModel, motion: PathMotion, limits: TimingLimits) -> None:
@@ -138,8 +137,9 @@ class PathLimits:
         return getattr(m, f"{name}_first"), getattr(m, f"{name}_second")
 
     def forces(self, a: Array, w: Array) -> list[tuple[Array, Array]]:
-        """Normal forces (n, 2) that are convex in (u'', u'^2), and their slopes (n, 2, 2), at
-        u'' = a and u'^2 = w (n,): planned ones, and robust ones where these are limited."""
+        """Compute normal forces (n, 2) that are convex in (u'', u'^2), and their slopes (n, 2, 2),
+        at u'' = a and u'^2 = w (n,), over the limit: planned ones, and robust ones if these are
+        limited."""
         model, limit = self._model, self._limits.force
         if limit is None:
             return []
@@ -152,7 +152,7 @@ class PathLimits:
         return [(force / limit, slope / limit) for force, slope in found]
 
     def ratios(self, a: Array, w: Array) -> Array:
-        """Limits that are not convex, signed (n, k)."""
+        """Compute limits that are not convex, signed (n, k)."""
         m, workcell, limits = self.motion, self._model.workcell, self._limits
         pressure = has_pressure_limit(workcell, limits)
         force = None if workcell.has_force_slopes and not self._grasped else limits.force
@@ -177,7 +177,8 @@ class PathLimits:
         return np.concatenate(columns, axis=1)
 
     def ratio_slopes(self, ratios: Array, a: Array, w: Array) -> Array:
-        """(n, k, 2) of `ratios` at a and w by (u'', u'^2), by forward differences."""
+        """Compute the slopes (n, k, 2) of `ratios` at a and w by (u'', u'^2), by forward
+        differences."""
         step_a = 1e-5 * max(float(np.abs(a).max()), 1e-6)
         step_w = 1e-5 * max(float(w.max()), 1e-6)
         by_a = (self.ratios(a + step_a, w) - ratios) / step_a
@@ -189,7 +190,7 @@ class PathLimits:
 
 
 def squared_speed_limit(motion: PathMotion, workcell: Workcell, limits: TimingLimits) -> Array:
-    """(n,) largest u'^2 by all limits on speeds; infinite where nothing moves."""
+    """Return the largest u'^2 (n,) by all limits on speeds; infinite where nothing moves."""
     task = workcell.task
     demands = []
     for limit in limits_of_block("speed"):
@@ -210,7 +211,7 @@ def squared_speed_limit(motion: PathMotion, workcell: Workcell, limits: TimingLi
 
 
 def duration_at_speed_limits(model: TimingModel, motion: PathMotion, limits: TimingLimits) -> float:
-    """Duration of a path driven at its speed limits alone, without ramps [s]."""
+    """Return the duration [s] of a path driven at its speed limits alone, without ramps."""
     squared = squared_speed_limit(motion, model.workcell, limits)
     slowness = 1.0 / np.sqrt(np.minimum(squared, 1e8))
     return float(np.trapezoid(slowness, motion.parameter))
@@ -267,7 +268,7 @@ def bound_of(limit: Limit, workcell: Workcell) -> Array:
 
 
 def limited_force(carry: Carry, workcell: Workcell, limits: TimingLimits) -> Array:
-    """(n, 2) normal forces that the force limit holds for: planned, and robust ones where asked."""
+    """Return the limited normal forces (n, 2): planned, and robust ones if these are limited."""
     if not limits.robust:
         return carry.normal_force
     commanded, leading = robust_model(workcell).hold(carry, workcell.uncertainty)
@@ -296,8 +297,8 @@ def _near_limit(carry: Carry, workcell: Workcell, limits: TimingLimits) -> Array
 def _robust_forces_above(
     level: float, points: PathPoints, workcell: Workcell, found: Array, every: int = 1
 ) -> bool:
-    """Write the robust forces above a level [N], of every so manieth point, into forces (n, 2);
-    whether there are any."""
+    """Write the robust forces above a level [N], of every `every`-th point, into forces (n, 2);
+    return True if there are any."""
     known, rows = False, np.arange(0, len(points), every)
     for part in np.array_split(rows, -(-len(rows) // ROBUST_BATCH)):
         least = np.full(len(part), level)
@@ -308,10 +309,9 @@ def _robust_forces_above(
 
 
 def has_pressure_limit(workcell: Workcell, limits: TimingLimits) -> bool:
-    """Whether the pressure's shift is a limit.
+    """Return True if the pressure's shift is a limit.
 
-    The joint allocation keeps it within the patches by pressing harder: there it is no limit, but
-    up to the patch's rim wherever the moments need it.
+    The joint allocation keeps it within the patches by pressing harder: there it is no limit.
     """
     return limits.pressure and workcell.task.allocation == "paper"
 
@@ -322,10 +322,10 @@ def check_limits(
     limits: TimingLimits,
     ratios: Mapping[str, Array] | None = None,
 ) -> Timing:
-    """A carry of a model as a timing with status `OK`, whatever it uses of its limits.
+    """Return a carry as a timing with status `OK`, with the utilisation of its limits.
 
     Args:
-        ratios: its `limit_ratios`, where they are known.
+        ratios: its `limit_ratios`, if known.
     """
     ratios = limit_ratios(carry, model.workcell, limits) if ratios is None else ratios
     use = dict[str, Utilisation]()
@@ -340,10 +340,8 @@ def check_limits(
 
 
 def joint_use(carry: Carry, workcell: Workcell) -> dict[str, Array]:
-    """Worst use of every joint's limits over the carry, (all joints,) per joint constraint.
-
-    Beside the three limits, `contact torque` is the share of the contact wrench alone.
-    """
+    """Return the largest utilisation of every joint's limits over the carry, (all joints,) per
+    joint constraint; `contact torque` is the share of the contact wrench alone."""
     ratios = limit_ratios(carry, workcell, TimingLimits())
     use = {name: ratios[name].max(axis=0) for name in PER_JOINT}
     limit = workcell.of_joints("torque_max")
@@ -351,8 +349,9 @@ def joint_use(carry: Carry, workcell: Workcell) -> dict[str, Array]:
 
 
 def largest_speed_factor(use: Callable[[float], float]) -> float:
-    """The largest factor on the speeds, at most one, with which no limit is exceeded, by the
-    largest use of any at a factor; one where none is by more than `RECOMPUTED_TOLERANCE`."""
+    """Return the largest factor on the speeds, at most one, without an exceeded limit, by a
+    function of the factor to the largest utilisation; one if none exceeds `RECOMPUTED_TOLERANCE`.
+    """
     fast = use(1.0)
     if fast <= 1.0 + RECOMPUTED_TOLERANCE:
         return 1.0
@@ -373,7 +372,7 @@ def largest_speed_factor(use: Callable[[float], float]) -> float:
 
 
 def most_used(use: dict[str, Utilisation]) -> Utilisation:
-    """The limit with the largest use; friction, tight by construction, counts only when broken."""
+    """Return the largest utilisation; friction, tight by construction, counts only if violated."""
     candidates = [
         excess
         for name, excess in use.items()
@@ -390,12 +389,12 @@ def _norm(vectors: Array) -> Array:
 @dataclass(frozen=True)
 class SpeedProfile:
     """Path speeds with constant u'' on intervals, at `REFINEMENT` samples per interval, both ends
-    of every interval included; to be driven along any path.
+    of every interval included.
 
     Attributes:
         index: (n,) of the samples among those of a path's motion.
         time: (n,) [s].
-        share: (n,) how far the samples lie within their intervals.
+        share: (n,) positions of the samples within their intervals.
         a, w: (n,) u'' and u'^2.
     """
 
@@ -407,7 +406,7 @@ class SpeedProfile:
 
     @classmethod
     def from_grid_speed(cls, grid_speed: Array) -> SpeedProfile:
-        """grid_speed: (intervals + 1,) path speed u' at the grid points [1/s]."""
+        """Sample path speeds u' at the grid points (intervals + 1,) [1/s]."""
         squared, intervals = grid_speed**2, len(grid_speed) - 1
         share = np.linspace(0.0, 1.0, REFINEMENT + 1)
         w = squared[:-1, None] + np.outer(np.diff(squared), share)
@@ -428,7 +427,8 @@ class SpeedProfile:
     def carry(
         self, model: TimingModel, motion: PathMotion, a: float = 0.0, w: float = 0.0
     ) -> Carry:
-        """A path driven so, with `a` added to u'' and `w` to u'^2 everywhere."""
+        """Return the carry of a path at these speeds, with `a` added to u'' and `w` to u'^2
+        everywhere."""
         speed = np.sqrt(np.maximum(self.w + w, 0.0))
         return model.carry(motion.at(self.index), self.time, speed, self.a + a)
 
@@ -440,16 +440,16 @@ def drive_path(
     limits: TimingLimits,
     motion: PathMotion | None = None,
 ) -> Timing:
-    """A given timing of a path with its carry, held against every limit.
+    """Check a given timing of a path against every limit.
 
     Args:
         model: its intervals are those of the timing.
         x: (n_var,) decision vector.
         grid_speed: (intervals + 1,) path speed u' at the grid points [1/s].
-        motion: the path's geometry, where it is known already.
+        motion: geometry of the path, if known.
 
     Returns:
-        Status `OK`, or `EXCEEDED` with the limit and the place; or why the path itself fails.
+        Status `OK`, or `EXCEEDED` with the limit and the place; or the error of the path itself.
 
     Raises:
         SettingsError: x or the speeds do not fit.

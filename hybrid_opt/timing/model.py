@@ -1,5 +1,5 @@
-"""The compiled functions that timing needs, built once per workcell, and what they return: the
-geometry of a path at samples of its parameter and between them, and its loads."""
+"""Compiled functions of timings, built once per workcell, and their results: the geometry of a path
+at samples of its parameter and between them, and its loads."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ REFINEMENT = 10
 """Samples per piece at which a timing is recomputed."""
 
 _SPLINE_EVERY = 2
-"""Samples from one knot of the splines between them to the next."""
+"""Samples per knot of the interpolating splines."""
 
 if TYPE_CHECKING:
     import casadi as ca
@@ -40,8 +40,7 @@ if TYPE_CHECKING:
 class PathMotion:
     """Geometry of the path of a decision vector x (n_var,) at samples of the path parameter.
 
-    Joints of both arms stand side by side. `symbolic.path_motion` describes the
-    quantities.
+    Joints of both arms are stacked. `symbolic.path_motion` describes the quantities.
     """
 
     x: Array
@@ -67,12 +66,12 @@ class PathMotion:
     manipulability: Array
 
     def at(self, samples: NDArray[np.intp]) -> PathMotion:
-        """The given samples in the given order."""
+        """Return the given samples in the given order."""
         sampled = {f.name: getattr(self, f.name)[samples] for f in fields(self) if f.name != "x"}
         return PathMotion(self.x, **sampled)
 
     def interpolate(self, u: Array) -> PathMotion:
-        """The geometry at parameters u (n,) in [0, 1], by cubic splines through the samples."""
+        """Interpolate the geometry at parameters u (n,) in [0, 1] by cubic splines."""
         spline, parts = self._spline
         values = np.split(spline(u), parts, axis=1)
         shaped = {
@@ -82,14 +81,16 @@ class PathMotion:
         return PathMotion(self.x, u, **shaped)
 
     def third_derivatives(self, u: Array) -> tuple[Array, Array]:
-        """Third derivatives by the parameter at u (n,): joints (n, joints), box position (n, 3)."""
+        """Return third derivatives by the parameter at u (n,): joints (n, joints), box position (n,
+        3)."""
         joints = self.q_second.shape[1]
         both = self._third(u)
         return both[:, :joints], both[:, joints : joints + 3]
 
     @cached_property
     def _spline(self) -> tuple[CubicSpline, Array]:
-        """One spline through all quantities side by side, and where each but the first begins."""
+        """Return one spline through all stacked quantities, and the first column of each but the
+        first."""
         u = self.parameter[::_SPLINE_EVERY]
         columns = [
             getattr(self, name)[::_SPLINE_EVERY].reshape(len(u), -1) for name in SAMPLED_FIELDS
@@ -132,8 +133,8 @@ class TimingModel:
         """Load or build the compiled functions.
 
         Args:
-            cell: compiled, where others share its functions.
-            robust: whether force limits hold in every case of the workcell's uncertainty.
+            cell: compiled, if others share its functions.
+            robust: whether force limits apply to every case of the workcell's uncertainty.
 
         Raises:
             SettingsError: the number of intervals is out of range.
@@ -155,9 +156,8 @@ class TimingModel:
         self._functions = compiled.functions("timing", make, str(samples), bodies=False)
 
     def path_motion(self, x: Array) -> PathMotion:
-        """The geometry at `REFINEMENT` samples per interval, uniform in u.
-
-        A path is mostly asked for several times in a row: the last one is remembered.
+        """Compute the geometry at `REFINEMENT` samples per interval, uniform in u; the last one is
+        cached.
 
         Args:
             x: (n_var,) decision vector, or the (n_path,) free waypoints alone, which then get the
@@ -201,12 +201,12 @@ class TimingModel:
         return {"limits": rows[None]} | poses
 
     def load(self, pose: Array, rate: Array, second_rate: Array) -> dict[str, Array]:
-        """`symbolic.contact.load.LOAD_OUTPUTS` for n samples (n, 6) of the box motion."""
+        """Compute `symbolic.contact.load.LOAD_OUTPUTS` for n samples (n, 6) of the box motion."""
         return self._functions["load"].batch(pose, rate, second_rate)
 
     def path_force(self, motion: PathMotion, a: Array, w: Array) -> tuple[Array, Array]:
-        """Normal forces (n, 2) [N] under u'' = a and u'^2 = w (n,), and their slopes (n, 2, 2) by
-        these, where the cell `has_force_slopes`."""
+        """Compute normal forces (n, 2) [N] under u'' = a and u'^2 = w (n,), and their slopes (n, 2,
+        2) by these, if the cell `has_force_slopes`."""
         path = (motion.pose, motion.pose_first, motion.pose_second)
         found = self._functions["path_force"].batch(*path, a, w)
         return found["normal_force"], found["slope"]
@@ -214,16 +214,17 @@ class TimingModel:
     def uncertain_load(
         self, carry: Carry, friction: Array, centre_of_mass: Array
     ) -> dict[str, Array]:
-        """Loads of a carry with other friction coefficients (2,) and centre of mass (3,) [m]."""
+        """Compute loads of a carry with other friction coefficients (2,) and centre of mass (3,)
+        [m]."""
         return self._functions["uncertain_load"].batch(
             carry.pose, carry.rate, carry.second_rate, friction, centre_of_mass
         )
 
     def arm_motion(self, arm: int, q: Array, pose: Array, first: Array) -> dict[str, Array]:
-        """`symbolic.path_motion.ARM_OUTPUTS` of one arm (0 or 1) on a straight line.
+        """Compute `symbolic.path_motion.ARM_OUTPUTS` of one arm (0 or 1) on a straight line.
 
         Args:
-            q: (n, joints) that hold a box at the poses, redundant ones standing still [rad].
+            q: (n, joints) that hold a box at the poses, redundant ones at rest [rad].
             pose: (n, 6) of that box [m, rad].
             first: (n, 6) its derivative by the path parameter; the second one is zero.
         """
@@ -234,15 +235,16 @@ class TimingModel:
         return self._functions[f"arm_{arm + 1}"].batch(np.ascontiguousarray(q), *motion, still)
 
     def wrench_torque(self, q: Array, pose: Array) -> Array:
-        """(n, all joints, 6) from contact wrenches to joint torques, at joints (n, all joints) and
-        box poses (n, 6)."""
+        """Compute the matrices (n, all joints, 6) from contact wrenches to joint torques, at joints
+        (n, all joints) and box poses (n, 6)."""
         arms, still = joints_of(self.workcell, q), np.zeros_like(pose)
         found = [self.arm_motion(arm, own, pose, still) for arm, own in enumerate(arms)]
         matrices = [each["wrench_torque"].reshape(len(q), -1, 6) for each in found]
         return np.concatenate(matrices, axis=1)
 
     def drive(self, motion: PathMotion, speed: Array, acceleration: Array) -> dict[str, Array]:
-        """Loads of a path driven with u' and u'' (n,) per sample; see also `contact_torque`."""
+        """Compute loads of a path driven with u' and u'' (n,) per sample; see also
+        `contact_torque`."""
         rate = motion.pose_first * speed[:, None]
         second = motion.pose_second * speed[:, None] ** 2 + (
             motion.pose_first * acceleration[:, None]
@@ -250,12 +252,12 @@ class TimingModel:
         return self.load(motion.pose, rate, second)
 
     def contact_torque(self, wrench_torque: Array, load: Mapping[str, Array]) -> Array:
-        """`contact_torque` of the wrenches of a `load`."""
+        """Compute `contact_torque` of the wrenches of a `load`."""
         wrenches = (load["wrench_1"], load["wrench_2"])
         return contact_torque(len(self.joint_names[0]), wrench_torque, wrenches)
 
     def carry(self, motion: PathMotion, time: Array, speed: Array, acceleration: Array) -> Carry:
-        """The carry with the given timing (n,) at the samples of `motion`."""
+        """Return the carry with the given timing (n,) at the samples of `motion`."""
         load = self.drive(motion, speed, acceleration)
         v, w, a = speed[:, None], speed[:, None] ** 2, acceleration[:, None]
         own = motion.torque_by_acceleration * a + motion.torque_by_speed * w
@@ -287,13 +289,13 @@ class TimingModel:
         )
 
     def still(self, motion: PathMotion) -> Carry:
-        """The carry that stands still at every sample of `motion`."""
+        """Return the carry at rest at every sample of `motion`."""
         zero = np.zeros(len(motion.parameter))
         return self.carry(motion, zero, zero, zero)
 
     def drive_limits(self, force: float) -> TimingLimits:
-        """The limits of drivable carries whose force limit this is [N], one of robust forces where
-        the model limits these."""
+        """Return the limits of drivable carries with a force limit [N], on robust forces if the
+        model limits these."""
         return TimingLimits(force=force, robust=self.is_robust)
 
     def checked(self, x: Array) -> Array:
@@ -322,17 +324,18 @@ def sample_limits_set(compiled: CompiledCell, lanes: int) -> NumericFunction:
 
 
 def require_intervals(intervals: int) -> None:
-    """Refuse a number of intervals that is out of range."""
+    """Raise an error for a number of intervals out of range."""
     if not 10 <= intervals <= 2000:
         raise SettingsError(f"{intervals} intervals; allowed are 10 to 2000")
 
 
 def contact_torque(first: int, wrench_torque: Array, wrenches: Iterable[Array]) -> Array:
-    """(n, all joints) joint torques that exert wrenches (n, 6) of either robot on the box [N m].
+    """Compute joint torques (n, all joints) that exert wrenches (n, 6) of either robot on the box
+    [N m].
 
     Args:
         first: number of the first arm's joints.
-        wrench_torque: (n, all joints, 6) from wrenches to torques, both arms side by side.
+        wrench_torque: (n, all joints, 6) from wrenches to torques, both arms stacked.
     """
     parts = (wrench_torque[:, :first], wrench_torque[:, first:])
     each = zip(parts, wrenches, strict=True)

@@ -35,24 +35,24 @@ from symbolic.read.arms import arm_model
 from symbolic.records import Robot, Workcell
 
 CUTS_PER_SAMPLE = 24
-"""Supporting lines that a sample has room for; the oldest make room for new ones."""
+"""Supporting lines per sample; new ones replace the oldest."""
 
 MAX_CUT_ITERATIONS = 20
-"""Times that paths are driven anew with more lines."""
+"""Runs of the passes with more lines."""
 
 CUT_TOLERANCE = 1e-4
-"""Excess over the limit that counts as none, as a share of it."""
+"""Accepted excess over the limit, as a share of it."""
 
 CUT_ABOVE = 0.98
 """Forces above this share of the limit have a tangent in advance."""
 
 REST_UTILISATION = 1.0 - 1e-6
-"""Share of the limit that standing still may use, as in the passes."""
+"""Largest share of the limit at rest, as in the passes."""
 
 
 AtRest = tuple[Array, int]
-"""Where standing still needs more than the limit: largest robust forces (2,) of both robots there
-[N], and the sample where the larger of them is."""
+"""Excess at rest: largest robust forces (2,) of both robots there [N], and the sample of the larger
+one."""
 
 
 class ForwardBackwardPasses:
@@ -159,7 +159,7 @@ def _options(limits: TimingLimits) -> list[float]:
 
 
 class RobustCuttingPlanes:
-    """The passes for n paths, with lines for their robust forces that become more as they run.
+    """Timings of n paths within robust forces, by supporting lines that are added between passes.
 
     Attributes:
         peak: (n, 2) largest robust forces of the last timing [N].
@@ -172,11 +172,11 @@ class RobustCuttingPlanes:
         paths: Mapping[str, Array],
         options: Array,
     ) -> None:
-        """Without any line.
+        """Start without lines.
 
         Args:
             passes: `forward_backward_passes` with `CUTS_PER_SAMPLE`.
-            paths: their `PathTimer.path_limits`.
+            paths: coefficients and poses; see `ForwardBackwardPasses.time`.
             options: (n, 4) of the passes, finite force limits first.
         """
         n, samples = paths["pose"].shape[:2]
@@ -195,7 +195,7 @@ class RobustCuttingPlanes:
         self._share = np.tile([0.0, 0.5, 1.0], self._intervals)
 
     def time(self, threads: int) -> tuple[dict[str, Array], list[AtRest | None]]:
-        """The passes' outputs, and for each path whether it cannot stand still."""
+        """Return the passes' outputs, and for each path its excess at rest, else None."""
         still = self._at_rest()
         out = self._passes.batch(self._rows, self._options, self._cuts, threads=threads)
         left = np.array([k for k, rest in enumerate(still) if rest is None], dtype=np.intp)
@@ -210,7 +210,8 @@ class RobustCuttingPlanes:
         return out, still
 
     def _at_rest(self) -> list[AtRest | None]:
-        """Which paths cannot stand still; the others get a tangent there."""
+        """Find paths whose robust force limit fails at rest, and add the cutting plane at u' = 0 to
+        the others."""
         n, samples = self._count.shape
         found: list[AtRest | None] = [None] * n
         path, sample = np.divmod(np.arange(n * samples), samples)
@@ -227,8 +228,8 @@ class RobustCuttingPlanes:
         return found
 
     def _cut(self, chosen: NDArray[np.intp], squared: Array) -> NDArray[np.bool_]:
-        """Add tangents where timings (m, intervals + 1) of the chosen paths come near their limits;
-        which of them exceed theirs."""
+        """Add tangents where timings (m, intervals + 1) of the chosen paths are near their limits;
+        return which of them exceed theirs."""
         m, per = len(chosen), len(self._sample)
         if not m:
             return np.zeros(0, dtype=bool)
@@ -261,7 +262,7 @@ class RobustCuttingPlanes:
         force: Array,
         slope: Array,
     ) -> None:
-        """Tangents of the larger force at points z (m, 2) of paths and samples `place`."""
+        """Add tangents of the larger force at points z (m, 2) of paths and samples `place`."""
         larger, every = force.argmax(axis=1), np.arange(len(force))
         limit = self._limit[place[0]]
         gradient = slope[every, larger] / limit[:, None]
@@ -286,7 +287,7 @@ PASS_STATUSES = (
     TimingStatus.NOT_CONVERGED,
     TimingStatus.SOLVER_FAILED,
 )
-"""Meanings of its statuses."""
+"""Statuses of the passes, by number."""
 
 
 def forward_backward_passes(

@@ -262,21 +262,20 @@ class JerkTiming:
 
 @dataclass(frozen=True)
 class PathTiming:
-    """The fastest timing of one path within limits, or why there is none.
+    """Fastest timing of one path within limits, or its error.
 
     Attributes:
         status: the outcome.
-        place: where it fails, or the most used limit.
+        place: of the failure, or of the most used limit.
         duration: [s], infinite without a timing.
-        peak_force: (2,) largest normal forces [N]; standing still without a timing, NaN where
-            the path itself fails.
-        use: largest share of each limit by name of the constraint, likewise; empty where the path
-            itself fails.
+        peak_force: (2,) largest normal forces [N]; at rest without a timing, NaN if the path itself
+            fails.
+        use: largest share of each limit by name, likewise; empty if the path itself fails.
         grid_speed: (intervals + 1,) path speed u' at the grid points [1/s], zero without a timing.
-        sweeps: how often both passes ran.
-        slowed: uniform factor on the path speed that made the limits hold, 1 normally.
-        robust_force: (2,) as peak_force, in every case of the workcell's uncertainty; None where
-            no limit asks for them.
+        sweeps: iterations of both passes.
+        slowed: uniform factor on the path speed by which the limits hold, 1 normally.
+        robust_force: (2,) as peak_force, in every case of the workcell's uncertainty; None if not
+            limited.
     """
 
     status: TimingStatus
@@ -291,12 +290,12 @@ class PathTiming:
 
     @property
     def ok(self) -> bool:
-        """Whether there is a timing that respects every limit."""
+        """Return True if the timing respects every limit."""
         return self.status is TimingStatus.OK
 
     @property
     def limited_force(self) -> float:
-        """Largest of the normal forces that its limits are about [N], see `peak_force`."""
+        """Return the largest limited normal force [N]; see `peak_force`."""
         known = self.peak_force if self.robust_force is None else self.robust_force
         return float(known.max())
 

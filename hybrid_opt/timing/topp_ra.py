@@ -46,11 +46,12 @@ from symbolic.array import Array
 from symbolic.errors import SettingsError
 
 MAX_ITERATIONS = 25
+"""Linear problems per timing at most."""
 SETTLED_CHANGE = 2e-4
-"""Relative change of duration below which linearised limits count as settled."""
+"""Relative change of the duration below which linearised limits count as settled."""
 
 INTERVAL_ENDS = (0.0, 1.0)
-"""Places within an interval at which limits are imposed, as a share of its length."""
+"""Positions within an interval at which limits apply, as shares of its length."""
 
 POINT_TOLERANCE = 1e-3
 """Largest excess at the points where limits are imposed, as a share of the limit."""
@@ -91,11 +92,11 @@ def toppra_timing(model: TimingModel, motion: PathMotion, limits: TimingLimits) 
 
 
 class _CuttingPlaneProblem:
-    """One path with one set of limits: linear problems from one timing to the next.
+    """Linear problems for one path with one set of limits, from one timing to the next.
 
-    `_tightened` (intervals,) divides an interval's bounds, above one where a limit is exceeded
-    between the points at which it is imposed; `_near` says which of the limits that are not convex
-    came near their bound so far.
+    `_tightened` (intervals,) divides an interval's bounds, above one if a limit is exceeded between
+    the points at which it applies; `_near` marks the limits that are not convex and came near their
+    bound.
     """
 
     def __init__(self, model: TimingModel, motion: PathMotion, limits: TimingLimits) -> None:
@@ -116,8 +117,8 @@ class _CuttingPlaneProblem:
         self._duration = np.inf
 
     def _first_rows(self) -> Iterator[LinearLimits]:
-        """The limits that are linear by themselves, on speeds, which bound u'^2 alone, and on joint
-        accelerations; supporting lines of the convex ones before any timing is known."""
+        """Return limits that are linear: on speeds, which bound u'^2 alone, and on joint
+        accelerations; and supporting lines of the convex ones before any timing is known."""
         limit = squared_speed_limit(self._at.motion, self._model.workcell, self._limits)
         limit = np.minimum(limit, SPEED_CEILING / self._scale**2)[:, None]
         one, alpha, beta = np.ones_like(limit), *self._at.joint_accelerations()
@@ -136,7 +137,7 @@ class _CuttingPlaneProblem:
             yield tangent_rows(*force, _pairs(still, still))
 
     def solve(self) -> Timing:
-        """Solve linear problems until recomputed limits hold and nothing changes any more."""
+        """Solve linear problems until recomputed limits hold and the timing settles."""
         squared = np.zeros(0)
         settled = False
         for iteration in range(1, MAX_ITERATIONS + 1):
@@ -151,7 +152,7 @@ class _CuttingPlaneProblem:
         return self._finish(squared, iteration, settled)
 
     def _interval_rows(self, rows: list[LinearLimits]) -> LinearLimits:
-        """The rows of each interval's points in terms of its u'' and its initial u'^2."""
+        """Express the rows of each interval's points by its u'' and its initial u'^2."""
         alpha, beta, bound = (
             np.concatenate([getattr(row, name) for row in rows], axis=1)
             for name in ("alpha", "beta", "bound")
@@ -168,14 +169,14 @@ class _CuttingPlaneProblem:
         )
 
     def _at_points(self, squared: Array) -> tuple[Array, Array]:
-        """u'' and u'^2 (points,) of a timing (intervals + 1,) in the scaled coordinate."""
+        """Return u'' and u'^2 (points,) of a timing (intervals + 1,) in the scaled coordinate."""
         slope = np.diff(squared)
         w = squared[:-1, None] + np.outer(slope, INTERVAL_ENDS)
         a = np.repeat(slope / (2.0 * np.diff(self._grid)), len(INTERVAL_ENDS))
         return a / self._scale, w.reshape(-1) / self._scale**2
 
     def _advance(self, squared: Array) -> bool:
-        """Add or renew rows about a timing; whether it already holds and has settled."""
+        """Add or renew rows about a timing; return True if it holds and has settled."""
         a, w = self._at_points(squared)
         excess = self._cut(a, w)
         ratios = self._at.ratios(a, w)
@@ -197,7 +198,8 @@ class _CuttingPlaneProblem:
         return excess <= POINT_TOLERANCE and change <= SETTLED_CHANGE
 
     def _cut(self, a: Array, w: Array) -> float:
-        """Add supporting lines of the convex limits that a timing exceeds; the largest excess."""
+        """Add supporting lines of the convex limits that a timing exceeds; return the largest
+        excess."""
         worst_excess = -1.0
         for first, second, limit in self._at.accelerations():
             vector = first * a[:, None] + second * w[:, None]
@@ -217,7 +219,8 @@ class _CuttingPlaneProblem:
         return worst_excess
 
     def _tighten(self, squared: Array) -> bool:
-        """Tighten the intervals that exceed a limit between their points; whether there are any."""
+        """Tighten the intervals that exceed a limit between their points; return True if there are
+        any."""
         ratios = limit_ratios(self._refined(squared), self._model.workcell, self._limits)
         del ratios[FRICTION]
         use = np.max([ratio.max(axis=1) for ratio in ratios.values()], axis=0)
@@ -227,7 +230,7 @@ class _CuttingPlaneProblem:
         return bool(exceeded.any())
 
     def _finish(self, squared: Array, iterations: int, settled: bool) -> Timing:
-        """Recompute on refined samples; slow down uniformly where a limit is still exceeded."""
+        """Recompute on refined samples; slow down uniformly if a limit is still exceeded."""
 
         @cache
         def driven(factor: float) -> Timing:
@@ -267,15 +270,15 @@ class _CuttingPlaneProblem:
 
 
 def norm_rows(first: Array, second: Array, limit: float, directions: Array) -> LinearLimits:
-    """Supporting lines of |first u'' + second u'^2| <= limit, by (n, 3) each: along every unit
-    vector of `directions` (n, k, 3) one."""
+    """Return supporting lines of |first u'' + second u'^2| <= limit, by (n, 3) each, one per unit
+    vector of `directions` (n, k, 3)."""
     alpha = np.einsum("nkd,nd->nk", directions, first) / limit
     beta = np.einsum("nkd,nd->nk", directions, second) / limit
     return LinearLimits(alpha, beta, np.ones_like(alpha))
 
 
 def tangent_rows(value: Array, gradient: Array, z: Array) -> LinearLimits:
-    """Supporting lines of convex values <= 1, touching them at z.
+    """Return supporting lines of convex values <= 1 that touch them at z.
 
     Args:
         value: (n, k) at z.
@@ -287,16 +290,16 @@ def tangent_rows(value: Array, gradient: Array, z: Array) -> LinearLimits:
 
 
 def linearised_rows(value: Array, gradient: Array, at_rest: Array, z: Array) -> LinearLimits:
-    """Linearisation of value <= 1 about z, kept satisfiable at rest.
+    """Linearise value <= 1 about z such that rest stays feasible.
 
-    Where it would forbid rest, which is truly allowed, it follows the value by u'' and the chord to
-    rest by u'^2: a row whose bound is raised instead cuts off nothing, not even z.
+    A linearisation that forbids rest follows the value by u'' and the chord to rest by u'^2: with a
+    raised bound instead, a row cuts off nothing, not even z.
 
     Args:
         value: (n, k) at z.
         gradient: (n, k, 2) by (u'', u'^2).
         at_rest: (n, k) at u'' = u'^2 = 0, below one.
-        z: (n, 2) the point of linearisation.
+        z: (n, 2) point of linearisation.
     """
     lines = tangent_rows(value, gradient, z)
     least = (1.0 - at_rest) / 2.0
@@ -331,14 +334,14 @@ and now and then call a feasible interval infeasible."""
 
 @dataclass(frozen=True)
 class SolverFailure:
-    """A failure of toppra: what it could not do, and the interval at which."""
+    """A failure of toppra, and its interval."""
 
     reason: str
     interval: int
 
 
 def fastest_speed(rows: LinearLimits, grid: Array) -> Array | SolverFailure:
-    """The fastest motion from rest to rest within linear limits.
+    """Compute the fastest motion from rest to rest within linear limits.
 
     Args:
         rows: the limits.
@@ -414,7 +417,7 @@ def _solve(rows: LinearLimits, grid: Array) -> Array | SolverFailure:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """toppra's log lines become statuses; nothing is printed."""
+    """Silence toppra's log; its failures become statuses."""
     logger = logging.getLogger("toppra")
     level = logger.level
     logger.setLevel(logging.CRITICAL + 1)

@@ -1,20 +1,21 @@
-"""Convex quadratic programs of a border and a chain, and how a Lagrangian is made one.
+"""Convex quadratic programs of a border and a chain, and convex models of a Lagrangian.
 
     minimise  d^T H d / 2 + g.d   where  A d <= b,  low <= d <= high
 
 The first variables, the border, meet all others. Those behind them are a chain, which meets its
-neighbours only: the waypoints of a path and the squared speeds along it. Such a symmetric matrix
-is a tridiagonal block with a border, factorised in a time that is linear in the chain. The method
-is Mehrotra's predictor and corrector (Nocedal and Wright 2006, chapter 16.6), in `quadratic.cpp`,
-with slacks s of the rows and multipliers y, z_low, z_high, until with mu -> 0
+neighbours only: the waypoints of a path and the squared speeds along it. Such a symmetric matrix is
+a tridiagonal block with a border, factorised in a time that is linear in the chain. The method is
+Mehrotra's predictor and corrector (Nocedal and Wright 2006, chapter 16.6), in `quadratic.cpp`, with
+slacks s of the rows and multipliers y, z_low, z_high, until with mu -> 0
 
     H d + g + A^T y - z_low + z_high = 0,   A d + s = b,
     y s = z_low (d - low) = z_high (high - d) = mu.
 
-It is our own because libraries take longer: on 29 programs of the rack (189 variables, 802 to 1,239
-rows) PIQP 0.7.0 took 5.5 times as long, dense as well as with its multistage backend, 15 times
-sparse, and Clarabel 100 times. What it answers is checked by its residuals; where they
-are too large, which is rare, Clarabel is asked.
+It needs nothing from former programs. On a drivable polish of the rack with four force limits (230
+programs) DAQP 0.11 without a warm start takes 2.2 times the core time in the programs and 1.4 times
+in the whole polish; from the multipliers of the last program 1.1 to 1.2 times in the programs and
+1.05 to 1.13 times in the whole. Answers are checked by their residuals; Clarabel solves a program
+whose answer fails the check.
 """
 
 from __future__ import annotations
