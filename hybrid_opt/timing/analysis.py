@@ -112,8 +112,8 @@ def _jump(model: TimingModel, carry: Carry) -> Place | None:
 
 
 def drivable_timing(model: TimingModel, x: Array) -> Timing:
-    """A drivable carry x (n_var,) timed within its own force limit: as the search found it, where
-    that holds between its grid points, too; else by `time_path`, which takes many times as long.
+    """Time a drivable carry x (n_var,) within its own force limit: as the search timed it if that
+    holds between its grid points, else by `time_path`.
 
     Raises:
         SettingsError: x does not fit the workcell.

@@ -112,7 +112,7 @@ def robustness_margins(model: TimingModel, carry: Carry) -> tuple[Margin, ...]:
     has_patches = has_pressure_limit(workcell, TimingLimits())
 
     def failure(friction: Array, centre: Array) -> str:
-        """Name of the limit that is exceeded most, or '' where everything holds."""
+        """Return the name of the most exceeded limit, or '' if all hold."""
         load = model.uncertain_load(carry, friction, centre)
         torque = model.contact_torque(wrench_torque, load) + own_torque
         use = {
@@ -125,7 +125,7 @@ def robustness_margins(model: TimingModel, carry: Carry) -> tuple[Margin, ...]:
         return "" if use[name] <= 1.0 else name
 
     def lowered(whose: str, which: Array) -> Margin:
-        """The coefficients marked by `which` (2,), lowered by the same share."""
+        """Lower the coefficients marked by `which` (2,) by the same share."""
         nominal = float(friction[which > 0.0].min())
         lost, fails = _largest_feasible_change(
             lambda lost: failure(friction * (1.0 - lost * which), centre),
@@ -134,7 +134,7 @@ def robustness_margins(model: TimingModel, carry: Carry) -> tuple[Margin, ...]:
         return Margin(f"friction of {whose}", "", nominal, nominal * (1.0 - lost), fails)
 
     def shifted(axis: int, sign: float) -> Margin:
-        """The centre of mass along one box axis, up to the box's faces."""
+        """Shift the centre of mass along one box axis, up to the box's faces."""
         nominal, direction = float(centre[axis]), sign * np.eye(3)[axis]
         offset, fails = _largest_feasible_change(
             lambda offset: failure(friction, centre + offset * direction),

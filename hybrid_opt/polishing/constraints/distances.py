@@ -1,13 +1,13 @@
-"""Distances kept: of the arms, and how the payload passes an obstacle.
+"""Rows of distances: of the arms, and of the payload that passes an obstacle.
 
-The smooth bound of a clearance may be lower than the true distance by a centimetre. So a row asks
-for the wanted distance less what FCL, or the sharp bound, measures beyond the smooth one at the
-current candidate; where the solution moves on and that was too much, the next round asks again.
+The smooth bound of a clearance may be lower than the true distance by a centimetre. So a row
+requires the wanted distance less the difference between the measured distance, or the sharp bound,
+and the smooth one at the current candidate; if the solution moves on and that was too much, the
+next iteration corrects it.
 
-Between a box and a box, the bound is the largest of a few gaps along single directions. A row that
-holds one of these gaps is smooth. Where the largest gap changes from one that falls to one that
-rises, the payload passes an edge, and the height of that kink gets a row of its own
-(`symbolic.smooth.passage`).
+Between two boxes the bound is the largest of a few gaps along single directions. A row with one of
+these gaps is smooth. Where the largest gap changes from a falling to a rising one, the payload
+passes an edge, and the height of that kink gets a row of its own (`symbolic.smooth.passage`).
 """
 
 from __future__ import annotations
@@ -32,20 +32,20 @@ from symbolic.smooth.passage import AxisSwitchGap, SeparatingAxisGap
 from symbolic.smooth.places import Clearance
 
 BODY_DISTANCE = 0.03
-"""Pairs with an arm's body nearer than this get a row at their lowest [m]."""
+"""Pairs with an arm's body nearer than this get a row at their minima [m]."""
 
 MEASURED_BELOW = 0.02
-"""Bounds lower than this are compared with FCL's distance [m]."""
+"""Bounds lower than this are replaced by measured distances [m]."""
 
 BESIDE_CLEARANCE = 0.015
-"""A violated clearance also gets rows this far to either side."""
+"""Distance of further rows on both sides of a violated clearance."""
 
 GAP_DISTANCE, GAP_STRIDE = 0.03, 0.02
 """The payload's gaps below the distance [m] get a row in every such stretch: they are cheap,
-because they need no joints, and decide where the path may go."""
+because they need no joints, and decide the path."""
 
 FAR_GAP_DISTANCE, FAR_GAP_STRIDE = 0.08, 0.04
-"""The same farther away, less densely."""
+"""The same for larger gaps, less densely."""
 
 KINK_DISTANCE = 0.06
 """Kinks of the payload's clearance lower than this get a row [m]."""
@@ -58,10 +58,11 @@ KINK_WINDOW = 0.04
 
 
 class DistanceConstraintKind(ConstraintKind[PathRow]):
-    """A kind whose values are distances of a pair; `window` is where a row's is measured.
+    """A kind with distances of a pair as values; `window` is the range of places in which a row's
+    distance is measured.
 
     Attributes:
-        wanted, least: (n_pairs,) distance to be asked of each pair, and below which it is
+        wanted, least: (n_pairs,) required distance of each pair, and the one below which it is
             violated [m].
     """
 
@@ -79,7 +80,8 @@ class DistanceConstraintKind(ConstraintKind[PathRow]):
     def required_values(
         self, carry: PlacedCarry, rows: Sequence[PathRow], is_relaxed: bool = False
     ) -> list[float]:
-        """See the module; the margin where no arm gets to."""
+        """Return the wanted distances less the smooth bound's error; the margin at places out of
+        reach."""
         values = np.full(len(rows), PATCH_MARGIN)
         chosen = [k for k, row in enumerate(rows) if row.place < carry.reached]
         if not chosen:
@@ -93,14 +95,14 @@ class DistanceConstraintKind(ConstraintKind[PathRow]):
         return values.tolist()
 
     def violations(self, carry: PlacedCarry) -> dict[int, Array]:
-        """(reached,) distances of every pair that comes too close [m], by pair."""
+        """Return distances (reached,) of every pair that is too close [m], by pair."""
         close = carry.distances.interpolated_clearance < self.least
         pairs = np.flatnonzero(close.any(axis=0)).tolist()
         truth = carry.distances.at(close)
         return {pair: truth[:, pair].copy() for pair in pairs}
 
     def _measured(self, carry: PlacedCarry, rows: Sequence[PathRow]) -> Array:
-        """Least distance in the window of each row."""
+        """Measure the least distance in the window of each row."""
         stretches = [
             (slice(max(0, row.place - self.window), row.place + self.window + 1), pair_of(row))
             for row in rows
@@ -109,26 +111,26 @@ class DistanceConstraintKind(ConstraintKind[PathRow]):
 
 
 def pair_of(row: PathRow) -> int:
-    """The active pair of a row whose value is a distance."""
+    """Return the active pair of a row with a distance as value."""
     assert isinstance(row.constraint, Clearance | SeparatingAxisGap | AxisSwitchGap)
     return row.constraint.pair
 
 
 class Clearances(DistanceConstraintKind):
-    """Rows at the lowest places of every pair that comes near."""
+    """Rows at the minima of every pair that comes near."""
 
     persists = True
 
     def near_rows(self, carry: PlacedCarry, limits: MinimisedForces) -> Iterable[PathRow]:
-        """Pairs whose bound is small."""
+        """Return rows of pairs with a small bound."""
         for pair in np.flatnonzero(carry.distances.bounds.min(axis=0) < BODY_DISTANCE).tolist():
             if pair not in self.separable:
                 for place in local_minima_below(carry.distances.bounds[:, pair], BODY_DISTANCE):
                     yield PathRow(Clearance(pair, self._columns[pair]), place)
 
     def violated_rows(self, carry: PlacedCarry, known: PlacedCarry) -> Iterable[PathRow]:
-        """Pairs that come too close: at the lowest place and around it; a dip counts at two
-        neighbours."""
+        """Return rows of pairs that are too close: at the minimum and around it; an interpolated
+        minimum counts at two neighbours."""
         width = self.grid.places(BESIDE_CLEARANCE)
         for pair, distance in self.violations(carry).items():
             if pair in self.separable:
@@ -143,7 +145,7 @@ class SeparatingAxisGaps(DistanceConstraintKind):
     """Rows of single gaps between the payload and a box, away from kinks."""
 
     def near_rows(self, carry: PlacedCarry, limits: MinimisedForces) -> Iterable[PathRow]:
-        """Rows along every stretch where the payload is near, at a few places each."""
+        """Return rows along every stretch where the payload is near, at a few places each."""
         grid = self.grid
         beside = grid.places(BESIDE_KINK)
         stretches = (
@@ -180,13 +182,13 @@ class AxisSwitchGaps(DistanceConstraintKind):
         self.window = cell.grid.places(KINK_WINDOW)
 
     def near_rows(self, carry: PlacedCarry, limits: MinimisedForces) -> Iterable[PathRow]:
-        """Kinks that are low."""
+        """Return rows of low kinks."""
         for pair, gaps in near_gaps(self, carry):
             for kink, place in edges(gaps, KINK_DISTANCE):
                 yield passing(pair, gaps, kink, place)
 
     def violated_rows(self, carry: PlacedCarry, known: PlacedCarry) -> Iterable[PathRow]:
-        """Kinks of the known candidate near places that are too close."""
+        """Return rows of the known candidate's kinks near places that are too close."""
         for pair, gaps, _, near in violated_passages(self, carry, known):
             for kink, place in near:
                 yield passing(pair, gaps, kink, place)
@@ -194,12 +196,12 @@ class AxisSwitchGaps(DistanceConstraintKind):
 
 @dataclass(frozen=True)
 class Gaps:
-    """A separable pair's gaps along every direction at m places.
+    """Gaps of a separable pair along every direction at m places.
 
     Attributes:
         along: (m, n) [m].
         best: (m,) direction of the largest.
-        height: (m,) that one [m].
+        height: (m,) the largest [m].
     """
 
     along: Array
@@ -208,13 +210,14 @@ class Gaps:
 
     @classmethod
     def from_values(cls, along: Array) -> Gaps:
-        """From the gaps along all directions (m, n) [m]."""
+        """Collect the gaps along all directions (m, n) [m]."""
         best = along.argmax(axis=1)
         return cls(along, best, along[np.arange(len(best)), best])
 
 
 def edges(gaps: Gaps, limit: float) -> list[tuple[int, int]]:
-    """Kinks lower than a limit [m]: the place before each, and the lower one of both beside it."""
+    """Return kinks lower than a limit [m]: the place before each, and the lower one of both
+    neighbours."""
     best, height, along = gaps.best, gaps.height, gaps.along
     return [
         (k, k + int(height[k + 1] < height[k]))
@@ -226,18 +229,18 @@ def edges(gaps: Gaps, limit: float) -> list[tuple[int, int]]:
 
 
 def passing(pair: int, gaps: Gaps, kink: int, place: int) -> PathRow:
-    """The row of a kink of `edges`."""
+    """Return the row of a kink of `edges`."""
     before, after = (int(gaps.best[k]) for k in (kink, kink + 1))
     return PathRow(AxisSwitchGap(pair, before, after), place)
 
 
 def separation(pair: int, gaps: Gaps, place: int) -> PathRow:
-    """The row of the largest gap at a place."""
+    """Return the row of the largest gap at a place."""
     return PathRow(SeparatingAxisGap(pair, int(gaps.best[place])), place)
 
 
 def near_gaps(kind: DistanceConstraintKind, carry: PlacedCarry) -> Iterable[tuple[int, Gaps]]:
-    """Every separable pair that comes near, and its gaps."""
+    """Return every separable pair that comes near, and its gaps."""
     for pair in np.flatnonzero(carry.distances.bounds.min(axis=0) < FAR_GAP_DISTANCE).tolist():
         if pair in kind.separable:
             yield pair, Gaps.from_values(carry.gaps(pair))
@@ -246,7 +249,8 @@ def near_gaps(kind: DistanceConstraintKind, carry: PlacedCarry) -> Iterable[tupl
 def violated_passages(
     kind: DistanceConstraintKind, carry: PlacedCarry, known: PlacedCarry
 ) -> Iterable[tuple[int, Gaps, int, list[tuple[int, int]]]]:
-    """Places that are too close: pair, gaps of the known candidate, place, its kinks nearby."""
+    """Return places that are too close: pair, gaps of the known candidate, place, its kinks
+    nearby."""
     window = kind.grid.places(KINK_WINDOW)
     for pair, distance in kind.violations(carry).items():
         if pair not in kind.separable:

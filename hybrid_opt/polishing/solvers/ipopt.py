@@ -56,31 +56,31 @@ class _Callback(ca.Callback):  # type: ignore[misc]  # CasADi has no types
         self.construct(name, {})
 
     def get_n_in(self) -> int:
-        """How many inputs."""
+        """Return the number of inputs."""
         return len(self._inputs)
 
     def get_n_out(self) -> int:
-        """How many outputs."""
+        """Return the number of outputs."""
         return len(self._outputs)
 
     def get_name_in(self, index: int) -> str:
-        """Name of an input."""
+        """Return the name of an input."""
         return self._inputs[index][0]
 
     def get_name_out(self, index: int) -> str:
-        """Name of an output."""
+        """Return the name of an output."""
         return self._outputs[index][0]
 
     def get_sparsity_in(self, index: int) -> ca.Sparsity:
-        """Sparsity of an input."""
+        """Return the sparsity of an input."""
         return self._inputs[index][1]
 
     def get_sparsity_out(self, index: int) -> ca.Sparsity:
-        """Sparsity of an output."""
+        """Return the sparsity of an output."""
         return self._outputs[index][1]
 
     def eval(self, arguments: Sequence[ca.DM]) -> list[Any]:
-        """The outputs."""
+        """Evaluate the outputs."""
         return self._evaluate(*[argument.full().ravel() for argument in arguments])
 
 
