@@ -34,12 +34,12 @@ def _add_options(parser: Parser) -> None:
         "--use",
         choices=TIMINGS,
         help="the timing of the carry: closest to the reference speed, the fastest, or the fastest "
-        "below --force-limit (default: force where that is given or the trajectory has a limit of "
-        "its own, as recommended ones, else closest)",
+        "below --planned-limit (default: force where that is given or the trajectory has a limit "
+        "of its own, as recommended ones, else closest)",
     )
     add(
         parser,
-        "--force-limit",
+        "--planned-limit",
         help="largest planned normal force [N], the largest robust one of a trajectory that was "
         "searched for robust forces (default: the trajectory's own, where it has one)",
     )

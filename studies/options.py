@@ -248,6 +248,7 @@ _SHARED: dict[str, dict[str, Any]] = {
     "FILE": {"type": TRAJECTORY_FILE, "help": "a trajectory file"},
     "--classes": {"type": whole(1, 100), "default": 1, "metavar": "N"},
     "--force-limit": {"type": force, "metavar": "N"},
+    "--planned-limit": {"type": force, "metavar": "N"},
     "--jobs": {
         "type": whole(0, 4096),
         "default": 0,

@@ -17,14 +17,14 @@ def _add_options(parser: Parser) -> None:
     )
     add(
         parser,
-        "--force-limit",
-        help="tell also the fastest timing whose normal forces stay below this [N]",
+        "--planned-limit",
+        help="tell also the fastest timing whose planned normal forces stay below this [N]",
     )
     parser.add_argument(
         "--force-curve",
         type=int,
         metavar="POINTS",
-        help="tell also the durations at this many force limits",
+        help="tell also the durations at this many limits of the planned force",
     )
     add(parser, "--json")
 

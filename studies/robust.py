@@ -23,7 +23,7 @@ def _add_options(parser: Parser) -> None:
     )
     add(
         parser,
-        "--force-limit",
+        "--planned-limit",
         help="tell also how fast the path can be driven with planned forces below this [N], and "
         "with forces below it that hold in all cases (arm 1 leads)",
     )

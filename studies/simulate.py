@@ -29,7 +29,7 @@ def _add_options(parser: Parser) -> None:
         help="how it is driven: as what it was searched for (within its force limit, or closest to "
         "the reference speeds where it has none), closest to them, or as fast as can be",
     )
-    add(parser, "--force-limit", help="fastest below this force")
+    add(parser, "--planned-limit", help="fastest with planned normal forces below this [N]")
     add(parser, "--leader")
     parser.add_argument(
         "--runs", type=whole(0, 10**6), default=20, help="random cases of the uncertainty"

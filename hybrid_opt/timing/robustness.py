@@ -159,8 +159,8 @@ def robustness_margins(model: TimingModel, carry: Carry) -> tuple[Margin, ...]:
 
 
 def _even_margins(model: TimingModel, carry: Carry) -> list[Margin]:
-    """Return the margins until an elastic pad lifts off at a rim: the largest shift of the pressure
-    on the carry."""
+    """Return how far the pressure of each pad may still shift at its largest shift on the carry,
+    before an elastic pad lifts off at a rim; nominal without any shift."""
     workcell = model.workcell
     if not presses_evenly(workcell):
         return []
@@ -176,8 +176,8 @@ def _even_margins(model: TimingModel, carry: Carry) -> list[Margin]:
     found = []
     for robot, contact, share in zip(workcell.robots, workcell.contacts, largest, strict=True):
         room = free_shift(contact)
-        name = f"room for the pressure of {robot.name}"
-        found.append(Margin(name, "m", room, room * float(share), "pad lifts off"))
+        name = f"room left for the pressure of {robot.name}"
+        found.append(Margin(name, "m", room, room * (1.0 - float(share)), "pad lifts off"))
     return found
 
 

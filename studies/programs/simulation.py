@@ -268,8 +268,8 @@ def simulate_file(options: argparse.Namespace) -> int:
 def _timed(cell: Cell, x: Array, options: argparse.Namespace) -> Carry:
     """The carry of an exported job with that timing."""
     model = cell.timing_model
-    if options.force_limit is not None:
-        return exported_carry(cell, time_path(model, x, model.drive_limits(options.force_limit)))
+    if options.planned_limit is not None:
+        return exported_carry(cell, time_path(model, x, model.drive_limits(options.planned_limit)))
     if options.timing == "fastest":
         return exported_carry(cell, time_path(model, x, TimingLimits()))
     if options.timing == "closest":

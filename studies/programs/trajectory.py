@@ -88,7 +88,7 @@ def _replayed(
         "provenance": dict(stored.provenance),
     }
     yield Finding(document, lines)
-    asked = (options.force_limit, options.force_curve)
+    asked = (options.planned_limit, options.force_curve)
     if options.timing or any(option is not None for option in asked):
         Progress().note("timing it, which takes some seconds")
         timing = timing_document(time_trajectory(replayed.cell.timing_model, stored.x, *asked))
@@ -116,7 +116,7 @@ def export_file(options: argparse.Namespace) -> int:
     with TemporaryDirectory() as folder:
         cell = stored.open_cell(Path(folder))
         build_study(cell, Progress(), polish=False, drivable=False)
-        timing = _chosen(cell.timing_model, stored, options.use, options.force_limit)
+        timing = _chosen(cell.timing_model, stored, options.use, options.planned_limit)
         jobs = JobModel(cell.compiled, cell.timing_model)
         job = jobs.plan(timing, squeeze, options.smoothing)
         origin = Origin.of_file(path, read_bytes(path), stored.provenance)
@@ -135,7 +135,7 @@ def _chosen(
     limits = TimingLimits(reference_speed=chosen == "closest")
     if chosen == "force":
         if force is None:
-            raise SettingsError("--use force needs --force-limit")
+            raise SettingsError("--use force needs --planned-limit")
         limits = model.drive_limits(force)
     return time_path(model, stored.x, limits)
 
@@ -197,7 +197,7 @@ def _robust_forces(cell: Cell, x: Array, options: argparse.Namespace) -> int:
         print("  nothing is uncertain, so there is nothing to check: state what may be off")
     else:
         exit_code = _priced(pressing_model(workcell), timing.carry, options)
-    for text in [] if options.force_limit is None else _timed(cell, x, options.force_limit):
+    for text in [] if options.planned_limit is None else _timed(cell, x, options.planned_limit):
         print(f"  {text}")
     return exit_code
 

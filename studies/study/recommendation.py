@@ -276,7 +276,7 @@ def recommend_from(
         why=found.why,
         source=source,
         file=file,
-        export=export_command(Path(file), found.limit),
+        export=export_command(Path(file)),
         duration=found.duration,
         force=found.force,
         parts=found.squeeze.parts,
@@ -403,7 +403,7 @@ def recommendation_text(found: StoredRecommendation, folder: str) -> Recommendat
     facts += [
         ("why", f"{found.why}; of {found.considered} drivable carries, from {found.source}"),
         ("file", str(Path(folder) / found.file)),
-        ("export", export_command(Path(folder) / found.file, found.force_limit)),
+        ("export", export_command(Path(folder) / found.file)),
         ("the force", f"{account(found.parts)}; {found.squeeze_reason}"),
         *[(rival.label, _rival(rival, found)) for rival in found.rivals],
         ("margins", "; ".join(_margins(found)) or "not known"),
@@ -411,19 +411,19 @@ def recommendation_text(found: StoredRecommendation, folder: str) -> Recommendat
     ]
     told = [str(each) for each in found.advice if abs(each.force) >= NOTICED][:ADVICE]
     if told:
-        facts.append(("costs most", "; ".join(told)))
+        facts.append(("with this path", "; ".join(told)))
     if found.price is not None:
         facts.append(("holds", _robust(found.price)))
     return RecommendationText(headline, tuple(facts), found.warnings)
 
 
-def export_command(path: Path, force: float) -> str:
-    """The command that makes of a trajectory file, timed within a force limit [N], what robots
+def export_command(path: Path) -> str:
+    """Return the command that makes of a trajectory file, timed within its own limits, what robots
     need."""
     output = path.with_name(f"{path.stem}-{EXPORT_TARGET}")
     return (
         f"python -m studies.export {shlex.quote(str(path))} --target {EXPORT_TARGET} "
-        f"--force-limit {force:.6g} --output {shlex.quote(str(output))}"
+        f"--output {shlex.quote(str(output))}"
     )
 
 
@@ -436,6 +436,8 @@ def _rival(rival: Rival, found: StoredRecommendation) -> str:
         same_force = f"{duration:.2f} s at the same force ({_percent(duration / found.duration)})"
     if math.isfinite(force):
         same_time = f"{force:.1f} N in the same time ({_percent(force / found.force)})"
+        if found.allowed is not None and force > found.allowed.min():
+            same_time += f", above the reference force of {found.allowed.min():.1f} N"
     return f"{same_force}, {same_time}"
 
 

@@ -43,7 +43,7 @@ def stored(folder: Path, table: str) -> Path:
 
 
 def test_tells_forces_price_and_check(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    arguments = ["--cases", "200", "--points", "3", "--force-limit", "66"]
+    arguments = ["--cases", "200", "--points", "3", "--planned-limit", "66"]
     assert robust.main([str(stored(tmp_path, TABLE)), *arguments]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert "below 66 N" in lines[-2]
@@ -128,7 +128,7 @@ def test_a_bundle_is_written(
     assert manifest["trajectory"]["replica"] == 2
     assert export.main([*arguments, "--stiffness", "1e4"]) == 0
     assert "Either arm late, at 10000 N/m" in capsys.readouterr().out
-    assert export.main([*arguments, "--squeeze", "1.6", "--force-limit", "60"]) == 0
+    assert export.main([*arguments, "--squeeze", "1.6", "--planned-limit", "60"]) == 0
     assert len(list(tmp_path.iterdir())) == 2
     (folder / "data" / "mine.txt").write_text("mine")
     assert export.main(arguments) == 2
@@ -140,8 +140,8 @@ def test_a_bundle_is_written(
     ("arguments", "message"),
     [
         (["--target", "data", "--step", "0"], "time step"),
-        (["--target", "data", "--use", "force"], "--force-limit"),
-        (["--target", "data", "--force-limit", "1"], "no timing to export"),
+        (["--target", "data", "--use", "force"], "--planned-limit"),
+        (["--target", "data", "--planned-limit", "1"], "no timing to export"),
         (["--target", "data", "--squeeze", "0.5"], "allowed is 1 to 10"),
         (["--target", "data", "--stiffness", "0"], "stiffness"),
         (["--target", "data", "--smoothing", "-1"], "smoothing"),
@@ -221,7 +221,7 @@ def test_what_differs_is_shown(file: Path, name: str, capsys: pytest.CaptureFixt
 
 
 def test_timing_report(file: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    arguments = [str(file), "--force-limit", "60", "--force-curve", "3"]
+    arguments = [str(file), "--planned-limit", "60", "--force-curve", "3"]
     assert replay.main(arguments) == 0
     text = capsys.readouterr().out
     for part in ("closest to reference", "force limited", "How far assumptions", "against force"):

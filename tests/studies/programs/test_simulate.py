@@ -41,7 +41,7 @@ def test_threshold_and_cases_of_a_stored_trajectory_without_arms(
 @pytest.mark.slow
 def test_arms_carry_a_stored_trajectory(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path, film, cell = stored(tmp_path, TABLE), tmp_path / "film.gif", tmp_path / "cell.xml"
-    arguments = [str(path), "--force-limit", "55", "--runs", "2", "--film", str(film)]
+    arguments = [str(path), "--planned-limit", "55", "--runs", "2", "--film", str(film)]
     assert simulate.main([*arguments, "--mjcf", str(cell)]) == 0
     out = capsys.readouterr().out
     factor = float(out.split("holds from ")[1].split()[0])
