@@ -22,6 +22,7 @@ from hybrid_opt.polishing.rows import ConstraintRows, Row, RowLayout
 from hybrid_opt.polishing.solvers.base import Residuals
 from hybrid_opt.polishing.solvers.quadratic import BorderedMatrix, BorderedRows
 from symbolic.array import Array
+from symbolic.limits import LIMITS, limits_of_block
 from symbolic.path.spline import path_basis
 from symbolic.records.cell import Workcell
 from symbolic.records.task import extended_waypoints
@@ -65,16 +66,11 @@ class PointInequalities:
         eye = np.eye(layout.size)
         forces = planned_branches(workcell)
         further = robust + (GRASP_ROWS if layout.by_program else 0)
-        blocks = [
-            eye[layout.block("speed")],
-            eye[layout.block("acceleration")],
-            -eye[layout.block("acceleration")],
-            eye[layout.block("cone")],
-            eye[layout.block("torque")],
-            -eye[layout.block("torque")],
-            eye[layout.block("pressure")],
-            forces.reshape(-1, layout.size),
-        ]
+        blocks = []
+        for block in dict.fromkeys(limit.block for limit in LIMITS if limit.block != "force"):
+            own = eye[layout.block(block)]
+            blocks += [own, -own] if limits_of_block(block)[0].is_signed else [own]
+        blocks.append(forces.reshape(-1, layout.size))
         planned = np.concatenate(blocks)
         mix = block_diag(planned, np.eye(further))
         is_force = np.arange(len(mix)) >= len(planned) - forces.shape[0] * forces.shape[1]
