@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 import pytest
@@ -155,13 +156,17 @@ def test_pads_have_to_press_before_the_box_is_lifted() -> None:
     assert risen[0] - risen[1] < 1e-4, "nothing is lifted"
 
 
+def _seen_late(shift: float, age: float, s: float) -> Seen:
+    return Seen(posture(s - shift), age=[age, age])
+
+
 @pytest.mark.parametrize("age", [0.0, 0.03, 0.09])
 def test_postures_are_compared_when_they_were_measured(age: float) -> None:
     """A late message of an arm in its place stops nothing; one of an arm that is late does."""
     s = job().begin("carry") + 2.0
     for late, state in ((0.0, "running"), (0.08, "held")):
-        machine = running(s)
-        ticks(machine, lambda s, late=late: Seen(posture(s - age - late), age=[age, age]))
+        machine, shift = running(s), age + late
+        ticks(machine, partial(_seen_late, shift, age))
         assert machine.state == state, machine.told()
 
 

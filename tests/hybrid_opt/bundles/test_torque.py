@@ -330,8 +330,8 @@ def by(name: str, joints: str = "", **stated: Any) -> Any:
     """A cell's job with something stated of its drivers, its joints called otherwise."""
     job = driven(planned(name), replace(DRIVER, **stated))
     if joints:
-        renamed = tuple(tuple(n.replace("panda", joints) for n in own) for own in job.joint_names)
-        job = replace(job, joint_names=renamed)
+        north, south = (tuple(n.replace("panda", joints) for n in own) for own in job.joint_names)
+        job = replace(job, joint_names=(north, south))
     return job
 
 

@@ -105,8 +105,8 @@ def test_a_seventh_axis_is_an_external_one_to_rapid() -> None:
 def test_franka_takes_the_pandas() -> None:
     """Called as franka_ros2 calls them."""
     job = driven(planned("pandas"))
-    renamed = tuple(tuple(n.replace("panda", "fr3") for n in own) for own in job.joint_names)
-    job = replace(job, joint_names=renamed)
+    north, south = (tuple(n.replace("panda", "fr3") for n in own) for own in job.joint_names)
+    job = replace(job, joint_names=(north, south))
     target = target_for("torque", job.workcell)
     target.refuse(job, "torque", any_arm=False)
     sheet = prepared(job, "torque", BundleOptions(step=0.05))
