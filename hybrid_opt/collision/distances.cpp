@@ -10,6 +10,7 @@
 #include <pybind11/numpy.h>
 #include <pybind11/pybind11.h>
 
+#include <algorithm>
 #include <cmath>
 #include <cstdint>
 #include <limits>
@@ -47,6 +48,21 @@ struct Pose {
   Rotation R;
   Vector p;
 };
+
+constexpr int WIDTH = 4;  // corners of a hull side by side: x of all, y of all, z of all
+
+// Largest u.x over corners, `WIDTH` side by side.
+double farthest_corner(const double *corners, size_t size, double u, double v, double w) {
+  double most[WIDTH] = {-INFINITE, -INFINITE, -INFINITE, -INFINITE};
+  for (size_t k = 0; k < size; k += 3 * WIDTH) {
+    const double *x = corners + k, *y = x + WIDTH, *z = y + WIDTH;
+    for (int i = 0; i < WIDTH; ++i) {
+      const double along = u * x[i] + v * y[i] + w * z[i];
+      most[i] = along > most[i] ? along : most[i];
+    }
+  }
+  return std::max(std::max(most[0], most[1]), std::max(most[2], most[3]));
+}
 
 // A convex shape in its own frame.
 class Shape {
@@ -90,18 +106,7 @@ class Shape {
       case HULL:
         break;
     }
-    double most[WIDTH];
-    for (int i = 0; i < WIDTH; ++i) most[i] = -INFINITE;
-    for (size_t k = 0; k < corners_.size(); k += 3 * WIDTH) {
-      const double *x = corners_.data() + k, *y = x + WIDTH, *z = y + WIDTH;
-      for (int i = 0; i < WIDTH; ++i) {
-        const double along = u[0] * x[i] + u[1] * y[i] + u[2] * z[i];
-        most[i] = along > most[i] ? along : most[i];
-      }
-    }
-    double found = most[0];
-    for (int i = 1; i < WIDTH; ++i) found = std::max(found, most[i]);
-    return found;
+    return farthest_corner(corners_.data(), corners_.size(), u[0], u[1], u[2]);
   }
 
   const coal::ShapeBase *coal() const { return coal_.get(); }
@@ -110,8 +115,6 @@ class Shape {
   double radius;
 
  private:
-  static constexpr int WIDTH = 4;  // corners side by side: x of all, y of all, z of all
-
   void set_hull(const double *corners, std::int64_t count) {
     std::vector<Vector> points;
     for (std::int64_t k = 0; k < count; ++k) points.emplace_back(corners + 3 * k);
@@ -150,6 +153,18 @@ struct Placed {
 // The gap between two pieces along a unit direction from a towards b; negative where they overlap.
 double gap(const Placed &a, const Placed &b, const Vector &u) {
   return -b.support(-u) - a.support(u);
+}
+
+// Largest u.x over pieces.
+double support(const std::vector<Placed> &pieces, const Vector &u) {
+  double found = -INFINITE;
+  for (const Placed &piece : pieces) found = std::max(found, piece.support(u));
+  return found;
+}
+
+bool are_finite(const std::vector<Placed> &pieces) {
+  return std::all_of(pieces.begin(), pieces.end(),
+                     [](const Placed &piece) { return piece.centre.allFinite(); });
 }
 
 // Bounds of the distance of two pieces: lower along `direction`, a unit vector from the first towards
@@ -281,11 +296,11 @@ class Bodies {
   // unknown; updated.
   Bounds bounds(const Poses &poses, std::int64_t i, std::int64_t j, Vector &direction) const {
     const std::vector<Placed> &first = placed(poses, i, 0), &second = placed(poses, j, 1);
+    if (!are_finite(first) || !are_finite(second)) return {-INFINITE, INFINITE, Vector::Zero()};
     Bounds nearest{INFINITE, INFINITE, direction};
     for (const Placed &a : first)
       for (const Placed &b : second) {
         const Vector between = b.centre - a.centre;
-        if (!between.allFinite()) return {-INFINITE, INFINITE, Vector::Zero()};
         if (between.norm() - a.shape->radius - b.shape->radius > nearest.upper) continue;
         const Bounds one = solver().bounds(a, b, direction, nearest.upper, 0.0);
         if (one.lower < nearest.lower) {
@@ -302,19 +317,16 @@ class Bodies {
   Verdict decide(const Poses &poses, std::int64_t i, std::int64_t j, double apart, double overlap,
                  double *hint) const {
     const std::vector<Placed> &first = placed(poses, i, 0), &second = placed(poses, j, 1);
+    if (!are_finite(first) || !are_finite(second)) return OPEN;
     const Vector direction = Eigen::Map<const Vector>(hint);
     if (direction.squaredNorm() > 0.0) {
-      double near = -INFINITE, far = INFINITE;
-      for (const Placed &a : first) near = std::max(near, a.support(direction));
-      for (const Placed &b : second) far = std::min(far, -b.support(-direction));
-      if (far - near > apart) return APART;
+      if (-support(second, -direction) - support(first, direction) > apart) return APART;
     }
     Verdict found = APART;
     double least = INFINITE;
     for (const Placed &a : first)
       for (const Placed &b : second) {
         const Vector between = b.centre - a.centre;
-        if (!between.allFinite()) return OPEN;
         if (between.norm() - a.shape->radius - b.shape->radius > apart) continue;
         const Bounds one = solver().bounds(a, b, direction, apart, overlap);
         if (one.lower < least) {

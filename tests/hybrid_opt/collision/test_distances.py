@@ -232,3 +232,12 @@ def test_no_answer_to_what_is_no_pose(centre: Array) -> None:
     lower, upper = known.bounds()
     assert np.isneginf(lower).all()
     assert np.isposinf(upper).all()
+    # Nor where the sample before found a direction.
+    positions = np.repeat(known.positions, 2, axis=0)
+    positions[0, 1::2] = 2.0
+    quaternions = np.repeat(known.quaternions, 2, axis=0)
+    least, rows = np.full(2, PROOF_MARGIN), np.arange(2)
+    for pair in range(2):
+        queries = rows, np.full(2, 2 * pair), np.full(2, 2 * pair + 1)
+        found = known.bodies.decide(quaternions, positions, *queries, least, least)
+        assert found.tolist() == [APART, OPEN]
