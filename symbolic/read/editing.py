@@ -65,8 +65,8 @@ def with_paths(data: Mapping[str, Any], change: Callable[[str], str]) -> Changes
             entry |= {"xacro_arguments": moved} if moved else {}
         folders = robot.get("package_dirs")
         if isinstance(folders, list):
-            moved = [change(str(name)) for name in folders]
-            entry |= {"package_dirs": moved} if moved != folders else {}
+            renamed = [change(str(name)) for name in folders]
+            entry |= {"package_dirs": renamed} if renamed != folders else {}
         if isinstance(robot.get("tool"), list):
             entry["tool"] = [changed(body, "path") for body in robot["tool"]]
         found["robots"].append(entry)
