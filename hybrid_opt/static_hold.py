@@ -12,7 +12,7 @@ import numpy as np
 
 from hybrid_opt.compiled_cell import kept_per_workcell
 from symbolic.array import Array, Pair
-from symbolic.contact.load import LOAD_OUTPUTS, closed_load_function, uncertain_load_function
+from symbolic.contact.load import LOAD_OUTPUTS, uncertain_load_function
 from symbolic.errors import WorkcellError
 from symbolic.records import Workcell
 from symbolic.records.poses import box_rotation
@@ -214,13 +214,11 @@ class _Still:
 
             self._models = [build_robot_model(robot) for robot in workcell.robots]
 
-    def exceeded(
-        self, mass: float = 1.0, friction: float = 1.0, function: ca.Function | None = None
-    ) -> list[StillUse]:
+    def exceeded(self, mass: float = 1.0, friction: float = 1.0) -> list[StillUse]:
         """The limits that are exceeded with other factors on mass and friction."""
         found = []
         for where, pose in self._poses.items():
-            load = still_load(self._workcell, pose, friction, function)
+            load = still_load(self._workcell, pose, friction)
             uses = [*self._contact_uses(where, load, mass), *self._torques(where, load, mass)]
             found += [use for use in uses if use.exceeded]
         return found
@@ -234,7 +232,7 @@ class _Still:
             # Where a pad presses too hard already, its whole force says nothing new.
             name, force = (NORMAL, normal) if normal > allowed else (WHOLE, mass * float(whole[i]))
             yield StillUse(name, robot.name, where, force, allowed, "N")
-            if workcell.task.allocation == "paper":  # the joint one presses harder instead
+            if workcell.task.allocation == "paper":  # soft fingers press harder instead
                 shift, radius = float(load["pressure_shift"][i]), workcell.contacts[i].patch_radius
                 yield StillUse(PRESSURE, robot.name, where, 1e3 * shift, 1e3 * radius, "mm")
 
@@ -256,14 +254,14 @@ class _Still:
             yield StillUse(TORQUE, whose, where, float(torque[joint]), float(most), unit)
 
     def remedy(self, exceeded: list[StillUse]) -> str:
-        """Mass, friction or patch that would suffice, each with all else as it is."""
+        """Mass or friction that would suffice, each with all else as it is."""
         ways = []
         if any(use.quantity != PRESSURE for use in exceeded):
-            ways = [way for way in (self._mass(), self._friction(), self._patch()) if way]
+            ways = [way for way in (self._mass(), self._friction()) if way]
         found = [" or ".join(ways)] if ways else []
         if any(use.quantity == PRESSURE for use in exceeded):
             most = max(use.needed for use in exceeded if use.quantity == PRESSURE)
-            found.append(f'patches of at least {most:.1f} mm radius or allocation = "joint"')
+            found.append(f'patches of at least {most:.1f} mm radius or allocation = "soft-finger"')
         if not found:
             return "No mass, friction or patch alone would do"
         return f"This would do: {', and '.join(found)}"
@@ -286,24 +284,9 @@ class _Still:
         wanted = " and ".join(f"{value:g}" for value in rounded)
         return f"friction of at least {wanted}"
 
-    def _patch(self) -> str:
-        """The patches with which the joint allocation need not press harder for the moments."""
-        workcell = self._workcell
-        if workcell.task.allocation == "paper" or not workcell.has_facing_pads:
-            return ""
-        function = closed_load_function(workcell, "paper")
-        if not self._bears(function=function):
-            return ""
-        loads = [still_load(workcell, pose, function=function) for pose in self._poses.values()]
-        most = max(float(load["pressure_shift"].max()) for load in loads)
-        return f"patches of at least {1e3 * most:.1f} mm radius"
-
-    def _bears(
-        self, mass: float = 1.0, friction: float = 1.0, function: ca.Function | None = None
-    ) -> bool:
+    def _bears(self, mass: float = 1.0, friction: float = 1.0) -> bool:
         """Whether forces and torques are within their limits."""
-        exceeded = self.exceeded(mass, friction, function)
-        return all(use.quantity == PRESSURE for use in exceeded)
+        return all(use.quantity == PRESSURE for use in self.exceeded(mass, friction))
 
 
 def _nearest(enough: Callable[[float], bool], here: float, far: float) -> float | None:

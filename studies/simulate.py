@@ -20,7 +20,7 @@ def _add_options(parser: Parser) -> None:
         help="of the arms: one leads and the other is force-controlled along the normal (leader), "
         "both are (both), both are springs about the plan (impedance); or no arms, pads on a "
         "carriage that follows the plan exactly (pads), or pads at their rims, turned by the "
-        "planned moments, as the allocations paper and joint assume (pads-driven)",
+        "planned moments, as the allocation paper assumes (pads-driven)",
     )
     parser.add_argument(
         "--timing",

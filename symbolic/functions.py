@@ -422,9 +422,8 @@ def timing_functions(model: CellModel, samples: int) -> dict[str, ca.Function]:
         "path_motion": path_motion_function(model, samples),
         "load": load_function(workcell),
         "uncertain_load": uncertain_load_function(workcell),
+        "path_force": path_force_function(workcell),
     }
-    if workcell.has_force_slopes:
-        functions["path_force"] = path_force_function(workcell)
     for i, (robot, robot_model, contact) in enumerate(
         zip(workcell.robots, model.robots, workcell.contacts, strict=True), start=1
     ):

@@ -293,7 +293,6 @@ def _workcell(take: _Take, cell: Workcell) -> NumberedWorkcell:
         facing=cell.has_facing_pads,
         opposite=cell.has_opposite_pads,
         beside=cell.has_pads_beside,
-        # Also of two facing pads: their polish smooths the program of pads anywhere.
         grasp=None if cell.has_closed_form else _grasp(take, HELD, "grasp", cell, None),
         squeezes=()
         if cell.has_one_squeeze

@@ -352,13 +352,13 @@ def build_all(makers: Sequence[Maker], progress: Progress) -> list[DualArmError]
 def _makers(cell: Cell, polish: bool) -> Iterator[Maker]:
     # Not imported at the top: who builds a few functions needs none of it.
     from hybrid_opt.polishing.drive import is_polishable
-    from hybrid_opt.robust.force import at_rest, pressing_model, robust_model
+    from hybrid_opt.robust.force import at_rest, robust_model
     from hybrid_opt.timing.model import TimingModel
     from hybrid_opt.timing.path_timer import PATH_INTERVALS
 
     compiled, workcell = cell.compiled, cell.workcell
     driven = workcell.task.time_law == "optimal"
-    known = is_polishable(workcell, cell.force_kind.robust) if driven else workcell.has_facing_pads
+    known = is_polishable(workcell, cell.force_kind.robust) if driven else workcell.has_one_squeeze
     yield lambda: cell.evaluator
     if polish and known:
         yield lambda: cell.polish_functions
@@ -367,6 +367,4 @@ def _makers(cell: Cell, polish: bool) -> Iterator[Maker]:
         yield lambda: TimingModel(compiled, PATH_INTERVALS)
     yield lambda: cell.timing_model
     yield lambda: JobCollisions(compiled)
-    yield lambda: robust_model(workcell)
-    if driven:
-        yield lambda: pressing_model(workcell).nominal(at_rest())  # built when first asked
+    yield lambda: robust_model(workcell).nominal(at_rest())  # some are built when first asked

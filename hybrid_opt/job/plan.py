@@ -49,7 +49,6 @@ from hybrid_opt.timing.jerk import applicable_jerk_limits
 from hybrid_opt.timing.model import TimingModel
 from hybrid_opt.timing.records import JerkLimits, Timing
 from symbolic.array import Array, interpolated
-from symbolic.contact.force_closure import presses_evenly
 from symbolic.errors import SettingsError
 from symbolic.geometry.bodies import CollisionBody
 from symbolic.geometry.pairs import ActivePair, CellGeometry, build_geometry, ignored_pairs
@@ -336,14 +335,8 @@ class JobModel:
 
         Raises:
             SettingsError: the timing failed, or the squeeze is not possible.
-            JobError: pads that do not face one another choose their pressure, an arm does not reach
-                a place, something collides, or a limit is exceeded.
+            JobError: an arm does not reach a place, something collides, or a limit is exceeded.
         """
-        if not (self.workcell.has_facing_pads or presses_evenly(self.workcell)):
-            raise JobError(
-                "whole jobs are those of pads that press evenly (task.allocation = 'soft-finger'), "
-                "or of two round pads that face one another"
-            )
         if timing.carry is None or not timing.ok:
             raise SettingsError(
                 f"there is no timing to export ({timing.status}: {timing.reason}); export one "

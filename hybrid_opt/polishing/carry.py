@@ -265,11 +265,7 @@ class CarryReader:
         if self._evaluator.workcell.task.allocation == "soft-finger":
             return found["normal_force"]
         along = found["normal_force"][:, 0] - found["normal_force"][:, 1]
-        if self._evaluator.workcell.task.allocation == "paper":
-            return np.column_stack([along, found["tangential_force"].sum(axis=1)])
-        whole = found["contact_force"][:, :3] + found["contact_force"][:, 3:]
-        square = (whole**2).sum(axis=1) - along**2
-        return np.column_stack([along, np.sqrt(np.maximum(square, 0.0))])
+        return np.column_stack([along, found["tangential_force"].sum(axis=1)])
 
     def _raised_by_gaps(self, bounds: Array, gaps: Callable[[int], Array]) -> Array:
         """Raise bounds (n, n_pairs) of the payload from a box to the largest gap."""

@@ -114,15 +114,14 @@ class PolishFunctions:
 def sample_quantities(workcell: Workcell) -> tuple[Quantity, ...]:
     """Return the quantities that a cell's programs evaluate at samples.
 
-    Driven carries have limits at the intervals of their timing, not at samples; jointly allocated
-    forces satisfy the pressure limit by themselves, and pads that do not face one another have no
-    closed form.
+    Driven carries have limits at the intervals of their timing, not at samples. The forces of pads
+    anywhere have no closed form: a program finds them from the load.
     """
     if workcell.task.time_law == "optimal":
         return ()
     if workcell.has_closed_form:
         return ("force", "pressure") if workcell.task.allocation == "paper" else ("force",)
-    return ("force", "load") if workcell.has_facing_pads else ("load",)
+    return ("load",)
 
 
 def polish_functions(compiled: CompiledCell) -> PolishFunctions:

@@ -88,10 +88,7 @@ DRIVE_EXTRAPOLATION = (2.0, 4.0, 8.0)
 LEAST_SQUARED, LARGEST_SQUARED = 0.9, 3.0
 """Largest relative fall and rise of a squared speed in a step."""
 
-UNPOLISHABLE = (
-    "the polish does not know the allocation 'joint' of two pads that face one another, nor robust "
-    "forces of pads whose normals are not opposite"
-)
+UNPOLISHABLE = "the polish does not know robust forces of pads whose normals are not opposite"
 """Reason why a cell is not `is_polishable`."""
 
 REST_FORCE_MARGIN = 1e-3
@@ -99,9 +96,9 @@ REST_FORCE_MARGIN = 1e-3
 
 
 def is_polishable(workcell: Workcell, robust: bool) -> bool:
-    """Return True if drivable carries of a cell can be polished: its planned forces have slopes,
-    and if robust ones are limited, it has two pads with opposite normals."""
-    return workcell.has_force_slopes and (workcell.has_one_squeeze or not robust)
+    """Return True if drivable carries of a cell can be polished: if robust forces are limited, it
+    needs two pads with opposite normals."""
+    return workcell.has_one_squeeze or not robust
 
 
 @dataclass(frozen=True)

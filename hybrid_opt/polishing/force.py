@@ -178,8 +178,8 @@ class ForceProgram:
         fixed[np.arange(layout.forces.stop), robot] = 1.0
         fixed[layout.sides, :2], fixed[layout.sides, 2] = -np.eye(2), target.direction
         self._rows = ConstraintRows(cell, layout, carry.q, mix, fixed)
-        # What the rows lack at the candidate: what the rounded time law takes off, what the joint
-        # allocation's barriers add, or what makes planned forces robust ones, with their slopes.
+        # What the rows lack at the candidate: what the rounded time law takes off, what the
+        # program's barriers add, or what makes planned forces robust ones, with their slopes.
         self._rows.values(x, np.zeros(3))
         found = self._rows.forces
         if cell.robust is None:

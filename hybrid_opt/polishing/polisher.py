@@ -31,8 +31,8 @@ TIMED_EVALUATIONS = 32
 
 def has_polishable_forces(workcell: Workcell, objectives: Sequence[str]) -> bool:
     """Return True if the polish has the pads' forces: planned ones of any pads, robust ones of two
-    round pads that face one another."""
-    return workcell.has_facing_pads or tuple(objectives) != ROBUST_OBJECTIVES
+    pads with opposite normals."""
+    return workcell.has_one_squeeze or tuple(objectives) != ROBUST_OBJECTIVES
 
 
 class Polisher:
@@ -59,8 +59,8 @@ class Polisher:
         Raises:
             SettingsError: the evaluator's objectives are not those of the polish: both peak forces,
                 planned or robust, or under the time law 'optimal' duration and one of them; the
-                pads do not close their grasp, robust forces are those of other pads than two round
-                ones that face one another, or forces of drivable carries are allocated jointly.
+                pads do not close their grasp, or robust forces are those of pads without opposite
+                normals.
             DualArmError: the functions cannot be built.
         """
         self.evaluator, self.settings = evaluator, settings

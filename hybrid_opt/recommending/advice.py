@@ -17,7 +17,7 @@ from hybrid_opt.carry import Carry
 from hybrid_opt.cell import Cell
 from hybrid_opt.recommending.choice import DrivenPaths, Option
 from hybrid_opt.robust.cases import LEADER, nominal_case
-from hybrid_opt.robust.force import HOLDS, BoxMotion, pressing_model, thinned
+from hybrid_opt.robust.force import HOLDS, BoxMotion, robust_model, thinned
 from hybrid_opt.timing.records import Timing, TimingLimits
 from hybrid_opt.timing.robustness import Margin
 from symbolic.array import Array
@@ -67,7 +67,7 @@ class Advice:
 def commanded_margins(carry: Carry, forces: Array) -> tuple[Margin, ...]:
     """How far friction, mass and centre of mass may be off, each for itself, while commanded forces
     (n, 2) [N] hold the carry."""
-    workcell, model = carry.workcell, pressing_model(carry.workcell)
+    workcell, model = carry.workcell, robust_model(carry.workcell)
     rows, motion = thinned(carry)
     enough, nominal = forces[rows, 1 - LEADER] * (1.0 + HOLDS), nominal_case(workcell)
 
@@ -140,7 +140,7 @@ def changes_of_cell(workcell: Workcell, motion: BoxMotion) -> Iterator[tuple[str
     doubt = workcell.uncertainty
 
     def needed(cell: Workcell, motion: BoxMotion) -> Array:
-        return pressing_model(cell).commanded(motion, doubt, LEADER)
+        return robust_model(cell).commanded(motion, doubt, LEADER)
 
     now = needed(workcell, motion)
     at = motion.at(np.argsort(-now)[:LOOKED_AT])

@@ -18,7 +18,7 @@ import numpy as np
 from hybrid_opt.cell import Cell
 from hybrid_opt.robust.budget import GripBudget
 from hybrid_opt.robust.cases import LEADER
-from hybrid_opt.robust.force import BoxMotion, pressing_model
+from hybrid_opt.robust.force import BoxMotion, robust_model
 from hybrid_opt.static_hold import unheld
 from hybrid_opt.timing.records import PathTiming, TimingLimits
 from symbolic.array import Array
@@ -194,7 +194,7 @@ class DrivenPaths:
     def __init__(self, cell: Cell, x: Array) -> None:
         """Compute the geometry of the paths."""
         self.x = np.atleast_2d(np.asarray(x, dtype=float))
-        self._model = pressing_model(cell.workcell)
+        self._model = robust_model(cell.workcell)
         self.highest_force = cell.workcell.task.force_limit[1]
         self._timer, self._robust = cell.path_timer, cell.force_kind.robust
         self._known = self._timer.path_limits(self.x)

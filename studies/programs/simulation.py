@@ -239,8 +239,8 @@ def simulate_file(options: argparse.Namespace) -> int:
         cell = stored.open_cell(Path(folder))
         if options.controller == DRIVEN and cell.workcell.task.allocation == "soft-finger":
             raise WitnessError(
-                "pads that are driven by planned moments are what the allocations 'paper' and "
-                "'joint' assume; this carry's pads press evenly: give another --controller"
+                "pads that are driven by planned moments are what the allocation 'paper' assumes; "
+                "this carry's pads press evenly: give another --controller"
             )
         progress = Progress()
         build_study(cell, progress, polish=False, drivable=False)

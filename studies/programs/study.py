@@ -159,7 +159,7 @@ def run_study(
     cell, competition = decided_cell(workcell, settings, execution)
     alone = is_drivable(cell, settings.objectives)
     if not alone and not has_polishable_forces(cell, settings.objectives):
-        progress.note("the polish of robust forces knows two round pads that face one another: off")
+        progress.note("the polish of robust forces knows two pads with opposite normals: off")
         study = replace(study, polish=None)
     polish = study.polish if alone else study.drivable_polish
     driven = Cell(cell).drivable().workcell if study.drivable and not alone else cell

@@ -35,7 +35,7 @@ from hybrid_opt.progress import Progress
 from hybrid_opt.robust.force import (
     LARGEST_FACTOR,
     RobustModel,
-    pressing_model,
+    robust_model,
     robust_price,
 )
 from hybrid_opt.robust.squeeze import SqueezeSettings
@@ -196,7 +196,7 @@ def _robust_forces(cell: Cell, x: Array, options: argparse.Namespace) -> int:
     if uncertainty.is_empty:
         print("  nothing is uncertain, so there is nothing to check: state what may be off")
     else:
-        exit_code = _priced(pressing_model(workcell), timing.carry, options)
+        exit_code = _priced(robust_model(workcell), timing.carry, options)
     for text in [] if options.planned_limit is None else _timed(cell, x, options.planned_limit):
         print(f"  {text}")
     return exit_code

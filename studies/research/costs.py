@@ -266,9 +266,7 @@ def report(result: Mapping[str, Any]) -> str:
 
 def _shares(figures: Mapping[str, Any]) -> str:
     parts = ", ".join(f"{name} {100 * share:.0f} %" for name, share in figures["shares"].items())
-    ratio = figures.get("compiled_over_paper")
-    joint = "" if ratio is None else f"{ratio:.2f} times a candidate of the allocation paper, "
-    return f"{joint}feasible {100 * figures['feasible_share']:.0f} %; compiled time: {parts}"
+    return f"feasible {100 * figures['feasible_share']:.0f} %; compiled time: {parts}"
 
 
 EVALUATIONS = 1000

@@ -10,7 +10,6 @@ import ctypes
 import sys
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -165,8 +164,7 @@ def with_collisions(
         seed: of the search and the draws.
 
     Returns:
-        The figures of the search's candidates and, as 'random', those of uniform candidates; under
-        the joint allocation also what they cost over the paper's.
+        The figures of the search's candidates and, as 'random', those of uniform candidates.
     """
     rng = np.random.default_rng(seed)
     progress(f"a search of {EVALUATIONS} evaluations, whose candidates are to be timed")
@@ -187,23 +185,15 @@ def with_collisions(
         "interpreted": interpreted.evaluate,
         "plain": plain,
     }
-    if workcell.task.allocation == "joint" and workcell.has_opposite_pads:
-        task = replace(workcell.task, allocation="paper")
-        ways["paper"] = CandidateEvaluator(replace(workcell, task=task)).evaluate
     figures: list[dict[str, Any]] = []
     for what, batches in (("the search's", searched), ("random", uniform)):
         progress(f"{candidates * repeats} rounds on {what} candidates, with collisions")
         one_each = batches[:, 0]
-        in_batches = ("compiled", "paper")
-        x = {name: batches if name in in_batches else one_each for name in ways}
+        x = {name: batches if name == "compiled" else one_each for name in ways}
         times = interleaved(ways, x, repeats)
-        for name in times.keys() & in_batches:
-            times[name] /= POPULATION
+        times["compiled"] /= POPULATION
         verdicts = evaluator.evaluate(np.concatenate(batches))
         averages = summary(times, np.mean)
-        if "paper" in times:
-            ratio = np.mean(times["compiled"] / times["paper"])
-            averages["compiled_over_paper"] = float(ratio)
         figures.append(
             {
                 **averages,

@@ -43,7 +43,7 @@ from hybrid_opt.recommending.recommendation import (
 )
 from hybrid_opt.robust.budget import Remedy
 from hybrid_opt.robust.cases import LEADER
-from hybrid_opt.robust.force import RobustPrice, pressing_model, robust_price
+from hybrid_opt.robust.force import RobustPrice, robust_model, robust_price
 from hybrid_opt.robust.squeeze import Part, account
 from hybrid_opt.store.files import read_record, to_json, write_json
 from hybrid_opt.store.trajectory_file import write_trajectory
@@ -256,7 +256,7 @@ def recommend_from(
         price, driven = None, found.carry.workcell
         if not driven.uncertainty.is_empty:
             rng = np.random.default_rng(campaign.settings.seed)
-            price = robust_price(pressing_model(driven), found.carry, rng, LEADER, threads=threads)
+            price = robust_price(robust_model(driven), found.carry, rng, LEADER, threads=threads)
         advance(1)
         without_jerk = math.nan
         if applicable_jerk_limits(cell.workcell, found.timing.limits) is not None:

@@ -3,12 +3,10 @@
 They can if an internal squeeze exists that lies strictly within every patch's cone (Bicchi and
 Kumar, Robotic grasping and contact: a review, ICRA 2000): pressing along it carries anything.
 
-Scaled wrenches of a contact, in its pad's axes, z into the payload: N, T / mu, N d / r and
-M / (mu r) with the normal force N, the tangential force T (2,), the centre of pressure d (2,), the
-moment M about the normal through the patch's centre, and r the patch's radius or half diagonal.
-A patch's state begins with it; see `corner_modes` for what follows where the patch is rectangular.
-A patch that presses evenly has no moment but that about its normal; its state is N, T / mu and
-M / (mu r).
+Pads press evenly (`symbolic.contact.soft_finger`), so that a pad bears no moment but that about its
+normal. Its state, in its axes, z into the payload, is N, T / mu and M / (mu r), with the normal
+force N, the tangential force T (2,), the moment M about the normal through the patch's centre, and
+r the patch's radius or half diagonal.
 
 What formulas of pads anywhere hold beside the pads' own numbers, the squeeze to start from and how
 wrenches balance a load, is derived here, too (`derived`).
@@ -32,17 +30,16 @@ from symbolic.records.poses import box_rotation, skew
 from symbolic.records.quantities import GRAVITY
 
 WRENCH_SIZE = 6
-POINT_SIZE, STATE_SIZE = 3, 12
-"""Sizes of a corner's force, and of a rectangular patch's state."""
+"""Entries of a pad's wrench: N, T (2,) [N], the first moment of the pressure (2,) and M [N m]."""
 
 EVEN = (0, 1, 2, 5)
 """Entries of a wrench that a patch under even pressure can bear: its state."""
 
-RIM_POINTS, DIRECTIONS = 12, 24
-"""Points on a round patch's rim and directions of friction that stand for its cone."""
+TANGENTIAL = (1, 2, 3)
+"""Entries of a state that friction carries."""
 
-TORSIONS = 4
-"""Shares of friction in every direction that stand for the cone under even pressure."""
+DIRECTIONS, TORSIONS = 24, 4
+"""Directions of friction, and shares of it in every direction, that stand for a patch's cone."""
 
 NEWTON_STEPS = 100
 BALANCED = 1e-6
@@ -110,11 +107,6 @@ def has_force_closure(workcell: Workcell) -> bool:
     return _balanced_states(workcell, SPARE_FRICTION) is not None
 
 
-def presses_evenly(workcell: Workcell) -> bool:
-    """Whether a workcell's pads are taken to press evenly."""
-    return workcell.task.allocation == "soft-finger"
-
-
 def pressed_alike(workcell: Workcell) -> Array:
     """(k, pads) coefficients of normal forces that are zero: pads side by side on one arm that
     press evenly press with one pressure, because the arm keeps their common plane's orientation.
@@ -122,7 +114,7 @@ def pressed_alike(workcell: Workcell) -> Array:
     Pads of one arm with different normals press as the motion asks.
     """
     pads, robots, rows = workcell.pads, workcell.pad_robots, []
-    for k in range(1, len(pads)) if presses_evenly(workcell) else ():
+    for k in range(1, len(pads)):
         first = robots.index(robots[k])
         normals = [pads[i].T_box_pad[:3, 2] for i in (first, k)]
         if first != k and normals[0] @ normals[1] > PARALLEL:
@@ -133,17 +125,17 @@ def pressed_alike(workcell: Workcell) -> Array:
 
 
 def balance_maps(workcell: Workcell, in_units: bool = False) -> list[Array]:
-    """Per pad (6 + k, n), from its state to what is balanced: force and moment about the box
+    """Per pad (6 + k, 4), from its state to what is balanced: force and moment about the box
     frame's origin, along the box's axes, then the rows of `pressed_alike`.
 
     Args:
         in_units: for states whose friction and radius are taken out.
     """
-    even, alike, found = presses_evenly(workcell), pressed_alike(workcell), []
+    alike, found = pressed_alike(workcell), []
     for i, pad in enumerate(workcell.pads):
         if in_units:
             pad = replace(pad, friction=1.0, patch_radius=1.0, half_sides=None)
-        to_box = state_to_box(pad, even)
+        to_box = state_to_box(pad)
         rows = np.zeros((len(alike), to_box.shape[1]))
         rows[:, 0] = alike[:, i]
         found.append(np.vstack([to_box, rows]))
@@ -161,8 +153,8 @@ def _balanced_states(workcell: Workcell, share: float) -> tuple[Array, ...] | No
 
     They are weighted sums of points on the cones' boundaries, all weights positive.
     """
-    even, maps = presses_evenly(workcell), balance_maps(workcell)
-    lessened = [_with_friction(_generators(pad, even), share) for pad in workcell.pads]
+    maps = balance_maps(workcell)
+    lessened = [_with_friction(_generators(pad), share) for pad in workcell.pads]
     columns = np.vstack([rows @ A.T for rows, A in zip(lessened, maps, strict=True)])
     weights = _weights(columns / np.abs(columns).max(axis=0))
     if weights is None:
@@ -196,17 +188,14 @@ def _weights(columns: Array) -> Array | None:
     return None
 
 
-def state_to_box(contact: Contact, even: bool = False) -> Array:
-    """(6, n) from a patch's state to force and moment about the box frame's origin, box axes."""
+def state_to_box(contact: Contact) -> Array:
+    """(6, 4) from a patch's state to force and moment about the box frame's origin, box axes."""
     mu, r = contact.friction, contact.patch_radius
     local = np.zeros((WRENCH_SIZE, WRENCH_SIZE))
     local[[0, 1, 2], [1, 2, 0]] = mu, mu, 1.0
     # A normal force N n at d turns about d x n = (d_y, -d_x).
     local[[3, 4, 5], [4, 3, 5]] = r, -r, mu * r
-    in_box = wrench_to_box(contact)
-    if even:
-        return np.asarray(in_box @ local[:, list(EVEN)])
-    return np.asarray(in_box @ local @ np.eye(WRENCH_SIZE, state_size(contact)))
+    return np.asarray(wrench_to_box(contact) @ local[:, list(EVEN)])
 
 
 def wrench_to_box(contact: Contact) -> Array:
@@ -215,54 +204,9 @@ def wrench_to_box(contact: Contact) -> Array:
     return np.block([[R, np.zeros((3, 3))], [skew(p) @ R, R]])
 
 
-def state_size(contact: Contact) -> int:
-    """Entries of a patch's state, unless it presses evenly."""
-    return WRENCH_SIZE if contact.half_sides is None else STATE_SIZE
-
-
-def corner_modes(half_sides: tuple[float, float]) -> Array:
-    """(12, 12) from a rectangular patch's state to its corners' forces N, T / mu, corner by corner.
-
-    The state is the scaled wrench, shared out evenly, and six ways to change the corners' forces
-    that leave it as it is.
-    """
-    x, y = np.array(half_sides) / np.hypot(*half_sides)
-    s_x, s_y = np.array([1.0, -1.0, -1.0, 1.0]), np.array([1.0, 1.0, -1.0, -1.0])
-    even, twisted = np.ones(4), s_x * s_y
-    n, t_x, t_y = np.eye(POINT_SIZE)
-    columns = [
-        np.outer(even, n) / 4.0,
-        np.outer(even, t_x) / 4.0,
-        np.outer(even, t_y) / 4.0,
-        np.outer(s_x, n) / (4.0 * x),
-        np.outer(s_y, n) / (4.0 * y),
-        (x * np.outer(s_x, t_y) - y * np.outer(s_y, t_x)) / 4.0,
-        np.outer(twisted, n) / 4.0,
-        np.outer(s_x, t_x) / 4.0,
-        np.outer(twisted, t_x) / 4.0,
-        np.outer(s_y, t_y) / 4.0,
-        np.outer(twisted, t_y) / 4.0,
-        (y * np.outer(s_x, t_y) + x * np.outer(s_y, t_x)) / 4.0,
-    ]
-    return np.column_stack([column.ravel() for column in columns])
-
-
-def tangential(state_size: int) -> list[int]:
-    """Which entries of a state friction carries."""
-    if state_size == len(EVEN):
-        return [1, 2, 3]
-    return [k for k in (1, 2, 5, 7, 8, 9, 10, 11) if k < state_size]
-
-
-def size_powers(state_size: int) -> tuple[int, ...]:
-    """Powers of a patch's size over another's by which a state's entries shrink, if the forces at
-    its corners are shared among those of the other: once for each axis along which they vary."""
-    return (0, 0, 0, 1, 1, 1, 2, 1, 2, 1, 2, 1)[:state_size]  # (0, 0, 0, 1) of `EVEN`
-
-
 def _with_friction(states: Array, share: float) -> Array:
     lessened = states.copy()
-    lessened[:, tangential(states.shape[1])] *= share
+    lessened[:, list(TANGENTIAL)] *= share
     return lessened
 
 
@@ -275,7 +219,8 @@ def scaled_patch(contact: Contact) -> SoftPatch:
     return SoftPatch(own.twist / contact.patch_radius, own.spread / contact.patch_radius)
 
 
-def _even_generators(contact: Contact) -> Array:
+def _generators(contact: Contact) -> Array:
+    """(n, 4) states on the boundary of a patch's cone that span it, each with N = 1."""
     patch, rows = scaled_patch(contact), []
     for angle in 2.0 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS:
         for share in np.linspace(0.0, 1.0, TORSIONS + 1)[:-1]:
@@ -286,37 +231,16 @@ def _even_generators(contact: Contact) -> Array:
     return np.array(rows)
 
 
-def _generators(contact: Contact, even: bool) -> Array:
-    """(n, state size) states on the boundary of a patch's cone that span it, each with N = 1."""
-    around = 2.0 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS
-    friction = np.column_stack([np.cos(around), np.sin(around)])
-    ones = np.ones((DIRECTIONS, 1))
-    if even:
-        return _even_generators(contact)
-    if contact.half_sides is not None:
-        at_corners = np.kron(np.eye(4), np.hstack([ones, friction]))
-        return np.asarray(np.linalg.solve(corner_modes(contact.half_sides), at_corners.T).T)
-    around = 2.0 * np.pi * np.arange(RIM_POINTS) / RIM_POINTS
-    rows = []
-    for x, y in np.column_stack([np.cos(around), np.sin(around)]):
-        moment = x * friction[:, 1:] - y * friction[:, :1]
-        rows.append(np.hstack([ones, friction, np.tile([x, y], (DIRECTIONS, 1)), moment]))
-    return np.concatenate(rows)
-
-
 # --- what formulas hold beside the pads' own numbers ---
 
 
 def left_components(workcell: Workcell) -> tuple[int, ...]:
-    """Components of the scaled wrenches that are what the others leave: all of the last pad's, or
-    of pads that press evenly the first ones that reach every load, forces before moments.
+    """Components of the states that are what the others leave: the first ones that reach every
+    load, forces before moments.
 
     The choice is structure: it knows neither friction nor sizes, and slightly other places of pads
     do not change it, as they would change pivots that are nearly alike.
     """
-    if not presses_evenly(workcell):
-        n = WRENCH_SIZE * len(workcell.pads)
-        return tuple(range(n - WRENCH_SIZE, n))
     effects = np.hstack(balance_maps(workcell, in_units=True)).astype(float)
     effects[3:LOAD_SIZE] /= MOMENT_ARM
     effects /= np.linalg.norm(effects, axis=0)
@@ -368,53 +292,38 @@ def derived(workcell: Workcell, reach: float = 1.0) -> GraspNumbers:
         load_to_left=_cleaned(to_left[:, :LOAD_SIZE]),
         free_to_left=_cleaned(to_left @ in_units[:, free]),
         to_robots=robot_wrenches(workcell),
-        shapes=tuple(_shape(presses_evenly(workcell), pad) for pad in workcell.pads),
+        shapes=tuple(_shape(pad) for pad in workcell.pads),
         load_at_rest=_load_at_rest(workcell),
         rest=None,
         rest_slopes=None,
         reach=reach,
-        least_reaches=np.array(least_reaches(workcell)),
     )
 
 
 def grasp_shapes(workcell: Workcell) -> dict[str, Any]:
     """Shapes of all arrays of `GraspNumbers`; `shapes` has one per pad."""
-    even, pads = presses_evenly(workcell), workcell.pads
-    b, m = len(left_components(workcell)), len(EVEN if even else range(WRENCH_SIZE)) * len(pads)
-    n = m if even else sum(state_size(pad) for pad in pads)
+    pads = workcell.pads
+    b, n = len(left_components(workcell)), len(EVEN) * len(pads)
     return {
         "squeeze": (n,),
         "spread": (n, LOAD_SIZE),
         "load_to_left": (b, LOAD_SIZE),
-        "free_to_left": (b, m - b),
+        "free_to_left": (b, n - b),
         "to_robots": (LOAD_SIZE, WRENCH_SIZE * len(pads)),
-        "shapes": tuple(_shape(even, pad).shape for pad in pads),
+        "shapes": tuple(_shape(pad).shape for pad in pads),
         "load_at_rest": (LOAD_SIZE,),
         "rest": (n,),
         "rest_slopes": (n, LOAD_SIZE),
         "reach": (),
-        "least_reaches": (2,),
     }
 
 
-def _shape(even: bool, pad: Contact) -> Array:
-    """What a pad's cone depends on: mean distance and spread of an even patch, or the half sides of
-    a rectangle, over its radius; none of a disc."""
+def _shape(pad: Contact) -> Array:
+    """What a pad's cone depends on: mean distance and spread over its radius; none of a disc."""
     if pad.half_sides is None:
         return np.zeros(0)
-    if not even:
-        return np.array(pad.half_sides) / pad.patch_radius
     patch = scaled_patch(pad)
     return np.array([patch.twist, *np.diag(patch.spread)])
-
-
-def least_reaches(workcell: Workcell) -> tuple[float, float]:
-    """Least radius or half side of each robot's patches [m]."""
-    first, second = (
-        min(pad.patch_radius if pad.half_sides is None else min(pad.half_sides) for pad in pads)
-        for pads in ((contact, *contact.further) for contact in workcell.contacts)
-    )
-    return first, second
 
 
 def smaller_patches(workcell: Workcell, share: float) -> Workcell:

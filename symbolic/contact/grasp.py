@@ -1,4 +1,4 @@
-"""The least contact forces of pads on a payload: any normals, any of the patches.
+"""The least contact forces of pads that press evenly on a payload: any normals, any patches.
 
     minimise the sum of all |f_i|^2  subject to  the wrenches balance what the motion needs,
                                                  each lies within its patch's cone
@@ -6,19 +6,15 @@
 (`symbolic.contact.central_path`), where the paper (Eqs. 38-42, 51-59) takes the least forces first
 and asks for the moment afterwards. The method starts from an internal squeeze
 (`symbolic.contact.force_closure`), pressed as hard as the load asks.
-
-Two round pads that face one another have a start without such a squeeze, because pressing harder
-carries anything: `OppositePads`, whose geometry may vary. Its coordinates are tangents a, b and
-normal n = a x b of contact 1. Shifts and arms in m, forces in N.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from functools import cache, cached_property, partial
+from dataclasses import replace
+from functools import cached_property
 from itertools import accumulate
-from typing import Any, Literal
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -32,15 +28,10 @@ from symbolic.contact.force_closure import (
     MOMENT_ARM,
     WRENCH_SIZE,
     derived,
-    presses_evenly,
     scaled_patch,
-    size_powers,
-    tangential,
 )
-from symbolic.contact.rectangular_patch import RectangularPatch
-from symbolic.contact.round_patch import RoundPatch, cross_2, patch_slack
 from symbolic.contact.soft_finger import SoftPatch
-from symbolic.expression import Expression, number, reciprocal, sx_given
+from symbolic.expression import number, reciprocal, sx_given
 from symbolic.records import Contact, Workcell
 from symbolic.records.numbered import GraspNumbers, NumberedWorkcell
 
@@ -97,8 +88,7 @@ class Grasp:
         self.numbers = derived(workcell) if numbers is None else numbers
         self.given = sx_given(workcell.payload, self.numbers)
         self.robots, self._pads = workcell.pad_robots, workcell.pads
-        even, shapes = presses_evenly(workcell), self.numbers.shapes
-        self.patches = tuple(map(partial(_patch, even), self._pads, shapes))
+        self.patches = tuple(map(_patch, self._pads, self.numbers.shapes))
         self.friction = ca.vertcat(*[ca.SX(number(c.friction)) for c in workcell.contacts])
         self.cell_sizes: tuple[tuple[str, int], ...] = (("load", LOAD_SIZE), ("friction", 2))
         self._left = np.array(self.numbers.left)
@@ -216,8 +206,7 @@ class Grasp:
         """(k, 6) of all pads in the squeeze, see `grasp_wrenches`; without symbols."""
         states = ca.vertsplit(ca.SX(number(self.numbers.squeeze)), self._ends)
         parts = [
-            whole_wrench(self.units(i, self.friction) * state[: patch.wrench_size])
-            for i, (state, patch) in enumerate(zip(states, self.patches, strict=True))
+            whole_wrench(self.units(i, self.friction) * state) for i, state in enumerate(states)
         ]
         return np.array(ca.evalf(ca.horzcat(*parts))).T
 
@@ -263,20 +252,15 @@ class Grasp:
         """(m,) what the entries of pad i's scaled wrench are multiples of."""
         robot = self.robots[i]
         radius = self.numbers.reach * self._pads[i].patch_radius
-        units = _units(friction[robot], reach[robot] * radius)
-        return units[list(EVEN)] if self.patches[i].wrench_size == len(EVEN) else units
+        mu = friction[robot]
+        return ca.vertcat(1.0, mu, mu, mu * (reach[robot] * radius))
 
     def _at(self, states: ca.SX, friction: ca.SX, reach: ca.SX = WHOLE) -> list[ca.SX]:
-        """States (n,) at the nominal friction and size with what they carry, at others: each
-        corner's force is shared among those of the other size."""
+        """States (n,) at the nominal friction and size with what they carry, at others."""
         moved, owns = [], ca.vertsplit(states, self._ends)
         for pad, robot, state in zip(self._pads, self.robots, owns, strict=True):
             by_friction, by_reach = pad.friction / friction[robot], 1.0 / reach[robot]
-            size = state.shape[0]
-            held, by_size = tangential(size), size_powers(size)
-            factors = [
-                (by_friction if k in held else 1.0) * by_reach ** by_size[k] for k in range(size)
-            ]
+            factors = (1.0, by_friction, by_friction, by_friction * by_reach)
             moved.append(state * ca.vertcat(*factors))
         return moved
 
@@ -300,190 +284,14 @@ def grasp_wrenches(
 
 
 def whole_wrench(wrench: ca.SX) -> ca.SX:
-    """All six entries of a pad's wrench (m,)."""
-    if wrench.shape[0] == WRENCH_SIZE:
-        return wrench
+    """All six entries of a pad's wrench (4,)."""
     whole = ca.SX(WRENCH_SIZE, wrench.shape[1])
     whole[list(EVEN), :] = wrench
     return ca.densify(whole)
 
 
-def _patch(even: bool, contact: Contact, shape: Any) -> Patch:
+def _patch(contact: Contact, shape: Any) -> Patch:
     if contact.half_sides is None:
-        return EvenPatch(scaled_patch(contact)) if even else RoundPatch()
-    sizes = ca.vertsplit(ca.SX(number(shape)))
-    if even:
-        return EvenPatch(SoftPatch(sizes[0], ca.diagcat(*sizes[1:])))
-    return RectangularPatch(*sizes)
-
-
-def _units(mu: ca.SX, r: ca.SX) -> ca.SX:
-    return ca.vertcat(1.0, mu, mu, r, r, mu * r)
-
-
-# --- two round pads that face one another ---
-
-
-Objective = Literal["effort", "squeeze"]
-"""|f_1|^2 + |f_2|^2 or N_1 + N_2."""
-
-LOWEST = (4.0 / 3.0) ** 0.5
-"""Bound of what a wrench without normal force takes from a patch's eigenvalues, over its length:
-their sum is zero and that of their squares is twice its square (Samuelson)."""
-
-BALANCE_SIZE = 9
-CELL_SIZES = (("balance", BALANCE_SIZE), ("friction", 2), ("radius", 2))
-
-
-def balance_of(
-    force: Expression, moment: Expression, arms: tuple[Expression, Expression]
-) -> Expression:
-    """What the contacts have to balance (9,), see `BALANCE_SIZE`.
-
-    Args:
-        force: (3,) resultant force.
-        moment: (3,) required moment about the centre of mass.
-        arms: (3,) each, from the centre of mass to the nominal contact points.
-    """
-    rest = moment - ca.cross(arms[1], force)
-    return ca.vertcat(force[2], force[:2], -rest[1], rest[0], rest[2], arms[0] - arms[1])
-
-
-def facing_wrenches(
-    balance: ca.MX,
-    friction: ca.MX,
-    radius: ca.MX,
-    objective: Objective = "effort",
-    differentiable: bool = False,
-) -> ca.MX:
-    """Wrenches (12,) of two round pads that face one another: of each N, T (2,) [N], the first
-    moment N d (2,) and M [N m] about n, all along a and b of contact 1.
-
-    There always are some, because pressing harder carries everything, if the patches overlap when
-    seen along the normal. Those of the least N_1 + N_2 in place of the least effort: the balance
-    fixes N_1 - N_2, so that both are as small as they can be; with less of either no pressure on
-    the patches carries what is asked, with more of both some does.
-
-    Args:
-        balance: (9,), see `balance_of`.
-        friction: (2,) Coulomb coefficients of the contacts.
-        radius: (2,) radii of the patches [m].
-        objective: what is least.
-        differentiable: see `symbolic.contact.central_path.least_effort`.
-    """
-    scale = ca.sqrt(ca.sumsqr(balance[:3]) + ca.sumsqr(balance[3:5] / balance[8]) + SCALE_FLOOR**2)
-    scaled = (ca.vertcat(balance[:6] / scale, balance[6:]), friction, radius)
-    found = least_effort(OppositePads(objective), *scaled, differentiable=differentiable)
-    return _facing_in_newtons()(found, scale, friction, radius)
-
-
-@cache
-def _facing_in_newtons() -> ca.Function:
-    found, scale = ca.SX.sym("w", 2 * WRENCH_SIZE), ca.SX.sym("s")
-    mu, r = ca.SX.sym("mu", 2), ca.SX.sym("r", 2)
-    units = ca.vertcat(*[_units(mu[i], r[i]) for i in (0, 1)])
-    return ca.Function("in_newtons", [found, scale, mu, r], [scale * units * found])
-
-
-@dataclass(frozen=True)
-class OppositePads:
-    """Two round pads that face one another, as a `symbolic.contact.central_path.Program`.
-
-    Its inputs are `balance_of`, over the force's scale, the coefficients and the radii, so that all
-    of these may vary.
-
-    Attributes:
-        objective: what is minimised.
-    """
-
-    objective: Objective
-    patches: tuple[Patch, ...] = (RoundPatch(), RoundPatch())
-    cell_sizes: tuple[tuple[str, int], ...] = CELL_SIZES
-
-    @property
-    def given(self) -> dict[str, ca.SX]:
-        """None: all are inputs."""
-        return {}
-
-    def free(self, wrenches: list[ca.SX]) -> ca.SX:
-        """The wrench of contact 1."""
-        return wrenches[0]
-
-    def balanced(self, free: ca.SX, cell: list[ca.SX]) -> list[ca.SX]:
-        """What contact 1 leaves to contact 2, its normal force along -n."""
-        wrench, (balance, friction, radius) = free, cell
-        tangent, moment = friction[0] * wrench[1:3], radius[0] * wrench[3:5]
-        # Moments about pad 2: (p_1 - p_2) x f_1 and the contacts' own make up what is required.
-        moment_2 = moment - balance[8] * tangent + wrench[0] * balance[6:8] - balance[3:5]
-        about_n = balance[5] - cross_2(balance[6:8], tangent) - friction[0] * radius[0] * wrench[5]
-        over_mu, over_r = reciprocal(friction[1]), reciprocal(radius[1])
-        left = ca.vertcat(
-            wrench[0] - balance[0],
-            (balance[1:3] - tangent) * over_mu,
-            moment_2 * over_r,
-            about_n * (over_mu * over_r),
-        )
-        return [wrench, left]
-
-    def effort(self, wrenches: list[ca.SX], cell: list[ca.SX]) -> ca.SX:
-        """Half the sum of the squared forces, or the sum of the normal ones."""
-        if self.objective == "squeeze":
-            return wrenches[0][0] + wrenches[1][0]
-        mu = cell[1]
-        forces = [ca.vertcat(w[0], mu[i] * w[1:3]) for i, w in enumerate(wrenches)]
-        return ca.sumsqr(ca.vertcat(*forces)) / 2.0
-
-    def start(self, cell: list[ca.SX]) -> tuple[list[ca.SX], ca.SX]:
-        """Wrenches within both cones, pressed as hard as what else they carry asks."""
-        balance, friction, radius = cell
-        # Tangential forces that leave little moment to be carried: least squares, scaled.
-        over_mu_1, over_mu_2 = 1.0 / friction[0] ** 2, 1.0 / friction[1] ** 2
-        lever = balance[8] / ca.sum1(radius)
-        by_lever = lever / ca.sum1(radius)
-        tangent = (over_mu_2 * balance[1:3] - by_lever * balance[3:5]) / (
-            over_mu_1 + over_mu_2 + lever**2
-        )
-        lighter = ca.fmax(balance[0], 0.0)
-        asked = [ca.norm_2(wrench[1:]) for wrench in _shared(cell, tangent, lighter)]
-        # The squeeze itself tilts the box where the pads do not face one another.
-        overlap = 1.0 - ca.norm_2(balance[6:8]) / ca.sum1(radius)
-        pressed = LOWEST * ca.fmax(*asked) / (START_SHARE * overlap) + START_FLOOR
-        return _shared(cell, tangent, pressed + lighter), ca.SX(START_WEIGHT)
-
-
-def even_slack(balance: ca.SX, friction: ca.SX, radius: ca.SX, n_1: ca.SX) -> ca.SX:
-    """Whether wrenches hold that share everything evenly, tangential forces in proportion to
-    friction, if contact 1 presses with n_1 [N].
-
-    Positive where both lie within their cones: then the patches carry what is asked. Where it is
-    not, another pressure still may.
-
-    Args:
-        balance, friction, radius: as in `facing_wrenches`.
-    """
-    left, tangent = [], friction[0] / ca.sum1(friction) * balance[1:3]
-    for wrench in _shared([balance, friction, radius], tangent, n_1):
-        normal = wrench[0]
-        left += [
-            normal,
-            1.0 - ca.sumsqr(wrench[1:3]) / normal**2,
-            1.0 - ca.sumsqr(wrench[3:5]) / normal**2,
-            patch_slack(wrench) / normal**4,
-        ]
-    return ca.mmin(ca.vertcat(*left))
-
-
-def _shared(cell: list[ca.SX], tangent: ca.SX, n_1: ca.SX) -> list[ca.SX]:
-    """Scaled wrenches (6,) of both contacts under a normal force and a tangential force (2,) of
-    contact 1, moments in proportion to radii and torsion to friction times radius."""
-    balance, friction, radius = cell
-    tilt = balance[8] * tangent + balance[3:5]
-    about_n = balance[5] - cross_2(balance[6:8], tangent)
-    # A share over the contact's own friction or radius is the whole over the sum of both.
-    first = ca.vertcat(
-        n_1,
-        tangent / friction[0],
-        (tilt - n_1 * balance[6:8]) / ca.sum1(radius),
-        about_n / ca.sum1(friction * radius),
-    )
-    return OppositePads("effort").balanced(first, cell)
+        return EvenPatch(scaled_patch(contact))
+    twist, *spread = ca.vertsplit(ca.SX(number(shape)))
+    return EvenPatch(SoftPatch(twist, ca.diagcat(*spread)))

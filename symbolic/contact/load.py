@@ -1,10 +1,8 @@
 """What one sample of the box motion asks of the two contacts, as one CasADi function.
 
 Joins rotation, force allocation and centre of pressure (paper Section 4.4). The allocation `paper`,
-and `soft-finger` on two pads with opposite normals, have closed forms (`held_by`). With `joint` the
-paper's result is kept wherever its shifts stay within the patches and leave no moment, and
-`symbolic.contact.grasp` takes over where not. For pads that do not face one another, or more than
-two, the paper has no result: `symbolic.contact.grasp` alone answers, for both other allocations.
+and `soft-finger` on two pads with opposite normals, have closed forms (`held_by`). The forces of
+other pads are found by the program of `symbolic.contact.grasp`.
 """
 
 from __future__ import annotations
@@ -14,7 +12,7 @@ from dataclasses import dataclass
 import casadi as ca
 
 from symbolic.contact.force_closure import WRENCH_SIZE
-from symbolic.contact.grasp import Grasp, balance_of, facing_wrenches, grasp_wrenches
+from symbolic.contact.grasp import Grasp, grasp_wrenches
 from symbolic.contact.paper import Both, allocate, pressure_shift, required_force, required_moment
 from symbolic.contact.soft_finger import Detached, SoftPatch, least_soft_squeeze
 from symbolic.expression import Expression, as_mx, mx_given, named_function, number, sx_given
@@ -165,9 +163,6 @@ SAMPLE_SIZES = (
 )
 """Inputs of the functions that allocate anew; force and moment in the world frame."""
 
-RESIDUAL_TOLERANCE = 1e-9
-"""Moment that counts as carried, as a share of the force times the distance of the contacts."""
-
 
 def load_function(workcell: Workcell) -> ca.Function:
     """Contact forces and centres of pressure from a box pose and its time derivatives.
@@ -215,8 +210,6 @@ def uncertain_load_function(workcell: Workcell) -> ca.Function:
     """
     if workcell.has_closed_form:
         return closed_load_function(workcell, workcell.task.allocation)
-    if workcell.has_opposite_pads:
-        return _joint_load_function(workcell)
     return _grasp_load_function(workcell)
 
 
@@ -249,35 +242,6 @@ def closed_load_function(workcell: Workcell, allocation: Allocation) -> ca.Funct
     }
     outputs = {name: ca.densify(value) for name, value in outputs.items()}
     return _named(inputs | sx_given(workcell.payload), outputs)
-
-
-def _joint_load_function(workcell: Workcell) -> ca.Function:
-    """The paper's result where the patches suffice for it, and the joint allocation elsewhere."""
-    given = mx_given(workcell.payload)
-    inputs = {name: ca.MX.sym(name, size) for name, size in SIZES.items()} | given
-    found = closed_load_function(workcell, "paper")(*inputs.values())
-    paper = dict(zip(LOAD_OUTPUTS, found, strict=True))
-    force = paper["contact_force"][:3] + paper["contact_force"][3:]
-    shift = "pressure_shift" if workcell.has_facing_pads else "shift_vector"
-    suffices = _suffices_function(workcell)(
-        inputs["pose"], paper[shift], paper["moment_residual"], force, *given.values()
-    )
-    kept = [paper[name] for name in GRASP_OUTPUTS]
-    passed = [
-        ca.MX.sym(name, value.shape[0]) for name, value in zip(GRASP_OUTPUTS, kept, strict=True)
-    ]
-    asked = [inputs["pose"], force, paper["required_moment"], inputs["friction"]]
-    asked += [inputs["centre_of_mass"], *given.values()]
-    unused = [ca.MX.sym("unused", value.shape[0]) for value in asked]
-    anew = _sample_function(workcell)
-    choice = ca.Function.if_else(
-        "allocation",
-        ca.Function("keep", [*unused, *passed], passed),
-        ca.Function("anew", [*unused, *passed], anew(*unused)),
-    )
-    chosen = choice(suffices, *asked, *kept)
-    outputs = paper | dict(zip(GRASP_OUTPUTS, chosen, strict=True))
-    return _named(inputs, outputs)
 
 
 def _grasp_load_function(workcell: Workcell) -> ca.Function:
@@ -318,74 +282,15 @@ def required(
     return [rotation, omega, alpha, force, moment]
 
 
-def _suffices_function(workcell: Workcell) -> ca.Function:
-    """pose, shifts, moment_residual (3,) and force (3,) to whether the paper's result holds.
-
-    The shifts are their lengths (2,) where both patches are round, else shift_vector (6,).
-    """
-    sizes = (("pose", 6), ("shift", 2 if workcell.has_facing_pads else 6), ("rest", 3), ("f", 3))
-    pose, shift, residual, force = inputs = [ca.SX.sym(*entry) for entry in sizes]
-    points = [number(contact.T_box_pad[:3, 3]) for contact in workcell.contacts]
-    distance = ca.norm_2(points[0] - points[1])
-    carried = ca.sumsqr(residual) <= (RESIDUAL_TOLERANCE * distance) ** 2 * ca.sumsqr(force)
-    rotation = rotation_matrix(workcell.task.orientation, pose[3:])
-    within = []
-    for i, contact in enumerate(workcell.contacts):
-        if workcell.has_facing_pads:
-            within.append(shift[i] <= contact.patch_radius)
-            continue
-        axes = ca.mtimes(rotation, number(contact.T_box_pad[:3, :2]))
-        moved = ca.mtimes(axes.T, shift[3 * i : 3 * i + 3])
-        if contact.half_sides is None:
-            within.append(_length(moved) <= contact.patch_radius)
-        else:
-            x, y = contact.half_sides
-            within.append(ca.logic_and(ca.fabs(moved[0]) <= x, ca.fabs(moved[1]) <= y))
-    holds = ca.logic_and(ca.logic_and(within[0], within[1]), carried)
-    return ca.Function("suffices", [*inputs, *sx_given(workcell.payload).values()], [holds])
-
-
 def _sample_function(workcell: Workcell) -> ca.Function:
     """pose, force, moment (world), friction and centre of mass to the outputs `GRASP_OUTPUTS`."""
     inputs, given = [ca.MX.sym(*entry) for entry in SAMPLE_SIZES], mx_given(workcell.payload)
     pose, force, moment, friction, centre_of_mass = inputs
     asked = (pose, force, moment, centre_of_mass)
-    if workcell.has_facing_pads:
-        wrenches = _facing_wrenches(workcell, asked, friction, list(given.values()))
-    else:
-        load = box_load_function(workcell)(*asked)
-        wrenches = grasp_wrenches(Grasp(workcell), load, friction, list(given.values()))
+    load = box_load_function(workcell)(*asked)
+    wrenches = grasp_wrenches(Grasp(workcell), load, friction, list(given.values()))
     outputs = grasp_world_function(workcell)(*asked, wrenches, *given.values())
     return ca.Function("grasp_sample", [*inputs, *given.values()], outputs)
-
-
-def _facing_wrenches(
-    workcell: Workcell,
-    asked: tuple[ca.MX, ca.MX, ca.MX, ca.MX],
-    friction: ca.MX,
-    given: list[ca.MX],
-) -> ca.MX:
-    """As `symbolic.contact.grasp.grasp_wrenches`, of two round pads that face one another, from the
-    inputs of `box_load_function`."""
-    pose, force, moment, centre_of_mass = inputs = [ca.SX.sym(*entry) for entry in _ASKED]
-    first, second = (number(contact.T_box_pad) for contact in workcell.contacts)
-    numbers = sx_given(workcell.payload).values()
-    in_box = first[:3, :3]
-    to_pad = ca.mtimes(rotation_matrix(workcell.task.orientation, pose[3:]), in_box).T
-    arms = [ca.mtimes(in_box.T, T[:3, 3] - centre_of_mass) for T in (first, second)]
-    needed = (ca.mtimes(to_pad, force), ca.mtimes(to_pad, moment))
-    outputs = [
-        balance_of(*needed, (arms[0], arms[1])),
-        ca.vertcat(*[ca.SX(number(contact.patch_radius)) for contact in workcell.contacts]),
-    ]
-    balance, radius = ca.Function("balance", [*inputs, *numbers], outputs)(*asked, *given)
-    found = facing_wrenches(balance, friction, radius)
-    # Pad 2 has its own tangents, and its normal is the opposite.
-    turn = ca.SX(ca.mtimes(second[:3, :2].T, first[:3, :2]))
-    own = ca.diagcat(ca.SX.eye(WRENCH_SIZE), 1.0, turn, turn, -1.0)
-    wrenches = ca.SX.sym("w", 2 * WRENCH_SIZE)
-    in_pads = ca.Function("in_pads", [wrenches, *numbers], [ca.mtimes(own, wrenches)])
-    return in_pads(found, *given)
 
 
 def _length(vector: Expression) -> Expression:
@@ -407,7 +312,7 @@ GRASP_OUTPUTS = (
     "wrench_1",
     "wrench_2",
 )
-"""Entries of `LOAD_OUTPUTS` that depend on the allocation."""
+"""Entries of `LOAD_OUTPUTS` that the program finds."""
 
 LEAST_FORCE = 1e-9
 """Normal force below which a centre of pressure counts as the patch's [N]."""

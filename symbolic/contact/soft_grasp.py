@@ -1,4 +1,4 @@
-"""Normal forces of the joint allocation on its central path, with exact derivatives by the load.
+"""Normal forces of pads anywhere on their program's central path, with exact derivatives.
 
 The least effort has kinks in the load, where a cone begins or ceases to be tight. At a weight mu of
 the barriers the states s of all patches, affine in the load w and in what is free, y, minimise

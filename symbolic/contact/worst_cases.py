@@ -5,15 +5,14 @@ known of the payload's inertia is taken to hold about the nominal centre of mass
 one, and to grow with the mass: with it the required force and moment are affine in the centre of
 mass and in the disturbance, each for itself.
 
-Of facing pads it is the least squeeze, of pads anywhere the least force of one robot: a linear
+Of opposite pads it is the least squeeze, of pads anywhere the least force of one robot: a linear
 objective in the program of `symbolic.contact.grasp`. That force is commanded before the case is
 known. Whatever wrenches of all pads then carry the load, an internal squeeze can be added to them
 that presses this robot's pads harder, so that with more than its least force the load is held as
 well.
 
-A displaced pad that chooses its pressure counts as a smaller one that lies within it: a disc
-shrinks by the displacement, a rectangle in proportion, so that its shorter side does. A pad that
-presses evenly presses about its displaced place.
+Pads press evenly in every case, about their displaced places: arms that command a normal force
+alone have no other pads, whatever the contact model of the plan.
 
 What is commanded is more: a share of it may be missing, and the arms may work against one another.
 With N a pad's least normal force, e the missing share and T the opposed tangential force, it is
@@ -34,26 +33,16 @@ import numpy as np
 from symbolic.contact.central_path import least
 from symbolic.contact.force_closure import (
     LOAD_SIZE,
-    WRENCH_SIZE,
     derived,
     has_force_closure,
-    presses_evenly,
     smaller_patches,
 )
-from symbolic.contact.grasp import (
-    BEYOND,
-    SCALE_FLOOR,
-    Grasp,
-    balance_of,
-    even_slack,
-    facing_wrenches,
-)
+from symbolic.contact.grasp import BEYOND, SCALE_FLOOR, Grasp
 from symbolic.contact.load import required
 from symbolic.contact.soft_finger import Detached, SoftPatch, least_soft_squeeze
 from symbolic.expression import (
     Expression,
     as_mx,
-    mx_given,
     mx_symbols,
     named_function,
     number,
@@ -139,15 +128,14 @@ def case_slopes_function(workcell: Workcell) -> ca.Function:
     """Box pose and its derivatives by u (6,), u'', u'^2 and a case (18,), see `CASE_SIZES`, to
     normal_force (2,) [N] as of `case_squeeze_function`, and slope (NumPy shape (2, 20)), of each
     force by pose, both derivatives, u'' and u'^2; of cases without displaced pads."""
-    _, inputs = _asked(workcell)
-    kind = type(inputs["case"])
-    path = {name: kind.sym(name, 6) for name in ("pose", "first", "second")}
-    path |= {"a": kind.sym("a"), "w": kind.sym("w")}
+    inputs = _inputs(ca.SX, sx_given(workcell.payload))
+    path = {name: ca.SX.sym(name, 6) for name in ("pose", "first", "second")}
+    path |= {"a": ca.SX.sym("a"), "w": ca.SX.sym("w")}
     pose, first, second, a, w = path.values()
     # A root has no slope at rest, what follows from its square has.
     motion = (pose, first * ca.sqrt(w + SQUARED_SPEED_FLOOR), first * a + second * w)
     detached, driven = Detached(), inputs | dict(zip(MOTION, motion, strict=True))
-    force = _least_force(workcell, None, driven, detached, differentiable=True)
+    force = _least_force(workcell, None, driven, detached)
     slope = ca.densify(ca.jacobian(force, ca.vertcat(*path.values())).T)
     found = detached.replaced([force, slope])
     outputs = dict(zip(("normal_force", "slope"), found, strict=True))
@@ -159,7 +147,8 @@ def case_difference_function(workcell: Workcell) -> ca.Function:
     """pose, rate, second_rate (6,) and a case (18,), see `CASE_SIZES`, to difference N_1 - N_2 [N],
     which no squeeze changes."""
     inputs = _inputs(ca.SX, sx_given(workcell.payload))
-    (difference,) = ca.cse([_balance_function(workcell)(*inputs.values())[0]])
+    motion = [inputs[name] for name in MOTION]
+    (difference,) = ca.cse([case_in_pad_axes(workcell, motion, inputs["case"])[0][2]])
     return named_function("case_difference", inputs, {"difference": difference}, cse=False)
 
 
@@ -173,8 +162,8 @@ def case_slack_function(workcell: Workcell, commanded: int = 1) -> ca.Function:
     given = sx_given(workcell.payload) if squeeze is None else squeeze.given
     inputs, force = _inputs(ca.SX, given), ca.SX.sym("force")
     case = inputs["case"]
-    friction, radius, *_, displacement, tracking, internal = case_parts(case)
     if squeeze is not None:
+        friction, *_, displacement, tracking, internal = case_parts(case)
         numbers = list(given.values())
         sizes = _sizes_function(squeeze)(case, *numbers)
         load = _origin_load(workcell, inputs)
@@ -182,15 +171,11 @@ def case_slack_function(workcell: Workcell, commanded: int = 1) -> ca.Function:
         left -= internal * _against_internal(squeeze)(friction, sizes, *numbers)
         slack = [commanded_slack(squeeze, load, friction, sizes, displacement, left)]
     else:
-        balance = _balance_function(workcell)(*inputs.values())
-        n_1 = force + balance[0] if commanded == 1 else force
-        if presses_evenly(workcell):
-            slack = [n_1 - _least_force(workcell, None, inputs)[0]]
-        else:
-            lost = tracking[0] * n_1 + tracking[1] * (n_1 - balance[0]) + _against_arms(case)
-            slack = [even_slack(balance, friction, radius, n_1 - lost)]
+        difference = case_in_pad_axes(workcell, [inputs[name] for name in MOTION], case)[0][2]
+        n_1 = force + difference if commanded == 1 else force
+        slack = [n_1 - _least_force(workcell, None, inputs)[0]]
     own = {name: inputs[name] for name in (*MOTION, "case")} | {"force": force} | given
-    found = slack if presses_evenly(workcell) and squeeze is None else ca.cse(slack)
+    found = slack if squeeze is None else ca.cse(slack)
     return named_function("case_slack", own, {"slack": found[0]}, cse=False)
 
 
@@ -199,8 +184,7 @@ def _asked(
 ) -> tuple[GraspSqueeze | None, dict[str, Expression]]:
     """The program of pads anywhere, and the inputs of functions of a cell's least force."""
     if workcell.has_one_squeeze:
-        kind, of = (ca.SX, sx_given) if presses_evenly(workcell) else (ca.MX, mx_given)
-        return None, _inputs(kind, of(workcell.payload))
+        return None, _inputs(ca.SX, sx_given(workcell.payload))
     squeeze = GraspSqueeze(workcell, commanded)
     return squeeze, _inputs(ca.MX, mx_symbols(squeeze.given))
 
@@ -220,23 +204,18 @@ def _least_force(
     displaced: bool = False,
     beside: Expression | float = 0.0,
 ) -> Expression:
-    """(2,) normal forces to command [N]: of pads anywhere, of soft fingers where the cell has
-    these, else of pads that choose their pressure (`symbolic.contact.grasp.facing_wrenches`).
+    """(2,) normal forces to command [N] of pads that press evenly.
 
     Args:
         beside: load (6,) about the box frame's origin beside that of the case, of pads anywhere.
     """
     case = inputs["case"]
-    friction, radius, *_ = case_parts(case)
+    friction, *_ = case_parts(case)
     if squeeze is not None:
         handed = {name: inputs[name] for name in squeeze.given}
         load = _origin_load(workcell, inputs)
         load = load if isinstance(beside, float) else load + beside
         return _to_command_of(squeeze, load, case, handed, differentiable)
-    if not presses_evenly(workcell):
-        balance = _balance_function(workcell)(*inputs.values())
-        wrenches = facing_wrenches(balance, friction, radius, "squeeze", differentiable)
-        return _to_command(wrenches[::WRENCH_SIZE], case)
     axes = workcell.contacts[0].T_box_pad[:3, :3]
     first, second = (SoftPatch.of(contact, axes) for contact in workcell.contacts)
     needed = case_in_pad_axes(workcell, [inputs[name] for name in MOTION], case)
@@ -269,13 +248,6 @@ def _against_arms(case: Expression) -> Expression:
 def case_parts(case: ca.SX | ca.MX) -> list[ca.SX | ca.MX]:
     """The parts of a case (18,), see `CASE_SIZES`."""
     return list(ca.vertsplit(case, [0, *accumulate(CASE_SIZES.values())]))
-
-
-def _balance_function(workcell: Workcell) -> ca.Function:
-    """pose, rate, second_rate and a case to what the contacts have to balance (9,)."""
-    inputs = [*_inputs(ca.SX, sx_given(workcell.payload)).values()]
-    balance = balance_of(*case_in_pad_axes(workcell, inputs[:3], inputs[3]))
-    return ca.Function("case_balance", inputs, [balance])
 
 
 def case_in_pad_axes(
@@ -353,15 +325,11 @@ def least_distance(workcell: Workcell) -> float:
 
 
 def _sizes_function(squeeze: GraspSqueeze) -> ca.Function:
-    """A case to the sizes (2,) of the robots' patches over the cell's own, less what displacements
-    take off."""
+    """A case to the sizes (2,) of the robots' patches over the cell's own."""
     case = ca.SX.sym("case", CASE_SIZE)
-    _, radius, *_, displacement, _, _ = case_parts(case)
+    radius = case_parts(case)[1]
     own = [ca.SX(number(contact.patch_radius)) for contact in squeeze.workcell.contacts]
     share = radius / ca.vertcat(*own)
-    if not squeeze.is_even:
-        lengths = [ca.norm_2(displacement[2 * i : 2 * i + 2]) for i in (0, 1)]
-        share -= ca.vertcat(*lengths) / number(squeeze.numbers.least_reaches)
     return ca.Function("sizes", [case, *squeeze.given.values()], [share])
 
 
@@ -390,8 +358,8 @@ commanded force makes that a little more than the least."""
 
 class GraspSqueeze(Grasp):
     """Least normal force of one robot, plus a little of the other's; see `OTHER_WEIGHT`. Inputs are
-    load, coefficients and sizes of the patches over the cell's own, (2,) by robot, and where pads
-    press evenly, their displacements (4,), the same for all pads of a robot, along their tangents.
+    load, coefficients and sizes of the patches over the cell's own, (2,) by robot, and the pads'
+    displacements (4,), the same for all pads of a robot, along their tangents.
 
     Attributes:
         workcell: the cell.
@@ -411,21 +379,18 @@ class GraspSqueeze(Grasp):
             numbers = derived(workcell, next(shares, 1.0))
         super().__init__(workcell, numbers)
         self.workcell, self.commanded = workcell, commanded
-        self.cell_sizes = (("load", LOAD_SIZE), ("friction", 2), ("reach", 2))
-        self.is_even = presses_evenly(workcell)
-        if self.is_even:
-            self.cell_sizes += (("displacement", 4),)
+        self.cell_sizes = (*self.cell_sizes, ("reach", 2), ("displacement", 4))
 
     def _nominal(self) -> tuple[list[float], ...]:
         """See `Grasp`."""
-        return (*super()._nominal(), [1.0, 1.0], *([[0.0] * 4] if self.is_even else []))
+        return (*super()._nominal(), [1.0, 1.0], [0.0] * 4)
 
     def balanced(self, free: ca.SX, cell: list[ca.SX]) -> list[ca.SX]:
         """See `symbolic.contact.central_path.Program`."""
-        load, friction, reach, *displaced = cell
+        load, friction, reach, displacement = cell
         wrenches = self._left_by(load, free, [friction, reach])
-        for _ in range(DISPLACED if displaced else 0):
-            turned = self._turned(wrenches, displaced[0], [friction, reach])
+        for _ in range(DISPLACED):
+            turned = self._turned(wrenches, displacement, [friction, reach])
             wrenches = self._left_by(
                 load - ca.vertcat(ca.SX.zeros(3), turned), free, [friction, reach]
             )
@@ -473,13 +438,13 @@ def commanded_forces(
         load: (6,) force and moment about the box frame's origin, along the box's axes.
         friction: (2,) Coulomb coefficients of the robots' pads.
         share: (2,) sizes of their patches over the cell's own.
-        displacement: (4,) of pads that press evenly [m].
+        displacement: (4,) of the pads [m].
         handed: the squeeze's given numbers, where they are symbols.
         differentiable: whether first derivatives are wanted.
     """
     handed = handed or {}
     reach = share / as_mx(ca.SX(number(squeeze.numbers.reach)), squeeze.given, handed)
-    cell = [load, friction, reach, *([displacement] if squeeze.is_even else [])]
+    cell = [load, friction, reach, displacement]
     return squeeze.solved(cell, list(handed.values()), differentiable)
 
 
@@ -498,11 +463,8 @@ def commanded_slack(
     own = [k for k, robot in enumerate(squeeze.robots) if robot == squeeze.commanded]
     pressed = (force - sum(asked[k][0] for k in own)) / sum(given[k][0] for k in own)
     held = [a + pressed * g for a, g in zip(asked, given, strict=True)]
-    enough = pressed
-    if squeeze.is_even:
-        cell = [load, friction, reach, displacement]
-        held = squeeze.balanced(squeeze.free(held), cell)
-        enough = ca.fmin(pressed, (1.0 + ROUNDING) * force - sum(held[k][0] for k in own))
+    held = squeeze.balanced(squeeze.free(held), [load, friction, reach, displacement])
+    enough = ca.fmin(pressed, (1.0 + ROUNDING) * force - sum(held[k][0] for k in own))
     slack = [patch.slack(state) for patch, state in zip(squeeze.patches, held, strict=True)]
     return ca.fmin(least(slack), enough)
 
@@ -513,10 +475,9 @@ def _against_internal(squeeze: GraspSqueeze) -> ca.Function:
     it."""
     friction, share = ca.SX.sym("friction", 2), ca.SX.sym("share", 2)
     given = squeeze.squeezed(friction, share / squeeze.numbers.reach)
-    robots, turning = enumerate(squeeze.robots), 3 if squeeze.is_even else 5
     left = [
-        friction[r] * (given[k][0] - ca.norm_2(given[k][1:3]) - ca.fabs(given[k][turning]))
-        for k, r in robots
+        friction[r] * (given[k][0] - ca.norm_2(given[k][1:3]) - ca.fabs(given[k][3]))
+        for k, r in enumerate(squeeze.robots)
     ]
     pressed = squeeze.normals[squeeze.commanded]
     held = ca.fmax(least(left), SCALE_FLOOR)

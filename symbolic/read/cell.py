@@ -370,14 +370,9 @@ def check_contacts(workcell: Workcell, problems: Problems) -> None:
     if allocation == "soft-finger" and workcell.has_opposite_pads:
         # They carry any moment by pressing harder where the line between them lies well within
         # their friction cones.
-        apart = first[:3, 3] - workcell.contacts[1].T_box_pad[:3, 3]
         friction = min(contact.friction for contact in workcell.contacts)
-        room = friction * abs(float(apart @ first[:3, 2]))
+        room = friction * workcell.pad_distance
         _check_beside(workcell, room, "friction times the pads' distance", problems)
-    elif allocation == "joint" and workcell.has_facing_pads:
-        # Likewise where the patches overlap, seen along the normal.
-        room = sum(contact.patch_radius for contact in workcell.contacts)
-        _check_beside(workcell, room, "both patch radii together", problems)
     elif allocation == "paper":
         if not workcell.has_facing_pads:
             second = workcell.contacts[1].T_box_pad
@@ -386,7 +381,7 @@ def check_contacts(workcell: Workcell, problems: Problems) -> None:
                 "contacts[1].xyz",
                 f"belongs to {len(workcell.pads)} pads, with a normal {turned:.4g} degrees off the "
                 "opposite of contacts[0]; the paper's allocation allows two round pads with "
-                "opposite normals: task.allocation = 'soft-finger' and 'joint' take any",
+                "opposite normals: task.allocation = 'soft-finger' takes any",
             )
     elif not has_force_closure(workcell):
         problems.add(

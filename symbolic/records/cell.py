@@ -542,6 +542,12 @@ class Workcell:
         return bool((np.abs(first + second) <= OPPOSITE).all())
 
     @property
+    def pad_distance(self) -> float:
+        """Distance of the contacts along the first one's normal [m]."""
+        first, second = (contact.T_box_pad[:3, 3] for contact in self.contacts)
+        return abs(float((first - second) @ self.contacts[0].T_box_pad[:3, 2]))
+
+    @property
     def pads_beside(self) -> float:
         """How far the contacts lie beside one another, seen along the first one's normal [m]."""
         first, second = (contact.T_box_pad[:3, 3] for contact in self.contacts)
@@ -561,17 +567,10 @@ class Workcell:
         return allocation == "paper" or (allocation == "soft-finger" and self.has_opposite_pads)
 
     @property
-    def has_force_slopes(self) -> bool:
-        """Whether the normal forces have slopes: in closed form, or by the program of pads
-        anywhere. That of two facing pads that choose their pressure has none."""
-        return self.has_closed_form or not self.has_facing_pads
-
-    @property
     def has_one_squeeze(self) -> bool:
         """Whether the force of one pad decides that of the other, so that a least squeeze says
         all."""
-        soft = self.task.allocation == "soft-finger"
-        return self.has_facing_pads or (soft and self.has_opposite_pads)
+        return self.has_opposite_pads
 
     @property
     def pads(self) -> tuple[Contact, ...]:

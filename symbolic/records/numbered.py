@@ -98,13 +98,13 @@ class NumberedTask(Task):
 @dataclass(frozen=True)
 class GraspNumbers:
     """What formulas of pads anywhere hold beside the pads' own numbers, as NumPy derives it: n
-    entries of all pads' states, of which m belong to their scaled wrenches; b rows of balance.
+    entries of all pads' states; b rows of balance.
 
     Attributes:
-        left: (b,) which of the m components are what the others leave.
+        left: (b,) which of the n components are what the others leave.
         squeeze: (n,) internal squeeze to start from.
         spread: (n, 6) the least states that balance a load.
-        load_to_left, free_to_left: (b, 6) and (b, m - b), what the load and the free components
+        load_to_left, free_to_left: (b, 6) and (b, n - b), what the load and the free components
             leave to the others, in units of `symbolic.contact.grasp.Grasp.units`.
         to_robots: (6, 6 k) from all pads' wrenches to force and moment of the robot that has the
             pad, see `symbolic.contact.force_closure`.
@@ -112,7 +112,6 @@ class GraspNumbers:
         load_at_rest: (6,) direction of the load at the start.
         rest, rest_slopes: (n,) and (n, 6) states on the central path there, and their slopes.
         reach: size of the patches that the squeeze lies within, over the cell's own.
-        least_reaches: (2,) of each robot's patches the least radius or half side [m].
         given: the group of those that are symbols.
     """
 
@@ -127,7 +126,6 @@ class GraspNumbers:
     rest: Any
     rest_slopes: Any
     reach: Any
-    least_reaches: Any
     given: Group | None = None
 
 

@@ -5,8 +5,8 @@ normal component F_n and the tangential magnitude F_t of the required force
 (`symbolic.contact.paper.normal_force_branches`), so that these two, and not the kinked forces, are
 differentiated; those of soft fingers are differentiated themselves. The share of each patch that
 the shift of the centre of pressure leaves is differentiated directly: its kinks are those of the
-forces. For jointly allocated forces the load is differentiated here, and the forces by the load in
-`grasp_force_functions`.
+forces. Where a program finds the forces, the load is differentiated here, and the forces by the
+load in `grasp_force_functions`.
 
 With the constant-speed law the motion at a sample depends on a window of five neighbouring samples
 alone (two finite differences). One small function serves all inner samples, with its window's basis
@@ -48,7 +48,7 @@ Block = Literal["inner", "first", "last", "path"]
 """Inner samples, one per call; the first two; the last two; all samples of another time law."""
 
 SAMPLE_BARRIER_WEIGHT = 1e-4
-"""Weight of the joint allocation's barriers; see `symbolic.contact.soft_grasp`. Forces exceed the
+"""Weight of the program's barriers; see `symbolic.contact.soft_grasp`. Forces exceed the
 least ones by a share of about this times the number of active constraints, which the polish
 corrects at every iterate."""
 
@@ -244,7 +244,7 @@ def _wrench_function(workcell: Workcell) -> ca.Function:
 
 def _margin_function(workcell: Workcell) -> ca.Function:
     """Return force and moment (6,) in the box frame -> 1 - (shift / patch radius)^2 (2,), by the
-    paper's allocation, which equals the joint one if the patches suffice."""
+    paper's allocation."""
     wrench, contacts = ca.SX.sym("wrench", 6), workcell.contacts
     shift = held_by(workcell, "paper", _contact_load(workcell, wrench))
     squares = ca.vertcat(*map(ca.sumsqr, shift.shifts))

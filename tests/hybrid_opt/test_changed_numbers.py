@@ -25,7 +25,7 @@ from hybrid_opt.polishing.settings import (
     PolishSettings,
     ProbeSettings,
 )
-from hybrid_opt.robust.force import pressing_model
+from hybrid_opt.robust.force import robust_model
 from symbolic.numbers import BODIES
 from symbolic.records import Workcell
 from tests.hybrid_opt.cells import drivable, shipped
@@ -131,7 +131,7 @@ def asked(cell: ho.Cell, drivable: ho.Cell, polishes: Sequence[ho.Cell]) -> tupl
     carry = cell.carry(cell.initial)
     timing = ho.time_path(cell, cell.initial)
     driven = drivable.carry(drivable.initial)
-    peak = pressing_model(drivable.workcell).peak(driven, drivable.workcell.uncertainty)
+    peak = robust_model(drivable.workcell).peak(driven, drivable.workcell.uncertainty)
     judged = drivable.evaluate(drivable.initial)
     for each in polishes:
         assert each.polish_functions.built

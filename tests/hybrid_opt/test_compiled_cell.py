@@ -31,7 +31,7 @@ from hybrid_opt.job.plan import JobCollisions
 from hybrid_opt.polishing.polisher import Polisher
 from hybrid_opt.polishing.settings import PolishSettings
 from hybrid_opt.progress import Progress
-from hybrid_opt.robust.force import RobustModel, at_rest, pressing_model
+from hybrid_opt.robust.force import RobustModel, at_rest, robust_model
 from hybrid_opt.timing.drive import search_carry
 from hybrid_opt.timing.model import TimingModel
 from symbolic.cell_model import CellModel
@@ -167,5 +167,5 @@ def test_nothing_is_compiled_after_everything_was_built(monkeypatch: pytest.Monk
         assert TimingModel(each.compiled).joint_names
         assert JobCollisions(each.compiled).geometry.active
         assert RobustModel(each.workcell).workcell is each.workcell
-    assert pressing_model(cell.drivable().workcell).nominal(at_rest()).min() > 0.0
+    assert robust_model(cell.drivable().workcell).nominal(at_rest()).min() > 0.0
     build_study(Cell.load(RACK), Progress(shown=False))

@@ -14,7 +14,7 @@ import hybrid_opt as ho
 from hybrid_opt import sweeping
 from hybrid_opt.front import Front
 from hybrid_opt.robust.cases import LEADER, worst_cases
-from hybrid_opt.robust.force import pressing_model
+from hybrid_opt.robust.force import robust_model
 from hybrid_opt.sensitivity import Sensitivity
 from hybrid_opt.timing.limits import drive_path
 from symbolic import outside
@@ -41,7 +41,7 @@ def in_changed(cell: ho.Cell, key: str, value: float) -> tuple[float, float]:
     """Force and duration where a number of the file has another value, from the beginning."""
     new = changed_cell(cell, key, value)
     carry, workcell = new.carry(cell.initial), new.workcell
-    force = pressing_model(workcell).commanded(carry, workcell.uncertainty, LEADER)
+    force = robust_model(workcell).commanded(carry, workcell.uncertainty, LEADER)
     return float(force.max()), carry.duration
 
 
@@ -163,7 +163,7 @@ def test_the_fastest_duration_is_that_of_paths_timed_anew(name: str, force: floa
         ends = []
         for sign in (-1.0, 1.0):
             workcell = changed_cell(cell, key, row.value + sign * 1e-4).workcell
-            model = pressing_model(workcell)
+            model = robust_model(workcell)
             ends.append(model.commanded(carry, workcell.uncertainty, LEADER).max())
         assert row.force == pytest.approx((ends[1] - ends[0]) / 2e-4, rel=1e-4)
 
@@ -184,7 +184,7 @@ def test_what_has_no_sensitivities_is_refused() -> None:
 
 def test_slopes_of_what_pads_anywhere_need() -> None:
     """By motion and case: against differences of the force itself."""
-    workcell = pressing_model(shipped("fork").workcell).workcell
+    workcell = robust_model(shipped("fork").workcell).workcell
     least = case_squeeze_function(workcell, 1)
     at = np.random.default_rng(1).normal(scale=0.1, size=18)
     at[2] += 0.8

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import hybrid_opt as ho
-from hybrid_opt.static_hold import still_load, unheld
+from hybrid_opt.static_hold import unheld
 from hybrid_opt.timing.model import TimingModel
 from studies import propose, run
 from studies.program import BAD_INPUT
@@ -88,18 +88,6 @@ def test_a_patch_that_would_do_is_told(tmp_path: Path) -> None:
     radius = 1e-3 * number(why, "patches of at least")
     assert unheld(load(changed("transfer", tmp_path, patch_radius=1.001 * radius))) == ""
     assert unheld(load(changed("transfer", tmp_path, patch_radius=0.98 * radius))) != ""
-
-
-def test_the_joint_allocation_tells_a_patch_that_presses_less(tmp_path: Path) -> None:
-    path = changed("transfer", tmp_path, patch_radius=0.003)
-    text = path.read_text().replace("[task]", '[task]\nallocation = "joint"')
-    path.write_text(text)
-    needed = float(still_load(load(path), np.zeros(6))["normal_force"].max())
-    path.write_text(re.sub(r"^reference_force = .*$", "reference_force = 75.0", text, flags=re.M))
-    assert needed > 75.0
-    radius = 1e-3 * number(unheld(load(path)), "patches of at least")
-    path.write_text(path.read_text().replace("patch_radius = 0.003", f"patch_radius = {radius}"))
-    assert unheld(load(path)) == ""
 
 
 def test_a_joint_that_is_too_weak_is_told() -> None:

@@ -97,7 +97,6 @@ MAKERS: dict[str, Callable[[CellModel], ca.Function]] = {
     "path": lambda model: sample_functions(model)["path"],
 }
 OTHERS: list[tuple[str, dict[str, Any]]] = [
-    ("load", {"allocation": "joint"}),
     ("load", {"allocation": "soft-finger"}),
     ("path", {"time_law": "ramped"}),
 ]

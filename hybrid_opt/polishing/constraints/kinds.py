@@ -10,7 +10,6 @@ from collections.abc import Iterable, Sequence
 from typing import Generic, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hybrid_opt.polishing.carry import PlacedCarry, local_minima_below
 from hybrid_opt.polishing.cell import SmoothCell
@@ -27,9 +26,6 @@ singularities: it covers the path between places."""
 
 CONE_TIGHT = 0
 """Branch of the normal force that governs unless the box is accelerated across by nearly 1 g."""
-
-FORCE_ROUNDING = 1e-6
-"""Share by which a force may exceed the paper's by rounding."""
 
 FORCE_STRIDE = 0.02
 """Distance of force rows along the path: forces are smooth there."""
@@ -129,16 +125,16 @@ class Forces(ConstraintKind[ForceRow]):
         self._ends = {0, 1, last - 1, last}
         self._every = set(range(0, last, self.grid.samples(FORCE_STRIDE)))
         self._ties = set(range(0, last + 1, self.grid.samples(TIE_STRIDE)))
-        self._joint = cell.robust is None and not cell.workcell.has_closed_form
-        self._facing = cell.workcell.has_facing_pads
+        by_program = cell.robust is None and not cell.workcell.has_closed_form
+        # The branch that has a row wherever forces matter.
+        self._main = PROGRAM_BRANCH if by_program else CONE_TIGHT
 
     def near_rows(self, carry: PlacedCarry, limits: MinimisedForces) -> Iterable[ForceRow]:
         """Return rows at every few samples, at the peaks and beside them."""
         samples = self._every | self._ends | self._peaks(carry)
-        main = self._main(carry)
         for robot, limited in enumerate(limits):
             for sample in samples if limited else samples & self._ties:
-                yield ForceRow(robot, main[sample], sample)
+                yield ForceRow(robot, self._main, sample)
         yield from self._other_branches(carry)
 
     def violated_rows(self, carry: PlacedCarry, known: PlacedCarry) -> Iterable[ForceRow]:
@@ -147,38 +143,21 @@ class Forces(ConstraintKind[ForceRow]):
 
     def peak_rows(self, carry: PlacedCarry, limits: MinimisedForces) -> set[ForceRow]:
         """Return rows at peaks that the program underestimated."""
-        main = self._main(carry)
         return {
-            ForceRow(robot, main[sample], sample)
+            ForceRow(robot, self._main, sample)
             for robot, limited in enumerate(limits)
             if limited
             for sample in self._peaks(carry)
         }
 
     def _values(self, carry: PlacedCarry) -> Array:
-        """Compute the paper's branches (samples, 2, branches) [N]."""
+        """Compute the branches (samples, 2, branches) of the forces [N]."""
         return np.asarray(np.einsum("rbk,nk->nrb", self.cell.coefficients, carry.split))
-
-    def _main(self, carry: PlacedCarry) -> list[int]:
-        """Return per sample the branch that has a row where forces matter."""
-        return [
-            PROGRAM_BRANCH if held else CONE_TIGHT
-            for held in self._is_found_by_program(carry).tolist()
-        ]
-
-    def _is_found_by_program(self, carry: PlacedCarry) -> NDArray[np.bool_]:
-        """Return (samples,) whether the joint allocation's forces differ, or nearly differ, from
-        the paper's."""
-        if not self._joint or not self._facing:
-            return np.full(len(carry.split), self._joint)
-        harder = carry.force > (1.0 + FORCE_ROUNDING) * self._values(carry).max(axis=2)
-        near = carry.shift > PRESSURE_SHARE
-        return np.asarray((harder | near).any(axis=1))
 
     def _peaks(self, carry: PlacedCarry) -> set[int]:
         """Return samples at and beside local maxima of either robot's normal force."""
-        is_paper = self.cell.robust is None and not self._joint
-        force = self._values(carry).max(axis=2) if is_paper else carry.force
+        has_branches = self.cell.robust is None and self._main == CONE_TIGHT
+        force = self._values(carry).max(axis=2) if has_branches else carry.force
         inner = force[1:-1]
         high = (inner >= force[:-2]) & (inner >= force[2:])
         high &= inner >= PEAK_SHARE * inner.max(axis=0)
@@ -190,12 +169,12 @@ class Forces(ConstraintKind[ForceRow]):
 
         Robust forces have one row per sample, of the governing case.
         """
-        if self.cell.robust is not None:
+        if self.cell.robust is not None or self._main == PROGRAM_BRANCH:
             return []
         force = self._values(carry)
         share = 1.0 - BRANCH_SHARE
         near = force >= share * force.max(axis=2, keepdims=True)
-        near[:, :, CONE_TIGHT] = near[self._is_found_by_program(carry)] = False
+        near[:, :, CONE_TIGHT] = False
         return [
             ForceRow(robot, branch, sample) for sample, robot, branch in np.argwhere(near).tolist()
         ]

@@ -321,7 +321,7 @@ def test_every_cell_that_ships_is_searched(name: str) -> None:
 def test_a_worker_elsewhere_searches_without_the_cells_files(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """With the joint allocation paths are timed one by one, which reads the robots' files."""
+    """Of a cell without a closed form."""
     cell = drivable("fork")
     evaluator = partial(CandidateEvaluator, objectives=DRIVABLE_OBJECTIVES)
     source = partial(with_cell, evaluator, collect_cell(cell.workcell))

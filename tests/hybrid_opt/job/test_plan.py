@@ -230,16 +230,12 @@ def test_a_box_may_stand_where_pads_may_be_displaced() -> None:
     assert job.stands_on == rack_job().stands_on
 
 
-def test_what_has_no_job_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_has_no_job_is_refused() -> None:
     with pytest.raises(JobError, match="joint torque"):
         rack_jobs().plan(rack_timing(), SqueezeSettings(factor=8.0))
     failed = time_path(rack().timing_model, rack().initial, TimingLimits(force=30.0))
     with pytest.raises(SettingsError, match="no timing to export"):
         rack_jobs().plan(failed)
-    monkeypatch.setattr(type(rack().workcell), "has_facing_pads", False)
-    monkeypatch.setattr("hybrid_opt.job.plan.presses_evenly", lambda cell: False)
-    with pytest.raises(JobError, match="face one another"):
-        rack_jobs().plan(rack_timing())
 
 
 def largest_jerk(phase: Phase) -> tuple[float, float]:

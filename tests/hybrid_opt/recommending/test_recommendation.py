@@ -23,7 +23,7 @@ from hybrid_opt.recommending.recommendation import (
     table_forces,
 )
 from hybrid_opt.robust.cases import random_cases
-from hybrid_opt.robust.force import BoxMotion, RobustModel, pressing_model
+from hybrid_opt.robust.force import BoxMotion, RobustModel, robust_model
 from hybrid_opt.robust.squeeze import commanded_forces
 from hybrid_opt.timing.solve import time_path
 from symbolic.array import Array
@@ -58,7 +58,7 @@ def timed(cell: ho.Cell, path: Array, force: float) -> ho.Timing:
 def held(cell: ho.Cell, carry: ho.Carry | None) -> Array:
     """(n,) what is to be commanded of arm 2 along a carry [N]."""
     assert carry is not None
-    return pressing_model(cell.workcell).hold(carry, cell.workcell.uncertainty)[0]
+    return robust_model(cell.workcell).hold(carry, cell.workcell.uncertainty)[0]
 
 
 @pytest.fixture(scope="module")
@@ -98,7 +98,7 @@ def test_it_holds_in_random_cases_with_what_is_commanded(
     cases = random_cases(drivable.workcell, doubt, 400, np.random.default_rng(1))
     parts = (phase.motion.pose, phase.motion.rate, phase.motion.second_rate)
     at = BoxMotion(*[np.ascontiguousarray(part[rows]) for part in parts])
-    needed = pressing_model(drivable.workcell).least_squeeze(at, cases)[:, :, 1]
+    needed = robust_model(drivable.workcell).least_squeeze(at, cases)[:, :, 1]
     assert (needed <= phase.force.normal[rows, 1] * (1.0 + 1e-9)).all()
 
 
@@ -111,7 +111,7 @@ def test_no_arm_feels_more_than_its_reference_force(
     cell = ho.Cell(replace(drivable.workcell, task=task), drivable.objective_names)
     answer = ho.recommend(ho.Front.of(cell, front.x), alone=True)
     assert not answer.warnings
-    held = pressing_model(drivable.workcell).hold(answer.carry, drivable.workcell.uncertainty)
+    held = robust_model(drivable.workcell).hold(answer.carry, drivable.workcell.uncertainty)
     assert max(each.max() for each in held) <= allowed * 1.003
 
 
@@ -319,7 +319,7 @@ def test_where_nothing_fits_it_says_what_would_do(drivable: ho.Cell, front: ho.F
     )
     assert stronger.fits
     assert stronger.duration == pytest.approx(found.duration, rel=0.02)
-    felt = max(each.max() for each in pressing_model(unsure.workcell).hold(found.carry, USUAL))
+    felt = max(each.max() for each in robust_model(unsure.workcell).hold(found.carry, USUAL))
     assert found.required.max() == pytest.approx(felt, rel=5e-3)
     assert len(found.remedies) == 3
     assert [abs(each.share) for each in found.remedies] == sorted(
@@ -405,7 +405,7 @@ WIDER: dict[str, dict[str, list[float]]] = {
 
 @pytest.mark.parametrize("name", ["fork", pytest.param("drum", marks=pytest.mark.slow)])
 def test_changes_of_pads_anywhere_are_those_of_the_file(name: str) -> None:
-    workcell, moved = model(f"{name}, even").workcell, motion(name)
+    workcell, moved = model(name).workcell, motion(name)
     told = dict(changes_of_cell(workcell, moved))
 
     def force(changes: dict[str, Any]) -> float:

@@ -17,7 +17,7 @@ from hybrid_opt.robust.budget import (
     grip_budget,
 )
 from hybrid_opt.robust.cases import least_friction
-from hybrid_opt.robust.force import BoxMotion, interpreted_pressing_model
+from hybrid_opt.robust.force import BoxMotion, interpreted_robust_model
 from symbolic.read.cell import changed
 from symbolic.records import USUAL, Workcell
 from symbolic.records.cell import RANGES
@@ -73,7 +73,7 @@ def numbers(text: str) -> list[float]:
 
 def test_remedies_do_and_a_little_less_does_not(rack: Workcell) -> None:
     """By cells that are read anew with them, for each kind of remedy."""
-    model, allowed = interpreted_pressing_model(rack), rack.task.reference_force
+    model, allowed = interpreted_robust_model(rack), rack.task.reference_force
     poses = np.array([rack.task.waypoints[0].lower, rack.task.waypoints[-1].lower])
     motion = BoxMotion(poses, np.zeros_like(poses), np.zeros_like(poses))
     required = grip_budget(rack).required

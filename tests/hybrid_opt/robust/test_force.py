@@ -22,7 +22,6 @@ from hybrid_opt.robust.force import (
     RobustModel,
     allowed_factor,
     at_rest,
-    closes_evenly,
 )
 from hybrid_opt.robust.path_force import BY_TIMING, PathPoints, RobustPath
 from symbolic.array import Array
@@ -31,7 +30,7 @@ from symbolic.errors import SettingsError
 from symbolic.read.cell import load
 from symbolic.records import Uncertainty
 from symbolic.records.cell import RANGES
-from tests.symbolic.cells import RACK, hand_cell, rack_cell, with_contacts, with_task
+from tests.symbolic.cells import RACK, hand_cell, rack_cell, with_contacts
 from tests.symbolic.contact.test_payload_load import random_motion
 
 SET = Uncertainty(
@@ -51,7 +50,7 @@ WIDE = Uncertainty(0.2, 0.05, np.full(3, 0.01), 0.005, np.full(3, 0.3))
 FRICTION = 0.8
 POINTS = 12
 
-SETS = {"hand": SET, "rack, even": WIDE}
+SETS = {"hand": SET, "rack": WIDE}
 """Of cells with pads that face one another; others have `SMALL`."""
 
 ANYWHERE = ["drum", "fork", pytest.param("corner", marks=pytest.mark.slow)]
@@ -59,13 +58,11 @@ ANYWHERE = ["drum", "fork", pytest.param("corner", marks=pytest.mark.slow)]
 
 @cache
 def model(name: str = "hand") -> RobustModel:
-    """Of a cell and its set; with `even` of pads that press evenly."""
+    """Of a cell and its set."""
     if name == "hand":
         cell = with_contacts(hand_cell(), friction=(FRICTION, FRICTION))
     else:
-        file = name.partition(",")[0]
-        cell = rack_cell() if file == "rack" else load(RACK.with_name(f"{file}.toml"))
-        cell = with_task(cell, allocation="soft-finger" if "even" in name else "joint")
+        cell = rack_cell() if name == "rack" else load(RACK.with_name(f"{name}.toml"))
     return RobustModel(replace(cell, uncertainty=SETS.get(name, SMALL)))
 
 
@@ -84,25 +81,26 @@ def motion(name: str = "hand") -> BoxMotion:
 def test_at_rest_the_worst_case_is_told_in_closed_form(leader: int) -> None:
     """Pads in line with the centre of mass: least friction, most mass, worst disturbance.
 
-    The contacts lie across y, N_1 - N_2 is the disturbance's share along it, and N_1 + N_2 the
-    tangential force over the coefficient.
+    The contacts lie across y, N_1 - N_2 is the disturbance's share along it, either way, and each
+    pad bears half of the tangential force: the lighter one holds it by friction.
     """
     uncertainty = Uncertainty(0.1, 0.05, np.zeros(3), 0.0, np.array([0.5, 0.3, 0.4]))
     commanded, leading = model().hold(at_rest(), uncertainty, leader)
     mass = 10.0 * 1.05
     tangential = mass * np.hypot(9.81 + 0.4, 0.5)
     along = mass * 0.3
-    expected = (tangential / (0.9 * FRICTION) + along) / 2.0
+    expected = tangential / (2.0 * 0.9 * FRICTION) + along
     assert commanded[0] == pytest.approx(expected, rel=1e-6)
     assert leading[0] == pytest.approx(expected + along, rel=1e-6)
 
 
 def test_a_displaced_centre_of_mass_is_held_by_pressing_harder() -> None:
-    """The known case of the allocation: 50 mm towards a pad, patches of 10 mm, 111.5 N."""
+    """50 mm towards a pad: opposed tangential forces of weight times 0.05 / 0.4 carry it, so that
+    the nearer pad bears 0.5 + 0.125 of the weight."""
     box = with_contacts(hand_cell(), friction=(0.5, 0.5), patch_radius=(0.01, 0.01))
     uncertainty = Uncertainty(centre_of_mass=np.array([0.0, 0.05, 0.0]))
     commanded, leading = RobustModel(box).hold(at_rest(), uncertainty)
-    assert commanded[0] == pytest.approx(98.1 * 0.25 / (0.5 * 0.4 + 0.02), rel=1e-6)
+    assert commanded[0] == pytest.approx(98.1 * 0.625 / 0.5, rel=1e-6)
     assert leading[0] == pytest.approx(commanded[0], rel=1e-6)
 
 
@@ -119,10 +117,9 @@ def test_a_fork_and_a_pad_press_alike() -> None:
     ("name", "cases", "share"),
     [
         ("hand", 3000, 0.9),
-        ("rack, even", 4000, 0.75),
-        ("drum", 400, 0.85),
-        ("drum, even", 200, 0.85),
-        ("fork", 400, 0.85),
+        ("rack", 4000, 0.75),
+        ("drum", 200, 0.85),
+        ("fork", 200, 0.85),
         pytest.param("corner", 400, 0.85, marks=pytest.mark.slow),
     ],
 )
@@ -139,7 +136,7 @@ def test_no_random_case_needs_more_and_some_need_nearly_as_much(
     assert not model(name).check(moved, weaker, cases, np.random.default_rng(1)).holds
 
 
-@pytest.mark.parametrize("factor", [0.95, 0.92])
+@pytest.mark.parametrize("factor", [0.91, 0.87])
 def test_the_closest_case_is_that_of_every_case_at_every_sample(factor: float) -> None:
     """In several turns, of which each looks only at what is closer than those before."""
     moved, rng = motion(), np.random.default_rng(5)
@@ -153,7 +150,7 @@ def test_the_closest_case_is_that_of_every_case_at_every_sample(factor: float) -
     share = (needed / force.commanded).max(axis=1)
     assert check.closest == share.max() > SCREENED
     assert check.failing == (share > 1.0 + HOLDS).sum()
-    assert check.holds == (factor > 0.93)
+    assert check.holds == (factor > 0.9)
 
 
 def test_cases_within_the_ranges_lie_below_the_vertices() -> None:
@@ -162,7 +159,9 @@ def test_cases_within_the_ranges_lie_below_the_vertices() -> None:
     for name in RANGES:
         one = replace(Uncertainty(), **{name: getattr(SET, name)})
         force = model().robust_force(motion(), one)
-        assert model().check(motion(), force, 500, rng).holds, name
+        # Pads that are displaced apart turn the torsion as well, which no vertex has.
+        beyond = 3e-3 if name == "relative_position" else HOLDS
+        assert model().check(motion(), force, 500, rng).closest < 1.0 + beyond, name
         assert (force.commanded >= (1.0 - 1e-7) * force.nominal[:, 1]).all(), name
 
 
@@ -180,7 +179,7 @@ def test_leading_arm_feels_no_more_than_told() -> None:
 @pytest.mark.parametrize("name", ANYWHERE)
 def test_more_friction_never_needs_more_force(name: str) -> None:
     """And a force is found wherever friction closes the grasp, far from the cell's own too."""
-    even, shares = model(f"{name}, even"), np.linspace(0.7, 1.3, 61)
+    even, shares = model(name), np.linspace(0.7, 1.3, 61)
     cases = np.tile(nominal_case(even.workcell), (len(shares), 1))
     assert next(iter(CASE_SIZES)) == "friction"
     cases[:, : CASE_SIZES["friction"]] *= shares[:, None]
@@ -191,7 +190,7 @@ def test_more_friction_never_needs_more_force(name: str) -> None:
 
 def test_what_is_commanded_is_known_without_every_case() -> None:
     """Also of more than `SAMPLES` samples: cases that rule at some are asked at all."""
-    even, moved = model("drum, even"), motion("drum")
+    even, moved = model("drum"), motion("drum")
     commanded, leading = even.hold(moved, SMALL)
     np.testing.assert_allclose(even.commanded(moved, SMALL), commanded, rtol=1e-9)
     above = float(np.median(commanded))
@@ -207,19 +206,10 @@ def test_what_is_commanded_is_known_without_every_case() -> None:
     np.testing.assert_allclose(even.commanded(many, SMALL), even.hold(many, SMALL)[0], rtol=1e-4)
 
 
-def test_pads_that_press_evenly_need_more() -> None:
-    """Than pads that choose their pressure; of functions with a form in lanes: without, a
-    recommendation would take minutes."""
-    even, moved = model("drum, even"), motion("drum")
-    assert (even.nominal(moved)[:, 1] > model("drum").nominal(moved)[:, 1]).all()
-    function = dense(case_squeeze_function(even.workcell))
+def test_forces_have_a_form_in_lanes() -> None:
+    """Without it a recommendation would take minutes."""
+    function = dense(case_squeeze_function(model("drum").workcell))
     assert lane_text(generated_c([function]), "lanes").entry
-
-
-def test_pads_that_only_choosing_their_pressure_would_close_are_told() -> None:
-    cell = load(RACK.with_name("corner.toml"))
-    assert closes_evenly(cell)
-    assert not closes_evenly(with_contacts(cell, friction=(0.9, 0.9)))
 
 
 def test_the_price_grows_with_the_set_until_it_uses_the_forces_up() -> None:
@@ -235,7 +225,12 @@ def test_the_price_grows_with_the_set_until_it_uses_the_forces_up() -> None:
     assert factor > 1.0
     assert (peak(factor) / limit).max() == pytest.approx(1.0, rel=1e-4)
     assert model().largest_factor(motion(), 0.1 * limit) == 0.0
-    assert allowed_factor(model().workcell, SET) == pytest.approx(0.0315 / 0.005)
+    # Friction is the first to be used up: its share, tilt, and displacements over the distance.
+    f = allowed_factor(model().workcell, SET)
+    left = (
+        np.tan(np.arctan(FRICTION * (1.0 - 0.1 * f)) - 0.03 * f) - (2.0 * 0.004 + 0.002) * f / 0.4
+    )
+    assert left == pytest.approx(0.0, abs=1e-6)
 
 
 def test_is_an_objective() -> None:
@@ -253,7 +248,7 @@ def test_a_set_that_nothing_holds_is_told() -> None:
     lost = replace(hand_cell(), uncertainty=Uncertainty(friction=1.0))
     with pytest.raises(SettingsError, match="no friction"):
         RobustPath(lost)
-    even, moved = model("fork, even"), motion("fork")
+    even, moved = model("fork"), motion("fork")
     assert 0.0 < even.largest_factor(moved, np.full(2, 1e9)) < LARGEST_FACTOR
     widest = SMALL.scaled(allowed_factor(even.workcell, SMALL))
     assert np.isinf(even.peak(moved, widest)).all()

@@ -14,8 +14,8 @@ from hybrid_opt.robust.force import (
     SAMPLES,
     BoxMotion,
     RobustModel,
+    robust_model,
     robust_price,
-    soft_model,
     thinned,
 )
 from hybrid_opt.robust.squeeze import (
@@ -93,7 +93,7 @@ SET = Uncertainty(
 def test_an_uncertain_cell_is_pressed_for_every_case() -> None:
     cell, commanded, squeeze = pressed(SET)
     carry = rack_carry()
-    needed = soft_model(cell).hold(carry, SET)[0]
+    needed = robust_model(cell).hold(carry, SET)[0]
     assert (commanded >= needed - 1e-6).all()
     assert commanded.max() == pytest.approx(needed.max(), abs=1e-6)
     assert str(squeeze) == "holds pads that press evenly in every case of the cell's [uncertainty]"
@@ -181,7 +181,7 @@ def test_the_largest_forces_are_among_the_thinned_samples() -> None:
 def test_what_is_commanded_holds_even_pads(name: str, settings: SqueezeSettings) -> None:
     """Although the plan, here none at all, asks for less."""
     cell, still = load(RACK.with_name(f"{name}.toml")), BoxMotion(*[np.zeros((2, 6))] * 3)
-    model, time = soft_model(cell), np.array([0.0, 1.0])
+    model, time = robust_model(cell), np.array([0.0, 1.0])
     extra, squeeze = pressed_beyond(cell, settings, time, still, np.zeros((2, 2)))
     assert (extra >= model.nominal(still)[:, 1] * (1.0 - 1e-9)).all()
     assert "press evenly" in str(squeeze)

@@ -55,11 +55,6 @@ class Program:
         self.rows += [({k: -v for k, v in terms.items()}, constant) for terms, constant in parts]
         self.cones.append(clarabel.ZeroConeT(len(parts)))
 
-    def semidefinite(self, triangle: list[Terms], order: int) -> None:
-        """The scaled upper triangle is that of a positive semidefinite matrix."""
-        self.rows += [({k: -v for k, v in terms.items()}, 0.0) for terms in triangle]
-        self.cones.append(clarabel.PSDTriangleConeT(order))
-
     def solve(self, cost: Array) -> Array:
         """The optimum; that of semidefinite cones to what the solver reaches."""
         semidefinite = any(isinstance(cone, clarabel.PSDTriangleConeT) for cone in self.cones)

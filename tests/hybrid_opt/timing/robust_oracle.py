@@ -16,10 +16,13 @@ from studies.research.plain.motion import GRAVITY, angular_rates, rotation
 from symbolic.array import Array
 from symbolic.records import Workcell
 from tests.hybrid_opt.timing.convex_oracle import Affine, Program, Terms
-from tests.symbolic.contact.oracle import disc
+from tests.symbolic.contact.oracle import points_of
 
 FORCE_UNIT = 50.0
 """[N], so that the program's unknowns are around one."""
+
+GRID = 4, 8
+"""Rings of a patch and points on each."""
 
 
 def robust_limit(
@@ -83,26 +86,29 @@ def _held(
     load: list[tuple[Terms, float]],
     commanded: int,
 ) -> None:
-    """Wrenches of both pads, about their nominal points, that carry a load."""
+    """Wrenches of both pads, about their nominal points, that carry a load: even pressure, and at
+    each point of a patch a tangential force within its friction cone."""
     axes = workcell.contacts[0].T_box_pad[:3, :3]
     arms = np.array([c.T_box_pad[:3, 3] - case[5:8] for c in workcell.contacts]) @ axes
-    unit = float(case[2:4].max())
-    own = program.fresh(14)
-    for k in range(3):
-        held = {own + 6 * pad + k: -FORCE_UNIT for pad in (0, 1)}
-        program.zero([(load[k][0] | held, load[k][1])])
-    for k in range(3):
-        held = {own + 6 * pad + 3 + k: -FORCE_UNIT * unit for pad in (0, 1)}
-        for pad, arm in enumerate(arms):
-            turn = np.cross(np.eye(3), -arm)  # row f: arm x e_f
-            held |= {own + 6 * pad + f: -FORCE_UNIT * turn[f, k] for f in range(3) if turn[f, k]}
-        program.zero([(load[3 + k][0] | held, load[3 + k][1])])
-    program.zero([({own + 8: 1.0, commanded: 1.0}, 0.0)])  # its normal points against contact 2
-    radius = case[2:4] / case[2:4].max()
-    for pad, sign in enumerate((1.0, -1.0)):
-        r, columns = radius[pad], np.zeros((21, 14))
-        units = np.diag([1.0, 1.0, sign, sign / r, sign / r, 1.0 / r, 1.0])
-        places = [*range(6 * pad, 6 * pad + 6), 12 + pad]
-        columns[:, places] = np.column_stack([disc(case[pad], unit) for unit in units])
-        rows = [{own + k: row[k] for k in np.flatnonzero(row).tolist()} for row in columns]
-        program.semidefinite(rows, 6)
+    own = program.fresh(2)
+    program.zero([({own + 1: 1.0, commanded: -1.0}, 0.0)])
+    found: list[Terms] = [{} for _ in range(6)]
+    for pad, (sign, contact) in enumerate(zip((1.0, -1.0), workcell.contacts, strict=True)):
+        points, share = points_of(contact, *GRID)
+        # Few points bear pure torsion as the disc does: their mean distance from its centre.
+        mean = share @ np.linalg.norm(points, axis=1)
+        points = points * (2.0 / 3.0 * contact.patch_radius / mean)
+        first = program.fresh(2 * len(points))
+        forces = [(own + pad, np.array([0.0, 0.0, sign]), arms[pad])]
+        for k, (point, part) in enumerate(zip(points, share.tolist(), strict=True)):
+            at = first + 2 * k
+            bound = ({own + pad: float(case[pad]) * part}, 0.0)
+            program.norm([bound, ({at: 1.0}, 0.0), ({at + 1: 1.0}, 0.0)])
+            place = arms[pad] + np.array([*point, 0.0])
+            forces += [(at + j, np.eye(3)[j], place) for j in (0, 1)]
+        for column, force, arm in forces:
+            for row, value in enumerate([*force, *np.cross(arm, force)]):
+                if value:
+                    found[row][column] = found[row].get(column, 0.0) - FORCE_UNIT * value
+    for k in range(6):
+        program.zero([(load[k][0] | found[k], load[k][1])])

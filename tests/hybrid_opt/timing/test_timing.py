@@ -266,15 +266,14 @@ def off_centre(allocation: Allocation) -> TimingModel:
     return timing_of(replace(cell, payload=payload, contacts=(first, second), task=task), 50)
 
 
-def test_what_the_joint_allocation_holds_can_be_timed() -> None:
+def test_what_soft_fingers_hold_can_be_timed() -> None:
     refused = time_path(off_centre("paper"), initial(), TimingLimits())
     assert refused.status is TimingStatus.INFEASIBLE_AT_REST
     assert refused.place.constraint == "pressure shift"
-    model = off_centre("joint")
+    model = off_centre("soft-finger")
     timing = time_path(model, initial(), TimingLimits())
     assert timing.status is TimingStatus.OK
     assert "pressure shift" not in timing.use
-    assert timing.driven.pressure_shift.max() <= SMALL_PATCH * (1.0 + 1e-6)
     assert np.abs(timing.driven.moment_residual).max() < 1e-5
     names = [margin.quantity for margin in robustness_margins(model, timing.driven)]
     assert not any(name.startswith("patch radius") for name in names)

@@ -15,7 +15,7 @@ from hybrid_opt.carry import Carry
 from hybrid_opt.cell import Cell
 from hybrid_opt.errors import WitnessError
 from hybrid_opt.robust.cases import nominal_case
-from hybrid_opt.robust.force import soft_model
+from hybrid_opt.robust.force import robust_model
 from hybrid_opt.robust.squeeze import SqueezeSettings, commanded_forces
 from hybrid_opt.witness.arms import Account, CellWitness
 from hybrid_opt.witness.box import Witness, bisected, drive_of, workcell_of_case
@@ -39,7 +39,6 @@ from tests.symbolic.cells import (
     hand_cell,
     with_contacts,
     with_payload,
-    with_task,
 )
 
 STILL = np.zeros(6)
@@ -137,7 +136,7 @@ def test_statics_of_pads_that_press_evenly(
     carry = replace(carry, pose=pose)
     case = nominal_case(cell)
     case[8:11] = acceleration
-    force = soft_model(cell).least_squeeze(carry, case[None])[0]
+    force = robust_model(cell).least_squeeze(carry, case[None])[0]
     if not (acceleration[1] or tilt[0]):
         pulled = np.add(acceleration, [0.0, 0.0, 9.81])
         along = np.array([np.cos(tilt[1]), -np.sin(tilt[1])]) @ pulled[[0, 2]]
@@ -153,7 +152,7 @@ def test_statics_of_pads_that_press_evenly(
 
 def test_pads_on_adjacent_faces_hold_at_rest_from_the_least_force_on() -> None:
     """Where little more than the least force would stop a box that falls until they press."""
-    carry, _ = at_rest(with_task(shipped("corner").workcell, allocation="soft-finger"))
+    carry, _ = at_rest(shipped("corner").workcell)
     assert threshold(carry) == pytest.approx(1.0, abs=0.02)
 
 
@@ -162,7 +161,7 @@ def test_pads_on_adjacent_faces_hold_at_rest_from_the_least_force_on() -> None:
 )
 def test_carries_of_pads_that_press_evenly(path: tuple[float, ...]) -> None:
     carry = carry_along(raised(), np.array(path), 0.5)
-    carry = replace(carry, normal_force=soft_model(carry.workcell).nominal(carry))
+    carry = replace(carry, normal_force=robust_model(carry.workcell).nominal(carry))
     assert threshold(carry) == pytest.approx(1.0, abs=0.02)
 
 
@@ -293,7 +292,7 @@ def test_the_planned_forces_are_the_least_of_pads_that_the_planned_moments_drive
 
 def test_a_box_that_many_points_hold_stays() -> None:
     """Steps that are not solved to their last digits would let it drift by 0.05 mm."""
-    carry, _ = at_rest(with_task(shipped("fork").workcell, allocation="soft-finger"))
+    carry, _ = at_rest(shipped("fork").workcell)
     witness = Witness(carry.workcell, SimulationSettings(points=91))
     outcome = witness.simulate(drive_of(carry, witness.settings), 1.2)
     assert outcome.slip.max() < 1e-5
@@ -302,7 +301,7 @@ def test_a_box_that_many_points_hold_stays() -> None:
 @pytest.mark.parametrize("off", [0.0, 0.025])
 def test_a_fork_is_held_from_the_least_force_on_at_which_its_pads_press_alike(off: float) -> None:
     """A load beside its middle, too, until the box has turned and the pads press differently."""
-    cell = with_task(shipped("fork").workcell, allocation="soft-finger")
+    cell = shipped("fork").workcell
     carry, _ = at_rest(with_payload(cell, centre_of_mass=np.array([off, 0.0, 0.0])))
     assert threshold(carry, SimulationSettings(slip=1e-4)) == pytest.approx(0.985, abs=0.025)
 
@@ -356,7 +355,7 @@ def test_an_uncertain_cell_is_pressed_with_its_robust_forces() -> None:
     other = Cell(unsure)
     other.compiled = cell.compiled  # which knows nothing of what is uncertain
     pressed, squeeze = pressed_reference(other, carry)
-    needed = soft_model(unsure).hold(carry, unsure.uncertainty)[0]
+    needed = robust_model(unsure).hold(carry, unsure.uncertainty)[0]
     assert squeeze.factor is None
     told = pressed.normal_force[2:, 1]
     assert (told >= needed - 1e-6).all()

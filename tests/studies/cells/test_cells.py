@@ -105,9 +105,9 @@ def test_robust_forces_keep_to_a_limit_and_hold_random_cases(cell: Cell) -> None
 @pytest.mark.slow
 def test_what_knows_closed_forms_only_refuses_it(cell: Cell) -> None:
     unsure = replace(cell.workcell, uncertainty=UNSURE)
-    with pytest.raises(SettingsError, match="face one another"):
+    with pytest.raises(SettingsError, match="opposite"):
         Polisher(CandidateEvaluator(unsure, ROBUST_OBJECTIVES), PolishSettings())
-    with pytest.raises(SettingsError, match="face one another"):
+    with pytest.raises(SettingsError, match="opposite"):
         RobustPath(cell.workcell)
 
 
@@ -129,16 +129,6 @@ def test_at_rest_both_pads_hold_half_of_the_crate() -> None:
         assert np.linalg.norm(force - along * normal) <= contact.friction * along
 
 
-def test_soft_fingers_need_more_but_hold_it_as_well() -> None:
-    workcell = load(CORNER)
-    even = replace(workcell, task=replace(workcell.task, allocation="soft-finger"))
-    still = np.zeros(6)
-    least, found = (call(load_function(cell), still, still, still) for cell in (workcell, even))
-    assert (found["normal_force"] >= least["normal_force"] * (1.0 - 1e-4)).all()
-    np.testing.assert_allclose(found["pressure_shift"], 0.0, atol=1e-9)
-    np.testing.assert_allclose(found["moment_residual"], 0.0, atol=1e-6)
-
-
 @pytest.mark.slow
 def test_compiled_passes_agree_with_the_independent_timing() -> None:
     """Where a program finds the contact forces, within a force limit that decides."""
@@ -154,16 +144,14 @@ def test_compiled_passes_agree_with_the_independent_timing() -> None:
 
 
 @pytest.mark.slow
-def test_only_the_joint_allocation_holds_a_load_to_one_side(tmp_path: Path) -> None:
+def test_pressing_harder_holds_a_load_to_one_side(tmp_path: Path) -> None:
     cell = shipped("uneven")
     carry = cell.carry(cell.initial)
     assert carry.judgement is not None
     assert carry.judgement.feasible
-    radius = cell.workcell.contacts[0].patch_radius
-    assert carry.peak_pressure_shift == pytest.approx([radius, radius], rel=1e-3)
-    assert np.abs(carry.moment_residual).max() < 1e-9
-    path = tmp_path / "paper.toml"
-    path.write_text(standing_text(UNEVEN).replace('allocation = "joint"\n', ""), encoding="utf-8")
+    assert np.abs(carry.moment_residual).max() < 1e-6
+    path, stated = tmp_path / "paper.toml", 'allocation = "soft-finger"\n'
+    path.write_text(standing_text(UNEVEN).replace(stated, ""), encoding="utf-8")
     paper = CandidateEvaluator(load(path)).carry(cell.initial)
     assert paper.judgement is not None
     assert paper.judgement.reason.startswith("pressure")

@@ -21,6 +21,7 @@ import hybrid_opt as ho
 from hybrid_opt.campaign import ExecutionSettings, Stage, open_folder, run_stages
 from hybrid_opt.campaign.results import read_campaign
 from hybrid_opt.errors import NoCarryError
+from hybrid_opt.evaluate.objectives import ROBUST_OBJECTIVES
 from hybrid_opt.indicators import metrics
 from hybrid_opt.progress import Progress
 from hybrid_opt.recommending.choice import Wish
@@ -378,10 +379,10 @@ def test_a_recommendation_alone_makes_nothing_else(
 def test_why_carries_are_not_polished_is_told(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    cell = tmp_path / "rack.toml"  # no file of a study, so that it ends here
-    joint = standing_text().replace("[task]", '[task]\ndrivable_allocation = "joint"')
-    cell.write_text(joint, "utf-8")
-    assert run.main([str(cell), "--output", str(tmp_path)]) == 2
+    cell = tmp_path / "fork.toml"  # no file of a study, so that it ends here
+    cell.write_text(standing_text(ROOT / "studies/workcells/fork.toml"), "utf-8")
+    robust = ["--objective", *ROBUST_OBJECTIVES]
+    assert run.main([str(cell), "--output", str(tmp_path), *robust]) == 2
     assert "are only searched, not polished: the polish does not" in capsys.readouterr().err
 
 

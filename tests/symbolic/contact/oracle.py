@@ -1,16 +1,9 @@
-"""Allocations as conic programs for clarabel, and grasps to try them on.
-
-A pressure on a disc that carries a wrench (N, T, q, M), scaled as `symbolic.contact.round_patch`
-does, exists where some z makes the Hermitian matrix [[N, q*, T*], [q, N, .], [T, z + i M, N]]
-positive semidefinite (q and T as complex numbers): it is the second moment of (1, x, f) over the
-pressure, x on the unit circle and f the direction of friction, of unit length, at x. On a rectangle
-it exists where forces at the corners, within their friction cones, carry the wrench.
-"""
+"""Contact forces as conic programs for clarabel, and grasps to try them on."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import casadi as ca
@@ -31,10 +24,8 @@ SOLVED = ("Solved", "AlmostSolved")
 
 def solved(
     squares: Any, cost: Array, blocks: Sequence[tuple[Any, Array, list[Any]]]
-) -> tuple[Array, float] | None:
-    """The least x . squares x / 2 + cost . x, and by how much what is minimised may be off: the
-    duality gap, and what the constraints miss times their multipliers (weak duality). None where
-    the solver gives up.
+) -> Array | None:
+    """The least x . squares x / 2 + cost . x; None where the solver gives up.
 
     Args:
         blocks: matrices, right sides and cones, in order: right - matrix x lies within.
@@ -49,97 +40,79 @@ def solved(
         upper = sparse.csc_matrix(sparse.triu(sparse.csc_matrix(squares)))
         found = clarabel.DefaultSolver(upper, cost, matrix, right, cones, options).solve()
         if str(found.status) in SOLVED:
-            x = np.array(found.x)
-            missed = np.abs(matrix @ x + np.array(found.s) - right)
-            gap = abs(found.obj_val - found.obj_val_dual)
-            return x, gap + float(np.abs(found.z) @ missed)
+            return np.array(found.x)
     return None
 
 
-def least_wrenches(
-    pads: tuple[Contact, ...], load: Array, normal_weights: Array | None = None
+def points_of(pad: Contact, radii: int = 8, around: int = 12) -> tuple[Array, Array]:
+    """(m, 2) points of a patch and the shares (m,) of the area that they stand for: as many rings
+    of a disc and points on each, or as many points along both sides of a rectangle."""
+    if pad.half_sides is not None:
+        along = (np.arange(around) + 0.5) / around * 2.0 - 1.0
+        points = np.array(np.meshgrid(*[half * along for half in pad.half_sides]))
+        return points.reshape(2, -1).T, np.full(around**2, around**-2.0)
+    angles = np.arange(around) + 0.5
+    r, angle = np.meshgrid((np.arange(radii) + 0.5) / radii, angles * 2.0 * np.pi / around)
+    at = np.stack([r * np.cos(angle), r * np.sin(angle)], axis=-1)
+    return pad.patch_radius * at.reshape(-1, 2), r.ravel() / r.sum()
+
+
+def area_of(pad: Contact) -> float:
+    if pad.half_sides is None:
+        return np.pi * pad.patch_radius**2
+    return 4.0 * pad.half_sides[0] * pad.half_sides[1]
+
+
+def least_on_grids(
+    pads: tuple[Contact, ...],
+    load: Array,
+    fork: bool = False,
+    normal_weights: Array | None = None,
 ) -> Array:
-    """(k, 6) forces and moments about the pads' centres, in their own axes, of least effort.
+    """(k, 6) as `wrenches`, of the least effort with friction at every point of a grid and pressure
+    that is the same all over each patch; on a fork also all over the first two.
 
     Args:
-        load: (6,) force and moment about the box frame's origin, box axes.
         normal_weights: (k,) for the least sum of so weighted normal forces in place of the effort.
-
-    Raises:
-        AssertionError: what the solver says does not hold.
     """
-    return least_within(pads, load, normal_weights)[0]
-
-
-def least_within(
-    pads: tuple[Contact, ...], load: Array, normal_weights: Array | None = None
-) -> tuple[Array, float]:
-    """The same, and by how much the least sum of normal forces may be off [N]."""
     size = float(np.linalg.norm(load[:3]) + 10.0 * np.linalg.norm(load[3:]))
-    # Forces may be a thousand times the load, where pads hardly close their grasp.
-    weights = normal_weights
-    tries = (_solve(pads, load, size * f, weights) for f in (1.0, 10.0, 100.0, 1000.0))
-    rough = next(found for found in tries if found is not None)[0]
-    found = _solve(pads, load, float(np.abs(rough[:, :3]).max()), weights)
-    assert found is not None
-    return found
-
-
-def _solve(
-    pads: tuple[Contact, ...], load: Array, size: float, normal_weights: Array | None
-) -> tuple[Array, float] | None:
-    """From a program whose unknowns are about one if forces are about `size`."""
-    ends = np.cumsum([0, *(12 if pad.half_sides else 7 for pad in pads)])
-    count, at = int(ends[-1]), 0
-    wrenches, blocks = np.zeros((len(pads), 6, count)), []
-    for i, pad in enumerate(pads):
-        at = int(ends[i])
-        if pad.half_sides:
-            x, y = pad.half_sides
-            for k, place in enumerate([(x, y), (-x, y), (-x, -y), (x, -y)]):
-                force = slice(at + 3 * k, at + 3 * k + 3)
-                wrenches[i, :, force] = np.vstack([np.eye(3), cross_matrix([*place, 0.0])])
-                rows = np.zeros((3, count))
-                rows[:, force] = np.roll(np.diag([1.0, 1.0, pad.friction]), 1, axis=0)
-                blocks.append((-rows, np.zeros(3), [clarabel.SecondOrderConeT(3)]))
-        else:
-            # A disc's moments in units of its radius, so that all unknowns are about as large.
-            wrenches[i, :, at : at + 6] = np.diag([1.0, 1.0, 1.0, *[pad.patch_radius] * 3])
-            rows = np.zeros((21, count))
-            rows[:, at : at + 7] = np.column_stack([disc(pad.friction, x) for x in np.eye(7)])
-            blocks.append((-rows, np.zeros(21), [clarabel.PSDTriangleConeT(6)]))
-    units = np.repeat([1.0, max(pad.patch_radius for pad in pads)], 3)
-    total = np.hstack([in_box(pad) for pad in pads]) @ wrenches.reshape(-1, count) / units[:, None]
-    asked = load / size / units
-    forces, cost = wrenches[:, :3].reshape(-1, count), np.zeros(count)
+    maps, cones = [], []
+    for pad in pads:
+        points, share = points_of(pad)
+        # Normal force, then the tangential force at every point over the normal force's share.
+        own = np.zeros((6, 1 + 2 * len(points)))
+        own[2, 0] = 1.0
+        own[0, 1::2] = own[1, 2::2] = share
+        own[5, 1::2], own[5, 2::2] = -share * points[:, 1], share * points[:, 0]
+        maps.append(own)
+        cone = np.zeros((len(points), 3, own.shape[1]))
+        cone[:, 0, 0] = pad.friction
+        cone[:, 1:, 1:] = np.kron(np.eye(len(points)), np.eye(2)).reshape(len(points), 2, -1)
+        cones.append(cone.reshape(-1, own.shape[1]))
+    # The pads' wrenches are unknowns of their own: the effort is theirs.
+    k, whole, cone = 6 * len(pads), sparse.block_diag(maps), sparse.block_diag(cones)
+    balance, asked = np.hstack([in_box(pad) for pad in pads]), load / size
+    if fork:
+        row = np.zeros(k)
+        row[[2, 8]] = 1.0 / area_of(pads[0]), -1.0 / area_of(pads[1])
+        balance, asked = np.vstack([balance, row]), np.append(asked, 0.0)
+    count, points = whole.shape[1], cone.shape[0] // 3
+    balanced = sparse.hstack([balance, sparse.csc_matrix((len(asked), count))])
+    blocks = [
+        (balanced, asked, [clarabel.ZeroConeT(len(asked))]),
+        (sparse.hstack([sparse.eye(k), -whole]), np.zeros(k), [clarabel.ZeroConeT(k)]),
+        (
+            sparse.hstack([sparse.csc_matrix((3 * points, k)), -cone]),
+            np.zeros(3 * points),
+            [clarabel.SecondOrderConeT(3)] * points,
+        ),
+    ]
+    squares, cost = np.tile([1.0, 1, 1, 0, 0, 0], len(pads)), np.zeros(k + count)
     if normal_weights is not None:
-        forces, cost = 0.0 * forces, normal_weights @ wrenches[:, 2]
-    found = solved(forces.T @ forces, cost, [(total, asked, [clarabel.ZeroConeT(6)]), *blocks])
-    if found is None:
-        return None
-    unknowns, unsure = found
-    missed, most = np.abs(total @ unknowns - asked).max(), float(np.abs(unknowns).max())
-    assert missed < 5e-7 * max(1.0, most) or normal_weights is not None
-    return size * wrenches @ unknowns, size * unsure
-
-
-def disc(mu: float, x: Array) -> Array:
-    """Scaled upper triangle (21,) of a disc's matrix, linear in force, moments over the radius, and
-    z (7,)."""
-    # A normal force N n at d turns about d x n = (d_y, -d_x).
-    q, t = complex(-x[4], x[3]), complex(x[0], x[1]) / mu
-    return scaled_triangle(x[2], q, t, x[6] + 1j * x[5] / mu)
-
-
-def scaled_triangle(n: float, q: complex, t: complex, beside: complex) -> Array:
-    """(21,) of the real (6, 6) form of the matrix above, as clarabel's cone has it."""
-    hermitian = np.array(
-        [[n, q.conjugate(), t.conjugate()], [q, n, beside.conjugate()], [t, beside, n]]
-    )
-    real = np.block([[hermitian.real, -hermitian.imag], [hermitian.imag, hermitian.real]])
-    return np.array(
-        [real[j, k] * (1.0 if j == k else np.sqrt(2.0)) for k in range(6) for j in range(k + 1)]
-    )
+        squares, cost[2:k:6] = 0.0 * squares, normal_weights
+    found = solved(sparse.diags([*squares, *np.zeros(count)]), cost, blocks)
+    assert found is not None
+    return size * found[:k].reshape(-1, 6)
 
 
 def cross_matrix(v: Array | list[float]) -> Array:
@@ -150,35 +123,6 @@ def in_box(pad: Contact) -> Array:
     """(6, 6) from a wrench about a pad's centre, in its axes, to one about the box frame."""
     R, p = pad.T_box_pad[:3, :3], pad.T_box_pad[:3, 3]
     return np.block([[R, np.zeros((3, 3))], [cross_matrix(p) @ R, R]])
-
-
-@dataclass(frozen=True)
-class Case:
-    """What two round pads that face one another have to carry; coordinates a, b, n of contact 1,
-    lengths in m.
-
-    Attributes:
-        force, moment: (3,) resultant and moment about the centre of mass.
-        arms: (2, 3) from the centre of mass to the nominal contact points.
-        friction, radius: (2,).
-    """
-
-    force: Array
-    moment: Array
-    arms: Array
-    friction: Array
-    radius: Array
-
-    def least(self, squeeze: bool = False) -> tuple[Array, float]:
-        """(2, 3) forces of least effort or N_1 + N_2, and by how much the latter may be off [N]."""
-        pads = []
-        for i, turn in enumerate((np.eye(3), np.diag([1.0, -1.0, -1.0]))):
-            T = np.eye(4)
-            T[:3, :3], T[:3, 3] = turn, self.arms[i]
-            pads.append(Contact(T, float(self.friction[i]), float(self.radius[i])))
-        load = np.concatenate([self.force, self.moment])
-        found, unsure = least_within((pads[0], pads[1]), load, np.ones(2) if squeeze else None)
-        return found[:, :3] * [[1.0, 1.0, 1.0], [1.0, -1.0, -1.0]], unsure
 
 
 # --- grasps ---

@@ -5,12 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 
 import casadi as ca
-import clarabel
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy import sparse
 from scipy.spatial.transform import Rotation
 
 from hybrid_opt.robust.cases import nominal_case
@@ -22,12 +20,13 @@ from symbolic.contact.worst_cases import case_squeeze_function
 from symbolic.records import Contact, Workcell
 from tests.symbolic.cells import hand_cell, with_contacts, with_task
 from tests.symbolic.contact.oracle import (
+    area_of,
     effort,
     function_of,
-    in_box,
+    least_on_grids,
+    points_of,
     random_grasp,
     random_load,
-    solved,
     wrenches,
 )
 
@@ -44,66 +43,6 @@ def even_cell() -> Workcell:
 
 
 # --- pads anywhere ---
-
-
-def points_of(pad: Contact, radii: int = 8, around: int = 12) -> tuple[Array, Array]:
-    """(m, 2) points of a patch and the shares (m,) of the area that they stand for: as many rings
-    of a disc and points on each, or as many points along both sides of a rectangle."""
-    if pad.half_sides is not None:
-        along = (np.arange(around) + 0.5) / around * 2.0 - 1.0
-        points = np.array(np.meshgrid(*[half * along for half in pad.half_sides]))
-        return points.reshape(2, -1).T, np.full(around**2, around**-2.0)
-    angles = np.arange(around) + 0.5
-    r, angle = np.meshgrid((np.arange(radii) + 0.5) / radii, angles * 2.0 * np.pi / around)
-    at = np.stack([r * np.cos(angle), r * np.sin(angle)], axis=-1)
-    return pad.patch_radius * at.reshape(-1, 2), r.ravel() / r.sum()
-
-
-def area_of(pad: Contact) -> float:
-    if pad.half_sides is None:
-        return np.pi * pad.patch_radius**2
-    return 4.0 * pad.half_sides[0] * pad.half_sides[1]
-
-
-def least_on_grids(pads: tuple[Contact, ...], load: Array, fork: bool = False) -> Array:
-    """(k, 6) as `wrenches`, of the least effort with friction at every point of a grid and pressure
-    that is the same all over each patch; on a fork also all over the first two."""
-    size = float(np.linalg.norm(load[:3]) + 10.0 * np.linalg.norm(load[3:]))
-    maps, cones = [], []
-    for pad in pads:
-        points, share = points_of(pad)
-        # Normal force, then the tangential force at every point over the normal force's share.
-        own = np.zeros((6, 1 + 2 * len(points)))
-        own[2, 0] = 1.0
-        own[0, 1::2] = own[1, 2::2] = share
-        own[5, 1::2], own[5, 2::2] = -share * points[:, 1], share * points[:, 0]
-        maps.append(own)
-        cone = np.zeros((len(points), 3, own.shape[1]))
-        cone[:, 0, 0] = pad.friction
-        cone[:, 1:, 1:] = np.kron(np.eye(len(points)), np.eye(2)).reshape(len(points), 2, -1)
-        cones.append(cone.reshape(-1, own.shape[1]))
-    # The pads' wrenches are unknowns of their own: the effort is theirs.
-    k, whole, cone = 6 * len(pads), sparse.block_diag(maps), sparse.block_diag(cones)
-    balance, asked = np.hstack([in_box(pad) for pad in pads]), load / size
-    if fork:
-        row = np.zeros(k)
-        row[[2, 8]] = 1.0 / area_of(pads[0]), -1.0 / area_of(pads[1])
-        balance, asked = np.vstack([balance, row]), np.append(asked, 0.0)
-    count, points = whole.shape[1], cone.shape[0] // 3
-    balanced = sparse.hstack([balance, sparse.csc_matrix((len(asked), count))])
-    blocks = [
-        (balanced, asked, [clarabel.ZeroConeT(len(asked))]),
-        (sparse.hstack([sparse.eye(k), -whole]), np.zeros(k), [clarabel.ZeroConeT(k)]),
-        (
-            sparse.hstack([sparse.csc_matrix((3 * points, k)), -cone]),
-            np.zeros(3 * points),
-            [clarabel.SecondOrderConeT(3)] * points,
-        ),
-    ]
-    squares = sparse.diags([*np.tile([1.0, 1, 1, 0, 0, 0], len(pads)), *np.zeros(count)])
-    found = solved(squares, np.zeros(k + count), blocks)
-    assert found is not None
-    return size * found[0][:k].reshape(-1, 6)
 
 
 @pytest.mark.parametrize("kinds", KINDS)

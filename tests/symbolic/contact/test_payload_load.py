@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import casadi as ca
 import clarabel
 import numpy as np
@@ -15,8 +13,9 @@ from codegen.lanes import lane_text
 from codegen.source import generated_c
 from studies.research.plain.motion import GRAVITY, angular_rates, rotation, sample_load
 from symbolic.array import Array
-from symbolic.contact.load import RESIDUAL_TOLERANCE, load_function
+from symbolic.contact.load import load_function
 from symbolic.contact.paper import allocate, normal_force_branches
+from symbolic.contact.soft_finger import SoftPatch, least_soft_squeeze
 from symbolic.contact.worst_cases import CASE_SIZE, case_squeeze_function
 from symbolic.records import Workcell
 from tests.symbolic.cells import (
@@ -27,7 +26,7 @@ from tests.symbolic.cells import (
     with_payload,
     with_task,
 )
-from tests.symbolic.contact.oracle import Case, least_wrenches, random_grasp, solved
+from tests.symbolic.contact.oracle import least_on_grids, random_grasp, solved
 
 
 def load(cell: Workcell, pose: Array, rate: Array, second: Array) -> dict[str, Array]:
@@ -176,7 +175,7 @@ def least_effort_forces(force: Array, normal: Array, mu: Array) -> tuple[Array, 
     blocks = [(balance, force, [clarabel.ZeroConeT(3)]), *cones]
     found = solved(2.0 * np.eye(6), np.zeros(6), blocks)
     assert found is not None
-    x = found[0]
+    x = found
     # The status alone is not trusted: what came out has to be a feasible pair of forces.
     assert np.abs(balance @ x - force).max() < 1e-7
     for cone in (cone_1, cone_2):
@@ -282,33 +281,26 @@ def box_load(cell: Workcell, motion: tuple[Array, Array, Array]) -> Array:
     return np.concatenate([R.T @ force, R.T @ (moment + np.cross(c, force))])
 
 
-def joint(cell: Workcell) -> Workcell:
-    return with_task(cell, allocation="joint")
+def even(cell: Workcell) -> Workcell:
+    return with_task(cell, allocation="soft-finger")
 
 
 @pytest.mark.parametrize(
     ("kinds", "count"),
-    [(None, 40), (("round", "rectangle"), 3), (("rectangle", "round", "rectangle"), 3)],
+    [(None, 20), (("round", "rectangle"), 2), (("rectangle", "round", "rectangle"), 2)],
 )
-def test_agrees_with_clarabel_and_balances_the_motion(
+def test_pads_that_press_evenly_balance_the_motion(
     kinds: tuple[str, ...] | None, count: int
 ) -> None:
-    rng, beyond = np.random.default_rng(7), 0
+    """With as much effort as points of friction all over the patches need."""
+    rng = np.random.default_rng(7)
     for _ in range(count):
-        cell = with_contacts(random_cell(rng), patch_radius=(0.008, 0.015))
-        motion = random_motion(rng)
-        beyond += bool((load(cell, *motion)["pressure_shift"] > [0.008, 0.015]).any())
-        cell = joint(random_grasp(rng, cell, kinds) if kinds else cell)
+        cell, motion = random_cell(rng), random_motion(rng)
+        cell = random_grasp(rng, even(cell), kinds) if kinds else even(cell)
         found, asked = load(cell, *motion), box_load(cell, motion)
-        expected = least_wrenches(cell.pads, asked)
-        own = [np.array(cell.pad_robots) == i for i in (0, 1)]
-        normal = [expected[pads, 2].sum() for pads in own]
-        tangential = [np.linalg.norm(expected[pads, :2], axis=1).sum() for pads in own]
-        size = np.abs(expected[:, :3]).max()
-        np.testing.assert_allclose(found["normal_force"], normal, atol=5e-3 * size)
-        np.testing.assert_allclose(found["tangential_force"], tangential, atol=5e-3 * size)
+        size = float(np.abs(found["contact_force"]).max())
         friction = np.array([contact.friction for contact in cell.contacts])
-        limit = friction * found["normal_force"] * (1.0 + 1e-12)
+        limit = friction * found["normal_force"] * (1.0 + 1e-9)
         assert (found["tangential_force"] <= limit).all()
         # Each robot's wrench about its first pad.
         R = rotation(motion[0][3:])
@@ -317,77 +309,17 @@ def test_agrees_with_clarabel_and_balances_the_motion(
             wrench = found[f"wrench_{i + 1}"]
             force, turning = R.T @ wrench[:3], R.T @ wrench[3:]
             total += np.concatenate([force, turning + np.cross(contact.T_box_pad[:3, 3], force)])
-        np.testing.assert_allclose(total, asked, atol=1e-8 * size)
-        np.testing.assert_allclose(found["moment_residual"], 0.0, atol=1e-8 * size)
+        np.testing.assert_allclose(total, asked, atol=1e-6 * size)
+        np.testing.assert_allclose(found["moment_residual"], 0.0, atol=1e-6 * size)
         forces = np.concatenate([found["wrench_1"][:3], found["wrench_2"][:3]])
         np.testing.assert_allclose(found["contact_force"], forces, atol=1e-12 * size)
-        if len(cell.pads) == 2:
-            effort = float(found["contact_force"] @ found["contact_force"])
-            assert effort == pytest.approx(float(np.sum(expected[:, :3] ** 2)), rel=1e-6)
-            radii = [contact.patch_radius for contact in cell.contacts]
-            assert (found["pressure_shift"] <= radii).all()
-    assert beyond >= count // 2
-
-
-@pytest.mark.parametrize("shape", ["round", "rectangle"])
-def test_opposite_pads_keep_the_papers_forces_where_their_patches_suffice(shape: str) -> None:
-    """Bit by bit; where a centre of pressure would leave its patch they press harder."""
-    rng, kept, pressed = np.random.default_rng(2), 0, 0
-    for _ in range(12):
-        paper_cell = random_cell(rng)
-        sides = (float(rng.uniform(0.005, 0.15)), float(rng.uniform(0.005, 0.15)))
-        radius = float(np.hypot(*sides)) if shape == "rectangle" else sides[0]
-        first, second = (
-            replace(c, patch_radius=radius, half_sides=sides if shape == "rectangle" else None)
-            for c in paper_cell.contacts
-        )
-        motion = random_motion(rng)
-        paper = load(paper_cell, *motion)
-        ours = load(joint(replace(paper_cell, contacts=(first, second))), *motion)
-        shifts = paper["shift_vector"].reshape(2, 3) @ rotation(motion[0][3:])
-        local = [s @ c.T_box_pad[:3, :2] for s, c in zip(shifts, (first, second), strict=True)]
-        if shape == "rectangle":
-            within = bool((np.abs(local) <= sides).all())
-        else:
-            within = bool((np.linalg.norm(local, axis=1) <= radius).all())
-        force = paper["contact_force"].reshape(2, 3).sum(axis=0)
-        left = float(np.linalg.norm(paper["moment_residual"]))
-        if within and left <= RESIDUAL_TOLERANCE * 0.4 * np.linalg.norm(force):
-            kept += 1
-            for name, value in paper.items():
-                np.testing.assert_array_equal(ours[name], value, err_msg=name)
-        else:
-            pressed += 1
-            efforts = [float(np.sum(each["contact_force"] ** 2)) for each in (paper, ours)]
-            assert efforts[1] >= (1.0 - 1e-12) * efforts[0]
-            assert ours["pressure_shift"].max() <= radius
-    assert min(kept, pressed) >= 2
-
-
-def test_a_moment_that_no_shift_carries_is_carried_by_torsion() -> None:
-    """In free fall nothing is tangential, so that the paper leaves a moment about the normal."""
-    cell = with_payload(ten_kilogram_cell(0.5), inertia=np.eye(3))
-    motion = np.zeros(6), np.zeros(6), np.array([0.0, 0.0, -9.81, 0.0, 1.0, 0.0])
-    assert np.linalg.norm(load(cell, *motion)["moment_residual"]) == pytest.approx(1.0)
-    result = load(joint(cell), *motion)
-    np.testing.assert_allclose(result["moment_residual"], 0.0, atol=1e-8)
-    # Both rims: 2 mu N r = 1 N m.
-    np.testing.assert_allclose(result["normal_force"], 1.0 / (2 * 0.5 * 0.0315), rtol=1e-6)
-
-
-def test_derivatives_pass_through_the_choice() -> None:
-    cell = with_contacts(joint(ten_kilogram_cell()), patch_radius=(0.01, 0.01))
-    cell = with_payload(cell, centre_of_mass=np.array([0.0, 0.05, 0.0]))
-    function = load_function(cell)
-    jacobian = function.factory("jacobian", function.name_in(), ["jac:normal_force:second_rate"])
-    motion = np.zeros(6), np.zeros(6), np.array([0.3, 0.2, 0.1, 0.0, 0.0, 0.0])
-    found = np.array(jacobian(*motion))
-    for k, step in enumerate(1e-4 * np.eye(6)):
-        ends = [
-            call(function, motion[0], motion[1], motion[2] + sign * step)["normal_force"]
-            for sign in (1.0, -1.0)
-        ]
-        np.testing.assert_allclose(found[:, k], (ends[0] - ends[1]) / 2e-4, atol=1e-4)
+        if kinds:
+            expected = least_on_grids(cell.pads, asked)
+            own = [np.array(cell.pad_robots) == i for i in (0, 1)]
+            normal = [expected[pads, 2].sum() for pads in own]
+            most = float(np.abs(expected[:, :3]).max())
+            np.testing.assert_allclose(found["normal_force"], normal, atol=0.05 * most)
+            np.testing.assert_allclose(found["pressure_shift"], 0.0, atol=1e-12)
 
 
 @pytest.mark.parametrize("kinds", [None, ("round", "rectangle")])
@@ -395,7 +327,7 @@ def test_runs_in_lanes(kinds: tuple[str, ...] | None) -> None:
     """A batch is evaluated side by side only if every construct of the function is known there."""
     cell = ten_kilogram_cell()
     cell = random_grasp(np.random.default_rng(1), cell, kinds) if kinds else cell
-    assert lane_text(generated_c([load_function(joint(cell))]), "load") is not None
+    assert lane_text(generated_c([load_function(even(cell))]), "load") is not None
 
 
 def test_squeezes_of_cases_agree_with_the_true_bodys_balance() -> None:
@@ -403,7 +335,7 @@ def test_squeezes_of_cases_agree_with_the_true_bodys_balance() -> None:
     rng = np.random.default_rng(11)
     for _ in range(40):
         cell, (pose, rate, second) = random_cell(rng), random_motion(rng)
-        friction, radius = rng.uniform(0.3, 1.2, 2), rng.uniform(0.005, 0.04, 2)
+        friction, radius = rng.uniform(0.3, 1.2, 2), np.full(2, np.nan)
         mass, disturbance = cell.payload.mass * rng.uniform(0.8, 1.2), rng.normal(size=3)
         centre = cell.payload.centre_of_mass + rng.normal(scale=0.01, size=3)
         displaced = rng.normal(scale=0.002, size=(2, 2))
@@ -418,9 +350,17 @@ def test_squeezes_of_cases_agree_with_the_true_bodys_balance() -> None:
         arms = (points - centre) @ R_box_pad
         arms[:, :2] += displaced
         to_pad = (rotation(pose[3:]) @ R_box_pad).T
-        expected, _ = Case(to_pad @ force, to_pad @ moment, arms, friction, radius).least(True)
+        patch_1, patch_2 = (SoftPatch.of(contact, R_box_pad) for contact in cell.contacts)
+        asked = ca.SX(to_pad @ force), ca.SX(to_pad @ moment)
+        held = least_soft_squeeze(
+            *asked,
+            (ca.SX(arms[0]), ca.SX(arms[1])),
+            ca.SX(friction),
+            (patch_1, patch_2),
+            offset=True,
+        )
+        expected = np.array(ca.evalf(held.normal)).ravel()
         case = np.concatenate([friction, radius, [mass], centre, disturbance, displaced.ravel()])
         case = np.append(case, np.zeros(CASE_SIZE - len(case)))  # pads press as commanded
         found = call(case_squeeze_function(cell), pose, rate, second, case)["normal_force"]
-        size = float(np.abs(expected[:, 2]).max())
-        assert found == pytest.approx(expected[:, 2] * [1.0, -1.0], abs=1e-6 * size)
+        np.testing.assert_allclose(found, expected, rtol=1e-9)

@@ -34,9 +34,9 @@ from tests.symbolic.read.samples import RACK, sample_data, write
 
 
 def cell(folder: Path, **changes: Any) -> Workcell:
-    """The sample cell under the joint allocation with other tables; `contacts` one per robot."""
+    """The sample cell held by soft fingers with other tables; `contacts` one per robot."""
     data = sample_data()
-    data["task"] |= {"allocation": "joint"} | changes.pop("task", {})
+    data["task"] |= {"allocation": "soft-finger"} | changes.pop("task", {})
     for name, value in changes.items():
         data[name] = value
     return load(write(folder, data))
@@ -130,12 +130,22 @@ def test_a_mesh(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("first", "allocation", "path", "words"),
     [
-        ({"normal": [0, 0, 0]}, "joint", "contacts[0].normal", "no direction"),
-        ({"xyz": [0, 0.9, 0], "normal": [0, -1, 0]}, "joint", "contacts[0].xyz", "a diagonal of"),
-        ({"patch_size": [0.1, 0.1]}, "joint", "contacts[0].patch_size", "beside"),
-        ({"further": [{"xyz": [0.05, 0.2, 0]}] * 3}, "joint", "contacts", "found 5 pads; allowed"),
-        ({"xyz": [0.15, 0, 0]}, "joint", "contacts", "do not close their grasp"),
-        ({"xyz": [0.15, 0, 0]}, "paper", "contacts[1].xyz", "'soft-finger' and 'joint' take any"),
+        ({"normal": [0, 0, 0]}, "soft-finger", "contacts[0].normal", "no direction"),
+        (
+            {"xyz": [0, 0.9, 0], "normal": [0, -1, 0]},
+            "soft-finger",
+            "contacts[0].xyz",
+            "a diagonal of",
+        ),
+        ({"patch_size": [0.1, 0.1]}, "soft-finger", "contacts[0].patch_size", "beside"),
+        (
+            {"further": [{"xyz": [0.05, 0.2, 0]}] * 3},
+            "soft-finger",
+            "contacts",
+            "found 5 pads; allowed",
+        ),
+        ({"xyz": [0.15, 0, 0]}, "soft-finger", "contacts", "do not close their grasp"),
+        ({"xyz": [0.15, 0, 0]}, "paper", "contacts[1].xyz", "'soft-finger' takes any"),
         ({"further": [{"xyz": [0.05, 0.2, 0]}]}, "paper", "contacts[1].xyz", "belongs to 3 pads"),
     ],
 )
@@ -280,9 +290,9 @@ def test_a_task_written_otherwise_is_refused() -> None:
     ("stated", "usual", "driven"),
     [
         ("", "paper", "soft-finger"),
-        ('allocation = "joint"\n', "joint", "joint"),
+        ('allocation = "soft-finger"\n', "soft-finger", "soft-finger"),
         ('drivable_allocation = "paper"\n', "paper", "paper"),
-        ('allocation = "joint"\ndrivable_allocation = "soft-finger"\n', "joint", "soft-finger"),
+        ('allocation = "soft-finger"\ndrivable_allocation = "paper"\n', "soft-finger", "paper"),
     ],
 )
 def test_what_robots_drive_has_an_allocation_of_its_own(

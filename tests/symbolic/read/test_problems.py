@@ -74,7 +74,13 @@ CASES: list[tuple[Any, ...]] = [
     ("uncertainty", {"pad_position": 0.04}, "less than 0.0315 m", "uncertainty.pad_position"),
     ("uncertainty", {"tilt": 2}, "this looks like deg", "uncertainty.tilt"),
     ("uncertainty", {"internal": 2.0}, "did you mean 'internal_force'", "uncertainty.internal"),
-    ("task.allocation", "conic", "allowed is one of 'paper', 'joint'"),
+    ("task.allocation", "conic", "allowed is one of 'paper', 'soft"),
+    (
+        "task.allocation",
+        "joint",
+        "no longer exists, because real pads need up to",
+    ),
+    ("task.drivable_allocation", "joint", "write 'soft-finger' and search, polish and time anew"),
     ("task.force_limit", [60.0, 50.0], "found 60 above 50"),
     ("task.time_law", "toppra", "allowed is one of 'constant', 'ramped'"),
     ("task.samples", 4, "found 4; allowed is a whole number 5 to"),
@@ -319,14 +325,15 @@ def test_further_checks_run_on_a_valid_cell_only(tmp_path: Path) -> None:
     assert len(seen) == 1
 
 
-def test_the_joint_allocation_asks_for_pads_that_face_one_another(tmp_path: Path) -> None:
-    """Of both radii of 31.5 mm, 0.9 are 56.7 mm."""
+def test_soft_fingers_ask_for_pads_that_nearly_face_one_another(tmp_path: Path) -> None:
+    """Of friction times the distance, 1.0 and 0.4 m, 0.9 are 0.36 m."""
     data = sample_data()
-    put(data, "task.allocation", "joint")
-    put(data, "contacts[1].xyz", [0.056, -0.20, 0.0])
-    assert load(write(tmp_path, data)).task.allocation == "joint"
-    put(data, "contacts[1].xyz", [0.058, -0.20, 0.0])
+    put(data, "payload.size", [0.9, 0.4, 0.25])
+    put(data, "task.allocation", "soft-finger")
+    put(data, "contacts[1].xyz", [0.35, -0.20, 0.0])
+    assert load(write(tmp_path, data)).task.allocation == "soft-finger"
+    put(data, "contacts[1].xyz", [0.37, -0.20, 0.0])
     (found,) = problems_of(write(tmp_path, data))
-    assert found.startswith("contacts[1].xyz: faces a point 0.058 m beside contacts[0]")
+    assert found.startswith("contacts[1].xyz: faces a point 0.37 m beside contacts[0]")
     put(data, "task.allocation", "paper")
     assert load(write(tmp_path, data)).task.allocation == "paper"

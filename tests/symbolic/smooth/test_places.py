@@ -259,7 +259,7 @@ def test_a_rounded_time_law_is_near_the_sharp_one_and_nearer_the_less_it_is_roun
 @pytest.mark.parametrize("rounding", [0.0, 0.02])
 @pytest.mark.parametrize(
     ("quantity", "allocation"),
-    [("force", "paper"), ("pressure", "paper"), ("load", "joint"), ("force", "soft-finger")],
+    [("force", "paper"), ("pressure", "paper"), ("load", "paper"), ("force", "soft-finger")],
 )
 @pytest.mark.parametrize("time_law", ["constant", "ramped"])
 def test_derivatives_are_those_of_the_values(
