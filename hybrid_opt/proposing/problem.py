@@ -92,16 +92,38 @@ class Problem:
         entries = self.data["contacts"]
         if all("xyz" in entry for entry in entries):
             return [{"xyz": entry["xyz"]} for entry in entries]
-        found = [robot.get("base", {}).get("xyz") for robot in self.data["robots"]]
-        known = all(isinstance(xyz, list) and len(xyz) == 3 for xyz in found)
-        bases = np.array(found, dtype=float) if known else None
-        if known and self.is_machine:
-            bases = shoulders(self._robots())
+        bases = self._bases
         start, goal = self.poses
         size = np.array(self.data["payload"]["size"], dtype=float)
         R_world_box = box_placement(self.orientation, start)[:3, :3]
         points = contact_points(size, np.array([start, goal]), R_world_box, bases)
         return [{"xyz": point} for point in points]
+
+    @cached_property
+    def _bases(self) -> Array | None:
+        """Positions (2, 3) of the robots' bases, of a machine those of its shoulders; None if the
+        file has none [m]."""
+        found = [robot.get("base", {}).get("xyz") for robot in self.data["robots"]]
+        if not all(isinstance(xyz, list) and len(xyz) == 3 for xyz in found):
+            return None
+        return shoulders(self._robots()) if self.is_machine else np.array(found, dtype=float)
+
+    def other_contacts(self) -> list[list[dict[str, Any]]]:
+        """Return the other pairs of faces that the pads may press, both ways round, the most
+        promising first: upright faces, then those that face the robots. None if the file names
+        points or has no bases."""
+        if self._bases is None or all("xyz" in entry for entry in self.data["contacts"]):
+            return []
+        R = box_placement(self.orientation, self.poses[0])[:3, :3]
+        size = np.array(self.data["payload"]["size"], dtype=float)
+        along = self._bases[0] - self._bases[1]
+        faces = [(axis, side) for axis in range(3) for side in (1.0, -1.0)]
+        faces.sort(
+            key=lambda face: (abs(R[2, face[0]]) > UPRIGHT, -face[1] * (along @ R[:, face[0]]))
+        )
+        points = [side * size[axis] / 2.0 * np.eye(3)[axis] for axis, side in faces]
+        pairs = [[{"xyz": (0.0 + s * p).tolist()} for s in (1.0, -1.0)] for p in points]
+        return [pair for pair in pairs if pair != self.contacts]
 
     def _robots(self) -> tuple[Robot, Robot]:
         """The robots alone, wherever the box is."""

@@ -49,6 +49,10 @@ ROUNDS = ((0, 4), (2000, 2), (6000, 6), (20000, 16), (60000, 24))
 """Configurations that the planner may look at for a path, 0 for straight motions alone, and how
 many pairs of holds get them."""
 
+OTHER_FACES = 20000
+"""Configurations for a path from which on other faces of the box are pressed too, if both arms can
+hold it by those that face them."""
+
 STRAYS = (
     Stray(0.0, 0.15, 0.8),
     Stray(0.0, 0.15, 0.3),
@@ -286,7 +290,11 @@ class _Search:
         self.begun = self.settings.clock()
         self._say("bases" if self.settings.bases else "ways to hold the box")
         spins = 2.0 * np.pi * np.arange(SPINS) / SPINS
-        choices = base_choices(self.problem, spins, self.rng) if self.settings.bases else [{}]
+        choices: list[dict[str, Any]] = [{}]
+        if self.settings.bases:
+            choices = base_choices(self.problem, spins, self.rng)
+        else:
+            choices += [{"contacts": pair} for pair in self.problem.other_contacts()]
         setups = [_Lazy(given, spins) for given in choices]
         found: list[Proposal] = []
         for effort, most in ROUNDS:
@@ -296,11 +304,16 @@ class _Search:
                     self._say(f"carry {len(found)} passes {one.passes}")
                     if len(found) == self.settings.classes:
                         return found
-                if self.too_late:
+                if self.too_late or (setup.setup and not self._takes_all(effort)):
                     break
         if not found:
             raise self._failed(setups)
         return found
+
+    def _takes_all(self, effort: int) -> bool:
+        """Return True if a round takes every choice: of bases each, of faces of the box only late
+        ones, as long as those that face the robots can be held."""
+        return self.settings.bases or effort >= OTHER_FACES
 
     def _round(self, lazy: _Lazy, effort: int, most: int) -> Iterator[Proposal]:
         """One round with one choice of bases."""
@@ -346,7 +359,9 @@ class _Search:
             )
         tried = next((lazy for lazy in setups if lazy.setup is not None), setups[0])
         if tried.setup is None and tried.problem:
-            return NoHoldError(f"{begin}: {tried.problem}")
+            more = len(setups) > 1 and not self.settings.bases
+            others = "; nor can it be held by any other pair of faces" if more else ""
+            return NoHoldError(f"{begin}: {tried.problem}{others}")
         met = "" if tried.setup is None else no_path(tried.setup.pairs, self.refusals)
         if self.too_late:
             more = f"{LONGER * self.settings.seconds:.0f}"

@@ -16,7 +16,9 @@ import pytest
 
 import hybrid_opt as ho
 from hybrid_opt.errors import NoHoldError, ProposalError
+from hybrid_opt.proposing import proposal as proposal_module
 from hybrid_opt.proposing import setup
+from hybrid_opt.proposing.problem import Problem
 from hybrid_opt.proposing.proposal import propose_classes, worked
 from symbolic.array import Array
 from symbolic.errors import SettingsError, WorkcellError
@@ -128,6 +130,37 @@ def test_what_is_out_of_reach_or_too_wide_is_told_before_any_work(
     with pytest.raises(NoHoldError, match=told):
         ho.propose(path, rng=np.random.default_rng(1))
     assert worked() - begun < 5.0  # measured: 0.4
+
+
+def test_every_pair_of_faces_is_tried_both_ways_round(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Those that face the robots first, top and bottom last."""
+    tried: list[Array] = []
+
+    def refuse(problem: Problem, given: dict[str, Any], *rest: object) -> None:
+        contacts = given.get("contacts", problem.contacts)
+        tried.append(np.array([contact["xyz"] for contact in contacts]))
+        raise ProposalError("cannot be held")
+
+    monkeypatch.setattr(proposal_module, "prepare", refuse)
+    path = rack_problem(tmp_path)
+    text = path.read_text(encoding="utf-8")
+    for point in ("0.0, 0.20, 0.055", "0.0, -0.20, 0.055"):
+        assert text.count(f"xyz = [{point}]\n") == 1
+        text = text.replace(f"xyz = [{point}]\n", "")
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(NoHoldError, match="nor can it be held by any other pair of faces"):
+        ho.propose(path, rng=np.random.default_rng(1))
+    assert len({pair.tobytes() for pair in tried}) == len(tried) == 6
+    size = load(RACK).payload.size
+    for pair in tried:
+        np.testing.assert_array_equal(pair[0], -pair[1])
+        assert np.abs(pair[0]).max() == pytest.approx(size[np.argmax(np.abs(pair[0]))] / 2.0)
+    axes = [int(np.argmax(np.abs(pair[0]))) for pair in tried]
+    assert axes[0] == 1
+    assert axes[-2:] == [2, 2]
+    assert tried[0][0][1] > 0.0, "the left robot stands at +y"
 
 
 def test_a_failure_for_lack_of_time_says_so_and_names_a_time_to_try(tmp_path: Path) -> None:
