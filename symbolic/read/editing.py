@@ -61,8 +61,8 @@ def with_paths(data: Mapping[str, Any], change: Callable[[str], str]) -> Changes
         arguments = robot.get("xacro_arguments")
         if isinstance(arguments, Mapping):
             paths = {k: v for k, v in arguments.items() if str(v).startswith(RELATIVE)}
-            moved = {key: f"./{path}" for key, path in changed(paths, *paths).items()}
-            entry |= {"xacro_arguments": moved} if moved else {}
+            others = {key: f"./{path}" for key, path in changed(paths, *paths).items()}
+            entry |= {"xacro_arguments": others} if others else {}
         folders = robot.get("package_dirs")
         if isinstance(folders, list):
             renamed = [change(str(name)) for name in folders]
