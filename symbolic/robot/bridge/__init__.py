@@ -77,9 +77,7 @@ def require_same_minor(built: dict[str, str], installed: dict[str, str]) -> None
         if installed[library].split(".")[:2] != version.split(".")[:2]
     ]
     if different:
-        raise BridgeError(
-            f"the Pinocchio-CasADi bridge does not fit: {'; '.join(different)}; {REMEDY}"
-        )
+        raise BridgeError(f"the compiled modules do not fit: {'; '.join(different)}; {REMEDY}")
 
 
 @cache
