@@ -32,7 +32,7 @@ from symbolic.errors import SettingsError
 from symbolic.geometry.pairs import CellGeometry
 from symbolic.path.pieces import same_paths, stated
 from symbolic.read.cell import changed, load
-from symbolic.read.cell_files import collect_cell, drivable_files, unpack_cell
+from symbolic.read.cell_files import CellFiles, collect_cell, drivable_files, unpack_cell
 from symbolic.records import Workcell
 from symbolic.records.task import initial_decision
 
@@ -101,6 +101,24 @@ class Cell:
         select_objectives(objectives)
         return cls(load(Path(path)), objectives, threads)
 
+    @classmethod
+    def of_files(
+        cls,
+        files: CellFiles,
+        objectives: Sequence[str | Objective] = PAPER_OBJECTIVES,
+        threads: int | None = None,
+    ) -> Cell:
+        """The cell of a workcell's files, which lie in a temporary folder that lasts as long as the
+        cell.
+
+        Raises:
+            SettingsError: an objective is unknown, or given twice.
+        """
+        folder = TemporaryDirectory()
+        cell = cls(unpack_cell(files, Path(folder.name)), objectives, threads)
+        cell._folder = folder
+        return cell
+
     def with_start_branches(self, branches: tuple[int, int]) -> Cell:
         """The cell with the start branches that its file says are searched for decided, read anew.
 
@@ -140,11 +158,8 @@ class Cell:
             BundleError: the workcell file cannot be changed, or was since it was read.
             SettingsError: an objective is unknown.
         """
-        folder = TemporaryDirectory()
-        workcell = unpack_cell(drivable_files(collect_cell(self.workcell)), Path(folder.name))
-        cell = Cell(workcell, self.force_kind.drivable, self._threads)
-        cell._folder = folder
-        return cell
+        files = drivable_files(collect_cell(self.workcell))
+        return Cell.of_files(files, self.force_kind.drivable, self._threads)
 
     @property
     def threads(self) -> int:

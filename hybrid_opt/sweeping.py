@@ -2,14 +2,13 @@
 
 Of each combination the carry that is recommended is asked for: the path of its neighbour, polished
 in the changed cell, or one path that stays as it is. Combinations that differ in the last key alone
-are neighbours: one worker goes through them. The path of the cell as it is takes part everywhere,
+are neighbours, computed one after the other. The path of the cell as it is takes part everywhere,
 so that a combination which hardly holds does not lead its neighbours astray.
 """
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import product
@@ -23,7 +22,6 @@ from hybrid_opt.carry import Carry
 from hybrid_opt.cell import Cell
 from hybrid_opt.door import polish
 from hybrid_opt.evaluate.evaluation import Evaluations
-from hybrid_opt.evaluate.objectives import Objective
 from hybrid_opt.front import Front
 from hybrid_opt.polishing.settings import DrivableSettings, PolishSettings
 from hybrid_opt.progress import ShowProgress, counted
@@ -36,11 +34,10 @@ from hybrid_opt.recommending.choice import (
     ranked,
 )
 from hybrid_opt.recommending.recommendation import recommend
-from hybrid_opt.store.files import from_json, read_record, to_json, write_json
-from hybrid_opt.work.service import Emit, LocalExecutor, Service, give_up
+from hybrid_opt.store.files import read_record, to_json, write_json
+from hybrid_opt.workers import LocalWorkers
 from symbolic.array import Array, Figure, Row
 from symbolic.errors import DualArmError, SettingsError
-from symbolic.records import Workcell
 
 POLISH = PolishSettings(attempts=8, drivable=DrivableSettings(first_rounds=12, members=4))
 """Polish of a path that was the best one of a nearby cell."""
@@ -155,74 +152,103 @@ def sweep(
             raise SettingsError(
                 f"{file} holds the sweep of another cell, or over other values: {_OTHER_FILE}"
             )
-    with counted(progress, "sweep", len(list(product(*values.values())))) as advance:
-        ledger = _Chains(known, file, advance)
-        context = partial(_context, cell.workcell, tuple(cell.objectives), known.x, fixed)
-        if len(ledger):
-            LocalExecutor(jobs).run(Service(context, _walk), ledger)
-    return ledger.sweep
+    chains = _Chains(known, file)
+    with counted(progress, "sweep", chains.size) as advance, LocalWorkers(jobs) as workers:
+        advance(len(chains.done))
+        call = partial(_next_row, _Request(cell, known.x, fixed, tuple(values)))
+
+        def store(index: int, row: Combination) -> None:
+            chains.store(row)
+            advance(1)
+
+        for column in chains.columns:
+            left = [(values, chains.near(values)) for values in chains.left(column)]
+            workers.map(call, left, store)
+    return chains.sweep
 
 
 class _Chains:
-    """A ledger: chains of combinations, each with those of it that are done."""
+    """Chains of combinations that differ in the last key alone, each with what is done of it.
 
-    def __init__(self, known: Sweep, file: Path | None, advance: Callable[[int], None]) -> None:
-        self.sweep, self._file, self._advance = known, file, advance
-        *outer, self._last = known.over.values()
-        self._done = {row.values: row for row in known.rows}
-        self._advance(len(self._done))
-        every = [tuple((*head, last) for last in self._last) for head in product(*outer)]
-        self._open = [chain for chain in every if not self._done.keys() >= set(chain)]
-        self._store()
+    Attributes:
+        sweep: its rows are what is done, in the order of the sweep.
+        size: combinations in all.
+        columns: values of the last key.
+        done: rows by their values.
+    """
 
-    def __len__(self) -> int:
-        return len(self._open)
+    def __init__(self, known: Sweep, file: Path | None) -> None:
+        self.sweep, self._file = known, file
+        *outer, self.columns = known.over.values()
+        self._heads = list(product(*outer))
+        self.size = len(self._heads) * len(self.columns)
+        self.done = {row.values: row for row in known.rows}
+        self._write()
 
-    def request(self, index: int) -> tuple[tuple[str, ...], tuple[Any, ...]]:
-        """The keys, and per combination of a chain its values or its row."""
-        chain = self._open[index]
-        return tuple(self.sweep.over), tuple(self._done.get(values, values) for values in chain)
+    def left(self, column: float) -> list[tuple[float, ...]]:
+        """Return the combinations with this value of the last key that are not done."""
+        every = [(*head, column) for head in self._heads]
+        return [values for values in every if values not in self.done]
 
-    def heard(self, index: int, message: bytes) -> None:
-        """Store a row."""
-        row = from_json(Combination, json.loads(message), "a worker", "run it again")
-        self._done[row.values] = row
-        self._advance(1)
-        self._store()
+    def near(self, values: tuple[float, ...]) -> Array | None:
+        """Return the carry of the nearest earlier combination of a chain that has one."""
+        *head, last = values
+        for value in reversed(self.columns[: self.columns.index(last)]):
+            if len(x := self.done[*head, value].x):
+                return x
+        return None
 
-    def answered(self, index: int, answer: None) -> None:
-        """All of its rows were told."""
+    def store(self, row: Combination) -> None:
+        """Take in a row, and write the file."""
+        self.done[row.values] = row
+        self._write()
 
-    def lost(self, index: int, reason: str) -> None:
-        """End the sweep; what is done is kept."""
-        give_up(reason)
-
-    def _store(self) -> None:
-        order = [values for values in product(*self.sweep.over.values()) if values in self._done]
-        rows = tuple(self._done[values] for values in order)
-        self.sweep = Sweep(self.sweep.about, self.sweep.over, self.sweep.x, rows)
+    def _write(self) -> None:
+        order = [values for values in product(*self.sweep.over.values()) if values in self.done]
+        rows = tuple(self.done[values] for values in order)
+        self.sweep = replace(self.sweep, rows=rows)
         if self._file is not None:
             write_json(self._file, to_json(self.sweep))
 
 
-def _context(
-    workcell: Workcell, objectives: tuple[str | Objective, ...], x: Array, fixed: bool
-) -> tuple[Cell, Array, bool]:
-    return Cell(workcell, objectives), x, fixed
+@dataclass(frozen=True)
+class _Request:
+    """What all combinations of a sweep share; the cell is loaded once in each process.
+
+    Attributes:
+        cell: as it is.
+        x: (n_var,) a good carry of it.
+        fixed: whether the path stays.
+        keys: of the combinations.
+    """
+
+    cell: Cell
+    x: Array
+    fixed: bool
+    keys: tuple[str, ...]
 
 
-def _walk(context: tuple[Cell, Array, bool], request: Any, emit: Emit) -> None:
-    """The rows of a chain, each from the one before it that has a carry."""
-    cell, x, fixed = context
-    keys, chain = request
-    near = [x]
-    for each in chain:
-        row = each
-        if not isinstance(row, Combination):
-            row = _row(cell, dict(zip(keys, each, strict=True)), near, fixed)
-            emit(json.dumps(to_json(row)).encode())
-        if len(row.x) and not fixed:
-            near = [x, row.x]
+_LOADED: dict[tuple[Any, ...], Cell] = {}
+"""The cell of the last sweep of this process."""
+
+
+def _loaded(cell: Cell) -> Cell:
+    """Return the cell that this process has loaded, where it is the same one."""
+    key = cell.workcell.digest, *cell.objectives
+    if key not in _LOADED:
+        _LOADED.clear()
+        _LOADED[key] = cell
+    return _LOADED[key]
+
+
+def _next_row(
+    request: _Request, combination: tuple[tuple[float, ...], Array | None]
+) -> Combination:
+    """Compute a row from the one before it that has a carry."""
+    numbers, near = combination
+    known = [request.x] if near is None or request.fixed else [request.x, near]
+    values = dict(zip(request.keys, numbers, strict=True))
+    return _row(_loaded(request.cell), values, known, request.fixed)
 
 
 def _row(

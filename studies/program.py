@@ -164,7 +164,7 @@ class Program:
 
 def _done(name: str, options: argparse.Namespace) -> int:
     """Import a function and do its work, the libraries in one thread; returns the exit code."""
-    from hybrid_opt.work.service import one_thread
+    from hybrid_opt.workers import one_thread
 
     module, _, function = name.rpartition(".")
     work = getattr(import_module(module), function)

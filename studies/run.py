@@ -15,7 +15,7 @@ from hybrid_opt.polishing.settings import (
     SOLVERS,
     PolishSettings,
 )
-from hybrid_opt.work.service import warm_up
+from hybrid_opt.workers import warm_up
 from studies.options import (
     QUICK_EVALUATIONS,
     QUICK_REPLICAS,

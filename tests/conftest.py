@@ -25,7 +25,7 @@ ROOMS = {
         "symbolic/functions/test_candidate.py",
     ),
     "process": (
-        *("faults", "hybrid_opt/work", "studies/programs", "studies/study"),
+        *("faults", "hybrid_opt/test_workers.py", "studies/programs", "studies/study"),
         *("fuzz/test_memory.py", "fuzz/test_programs.py", "hybrid_opt/campaign/test_search.py"),
         *("studies/test_program.py", "symbolic/read/test_xacro_file.py", "test_docs.py"),
     ),

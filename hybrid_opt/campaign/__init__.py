@@ -1,6 +1,6 @@
 """Campaigns: algorithms times replicas with equal budgets, stored so that nothing is lost."""
 
-from hybrid_opt.campaign.folder import CampaignFolder, ExecutionSettings, executor_for, open_folder
+from hybrid_opt.campaign.folder import CampaignFolder, ExecutionSettings, open_folder, workers_for
 from hybrid_opt.campaign.search_stage import search_stage
 from hybrid_opt.campaign.settings import CampaignSettings
 from hybrid_opt.campaign.stages import Stage, check_stages, run_stages
@@ -11,8 +11,8 @@ __all__ = [
     "ExecutionSettings",
     "Stage",
     "check_stages",
-    "executor_for",
     "open_folder",
     "run_stages",
     "search_stage",
+    "workers_for",
 ]

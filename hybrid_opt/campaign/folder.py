@@ -3,13 +3,12 @@ made from one workcell, with one set of settings and one version of the software
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import platform
 import shutil
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import version
@@ -26,6 +25,7 @@ from hybrid_opt.campaign.settings import (
     StoredCell,
 )
 from hybrid_opt.cell import Cell
+from hybrid_opt.cluster import DaskWorkers
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.store.files import (
     LOCK,
@@ -36,8 +36,7 @@ from hybrid_opt.store.files import (
     to_json,
     write_json,
 )
-from hybrid_opt.work.dask_cluster import DaskExecutor
-from hybrid_opt.work.service import Executor, LocalExecutor
+from hybrid_opt.workers import LocalWorkers, Workers
 from symbolic.array import Range, require_allowed
 from symbolic.errors import SettingsError
 from symbolic.outside import sync_folder
@@ -84,16 +83,16 @@ class ExecutionSettings:
             )
 
 
-def executor_for(execution: ExecutionSettings) -> Executor:
-    """The executor that the settings ask for."""
+def workers_for(execution: ExecutionSettings) -> Workers:
+    """Return the workers that the settings ask for; none is started yet."""
     if execution.executor == "dask":
         assert execution.scheduler is not None
-        return DaskExecutor(execution.scheduler, environment(), environment)
-    return LocalExecutor(execution.jobs)
+        return DaskWorkers(execution.scheduler, environment)
+    return LocalWorkers(execution.jobs)
 
 
 FORMAT = "dual-arm-carry campaign"
-VERSION = 1
+VERSION = 2
 
 _PACKAGES = ("casadi", "moocore", "numpy", "pin", "pymoo", "python-fcl", "scipy", "trimesh")
 
@@ -120,12 +119,6 @@ def configuration_of(settings: CampaignSettings, root: Path, workcell: Workcell)
     file = workcell.source.relative_to(root.resolve()).as_posix()
     cell = StoredCell(workcell.name, file, workcell.digest)
     return Configuration(FORMAT, VERSION, cell, settings, environment())
-
-
-def replica_identity(campaign: Any, algorithm: str, replica: int) -> bytes:
-    """32 bytes that identify one replica of a campaign."""
-    text = json.dumps([campaign, algorithm, replica], sort_keys=True)
-    return hashlib.sha256(text.encode()).digest()
 
 
 def require_equal(stored: Any, wanted: Mapping[str, Any], where: str) -> None:
@@ -167,6 +160,7 @@ class CampaignFolder:
         execution: how.
         cell: of the folder's own copy of the workcell, with the settings' objectives.
         files: the workcell's files.
+        workers: make the calls of its stages.
     """
 
     root: Path
@@ -174,6 +168,7 @@ class CampaignFolder:
     execution: ExecutionSettings
     cell: Cell
     files: CellFiles
+    workers: Workers
 
     @property
     def workcell(self) -> Workcell:
@@ -183,9 +178,16 @@ class CampaignFolder:
 
 @contextmanager
 def open_folder(
-    settings: CampaignSettings, execution: ExecutionSettings, workcell: Workcell
+    settings: CampaignSettings,
+    execution: ExecutionSettings,
+    workcell: Workcell,
+    workers: Workers | None = None,
 ) -> Iterator[CampaignFolder]:
     """Start or continue a campaign in its results folder, locked for the `with` block.
+
+    Args:
+        workers: make the calls of its stages; None for those of the execution, which end with the
+            `with` block.
 
     Raises:
         ResultsError: the folder is in use, holds something else, or is to be continued but was
@@ -195,7 +197,7 @@ def open_folder(
     files = collect_cell(workcell)
     with storing(root):
         root.mkdir(parents=True, exist_ok=True)
-    with locked(root):
+    with locked(root), ExitStack() as stack:
         require_usable(execution)
         if execution.overwrite:
             _clear(root)
@@ -213,7 +215,10 @@ def open_folder(
             write_json(root / CONFIGURATION, wanted)
         else:
             require_equal(stored, wanted, str(root))
-        yield CampaignFolder(root, settings, execution, Cell(copy, settings.objectives), files)
+        if workers is None:
+            workers = stack.enter_context(workers_for(execution))
+        cell = Cell(copy, settings.objectives)
+        yield CampaignFolder(root, settings, execution, cell, files, workers)
 
 
 def require_usable(execution: ExecutionSettings) -> None:

@@ -18,20 +18,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hybrid_opt.campaign.candidates import decode
 from hybrid_opt.campaign.folder import FORMAT, VERSION
-from hybrid_opt.campaign.journal import decode
 from hybrid_opt.campaign.settings import (
     CONFIGURATION,
-    DONE,
-    EVALUATIONS,
-    POLISH,
     RECOMMENDED,
     UNION,
     CampaignSettings,
     Configuration,
-    FinishedReplica,
-    polished_folder,
-    replica_folder,
+    polished_file,
+    replica_file,
 )
 from hybrid_opt.carry import Carry
 from hybrid_opt.cell import Cell
@@ -45,9 +41,7 @@ from hybrid_opt.store.files import (
     from_json,
     read_bytes,
     read_document,
-    read_record,
     record_of,
-    sha256,
 )
 from symbolic.array import Array, set_read_only
 from symbolic.read.cell import load as load_workcell
@@ -65,24 +59,21 @@ _record_of = lru_cache(maxsize=KEPT)(record_of)
 
 @dataclass(frozen=True)
 class Replica:
-    """A finished replica; arrays are read-only.
+    """A replica whose search is done; arrays are read-only.
 
     Attributes:
         algorithm: its name.
         replica: its number, from 0.
         evaluations: every candidate in the order of evaluation.
-        generation: (n,) the generation of each, from 1.
         seconds: what the search took.
     """
 
     algorithm: str
     replica: int
     evaluations: Evaluations
-    generation: NDArray[np.int64]
     seconds: float
 
     def __post_init__(self) -> None:
-        set_read_only(self)
         set_read_only(self.evaluations)
 
     @cached_property
@@ -259,40 +250,22 @@ def read_configuration(root: str | Path) -> Configuration:
     return from_json(Configuration, read_document(path, FORMAT, VERSION, remedy), path, remedy)
 
 
-def finished_replica(
-    root: Path, algorithm: str, number: int, names: Sequence[str]
-) -> tuple[FinishedReplica, tuple[bytes, ...]]:
-    """The record of a finished replica and the content of its files of these names.
+def read_replica(root: Path, algorithm: str, number: int, objectives: tuple[str, ...]) -> Replica:
+    """Read one replica whose search is done.
 
     Raises:
-        ResultsError: it is not finished, or one of these files is damaged.
+        ResultsError: it is not done, or its file is damaged.
     """
-    folder = replica_folder(root, algorithm, number)
-    if not (folder / DONE).exists():
+    path = replica_file(root, algorithm, number)
+    if not path.exists():
         raise ResultsError(
-            f"{folder}: {algorithm} replica {number} is not finished; continue the campaign with "
+            f"{path}: {algorithm} replica {number} is not finished; continue the campaign with "
             "--resume"
         )
-    marker = read_record(FinishedReplica, folder / DONE, ANEW)
-    contents = tuple(read_bytes(folder / name) for name in names)
-    for name, content in zip(names, contents, strict=True):
-        if marker.sha256.get(name) != sha256(content):
-            raise ResultsError(f"{folder / name}: damaged, its checksum differs; {ANEW}")
-    return marker, contents
-
-
-def read_replica(root: Path, algorithm: str, number: int, objectives: tuple[str, ...]) -> Replica:
-    """Read one finished replica.
-
-    Raises:
-        ResultsError: it is not finished, or a file is damaged.
-    """
-    marker, (content,) = finished_replica(root, algorithm, number, [EVALUATIONS])
-    path = replica_folder(root, algorithm, number) / EVALUATIONS
-    table = _decoded(content, path)
-    if table.objective_names != objectives:
-        raise ResultsError(f"{path}: holds other objectives than the campaign")
-    return Replica(algorithm, number, table.evaluations, table.generation, marker.seconds)
+    found = _decoded(read_bytes(path), path)
+    if found.objective_names != objectives:
+        raise ResultsError(f"{path}: holds other objectives than the campaign; {ANEW}")
+    return Replica(algorithm, number, found.evaluations, found.seconds)
 
 
 def is_whole(exists: bool, read: Callable[[], object]) -> bool:
@@ -318,7 +291,7 @@ def read_polished(root: Path, front: Front) -> PolishedFront | None:
     Raises:
         ResultsError: the file is damaged.
     """
-    path = polished_folder(root, *front.key) / POLISH
+    path = polished_file(root, *front.key)
     if not path.exists():
         return None
     found: PolishedFront = _record_of(PolishedFront, read_bytes(path), path, ANEW)

@@ -14,7 +14,7 @@ import numpy as np
 from hybrid_opt import metaheuristics
 from hybrid_opt.evaluate.objectives import PAPER_OBJECTIVES, select_objectives
 from hybrid_opt.metaheuristics.run import ConstraintHandling
-from symbolic.array import Count, Range, require_allowed
+from symbolic.array import Range, require_allowed
 from symbolic.errors import SettingsError
 
 FirstGeneration = Literal["initial", "random"]
@@ -145,24 +145,6 @@ class Configuration:
 
 
 @dataclass(frozen=True)
-class FinishedReplica:
-    """replica.json, written last: with it, a replica is done.
-
-    Attributes:
-        algorithm, replica: which one.
-        evaluations: candidates.
-        seconds: what the search took.
-        sha256: checksums of its files by name.
-    """
-
-    algorithm: str
-    replica: Count
-    evaluations: Count
-    seconds: Seconds
-    sha256: Mapping[str, str]
-
-
-@dataclass(frozen=True)
 class StageMark:
     """stages/NAME.json: how far a stage is, its own settings, and the time spent on it [s]."""
 
@@ -188,21 +170,15 @@ NO_RECOMMENDATION = "no-recommendation.json"
 SIMULATED = "simulated"
 HAND_MADE = "hand-made.json"
 
-EVALUATIONS = "evaluations.csv.gz"
-FRONT = "front.csv"
-DONE = "replica.json"
-JOURNAL = "journal.bin"
-POLISH = "polish.json"
-
 
 UNION = "union"
 """Name of the non-dominated candidates of all searches together, where others have an algorithm's:
 the one front of a drivable experiment that is polished."""
 
 
-def replica_folder(root: Path, algorithm: str, replica: int) -> Path:
-    """Folder of one replica, counted from 0."""
-    return root / REPLICAS / algorithm / f"{replica:02d}"
+def replica_file(root: Path, algorithm: str, replica: int) -> Path:
+    """Return the file of the candidates of one replica, counted from 0."""
+    return root / REPLICAS / algorithm / f"{replica:02d}.csv.gz"
 
 
 def selected_file(root: Path, algorithm: str, replica: int) -> Path:
@@ -210,9 +186,9 @@ def selected_file(root: Path, algorithm: str, replica: int) -> Path:
     return root / SELECTED / algorithm / f"{replica:02d}.json"
 
 
-def polished_folder(root: Path, algorithm: str, replica: int) -> Path:
-    """Folder of what the polish made of one replica's front."""
-    return root / POLISHED / algorithm / f"{replica:02d}"
+def polished_file(root: Path, algorithm: str, replica: int) -> Path:
+    """Return the file of the polished front of one replica, or of the `UNION`."""
+    return root / POLISHED / algorithm / f"{replica:02d}.json"
 
 
 def polished_selected_file(root: Path, algorithm: str, replica: int) -> Path:

@@ -15,11 +15,11 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import lru_cache, partial
 from importlib.metadata import version
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, TypeVar
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
@@ -47,8 +47,9 @@ from hybrid_opt.cell import Cell
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.evaluate.objectives import force_kind
 from hybrid_opt.job.plan import JobCollisions, JobModel
-from hybrid_opt.progress import Progress
-from hybrid_opt.store.files import read_record, to_json, write_json
+from hybrid_opt.progress import Progress, ShowProgress, passed_on
+from hybrid_opt.store.files import read_record, to_json, write_atomically, write_json
+from hybrid_opt.workers import one_thread
 from symbolic.errors import DualArmError
 from symbolic.read.cell import load
 from symbolic.read.cell_files import CellFiles, drivable_files, unpack_cell
@@ -173,7 +174,7 @@ def drivable_stage(stages: Sequence[Stage], replicas: int | None = None) -> Stag
         with TemporaryDirectory() as files:
             workcell = unpack_cell(drivable_files(folder.files), Path(files))
             settings = drivable_settings(folder.settings, replicas)
-            with open_folder(settings, execution, workcell) as inner:
+            with open_folder(settings, execution, workcell, folder.workers) as inner:
                 run_stages(inner, stages, Progress(progress.shown, DRIVABLE))
 
     inside = {stage.name: dict(stage.settings) for stage in stages}
@@ -224,6 +225,61 @@ def store_branches(root: Path, competition: BranchCompetition | None) -> str:
         return ""
     write_json(root / BRANCHES, to_json(competition))
     return f"{str(competition).capitalize()}.\n\n"
+
+
+Argument = TypeVar("Argument")
+ArgumentIn = TypeVar("ArgumentIn", contravariant=True)
+
+
+class ReplicaFunction(Protocol[ArgumentIn]):
+    """Computes the content of a replica's file in any process."""
+
+    def __call__(self, argument: ArgumentIn, progress: ShowProgress = False, /) -> bytes:
+        """Return the content; `progress` as in `hybrid_opt.search`."""
+
+
+def store_results(
+    folder: CampaignFolder,
+    progress: Progress,
+    stage: tuple[str, str, int],
+    function: ReplicaFunction[Argument],
+    left: Mapping[Path, Argument],
+    done: int,
+) -> None:
+    """Have the workers compute the files that are missing, and store each when it is done.
+
+    The only file of a stage is computed in this process, which sees its progress.
+
+    Args:
+        stage: title of the work, the unit of its progress, and units in each file.
+        function: returns the content of a file.
+        left: its argument for each file that is missing.
+        done: files that are there.
+    """
+    title, unit, each = stage
+    paths = list(left)
+    with progress.stage(title, (done + len(left)) * each, unit, done * each) as advance:
+
+        def store(index: int, content: bytes) -> None:
+            write_atomically(paths[index], content)
+            advance(each)
+
+        if done + len(left) == 1:
+            for path, argument in left.items():
+                with one_thread():
+                    content = function(argument, passed_on(advance))
+                write_atomically(path, content)
+        else:
+            folder.workers.map(function, list(left.values()), store)
+
+
+@lru_cache(maxsize=2)
+def loaded_cell(files: CellFiles, objectives: tuple[str, ...]) -> Cell:
+    """Return a cell with these files; a process remembers the last ones.
+
+    One thread evaluates its candidates: workers share the cores.
+    """
+    return Cell.of_files(files, objectives, threads=1)
 
 
 Made = TypeVar("Made")
@@ -277,8 +333,10 @@ def cells_of(files: CellFiles, objectives: tuple[str, ...], driven: bool) -> Cel
     return (own, (drivable_files(files), force_kind(objectives).drivable))
 
 
+@lru_cache(maxsize=1)
 def ready_cells(cells: Cells) -> tuple[ReadyCell, ...]:
-    """Load the cells' compiled functions, or build them where they are missing; in any process."""
+    """Load the cells' compiled functions, or build them where they are missing; in any process,
+    which remembers the last ones."""
     return tuple(with_cell(partial(ReadyCell.of, names), files) for files, names in cells)
 
 

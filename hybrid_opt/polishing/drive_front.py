@@ -109,8 +109,6 @@ class DriveRun(PolishRun[DriveAttempt]):
         settings: PolishSettings,
         recheck: Callable[[Array], str],
         archive: ParetoArchive,
-        recorded: list[PolishOutcome | FailedAttempt],
-        on_outcome: Callable[[PolishOutcome], None],
         on_progress: Callable[[int, int], None],
         paths: Array,
     ) -> None:
@@ -121,9 +119,7 @@ class DriveRun(PolishRun[DriveAttempt]):
                 `recheck_timing`.
             paths: (m, n_path) known paths that are not on the front.
         """
-        super().__init__(
-            drive_method.cell.evaluator, settings, archive, recorded, on_outcome, on_progress
-        )
+        super().__init__(drive_method.cell.evaluator, settings, archive, on_progress)
         self._most_attempts = MOST_DRIVE_ATTEMPTS
         self._method, self._recheck, task = drive_method, recheck, drive_method.cell.task
         self._n_path, self._range = task.n_path, drive_method.paths.force_limit

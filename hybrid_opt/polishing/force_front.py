@@ -35,7 +35,6 @@ from hybrid_opt.polishing.front import (
     LEAST_SPAN,
     OWN_SHARE,
     Attempt,
-    FailedAttempt,
     ParetoArchive,
     PolishRun,
 )
@@ -325,13 +324,9 @@ class ForceRun(PolishRun[ForceAttempt]):
         solver: ForceSolver,
         settings: PolishSettings,
         archive: ParetoArchive,
-        recorded: list[PolishOutcome | FailedAttempt],
-        on_outcome: Callable[[PolishOutcome], None],
         on_progress: Callable[[int, int], None],
     ) -> None:
-        super().__init__(
-            solver.cell.evaluator, settings, archive, recorded, on_outcome, on_progress
-        )
+        super().__init__(solver.cell.evaluator, settings, archive, on_progress)
         self._solver, self._mirror = solver, mirror_of(solver.cell.workcell)
         self._tried: set[tuple[int | None, bytes]] = set()
         self._stalls: dict[int | None, int] = {0: 0, 1: 0, None: 0}

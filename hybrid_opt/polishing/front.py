@@ -91,11 +91,7 @@ class ParetoArchive:
 
 @dataclass(frozen=True)
 class FailedAttempt:
-    """An attempt without a solution; reason: killed, timeout, or an exception's message.
-
-    Exceptions are caught here. The owner of the process notices crashes and hangs
-    (`hybrid_opt.work`) and continues after them.
-    """
+    """An attempt without a solution; reason: an exception's message."""
 
     reason: str
 
@@ -130,12 +126,10 @@ class PolishRun(ABC, Generic[AnyAttempt]):
         evaluator: CandidateEvaluator,
         settings: PolishSettings,
         archive: ParetoArchive,
-        recorded: list[PolishOutcome | FailedAttempt],
-        on_outcome: Callable[[PolishOutcome], None],
         on_progress: Callable[[int, int], None],
     ) -> None:
         self._evaluator, self._settings = evaluator, settings
-        self._archive, self._recorded, self._on_outcome = archive, recorded, on_outcome
+        self._archive = archive
         self.outcomes: list[PolishOutcome] = []
         self._most_attempts, self._expected, self._on_progress = settings.attempts, 0, on_progress
 
@@ -156,18 +150,11 @@ class PolishRun(ABC, Generic[AnyAttempt]):
         self._on_progress(len(self.outcomes), len(self.outcomes) + attempts)
 
     def _process(self, attempts: list[AnyAttempt]) -> None:
-        """Solve, evaluate and record attempts; recorded ones are not solved again."""
+        """Solve, evaluate and record attempts."""
         for attempt in attempts[: max(0, self._attempts_left())]:
-            known = self._recorded.pop(0) if self._recorded else None
-            if isinstance(known, PolishOutcome):
-                self._record(attempt, known)
-            else:
-                begin = time.perf_counter()
-                answer = known or self._solve_guarded(attempt)
-                outcome = self._outcome(attempt, answer, begin)
-                self._record(attempt, outcome)
-                if known is None:
-                    self._on_outcome(outcome)
+            begin = time.perf_counter()
+            answer = self._solve_guarded(attempt)
+            self._record(attempt, self._outcome(attempt, answer, begin))
             self._announce(max(self._expected - 1, 0))
 
     def _solve_guarded(self, attempt: AnyAttempt) -> Solution | FailedAttempt:
@@ -257,7 +244,7 @@ class PolishRun(ABC, Generic[AnyAttempt]):
 def use_one_thread() -> None:
     """Limit IPOPT's BLAS to one thread, so that it does not spin on cores of other workers: its
     matrices are too small for threads. It is loaded with the first solve, too late for
-    `hybrid_opt.work.service.one_thread`."""
+    `hybrid_opt.workers.one_thread`."""
     for library in Path(casadi.__file__).parent.glob("*openblas*.so*"):
         with suppress(OSError, AttributeError):
             ctypes.CDLL(str(library)).openblas_set_num_threads(1)

@@ -15,11 +15,11 @@ from hybrid_opt.polishing.drive import DriveStepMethod
 from hybrid_opt.polishing.drive_front import DriveRun, recheck_timing
 from hybrid_opt.polishing.force import ForceSolver
 from hybrid_opt.polishing.force_front import ForceRun
-from hybrid_opt.polishing.front import FailedAttempt, ParetoArchive, PolishRun
-from hybrid_opt.polishing.records import PolishedFront, PolishOutcome
+from hybrid_opt.polishing.front import ParetoArchive, PolishRun
+from hybrid_opt.polishing.records import PolishedFront
 from hybrid_opt.polishing.settings import PolishSettings
 from hybrid_opt.timing.model import TimingModel
-from hybrid_opt.work.service import one_thread
+from hybrid_opt.workers import one_thread
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.records.cell import Workcell
@@ -72,7 +72,6 @@ class Polisher:
             self.solver = ForceSolver(cell, settings)
             return
         self.drive_method = DriveStepMethod(cell)
-        # At once: the cell's files may be there only for as long as this is made.
         self._timings = TimingModel(evaluator.compiled, self.drive_method.driver.timer.intervals)
 
     def recheck(self, x: Array) -> str:
@@ -85,8 +84,6 @@ class Polisher:
         self,
         front_x: Array,
         rng: np.random.Generator,
-        recorded: Sequence[PolishOutcome | FailedAttempt] = (),
-        on_outcome: Callable[[PolishOutcome], None] = lambda outcome: None,
         paths: Array | None = None,
         on_progress: Callable[[int, int], None] = lambda done, total: None,
     ) -> PolishedFront:
@@ -95,9 +92,6 @@ class Polisher:
         Args:
             front_x: (k, n_var) decision vectors; k may be 0.
             rng: draws the starts of attempts at the balanced middle.
-            recorded: outcomes of an earlier, interrupted polish of the same front, which are not
-                repeated; `FailedAttempt` for an attempt that ended its process.
-            on_outcome: receives each new outcome.
             paths: (m, n_path) known good free waypoints, not necessarily on the front; only the
                 polish of drivable carries uses them. None for none.
             on_progress: receives attempts done, and the expected total.
@@ -109,7 +103,7 @@ class Polisher:
         feasible = np.flatnonzero(found.feasible)
         archive = ParetoArchive(x[feasible], found.objectives[feasible], feasible.tolist())
         known = np.empty((0, self.evaluator.workcell.task.n_path)) if paths is None else paths
-        given = archive, list(recorded), on_outcome, on_progress
+        given = archive, on_progress
         run: PolishRun[Any]
         if self.solver is not None:
             run = ForceRun(self.solver, self.settings, *given)
@@ -127,9 +121,7 @@ class Polisher:
             parent=np.array([archive.parent[k] for k in rows], dtype=np.int64),
             polished=np.array([archive.polished[k] for k in rows], dtype=bool),
             outcomes=tuple(run.outcomes),
-            seconds=time.perf_counter()
-            - begin
-            + sum(o.seconds for o in recorded if isinstance(o, PolishOutcome)),
+            seconds=time.perf_counter() - begin,
             evaluation_seconds=unit,
             solver="quadratic" if self.solver is None else self.settings.solver,
         )

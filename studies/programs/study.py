@@ -12,7 +12,6 @@ from hybrid_opt.campaign import (
     ExecutionSettings,
     Stage,
     check_stages,
-    executor_for,
     open_folder,
     run_stages,
     search_stage,
@@ -131,7 +130,7 @@ def report_stage(with_paper: bool, pdf: bool) -> Stage:
         # Drawing libraries are heavy: they are imported when something is drawn.
         from studies.report.generate import make_report
 
-        make_report(folder.root, settings, progress, executor_for(folder.execution))
+        make_report(folder.root, settings, progress, folder.workers)
 
     return Stage("report", run, settings)
 

@@ -17,7 +17,7 @@ from hybrid_opt.recommending.recommendation import recommend
 from hybrid_opt.store.files import to_json
 from hybrid_opt.store.trajectory_file import read_trajectory
 from hybrid_opt.sweeping import Sweep, require_keys, stored_sweep, sweep
-from hybrid_opt.work.service import warm_up
+from hybrid_opt.workers import warm_up
 from studies.program import load_workcell
 from studies.report.drawing import (
     in_style,

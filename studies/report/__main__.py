@@ -31,7 +31,7 @@ def _run(options: argparse.Namespace) -> int:
     from hybrid_opt.campaign.settings import STAGES
     from hybrid_opt.progress import Progress
     from hybrid_opt.store.files import read_json
-    from hybrid_opt.work.service import LocalExecutor, warm_up
+    from hybrid_opt.workers import LocalWorkers, warm_up
 
     if options.into:
         from studies.report.generate import insert_tables
@@ -50,7 +50,8 @@ def _run(options: argparse.Namespace) -> int:
         made = stored.get("settings", {}) if isinstance(stored, dict) else {}
         pdf = options.pdf or bool(made.get("pdf", True))
         settings = {"with_paper": bool(made.get("with_paper")), "pdf": pdf}
-        make_report(options.results, settings, Progress(not options.quiet), LocalExecutor(0))
+        with LocalWorkers(0) as workers:
+            make_report(options.results, settings, Progress(not options.quiet), workers)
         print(f"Report: {options.results / 'report.html'}")
     return 0
 

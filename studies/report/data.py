@@ -14,7 +14,7 @@ import numpy as np
 from hybrid_opt.branches import BranchCompetition
 from hybrid_opt.campaign.results import CampaignResults, read_campaign
 from hybrid_opt.campaign.settings import CONFIGURATION, HAND_MADE, RECOMMENDED, SUMMARY, UNION
-from hybrid_opt.campaign.stages import ReadyCell, cells_of, read_branches, ready_cells
+from hybrid_opt.campaign.stages import Cells, ReadyCell, cells_of, read_branches, ready_cells
 from hybrid_opt.display.table import Table
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
@@ -31,7 +31,7 @@ from hybrid_opt.recommending.recommendation import level_force
 from hybrid_opt.store.trajectory_file import read_trajectory
 from hybrid_opt.timing.analysis import TimingDocument, read_timing
 from hybrid_opt.timing.records import TimingLimits
-from hybrid_opt.work.service import Executor, LocalExecutor, Service, answer_all, called
+from hybrid_opt.workers import LocalWorkers, Workers
 from studies.report.drawing import RECOMMENDED as RECOMMENDED_LOOK
 from studies.report.drawing import DrawnCarry, LineStyle, series
 from studies.report.page_carries import RECOMMENDED_LABEL, DrawnJob, drawn_job, recommended_job
@@ -233,12 +233,12 @@ class ReportData(Experiment):
         return None
 
 
-def gather(results: CampaignResults, executor: Executor | None = None) -> ReportData:
+def gather(results: CampaignResults, workers: Workers | None = None) -> ReportData:
     """Evaluate what is drawn in detail.
 
     Args:
         results: of a finished study.
-        executor: who does what takes long, None for this process.
+        workers: make the calls that take long, None for this process.
 
     Raises:
         ResultsError: the folder is not complete or damaged.
@@ -274,8 +274,7 @@ def gather(results: CampaignResults, executor: Executor | None = None) -> Report
     alone = results.workcell.task.time_law == "optimal"
     # Jobs are what robots are told: by the cell that they drive.
     cells = cells_of(first.files, results.objectives, alone)
-    service: Service[Any, Any, Any] = Service(partial(ready_cells, cells), called)
-    reach, *jobs = answer_all(executor or LocalExecutor(), service, calls)
+    reach, *jobs = (workers or LocalWorkers()).map(partial(_call, cells), calls)
     return ReportData(
         **vars(first),
         root=results.root,
@@ -345,6 +344,10 @@ def _titles(results: CampaignResults) -> tuple[str, ...]:
     for i, robot in enumerate(results.workcell.robots):
         titles = [title.replace(f"robot {i + 1}", robot.name) for title in titles]
     return tuple(titles)
+
+
+def _call(cells: Cells, call: Callable[[Sequence[ReadyCell]], Any]) -> Any:
+    return call(ready_cells(cells))
 
 
 def _reach(geometry: CellGeometry, _: Sequence[ReadyCell]) -> ReachMap:

@@ -14,9 +14,10 @@ import html
 import inspect
 import json
 import math
+import pickle
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from functools import partial
+from functools import lru_cache, partial
 from importlib.resources import files
 from io import BytesIO
 from pathlib import Path
@@ -33,7 +34,7 @@ from hybrid_opt.progress import Progress
 from hybrid_opt.robust.squeeze import PADS
 from hybrid_opt.store.files import to_json, write_atomically
 from hybrid_opt.timing.analysis import TimingDocument, stored_timing
-from hybrid_opt.work.service import Executor, LocalExecutor, Service, answer_all, called
+from hybrid_opt.workers import LocalWorkers, Workers
 from studies.program import ReportError
 from studies.report import PAGE, PICTURES, TABLES, pictures_carry, pictures_cell, pictures_fronts
 from studies.report.data import ReportData, gather
@@ -140,15 +141,15 @@ def _search_pictures(data: ReportData) -> Iterator[ReportPicture]:
 
 
 def make_report(
-    root: Path, settings: Mapping[str, bool], progress: Progress, executor: Executor
+    root: Path, settings: Mapping[str, bool], progress: Progress, workers: Workers
 ) -> None:
     """Write the report of a results folder; settings as `write_report` has them.
 
     Raises:
         DualArmError: the folder is not complete, or cannot be written.
     """
-    data = gather(read_campaign(root), executor)
-    write_report(root, data, **settings, progress=progress, executor=executor)
+    data = gather(read_campaign(root), workers)
+    write_report(root, data, **settings, progress=progress, workers=workers)
 
 
 def write_report(
@@ -157,7 +158,7 @@ def write_report(
     with_paper: bool,
     pdf: bool = True,
     progress: Progress | None = None,
-    executor: Executor | None = None,
+    workers: Workers | None = None,
 ) -> None:
     """Write all files of the report.
 
@@ -165,18 +166,16 @@ def write_report(
         with_paper: whether figures that the paper states of its rack stand beside ours.
         pdf: whether pictures are also written as PDF, which takes as long as to draw them.
         progress: where to show it.
-        executor: who draws, None for this process.
+        workers: draw, None for this process.
 
     Raises:
         ResultsError: the folder cannot be written.
     """
     pictures = _listed(data)
-    service: Service[Any, Any, dict[str, bytes]] = Service(partial(_listed, data), called)
-    calls = [partial(_drawn, k, pdf) for k in range(len(pictures))]
+    draw = partial(_drawn, pickle.dumps(data), pdf)
     progress = progress or Progress(shown=False)
     with progress.stage("report", len(pictures) + 1, "pictures") as advance:
-        workers = executor or LocalExecutor()
-        drawn = answer_all(workers, service, calls, lambda *_: advance(1))
+        drawn = (workers or LocalWorkers()).map(draw, range(len(pictures)), lambda *_: advance(1))
         for picture, made in zip(pictures, drawn, strict=True):
             for suffix, content in made.items():
                 write_atomically(root / PICTURES / f"{picture.name}.{suffix}", content)
@@ -188,7 +187,7 @@ def write_report(
         shown = zip(pictures, drawn, strict=True)
         page = render_page(
             data,
-            page_document(data, executor),
+            page_document(data, workers),
             "".join(table.html() for table in tables),
             "".join(_picture(made["png"], picture.caption) for picture, made in shown),
         )
@@ -245,9 +244,14 @@ def _listed(data: ReportData) -> list[ReportPicture]:
     return list(report_pictures(data))
 
 
-def _drawn(index: int, pdf: bool, pictures: list[ReportPicture]) -> dict[str, bytes]:
-    """Draw a picture; returns its files by suffix."""
-    return files_of(pictures[index].draw(), pdf)
+def _drawn(data: bytes, pdf: bool, index: int) -> dict[str, bytes]:
+    """Draw a picture of pickled data; returns its files by suffix."""
+    return files_of(_unpickled(data)[index].draw(), pdf)
+
+
+@lru_cache(maxsize=1)
+def _unpickled(data: bytes) -> list[ReportPicture]:
+    return _listed(pickle.loads(data))
 
 
 def render_page(data: ReportData, document: dict[str, Any], tables: str, pictures: str) -> str:

@@ -24,7 +24,6 @@ from hybrid_opt.timing.analysis import drivable_timing
 from hybrid_opt.timing.records import JerkLimits, Timing, TimingLimits
 from hybrid_opt.timing.robustness import Margin, robustness_margins
 from hybrid_opt.timing.solve import time_path
-from hybrid_opt.work.service import Emit
 from symbolic.array import Array
 from symbolic.errors import DualArmError
 from symbolic.path.pieces import same_paths
@@ -262,9 +261,7 @@ def _rounded(values: Array, digits: int) -> list[float]:
     return [round(value, digits) for value in values.tolist()]
 
 
-def page_trajectory(
-    cells: Sequence[ReadyCell], shown: PageTrajectory, emit: Emit | None = None
-) -> dict[str, Any]:
+def page_trajectory(cells: Sequence[ReadyCell], shown: PageTrajectory) -> dict[str, Any]:
     """A trajectory of the page as JSON values: its motions, and all that is said of it.
 
     Args:

@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from hybrid_opt.campaign.stages import cells_of, ready_cells
+from hybrid_opt.campaign.stages import Cells, cells_of, ready_cells
 from hybrid_opt.display.scene import packed, scene_data
-from hybrid_opt.work.service import Executor, LocalExecutor, Service, answer_all
+from hybrid_opt.workers import LocalWorkers, Workers
 from studies.report.data import Experiment, ReportData
 from studies.report.drawing import ARMS, MARKED, DrawnCarry, LineStyle
 from studies.report.page_carries import (
@@ -266,19 +266,19 @@ Numbered = tuple[Group, list[int]]
 """A group and the numbers of its trajectories on the page."""
 
 
-def page_document(data: ReportData, executor: Executor | None = None) -> dict[str, Any]:
-    """The page's data as JSON values; without an executor this process works them out."""
+def page_document(data: ReportData, workers: Workers | None = None) -> dict[str, Any]:
+    """Return the page's data as JSON values; without workers this process computes them."""
     # Where the cell itself is drivable there is one experiment.
     cells = [] if data.alone else [(data.files, data.objectives)]
     drive, search = list[Group](), [] if data.alone else list(_search_groups(data))
     if data.drivable is not None:
         drive = list(_drive_groups(data, data.drivable, len(cells)))
         cells.append((data.drivable.files, data.drivable.objectives))
-        ready = partial(ready_cells, tuple(cells))
+        every: Cells = tuple(cells)
     else:
-        ready = partial(ready_cells, cells_of(data.files, data.objectives, data.alone))
+        every = cells_of(data.files, data.objectives, data.alone)
     shown = [one for group in (*drive, *search) for one in group.shown]
-    found = answer_all(executor or LocalExecutor(), Service(ready, page_trajectory), shown)
+    found = (workers or LocalWorkers()).map(partial(_trajectory, every), shown)
     numbers = count()
     numbered = [(group, [next(numbers) for _ in group.shown]) for group in (*drive, *search)]
     views = []
@@ -304,6 +304,10 @@ def page_document(data: ReportData, executor: Executor | None = None) -> dict[st
         ],
         **scene_data(data.geometry, data.carries[-1].timed),
     }
+
+
+def _trajectory(cells: Cells, shown: PageTrajectory) -> dict[str, Any]:
+    return page_trajectory(ready_cells(cells), shown)
 
 
 def _drive_groups(data: ReportData, drivable: Experiment, cell: int) -> Iterator[Group]:

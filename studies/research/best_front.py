@@ -7,20 +7,23 @@ import itertools
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
-from hybrid_opt.campaign.polish_stage import polisher_source
+from hybrid_opt.campaign.stages import loaded_cell
+from hybrid_opt.door import polish
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.evaluate.objectives import PAPER_OBJECTIVES
+from hybrid_opt.front import Front
 from hybrid_opt.indicators import metrics
-from hybrid_opt.polishing.polisher import Polisher
+from hybrid_opt.polishing.front import use_one_thread
 from hybrid_opt.polishing.records import PolishedFront
 from hybrid_opt.polishing.settings import FillSettings, PolishSettings
 from hybrid_opt.store.files import AGAIN, read_bytes, write_atomically
-from hybrid_opt.work.service import Emit, LocalExecutor, Service, answer_all
+from hybrid_opt.workers import LocalWorkers
 from studies.program import load_workcell
 from symbolic import outside
 from symbolic.array import Array
@@ -83,31 +86,28 @@ def compute_reference_front(
     begins = [initial_decision(evaluator.workcell.task), *candidates[feasible[:starts]]]
     cell = collect_cell(evaluator.workcell)
     count = itertools.count(1)
-    executor = LocalExecutor(jobs)
-    parts = answer_all(
-        executor,
-        _polish_service(cell, ATTEMPTS, FillSettings(attempts=0)),
-        list(zip([start[None] for start in begins], rng.spawn(len(begins)), strict=True)),
-        lambda *_: tell(f"start {next(count)} of {len(begins)}"),
-    )
+    first = PolishSettings(attempts=ATTEMPTS, rounds=ROUNDS, fill=FillSettings(attempts=0))
+    with LocalWorkers(jobs) as workers:
+        parts = workers.map(
+            partial(_polished, cell, first),
+            list(zip([start[None] for start in begins], rng.spawn(len(begins)), strict=True)),
+            lambda *_: tell(f"start {next(count)} of {len(begins)}"),
+        )
     union = np.concatenate([part.x for part in parts])
-    (front,) = answer_all(executor, _polish_service(cell, attempts, FillSettings()), [(union, rng)])
+    front = _polished(cell, PolishSettings(attempts=attempts, rounds=ROUNDS), (union, rng))
     tell(f"reference front: {len(front.x)} points")
     return ReferenceFront(evaluator.workcell.digest, front.objectives, front.x)
 
 
-def _polish_service(
-    cell: CellFiles, attempts: int, fill: FillSettings
-) -> Service[Polisher, tuple[Array, np.random.Generator], PolishedFront]:
-    settings = PolishSettings(attempts=attempts, rounds=ROUNDS, fill=fill)
-    source = polisher_source(cell, PAPER_OBJECTIVES, settings)
-    return Service(source, _polished)
-
-
 def _polished(
-    polisher: Polisher, request: tuple[Array, np.random.Generator], emit: Emit
+    files: CellFiles, settings: PolishSettings, start: tuple[Array, np.random.Generator]
 ) -> PolishedFront:
-    return polisher.polish(*request)
+    x, rng = start
+    use_one_thread()
+    front = Front.of(loaded_cell(files, PAPER_OBJECTIVES), x)
+    done = polish(front, rng=rng, settings=settings).polished
+    assert done is not None
+    return done
 
 
 def encode(front: ReferenceFront, command: str) -> bytes:

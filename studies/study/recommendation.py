@@ -5,9 +5,8 @@ from __future__ import annotations
 
 import math
 import shlex
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -49,13 +48,6 @@ from hybrid_opt.store.files import read_record, to_json, write_json
 from hybrid_opt.store.trajectory_file import write_trajectory
 from hybrid_opt.timing.jerk import applicable_jerk_limits
 from hybrid_opt.timing.robustness import Margin
-from hybrid_opt.work.service import (
-    LocalExecutor,
-    Service,
-    answer_all,
-    called,
-    nothing,
-)
 from symbolic.array import Array, Count, Figure, Pair
 from symbolic.path.pieces import same_paths
 from symbolic.records import Task, Workcell
@@ -171,23 +163,17 @@ class NoRecommendation:
     reason: str
 
 
-_Call = Callable[[None], StoredRecommendation | NoRecommendation]
-
-
 def recommendation_stage(wish: ho.Wish) -> Stage:
     """The stage that writes `recommended.json`, a trajectory file, and `recommendation.json`, or
     `no-recommendation.json`."""
 
     def run(folder: CampaignFolder, progress: Progress) -> None:
-        # In as many threads as there are workers, which wait meanwhile; the worker itself shows the
-        # progress: it alone knows how much there is to do.
-        call: _Call = partial(_recommended, folder.root, wish, progress, folder.execution.jobs)
-        service: Service[None, _Call, StoredRecommendation | NoRecommendation]
-        service = Service(nothing, called)
-        # A worker here, where the folder is: its libraries are loaded already, which takes this
-        # process a second.
-        apart = folder.execution.jobs != 1 and folder.execution.executor == "processes"
-        (found,) = answer_all(LocalExecutor(apart=apart), service, [call])
+        found: StoredRecommendation | NoRecommendation
+        try:
+            path, threads = folder.root / RECOMMENDED, folder.execution.jobs
+            found = recommend_from(folder.root, wish, path, progress, threads)
+        except NoCarryError as error:
+            found = NoRecommendation(str(error))
         none = isinstance(found, NoRecommendation)
         written, other = (NO_RECOMMENDATION, RECOMMENDATION)[:: 1 if none else -1]
         # Also after an earlier attempt that was interrupted.
@@ -195,15 +181,6 @@ def recommendation_stage(wish: ho.Wish) -> Stage:
         write_json(folder.root / written, to_json(found))
 
     return Stage("recommendation", run, to_json(wish))
-
-
-def _recommended(
-    root: Path, wish: ho.Wish, progress: Progress, threads: int, _: None
-) -> StoredRecommendation | NoRecommendation:
-    try:
-        return recommend_from(root, wish, root / RECOMMENDED, progress, threads)
-    except NoCarryError as error:
-        return NoRecommendation(str(error))
 
 
 def read_recommendation(root: Path) -> StoredRecommendation | NoRecommendation | None:

@@ -12,7 +12,7 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from hybrid_opt.campaign import CampaignFolder, Stage, executor_for
+from hybrid_opt.campaign import CampaignFolder, Stage
 from hybrid_opt.campaign.settings import (
     POLISHED_SUFFIX,
     RECOMMENDED,
@@ -21,7 +21,7 @@ from hybrid_opt.campaign.settings import (
     UNION,
     polished_selected_file,
 )
-from hybrid_opt.campaign.stages import ReadyCell, cells_of, ready_cells
+from hybrid_opt.campaign.stages import Cells, cells_of, ready_cells
 from hybrid_opt.display.table import Table, number
 from hybrid_opt.errors import ResultsError, WitnessError
 from hybrid_opt.metaheuristics.registry import title
@@ -37,7 +37,6 @@ from hybrid_opt.timing.analysis import (
 from hybrid_opt.timing.records import TimingStatus
 from hybrid_opt.witness.arms import Account, CellWitness, account_of
 from hybrid_opt.witness.reference import Control, driven_carry
-from hybrid_opt.work.service import Emit, Service, answer_all, nothing
 from studies.study.recommendation import StoredRecommendation
 from studies.study.summary import read_summary
 from symbolic.array import Array, Figure, Row, Shape, evenly
@@ -193,7 +192,7 @@ def _run(folder: CampaignFolder, progress: Progress) -> None:
             write_json(_file(folder.root, left[index].name), to_json(answer))
             advance(1)
 
-        answer_all(executor_for(folder.execution), Service(nothing, _simulated), left, answered)
+        folder.workers.map(_simulated, left, answered)
 
 
 def _file(root: Path, name: str) -> Path:
@@ -225,7 +224,7 @@ def wanted_carries(root: Path) -> list[SimulationRequest]:
     ]
 
 
-def _simulated(_: None, one: SimulationRequest, emit: Emit) -> StoredSimulation:
+def _simulated(one: SimulationRequest) -> StoredSimulation:
     whose = (one.label, one.digest, CONTROL)
     with TemporaryDirectory() as folder:
         cell = one.trajectory.open_cell(Path(folder))
@@ -270,18 +269,19 @@ def timing_stage(force_limit: float | None = None, curves: bool = True) -> Stage
             for f in files
         ]
         driven = folder.workcell.task.time_law == "optimal"
-        source = partial(ready_cells, cells_of(folder.files, folder.settings.objectives, driven))
+        cells = cells_of(folder.files, folder.settings.objectives, driven)
         with progress.stage(TIMING, len(requests), "trajectories") as advance:
-            workers = executor_for(folder.execution)
-            found = answer_all(workers, Service(source, _document), requests, lambda *_: advance(1))
+            call = partial(_document, cells)
+            found = folder.workers.map(call, requests, lambda *_: advance(1))
         for file, document in zip(files, found, strict=True):
             write_json(folder.root / TIMING / file, to_json(document))
 
     return Stage(TIMING, run, {"force_limit": force_limit})
 
 
-def _document(cells: tuple[ReadyCell, ...], request: Request, emit: Emit) -> TimingDocument:
-    own, driven = cells[0].jobs.timing, cells[-1].jobs.timing
+def _document(cells: Cells, request: Request) -> TimingDocument:
+    ready = ready_cells(cells)
+    own, driven = ready[0].jobs.timing, ready[-1].jobs.timing
     return timing_document(time_trajectory(driven, *request, own=own))
 
 

@@ -64,6 +64,9 @@ class CellFiles:
     folders: tuple[str, ...]
     digest: str
 
+    def __hash__(self) -> int:
+        return hash(self.digest)
+
 
 def collect_cell(workcell: Workcell) -> CellFiles:
     """Collect the files of a workcell that was read with `symbolic.read.cell.load`.

@@ -12,7 +12,6 @@ from pathlib import Path
 import pytest
 
 from hybrid_opt.bundles.bundle import read_manifest, write_bundle
-from hybrid_opt.campaign.journal import Journal
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.store.files import read_json, sha256, write_atomically, write_json
 from hybrid_opt.store.trajectory_file import read_trajectory, write_trajectory
@@ -63,15 +62,6 @@ def fill(disk: Path) -> None:
 Writer = Callable[[Path], None]
 
 
-def _append(path: Path) -> None:
-    journal = Journal(path, b"i" * 32)
-    try:
-        for _ in range(100):
-            journal.append(b"\0" * 8192)
-    finally:
-        journal.close()
-
-
 def _trajectory(path: Path) -> None:
     write_trajectory(path, rack_cell(), rack_cell().task.initial.ravel(), {"duration": 1.0}, {})
 
@@ -83,7 +73,6 @@ def _bundle(path: Path) -> None:
 WRITERS: dict[str, Writer] = {
     "content": lambda path: write_atomically(path, b"x" * 500_000),
     "json": lambda path: write_json(path, ["x" * 500_000]),
-    "journal": _append,
     "trajectory": _trajectory,
     "bundle": _bundle,
 }

@@ -7,6 +7,7 @@ of a worker.
 
 from __future__ import annotations
 
+import gzip
 import json
 import os
 import random
@@ -140,12 +141,15 @@ def linger(seconds: float, stage: str, output: Path, process: subprocess.Popen[b
 
 
 def contents(root: Path) -> dict[str, Any]:
-    """Every file of a results folder; of JSON the values, without times."""
+    """Every file of a results folder; of JSON the values and of candidates the lines, without
+    times."""
     found: dict[str, Any] = {}
     for path in sorted(root.rglob("*")):
         name = path.relative_to(root).as_posix()
         if path.is_file() and not any(part.startswith(".") for part in name.split("/")):
             content = path.read_bytes()
+            if path.suffix == ".gz":
+                content = gzip.decompress(content).partition(b"\n")[2]
             found[name] = _timeless(json.loads(content)) if path.suffix == ".json" else content
     return found
 

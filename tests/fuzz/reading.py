@@ -14,9 +14,8 @@ import numpy as np
 
 from codegen.cache import Cache
 from hybrid_opt.bundles.bundle import read_manifest
-from hybrid_opt.campaign.journal import Journal, decode
+from hybrid_opt.campaign.candidates import decode
 from hybrid_opt.campaign.results import read_configuration
-from hybrid_opt.campaign.settings import FinishedReplica
 from hybrid_opt.polishing.records import PolishedFront
 from hybrid_opt.store.files import read_bytes, read_record
 from hybrid_opt.store.trajectory_file import read_trajectory
@@ -33,10 +32,8 @@ READERS: dict[str, Callable[[Path], Any]] = {
     **dict.fromkeys([f"m.{kind}" for kind in FORMATS], lambda path: read_mesh(path, np.ones(3))),
     "trajectory.json": read_trajectory,
     "configuration.json": lambda path: read_configuration(path.parent),
-    "replica.json": lambda path: read_record(FinishedReplica, path, ""),
     "polish.json": lambda path: read_record(PolishedFront, path, ""),
     "candidates.csv.gz": lambda path: decode(read_bytes(path), path),
-    "journal.bin": lambda path: Journal(path, bytes(32)),
     "manifest.json": lambda path: read_manifest(path.parent),
     "front.csv": read_reference_front,
     "key.json": lambda path: Cache(path.parent).find(path.stem),

@@ -9,13 +9,12 @@ import os
 import struct
 import subprocess
 import sys
-import zlib
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from hybrid_opt.campaign.journal import columns
+from hybrid_opt.campaign.candidates import columns
 from symbolic.outside import MEBIBYTE, MESH_BYTES, MOST_VALUES, URDF_BYTES, WORKCELL_BYTES
 from symbolic.read.descriptions import MEMORY_BYTES, MEMORY_PER_BYTE
 from symbolic.read.elements import MOST_ATTRIBUTES
@@ -36,25 +35,19 @@ LISTED = (
 PAIR = b"<disable_collisions link1='%d' link2='b'/>"
 POINT = b',{"objectives":[0,0],"parent":0,"polished":true,"x":[0,0]}'
 POINTS_END = b'],"figures":{},"attempts":[]}'
-REPLICA = b'{"algorithm": "a", "replica": 0, "evaluations": 1, "seconds": 1, "sha256": {"a": "a"'
 MANIFEST = b'{"format": "dual-arm-carry bundle", "version": 1, "files": {"a": "a"'
 
 
 def packed(n_var: int, rows: int) -> bytes:
     """Candidates of zeros, which pack a thousand times smaller."""
     names = columns(n_var, ("a", "b"))
-    zeros = ",".join(["0"] * (len(names) - 4))
+    zeros = ",".join(["0"] * (len(names) - 3))
     content = io.BytesIO()
     with gzip.open(content, "wb", 6) as file:
-        file.write((",".join(names) + "\n").encode())
+        file.write(("# seconds: 1.0\n" + ",".join(names) + "\n").encode())
         for row in range(1, rows + 1):
-            file.write(f"{row},1,1,,{zeros}\n".encode())
+            file.write(f"{row},1,,{zeros}\n".encode())
     return content.getvalue()
-
-
-def journal(*payloads: bytes, times: int = 1) -> bytes:
-    blocks = (struct.pack("<II", len(one), zlib.crc32(one)) + one for one in payloads)
-    return b"DACARRY1" + b"\0" * 32 + b"".join(blocks) * times
 
 
 WORDS = {kind: 2 * most - 100 for kind, most in MOST_WORDS.items()}
@@ -86,7 +79,6 @@ NAMED: dict[str, tuple[str, bytes, bytes, bytes, int]] = {
     "links": ("arm.urdf", b"<robot>", b"<link name='%d'/>", b"</robot>", 99_000),
     "pairs": ("arm.srdf", b"<robot>", PAIR, b"</robot>", 99_000),
     "configuration": ("configuration.json", b'{"a": 0', b', "%d": []', b"}", MOST_VALUES // 3),
-    "checksums": ("replica.json", REPLICA, b', "%d": "a"', b"}}", MOST_VALUES - 10),
     "manifest": ("manifest.json", MANIFEST, b', "%d": "a"', b"}}", MOST_VALUES - 10),
 }
 """The same with how many pieces there are, which have a number each."""
@@ -96,8 +88,6 @@ OTHERS: dict[str, tuple[str, Callable[[], bytes]]] = {
     "candidates": ("candidates.csv.gz", lambda: packed(18, 1_000_000)),
     "wide candidates": ("candidates.csv.gz", lambda: packed(3000, 8000)),
     "one long line": ("candidates.csv.gz", lambda: gzip.compress(b"a" * 2**29)),
-    "many blocks": ("journal.bin", lambda: journal(bytes(12), times=2_000_000)),
-    "one block": ("journal.bin", lambda: journal(bytes(100 * MEBIBYTE))),
 }
 ALWAYS = ("robots", "attributes", "corners")
 

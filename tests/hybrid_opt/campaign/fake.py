@@ -20,8 +20,11 @@ from hybrid_opt.campaign import (
     run_stages,
     search_stage,
 )
+from hybrid_opt.campaign.candidates import EvaluatedCandidates, encode
+from hybrid_opt.campaign.search_stage import SearchRequest
 from hybrid_opt.evaluate.evaluation import FEASIBLE, REASONS, Evaluations
-from hybrid_opt.progress import Progress
+from hybrid_opt.metaheuristics.run import SearchSettings, search_carries
+from hybrid_opt.progress import Progress, ShowProgress
 from symbolic.array import Array
 from symbolic.errors import DualArmError
 from symbolic.read.cell import load
@@ -78,7 +81,7 @@ class FakeEvaluator:
 
 @dataclass(frozen=True)
 class FakeSource:
-    """Makes fake evaluators.
+    """Searches the fake problem as a campaign searches a cell.
 
     delay: seconds per call. log: file that every evaluated x is appended to. An evaluator kills
     its process after dies_at evaluations, if it always_dies or if the file dies_once is missing,
@@ -92,8 +95,16 @@ class FakeSource:
     always_dies: bool = False
     dies_beyond: int = 0
 
-    def __call__(self) -> FakeEvaluator:
-        return FakeEvaluator(self)
+    def __call__(self, request: SearchRequest, progress: ShowProgress = False, /) -> bytes:
+        settings, name = request.settings, request.algorithm
+        found = search_carries(
+            FakeEvaluator(self),
+            name,
+            settings.evaluations,
+            settings.replica_rng(name, request.replica),
+            SearchSettings(settings.algorithms[name], settings.constraint_handling),
+        )
+        return encode(EvaluatedCandidates(found[0], OBJECTIVES, 0.0))
 
     def must_die(self) -> bool:
         if self.dies_once and not Path(self.dies_once).exists():
@@ -125,11 +136,10 @@ def run_search(
 
 
 def files_of(root: Path) -> dict[str, bytes]:
-    """The results of all replicas by path, without what depends on time."""
+    """The results of all replicas by path."""
     return {
         path.relative_to(root).as_posix(): path.read_bytes()
-        for pattern in ("evaluations.csv.gz", "front.csv")
-        for path in sorted(root.glob(f"replicas/*/*/{pattern}"))
+        for path in sorted(root.glob("replicas/*/*.csv.gz"))
     }
 
 

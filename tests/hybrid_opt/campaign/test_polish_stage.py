@@ -19,21 +19,20 @@ from hybrid_opt.campaign import (
     run_stages,
     search_stage,
 )
-from hybrid_opt.campaign.journal import Journal, ReplicaRequest
-from hybrid_opt.campaign.polish_stage import PolishLedger, polish_replica, polish_stage
+from hybrid_opt.campaign import polish_stage as stage
+from hybrid_opt.campaign.polish_stage import PolishRequest, polish_front, polish_stage
 from hybrid_opt.campaign.results import read_campaign, read_polished
-from hybrid_opt.campaign.settings import JOURNAL, POLISH, polished_folder
-from hybrid_opt.errors import DamagedResultsWarning, ResultsError, WorkerError
+from hybrid_opt.campaign.settings import polished_file
+from hybrid_opt.errors import DamagedResultsWarning, ResultsError
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.indicators import metrics
-from hybrid_opt.polishing.polisher import Polisher
 from hybrid_opt.polishing.records import PolishedFront, PolishOutcome
 from hybrid_opt.polishing.settings import FillSettings, PolishSettings, ProbeSettings
 from hybrid_opt.polishing.solvers.base import Residuals
 from hybrid_opt.progress import Progress
 from hybrid_opt.store.files import from_json, to_json
-from symbolic.array import Array
 from symbolic.read.cell import load
+from symbolic.read.cell_files import collect_cell
 from tests.symbolic.cells import RACK
 
 SETTINGS = CampaignSettings(algorithms={"nsga2": {}}, evaluations=200, replicas=1, seed=5)
@@ -74,39 +73,22 @@ def test_a_polished_front_is_feasible_certified_and_better(finished: Path) -> No
     assert POLISHED.attempts + probes < polished.effort.attempts <= most
     assert 0.0 < polished.effort.widest_gap < 1.0
     assert polished.effort.equivalent_evaluations > 0
-    assert not (polished_folder(finished, "nsga2", 0) / JOURNAL).exists()
 
 
-def test_a_lost_solve_costs_one_attempt_however_many_were_made(
-    finished: Path, tmp_path: Path
-) -> None:
-    shutil.copytree(finished, tmp_path / "again")
-    (polished_folder(tmp_path / "again", "nsga2", 0) / POLISH).unlink()
-    execution = ExecutionSettings(tmp_path / "again", jobs=1, resume=True)
-    with open_folder(SETTINGS, execution, load(RACK)) as folder:
-        ledger = PolishLedger(folder, POLISHED, None)
-        for _ in range(2 * POLISHED.attempts):
-            ledger.heard(0, b"an attempt")
-        for _ in range(POLISHED.attempts - 1):
-            ledger.lost(0, "crashed")
-        with pytest.raises(WorkerError, match="given up"):
-            ledger.lost(0, "crashed")
-        ledger.close()
-
-
-def test_a_polisher_is_given_the_paths_that_are_known_beside(
+def test_a_polish_is_given_the_paths_that_are_known_beside(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    paths, seen = np.arange(36.0).reshape(2, 18), list[Any]()
+    paths, seen = tuple(np.arange(36.0).reshape(2, 18)), list[Any]()
 
-    def polish(self: Polisher, front_x: Array, *_: object, **options: Any) -> PolishedFront:
+    def polish(front: object, **options: Any) -> None:
         seen.append(options["paths"])
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(Polisher, "polish", polish)
-    request = ReplicaRequest(SETTINGS, "nsga2", 0, np.empty((0, 18)), (), paths)
+    monkeypatch.setattr(stage, "polish", polish)
+    files, x = collect_cell(load(RACK)), np.empty((0, 18))
+    request = PolishRequest(files, SETTINGS, POLISHED, "nsga2", 0, x, paths)
     with pytest.raises(KeyboardInterrupt):
-        polish_replica(object.__new__(Polisher), request, lambda block: None)
+        polish_front(request)
     assert seen == [paths]
 
 
@@ -146,45 +128,21 @@ def test_what_was_not_solved_counts_in_no_figure_of_solves() -> None:
 
 
 def test_attempts_come_back_from_their_file(finished: Path) -> None:
-    document = json.loads((polished_folder(finished, "nsga2", 0) / POLISH).read_text())
+    document = json.loads(polished_file(finished, "nsga2", 0).read_text())
     for stored in document["outcomes"]:
         assert to_json(from_json(PolishOutcome, stored, "an attempt", "")) == stored
 
 
-def test_a_damaged_front_is_polished_anew_and_an_interruption_repeats_no_attempt(
-    finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    root, append = tmp_path / "results", Journal.append
+def test_a_damaged_front_is_polished_anew(finished: Path, tmp_path: Path) -> None:
+    root = tmp_path / "results"
     shutil.copytree(finished, root)
-    path = polished_folder(root, "nsga2", 0) / POLISH
+    path = polished_file(root, "nsga2", 0)
     before = json.loads(path.read_text())
     path.write_text("{}")
-    recorded = list[bytes]()
-
-    def interrupt(journal: Journal, payload: bytes) -> None:
-        append(journal, payload)
-        recorded.append(payload)
-        if len(recorded) == 2:
-            raise KeyboardInterrupt
-
-    monkeypatch.setattr(Journal, "append", interrupt)
-    damaged = r"polish.json: damaged at x: is missing"
-    with pytest.warns(DamagedResultsWarning, match=damaged), pytest.raises(KeyboardInterrupt):
+    with pytest.warns(DamagedResultsWarning, match=r"00.json: damaged at x: is missing"):
         run(root, resume=True)
-    interrupted = list(recorded)
-    with pytest.warns(DamagedResultsWarning, match=damaged):
-        run(root, resume=True)
-    assert not set(recorded[2:]) & set(interrupted)
     after = json.loads(path.read_text())
     assert [after[key] for key in ("x", "objectives")] == [before["x"], before["objectives"]]
-
-
-def test_a_recorded_attempt_of_nonsense_is_told() -> None:
-    request = ReplicaRequest(SETTINGS, "nsga2", 0, np.zeros((1, 18)), (b"[]",))
-    for block in (b"[]", b"{}", b"\xff", b'{"x": 1e999}', b"[" * 90):
-        recorded = replace(request, recorded=(block,))
-        with pytest.raises(ResultsError, match=r"nsga2 replica 0: .*; delete journal.bin in its"):
-            polish_replica(object.__new__(Polisher), recorded, lambda message: None)
 
 
 def test_its_settings_decide_its_results() -> None:
@@ -216,9 +174,9 @@ def test_a_damaged_file_is_told(
 ) -> None:
     (front,) = read_campaign(finished).searched
     assert read_polished(tmp_path, front) is None
-    whole = json.loads((polished_folder(finished, "nsga2", 0) / POLISH).read_text())
+    whole = json.loads(polished_file(finished, "nsga2", 0).read_text())
     spoilt = whole | {key: change(whole[key]) for key, change in damage.items()}
-    path = polished_folder(tmp_path, "nsga2", 0) / POLISH
+    path = polished_file(tmp_path, "nsga2", 0)
     path.parent.mkdir(parents=True)
     path.write_text(json.dumps(spoilt))
     with pytest.raises(ResultsError, match=rf"damaged ?{told}.*; --resume computes it anew"):

@@ -30,8 +30,7 @@ def evaluator() -> CandidateEvaluator:
 def replica_of(evaluator: CandidateEvaluator, count: int) -> Replica:
     x = np.random.default_rng(8).uniform(evaluator.lower, evaluator.upper, (count, evaluator.n_var))
     found = evaluator.evaluate(x)
-    generation = np.ones(count, dtype=np.int64)
-    return Replica("random", 0, found, generation, 0.0)
+    return Replica("random", 0, found, 0.0)
 
 
 def test_balanced_is_the_least_mean() -> None:

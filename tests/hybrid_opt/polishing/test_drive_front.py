@@ -12,9 +12,8 @@ from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES, duration_unit
 from hybrid_opt.indicators import metrics
 from hybrid_opt.polishing.polisher import Polisher
-from hybrid_opt.polishing.records import PolishedFront, PolishOutcome
+from hybrid_opt.polishing.records import PolishedFront
 from hybrid_opt.polishing.settings import DrivableSettings, PolishSettings
-from hybrid_opt.store.files import from_json, to_json
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.records.task import initial_decision
@@ -60,14 +59,6 @@ def test_the_front_dominates_more_than_before() -> None:
     np.testing.assert_array_equal(after.objectives, polished().objectives)
     assert metrics.hypervolume(after.objectives, BOUND) > metrics.hypervolume(before, BOUND) + 0.01
     assert any(outcome.status == "accepted" for outcome in polished().outcomes)
-
-
-def test_a_polish_goes_on_where_it_was_interrupted() -> None:
-    written = [to_json(outcome) for outcome in polished().outcomes[:-2]]
-    recorded = [from_json(PolishOutcome, values, "an attempt", "") for values in written]
-    again = polisher().polish(starts(), np.random.default_rng(0), recorded=recorded)
-    np.testing.assert_array_equal(again.x, polished().x)
-    np.testing.assert_array_equal(again.objectives, polished().objectives)
 
 
 def fastest(paths: Array, forces: Array) -> Array:

@@ -28,14 +28,12 @@ from hybrid_opt.polishing.force_front import (
 from hybrid_opt.polishing.front import (
     IMPROVEMENT_TOLERANCE,
     OPTIMAL_STATIONARITY,
-    FailedAttempt,
     ParetoArchive,
 )
 from hybrid_opt.polishing.point import Solution
 from hybrid_opt.polishing.polisher import Polisher
-from hybrid_opt.polishing.records import PolishedFront, PolishOutcome
+from hybrid_opt.polishing.records import PolishedFront
 from hybrid_opt.polishing.settings import FillSettings, PolishSettings
-from hybrid_opt.store.files import from_json, to_json
 from studies.research.best_front import read_reference_front
 from symbolic.array import Array
 from symbolic.errors import SettingsError
@@ -167,33 +165,6 @@ def test_what_it_cost_is_told_in_evaluations() -> None:
     beside_probes = sum(o.aim != "probe" for o in result.outcomes)
     assert SETTINGS.attempts < beside_probes <= most
     assert sum(o.status == "accepted" for o in result.outcomes) == result.counts["accepted"]
-
-
-def test_recorded_attempts_are_not_repeated() -> None:
-    texts = [to_json(outcome) for outcome in polished().outcomes]
-    recorded = [from_json(PolishOutcome, text, "an attempt", "") for text in texts[:-2]]
-    emitted: list[PolishOutcome] = []
-    again = polisher().polish(
-        start_front(), np.random.default_rng(0), recorded=recorded, on_outcome=emitted.append
-    )
-    assert len(emitted) == 2
-    np.testing.assert_array_equal(again.x, polished().x)
-
-
-@pytest.mark.slow
-def test_an_attempt_that_ended_its_process_costs_itself_alone() -> None:
-    recorded: list[PolishOutcome | FailedAttempt] = [
-        *polished().outcomes[:2],
-        FailedAttempt("killed"),
-    ]
-    emitted: list[PolishOutcome] = []
-    again = polisher().polish(
-        start_front(), np.random.default_rng(0), recorded=recorded, on_outcome=emitted.append
-    )
-    assert (again.outcomes[2].status, again.outcomes[2].reason) == ("failed", "killed")
-    assert again.outcomes[2] not in emitted
-    assert len(again.outcomes) > 3
-    assert len(emitted) == len(again.outcomes) - 3
 
 
 def test_a_front_of_one_point() -> None:

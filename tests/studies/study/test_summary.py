@@ -29,6 +29,7 @@ from hybrid_opt.static_hold import StaticHold
 from hybrid_opt.store.files import from_json, to_json, write_json
 from hybrid_opt.timing.analysis import closest_to_reference_timing, read_timing
 from hybrid_opt.timing.solve import time_path
+from hybrid_opt.workers import LocalWorkers
 from studies import run
 from studies.study import simulation as stage
 from studies.study.recommendation import known_paths, least_force
@@ -79,7 +80,7 @@ def replica(objectives: list[list[float]], reasons: list[str], number: int = 0) 
         violation,
         violation,
     )
-    return Replica("nsga2", number, found, np.ones(n, dtype=np.int64), 1.5 + number)
+    return Replica("nsga2", number, found, 1.5 + number)
 
 
 FRONT = [[0.6, 0.4], [0.5, 0.5], [0.3, 0.3], [0.4, 0.7]]
@@ -265,7 +266,7 @@ def test_every_answer_is_kept_and_not_asked_for_again(
     assert not any(is_done(own_study, one) for one in wanted)
     asked: list[str] = []
 
-    def few(_: None, one: SimulationRequest, emit: object) -> StoredSimulation:
+    def few(one: SimulationRequest) -> StoredSimulation:
         asked.append(one.label)
         if one.label == "recommended" and len(asked) == 4:
             raise KeyboardInterrupt
@@ -274,7 +275,8 @@ def test_every_answer_is_kept_and_not_asked_for_again(
     monkeypatch.setattr(stage, "_simulated", few)
     results, silent = read_campaign(own_study), Progress(shown=False)
     execution, files = ExecutionSettings(own_study, jobs=1), collect_cell(results.workcell)
-    folder = CampaignFolder(own_study, results.settings, execution, results.cell, files)
+    workers = LocalWorkers(1)
+    folder = CampaignFolder(own_study, results.settings, execution, results.cell, files, workers)
     with pytest.raises(KeyboardInterrupt):
         simulation_stage().run(folder, silent)
     assert [is_done(own_study, one) for one in wanted] == [True, True, True, False]

@@ -1,4 +1,4 @@
-"""A campaign's settings, journals and tables of candidates."""
+"""A campaign's settings and files of candidates."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from collections.abc import Callable
 from dataclasses import fields, replace
 from functools import partial
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -21,16 +20,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from hybrid_opt.campaign import CampaignSettings, ExecutionSettings
-from hybrid_opt.campaign.journal import (
-    EvaluationTable,
-    Journal,
-    candidates_in,
-    decode,
-    decode_generation,
-    encode,
-    encode_front,
-    encode_generation,
-)
+from hybrid_opt.campaign.candidates import EvaluatedCandidates, decode, encode
 from hybrid_opt.campaign.settings import chosen
 from hybrid_opt.campaign.stages import drivable_settings
 from hybrid_opt.errors import ResultsError
@@ -39,102 +29,20 @@ from hybrid_opt.store.files import from_json, to_json
 from symbolic.errors import SettingsError
 from tests.hybrid_opt.campaign.fake import OBJECTIVES, verdicts
 
-IDENTITY = bytes(range(32))
-BLOCKS = [
-    encode_generation(0.5 * n, verdicts(np.random.default_rng(n).random((n, 4)))) for n in (3, 1, 7)
-]
+PATH = Path("00.csv.gz")
 
 
-def write(path: Path, blocks: list[bytes] = BLOCKS) -> bytes:
-    journal = Journal(path, IDENTITY)
-    for block in blocks:
-        journal.append(block)
-    journal.close()
-    return path.read_bytes()
-
-
-def reopened(path: Path) -> list[bytes]:
-    journal = Journal(path, IDENTITY)
-    journal.close()
-    return journal.payloads
-
-
-def test_a_generation_survives_to_the_bit() -> None:
-    x = np.random.default_rng(1).random((9, 4))
-    x[2, 0] = 0.31
-    found = verdicts(x)
-    seconds, again = decode_generation(encode_generation(1.25, found), 4, 2)
-    assert seconds == 1.25
-    for field in fields(Evaluations):
-        before, after = getattr(found, field.name), getattr(again, field.name)
-        assert (before.dtype, before.tobytes()) == (after.dtype, after.tobytes())
-    assert candidates_in(encode_generation(0.0, found)) == 9
-
-
-@pytest.mark.parametrize(("n_var", "n_obj"), [(3, 2), (5, 2), (4, 3), (4, 1)])
-def test_blocks_of_another_problem_are_refused(n_var: int, n_obj: int) -> None:
-    with pytest.raises(ResultsError, match="does not fit the problem"):
-        decode_generation(BLOCKS[0], n_var, n_obj)
-
-
-@given(st.data())
-def test_cut_anywhere_keeps_the_whole_blocks(data: st.DataObject) -> None:
-    with TemporaryDirectory() as folder:
-        path = Path(folder) / "journal.bin"
-        whole = write(path)
-        cut = data.draw(st.integers(0, len(whole)))
-        path.write_bytes(whole[:cut])
-        ends = np.cumsum([40, *(8 + len(block) for block in BLOCKS)])
-        kept = max(int(np.count_nonzero(ends <= cut)) - 1, 0)
-        assert reopened(path) == BLOCKS[:kept]
-        # What was cut off can be written again.
-        assert write(path, BLOCKS[kept:]) == whole
-
-
-@given(st.data())
-def test_damage_anywhere_is_never_read(data: st.DataObject) -> None:
-    with TemporaryDirectory() as folder:
-        path = Path(folder) / "journal.bin"
-        whole = bytearray(write(path))
-        place = data.draw(st.integers(0, len(whole) - 1))
-        whole[place] ^= data.draw(st.integers(1, 255))
-        path.write_bytes(whole)
-        if place < 40:
-            with pytest.raises(ResultsError, match="belongs to another campaign"):
-                reopened(path)
-        else:
-            found = reopened(path)
-            assert len(found) < len(BLOCKS)
-            assert found == BLOCKS[: len(found)]
-
-
-def test_another_identity_is_refused(tmp_path: Path) -> None:
-    write(tmp_path / "journal.bin")
-    with pytest.raises(ResultsError, match="belongs to another campaign or version; delete it"):
-        Journal(tmp_path / "journal.bin", bytes(32))
-
-
-def test_discarding_removes_the_file(tmp_path: Path) -> None:
-    journal = Journal(tmp_path / "a/journal.bin", IDENTITY)
-    journal.append(BLOCKS[0])
-    journal.discard()
-    assert not journal.path.exists()
-
-
-PATH = Path("evaluations.csv.gz")
-
-
-def table(count: int = 30) -> EvaluationTable:
+def table(count: int = 30) -> EvaluatedCandidates:
     x = np.random.default_rng(3).random((count, 4))
     x[::7, 0] = 0.31
-    return EvaluationTable(verdicts(x), np.arange(count, dtype=np.int64) // 8 + 1, OBJECTIVES)
+    return EvaluatedCandidates(verdicts(x), OBJECTIVES, 1.25)
 
 
 def test_table_survives_to_the_bit() -> None:
     before = table()
     after = decode(encode(before), PATH)
     assert after.objective_names == OBJECTIVES
-    np.testing.assert_array_equal(after.generation, before.generation)
+    assert after.seconds == before.seconds
     for field in fields(Evaluations):
         old = getattr(before.evaluations, field.name)
         new = getattr(after.evaluations, field.name)
@@ -143,11 +51,11 @@ def test_table_survives_to_the_bit() -> None:
 
 def test_files_from_before_a_reason_was_added_are_read() -> None:
     before = table()
-    header, *lines = gzip.decompress(encode(before)).decode().splitlines()
+    comment, header, *lines = gzip.decompress(encode(before)).decode().splitlines()
     names = header.split(",")
     kept = [k for k, name in enumerate(names) if not name.endswith("no_timing")]
     old = [",".join(line.split(",")[k] for k in kept) for line in (header, *lines)]
-    after = decode(gzip.compress(("\n".join(old) + "\n").encode()), PATH).evaluations
+    after = decode(gzip.compress(("\n".join([comment, *old]) + "\n").encode()), PATH).evaluations
     np.testing.assert_array_equal(after.violation, before.evaluations.violation)
     np.testing.assert_array_equal(after.violation_time, before.evaluations.violation_time)
     np.testing.assert_array_equal(after.reason, before.evaluations.reason)
@@ -157,13 +65,15 @@ def test_files_from_before_a_reason_was_added_are_read() -> None:
 def test_any_number_survives(x: np.ndarray[tuple[int, int], np.dtype[np.float64]]) -> None:
     found = verdicts(np.full((2, 4), 0.5))
     arrays = {f.name: getattr(found, f.name) for f in fields(Evaluations)} | {"x": x}
-    names = EvaluationTable(Evaluations(**arrays), np.ones(2, dtype=np.int64), OBJECTIVES)
+    names = EvaluatedCandidates(Evaluations(**arrays), OBJECTIVES, 0.0)
     assert decode(encode(names), PATH).evaluations.x.tobytes() == x.tobytes()
 
 
 def test_columns_mean_what_they_say() -> None:
     before = table()
-    rows = list(csv.DictReader(io.StringIO(gzip.decompress(encode(before)).decode())))
+    text = io.StringIO(gzip.decompress(encode(before)).decode())
+    assert text.readline() == "# seconds: 1.25\n"
+    rows = list(csv.DictReader(text))
     found = before.evaluations
     assert [int(row["evaluation"]) for row in rows] == list(range(1, 31))
     for k, row in enumerate(rows):
@@ -181,17 +91,8 @@ def test_same_table_same_bytes() -> None:
     assert encode(table()) == encode(table())
 
 
-def test_front_names_its_evaluations() -> None:
-    before = table()
-    text = encode_front(before, np.array([4, 2])).decode()
-    rows = list(csv.DictReader(io.StringIO(text)))
-    assert [row["evaluation"] for row in rows] == ["5", "3"]
-    assert float(rows[0]["x_1"]) == before.evaluations.x[4, 0]
-    assert float(rows[1]["peak_force_2"]) == before.evaluations.objectives[2, 1]
-
-
 def test_a_small_file_does_not_unfold_into_a_huge_one() -> None:
-    header = gzip.decompress(encode(table())).partition(b"\n")[0] + b"\n"
+    header = b"".join(gzip.decompress(encode(table())).splitlines(keepends=True)[:2])
     tracemalloc.start()
     packed = gzip.compress(header + b"0" * 2**28, 1)
     tracemalloc.reset_peak()
@@ -211,17 +112,19 @@ def test_a_small_file_does_not_unfold_into_a_huge_one() -> None:
         lambda text: text.replace(b"\n3,", b"\n4,"),
         lambda text: text.replace(b"0.", b"zero", 40),
         lambda text: text.replace(b"\n3,", b"\n\n3,"),
-        lambda text: text.partition(b"\n")[0] + b"\n",
-        lambda text: text + b"31,1,1,,0.0\n",
-        lambda text: re.sub(rb"\n1,\d+,", rb"\n1,1e308,", text),
-        lambda text: re.sub(rb"\n1,(\d+),\d,", rb"\n1,\1,2,", text),
+        lambda text: b"".join(text.splitlines(keepends=True)[:2]),
+        lambda text: text + b"31,1,,0.0\n",
+        lambda text: re.sub(rb"\n1,\d,", rb"\n1,2,", text),
+        lambda text: text.partition(b"\n")[2],
+        lambda text: text.replace(b"seconds: 1.25", b"seconds: -1"),
+        lambda text: text.replace(b"seconds: 1.25", b"seconds: inf"),
         lambda text: re.sub(rb",[^,]*\n2,", rb",x\n2,", text),
     ],
 )
 def test_damage_is_told(spoil: Callable[[bytes], bytes]) -> None:
     spoilt = gzip.compress(spoil(gzip.decompress(encode(table()))))
     for content in (spoilt, encode(table())[:-20], b"not gzip"):
-        with pytest.raises(ResultsError, match=r"evaluations.csv.gz: damaged"):
+        with pytest.raises(ResultsError, match=r"00.csv.gz: damaged"):
             decode(content, PATH)
 
 

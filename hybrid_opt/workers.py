@@ -1,0 +1,250 @@
+"""Independent calls in worker processes of this machine, through `concurrent.futures`.
+
+Functions, arguments and results can be pickled. A worker remembers by itself what it loads
+(`functools.lru_cache`). Results depend neither on who works nor on the order. A call takes seconds,
+so a call that is lost with its worker is repeated as a whole. `hybrid_opt.cluster` has the same for
+a Dask cluster.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import sys
+import traceback
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import BrokenExecutor, Future, ProcessPoolExecutor, as_completed
+from contextlib import AbstractContextManager, contextmanager, suppress
+from functools import lru_cache
+from multiprocessing import forkserver, resource_tracker
+from multiprocessing.connection import Connection, wait
+from multiprocessing.process import BaseProcess
+from threading import Thread, current_thread, main_thread
+from types import TracebackType
+from typing import Any, Self, TypeVar
+
+from threadpoolctl import ThreadpoolController
+
+from codegen.function import available_cores
+from hybrid_opt.errors import WorkerError
+from symbolic.errors import DualArmError
+
+Argument = TypeVar("Argument")
+Result = TypeVar("Result")
+OnResult = Callable[[int, Any], None]
+
+MAX_DEATHS = 3
+"""Deaths of workers, with no result in between, after which the work is given up."""
+
+KEPT = "what was computed is kept: continue with --resume"
+
+
+def ignore_result(index: int, result: object) -> None:
+    """Do nothing with a result."""
+
+
+class Workers(ABC):
+    """Makes calls; use it in a `with` block, at whose end all work ends."""
+
+    @abstractmethod
+    def map(
+        self,
+        function: Callable[[Argument], Result],
+        arguments: Sequence[Argument],
+        on_result: OnResult = ignore_result,
+    ) -> list[Result]:
+        """Call a function with every argument; returns the results in the arguments' order.
+
+        Args:
+            on_result: called in this process with index and result of each call as it ends.
+
+        Raises:
+            DualArmError: a call failed with this text, or workers were lost.
+        """
+
+    @abstractmethod
+    def close(self) -> None:
+        """End all workers at once."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+
+class LocalWorkers(Workers):
+    """Makes calls in processes of this machine; a single call, or all of them with one job, in this
+    process, where nothing protects it from what the call does."""
+
+    def __init__(self, jobs: int = 1) -> None:
+        """Start nothing yet; `jobs` are the most processes, 0 for one per core."""
+        self._jobs = jobs or available_cores()
+        self._pool: ProcessPoolExecutor | None = None
+        self._processes = set[BaseProcess]()
+        self._lifeline: Connection | None = None
+
+    def map(
+        self,
+        function: Callable[[Argument], Result],
+        arguments: Sequence[Argument],
+        on_result: OnResult = ignore_result,
+    ) -> list[Result]:
+        """See `Workers`."""
+        results: dict[int, Result] = {}
+        if min(self._jobs, len(arguments)) <= 1:
+            for index, argument in enumerate(arguments):
+                with one_thread():
+                    results[index] = function(argument)
+                on_result(index, results[index])
+        deaths = 0
+        while len(results) < len(arguments):
+            left = [k for k in range(len(arguments)) if k not in results]
+            try:
+                calls = self._submit(function, {k: arguments[k] for k in left})
+                for index, result in finished(calls):
+                    results[index], deaths = result, 0
+                    on_result(index, result)
+            except BrokenExecutor as error:
+                self.close()
+                deaths += 1
+                if deaths == MAX_DEATHS:
+                    raise WorkerError(
+                        f"worker processes died {MAX_DEATHS} times (killed from outside, out of "
+                        "memory, or started by a script without `if __name__ == '__main__':`?); "
+                        f"{KEPT}, perhaps with fewer --jobs"
+                    ) from error
+            except BaseException:
+                self.close()
+                raise
+        return [results[index] for index in range(len(arguments))]
+
+    def _submit(
+        self, function: Callable[[Argument], Result], arguments: Mapping[int, Argument]
+    ) -> dict[Future[Result], int]:
+        """Submit calls, with which the pool starts its processes."""
+        with _interrupts_later():
+            pool, before = self._started(), set(multiprocessing.active_children())
+            calls = {pool.submit(call_safely, function, one): k for k, one in arguments.items()}
+            self._processes |= set(multiprocessing.active_children()) - before
+        return calls
+
+    def _started(self) -> ProcessPoolExecutor:
+        if self._pool is None:
+            end, self._lifeline = multiprocessing.Pipe(duplex=False)
+            with _without_interrupts():
+                forkserver.ensure_running()
+            context = multiprocessing.get_context("forkserver")
+            self._pool = ProcessPoolExecutor(self._jobs, context, _live, (end,))
+        return self._pool
+
+    def close(self) -> None:
+        """See `Workers`."""
+        if self._pool is not None and self._lifeline is not None:
+            self._pool.shutdown(wait=False, cancel_futures=True)
+            for process in self._processes:
+                process.kill()
+            # What they share with this process has to last as long as they do.
+            for process in self._processes:
+                wait([process.sentinel])
+            self._lifeline.close()
+            self._pool = self._lifeline = None
+            self._processes.clear()
+
+
+def finished(calls: dict[Future[Result], int]) -> Iterator[tuple[int, Result]]:
+    """Yield index and result of each call as it ends."""
+    for call in as_completed(calls):
+        yield calls[call], call.result()
+
+
+def call_safely(function: Callable[[Argument], Result], argument: Argument) -> Result:
+    """Call a function in a worker: with linear algebra in one thread, and with errors that can be
+    pickled, which not every exception can."""
+    try:
+        with one_thread():
+            return function(argument)
+    except DualArmError as error:
+        raise DualArmError(str(error)) from None
+    except Exception:
+        raise RuntimeError(traceback.format_exc()) from None
+
+
+def one_thread() -> AbstractContextManager[object]:
+    """Limit linear algebra to one thread within a `with` block.
+
+    Workers fill the cores, and on matrices as small as ours several threads wait for one another:
+    without it a drivable front of two attempts took 18.4 core-seconds in place of 9.3.
+    """
+    limited: AbstractContextManager[object]
+    limited = _controller(len(sys.modules)).limit(limits=1, user_api="blas")
+    return limited
+
+
+@lru_cache(maxsize=1)
+def _controller(modules: int) -> ThreadpoolController:
+    """Return the controller of the libraries loaded with this number of modules: a new one takes
+    4 ms."""
+    return ThreadpoolController()
+
+
+def warm_up(*modules: str) -> None:
+    """Start the server that workers come from, and let it load modules meanwhile.
+
+    For programs; without it, each worker loads what it needs.
+    """
+    multiprocessing.get_context("forkserver").set_forkserver_preload(list(modules))
+    with _without_interrupts():
+        forkserver.ensure_running()
+
+
+@contextmanager
+def _without_interrupts() -> Iterator[None]:
+    """Keep Ctrl-C from processes that are started in the `with` block, and from their children.
+
+    It is sent to the whole group, but the parent alone decides what it means. The mask is
+    inherited, so that it holds from a process's first moment.
+    """
+    # Lifts the mask when it starts for the first time.
+    resource_tracker.ensure_running()
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+@contextmanager
+def _interrupts_later() -> Iterator[None]:
+    """Raise Ctrl-C at the end of the `with` block only: nobody knows of a process whose start it
+    interrupts."""
+    if current_thread() is not main_thread():
+        yield
+        return
+    heard = list[int]()
+    before = signal.signal(signal.SIGINT, lambda number, frame: heard.append(number))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+    if heard:
+        raise KeyboardInterrupt
+
+
+def _live(lifeline: Connection) -> None:
+    """Begin a worker's life, which ends with the lifeline: with the pool, or with the parent."""
+    Thread(target=_end_with, args=(lifeline,), daemon=True).start()
+
+
+def _end_with(lifeline: Connection) -> None:
+    """End this process, also in the midst of a call, when the other end of a pipe is closed."""
+    with suppress(EOFError, OSError):
+        lifeline.recv()
+    os._exit(1)
