@@ -270,6 +270,7 @@ def test_every_cell_that_ships_is_searched(name: str) -> None:
 def test_a_worker_elsewhere_searches_without_the_cells_files(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """Of a cell without a closed form."""
     cell = drivable("fork")
     settings = CampaignSettings({"random": {}}, CANDIDATES, 2, objectives=DRIVABLE_OBJECTIVES)
     files = collect_cell(cell.workcell)
