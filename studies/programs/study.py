@@ -114,7 +114,7 @@ def stages(study: StudySettings, alone: bool = False) -> tuple[Stage, ...]:
     every.append(summary_stage("" if study.drivable else NOT_ASKED))
     if study.recommend_only:
         return tuple(every)
-    every.append(timing_stage(study.wish.force))
+    every.append(timing_stage())
     if study.simulate:
         every.append(simulation_stage())
     if study.report:

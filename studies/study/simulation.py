@@ -242,16 +242,17 @@ TIMING = "timing"
 CURVE_POINTS = 12
 """Points of the curve of duration against force limit, of trajectories that a report shows."""
 
-Request = tuple[Array, float | None, int | None]
-"""Decision vector, force limit [N], points of the curve."""
+Request = tuple[Array, int | None]
+"""Decision vector and number of points of the curve, None for no curve."""
 
 
-def timing_stage(force_limit: float | None = None, curves: bool = True) -> Stage:
-    """The stage that writes `timing/`: one document per selected trajectory, but where the union of
-    all fronts was polished only for its own and those that a report shows.
+def timing_stage(curves: bool = True) -> Stage:
+    """Return the stage that writes `timing/`: one document per selected trajectory.
+
+    Where the union of all fronts was polished, only its own trajectory and those that a report
+    shows have one.
 
     Args:
-        force_limit: normal force [N] of an additional, force-limited timing.
         curves: whether those that a report shows are also timed at many force limits.
     """
 
@@ -265,8 +266,7 @@ def timing_stage(force_limit: float | None = None, curves: bool = True) -> Stage
             files = [file for file in files if file in {*shown, union}]
         timed = shown if curves else set[Path]()
         requests = [
-            (read_trajectory(selected / f).x, force_limit, CURVE_POINTS if f in timed else None)
-            for f in files
+            (read_trajectory(selected / f).x, CURVE_POINTS if f in timed else None) for f in files
         ]
         driven = folder.workcell.task.time_law == "optimal"
         cells = cells_of(folder.files, folder.settings.objectives, driven)
@@ -276,13 +276,14 @@ def timing_stage(force_limit: float | None = None, curves: bool = True) -> Stage
         for file, document in zip(files, found, strict=True):
             write_json(folder.root / TIMING / file, to_json(document))
 
-    return Stage(TIMING, run, {"force_limit": force_limit})
+    return Stage(TIMING, run)
 
 
 def _document(cells: Cells, request: Request) -> TimingDocument:
     ready = ready_cells(cells)
     own, driven = ready[0].jobs.timing, ready[-1].jobs.timing
-    return timing_document(time_trajectory(driven, *request, own=own))
+    x, curve_points = request
+    return timing_document(time_trajectory(driven, x, curve_points=curve_points, own=own))
 
 
 def limits_on_jerk(root: Path, recommended: StoredRecommendation | None) -> Table | None:
