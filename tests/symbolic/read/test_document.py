@@ -81,7 +81,7 @@ def test_every_key_is_documented(tmp_path: Path) -> None:
 def test_the_messages_shown_are_real(tmp_path: Path) -> None:
     data = sample_data()
     put(data, "payload.size[0]", 300)
-    put(data, "task.reference_force", 12)
+    put(data, "task.reference_force", 0.5)
     told = problems(write(tmp_path, data))
     assert len(told) == 2
     for text in told:
