@@ -112,10 +112,10 @@ class RowSelector:
     ) -> dict[Row, float]:
         """Return the required values of violated rows; see `ConstraintKind`."""
 
-        def program_rows(kind: ConstraintKind[Any], own: list[Row]) -> list[float]:
+        def tighten(kind: ConstraintKind[Any], own: list[Row]) -> list[float]:
             return kind.tightened_bounds(carry, known, own, [before.get(row, 0.0) for row in own])
 
-        return self._by_kind(rows, program_rows)
+        return self._by_kind(rows, tighten)
 
     def persists(self, row: Row) -> bool:
         """Return True if a row's tightened bound stays valid at other candidates."""
