@@ -364,8 +364,8 @@ class _Search:
             return NoHoldError(f"{begin}: {tried.problem}{others}")
         met = "" if tried.setup is None else no_path(tried.setup.pairs, self.refusals)
         if self.too_late:
-            more = f"{LONGER * self.settings.seconds:.0f}"
-            begin = f"{begin}, when it was out of time; try {more} s (--time {more})"
+            longer = f"{LONGER * self.settings.seconds:.0f}"
+            begin = f"{begin}, when it was out of time; try {longer} s (--time {longer})"
         return ProposalError(f"{begin}: {met or 'no path was tried yet'}")
 
     def _paths(
