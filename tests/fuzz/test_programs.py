@@ -123,11 +123,12 @@ def test_a_hostile_file(tmp_path: Path, case: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("program", "further"), [("compare", "."), pytest.param("report", "--quiet", marks=SLOW)]
+    ("program", "further"), [("compare", "{0}"), pytest.param("report", "--quiet", marks=SLOW)]
 )
 def test_a_hostile_results_folder(tmp_path: Path, program: str, further: str) -> None:
     os.mkfifo(tmp_path / "configuration.json")
-    assert f"{tmp_path}/configuration.json" in refused(0, program, str(tmp_path), further)
+    said = refused(0, program, str(tmp_path), further.format(tmp_path))
+    assert f"{tmp_path}/configuration.json" in said
 
 
 @pytest.mark.slow

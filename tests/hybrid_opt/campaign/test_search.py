@@ -227,7 +227,7 @@ def test_unfinished_results_are_told(tmp_path: Path) -> None:
         pass
     with pytest.raises(ResultsError, match="nsga2 replica 0 is not finished"):
         read_campaign(tmp_path)
-    with pytest.raises(ResultsError, match="is no results folder"):
+    with pytest.raises(ResultsError, match="does not exist"):
         read_campaign(tmp_path / "replicas")
 
 

@@ -150,7 +150,7 @@ def test_distances_are_those_of_coal_and_of_a_quadratic_program(kinds: int) -> N
         apart += 1
         assert lower[k] == pytest.approx(expected, abs=1e-7)
         assert upper[k] == pytest.approx(expected, abs=1e-7)
-        assert lower[k] <= upper[k] + 1e-12
+        assert lower[k] <= upper[k] + 1e-9  # GJK's projections on flat simplices round
         if kinds == 1 and apart < 60:
             assert lower[k] == pytest.approx(quadratic_distance(first, second), abs=1e-6)
     assert apart > 100

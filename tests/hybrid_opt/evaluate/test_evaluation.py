@@ -180,7 +180,7 @@ def test_screening_changes_no_sample_of_random_candidates(n: int) -> None:
     assert samples > 80 * n
 
 
-UNEVEN = RACK.parent / "uneven.toml"
+FORK = RACK.parent / "fork.toml"
 
 VERDICT = ("penalised", "feasible", "reason", "position", "violation", "violation_time")
 
@@ -324,7 +324,7 @@ def test_the_joints_way_is_longer_than_the_straight_one_and_told_over_their_rang
 @pytest.mark.parametrize("lanes", [0, pytest.param(2, marks=pytest.mark.slow)])
 def test_forces_that_come_last_are_those_of_one_by_one(lanes: int) -> None:
     """Where a program finds them: of all where that is wanted, else of what violates nothing."""
-    x, ours, made = mixed(UNEVEN, 21, 7), fused(UNEVEN), kernel(UNEVEN, lanes)
+    x, ours, made = mixed(FORK, 21, 7), fused(FORK), kernel(FORK, lanes)
     x[::4] = initial_decision(ours.workcell.task)
     whole, names = one_by_one(ours.outputs(x), ours.checker), tuple(SAMPLE_NAMES)
     assert_same_samples(made.evaluate(x, names, all_forces=True), whole)
@@ -336,7 +336,7 @@ def test_forces_that_come_last_are_those_of_one_by_one(lanes: int) -> None:
         np.testing.assert_array_equal(found.outputs[name][kept], whole.outputs[name][kept], name)
         assert name not in of_forces or not found.outputs[name][~kept].any(), name
     np.testing.assert_array_equal(found.colliding, whole.colliding)
-    assert_same(ours.evaluate(x), stepwise(UNEVEN).evaluate(x), VERDICT)
+    assert_same(ours.evaluate(x), stepwise(FORK).evaluate(x), VERDICT)
 
 
 def test_a_kernel_that_differs_is_not_used(monkeypatch: pytest.MonkeyPatch) -> None:
