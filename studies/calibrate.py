@@ -13,7 +13,7 @@ import argparse
 import json
 import sys
 
-from studies.options import INPUT, OUTPUT_FILE, add
+from studies.options import OUTPUT_FILE, RECORDING, add
 from studies.program import FAULT, Parser, Program, load_workcell
 from symbolic.errors import SettingsError
 
@@ -21,7 +21,7 @@ from symbolic.errors import SettingsError
 def _add_options(parser: Parser) -> None:
     add(parser, "WORKCELL")
     parser.add_argument(
-        "runs", metavar="RUN", type=INPUT, nargs="+", help="a recording, RUN.toml beside it"
+        "runs", metavar="RUN", type=RECORDING, nargs="+", help="a recording, RUN.toml beside it"
     )
     parser.add_argument(
         "--out",

@@ -99,7 +99,9 @@ def _held(timing: ho.Timing) -> str:
     """Which limits a carry is at."""
     if not timing.ok:
         return timing.reason
-    return ", ".join(name for name, excess in timing.use.items() if excess.ratio > HELD)
+    # The least forces always use the whole friction.
+    limits = (name for name in timing.use if name != "friction")
+    return ", ".join(name for name in limits if timing.use[name].ratio > HELD)
 
 
 main = Program("demo", __doc__, _add_options, "studies.demo.show")

@@ -160,6 +160,12 @@ def _require_any(path: Path) -> None:
         raise SettingsError(f"{path}: does not exist{_expected(path, '')}")
 
 
+def _require_recording(path: Path) -> None:
+    """Refuse a recording without any file; one with a file per arm has only RUN.toml."""
+    if not path.with_suffix(".toml").exists():
+        _require_any(path)
+
+
 def _require_place(path: Path) -> None:
     """Refuse a path that cannot be written or made by this user."""
     existing = next(each for each in (path, *path.absolute().parents) if each.exists())
@@ -194,6 +200,7 @@ TRAJECTORY_FILE = PathType(partial(_require_file, kind=TRAJECTORY))
 INPUT_FILE = PathType(_require_file)
 INPUT_FOLDER = PathType(_require_folder)
 INPUT = PathType(_require_any)
+RECORDING = PathType(_require_recording)
 RESULTS_FOLDER = PathType(_require_results)
 OUTPUT_FILE = PathType(_require_output_file)
 OUTPUT_FOLDER = PathType(_require_output_folder)

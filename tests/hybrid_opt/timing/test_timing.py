@@ -297,8 +297,9 @@ def timed() -> TimedTrajectory:
 
 def test_every_timing_is_told_and_stored(tmp_path: Path) -> None:
     timed()
-    # Three for every carry, one within the force limit, the margins, three of the curve.
-    assert [(k, 8) for k in range(1, 9)] == TOLD
+    # Three for every carry, one within the force limit, the margins, the validation, three of the
+    # curve.
+    assert [(k, 9) for k in range(1, 10)] == TOLD
     path = tmp_path / "timing.json"
     document = to_json(timing_document(timed()))
     write_json(path, document)

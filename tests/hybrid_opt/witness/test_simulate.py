@@ -273,9 +273,6 @@ def at_rest(cell: Workcell) -> tuple[Carry, Array]:
     [
         ("drum", (-0.04, 0.0, 0.0)),
         ("fork", (0.0, 0.0, 0.0)),
-        # Far off the line between the pads, whose pressures are shared as planned.
-        ("fork", (0.05, 0.0, 0.0)),
-        ("drum", (0.0, 0.0, 0.0)),
     ],
 )
 def test_the_planned_forces_are_the_least_of_pads_that_the_planned_moments_drive(
@@ -304,16 +301,6 @@ def test_a_fork_is_held_from_the_least_force_on_at_which_its_pads_press_alike(of
     cell = shipped("fork").workcell
     carry, _ = at_rest(with_payload(cell, centre_of_mass=np.array([off, 0.0, 0.0])))
     assert threshold(carry, SimulationSettings(slip=1e-4)) == pytest.approx(0.985, abs=0.025)
-
-
-def test_pads_that_press_evenly_need_more_where_a_load_twists() -> None:
-    """A fork needs as much in the middle, and a third more for a load far off it."""
-    found = []
-    for off in (0.0, 0.05):
-        cell = with_payload(shipped("fork").workcell, centre_of_mass=np.array([off, 0.0, 0.0]))
-        drive = drive_of(at_rest(cell)[0], SimulationSettings())
-        found.append([Witness(cell).simulate(drive, factor).holds for factor in (0.98, 1.02, 1.2)])
-    assert found == [[False, True, True], [False, False, False]]
 
 
 @cache

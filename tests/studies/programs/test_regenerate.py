@@ -51,8 +51,16 @@ def functions(_: object) -> dict[str, ca.Function]:
 
 
 @pytest.fixture
-def run(cache: Cache, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Run:
+def run(
+    cache: Cache,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> Run:
     """The program with a cell of one function in place of the file's; code, output and messages."""
+    monkeypatch.chdir(tmp_path)
+    for name in ("cell.toml", "other.toml"):
+        (tmp_path / name).touch()
     monkeypatch.setattr("studies.programs.regeneration.CompiledCell", TinyCell)
     monkeypatch.setattr("symbolic.read.cell.load", tiny)
     monkeypatch.setattr("symbolic.functions.arm_functions", functions)
