@@ -91,9 +91,9 @@ def picture(_: Any, block: dict[str, Any], gallery: dict[str, Any]) -> str:
     return ""
 
 
-def reference() -> Path:
+def api() -> Path:
     """A page for every public name, with the examples that use it, and one for stored figures."""
-    folder = ROOT / "docs" / "reference"
+    folder = ROOT / "docs" / "api"
     folder.mkdir(exist_ok=True)
     rows = []
     for name in sorted(ho.__all__):
@@ -123,7 +123,8 @@ def reference() -> Path:
     _write(folder / "summary.rst", page)
     rows.append(f"* :doc:`{stored} <summary>`")
     listed = "\n".join(f"   {name}" for name in (*sorted(ho.__all__), "summary"))
-    index = "Reference\n=========\n\nWhat ``import hybrid_opt as ho`` gives.\n\n"
+    title = "The library, name by name"
+    index = f"{title}\n{'=' * len(title)}\n\nWhat ``import hybrid_opt as ho`` gives.\n\n"
     hidden = f"\n\n.. toctree::\n   :hidden:\n\n{listed}\n"
     _write(folder / "index.rst", index + "\n".join(rows) + hidden)
     return folder
@@ -135,7 +136,7 @@ def _write(path: Path, text: str) -> None:
         path.write_text(text, "utf-8")
 
 
-reference()
+api()
 sphinx_gallery_conf: dict[str, Any] = {
     "examples_dirs": [str(examples())],
     "gallery_dirs": ["gallery"],

@@ -1,4 +1,4 @@
-"""The library. `import hybrid_opt as ho` and work with a cell; docs/library.md shows how.
+"""The library. `import hybrid_opt as ho` and work with a cell; docs/reference/library.md shows how.
 
 `Cell` is the only resource. `search` and `polish` make a `Front`, a front gives a `Carry`,
 `time_path` makes a `Timing` of it, `recommend` says which to run, `plan_job` plans the whole job

@@ -150,7 +150,7 @@ class Cell:
     def drivable(self) -> Cell:
         """The same cell with carries as robots drive them: under the time law 'optimal', searched
         for duration and peak force, the robust one where robust forces are minimised
-        (docs/timing.md).
+        (docs/explanation/timing.md).
 
         Its workcell file lies in a temporary folder that lasts as long as the cell.
 

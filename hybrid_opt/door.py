@@ -149,7 +149,7 @@ def time_every_way(
 
 
 def save(carry: Carry, path: str | Path, provenance: Mapping[str, Any] | None = None) -> None:
-    """Store a carry of `Cell.carry` with its whole cell in one file; see docs/export.md.
+    """Store a carry of `Cell.carry` with its whole cell in one file; see docs/reference/bundles.md.
 
     Args:
         path: the file, replaced where it exists.

@@ -3,8 +3,8 @@
 From recordings (MCAP, rosbag2, CSV, RTDE's as well) with a side file in TOML each it
 tells the sensors' offsets and crosstalk, mass, centre of mass, a bracket of the friction, how
 forces follow their commands, how the pads drift; and writes the workcell file with that in it. It
-names what is wrong with a run, or missing (docs/calibration.md). Exit code 1 where something is
-refused.
+names what is wrong with a run, or missing (docs/how-to/calibration.md). Exit code 1 where something
+is refused.
 """
 
 from __future__ import annotations

@@ -451,7 +451,8 @@ GONE = {
     "json": "data",
     "mcap": "data",
 }
-"""Targets of earlier versions, and what is to be used instead; docs/export.md says why."""
+"""Targets of earlier versions, and what is to be used instead; docs/reference/bundles.md says
+why."""
 
 
 def require_target(name: str) -> None:

@@ -1,8 +1,9 @@
 """A recorded run of a cell: joints, what the sensors at both wrists felt, what was commanded, and
 what a person says of it in a side file.
 
-RUN.toml lies beside RUN.csv, RUN.mcap or the folder RUN; docs/calibration.md explains its keys.
-Each arm may have a file of its own; what the second recorded is taken at the times of the first.
+RUN.toml lies beside RUN.csv, RUN.mcap or the folder RUN; docs/how-to/calibration.md explains its
+keys. Each arm may have a file of its own; what the second recorded is taken at the times of the
+first.
 """
 
 from __future__ import annotations
@@ -198,7 +199,7 @@ def read_run(path: Path, workcell: Workcell) -> Run:
     try:
         data = outside.toml_tables(outside.read_bytes(outside.resolved(side), 2**20))
     except OutsideError as error:
-        told = f"a recording's side file: {error}; docs/calibration.md explains it"
+        told = f"a recording's side file: {error}; docs/how-to/calibration.md explains it"
         raise WorkcellError(str(side), (told,)) from error
     problems = Problems()
     table = Table(data, "", problems)

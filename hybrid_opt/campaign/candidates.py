@@ -1,4 +1,5 @@
-"""Evaluated candidates of a search as one compressed CSV file; docs/results.md has its columns.
+"""Evaluated candidates of a search as one compressed CSV file; docs/reference/results.md has its
+columns.
 
 The first line is a comment with the time that the search took. Numbers have the fewest digits that
 give the same bits when read back.

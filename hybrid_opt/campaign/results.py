@@ -1,7 +1,7 @@
 """Reading a campaign's results folder back into frozen records, or what else this project wrote.
 
 Nothing stored is executed, and files are compared with the checksums taken when they were
-written. docs/results.md describes the folder.
+written. docs/reference/results.md describes the folder.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
 """Settings of a campaign and the source of its randomness; the small files of its results folder as
-records, and where they lie (docs/results.md)."""
+records, and where they lie (docs/reference/results.md)."""
 
 from __future__ import annotations
 

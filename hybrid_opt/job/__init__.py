@@ -1,1 +1,1 @@
-"""A whole job: grip, press, lift, carry, set down, let go. docs/job.md describes it."""
+"""A whole job: grip, press, lift, carry, set down, let go. docs/explanation/job.md describes it."""

@@ -1,4 +1,4 @@
-"""Planning a whole job around the timing of a carry. docs/job.md explains the phases.
+"""Planning a whole job around the timing of a carry. docs/explanation/job.md explains the phases.
 
 Pads approach along the contact normals, press while the box stands, take over its weight with the
 press, lift it off, carry it, set it down, let go, and retreat. Every phase but the carry follows a

@@ -1,5 +1,5 @@
-"""Settings of a polish. All other numbers are constants beside their use; docs/polish.md explains
-it.
+"""Settings of a polish. All other numbers are constants beside their use;
+docs/explanation/polish.md explains it.
 
 Widths along the path are in the path parameter (the whole path is 1), distances in metres, steps in
 half ranges of the decision variables: none of them changes its meaning with the number of samples.

@@ -220,7 +220,8 @@ def propose_classes(
     postures.
 
     Args:
-        path: a workcell file in which what is proposed may be missing (docs/your-own-cell.md).
+        path: a workcell file in which what is proposed may be missing
+            (docs/tutorials/two-robots.md).
         rng: its only randomness. The same state gives the same proposals where time does not run
             out.
         settings: how many are looked for, among others; None for the defaults: one.

@@ -1,5 +1,5 @@
 """A trajectory stored as one self-contained JSON file, and evaluated again from it alone.
-docs/export.md describes the format.
+docs/reference/bundles.md describes the format.
 
 The file holds the decision vector, the start postures, the figures it was reported with, how it
 came about, and the whole workcell with every file that the workcell names. Reading it executes

@@ -1,4 +1,5 @@
-"""Fastest timings of paths by a compiled backward and forward pass; docs/timing.md explains it.
+"""Fastest timings of paths by a compiled backward and forward pass; docs/explanation/timing.md
+explains it.
 
 At a point of the path every limit bounds a function of u'' and u'^2 (`symbolic.limits`). Robust
 forces are convex in (u'', u'^2) (`hybrid_opt.robust.path_force`), but take an interior-point method

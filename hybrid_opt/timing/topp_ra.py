@@ -1,4 +1,5 @@
-"""Validation of timings by TOPP-RA: a sequence of its linear programs. docs/timing.md explains it.
+"""Validation of timings by TOPP-RA: a sequence of its linear programs. docs/explanation/timing.md
+explains it.
 
 At a point of the path every limit reads alpha u'' + beta u'^2 <= bound. Joint speeds and
 accelerations do so exactly. Limits that are convex in (u'', u'^2) enter as supporting lines, added

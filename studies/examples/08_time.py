@@ -3,7 +3,7 @@
 `ho.time_path` finds the fastest timing from rest to rest within the limits of joints, torques,
 contacts and payload. `ho.TimingLimits` adds a limit of the normal forces, or keeps to the task's
 reference speed. `ho.time_every_way` puts all timings side by side and says how wrong the cell's
-description may be (docs/timing.md).
+description may be (docs/explanation/timing.md).
 """
 
 import hybrid_opt as ho

@@ -1,10 +1,10 @@
 """Change a cell: the rack with a heavier box and other pads, and a search in it.
 
-A workcell is a file (docs/your-own-cell.md). `cell.changed` gives another cell in memory, by the
-keys of the file: `payload.mass`, `contacts.friction` of both contacts, `contacts[0].friction` of
-one, `environment.top board.xyz` by the body's name. The changed cell is checked like a file. It can
-be searched, polished, stored and exported like any other. Nothing is compiled anew where only
-numbers differ (docs/speed.md).
+A workcell is a file (docs/tutorials/two-robots.md). `cell.changed` gives another cell in memory, by
+the keys of the file: `payload.mass`, `contacts.friction` of both contacts, `contacts[0].friction`
+of one, `environment.top board.xyz` by the body's name. The changed cell is checked like a file. It
+can be searched, polished, stored and exported like any other. Nothing is compiled anew where only
+numbers differ (docs/explanation/speed.md).
 """
 
 import numpy as np

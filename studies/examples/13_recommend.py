@@ -1,9 +1,10 @@
 """Recommend the carry to run, as the robots drive it, and say why.
 
 In a drivable cell each candidate is a path and a force limit, timed as fast as all limits allow. In
-a cell that minimises robust forces the limit is about these (docs/robust.md). Wishes are about the
-commanded force, the driven duration, the payload, the reference force or the uncertainty
-(docs/results.md). The budget of the grip says before any search whether the box can be held.
+a cell that minimises robust forces the limit is about these (docs/explanation/robust.md). Wishes
+are about the commanded force, the driven duration, the payload, the reference force or the
+uncertainty (docs/reference/results.md). The budget of the grip says before any search whether the
+box can be held.
 """
 
 import numpy as np

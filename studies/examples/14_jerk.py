@@ -1,7 +1,7 @@
 """Time a carry within limits on jerk as well.
 
 Without `jerk=` the limits are those that the workcell states as `jerk_max` of its robots
-(docs/timing.md).
+(docs/explanation/timing.md).
 """
 
 import numpy as np

@@ -1,8 +1,8 @@
 """Propose a first carry and a complete workcell file for a problem.
 
 A problem file has no carry yet. `ho.propose` finds one and completes the file
-(docs/your-own-cell.md); store its text beside the problem's robots. `ho.propose_classes` finds
-several that pass what is in the way on different sides.
+(docs/tutorials/two-robots.md); store its text beside the problem's robots. `ho.propose_classes`
+finds several that pass what is in the way on different sides.
 """
 
 from pathlib import Path

@@ -1,7 +1,7 @@
 """Let start branches of the arms compete.
 
 Where the workcell says `start_branch = "search"`, pairs of branches compete before the search
-(docs/results.md).
+(docs/reference/results.md).
 """
 
 import numpy as np

@@ -1,8 +1,9 @@
 """Ask whether position control can press, and what happens if both arms do not start together.
 
 Arms that only track positions press by aiming into the box, so the force depends on their stiffness
-[N/m] (docs/job.md). A target that gives each arm a controller of its own is refused where the box
-would not survive 10 ms between their starts, or the skew that `ho.BundleOptions(skew=...)` names.
+[N/m] (docs/explanation/job.md). A target that gives each arm a controller of its own is refused
+where the box would not survive 10 ms between their starts, or the skew that
+`ho.BundleOptions(skew=...)` names.
 """
 
 import hybrid_opt as ho

@@ -1,5 +1,5 @@
-"""The figures of a campaign: the records of `summary.json` (docs/results.md), and the stage that
-makes them of a finished search, with fronts and selected trajectories."""
+"""The figures of a campaign: the records of `summary.json` (docs/reference/results.md), and the
+stage that makes them of a finished search, with fronts and selected trajectories."""
 
 from __future__ import annotations
 

@@ -1,5 +1,6 @@
-"""Reading a workcell from a TOML file, as it is or with other values. docs/workcell.md describes
-every key. Names, references, reach and what else several sections decide are checked last."""
+"""Reading a workcell from a TOML file, as it is or with other values. docs/reference/workcell.md
+describes every key. Names, references, reach and what else several sections decide are checked
+last."""
 
 from __future__ import annotations
 

@@ -386,7 +386,7 @@ USUAL = Uncertainty(
 )
 """Taken where a cell states nothing: of a cell that was set up with care. From logs of two UR5e
 that squeeze boxes (adamweinhardt/dual-arm-manipulation, commit 6699139, 206 runs); the tilt there
-contains the arms' relative angle. docs/robust.md says more."""
+contains the arms' relative angle. docs/explanation/robust.md says more."""
 
 
 @dataclass(frozen=True)

@@ -175,7 +175,7 @@ def test_every_program_is_listed(
         assert [line.removeprefix(prefix).split()[0] for line in listed] == list(PROGRAMS)
         assert all(line.startswith(prefix) and len(line) < 140 for line in listed)
         assert all(len(line.removeprefix(prefix).split()) > 3 for line in listed)
-    page = (ROOT / "docs/programs.md").read_text("utf-8")
+    page = (ROOT / "docs/reference/programs.md").read_text("utf-8")
     named = set(re.findall(r"`python -m studies\.([\w.]+)", page))
     assert set(PROGRAMS) == named | {"report"}
     assert main(["rnu"], called) == 2

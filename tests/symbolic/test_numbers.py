@@ -130,7 +130,7 @@ STRUCTURE: dict[str, dict[str, Any]] = {
     "allocation": {"task.allocation": "soft-finger"},
     "pads beside one another": {"contacts[0].xyz": [0.01, 0.2, 0.055]},
 }
-"""What is compiled anew, see docs/speed.md."""
+"""What is compiled anew, see docs/explanation/speed.md."""
 
 
 def test_structure_is_what_formulas_are_written_of() -> None:

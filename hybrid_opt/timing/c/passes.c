@@ -1,6 +1,7 @@
 /* The fastest timing of one path by a backward and a forward pass over intervals of constant u''.
 
-   docs/timing.md explains the method; `symbolic.limits.limit_layout` the coefficients at a sample.
+   docs/explanation/timing.md explains the method; `symbolic.limits.limit_layout` the coefficients
+   at a sample.
    The text before this file defines INTERVALS, JOINTS, the SIZE of a sample's row, the offset of
    every block (AT_...), RATIOS, CUTS, the lines per sample that a caller adds, HELD, the input with
    the payload's parameters, the enumerations of the limits and of their slack groups (`LIMITS` of

@@ -219,7 +219,7 @@
     seek(0);
   }
 
-  /* A trajectory file, as docs/export.md describes it. */
+  /* A trajectory file, as docs/reference/bundles.md describes it. */
   function fileOf(carry) {
     return JSON.stringify({ format: "dual-arm-carry trajectory", version: 1,
       decision: carry.decision, start: carry.start, figures: carry.figures,

@@ -36,7 +36,7 @@ from tests.symbolic.cells import rack_cell
 from tests.symbolic.read.samples import RACK, STUDIES, cells, numbers, sample_data, write
 from tests.symbolic.read.test_problems import put
 
-DOCUMENT = (STUDIES.parent / "docs" / "workcell.md").read_text(encoding="utf-8")
+DOCUMENT = (STUDIES.parent / "docs/reference/workcell.md").read_text(encoding="utf-8")
 SECTIONS = (
     "",
     "robots[0].",
