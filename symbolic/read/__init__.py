@@ -1,4 +1,4 @@
-"""Bytes to records: workcell files, robot descriptions, meshes; checks across sections last.
+"""Readers from bytes to records: workcell files, robot descriptions, meshes.
 
 cell: a whole workcell file. cell_files: that and all it names as one value. tables, elements: typed
 reading of TOML and XML. descriptions, urdf, arms: a robot's description, and the arm in it.

@@ -1,4 +1,4 @@
-"""The arms in robots' descriptions: chains of joints, Pinocchio's models, and whose link is whose.
+"""Arms in robot descriptions: chains of joints, Pinocchio models, and which arm models which link.
 
 A serial arm of six joints or more is picked from a description (`symbolic.read.urdf`); every other
 joint is held.
@@ -34,7 +34,7 @@ Positions = tuple[tuple[str, float], ...]
 
 
 def chain_joints(urdf: Urdf, root: str, tip: str) -> tuple[str, ...]:
-    """The joints between two links that move, from the root to the tip.
+    """Return the moving joints between two links, from the root to the tip.
 
     Raises:
         RobotModelError: a link does not exist, or the tip does not hang on the root.
@@ -57,7 +57,7 @@ def chain_joints(urdf: Urdf, root: str, tip: str) -> tuple[str, ...]:
 
 
 def held_joints(urdf: Urdf, moving: Sequence[str], locked: Positions) -> Positions:
-    """Every joint of a description that does not move, with the position it is held at.
+    """Return every joint of a description that does not move, with its held position.
 
     That is the one of `locked`, else zero or the nearest that its limits allow; a joint that
     mimics another stands where that one puts it.
@@ -109,7 +109,7 @@ class RobotModelWarning(DualArmWarning):
 
 @cache
 def _warn_left_out(file: str, joint: str, mimicked: str) -> None:
-    """Say once that a joint does not follow another."""
+    """Warn once that a joint does not follow the joint that it mimics."""
     warnings.warn(
         f"{file}: joint {joint!r} does not follow {mimicked!r}, which moves; what hangs on it has "
         "neither shape nor mass",
@@ -119,7 +119,6 @@ def _warn_left_out(file: str, joint: str, mimicked: str) -> None:
 
 
 def _is_empty_behind(urdf: Urdf, joint: str) -> bool:
-    """Return True if no link that hangs on a joint has a collision shape or a mass."""
     behind = {link for link in urdf.links if joint in urdf.above(link)}
     tree = ElementTree.fromstring(urdf.kinematics)
     heavy = {link.get("name") for link in tree.iter("link") if _mass(link) > 0.0}
@@ -132,7 +131,8 @@ def _mass(link: ElementTree.Element) -> float:
 
 
 def without_links(urdf: Urdf, patterns: tuple[str, ...]) -> Urdf:
-    """A description without some links, all that hangs on them, and the joints that move these.
+    """Return a description without some links, without what hangs on them and the joints that move
+    them.
 
     Args:
         urdf: the description.
@@ -174,7 +174,7 @@ def without_links(urdf: Urdf, patterns: tuple[str, ...]) -> Urdf:
 
 
 def listed(names: Sequence[str], most: int = 20) -> str:
-    """Names for a message, the first of many."""
+    """List names for a message, at most the first `most`."""
     text = ", ".join(repr(name) for name in names[:most]) or "none"
     return f"{text} and {len(names) - most} more" if len(names) > most else text
 
@@ -187,13 +187,13 @@ FOLLOWING = 6
 
 
 def robot_urdf(robot: Robot) -> Urdf:
-    """The description of a robot of a workcell, without the links that it drops."""
+    """Read the description of a workcell's robot, without the links of `drop_links`."""
     urdf = read_urdf(robot.urdf, robot.xacro_arguments, robot.package_dirs)
     return without_links(urdf, robot.drop_links) if robot.drop_links else urdf
 
 
 def reduced_model(urdf: Urdf, held: Positions = ()) -> pin.Model:
-    """The Pinocchio model of a URDF with some joints held.
+    """Return the Pinocchio model of a URDF with some joints held.
 
     Args:
         urdf: the robot's description.
@@ -208,7 +208,7 @@ def reduced_model(urdf: Urdf, held: Positions = ()) -> pin.Model:
 
 @lru_cache(maxsize=16)
 def _reduced(kinematics: str, file: str, held: Positions) -> pin.Model:
-    """See `reduced_model`; not to be modified."""
+    """Build the model of `reduced_model`; cached, so callers must not modify it."""
     try:
         model = pin.buildModelFromXML(kinematics)
     except (ValueError, RuntimeError, IndexError) as error:
@@ -229,7 +229,7 @@ def _reduced(kinematics: str, file: str, held: Positions) -> pin.Model:
 
 
 def moving_joints(urdf: Urdf, chain_root: str, flange: str, locked: Positions) -> tuple[str, ...]:
-    """The joints that move an arm's flange.
+    """Return the joints that move an arm's flange.
 
     Args:
         urdf: the robot's description.
@@ -251,7 +251,8 @@ def moving_joints(urdf: Urdf, chain_root: str, flange: str, locked: Positions) -
 
 
 def arm_model(robot: Robot) -> pin.Model:
-    """The model of a robot of a workcell: its chain, all else held, its tool's mass included.
+    """Return a robot's model: its chain of moving joints, other joints held, the tool's mass
+    included.
 
     Raises:
         RobotModelError: it is not a serial arm with that flange.
@@ -272,19 +273,20 @@ def arm_model(robot: Robot) -> pin.Model:
 
 @lru_cache(maxsize=16)
 def _problems(kinematics: str, file: str, held: Positions, flange: str) -> tuple[str, ...]:
-    """What keeps a description from being an arm with that flange."""
+    """List the reasons why a description is not an arm with that flange."""
     model = _reduced(kinematics, file, held)
     found = structure_problem(model), flange_problem(model, flange)
     return tuple(problem for problem in found if problem)
 
 
 def turning_joints(model: pin.Model) -> tuple[bool, ...]:
-    """Which joints of an arm turn, in the order of q; the others slide."""
+    """Return, per joint in the order of q, True for a revolute joint and False for a prismatic
+    one."""
     return tuple(str(joint.shortname()).startswith("JointModelR") for joint in model.joints[1:])
 
 
 def structure_problem(model: pin.Model) -> str:
-    """Why a model is no serial arm of at least six joints, or an empty string."""
+    """Return why a model is not a serial arm of at least six joints, or an empty string."""
     names = list(model.names)[1:]
     if len(names) < FOLLOWING:
         return (
@@ -307,7 +309,7 @@ def structure_problem(model: pin.Model) -> str:
 
 
 def flange_problem(model: pin.Model, flange: str) -> str:
-    """Why a frame cannot carry the tool, or an empty string."""
+    """Return why a frame cannot carry the tool, or an empty string."""
     bodies = [frame.name for frame in model.frames if frame.type == pin.FrameType.BODY]
     tip = model.njoints - 1
     last = [x for x in bodies if model.frames[link_frame(model, x)].parentJoint == tip]
@@ -320,7 +322,7 @@ def flange_problem(model: pin.Model, flange: str) -> str:
 
 
 def link_frame(model: pin.Model, link: str) -> int:
-    """Index of a link's frame; a joint may have the same name."""
+    """Return the index of a link's frame; a joint may have the same name."""
     return int(model.getFrameId(link, pin.FrameType.BODY))
 
 
@@ -355,7 +357,7 @@ Arms = tuple[Robot, Robot]
 
 @dataclass(frozen=True)
 class ArmLinks:
-    """The links with collision shapes that are modelled as an arm's, in the order of its file.
+    """Links with collision shapes that are modelled as one arm's, in the order of its file.
 
     Attributes:
         moved: links behind the arm's first moving joint; those that only common joints move are
@@ -371,7 +373,8 @@ class ArmLinks:
 
 
 def one_machine(robots: Arms) -> bool:
-    """Whether two robots are the arms of one machine: chains of one description at one place."""
+    """Return True if two robots are arms of one machine: chains of one description at one base
+    pose."""
     first, second = robots
     return (
         bool(first.chain_root and second.chain_root)
@@ -382,7 +385,7 @@ def one_machine(robots: Arms) -> bool:
 
 
 def arm_links(robots: Arms, i: int) -> ArmLinks:
-    """The links that are modelled as arm i's (0 or 1)."""
+    """Return the links that are modelled as arm i's (0 or 1)."""
     carried = _carriers(robots[i])
     still = [link for link in carried if carried[link] == UNMOVED]
     moved = [link for link in carried if carried[link] != UNMOVED]
@@ -402,7 +405,8 @@ UNMOVED = "universe"
 
 
 def common_joints(robots: Arms) -> tuple[str, ...]:
-    """Joints that move both arms of one machine, in their order."""
+    """Return the joints that move both arms of one machine, in the order of the first arm's
+    chain."""
     if not one_machine(robots):
         return ()
     first, second = (tuple(arm_model(robot).names)[1:] for robot in robots)
@@ -410,7 +414,7 @@ def common_joints(robots: Arms) -> tuple[str, ...]:
 
 
 def machine_problem(robots: Arms) -> str:
-    """Why two robots cannot be the arms of one machine, or an empty string."""
+    """Return why two robots cannot be the arms of one machine, or an empty string."""
     if not one_machine(robots):
         return ""
     chains, held = [], []
@@ -448,12 +452,11 @@ def machine_problem(robots: Arms) -> str:
 
 
 def _is_behind(urdf: Urdf, link: str, joints: Collection[str]) -> bool:
-    """Whether a link hangs on one of these joints."""
     return any(name in joints for name in urdf.above(link))
 
 
 def _carriers(robot: Robot) -> dict[str, str]:
-    """The last joint of the arm that moves each link with shapes; 'universe' of one that stands
+    """Return the last arm joint before each link with shapes; 'universe' for a link that stands
     still."""
     model = arm_model(robot)
     links = robot_urdf(robot).collisions
@@ -461,7 +464,7 @@ def _carriers(robot: Robot) -> dict[str, str]:
 
 
 def _mount(robot: Robot, still: Collection[str]) -> str:
-    """The last link with shapes on the way from the root to the arm's first own joint."""
+    """Return the last link with shapes on the way from the root to the arm's first own joint."""
     urdf = robot_urdf(robot)
     way = (robot.flange, *(urdf.joints[name].parent for name in urdf.above(robot.flange)))
     return next((link for link in way if link in still), "")
@@ -471,7 +474,7 @@ def _mount(robot: Robot, still: Collection[str]) -> str:
 
 
 def body_names(workcell: Workcell) -> dict[str, tuple[str, ...]]:
-    """The names by which collision pairs are addressed, per owner.
+    """Return the names by which collision pairs are addressed, per owner.
 
     The payload is `payload`, an environment body has its own name, a link or tool body of a
     robot is `ROBOT/NAME`; what stands still of a machine with both arms bears the name of the

@@ -1,6 +1,6 @@
-"""Reading a workcell from a TOML file, as it is or with other values. docs/reference/workcell.md
-describes every key. Names, references, reach and what else several sections decide are checked
-last."""
+"""Read a workcell from a TOML file, as written or with changed values. docs/reference/workcell.md
+describes every key. Names, references, reach and other conditions on several sections are
+checked last."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ def load(
 
 
 def changed(workcell: Workcell, changes: Mapping[str, Any]) -> Workcell:
-    """The workcell with other values of some keys of its file, checked like a file.
+    """Return the workcell with changed values of some keys of its file, checked like a file.
 
     Args:
         workcell: read from a file.
@@ -119,7 +119,8 @@ def changed(workcell: Workcell, changes: Mapping[str, Any]) -> Workcell:
 def _build(
     table: Table, source: Path, content: bytes, stored: bool, reach: bool
 ) -> Workcell | None:
-    """The records, as far as they can be built; None where a section has the wrong count."""
+    """Build as many records as possible; return None if a section has the wrong number of
+    entries."""
     problems, folder = table.problems, source.parent
     name = table.text("name")
     robots = [read_robot(entry, folder, stored) for entry in table.tables("robots", exactly=2)]
@@ -169,7 +170,7 @@ def _build(
 
 
 def _digest(content: bytes, workcell: Workcell) -> str:
-    """SHA-256 over a workcell file and the content of every file it names.
+    """Compute the SHA-256 of a workcell file and of the content of every file it names.
 
     Where the files stand does not matter, only what is in them: the file's own bytes, per robot
     its URDF (a xacro file as it expands), the meshes the URDF names and its SRDF, and the meshes
@@ -193,7 +194,7 @@ def _digest(content: bytes, workcell: Workcell) -> str:
 
 
 def _named(workcell: Workcell) -> Iterator[bytes]:
-    """The content of every file that a workcell names, nothing for a missing one."""
+    """Yield the content of every file that a workcell names, empty for a missing file."""
     for robot in workcell.robots:
         yield description_content(robot.urdf, robot.xacro_arguments, robot.package_dirs)
         urdf = robot_urdf(robot)
@@ -220,7 +221,7 @@ def _content(path: Path, most: int) -> bytes:
 
 
 def with_branches(content: bytes, data: Mapping[str, Any], decided: tuple[int, int]) -> bytes:
-    """A workcell file's text with start branches in the place of "search", where decided.
+    """Return a workcell file's text with `start_branch = "search"` replaced by the branches found.
 
     Raises:
         SettingsError: see `symbolic.read.editing.completed`.
@@ -251,7 +252,7 @@ _INDEX = re.compile(r"\[(\d+)\]\.?(.*)", re.DOTALL)
 
 
 def changed_text(content: bytes, changes: Mapping[str, Any], file: str) -> bytes:
-    """The text of a workcell file in which some keys have other values; comments are lost.
+    """Return the text of a workcell file with changed values of some keys; comments are lost.
 
     Args:
         content: of the file.
@@ -283,12 +284,13 @@ def changed_text(content: bytes, changes: Mapping[str, Any], file: str) -> bytes
 
 @lru_cache(maxsize=4)
 def _tables_of(content: bytes) -> dict[str, Any]:
-    """Its tables, not to be modified: many cells are tried out that differ from one."""
+    """Parse the tables, cached because many variants of one cell are tried; callers must not
+    modify them."""
     return outside.toml_tables(content)
 
 
 def _owners(table: Any, path: str) -> Iterator[tuple[dict[str, Any], str]]:
-    """Every table that a key path ends in, and its last key."""
+    """Yield every table that a key path ends in, with the path's last key."""
     key, _, rest = path.partition(".")
     name, bracket, index = key.partition("[")
     if bracket:
@@ -306,7 +308,7 @@ def _owners(table: Any, path: str) -> Iterator[tuple[dict[str, Any], str]]:
 
 
 def _among(tables: list[dict[str, Any]], rest: str) -> Iterator[tuple[dict[str, Any], str]]:
-    """The same of an array of tables, by an index, a name, or all of them."""
+    """Yield the same for an array of tables, selected by index or name, or all of them."""
     if found := _INDEX.match(rest):
         k = int(found[1])
         if k < len(tables):
@@ -318,7 +320,7 @@ def _among(tables: list[dict[str, Any]], rest: str) -> Iterator[tuple[dict[str, 
 
 
 def _plain(value: Any) -> Any:
-    """A value as TOML knows it."""
+    """Convert NumPy values to plain values of TOML."""
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()
     if isinstance(value, Mapping):
@@ -335,7 +337,7 @@ REACH_SLACK = 1e-6  # [m], rounding of a flange exactly at full stretch
 
 
 def check_names(workcell: Workcell, problems: Problems) -> None:
-    """Names are unique where they are used to address something."""
+    """Check that names are unique where they address something."""
     robots = [(f"robots[{i}].name", robot.name) for i, robot in enumerate(workcell.robots)]
     bodies = [(f"environment[{i}].name", b.name) for i, b in enumerate(workcell.environment)]
     _check_unique([("'payload' (reserved)", PAYLOAD), *robots, *bodies], problems)
@@ -364,7 +366,7 @@ def _check_unique(entries: list[tuple[str, str]], problems: Problems) -> None:
 
 
 def check_contacts(workcell: Workcell, problems: Problems) -> None:
-    """The pads can hold the payload whatever the motion asks, as the allocation takes them."""
+    """Check that the pads can hold the payload under any motion, as the allocation models them."""
     if not problems.clean("contacts", "task.allocation", *SHAPE_KEYS):
         return
     allocation, first = workcell.task.allocation, workcell.contacts[0].T_box_pad
@@ -395,7 +397,7 @@ def check_contacts(workcell: Workcell, problems: Problems) -> None:
 
 
 def _check_beside(workcell: Workcell, room: float, meaning: str, problems: Problems) -> None:
-    """Pads lie beside one another by less than most of some room [m]."""
+    """Check that the pads' lateral offset is less than `PATCH_OVERLAP` times `room` [m]."""
     beside, room = workcell.pads_beside, PATCH_OVERLAP * room
     if beside >= room:
         problems.add(
@@ -407,7 +409,8 @@ def _check_beside(workcell: Workcell, room: float, meaning: str, problems: Probl
 
 
 def check_uncertainty(workcell: Workcell, problems: Problems) -> None:
-    """Displaced pads keep some of their patches, and these face one another."""
+    """Check that displaced pads stay on part of their patches, and that these still face each
+    other."""
     displaced = workcell.uncertainty.pad_position
     if not (displaced and workcell.uncertainty.stated) or not problems.clean(
         "uncertainty", "contacts", *SHAPE_KEYS
@@ -430,7 +433,8 @@ def check_uncertainty(workcell: Workcell, problems: Problems) -> None:
 
 
 def check_shapes(workcell: Workcell, problems: Problems) -> None:
-    """There are not more collision shapes than convex pieces allowed; a mesh has at least one."""
+    """Check that the shapes do not exceed the allowed convex pieces; a mesh has at least one
+    piece."""
     most = workcell.collision.most_pieces
     if not problems.clean("collision.most_pieces", *_of_robots("urdf")):
         return
@@ -451,7 +455,7 @@ def check_shapes(workcell: Workcell, problems: Problems) -> None:
 
 
 def check_references(workcell: Workcell, problems: Problems) -> None:
-    """Names in allowed contacts and ignored pairs exist."""
+    """Check that the names in allowed contacts and ignored pairs exist."""
     if not problems.clean("environment"):
         return
 
@@ -477,18 +481,18 @@ ARM_KEYS = ("urdf", "chain", "locked_joints", "drop_links")
 
 
 def _of_robots(*parts: str) -> list[str]:
-    """Keys of both robots."""
     return [f"robots[{index}].{part}" for index in (0, 1) for part in parts]
 
 
 def check_machine(workcell: Workcell, problems: Problems) -> None:
-    """Two arms of one machine move apart from one another, and agree on what stands still."""
+    """Check that two arms of one machine move independently and agree on the links that stand
+    still."""
     if problems.clean(*_of_robots(*ARM_KEYS)) and (problem := machine_problem(workcell.robots)):
         problems.add("robots[1].chain", problem)
 
 
 def check_speeds(workcell: Workcell, problems: Problems) -> None:
-    """The reference speeds are within the payload's own limits."""
+    """Check that the reference speeds are within the payload's own limits."""
     for key, limit_key in (
         ("reference_speed", "velocity_max"),
         ("reference_angular_speed", "angular_velocity_max"),
@@ -502,7 +506,7 @@ def check_speeds(workcell: Workcell, problems: Problems) -> None:
 
 
 def check_reach(workcell: Workcell, problems: Problems) -> None:
-    """No fixed pose asks for more than the stretched length of an arm.
+    """Check that no fixed pose is farther away than the stretched length of an arm.
 
     This is necessary, not sufficient: it costs no inverse kinematics.
     """
@@ -529,7 +533,7 @@ def check_reach(workcell: Workcell, problems: Problems) -> None:
 
 
 def stretched_length(robot: Robot) -> tuple[Array, float]:
-    """Where the first joint stands (3,) [m] in the world, and an upper bound of the reach [m].
+    """Return the first joint's position (3,) in the world and an upper bound of the reach [m].
 
     The bound is the sum of the distances between successive joints and the flange, and of how far
     joints may slide.
@@ -559,7 +563,7 @@ def _fixed_poses(workcell: Workcell) -> Iterator[tuple[str, Array]]:
 
 
 def check_all(workcell: Workcell, problems: Problems, reach: bool) -> None:
-    """Make every check across sections that needs no inverse kinematics; `reach` as of `load`."""
+    """Make every check across sections that needs no inverse kinematics; `reach` as in `load`."""
     checks: tuple[Callable[[Workcell, Problems], None], ...] = (
         check_machine,
         check_shapes,

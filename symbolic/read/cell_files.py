@@ -1,4 +1,4 @@
-"""A workcell file with every file it names, as one value that can be stored and unpacked.
+"""A workcell file and every file it names, as one value that can be stored and unpacked.
 
 The layout keeps the file's own relative references valid, so that the workcell's digest stays
 the same. Absolute references are replaced by relative ones. Unpacking writes below one folder
@@ -133,7 +133,7 @@ Encoding = Literal["utf-8", "zlib+base64"]
 
 @dataclass(frozen=True)
 class StoredFile:
-    """A file as JSON values: text as it is, binary and large files compressed."""
+    """A file as JSON values: text unchanged, binary and large files compressed."""
 
     path: str
     sha256: str
@@ -152,7 +152,7 @@ class StoredFiles:
 
 
 def cell_to_json(stored: CellFiles) -> dict[str, Any]:
-    """The files as JSON values, see `StoredFiles`."""
+    """Convert the files to JSON values, see `StoredFiles`."""
     files = [asdict(_packed(name, stored.files[name])) for name in sorted(stored.files)]
     return {
         "workcell": stored.workcell,
@@ -163,7 +163,7 @@ def cell_to_json(stored: CellFiles) -> dict[str, Any]:
 
 
 def cell_from_json(data: Any) -> CellFiles:
-    """The files from JSON values, every field checked.
+    """Read the files from JSON values, checking every field.
 
     Raises:
         BundleError: with the field that is wrong.
@@ -222,12 +222,11 @@ def _check_name(name: str, key: str) -> None:
 
 
 def _is_plain(name: str) -> bool:
-    """Return True if every system can hold a normalised relative path; it may lead upwards."""
     return all(part not in ("", ".") and not re.search(_UNSAFE, part) for part in name.split("/"))
 
 
 def _check_references(stored: CellFiles, root: Path) -> None:
-    """No reference of the workcell or of its URDFs may lead out of the files."""
+    """Refuse a workcell or URDF that refers to anything outside the stored files."""
     base = posixpath.dirname(stored.workcell)
     for reference, package_dirs in references(parse_toml(stored.files[stored.workcell])):
         target = joined(base, reference)
@@ -257,7 +256,7 @@ def _check_references(stored: CellFiles, root: Path) -> None:
 
 
 class CellCollector:
-    """Gathers a workcell's files and gives each a place relative to the workcell file."""
+    """Collect a workcell's files and assign each a place relative to the workcell file."""
 
     def __init__(self, source: Path, text: bytes | None = None) -> None:
         self._source = source
@@ -299,7 +298,7 @@ class CellCollector:
             self._text = completed(outside.text(self._text), stated, changes).encode()
 
     def layout(self) -> tuple[str, dict[str, bytes], tuple[str, ...]]:
-        """Everything collected, moved so that no path leads upwards.
+        """Return everything collected, moved so that no path leads upwards.
 
         Returns:
             The path of the workcell file, the content of every file by path, and the package
@@ -318,12 +317,9 @@ class CellCollector:
         return workcell, files, tuple(folders)
 
     def _place(self, reference: str) -> str:
-        """The place of a reference of the workcell file, relative to that file."""
         return posixpath.normpath(self._address(reference))
 
     def _address(self, reference: str) -> str:
-        """Return the stored file's reference: the same if it is relative and any system can hold
-        it."""
         place = posixpath.normpath(reference)
         if not reference.startswith(PACKAGE_SCHEME) and (place == "." or _is_plain(place)):
             turns_back = reference.split("/").count("..") > place.split("/").count("..")
@@ -338,7 +334,7 @@ class CellCollector:
         return f"embedded/{self._moved}/{name or 'folder'}"
 
     def _with_meshes(self, robot: Robot, place: str, packages: list[tuple[Path, str]]) -> bytes:
-        """Add the meshes of a URDF; its content with this machine's addresses replaced."""
+        """Add the meshes of a URDF; return its content with this machine's addresses replaced."""
         path = robot.urdf
         with _told():
             content = description_content(path, robot.xacro_arguments, robot.package_dirs)
@@ -362,7 +358,8 @@ class CellCollector:
     def _own_place(
         address: str, urdf: Path, place: str, packages: list[tuple[Path, str]]
     ) -> str | None:
-        """Where a mesh address leads within the workcell's own folders; None beyond them."""
+        """Return the path of a mesh within the workcell's own folders, or None if it lies
+        outside them."""
         if address.startswith(PACKAGE_SCHEME):
             held = (at for folder, at in packages if resolve_mesh(address, urdf, (folder,)))
             folder = next(held, None)
@@ -378,7 +375,7 @@ def _content(path: Path, most: int) -> bytes:
 
 @contextmanager
 def _told(subject: str = "") -> Iterator[None]:
-    """Tell what is wrong with something as an error of this module."""
+    """Raise errors of other modules as a `BundleError` about `subject`."""
     try:
         yield
     except DualArmError as error:
@@ -386,7 +383,7 @@ def _told(subject: str = "") -> Iterator[None]:
 
 
 def _replaced(text: str, reference: str, moved: str, file: str) -> str:
-    """Text with every quoted occurrence of a reference replaced."""
+    """Replace every quoted occurrence of a reference in a text."""
     for quote in ('"', "'"):
         if f"{quote}{reference}{quote}" in text:
             return text.replace(f"{quote}{reference}{quote}", f"{quote}{moved}{quote}")
@@ -397,12 +394,12 @@ def _replaced(text: str, reference: str, moved: str, file: str) -> str:
 
 
 def joined(base: str, reference: str) -> str:
-    """A reference seen from the folder that `base` is relative to, `..` resolved."""
+    """Resolve a reference that is relative to `base`, including `..`."""
     return posixpath.normpath(posixpath.join(base, reference))
 
 
 def parse_toml(content: bytes) -> dict[str, Any]:
-    """The tables of a workcell file.
+    """Parse the tables of a workcell file.
 
     Raises:
         BundleError: it is not TOML.
@@ -412,7 +409,7 @@ def parse_toml(content: bytes) -> dict[str, Any]:
 
 
 def references(data: Mapping[str, Any]) -> Iterator[tuple[str, list[str] | None]]:
-    """Files named by a workcell: the reference and, for a URDF, its package folders.
+    """Yield the files that a workcell names: the reference and, for a URDF, its package folders.
 
     Raises:
         BundleError: a key is missing or has another type.
@@ -439,7 +436,7 @@ def _meshes(bodies: Any) -> Iterator[tuple[str, None]]:
 
 
 def drivable_files(stored: CellFiles) -> CellFiles:
-    """The files of a cell (`collect_cell`) under 'optimal'.
+    """Return the files of a cell (`collect_cell`) with the time law changed to 'optimal'.
 
     Raises:
         BundleError: the file writes the task in a way that cannot be changed line by line, or the

@@ -1,4 +1,4 @@
-"""Where robot descriptions and their meshes lie, and what xacro macros in them expand to.
+"""Locations of robot descriptions and their meshes, and the expansion of xacro macros.
 
 Packages are looked up in given folders, above the description, where ROS's environment variables
 point, and beside the installed Python packages.
@@ -47,7 +47,7 @@ _SKIPPED = ("build", "devel", "install", "log")
 
 
 def find_package(name: str, package_dirs: Sequence[Path], description: Path) -> Path | None:
-    """The folder of a package, or None where there is none.
+    """Return the folder of a package, or None if there is none.
 
     In this order: in one of `package_dirs`; a folder NAME above the description; `share/NAME` below
     each prefix of AMENT_PREFIX_PATH; in or at most `DEEPEST_PACKAGE` levels below a folder of
@@ -66,7 +66,7 @@ def find_package(name: str, package_dirs: Sequence[Path], description: Path) -> 
 
 
 def _packages(name: str, package_dirs: Sequence[Path], description: Path) -> Iterator[Path]:
-    """Folders of a package, the first one first."""
+    """Yield the folders of a package in order of precedence."""
     for folder in package_dirs:
         package = package_in(folder, name)
         if package is not None:
@@ -84,8 +84,7 @@ def _packages(name: str, package_dirs: Sequence[Path], description: Path) -> Ite
 
 
 def package_in(folder: Path, name: str) -> Path | None:
-    """The folder NAME in a folder, else the one whose package.xml says so; None where neither is
-    there."""
+    """Return the subfolder called `name`, else one whose package.xml has that name, else None."""
     if os.path.isdir(folder / name):
         return folder / name
     try:
@@ -96,7 +95,7 @@ def package_in(folder: Path, name: str) -> Path | None:
 
 
 def _package_name(folder: Path) -> str | None:
-    """What a folder's package.xml says, None where it has none."""
+    """Return the name in a folder's package.xml, or None without one."""
     file = folder / "package.xml"
     if not file.is_file():
         return None
@@ -110,7 +109,7 @@ def _package_name(folder: Path) -> str | None:
 def further_package_dirs(
     addresses: Iterable[str], package_dirs: Sequence[Path], description: Path
 ) -> tuple[Path, ...]:
-    """Folders besides `package_dirs` that hold the packages of mesh addresses, each once.
+    """Return folders besides `package_dirs` that hold the packages of mesh addresses, each once.
 
     A package that a given folder already holds is left out, and one that is nowhere.
     """
@@ -129,7 +128,7 @@ def _paths(variable: str) -> Iterator[Path]:
 
 
 def _below(folder: Path, name: str, levels: int) -> Iterator[Path]:
-    """Folders of that name with a package.xml, in a folder or below it."""
+    """Yield folders with that name and a package.xml, in a folder or up to `levels` below it."""
     is_package = (folder / "package.xml").is_file()
     if folder.name == name and is_package:
         yield folder
@@ -144,7 +143,7 @@ def _below(folder: Path, name: str, levels: int) -> Iterator[Path]:
 
 
 def resolve_mesh(address: str, urdf: Path, package_dirs: Sequence[Path]) -> Path | None:
-    """The file behind a mesh address of a URDF, or None where there is none.
+    """Return the file behind a mesh address of a URDF, or None if it does not exist.
 
     `package://NAME/REST` is looked up in the package NAME of each folder (`package_in`); `file://`
     addresses are absolute; anything else is relative to the URDF's folder.
@@ -179,8 +178,7 @@ Parts = tuple[tuple[str, bytes], ...]
 def description_content(
     path: Path, arguments: Arguments = (), package_dirs: Sequence[Path] = ()
 ) -> bytes:
-    """The URDF text of a robot's description: the file's own, or what its macros expand to, or what
-    an MJCF file says.
+    """Return the URDF text of a robot's description: unchanged, expanded from xacro, or from MJCF.
 
     Args:
         path: a URDF, a xacro or an MJCF file.
@@ -212,12 +210,13 @@ def description_content(
 
 
 def is_mjcf(content: bytes) -> bool:
-    """Whether the root of a file is MuJoCo's."""
+    """Return True if the root element is MuJoCo's."""
     return _MJCF.match(content) is not None
 
 
 def is_xacro(content: bytes) -> bool:
-    """Whether a description holds macros to be expanded; generated URDFs often keep the name."""
+    """Return True if a description holds macros to expand; generated URDFs often keep the
+    suffix."""
     return _XACRO.search(content) is not None and _MACRO.search(content) is not None
 
 
@@ -225,7 +224,7 @@ def is_xacro(content: bytes) -> bool:
 def _expanded(
     path: Path, content: bytes, arguments: Arguments, package_dirs: tuple[Path, ...]
 ) -> tuple[bytes | None, Parts]:
-    """The expanded text, and path and digest of every file that was included.
+    """Return the expanded text and, for every included file, its path and digest.
 
     The text is None where it took too long: that is remembered too, since both robots of a cell
     may name the file.
@@ -245,7 +244,7 @@ def _expanded(
 
 
 def _answer(request: Any) -> Any:
-    """What the process says to a request; None where it takes too long."""
+    """Send a request to the expanding process; return its answer, or None after a timeout."""
     paths = [os.path.abspath(entry) for entry in sys.path]
     with tempfile.TemporaryFile() as answer:
         try:
@@ -272,7 +271,7 @@ def _answer(request: Any) -> Any:
 
 
 def _state(paths: Iterable[str]) -> Parts:
-    """Each file with the digest of its content; with nothing where it is missing."""
+    """Return each file with the digest of its content, empty if it is missing."""
     return tuple((path, _digest(path) if os.path.exists(path) else b"") for path in paths)
 
 
@@ -299,7 +298,7 @@ _WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC
 
 
 def main() -> int:
-    """Answer the request on standard input; the exit code."""
+    """Answer the request on standard input; return the exit code."""
     request = json.load(sys.stdin)
     path = Path(request["path"])
     answer, sys.stdout = sys.stdout, io.StringIO()
@@ -317,7 +316,7 @@ def main() -> int:
 
 
 def _limit(size: int) -> None:
-    """Bound what is left of this process's life."""
+    """Bound the process's remaining time, file size and memory for an input of `size` bytes."""
     for kind, most in (
         (resource.RLIMIT_CORE, 0),
         (resource.RLIMIT_CPU, CPU_SECONDS),
@@ -331,7 +330,8 @@ def _limit(size: int) -> None:
 
 
 def _refuse_deeds(event: str, arguments: tuple[Any, ...]) -> None:
-    """An expansion reads files; whatever else its expressions find a way to is refused."""
+    """Audit hook: let an expansion read files, and refuse everything else that its expressions
+    try."""
     writes = event == "open" and isinstance(arguments[2], int) and arguments[2] & _WRITING
     if writes or (event.startswith(_REFUSED) and event not in _LOOKING):
         raise OutsideError(f"holds an expression that does more than compute ({event})")
@@ -340,7 +340,7 @@ def _refuse_deeds(event: str, arguments: tuple[Any, ...]) -> None:
 def _expand(
     xacro: Any, path: Path, arguments: Mapping[str, str], package_dirs: list[str]
 ) -> dict[str, Any]:
-    """The expanded text, and the paths of the files that were included."""
+    """Return the expanded text and the paths of the included files."""
     found: dict[str, Path] = {}
 
     def find(name: str) -> str:
@@ -368,7 +368,7 @@ def _expand(
 
 
 def _opened(name: str) -> io.StringIO:
-    """An included file, through the door; what is missing may be optional."""
+    """Open an included file within the size bounds; a missing file may be optional."""
     if not os.path.exists(name):
         raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), name)
     try:
@@ -378,7 +378,7 @@ def _opened(name: str) -> io.StringIO:
 
 
 def _by_package(address: str, packages: Mapping[str, Path]) -> str:
-    """A mesh address without this machine's folders, as far as they are those of packages."""
+    """Replace this machine's package folders in a mesh address by `package://NAME`."""
     for name, folder in packages.items():
         start = f"{folder}/"
         if address.removeprefix("file://").startswith(start):
@@ -387,7 +387,7 @@ def _by_package(address: str, packages: Mapping[str, Path]) -> str:
 
 
 def _refusal(error: BaseException, xacro: Any) -> str:
-    """What went wrong, and in which file and macro."""
+    """Describe an error by its causes, with the file and the macro."""
     causes = [error]
     for one in causes:  # an error and those that it was made of
         inner = (getattr(one, "exc", None), one.__cause__, one.__context__)

@@ -1,4 +1,4 @@
-"""The text of a workcell file with other values, comments and order as they were.
+"""Changes to the text of a workcell file that keep comments and order.
 
 TOML Kit takes long to load, so that readers of cells import this module where they change a text.
 """
@@ -26,7 +26,7 @@ INLINE = ("base", "pad")
 
 
 def completed(text: str, data: Mapping[str, Any], changes: Changes) -> str:
-    """A workcell file's text with values set.
+    """Return a workcell file's text with values set.
 
     Args:
         text: the file; '' to write `data` without comments.
@@ -43,7 +43,7 @@ def completed(text: str, data: Mapping[str, Any], changes: Changes) -> str:
 
 
 def with_paths(data: Mapping[str, Any], change: Callable[[str], str]) -> Changes:
-    """Changes by which the paths of robots, tools, environment and payload are others.
+    """Return changes that replace the paths of robots, tools, environment and payload.
 
     Args:
         data: the tables of a workcell file.
@@ -76,7 +76,7 @@ def with_paths(data: Mapping[str, Any], change: Callable[[str], str]) -> Changes
 
 
 def extended(text: str, data: Mapping[str, Any], key: str, tables: list[dict[str, Any]]) -> str:
-    """A workcell file's text with tables added behind those of an array, as `[[environment]]`.
+    """Return a workcell file's text with tables appended to an array, such as `[[environment]]`.
 
     Args:
         text, data: the file, and what it holds.
@@ -103,7 +103,7 @@ def extended(text: str, data: Mapping[str, Any], key: str, tables: list[dict[str
 def _edited(
     text: str, wanted: Mapping[str, Any], edit: Callable[[tomlkit.TOMLDocument], None]
 ) -> str:
-    """A text after an edit that has to make it say what is wanted."""
+    """Edit a text, and check that the result parses to the wanted values."""
     with suppress(OutsideError, TOMLKitError, LookupError, TypeError, ValueError):
         document = tomlkit.parse(text)
         edit(document)
@@ -117,7 +117,8 @@ def _edited(
 
 
 def _alike(found: Any, wanted: Any) -> bool:
-    """Whether values are equal; what is no number is like itself, and told by the reader."""
+    """Return True if values are equal; non-numbers such as NaN equal themselves, the reader
+    refuses them."""
     if isinstance(found, Mapping) and isinstance(wanted, Mapping):
         return found.keys() == wanted.keys() and all(_alike(found[k], wanted[k]) for k in found)
     if isinstance(found, list) and isinstance(wanted, list):
@@ -126,7 +127,7 @@ def _alike(found: Any, wanted: Any) -> bool:
 
 
 def merged(data: Any, changes: Any) -> Any:
-    """Content of a file after the changes, as plain values; also changes after further ones."""
+    """Merge changes into plain values; None removes a key. Also merges two sets of changes."""
     if isinstance(changes, Mapping) and isinstance(data, Mapping):
         found = dict(data)
         for key, value in changes.items():
@@ -163,8 +164,8 @@ def _apply(place: Any, changes: Any) -> None:
 
 
 def _cut_heading(place: Any) -> list[Any]:
-    """Take away the blank line at a table's end and what follows it: comments there are about the
-    next table, before which new ones go."""
+    """Remove and return a table's trailing blank line and comments: they belong to the next table,
+    and new tables go before them."""
     body = _last_body(place)
     blank = end = len(body)
     while end and body[end - 1][0] is None:
@@ -177,8 +178,8 @@ def _cut_heading(place: Any) -> list[Any]:
 
 
 def _last_body(place: Any) -> list[Any]:
-    """Pairs of keys, None for comments and blank lines, and items of the table that ends a table;
-    none where one is written in one line, or in several places."""
+    """Return the (key, item) pairs of a table's last part, with key None for comments and blank
+    lines; empty for an inline table or one written in several places."""
     if isinstance(place, AoT):
         return _last_body(place[-1]) if len(place) else []
     if not isinstance(place, Table | tomlkit.TOMLDocument):
@@ -188,7 +189,7 @@ def _last_body(place: Any) -> list[Any]:
 
 
 def _item(value: Any) -> Any:
-    """A value as TOML: tables with headings, rows of numbers one below the other."""
+    """Convert a value to TOML: tables with headings, one row of numbers per line."""
     if isinstance(value, Mapping):
         table = tomlkit.table()
         for key, entry in value.items():

@@ -1,4 +1,4 @@
-"""Elements of an XML document, read attribute by attribute, every problem with its place."""
+"""Elements of an XML document, read attribute by attribute; every problem names its place."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
 
 
 class _LimitedBuilder(ElementTree.TreeBuilder):
-    """Builds elements, but neither too many nor too deep."""
+    """Build elements, with bounds on their number and depth."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -46,7 +46,7 @@ class _LimitedBuilder(ElementTree.TreeBuilder):
 
 
 def parse_elements(document: str, root_tag: str = "robot") -> ElementTree.Element:
-    """The root element of an XML document, of that tag.
+    """Parse an XML document and return its root element, which must have the given tag.
 
     Raises:
         OutsideError: it is no XML, has too many elements, or another root.
@@ -99,11 +99,11 @@ class Part:
         return self.element.tag
 
     def at(self, key: str) -> str:
-        """How messages name an attribute."""
+        """Return how messages name an attribute."""
         return f"{self.path} {key}".lstrip()
 
     def named(self, tag: str) -> dict[str, Part]:
-        """The inner elements of a tag by their names, which have to differ."""
+        """Return the inner elements of a tag by their names, which must be unique."""
         found: dict[str, Part] = {}
         for index, element in enumerate(self.element.findall(tag)):
             name = Part(element, f"{self.path}/{tag}[{index}]".lstrip("/"), self.problems)
@@ -115,12 +115,13 @@ class Part:
         return found
 
     def child(self, tag: str) -> Part | None:
-        """The first inner element of a tag, or None."""
+        """Return the first inner element of a tag, or None."""
         element = self.element.find(tag)
         return None if element is None else self._inner(element, tag)
 
     def required(self, tag: str) -> Part:
-        """The first inner element of a tag; one that reports nothing further if it is missing."""
+        """Return the first inner element of a tag; a missing one is one problem and reports no
+        others."""
         found = self.child(tag)
         if found is None:
             self.problems.add(self.path, f"<{tag}> is missing")
@@ -128,7 +129,7 @@ class Part:
         return found
 
     def all(self, tag: str) -> list[Part]:
-        """Every inner element of a tag; none of them is kept."""
+        """Return every inner element of a tag; none is added to `kept`."""
         path = f"{self.path}/{tag}".removeprefix("/")
         return [
             Part(element, f"{path}[{index}]", self.problems)
@@ -136,7 +137,7 @@ class Part:
         ]
 
     def only(self, tags: Sequence[str]) -> Part:
-        """The first inner element, whose tag has to be one of these."""
+        """Return the first inner element, whose tag must be one of `tags`."""
         element = next(iter(self.element), None)
         if element is None or element.tag not in tags:
             found = "nothing" if element is None else shown(element.tag)
@@ -145,15 +146,15 @@ class Part:
         return self._inner(element, element.tag)
 
     def raw(self, key: str) -> str | None:
-        """An attribute as written."""
+        """Return an attribute as written."""
         return self.element.get(key)
 
     def inner_text(self, tag: str) -> str:
-        """The text between the tags of the first inner element of a tag; '' where there is none."""
+        """Return the text of the first inner element of a tag, '' without one."""
         return (self.element.findtext(tag) or "").strip()
 
     def text(self, key: str, most: int = MOST_NAME) -> str:
-        """A printable text that is not empty; '' after a problem."""
+        """Read a printable, non-empty text; '' after a problem."""
         value = self.raw(key)
         if value is None:
             self.problems.add(self.at(key), "is missing")
@@ -167,7 +168,7 @@ class Part:
         return ""
 
     def choice(self, key: str, allowed: Sequence[str]) -> str:
-        """One of the allowed words; '' after a problem."""
+        """Read one of the allowed words; '' after a problem."""
         value = self.text(key)
         if value and value not in allowed:
             hint = suggestion(value, allowed)
@@ -179,17 +180,17 @@ class Part:
         return value
 
     def number(self, key: str, allowed: Range, default: str | None = None) -> float:
-        """A finite number within a range."""
+        """Read a finite number within a range."""
         return float(self.numbers(key, (allowed,), default)[0])
 
     def numbers(self, key: str, allowed: Sequence[Range], default: str | None = None) -> Array:
-        """Numbers separated by spaces, one range each."""
+        """Read numbers separated by spaces, one range each."""
         if key in self.element.attrib:
             self.kept.set(key, self.element.attrib[key])
         return self._numbers(self.at(key), self.element.get(key, default), allowed)
 
     def content(self, allowed: Sequence[Range]) -> Array:
-        """The numbers between the element's tags, one range each."""
+        """Read the numbers between the element's tags, one range each."""
         return self._numbers(self.path, self.element.text, allowed)
 
     def _numbers(self, path: str, value: str | None, allowed: Sequence[Range]) -> Array:

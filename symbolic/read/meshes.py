@@ -1,4 +1,4 @@
-"""Triangle meshes read from files, within bounds."""
+"""Triangle meshes from files, with bounds on size and content."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ trimesh.util.log.setLevel(logging.CRITICAL)
 
 
 def read_mesh(path: Path, scale: Array) -> trimesh.Trimesh:
-    """A mesh, scaled by (3,) factors, its equal vertices merged.
+    """Read a mesh, scaled by (3,) factors, with equal vertices merged.
 
     Raises:
         CollisionModelError: the file cannot be read, or is empty, flat, too large or too fine.
@@ -55,7 +55,7 @@ def read_mesh(path: Path, scale: Array) -> trimesh.Trimesh:
 
 
 def _sound(mesh: trimesh.Trimesh, scale: Array) -> trimesh.Trimesh:
-    """A mesh scaled and checked."""
+    """Scale a mesh and check that it is finite, within bounds and not flat."""
     if not np.all(np.isfinite(mesh.vertices)):
         raise OutsideError("the mesh has vertices that are not finite numbers")
     _require_few(len(mesh.faces), MOST_FACES, "triangles")
@@ -91,7 +91,7 @@ def _require_few(count: int, most: int, meaning: str) -> None:
 
 
 def _read(path: Path) -> trimesh.Trimesh:
-    """The triangles of a file, nothing but their number of corners checked."""
+    """Read the triangles of a file, checking only their number of corners."""
     kind = path.suffix.lower().removeprefix(".")
     if kind not in FORMATS:
         raise OutsideError(
@@ -129,18 +129,19 @@ def _read(path: Path) -> trimesh.Trimesh:
 
 
 def _is_text(kind: str, content: bytes) -> bool:
-    """Whether a mesh is read word by word; of STL the reader keeps numbers only."""
+    """Return True if a mesh is parsed word by word; of an STL text only the numbers are."""
     second = content[:1000].split(b"\n", 2)[1:2]
     return kind in ("obj", "off") or (kind == "ply" and b"binary" not in b"".join(second).lower())
 
 
 def _gaps(content: bytes) -> int:
-    """Upper bound of the gaps between words: letters beyond ASCII may be some."""
+    """Bound the number of gaps between words from above; bytes beyond ASCII may be spaces."""
     letters = np.frombuffer(content, np.uint8)
     return int(np.count_nonzero((letters <= 32) | (letters >= 128)))
 
 
 def _collada_unit(mesh: trimesh.Trimesh) -> float:
-    """Metres per unit; trimesh tells a COLLADA file's as '0.01 * meters' and does not apply it."""
+    """Return metres per unit of a COLLADA file; trimesh reports '0.01 * meters' without applying
+    it."""
     factor, _, unit = str(mesh.units or "").partition(" * ")
     return float(factor) if unit == "meters" else 1.0

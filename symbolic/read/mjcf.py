@@ -1,4 +1,4 @@
-"""MJCF, MuJoCo's descriptions of robots, as URDF: bodies, joints, masses, limits and shapes.
+"""MJCF, MuJoCo's robot descriptions, converted to URDF: bodies, joints, masses, limits and shapes.
 
 MuJoCo's own reader compiles the file, so includes, defaults and angles in degrees are its. What is
 written is what the compiled model holds; what URDF has no words for is refused.
@@ -23,7 +23,7 @@ NO_READER = "is a file of MuJoCo, whose reader is not installed: pip install 'du
 
 
 def compiled(path: Path) -> Any:
-    """MuJoCo's module, the file as it is written (`MjSpec`), and its compiled model.
+    """Return MuJoCo's module, the file's `MjSpec`, and its compiled model.
 
     Raises:
         OutsideError: MuJoCo is not installed, or does not take the file.
@@ -42,8 +42,7 @@ def compiled(path: Path) -> Any:
 def geom_shape(
     mujoco: Any, model: Any, geom: int
 ) -> tuple[str, Box | Sphere | Cylinder | Capsule | None]:
-    """The kind of a geom of a compiled model, such as 'box', and its shape where it is one of
-    these."""
+    """Return a geom's kind, such as 'box', and its shape, or None for another kind of geom."""
     kind = mujoco.mjtGeom(int(model.geom_type[geom])).name[7:].lower()
     size = model.geom_size[geom]
     radius, length = float(size[0]), 2.0 * float(size[1])
@@ -58,7 +57,7 @@ def geom_shape(
 
 @lru_cache(maxsize=8)
 def mjcf_as_urdf(path: Path, content: bytes) -> bytes:
-    """The URDF of a robot's MJCF: a link per body, and per named site.
+    """Convert a robot's MJCF to URDF: one link per body and per named site.
 
     The world is the root link `world`. MJCF knows no velocity limits: they are zero, and a cell
     has to give its own (`velocity_max`). Shapes that collide with nothing (contype and
@@ -79,7 +78,7 @@ def mjcf_as_urdf(path: Path, content: bytes) -> bytes:
 
 
 class _Writer:
-    """Writes a compiled model."""
+    """Writer of a compiled model as URDF."""
 
     def __init__(self, mujoco: Any, model: Any) -> None:
         self._mujoco, self._model = mujoco, model
@@ -109,7 +108,7 @@ class _Writer:
         return ElementTree.tostring(self._root)
 
     def _joints(self, body: int, name: str) -> None:
-        """The joints between a body and its parent, each about its own point of the body."""
+        """Write the joints between a body and its parent, each about its own point of the body."""
         model, kinds = self._model, self._mujoco.mjtJoint
         parent = self._names[model.body_parentid[body]]
         T_parent_body = self._pose(model.body_pos[body], model.body_quat[body])
@@ -152,7 +151,7 @@ class _Writer:
         return element
 
     def _effort(self, joint: int) -> float:
-        """What may act at a joint: its own bound, else that of its motors; 0 where none is."""
+        """Return a joint's largest effort: its own bound, else its motors', else 0."""
         model, words = self._model, self._mujoco
         if model.jnt_actfrclimited[joint]:
             return float(np.abs(model.jnt_actfrcrange[joint]).min())
@@ -214,7 +213,7 @@ class _Writer:
 def _add(
     parent: ElementTree.Element, tag: str, pose: Array | None = None, **said: Any
 ) -> ElementTree.Element:
-    """An inner element with its origin, and with texts and numbers as attributes."""
+    """Add an inner element with an origin, and with texts and numbers as attributes."""
     written = {
         key: value if isinstance(value, str) else " ".join(map(repr, np.ravel(value).tolist()))
         for key, value in said.items()

@@ -1,4 +1,4 @@
-"""The payload section of a workcell file, and the contacts section: where pads press on it."""
+"""Payload and contacts sections of a workcell file: the box, and the places of the pads on it."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ KINDS = ("box", "cylinder", "mesh")
 
 
 def read_payload(table: Table, folder: Path) -> Payload:
-    """What is carried; a mesh's path is relative to `folder`."""
+    """Read the payload; a mesh's path is relative to `folder`."""
     kind = table.choice("kind", KINDS, "box")
     mass = table.number("mass", quantity.MASS)
     if kind == "mesh":
@@ -49,7 +49,8 @@ def read_payload(table: Table, folder: Path) -> Payload:
 
 
 def solid_box_inertia(size: Array, mass: float) -> Array:
-    """Inertia (3, 3) [kg m^2] of a homogeneous cuboid about its centre, along its edges."""
+    """Compute the inertia (3, 3) [kg m^2] of a homogeneous cuboid about its centre, along its
+    edges."""
     squares = np.asarray(size) ** 2
     return read_only(np.diag(mass / 12 * (squares.sum() - squares)))
 
@@ -68,7 +69,8 @@ def _cylinder(table: Table, mass: float) -> Payload:
 
 
 def _mesh(table: Table, folder: Path, mass: float) -> Payload:
-    """A mesh is as heavy everywhere within its surface, or its hull where that has holes."""
+    """Read a mesh payload, of uniform density within its surface, or within its hull if it has
+    holes."""
     path = read_file(table, "path", folder, outside.MESH_BYTES)
     scale = table.vector("scale", (quantity.SCALE,) * 3, (1.0, 1.0, 1.0), filling=True)
     nothing = Payload(read_only(np.ones(3)), mass, np.zeros(3), np.eye(3))
@@ -120,7 +122,7 @@ ALONG_Z = 0.9  # share of a normal along z from which on a pad's x axis is measu
 
 
 def read_contact(table: Table, payload: Payload) -> Contact:
-    """One robot's pads on a payload."""
+    """Read one robot's pads on a payload."""
     friction = table.number("friction", quantity.FRICTION)
     half_sides: tuple[float, float] | None = None
     if table.has("patch_size"):
@@ -140,7 +142,7 @@ def read_contact(table: Table, payload: Payload) -> Contact:
 
 
 def check_count(contacts: list[Contact], problems: Problems) -> None:
-    """There are not more pads than allowed."""
+    """Check that there are at most `MOST_PADS` pads."""
     count = sum(1 + len(contact.further) for contact in contacts)
     if count > MOST_PADS:
         problems.add("contacts", f"found {count} pads; allowed are {MOST_PADS} on both arms")
@@ -149,8 +151,8 @@ def check_count(contacts: list[Contact], problems: Problems) -> None:
 def _read_place(
     table: Table, payload: Payload | None, radius: float, half_sides: tuple[float, float] | None
 ) -> Array:
-    """T_box_pad (4, 4) of a pad on the payload's surface, or at a normal of its own; the identity
-    where the payload or the patch are wrong."""
+    """Read T_box_pad (4, 4), on the surface or with a normal of its own; the identity after a
+    problem."""
     point = table.vector("xyz", (quantity.POSITION,) * 3)
     spin = table.number("spin", quantity.ANGLE, 0.0)
     written = table.vector("normal", (quantity.DIRECTION,) * 3) if table.has("normal") else None
@@ -171,7 +173,7 @@ def _read_place(
 
 
 def pad_rotation(normal: Array, spin: float) -> Array:
-    """R_box_pad (3, 3) of a pad.
+    """Compute R_box_pad (3, 3) of a pad.
 
     z is the contact normal. At zero spin x points along the box's +z axis as far as it can, where
     the normal is nearly along that, along its +x axis; y completes the right-handed frame. `spin`
@@ -199,7 +201,7 @@ def _on_surface(
     radius: float,
     half_sides: tuple[float, float] | None,
 ) -> Array:
-    """T_box_pad (4, 4) of a pad on a face; the identity where it is on none.
+    """Compute T_box_pad (4, 4) of a pad on a face; the identity if the point is on no face.
 
     A point of a box has three coordinates away from its middle, one of a cylinder two: across its
     axis and along it. A face is where one of them has its largest value.

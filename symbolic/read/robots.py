@@ -1,4 +1,4 @@
-"""The robots section of a workcell file: descriptions, arms, limits, tools.
+"""Robots section of a workcell file: descriptions, arms, limits, tools.
 
 Robots may be named: descriptions that Python packages hold or download. A name that ends in
 `_description` is a module of the package `robot_descriptions`, which clones the repository with the
@@ -61,7 +61,7 @@ MAX_START_BRANCH = 1000
 
 
 def read_robot(table: Table, folder: Path, stored: bool = False) -> tuple[Robot, int]:
-    """One arm and the index of its start branch (-1: the criterion's choice, -2: searched for).
+    """Read one arm and the index of its start branch (-1: by criterion, -2: searched for).
 
     Args:
         table: its section.
@@ -107,7 +107,7 @@ def read_robot(table: Table, folder: Path, stored: bool = False) -> tuple[Robot,
 
 
 def _read_redundant(table: Table, model: pin.Model | None) -> tuple[str, ...]:
-    """The joints beyond six that the file names; () leaves the choice to the tool."""
+    """Read the redundant joints that the file names; () leaves the choice to the program."""
     names = table.texts("redundant_joints", "names of joints")
     if model is None or not names:
         return names
@@ -139,7 +139,7 @@ UNKNOWN = "unknown"
 
 @cache
 def _warn_unjudged(robot: str) -> None:
-    """Say once that a robot's torques limit nothing."""
+    """Warn once that a robot's torques are not limited."""
     warnings.warn(
         f'robot {robot!r} has torque_max = "{UNKNOWN}": no carry, timing or job is judged by the '
         "torques of its joints, and their use is shown as 0 %",
@@ -149,7 +149,7 @@ def _warn_unjudged(robot: str) -> None:
 
 
 def _read_limits(table: Table, model: pin.Model | None) -> dict[str, Array | None]:
-    """The limits, from the file or else from the description; (n,) each."""
+    """Read the limits (n,), from the file or else from the description."""
     n, found = FOLLOWING if model is None else model.nq, dict[str, Array | None]()
     for key, (own, allowed) in LIMITS.items():
         if key == "torque_max" and table.raw(key, None) == UNKNOWN:
@@ -200,8 +200,8 @@ MOST_FOLDERS = 100
 def _read_description(
     table: Table, folder: Path, stored: bool
 ) -> tuple[dict[str, Any], pin.Model | None]:
-    """What a robot's section says of its description, as fields of `symbolic.records.Robot`, and
-    the arm's model; None after problems.
+    """Return a description as fields of `symbolic.records.Robot`, and the arm's model, None after
+    problems.
 
     Args:
         table: the robot's section.
@@ -259,13 +259,13 @@ def _read_description(
 
 
 def _argument(value: str, folder: Path) -> str:
-    """Return a xacro file's argument; a relative path as one that holds in any folder."""
+    """Return a xacro argument, with a relative path made absolute."""
     return str((folder / value).resolve()) if value.startswith(RELATIVE) else value
 
 
 @contextmanager
 def _told(table: Table, key: str) -> Iterator[None]:
-    """Record what is wrong with what a key names."""
+    """Record errors about the content that a key names as problems of that key."""
     try:
         yield
     except UrdfError as error:
@@ -276,8 +276,7 @@ def _told(table: Table, key: str) -> Iterator[None]:
 
 
 def _read_named(table: Table) -> NamedRobot:
-    """The description of a robot's name; what is wrong stands at the key that it takes the place
-    of."""
+    """Read the description of a named robot; problems are recorded at the key 'robot'."""
     name = table.text("robot")
     if table.has("urdf"):
         table.add("urdf", "found beside 'robot'; give one of the two")
@@ -313,7 +312,7 @@ def _read_folders(table: Table, folder: Path) -> tuple[Path, ...]:
 
 
 def _read_described(table: Table, key: str, folder: Path, package_dirs: tuple[Path, ...]) -> Path:
-    """A file named relative to the workcell's folder, or as package://NAME/..."""
+    """Read a path relative to the workcell's folder, or an address package://NAME/..."""
     address = table.raw(key, None)
     if not isinstance(address, str) or not address.startswith(PACKAGE_SCHEME):
         return read_file(table, key, folder, outside.URDF_BYTES)
@@ -330,7 +329,8 @@ def _read_described(table: Table, key: str, folder: Path, package_dirs: tuple[Pa
 
 
 def _read_chain(table: Table) -> tuple[str, str]:
-    """The links that the arm begins and ends at; '' for the first where only a flange is given."""
+    """Read the links at which the arm begins and ends; '' for the first if only a flange is
+    given."""
     if not table.has("chain"):
         return "", table.text("flange")
     table.refuse("chain", ("flange",))
@@ -345,7 +345,7 @@ def _read_chain(table: Table) -> tuple[str, str]:
 def _read_model(
     table: Table, urdf: Urdf, locked: Positions, root: str, flange: str
 ) -> pin.Model | None:
-    """The arm's model, or recorded problems and None."""
+    """Return the arm's model, or record problems and return None."""
     moving: tuple[str, ...] | None = None
     model: pin.Model | None = None
     with _told(table, "urdf"):
@@ -407,7 +407,7 @@ class NamedRobot:
 
 
 def named_robot(name: str) -> NamedRobot:
-    """The description of a name, downloaded where it is not there yet.
+    """Return the description of that name, downloading it if necessary.
 
     Raises:
         OutsideError: none has that name, a package is missing, or the download failed.
@@ -438,7 +438,7 @@ def _installed(name: str) -> NamedRobot:
 
 
 def _has_links(path: Path) -> bool:
-    """Return True if a file describes anything; some packages ship files without content."""
+    """Return True if a file describes any link; some packages ship empty files."""
     return b"<link" in outside.read_bytes(path, outside.URDF_BYTES)
 
 
@@ -473,6 +473,5 @@ def _downloaded(name: str) -> NamedRobot:
 
 
 def _modules() -> Iterator[str]:
-    """Names of all descriptions of the package."""
     folder = Path(str(find_spec(MODULES).origin)).parent  # type: ignore[union-attr]
     return (path.stem for path in sorted(folder.glob("*_description.py")))

@@ -1,4 +1,4 @@
-"""What readers of scenes gather: shapes with their poses in the world, and what cannot be a body.
+"""Shapes of a scene with their poses in the world, and the reports of what cannot be a body.
 
 Whatever is left out is reported by name and reason: an obstacle that is silently missing would
 make every verdict of a cell wrong.
@@ -58,7 +58,7 @@ class Scene:
     files: Mapping[str, bytes]
 
     def tables(self, folder: Path, meshes: Path) -> list[dict[str, Any]]:
-        """`[[environment]]` of a workcell file.
+        """Return the scene as `[[environment]]` tables of a workcell file.
 
         Args:
             folder: that of the file, to which meshes are relative.
@@ -69,7 +69,7 @@ class Scene:
 
 @dataclass
 class SceneBuilder:
-    """What a scene holds so far."""
+    """Collects the bodies of a scene."""
 
     bodies: list[Body] = field(default_factory=list)
     left_out: list[str] = field(default_factory=list)
@@ -79,8 +79,8 @@ class SceneBuilder:
     names: set[str] = field(default_factory=lambda: {PAYLOAD})
 
     def add(self, name: str, shape: Shape | Capsule, pose: Array) -> None:
-        """Take a shape at its pose (4, 4) in the world, unless a workcell would refuse it; a
-        capsule as a cylinder and the spheres at its ends."""
+        """Add a shape at its pose (4, 4) in the world, unless a workcell would refuse it; add a
+        capsule as a cylinder and two spheres."""
         if isinstance(shape, Capsule):
             self.add(name, Cylinder(shape.radius, shape.length), pose)
             for end in (-0.5, 0.5):
@@ -110,7 +110,8 @@ class SceneBuilder:
             self.bodies.append(body)
 
     def triangles(self, name: str, vertices: Array, faces: NDArray[np.int64], pose: Array) -> None:
-        """Take a mesh that has no file: vertices (n, 3) [m], and corners (m, 3) of its faces."""
+        """Add a mesh without a file: vertices (n, 3) [m], and vertex indices (m, 3) of its
+        faces."""
         import trimesh
 
         content = trimesh.exchange.stl.export_stl(trimesh.Trimesh(vertices, faces, process=False))
@@ -125,7 +126,7 @@ class SceneBuilder:
             self.files[file] = content
 
     def mesh(self, name: str, address: str, file: Path, scale: Array, pose: Array) -> None:
-        """A mesh that a scene's file names by its address."""
+        """Add a mesh that a scene's file names by its address."""
         path = file_at(address, file)
         if path is None:
             self.leave(name, f"its mesh {shown(address)} is not found; {WHERE}")
@@ -133,7 +134,7 @@ class SceneBuilder:
             self.add(name, Mesh(path, scale), pose)
 
     def half_space(self, name: str, normal: Array, offset: float, pose: Array) -> None:
-        """All x of a frame at a pose (4, 4) for which normal x + offset <= 0."""
+        """Add the half-space normal x + offset <= 0 of a frame at a pose (4, 4)."""
         length = float(np.linalg.norm(normal))
         if length < 1e-6:
             self.problems.add(name, "found a plane without a normal")
@@ -142,7 +143,7 @@ class SceneBuilder:
             self.plane(name, pose @ transform(axes_with_z(normal / length), foot))
 
     def plane(self, name: str, pose: Array) -> None:
-        """The half-space below a frame's x-y plane."""
+        """Add the half-space below a frame's x-y plane."""
         normal = pose[:3, 2]
         middle = normal * (normal @ pose[:3, 3] - SLAB[2] / 2.0)
         size = " x ".join(f"{side:g}" for side in SLAB)
@@ -150,15 +151,15 @@ class SceneBuilder:
         self.add(name, Box(np.array(SLAB)), transform(pose[:3, :3], middle))
 
     def leave(self, name: str, why: str) -> None:
-        """Something is no body."""
+        """Report that something is left out."""
         self.left_out.append(f"{outside.printable(name) or 'scene'}: {why}")
 
     def note(self, name: str, what: str) -> None:
-        """Something is taken otherwise than it is."""
+        """Report that something is represented differently than in the scene."""
         self.notes.append(f"{outside.printable(name) or 'scene'}: {what}")
 
     def _name(self, name: str) -> str:
-        """One that an environment takes: a key path names bodies, a pattern stands for some."""
+        """Return a unique name without the characters of key paths and patterns."""
         wanted = re.sub(r"[/.*?\[\]]+", "-", outside.printable(name)).strip() or "body"
         wanted = wanted[: MAX_NAME_LENGTH - 6].strip()
         free = (wanted if k == 1 else f"{wanted} {k}" for k in range(1, MOST_BODIES + 3))
@@ -166,7 +167,8 @@ class SceneBuilder:
 
 
 def _table(body: Body, folder: Path, meshes: Path) -> dict[str, Any]:
-    """A body as a table of a workcell file, its mesh, one below `meshes`, relative to a folder."""
+    """Convert a body to a table of a workcell file; mesh paths below `meshes` become relative to
+    `folder`."""
     table: dict[str, Any] = {"name": body.name, "kind": type(body.shape).__name__.lower()}
     for key, value in vars(body.shape).items():
         if key == "path":
@@ -185,7 +187,8 @@ def _plain(values: Array) -> list[float]:
 
 
 def quaternion_pose(xyz: Array, xyzw: Array, at: str, problems: Problems) -> Array:
-    """(4, 4) of a position and a quaternion x, y, z, w; of all zeros no rotation, as in MoveIt."""
+    """Compute the pose (4, 4) of a position and a quaternion x, y, z, w; zeros mean no rotation, as
+    in MoveIt."""
     length = float(np.linalg.norm(xyzw))
     if length and abs(length - 1.0) > 1e-2:
         problems.add(at, f"found a quaternion of length {length:g}; allowed is 1")
@@ -202,7 +205,7 @@ _VARIABLES = ("GZ_SIM_RESOURCE_PATH", "GAZEBO_MODEL_PATH", "SDF_PATH")
 
 
 def file_at(address: str, file: Path) -> Path | None:
-    """The file behind an address in an SDF file; of a model's folder the file that it names."""
+    """Return the file behind an address in an SDF file; for a model's folder, its description."""
     scheme, _, rest = address.rpartition("://")
     if not rest or "\0" in rest or scheme not in ("", "file", "model", "package"):
         return None
@@ -224,7 +227,7 @@ def file_at(address: str, file: Path) -> Path | None:
 
 
 def _main_file(folder: Path) -> str | None:
-    """What a model's folder names as its description; of several versions the last."""
+    """Return the description that a model.config names, the last of several versions."""
     config = folder / "model.config"
     if not config.is_file():
         return None

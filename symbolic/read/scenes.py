@@ -1,5 +1,5 @@
-"""Scenes of other programs to bodies of a cell's environment: SDF of Gazebo and Drake, planning
-scenes of MoveIt (the message in YAML, and the text that its panel in RViz saves), and MJCF."""
+"""Scenes of other programs as bodies of a cell's environment: SDF of Gazebo and Drake, planning
+scenes of MoveIt (its message in YAML, and the text that RViz saves), and MJCF."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ SHAPES = {"box": Box, "sphere": Sphere, "cylinder": Cylinder, "capsule": Capsule
 
 
 def read_scene(path: Path) -> Scene:
-    """The obstacles of SDF (a world or a model), of MJCF, or of a planning scene of MoveIt (its
-    message in YAML, or its own text, .scene).
+    """Read the obstacles of SDF (a world or a model), of MJCF, or of a MoveIt planning scene (its
+    message in YAML, or its text format, .scene).
 
     Raises:
         SceneError: the file cannot be read, is no scene, or is wrong; every problem with its
@@ -75,7 +75,7 @@ OWN = ("", "__model__", "__root__")
 
 @dataclass
 class _Scope:
-    """A world or a model: its frames by name, and the models in it."""
+    """Scope of names, a world or a model: its frames, and the models in it."""
 
     part: Part
     file: Path
@@ -83,13 +83,12 @@ class _Scope:
     inner: dict[str, _Scope] = field(default_factory=dict)
 
     def enter(self, name: str, base: str, pose: Array) -> None:
-        """Add a frame at a pose (4, 4) in the frame called `base`."""
         if name in self.frames:
             raise OutsideError(f"{self.part.path}: holds two things called {shown(name)}")
         self.frames[name] = (base, pose)
 
     def frame(self, name: str) -> Array:
-        """(4, 4) of a frame in the scope's own."""
+        """Compute the pose (4, 4) of a frame in the scope's own frame."""
         T_name, met = np.eye(4), 0
         while name not in (*OWN, "world") or (name == "world" and self.part.tag == "model"):
             head, _, rest = name.partition("::")
@@ -109,14 +108,14 @@ class _Scope:
 
 
 class _Sdf:
-    """Reads SDF files, those that are included as well."""
+    """Reader of SDF files and of the files that they include."""
 
     def __init__(self, found: SceneBuilder) -> None:
         self._found = found
         self._files = 0
 
     def read(self, path: Path) -> None:
-        """Gather the first world of a file, or its models."""
+        """Add the first world of a file, or its models."""
         root = self._root(path, found_in="")
         worlds = list(root.named("world").values())
         for further in worlds[1:]:
@@ -164,7 +163,7 @@ class _Sdf:
     def _place(
         self, scope: _Scope, name: str, model: _Scope, placed: tuple[str, Array], by: Part
     ) -> None:
-        """Enter a model, which stands where `placed` puts its placement frame."""
+        """Enter a model at its pose, which `placed` states for its placement frame."""
         base, pose = placed
         frame = by.raw("placement_frame") or by.inner_text("placement_frame")
         scope.enter(name, base, pose @ inverse(model.frame(frame)))
@@ -198,7 +197,8 @@ class _Sdf:
             self._place(scope, wanted or name, inner, placed, by)
 
     def _pose(self, part: Part) -> tuple[str, Array]:
-        """The frame to which an element's pose is relative, '' for its own default; (4, 4)."""
+        """Read an element's pose (4, 4) and the frame that it is relative to, '' for the
+        default."""
         pose = part.child("pose")
         if pose is None:
             return "", np.eye(4)
@@ -273,7 +273,7 @@ _ADDED = (None, 0, "", "0", "\0", "ADD", "add")
 
 
 class _Loader(yaml.CSafeLoader):
-    """YAML in which 1e-05 is a number, as those say who write it so."""
+    """YAML loader in which 1e-05 is a number, as the writers of these files mean it."""
 
 
 _Loader.add_implicit_resolver(
@@ -284,7 +284,7 @@ _Loader.add_implicit_resolver(
 
 
 def read_message(path: Path) -> dict[str, Any]:
-    """The fields of a message that `ros2 topic echo` or robowflex wrote as YAML.
+    """Read the fields of a message that `ros2 topic echo` or robowflex wrote as YAML.
 
     Raises:
         OutsideError: it is no such file.
@@ -301,7 +301,7 @@ def read_message(path: Path) -> dict[str, Any]:
 
 
 def _read_moveit(path: Path, found: SceneBuilder) -> None:
-    """Gather a planning scene's message, or its world alone.
+    """Add a planning scene's message, or its world alone.
 
     Raises:
         OutsideError: it is no such scene.
@@ -328,7 +328,7 @@ def _read_moveit(path: Path, found: SceneBuilder) -> None:
 
 
 def _object(table: Table, frames: Mapping[str, Array], path: Path, found: SceneBuilder) -> None:
-    """One collision object: its primitives, meshes and planes."""
+    """Add one collision object: its primitives, meshes and planes."""
     name = str(table.raw("id", "") or "object")
     if table.raw("operation", None) not in _ADDED:
         found.leave(name, f"is not added: its operation is {shown(table.raw('operation'))}")
@@ -368,7 +368,7 @@ _PLACES = {"primitives": "primitive_poses", "meshes": "mesh_poses", "planes": "p
 
 
 def _frame(table: Table, place: str = "position", turn: str = "orientation") -> Array:
-    """(4, 4) of a pose, its numbers by letters or in a row; a part that is missing is zero."""
+    """Read a pose (4, 4), its numbers by letters or in a row; a missing part is zero."""
     parts = []
     for key, letters in ((place, "xyz"), (turn, "xyzw")):
         if isinstance(table.raw(key, None), Mapping):
@@ -380,7 +380,8 @@ def _frame(table: Table, place: str = "position", turn: str = "orientation") -> 
 
 
 def _primitive(name: str, kind: str, sizes: Array, pose: Array, found: SceneBuilder) -> None:
-    """A shape of MoveIt's message; of a cylinder the length comes first, of a plane its factors."""
+    """Add a primitive of MoveIt's message: a cylinder's size is length, radius, a plane's its
+    coefficients."""
     match kind:
         case "box":
             found.add(name, Box(sizes), pose)
@@ -395,7 +396,7 @@ def _primitive(name: str, kind: str, sizes: Array, pose: Array, found: SceneBuil
 
 
 def _moveit_mesh(name: str, table: Table, pose: Array, path: Path, found: SceneBuilder) -> None:
-    """A mesh by its address, or by its triangles."""
+    """Add a mesh by its address, or by its triangles."""
     if table.has("resource"):
         scale = table.vector("dimensions", (ANY,) * 3, (1.0, 1.0, 1.0))
         found.mesh(name, str(table.raw("resource")), path, scale, pose)
@@ -415,7 +416,7 @@ def _moveit_mesh(name: str, table: Table, pose: Array, path: Path, found: SceneB
 
 
 def _triangles(name: str, vertices: Any, faces: Any, pose: Array, found: SceneBuilder) -> None:
-    """A mesh of vertices and corners as they are written."""
+    """Add a mesh from vertices and vertex indices as written."""
     try:
         places = np.array(vertices, dtype=float).reshape(-1, 3)
         corners = np.array(faces, dtype=float).reshape(-1, 3)
@@ -433,7 +434,7 @@ def _triangles(name: str, vertices: Any, faces: Any, pose: Array, found: SceneBu
 
 
 def _read_moveit_text(path: Path, found: SceneBuilder) -> None:
-    """Gather a scene's text: objects behind stars, numbers in rows.
+    """Add the objects of a scene's text: a name behind a star, then rows of numbers.
 
     Raises:
         OutsideError: it is no such text.
@@ -453,7 +454,8 @@ def _read_moveit_text(path: Path, found: SceneBuilder) -> None:
 
 
 def _written_object(name: str, words: Sequence[str], placed: bool, found: SceneBuilder) -> None:
-    """One object of such a text; in an old one shapes are in the world, in others in the object."""
+    """Add one object of such a text; an old text gives shapes in the world, a newer one in the
+    object."""
     at = 0
 
     def numbers(count: int) -> Array:
@@ -497,7 +499,7 @@ def _written_object(name: str, words: Sequence[str], placed: bool, found: SceneB
 
 
 def _read_mjcf(path: Path, found: SceneBuilder) -> None:
-    """Gather the shapes of the world and of bodies that are fixed in it, as MuJoCo places them."""
+    """Add the shapes of the world and of bodies fixed in it, at the poses that MuJoCo computes."""
     mujoco, _, model = compiled(path)
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)

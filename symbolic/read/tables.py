@@ -1,5 +1,5 @@
-"""Nested values of TOML, YAML and JSON to records; what is allowed stands in the annotations of a
-record's fields.
+"""Nested values of TOML, YAML and JSON converted to records; annotations of a record's fields state
+the allowed values.
 
 `checked` knows `bool`, `int`, `float`, `str`, `Literal`, enumerations, `tuple`,
 `Mapping[str, ...]`, `... | None`, dataclasses, `Any` for values that are only passed on, and
@@ -75,7 +75,7 @@ class Table:
         return iter(self._data)
 
     def at(self, key: str) -> str:
-        """The full key path of a key."""
+        """Return the full key path of a key."""
         return f"{self.path}.{key}" if self.path else key
 
     def add(self, key: str, text: str) -> None:
@@ -83,11 +83,11 @@ class Table:
         self.problems.add(self.at(key), text)
 
     def clean(self, *keys: str) -> bool:
-        """Whether nothing is wrong with the values of these keys."""
+        """Return True if the values of these keys have no problem."""
         return self.problems.clean(*map(self.at, keys))
 
     def raw(self, key: str, default: Any = _REQUIRED) -> Any:
-        """The value as it stands; a missing required key is a problem and gives None."""
+        """Return the value as written; a missing required key is a problem and gives None."""
         self._known.add(key)
         if key in self._data:
             return self._data[key]
@@ -97,18 +97,18 @@ class Table:
         return default
 
     def has(self, key: str) -> bool:
-        """Whether an optional key is there; it is known either way."""
+        """Return True if an optional key is present; `close` then does not report it as unknown."""
         return self.raw(key, None) is not None
 
     def refuse(self, key: str, others: Sequence[str]) -> None:
-        """Record a problem of a key that excludes others where one of these is there as well."""
+        """Record a problem if a key stands together with one of the keys that it excludes."""
         beside = " and ".join(repr(other) for other in others if other in self._data)
         self._known.update(others)
         if beside:
             self.add(key, f"found beside {beside}; allowed is one or the other")
 
     def close(self) -> None:
-        """Record every key that nobody asked for."""
+        """Record every key that no reader has used."""
         unknown = [key for key in self._data if key not in self._known]
         allowed = ", ".join(sorted(self._known))
         for key in unknown[:MOST_UNKNOWN]:
@@ -121,14 +121,14 @@ class Table:
             )
 
     def value(self, key: str, kind: Any, default: Any = _REQUIRED) -> Any:
-        """A value as an annotation says, see `checked`; the default is taken as it is."""
+        """Read a value by an annotation, see `checked`; the default is returned unchecked."""
         value = self.raw(key, default)
         if key in self._data and not (value is None and default is not _REQUIRED):
             return checked(kind, value, self.at(key), self.problems)
         return _stand_in(kind) if default is _REQUIRED else default
 
     def number(self, key: str, allowed: Range, default: float | None = None) -> float:
-        """A number within a range."""
+        """Read a number within a range."""
         found: float = self.value(
             key, Annotated[float, allowed], _REQUIRED if default is None else default
         )
@@ -141,29 +141,29 @@ class Table:
         default: Sequence[float] | Array | None = None,
         filling: bool = False,
     ) -> Array:
-        """An array with one range per entry; one number for all of it where `filling`."""
+        """Read an array with one range per entry; with `filling`, one number fills it."""
         value = self.raw(key, _REQUIRED if default is None else list(default))
         if value is None and (default is not None or key not in self):
             return read_only(np.ones(len(allowed)) if default is None else default)
         return checked_vector(value, allowed, self.at(key), self.problems, filling)
 
     def integer(self, key: str, low: int, high: int, default: int) -> int:
-        """A whole number within [low, high]."""
+        """Read an integer within [low, high]."""
         found: int = self.value(key, Annotated[int, Range(low, high)], default)
         return found
 
     def choice(self, key: str, allowed: Sequence[str], default: str | None = None) -> str:
-        """One of the allowed words; '' after a problem."""
+        """Read one of the allowed words; '' after a problem."""
         usual = _REQUIRED if default is None else default
         return str(self.value(key, Literal[tuple(allowed)], usual))
 
     def text(self, key: str, default: str | None = None) -> str:
-        """A printable, not empty, single-line text; '' after a problem."""
+        """Read a printable, non-empty, single-line text; '' after a problem."""
         return str(self.value(key, Label, _REQUIRED if default is None else default))
 
     def texts(self, key: str, meaning: str) -> tuple[str, ...]:
-        """An array of texts, which mean something; empty where the key is missing, or after a
-        problem."""
+        """Read an array of texts, described by `meaning` in messages; empty if missing or after
+        a problem."""
         value = self.raw(key, [])
         if isinstance(value, list) and all(isinstance(entry, str) and entry for entry in value):
             return tuple(value)
@@ -171,7 +171,7 @@ class Table:
         return ()
 
     def table(self, key: str, default: Mapping[str, Any] | None = None) -> Table:
-        """A sub-table; an empty one after a problem, which then reports nothing further."""
+        """Read a sub-table; after a problem, an empty one that reports nothing further."""
         value = self.raw(key, _REQUIRED if default is None else default)
         if value is not None and isinstance(value, Mapping):
             return Table(value, self.at(key), self.problems)
@@ -180,7 +180,7 @@ class Table:
         return Table({}, self.at(key), Problems())
 
     def tables(self, key: str, exactly: int | None = None) -> list[Table]:
-        """An array of tables, of any length (and not required) or of exactly that many.
+        """Read an array of tables: optional and of any length, or of exactly that many.
 
         Of too many the first ones.
         """
@@ -199,7 +199,7 @@ class Table:
         ]
 
     def record(self, kind: type[Record], **given: Any) -> Record:
-        """The record whose fields are the table's keys; fields that are given are none.
+        """Read a record whose fields are the table's keys, except those passed as `given`.
 
         Raises:
             ValueError: the record itself refuses what its fields allow.
@@ -229,7 +229,7 @@ def _hints(kind: Any) -> dict[str, Any]:
 
 
 def checked(kind: Any, value: Any, path: str, problems: Problems) -> Any:
-    """A value that an annotation allows, or a recorded problem and a stand-in.
+    """Check a value against an annotation; record a problem and return a placeholder otherwise.
 
     Args:
         kind: the annotation.
@@ -284,7 +284,7 @@ def checked(kind: Any, value: Any, path: str, problems: Problems) -> Any:
 
 
 def _single(kind: Any, marks: Sequence[Any], value: Any, path: str, problems: Problems) -> Any:
-    """A number, a text, a word of several, or true or false."""
+    """Check a number, a text, one of several words, or a boolean."""
     ranges = [mark for mark in marks if isinstance(mark, Range)]
     if kind is float:
         return checked_number(value, ranges[0] if ranges else ANY_NUMBER, path, problems)
@@ -316,7 +316,7 @@ def _single(kind: Any, marks: Sequence[Any], value: Any, path: str, problems: Pr
 
 
 def _stand_in(kind: Any, marks: Sequence[Any] = ()) -> Any:
-    """What takes the place of a wrong or missing value."""
+    """Return a valid placeholder for a wrong or missing value."""
     if get_origin(kind) is Annotated:
         kind, *marks = get_args(kind)
     for mark in marks:
@@ -332,7 +332,8 @@ def _stand_in(kind: Any, marks: Sequence[Any] = ()) -> Any:
 
 
 def checked_number(value: Any, allowed: Range, path: str, problems: Problems) -> float:
-    """The value as a finite float within a range, or a recorded problem and a stand-in."""
+    """Return the value as a finite float within a range, or record a problem and return a
+    placeholder."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         problems.add(path, f"found {shown(value)}; allowed is a number, {allowed.allowed()}")
         return 1.0
@@ -351,8 +352,8 @@ def checked_number(value: Any, allowed: Range, path: str, problems: Problems) ->
 def checked_vector(
     value: Any, allowed: Sequence[Range], path: str, problems: Problems, filling: bool = False
 ) -> Array:
-    """The value as a read-only array, or recorded problems and a stand-in; one number for all of
-    it where `filling`."""
+    """Return the value as a read-only array, or record problems and return a placeholder; with
+    `filling`, one number fills the array."""
     if filling and not isinstance(value, list):
         return read_only(np.full(len(allowed), checked_number(value, allowed[0], path, problems)))
     if not isinstance(value, list) or len(value) != len(allowed):
@@ -369,7 +370,7 @@ def checked_vector(
 def _array(
     shape: Shape, marks: Sequence[Any], value: Any, path: str, problems: Problems
 ) -> np.ndarray[Any, Any]:
-    """A read-only array of numbers, finite unless they may miss."""
+    """Check a read-only array of numbers, finite unless the annotation allows missing entries."""
     for mark in marks:
         if isinstance(mark, Range):
             filling = any(isinstance(other, Filling) for other in marks)
@@ -410,7 +411,7 @@ SHAPES = {"box": Box, "cylinder": Cylinder, "sphere": Sphere, "mesh": Mesh}
 
 
 def read_pose(table: Table, key: str) -> Array:
-    """A transform from a sub-table {xyz, rpy}, both zero by default. Returns (4, 4), read-only."""
+    """Read a transform (4, 4), read-only, from a sub-table {xyz, rpy}, both zero by default."""
     inner = table.table(key)
     pose = _xyz_rpy(inner)
     inner.close()
@@ -424,7 +425,7 @@ def _xyz_rpy(table: Table) -> Array:
 
 
 def read_body(table: Table, folder: Path) -> Body:
-    """A named collision shape with its pose; mesh paths are relative to `folder`."""
+    """Read a named collision shape with its pose; mesh paths are relative to `folder`."""
     name, pose = table.text("name"), _xyz_rpy(table)
     kind = table.choice("kind", tuple(SHAPES))
     if not kind:  # without a kind nobody can say which keys are unknown
@@ -434,7 +435,7 @@ def read_body(table: Table, folder: Path) -> Body:
 
 
 def read_file(table: Table, key: str, folder: Path, most: int, at: Path | None = None) -> Path:
-    """The absolute path of a file named relative to `folder`; it has to be readable.
+    """Return the absolute path of a readable file named relative to `folder`.
 
     Args:
         table, key: where it is named.
@@ -459,7 +460,7 @@ def read_file(table: Table, key: str, folder: Path, most: int, at: Path | None =
 
 
 def read_inertia(table: Table, bound: float, allowed: str = "a 3 x 3 matrix") -> Array:
-    """The (3, 3) matrix of the key `inertia` [kg m^2], a rigid body's.
+    """Read the (3, 3) matrix of the key `inertia` [kg m^2] of a rigid body.
 
     Args:
         table: where it stands.
@@ -482,7 +483,7 @@ def read_inertia(table: Table, bound: float, allowed: str = "a 3 x 3 matrix") ->
 
 
 def inertia_problem(inertia: Array, bound: float) -> str:
-    """Why a matrix is no inertia of a rigid body, or an empty string.
+    """Return why a matrix is not the inertia of a rigid body, or an empty string.
 
     Args:
         inertia: (3, 3) [kg m^2].

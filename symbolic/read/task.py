@@ -1,5 +1,5 @@
-"""The task section of a workcell file, and the redundant joints: those beyond six, whose paths are
-decided.
+"""Task section of a workcell file, and the redundant joints: those beyond six, whose paths are
+decision variables.
 
 Which joints are redundant, and where they may stand to begin with, is read off one posture path
 along the hand-made trajectory: of all joints together, by Newton steps of least norm that drift to
@@ -56,8 +56,8 @@ ABOVE_STILL = 1.001
 
 
 def read_task(table: Table) -> tuple[Task, tuple[RedundancyEntry, ...]]:
-    """What is to be carried where, and how a candidate is sampled and judged; and what is said of
-    redundant joints."""
+    """Read the task (fixed poses, waypoints, sampling, limits) and the entries of redundant
+    joints."""
     orientation = _orientation(table)
     names = components(orientation)
     start = _fixed(table, "start")
@@ -91,8 +91,8 @@ def read_task(table: Table) -> tuple[Task, tuple[RedundancyEntry, ...]]:
 
 
 def _allocation(table: Table, time_law: TimeLaw) -> Allocation:
-    """The allocation of forces. What robots drive is held by soft fingers where nothing else is
-    stated."""
+    """Read the allocation of forces; the default is 'soft-finger' under the law 'optimal', else
+    'paper'."""
     driven = time_law == "optimal"
     usual = _known_allocation(table, "allocation", "soft-finger" if driven else "paper")
     own = _known_allocation(table, "drivable_allocation", usual)
@@ -111,8 +111,8 @@ def _known_allocation(table: Table, key: str, usual: str) -> str:
 
 
 def _check_vectors(task: Task, problems: Problems) -> None:
-    """Every rotation vector that a waypoint allows stays well below a full turn, at which small
-    changes of it no longer turn the box about every axis."""
+    """Check that every allowed rotation vector stays well below a full turn, where the map from
+    vectors to rotations is singular."""
     for k, waypoint in enumerate(task.waypoints):
         farthest = np.maximum(np.abs(waypoint.lower[3:]), np.abs(waypoint.upper[3:]))
         if np.linalg.norm(farthest) > MOST_TURN:
@@ -125,7 +125,7 @@ def _check_vectors(task: Task, problems: Problems) -> None:
 
 
 def with_force_limit(task: Task, payload: Payload, contacts: Sequence[Contact]) -> Task:
-    """The task with the default bounds of the force limit where its file has none.
+    """Return the task with the default bounds of the force limit if its file has none.
 
     From a thousandth above the force that holds the payload level and still between upright
     contacts to the smaller reference force.
@@ -138,7 +138,7 @@ def with_force_limit(task: Task, payload: Payload, contacts: Sequence[Contact]) 
 
 
 def _orientation(table: Table) -> Orientation:
-    """What the last three numbers of every pose of the task mean."""
+    """Read the meaning of the last three numbers of every pose of the task."""
     known = get_args(Rotation)
     rotation = cast("Rotation", table.choice("rotation", known, known[0]))
     rpy = table.vector("rotation_reference", (quantity.ANGLE,) * 3, default=(0.0, 0.0, 0.0))
@@ -150,7 +150,7 @@ def _orientation(table: Table) -> Orientation:
 
 
 def _force_limit(table: Table) -> tuple[float, float]:
-    """Bounds of the force limit; infinite above where the file has none."""
+    """Read the bounds of the force limit; the upper one is infinite if the file has none."""
     if "force_limit" not in table:
         return (0.0, np.inf)
     low, high = table.vector("force_limit", (quantity.FORCE,) * 2)
@@ -168,7 +168,7 @@ def _fixed(table: Table, key: str) -> Waypoint:
 
 
 def _waypoints(table: Table, names: Sequence[str]) -> list[Waypoint]:
-    """One fixed waypoint, or `count` free ones that share their bounds."""
+    """Read one fixed waypoint, or `count` free ones that share their bounds."""
     if table.has("fixed"):
         pose = table.vector("fixed", quantity.POSE)
         table.refuse("fixed", ("lower", "upper", "count"))
@@ -193,7 +193,7 @@ def _waypoints(table: Table, names: Sequence[str]) -> list[Waypoint]:
 
 
 def _read_initial(table: Table, free: list[Waypoint], names: Sequence[str]) -> Array:
-    """The hand-made free waypoints (n_free, 6); the centres of the bounds by default."""
+    """Read the initial free waypoints (n_free, 6); the centres of the bounds by default."""
     value = table.raw("initial", None)
     path, problems = table.at("initial"), table.problems
     if value is None:
@@ -236,7 +236,7 @@ MOST_BEYOND = 6
 
 @dataclass(frozen=True)
 class RedundancyEntry:
-    """What a file says of a redundant joint; None where it says nothing.
+    """Entry of a redundant joint in a file; None where the file states nothing.
 
     Attributes:
         path: of the entry in the file.
@@ -252,7 +252,7 @@ class RedundancyEntry:
 
 
 def read_redundant(table: Table, n_waypoints: int) -> tuple[RedundancyEntry, ...]:
-    """The entries of `task.redundant`."""
+    """Read the entries of `task.redundant`."""
     found = []
     for entry in table.tables("redundant"):
         values = {
@@ -268,7 +268,8 @@ def read_redundant(table: Table, n_waypoints: int) -> tuple[RedundancyEntry, ...
 def with_redundancy(
     workcell: Workcell, entries: Sequence[RedundancyEntry], problems: Problems
 ) -> Workcell:
-    """The workcell with its redundant joints, chosen and placed where its file says nothing."""
+    """Return the workcell with its redundant joints, chosen and placed automatically where the file
+    states none."""
     if not problems.clean("robots", "task", "contacts", *SHAPE_KEYS):
         return workcell
     models = [arm_model(robot) for robot in workcell.robots]
@@ -313,7 +314,7 @@ def with_redundancy(
 def _choice(
     workcell: Workcell, i: int, entries: Sequence[RedundancyEntry], common: tuple[str, ...]
 ) -> tuple[PosturePath | None, tuple[str, ...]]:
-    """Arm i's path along the hand-made trajectory, where it is needed, and its redundant joints."""
+    """Return arm i's path along the hand-made trajectory, if needed, and its redundant joints."""
     robot = workcell.robots[i]
     model = arm_model(robot)
     names, beyond = list(model.names)[1:], model.nq - FOLLOWING
@@ -335,7 +336,7 @@ def _choice(
 
 
 def _entry(entries: Sequence[RedundancyEntry], robot: Robot, name: str) -> RedundancyEntry:
-    """What the file says of a joint; the entry of this robot before one for either."""
+    """Return the entry of a joint; an entry for this robot takes precedence over one for either."""
     by_name = {entry.joint: entry for entry in reversed(entries)}
     nothing = RedundancyEntry("", name)
     return by_name.get(f"{robot.name}/{name}", by_name.get(name, nothing))
@@ -391,7 +392,7 @@ CENTRING = 0.05
 
 @dataclass(frozen=True)
 class PosturePath:
-    """An arm along the hand-made trajectory.
+    """Path of an arm's joints along the hand-made trajectory.
 
     Attributes:
         q: (n, joints) at poses evenly spaced along the path parameter, ends included [rad or m].
@@ -402,12 +403,12 @@ class PosturePath:
     jacobian: Array
 
     def at_waypoints(self, joint: int) -> Array:
-        """(n_waypoints,) positions of a joint, to a thousandth."""
+        """Return a joint's positions (n_waypoints,) [rad or m], rounded to 0.001."""
         return np.asarray(np.round(self.q[::BETWEEN, joint], 3))
 
 
 class _Chain:
-    """Numeric kinematics of an arm, some joints held."""
+    """Numeric kinematics of an arm with some joints held."""
 
     def __init__(
         self, robot: Robot, contact: Contact, task: Task, held: Mapping[int, float]
@@ -424,14 +425,14 @@ class _Chain:
         self.middle = (self.low + self.high) / 2.0
 
     def jacobian(self, q: Array) -> Array:
-        """(6, joints), axes of the root."""
+        """Compute the Jacobian (6, joints) of the flange, in axes of the root."""
         J: Array = pin.computeFrameJacobian(
             self.model, self.data, q, self.flange, pin.LOCAL_WORLD_ALIGNED
         )
         return J
 
     def error(self, q: Array, pose: Array) -> Array:
-        """(6,) what is missing to a box pose."""
+        """Compute the pose error (6,) to a box pose."""
         T = self.to_root @ box_placement(self.orientation, pose) @ self.T_box_flange
         pin.framesForwardKinematics(self.model, self.data, q)
         here = self.data.oMf[self.flange]
@@ -439,7 +440,7 @@ class _Chain:
         return np.concatenate([T[:3, 3] - here.translation, turn])
 
     def reach(self, q: Array, pose: Array) -> Array | None:
-        """A posture near q that holds the box within the joint limits; None if none is found."""
+        """Find a posture near q that holds the box within the joint limits; None without one."""
         for _ in range(STEPS):
             error = self.error(q, pose)
             if np.linalg.norm(error) < CLOSE and self.within(q):
@@ -453,11 +454,11 @@ class _Chain:
         return None
 
     def within(self, q: Array) -> bool:
-        """Whether no joint is beyond its limits."""
+        """Return True if every joint is within its limits."""
         return bool(np.all((q >= self.robot.position_lower) & (q <= self.robot.position_upper)))
 
     def starts(self) -> Array:
-        """The middle posture and random ones."""
+        """Return the middle posture and random ones."""
         rng = np.random.default_rng(0)
         q = np.vstack([self.middle, rng.uniform(self.low, self.high, (SEEDS, len(self.low)))])
         for joint, value in self.held.items():
@@ -468,7 +469,8 @@ class _Chain:
 def posture_path(
     robot: Robot, contact: Contact, task: Task, held: Mapping[int, float]
 ) -> PosturePath | None:
-    """A path of all joints of an arm along the hand-made trajectory, away from joint limits.
+    """Compute a path of all joints of an arm along the hand-made trajectory, away from joint
+    limits.
 
     Args:
         robot, contact: the arm and what it holds the box by.
@@ -510,7 +512,7 @@ def posture_path(
 def best_conditioned(
     path: PosturePath | None, n_joints: int, forced: Sequence[int]
 ) -> tuple[int, ...]:
-    """The redundant joints of an arm: those without which the other six are conditioned best.
+    """Return the redundant joints of an arm: those that leave the other six conditioned best.
 
     Args:
         path: the arm along the hand-made trajectory; None: the joints next to the root.

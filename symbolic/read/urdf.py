@@ -1,4 +1,4 @@
-"""A URDF file as checked records, before any other library sees it.
+"""URDF files as checked records, before any other library reads them.
 
 What is taken over is what this project uses: the tree of links and joints, masses and inertias,
 collision shapes, and the addresses of meshes. Everything taken is checked here, each problem with
@@ -45,7 +45,7 @@ _MOMENTS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 
 @dataclass(frozen=True)
 class UrdfMesh:
-    """A mesh by its address as written; scale: (3,) factor per axis."""
+    """Mesh with its address as written; scale: (3,) factor per axis."""
 
     address: str
     scale: Array
@@ -53,7 +53,7 @@ class UrdfMesh:
 
 @dataclass(frozen=True)
 class UrdfCollision:
-    """A collision shape of a link; pose: (4, 4) in the link's frame."""
+    """Collision shape of a link; pose: (4, 4) in the link's frame."""
 
     shape: Box | Cylinder | Sphere | Capsule | UrdfMesh
     pose: Array
@@ -61,7 +61,7 @@ class UrdfCollision:
 
 @dataclass(frozen=True)
 class Urdf:
-    """What a URDF file says, checked.
+    """Checked content of a URDF file.
 
     Attributes:
         file: the file's name, without its folder.
@@ -87,7 +87,7 @@ class Urdf:
         return {joint.child: name for name, joint in self.joints.items()}
 
     def above(self, link: str) -> Iterator[str]:
-        """The joints between a link and the root, from the link upwards."""
+        """Yield the joints between a link and the root, from the link upwards."""
         while link in self.moved_by:
             yield self.moved_by[link]
             link = self.joints[self.moved_by[link]].parent
@@ -125,7 +125,7 @@ def read_urdf(path: Path, arguments: Arguments = (), package_dirs: Sequence[Path
 
 @lru_cache(maxsize=8)
 def parse_urdf(content: bytes, file: str) -> Urdf:
-    """The records of a URDF's content; `file` names it in messages.
+    """Parse the records of a URDF's content; `file` names it in messages.
 
     Raises:
         UrdfError: see `read_urdf`.
@@ -302,7 +302,7 @@ def _joint(joint: Part) -> UrdfJoint:
 
 
 def pose_of(part: Part) -> Array:
-    """(4, 4) of an element's origin; the identity where it has none."""
+    """Read an element's origin (4, 4); the identity without one."""
     origin = part.child("origin")
     if origin is None:
         return read_only(np.eye(4))
@@ -314,7 +314,7 @@ def pose_of(part: Part) -> Array:
 def _tree_problem(
     links: tuple[str, ...], joints: Mapping[str, UrdfJoint]
 ) -> tuple[str, str] | None:
-    """Why links and joints are no tree, as (element, text); None where they are one."""
+    """Return (element, text) if links and joints do not form a tree, else None."""
     if not links:
         return "robot", "has no links; allowed is a tree of links and joints"
     moved_by: dict[str, str] = {}
@@ -352,7 +352,7 @@ def _tree_problem(
 
 
 def _mimic_problem(joints: Mapping[str, UrdfJoint]) -> tuple[str, str] | None:
-    """Which joints follow one another in a circle, as (element, text)."""
+    """Return (element, text) if joints mimic each other in a circle, else None."""
     for name in joints:
         met, followed = {name}, joints[name].mimics
         while followed:
@@ -367,7 +367,7 @@ def _mimic_problem(joints: Mapping[str, UrdfJoint]) -> tuple[str, str] | None:
 
 
 def read_srdf(path: Path) -> tuple[IgnoredPair, ...]:
-    """The `disable_collisions` elements of an SRDF file, in its order; the rest is not read.
+    """Read the `disable_collisions` elements of an SRDF file, in its order; ignore the rest.
 
     They are pairs of links with the file's reason, such as 'Adjacent' or 'Never', or none.
 
