@@ -5,7 +5,7 @@ It also serves where a function is evaluated so few times that compiling it woul
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import casadi as ca
@@ -40,17 +40,7 @@ class InterpretedFunction(NumericFunction):
         self.function = dense(function)
 
     def _evaluate_block(self, inputs: Sequence[Array], block: NDArray[np.void]) -> None:
-        self._into(inputs, [block[name] for name in self.output_names])
-
-    def _into(self, inputs: Sequence[Array], outputs: Sequence[Array]) -> None:
-        buffer, evaluate = self.function.buffer()
-        for i, array in enumerate(inputs):
-            buffer.set_arg(i, array.data)
-        for i, array in enumerate(outputs):
-            buffer.set_res(i, array.data)
-        evaluate()
-        if buffer.ret():
-            raise CodegenError(f"{self.name}: the function failed")
+        self._evaluator(inputs, [block[name] for name in self.output_names])()
 
     def _evaluate_batch(
         self,
@@ -60,13 +50,37 @@ class InterpretedFunction(NumericFunction):
         n: int,
         threads: int,
     ) -> None:
+        # One evaluation's memory serves all: CasADi is told addresses once a batch.
+        own = [
+            np.empty(array.shape[1:]) if per else array
+            for array, per in zip(inputs, batched, strict=True)
+        ]
+        found = [np.empty(array.shape[1:]) for array in outputs]
+        changing = [
+            (array, one) for array, one, per in zip(inputs, own, batched, strict=True) if per
+        ]
+        evaluate = self._evaluator(own, found)
         for k in range(n):
-            # With the ellipsis a scalar stays an array that shares the batch's memory.
-            chosen = [
-                array[k, ...] if per_candidate else array
-                for array, per_candidate in zip(inputs, batched, strict=True)
-            ]
-            self._into(chosen, [output[k, ...] for output in outputs])
+            for array, one in changing:
+                one[...] = array[k]
+            evaluate()
+            for array, one in zip(outputs, found, strict=True):
+                array[k] = one
+
+    def _evaluator(self, inputs: Sequence[Array], outputs: Sequence[Array]) -> Callable[[], None]:
+        """Bind the function to arrays that it reads and writes at each call."""
+        buffer, evaluate = self.function.buffer()
+        for i, array in enumerate(inputs):
+            buffer.set_arg(i, array.data)
+        for i, array in enumerate(outputs):
+            buffer.set_res(i, array.data)
+
+        def checked() -> None:
+            evaluate()
+            if buffer.ret():
+                raise CodegenError(f"{self.name}: the function failed")
+
+        return checked
 
 
 @dataclass(frozen=True)

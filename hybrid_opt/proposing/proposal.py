@@ -41,6 +41,7 @@ from hybrid_opt.proposing.via_points import (
     travelled,
 )
 from symbolic.array import Array
+from symbolic.cell_model import CellBodies
 from symbolic.errors import SettingsError, WorkcellError
 from symbolic.path.spline import path_basis
 from symbolic.records import POSE_SIZE, Workcell
@@ -400,39 +401,39 @@ class _Search:
         dense = shortened(pair.chain, corners, self.rng)
         for count in range(1, MOST_VIA_POINTS + 1):
             via = fit(pair.chain, dense, count, self.rng)
-            if via is not None:
-                whole = np.vstack([pair.start.extended, via, pair.goal.extended])
-                short = straightened(pair.chain, pair.start, whole, self.rng)
-                return np.asarray(np.round(short[1:-1], 4))
-            if self.too_late:
-                break
+            if via is not None or self.too_late:
+                return via
         return None
 
     def _judged(self, setup: Setup, pair: Pair, via: Array, box: BoxAlone) -> Iterator[Proposal]:
         """The proposal with these via-points, none where the evaluator refuses it or one of its
         class was found before."""
-        ends = np.round([pair.start.extended, pair.goal.extended], 4)
-        waypoints = np.vstack([ends[0], via, ends[1]])
-        path = path_basis(len(waypoints), np.linspace(0.0, 1.0, LEAST_SAMPLES)).position @ waypoints
-        if self._is_known(pair, box, path[:, :POSE_SIZE]):
+        fitted = np.vstack([pair.start.extended, via, pair.goal.extended])
+        if self._is_known(pair, box, _poses(fitted)):
             return
         self._say("the evaluator's verdict")
         begun = self.spent
-        spins = (pair.holds[0].spin, pair.holds[1].spin)
-        found = Draft(setup.workcell, spins, (-1, -1), waypoints, setup.given)
-        trial = Trial(self._workcell(found), pair.start.q, named=False)
-        judgement, why = trial.verdict()
+        first = self._trial(setup, pair, fitted)
+        certified = self.spent if first.verdict()[0].feasible else None
+        self._say("a shorter way")
+        straight = straightened(pair.chain, pair.start, fitted, self.rng)
+        found = self._trial(setup, pair, straight, first.bodies)
+        judgement, why = found.verdict()
         if not judgement.feasible:
-            self.refusals.append(why)
+            if certified is None:
+                self.refusals.append(why)
+                return
+            found, straight = first, fitted
+        certified = certified or self.spent
+        if self._is_known(pair, box, _poses(straight)):
             return
-        certified = self.spent
         self._say("bounds")
-        # The verdict on the file takes about as long as this one did.
-        bounds = self._bounds(trial, self.settings.seconds - 1.5 * (self.spent - begun))
-        moved = replace(found, bounds=bounds).around(bounds.carry)
+        # The verdict on the file takes about as long as these did.
+        bounds = self._bounds(found, self.settings.seconds - 1.5 * (self.spent - begun))
+        moved = self._draft(setup, pair, straight, bounds).around(bounds.carry)
         self._say("the evaluator's verdict on the file")
         try:
-            last = Trial(self._workcell(moved), trial.start_of(bounds.carry), trial.bodies)
+            last = Trial(self._workcell(moved), found.start_of(bounds.carry), found.bodies)
         except BranchLostError:
             self.refusals.append("the start posture is not among the arm's start branches")
             return
@@ -441,7 +442,7 @@ class _Search:
             self.refusals.append(why)
             return
         outputs = last.evaluator.outputs(last.initial[None])
-        self.known.add((id(pair), box.passed(path[:, :POSE_SIZE])))
+        self.known.add((id(pair), box.passed(_poses(straight))))
         self._say("the pads' way to the box")
         blocked, stand_off = ("", None) if self.out_of_time else self._pads_way(last)
         yield Proposal(
@@ -456,6 +457,21 @@ class _Search:
             box.passed(outputs["pose"][0]),
             blocked,
         )
+
+    def _draft(
+        self, setup: Setup, pair: Pair, waypoints: Array, bounds: Bounds | None = None
+    ) -> Draft:
+        """What is found with waypoints (n, 6 + m), rounded as a file states them."""
+        spins = (pair.holds[0].spin, pair.holds[1].spin)
+        rounded = np.round(waypoints, 4)
+        return Draft(setup.workcell, spins, (-1, -1), rounded, setup.given, bounds)
+
+    def _trial(
+        self, setup: Setup, pair: Pair, waypoints: Array, bodies: CellBodies | None = None
+    ) -> Trial:
+        """The carry through waypoints (n, 6 + m); bodies as of `Trial`."""
+        workcell = self._workcell(self._draft(setup, pair, waypoints))
+        return Trial(workcell, pair.start.q, bodies, named=False)
 
     def _pads_way(self, trial: Trial) -> tuple[str, float | None]:
         """What blocks the pads before a trial's carry or after it, '' where nothing does, and the
@@ -486,3 +502,9 @@ class _Search:
             lambda: self.spent > until,
         )
         return sampling.bounds_around(trial.initial)
+
+
+def _poses(waypoints: Array) -> Array:
+    """(n, 6) box poses along the spline through waypoints (w, 6 + m)."""
+    basis = path_basis(len(waypoints), np.linspace(0.0, 1.0, LEAST_SAMPLES)).position
+    return np.asarray((basis @ waypoints)[:, :POSE_SIZE])

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from itertools import pairwise
 
-import cma
 import numpy as np
 
 from hybrid_opt.proposing.holding import JUMP
@@ -137,6 +136,9 @@ def straightened(
 
     Found by an evolution strategy, CMA-ES (Hansen, arXiv 1604.00772), from the given one on.
     """
+    # Not imported at the top: it brings Matplotlib, and a first carry is there before.
+    import cma
+
     lever = levers(waypoints.shape[1])
     basis = path_basis(len(waypoints), np.linspace(0.0, 1.0, MEASURED)).position
     places = list(_closed_path(chain, start, basis @ waypoints))
