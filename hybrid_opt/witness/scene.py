@@ -257,7 +257,7 @@ def contact_points(
         around = pressed_places(pad, pads, settings.points)
         in_pad = np.column_stack([around, np.full(len(around), -POINT_RADIUS)])
         T = T_body_pad if pad is contact else T_body_box @ pad.T_box_pad
-        stiffness = settings.layer * _area(pad) / len(around)
+        stiffness = settings.layer * pad.area / len(around)
         text += [
             f'<geom type="sphere" size="{POINT_RADIUS!r}" contype="{PRESSES}" conaffinity="0" '
             f'priority="1" friction="{contact.friction!r} 0 0" pos="{mjcf_text(place)}" '
@@ -269,13 +269,7 @@ def contact_points(
 
 def patch_area(contact: Contact) -> float:
     """Area of all pads of a robot [m^2]."""
-    return sum(_area(pad) for pad in (contact, *contact.further))
-
-
-def _area(pad: Contact) -> float:
-    if pad.half_sides is None:
-        return float(np.pi * pad.patch_radius**2)
-    return float(4.0 * np.prod(pad.half_sides))
+    return sum(pad.area for pad in (contact, *contact.further))
 
 
 def pressed_places(contact: Contact, pads: Pads, points: int) -> Array:

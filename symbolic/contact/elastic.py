@@ -1,13 +1,21 @@
-"""Where elastic pads press when arms keep their orientation: shifts of their centres of pressure.
+"""Elastic layers between arms that keep their poses and the payload: how they share a load, and
+where pads then press.
+
+Each pad is a layer of springs, of equal stiffness all over its area. The payload moves by six
+numbers until all layers together bear the load. With a pad's stiffness K_i and the map A_i from its
+wrench to one about the box frame it bears K_i A_i^T (sum_j A_j K_j A_j^T)^-1 of the load: a
+constant matrix.
 
 Pads that press evenly are a limit (`symbolic.contact.soft_finger`): a layer that gives lets the box
-turn a little against the arms, and its pressure tilts with it. Each pad is a layer of springs, of
-equal stiffness all over its area; the box moves by six numbers until all layers together carry the
-load. What a layer then carries as moments about its tangents shifts its pressure. A shift of a
-quarter of a disc's radius, or of a third of a rectangle's half side, takes the pressure off a rim.
+turn a little against the arms, and its pressure tilts with it. What a layer then carries as moments
+about its tangents shifts its pressure. A shift of a quarter of a disc's radius, of half a cup's, or
+of a third of a rectangle's half side, takes the pressure off a rim.
 """
 
 from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -19,49 +27,63 @@ SHEAR = 1.0 / 3.0
 """Stiffness of a layer along it over that across it: rubber keeps its volume."""
 
 
+def layer_shares(pads: Sequence[Contact]) -> Array:
+    """Return the matrices (n, 6, 6) from a load to the wrenches that n pads bear of it.
+
+    The load is force and moment about the box frame's origin, box axes; a wrench is that of the pad
+    on the payload about the pad's place, in the pad's axes [N, N m].
+    """
+    maps, stiff = [wrench_to_box(pad) for pad in pads], [_stiffness(pad) for pad in pads]
+    whole = sum(A @ K @ A.T for A, K in zip(maps, stiff, strict=True))
+    return np.array([K @ A.T @ np.linalg.inv(whole) for A, K in zip(maps, stiff, strict=True)])
+
+
 def pressure_shifts(workcell: Workcell, load: Array, normal: Array) -> Array:
-    """(n, 2) shifts of the centres of pressure over those that take the pressure off a rim; the
-    largest of a robot's pads.
+    """Return the shifts (n, 2) of the centres of pressure over those that take the pressure off a
+    rim; the largest of a robot's pads.
 
     Args:
-        workcell: whose pads share each robot's normal force by their areas.
+        workcell: its pads share each robot's normal force by their areas.
         load: (n, 6) force and moment about the box frame's origin, box axes [N, N m].
         normal: (n, 2) normal forces of the robots [N].
     """
     pads, robots = workcell.pads, workcell.pad_robots
-    maps, stiff = [wrench_to_box(pad) for pad in pads], [_stiffness(pad) for pad in pads]
-    whole = sum(A @ K @ A.T for A, K in zip(maps, stiff, strict=True))
-    moved = np.linalg.solve(whole, load.T)
-    area = np.array([K[2, 2] for K in stiff])
+    area = np.array([pad.area for pad in pads])
     own = np.bincount(robots, area, 2)[list(robots)]
     found = np.zeros((len(load), 2))
-    for i, (pad, robot) in enumerate(zip(pads, robots, strict=True)):
-        tilting = (stiff[i] @ maps[i].T @ moved)[3:5]
+    for i, share in enumerate(layer_shares(pads)):
+        tilting = share[3:5] @ load.T
         # A normal force N n at d turns about d x n = (d_y, -d_x).
-        shift = np.abs(tilting[::-1]) / (normal[:, robot] * area[i] / own[i])
-        if pad.half_sides is None:
-            use = np.linalg.norm(shift, axis=0) / free_shift(pad)
-        else:
-            use = np.abs(shift / (np.array(pad.half_sides)[:, None] / 3.0)).sum(axis=0)
-        found[:, robot] = np.maximum(found[:, robot], use)
+        shift = np.abs(tilting[::-1]) / (normal[:, robots[i]] * area[i] / own[i])
+        use = shift / np.array(kern(pads[i]))[:, None]
+        is_round = pads[i].half_sides is None
+        use = np.linalg.norm(use, axis=0) if is_round else use.sum(axis=0)
+        found[:, robots[i]] = np.maximum(found[:, robots[i]], use)
     return found
 
 
 def free_shift(pad: Contact) -> float:
-    """Shift of a pad's centre of pressure that takes the pressure off its rim [m]."""
+    """Return the shift of a pad's centre of pressure that takes the pressure off its rim [m]."""
+    return float(min(kern(pad)))
+
+
+def kern(pad: Contact) -> tuple[Any, Any]:
+    """Return the shifts of the centre of pressure along a pad's axes that take the pressure off its
+    rim, numbers or symbols [m]."""
     if pad.half_sides is None:
-        return pad.patch_radius / 4.0
-    return min(pad.half_sides) / 3.0
+        share = 2.0 if pad.is_ring else 4.0
+        return pad.patch_radius / share, pad.patch_radius / share
+    return pad.half_sides[0] / 3.0, pad.half_sides[1] / 3.0
 
 
 def _stiffness(pad: Contact) -> Array:
     """(6, 6) of a pad's layer, in its axes, over that of a unit of area across it."""
+    area = pad.area
+    # Means of the squared coordinates: the side, or the radius of a ring or a disc, times the kern.
     if pad.half_sides is None:
-        area = np.pi * pad.patch_radius**2
-        x_squared = y_squared = area * pad.patch_radius**2 / 4.0
+        squares = [pad.patch_radius * shift for shift in kern(pad)]
     else:
-        x, y = pad.half_sides
-        area = 4.0 * x * y
-        x_squared, y_squared = area * x**2 / 3.0, area * y**2 / 3.0
-    along = [SHEAR * area, SHEAR * area, area]
-    return np.diag([*along, y_squared, x_squared, SHEAR * (x_squared + y_squared)])
+        squares = [side * shift for side, shift in zip(pad.half_sides, kern(pad), strict=True)]
+    x_squared, y_squared = squares
+    torsion = SHEAR * (x_squared + y_squared)
+    return area * np.diag([SHEAR, SHEAR, 1.0, y_squared, x_squared, torsion])

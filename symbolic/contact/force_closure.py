@@ -119,7 +119,7 @@ def pressed_alike(workcell: Workcell) -> Array:
         normals = [pads[i].T_box_pad[:3, 2] for i in (first, k)]
         if first != k and normals[0] @ normals[1] > PARALLEL:
             row = np.zeros(len(pads))
-            row[first], row[k] = 1.0, -_area(pads[first]) / _area(pads[k])
+            row[first], row[k] = 1.0, -pads[first].area / pads[k].area
             rows.append(row)
     return np.array(rows).reshape(-1, len(pads))
 
@@ -140,12 +140,6 @@ def balance_maps(workcell: Workcell, in_units: bool = False) -> list[Array]:
         rows[:, 0] = alike[:, i]
         found.append(np.vstack([to_box, rows]))
     return found
-
-
-def _area(pad: Contact) -> float:
-    if pad.half_sides is None:
-        return np.pi * pad.patch_radius**2
-    return 4.0 * pad.half_sides[0] * pad.half_sides[1]
 
 
 def _balanced_states(workcell: Workcell, share: float) -> tuple[Array, ...] | None:

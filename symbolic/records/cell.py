@@ -12,7 +12,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 
@@ -234,6 +234,10 @@ class Payload:
         return Box(self.size) if self.shape is None else self.shape
 
 
+HandKind = Literal["pad", "cup", "magnet", "fingers"]
+"""A pad holds because both arms squeeze the payload; a hand of another kind holds by itself."""
+
+
 @dataclass(frozen=True)
 class Contact:
     """The frictional contact between one robot's pad and the box.
@@ -245,8 +249,11 @@ class Contact:
         patch_radius: radius of a round contact patch, half the diagonal of a rectangular one [m].
         half_sides: half the sides of a rectangular patch along the pad's x and y axes [m]; None
             for a round one.
-        further: other pads of the same robot, rigidly beside the first, as on a fork; with its
-            friction and its kind of patch.
+        further: other pads of the same robot, rigidly beside the first, as on a fork, in an array
+            of cups or in a gripper; with its friction, patch, kind and holding force.
+        kind: of the hand. A cup presses along its lip, a ring; the others all over their patch.
+        holding_force: with which a hand holds by itself: vacuum times area, a magnet's pull, the
+            closing force of a gripper [N]; zero for a pad.
     """
 
     T_box_pad: Array
@@ -254,6 +261,20 @@ class Contact:
     patch_radius: float
     half_sides: tuple[float, float] | None = None
     further: tuple[Contact, ...] = ()
+    kind: HandKind = "pad"
+    holding_force: float = 0.0
+
+    @property
+    def is_ring(self) -> bool:
+        """Whether the patch presses along its rim alone."""
+        return self.kind == "cup"
+
+    @property
+    def area(self) -> float:
+        """Area within the patch's rim [m^2]."""
+        if self.half_sides is None:
+            return float(np.pi * self.patch_radius**2)
+        return float(4.0 * np.prod(self.half_sides))
 
 
 @dataclass(frozen=True)

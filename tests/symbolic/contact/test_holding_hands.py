@@ -1,0 +1,235 @@
+"""Hands that hold by themselves, against makers' formulas, springs, and conic programs."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import casadi as ca
+import clarabel
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from symbolic.array import Array
+from symbolic.contact.elastic import SHEAR, kern, layer_shares
+from symbolic.contact.force_closure import wrench_to_box
+from symbolic.contact.holding_hands import HandPatch, needed_holding_forces
+from symbolic.records import Contact
+from symbolic.records.poses import transform
+from tests.symbolic.contact.oracle import solved
+
+RADIUS, FRICTION = 0.04, 0.5
+
+DISC = Contact(np.eye(4), FRICTION, RADIUS, kind="magnet", holding_force=100.0)
+CUP = replace(DISC, kind="cup")
+FINGER = replace(DISC, kind="fingers", half_sides=(0.03, 0.02), patch_radius=0.0360555)
+HANDS = {"disc": DISC, "cup": CUP, "finger": FINGER}
+
+SEEDS = st.integers(0, 2**31)
+
+
+def needed(hand: Contact, wrench: Array) -> Array:
+    """(2,) forces against lifting and against sliding [N]."""
+    found = needed_holding_forces(ca.DM(wrench), hand.friction, HandPatch.of(hand))
+    return np.array([float(value) for value in found])
+
+
+def random_hands(seed: int, count: int) -> tuple[Contact, ...]:
+    """Hands of all kinds with any places and normals within a box of 0.4 m."""
+    rng, kinds = np.random.default_rng(seed), list(HANDS.values())
+    return tuple(
+        replace(
+            kinds[k % 3],
+            T_box_pad=transform(Rotation.random(rng=rng).as_matrix(), rng.uniform(-0.2, 0.2, 3)),
+        )
+        for k in range(count)
+    )
+
+
+def random_load(seed: int) -> Array:
+    rng = np.random.default_rng(seed)
+    return np.concatenate([rng.normal(0.0, 50.0, 3), rng.normal(0.0, 5.0, 3)])
+
+
+def points_of(hand: Contact, count: int) -> tuple[Array, Array]:
+    """(n, 2) points of a patch, and their shares (n,) of its area, exact for second moments."""
+    nodes, doubled = np.polynomial.legendre.leggauss(count)
+    if hand.half_sides is not None:
+        x, y = np.meshgrid(*[side * nodes for side in hand.half_sides])
+        return np.column_stack([x.ravel(), y.ravel()]), np.outer(doubled, doubled).ravel() / 4.0
+    angle = 2.0 * np.pi * np.arange(4 * count) / (4 * count)
+    # Even in the squared radius: each ring stands for as much area.
+    at, weight = np.sqrt((nodes + 1.0) / 2.0), doubled / 2.0
+    if hand.is_ring:
+        at, weight = np.ones(1), np.ones(1)
+    r, phi = (each.ravel() for each in np.meshgrid(at, angle))
+    points = hand.patch_radius * np.column_stack([r * np.cos(phi), r * np.sin(phi)])
+    return points, np.tile(weight, len(angle)) / len(angle)
+
+
+# --- one cup without moments: J. Schmalz GmbH, basic principles of vacuum technology ---
+
+
+def held_by_one_cup(normal: Array, acceleration: Array, mass: float = 6.0) -> float:
+    """Needed holding force of a cup at the centre of mass, for one acceleration."""
+    z = np.asarray(normal)
+    x = np.cross([0.0, 1.0, 0.0], z) if abs(z[1]) < 0.9 else np.array([1.0, 0.0, 0.0])
+    axes = np.column_stack([x, np.cross(z, x), z])
+    cup = replace(CUP, T_box_pad=transform(axes, np.zeros(3)))
+    load = np.concatenate([mass * (acceleration + np.array([0.0, 0.0, 9.80665])), np.zeros(3)])
+    return float(needed(cup, layer_shares((cup,))[0] @ load).max())
+
+
+@pytest.mark.parametrize("a", [0.0, 1.5, 5.0])
+def test_one_cup_without_moments_needs_what_makers_say(a: float) -> None:
+    m, g, mu = 6.0, 9.80665, FRICTION
+    above, beside = np.array([0.0, 0.0, -1.0]), np.array([1.0, 0.0, 0.0])
+    lifted, along = np.array([0.0, 0.0, a]), np.array([a, 0.0, 0.0])
+    assert held_by_one_cup(above, lifted) == pytest.approx(m * (g + a), rel=1e-9)
+    assert held_by_one_cup(above, along) == pytest.approx(m * (g + a / mu), rel=1e-9)
+    assert held_by_one_cup(beside, lifted) == pytest.approx(m / mu * (g + a), rel=1e-9)
+
+
+# --- the split ---
+
+
+def split_by_springs(hands: tuple[Contact, ...], load: Array) -> Array:
+    """(n, 6) wrenches of hands whose patches are grids of springs: the least elastic energy that
+    balances a load, as one program over the forces of all springs."""
+    maps, compliance, owners = [], [], []
+    for k, hand in enumerate(hands):
+        for place, share in zip(*points_of(hand, 6), strict=True):
+            x, y = place
+            lever = np.array([[0.0, 0.0, y], [0.0, 0.0, -x], [-y, x, 0.0]])
+            maps.append(np.vstack([np.eye(3), lever]))
+            compliance.append(1.0 / (share * hand.area * np.array([SHEAR, SHEAR, 1.0])))
+            owners.append(k)
+    to_box = np.hstack([wrench_to_box(hands[k]) @ own for k, own in zip(owners, maps, strict=True)])
+    # min 1/2 f C f  s.t.  B f = load; with g = sqrt(C) f the least norm.
+    root = np.sqrt(np.concatenate(compliance))
+    forces = np.linalg.lstsq(to_box / root, load, rcond=None)[0] / root
+    wrenches = np.zeros((len(hands), 6))
+    for j, k in enumerate(owners):
+        wrenches[k] += maps[j] @ forces[3 * j : 3 * j + 3]
+    return wrenches
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_hands_share_a_load_like_grids_of_springs(seed: int) -> None:
+    hands, load = random_hands(seed, 2 + seed), random_load(seed)
+    found = layer_shares(hands) @ load
+    expected = split_by_springs(hands, load)
+    np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-6 * np.abs(expected).max())
+
+
+@given(seed=SEEDS, count=st.integers(1, 6))
+def test_shares_balance_the_load(seed: int, count: int) -> None:
+    hands, load = random_hands(seed, count), random_load(seed)
+    wrenches = layer_shares(hands) @ load
+    total = sum(wrench_to_box(hand) @ own for hand, own in zip(hands, wrenches, strict=True))
+    np.testing.assert_allclose(total, load, atol=1e-9 * np.abs(load).max())
+
+
+@given(seed=SEEDS)
+def test_the_box_frame_does_not_matter(seed: int) -> None:
+    hands, load = random_hands(seed, 3), random_load(seed)
+    rng = np.random.default_rng(seed)
+    T = transform(Rotation.random(rng=rng).as_matrix(), rng.uniform(-0.3, 0.3, 3))
+    moved = tuple(replace(hand, T_box_pad=T @ hand.T_box_pad) for hand in hands)
+    force, moment = T[:3, :3] @ load[:3], T[:3, :3] @ load[3:]
+    other = np.concatenate([force, moment + np.cross(T[:3, 3], force)])
+    np.testing.assert_allclose(layer_shares(moved) @ other, layer_shares(hands) @ load, atol=1e-7)
+
+
+@given(seed=SEEDS)
+def test_mirrored_hands_need_the_same(seed: int) -> None:
+    """Half a turn about z exchanges both hands of a pair and turns the load."""
+    (first, _), load = random_hands(seed, 2), random_load(seed)
+    half = np.diag([-1.0, -1.0, 1.0, 1.0])
+    hands = first, replace(first, T_box_pad=half @ first.T_box_pad)
+    turned = np.concatenate([half[:3, :3] @ load[:3], half[:3, :3] @ load[3:]])
+    own, other = layer_shares(hands) @ load, layer_shares(hands) @ turned
+    np.testing.assert_allclose(own[0], other[1], atol=1e-8)
+    np.testing.assert_allclose(own[1], other[0], atol=1e-8)
+
+
+# --- what a hand needs ---
+
+
+@given(seed=SEEDS, name=st.sampled_from(sorted(HANDS)), factor=st.floats(0.1, 10.0))
+def test_needs_grow_with_the_load_and_add_up_at_most(seed: int, name: str, factor: float) -> None:
+    hand, one, other = HANDS[name], random_load(seed), random_load(seed + 1)
+    alone = needed(hand, one)
+    np.testing.assert_allclose(needed(hand, factor * one), factor * alone, rtol=1e-6, atol=1e-6)
+    assert (needed(hand, one + other) <= alone + needed(hand, other) + 1e-6).all()
+
+
+@given(seed=SEEDS, name=st.sampled_from(("disc", "cup")), angle=st.floats(-np.pi, np.pi))
+def test_the_spin_of_a_round_hand_does_not_matter(seed: int, name: str, angle: float) -> None:
+    wrench, turn = random_load(seed), Rotation.from_euler("z", angle).as_matrix()
+    spun = np.concatenate([turn @ wrench[:3], turn @ wrench[3:]])
+    np.testing.assert_allclose(needed(HANDS[name], spun), needed(HANDS[name], wrench), rtol=1e-9)
+
+
+@given(seed=SEEDS, name=st.sampled_from(sorted(HANDS)))
+def test_a_rim_lifts_where_the_least_pressure_of_a_layer_vanishes(seed: int, name: str) -> None:
+    """A layer's pressure is linear over its patch: the least force under which no point of its rim
+    pulls, with the slope from moments of a grid."""
+    hand, wrench = HANDS[name], random_load(seed)
+    points, share = points_of(hand, 3)
+    if hand.half_sides is None:
+        around = 2.0 * np.pi * np.arange(360) / 360.0
+        edge = hand.patch_radius * np.column_stack([np.cos(around), np.sin(around)])
+    else:
+        edge = np.array([[1, 1], [1, -1], [-1, 1], [-1, -1]]) * np.array(hand.half_sides)
+    # Pressure a + b x + c y: moments M_x = sum y p, M_y = -sum x p fix b and c.
+    x, y = points.T
+    bend = np.array([[share @ (x * y), share @ (y * y)], [-share @ (x * x), -share @ (x * y)]])
+    slope = np.linalg.solve(bend, wrench[3:5])
+    least = float((-(edge @ slope)).max() - wrench[2])
+    assert needed(hand, wrench)[0] == pytest.approx(least, rel=1e-4, abs=1e-4 * abs(wrench).max())
+
+
+def least_against_sliding(hand: Contact, wrench: Array, count: int) -> float:
+    """Least force under which friction of an even pressure on a grid bears a wrench."""
+    points, share = points_of(hand, count)
+    n = len(points)
+    # Unknowns: P, then the tangential forces (n, 2) of the points.
+    balance = np.zeros((3, 1 + 2 * n))
+    balance[0, 1::2] = balance[1, 2::2] = 1.0
+    balance[2, 1::2], balance[2, 2::2] = -points[:, 1], points[:, 0]
+    scale = RADIUS
+    balance[2] /= scale
+    right = np.array([wrench[0], wrench[1], wrench[5] / scale])
+    cones = np.zeros((3 * n, 1 + 2 * n))
+    cones[::3, 0] = -hand.friction * share
+    cones[1::3, 1::2] = cones[2::3, 2::2] = -np.eye(n)
+    cost = np.zeros(1 + 2 * n)
+    cost[0] = 1.0
+    blocks = [
+        (balance, right, [clarabel.ZeroConeT(3)]),
+        (cones, np.zeros(3 * n), [clarabel.SecondOrderConeT(3)] * n),
+    ]
+    found = solved(np.zeros((1 + 2 * n,) * 2), cost, blocks)
+    assert found is not None
+    return float(found[0] - wrench[2])
+
+
+@pytest.mark.parametrize("name", sorted(HANDS))
+@pytest.mark.parametrize("lever", [0.0, 0.1, 0.3, 0.7, 1.5, 100.0])
+def test_sliding_needs_what_even_pressure_bears(name: str, lever: float) -> None:
+    """Torsion in radii times the tangential force; the model is on the safe side."""
+    hand, beyond = HANDS[name], {"disc": 0.022, "cup": 0.031, "finger": 0.11}[name]
+    for angle in (0.0, 0.6, 1.57):
+        tangential = np.array([np.cos(angle), np.sin(angle)]) / (1.0 + lever) * 40.0
+        torsion = lever / (1.0 + lever) * 40.0 * hand.patch_radius
+        wrench = np.array([*tangential, 0.0, 0.0, 0.0, torsion])
+        exact = least_against_sliding(hand, wrench, 8)
+        assert -4e-3 < needed(hand, wrench)[1] / exact - 1.0 < beyond
+
+
+def test_a_cups_lip_has_the_moments_of_a_ring() -> None:
+    assert kern(CUP) == (RADIUS / 2.0,) * 2
+    assert kern(DISC) == (RADIUS / 4.0,) * 2
