@@ -1,4 +1,4 @@
-"""The one array type of all packages, and what annotations say of the values of a record."""
+"""The one array type of all packages, and the annotations of allowed values of a record."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Range:
-    """What a number may be.
+    """Allowed range of a number.
 
     Attributes:
         low, high: lowest and highest value.
@@ -33,17 +33,17 @@ class Range:
     mistaken: tuple[tuple[str, float], ...] = ()
 
     def contains(self, value: float) -> bool:
-        """Whether the value is finite and within the range."""
+        """Return True if the value is finite and within the range."""
         return math.isfinite(value) and self.low <= value <= self.high
 
     def allowed(self) -> str:
-        """The range in words."""
+        """Describe the range in words."""
         if self.low == -math.inf and self.high == math.inf:
             return "any that is finite"
         return f"{self.low:g} to {self.high:g} {self.unit}".rstrip()
 
     def suspicion(self, value: float) -> str:
-        """Which other unit a value outside the range was probably written in, or ''."""
+        """Name another unit in which a value outside the range was probably written, or ''."""
         for name, factor in self.mistaken:
             if math.isfinite(value) and value != 0 and self.contains(value * factor):
                 return (
@@ -55,7 +55,7 @@ class Range:
 
 @dataclass(frozen=True)
 class Form:
-    """What a text has to be.
+    """Allowed form of a text.
 
     Attributes:
         problem: what is wrong with a value, '' where nothing is.
@@ -74,7 +74,7 @@ class Shape:
 
 @dataclass(frozen=True)
 class Filling:
-    """Marks an array for which a single number may stand: all of it are that number."""
+    """Marks an array that a single number may fill."""
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,7 @@ Row = Annotated[Array, Shape((None,))]
 
 
 def interpolated(at: Array, along: Array, values: Array) -> Array:
-    """(m, ...) values (n, ...) at places (m,), linearly between those at ascending places (n,)."""
+    """Interpolate values (n, ...) given at ascending places (n,) linearly at places (m,)."""
     found = np.empty((len(at), *values.shape[1:]))
     for column in np.ndindex(values.shape[1:]):
         every = (slice(None), *column)
@@ -107,20 +107,20 @@ def interpolated(at: Array, along: Array, values: Array) -> Array:
 
 
 def evenly(count: int, most: int) -> NDArray[np.intp]:
-    """At most `most` of `count` rows, evenly spread, both ends among them."""
+    """Return at most `most` of `count` row indices, evenly spread, including both ends."""
     return np.linspace(0, count - 1, min(count, most)).round().astype(np.intp)
 
 
 def set_read_only(record: object) -> None:
-    """Refuse changes of the arrays that a record holds itself."""
+    """Make the arrays of a record read-only."""
     for value in vars(record).values():
         if isinstance(value, np.ndarray):
             value.setflags(write=False)
 
 
 def require_allowed(settings: object, whose: str = "") -> None:
-    """Refuse a record of settings with a value that its annotations do not allow: another one than
-    a `Literal` names, or no number of a `Range`. None is allowed where the annotation has it.
+    """Refuse a settings record with a value that its annotations do not allow: not one of a
+    `Literal`, or outside a `Range`. None is allowed if the annotation allows it.
 
     Args:
         whose: the settings are, in front of the message.

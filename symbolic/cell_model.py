@@ -1,4 +1,4 @@
-"""A workcell together with its robots' models and the postures it starts from."""
+"""A workcell with its robots' models and start postures."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from symbolic.robot.model import RobotModel, build_robot_model
 
 @dataclass(frozen=True, eq=False)
 class CellBodies:
-    """A cell's arms and bodies, which do not depend on the postures that arms start in.
+    """A cell's arms and bodies, independent of the start postures.
 
     Attributes:
         workcell: the description.
@@ -42,7 +42,7 @@ class CellBodies:
 
     @cached_property
     def screen(self) -> Screen:
-        """What bounds of distances are made of."""
+        """Numbers behind the bounds of distances."""
         return screen_of(self.geometry)
 
     @cached_property
@@ -68,7 +68,7 @@ class CellModel(CellBodies):
 
 
 def build_cell_bodies(workcell: Workcell) -> CellBodies:
-    """Read the robots and the bodies, which takes a fifth of what the whole model takes.
+    """Read the robots and the bodies, in a fifth of the time of the whole model.
 
     Raises:
         RobotModelError: a URDF does not give an arm.
@@ -133,8 +133,8 @@ def build_cell_model(
 
 
 def own_pairs(geometry: CellGeometry, arm: int) -> list[int]:
-    """Active pairs of one arm's bodies with anything but the other arm; what stands of a machine
-    is of neither."""
+    """Return the active pairs of one arm's bodies with anything except the other arm; the still
+    part of a machine belongs to neither arm."""
     own, other = (f"robot {i + 1}" for i in (arm, 1 - arm))
     groups = [
         {geometry.bodies[body].group for body in (pair.first, pair.second)}
@@ -144,7 +144,8 @@ def own_pairs(geometry: CellGeometry, arm: int) -> list[int]:
 
 
 def own_clearance(geometry: CellGeometry, arm: int, bounds: Bounds) -> Clearance:
-    """Least clearance bound [m] of one arm over samples, the other arm left out.
+    """Return a function of one arm's least clearance bound [m] over samples, the other arm left
+    out.
 
     Args:
         bounds: of all pairs, from poses (n, 6) and both arms' joints.

@@ -1,4 +1,4 @@
-"""The root of all errors that a user can cause, and those of describing a cell.
+"""The root of all user errors, and the errors of describing a cell.
 
 Each package above has an `errors` module with those that it alone raises.
 """
@@ -13,7 +13,7 @@ class DualArmWarning(UserWarning):
 
 
 class OutsideError(DualArmError):
-    """A file from outside is not taken; the text says why, but not which file it is."""
+    """A file from outside is refused; the text says why, but not which file it is."""
 
 
 class WorkcellError(DualArmError):
@@ -54,7 +54,7 @@ class SceneError(DualArmError):
 
 
 class BridgeError(DualArmError):
-    """What installing compiles is missing, or was built for other versions."""
+    """Code compiled at installation is missing, or was built for other versions."""
 
 
 class CollisionModelError(DualArmError):

@@ -15,15 +15,15 @@ Expression: TypeAlias = ca.SX | ca.MX
 
 
 def reciprocal(x: ca.SX) -> ca.SX:
-    """1 / x, to be multiplied with: CasADi makes a division of x * (1 / y), and a processor takes
-    ten times as long for that as for the product."""
+    """Compute 1 / x for multiplication: CasADi turns x * (1 / y) into a division, which costs ten
+    times as much as a product."""
     return 2.0 / (x + x)
 
 
 def named_function(
     name: str, inputs: Mapping[str, Any], outputs: Mapping[str, Any], cse: bool = True
 ) -> ca.Function:
-    """A function by the names of what it takes and gives, in order.
+    """Build a function from named inputs and outputs, in order.
 
     Args:
         cse: whether what occurs several times is computed once.
@@ -33,39 +33,40 @@ def named_function(
 
 
 def number(value: Any) -> Any:
-    """A number or an array of a record as an expression; symbols as they are."""
+    """Return a number or an array of a record as an expression; symbols unchanged."""
     return value if isinstance(value, ca.SX | ca.MX) else ca.DM(value)
 
 
 def sx_given(*records: Any) -> dict[str, ca.SX]:
-    """The groups of numbers of some records by the names of the inputs, without repetition; none of
-    plain records."""
+    """Return the parameter groups of some records by input name, each once; empty for plain
+    records."""
     groups = (group for record in records if (group := getattr(record, "given", None)) is not None)
     return {group.name: group.symbols for group in groups}
 
 
 def mx_given(*records: Any) -> dict[str, ca.MX]:
-    """The same as new symbols, of functions that only hand them on."""
+    """Return the same groups as new MX symbols, for functions that only pass them on."""
     return mx_symbols(sx_given(*records))
 
 
 def mx_symbols(given: Mapping[str, ca.SX]) -> dict[str, ca.MX]:
-    """Symbols that hand on groups of numbers."""
+    """Return MX symbols for parameter groups."""
     return {name: ca.MX.sym(name, symbols.numel()) for name, symbols in given.items()}
 
 
 def of(handed: Mapping[str, ca.MX], *records: Any) -> dict[str, ca.MX]:
-    """Those of `mx_given` that belong to some of its records."""
+    """Select the symbols of `mx_parameters` that belong to some records."""
     return {name: handed[name] for name in sx_given(*records)}
 
 
 def as_mx(value: ca.SX, given: Mapping[str, ca.SX], handed: Mapping[str, ca.MX]) -> ca.MX:
-    """An expression of numbers as one of the symbols of `mx_given`."""
+    """Return an SX expression of parameters as an MX expression of the symbols of
+    `mx_parameters`."""
     if not given:
         return ca.MX(ca.evalf(value))
     return ca.Function("numbers", list(given.values()), [value])(*handed.values())
 
 
 def repeated(given: Mapping[str, ca.MX], n: int) -> list[ca.MX]:
-    """Numbers as `casadi.Function.map` takes them: once per column."""
+    """Repeat parameters once per column, as `casadi.Function.map` takes them."""
     return [ca.repmat(symbols, 1, n) for symbols in given.values()]

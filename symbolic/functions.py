@@ -1,4 +1,4 @@
-"""The functions that are compiled, by who needs them.
+"""The functions that are compiled, by their users.
 
 A whole candidate, from its decision vector to every sample: path, time law, payload load and both
 arms composed. The outputs hold one sample per column, so that NumPy sees (n_samples, dim). For the
@@ -62,7 +62,7 @@ FRICTION_TOLERANCE = 1e-9
 
 
 def candidate_function(model: CellModel) -> ca.Function:
-    """Evaluator of one candidate: x (n_var,) to every per-sample quantity.
+    """Build the evaluator of one candidate: x (n_var,) to every per-sample quantity.
 
     Outputs (NumPy shapes, n samples): time (n,) [s]; pose (n, 6), rate, second_rate (n, 6) with
     respect to time; those of `LOAD_OUTPUTS` without the wrenches; per robot i = 1, 2 those of
@@ -107,7 +107,7 @@ def candidate_function(model: CellModel) -> ca.Function:
 
 
 def _all(model: CellModel) -> dict[str, ca.MX]:
-    """The numbers of whole candidates."""
+    """Return the parameters of a whole candidate."""
     workcell = model.workcell
     return mx_given(workcell.task, *workcell.robots, model, workcell.payload)
 
@@ -119,14 +119,14 @@ def _waypoints(task: Task, x: ca.MX, handed: dict[str, ca.MX]) -> ca.MX:
 def _constraints(
     workcell: Workcell, values: dict[str, ca.MX], n: int, handed: dict[str, ca.MX]
 ) -> ca.MX:
-    """`_constraint_function` of n samples."""
+    """Map `_constraint_function` over n samples."""
     numbers = repeated(of(handed, *workcell.robots, workcell.payload), n)
     inputs = [values[name] for name in _CONSTRAINT_INPUTS]
     return _constraint_function(workcell).map(n)(*inputs, *numbers)
 
 
 def motion_function(model: CellModel) -> ca.Function:
-    """What of a candidate needs no forces, much cheaper where those are found by a solver; not for
+    """Build the evaluator without forces, much cheaper where a solver finds those; not for
     'optimal'.
 
     Outputs as of `candidate_function`: time, pose, q_1, q_2, and the violation (9,) of reach,
@@ -177,8 +177,8 @@ SAMPLE_NAMES = frozenset(
 
 
 def sample_sizes(workcell: Workcell) -> dict[str, int]:
-    """Outputs of `sample_functions`' `sample` after the states, and their entries; the candidate's
-    function has the same ones."""
+    """Return the outputs after the states of `sample_functions`' `sample`, with their number of
+    entries; the candidate's function has the same outputs."""
     sizes = dict(_LOAD_SIZES)
     for i, robot in enumerate(workcell.robots, start=1):
         joints = robot.position_lower.shape[0]
@@ -188,20 +188,20 @@ def sample_sizes(workcell: Workcell) -> dict[str, int]:
 
 
 def forces_come_last(workcell: Workcell) -> bool:
-    """Whether a candidate's forces are found after all else is known of it, where that is free of
-    violations: a program solves for them, and then nothing but objectives depends on them."""
+    """Return True if a candidate's forces are computed only after everything else is free of
+    violations: a program solves for them, and then only objectives depend on them."""
     return not workcell.has_closed_form
 
 
 def force_sizes(workcell: Workcell) -> dict[str, int]:
-    """Outputs of `sample_functions`' `forces`, and their entries."""
+    """Return the outputs of `sample_functions`' `forces`, with their number of entries."""
     torques = [f"joint_torque_{i}" for i in (1, 2)]
     sizes = _LOAD_SIZES | {name: sample_sizes(workcell)[name] for name in torques}
     return sizes | {"force_constraint": len(FORCE_CONSTRAINTS)}
 
 
 def sample_functions(model: CellModel) -> dict[str, ca.Function]:
-    """A candidate's function in parts, to be put together sample by sample; not for 'optimal'.
+    """Build a candidate's function in parts, to be composed sample by sample; not for 'optimal'.
 
     path: x (n_var,) -> time (1, n), pose (6 + m, n), extended by the redundant joints, rate,
     second_rate (6, n). start: first pose, joints of both arms there -> state_1, state_2 before the
@@ -257,7 +257,8 @@ def sample_functions(model: CellModel) -> dict[str, ca.Function]:
 
 
 def kernel_numbers(workcell: Workcell, screen: Screen) -> dict[str, tuple[str, ...]]:
-    """Which numbers each of `kernel_functions` takes behind its other inputs, in order.
+    """Return the parameter groups that each of `kernel_functions` takes after its other inputs, in
+    order.
 
     Args:
         workcell, screen: with numbers.
@@ -276,7 +277,7 @@ def _forces_function(
     load: dict[str, ca.MX],
     handed: dict[str, ca.MX],
 ) -> ca.Function:
-    """See `sample_functions`."""
+    """Build the function `forces` of `sample_functions`."""
     workcell = model.workcell
     joints = [ca.MX.sym(f"q_{i + 1}", model.robots[i].n_joints) for i in (0, 1)]
     outputs = dict(load)
@@ -320,7 +321,7 @@ _CONSTRAINT_INPUTS = (
 
 
 def _constraint_function(workcell: Workcell) -> ca.Function:
-    """Constraint values (9,) of one sample from the named outputs."""
+    """Build the function of constraint values (9,) of one sample from the named outputs."""
     sizes = {"normal_force": 2, "tangential_force": 2, "pressure_shift": 2}
     inputs = {name: ca.SX.sym(name, sizes.get(name, 1)) for name in _CONSTRAINT_INPUTS}
     given = sx_given(*workcell.robots, workcell.payload)
@@ -353,7 +354,8 @@ def _row_max(matrix: ca.MX) -> ca.MX:
 
 
 def _time_share(time: ca.MX) -> ca.MX:
-    """Share (1, n) of the duration that each sample stands for: half of both neighbouring steps."""
+    """Compute the share (1, n) of the duration that each sample represents: half of both
+    neighbouring steps."""
     steps = time[:, 1:] - time[:, :-1]
     return (ca.horzcat(0.0, steps) + ca.horzcat(steps, 0.0)) / (2.0 * time[-1])
 
@@ -362,7 +364,7 @@ def _time_share(time: ca.MX) -> ca.MX:
 
 
 def arm_functions(model: CellModel) -> dict[str, ca.Function]:
-    """The functions by name that know no bodies.
+    """Build the functions that need no bodies, by name.
 
     candidate: the evaluator of a whole candidate, see `candidate_function`.
     inverse_dynamics_i: of each arm i = 1, 2 (`symbolic.robot.model`).
@@ -376,15 +378,15 @@ def arm_functions(model: CellModel) -> dict[str, ca.Function]:
 
 
 def cell_functions(model: CellModel) -> dict[str, ca.Function]:
-    """The functions by name: those of `arm_functions`, and those of
+    """Build the functions of `arm_functions` and of
     `symbolic.geometry.clearance.screening_functions`."""
     return arm_functions(model) | model.screening
 
 
 def branch_functions(model: CellModel) -> dict[str, ca.Function]:
-    """What start branches are found with: poses, all samples (6 + m, n) of a path through waypoints
-    (6 + m, w); of each arm i = 1, 2 approach_i (`symbolic.robot.branches`) and follow_i
-    (`symbolic.robot.arm.follow_function`)."""
+    """Build the functions that find start branches: poses, all samples (6 + m, n) of a path through
+    waypoints (6 + m, w); of each arm i = 1, 2 approach_i (`symbolic.robot.branches`) and
+    follow_i (`symbolic.robot.arm.follow_function`)."""
     task = model.workcell.task
     waypoints = ca.SX.sym("waypoints", task.extended_size, len(task.waypoints))
     poses = waypoints @ ca.DM(sample_basis(task).position.T)
@@ -399,7 +401,7 @@ def branch_functions(model: CellModel) -> dict[str, ca.Function]:
 
 
 def kernel_functions(model: CellModel) -> dict[str, ca.Function]:
-    """What a whole evaluation is put together from, sample by sample.
+    """Build the functions of a whole evaluation, to be composed sample by sample.
 
     path, start, predict, sample and, of some cells, forces: see `sample_functions`.
     clearance, far_clearance, piece_poses: see `symbolic.geometry.clearance.screening_functions`.
@@ -410,7 +412,7 @@ def kernel_functions(model: CellModel) -> dict[str, ca.Function]:
 
 
 def timing_functions(model: CellModel, samples: int) -> dict[str, ca.Function]:
-    """Functions for the timing of one workcell.
+    """Build the functions for the timing of one workcell.
 
     path_motion: see `symbolic.path_motion`, at that many samples. load, uncertain_load: see
     `symbolic.contact.load`. arm_i per arm i = 1, 2: see

@@ -1,4 +1,4 @@
-"""A cell's numbers as inputs: what is compiled depends on structure alone.
+"""A cell's parameters as inputs, so that compiled code depends on the topology only.
 
 `CellNumbers` divides what formulas are made of into numbers, which compiled functions take as
 vectors, and structure, whose digests are the keys of what is compiled. Structure is everything that
@@ -55,7 +55,7 @@ GROUPS = frozenset((TASK, HELD, START, BODIES, *ARMS, *SQUEEZES))
 
 @dataclass(frozen=True)
 class Number:
-    """The place of numbers in a structure: what they are, without their values.
+    """A parameter array in a topology: its group, key and shape, without values.
 
     Attributes:
         group: they belong to.
@@ -70,14 +70,14 @@ class Number:
 
 @dataclass(frozen=True)
 class _Later:
-    """Numbers that are found when they are first asked for."""
+    """Parameters that are computed on first use."""
 
     shape: tuple[int, ...]
     find: Callable[[], Array]
 
 
 class _Collector:
-    """Takes numbers: places in the structure, the values aside."""
+    """Collects parameters: places stay in the topology, values are stored separately."""
 
     def __init__(self) -> None:
         self.entries: dict[str, list[tuple[Number, Array | _Later]]] = {}
@@ -104,8 +104,8 @@ class _Collector:
 
 
 class _Symbols:
-    """Takes the same numbers: slices of one vector of symbols per group, in the order in which they
-    were collected."""
+    """Replaces the same parameters by slices of one vector of symbols per group, in the order in
+    which they were collected."""
 
     def __init__(self, sizes: Mapping[str, int]) -> None:
         self._groups = {name: Group(name, ca.SX.sym(name, size)) for name, size in sizes.items()}
@@ -138,7 +138,7 @@ _Take = _Collector | _Symbols
 
 @dataclass(frozen=True)
 class WorkcellNumbers:
-    """The numbers and the structure of a cell without its bodies.
+    """Parameters and topology of a cell without its bodies.
 
     Attributes:
         cell: the description.
@@ -162,18 +162,18 @@ class WorkcellNumbers:
 
     @property
     def layout(self) -> dict[str, tuple[Number, ...]]:
-        """What the entries of every group are, but for the start postures, in order."""
+        """Entries of every group but the start postures, in order."""
         return {name: tuple(each for each, _ in found) for name, found in self._entries.items()}
 
     @cached_property
     def sizes(self) -> dict[str, int]:
-        """Numbers per group, but for the start postures."""
+        """Number of parameters per group but the start postures."""
         return {
             name: sum(prod(each.shape) for each in found) for name, found in self.layout.items()
         }
 
     def vector(self, name: str) -> Array:
-        """The numbers (n,) of a group.
+        """Return the parameters (n,) of a group.
 
         Raises:
             SettingsError: the pads do not close the grasp that they are of.
@@ -189,7 +189,7 @@ class WorkcellNumbers:
 
     @property
     def digest(self) -> str:
-        """Digest of the structure without bodies."""
+        """Digest of the topology without bodies."""
         return self._without_arms
 
     @cached_property
@@ -197,7 +197,7 @@ class WorkcellNumbers:
         return digest_of_parts((self.workcell,))
 
     def symbols(self) -> NumberedWorkcell:
-        """The cell with symbols instead of numbers."""
+        """Return the cell with symbols instead of numbers."""
         return _workcell(self._symbols(), self.cell)
 
     def _symbols(self, further: Mapping[str, int] = MappingProxyType({})) -> _Symbols:
@@ -206,7 +206,7 @@ class WorkcellNumbers:
 
 @dataclass(frozen=True)
 class CellNumbers(WorkcellNumbers):
-    """The same of a whole cell.
+    """Parameters and topology of a whole cell.
 
     Attributes:
         bounds: what bounds of distances are made of.
@@ -232,7 +232,7 @@ class CellNumbers(WorkcellNumbers):
 
     @cached_property
     def digest(self) -> str:
-        """Digest of the structure without bodies but the arms' own."""
+        """Digest of the topology without bodies except the arms' own."""
         arms = tuple(
             (model.model.saveToString(), model.flange_id, model.redundant, model.pose_size)
             for model in self.models
@@ -241,11 +241,11 @@ class CellNumbers(WorkcellNumbers):
 
     @cached_property
     def bodies_digest(self) -> str:
-        """Digest of the whole structure."""
+        """Digest of the whole topology."""
         return digest_of_parts((self.digest, self.screen))
 
     def symbolic(self, bodies: CellBodies) -> CellModel:
-        """The model whose functions take the numbers as inputs.
+        """Build the model whose functions take the parameters as inputs.
 
         Args:
             bodies: of the cell, or of another one of the same structure.
@@ -265,7 +265,7 @@ class CellNumbers(WorkcellNumbers):
 
 
 def _workcell(take: _Take, cell: Workcell) -> NumberedWorkcell:
-    """The cell with its numbers taken; what no formula reads is left out."""
+    """Take the parameters of the cell; those that no formula reads are left out."""
     pairs = zip(cell.robots, cell.contacts, strict=True)
     first, second = (_robot(take, i, *pair) for i, pair in enumerate(pairs))
     payload: Any = replace(cell.payload, size=np.zeros(3), shape=None, jerk_max=None)
@@ -303,7 +303,8 @@ def _workcell(take: _Take, cell: Workcell) -> NumberedWorkcell:
 def _grasp(
     take: _Take, group: str, path: str, cell: Workcell, commanded: int | None
 ) -> GraspNumbers:
-    """What the program of pads anywhere derives, under a commanded force or without."""
+    """Take the derived quantities of a grasp by pads with any normals, with or without a
+    commanded force."""
 
     @cache
     def found() -> GraspNumbers:
@@ -329,7 +330,7 @@ def _grasp(
 
 
 def _as(kind: Any, record: Any, **changes: Any) -> Any:
-    """A record of numbers with the fields of a plain one, some changed."""
+    """Build a record of parameters with the fields of a plain one, some changed."""
     known = {each.name: getattr(record, each.name) for each in fields(record)}
     return kind(**(known | changes))
 
@@ -365,7 +366,7 @@ def _split(T: Array) -> tuple[Array, Array]:
 
 
 def _turn(take: _Take, group: str, path: str, rotation: Array) -> Any:
-    """Rotation of a base. Most bases stand upright, which is structure."""
+    """Take the rotation of a base; an upright base is topology, as most are."""
     level = np.array([0.0, 0.0, 1.0])
     if np.array_equal(rotation[2], level) and np.array_equal(rotation[:, 2], level):
         cosine, sine = rotation[0, 0], rotation[1, 0]
@@ -430,7 +431,7 @@ def _joint(take: _Take, joint: RedundantJoint) -> NumberedJoint:
 
 
 def _screen(take: _Take, screen: Screen) -> Screen:
-    """The screen with its numbers taken: all but the shapes of links and of meshes."""
+    """Take the screen's parameters: all except the shapes of links and of meshes."""
     first, second = (_base(take, f"robots[{i}]", base) for i, base in enumerate(screen.bases))
     return replace(
         screen,
@@ -451,7 +452,7 @@ def _base(take: _Take, path: str, base: Base) -> Base:
 
 @lru_cache(maxsize=512)
 def _collected_body(seen: CacheKey) -> tuple[Any, list[tuple[Number, Array | _Later]]]:
-    """Cells that are tried out share most bodies."""
+    """Collect a body's parameters, cached because variants of a cell share most bodies."""
     take, (path, body) = _Collector(), seen.given
     return _body(take, path, body), take.entries.get(BODIES, [])
 
@@ -467,7 +468,7 @@ def _body(take: _Take, path: str, body: ScreenBody) -> Any:
 
 
 def _own(take: _Take, path: str, value: Any) -> Any:
-    """Every array of a record taken, in the order of its fields."""
+    """Take every array of a record, in the order of its fields."""
     if isinstance(value, np.ndarray) and value.size:
         return take(BODIES, path, value)
     if isinstance(value, tuple):

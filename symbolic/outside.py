@@ -1,4 +1,4 @@
-"""The one door for files from outside: what is no plain file of a sensible size stays outside.
+"""Reading and writing of files from outside the program, with bounds on type, size and content.
 
 Every file that the project did not write in the same breath is read here, whatever its format:
 a workcell, a URDF, a mesh, a stored result, a trajectory, an entry of the cache. A path may lead
@@ -65,7 +65,7 @@ _LONG = re.compile(rf"(?:[ \t]*+\.[ \t]*+{_KEY_PART}){{{MOST_DEPTH}}}")
 
 
 def resolved(path: Path) -> Path:
-    """The absolute path of an existing file, symbolic links followed.
+    """Return the absolute path of an existing file, with symbolic links resolved.
 
     Raises:
         OutsideError: there is none, or the links lead in a circle.
@@ -79,7 +79,7 @@ def resolved(path: Path) -> Path:
 def read_bytes(
     path: Path, most: int, judge: Callable[[os.stat_result], None] = lambda found: None
 ) -> bytes:
-    """A regular file's content.
+    """Read a regular file's content.
 
     Args:
         path: the file, or a symbolic link to it.
@@ -105,7 +105,7 @@ def require(path: Path, most: int) -> None:
 
 
 def text(content: bytes) -> str:
-    """Content as text.
+    """Decode content as UTF-8.
 
     Raises:
         OutsideError: it is not UTF-8.
@@ -119,7 +119,7 @@ def text(content: bytes) -> str:
 
 
 def xml_text(content: bytes) -> str:
-    """The text of an XML document, without a byte order mark.
+    """Decode an XML document, without a byte order mark.
 
     Raises:
         OutsideError: it is not UTF-8, declares another encoding, or has a document type, whose
@@ -138,7 +138,7 @@ def xml_text(content: bytes) -> str:
 
 
 def json_value(content: bytes) -> Any:
-    """The value of a JSON document, every number finite and every text printable as UTF-8.
+    """Parse a JSON document in which every number is finite and every text is printable as UTF-8.
 
     Raises:
         OutsideError: it is not JSON, nested too deeply, holds too many values, a number that is
@@ -162,7 +162,7 @@ def json_value(content: bytes) -> Any:
 
 
 def toml_tables(content: bytes) -> dict[str, Any]:
-    """The tables of a TOML document.
+    """Parse the tables of a TOML document.
 
     Raises:
         OutsideError: it is not TOML or nested too deeply.
@@ -191,7 +191,7 @@ _TOO_DEEP = f"nested too deeply; allowed is a depth of {MOST_DEPTH}"
 
 
 def megabytes(size: float) -> str:
-    """A size in words people compare with their file manager."""
+    """Return a size in MiB as a text."""
     return f"{size / MEBIBYTE:.3g} MiB"
 
 
@@ -243,7 +243,7 @@ def _json_depth(document: str) -> int:
 
 
 def _depth(value: Any) -> int:
-    """Depth of nested tables and arrays, without recursion."""
+    """Compute the depth of nested tables and arrays, without recursion."""
     level, layer = 0, [value]
     while layer:
         level += 1
@@ -268,7 +268,7 @@ def _finite(digits: str) -> float:
 
 
 def _refuse_surrogates(value: Any) -> None:
-    """A text that no file and no terminal can hold would only be found out when it is written."""
+    """Refuse half surrogate pairs, which no file and no terminal can hold."""
     left = [value]
     while left:
         one = left.pop()
@@ -341,7 +341,7 @@ def sync_folder(folder: Path) -> None:
 
 @contextmanager
 def _alone(draft: Path, mode: int) -> Iterator[BinaryIO]:
-    """A new, empty file that nobody else writes, as far as the file system has locks."""
+    """Open a new, empty file with an exclusive lock, as far as the file system has locks."""
     while True:
         with open(os.open(draft, os.O_WRONLY | os.O_CREAT | os.O_NOFOLLOW, mode), "wb") as file:
             with suppress(OSError):
@@ -353,7 +353,8 @@ def _alone(draft: Path, mode: int) -> Iterator[BinaryIO]:
 
 
 def _is_still(draft: Path, file: BinaryIO) -> bool:
-    """False where whoever held the lock before has renamed what was opened: it is theirs."""
+    """Return True if the path still is the locked file; a former owner of the lock may have
+    renamed it."""
     try:
         return os.path.samestat(os.fstat(file.fileno()), draft.stat(follow_symlinks=False))
     except FileNotFoundError:
@@ -361,5 +362,5 @@ def _is_still(draft: Path, file: BinaryIO) -> bool:
 
 
 def printable(text: str) -> str:
-    """A foreign text in one line of printable characters."""
+    """Return a foreign text in one line of printable characters."""
     return " ".join("".join(c if c.isprintable() else " " for c in text).split())

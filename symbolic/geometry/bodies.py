@@ -29,7 +29,7 @@ MOST_CORNERS = 100_000
 
 @dataclass(frozen=True)
 class Frame:
-    """What a body is fixed to.
+    """Frame that a body is fixed to.
 
     Attributes:
         kind: 'world', 'box', or 'link', behind a joint of a robot.
@@ -110,7 +110,7 @@ class ArmGeometry(ContentRecord):
 
 
 def collision_bodies(workcell: Workcell) -> tuple[CollisionBody, ...]:
-    """All bodies: robot 1, robot 2, payload, environment, each in the order of its file.
+    """Return all bodies: robot 1, robot 2, payload, environment, each in the order of its file.
 
     What stands still of a robot that is a chain of a larger machine counts as environment.
 
@@ -148,7 +148,7 @@ def _check_body(seen: CacheKey) -> None:
 
 
 def arm_geometry(workcell: Workcell, i: int) -> ArmGeometry:
-    """The joints of robot i as numbers."""
+    """Compute the geometry of robot i's joints as numbers."""
     robot, contact = workcell.robots[i], workcell.contacts[i]
     model = arm_model(robot)
     data = model.createData()
@@ -169,7 +169,7 @@ def arm_geometry(workcell: Workcell, i: int) -> ArmGeometry:
 
 
 def _check_effort(bodies: list[CollisionBody], most_pieces: int) -> None:
-    """Refuse more pieces and corners than the sorting of pairs gets through in some seconds."""
+    """Refuse more pieces and corners than sorting the pairs handles in some seconds."""
     pieces = sum(len(body.pieces) for body in bodies)
     largest = max(bodies, key=lambda body: len(body.pieces))
     if pieces > most_pieces:
@@ -193,7 +193,7 @@ def _corners(piece: Piece) -> int:
 
 
 def _robot_bodies(robot: Robot, i: int, links: ArmLinks, meshes: MeshReader) -> list[CollisionBody]:
-    """The bodies of one arm and its tool."""
+    """Return the bodies of one arm and its tool."""
     group: Group = "robot 1" if i == 0 else "robot 2"
     model = arm_model(robot)
     own = links.moved if robot.chain_root else (*links.still, *links.moved)
@@ -219,7 +219,7 @@ def _robot_bodies(robot: Robot, i: int, links: ArmLinks, meshes: MeshReader) -> 
 def _standing_bodies(
     robots: tuple[Robot, Robot], i: int, links: tuple[ArmLinks, ArmLinks], meshes: MeshReader
 ) -> list[CollisionBody]:
-    """What stands still of the machine that arm i is a chain of."""
+    """Return the bodies of arm i's machine that stand still."""
     robot, bodies = robots[i], []
     if not robot.chain_root:
         return []
@@ -235,7 +235,7 @@ def _standing_bodies(
 
 
 def _attachment(model: pin.Model, link: str, robot: Robot, i: int) -> tuple[Frame, Array]:
-    """The frame that a link is fixed to and the link's pose in it."""
+    """Return the frame that a link is fixed to and the link's pose in it."""
     frame = model.frames[link_frame(model, link)]
     placement: Array = frame.placement.homogeneous
     if frame.parentJoint == 0:
@@ -246,7 +246,8 @@ def _attachment(model: pin.Model, link: str, robot: Robot, i: int) -> tuple[Fram
 def _link_pieces(
     robot: Robot, links: Collection[str], meshes: MeshReader
 ) -> dict[str, tuple[Piece, ...]]:
-    """The collision pieces of some links of a URDF, in the link's frame and the file's order."""
+    """Return the collision pieces of some links of a URDF, in the link's frame and the file's
+    order."""
     found_pieces = {}
     for link, collisions in robot_urdf(robot).collisions.items():
         if link not in links:
@@ -275,14 +276,15 @@ def _located(mesh: UrdfMesh, robot: Robot, owner: str) -> Mesh:
 
 
 class MeshReader:
-    """The meshes of one cell: each is read and cut once, within `MOST_CELL_FACES` together."""
+    """Reader of a cell's meshes: each is read and decomposed once, within `MOST_CELL_FACES`
+    together."""
 
     def __init__(self) -> None:
         self._known: dict[tuple[Path, tuple[float, ...]], tuple[Hull, ...]] = {}
         self._triangles = 0
 
     def hulls(self, mesh: Mesh) -> tuple[Hull, ...]:
-        """The convex pieces of a mesh.
+        """Return the convex pieces of a mesh.
 
         Raises:
             CollisionModelError: see `symbolic.read.meshes.read_mesh`; and all meshes so far
@@ -306,7 +308,8 @@ class MeshReader:
 
 
 def _state(path: Path) -> tuple[int, int]:
-    """Changes where a file does; zero where it cannot be asked, which reading it then tells."""
+    """Return a file's modification time and size; zeros if it is missing, which reading it then
+    reports."""
     try:
         found = path.stat()
     except OSError:
@@ -318,7 +321,7 @@ def _state(path: Path) -> tuple[int, int]:
 def _cut_file(
     path: Path, scale: tuple[float, ...], state: tuple[int, int]
 ) -> tuple[tuple[Hull, ...], int]:
-    """The convex pieces of a mesh file and its number of triangles.
+    """Compute the convex pieces of a mesh file and its number of triangles.
 
     Kept beyond one cell: what tries a cell out reads its robots several times.
     """
@@ -332,7 +335,7 @@ def _cut_file(
 def shape_pieces(
     shape: Shape | Capsule, pose: Array, owner: str, meshes: MeshReader
 ) -> tuple[Piece, ...]:
-    """The convex pieces of a shape at a pose (4, 4)."""
+    """Return the convex pieces of a shape at a pose (4, 4)."""
     if not isinstance(shape, Mesh):
         return (Piece(shape, pose),)
     try:

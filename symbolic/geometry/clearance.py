@@ -58,7 +58,7 @@ def screening_functions(
     softness: Softness = EXACT,
     screen: Screen | None = None,
 ) -> dict[str, ca.Function]:
-    """The functions that collision checking calls, by name.
+    """Build the functions that collision checking calls, by name.
 
     The first two take pose (6,), q_1 and q_2 (n,) [m, rad] of one sample.
     clearance: -> clearance (n_near,), lower bounds of the distances of the possible pairs that are
@@ -108,7 +108,8 @@ def screening_functions(
 
 
 def _piece_pose(placed: tuple[ca.SX, ca.SX] | None, turn: Any, centre: Any) -> tuple[ca.SX, ca.SX]:
-    """Unit quaternion (4,) and position (3,) in the world of a piece, see `ScreenBody.pieces`.
+    """Compute the unit quaternion (4,) and position (3,) in the world of a piece, see
+    `ScreenBody.pieces`.
 
     Args:
         placed: rotation and position of its frame; None of what stands.
@@ -128,7 +129,8 @@ BOX_NUMBERS = 15
 
 
 def box_numbers(body: CollisionBody) -> Array:
-    """(BOX_NUMBERS,) of a fixed box: its rotation (3, 3), centre (3,) and half edges (3,)."""
+    """Return a fixed box as numbers (BOX_NUMBERS,): rotation (3, 3), centre (3,) and half edges
+    (3,)."""
     (piece,) = body.pieces
     assert isinstance(piece.shape, Box)
     half = np.asarray(piece.shape.size) / 2.0
@@ -136,7 +138,7 @@ def box_numbers(body: CollisionBody) -> Array:
 
 
 class Scene:
-    """The bodies of one sample; every expression is built once and shared."""
+    """Distance bounds of one sample; every expression is built once and shared."""
 
     def __init__(
         self,
@@ -146,7 +148,7 @@ class Scene:
         placements: tuple[tuple[ca.SX, ca.SX], tuple[ca.SX, ca.SX]],
         softness: Softness,
     ) -> None:
-        """Nothing is built yet.
+        """Store the placements; expressions are built on demand.
 
         Args:
             R_box, p_box: (3, 3) and (3,), the box in the world.
@@ -171,7 +173,7 @@ class Scene:
         self._chains: dict[int, list[ca.SX]] = {}
 
     def bound(self, pair: int) -> ca.SX:
-        """Lower bound of the distance between the bodies of a possible pair."""
+        """Compute a lower bound of the distance between the bodies of a possible pair."""
         i, j = self.screen.pairs[pair]
         first, second = self.screen.bodies[i], self.screen.bodies[j]
         if second.obstacles:
@@ -191,13 +193,13 @@ class Scene:
         return self.soft.maximum_below(gaps)
 
     def separable(self, pair: int) -> bool:
-        """Whether a possible pair is the payload and an obstacle of one box."""
+        """Return True if a possible pair is the payload and an obstacle of one box."""
         first, second = (self.screen.bodies[body] for body in self.screen.pairs[pair])
         kinds = [obstacle.kind for obstacle in second.obstacles]
         return first.group == "payload" and kinds == [Box]
 
     def separation(self, obstacle: ca.SX, direction: ca.SX) -> ca.SX:
-        """The gap between the payload and a fixed box along a direction.
+        """Compute the gap between the payload and a fixed box along a direction.
 
         Args:
             obstacle: (BOX_NUMBERS,) of the box, see `box_numbers`; may be symbols.
@@ -221,11 +223,11 @@ class Scene:
         return list(zip(self._interval(i, axes), self._interval(j, axes), strict=True))
 
     def _gap(self, pairs: Sequence[tuple[Interval, Interval]]) -> ca.SX:
-        """Largest separation over directions, given both bodies' intervals."""
+        """Compute the largest separation over directions from both bodies' intervals."""
         return self.soft.maximum_below(_gaps(pairs))
 
     def _interval(self, index: int, axes: Axes) -> list[Interval]:
-        """Per direction the extent of a body."""
+        """Compute a body's extent per direction."""
         key = (index, axes.key)
         body = self.screen.bodies[index]
         if body.extent is not None and axes is self._world:
@@ -243,14 +245,15 @@ class Scene:
         return self._intervals[key]
 
     def _piece_interval(self, A: ca.SX, offset: ca.SX, piece: Solid) -> list[Interval]:
-        """Extent of a cover piece along the rows of A, its frame's origin at offset."""
+        """Compute the extent of a cover piece along the rows of A, with its frame's origin at
+        offset."""
         middle = ca.mtimes(A, ca.SX(number(piece.centre))) + offset
         seen = A if piece.rotation is None else ca.mtimes(A, turned(piece.rotation))
         reach = [self._reach(seen[k, :], piece) for k in range(3)]
         return [(middle[k] - reach[k], middle[k] + reach[k]) for k in range(3)]
 
     def _reach(self, u: ca.SX, piece: Solid) -> ca.SX:
-        """Support of a piece about its centre along u (1, 3) in its own axes."""
+        """Compute the support of a piece about its centre along u (1, 3) in its own axes."""
         size = ca.SX(number(piece.size))
         if piece.kind is Box:
             return sum((size[k] * self.soft.entry_above(u[k]) for k in range(3)), ca.SX(0))
@@ -262,7 +265,7 @@ class Scene:
         return axial + size[0]
 
     def _seen(self, frame: Frame, axes: Axes) -> tuple[ca.SX, ca.SX]:
-        """Rotation and position of a frame in coordinates along the axes."""
+        """Compute the rotation and position of a frame in coordinates along the axes."""
         key = (frame, axes.key)
         if key not in self._relative:
             R, p = self._placed[frame]
@@ -274,7 +277,7 @@ class Scene:
         return Axes(str(frame), self._placed[frame][0].T)
 
     def _chain(self, index: int) -> tuple[list[ca.SX], ca.SX]:
-        """Centres in the world and the radius of a body's chain of spheres."""
+        """Compute the centres in the world and the radius of a body's chain of spheres."""
         body = self.screen.bodies[index]
         assert body.chain is not None, "obstacles have no chains"
         if index not in self._chains:
@@ -284,18 +287,19 @@ class Scene:
         return self._chains[index], ca.SX(number(body.chain.radius))
 
     def _nearest(self, squared: Sequence[ca.SX]) -> ca.SX:
-        """Root of the least of some squared distances."""
+        """Compute the root of the least of some squared distances."""
         if self.soft.width:
             return self.soft.minimum_below([self.soft.norm_below(s) for s in squared])
         return self.soft.norm_below(self.soft.minimum_below(squared))
 
     def _chain_bound(self, i: int, j: int) -> ca.SX:
-        """Two chains of spheres: distance of the nearest centres less both radii."""
+        """Bound the distance of two chains of spheres: the nearest centres less both radii."""
         (first, r_1), (second, r_2) = self._chain(i), self._chain(j)
         return self._nearest([ca.sumsqr(a - b) for a in first for b in second]) - (r_1 + r_2)
 
     def _near_bound(self, i: int, j: int) -> ca.SX:
-        """Piece by piece, along the axes of the first body's frame, the world's where it stands."""
+        """Bound the distance piece by piece, along the axes of the first body's frame, or the
+        world's if it stands still."""
         first, second = self.screen.bodies[i], self.screen.bodies[j]
         stands = first.extent is not None
         axes = self._world if stands else self._own_axes(first.frame)
@@ -313,7 +317,7 @@ class Scene:
         )
 
     def _box_bound(self, link: int) -> ca.SX:
-        """A chain of spheres against the payload's box, or the one that holds its pieces."""
+        """Bound the distance between a chain of spheres and the payload's bounding box."""
         box = self.screen.payload
         half, (R, p) = ca.SX(number(box.size)), self._placed[BOX]
         if isinstance(box.centre, ca.SX) or box.centre.any():
@@ -330,7 +334,7 @@ class Scene:
         return self._nearest(squared) - radius - 3**0.5 / 2.0 * self.soft.width
 
     def _obstacle(self, index: int, other: int, k: int) -> ca.SX:
-        """A moving body against piece k of an obstacle."""
+        """Bound the distance between a moving body and piece k of an obstacle."""
         body, obstacle = self.screen.bodies[index], self.screen.bodies[other].obstacles[k]
         axes = self._world
         if obstacle.axes is not None:
@@ -346,7 +350,7 @@ class Scene:
         return self.soft.maximum_below(gaps)
 
     def _round_bound(self, index: int, obstacle: Obstacle) -> ca.SX:
-        """A chain of spheres against a fixed cylinder, capsule or sphere."""
+        """Bound the distance between a chain of spheres and a fixed cylinder, capsule or sphere."""
         centres, radius = self._chain(index)
         offset, size = number(obstacle.offset), ca.SX(number(obstacle.cover.size))
         bounds = []
@@ -363,13 +367,13 @@ class Scene:
 
 
 def _ends(extent: Any, k: int) -> list[Interval]:
-    """Per direction both ends of the extent in rows 2 k and 2 k + 1."""
+    """Return, per direction, both ends of the extent in rows 2 k and 2 k + 1."""
     rows = ca.SX(number(extent))
     return [(rows[2 * k, d], rows[2 * k + 1, d]) for d in range(3)]
 
 
 def _gaps(pairs: Sequence[tuple[Interval, Interval]]) -> list[ca.SX]:
-    """Gaps between two intervals, either one below the other, for all given pairs of them."""
+    """Compute the gaps between two intervals, in either order, for all given pairs of them."""
     return [gap for a, b in pairs for gap in (a[0] - b[1], b[0] - a[1])]
 
 
@@ -392,7 +396,8 @@ def motion_function(
     name: str,
     pairs: Iterable[int],
 ) -> ca.Function:
-    """Two configurations -> chord, bend (n_pairs,) [m] of some possible pairs.
+    """Build the function of two configurations -> chord, bend (n_pairs,) [m] of some possible
+    pairs.
 
     They are the sums of both bodies' chords and bends, see the module; of two links of one arm,
     the length of the path of one seen from the other, which needs no bend.
@@ -441,7 +446,7 @@ def _body_motion(
     placed_b: dict[Frame, tuple[ca.SX, ca.SX]],
     steps: list[ca.SX],
 ) -> tuple[ca.SX, ca.SX]:
-    """Chord and bend of one body."""
+    """Compute the chord and bend of one body."""
     if body.reach is None:
         return ca.SX(0), ca.SX(0)
     centre, spans = number(body.reach.centre), number(body.reach.spans)
@@ -457,7 +462,7 @@ def _body_motion(
 
 
 def _between_links(first: ScreenBody, second: ScreenBody, step: ca.SX) -> ca.SX:
-    """Length of the path of the later link seen from the earlier one."""
+    """Compute the length of the path of the later link seen from the earlier one."""
     assert second.reach is not None, "the later of two links moves"
     reach = number(second.reach.joints)
     moving = range(first.frame.joint + 1, second.frame.joint + 1)

@@ -1,4 +1,4 @@
-"""Few simple shapes that contain a body: what the compiled screening computes with.
+"""Covers of a body by few simple shapes, on which the compiled screening computes.
 
 Two covers per body: `slab_cover`, boxes, cylinders, spheres and capsules with exact support
 functions, and `chain_cover`, chains of equal spheres. Both are proven to contain the body by
@@ -54,7 +54,7 @@ _DIRECTIONS = _directions()
 
 
 def slab_cover(body: CollisionBody) -> tuple[Piece, ...]:
-    """Boxes, cylinders, spheres and capsules that contain the body.
+    """Cover a body by boxes, cylinders, spheres and capsules.
 
     Simple shapes stand for themselves; a hull gets its smallest box among a few orientations.
     Pieces inside another are dropped, and pieces that fill a common box nearly are merged.
@@ -75,7 +75,7 @@ def _slab_cover(seen: CacheKey) -> tuple[Piece, ...]:
 
 
 def chain_cover(body: CollisionBody) -> SphereChain:
-    """A chain of equal spheres that contains the body, along its longest principal side."""
+    """Cover a body by a chain of equal spheres along its longest principal side."""
     return _chain_cover(CacheKey(body.pieces))
 
 
@@ -87,7 +87,7 @@ def _chain_cover(seen: CacheKey) -> SphereChain:
 
 
 def close_pairs(geometry: CellGeometry) -> frozenset[tuple[int, int]]:
-    """Pairs within an arm whose chains of spheres cannot be told apart in many postures."""
+    """Return the pairs within an arm whose chains of spheres overlap in many postures."""
     bodies, found = geometry.bodies, []
     # Where an arm stands does not matter.
     known = [b.content if b.root is None else digest_of_parts(b.root[1]) for b in bodies]
@@ -120,7 +120,8 @@ def _often_close(seen: CacheKey) -> bool:
 
 @lru_cache(maxsize=4)
 def _steps(seen: CacheKey) -> list[Array]:
-    """Per joint of an arm its frame in the one before it (POSTURES, 4, 4) at random postures."""
+    """Compute, per joint of an arm, its frame in the one before it (POSTURES, 4, 4) at random
+    postures."""
     (arm,), found = seen.given, []
     q = np.random.default_rng(0).uniform(arm.lower, arm.upper, (POSTURES, arm.joints))
     for k, axis in enumerate(arm.axes):
@@ -135,7 +136,7 @@ def _steps(seen: CacheKey) -> list[Array]:
 
 
 def _apart(first: tuple[Piece, ...], second: tuple[Piece, ...], T: Array) -> NDArray[np.bool_]:
-    """(n,) whether two sets of pieces are separated along a coordinate axis, the second seen from
+    """Return (n,) True where a coordinate axis separates two sets of pieces, the second seen from
     the first by T (n, 4, 4)."""
     axes = np.concatenate([np.eye(3), -np.eye(3)])
     high = np.max([support(piece, axes) for piece in first], axis=0)
@@ -146,7 +147,7 @@ def _apart(first: tuple[Piece, ...], second: tuple[Piece, ...], T: Array) -> NDA
 
 
 def _covered(piece: Piece, cover: list[Piece]) -> bool:
-    """A piece is its own cover, or lies in one box of the cover (exact)."""
+    """Return True if a piece is its own cover, or lies in one box of the cover (exact)."""
     return any(
         other is piece or (isinstance(other.shape, Box) and contains(other, piece))
         for other in cover
@@ -166,7 +167,7 @@ def _volume(box: Piece) -> float:
 
 
 def _orientations(pieces: tuple[Piece, ...]) -> list[Array]:
-    """The body's axes, each piece's axes, and the principal axes of hull vertices."""
+    """Return the body's axes, each piece's axes, and the principal axes of hull vertices."""
     found = [np.eye(3)]
     for piece in pieces:
         found.append(piece.rotation)
@@ -193,7 +194,7 @@ def _outermost(cover: list[Piece]) -> list[Piece]:
 
 
 def _merge_once(cover: list[Piece]) -> list[Piece] | None:
-    """Merge the pair whose common box stands out least, if that is within the slack."""
+    """Merge the pair whose common box adds the least volume, if that is within the slack."""
     best: tuple[float, int, int, Piece] | None = None
     for i, j in combinations(range(len(cover)), 2):
         pair = (cover[i], cover[j])

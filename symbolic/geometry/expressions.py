@@ -1,4 +1,4 @@
-"""What bounds of distances are made of: operations on their safe side, and placements.
+"""One-sided operations for bounds of distances, exact or smooth, and placements.
 
 A lower bound of a distance stays one if every operation that it is made of errs downwards (or
 upwards where it is subtracted). `EXACT` computes the sharpest bound, with kinks; `Smooth(width)`
@@ -29,7 +29,7 @@ _TINY = 1e-12
 
 @dataclass(frozen=True)
 class Softness:
-    """The operations; width 0 means exact.
+    """Operations that err to one side; width 0 means exact.
 
     `above` results are at least the true value, `below` results at most.
 
@@ -43,46 +43,46 @@ class Softness:
     turn: float | None = None
 
     def absolute_above(self, x: ca.SX) -> ca.SX:
-        """|x| or slightly more."""
+        """Compute |x| or slightly more."""
         return ca.sqrt(x * x + self.width**2) if self.width else ca.fabs(x)
 
     def entry_above(self, x: ca.SX) -> ca.SX:
-        """|x| of an entry of a rotation, or slightly more."""
+        """Compute |x| of an entry of a rotation, or slightly more."""
         turn = self.width if self.turn is None else self.turn
         return ca.sqrt(x * x + turn**2) if turn else ca.fabs(x)
 
     def absolute_below(self, x: ca.SX) -> ca.SX:
-        """|x| or slightly less."""
+        """Compute |x| or slightly less."""
         return self.absolute_above(x) - self.width
 
     def ramp_above(self, x: ca.SX) -> ca.SX:
-        """max(x, 0) or up to half a width more; never negative."""
+        """Compute max(x, 0) or up to half a width more; never negative."""
         return (x + ca.sqrt(x * x + self.width**2)) / 2.0 if self.width else ca.fmax(x, 0.0)
 
     def maximum_above(self, values: Sequence[ca.SX]) -> ca.SX:
-        """Largest value or slightly more."""
+        """Compute the largest value or slightly more."""
         return _fold(self._pair_above if self.width else ca.fmax, values)
 
     def maximum_below(self, values: Sequence[ca.SX]) -> ca.SX:
-        """Largest value or slightly less."""
+        """Compute the largest value or slightly less."""
         if not self.width:
             return _fold(ca.fmax, values)
         return _fold(lambda a, b: self._pair_above(a, b) - self.width / 2.0, values)
 
     def minimum_below(self, values: Sequence[ca.SX]) -> ca.SX:
-        """Least value or slightly less."""
+        """Compute the least value or slightly less."""
         if not self.width:
             return _fold(ca.fmin, values)
         return -self.maximum_above([-value for value in values])
 
     def norm_below(self, squared: ca.SX) -> ca.SX:
-        """Root of a squared length, or slightly less."""
+        """Compute the root of a squared length, or slightly less."""
         if self.width:
             return ca.sqrt(squared + self.width**2) - self.width
         return ca.sqrt(ca.fmax(squared, _TINY)) - _TINY**0.5
 
     def cosine_above(self, sine: ca.SX) -> ca.SX:
-        """sqrt(1 - sine^2) or slightly more."""
+        """Compute sqrt(1 - sine^2) or slightly more."""
         rest = 1.0 - sine * sine
         if self.width:
             # 1 - sine^2 may be -1e-16 by roundoff; the width keeps the root's argument positive.
@@ -104,7 +104,7 @@ EXACT = Softness()
 
 
 class BasePose(Protocol):
-    """Where an arm stands: rotation (3, 3) and position (3,) [m], arrays or symbols."""
+    """Pose of an arm's base: rotation (3, 3) and position (3,) [m], arrays or symbols."""
 
     @property
     def rotation(self) -> Any:
@@ -116,7 +116,7 @@ class BasePose(Protocol):
 
 
 def world_placements(base: BasePose, placements: tuple[ca.SX, ca.SX]) -> list[tuple[ca.SX, ca.SX]]:
-    """Rotation and position in the world of each joint frame given in the root."""
+    """Compute the rotation and position in the world of each joint frame given in the root."""
     rotations, positions = placements
     R, p = ca.SX(number(base.rotation)), ca.SX(number(base.position))
     return [
@@ -126,14 +126,14 @@ def world_placements(base: BasePose, placements: tuple[ca.SX, ca.SX]) -> list[tu
 
 
 def clean(matrix: Array) -> Array:
-    """Entries within 1e-15 of -1, 0 or 1 made exact, so that expressions simplify."""
+    """Round entries within 1e-15 of -1, 0 or 1, so that expressions simplify."""
     rounded = np.round(matrix)
     near = (np.abs(matrix - rounded) < 1e-15) & (np.abs(rounded) <= 1.0)
     return np.where(near, rounded, matrix)
 
 
 def quaternion(R: ca.SX) -> ca.SX:
-    """The unit quaternion (4,), w x y z, of a rotation (3, 3), stable for every angle.
+    """Compute the unit quaternion (4,), w x y z, of a rotation (3, 3), stable for every angle.
 
     Each column below is the quaternion times one of its own components (times 4); the column of
     the largest component is the accurate one (Shepperd 1978).

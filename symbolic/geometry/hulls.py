@@ -32,7 +32,7 @@ _TOLD: dict[str | tuple[str, type[Warning], int], int] = {}
 
 
 def convex_pieces(path: Path, scale: Array) -> tuple[Hull, ...]:
-    """Convex hulls, in the mesh's frame, whose union contains the mesh.
+    """Decompose a mesh file into convex hulls, in the mesh's frame, whose union contains the mesh.
 
     Args:
         path: a file in one of `FORMATS`.
@@ -45,7 +45,7 @@ def convex_pieces(path: Path, scale: Array) -> tuple[Hull, ...]:
 
 
 def cut(mesh: trimesh.Trimesh, path: Path) -> tuple[Hull, ...]:
-    """The convex pieces of a mesh of `read_mesh`; `path` names it in messages.
+    """Decompose a mesh of `read_mesh` into convex pieces; `path` names it in messages.
 
     Raises:
         CollisionModelError: a part has no convex hull.
@@ -79,7 +79,7 @@ def cut(mesh: trimesh.Trimesh, path: Path) -> tuple[Hull, ...]:
 
 
 def _outermost(pieces: list[Hull]) -> tuple[Hull, ...]:
-    """The pieces without those that lie in another: screws and bearings inside a housing."""
+    """Remove pieces that lie in another: screws and bearings inside a housing."""
     volumes = [hull_volume(piece.vertices[piece.faces]) for piece in pieces]
     kept: list[tuple[Hull, Array]] = []
     for k in np.argsort(volumes, kind="stable")[::-1]:
@@ -94,7 +94,7 @@ def _outermost(pieces: list[Hull]) -> tuple[Hull, ...]:
 
 
 def _thickened(triangles: Array) -> Array:
-    """The corners of a flat surface, moved both ways along every axis."""
+    """Return the corners of a flat surface, moved both ways along every axis."""
     steps = SMALLEST_SIZE * np.concatenate([np.eye(3), -np.eye(3)])
     return np.asarray(triangles.reshape(-1, 1, 3) + steps, dtype=float)
 
@@ -115,7 +115,7 @@ WORTHWHILE = 0.05
 
 
 def hull_of(points: Array) -> Hull:
-    """The convex hull of points, its faces turned outwards."""
+    """Compute the convex hull of points, with faces oriented outwards."""
     hull = ConvexHull(points.reshape(-1, 3))
     vertices = hull.points[hull.vertices]
     index = np.full(len(hull.points), -1)
@@ -131,7 +131,7 @@ def hull_of(points: Array) -> Hull:
 
 
 def decompose(triangles: Array, solid: float) -> list[Hull]:
-    """Cut greedily, always the part whose best cut removes the most empty volume.
+    """Cut a surface greedily, always the part whose best cut removes the most empty volume.
 
     Args:
         triangles: (n, 3, 3) of a watertight surface.
@@ -151,7 +151,7 @@ def decompose(triangles: Array, solid: float) -> list[Hull]:
 
 
 def hull_volume(triangles: Array) -> float:
-    """Volume of the convex hull; zero where it is flat."""
+    """Compute the volume of the convex hull; zero if it is flat."""
     try:
         return float(ConvexHull(triangles.reshape(-1, 3)).volume)
     except (QhullError, ValueError):
@@ -159,7 +159,7 @@ def hull_volume(triangles: Array) -> float:
 
 
 def _best_cut(triangles: Array) -> tuple[float, tuple[Array, ...]]:
-    """The gain [m^3] of the best plane across a coordinate axis, and the two halves."""
+    """Return the gain [m^3] of the best plane across a coordinate axis, and the two halves."""
     volume = hull_volume(triangles)
     lower, upper = triangles.min(axis=(0, 1)), triangles.max(axis=(0, 1))
     best: tuple[float, tuple[Array, ...]] = (0.0, ())
@@ -173,7 +173,8 @@ def _best_cut(triangles: Array) -> tuple[float, tuple[Array, ...]]:
 
 
 def _clip(triangles: Array, axis: int, level: float, side: float) -> Array:
-    """The parts of triangles (n, 3, 3) where side * (coordinate - level) >= 0, as triangles."""
+    """Return the parts of triangles (n, 3, 3) with side * (coordinate - level) >= 0, as
+    triangles."""
     height = side * (triangles[:, :, axis] - level)
     inside = height >= 0.0
     count = inside.sum(axis=1)

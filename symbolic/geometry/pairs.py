@@ -1,4 +1,4 @@
-"""Which pairs of bodies are checked for collision, and why the others are not.
+"""Pairs of bodies that are checked for collision, and the reasons to leave out the others.
 
 A pair is left out only for a reason that holds for every candidate: the bodies never move
 against each other, they are neighbours in an arm and overlap by construction, the user says so,
@@ -51,8 +51,8 @@ POSTURES = 300
 
 @dataclass(frozen=True)
 class ActivePair:
-    """Two bodies, as indices into the cell's bodies, that have to be kept apart, or may have to be
-    with other numbers."""
+    """Two bodies, as indices into the cell's bodies, to be checked now, or with other
+    parameters."""
 
     first: int
     second: int
@@ -60,7 +60,7 @@ class ActivePair:
 
 @dataclass(frozen=True)
 class ExcludedPair:
-    """Two bodies that are not checked, and why."""
+    """Two bodies that are not checked, with the reason."""
 
     first: int
     second: int
@@ -69,7 +69,7 @@ class ExcludedPair:
 
 @dataclass(frozen=True)
 class CellGeometry:
-    """Everything that collision checking knows of a workcell.
+    """Collision model of a workcell.
 
     Attributes:
         workcell: the description.
@@ -94,24 +94,26 @@ class CellGeometry:
 
     @property
     def blocks(self) -> Mapping[str, range]:
-        """Possible pairs that are bounded together, by what the names of functions begin with."""
+        """Return the blocks of possible pairs that are bounded together, by their functions'
+        prefix."""
         far = range(self.near, len(self.possible))
         return {"": range(self.near)} | ({"far_": far} if far else {})
 
     @cached_property
     def columns(self) -> NDArray[np.intp]:
-        """(n_active,) where every active pair is among the possible ones."""
+        """(n_active,) index of every active pair among the possible ones."""
         places = {pair: k for k, pair in enumerate(self.possible)}
         return np.array([places[pair] for pair in self.active], dtype=np.intp)
 
     @cached_property
     def asked(self) -> tuple[str, ...]:
-        """The blocks that are needed: the first one, and those with active pairs."""
+        """Prefixes of the blocks to evaluate: the first one, and those with active pairs."""
         blocks = self.blocks.items()
         return tuple(b for b, pairs in blocks if not b or np.isin(self.columns, pairs).any())
 
     def of_active(self, bounds: Sequence[Array]) -> Array:
-        """(n, n_active) from the bounds (n, n_block) of the blocks that are needed."""
+        """Select the bounds of active pairs (n, n_active) from the bounds (n, n_block) of the
+        evaluated blocks."""
         sizes = [len(self.blocks[block]) for block in self.asked]
         parts = [each.reshape(len(each), n) for each, n in zip(bounds, sizes, strict=True)]
         whole = parts[0] if len(parts) == 1 else np.hstack(parts)
@@ -131,7 +133,7 @@ class CellGeometry:
         )
 
     def index(self, name: str) -> int:
-        """Index of a body.
+        """Return the index of a body.
 
         Raises:
             CollisionModelError: there is no such body.
@@ -143,7 +145,7 @@ class CellGeometry:
 
 
 def pair_tolerance(workcell: Workcell, a: CollisionBody, b: CollisionBody) -> float:
-    """Distance up to which two bodies count as colliding [m].
+    """Return the distance up to which two bodies count as colliding [m].
 
     That of the workcell, and for the payload how far displaced pads may have it off its place:
     arms that keep to their paths carry a box that they took hold of elsewhere. Only a set that the
@@ -179,7 +181,7 @@ def build_geometry(workcell: Workcell) -> CellGeometry:
 def _sorted_pairs(
     given: CacheKey,
 ) -> tuple[tuple[ActivePair, ...], tuple[ExcludedPair, ...], tuple[ActivePair, ...], int]:
-    """Active, excluded and possible pairs, and how many of these are near."""
+    """Sort the pairs: active, excluded, possible, and the number of possible ones that are near."""
     workcell, bodies, arms, ignored = given.given
     # Pairs within an arm are sorted as if its root were the world: where it stands does not matter.
     at_roots = tuple(b if b.root is None else replace(b, pieces=b.root[1]) for b in bodies)
@@ -218,8 +220,8 @@ def _sorted_pairs(
 
 @cache
 def _is_own(first: str, first_stands: bool, second: str, second_stands: bool) -> bool:
-    """Whether a pair is of one arm, or of what one moves and the box, which the other arm may bring
-    near to what stands; by the groups of both bodies, and whether they stand on an arm's root."""
+    """Return True if a pair is of one arm and its own parts or the box, and the other arm cannot
+    change it. Takes the groups of both bodies, and whether each stands on an arm's root."""
     groups = {first, second}
     if "payload" in groups and (first_stands or second_stands):
         return False
@@ -227,7 +229,7 @@ def _is_own(first: str, first_stands: bool, second: str, second_stands: bool) ->
 
 
 def _arms_of(body: CollisionBody) -> tuple[int, ...]:
-    """The arms whose joints, or base, say where a body is."""
+    """Return the arms whose joints or base determine a body's pose."""
     if body.frame.kind == "box":
         return (0, 1)
     if body.root is not None:
@@ -237,8 +239,8 @@ def _arms_of(body: CollisionBody) -> tuple[int, ...]:
 
 @dataclass(frozen=True)
 class _PairStatus:
-    """What becomes of a pair: why it is not active, '' where it is; whether it is possible, and
-    not among the near ones."""
+    """Status of a pair: the reason to exclude it, '' if active; whether it is possible, and whether
+    it is far."""
 
     reason: str
     possible: bool
@@ -264,13 +266,13 @@ def _sorted(seen: CacheKey) -> _PairStatus:
 
 
 def _is_far(a: CollisionBody, b: CollisionBody) -> bool:
-    """See `CellGeometry.near`."""
+    """Return True for a pair that few cells check, see `CellGeometry.near`."""
     still = any(x.root is not None or (x.frame.joint == 0 and not x.is_tool) for x in (a, b))
     return still and a.group != b.group and "payload" not in (a.group, b.group)
 
 
 def _check_tools(bodies: tuple[CollisionBody, ...], arms: tuple[ArmGeometry, ArmGeometry]) -> None:
-    """The tools touch the payload that they hold, and do not enter it."""
+    """Check that tools do not penetrate the payload that they hold beyond touching."""
     payload = next(body for body in bodies if body.frame.kind == "box")
     cores = [shrunk(piece, MOST_ENTERED) for piece in payload.pieces]
     for body in bodies:
@@ -286,7 +288,8 @@ def _check_tools(bodies: tuple[CollisionBody, ...], arms: tuple[ArmGeometry, Arm
 
 
 def _rigid(a: CollisionBody, b: CollisionBody, arms: tuple[ArmGeometry, ArmGeometry]) -> str:
-    """The pair does not move against each other: fixed, or held by the exact grasp."""
+    """Exclude a pair that does not move relative to each other: fixed, or held by the exact
+    grasp."""
     if a.frame != b.frame and "box" not in (a.frame.kind, b.frame.kind):
         return ""
     for robot in (0, 1):
@@ -304,7 +307,7 @@ def _rigid(a: CollisionBody, b: CollisionBody, arms: tuple[ArmGeometry, ArmGeome
 
 
 def _neighbours(a: CollisionBody, b: CollisionBody, bodies: tuple[CollisionBody, ...]) -> str:
-    """Links of one arm with no shape on the joints between them."""
+    """Exclude links of one arm with no shape on the joints between them."""
     for standing, link in ((a, b), (b, a)):
         if link.frame.robot in (standing.carries or ()) and not link.is_tool:
             before = [
@@ -321,7 +324,8 @@ def _neighbours(a: CollisionBody, b: CollisionBody, bodies: tuple[CollisionBody,
 def _always_touching(
     a: CollisionBody, b: CollisionBody, arms: tuple[ArmGeometry, ArmGeometry]
 ) -> str:
-    """A pair within an arm (the box it holds included) that touches in every sampled posture."""
+    """Exclude a pair within an arm (with the box it holds) that touches in every sampled
+    posture."""
     own = {body.group for body in (a, b) if body.carries is None}
     for robot in _movers(a, b):
         group = f"robot {robot + 1}"
@@ -344,7 +348,7 @@ def _always_touching(
 def ignored_pairs(
     workcell: Workcell, bodies: Sequence[CollisionBody]
 ) -> Mapping[frozenset[str], str]:
-    """The reason of every pair that is left out, by the names of its bodies.
+    """Return the reason of every ignored pair, by the names of its bodies.
 
     What the workcell file says counts before an SRDF. A link that an SRDF names and that has no
     collision shape is passed over.
@@ -385,7 +389,7 @@ def ignored_pairs(
 
 
 def anchor(body: CollisionBody, arms: tuple[ArmGeometry, ArmGeometry], robot: int) -> CollisionBody:
-    """The body with a carried box seen as part of a robot's last link."""
+    """Return the body, with a held box represented as part of a robot's last link."""
     if body.frame.kind != "box":
         return body
     known = body.content, arms[robot].content, robot
@@ -400,7 +404,7 @@ def _anchored(seen: CacheKey) -> CollisionBody:
 
 
 def _movers(a: CollisionBody, b: CollisionBody) -> tuple[int, ...]:
-    """The robots that may move one body against the other; both may hold the payload."""
+    """Return the robots that may move one body against the other; both may hold the payload."""
     if "box" in (a.frame.kind, b.frame.kind):
         return (0, 1)
     return tuple(robot for robot in (0, 1) if robot in (a.frame.robot, b.frame.robot))
@@ -409,7 +413,7 @@ def _movers(a: CollisionBody, b: CollisionBody) -> tuple[int, ...]:
 def _ordered(
     a: CollisionBody, b: CollisionBody, arms: tuple[ArmGeometry, ArmGeometry], robot: int
 ) -> tuple[CollisionBody, CollisionBody]:
-    """Both bodies as `anchor` sees them, the one on the later joint last."""
+    """Return both bodies as `anchor` represents them, the one on the later joint last."""
     left, right = anchor(a, arms, robot), anchor(b, arms, robot)
     return (left, right) if left.frame.joint <= right.frame.joint else (right, left)
 
@@ -420,7 +424,7 @@ def out_of_reach(
     arms: tuple[ArmGeometry, ArmGeometry],
     tolerance: float,
 ) -> str:
-    """A bound of the motion of one about the other keeps them apart."""
+    """Exclude a pair that a bound of their relative motion keeps apart."""
     margin = tolerance + 1e-3
     if {a.frame.robot, b.frame.robot} == {0, 1}:
         zones = [_zone(body, arms[body.frame.robot], -1) for body in (a, b)]
@@ -437,14 +441,14 @@ def out_of_reach(
 
 
 def _gap(zone: Piece, pieces: tuple[Piece, ...]) -> float:
-    """Distance of a zone from pieces [m], not above 0 where they meet."""
+    """Compute the distance of a zone from pieces [m], at most 0 if they meet."""
     if isinstance(zone.shape, Sphere):
         return min(_from_point(p, zone.centre) for p in pieces) - zone.shape.radius
     return coal_distance((zone,), pieces)
 
 
 def _from_point(piece: Piece, point: Array) -> float:
-    """Distance of a point from a piece [m], not above 0 inside."""
+    """Compute the distance of a point from a piece [m], at most 0 inside."""
     x, y, z = ((point - piece.centre) @ piece.rotation).tolist()
     shape = piece.shape
     match shape:
@@ -469,7 +473,7 @@ def never_meet(
     arms: tuple[ArmGeometry, ArmGeometry],
     tolerance: float,
 ) -> str:
-    """Bodies two joints apart that no position of the two joints brings together.
+    """Exclude bodies two joints apart that no position of the two joints brings together.
 
     The farther body is replaced by its swept cylinder about the second joint's axis; the first
     joint's range is cut into intervals, each cleared by the distance at its middle, which is
@@ -508,7 +512,8 @@ def never_meet(
 
 
 def _zone(body: CollisionBody, arm: ArmGeometry, below: int) -> Piece:
-    """What a body behind joint `body.frame.joint` can reach, seen from joint `below` (-1: world).
+    """Compute the region that a body behind joint `body.frame.joint` can reach, seen from joint
+    `below` (-1: world).
 
     One joint that turns between them: the swept cylinder about its axis. Else the ball about the
     first joint's origin whose radius is the stretched chain.
@@ -525,7 +530,7 @@ def _zone_of(seen: CacheKey) -> Piece:
 
 @lru_cache(maxsize=256)
 def _zone_in_root(seen: CacheKey) -> Piece:
-    """The same, seen from the arm's root in place of the world."""
+    """Compute the same region, seen from the arm's root instead of the world."""
     body, arm, below = seen.given
     first = below + 1
     T = arm.origins[first]
@@ -535,7 +540,7 @@ def _zone_in_root(seen: CacheKey) -> Piece:
 
 
 def chain_radius(body: CollisionBody, arm: ArmGeometry, first: int) -> float:
-    """Distance from the origin of joint `first` that no point of a body behind it exceeds [m]."""
+    """Bound the distance of any point of a body from the origin of joint `first` before it [m]."""
     behind = slice(first + 1, body.frame.joint + 1)
     offsets = np.linalg.norm(arm.origins[behind, :3, 3], axis=1) + arm.slides[behind]
     own = max(farthest_from_point(piece, np.zeros(3)) for piece in body.pieces)
@@ -543,7 +548,8 @@ def chain_radius(body: CollisionBody, arm: ArmGeometry, first: int) -> float:
 
 
 def relative_placement(arm: ArmGeometry, below: int, joint: int, q: Array) -> Array:
-    """(4, 4) of a joint's frame in the frame of an earlier joint (-1: world) at q (n,)."""
+    """Compute the pose (4, 4) of a joint's frame in the frame of an earlier joint (-1: world) at
+    q (n,)."""
     T: Array = arm.T_world_root if below < 0 else np.eye(4)
     for k in range(below + 1, joint + 1):
         moved = np.eye(4)
@@ -559,7 +565,7 @@ def relative_placement(arm: ArmGeometry, below: int, joint: int, q: Array) -> Ar
 
 
 def coal_geometry(piece: Piece) -> tuple[coal.CollisionGeometry, coal.Transform3s]:
-    """A piece as a Coal shape at its pose in the body's frame."""
+    """Convert a piece to a Coal shape at its pose in the body's frame."""
     pose = coal.Transform3s(piece.rotation, piece.centre)
     shape = piece.shape
     match shape:
@@ -583,7 +589,8 @@ def _convex(hull: Hull) -> coal.CollisionGeometry:
 
 
 def coal_distance(first: tuple[Piece, ...], second: tuple[Piece, ...]) -> float:
-    """Least distance between two sets of pieces in one frame; negative where they overlap."""
+    """Compute the least distance between two sets of pieces in one frame; negative if they
+    overlap."""
     request, result = coal.DistanceRequest(), coal.DistanceResult()
     left, right = [coal_geometry(p) for p in first], [coal_geometry(p) for p in second]
     distances = []

@@ -55,7 +55,7 @@ class Piece:
         return self.pose[:3, :3]
 
     def moved(self, T: Array) -> Piece:
-        """The same piece seen from the frame that T (4, 4) maps the body's frame into."""
+        """Return the piece in the frame into which T (4, 4) maps the body's frame."""
         return Piece(self.shape, T @ self.pose)
 
 
@@ -90,13 +90,15 @@ def check_piece(piece: Piece, owner: str) -> None:
 
 
 def support(piece: Piece, directions: Array) -> Array:
-    """Largest u.x over the piece, exact, for each row u of directions (n, 3); returns (n,)."""
+    """Compute the largest u.x over the piece, exact, for each row u of directions (n, 3);
+    returns (n,)."""
     u = np.atleast_2d(directions)
     return np.asarray(u @ piece.centre + reach(piece.shape, u @ piece.rotation), dtype=float)
 
 
 def reach(shape: ConvexShape, directions: Array) -> Array:
-    """Largest u.x over a shape in its own frame, exact, per row u of (n, 3); returns (n,)."""
+    """Compute the largest u.x over a shape in its own frame, exact, per row u of (n, 3); returns
+    (n,)."""
     u = directions
     match shape:
         case Box():
@@ -115,8 +117,8 @@ def reach(shape: ConvexShape, directions: Array) -> Array:
 
 
 def shrunk(piece: Piece, by: float) -> Piece:
-    """The piece smaller by a length on every side; a hull by at least that. Of pieces that are too
-    thin little is left."""
+    """Shrink a piece by a length on every side, a hull by at least that; a thin piece keeps a
+    minimum size."""
     shape = piece.shape
     left = SMALLEST_SIZE
     match shape:
@@ -143,12 +145,13 @@ def shrunk(piece: Piece, by: float) -> Piece:
 
 
 def box_corners(size: Array) -> Array:
-    """(8, 3) corners of a cuboid of the given edge lengths, centred at its frame."""
+    """Return the corners (8, 3) of a cuboid of the given edge lengths, centred at its frame."""
     return np.array(list(product((-0.5, 0.5), repeat=3))) * np.asarray(size)
 
 
 def skeleton(piece: Piece) -> tuple[Array, float]:
-    """Points (n, 3) in the body's frame and a radius, whose thickened hull contains the piece.
+    """Return points (n, 3) in the body's frame and a radius, whose thickened hull contains the
+    piece.
 
     Exact for boxes, spheres, capsules and hulls. A cylinder is represented by its two end
     centres and its radius, which adds the end caps.
@@ -169,7 +172,8 @@ def skeleton(piece: Piece) -> tuple[Array, float]:
 
 
 def farthest_from_point(piece: Piece, point: Array) -> float:
-    """Largest distance of the piece's points from a point of the body's frame, exact."""
+    """Compute the largest distance of the piece's points from a point of the body's frame,
+    exact."""
     if isinstance(piece.shape, Cylinder):
         local = np.abs(piece.rotation.T @ (np.asarray(point) - piece.centre))
         radial = np.hypot(local[0], local[1]) + piece.shape.radius
@@ -179,7 +183,7 @@ def farthest_from_point(piece: Piece, point: Array) -> float:
 
 
 def farthest_from_axis(piece: Piece, point: Array, axis: Array) -> float:
-    """Distance from a line (point, unit axis) that no point of the piece exceeds."""
+    """Bound the distance of the piece's points from a line (point, unit axis)."""
     points, radius = skeleton(piece)
     arms = points - point
     across = arms - np.outer(arms @ axis, axis)
@@ -187,7 +191,8 @@ def farthest_from_axis(piece: Piece, point: Array, axis: Array) -> float:
 
 
 def bounding_box(pieces: tuple[Piece, ...], rotation: Array) -> Piece:
-    """The smallest box with the given axes (3, 3, columns) that contains all pieces, exact."""
+    """Compute the smallest box with the given axes (3, 3, columns) that contains all pieces,
+    exact."""
     axes = np.asarray(rotation).T
     upper = np.max([support(piece, axes) for piece in pieces], axis=0)
     lower = -np.max([support(piece, -axes) for piece in pieces], axis=0)
@@ -195,7 +200,8 @@ def bounding_box(pieces: tuple[Piece, ...], rotation: Array) -> Piece:
 
 
 def edges(pieces: tuple[Piece, ...]) -> Array:
-    """(3,) edge lengths, ascending, of the pieces' bounding box along the frame's axes [m]."""
+    """Compute the edge lengths (3,), ascending, of the pieces' bounding box along the frame's
+    axes [m]."""
     box = bounding_box(pieces, np.eye(3))
     assert isinstance(box.shape, Box)
     return np.asarray(np.sort(box.shape.size))
@@ -205,7 +211,8 @@ def edges(pieces: tuple[Piece, ...]) -> Array:
 
 
 def contains(cover: Piece, piece: Piece, tolerance: float = 1e-12) -> bool:
-    """Whether a box or sphere contains a piece. Exact, up to the tolerance [m] for roundoff."""
+    """Return True if a box or sphere contains a piece, exact up to the tolerance [m] for
+    roundoff."""
     match cover.shape:
         case Box():
             axes = cover.rotation.T
@@ -280,12 +287,12 @@ def sphere_chain(pieces: tuple[Piece, ...], rotation: Array, slenderness: float)
 
 
 def ball(centre: Array, radius: float) -> Piece:
-    """A sphere piece."""
     return Piece(Sphere(radius), transform(np.eye(3), centre))
 
 
 def swept_cylinder(pieces: tuple[Piece, ...], point: Array, axis: Array) -> Piece:
-    """A cylinder about a line (point, unit axis) that contains the pieces in every rotation.
+    """Compute a cylinder about a line (point, unit axis) that contains the pieces in every
+    rotation.
 
     The pieces' extent along the axis is exact; the radius errs to the safe side for cylinders.
     """

@@ -1,4 +1,4 @@
-"""What bounds of distances and motions are made of, as numbers: covers, obstacles, reach.
+"""Numbers behind the bounds of distances and motions: covers, obstacles, reach.
 
 NumPy finds it once per cell. `symbolic.geometry.clearance` writes expressions of it, whether it
 holds arrays or symbols in their place (`symbolic.numbers.CellNumbers`). Which bound a pair gets
@@ -68,7 +68,7 @@ class Chain:
 
 @dataclass(frozen=True)
 class Reach:
-    """How a body moves with its frame.
+    """Geometry of a body's motion with its frame.
 
     Attributes:
         centre: (3,) of its bounding box [m].
@@ -172,7 +172,7 @@ class Screen:
 
 
 def screen_of(geometry: CellGeometry) -> Screen:
-    """The screen of a cell's bodies and possible pairs."""
+    """Compute the screen of a cell's bodies and possible pairs."""
     bodies, arms = geometry.bodies, geometry.arms
     pairs = tuple((pair.first, pair.second) for pair in geometry.possible)
     close = close_pairs(geometry)
@@ -195,12 +195,12 @@ def screen_of(geometry: CellGeometry) -> Screen:
 
 
 def has_hulls(body: CollisionBody) -> bool:
-    """Whether a body is made of a mesh."""
+    """Return True if a body has a mesh."""
     return any(isinstance(piece.shape, Hull) for piece in body.pieces)
 
 
 def _seen(body: CollisionBody, arms: tuple[ArmGeometry, ArmGeometry]) -> CacheKey:
-    """A body and what of both arms its bounds are made of."""
+    """Return the key of a body and of the parts of both arms that its bounds depend on."""
     of: tuple[Any, ...] = (body.content,)
     if body.frame.kind == "link":
         of = (body.content, arms[body.frame.robot].chain)
@@ -288,7 +288,7 @@ def _obstacle(piece: Piece) -> Obstacle:
 
 
 def _extent(piece: Piece, A: Array) -> Array:
-    """(2, 3) least and largest coordinate along the rows of A (3, 3) [m]."""
+    """Compute the least and largest coordinates (2, 3) along the rows of A (3, 3) [m]."""
     return np.stack([-support(piece, -A), support(piece, A)])
 
 
@@ -305,8 +305,8 @@ def _reach(body: CollisionBody, arms: tuple[ArmGeometry, ArmGeometry]) -> Reach:
 
 
 def reach_about_joints(body: CollisionBody, arm: ArmGeometry) -> Array:
-    """(n,) distance from each joint's axis that no point of a link's body exceeds [m]; 1 of a joint
-    that slides.
+    """Bound the distances (n,) of a link's body from each joint's axis [m]; 1 for a prismatic
+    joint.
 
     Joints behind the body do not move it: zero. Own joint: from the shape; joints further down:
     with the chain between stretched.
@@ -327,7 +327,7 @@ def reach_about_joints(body: CollisionBody, arm: ArmGeometry) -> Array:
 
 
 def _slanted_matters(body: CollisionBody) -> bool:
-    """Whether a body is the payload, or long."""
+    """Return True if a body is the payload, or long."""
     _, width, length = edges(body.pieces)
     return body.frame.kind == "box" or bool(length - width > LONG)
 
@@ -344,11 +344,11 @@ def _between(first: Array, second: Array) -> Array | None:
 
 
 def turned(rotation: Any) -> ca.SX:
-    """A rotation (3, 3) or None as an expression."""
+    """Return a rotation (3, 3), or the identity for None, as an expression."""
     return ca.SX.eye(3) if rotation is None else ca.SX(number(rotation))
 
 
 def columns(values: Any) -> Sequence[ca.SX]:
-    """The rows (n, 3) of an array as columns."""
+    """Return the rows (n, 3) of an array as columns."""
     whole = ca.SX(number(values))
     return [whole[k, :].T for k in range(whole.shape[0])]

@@ -1,4 +1,4 @@
-"""Paths of more waypoints than a file states, and the same path through those of another task.
+"""Refinement of a task's path: free waypoints between those of the file, on the same spline.
 
 The pieces between the stated waypoints are halved, or cut into more, by free waypoints. The path's
 knots are uniform and its spline's end conditions do not depend on them, so that every path through
@@ -20,7 +20,7 @@ from symbolic.records.task import RedundantJoint, Task, Waypoint, extended_waypo
 
 
 def in_pieces(task: Task) -> Task:
-    """A task as its file states it, with the waypoints between those.
+    """Return a task with the waypoints of its pieces, between those of its file.
 
     Bounds hold every path that the stated ones allow.
     """
@@ -47,7 +47,7 @@ def in_pieces(task: Task) -> Task:
 
 
 def stated(task: Task) -> Task:
-    """The task with the waypoints that its file states alone."""
+    """Return the task with only the waypoints of its file."""
     if task.pieces == 1:
         return task
     every = slice(None, None, task.pieces)
@@ -73,12 +73,14 @@ def _with_waypoints(
 
 
 def stated_entries(task: Task) -> NDArray[np.intp]:
-    """(n_path of the stated task,) the path's variables that are of stated waypoints."""
+    """Return the indices (n_path of the coarse task,) of the path variables that belong to
+    waypoints of the file."""
     return np.flatnonzero(task.free_entries[0] % task.pieces == 0)
 
 
 def by_levels(task: Task) -> tuple[Array, Array]:
-    """How a path's variables follow moves of few waypoints, then of those between them.
+    """Compute a hierarchical basis of the path variables: moves of coarse waypoints, then of finer
+    ones.
 
     The grid of stated waypoints is refined, by halves as long as that is possible. A move of a
     waypoint takes along those of finer grids, on the path through the grid where it is first.
@@ -99,7 +101,7 @@ def by_levels(task: Task) -> tuple[Array, Array]:
 
 
 def _steps(pieces: int) -> list[int]:
-    """Strides of the grids from the stated waypoints to all."""
+    """Return the strides of the grids from the waypoints of the file to all."""
     steps = [pieces]
     while steps[-1] > 1:
         steps.append(steps[-1] // 2 if steps[-1] % 2 == 0 else 1)
@@ -107,8 +109,8 @@ def _steps(pieces: int) -> list[int]:
 
 
 def same_paths(x: Array, source: Task, target: Task) -> Array:
-    """Decision vectors (n, n_path or more) of one task through the waypoints of another: the same
-    paths if the target has all waypoints of the source, else paths through what it has of them.
+    """Convert decision vectors (n, n_path or more) of one task to the waypoints of another: the
+    same paths if the target has all waypoints of the source, else paths through the common ones.
 
     What follows the path, a force limit, stays.
     """
@@ -123,7 +125,7 @@ def same_paths(x: Array, source: Task, target: Task) -> Array:
 
 @cache
 def _through(n: int, m: int) -> Array:
-    """(m, n) from waypoints to the places of m waypoints on their path."""
+    """Compute the matrix (m, n) from n waypoints to m waypoints evenly spaced on their path."""
     u = np.linspace(0.0, 1.0, m)
     by = path_position(n, u).copy()
     known, where = np.divmod(np.arange(m) * (n - 1), m - 1)

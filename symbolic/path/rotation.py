@@ -26,7 +26,7 @@ _SINE = [0.5 * (-0.25) ** n / factorial(2 * n + 1) for n in range(TERMS)]
 
 
 def rotation_matrix(orientation: Orientation, numbers: Expression) -> Expression:
-    """R_world_box (3, 3) from the last three numbers (3,) of a pose [rad]."""
+    """Compute R_world_box (3, 3) from the last three numbers (3,) of a pose [rad]."""
     if orientation.is_vector:
         turn = _matrix_of(*_quaternion(numbers))
         return ca.mtimes(turn, ca.DM(orientation.reference))
@@ -34,7 +34,8 @@ def rotation_matrix(orientation: Orientation, numbers: Expression) -> Expression
 
 
 def angular_velocity(orientation: Orientation, numbers: Expression, rate: Expression) -> Expression:
-    """Angular velocity (3,) in the world frame from the numbers and their rate [rad/s]."""
+    """Compute the angular velocity (3,) in the world frame from the numbers and their rate
+    [rad/s]."""
     if orientation.is_vector:
         zero = type(rate).zeros(3)
         return _turned(*_quaternion(numbers), *_quaternion_rates(numbers, rate, zero)[0])
@@ -44,7 +45,8 @@ def angular_velocity(orientation: Orientation, numbers: Expression, rate: Expres
 def angular_acceleration(
     orientation: Orientation, numbers: Expression, rate: Expression, second: Expression
 ) -> Expression:
-    """Angular acceleration (3,) in the world frame from the numbers, their rate and second rate."""
+    """Compute the angular acceleration (3,) in the world frame from the numbers, their rate and
+    second rate."""
     if orientation.is_vector:
         return _turned(*_quaternion(numbers), *_quaternion_rates(numbers, rate, second)[1])
     return _rpy_acceleration(numbers, rate, second)
@@ -55,7 +57,7 @@ Quaternion = tuple[Expression, Expression]
 
 
 def _quaternion(v: Expression) -> Quaternion:
-    """The unit quaternion of a rotation vector."""
+    """Compute the unit quaternion of a rotation vector."""
     square = ca.sumsqr(v)
     return _series(_COSINE, square), _series(_SINE, square) * v
 
@@ -63,7 +65,7 @@ def _quaternion(v: Expression) -> Quaternion:
 def _quaternion_rates(
     v: Expression, rate: Expression, second: Expression
 ) -> tuple[Quaternion, Quaternion]:
-    """First and second time derivative of the unit quaternion of a rotation vector."""
+    """Compute the first and second time derivative of the unit quaternion of a rotation vector."""
     square = ca.sumsqr(v)
     moved, pushed = 2.0 * ca.dot(v, rate), 2.0 * (ca.sumsqr(rate) + ca.dot(v, second))
     real, share = (_derivatives(each, square, moved, pushed) for each in (_COSINE, _SINE))
@@ -77,7 +79,8 @@ def _quaternion_rates(
 def _derivatives(
     series: Sequence[float], square: Expression, moved: Expression, pushed: Expression
 ) -> Quaternion:
-    """First and second time derivative of a power series of a square that has these."""
+    """Compute the first and second time derivative of a power series in `square`, given those of
+    `square`."""
     first = [n * c for n, c in enumerate(series)][1:]
     slope = _series(first, square)
     bend = _series([n * c for n, c in enumerate(first)][1:], square)
@@ -92,12 +95,12 @@ def _series(coefficients: Sequence[float], x: Expression) -> Expression:
 
 
 def _turned(w: Expression, u: Expression, w_rate: Expression, u_rate: Expression) -> Expression:
-    """Vector part (3,) of 2 q' q*, q = (w, u)."""
+    """Compute the vector part (3,) of 2 q' q*, q = (w, u)."""
     return 2.0 * (w * u_rate - w_rate * u + ca.cross(u, u_rate))
 
 
 def _matrix_of(w: Expression, u: Expression) -> Expression:
-    """Rotation (3, 3) of a unit quaternion."""
+    """Compute the rotation (3, 3) of a unit quaternion."""
     across = ca.skew(u)
     return type(w).eye(3) + 2.0 * (w * across + ca.mtimes(across, across))
 
@@ -114,7 +117,8 @@ def _rpy_matrix(rpy: Expression) -> Expression:
 
 
 def rate_matrix(rpy: Expression) -> Expression:
-    """E (3, 3) with angular velocity = E(rpy) @ rpy_rate, world frame, of roll, pitch, yaw."""
+    """Compute E (3, 3) with angular velocity = E(rpy) @ rpy_rate, world frame, of roll, pitch,
+    yaw."""
     cp, sp = ca.cos(rpy[1]), ca.sin(rpy[1])
     cy, sy = ca.cos(rpy[2]), ca.sin(rpy[2])
     return ca.vertcat(

@@ -25,7 +25,7 @@ from symbolic.records import Task
 
 @dataclass(frozen=True)
 class PathBasis:
-    """Constant matrices that turn waypoints into samples: poses = position @ waypoints.
+    """Constant matrices from waypoints to samples: poses = position @ waypoints.
 
     Attributes:
         parameter: (n,) path parameter u of every sample.
@@ -40,7 +40,7 @@ class PathBasis:
 
 
 def path_basis(n_waypoints: int, parameter: Array) -> PathBasis:
-    """Basis matrices of the natural quintic spline at the given parameters.
+    """Compute the basis matrices of the natural quintic spline at the given parameters.
 
     Args:
         n_waypoints: number of waypoints, at least 2; two make a straight line.
@@ -55,7 +55,7 @@ def path_basis(n_waypoints: int, parameter: Array) -> PathBasis:
 
 
 def path_position(n_waypoints: int, parameter: Array) -> Array:
-    """`PathBasis.position` alone."""
+    """Compute `PathBasis.position` only."""
     if n_waypoints == 2:
         return path_basis(n_waypoints, parameter).position
     return np.ascontiguousarray(_natural_splines(n_waypoints)[0](parameter), dtype=float)
@@ -63,7 +63,8 @@ def path_position(n_waypoints: int, parameter: Array) -> Array:
 
 @cache
 def _natural_splines(n_waypoints: int) -> tuple[Callable[[Array], Array], ...]:
-    """The natural quintic splines of unit waypoints, and their first and second derivatives."""
+    """Compute the natural quintic splines of unit waypoints, and their first and second
+    derivatives."""
     # Not imported at the top: SciPy takes long to start, and compiled functions need no basis.
     from scipy.interpolate import make_interp_spline
 
@@ -74,7 +75,7 @@ def _natural_splines(n_waypoints: int) -> tuple[Callable[[Array], Array], ...]:
 
 
 def sample_basis(task: Task) -> PathBasis:
-    """Basis at the task's samples, uniform in u."""
+    """Compute the basis at the task's samples, uniform in u."""
     return path_basis(len(task.waypoints), np.linspace(0.0, 1.0, task.samples))
 
 
@@ -84,14 +85,15 @@ NONE: Handed = MappingProxyType({})
 
 
 def _fixed(task: Task, value: Any, x: Expression, handed: Handed) -> Expression:
-    """A number of the task as the kind of expression that x is."""
+    """Return a parameter of the task as the same kind of expression as x."""
     if isinstance(x, ca.MX) and isinstance(value, ca.SX):
         return as_mx(value, sx_given(task), handed)
     return type(x)(number(value))
 
 
 def waypoint_matrix(task: Task, x: Expression, handed: Handed = NONE) -> Expression:
-    """All waypoints (6, n_waypoints) from the decision vector (paper Eq. 17), angles unwrapped.
+    """Compute all waypoints (6, n_waypoints) from the decision vector (paper Eq. 17), angles
+    unwrapped.
 
     Args:
         x: (n_var,) free waypoints in path order, each a pose.
@@ -116,7 +118,8 @@ def waypoint_matrix(task: Task, x: Expression, handed: Handed = NONE) -> Express
 def extended_matrix(
     task: Task, x: Expression, waypoints: Expression, handed: Handed = NONE
 ) -> Expression:
-    """The extended waypoints (6 + m, n_waypoints): the redundant joints' values below the poses.
+    """Compute the extended waypoints (6 + m, n_waypoints): the redundant joints' values below the
+    poses.
 
     Args:
         x: (n_var,) decision vector.
@@ -142,7 +145,7 @@ def extended_matrix(
 
 
 def _unwrap(reference: Expression, angles: Expression) -> Expression:
-    """Angles moved by full turns to lie within half a turn of the reference.
+    """Move angles by full turns to lie within half a turn of the reference.
 
     Half a turn in either direction stays as it is written (NumPy's `unwrap`).
     """

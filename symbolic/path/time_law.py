@@ -1,4 +1,4 @@
-"""Time laws: when the box is at which sample, and how fast and accelerated it is there.
+"""Time laws: the time of each sample, and the velocity and acceleration of the box there.
 
 `constant` is the paper's (Eqs. 22-26): every step takes its length over the reference speed,
 velocity and acceleration are second-order finite differences on those times, one-sided at the
@@ -58,7 +58,7 @@ def timed_path(
     rounding: ca.MX | None = None,
     handed: Handed = NONE,
 ) -> TimedPath:
-    """Poses at the samples of `basis` with the task's time law.
+    """Compute the poses at the samples of `basis` with the task's time law.
 
     Args:
         waypoints: (6, n_waypoints) from `symbolic.path.spline.waypoint_matrix`.
@@ -77,7 +77,7 @@ def timed_path(
 def driven_path(
     basis: PathBasis, waypoints: ca.MX, time: ca.MX, speed: ca.MX, acceleration: ca.MX
 ) -> TimedPath:
-    """Poses at the samples of `basis`, driven as found elsewhere.
+    """Compute the poses at the samples of `basis`, with times and path speeds from a solver.
 
     Args:
         waypoints: (6, n_waypoints) from `symbolic.path.spline.waypoint_matrix`.
@@ -93,7 +93,7 @@ def driven_path(
 def _along(
     time: ca.MX, path: tuple[ca.MX, ca.MX, ca.MX], speed: ca.MX, acceleration: ca.MX
 ) -> TimedPath:
-    """From pose and derivatives by u, u' and u''."""
+    """Compute the timed path from the pose's derivatives by u, and u' and u''."""
     (pose, first, second), rows = path, ca.repmat(1.0, 6, 1)
     pushed = second * ca.mtimes(rows, speed**2) + first * ca.mtimes(rows, acceleration)
     return TimedPath(time, pose, first * ca.mtimes(rows, speed), pushed)
@@ -110,8 +110,8 @@ def _constant(task: Task, pose: ca.MX, rounding: ca.MX | None, handed: Handed) -
 
 
 def _step_time_function(task: Task, is_rounded: bool) -> ca.Function:
-    """Duration of the step between two neighbouring poses (paper Eqs. 23-24), and by which share
-    its kink is rounded, if it is."""
+    """Build the function of the duration of a step between two poses (paper Eqs. 23-24), with its
+    kink rounded by a share if `is_rounded`."""
     start, end, given = ca.SX.sym("start", 6), ca.SX.sym("end", 6), sx_given(task).values()
     step = end - start
     length = _smooth_norm(step[:3])
@@ -128,7 +128,8 @@ def _step_time_function(task: Task, is_rounded: bool) -> ca.Function:
 
 
 def _gradient(values: ca.MX, durations: ca.MX) -> ca.MX:
-    """Second-order finite differences along the columns on uneven steps, one-sided at the ends."""
+    """Compute second-order finite differences along the columns on uneven steps, one-sided at
+    the ends."""
     rows = values.shape[0]
     before, after = durations[:, :-1], durations[:, 1:]
     step = ca.repmat(1.0, rows, 1)
@@ -143,7 +144,7 @@ def _gradient(values: ca.MX, durations: ca.MX) -> ca.MX:
 
 
 def _one_sided(here: ca.MX, near: ca.MX, far: ca.MX, near_step: ca.MX, far_step: ca.MX) -> ca.MX:
-    """Derivative at `here` of the parabola through three values with signed steps."""
+    """Compute the derivative at `here` of the parabola through three values with signed steps."""
     total = near_step + far_step
     return (
         -(2.0 * near_step + far_step) / (near_step * total) * here
@@ -171,7 +172,8 @@ def _ramped(
 
 
 def _length_rate_function(task: Task) -> ca.Function:
-    """Arc length per unit of u and its derivative; rotation counts at the reference speeds."""
+    """Build the function of arc length per unit of u and its derivative; rotation counts at the
+    reference speeds."""
     pose, first, second = (ca.SX.sym(name, 6) for name in ("pose", "first", "second"))
     lever = task.reference_speed / task.reference_angular_speed
     turn = angular_velocity(task.orientation, pose[3:], first[3:])
@@ -186,7 +188,8 @@ def _length_rate_function(task: Task) -> ca.Function:
 
 
 def _ramp_function(task: Task) -> ca.Function:
-    """Time, speed and acceleration at an arc length of a smooth rest-to-rest drive."""
+    """Build the function of time, speed and acceleration at an arc length of a smooth rest-to-rest
+    motion."""
     arc, total = ca.SX.sym("arc"), ca.SX.sym("total")
     ramp = task.ramp_time
     cruise = ca.fmin(task.reference_speed, total / ramp)

@@ -1,4 +1,4 @@
-"""The cell: shapes, robots, payload, contacts, uncertainty, handling, and what identifies it all.
+"""The cell: shapes, robots, payload, contacts, uncertainty, handling, and its digest.
 
 A workcell that is as it was read has the digest of its files. One that was changed in memory
 (`dataclasses.replace`) has one of its own, made from that and from its values, so that nothing that
@@ -203,7 +203,7 @@ class Robot:
 
 @dataclass(frozen=True)
 class Payload:
-    """What is carried, called the box.
+    """The payload, called the box.
 
     Attributes:
         size: (3,) edge lengths along the box axes [m]; of another shape those of a box about the
@@ -230,7 +230,7 @@ class Payload:
 
     @property
     def solid(self) -> Box | Cylinder | Mesh:
-        """Its geometry in the box frame."""
+        """Its geometry in the box frame, a box of `size` by default."""
         return Box(self.size) if self.shape is None else self.shape
 
 
@@ -279,7 +279,7 @@ class Contact:
 
 @dataclass(frozen=True)
 class Uncertainty:
-    """How far from its nominal value each quantity may be while the robots hold the box.
+    """Largest deviation of each quantity from its nominal value while the robots hold the box.
 
     Attributes:
         friction: share by which either coefficient may be lower or higher.
@@ -314,7 +314,7 @@ class Uncertainty:
 
     @property
     def is_empty(self) -> bool:
-        """Whether nothing may be different from what the workcell says."""
+        """True if no quantity deviates."""
         return not any(np.any(getattr(self, name)) for name in RANGES)
 
     @property
@@ -329,17 +329,16 @@ class Uncertainty:
 
     @property
     def apart(self) -> float:
-        """How far the pads may be displaced along their faces, one way and the other, together
-        [m]."""
+        """Largest displacement of the pads along their faces relative to each other [m]."""
         return 0.0 if self.stiffness else self.relative_position
 
     @property
     def turned(self) -> float:
-        """Angle of a pad against its face, whatever turns it [rad]."""
+        """Largest angle of a pad against its face, from tilt and relative orientation [rad]."""
         return self.tilt + self.relative_angle
 
     def scaled(self, factor: float) -> Uncertainty:
-        """All ranges times a factor."""
+        """Return the set with every range times a factor."""
         return replace(self, **{name: factor * getattr(self, name) for name in RANGES})
 
     def changed(self, by: float | Mapping[str, float]) -> Uncertainty:
@@ -363,7 +362,7 @@ class Uncertainty:
         return replace(self, **ranges)
 
     def only(self, names: Iterable[str]) -> Uncertainty:
-        """The set with some of its ranges alone."""
+        """Return the set restricted to some of its ranges; the others are zero."""
         none = Uncertainty()
         others = {name: getattr(none, name) for name in RANGES if name not in names}
         return replace(self, **others)
@@ -412,7 +411,7 @@ contains the arms' relative angle. docs/explanation/robust.md says more."""
 
 @dataclass(frozen=True)
 class Handling:
-    """What the robots do before and after the carry.
+    """Motion of the robots before and after the carry.
 
     Attributes:
         stand_off: distance of both pads from the box before it is gripped and after it is let
@@ -438,7 +437,7 @@ class Handling:
 
 @dataclass(frozen=True)
 class Reading:
-    """What a workcell was like when it was read.
+    """State of a workcell when it was read.
 
     Attributes:
         files: SHA-256 over the workcell file and the content of every file it names.
@@ -454,7 +453,7 @@ class Reading:
 
 
 def reading_of(workcell: Any, files: str) -> Reading:
-    """The reading of a workcell as it is now."""
+    """Compute the reading of a workcell in its present state."""
     arms = [(r.urdf, r.package_dirs, r.xacro_arguments, r.srdf) for r in workcell.robots]
     values = digest_of_parts(workcell, workcell.source.parent)
     return Reading(files, values, frozenset([*_paths(workcell), *map(repr, arms)]))
@@ -487,7 +486,7 @@ SEARCHED = -2
 
 @dataclass(frozen=True)
 class IgnoredPair:
-    """Bodies that collision checking leaves out against one another, with the user's reason.
+    """Bodies that collision checking leaves out against each other, with the user's reason.
 
     Attributes:
         first, second: names of bodies, or patterns with `*` and `?` that stand for several.
@@ -501,7 +500,7 @@ class IgnoredPair:
 
 @dataclass(frozen=True)
 class CollisionSettings:
-    """How collisions are judged.
+    """Settings of collision checking.
 
     Attributes:
         tolerance: bodies closer than this count as colliding [m].
@@ -545,18 +544,18 @@ class Workcell:
     text: bytes | None = field(default=None, repr=False)
 
     def of_joints(self, name: str) -> Array:
-        """(joints,) what robots tell of each joint under a name, both arms side by side."""
+        """Stack a limit that each robot states per joint, both arms: (joints,)."""
         return np.concatenate([getattr(robot, name) for robot in self.robots])
 
     @property
     def has_facing_pads(self) -> bool:
-        """Whether two round pads with opposite normals hold the payload: what the paper's
-        allocation is for."""
+        """True if two round pads with opposite normals hold the payload, as the paper's
+        allocation requires."""
         return self.has_opposite_pads and not any(c.half_sides for c in self.contacts)
 
     @property
     def has_opposite_pads(self) -> bool:
-        """Whether two pads with opposite normals hold the payload, whatever their patches."""
+        """True if two pads with opposite normals hold the payload, with patches of any shape."""
         if any(contact.further for contact in self.contacts):
             return False
         first, second = (contact.T_box_pad[:3, 2] for contact in self.contacts)
@@ -570,27 +569,27 @@ class Workcell:
 
     @property
     def pads_beside(self) -> float:
-        """How far the contacts lie beside one another, seen along the first one's normal [m]."""
+        """Lateral offset of the contacts, seen along the first one's normal [m]."""
         first, second = (contact.T_box_pad[:3, 3] for contact in self.contacts)
         normal, apart = self.contacts[0].T_box_pad[:3, 2], first - second
         return float(np.linalg.norm(apart - (apart @ normal) * normal))
 
     @property
     def has_pads_beside(self) -> bool:
-        """Whether they lie beside one another at all."""
+        """True if the contacts are offset laterally."""
         return self.pads_beside > BESIDE
 
     @property
     def has_closed_form(self) -> bool:
-        """Whether the contact forces have a closed form: the paper's, and those of soft fingers on
-        two pads with opposite normals. All others are found by a program."""
+        """True if the contact forces have a closed form: the paper's, and those of soft fingers on
+        two pads with opposite normals. A convex program finds all others."""
         allocation = self.task.allocation
         return allocation == "paper" or (allocation == "soft-finger" and self.has_opposite_pads)
 
     @property
     def has_one_squeeze(self) -> bool:
-        """Whether the force of one pad decides that of the other, so that a least squeeze says
-        all."""
+        """True if the force of one pad determines the other's, so that one number states the
+        grasp force."""
         return self.has_opposite_pads
 
     @property
@@ -605,8 +604,8 @@ class Workcell:
 
     @cached_property
     def digest(self) -> str:
-        """Identifies the cell in caches and results: SHA-256 over the file and every file it names
-        (URDF, meshes), and over its values where it was changed in memory; '' without files."""
+        """Key of the cell in caches and results: SHA-256 over the file and every file it names
+        (URDF, meshes), and over its values if it was changed in memory; '' without files."""
         if self.reading is None:
             return ""
         files, now = self.reading.files, reading_of(self, "")
@@ -618,13 +617,13 @@ class Workcell:
 
 
 def box_flange(robot: Robot, contact: Contact) -> Array:
-    """T_box_flange (4, 4) of the arm that holds this contact."""
+    """Compute T_box_flange (4, 4) of the arm that holds this contact."""
     known: Array | None = getattr(robot, "T_box_flange", None)  # of numbers that are symbols
     return contact.T_box_pad @ inverse(robot.T_flange_pad) if known is None else known
 
 
 def flange_lever(robot: Robot, contact: Contact) -> Array:
-    """(3,) from the flange to the nominal contact point, box axes [m]."""
+    """Compute the vector (3,) from the flange to the nominal contact point, box axes [m]."""
     known: Array | None = getattr(robot, "lever", None)
     return contact.T_box_pad[:3, 3] - box_flange(robot, contact)[:3, 3] if known is None else known
 

@@ -1,4 +1,4 @@
-"""Records and their values as bytes: for digests, and to recognise what was computed before."""
+"""Records and their values as bytes, for digests and cache keys."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import numpy as np
 
 
 def digest_of_parts(value: Any, folder: Path = Path()) -> str:
-    """SHA-256 over the content of a record, part by part; paths as seen from a folder."""
+    """Compute the SHA-256 of a record's content, part by part; paths relative to a folder."""
     found: list[bytes] = []
 
     def add(values: Iterable[Any]) -> None:
@@ -48,13 +48,13 @@ def digest_of_parts(value: Any, folder: Path = Path()) -> str:
 
 
 def _counted(part: bytes) -> bytes:
-    """A part after its length, which keeps it apart from others."""
+    """Prefix a part with its length, so that neighbouring parts cannot be confused."""
     return len(part).to_bytes(8, "big") + part
 
 
 @cache
 def _kind(of: type) -> str:
-    """How values of a type are taken apart: records and arrays are many, and asked often."""
+    """Return how values of a type are divided into parts; cached, since it is called often."""
     if of in (str, int, bool, type(None)):
         return "plain"
     known = {tuple: "tuple", np.ndarray: "array", type: "type", ContentRecord: "content"}
@@ -88,7 +88,7 @@ def _array_head(dtype: np.dtype[Any], shape: tuple[int, ...]) -> bytes:
 
 @cache
 def _record(kind: Hashable) -> tuple[bytes, tuple[str, ...]]:
-    """What the content of a record begins with, and the names of the fields that belong to it."""
+    """Return the prefix of a record's content, and the names of its fields that belong to it."""
     own: Any = kind
     names = (each.name for each in fields(own))
     kept = tuple(name for name in names if name not in ("source", "reading", "text"))
@@ -96,25 +96,26 @@ def _record(kind: Hashable) -> tuple[bytes, tuple[str, ...]]:
 
 
 class ContentRecord:
-    """A record that keeps its digest, so that what is made of it is recognised fast."""
+    """A record that caches its digest, so that equal records are recognised fast."""
 
     @cached_property
     def content(self) -> str:
-        """Digest of all of it."""
+        """Digest of the whole record."""
         kind: Any = type(self)
         return digest_of_parts((kind, tuple(getattr(self, name) for name in _record(kind)[1])))
 
 
 class CacheKey:
-    """Arguments of a function whose answers are kept (`functools.lru_cache`): equal to others where
-    these are the same. Cells that are tried out share most of what they are made of.
+    """Key of a function with `functools.lru_cache`: keys with equal content are equal. Cells that
+    differ in few values share most cached results.
 
     Attributes:
         given: the arguments.
     """
 
     def __init__(self, *given: Any, known: Hashable = None) -> None:
-        """known: what identifies them; None for their whole content."""
+        """Store the arguments; `known` identifies them, None for a digest of their whole
+        content."""
         self.given = given
         self._known = digest_of_parts(given) if known is None else known
 

@@ -1,4 +1,4 @@
-"""Records whose numbers are symbols: what formulas take where a cell's numbers are inputs.
+"""Records whose parameters are symbols: formulas take them where a cell's parameters are inputs.
 
 A formula reads `payload.mass` of either kind of record, so that it is written once. A function made
 of records with symbols has their groups as its last inputs (`symbolic.expression.sx_given`); of
@@ -23,7 +23,7 @@ from symbolic.records.task import RedundantJoint, Task, Waypoint
 
 @dataclass(frozen=True)
 class Group:
-    """Numbers that functions take as one vector.
+    """Parameters that functions take as one vector.
 
     Attributes:
         name: of the input.
@@ -51,7 +51,7 @@ class NumberedRobot(Robot):
 
 @dataclass(frozen=True)
 class NumberedPayload(Payload):
-    """What is carried. given: its numbers, with those of the contacts."""
+    """The payload. given: its parameters, with those of the contacts."""
 
     given: Group | None = None
 
@@ -66,39 +66,38 @@ class NumberedContact(Contact):
 
 @dataclass(frozen=True)
 class NumberedWaypoint(Waypoint):
-    """A pose of the path, of which only a fixed one has numbers."""
+    """A pose of the path; only a fixed one has parameters."""
 
     fixed: bool = False
 
     @property
     def is_fixed(self) -> bool:
-        """See `Waypoint`."""
         return self.fixed
 
 
 @dataclass(frozen=True)
 class NumberedJoint(RedundantJoint):
-    """A redundant joint. free: at which waypoints it is; elsewhere `lower` holds its numbers."""
+    """A redundant joint. free: waypoints at which it is a variable; elsewhere `lower` holds its
+    parameters."""
 
     free: tuple[bool, ...] = ()
 
     @property
     def moving(self) -> NDArray[np.bool_]:
-        """See `RedundantJoint`."""
         return np.array(self.free, dtype=np.bool_)
 
 
 @dataclass(frozen=True, kw_only=True)
 class NumberedTask(Task):
-    """A task. given: its numbers."""
+    """A task. given: its parameters."""
 
     given: Group | None = None
 
 
 @dataclass(frozen=True)
 class GraspNumbers:
-    """What formulas of pads anywhere hold beside the pads' own numbers, as NumPy derives it: n
-    entries of all pads' states; b rows of balance.
+    """Quantities that NumPy derives for grasps by pads with any normals, beside the pads' own
+    parameters: n entries of all pads' states; b rows of balance.
 
     Attributes:
         left: (b,) which of the n components are what the others leave.
@@ -131,7 +130,7 @@ class GraspNumbers:
 
 @dataclass(frozen=True)
 class NumberedWorkcell(Workcell):
-    """A cell whose pads stand as these say, whatever their numbers.
+    """A cell with the pads' arrangement fixed and its parameters symbolic.
 
     Attributes:
         facing, opposite, beside: see the properties of `Workcell`.
@@ -147,15 +146,12 @@ class NumberedWorkcell(Workcell):
 
     @property
     def has_facing_pads(self) -> bool:
-        """See `Workcell`."""
         return self.facing
 
     @property
     def has_opposite_pads(self) -> bool:
-        """See `Workcell`."""
         return self.opposite
 
     @property
     def has_pads_beside(self) -> bool:
-        """See `Workcell`."""
         return self.beside

@@ -1,4 +1,4 @@
-"""Poses as numbers: homogeneous transforms, and the chart of rotations that a cell's poses use."""
+"""Poses as numbers: homogeneous transforms, and the coordinates of rotations in a cell's poses."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from symbolic.array import Array
 
 
 def read_only(values: Any) -> Array:
-    """A read-only float64 copy of an array-like."""
+    """Return a read-only float64 copy of an array-like."""
     array = np.array(values, dtype=np.float64)
     array.setflags(write=False)
     return array
@@ -26,7 +26,7 @@ Rotation = Literal["roll-pitch-yaw", "quaternion"]
 
 @dataclass(frozen=True)
 class Orientation:
-    """How three numbers [rad] give R_world_box.
+    """Map from three numbers [rad] to R_world_box.
 
     'roll-pitch-yaw', the paper's: Rz(yaw) Ry(pitch) Rx(roll). 'quaternion': a rotation vector v
     along the world's axes, whose unit quaternion (cos |v|/2, sin |v|/2 v/|v|) turns the reference:
@@ -42,7 +42,8 @@ class Orientation:
 
     @property
     def is_vector(self) -> bool:
-        """Whether the numbers are a rotation vector; angles otherwise, each up to full turns."""
+        """True if the numbers are a rotation vector; else they are angles, each periodic in full
+        turns."""
         return self.rotation == "quaternion"
 
     @property
@@ -53,7 +54,7 @@ class Orientation:
         return ("roll", "pitch", "yaw")
 
     def unwrapped(self, numbers: Array) -> Array:
-        """Numbers (n, 3) along a path, angles without jumps of full turns."""
+        """Return numbers (n, 3) along a path, with angles unwrapped."""
         return numbers if self.is_vector else np.unwrap(numbers, axis=0)
 
 
@@ -61,7 +62,7 @@ class Orientation:
 
 
 def rotation_from_rpy(rpy: ArrayLike) -> Array:
-    """Rotations Rz(yaw) Ry(pitch) Rx(roll), the convention of URDF.
+    """Compute rotations Rz(yaw) Ry(pitch) Rx(roll), the convention of URDF.
 
     Args:
         rpy: (..., 3) roll, pitch, yaw [rad].
@@ -80,7 +81,8 @@ def rotation_from_rpy(rpy: ArrayLike) -> Array:
 
 
 def rpy_from_rotation(rotation: Array) -> Array:
-    """Roll, pitch, yaw (3,) [rad] of a rotation (3, 3); no roll at a pitch of a quarter turn."""
+    """Compute roll, pitch, yaw (3,) [rad] of a rotation (3, 3); roll is zero at a pitch of +-90
+    degrees."""
     level = np.hypot(rotation[0, 0], rotation[1, 0])
     pitch = np.arctan2(-rotation[2, 0], level)
     if level < 1e-9:
@@ -90,7 +92,8 @@ def rpy_from_rotation(rotation: Array) -> Array:
 
 
 def rotation_from_vector(vector: ArrayLike) -> Array:
-    """Rotations exp(v) of rotation vectors (..., 3) [rad], by Rodrigues' formula: (..., 3, 3)."""
+    """Compute rotations exp(v) (..., 3, 3) of rotation vectors (..., 3) [rad] by Rodrigues'
+    formula."""
     v = np.asarray(vector, dtype=float)
     angle = np.linalg.norm(v, axis=-1)[..., None, None]
     across = np.cross(v[..., None, :], np.eye(3))
@@ -101,7 +104,7 @@ def rotation_from_vector(vector: ArrayLike) -> Array:
 
 
 def box_rotation(orientation: Orientation, pose: ArrayLike) -> Array:
-    """R_world_box (..., 3, 3) of poses (..., 6) [m, rad] of a cell with this orientation."""
+    """Compute R_world_box (..., 3, 3) of poses (..., 6) [m, rad] in this orientation convention."""
     numbers = np.asarray(pose, dtype=float)[..., 3:6]
     if orientation.is_vector:
         return np.asarray(rotation_from_vector(numbers) @ orientation.reference)
@@ -109,7 +112,7 @@ def box_rotation(orientation: Orientation, pose: ArrayLike) -> Array:
 
 
 def box_placement(orientation: Orientation, pose: ArrayLike) -> Array:
-    """T_world_box (..., 4, 4) of poses (..., 6) [m, rad] of a cell with this orientation."""
+    """Compute T_world_box (..., 4, 4) of poses (..., 6) [m, rad] in this orientation convention."""
     given = np.asarray(pose, dtype=float)
     T = np.zeros((*given.shape[:-1], 4, 4))
     T[..., :3, :3] = box_rotation(orientation, given)
@@ -119,12 +122,12 @@ def box_placement(orientation: Orientation, pose: ArrayLike) -> Array:
 
 
 def pose_matrix(xyz: ArrayLike, rpy: ArrayLike) -> Array:
-    """Homogeneous transform from a position [m] and roll, pitch, yaw [rad]. Returns (4, 4)."""
+    """Compute the transform (4, 4) of a position [m] and roll, pitch, yaw [rad]."""
     return transform(rotation_from_rpy(rpy), xyz)
 
 
 def transform(rotation: ArrayLike, translation: ArrayLike) -> Array:
-    """Homogeneous transform from a rotation (3, 3) and a translation (3,) [m]. Returns (4, 4)."""
+    """Build the transform (4, 4) of a rotation (3, 3) and a translation (3,) [m]."""
     matrix = np.eye(4)
     matrix[:3, :3] = rotation
     matrix[:3, 3] = translation
@@ -132,7 +135,7 @@ def transform(rotation: ArrayLike, translation: ArrayLike) -> Array:
 
 
 def axes_with_z(axis: Array) -> Array:
-    """A rotation (3, 3) whose third column is the unit axis (3,)."""
+    """Compute a rotation (3, 3) whose third column is the unit axis (3,)."""
     helper = np.eye(3)[int(np.argmin(np.abs(axis)))]
     x = np.cross(helper, axis)
     x /= np.linalg.norm(x)
@@ -140,12 +143,12 @@ def axes_with_z(axis: Array) -> Array:
 
 
 def inverse(T_a_b: Array) -> Array:
-    """The transform T_b_a of a rigid T_a_b, without a general matrix inversion."""
+    """Invert a rigid transform: T_b_a of T_a_b, by the transposed rotation."""
     rotation = T_a_b[:3, :3].T
     return transform(rotation, -rotation @ T_a_b[:3, 3])
 
 
 def skew(vector: ArrayLike) -> Array:
-    """The matrix (3, 3) whose product with another vector is the cross product of (3,) with it."""
+    """Return the matrix (3, 3) whose product with a vector is the cross product of (3,) with it."""
     x, y, z = np.asarray(vector, dtype=float)
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])

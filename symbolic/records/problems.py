@@ -1,4 +1,4 @@
-"""Problems of a file gathered by place, the words that report them, and patterns of names."""
+"""Problems of a file collected by key path, words for their messages, and patterns of names."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class Problems:
             self.uncounted += 1
 
     def clean(self, *prefixes: str) -> bool:
-        """Whether nothing was found at, below or above any of these key paths."""
+        """Return True if no problem was found at, below or above any of these key paths."""
         return not any(
             _is_within(path, prefix) or _is_within(prefix, path)
             for path, _ in self.found
@@ -57,13 +57,13 @@ class Problems:
         )
 
     def messages(self) -> tuple[str, ...]:
-        """All problems as `key.path: text`, and how many more there are."""
+        """Return all problems as `key.path: text`, and the number of those not listed."""
         told = tuple(f"{path}: {text}" for path, text in self.found)
         return (*told, f"and {self.uncounted} more") if self.uncounted else told
 
 
 class FirstProblem(Problems):
-    """Stops at the first problem."""
+    """Raises the first problem at once."""
 
     def add(self, path: str, text: str) -> None:
         """Raise the problem.
@@ -79,7 +79,7 @@ def _is_within(path: str, prefix: str) -> bool:
 
 
 def suggestion(word: str, candidates: Iterable[str]) -> str:
-    """A 'did you mean' for a misspelt word, or an empty string."""
+    """Return a 'did you mean' for a misspelt word, or an empty string."""
     if len(word) > LONGEST_WORD:
         return ""
     close = difflib.get_close_matches(word, list(candidates), n=1, cutoff=0.6)
@@ -87,7 +87,7 @@ def suggestion(word: str, candidates: Iterable[str]) -> str:
 
 
 def shown(value: Any) -> str:
-    """A value as a short single line for a message, control characters escaped.
+    """Return a value as a short single line for a message, control characters escaped.
 
     Of a long one both ends: a path is known by its last part.
     """
@@ -96,10 +96,10 @@ def shown(value: Any) -> str:
 
 
 class _Short(reprlib.Repr):
-    """Looks only as far into a value as a message can show."""
+    """`repr` that reads only as much of a value as a message can show."""
 
     def repr_int(self, x: int, level: int) -> str:
-        """Python refuses to write out numbers of thousands of digits."""
+        """Return an integer's digits, or its number of bits: Python refuses thousands of digits."""
         return repr(x) if x.bit_length() < 200 else f"a number of {x.bit_length()} bits"
 
 
@@ -109,7 +109,7 @@ _short.maxlist = _short.maxdict = 60
 
 
 def text_problem(value: Any) -> str:
-    """What is wrong with a value as a text for people and reports, or an empty string."""
+    """Return what is wrong with a value as a text for reports, or an empty string."""
     if not isinstance(value, str):
         return "allowed is a text"
     if not value.strip():
@@ -128,7 +128,7 @@ Label = Annotated[str, Form(text_problem)]
 
 
 def form_of(pattern: str, meaning: str) -> Form:
-    """Texts of a pattern, and what they mean."""
+    """Return the form of texts that match a pattern; `meaning` describes it in messages."""
     form = re.compile(pattern)
 
     def problem(value: Any) -> str:
@@ -141,7 +141,7 @@ def form_of(pattern: str, meaning: str) -> Form:
 
 
 def matching(pattern: str, names: Iterable[str]) -> tuple[str, ...]:
-    """The names that a pattern stands for: `*` is any text, `?` any character.
+    """Return the names that match a pattern: `*` is any text, `?` any character.
 
     A name that is written out stands for itself, also where it holds such a character.
     """

@@ -1,4 +1,4 @@
-"""The believable range of every quantity in a workcell file.
+"""Allowed range of every quantity in a workcell file.
 
 The ranges are wide for cells of industrial arms and narrow enough that a value in another unit
 (mm, degrees, g, kgf, mm/s) falls outside and is refused. docs/reference/workcell.md lists them.

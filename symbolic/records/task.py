@@ -1,4 +1,4 @@
-"""What is to be carried where, and the decision vector that this makes.
+"""The task of a carry, and its decision vector.
 
 The decision vector holds the free waypoints of a task's path, one after the other. The free values
 of the redundant joints follow them, joint by joint; under the time law 'optimal' the force limit
@@ -67,12 +67,12 @@ class RedundantJoint:
 
     @property
     def is_common(self) -> bool:
-        """Whether it moves both arms."""
+        """True if it moves both arms."""
         return min(self.drives) >= 0
 
     @property
     def moving(self) -> NDArray[np.bool_]:
-        """(n_waypoints,) where its value is a decision variable."""
+        """(n_waypoints,) True where its value is a decision variable."""
         return np.asarray(self.lower < self.upper)
 
 
@@ -92,7 +92,7 @@ class AllowedContact:
 
 @dataclass(frozen=True, kw_only=True)
 class Task:
-    """What is to be carried where, and how a candidate is sampled and judged.
+    """The box path to plan, its sampling, and the settings of forces and time.
 
     Attributes:
         waypoints: the ordered poses of the path; the first and last are fixed.
@@ -134,8 +134,8 @@ class Task:
         return POSE_SIZE + len(self.redundant)
 
     def redundant_of(self, arm: int) -> tuple[tuple[int, int], ...]:
-        """Per redundant joint of robot `arm` its index in the arm and its place in the extended
-        pose."""
+        """Return, per redundant joint of robot `arm`, its index in the arm and its place in the
+        extended pose."""
         return tuple(
             (joint.drives[arm], POSE_SIZE + k)
             for k, joint in enumerate(self.redundant)
@@ -198,18 +198,18 @@ class Task:
 
 
 def components(orientation: Orientation) -> tuple[str, ...]:
-    """What the numbers of a pose are called [m, rad]."""
+    """Return the names of the numbers of a pose [m, rad]."""
     return ("x", "y", "z", *orientation.components)
 
 
 def waypoints_of(task: Task, x: Array) -> Array:
-    """All waypoints (n_waypoints, 6) of a decision vector (n_var,), angles unwrapped."""
+    """Return all waypoints (n_waypoints, 6) of a decision vector (n_var,), angles unwrapped."""
     return extended_waypoints(task, x)[:, :POSE_SIZE]
 
 
 def extended_waypoints(task: Task, x: Array) -> Array:
-    """All waypoints (n_waypoints, 6 + m) of a decision vector (n_var,), the values of the redundant
-    joints beside the poses."""
+    """Return all waypoints (n_waypoints, 6 + m) of a decision vector (n_var,): poses, then
+    redundant joints."""
     points = np.array([waypoint.lower for waypoint in task.waypoints])
     points = np.column_stack([points, *[joint.lower for joint in task.redundant]])
     points[task.free_entries] = x[: task.n_path]
@@ -218,23 +218,23 @@ def extended_waypoints(task: Task, x: Array) -> Array:
 
 
 def place_redundant(task: Task, extended: Array, joints: Sequence[Array]) -> None:
-    """Put both arms' redundant joints, (n, joints) each and changed in place, where the extended
-    poses (n, 6 + m) say."""
+    """Write the redundant joints of the extended poses (n, 6 + m) into both arms' joints (n,
+    joints), in place."""
     for arm, q in enumerate(joints):
         for joint, place in task.redundant_of(arm):
             q[:, joint] = extended[:, place]
 
 
 def decision_of(task: Task, waypoints: Array) -> Array:
-    """The decision vector (n_var,) of all waypoints (n_waypoints, 6 + m); a force limit at its
-    upper bound."""
+    """Return the decision vector (n_var,) of all waypoints (n_waypoints, 6 + m); a force limit
+    takes its upper bound."""
     path = np.array(waypoints[task.free_entries], dtype=float)
     return np.append(path, task.force_limit[1]) if task.time_law == "optimal" else path
 
 
 def initial_decision(task: Task) -> Array:
-    """The decision vector (n_var,) of the hand-made trajectory, a force limit at its upper
-    bound."""
+    """Return the decision vector (n_var,) of the hand-made trajectory; a force limit takes its
+    upper bound."""
     points = np.array([waypoint.lower for waypoint in task.waypoints])
     points[list(task.free_indices)] = task.initial
     return decision_of(task, _beside_initial(task, points))
@@ -245,8 +245,8 @@ def _beside_initial(task: Task, poses: Array) -> Array:
 
 
 def straight_line(task: Task) -> Array:
-    """(n_var,) free waypoints evenly spaced on the straight lines between the fixed ones, the
-    redundant joints as in the hand-made trajectory."""
+    """Return free waypoints (n_var,) evenly spaced on the straight lines between the fixed ones,
+    with the redundant joints of the hand-made trajectory."""
     fixed = [i for i, waypoint in enumerate(task.waypoints) if waypoint.is_fixed]
     poses = np.array([waypoint.lower for waypoint in task.waypoints])
     numbers = np.arange(len(task.waypoints))
@@ -255,7 +255,8 @@ def straight_line(task: Task) -> Array:
 
 
 def variable_names(task: Task) -> tuple[str, ...]:
-    """What the decision variables (n_var,) are; waypoints count from 1, the start is none."""
+    """Return the names of the decision variables (n_var,); waypoints count from 1, after the
+    start."""
     names = [*components(task.orientation), *(joint.name for joint in task.redundant)]
     rows, columns = task.free_entries
     found = [f"waypoint {row}, {names[column]}" for row, column in zip(rows, columns, strict=True)]

@@ -1,4 +1,4 @@
-"""One arm that follows the box: inverse kinematics along the samples, limits and joint load.
+"""One arm that follows the box: inverse kinematics along the samples, limits and joint torques.
 
 Paper Eqs. 29-33 and 61-62. The flange's target follows from the box pose alone, so both arms
 keep the relative grasp exactly; an arm's redundant joints are where the extended pose says
@@ -63,7 +63,7 @@ that exerts the contact wrench [N m, or N].
 def flange_target(
     robot: Robot, contact: Contact, position: ca.SX, rotation: ca.SX
 ) -> tuple[ca.SX, ca.SX]:
-    """Flange rotation (3, 3) and position (3,) in the robot's root frame, from the box pose.
+    """Compute the flange's target rotation (3, 3) and position (3,) in the robot's root frame.
 
     Args:
         position, rotation: (3,) and (3, 3), the box in the world (paper Eqs. 30-33).
@@ -79,7 +79,8 @@ def flange_target(
 
 
 def limit_margin(robot: Robot, q: ca.SX) -> ca.SX:
-    """Least distance (scalar) of the joints to their limits, negative beyond one [rad]."""
+    """Compute the least distance (scalar) of the joints to their limits, negative beyond one
+    [rad]."""
     lower, upper = number(robot.position_lower), number(robot.position_upper)
     return ca.mmin(ca.vertcat(q - lower, upper - q))
 
@@ -87,7 +88,7 @@ def limit_margin(robot: Robot, q: ca.SX) -> ca.SX:
 def joint_torque(
     robot: Robot, contact: Contact, jacobian: ca.SX, rotation: ca.SX, wrench: ca.SX
 ) -> ca.SX:
-    """Joint torques (n,) that exert a contact wrench on the box (paper Eq. 45) [N m].
+    """Compute the joint torques (n,) that exert a contact wrench on the box (paper Eq. 45) [N m].
 
     Args:
         jacobian: (6, n) of the flange in the robot's root frame, linear rows first.
@@ -102,7 +103,7 @@ def joint_torque(
 
 
 def track_function(robot: Robot, model: RobotModel, contact: Contact, name: str) -> ca.Function:
-    """One sample of an arm's motion, to be accumulated along the path.
+    """Build the function of one sample of an arm's motion, to be accumulated along the path.
 
     Inputs: state (3 n + 1,) = joints at the previous sample, their last change, that change's own
     change, and `lost`; the extended pose; wrench (6,) on the box about the nominal contact point.
@@ -143,7 +144,8 @@ def track_function(robot: Robot, model: RobotModel, contact: Contact, name: str)
 
 
 def torque_function(robot: Robot, model: RobotModel, contact: Contact, name: str) -> ca.Function:
-    """Joints (n,), extended pose and wrench as of `track_function` to its joint_torque (n,)."""
+    """Build the function from joints (n,), extended pose and wrench, as in `track_function`, to
+    joint_torque (n,)."""
     q, pose = ca.SX.sym("q", model.n_joints), ca.SX.sym("pose", model.pose_size)
     wrench = ca.SX.sym("wrench", 6)
     rotation = rotation_matrix(model.orientation, pose[3:6])
@@ -153,7 +155,8 @@ def torque_function(robot: Robot, model: RobotModel, contact: Contact, name: str
 
 
 def _track_parts(robot: Robot, model: RobotModel, contact: Contact) -> dict[str, ca.Function]:
-    """The steps of `track_function`; those that begin with a condition do nothing without it.
+    """Build the steps of `track_function`; conditional ones copy their input if the condition is
+    false.
 
     target: pose -> R_world_box, and the flange's target. approach: state, pose, target -> joints
     after `CHEAP_STEPS`, the residual before the last. closer: joints, target -> joints one step on.
@@ -202,7 +205,7 @@ def _track_parts(robot: Robot, model: RobotModel, contact: Contact) -> dict[str,
 
 
 def _placed(model: RobotModel, q: ca.SX, R_target: ca.SX, p_target: ca.SX) -> list[ca.SX]:
-    """Joints (n,), their pose residual and their Jacobian (6, n)."""
+    """Return the joints (n,), their pose residual and their Jacobian (6, n)."""
     R, p, jacobian = model.kinematics(q)
     return [q, pose_error(R_target, p_target, R, p)[1], jacobian]
 
@@ -214,7 +217,8 @@ def _function(name: str, inputs: list[ca.SX], outputs: list[ca.SX]) -> ca.Functi
 def _where(
     name: str, inputs: list[ca.SX], results: list[ca.SX], otherwise: list[ca.SX]
 ) -> ca.Function:
-    """Condition and inputs -> the results, or without the condition the others, not computed."""
+    """Build a function that returns the results if its first input is true, else the inputs
+    `otherwise`."""
     chosen = _function(name, inputs, results)
     left = _function(f"{name}_not", inputs, otherwise)
     return ca.Function.if_else(f"{name}_where", chosen, left)
@@ -223,7 +227,7 @@ def _where(
 def follow_function(
     robot: Robot, model: RobotModel, contact: Contact, samples: int, name: str
 ) -> ca.Function:
-    """An arm's motion along all samples of a box path.
+    """Build the function of an arm's motion along all samples of a box path.
 
     Inputs: start (n,), joints at the first box pose [rad]; pose (6 + m, samples), extended; wrench
     (6, samples) on the box about the nominal contact point. Outputs: `TRACK_OUTPUTS`.
@@ -253,7 +257,7 @@ def follow_function(
 
 
 def start_function(robot: Robot, model: RobotModel, contact: Contact, name: str) -> ca.Function:
-    """State of `track_function` before the first sample.
+    """Build the function of the state of `track_function` before the first sample.
 
     Inputs: start (n,), joints at the first box pose; extended, the first extended pose. An arm's
     redundant joints move from the one to the other, evenly, in `BEGIN_STEPS` Newton steps that keep
@@ -282,7 +286,8 @@ def start_function(robot: Robot, model: RobotModel, contact: Contact, name: str)
 def prediction_function(
     robot: Robot, model: RobotModel, contact: Contact, name: str
 ) -> ca.Function:
-    """State of `track_function` after the first sample -> one that predicts the second.
+    """Build the function that predicts the second sample: the state of `track_function` after the
+    first sample, with the change of the joints found by Newton steps.
 
     Inputs: state (3 n + 1,); the extended pose of the second sample.
     """
@@ -301,7 +306,7 @@ def prediction_function(
 
 
 def posture_function(robots: Arms, models: Models, contacts: Contacts) -> ca.Function:
-    """Both arms' postures at one box pose, from nearby joint positions.
+    """Build the function of both arms' postures at one box pose, from nearby joint positions.
 
     Inputs: pose (6,) of the box; guess_1, guess_2 (n,) [rad], whose redundant joints stay. Outputs:
     q_1, q_2 (n,) after `NEWTON_STEPS`; residual_1, residual_2, their pose residuals [m, rad].
@@ -335,7 +340,7 @@ _POSTURES = 200
 
 
 def pose_error(R_target: ca.SX, p_target: ca.SX, R: ca.SX, p: ca.SX) -> tuple[ca.SX, ca.SX]:
-    """Newton's right-hand side (6,) and the pose residual (scalar) of a placement.
+    """Compute Newton's right-hand side (6,) and the pose residual (scalar) of a placement.
 
     The right-hand side holds the position error and the axis of the rotation error times the
     sine of its angle. The residual uses twice the sine of the half angle instead, which is zero
@@ -349,7 +354,7 @@ def pose_error(R_target: ca.SX, p_target: ca.SX, R: ca.SX, p: ca.SX) -> tuple[ca
 
 
 def newton_step(model: RobotModel, q: ca.SX, R_target: ca.SX, p_target: ca.SX) -> ca.SX:
-    """One safeguarded Newton step of the inverse kinematics; q (n,) to q (n,)."""
+    """Make one safeguarded Newton step of the inverse kinematics; q (n,) to q (n,)."""
     R, p = model.placement(q)
     error, _ = pose_error(R_target, p_target, R, p)
     Q, upper = ca.qr(following_columns(model, model.jacobian(q)))
@@ -360,7 +365,8 @@ def newton_step(model: RobotModel, q: ca.SX, R_target: ca.SX, p_target: ca.SX) -
 def block_step(
     model: RobotModel, q: ca.SX, R_target: ca.SX, p_target: ca.SX
 ) -> tuple[ca.SX, ca.SX]:
-    """A Newton step of the six joints with fewer operations, and the pose residual before it.
+    """Make a Newton step of the six joints with fewer operations; also return the pose residual
+    before it.
 
     The angular rows give three joints in terms of the others by Cramer's rule, and the rest is
     again a 3 by 3 system. Without pivoting: not to be trusted where the three axes nearly lie in a
@@ -386,7 +392,7 @@ def block_step(
 
 
 def _cramer(A: ca.SX) -> Callable[[ca.SX], ca.SX]:
-    """Solves A x = b, A (3, 3), for right-hand sides b (3,)."""
+    """Return a solver of A x = b, A (3, 3), for right-hand sides b (3,)."""
     a, b, c = A[:, 0], A[:, 1], A[:, 2]
     rows = ca.cross(b, c), ca.cross(c, a), ca.cross(a, b)
     # The guard keeps CasADi from turning the products with a reciprocal into divisions.
@@ -396,7 +402,7 @@ def _cramer(A: ca.SX) -> Callable[[ca.SX], ca.SX]:
 
 @lru_cache(maxsize=8)
 def _independent_axes(model: RobotModel) -> tuple[int, ...]:
-    """The three of the six joints whose axes keep farthest from a common plane, in most
+    """Return the three of the six joints whose axes stay farthest from a common plane in random
     postures."""
     lower, upper = model.model.lowerPositionLimit, model.model.upperPositionLimit
     postures = np.random.default_rng(0).uniform(lower, upper, (_POSTURES, len(lower)))
@@ -410,12 +416,12 @@ def _independent_axes(model: RobotModel) -> tuple[int, ...]:
 
 
 def following_columns(model: RobotModel, jacobian: ca.SX) -> ca.SX:
-    """The columns (6, 6) of a Jacobian (6, n) that belong to the joints that follow the box."""
+    """Return the columns (6, 6) of a Jacobian (6, n) of the joints that follow the box."""
     return jacobian[:, list(model.following)] if model.redundant else jacobian
 
 
 def _limited(model: RobotModel, q: ca.SX, step: ca.SX) -> ca.SX:
-    """q after a step of the six joints that is shortened to `MAX_JOINT_STEP`."""
+    """Return q after a step of the six joints, shortened to `MAX_JOINT_STEP`."""
     largest = ca.norm_inf(step)
     # At a singular posture the step is not a number: stay, and let the residual tell.
     usable = ca.norm_1(step) < 1e9
@@ -427,7 +433,7 @@ def _limited(model: RobotModel, q: ca.SX, step: ca.SX) -> ca.SX:
 
 
 def manipulability(jacobian: ca.SX) -> ca.SX:
-    """|det J| [m^3] of a (6, 6) Jacobian (Yoshikawa's measure of six joints).
+    """Compute |det J| [m^3] of a (6, 6) Jacobian (Yoshikawa's manipulability of six joints).
 
     By Laplace's expansion in minors of three rows: no division, so exact at singular postures.
     """
@@ -444,7 +450,7 @@ def _others(joints: tuple[int, ...]) -> tuple[int, ...]:
 
 
 def _minors(rows: ca.SX) -> dict[tuple[int, ...], ca.SX]:
-    """Determinants of all 3 by 3 parts of (3, 6) rows, by their columns."""
+    """Compute the determinants of all 3 by 3 parts of (3, 6) rows, by their columns."""
     pairs = {
         (i, j): rows[1, i] * rows[2, j] - rows[1, j] * rows[2, i]
         for i, j in combinations(range(6), 2)

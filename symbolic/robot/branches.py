@@ -49,7 +49,7 @@ ROBUST_CLEARANCE = 0.02
 
 @dataclass(frozen=True, eq=False)
 class StartBranch:
-    """One way for one arm to hold the box at the start, and how the carry goes from there.
+    """A start posture of one arm, and the figures of its motion along the hand-made trajectory.
 
     Attributes:
         q: (n,) joint positions at the first waypoint [rad].
@@ -97,7 +97,7 @@ Clearance = Callable[[Array, Array], float]
 
 @dataclass(frozen=True)
 class ArmSearch:
-    """What start branches of an arm are found with.
+    """Functions with which start branches of an arm are found.
 
     Attributes:
         approach, follow, poses, clearance: see there.
@@ -114,7 +114,7 @@ class ArmSearch:
 def interpreted_search(
     workcell: Workcell, arm: int, model: RobotModel, clearance: Clearance | None = None
 ) -> ArmSearch:
-    """The same by CasADi's interpreter."""
+    """Build the search of an arm's start branches with CasADi's interpreter."""
     track = follow_function(
         workcell.robots[arm], model, workcell.contacts[arm], workcell.task.samples, "follow"
     )
@@ -135,7 +135,7 @@ def interpreted_search(
 
 
 def interpreted_approach(model: RobotModel) -> Approach:
-    """An arm's `approach_function` by CasADi's interpreter."""
+    """Build an arm's `approach_function` with CasADi's interpreter."""
     function = approach_function(model, "approach")
 
     def approach(q: Array, rotation: Array, position: Array) -> Mapping[str, Array]:
@@ -148,7 +148,7 @@ def interpreted_approach(model: RobotModel) -> Approach:
 
 
 def approach_function(model: RobotModel, name: str) -> ca.Function:
-    """Damped Newton steps towards a placement of the flange.
+    """Build the function of damped Newton steps towards a placement of the flange.
 
     Inputs: q (n,) [rad, or m where a joint slides]; rotation (3, 3) and position (3,) wanted of the
     flange in the root. Outputs: reached (n,), joints before the last step; residual, the pose
@@ -188,7 +188,7 @@ def inverse_kinematics(
     redundant: Mapping[int, float] = MappingProxyType({}),
     approach: Approach | None = None,
 ) -> Array:
-    """All joint positions found for a flange pose, full turns of a joint counted once.
+    """Find the joint positions of a flange pose, full turns of a joint counted once.
 
     Args:
         T_root_flange: (4, 4) wanted flange placement in the robot's root frame.
@@ -226,13 +226,14 @@ def inverse_kinematics(
 
 
 def _spread(count: int) -> Array:
-    """(count, 6) points that fill the unit cube evenly, the same on every machine."""
+    """Return points (count, 6) that fill the unit cube evenly, the same on every machine."""
     steps = 1.0 / np.cumprod(np.full(6, SPREAD_ROOT))
     return np.asarray((0.5 + np.arange(count)[:, None] * steps) % 1.0)
 
 
 def _distinct(q: Array) -> Array:
-    """Rows that differ from all earlier ones by more than rounding, full turns apart ignored."""
+    """Return the rows that differ from all earlier ones by more than rounding, modulo full
+    turns."""
     kept = []
     while len(q):
         kept.append(q[0])
@@ -242,8 +243,8 @@ def _distinct(q: Array) -> Array:
 
 
 def _central_turns(robot: Robot, model: RobotModel, least: Array, greatest: Array) -> Array:
-    """Full turns [rad] that move a joint range nearest to the middle of the joint's limits; none of
-    joints that slide and of redundant ones."""
+    """Compute the full turns [rad] that move each joint range nearest to the middle of the joint's
+    limits; zero for prismatic and redundant joints."""
     middle = (robot.position_lower + robot.position_upper) / 2.0
     free = [turns and k in model.following for k, turns in enumerate(model.turning)]
     turns = np.array(free) * np.round((middle - (least + greatest) / 2.0) / (2.0 * np.pi))
@@ -253,7 +254,7 @@ def _central_turns(robot: Robot, model: RobotModel, least: Array, greatest: Arra
 def start_branches(
     workcell: Workcell, arm: int, model: RobotModel, search: ArmSearch | None = None
 ) -> tuple[StartBranch, ...]:
-    """All branches of one arm at the first waypoint, best first (see `StartBranch.rank`).
+    """Return all branches of one arm at the first waypoint, best first (see `StartBranch.rank`).
 
     Each branch is followed along the hand-made initial trajectory; a joint that may turn more
     than once starts on the turn that keeps it farthest from its limits there.
@@ -306,7 +307,7 @@ def start_branches(
 
 
 def start_flange(workcell: Workcell, robot: Robot, contact: Contact) -> Array:
-    """T_root_flange (4, 4) of an arm that holds the box at the first waypoint."""
+    """Compute T_root_flange (4, 4) of an arm that holds the box at the first waypoint."""
     start = workcell.task.waypoints[0].lower
     T_world_box = box_placement(workcell.task.orientation, start)
     return inverse(robot.T_world_base) @ T_world_box @ box_flange(robot, contact)

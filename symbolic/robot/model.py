@@ -68,11 +68,11 @@ class RobotModel:
 
     @cached_property
     def turning(self) -> tuple[bool, ...]:
-        """Which joints turn; the others slide."""
+        """True per revolute joint, False per prismatic one."""
         return turning_joints(self.model)
 
     def with_redundant(self, q: Expression, extended: Expression) -> Expression:
-        """Joints (n,) whose redundant ones are where the extended pose says."""
+        """Return the joints (n,) with redundant ones replaced by those of the extended pose."""
         columns = dict(self.redundant)
         if not columns:
             return q
@@ -149,6 +149,7 @@ def build_robot_model(
 
 
 def gravity_in_root(T_world_base: Array) -> Array:
-    """(3,) acceleration of gravity [m/s^2] along the axes of a base at T_world_base (4, 4)."""
+    """Compute the acceleration of gravity (3,) [m/s^2] along the axes of a base at T_world_base
+    (4, 4)."""
     gravity: Array = T_world_base[:3, :3].T @ pinocchio.Model.gravity981
     return gravity + 0.0  # no negative zeros: upright arms are alike
