@@ -32,9 +32,9 @@ from typing import Any, TypeVar
 import platformdirs
 
 from codegen.errors import CodegenError
-from symbolic import outside
+from symbolic import safe_io
 from symbolic.errors import OutsideError
-from symbolic.outside import replace_file
+from symbolic.safe_io import replace_file
 
 FORMAT = 1
 """Part of every key; rises when what is stored changes its meaning."""
@@ -44,7 +44,7 @@ _SOURCES = {".py", ".c", ".h"}
 Found = TypeVar("Found")
 
 _STALE_SECONDS = 3600.0
-_MOST_BYTES = 256 * outside.MEBIBYTE
+_MOST_BYTES = 256 * safe_io.MEBIBYTE
 
 MOST_KEPT = 4 * 2**30
 """Size from which on a cache loses what was not used for longest [bytes]."""
@@ -230,7 +230,7 @@ class Cache:
         if raw is None:
             return None
         try:
-            stored = outside.json_value(raw)
+            stored = safe_io.json_value(raw)
             facts = stored["facts"]
             intact = stored["sha256"] == digest(_canonical(facts))
         except (OutsideError, KeyError, TypeError):
@@ -420,7 +420,7 @@ class Cache:
             found = path.stat()
             if not stat.S_ISREG(found.st_mode):
                 return None
-            return outside.read_bytes(path, _MOST_BYTES, partial(_require_own, path))
+            return safe_io.read_bytes(path, _MOST_BYTES, partial(_require_own, path))
         except FileNotFoundError:
             return None
         except OSError as error:

@@ -96,7 +96,7 @@ def _require_own(package: str, member: str) -> None:
         )
 
 
-_require_own("symbolic", "outside")
+_require_own("symbolic", "safe_io")
 _require_own("codegen", "compiled")
 
 _HOMES = {

@@ -26,7 +26,7 @@ from hybrid_opt.progress import ShowProgress, counted
 from symbolic.array import Array
 from symbolic.errors import SettingsError, WorkcellError
 from symbolic.functions import CONSTRAINTS
-from symbolic.records import SEARCHED, TimeLaw
+from symbolic.records import SEARCHED_BRANCH, TimeLaw
 
 SAMPLED = 32
 """Random candidates of which a pair has to hold one, where it does not hold the hand-made
@@ -176,7 +176,7 @@ def search_branches(
         raise SettingsError("start branches compete by the hypervolume of two objectives")
     model, wanted = cell.compiled.model, cell.workcell.start_branch
     choices = [
-        range(len(found)) if branch == SEARCHED else (max(branch, 0),)
+        range(len(found)) if branch == SEARCHED_BRANCH else (max(branch, 0),)
         for found, branch in zip(model.branches, wanted, strict=True)
     ]
     tried = np.vstack([cell.initial, cell.random(SAMPLED, rng)])

@@ -202,19 +202,19 @@ class Carry(Displayable):
     @property
     def q(self) -> Array:
         """(n, all joints) both arms' joint positions side by side [rad]."""
-        return self.side_by_side("q")
+        return self.stack_arms("q")
 
     @property
     def contact_torque(self) -> Array:
         """(n, all joints) joint torques of the contact wrenches, both arms side by side [N m]."""
-        return self.side_by_side("contact_torque")
+        return self.stack_arms("contact_torque")
 
     @property
     def torque(self) -> Array:
         """(n, all joints) whole joint torques, both arms side by side [N m]."""
-        return self.side_by_side("torque")
+        return self.stack_arms("torque")
 
-    def side_by_side(self, name: str) -> Array:
+    def stack_arms(self, name: str) -> Array:
         """(n, all joints) a quantity of `ArmMotion` with the second arm's joints after the
         first's."""
         return np.concatenate([getattr(arm, name) for arm in self.arms], axis=1)

@@ -30,7 +30,7 @@ from hybrid_opt.static_hold import StaticHold, require_hold, static_hold, unheld
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.geometry.pairs import CellGeometry
-from symbolic.path.pieces import same_paths, stated
+from symbolic.path.pieces import coarse_task, resample_decisions
 from symbolic.read.cell import changed, load
 from symbolic.read.cell_files import CellFiles, collect_cell, drivable_files, unpack_cell
 from symbolic.records import Workcell
@@ -278,9 +278,9 @@ class Cell:
     def random(self, count: int, rng: np.random.Generator) -> Array:
         """(count, n_var) decision vectors drawn uniformly from within the bounds of the waypoints
         that the file states."""
-        task, drawn = self.workcell.task, stated(self.workcell.task)
+        task, drawn = self.workcell.task, coarse_task(self.workcell.task)
         x = rng.uniform(drawn.lower, drawn.upper, (count, drawn.n_var))
-        return same_paths(x, drawn, task)
+        return resample_decisions(x, drawn, task)
 
     def carry(self, x: Array) -> Carry:
         """One decision vector (n_var,) in detail, with its verdict, under the task's time law.

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
     from symbolic.cell_model import CellBodies, CellModel
     from symbolic.geometry.pairs import CellGeometry
-    from symbolic.numbers import CellNumbers, WorkcellNumbers
+    from symbolic.parameters import CellParameters, WorkcellParameters
     from symbolic.robot.branches import ArmSearch
 
 Loaded = TypeVar("Loaded")
@@ -143,12 +143,12 @@ class CompiledCell:
         return self.bodies.geometry
 
     @cached_property
-    def numbers(self) -> CellNumbers:
+    def numbers(self) -> CellParameters:
         """What of the cell is a number, and what is structure."""
-        from symbolic.numbers import CellNumbers
+        from symbolic.parameters import CellParameters
 
         bodies = self.bodies
-        return CellNumbers(self.workcell, bodies.screen, bodies.robots)
+        return CellParameters(self.workcell, bodies.screen, bodies.robots)
 
     @cached_property
     def symbols(self) -> CellModel:
@@ -165,7 +165,7 @@ class CompiledCell:
         if self._given is not None or "model" in vars(self):
             return self.model.start
         # Found by a search, which does not know what is held: kept.
-        from symbolic.numbers import HELD, SQUEEZES
+        from symbolic.parameters import HELD, SQUEEZES
 
         cache, task = self.cache or Cache(), self.workcell.task
         names = [name for name in self.numbers.sizes if name not in (HELD, *SQUEEZES)]
@@ -188,8 +188,8 @@ class CompiledCell:
         return self.once(key, find)
 
     def vector(self, group: str) -> Array:
-        """The numbers (n,) of a group, see `symbolic.numbers`."""
-        from symbolic.numbers import START
+        """The numbers (n,) of a group, see `symbolic.parameters`."""
+        from symbolic.parameters import START
 
         return np.concatenate(self.start) if group == START else self.numbers.vector(group)
 
@@ -242,7 +242,7 @@ class CompiledCell:
 
     def bound(self, function: NumericFunction) -> NumericFunction:
         """A function with this cell's numbers for its last inputs."""
-        from symbolic.numbers import GROUPS
+        from symbolic.parameters import GROUPS
 
         return function.bound(
             {name: self.vector(name) for name in function.input_names if name in GROUPS}
@@ -303,16 +303,16 @@ def kept_per_workcell(build: Callable[[Workcell], Loaded]) -> Callable[[Workcell
     return built
 
 
-def _numbers(workcell: Workcell) -> WorkcellNumbers:
-    from symbolic.numbers import WorkcellNumbers
+def _numbers(workcell: Workcell) -> WorkcellParameters:
+    from symbolic.parameters import WorkcellParameters
 
-    return WorkcellNumbers(workcell)
+    return WorkcellParameters(workcell)
 
 
 _held_numbers = kept_per_workcell(_numbers)
 
 
-def bound_to(function: NumericFunction, numbers: WorkcellNumbers) -> NumericFunction:
+def bound_to(function: NumericFunction, numbers: WorkcellParameters) -> NumericFunction:
     """A function with a cell's numbers, but for start postures, for its last inputs."""
     names = [name for name in function.input_names if name in numbers.sizes]
     return function.bound({name: numbers.vector(name) for name in names})

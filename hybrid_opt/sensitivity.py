@@ -29,10 +29,10 @@ from hybrid_opt.timing.limits import limit_ratios
 from hybrid_opt.timing.model import TimingModel
 from hybrid_opt.timing.records import Timing
 from hybrid_opt.timing.robustness import TimingSensitivity
-from symbolic import outside
+from symbolic import safe_io
 from symbolic.array import Array
 from symbolic.errors import SettingsError, WorkcellError
-from symbolic.numbers import WorkcellNumbers
+from symbolic.parameters import WorkcellParameters
 from symbolic.path.spline import path_basis, sample_basis
 from symbolic.path.time_law import timed_path
 from symbolic.read.cell import changed
@@ -302,7 +302,7 @@ class _Fastest:
             raise SettingsError(f"there is no timing: {timing.reason}")
         self.carry, self._limits = timing.carry, timing.limits
         self._compiled = CompiledCell(self.carry.workcell)
-        self._digest = WorkcellNumbers(self.carry.workcell).digest
+        self._digest = WorkcellParameters(self.carry.workcell).digest
         self._near = TimingSensitivity(TimingModel(self._compiled), timing)
 
     def moved_by(self, number: _Number) -> bool:
@@ -313,7 +313,7 @@ class _Fastest:
         """See `_Law`: as of upright bases that are tilted, and of pads anywhere that move."""
         if number.is_limit or not self.moved_by(number):
             return False
-        return WorkcellNumbers(workcell).digest != self._digest
+        return WorkcellParameters(workcell).digest != self._digest
 
     def durations(self, number: _Number, low: Workcell, high: Workcell) -> tuple[float, float]:
         """See `_Law`."""
@@ -341,8 +341,8 @@ class _Fastest:
 
 def _numbers(workcell: Workcell) -> Iterator[_Number]:
     """All that are told of, as the file states them, or else with what they are then."""
-    text = workcell.text or outside.read_bytes(workcell.source, outside.WORKCELL_BYTES)
-    data = outside.toml_tables(text)
+    text = workcell.text or safe_io.read_bytes(workcell.source, safe_io.WORKCELL_BYTES)
+    data = safe_io.toml_tables(text)
     yield from _of(data["payload"], "payload", PAYLOAD, workcell.payload)
     for i, table in enumerate(data["contacts"]):
         yield from _of(table, f"contacts[{i}]", CONTACT)

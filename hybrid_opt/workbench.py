@@ -26,7 +26,7 @@ from hybrid_opt.robust.squeeze import Squeeze, SqueezeSettings, commanded_forces
 from hybrid_opt.timing.records import TimingLimits
 from symbolic.array import Array
 from symbolic.errors import DualArmError, WorkcellError
-from symbolic.path.pieces import same_paths, stated
+from symbolic.path.pieces import coarse_task, resample_decisions
 from symbolic.read.cell_files import collect_cell, unpack_cell
 from symbolic.records import POSE_SIZE, Workcell
 from symbolic.records.poses import box_placement, inverse, rpy_from_rotation, transform
@@ -164,8 +164,8 @@ class Session:
         folder = Path(folder)
         if folder.exists() and any(folder.iterdir()):
             raise ResultsError(f"{folder}: is not empty; save the cell into a folder of its own")
-        task = stated(self.base.workcell.task)
-        (x,) = same_paths(self.x, self.cell.workcell.task, task)
+        task = coarse_task(self.base.workcell.task)
+        (x,) = resample_decisions(self.x, self.cell.workcell.task, task)
         poses = x[: task.n_box].reshape(-1, POSE_SIZE)
         cell = self.base.changed(self.changes | {"task.initial": poses.tolist()})
         return unpack_cell(collect_cell(cell.workcell), folder).source

@@ -16,7 +16,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, TypeVar
 
-from symbolic import outside
+from symbolic import safe_io
 from symbolic.errors import OutsideError, SettingsError, WorkcellError
 from symbolic.records.problems import suggestion
 
@@ -103,7 +103,7 @@ def _kind_of(path: Path) -> str:
             head = file.read(_HEAD_BYTES)
             if head.lstrip()[:1] == b"{":
                 return TRAJECTORY if _FORMAT.search(head) else ""
-            return WORKCELL if _SECTION.search(head + file.read(outside.WORKCELL_BYTES)) else ""
+            return WORKCELL if _SECTION.search(head + file.read(safe_io.WORKCELL_BYTES)) else ""
     except OSError:
         return ""
 
@@ -111,7 +111,7 @@ def _kind_of(path: Path) -> str:
 def _require_file(path: Path, kind: str = "") -> None:
     """Refuse what cannot be read as a file, or is recognised as something other than `kind`."""
     try:
-        outside.require(path, outside.MOST_BYTES)
+        safe_io.require(path, safe_io.MOST_BYTES)
     except OutsideError as error:
         raise SettingsError(f"{path}: {error}{_expected(path, kind)}") from error
     found = _kind_of(path)
@@ -136,7 +136,7 @@ def _expected(path: Path, kind: str) -> str:
 def _require_workcell(path: Path) -> None:
     _require_file(path, WORKCELL)
     try:
-        outside.toml_tables(outside.read_bytes(path, outside.WORKCELL_BYTES))
+        safe_io.toml_tables(safe_io.read_bytes(path, safe_io.WORKCELL_BYTES))
     except OutsideError as error:
         raise WorkcellError(str(path), (f"file: {error}",)) from error
 

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from studies.options import PathType, check_paths
-from symbolic import outside
+from symbolic import safe_io
 from symbolic.errors import DualArmError, DualArmWarning, OutsideError, WorkcellError
 from symbolic.records.problems import suggestion
 
@@ -185,8 +185,8 @@ def load_workcell(path: Path) -> Workcell:
         return load(path)
     except WorkcellError as error:
         with suppress(OutsideError):
-            content = outside.read_bytes(outside.resolved(path), outside.WORKCELL_BYTES)
-            task = outside.toml_tables(content).get("task")
+            content = safe_io.read_bytes(safe_io.resolved(path), safe_io.WORKCELL_BYTES)
+            task = safe_io.toml_tables(content).get("task")
             if isinstance(task, dict) and task.keys().isdisjoint({"waypoints", "initial"}):
                 raise DualArmError(
                     f"{error}\nIt has no carry yet; a workcell with one is made of such a problem "

@@ -16,12 +16,12 @@ from typing import TYPE_CHECKING, Any
 
 from studies.options import INPUT_FILE
 from studies.program import FAULT, Parser, Program
-from symbolic import outside
+from symbolic import safe_io
 from symbolic.errors import OutsideError, SceneError
-from symbolic.outside import replace_file
+from symbolic.safe_io import replace_file
 
 if TYPE_CHECKING:
-    from symbolic.read.scene_bodies import Scene
+    from symbolic.read.scene_bodies import ImportedScene
 
 
 def _add_options(parser: Parser) -> None:
@@ -60,12 +60,12 @@ def add_scene(options: argparse.Namespace) -> int:
     return FAULT if scene.left_out else 0
 
 
-def _add(scene: Scene, path: Path) -> None:
+def _add(scene: ImportedScene, path: Path) -> None:
     from symbolic.read.editing import extended
 
     try:
-        content = outside.read_bytes(path, outside.WORKCELL_BYTES)
-        data = outside.toml_tables(content)
+        content = safe_io.read_bytes(path, safe_io.WORKCELL_BYTES)
+        data = safe_io.toml_tables(content)
     except OutsideError as error:
         raise SceneError(f"{path}: {error}") from error
     meshes = path.absolute().with_name(f"{path.stem}-meshes")

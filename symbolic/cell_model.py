@@ -15,7 +15,7 @@ from symbolic.geometry.clearance import screening_functions
 from symbolic.geometry.pairs import CellGeometry, build_geometry
 from symbolic.geometry.screen import Screen, screen_of
 from symbolic.records import Workcell
-from symbolic.records.numbered import Group
+from symbolic.records.numbered import ParameterGroup
 from symbolic.robot.branches import (
     ArmSearch,
     Clearance,
@@ -64,7 +64,7 @@ class CellModel(CellBodies):
 
     branches: tuple[tuple[StartBranch, ...], tuple[StartBranch, ...]]
     start: tuple[Array, Array]
-    given: Group | None = None
+    given: ParameterGroup | None = None
 
 
 def build_cell_bodies(workcell: Workcell) -> CellBodies:

@@ -37,16 +37,16 @@ def number(value: Any) -> Any:
     return value if isinstance(value, ca.SX | ca.MX) else ca.DM(value)
 
 
-def sx_given(*records: Any) -> dict[str, ca.SX]:
+def sx_parameters(*records: Any) -> dict[str, ca.SX]:
     """Return the parameter groups of some records by input name, each once; empty for plain
     records."""
     groups = (group for record in records if (group := getattr(record, "given", None)) is not None)
     return {group.name: group.symbols for group in groups}
 
 
-def mx_given(*records: Any) -> dict[str, ca.MX]:
+def mx_parameters(*records: Any) -> dict[str, ca.MX]:
     """Return the same groups as new MX symbols, for functions that only pass them on."""
-    return mx_symbols(sx_given(*records))
+    return mx_symbols(sx_parameters(*records))
 
 
 def mx_symbols(given: Mapping[str, ca.SX]) -> dict[str, ca.MX]:
@@ -54,9 +54,9 @@ def mx_symbols(given: Mapping[str, ca.SX]) -> dict[str, ca.MX]:
     return {name: ca.MX.sym(name, symbols.numel()) for name, symbols in given.items()}
 
 
-def of(handed: Mapping[str, ca.MX], *records: Any) -> dict[str, ca.MX]:
+def select_parameters(handed: Mapping[str, ca.MX], *records: Any) -> dict[str, ca.MX]:
     """Select the symbols of `mx_parameters` that belong to some records."""
-    return {name: handed[name] for name in sx_given(*records)}
+    return {name: handed[name] for name in sx_parameters(*records)}
 
 
 def as_mx(value: ca.SX, given: Mapping[str, ca.SX], handed: Mapping[str, ca.MX]) -> ca.MX:
@@ -67,6 +67,6 @@ def as_mx(value: ca.SX, given: Mapping[str, ca.SX], handed: Mapping[str, ca.MX])
     return ca.Function("numbers", list(given.values()), [value])(*handed.values())
 
 
-def repeated(given: Mapping[str, ca.MX], n: int) -> list[ca.MX]:
+def tile(given: Mapping[str, ca.MX], n: int) -> list[ca.MX]:
     """Repeat parameters once per column, as `casadi.Function.map` takes them."""
     return [ca.repmat(symbols, 1, n) for symbols in given.values()]

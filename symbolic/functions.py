@@ -11,7 +11,13 @@ import casadi as ca
 
 from symbolic.cell_model import CellModel
 from symbolic.contact.load import LOAD_OUTPUTS, load_function, uncertain_load_function
-from symbolic.expression import mx_given, named_function, of, repeated, sx_given
+from symbolic.expression import (
+    mx_parameters,
+    named_function,
+    select_parameters,
+    sx_parameters,
+    tile,
+)
 from symbolic.geometry.screen import Screen
 from symbolic.limit_coefficients import path_force_function
 from symbolic.path.spline import extended_matrix, sample_basis, waypoint_matrix
@@ -76,14 +82,14 @@ def candidate_function(model: CellModel) -> ca.Function:
     n = workcell.task.samples
     x, basis, handed = ca.MX.sym("x", workcell.task.n_var), sample_basis(workcell.task), _all(model)
     inputs = {"x": x}
-    waypoints, own = _waypoints(workcell.task, x, handed), of(handed, workcell.task)
+    waypoints, own = _waypoints(workcell.task, x, handed), select_parameters(handed, workcell.task)
     if workcell.task.time_law == "optimal":
         inputs |= {name: ca.MX.sym(name, n) for name in DRIVE_INPUTS}
         path = driven_path(basis, waypoints, *[inputs[name].T for name in DRIVE_INPUTS])
     else:
         path = timed_path(workcell.task, basis, waypoints, handed=own)
     inputs |= handed
-    held = repeated(of(handed, workcell.payload), n)
+    held = tile(select_parameters(handed, workcell.payload), n)
     found = load_function(workcell).map(n)(path.pose, path.rate, path.second_rate, *held)
     load = dict(zip(LOAD_OUTPUTS, found, strict=True))
     outputs: dict[str, ca.MX] = {
@@ -109,18 +115,18 @@ def candidate_function(model: CellModel) -> ca.Function:
 def _all(model: CellModel) -> dict[str, ca.MX]:
     """Return the parameters of a whole candidate."""
     workcell = model.workcell
-    return mx_given(workcell.task, *workcell.robots, model, workcell.payload)
+    return mx_parameters(workcell.task, *workcell.robots, model, workcell.payload)
 
 
 def _waypoints(task: Task, x: ca.MX, handed: dict[str, ca.MX]) -> ca.MX:
-    return waypoint_matrix(task, x, of(handed, task))
+    return waypoint_matrix(task, x, select_parameters(handed, task))
 
 
 def _constraints(
     workcell: Workcell, values: dict[str, ca.MX], n: int, handed: dict[str, ca.MX]
 ) -> ca.MX:
     """Map `_constraint_function` over n samples."""
-    numbers = repeated(of(handed, *workcell.robots, workcell.payload), n)
+    numbers = tile(select_parameters(handed, *workcell.robots, workcell.payload), n)
     inputs = [values[name] for name in _CONSTRAINT_INPUTS]
     return _constraint_function(workcell).map(n)(*inputs, *numbers)
 
@@ -135,7 +141,7 @@ def motion_function(model: CellModel) -> ca.Function:
     workcell = model.workcell
     n = workcell.task.samples
     x, basis, handed = ca.MX.sym("x", workcell.task.n_var), sample_basis(workcell.task), _all(model)
-    waypoints, own = _waypoints(workcell.task, x, handed), of(handed, workcell.task)
+    waypoints, own = _waypoints(workcell.task, x, handed), select_parameters(handed, workcell.task)
     path = timed_path(workcell.task, basis, waypoints, handed=own)
     whole = extended_matrix(workcell.task, x, waypoints, own)
     pose = ca.mtimes(whole, ca.DM(basis.position.T))
@@ -213,8 +219,11 @@ def sample_functions(model: CellModel) -> dict[str, ca.Function]:
     """
     workcell = model.workcell
     x, basis, handed = ca.MX.sym("x", workcell.task.n_var), sample_basis(workcell.task), _all(model)
-    own, held = of(handed, workcell.task), of(handed, workcell.payload)
-    arms = of(handed, *workcell.robots)
+    own, held = (
+        select_parameters(handed, workcell.task),
+        select_parameters(handed, workcell.payload),
+    )
+    arms = select_parameters(handed, *workcell.robots)
     waypoints = _waypoints(workcell.task, x, handed)
     path = timed_path(workcell.task, basis, waypoints, handed=own)
     extended = extended_matrix(workcell.task, x, waypoints, own)
@@ -230,7 +239,7 @@ def sample_functions(model: CellModel) -> dict[str, ca.Function]:
     begins = [ca.MX.sym(f"begin_{i + 1}", arm.n_joints) for i, arm in enumerate(model.robots)]
     for i in (0, 1):
         arm = (workcell.robots[i], model.robots[i], workcell.contacts[i])
-        given = of(handed, workcell.robots[i]).values()
+        given = select_parameters(handed, workcell.robots[i]).values()
         starts.append(start_function(*arm, f"arm_{i + 1}_start")(begins[i], pose, *given))
         state = ca.MX.sym(f"state_{i + 1}", starts[i].shape[0])
         states.append(state)
@@ -263,9 +272,9 @@ def kernel_numbers(workcell: Workcell, screen: Screen) -> dict[str, tuple[str, .
     Args:
         workcell, screen: with numbers.
     """
-    arms, held = tuple(sx_given(*workcell.robots)), tuple(sx_given(workcell.payload))
-    bodies = tuple(sx_given(screen))
-    found = {"path": tuple(sx_given(workcell.task)), "start": arms, "predict": arms}
+    arms, held = tuple(sx_parameters(*workcell.robots)), tuple(sx_parameters(workcell.payload))
+    bodies = tuple(sx_parameters(screen))
+    found = {"path": tuple(sx_parameters(workcell.task)), "start": arms, "predict": arms}
     found |= {"sample": (*arms, *held)}
     found |= dict.fromkeys(("clearance", "far_clearance", "piece_poses"), bodies)
     return found | ({"forces": (*arms, *held)} if forces_come_last(workcell) else {})
@@ -283,13 +292,20 @@ def _forces_function(
     outputs = dict(load)
     for i, q in enumerate(joints):
         arm = (workcell.robots[i], model.robots[i], workcell.contacts[i])
-        torque, own = torque_function(*arm, f"arm_{i + 1}_torque"), of(handed, arm[0]).values()
+        torque, own = (
+            torque_function(*arm, f"arm_{i + 1}_torque"),
+            select_parameters(handed, arm[0]).values(),
+        )
         outputs[f"joint_torque_{i + 1}"] = torque(q, motion[0], load[f"wrench_{i + 1}"], *own)
     known = dict.fromkeys(_CONSTRAINT_INPUTS[:-3], ca.DM.zeros(1))
     constraint = _constraints(workcell, outputs | known, 1, handed)
     outputs["force_constraint"] = constraint[-len(FORCE_CONSTRAINTS) :]
     names = list(force_sizes(workcell))
-    given = [*motion, *joints, *of(handed, *workcell.robots, workcell.payload).values()]
+    given = [
+        *motion,
+        *joints,
+        *select_parameters(handed, *workcell.robots, workcell.payload).values(),
+    ]
     results = [outputs[name] for name in names]
     return ca.Function("forces", given, results, [v.name() for v in given], names)
 
@@ -301,7 +317,7 @@ def _track(
     n = model.workcell.task.samples
     follow = follow_function(robot, model.robots[i], contact, n, f"arm_{i + 1}")
     start = start_posture(model, i, handed)
-    results = follow(start, pose, wrench, *of(handed, robot).values())
+    results = follow(start, pose, wrench, *select_parameters(handed, robot).values())
     return dict(zip(TRACK_OUTPUTS, results, strict=True))
 
 
@@ -324,7 +340,7 @@ def _constraint_function(workcell: Workcell) -> ca.Function:
     """Build the function of constraint values (9,) of one sample from the named outputs."""
     sizes = {"normal_force": 2, "tangential_force": 2, "pressure_shift": 2}
     inputs = {name: ca.SX.sym(name, sizes.get(name, 1)) for name in _CONSTRAINT_INPUTS}
-    given = sx_given(*workcell.robots, workcell.payload)
+    given = sx_parameters(*workcell.robots, workcell.payload)
     weight = -workcell.payload.mass * GRAVITY[2]
     values: dict[str, ca.SX] = {}
     cones = []

@@ -17,7 +17,14 @@ from symbolic.contact.grasp import Grasp
 from symbolic.contact.load import ContactLoad, HeldLoad, frictions, held_by
 from symbolic.contact.soft_finger import Detached
 from symbolic.contact.soft_grasp import SoftGrasp
-from symbolic.expression import as_mx, mx_given, named_function, number, of, sx_given
+from symbolic.expression import (
+    as_mx,
+    mx_parameters,
+    named_function,
+    number,
+    select_parameters,
+    sx_parameters,
+)
 from symbolic.limits import limit_layout
 from symbolic.path.spline import path_basis, waypoint_matrix
 from symbolic.path_motion import (
@@ -58,17 +65,19 @@ def path_function(model: CellModel, samples: int) -> ca.Function:
     """
     workcell = model.workcell
     x, task = ca.MX.sym("x", workcell.task.n_path), workcell.task
-    handed = mx_given(task, *workcell.robots, model)
-    waypoints = waypoint_matrix(task, x, of(handed, task))
+    handed = mx_parameters(task, *workcell.robots, model)
+    waypoints = waypoint_matrix(task, x, select_parameters(handed, task))
     basis = path_basis(len(task.waypoints), np.linspace(0.0, 1.0, samples))
-    moved = extended_motion(task, x, basis, waypoints, of(handed, task))
+    moved = extended_motion(task, x, basis, waypoints, select_parameters(handed, task))
     outputs = dict(zip(PATH_OUTPUTS, moved, strict=False))
     no_wrench = ca.DM.zeros(6, samples)
     verdicts: dict[str, ca.MX] = {}
     for i, (robot, contact) in enumerate(zip(workcell.robots, workcell.contacts, strict=True)):
         follow = follow_function(robot, model.robots[i], contact, samples, f"limits_arm_{i + 1}")
         start = start_posture(model, i, handed)
-        results = follow(start, outputs["pose"], no_wrench, *of(handed, robot).values())
+        results = follow(
+            start, outputs["pose"], no_wrench, *select_parameters(handed, robot).values()
+        )
         tracked = dict(zip(TRACK_OUTPUTS, results, strict=True))
         outputs[f"q_{i + 1}"] = tracked["q"]
         verdicts |= {f"{name}_{i + 1}": tracked[name] for name in ARM_CHECK_OUTPUTS}
@@ -82,7 +91,7 @@ def sample_limits_function(model: CellModel) -> ca.Function:
     payload, task, layout = workcell.payload, workcell.task, limit_layout(workcell)
     given = [ca.SX.sym(name, task.extended_size) for name in ("pose", "first", "second")]
     pose, first, second = (values[:6] for values in given)
-    held = sx_given(payload).values()
+    held = sx_parameters(payload).values()
     box = dict(zip(BOX_OUTPUTS, box_function(workcell)(pose, first, second, *held), strict=True))
     rotation = ca.reshape(box["rotation"], 3, 3).T
     axes = ca.mtimes(rotation, number(workcell.contacts[0].T_box_pad[:3, :3]))
@@ -90,7 +99,7 @@ def sample_limits_function(model: CellModel) -> ca.Function:
     for i, (robot, contact) in enumerate(zip(workcell.robots, workcell.contacts, strict=True)):
         q.append(ca.SX.sym(f"q_{i + 1}", robot.velocity_max.shape[0]))
         derivatives = arm_derivative_function(robot, model.robots[i], contact, f"limits_of_{i + 1}")
-        own_numbers = sx_given(robot).values()
+        own_numbers = sx_parameters(robot).values()
         arm = dict(zip(ARM_OUTPUTS, derivatives(q[i], *given, *own_numbers), strict=True))
         torque_max = number(robot.torque_max)
         speed.append(arm["q_first"] / number(robot.velocity_max))
@@ -132,7 +141,7 @@ def sample_limits_function(model: CellModel) -> ca.Function:
 
 def limit_numbers(workcell: Workcell) -> dict[str, ca.SX]:
     """Return the parameters that `sample_limits_function` takes after its other inputs."""
-    return sx_given(workcell.task, *workcell.robots, workcell.payload)
+    return sx_parameters(workcell.task, *workcell.robots, workcell.payload)
 
 
 def _held(
@@ -165,7 +174,7 @@ def force_functions(workcell: Workcell) -> tuple[ca.Function, ca.Function]:
     sizes = limit_layout(workcell).sizes
     names = ("limit_forces", "limit_force_slopes")
     if not workcell.has_closed_form:
-        handed = mx_given(workcell.payload)
+        handed = mx_parameters(workcell.payload)
         asked = [ca.MX.sym("asked", sizes["force"] + sizes["moment"]), *map(ca.MX.sym, "aw")]
         asked += handed.values()
         load, by_timing = _load_function(workcell)(*asked)
@@ -181,7 +190,8 @@ def force_functions(workcell: Workcell) -> tuple[ca.Function, ca.Function]:
     blocks = {name: ca.SX.sym(name, sizes[name]) for name in ("force", "moment")}
     inputs, alone, sloping = _inputs(workcell, blocks), Detached(0), Detached(1)
     value, varied = (
-        _held(workcell, blocks, inputs["a"], inputs["w"], of).normal for of in (alone, sloping)
+        _held(workcell, blocks, inputs["a"], inputs["w"], select_parameters).normal
+        for select_parameters in (alone, sloping)
     )
     found = alone.replaced([ca.densify(value), alone.symbols])
     outputs = dict(zip(("value", "solved"), found, strict=True))
@@ -201,7 +211,7 @@ def _load_function(workcell: Workcell) -> ca.Function:
     about = ca.mtimes(axes, ca.mtimes(ca.reshape(asked[size:], 3, 2), timing))
     load = ca.vertcat(force, about + ca.cross(ca.SX(centre), force))
     outputs = [load, ca.densify(ca.jacobian(load, timing))]
-    inputs = [asked, timing[0], timing[1], *sx_given(payload).values()]
+    inputs = [asked, timing[0], timing[1], *sx_parameters(payload).values()]
     return ca.Function("load", inputs, ca.cse(outputs))
 
 
@@ -209,11 +219,11 @@ def path_force_function(workcell: Workcell) -> ca.Function:
     """Return box pose and its derivatives by u (6,), u'' and u'^2 -> normal_force (2,) [N] and
     slope (2, 2), of each force by u'' and by u'^2."""
     closed, payload = workcell.has_closed_form, workcell.payload
-    kind, given = (ca.SX, sx_given) if closed else (ca.MX, mx_given)
+    kind, given = (ca.SX, sx_parameters) if closed else (ca.MX, mx_parameters)
     numbers: dict[str, Any] = dict(given(payload))
     own = [ca.SX(number(workcell.contacts[0].T_box_pad[:3, :3])), ca.DM(GRAVITY) * payload.mass]
     if not closed:
-        own = [as_mx(ca.SX(value), sx_given(payload), numbers) for value in own]
+        own = [as_mx(ca.SX(value), sx_parameters(payload), numbers) for value in own]
     path = {name: kind.sym(name, 6) for name in ("pose", "first", "second")}
     a, w = kind.sym("a"), kind.sym("w")
     moved = box_function(workcell)(*path.values(), *numbers.values())
@@ -248,7 +258,10 @@ def ratio_functions(workcell: Workcell) -> tuple[ca.Function, ca.Function]:
     blocks = {name: ca.SX.sym(name, sizes[name]) for name in names}
     inputs, alone, sloping = _inputs(workcell, blocks), Detached(0), Detached(1)
     timing = inputs["a"], inputs["w"]
-    value, varied = (contact_limits(workcell, blocks, timing, of)[0] for of in (alone, sloping))
+    value, varied = (
+        contact_limits(workcell, blocks, timing, select_parameters)[0]
+        for select_parameters in (alone, sloping)
+    )
     whole = inputs | {"solved": alone.symbols}
     return (
         named_function("limit_ratios", whole, {"value": ca.densify(value)}),
@@ -302,7 +315,7 @@ def _program_ratios(workcell: Workcell) -> tuple[ca.Function, ca.Function]:
     own, by_wrench = ca.reshape(torque, joints, 3), ca.reshape(wrench, 6, joints).T
     # Each arm's joints feel its own wrench.
     first, grasp = workcell.robots[0].velocity_max.shape[0], Grasp(workcell)
-    handed = mx_given(workcell.payload)
+    handed = mx_parameters(workcell.payload)
     given = list(handed.values())
     felt = as_mx(ca.SX(number(grasp.numbers.to_robots)), grasp.given, handed)
     # The pads of the first robot come first.
@@ -331,7 +344,7 @@ def _program_ratios(workcell: Workcell) -> tuple[ca.Function, ca.Function]:
 def _inputs(workcell: Workcell, blocks: dict[str, ca.SX]) -> dict[str, ca.SX]:
     """Return the inputs of `limit_forces`, from blocks of a sample."""
     timing = {name: ca.SX.sym(name) for name in ("a", "w")}
-    return {"sample": ca.vertcat(*blocks.values())} | timing | sx_given(workcell.payload)
+    return {"sample": ca.vertcat(*blocks.values())} | timing | sx_parameters(workcell.payload)
 
 
 def _slopes(name: str, value: ca.SX, inputs: dict[str, ca.SX], detached: Detached) -> ca.Function:

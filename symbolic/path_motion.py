@@ -13,7 +13,15 @@ import numpy as np
 
 from symbolic.cell_model import CellModel
 from symbolic.contact.paper import required_moment
-from symbolic.expression import as_mx, mx_given, named_function, number, of, repeated, sx_given
+from symbolic.expression import (
+    as_mx,
+    mx_parameters,
+    named_function,
+    number,
+    select_parameters,
+    sx_parameters,
+    tile,
+)
 from symbolic.path.rotation import angular_acceleration, angular_velocity, rotation_matrix
 from symbolic.path.spline import (
     NONE,
@@ -77,29 +85,29 @@ def path_motion_function(model: CellModel, samples: int) -> ca.Function:
     """
     workcell = model.workcell
     x, task = ca.MX.sym("x", workcell.task.n_var), workcell.task
-    handed = mx_given(task, *workcell.robots, model, workcell.payload)
-    waypoints = waypoint_matrix(task, x, of(handed, task))
+    handed = mx_parameters(task, *workcell.robots, model, workcell.payload)
+    waypoints = waypoint_matrix(task, x, select_parameters(handed, task))
     basis = path_basis(len(task.waypoints), np.linspace(0.0, 1.0, samples))
     pose, first, second = (
         ca.mtimes(waypoints, ca.DM(matrix.T))
         for matrix in (basis.position, basis.first, basis.second)
     )
     outputs = {"pose": pose, "pose_first": first, "pose_second": second}
-    held = repeated(of(handed, workcell.payload), samples)
+    held = tile(select_parameters(handed, workcell.payload), samples)
     box = box_function(workcell).map(samples)(pose, first, second, *held)
     outputs |= dict(zip(BOX_OUTPUTS, box, strict=True))
     no_wrench = ca.DM.zeros(6, samples)
-    moved = extended_motion(task, x, basis, waypoints, of(handed, task))
+    moved = extended_motion(task, x, basis, waypoints, select_parameters(handed, task))
     for i in (0, 1):
         robot, contact = workcell.robots[i], workcell.contacts[i]
         follow = follow_function(robot, model.robots[i], contact, samples, f"path_arm_{i + 1}")
-        given = of(handed, robot)
+        given = select_parameters(handed, robot)
         start = start_posture(model, i, handed)
         found = follow(start, moved[0], no_wrench, *given.values())
         tracked = dict(zip(TRACK_OUTPUTS, found, strict=True))
         del tracked["joint_torque"]
         arm = arm_derivative_function(robot, model.robots[i], contact, f"path_derivatives_{i + 1}")
-        derivatives = arm.map(samples)(tracked["q"], *moved, *repeated(given, samples))
+        derivatives = arm.map(samples)(tracked["q"], *moved, *tile(given, samples))
         derived = dict(zip(ARM_OUTPUTS, derivatives, strict=True))
         outputs |= {f"{name}_{i + 1}": value for name, value in (tracked | derived).items()}
     return named_function("path_motion", {"x": x} | handed, outputs)
@@ -108,7 +116,11 @@ def path_motion_function(model: CellModel, samples: int) -> ca.Function:
 def start_posture(model: CellModel, arm: int, handed: Handed) -> ca.MX:
     """Return the joints (n,) of an arm at the start of the path."""
     start = model.start[arm]
-    return as_mx(start, sx_given(model), of(handed, model)) if handed else ca.MX(ca.DM(start))
+    return (
+        as_mx(start, sx_parameters(model), select_parameters(handed, model))
+        if handed
+        else ca.MX(ca.DM(start))
+    )
 
 
 def extended_motion(
@@ -148,7 +160,7 @@ def box_function(workcell: Workcell) -> ca.Function:
         "moment_by_acceleration": required_moment(inertia, rotation, ca.SX.zeros(3), omega),
         "moment_by_speed": required_moment(inertia, rotation, omega, alpha),
     }
-    inputs = [pose, first, second, *sx_given(payload).values()]
+    inputs = [pose, first, second, *sx_parameters(payload).values()]
     return ca.Function("path_box", inputs, [ca.densify(outputs[name]) for name in BOX_OUTPUTS])
 
 
@@ -202,5 +214,5 @@ def arm_derivative_function(
         "torque_at_rest": at_rest,
         "wrench_torque": ca.vec(ca.jacobian(torque, wrench).T),
     }
-    inputs = {"q": q} | dict(zip(names, given, strict=True)) | sx_given(robot)
+    inputs = {"q": q} | dict(zip(names, given, strict=True)) | sx_parameters(robot)
     return named_function(name, inputs, {k: ca.densify(outputs[k]) for k in ARM_OUTPUTS})

@@ -48,8 +48,8 @@ from hybrid_opt.robust.squeeze import PADS
 from hybrid_opt.store.files import AGAIN, own_version, read_bytes, read_document, sha256, storing
 from hybrid_opt.timing.records import Timing
 from symbolic.errors import SettingsError
-from symbolic.outside import replace_file, sync_folder
 from symbolic.records import Workcell
+from symbolic.safe_io import replace_file, sync_folder
 
 UNITS = {
     "length": "m",

@@ -235,7 +235,9 @@ def stop_of(job: Job) -> Stop:
         r, change = (np.tile(each, len(places))[:, None] for each in (rate, slope))
         at = {name: interpolated(s, time, values) for name, values in columns.items()}
         second = at["q_second"] * r**2 + at["q_rate"] * change
-        joint_use = float((np.abs(second) / job.workcell.of_joints("acceleration_max")).max())
+        joint_use = float(
+            (np.abs(second) / job.workcell.stack_joint_limits("acceleration_max")).max()
+        )
         # Between two samples of phases that hold the box, pads alone hold it.
         alone = np.interp(s, time, held) == 1.0
         box = (at["pose"], at["rate"] * r, at["second_rate"] * r**2 + at["rate"] * change)

@@ -122,7 +122,7 @@ def require_torque(job: Job) -> None:
 
 def joint_stiffness(job: Job) -> Array:
     """Return the proportional gains (joints,) of both arms [N m/rad, N/m]."""
-    largest = job.workcell.of_joints("torque_max")
+    largest = job.workcell.stack_joint_limits("torque_max")
     return np.minimum(GAIN * largest, FASTEST**2 * joint_inertia(job))
 
 

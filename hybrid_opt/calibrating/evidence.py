@@ -29,7 +29,7 @@ from hybrid_opt.calibrating.faults import (
 from hybrid_opt.calibrating.recording import Places, Run, places_of, tared
 from hybrid_opt.display.table import number, text_table
 from hybrid_opt.proposing.problem import Problem
-from symbolic import outside
+from symbolic import safe_io
 from symbolic.array import Array
 from symbolic.errors import OutsideError, SettingsError, WorkcellError
 from symbolic.read.cell import load as load_cell
@@ -402,8 +402,8 @@ def calibrated_file(source: Path, evidence: Evidence, output: Path) -> str:
         SettingsError: the file is written in a way that cannot be completed.
     """
     try:
-        text = outside.text(outside.read_bytes(source, outside.WORKCELL_BYTES))
-        data = outside.toml_tables(text.encode())
+        text = safe_io.text(safe_io.read_bytes(source, safe_io.WORKCELL_BYTES))
+        data = safe_io.toml_tables(text.encode())
     except OutsideError as error:
         raise WorkcellError(str(source), (f"file: {error}",)) from error
     load_cell(source, text=completed(text, data, evidence.changes).encode())

@@ -21,11 +21,11 @@ from hybrid_opt.bundles.arms import prefixes
 from hybrid_opt.bundles.job_file import pad_places
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.store.files import read_bytes
-from symbolic import outside
+from symbolic import safe_io
 from symbolic.array import Array, Range, interpolated
 from symbolic.errors import OutsideError, WorkcellError
 from symbolic.read.arms import arm_model
-from symbolic.read.tables import Table
+from symbolic.read.tables import TableReader
 from symbolic.records import Workcell
 from symbolic.records import quantities as quantity
 from symbolic.records.poses import inverse, skew
@@ -197,12 +197,12 @@ def read_run(path: Path, workcell: Workcell) -> Run:
     """
     side = path.with_suffix(".toml")
     try:
-        data = outside.toml_tables(outside.read_bytes(outside.resolved(side), 2**20))
+        data = safe_io.toml_tables(safe_io.read_bytes(safe_io.resolved(side), 2**20))
     except OutsideError as error:
         told = f"a recording's side file: {error}; docs/how-to/calibration.md explains it"
         raise WorkcellError(str(side), (told,)) from error
     problems = Problems()
-    table = Table(data, "", problems)
+    table = TableReader(data, "", problems)
     frame = table.choice("frame", FRAMES, "flange")
     largest = None
     if table.has("sensor_range"):
@@ -223,7 +223,7 @@ def read_run(path: Path, workcell: Workcell) -> Run:
     return together(path.name, (recorded[0], recorded[1]), labels, frame, largest)
 
 
-def _read_arm(table: Table, path: Path, workcell: Workcell, arm: int) -> ArmLog:
+def _read_arm(table: TableReader, path: Path, workcell: Workcell, arm: int) -> ArmLog:
     """What one arm recorded, by the columns that the side file names."""
     file = path.parent / table.text("file") if table.has("file") else path
     names = list(arm_model(workcell.robots[arm]).names)[1:]
@@ -265,7 +265,7 @@ def _read_arm(table: Table, path: Path, workcell: Workcell, arm: int) -> ArmLog:
     return ArmLog(time[sound], joints[sound], wrench[sound], commanded[sound], lost)
 
 
-def _read_bag(table: Table, file: Path, names: list[str]) -> ArmLog:
+def _read_bag(table: TableReader, file: Path, names: list[str]) -> ArmLog:
     """What one arm recorded in ROS 2, at the times of its joint states."""
     if table.has("joints"):
         value = table.raw("joints")
@@ -300,7 +300,7 @@ def _read_bag(table: Table, file: Path, names: list[str]) -> ArmLog:
 def _csv_columns(path: Path) -> dict[str, Array]:
     """Columns by name; commas, semicolons or blanks between them, what is empty is not finite."""
     try:
-        text = outside.text(read_bytes(path))
+        text = safe_io.text(read_bytes(path))
         dialect = csv.Sniffer().sniff(text.partition("\n")[0], ",; \t")
         header, *rows = [row for row in csv.reader(io.StringIO(text), dialect) if row]
         values = np.array([[float(word or "nan") for word in row] for row in rows])

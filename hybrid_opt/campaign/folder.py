@@ -39,10 +39,10 @@ from hybrid_opt.store.files import (
 from hybrid_opt.workers import LocalWorkers, Workers
 from symbolic.array import Range, require_allowed
 from symbolic.errors import SettingsError
-from symbolic.outside import sync_folder
 from symbolic.read.cell import load
 from symbolic.read.cell_files import CellFiles, collect_cell, unpack_cell
 from symbolic.records import Workcell
+from symbolic.safe_io import sync_folder
 
 ExecutorName = Literal["processes", "dask"]
 

@@ -53,7 +53,7 @@ from hybrid_opt.workers import one_thread
 from symbolic.errors import DualArmError
 from symbolic.read.cell import load
 from symbolic.read.cell_files import CellFiles, drivable_files, unpack_cell
-from symbolic.records import SEARCHED, Workcell
+from symbolic.records import SEARCHED_BRANCH, Workcell
 
 
 @dataclass(frozen=True)
@@ -197,7 +197,7 @@ def decided_cell(
     Raises:
         DualArmError: no pair of branches holds any trajectory, or the stored decision is damaged.
     """
-    if SEARCHED not in workcell.start_branch:
+    if SEARCHED_BRANCH not in workcell.start_branch:
         return workcell, None
     competition = read_branches(execution.output) if execution.resume else None
     if competition is None:
@@ -416,7 +416,9 @@ def _makers(cell: Cell, polish: bool) -> Iterator[Maker]:
 
     compiled, workcell = cell.compiled, cell.workcell
     driven = workcell.task.time_law == "optimal"
-    known = is_polishable(workcell, cell.force_kind.robust) if driven else workcell.has_one_squeeze
+    known = (
+        is_polishable(workcell, cell.force_kind.robust) if driven else workcell.has_scalar_squeeze
+    )
     yield lambda: cell.evaluator
     if polish and known:
         yield lambda: cell.polish_functions

@@ -18,7 +18,7 @@ from hybrid_opt.collision.distances import INTERSECTING, OPEN, BodyDistances
 from hybrid_opt.collision.judge import FCL_RESOLUTION, Judge
 from symbolic.array import Array
 from symbolic.geometry.pairs import CellGeometry
-from symbolic.records import PAYLOAD
+from symbolic.records import PAYLOAD_NAME
 
 
 @dataclass(frozen=True)
@@ -310,7 +310,7 @@ class CollisionChecker:
         found = []
         zero = np.zeros(1, dtype=np.intp)
         for allowed in task.allowed_contacts:
-            pair = pairs.get((PAYLOAD, allowed.body))
+            pair = pairs.get((PAYLOAD_NAME, allowed.body))
             if pair is None:
                 continue
             for waypoint in task.waypoints:

@@ -22,7 +22,7 @@ from symbolic.errors import BridgeError
 from symbolic.geometry.bodies import BOX, CollisionBody
 from symbolic.geometry.pairs import CellGeometry
 from symbolic.geometry.pieces import ConvexShape, Hull, shrunk
-from symbolic.records import PAYLOAD, Box, Capsule, Cylinder, Sphere
+from symbolic.records import PAYLOAD_NAME, Box, Capsule, Cylinder, Sphere
 from symbolic.robot.bridge import REMEDY, require_same_minor
 
 INTERSECTING, OPEN, APART = -1, 0, 1
@@ -66,7 +66,7 @@ class BodyDistances:
         Args:
             resting_tolerance: by how much the smaller payload is smaller on every side [m].
         """
-        payload = geometry.index(PAYLOAD)
+        payload = geometry.index(PAYLOAD_NAME)
         smaller = tuple(shrunk(p, resting_tolerance) for p in geometry.bodies[payload].pieces)
         resting = CollisionBody("shrunk payload", "payload", BOX, smaller)
         self.bodies = (*geometry.bodies, resting)

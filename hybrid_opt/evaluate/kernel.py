@@ -349,7 +349,7 @@ def _definitions(geometry: CellGeometry) -> str:
 
 def _groups(compiled: CompiledCell) -> list[str]:
     """The groups of numbers that the kernel holds, in order: no squeezes of commanded forces."""
-    from symbolic.numbers import SQUEEZES
+    from symbolic.parameters import SQUEEZES
 
     return [name for name in compiled.numbers.sizes if name not in SQUEEZES]
 

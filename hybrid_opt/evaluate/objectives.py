@@ -142,7 +142,9 @@ def _joint_length(outputs: Outputs, workcell: Workcell) -> Array:
     """Euclidean length of the path of all joints of both arms, over that of their ranges."""
     steps = [np.diff(outputs[name], axis=1) for name in _JOINTS]
     length = np.sqrt(sum((step**2).sum(axis=2) for step in steps)).sum(axis=1)
-    ranges = workcell.of_joints("position_upper") - workcell.of_joints("position_lower")
+    ranges = workcell.stack_joint_limits("position_upper") - workcell.stack_joint_limits(
+        "position_lower"
+    )
     return np.asarray(length / np.linalg.norm(ranges), dtype=float)
 
 

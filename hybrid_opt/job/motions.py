@@ -188,7 +188,7 @@ def followed(
     samples = rise(1.0, SAMPLES).value
     guess = interpolated(samples, ways[: len(reached)], reached)
     q = held_at(workcell, posture, line, share(samples), guess)
-    lower, upper = map(workcell.of_joints, ("position_lower", "position_upper"))
+    lower, upper = map(workcell.stack_joint_limits, ("position_lower", "position_upper"))
     outside = ((q < lower) | (q > upper)).any(axis=1)
     lost = ~np.isfinite(q).all(axis=1)
     for wrong, what in ((lost, "does not reach"), (outside, "leaves its joints' range")):
@@ -242,7 +242,7 @@ def timed(model: TimingModel, line: Straight, q: Array) -> PhaseMotion:
     third = CubicSpline(unit.time, q_second).derivative()(unit.time)
     payload = model.workcell.payload
     joint_speed, joint_acceleration = map(
-        model.workcell.of_joints, ("velocity_max", "acceleration_max")
+        model.workcell.stack_joint_limits, ("velocity_max", "acceleration_max")
     )
     jerk = JerkLimits.from_workcell(model.workcell) or JerkLimits(np.full(q.shape[1], np.inf))
     gentle = min(payload.acceleration_max, LIFTING_ACCELERATION)
@@ -294,9 +294,9 @@ def carry_motion(model: TimingModel, carry: Carry) -> PhaseMotion:
         rate=carry.rate,
         second_rate=carry.second_rate,
         q=q,
-        q_rate=carry.side_by_side("q_rate"),
-        q_second=carry.side_by_side("q_second"),
-        own_torque=carry.side_by_side("own_torque"),
+        q_rate=carry.stack_arms("q_rate"),
+        q_second=carry.stack_arms("q_second"),
+        own_torque=carry.stack_arms("own_torque"),
         wrench_torque=model.wrench_torque(q, pose),
     )
     end = max(at_even_steps(float(time[-1]), TICK), time[-1])
@@ -429,7 +429,7 @@ def phase_use(
         bounded["payload jerk"] = _most(box / jerk.payload)
     return bounded | {
         **joint_use(workcell, motion.q, motion.q_rate, motion.q_second),
-        "joint torque": _most(np.abs(effort) / workcell.of_joints("torque_max")),
+        "joint torque": _most(np.abs(effort) / workcell.stack_joint_limits("torque_max")),
         "payload velocity": _most(_length(motion.rate) / payload.velocity_max),
         "payload acceleration": _most(_length(motion.second_rate) / payload.acceleration_max),
         "least normal force": _most(force.least / np.maximum(force.normal, _FORCE_FLOOR)),
@@ -438,11 +438,13 @@ def phase_use(
 
 def joint_use(workcell: Workcell, q: Array, rate: Array, second: Array) -> dict[str, float]:
     """Largest position, velocity and acceleration of joints (n, joints) over their limits."""
-    lower, upper = map(workcell.of_joints, ("position_lower", "position_upper"))
+    lower, upper = map(workcell.stack_joint_limits, ("position_lower", "position_upper"))
     return {
         "joint position": _most(np.abs(2.0 * q - lower - upper) / (upper - lower)),
-        "joint velocity": _most(np.abs(rate) / workcell.of_joints("velocity_max")),
-        "joint acceleration": _most(np.abs(second) / workcell.of_joints("acceleration_max")),
+        "joint velocity": _most(np.abs(rate) / workcell.stack_joint_limits("velocity_max")),
+        "joint acceleration": _most(
+            np.abs(second) / workcell.stack_joint_limits("acceleration_max")
+        ),
     }
 
 

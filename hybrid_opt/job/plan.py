@@ -53,7 +53,7 @@ from symbolic.errors import SettingsError
 from symbolic.geometry.bodies import CollisionBody
 from symbolic.geometry.pairs import ActivePair, CellGeometry, build_geometry, ignored_pairs
 from symbolic.geometry.pieces import support
-from symbolic.records import PAYLOAD, AllowedContact, Handling, Waypoint, Workcell
+from symbolic.records import PAYLOAD_NAME, AllowedContact, Handling, Waypoint, Workcell
 from symbolic.records.task import extended_waypoints
 
 LARGEST_DROP = 0.3
@@ -142,7 +142,7 @@ class JobCollisions:
                 where nothing is found within `LARGEST_DROP`.
         """
         distances = BodyDistances(self.geometry, RESTING_TOLERANCE)
-        payload, bodies = self.geometry.index(PAYLOAD), self.geometry.bodies
+        payload, bodies = self.geometry.index(PAYLOAD_NAME), self.geometry.bodies
         pairs = [
             (p.first, p.second) for p in self.geometry.active if payload in (p.first, p.second)
         ]
@@ -209,7 +209,7 @@ def job_geometry(workcell: Workcell, everywhere: bool = False) -> CellGeometry:
         CollisionModelError: a shape is unusable, or an ignored pair names no body.
     """
     geometry = build_geometry(workcell)
-    bodies, payload = geometry.bodies, geometry.index(PAYLOAD)
+    bodies, payload = geometry.bodies, geometry.index(PAYLOAD_NAME)
     ignored = ignored_pairs(workcell, bodies)
     active, excluded = list(geometry.active), []
     for pair in geometry.excluded:
@@ -218,7 +218,7 @@ def job_geometry(workcell: Workcell, everywhere: bool = False) -> CellGeometry:
         if (
             other is None
             or not other.group.startswith("robot")
-            or frozenset((other.name, PAYLOAD)) in ignored
+            or frozenset((other.name, PAYLOAD_NAME)) in ignored
         ):
             excluded.append(pair)
         elif not everywhere and _behind_pad(other, geometry):

@@ -58,8 +58,8 @@ def rests_at_ends(timing: Timing) -> bool:
 def acceleration_at_ends(timing: Timing) -> float:
     """Largest acceleration of a joint at either end, over its limit."""
     carry = timing.driven
-    limit = carry.workcell.of_joints("acceleration_max")
-    return float((np.abs(carry.side_by_side("q_second")[[0, -1]]) / limit).max())
+    limit = carry.workcell.stack_joint_limits("acceleration_max")
+    return float((np.abs(carry.stack_arms("q_second")[[0, -1]]) / limit).max())
 
 
 def without_jumps(

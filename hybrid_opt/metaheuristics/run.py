@@ -18,7 +18,7 @@ from hybrid_opt.metaheuristics.guarded import violation_of
 from hybrid_opt.metaheuristics.registry import AlgorithmSettings, make
 from symbolic.array import Array, require_allowed, set_read_only
 from symbolic.errors import SettingsError
-from symbolic.path.pieces import same_paths, stated
+from symbolic.path.pieces import coarse_task, resample_decisions
 from symbolic.records import Task
 
 ConstraintHandling = Literal["penalty", "constraints"]
@@ -79,13 +79,13 @@ class StatedPaths:
     """
 
     def __init__(self, evaluator: Evaluator, task: Task) -> None:
-        self._evaluator, self._task, self._stated = evaluator, task, stated(task)
+        self._evaluator, self._task, self._stated = evaluator, task, coarse_task(task)
         self.objective_names, self.n_var = evaluator.objective_names, self._stated.n_var
         self.lower, self.upper = self._stated.lower, self._stated.upper
 
     def evaluate(self, x: Array) -> Evaluations:
         """See `Evaluator`; the candidates are the task's own."""
-        return self._evaluator.evaluate(same_paths(x, self._stated, self._task))
+        return self._evaluator.evaluate(resample_decisions(x, self._stated, self._task))
 
     def certified(self, evaluations: Evaluations) -> Evaluations:
         """See `Evaluator`."""
@@ -93,7 +93,7 @@ class StatedPaths:
 
     def drawn(self, x: Array | None) -> Array | None:
         """Candidates of the task (n, its n_var) as searches draw them."""
-        return None if x is None else same_paths(x, self._task, self._stated)
+        return None if x is None else resample_decisions(x, self._task, self._stated)
 
 
 class CarryProblem(Problem):  # type: ignore[misc]

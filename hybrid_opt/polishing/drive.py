@@ -48,7 +48,7 @@ from hybrid_opt.timing.drive import CandidateDriver
 from hybrid_opt.timing.records import PathTiming
 from symbolic.array import Array
 from symbolic.errors import SettingsError
-from symbolic.path.pieces import by_levels, stated_entries
+from symbolic.path.pieces import coarse_entries, hierarchical_basis
 from symbolic.records import Workcell
 from symbolic.records.task import waypoints_of
 
@@ -98,7 +98,7 @@ REST_FORCE_MARGIN = 1e-3
 def is_polishable(workcell: Workcell, robust: bool) -> bool:
     """Return True if drivable carries of a cell can be polished: if robust forces are limited, it
     needs two pads with opposite normals."""
-    return workcell.has_one_squeeze or not robust
+    return workcell.has_scalar_squeeze or not robust
 
 
 @dataclass(frozen=True)
@@ -230,9 +230,9 @@ class DriveStepMethod(StepMethod[DriveIterate, DriveStep]):
         super().__init__(cell, RowSelector(cell), CarryReader(cell))
         self.driver, self._n = driver, task.n_path
         self.half = cell.half[: task.n_path]
-        self._own = own = stated_entries(task) if is_coarse else np.arange(task.n_path)
+        self._own = own = coarse_entries(task) if is_coarse else np.arange(task.n_path)
         self._bounds = task.lower[own], task.upper[own]
-        by, square = by_levels(task)
+        by, square = hierarchical_basis(task)
         self._unit = (self.half * square)[own]
         self._newton = NEWTON_STEP * float(square[own].min())
         self._spread = by[:, own] * self._unit

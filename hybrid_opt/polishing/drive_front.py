@@ -26,7 +26,7 @@ from hybrid_opt.timing.drive import CandidateDriver
 from hybrid_opt.timing.limits import drive_path
 from hybrid_opt.timing.model import TimingModel
 from symbolic.array import Array
-from symbolic.path.pieces import same_paths, stated
+from symbolic.path.pieces import coarse_task, resample_decisions
 from symbolic.records.task import initial_decision
 
 LEAST_GAP = 0.02
@@ -182,14 +182,14 @@ class DriveRun(PolishRun[DriveAttempt]):
         the basin."""
         paths, durations = self._known_paths(force)
         best = paths[int(np.argmin(durations))]
-        task, own = self._method.cell.task, stated(self._method.cell.task)
+        task, own = self._method.cell.task, coarse_task(self._method.cell.task)
 
         def durations_of(turned_paths: Array) -> Array:
-            return self._method.paths.durations(same_paths(turned_paths, own, task), force)
+            return self._method.paths.durations(resample_decisions(turned_paths, own, task), force)
 
         return [
-            same_paths(path, own, task)[0]
-            for base in same_paths(np.array([best, self._hand_made]), task, own)
+            resample_decisions(path, own, task)[0]
+            for base in resample_decisions(np.array([best, self._hand_made]), task, own)
             for path in rotated_starts(own, base, durations_of)
         ]
 

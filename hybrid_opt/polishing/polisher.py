@@ -32,7 +32,7 @@ TIMED_EVALUATIONS = 32
 def has_polishable_forces(workcell: Workcell, objectives: Sequence[str]) -> bool:
     """Return True if the polish has the pads' forces: planned ones of any pads, robust ones of two
     pads with opposite normals."""
-    return workcell.has_one_squeeze or tuple(objectives) != ROBUST_OBJECTIVES
+    return workcell.has_scalar_squeeze or tuple(objectives) != ROBUST_OBJECTIVES
 
 
 class Polisher:

@@ -13,14 +13,14 @@ import numpy as np
 
 from hybrid_opt.proposing.decimals import pose_limits, readable_turns
 from hybrid_opt.proposing.holding import shoulders
-from symbolic import outside
+from symbolic import safe_io
 from symbolic.array import Array
 from symbolic.errors import OutsideError, WorkcellError
 from symbolic.read.cell import load
 from symbolic.read.descriptions import PACKAGE_SCHEME
 from symbolic.read.editing import completed, merged, with_paths
 from symbolic.read.robots import read_robot
-from symbolic.read.tables import Table
+from symbolic.read.tables import TableReader
 from symbolic.records import Robot, Workcell
 from symbolic.records import quantities as quantity
 from symbolic.records.poses import Orientation, box_placement, rotation_from_rpy
@@ -128,7 +128,7 @@ class Problem:
     def _robots(self) -> tuple[Robot, Robot]:
         """The robots alone, wherever the box is."""
         problems = Problems()
-        entries = Table(self.data, "", problems).tables("robots", exactly=2)
+        entries = TableReader(self.data, "", problems).tables("robots", exactly=2)
         found = [read_robot(entry, self.source.parent)[0] for entry in entries]
         if problems.found:
             raise WorkcellError(str(self.source), problems.messages())
@@ -207,13 +207,13 @@ def read_problem(path: str | Path) -> Problem:
     """
     path = Path(path)
     try:
-        source = outside.resolved(path)
-        text = outside.text(outside.read_bytes(source, outside.WORKCELL_BYTES))
-        data = outside.toml_tables(text.encode())
+        source = safe_io.resolved(path)
+        text = safe_io.text(safe_io.read_bytes(source, safe_io.WORKCELL_BYTES))
+        data = safe_io.toml_tables(text.encode())
     except OutsideError as error:
         raise WorkcellError(str(path), (f"file: {error}",)) from error
     problems = Problems()
-    _require_known(Table(data, "", problems))
+    _require_known(TableReader(data, "", problems))
     if problems.found:
         raise WorkcellError(str(path), problems.messages())
     text = completed(text, data, {"task": dict.fromkeys(PROPOSED)})
@@ -222,7 +222,7 @@ def read_problem(path: str | Path) -> Problem:
     return Problem(source, text, data)
 
 
-def _require_known(table: Table) -> None:
+def _require_known(table: TableReader) -> None:
     """Record what this module needs and lacks; the reader of workcell files checks the rest."""
     task, payload = table.table("task"), table.table("payload")
     _, contacts = (table.tables(key, exactly=2) for key in ("robots", "contacts"))

@@ -63,7 +63,7 @@ def plan_reach(job: Job, q: Array, *, rng: np.random.Generator, after: bool = Fa
     """
     cell, end = job.workcell, job.phases[-1 if after else 0].motion.q[-1 if after else 0]
     q = np.asarray(q, dtype=float)
-    bounds = cell.of_joints("position_lower"), cell.of_joints("position_upper")
+    bounds = cell.stack_joint_limits("position_lower"), cell.stack_joint_limits("position_upper")
     if q.shape != end.shape or not bool(np.all((q >= bounds[0]) & (q <= bounds[1]))):
         raise SettingsError(
             f"q has shape {q.shape}; needs {len(end)} joint positions within their limits"

@@ -33,7 +33,7 @@ from symbolic.geometry.bodies import MeshReader, shape_pieces
 from symbolic.geometry.clearance import screening_functions
 from symbolic.geometry.pairs import CellGeometry, coal_distance
 from symbolic.geometry.pieces import Piece, support
-from symbolic.records import PAYLOAD, Handling, Workcell
+from symbolic.records import PAYLOAD_NAME, Handling, Workcell
 from symbolic.records.poses import box_placement
 from symbolic.records.task import initial_decision
 from symbolic.robot.branches import StartBranch
@@ -61,7 +61,7 @@ class BoxAlone:
         """Prepare their shapes."""
         meshes = MeshReader()
         self._orientation = workcell.task.orientation
-        self._box = shape_pieces(workcell.payload.solid, np.eye(4), PAYLOAD, meshes)
+        self._box = shape_pieces(workcell.payload.solid, np.eye(4), PAYLOAD_NAME, meshes)
         self._names = [body.name for body in workcell.environment]
         self._standing = [
             shape_pieces(body.shape, body.pose, body.name, meshes) for body in workcell.environment
@@ -213,12 +213,14 @@ class PoseJudge:
     def resting(self, pose: Array) -> list[tuple[str, bool]]:
         """What stands where the box (6,) is to be: environment bodies, and whether the box enters
         them by more than what rests on something may."""
-        names = [(k, pair) for k, pair in enumerate(self.geometry.pair_names) if PAYLOAD in pair]
+        names = [
+            (k, pair) for k, pair in enumerate(self.geometry.pair_names) if PAYLOAD_NAME in pair
+        ]
         standing = {body.name for body in self.geometry.workcell.environment}
         q_1, q_2 = (np.zeros((1, arm.joints)) for arm in self.geometry.arms)
         found = []
         for number, pair in names:
-            other = next(name for name in pair if name != PAYLOAD)
+            other = next(name for name in pair if name != PAYLOAD_NAME)
             if other not in standing:
                 continue
             at, pair_number = np.zeros(1, dtype=np.intp), np.full(1, number)

@@ -129,9 +129,9 @@ def check_pads(workcell: Workcell) -> None:
         return  # a grasp that is not closed is refused where its squeeze is looked for
     friction = min(contact.friction for contact in workcell.contacts)
     room = PATCH_OVERLAP * friction * workcell.pad_distance
-    if workcell.pads_beside >= room:
+    if workcell.pad_offset >= room:
         raise SettingsError(
-            f"the contacts lie {workcell.pads_beside:g} m beside one another; robust forces "
+            f"the contacts lie {workcell.pad_offset:g} m beside one another; robust forces "
             f"need less than {room:g} m, so that pressing harder holds whatever happens"
         )
 

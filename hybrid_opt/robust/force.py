@@ -199,7 +199,7 @@ class RobustModel:
         self._functions: dict[tuple[object, ...], NumericFunction] = {}
         # Many motions are asked about under a few sets.
         self._worst = lru_cache(maxsize=8)(self._checked_cases)
-        self._one = workcell.has_one_squeeze
+        self._one = workcell.has_scalar_squeeze
         if self._one:
             self._squeeze(1, displaced=True)
             self._squeeze(1, displaced=False)

@@ -39,7 +39,7 @@ from symbolic.contact.worst_cases import (
     case_squeeze_function,
 )
 from symbolic.errors import SettingsError
-from symbolic.numbers import HELD, WorkcellNumbers
+from symbolic.parameters import HELD, WorkcellParameters
 from symbolic.records import Workcell
 
 BY_TIMING = slice(18, 20)
@@ -95,7 +95,7 @@ class RobustPath:
                 friction.
             DualArmError: a function cannot be built.
         """
-        if not workcell.has_one_squeeze:
+        if not workcell.has_scalar_squeeze:
             raise SettingsError(
                 "limits and slopes of robust forces need two pads with opposite normals"
             )
@@ -210,7 +210,7 @@ class RulingForce:
         """
         model = robust_model(carry.workcell)
         self._workcell, self._leader = model.workcell, leader
-        self._squeezed = model.workcell.has_one_squeeze
+        self._squeezed = model.workcell.has_scalar_squeeze
         needed = model.commanded(carry, carry.workcell.uncertainty, leader)
         few = np.flatnonzero(needed >= (1.0 - TIED) * needed.max())
         cases = worst_cases(model.workcell, carry.workcell.uncertainty, leader)
@@ -253,7 +253,7 @@ class RulingForce:
         cases = cases[self._ruling]
         moved = np.hstack([*parts_of(motion), cases])
         if self._squeezed:
-            held = WorkcellNumbers(cell).vector(HELD)
+            held = WorkcellParameters(cell).vector(HELD)
             return np.hstack([moved, np.tile(held, (len(moved), 1))])
         if pads:
             least = case_squeeze_function(cell, 1 - self._leader)
@@ -268,7 +268,7 @@ class RulingForce:
         """(k, 2, m) of the force of each ruling case by `_inputs`, were either friction the lower
         one by a trifle: the lower one decides what the opposed force takes."""
         if self._squeezed:
-            numbers = WorkcellNumbers(self._workcell)
+            numbers = WorkcellParameters(self._workcell)
             made = case_gradient_function(numbers.symbols(), numbers=True)
             function = bound_to(InterpretedFunction(made), numbers)
         else:

@@ -25,11 +25,11 @@ from typing import Any, TypeVar
 import numpy as np
 
 from hybrid_opt.errors import ResultsError
-from symbolic import outside
+from symbolic import safe_io
 from symbolic.errors import OutsideError
-from symbolic.outside import replace_file
 from symbolic.read.tables import checked
 from symbolic.records.problems import FirstProblem, shown
+from symbolic.safe_io import replace_file
 
 Record = TypeVar("Record")
 
@@ -163,7 +163,7 @@ def read_json(path: Path, remedy: str = "") -> Any:
 def json_of(content: bytes, path: Path | str, remedy: str = "") -> Any:
     """The JSON values of a file's content; see `read_json`."""
     try:
-        return outside.json_value(content)
+        return safe_io.json_value(content)
     except OutsideError as error:
         told = f"; {remedy}" if remedy else ""
         raise ResultsError(f"{path}: damaged ({error}){told}") from error
@@ -192,10 +192,10 @@ def read_bytes(path: Path) -> bytes:
     """A file's content.
 
     Raises:
-        ResultsError: it cannot be read, is no regular file, or larger than `outside.MOST_BYTES`.
+        ResultsError: it cannot be read, is no regular file, or larger than `safe_io.MOST_BYTES`.
     """
     try:
-        return outside.read_bytes(path, outside.MOST_BYTES)
+        return safe_io.read_bytes(path, safe_io.MOST_BYTES)
     except OutsideError as error:
         raise ResultsError(f"{path}: {error}") from error
 

@@ -25,7 +25,6 @@ from hybrid_opt.evaluate.objectives import OBJECTIVES, PAPER_OBJECTIVES
 from hybrid_opt.store.files import AGAIN, from_json, read_document, storing
 from symbolic.array import Array
 from symbolic.errors import BundleError
-from symbolic.outside import replace_file
 from symbolic.read.cell_files import (
     CellFiles,
     cell_from_json,
@@ -35,6 +34,7 @@ from symbolic.read.cell_files import (
 )
 from symbolic.records import Workcell
 from symbolic.records.problems import shown, text_problem
+from symbolic.safe_io import replace_file
 
 FORMAT = "dual-arm-carry trajectory"
 VERSION = 1

@@ -41,7 +41,7 @@ from hybrid_opt.timing.solve import time_path
 from hybrid_opt.timing.topp_ra import validate_timing
 from symbolic.array import Array, Count, Figure, Missing, Pair, Row, Shape
 from symbolic.errors import SettingsError
-from symbolic.path.pieces import same_paths
+from symbolic.path.pieces import resample_decisions
 from symbolic.records import Workcell
 
 LEAST_FORCE_RATIO = 1.001
@@ -100,8 +100,8 @@ def check_search_timing(model: TimingModel, x: Array) -> Timing:
 def _jump(model: TimingModel, carry: Carry) -> Place | None:
     """Return the joint with the largest relative speed at the carry's ends; None if all are at
     rest."""
-    limit = model.workcell.of_joints("velocity_max")
-    ends = np.abs(carry.side_by_side("q_rate")[[0, -1]]) / limit
+    limit = model.workcell.stack_joint_limits("velocity_max")
+    ends = np.abs(carry.stack_arms("q_rate")[[0, -1]]) / limit
     if float(ends.max()) < REST_SPEED:
         return None
     end, joint = np.unravel_index(int(np.argmax(ends)), ends.shape)
@@ -227,7 +227,7 @@ def time_trajectory(
     """
     task, found_in = model.workcell.task, own or model
     jerk, kept, limits = None, None, TimingLimits()
-    (path,) = same_paths(x, found_in.workcell.task, task)
+    (path,) = resample_decisions(x, found_in.workcell.task, task)
     if len(path) == task.n_var > task.n_path:
         limits = model.drive_limits(float(path[-1]))
         kept = applicable_jerk_limits(model.workcell, limits)

@@ -119,7 +119,7 @@ def time_with_jerk(
 def applicable_jerk_limits(workcell: Workcell, limits: TimingLimits) -> JerkLimits | None:
     """Return the cell's limits on jerk for timings within `limits`; None without any, or if limited
     robust forces have no slopes."""
-    slopes = workcell.has_one_squeeze or not limits.robust
+    slopes = workcell.has_scalar_squeeze or not limits.robust
     return JerkLimits.from_workcell(workcell) if slopes else None
 
 
@@ -257,8 +257,8 @@ class _JerkProblem:
     def _jerks(self, at: WarpedPath, c: Array) -> tuple[Array, Array]:
         """Return the largest joint jerk and payload jerk (n,) over their limits."""
         joint, box = at.jerk(c)
-        of_joints = (np.abs(joint) / self._jerk.joints).max(axis=1)
-        return of_joints, np.linalg.norm(box, axis=1) / self._jerk.payload
+        stack_joint_limits = (np.abs(joint) / self._jerk.joints).max(axis=1)
+        return stack_joint_limits, np.linalg.norm(box, axis=1) / self._jerk.payload
 
     def _check(self, at: WarpedPath, c: Array) -> tuple[Timing, float, float, float]:
         timing = check_limits(self._model, self._carry(at, c), self._limits)

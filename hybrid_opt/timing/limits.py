@@ -103,7 +103,7 @@ class PathLimits:
     """Limits of a path at samples, as functions of (u'', u'^2) over the limits.
 
     Speeds are in `squared_speed_limit`. Robust forces of pads without one squeeze
-    (`Workcell.has_one_squeeze`) are among the ratios.
+    (`Workcell.has_scalar_squeeze`) are among the ratios.
 
     Attributes:
         motion: geometry of the path at the samples.
@@ -112,7 +112,7 @@ class PathLimits:
     def __init__(self, model: TimingModel, motion: PathMotion, limits: TimingLimits) -> None:
         self.motion, self._model, self._limits = motion, model, limits
         workcell = model.workcell
-        self._squeezed = limits.robust and workcell.has_one_squeeze
+        self._squeezed = limits.robust and workcell.has_scalar_squeeze
         self._grasped = limits.robust and not self._squeezed
 
     def joint_accelerations(self) -> tuple[Array, Array]:
@@ -161,7 +161,7 @@ class PathLimits:
         if limits.torque:
             own = m.torque_by_acceleration * a[:, None] + m.torque_by_speed * w[:, None]
             torque = self._model.contact_torque(m.wrench_torque, load) + own + m.torque_at_rest
-            columns.append(torque / workcell.of_joints("torque_max"))
+            columns.append(torque / workcell.stack_joint_limits("torque_max"))
         if pressure:
             radius = np.array([contact.patch_radius for contact in workcell.contacts])
             columns.append(load["pressure_shift"] / radius)
@@ -236,7 +236,7 @@ def limit_ratios(carry: Carry, workcell: Workcell, limits: TimingLimits) -> dict
                 _norm(carry.angular_velocity) / task.reference_angular_speed,
             )
         elif limit.scope == "joint":
-            ratios[limit.name] = np.abs(carry.side_by_side(limit.carry)) / bound_of(limit, workcell)
+            ratios[limit.name] = np.abs(carry.stack_arms(limit.carry)) / bound_of(limit, workcell)
         elif limit.scope == "payload":
             vector = getattr(carry, limit.carry)[:, :3]
             ratios[limit.name] = _norm(vector) / bound_of(limit, workcell)
@@ -256,7 +256,7 @@ def bound_of(limit: Limit, workcell: Workcell) -> Array:
     """Return the largest values of a limited quantity: (all joints,), (2,) robots, or of the
     payload."""
     if limit.scope == "joint":
-        return workcell.of_joints(limit.bound)
+        return workcell.stack_joint_limits(limit.bound)
     if limit.scope == "payload":
         return np.asarray(getattr(workcell.payload, limit.bound), dtype=float)
     return np.array([getattr(contact, limit.bound) for contact in workcell.contacts])
@@ -276,7 +276,7 @@ def _near_limit(carry: Carry, workcell: Workcell, limits: TimingLimits) -> Array
     Robust forces below `EXACT_FORCE_ABOVE` of the limit and below the carry's largest are replaced
     by the planned ones, which takes a fraction of the time.
     """
-    if not limits.robust or limits.force is None or not workcell.has_one_squeeze:
+    if not limits.robust or limits.force is None or not workcell.has_scalar_squeeze:
         return limited_force(carry, workcell, limits)
     n = len(carry)
     points = PathPoints(carry.pose, carry.rate, carry.second_rate, np.zeros(n), np.ones(n))
@@ -336,7 +336,7 @@ def joint_use(carry: Carry, workcell: Workcell) -> dict[str, Array]:
     joint constraint; `contact torque` is the share of the contact wrench alone."""
     ratios = limit_ratios(carry, workcell, TimingLimits())
     use = {name: ratios[name].max(axis=0) for name in PER_JOINT}
-    limit = workcell.of_joints("torque_max")
+    limit = workcell.stack_joint_limits("torque_max")
     return use | {"contact torque": (np.abs(carry.contact_torque) / limit).max(axis=0)}
 
 

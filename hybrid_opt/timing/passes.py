@@ -80,7 +80,7 @@ class ForwardBackwardPasses:
     def supports(self, limits: TimingLimits) -> bool:
         """Return True if the passes impose these limits: they need contact wrenches that follow
         from the load alone, and for robust forces pads with one squeeze."""
-        return self._passes is not None and (self.workcell.has_one_squeeze or not limits.robust)
+        return self._passes is not None and (self.workcell.has_scalar_squeeze or not limits.robust)
 
     def time(self, paths: Mapping[str, Array], limits: Sequence[TimingLimits]) -> list[PathTiming]:
         """Compute the fastest timings of paths, each within its own limits.
@@ -330,7 +330,7 @@ def _passes_c() -> str:
 def _source(workcell: Workcell, intervals: int, cuts: int) -> tuple[Signature, str]:
     # Not imported at the top: a warm start needs no CasADi.
     from codegen.source import handwritten_source
-    from symbolic.expression import sx_given
+    from symbolic.expression import sx_parameters
     from symbolic.limit_coefficients import force_functions, ratio_functions
 
     layout = limit_layout(workcell)
@@ -349,7 +349,7 @@ def _source(workcell: Workcell, intervals: int, cuts: int) -> tuple[Signature, s
         "HELD": 3 if cuts else 2,
         **{f"AT_{name.upper()}": place for name, place in layout.offsets.items()},
     }
-    held = sx_given(workcell.payload)
+    held = sx_parameters(workcell.payload)
     # Both ends of an interval take the time of one; programs of forces are no straight code.
     pairs = (helpers[0], helpers[2]) if workcell.has_closed_form else ()
     constants["IN_PAIRS"] = int(bool(pairs))

@@ -106,7 +106,7 @@ def robustness_margins(model: TimingModel, carry: Carry) -> tuple[Margin, ...]:
     names = [robot.name for robot in workcell.robots]
     friction = np.array([contact.friction for contact in contacts])
     radius = np.array([contact.patch_radius for contact in contacts])
-    centre, own_torque = np.array(payload.centre_of_mass), carry.side_by_side("own_torque")
+    centre, own_torque = np.array(payload.centre_of_mass), carry.stack_arms("own_torque")
     wrench_torque = model.wrench_torque(carry.q, carry.pose)
     has_patches = has_pressure_limit(workcell, TimingLimits())
 
@@ -116,7 +116,9 @@ def robustness_margins(model: TimingModel, carry: Carry) -> tuple[Margin, ...]:
         torque = model.contact_torque(wrench_torque, load) + own_torque
         use = {
             "normal force": float((load["normal_force"] / task.reference_force).max()),
-            "joint torque": float((np.abs(torque) / workcell.of_joints("torque_max")).max()),
+            "joint torque": float(
+                (np.abs(torque) / workcell.stack_joint_limits("torque_max")).max()
+            ),
         }
         if has_patches:
             use["pressure shift"] = float((load["pressure_shift"] / radius).max())

@@ -166,7 +166,7 @@ class CellWitness:
         Raises:
             WitnessError: MuJoCo is not installed, or torques are unknown.
         """
-        if not np.isfinite(workcell.of_joints("torque_max")).all():
+        if not np.isfinite(workcell.stack_joint_limits("torque_max")).all():
             raise WitnessError(
                 "controllers of simulated arms are scaled by torque_max, which is unknown here; "
                 "give torques of all joints"
@@ -218,7 +218,7 @@ class _Run:
         split = len(self._workcell.robots[0].torque_max)
         self._arms = (slice(0, split), slice(split, None))
         self._ticks = _Ticks.of(reference, factor, self._settings)
-        self._limit = self._workcell.of_joints("torque_max")
+        self._limit = self._workcell.stack_joint_limits("torque_max")
         self._torque_use = np.zeros(len(self._limit))
         self._jacobian = np.zeros((6, self._model.nv))
         self._standing = self._place(witness.disturbance)
@@ -367,7 +367,7 @@ class _Ticks:
         at = np.minimum(time, end)
 
         counts = [len(robot.torque_max) for robot in reference.workcell.robots]
-        limit = reference.workcell.of_joints("torque_max")
+        limit = reference.workcell.stack_joint_limits("torque_max")
         motors = settings.armature * limit * motion.q_second
         more = (factor - 1.0) * np.repeat(reference.normal_force, counts, axis=1)
         return cls(

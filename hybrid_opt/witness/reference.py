@@ -154,8 +154,8 @@ def carry_reference(
     motion = JointMotion(
         time=np.concatenate([[begin - SETTLE, begin], carry.time]),
         q=_with_rest(carry.q, 1.0),
-        q_rate=_with_rest(carry.side_by_side("q_rate"), 0.0),
-        q_second=_with_rest(carry.side_by_side("q_second"), 0.0),
+        q_rate=_with_rest(carry.stack_arms("q_rate"), 0.0),
+        q_second=_with_rest(carry.stack_arms("q_second"), 0.0),
     )
     pose, rate, second = (
         _with_rest(values, keep)

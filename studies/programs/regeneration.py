@@ -95,7 +95,7 @@ def _built(
     found: list[Agreement],
 ) -> Iterator[Finding]:
     """Compile the functions of the evaluator, and compare them with the interpreted ones."""
-    from symbolic.numbers import GROUPS
+    from symbolic.parameters import GROUPS
 
     task = cell.workcell.task
     how = {"rebuild": options.check, "lanes": EVALUATOR_LANES}

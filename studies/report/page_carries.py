@@ -26,7 +26,7 @@ from hybrid_opt.timing.robustness import Margin, robustness_margins
 from hybrid_opt.timing.solve import time_path
 from symbolic.array import Array
 from symbolic.errors import DualArmError
-from symbolic.path.pieces import same_paths
+from symbolic.path.pieces import resample_decisions
 from symbolic.records import Workcell
 from symbolic.records.poses import box_rotation
 
@@ -79,7 +79,7 @@ def drawn_job(label: str, x: Array, limits: TimingLimits, cells: Sequence[ReadyC
     with the forces that an export commands by default, within the cell's limits on jerk, which
     takes long."""
     model = cells[-1].jobs
-    (path,) = same_paths(x, cells[0].cell.workcell.task, model.workcell.task)
+    (path,) = resample_decisions(x, cells[0].cell.workcell.task, model.workcell.task)
     return drawn(model, label, lambda: time_path(model.timing, path, limits), True)
 
 
@@ -273,7 +273,7 @@ def page_trajectory(cells: Sequence[ReadyCell], shown: PageTrajectory) -> dict[s
     judged = cell.carry(shown.x)
     assert judged.judgement is not None, "carries of a cell are judged"
     task = driving.cell.workcell.task
-    path = same_paths(shown.x, cell.workcell.task, task)[0, : task.n_path]
+    path = resample_decisions(shown.x, cell.workcell.task, task)[0, : task.n_path]
     limits = _limits(cell, shown.x)
     if shown.recommended:
         # The recommended carry is driven as an export does, others without limits on jerk.
@@ -335,7 +335,9 @@ def _uses(workcell: Workcell, whole: Array, contact: Sequence[Array]) -> dict[st
 
 def torque_use(workcell: Workcell, torque: Array) -> Array:
     """(joints,) largest use of each joint's torque (n, joints) in percent."""
-    return np.asarray(100.0 * np.abs(torque).max(axis=0) / workcell.of_joints("torque_max"))
+    return np.asarray(
+        100.0 * np.abs(torque).max(axis=0) / workcell.stack_joint_limits("torque_max")
+    )
 
 
 def _limits(cell: ho.Cell, x: Array) -> ho.TimingLimits:

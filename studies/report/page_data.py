@@ -24,7 +24,7 @@ from studies.report.page_carries import (
     page_trajectory,
 )
 from symbolic.array import Array, evenly
-from symbolic.path.pieces import same_paths
+from symbolic.path.pieces import resample_decisions
 from symbolic.read.cell_files import cell_to_json
 from symbolic.records import Workcell
 
@@ -322,7 +322,7 @@ def _drive_groups(data: ReportData, drivable: Experiment, cell: int) -> Iterator
     low, high = drivable.workcell.task.force_limit
     for carry, label, curve in curves(data):
         own, task = carry.timed.workcell.task, drivable.workcell.task
-        source, path = carry.source, same_paths(carry.x, own, task)[0, : task.n_path]
+        source, path = carry.source, resample_decisions(carry.x, own, task)[0, : task.n_path]
         force = curve[evenly(len(curve), CURVE_MEMBERS), 0]
         some = tuple(
             PageTrajectory(source, np.append(path, limit), cell)

@@ -25,7 +25,7 @@ from hybrid_opt.polishing.settings import FillSettings, PolishSettings
 from hybrid_opt.store.files import AGAIN, read_bytes, write_atomically
 from hybrid_opt.workers import LocalWorkers
 from studies.program import load_workcell
-from symbolic import outside
+from symbolic import safe_io
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.read.cell_files import CellFiles, collect_cell
@@ -131,8 +131,8 @@ def read_reference_front(path: Path) -> ReferenceFront:
     """
     try:
         content = read_bytes(path)
-        if content.count(b",") + content.count(b"\n") > outside.MOST_VALUES:
-            raise ValueError(f"it holds more than {outside.MOST_VALUES} values")
+        if content.count(b",") + content.count(b"\n") > safe_io.MAX_JSON_VALUES:
+            raise ValueError(f"it holds more than {safe_io.MAX_JSON_VALUES} values")
         lines = content.decode("ascii").splitlines()
         digest = lines[1].removeprefix("# workcell: ")
         values = np.array([[float(word) for word in line.split(",")] for line in lines[3:]])

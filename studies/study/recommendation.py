@@ -49,7 +49,7 @@ from hybrid_opt.store.trajectory_file import write_trajectory
 from hybrid_opt.timing.jerk import applicable_jerk_limits
 from hybrid_opt.timing.robustness import Margin
 from symbolic.array import Array, Count, Figure, Pair
-from symbolic.path.pieces import same_paths
+from symbolic.path.pieces import resample_decisions
 from symbolic.records import Task, Workcell
 
 
@@ -470,7 +470,7 @@ def known_paths(root: Path, task: Task) -> Array:
     own, n = campaign.workcell.task, campaign.workcell.task.n_path
     found = [path[None] for path in least_force(campaign, task).values()]
     polished = [front for front in campaign.fronts if front.polished and len(front)]
-    found += [same_paths(f.x[[0, len(f) // 2, -1], :n], own, task) for f in polished]
+    found += [resample_decisions(f.x[[0, len(f) // 2, -1], :n], own, task) for f in polished]
     return np.unique(np.concatenate(found), axis=0) if found else np.empty((0, task.n_path))
 
 
@@ -482,7 +482,7 @@ def least_force(campaign: CampaignResults, task: Task) -> dict[str, Array]:
     if chosen is None:
         return {}
     own = campaign.workcell.task
-    return {LEAST_FORCE: same_paths(chosen.carry.x[: own.n_path], own, task)[0]}
+    return {LEAST_FORCE: resample_decisions(chosen.carry.x[: own.n_path], own, task)[0]}
 
 
 def is_drivable(workcell: Workcell, objectives: Sequence[str]) -> bool:

@@ -31,7 +31,7 @@ from symbolic.contact.force_closure import (
     scaled_patch,
 )
 from symbolic.contact.soft_finger import SoftPatch
-from symbolic.expression import number, reciprocal, sx_given
+from symbolic.expression import number, reciprocal, sx_parameters
 from symbolic.records import Contact, Workcell
 from symbolic.records.numbered import GraspNumbers, NumberedWorkcell
 
@@ -86,7 +86,7 @@ class Grasp:
         if numbers is None and isinstance(workcell, NumberedWorkcell):
             numbers = workcell.grasp
         self.numbers = derived(workcell) if numbers is None else numbers
-        self.given = sx_given(workcell.payload, self.numbers)
+        self.given = sx_parameters(workcell.payload, self.numbers)
         self.robots, self._pads = workcell.pad_robots, workcell.pads
         self.patches = tuple(map(_patch, self._pads, self.numbers.shapes))
         self.friction = ca.vertcat(*[ca.SX(number(c.friction)) for c in workcell.contacts])

@@ -15,7 +15,14 @@ from symbolic.contact.force_closure import WRENCH_SIZE
 from symbolic.contact.grasp import Grasp, grasp_wrenches
 from symbolic.contact.paper import Both, allocate, pressure_shift, required_force, required_moment
 from symbolic.contact.soft_finger import Detached, SoftPatch, least_soft_squeeze
-from symbolic.expression import Expression, as_mx, mx_given, named_function, number, sx_given
+from symbolic.expression import (
+    Expression,
+    as_mx,
+    mx_parameters,
+    named_function,
+    number,
+    sx_parameters,
+)
 from symbolic.path.rotation import angular_acceleration, angular_velocity, rotation_matrix
 from symbolic.records import Allocation, Workcell
 
@@ -104,7 +111,7 @@ def _by_soft_fingers(workcell: Workcell, asked: ContactLoad, detached: Detached 
         (arms[0], arms[1]),
         asked.friction,
         (patches[0], patches[1]),
-        workcell.has_pads_beside,
+        workcell.has_offset_pads,
         detached,
     )
     force_1 = ca.mtimes(axes, ca.vertcat(held.tangent_1, held.normal[0]))
@@ -173,10 +180,10 @@ def load_function(workcell: Workcell) -> ca.Function:
     payload = workcell.payload
     own: list[Expression] = [frictions(workcell), ca.SX(number(payload.centre_of_mass))]
     if workcell.has_closed_form:
-        kind, given = ca.SX, sx_given(payload)
+        kind, given = ca.SX, sx_parameters(payload)
     else:
-        kind, given = ca.MX, mx_given(payload)
-        own = [as_mx(value, sx_given(payload), given) for value in own]
+        kind, given = ca.MX, mx_parameters(payload)
+        own = [as_mx(value, sx_parameters(payload), given) for value in own]
     inputs = {name: kind.sym(name, 6) for name in ("pose", "rate", "second_rate")}
     outputs = uncertain_load_function(workcell).call([*inputs.values(), *own, *given.values()])
     named = dict(zip(LOAD_OUTPUTS, outputs, strict=True))
@@ -241,7 +248,7 @@ def closed_load_function(workcell: Workcell, allocation: Allocation) -> ca.Funct
         "wrench_2": held.wrenches[1],
     }
     outputs = {name: ca.densify(value) for name, value in outputs.items()}
-    return _named(inputs | sx_given(workcell.payload), outputs)
+    return _named(inputs | sx_parameters(workcell.payload), outputs)
 
 
 def _grasp_load_function(workcell: Workcell) -> ca.Function:
@@ -249,7 +256,7 @@ def _grasp_load_function(workcell: Workcell) -> ca.Function:
     inputs = {name: ca.MX.sym(name, size) for name, size in SIZES.items()}
     names = ("angular_velocity", "angular_acceleration", "force", "required_moment")
     given = [ca.SX.sym(name, size) for name, size in SIZES.items() if name != "friction"]
-    numbers, handed = sx_given(workcell.payload), mx_given(workcell.payload)
+    numbers, handed = sx_parameters(workcell.payload), mx_parameters(workcell.payload)
     of_motion = required(workcell, *given)[1:]
     asked_of = [inputs[name] for name in SIZES if name != "friction"]
     function = ca.Function("required", [*given, *numbers.values()], of_motion)
@@ -284,7 +291,7 @@ def required(
 
 def _sample_function(workcell: Workcell) -> ca.Function:
     """pose, force, moment (world), friction and centre of mass to the outputs `GRASP_OUTPUTS`."""
-    inputs, given = [ca.MX.sym(*entry) for entry in SAMPLE_SIZES], mx_given(workcell.payload)
+    inputs, given = [ca.MX.sym(*entry) for entry in SAMPLE_SIZES], mx_parameters(workcell.payload)
     pose, force, moment, friction, centre_of_mass = inputs
     asked = (pose, force, moment, centre_of_mass)
     load = box_load_function(workcell)(*asked)
@@ -372,6 +379,6 @@ def grasp_world_function(workcell: Workcell) -> ca.Function:
     }
     return ca.Function(
         "grasp_world",
-        [*inputs, wrenches, *sx_given(workcell.payload).values()],
+        [*inputs, wrenches, *sx_parameters(workcell.payload).values()],
         ca.cse([ca.densify(outputs[name]) for name in GRASP_OUTPUTS]),
     )

@@ -46,7 +46,7 @@ from symbolic.expression import (
     mx_symbols,
     named_function,
     number,
-    sx_given,
+    sx_parameters,
 )
 from symbolic.records import Workcell
 from symbolic.records.numbered import NumberedWorkcell
@@ -128,7 +128,7 @@ def case_slopes_function(workcell: Workcell) -> ca.Function:
     """Box pose and its derivatives by u (6,), u'', u'^2 and a case (18,), see `CASE_SIZES`, to
     normal_force (2,) [N] as of `case_squeeze_function`, and slope (NumPy shape (2, 20)), of each
     force by pose, both derivatives, u'' and u'^2; of cases without displaced pads."""
-    inputs = _inputs(ca.SX, sx_given(workcell.payload))
+    inputs = _inputs(ca.SX, sx_parameters(workcell.payload))
     path = {name: ca.SX.sym(name, 6) for name in ("pose", "first", "second")}
     path |= {"a": ca.SX.sym("a"), "w": ca.SX.sym("w")}
     pose, first, second, a, w = path.values()
@@ -146,7 +146,7 @@ def case_slopes_function(workcell: Workcell) -> ca.Function:
 def case_difference_function(workcell: Workcell) -> ca.Function:
     """pose, rate, second_rate (6,) and a case (18,), see `CASE_SIZES`, to difference N_1 - N_2 [N],
     which no squeeze changes."""
-    inputs = _inputs(ca.SX, sx_given(workcell.payload))
+    inputs = _inputs(ca.SX, sx_parameters(workcell.payload))
     motion = [inputs[name] for name in MOTION]
     (difference,) = ca.cse([case_in_pad_axes(workcell, motion, inputs["case"])[0][2]])
     return named_function("case_difference", inputs, {"difference": difference}, cse=False)
@@ -158,8 +158,8 @@ def case_slack_function(workcell: Workcell, commanded: int = 1) -> ca.Function:
     Where it is positive, one pressure that is known holds the case; elsewhere
     `case_squeeze_function` knows. It takes a thirtieth of that one's time.
     """
-    squeeze = None if workcell.has_one_squeeze else GraspSqueeze(workcell, commanded)
-    given = sx_given(workcell.payload) if squeeze is None else squeeze.given
+    squeeze = None if workcell.has_scalar_squeeze else GraspSqueeze(workcell, commanded)
+    given = sx_parameters(workcell.payload) if squeeze is None else squeeze.given
     inputs, force = _inputs(ca.SX, given), ca.SX.sym("force")
     case = inputs["case"]
     if squeeze is not None:
@@ -183,8 +183,8 @@ def _asked(
     workcell: Workcell, commanded: int = 1
 ) -> tuple[GraspSqueeze | None, dict[str, Expression]]:
     """The program of pads anywhere, and the inputs of functions of a cell's least force."""
-    if workcell.has_one_squeeze:
-        return None, _inputs(ca.SX, sx_given(workcell.payload))
+    if workcell.has_scalar_squeeze:
+        return None, _inputs(ca.SX, sx_parameters(workcell.payload))
     squeeze = GraspSqueeze(workcell, commanded)
     return squeeze, _inputs(ca.MX, mx_symbols(squeeze.given))
 
@@ -219,13 +219,13 @@ def _least_force(
     axes = workcell.contacts[0].T_box_pad[:3, :3]
     first, second = (SoftPatch.of(contact, axes) for contact in workcell.contacts)
     needed = case_in_pad_axes(workcell, [inputs[name] for name in MOTION], case)
-    offset = displaced or workcell.has_pads_beside
+    offset = displaced or workcell.has_offset_pads
     held = least_soft_squeeze(*needed, friction, (first, second), offset, detached)
     return ca.densify(_to_command(held.normal, case))
 
 
 def _origin_load(workcell: Workcell, inputs: dict[str, Expression]) -> Expression:
-    names = (*MOTION, "case", *sx_given(workcell.payload))
+    names = (*MOTION, "case", *sx_parameters(workcell.payload))
     return case_origin_load_function(workcell)(*[inputs[name] for name in names])
 
 
@@ -268,7 +268,7 @@ def case_in_pad_axes(
         + ca.vertcat(displacement[2 * i : 2 * i + 2], 0.0)
         for i, contact in enumerate(workcell.contacts)
     ]
-    in_box = case_load_function(workcell)(*motion, case, *sx_given(workcell.payload).values())
+    in_box = case_load_function(workcell)(*motion, case, *sx_parameters(workcell.payload).values())
     force, moment = (ca.mtimes(axes.T, part) for part in in_box)
     return force, moment, (arms[0], arms[1])
 
@@ -277,7 +277,7 @@ def case_load_function(workcell: Workcell) -> ca.Function:
     """pose, rate, second_rate and a case to the force and the moment about the nominal centre of
     mass that the case asks for, (3,) each, box axes."""
     payload = workcell.payload
-    inputs = [*_inputs(ca.SX, sx_given(payload)).values()]
+    inputs = [*_inputs(ca.SX, sx_parameters(payload)).values()]
     pose, rate, second, case, *_ = inputs
     _, _, mass, centre, disturbance, *_ = case_parts(case)
     nominal = number(payload.centre_of_mass)
@@ -335,7 +335,7 @@ def _sizes_function(squeeze: GraspSqueeze) -> ca.Function:
 
 def case_origin_load_function(workcell: Workcell) -> ca.Function:
     """The load about the box frame's origin (6,), box axes."""
-    inputs = [*_inputs(ca.SX, sx_given(workcell.payload)).values()]
+    inputs = [*_inputs(ca.SX, sx_parameters(workcell.payload)).values()]
     force, moment = case_load_function(workcell)(*inputs)
     about = moment + ca.cross(ca.SX(number(workcell.payload.centre_of_mass)), force)
     return ca.Function("origin_load", inputs, ca.cse([ca.vertcat(force, about)]))

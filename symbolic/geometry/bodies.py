@@ -18,7 +18,7 @@ from symbolic.geometry.pieces import Hull, Piece, check_piece
 from symbolic.read.arms import ArmLinks, arm_links, arm_model, link_frame, one_machine, robot_urdf
 from symbolic.read.descriptions import resolve_mesh
 from symbolic.read.urdf import UrdfMesh
-from symbolic.records import PAYLOAD, Capsule, Mesh, Robot, Shape, Workcell
+from symbolic.records import PAYLOAD_NAME, Capsule, Mesh, Robot, Shape, Workcell
 from symbolic.records.content import CacheKey, ContentRecord, digest_of_parts
 from symbolic.records.problems import shown
 
@@ -124,7 +124,7 @@ def collision_bodies(workcell: Workcell) -> tuple[CollisionBody, ...]:
         mount = f"{workcell.robots[0].name}/{links[1].mount}"
         bodies = [replace(b, carries=(1,)) if b.name == mount else b for b in bodies]
     payload = shape_pieces(workcell.payload.solid, np.eye(4), "the payload", meshes)
-    bodies.append(CollisionBody(PAYLOAD, "payload", BOX, payload))
+    bodies.append(CollisionBody(PAYLOAD_NAME, "payload", BOX, payload))
     bodies += [b for i in (0, 1) for b in _standing_bodies(workcell.robots, i, links, meshes)]
     for obstacle in workcell.environment:
         owner = f"environment body {obstacle.name!r}"

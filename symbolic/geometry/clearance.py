@@ -34,16 +34,16 @@ import casadi as ca
 import numpy as np
 
 from symbolic.array import Array
-from symbolic.expression import named_function, number, sx_given
+from symbolic.expression import named_function, number, sx_parameters
 from symbolic.geometry.bodies import BOX, WORLD, CollisionBody, Frame
 from symbolic.geometry.expressions import EXACT, Softness, clean, quaternion, world_placements
 from symbolic.geometry.pairs import CellGeometry
 from symbolic.geometry.screen import (
+    CoverSolid,
     Obstacle,
     Reach,
     Screen,
     ScreenBody,
-    Solid,
     columns,
     screen_of,
     turned,
@@ -78,7 +78,7 @@ def screening_functions(
     q = [ca.SX.sym(f"q_{i}", arm.joints) for i, arm in enumerate(geometry.arms, start=1)]
     R, p = rotation_matrix(geometry.workcell.task.orientation, pose[3:]), pose[:3]
     first, second = (joint_placements[i](q[i]) for i in (0, 1))
-    scene = Scene(screen, R, p, (first, second), softness)
+    scene = DistanceBounds(screen, R, p, (first, second), softness)
     placed = {BOX: (R, p)}
     for i, base in enumerate(screen.bases):
         for j, joint in enumerate(world_placements(base, (first, second)[i])):
@@ -88,7 +88,7 @@ def screening_functions(
         for body in screen.bodies
         for piece in body.pieces
     ]
-    given = sx_given(screen)
+    given = sx_parameters(screen)
     inputs, names = [pose, *q, *given.values()], ["pose", "q_1", "q_2", *given]
     outputs = [ca.horzcat(*column) for column in zip(*poses, strict=True)]
     found = {
@@ -137,7 +137,7 @@ def box_numbers(body: CollisionBody) -> Array:
     return np.concatenate([clean(piece.rotation).ravel(), clean(piece.centre), half])
 
 
-class Scene:
+class DistanceBounds:
     """Distance bounds of one sample; every expression is built once and shared."""
 
     def __init__(
@@ -244,7 +244,7 @@ class Scene:
             ]
         return self._intervals[key]
 
-    def _piece_interval(self, A: ca.SX, offset: ca.SX, piece: Solid) -> list[Interval]:
+    def _piece_interval(self, A: ca.SX, offset: ca.SX, piece: CoverSolid) -> list[Interval]:
         """Compute the extent of a cover piece along the rows of A, with its frame's origin at
         offset."""
         middle = ca.mtimes(A, ca.SX(number(piece.centre))) + offset
@@ -252,7 +252,7 @@ class Scene:
         reach = [self._reach(seen[k, :], piece) for k in range(3)]
         return [(middle[k] - reach[k], middle[k] + reach[k]) for k in range(3)]
 
-    def _reach(self, u: ca.SX, piece: Solid) -> ca.SX:
+    def _reach(self, u: ca.SX, piece: CoverSolid) -> ca.SX:
         """Compute the support of a piece about its centre along u (1, 3) in its own axes."""
         size = ca.SX(number(piece.size))
         if piece.kind is Box:
@@ -433,7 +433,7 @@ def motion_function(
         else:
             chords.append(own[i][0] + own[j][0])
             bends.append(own[i][1] + own[j][1])
-    given = sx_given(screen)
+    given = sx_parameters(screen)
     names = [f"{what}_{end}" for end in ("a", "b") for what in ("pose", "q_1", "q_2")]
     inputs = dict(zip(names, (*inputs_a, *inputs_b), strict=True)) | given
     return named_function(name, inputs, {"chord": ca.vertcat(*chords), "bend": ca.vertcat(*bends)})

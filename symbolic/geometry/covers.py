@@ -38,7 +38,7 @@ SLENDERNESS = 1.3
 """Length of a chain's slabs over the body's width: fewer, larger spheres for larger values."""
 
 
-POSTURES = 200
+OVERLAP_POSTURES = 200
 """Random postures in which chains of spheres are tried."""
 
 OFTEN = 0.5
@@ -107,7 +107,7 @@ def _often_close(seen: CacheKey) -> bool:
     a, b, arm = seen.given
     a = a if a.root is None else replace(a, pieces=a.root[1])
     steps, chains = _steps(CacheKey(arm, known=arm.chain)), [chain_cover(body) for body in (a, b)]
-    T = np.broadcast_to(np.eye(4), (POSTURES, 4, 4))
+    T = np.broadcast_to(np.eye(4), (OVERLAP_POSTURES, 4, 4))
     for k in range(a.frame.joint + 1, b.frame.joint + 1):
         T = T @ steps[k]
     moved = chains[1].centres @ T[:, :3, :3].transpose(0, 2, 1) + T[:, None, :3, 3]
@@ -115,7 +115,7 @@ def _often_close(seen: CacheKey) -> bool:
     touching = gaps.min(axis=(1, 2)) <= chains[0].radius + chains[1].radius
     if a.frame.kind == "world":
         touching &= ~_apart(a.pieces, b.pieces, T)
-    return bool(np.count_nonzero(touching) > OFTEN * POSTURES)
+    return bool(np.count_nonzero(touching) > OFTEN * OVERLAP_POSTURES)
 
 
 @lru_cache(maxsize=4)
@@ -123,7 +123,7 @@ def _steps(seen: CacheKey) -> list[Array]:
     """Compute, per joint of an arm, its frame in the one before it (POSTURES, 4, 4) at random
     postures."""
     (arm,), found = seen.given, []
-    q = np.random.default_rng(0).uniform(arm.lower, arm.upper, (POSTURES, arm.joints))
+    q = np.random.default_rng(0).uniform(arm.lower, arm.upper, (OVERLAP_POSTURES, arm.joints))
     for k, axis in enumerate(arm.axes):
         moved = np.tile(np.eye(4), (len(q), 1, 1))
         along = q[:, k, None] * axis

@@ -45,7 +45,7 @@ from symbolic.records.problems import matching
 MOST_ENTERED = 1e-3
 """Depth by which a tool may be drawn into the payload, as pads that give way are [m]."""
 
-POSTURES = 300
+CONTACT_POSTURES = 300
 """Random postures in which a pair has to touch to count as always touching."""
 
 
@@ -332,13 +332,15 @@ def _always_touching(
         if group not in own or own - {group, "payload"}:
             continue
         arm, (low, high) = arms[robot], _ordered(a, b, arms, robot)
-        postures = np.random.default_rng(0).uniform(arm.lower, arm.upper, (POSTURES, arm.joints))
+        postures = np.random.default_rng(0).uniform(
+            arm.lower, arm.upper, (CONTACT_POSTURES, arm.joints)
+        )
         for q in postures:
             T = relative_placement(arm, low.frame.joint, high.frame.joint, q)
             if coal_distance(tuple(p.moved(T) for p in high.pieces), low.pieces) > 0.0:
                 break
         else:
-            return f"touch in all of {POSTURES} random postures"
+            return f"touch in all of {CONTACT_POSTURES} random postures"
     return ""
 
 

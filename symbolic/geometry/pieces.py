@@ -287,6 +287,7 @@ def sphere_chain(pieces: tuple[Piece, ...], rotation: Array, slenderness: float)
 
 
 def ball(centre: Array, radius: float) -> Piece:
+    """Return a sphere piece."""
     return Piece(Sphere(radius), transform(np.eye(3), centre))
 
 

@@ -1,8 +1,8 @@
 """Numbers behind the bounds of distances and motions: covers, obstacles, reach.
 
-NumPy finds it once per cell. `symbolic.geometry.clearance` writes expressions of it, whether it
-holds arrays or symbols in their place (`symbolic.numbers.CellNumbers`). Which bound a pair gets
-depends on numbers, too: that is kept as flags.
+NumPy computes it once per cell. `symbolic.geometry.clearance` writes expressions of it, of arrays or
+of symbols in their place (`symbolic.parameters.CellParameters`). The choice of a pair's bound depends
+on numbers, too, and is stored as flags.
 """
 
 from __future__ import annotations
@@ -33,16 +33,16 @@ from symbolic.geometry.pieces import (
 )
 from symbolic.records import Box, Capsule, Cylinder, Sphere
 from symbolic.records.content import CacheKey, ContentRecord
-from symbolic.records.numbered import Group
+from symbolic.records.numbered import ParameterGroup
 from symbolic.records.poses import axes_with_z
 
-LONG = 0.25
+SLANTED_LENGTH = 0.25
 """Bodies longer than wide by more than this [m] are also compared along their own axes: across
 the world's axes, a slanted body seems wider by up to that much."""
 
 
 @dataclass(frozen=True)
-class Solid:
+class CoverSolid:
     """A simple shape in a frame.
 
     Attributes:
@@ -59,7 +59,7 @@ class Solid:
 
 
 @dataclass(frozen=True)
-class Chain:
+class ScreenChain:
     """Equal spheres. centres: (n, 3) in a frame [m]. radius: (1,) of each [m]."""
 
     centres: Array
@@ -98,7 +98,7 @@ class Obstacle:
     kind: type
     axes: Array | None
     extent: Array
-    cover: Solid
+    cover: CoverSolid
     to_own: Array | None
     offset: Array
 
@@ -125,8 +125,8 @@ class ScreenBody(ContentRecord):
 
     group: str
     frame: Frame
-    cover: tuple[Solid, ...]
-    chain: Chain | None
+    cover: tuple[CoverSolid, ...]
+    chain: ScreenChain | None
     extent: Array | None
     reach: Reach | None
     pieces: tuple[tuple[Array | None, Array], ...]
@@ -136,7 +136,7 @@ class ScreenBody(ContentRecord):
 
 
 @dataclass(frozen=True)
-class Base:
+class ScreenBase:
     """Where an arm stands. rotation: (3, 3); position: (3,) [m]."""
 
     rotation: Any
@@ -160,15 +160,15 @@ class Screen:
         given: the group of its numbers where these are symbols.
     """
 
-    bases: tuple[Base, Base]
+    bases: tuple[ScreenBase, ScreenBase]
     turning: tuple[tuple[bool, ...], tuple[bool, ...]]
     bodies: tuple[ScreenBody, ...]
     pairs: tuple[tuple[int, int], ...]
     own: tuple[bool | None, ...]
-    payload: Solid
+    payload: CoverSolid
     payload_is_mesh: bool
     between: Array | None
-    given: Group | None = None
+    given: ParameterGroup | None = None
 
 
 def screen_of(geometry: CellGeometry) -> Screen:
@@ -181,7 +181,7 @@ def screen_of(geometry: CellGeometry) -> Screen:
     box = payload.pieces[0]
     if len(payload.pieces) > 1 or not isinstance(box.shape, Box):
         box = bounding_box(payload.pieces, np.eye(3))
-    bases = [Base(clean(T[:3, :3]), T[:3, 3]) for T in (arm.T_world_root for arm in arms)]
+    bases = [ScreenBase(clean(T[:3, :3]), T[:3, 3]) for T in (arm.T_world_root for arm in arms)]
     return Screen(
         (bases[0], bases[1]),
         (arms[0].turning, arms[1].turning),
@@ -239,7 +239,7 @@ def _bounded(seen: CacheKey) -> ScreenBody:
         extent = np.concatenate([whole[None], each]).reshape(-1, 3)
     else:
         reach = _reach(body, arms)
-    spheres = Chain(clean(centres), np.array([chain.radius]))
+    spheres = ScreenChain(clean(centres), np.array([chain.radius]))
     cover, constant = tuple(_solid(piece) for piece in solids), is_link or has_hulls(body)
     slanted = _slanted_matters(body)
     return ScreenBody(
@@ -247,7 +247,7 @@ def _bounded(seen: CacheKey) -> ScreenBody:
     )
 
 
-def _solid(piece: Piece) -> Solid:
+def _solid(piece: Piece) -> CoverSolid:
     shape = piece.shape
     if isinstance(shape, Box):
         size = np.asarray(shape.size) / 2.0
@@ -256,7 +256,7 @@ def _solid(piece: Piece) -> Solid:
     else:
         assert isinstance(shape, Cylinder | Capsule), "a cover has no hulls"
         size = np.array([shape.radius, shape.length / 2.0])
-    return Solid(type(shape), size, clean(piece.centre), _rotation(piece))
+    return CoverSolid(type(shape), size, clean(piece.centre), _rotation(piece))
 
 
 def _rotation(piece: Piece) -> Array | None:
@@ -278,7 +278,7 @@ def _obstacle(piece: Piece) -> Obstacle:
     extent = _extent(piece, A)
     if box is not None and along_world:
         half = np.abs(R) @ (np.asarray(box.size) / 2.0)
-        cover = Solid(Box, half, clean(piece.centre), None)
+        cover = CoverSolid(Box, half, clean(piece.centre), None)
     else:
         (found,) = slab_cover(CollisionBody("", "environment", WORLD, (piece,)))
         cover = _solid(found)
@@ -329,7 +329,7 @@ def reach_about_joints(body: CollisionBody, arm: ArmGeometry) -> Array:
 def _slanted_matters(body: CollisionBody) -> bool:
     """Return True if a body is the payload, or long."""
     _, width, length = edges(body.pieces)
-    return body.frame.kind == "box" or bool(length - width > LONG)
+    return body.frame.kind == "box" or bool(length - width > SLANTED_LENGTH)
 
 
 def _between(first: Array, second: Array) -> Array | None:

@@ -19,7 +19,7 @@ from symbolic.path.spline import path_position
 from symbolic.records.task import RedundantJoint, Task, Waypoint, extended_waypoints
 
 
-def in_pieces(task: Task) -> Task:
+def refined_task(task: Task) -> Task:
     """Return a task with the waypoints of its pieces, between those of its file.
 
     Bounds hold every path that the stated ones allow.
@@ -46,7 +46,7 @@ def in_pieces(task: Task) -> Task:
     return _with_waypoints(task, lower, upper, hand_made, redundant)
 
 
-def stated(task: Task) -> Task:
+def coarse_task(task: Task) -> Task:
     """Return the task with only the waypoints of its file."""
     if task.pieces == 1:
         return task
@@ -72,13 +72,13 @@ def _with_waypoints(
     return replace(found, initial=hand_made[list(found.free_indices)])
 
 
-def stated_entries(task: Task) -> NDArray[np.intp]:
+def coarse_entries(task: Task) -> NDArray[np.intp]:
     """Return the indices (n_path of the coarse task,) of the path variables that belong to
     waypoints of the file."""
     return np.flatnonzero(task.free_entries[0] % task.pieces == 0)
 
 
-def by_levels(task: Task) -> tuple[Array, Array]:
+def hierarchical_basis(task: Task) -> tuple[Array, Array]:
     """Compute a hierarchical basis of the path variables: moves of coarse waypoints, then of finer
     ones.
 
@@ -108,7 +108,7 @@ def _steps(pieces: int) -> list[int]:
     return steps
 
 
-def same_paths(x: Array, source: Task, target: Task) -> Array:
+def resample_decisions(x: Array, source: Task, target: Task) -> Array:
     """Convert decision vectors (n, n_path or more) of one task to the waypoints of another: the
     same paths if the target has all waypoints of the source, else paths through the common ones.
 

@@ -19,7 +19,7 @@ import casadi as ca
 import numpy as np
 
 from symbolic.array import Array
-from symbolic.expression import Expression, as_mx, number, sx_given
+from symbolic.expression import Expression, as_mx, number, sx_parameters
 from symbolic.records import Task
 
 
@@ -81,13 +81,13 @@ def sample_basis(task: Task) -> PathBasis:
 
 Handed = Mapping[str, ca.MX]
 NONE: Handed = MappingProxyType({})
-"""A cell's numbers as inputs of a function of MX (`symbolic.expression.mx_given`)."""
+"""A cell's numbers as inputs of a function of MX (`symbolic.expression.mx_parameters`)."""
 
 
 def _fixed(task: Task, value: Any, x: Expression, handed: Handed) -> Expression:
     """Return a parameter of the task as the same kind of expression as x."""
     if isinstance(x, ca.MX) and isinstance(value, ca.SX):
-        return as_mx(value, sx_given(task), handed)
+        return as_mx(value, sx_parameters(task), handed)
     return type(x)(number(value))
 
 

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 
 import casadi as ca
 
-from symbolic.expression import repeated, sx_given
+from symbolic.expression import sx_parameters, tile
 from symbolic.path.rotation import angular_acceleration, angular_velocity
 from symbolic.path.spline import NONE, Handed, PathBasis
 from symbolic.records import Task
@@ -103,7 +103,7 @@ def _constant(task: Task, pose: ca.MX, rounding: ca.MX | None, handed: Handed) -
     count = pose.shape[1] - 1
     step = _step_time_function(task, rounding is not None).map(count)
     rounded = [] if rounding is None else [ca.repmat(rounding, 1, count)]
-    durations = step(pose[:, :-1], pose[:, 1:], *rounded, *repeated(handed, count))
+    durations = step(pose[:, :-1], pose[:, 1:], *rounded, *tile(handed, count))
     time = ca.horzcat(0.0, ca.cumsum(durations, 1))
     rate = _gradient(pose, durations)
     return TimedPath(time, pose, rate, _gradient(rate, durations))
@@ -112,7 +112,7 @@ def _constant(task: Task, pose: ca.MX, rounding: ca.MX | None, handed: Handed) -
 def _step_time_function(task: Task, is_rounded: bool) -> ca.Function:
     """Build the function of the duration of a step between two poses (paper Eqs. 23-24), with its
     kink rounded by a share if `is_rounded`."""
-    start, end, given = ca.SX.sym("start", 6), ca.SX.sym("end", 6), sx_given(task).values()
+    start, end, given = ca.SX.sym("start", 6), ca.SX.sym("end", 6), sx_parameters(task).values()
     step = end - start
     length = _smooth_norm(step[:3])
     angle = _smooth_norm(angular_velocity(task.orientation, (start[3:] + end[3:]) / 2.0, step[3:]))
@@ -158,7 +158,7 @@ def _ramped(
 ) -> TimedPath:
     pose, first, second = along
     n = pose.shape[1]
-    given = repeated(handed, n)
+    given = tile(handed, n)
     slope, curvature = _length_rate_function(task).map(n)(pose, first, second, *given)
     width = float(basis.parameter[1] - basis.parameter[0])
     # Trapezoid with end correction: fourth order in the sample width.
@@ -183,7 +183,7 @@ def _length_rate_function(task: Task) -> ca.Function:
     angular_rate = lever**2 * ca.dot(turn, turn_rate) / angular
     slope = ca.fmax(linear, angular)
     curvature = ca.if_else(linear >= angular, linear_rate, angular_rate)
-    inputs = [pose, first, second, *sx_given(task).values()]
+    inputs = [pose, first, second, *sx_parameters(task).values()]
     return ca.Function("length_rate", inputs, [slope, curvature])
 
 
@@ -208,7 +208,7 @@ def _ramp_function(task: Task) -> ca.Function:
     speed = ca.if_else(ramping, cruise * (3.0 * tau**2 - 2.0 * tau**3), cruise)
     push = ca.if_else(ramping, cruise / ramp * 6.0 * tau * (1.0 - tau), 0.0)
     acceleration = ca.if_else(from_end, -push, push)
-    inputs = [arc, total, *sx_given(task).values()]
+    inputs = [arc, total, *sx_parameters(task).values()]
     return ca.Function("ramp", inputs, [time, speed, acceleration])
 
 

@@ -26,7 +26,7 @@ import pinocchio as pin
 from symbolic.array import Array
 from symbolic.errors import DualArmWarning, RobotModelError
 from symbolic.read.urdf import Urdf, read_urdf
-from symbolic.records import PAYLOAD, Robot, Workcell
+from symbolic.records import PAYLOAD_NAME, Robot, Workcell
 from symbolic.records.problems import matching, suggestion
 
 Positions = tuple[tuple[str, float], ...]
@@ -481,7 +481,7 @@ def body_names(workcell: Workcell) -> dict[str, tuple[str, ...]]:
     first. The keys are `payload`, `environment` and the robots' names.
     """
     names = {
-        PAYLOAD: (PAYLOAD,),
+        PAYLOAD_NAME: (PAYLOAD_NAME,),
         "environment": tuple(body.name for body in workcell.environment),
     }
     for i, robot in enumerate(workcell.robots):

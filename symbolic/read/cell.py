@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from symbolic import outside
+from symbolic import safe_io
 from symbolic.array import Array
 from symbolic.contact.force_closure import has_force_closure
 from symbolic.errors import OutsideError, RobotModelError, WorkcellError
@@ -30,12 +30,12 @@ from symbolic.read.arms import (
 from symbolic.read.descriptions import description_content, resolve_mesh
 from symbolic.read.payload import SHAPE_KEYS, check_count, read_contact, read_payload
 from symbolic.read.robots import read_robot
-from symbolic.read.tables import Table, read_body
+from symbolic.read.tables import TableReader, read_body
 from symbolic.read.task import read_task, with_force_limit, with_redundancy
 from symbolic.records import (
-    PAYLOAD,
-    SEARCHED,
-    USUAL,
+    PAYLOAD_NAME,
+    SEARCHED_BRANCH,
+    USUAL_UNCERTAINTY,
     CollisionSettings,
     Handling,
     Mesh,
@@ -54,7 +54,7 @@ def load(
     path: str | Path,
     checks: Sequence[Check] = (),
     stored: bool = False,
-    decided: tuple[int, int] = (SEARCHED, SEARCHED),
+    decided: tuple[int, int] = (SEARCHED_BRANCH, SEARCHED_BRANCH),
     text: bytes | None = None,
     reach: bool = True,
 ) -> Workcell:
@@ -76,16 +76,16 @@ def load(
     """
     path = Path(path)
     try:
-        source = outside.resolved(path)
-        content = outside.read_bytes(source, outside.WORKCELL_BYTES) if text is None else text
-        data = outside.toml_tables(content)
+        source = safe_io.resolved(path)
+        content = safe_io.read_bytes(source, safe_io.WORKCELL_BYTES) if text is None else text
+        data = safe_io.toml_tables(content)
         settled = with_branches(content, data, decided)
         if settled != content:
-            content, data = settled, outside.toml_tables(settled)
+            content, data = settled, safe_io.toml_tables(settled)
     except OutsideError as error:
         raise WorkcellError(str(path), (f"file: {error}",)) from error
     problems = Problems()
-    workcell = _build(Table(data, "", problems), source, content, stored, reach)
+    workcell = _build(TableReader(data, "", problems), source, content, stored, reach)
     if workcell is None or problems.found:
         raise WorkcellError(str(path), problems.messages())
     further = tuple(problem for check in checks for problem in check(workcell))
@@ -107,9 +107,9 @@ def changed(workcell: Workcell, changes: Mapping[str, Any]) -> Workcell:
     """
     source, text = workcell.source, workcell.text
     try:
-        known = outside.read_bytes(source, outside.WORKCELL_BYTES) if text is None else text
+        known = safe_io.read_bytes(source, safe_io.WORKCELL_BYTES) if text is None else text
         if b"search" in known:
-            known = with_branches(known, outside.toml_tables(known), workcell.start_branch)
+            known = with_branches(known, safe_io.toml_tables(known), workcell.start_branch)
         content = changed_text(known, changes, str(source))
     except OutsideError as error:
         raise WorkcellError(str(source), (f"file: {error}",)) from error
@@ -117,7 +117,7 @@ def changed(workcell: Workcell, changes: Mapping[str, Any]) -> Workcell:
 
 
 def _build(
-    table: Table, source: Path, content: bytes, stored: bool, reach: bool
+    table: TableReader, source: Path, content: bytes, stored: bool, reach: bool
 ) -> Workcell | None:
     """Build as many records as possible; return None if a section has the wrong number of
     entries."""
@@ -134,7 +134,7 @@ def _build(
         # A pattern may stand against itself: all bodies that it matches against one another.
         if pair.first and pair.first == pair.second and not set(pair.first) & {"*", "?"}:
             problems.add(f"collision.ignored[{index}]", f"pairs {pair.first!r} with itself")
-    uncertainty = USUAL
+    uncertainty = USUAL_UNCERTAINTY
     if table.has("uncertainty"):
         uncertainty = table.table("uncertainty").record(Uncertainty, stated=True)
     handling = table.table("handling", {}).record(Handling)
@@ -163,9 +163,9 @@ def _build(
     workcell = with_redundancy(workcell, redundant, problems)
     if workcell.task.pieces > 1 and not problems.found:
         # Not imported at the top: it needs CasADi.
-        from symbolic.path.pieces import in_pieces
+        from symbolic.path.pieces import refined_task
 
-        workcell = replace(workcell, task=in_pieces(workcell.task))
+        workcell = replace(workcell, task=refined_task(workcell.task))
     return replace(workcell, reading=reading_of(workcell, identity)) if identity else workcell
 
 
@@ -180,14 +180,14 @@ def _digest(content: bytes, workcell: Workcell) -> str:
         OutsideError: one of them cannot be read, or together they are too large.
     """
     outer = hashlib.sha256(hashlib.sha256(content).digest())
-    room = outside.CELL_BYTES
+    room = safe_io.CELL_BYTES
     # Fixed-length inner digests keep the parts apart.
     for part in _named(workcell):
         room -= len(part)
         if room < 0:
             raise OutsideError(
                 "the files that it names are together larger than "
-                f"{outside.megabytes(outside.CELL_BYTES)}; simplify the meshes"
+                f"{safe_io.megabytes(safe_io.CELL_BYTES)}; simplify the meshes"
             )
         outer.update(hashlib.sha256(part).digest())
     return outer.hexdigest()
@@ -200,19 +200,19 @@ def _named(workcell: Workcell) -> Iterator[bytes]:
         urdf = robot_urdf(robot)
         for address in (*urdf.collision_meshes, *urdf.visual_meshes):
             mesh = resolve_mesh(address, robot.urdf, robot.package_dirs)
-            yield b"" if mesh is None else _content(mesh, outside.MESH_BYTES)
+            yield b"" if mesh is None else _content(mesh, safe_io.MESH_BYTES)
         if robot.srdf is not None:
-            yield _content(robot.srdf, outside.URDF_BYTES)
+            yield _content(robot.srdf, safe_io.URDF_BYTES)
     tools = [body.shape for robot in workcell.robots for body in robot.tool]
     around = [body.shape for body in workcell.environment]
     for shape in (*tools, *around, workcell.payload.shape):
         if isinstance(shape, Mesh):
-            yield _content(shape.path, outside.MESH_BYTES)
+            yield _content(shape.path, safe_io.MESH_BYTES)
 
 
 def _content(path: Path, most: int) -> bytes:
     try:
-        return outside.read_bytes(path, most)
+        return safe_io.read_bytes(path, most)
     except OutsideError as error:
         raise OutsideError(f"names {path.name}, which {error}") from error
 
@@ -230,7 +230,7 @@ def with_branches(content: bytes, data: Mapping[str, Any], decided: tuple[int, i
     if not isinstance(robots, list) or len(robots) != len(decided):
         return content
     found = [
-        {"start_branch": branch} if asks and branch != SEARCHED else {}
+        {"start_branch": branch} if asks and branch != SEARCHED_BRANCH else {}
         for asks, branch in zip(map(_asks_for_search, robots), decided, strict=True)
     ]
     if not any(found):
@@ -238,7 +238,7 @@ def with_branches(content: bytes, data: Mapping[str, Any], decided: tuple[int, i
     # Not imported at the top: see the module.
     from symbolic.read.editing import completed
 
-    return completed(outside.text(content), data, {"robots": found}).encode()
+    return completed(safe_io.text(content), data, {"robots": found}).encode()
 
 
 def _asks_for_search(robot: Any) -> bool:
@@ -286,7 +286,7 @@ def changed_text(content: bytes, changes: Mapping[str, Any], file: str) -> bytes
 def _tables_of(content: bytes) -> dict[str, Any]:
     """Parse the tables, cached because many variants of one cell are tried; callers must not
     modify them."""
-    return outside.toml_tables(content)
+    return safe_io.toml_tables(content)
 
 
 def _owners(table: Any, path: str) -> Iterator[tuple[dict[str, Any], str]]:
@@ -340,7 +340,7 @@ def check_names(workcell: Workcell, problems: Problems) -> None:
     """Check that names are unique where they address something."""
     robots = [(f"robots[{i}].name", robot.name) for i, robot in enumerate(workcell.robots)]
     bodies = [(f"environment[{i}].name", b.name) for i, b in enumerate(workcell.environment)]
-    _check_unique([("'payload' (reserved)", PAYLOAD), *robots, *bodies], problems)
+    _check_unique([("'payload' (reserved)", PAYLOAD_NAME), *robots, *bodies], problems)
     for index, robot in enumerate(workcell.robots):
         path = f"robots[{index}]"
         links: list[tuple[str, str]] = []
@@ -398,7 +398,7 @@ def check_contacts(workcell: Workcell, problems: Problems) -> None:
 
 def _check_beside(workcell: Workcell, room: float, meaning: str, problems: Problems) -> None:
     """Check that the pads' lateral offset is less than `PATCH_OVERLAP` times `room` [m]."""
-    beside, room = workcell.pads_beside, PATCH_OVERLAP * room
+    beside, room = workcell.pad_offset, PATCH_OVERLAP * room
     if beside >= room:
         problems.add(
             "contacts[1].xyz",
@@ -423,7 +423,7 @@ def check_uncertainty(workcell: Workcell, problems: Problems) -> None:
         )
         return
     radii = [contact.patch_radius for contact in workcell.contacts]
-    room = min(min(radii), (sum(radii) - workcell.pads_beside / PATCH_OVERLAP) / 2.0)
+    room = min(min(radii), (sum(radii) - workcell.pad_offset / PATCH_OVERLAP) / 2.0)
     if displaced >= room:
         problems.add(
             "uncertainty.pad_position",

@@ -24,7 +24,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Literal
 
-from symbolic import outside
+from symbolic import safe_io
 from symbolic.errors import BundleError, DualArmError, OutsideError
 from symbolic.read.cell import load, with_branches
 from symbolic.read.descriptions import (
@@ -41,7 +41,7 @@ from symbolic.records import Robot, Workcell
 from symbolic.records.problems import FirstProblem, shown
 
 MAX_FILES = 1000
-MAX_TOTAL_BYTES = outside.CELL_BYTES
+MAX_TOTAL_BYTES = safe_io.CELL_BYTES
 MAX_PLAIN_BYTES = 256 * 2**10
 """Text up to this size is stored as it is, anything else compressed."""
 
@@ -260,7 +260,7 @@ class CellCollector:
 
     def __init__(self, source: Path, text: bytes | None = None) -> None:
         self._source = source
-        self._text = _content(source, outside.WORKCELL_BYTES) if text is None else text
+        self._text = _content(source, safe_io.WORKCELL_BYTES) if text is None else text
         self._files: dict[str, bytes] = {}
         self._folders: list[str] = []
         self._moved = 0
@@ -288,14 +288,14 @@ class CellCollector:
             self._files[urdf] = self._with_meshes(robot, urdf, named)
             if robot.srdf is not None:
                 place = self._place(str(entry["srdf"]))
-                self._files[place] = _content(robot.srdf, outside.URDF_BYTES)
+                self._files[place] = _content(robot.srdf, safe_io.URDF_BYTES)
         for reference, package_dirs in references(data):
             if package_dirs is None and self._place(reference) not in self._files:
-                content = _content(self._source.parent / reference, outside.MESH_BYTES)
+                content = _content(self._source.parent / reference, safe_io.MESH_BYTES)
                 self._files[self._place(reference)] = content
         changes = merged({"robots": described}, with_paths(data, self._address))
         with _told(f"{self._source.name}:"):
-            self._text = completed(outside.text(self._text), stated, changes).encode()
+            self._text = completed(safe_io.text(self._text), stated, changes).encode()
 
     def layout(self) -> tuple[str, dict[str, bytes], tuple[str, ...]]:
         """Return everything collected, moved so that no path leads upwards.
@@ -351,7 +351,7 @@ class CellCollector:
                 content = _replaced(content.decode("utf-8"), address, relative, path.name).encode(
                     "utf-8"
                 )
-            self._files[target] = _content(mesh, outside.MESH_BYTES)
+            self._files[target] = _content(mesh, safe_io.MESH_BYTES)
         return content
 
     @staticmethod
@@ -370,7 +370,7 @@ class CellCollector:
 
 def _content(path: Path, most: int) -> bytes:
     with _told(str(path)):
-        return outside.read_bytes(path, most)
+        return safe_io.read_bytes(path, most)
 
 
 @contextmanager
@@ -405,7 +405,7 @@ def parse_toml(content: bytes) -> dict[str, Any]:
         BundleError: it is not TOML.
     """
     with _told("the stored workcell:"):
-        return outside.toml_tables(content)
+        return safe_io.toml_tables(content)
 
 
 def references(data: Mapping[str, Any]) -> Iterator[tuple[str, list[str] | None]]:
@@ -445,7 +445,7 @@ def drivable_files(stored: CellFiles) -> CellFiles:
     content = stored.files[stored.workcell]
     law = {"task": {"time_law": "optimal"}}
     with _told(f"{stored.workcell}: the time law cannot be changed:"):
-        changed = completed(outside.text(content), parse_toml(content), law).encode()
+        changed = completed(safe_io.text(content), parse_toml(content), law).encode()
     draft = replace(stored, files={**stored.files, stored.workcell: changed}, digest="")
     with TemporaryDirectory() as folder:
         digest = unpack_cell(draft, Path(folder), check_digest=False).digest

@@ -29,7 +29,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from symbolic import outside
+from symbolic import safe_io
 from symbolic.errors import OutsideError
 
 PACKAGE_SCHEME = "package://"
@@ -41,7 +41,7 @@ LONGEST_NAME = 200
 RELATIVE = ("./", "../")
 """Begin of a xacro argument that is a path relative to the workcell file."""
 
-_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
+_PACKAGE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
 _PACKAGE = re.compile(rb"<name>\s*([^<\s]+)\s*</name>")
 _SKIPPED = ("build", "devel", "install", "log")
 
@@ -60,7 +60,7 @@ def find_package(name: str, package_dirs: Sequence[Path], description: Path) -> 
         package_dirs: the folders that a workcell names.
         description: the file that names the package.
     """
-    if len(name) > LONGEST_NAME or not _NAME.fullmatch(name):
+    if len(name) > LONGEST_NAME or not _PACKAGE_NAME.fullmatch(name):
         return None
     return next(_packages(name, package_dirs, description), None)
 
@@ -100,7 +100,7 @@ def _package_name(folder: Path) -> str | None:
     if not file.is_file():
         return None
     try:
-        found = _PACKAGE.search(outside.read_bytes(file, outside.WORKCELL_BYTES))
+        found = _PACKAGE.search(safe_io.read_bytes(file, safe_io.WORKCELL_BYTES))
     except OutsideError:
         return None
     return found[1].decode("utf-8", "replace") if found else None
@@ -188,7 +188,7 @@ def description_content(
     Raises:
         OutsideError: it cannot be read or expanded, or not within the bounds of that process.
     """
-    content = outside.read_bytes(path, outside.URDF_BYTES)
+    content = safe_io.read_bytes(path, safe_io.URDF_BYTES)
     if is_mjcf(content):
         # Not imported at the top: the process that expands xacro has little memory.
         from symbolic.read.mjcf import mjcf_as_urdf
@@ -276,7 +276,7 @@ def _state(paths: Iterable[str]) -> Parts:
 
 
 def _digest(path: str) -> bytes:
-    return hashlib.sha256(outside.read_bytes(Path(path), outside.URDF_BYTES)).digest()
+    return hashlib.sha256(safe_io.read_bytes(Path(path), safe_io.URDF_BYTES)).digest()
 
 
 # --- the process in which xacro runs ---
@@ -285,11 +285,11 @@ def _digest(path: str) -> bytes:
 CPU_SECONDS = 5
 """Longest time that an expansion may compute."""
 
-MEMORY_BYTES = 192 * outside.MEBIBYTE
+MEMORY_BYTES = 192 * safe_io.MEBIBYTE
 MEMORY_PER_BYTE = 6
 """Memory that it may take, and how much more per byte of the file."""
 
-ANSWER_BYTES = 8 * outside.URDF_BYTES
+ANSWER_BYTES = 8 * safe_io.URDF_BYTES
 """Largest answer; JSON may take six bytes for a letter."""
 
 _REFUSED = ("os.", "subprocess.", "socket.", "shutil.", "ctypes.", "resource.", "signal.", "pty.")
@@ -360,9 +360,9 @@ def _expand(
         mesh.setAttribute("filename", _by_package(mesh.getAttribute("filename"), found))
     # What stands beside the root are comments that name this machine's folders.
     text = document.documentElement.toxml()
-    if len(text) > outside.URDF_BYTES:
+    if len(text) > safe_io.URDF_BYTES:
         raise OutsideError(
-            f"expands to more than {outside.megabytes(outside.URDF_BYTES)}, which is the limit"
+            f"expands to more than {safe_io.megabytes(safe_io.URDF_BYTES)}, which is the limit"
         )
     return {"urdf": text, "included": list(dict.fromkeys(map(str, xacro.all_includes)))}
 
@@ -372,7 +372,7 @@ def _opened(name: str) -> io.StringIO:
     if not os.path.exists(name):
         raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), name)
     try:
-        return io.StringIO(outside.text(outside.read_bytes(Path(name), outside.URDF_BYTES)))
+        return io.StringIO(safe_io.text(safe_io.read_bytes(Path(name), safe_io.URDF_BYTES)))
     except OutsideError as error:
         raise OutsideError(f"includes {Path(name).name}, which {error}") from error
 

@@ -13,7 +13,7 @@ import tomlkit
 from tomlkit.exceptions import TOMLKitError
 from tomlkit.items import AoT, Null, Table, Whitespace
 
-from symbolic import outside
+from symbolic import safe_io
 from symbolic.errors import OutsideError, SettingsError
 from symbolic.read.descriptions import RELATIVE
 
@@ -108,7 +108,7 @@ def _edited(
         document = tomlkit.parse(text)
         edit(document)
         found = document.as_string()
-        if _alike(outside.toml_tables(found.encode()), wanted):
+        if _alike(safe_io.toml_tables(found.encode()), wanted):
             return found
     raise SettingsError(
         "the file cannot be completed as it is written; begin each section with a heading of "

@@ -16,11 +16,11 @@ from symbolic.records.problems import Problems, shown, suggestion
 
 MOST_ELEMENTS = 100_000
 MOST_ATTRIBUTES = 500_000
-MOST_DEPTH = 32
+MAX_ELEMENT_DEPTH = 32
 MOST_NAME = 200
 
 # Python's float() takes more than that (1_000, other digits), and C readers other things (0x1p3).
-_NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
+_XML_NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
 
 
 class _LimitedBuilder(ElementTree.TreeBuilder):
@@ -34,8 +34,8 @@ class _LimitedBuilder(ElementTree.TreeBuilder):
     def start(self, tag: str, attrs: dict[str, str], /) -> ElementTree.Element:
         self._depth += 1
         self._count += 1
-        if self._depth > MOST_DEPTH:
-            raise OutsideError(f"nested too deeply; allowed is a depth of {MOST_DEPTH}")
+        if self._depth > MAX_ELEMENT_DEPTH:
+            raise OutsideError(f"nested too deeply; allowed is a depth of {MAX_ELEMENT_DEPTH}")
         if self._count > MOST_ELEMENTS:
             raise OutsideError(f"has more than {MOST_ELEMENTS} elements, which is the limit")
         return super().start(tag, attrs)
@@ -75,7 +75,7 @@ def parse_elements(document: str, root_tag: str = "robot") -> ElementTree.Elemen
     return root
 
 
-class Part:
+class ElementReader:
     """One element with the words by which messages name it.
 
     Attributes:
@@ -102,11 +102,11 @@ class Part:
         """Return how messages name an attribute."""
         return f"{self.path} {key}".lstrip()
 
-    def named(self, tag: str) -> dict[str, Part]:
+    def named(self, tag: str) -> dict[str, ElementReader]:
         """Return the inner elements of a tag by their names, which must be unique."""
-        found: dict[str, Part] = {}
+        found: dict[str, ElementReader] = {}
         for index, element in enumerate(self.element.findall(tag)):
-            name = Part(element, f"{self.path}/{tag}[{index}]".lstrip("/"), self.problems)
+            name = ElementReader(element, f"{self.path}/{tag}[{index}]".lstrip("/"), self.problems)
             if (called := name.text("name")) in found:
                 self.problems.add(name.at("name"), f"found {called!r} again; names differ")
             elif called:
@@ -114,35 +114,35 @@ class Part:
                 found[called].text("name")
         return found
 
-    def child(self, tag: str) -> Part | None:
+    def child(self, tag: str) -> ElementReader | None:
         """Return the first inner element of a tag, or None."""
         element = self.element.find(tag)
         return None if element is None else self._inner(element, tag)
 
-    def required(self, tag: str) -> Part:
+    def required(self, tag: str) -> ElementReader:
         """Return the first inner element of a tag; a missing one is one problem and reports no
         others."""
         found = self.child(tag)
         if found is None:
             self.problems.add(self.path, f"<{tag}> is missing")
-            return Part(ElementTree.Element(tag), f"{self.path}/{tag}", Problems())
+            return ElementReader(ElementTree.Element(tag), f"{self.path}/{tag}", Problems())
         return found
 
-    def all(self, tag: str) -> list[Part]:
+    def all(self, tag: str) -> list[ElementReader]:
         """Return every inner element of a tag; none is added to `kept`."""
         path = f"{self.path}/{tag}".removeprefix("/")
         return [
-            Part(element, f"{path}[{index}]", self.problems)
+            ElementReader(element, f"{path}[{index}]", self.problems)
             for index, element in enumerate(self.element.findall(tag))
         ]
 
-    def only(self, tags: Sequence[str]) -> Part:
+    def only(self, tags: Sequence[str]) -> ElementReader:
         """Return the first inner element, whose tag must be one of `tags`."""
         element = next(iter(self.element), None)
         if element is None or element.tag not in tags:
             found = "nothing" if element is None else shown(element.tag)
             self.problems.add(self.path, f"found {found}; allowed is one of {', '.join(tags)}")
-            return Part(ElementTree.Element("none"), self.path, Problems())
+            return ElementReader(ElementTree.Element("none"), self.path, Problems())
         return self._inner(element, element.tag)
 
     def raw(self, key: str) -> str | None:
@@ -201,12 +201,12 @@ class Part:
             self.problems.add(path, "is missing" if value is None else told)
             return read_only(np.ones(len(allowed)))
         # A word that is no number is told as a text that is none.
-        numbers = [float(word) if _NUMBER.fullmatch(word) else word for word in words]
+        numbers = [float(word) if _XML_NUMBER.fullmatch(word) else word for word in words]
         if len(allowed) == 1:
             return read_only([checked_number(numbers[0], allowed[0], path, self.problems)])
         return checked_vector(numbers, allowed, path, self.problems)
 
-    def _inner(self, element: ElementTree.Element, name: str) -> Part:
-        found = Part(element, f"{self.path}/{name}".removeprefix("/"), self.problems)
+    def _inner(self, element: ElementTree.Element, name: str) -> ElementReader:
+        found = ElementReader(element, f"{self.path}/{name}".removeprefix("/"), self.problems)
         self.kept.append(found.kept)
         return found

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
-from symbolic import outside
+from symbolic import safe_io
 from symbolic.array import Array
 from symbolic.errors import CollisionModelError, OutsideError
 from symbolic.records.quantities import SMALLEST_SIZE
@@ -98,9 +98,9 @@ def _read(path: Path) -> trimesh.Trimesh:
             f"cannot be read as a mesh; allowed are the formats {', '.join(FORMATS)}"
         )
     try:
-        content = outside.read_bytes(path, outside.MESH_BYTES)
+        content = safe_io.read_bytes(path, safe_io.MESH_BYTES)
         if kind == "dae":
-            outside.xml_text(content)
+            safe_io.xml_text(content)
     except OutsideError as error:
         raise OutsideError(f"the mesh {error}") from error
     if kind == "dae":

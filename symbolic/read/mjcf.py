@@ -15,9 +15,9 @@ import numpy as np
 
 from symbolic.array import Array
 from symbolic.errors import OutsideError
-from symbolic.outside import printable
 from symbolic.records import Box, Capsule, Cylinder, Sphere
 from symbolic.records.poses import inverse, rpy_from_rotation, transform
+from symbolic.safe_io import printable
 
 NO_READER = "is a file of MuJoCo, whose reader is not installed: pip install 'dual-arm-carry[sim]'"
 

@@ -6,21 +6,21 @@ from pathlib import Path
 
 import numpy as np
 
-from symbolic import outside
+from symbolic import safe_io
 from symbolic.array import Array
 from symbolic.errors import CollisionModelError
-from symbolic.read.tables import Table, read_file, read_inertia
+from symbolic.read.tables import TableReader, read_file, read_inertia
 from symbolic.records import Contact, Cylinder, Mesh, Payload
 from symbolic.records import quantities as quantity
 from symbolic.records.poses import read_only, transform
 from symbolic.records.problems import Problems
 
-KINDS = ("box", "cylinder", "mesh")
+PAYLOAD_KINDS = ("box", "cylinder", "mesh")
 
 
-def read_payload(table: Table, folder: Path) -> Payload:
+def read_payload(table: TableReader, folder: Path) -> Payload:
     """Read the payload; a mesh's path is relative to `folder`."""
-    kind = table.choice("kind", KINDS, "box")
+    kind = table.choice("kind", PAYLOAD_KINDS, "box")
     mass = table.number("mass", quantity.MASS)
     if kind == "mesh":
         solid = _mesh(table, folder, mass)
@@ -55,12 +55,12 @@ def solid_box_inertia(size: Array, mass: float) -> Array:
     return read_only(np.diag(mass / 12 * (squares.sum() - squares)))
 
 
-def _box(table: Table, mass: float) -> Payload:
+def _box(table: TableReader, mass: float) -> Payload:
     size = table.vector("size", (quantity.PAYLOAD_SIZE,) * 3)
     return Payload(size, mass, np.zeros(3), solid_box_inertia(size, mass))
 
 
-def _cylinder(table: Table, mass: float) -> Payload:
+def _cylinder(table: TableReader, mass: float) -> Payload:
     radius, length = (table.number(key, quantity.PAYLOAD_SIZE) for key in ("radius", "length"))
     across = mass / 12 * (3 * radius**2 + length**2)
     inertia = read_only(np.diag([across, across, mass / 2 * radius**2]))
@@ -68,10 +68,10 @@ def _cylinder(table: Table, mass: float) -> Payload:
     return Payload(size, mass, np.zeros(3), inertia, shape=Cylinder(radius, length))
 
 
-def _mesh(table: Table, folder: Path, mass: float) -> Payload:
+def _mesh(table: TableReader, folder: Path, mass: float) -> Payload:
     """Read a mesh payload, of uniform density within its surface, or within its hull if it has
     holes."""
-    path = read_file(table, "path", folder, outside.MESH_BYTES)
+    path = read_file(table, "path", folder, safe_io.MESH_BYTES)
     scale = table.vector("scale", (quantity.SCALE,) * 3, (1.0, 1.0, 1.0), filling=True)
     nothing = Payload(read_only(np.ones(3)), mass, np.zeros(3), np.eye(3))
     if not table.clean("path", "scale"):
@@ -100,7 +100,7 @@ def _mesh(table: Table, folder: Path, mass: float) -> Payload:
     return solid
 
 
-def _read_inertia(table: Table, kind: str, solid: Payload) -> Array:
+def _read_inertia(table: TableReader, kind: str, solid: Payload) -> Array:
     words = ("solid box", "solid") if kind == "box" else ("solid",)
     if table.raw("inertia", "solid") in words:
         return solid.inertia
@@ -117,11 +117,11 @@ MOST_PADS = 4
 SHAPE_KEYS = tuple(
     f"payload.{key}" for key in ("kind", "size", "radius", "length", "path", "scale")
 )
-LEAST_NORMAL = 1e-3  # length of a written normal below which it says no direction
+SHORTEST_NORMAL = 1e-3  # length of a written normal below which it says no direction
 ALONG_Z = 0.9  # share of a normal along z from which on a pad's x axis is measured from the box's x
 
 
-def read_contact(table: Table, payload: Payload) -> Contact:
+def read_contact(table: TableReader, payload: Payload) -> Contact:
     """Read one robot's pads on a payload."""
     friction = table.number("friction", quantity.FRICTION)
     half_sides: tuple[float, float] | None = None
@@ -133,7 +133,7 @@ def read_contact(table: Table, payload: Payload) -> Contact:
         radius = table.number("patch_radius", quantity.PATCH_RADIUS)
     known = table.clean("patch_radius", "patch_size") and table.problems.clean(*SHAPE_KEYS)
 
-    def pad(place: Table, further: tuple[Contact, ...] = ()) -> Contact:
+    def pad(place: TableReader, further: tuple[Contact, ...] = ()) -> Contact:
         pose = _read_place(place, payload if known else None, radius, half_sides)
         place.close()
         return Contact(pose, friction, radius, half_sides, further)
@@ -149,14 +149,17 @@ def check_count(contacts: list[Contact], problems: Problems) -> None:
 
 
 def _read_place(
-    table: Table, payload: Payload | None, radius: float, half_sides: tuple[float, float] | None
+    table: TableReader,
+    payload: Payload | None,
+    radius: float,
+    half_sides: tuple[float, float] | None,
 ) -> Array:
     """Read T_box_pad (4, 4), on the surface or with a normal of its own; the identity after a
     problem."""
     point = table.vector("xyz", (quantity.POSITION,) * 3)
     spin = table.number("spin", quantity.ANGLE, 0.0)
     written = table.vector("normal", (quantity.DIRECTION,) * 3) if table.has("normal") else None
-    if written is not None and np.linalg.norm(written) < LEAST_NORMAL:
+    if written is not None and np.linalg.norm(written) < SHORTEST_NORMAL:
         table.add("normal", "found no direction; allowed is one into the payload")
     if payload is None or not table.clean("xyz", "spin", "normal"):
         return read_only(np.eye(4))
@@ -194,7 +197,7 @@ def pad_rotation(normal: Array, spin: float) -> Array:
 
 
 def _on_surface(
-    table: Table,
+    table: TableReader,
     point: Array,
     spin: float,
     payload: Payload,

@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from symbolic import outside
+from symbolic import safe_io
 from symbolic.array import Array, Range
 from symbolic.errors import OutsideError, RobotModelError, UrdfError
 from symbolic.read.arms import (
@@ -48,9 +48,9 @@ from symbolic.read.descriptions import (
     is_xacro,
     resolve_mesh,
 )
-from symbolic.read.tables import Table, read_body, read_file, read_inertia, read_pose
+from symbolic.read.tables import TableReader, read_body, read_file, read_inertia, read_pose
 from symbolic.read.urdf import LARGEST_GYRATION, Urdf, read_srdf, read_urdf
-from symbolic.records import SEARCHED, Driver, Robot, ToolLoad
+from symbolic.records import SEARCHED_BRANCH, Driver, Robot, ToolLoad
 from symbolic.records import quantities as quantity
 from symbolic.records.poses import read_only
 from symbolic.records.problems import shown, suggestion
@@ -60,7 +60,7 @@ DEFAULT_ACCELERATION = 5.0  # [rad/s^2]
 MAX_START_BRANCH = 1000
 
 
-def read_robot(table: Table, folder: Path, stored: bool = False) -> tuple[Robot, int]:
+def read_robot(table: TableReader, folder: Path, stored: bool = False) -> tuple[Robot, int]:
     """Read one arm and the index of its start branch (-1: by criterion, -2: searched for).
 
     Args:
@@ -72,7 +72,7 @@ def read_robot(table: Table, folder: Path, stored: bool = False) -> tuple[Robot,
     if "/" in name:
         table.add("name", f"found {name!r}; allowed is a name without '/'")
     described, model = _read_description(table, folder, stored)
-    branch = SEARCHED
+    branch = SEARCHED_BRANCH
     if table.raw("start_branch", -1) != "search":
         branch = table.integer("start_branch", -1, MAX_START_BRANCH, -1)
     tool_load = None
@@ -106,7 +106,7 @@ def read_robot(table: Table, folder: Path, stored: bool = False) -> tuple[Robot,
     return robot, branch
 
 
-def _read_redundant(table: Table, model: pin.Model | None) -> tuple[str, ...]:
+def _read_redundant(table: TableReader, model: pin.Model | None) -> tuple[str, ...]:
     """Read the redundant joints that the file names; () leaves the choice to the program."""
     names = table.texts("redundant_joints", "names of joints")
     if model is None or not names:
@@ -122,7 +122,7 @@ def _read_redundant(table: Table, model: pin.Model | None) -> tuple[str, ...]:
     return names
 
 
-LIMITS = {
+LIMIT_KEYS = {
     "position_lower": ("lowerPositionLimit", quantity.JOINT_POSITION),
     "position_upper": ("upperPositionLimit", quantity.JOINT_POSITION),
     "velocity_max": ("velocityLimit", quantity.JOINT_SPEED),
@@ -133,7 +133,7 @@ LIMITS = {
 """The joints' limits: what Pinocchio calls them, where a description has them, and their range."""
 
 
-UNKNOWN = "unknown"
+UNKNOWN_TORQUE = "unknown"
 """The value of `torque_max` that stands for torques that nobody published."""
 
 
@@ -141,18 +141,18 @@ UNKNOWN = "unknown"
 def _warn_unjudged(robot: str) -> None:
     """Warn once that a robot's torques are not limited."""
     warnings.warn(
-        f'robot {robot!r} has torque_max = "{UNKNOWN}": no carry, timing or job is judged by the '
-        "torques of its joints, and their use is shown as 0 %",
+        f'robot {robot!r} has torque_max = "{UNKNOWN_TORQUE}": no carry, timing or job is judged '
+        "by the torques of its joints, and their use is shown as 0 %",
         RobotModelWarning,
         stacklevel=2,
     )
 
 
-def _read_limits(table: Table, model: pin.Model | None) -> dict[str, Array | None]:
+def _read_limits(table: TableReader, model: pin.Model | None) -> dict[str, Array | None]:
     """Read the limits (n,), from the file or else from the description."""
     n, found = FOLLOWING if model is None else model.nq, dict[str, Array | None]()
-    for key, (own, allowed) in LIMITS.items():
-        if key == "torque_max" and table.raw(key, None) == UNKNOWN:
+    for key, (own, allowed) in LIMIT_KEYS.items():
+        if key == "torque_max" and table.raw(key, None) == UNKNOWN_TORQUE:
             found[key] = read_only(np.full(n, np.inf))
             _warn_unjudged(table.text("name"))
         elif table.has(key):
@@ -176,10 +176,12 @@ def _read_limits(table: Table, model: pin.Model | None) -> dict[str, Array | Non
     return found
 
 
-def _described_limit(table: Table, key: str, allowed: Range, values: Array) -> Array:
+def _described_limit(table: TableReader, key: str, allowed: Range, values: Array) -> Array:
     for joint, value in enumerate(values.tolist(), 1):
         if not allowed.contains(value):
-            more = f', or {key} = "{UNKNOWN}" to judge without torques' * (key == "torque_max")
+            more = f', or {key} = "{UNKNOWN_TORQUE}" to judge without torques' * (
+                key == "torque_max"
+            )
             table.add(
                 key,
                 f"the description gives {value:g} for joint {joint}; allowed is "
@@ -198,7 +200,7 @@ MOST_FOLDERS = 100
 
 
 def _read_description(
-    table: Table, folder: Path, stored: bool
+    table: TableReader, folder: Path, stored: bool
 ) -> tuple[dict[str, Any], pin.Model | None]:
     """Return a description as fields of `symbolic.records.Robot`, and the arm's model, None after
     problems.
@@ -264,7 +266,7 @@ def _argument(value: str, folder: Path) -> str:
 
 
 @contextmanager
-def _told(table: Table, key: str) -> Iterator[None]:
+def _told(table: TableReader, key: str) -> Iterator[None]:
     """Record errors about the content that a key names as problems of that key."""
     try:
         yield
@@ -275,7 +277,7 @@ def _told(table: Table, key: str) -> Iterator[None]:
         table.add(key, str(error))
 
 
-def _read_named(table: Table) -> NamedRobot:
+def _read_named(table: TableReader) -> NamedRobot:
     """Read the description of a named robot; problems are recorded at the key 'robot'."""
     name = table.text("robot")
     if table.has("urdf"):
@@ -290,7 +292,7 @@ def _read_named(table: Table) -> NamedRobot:
     return NamedRobot(Path(), (), ())
 
 
-def _read_folders(table: Table, folder: Path) -> tuple[Path, ...]:
+def _read_folders(table: TableReader, folder: Path) -> tuple[Path, ...]:
     value = table.raw("package_dirs", [])
     if not isinstance(value, list):
         table.add("package_dirs", f"found {shown(value)}; allowed is an array of folders")
@@ -311,11 +313,13 @@ def _read_folders(table: Table, folder: Path) -> tuple[Path, ...]:
     return tuple(folders)
 
 
-def _read_described(table: Table, key: str, folder: Path, package_dirs: tuple[Path, ...]) -> Path:
+def _read_described(
+    table: TableReader, key: str, folder: Path, package_dirs: tuple[Path, ...]
+) -> Path:
     """Read a path relative to the workcell's folder, or an address package://NAME/..."""
     address = table.raw(key, None)
     if not isinstance(address, str) or not address.startswith(PACKAGE_SCHEME):
-        return read_file(table, key, folder, outside.URDF_BYTES)
+        return read_file(table, key, folder, safe_io.URDF_BYTES)
     name, _, rest = address.removeprefix(PACKAGE_SCHEME).partition("/")
     package = find_package(name, package_dirs, folder / "workcell")
     if package is None or ".." in rest.split("/"):
@@ -325,10 +329,10 @@ def _read_described(table: Table, key: str, folder: Path, package_dirs: tuple[Pa
             "package_dirs, ROS_PACKAGE_PATH, AMENT_PREFIX_PATH and the Python environment",
         )
         return folder
-    return read_file(table, key, folder, outside.URDF_BYTES, package / rest)
+    return read_file(table, key, folder, safe_io.URDF_BYTES, package / rest)
 
 
-def _read_chain(table: Table) -> tuple[str, str]:
+def _read_chain(table: TableReader) -> tuple[str, str]:
     """Read the links at which the arm begins and ends; '' for the first if only a flange is
     given."""
     if not table.has("chain"):
@@ -343,7 +347,7 @@ def _read_chain(table: Table) -> tuple[str, str]:
 
 
 def _read_model(
-    table: Table, urdf: Urdf, locked: Positions, root: str, flange: str
+    table: TableReader, urdf: Urdf, locked: Positions, root: str, flange: str
 ) -> pin.Model | None:
     """Return the arm's model, or record problems and return None."""
     moving: tuple[str, ...] | None = None
@@ -365,7 +369,9 @@ def _read_model(
     return model
 
 
-def _check_meshes(table: Table, urdf: Urdf, file: Path, package_dirs: tuple[Path, ...]) -> None:
+def _check_meshes(
+    table: TableReader, urdf: Urdf, file: Path, package_dirs: tuple[Path, ...]
+) -> None:
     for address in urdf.collision_meshes:
         path = resolve_mesh(address, file, package_dirs)
         problem = (
@@ -375,7 +381,7 @@ def _check_meshes(table: Table, urdf: Urdf, file: Path, package_dirs: tuple[Path
         )
         if path is not None:
             try:
-                outside.require(path, outside.MESH_BYTES)
+                safe_io.require(path, safe_io.MESH_BYTES)
                 continue
             except OutsideError as error:
                 problem = str(error)
@@ -388,7 +394,7 @@ def _check_meshes(table: Table, urdf: Urdf, file: Path, package_dirs: tuple[Path
 MODULES = "robot_descriptions"
 FILES = "example-robot-data"
 
-_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,99}")
+_ROBOT_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,99}")
 
 
 @dataclass(frozen=True)
@@ -412,7 +418,7 @@ def named_robot(name: str) -> NamedRobot:
     Raises:
         OutsideError: none has that name, a package is missing, or the download failed.
     """
-    if not _NAME.fullmatch(name):
+    if not _ROBOT_NAME.fullmatch(name):
         raise OutsideError("is no name; allowed are letters, digits, '_' and '-'")
     return _downloaded(name) if name.endswith("_description") else _installed(name)
 
@@ -439,7 +445,7 @@ def _installed(name: str) -> NamedRobot:
 
 def _has_links(path: Path) -> bool:
     """Return True if a file describes any link; some packages ship empty files."""
-    return b"<link" in outside.read_bytes(path, outside.URDF_BYTES)
+    return b"<link" in safe_io.read_bytes(path, safe_io.URDF_BYTES)
 
 
 def _downloaded(name: str) -> NamedRobot:

@@ -18,13 +18,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from symbolic import outside
+from symbolic import safe_io
 from symbolic.array import Array, Range
 from symbolic.errors import CollisionModelError, OutsideError
 from symbolic.read.descriptions import find_package
 from symbolic.read.elements import parse_elements
-from symbolic.read.tables import Table, read_body
-from symbolic.records import PAYLOAD, Body, Box, Capsule, Cylinder, Mesh, Shape, Sphere
+from symbolic.read.tables import TableReader, read_body
+from symbolic.records import PAYLOAD_NAME, Body, Box, Capsule, Cylinder, Mesh, Shape, Sphere
 from symbolic.records.poses import axes_with_z, rpy_from_rotation, transform
 from symbolic.records.problems import MAX_NAME_LENGTH, Problems, shown
 
@@ -41,7 +41,7 @@ DIGITS = 12
 
 
 @dataclass(frozen=True)
-class Scene:
+class ImportedScene:
     """The obstacles of a scene.
 
     Attributes:
@@ -76,7 +76,7 @@ class SceneBuilder:
     notes: list[str] = field(default_factory=list)
     files: dict[str, bytes] = field(default_factory=dict)
     problems: Problems = field(default_factory=Problems)
-    names: set[str] = field(default_factory=lambda: {PAYLOAD})
+    names: set[str] = field(default_factory=lambda: {PAYLOAD_NAME})
 
     def add(self, name: str, shape: Shape | Capsule, pose: Array) -> None:
         """Add a shape at its pose (4, 4) in the world, unless a workcell would refuse it; add a
@@ -94,7 +94,7 @@ class SceneBuilder:
         if not np.all(np.isfinite(pose)):
             problems.add("pose", "is not finite")
         else:
-            read_body(Table(_table(body, Path("/"), Path("/")), "", problems), Path("/"))
+            read_body(TableReader(_table(body, Path("/"), Path("/")), "", problems), Path("/"))
         if isinstance(shape, Mesh) and not problems.found:
             # Not imported at the top: reading meshes takes long to load.
             from symbolic.read.meshes import read_mesh
@@ -152,15 +152,15 @@ class SceneBuilder:
 
     def leave(self, name: str, why: str) -> None:
         """Report that something is left out."""
-        self.left_out.append(f"{outside.printable(name) or 'scene'}: {why}")
+        self.left_out.append(f"{safe_io.printable(name) or 'scene'}: {why}")
 
     def note(self, name: str, what: str) -> None:
         """Report that something is represented differently than in the scene."""
-        self.notes.append(f"{outside.printable(name) or 'scene'}: {what}")
+        self.notes.append(f"{safe_io.printable(name) or 'scene'}: {what}")
 
     def _name(self, name: str) -> str:
         """Return a unique name without the characters of key paths and patterns."""
-        wanted = re.sub(r"[/.*?\[\]]+", "-", outside.printable(name)).strip() or "body"
+        wanted = re.sub(r"[/.*?\[\]]+", "-", safe_io.printable(name)).strip() or "body"
         wanted = wanted[: MAX_NAME_LENGTH - 6].strip()
         free = (wanted if k == 1 else f"{wanted} {k}" for k in range(1, MOST_BODIES + 3))
         return next(each for each in free if each not in self.names)
@@ -231,7 +231,7 @@ def _main_file(folder: Path) -> str | None:
     config = folder / "model.config"
     if not config.is_file():
         return None
-    content = outside.read_bytes(config, outside.WORKCELL_BYTES)
-    root = parse_elements(outside.xml_text(content), "model")
+    content = safe_io.read_bytes(config, safe_io.WORKCELL_BYTES)
+    root = parse_elements(safe_io.xml_text(content), "model")
     named = [(each.text or "").strip() for each in root.findall("sdf")]
     return named[-1] if named else None

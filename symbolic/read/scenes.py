@@ -12,28 +12,28 @@ from typing import Any
 import numpy as np
 import yaml
 
-from symbolic import outside
+from symbolic import safe_io
 from symbolic.array import Array
 from symbolic.errors import OutsideError, SceneError
-from symbolic.read.elements import Part, parse_elements
+from symbolic.read.elements import ElementReader, parse_elements
 from symbolic.read.mjcf import compiled, geom_shape
 from symbolic.read.scene_bodies import (
     ANY,
     WHERE,
-    Scene,
+    ImportedScene,
     SceneBuilder,
     file_at,
     quaternion_pose,
 )
-from symbolic.read.tables import Table
+from symbolic.read.tables import TableReader
 from symbolic.records import Box, Capsule, Cylinder, Sphere
 from symbolic.records.poses import inverse, pose_matrix, transform
 from symbolic.records.problems import shown, suggestion
 
-SHAPES = {"box": Box, "sphere": Sphere, "cylinder": Cylinder, "capsule": Capsule}
+SDF_SHAPES = {"box": Box, "sphere": Sphere, "cylinder": Cylinder, "capsule": Capsule}
 
 
-def read_scene(path: Path) -> Scene:
+def read_scene(path: Path) -> ImportedScene:
     """Read the obstacles of SDF (a world or a model), of MJCF, or of a MoveIt planning scene (its
     message in YAML, or its text format, .scene).
 
@@ -43,7 +43,7 @@ def read_scene(path: Path) -> Scene:
     """
     found = SceneBuilder()
     try:
-        text = outside.text(outside.read_bytes(path, outside.URDF_BYTES))
+        text = safe_io.text(safe_io.read_bytes(path, safe_io.URDF_BYTES))
         head = re.match(r"\s*+(?:(?><\?.*?\?>|<!--.*?-->)\s*+)*+<([A-Za-z]\w*)", text, re.DOTALL)
         kind = head[1] if head else path.suffix.lower()
         if kind not in READERS:
@@ -59,7 +59,9 @@ def read_scene(path: Path) -> Scene:
         raise SceneError(f"{path.name}: cannot be read as a scene{told}")
     if not found.bodies and not found.left_out:
         raise SceneError("; ".join([f"{path.name}: holds no obstacle", *found.notes[:5]]))
-    return Scene(tuple(found.bodies), tuple(found.left_out), tuple(found.notes), found.files)
+    return ImportedScene(
+        tuple(found.bodies), tuple(found.left_out), tuple(found.notes), found.files
+    )
 
 
 # --- SDF ---
@@ -77,7 +79,7 @@ OWN = ("", "__model__", "__root__")
 class _Scope:
     """Scope of names, a world or a model: its frames, and the models in it."""
 
-    part: Part
+    part: ElementReader
     file: Path
     frames: dict[str, tuple[str, Array]] = field(default_factory=dict)
     inner: dict[str, _Scope] = field(default_factory=dict)
@@ -135,16 +137,16 @@ class _Sdf:
                 self._found.note(name, "is not static; it is taken where it stands, joints at zero")
             self._shapes(model, scope.frame(name), name)
 
-    def _root(self, path: Path, found_in: str) -> Part:
+    def _root(self, path: Path, found_in: str) -> ElementReader:
         self._files += 1
         if self._files > MOST_FILES:
             raise OutsideError(f"includes more than {MOST_FILES} files, which is the limit")
-        content = outside.read_bytes(path, outside.URDF_BYTES)
-        return Part(
-            parse_elements(outside.xml_text(content), "sdf"), found_in, self._found.problems
+        content = safe_io.read_bytes(path, safe_io.URDF_BYTES)
+        return ElementReader(
+            parse_elements(safe_io.xml_text(content), "sdf"), found_in, self._found.problems
         )
 
-    def _scope(self, part: Part, file: Path, trail: tuple[Path, ...]) -> _Scope:
+    def _scope(self, part: ElementReader, file: Path, trail: tuple[Path, ...]) -> _Scope:
         scope = _Scope(part, file)
         for tag in ("link", "frame", "joint"):
             for name, each in part.named(tag).items():
@@ -161,7 +163,7 @@ class _Sdf:
         return scope
 
     def _place(
-        self, scope: _Scope, name: str, model: _Scope, placed: tuple[str, Array], by: Part
+        self, scope: _Scope, name: str, model: _Scope, placed: tuple[str, Array], by: ElementReader
     ) -> None:
         """Enter a model at its pose, which `placed` states for its placement frame."""
         base, pose = placed
@@ -169,7 +171,7 @@ class _Sdf:
         scope.enter(name, base, pose @ inverse(model.frame(frame)))
         scope.inner[name] = model
 
-    def _include(self, scope: _Scope, part: Part, trail: tuple[Path, ...]) -> None:
+    def _include(self, scope: _Scope, part: ElementReader, trail: tuple[Path, ...]) -> None:
         address = part.inner_text("uri")
         wanted = part.inner_text("name")
         path = file_at(address, scope.file)
@@ -196,7 +198,7 @@ class _Sdf:
             placed = self._pose(part if part.child("pose") else model)
             self._place(scope, wanted or name, inner, placed, by)
 
-    def _pose(self, part: Part) -> tuple[str, Array]:
+    def _pose(self, part: ElementReader) -> tuple[str, Array]:
         """Read an element's pose (4, 4) and the frame that it is relative to, '' for the
         default."""
         pose = part.child("pose")
@@ -230,14 +232,14 @@ class _Sdf:
         for inner, model in scope.inner.items():
             self._shapes(model, T_world_model @ scope.frame(inner), f"{name} {inner}")
 
-    def _shape(self, collision: Part, file: Path, name: str, pose: Array) -> None:
+    def _shape(self, collision: ElementReader, file: Path, name: str, pose: Array) -> None:
         geometry = collision.required("geometry")
         element = next(iter(geometry.element), None)
         if element is None:
             collision.problems.add(geometry.path, "is empty; allowed is a shape")
             return
         part = geometry.required(element.tag)
-        kind = SHAPES.get(part.tag)
+        kind = SDF_SHAPES.get(part.tag)
         if kind is not None:
             count = 3 if kind is Box else 1
             sizes = [part.required(each.name).content((ANY,) * count) for each in fields(kind)]
@@ -289,7 +291,7 @@ def read_message(path: Path) -> dict[str, Any]:
     Raises:
         OutsideError: it is no such file.
     """
-    text = outside.text(outside.read_bytes(path, outside.URDF_BYTES))
+    text = safe_io.text(safe_io.read_bytes(path, safe_io.URDF_BYTES))
     try:
         # `ros2 topic echo` ends a message by a line that begins the next one.
         document = next(iter(yaml.load_all(text, Loader=_Loader)), None)
@@ -308,7 +310,7 @@ def _read_moveit(path: Path, found: SceneBuilder) -> None:
     """
     document = read_message(path)
     scene = document.get("scene")
-    whole = Table(scene if isinstance(scene, dict) else document, "", found.problems)
+    whole = TableReader(scene if isinstance(scene, dict) else document, "", found.problems)
     world = whole.table("world", {}) if "world" in whole else whole
     if "collision_objects" not in world:
         raise OutsideError("has no world.collision_objects; is it a planning scene of MoveIt?")
@@ -327,7 +329,9 @@ def _read_moveit(path: Path, found: SceneBuilder) -> None:
         found.leave(str(name), "is attached to a robot; describe it as the payload or a tool")
 
 
-def _object(table: Table, frames: Mapping[str, Array], path: Path, found: SceneBuilder) -> None:
+def _object(
+    table: TableReader, frames: Mapping[str, Array], path: Path, found: SceneBuilder
+) -> None:
     """Add one collision object: its primitives, meshes and planes."""
     name = str(table.raw("id", "") or "object")
     if table.raw("operation", None) not in _ADDED:
@@ -367,7 +371,7 @@ def _object(table: Table, frames: Mapping[str, Array], path: Path, found: SceneB
 _PLACES = {"primitives": "primitive_poses", "meshes": "mesh_poses", "planes": "plane_poses"}
 
 
-def _frame(table: Table, place: str = "position", turn: str = "orientation") -> Array:
+def _frame(table: TableReader, place: str = "position", turn: str = "orientation") -> Array:
     """Read a pose (4, 4), its numbers by letters or in a row; a missing part is zero."""
     parts = []
     for key, letters in ((place, "xyz"), (turn, "xyzw")):
@@ -395,7 +399,9 @@ def _primitive(name: str, kind: str, sizes: Array, pose: Array, found: SceneBuil
             found.leave(name, f"is a {other}, which no body is")
 
 
-def _moveit_mesh(name: str, table: Table, pose: Array, path: Path, found: SceneBuilder) -> None:
+def _moveit_mesh(
+    name: str, table: TableReader, pose: Array, path: Path, found: SceneBuilder
+) -> None:
     """Add a mesh by its address, or by its triangles."""
     if table.has("resource"):
         scale = table.vector("dimensions", (ANY,) * 3, (1.0, 1.0, 1.0))
@@ -439,7 +445,7 @@ def _read_moveit_text(path: Path, found: SceneBuilder) -> None:
     Raises:
         OutsideError: it is no such text.
     """
-    text = outside.text(outside.read_bytes(path, outside.URDF_BYTES))
+    text = safe_io.text(safe_io.read_bytes(path, safe_io.URDF_BYTES))
     _, *objects = re.split(r"^\*", text, flags=re.MULTILINE)
     # Behind the first name stands a place, or in an old text the number of shapes.
     placed = any(len(line.split()) > 1 for each in objects[:1] for line in each.split("\n")[1:2])

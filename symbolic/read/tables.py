@@ -35,7 +35,7 @@ from typing import (
 
 import numpy as np
 
-from symbolic import outside
+from symbolic import safe_io
 from symbolic.array import Array, Filling, Form, Missing, Range, Shape
 from symbolic.errors import DualArmError, OutsideError
 from symbolic.records import Body, Box, Cylinder, Mesh, Sphere
@@ -53,7 +53,7 @@ Record = TypeVar("Record")
 _REQUIRED: Any = object()
 
 
-class Table:
+class TableReader:
     """A table of a document, read key by key.
 
     Args:
@@ -170,16 +170,16 @@ class Table:
         self.add(key, f"found {shown(value)}; allowed is an array of texts, {meaning}")
         return ()
 
-    def table(self, key: str, default: Mapping[str, Any] | None = None) -> Table:
+    def table(self, key: str, default: Mapping[str, Any] | None = None) -> TableReader:
         """Read a sub-table; after a problem, an empty one that reports nothing further."""
         value = self.raw(key, _REQUIRED if default is None else default)
         if value is not None and isinstance(value, Mapping):
-            return Table(value, self.at(key), self.problems)
+            return TableReader(value, self.at(key), self.problems)
         if value is not None:
             self.add(key, f"found {shown(value)}; allowed is a table")
-        return Table({}, self.at(key), Problems())
+        return TableReader({}, self.at(key), Problems())
 
-    def tables(self, key: str, exactly: int | None = None) -> list[Table]:
+    def tables(self, key: str, exactly: int | None = None) -> list[TableReader]:
         """Read an array of tables: optional and of any length, or of exactly that many.
 
         Of too many the first ones.
@@ -194,7 +194,7 @@ class Table:
         if exactly is not None and len(value) != exactly:
             self.add(key, f"found {len(value)} tables; allowed are exactly {exactly}")
         return [
-            Table(entry, f"{self.at(key)}[{index}]", self.problems)
+            TableReader(entry, f"{self.at(key)}[{index}]", self.problems)
             for index, entry in enumerate(value[:exactly])
         ]
 
@@ -252,7 +252,7 @@ def checked(kind: Any, value: Any, path: str, problems: Problems) -> Any:
         return _array(shape, marks, value, path, problems)
     if isinstance(kind, type) and is_dataclass(kind):
         if isinstance(value, Mapping):
-            return Table(value, path, problems).record(kind)
+            return TableReader(value, path, problems).record(kind)
         problem = "allowed is a table"
     elif origin is tuple:
         kinds = arguments
@@ -410,7 +410,7 @@ SHAPES = {"box": Box, "cylinder": Cylinder, "sphere": Sphere, "mesh": Mesh}
 """Shapes of a body by their kinds in a file."""
 
 
-def read_pose(table: Table, key: str) -> Array:
+def read_pose(table: TableReader, key: str) -> Array:
     """Read a transform (4, 4), read-only, from a sub-table {xyz, rpy}, both zero by default."""
     inner = table.table(key)
     pose = _xyz_rpy(inner)
@@ -418,23 +418,25 @@ def read_pose(table: Table, key: str) -> Array:
     return pose
 
 
-def _xyz_rpy(table: Table) -> Array:
+def _xyz_rpy(table: TableReader) -> Array:
     xyz = table.vector("xyz", (quantity.POSITION,) * 3, default=(0.0, 0.0, 0.0))
     rpy = table.vector("rpy", (quantity.ANGLE,) * 3, default=(0.0, 0.0, 0.0))
     return read_only(pose_matrix(xyz, rpy))
 
 
-def read_body(table: Table, folder: Path) -> Body:
+def read_body(table: TableReader, folder: Path) -> Body:
     """Read a named collision shape with its pose; mesh paths are relative to `folder`."""
     name, pose = table.text("name"), _xyz_rpy(table)
     kind = table.choice("kind", tuple(SHAPES))
     if not kind:  # without a kind nobody can say which keys are unknown
         return Body(name, Sphere(1.0), pose)
-    files = {"path": read_file(table, "path", folder, outside.MESH_BYTES)} if kind == "mesh" else {}
+    files = {"path": read_file(table, "path", folder, safe_io.MESH_BYTES)} if kind == "mesh" else {}
     return Body(name, table.record(SHAPES[kind], **files), pose)
 
 
-def read_file(table: Table, key: str, folder: Path, most: int, at: Path | None = None) -> Path:
+def read_file(
+    table: TableReader, key: str, folder: Path, most: int, at: Path | None = None
+) -> Path:
     """Return the absolute path of a readable file named relative to `folder`.
 
     Args:
@@ -450,8 +452,8 @@ def read_file(table: Table, key: str, folder: Path, most: int, at: Path | None =
         table.add(key, f"found {shown(value)}; allowed is the path of a file")
         return folder
     try:
-        path = outside.resolved(at or folder / value)
-        outside.require(path, most)
+        path = safe_io.resolved(at or folder / value)
+        safe_io.require(path, most)
     except OutsideError as error:
         hint = "" if at else "; paths are relative to the workcell file"
         table.add(key, f"found {shown(value)}, which {error}{hint}")
@@ -459,7 +461,7 @@ def read_file(table: Table, key: str, folder: Path, most: int, at: Path | None =
     return path
 
 
-def read_inertia(table: Table, bound: float, allowed: str = "a 3 x 3 matrix") -> Array:
+def read_inertia(table: TableReader, bound: float, allowed: str = "a 3 x 3 matrix") -> Array:
     """Read the (3, 3) matrix of the key `inertia` [kg m^2] of a rigid body.
 
     Args:

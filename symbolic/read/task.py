@@ -19,7 +19,7 @@ import pinocchio as pin
 from symbolic.array import Array
 from symbolic.read.arms import FOLLOWING, arm_model, common_joints, link_frame, turning_joints
 from symbolic.read.payload import SHAPE_KEYS
-from symbolic.read.tables import Table, checked_vector
+from symbolic.read.tables import TableReader, checked_vector
 from symbolic.records import (
     POSE_SIZE,
     Allocation,
@@ -52,10 +52,10 @@ MAX_PIECES = 10
 MOST_TURN = 5.0
 """Largest rotation vector of a waypoint [rad]: a full turn less what the spline may swing out."""
 
-ABOVE_STILL = 1.001
+FORCE_LIMIT_MARGIN = 1.001
 
 
-def read_task(table: Table) -> tuple[Task, tuple[RedundancyEntry, ...]]:
+def read_task(table: TableReader) -> tuple[Task, tuple[RedundancyEntry, ...]]:
     """Read the task (fixed poses, waypoints, sampling, limits) and the entries of redundant
     joints."""
     orientation = _orientation(table)
@@ -90,7 +90,7 @@ def read_task(table: Table) -> tuple[Task, tuple[RedundancyEntry, ...]]:
     return task, redundant
 
 
-def _allocation(table: Table, time_law: TimeLaw) -> Allocation:
+def _allocation(table: TableReader, time_law: TimeLaw) -> Allocation:
     """Read the allocation of forces; the default is 'soft-finger' under the law 'optimal', else
     'paper'."""
     driven = time_law == "optimal"
@@ -99,7 +99,7 @@ def _allocation(table: Table, time_law: TimeLaw) -> Allocation:
     return cast("Allocation", own if driven else usual)
 
 
-def _known_allocation(table: Table, key: str, usual: str) -> str:
+def _known_allocation(table: TableReader, key: str, usual: str) -> str:
     if table.raw(key, usual) == "joint":
         table.add(
             key,
@@ -133,11 +133,11 @@ def with_force_limit(task: Task, payload: Payload, contacts: Sequence[Contact]) 
     if np.isfinite(task.force_limit[1]):
         return task
     still = payload.mass * -GRAVITY[2] / sum(contact.friction for contact in contacts)
-    highest = max(float(task.reference_force.min()), ABOVE_STILL * still)
-    return replace(task, force_limit=(ABOVE_STILL * still, highest))
+    highest = max(float(task.reference_force.min()), FORCE_LIMIT_MARGIN * still)
+    return replace(task, force_limit=(FORCE_LIMIT_MARGIN * still, highest))
 
 
-def _orientation(table: Table) -> Orientation:
+def _orientation(table: TableReader) -> Orientation:
     """Read the meaning of the last three numbers of every pose of the task."""
     known = get_args(Rotation)
     rotation = cast("Rotation", table.choice("rotation", known, known[0]))
@@ -149,7 +149,7 @@ def _orientation(table: Table) -> Orientation:
     return Orientation(rotation, read_only(rotation_from_rpy(rpy)))
 
 
-def _force_limit(table: Table) -> tuple[float, float]:
+def _force_limit(table: TableReader) -> tuple[float, float]:
     """Read the bounds of the force limit; the upper one is infinite if the file has none."""
     if "force_limit" not in table:
         return (0.0, np.inf)
@@ -162,12 +162,12 @@ def _force_limit(table: Table) -> tuple[float, float]:
     return (float(low), float(high))
 
 
-def _fixed(table: Table, key: str) -> Waypoint:
+def _fixed(table: TableReader, key: str) -> Waypoint:
     pose = table.vector(key, quantity.POSE)
     return Waypoint(pose, pose)
 
 
-def _waypoints(table: Table, names: Sequence[str]) -> list[Waypoint]:
+def _waypoints(table: TableReader, names: Sequence[str]) -> list[Waypoint]:
     """Read one fixed waypoint, or `count` free ones that share their bounds."""
     if table.has("fixed"):
         pose = table.vector("fixed", quantity.POSE)
@@ -192,7 +192,7 @@ def _waypoints(table: Table, names: Sequence[str]) -> list[Waypoint]:
     return [Waypoint(lower, upper)] * count
 
 
-def _read_initial(table: Table, free: list[Waypoint], names: Sequence[str]) -> Array:
+def _read_initial(table: TableReader, free: list[Waypoint], names: Sequence[str]) -> Array:
     """Read the initial free waypoints (n_free, 6); the centres of the bounds by default."""
     value = table.raw("initial", None)
     path, problems = table.at("initial"), table.problems
@@ -251,7 +251,7 @@ class RedundancyEntry:
     initial: Array | None = None
 
 
-def read_redundant(table: Table, n_waypoints: int) -> tuple[RedundancyEntry, ...]:
+def read_redundant(table: TableReader, n_waypoints: int) -> tuple[RedundancyEntry, ...]:
     """Read the entries of `task.redundant`."""
     found = []
     for entry in table.tables("redundant"):
@@ -377,16 +377,16 @@ def _joint(
 SEEDS = 24
 """Random postures from which the start posture is looked for."""
 
-STEPS = 80
+MAX_NEWTON_STEPS = 80
 """Newton steps to the start posture, and at most to each pose after it."""
 
-BETWEEN = 4
+POSES_PER_PIECE = 4
 """Poses per piece of the path."""
 
 CLOSE = 1e-4
 """Pose error of a reached posture [m, rad]; the values are only a proposal."""
 
-CENTRING = 0.05
+CENTRING_SHARE = 0.05
 """Share of the way to the middle of their ranges that joints go in a step where they are free."""
 
 
@@ -404,7 +404,7 @@ class PosturePath:
 
     def at_waypoints(self, joint: int) -> Array:
         """Return a joint's positions (n_waypoints,) [rad or m], rounded to 0.001."""
-        return np.asarray(np.round(self.q[::BETWEEN, joint], 3))
+        return np.asarray(np.round(self.q[::POSES_PER_PIECE, joint], 3))
 
 
 class _Chain:
@@ -441,13 +441,13 @@ class _Chain:
 
     def reach(self, q: Array, pose: Array) -> Array | None:
         """Find a posture near q that holds the box within the joint limits; None without one."""
-        for _ in range(STEPS):
+        for _ in range(MAX_NEWTON_STEPS):
             error = self.error(q, pose)
             if np.linalg.norm(error) < CLOSE and self.within(q):
                 return q
             J = self.jacobian(q)[:, self.free]
             inverted = J.T @ np.linalg.inv(J @ J.T + 1e-8 * np.eye(6))
-            centring = CENTRING * (self.middle - q)[self.free]
+            centring = CENTRING_SHARE * (self.middle - q)[self.free]
             step = inverted @ error + centring - inverted @ (J @ centring)
             q = q.copy()
             q[self.free] += step * min(1.0, 0.4 / max(float(np.abs(step).max()), 1e-12))
@@ -487,7 +487,7 @@ def posture_path(
     points = np.array([waypoint.lower for waypoint in task.waypoints])
     points[list(task.free_indices)] = task.initial
     points[:, 3:] = task.orientation.unwrapped(points[:, 3:])
-    u = np.linspace(0.0, 1.0, BETWEEN * (len(points) - 1) + 1)
+    u = np.linspace(0.0, 1.0, POSES_PER_PIECE * (len(points) - 1) + 1)
     poses = path_basis(len(points), u).position @ points[:, :POSE_SIZE]
     best, most = None, -np.inf
     for start in chain.starts():

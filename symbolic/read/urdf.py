@@ -19,11 +19,11 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from symbolic import outside
+from symbolic import safe_io
 from symbolic.array import Array
 from symbolic.errors import OutsideError, UrdfError
 from symbolic.read.descriptions import Arguments, description_content
-from symbolic.read.elements import Part, parse_elements
+from symbolic.read.elements import ElementReader, parse_elements
 from symbolic.records import Box, Capsule, Cylinder, IgnoredPair, Sphere
 from symbolic.records import quantities as quantity
 from symbolic.records.poses import pose_matrix, read_only
@@ -132,8 +132,8 @@ def parse_urdf(content: bytes, file: str) -> Urdf:
     """
     problems = Problems()
     try:
-        root = parse_elements(outside.xml_text(content))
-        urdf = _read_robot(Part(root, "", problems), file)
+        root = parse_elements(safe_io.xml_text(content))
+        urdf = _read_robot(ElementReader(root, "", problems), file)
     except OutsideError as error:
         raise UrdfError(file, (str(error),)) from error
     if problems.found:
@@ -141,7 +141,7 @@ def parse_urdf(content: bytes, file: str) -> Urdf:
     return urdf
 
 
-def _read_robot(root: Part, file: str) -> Urdf:
+def _read_robot(root: ElementReader, file: str) -> Urdf:
     links, joints = root.named("link"), root.named("joint")
     if len(links) > MOST_LINKS:
         raise OutsideError(
@@ -173,7 +173,7 @@ def _read_robot(root: Part, file: str) -> Urdf:
     return urdf
 
 
-def _check_inertial(link: Part) -> None:
+def _check_inertial(link: ElementReader) -> None:
     inertial = link.child("inertial")
     if inertial is None:
         return
@@ -200,7 +200,7 @@ def _inertia_problem(inertia: Array, mass: float) -> str:
     return ""
 
 
-def _collision(part: Part) -> UrdfCollision:
+def _collision(part: ElementReader) -> UrdfCollision:
     pose = pose_of(part)
     shape: Box | Cylinder | Sphere | Capsule | UrdfMesh = Sphere(1.0)
     element = part.required("geometry").only(("box", "cylinder", "sphere", "capsule", "mesh"))
@@ -222,7 +222,7 @@ def _collision(part: Part) -> UrdfCollision:
     return UrdfCollision(shape, pose)
 
 
-def _visual_meshes(link: Part) -> tuple[str, ...]:
+def _visual_meshes(link: ElementReader) -> tuple[str, ...]:
     found = (mesh.get("filename", "") for mesh in link.element.findall("visual/geometry/mesh"))
     return tuple(address for address in found if address)
 
@@ -258,7 +258,7 @@ class UrdfJoint:
     offset: float = 0.0
 
 
-def _joint(joint: Part) -> UrdfJoint:
+def _joint(joint: ElementReader) -> UrdfJoint:
     kind = joint.choice("type", JOINT_TYPES)
     parent, child = (joint.required(tag).text("link") for tag in ("parent", "child"))
     pose_of(joint)
@@ -301,7 +301,7 @@ def _joint(joint: Part) -> UrdfJoint:
     return found
 
 
-def pose_of(part: Part) -> Array:
+def pose_of(part: ElementReader) -> Array:
     """Read an element's origin (4, 4); the identity without one."""
     origin = part.child("origin")
     if origin is None:
@@ -375,7 +375,7 @@ def read_srdf(path: Path) -> tuple[IgnoredPair, ...]:
         UrdfError: the file cannot be read, is no XML, or one of these elements lacks a link.
     """
     try:
-        return _parse_srdf(outside.read_bytes(path, outside.URDF_BYTES), path.name)
+        return _parse_srdf(safe_io.read_bytes(path, safe_io.URDF_BYTES), path.name)
     except OutsideError as error:
         raise UrdfError(path.name, (str(error),)) from error
 
@@ -383,7 +383,7 @@ def read_srdf(path: Path) -> tuple[IgnoredPair, ...]:
 @lru_cache(maxsize=8)
 def _parse_srdf(content: bytes, file: str) -> tuple[IgnoredPair, ...]:
     problems = Problems()
-    root = Part(parse_elements(outside.xml_text(content)), "", problems)
+    root = ElementReader(parse_elements(safe_io.xml_text(content)), "", problems)
     pairs = tuple(
         IgnoredPair(part.text("link1"), part.text("link2"), part.raw("reason") or "")
         for part in root.all("disable_collisions")

@@ -12,9 +12,9 @@ format; `symbolic.read.cell` reads them from TOML.
 """
 
 from symbolic.records.cell import (
-    PAYLOAD,
-    SEARCHED,
-    USUAL,
+    PAYLOAD_NAME,
+    SEARCHED_BRANCH,
+    USUAL_UNCERTAINTY,
     Body,
     Box,
     Capsule,
@@ -44,10 +44,10 @@ from symbolic.records.task import (
 )
 
 __all__ = [
-    "PAYLOAD",
+    "PAYLOAD_NAME",
     "POSE_SIZE",
-    "SEARCHED",
-    "USUAL",
+    "SEARCHED_BRANCH",
+    "USUAL_UNCERTAINTY",
     "Allocation",
     "AllowedContact",
     "Body",

@@ -392,7 +392,7 @@ RANGES = {
 }
 """What is uncertain in an `Uncertainty`, by name: words, and the factor to the unit in them."""
 
-USUAL = Uncertainty(
+USUAL_UNCERTAINTY = Uncertainty(
     friction=0.20,  # slips of one pair of surfaces spread by 10 %; twice that for another day
     mass=0.05,  # wrist sensors, zeroed: -10 to +5 %; a box that was weighed
     centre_of_mass=np.broadcast_to(0.005, 3),  # calibrated by tilts: 1.3 to 1.8 mm rms; 3 times it
@@ -473,14 +473,14 @@ def _paths(value: Any) -> Iterator[str]:
 # --- the whole cell ---
 
 
-BESIDE = 1e-9
+OFFSET_TOLERANCE = 1e-9
 """Distance between contacts, seen along their normals, from which on they count as beside one
 another [m]."""
 
 OPPOSITE = 1e-9
 """Sum of two unit normals that counts as none."""
 
-SEARCHED = -2
+SEARCHED_BRANCH = -2
 """`Workcell.start_branch` of a robot whose branches compete."""
 
 
@@ -522,7 +522,7 @@ class Workcell:
         robots: the two arms; robot i holds contact i.
         payload, contacts, task, environment, collision, uncertainty, handling: see their records.
         start_branch: (2,) per robot the index of the start branch among the ranked branches,
-            -1 for the stated criterion's choice, or `SEARCHED`: all compete, see
+            -1 for the stated criterion's choice, or `SEARCHED_BRANCH`: all compete, see
             `hybrid_opt.branches`, and until then it is the criterion's choice.
         source: the file it came from.
         reading: what it was like when it was read from `source`.
@@ -539,11 +539,11 @@ class Workcell:
     start_branch: tuple[int, int] = (-1, -1)
     source: Path = Path()
     reading: Reading | None = None
-    uncertainty: Uncertainty = USUAL
+    uncertainty: Uncertainty = USUAL_UNCERTAINTY
     handling: Handling = field(default_factory=Handling)
     text: bytes | None = field(default=None, repr=False)
 
-    def of_joints(self, name: str) -> Array:
+    def stack_joint_limits(self, name: str) -> Array:
         """Stack a limit that each robot states per joint, both arms: (joints,)."""
         return np.concatenate([getattr(robot, name) for robot in self.robots])
 
@@ -568,16 +568,16 @@ class Workcell:
         return abs(float((first - second) @ self.contacts[0].T_box_pad[:3, 2]))
 
     @property
-    def pads_beside(self) -> float:
+    def pad_offset(self) -> float:
         """Lateral offset of the contacts, seen along the first one's normal [m]."""
         first, second = (contact.T_box_pad[:3, 3] for contact in self.contacts)
         normal, apart = self.contacts[0].T_box_pad[:3, 2], first - second
         return float(np.linalg.norm(apart - (apart @ normal) * normal))
 
     @property
-    def has_pads_beside(self) -> bool:
+    def has_offset_pads(self) -> bool:
         """True if the contacts are offset laterally."""
-        return self.pads_beside > BESIDE
+        return self.pad_offset > OFFSET_TOLERANCE
 
     @property
     def has_closed_form(self) -> bool:
@@ -587,7 +587,7 @@ class Workcell:
         return allocation == "paper" or (allocation == "soft-finger" and self.has_opposite_pads)
 
     @property
-    def has_one_squeeze(self) -> bool:
+    def has_scalar_squeeze(self) -> bool:
         """True if the force of one pad determines the other's, so that one number states the
         grasp force."""
         return self.has_opposite_pads
@@ -628,5 +628,5 @@ def flange_lever(robot: Robot, contact: Contact) -> Array:
     return contact.T_box_pad[:3, 3] - box_flange(robot, contact)[:3, 3] if known is None else known
 
 
-PAYLOAD = "payload"
+PAYLOAD_NAME = "payload"
 """Name of the payload's body."""

@@ -1,12 +1,11 @@
 """Records whose parameters are symbols: formulas take them where a cell's parameters are inputs.
 
 A formula reads `payload.mass` of either kind of record, so that it is written once. A function made
-of records with symbols has their groups as its last inputs (`symbolic.expression.sx_given`); of
-plain records it has none. Beside its own numbers a record holds those that NumPy derives from them,
+of records with symbols has their groups as its last inputs (`symbolic.expression.sx_parameters`); a
+function of plain records has none. A record also holds the numbers that NumPy derives from its own,
 so that compiled code sees the same bits as a constant would have.
 
-What is not taken for a number of a group stays as it is and is structure
-(`symbolic.numbers.CellNumbers`).
+Everything else in a record is topology (`symbolic.parameters.CellParameters`).
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ from symbolic.records.task import RedundantJoint, Task, Waypoint
 
 
 @dataclass(frozen=True)
-class Group:
+class ParameterGroup:
     """Parameters that functions take as one vector.
 
     Attributes:
@@ -46,14 +45,14 @@ class NumberedRobot(Robot):
 
     T_box_flange: Any = None
     lever: Any = None
-    given: Group | None = None
+    given: ParameterGroup | None = None
 
 
 @dataclass(frozen=True)
 class NumberedPayload(Payload):
     """The payload. given: its parameters, with those of the contacts."""
 
-    given: Group | None = None
+    given: ParameterGroup | None = None
 
 
 @dataclass(frozen=True)
@@ -72,6 +71,7 @@ class NumberedWaypoint(Waypoint):
 
     @property
     def is_fixed(self) -> bool:
+        """True if the task fixes this pose."""
         return self.fixed
 
 
@@ -84,6 +84,7 @@ class NumberedJoint(RedundantJoint):
 
     @property
     def moving(self) -> NDArray[np.bool_]:
+        """(n_waypoints,) True where its value is a decision variable."""
         return np.array(self.free, dtype=np.bool_)
 
 
@@ -91,7 +92,7 @@ class NumberedJoint(RedundantJoint):
 class NumberedTask(Task):
     """A task. given: its parameters."""
 
-    given: Group | None = None
+    given: ParameterGroup | None = None
 
 
 @dataclass(frozen=True)
@@ -125,7 +126,7 @@ class GraspNumbers:
     rest: Any
     rest_slopes: Any
     reach: Any
-    given: Group | None = None
+    given: ParameterGroup | None = None
 
 
 @dataclass(frozen=True)
@@ -146,12 +147,15 @@ class NumberedWorkcell(Workcell):
 
     @property
     def has_facing_pads(self) -> bool:
+        """True if two round pads with opposite normals hold the payload."""
         return self.facing
 
     @property
     def has_opposite_pads(self) -> bool:
+        """True if two pads with opposite normals hold the payload."""
         return self.opposite
 
     @property
-    def has_pads_beside(self) -> bool:
+    def has_offset_pads(self) -> bool:
+        """True if the contacts are offset laterally."""
         return self.beside

@@ -22,7 +22,7 @@ MOST_PROBLEMS = 100
 """Most problems of a file that are listed; the rest is counted."""
 
 
-LONGEST_WORD = 200
+LONGEST_SUGGESTION = 200
 """Longest word for which a similar one is looked for."""
 
 
@@ -80,7 +80,7 @@ def _is_within(path: str, prefix: str) -> bool:
 
 def suggestion(word: str, candidates: Iterable[str]) -> str:
     """Return a 'did you mean' for a misspelt word, or an empty string."""
-    if len(word) > LONGEST_WORD:
+    if len(word) > LONGEST_SUGGESTION:
         return ""
     close = difflib.get_close_matches(word, list(candidates), n=1, cutoff=0.6)
     return f"; did you mean {close[0]!r}?" if close else ""

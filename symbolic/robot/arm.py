@@ -3,10 +3,9 @@
 Paper Eqs. 29-33 and 61-62. The flange's target follows from the box pose alone, so both arms
 keep the relative grasp exactly; an arm's redundant joints are where the extended pose says
 (`RobotModel`), the other six follow. Newton's method is warm started by quadratic extrapolation of
-the previous samples; what it reaches is measured, never assumed. Two cheap steps suffice nearly
-everywhere, a third is made where the second started too far away, and where that is not enough,
-`NEWTON_STEPS` steps by the QR factors have the last word: a sample counts as lost only if they do
-not reach it either.
+the previous samples, and its residual is measured. Two cheap steps suffice nearly everywhere. A
+third follows where the second started too far away. If that is not enough, `IK_NEWTON_STEPS` steps
+by QR factors decide: a sample counts as lost only if they do not reach it either.
 """
 
 from __future__ import annotations
@@ -19,7 +18,14 @@ from operator import add
 import casadi as ca
 import numpy as np
 
-from symbolic.expression import Expression, mx_given, named_function, number, repeated, sx_given
+from symbolic.expression import (
+    Expression,
+    mx_parameters,
+    named_function,
+    number,
+    sx_parameters,
+    tile,
+)
 from symbolic.path.rotation import rotation_matrix
 from symbolic.records import Contact, Robot
 from symbolic.records.cell import box_flange, flange_lever
@@ -29,7 +35,7 @@ Arms = tuple[Robot, Robot]
 Models = tuple[RobotModel, RobotModel]
 Contacts = tuple[Contact, Contact]
 
-NEWTON_STEPS = 3
+IK_NEWTON_STEPS = 3
 """Newton steps per sample; extrapolation brings the start within their basin."""
 
 BEGIN_STEPS = 12
@@ -39,11 +45,11 @@ has them at the first sample."""
 CHEAP_STEPS = 2
 """Newton steps by blocks that every sample gets."""
 
-FAR = 1e-5
+THIRD_STEP_RESIDUAL = 1e-5
 """Pose residual before the last cheap step above which one more is made [m, rad]; Newton's method
 squares it, within a factor of about 5."""
 
-SURE = 1e-9
+TRUSTED_RESIDUAL = 1e-9
 """Pose residual above which the cheap steps are not trusted [m, rad]."""
 
 REACH_TOLERANCE = 1e-6
@@ -111,16 +117,18 @@ def track_function(robot: Robot, model: RobotModel, contact: Contact, name: str)
     """
     n = model.n_joints
     state, pose = ca.MX.sym("state", 3 * n + 1), ca.MX.sym("pose", model.pose_size)
-    wrench, given = ca.MX.sym("wrench", 6), mx_given(robot)
+    wrench, given = ca.MX.sym("wrench", 6), mx_parameters(robot)
     parts = _track_parts(robot, model, contact)
     previous, lost = state[:n], state[3 * n]
     rotation, R_target, p_target = parts["target"](pose, *given.values())
     target = (R_target, p_target)
     q, before = parts["approach"](state, pose, *target)
     following = lost < 0.5
-    q = parts["closer"](ca.logic_and(following, ca.logic_not(before <= FAR)), q, *target)
+    q = parts["closer"](
+        ca.logic_and(following, ca.logic_not(before <= THIRD_STEP_RESIDUAL)), q, *target
+    )
     found = parts["place"](q, *target)
-    unsure = ca.logic_and(following, ca.logic_not(found[1] <= SURE))
+    unsure = ca.logic_and(following, ca.logic_not(found[1] <= TRUSTED_RESIDUAL))
     found = parts["again"](unsure, state, pose, *target, *found)
     jump = ca.norm_inf(found[0] - previous)
     arrived = ca.logic_and(found[1] <= REACH_TOLERANCE, jump <= MAX_JOINT_STEP)
@@ -151,7 +159,7 @@ def torque_function(robot: Robot, model: RobotModel, contact: Contact, name: str
     rotation = rotation_matrix(model.orientation, pose[3:6])
     _, _, jacobian = model.kinematics(q)
     torque = joint_torque(robot, contact, jacobian, rotation, wrench)
-    return _function(name, [q, pose, wrench, *sx_given(robot).values()], [torque])
+    return _function(name, [q, pose, wrench, *sx_parameters(robot).values()], [torque])
 
 
 def _track_parts(robot: Robot, model: RobotModel, contact: Contact) -> dict[str, ca.Function]:
@@ -161,7 +169,7 @@ def _track_parts(robot: Robot, model: RobotModel, contact: Contact) -> dict[str,
     target: pose -> R_world_box, and the flange's target. approach: state, pose, target -> joints
     after `CHEAP_STEPS`, the residual before the last. closer: joints, target -> joints one step on.
     place: joints, target -> joints, residual, jacobian. again: state, pose, target and what `place`
-    found -> the better of that and `NEWTON_STEPS` steps by QR. held: previous joints, target and
+    found -> the better of that and `IK_NEWTON_STEPS` steps by QR. held: previous joints, target and
     what was found -> what `place` finds at the previous joints. measures: joints, jacobian,
     R_world_box, wrench -> limit margin, manipulability, joint torque.
     """
@@ -170,7 +178,7 @@ def _track_parts(robot: Robot, model: RobotModel, contact: Contact) -> dict[str,
     wrench = ca.SX.sym("wrench", 6)
     q, R, p = ca.SX.sym("q", n), ca.SX.sym("R", 3, 3), ca.SX.sym("p", 3)
     residual, jacobian = ca.SX.sym("residual"), ca.SX.sym("jacobian", 6, n)
-    start, given = ca.SX.sym("start", n), sx_given(robot).values()
+    start, given = ca.SX.sym("start", n), sx_parameters(robot).values()
     rotation = rotation_matrix(model.orientation, pose[3:6])
     target = [rotation, *flange_target(robot, contact, pose[:3], rotation)]
     previous, change = state[:n], state[n : 2 * n]
@@ -183,7 +191,7 @@ def _track_parts(robot: Robot, model: RobotModel, contact: Contact) -> dict[str,
     found = [q, residual, jacobian]
 
     other = model.with_redundant(previous + change, pose)
-    for _ in range(NEWTON_STEPS):
+    for _ in range(IK_NEWTON_STEPS):
         other = newton_step(model, other, R, p)
     anew = _placed(model, other, R, p)
     keep = residual <= anew[1]
@@ -236,7 +244,7 @@ def follow_function(
     predict it, and what they find takes the extrapolation's place.
     """
     start, pose = ca.MX.sym("start", model.n_joints), ca.MX.sym("pose", model.pose_size, samples)
-    wrench, given = ca.MX.sym("wrench", 6, samples), mx_given(robot)
+    wrench, given = ca.MX.sym("wrench", 6, samples), mx_parameters(robot)
     track = track_function(robot, model, contact, f"{name}_sample")
     begin = start_function(robot, model, contact, f"{name}_start")
     first = track(
@@ -245,7 +253,7 @@ def follow_function(
     predict = prediction_function(robot, model, contact, f"{name}_prediction")
     state = predict(first[0], pose[:, 1], *given.values())
     rest = track.mapaccum(f"{name}_samples", samples - 1)(
-        state, pose[:, 1:], wrench[:, 1:], *repeated(given, samples - 1)
+        state, pose[:, 1:], wrench[:, 1:], *tile(given, samples - 1)
     )
     return ca.Function(
         name,
@@ -265,7 +273,7 @@ def start_function(robot: Robot, model: RobotModel, contact: Contact, name: str)
     """
     n = model.n_joints
     start, pose = ca.MX.sym("start", n), ca.MX.sym("pose", model.pose_size)
-    numbers = mx_given(robot)
+    numbers = mx_parameters(robot)
     q: Expression = start
     if model.redundant:
         q_start, at = ca.SX.sym("start", n), ca.SX.sym("q", n)
@@ -274,7 +282,7 @@ def start_function(robot: Robot, model: RobotModel, contact: Contact, name: str)
         target = flange_target(robot, contact, given[:3], rotation)
         away = (model.with_redundant(q_start, given) - q_start) / BEGIN_STEPS
         moved = newton_step(model, at + away, *target)
-        inputs = [q_start, at, given, *sx_given(robot).values()]
+        inputs = [q_start, at, given, *sx_parameters(robot).values()]
         move = _function(f"{name}_step", inputs, [moved])
         for _ in range(BEGIN_STEPS):
             q = move(start, q, pose, *numbers.values())
@@ -297,10 +305,10 @@ def prediction_function(
     R_target, p_target = flange_target(robot, contact, pose[:3], rotation)
     start = state[:n]
     q = model.with_redundant(start, pose)
-    for _ in range(NEWTON_STEPS):
+    for _ in range(IK_NEWTON_STEPS):
         q = newton_step(model, q, R_target, p_target)
     predicting = ca.vertcat(start, q - start, ca.SX.zeros(n), state[3 * n])
-    given = sx_given(robot)
+    given = sx_parameters(robot)
     inputs, names = [state, pose, *given.values()], ["state", "pose", *given]
     return ca.Function(name, inputs, ca.cse([predicting]), names, ["predicting"])
 
@@ -309,7 +317,7 @@ def posture_function(robots: Arms, models: Models, contacts: Contacts) -> ca.Fun
     """Build the function of both arms' postures at one box pose, from nearby joint positions.
 
     Inputs: pose (6,) of the box; guess_1, guess_2 (n,) [rad], whose redundant joints stay. Outputs:
-    q_1, q_2 (n,) after `NEWTON_STEPS`; residual_1, residual_2, their pose residuals [m, rad].
+    q_1, q_2 (n,) after `IK_NEWTON_STEPS`; residual_1, residual_2, their pose residuals [m, rad].
     """
     pose = ca.SX.sym("pose", 6)
     guesses = [ca.SX.sym(f"guess_{i + 1}", model.n_joints) for i, model in enumerate(models)]
@@ -317,12 +325,12 @@ def posture_function(robots: Arms, models: Models, contacts: Contacts) -> ca.Fun
     postures, residuals = [], []
     for robot, model, contact, q in zip(robots, models, contacts, guesses, strict=True):
         R_target, p_target = flange_target(robot, contact, pose[:3], rotation)
-        for _ in range(NEWTON_STEPS):
+        for _ in range(IK_NEWTON_STEPS):
             q = newton_step(model, q, R_target, p_target)
         R, p = model.placement(q)
         postures.append(q)
         residuals.append(pose_error(R_target, p_target, R, p)[1])
-    given = sx_given(*robots)
+    given = sx_parameters(*robots)
     inputs = {"pose": pose, "guess_1": guesses[0], "guess_2": guesses[1]} | given
     names = ("q_1", "q_2", "residual_1", "residual_2")
     outputs = dict(zip(names, (*postures, *residuals), strict=True))

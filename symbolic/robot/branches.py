@@ -37,10 +37,10 @@ MOST_STEPS, STEPS = 80, 4
 SOLUTION_TOLERANCE = 1e-10
 """Largest pose residual of a solution [m, rad]."""
 
-SAME_BRANCH = 1e-4
+BRANCH_TOLERANCE = 1e-4
 """Solutions closer than this in every joint are one [rad]."""
 
-STEP_LIMIT = 0.4
+IK_STEP_LIMIT = 0.4
 """Largest change of a joint in one step of the search [rad]."""
 
 ROBUST_CLEARANCE = 0.02
@@ -163,7 +163,7 @@ def approach_function(model: RobotModel, name: str) -> ca.Function:
     normal = ca.mtimes(J.T, J) + damping * ca.SX.eye(6)
     D, LT, order = ca.ldl(normal, False)
     solved = ca.ldl_solve(ca.mtimes(J.T, error), D, LT, order)
-    scale = STEP_LIMIT / ca.fmax(ca.norm_inf(solved), STEP_LIMIT)
+    scale = IK_STEP_LIMIT / ca.fmax(ca.norm_inf(solved), IK_STEP_LIMIT)
     moved = list(ca.vertsplit(q))
     for k, joint in enumerate(model.following):
         moved[joint] = q[joint] + scale * solved[k]
@@ -238,7 +238,7 @@ def _distinct(q: Array) -> Array:
     while len(q):
         kept.append(q[0])
         turns = np.abs(np.remainder(q - q[0] + np.pi, 2 * np.pi) - np.pi)
-        q = q[~np.all(turns < SAME_BRANCH, axis=1)]
+        q = q[~np.all(turns < BRANCH_TOLERANCE, axis=1)]
     return np.array(kept).reshape(-1, q.shape[1])
 
 

@@ -21,7 +21,7 @@ import casadi as ca
 import numpy as np
 
 from symbolic.array import Array
-from symbolic.expression import named_function, sx_given
+from symbolic.expression import named_function, sx_parameters
 from symbolic.geometry.clearance import BOX_NUMBERS
 from symbolic.smooth.places import PathConstraint, PathPointSymbols
 
@@ -174,5 +174,5 @@ def gap_function(place: PathPointSymbols) -> ca.Function:
         unit = n / ca.sqrt(ca.fmax(squared, PARALLEL_SINE**2))
         along = place.sharp_scene.separation(obstacle, unit)
         found.append(ca.if_else(squared < PARALLEL_SINE**2, PARALLEL_GAP, along))
-    inputs = {"pose": place.pose, "obstacle": obstacle} | sx_given(place.model.screen)
+    inputs = {"pose": place.pose, "obstacle": obstacle} | sx_parameters(place.model.screen)
     return named_function(GAPS, inputs, {"gaps": ca.densify(ca.vertcat(*found))})

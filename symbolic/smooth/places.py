@@ -25,8 +25,8 @@ import numpy as np
 
 from symbolic.array import Array
 from symbolic.cell_model import CellBodies, CellModel
-from symbolic.expression import named_function, sx_given
-from symbolic.geometry.clearance import Scene, box_numbers
+from symbolic.expression import named_function, sx_parameters
+from symbolic.geometry.clearance import DistanceBounds, box_numbers
 from symbolic.geometry.expressions import EXACT, Softness
 from symbolic.path.rotation import rotation_matrix
 from symbolic.robot.arm import (
@@ -78,19 +78,19 @@ class PathPointSymbols:
         return rotation_matrix(self.model.workcell.task.orientation, self.pose[3:])
 
     @cached_property
-    def scene(self) -> Scene:
+    def scene(self) -> DistanceBounds:
         """Return the bodies, with rounded kinks of their distances."""
         return self._scene(Softness(KINK_WIDTH, PARALLEL_WIDTH))
 
     @cached_property
-    def sharp_scene(self) -> Scene:
+    def sharp_scene(self) -> DistanceBounds:
         """Return the bodies with exact distances."""
         return self._scene(EXACT)
 
-    def _scene(self, softness: Softness) -> Scene:
+    def _scene(self, softness: Softness) -> DistanceBounds:
         placed = [self.model.robots[arm].joint_placements(self.q[arm]) for arm in (0, 1)]
         at = self.rotation, self.pose[:3], (placed[0], placed[1])
-        return Scene(self.model.screen, *at, softness)
+        return DistanceBounds(self.model.screen, *at, softness)
 
     def obstacle(self, pair: int) -> Array:
         """Return the parameters of the box of a separable pair."""
@@ -141,7 +141,7 @@ class PathConstraint(ABC):
 
     def given(self, model: CellBodies) -> dict[str, ca.SX]:
         """Return the cell's parameters in the value: by default those of its bodies."""
-        return sx_given(model.screen)
+        return sx_parameters(model.screen)
 
 
 @dataclass(frozen=True, order=True)
@@ -245,7 +245,7 @@ class ManipulabilityLimit(PathConstraint):
 
     def given(self, model: CellBodies) -> dict[str, ca.SX]:
         """Return the symbols of the arm."""
-        return sx_given(model.workcell.robots[self.arm])
+        return sx_parameters(model.workcell.robots[self.arm])
 
 
 def row_name(family: str, order: Order) -> str:
@@ -307,7 +307,7 @@ def closure_functions(model: CellModel, arm: int) -> dict[str, ca.Function]:
     closure = ca.vertcat(held, *tied)
     pull = -ca.solve(ca.jacobian(closure, joints), ca.SX.eye(n))
     follow = ca.mtimes(pull, ca.jacobian(closure, pose))
-    given = sx_given(cell.robots[arm])
+    given = sx_parameters(cell.robots[arm])
     slopes = ca.Function("slopes", [pose, joints, *given.values()], [follow, pull])
 
     q = own.with_redundant(reference, pose)

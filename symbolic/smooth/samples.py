@@ -29,7 +29,14 @@ from symbolic.contact.grasp import Grasp
 from symbolic.contact.load import ContactLoad, frictions, held_by, required
 from symbolic.contact.paper import normal_force_branches, split_force
 from symbolic.contact.soft_grasp import SoftGrasp
-from symbolic.expression import mx_given, named_function, number, of, repeated, sx_given
+from symbolic.expression import (
+    mx_parameters,
+    named_function,
+    number,
+    select_parameters,
+    sx_parameters,
+    tile,
+)
 from symbolic.path.spline import PathBasis, sample_basis, waypoint_matrix
 from symbolic.path.time_law import timed_path
 from symbolic.records.cell import Workcell
@@ -182,17 +189,17 @@ def _window_functions(
     task = workcell.task
     n_waypoints = len(task.waypoints)
     x, basis = ca.MX.sym("x", task.n_var), ca.MX.sym("basis", n_waypoints, DIFFERENCE_WINDOW)
-    rounding, handed = ca.MX.sym("rounding"), mx_given(task, workcell.payload)
+    rounding, handed = ca.MX.sym("rounding"), mx_parameters(task, workcell.payload)
     # The window's poses are handed to the time law as waypoints of an identity basis.
     identity = np.eye(DIFFERENCE_WINDOW)
-    window = ca.mtimes(waypoint_matrix(task, x, of(handed, task)), basis)
+    window = ca.mtimes(waypoint_matrix(task, x, select_parameters(handed, task)), basis)
     own = PathBasis(np.linspace(0.0, 1.0, DIFFERENCE_WINDOW), identity, identity, identity)
     wrench = _wrench_function(workcell)
     wrenches = _at_samples(workcell, wrench, (own, window, rounding), columns, handed)
     flat = ca.Function("wrenches", [x, basis, rounding, *handed.values()], [wrenches]).expand()
     inputs = [ca.SX.sym(name, *flat.size_in(k)) for k, name in enumerate(INPUTS)]
-    given = sx_given(task, workcell.payload)
-    wrenches, held = flat(*inputs, *given.values()), sx_given(workcell.payload).values()
+    given = sx_parameters(task, workcell.payload)
+    wrenches, held = flat(*inputs, *given.values()), sx_parameters(workcell.payload).values()
     each = [sample(wrenches[k : k + 6], *held) for k in range(0, wrenches.numel(), 6)]
     return _functions(ca.vertcat(*each), inputs, given, quantity, block)
 
@@ -202,12 +209,12 @@ def _whole_path(
 ) -> dict[str, ca.Function]:
     task = workcell.task
     x, unused = ca.MX.sym("x", task.n_var), ca.MX.sym("basis", len(task.waypoints), task.samples)
-    rounding, handed = ca.MX.sym("rounding"), mx_given(task, workcell.payload)
+    rounding, handed = ca.MX.sym("rounding"), mx_parameters(task, workcell.payload)
     every, wrench = tuple(range(task.samples)), _wrench_function(workcell)
     motion = [ca.SX.sym(name, 6) for name in MOTION_INPUTS]
-    held = sx_given(workcell.payload).values()
+    held = sx_parameters(workcell.payload).values()
     whole = ca.Function("sample", [*motion, *held], [sample(wrench(*motion, *held), *held)])
-    waypoints = waypoint_matrix(task, x, of(handed, task))
+    waypoints = waypoint_matrix(task, x, select_parameters(handed, task))
     values = _at_samples(workcell, whole, (sample_basis(task), waypoints, None), every, handed)
     return _functions(values, [x, unused, rounding], handed, quantity, "path")
 
@@ -225,8 +232,11 @@ def _at_samples(
         along: basis, waypoints and rounding of `timed_path`.
         handed: parameters of task and payload.
     """
-    path, at = timed_path(workcell.task, *along, of(handed, workcell.task)), list(columns)
-    held = repeated(of(handed, workcell.payload), len(at))
+    path, at = (
+        timed_path(workcell.task, *along, select_parameters(handed, workcell.task)),
+        list(columns),
+    )
+    held = tile(select_parameters(handed, workcell.payload), len(at))
     each = of_motion.map(len(at))
     return ca.vec(each(path.pose[:, at], path.rate[:, at], path.second_rate[:, at], *held))
 
@@ -239,7 +249,7 @@ def _wrench_function(workcell: Workcell) -> ca.Function:
     centre = number(payload.centre_of_mass)
     rotation, *_, force, moment = required(workcell, pose, rate, second, centre)
     wrench = ca.vertcat(ca.mtimes(rotation.T, force), ca.mtimes(rotation.T, moment))
-    return ca.Function("sample_wrench", [*motion, *sx_given(payload).values()], [wrench])
+    return ca.Function("sample_wrench", [*motion, *sx_parameters(payload).values()], [wrench])
 
 
 def _margin_function(workcell: Workcell) -> ca.Function:
@@ -249,7 +259,7 @@ def _margin_function(workcell: Workcell) -> ca.Function:
     shift = held_by(workcell, "paper", _contact_load(workcell, wrench))
     squares = ca.vertcat(*map(ca.sumsqr, shift.shifts))
     radius = ca.vertcat(*[ca.SX(number(contact.patch_radius)) for contact in contacts])
-    given = sx_given(workcell.payload).values()
+    given = sx_parameters(workcell.payload).values()
     return ca.Function("sample_margin", [wrench, *given], [1.0 - squares / radius**2])
 
 
@@ -258,7 +268,7 @@ def _load_function(workcell: Workcell) -> ca.Function:
     origin."""
     wrench, centre = ca.SX.sym("wrench", 6), number(workcell.payload.centre_of_mass)
     about = wrench[3:] + ca.cross(ca.SX(centre), wrench[:3])
-    given = sx_given(workcell.payload).values()
+    given = sx_parameters(workcell.payload).values()
     return ca.Function("sample_load", [wrench, *given], [ca.vertcat(wrench[:3], about)])
 
 
@@ -272,7 +282,7 @@ def _force_function(workcell: Workcell) -> ca.Function:
     else:
         normal = ca.SX(number(workcell.contacts[0].T_box_pad[:3, 2]))
         quantities = ca.vertcat(*split_force(wrench[:3], normal)[:2])
-    given = sx_given(workcell.payload).values()
+    given = sx_parameters(workcell.payload).values()
     return ca.Function("sample_split", [wrench, *given], [quantities])
 
 

@@ -20,7 +20,7 @@ from symbolic.geometry.pairs import build_geometry
 from symbolic.read.arms import arm_model
 from symbolic.read.cell import load
 from symbolic.read.scenes import read_scene
-from symbolic.read.tables import Table, read_body
+from symbolic.read.tables import TableReader, read_body
 from symbolic.records import Workcell
 from symbolic.records.problems import Problems
 from tests.fuzz.damage import (
@@ -144,7 +144,7 @@ def scene(kind: str, damaged: Bytes) -> None:
             (Path(folder) / name).write_bytes(content)
         for table in tables:
             problems = Problems()
-            read_body(Table(table, "", problems), Path(folder))
+            read_body(TableReader(table, "", problems), Path(folder))
             assert problems.found == []
 
 

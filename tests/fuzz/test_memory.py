@@ -15,10 +15,10 @@ from pathlib import Path
 import pytest
 
 from hybrid_opt.campaign.candidates import columns
-from symbolic.outside import MEBIBYTE, MESH_BYTES, MOST_VALUES, URDF_BYTES, WORKCELL_BYTES
 from symbolic.read.descriptions import MEMORY_BYTES, MEMORY_PER_BYTE
 from symbolic.read.elements import MOST_ATTRIBUTES
 from symbolic.read.meshes import MOST_WORDS
+from symbolic.safe_io import MAX_JSON_VALUES, MEBIBYTE, MESH_BYTES, URDF_BYTES, WORKCELL_BYTES
 from tests.symbolic.cells import ROOT
 from tests.waiting import HANGS, MOST_SECONDS
 
@@ -64,7 +64,7 @@ FULL: dict[str, tuple[str, bytes, bytes, bytes, int]] = {
     "vertices": ("m.off", b"OFF\n900000 1 0\n", b"0 0 0\n", b"", WORDS["off"]),
     "listed vertices": ("m.ply", LISTED, b"0 0 0\n", b"3 0 1 2\n", WORDS["ply"]),
     "collada": ("m.dae", COLLADA, b"<a/>", b"</COLLADA>", 1_900_000),
-    "values": ("trajectory.json", b"[", b"[],", b"1]", 3 * (MOST_VALUES // 2 - 9)),
+    "values": ("trajectory.json", b"[", b"[],", b"1]", 3 * (MAX_JSON_VALUES // 2 - 9)),
     "letters": ("trajectory.json", b'["', b"a", b'\xf0\x9f\x98\x80"]', 100 * MEBIBYTE),
     "points": ("polish.json", b'{"front": [{}', POINT, POINTS_END, 7_000_000),
     "front": ("front.csv", b"#\n#\nh\n", b"1,1,1\n", b"", 2_000_000),
@@ -78,8 +78,8 @@ NAMED: dict[str, tuple[str, bytes, bytes, bytes, int]] = {
     "attributes": ("arm.urdf", b"<robot><link ", b"a%x='' ", b"/></robot>", MOST_ATTRIBUTES - 1),
     "links": ("arm.urdf", b"<robot>", b"<link name='%d'/>", b"</robot>", 99_000),
     "pairs": ("arm.srdf", b"<robot>", PAIR, b"</robot>", 99_000),
-    "configuration": ("configuration.json", b'{"a": 0', b', "%d": []', b"}", MOST_VALUES // 3),
-    "manifest": ("manifest.json", MANIFEST, b', "%d": "a"', b"}}", MOST_VALUES - 10),
+    "configuration": ("configuration.json", b'{"a": 0', b', "%d": []', b"}", MAX_JSON_VALUES // 3),
+    "manifest": ("manifest.json", MANIFEST, b', "%d": "a"', b"}}", MAX_JSON_VALUES - 10),
 }
 """The same with how many pieces there are, which have a number each."""
 

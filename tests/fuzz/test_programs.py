@@ -16,7 +16,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from symbolic.outside import MEBIBYTE
+from symbolic.safe_io import MEBIBYTE
 from tests.fuzz.damage import Bytes, byte_damage, xml_damage
 from tests.symbolic.cells import ROOT
 from tests.symbolic.read.samples import GOFA, RACK, sample_data, write

@@ -17,7 +17,7 @@ from hybrid_opt.indicators.metrics import front_rows, hypervolume
 from symbolic.errors import SettingsError
 from symbolic.read.cell import load
 from symbolic.read.cell_files import collect_cell, unpack_cell
-from symbolic.records import SEARCHED
+from symbolic.records import SEARCHED_BRANCH
 from tests.symbolic.read.samples import RACK
 
 TRANSFER = RACK.with_name("transfer.toml")
@@ -26,7 +26,7 @@ TRANSFER = RACK.with_name("transfer.toml")
 @pytest.fixture(scope="module")
 def cell() -> Cell:
     # Its digest is the rack's, so that the rack's compiled functions serve it.
-    return Cell(replace(load(RACK), start_branch=(SEARCHED, SEARCHED)))
+    return Cell(replace(load(RACK), start_branch=(SEARCHED_BRANCH, SEARCHED_BRANCH)))
 
 
 @pytest.fixture(scope="module")
@@ -68,7 +68,7 @@ def test_pairs_that_hold_nothing_get_nothing(cell: Cell, found: BranchCompetitio
 
 
 def test_a_robot_with_a_number_keeps_it() -> None:
-    cell = Cell(replace(load(RACK), start_branch=(SEARCHED, 2)))
+    cell = Cell(replace(load(RACK), start_branch=(SEARCHED_BRANCH, 2)))
     told: list[tuple[int, int]] = []
     found = search_branches(
         cell,
@@ -97,11 +97,13 @@ def test_drivable_carries_choose_branches_under_the_ramped_law() -> None:
     # As a drivable experiment of the transfer cell, whose own law is 'ramped'.
     workcell = load(TRANSFER)
     task = replace(workcell.task, time_law="optimal")
-    cell = Cell(replace(workcell, task=task, start_branch=(SEARCHED, -1)), DRIVABLE_OBJECTIVES)
+    cell = Cell(
+        replace(workcell, task=task, start_branch=(SEARCHED_BRANCH, -1)), DRIVABLE_OBJECTIVES
+    )
     found = search_branches(cell, evaluations=50, rng=np.random.default_rng(1))
     assert found.time_law == "ramped"
     assert "evaluations under the time law ramped" in str(found)
-    ramped = Cell(replace(workcell, start_branch=(SEARCHED, -1)))
+    ramped = Cell(replace(workcell, start_branch=(SEARCHED_BRANCH, -1)))
     assert found == search_branches(ramped, evaluations=50, rng=np.random.default_rng(1))
     assert found.pairs[0].hypervolume > 0.0
 

@@ -124,10 +124,10 @@ def test_joint_rates_are_those_of_the_exact_derivatives() -> None:
     speed = ((carry.rate * first).sum(axis=1) / length)[:, None]
     bend = carry.second_rate - second * speed**2
     push = ((bend * first).sum(axis=1) / length)[:, None]
-    np.testing.assert_allclose(carry.side_by_side("q_rate"), q_first * speed, atol=1e-3)
+    np.testing.assert_allclose(carry.stack_arms("q_rate"), q_first * speed, atol=1e-3)
     inside = slice(3, -3)
     expected = (q_second * speed**2 + q_first * push)[inside]
-    np.testing.assert_allclose(carry.side_by_side("q_second")[inside], expected, atol=5e-3)
+    np.testing.assert_allclose(carry.stack_arms("q_second")[inside], expected, atol=5e-3)
 
 
 def test_a_ramped_carry_rests_at_its_ends() -> None:

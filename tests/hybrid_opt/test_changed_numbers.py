@@ -26,7 +26,7 @@ from hybrid_opt.polishing.settings import (
     ProbeSettings,
 )
 from hybrid_opt.robust.force import robust_model
-from symbolic.numbers import BODIES
+from symbolic.parameters import BODIES
 from symbolic.records import Workcell
 from tests.hybrid_opt.cells import drivable, shipped
 from tests.symbolic.cells import RACK, rack_cell

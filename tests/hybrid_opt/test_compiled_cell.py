@@ -35,7 +35,7 @@ from hybrid_opt.robust.force import RobustModel, at_rest, robust_model
 from hybrid_opt.timing.drive import search_carry
 from hybrid_opt.timing.model import TimingModel
 from symbolic.cell_model import CellModel
-from symbolic.numbers import START
+from symbolic.parameters import START
 from tests.symbolic.cells import RACK, hand_cell, hand_model, rack_cell
 
 

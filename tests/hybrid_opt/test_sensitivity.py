@@ -17,7 +17,7 @@ from hybrid_opt.robust.cases import LEADER, worst_cases
 from hybrid_opt.robust.force import robust_model
 from hybrid_opt.sensitivity import Sensitivity
 from hybrid_opt.timing.limits import drive_path
-from symbolic import outside
+from symbolic import safe_io
 from symbolic.array import Array
 from symbolic.contact.worst_cases import case_gradient_function, case_squeeze_function
 from symbolic.errors import SettingsError, WorkcellError
@@ -47,7 +47,7 @@ def in_changed(cell: ho.Cell, key: str, value: float) -> tuple[float, float]:
 
 def stated(cell: ho.Cell, path: str) -> Any:
     """What the file states, or else the record."""
-    table: Any = outside.toml_tables(Path(cell.workcell.source).read_bytes())
+    table: Any = safe_io.toml_tables(Path(cell.workcell.source).read_bytes())
     for part in path.replace("[", ".").replace("]", "").split("."):
         table = table[int(part)] if part.isdigit() else table.get(part)
     return cell.workcell.payload.centre_of_mass if table is None else table

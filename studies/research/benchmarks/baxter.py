@@ -17,7 +17,7 @@ import numpy as np
 import pinocchio as pin
 
 from studies.research.benchmarks.measuring import Benchmark, Source, Task, carry_problem
-from symbolic import outside
+from symbolic import safe_io
 from symbolic.array import Array
 from symbolic.errors import OutsideError
 from symbolic.read.scenes import read_message, read_scene
@@ -68,7 +68,7 @@ def source(count: int, seed: int) -> Source:
 
     def benchmark(there: Path) -> Benchmark:
         tasks, rng = [], np.random.default_rng(seed)
-        outside.require(there / "baxter.urdf", outside.URDF_BYTES)
+        safe_io.require(there / "baxter.urdf", safe_io.URDF_BYTES)
         hands = Hands(there / "baxter.urdf")
         for kind in KINDS:
             scenes = there / "problems" / f"bookshelf_tall_both_arms_{kind}_baxter"

@@ -24,9 +24,9 @@ from studies.research.turns import progress
 from symbolic.array import Array
 from symbolic.errors import OutsideError, SettingsError
 from symbolic.geometry.pairs import build_geometry
-from symbolic.outside import replace_file
 from symbolic.read.cell import load
 from symbolic.read.editing import completed
+from symbolic.safe_io import replace_file
 
 EVALUATIONS = 1000
 """Evaluations of the search behind a fastest carry."""

@@ -18,7 +18,7 @@ import pinocchio as pin
 from pinocchio.utils import rotate
 
 from studies.research.benchmarks.measuring import Benchmark, Source, Task, carry_problem
-from symbolic import outside
+from symbolic import safe_io
 from symbolic.array import Array
 from symbolic.errors import OutsideError
 from symbolic.read.scenes import read_scene
@@ -75,7 +75,7 @@ NOTE = (
 
 def benchmark(there: Path) -> Benchmark:
     """The three carries of their folder."""
-    given = postures(outside.read_bytes(there / "notebooks/main.ipynb", outside.WORKCELL_BYTES))
+    given = postures(safe_io.read_bytes(there / "notebooks/main.ipynb", safe_io.WORKCELL_BYTES))
     urdf = there / "models/iiwa14_convex_decimated_collision.urdf"
     model = pin.buildModelFromUrdf(str(urdf))
     poses = {name: _box(model, q[:7]) for name, q in given.items()}

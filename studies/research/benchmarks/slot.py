@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from studies.research.benchmarks.measuring import Benchmark, Source, Task, carry_problem
-from symbolic import outside
+from symbolic import safe_io
 from symbolic.errors import OutsideError
 from symbolic.read.elements import parse_elements
 
@@ -76,8 +76,8 @@ NOTE = (
 
 def benchmark(there: Path) -> Benchmark:
     """The carry of their folder, within three kinds of limits."""
-    content = outside.read_bytes(there / "models/scene_slot_gate.xml", outside.URDF_BYTES)
-    scene = [TABLE, *bodies(outside.text(content))]
+    content = safe_io.read_bytes(there / "models/scene_slot_gate.xml", safe_io.URDF_BYTES)
+    scene = [TABLE, *bodies(safe_io.text(content))]
     tasks = []
     for name, limits, seconds in LIMITS:
         problem = carry_problem(

@@ -15,11 +15,11 @@ from symbolic.records.poses import Orientation
 from symbolic.robot.arm import (
     BEGIN_STEPS,
     CHEAP_STEPS,
-    FAR,
+    IK_NEWTON_STEPS,
     MAX_JOINT_STEP,
-    NEWTON_STEPS,
     REACH_TOLERANCE,
-    SURE,
+    THIRD_STEP_RESIDUAL,
+    TRUSTED_RESIDUAL,
 )
 
 
@@ -121,13 +121,13 @@ class PlainArm:
         for _ in range(CHEAP_STEPS):
             before = self.residual(q, target)
             q = self.newton_step(q, target)
-        if before > FAR:
+        if before > THIRD_STEP_RESIDUAL:
             q = self.newton_step(q, target)
-        if self.residual(q, target) <= SURE:
+        if self.residual(q, target) <= TRUSTED_RESIDUAL:
             return q
         other = previous + change
         other[self.redundant] = values
-        for _ in range(NEWTON_STEPS):
+        for _ in range(IK_NEWTON_STEPS):
             other = self.newton_step(other, target)
         return min(q, other, key=lambda found: self.residual(found, target))
 
@@ -155,7 +155,7 @@ class PlainArm:
         change, curve = np.zeros(len(start)), np.zeros(len(start))
         predicted = previous.copy()
         predicted[self.redundant] = values[1]
-        for _ in range(NEWTON_STEPS):
+        for _ in range(IK_NEWTON_STEPS):
             predicted = self.newton_step(predicted, self.flange_target(poses[1]))
         lost = 0.0
         samples: dict[str, list[object]] = {}

@@ -28,7 +28,7 @@ REMEDY = "run `pip install -e .` in the project's folder to compile it for this 
 
 
 def frame_kinematics(model: pinocchio.Model, frame: int) -> casadi.Function:
-    """Placement and Jacobian of a frame of the model.
+    """Return the placement and Jacobian of a frame of the model.
 
     q (nq,) -> rotation (3, 3) and position (3,) [m] of the frame in the root, and its jacobian
     (6, nv): rows 0-2 give the linear velocity of the frame's origin, rows 3-5 the angular
@@ -38,7 +38,7 @@ def frame_kinematics(model: pinocchio.Model, frame: int) -> casadi.Function:
 
 
 def frame_drift(model: pinocchio.Model, frame: int) -> casadi.Function:
-    """The part of a frame's acceleration that the joint velocities cause alone, dJ/dt v.
+    """Return the part dJ/dt v of a frame's acceleration, caused by the joint velocities alone.
 
     q (nq,), v (nv,) -> drift (6,): linear [m/s^2] then angular [rad/s^2], along the root's axes,
     so that the frame's classical acceleration is jacobian @ a + drift.
@@ -47,7 +47,7 @@ def frame_drift(model: pinocchio.Model, frame: int) -> casadi.Function:
 
 
 def joint_placements(model: pinocchio.Model) -> casadi.Function:
-    """Placements of all n joints but the universe, in the model's order.
+    """Return the placements of all n joints but the universe, in the model's order.
 
     q (nq,) -> rotations (3, 3 n), side by side, and positions (3, n) [m], in the root.
     """
@@ -55,7 +55,7 @@ def joint_placements(model: pinocchio.Model) -> casadi.Function:
 
 
 def inverse_dynamics(model: pinocchio.Model) -> casadi.Function:
-    """Joint torques of a motion without external forces, by the recursive Newton-Euler algorithm.
+    """Return joint torques without external forces, by the recursive Newton-Euler algorithm.
 
     q (nq,), v (nv,), a (nv,) -> torque (nv,) [N m]; gravity is the model's, rotor inertias count.
     """
@@ -82,7 +82,7 @@ def require_same_minor(built: dict[str, str], installed: dict[str, str]) -> None
 
 @cache
 def _extension() -> ModuleType:
-    """The compiled module; casadi and pinocchio are loaded before it, with its libraries."""
+    """Import the compiled module, after casadi and pinocchio have loaded its libraries."""
     try:
         extension = import_module("symbolic.robot.bridge._pinocchio_casadi")
     except ImportError as error:
@@ -97,7 +97,7 @@ def _extension() -> ModuleType:
 
 
 def _function(serialised: str) -> casadi.Function:
-    """The function, with the terms shared that Pinocchio's algorithms compute twice."""
+    """Return the function, sharing terms that Pinocchio's algorithms compute twice."""
     function = casadi.Function.deserialize(serialised)
     inputs = function.sx_in()
     outputs = casadi.cse(function.call(inputs))

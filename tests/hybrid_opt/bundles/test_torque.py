@@ -115,7 +115,7 @@ def test_gains_are_those_of_damped_soft_joints() -> None:
     0.7, and far from what a sampled derivative makes unstable."""
     job = exported("torque").job
     inertia, gains = joint_inertia(job), cell_controller()["gains"]
-    torque = job.workcell.of_joints("torque_max")
+    torque = job.workcell.stack_joint_limits("torque_max")
     for k, joint in enumerate(JOINTS):
         p, d = gains[joint]["p"], gains[joint]["d"]
         assert p <= 7.0 * torque[k] + 1e-9

@@ -84,7 +84,7 @@ def test_a_time_optimal_timing_loses_its_jumps(width: float) -> None:
     assert acceleration_at_ends(found) == 0.0
     assert timing.duration < found.duration < 1.02 * (timing.duration + 2.0 * width)
     # The jerk is bounded by the largest jump, twice the limit, times the kernel's peak.
-    time, second = carry.time, carry.side_by_side("q_second")
+    time, second = carry.time, carry.stack_arms("q_second")
     limit = np.concatenate([robot.acceleration_max for robot in cell.robots])
     jerk = np.abs(np.diff(second, axis=0)) / np.diff(time)[:, None]
     assert (jerk / limit).max() <= 2.0 * (35.0 / 32.0) / width * 1.05
@@ -93,9 +93,9 @@ def test_a_time_optimal_timing_loses_its_jumps(width: float) -> None:
     poses = path_basis(len(points), carry.parameter).position @ points
     np.testing.assert_allclose(carry.pose, poses, atol=1e-10)
     for values, rate in (
-        (carry.q, carry.side_by_side("q_rate")),
+        (carry.q, carry.stack_arms("q_rate")),
         (carry.pose, carry.rate),
-        (carry.side_by_side("q_rate"), second),
+        (carry.stack_arms("q_rate"), second),
     ):
         slope = np.gradient(values, time, axis=0)
         np.testing.assert_allclose(slope[2:-2], rate[2:-2], atol=0.005 * np.abs(rate).max())

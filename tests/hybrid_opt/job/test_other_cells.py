@@ -59,7 +59,7 @@ def test_pads_that_do_not_face_one_another_keep_limits_on_jerk() -> None:
     )
     cell = Cell(replace(shipping.workcell, robots=(first, second)), DRIVABLE_OBJECTIVES)
     timing = driven_timing(cell.timing_model, cell.initial)
-    jerk = np.diff(timing.driven.side_by_side("q_second"), axis=0)
+    jerk = np.diff(timing.driven.stack_arms("q_second"), axis=0)
     jerk /= np.diff(timing.driven.time)[:, None]
     assert 45.0 < np.abs(jerk).max() <= 50.0 * 1.005
     jerk_limits = JerkLimits.from_workcell(cell.workcell)

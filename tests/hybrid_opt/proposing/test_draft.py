@@ -16,7 +16,7 @@ from hybrid_opt.proposing.decimals import UNITS, readable_turns, rounded_outward
 from hybrid_opt.proposing.draft import Draft, changes, decision_bounds
 from hybrid_opt.proposing.problem import Problem, read_problem
 from symbolic.read.editing import merged
-from symbolic.read.tables import Table
+from symbolic.read.tables import TableReader
 from symbolic.read.task import MOST_TURN, read_task
 from symbolic.records import Task
 from symbolic.records.poses import Orientation
@@ -49,7 +49,7 @@ def read_back(problem: Problem, found: Draft) -> tuple[Task, list[str]]:
     """Read the task that a draft makes of a problem; with the reader's problems."""
     data: dict[str, Any] = merged(problem.data, changes(problem, found))
     problems = Problems()
-    task, _ = read_task(Table(data["task"], "task", problems))
+    task, _ = read_task(TableReader(data["task"], "task", problems))
     return task, list(problems.messages()) if problems.found else []
 
 

@@ -28,9 +28,9 @@ from hybrid_opt.robust.squeeze import commanded_forces
 from hybrid_opt.timing.solve import time_path
 from symbolic.array import Array
 from symbolic.errors import SettingsError
-from symbolic.path.pieces import same_paths
+from symbolic.path.pieces import resample_decisions
 from symbolic.read.cell import changed
-from symbolic.records import USUAL, Contact, Task
+from symbolic.records import USUAL_UNCERTAINTY, Contact, Task
 from symbolic.records.cell import RANGES
 from tests.hybrid_opt import cells
 from tests.hybrid_opt.robust.test_force import SMALL as SET
@@ -132,7 +132,7 @@ def test_one_duration_and_one_force(drivable: ho.Cell, found: Recommendation) ->
 
 def test_limits_on_jerk_are_kept(drivable: ho.Cell, found: Recommendation) -> None:
     carry = found.carry
-    jerk = np.diff(carry.side_by_side("q_second"), axis=0) / np.diff(carry.time)[:, None]
+    jerk = np.diff(carry.stack_arms("q_second"), axis=0) / np.diff(carry.time)[:, None]
     stated = [robot.jerk_max for robot in drivable.workcell.robots]
     assert stated[0] is not None
     assert np.abs(jerk).max() <= stated[0].min() * 1.01
@@ -301,7 +301,9 @@ def test_margins_are_those_at_the_commanded_force(found: Recommendation) -> None
 
 def test_where_nothing_fits_it_says_what_would_do(drivable: ho.Cell, front: ho.Front) -> None:
     """The rack's robots are too weak for the usual set."""
-    unsure = ho.Cell(replace(drivable.workcell, uncertainty=USUAL), drivable.objective_names)
+    unsure = ho.Cell(
+        replace(drivable.workcell, uncertainty=USUAL_UNCERTAINTY), drivable.objective_names
+    )
     found = ho.recommend(ho.Front.of(unsure, front.x[:2]), alone=True)
     assert not found.fits
     assert not found.warnings
@@ -319,7 +321,9 @@ def test_where_nothing_fits_it_says_what_would_do(drivable: ho.Cell, front: ho.F
     )
     assert stronger.fits
     assert stronger.duration == pytest.approx(found.duration, rel=0.02)
-    felt = max(each.max() for each in robust_model(unsure.workcell).hold(found.carry, USUAL))
+    felt = max(
+        each.max() for each in robust_model(unsure.workcell).hold(found.carry, USUAL_UNCERTAINTY)
+    )
     assert found.required.max() == pytest.approx(felt, rel=5e-3)
     assert len(found.remedies) == 3
     assert [abs(each.share) for each in found.remedies] == sorted(
@@ -379,7 +383,7 @@ def test_a_drivable_cell_is_the_same_cell(drivable: ho.Cell) -> None:
     cell = cells.shipped("rack")
     assert drivable.objective_names == ("duration", "peak_force")
     own, task = drivable.workcell.task, cell.workcell.task
-    (path,) = same_paths(drivable.initial[:-1], own, task)
+    (path,) = resample_decisions(drivable.initial[:-1], own, task)
     np.testing.assert_allclose(path, cell.initial, atol=1e-12)
     assert drivable.workcell.source.is_file()
     assert not drivable.force_kind.robust

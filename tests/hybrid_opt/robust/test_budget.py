@@ -19,7 +19,7 @@ from hybrid_opt.robust.budget import (
 from hybrid_opt.robust.cases import least_friction
 from hybrid_opt.robust.force import BoxMotion, interpreted_robust_model
 from symbolic.read.cell import changed
-from symbolic.records import USUAL, Workcell
+from symbolic.records import USUAL_UNCERTAINTY, Workcell
 from symbolic.records.cell import RANGES
 from tests.hybrid_opt import cells
 
@@ -29,13 +29,13 @@ GRAVITY = 9.81
 @pytest.fixture(scope="module")
 def rack() -> Workcell:
     """The rack, of whose robots the usual uncertainty asks too much."""
-    return replace(cells.shipped("rack").workcell, uncertainty=USUAL)
+    return replace(cells.shipped("rack").workcell, uncertainty=USUAL_UNCERTAINTY)
 
 
 def test_it_is_what_friction_and_weight_say(rack: Workcell) -> None:
     """With pads at the height of the centre of mass and no disturbance the load is the weight."""
     doubt = replace(
-        USUAL,
+        USUAL_UNCERTAINTY,
         centre_of_mass=np.zeros(3),
         disturbance=np.zeros(3),
         relative_position=0.0,
@@ -79,7 +79,9 @@ def test_remedies_do_and_a_little_less_does_not(rack: Workcell) -> None:
     required = grip_budget(rack).required
     remedies = cheapest_remedies(model, motion, required, allowed, most=100)
     told = {each.change.rstrip("0123456789. "): each for each in remedies}
-    ranges = {f"uncertainty.{name}": getattr(USUAL, name) for name in (*RANGES, "stiffness")}
+    ranges = {
+        f"uncertainty.{name}": getattr(USUAL_UNCERTAINTY, name) for name in (*RANGES, "stiffness")
+    }
 
     def cell(**changes: object) -> GripBudget:
         return grip_budget(changed(rack, {**ranges, **changes}))
@@ -98,10 +100,10 @@ def test_remedies_do_and_a_little_less_does_not(rack: Workcell) -> None:
     both("payload.mass", by_kind["mass of"], 0.03)
     both("contacts.friction", by_kind["friction of "], -0.01)
     both("uncertainty.friction", by_kind["friction off"] / 100.0, 0.004)
-    scaled = USUAL.scaled(by_kind["every range"])
+    scaled = USUAL_UNCERTAINTY.scaled(by_kind["every range"])
     assert grip_budget(replace(rack, uncertainty=scaled)).fits
     assert not grip_budget(
-        replace(rack, uncertainty=USUAL.scaled(by_kind["every range"] + 0.02))
+        replace(rack, uncertainty=USUAL_UNCERTAINTY.scaled(by_kind["every range"] + 0.02))
     ).fits
     assert [abs(each.share) for each in remedies] == sorted(abs(each.share) for each in remedies)
     assert grip_budget(rack).remedies == remedies[:3]
@@ -114,5 +116,5 @@ def test_it_is_told_with_its_numbers(rack: Workcell) -> None:
     fitting = budget_text(cells.shipped("rack").workcell)
     asked = "grip at rest, with the cell's [uncertainty]: 92.9 N of 117.7 N"
     assert fitting == f"{asked}, 21 % left for the motion"
-    none = replace(rack, uncertainty=replace(USUAL, friction=0.99))
+    none = replace(rack, uncertainty=replace(USUAL_UNCERTAINTY, friction=0.99))
     assert "leaves no friction" in budget_text(none)

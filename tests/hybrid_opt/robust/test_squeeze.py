@@ -29,7 +29,7 @@ from hybrid_opt.robust.squeeze import (
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.read.cell import load
-from symbolic.records import USUAL, Uncertainty, Workcell
+from symbolic.records import USUAL_UNCERTAINTY, Uncertainty, Workcell
 from tests.hybrid_opt.job.jobs import rack, rack_job, rack_jobs, rack_timing
 from tests.symbolic.cells import RACK
 
@@ -131,7 +131,7 @@ def test_a_stated_stiffness_makes_a_force_of_the_arms_places() -> None:
 
 
 def test_a_cell_that_states_nothing_is_pressed_for_the_usual_set() -> None:
-    _, commanded, squeeze = pressed(USUAL)
+    _, commanded, squeeze = pressed(USUAL_UNCERTAINTY)
     assert str(squeeze) == "holds pads that press evenly in every case of the usual uncertainty"
     _, least, told = pressed(Uncertainty())
     assert "states that nothing is uncertain" in str(told)

@@ -161,7 +161,7 @@ def test_a_missing_file_and_a_folder_are_told(tmp_path: Path) -> None:
 
 
 def test_enormous_files_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("symbolic.outside.MOST_BYTES", 100)
+    monkeypatch.setattr("symbolic.safe_io.MOST_BYTES", 100)
     path = tmp_path / "t.json"
     path.write_text(document(), encoding="utf-8")
     with pytest.raises(ResultsError, match="too large"):

@@ -44,7 +44,7 @@ def test_every_limit_holds_and_the_jerk_is_that_of_what_is_driven(size: float) -
     assert found.timing.ok
     assert max(excess.ratio for excess in found.timing.use.values()) <= 1.005
     # Differences of the joints' accelerations over time, an independent way to their jerk.
-    acceleration, time = carry.side_by_side("q_second"), carry.time
+    acceleration, time = carry.stack_arms("q_second"), carry.time
     jerk = np.diff(acceleration, axis=0) / np.diff(time)[:, None]
     assert np.abs(jerk).max() <= size * 1.01
     box = np.diff(carry.second_rate[:, :3], axis=0) / np.diff(time)[:, None]
@@ -55,10 +55,10 @@ def test_every_limit_holds_and_the_jerk_is_that_of_what_is_driven(size: float) -
 def test_positions_speeds_and_accelerations_belong_together_and_end_at_rest() -> None:
     carry = timed(40.0).timing.driven
     steps = np.diff(carry.time)[:, None]
-    q, rate = carry.side_by_side("q"), carry.side_by_side("q_rate")
+    q, rate = carry.stack_arms("q"), carry.stack_arms("q_rate")
     middle = (rate[1:] + rate[:-1]) / 2.0
     np.testing.assert_allclose(np.diff(q, axis=0) / steps, middle, atol=2e-4)
-    second = carry.side_by_side("q_second")
+    second = carry.stack_arms("q_second")
     middle = (second[1:] + second[:-1]) / 2.0
     np.testing.assert_allclose(np.diff(rate, axis=0) / steps, middle, atol=2e-2)
     for values in (rate, second):

@@ -81,10 +81,10 @@ def test_limits_hold_between_the_grid_points_and_are_reached(
 def test_a_carry_starts_and_ends_at_rest_and_its_rates_integrate() -> None:
     carry = time_path(hand_timing(), initial()).driven
     for end in (0, -1):
-        np.testing.assert_allclose(carry.side_by_side("q_rate")[end], 0.0, atol=1e-9)
+        np.testing.assert_allclose(carry.stack_arms("q_rate")[end], 0.0, atol=1e-9)
     step = np.diff(carry.time)[:, None]
     assert (step >= 0.0).all()
-    q, q_rate, q_second = (carry.side_by_side(name) for name in ("q", "q_rate", "q_second"))
+    q, q_rate, q_second = (carry.stack_arms(name) for name in ("q", "q_rate", "q_second"))
     for value, rate in ((q, q_rate), (q_rate, q_second)):
         integral = np.sum(step * (rate[1:] + rate[:-1]) / 2.0, axis=0)
         np.testing.assert_allclose(integral, value[-1] - value[0], atol=2e-3)
@@ -119,7 +119,7 @@ def test_the_search_timing_starts_at_speed_and_is_told_so() -> None:
     check_limits = check_search_timing(hand_timing(), initial())
     assert check_limits.status is TimingStatus.EXCEEDED
     assert check_limits.place.constraint == "start from rest"
-    assert np.abs(check_limits.driven.side_by_side("q_rate")[0]).max() > 0.05
+    assert np.abs(check_limits.driven.stack_arms("q_rate")[0]).max() > 0.05
 
 
 def test_the_closest_timing_cruises_at_the_reference_speed() -> None:

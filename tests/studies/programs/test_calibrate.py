@@ -13,7 +13,7 @@ import pytest
 from hybrid_opt.calibrating.recording import Run
 from studies.calibrate import main
 from symbolic.read.cell import load
-from symbolic.records.cell import USUAL
+from symbolic.records.cell import USUAL_UNCERTAINTY
 from tests.hybrid_opt.calibrating.generator import (
     CELL,
     LEVEL,
@@ -87,8 +87,8 @@ def test_a_cell_without_ranges_gets_them_all(tmp_path: Path) -> None:
     assert main([str(cell), str(write(run(0), tmp_path)), "--out", str(out)]) == 0
     found = load(out).uncertainty
     assert found.stated
-    assert (found.friction, found.tilt) == (USUAL.friction, USUAL.tilt)
-    assert found.mass < USUAL.mass
+    assert (found.friction, found.tilt) == (USUAL_UNCERTAINTY.friction, USUAL_UNCERTAINTY.tilt)
+    assert found.mass < USUAL_UNCERTAINTY.mass
 
 
 @pytest.mark.parametrize("frozen", [False, True])

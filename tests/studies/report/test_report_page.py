@@ -213,7 +213,7 @@ def test_every_point_shows_what_robots_drive_and_its_job(
         assert shown["label"].startswith(f"{front.source}: {timing.duration:.2f} s, ")
         assert timing.carry is not None
         torque = np.abs(timing.carry.torque).max(axis=0)
-        use = 100.0 * torque / data.workcell.of_joints("torque_max")
+        use = 100.0 * torque / data.workcell.stack_joint_limits("torque_max")
         np.testing.assert_allclose(motion["torqueUse"], use, atol=1e-2)
         job = JobModel(cell.compiled, cell.timing_model).plan(timing, within_jerk=False)
         assert whole["name"] == "the whole job"
@@ -224,7 +224,7 @@ def test_every_point_shows_what_robots_drive_and_its_job(
             assert mine["duration"] == pytest.approx(phase.duration, abs=1e-5)
             assert mine["use"] == pytest.approx(100.0 * phase.use[mine["most"]], abs=1e-2)
         effort = np.concatenate([phase.effort for phase in job.phases])
-        use = 100.0 * np.abs(effort).max(axis=0) / data.workcell.of_joints("torque_max")
+        use = 100.0 * np.abs(effort).max(axis=0) / data.workcell.stack_joint_limits("torque_max")
         np.testing.assert_allclose(whole["torqueUse"], use, atol=1e-2)
         table = samples(whole)
         assert np.all(np.diff(table[:, 0]) > 0.0)

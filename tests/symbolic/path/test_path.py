@@ -22,7 +22,13 @@ from studies.research.plain.motion import (
 )
 from symbolic.array import Array
 from symbolic.errors import WorkcellError
-from symbolic.path.pieces import by_levels, in_pieces, same_paths, stated, stated_entries
+from symbolic.path.pieces import (
+    coarse_entries,
+    coarse_task,
+    hierarchical_basis,
+    refined_task,
+    resample_decisions,
+)
 from symbolic.path.rotation import (
     angular_acceleration,
     angular_velocity,
@@ -89,7 +95,7 @@ PIECES = 3
 def both(name: str) -> tuple[Task, Task]:
     """A shipped task as it is stated under the time law 'optimal', and in pieces."""
     task = replace(load(RACK.with_name(f"{name}.toml")).task, time_law="optimal", pieces=1)
-    return task, in_pieces(replace(task, pieces=PIECES))
+    return task, refined_task(replace(task, pieces=PIECES))
 
 
 def drawn(task: Task, count: int = 4) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
@@ -101,7 +107,7 @@ def drawn(task: Task, count: int = 4) -> np.ndarray[tuple[int, int], np.dtype[np
 def test_paths_through_stated_waypoints_are_paths_through_all(name: str) -> None:
     coarse, fine = both(name)
     x = drawn(coarse)
-    same = same_paths(x, coarse, fine)
+    same = resample_decisions(x, coarse, fine)
     assert same.shape == (len(x), fine.n_var)
     assert ((same >= fine.lower) & (same <= fine.upper)).all()
     np.testing.assert_array_equal(same[:, -1], x[:, -1])
@@ -110,18 +116,18 @@ def test_paths_through_stated_waypoints_are_paths_through_all(name: str) -> None
     for one, other in zip(x, same, strict=True):
         expected = at[0] @ extended_waypoints(coarse, one)
         np.testing.assert_allclose(at[1] @ extended_waypoints(fine, other), expected, atol=1e-12)
-    np.testing.assert_array_equal(same_paths(same, fine, coarse), x)
+    np.testing.assert_array_equal(resample_decisions(same, fine, coarse), x)
 
 
 @pytest.mark.parametrize("name", ["rack", "pandas", "transfer"])
 def test_the_stated_task_comes_back(name: str) -> None:
     coarse, fine = both(name)
-    again = stated(fine)
-    assert stated(coarse) is coarse
+    again = coarse_task(fine)
+    assert coarse_task(coarse) is coarse
     assert len(fine.waypoints) == PIECES * (len(coarse.waypoints) - 1) + 1
     for field in ("lower", "upper", "initial"):
         np.testing.assert_array_equal(getattr(again, field), getattr(coarse, field))
-    hand_made = same_paths(initial_decision(coarse), coarse, fine)[0]
+    hand_made = resample_decisions(initial_decision(coarse), coarse, fine)[0]
     np.testing.assert_allclose(initial_decision(fine), hand_made, atol=1e-12)
     for one, other in zip(again.redundant, coarse.redundant, strict=True):
         np.testing.assert_array_equal(one.initial, other.initial)
@@ -132,18 +138,18 @@ def test_the_stated_task_comes_back(name: str) -> None:
 def test_moves_of_stated_waypoints_are_followed_by_the_others(name: str) -> None:
     coarse, fine = both(name)
     x, n, m = drawn(coarse, 1)[0], coarse.n_path, fine.n_path
-    levels, square = by_levels(fine)
+    levels, square = hierarchical_basis(fine)
     assert levels.shape == (m, m)
     assert np.linalg.matrix_rank(levels) == m
-    own = stated_entries(fine)
+    own = coarse_entries(fine)
     by, others = levels[:, own], np.setdiff1d(np.arange(m), own)
     np.testing.assert_array_equal(levels[np.ix_(own, others)], 0.0)
     np.testing.assert_array_equal(square[own], 1.0)
     np.testing.assert_allclose(square[others], 1.0 / PIECES**2)
-    np.testing.assert_array_equal(by[stated_entries(fine)], np.eye(n))
+    np.testing.assert_array_equal(by[coarse_entries(fine)], np.eye(n))
     step = 1e-3 * np.random.default_rng(3).normal(size=n)
     inside = np.clip(x[:n] + step, coarse.lower[:n], coarse.upper[:n])
-    moved = same_paths(inside, coarse, fine)[0] - same_paths(x[:n], coarse, fine)[0]
+    moved = resample_decisions(inside, coarse, fine)[0] - resample_decisions(x[:n], coarse, fine)[0]
     np.testing.assert_allclose(by @ (inside - x[:n]), moved, atol=1e-12)
 
 

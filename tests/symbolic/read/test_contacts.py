@@ -12,7 +12,7 @@ import pytest
 import trimesh
 
 from symbolic.errors import BundleError, WorkcellError
-from symbolic.path.pieces import stated
+from symbolic.path.pieces import coarse_task
 from symbolic.read.arms import arm_model
 from symbolic.read.cell import load, with_branches
 from symbolic.read.cell_files import CellFiles, collect_cell, drivable_files, unpack_cell
@@ -254,7 +254,7 @@ def test_only_the_time_law_differs(path: Path, tmp_path: Path) -> None:
     original = collect_cell(cell)
     drivable = unpack_cell(drivable_files(original), tmp_path)
     assert drivable.task.time_law == "optimal"
-    assert stated(drivable.task).n_var == cell.task.n_var + 1
+    assert coarse_task(drivable.task).n_var == cell.task.n_var + 1
     assert drivable.digest != cell.digest
     first, second = (
         tomllib.loads(stored.files[stored.workcell].decode())
@@ -263,7 +263,7 @@ def test_only_the_time_law_differs(path: Path, tmp_path: Path) -> None:
     assert second["task"].pop("time_law") == "optimal"
     first["task"].pop("time_law")
     assert first == second
-    np.testing.assert_array_equal(stated(drivable.task).lower[:-1], cell.task.lower)
+    np.testing.assert_array_equal(coarse_task(drivable.task).lower[:-1], cell.task.lower)
 
 
 def rewritten(old: str, new: str) -> CellFiles:
@@ -296,9 +296,9 @@ def test_a_task_written_otherwise_is_refused() -> None:
     ],
 )
 def test_what_robots_drive_has_an_allocation_of_its_own(
-    stated: str, usual: str, driven: str, tmp_path: Path
+    coarse_task: str, usual: str, driven: str, tmp_path: Path
 ) -> None:
-    variant = rewritten("[task]\n", f"[task]\n{stated}")
+    variant = rewritten("[task]\n", f"[task]\n{coarse_task}")
     cell = unpack_cell(variant, tmp_path / "usual", check_digest=False)
     assert cell.task.allocation == usual
     assert unpack_cell(drivable_files(variant), tmp_path / "driven").task.allocation == driven

@@ -20,7 +20,7 @@ from symbolic.errors import WorkcellError
 from symbolic.read.cell import changed, changed_text, load, stretched_length
 from symbolic.read.payload import pad_rotation
 from symbolic.records import (
-    USUAL,
+    USUAL_UNCERTAINTY,
     Body,
     Box,
     CollisionSettings,
@@ -248,7 +248,7 @@ def assert_same_cell(cell: Workcell, data: dict[str, Any]) -> None:
     if "uncertainty" in data:
         assert_same(cell.uncertainty, data["uncertainty"])
     else:
-        assert cell.uncertainty is USUAL
+        assert cell.uncertainty is USUAL_UNCERTAINTY
 
 
 def assert_same_task(cell: Workcell, data: dict[str, Any]) -> None:

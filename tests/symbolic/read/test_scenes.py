@@ -14,24 +14,24 @@ from scipy.spatial.transform import Rotation
 
 from symbolic.array import Array
 from symbolic.errors import SceneError
-from symbolic.read.scene_bodies import Scene
+from symbolic.read.scene_bodies import ImportedScene
 from symbolic.read.scenes import read_scene
-from symbolic.read.tables import Table, read_body
+from symbolic.read.tables import TableReader, read_body
 from symbolic.records import Body, Box, Cylinder, Mesh, Sphere
 from symbolic.records.problems import Problems
 
 
-def scene(folder: Path, text: str, name: str = "scene.sdf") -> Scene:
+def scene(folder: Path, text: str, name: str = "scene.sdf") -> ImportedScene:
     path = folder / name
     path.write_text(text, encoding="utf-8")
     return read_scene(path)
 
 
-def by_name(found: Scene) -> dict[str, Body]:
+def by_name(found: ImportedScene) -> dict[str, Body]:
     return {body.name: body for body in found.bodies}
 
 
-def places(found: Scene) -> dict[str, list[float]]:
+def places(found: ImportedScene) -> dict[str, list[float]]:
     return {body.name: body.pose[:3, 3].round(9).tolist() for body in found.bodies}
 
 
@@ -497,6 +497,6 @@ def test_a_pose_survives_the_scene_and_the_table(
     found = scene(folder, sdf(text))
     (table,) = found.tables(folder, folder)
     problems = Problems()
-    body = read_body(Table(table, "", problems), folder)
+    body = read_body(TableReader(table, "", problems), folder)
     assert not problems.found
     np.testing.assert_allclose(body.pose, expected, atol=1e-8)

@@ -26,8 +26,8 @@ from symbolic.read.urdf import read_urdf
 from symbolic.robot import bridge
 from symbolic.robot.arm import (
     CHEAP_STEPS,
+    IK_NEWTON_STEPS,
     MAX_JOINT_STEP,
-    NEWTON_STEPS,
     REACH_TOLERANCE,
     follow_function,
     newton_step,
@@ -49,7 +49,7 @@ _R, _p = ca.SX.sym("R", 3, 3), ca.SX.sym("p", 3)
 def step_function() -> ca.Function:
     model = gofa_model()
     result = _q
-    for _ in range(NEWTON_STEPS):
+    for _ in range(IK_NEWTON_STEPS):
         result = newton_step(model, result, _R, _p)
     _, residual = pose_error(_R, _p, *model.placement(result))
     return ca.Function("step", [_q, _R, _p], [result, residual])

@@ -18,7 +18,7 @@ from symbolic.functions import candidate_function
 from symbolic.geometry.clearance import screening_functions
 from symbolic.geometry.pairs import coal_distance
 from symbolic.path.rotation import rotation_matrix
-from symbolic.records.cell import PAYLOAD, Box, Workcell
+from symbolic.records.cell import PAYLOAD_NAME, Box, Workcell
 from symbolic.records.poses import Orientation
 from symbolic.records.task import Allocation, TimeLaw
 from symbolic.robot.arm import flange_target, manipulability, pose_error
@@ -141,7 +141,7 @@ def test_one_direction_separates_boxes_that_are_apart(
     edge = half * np.where(np.arange(3) == chosen % 3, 0.0, 1.0 - 2.0 * (chosen // 3 % 2))
     pose = np.concatenate([obstacle.pose[:3, :3] @ edge + obstacle.pose[:3, 3] + away, turn])
     rotation = rotation_matrix(rack_model().workcell.task.orientation, turn)
-    payload = rack_model().geometry.bodies[rack_model().geometry.index(PAYLOAD)].pieces[0]
+    payload = rack_model().geometry.bodies[rack_model().geometry.index(PAYLOAD_NAME)].pieces[0]
     placed = np.eye(4)
     placed[:3, :3], placed[:3, 3] = np.array(ca.DM(rotation)), pose[:3]
     edges = np.array(ca.DM(rotation)), obstacle.pose[:3, :3]

@@ -8,7 +8,7 @@ from pathlib import Path
 
 
 def prefixes() -> list[Path]:
-    """The folders to search, existing ones only, in the order of preference."""
+    """Return the existing folders to search, in order of preference."""
     found = [Path(folder) for folder in sysconfig.get_paths().values()]
     for package in ("casadi", "cmeel", "pybind11"):
         spec = importlib.util.find_spec(package)

@@ -38,10 +38,10 @@ CELL_BYTES = 128 * MEBIBYTE
 MOST_BYTES = 512 * MEBIBYTE
 """Largest file that is read, whatever it is."""
 
-MOST_VALUES = 1_000_000
+MAX_JSON_VALUES = 1_000_000
 """Most values of one JSON document: each takes up to about 200 bytes once it is read."""
 
-MOST_DEPTH = 50
+MAX_NESTING = 50
 """Deepest nesting of JSON and TOML values."""
 
 _KINDS = (
@@ -61,7 +61,7 @@ _KEYS_AND_TEXTS = re.compile(
     rf"{_KEY_PART}(?P<further>(?:[ \t]*+\.[ \t]*+{_KEY_PART})*+)",
     re.DOTALL,
 )
-_LONG = re.compile(rf"(?:[ \t]*+\.[ \t]*+{_KEY_PART}){{{MOST_DEPTH}}}")
+_LONG = re.compile(rf"(?:[ \t]*+\.[ \t]*+{_KEY_PART}){{{MAX_NESTING}}}")
 
 
 def resolved(path: Path) -> Path:
@@ -146,12 +146,12 @@ def json_value(content: bytes) -> Any:
     """
     count = sum(content.count(mark) for mark in (b",", b"[", b"{"))
     # Quotation marks within texts count as well, so there may be more of them.
-    if count > MOST_VALUES or content.count(b'"') > 8 * MOST_VALUES:
-        raise OutsideError(f"holds more than {MOST_VALUES} values, which is the limit")
+    if count > MAX_JSON_VALUES or content.count(b'"') > 8 * MAX_JSON_VALUES:
+        raise OutsideError(f"holds more than {MAX_JSON_VALUES} values, which is the limit")
     found = text(content)
     depth = _json_depth(found)
-    if depth > MOST_DEPTH:
-        raise OutsideError(f"nested {depth} deep; allowed is {MOST_DEPTH}")
+    if depth > MAX_NESTING:
+        raise OutsideError(f"nested {depth} deep; allowed is {MAX_NESTING}")
     try:
         value = json.loads(found, parse_constant=_refuse_constant, parse_float=_finite)
     except ValueError as error:
@@ -175,19 +175,19 @@ def toml_tables(content: bytes) -> dict[str, Any]:
         for match in _KEYS_AND_TEXTS.finditer(found)
         if match["further"]
     ):
-        raise OutsideError(f"a key of more than {MOST_DEPTH} parts; {_TOO_DEEP}")
+        raise OutsideError(f"a key of more than {MAX_NESTING} parts; {_TOO_DEEP}")
     try:
         tables = tomllib.loads(found)
     except RecursionError as error:
         raise OutsideError(_TOO_DEEP) from error
     except ValueError as error:  # also from numbers with too many digits
         raise OutsideError(f"not valid TOML: {_one_line(error)}") from error
-    if _depth(tables) > MOST_DEPTH:
+    if _depth(tables) > MAX_NESTING:
         raise OutsideError(_TOO_DEEP)
     return tables
 
 
-_TOO_DEEP = f"nested too deeply; allowed is a depth of {MOST_DEPTH}"
+_TOO_DEEP = f"nested too deeply; allowed is a depth of {MAX_NESTING}"
 
 
 def megabytes(size: float) -> str:

@@ -1,15 +1,15 @@
 """A cell's parameters as inputs, so that compiled code depends on the topology only.
 
-`CellNumbers` divides what formulas are made of into numbers, which compiled functions take as
-vectors, and structure, whose digests are the keys of what is compiled. Structure is everything that
-is not named here as a number, values that remain in formulas included: nothing has to be listed
-for a digest to be right. The dynamics of an arm come from its description and are structure; so are
-the meshes and where bodies of several pieces are fixed to a link.
+`CellParameters` divides the content of a cell into parameters, which compiled functions take as
+vectors, and topology, whose digests are the keys of compiled code. Everything that is not named
+here as a parameter is topology, including values that remain in formulas: a digest is right without
+a list of them. The dynamics of an arm come from its description and are topology; so are the meshes,
+and the poses on a link of bodies of several pieces.
 
-A vector is a group of numbers that functions share: those of the task, of either arm, of what is
-held, of both start postures, of the bodies, and of the squeezes of pads anywhere under either
-robot's commanded force. Its entries are named by the key paths of the workcell file; those that
-NumPy derives from several keys are named by what they are.
+A vector is a group of parameters that functions share: those of the task, of either arm, of the
+payload and contacts, of both start postures, of the bodies, and of grasps by pads with any normals
+under either robot's commanded force. Its entries are named by the key paths of the workcell file;
+entries that NumPy derives from several keys have names of their own.
 """
 
 from __future__ import annotations
@@ -29,13 +29,12 @@ from symbolic.array import Array
 from symbolic.cell_model import CellBodies, CellModel
 from symbolic.contact.force_closure import grasp_shapes, left_components
 from symbolic.contact.soft_finger import SoftPatch
-from symbolic.geometry.screen import Base, Screen, ScreenBody
+from symbolic.geometry.screen import Screen, ScreenBase, ScreenBody
 from symbolic.records import Contact, RedundantJoint, Robot, Task, Waypoint, Workcell
 from symbolic.records.cell import box_flange, flange_lever
 from symbolic.records.content import CacheKey, digest_of_parts
 from symbolic.records.numbered import (
     GraspNumbers,
-    Group,
     NumberedContact,
     NumberedJoint,
     NumberedPayload,
@@ -43,18 +42,19 @@ from symbolic.records.numbered import (
     NumberedTask,
     NumberedWaypoint,
     NumberedWorkcell,
+    ParameterGroup,
 )
 from symbolic.robot.model import RobotModel
 
 TASK, HELD, START, BODIES = "task_numbers", "held_numbers", "start_numbers", "body_numbers"
-ARMS = ("arm_1_numbers", "arm_2_numbers")
+ARM_GROUPS = ("arm_1_numbers", "arm_2_numbers")
 SQUEEZES = ("squeeze_1_numbers", "squeeze_2_numbers")
-GROUPS = frozenset((TASK, HELD, START, BODIES, *ARMS, *SQUEEZES))
+GROUPS = frozenset((TASK, HELD, START, BODIES, *ARM_GROUPS, *SQUEEZES))
 """Names of the groups, which end functions' inputs."""
 
 
 @dataclass(frozen=True)
-class Number:
+class Parameter:
     """A parameter array in a topology: its group, key and shape, without values.
 
     Attributes:
@@ -69,7 +69,7 @@ class Number:
 
 
 @dataclass(frozen=True)
-class _Later:
+class LazyParameter:
     """Parameters that are computed on first use."""
 
     shape: tuple[int, ...]
@@ -80,11 +80,11 @@ class _Collector:
     """Collects parameters: places stay in the topology, values are stored separately."""
 
     def __init__(self) -> None:
-        self.entries: dict[str, list[tuple[Number, Array | _Later]]] = {}
+        self.entries: dict[str, list[tuple[Parameter, Array | LazyParameter]]] = {}
 
     def __call__(self, group: str, key: str, value: Any) -> Any:
-        array = value if isinstance(value, _Later) else np.asarray(value, dtype=float)
-        entry = Number(group, key, array.shape)
+        array = value if isinstance(value, LazyParameter) else np.asarray(value, dtype=float)
+        entry = Parameter(group, key, array.shape)
         self.entries.setdefault(group, []).append((entry, array))
         return entry
 
@@ -94,8 +94,8 @@ class _Collector:
     def upright(self, cosine: Any, sine: Any) -> Any:
         return ("turn about z", cosine, sine)
 
-    def group(self, name: str) -> Group:
-        return Group(name, ())
+    def group(self, name: str) -> ParameterGroup:
+        return ParameterGroup(name, ())
 
     def body(self, path: str, body: ScreenBody) -> Any:
         taken, entries = _collected_body(CacheKey(path, body, known=(path, body.content)))
@@ -108,11 +108,13 @@ class _Symbols:
     which they were collected."""
 
     def __init__(self, sizes: Mapping[str, int]) -> None:
-        self._groups = {name: Group(name, ca.SX.sym(name, size)) for name, size in sizes.items()}
+        self._groups = {
+            name: ParameterGroup(name, ca.SX.sym(name, size)) for name, size in sizes.items()
+        }
         self._taken = dict.fromkeys(sizes, 0)
 
     def __call__(self, group: str, key: str, value: Any) -> Any:
-        shape = value.shape if isinstance(value, _Later) else np.shape(value)
+        shape = value.shape if isinstance(value, LazyParameter) else np.shape(value)
         at, size = self._taken[group], prod(shape)
         self._taken[group] = at + size
         found = self._groups[group].symbols[at : at + size]
@@ -126,7 +128,7 @@ class _Symbols:
             ca.horzcat(cosine, -sine, 0), ca.horzcat(sine, cosine, 0), ca.DM([[0, 0, 1]])
         )
 
-    def group(self, name: str) -> Group:
+    def group(self, name: str) -> ParameterGroup:
         return self._groups[name]
 
     def body(self, path: str, body: ScreenBody) -> Any:
@@ -137,7 +139,7 @@ _Take = _Collector | _Symbols
 
 
 @dataclass(frozen=True)
-class WorkcellNumbers:
+class WorkcellParameters:
     """Parameters and topology of a cell without its bodies.
 
     Attributes:
@@ -157,11 +159,11 @@ class WorkcellNumbers:
         return self._collected[1]
 
     @property
-    def _entries(self) -> dict[str, list[tuple[Number, Array | _Later]]]:
+    def _entries(self) -> dict[str, list[tuple[Parameter, Array | LazyParameter]]]:
         return self._collected[0].entries
 
     @property
-    def layout(self) -> dict[str, tuple[Number, ...]]:
+    def layout(self) -> dict[str, tuple[Parameter, ...]]:
         """Entries of every group but the start postures, in order."""
         return {name: tuple(each for each, _ in found) for name, found in self._entries.items()}
 
@@ -179,7 +181,9 @@ class WorkcellNumbers:
             SettingsError: the pads do not close the grasp that they are of.
         """
         if name not in self._vectors:
-            parts = [v.find() if isinstance(v, _Later) else v for _, v in self._entries[name]]
+            parts = [
+                v.find() if isinstance(v, LazyParameter) else v for _, v in self._entries[name]
+            ]
             self._vectors[name] = np.concatenate([np.ravel(part) for part in parts])
         return self._vectors[name]
 
@@ -205,7 +209,7 @@ class WorkcellNumbers:
 
 
 @dataclass(frozen=True)
-class CellNumbers(WorkcellNumbers):
+class CellParameters(WorkcellParameters):
     """Parameters and topology of a whole cell.
 
     Attributes:
@@ -227,7 +231,7 @@ class CellNumbers(WorkcellNumbers):
         return self._of_bodies[1]
 
     @property
-    def _entries(self) -> dict[str, list[tuple[Number, Array | _Later]]]:
+    def _entries(self) -> dict[str, list[tuple[Parameter, Array | LazyParameter]]]:
         return super()._entries | self._of_bodies[0].entries
 
     @cached_property
@@ -292,10 +296,10 @@ def _workcell(take: _Take, cell: Workcell) -> NumberedWorkcell:
         environment=(),
         facing=cell.has_facing_pads,
         opposite=cell.has_opposite_pads,
-        beside=cell.has_pads_beside,
+        beside=cell.has_offset_pads,
         grasp=None if cell.has_closed_form else _grasp(take, HELD, "grasp", cell, None),
         squeezes=()
-        if cell.has_one_squeeze
+        if cell.has_scalar_squeeze
         else tuple(_grasp(take, name, name, cell, i) for i, name in enumerate(SQUEEZES)),
     )
 
@@ -320,9 +324,9 @@ def _grasp(
 
     def taken(name: str, shape: Any) -> Any:
         if name == "shapes":
-            pads = (_Later(each, partial(shape_of, k)) for k, each in enumerate(shape))
+            pads = (LazyParameter(each, partial(shape_of, k)) for k, each in enumerate(shape))
             return tuple(take(group, f"{path}.shapes[{k}]", pad) for k, pad in enumerate(pads))
-        return take(group, f"{path}.{name}", _Later(shape, lambda: getattr(found(), name)))
+        return take(group, f"{path}.{name}", LazyParameter(shape, lambda: getattr(found(), name)))
 
     shapes = grasp_shapes(cell)
     numbers = {name: taken(name, shape) for name, shape in shapes.items()}
@@ -336,7 +340,7 @@ def _as(kind: Any, record: Any, **changes: Any) -> Any:
 
 
 def _robot(take: _Take, i: int, robot: Robot, contact: Contact) -> NumberedRobot:
-    group, path = ARMS[i], f"robots[{i}]"
+    group, path = ARM_GROUPS[i], f"robots[{i}]"
     T_box_flange = box_flange(robot, contact)
     names = ["position_lower", "position_upper", "velocity_max", "acceleration_max"]
     names += ["torque_max", "min_manipulability"]
@@ -445,13 +449,13 @@ def _screen(take: _Take, screen: Screen) -> Screen:
     )
 
 
-def _base(take: _Take, path: str, base: Base) -> Base:
+def _base(take: _Take, path: str, base: ScreenBase) -> ScreenBase:
     rotation = _turn(take, BODIES, path, base.rotation)
-    return Base(rotation, take(BODIES, f"{path}.base.xyz", base.position))
+    return ScreenBase(rotation, take(BODIES, f"{path}.base.xyz", base.position))
 
 
 @lru_cache(maxsize=512)
-def _collected_body(seen: CacheKey) -> tuple[Any, list[tuple[Number, Array | _Later]]]:
+def _collected_body(seen: CacheKey) -> tuple[Any, list[tuple[Parameter, Array | LazyParameter]]]:
     """Collect a body's parameters, cached because variants of a cell share most bodies."""
     take, (path, body) = _Collector(), seen.given
     return _body(take, path, body), take.entries.get(BODIES, [])

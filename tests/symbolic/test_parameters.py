@@ -16,7 +16,7 @@ from symbolic.cell_model import CellBodies, CellModel, build_cell_bodies
 from symbolic.contact.load import load_function
 from symbolic.functions import arm_functions, sample_functions
 from symbolic.limit_coefficients import path_force_function, sample_limits_function
-from symbolic.numbers import GROUPS, HELD, START, TASK, CellNumbers
+from symbolic.parameters import GROUPS, HELD, START, TASK, CellParameters
 from symbolic.read.cell import changed, load
 from symbolic.records import Workcell
 from symbolic.records.poses import pose_matrix
@@ -28,9 +28,9 @@ def bodies() -> CellBodies:
     return build_cell_bodies(rack_cell())
 
 
-def numbers_of(cell: Workcell) -> CellNumbers:
+def numbers_of(cell: Workcell) -> CellParameters:
     own = build_cell_bodies(cell)
-    return CellNumbers(cell, own.screen, own.robots)
+    return CellParameters(cell, own.screen, own.robots)
 
 
 def turned_cell() -> Workcell:
@@ -52,7 +52,7 @@ def turned_cell() -> Workcell:
     return replace(cell, robots=(first, second), payload=payload, contacts=(one, two))
 
 
-def vectors(numbers: CellNumbers) -> dict[str, Array]:
+def vectors(numbers: CellParameters) -> dict[str, Array]:
     """Of all groups."""
     return {name: numbers.vector(name) for name in numbers.sizes}
 
@@ -60,7 +60,7 @@ def vectors(numbers: CellNumbers) -> dict[str, Array]:
 def both(cell: Workcell) -> tuple[CellModel, CellModel, dict[str, Array]]:
     """The model with constants, with symbols, and the values of these."""
     plain = hand_model(cell)
-    numbers = CellNumbers(cell, plain.screen, plain.robots)
+    numbers = CellParameters(cell, plain.screen, plain.robots)
     values = vectors(numbers) | {START: np.concatenate(plain.start)}
     return plain, numbers.symbolic(plain), values
 
@@ -149,7 +149,7 @@ def test_structure_is_what_formulas_are_written_of() -> None:
 
 
 def test_entries_are_named_by_their_keys() -> None:
-    numbers = CellNumbers(rack_cell(), bodies().screen, bodies().robots)
+    numbers = CellParameters(rack_cell(), bodies().screen, bodies().robots)
     held = {entry.key for entry in numbers.layout["held_numbers"]}
     assert {"payload.mass", "contacts[0].friction", "contacts[1].patch_radius"} <= held
     for group, entries in numbers.layout.items():

@@ -17,9 +17,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from symbolic import outside
+from symbolic import safe_io
 from symbolic.errors import OutsideError
-from symbolic.outside import replace_file
+from symbolic.safe_io import replace_file
 from tests.waiting import soon
 
 MOST = 1000
@@ -30,17 +30,17 @@ def test_a_regular_file_comes_in_also_through_links(tmp_path: Path) -> None:
     path.write_bytes(b"content")
     (tmp_path / "link").symlink_to(path)
     (tmp_path / "second").symlink_to(tmp_path / "link")
-    assert outside.read_bytes(path, MOST) == b"content"
-    assert outside.read_bytes(tmp_path / "second", MOST) == b"content"
-    assert outside.resolved(tmp_path / "second") == path.resolve()
+    assert safe_io.read_bytes(path, MOST) == b"content"
+    assert safe_io.read_bytes(tmp_path / "second", MOST) == b"content"
+    assert safe_io.resolved(tmp_path / "second") == path.resolve()
 
 
 def test_the_limit_is_exact(tmp_path: Path) -> None:
     path = tmp_path / "file"
     path.write_bytes(b"x" * MOST)
-    assert len(outside.read_bytes(path, MOST)) == MOST
+    assert len(safe_io.read_bytes(path, MOST)) == MOST
     path.write_bytes(b"x" * (MOST + 1))
-    for refuse in (outside.read_bytes, outside.require):
+    for refuse in (safe_io.read_bytes, safe_io.require):
         with pytest.raises(OutsideError, match=r"is too large .* allowed are"):
             refuse(path, MOST)
 
@@ -49,8 +49,8 @@ def test_a_file_that_hides_its_size_is_read_no_further() -> None:
     maps = Path("/proc/self/maps")
     assert maps.stat().st_size == 0
     with pytest.raises(OutsideError, match="is too large"):
-        outside.read_bytes(maps, 10)
-    assert outside.read_bytes(maps, 10_000_000)
+        safe_io.read_bytes(maps, 10)
+    assert safe_io.read_bytes(maps, 10_000_000)
 
 
 def test_what_is_no_regular_file_is_refused_at_once(tmp_path: Path) -> None:
@@ -70,10 +70,10 @@ def test_what_is_no_regular_file_is_refused_at_once(tmp_path: Path) -> None:
         ]
         for path, words in odd:
             with soon(), pytest.raises(OutsideError, match=rf"cannot be read \(.*{words}"):
-                outside.read_bytes(path, MOST)
+                safe_io.read_bytes(path, MOST)
     for path in (tmp_path / "loop", tmp_path / "gone", tmp_path / ("x" * 5000)):
         with pytest.raises(OutsideError, match="cannot be read"):
-            outside.resolved(path)
+            safe_io.resolved(path)
 
 
 values = st.recursive(
@@ -90,12 +90,12 @@ values = st.recursive(
 @given(values, st.booleans())
 def test_json_comes_in_as_written(value: Any, ascii_only: bool) -> None:
     content = json.dumps(value, ensure_ascii=ascii_only).encode()
-    assert outside.json_value(content) == value
+    assert safe_io.json_value(content) == value
 
 
 @given(st.binary(max_size=200))
 def test_any_bytes_are_a_value_or_refused(content: bytes) -> None:
-    for read in (outside.json_value, outside.toml_tables):
+    for read in (safe_io.json_value, safe_io.toml_tables):
         with suppress(OutsideError):
             read(content)
 
@@ -110,11 +110,11 @@ def test_the_depth_is_that_of_the_value(value: Any) -> None:
         return 0
 
     nested = value
-    for _ in range(outside.MOST_DEPTH - depth(value)):
+    for _ in range(safe_io.MAX_NESTING - depth(value)):
         nested = [nested]
-    assert outside.json_value(json.dumps(nested).encode()) == nested
+    assert safe_io.json_value(json.dumps(nested).encode()) == nested
     with pytest.raises(OutsideError, match="nested 51 deep; allowed is 50"):
-        outside.json_value(json.dumps([nested]).encode())
+        safe_io.json_value(json.dumps([nested]).encode())
 
 
 JSON: list[tuple[bytes, str]] = [
@@ -128,7 +128,7 @@ JSON: list[tuple[bytes, str]] = [
     (b'{"\\udfff": 1}', "half a surrogate pair"),
     (b'[[{"a": "x\\uD800y"}]]', "half a surrogate pair"),
     (b"[" * 100_000, "nested 100000 deep"),
-    (b"[" + b"0," * outside.MOST_VALUES + b"0]", "more than 1000000 values"),
+    (b"[" + b"0," * safe_io.MAX_JSON_VALUES + b"0]", "more than 1000000 values"),
     (b"[" + b'"",' * 100 + b'"\xff"]', "byte 302 is not UTF-8"),
 ]
 TOML: list[tuple[bytes, str]] = [
@@ -153,9 +153,9 @@ XML: list[tuple[bytes, str]] = [
 @pytest.mark.parametrize(
     ("read", "content", "words"),
     [
-        *((outside.json_value, *case) for case in JSON),
-        *((outside.toml_tables, *case) for case in TOML),
-        *((outside.xml_text, *case) for case in XML),
+        *((safe_io.json_value, *case) for case in JSON),
+        *((safe_io.toml_tables, *case) for case in TOML),
+        *((safe_io.xml_text, *case) for case in XML),
     ],
 )
 def test_what_is_no_such_document_is_refused(
@@ -166,13 +166,13 @@ def test_what_is_no_such_document_is_refused(
 
 
 def test_whole_surrogate_pairs_and_escaped_ones_are_text() -> None:
-    assert outside.json_value(b'"\\ud83d\\ude00"') == "\U0001f600"
-    assert outside.json_value(b'"\\\\ud800"') == "\\ud800"
+    assert safe_io.json_value(b'"\\ud83d\\ude00"') == "\U0001f600"
+    assert safe_io.json_value(b'"\\\\ud800"') == "\\ud800"
 
 
 def test_toml_comes_in_as_a_plain_reader_has_it() -> None:
     content = b"# " + b"a.b, " * 100 + b"\nx = [" + b"0.1, " * 1000 + b"]\na.b.c = '...'\n"
-    found = outside.toml_tables(content)
+    found = safe_io.toml_tables(content)
     assert found == tomllib.loads(content.decode())
     assert math.isclose(sum(found["x"]), 100.0)
 
@@ -190,12 +190,12 @@ def test_toml_comes_in_as_a_plain_reader_has_it() -> None:
     ],
 )
 def test_dots_in_texts_are_no_keys(content: bytes) -> None:
-    assert outside.toml_tables(content) == tomllib.loads(content.decode())
+    assert safe_io.toml_tables(content) == tomllib.loads(content.decode())
 
 
 def test_xml_comes_in_without_its_mark() -> None:
     document = '<?xml version="1.0" encoding="UTF-8"?><a b="\xe9"/>'
-    assert outside.xml_text(document.encode("utf-8-sig")) == document
+    assert safe_io.xml_text(document.encode("utf-8-sig")) == document
 
 
 def test_content_and_permissions_are_those_asked_for(tmp_path: Path) -> None:
