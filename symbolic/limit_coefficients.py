@@ -190,8 +190,8 @@ def force_functions(workcell: Workcell) -> tuple[ca.Function, ca.Function]:
     blocks = {name: ca.SX.sym(name, sizes[name]) for name in ("force", "moment")}
     inputs, alone, sloping = _inputs(workcell, blocks), Detached(0), Detached(1)
     value, varied = (
-        _held(workcell, blocks, inputs["a"], inputs["w"], select_parameters).normal
-        for select_parameters in (alone, sloping)
+        _held(workcell, blocks, inputs["a"], inputs["w"], detached).normal
+        for detached in (alone, sloping)
     )
     found = alone.replaced([ca.densify(value), alone.symbols])
     outputs = dict(zip(("value", "solved"), found, strict=True))
@@ -259,8 +259,7 @@ def ratio_functions(workcell: Workcell) -> tuple[ca.Function, ca.Function]:
     inputs, alone, sloping = _inputs(workcell, blocks), Detached(0), Detached(1)
     timing = inputs["a"], inputs["w"]
     value, varied = (
-        contact_limits(workcell, blocks, timing, select_parameters)[0]
-        for select_parameters in (alone, sloping)
+        contact_limits(workcell, blocks, timing, detached)[0] for detached in (alone, sloping)
     )
     whole = inputs | {"solved": alone.symbols}
     return (

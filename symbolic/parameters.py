@@ -2,9 +2,9 @@
 
 `CellParameters` divides the content of a cell into parameters, which compiled functions take as
 vectors, and topology, whose digests are the keys of compiled code. Everything that is not named
-here as a parameter is topology, including values that remain in formulas: a digest is right without
-a list of them. The dynamics of an arm come from its description and are topology; so are the meshes,
-and the poses on a link of bodies of several pieces.
+here as a parameter is topology, including values that remain in formulas: a digest is right
+without a list of them. The dynamics of an arm come from its description and are topology; so are
+the meshes, and the poses on a link of bodies of several pieces.
 
 A vector is a group of parameters that functions share: those of the task, of either arm, of the
 payload and contacts, of both start postures, of the bodies, and of grasps by pads with any normals

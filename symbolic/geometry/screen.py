@@ -1,8 +1,8 @@
 """Numbers behind the bounds of distances and motions: covers, obstacles, reach.
 
-NumPy computes it once per cell. `symbolic.geometry.clearance` writes expressions of it, of arrays or
-of symbols in their place (`symbolic.parameters.CellParameters`). The choice of a pair's bound depends
-on numbers, too, and is stored as flags.
+NumPy computes it once per cell. `symbolic.geometry.clearance` writes expressions of it, with arrays
+or symbols as values (`symbolic.parameters.CellParameters`). The choice of a pair's bound depends on
+numbers, too, and is stored as flags.
 """
 
 from __future__ import annotations

@@ -296,9 +296,9 @@ def test_a_task_written_otherwise_is_refused() -> None:
     ],
 )
 def test_what_robots_drive_has_an_allocation_of_its_own(
-    coarse_task: str, usual: str, driven: str, tmp_path: Path
+    stated: str, usual: str, driven: str, tmp_path: Path
 ) -> None:
-    variant = rewritten("[task]\n", f"[task]\n{coarse_task}")
+    variant = rewritten("[task]\n", f"[task]\n{stated}")
     cell = unpack_cell(variant, tmp_path / "usual", check_digest=False)
     assert cell.task.allocation == usual
     assert unpack_cell(drivable_files(variant), tmp_path / "driven").task.allocation == driven
