@@ -1,16 +1,20 @@
 """Sphinx's settings: `sphinx-build -W -b html docs build/site`.
 
-The reference comes from the docstrings of what `hybrid_opt` exports, the gallery from the files of
-`studies/examples`, which are run; `-D sphinx_gallery_conf.plot_gallery=0` leaves that out.
+The pages of names come from the docstrings of what `hybrid_opt` exports, the command line from the
+programs' `--help`, the gallery from the files of `studies/examples`, which are run;
+`-D sphinx_gallery_conf.plot_gallery=0` leaves that out.
 """
 
 from __future__ import annotations
 
 import ast
 import inspect
+import io
 import os
 import re
 import sys
+from contextlib import redirect_stdout, suppress
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +25,7 @@ os.environ["TQDM_DISABLE"] = "1"  # an example's bar would be shown once per ste
 from sphinx_gallery.scrapers import figure_rst  # noqa: E402
 
 import hybrid_opt as ho  # noqa: E402
+from studies.__main__ import COMMAND, programs  # noqa: E402
 
 project = "dual-arm-carry"
 author = copyright = "the project's contributors"
@@ -37,7 +42,6 @@ extensions = [
 html_theme = "furo"
 html_title = project
 exclude_patterns = [
-    "README.md",
     "sg_execution_times.rst",
     *(f"gallery/*.{end}" for end in ("ipynb", "py", "md5", "zip")),
 ]
@@ -130,6 +134,22 @@ def api() -> Path:
     return folder
 
 
+def command_line() -> Path:
+    """A page with what `--help` prints of every program."""
+    os.environ["COLUMNS"] = "96"
+    title = "Command line"
+    parts = [f"{title}\n{'=' * len(title)}\n", f"What ``{COMMAND} NAME --help`` prints.\n"]
+    for name, (module, _) in programs().items():
+        shown = io.StringIO()
+        with redirect_stdout(shown), suppress(SystemExit):
+            import_module(module).main(["--help"], f"{COMMAND} {name}")
+        text = "\n".join(f"   {line}".rstrip() for line in shown.getvalue().splitlines())
+        parts.append(f"{name}\n{'-' * len(name)}\n\n.. code-block:: text\n\n{text}\n")
+    path = ROOT / "docs" / "reference" / "command-line.rst"
+    _write(path, "\n".join(parts))
+    return path
+
+
 def _write(path: Path, text: str) -> None:
     """Write where something changed, so that Sphinx reads no page twice."""
     if not path.exists() or path.read_text("utf-8") != text:
@@ -137,6 +157,7 @@ def _write(path: Path, text: str) -> None:
 
 
 api()
+command_line()
 sphinx_gallery_conf: dict[str, Any] = {
     "examples_dirs": [str(examples())],
     "gallery_dirs": ["gallery"],

@@ -1,4 +1,7 @@
-"""Links, files, programs and options that the documentation names exist; addresses are whole."""
+"""Links, files, programs and options that the documentation names exist; addresses are whole.
+
+Python blocks are parts of examples, which tests run; TOML blocks can be read; the shell lines of
+the own-cell tutorial are run. Programs and options of all other shell lines are checked."""
 
 from __future__ import annotations
 
@@ -7,6 +10,8 @@ import re
 import shlex
 import subprocess
 import sys
+import textwrap
+import tomllib
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
@@ -21,7 +26,7 @@ DOCUMENTS = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md")])
 NAMES = [str(path.relative_to(ROOT)) for path in DOCUMENTS]
 
 LINK = re.compile(r"\[[^\]]*\]\(([^)\s]+)\)")
-COMMAND = re.compile(r"python -m ([a-z_]+(?:\.[a-z_]+)*)([^\n`#]*)")
+COMMAND = re.compile(r"(python -m |(?<!\")dual-arm-carry )([a-z_]+(?:\.[a-z_]+)*)([^\n`#]*)")
 OPTION = re.compile(r"--[a-z][a-z-]*")
 SOURCE = re.compile(r"`((?:symbolic|codegen|hybrid_opt|studies|tests|docs)/[\w./-]+)`")
 OWN = ("symbolic", "codegen", "hybrid_opt", "studies")
@@ -60,11 +65,11 @@ def broken_links(path: Path, text: str) -> list[str]:
 
 def commands(text: str) -> list[tuple[str, list[str]]]:
     """Modules of this project that a document runs, with the options it gives them."""
-    return [
-        (module, OPTION.findall(rest))
-        for module, rest in COMMAND.findall(text)
-        if module.split(".")[0] in OWN
+    found = [
+        (name if how.startswith("python") else f"studies.{name}", OPTION.findall(rest))
+        for how, name, rest in COMMAND.findall(text)
     ]
+    return [(module, options) for module, options in found if module.split(".")[0] in OWN]
 
 
 @cache
@@ -108,62 +113,93 @@ def test_what_is_broken_would_be_found(tmp_path: Path) -> None:
     found = broken_links(page, page.read_text())
     assert found == ["gone.md", "#another", "http://x", "https://x"]
     assert commands("`python -m studies.rack --jobs 2`") == [("studies.rack", ["--jobs"])]
+    assert commands("dual-arm-carry run x --quick") == [("studies.run", ["--quick"])]
     assert "--no-such-option" not in OPTION.findall(help_of("studies.rack"))
 
 
+def blocks(text: str, language: str) -> list[str]:
+    """Fenced code blocks of a document, without the indentation of list items."""
+    found = re.findall(rf"^ *```{language}\n(.*?)^ *```", text, flags=re.DOTALL | re.MULTILINE)
+    return [textwrap.dedent(block) for block in found]
+
+
+def test_python_blocks_are_parts_of_examples() -> None:
+    """`tests/studies/test_examples.py` runs these."""
+    examples = "".join(path.read_text("utf-8") for path in ROOT.glob("studies/examples/*.py"))
+    found = [block for path in DOCUMENTS for block in blocks(path.read_text("utf-8"), "python")]
+    assert found
+    for block in found:
+        assert block.strip() in examples, block
+
+
+def test_toml_blocks_can_be_read() -> None:
+    found = [block for path in DOCUMENTS for block in blocks(path.read_text("utf-8"), "toml")]
+    assert len(found) > 5
+    for block in found:
+        assert tomllib.loads(block), block
+
+
 @pytest.mark.slow
-def test_the_lines_for_a_cell_of_ones_own_end_without_a_warning(tmp_path: Path) -> None:
-    """As README has them, but for the installation; in a folder that has the checkout's studies."""
-    section = (ROOT / "README.md").read_text("utf-8").split("## Your own cell")[1]
-    install, *lines = re.findall(r"```sh\n(.*?)```", section, flags=re.DOTALL)[0].splitlines()
-    assert install.startswith("pip install")
-    assert len(lines) == 3
+def test_the_tutorial_of_a_cell_of_ones_own_ends_with_a_bundle_and_no_warning(
+    tmp_path: Path,
+) -> None:
+    """As printed, but for the installation; in a folder that has the checkout's studies."""
+    lines = blocks((ROOT / "docs/tutorials/two-robots.md").read_text("utf-8"), "sh")[0].splitlines()
+    readme = (ROOT / "README.md").read_text("utf-8").split("## Your own cell")[1]
+    assert blocks(readme, "sh")[0].splitlines() == lines[1:-1]
+    assert lines[1].startswith("pip install")
     (tmp_path / "studies").symlink_to(ROOT / "studies")
-    for line in lines:
+    printed = ""
+    for line in lines[2:]:
         words = shlex.split(line)
-        words[0] = sys.executable if words[0] == "python" else words[0]
+        if words[0] == "dual-arm-carry":
+            words[:1] = [sys.executable, "-m", "studies"]
         done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=False)
         assert done.returncode == 0, done.stderr
         assert "WARNING" not in done.stdout + done.stderr, done.stdout
-    assert done.stdout.startswith("Run this carry: ")
-    assert "grip at rest, with the usual uncertainty: 96.4 N of 120.0 N" in done.stderr
+        printed += done.stdout + done.stderr
+    assert "Run this carry: " in printed
+    assert "grip at rest, with the usual uncertainty: 96.4 N of 120.0 N" in printed
+    assert list(tmp_path.glob("bundles/*/torque/manifest.json"))
 
 
 def test_the_index_lists_every_page() -> None:
-    docs = ROOT / "docs"
-    pages = {path.relative_to(docs).as_posix() for path in docs.glob("**/*.md")} - {
-        "README.md",
-        "index.md",
+    docs, text = ROOT / "docs", (ROOT / "docs/index.md").read_text("utf-8")
+    pages = {path.relative_to(docs).as_posix() for path in docs.glob("**/*.md")} - {"index.md"}
+    assert pages == {link for link in LINK.findall(text) if "://" not in link}
+    assert pages <= {f"{line}.md" for line in text.splitlines()}
+
+
+MOST_WORDS = 22_500
+"""Of all pages together: what a reader can find something in."""
+
+
+def test_pages_stay_short() -> None:
+    tokens = [w for path in ROOT.glob("docs/**/*.md") for w in path.read_text("utf-8").split()]
+    assert len([w for w in tokens if re.search(r"\w", w)]) <= MOST_WORDS
+
+
+def test_every_benchmark_has_a_command() -> None:
+    text = (ROOT / "docs/reference/benchmarks.md").read_text("utf-8")
+    rows = re.findall(r"^\|(?! ?-)(.*)\|(.*)\|(.*)\|$", text, flags=re.MULTILINE)[1:]
+    assert len(rows) >= 5
+    for *_, command in rows:
+        assert re.fullmatch(r" `(dual-arm-carry|python) .*` ", command), command
+
+
+def test_pages_that_the_packages_name_exist() -> None:
+    named = {
+        (path.name, page)
+        for package in OWN
+        for ending in ("py", "toml", "c", "cpp", "hpp", "js")
+        for path in (ROOT / package).rglob(f"*.{ending}")
+        for page in re.findall(r"\bdocs/[\w./-]+\.md(?! there)", path.read_text("utf-8"))
     }
-    assert pages <= set(LINK.findall((docs / "README.md").read_text("utf-8")))
+    assert len(named) > 20
+    assert [each for each in sorted(named) if not (ROOT / each[1]).is_file()] == []
 
 
-@pytest.mark.parametrize("name", [name for name in NAMES if name.startswith("docs/measured/")])
-def test_a_measurement_has_its_date_and_its_command(name: str) -> None:
-    text = (ROOT / name).read_text("utf-8")
-    assert re.search(r"\n\n20\d\d-\d\d-\d\d[ .]", text)
-    assert re.search(r"^    python ", text, flags=re.MULTILINE)
-    assert re.search(r"^\|", text, flags=re.MULTILINE)
-
-
-QUESTION = re.compile(r"^\| (.*\*\*(.+?)\*\*.*\?) \| `([^`]+)` \|$", flags=re.MULTILINE)
-
-
-def test_questions_are_answered_by_one_file_each() -> None:
-    """The file exists and speaks of what the question is about."""
-    asked = QUESTION.findall((ROOT / "CONTRIBUTING.md").read_text("utf-8"))
-    assert len({file for _, _, file in asked}) == len(asked) >= 20
-    for question, subject, file in asked:
-        assert subject.lower() in (ROOT / file).read_text("utf-8").lower(), question
-
-
-def test_every_room_is_listed_and_says_what_is_inside() -> None:
-    text = (ROOT / "CONTRIBUTING.md").read_text("utf-8")
-    rooms = [
-        path.parent
-        for package in ("symbolic", "hybrid_opt")
-        for path in (ROOT / package).glob("*/__init__.py")
-    ]
-    for room in rooms:
-        assert f"| `{room.relative_to(ROOT).as_posix()}` |" in text, room
-        assert ast.get_docstring(ast.parse((room / "__init__.py").read_text("utf-8"))), room
+def test_every_room_says_what_is_inside() -> None:
+    for package in ("symbolic", "hybrid_opt"):
+        for path in (ROOT / package).glob("*/__init__.py"):
+            assert ast.get_docstring(ast.parse(path.read_text("utf-8"))), path

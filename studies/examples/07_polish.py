@@ -1,9 +1,8 @@
 """Polish a front, and see what each attempt became.
 
 The polish minimises the paper's two objectives (docs/explanation/polish.md). The result is a front
-again. Fronts of `Cell.drivable()` are polished by duration and force
-(docs/explanation/drivable.md); carries whose paths are known to be good take part with
-`paths=[carry]`.
+again. Fronts of `Cell.drivable()` are polished by duration and force; carries whose paths are known
+to be good take part with `paths=[carry]`.
 """
 
 import numpy as np

@@ -1,7 +1,7 @@
 """The examples, and the cells, problems and robots they read: `python -m studies.examples FOLDER`.
 
-They are copied to FOLDER/studies and run in FOLDER as they do in the repository:
-`python studies/examples/01_evaluate.py`.
+A notebook and numbered programs are copied to FOLDER/studies and run in FOLDER as they do in the
+repository: `python studies/examples/01_evaluate.py`.
 """
 
 from __future__ import annotations
@@ -13,7 +13,13 @@ from pathlib import Path
 from studies.options import OUTPUT_FOLDER
 from studies.program import Parser, Program
 
-SHIPPED = ("examples/[0-9]*.py", "problems/*.toml", "robots/*.urdf", "workcells/*.toml")
+SHIPPED = (
+    "examples/[0-9]*.py",
+    "examples/*.ipynb",
+    "problems/*.toml",
+    "robots/*.urdf",
+    "workcells/*.toml",
+)
 """What is copied, below `studies`."""
 
 

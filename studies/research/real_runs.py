@@ -3,7 +3,7 @@
 Reads the logs of two UR5e that squeeze boxes where you have fetched them, nothing of theirs comes
 with this project; without `--folder` it says how to get them. For every run that is labelled it
 tells what the model asks for beside what was measured, and what happened to the box
-(docs/measured/real-runs.md).
+(docs/explanation/validation.md).
 """
 
 from __future__ import annotations

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import json
 import re
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from symbolic.read.cell import load
 ROOT = Path(__file__).resolve().parents[2]
 EXAMPLES = sorted((ROOT / "studies" / "examples").glob("[0-9]*.py"))
 NAMES = [path.name for path in EXAMPLES]
+NOTEBOOK = ROOT / "studies" / "examples" / "tour.ipynb"
 
 SMALL = {
     "evaluations=1000": "evaluations=120",
@@ -71,6 +73,19 @@ def test_it_runs(
 
 
 @pytest.mark.slow
+def test_the_notebook_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    cells = json.loads(NOTEBOOK.read_text("utf-8"))["cells"]
+    code = [cell["source"] for cell in cells if cell["cell_type"] == "code"]
+    assert len(code) >= 8
+    assert all(cell["outputs"] == [] for cell in cells if cell["cell_type"] == "code")
+    run("\n".join(code), tmp_path, monkeypatch)
+    assert "Recommended" in capsys.readouterr().out
+    assert list((tmp_path / "out").rglob("manifest.json"))
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(2, 21))
 def test_the_first_runs_with_every_seed(
     seed: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
@@ -94,7 +109,8 @@ def test_a_copy_holds_what_the_examples_and_its_cells_read(
 ) -> None:
     assert copy([str(tmp_path / "new")]) == 0
     monkeypatch.chdir(tmp_path / "new")
-    copies = sorted(Path("studies/examples").iterdir())
+    assert Path("studies/examples/tour.ipynb").read_bytes() == NOTEBOOK.read_bytes()
+    copies = sorted(Path("studies/examples").glob("*.py"))
     assert [path.name for path in copies] == NAMES
     read = {name for path in copies for name in re.findall(r'"(studies/[^"]+)"', path.read_text())}
     assert read == {"studies/workcells/rack.toml", "studies/problems/past-a-post.toml"}
