@@ -1,4 +1,4 @@
-"""From functions and C text to loaded libraries: found in the cache, else compiled side by side.
+"""From functions and C text to loaded libraries, found in the cache or compiled in parallel.
 
 There is one way for all of them. A `Source` is C to compile: of one CasADi function with its
 driver, of one that is written by hand, or of a program (`load_or_build_program`). Its library is
@@ -76,8 +76,8 @@ class Source:
 
     @classmethod
     def of(cls, name: str, function: ca.Function, lanes: int, level: int | None) -> Source:
-        """The C of a function; level None for one by the size of what CasADi generates. Without
-        lanes, with one warning, where it has no form in them."""
+        """Generate the C of a function; level None chooses one by the size of the generated text.
+        Without lanes, with one warning, if its C has no form in lanes."""
         from codegen.source import c_source, dense, generated_c, operations
 
         whole = dense(function)
@@ -104,7 +104,7 @@ class Library:
     handle: ctypes.CDLL
 
     def function(self) -> CompiledFunction:
-        """What it holds as a numeric function.
+        """Return the library's content as a numeric function.
 
         Raises:
             CodegenError: it has no driver.
@@ -115,7 +115,7 @@ class Library:
 
 @dataclass(frozen=True)
 class FunctionReport:
-    """How one function was built.
+    """Record of one function's build.
 
     Attributes:
         name: in the set that was built.
@@ -150,8 +150,8 @@ class Build:
 
 
 def compiler_of(cache: Cache) -> Compiler:
-    """The C compiler; where there is none, the one that made what the cache holds for this
-    processor, so that it is found.
+    """Return the C compiler; without one, the compiler that made the cached libraries for this
+    processor, so that they are found.
 
     Raises:
         CodegenError: there is none, and CC names one or the cache knows of none.
@@ -241,7 +241,7 @@ def load_or_build(
     levels: Mapping[str, int] | None = None,
     lanes: int = 1,
 ) -> dict[str, NumericFunction]:
-    """A set of functions by the key of what they are made from.
+    """Load or build a set of functions by the key of their ingredients.
 
     Where the set was built before, with this compiler and these library versions, neither
     expressions nor C are made again: `make` is not called and CasADi is not imported.
@@ -265,7 +265,7 @@ def load_or_build(
 def load_or_compile(
     key: str, make: Callable[[], tuple[Signature, str]], cache: Cache | None = None
 ) -> NumericFunction:
-    """A function written in C by hand, by the key of what it is made from.
+    """Load or compile a function written in C by hand, by the key of its ingredients.
 
     Args:
         key: as of `load_or_build`.
@@ -295,7 +295,7 @@ def load_or_build_program(
     cache: Cache | None = None,
     lanes: int = 0,
 ) -> ctypes.CDLL:
-    """Several CasADi functions in lanes, and C of our own that calls them, as one library.
+    """Load or build several CasADi functions in lanes, and own C that calls them, as one library.
 
     For work in which calling through NumPy would cost more than the functions: intermediate results
     stay in lanes and in the cache of the processor; see `codegen.source.program_source`.
@@ -352,7 +352,8 @@ def _set_key(key: str, levels: Mapping[str, int] | None, lanes: int, cache: Cach
 def _obtained(
     key: str, sources: Callable[[], Iterable[Source]], cache: Cache
 ) -> dict[str, Library]:
-    """The libraries of a recipe: those that its record names, or what its sources become."""
+    """Load the libraries of a recipe: those that its record names, or those compiled from its
+    sources."""
 
     def find() -> dict[str, Library] | None:
         record = cache.read_record(key)
@@ -376,7 +377,7 @@ def _remember(key: str, built: Mapping[str, tuple[Library, bool]], cache: Cache)
 
 
 def _loaded(key: str, cache: Cache) -> Library | None:
-    """The library kept under a key; None where there is none that can be loaded."""
+    """Load the library stored under a key; None if there is none that can be loaded."""
     entry = cache.find(key)
     try:
         return None if entry is None else Library(entry, ctypes.CDLL(str(entry.library)))
@@ -387,7 +388,7 @@ def _loaded(key: str, cache: Cache) -> Library | None:
 def _compiled(
     sources: Iterable[Source], cache: Cache, *, rebuild: bool = False
 ) -> dict[str, tuple[Library, bool]]:
-    """The libraries of sources by name, and whether the cache had them already.
+    """Compile sources; return the libraries by name, and whether the cache already had them.
 
     Compilers run side by side, and while the sources that follow are made.
     """
@@ -412,8 +413,8 @@ def _compiled(
 def _begin(
     source: Source, compiler: Compiler, cache: Cache, pool: ThreadPoolExecutor, rebuild: bool
 ) -> Future[tuple[Library, bool]]:
-    """Begin to compile a source. Work that is submitted begins in turn: parts before what needs
-    them."""
+    """Begin to compile a source. Submitted work starts in order: parts before the library that
+    needs them."""
     flags = () if source.lanes == 1 else LANE_FLAGS
     rest, parts = in_parts(source.text, source.lanes, source.most)
     # Names and shapes are part of the C text, except which of two equal layouts they mean.
@@ -478,7 +479,7 @@ def _require_sound(compiler: Compiler, cache: Cache) -> None:
 
 
 def _object(part: Part, compiler: Compiler, cache: Cache) -> Path:
-    """A part's object file."""
+    """Return a part's object file, compiled if the cache lacks it."""
     flags = (*FLAGS, *LANE_FLAGS)
     key = key_of("part", compiler=compiler.identity, level=part.level, flags=flags, text=part.text)
 

@@ -1,4 +1,4 @@
-"""A user's folder of compiled libraries, addressed by what they were made from.
+"""A user's folder of compiled libraries, addressed by their ingredients.
 
 Every library has a manifest beside it, written last, that holds the library's checksum and its
 own: an interrupted or damaged build is not found and is made again. Files appear by renaming, so
@@ -57,7 +57,7 @@ _KEY_END = re.compile("[-.]")
 
 
 def key_of(what: str, **parts: object) -> str:
-    """The key of something in a cache: what it is, and by name all that it is made from.
+    """Compute the key of an entry in a cache: its kind and, by name, all its ingredients.
 
     Every key of a cache comes from here, so that what makes it anew can be read in one place:
 
@@ -74,7 +74,7 @@ def key_of(what: str, **parts: object) -> str:
 
 
 def digest(*parts: str | bytes) -> str:
-    """SHA-256 over the parts, each with its length so that none can flow into the next."""
+    """Compute the SHA-256 of the parts, each prefixed with its length."""
     total = hashlib.sha256()
     for part in parts:
         raw = part.encode() if isinstance(part, str) else part
@@ -85,13 +85,13 @@ def digest(*parts: str | bytes) -> str:
 
 @cache
 def library_version(name: str) -> str:
-    """Version of an installed library, kept: the look-up takes milliseconds."""
+    """Return the version of an installed library, cached since the look-up takes milliseconds."""
     return version(name)
 
 
 def source_digest(*packages: str) -> str:
-    """SHA-256 over the Python and C sources of installed packages and modules, which are not
-    imported."""
+    """Compute the SHA-256 of the Python and C sources of installed packages and modules, without
+    importing them."""
     total: list[str | bytes] = []
     for name, file in _sources(packages):
         total += [name, file.read_bytes()]
@@ -99,7 +99,7 @@ def source_digest(*packages: str) -> str:
 
 
 def _code(file: Path) -> str | bytes:
-    """What a source does: a Python file without its comments and docstrings."""
+    """Return a source without what has no effect: comments and docstrings of a Python file."""
     raw = file.read_bytes()
     if file.suffix != ".py":
         return raw
@@ -113,7 +113,8 @@ class _Undocumented(ast.NodeTransformer):
 
 
 def _sources(packages: Sequence[str]) -> Iterator[tuple[str, Path]]:
-    """Every source file of packages or modules, with a name that does not depend on its folder."""
+    """Yield every source file of packages or modules, with a name that does not depend on its
+    folder."""
     for package in packages:
         spec = importlib.util.find_spec(package)
         if spec is None:
@@ -127,7 +128,7 @@ def _sources(packages: Sequence[str]) -> Iterator[tuple[str, Path]]:
 
 
 def largest_size() -> int:
-    """What a cache may hold [bytes], see `Cache.trim`.
+    """Return the largest size of a cache [bytes], see `Cache.trim`.
 
     Raises:
         CodegenError: the environment variable holds no number.
@@ -143,7 +144,7 @@ def largest_size() -> int:
 
 
 def default_folder() -> Path:
-    """DUAL_ARM_CACHE if set, otherwise `dual-arm-carry` in the user's cache folder
+    """Return DUAL_ARM_CACHE if set, otherwise `dual-arm-carry` in the user's cache folder
     (XDG_CACHE_HOME, by default ~/.cache)."""
     own = os.environ.get("DUAL_ARM_CACHE", "")
     return Path(own).expanduser() if own else platformdirs.user_cache_path("dual-arm-carry")
@@ -151,7 +152,7 @@ def default_folder() -> Path:
 
 @dataclass(frozen=True)
 class Usage:
-    """What a cache holds: libraries, and all files with their size together [bytes]."""
+    """Content of a cache: number of libraries, and the total size of all files [bytes]."""
 
     libraries: int
     files: int
@@ -174,13 +175,13 @@ class Entry:
 
 
 class Cache:
-    """The folder, its safety and its files."""
+    """A cache folder: its safety and its files."""
 
     def __init__(self, folder: Path | None = None) -> None:
         self.folder = Path(os.path.abspath(folder if folder is not None else default_folder()))
 
     def find(self, key: str) -> Entry | None:
-        """The entry of this key, or None where it is missing or damaged.
+        """Return the entry of this key, or None if it is missing or damaged.
 
         Raises:
             CodegenError: others than the user can write to the folder or the file.
@@ -200,7 +201,7 @@ class Cache:
     def store(
         self, key: str, make: Callable[[Path], Mapping[str, Any]], suffix: str = ".so"
     ) -> Entry:
-        """Make a library and put it under this key, replacing what is there.
+        """Make a library and store it under this key, replacing an existing one.
 
         Args:
             key: see `digest`.
@@ -224,7 +225,7 @@ class Cache:
         return Entry(key, library, facts)
 
     def read_record(self, key: str) -> dict[str, Any] | None:
-        """The record stored under this key, or None where it is missing or damaged."""
+        """Return the record stored under this key, or None if it is missing or damaged."""
         self._require_safe()
         raw = self._read_own(self.folder / f"{key}.json")
         if raw is None:
@@ -258,7 +259,7 @@ class Cache:
         *,
         anew: bool = False,
     ) -> tuple[Found, bool]:
-        """What is kept under a key; made, by one process only, where it is not there.
+        """Return the value stored under a key; if it is missing, exactly one process makes it.
 
         Args:
             find: loads it; None where it is missing, damaged or cannot be loaded.
@@ -277,7 +278,7 @@ class Cache:
             return (make(), False) if found is None else (found, True)
 
     def code_digest(self, *packages: str) -> str:
-        """SHA-256 over what packages' sources do: comments and docstrings do not count.
+        """Compute the SHA-256 of packages' sources without comments and docstrings.
 
         Parsing takes a while: the answer is kept by the digest of the sources as they are.
         """
@@ -306,16 +307,16 @@ class Cache:
             os.close(handle)
 
     def usage(self) -> Usage:
-        """What it holds."""
+        """Return the number of libraries and the total size."""
         kept = self._by_use()
         files = [file for *_, files in kept for file in files]
         libraries = sum(file.suffix == ".so" for file in files)
         return Usage(libraries, len(files), sum(size for _, size, _ in kept))
 
     def trim(self, most: int | None = None) -> int:
-        """Remove what was not used for longest until the rest is at most so large [bytes]; None for
-        what DUAL_ARM_CACHE_LIMIT says in gibibytes, by default `MOST_KEPT`. What is removed is made
-        anew when it is needed.
+        """Remove the least recently used files until the rest is at most so large [bytes]; None for
+        the limit of DUAL_ARM_CACHE_LIMIT in gibibytes, by default `MOST_KEPT`. Removed libraries
+        are made again when they are needed.
 
         Returns:
             The number of libraries removed.
@@ -337,7 +338,7 @@ class Cache:
         return libraries
 
     def _by_use(self) -> list[tuple[float, int, list[Path]]]:
-        """When the files of every key were last used, their size, and they; oldest first."""
+        """Return, per key, the time of last use, the size and the files; oldest first."""
         found: dict[str, tuple[float, int, list[Path]]] = {}
         if self.folder.exists():
             self._require_safe()
@@ -351,7 +352,7 @@ class Cache:
         return sorted(found.values(), key=lambda each: each[0])
 
     def clean(self) -> int:
-        """Remove everything this cache has stored; the number of libraries removed."""
+        """Remove everything this cache has stored; return the number of libraries removed."""
         libraries = self.trim(-1)
         for left in self.folder.glob("build-*"):
             shutil.rmtree(left, ignore_errors=True)
@@ -378,7 +379,7 @@ class Cache:
             os.close(handle)
 
     def _sweep(self) -> None:
-        """Remove what builds left behind that were killed long ago.
+        """Remove the remains of builds that were killed long ago.
 
         A living build holds a lock, so that a clock that jumps does not end it.
         """
@@ -415,7 +416,7 @@ class Cache:
                 )
 
     def _read_own(self, path: Path) -> bytes | None:
-        """Content of a file that nobody else can have written; None where it is missing."""
+        """Return the content of a file that nobody else can have written; None if it is missing."""
         try:
             found = path.stat()
             if not stat.S_ISREG(found.st_mode):

@@ -130,7 +130,7 @@ class CompiledFunction(NumericFunction):
     def _ports(
         self, inputs: Sequence[Array], batched: Sequence[bool], outputs: Sequence[Array]
     ) -> ctypes.Array[ctypes.c_longlong]:
-        """Address and step of every argument of a batch, as the driver wants them.
+        """Return the address and stride of every argument of a batch, as the driver takes them.
 
         Raises:
             CodegenError: several values of an input that lanes share.
@@ -165,7 +165,7 @@ class CompiledFunction(NumericFunction):
         return run, lambda: self._native(address)
 
     def _native(self, ports: int) -> NativeCall:
-        """Work memory is this thread's own, and stays."""
+        """Return addresses for C with work memory of this thread."""
         lanes = self._in_lanes if self.lanes > 1 else None
         own = [0, 0] if lanes is None else [lanes.address, lanes.own.address]
         return NativeCall(self._one.address, own[0], ports, self._one.own.address, own[1])
@@ -176,7 +176,7 @@ class CompiledFunction(NumericFunction):
         self._check(driver.run(ports_address, begin, end), " of the batch")
 
     def _lanes_agree(self) -> bool:
-        """Whether a ragged batch in lanes gives the bits of single evaluations."""
+        """Return True if a ragged batch in lanes gives the bits of single evaluations."""
         rng = np.random.default_rng(0)
         n = self.lanes + 1
         batched = [not shared for shared in self._shared]
@@ -202,7 +202,7 @@ class CompiledFunction(NumericFunction):
 
 
 class _Driver:
-    """One of a library's drivers, with work memory that is kept between its calls.
+    """One of a library's drivers, with work memory that is reused between calls.
 
     Attributes:
         address: of the function.
@@ -216,14 +216,14 @@ class _Driver:
         self._idle, self._own = deque[_Work](), threading.local()
 
     def taken(self) -> _Work:
-        """Work memory that no other thread uses."""
+        """Take work memory that no other thread uses."""
         try:
             return self._idle.pop()
         except IndexError:
             return _Work(self._sizes, self._n_ports)
 
     def run(self, ports_address: int, begin: int, end: int, work: _Work | None = None) -> int:
-        """Evaluate candidates begin to end; the first that failed, or `_SUCCESS`."""
+        """Evaluate candidates begin to end; return the first that failed, or `_SUCCESS`."""
         work = self.taken() if work is None else work
         status: int = self._function(ports_address, work.address, begin, end)
         self._idle.append(work)
@@ -231,7 +231,7 @@ class _Driver:
 
     @property
     def own(self) -> _Work:
-        """Work memory of this thread, for good."""
+        """Permanent work memory of this thread."""
         if not hasattr(self._own, "work"):
             self._own.work = self.taken()
         work: _Work = self._own.work
@@ -261,7 +261,7 @@ _warned = False
 
 
 def cannot_load(name: str, error: Exception) -> CodegenError:
-    """Why a library in the cache is of no use, and what to do."""
+    """Build the error for a library of the cache that cannot be loaded, with the remedy."""
     return CodegenError(
         f"{name}: the compiled library cannot be loaded: {error}; if its folder does not allow "
         "programs, name another one in the environment variable DUAL_ARM_CACHE"
@@ -269,7 +269,7 @@ def cannot_load(name: str, error: Exception) -> CodegenError:
 
 
 def warn_one_lane(name: str, reason: str) -> None:
-    """Tell once per process that a function runs one evaluation at a time."""
+    """Warn once per process that a function runs one evaluation at a time."""
     global _warned
     if _warned:
         return
@@ -285,7 +285,7 @@ _threads: dict[int, ThreadPoolExecutor] = {}
 
 
 def thread_pool() -> ThreadPoolExecutor:
-    """The process's threads; a forked child has none of its parent's and gets its own."""
+    """Return the process's thread pool; a forked child gets its own."""
     process = os.getpid()
     if process not in _threads:
         _threads.clear()
@@ -303,6 +303,6 @@ def _address(array: Array) -> int:
 
 
 def _same(a: Array, b: Array) -> bool:
-    """Whether two arrays hold the same bits, NaN equal to NaN whatever its bits."""
+    """Return True if two arrays hold the same bits, with all NaN equal."""
     unlike = a.view(np.int64) != b.view(np.int64)
     return not (unlike & ~(np.isnan(a) & np.isnan(b))).any()

@@ -1,4 +1,4 @@
-"""The system's C compiler: which one, its identity, its flags, one call of it."""
+"""The system's C compiler: detection, identity, flags, one call of it."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ _INTERRUPTED = threading.Event()
 
 @contextmanager
 def interruptible() -> Iterator[None]:
-    """Where Ctrl-C ends the `with` block, all compilers of this process end, and none begins.
+    """On Ctrl-C in the `with` block, end all compilers of this process and start no more.
 
     They begin again with what the main thread wants compiled next.
     """
@@ -117,7 +117,7 @@ def interruptible() -> Iterator[None]:
 
 
 def stop_if_interrupted() -> None:
-    """What is begun in a thread ends where what it was begun for was interrupted.
+    """Raise in a worker thread if the main thread was interrupted.
 
     Raises:
         KeyboardInterrupt: it was, see `interruptible`.
@@ -127,7 +127,7 @@ def stop_if_interrupted() -> None:
 
 
 def _end(process: subprocess.Popen[str]) -> None:
-    """End a compiler with what it started."""
+    """Kill a compiler and the processes that it started."""
     with suppress(ProcessLookupError):
         os.killpg(process.pid, signal.SIGKILL)
 
@@ -137,7 +137,7 @@ _OTHER_COMPILER = "name another one in the environment variable CC"
 
 @dataclass(frozen=True)
 class Compiler:
-    """A C compiler that answered.
+    """A C compiler that has answered.
 
     Attributes:
         command: its absolute path, then arguments that the user's CC carries.
@@ -269,21 +269,21 @@ class Compiler:
 
 
 def default_level(c_bytes: int) -> int:
-    """Optimisation level that keeps the build of a source of this size short."""
+    """Return the optimisation level that keeps the build of a source of this size short."""
     if c_bytes <= SMALL_SOURCE:
         return 3
     return 1 if c_bytes <= LARGE_SOURCE else 0
 
 
 def part_level(c_bytes: int, in_lanes: bool) -> int:
-    """Level of a function that is compiled apart (`codegen.parts`)."""
+    """Return the level of a function that is compiled separately (`codegen.parts`)."""
     level = LANE_LEVEL if in_lanes else default_level(c_bytes)
     return level if c_bytes < LONG_PART else min(level, 1 if in_lanes else 2)
 
 
 def find_compiler() -> Compiler:
-    """The C compiler: the one that CC names, otherwise the first that works of cc, gcc, clang, and
-    that of the package `ziglang`.
+    """Return the C compiler: the one that CC names, otherwise the first that works of cc, gcc,
+    clang, and that of the package `ziglang`.
 
     A set CC is taken at its word: if it does not run, nothing else is tried.
 
@@ -340,7 +340,7 @@ def _find(cc: str, path: str) -> Compiler | None:
 
 
 def _ask(command: tuple[str, ...], *arguments: str) -> str | None:
-    """What a compiler says to these arguments; None where it refuses."""
+    """Return a compiler's output for these arguments; None if it refuses."""
     try:
         said = subprocess.run(
             [*command, *arguments],

@@ -1,4 +1,4 @@
-"""What can go wrong between an expression and its compiled function."""
+"""Errors between an expression and its compiled function."""
 
 from symbolic.errors import DualArmError, DualArmWarning
 

@@ -1,4 +1,4 @@
-"""Numeric functions that NumPy calls: the interface that all share.
+"""Numeric functions that NumPy calls: their common interface.
 
 CasADi stores matrices by column. A CasADi (r, c) matrix is therefore a NumPy (c, r) array in C
 order without a copy; a column or row vector is (n,) and a scalar (1, 1) is ().
@@ -49,7 +49,7 @@ class Signature:
 
     @classmethod
     def of(cls, function: ca.Function) -> Signature:
-        """Signature of a CasADi function, its sparse inputs and outputs taken as dense."""
+        """Return the signature of a CasADi function, with sparse inputs and outputs as dense."""
         return cls(
             name=function.name(),
             input_names=tuple(function.name_in()),
@@ -66,12 +66,13 @@ class Signature:
         return cls(**{name: _as_tuple(value) for name, value in stored.items()})
 
     def to_json(self) -> dict[str, Any]:
-        """As plain lists and strings."""
+        """Return plain lists and strings."""
         found: dict[str, Any] = json.loads(json.dumps(asdict(self)))
         return found
 
     def output_record(self) -> np.dtype[np.void]:
-        """Structured type that holds all outputs of one evaluation in one block of memory."""
+        """Return the structured type that holds all outputs of one evaluation in one block of
+        memory."""
         return np.dtype(
             [
                 (name, np.float64, shape)
@@ -85,7 +86,7 @@ def _as_tuple(value: Any) -> Any:
 
 
 def numpy_shape(rows: int, columns: int) -> Shape:
-    """NumPy shape of a dense CasADi (rows, columns) matrix."""
+    """Return the NumPy shape of a dense CasADi (rows, columns) matrix."""
     if rows == 1 or columns == 1:
         return () if rows == columns else (rows * columns,)
     return (columns, rows)
@@ -111,7 +112,7 @@ class NumericFunction(ABC):
         self._bound: list[Array] = []
 
     def bound(self, values: Mapping[str, Array]) -> Self:
-        """The same function with values for its last inputs, as far as these are among them.
+        """Return the function with values bound to its last inputs, as far as `values` has them.
 
         Args:
             values: by the names of inputs, each of its input's shape.
@@ -201,7 +202,7 @@ class NumericFunction(ABC):
     def prepared(
         self, n: int, shared: Collection[str] = (), given: Mapping[str, Array] | None = None
     ) -> PreparedBatch:
-        """A batch of up to n evaluations on arrays that stay where they are.
+        """Prepare a batch of up to n evaluations on arrays with fixed addresses.
 
         For calls whose work is small beside `batch`'s own checks and allocations.
 
@@ -242,8 +243,8 @@ class NumericFunction(ABC):
     def _prepared(
         self, inputs: Sequence[Array], batched: Sequence[bool], outputs: Sequence[Array]
     ) -> tuple[Callable[[int], None], Callable[[], NativeCall] | None]:
-        """A call that evaluates the first `count` of a batch on fixed arrays, and one that returns
-        how C evaluates them; None where it cannot."""
+        """Return a call that evaluates the first `count` of a batch on fixed arrays, and one that
+        returns the addresses for C, None if C cannot evaluate it."""
 
         def run(count: int) -> None:
             self._evaluate_batch(inputs, batched, outputs, count, 1)
@@ -263,7 +264,7 @@ class NumericFunction(ABC):
         n: int,
         threads: int,
     ) -> None:
-        """Evaluate n > 0 candidates; `batched` says which inputs have one value for each."""
+        """Evaluate n > 0 candidates; `batched` states which inputs have one value for each."""
 
     def _require_count(self, given: int) -> None:
         if given != len(self.input_names):
@@ -324,14 +325,13 @@ class PreparedBatch:
         run: Callable[[int], None],
         native: Callable[[], NativeCall] | None = None,
     ) -> None:
-        """See `NumericFunction.prepared`."""
+        """Store the arrays and the call, see `NumericFunction.prepared`."""
         self.inputs, self.outputs, self.size, self._run = inputs, outputs, size, run
         self._native = native
 
     @property
     def native(self) -> NativeCall | None:
-        """How C evaluates the batch, in the thread that asks; None where functions are
-        interpreted."""
+        """Addresses for C in the calling thread; None for interpreted functions."""
         return None if self._native is None else self._native()
 
     def __call__(self, count: int | None = None) -> dict[str, Array]:
@@ -349,7 +349,7 @@ class PreparedBatch:
 
 
 def available_cores() -> int:
-    """Cores that this process may use."""
+    """Return the number of cores that this process may use."""
     try:
         return len(os.sched_getaffinity(0))
     except AttributeError:

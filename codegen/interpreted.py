@@ -35,7 +35,7 @@ class InterpretedFunction(NumericFunction):
     """
 
     def __init__(self, function: ca.Function) -> None:
-        """Sparse inputs and outputs become dense."""
+        """Make sparse inputs and outputs dense."""
         super().__init__(Signature.of(function))
         self.function = dense(function)
 
@@ -104,7 +104,7 @@ class Agreement:
 
     @property
     def agrees(self) -> bool:
-        """Whether both are within `TOLERANCE`."""
+        """True if both are within `TOLERANCE`."""
         return max(self.outputs, self.derivatives) <= TOLERANCE
 
 
@@ -148,7 +148,8 @@ def compare(
 
 
 def directional_derivative(function: ca.Function) -> ca.Function:
-    """Directional derivative: the inputs, the outputs and a direction to the outputs' slopes.
+    """Build the directional derivative: the inputs, the outputs and a direction to the outputs'
+    slopes.
 
     A random direction reaches every first derivative at the price of about two evaluations.
     """
@@ -156,7 +157,7 @@ def directional_derivative(function: ca.Function) -> ca.Function:
 
 
 def relative_difference(reference: Array, other: Array) -> float:
-    """Largest difference of two arrays over the reference's largest finite entry.
+    """Compute the largest difference of two arrays over the reference's largest finite entry.
 
     Infinite where NaN or infinite entries differ.
     """

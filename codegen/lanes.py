@@ -123,7 +123,7 @@ class LaneText:
 
 
 def lane_text(generated: str, prefix: str, shared: Collection[int] = ()) -> LaneText:
-    """What CasADi generated for one function, over `codegen/c/lanes.h`.
+    """Translate CasADi's C of one function to the lanes of `codegen/c/lanes.h`.
 
     Args:
         generated: CasADi's text, with its own comments.
@@ -171,7 +171,8 @@ def _lines(function: re.Match[str], shared: Collection[int] = ()) -> str:
 
 
 def _choice(function: re.Match[str]) -> str | None:
-    """`casadi.Function.if_else`: each branch runs if a lane wants it, and its lanes are taken."""
+    """Translate `casadi.Function.if_else`: each branch runs if a lane needs it; a mask selects
+    its lanes."""
     branches = _CHOICE.match(function["body"])
     if branches is None or function["outputs"] is None:
         return None
@@ -197,7 +198,7 @@ def _choice(function: re.Match[str]) -> str | None:
 
 
 def _size(described: str) -> int:
-    """Entries of a result as CasADi's comment describes it: name, name[3] or name[3x4]."""
+    """Return the number of entries of a result in CasADi's comment: name, name[3] or name[3x4]."""
     shape = re.search(r"\[(\d+)(?:x(\d+))?\]", described)
     return prod(int(length) for length in shape.groups(default="1")) if shape else 1
 

@@ -1,4 +1,4 @@
-"""C text in parts that are compiled apart, and long straight-line C in pieces.
+"""C text in parts that are compiled separately, and long straight-line C in pieces.
 
 The same functions stand in many texts: an arm's Newton steps in everything that follows a path,
 and twice where both arms are of one kind. A part is a function that is long and calls no other
@@ -88,8 +88,8 @@ class Part:
 
 
 def in_parts(text: str, lanes: int, most: int = 3) -> tuple[str, tuple[Part, ...]]:
-    """C text of `codegen.source` with declarations in place of its parts, and
-    the parts, each once.
+    """Replace the parts of a C text of `codegen.source` by declarations; return the text and the
+    parts, each once.
 
     Args:
         lanes: of the text; 0 for what suits the machine.
@@ -137,7 +137,7 @@ def in_parts(text: str, lanes: int, most: int = 3) -> tuple[str, tuple[Part, ...
 
 @cache
 def runtime(name: str) -> str:
-    """C that stands around generated functions: the text of a file of `codegen/c`, those that it
+    """Return the text of a file of `codegen/c`, the runtime around generated functions, with its
     includes filled in."""
     text = files("codegen").joinpath("c", name).read_text()
     return _INCLUDE.sub(lambda found: runtime(found[1]), text)
@@ -148,12 +148,12 @@ def _preamble(*runtimes: str) -> str:
 
 
 def is_long(body: str) -> bool:
-    """Whether a function is long enough to be cut."""
+    """Return True if a function is long enough to be cut."""
     return body.count("\n") >= LONG
 
 
 def in_pieces(text: str) -> str:
-    """C text of CasADi functions, also of `codegen.lanes`, the long straight ones in pieces."""
+    """Cut the long straight-line functions of a C text, also of `codegen.lanes`, into pieces."""
     return _STRAIGHT.sub(_cut, text)
 
 
@@ -188,7 +188,7 @@ def _cut(found: re.Match[str]) -> str:
 
 
 def _used(piece: list[str]) -> tuple[set[str], set[str]]:
-    """Variables that a piece reads before it sets them, and those that it sets."""
+    """Return the variables that a piece reads before it sets them, and those that it sets."""
     read, written = set[str](), set[str]()
     for line in piece:
         variables = _VARIABLE.findall(line)

@@ -1,4 +1,5 @@
-"""From CasADi functions to self-contained C text: with a batch driver, or behind C of our own."""
+"""From CasADi functions to self-contained C text: with a batch driver, or with own C that calls
+them."""
 
 from __future__ import annotations
 
@@ -15,7 +16,7 @@ from codegen.parts import runtime
 
 
 def dense(function: ca.Function) -> ca.Function:
-    """The same function with dense inputs and outputs.
+    """Return the function with dense inputs and outputs.
 
     Entries of a dense input outside the sparsity that the function was made for are ignored.
     """
@@ -38,7 +39,7 @@ def dense(function: ca.Function) -> ca.Function:
 
 
 def c_source(function: ca.Function, lanes: int = 1, generated: str = "") -> str:
-    """C text of a dense CasADi function: what CasADi generates, then the batch drivers.
+    """Generate the C text of a dense CasADi function: CasADi's C, then the batch drivers.
 
     Args:
         function: any that CasADi can write as C.
@@ -74,7 +75,7 @@ def handwritten_source(
     helpers: Sequence[ca.Function],
     in_pairs: Mapping[str, ca.Function] = MappingProxyType({}),
 ) -> str:
-    """C text of a function written by hand, with the batch driver.
+    """Assemble the C text of a function written by hand, with the batch driver.
 
     Args:
         signature: its name, inputs and outputs.
@@ -93,7 +94,8 @@ def handwritten_source(
 
 
 def program_source(functions: Mapping[str, ca.Function], own: str, lanes: int = 0) -> str:
-    """C text of functions in lanes (`_lane_functions`), with C of our own that calls them.
+    """Generate the C text of functions in lanes (`_lane_functions`), followed by own C that calls
+    them.
 
     Raises:
         CodegenError: CasADi cannot write a function as C, or it has no form in lanes.
@@ -109,15 +111,15 @@ def program_source(functions: Mapping[str, ca.Function], own: str, lanes: int = 
 
 
 def _lanes_header(lanes: int) -> list[str]:
-    """The types of lanes, as many as given, or for 0 as many as suit the machine that compiles."""
+    """Return the types of lanes: the given number, or for 0 the machine's."""
     width = f"#define DUAL_ARM_LANES {lanes}\n" if lanes else ""
     return [runtime("one_lane.h"), width, runtime("lanes.h")]
 
 
 def _lane_functions(functions: Mapping[str, ca.Function]) -> Iterator[str]:
-    """C of every function `f` as `f(arg, res, iw, w)` over `lanes_real`, with the room that it
-    needs as f_ARG, f_RES, f_IW and f_W, the size of its k-th result as f_OUT_k, and as f_SHARED
-    whether it takes `SHARED` arguments as numbers, not lanes."""
+    """Yield the C of every function `f` as `f(arg, res, iw, w)` over `lanes_real`, with its sizes
+    of memory as f_ARG, f_RES, f_IW and f_W, the size of its k-th result as f_OUT_k, and as
+    f_SHARED whether it takes `SHARED` arguments as numbers instead of lanes."""
     for name, function in functions.items():
         whole = dense(function)
         shared = shared_inputs(whole)
@@ -138,15 +140,15 @@ SHARED = "_numbers"
 
 
 def shared_inputs(function: ca.Function) -> tuple[int, ...]:
-    """The inputs that a function takes as numbers in lanes, too: those of straight ones that are
-    `SHARED`. Other functions hand arguments on, in lanes."""
+    """Return the inputs that a function in lanes takes as plain numbers: the `SHARED` ones of
+    straight functions. Other functions pass arguments on, in lanes."""
     straight = function.is_a("SXFunction")
     names = enumerate(function.name_in())
     return tuple(k for k, name in names if straight and name.endswith(SHARED))
 
 
 def generated_c(functions: Sequence[ca.Function]) -> str:
-    """What CasADi generates for dense functions, at least one.
+    """Generate CasADi's C of dense functions, at least one.
 
     Raises:
         CodegenError: CasADi cannot write one of them as C.
@@ -163,7 +165,7 @@ def generated_c(functions: Sequence[ca.Function]) -> str:
 
 
 def _filled(driver: str, signature: Signature, generated: str = "") -> str:
-    """A driver with the names and sizes of a function, and whether its C keeps state."""
+    """Fill a driver with a function's names and sizes, and whether its C keeps state."""
     inputs = [prod(shape) for shape in signature.input_shapes]
     outputs = [prod(shape) for shape in signature.output_shapes]
     return (
@@ -176,7 +178,7 @@ def _filled(driver: str, signature: Signature, generated: str = "") -> str:
 
 
 def operations(function: ca.Function, left_out: frozenset[str] = frozenset()) -> int:
-    """Number of instructions that one evaluation runs.
+    """Count the instructions that one evaluation runs.
 
     Nested calls count with all their instructions, as often as they run, both branches of a
     choice as well; an instruction on a whole vector counts once.

@@ -1,4 +1,4 @@
-"""Campaigns: algorithms times replicas with equal budgets, stored so that nothing is lost."""
+"""Campaigns: algorithms times replicas with equal budgets, stored safely."""
 
 from hybrid_opt.campaign.folder import CampaignFolder, ExecutionSettings, open_folder, workers_for
 from hybrid_opt.campaign.search_stage import search_stage

@@ -53,7 +53,7 @@ class EvaluatedCandidates:
 def _groups(
     n_var: int, objective_names: tuple[str, ...], reasons: tuple[str, ...] = REASONS
 ) -> dict[str, list[str]]:
-    """Columns of numbers by the field of `Evaluations` that they hold."""
+    """Return the columns of numbers by the field of `Evaluations` that they hold."""
     return {
         "x": [f"x_{k + 1}" for k in range(n_var)],
         "objectives": [f"objective_{name}" for name in objective_names],
@@ -66,7 +66,7 @@ def _groups(
 def columns(
     n_var: int, objective_names: tuple[str, ...], reasons: tuple[str, ...] = REASONS
 ) -> list[str]:
-    """The names of all columns."""
+    """Return the names of all columns."""
     return [*_FIXED, *chain(*_groups(n_var, objective_names, reasons).values())]
 
 
@@ -137,7 +137,7 @@ def _text(line: bytes) -> str:
 
 
 def _rows(file: gzip.GzipFile, width: int, most: int) -> tuple[Array, NDArray[np.int8]]:
-    """Numbers (n, width - 1) and reasons (n,) of all rows.
+    """Read the numbers (n, width - 1) and reasons (n,) of all rows.
 
     Row by row, so that no more is held than what is kept, and a small file cannot unfold into a
     huge one: each row bears its number, and there are not more than `most` numbers.

@@ -1,5 +1,5 @@
-"""How a campaign is carried out, and its results folder: held by one process while it works, and
-made from one workcell, with one set of settings and one version of the software."""
+"""Execution of a campaign, and its results folder: locked by one process, made from one workcell
+with one set of settings and one version of the software."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ ExecutorName = Literal["processes", "dask"]
 
 @dataclass(frozen=True)
 class ExecutionSettings:
-    """How a campaign is carried out; nothing here changes its results.
+    """Execution of a campaign; nothing here changes its results.
 
     Attributes:
         output: the results folder.
@@ -99,7 +99,8 @@ _PACKAGES = ("casadi", "moocore", "numpy", "pin", "pymoo", "python-fcl", "scipy"
 
 @cache
 def environment() -> Mapping[str, str]:
-    """Versions of everything that takes part in a search, and a digest of our own sources."""
+    """Return the versions of everything that takes part in a search, and a digest of the own
+    sources."""
     versions = {name: version(name) for name in _PACKAGES}
     versions["dual-arm-carry"] = own_version()  # beside the digest of the sources
     versions["sources"] = source_digest("symbolic", "codegen", "hybrid_opt")
@@ -109,7 +110,7 @@ def environment() -> Mapping[str, str]:
 
 
 def configuration_of(settings: CampaignSettings, root: Path, workcell: Workcell) -> Configuration:
-    """What identifies a campaign.
+    """Return the configuration that identifies a campaign.
 
     Args:
         settings: the campaign's.
@@ -140,8 +141,8 @@ def require_equal(stored: Any, wanted: Mapping[str, Any], where: str) -> None:
 
 
 def differences(first: Any, second: Any, key: str = "") -> Iterator[tuple[str, Any, Any]]:
-    """Where two trees of JSON values differ: keys joined by points, and both values, None where one
-    has none."""
+    """Yield the differences of two trees of JSON values: keys joined by points, and both values,
+    None for a missing one."""
     if isinstance(first, dict) and isinstance(second, dict):
         for name in dict.fromkeys((*first, *second)):
             inner = f"{key}.{name}" if key else name
@@ -249,7 +250,7 @@ _ELSEWHERE = "choose another --output, or remove those results with --overwrite"
 
 
 def _clear(root: Path) -> None:
-    """Remove all that a results folder holds.
+    """Remove everything in a results folder.
 
     Marks of what is done go first and the configuration last: whatever moment ends it, nothing
     looks done that is not there, and the folder can be overwritten again.
@@ -264,7 +265,7 @@ def _clear(root: Path) -> None:
 
 
 def _stored_cell(root: Path, files: CellFiles) -> Workcell:
-    """The folder's copy of the workcell, made where it is missing."""
+    """Return the folder's copy of the workcell, made if it is missing."""
     folder = root / WORKCELL
     if not folder.exists():
         draft = root / f".{WORKCELL}"

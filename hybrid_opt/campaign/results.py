@@ -1,4 +1,4 @@
-"""Reading a campaign's results folder back into frozen records, or what else this project wrote.
+"""Readers of a campaign's results folder, and of all other files of this project.
 
 Nothing stored is executed, and files are compared with the checksums taken when they were
 written. docs/reference/results.md describes the folder.
@@ -157,7 +157,7 @@ class CampaignResults:
         return self.settings.objectives
 
     def of(self, algorithm: str) -> tuple[Replica, ...]:
-        """The replicas of one algorithm."""
+        """Return the replicas of one algorithm."""
         return tuple(found for found in self.replicas if found.algorithm == algorithm)
 
     @cached_property
@@ -191,7 +191,7 @@ class CampaignResults:
         return tuple(front for front in (*found, self.polished(UNION)) if front is not None)
 
     def polished(self, algorithm: str, replica: int = 0) -> Front | None:
-        """The polished front of a replica, or of the `UNION`; None where it was not polished.
+        """Return the polished front of a replica, or of the `UNION`; None if it was not polished.
 
         Raises:
             ResultsError: it is damaged.
@@ -204,8 +204,8 @@ class CampaignResults:
 
 
 def union(fronts: Sequence[Front]) -> list[tuple[Front, int]]:
-    """Members of several fronts that no other one dominates, by increasing objectives: each as its
-    front and its row there."""
+    """Return the members of several fronts that no other one dominates, by increasing objectives,
+    each as its front and its row there."""
     members = [(front, row) for front in fronts for row in range(len(front))]
     objectives = np.concatenate([front.objectives for front in fronts])
     return [members[k] for k in metrics.front_rows(objectives, np.ones(len(members), dtype=bool))]
@@ -236,7 +236,7 @@ def read_campaign(root: str | Path) -> CampaignResults:
 
 
 def read_configuration(root: str | Path) -> Configuration:
-    """The configuration of a campaign.
+    """Read the configuration of a campaign.
 
     Raises:
         ResultsError: the folder holds none, a damaged one, or one of another version.
@@ -269,7 +269,7 @@ def read_replica(root: Path, algorithm: str, number: int, objectives: tuple[str,
 
 
 def is_whole(exists: bool, read: Callable[[], object]) -> bool:
-    """Whether what a stage left is there and can be read; damage is reported as a warning.
+    """Return True if a stage's result exists and can be read; report damage as a warning.
 
     Args:
         exists: whether it is there.
@@ -286,7 +286,7 @@ def is_whole(exists: bool, read: Callable[[], object]) -> bool:
 
 
 def read_polished(root: Path, front: Front) -> PolishedFront | None:
-    """What a polish made of a front; None where it was not polished.
+    """Read the polished front; None if it was not polished.
 
     Raises:
         ResultsError: the file is damaged.
@@ -313,9 +313,8 @@ _OPENED: list[TemporaryDirectory[str]] = []
 
 
 def load(path: str | Path) -> Cell | Carry | CampaignResults | Mapping[str, Any]:
-    """Read back what this project wrote: a workcell file as a `Cell`, a trajectory file as a
-    `Carry`, the results folder of a study as its fronts (`.cell`, `.fronts`), a bundle as its
-    manifest.
+    """Read a file of this project: a workcell file as a `Cell`, a trajectory file as a `Carry`, the
+    results folder of a study as its fronts (`.cell`, `.fronts`), a bundle as its manifest.
 
     Raises:
         WorkcellError: the workcell file is wrong.

@@ -32,7 +32,7 @@ SIZE_KEYS = ("population", "swarm", "batch")
 
 
 def sized(algorithm: str, size: int) -> dict[str, Any]:
-    """The settings of an algorithm that evaluates `size` candidates per generation."""
+    """Return the settings of an algorithm that evaluates `size` candidates per generation."""
     known = asdict(metaheuristics.settings_of(algorithm))
     return {key: size for key in SIZE_KEYS if key in known}
 
@@ -40,7 +40,7 @@ def sized(algorithm: str, size: int) -> dict[str, Any]:
 def chosen(
     names: Sequence[str], populations: Sequence[tuple[str, int]] = ()
 ) -> dict[str, dict[str, Any]]:
-    """The algorithms of a campaign with those of their settings that are no defaults.
+    """Return the algorithms of a campaign with their non-default settings.
 
     Args:
         names: known to `hybrid_opt.metaheuristics`, each once.
@@ -84,7 +84,7 @@ class CampaignSettings:
     first_generation: FirstGeneration = "initial"
 
     def __post_init__(self) -> None:
-        """Check every value and spell out the algorithms' settings.
+        """Check every value and fill in the algorithms' settings.
 
         Raises:
             SettingsError: with the value, and what is allowed.
@@ -100,11 +100,11 @@ class CampaignSettings:
         object.__setattr__(self, "algorithms", whole)
 
     def starts_from_initial(self, algorithm: str) -> bool:
-        """Whether an algorithm's first generation holds the hand-made trajectory."""
+        """Return True if an algorithm's first generation holds the hand-made trajectory."""
         return self.first_generation == "initial" and algorithm != "random"
 
     def replica_rng(self, algorithm: str, replica: int) -> np.random.Generator:
-        """The only source of randomness of one replica.
+        """Return the only source of randomness of one replica.
 
         It depends on the campaign's seed, the algorithm's name and the replica's number alone:
         not on other algorithms, on the number of replicas, or on the order of work.
@@ -182,7 +182,7 @@ def replica_file(root: Path, algorithm: str, replica: int) -> Path:
 
 
 def selected_file(root: Path, algorithm: str, replica: int) -> Path:
-    """Trajectory file of the solution selected from one replica."""
+    """Return the trajectory file of the solution selected from one replica."""
     return root / SELECTED / algorithm / f"{replica:02d}.json"
 
 
@@ -192,10 +192,10 @@ def polished_file(root: Path, algorithm: str, replica: int) -> Path:
 
 
 def polished_selected_file(root: Path, algorithm: str, replica: int) -> Path:
-    """Trajectory file of the solution selected from a replica's polished front."""
+    """Return the trajectory file of the solution selected from a replica's polished front."""
     return root / SELECTED / f"{algorithm}{POLISHED_SUFFIX}" / f"{replica:02d}.json"
 
 
 def reference_front_file(root: Path) -> Path:
-    """Non-dominated union of all fronts of the campaign."""
+    """Return the file of the non-dominated union of all fronts of the campaign."""
     return root / FRONTS / "reference.csv"

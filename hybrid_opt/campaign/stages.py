@@ -1,6 +1,5 @@
-"""The steps of a study, each carried out once and then remembered as done; its cells, as values
-that go to any process or machine, with resources made from them there; and all that is compiled
-for it, built at once on all cores before any of it is needed.
+"""Stages of a study, each run once and marked as done; its cells as values for any process or
+machine; and the parallel build of everything that it compiles.
 
 A stage reads what earlier stages left in the results folder and writes files of its own. Its
 marker, `stages/NAME.json`, is written when it begins and again when it is done. If a marker is
@@ -105,7 +104,7 @@ def _path(folder: CampaignFolder, stage: Stage) -> Path:
 
 
 def _marker(folder: CampaignFolder, stage: Stage) -> StageMark | None:
-    """The marker of a stage; None where it never began."""
+    """Return the marker of a stage; None if it never began."""
     path = _path(folder, stage)
     return (
         read_record(StageMark, path, "delete it to run the stage again") if path.exists() else None
@@ -142,8 +141,8 @@ which carry to run, and its replicas' fronts differ by about one per cent."""
 
 
 def drivable_settings(settings: CampaignSettings, replicas: int | None = None) -> CampaignSettings:
-    """Settings of the drivable experiment beside another one: the same but for the objectives,
-    durations and forces of the kind that the other one minimises, and for the replicas.
+    """Return the settings of the drivable experiment beside another one: the same except the
+    objectives, durations and forces of the kind that the other one minimises, and the replicas.
 
     Args:
         replicas: per algorithm; None for as many, at most `DRIVABLE_REPLICAS`.
@@ -158,7 +157,7 @@ def drivable_settings(settings: CampaignSettings, replicas: int | None = None) -
 
 
 def drivable_stage(stages: Sequence[Stage], replicas: int | None = None) -> Stage:
-    """The stage that searches for carries as robots drive them, in the folder `drivable/`.
+    """Return the stage that searches for drivable carries, in the folder `drivable/`.
 
     The folder is a campaign like any other, of the drivable variant of the study's cell.
 
@@ -190,7 +189,8 @@ SHARE = 2
 def decided_cell(
     workcell: Workcell, settings: CampaignSettings, execution: ExecutionSettings
 ) -> tuple[Workcell, BranchCompetition | None]:
-    """The workcell with its start branches decided, and how; None where its file decides them.
+    """Return the workcell with its start branches decided, and the competition; None if its file
+    decides them.
 
     A campaign that is continued keeps the decision that it began with.
 
@@ -209,7 +209,7 @@ def decided_cell(
 
 
 def read_branches(root: Path) -> BranchCompetition | None:
-    """How the start branches of a study in a results folder were decided; None where its workcell
+    """Read the decision on the start branches of a study in a results folder; None if its workcell
     decides them.
 
     Raises:
@@ -220,7 +220,7 @@ def read_branches(root: Path) -> BranchCompetition | None:
 
 
 def store_branches(root: Path, competition: BranchCompetition | None) -> str:
-    """Store a decision in a results folder; returns what to print of it, '' without one."""
+    """Store a decision in a results folder; return its text to print, '' without one."""
     if competition is None:
         return ""
     write_json(root / BRANCHES, to_json(competition))
@@ -246,7 +246,7 @@ def store_results(
     left: Mapping[Path, Argument],
     done: int,
 ) -> None:
-    """Have the workers compute the files that are missing, and store each when it is done.
+    """Have the workers compute the missing files, and store each when it is done.
 
     The only file of a stage is computed in this process, which sees its progress.
 
@@ -275,7 +275,7 @@ def store_results(
 
 @lru_cache(maxsize=2)
 def loaded_cell(files: CellFiles, objectives: tuple[str, ...]) -> Cell:
-    """Return a cell with these files; a process remembers the last ones.
+    """Return a cell with these files; a process caches the last ones.
 
     One thread evaluates its candidates: workers share the cores.
     """
@@ -286,14 +286,15 @@ Made = TypeVar("Made")
 
 
 def with_cell(of_workcell: Callable[[Workcell], Made], files: CellFiles) -> Made:
-    """Result of a function of a stored workcell, whose files exist only as long as it runs."""
+    """Return the result of a function of a stored workcell, whose files exist only during the
+    call."""
     with TemporaryDirectory() as folder:
         return of_workcell(unpack_cell(files, Path(folder)))
 
 
 @dataclass(frozen=True)
 class ReadyCell:
-    """A cell with all loaded that judges, times and plans its carries.
+    """A cell with everything loaded that evaluates, times and plans its carries.
 
     Attributes:
         cell: the cell.
@@ -305,7 +306,7 @@ class ReadyCell:
 
     @classmethod
     def of(cls, objectives: tuple[str, ...], workcell: Workcell) -> ReadyCell:
-        """Load what is loaded when it is first needed: the cell's files are there only now."""
+        """Load everything that is loaded on first use, since the cell's files exist only now."""
         # Not imported at the top: other stages time nothing.
         from hybrid_opt.timing.drive import search_carry, search_timing
 
@@ -322,7 +323,7 @@ Cells = tuple[tuple[CellFiles, tuple[str, ...]], ...]
 
 
 def cells_of(files: CellFiles, objectives: tuple[str, ...], driven: bool) -> Cells:
-    """An experiment's own cell, and the drivable variant of it, whose contact model may differ.
+    """Return an experiment's own cell, and its drivable variant, whose contact model may differ.
 
     Args:
         driven: whether robots drive the experiment's own cell.
@@ -335,8 +336,7 @@ def cells_of(files: CellFiles, objectives: tuple[str, ...], driven: bool) -> Cel
 
 @lru_cache(maxsize=1)
 def ready_cells(cells: Cells) -> tuple[ReadyCell, ...]:
-    """Load the cells' compiled functions, or build them where they are missing; in any process,
-    which remembers the last ones."""
+    """Load the cells' compiled functions, or build missing ones; a process caches the last ones."""
     return tuple(with_cell(partial(ReadyCell.of, names), files) for files, names in cells)
 
 
@@ -350,7 +350,7 @@ _TICK = 1.0
 
 
 def build_study(cell: Cell, progress: Progress, polish: bool = True, drivable: bool = True) -> None:
-    """Load or build the functions of a study, all compilers side by side.
+    """Load or build the functions of a study, with all compilers in parallel.
 
     What a polish compiles when its solves first ask for it, rows of arms' clearances, is not among
     them. Where all was built before nothing is done; what cannot be built is left to who asks for
@@ -378,7 +378,7 @@ def build_study(cell: Cell, progress: Progress, polish: bool = True, drivable: b
 
 
 def build_all(makers: Sequence[Maker], progress: Progress) -> list[DualArmError]:
-    """Load or build functions side by side; what cannot be built is left to who asks for it.
+    """Load or build functions in parallel; a failed build is left to its first caller.
 
     Ctrl-C ends all compilers and loses nothing that is compiled; the threads that make expressions
     are not waited for.

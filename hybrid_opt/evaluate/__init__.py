@@ -1,1 +1,1 @@
-"""What a candidate is worth."""
+"""Evaluation of candidates."""

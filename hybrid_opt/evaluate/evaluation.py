@@ -69,7 +69,7 @@ FEASIBLE = -1
 
 @dataclass(frozen=True, repr=False)
 class Evaluations:
-    """Verdicts on n candidates; every array has a leading axis over them.
+    """Evaluations of n candidates; every array has a leading axis over them.
 
     Attributes:
         x: (n, n_var) decision vectors.
@@ -98,7 +98,7 @@ class Evaluations:
         return len(self.x)
 
     def judgement(self, row: int, objective_names: Sequence[str]) -> Judgement:
-        """The verdict on one candidate in words."""
+        """Return the verdict on one candidate in words."""
         feasible = bool(self.feasible[row])
         return Judgement(
             feasible=feasible,
@@ -109,7 +109,8 @@ class Evaluations:
 
     @property
     def infeasible_by_reason(self) -> dict[str, int]:
-        """Infeasible candidates by the constraint violated first, the most frequent first."""
+        """Number of infeasible candidates by the constraint violated first, the most frequent
+        first."""
         counts = {name: int(np.sum(self.reason == i)) for i, name in enumerate(REASONS)}
         found = sorted(counts.items(), key=lambda item: -item[1])
         return {name: count for name, count in found if count}
@@ -126,7 +127,7 @@ class Evaluations:
 
 
 def concatenated(parts: list[Evaluations]) -> Evaluations:
-    """Several evaluations, at least one, in order as one."""
+    """Concatenate evaluations, at least one, in order."""
     return Evaluations(
         **{f.name: np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Evaluations)}
     )
@@ -190,7 +191,7 @@ class CandidateEvaluator:
 
     @cached_property
     def _kernel(self) -> Kernel | None:
-        """The evaluation in lanes, where there is one."""
+        """The evaluation in lanes, if the machine and the cell allow it."""
         return load_kernel(self.compiled, self.checker, self.outputs) if self._in_lanes else None
 
     def _driver(self, threads: int) -> CandidateDriver | None:
@@ -204,8 +205,8 @@ class CandidateEvaluator:
         return CandidateDriver(timer, threads, force_kind(self.objectives).robust)
 
     def beginning_at(self, q_1: Array, q_2: Array) -> CandidateEvaluator:
-        """The same evaluator with other start postures: joints (n,) of each arm that hold the box
-        at the start. Its `outputs` and `carry` stay those of the cell's own branches.
+        """Return the evaluator with other start postures: joints (n,) of each arm that hold the box
+        at the start. Its `outputs` and `carry` use the cell's own branches.
 
         Raises:
             SettingsError: candidates of this cell are not evaluated in lanes.
@@ -221,16 +222,16 @@ class CandidateEvaluator:
         return other
 
     def outputs(self, x: Array) -> dict[str, Array]:
-        """Every per-sample output for decision vectors (n, n_var), see
-        `symbolic.functions`; under the time law 'optimal' also what
-        `hybrid_opt.timing.drive.CandidateDriver.outputs` adds."""
+        """Compute every per-sample output for decision vectors (n, n_var), see
+        `symbolic.functions`; under the time law 'optimal' also those of
+        `hybrid_opt.timing.drive.CandidateDriver.outputs`."""
         x = self._checked(x)
         if self.driver is not None:
             return self.driver.outputs(self._candidate, x)
         return self._candidate.batch(x, threads=self.threads)
 
     def evaluate(self, x: Array, with_collisions: bool = True) -> Evaluations:
-        """Verdicts on decision vectors (n, n_var).
+        """Evaluate decision vectors (n, n_var).
 
         Args:
             with_collisions: see `sampled`.
@@ -244,7 +245,7 @@ class CandidateEvaluator:
         return self._judge(x, sampled, sampled.outputs if whole else self.outputs(x))
 
     def sampled(self, x: Array, with_collisions: bool = True) -> SampledVerdicts:
-        """What the samples of decision vectors (n, n_var) say, before objectives are known.
+        """Evaluate decision vectors (n, n_var) on their samples, before objectives.
 
         Args:
             with_collisions: False leaves collisions out where the evaluation is in lanes.
@@ -257,7 +258,7 @@ class CandidateEvaluator:
         )
 
     def carry(self, x: Array) -> Carry:
-        """One decision vector (n_var,) with its verdict, under the task's time law.
+        """Evaluate one decision vector (n_var,) under the task's time law.
 
         Raises:
             SettingsError: x has the wrong shape.
@@ -270,7 +271,7 @@ class CandidateEvaluator:
         return carry_under_time_law(self.workcell, self.functions, x[0], single, judgement)
 
     def certificate(self, x: Array) -> Certificate:
-        """The continuous verdict on one decision vector (n_var,).
+        """Certify one decision vector (n_var,) between its samples.
 
         Raises:
             LostPathError: an arm loses the path, on its samples or between them.
@@ -287,7 +288,8 @@ class CandidateEvaluator:
         return found
 
     def _paths(self, x: Array) -> list[SampledPath | None]:
-        """The carries of decision vectors (n, n_var) on their samples; None where one is lost."""
+        """Return the paths of decision vectors (n, n_var) on their samples; None if an arm loses
+        the path."""
         if self._kernel is None:
             outputs: Mapping[str, Array] = self.outputs(x)
         else:
@@ -303,7 +305,7 @@ class CandidateEvaluator:
         ]
 
     def certified(self, evaluations: Evaluations) -> Evaluations:
-        """The evaluations with their feasible front proven free between the samples.
+        """Return the evaluations with their feasible front proven free between the samples.
 
         Members of the front that are not proven free become infeasible for the reason
         `between_samples`; what only they dominated is certified in turn, until the front stands.
@@ -332,8 +334,8 @@ class CandidateEvaluator:
         )
 
     def _failures_between_samples(self, x: Array) -> list[float | None]:
-        """Path parameter where carries (n, n_var) are not proven free, None where one is. Paths are
-        remembered: carries may differ in their force limits alone."""
+        """Return, for each carry (n, n_var), the path parameter where it is not proven free, else
+        None. Paths are cached, since carries may differ in their force limits only."""
         paths = np.ascontiguousarray(x[:, : self.workcell.task.n_path])
         keys = [path.tobytes() for path in paths]
         new = {key: row for row, key in enumerate(keys) if key not in self._proofs}
@@ -358,7 +360,7 @@ class CandidateEvaluator:
     def _judge(
         self, x: Array, sampled: SampledVerdicts, described: Mapping[str, Array]
     ) -> Evaluations:
-        """Objectives, feasibility and penalties.
+        """Compute objectives, feasibility and penalties.
 
         Args:
             described: the per-sample outputs that the objectives need.
@@ -415,15 +417,16 @@ class CandidateEvaluator:
 
 
 def _failure(certificate: Certificate | None) -> float | None:
-    """Path parameter where a carry is not proven free, None where it is throughout; the start where
-    an arm loses the path, on its samples already without a certificate."""
+    """Return the path parameter where a carry is not proven free, else None; the start if an arm
+    loses the path."""
     if certificate is not None and certificate.is_free:
         return None
     return 0.0 if certificate is None or certificate.lost else certificate.at_parameter
 
 
 def _needs(objectives: Sequence[Objective]) -> tuple[str, ...] | None:
-    """What the kernel has to give per sample; None if the objectives need more than it can."""
+    """Return the kernel's outputs per sample that the objectives need; None if they need more than
+    it has."""
     wanted: set[str] = set()
     for objective in objectives:
         if objective.needs is None:
@@ -433,7 +436,7 @@ def _needs(objectives: Sequence[Objective]) -> tuple[str, ...] | None:
 
 
 class LockedEvaluator:
-    """Evaluates box paths alone, every redundant joint at one position throughout.
+    """Evaluates box paths with every redundant joint at one constant position.
 
     A redundant joint with a constant path gives what the arm with that joint locked gives, so that
     one compiled cell serves all positions. Decision vectors are the free waypoints of the box.
@@ -462,11 +465,11 @@ class LockedEvaluator:
         self.lower, self.upper = evaluator.lower[: self.n_var], evaluator.upper[: self.n_var]
 
     def evaluate(self, x: Array) -> Evaluations:
-        """Verdicts on box paths (n, n_var)."""
+        """Evaluate box paths (n, n_var)."""
         return replace(self._evaluator.evaluate(self._whole(x)), x=x)
 
     def certified(self, evaluations: Evaluations) -> Evaluations:
-        """See `CandidateEvaluator.certified`."""
+        """Certify as `CandidateEvaluator.certified`."""
         whole = replace(evaluations, x=self._whole(evaluations.x))
         return replace(self._evaluator.certified(whole), x=evaluations.x)
 

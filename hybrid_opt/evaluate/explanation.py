@@ -1,4 +1,4 @@
-"""Why a candidate is infeasible, in words that name what to change."""
+"""Reasons why a candidate is infeasible, in words that name what to change."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ DAMPING = 1e-4
 
 @dataclass(frozen=True)
 class Explanation:
-    """What is in the way of one candidate where it first fails.
+    """The first failure of one candidate.
 
     Attributes:
         reason: one of `hybrid_opt.evaluate.evaluation.REASONS`.
@@ -64,7 +64,7 @@ class Explanation:
 
 
 def explain(evaluator: CandidateEvaluator, evaluations: Evaluations) -> tuple[Explanation, ...]:
-    """Why each infeasible candidate is so, in order.
+    """Explain, in order, why each infeasible candidate fails.
 
     Args:
         evaluator: that judged them.
@@ -80,7 +80,7 @@ def explain(evaluator: CandidateEvaluator, evaluations: Evaluations) -> tuple[Ex
 
 
 def frequent(explanations: Iterable[Explanation]) -> dict[str, dict[str, int]]:
-    """How often each pair, joint and arm is in the way, the most frequent first."""
+    """Count the failures per pair, joint and arm, the most frequent first."""
     counts: dict[str, Counter[str]] = {"pairs": Counter(), "joints": Counter(), "reach": Counter()}
     for one in explanations:
         if one.pair is not None:
@@ -125,7 +125,7 @@ def _explained(
 
 
 def missing_reach(robot: Robot, contact: Contact, T_world_box: Array, q: Array) -> float:
-    """How far an arm's flange stays from where it would hold the box, at best [m].
+    """Compute the least distance of an arm's flange from where it would hold the box [m].
 
     The distance where position and orientation together are nearest, joints within their limits;
     found by damped least squares from one posture, so another posture may come nearer.

@@ -1,4 +1,4 @@
-"""What the samples of candidates say: constraints and collisions, before objectives are known.
+"""Evaluation of candidates on their samples: constraints and collisions, before objectives.
 
 Whole evaluations run in lanes: `kernel.c` calls the cell's functions sample by sample, several
 candidates side by side, sums up the violations, bounds every pair's distance, and has Coal prove of
@@ -47,7 +47,7 @@ _RESTING = np.dtype([("pair", np.int64), ("place", np.float64, 3), ("departure",
 
 @dataclass(frozen=True)
 class SampledVerdicts:
-    """n candidates on their samples.
+    """A cell's evaluation in lanes. Not to be shared between threads, since its checker is not.
 
     Attributes:
         outputs: 'time' (n, samples) [s], 'violation' and 'violation_time' (n, constraints), and
@@ -65,7 +65,7 @@ class SampledVerdicts:
 
 
 def one_by_one(outputs: Mapping[str, Array], checker: CollisionChecker) -> SampledVerdicts:
-    """The verdicts from every per-sample output of the candidate function, in NumPy."""
+    """Compute the verdicts from every per-sample output of the candidate function, in NumPy."""
     violated = np.asarray(outputs["constraint"] > 0.0)
     bad = np.asarray(np.any(violated, axis=2))
     n, samples = bad.shape
@@ -82,8 +82,8 @@ def one_by_one(outputs: Mapping[str, Array], checker: CollisionChecker) -> Sampl
 
 
 def reached_samples(outputs: Mapping[str, Array], row: int) -> tuple[Array, Array, Array]:
-    """Box poses and both arms' joints at a candidate's samples before an arm loses the path: those
-    that can collide."""
+    """Return box poses and both arms' joints at a candidate's samples before an arm loses the path:
+    only those can collide."""
     lost = (outputs["lost_1"][row] > 0.0) | (outputs["lost_2"][row] > 0.0)
     reached = int(np.argmax(lost)) if lost.any() else len(lost)
     pose, q_1, q_2 = (outputs[name][row, :reached] for name in ("pose", "q_1", "q_2"))
@@ -91,7 +91,7 @@ def reached_samples(outputs: Mapping[str, Array], row: int) -> tuple[Array, Arra
 
 
 def collision_shares(colliding: NDArray[np.bool_], time: Array) -> Array:
-    """Share (n,) of the duration that the colliding samples (n, samples) stand for, each for half
+    """Compute the share (n,) of the duration of the colliding samples (n, samples), each for half
     of both neighbouring steps; times (n, samples) [s]."""
     shares, halves = np.zeros(len(time)), np.diff(time) / 2.0
     durations = np.zeros(time.shape)
@@ -210,7 +210,7 @@ class Kernel:
         begin: Array | None,
         **choices: bool,
     ) -> list[NDArray[np.void]]:
-        """The kernel on candidates of one thread; the pairs that it leaves open."""
+        """Run the kernel on candidates of one thread; return the pairs that it leaves open."""
         n = len(arrays["x"])
         room = np.empty(self._room if choices["with_collisions"] else 0, self._open_pair)
         pointers = (ctypes.c_void_p * len(wanted))(*wanted)
@@ -246,7 +246,7 @@ def load_kernel(
     outputs: Callable[[Array], Mapping[str, Array]],
     lanes: int = 0,
 ) -> Kernel | None:
-    """The kernel of a cell.
+    """Load or build the kernel of a cell.
 
     It is only used where it gives the bits of the functions that it is made of.
 
@@ -289,7 +289,8 @@ def load_kernel(
 
 
 def _same(found: SampledVerdicts, expected: SampledVerdicts) -> bool:
-    """Whether two evaluations agree to the last bit, in all that the first one has."""
+    """Return True if two evaluations agree to the last bit, in everything that the first one
+    has."""
     pairs = [(values, expected.outputs[name]) for name, values in found.outputs.items()]
     pairs += [
         (getattr(found, name), getattr(expected, name))
@@ -299,7 +300,7 @@ def _same(found: SampledVerdicts, expected: SampledVerdicts) -> bool:
 
 
 def _definitions(geometry: CellGeometry) -> str:
-    """The numbers that kernel.c is written for."""
+    """Write the sizes for which kernel.c is compiled."""
     workcell = geometry.workcell
     sizes = sample_sizes(workcell)
     ends = np.cumsum(list(sizes.values()))
@@ -348,14 +349,15 @@ def _definitions(geometry: CellGeometry) -> str:
 
 
 def _groups(compiled: CompiledCell) -> list[str]:
-    """The groups of numbers that the kernel holds, in order: no squeezes of commanded forces."""
+    """Return the groups of parameters that the kernel takes, in order: without squeezes of
+    commanded forces."""
     from symbolic.parameters import SQUEEZES
 
     return [name for name in compiled.numbers.sizes if name not in SQUEEZES]
 
 
 def _given(compiled: CompiledCell) -> str:
-    """Macros of kernel.c: where each function's numbers are among all groups."""
+    """Write the macros of kernel.c that locate each function's parameters among all groups."""
     numbers, groups = compiled.numbers, _groups(compiled)
     sizes = [numbers.sizes[name] for name in groups]
     at = dict(zip(groups, np.cumsum([0, *sizes]).tolist(), strict=False))
@@ -371,12 +373,12 @@ def _given(compiled: CompiledCell) -> str:
 
 
 def configuration_size(workcell: Workcell) -> int:
-    """Entries of a configuration: box pose, joints of the first and of the second arm."""
+    """Return the number of entries of a configuration: box pose, joints of both arms."""
     return POSE_SIZE + sum(len(robot.position_lower) for robot in workcell.robots)
 
 
 def open_pair(workcell: Workcell) -> np.dtype[np.void]:
-    """`open_pair` of kernel.c: a pair of a sample that is left to FCL."""
+    """Return `open_pair` of kernel.c: a pair of a sample that FCL has to decide."""
     return np.dtype(
         [
             ("candidate", np.int64),
@@ -414,8 +416,8 @@ class BatchData(ctypes.Structure):
 
 
 def _judge_data(checker: CollisionChecker) -> tuple[JudgeData, dict[str, NDArray[Any]]]:
-    """Pairs and margins of a cell, and the memory that they point into, to be kept as long as
-    they, and as the checker, which has the bodies."""
+    """Return the pairs and margins of a cell, and the memory that they point into, which must
+    outlive them, as must the checker with its bodies."""
     geometry = checker.geometry
     arrays = {
         "pairs": np.array([(p.first, p.second) for p in geometry.active], dtype=np.int64),

@@ -1,4 +1,4 @@
-"""The objectives a search may minimise, each a pure function of the evaluator's outputs.
+"""Objectives of a search, each a pure function of the evaluator's outputs.
 
 The paper's two are the peak normal forces of both robots (Eq. 60). All are dimensionless and
 scaled so that values of interest lie below one, which keeps the paper's penalty (values above
@@ -54,7 +54,7 @@ FORCE_PAIRS = (PAPER_OBJECTIVES, ROBUST_OBJECTIVES)
 
 @dataclass(frozen=True)
 class ForceKind:
-    """The normal forces that are limited and minimised in carries as robots drive them.
+    """Kind of normal forces that are limited and minimised in drivable carries.
 
     Attributes:
         robust: whether they hold in every case of the workcell's uncertainty.
@@ -102,28 +102,28 @@ def _larger(forces: Evaluate) -> Evaluate:
 
 
 def _peak_forces(outputs: Outputs, workcell: Workcell) -> Array:
-    """(n, 2) peak normal forces over the reference forces: those of the whole path where a timing
-    tells them."""
+    """Return the peak normal forces (n, 2) over the reference forces, of the whole path if the
+    timing has them."""
     known = outputs.get("peak_force")
     peaks = outputs["normal_force"].max(axis=1) if known is None else known
     return np.asarray(peaks / workcell.task.reference_force)
 
 
 def _mean_force(outputs: Outputs, workcell: Workcell) -> Array:
-    """Time average of both normal forces over the mean reference force."""
+    """Compute the time mean of both normal forces over the mean reference force."""
     both, time = outputs["normal_force"].mean(axis=2), outputs["time"]
     mean = np.trapezoid(both, time, axis=1) / (time[:, -1] - time[:, 0])
     return np.asarray(mean / float(workcell.task.reference_force.mean()), dtype=float)
 
 
 def _duration(outputs: Outputs, workcell: Workcell) -> Array:
-    """Duration over twice the time that the initial trajectory's polygon takes."""
+    """Compute the duration over twice the time of the initial trajectory's polygon."""
     duration = outputs["time"][:, -1] / duration_unit(workcell)
     return np.asarray(duration, dtype=float)
 
 
 def _peak_torque_use(outputs: Outputs, workcell: Workcell) -> Array:
-    """Largest joint torque from the contact wrench over that joint's maximum."""
+    """Compute the largest joint torque from the contact wrench over that joint's maximum."""
     uses = [
         (np.abs(outputs[f"joint_torque_{i + 1}"]) / robot.torque_max).max(axis=(1, 2))
         for i, robot in enumerate(workcell.robots)
@@ -132,14 +132,15 @@ def _peak_torque_use(outputs: Outputs, workcell: Workcell) -> Array:
 
 
 def _force_imbalance(outputs: Outputs, workcell: Workcell) -> Array:
-    """Largest difference of the two normal forces over the mean reference force."""
+    """Compute the largest difference of the two normal forces over the mean reference force."""
     forces = outputs["normal_force"]
     difference: Array = np.abs(forces[:, :, 0] - forces[:, :, 1]).max(axis=1)
     return difference / float(workcell.task.reference_force.mean())
 
 
 def _joint_length(outputs: Outputs, workcell: Workcell) -> Array:
-    """Euclidean length of the path of all joints of both arms, over that of their ranges."""
+    """Compute the Euclidean length of the path of all joints of both arms, over that of their
+    ranges."""
     steps = [np.diff(outputs[name], axis=1) for name in _JOINTS]
     length = np.sqrt(sum((step**2).sum(axis=2) for step in steps)).sum(axis=1)
     ranges = workcell.stack_joint_limits("position_upper") - workcell.stack_joint_limits(
@@ -149,7 +150,7 @@ def _joint_length(outputs: Outputs, workcell: Workcell) -> Array:
 
 
 def _friction_use(outputs: Outputs, workcell: Workcell) -> Array:
-    """Least friction margin, as the share of friction used at the reference squeeze.
+    """Compute the share of friction used at the reference squeeze.
 
     With the least normal forces the cones are tight by construction, so the margin is taken at
     the reference forces: both pads squeeze as hard as they may, the needed coefficient is
@@ -164,7 +165,7 @@ def _friction_use(outputs: Outputs, workcell: Workcell) -> Array:
 
 
 def _robust_forces(outputs: Outputs, workcell: Workcell) -> Array:
-    """(n, 2) peaks over the reference force of what the workcell's uncertainty asks of each arm.
+    """Compute the peaks (n, 2) over the reference force of each arm's robust force.
 
     Arm 1 leads, the force of arm 2 is commanded (`hybrid_opt.robust`). A timing that limits them
     tells those of the whole path.
@@ -183,8 +184,8 @@ def _robust_forces(outputs: Outputs, workcell: Workcell) -> Array:
 
 
 def duration_unit(workcell: Workcell) -> float:
-    """The time [s] that the objective `duration` counts as one: twice that along the hand-made
-    trajectory's straight pieces at the reference speeds."""
+    """Compute the time [s] that the objective `duration` counts as one: twice that along the
+    hand-made trajectory's straight pieces at the reference speeds."""
     task = workcell.task
     steps = np.diff(waypoints_of(task, initial_decision(task)), axis=0)
     lengths = np.linalg.norm(steps[:, :3], axis=1) / task.reference_speed
@@ -241,7 +242,7 @@ OBJECTIVES: dict[str, Objective] = {
 
 
 def objectives() -> dict[str, str]:
-    """The objectives that a `Cell` may minimise, by name what they are."""
+    """Return the objectives that a `Cell` may minimise: titles by name."""
     return {name: objective.title for name, objective in OBJECTIVES.items()}
 
 
@@ -249,7 +250,7 @@ _ROBUST = tuple(OBJECTIVES[name].evaluate for name in ("robust_force", *ROBUST_O
 
 
 def force_kind(objectives: Sequence[str | Objective]) -> ForceKind:
-    """The forces that the limits of the time law 'optimal' are about: robust ones where these are
+    """Return the kind of forces that the time law 'optimal' limits: robust ones if those are
     minimised.
 
     Raises:
@@ -261,7 +262,7 @@ def force_kind(objectives: Sequence[str | Objective]) -> ForceKind:
 
 
 def select_objectives(wanted: Sequence[str | Objective]) -> tuple[Objective, ...]:
-    """The wanted objectives in order: named ones of `OBJECTIVES`, and records of one's own.
+    """Return the wanted objectives in order: named ones of `OBJECTIVES`, and own records.
 
     Raises:
         SettingsError: a name is unknown or given twice, or none is given.

@@ -1,4 +1,4 @@
-"""Promises of every algorithm here beyond pymoo: an exact budget and finite fronts."""
+"""Guarantees of every algorithm here beyond pymoo: an exact budget and finite fronts."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ infinity it leaves differences and normalisations finite."""
 
 
 def violation_of(objectives: Array, constraints: Array) -> Array:
-    """Total constraint violation of evaluated points.
+    """Compute the total constraint violation of evaluated points.
 
     Args:
         objectives: (n, n_obj).
@@ -40,7 +40,7 @@ def violation_of(objectives: Array, constraints: Array) -> Array:
 
 
 def feasible_front(points: Population) -> Population:
-    """The feasible, mutually non-dominated members of evaluated points, each value once."""
+    """Return the feasible, mutually non-dominated members of evaluated points, each value once."""
     if len(points) == 0:
         return points
     feasible = points[points.get("CV")[:, 0] == 0.0]
@@ -50,7 +50,8 @@ def feasible_front(points: Population) -> Population:
 
 
 class Guarded(Algorithm):  # type: ignore[misc]
-    """Mixin, to stand before a pymoo algorithm among the bases.
+    """Mixin with an exact budget and finite fronts, placed before a pymoo algorithm among the
+    bases.
 
     - The last generation is cut so that exactly the evaluations of an `n_eval` termination
       are spent, whatever the population size.
@@ -74,14 +75,14 @@ class Guarded(Algorithm):  # type: ignore[misc]
         return None
 
     def infill(self) -> Population:
-        """The next candidates, never more than the budget has left."""
+        """Return the next candidates, at most the remaining budget."""
         candidates = super().infill()
         if self.budget is None:
             return candidates
         return candidates[: max(self.budget - self.evaluator.n_eval, 0)]
 
     def advance(self, infills: Population | None = None, **kwargs: Any) -> Any:
-        """Take evaluated candidates; those without finite values are disarmed first."""
+        """Take evaluated candidates, with non-finite ones made infeasible first."""
         if infills is not None and len(infills) > 0:
             objectives, constraints = infills.get("F", "G")
             violation = violation_of(objectives, constraints)
@@ -124,7 +125,7 @@ class WarmSampling(FloatRandomSampling):  # type: ignore[misc]
 
 
 class FillingMating(Mating):  # type: ignore[misc]
-    """Mating that always delivers: what unique offspring cannot fill, uniform samples do.
+    """Mating that always fills its offspring: uniform samples replace missing unique ones.
 
     pymoo stops a run early when crossover and mutation yield duplicates only, as happens in a
     collapsed population; the budget would then not be spent.

@@ -60,7 +60,7 @@ class MopsoSettings:
 
 
 def hypercubes(objectives: Array, divisions: int) -> Indices:
-    """Number the occupied hypercubes of the grid that the points themselves span.
+    """Assign numbers to the occupied hypercubes of the grid that the points themselves span.
 
     Args:
         objectives: (n, n_obj), finite.
@@ -217,7 +217,7 @@ def replaces_best(
     best_violation: Array,
     rng: np.random.Generator,
 ) -> Mask:
-    """Whether each particle's new point becomes its personal best.
+    """Return True for each particle whose new point becomes its personal best.
 
     Less violation wins; among equals a dominating point wins, a dominated one loses, and
     between incomparable ones a fair coin decides.

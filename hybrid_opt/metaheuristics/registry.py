@@ -75,7 +75,7 @@ class GuardedSmsEmoa(Guarded, SMSEMOA):  # type: ignore[misc]
 def _genetic(
     kind: type[Algorithm], compare: Any, settings: GeneticSettings, initial: Array | None
 ) -> Algorithm:
-    """An algorithm that mates the winners of tournaments, who are compared so."""
+    """Build an algorithm that mates the winners of tournaments decided by `compare`."""
     mating = FillingMating(
         TournamentSelection(func_comp=compare),
         SBX(eta=settings.crossover_eta, prob=settings.crossover_probability),
@@ -86,7 +86,7 @@ def _genetic(
 
 
 class RandomSearch(Guarded, Algorithm):  # type: ignore[misc]
-    """Uniform random points within the bounds: the floor that any search has to beat."""
+    """Uniform random points within the bounds: the baseline of every search."""
 
     def __init__(
         self, settings: RandomSettings, initial: Array | None = None, **kwargs: Any
@@ -135,22 +135,22 @@ REGISTRY: dict[str, _Entry] = {
 
 
 def names() -> tuple[str, ...]:
-    """The names that `make` knows."""
+    """Return the names that `make` accepts."""
     return tuple(REGISTRY)
 
 
 def algorithms() -> dict[str, str]:
-    """The searches that `make` knows, by name what they are called in print."""
+    """Return the searches that `make` accepts: titles by name."""
     return {name: entry.title for name, entry in REGISTRY.items()}
 
 
 def title(name: str) -> str:
-    """How an algorithm is called in print; another name stays as it is."""
+    """Return an algorithm's title in print; an unknown name is returned unchanged."""
     return REGISTRY[name].title if name in REGISTRY else name
 
 
 def settings_of(name: str, overrides: Mapping[str, object] | None = None) -> AlgorithmSettings:
-    """The effective settings of an algorithm: its defaults with `overrides`.
+    """Return the effective settings of an algorithm: its defaults with `overrides`.
 
     Raises:
         SettingsError: unknown algorithm or setting, or a value outside its range.
@@ -172,7 +172,7 @@ def make(
     settings: AlgorithmSettings | Mapping[str, object] | None = None,
     initial: Array | None = None,
 ) -> Algorithm:
-    """A fresh algorithm for one run.
+    """Build a fresh algorithm for one run.
 
     Args:
         name: one of `names()`.

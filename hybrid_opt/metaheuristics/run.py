@@ -1,5 +1,5 @@
-"""A search among a cell's carries: the problem that pymoo's algorithms see, the run that spends the
-evaluations, and the record of what they evaluated."""
+"""A search among a cell's carries: pymoo's problem, the run that spends the evaluations, and the
+record of all evaluated candidates."""
 
 from __future__ import annotations
 
@@ -40,14 +40,15 @@ class Evaluator(Protocol):
     upper: Array
 
     def evaluate(self, x: Array) -> Evaluations:
-        """Verdicts on decision vectors (n, n_var)."""
+        """Evaluate decision vectors (n, n_var)."""
 
     def certified(self, evaluations: Evaluations) -> Evaluations:
-        """The evaluations with their feasible front proven free between the samples."""
+        """Return the evaluations with every member of their feasible front proven free between
+        the samples."""
 
 
 def disarmed(evaluations: Evaluations) -> Evaluations:
-    """The evaluations with every candidate that has a figure that is not finite made infeasible.
+    """Make every candidate with a non-finite figure infeasible.
 
     The last line of defence: whatever an evaluator returns, no NaN or infinity can look like a
     good candidate. Such candidates get `WORST_PENALTY` and the reason `NOT_FINITE`.
@@ -72,7 +73,7 @@ def disarmed(evaluations: Evaluations) -> Evaluations:
 
 
 class StatedPaths:
-    """Evaluates the decision vectors of a task's stated waypoints, see `symbolic.path.pieces`.
+    """Evaluates decision vectors of a task's coarse waypoints, see `symbolic.path.pieces`.
 
     Attributes:
         objective_names, n_var, lower, upper: see `Evaluator`.
@@ -84,20 +85,20 @@ class StatedPaths:
         self.lower, self.upper = self._stated.lower, self._stated.upper
 
     def evaluate(self, x: Array) -> Evaluations:
-        """See `Evaluator`; the candidates are the task's own."""
+        """Evaluate as `Evaluator`; the returned candidates are the task's own."""
         return self._evaluator.evaluate(resample_decisions(x, self._stated, self._task))
 
     def certified(self, evaluations: Evaluations) -> Evaluations:
-        """See `Evaluator`."""
+        """Certify as `Evaluator`."""
         return self._evaluator.certified(evaluations)
 
     def drawn(self, x: Array | None) -> Array | None:
-        """Candidates of the task (n, its n_var) as searches draw them."""
+        """Convert candidates of the task (n, its n_var) to the coarse task that searches use."""
         return None if x is None else resample_decisions(x, self._task, self._stated)
 
 
 class CarryProblem(Problem):  # type: ignore[misc]
-    """A cell's candidates as a vectorised pymoo problem that keeps what it evaluated.
+    """A cell's candidates as a vectorised pymoo problem that stores its evaluations.
 
     With handling 'penalty' the objectives are the penalised ones (paper Eq. 60) and there are no
     constraints; with 'constraints' they are the plain ones, and each of `REASONS` is an
@@ -130,7 +131,7 @@ class CarryProblem(Problem):  # type: ignore[misc]
 
     @property
     def evaluations(self) -> Evaluations:
-        """Every evaluated candidate in the order of evaluation; there has to be one."""
+        """Every evaluated candidate in the order of evaluation; needs at least one."""
         return concatenated(self.batches)
 
     def _evaluate(self, x: Array, out: dict[str, Any], *args: Any, **kwargs: Any) -> None:
@@ -170,7 +171,7 @@ class Evaluated:
 
     @property
     def feasible(self) -> NDArray[np.bool_]:
-        """(n,) whether every constraint is satisfied and every objective is finite."""
+        """(n,) True where every constraint is satisfied and every objective is finite."""
         return np.asarray(self.violation == 0.0)
 
 
@@ -240,7 +241,7 @@ def search(
 
 @dataclass(frozen=True)
 class SearchSettings:
-    """How a search is done.
+    """Settings of a search.
 
     Attributes:
         algorithm: settings of the algorithm, `GeneticSettings` of NSGA-II and SMS-EMOA or
@@ -267,7 +268,7 @@ def search_carries(
     evaluated: Callable[[int], None] = lambda count: None,
     task: Task | None = None,
 ) -> tuple[Evaluations, NDArray[np.intp]]:
-    """Spend exactly that many evaluations and certify the front of all of them; returns the
+    """Spend exactly that many evaluations and certify the front of all of them; return the
     candidates in order and the generation (n,) of each, from 1.
 
     Args:

@@ -1,4 +1,4 @@
-"""Files, written so that nothing is lost, and read without trust.
+"""Files, written atomically, and read without trust.
 
 files: atomic writes, frozen records as JSON. trajectory_file: a carry with its whole cell in one
 file, and evaluated again from it.

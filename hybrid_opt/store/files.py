@@ -1,5 +1,4 @@
-"""Files of results: written so that an interruption at any moment leaves the old content or the new
-one, frozen records as JSON in them, checked once when they are read.
+"""Files of results: written atomically, frozen records as JSON, checked once when they are read.
 
 The annotations of a record's fields say what is allowed, see `symbolic.read.tables`.
 """
@@ -44,7 +43,7 @@ _FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 
 @contextmanager
 def storing(path: Path, remedy: str = RESUME) -> Iterator[None]:
-    """Turn a failure to store `path` into one clear message.
+    """Report a failure to store `path` as one clear message.
 
     Args:
         remedy: what to do where the disk is full.
@@ -61,7 +60,7 @@ def storing(path: Path, remedy: str = RESUME) -> Iterator[None]:
 
 
 def write_atomically(path: Path, content: bytes, remedy: str = RESUME) -> None:
-    """Replace a file in one step, durably; its folder is made if it is missing.
+    """Replace a file in one step, durably; make its folder if it is missing.
 
     Args:
         remedy: what to do where the disk is full.
@@ -81,7 +80,7 @@ def write_json(path: Path, document: Any) -> None:
 
 
 def to_json(value: Any) -> Any:
-    """A record as JSON values.
+    """Convert a record to JSON values.
 
     Numbers that are not finite become null. Fields without a value that have none by default are
     left out.
@@ -106,7 +105,7 @@ def to_json(value: Any) -> Any:
 def from_json(
     kind: type[Record], value: Any, path: Path | str, remedy: str, is_open: bool = True
 ) -> Record:
-    """The record that JSON values describe.
+    """Read a record from JSON values.
 
     Args:
         kind: the record's class.
@@ -136,12 +135,12 @@ def read_record(kind: type[Record], path: Path, remedy: str) -> Record:
 
 
 def record_of(kind: type[Record], content: bytes, path: Path | str, remedy: str) -> Record:
-    """The record in a file's content; see `read_record`."""
+    """Read the record in a file's content; see `read_record`."""
     return from_json(kind, json_of(content, path, remedy), path, remedy)
 
 
 def csv_text(header: Sequence[str], rows: Iterable[Sequence[str | float]]) -> str:
-    """Comma-separated values: numbers with as many digits as it takes to get the same bits back."""
+    """Format comma-separated values, with the fewest digits that give the same bits back."""
     text = io.StringIO()
     csv.writer(text, lineterminator="\n").writerows([header, *rows])
     return text.getvalue()
@@ -161,7 +160,7 @@ def read_json(path: Path, remedy: str = "") -> Any:
 
 
 def json_of(content: bytes, path: Path | str, remedy: str = "") -> Any:
-    """The JSON values of a file's content; see `read_json`."""
+    """Parse the JSON values of a file's content; see `read_json`."""
     try:
         return safe_io.json_value(content)
     except OutsideError as error:
@@ -189,7 +188,7 @@ def read_document(path: Path, form: str, version: int, remedy: str = "") -> dict
 
 
 def read_bytes(path: Path) -> bytes:
-    """A file's content.
+    """Read a file's content.
 
     Raises:
         ResultsError: it cannot be read, is no regular file, or larger than `safe_io.MOST_BYTES`.
@@ -201,7 +200,7 @@ def read_bytes(path: Path) -> bytes:
 
 
 def sha256(content: bytes) -> str:
-    """SHA-256 as hexadecimal text."""
+    """Compute the SHA-256 as hexadecimal text."""
     return hashlib.sha256(content).hexdigest()
 
 
@@ -233,7 +232,7 @@ def locked(folder: Path) -> Iterator[None]:
 
 
 def own_version() -> str:
-    """As installed; run from its sources alone it has none."""
+    """Return the installed version; sources without an installation have none."""
     try:
         return version("dual-arm-carry")
     except PackageNotFoundError:

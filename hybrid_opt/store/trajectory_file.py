@@ -1,4 +1,4 @@
-"""A trajectory stored as one self-contained JSON file, and evaluated again from it alone.
+"""Trajectory stored as one self-contained JSON file, and its re-evaluation.
 docs/reference/bundles.md describes the format.
 
 The file holds the decision vector, the start postures, the figures it was reported with, how it
@@ -57,7 +57,7 @@ RELATIVE_TOLERANCE = 1e-6
 
 @dataclass(frozen=True)
 class StoredTrajectory:
-    """The content of a trajectory file.
+    """Content of a trajectory file.
 
     Attributes:
         x: (n_var,) decision vector.
@@ -82,7 +82,7 @@ class StoredTrajectory:
         return found or PAPER_OBJECTIVES
 
     def open_cell(self, folder: Path) -> Cell:
-        """Its cell, which minimises these objectives; its files are written below a folder.
+        """Open its cell, which minimises the stored objectives; write its files below a folder.
 
         Raises:
             ResultsError: as of `unpack`.
@@ -155,7 +155,7 @@ def write_trajectory(
 
 
 def _standing_still(workcell: Workcell) -> tuple[Array, ...]:
-    """Inputs of a candidate besides x: under 'optimal' a timing, which the start
+    """Return the inputs of a candidate besides x: under 'optimal' a timing at rest, which the start
     postures do not depend on."""
     if workcell.task.time_law != "optimal":
         return ()
@@ -193,7 +193,7 @@ class _Content:
     cell: Any
 
     def __post_init__(self) -> None:
-        """Refuse more numbers and larger ones than any cell has, and names that cannot be told."""
+        """Refuse more numbers and larger ones than any cell has, and unprintable names."""
         vectors = {"decision": self.decision, "start[0]": self.start[0], "start[1]": self.start[1]}
         for name, values in (vectors | {"figures": tuple(self.figures.values())}).items():
             if len(values) > MOST_NUMBERS:
@@ -213,7 +213,7 @@ class _Content:
 
 @dataclass(frozen=True)
 class FigureComparison:
-    """A stored figure beside the recomputed one, which is None where nothing computes it."""
+    """A stored figure and the recomputed one, None if nothing computes it."""
 
     name: str
     stored: float
@@ -221,7 +221,7 @@ class FigureComparison:
 
     @property
     def same(self) -> bool:
-        """Whether both agree to the tolerances of a re-evaluation."""
+        """True if both agree to the tolerances of a re-evaluation."""
         if self.recomputed is None:
             return False
         allowed = ABSOLUTE_TOLERANCE + RELATIVE_TOLERANCE * abs(self.stored)
@@ -244,7 +244,7 @@ class Replay:
 
     @property
     def reproduced(self) -> bool:
-        """Whether every stored figure and the start postures came out again."""
+        """True if every stored figure and the start postures were reproduced."""
         return self.start_difference <= START_TOLERANCE and all(
             figure.same for figure in self.figures
         )
