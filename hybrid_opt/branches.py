@@ -1,4 +1,4 @@
-"""Which start branches a cell's arms take: pairs of them compete for evaluations.
+"""Choice of a cell's start branches: pairs of branches compete for evaluations.
 
 Successive halving (Karnin, Koren and Somekh, ICML 2013): in every round all pairs that are left get
 the same number of evaluations, and the better half goes on. A pair is as good as the hypervolume of
@@ -108,7 +108,7 @@ class BranchCompetition:
 
 
 class _Pair:
-    """One pair and what it was given so far."""
+    """One pair and its evaluations so far."""
 
     def __init__(self, branches: tuple[int, int], evaluator: CandidateEvaluator) -> None:
         self.branches, self.evaluator = branches, evaluator
@@ -116,7 +116,7 @@ class _Pair:
         self._parts: list[Evaluations] = []
 
     def search(self, algorithm: str, evaluations: int, rng: np.random.Generator) -> None:
-        """One round more."""
+        """Search for one more round."""
         known = concatenated(self._parts)
         order = np.argsort(known.penalised.mean(axis=1), kind="stable")
         settings = SearchSettings(initial=known.x[order[: min(BEST, evaluations)]])
@@ -125,13 +125,13 @@ class _Pair:
         self.rounds += 1
 
     def try_out(self, x: Array) -> bool:
-        """Whether both arms hold one of some candidates."""
+        """Return True if both arms hold one of some candidates."""
         found = self.evaluator.evaluate(x)
         self._parts.append(found)
         return bool(np.any(np.all(found.violation[:, _HOLDING] <= 0.0, axis=1)))
 
     def result(self) -> PairResult:
-        """Where it stands."""
+        """Return its present result."""
         known = concatenated(self._parts)
         rows = front_rows(known.objectives, known.feasible)
         volume = hypervolume(known.objectives[rows], REFERENCE_POINT) if len(rows) else 0.0
@@ -212,7 +212,7 @@ def search_branches(
 
 
 def _from_rest_to_rest(cell: Cell) -> Cell:
-    """The cell under 'ramped', with the paper's objectives."""
+    """Return the cell under 'ramped', with the paper's objectives."""
     task = replace(cell.workcell.task, time_law="ramped")
     return Cell(replace(cell.workcell, task=task), PAPER_OBJECTIVES, cell.threads)
 

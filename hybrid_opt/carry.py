@@ -1,4 +1,4 @@
-"""One carry: how box and arms move, and the forces between them, under one timing.
+"""One carry: motion of box and arms, and the forces between them, under one timing.
 
 `Cell.carry` gives a candidate under the task's own time law, as a search sees it; `time_path` gives
 one under a timing that robots can drive; exports take one at even time steps. All are this record.
@@ -215,13 +215,12 @@ class Carry(Displayable):
         return self.stack_arms("torque")
 
     def stack_arms(self, name: str) -> Array:
-        """(n, all joints) a quantity of `ArmMotion` with the second arm's joints after the
-        first's."""
+        """Stack a quantity of both arms' `ArmMotion`: (n, all joints), the first arm's first."""
         return np.concatenate([getattr(arm, name) for arm in self.arms], axis=1)
 
     @property
     def figures(self) -> dict[str, float]:
-        """What a judged carry is stored with and reported by, SI units.
+        """Figures of an evaluated carry for storage and reports, SI units.
 
         `feasible` is 1 or 0; `objective_<name>` are without penalty; means are over time.
         """
@@ -245,7 +244,7 @@ class Carry(Displayable):
         return figures
 
     def view(self, height: int = 480) -> Page:
-        """The carry in three dimensions: shown in a notebook's cell, or saved as a page.
+        """Show the carry in three dimensions: in a notebook's cell, or saved as a page.
 
         Args:
             height: of the notebook's cell [px].
@@ -255,7 +254,7 @@ class Carry(Displayable):
 
 
 def joints_of(workcell: Workcell, values: Array) -> tuple[Array, Array]:
-    """Columns of both arms (n, all joints), side by side, as (n, n_joints) of each."""
+    """Split stacked joints (n, all joints) into (n, n_joints) of each arm."""
     first = len(workcell.robots[0].velocity_max)
     return values[:, :first], values[:, first:]
 
@@ -267,7 +266,7 @@ def carry_under_time_law(
     outputs: Mapping[str, Array],
     judgement: Judgement | None = None,
 ) -> Carry:
-    """The carry of one candidate from its outputs.
+    """Build the carry of one candidate from its outputs.
 
     Args:
         functions: with both arms' `inverse_dynamics_i`, see `symbolic.functions`.
@@ -300,7 +299,7 @@ def carry_under_time_law(
 
 
 def decision_of(carry: Carry | Array) -> Array:
-    """(n_var,) decision vector of a carry, or the vector itself."""
+    """Return the decision vector (n_var,) of a carry, or the vector itself."""
     return carry.x if isinstance(carry, Carry) else carry
 
 
@@ -320,7 +319,7 @@ def _arm(
 def _joint_rates(
     workcell: Workcell, x: Array, q: Array, outputs: Mapping[str, Array]
 ) -> tuple[Array, Array]:
-    """First and second time derivatives of joints q (n, n_joints).
+    """Compute the first and second time derivatives of joints q (n, n_joints).
 
     Under 'constant' they are second-order finite differences on the law's times, as the paper
     takes the box's (one-sided at the ends). Under 'ramped' the law's own u' and u'' drive the

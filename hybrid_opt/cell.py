@@ -1,4 +1,4 @@
-"""A dual-arm cell, ready to be worked with: its description, and its compiled functions on demand.
+"""A dual-arm cell: its description, and its compiled functions on demand.
 
 The only resource of the library. Everything it computes is returned as a frozen record.
 """
@@ -82,7 +82,7 @@ class Cell:
         self._folder: TemporaryDirectory[str] | None = None  # of its files
 
     def __reduce__(self) -> tuple[type[Cell], tuple[Any, ...]]:
-        """Its description: another process loads its functions anew."""
+        """Pickle the description: another process loads its functions anew."""
         return Cell, (self.workcell, self._objectives, self._threads)
 
     @classmethod
@@ -92,7 +92,7 @@ class Cell:
         objectives: Sequence[str | Objective] = PAPER_OBJECTIVES,
         threads: int | None = None,
     ) -> Cell:
-        """The cell of a workcell file.
+        """Load the cell of a workcell file.
 
         Raises:
             WorkcellError: the file is wrong; the message lists every problem.
@@ -108,7 +108,7 @@ class Cell:
         objectives: Sequence[str | Objective] = PAPER_OBJECTIVES,
         threads: int | None = None,
     ) -> Cell:
-        """The cell of a workcell's files, which lie in a temporary folder that lasts as long as the
+        """Open the cell of a workcell's files, in a temporary folder that lasts as long as the
         cell.
 
         Raises:
@@ -120,7 +120,7 @@ class Cell:
         return cell
 
     def with_start_branches(self, branches: tuple[int, int]) -> Cell:
-        """The cell with the start branches that its file says are searched for decided, read anew.
+        """Return the cell with the start branches set that its file leaves to a search, read anew.
 
         Raises:
             WorkcellError: the file was changed and is wrong now.
@@ -130,7 +130,7 @@ class Cell:
         return Cell(decided, self._objectives, self._threads)
 
     def changed(self, changes: Mapping[str, Any]) -> Cell:
-        """The cell with other numbers, in memory: what is compiled stays the same.
+        """Return the cell with other numbers, in memory, without compiling again.
 
         It can be stored, searched, polished and exported like any other.
 
@@ -148,8 +148,8 @@ class Cell:
         return cell
 
     def drivable(self) -> Cell:
-        """The same cell with carries as robots drive them: under the time law 'optimal', searched
-        for duration and peak force, the robust one where robust forces are minimised
+        """Return the drivable variant of the cell: under the time law 'optimal', searched for
+        duration and peak force, the robust one if robust forces are minimised
         (docs/explanation/timing.md).
 
         Its workcell file lies in a temporary folder that lasts as long as the cell.
@@ -170,7 +170,7 @@ class Cell:
 
     @cached_property
     def evaluator(self) -> CandidateEvaluator:
-        """What judges candidates.
+        """Evaluator of candidates.
 
         Raises:
             SettingsError: an objective is unknown.
@@ -182,21 +182,21 @@ class Cell:
 
     @cached_property
     def timing_model(self) -> TimingModel:
-        """What times carries."""
+        """Timing model of carries."""
         from hybrid_opt.timing.model import TimingModel
 
         return TimingModel(self.compiled, robust=self.force_kind.robust)
 
     @cached_property
     def path_timer(self) -> PathTimer:
-        """What times many paths, in compiled code."""
+        """Timer of many paths, in compiled code."""
         from hybrid_opt.timing.path_timer import PathTimer
 
         return PathTimer(self.compiled, threads=self.threads)
 
     @cached_property
     def polish_functions(self) -> PolishFunctions:
-        """What polishes are assembled from."""
+        """Functions from which polishes are assembled."""
         from hybrid_opt.polishing.cell import polish_functions
 
         return polish_functions(self.compiled)
@@ -208,11 +208,11 @@ class Cell:
 
     @cached_property
     def unheld(self) -> str:
-        """Why the payload cannot be held still, and what would do; '' where it can."""
+        """Reason why the payload cannot be held still, and a remedy; '' if it can."""
         return unheld(self.workcell) or unheld(self.workcell, self.evaluator.outputs)
 
     def require_hold(self) -> None:
-        """Refuse a payload that cannot be held still; what needs no compiled code is asked first.
+        """Refuse a payload that cannot be held still; checks without compiled code come first.
 
         Raises:
             WorkcellError: it cannot; the text says what is needed, allowed, and what would do.
@@ -227,7 +227,7 @@ class Cell:
 
     @property
     def force_kind(self) -> ForceKind:
-        """The forces that limits of drivable carries are about: robust ones where these are
+        """Kind of forces that limits of drivable carries are about: robust ones if these are
         minimised.
 
         Raises:
@@ -266,7 +266,7 @@ class Cell:
         return initial_decision(self.workcell.task)
 
     def evaluate(self, x: Array) -> Evaluations:
-        """Verdicts on decision vectors (n, n_var), on the task's samples.
+        """Evaluate decision vectors (n, n_var) on the task's samples.
 
         Raises:
             SettingsError: x has the wrong shape.
@@ -276,14 +276,14 @@ class Cell:
         return concatenated([self.evaluator.evaluate(x[k : k + _CHUNK]) for k in begins])
 
     def random(self, count: int, rng: np.random.Generator) -> Array:
-        """(count, n_var) decision vectors drawn uniformly from within the bounds of the waypoints
-        that the file states."""
+        """Draw decision vectors (count, n_var) uniformly from the bounds of the coarse task's
+        waypoints."""
         task, drawn = self.workcell.task, coarse_task(self.workcell.task)
         x = rng.uniform(drawn.lower, drawn.upper, (count, drawn.n_var))
         return resample_decisions(x, drawn, task)
 
     def carry(self, x: Array) -> Carry:
-        """One decision vector (n_var,) in detail, with its verdict, under the task's time law.
+        """Evaluate one decision vector (n_var,) in detail, under the task's time law.
 
         Raises:
             SettingsError: x has the wrong shape.
@@ -291,7 +291,7 @@ class Cell:
         return self.evaluator.carry(x)
 
     def certify(self, x: Array | Carry) -> Certificate:
-        """The verdict on the collisions of one carry along its continuous path.
+        """Certify that one carry is free of collisions along its continuous path.
 
         Args:
             x: (n_var,) decision vector, or a carry.
@@ -317,7 +317,7 @@ class Cell:
 
 
 def example(name: str = "rack", objectives: Sequence[str | Objective] = PAPER_OBJECTIVES) -> Cell:
-    """A cell that ships with the project.
+    """Load a cell that ships with the project.
 
     Raises:
         SettingsError: there is none of that name; the message lists them.

@@ -64,7 +64,7 @@ class DaskWorkers(Workers):
         arguments: Sequence[Argument],
         on_result: OnResult = ignore_result,
     ) -> list[Result]:
-        """See `Workers`.
+        """Call a function with every argument on the cluster, see `Workers.map`.
 
         Raises:
             SettingsError: Dask is not installed, or no scheduler or worker answers.
@@ -138,7 +138,7 @@ class DaskWorkers(Workers):
 
 
 def _require_address(address: str) -> None:
-    """Refuse what is no address: a client that is given none waits, and complains when it goes."""
+    """Refuse an invalid address: a client without a valid one waits, and complains when it ends."""
     from distributed.comm import addressing
 
     host_port: Any = addressing.get_address_host_port  # untyped
@@ -171,7 +171,7 @@ def _call(
     function: Callable[[Argument], Result],
     argument: Argument,
 ) -> Result:
-    """Make a call on a worker whose software is the one that is wanted."""
+    """Call a function on a worker, after comparing its software with the wanted one."""
     found = environment()
     for name in sorted({*found, *wanted}):
         if found.get(name) != wanted.get(name):

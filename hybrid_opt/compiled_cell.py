@@ -31,7 +31,7 @@ KEPT = 2
 
 
 class CompiledCell:
-    """What is compiled for a workcell. Share one wherever several sets of functions are needed.
+    """Compiled functions of a workcell. Share one wherever several sets of functions are needed.
 
     A set is loaded where it was built before, also by other processes; then neither expressions
     nor the model are made. Otherwise it is made from the model, which is built once.
@@ -61,13 +61,13 @@ class CompiledCell:
         self._loaded: dict[object, Any] = {}
 
     def of_changed(self, workcell: Workcell) -> CompiledCell:
-        """Another workcell, for which what is loaded for this one is not loaded again."""
+        """Return another workcell's functions that share the loaded ones."""
         other = CompiledCell(workcell, self.cache)
         other._loaded, other._is_changed = self._loaded, True
         return other
 
     def once(self, key: object, load: Callable[[], Loaded]) -> Loaded:
-        """What is loaded under a key, for all cells that were changed from one."""
+        """Return the value cached under `key`; cells derived from each other share the cache."""
         if key not in self._loaded:
             self._loaded[key] = load()
         found: Loaded = self._loaded[key]
@@ -75,7 +75,7 @@ class CompiledCell:
 
     @classmethod
     def of(cls, cell: Workcell | CompiledCell) -> CompiledCell:
-        """A workcell to be compiled; one that is compiled already is shared."""
+        """Return the functions of a workcell; compiled ones are shared."""
         return cell if isinstance(cell, CompiledCell) else cls(cell)
 
     @cached_property
@@ -93,7 +93,7 @@ class CompiledCell:
         return build_cell_model(self.workcell, self.bodies, self._searches())
 
     def _searches(self) -> tuple[ArmSearch, ArmSearch]:
-        """What start branches are found with, compiled."""
+        """Return the compiled searches for start branches."""
         from symbolic.cell_model import own_clearance
         from symbolic.robot.branches import ArmSearch
 
@@ -144,7 +144,7 @@ class CompiledCell:
 
     @cached_property
     def numbers(self) -> CellParameters:
-        """What of the cell is a number, and what is structure."""
+        """Parameters and topology of the cell."""
         from symbolic.parameters import CellParameters
 
         bodies = self.bodies
@@ -152,7 +152,7 @@ class CompiledCell:
 
     @cached_property
     def symbols(self) -> CellModel:
-        """The model whose functions take the numbers as inputs."""
+        """The model whose functions take the parameters as inputs."""
         return self.numbers.symbolic(self.bodies)
 
     @cached_property
@@ -188,13 +188,14 @@ class CompiledCell:
         return self.once(key, find)
 
     def vector(self, group: str) -> Array:
-        """The numbers (n,) of a group, see `symbolic.parameters`."""
+        """Return the parameters (n,) of a group, see `symbolic.parameters`."""
         from symbolic.parameters import START
 
         return np.concatenate(self.start) if group == START else self.numbers.vector(group)
 
     def key(self, name: str, *details: str, bodies: bool = True) -> str:
-        """A recipe's key: what a set of functions is made from (CasADi is part of every set's).
+        """Compute a recipe's key: the ingredients of a set of functions (CasADi is part of every
+        set's).
 
         Args:
             details: whatever else that is.
@@ -218,8 +219,8 @@ class CompiledCell:
         levels: Mapping[str, int] | None = None,
         bodies: bool = True,
     ) -> dict[str, NumericFunction]:
-        """A set of functions with this cell's numbers, from the cache where one of the same
-        structure was built before.
+        """Return a set of functions with this cell's parameters, from the cache if one of the same
+        topology was built before.
 
         Args:
             name: of the set.
@@ -241,7 +242,7 @@ class CompiledCell:
         return {name: self.bound(function) for name, function in built.items()}
 
     def bound(self, function: NumericFunction) -> NumericFunction:
-        """A function with this cell's numbers for its last inputs."""
+        """Bind this cell's parameters to a function's last inputs."""
         from symbolic.parameters import GROUPS
 
         return function.bound(
@@ -262,7 +263,7 @@ class CompiledCell:
 
     @cached_property
     def screening(self) -> dict[str, NumericFunction]:
-        """The functions that know the bodies."""
+        """The functions that depend on the bodies."""
 
         def make(model: CellModel) -> Mapping[str, ca.Function]:
             return model.screening
@@ -272,12 +273,12 @@ class CompiledCell:
 
 @lru_cache
 def _expressions(folder: Path) -> str:
-    """What formulas are written in, as it was when this process first asked."""
+    """Compute the digest of the package that writes formulas, as of this process's first call."""
     return Cache(folder).code_digest("symbolic")
 
 
 class _Identity:
-    """Lets a cache compare workcells by what they are, not by what they say."""
+    """Compares workcells by identity in a cache."""
 
     def __init__(self, workcell: Workcell) -> None:
         self.workcell = workcell
@@ -290,7 +291,7 @@ class _Identity:
 
 
 def kept_per_workcell(build: Callable[[Workcell], Loaded]) -> Callable[[Workcell], Loaded]:
-    """A function that gives the same record the same answer of `build` again."""
+    """Cache a function's result per workcell, by identity."""
 
     @lru_cache(maxsize=KEPT)
     def kept(identity: _Identity) -> Loaded:
@@ -313,7 +314,7 @@ _held_numbers = kept_per_workcell(_numbers)
 
 
 def bound_to(function: NumericFunction, numbers: WorkcellParameters) -> NumericFunction:
-    """A function with a cell's numbers, but for start postures, for its last inputs."""
+    """Bind a cell's parameters, except start postures, to a function's last inputs."""
     names = [name for name in function.input_names if name in numbers.sizes]
     return function.bound({name: numbers.vector(name) for name in names})
 
@@ -328,8 +329,8 @@ def held_function(
     make: Callable[[Workcell], ca.Function],
     lanes: int = 1,
 ) -> NumericFunction:
-    """A function of what is held and how, with a cell's numbers, from the cache where one of the
-    same structure was built before. Neither arms nor bodies are read.
+    """Return a function of payload and contacts with a cell's parameters, from the cache if one of
+    the same topology was built before. Arms and bodies are not read.
 
     Args:
         name: in the cache.

@@ -1,4 +1,4 @@
-"""What is done with a cell: search, polish, time, store, and find its fastest class of carries."""
+"""Operations on a cell: search, polish, time, store, and rank its homotopy classes."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ def polish(
 
 
 def time_path(cell: Cell, carry: Carry | Array, limits: TimingLimits | None = None) -> Timing:
-    """The fastest timing from rest to rest that robots can drive.
+    """Compute the fastest timing from rest to rest that robots can drive.
 
     Args:
         carry: the carry whose path is timed, or its decision vector (n_var,).
@@ -111,7 +111,8 @@ def time_with_jerk(
     limits: TimingLimits | None = None,
     jerk: JerkLimits | None = None,
 ) -> JerkTiming:
-    """A fast timing within limits on jerk as well, at rest without acceleration at both ends.
+    """Compute a fast timing within limits on jerk as well, at rest without acceleration at both
+    ends.
 
     Args:
         carry, limits: as for `time_path`.
@@ -136,7 +137,7 @@ def time_every_way(
     curve_points: int | None = None,
     progress: ShowProgress = False,
 ) -> TimedTrajectory:
-    """The search's timing and the drivable ones of a carry side by side, with margins.
+    """Compare the search's timing and the drivable ones of a carry, with margins.
 
     Args:
         force_limit: normal force [N] of a force-limited timing, None for no such timing.
@@ -162,7 +163,7 @@ def save(carry: Carry, path: str | Path, provenance: Mapping[str, Any] | None = 
 
 
 def fastest_carry(cell: Cell, evaluations: int, rng: np.random.Generator) -> Carry:
-    """The fastest carry of a small study of a cell as robots drive it: one search, one polish.
+    """Find the fastest carry of a small study of a drivable cell: one search, one polish.
 
     Raises:
         SettingsError: no carry that holds was found.
@@ -177,7 +178,7 @@ def compared_classes(
     rng: np.random.Generator,
     tell: Callable[[str], None] = lambda text: None,
 ) -> tuple[list[Proposal], Table]:
-    """Proposals with the fastest class first, and what was found of each.
+    """Rank proposals by the duration of their classes' fastest carries; return them and a table.
 
     Args:
         evaluations: of the search within each class.

@@ -1,4 +1,4 @@
-"""What can go wrong with results and with those who compute them."""
+"""Errors of results and of their computation."""
 
 from symbolic.errors import DualArmError, DualArmWarning
 
@@ -16,11 +16,11 @@ class DisplayError(DualArmError):
 
 
 class WorkerError(DualArmError):
-    """Processes or machines that work for this one were lost or do not fit."""
+    """Worker processes or machines were lost, or their software differs."""
 
 
 class WitnessError(DualArmError):
-    """The simulator is missing, or cannot answer what it was asked."""
+    """The simulator is missing, or cannot answer."""
 
 
 class NoCarryError(ResultsError):

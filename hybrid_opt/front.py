@@ -1,5 +1,5 @@
-"""A front: the feasible carries that no other one dominates, as a search or a polish left them; and
-the carry that stands for it.
+"""A front: the feasible carries that no other one dominates, from a search or a polish; and the
+carry selected from it.
 
 The balanced carry has the least mean of both robots' peak normal forces. Where one robot can
 relieve the other at no cost, a polished front is flat: many points have the same mean to five
@@ -58,14 +58,14 @@ class Front(Displayable):
     def of_search(
         cls, cell: Cell, algorithm: str, evaluations: Evaluations, replica: int | None = None
     ) -> Front:
-        """The front among evaluated candidates that `CandidateEvaluator.certified` went through."""
+        """Return the front of evaluations that `CandidateEvaluator.certified` has processed."""
         rows = metrics.front_rows(evaluations.objectives, evaluations.feasible)
         x, objectives = evaluations.x[rows], evaluations.objectives[rows]
         return cls(cell, algorithm, x, objectives, evaluations, replica=replica)
 
     @classmethod
     def of(cls, cell: Cell, x: Array) -> Front:
-        """The front of carries that are known to be feasible and free; they are evaluated anew.
+        """Evaluate carries that are known to be feasible and free, and return them as a front.
 
         Args:
             x: (k, n_var) decision vectors by increasing first objective.
@@ -77,7 +77,7 @@ class Front(Displayable):
         return cls(cell, "given", found.x, found.objectives, found)
 
     def after(self, polish: PolishedFront) -> Front:
-        """What a polish made of it."""
+        """Return the front after its polish."""
         return replace(self, x=polish.x, objectives=polish.objectives, polished=polish)
 
     def polish(
@@ -88,7 +88,7 @@ class Front(Displayable):
         paths: Sequence[Carry | Array] = (),
         progress: ShowProgress = False,
     ) -> Front:
-        """Improve it, see `hybrid_opt.polish`."""
+        """Improve the front, see `hybrid_opt.polish`."""
         # Not imported at the top: solvers take long to load.
         from hybrid_opt.polishing.polisher import Polisher
 
@@ -114,7 +114,7 @@ class Front(Displayable):
 
     @property
     def key(self) -> tuple[str, int]:
-        """What found it, and the number of its replica, 0 where it is of none."""
+        """Algorithm and number of the replica, 0 if it belongs to none."""
         return self.algorithm, self.replica or 0
 
     @property
@@ -139,14 +139,14 @@ class Front(Displayable):
         return len(self.x)
 
     def __getitem__(self, index: int) -> Carry:
-        """A member in detail, by its place on the front."""
+        """Return a member in detail, by its index on the front."""
         return self.cell.carry(self.x[index])
 
     def __iter__(self) -> Iterator[Carry]:
         return (self[index] for index in range(len(self)))
 
     def balanced(self) -> Carry:
-        """The member of least mean of both robots' peak normal forces, see `balanced`.
+        """Return the member of least mean of both robots' peak normal forces, see `balanced`.
 
         Raises:
             SettingsError: the front is empty.
@@ -154,7 +154,7 @@ class Front(Displayable):
         return self[balanced(self._peaks())]
 
     def lowest_force(self, robot: int) -> Carry:
-        """The member of least peak normal force of one robot.
+        """Return the member of least peak normal force of one robot.
 
         Args:
             robot: 0 or 1.
@@ -167,7 +167,7 @@ class Front(Displayable):
         return self[int(np.argmin(self._peaks()[:, robot]))]
 
     def lowest(self, objective: str) -> Carry:
-        """The member with the least value of one of the objectives.
+        """Return the member with the least value of one of the objectives.
 
         Raises:
             SettingsError: the front is empty, or was not searched for that objective.
@@ -180,12 +180,13 @@ class Front(Displayable):
         return self[int(np.argmin(self.objectives[:, self.objective_names.index(objective)]))]
 
     def hypervolume(self, reference: Array | None = None) -> float:
-        """Volume that the front dominates up to a reference point (n_obj,), the paper's 1.1."""
+        """Compute the volume that the front dominates up to a reference point (n_obj,), by default
+        the paper's 1.1."""
         point = metrics.reference_point(len(self.objective_names))
         return metrics.hypervolume(self.objectives, point if reference is None else reference)
 
     def spacing(self) -> float:
-        """Unevenness of the front, see `hybrid_opt.indicators.metrics.spacing`."""
+        """Compute the unevenness of the front, see `hybrid_opt.indicators.metrics.spacing`."""
         return metrics.spacing(self.objectives)
 
     def _peaks(self) -> Array:
@@ -209,7 +210,7 @@ _CHUNK = 256
 
 @dataclass(frozen=True)
 class SelectedCarry:
-    """The carry that stands for a front.
+    """The carry selected from a front.
 
     Attributes:
         row: its row among the replica's evaluations, or in the polished front.
@@ -227,15 +228,15 @@ class SelectedCarry:
 
 
 def balanced(peak_normal_force: Array) -> int:
-    """Index of the least mean of both robots' peak forces (k, 2); of equals, whose means differ by
-    less than `TIE`, that of the least larger force."""
+    """Return the index of the least mean of both robots' peak forces (k, 2); among means that
+    differ by less than `TIE`, that of the least larger force."""
     mean = peak_normal_force.mean(axis=1)
     equal = mean <= mean.min() * (1.0 + TIE)
     return int(np.argmin(np.where(equal, peak_normal_force.max(axis=1), np.inf)))
 
 
 def knee(points: Array) -> int:
-    """Index of the point (k, 2) whose objectives, both positive, have the least product.
+    """Return the index of the point (k, 2) with the least product of objectives, both positive.
 
     Beside it one per cent of either objective buys at most one per cent of the other. The distance
     from the line between the front's ends (Das 1999) would depend on how far the ends were
@@ -255,7 +256,7 @@ def knee(points: Array) -> int:
 def select(
     evaluator: CandidateEvaluator, x: Array, rows: NDArray[np.intp] | None = None
 ) -> SelectedCarry | None:
-    """The carry that stands for a front, None where the front is empty.
+    """Select the carry that represents a front, None if the front is empty.
 
     Args:
         x: (k, n_var) the front's decision vectors.
@@ -269,8 +270,8 @@ def select(
 
 
 def selected_row(evaluator: CandidateEvaluator, x: Array) -> int:
-    """Index of the carry that stands for a front (k, n_var), k > 0: the balanced one, under the
-    time law 'optimal' the knee of duration and larger peak force."""
+    """Return the index of the selected carry of a front (k, n_var), k > 0: the balanced one, under
+    the time law 'optimal' the knee of duration and larger peak force."""
     peaks, durations = _peaks_and_durations(evaluator, x)
     if evaluator.workcell.task.time_law != "optimal":
         return balanced(peaks)
@@ -278,12 +279,13 @@ def selected_row(evaluator: CandidateEvaluator, x: Array) -> int:
 
 
 def peak_normal_forces(evaluator: CandidateEvaluator, x: Array) -> Array:
-    """(n, 2) peak normal force of each robot [N] for decision vectors (n, n_var)."""
+    """Compute the peak normal force (n, 2) of each robot [N] for decision vectors (n, n_var)."""
     return _peaks_and_durations(evaluator, x)[0]
 
 
 def _peaks_and_durations(evaluator: CandidateEvaluator, x: Array) -> tuple[Array, Array]:
-    """(n, 2) peak normal forces [N] and (n,) durations [s] of decision vectors (n, n_var)."""
+    """Compute peak normal forces (n, 2) [N] and durations (n,) [s] of decision vectors (n,
+    n_var)."""
     peaks, durations = [], []
     for begin in range(0, len(x), _CHUNK):
         outputs = evaluator.outputs(x[begin : begin + _CHUNK])

@@ -1,5 +1,4 @@
-"""Where two pads press on their faces: places within given ranges, compared by what the cell's
-hand-made path costs with them.
+"""Choice of the places where two pads press on their faces, by the cost of the hand-made path.
 
 The places are numbers of the cell, so that each trial takes what a changed cell takes, without a
 compiler. Both pads move alike, so that they stay opposite one another.
@@ -66,7 +65,7 @@ class Grip:
 def propose_grip(
     cell: Cell, up: Range, along: Range, trials: int = TRIALS, *, progress: ShowProgress = False
 ) -> Grip:
-    """The best place of the pads for the cell's hand-made path, which is certified with it.
+    """Find the best place of the pads for the cell's hand-made path, and certify the path with it.
 
     Args:
         cell: with upright faces where the pads press, and forces in closed form.
@@ -122,7 +121,7 @@ def propose_grip(
 
 
 def _ways(workcell: Workcell) -> Array:
-    """(2, 3) upwards and level along the faces, box axes, as the payload stands at the start.
+    """Compute the directions (2, 3) upwards and level along the faces, box axes, at the start.
 
     Raises:
         SettingsError: the faces are not upright.
@@ -137,7 +136,7 @@ def _ways(workcell: Workcell) -> Array:
 
 
 def _changes(workcell: Workcell, ways: Array, at: tuple[float, float]) -> dict[str, Any]:
-    """Changes by key path, see `Cell.changed`."""
+    """Return changes by key path, see `Cell.changed`."""
     if at == (0.0, 0.0):
         return {}
     shift = np.asarray(at) @ ways
@@ -148,7 +147,8 @@ def _changes(workcell: Workcell, ways: Array, at: tuple[float, float]) -> dict[s
 
 
 def _cost(drivable: Cell, changes: dict[str, Any]) -> tuple[float, float, float]:
-    """Least product of duration and commanded force [N s], and both; infinite for none."""
+    """Compute the least product of duration and commanded force [N s], and both; infinite for
+    none."""
     none = np.inf, np.inf, np.inf
     try:
         cell = drivable.changed(changes) if changes else drivable

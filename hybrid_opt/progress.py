@@ -17,10 +17,10 @@ ShowProgress = Literal[False, True] | Callable[[int, int], None]
 
 
 class Advance(Protocol):
-    """Takes how many more units are done, and those in all where more is known of them now."""
+    """Takes the number of further units done, and the total if it has changed."""
 
     def __call__(self, count: int, total: int | None = None, /) -> None:
-        """Go on."""
+        """Advance the progress."""
 
 
 @contextmanager
@@ -57,7 +57,7 @@ def counted(progress: ShowProgress, what: str, total: int) -> Iterator[Advance]:
 
 
 def passed_on(advance: Advance) -> Callable[[int, int], None]:
-    """What a call takes as its `progress`, for a count that has begun."""
+    """Adapt an open progress bar to a `progress(done, total)` callback."""
     before = 0
 
     def tell(done: int, total: int) -> None:
@@ -75,7 +75,7 @@ def _set_total(bar: tqdm[NoReturn], total: int | None) -> None:
 
 
 def following(progress: ShowProgress, what: str, items: Sequence[T]) -> Iterator[T]:
-    """The items of a call one by one, each counted when the next is asked for."""
+    """Yield the items of a call, counting each when the next is requested."""
     with counted(progress, what, len(items)) as advance:
         for item in items:
             yield item
@@ -102,7 +102,7 @@ class Progress:
     def stage(
         self, title: str, total: int, unit: str, done: int = 0, delay: float = 0.0
     ) -> Iterator[Advance]:
-        """A line for the time of the `with` block.
+        """Show a line during the `with` block.
 
         Args:
             title: what is being done.
@@ -135,6 +135,6 @@ class Progress:
             yield advance
 
     def note(self, text: str) -> None:
-        """A line of its own."""
+        """Print a line of its own."""
         if self.shown:
             tqdm.write(text, file=sys.stderr)

@@ -1,4 +1,4 @@
-"""What every number of a cell does to a carry: derivatives of the force and of the duration.
+"""Sensitivities of a carry's force and duration to every number of a cell.
 
 The path stays, driven by the task's time law or as fast as limits allow. The force is the largest
 to command that holds in every case of the cell's uncertainty, as a recommendation commands it. Its
@@ -143,7 +143,7 @@ class Sensitivity:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Sensitivities(Displayable):
-    """What the numbers of a cell do to a carry, the largest first; others do nothing.
+    """Sensitivities of a carry to the numbers of a cell, the largest first; others have no effect.
 
     Attributes:
         workcell: the cell.
@@ -160,7 +160,7 @@ class Sensitivities(Displayable):
     missing: Mapping[str, str]
 
     def __getitem__(self, key: str) -> Sensitivity:
-        """The number of a key.
+        """Return the sensitivity of a key.
 
         Raises:
             KeyError: the number does nothing, or its sensitivity is missing.
@@ -199,7 +199,7 @@ class _Number:
 
 
 def sensitivities(carry: Carry | Timing, *, progress: ShowProgress = False) -> Sensitivities:
-    """Derivatives of a carry's force and duration by the numbers of its cell.
+    """Compute the derivatives of a carry's force and duration by the numbers of its cell.
 
     Args:
         carry: under the time law of its task; or the fastest timing of a path within limits. Of a
@@ -254,7 +254,7 @@ def sensitivities(carry: Carry | Timing, *, progress: ShowProgress = False) -> S
 
 
 class _Law:
-    """A carry under its task's time law, in cells nearby."""
+    """A carry under its task's time law, in neighbouring cells."""
 
     def __init__(self, carry: Carry) -> None:
         if carry.timing not in ("constant", "ramped"):
@@ -265,20 +265,20 @@ class _Law:
         self.carry = carry
 
     def moved_by(self, number: _Number) -> bool:
-        """Whether the motion or its duration may depend on a number."""
+        """Return True if the motion or its duration may depend on a number."""
         return number.section == "task"
 
     def is_compiled_with(self, number: _Number, workcell: Workcell) -> bool:
-        """Whether the duration in another cell cannot be told without compiling."""
+        """Return True if the duration in another cell requires compiling."""
         return False
 
     def durations(self, number: _Number, low: Workcell, high: Workcell) -> tuple[float, float]:
-        """Changes of the duration towards the higher and the lower of two cells [s]."""
+        """Compute the changes of the duration towards the higher and the lower of two cells [s]."""
         before, after = (float(self._driven(cell)[0][-1, 0]) for cell in (low, high))
         return (after - before) / 2.0, (before - after) / 2.0
 
     def motion(self, workcell: Workcell, samples: NDArray[np.intp]) -> BoxMotion:
-        """The motion at some samples, in another cell."""
+        """Compute the motion at some samples, in another cell."""
         return BoxMotion(*[part[samples] for part in self._driven(workcell)[1:]])
 
     def _driven(self, workcell: Workcell) -> list[Array]:
@@ -290,8 +290,8 @@ class _Law:
 
 
 class _Fastest:
-    """The fastest timing of a path, in cells nearby: the motion is what its speeds make of the path
-    there, the duration what the limits' shares at these speeds leave."""
+    """The fastest timing of a path, in neighbouring cells: its speeds are fixed, and the duration
+    follows from the limits' ratios at these speeds."""
 
     def __init__(self, timing: Timing) -> None:
         if timing.limits.robust:
@@ -306,17 +306,18 @@ class _Fastest:
         self._near = TimingSensitivity(TimingModel(self._compiled), timing)
 
     def moved_by(self, number: _Number) -> bool:
-        """See `_Law`."""
+        """Return True if the motion or its duration may depend on a number."""
         return number.section != "uncertainty"
 
     def is_compiled_with(self, number: _Number, workcell: Workcell) -> bool:
-        """See `_Law`: as of upright bases that are tilted, and of pads anywhere that move."""
+        """Return True if another cell requires compiling: upright bases that are tilted, or moved
+        pads with any normals."""
         if number.is_limit or not self.moved_by(number):
             return False
         return WorkcellParameters(workcell).digest != self._digest
 
     def durations(self, number: _Number, low: Workcell, high: Workcell) -> tuple[float, float]:
-        """See `_Law`."""
+        """Compute the changes of the duration towards the higher and the lower of two cells [s]."""
         before, after = (self._ratios(number, cell) for cell in (low, high))
         return self._near.changes(before, after)
 
@@ -328,7 +329,7 @@ class _Fastest:
         return limit_ratios(carry, workcell, self._limits)
 
     def motion(self, workcell: Workcell, samples: NDArray[np.intp]) -> BoxMotion:
-        """See `_Law`."""
+        """Compute the motion at some samples, in another cell."""
         points, speeds = waypoints_of(workcell.task, self.carry.x), self._near.speeds
         basis = path_basis(len(points), self.carry.parameter[samples])
         first, second = basis.first @ points, basis.second @ points
@@ -340,7 +341,8 @@ class _Fastest:
 
 
 def _numbers(workcell: Workcell) -> Iterator[_Number]:
-    """All that are told of, as the file states them, or else with what they are then."""
+    """Yield all numbers of the sensitivities, as the file states them, or else with their
+    defaults."""
     text = workcell.text or safe_io.read_bytes(workcell.source, safe_io.WORKCELL_BYTES)
     data = safe_io.toml_tables(text)
     yield from _of(data["payload"], "payload", PAYLOAD, workcell.payload)

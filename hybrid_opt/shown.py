@@ -1,4 +1,4 @@
-"""Objects that show themselves in a terminal and in a notebook.
+"""Protocol of objects with a display in a terminal and in a notebook.
 
 They do not know how they look: the rooms of `hybrid_opt.display` do, which are imported when an
 object is shown.
@@ -12,7 +12,8 @@ from typing import Any, Protocol
 
 
 def display(room: str) -> Any:
-    """A module that shows objects: 'objects' as text and HTML, 'scene' in three dimensions."""
+    """Import a module that displays objects: 'objects' as text and HTML, 'scene' in three
+    dimensions."""
     return import_module(f"hybrid_opt.display.{room}")
 
 
@@ -30,7 +31,7 @@ class Page(Protocol):
     """A self-contained page, which a notebook shows in a cell."""
 
     def page(self) -> str:
-        """Its text."""
+        """Return its text."""
 
     def save(self, path: str | Path) -> None:
         """Write it into a file."""

@@ -1,5 +1,5 @@
-"""Holding the payload still: the forces it takes, which no carry can stay far below, what they say
-of the payload that could be carried, and whether robots and pads can do it at all."""
+"""Static hold of the payload: its forces, which no carry falls far below, the payload limit that
+follows, and whether robots and pads can bear it."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class StaticHold:
 
 @kept_per_workcell
 def static_hold(workcell: Workcell) -> StaticHold:
-    """Forces of the payload held level and still; the same record for the same workcell.
+    """Compute the forces of the payload held level and still; cached per workcell.
 
     With equal friction coefficients mu the normal forces are m g / (2 mu) each, and the whole
     forces (m g / 2) sqrt(1 + 1 / mu^2).
@@ -63,7 +63,7 @@ def static_hold(workcell: Workcell) -> StaticHold:
 
 
 def mass_at_reference(workcell: Workcell, force: Array) -> Array:
-    """(2,) payload [kg] at which a force of each robot reaches its reference force.
+    """Compute the payload (2,) [kg] at which a force of each robot reaches its reference force.
 
     Forces along an unchanged motion are proportional to the mass (paper Figure 12).
 
@@ -76,7 +76,7 @@ def mass_at_reference(workcell: Workcell, force: Array) -> Array:
 
 
 def payload_limit(workcell: Workcell, contact_force: Array) -> float:
-    """Least payload [kg] at which a robot's whole force reaches its reference force.
+    """Compute the least payload [kg] at which a robot's whole force reaches its reference force.
 
     Args:
         workcell: the cell.
@@ -91,8 +91,8 @@ _load_of = kept_per_workcell(uncertain_load_function)
 def still_load(
     workcell: Workcell, pose: Array, friction: float = 1.0, function: ca.Function | None = None
 ) -> dict[str, Array]:
-    """What the contacts have to bear while the payload stands still in a pose, the only place that
-    says which normal forces that takes.
+    """Compute the load of the contacts while the payload stands still in a pose; the only source of
+    static normal forces.
 
     Args:
         pose: (6,) of the box [m, rad].
@@ -113,7 +113,7 @@ def still_load(
 
 @dataclass(frozen=True)
 class StillUse:
-    """What standing still at one end of the path asks of a limit.
+    """Use of a limit while standing still at one end of the path.
 
     Attributes:
         quantity: what is limited.
@@ -136,7 +136,7 @@ class StillUse:
 
     @property
     def exceeded(self) -> bool:
-        """Whether the limit does not allow it."""
+        """True if the use exceeds the limit."""
         return self.share > 1.0 + ROUNDING
 
     def __str__(self) -> str:
@@ -151,8 +151,8 @@ PRESSURE, TORQUE = "shift of the pressure", "joint torque"
 
 
 def unheld(workcell: Workcell, outputs: Outputs | None = None) -> str:
-    """Why the payload cannot be held still at the start or the goal, and what would do; '' where
-    it can.
+    """Return why the payload cannot be held still at the start or the goal, with a remedy; '' if it
+    can.
 
     Normal forces and whole forces are held against the reference forces, which are what the robots
     may carry, shifts of the pressure against the patches where they are a limit.
@@ -189,7 +189,7 @@ def require_hold(workcell: Workcell, outputs: Outputs | None = None) -> None:
 
 
 def _ends(workcell: Workcell, outputs: Outputs) -> list[tuple[Array, Array]]:
-    """Both arms' joints at the start and the goal of the hand-made trajectory; those that are
+    """Return both arms' joints at the start and the goal of the hand-made trajectory, if
     reached."""
     found = outputs(initial_decision(workcell.task)[None])
     return [
@@ -200,7 +200,7 @@ def _ends(workcell: Workcell, outputs: Outputs) -> list[tuple[Array, Array]]:
 
 
 class _Still:
-    """A payload at rest at both ends of its path, with other masses and friction as well."""
+    """A payload at rest at both ends of its path, with scaled mass and friction."""
 
     def __init__(self, workcell: Workcell, postures: list[tuple[Array, Array]]) -> None:
         ends = (workcell.task.waypoints[0].lower, workcell.task.waypoints[-1].lower)
@@ -215,7 +215,7 @@ class _Still:
             self._models = [build_robot_model(robot) for robot in workcell.robots]
 
     def exceeded(self, mass: float = 1.0, friction: float = 1.0) -> list[StillUse]:
-        """The limits that are exceeded with other factors on mass and friction."""
+        """Return the limits that are exceeded with other factors on mass and friction."""
         found = []
         for where, pose in self._poses.items():
             load = still_load(self._workcell, pose, friction)
@@ -237,7 +237,7 @@ class _Still:
                 yield StillUse(PRESSURE, robot.name, where, 1e3 * shift, 1e3 * radius, "mm")
 
     def _torques(self, where: str, load: dict[str, Array], mass: float) -> Iterator[StillUse]:
-        """The most used joint of each arm, where its posture is known."""
+        """Yield the most used joint of each arm, if its posture is known."""
         from symbolic.robot.arm import joint_torque
 
         workcell = self._workcell
@@ -254,7 +254,7 @@ class _Still:
             yield StillUse(TORQUE, whose, where, float(torque[joint]), float(most), unit)
 
     def remedy(self, exceeded: list[StillUse]) -> str:
-        """Mass or friction that would suffice, each with all else as it is."""
+        """Find the mass or friction that would suffice, each with everything else unchanged."""
         ways = []
         if any(use.quantity != PRESSURE for use in exceeded):
             ways = [way for way in (self._mass(), self._friction()) if way]
@@ -285,12 +285,13 @@ class _Still:
         return f"friction of at least {wanted}"
 
     def _bears(self, mass: float = 1.0, friction: float = 1.0) -> bool:
-        """Whether forces and torques are within their limits."""
+        """Return True if forces and torques are within their limits."""
         return all(use.quantity == PRESSURE for use in self.exceeded(mass, friction))
 
 
 def _nearest(enough: Callable[[float], bool], here: float, far: float) -> float | None:
-    """The factor nearest to one that fails which is enough, None where even the far one is not."""
+    """Find the nearest sufficient factor between one that fails and `far`, None if `far` fails
+    as well."""
     if not enough(far):
         return None
     for _ in range(STEPS):

@@ -1,4 +1,4 @@
-"""What other numbers of a cell would do to its carry: duration and force for every combination.
+"""Sweep over numbers of a cell: duration and force of its recommended carry for every combination.
 
 Of each combination the carry that is recommended is asked for: the path of its neighbour, polished
 in the changed cell, or one path that stays as it is. Combinations that differ in the last key alone
@@ -66,7 +66,7 @@ class Combination:
 
 @dataclass(frozen=True)
 class Sweep:
-    """What a sweep found, and what is stored of it.
+    """Result of a sweep, as stored.
 
     Attributes:
         about: digest of the cell, of what it minimises, and of whether the path is fixed.
@@ -91,7 +91,7 @@ class Sweep:
 
 
 def stored_sweep(file: Path) -> Sweep:
-    """What a file holds of a sweep.
+    """Read a stored sweep.
 
     Raises:
         ResultsError: it cannot be read or is damaged.
@@ -120,7 +120,8 @@ def sweep(
     jobs: int = 1,
     progress: ShowProgress = False,
 ) -> Sweep:
-    """The recommended carry's duration and force for every combination of some numbers of a cell.
+    """Compute the recommended carry's duration and force for every combination of some numbers of a
+    cell.
 
     Args:
         cell: under the time law 'optimal', see `Cell.drivable`.
@@ -272,8 +273,8 @@ def _row(
 
 
 def _tried(cell: Cell, near: Sequence[Array], fixed: bool) -> Evaluations:
-    """Verdicts on paths, and on the hand-made one where they may change, each within the limit that
-    suits it best."""
+    """Evaluate paths, and the hand-made one unless the path is fixed, each within its best force
+    limit."""
     x = np.array([x[:-1] for x in (near if fixed else [*near, cell.initial])])
     paths = DrivenPaths(cell, x)
     options = paths.all_options(cell.workcell.task.force_limit[1])

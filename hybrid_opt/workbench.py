@@ -1,5 +1,5 @@
-"""A cell that is changed bit by bit, with a carry in it that is judged after every change: a
-session, and its page in a browser with handles to drag, fields for numbers, verdict and forces."""
+"""A cell that is changed interactively, with a carry evaluated after every change: a session, and
+its page in a browser with handles to drag, fields for numbers, verdict and forces."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ FIRST = 39
 
 @dataclass(frozen=True)
 class Handle:
-    """Something of a cell that has a place.
+    """A draggable part of a cell.
 
     Attributes:
         key: in the workcell file: 'task.start', 'environment.top board', 'robots[0].base' or
@@ -113,7 +113,7 @@ class Session:
         return self.verdict.cell or self._drivable
 
     def change(self, changes: Mapping[str, Any]) -> Verdict:
-        """Change more; what is refused changes nothing.
+        """Apply more changes; a refused change leaves the session as it is.
 
         Args:
             changes: by key path of the workcell file; 'force_limit' is that of the carry [N].
@@ -135,11 +135,11 @@ class Session:
         return self.verdict
 
     def move(self, handle: Handle, pose: Array) -> Verdict:
-        """Put something at another place (4, 4) of the world, see `handles`."""
+        """Move a handle to another pose (4, 4) of the world, see `handles`."""
         return self.change(moved(self.cell.workcell, handle, pose))
 
     def optimise(self, rng: np.random.Generator, evaluations: int = EVALUATIONS) -> Verdict:
-        """Search around the carry at hand for the one of least product of duration and force."""
+        """Search around the present carry for the least product of duration and force."""
         task, cell = self.cell.workcell.task, self.cell
         width = np.where(np.isfinite(task.upper - task.lower), task.upper - task.lower, 0.0)
         near = self.x + NEAR * width * rng.standard_normal((FIRST, task.n_var))
@@ -155,8 +155,8 @@ class Session:
         return self.verdict
 
     def save(self, folder: str | Path) -> Path:
-        """Write the changed cell, with the path at hand as its hand-made one, and every file that
-        it needs into a folder of its own; returns the workcell file.
+        """Write the changed cell, with the present path as its hand-made one, and every file that
+        it needs into a folder of its own; return the workcell file.
 
         Raises:
             DualArmError: the folder is not empty, or cannot be written.
@@ -209,7 +209,8 @@ class Session:
 
 
 def handles(workcell: Workcell) -> tuple[Handle, ...]:
-    """Parts of a cell that may be dragged: start, goal, bodies around, bases and pads."""
+    """Return the parts of a cell that may be dragged: start, goal, bodies around, bases and
+    pads."""
     task, bodies = workcell.task, workcell.environment
     first, last = (
         box_placement(task.orientation, task.waypoints[k].lower[:POSE_SIZE]) for k in (0, -1)
@@ -230,7 +231,7 @@ def handles(workcell: Workcell) -> tuple[Handle, ...]:
 
 
 def moved(workcell: Workcell, handle: Handle, pose: Array) -> dict[str, Any]:
-    """The changes, by key path, that put a handle at another place (4, 4) of the world."""
+    """Return the changes, by key path, that move a handle to another pose (4, 4) of the world."""
     xyz = [round(value, 6) for value in pose[:3, 3].tolist()]
     rpy = [round(value, 6) for value in rpy_from_rotation(pose[:3, :3]).tolist()]
     section = handle.key.partition(".")[0].partition("[")[0]
@@ -307,19 +308,19 @@ class Workbench:
         self._thread.start()
 
     def ask(self, changes: dict[str, Any]) -> None:
-        """Have changes judged; of several that wait, the last of a key counts."""
+        """Request an evaluation of changes; of several that wait, the last of a key counts."""
         with self._news:
             self._changes |= changes
             self._news.notify()
 
     def do(self, task: Callable[[], None]) -> None:
-        """Have something done beside judging, in the order of asking."""
+        """Request another task, done in order."""
         with self._news:
             self._tasks.append(task)
             self._news.notify()
 
     def close(self) -> None:
-        """End it."""
+        """Stop serving."""
         with self._news:
             self._closed = True
             self._news.notify()
@@ -381,7 +382,7 @@ class Workbench:
         )
 
     def _look(self) -> None:
-        """Begin where the whole motion is seen from the front, above."""
+        """Set the camera to see the whole motion from the front, above."""
         carry = self.session.verdict.carry
         assert carry is not None, "a session begins with a carry"
         points = motion_points(self._geometry, carry.pose, carry.q)
@@ -469,7 +470,7 @@ class Workbench:
         self._pose()
 
     def _draw(self, verdict: Verdict) -> None:
-        """Meshes of bodies that are new, or changed their shape or place."""
+        """Draw meshes of bodies that are new, or changed their shape or pose."""
         assert verdict.cell is not None
         self._geometry = verdict.cell.geometry
         scene = self._server.scene
@@ -488,7 +489,7 @@ class Workbench:
             self._solids[solid.name] = (solid, mesh)
 
     def _pose(self) -> None:
-        """Everything that moves, where it is at the place that is looked at."""
+        """Draw everything that moves at the selected sample."""
         carry = self.session.verdict.carry
         if carry is None:
             return

@@ -97,7 +97,7 @@ class LocalWorkers(Workers):
         arguments: Sequence[Argument],
         on_result: OnResult = ignore_result,
     ) -> list[Result]:
-        """See `Workers`."""
+        """Call a function with every argument in processes, see `Workers.map`."""
         results: dict[int, Result] = {}
         if min(self._jobs, len(arguments)) <= 1:
             for index, argument in enumerate(arguments):
@@ -146,7 +146,7 @@ class LocalWorkers(Workers):
         return self._pool
 
     def close(self) -> None:
-        """See `Workers`."""
+        """End all processes at once."""
         if self._pool is not None and self._lifeline is not None:
             self._pool.shutdown(wait=False, cancel_futures=True)
             for process in self._processes:

@@ -1,1 +1,1 @@
-"""What recorded runs of a real cell say of its numbers: sensors, payload, friction, forces."""
+"""Calibration of a cell from recorded runs: sensors, payload, friction, forces."""

@@ -1,4 +1,4 @@
-"""What holds, steps of force and slips say: pure functions of arrays.
+"""Estimates from holds, steps of force and slips: pure functions of arrays.
 
 **Loads.** While a box is held still, what its pads give balances its weight. With the readings
 (f, m) of arm i about its pad, free of offsets, N the normal force among them, and c the share of N
@@ -76,7 +76,7 @@ class Hold:
 
 @dataclass(frozen=True)
 class Load:
-    """What holds say; standard deviations are infinite of what they do not show.
+    """Estimate from holds; standard deviations are infinite where the holds show nothing.
 
     Attributes:
         mass: [kg].
@@ -94,22 +94,22 @@ class Load:
 
     @property
     def sees_mass(self) -> bool:
-        """Whether the holds show the mass."""
+        """True if the holds show the mass."""
         return bool(self.deviations[0] <= SEEN_MASS * abs(self.mass))
 
     @property
     def sees_centre(self) -> Array:
-        """(3,) along which axes of the box they show the centre of mass."""
+        """(3,) True per axis of the box along which they show the centre of mass."""
         return np.asarray(self.deviations[1:4] <= SEEN_CENTRE)
 
     @property
     def sees_crosstalk(self) -> Array:
-        """(2, 2) which crosstalk they show."""
+        """(2, 2) True per crosstalk that they show."""
         return np.asarray(self.deviations[4:].reshape(2, 2) <= SEEN_CROSSTALK)
 
 
 def fit_load(holds: Sequence[Hold], moments: bool = True) -> Load:
-    """The load and the crosstalk that explain holds best.
+    """Estimate the load and the crosstalk that explain holds best.
 
     Args:
         holds: at least one.
@@ -149,7 +149,8 @@ def fit_load(holds: Sequence[Hold], moments: bool = True) -> Load:
 
 
 def _balance(hold: Hold) -> tuple[Array, Array, Array]:
-    """(1) and (2) of a hold: matrix (6, unknowns), right side (6,), covariance of that (6, 6)."""
+    """Compute (1) and (2) of a hold: matrix (6, unknowns), right side (6,), covariance of that
+    (6, 6)."""
     matrix, value, noise = np.zeros((6, len(WIDTHS))), np.zeros(6), np.zeros((6, 6))
     matrix[:3, 0] = hold.gravity
     matrix[3:, 1:4] = -skew(hold.gravity)
@@ -166,7 +167,7 @@ def _balance(hold: Hold) -> tuple[Array, Array, Array]:
 
 
 def without_crosstalk(wrench: Array, crosstalk: Array) -> Array:
-    """Readings (..., 2, 6) about the pads with what the normal force shows elsewhere taken out."""
+    """Remove crosstalk of the normal force from readings (..., 2, 6) about the pads."""
     found = np.array(wrench)
     found[..., :2] += wrench[..., 2:3] * crosstalk
     return found
@@ -195,7 +196,8 @@ CLEARER = 1.05
 def delay(
     time: Array, first: Array, second: Array, most: float = 1.0, apart: float | None = None
 ) -> float | None:
-    """How much later the second signal (n,) does what the first (n,) does [s]; negative: earlier.
+    """Estimate the delay of the second signal (n,) behind the first (n,) [s]; negative if it is
+    earlier.
 
     Args:
         time: (n,) [s].
@@ -245,7 +247,7 @@ LARGEST_RATIO = 20.0
 
 
 class FrictionRatio:
-    """The coefficient of both pads with which what was measured is just held.
+    """Coefficient of both pads at which a measured wrench is just held.
 
     Args:
         workcell: whose patches press, evenly.
@@ -261,7 +263,8 @@ class FrictionRatio:
             self._capacity.append(ca.Function("capacity", [grip, tangent], [carried]))
 
     def __call__(self, wrench: Array) -> float:
-        """Ratio of readings (2, 6) about the pads, along their axes, free of offset and crosstalk.
+        """Compute the ratio of readings (2, 6) about the pads, along their axes, free of offset and
+        crosstalk.
 
         Returns:
             the ratio; infinite where a pad does not press.

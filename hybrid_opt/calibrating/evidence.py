@@ -1,4 +1,4 @@
-"""From recorded runs to what they show of a cell, and to its workcell file with that in it."""
+"""Evidence of a cell from recorded runs, and a workcell file with the calibrated values."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ class Entry:
 
 @dataclass
 class Evidence:
-    """What runs show of a cell, found one after the other.
+    """Evidence from runs of a cell, collected step by step.
 
     Attributes:
         workcell: the cell.
@@ -137,7 +137,7 @@ class Evidence:
 
 
 def calibrate(workcell: Workcell, runs: Sequence[Run]) -> Evidence:
-    """What runs show of a cell.
+    """Collect the evidence of runs about a cell.
 
     Raises:
         SettingsError: runs of different boxes.
@@ -176,7 +176,7 @@ def _tell_offsets(run: Run, offsets: Array, evidence: Evidence) -> None:
 
 
 def _pieces(run: Run, places: Places) -> list[Hold]:
-    """A run's holds that are still and whole, in pieces."""
+    """Cut a run's holds into pieces that are still and complete."""
     found = []
     for begin, end in run.labels.held:
         if any(a < end and b > begin for a, b in run.lost):
@@ -201,7 +201,7 @@ def _pieces(run: Run, places: Places) -> list[Hold]:
 
 
 def _empty(run: Run, pieces: list[Hold], evidence: Evidence) -> None:
-    """What sensors tell of nothing, in the postures of an empty run."""
+    """Compare the sensors with zero, in the postures of an empty run."""
     if not pieces:
         return
     most = max(float(np.linalg.norm(piece.wrench[:, :3], axis=1).max()) for piece in pieces)
@@ -217,7 +217,7 @@ Sound = list[tuple[Run, Places]]
 
 
 def _load(sound: Sound, evidence: Evidence) -> Load | None:
-    """Mass, centre of mass and crosstalk, as far as they are seen."""
+    """Estimate mass, centre of mass and crosstalk, as far as the runs show them."""
     holds, moments = [], True
     for run, places in sound:
         found = _pieces(run, places)
@@ -281,7 +281,7 @@ def _load(sound: Sound, evidence: Evidence) -> Load | None:
 
 
 def _friction(sound: Sound, load: Load | None, evidence: Evidence) -> None:
-    """A bracket of the friction: greatest ratio that held, least that slipped."""
+    """Bracket the friction: greatest ratio that held, least that slipped."""
     if load is None or not load.sees_crosstalk.all() or not evidence.workcell.has_opposite_pads:
         return
     ratio_of = FrictionRatio(evidence.workcell)
@@ -322,7 +322,7 @@ def _friction(sound: Sound, load: Load | None, evidence: Evidence) -> None:
 
 
 def _tracking(sound: Sound, evidence: Evidence) -> None:
-    """Force over the commanded one as quantiles, and its lag."""
+    """Compute quantiles of the force over the commanded one, and its lag."""
     worst: list[float] = []
     for i in range(2):
         shares, lags = [], []
@@ -350,7 +350,7 @@ def _tracking(sound: Sound, evidence: Evidence) -> None:
 
 
 def _drift(sound: Sound, evidence: Evidence) -> None:
-    """How far the pads move along one another while they hold, and how late one arm is."""
+    """Measure the relative motion of the pads while they hold, and the delay between the arms."""
     beside: list[Array] = []
     turned: list[Array] = []
     delays = []
@@ -391,7 +391,8 @@ def _drift(sound: Sound, evidence: Evidence) -> None:
 
 
 def calibrated_file(source: Path, evidence: Evidence, output: Path) -> str:
-    """The text of a workcell file with what runs show, comments kept, evidence as comments.
+    """Write the text of a workcell file with calibrated values, comments kept, evidence as
+    comments.
 
     Args:
         source: the workcell file.

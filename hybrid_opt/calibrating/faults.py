@@ -1,4 +1,4 @@
-"""What is wrong with a recorded run, each fault by its name."""
+"""Faults of a recorded run, each with its name."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ standard error."""
 
 @dataclass(frozen=True)
 class Fault:
-    """Something that is wrong.
+    """A fault of a recording.
 
     Attributes:
         run: its name; '' for all.
@@ -75,7 +75,7 @@ class Fault:
 
 
 def recording_faults(workcell: Workcell, run: Run, places: Places) -> list[Fault]:
-    """What a run shows by itself.
+    """Find the faults of a single run.
 
     Args:
         places: its pads, the sensors' offsets taken out.
@@ -95,7 +95,7 @@ def recording_faults(workcell: Workcell, run: Run, places: Places) -> list[Fault
 
 
 def _tare_faults(run: Run, places: Places) -> list[Fault]:
-    """Tares at which nothing was recorded, or an arm touches something."""
+    """Find tares at which nothing was recorded, or an arm touches something."""
     found = []
     recorded = [instant for instant in run.labels.tare if run.around(instant).any()]
     if not recorded:
@@ -145,7 +145,7 @@ def _frame_faults(run: Run, places: Places) -> list[Fault]:
 
 
 def _held(run: Run) -> Array:
-    """(n,) which samples lie in a hold."""
+    """Return (n,) True for samples within a hold."""
     found = np.zeros(len(run.time), dtype=bool)
     for span in run.labels.held:
         found |= run.within(*span)
@@ -167,7 +167,8 @@ def _unit_faults(workcell: Workcell, run: Run, places: Places) -> list[Fault]:
 
 
 def _force_units(run: Run, places: Places, held: Array) -> list[str]:
-    """Forces, of whatever frame, against what is commanded and against those of the other arm."""
+    """Compare forces, independent of frame, with the commanded ones and with those of the other
+    arm."""
     force = np.median(np.linalg.norm(places.wrench[held, :, :3], axis=2), axis=0)
     commands = np.isfinite(run.commanded).any(axis=0)
     asked = np.nanmedian(np.where(commands, run.commanded[held], 0.0), axis=0)
@@ -188,7 +189,7 @@ def _force_units(run: Run, places: Places, held: Array) -> list[str]:
 
 
 def _moment_units(workcell: Workcell, places: Places, held: Array) -> list[str]:
-    """Moments about the pads against what their patches can bear."""
+    """Compare moments about the pads with the capacity of their patches."""
     normal = np.abs(np.median(places.normal[held], axis=0)).mean()
     for i, contact in enumerate(workcell.contacts):
         moment = float(np.median(np.linalg.norm(places.wrench[held, i, 3:], axis=1)))
@@ -199,7 +200,7 @@ def _moment_units(workcell: Workcell, places: Places, held: Array) -> list[str]:
 
 
 def _dropouts(run: Run) -> list[Fault]:
-    """Spans without anything new, and holds that are not in the recording."""
+    """Find spans without new data, and holds that are not in the recording."""
     found = [
         f"nothing new for {end - begin:.2f} s from {begin:.2f} s on" for begin, end in run.lost
     ]
@@ -229,7 +230,7 @@ def _range_faults(run: Run) -> list[Fault]:
 
 
 def _pad_faults(workcell: Workcell, run: Run, places: Places) -> list[Fault]:
-    """Pads that do not stand as they hold the box, and a squeeze that vanishes."""
+    """Find pads that are not where they hold the box, and a squeeze that vanishes."""
     found = []
     nominal = inverse(workcell.contacts[0].T_box_pad) @ workcell.contacts[1].T_box_pad
     room = sum(contact.patch_radius for contact in workcell.contacts)
@@ -265,7 +266,7 @@ def _pad_faults(workcell: Workcell, run: Run, places: Places) -> list[Fault]:
 
 
 def vanished(normal: Array) -> Array:
-    """(n,) at which samples of a hold the lesser of both normal forces (n, 2) has vanished."""
+    """Return (n,) True where the lesser of both normal forces (n, 2) vanishes during a hold."""
     squeeze = normal.min(axis=1)
     usual = np.quantile(squeeze, 0.75) if len(squeeze) else 0.0
     return np.asarray((squeeze < VANISHED * usual) & (usual > 0.0))
@@ -283,7 +284,7 @@ def _clock_faults(run: Run, places: Places) -> list[Fault]:
 
 
 def load_faults(holds: list[Hold], load: Load, moments: bool) -> list[Fault]:
-    """What the balance of all holds shows: other units, swapped arms, or what nobody knows.
+    """Find faults in the balance of all holds: other units, swapped arms, or an unknown cause.
 
     Args:
         load: what they show together.

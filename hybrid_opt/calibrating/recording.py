@@ -1,5 +1,4 @@
-"""A recorded run of a cell: joints, what the sensors at both wrists felt, what was commanded, and
-what a person says of it in a side file.
+"""A recorded run of a cell: joints, wrenches at both wrists, commands, and a side file with labels.
 
 RUN.toml lies beside RUN.csv, RUN.mcap or the folder RUN; docs/how-to/calibration.md explains its
 keys. Each arm may have a file of its own; what the second recorded is taken at the times of the
@@ -48,7 +47,7 @@ Spans = tuple[tuple[float, float], ...]
 
 @dataclass(frozen=True)
 class Labels:
-    """What a person says of a run, times on its clock [s].
+    """Labels of a run in its side file, times on its clock [s].
 
     Attributes:
         mass: of the box, weighed [kg]; None where it was not.
@@ -100,11 +99,11 @@ class Run:
         return bool(np.isfinite(self.wrench[:, :, 3:]).all())
 
     def within(self, begin: float, end: float) -> Array:
-        """(n,) which samples lie between two instants."""
+        """Return (n,) True for samples between two instants."""
         return np.asarray((self.time >= begin) & (self.time <= end))
 
     def around(self, instant: float) -> Array:
-        """(n,) which samples are near an instant at which both arms stand still."""
+        """Return (n,) True for samples near an instant at which both arms stand still."""
         return self.within(instant - TARE_TIME / 2.0, instant + TARE_TIME / 2.0)
 
 
@@ -117,7 +116,7 @@ GAP, LONG_GAP = 10.0, 0.2
 
 @dataclass(frozen=True)
 class ArmLog:
-    """What one arm recorded, at m samples.
+    """Recording of one arm, at m samples.
 
     Attributes:
         time: (m,) ascending [s].
@@ -135,7 +134,7 @@ class ArmLog:
 
 
 def lost_spans(time: Array, values: Array) -> Spans:
-    """Spans without samples, or with the very same values (m, k) in all of them."""
+    """Return the spans without samples, or with identical values (m, k) in all of them."""
     steps = np.diff(time)
     long = np.flatnonzero(steps > max(GAP * float(np.median(steps)), LONG_GAP))
     same = (np.diff(values, axis=0) == 0.0).all(axis=1)
@@ -152,7 +151,8 @@ def together(
     frame: str,
     largest: Array | None = None,
 ) -> Run:
-    """A run of what both arms recorded; what the second did is taken at the times of the first.
+    """Merge the recordings of both arms into a run, the second interpolated at the times of the
+    first.
 
     Args:
         name: of its file.
@@ -189,7 +189,7 @@ def together(
 
 
 def read_run(path: Path, workcell: Workcell) -> Run:
-    """A run and its side file, the same name with the ending `.toml`.
+    """Read a run and its side file, the same name with the ending `.toml`.
 
     Raises:
         ResultsError: the recording cannot be read, or lacks a column.
@@ -224,7 +224,7 @@ def read_run(path: Path, workcell: Workcell) -> Run:
 
 
 def _read_arm(table: TableReader, path: Path, workcell: Workcell, arm: int) -> ArmLog:
-    """What one arm recorded, by the columns that the side file names."""
+    """Read one arm's recording, by the columns that the side file names."""
     file = path.parent / table.text("file") if table.has("file") else path
     names = list(arm_model(workcell.robots[arm]).names)[1:]
     if is_bag(file):
@@ -266,7 +266,7 @@ def _read_arm(table: TableReader, path: Path, workcell: Workcell, arm: int) -> A
 
 
 def _read_bag(table: TableReader, file: Path, names: list[str]) -> ArmLog:
-    """What one arm recorded in ROS 2, at the times of its joint states."""
+    """Read one arm's recording in ROS 2, at the times of its joint states."""
     if table.has("joints"):
         value = table.raw("joints")
         if not isinstance(value, list) or len(value) != len(names):
@@ -298,7 +298,8 @@ def _read_bag(table: TableReader, file: Path, names: list[str]) -> ArmLog:
 
 
 def _csv_columns(path: Path) -> dict[str, Array]:
-    """Columns by name; commas, semicolons or blanks between them, what is empty is not finite."""
+    """Read columns by name, separated by commas, semicolons or blanks; empty values are not
+    finite."""
     try:
         text = safe_io.text(read_bytes(path))
         dialect = csv.Sniffer().sniff(text.partition("\n")[0], ",; \t")
@@ -316,7 +317,7 @@ def _csv_columns(path: Path) -> dict[str, Array]:
 
 @dataclass(frozen=True)
 class Places:
-    """Where both pads are in a run, and what acts on them.
+    """Poses of both pads in a run, and the wrenches on them.
 
     Attributes:
         pads: (n, 2, 4, 4), the pads in the world.
@@ -335,7 +336,7 @@ class Places:
 
 
 def places_of(workcell: Workcell, run: Run) -> Places:
-    """A run in the frames of the pads."""
+    """Convert a run to the frames of the pads."""
     pads, boxes, wrenches = [], [], []
     for i, (robot, contact) in enumerate(zip(workcell.robots, workcell.contacts, strict=True)):
         T_world_pad = pad_places(workcell, i, run.joints[i])
@@ -361,7 +362,7 @@ def places_of(workcell: Workcell, run: Run) -> Places:
 
 
 def tared(run: Run, places: Places) -> tuple[Places, Array]:
-    """A run without its sensors' offsets, each as at the tare before.
+    """Subtract the sensors' offsets from a run, each as at the tare before.
 
     Returns:
         the readings without them, and (k, 2, 6) the offsets of the k tares that were recorded.
@@ -381,12 +382,12 @@ Messages = list[tuple[float, Any]]
 
 
 def is_bag(path: Path) -> bool:
-    """Whether a path is a recording of ROS 2, by its name."""
+    """Return True if a path is a recording of ROS 2, by its name."""
     return path.is_dir() or path.suffix.lower() in ENDINGS
 
 
 def read_topics(path: Path, topics: Collection[str]) -> dict[str, Messages]:
-    """The messages of some topics.
+    """Read the messages of some topics.
 
     Raises:
         ResultsError: it cannot be read, lacks a topic, or rosbags is not installed.
@@ -419,7 +420,7 @@ def read_topics(path: Path, topics: Collection[str]) -> dict[str, Messages]:
 
 
 def joint_series(messages: Messages, names: list[str], path: Path) -> tuple[Array, Array]:
-    """Times (n,) [s] and positions (n, joints) of JointState messages that have all joints.
+    """Return times (n,) [s] and positions (n, joints) of JointState messages that have all joints.
 
     Raises:
         ResultsError: none has.
@@ -439,7 +440,7 @@ def joint_series(messages: Messages, names: list[str], path: Path) -> tuple[Arra
 
 
 def wrench_series(messages: Messages) -> tuple[Array, Array]:
-    """Times (n,) [s] and wrenches (n, 6) of WrenchStamped or Wrench messages [N, N m]."""
+    """Return times (n,) [s] and wrenches (n, 6) of WrenchStamped or Wrench messages [N, N m]."""
     rows = []
     for _, message in messages:
         wrench: Any = getattr(message, "wrench", message)
@@ -449,7 +450,8 @@ def wrench_series(messages: Messages) -> tuple[Array, Array]:
 
 
 def force_series(messages: Messages) -> tuple[Array, Array]:
-    """Times (n,) [s] and normal forces (n,) [N]: a number, or a wrench along z, either way."""
+    """Return times (n,) [s] and normal forces (n,) [N] from numbers, or from wrenches along z of
+    either sign."""
     if messages and hasattr(messages[0][1], "data"):
         return (
             np.array([time for time, _ in messages]),

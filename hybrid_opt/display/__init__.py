@@ -1,4 +1,4 @@
-"""How a carry, a front and a timing look in a terminal and in a notebook.
+"""Display of carries, fronts and timings in a terminal and in a notebook.
 
 objects, table: texts and HTML tables, plots as inline pictures. scene: the cell in three
 dimensions, for notebooks and for the report's page. Only the plots need Matplotlib.

@@ -1,4 +1,4 @@
-"""Objects as text, and in a notebook as their figures beside a picture.
+"""Objects as text, and in a notebook as their figures next to a picture.
 
 A carry stands beside its normal forces, a front's points before the search's candidates, a timing's
 use of its limits beside the carry under it.
@@ -37,12 +37,12 @@ ONE_WAY = 1e-6
 
 
 def text_of(shown: object) -> str:
-    """What an object prints."""
+    """Format an object for print."""
     return "\n".join([heading_of(shown), *lines(figures_of(shown))])
 
 
 def html_of(shown: object) -> str:
-    """What a notebook shows of an object: its figures, or else its own text, and its picture."""
+    """Format an object for a notebook: its figures, or else its own text, and its picture."""
     if isinstance(shown, Job | Recommendation):
         return f"<div><pre>{html.escape(repr(shown))}</pre>{picture_of(shown)}</div>"
     heading = html.escape(heading_of(shown))
@@ -51,19 +51,19 @@ def html_of(shown: object) -> str:
 
 @singledispatch
 def heading_of(shown: object) -> str:
-    """An object in one line."""
+    """Describe an object in one line."""
     raise NotImplementedError(f"{type(shown).__name__} has no display")
 
 
 @singledispatch
 def figures_of(shown: object) -> dict[str, str]:
-    """Its figures by name, with units."""
+    """Return its figures by name, with units."""
     raise NotImplementedError(f"{type(shown).__name__} has no display")
 
 
 @singledispatch
 def picture_of(shown: object) -> str:
-    """A picture of it as HTML, '' for none."""
+    """Draw a picture of it as HTML, '' for none."""
     raise NotImplementedError(f"{type(shown).__name__} has no display")
 
 
@@ -107,14 +107,14 @@ def _(carry: Carry) -> str:
 
 @picture_of.register
 def _(job: Job) -> str:
-    """The commanded normal forces of the whole job."""
+    """Draw the commanded normal forces of the whole job."""
     time = np.concatenate([phase.begin + phase.motion.time for phase in job.phases])
     force = np.concatenate([phase.force.normal for phase in job.phases])
     return _forces(job.workcell, time, force, "commanded normal force [N]")
 
 
 def _forces(workcell: Workcell, time: Array, force: Array, title: str, *more: Series) -> str:
-    """Forces (n, 2) of both arms over time (n,), and more beside them."""
+    """Plot forces (n, 2) of both arms over time (n,), and more series."""
     series = [
         Series(robot.name, np.column_stack([time, force[:, i]]), ARMS[i])
         for i, robot in enumerate(workcell.robots)
@@ -158,7 +158,7 @@ def _(front: Front) -> dict[str, str]:
 
 @picture_of.register
 def _(front: Front) -> str:
-    """Its points and candidates by their first two objectives."""
+    """Plot its points and candidates by their first two objectives."""
     if len(front) == 0 or front.objectives.shape[1] < 2:
         return ""
     series = []
@@ -178,7 +178,7 @@ def _(front: Front) -> str:
 
 
 def _nearest(cloud: Array, points: Array) -> Array:
-    """A front of one point gets some of the candidates around it to stand before."""
+    """Return the candidates around a front's only point, to be drawn behind it."""
     if len(points) > 1 or len(cloud) == 0:
         return np.empty((0, 2))
     distance = np.abs(cloud - points[0]).max(axis=1)
@@ -192,7 +192,7 @@ def _(timing: Timing) -> str:
 
 @figures_of.register
 def _(timing: Timing) -> dict[str, str]:
-    """How far each limit is used and where, the most used first."""
+    """Format the use of each limit and its location, the most used first."""
     ranked = sorted(timing.use.items(), key=lambda item: -item[1].ratio)
     return {
         name: f"{100.0 * excess.ratio:5.1f} %  {_where(excess.place.robot, excess.place.joint)}"
@@ -217,7 +217,7 @@ def _(found: Sensitivities) -> str:
 
 @figures_of.register
 def _(found: Sensitivities) -> dict[str, str]:
-    """What a usual change of each number changes."""
+    """Format the effect of a usual change of each number."""
     return {f"{row.key} = {row.value:g} {row.unit}".rstrip(): _changes(row) for row in found.rows}
 
 
@@ -280,7 +280,7 @@ class Series:
 
 
 def plot(series: list[Series], x_title: str, y_title: str, focus: Array) -> str:
-    """An SVG picture of the series; those outside of the axes are clipped.
+    """Draw an SVG picture of the series; those outside of the axes are clipped.
 
     Args:
         focus: (n, 2) points that the axes have to hold.

@@ -1,5 +1,4 @@
-"""The cell in three dimensions: what `scene.js` draws of it in a browser, as a page that plays a
-carry."""
+"""The cell in three dimensions: data for `scene.js` in a browser, and a page that plays a carry."""
 
 from __future__ import annotations
 
@@ -27,7 +26,7 @@ from symbolic.geometry.pairs import CellGeometry, build_geometry
 def scene_data(
     geometry: CellGeometry, carry: Carry, marked: Collection[str] = ()
 ) -> dict[str, Any]:
-    """Shapes, joints and a good place to look from, as JSON values.
+    """Return shapes, joints and a good viewpoint, as JSON values.
 
     Args:
         marked: names of bodies that are shown in red.
@@ -66,12 +65,12 @@ THREE, PLOTLY = "vendor/three.min.js", "vendor/plotly-basic.min.js"
 
 
 def asset(name: str) -> str:
-    """The text of a script or page that ships with this room."""
+    """Read the text of a script or page that ships with this room."""
     return (files("hybrid_opt.display") / name).read_text("utf-8")
 
 
 def embedded_json(document: Any) -> str:
-    """JSON for a script element: no text in it can end the element or open another."""
+    """Write JSON for a script element: no text in it can end the element or open another."""
     text = json.dumps(document, allow_nan=False, separators=(",", ":"))
     for letter in "<>&\u2028\u2029":
         text = text.replace(letter, f"\\u{ord(letter):04x}")
@@ -79,7 +78,7 @@ def embedded_json(document: Any) -> str:
 
 
 def packed(values: NDArray[Any], kind: type[np.generic]) -> str:
-    """Little-endian numbers in base64."""
+    """Encode little-endian numbers in base64."""
     return base64.b64encode(
         np.ascontiguousarray(values, dtype=np.dtype(kind).newbyteorder("<")).tobytes()
     ).decode("ascii")
@@ -103,7 +102,7 @@ MAX_SAMPLES = 200
 
 @dataclass(frozen=True)
 class Look:
-    """A place of a carry worth looking at.
+    """A sample of a carry to look at first.
 
     Attributes:
         sample: number of the sample.
@@ -131,7 +130,7 @@ class CarryView:
     look: Look | None = None
 
     def page(self) -> str:
-        """The page's text: no network, nothing but its own scripts."""
+        """Write the page's text: no network, nothing but its own scripts."""
         carry = self.carry
         rows = np.unique(np.linspace(0, len(carry) - 1, min(len(carry), MAX_SAMPLES)).astype(int))
         columns = [carry.time[:, None] - carry.time[0], carry.pose, carry.q]

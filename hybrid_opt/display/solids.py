@@ -1,4 +1,4 @@
-"""The bodies of a cell as triangle meshes, and where they are along a carry.
+"""The bodies of a cell as triangle meshes, and their poses along a carry.
 
 Meshes of simple shapes are made here: trimesh, which reads those of files, takes longer to start
 than a picture takes.
@@ -49,7 +49,7 @@ class Solid:
 
 
 def cell_solids(geometry: CellGeometry) -> tuple[Solid, ...]:
-    """Every collision body of a cell as triangles."""
+    """Convert every collision body of a cell to triangles."""
     return tuple(_triangles(CacheKey(body, known=body.content)) for body in geometry.bodies)
 
 
@@ -73,7 +73,7 @@ def _triangles(seen: CacheKey) -> Solid:
 
 
 def _mesh(shape: ConvexShape) -> tuple[Array, NDArray[np.int64]]:
-    """Vertices (n, 3) in the shape's own frame and faces (m, 3), outward."""
+    """Compute vertices (n, 3) in the shape's own frame and faces (m, 3), outward."""
     match shape:
         case Box():
             return box_corners(shape.size), _BOX_FACES
@@ -103,8 +103,8 @@ _BOX_FACES = np.array(
 
 
 def _revolved(across: Array, along: Array) -> tuple[Array, NDArray[np.int64]]:
-    """The mesh of a curve turned about z, from its lower to its upper end, both on the axis: its
-    distances (n,) from z and places (n,) along it [m]."""
+    """Compute the mesh of a curve turned about z, from its lower to its upper end, both on the
+    axis: its distances (n,) from z and places (n,) along it [m]."""
     rings, angles = len(across) - 2, np.linspace(0.0, 2.0 * np.pi, SECTIONS + 1)[:-1]
     circle = np.column_stack([np.cos(angles), np.sin(angles), np.ones(SECTIONS)])
     scales = np.column_stack([across, across, along])[1:-1]
@@ -123,7 +123,7 @@ def _revolved(across: Array, along: Array) -> tuple[Array, NDArray[np.int64]]:
 
 
 def joint_placements(arm: ArmGeometry, q: Array) -> Array:
-    """(n, n_joints, 4, 4) of an arm's joint frames in the world at joints q (n, n_joints)."""
+    """Compute an arm's joint frames (n, n_joints, 4, 4) in the world at joints q (n, n_joints)."""
     placed = np.empty((*q.shape, 4, 4))
     T = np.broadcast_to(arm.T_world_root, (len(q), 4, 4))
     for j in range(q.shape[1]):
@@ -139,7 +139,8 @@ def joint_placements(arm: ArmGeometry, q: Array) -> Array:
 
 
 def frame_placements(geometry: CellGeometry, pose: Array, q: Array) -> dict[Frame, Array]:
-    """(n, 4, 4) of every frame in the world along n samples: pose (n, 6), q (n, all joints)."""
+    """Compute the pose (n, 4, 4) of every frame in the world along n samples: pose (n, 6), q (n,
+    all joints)."""
     placed = {
         Frame("world"): np.broadcast_to(np.eye(4), (len(pose), 4, 4)),
         Frame("box"): box_placement(geometry.workcell.task.orientation, pose),
@@ -156,7 +157,8 @@ def frame_placements(geometry: CellGeometry, pose: Array, q: Array) -> dict[Fram
 def extent_points(
     geometry: CellGeometry, solids: tuple[Solid, ...], pose: Array, q: Array
 ) -> Array:
-    """(k, 3) corners of every solid's own bounding box at n samples, the ground left out.
+    """Compute the corners (k, 3) of every solid's own bounding box at n samples, the ground left
+    out.
 
     They frame what a picture has to show: pose (n, 6), q (n, all joints).
     """
@@ -178,6 +180,6 @@ _VIEWED = 12
 
 
 def motion_points(geometry: CellGeometry, pose: Array, q: Array) -> Array:
-    """(k, 3) what a picture of a whole motion has to show, see `extent_points`."""
+    """Compute the points (k, 3) that frame a picture of a whole motion, see `extent_points`."""
     every = slice(None, None, max(1, len(pose) // _VIEWED))
     return extent_points(geometry, cell_solids(geometry), pose[every], q[every])

@@ -1,4 +1,4 @@
-"""Tables of texts in every form, and how a quantity reads in all of them."""
+"""Tables of texts in every form, and the format of quantities in all of them."""
 
 from __future__ import annotations
 
@@ -22,20 +22,20 @@ WIDTH = 100
 
 
 def number(value: float | None, digits: int = 2, scale: float = 1.0) -> str:
-    """A figure in print; `NOTHING` where there is none."""
+    """Format a figure; `NOTHING` for None."""
     if value is None or not math.isfinite(value):
         return NOTHING
     return f"{value * scale:z.{digits}f}"
 
 
 def counted(count: int, noun: str) -> str:
-    """A number of things, whose plural ends in s."""
+    """Format a number of things; the plural of the noun ends in s."""
     return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
 
 
 @dataclass(frozen=True)
 class Quantity:
-    """How a quantity reads wherever it is shown.
+    """Format of a quantity in tables, figures and pages.
 
     Attributes:
         name, unit: of its column; a pure number has the unit ''.
@@ -49,20 +49,21 @@ class Quantity:
     scale: float = 1.0
 
     def heading(self, whose: str = "") -> str:
-        """Heading of a column: the name, whose it is, and the unit."""
+        """Format the heading of a column: the name, its owner, and the unit."""
         named = f"{self.name}, {whose}" if whose else self.name
         return f"{named} [{self.unit}]" if self.unit else named
 
     def __call__(self, value: float | None) -> str:
-        """A value in print."""
+        """Format a value."""
         return number(value, self.digits, self.scale)
 
     def mean(self, mean: float | None, std: float | None) -> str:
-        """Mean and standard deviation."""
+        """Format mean and standard deviation."""
         return f"{self(mean)} ± {self(std)}"
 
     def spread(self, middle: float, low: float, high: float) -> str:
-        """A value in the middle and the range around it, the value alone where they are equal."""
+        """Format a value in the middle and the range around it, the value alone if they are
+        equal."""
         if low == high or not math.isfinite(middle):
             return self(middle)
         return f"{self(middle)} [{self(low)}, {self(high)}]"
@@ -87,29 +88,29 @@ class Table:
 
     @property
     def words(self) -> tuple[bool, ...]:
-        """Whether each column holds words, which begin at the left; others hold figures."""
+        """Per column, True if it holds words, which are flush left; others hold figures."""
         columns = zip(*self.rows, strict=True) if self.rows else [()] * len(self.header)
         return tuple(k == 0 or not any(map(_is_figure, column)) for k, column in enumerate(columns))
 
     def text(self) -> str:
-        """For a terminal."""
+        """Format for a terminal."""
         left = [k for k, word in enumerate(self.words) if word]
         parts = [self.title, text_table([self.header, *self.rows], left)]
         return "\n".join(parts + ([textwrap.fill(self.note, WIDTH)] if self.note else []))
 
     def csv(self) -> str:
-        """Comma-separated values, without title and note."""
+        """Format as comma-separated values, without title and note."""
         return csv_text(self.header, self.rows)
 
     def markdown(self) -> str:
-        """A Markdown table with title and note."""
+        """Format as a Markdown table with title and note."""
         rule = tuple("---" if word else "---:" for word in self.words)
         lines = [self.header, rule, *self.rows]
         body = "\n".join("| " + " | ".join(map(_markdown, row)) + " |" for row in lines)
         return f"**{_markdown(self.title)}**\n\n{body}\n\n{_markdown(self.note)}\n"
 
     def latex(self) -> str:
-        """A LaTeX table with booktabs rules."""
+        """Format as a LaTeX table with booktabs rules."""
         columns = "".join("l" if word else "r" for word in self.words)
         head, *rows = (" & ".join(map(_latex, row)) + r" \\" for row in (self.header, *self.rows))
         lines = [
@@ -129,7 +130,7 @@ class Table:
         return "\n".join(lines)
 
     def html(self) -> str:
-        """An HTML table; every text is escaped."""
+        """Format as an HTML table; every text is escaped."""
         head, *body = (
             "".join(map(_html_cell, [kind] * len(row), row, self.words))
             for kind, row in (("th", self.header), *(("td", row) for row in self.rows))
@@ -142,7 +143,7 @@ class Table:
 
 
 def text_table(rows: Sequence[Sequence[str]], left: Collection[int] = (0,)) -> str:
-    """Rows in columns with a line below the first one, the head.
+    """Format rows in columns with a line below the first one, the head.
 
     Args:
         rows: cells; the rows are equally long.
@@ -160,13 +161,13 @@ def text_table(rows: Sequence[Sequence[str]], left: Collection[int] = (0,)) -> s
 
 
 def lines(figures: Mapping[str, str]) -> list[str]:
-    """One line per figure, values aligned."""
+    """Format one line per figure, values aligned."""
     width = max((len(name) for name in figures), default=0)
     return [f"  {name:<{width}}  {value}" for name, value in figures.items()]
 
 
 def figures_html(figures: Mapping[str, str]) -> str:
-    """An HTML table of two columns."""
+    """Format an HTML table of two columns."""
     rows = "".join(
         f'<tr><th style="text-align:left">{html.escape(name)}</th>'
         f'<td style="text-align:left">{html.escape(value)}</td></tr>'
@@ -176,7 +177,7 @@ def figures_html(figures: Mapping[str, str]) -> str:
 
 
 def _is_figure(cell: str) -> bool:
-    """Whether a cell is a figure, with what belongs to it."""
+    """Return True if a cell is a figure, with its unit or spread."""
     return len(cell) <= LONG and re.match(r"[-+\N{MINUS SIGN}]?\.?\d", cell) is not None
 
 

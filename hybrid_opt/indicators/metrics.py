@@ -1,4 +1,4 @@
-"""Indicators of fronts and of all the points that a search evaluated.
+"""Indicators of fronts and of all points that a search evaluated.
 
 All objectives are minimised. A front is an (n, n_obj) array of objectives. Hypervolume, IGD and
 spacing compare objectives of different units, so normalise first, and with the same bounds for
@@ -50,7 +50,7 @@ def normalise(objectives: ArrayLike, ideal: ArrayLike, nadir: ArrayLike) -> Arra
 
 
 def non_dominated(objectives: ArrayLike, feasible: ArrayLike | None = None) -> Mask:
-    """(n,) mask of the feasible points that no feasible point dominates.
+    """Return the mask (n,) of the feasible points that no feasible point dominates.
 
     The first of equal points is kept. A point with a NaN or infinite objective is never in.
 
@@ -72,25 +72,25 @@ def non_dominated(objectives: ArrayLike, feasible: ArrayLike | None = None) -> M
 
 
 def front_rows(objectives: ArrayLike, feasible: ArrayLike | None = None) -> NDArray[np.intp]:
-    """(k,) rows of the non-dominated feasible points, by increasing objectives."""
+    """Return the rows (k,) of the non-dominated feasible points, by increasing objectives."""
     values = np.asarray(objectives, dtype=np.float64)
     rows = np.flatnonzero(non_dominated(values, feasible))
     return rows[np.lexsort(values[rows].T[::-1])]
 
 
 def reference_point(n_obj: int) -> tuple[float, ...]:
-    """The paper's reference point of the hypervolume, for any number of objectives."""
+    """Return the paper's reference point of the hypervolume, for any number of objectives."""
     return (REFERENCE_POINT[0],) * n_obj
 
 
 def front_of(objectives: ArrayLike, feasible: ArrayLike | None = None) -> Array:
-    """(k, n_obj) the non-dominated feasible objectives, by increasing first objective."""
+    """Return the non-dominated feasible objectives (k, n_obj), by increasing first objective."""
     values = np.asarray(objectives, dtype=np.float64)
     return np.asarray(values[front_rows(values, feasible)])
 
 
 def hypervolume(front: ArrayLike, reference: ArrayLike = REFERENCE_POINT) -> float:
-    """Volume that a front dominates up to the reference point; 0 for an empty front.
+    """Compute the volume that a front dominates up to the reference point; 0 for an empty front.
 
     Source: Zitzler and Thiele 1999; computed by moocore (Fonseca et al. 2006).
     """
@@ -103,8 +103,8 @@ def hypervolume(front: ArrayLike, reference: ArrayLike = REFERENCE_POINT) -> flo
 
 
 def igd(front: ArrayLike, reference_front: ArrayLike) -> float:
-    """Inverted generational distance: mean Euclidean distance from each reference point to the
-    nearest point of the front; infinite for an empty front.
+    """Compute the inverted generational distance: mean Euclidean distance from each reference point
+    to the nearest point of the front; infinite for an empty front.
 
     Source: Coello Coello and Reyes Sierra 2004, with the mean of distances (not the root of
     their squared sum).
@@ -113,7 +113,7 @@ def igd(front: ArrayLike, reference_front: ArrayLike) -> float:
 
 
 def igd_plus(front: ArrayLike, reference_front: ArrayLike) -> float:
-    """IGD with only the components in which the front is worse than the reference; weakly
+    """Compute IGD with only the components in which the front is worse than the reference; weakly
     Pareto compliant; infinite for an empty front.
 
     Source: Ishibuchi, Masuda, Tanigaki and Nojima 2015.
@@ -131,8 +131,8 @@ def _mean_distance(of_moocore: str, front: ArrayLike, reference_front: ArrayLike
 
 
 def spacing(front: ArrayLike) -> float:
-    """Sample standard deviation (divisor n - 1) of each point's L1 distance to its nearest
-    neighbour; 0 is even.
+    """Compute the sample standard deviation (divisor n - 1) of each point's L1 distance to its
+    nearest neighbour; 0 is even.
 
     NaN for fewer than three points: one has no neighbour, and two are always evenly spaced.
     Says nothing about convergence or extent, so never use it alone.
@@ -148,18 +148,18 @@ def spacing(front: ArrayLike) -> float:
 
 
 def feasible_count(feasible: ArrayLike) -> int:
-    """Number of feasible points."""
+    """Count the feasible points."""
     return int(np.count_nonzero(np.asarray(feasible, dtype=bool)))
 
 
 def feasible_share(feasible: ArrayLike) -> float:
-    """Feasible points as a fraction of all, in [0, 1]; NaN without points."""
+    """Compute the feasible points as a fraction of all, in [0, 1]; NaN without points."""
     mask = np.asarray(feasible, dtype=bool)
     return feasible_count(mask) / len(mask) if len(mask) > 0 else float("nan")
 
 
 def best_so_far(objectives: ArrayLike, feasible: ArrayLike) -> Array:
-    """(n, n_obj) least feasible value of each objective up to each evaluation.
+    """Compute the least feasible value (n, n_obj) of each objective up to each evaluation.
 
     NaN before the first feasible point. The objectives' minima may belong to different points.
     """
@@ -170,7 +170,7 @@ def best_so_far(objectives: ArrayLike, feasible: ArrayLike) -> Array:
 
 
 def excess_above_static(objectives: ArrayLike, static: ArrayLike) -> Array:
-    """How far peak forces lie above the force of holding the payload still, in percent.
+    """Compute the excess of peak forces over those of the static hold, in percent.
 
     Args:
         objectives: (..., n_obj) normalised peak normal forces.
@@ -201,7 +201,7 @@ class BindingBound:
 
 
 def binding_bounds(task: Task, x: Array) -> tuple[BindingBound, ...]:
-    """The bounds that decision vectors (k, n_var) lie on, in the order of the variables.
+    """Return the bounds that decision vectors (k, n_var) lie on, in the order of the variables.
 
     A variable whose bounds are equal has no range and is left out. So are the bounds of the force
     limit: they are where a front ends, the force at rest and the robots' own limit.

@@ -113,7 +113,7 @@ def rank_test(
 
 
 def magnitude_of(a12: float) -> Magnitude:
-    """Vargha and Delaney's (2000) words for an effect size."""
+    """Return Vargha and Delaney's (2000) word for an effect size."""
     effect = abs(a12 - 0.5)
     # The limits 0.56, 0.64, 0.71 are two-decimal figures; the margin keeps them inclusive.
     for limit, word in ((0.21, "large"), (0.14, "medium"), (0.06, "small")):
@@ -123,7 +123,7 @@ def magnitude_of(a12: float) -> Magnitude:
 
 
 def holm(p_values: Sequence[float]) -> tuple[float, ...]:
-    """Holm's (1979) step-down correction for several tests; NaN stay and do not count.
+    """Apply Holm's (1979) step-down correction for several tests; NaN stay and do not count.
 
     Returns:
         Adjusted p-values in the given order.
@@ -138,7 +138,7 @@ def holm(p_values: Sequence[float]) -> tuple[float, ...]:
 
 
 def corrected(tests: Sequence[RankTest]) -> tuple[RankTest, ...]:
-    """The tests of one family with Holm's correction in `p_holm`."""
+    """Return the tests of one family with Holm's correction in `p_holm`."""
     adjusted = holm([test.p for test in tests])
     return tuple(replace(test, p_holm=p_holm) for test, p_holm in zip(tests, adjusted, strict=True))
 
@@ -155,7 +155,7 @@ def _ranked(values: ArrayLike) -> Array:
 
 
 def _exact_with_ties(ranks: Array, count: int) -> tuple[float, float]:
-    """U and two-sided p of the first `count` midranks, over all ways to choose them.
+    """Compute U and two-sided p of the first `count` midranks, over all ways to choose them.
 
     Counts the subsets of each size by their sum of doubled (hence whole) midranks.
     """
@@ -176,7 +176,8 @@ def _exact_with_ties(ranks: Array, count: int) -> tuple[float, float]:
 def attainment_surfaces(
     fronts: Sequence[ArrayLike], percentiles: Sequence[float] = (25.0, 50.0, 75.0)
 ) -> dict[float, Array]:
-    """Attainment surfaces of replicas' fronts by percentile: goals that this percentage attains.
+    """Compute attainment surfaces of replicas' fronts by percentile: goals that this percentage
+    attains.
 
     Each is given by its corners (k, n_obj), by increasing first objective; it is empty where fewer
     fronts than that hold any point. A surface belongs to the least number of fronts that makes up

@@ -1,4 +1,5 @@
-"""How stiffness changes forces: arms that track positions, and arms that do not start together.
+"""Effects of stiffness on forces: arms that track positions, and arms that start at different
+times.
 
 An arm that tracks positions presses by aiming into the box; its stiffness k at the pad turns the
 penetration into force. Both arms hold the box in series, so that a relative displacement d of the
@@ -58,7 +59,7 @@ class PositionControl:
 
     @property
     def verdict(self) -> str:
-        """Whether position control can do it, in words."""
+        """Feasibility of position control, in words."""
         if self.share <= TRACKED:
             return "yes"
         if self.force_error <= self.margin:
@@ -90,12 +91,12 @@ class Skew:
 
     @property
     def survived(self) -> bool:
-        """Whether friction still holds the box everywhere."""
+        """True if friction still holds the box everywhere."""
         return self.margin >= 0.0
 
 
 def position_control(job: Job, stiffness: float) -> PositionControl:
-    """A job's forces where arms of a stiffness [N/m] track positions.
+    """Compute a job's forces if arms of a stiffness [N/m] track positions.
 
     Raises:
         SettingsError: the stiffness is not positive.
@@ -109,12 +110,13 @@ def position_control(job: Job, stiffness: float) -> PositionControl:
 
 
 def force_margin(job: Job) -> float:
-    """Least commanded beyond least necessary normal force while the box is held [N]."""
+    """Compute the least excess of the commanded over the necessary normal force while the box is
+    held [N]."""
     return min(float((p.force.normal - p.force.least).min()) for p in job.held)
 
 
 def skewed(job: Job, delay: float, stiffness: float) -> Skew:
-    """Effect of either arm being late while the box is held: the worse of both.
+    """Compute the effect of a delay of either arm while the box is held: the worse of both.
 
     Pads and box as springs, quasi-static: the pads' relative displacement along the normal changes
     the squeeze, the one across it has to be borne by friction as well.
@@ -139,7 +141,7 @@ def skewed(job: Job, delay: float, stiffness: float) -> Skew:
 
 
 def largest_skew(job: Job, stiffness: float) -> float:
-    """The longest delay of either arm that friction survives, up to `LARGEST_SKEW` [s].
+    """Compute the longest delay of either arm that friction survives, up to `LARGEST_SKEW` [s].
 
     Raises:
         SettingsError: the stiffness is not positive.
@@ -218,7 +220,7 @@ def require_delay(delay: float) -> None:
 
 
 def position_text(found: Sequence[PositionControl]) -> str:
-    """Forces under position control, by stiffness."""
+    """Format the forces under position control, by stiffness."""
     rows = [
         [
             f"{each.stiffness:g}",
@@ -234,7 +236,7 @@ def position_text(found: Sequence[PositionControl]) -> str:
 
 
 def skew_text(found: Sequence[Skew]) -> str:
-    """Effect of a late arm, by delay: the worse of both."""
+    """Format the effect of a late arm, by delay: the worse of both."""
     rows = [
         [
             f"{1e3 * each.delay:g}",

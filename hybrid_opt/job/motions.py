@@ -1,5 +1,5 @@
-"""How box and arms move and press in the phases of a job: in straight lines, not at all, in the
-timed carry; and how far each phase uses its limits.
+"""Motions and forces of the phases of a job: straight lines, rest, and the timed carry; and the use
+of each limit in every phase.
 
 Every phase beside the carry takes a smooth way from 0 to 1, h(t/T) with
 
@@ -71,7 +71,7 @@ class Rise:
 
 
 def rise(duration: float, samples: int) -> Rise:
-    """The way from 0 to 1 within a duration [s]."""
+    """Compute the rest-to-rest profile from 0 to 1 within a duration [s]."""
     share = np.linspace(0.0, 1.0, samples)
     # Rounding must not leave [0, 1]; the last values of a polynomial of degree 7 would.
     value = np.clip(_H(share), 0.0, 1.0)
@@ -82,13 +82,13 @@ def rise(duration: float, samples: int) -> Rise:
 
 
 def at_even_steps(duration: float, step: float) -> float:
-    """The duration rounded up to whole steps [s]."""
+    """Round the duration up to whole steps [s]."""
     return float(np.ceil(duration / step - 1e-9) * step)
 
 
 @dataclass(frozen=True)
 class Straight:
-    """A translation of the box, of both pads, or of all.
+    """A straight translation of the box, of both pads, or of all.
 
     Attributes:
         name: of the phase.
@@ -110,7 +110,8 @@ class Straight:
         return float(np.linalg.norm((ways[:, 1] - ways[:, 0])[:, :3], axis=1).max())
 
     def at(self, share: Array) -> tuple[Array, Array, Array]:
-        """Poses (n, 6) at shares (n,) of the way: box, and those that either pad holds."""
+        """Compute poses (n, 6) at shares (n,) of the way: of the box, and those that either pad
+        holds."""
         ways = np.concatenate([self.box[None], self.held])
         poses = ways[:, None, 0] + share[:, None] * (ways[:, 1] - ways[:, 0])[:, None]
         return poses[0], poses[1], poses[2]
@@ -119,7 +120,8 @@ class Straight:
 def straight(
     workcell: Workcell, name: str, box: Array, away: tuple[float, float], speed: float
 ) -> Straight:
-    """The box from a pose to another of the same orientation, with both pads along their normals.
+    """Build the motion of the box between two poses of the same orientation, with both pads along
+    their normals.
 
     Args:
         box: (2, 6) its poses at beginning and end.
@@ -137,7 +139,7 @@ def straight(
 def lines_around(
     workcell: Workcell, handling: Handling, stands: tuple[Array, Array], pose: Array
 ) -> tuple[list[Straight], list[Straight]]:
-    """Straight motions before a carry and after it, either list from the carry outwards.
+    """Build the straight motions before a carry and after it, either list from the carry outwards.
 
     Args:
         handling: how; the workcell's own or another.
@@ -161,7 +163,8 @@ def lines_around(
 def followed(
     workcell: Workcell, posture: NumericFunction, line: Straight, known: Array, at_end: bool
 ) -> Array:
-    """(SAMPLES, joints) both arms' joints along a line, by Newton's method from a known end.
+    """Compute both arms' joints (SAMPLES, joints) along a line, by Newton's method from a known
+    end.
 
     Samples are at the places that the profile of `rise` passes at even times. Newton's method goes
     from place to place every `STEP`, then from between these to all samples at once. Redundant
@@ -176,7 +179,7 @@ def followed(
     """
 
     def share(way: Array) -> Array:
-        """Share of the line from its start; `way` is counted from the known end."""
+        """Return the share of the line from its start; `way` is counted from the known end."""
         return 1.0 - way if at_end else way
 
     ways, passed = np.linspace(0.0, 1.0, int(np.ceil(line.length / STEP)) + 1), [known]
@@ -204,7 +207,8 @@ def followed(
 def held_at(
     workcell: Workcell, posture: NumericFunction, line: Straight, share: Array, guess: Array
 ) -> Array:
-    """(n, joints) both arms' joints at shares (n,) of a line, from guesses (n, joints) [rad].
+    """Compute both arms' joints (n, joints) at shares (n,) of a line, from guesses (n, joints)
+    [rad].
 
     Where an arm does not arrive its joints are NaN.
     """
@@ -218,7 +222,7 @@ def held_at(
 
 
 def timed(model: TimingModel, line: Straight, q: Array) -> PhaseMotion:
-    """The motion along a line from rest to rest, as fast as its speed and the limits allow.
+    """Compute the motion along a line from rest to rest, as fast as its speed and the limits allow.
 
     Args:
         q: (SAMPLES, joints) as from `followed` [rad].
@@ -273,7 +277,7 @@ def timed(model: TimingModel, line: Straight, q: Array) -> PhaseMotion:
 
 
 def standing_still(motion: PhaseMotion, sample: int, time: Array) -> PhaseMotion:
-    """The state of a motion at one sample, held at times (n,) [s]."""
+    """Repeat the state of a motion at one sample, at times (n,) [s]."""
     arrays = {
         name: np.repeat(values[sample][None], len(time), axis=0)
         for name, values in vars(motion).items()
@@ -284,7 +288,7 @@ def standing_still(motion: PhaseMotion, sample: int, time: Array) -> PhaseMotion
 
 
 def carry_motion(model: TimingModel, carry: Carry) -> PhaseMotion:
-    """The carry as it is timed, then at rest until a whole number of ticks is over."""
+    """Return the carry's timed motion, then rest until a whole number of ticks is over."""
     q, pose = np.ascontiguousarray(carry.q), np.ascontiguousarray(carry.pose)
     time = carry.time - carry.time[0]
     motion = PhaseMotion(
@@ -324,8 +328,8 @@ _NO_JUMP = 1e-6
 def holding(
     model: TimingModel, settings: SqueezeSettings, motions: Sequence[PhaseMotion]
 ) -> tuple[list[Force], Squeeze]:
-    """Forces of phases that follow one another, with the box held in all of them, and how they came
-    about.
+    """Compute the forces of consecutive phases that hold the box, and the squeeze that they follow
+    from.
 
     Raises:
         SettingsError: the uncertainty leaves no friction or patch.
@@ -351,8 +355,8 @@ def holding(
 def pressing(
     motion: PhaseMotion, hold: Force, sample: int, rate: float
 ) -> tuple[PhaseMotion, Force]:
-    """Forces that rise from nothing to those of one sample, or fall for the last, while all stand
-    still there.
+    """Compute forces that rise from zero to those of one sample, or fall for the last, while
+    everything stands still.
 
     The box's weight goes over from what it stands on to the arms with the same profile, so that
     friction is used no more than when the box is held.
@@ -374,13 +378,14 @@ def pressing(
 
 
 def without_force(motion: PhaseMotion) -> Force:
-    """Pads that touch nothing."""
+    """Return the forces of pads that touch nothing."""
     n = len(motion.time)
     return Force(np.zeros((n, 2)), np.zeros((n, 2)), np.zeros((n, 2, 6)))
 
 
 def unit_squeeze(workcell: Workcell, pose: Array, leader: int = 0) -> Array:
-    """(n, 2, 6) wrenches about the nominal contact points of 1 N that is commanded beyond the plan.
+    """Compute the wrenches (n, 2, 6) about the nominal contact points of 1 N commanded beyond the
+    plan.
 
     Of pads with opposite normals both forces act on one line, midway between the nominal points,
     and balance one another. Of others it is an internal squeeze within all friction cones.
@@ -414,7 +419,8 @@ def unit_squeeze(workcell: Workcell, pose: Array, leader: int = 0) -> Array:
 def phase_use(
     workcell: Workcell, motion: PhaseMotion, force: Force, jerk: JerkLimits | None = None
 ) -> dict[str, float]:
-    """Largest value over its limit by constraint, of what every phase has.
+    """Compute the largest value over its limit, by constraint, of the quantities that every phase
+    has.
 
     Torques are those of arms and commanded contact wrenches together. Friction and pressure are
     judged where forces are planned (`hybrid_opt.timing`): pressing harder only helps them.
@@ -437,7 +443,8 @@ def phase_use(
 
 
 def joint_use(workcell: Workcell, q: Array, rate: Array, second: Array) -> dict[str, float]:
-    """Largest position, velocity and acceleration of joints (n, joints) over their limits."""
+    """Compute the largest position, velocity and acceleration of joints (n, joints) over their
+    limits."""
     lower, upper = map(workcell.stack_joint_limits, ("position_lower", "position_upper"))
     return {
         "joint position": _most(np.abs(2.0 * q - lower - upper) / (upper - lower)),
@@ -449,7 +456,8 @@ def joint_use(workcell: Workcell, q: Array, rate: Array, second: Array) -> dict[
 
 
 def _jerk(time: Array, second: Array) -> Array:
-    """(n - 1, k) magnitudes of the change of accelerations (n, k) per time; infinite at jumps."""
+    """Compute the magnitudes (n - 1, k) of the change of accelerations (n, k) per time; infinite at
+    jumps."""
     steps, change = np.diff(time)[:, None], np.abs(np.diff(second, axis=0))
     jumps = np.where(change > _NO_JUMP, np.inf, 0.0)
     return np.where(steps > _SAME_TIME, change / np.maximum(steps, _SAME_TIME), jumps)

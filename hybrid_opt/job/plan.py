@@ -1,4 +1,4 @@
-"""Planning a whole job around the timing of a carry. docs/explanation/job.md explains the phases.
+"""Plan of a whole job around the timing of a carry. docs/explanation/job.md explains the phases.
 
 Pads approach along the contact normals, press while the box stands, take over its weight with the
 press, lift it off, carry it, set it down, let go, and retreat. Every phase but the carry follows a
@@ -83,7 +83,7 @@ class SupportedPose:
 
 @dataclass(frozen=True)
 class Around:
-    """What comes before a carry and after it.
+    """Straight motions and supports before a carry and after it.
 
     Attributes:
         checker: of the whole job.
@@ -98,7 +98,8 @@ class Around:
     def followed(
         self, workcell: Workcell, posture: NumericFunction, q: Array
     ) -> Iterator[tuple[int, Straight, Array]]:
-        """Side, line and both arms' joints along it (`SAMPLES`, joints) of every straight motion.
+        """Yield side, line and both arms' joints along it (`SAMPLES`, joints) of every straight
+        motion.
 
         Args:
             posture: `symbolic.robot.arm.posture_function`.
@@ -135,7 +136,7 @@ class JobCollisions:
         self._functions = compiled.screening
 
     def standing(self, pose: Array, height: float | None) -> SupportedPose:
-        """Where the box stands below a pose (6,).
+        """Find where the box stands below a pose (6,).
 
         Args:
             height: how far below [m]; None to lower it until it touches something, and not at all
@@ -173,7 +174,7 @@ class JobCollisions:
         return SupportedPose(_lowered(pose, found), found, tuple(names))
 
     def around(self, handling: Handling, pose: Array) -> Around:
-        """What is around a carry whose box begins and ends at poses (2, 6)."""
+        """Plan the straight motions around a carry whose box begins and ends at poses (2, 6)."""
         heights = (handling.lift_height, handling.set_down_height)
         before, after = (self.standing(*each) for each in zip(pose, heights, strict=True))
         stands = (before.pose, after.pose)
@@ -182,7 +183,8 @@ class JobCollisions:
         return Around(checker, lines, (before.bodies, after.bodies))
 
     def checker(self, places: Sequence[SupportedPose]) -> CollisionChecker:
-        """The checker of a job whose box stands at these places before and after the carry."""
+        """Build the checker of a job whose box stands at these places before and after the
+        carry."""
         task = self._workcell.task
         poses = tuple(Waypoint(place.pose, place.pose) for place in places)
         contacts = tuple(
@@ -200,7 +202,8 @@ class JobCollisions:
 
 
 def job_geometry(workcell: Workcell, everywhere: bool = False) -> CellGeometry:
-    """Bodies and pairs of a cell whose box is not always held; see the module's contact rules.
+    """Return the bodies and pairs of a cell whose box is not always held; see the module's contact
+    rules.
 
     Args:
         everywhere: whether bodies behind a pad are checked against the box as well.
@@ -229,7 +232,7 @@ def job_geometry(workcell: Workcell, everywhere: bool = False) -> CellGeometry:
 
 
 def _behind_pad(body: CollisionBody, geometry: CellGeometry) -> bool:
-    """Whether a body moves with its arm's pad and lies behind its plane."""
+    """Return True if a body moves with its arm's pad and lies behind its plane."""
     arm = body.frame.robot
     if arm < 0 or body.frame.joint != len(geometry.arms[arm].axes) - 1:
         return False
@@ -252,8 +255,8 @@ def what_blocks(
     pose: Array,
     q: Array,
 ) -> str:
-    """The first straight motion around a carry that an arm does not follow, or on which something
-    collides, with what does; '' where all are free on their samples.
+    """Describe the first straight motion around a carry that an arm does not follow, or that
+    collides; '' if all are free on their samples.
 
     Args:
         workcell: two round pads of it face one another.
@@ -321,7 +324,7 @@ class JobModel:
         handling: Handling | None = None,
         within_jerk: bool = True,
     ) -> Job:
-        """The whole job around a timed carry.
+        """Plan the whole job around a timed carry.
 
         Args:
             timing: of a carry of this workcell, one that robots can drive.
@@ -372,8 +375,8 @@ class JobModel:
         )
 
     def _around(self, carry: Carry, handling: Handling) -> tuple[Around, list[Phase], list[Phase]]:
-        """The moving phases before a carry and after it, either from the carry outwards, computed
-        once for carries with the same ends."""
+        """Plan the moving phases before a carry and after it, either from the carry outwards;
+        cached for carries with the same ends."""
         pose, q = carry.pose[[0, -1]], carry.q[[0, -1]].round(_SAME_POSTURE)
         key = handling, pose.tobytes() + q.tobytes()
         if key in self._known:
@@ -390,7 +393,7 @@ class JobModel:
         return self._known[key]
 
     def _proof(self, checker: CollisionChecker, carry: Carry) -> Certificate:
-        """The continuous verdict on the carry."""
+        """Certify the carry between its samples."""
         u = np.linspace(0.0, 1.0, PATH_SAMPLES)
         q = interpolated(u, carry.parameter, carry.q)
         task = self.workcell.task
@@ -398,7 +401,7 @@ class JobModel:
         return certificates(checker, self._posture, [path])[0]
 
     def _free(self, checker: CollisionChecker, line: Straight, motion: PhaseMotion) -> Certificate:
-        """The continuous verdict on a straight motion."""
+        """Certify a straight motion between its samples."""
         share = rise(1.0, SAMPLES).value
 
         def at(u: Array) -> tuple[Array, Array, Array]:
@@ -411,8 +414,7 @@ class JobModel:
     def _phases(
         self, drafts: Sequence[Phase], timing: Timing, jerk: JerkLimits | None
     ) -> Iterator[Phase]:
-        """The phases one after the other, with their uses; none that collides or exceeds a
-        limit."""
+        """Yield the phases in order, with their uses; raise if one collides or exceeds a limit."""
         begin = 0.0
         for draft in drafts:
             # Jumps that a carry is to keep are reported elsewhere.
@@ -441,7 +443,7 @@ class JobModel:
 
 @dataclass(frozen=True)
 class Pressed:
-    """How hard a timed carry is pressed.
+    """Commanded forces of a timed carry.
 
     Attributes:
         forces: (n, 2) normal forces to command along the carry [N].
@@ -458,7 +460,7 @@ class Pressed:
 
 
 def pressed(model: JobModel, timing: Timing, settings: SqueezeSettings | None = None) -> Pressed:
-    """How hard to press along a timed carry, as its job does.
+    """Compute the forces to press with along a timed carry, as its job does.
 
     Args:
         model: of the carry's workcell.
@@ -495,7 +497,7 @@ class HasTiming(Protocol):
 def plan_job(
     timing: Timing | HasTiming, squeeze: SqueezeSettings | None = None, smoothing: float = WIDTH
 ) -> Job:
-    """The whole job around a timed carry, or one that is recommended, see `JobModel.plan`."""
+    """Plan the whole job around a timed or recommended carry, see `JobModel.plan`."""
     timing = timing if isinstance(timing, Timing) else timing.timing
     if timing.carry is None:
         raise SettingsError(f"there is no timing to export ({timing.status}: {timing.reason})")

@@ -1,6 +1,5 @@
-"""A whole job: from the pads away from the box, through the carry, to the pads away again; and the
-same at even time steps, as robot controllers take it.
-"""
+"""A whole job, from the approach of the pads to their retreat; and its samples at even time steps,
+as robot controllers take it."""
 
 from __future__ import annotations
 
@@ -37,7 +36,7 @@ LARGEST_STEP = 1.0
 
 @dataclass(frozen=True, eq=False)
 class PhaseMotion:
-    """How box and arms move in a phase at n samples; world frame, both arms' joints side by side.
+    """Motion of box and arms in a phase at n samples; world frame, both arms' joints stacked.
 
     A sample may stand twice where an acceleration jumps, once for each side.
 
@@ -68,13 +67,13 @@ class PhaseMotion:
         return float(self.time[-1])
 
     def contact_effort(self, wrench: Array) -> Array:
-        """(n, joints) joint torques that exert wrenches (n, 2, 6) on the box [N m]."""
+        """Compute the joint torques (n, joints) that exert wrenches (n, 2, 6) on the box [N m]."""
         return contact_torque(self.first, self.wrench_torque, np.swapaxes(wrench, 0, 1))
 
 
 @dataclass(frozen=True, eq=False)
 class Force:
-    """How the robots press in a phase at n samples, world frame.
+    """Forces of the robots in a phase at n samples, world frame.
 
     Attributes:
         normal: (n, 2) commanded normal force of each robot [N].
@@ -130,7 +129,7 @@ class Phase:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Job(Displayable):
-    """A carry with all that has to happen before and after it.
+    """A carry with everything that happens before and after it.
 
     Attributes:
         workcell: the cell.
@@ -155,7 +154,7 @@ class Job(Displayable):
         return self.phases[-1].begin + self.phases[-1].duration
 
     def phase(self, name: str) -> Phase:
-        """The phase of a name."""
+        """Return the phase of a name."""
         return next(phase for phase in self.phases if phase.name == name)
 
     @property
@@ -225,7 +224,7 @@ class SampledJob:
         set_read_only(self)
 
     def span(self, index: int) -> slice:
-        """The samples of a phase, both ends included."""
+        """Return the samples of a phase, both ends included."""
         return slice(self.last[index - 1] if index else 0, self.last[index] + 1)
 
     @property
@@ -237,13 +236,13 @@ class SampledJob:
         return tuple(names)
 
     def arm(self, index: int, values: Array) -> Array:
-        """The columns of one arm (0 or 1) of (n, joints)."""
+        """Return the columns of one arm (0 or 1) of (n, joints)."""
         first = len(self.job.joint_names[0])
         return values[:, :first] if index == 0 else values[:, first:]
 
 
 def sample_job(job: Job, step: float) -> SampledJob:
-    """A job at even time steps within each phase, from time 0.
+    """Sample a job at even time steps within each phase, from time 0.
 
     Joints and box follow cubic Hermite pieces between the job's own samples, which are denser than
     any sensible step; accelerations, torques and forces are interpolated linearly.

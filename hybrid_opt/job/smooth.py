@@ -1,4 +1,4 @@
-"""A timing without jumps of the acceleration, from one that has them.
+"""Smoothing of a timing with jumps of the acceleration.
 
 Time-optimal timings switch accelerations in no time, and begin and end with one. No controller
 follows that. Here the path parameter as a function of time, u(t), is averaged over a short window
@@ -51,12 +51,12 @@ _INSIDE = 0.01
 
 
 def rests_at_ends(timing: Timing) -> bool:
-    """Whether all joints begin and end without acceleration."""
+    """Return True if all joints begin and end without acceleration."""
     return acceleration_at_ends(timing) <= RESTS
 
 
 def acceleration_at_ends(timing: Timing) -> float:
-    """Largest acceleration of a joint at either end, over its limit."""
+    """Compute the largest acceleration of a joint at either end, over its limit."""
     carry = timing.driven
     limit = carry.workcell.stack_joint_limits("acceleration_max")
     return float((np.abs(carry.stack_arms("q_second")[[0, -1]]) / limit).max())
@@ -65,8 +65,8 @@ def acceleration_at_ends(timing: Timing) -> float:
 def without_jumps(
     model: TimingModel, timing: Timing, jerk: JerkLimits | None, width: float = WIDTH
 ) -> Timing:
-    """A timing of the same path within the same limits whose acceleration does not jump: what jobs
-    drive.
+    """Compute a timing of the same path within the same limits without jumps of the acceleration,
+    as jobs need it.
 
     Args:
         model: of the timing's workcell.
@@ -89,16 +89,16 @@ def without_jumps(
 
 
 def driven_limits(model: TimingModel, x: Array) -> TimingLimits:
-    """Limits within which jobs drive a carry x (n_var,): its own force limit where its time law has
-    one, else the reference speeds."""
+    """Return the limits of a job's carry x (n_var,): its own force limit if its time law has one,
+    else the reference speeds."""
     if model.workcell.task.time_law == "optimal":
         return model.drive_limits(float(x[-1]))
     return TimingLimits(reference_speed=True)
 
 
 def driven_timing(model: TimingModel, x: Array) -> Timing:
-    """How jobs drive a carry x (n_var,): as fast as `driven_limits` and all others allow, without
-    jumps of acceleration.
+    """Compute the timing of a job's carry x (n_var,): as fast as `driven_limits` and all others
+    allow, without jumps of acceleration.
 
     Raises:
         JobError: as of `without_jumps`.
@@ -113,7 +113,7 @@ def driven_timing(model: TimingModel, x: Array) -> Timing:
 
 
 def _smoothed(model: TimingModel, timing: Timing, width: float) -> Timing:
-    """The timing averaged over a window, within the limits that it was found for."""
+    """Average the timing over a window, within the limits of its solution."""
     u, rate, second = _averaged(timing.grid_speed, width)
     motion = model.path_motion(timing.driven.x).interpolate(u)
     limits = timing.limits
@@ -141,8 +141,8 @@ def _smoothed(model: TimingModel, timing: Timing, width: float) -> Timing:
 
 @dataclass(frozen=True)
 class _Slowdown:
-    """A timing slowed by a factor, and how far it uses its limits: beyond them, and every use but
-    that of friction, which is tight by construction."""
+    """A timing slowed by a factor: its excess over limits, and every use except that of friction,
+    which is tight by construction."""
 
     factor: float
     timing: Timing
@@ -151,7 +151,7 @@ class _Slowdown:
 
 
 def _fastest(driven: Callable[[float], _Slowdown]) -> _Slowdown:
-    """The motion with the largest factor up to 1 that holds the limits.
+    """Find the motion with the largest factor up to 1 that stays within the limits.
 
     Raises:
         JobError: none does that is not below half.
@@ -178,7 +178,7 @@ def _fastest(driven: Callable[[float], _Slowdown]) -> _Slowdown:
 
 
 def _between(slow: _Slowdown, fast: _Slowdown) -> float:
-    """A factor between two at which what is exceeded with one of them is used fully.
+    """Interpolate a factor between two at which the limit exceeded with one of them is used fully.
 
     Accelerations, forces and torques are nearly affine in the factor's square, so that hardly more
     than one guess is needed.
@@ -192,7 +192,7 @@ def _between(slow: _Slowdown, fast: _Slowdown) -> float:
 
 
 def _averaged(grid_speed: Array, width: float) -> tuple[Array, Array, Array]:
-    """u, u' and u'' of the averaged timing at every `EVERY`th step."""
+    """Compute u, u' and u'' of the averaged timing at every `EVERY`th step."""
     intervals = len(grid_speed) - 1
     grid = np.linspace(0.0, 1.0, intervals + 1)
     steps = 2.0 * np.diff(grid) / (grid_speed[:-1] + grid_speed[1:])

@@ -82,7 +82,7 @@ class ArmOutcome(Outcome):
 
 
 class PressedBox(HeldBox):
-    """Also reads how hard the pads press, and mends what their contacts neglect."""
+    """Measures the pads' normal forces as well, and corrects the contacts' acceleration."""
 
     def __init__(self, mujoco: ModuleType, model: Any, data: Any, workcell: Workcell) -> None:
         """Find the pads' contact points as well."""
@@ -105,7 +105,7 @@ class PressedBox(HeldBox):
         return np.bincount(pad, self._data.efc_force[address], 2).astype(float)
 
     def mend_contacts(self) -> None:
-        """Contacts of this step, all accelerations included.
+        """Correct the contacts of this step for all accelerations.
 
         MuJoCo takes J dv/dt for the acceleration of the box over a pad, which has dJ/dt v besides:
         some tenths of m/s^2 where arms swing. Contacts that do not know it creep by millimetres
@@ -123,7 +123,7 @@ class PressedBox(HeldBox):
         self._data.efc_aref[rows] -= sign * np.einsum("nij,nj->ni", axes, unseen)
 
     def _unseen(self, pad: int) -> Array:
-        """(3,) dJ/dt v of a pad less that of the box beneath it, world axes [m/s^2]."""
+        """Compute (3,) dJ/dt v of a pad less that of the box beneath it, world axes [m/s^2]."""
         place, found = self._data.site_xpos[self.sites[pad]], []
         for body in (self._bodies[pad], self.box):
             self._mujoco.mj_jacDot(self._model, self._data, self._change, None, place, body)
@@ -132,8 +132,8 @@ class PressedBox(HeldBox):
         return less
 
     def _contacts(self) -> tuple[Indices, NDArray[np.bool_], Indices, Array]:
-        """The pads' active contacts: the pad (n,), whether it is the first body (n,), the first of
-        three rows among the constraints (n,), the contact's axes as rows (n, 3, 3)."""
+        """Return the pads' active contacts: the pad (n,), whether it is the first body (n,), the
+        first of three rows among the constraints (n,), the contact's axes as rows (n, 3, 3)."""
         contact = self._data.contact
         sides = self._pad_of_geom[contact.geom]
         pad = sides.max(axis=1)
@@ -143,7 +143,7 @@ class PressedBox(HeldBox):
 
 
 class CellWitness:
-    """A workcell with its arms, as it really is.
+    """A simulated workcell with its arms.
 
     Attributes:
         workcell, settings: what is simulated, and how.
@@ -183,7 +183,7 @@ class CellWitness:
         control: Control = "leader",
         factor: float = 1.0,
     ) -> ArmOutcome:
-        """One job, up to its end or to a slip.
+        """Simulate one job, up to its end or to a slip.
 
         Args:
             reference: the cell's commands; its workcell may differ from the simulated one in
@@ -238,7 +238,7 @@ class _Run:
         ]
 
     def outcome(self) -> ArmOutcome:
-        """Simulate."""
+        """Run the simulation."""
         settings, pads, held = self._settings, self._pads, self._reference.job.held
         per_tick = round(settings.control_period / settings.time_step)
         every = max(1, round(LOOKED_AT / settings.control_period))
@@ -288,7 +288,7 @@ class _Run:
         )
 
     def _place(self, disturbance: Array) -> Array:
-        """Put arms and box at their first poses; returns the box's (7,) as MuJoCo has it."""
+        """Set arms and box to their first poses; return the box's (7,) in MuJoCo's form."""
         data, job = self._data, self._reference.job
         data.qpos[self._q], data.qvel[self._v] = self._ticks.q[0], self._ticks.q_rate[0]
         rotation = box_rotation(self._workcell.task.orientation, job.start)
@@ -304,7 +304,7 @@ class _Run:
         return standing
 
     def _begin_step(self, time: float) -> None:
-        """First half of a step: places and contacts of this very moment."""
+        """Make the first half of a step: poses and contacts of this moment."""
         if time < self._reference.job.stands:
             self._data.qpos[self._pose] = self._standing
             self._data.qvel[self._box_v] = 0.0
@@ -312,7 +312,7 @@ class _Run:
         self._pads.mend_contacts()
 
     def _torque(self, k: int, measured: Array) -> Array:
-        """(all joints,) torques at tick k, within what the joints can do."""
+        """Compute the torques (all joints,) at tick k, clipped to the joints' limits."""
         data, ticks = self._data, self._ticks
         error = ticks.q[k] - data.qpos[self._q]
         error_rate = ticks.q_rate[k] - data.qvel[self._v]
@@ -337,7 +337,8 @@ class _Run:
         return np.clip(torque, -self._limit, self._limit)
 
     def _joint_inertia(self) -> Array:
-        """(all joints,) what each joint moves when the others stand still [kg m^2]."""
+        """Compute the inertia (all joints,) about each joint while the others stand still [kg
+        m^2]."""
         found = np.empty(len(self._v))
         for k, joint in enumerate(self._v):
             unit, moved = np.zeros(self._model.nv), np.zeros(self._model.nv)
@@ -407,7 +408,7 @@ class Account:
 def account_of(
     cell: Cell, carry: Carry, witness: CellWitness, control: Control = "leader", leader: int = 0
 ) -> Account:
-    """Simulate a carry at its threshold, and as it would be pressed.
+    """Simulate a carry at its threshold, and with the commanded forces.
 
     Args:
         carry: from rest to rest.

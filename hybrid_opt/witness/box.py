@@ -73,7 +73,8 @@ class Outcome:
         return int(self.slip[-1].argmax())
 
     def begins(self, slip: float) -> float:
-        """Time at which the slip first exceeds `BEGINS` times `slip` [s]; infinite where never."""
+        """Return the time at which the slip first exceeds `BEGINS` times `slip` [s]; infinite if
+        never."""
         beyond = np.flatnonzero(self.slip.max(axis=1) > BEGINS * slip)
         return float(self.time[beyond[0]]) if len(beyond) else float("inf")
 
@@ -101,7 +102,7 @@ class Threshold(Generic[AnyOutcome]):
 def bisected(
     simulate: Callable[[float], AnyOutcome], low: float, high: float, steps: int
 ) -> Threshold[AnyOutcome]:
-    """The least factor with which a simulation holds, by bisection.
+    """Find the least factor with which a simulation holds, by bisection.
 
     Args:
         simulate: a factor to what it shows.
@@ -122,7 +123,7 @@ def bisected(
 
 
 def mujoco_module() -> ModuleType:
-    """The simulator.
+    """Import the simulator.
 
     Raises:
         WitnessError: it is not installed.
@@ -136,7 +137,7 @@ def mujoco_module() -> ModuleType:
 
 
 class HeldBox:
-    """Where the box is between its pads in one simulation, at the beginning of its last step.
+    """Pose of the box between its pads in one simulation, at the beginning of its last step.
 
     Attributes:
         sites: of the two pads.
@@ -153,8 +154,8 @@ class HeldBox:
         self._settled: tuple[Array, Array] | None = None
 
     def look(self) -> tuple[Array, float]:
-        """How far places of the box have moved from the patches' rims in the planes of the pads
-        (2,) [m], and the angle by which it turned between them [rad], since the first look."""
+        """Measure the displacement of the box over the patches' rims in the planes of the pads (2,)
+        [m], and its rotation between them [rad], since the first call."""
         axes = self._data.site_xmat[self.sites].reshape(2, 3, 3)
         places = self._data.site_xpos[self.sites][:, None]
         position = self._data.xpos[self.box]
@@ -194,9 +195,9 @@ class Drive:
 
 
 def planned_moments(cell: Cell, carry: Carry) -> Array:
-    """(n + 1, 2, 3) moments of each robot's planned wrenches about the middle of its pads, for the
-    carry's own friction and centre of mass [N m], world frame: at rest before it, then at its
-    samples."""
+    """Compute the moments (n + 1, 2, 3) of each robot's planned wrenches about the middle of its
+    pads, for the carry's own friction and centre of mass [N m], world frame: at rest before it,
+    then at its samples."""
     workcell = carry.workcell
     still = np.zeros_like(carry.rate[:1])
     known = replace(
@@ -223,7 +224,7 @@ def drive_of(
     leader: int = 0,
     moments: Array | None = None,
 ) -> Drive:
-    """A carry from rest to rest, with the box at rest before it.
+    """Compute the motion of a carry from rest to rest, with the box at rest before it.
 
     Args:
         press: (n,) force to press with at the carry's samples; the planned normal force of the
@@ -276,7 +277,7 @@ def drive_of(
 
 
 def refuse_motion_at_ends(carry: Carry) -> None:
-    """Refuse what no simulation can begin with.
+    """Refuse a carry that no simulation can begin with.
 
     Raises:
         SettingsError: the carry does not start and end at rest.
@@ -313,7 +314,7 @@ class Witness:
         self._model = cache(self._compiled)
 
     def simulate(self, drive: Drive, factor: float = 1.0) -> Outcome:
-        """One carry with the pressing force times a factor, up to its end or to a slip."""
+        """Simulate one carry with the pressing force times a factor, up to its end or to a slip."""
         mujoco, model, settings = self._mujoco, self._model(drive.leader), self.settings
         data = mujoco.MjData(model)
         held = HeldBox(model, data, self.workcell)
@@ -352,8 +353,8 @@ class Witness:
 
 
 def workcell_of_case(workcell: Workcell, case: Array) -> Workcell:
-    """The workcell as it is in a case (18,), see `symbolic.contact.worst_cases.CASE_SIZES`, but for
-    the disturbance and what the arms do."""
+    """Return the workcell of a case (18,), see `symbolic.contact.worst_cases.CASE_SIZES`, except
+    the disturbance and the arms' errors."""
     payload = workcell.payload
     mass, centre = float(case[4]), case[5:8]
     # The inertia is known about the nominal centre of mass: Steiner's theorem takes it to the true.

@@ -44,7 +44,7 @@ TOUCHES = 5.0
 
 @dataclass(frozen=True, eq=False)
 class JointMotion:
-    """Both arms' joints side by side at n moments, times not decreasing.
+    """Both arms' joints stacked at n moments, times not decreasing.
 
     Attributes:
         time: (n,) [s].
@@ -105,7 +105,7 @@ def job_reference(
     job: BoxJob,
     effort: Array | None = None,
 ) -> Reference:
-    """References from joints and forces.
+    """Build references from joints and forces.
 
     Args:
         normal_force: (n, 2) force that each pad has to press with [N].
@@ -135,7 +135,8 @@ def job_reference(
 def carry_reference(
     cell: Cell, carry: Carry, press: Array | None = None, leader: int = 0
 ) -> Reference:
-    """A carry from rest to rest, after some time at rest, with the forces of its planned wrenches.
+    """Build the reference of a carry from rest to rest, after some time at rest, with the forces of
+    its planned wrenches.
 
     Args:
         press: (n,) normal force to command the arm that does not lead; its planned one by default
@@ -191,8 +192,8 @@ def carry_reference(
 def with_tracking_error(
     reference: Reference, amplitude: float, rng: np.random.Generator, opposed: float = 0.0
 ) -> Reference:
-    """References whose joints are off by a random sinusoid each, which begins at zero, of arms that
-    push against one another.
+    """Return references with a random sinusoidal error of each joint, starting at zero, and arms
+    that push against each other.
 
     Frequencies are drawn from 0.3 to 1.5 Hz. All else that is fed forward stays.
 
@@ -216,7 +217,8 @@ def with_tracking_error(
 
 
 def press_torque(workcell: Workcell, q: Array) -> Array:
-    """(n, all joints) torques of each arm's joints that press with 1 N, at joints (n, all).
+    """Compute the torques (n, all joints) of each arm's joints that press with 1 N, at joints (n,
+    all).
 
     Both press along the normals where these are opposite, else along the line between the middles
     of their pads, so that what they add cancels in the payload.
@@ -234,8 +236,8 @@ def press_torque(workcell: Workcell, q: Array) -> Array:
 
 
 def _force_torque(workcell: Workcell, q: Array, forces: tuple[Array, Array]) -> Array:
-    """(n, all joints) torques of forces (3,) or (n, 3) on the box, in its frame, one of each robot
-    in the middle of its pads [N m]."""
+    """Compute the torques (n, all joints) of forces (3,) or (n, 3) on the box, in its frame, one of
+    each robot in the middle of its pads [N m]."""
     found = []
     parts = zip(workcell.robots, workcell.contacts, forces, joints_of(workcell, q), strict=True)
     for robot, contact, force, values in parts:
@@ -254,7 +256,7 @@ def _force_torque(workcell: Workcell, q: Array, forces: tuple[Array, Array]) -> 
 
 
 def inverse_dynamics(workcell: Workcell, motion: JointMotion) -> Array:
-    """(n, all joints) torques that move the bare arms [N m]."""
+    """Compute the torques (n, all joints) that move the bare arms [N m]."""
     found = []
     parts = [joints_of(workcell, values) for values in (motion.q, motion.q_rate, motion.q_second)]
     for robot, *rows in zip(workcell.robots, *parts, strict=True):
@@ -269,7 +271,7 @@ def _counts(workcell: Workcell) -> list[int]:
 
 
 def _with_rest(values: Array, keep: float) -> Array:
-    """Two rows before the others: the first one, times `keep`."""
+    """Prepend two rows: the first one, times `keep`."""
     return np.concatenate([keep * values[:1], keep * values[:1], values])
 
 
@@ -295,7 +297,7 @@ class ArmState:
 
 
 class ArmController:
-    """One arm's controller, which remembers the integral of its force error.
+    """Controller of one arm, with the integral of its force error.
 
     Attributes:
         is_force_controlled: whether it controls its force along the normal.
@@ -325,7 +327,7 @@ class ArmController:
         self._integral = 0.0
 
     def torque(self, state: ArmState, effort: Array, normal_force: float) -> Array:
-        """(n_joints,) joint torques [N m].
+        """Compute the joint torques (n_joints,) [N m].
 
         Args:
             effort: (n_joints,) to feed forward [N m].
@@ -349,14 +351,14 @@ class ArmController:
 
 
 def pressed_reference(cell: Cell, carry: Carry, leader: int = 0) -> tuple[Reference, Squeeze]:
-    """As a job presses: with robust forces where the workcell states what is uncertain, smoothed so
-    that controllers can follow them and never below what is needed."""
+    """Build a job's reference: with robust forces if the workcell states its uncertainty, smoothed
+    so that controllers can follow them and never below the needed ones."""
     forces, squeeze = commanded_forces(cell.workcell, carry, SqueezeSettings(leader=leader))
     return carry_reference(cell, carry, forces[:, 1 - leader], leader), squeeze
 
 
 def driven_carry(cell: Cell, x: Array) -> Carry:
-    """A decision vector's carry from rest to rest as a job drives it.
+    """Compute a decision vector's carry from rest to rest, timed as in a job.
 
     Raises:
         WitnessError: there is none.
@@ -366,7 +368,7 @@ def driven_carry(cell: Cell, x: Array) -> Carry:
 
 
 def exported_carry(cell: Cell, timing: Timing) -> Carry:
-    """The carry of a timing as a job drives it.
+    """Compute the carry of a timing, timed as in a job.
 
     Raises:
         WitnessError: there is none.

@@ -1,4 +1,4 @@
-"""The witness's scenes as MJCF: a free box between two pads on a carriage, and the whole cell.
+"""MJCF of the simulated scenes: a free box between two pads on a carriage, and the whole cell.
 
 Each pad is a set of small spheres that touch the face of the box: all over its patch, for an
 elastic pad that presses evenly while an arm keeps its orientation. On the carriage the leader's pad
@@ -86,7 +86,7 @@ UNTOUCHED = 'contype="0" conaffinity="0"'
 
 @dataclass(frozen=True)
 class ContactSettings:
-    """How contacts are simulated, of pads alone as of whole cells.
+    """Settings of simulated contacts, of pads alone and of whole cells.
 
     Attributes:
         time_step: of the physics [s].
@@ -114,7 +114,7 @@ class ContactSettings:
 
 @dataclass(frozen=True)
 class SimulationSettings(ContactSettings):
-    """How the witness simulates pads alone.
+    """Settings of the simulation of pads alone.
 
     Attributes:
         pads: 'even' for points all over the patches of pads that keep their planned orientation;
@@ -134,7 +134,7 @@ class SimulationSettings(ContactSettings):
 
 @dataclass(frozen=True)
 class ArmSettings(ContactSettings):
-    """How the cell and its controllers are simulated.
+    """Settings of the simulated cell and its controllers.
 
     Attributes:
         control_period: of the controllers, a multiple of the time step [s].
@@ -171,7 +171,7 @@ class ArmSettings(ContactSettings):
 def scene_text(
     workcell: Workcell, settings: SimulationSettings, leader: int, disturbance: ArrayLike
 ) -> str:
-    """The MJCF document of pads alone; see `compiled`.
+    """Write the MJCF document of pads alone; see `compiled`.
 
     Args:
         leader: index of the pad that is fixed to the carriage.
@@ -201,7 +201,7 @@ def scene_text(
 
 
 def compiled(mujoco: ModuleType, text: str) -> tuple[Any, str]:
-    """The simulator's model of a scene, and the scene as MuJoCo reads it.
+    """Compile the simulator's model of a scene; also return the scene as MuJoCo reads it.
 
     The pads' points state their stiffness [N/m] as negative `solref`. MuJoCo wants it times a
     regularisation, which follows from the masses that are compiled.
@@ -221,7 +221,7 @@ def compiled(mujoco: ModuleType, text: str) -> tuple[Any, str]:
 
 
 def box_body(payload: Payload, geoms: str) -> str:
-    """The free body `box` with the payload's mass and inertia, and what touches it."""
+    """Write the free body `box` with the payload's mass and inertia, and the given geoms."""
     about = payload.inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
     return f"""<body name="box">
       <freejoint name="box"/>
@@ -232,7 +232,7 @@ def box_body(payload: Payload, geoms: str) -> str:
 
 
 def solver_options(settings: ContactSettings, gravity: Array, heaviest: float = 1.0) -> str:
-    """MuJoCo's options: cones as they are, solved to many digits, hardly any creep.
+    """Write MuJoCo's options: elliptic cones, solved to many digits, with hardly any creep.
 
     Args:
         heaviest: mass of what is far heavier than the box, if anything is [kg].
@@ -245,8 +245,8 @@ def solver_options(settings: ContactSettings, gravity: Array, heaviest: float = 
 def contact_points(
     contact: Contact, settings: ContactSettings, T_body_pad: Array, pads: Pads = "even"
 ) -> str:
-    """Spheres where a robot's patches press, touching their planes, as geoms of the body that holds
-    its pads.
+    """Write spheres at the contact points of a robot's patches, touching their planes, as geoms of
+    the body that holds its pads.
 
     Args:
         T_body_pad: (4, 4) of the first pad.
@@ -268,12 +268,12 @@ def contact_points(
 
 
 def patch_area(contact: Contact) -> float:
-    """Area of all pads of a robot [m^2]."""
+    """Compute the area of all pads of a robot [m^2]."""
     return sum(pad.area for pad in (contact, *contact.further))
 
 
 def pressed_places(contact: Contact, pads: Pads, points: int) -> Array:
-    """(n, 2) places of a patch, in its pad's plane, that press on the payload [m].
+    """Compute the points (n, 2) of a patch, in its pad's plane, that press on the payload [m].
 
     Those of driven pads lie evenly around a round patch's rim, and at the corners of a rectangle:
     all that presses on its sides could be shared by them and twists less.
@@ -297,16 +297,16 @@ def pressed_places(contact: Contact, pads: Pads, points: int) -> Array:
 
 
 def tilt_centre(contact: Contact) -> Array:
-    """(3,) the middle of a robot's pads, along the axes of the first from its place [m]: what
-    presses there shares itself out evenly."""
+    """Compute the middle (3,) of a robot's pads, along the axes of the first from its origin [m],
+    where a force is shared evenly."""
     places = np.mean([pad.T_box_pad[:3, 3] for pad in (contact, *contact.further)], axis=0)
     T = contact.T_box_pad
     return np.asarray(T[:3, :3].T @ (places - T[:3, 3]))
 
 
 def rim(contact: Contact, points: int) -> Array:
-    """(n, 2) places on a patch's rim in its pad's plane [m]: evenly around, or evenly along the
-    sides of a rectangle, corners included."""
+    """Compute points (n, 2) on a patch's rim in its pad's plane [m]: evenly around, or evenly along
+    the sides of a rectangle, corners included."""
     if contact.half_sides is None:
         angles = 2.0 * np.pi * np.arange(points) / points
         return contact.patch_radius * np.column_stack([np.cos(angles), np.sin(angles)])
@@ -318,7 +318,7 @@ def rim(contact: Contact, points: int) -> Array:
 
 
 def presses_on_box(workcell: Workcell) -> bool:
-    """Whether all pads press on faces of a box."""
+    """Return True if all pads press on faces of a box."""
     size = workcell.payload.size
     return workcell.payload.shape is None and all(
         abs(pad.T_box_pad[:3, 2] @ (pad.T_box_pad[:3, 3] + pad.T_box_pad[:3, 2] * size / 2.0))
@@ -329,7 +329,7 @@ def presses_on_box(workcell: Workcell) -> bool:
 
 
 def plates(workcell: Workcell, touched: str) -> str:
-    """A flat plate under each pad, as geoms of the box: what pads press on where it is no box.
+    """Write a flat plate under each pad, as geoms of the box: the contact surface of other shapes.
 
     The planner takes patches for flat; a pad is moulded to what it holds.
 
@@ -346,7 +346,7 @@ def plates(workcell: Workcell, touched: str) -> str:
 
 
 def piece_geom(piece: Piece, touch: str, meshes: list[str]) -> str:
-    """A piece as a geom; a hull's mesh is added to the assets."""
+    """Write a piece as a geom; add a hull's mesh to the assets."""
     shape = piece.shape
     match shape:
         case Box():
@@ -366,12 +366,12 @@ def piece_geom(piece: Piece, touch: str, meshes: list[str]) -> str:
 
 
 def tilt_names(robot: int) -> tuple[str, str]:
-    """Names of the joints about the x and y axes of a robot's pad."""
+    """Return the names of the joints about the x and y axes of a robot's pad."""
     return f"tilt_x_{robot + 1}", f"tilt_y_{robot + 1}"
 
 
 def pad_site(robot: int, T_body_pad: Array) -> str:
-    """Where a robot's first pad is, for who looks at it."""
+    """Write the site of a robot's first pad."""
     return f'<site name="pad_{robot + 1}" {placed(T_body_pad)} size="0.005"/>'
 
 
@@ -394,18 +394,18 @@ def _pad_text(workcell: Workcell, settings: SimulationSettings, i: int, slides: 
 
 
 def placed(T: Array) -> str:
-    """A transform (4, 4) as MJCF's attributes."""
+    """Write a transform (4, 4) as MJCF's attributes."""
     turn = Rotation.from_matrix(T[:3, :3]).as_quat(scalar_first=True)
     return f'pos="{mjcf_text(T[:3, 3])}" quat="{mjcf_text(turn)}"'
 
 
 def mjcf_text(values: ArrayLike) -> str:
-    """Numbers as an attribute's value."""
+    """Write numbers as an attribute's value."""
     return " ".join(repr(float(value)) for value in np.ravel(values))
 
 
 def cell_text(workcell: Workcell, settings: ArmSettings) -> str:
-    """The MJCF document of a whole cell; see `compiled`.
+    """Write the MJCF document of a whole cell; see `compiled`.
 
     Joints are named `joint_ROBOT_NUMBER`, sites of the pads `pad_1` and `pad_2`, the box `box`. A
     joint that moves both arms, and the link that it moves, stand in both and are tied together:
@@ -449,7 +449,8 @@ def cell_text(workcell: Workcell, settings: ArmSettings) -> str:
 
 
 def _ties(workcell: Workcell) -> Iterator[str]:
-    """Ties between the two copies of each joint that moves both arms, as stiff as steps allow."""
+    """Yield ties between the two copies of each joint that moves both arms, as stiff as steps
+    allow."""
     names = [tuple(arm_model(robot).names)[1:] for robot in workcell.robots]
     for name in common_joints(workcell.robots):
         first, second = (_name("joint", i, own.index(name)) for i, own in enumerate(names))
@@ -457,7 +458,7 @@ def _ties(workcell: Workcell) -> Iterator[str]:
 
 
 def _arm(workcell: Workcell, settings: ArmSettings, i: int, shown: dict[Frame, list[str]]) -> str:
-    """The nested bodies of one arm, its pad on the last."""
+    """Write the nested bodies of one arm, its pad on the last."""
     model, geometry = arm_model(workcell.robots[i]), arm_geometry(workcell, i)
     contact = workcell.contacts[i]
     # The pad stands where the nominal contact has it, whatever the place on the box is.
@@ -483,7 +484,7 @@ def _name(kind: str, robot: int, joint: int) -> str:
 
 
 def joint_names(workcell: Workcell) -> list[str]:
-    """Names of both arms' joints in the document, side by side."""
+    """Return the names of both arms' joints in the document, stacked."""
     counts = [len(robot.torque_max) for robot in workcell.robots]
     return [_name("joint", i, j) for i, count in enumerate(counts) for j in range(count)]
 
