@@ -63,11 +63,13 @@ class Cell:
         workcell: Workcell,
         objectives: Sequence[str | Objective] = PAPER_OBJECTIVES,
         threads: int | None = None,
+        compiled: CompiledCell | None = None,
     ) -> None:
         """Describe a cell; nothing is compiled yet.
 
         Args:
             objectives: what searches minimise: names of `OBJECTIVES`, or records of one's own.
+            compiled: where its functions come from, such as an `InterpretedCell` of the workcell.
             threads: for the evaluation of candidates, 0 for one per core; has no influence on
                 results. By default one per core, in a worker process, which shares them, one.
 
@@ -75,7 +77,7 @@ class Cell:
             SettingsError: an objective is unknown, or given twice.
         """
         self.workcell = workcell
-        self.compiled = CompiledCell(workcell)
+        self.compiled = CompiledCell(workcell) if compiled is None else compiled
         self._threads = threads
         select_objectives(objectives)
         self._objectives = tuple(objectives)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from functools import cached_property, lru_cache, wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 import numpy as np
 
@@ -39,7 +39,10 @@ class CompiledCell:
     Attributes:
         workcell: the description.
         cache: where libraries are kept, None for the user's folder.
+        is_compiled: True, except for an `InterpretedCell`.
     """
+
+    is_compiled: ClassVar[bool] = True
 
     def __init__(
         self, workcell: Workcell, cache: Cache | None = None, model: CellModel | None = None
@@ -53,7 +56,8 @@ class CompiledCell:
         Raises:
             CodegenError: there is no C compiler, and the cache knows of none.
         """
-        compiler_of(cache or Cache())
+        if self.is_compiled:
+            compiler_of(cache or Cache())
         self.workcell = workcell
         self.cache = cache
         self._given = model
@@ -92,8 +96,8 @@ class CompiledCell:
             return self._given
         return build_cell_model(self.workcell, self.bodies, self._searches())
 
-    def _searches(self) -> tuple[ArmSearch, ArmSearch]:
-        """Return the compiled searches for start branches."""
+    def _searches(self) -> tuple[ArmSearch, ArmSearch] | None:
+        """Return the compiled searches for start branches; None for CasADi's interpreter."""
         from symbolic.cell_model import own_clearance
         from symbolic.robot.branches import ArmSearch
 
@@ -269,6 +273,42 @@ class CompiledCell:
             return model.screening
 
         return self.functions(SCREENING, make, lanes=EVALUATOR_LANES)
+
+
+class InterpretedCell(CompiledCell):
+    """A cell of which nothing is compiled: CasADi's interpreter evaluates its functions.
+
+    For what is evaluated some hundred times: a candidate takes fifty times as long, and the sets
+    of a new cell take a minute to compile.
+    """
+
+    is_compiled = False
+
+    def _searches(self) -> None:
+        return None
+
+    @cached_property
+    def start(self) -> tuple[Array, Array]:
+        """Return the joints (n,) of each arm at the first waypoint [rad]."""
+        return self.model.start
+
+    def functions(
+        self,
+        name: str,
+        make: Callable[[CellModel], Mapping[str, ca.Function]],
+        *details: str,
+        **choices: Any,
+    ) -> dict[str, NumericFunction]:
+        """Return a set of functions of this cell, made from its model."""
+        from codegen.interpreted import InterpretedFunction
+
+        return {name: InterpretedFunction(function) for name, function in make(self.model).items()}
+
+
+def is_interpretable(workcell: Workcell) -> bool:
+    """Return True if candidates take CasADi's interpreter milliseconds: no program solves for their
+    forces, and no compiled passes time them."""
+    return workcell.has_closed_form and workcell.task.time_law != "optimal"
 
 
 @lru_cache

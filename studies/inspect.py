@@ -22,7 +22,7 @@ def _add_options(parser: Parser) -> None:
     parser.add_argument(
         "--candidates",
         type=whole(1, 10**7),
-        default=1000,
+        default=250,
         metavar="N",
         help="random candidates to judge",
     )

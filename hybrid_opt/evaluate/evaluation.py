@@ -187,7 +187,8 @@ class CandidateEvaluator:
         self._needs = _needs(self.objectives)
         self._begin: Array | None = None
         self._proofs: dict[bytes, float | None] = {}
-        self._in_lanes = functions is None and self.driver is None
+        compiled_here = functions is None and self.compiled.is_compiled
+        self._in_lanes = compiled_here and self.driver is None
 
     @cached_property
     def _kernel(self) -> Kernel | None:

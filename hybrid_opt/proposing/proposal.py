@@ -19,7 +19,6 @@ from typing import Any
 
 import numpy as np
 
-from codegen.compiler import find_compiler
 from hybrid_opt.carry import Judgement
 from hybrid_opt.display import table
 from hybrid_opt.errors import NoHoldError, ProposalError
@@ -234,9 +233,7 @@ def propose_classes(
         WorkcellError: the file is wrong.
         ProposalError: no carry was found; the text says what is in the way.
         SettingsError: OMPL is not installed.
-        CodegenError: there is no C compiler, which the verdict on a proposal needs.
     """
-    find_compiler()
     settings = settings or ProposeSettings()
     with counted(progress, "seconds of work", ceil(settings.seconds)) as advance:
         search = _Search(read_problem(path), rng, settings, tell, passed_on(advance))

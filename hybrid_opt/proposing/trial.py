@@ -4,19 +4,17 @@ of the cell, and a proposed carry by the evaluator."""
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from codegen.function import NumericFunction
 from codegen.interpreted import InterpretedFunction
 from hybrid_opt.carry import Judgement
 from hybrid_opt.collision.certify import LostPathError
 from hybrid_opt.collision.checker import CollisionChecker
-from hybrid_opt.compiled_cell import CompiledCell
+from hybrid_opt.compiled_cell import InterpretedCell
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.evaluate.explanation import explain
 from hybrid_opt.job.plan import JobCollisions, what_blocks
@@ -28,7 +26,7 @@ from symbolic.cell_model import (
     build_cell_bodies,
     build_cell_model,
 )
-from symbolic.functions import cell_functions, motion_function
+from symbolic.functions import motion_function
 from symbolic.geometry.bodies import MeshReader, shape_pieces
 from symbolic.geometry.clearance import screening_functions
 from symbolic.geometry.pairs import CellGeometry, coal_distance
@@ -38,9 +36,6 @@ from symbolic.records.poses import box_placement
 from symbolic.records.task import initial_decision
 from symbolic.robot.branches import StartBranch
 from symbolic.robot.model import build_robot_model
-
-if TYPE_CHECKING:
-    import casadi as ca
 
 MARGINS = (0.01, 0.004, 0.0015, 0.0005, 0.0)
 """Clearances that a first path may keep beyond the cell's tolerance, the widest possible counts
@@ -313,10 +308,8 @@ class Trial:
             model = CellModel(workcell, known.robots, known.geometry, ((), ()), start)
         vars(model)["screening"] = self.bodies.screening  # of the same bodies: not made again
         self.workcell, self.model, self.branches = workcell, model, workcell.start_branch
-        functions = {
-            name: InterpretedFunction(function) for name, function in cell_functions(model).items()
-        }
-        self.evaluator = CandidateEvaluator(self.workcell, functions=functions)
+        interpreted = InterpretedCell(self.workcell, model=model)
+        self.evaluator = CandidateEvaluator(self.workcell, compiled=interpreted)
         # Forces that a solver finds take most of a candidate's time.
         self._solved = not self.workcell.has_closed_form
         self._motion = InterpretedFunction(motion_function(model)) if self._solved else None
@@ -415,19 +408,6 @@ def _branch(branches: tuple[StartBranch, ...], q: Array) -> int:
     return best
 
 
-class _InterpretedCell(CompiledCell):
-    """A cell of which nothing is compiled."""
-
-    def functions(
-        self,
-        name: str,
-        make: Callable[[CellModel], Mapping[str, ca.Function]],
-        *details: str,
-        **choices: Any,
-    ) -> dict[str, NumericFunction]:
-        return {name: InterpretedFunction(function) for name, function in make(self.model).items()}
-
-
 def grasp_blocked(trial: Trial, handling: Handling) -> str:
     """What is in the way of the pads' approach before a trial's carry or of their retreat after
     it, lift and set-down included, in the place of the cell's own handling; '' where nothing is, or
@@ -437,6 +417,6 @@ def grasp_blocked(trial: Trial, handling: Handling) -> str:
         return ""
     found = trial.evaluator.outputs(trial.initial[None])
     q = np.hstack([found["q_1"][0], found["q_2"][0]])[[0, -1]]
-    collisions = JobCollisions(_InterpretedCell(cell, model=trial.model))
+    collisions = JobCollisions(InterpretedCell(cell, model=trial.model))
     posture = trial.evaluator.functions["posture"]
     return what_blocks(cell, collisions, posture, found["pose"][0][[0, -1]], q)

@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 
 import hybrid_opt as ho
-from hybrid_opt.campaign.stages import Maker, build_all
 from hybrid_opt.carry import Carry, Judgement
 from hybrid_opt.cell import Cell
+from hybrid_opt.compiled_cell import InterpretedCell, is_interpretable
 from hybrid_opt.evaluate.explanation import Explanation, explain, frequent
 from hybrid_opt.front import Front
 from hybrid_opt.indicators.metrics import BindingBound, binding_bounds
@@ -26,7 +26,7 @@ from symbolic.records import Workcell
 from symbolic.records.task import straight_line
 from symbolic.robot.branches import StartBranch
 
-EXPLAINED = 200
+EXPLAINED = 100
 """Most infeasible candidates that are looked at closer."""
 
 POLISH_ATTEMPTS = 10
@@ -73,18 +73,24 @@ def inspected(
     Raises:
         DualArmError: the model cannot be built, or a picture cannot be written.
     """
-    cell, progress = Cell(workcell), progress or Progress(shown=False)
+    progress = progress or Progress(shown=False)
+    is_interpreted = not polish and is_interpretable(workcell)
+    cell = Cell(workcell, compiled=InterpretedCell(workcell) if is_interpreted else None)
     yield Finding({"candidates": candidates, "seed": seed})
     facts = _facts(workcell)
     yield Finding(
         {"name": workcell.name, "facts": facts},
         (workcell.name, "", *(f"  {heading}: {text}" for heading, text in facts.items()), ""),
     )
-    makers: list[Maker] = [lambda: cell.evaluator]
-    if polish:
-        makers.append(lambda: cell.polish_functions)
-    # Whoever needs what cannot be compiled reports it.
-    build_all(makers, progress)
+    if not is_interpreted:
+        # Not imported at the top: it brings the searches, which nothing else here needs.
+        from hybrid_opt.campaign.stages import Maker, build_all
+
+        makers: list[Maker] = [lambda: cell.evaluator]
+        if polish:
+            makers.append(lambda: cell.polish_functions)
+        # Whoever needs what cannot be compiled reports it.
+        build_all(makers, progress)
     yield _at_rest(cell)
     carries = {
         "initial": cell.carry(cell.initial),

@@ -15,9 +15,10 @@ from hybrid_opt.bundles import BundleOptions, Origin, export
 from hybrid_opt.bundles.bundle import read_manifest, require_target, warnings_of
 from hybrid_opt.bundles.check import as_document, check
 from hybrid_opt.bundles.check import read_trajectory as joint_trajectory
-from hybrid_opt.campaign.stages import build_all, build_study
+from hybrid_opt.campaign.stages import build_study
 from hybrid_opt.carry import Carry
 from hybrid_opt.cell import Cell
+from hybrid_opt.compiled_cell import InterpretedCell
 from hybrid_opt.display.table import number, text_table
 from hybrid_opt.job.compliance import (
     SKEWS,
@@ -159,8 +160,8 @@ def _report(job: Job, stiffness: float | None) -> str:
 
 def check_file(options: argparse.Namespace) -> int:
     """Print what a joint trajectory does in a cell; returns the exit code."""
-    cell = Cell(load_workcell(options.workcell)).drivable()
-    build_all([lambda: cell.evaluator, lambda: cell.timing_model], Progress())
+    workcell = load_workcell(options.workcell)
+    cell = Cell(workcell, compiled=InterpretedCell(workcell))
     trajectory = joint_trajectory(options.trajectory, cell.workcell)
     held = None if options.held is None else (options.held[0], options.held[1])
     found = check(cell, trajectory, held, options.interpolation)

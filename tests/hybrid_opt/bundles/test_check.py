@@ -13,6 +13,8 @@ import yaml
 
 from hybrid_opt.bundles.check import Finding, check, read_trajectory
 from hybrid_opt.bundles.job_file import Interpolation
+from hybrid_opt.cell import Cell
+from hybrid_opt.compiled_cell import InterpretedCell
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.store.trajectory_file import FORMAT
 from symbolic.array import Array
@@ -64,6 +66,18 @@ def test_our_own_job_passes(tmp_path: Path) -> None:
     phase = rack_job().phase("carry")
     np.testing.assert_allclose(whole.normal_force, phase.force.least.max(axis=0), rtol=0.02)
     np.testing.assert_allclose(told.normal_force, whole.normal_force, rtol=0.05)
+
+
+def test_the_interpreter_says_what_compiled_functions_say(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    content = ros(*carried()[:3])
+    compiled = judged(tmp_path / "job.yaml", content)
+    monkeypatch.setenv("CC", "no-such-compiler")
+    workcell = rack().workcell
+    cell = Cell(workcell, compiled=InterpretedCell(workcell))
+    found = check(cell, read_trajectory(tmp_path / "job.yaml", workcell))
+    assert repr(found) == repr(compiled)
 
 
 def test_what_cannot_be_driven_is_told(tmp_path: Path) -> None:

@@ -50,7 +50,7 @@ def find(workcell: Workcell, *given: Any, **more: Any) -> Inspection:
 @pytest.fixture(scope="module")
 def found(transfer: Workcell, tmp_path_factory: pytest.TempPathFactory) -> Inspection:
     folder = tmp_path_factory.mktemp("pictures")
-    return find(transfer, 1500, 7, folder, view=folder / "new" / "view.html")
+    return find(transfer, 300, 7, folder, view=folder / "new" / "view.html")
 
 
 def test_the_second_cell_is_worth_searching_and_counts_are_the_evaluators(
@@ -60,12 +60,22 @@ def test_the_second_cell_is_worth_searching_and_counts_are_the_evaluators(
     assert not found.straight_line.feasible
     assert 0.02 <= found.feasible_share <= 0.20
     evaluator = CandidateEvaluator(transfer)
-    x = np.random.default_rng(7).uniform(evaluator.lower, evaluator.upper, (1500, evaluator.n_var))
+    x = np.random.default_rng(7).uniform(evaluator.lower, evaluator.upper, (300, evaluator.n_var))
     verdicts = evaluator.evaluate(x)
     assert found.feasible_share == pytest.approx(verdicts.feasible.mean())
     for reason, count in found.infeasible_by_reason.items():
         assert count == (verdicts.reason == REASONS.index(reason)).sum()
     assert sum(found.infeasible_by_reason.values()) == (~verdicts.feasible).sum()
+
+
+def test_a_new_cell_needs_no_compiler(
+    transfer: Workcell, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("DUAL_ARM_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setenv("CC", "no-such-compiler")
+    told = find(transfer, 1, 1).lines
+    assert any("At rest, level" in line for line in told)
+    assert not (tmp_path / "cache").exists()
 
 
 def test_every_pair_is_active_or_excluded_with_a_reason(found: Inspection) -> None:
