@@ -16,6 +16,7 @@ from hybrid_opt.cell import Cell
 from hybrid_opt.progress import Advance, ShowProgress, counted
 from hybrid_opt.recommending.choice import DrivenPaths, Goal, Wish, best_of_paths, ranked
 from symbolic.array import Array
+from symbolic.contact.registry import contact_model
 from symbolic.errors import DualArmError, SettingsError
 from symbolic.records import Workcell
 from symbolic.records.poses import box_rotation
@@ -83,10 +84,10 @@ def propose_grip(
         if not -1.0 <= low <= high <= 1.0:
             raise SettingsError(f"a range from {low:g} to {high:g} m: allowed is -1 <= low <= high")
     drivable = cell.drivable()
-    if not (cell.workcell.has_closed_form and drivable.workcell.has_closed_form):
+    if not all(contact_model(each.workcell).has_closed_form for each in (cell, drivable)):
         raise SettingsError(
-            "places of pads are compared where their forces have a closed form: two opposite pads, "
-            "allocation 'paper' or 'soft-finger'"
+            "places of pads are compared where their forces have a closed form: two pads with "
+            "opposite normals"
         )
     ways, tried = _ways(cell.workcell), dict[tuple[float, float], tuple[float, float, float]]()
     bounds = np.array([up, along])

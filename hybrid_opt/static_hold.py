@@ -13,6 +13,7 @@ import numpy as np
 from hybrid_opt.compiled_cell import kept_per_workcell
 from symbolic.array import Array, Pair
 from symbolic.contact.load import LOAD_OUTPUTS, uncertain_load_function
+from symbolic.contact.registry import contact_model
 from symbolic.errors import WorkcellError
 from symbolic.records import Workcell
 from symbolic.records.poses import box_rotation
@@ -232,7 +233,7 @@ class _Still:
             # Where a pad presses too hard already, its whole force says nothing new.
             name, force = (NORMAL, normal) if normal > allowed else (WHOLE, mass * float(whole[i]))
             yield StillUse(name, robot.name, where, force, allowed, "N")
-            if workcell.task.allocation == "paper":  # soft fingers press harder instead
+            if contact_model(workcell).has_pressure_limit:
                 shift, radius = float(load["pressure_shift"][i]), workcell.contacts[i].patch_radius
                 yield StillUse(PRESSURE, robot.name, where, 1e3 * shift, 1e3 * radius, "mm")
 

@@ -11,6 +11,7 @@ import casadi as ca
 
 from symbolic.cell_model import CellModel
 from symbolic.contact.load import LOAD_OUTPUTS, load_function, uncertain_load_function
+from symbolic.contact.registry import contact_model
 from symbolic.expression import (
     mx_parameters,
     named_function,
@@ -196,7 +197,7 @@ def sample_sizes(workcell: Workcell) -> dict[str, int]:
 def forces_come_last(workcell: Workcell) -> bool:
     """Return True if a candidate's forces are computed only after everything else is free of
     violations: a program solves for them, and then only objectives depend on them."""
-    return not workcell.has_closed_form
+    return not contact_model(workcell).has_closed_form
 
 
 def force_sizes(workcell: Workcell) -> dict[str, int]:

@@ -14,8 +14,9 @@ import numpy as np
 from symbolic.cell_model import CellModel
 from symbolic.contact.force_closure import WRENCH_SIZE
 from symbolic.contact.grasp import Grasp
-from symbolic.contact.load import ContactLoad, HeldLoad, frictions, held_by
-from symbolic.contact.soft_finger import Detached
+from symbolic.contact.load import frictions
+from symbolic.contact.model import ContactLoad, ImplicitVariables
+from symbolic.contact.registry import contact_model
 from symbolic.contact.soft_grasp import SoftGrasp
 from symbolic.expression import (
     as_mx,
@@ -144,21 +145,19 @@ def limit_numbers(workcell: Workcell) -> dict[str, ca.SX]:
     return sx_parameters(workcell.task, *workcell.robots, workcell.payload)
 
 
-def _held(
-    workcell: Workcell, blocks: dict[str, ca.SX], a: ca.SX, w: ca.SX, detached: Detached | None
-) -> HeldLoad:
-    """Return contact wrenches along the axes of contact 1 from the blocks force and moment."""
+def _contact_load(workcell: Workcell, blocks: dict[str, ca.SX], a: ca.SX, w: ca.SX) -> ContactLoad:
+    """Return the load of the contacts along the axes of contact 1 from the blocks force and
+    moment."""
     by = [blocks["force"][3 * k : 3 * k + 3] for k in range(3)]
     axes, centre = workcell.contacts[0].T_box_pad[:3, :3], workcell.payload.centre_of_mass
     arms = [ca.SX(number(axes.T @ (c.T_box_pad[:3, 3] - centre))) for c in workcell.contacts]
-    asked = ContactLoad(
+    return ContactLoad(
         by[0] * a + by[1] * w + by[2],
         blocks["moment"][:3] * a + blocks["moment"][3:] * w,
         (arms[0], arms[1]),
         ca.SX(ca.DM.eye(3)),
         frictions(workcell),
     )
-    return held_by(workcell, workcell.task.allocation, asked, detached)
 
 
 def force_functions(workcell: Workcell) -> tuple[ca.Function, ca.Function]:
@@ -173,7 +172,7 @@ def force_functions(workcell: Workcell) -> tuple[ca.Function, ca.Function]:
     """
     sizes = limit_layout(workcell).sizes
     names = ("limit_forces", "limit_force_slopes")
-    if not workcell.has_closed_form:
+    if not contact_model(workcell).has_closed_form:
         handed = mx_parameters(workcell.payload)
         asked = [ca.MX.sym("asked", sizes["force"] + sizes["moment"]), *map(ca.MX.sym, "aw")]
         asked += handed.values()
@@ -188,11 +187,9 @@ def force_functions(workcell: Workcell) -> tuple[ca.Function, ca.Function]:
             ca.Function(names[1], [*asked, state], [normal, *slopes]),
         )
     blocks = {name: ca.SX.sym(name, sizes[name]) for name in ("force", "moment")}
-    inputs, alone, sloping = _inputs(workcell, blocks), Detached(0), Detached(1)
-    value, varied = (
-        _held(workcell, blocks, inputs["a"], inputs["w"], detached).normal
-        for detached in (alone, sloping)
-    )
+    inputs, alone, sloping = _inputs(workcell, blocks), ImplicitVariables(0), ImplicitVariables(1)
+    load = _contact_load(workcell, blocks, inputs["a"], inputs["w"])
+    value, varied = (contact_model(workcell).hold(load, of).normal for of in (alone, sloping))
     found = alone.replaced([ca.densify(value), alone.symbols])
     outputs = dict(zip(("value", "solved"), found, strict=True))
     return named_function(names[0], inputs, outputs), _slopes(names[1], varied, inputs, sloping)
@@ -218,7 +215,7 @@ def _load_function(workcell: Workcell) -> ca.Function:
 def path_force_function(workcell: Workcell) -> ca.Function:
     """Return box pose and its derivatives by u (6,), u'' and u'^2 -> normal_force (2,) [N] and
     slope (2, 2), of each force by u'' and by u'^2."""
-    closed, payload = workcell.has_closed_form, workcell.payload
+    closed, payload = contact_model(workcell).has_closed_form, workcell.payload
     kind, given = (ca.SX, sx_parameters) if closed else (ca.MX, mx_parameters)
     numbers: dict[str, Any] = dict(given(payload))
     own = [ca.SX(number(workcell.contacts[0].T_box_pad[:3, :3])), ca.DM(GRAVITY) * payload.mass]
@@ -253,13 +250,13 @@ def ratio_functions(workcell: Workcell) -> tuple[ca.Function, ca.Function]:
     """
     sizes = limit_layout(workcell).sizes
     names = ("force", "moment", "torque", "wrench")
-    if not workcell.has_closed_form:
+    if not contact_model(workcell).has_closed_form:
         return _program_ratios(workcell)
     blocks = {name: ca.SX.sym(name, sizes[name]) for name in names}
-    inputs, alone, sloping = _inputs(workcell, blocks), Detached(0), Detached(1)
+    inputs, alone, sloping = _inputs(workcell, blocks), ImplicitVariables(0), ImplicitVariables(1)
     timing = inputs["a"], inputs["w"]
     value, varied = (
-        contact_limits(workcell, blocks, timing, detached)[0] for detached in (alone, sloping)
+        contact_limits(workcell, blocks, timing, implicit)[0] for implicit in (alone, sloping)
     )
     whole = inputs | {"solved": alone.symbols}
     return (
@@ -272,7 +269,7 @@ def contact_limits(
     workcell: Workcell,
     blocks: dict[str, ca.SX],
     timing: tuple[ca.SX, ca.SX],
-    detached: Detached,
+    implicit: ImplicitVariables,
 ) -> tuple[ca.SX, ca.SX]:
     """Return limits on the contact forces at one sample.
 
@@ -280,14 +277,15 @@ def contact_limits(
         workcell: the cell.
         blocks: force, moment, torque and wrench; see `limit_layout`.
         timing: u'' and u'^2.
-        detached: see `symbolic.contact.soft_finger.Detached`.
+        implicit: see `ImplicitVariables`.
 
     Returns:
         Ratios (joints + 2,): joint torques over their limits, signed, then the shifts of both
-        centres of pressure over their patch radii; normal forces (2,) [N].
+        centres of pressure over their patch radii; `ContactModel.force_quantities` (2,) [N].
     """
     (a, w), joints = timing, limit_layout(workcell).joints
-    held = _held(workcell, blocks, a, w, detached)
+    model, load = contact_model(workcell), _contact_load(workcell, blocks, a, w)
+    held = model.hold(load, implicit)
     own = ca.reshape(blocks["torque"], joints, 3)
     wrench_by_joint = ca.reshape(blocks["wrench"], 6, joints).T
     torque, start = own[:, 0] * a + own[:, 1] * w + own[:, 2], 0
@@ -300,7 +298,7 @@ def contact_limits(
         ca.sqrt(ca.sumsqr(moved) + 1e-24) / contact.patch_radius
         for moved, contact in zip(held.shifts, workcell.contacts, strict=True)
     ]
-    return ca.vertcat(*ratios), held.normal
+    return ca.vertcat(*ratios), model.force_quantities(load, held)
 
 
 def _program_ratios(workcell: Workcell) -> tuple[ca.Function, ca.Function]:
@@ -346,8 +344,10 @@ def _inputs(workcell: Workcell, blocks: dict[str, ca.SX]) -> dict[str, ca.SX]:
     return {"sample": ca.vertcat(*blocks.values())} | timing | sx_parameters(workcell.payload)
 
 
-def _slopes(name: str, value: ca.SX, inputs: dict[str, ca.SX], detached: Detached) -> ca.Function:
+def _slopes(
+    name: str, value: ca.SX, inputs: dict[str, ca.SX], implicit: ImplicitVariables
+) -> ca.Function:
     """Return a value and its derivatives by u'' and u'^2, from inputs and solved variables."""
     value = ca.densify(value)
     by = {f"by_{z}": ca.densify(ca.jacobian(value, inputs[z])) for z in ("a", "w")}
-    return named_function(name, inputs | {"solved": detached.symbols}, {"value": value} | by)
+    return named_function(name, inputs | {"solved": implicit.symbols}, {"value": value} | by)

@@ -28,6 +28,7 @@ import numpy as np
 from symbolic.array import Array
 from symbolic.cell_model import CellBodies, CellModel
 from symbolic.contact.force_closure import grasp_shapes, left_components
+from symbolic.contact.registry import command_model, contact_model
 from symbolic.contact.soft_finger import SoftPatch
 from symbolic.geometry.screen import Screen, ScreenBase, ScreenBody
 from symbolic.records import Contact, RedundantJoint, Robot, Task, Waypoint, Workcell
@@ -297,9 +298,11 @@ def _workcell(take: _Take, cell: Workcell) -> NumberedWorkcell:
         facing=cell.has_facing_pads,
         opposite=cell.has_opposite_pads,
         beside=cell.has_offset_pads,
-        grasp=None if cell.has_closed_form else _grasp(take, HELD, "grasp", cell, None),
+        grasp=None
+        if contact_model(cell).has_closed_form
+        else _grasp(take, HELD, "grasp", cell, None),
         squeezes=()
-        if cell.has_scalar_squeeze
+        if command_model(cell).has_scalar_squeeze
         else tuple(_grasp(take, name, name, cell, i) for i, name in enumerate(SQUEEZES)),
     )
 

@@ -44,9 +44,9 @@ from hybrid_opt.job.compliance import (
 from hybrid_opt.job.plan import plan_job
 from hybrid_opt.job.records import Job, sample_job
 from hybrid_opt.job.smooth import RESTS, acceleration_at_ends
-from hybrid_opt.robust.squeeze import PADS
 from hybrid_opt.store.files import AGAIN, own_version, read_bytes, read_document, sha256, storing
 from hybrid_opt.timing.records import Timing
+from symbolic.contact.registry import contact_model
 from symbolic.errors import SettingsError
 from symbolic.records import Workcell
 from symbolic.safe_io import replace_file, sync_folder
@@ -264,7 +264,7 @@ def manifest(
             "text": str(job.squeeze),
             "factor": job.squeeze.factor,
             "force": job.squeeze.force,
-            "assumes": f"the planned wrenches are of {PADS[job.workcell.task.allocation]}",
+            "assumes": f"the planned wrenches are of {contact_model(job.workcell).assumption}",
             "parts": {part.name: part.force for part in job.squeeze.parts},
             "force_controlled": job.workcell.robots[export.follower].name,
             "peak_normal_force": job.peak_normal_force.tolist(),

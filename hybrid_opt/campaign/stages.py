@@ -49,6 +49,7 @@ from hybrid_opt.job.plan import JobCollisions, JobModel
 from hybrid_opt.progress import Progress, ShowProgress, passed_on
 from hybrid_opt.store.files import read_record, to_json, write_atomically, write_json
 from hybrid_opt.workers import one_thread
+from symbolic.contact.registry import command_model
 from symbolic.errors import DualArmError
 from symbolic.read.cell import load
 from symbolic.read.cell_files import CellFiles, drivable_files, unpack_cell
@@ -417,7 +418,9 @@ def _makers(cell: Cell, polish: bool) -> Iterator[Maker]:
     compiled, workcell = cell.compiled, cell.workcell
     driven = workcell.task.time_law == "optimal"
     known = (
-        is_polishable(workcell, cell.force_kind.robust) if driven else workcell.has_scalar_squeeze
+        is_polishable(workcell, cell.force_kind.robust)
+        if driven
+        else command_model(workcell).has_scalar_squeeze
     )
     yield lambda: cell.evaluator
     if polish and known:

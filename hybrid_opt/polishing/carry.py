@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache, partial
 
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from hybrid_opt.polishing.cell import SmoothCell
 from symbolic.array import Array
+from symbolic.contact.registry import contact_model
 from symbolic.records.task import POSE_SIZE, extended_waypoints, place_redundant
 from symbolic.robot.arm import REACH_TOLERANCE
 from symbolic.smooth.places import ManipulabilityLimit
@@ -246,7 +247,7 @@ class CarryReader:
             reached=reached,
             unreachable_arms=tuple(np.flatnonzero(~followed.all(axis=0)).tolist()),
             manipulability=np.sqrt(np.maximum(np.column_stack(squares), 0.0))[:reached],
-            split=self._split(found),
+            split=contact_model(evaluator.workcell).planned_quantities(found),
             force=minimised,
             peak=minimised.max(axis=0) / task.reference_force,
             shift=found["pressure_shift"] / self._radii,
@@ -258,14 +259,6 @@ class CarryReader:
             ),
             gaps=gaps,
         )
-
-    def _split(self, found: Mapping[str, Array]) -> Array:
-        """Return `PlacedCarry.split`. By the paper's allocation both tangential forces have the
-        same direction."""
-        if self._evaluator.workcell.task.allocation == "soft-finger":
-            return found["normal_force"]
-        along = found["normal_force"][:, 0] - found["normal_force"][:, 1]
-        return np.column_stack([along, found["tangential_force"].sum(axis=1)])
 
     def _raised_by_gaps(self, bounds: Array, gaps: Callable[[int], Array]) -> Array:
         """Raise bounds (n, n_pairs) of the payload from a box to the largest gap."""

@@ -16,6 +16,7 @@ from hybrid_opt.evaluate.objectives import ROBUST_OBJECTIVES
 from hybrid_opt.polishing.robust import RobustSamples
 from symbolic.array import Array
 from symbolic.cell_model import CellBodies, CellModel
+from symbolic.contact.registry import contact_model
 from symbolic.limit_coefficients import TIMING_BARRIER_WEIGHT
 from symbolic.path.spline import path_basis
 from symbolic.records.cell import Workcell
@@ -36,7 +37,6 @@ from symbolic.smooth.places import (
 )
 from symbolic.smooth.samples import (
     Quantity,
-    force_branches,
     grasp_force_functions,
     grasp_force_name,
     sample_blocks,
@@ -119,8 +119,9 @@ def sample_quantities(workcell: Workcell) -> tuple[Quantity, ...]:
     """
     if workcell.task.time_law == "optimal":
         return ()
-    if workcell.has_closed_form:
-        return ("force", "pressure") if workcell.task.allocation == "paper" else ("force",)
+    model = contact_model(workcell)
+    if model.has_closed_form:
+        return ("force", "pressure") if model.has_pressure_limit else ("force",)
     return ("load",)
 
 
@@ -171,7 +172,7 @@ def polish_functions(compiled: CompiledCell) -> PolishFunctions:
         built |= compiled.functions("held", _held, levels=levels, lanes=0, bodies=False)
     if compiled.workcell.task.time_law == "optimal":
         built |= compiled.functions("driven", driven_functions, lanes=0, bodies=False)
-        if not compiled.workcell.has_closed_form:
+        if not contact_model(compiled.workcell).has_closed_form:
             built |= compiled.functions(
                 "driven held", _driven_held, levels=levels, lanes=0, bodies=False
             )
@@ -270,7 +271,7 @@ class SmoothCell:
         self.centre = (self.task.upper + self.task.lower) / 2.0
         self.half = np.where(half > 0.0, half, 1.0)
         self.blocks = sample_blocks(self.task)
-        self.coefficients = force_branches(self.workcell)
+        self.coefficients = contact_model(self.workcell).force_branches
         self.free = self.task.free_entries
         self._n_path = self.task.n_path
         fixed = [waypoint.lower for waypoint in self.task.waypoints]

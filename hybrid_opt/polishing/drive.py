@@ -47,6 +47,7 @@ from hybrid_opt.robust.path_force import PathPoints, robust_path
 from hybrid_opt.timing.drive import CandidateDriver
 from hybrid_opt.timing.records import PathTiming
 from symbolic.array import Array
+from symbolic.contact.registry import command_model
 from symbolic.errors import SettingsError
 from symbolic.path.pieces import coarse_entries, hierarchical_basis
 from symbolic.records import Workcell
@@ -98,7 +99,7 @@ REST_FORCE_MARGIN = 1e-3
 def is_polishable(workcell: Workcell, robust: bool) -> bool:
     """Return True if drivable carries of a cell can be polished: if robust forces are limited, it
     needs two pads with opposite normals."""
-    return workcell.has_scalar_squeeze or not robust
+    return command_model(workcell).has_scalar_squeeze or not robust
 
 
 @dataclass(frozen=True)

@@ -26,6 +26,7 @@ from hybrid_opt.timing.drive import CandidateDriver
 from hybrid_opt.timing.limits import drive_path
 from hybrid_opt.timing.model import TimingModel
 from symbolic.array import Array
+from symbolic.contact.registry import contact_model
 from symbolic.path.pieces import coarse_task, resample_decisions
 from symbolic.records.task import initial_decision
 
@@ -150,7 +151,7 @@ class DriveRun(PolishRun[DriveAttempt]):
         self._announce(1 + ahead)
         paths, durations = self._known_paths(limits[0])
         self._attempt(paths[int(np.argmin(durations))], limits[0], "stated")
-        if self._method.cell.task.allocation != "soft-finger":
+        if contact_model(self._method.cell.workcell).has_pressure_limit:
             middle = self._intermediate_force(limits[0], fast)
             turned_paths = self._rotated(middle)
             self._announce(len(turned_paths) + ahead)

@@ -22,6 +22,7 @@ from hybrid_opt.polishing.rows import ConstraintRows, Row, RowLayout
 from hybrid_opt.polishing.solvers.base import Residuals
 from hybrid_opt.polishing.solvers.quadratic import BorderedMatrix, BorderedRows
 from symbolic.array import Array
+from symbolic.contact.registry import contact_model
 from symbolic.limits import LIMITS, limits_of_block
 from symbolic.path.spline import path_basis
 from symbolic.records.cell import Workcell
@@ -215,14 +216,15 @@ class IntervalValues:
         first = self._functions.built[DRIVEN_FIRST]
         out = first.batch(*begins[:-2], still, still, threads=grid.threads)
         follow = [along[::2] for along in self._follow]
-        paper, by_program = grid.workcell.task.allocation == "paper", grid.layout.by_program
-        block = grid.layout.block("pressure" if paper else "load" if by_program else "force")
+        by_pressure = contact_model(grid.workcell).has_pressure_limit
+        by_program = grid.layout.by_program
+        block = grid.layout.block("pressure" if by_pressure else "load" if by_program else "force")
         value, slope = out["value"][:, block], out["slope"][:, block]
         slope = _followed(grid, slope, follow)[:, :, : grid.moving]
         if by_program:
             pressed = self._functions.built[grasp_force_name("first")].batch(value)
             value, slope = pressed["normal"], _by_load(pressed, slope)
-        whole = 1.0 if paper else force
+        whole = 1.0 if by_pressure else force
         return value.reshape(-1) / whole, slope.reshape(-1, grid.moving) / whole
 
     def rows(self) -> Array:

@@ -21,6 +21,7 @@ from hybrid_opt.polishing.settings import PolishSettings
 from hybrid_opt.timing.model import TimingModel
 from hybrid_opt.workers import one_thread
 from symbolic.array import Array
+from symbolic.contact.registry import command_model
 from symbolic.errors import SettingsError
 from symbolic.records.cell import Workcell
 from symbolic.records.task import initial_decision
@@ -32,7 +33,7 @@ TIMED_EVALUATIONS = 32
 def has_polishable_forces(workcell: Workcell, objectives: Sequence[str]) -> bool:
     """Return True if the polish has the pads' forces: planned ones of any pads, robust ones of two
     pads with opposite normals."""
-    return workcell.has_scalar_squeeze or tuple(objectives) != ROBUST_OBJECTIVES
+    return command_model(workcell).has_scalar_squeeze or tuple(objectives) != ROBUST_OBJECTIVES
 
 
 class Polisher:

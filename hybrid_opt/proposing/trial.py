@@ -26,6 +26,7 @@ from symbolic.cell_model import (
     build_cell_bodies,
     build_cell_model,
 )
+from symbolic.contact.registry import contact_model
 from symbolic.functions import motion_function
 from symbolic.geometry.bodies import MeshReader, shape_pieces
 from symbolic.geometry.clearance import screening_functions
@@ -311,7 +312,7 @@ class Trial:
         interpreted = InterpretedCell(self.workcell, model=model)
         self.evaluator = CandidateEvaluator(self.workcell, compiled=interpreted)
         # Forces that a solver finds take most of a candidate's time.
-        self._solved = not self.workcell.has_closed_form
+        self._solved = not contact_model(self.workcell).has_closed_form
         self._motion = InterpretedFunction(motion_function(model)) if self._solved else None
 
     @property

@@ -18,7 +18,7 @@ from hybrid_opt.cell import Cell
 from hybrid_opt.recommending.choice import DrivenPaths, Option
 from hybrid_opt.robust.cases import LEADER, nominal_case
 from hybrid_opt.robust.force import HOLDS, BoxMotion, robust_model, thinned
-from hybrid_opt.timing.records import Timing, TimingLimits
+from hybrid_opt.timing.records import Timing
 from hybrid_opt.timing.robustness import Margin
 from symbolic.array import Array
 from symbolic.records import Contact, Workcell
@@ -203,7 +203,7 @@ def _wider(pad: Contact) -> Contact:
 def _of_pitch(cell: Cell, path: Array, option: Option, slope: float) -> Iterator[Advice]:
     """One more degree of pitch at every via-point, the better way round, if nothing is in the
     way."""
-    if slope == 0.0 or not cell.path_timer.passes.supports(TimingLimits()):
+    if slope == 0.0:
         return
     task, varied, names = cell.workcell.task, [], []
     for place in range(len(task.free_indices)):

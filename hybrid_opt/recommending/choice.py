@@ -255,7 +255,7 @@ class DrivenPaths:
             told: called `FORCES` times as the work goes on.
         """
         found, limits = self.options(own), []
-        if not self._robust and self._timer.passes.supports(TimingLimits()):
+        if not self._robust:
             still = np.array([timing.limited_force for _, _, timing in self._driven(1e-6)])
             least = np.where(np.isfinite(still), still, self.highest_force)
             low = np.minimum((1.0 + LEAST_ABOVE_STILL) * least, self.highest_force)

@@ -31,8 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from symbolic.array import Array
-from symbolic.errors import SettingsError
-from symbolic.read.cell import PATCH_OVERLAP
+from symbolic.contact.registry import command_model
 from symbolic.records import Uncertainty, Workcell
 
 LEADER, FOLLOWER = 0, 1
@@ -59,20 +58,12 @@ def worst_cases(workcell: Workcell, uncertainty: Uncertainty, leader: int = 0) -
     Args:
         leader: index of the robot whose force is not commanded.
     """
-    case, off = nominal_case(workcell), uncertainty.pad_position
-    case[0:2] = least_friction(workcell, uncertainty)
+    case = nominal_case(workcell)
+    case[0:2] = command_model(workcell).least_friction(uncertainty)
     case[4] *= 1.0 + uncertainty.mass
     case[16 - leader] = uncertainty.tracking
     case[17] = uncertainty.opposed_force
-    centre = uncertainty.centre_of_mass
-    places = [np.zeros(4)]
-    if not workcell.has_opposite_pads:
-        off += uncertainty.apart / 2.0
-        signs = product((-1.0, 1.0) if off > 0.0 else (0.0,), repeat=4)
-        places = [off * np.array(at) for at in signs]
-    else:
-        normal = workcell.contacts[0].T_box_pad[:3, 2]
-        centre = centre + off * np.sqrt(np.maximum(1.0 - normal**2, 0.0))
+    centre, places = command_model(workcell).worst_displacements(uncertainty)
     ranges = np.concatenate([centre, uncertainty.disturbance])
     corners = product(*[(-width, width) if width > 0.0 else (0.0,) for width in ranges])
     return np.array(
@@ -82,15 +73,6 @@ def worst_cases(workcell: Workcell, uncertainty: Uncertainty, leader: int = 0) -
             for place in places
         ]
     )
-
-
-def least_friction(workcell: Workcell, uncertainty: Uncertainty) -> Array:
-    """(2,) coefficients of friction that stand for the worst of a set, zero or less for none."""
-    friction = np.array([contact.friction for contact in workcell.contacts])
-    left = np.tan(np.arctan(friction * (1.0 - uncertainty.friction)) - uncertainty.turned)
-    if workcell.has_opposite_pads:
-        left -= (2.0 * uncertainty.pad_position + uncertainty.apart) / workcell.pad_distance
-    return np.asarray(left)
 
 
 def random_cases(
@@ -117,23 +99,6 @@ def _in_discs(rng: np.random.Generator, radius: float, n: int, discs: int) -> Ar
     angle = rng.uniform(0.0, 2.0 * np.pi, (n, discs))
     reach = radius * np.sqrt(rng.random((n, discs)))
     return np.stack([reach * np.cos(angle), reach * np.sin(angle)], axis=2)
-
-
-def check_pads(workcell: Workcell) -> None:
-    """Refuse pads that cannot hold whatever happens.
-
-    Raises:
-        SettingsError: some cases cannot be held, however hard both press.
-    """
-    if not workcell.has_opposite_pads:
-        return  # a grasp that is not closed is refused where its squeeze is looked for
-    friction = min(contact.friction for contact in workcell.contacts)
-    room = PATCH_OVERLAP * friction * workcell.pad_distance
-    if workcell.pad_offset >= room:
-        raise SettingsError(
-            f"the contacts lie {workcell.pad_offset:g} m beside one another; robust forces "
-            f"need less than {room:g} m, so that pressing harder holds whatever happens"
-        )
 
 
 @dataclass(frozen=True)

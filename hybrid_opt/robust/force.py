@@ -23,19 +23,17 @@ from codegen.function import NumericFunction
 from hybrid_opt.carry import Carry
 from hybrid_opt.compiled_cell import held_function, kept_per_workcell
 from hybrid_opt.robust.cases import (
-    check_pads,
-    least_friction,
     nominal_case,
     random_cases,
     ruling_cases,
     worst_cases,
 )
 from symbolic.array import Array, Count, Figure, Pair, Row, Shape, evenly
+from symbolic.contact.registry import command_model
 from symbolic.contact.worst_cases import (
     GraspSqueeze,
     case_slack_function,
     case_squeeze_function,
-    least_distance,
 )
 from symbolic.errors import SettingsError
 from symbolic.records import Uncertainty, Workcell
@@ -51,10 +49,6 @@ FEW, RULING = 3, 4
 """Samples at which cases that may ask for most are looked for, and how many at each."""
 
 BISECTIONS = 30
-DISPLACED = 0.2
-"""Displacement of pads anywhere, over the least distance of two pads of different robots,
-up to which forces are looked for."""
-
 LARGEST_FACTOR, FACTOR_ERROR = 20.0, 1e-6
 """The largest multiple of a set that is looked for, and how far off one that is found may be."""
 
@@ -193,13 +187,14 @@ class RobustModel:
             SettingsError: some cases cannot be held, however hard the pads press.
             DualArmError: a function cannot be built.
         """
-        check_pads(workcell)
+        if problem := command_model(workcell).problem:
+            raise SettingsError(": ".join(problem))
         self.workcell = workcell
         self._load = load
         self._functions: dict[tuple[object, ...], NumericFunction] = {}
         # Many motions are asked about under a few sets.
         self._worst = lru_cache(maxsize=8)(self._checked_cases)
-        self._one = workcell.has_scalar_squeeze
+        self._one = command_model(workcell).has_scalar_squeeze
         if self._one:
             self._squeeze(1, displaced=True)
             self._squeeze(1, displaced=False)
@@ -482,10 +477,8 @@ def allowed_factor(workcell: Workcell, uncertainty: Uncertainty) -> float:
 def _leaves_something(workcell: Workcell, uncertainty: Uncertainty) -> bool:
     """Whether friction, patches, mass and force are left in the worst case."""
     shares = [1.0 - uncertainty.mass, 1.0 - uncertainty.tracking]
-    left = [*least_friction(workcell, uncertainty), *shares]
-    if not workcell.has_opposite_pads:
-        off = uncertainty.pad_position + uncertainty.apart / 2.0
-        left.append(DISPLACED * least_distance(workcell) - off)
+    model = command_model(workcell)
+    left = [*model.least_friction(uncertainty), model.room_for_displacements(uncertainty), *shares]
     return bool(min(left) > 0.0)
 
 

@@ -31,6 +31,7 @@ from hybrid_opt.robust.force import (
     robust_model,
 )
 from symbolic.array import Array
+from symbolic.contact.registry import command_model
 from symbolic.contact.worst_cases import (
     case_difference_function,
     case_gradient_function,
@@ -95,7 +96,7 @@ class RobustPath:
                 friction.
             DualArmError: a function cannot be built.
         """
-        if not workcell.has_scalar_squeeze:
+        if not command_model(workcell).has_scalar_squeeze:
             raise SettingsError(
                 "limits and slopes of robust forces need two pads with opposite normals"
             )
@@ -210,7 +211,7 @@ class RulingForce:
         """
         model = robust_model(carry.workcell)
         self._workcell, self._leader = model.workcell, leader
-        self._squeezed = model.workcell.has_scalar_squeeze
+        self._squeezed = command_model(model.workcell).has_scalar_squeeze
         needed = model.commanded(carry, carry.workcell.uncertainty, leader)
         few = np.flatnonzero(needed >= (1.0 - TIED) * needed.max())
         cases = worst_cases(model.workcell, carry.workcell.uncertainty, leader)

@@ -28,7 +28,7 @@ from hybrid_opt.robust.force import (
 from symbolic.array import Array
 from symbolic.contact.grasp import Grasp
 from symbolic.errors import SettingsError
-from symbolic.records import Allocation, Uncertainty, Workcell
+from symbolic.records import Uncertainty, Workcell
 
 LARGEST_FACTOR = 10.0
 SMOOTHING = 0.1
@@ -68,14 +68,6 @@ class SqueezeSettings:
             raise SettingsError(
                 f"smoothing over {self.smoothing:g} s: allowed is {2.0 * STEP:g} to 10 s"
             )
-
-
-DRIVEN = "pads that choose their pressure, by moments commanded at both wrists"
-PADS: dict[Allocation, str] = {
-    "paper": DRIVEN,
-    "soft-finger": "pads that press evenly, on arms that keep their orientation",
-}
-"""What the planned forces of each allocation are of."""
 
 
 @dataclass(frozen=True)

@@ -52,6 +52,7 @@ from hybrid_opt.timing.records import (
 )
 from hybrid_opt.timing.solve import time_path
 from symbolic.array import Array
+from symbolic.contact.registry import command_model
 from symbolic.records import Workcell
 
 if TYPE_CHECKING:
@@ -119,7 +120,7 @@ def time_with_jerk(
 def applicable_jerk_limits(workcell: Workcell, limits: TimingLimits) -> JerkLimits | None:
     """Return the cell's limits on jerk for timings within `limits`; None without any, or if limited
     robust forces have no slopes."""
-    slopes = workcell.has_scalar_squeeze or not limits.robust
+    slopes = command_model(workcell).has_scalar_squeeze or not limits.robust
     return JerkLimits.from_workcell(workcell) if slopes else None
 
 

@@ -24,6 +24,7 @@ from hybrid_opt.timing.records import (
     limit_place,
 )
 from symbolic.array import Array
+from symbolic.contact.registry import command_model, contact_model
 from symbolic.errors import SettingsError
 from symbolic.functions import TIMING_TOLERANCE
 from symbolic.limits import LIMITS, Limit, limits_of_block
@@ -103,7 +104,7 @@ class PathLimits:
     """Limits of a path at samples, as functions of (u'', u'^2) over the limits.
 
     Speeds are in `squared_speed_limit`. Robust forces of pads without one squeeze
-    (`Workcell.has_scalar_squeeze`) are among the ratios.
+    (`ContactModel.has_scalar_squeeze`) are among the ratios.
 
     Attributes:
         motion: geometry of the path at the samples.
@@ -112,7 +113,7 @@ class PathLimits:
     def __init__(self, model: TimingModel, motion: PathMotion, limits: TimingLimits) -> None:
         self.motion, self._model, self._limits = motion, model, limits
         workcell = model.workcell
-        self._squeezed = limits.robust and workcell.has_scalar_squeeze
+        self._squeezed = limits.robust and command_model(workcell).has_scalar_squeeze
         self._grasped = limits.robust and not self._squeezed
 
     def joint_accelerations(self) -> tuple[Array, Array]:
@@ -276,7 +277,9 @@ def _near_limit(carry: Carry, workcell: Workcell, limits: TimingLimits) -> Array
     Robust forces below `EXACT_FORCE_ABOVE` of the limit and below the carry's largest are replaced
     by the planned ones, which takes a fraction of the time.
     """
-    if not limits.robust or limits.force is None or not workcell.has_scalar_squeeze:
+    if not limits.robust or limits.force is None:
+        return limited_force(carry, workcell, limits)
+    if not command_model(workcell).has_scalar_squeeze:
         return limited_force(carry, workcell, limits)
     n = len(carry)
     points = PathPoints(carry.pose, carry.rate, carry.second_rate, np.zeros(n), np.ones(n))
@@ -305,7 +308,7 @@ def _robust_forces_above(
 
 def has_pressure_limit(workcell: Workcell, limits: TimingLimits) -> bool:
     """Return True if the pressure's shift is a limit."""
-    return limits.pressure and workcell.task.allocation == "paper"
+    return limits.pressure and contact_model(workcell).has_pressure_limit
 
 
 def check_limits(

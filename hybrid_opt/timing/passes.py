@@ -31,6 +31,7 @@ from hybrid_opt.timing.records import (
     limit_place,
 )
 from symbolic.array import Array
+from symbolic.contact.registry import command_model, contact_model
 from symbolic.limits import LIMIT_NAMES, limit_layout, passes_enumeration
 from symbolic.read.arms import arm_model
 from symbolic.records import Robot, Workcell
@@ -76,11 +77,11 @@ class ForwardBackwardPasses:
         first, second = compiled.workcell.robots
         self.joint_names = (joint_names(first), joint_names(second))
         self._passes = forward_backward_passes(compiled, intervals)
+        self._has_scalar_squeeze = command_model(self.workcell).has_scalar_squeeze
 
     def supports(self, limits: TimingLimits) -> bool:
-        """Return True if the passes impose these limits: they need contact wrenches that follow
-        from the load alone, and for robust forces pads with one squeeze."""
-        return self._passes is not None and (self.workcell.has_scalar_squeeze or not limits.robust)
+        """Return True if the passes impose these limits: robust forces need a scalar squeeze."""
+        return self._has_scalar_squeeze or not limits.robust
 
     def time(self, paths: Mapping[str, Array], limits: Sequence[TimingLimits]) -> list[PathTiming]:
         """Compute the fastest timings of paths, each within its own limits.
@@ -293,7 +294,7 @@ PASS_STATUSES = (
 
 def forward_backward_passes(
     compiled: CompiledCell, intervals: int, cuts: int = 0
-) -> NumericFunction | None:
+) -> NumericFunction:
     """Load or build the timing of one path from its limits by a backward and a forward pass.
 
     Inputs: samples (2 intervals + 1, `symbolic.limits.limit_layout`) at both ends and the middle of
@@ -310,16 +311,12 @@ def forward_backward_passes(
 
     Args:
         cuts: lines per sample that the caller adds.
-
-    Returns:
-        The function; None if limits do not determine the contact wrenches.
     """
-    workcell, cache = compiled.workcell, compiled.cache
-    if workcell.has_opposite_pads and not workcell.has_closed_form:
-        return None  # among wrenches of the same effort the load function keeps the paper's
     details = (str(intervals), str(cuts), source_digest(__name__, "symbolic.limits"), _passes_c())
     key = compiled.key("path timing", *details, bodies=False)
-    made = load_or_compile(key, lambda: _source(compiled.symbols.workcell, intervals, cuts), cache)
+    made = load_or_compile(
+        key, lambda: _source(compiled.symbols.workcell, intervals, cuts), compiled.cache
+    )
     return compiled.bound(made)
 
 
@@ -351,7 +348,7 @@ def _source(workcell: Workcell, intervals: int, cuts: int) -> tuple[Signature, s
     }
     held = sx_parameters(workcell.payload)
     # Both ends of an interval take the time of one; programs of forces are no straight code.
-    pairs = (helpers[0], helpers[2]) if workcell.has_closed_form else ()
+    pairs = (helpers[0], helpers[2]) if contact_model(workcell).has_closed_form else ()
     constants["IN_PAIRS"] = int(bool(pairs))
     text = "".join(
         [

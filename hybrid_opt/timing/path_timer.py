@@ -72,8 +72,7 @@ class PathTimer:
         self._path, self._limits = paths["path"], sample_limits_set(compiled, lanes)
         self.passes = ForwardBackwardPasses(compiled, intervals, threads)
         # Made here: the cell's files may be gone when the first path is timed.
-        robust = TimingLimits(force=1.0, robust=True)
-        has_all = self.passes.supports(TimingLimits()) and self.passes.supports(robust)
+        has_all = self.passes.supports(TimingLimits(force=1.0, robust=True))
         self._model = None if has_all else TimingModel(compiled, intervals)
 
     def path_limits(self, x: Array) -> dict[str, Array]:

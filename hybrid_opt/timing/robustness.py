@@ -28,6 +28,7 @@ from hybrid_opt.timing.model import REFINEMENT, TimingModel
 from hybrid_opt.timing.records import FRICTION, Timing, TimingLimits
 from symbolic.array import Array
 from symbolic.contact.elastic import free_shift, pressure_shifts
+from symbolic.contact.registry import contact_model
 from symbolic.errors import SettingsError
 from symbolic.records.poses import box_rotation
 
@@ -163,7 +164,7 @@ def _even_margins(model: TimingModel, carry: Carry) -> list[Margin]:
     """Return how far the pressure of each pad may still shift at its largest shift on the carry,
     before an elastic pad lifts off at a rim; nominal without any shift."""
     workcell = model.workcell
-    if workcell.task.allocation != "soft-finger":
+    if not contact_model(workcell).has_elastic_layers:
         return []
     load = model.load(carry.pose, carry.rate, carry.second_rate)
     turned = box_rotation(workcell.task.orientation, carry.pose)

@@ -47,6 +47,7 @@ from hybrid_opt.witness.scene import LARGEST_STEP, ArmSettings, Pads, Simulation
 from studies.options import DRIVEN, PADS
 from studies.report.looks import Film, write_animation
 from symbolic.array import Array
+from symbolic.contact.registry import contact_model
 from symbolic.records import Workcell
 
 
@@ -237,10 +238,10 @@ def simulate_file(options: argparse.Namespace) -> int:
     stored = read_trajectory(options.file)
     with TemporaryDirectory() as folder:
         cell = stored.open_cell(Path(folder))
-        if options.controller == DRIVEN and cell.workcell.task.allocation == "soft-finger":
+        if options.controller == DRIVEN and not contact_model(cell.workcell).has_pressure_limit:
             raise WitnessError(
-                "pads that are driven by planned moments are what the allocation 'paper' assumes; "
-                "this carry's pads press evenly: give another --controller"
+                "planned moments at the wrists belong to pads that choose their pressure; this "
+                f"carry is of {contact_model(cell.workcell).assumption}: give another --controller"
             )
         progress = Progress()
         build_study(cell, progress, polish=False, drivable=False)

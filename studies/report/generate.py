@@ -31,7 +31,6 @@ from hybrid_opt.campaign.results import read_campaign
 from hybrid_opt.display.scene import PLOTLY, THREE, asset, embedded_json
 from hybrid_opt.display.table import Table, counted, number
 from hybrid_opt.progress import Progress
-from hybrid_opt.robust.squeeze import PADS
 from hybrid_opt.store.files import to_json, write_atomically
 from hybrid_opt.timing.analysis import TimingDocument, stored_timing
 from hybrid_opt.workers import LocalWorkers, Workers
@@ -43,6 +42,7 @@ from studies.report.page_carries import RECOMMENDED_LABEL, phases
 from studies.report.page_data import page_document
 from studies.study.summary import read_summary
 from studies.study.tables import margins, study_tables, timings
+from symbolic.contact.registry import contact_model
 
 BEGIN = "<!-- measured: begin -->"
 END = "<!-- measured: end -->"
@@ -359,10 +359,10 @@ def _facts(data: ReportData) -> str:
 
 def _assumed(data: ReportData) -> str:
     """Which pads the forces of both experiments are of."""
-    said = f"The forces of this experiment are of {PADS[data.workcell.task.allocation]}."
+    said = f"The forces of this experiment are of {contact_model(data.workcell).assumption}."
     if data.drivable is None:
         return said
-    return f"{said} What robots drive is of {PADS[data.drivable.workcell.task.allocation]}."
+    return f"{said} What robots drive is of {contact_model(data.drivable.workcell).assumption}."
 
 
 def _picture(png: bytes, caption: str) -> str:

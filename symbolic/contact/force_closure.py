@@ -320,6 +320,15 @@ def _shape(pad: Contact) -> Array:
     return np.array([patch.twist, *np.diag(patch.spread)])
 
 
+def least_distance(workcell: Workcell) -> float:
+    """Least distance between two pads of different robots [m]."""
+    places = [
+        np.array([pad.T_box_pad[:3, 3] for pad in (contact, *contact.further)])
+        for contact in workcell.contacts
+    ]
+    return float(np.linalg.norm(places[0][:, None] - places[1], axis=2).min())
+
+
 def smaller_patches(workcell: Workcell, share: float) -> Workcell:
     """The cell with smaller patches about the same places."""
 

@@ -1,20 +1,18 @@
-"""What one sample of the box motion asks of the two contacts, as one CasADi function.
+"""The contact forces at one sample of the box motion, as one CasADi function.
 
-Joins rotation, force allocation and centre of pressure (paper Section 4.4). The allocation `paper`,
-and `soft-finger` on two pads with opposite normals, have closed forms (`held_by`). The forces of
-other pads are found by the program of `symbolic.contact.grasp`.
+Joins rotation, contact forces and centres of pressure (paper Section 4.4). The contact model gives
+the forces as an expression, or the program of `symbolic.contact.grasp` finds them.
 """
 
 from __future__ import annotations
-
-from dataclasses import dataclass
 
 import casadi as ca
 
 from symbolic.contact.force_closure import WRENCH_SIZE
 from symbolic.contact.grasp import Grasp, grasp_wrenches
-from symbolic.contact.paper import Both, allocate, pressure_shift, required_force, required_moment
-from symbolic.contact.soft_finger import Detached, SoftPatch, least_soft_squeeze
+from symbolic.contact.model import ContactLoad
+from symbolic.contact.paper import required_force, required_moment
+from symbolic.contact.registry import contact_model
 from symbolic.expression import (
     Expression,
     as_mx,
@@ -24,113 +22,7 @@ from symbolic.expression import (
     sx_parameters,
 )
 from symbolic.path.rotation import angular_acceleration, angular_velocity, rotation_matrix
-from symbolic.records import Allocation, Workcell
-
-
-@dataclass(frozen=True)
-class ContactLoad:
-    """The load that two contacts bear; all vectors along the same axes, the world's for instance.
-
-    Attributes:
-        force, moment: (3,) on the payload, about its centre of mass [N, N m].
-        arms: (3,) each, from there to the nominal contact points [m].
-        axes: (3, 3) tangents and normal of contact 1 as columns.
-        friction: (2,) Coulomb coefficients.
-    """
-
-    force: Expression
-    moment: Expression
-    arms: Both
-    axes: Expression
-    friction: Expression
-
-
-@dataclass(frozen=True)
-class HeldLoad:
-    """How two contacts bear a load.
-
-    Attributes:
-        normal, tangential: (2,) normal forces and magnitudes of the tangential ones [N].
-        forces: (3,) each, on the payload [N].
-        shifts: (3,) each, of the centres of pressure [m].
-        moments: (3,) each, on the payload about the nominal contact points [N m].
-        point_residual, residual: (3,) moment missing with the forces at the nominal points, and
-            with the moments [N m].
-    """
-
-    normal: Expression
-    tangential: Expression
-    forces: Both
-    shifts: Both
-    moments: Both
-    point_residual: Expression
-    residual: Expression
-
-    @property
-    def wrenches(self) -> Both:
-        """(6,) each, force and moment."""
-        first, second = (ca.vertcat(*pair) for pair in zip(self.forces, self.moments, strict=True))
-        return first, second
-
-
-def held_by(
-    workcell: Workcell, allocation: Allocation, asked: ContactLoad, detached: Detached | None = None
-) -> HeldLoad:
-    """The least contact forces: of the paper, or of soft fingers.
-
-    Args:
-        workcell: whose contacts these are.
-        allocation: 'paper' or 'soft-finger'.
-        asked: what the contacts have to give.
-        detached: see `symbolic.contact.soft_finger.Detached`.
-    """
-    if allocation == "paper":
-        return _by_paper(asked)
-    return _by_soft_fingers(workcell, asked, detached)
-
-
-def _by_paper(asked: ContactLoad) -> HeldLoad:
-    """Least forces first; then the least shifts of the pressure that carry the moment."""
-    axes, mu = asked.axes, asked.friction
-    normal, tangential, forces = allocate(asked.force, axes[:, 2], (mu[0], mu[1]))
-    tangents = axes[:, 0], axes[:, 1]
-    shifts, point, residual = pressure_shift(asked.moment, asked.arms, forces, tangents)
-    moments = ca.cross(shifts[0], forces[0]), ca.cross(shifts[1], forces[1])
-    return HeldLoad(normal, tangential, forces, shifts, moments, point, residual)
-
-
-def _by_soft_fingers(workcell: Workcell, asked: ContactLoad, detached: Detached | None) -> HeldLoad:
-    """Pads that press evenly: no shift, torsion in proportion to what either can carry."""
-    axes = asked.axes
-    in_box = workcell.contacts[0].T_box_pad[:3, :3]
-    patches = [SoftPatch.of(contact, in_box) for contact in workcell.contacts]
-    arms = [ca.mtimes(axes.T, arm) for arm in asked.arms]
-    held = least_soft_squeeze(
-        ca.mtimes(axes.T, asked.force),
-        ca.mtimes(axes.T, asked.moment),
-        (arms[0], arms[1]),
-        asked.friction,
-        (patches[0], patches[1]),
-        workcell.has_offset_pads,
-        detached,
-    )
-    force_1 = ca.mtimes(axes, ca.vertcat(held.tangent_1, held.normal[0]))
-    force_2 = ca.mtimes(axes, ca.vertcat(held.tangent_2, -held.normal[1]))
-    share = held.torsion / ca.fmax(ca.sum1(held.capacity), 1e-300)
-    moment_1, moment_2 = (axes[:, 2] * held.capacity[i] * share for i in (0, 1))
-    point = asked.moment - ca.cross(asked.arms[0], force_1) - ca.cross(asked.arms[1], force_2)
-    tangential = [ca.sqrt(ca.sumsqr(t) + 1e-24) for t in (held.tangent_1, held.tangent_2)]
-    none = ca.SX.zeros(3)
-    return HeldLoad(
-        held.normal,
-        ca.vertcat(*tangential),
-        (force_1, force_2),
-        (none, none),
-        (moment_1, moment_2),
-        point,
-        point - moment_1 - moment_2,
-    )
-
+from symbolic.records import Workcell
 
 LOAD_OUTPUTS = (
     "angular_velocity",
@@ -179,7 +71,7 @@ def load_function(workcell: Workcell) -> ca.Function:
     """
     payload = workcell.payload
     own: list[Expression] = [frictions(workcell), ca.SX(number(payload.centre_of_mass))]
-    if workcell.has_closed_form:
+    if contact_model(workcell).has_closed_form:
         kind, given = ca.SX, sx_parameters(payload)
     else:
         kind, given = ca.MX, mx_parameters(payload)
@@ -215,14 +107,12 @@ def uncertain_load_function(workcell: Workcell) -> ca.Function:
     Inputs: pose, rate, second_rate (6,); friction (2,) coefficients of the contacts;
     centre_of_mass (3,) in the box frame [m]. Outputs: see `LOAD_OUTPUTS`.
     """
-    if workcell.has_closed_form:
-        return closed_load_function(workcell, workcell.task.allocation)
+    if contact_model(workcell).has_closed_form:
+        return _closed_load_function(workcell)
     return _grasp_load_function(workcell)
 
 
-def closed_load_function(workcell: Workcell, allocation: Allocation) -> ca.Function:
-    """`uncertain_load_function` by an allocation with a closed form, whatever the workcell's own
-    is."""
+def _closed_load_function(workcell: Workcell) -> ca.Function:
     inputs = {name: ca.SX.sym(name, size) for name, size in SIZES.items()}
     pose, rate, second, friction, centre_of_mass = inputs.values()
     contacts = workcell.contacts
@@ -230,9 +120,8 @@ def closed_load_function(workcell: Workcell, allocation: Allocation) -> ca.Funct
     points = [number(contact.T_box_pad[:3, 3]) for contact in contacts]
     arms = [ca.mtimes(rotation, point - centre_of_mass) for point in points]
     axes = ca.mtimes(rotation, number(contacts[0].T_box_pad[:3, :3]))
-    held = held_by(
-        workcell, allocation, ContactLoad(force, moment, (arms[0], arms[1]), axes, friction)
-    )
+    load = ContactLoad(force, moment, (arms[0], arms[1]), axes, friction)
+    held = contact_model(workcell).hold(load)
     outputs = {
         "angular_velocity": omega,
         "angular_acceleration": alpha,

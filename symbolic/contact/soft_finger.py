@@ -24,20 +24,22 @@ Coordinates: tangents a, b and normal n = a x b of contact 1. Forces in N, lengt
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TypeAlias
 
 import casadi as ca
 import numpy as np
 
 from symbolic.array import Array
+from symbolic.contact.model import Both, ImplicitVariables
 from symbolic.expression import Expression, number
 from symbolic.records import Contact
 from symbolic.records.numbered import NumberedContact
 
 NEWTON_STEPS = 3
 """Newton steps for given tangential forces, from `_first_grip`: relative errors of forces are then
-below 1e-6, of pads of one size 1e-9. One less where results take two more, see `Detached`."""
+below 1e-6, of pads of one size 1e-9. One less where results take two more, see
+`symbolic.contact.model.ImplicitVariables`."""
 
 LEAST_GRIP = 0.05
 """Least grip that these start from, as a share of what the first pad would need for all torsion:
@@ -61,47 +63,6 @@ FORCE_FLOOR = 1e-9
 
 Load: TypeAlias = tuple[Expression, Expression, Expression]
 """Tangential force (2,) of each contact [N], and the torsion that both carry together [N m]."""
-
-Both: TypeAlias = tuple[Expression, Expression]
-"""One value per pad."""
-
-
-@dataclass
-class Detached:
-    """Receives what was solved for, as a symbol and its value. Results then depend on the symbol;
-    replace it afterwards.
-
-    Attributes:
-        steps: of Newton's method from the symbol to what the results depend on. With one, first
-            derivatives are exact although they take the symbol for a constant; with two, second
-            derivatives as well. None for results without derivatives.
-    """
-
-    steps: int = 2
-    _found: list[tuple[ca.SX, ca.SX]] = field(default_factory=list)
-
-    def detach(self, value: ca.SX) -> ca.SX:
-        """The symbol of what was solved for."""
-        symbol = ca.SX.sym("solved")
-        self._found.append((symbol, value))
-        return symbol
-
-    @property
-    def symbols(self) -> ca.SX:
-        """(k,) all symbols."""
-        return ca.vertcat(ca.SX(0, 1), *[symbol for symbol, _ in self._found])
-
-    @property
-    def values(self) -> ca.SX:
-        """(k,) what they stand for."""
-        return ca.vertcat(ca.SX(0, 1), *[value for _, value in self._found])
-
-    def replaced(self, outputs: list[Expression]) -> list[Expression]:
-        """Outputs with what was solved for in the symbols' place."""
-        if not self._found:
-            return outputs
-        found: list[Expression] = ca.substitute(outputs, [self.symbols], [self.values])
-        return list(ca.cse(found))
 
 
 @dataclass(frozen=True)
@@ -199,7 +160,7 @@ def least_soft_squeeze(
     friction: Expression,
     patches: tuple[SoftPatch, SoftPatch],
     offset: bool = False,
-    detached: Detached | None = None,
+    implicit: ImplicitVariables | None = None,
 ) -> SoftFingers:
     """The least normal forces that hold.
 
@@ -210,7 +171,7 @@ def least_soft_squeeze(
         patches: of both pads.
         offset: whether the contacts may lie beside one another, seen along n; tangential forces
             and torsion then depend on the squeeze.
-        detached: see `Detached`; without effect where `offset` is set.
+        implicit: see `symbolic.contact.model.ImplicitVariables`; without effect with `offset`.
     """
     apart = arms[0] - arms[1]
     # About the middle of the contacts: apart x half the difference of both forces, and torsion.
@@ -227,7 +188,7 @@ def least_soft_squeeze(
 
     squeeze = ca.fabs(force[2]) if offset else ca.SX(0.0)
     load = shared(squeeze)
-    normal, capacity = _pressed(load, force[2], friction, patches, None if offset else detached)
+    normal, capacity = _pressed(load, force[2], friction, patches, None if offset else implicit)
     # The least squeeze for what a squeeze asks is a convex function of it: secants reach the one
     # that asks for itself.
     before = squeeze
@@ -250,7 +211,7 @@ def _pressed(
     difference: Expression,
     friction: Expression,
     patches: tuple[SoftPatch, SoftPatch],
-    detached: Detached | None,
+    implicit: ImplicitVariables | None,
 ) -> tuple[Expression, Expression]:
     """Least normal forces (2,) [N] and torsion capacities (2,) [N m] for given tangential forces.
 
@@ -258,7 +219,7 @@ def _pressed(
         load: tangential force (2,) of each contact, and the torsion.
         difference: N_1 - N_2.
         friction, patches: of both pads.
-        detached: see `Detached`.
+        implicit: see `symbolic.contact.model.ImplicitVariables`.
     """
     *tangents, torsion = load
     asked, squares = ca.fabs(torsion), [_squared(tangent) for tangent in tangents]
@@ -291,13 +252,13 @@ def _pressed(
         missing = asked - carried - carried_too
         return ca.fmax(grip + missing * below / (slope + LEVER_FLOOR * below), FORCE_FLOOR)
 
-    more = detached.steps if detached is not None else 0
+    more = implicit.steps if implicit is not None else 0
     beginning = other_grip_squared(in_order([ca.sqrt(square) for square in squares])[0])
     grip = _first_grip(asked, (twist, half), share, squared, beginning)
     for _ in range(NEWTON_STEPS - max(0, more - 1)):
         grip = newton(grip)
-    if detached is not None:
-        grip = detached.detach(grip)
+    if implicit is not None:
+        grip = implicit.detach(grip)
     for _ in range(more):
         grip = newton(grip)
     bound = ca.sqrt(grip**2 + squared[0])

@@ -11,8 +11,9 @@ known. Whatever wrenches of all pads then carry the load, an internal squeeze ca
 that presses this robot's pads harder, so that with more than its least force the load is held as
 well.
 
-Pads press evenly in every case, about their displaced places: arms that command a normal force
-alone have no other pads, whatever the contact model of the plan.
+The contact model of what is commanded decides (`ContactModel.command_model`): arms that command a
+normal force alone have pads that press evenly, about their displaced places, whatever the plan
+takes them for.
 
 What is commanded is more: a share of it may be missing, and the arms may work against one another.
 With N a pad's least normal force, e the missing share and T the opposed tangential force, it is
@@ -28,7 +29,6 @@ from itertools import accumulate
 from typing import Any
 
 import casadi as ca
-import numpy as np
 
 from symbolic.contact.central_path import least
 from symbolic.contact.force_closure import (
@@ -39,7 +39,8 @@ from symbolic.contact.force_closure import (
 )
 from symbolic.contact.grasp import BEYOND, SCALE_FLOOR, Grasp
 from symbolic.contact.load import required
-from symbolic.contact.soft_finger import Detached, SoftPatch, least_soft_squeeze
+from symbolic.contact.model import ContactLoad, ImplicitVariables
+from symbolic.contact.registry import command_model
 from symbolic.expression import (
     Expression,
     as_mx,
@@ -108,11 +109,11 @@ def case_gradient_function(
     squeeze, inputs = _asked(workcell, commanded)
     by = [*inputs.values()] if numbers else [inputs[name] for name in MOTION]
     if squeeze is None:
-        detached = Detached()
+        implicit = ImplicitVariables()
         # Pads that are moved alone lie beside one another then.
-        force = _least_force(workcell, None, inputs, detached, True, displaced=numbers)
+        force = _least_force(workcell, None, inputs, implicit, True, displaced=numbers)
         slope = ca.densify(ca.horzcat(*[ca.jacobian(force, part) for part in by]).T)
-        found = detached.replaced([force, slope])
+        found = implicit.replaced([force, slope])
     else:
         beside, own = ca.MX.sym("beside", LOAD_SIZE), len(inputs) - len(squeeze.given)
         force = _least_force(workcell, squeeze, inputs, differentiable=True, beside=beside)
@@ -134,10 +135,10 @@ def case_slopes_function(workcell: Workcell) -> ca.Function:
     pose, first, second, a, w = path.values()
     # A root has no slope at rest, what follows from its square has.
     motion = (pose, first * ca.sqrt(w + SQUARED_SPEED_FLOOR), first * a + second * w)
-    detached, driven = Detached(), inputs | dict(zip(MOTION, motion, strict=True))
-    force = _least_force(workcell, None, driven, detached)
+    implicit, driven = ImplicitVariables(), inputs | dict(zip(MOTION, motion, strict=True))
+    force = _least_force(workcell, None, driven, implicit)
     slope = ca.densify(ca.jacobian(force, ca.vertcat(*path.values())).T)
-    found = detached.replaced([force, slope])
+    found = implicit.replaced([force, slope])
     outputs = dict(zip(("normal_force", "slope"), found, strict=True))
     inputs = path | {name: inputs[name] for name in inputs if name not in MOTION}
     return named_function("case_slopes", inputs, outputs, cse=False)
@@ -158,7 +159,9 @@ def case_slack_function(workcell: Workcell, commanded: int = 1) -> ca.Function:
     Where it is positive, one pressure that is known holds the case; elsewhere
     `case_squeeze_function` knows. It takes a thirtieth of that one's time.
     """
-    squeeze = None if workcell.has_scalar_squeeze else GraspSqueeze(workcell, commanded)
+    squeeze = (
+        None if command_model(workcell).has_scalar_squeeze else GraspSqueeze(workcell, commanded)
+    )
     given = sx_parameters(workcell.payload) if squeeze is None else squeeze.given
     inputs, force = _inputs(ca.SX, given), ca.SX.sym("force")
     case = inputs["case"]
@@ -183,7 +186,7 @@ def _asked(
     workcell: Workcell, commanded: int = 1
 ) -> tuple[GraspSqueeze | None, dict[str, Expression]]:
     """The program of pads anywhere, and the inputs of functions of a cell's least force."""
-    if workcell.has_scalar_squeeze:
+    if command_model(workcell).has_scalar_squeeze:
         return None, _inputs(ca.SX, sx_parameters(workcell.payload))
     squeeze = GraspSqueeze(workcell, commanded)
     return squeeze, _inputs(ca.MX, mx_symbols(squeeze.given))
@@ -199,12 +202,12 @@ def _least_force(
     workcell: Workcell,
     squeeze: GraspSqueeze | None,
     inputs: dict[str, Expression],
-    detached: Detached | None = None,
+    implicit: ImplicitVariables | None = None,
     differentiable: bool = False,
     displaced: bool = False,
     beside: Expression | float = 0.0,
 ) -> Expression:
-    """(2,) normal forces to command [N] of pads that press evenly.
+    """(2,) normal forces to command [N].
 
     Args:
         beside: load (6,) about the box frame's origin beside that of the case, of pads anywhere.
@@ -216,11 +219,9 @@ def _least_force(
         load = _origin_load(workcell, inputs)
         load = load if isinstance(beside, float) else load + beside
         return _to_command_of(squeeze, load, case, handed, differentiable)
-    axes = workcell.contacts[0].T_box_pad[:3, :3]
-    first, second = (SoftPatch.of(contact, axes) for contact in workcell.contacts)
-    needed = case_in_pad_axes(workcell, [inputs[name] for name in MOTION], case)
-    offset = displaced or workcell.has_offset_pads
-    held = least_soft_squeeze(*needed, friction, (first, second), offset, detached)
+    force, moment, arms = case_in_pad_axes(workcell, [inputs[name] for name in MOTION], case)
+    asked = ContactLoad(force, moment, arms, ca.SX(ca.DM.eye(3)), friction)
+    held = command_model(workcell).hold(asked, implicit, displaced)
     return ca.densify(_to_command(held.normal, case))
 
 
@@ -313,15 +314,6 @@ def _to_command_of(
     # One entry after the other: a scalar times a vector repeats it by a form without lanes.
     force += ca.vertcat(*[more * shares[i] for i in (0, 1)])
     return force
-
-
-def least_distance(workcell: Workcell) -> float:
-    """Least distance between two pads of different robots [m]."""
-    places = [
-        np.array([pad.T_box_pad[:3, 3] for pad in (contact, *contact.further)])
-        for contact in workcell.contacts
-    ]
-    return float(np.linalg.norm(places[0][:, None] - places[1], axis=2).min())
 
 
 def _sizes_function(squeeze: GraspSqueeze) -> ca.Function:

@@ -17,7 +17,7 @@ import numpy as np
 
 from symbolic import safe_io
 from symbolic.array import Array
-from symbolic.contact.force_closure import has_force_closure
+from symbolic.contact.registry import contact_model
 from symbolic.errors import OutsideError, RobotModelError, WorkcellError
 from symbolic.read.arms import (
     arm_model,
@@ -366,46 +366,11 @@ def _check_unique(entries: list[tuple[str, str]], problems: Problems) -> None:
 
 
 def check_contacts(workcell: Workcell, problems: Problems) -> None:
-    """Check that the pads can hold the payload under any motion, as the allocation models them."""
+    """Check that the pads hold the payload under every motion."""
     if not problems.clean("contacts", "task.allocation", *SHAPE_KEYS):
         return
-    allocation, first = workcell.task.allocation, workcell.contacts[0].T_box_pad
-    if allocation == "soft-finger" and workcell.has_opposite_pads:
-        # They carry any moment by pressing harder where the line between them lies well within
-        # their friction cones.
-        friction = min(contact.friction for contact in workcell.contacts)
-        room = friction * workcell.pad_distance
-        _check_beside(workcell, room, "friction times the pads' distance", problems)
-    elif allocation == "paper":
-        if not workcell.has_facing_pads:
-            second = workcell.contacts[1].T_box_pad
-            turned = np.degrees(np.arccos(np.clip(-first[:3, 2] @ second[:3, 2], -1.0, 1.0)))
-            problems.add(
-                "contacts[1].xyz",
-                f"belongs to {len(workcell.pads)} pads, with a normal {turned:.4g} degrees off the "
-                "opposite of contacts[0]; the paper's allocation allows two round pads with "
-                "opposite normals: task.allocation = 'soft-finger' takes any",
-            )
-    elif not has_force_closure(workcell):
-        problems.add(
-            "contacts",
-            "the pads do not close their grasp: no squeeze within their friction cones holds the "
-            "payload against whatever the motion asks; allowed is enough friction (with 5 % to "
-            "spare) along the lines between them: turn them towards one another, raise friction "
-            "or add a pad (further)",
-        )
-
-
-def _check_beside(workcell: Workcell, room: float, meaning: str, problems: Problems) -> None:
-    """Check that the pads' lateral offset is less than `PATCH_OVERLAP` times `room` [m]."""
-    beside, room = workcell.pad_offset, PATCH_OVERLAP * room
-    if beside >= room:
-        problems.add(
-            "contacts[1].xyz",
-            f"faces a point {beside:g} m beside contacts[0]; task.allocation = "
-            f"{workcell.task.allocation!r} allows less than {room:g} m here, {PATCH_OVERLAP:g} of "
-            f"{meaning}",
-        )
+    if problem := contact_model(workcell).problem:
+        problems.add(*problem)
 
 
 def check_uncertainty(workcell: Workcell, problems: Problems) -> None:

@@ -17,12 +17,12 @@ import numpy as np
 import pinocchio as pin
 
 from symbolic.array import Array
+from symbolic.contact.registry import CONTACT_MODELS
 from symbolic.read.arms import FOLLOWING, arm_model, common_joints, link_frame, turning_joints
 from symbolic.read.payload import SHAPE_KEYS
 from symbolic.read.tables import TableReader, checked_vector
 from symbolic.records import (
     POSE_SIZE,
-    Allocation,
     Contact,
     Payload,
     RedundantJoint,
@@ -90,13 +90,13 @@ def read_task(table: TableReader) -> tuple[Task, tuple[RedundancyEntry, ...]]:
     return task, redundant
 
 
-def _allocation(table: TableReader, time_law: TimeLaw) -> Allocation:
+def _allocation(table: TableReader, time_law: TimeLaw) -> str:
     """Read the allocation of forces; the default is 'soft-finger' under the law 'optimal', else
     'paper'."""
     driven = time_law == "optimal"
     usual = _known_allocation(table, "allocation", "soft-finger" if driven else "paper")
     own = _known_allocation(table, "drivable_allocation", usual)
-    return cast("Allocation", own if driven else usual)
+    return own if driven else usual
 
 
 def _known_allocation(table: TableReader, key: str, usual: str) -> str:
@@ -107,7 +107,7 @@ def _known_allocation(table: TableReader, key: str, usual: str) -> str:
             "write 'soft-finger' and search, polish and time anew",
         )
         return usual
-    return table.choice(key, get_args(Allocation), usual)
+    return table.choice(key, tuple(CONTACT_MODELS), usual)
 
 
 def _check_vectors(task: Task, problems: Problems) -> None:

@@ -35,7 +35,6 @@ from symbolic.records.cell import (
 )
 from symbolic.records.task import (
     POSE_SIZE,
-    Allocation,
     AllowedContact,
     RedundantJoint,
     Task,
@@ -48,7 +47,6 @@ __all__ = [
     "POSE_SIZE",
     "SEARCHED_BRANCH",
     "USUAL_UNCERTAINTY",
-    "Allocation",
     "AllowedContact",
     "Body",
     "Box",

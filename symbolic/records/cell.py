@@ -549,8 +549,7 @@ class Workcell:
 
     @property
     def has_facing_pads(self) -> bool:
-        """True if two round pads with opposite normals hold the payload, as the paper's
-        allocation requires."""
+        """Whether two round pads with opposite normals hold the payload."""
         return self.has_opposite_pads and not any(c.half_sides for c in self.contacts)
 
     @property
@@ -578,19 +577,6 @@ class Workcell:
     def has_offset_pads(self) -> bool:
         """True if the contacts are offset laterally."""
         return self.pad_offset > OFFSET_TOLERANCE
-
-    @property
-    def has_closed_form(self) -> bool:
-        """True if the contact forces have a closed form: the paper's, and those of soft fingers on
-        two pads with opposite normals. A convex program finds all others."""
-        allocation = self.task.allocation
-        return allocation == "paper" or (allocation == "soft-finger" and self.has_opposite_pads)
-
-    @property
-    def has_scalar_squeeze(self) -> bool:
-        """True if the force of one pad determines the other's, so that one number states the
-        grasp force."""
-        return self.has_opposite_pads
 
     @property
     def pads(self) -> tuple[Contact, ...]:

@@ -22,7 +22,6 @@ from symbolic.records.poses import Orientation
 from symbolic.records.problems import Label
 
 TimeLaw = Literal["constant", "ramped", "optimal"]
-Allocation = Literal["paper", "soft-finger"]
 
 POSE_SIZE = 6
 """x, y, z [m] and three numbers of the orientation [rad], see `symbolic.records.poses`."""
@@ -105,8 +104,7 @@ class Task:
         reference_force: (2,) [N], normalises each robot's normal force.
         initial: (n_free, 6), the hand-made trajectory's free waypoints.
         allowed_contacts: contacts that are no collisions, see AllowedContact.
-        allocation: 'paper' (least forces first, then the moments) or 'soft-finger' (the least
-            forces that carry the moments as well, by pads that press evenly).
+        allocation: name of the contact model, see `symbolic.contact.registry`.
         force_limit: (2,) bounds of the force limit, the last decision variable of 'optimal' [N].
         redundant: the joints whose paths are decided beside the box's, see RedundantJoint.
         orientation: what the last three numbers of every pose mean.
@@ -122,7 +120,7 @@ class Task:
     reference_force: Annotated[Pair, quantity.FORCE, Filling()]
     initial: Array
     allowed_contacts: tuple[AllowedContact, ...] = ()
-    allocation: Allocation = "paper"
+    allocation: str = "paper"
     force_limit: tuple[float, float] = (0.0, np.inf)
     redundant: tuple[RedundantJoint, ...] = ()
     orientation: Orientation = field(default_factory=Orientation)

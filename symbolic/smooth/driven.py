@@ -16,7 +16,8 @@ import numpy as np
 from symbolic.array import Array
 from symbolic.cell_model import CellModel
 from symbolic.contact.force_closure import LOAD_SIZE
-from symbolic.contact.soft_finger import Detached
+from symbolic.contact.model import ImplicitVariables
+from symbolic.contact.registry import contact_model
 from symbolic.expression import named_function, number
 from symbolic.limit_coefficients import (
     PATH_OUTPUTS,
@@ -26,13 +27,9 @@ from symbolic.limit_coefficients import (
 )
 from symbolic.limits import BlockLayout, limit_layout
 from symbolic.records import Workcell
-from symbolic.smooth.samples import force_branches
 
 DRIVEN_FIRST, DRIVEN_SECOND = "driven_first", "driven_second"
 """Names of the functions."""
-
-TANGENTIAL_SMOOTHING = 1e-9
-"""Smooths the tangential force's magnitude at zero [N]."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +73,7 @@ def driven_layout(workcell: Workcell) -> DrivenLayout:
 
     pressure (2): shifts of the centres of pressure over their patches' radii.
     """
-    j, closed = limit_layout(workcell).joints, int(workcell.has_closed_form)
+    j, closed = limit_layout(workcell).joints, int(contact_model(workcell).has_closed_form)
     sizes = {"speed": j + 2, "acceleration": j, "cone": 2, "force": 2 * closed}
     sizes |= {"load": LOAD_SIZE * (1 - closed), "torque": j * closed, "pressure": 2 * closed}
     return DrivenLayout(j, sizes, workcell.task.extended_size, not closed)
@@ -85,7 +82,7 @@ def driven_layout(workcell: Workcell) -> DrivenLayout:
 def planned_branches(workcell: Workcell) -> Array:
     """Return the branches of both planned normal forces as sums of a point's quantities (2,
     branches, quantities); none if a program finds the forces."""
-    layout, own = driven_layout(workcell), force_branches(workcell)
+    layout, own = driven_layout(workcell), contact_model(workcell).force_branches
     if layout.by_program:
         return np.zeros((2, 0, layout.size))
     forces = np.zeros((2, own.shape[1], layout.size))
@@ -106,14 +103,14 @@ def driven_functions(model: CellModel) -> dict[str, ca.Function]:
     names = [*PATH_OUTPUTS, "a", "w"]
     sizes = [layout.pose] * 3 + [*[arm.n_joints for arm in model.robots], 1, 1]
     inputs = {name: ca.SX.sym(name, size) for name, size in zip(names, sizes, strict=True)}
-    detached = Detached()
-    value, y = _value(model, [*inputs.values()], detached), ca.vertcat(*inputs.values())
+    implicit = ImplicitVariables()
+    value, y = _value(model, [*inputs.values()], implicit), ca.vertcat(*inputs.values())
     assert value.shape == (layout.size, 1)
     first = [value, ca.densify(ca.jacobian(value, y).T)]
     weight, direction = ca.SX.sym("weight", layout.size), ca.SX.sym("direction", layout.variables)
     gradient = ca.gradient(ca.dot(weight, value), y)
     second = [ca.densify(ca.jtimes(gradient, y, direction))]
-    first, second = map(detached.replaced, (first, second))
+    first, second = map(implicit.replaced, (first, second))
     given = limit_numbers(model.workcell)
     values, bent = dict(zip(("value", "slope"), first, strict=True)), {"change": second[0]}
     along = inputs | {"weight": weight, "direction": direction}
@@ -123,7 +120,7 @@ def driven_functions(model: CellModel) -> dict[str, ca.Function]:
     }
 
 
-def _value(model: CellModel, inputs: list[ca.SX], detached: Detached) -> ca.SX:
+def _value(model: CellModel, inputs: list[ca.SX], implicit: ImplicitVariables) -> ca.SX:
     """Return the quantities of `driven_layout`."""
     workcell = model.workcell
     limits, joints = limit_layout(workcell), limit_layout(workcell).joints
@@ -139,17 +136,14 @@ def _value(model: CellModel, inputs: list[ca.SX], detached: Detached) -> ca.SX:
     # Not the lengths' squares: a length has no slope where the box does not move.
     speeds = [ca.sumsqr(cones[k][:3] * reach[k]) for k in (0, 1)]
     force = block["force"][:3] * a + block["force"][3:6] * w + block["force"][6:]
-    if not workcell.has_closed_form:
+    if not contact_model(workcell).has_closed_form:
         axes = ca.SX(number(workcell.contacts[0].T_box_pad[:3, :3]))
         moment = block["moment"][:3] * a + block["moment"][3:] * w
         in_box, centre = ca.mtimes(axes, force), ca.SX(number(payload.centre_of_mass))
         forces, ratios = ca.vertcat(in_box, ca.mtimes(axes, moment) + ca.cross(centre, in_box)), []
     else:
-        found, forces = contact_limits(workcell, block, (a, w), detached)
+        found, forces = contact_limits(workcell, block, (a, w), implicit)
         ratios = [found]
-    if workcell.task.allocation == "paper":
-        tangential = ca.sqrt(force[0] ** 2 + force[1] ** 2 + TANGENTIAL_SMOOTHING**2)
-        forces = ca.vertcat(force[2], tangential)
     return ca.vertcat(
         block["speed"][:joints] ** 2 * w,
         *[speed * w for speed in speeds],

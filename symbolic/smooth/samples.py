@@ -26,8 +26,9 @@ from numpy.typing import NDArray
 
 from symbolic.array import Array
 from symbolic.contact.grasp import Grasp
-from symbolic.contact.load import ContactLoad, frictions, held_by, required
-from symbolic.contact.paper import normal_force_branches, split_force
+from symbolic.contact.load import frictions, required
+from symbolic.contact.model import ContactLoad
+from symbolic.contact.registry import contact_model
 from symbolic.contact.soft_grasp import SoftGrasp
 from symbolic.expression import (
     mx_parameters,
@@ -108,18 +109,6 @@ def sample_blocks(task: Task) -> tuple[SampleBlock, ...]:
         SampleBlock("first", np.array([[0, 1]]), position[None, :DIFFERENCE_WINDOW]),
         SampleBlock("last", np.array([[n - 2, n - 1]]), position[None, -DIFFERENCE_WINDOW:]),
     )
-
-
-def force_branches(workcell: Workcell) -> Array:
-    """Return coefficients (2, branches, 2), per robot and branch, of both force quantities of
-    `_force_function` in a normal force, which is the largest of its branches."""
-    if workcell.task.allocation == "soft-finger":
-        return np.eye(2)[:, None]
-    f_n, f_t = ca.SX.sym("f_n"), ca.SX.sym("f_t")
-    friction = (workcell.contacts[0].friction, workcell.contacts[1].friction)
-    second = normal_force_branches(f_n, f_t, friction)
-    split = ca.vertcat(f_n, f_t)
-    return np.array([ca.DM(ca.jacobian(second + own * f_n, split)).full() for own in (1.0, 0.0)])
 
 
 def sample_functions(workcell: Workcell, quantity: Quantity) -> dict[str, ca.Function]:
@@ -253,10 +242,9 @@ def _wrench_function(workcell: Workcell) -> ca.Function:
 
 
 def _margin_function(workcell: Workcell) -> ca.Function:
-    """Return force and moment (6,) in the box frame -> 1 - (shift / patch radius)^2 (2,), by the
-    paper's allocation."""
+    """Return force and moment (6,) in the box frame -> 1 - (shift / patch radius)^2 (2,)."""
     wrench, contacts = ca.SX.sym("wrench", 6), workcell.contacts
-    shift = held_by(workcell, "paper", _contact_load(workcell, wrench))
+    shift = contact_model(workcell).hold(_contact_load(workcell, wrench))
     squares = ca.vertcat(*map(ca.sumsqr, shift.shifts))
     radius = ca.vertcat(*[ca.SX(number(contact.patch_radius)) for contact in contacts])
     given = sx_parameters(workcell.payload).values()
@@ -274,14 +262,10 @@ def _load_function(workcell: Workcell) -> ca.Function:
 
 def _force_function(workcell: Workcell) -> ca.Function:
     """Return force and moment (6,) in the box frame -> the two quantities whose linear branches are
-    the normal forces (`force_branches`): both normal forces of soft fingers, with one branch each,
-    otherwise F_n and F_t. Another contact model in closed form is added in these two functions."""
-    wrench = ca.SX.sym("wrench", 6)
-    if workcell.task.allocation == "soft-finger":
-        quantities = held_by(workcell, "soft-finger", _contact_load(workcell, wrench)).normal
-    else:
-        normal = ca.SX(number(workcell.contacts[0].T_box_pad[:3, 2]))
-        quantities = ca.vertcat(*split_force(wrench[:3], normal)[:2])
+    the normal forces (`ContactModel.force_quantities`)."""
+    wrench, model = ca.SX.sym("wrench", 6), contact_model(workcell)
+    load = _contact_load(workcell, wrench)
+    quantities = model.force_quantities(load, model.hold(load))
     given = sx_parameters(workcell.payload).values()
     return ca.Function("sample_split", [wrench, *given], [quantities])
 

@@ -22,7 +22,7 @@ from symbolic.limit_coefficients import (
 )
 from symbolic.limits import limit_layout
 from symbolic.path_motion import path_motion_function
-from symbolic.records import Allocation, Workcell
+from symbolic.records import Workcell
 from symbolic.records.poses import pose_matrix
 from symbolic.records.task import initial_decision
 from symbolic.smooth.places import closure_functions, closure_name
@@ -238,7 +238,7 @@ def test_speeds_and_accelerations_are_the_paths_over_their_limits() -> None:
 
 
 @pytest.mark.parametrize("allocation", ["paper", "soft-finger"])
-def test_torques_and_shifts_are_those_of_the_load_and_the_arms(allocation: Allocation) -> None:
+def test_torques_and_shifts_are_those_of_the_load_and_the_arms(allocation: str) -> None:
     """The other route: contact forces in the world frame, then each arm's own torques."""
     motion, cell = outputs()[1], uneven()
     cell = replace(cell, task=replace(cell.task, allocation=allocation))

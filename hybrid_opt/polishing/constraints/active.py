@@ -36,6 +36,7 @@ from hybrid_opt.polishing.constraints.kinds import (
 )
 from hybrid_opt.polishing.rows import ForceRow, PathRow, PressureRow, Row
 from symbolic.array import Array
+from symbolic.contact.registry import contact_model
 from symbolic.smooth.passage import AxisSwitchGap, SeparatingAxisGap
 from symbolic.smooth.places import Clearance, JointLimit, ManipulabilityLimit
 
@@ -58,7 +59,7 @@ class RowSelector:
         self._movable = cell.grid.movable
         self._distances = Clearances(cell)
         sampled: dict[type, ConstraintKind[Any]] = {ForceRow: self.forces}
-        if cell.task.allocation == "paper":
+        if contact_model(cell.workcell).has_pressure_limit:
             sampled[PressureRow] = Pressure(cell)
         driven = cell.task.time_law == "optimal"
         self._kinds: dict[type, ConstraintKind[Any]] = ({} if driven else sampled) | {

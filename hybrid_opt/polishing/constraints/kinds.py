@@ -15,6 +15,7 @@ from hybrid_opt.polishing.carry import PlacedCarry, local_minima_below
 from hybrid_opt.polishing.cell import SmoothCell
 from hybrid_opt.polishing.rows import PROGRAM_BRANCH, ForceRow, PathRow, PressureRow, row_numbers
 from symbolic.array import Array
+from symbolic.contact.registry import contact_model
 from symbolic.smooth.places import JointLimit, ManipulabilityLimit, Side
 
 PATCH_MARGIN = 1e-6
@@ -125,7 +126,7 @@ class Forces(ConstraintKind[ForceRow]):
         self._ends = {0, 1, last - 1, last}
         self._every = set(range(0, last, self.grid.samples(FORCE_STRIDE)))
         self._ties = set(range(0, last + 1, self.grid.samples(TIE_STRIDE)))
-        by_program = cell.robust is None and not cell.workcell.has_closed_form
+        by_program = cell.robust is None and not contact_model(cell.workcell).has_closed_form
         # The branch that has a row wherever forces matter.
         self._main = PROGRAM_BRANCH if by_program else CONE_TIGHT
 

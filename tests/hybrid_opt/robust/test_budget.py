@@ -16,8 +16,8 @@ from hybrid_opt.robust.budget import (
     cheapest_remedies,
     grip_budget,
 )
-from hybrid_opt.robust.cases import least_friction
 from hybrid_opt.robust.force import BoxMotion, interpreted_robust_model
+from symbolic.contact.registry import command_model
 from symbolic.read.cell import changed
 from symbolic.records import USUAL_UNCERTAINTY, Workcell
 from symbolic.records.cell import RANGES
@@ -50,7 +50,7 @@ def test_it_is_what_friction_and_weight_say(rack: Workcell) -> None:
         },
     )
     budget = grip_budget(replace(level, uncertainty=doubt))
-    friction = least_friction(replace(level, uncertainty=doubt), doubt).min()
+    friction = command_model(replace(level, uncertainty=doubt)).least_friction(doubt).min()
     weight = GRAVITY * level.payload.mass * (1.0 + doubt.mass)
     force = (weight / (2.0 * friction) + doubt.internal_force / friction) / (1.0 - doubt.tracking)
     np.testing.assert_allclose(budget.required, force, rtol=2e-3)

@@ -31,7 +31,6 @@ from hybrid_opt.timing.topp_ra import linearised_rows, validate_timing
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.read.cell import load
-from symbolic.records import Allocation
 from tests.hybrid_opt.timing import convex_oracle, nonlinear_oracle
 from tests.hybrid_opt.timing.cells import (
     hand_timing,
@@ -257,7 +256,7 @@ SMALL_PATCH, OFFSET = 0.012, 0.05
 """[m] Neither holds the box without pressing harder."""
 
 
-def off_centre(allocation: Allocation) -> TimingModel:
+def off_centre(allocation: str) -> TimingModel:
     cell = hand_cell()
     along = cell.contacts[0].T_box_pad[:3, 2]
     payload = replace(cell.payload, centre_of_mass=OFFSET * along)

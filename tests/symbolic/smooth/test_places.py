@@ -14,13 +14,14 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from symbolic.array import Array
+from symbolic.contact.registry import contact_model
 from symbolic.functions import candidate_function
 from symbolic.geometry.clearance import screening_functions
 from symbolic.geometry.pairs import coal_distance
 from symbolic.path.rotation import rotation_matrix
 from symbolic.records.cell import PAYLOAD_NAME, Box, Workcell
 from symbolic.records.poses import Orientation
-from symbolic.records.task import Allocation, TimeLaw
+from symbolic.records.task import TimeLaw
 from symbolic.robot.arm import flange_target, manipulability, pose_error
 from symbolic.smooth.passage import (
     PARALLEL_GAP,
@@ -43,7 +44,6 @@ from symbolic.smooth.places import (
 )
 from symbolic.smooth.samples import (
     Quantity,
-    force_branches,
     sample_blocks,
     sample_functions,
     sample_name,
@@ -205,7 +205,7 @@ def test_joint_rows_are_their_definitions(arm: int) -> None:
     assert float(manipulability(jacobian)) == pytest.approx(abs(np.linalg.det(jacobian)))
 
 
-def cell_with(time_law: TimeLaw, samples: int = 12, allocation: Allocation = "paper") -> Workcell:
+def cell_with(time_law: TimeLaw, samples: int = 12, allocation: str = "paper") -> Workcell:
     cell = hand_cell()
     task = replace(cell.task, time_law=time_law, samples=samples, allocation=allocation)
     return replace(cell, task=task)
@@ -232,11 +232,11 @@ def split_of(
     ("samples", "allocation"), [(5, "paper"), (6, "paper"), (12, "paper"), (12, "soft-finger")]
 )
 def test_the_largest_branch_is_the_evaluators_normal_force(
-    time_law: TimeLaw, samples: int, allocation: Allocation
+    time_law: TimeLaw, samples: int, allocation: str
 ) -> None:
     cell = cell_with(time_law, samples, allocation)
     evaluate = candidate_function(hand_model(cell))
-    coefficients, functions = force_branches(cell), sample_functions(cell, "force")
+    coefficients, functions = contact_model(cell).force_branches, sample_functions(cell, "force")
     for seed in range(5):
         x = random_x(cell, seed)
         outputs = dict(zip(evaluate.name_out(), evaluate(x), strict=True))
@@ -263,7 +263,7 @@ def test_a_rounded_time_law_is_near_the_sharp_one_and_nearer_the_less_it_is_roun
 )
 @pytest.mark.parametrize("time_law", ["constant", "ramped"])
 def test_derivatives_are_those_of_the_values(
-    time_law: TimeLaw, quantity: Quantity, allocation: Allocation, rounding: float
+    time_law: TimeLaw, quantity: Quantity, allocation: str, rounding: float
 ) -> None:
     cell = cell_with(time_law, allocation=allocation)
     functions = sample_functions(cell, quantity)

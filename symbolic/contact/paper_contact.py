@@ -1,0 +1,79 @@
+"""The paper's contact model: least forces first, then pressure shifts that carry the moments."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import casadi as ca
+import numpy as np
+
+from symbolic.array import Array
+from symbolic.contact.model import ContactLoad, ContactModel, HeldLoad, ImplicitVariables, Problem
+from symbolic.contact.paper import allocate, normal_force_branches, pressure_shift, split_force
+from symbolic.contact.soft_contact import soft_finger
+from symbolic.expression import Expression
+
+
+class PaperContact(ContactModel):
+    """Two round pads with opposite normals that choose their pressure.
+
+    That takes commanded moments at both wrists, which few cells have. What is commanded therefore
+    holds pads that press evenly.
+    """
+
+    assumption = "pads that choose their pressure, by moments commanded at both wrists"
+    has_pressure_limit = True
+
+    @property
+    def command_model(self) -> ContactModel:
+        """See `ContactModel`."""
+        return soft_finger(self.workcell)
+
+    @property
+    def problem(self) -> Problem | None:
+        """See `ContactModel`."""
+        workcell = self.workcell
+        if workcell.has_facing_pads:
+            return None
+        first, second = (contact.T_box_pad[:3, 2] for contact in workcell.contacts)
+        turned = np.degrees(np.arccos(np.clip(-first @ second, -1.0, 1.0)))
+        return (
+            "contacts[1].xyz",
+            f"belongs to {len(workcell.pads)} pads, with a normal {turned:.4g} degrees off the "
+            "opposite of contacts[0]; the paper's allocation allows two round pads with "
+            "opposite normals: task.allocation = 'soft-finger' takes any",
+        )
+
+    def hold(
+        self,
+        load: ContactLoad,
+        implicit: ImplicitVariables | None = None,
+        displaced: bool = False,
+    ) -> HeldLoad:
+        """See `ContactModel`: paper Eqs. 38-42 and 51-59."""
+        axes, mu = load.axes, load.friction
+        normal, tangential, forces = allocate(load.force, axes[:, 2], (mu[0], mu[1]))
+        tangents = axes[:, 0], axes[:, 1]
+        shifts, point, residual = pressure_shift(load.moment, load.arms, forces, tangents)
+        moments = ca.cross(shifts[0], forces[0]), ca.cross(shifts[1], forces[1])
+        return HeldLoad(normal, tangential, forces, shifts, moments, point, residual)
+
+    @property
+    def force_branches(self) -> Array:
+        """See `ContactModel`: those of `normal_force_branches`, for contact 1 with F_n added."""
+        f_n, f_t = ca.SX.sym("f_n"), ca.SX.sym("f_t")
+        contacts = self.workcell.contacts
+        second = normal_force_branches(f_n, f_t, (contacts[0].friction, contacts[1].friction))
+        split = ca.vertcat(f_n, f_t)
+        return np.array(
+            [ca.DM(ca.jacobian(second + own * f_n, split)).full() for own in (1.0, 0.0)]
+        )
+
+    def force_quantities(self, load: ContactLoad, held: HeldLoad) -> Expression:
+        """Return the normal component and the tangential magnitude (2,) of the force [N]."""
+        return ca.vertcat(*split_force(load.force, load.axes[:, 2])[:2])
+
+    def planned_quantities(self, found: Mapping[str, Array]) -> Array:
+        """See `ContactModel`. Both tangential forces have the same direction."""
+        normal, tangential = found["normal_force"], found["tangential_force"]
+        return np.column_stack([normal[:, 0] - normal[:, 1], tangential.sum(axis=1)])

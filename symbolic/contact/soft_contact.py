@@ -1,0 +1,124 @@
+"""The contact model of soft fingers: elastic pads that press evenly, on arms that keep the
+orientation of their pads (`symbolic.contact.soft_finger`)."""
+
+from __future__ import annotations
+
+from itertools import product
+
+import casadi as ca
+import numpy as np
+
+from symbolic.array import Array
+from symbolic.contact.force_closure import has_force_closure, least_distance
+from symbolic.contact.model import ContactLoad, ContactModel, HeldLoad, ImplicitVariables, Problem
+from symbolic.contact.soft_finger import SoftPatch, least_soft_squeeze
+from symbolic.records import Workcell
+from symbolic.records.cell import Uncertainty
+
+PAD_OFFSET_SHARE = 0.9
+"""Share of friction times the pads' distance by which pads may lie beside one another: the line
+between them then lies well within their friction cones, and pressing harder carries any moment."""
+
+LARGEST_DISPLACEMENT = 0.2
+"""Displacement of pads anywhere, over the least distance of two pads of different robots, up to
+which forces are looked for."""
+
+
+def soft_finger(workcell: Workcell) -> ContactModel:
+    """Return the model of a workcell's soft fingers: in closed form for two pads with opposite
+    normals."""
+    return (SoftFinger if workcell.has_opposite_pads else SoftFingerGrasp)(workcell)
+
+
+class SoftFinger(ContactModel):
+    """Two pads with opposite normals and any patches."""
+
+    assumption = "pads that press evenly, on arms that keep their orientation"
+    has_elastic_layers = True
+
+    @property
+    def problem(self) -> Problem | None:
+        """See `ContactModel`."""
+        friction = min(contact.friction for contact in self.workcell.contacts)
+        beside, room = self.workcell.pad_offset, friction * self.workcell.pad_distance
+        if beside < PAD_OFFSET_SHARE * room:
+            return None
+        return (
+            "contacts[1].xyz",
+            f"faces a point {beside:g} m beside contacts[0]; pads that press evenly allow less "
+            f"than {PAD_OFFSET_SHARE * room:g} m here, {PAD_OFFSET_SHARE:g} of friction times the "
+            "pads' distance, so that pressing harder holds whatever happens",
+        )
+
+    def hold(
+        self,
+        load: ContactLoad,
+        implicit: ImplicitVariables | None = None,
+        displaced: bool = False,
+    ) -> HeldLoad:
+        """See `ContactModel`. No shift; torsion in proportion to what either pad can carry."""
+        workcell, axes = self.workcell, load.axes
+        in_box = workcell.contacts[0].T_box_pad[:3, :3]
+        patches = [SoftPatch.of(contact, in_box) for contact in workcell.contacts]
+        arms = [ca.mtimes(axes.T, arm) for arm in load.arms]
+        held = least_soft_squeeze(
+            ca.mtimes(axes.T, load.force),
+            ca.mtimes(axes.T, load.moment),
+            (arms[0], arms[1]),
+            load.friction,
+            (patches[0], patches[1]),
+            displaced or workcell.has_offset_pads,
+            implicit,
+        )
+        force_1 = ca.mtimes(axes, ca.vertcat(held.tangent_1, held.normal[0]))
+        force_2 = ca.mtimes(axes, ca.vertcat(held.tangent_2, -held.normal[1]))
+        share = held.torsion / ca.fmax(ca.sum1(held.capacity), 1e-300)
+        moment_1, moment_2 = (axes[:, 2] * held.capacity[i] * share for i in (0, 1))
+        point = load.moment - ca.cross(load.arms[0], force_1) - ca.cross(load.arms[1], force_2)
+        tangential = [ca.sqrt(ca.sumsqr(t) + 1e-24) for t in (held.tangent_1, held.tangent_2)]
+        none = ca.SX.zeros(3)
+        return HeldLoad(
+            held.normal,
+            ca.vertcat(*tangential),
+            (force_1, force_2),
+            (none, none),
+            (moment_1, moment_2),
+            point,
+            point - moment_1 - moment_2,
+        )
+
+
+class SoftFingerGrasp(SoftFinger):
+    """Pads anywhere, several of one arm included. The program of `symbolic.contact.grasp` finds
+    their forces."""
+
+    has_closed_form = False
+
+    @property
+    def problem(self) -> Problem | None:
+        """See `ContactModel`."""
+        if has_force_closure(self.workcell):
+            return None
+        return (
+            "contacts",
+            "the pads do not close their grasp: no squeeze within their friction cones holds the "
+            "payload against whatever the motion asks; allowed is enough friction (with 5 % to "
+            "spare) along the lines between them: turn them towards one another, raise friction "
+            "or add a pad (further)",
+        )
+
+    def least_friction(self, uncertainty: Uncertainty) -> Array:
+        """See `ContactModel`. Displacements are cases of their own."""
+        return self._tilted_friction(uncertainty)
+
+    def worst_displacements(self, uncertainty: Uncertainty) -> tuple[Array, Array]:
+        """See `ContactModel`. To first order no displacements are worse than the corners of squares
+        about their discs."""
+        off = uncertainty.pad_position + uncertainty.apart / 2.0
+        signs = product((-1.0, 1.0) if off > 0.0 else (0.0,), repeat=4)
+        return uncertainty.centre_of_mass, np.array([off * np.array(at) for at in signs])
+
+    def room_for_displacements(self, uncertainty: Uncertainty) -> float:
+        """See `ContactModel`."""
+        off = uncertainty.pad_position + uncertainty.apart / 2.0
+        return LARGEST_DISPLACEMENT * least_distance(self.workcell) - off
