@@ -451,8 +451,7 @@ GONE = {
     "json": "data",
     "mcap": "data",
 }
-"""Targets of earlier versions, and what is to be used instead; docs/reference/bundles.md says
-why."""
+"""Targets of earlier versions, and their replacements."""
 
 
 def require_target(name: str) -> None:

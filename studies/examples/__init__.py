@@ -1,5 +1,4 @@
-"""A way to learn the library: numbered programs of about ten lines. docs/reference/library.md lists
-them.
+"""A way to learn the library: a notebook, and numbered programs of at most twenty lines.
 
 Run them from the repository's root, or from a folder into which `python -m studies.examples FOLDER`
 copied them, as `python studies/examples/01_evaluate.py`.

@@ -1,4 +1,4 @@
-"""The examples run, their copies too; docs/reference/library.md and the README hold the first."""
+"""The examples run, their copies too; the page of the library and the README hold the first."""
 
 from __future__ import annotations
 
@@ -120,15 +120,6 @@ def test_a_copy_holds_what_the_examples_and_its_cells_read(
     capsys.readouterr()
     assert copy([]) == BAD_INPUT
     assert "studies: exists already" in capsys.readouterr().err
-
-
-def test_the_library_page_lists_every_example_and_names_only_what_it_calls() -> None:
-    page = (ROOT / "docs/reference/library.md").read_text("utf-8")
-    rows = re.findall(r"^\| `(\d\d_\w+\.py)` \|.*\|(.*)\|$", page, flags=re.MULTILINE)
-    assert [name for name, _ in rows] == NAMES
-    for path, (_, calls) in zip(EXAMPLES[1:], rows[1:], strict=True):
-        code = code_of(path)
-        assert all(name.split(".")[-1] in code for name in re.findall(r"`([\w.]+)`", calls)), path
 
 
 @pytest.mark.parametrize("page", ["README.md", "docs/reference/library.md"])
