@@ -17,7 +17,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from hybrid_opt.carry import Carry
-from hybrid_opt.display.table import figures_html, lines
+from hybrid_opt.display.table import figures_html, lines, number
 from hybrid_opt.evaluate.objectives import PAPER_OBJECTIVES
 from hybrid_opt.front import Front
 from hybrid_opt.indicators.metrics import excess_above_static
@@ -86,7 +86,7 @@ def _(carry: Carry) -> dict[str, str]:
         "peak whole force": f"{_pair(carry.peak_resultant_force, 3)} N",
         "payload limit": f"{carry.payload_limit:.3f} kg (level and still {hold.payload_limit:.3f})",
         "largest pressure shift": f"{_pair(1e3 * carry.peak_pressure_shift, 2)} mm",
-        "torque of the contacts": f"{_pair(100.0 * carry.peak_contact_torque_use, 1)} % of maximum",
+        "torque of the contacts": f"{_torques(carry.peak_contact_torque_use)} % of maximum",
     }
     if carry.judgement is not None:
         found |= {
@@ -125,6 +125,11 @@ def _forces(workcell: Workcell, time: Array, force: Array, title: str, *more: Se
 @picture_of.register
 def _(found: Recommendation) -> str:
     return picture_of(found.carry if found.job is None else found.job)
+
+
+def _torques(uses: Array) -> str:
+    """Format uses of torques [%]; a use of zero is that of an arm whose torques are unknown."""
+    return ", ".join(number(use or None, 1, 100.0) for use in uses.tolist())
 
 
 def _pair(values: Array, digits: int) -> str:

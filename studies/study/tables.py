@@ -458,7 +458,8 @@ def _timing_cells(timing: StoredTiming) -> tuple[str, ...]:
         FINE_DURATION(timing.duration),
         *map(FORCE, timing.peak_normal_force),
         PAYLOAD(timing.payload_limit),
-        TORQUE(None if torque is None else torque.max()),
+        # Of arms whose torques are unknown nothing is used: no share of a limit that is not there.
+        TORQUE(None if torque is None else float(torque.max()) or None),
         SHIFT(timing.peak_pressure_shift.max()),
     )
 

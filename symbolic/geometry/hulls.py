@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
+from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
 from symbolic.array import Array
@@ -52,8 +53,9 @@ def cut(mesh: trimesh.Trimesh, path: Path) -> tuple[Hull, ...]:
     """
     pieces: list[Hull] = []
     open_components = 0
+    large, small = _parts(mesh)
     try:
-        for component in mesh.split(only_watertight=False, repair=False):
+        for component in large:
             triangles = np.asarray(component.triangles, dtype=float)
             filled = hull_volume(triangles)
             if component.is_watertight and component.is_winding_consistent and filled > 0.0:
@@ -61,21 +63,58 @@ def cut(mesh: trimesh.Trimesh, path: Path) -> tuple[Hull, ...]:
             else:
                 open_components += 1
                 pieces.append(hull_of(triangles if filled > 0.0 else _thickened(triangles)))
+        if len(small):
+            joined = np.vstack([mesh.triangles[faces] for faces in small])
+            pieces.append(hull_of(_thickened(joined)))
     except QhullError as error:
         raise CollisionModelError(
             f"{path}: a part of the mesh has no convex hull; remove triangles that are points or "
             "lines"
         ) from error
     if open_components:
-        warnings.warn_explicit(
+        _warn(
+            path,
             f"{open_components} part(s) of the mesh {path.name} are not watertight; the convex "
             "hull of each is used as its collision shape. Close the holes to get a tighter shape",
-            CollisionModelWarning,
-            filename=path.name,  # the mesh is to be corrected, not a line of this source
-            lineno=0,
-            registry=_TOLD,
+        )
+    if len(small):
+        _warn(
+            path,
+            f"the mesh {path.name} has {len(large) + len(small)} separate parts; one convex hull "
+            f"around the {len(small)} smallest is used as their collision shape. Remove screws and "
+            "the like to get a tighter shape",
         )
     return _outermost(pieces)
+
+
+def _warn(path: Path, text: str) -> None:
+    """Warn once; the mesh is to be corrected, not a line of this source."""
+    warnings.warn_explicit(
+        text, CollisionModelWarning, filename=path.name, lineno=0, registry=_TOLD
+    )
+
+
+MOST_PARTS = 400
+"""Most connected components of a mesh that become convex pieces of their own; of a mesh with more
+only `LARGE_PARTS` do."""
+
+LARGE_PARTS = 24
+"""Largest components of a mesh of many that keep convex pieces of their own."""
+
+
+def _parts(mesh: trimesh.Trimesh) -> tuple[list[trimesh.Trimesh], list[NDArray[np.intp]]]:
+    """Return the components of a mesh that become pieces, and the faces of each one that does
+    not."""
+    nodes = np.arange(len(mesh.faces))
+    parts = list(trimesh.graph.connected_components(mesh.face_adjacency, nodes=nodes, min_len=1))
+    large = len(parts)
+    if large > MOST_PARTS:
+        extent = [np.ptp(mesh.triangles[faces].reshape(-1, 3), axis=0).max() for faces in parts]
+        parts = [parts[k] for k in np.argsort(extent, kind="stable")[::-1]]
+        large = LARGE_PARTS
+    found = mesh.submesh(parts[:large], only_watertight=False, repair=False)
+    assert isinstance(found, list), "parts that are not appended to one another are a list"
+    return found, parts[large:]
 
 
 def _outermost(pieces: list[Hull]) -> tuple[Hull, ...]:

@@ -31,9 +31,6 @@ each, of PLY 300. A mesh of `MOST_FACES` has fewer."""
 MOST_MARKS = 500_000
 """Most elements and attributes of a COLLADA mesh."""
 
-MOST_PARTS = 400
-"""Most connected components of one mesh: each becomes a convex piece or several."""
-
 LARGEST_EXTENT = 100.0
 """Largest extent and coordinate of a mesh [m]: more is a file in millimetres without its scale."""
 
@@ -76,9 +73,6 @@ def _sound(mesh: trimesh.Trimesh, scale: Array) -> trimesh.Trimesh:
             "use a box"
         )
     mesh.merge_vertices()
-    nodes = np.arange(len(mesh.faces))
-    parts = trimesh.graph.connected_components(mesh.face_adjacency, nodes=nodes, min_len=1)
-    _require_few(len(parts), MOST_PARTS, "separate parts")
     return mesh
 
 

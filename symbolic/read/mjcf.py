@@ -15,6 +15,7 @@ import numpy as np
 
 from symbolic.array import Array
 from symbolic.errors import OutsideError
+from symbolic.read.scene_bodies import slab_below
 from symbolic.records import Box, Capsule, Cylinder, Sphere
 from symbolic.records.poses import inverse, rpy_from_rotation, transform
 from symbolic.safe_io import printable
@@ -61,7 +62,8 @@ def mjcf_as_urdf(path: Path, content: bytes) -> bytes:
 
     The world is the root link `world`. MJCF knows no velocity limits: they are zero, and a cell
     has to give its own (`velocity_max`). Shapes that collide with nothing (contype and
-    conaffinity zero) are left out. A floating base is fixed where the file has it.
+    conaffinity zero) are left out; slabs take the place of planes. A floating base, or an object
+    that lies loose in a scene, is fixed where the file has it.
 
     Args:
         path: the file.
@@ -116,13 +118,12 @@ class _Writer:
         for joint in range(first, first + count):
             called = model.joint(joint).name or f"joint_{joint}"
             kind = kinds(int(model.jnt_type[joint]))
-            if kind == kinds.mjJNT_FREE and np.count_nonzero(model.jnt_type == kind) == 1:
-                continue  # a floating base, the only one
+            if kind == kinds.mjJNT_FREE:
+                continue  # a floating base, or a loose object: it stands where the file has it
             if kind not in (kinds.mjJNT_HINGE, kinds.mjJNT_SLIDE):
                 raise OutsideError(
-                    f"joint {called!r} of body {name!r} is a ball or one of several free ones; "
-                    "allowed are hinges, slides and one floating base: leave what stands around "
-                    "to the cell's environment"
+                    f"joint {called!r} of body {name!r} is a ball; allowed are hinges, slides and "
+                    "free joints, which are held where the file has them"
                 )
             if model.qpos0[model.jnt_qposadr[joint]]:
                 raise OutsideError(f"joint {called!r} has a ref; allowed is zero")
@@ -189,6 +190,9 @@ class _Writer:
         pose = self._pose(model.geom_pos[geom], model.geom_quat[geom])
         kind, shape = geom_shape(self._mujoco, model, geom)
         mesh = int(model.geom_dataid[geom])
+        if kind == "plane":
+            kind = "box"
+            shape, pose = slab_below(pose)
         if shape is not None:
             said = vars(shape)
         elif kind == "mesh" and model.mesh_pathadr[mesh] >= 0:
@@ -197,10 +201,9 @@ class _Writer:
             # MuJoCo turns a mesh to its principal axes, and the geom with it.
             pose = pose @ inverse(self._pose(model.mesh_pos[mesh], model.mesh_quat[mesh]))
         else:
-            scene = "" if model.geom_bodyid[geom] else "; name the robot's file, not a scene's"
             raise OutsideError(
                 f"body {name!r} has a shape of the kind {kind}; allowed are boxes, cylinders, "
-                f"spheres, capsules and meshes with a file{scene}"
+                "spheres, capsules, planes and meshes with a file"
             )
         _add(_add(_add(link, "collision", pose), "geometry"), kind, **said)
 

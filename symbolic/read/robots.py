@@ -142,7 +142,7 @@ def _warn_unjudged(robot: str) -> None:
     """Warn once that a robot's torques are not limited."""
     warnings.warn(
         f'robot {robot!r} has torque_max = "{UNKNOWN_TORQUE}": no carry, timing or job is judged '
-        "by the torques of its joints, and their use is shown as 0 %",
+        "by the torques of its joints, and tables show no use of them",
         RobotModelWarning,
         stacklevel=2,
     )

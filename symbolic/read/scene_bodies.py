@@ -40,6 +40,14 @@ DIGITS = 12
 """Decimals of lengths and angles that are written: what is beyond them is rounding of poses."""
 
 
+def slab_below(pose: Array) -> tuple[Box, Array]:
+    """Return the box, and its pose (4, 4), that stands for a half-space below a frame's x-y
+    plane."""
+    normal = pose[:3, 2]
+    middle = normal * (normal @ pose[:3, 3] - SLAB[2] / 2.0)
+    return Box(np.array(SLAB)), transform(pose[:3, :3], middle)
+
+
 @dataclass(frozen=True)
 class ImportedScene:
     """The obstacles of a scene.
@@ -144,11 +152,9 @@ class SceneBuilder:
 
     def plane(self, name: str, pose: Array) -> None:
         """Add the half-space below a frame's x-y plane."""
-        normal = pose[:3, 2]
-        middle = normal * (normal @ pose[:3, 3] - SLAB[2] / 2.0)
         size = " x ".join(f"{side:g}" for side in SLAB)
         self.note(name, f"is a plane; a slab of {size} m below it takes its place")
-        self.add(name, Box(np.array(SLAB)), transform(pose[:3, :3], middle))
+        self.add(name, *slab_below(pose))
 
     def leave(self, name: str, why: str) -> None:
         """Report that something is left out."""
