@@ -15,21 +15,22 @@ import signal
 import sys
 from collections.abc import Sequence
 from contextlib import suppress
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import rclpy
 from action_msgs.msg import GoalStatus
+from builtin_interfaces.msg import Duration, Time
 from control_msgs.action import FollowJointTrajectory
 from geometry_msgs.msg import WrenchStamped
 from rclpy.action import ActionClient
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
-from rosidl_runtime_py import set_message_fields
-from rosidl_runtime_py.utilities import get_service
 from sensor_msgs.msg import JointState
-from std_msgs.msg import String
+from std_msgs.msg import Header, String
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from hybrid_opt.bundles.programs.carry_job import Job, Machine, Moment, Refused, Seen
 
@@ -54,6 +55,30 @@ CTRL_C = "Ctrl-C"
 
 NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 """Of measurements: hears reliable publishers and those of best effort, keeps no queue."""
+
+
+def parts(time: float) -> tuple[int, int]:
+    """Whole seconds and the nanoseconds beyond them."""
+    return divmod(round(time * 1e9), 10**9)
+
+
+def service_of(kind: str) -> Any:
+    """The type of a service by its name PACKAGE/srv/NAME."""
+    package, _, name = kind.split("/")
+    return getattr(import_module(f"{package}.srv"), name)
+
+
+def fill(message: Any, values: dict[str, Any]) -> None:
+    """Set fields of a message.
+
+    Raises:
+        AttributeError: it has no such field.
+    """
+    for name, value in values.items():
+        if isinstance(value, dict):
+            fill(getattr(message, name), value)
+        else:
+            setattr(message, name, value)
 
 
 class Run:
@@ -161,9 +186,9 @@ class Run:
             Refused: none fits.
         """
         for request in requests:
-            message = get_service(kind).Request()
+            message = service_of(kind).Request()
             try:
-                set_message_fields(message, request)
+                fill(message, request)
             except AttributeError:
                 continue
             break
@@ -175,7 +200,7 @@ class Run:
 
     def _find(self, name: str, kind: str) -> None:
         """Find a service before anything moves."""
-        self._clients[name] = self.node.create_client(get_service(kind), name)
+        self._clients[name] = self.node.create_client(service_of(kind), name)
         if not self._clients[name].wait_for_service(timeout_sec=PATIENCE):
             raise Refused(f"{name} is not there; are the controllers launched?")
 
@@ -217,12 +242,7 @@ class Run:
         Raises:
             Refused: a controller does not take it.
         """
-        goals = []
-        for group in self.config["groups"]:
-            goals.append(FollowJointTrajectory.Goal())
-            set_message_fields(goals[-1], self._goal(group["arms"], moments))
-            goals[-1].trajectory.header.stamp.sec = int(begin)
-            goals[-1].trajectory.header.stamp.nanosec = int((begin - int(begin)) * 1e9)
+        goals = [self._goal(group["arms"], moments, begin) for group in self.config["groups"]]
         # Large goals take long to build: none is sent before all are there.
         both = zip(self._actions, goals, strict=True)
         sent = [client.send_goal_async(goal) for client, goal in both]
@@ -245,16 +265,15 @@ class Run:
 
         return ended
 
-    def _goal(self, arms: Sequence[int], moments: Sequence[Moment]) -> dict[str, Any]:
+    def _goal(self, arms: Sequence[int], moments: Sequence[Moment], begin: float) -> Any:
         # Without tolerances: a controller that gives up by itself drops the squeeze.
-        return {
-            "trajectory": {
-                "joint_names": self._joined(
-                    arms, [self.job.robots[arm]["ros_joints"] for arm in arms]
-                ),
-                "points": [self._point(arms, moment) for moment in moments],
-            }
-        }
+        sec, nanosec = parts(begin)
+        trajectory = JointTrajectory(
+            header=Header(stamp=Time(sec=sec, nanosec=nanosec)),
+            joint_names=self._joined(arms, [self.job.robots[arm]["ros_joints"] for arm in arms]),
+            points=[self._point(arms, moment) for moment in moments],
+        )
+        return FollowJointTrajectory.Goal(trajectory=trajectory)
 
     def _joined(self, arms: Sequence[int], rows: Sequence[Sequence[Any]]) -> list[Any]:
         """What arms' joints have, side by side; of a joint that moves both arms the first's."""
@@ -264,22 +283,19 @@ class Run:
                 found.setdefault(name, value)
         return list(found.values())
 
-    def _point(self, arms: Sequence[int], at: Moment) -> dict[str, Any]:
+    def _point(self, arms: Sequence[int], at: Moment) -> Any:
         job, r = self.job, at.rate
-        rates = [job.linear(arm, "velocity", at.s) for arm in arms]
-        seconds = [job.linear(arm, "acceleration", at.s) for arm in arms]
-        nanoseconds = round(at.time * 1e9)
+        rates = self._joined(arms, [job.linear(arm, "velocity", at.s) for arm in arms])
+        seconds = self._joined(arms, [job.linear(arm, "acceleration", at.s) for arm in arms])
+        sec, nanosec = parts(at.time)
         efforts = [job.effort(arm, "without_gravity", at.s, r) for arm in arms]
-        return {
-            "positions": self._joined(arms, [job.position(arm, at.s) for arm in arms]),
-            "velocities": [r * v for v in self._joined(arms, rates)],
-            "accelerations": [
-                r * r * a + at.change * v
-                for v, a in zip(self._joined(arms, rates), self._joined(arms, seconds), strict=True)
-            ],
-            "effort": self._joined(arms, efforts),
-            "time_from_start": {"sec": nanoseconds // 10**9, "nanosec": nanoseconds % 10**9},
-        }
+        return JointTrajectoryPoint(
+            positions=self._joined(arms, [job.position(arm, at.s) for arm in arms]),
+            velocities=[r * v for v in rates],
+            accelerations=[r * r * a + at.change * v for v, a in zip(rates, seconds, strict=True)],
+            effort=self._joined(arms, efforts),
+            time_from_start=Duration(sec=sec, nanosec=nanosec),
+        )
 
     def start(self) -> None:
         """Send the whole job and begin.

@@ -1,0 +1,221 @@
+"""Joint trajectory controllers and the arms that they drive, as a bundle's programs meet them.
+
+The controllers are C++; these are their rules, after ros2_controllers jazzy
+(joint_trajectory_controller.cpp: goals of an inactive controller are rejected, :1401; what is
+validated, :1740; a hold has no effort, :2083; trajectory.cpp: efforts are linear between points,
+:296). libfranka sets a load only while no motion runs. Arms follow their commands at once; their
+sensors feel what the job's nearest sample presses.
+
+NumPy and SciPy only: environments of ROS 2 import it, too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import BPoly
+
+Array = NDArray[np.float64]
+
+SUCCEEDED, CANCELED, ABORTED = 4, 5, 6
+"""Of action_msgs/msg/GoalStatus."""
+
+FLOAT_EPSILON = 1.1920929e-07
+
+Ended = Callable[[int, str], None]
+"""Gets the status of a goal that has ended, and why."""
+
+
+class Controller:
+    """A joint trajectory controller that commands efforts.
+
+    Attributes:
+        q: where its joints are.
+        desired, rate, effort: of its reference.
+        stands: joints that do not follow.
+    """
+
+    def __init__(self, time: Callable[[], float], joints: list[str], q: Array) -> None:
+        self.time, self.joints = time, joints
+        self.q, self.effort = q.copy(), np.zeros(len(q))
+        self.desired, self.rate = q.copy(), np.zeros(len(q))
+        self.is_active = self.refuses = False
+        self.aborts_at: float | None = None
+        self.stands = np.zeros(len(q), dtype=bool)
+        self._spline: BPoly | None = None
+        self._times = np.zeros(1)
+        self._rows = np.zeros((1, len(q)))
+        self._start = 0.0
+        self._ended: Ended | None = None
+
+    def switch(self, is_active: bool) -> None:
+        """`on_activate`: it holds where it is."""
+        self.is_active = is_active
+        self._hold()
+
+    def accepts(self, trajectory: Any) -> bool:
+        """`goal_received_callback` and `validate_trajectory_msg`."""
+        points = trajectory.points
+        rows = [
+            row
+            for point in points
+            for row in (point.positions, point.velocities, point.accelerations, point.effort)
+        ]
+        return (
+            self.is_active
+            and not self.refuses
+            and sorted(trajectory.joint_names) == sorted(self.joints)
+            and bool((np.diff(times_of(points)) > 0.0).all())
+            and max(abs(v) for v in points[-1].velocities) <= FLOAT_EPSILON
+            and {len(row) for row in rows} == {len(self.joints)}
+        )
+
+    def take(self, trajectory: Any, ended: Ended) -> None:
+        """Drive a trajectory that is accepted, in place of another one."""
+        if self._ended is not None:
+            self._end(CANCELED, "Current goal cancelled due to new incoming action.")
+        points = trajectory.points
+        order = [list(trajectory.joint_names).index(name) for name in self.joints]
+
+        def column(name: str) -> Array:
+            rows = np.array([getattr(point, name) for point in points], dtype=float)
+            return np.asarray(rows[:, order])
+
+        self._start, times = seconds(trajectory.header.stamp) or self.time(), times_of(points)
+        known = np.stack([column(n) for n in ("positions", "velocities", "accelerations")], axis=1)
+        rows = column("effort")
+        if len(times) == 1:
+            # From where it is to a single point.
+            here = np.stack([self.desired, *np.zeros((2, len(self.q)))])
+            times = np.array([self.time() - self._start, *times])
+            known, rows = np.stack([here, *known]), np.stack([self.effort, *rows])
+        self._times, self._rows = times, rows
+        self._spline = BPoly.from_derivatives(times, known)
+        self._ended = ended
+
+    def _hold(self) -> None:
+        """`set_hold_position`: where it is, without effort."""
+        self._spline, self.effort = None, np.zeros(len(self.q))
+        self.desired, self.rate = self.q.copy(), np.zeros(len(self.q))
+
+    def _end(self, status: int, text: str) -> None:
+        ended, self._ended = self._ended, None
+        assert ended is not None
+        ended(status, text)
+
+    def step(self) -> None:
+        """Sample the reference."""
+        now = self.time()
+        if self._spline is None or now < self._start + self._times[0]:
+            return
+        if self.aborts_at is not None and now >= self.aborts_at:
+            self.aborts_at = None
+            self._end(ABORTED, "Aborted due to hardware")
+            self._hold()
+            return
+        time = now - self._start
+        place = float(np.clip(time, self._times[0], self._times[-1]))
+        self.desired, self.rate = np.asarray(self._spline(place)), np.zeros(len(self.q))
+        if self._times[0] < time < self._times[-1]:
+            self.rate = np.asarray(self._spline(place, 1))
+        self.effort = np.array([np.interp(place, self._times, c) for c in self._rows.T])
+        if time >= self._times[-1] and self._ended is not None:
+            self._end(SUCCEEDED, "Goal successfully reached!")
+
+
+def seconds(stamp: Any) -> float:
+    return float(stamp.sec + 1e-9 * stamp.nanosec)
+
+
+def times_of(points: Sequence[Any]) -> Array:
+    return np.array([seconds(point.time_from_start) for point in points])
+
+
+class ControlledCell:
+    """Both arms and their controllers, without the way in which a program reaches them.
+
+    Attributes:
+        config: `config/cell.json` of the bundle.
+        robots: both arms' parts of its job.
+        calls: of services, by name and request.
+        record: per step the time and both arms' positions and efforts.
+        silent: arms that publish no joint states.
+        offset: by which an arm's encoders are wrong [rad].
+        felt: offset of each sensor [N]; None for one that is silent.
+    """
+
+    def __init__(self, job: dict[str, Any], config: dict[str, Any]) -> None:
+        self.config, self.robots = config, job["robots"]
+        self.calls: list[tuple[str, Any]] = []
+        self.record: list[tuple[Any, ...]] = []
+        self.silent, self.offset = [False, False], [0.0, 0.0]
+        self.felt: list[float | None] = [0.0, 0.0]
+        self.controllers: dict[str, Controller] = {}
+        self._arms: dict[int, tuple[Controller, list[int]]] = {}
+        for group in config["groups"]:
+            robots = {arm: self.robots[arm] for arm in group["arms"]}
+            first: dict[str, float] = {}
+            for robot in robots.values():
+                first |= dict(zip(robot["ros_joints"], robot["position"][0], strict=True))
+            made = Controller(self.time, list(first), np.array(list(first.values())))
+            self.controllers[group["action"]] = made
+            for arm, robot in robots.items():
+                self._arms[arm] = made, [made.joints.index(name) for name in robot["ros_joints"]]
+        self._samples = [
+            (np.array(robot["position"]), np.array(robot["hold_effort_without_gravity"]))
+            for robot in self.robots
+        ]
+
+    def time(self) -> float:
+        """Time of the controllers [s]."""
+        raise NotImplementedError
+
+    def of(self, arm: int) -> tuple[Controller, list[int]]:
+        """An arm's controller, and the places of the arm's joints among its own."""
+        return self._arms[arm]
+
+    def q(self, arm: int) -> Array:
+        controller, part = self.of(arm)
+        return controller.q[part]
+
+    def effort(self, arm: int) -> Array:
+        controller, part = self.of(arm)
+        return controller.effort[part]
+
+    def drive(self) -> None:
+        """One cycle of the controllers and arms."""
+        for controller in self.controllers.values():
+            controller.step()
+        self.move()
+        both = [np.concatenate([each(0), each(1)]) for each in (self.q, self.effort)]
+        self.record.append((self.time(), *both))
+
+    def move(self) -> None:
+        """Let all arms follow: they are where their controllers want them."""
+        for controller in self.controllers.values():
+            if controller.is_active:
+                controller.q = np.where(controller.stands, controller.q, controller.desired)
+
+    def pressed(self, arm: int) -> float:
+        """Normal force [N] of the job's sample whose posture and effort are the nearest."""
+        q, effort = self._samples[arm]
+        far = np.abs(q - self.q(arm)).max(axis=1) * 1e3
+        far += np.abs(effort - self.effort(arm)).max(axis=1)
+        return float(self.robots[arm]["normal_force"][int(np.argmin(far))])
+
+    def serve(self, name: str, kind: str, request: Any) -> dict[str, Any]:
+        """Answer a call of a service by the fields of its response."""
+        self.calls.append((name, request))
+        space = name.split("/")[1]
+        own = [c for action, c in self.controllers.items() if action.startswith(f"/{space}/")]
+        own = own or list(self.controllers.values())
+        if kind.endswith("SwitchController"):
+            for controller in own:
+                controller.switch(bool(request.activate_controllers))
+            return {"ok": True}
+        if kind.endswith("SetLoad") and any(controller.is_active for controller in own):
+            return {"success": False, "error": "command rejected: motion running"}
+        return {"success": True}

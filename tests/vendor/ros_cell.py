@@ -1,0 +1,179 @@
+"""Both arms' controllers over ROS 2: PYTHON -m tests.vendor.ros_cell FOLDER [FAULT WHEN ARM]
+
+Plays the drivers of the bundle in FOLDER: real actions, services, messages and quality of service
+over FastDDS, around the rules of `controlled.py`. A fault happens WHEN seconds after the first
+goal's start; negative, from the beginning. FOLDER/start gets this start as text, in seconds of the
+system's clock. On SIGTERM, FOLDER/cell.npz gets what happened.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import signal
+import sys
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import rclpy
+from control_msgs.action import FollowJointTrajectory
+from geometry_msgs.msg import WrenchStamped
+from rclpy.action import ActionServer, CancelResponse, GoalResponse
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.signals import SignalHandlerOptions
+from rclpy.task import Future
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import JointState
+
+from tests.hybrid_opt.bundles.controlled import SUCCEEDED, ControlledCell
+
+CYCLE = 0.01
+"""Of controllers and topics [s]; those of robots are shorter."""
+
+
+class RosCell(ControlledCell):
+    """A cell whose programs come over ROS 2.
+
+    Attributes:
+        starts: start of each accepted goal [s], with the arms that it drives.
+    """
+
+    def __init__(self, node: Any, folder: Path) -> None:
+        """Offer what the drivers of `config/cell.json` do."""
+        self.node = node
+        job = json.loads((folder / "job.json").read_text("utf-8"))
+        super().__init__(job, json.loads((folder / "config/cell.json").read_text("utf-8")))
+        self.starts: list[float] = []
+        self._servers = [self._server(action) for action in self.controllers]
+        for call in self.config["prepare"]:
+            package, _, name = call["kind"].split("/")
+            kind = getattr(import_module(f"{package}.srv"), name)
+            node.create_service(kind, call["name"], self._service(call["name"], call["kind"]))
+        topics = self.config["joint_states"]
+        self._states = [node.create_publisher(JointState, topic, 10) for topic in topics]
+        # franka_robot_state_broadcaster.cpp:125, force_torque_sensor_broadcaster.cpp:120.
+        policy = ReliabilityPolicy.RELIABLE
+        if any("franka" in call["kind"] for call in self.config["prepare"]):
+            policy = ReliabilityPolicy.BEST_EFFORT
+        quality = QoSProfile(depth=1, reliability=policy)
+        self._wrenches = [
+            source and node.create_publisher(WrenchStamped, source["topic"], quality)
+            for source in self.config["wrench"]
+        ]
+        self._clock = node.create_publisher(Clock, "/clock", 1)
+        node.create_timer(CYCLE, self._cycle)
+
+    def time(self) -> float:
+        """Time of the node's clock [s]."""
+        return float(self.node.get_clock().now().nanoseconds) * 1e-9
+
+    def _service(self, name: str, kind: str) -> Any:
+        def answer(request: Any, response: Any) -> Any:
+            for field, value in self.serve(name, kind, request).items():
+                setattr(response, field, value)
+            return response
+
+        return answer
+
+    def _server(self, action: str) -> Any:
+        controller, results = self.controllers[action], dict[bytes, Future]()
+
+        def receive(goal: Any) -> Any:
+            accepted = controller.accepts(goal.trajectory)
+            return GoalResponse.ACCEPT if accepted else GoalResponse.REJECT
+
+        def take(handle: Any) -> None:
+            done = results[bytes(handle.goal_id.uuid)] = Future()
+            stamp = handle.request.trajectory.header.stamp
+            self.starts.append(stamp.sec + 1e-9 * stamp.nanosec)
+            controller.take(handle.request.trajectory, lambda *end: done.set_result(end))
+            handle.execute()
+
+        async def execute(handle: Any) -> Any:
+            status, text = await results.pop(bytes(handle.goal_id.uuid))
+            (handle.succeed if status == SUCCEEDED else handle.abort)()
+            return FollowJointTrajectory.Result(error_string=text)
+
+        return ActionServer(
+            self.node,
+            FollowJointTrajectory,
+            action,
+            execute_callback=execute,
+            goal_callback=receive,
+            handle_accepted_callback=take,
+            cancel_callback=lambda _: CancelResponse.REJECT,
+        )
+
+    def _cycle(self) -> None:
+        self.drive()
+        stamp = self.node.get_clock().now().to_msg()
+        # Heard where the bundle is for a simulator.
+        self._clock.publish(Clock(clock=stamp))
+        for arm, robot in enumerate(self.robots):
+            if not self.silent[arm]:
+                message = JointState(name=robot["ros_joints"])
+                message.header.stamp = stamp
+                message.position = (self.q(arm) + self.offset[arm]).tolist()
+                self._states[arm % len(self._states)].publish(message)
+            felt, publisher = self.felt[arm], self._wrenches[arm]
+            if publisher and felt is not None:
+                wrench = WrenchStamped()
+                wrench.header.stamp = stamp
+                axis, newton = self.config["wrench"][arm]["axis"], self.pressed(arm) + felt
+                force = wrench.wrench.force
+                force.x, force.y, force.z = (newton * value for value in axis)
+                publisher.publish(wrench)
+
+    def fault(self, name: str, arm: int) -> None:
+        """Let something go wrong."""
+        controller, part = self.of(arm)
+        if name == "stands":
+            controller.stands[part] = True
+        elif name == "silent":
+            self.silent[arm] = True
+        elif name == "deaf":
+            self.felt[arm] = None
+        elif name == "offset":
+            self.felt[arm] = 10.0
+        elif name == "elsewhere":
+            controller.q[part] += math.radians(3.0)
+        elif name == "rejects":
+            controller.refuses = True
+        elif name == "aborts":
+            controller.aborts_at = self.time()
+        else:
+            raise ValueError(name)
+
+
+def main() -> None:
+    """Play the drivers until SIGTERM."""
+    folder = Path(sys.argv[1])
+    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+    node = rclpy.create_node("cell")
+    cell = RosCell(node, folder)
+    ends: list[int] = []
+    signal.signal(signal.SIGTERM, lambda number, _: ends.append(number))
+    pending = []
+    if len(sys.argv) > 2:
+        name, when, arm = sys.argv[2], float(sys.argv[3]), int(sys.argv[4])
+        if when < 0.0:
+            cell.fault(name, arm)
+        else:
+            pending.append((when, name, arm))
+    print("ready", flush=True)
+    while not ends:
+        rclpy.spin_once(node, timeout_sec=0.1)
+        if len(cell.starts) == len(cell.controllers):
+            (folder / "starting").write_text(str(cell.starts[0]), "utf-8")
+            (folder / "starting").replace(folder / "start")
+        if pending and cell.starts and cell.time() >= cell.starts[0] + pending[0][0]:
+            cell.fault(*pending.pop()[1:])
+    time, q, effort = (np.array(column) for column in zip(*cell.record, strict=True))
+    np.savez(folder / "cell.npz", time=time, q=q, effort=effort, starts=cell.starts)
+    rclpy.shutdown()
+
+
+if __name__ == "__main__":
+    main()
