@@ -259,7 +259,7 @@ def test_a_pause_of_the_program_stops_nothing(pause: float, tmp_path: Path) -> N
 
 
 def test_controllers_end_the_job_of_a_killed_program(tmp_path: Path) -> None:
-    """As docs/export.md says: nothing is dropped, and the box is set down."""
+    """As docs/reference/bundles.md says: nothing is dropped, and the box is set down."""
 
     def act(live: Live) -> None:
         live.wait_until(middle())
