@@ -9,12 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from codegen.function import NumericFunction
 from hybrid_opt.collision.distances import INTERSECTING, OPEN, BodyDistances
+from hybrid_opt.collision.joint_tables import JointTable, joint_tables
 from hybrid_opt.collision.judge import FCL_RESOLUTION, Judge
 from symbolic.array import Array
 from symbolic.geometry.pairs import CellGeometry
@@ -107,7 +109,16 @@ class CollisionChecker:
             q_1, q_2: (n, joints) joint positions [rad].
         """
         asked = [self.functions[f"{block}clearance"] for block in self.geometry.asked]
-        return self.geometry.of_active([f.batch(pose, q_1, q_2)["clearance"] for f in asked])
+        found = self.geometry.of_active([f.batch(pose, q_1, q_2)["clearance"] for f in asked])
+        for table in self.tables:
+            tabulated = table.look_up((q_1, q_2)[table.robot])
+            found[:, table.pair] = np.fmax(found[:, table.pair], tabulated)
+        return found
+
+    @cached_property
+    def tables(self) -> tuple[JointTable, ...]:
+        """Tabulated bounds of active pairs."""
+        return joint_tables(self.geometry)
 
     def check(self, pose: Array, q_1: Array, q_2: Array, clearance: Array | None = None) -> Verdict:
         """Check n samples.

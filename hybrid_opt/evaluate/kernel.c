@@ -21,11 +21,16 @@ typedef int (*decide_pair)(const void* bodies, const double* quaternions, const 
                            long long stride, long long first, long long second, double apart,
                            double overlap, double* direction);
 
+/* Lower bounds of a pair's distance over the positions of two joints of a robot, by cells of one turn
+   of each (hybrid_opt/collision/joint_tables.py); bounds is null where there are none. */
+typedef struct { const float* bounds; long long robot, joint; } joint_table;
+
 /* The cell's pairs. columns: of each among all bounds; shrunk_payload: a further body, for the
    payload where it rests. */
 typedef struct {
   const long long *pairs, *columns;
   const resting_place* resting;
+  const joint_table* tables; /* of each pair */
   const double *free_beyond, *tolerance; /* of each pair */
   long long n_pairs, has_far, n_resting, shrunk_payload;
   double margin;
@@ -258,6 +263,26 @@ static int decide(const judge_data* judge, long long pair, int k, int l) {
                        judge->margin + tolerance, judge->margin - tolerance, s->direction[pair][l]);
 }
 
+/* Cell of a table at a joint position [rad], -1 where it is uncertain. */
+static long long table_cell(double q) {
+  if (!(fabs(q) < TABLE_MOST_ANGLE)) return -1;
+  return (long long)floor(q * TABLE_CELLS_PER_RADIAN) & (TABLE_CELLS - 1);
+}
+
+/* The lanes among `bits` that the table of a pair leaves open. */
+static unsigned not_tabulated_free(const judge_data* judge, long long pair, int k, unsigned bits) {
+  const joint_table* table = judge->tables + pair;
+  if (!table->bounds) return bits;
+  const lanes_real* q = own->q[k][table->robot] + table->joint;
+  for (int l = 0; l < DUAL_ARM_LANES; ++l) {
+    if (!(bits >> l & 1u)) continue;
+    long long first = table_cell(lane_of(q, l)), second = table_cell(lane_of(q + 1, l));
+    if (first < 0 || second < 0) continue;
+    if (table->bounds[first * TABLE_CELLS + second] > judge->free_beyond[pair]) bits &= ~(1u << l);
+  }
+  return bits;
+}
+
 /* Which samples of the candidates collide, and which pairs are still to be judged. */
 static int collide(batch_data* batch, const judge_data* judge, long long first, int m) {
   scratch* s = own;
@@ -292,6 +317,8 @@ static int collide(batch_data* batch, const judge_data* judge, long long first, 
       lanes_mask free = s->clearance[judge->columns[pair]] > lanes_all_equal(judge->free_beyond[pair]);
       unsigned bits = ~lanes_bits(free) & alive & ~colliding;
       if (__builtin_expect(!bits, 1)) continue;
+      bits = not_tabulated_free(judge, pair, k, bits);
+      if (!bits) continue;
       if (!placed_already) {
         s->arg[0] = s->pose[k];
         for (int i = 0; i < 2; ++i) s->arg[1 + i] = s->q[k][i];

@@ -25,6 +25,7 @@ from codegen.errors import CodegenError, FormError
 from codegen.function import available_cores
 from hybrid_opt.collision.checker import PROOF_MARGIN, CollisionChecker
 from hybrid_opt.collision.distances import compiled_distances
+from hybrid_opt.collision.joint_tables import CELLS, CELLS_PER_RADIAN, MOST_ANGLE
 from hybrid_opt.compiled_cell import CompiledCell
 from symbolic.array import Array
 from symbolic.functions import (
@@ -43,6 +44,8 @@ _LEAST_ROOM = 4096
 """Open pairs that are collected before they are handed on, beside those of one pass."""
 
 _RESTING = np.dtype([("pair", np.int64), ("place", np.float64, 3), ("departure", np.float64)])
+
+_TABLE = np.dtype([("bounds", np.uintp), ("robot", np.int64), ("joint", np.int64)])
 
 
 @dataclass(frozen=True)
@@ -320,6 +323,9 @@ def _definitions(geometry: CellGeometry) -> str:
         "SAMPLE_SIZE": sum(sizes.values()),
         "CONSTRAINT_AT": starts["constraint"],
         "CONSTRAINT_OUTPUT": list(sizes).index("constraint"),
+        "TABLE_CELLS": CELLS,
+        "TABLE_CELLS_PER_RADIAN": repr(CELLS_PER_RADIAN),
+        "TABLE_MOST_ANGLE": MOST_ANGLE,
     }
     lists = {
         "N_JOINTS": joints,
@@ -394,7 +400,7 @@ class JudgeData(ctypes.Structure):
 
     _fields_ = [
         *((name, ctypes.c_void_p) for name in ("pairs", "columns")),
-        *((name, ctypes.c_void_p) for name in ("resting", "free_beyond", "tolerance")),
+        *((name, ctypes.c_void_p) for name in ("resting", "tables", "free_beyond", "tolerance")),
         *((name, ctypes.c_longlong) for name in ("n_pairs", "has_far", "n_resting")),
         ("shrunk_payload", ctypes.c_longlong),
         ("margin", ctypes.c_double),
@@ -419,7 +425,11 @@ def _judge_data(checker: CollisionChecker) -> tuple[JudgeData, dict[str, NDArray
     """Return the pairs and margins of a cell, and the memory that they point into, which must
     outlive them, as must the checker with its bodies."""
     geometry = checker.geometry
+    tables = np.zeros(len(geometry.active), dtype=_TABLE)
+    for table in checker.tables:
+        tables[table.pair] = table.bounds.ctypes.data, table.robot, table.joint
     arrays = {
+        "tables": tables,
         "pairs": np.array([(p.first, p.second) for p in geometry.active], dtype=np.int64),
         "columns": geometry.columns.astype(np.int64),
         "resting": np.array(checker.resting_places, dtype=_RESTING),
