@@ -13,6 +13,7 @@ from codegen.build import compiler_of, load_or_build
 from codegen.cache import Cache, key_of, library_version
 from codegen.function import NumericFunction
 from symbolic.array import Array
+from symbolic.contact.registry import contact_model
 from symbolic.records import Workcell
 from symbolic.records.task import initial_decision
 
@@ -308,7 +309,7 @@ class InterpretedCell(CompiledCell):
 def is_interpretable(workcell: Workcell) -> bool:
     """Return True if candidates take CasADi's interpreter milliseconds: no program solves for their
     forces, and no compiled passes time them."""
-    return workcell.has_closed_form and workcell.task.time_law != "optimal"
+    return contact_model(workcell).has_closed_form and workcell.task.time_law != "optimal"
 
 
 @lru_cache
