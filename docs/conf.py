@@ -95,11 +95,19 @@ def picture(_: Any, block: dict[str, Any], gallery: dict[str, Any]) -> str:
     return ""
 
 
+def purposes() -> dict[str, list[str]]:
+    """The public names by purpose, as the page of the library groups them."""
+    text = (ROOT / "docs" / "reference" / "library.md").read_text("utf-8")
+    section = text.split("## The names by purpose")[1].split("\n## ")[0]
+    rows = re.findall(r"^\| ([a-z ]+) \| (`.*`) \|$", section, flags=re.MULTILINE)
+    return {group: re.findall(r"`(\w+)`", names) for group, names in rows}
+
+
 def api() -> Path:
     """A page for every public name, with the examples that use it, and one for stored figures."""
     folder = ROOT / "docs" / "api"
     folder.mkdir(exist_ok=True)
-    rows = []
+    rows = {}
     for name in sorted(ho.__all__):
         thing = getattr(ho, name)
         summary = (inspect.getdoc(thing) or "").split("\n\n")[0].replace("\n", " ")
@@ -121,16 +129,20 @@ def api() -> Path:
             ]
         )
         _write(folder / f"{name}.rst", page)
-        rows.append(f"* :doc:`{name} <{name}>`: {summary}")
+        rows[name] = f"* :doc:`{name} <{name}>`: {summary}"
     stored = "Figures of a study: summary.json"
     page = f"{stored}\n{'=' * len(stored)}\n\n.. automodule:: studies.study.summary\n"
     _write(folder / "summary.rst", page)
-    rows.append(f"* :doc:`{stored} <summary>`")
+    rows["summary"] = f"* :doc:`{stored} <summary>`"
     listed = "\n".join(f"   {name}" for name in (*sorted(ho.__all__), "summary"))
     title = "The library, name by name"
-    index = f"{title}\n{'=' * len(title)}\n\nWhat ``import hybrid_opt as ho`` gives.\n\n"
-    hidden = f"\n\n.. toctree::\n   :hidden:\n\n{listed}\n"
-    _write(folder / "index.rst", index + "\n".join(rows) + hidden)
+    index = [f"{title}\n{'=' * len(title)}\n", "What ``import hybrid_opt as ho`` gives.\n"]
+    for group, names in {**purposes(), "stored figures": ["summary"]}.items():
+        heading = group.capitalize()
+        listed_here = "\n".join(rows[name] for name in names)
+        index.append(f"{heading}\n{'-' * len(heading)}\n\n{listed_here}\n")
+    index.append(f".. toctree::\n   :hidden:\n\n{listed}\n")
+    _write(folder / "index.rst", "\n".join(index))
     return folder
 
 

@@ -19,6 +19,7 @@ from urllib.parse import urlsplit
 
 import pytest
 
+import hybrid_opt as ho
 from tests.waiting import HANGS
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -168,6 +169,12 @@ def test_the_index_lists_every_page() -> None:
     pages = {path.relative_to(docs).as_posix() for path in docs.glob("**/*.md")} - {"index.md"}
     assert pages == {link for link in LINK.findall(text) if "://" not in link}
     assert pages <= {f"{line}.md" for line in text.splitlines()}
+
+
+def test_the_library_page_groups_every_public_name_once() -> None:
+    text = (ROOT / "docs/reference/library.md").read_text("utf-8")
+    section = text.split("## The names by purpose")[1].split("\n## ")[0]
+    assert sorted(re.findall(r"`(\w+)`", section)) == sorted(ho.__all__)
 
 
 MOST_WORDS = 20_000
