@@ -291,9 +291,8 @@ def add(parser: argparse._ActionsContainer, *names: str, **own: Any) -> None:
         parser.add_argument(name.lower(), **(place | _SHARED[name] | own))
 
 
-def add_wishes(parser: argparse._ActionsContainer, more: str = "") -> None:
-    """Add what may be asked of the recommended carry; `Wish` takes it. `more` says what else the
-    program does with a limit of the force."""
+def add_wishes(parser: argparse._ActionsContainer) -> None:
+    """Add the targets of a recommendation; `Wish` takes them."""
     parser.add_argument(
         "--duration",
         type=force,
@@ -304,8 +303,8 @@ def add_wishes(parser: argparse._ActionsContainer, more: str = "") -> None:
     add(
         parser,
         "--force-limit",
-        help=f"recommend the shortest carry that needs at most N newtons commanded{more} (default: "
-        "the least product of duration and commanded force)",
+        help="recommend the shortest carry that needs at most N newtons commanded (default: the "
+        "least product of duration and commanded force)",
     )
     parser.add_argument(
         "--payload",

@@ -160,7 +160,7 @@ def add_options(parser: Parser, output: str) -> None:
         help="independent runs per algorithm of that search (default: as --replicas, at most "
         f"{stated('hybrid_opt.campaign.stages.DRIVABLE_REPLICAS')})",
     )
-    add_wishes(after, "; also times every selected carry with that limit of its planned forces")
+    add_wishes(after)
     after.add_argument(
         "--simulate",
         action="store_true",
