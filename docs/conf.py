@@ -148,7 +148,7 @@ def api() -> Path:
 
 def command_line() -> Path:
     """A page with what `--help` prints of every program."""
-    os.environ["COLUMNS"] = "96"
+    os.environ["COLUMNS"] = "86"
     title = "Command line"
     parts = [f"{title}\n{'=' * len(title)}\n", f"What ``{COMMAND} NAME --help`` prints.\n"]
     for name, (module, _) in programs().items():
