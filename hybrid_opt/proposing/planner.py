@@ -16,7 +16,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from itertools import pairwise, product
+from itertools import pairwise, permutations, product
 from typing import Any
 
 import numpy as np
@@ -162,13 +162,14 @@ class ClosedChain:
         return Place(extended, (found[0], found[1]))
 
     def close_many(
-        self, extended: Array, q: tuple[Array, Array]
+        self, extended: Array, q: tuple[Array, Array], steps: int = TRACKING_STEPS
     ) -> tuple[tuple[Array, Array], NDArray[np.bool_]]:
         """Configurations near given joints, all side by side; collisions do not count.
 
         Args:
             extended: (n, 6 + m).
             q: per arm (n, joints).
+            steps: of Newton's method, at most.
 
         Returns:
             Per arm the joints (n, joints), and which configurations (n,) are closed within limits.
@@ -179,7 +180,7 @@ class ClosedChain:
             guess = near.copy()
             for joint, place in arm.redundant:
                 guess[:, joint] = extended[:, place]
-            there = arm.many.solve(guess, T_world_box @ arm.T_box_joint, TRACKING_STEPS)
+            there = arm.many.solve(guess, T_world_box @ arm.T_box_joint, steps)
             closed &= (there.residual <= REACHED) & (there.manipulability >= arm.many.least)
             closed &= np.all((there.q >= arm.lower) & (there.q <= arm.upper), axis=1)
             found.append(there.q)
@@ -202,6 +203,50 @@ class ClosedChain:
                     return
                 batch = []
         yield from batch[: self._free(batch)]
+
+    def along_many(self, begins: Sequence[Place], paths: Array) -> list[list[Place]]:
+        """Follow paths side by side, each as far as it is free.
+
+        Args:
+            begins: a configuration at the begin of each path.
+            paths: (k, n, 6 + m) extended poses, `STEP` apart or less.
+
+        Returns:
+            The configurations along each path, its begin first.
+        """
+        found = [[begin] for begin in begins]
+        alive = np.arange(len(begins))
+        q = np.array([begin.q[0] for begin in begins]), np.array([begin.q[1] for begin in begins])
+        step = np.zeros_like(q[0]), np.zeros_like(q[1])
+        for extended in paths.transpose(1, 0, 2)[1:]:
+            there, on = self.close_many(extended[alive], (q[0] + step[0], q[1] + step[1]))
+            step = there[0] - q[0], there[1] - q[1]
+            on &= np.max(np.abs(np.hstack(step)), axis=1) <= JUMP
+            alive, q = alive[on], (there[0][on], there[1][on])
+            step = step[0][on], step[1][on]
+            for row, k in enumerate(alive.tolist()):
+                found[k].append(Place(extended[k], (q[0][row], q[1][row])))
+            if not len(alive):
+                break
+        self.looked += sum(map(len, found)) - len(found)
+        return [[one[0], *one[1 : 1 + self._free(one[1:])]] for one in found]
+
+    def between(self, first: Place, last: Place, path: Array) -> list[Place] | None:
+        """The configurations along a path (n, 6 + m) between two of them, None if not all are free,
+        or the joints do not lead from the one to the other."""
+        share = np.linspace(0.0, 1.0, len(path))[:, None]
+        near = [(1.0 - share) * a + share * b for a, b in zip(first.q, last.q, strict=True)]
+        q, closed = self.close_many(path, (near[0], near[1]), NEWTON_STEPS)
+        self.looked += len(path)
+        whole = np.hstack(q)
+        joined = np.abs(np.diff(whole, axis=0)).max(initial=0.0) <= JUMP
+        arrives = np.abs(whole[-1] - np.concatenate(last.q)).max() < MATCH
+        begins = np.abs(whole[0] - np.concatenate(first.q)).max() < MATCH
+        if not (closed.all() and joined and begins and arrives):
+            return None
+        places = [Place(each, (q[0][k], q[1][k])) for k, each in enumerate(path)]
+        free = self._free(places[1:-1]) == len(places) - 2
+        return [first, *places[1:-1], last] if free else None
 
     def reach(self, begin: Place, extended: Array) -> Place | None:
         """The configuration at the end of a straight motion, None if it is not free."""
@@ -247,6 +292,9 @@ RETREAT = 0.6
 
 SHORT_RETREAT = 0.06
 """Shortest one that is of use [m]."""
+
+DIRECTIONS = np.array([way for way in product((-1.0, 0.0, 1.0), repeat=3) if any(way)])
+"""Directions of retreats, along the world's axes and between them."""
 
 RETREAT_STOPS = 4
 """Stride of a retreat's configurations at which the box may turn to the other end's pose."""
@@ -356,30 +404,33 @@ itself first."""
 def retreats(chain: ClosedChain, ends: tuple[Place, Place]) -> Retreats:
     """Straight motions out of start and goal along the world's axes and between them: out of a
     shelf, for instance."""
-    signs = np.array(list(product((-1.0, 0.0, 1.0), repeat=3)))
-    found: Retreats = ([], [])
-    for way in signs[np.any(signs != 0.0, axis=1)]:
-        for end, place in enumerate(ends):
-            away = place.extended.copy()
-            away[:3] += RETREAT * way / np.linalg.norm(way)
-            path = straight(place.extended, away)
-            found[end].append([place, *chain.along(place, path[1:])])
-    return found
+    ways = DIRECTIONS / np.linalg.norm(DIRECTIONS, axis=1)[:, None]
+    begins = [place for place in ends for _ in ways]
+    away = np.array([place.extended for place in begins])
+    away[:, :3] += RETREAT * np.tile(ways, (len(ends), 1))
+    steps = round(RETREAT / STEP)
+    paths = np.linspace([place.extended for place in begins], away, steps + 1, axis=1)
+    found = chain.along_many(begins, paths)
+    return found[: len(ways)], found[len(ways) :]
 
 
 def straight_paths(chain: ClosedChain, out: Retreats, box: BoxAlone) -> Iterator[list[Place]]:
-    """Corners of free paths of a retreat, a straight motion, and the opposite of a retreat along
-    the same direction: the shortest found first, along each direction one."""
-    ways: dict[tuple[bytes, bytes], tuple[float, int, list[Place]]] = {}
-    for along, (first, last) in enumerate(zip(*out, strict=True)):
+    """Corners of free paths of a retreat, a straight motion, and the opposite of a retreat: the
+    shortest found first, along each pair of directions one. The directions are the same, or both
+    along axes of the world: up out of a bin, and into a shelf from its front."""
+    ways: dict[tuple[bytes, bytes], tuple[float, tuple[int, int], list[Place]]] = {}
+    axes = np.flatnonzero(np.count_nonzero(DIRECTIONS, axis=1) == 1)
+    same_way = [(k, k) for k in range(len(DIRECTIONS))]
+    for along in (*same_way, *permutations(axes.tolist(), 2)):
+        first, last = out[0][along[0]], out[1][along[1]]
         for a, b in product(first[::RETREAT_STOPS], last[::RETREAT_STOPS]):
             corners = [first[0], a, b, last[0]]
             length = sum(distance(p.extended, q.extended) for p, q in pairwise(corners))
-            ways[a.extended.tobytes(), b.extended.tobytes()] = length, along, corners
-    tried, done = 0, set[int]()
+            ways.setdefault((a.extended.tobytes(), b.extended.tobytes()), (length, along, corners))
+    tried, done = 0, set[tuple[int, int]]()
     for _, along, corners in sorted(ways.values(), key=lambda way: way[0]):
         begin, end = corners[1].extended, corners[2].extended
-        if along in done or box.meets((begin + BETWEEN[:, None] * (end - begin))[:, :POSE_SIZE]):
+        if along in done or box.is_between(begin[:POSE_SIZE], end[:POSE_SIZE], BETWEEN):
             continue
         there = chain.reach(corners[1], end)
         tried += 1

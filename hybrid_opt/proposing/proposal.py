@@ -45,20 +45,20 @@ from symbolic.errors import SettingsError, WorkcellError
 from symbolic.path.spline import path_basis
 from symbolic.records import POSE_SIZE, Workcell
 
-ROUNDS = ((0, 4), (2000, 2), (6000, 6), (20000, 16), (60000, 24))
-"""Configurations that the planner may look at for a path, 0 for straight motions alone, and how
-many pairs of holds get them."""
+ROUNDS = ((0, 12, 0), (500, 12, 2), (2500, 6, 6), (8000, 16, 6), (30000, 24, 6))
+"""Configurations that the planner may look at for a path, 0 for straight motions alone, how many
+pairs of holds get them, and among how many of `STRAYS`: short tries of all before long ones."""
 
-OTHER_FACES = 20000
+OTHER_FACES = 8000
 """Configurations for a path from which on other faces of the box are pressed too, if both arms can
 hold it by those that face them."""
 
 STRAYS = (
     Stray(0.0, 0.15, 0.8),
+    Stray(0.3, 0.15, 0.8),
     Stray(0.0, 0.15, 0.3),
     Stray(0.0, 0.05, 0.3),
     Stray(0.0, 0.15, 0.15),
-    Stray(0.3, 0.15, 0.8),
     Stray(0.3, 0.05, 0.8),
 )
 """What paths are looked for among; the narrower, the sooner a gap is found, if it is there."""
@@ -296,9 +296,9 @@ class _Search:
             choices += [{"contacts": pair} for pair in self.problem.other_contacts()]
         setups = [_Lazy(given, spins) for given in choices]
         found: list[Proposal] = []
-        for effort, most in ROUNDS:
+        for effort, most, strays in ROUNDS:
             for setup in setups:
-                for one in self._round(setup, effort, most):
+                for one in self._round(setup, effort, most, strays):
                     found.append(one)
                     self._say(f"carry {len(found)} passes {one.passes}")
                     if len(found) == self.settings.classes:
@@ -314,7 +314,7 @@ class _Search:
         ones, as long as those that face the robots can be held."""
         return self.settings.bases or effort >= OTHER_FACES
 
-    def _round(self, lazy: _Lazy, effort: int, most: int) -> Iterator[Proposal]:
+    def _round(self, lazy: _Lazy, effort: int, most: int, strays: int) -> Iterator[Proposal]:
         """One round with one choice of bases."""
         if lazy.setup is None and not lazy.problem:
             self._say("ways to hold the box")
@@ -332,7 +332,7 @@ class _Search:
                 break
             self._say(f"paths of pair {number + 1} of {len(lazy.setup.pairs)}")
             long: list[Array] = []
-            for corners in self._paths(lazy.setup, pair, effort, box):
+            for corners in self._paths(lazy.setup, pair, effort, strays, box):
                 if corners is None or self._is_known(pair, box, along(corners)):
                     continue
                 via = self._via_points(pair, corners)
@@ -368,7 +368,7 @@ class _Search:
         return ProposalError(f"{begin}: {met or 'no path was tried yet'}")
 
     def _paths(
-        self, setup: Setup, pair: Pair, effort: int, box: BoxAlone
+        self, setup: Setup, pair: Pair, effort: int, strays: int, box: BoxAlone
     ) -> Iterator[list[Place] | None]:
         """Corners of paths in one way of holding."""
         if not effort:
@@ -377,7 +377,7 @@ class _Search:
             return
         limits = [(joint.lower.min(), joint.upper.max()) for joint in setup.workcell.task.redundant]
         sided = [replace(STRAYS[0], towards=side) for side in SIDES]
-        for stray in (*STRAYS, *(sided if self.settings.classes > 1 else ())):
+        for stray in (*STRAYS[:strays], *(sided if self.settings.classes > 1 else ())):
             if self.too_late:
                 return
             ends = pair.start.extended, pair.goal.extended

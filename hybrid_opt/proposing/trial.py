@@ -57,6 +57,7 @@ class BoxAlone:
         """Prepare their shapes."""
         meshes = MeshReader()
         self._orientation = workcell.task.orientation
+        self._met: dict[tuple[bytes, bytes], bool] = {}
         self._box = shape_pieces(workcell.payload.solid, np.eye(4), PAYLOAD_NAME, meshes)
         self._names = [body.name for body in workcell.environment]
         self._standing = [
@@ -68,6 +69,14 @@ class BoxAlone:
         return any(
             self._meets(box, k) for box in self._boxes(path) for k in range(len(self._names))
         )
+
+    def is_between(self, begin: Array, end: Array, shares: Array) -> bool:
+        """Return True if the box meets the environment between two poses (6,), at shares (n,) of
+        the straight motion; remembered, because all ways to hold ask for the same ones."""
+        key = begin.tobytes(), end.tobytes()
+        if key not in self._met:
+            self._met[key] = self.meets(begin + shares[:, None] * (end - begin))
+        return self._met[key]
 
     def passed(self, path: Array) -> tuple[str, ...]:
         """Sides on which a path (n, 6) passes what the straight motion between its ends meets, such

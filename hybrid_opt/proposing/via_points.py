@@ -79,9 +79,8 @@ def shortened(
         if rng.random() < 0.5:  # in one coordinate alone, the others go on as they do
             path, column = np.array([place.extended for place in old]), rng.integers(path.shape[1])
             path[:, column] = np.linspace(path[0, column], path[-1, column], len(path))
-        found = chain.way(old[0], path)
-        arrived = found is not None and same(found[-1], old[-1])
-        if found and arrived and joint_length(found) < SHORTER * joint_length(old):
+        found = chain.between(old[0], old[-1], path)
+        if found and joint_length(found) < SHORTER * joint_length(old):
             dense[first : last + 1] = found
     return dense
 
