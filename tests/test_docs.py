@@ -141,9 +141,7 @@ def test_toml_blocks_can_be_read() -> None:
 
 
 @pytest.mark.slow
-def test_the_tutorial_of_a_cell_of_ones_own_ends_with_a_bundle_and_no_warning(
-    tmp_path: Path,
-) -> None:
+def test_the_tutorial_of_a_cell_of_ones_own_ends_with_a_bundle(tmp_path: Path) -> None:
     """As printed, but for the installation; in a folder that has the checkout's studies."""
     lines = blocks((ROOT / "docs/tutorials/two-robots.md").read_text("utf-8"), "sh")[0].splitlines()
     readme = (ROOT / "README.md").read_text("utf-8").split("## Your own cell")[1]
