@@ -1,6 +1,6 @@
 """From functions and C text to loaded libraries, found in the cache or compiled in parallel.
 
-There is one way for all of them. A `Source` is C to compile: of one CasADi function with its
+There is one way for all of them. A `CSource` is C to compile: of one CasADi function with its
 driver, of one that is written by hand, or of a program (`load_or_build_program`). Its library is
 kept under a key of the text and of what compiles it; long functions in it are parts, object files
 under keys of their own. What sources are made from has a key as well, a recipe's: under it the
@@ -22,7 +22,7 @@ from pathlib import Path
 from threading import Lock
 from typing import TYPE_CHECKING, Any
 
-from codegen.cache import Cache, Entry, key_of, library_version
+from codegen.cache import Cache, CacheEntry, key_of, library_version
 from codegen.compiled import CompiledFunction, cannot_load, warn_one_lane
 from codegen.compiler import (
     FLAGS,
@@ -36,7 +36,7 @@ from codegen.compiler import (
 )
 from codegen.errors import CodegenError, FormError
 from codegen.function import NumericFunction, Signature, available_cores
-from codegen.parts import Part, in_parts
+from codegen.parts import CodePart, in_parts
 
 if TYPE_CHECKING:
     import casadi as ca
@@ -53,7 +53,7 @@ the first while the second is made."""
 
 
 @dataclass(frozen=True)
-class Source:
+class CSource:
     """C to compile.
 
     Attributes:
@@ -75,7 +75,7 @@ class Source:
     most: int = 3
 
     @classmethod
-    def of(cls, name: str, function: ca.Function, lanes: int, level: int | None) -> Source:
+    def of(cls, name: str, function: ca.Function, lanes: int, level: int | None) -> CSource:
         """Generate the C of a function; level None chooses one by the size of the generated text.
         Without lanes, with one warning, if its C has no form in lanes."""
         from codegen.source import c_source, dense, generated_c, operations
@@ -100,7 +100,7 @@ class Library:
         handle: what it offers, by attribute.
     """
 
-    entry: Entry
+    entry: CacheEntry
     handle: ctypes.CDLL
 
     def function(self) -> CompiledFunction:
@@ -192,7 +192,7 @@ def compile_function(
     Raises:
         CodegenError: there is no C compiler; or it cannot be generated, compiled, cached or loaded.
     """
-    source = Source.of(function.name(), function, lanes, level)
+    source = CSource.of(function.name(), function, lanes, level)
     return _compiled([source], cache or Cache())[source.name][0].function()
 
 
@@ -278,9 +278,9 @@ def load_or_compile(
             whatever `make` raises.
     """
 
-    def source() -> Iterable[Source]:
+    def source() -> Iterable[CSource]:
         signature, text = make()
-        yield Source(signature.name, text, HANDWRITTEN_LEVEL, signature=signature)
+        yield CSource(signature.name, text, HANDWRITTEN_LEVEL, signature=signature)
 
     cache = cache or Cache()
     (library,) = _obtained(_set_key(key, None, 1, cache), source, cache).values()
@@ -316,10 +316,10 @@ def load_or_build_program(
         CodegenError: as of `load_or_compile`; or a function has no form in lanes.
     """
 
-    def source() -> Iterable[Source]:
+    def source() -> Iterable[CSource]:
         from codegen.source import program_source
 
-        yield Source(name, program_source(make(), own, lanes), LANE_LEVEL, lanes)
+        yield CSource(name, program_source(make(), own, lanes), LANE_LEVEL, lanes)
 
     cache = cache or Cache()
     full = key_of("program", name=name, of=_set_key(key, None, lanes, cache), own=own)
@@ -328,13 +328,13 @@ def load_or_build_program(
 
 def _sources_of(
     make: Callable[[], Mapping[str, ca.Function]], levels: Mapping[str, int], lanes: int
-) -> Iterable[Source]:
+) -> Iterable[CSource]:
     from codegen.source import operations
 
     functions = make()
     # The longest first: none is left to run alone in the end.
     for name in sorted(functions, key=lambda name: -operations(functions[name])):
-        yield Source.of(name, functions[name], lanes, levels.get(name))
+        yield CSource.of(name, functions[name], lanes, levels.get(name))
 
 
 def _set_key(key: str, levels: Mapping[str, int] | None, lanes: int, cache: Cache) -> str:
@@ -350,7 +350,7 @@ def _set_key(key: str, levels: Mapping[str, int] | None, lanes: int, cache: Cach
 
 
 def _obtained(
-    key: str, sources: Callable[[], Iterable[Source]], cache: Cache
+    key: str, sources: Callable[[], Iterable[CSource]], cache: Cache
 ) -> dict[str, Library]:
     """Load the libraries of a recipe: those that its record names, or those compiled from its
     sources."""
@@ -386,7 +386,7 @@ def _loaded(key: str, cache: Cache) -> Library | None:
 
 
 def _compiled(
-    sources: Iterable[Source], cache: Cache, *, rebuild: bool = False
+    sources: Iterable[CSource], cache: Cache, *, rebuild: bool = False
 ) -> dict[str, tuple[Library, bool]]:
     """Compile sources; return the libraries by name, and whether the cache already had them.
 
@@ -411,7 +411,7 @@ def _compiled(
 
 
 def _begin(
-    source: Source, compiler: Compiler, cache: Cache, pool: ThreadPoolExecutor, rebuild: bool
+    source: CSource, compiler: Compiler, cache: Cache, pool: ThreadPoolExecutor, rebuild: bool
 ) -> Future[tuple[Library, bool]]:
     """Begin to compile a source. Submitted work starts in order: parts before the library that
     needs them."""
@@ -478,7 +478,7 @@ def _require_sound(compiler: Compiler, cache: Cache) -> None:
     cache.obtain(key, lambda: cache.read_record(key), test)
 
 
-def _object(part: Part, compiler: Compiler, cache: Cache) -> Path:
+def _object(part: CodePart, compiler: Compiler, cache: Cache) -> Path:
     """Return a part's object file, compiled if the cache lacks it."""
     flags = (*FLAGS, *LANE_FLAGS)
     key = key_of("part", compiler=compiler.identity, level=part.level, flags=flags, text=part.text)

@@ -36,7 +36,7 @@ from symbolic import safe_io
 from symbolic.errors import OutsideError
 from symbolic.safe_io import replace_file
 
-FORMAT = 1
+CACHE_FORMAT = 1
 """Part of every key; rises when what is stored changes its meaning."""
 
 _SOURCES = {".py", ".c", ".h"}
@@ -70,7 +70,7 @@ def key_of(what: str, **parts: object) -> str:
       compiler       the processor: which compiler made what is kept (`codegen.build.compiler_of`)
     """
     named = [f"{name}={value}" for name, value in sorted(parts.items())]
-    return digest(what, str(FORMAT), *named)
+    return digest(what, str(CACHE_FORMAT), *named)
 
 
 def digest(*parts: str | bytes) -> str:
@@ -160,7 +160,7 @@ class Usage:
 
 
 @dataclass(frozen=True)
-class Entry:
+class CacheEntry:
     """A library found in the cache, its content verified.
 
     Attributes:
@@ -180,7 +180,7 @@ class Cache:
     def __init__(self, folder: Path | None = None) -> None:
         self.folder = Path(os.path.abspath(folder if folder is not None else default_folder()))
 
-    def find(self, key: str) -> Entry | None:
+    def find(self, key: str) -> CacheEntry | None:
         """Return the entry of this key, or None if it is missing or damaged.
 
         Raises:
@@ -196,11 +196,11 @@ class Cache:
         content = self._read_own(library)
         if content is None or hashlib.sha256(content).hexdigest() != facts.get("sha256"):
             return None
-        return Entry(key, library, facts)
+        return CacheEntry(key, library, facts)
 
     def store(
         self, key: str, make: Callable[[Path], Mapping[str, Any]], suffix: str = ".so"
-    ) -> Entry:
+    ) -> CacheEntry:
         """Make a library and store it under this key, replacing an existing one.
 
         Args:
@@ -222,7 +222,7 @@ class Cache:
                 built.replace(library)
         facts |= {"library": library.name, "sha256": checksum}
         self.write_record(key, facts)
-        return Entry(key, library, facts)
+        return CacheEntry(key, library, facts)
 
     def read_record(self, key: str) -> dict[str, Any] | None:
         """Return the record stored under this key, or None if it is missing or damaged."""

@@ -19,7 +19,7 @@ from codegen.function import NumericFunction, Signature
 from codegen.source import dense
 from symbolic.array import Array
 
-TOLERANCE = 1e-10
+AGREEMENT_TOLERANCE = 1e-10
 """Largest relative difference allowed between compiled and interpreted."""
 
 RESIDUE = 1e-6
@@ -104,8 +104,8 @@ class Agreement:
 
     @property
     def agrees(self) -> bool:
-        """True if both are within `TOLERANCE`."""
-        return max(self.outputs, self.derivatives) <= TOLERANCE
+        """True if both are within `AGREEMENT_TOLERANCE`."""
+        return max(self.outputs, self.derivatives) <= AGREEMENT_TOLERANCE
 
 
 def compare(

@@ -14,10 +14,10 @@
   entry     = "return casadi_f" N "(arg, res, iw, w, mem);"
 
 with at most one statement on a line. The forms that a line may take are listed in `FORMS`, each
-with an example, and in `KEPT`, those that mean the same for lanes as for numbers. In lanes (the
-types of `codegen/c/lanes.h`) constants are equal in all lanes, comparisons and choices are masks,
-and a branch of `casadi.Function.if_else` runs where any lane wants it. A line of any other form is
-told with its text (`FormError`): a new version of CasADi, or a function of it that was not
+with an example, and in `KEPT_FORMS`, those that mean the same for lanes as for numbers. In lanes
+(the types of `codegen/c/lanes.h`) constants are equal in all lanes, comparisons and choices are
+masks, and a branch of `casadi.Function.if_else` runs if any lane needs it. A line of any other form
+raises a `FormError` with its text: a new version of CasADi, or a function of it that was not
 used before, then asks for one more entry here.
 """
 
@@ -64,7 +64,7 @@ FORMS = [
 ]
 """What is written anew for lanes: an example, its pattern, and what takes its place. In order."""
 
-KEPT = [
+KEPT_FORMS = [
     (example, re.compile(pattern))
     for example, pattern in (
         ("if (res[0]!=0) res[0][1]=a0;", r"if \(res\d*\[\d+\](?:!=0)?\)"),
@@ -162,7 +162,7 @@ def _lines(function: re.Match[str], shared: Collection[int] = ()) -> str:
         body = pattern.sub(in_lanes, body)
     for written, line in zip(function["body"].splitlines(), body.splitlines(), strict=True):
         rest = line
-        for _, pattern in KEPT:
+        for _, pattern in KEPT_FORMS:
             rest = pattern.sub("", rest)
         if _COMPARES.search(rest) or not all(map(_WORDS.match, _WORD.findall(rest))):
             head = function[0].partition("\n")[0] if function["outputs"] else function["name"]

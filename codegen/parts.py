@@ -38,7 +38,7 @@ _CALLED = re.compile(
     r"\{\n(?P<body>(?:  [^\n]*\n)*)\}\n)",
     re.M,
 )
-_WORD = re.compile(r"\b[A-Za-z_]\w*")
+_VARIABLE_NAME = re.compile(r"\b[A-Za-z_]\w*")
 _OWN = {
     "casadi": re.compile(
         r"^(?:casadi_(?:real|int|inf|sq|fmax|fmin|fabs|sign)|a\d+|w\d+|arg|res|if|return|e|sqrt|"
@@ -50,7 +50,7 @@ _OWN = {
 }
 """Words of a function that a part knows: those of `codegen/c/part.h` and `codegen/c/lanes.h`."""
 
-LONG = 16_000
+CUT_STATEMENTS = 16_000
 """Statements from which on a function is cut: shorter ones are evaluated more often, and faster as
 a whole. Of clearances of the rack 12,800 statements took 0.78 us in lanes cut, 11,900 took 0.48 us
 as a whole."""
@@ -73,7 +73,7 @@ _VARIABLE = re.compile(r"\ba\d+\b")
 
 
 @dataclass(frozen=True)
-class Part:
+class CodePart:
     """A function in a file of its own.
 
     Attributes:
@@ -87,7 +87,7 @@ class Part:
     level: int
 
 
-def in_parts(text: str, lanes: int, most: int = 3) -> tuple[str, tuple[Part, ...]]:
+def in_parts(text: str, lanes: int, most: int = 3) -> tuple[str, tuple[CodePart, ...]]:
     """Replace the parts of a C text of `codegen.source` by declarations; return the text and the
     parts, each once.
 
@@ -102,14 +102,14 @@ def in_parts(text: str, lanes: int, most: int = 3) -> tuple[str, tuple[Part, ...
         + runtime("lanes.h")
         + "#if DUAL_ARM_LANES > 1\n",
     }
-    parts: dict[str, Part] = {}
+    parts: dict[str, CodePart] = {}
     names: dict[str, str] = {}
 
     def take(found: re.Match[str]) -> str:
         kind, body = found["real"], found["body"]
         words = _OWN[kind]
         least = LEAST_ENTRY if found["name"].endswith("_f0") else LEAST_BYTES
-        if len(body) < least or not all(words.match(w) for w in set(_WORD.findall(body))):
+        if len(body) < least or not all(words.match(w) for w in set(_VARIABLE_NAME.findall(body))):
             return found[0]
         content = in_pieces(f"static int part_f0{found['rest']}")
         content = content.replace("static int part_f0(", "int PART(")
@@ -120,7 +120,7 @@ def in_parts(text: str, lanes: int, most: int = 3) -> tuple[str, tuple[Part, ...
         # Long functions with lanes are evaluated in batches; one by one they only check that lanes
         # are right.
         hardly_used = kind == "casadi" and "dual_arm_run_lanes" in text and is_long(body)
-        parts[name] = Part(name, whole, 0 if hardly_used else min(level, most))
+        parts[name] = CodePart(name, whole, 0 if hardly_used else min(level, most))
         names[found["name"]] = name
         return f"int PART_{found['name']}{found['rest'].split(' {', 1)[0]};\n"
 
@@ -149,7 +149,7 @@ def _preamble(*runtimes: str) -> str:
 
 def is_long(body: str) -> bool:
     """Return True if a function is long enough to be cut."""
-    return body.count("\n") >= LONG
+    return body.count("\n") >= CUT_STATEMENTS
 
 
 def in_pieces(text: str) -> str:

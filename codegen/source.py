@@ -119,7 +119,7 @@ def _lanes_header(lanes: int) -> list[str]:
 def _lane_functions(functions: Mapping[str, ca.Function]) -> Iterator[str]:
     """Yield the C of every function `f` as `f(arg, res, iw, w)` over `lanes_real`, with its sizes
     of memory as f_ARG, f_RES, f_IW and f_W, the size of its k-th result as f_OUT_k, and as
-    f_SHARED whether it takes `SHARED` arguments as numbers instead of lanes."""
+    f_SHARED whether it takes `SHARED_SUFFIX` arguments as numbers instead of lanes."""
     for name, function in functions.items():
         whole = dense(function)
         shared = shared_inputs(whole)
@@ -135,16 +135,19 @@ def _lane_functions(functions: Mapping[str, ca.Function]) -> Iterator[str]:
         )
 
 
-SHARED = "_numbers"
+SHARED_SUFFIX = "_numbers"
 """End of the names of inputs that have one value for all evaluations of a batch."""
 
 
 def shared_inputs(function: ca.Function) -> tuple[int, ...]:
-    """Return the inputs that a function in lanes takes as plain numbers: the `SHARED` ones of
-    straight functions. Other functions pass arguments on, in lanes."""
+    """Return the inputs that a function in lanes takes as plain numbers.
+
+    These are the inputs of straight functions with the `SHARED_SUFFIX`; other functions pass
+    arguments on, in lanes.
+    """
     straight = function.is_a("SXFunction")
     names = enumerate(function.name_in())
-    return tuple(k for k, name in names if straight and name.endswith(SHARED))
+    return tuple(k for k, name in names if straight and name.endswith(SHARED_SUFFIX))
 
 
 def generated_c(functions: Sequence[ca.Function]) -> str:

@@ -20,6 +20,12 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     __version__: str
+    from hybrid_opt.api import compare_timings as compare_timings
+    from hybrid_opt.api import polish as polish
+    from hybrid_opt.api import save as save
+    from hybrid_opt.api import search as search
+    from hybrid_opt.api import time_path as time_path
+    from hybrid_opt.api import time_with_jerk as time_with_jerk
     from hybrid_opt.branches import search_branches as search_branches
     from hybrid_opt.bundles.bundle import Origin as Origin
     from hybrid_opt.bundles.bundle import export as export
@@ -29,12 +35,6 @@ if TYPE_CHECKING:
     from hybrid_opt.carry import Carry as Carry
     from hybrid_opt.cell import Cell as Cell
     from hybrid_opt.cell import example as example
-    from hybrid_opt.door import polish as polish
-    from hybrid_opt.door import save as save
-    from hybrid_opt.door import search as search
-    from hybrid_opt.door import time_every_way as time_every_way
-    from hybrid_opt.door import time_path as time_path
-    from hybrid_opt.door import time_with_jerk as time_with_jerk
     from hybrid_opt.errors import JobError as JobError
     from hybrid_opt.errors import ProposalError as ProposalError
     from hybrid_opt.errors import ResultsError as ResultsError

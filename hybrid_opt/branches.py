@@ -22,7 +22,7 @@ from hybrid_opt.evaluate.evaluation import CandidateEvaluator, Evaluations, conc
 from hybrid_opt.evaluate.objectives import PAPER_OBJECTIVES
 from hybrid_opt.indicators.metrics import REFERENCE_POINT, front_rows, hypervolume
 from hybrid_opt.metaheuristics.run import SearchSettings, search_carries
-from hybrid_opt.progress import ShowProgress, counted
+from hybrid_opt.progress import ShowProgress, progress_bar
 from symbolic.array import Array
 from symbolic.errors import SettingsError, WorkcellError
 from symbolic.functions import CONSTRAINTS
@@ -32,7 +32,7 @@ SAMPLED = 32
 """Random candidates of which a pair has to hold one, where it does not hold the hand-made
 trajectory."""
 
-LEAST = 24
+LEAST_EVALUATIONS = 24
 """Least evaluations of a pair in a round: fewer tell nothing."""
 
 BEST = 10
@@ -159,8 +159,8 @@ def search_branches(
 
     Args:
         cell: the cell.
-        evaluations: about how many the competition may spend; at least `LEAST` per pair and round,
-            beside those in which pairs are tried out.
+        evaluations: approximate budget of the competition; at least `LEAST_EVALUATIONS` per pair
+            and round, beside those in which pairs are tried out.
         rng: its only randomness.
         algorithm: that searches.
         progress: True for a bar, or what takes searches done and in all.
@@ -198,9 +198,9 @@ def search_branches(
     left, standing = pairs, [len(pairs)]
     while len(standing) < rounds:
         standing.append(ceil(standing[-1] / 2))
-    with counted(progress, "start branches", sum(standing)) as advance:
+    with progress_bar(progress, "start branches", sum(standing)) as advance:
         for _ in range(rounds):
-            each = max(evaluations // (rounds * len(left)), LEAST)
+            each = max(evaluations // (rounds * len(left)), LEAST_EVALUATIONS)
             for pair in left:
                 pair.search(algorithm, each, rng)
                 advance(1)

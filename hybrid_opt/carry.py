@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from codegen.function import NumericFunction
+from hybrid_opt.display_protocol import Displayable, Page, display
 from hybrid_opt.indicators.metrics import excess_above_static
-from hybrid_opt.shown import Displayable, Page, display
 from hybrid_opt.static_hold import payload_limit, static_hold
 from symbolic.array import Array, set_read_only
 from symbolic.path.spline import sample_basis

@@ -26,7 +26,7 @@ from hybrid_opt.evaluate.objectives import (
     force_kind,
     select_objectives,
 )
-from hybrid_opt.static_hold import StaticHold, require_hold, static_hold, unheld
+from hybrid_opt.static_hold import StaticHold, require_hold, static_hold, static_hold_error
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.geometry.pairs import CellGeometry
@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from hybrid_opt.timing.model import TimingModel
     from hybrid_opt.timing.path_timer import PathTimer
 
-_CHUNK = 500
+_EVALUATED_AT_ONCE = 500
 """Candidates evaluated at once; every sample of each is held in memory."""
 
 
@@ -104,7 +104,7 @@ class Cell:
         return cls(load(Path(path)), objectives, threads)
 
     @classmethod
-    def of_files(
+    def from_files(
         cls,
         files: CellFiles,
         objectives: Sequence[str | Objective] = PAPER_OBJECTIVES,
@@ -145,7 +145,7 @@ class Cell:
                 every problem.
         """
         cell = Cell(changed(self.workcell, changes), self._objectives, self._threads)
-        cell.compiled = self.compiled.of_changed(cell.workcell)
+        cell.compiled = self.compiled.with_parameters(cell.workcell)
         cell._folder = self._folder
         return cell
 
@@ -161,7 +161,7 @@ class Cell:
             SettingsError: an objective is unknown.
         """
         files = drivable_files(collect_cell(self.workcell))
-        return Cell.of_files(files, self.force_kind.drivable, self._threads)
+        return Cell.from_files(files, self.force_kind.drivable, self._threads)
 
     @property
     def threads(self) -> int:
@@ -209,9 +209,11 @@ class Cell:
         return static_hold(self.workcell)
 
     @cached_property
-    def unheld(self) -> str:
+    def static_hold_error(self) -> str:
         """Reason why the payload cannot be held still, and a remedy; '' if it can."""
-        return unheld(self.workcell) or unheld(self.workcell, self.evaluator.outputs)
+        return static_hold_error(self.workcell) or static_hold_error(
+            self.workcell, self.evaluator.outputs
+        )
 
     def require_hold(self) -> None:
         """Refuse a payload that cannot be held still; checks without compiled code come first.
@@ -274,8 +276,10 @@ class Cell:
             SettingsError: x has the wrong shape.
         """
         x = np.atleast_2d(x)
-        begins = range(0, max(len(x), 1), _CHUNK)
-        return concatenated([self.evaluator.evaluate(x[k : k + _CHUNK]) for k in begins])
+        begins = range(0, max(len(x), 1), _EVALUATED_AT_ONCE)
+        return concatenated(
+            [self.evaluator.evaluate(x[k : k + _EVALUATED_AT_ONCE]) for k in begins]
+        )
 
     def random(self, count: int, rng: np.random.Generator) -> Array:
         """Draw decision vectors (count, n_var) uniformly from the bounds of the coarse task's

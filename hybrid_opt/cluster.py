@@ -12,7 +12,7 @@ from typing import Any
 
 from hybrid_opt.errors import WorkerError
 from hybrid_opt.workers import (
-    KEPT,
+    RESUME_HINT,
     Argument,
     OnResult,
     Result,
@@ -28,7 +28,7 @@ CONNECT_SECONDS = 15.0
 LOST_SECONDS = 10.0
 """Time without its scheduler after which the work is given up."""
 
-_TICK = 1.0
+_CONNECTION_INTERVAL = 1.0
 """Interval at which the connection is looked at [s]."""
 
 _CONNECTED = "running"
@@ -81,7 +81,7 @@ class DaskWorkers(Workers):
         results: dict[int, Result] = {}
         left, connected = set(calls), time.monotonic()
         while left:
-            done, left = wait(left, _TICK, FIRST_COMPLETED)
+            done, left = wait(left, _CONNECTION_INTERVAL, FIRST_COMPLETED)
             for call in done:
                 results[calls[call]] = result = self._result(call)
                 on_result(calls[call], result)
@@ -107,7 +107,7 @@ class DaskWorkers(Workers):
             self._give_up(f"lost a task ({type(error).__name__}: {error})")
 
     def _give_up(self, why: str) -> None:
-        raise WorkerError(f"the scheduler at {self._address} {why}; {KEPT}")
+        raise WorkerError(f"the scheduler at {self._address} {why}; {RESUME_HINT}")
 
     def _connect(self) -> None:
         if self._client is not None:

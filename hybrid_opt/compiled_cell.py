@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 Loaded = TypeVar("Loaded")
 
-KEPT = 2
+CACHED_WORKCELLS = 2
 """Workcells that a function remembers."""
 
 
@@ -65,13 +65,13 @@ class CompiledCell:
         self._is_changed = False
         self._loaded: dict[object, Any] = {}
 
-    def of_changed(self, workcell: Workcell) -> CompiledCell:
+    def with_parameters(self, workcell: Workcell) -> CompiledCell:
         """Return another workcell's functions that share the loaded ones."""
         other = CompiledCell(workcell, self.cache)
         other._loaded, other._is_changed = self._loaded, True
         return other
 
-    def once(self, key: object, load: Callable[[], Loaded]) -> Loaded:
+    def memoise(self, key: object, load: Callable[[], Loaded]) -> Loaded:
         """Return the value cached under `key`; cells derived from each other share the cache."""
         if key not in self._loaded:
             self._loaded[key] = load()
@@ -123,7 +123,7 @@ class CompiledCell:
             def along(starts: Array, extended: Array) -> Mapping[str, Array]:
                 return follow.batch(starts, extended, np.zeros((len(extended), 6)))
 
-            postures = self.once(("postures", arm, self.numbers.digest), dict[bytes, Array])
+            postures = self.memoise(("postures", arm, self.numbers.digest), dict[bytes, Array])
             clearance = own_clearance(geometry, arm, bounds)
             return ArmSearch(approach.batch, along, poses, clearance, postures)
 
@@ -190,7 +190,7 @@ class CompiledCell:
             first, second = (np.array(q) for q in record["joints"])
             return first, second
 
-        return self.once(key, find)
+        return self.memoise(key, find)
 
     def vector(self, group: str) -> Array:
         """Return the parameters (n,) of a group, see `symbolic.parameters`."""
@@ -238,7 +238,7 @@ class CompiledCell:
             DualArmError: the model or its code cannot be built.
         """
         key = self.key(name, *details, bodies=bodies)
-        built = self.once(
+        built = self.memoise(
             (key, lanes, str(levels)),
             lambda: load_or_build(
                 key, lambda: make(self.symbols), self.cache, lanes=lanes, levels=levels
@@ -331,10 +331,10 @@ class _Identity:
         return isinstance(other, _Identity) and self.workcell is other.workcell
 
 
-def kept_per_workcell(build: Callable[[Workcell], Loaded]) -> Callable[[Workcell], Loaded]:
+def cache_by_workcell(build: Callable[[Workcell], Loaded]) -> Callable[[Workcell], Loaded]:
     """Cache a function's result per workcell, by identity."""
 
-    @lru_cache(maxsize=KEPT)
+    @lru_cache(maxsize=CACHED_WORKCELLS)
     def kept(identity: _Identity) -> Loaded:
         return build(identity.workcell)
 
@@ -351,7 +351,7 @@ def _numbers(workcell: Workcell) -> WorkcellParameters:
     return WorkcellParameters(workcell)
 
 
-_held_numbers = kept_per_workcell(_numbers)
+_held_numbers = cache_by_workcell(_numbers)
 
 
 def bound_to(function: NumericFunction, numbers: WorkcellParameters) -> NumericFunction:
@@ -361,10 +361,10 @@ def bound_to(function: NumericFunction, numbers: WorkcellParameters) -> NumericF
 
 
 _held: dict[tuple[Path, str, int], NumericFunction] = {}
-"""Functions that `held_function` loaded: cells that are tried out share them."""
+"""Functions that `contact_function` loaded: cells that are tried out share them."""
 
 
-def held_function(
+def contact_function(
     workcell: Workcell,
     name: str,
     make: Callable[[Workcell], ca.Function],

@@ -19,7 +19,7 @@ class WorkerError(DualArmError):
     """Worker processes or machines were lost, or their software differs."""
 
 
-class WitnessError(DualArmError):
+class SimulationError(DualArmError):
     """The simulator is missing, or cannot answer."""
 
 

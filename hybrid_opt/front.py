@@ -17,12 +17,12 @@ from numpy.typing import NDArray
 
 from hybrid_opt.carry import Carry, decision_of
 from hybrid_opt.cell import Cell
+from hybrid_opt.display_protocol import Displayable
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator, Evaluations
 from hybrid_opt.indicators import metrics
 from hybrid_opt.polishing.records import PolishedFront
 from hybrid_opt.polishing.settings import PolishSettings, default_settings
-from hybrid_opt.progress import ShowProgress, counted, passed_on
-from hybrid_opt.shown import Displayable
+from hybrid_opt.progress import ShowProgress, as_callback, progress_bar
 from symbolic.array import Array, set_read_only
 from symbolic.errors import SettingsError
 
@@ -108,8 +108,8 @@ class Front(Displayable):
                     f"{task.n_var} with a force limit"
                 )
         beside = np.array([path[: task.n_path] for path in known]).reshape(-1, task.n_path)
-        with counted(progress, "polish", settings.attempts) as advance:
-            done = polisher.polish(self.x, rng, paths=beside, on_progress=passed_on(advance))
+        with progress_bar(progress, "polish", settings.attempts) as advance:
+            done = polisher.polish(self.x, rng, paths=beside, on_progress=as_callback(advance))
         return self.after(done)
 
     @property

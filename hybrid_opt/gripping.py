@@ -13,7 +13,7 @@ import numpy as np
 from scipy.optimize import direct
 
 from hybrid_opt.cell import Cell
-from hybrid_opt.progress import Advance, ShowProgress, counted
+from hybrid_opt.progress import Advance, ShowProgress, progress_bar
 from hybrid_opt.recommending.choice import DrivenPaths, Goal, Wish, best_of_paths, ranked
 from symbolic.array import Array
 from symbolic.contact.registry import contact_model
@@ -24,7 +24,7 @@ from symbolic.records.poses import box_rotation
 TRIALS = 40
 """Places that are tried; those that come out equal count each time."""
 
-UPRIGHT = 0.9
+UPRIGHT_FACE = 0.9
 """Least part of the world's z that lies in an upright face."""
 
 WORST = 1e9
@@ -103,7 +103,7 @@ def propose_grip(
         return min(tried[at][0], WORST)
 
     tried[0.0, 0.0] = before = _cost(drivable, {})
-    with counted(progress, "places of the pads", trials if open_.any() else 1) as advance:
+    with progress_bar(progress, "places of the pads", trials if open_.any() else 1) as advance:
         if open_.any():
             direct(cost, bounds[open_].tolist(), args=(advance,), maxfun=trials, eps=1e-2)
         else:
@@ -130,7 +130,7 @@ def _ways(workcell: Workcell) -> Array:
     turn = box_rotation(workcell.task.orientation, workcell.task.waypoints[0].lower)
     normal, upwards = workcell.contacts[0].T_box_pad[:3, 2], turn.T @ [0.0, 0.0, 1.0]
     upwards = upwards - (upwards @ normal) * normal
-    if np.linalg.norm(upwards) < UPRIGHT:
+    if np.linalg.norm(upwards) < UPRIGHT_FACE:
         raise SettingsError("places of pads are proposed on upright faces; these are not")
     upwards /= np.linalg.norm(upwards)
     return np.array([upwards, np.cross(upwards, normal)])

@@ -24,7 +24,7 @@ class Advance(Protocol):
 
 
 @contextmanager
-def counted(progress: ShowProgress, what: str, total: int) -> Iterator[Advance]:
+def progress_bar(progress: ShowProgress, what: str, total: int) -> Iterator[Advance]:
     """Count the units of a call.
 
     Args:
@@ -56,7 +56,7 @@ def counted(progress: ShowProgress, what: str, total: int) -> Iterator[Advance]:
     yield advance
 
 
-def passed_on(advance: Advance) -> Callable[[int, int], None]:
+def as_callback(advance: Advance) -> Callable[[int, int], None]:
     """Adapt an open progress bar to a `progress(done, total)` callback."""
     before = 0
 
@@ -74,9 +74,9 @@ def _set_total(bar: tqdm[NoReturn], total: int | None) -> None:
         bar.refresh()
 
 
-def following(progress: ShowProgress, what: str, items: Sequence[T]) -> Iterator[T]:
+def track(progress: ShowProgress, what: str, items: Sequence[T]) -> Iterator[T]:
     """Yield the items of a call, counting each when the next is requested."""
-    with counted(progress, what, len(items)) as advance:
+    with progress_bar(progress, what, len(items)) as advance:
         for item in items:
             yield item
             advance(1)

@@ -20,11 +20,11 @@ from numpy.typing import NDArray
 
 from hybrid_opt.carry import Carry
 from hybrid_opt.compiled_cell import CompiledCell
-from hybrid_opt.progress import ShowProgress, following
+from hybrid_opt.display_protocol import Displayable
+from hybrid_opt.progress import ShowProgress, track
 from hybrid_opt.robust.cases import LEADER
 from hybrid_opt.robust.force import BoxMotion
 from hybrid_opt.robust.path_force import RulingForce
-from hybrid_opt.shown import Displayable
 from hybrid_opt.timing.limits import limit_ratios
 from hybrid_opt.timing.model import TimingModel
 from hybrid_opt.timing.records import Timing
@@ -39,15 +39,15 @@ from symbolic.read.cell import changed
 from symbolic.records import Workcell
 from symbolic.records.task import waypoints_of
 
-STEP = 1e-5
+DIFFERENCE_STEP = 1e-5
 """Half the distance of two cells nearby, in the number's unit."""
 
-LEAST = 1e-7
+LEAST_EFFECT = 1e-7
 """Share of force or duration that a usual change has to move for a number to be told."""
 
-POSE = ("m",) * 3 + ("rad",) * 3
+POSE_UNITS = ("m",) * 3 + ("rad",) * 3
 
-PAYLOAD = {
+PAYLOAD_UNITS = {
     "mass": "kg",
     "centre_of_mass": "m",
     "size": "m",
@@ -58,7 +58,7 @@ PAYLOAD = {
     "angular_velocity_max": "rad/s",
     "angular_acceleration_max": "rad/s^2",
 }
-CONTACT = {
+CONTACT_UNITS = {
     "xyz": "m",
     "normal": "",
     "spin": "rad",
@@ -66,7 +66,7 @@ CONTACT = {
     "patch_radius": "m",
     "patch_size": "m",
 }
-ROBOT = {
+ROBOT_UNITS = {
     "base.xyz": "m",
     "base.rpy": "rad",
     "pad.xyz": "m",
@@ -75,14 +75,14 @@ ROBOT = {
     "acceleration_max": "rad/s^2",
     "torque_max": "N m",
 }
-TASK = {
-    "start": POSE,
-    "goal": POSE,
+TASK_UNITS = {
+    "start": POSE_UNITS,
+    "goal": POSE_UNITS,
     "reference_speed": "m/s",
     "reference_angular_speed": "rad/s",
     "ramp_time": "s",
 }
-UNCERTAINTY = {
+UNCERTAINTY_UNITS = {
     "friction": "",
     "mass": "",
     "centre_of_mass": "m",
@@ -97,7 +97,7 @@ UNCERTAINTY = {
 }
 """Units by key; of a joint that slides m stands for rad, and N for N m."""
 
-USUAL = {
+USUAL_CHANGES = {
     "": 0.01,
     "m": 1e-3,
     "rad": np.pi / 180.0,
@@ -138,7 +138,7 @@ class Sensitivity:
     @property
     def change(self) -> float:
         """A usual one [unit]."""
-        return float(USUAL[self.unit])
+        return float(USUAL_CHANGES[self.unit])
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -214,14 +214,14 @@ def sensitivities(carry: Carry | Timing, *, progress: ShowProgress = False) -> S
     drive = _Law(carry) if isinstance(carry, Carry) else _Fastest(carry)
     workcell, ruling = drive.carry.workcell, RulingForce(drive.carry, LEADER)
     rows, missing = [], {}
-    for number in following(progress, "sensitivities", list(_numbers(workcell))):
+    for number in track(progress, "sensitivities", list(_numbers(workcell))):
         if number.section == "uncertainty" and number.value == 0.0:
             missing[number.key] = "zero: a range begins or ends there"
             continue
         if not drive.moved_by(number) and number.section == "robots":
             continue
         try:
-            low, high = (number.moved(workcell, by) for by in (-STEP, STEP))
+            low, high = (number.moved(workcell, by) for by in (-DIFFERENCE_STEP, DIFFERENCE_STEP))
         except WorkcellError as error:
             missing[number.key] = str(error).splitlines()[-1].strip(" -")
             continue
@@ -233,14 +233,14 @@ def sensitivities(carry: Carry | Timing, *, progress: ShowProgress = False) -> S
             )
         elif drive.moved_by(number):
             changes = drive.durations(number, low, high)
-            longer = changes[0] / STEP, changes[1] / STEP
+            longer = changes[0] / DIFFERENCE_STEP, changes[1] / DIFFERENCE_STEP
             if not np.isfinite(changes).all():
                 longer, missing[number.key] = (None, None), "duration: no timing nearby holds"
         rise = fall = 0.0
         if number.section != "robots":
             motions = drive.motion(low, ruling.samples), drive.motion(high, ruling.samples)
             rise, fall = ruling.slopes(low, high, motions, number.section == "contacts")
-        forces = rise / STEP, fall / STEP
+        forces = rise / DIFFERENCE_STEP, fall / DIFFERENCE_STEP
         rows.append(Sensitivity(number.key, number.value, number.unit, *forces, *longer))
     duration = drive.carry.duration
 
@@ -249,7 +249,9 @@ def sensitivities(carry: Carry | Timing, *, progress: ShowProgress = False) -> S
         longer = max(abs(row.duration or 0.0), abs(row.lowered_duration or 0.0)) / duration
         return row.change * max(harder, longer)
 
-    told = tuple(sorted((row for row in rows if size(row) > LEAST), key=lambda row: -size(row)))
+    told = tuple(
+        sorted((row for row in rows if size(row) > LEAST_EFFECT), key=lambda row: -size(row))
+    )
     return Sensitivities(workcell, ruling.force, duration, told, missing)
 
 
@@ -324,7 +326,7 @@ class _Fastest:
     def _ratios(self, number: _Number, workcell: Workcell) -> dict[str, Array]:
         carry = self.carry
         if not number.is_limit:
-            model = TimingModel(self._compiled.of_changed(workcell))
+            model = TimingModel(self._compiled.with_parameters(workcell))
             carry = self._near.speeds.carry(model, model.path_motion(carry.x))
         return limit_ratios(carry, workcell, self._limits)
 
@@ -345,16 +347,16 @@ def _numbers(workcell: Workcell) -> Iterator[_Number]:
     defaults."""
     text = workcell.text or safe_io.read_bytes(workcell.source, safe_io.WORKCELL_BYTES)
     data = safe_io.toml_tables(text)
-    yield from _of(data["payload"], "payload", PAYLOAD, workcell.payload)
+    yield from _of(data["payload"], "payload", PAYLOAD_UNITS, workcell.payload)
     for i, table in enumerate(data["contacts"]):
-        yield from _of(table, f"contacts[{i}]", CONTACT)
+        yield from _of(table, f"contacts[{i}]", CONTACT_UNITS)
         for k, pad in enumerate(table.get("further", ())):
-            yield from _of(pad, f"contacts[{i}].further[{k}]", CONTACT)
+            yield from _of(pad, f"contacts[{i}].further[{k}]", CONTACT_UNITS)
     for i, table in enumerate(data["robots"]):
-        yield from _of(table, f"robots[{i}]", ROBOT, workcell.robots[i])
-    yield from _of(data["task"], "task", TASK, workcell.task)
+        yield from _of(table, f"robots[{i}]", ROBOT_UNITS, workcell.robots[i])
+    yield from _of(data["task"], "task", TASK_UNITS, workcell.task)
     if "uncertainty" in data:
-        yield from _of(data["uncertainty"], "uncertainty", UNCERTAINTY, workcell.uncertainty)
+        yield from _of(data["uncertainty"], "uncertainty", UNCERTAINTY_UNITS, workcell.uncertainty)
 
 
 def _of(

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import casadi as ca
 import numpy as np
 
-from hybrid_opt.compiled_cell import kept_per_workcell
+from hybrid_opt.compiled_cell import cache_by_workcell
 from symbolic.array import Array, Pair
 from symbolic.contact.load import LOAD_OUTPUTS, uncertain_load_function
 from symbolic.contact.registry import contact_model
@@ -23,13 +23,13 @@ from symbolic.records.task import initial_decision
 if TYPE_CHECKING:
     from symbolic.robot.model import RobotModel
 
-ROUNDING = 1e-6
+UTILISATION_TOLERANCE = 1e-6
 """Share by which a limit may be exceeded that is met exactly."""
 
 Outputs = Callable[[Array], dict[str, Array]]
 """Every per-sample output of decision vectors (n, n_var)."""
 
-STEPS = 24
+REMEDY_BISECTIONS = 24
 """Bisections for the mass or the friction that would do."""
 
 
@@ -48,7 +48,7 @@ class StaticHold:
     payload_limit: float
 
 
-@kept_per_workcell
+@cache_by_workcell
 def static_hold(workcell: Workcell) -> StaticHold:
     """Compute the forces of the payload held level and still; cached per workcell.
 
@@ -86,7 +86,7 @@ def payload_limit(workcell: Workcell, contact_force: Array) -> float:
     return float(mass_at_reference(workcell, contact_force).min())
 
 
-_load_of = kept_per_workcell(uncertain_load_function)
+_load_of = cache_by_workcell(uncertain_load_function)
 
 
 def still_load(
@@ -113,7 +113,7 @@ def still_load(
 
 
 @dataclass(frozen=True)
-class StillUse:
+class StaticUtilisation:
     """Use of a limit while standing still at one end of the path.
 
     Attributes:
@@ -138,7 +138,7 @@ class StillUse:
     @property
     def exceeded(self) -> bool:
         """True if the use exceeds the limit."""
-        return self.share > 1.0 + ROUNDING
+        return self.share > 1.0 + UTILISATION_TOLERANCE
 
     def __str__(self) -> str:
         return (
@@ -151,7 +151,7 @@ NORMAL, WHOLE = "normal force", "force in all"
 PRESSURE, TORQUE = "shift of the pressure", "joint torque"
 
 
-def unheld(workcell: Workcell, outputs: Outputs | None = None) -> str:
+def static_hold_error(workcell: Workcell, outputs: Outputs | None = None) -> str:
     """Return why the payload cannot be held still at the start or the goal, with a remedy; '' if it
     can.
 
@@ -171,7 +171,7 @@ def unheld(workcell: Workcell, outputs: Outputs | None = None) -> str:
     exceeded = still.exceeded()
     if not exceeded:
         return ""
-    worst: dict[tuple[str, str], StillUse] = {}
+    worst: dict[tuple[str, str], StaticUtilisation] = {}
     for use in sorted(exceeded, key=lambda use: -use.share):
         worst.setdefault((use.quantity, use.whose), use)
     told = "; ".join(str(use) for use in worst.values())
@@ -179,12 +179,12 @@ def unheld(workcell: Workcell, outputs: Outputs | None = None) -> str:
 
 
 def require_hold(workcell: Workcell, outputs: Outputs | None = None) -> None:
-    """Refuse a cell whose payload cannot be held still, see `unheld`.
+    """Refuse a cell whose payload cannot be held still, see `static_hold_error`.
 
     Raises:
         WorkcellError: it cannot.
     """
-    told = unheld(workcell, outputs)
+    told = static_hold_error(workcell, outputs)
     if told:
         raise WorkcellError(str(workcell.source), (f"payload: {told}",))
 
@@ -215,7 +215,7 @@ class _Still:
 
             self._models = [build_robot_model(robot) for robot in workcell.robots]
 
-    def exceeded(self, mass: float = 1.0, friction: float = 1.0) -> list[StillUse]:
+    def exceeded(self, mass: float = 1.0, friction: float = 1.0) -> list[StaticUtilisation]:
         """Return the limits that are exceeded with other factors on mass and friction."""
         found = []
         for where, pose in self._poses.items():
@@ -224,7 +224,9 @@ class _Still:
             found += [use for use in uses if use.exceeded]
         return found
 
-    def _contact_uses(self, where: str, load: dict[str, Array], mass: float) -> Iterator[StillUse]:
+    def _contact_uses(
+        self, where: str, load: dict[str, Array], mass: float
+    ) -> Iterator[StaticUtilisation]:
         workcell = self._workcell
         whole = np.linalg.norm(load["contact_force"].reshape(2, 3), axis=1)
         for i, robot in enumerate(workcell.robots):
@@ -232,12 +234,16 @@ class _Still:
             normal = mass * float(load["normal_force"][i])
             # Where a pad presses too hard already, its whole force says nothing new.
             name, force = (NORMAL, normal) if normal > allowed else (WHOLE, mass * float(whole[i]))
-            yield StillUse(name, robot.name, where, force, allowed, "N")
+            yield StaticUtilisation(name, robot.name, where, force, allowed, "N")
             if contact_model(workcell).has_pressure_limit:
                 shift, radius = float(load["pressure_shift"][i]), workcell.contacts[i].patch_radius
-                yield StillUse(PRESSURE, robot.name, where, 1e3 * shift, 1e3 * radius, "mm")
+                yield StaticUtilisation(
+                    PRESSURE, robot.name, where, 1e3 * shift, 1e3 * radius, "mm"
+                )
 
-    def _torques(self, where: str, load: dict[str, Array], mass: float) -> Iterator[StillUse]:
+    def _torques(
+        self, where: str, load: dict[str, Array], mass: float
+    ) -> Iterator[StaticUtilisation]:
         """Yield the most used joint of each arm, if its posture is known."""
         from symbolic.robot.arm import joint_torque
 
@@ -252,9 +258,9 @@ class _Still:
             joint = int(np.argmax(torque / robot.torque_max))
             whose, most = f"{robot.name}/{model.joint_names[joint]}", robot.torque_max[joint]
             unit = "N m" if model.turning[joint] else "N"
-            yield StillUse(TORQUE, whose, where, float(torque[joint]), float(most), unit)
+            yield StaticUtilisation(TORQUE, whose, where, float(torque[joint]), float(most), unit)
 
-    def remedy(self, exceeded: list[StillUse]) -> str:
+    def remedy(self, exceeded: list[StaticUtilisation]) -> str:
         """Find the mass or friction that would suffice, each with everything else unchanged."""
         ways = []
         if any(use.quantity != PRESSURE for use in exceeded):
@@ -295,7 +301,7 @@ def _nearest(enough: Callable[[float], bool], here: float, far: float) -> float 
     as well."""
     if not enough(far):
         return None
-    for _ in range(STEPS):
+    for _ in range(REMEDY_BISECTIONS):
         middle = (here + far) / 2.0
         here, far = (here, middle) if enough(middle) else (middle, far)
     return far

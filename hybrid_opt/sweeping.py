@@ -18,13 +18,13 @@ from typing import Any
 import numpy as np
 
 from codegen.cache import digest
+from hybrid_opt.api import polish
 from hybrid_opt.carry import Carry
 from hybrid_opt.cell import Cell
-from hybrid_opt.door import polish
 from hybrid_opt.evaluate.evaluation import Evaluations
 from hybrid_opt.front import Front
 from hybrid_opt.polishing.settings import DrivableSettings, PolishSettings
-from hybrid_opt.progress import ShowProgress, counted
+from hybrid_opt.progress import ShowProgress, progress_bar
 from hybrid_opt.recommending.choice import (
     DrivenPaths,
     Goal,
@@ -90,7 +90,7 @@ class Sweep:
         return f"  {', '.join(f'{key} {value:g}' for key, value in named)}: {said}"
 
 
-def stored_sweep(file: Path) -> Sweep:
+def read_sweep(file: Path) -> Sweep:
     """Read a stored sweep.
 
     Raises:
@@ -148,13 +148,13 @@ def sweep(
     about = digest(cell.workcell.digest, *cell.objective_names, str(fixed))
     known, file = Sweep(about, values, x), None if file is None else Path(file)
     if file is not None and file.exists():
-        known = stored_sweep(file)
+        known = read_sweep(file)
         if (known.about, dict(known.over)) != (about, values):
             raise SettingsError(
                 f"{file} holds the sweep of another cell, or over other values: {_OTHER_FILE}"
             )
     chains = _Chains(known, file)
-    with counted(progress, "sweep", chains.size) as advance, LocalWorkers(jobs) as workers:
+    with progress_bar(progress, "sweep", chains.size) as advance, LocalWorkers(jobs) as workers:
         advance(len(chains.done))
         call = partial(_next_row, _Request(cell, known.x, fixed, tuple(values)))
 

@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from hybrid_opt.api import save, search, time_path
 from hybrid_opt.bundles.bundle import TARGETS, export
 from hybrid_opt.carry import Carry
 from hybrid_opt.cell import Cell
 from hybrid_opt.display.solids import Solid, cell_solids, frame_placements, motion_points
-from hybrid_opt.door import save, search, time_path
 from hybrid_opt.errors import DisplayError, ResultsError
 from hybrid_opt.evaluate.explanation import explain
 from hybrid_opt.job.plan import plan_job
@@ -31,10 +31,10 @@ from symbolic.read.cell_files import collect_cell, unpack_cell
 from symbolic.records import POSE_SIZE, Workcell
 from symbolic.records.poses import box_placement, inverse, rpy_from_rotation, transform
 
-EVALUATIONS = 400
+SEARCH_EVALUATIONS = 400
 """Candidates of a search around the carry at hand: 1.6 s on the rack."""
 
-NEAR = 0.05
+SEARCH_WIDTH = 0.05
 """Standard deviation of its first generation around that carry, over the bounds' width."""
 
 FIRST = 39
@@ -60,7 +60,7 @@ class Handle:
 
 
 @dataclass(frozen=True, eq=False)
-class Verdict:
+class SessionVerdict:
     """A carry in a cell.
 
     Attributes:
@@ -112,7 +112,7 @@ class Session:
         """The changed cell under the time law 'optimal'."""
         return self.verdict.cell or self._drivable
 
-    def change(self, changes: Mapping[str, Any]) -> Verdict:
+    def change(self, changes: Mapping[str, Any]) -> SessionVerdict:
         """Apply more changes; a refused change leaves the session as it is.
 
         Args:
@@ -126,7 +126,7 @@ class Session:
         except WorkcellError as error:
             text = "; ".join(error.problems)
             took = time.perf_counter() - begin
-            return Verdict(None, None, f"refused: {text}", False, None, None, took)
+            return SessionVerdict(None, None, f"refused: {text}", False, None, None, took)
         if limit is not None:
             low, high = cell.workcell.task.force_limit
             self.x[-1] = min(max(float(limit), low), high)
@@ -134,15 +134,17 @@ class Session:
         self.verdict = self._judged(cell, begin)
         return self.verdict
 
-    def move(self, handle: Handle, pose: Array) -> Verdict:
+    def move(self, handle: Handle, pose: Array) -> SessionVerdict:
         """Move a handle to another pose (4, 4) of the world, see `handles`."""
         return self.change(moved(self.cell.workcell, handle, pose))
 
-    def optimise(self, rng: np.random.Generator, evaluations: int = EVALUATIONS) -> Verdict:
+    def optimise(
+        self, rng: np.random.Generator, evaluations: int = SEARCH_EVALUATIONS
+    ) -> SessionVerdict:
         """Search around the present carry for the least product of duration and force."""
         task, cell = self.cell.workcell.task, self.cell
         width = np.where(np.isfinite(task.upper - task.lower), task.upper - task.lower, 0.0)
-        near = self.x + NEAR * width * rng.standard_normal((FIRST, task.n_var))
+        near = self.x + SEARCH_WIDTH * width * rng.standard_normal((FIRST, task.n_var))
         first = np.clip(np.vstack([self.x, near]), task.lower, task.upper)
         settings = SearchSettings(initial=first)
         front = search(cell, evaluations=evaluations, rng=rng, settings=settings)
@@ -185,7 +187,7 @@ class Session:
         save(carry, Path(folder) / "carry.json", {"by": "hand"})
         return export(plan_job(timing), target, folder)
 
-    def _judged(self, cell: Cell, begin: float | None = None) -> Verdict:
+    def _judged(self, cell: Cell, begin: float | None = None) -> SessionVerdict:
         begin = time.perf_counter() if begin is None else begin
         carry = cell.carry(self.x)
         judgement = carry.judgement
@@ -205,7 +207,7 @@ class Session:
         else:
             text = f"infeasible: {explain(cell.evaluator, cell.evaluate(self.x))[0]}"
         took = time.perf_counter() - begin
-        return Verdict(cell, carry, text, judgement.feasible, commanded, squeeze, took)
+        return SessionVerdict(cell, carry, text, judgement.feasible, commanded, squeeze, took)
 
 
 def handles(workcell: Workcell) -> tuple[Handle, ...]:
@@ -257,9 +259,13 @@ def moved(workcell: Workcell, handle: Handle, pose: Array) -> dict[str, Any]:
 # --- in a browser ---
 
 
-HOST = "127.0.0.1"
+LOCAL_HOST = "127.0.0.1"
 
-COLOURS = {"robot": (148, 156, 166), "payload": (222, 158, 64), "environment": (196, 202, 208)}
+GROUP_COLOURS = {
+    "robot": (148, 156, 166),
+    "payload": (222, 158, 64),
+    "environment": (196, 202, 208),
+}
 
 FRAME = 0.04
 """Time between two frames of a carry that plays [s]."""
@@ -298,8 +304,8 @@ class Workbench:
         self._tasks: list[Callable[[], None]] = []
         self._closed = False
         self._solids: dict[str, tuple[Solid, Any]] = {}
-        self._server = viser.ViserServer(HOST, port, label="dual-arm carry", verbose=False)
-        self.url = f"http://{HOST}:{self._server.get_port()}"
+        self._server = viser.ViserServer(LOCAL_HOST, port, label="dual-arm carry", verbose=False)
+        self.url = f"http://{LOCAL_HOST}:{self._server.get_port()}"
         self._server.gui.configure_theme(show_logo=False, show_share_button=False)
         self._build()
         self._show(session.verdict)
@@ -456,7 +462,7 @@ class Workbench:
     def _told(self, text: str) -> None:
         self._verdict.content = text
 
-    def _show(self, verdict: Verdict) -> None:
+    def _show(self, verdict: SessionVerdict) -> None:
         state, _, rest = verdict.text.partition(" ")
         self._told(f"**{state}** {rest}\n\njudged in {1e3 * verdict.seconds:.1f} ms")
         if verdict.carry is None:
@@ -469,7 +475,7 @@ class Workbench:
         self._draw(verdict)
         self._pose()
 
-    def _draw(self, verdict: Verdict) -> None:
+    def _draw(self, verdict: SessionVerdict) -> None:
         """Draw meshes of bodies that are new, or changed their shape or pose."""
         assert verdict.cell is not None
         self._geometry = verdict.cell.geometry
@@ -482,7 +488,7 @@ class Workbench:
                 f"/bodies/{solid.name.replace('/', ' ')}",
                 solid.vertices,
                 solid.faces,
-                color=COLOURS.get(solid.group, COLOURS["robot"]),
+                color=GROUP_COLOURS.get(solid.group, GROUP_COLOURS["robot"]),
                 flat_shading=True,
                 side="double",
             )

@@ -38,7 +38,7 @@ OnResult = Callable[[int, Any], None]
 MAX_DEATHS = 3
 """Deaths of workers, with no result in between, after which the work is given up."""
 
-KEPT = "what was computed is kept: continue with --resume"
+RESUME_HINT = "what was computed is kept: continue with --resume"
 
 
 def ignore_result(index: int, result: object) -> None:
@@ -119,7 +119,7 @@ class LocalWorkers(Workers):
                     raise WorkerError(
                         f"worker processes died {MAX_DEATHS} times (killed from outside, out of "
                         "memory, or started by a script without `if __name__ == '__main__':`?); "
-                        f"{KEPT}, perhaps with fewer --jobs"
+                        f"{RESUME_HINT}, perhaps with fewer --jobs"
                     ) from error
             except BaseException:
                 self.close()

@@ -19,10 +19,10 @@ OUTPUT = Path("results/demo")
 SHOWN = 5
 """Carries of the first front that are shown."""
 
-LONGEST = 2.0
+LARGEST_SLOWDOWN = 2.0
 """Times the shortest duration that a shown carry may take."""
 
-HELD = 0.99
+BINDING_USE = 0.99
 """Used so far, a limit holds a carry back."""
 
 
@@ -83,7 +83,9 @@ def first_result(evaluations: int = QUICK_EVALUATIONS, seed: int = 1) -> Iterato
     front = ho.search(cell, "nsga2", evaluations=evaluations, rng=rng)
     front = ho.polish(front, rng=rng, settings=quick_settings("optimal"), progress=True)
     carries = sorted(front, key=lambda carry: carry.duration)
-    carries = [carry for carry in carries if carry.duration < LONGEST * carries[0].duration]
+    carries = [
+        carry for carry in carries if carry.duration < LARGEST_SLOWDOWN * carries[0].duration
+    ]
     rows = []
     for carry in (carries[k] for k in evenly(len(carries), SHOWN)):
         force = float(carry.peak_normal_force.max())
@@ -101,7 +103,7 @@ def _held(timing: ho.Timing) -> str:
         return timing.reason
     # The least forces always use the whole friction.
     limits = (name for name in timing.use if name != "friction")
-    return ", ".join(name for name in limits if timing.use[name].ratio > HELD)
+    return ", ".join(name for name in limits if timing.use[name].ratio > BINDING_USE)
 
 
 main = Program("demo", __doc__, _add_options, "studies.demo.show")

@@ -54,7 +54,7 @@ def _add_options(parser: Parser) -> None:
     parser.add_argument(
         "--smoothing",
         type=float,
-        default=stated("hybrid_opt.job.smooth.WIDTH"),
+        default=stated("hybrid_opt.job.smooth.SMOOTHING_WIDTH"),
         metavar="S",
         help="half the width of the window over which a timing whose acceleration jumps is "
         "averaged [s]; 0 leaves it as it is",

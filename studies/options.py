@@ -25,9 +25,9 @@ LARGEST_SEED = 2**63 - 1
 QUICK_EVALUATIONS, QUICK_REPLICAS = 300, 2
 """Evaluations and replicas of a small but complete study."""
 
-DRIVEN = "pads-driven"
+PADS_DRIVEN = "pads-driven"
 
-PADS = ("pads", DRIVEN)
+PAD_WITNESSES = ("pads", PADS_DRIVEN)
 """The witnesses without arms, beside the controllers of those with them."""
 
 Number = TypeVar("Number", int, float)
@@ -127,7 +127,7 @@ def _expected(path: Path, kind: str) -> str:
         names = [each.name for each in folder.iterdir()] if folder.is_dir() else []
         return f"{expected}{suggestion(path.name, names)}"
     if kind == TRAJECTORY:
-        name = stated("hybrid_opt.campaign.settings.RECOMMENDED")
+        name = stated("hybrid_opt.campaign.settings.RECOMMENDED_FILE")
         known = path / name if (path / name).exists() else f"results/NAME/{name}"
         return f"{expected}, as studies write it: {known}"
     return expected

@@ -282,7 +282,7 @@ def _show_warnings(verbose: bool) -> None:
 
 
 @dataclass(frozen=True)
-class Finding:
+class Outcome:
     """One thing that a program found out.
 
     Attributes:
@@ -294,7 +294,7 @@ class Finding:
     lines: tuple[str, ...] = ()
 
 
-def print_findings(findings: Iterable[Finding], as_json: bool) -> None:
+def print_findings(findings: Iterable[Outcome], as_json: bool) -> None:
     """Print each when it is found, or all at once as one JSON object."""
     values: dict[str, Any] = {}
     for finding in findings:

@@ -101,10 +101,10 @@ def _run(options: argparse.Namespace) -> int:
         tell=tell,
     )
     if options.study is not None:
-        from hybrid_opt.door import compared_classes
+        from hybrid_opt.api import rank_homotopy_classes
 
         rng = np.random.default_rng(options.seed)
-        proposals, table = compared_classes(proposals, options.study, rng, tell)
+        proposals, table = rank_homotopy_classes(proposals, options.study, rng, tell)
         print(table.text())
     for k, proposal in enumerate(proposals, 1):
         name = output if k == 1 else output.with_stem(f"{output.stem}-{k}")

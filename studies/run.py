@@ -35,7 +35,7 @@ DESCRIPTION = (
 
 KNOWN: tuple[str, ...] = stated("hybrid_opt.metaheuristics.registry.REGISTRY")
 
-USUAL = "hybrid_opt.campaign.settings.ALGORITHMS"
+DEFAULT_ALGORITHMS = "hybrid_opt.campaign.settings.ALGORITHMS"
 
 WORKERS_LOAD = (
     "hybrid_opt.campaign.polish_stage",
@@ -83,7 +83,7 @@ def add_options(parser: Parser, output: str) -> None:
         nargs="+",
         action="extend",
         metavar="NAME",
-        help=f"which of {', '.join(KNOWN)} (default: {' '.join(stated(USUAL))})",
+        help=f"which of {', '.join(KNOWN)} (default: {' '.join(stated(DEFAULT_ALGORITHMS))})",
     )
     search.add_argument(
         "--population",

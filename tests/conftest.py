@@ -100,7 +100,7 @@ Once = Callable[[str, Callable[[Path], None]], Path]
 
 
 @pytest.fixture(scope="session")
-def once(tmp_path_factory: pytest.TempPathFactory) -> Once:
+def memoise(tmp_path_factory: pytest.TempPathFactory) -> Once:
     """What is made once for all processes of a run, in folders that no test changes."""
     base = tmp_path_factory.getbasetemp()
     # Each worker of pytest-xdist has a folder of its own in the run's.
@@ -120,7 +120,7 @@ def once(tmp_path_factory: pytest.TempPathFactory) -> Once:
 
 
 @pytest.fixture(scope="session")
-def polished_study(once: Once) -> Path:
+def polished_study(memoise: Once) -> Path:
     """Results folder of a small polished and timed study of the rack, without a report."""
 
     def make(folder: Path) -> None:
@@ -141,7 +141,7 @@ def polished_study(once: Once) -> Path:
         wanted = StudySettings(polish, drivable_replicas=1, report=False)
         run_study(load(RACK), campaign, execution, Progress(shown=False), wanted)
 
-    return once("polished", make)
+    return memoise("polished", make)
 
 
 @pytest.fixture

@@ -44,7 +44,7 @@ from hybrid_opt.display.table import text_table
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.job.motions import joint_use
 from hybrid_opt.store.files import read_bytes
-from hybrid_opt.store.trajectory_file import FORMAT as CARRY_FORMAT
+from hybrid_opt.store.trajectory_file import TRAJECTORY_FORMAT as CARRY_FORMAT
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.read.arms import arm_model

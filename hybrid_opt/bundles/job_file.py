@@ -27,11 +27,11 @@ from scipy.interpolate import BPoly
 
 from hybrid_opt.bundles.arms import prefixes
 from hybrid_opt.bundles.programs.carry_job import FORMAT, VERSION, Limits
-from hybrid_opt.compiled_cell import kept_per_workcell
+from hybrid_opt.compiled_cell import cache_by_workcell
 from hybrid_opt.errors import JobError
 from hybrid_opt.job.compliance import TRACKED, largest_skew, require_delay, require_stiffness
 from hybrid_opt.job.motions import unit_squeeze
-from hybrid_opt.job.records import HELD, Job, SampledJob, sample_job
+from hybrid_opt.job.records import HELD_PHASES, Job, SampledJob, sample_job
 from hybrid_opt.timing.model import TimingModel, contact_torque
 from symbolic.array import Array, interpolated
 from symbolic.errors import SettingsError
@@ -189,7 +189,7 @@ INSTANTS = 9
 JOINT_USE = 1.1
 """Joint acceleration of a stop over its limit, if it can be had: timings use the limits whole."""
 
-_model = kept_per_workcell(TimingModel)
+_model = cache_by_workcell(TimingModel)
 
 
 @dataclass(frozen=True)
@@ -218,7 +218,9 @@ def stop_of(job: Job) -> Stop:
     """
     model, motions = _model(job.workcell), [phase.motion for phase in job.phases]
     time = np.concatenate([phase.begin + phase.motion.time for phase in job.phases])
-    held = np.concatenate([np.full(len(p.motion.time), float(p.name in HELD)) for p in job.phases])
+    held = np.concatenate(
+        [np.full(len(p.motion.time), float(p.name in HELD_PHASES)) for p in job.phases]
+    )
     columns = {
         name: np.concatenate([getattr(motion, name) for motion in motions])
         for name in ("pose", "rate", "second_rate", "q_rate", "q_second")

@@ -25,7 +25,7 @@ from hybrid_opt.bundles.job_file import Export
 from hybrid_opt.bundles.programs import filled
 from hybrid_opt.bundles.programs.carry_job import PRESSED
 from hybrid_opt.job.motions import TICK
-from hybrid_opt.job.records import HELD, Job
+from hybrid_opt.job.records import HELD_PHASES, Job
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.records.poses import box_rotation
@@ -140,10 +140,10 @@ def _phase(export: Export, arm: int, index: int, name: str) -> Iterator[str]:
     for k in range(span.start + 1, span.stop):
         # Until the next reference no less than is needed.
         ahead = k + every + 3
-        newton = float(force[k:ahead].max()) if name in HELD else float(force[k])
+        newton = float(force[k:ahead].max()) if name in HELD_PHASES else float(force[k])
         yield f"    go({_list(q[k])}, {newton:.3f})"
         # Before the box is lifted the pads have to press.
-        if name in HELD or (name == "press" and newton >= PRESSED * most > 0.0):
+        if name in HELD_PHASES or (name == "press" and newton >= PRESSED * most > 0.0):
             yield f"    feel({newton:.3f})"
     yield "  end"
 

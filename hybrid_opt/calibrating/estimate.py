@@ -53,7 +53,7 @@ as seen."""
 
 
 @dataclass(frozen=True)
-class Hold:
+class MeasuredHold:
     """A box held still, in means over a short time.
 
     Attributes:
@@ -108,7 +108,7 @@ class Load:
         return np.asarray(self.deviations[4:].reshape(2, 2) <= SEEN_CROSSTALK)
 
 
-def fit_load(holds: Sequence[Hold], moments: bool = True) -> Load:
+def fit_load(holds: Sequence[MeasuredHold], moments: bool = True) -> Load:
     """Estimate the load and the crosstalk that explain holds best.
 
     Args:
@@ -148,7 +148,7 @@ def fit_load(holds: Sequence[Hold], moments: bool = True) -> Load:
     return Load(float(x[0]), centre, x[4:SOUGHT].reshape(2, 2), deviations, residual)
 
 
-def _balance(hold: Hold) -> tuple[Array, Array, Array]:
+def _balance(hold: MeasuredHold) -> tuple[Array, Array, Array]:
     """Compute (1) and (2) of a hold: matrix (6, unknowns), right side (6,), covariance of that
     (6, 6)."""
     matrix, value, noise = np.zeros((6, len(WIDTHS))), np.zeros(6), np.zeros((6, 6))
@@ -176,7 +176,7 @@ def without_crosstalk(wrench: Array, crosstalk: Array) -> Array:
 # --- delays ---
 
 
-STEP = 0.005
+GRID_STEP = 0.005
 """Step of the grid on which signals are compared [s]."""
 
 LARGEST_GRID = 2_000_000
@@ -208,10 +208,10 @@ def delay(
         where the rates of both correlate best; None where they hardly do, or hardly better than
         with a delay that does not count.
     """
-    wide = round(SMOOTHED / STEP)
-    if not 4 * wide < (time[-1] - time[0]) / STEP < LARGEST_GRID:
+    wide = round(SMOOTHED / GRID_STEP)
+    if not 4 * wide < (time[-1] - time[0]) / GRID_STEP < LARGEST_GRID:
         return None
-    grid = np.arange(time[0], time[-1], STEP)
+    grid = np.arange(time[0], time[-1], GRID_STEP)
     kernel = np.ones(wide) / wide
 
     def rate(signal: Array) -> Array:
@@ -221,7 +221,7 @@ def delay(
 
     a, b = rate(first), rate(second)
     n = len(a)
-    reach = min(round(most / STEP), n // 2)
+    reach = min(round(most / GRID_STEP), n // 2)
     lags = np.arange(-reach, reach + 1)
     product = correlate(b, a, method="fft")[n - 1 + lags]
     # Only what overlaps counts, else a long delay's fewer samples would count against it.
@@ -234,10 +234,10 @@ def delay(
     if near[best] < LEAST_LIKENESS:
         return None
     if apart is not None:
-        without = near[np.abs(lags) * STEP <= apart].max()
+        without = near[np.abs(lags) * GRID_STEP <= apart].max()
         if 1.0 - without <= CLEARER * (1.0 - near[best]):
             return None
-    return (best - reach) * STEP
+    return (best - reach) * GRID_STEP
 
 
 # --- friction ---

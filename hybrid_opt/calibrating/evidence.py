@@ -13,8 +13,8 @@ import tomlkit
 
 from hybrid_opt.calibrating.estimate import (
     FrictionRatio,
-    Hold,
     Load,
+    MeasuredHold,
     delay,
     fit_load,
     without_crosstalk,
@@ -26,7 +26,7 @@ from hybrid_opt.calibrating.faults import (
     recording_faults,
     vanished,
 )
-from hybrid_opt.calibrating.recording import Places, Run, places_of, tared
+from hybrid_opt.calibrating.recording import Places, Recording, places_of, tared
 from hybrid_opt.display.table import number, text_table
 from hybrid_opt.proposing.problem import Problem
 from symbolic import safe_io
@@ -42,7 +42,7 @@ from symbolic.records.quantities import GRAVITY
 PIECE, SHORTEST = 2.0, 0.5
 """Least length of the pieces into which holds are cut [s]."""
 
-STILL = 0.01
+STILL_MOTION = 0.01
 """Most that a joint moves in a piece of a hold that counts as still [rad or m]."""
 
 RATIO_TIME = 0.2
@@ -62,7 +62,7 @@ SAME_BOX = 0.03
 
 
 @dataclass(frozen=True)
-class Entry:
+class EvidenceEntry:
     """One quantity that the runs show.
 
     Attributes:
@@ -91,7 +91,7 @@ class Evidence:
 
     workcell: Workcell
     runs: tuple[str, ...]
-    entries: list[Entry] = field(default_factory=list)
+    entries: list[EvidenceEntry] = field(default_factory=list)
     faults: list[Fault] = field(default_factory=list)
     asks: list[str] = field(default_factory=list)
     tables: dict[str, Any] = field(default_factory=dict)
@@ -99,7 +99,7 @@ class Evidence:
 
     def tell(self, name: str, found: str, key: str = "") -> None:
         """Add a quantity."""
-        self.entries.append(Entry(name, found, key))
+        self.entries.append(EvidenceEntry(name, found, key))
 
     def doubt(self, name: str, value: Any) -> None:
         """Set a range of `[uncertainty]`, rounded up."""
@@ -136,7 +136,7 @@ class Evidence:
         }
 
 
-def calibrate(workcell: Workcell, runs: Sequence[Run]) -> Evidence:
+def calibrate(workcell: Workcell, runs: Sequence[Recording]) -> Evidence:
     """Collect the evidence of runs about a cell.
 
     Raises:
@@ -167,7 +167,7 @@ def calibrate(workcell: Workcell, runs: Sequence[Run]) -> Evidence:
 # --- sensors and load ---
 
 
-def _tell_offsets(run: Run, offsets: Array, evidence: Evidence) -> None:
+def _tell_offsets(run: Recording, offsets: Array, evidence: Evidence) -> None:
     for i in range(2):
         told = ", ".join(number(value, 2) for value in offsets[:, i, :3].mean(axis=0))
         moved = np.ptp(offsets[:, i, :3], axis=0).max()
@@ -175,7 +175,7 @@ def _tell_offsets(run: Run, offsets: Array, evidence: Evidence) -> None:
         evidence.tell(f"{run.name}, offset of arm {i + 1}", f"{told} N{drift}")
 
 
-def _pieces(run: Run, places: Places) -> list[Hold]:
+def _pieces(run: Recording, places: Places) -> list[MeasuredHold]:
     """Cut a run's holds into pieces that are still and complete."""
     found = []
     for begin, end in run.labels.held:
@@ -189,18 +189,18 @@ def _pieces(run: Run, places: Places) -> list[Hold]:
             inside = run.within(first, last)
             if last - first < SHORTEST or np.count_nonzero(inside) < 5:
                 continue
-            if max(np.ptp(q[inside], axis=0).max() for q in run.joints) > STILL:
+            if max(np.ptp(q[inside], axis=0).max() for q in run.joints) > STILL_MOTION:
                 continue
             middle = np.flatnonzero(inside)[np.count_nonzero(inside) // 2]
             T_world_box = places.box[middle]
             pads = np.array([inverse(T_world_box) @ pad for pad in places.pads[middle]])
             wrench = np.nan_to_num(places.wrench[inside].mean(axis=0))
             gravity = T_world_box[:3, :3].T @ GRAVITY
-            found.append(Hold(pads, gravity, wrench, run.labels.mass))
+            found.append(MeasuredHold(pads, gravity, wrench, run.labels.mass))
     return found
 
 
-def _empty(run: Run, pieces: list[Hold], evidence: Evidence) -> None:
+def _empty(run: Recording, pieces: list[MeasuredHold], evidence: Evidence) -> None:
     """Compare the sensors with zero, in the postures of an empty run."""
     if not pieces:
         return
@@ -212,7 +212,7 @@ def _empty(run: Run, pieces: list[Hold], evidence: Evidence) -> None:
         evidence.faults.append(Fault(run.name, "residual", text, serious=False))
 
 
-Sound = list[tuple[Run, Places]]
+Sound = list[tuple[Recording, Places]]
 """Runs without serious faults, their readings without offsets."""
 
 
@@ -292,7 +292,7 @@ def _friction(sound: Sound, load: Load | None, evidence: Evidence) -> None:
             continue
         wrench = without_crosstalk(places.wrench, load.crosstalk)
 
-        def ratio(begin: float, run: Run = run, wrench: Array = wrench) -> float:
+        def ratio(begin: float, run: Recording = run, wrench: Array = wrench) -> float:
             inside = run.within(begin, begin + RATIO_TIME)
             return ratio_of(wrench[inside].mean(axis=0)) if inside.any() else np.nan
 

@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hybrid_opt.calibrating.estimate import Hold, Load, delay, fit_load
-from hybrid_opt.calibrating.recording import TARE_TIME, Places, Run, places_of
+from hybrid_opt.calibrating.estimate import Load, MeasuredHold, delay, fit_load
+from hybrid_opt.calibrating.recording import TARE_TIME, Places, Recording, places_of
 from symbolic.array import Array
 from symbolic.records import Workcell
 from symbolic.records.poses import inverse
@@ -25,7 +25,7 @@ VANISHED = 0.1
 LEAST_NORMAL = 0.5
 """Normal over whole force below which a frame is not what it is said to be: friction of 1.7."""
 
-APART = 0.03
+LARGEST_CLOCK_OFFSET = 0.03
 """Difference of both arms' clocks that is told [s]: the box hands normal forces on at once."""
 
 LARGEST_DELAY = 5.0
@@ -74,7 +74,7 @@ class Fault:
         return f"{where}{self.name}: {self.text}"
 
 
-def recording_faults(workcell: Workcell, run: Run, places: Places) -> list[Fault]:
+def recording_faults(workcell: Workcell, run: Recording, places: Places) -> list[Fault]:
     """Find the faults of a single run.
 
     Args:
@@ -94,7 +94,7 @@ def recording_faults(workcell: Workcell, run: Run, places: Places) -> list[Fault
     )
 
 
-def _tare_faults(run: Run, places: Places) -> list[Fault]:
+def _tare_faults(run: Recording, places: Places) -> list[Fault]:
     """Find tares at which nothing was recorded, or an arm touches something."""
     found = []
     recorded = [instant for instant in run.labels.tare if run.around(instant).any()]
@@ -131,7 +131,7 @@ def _tare_faults(run: Run, places: Places) -> list[Fault]:
     return [Fault(run.name, "missing tare", text) for text in found]
 
 
-def _frame_faults(run: Run, places: Places) -> list[Fault]:
+def _frame_faults(run: Recording, places: Places) -> list[Fault]:
     held = _held(run)
     if not held.any() or run.labels.empty:
         return []
@@ -144,7 +144,7 @@ def _frame_faults(run: Run, places: Places) -> list[Fault]:
     return [Fault(run.name, "wrong sign or frame", text)]
 
 
-def _held(run: Run) -> Array:
+def _held(run: Recording) -> Array:
     """Return (n,) True for samples within a hold."""
     found = np.zeros(len(run.time), dtype=bool)
     for span in run.labels.held:
@@ -152,7 +152,7 @@ def _held(run: Run) -> Array:
     return found
 
 
-def _unit_faults(workcell: Workcell, run: Run, places: Places) -> list[Fault]:
+def _unit_faults(workcell: Workcell, run: Recording, places: Places) -> list[Fault]:
     found = []
     if run.steps.max() > LONGEST_STEP:
         found.append(f"a sample every {run.steps.max():g} s; times look like ms")
@@ -166,7 +166,7 @@ def _unit_faults(workcell: Workcell, run: Run, places: Places) -> list[Fault]:
     return [Fault(run.name, "unit error", text) for text in found]
 
 
-def _force_units(run: Run, places: Places, held: Array) -> list[str]:
+def _force_units(run: Recording, places: Places, held: Array) -> list[str]:
     """Compare forces, independent of frame, with the commanded ones and with those of the other
     arm."""
     force = np.median(np.linalg.norm(places.wrench[held, :, :3], axis=2), axis=0)
@@ -199,7 +199,7 @@ def _moment_units(workcell: Workcell, places: Places, held: Array) -> list[str]:
     return []
 
 
-def _dropouts(run: Run) -> list[Fault]:
+def _dropouts(run: Recording) -> list[Fault]:
     """Find spans without new data, and holds that are not in the recording."""
     found = [
         f"nothing new for {end - begin:.2f} s from {begin:.2f} s on" for begin, end in run.lost
@@ -217,7 +217,7 @@ def _dropouts(run: Run) -> list[Fault]:
     return [Fault(run.name, "dropout", each + text, serious=False) for each in found]
 
 
-def _range_faults(run: Run) -> list[Fault]:
+def _range_faults(run: Recording) -> list[Fault]:
     found = []
     for what, largest, part in zip(
         ("force", "moment"), run.largest, np.split(run.wrench, 2, axis=2), strict=True
@@ -229,7 +229,7 @@ def _range_faults(run: Run) -> list[Fault]:
     return found
 
 
-def _pad_faults(workcell: Workcell, run: Run, places: Places) -> list[Fault]:
+def _pad_faults(workcell: Workcell, run: Recording, places: Places) -> list[Fault]:
     """Find pads that are not where they hold the box, and a squeeze that vanishes."""
     found = []
     nominal = inverse(workcell.contacts[0].T_box_pad) @ workcell.contacts[1].T_box_pad
@@ -272,9 +272,11 @@ def vanished(normal: Array) -> Array:
     return np.asarray((squeeze < VANISHED * usual) & (usual > 0.0))
 
 
-def _clock_faults(run: Run, places: Places) -> list[Fault]:
-    late = delay(run.time, places.normal[:, 0], places.normal[:, 1], LARGEST_DELAY, APART)
-    if late is None or abs(late) <= APART:
+def _clock_faults(run: Recording, places: Places) -> list[Fault]:
+    late = delay(
+        run.time, places.normal[:, 0], places.normal[:, 1], LARGEST_DELAY, LARGEST_CLOCK_OFFSET
+    )
+    if late is None or abs(late) <= LARGEST_CLOCK_OFFSET:
         return []
     text = (
         f"arm 2's normal force comes {late:.2f} s after arm 1's, although the box hands it on at "
@@ -283,7 +285,7 @@ def _clock_faults(run: Run, places: Places) -> list[Fault]:
     return [Fault(run.name, "clock offset", text)]
 
 
-def load_faults(holds: list[Hold], load: Load, moments: bool) -> list[Fault]:
+def load_faults(holds: list[MeasuredHold], load: Load, moments: bool) -> list[Fault]:
     """Find faults in the balance of all holds: other units, swapped arms, or an unknown cause.
 
     Args:

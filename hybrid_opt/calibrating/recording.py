@@ -37,8 +37,8 @@ axes of the arm's base, as RTDE does."""
 TARE_TIME = 0.4
 """Time around a tare instant over which readings are averaged [s]."""
 
-TIME = Range(-1e12, 1e12, "s")
-Instant = Annotated[float, TIME]
+TIME_RANGE = Range(-1e12, 1e12, "s")
+Instant = Annotated[float, TIME_RANGE]
 FORCE_RANGE = Range(1.0, 1e6, "N")
 MOMENT_RANGE = Range(0.1, 1e5, "N m")
 
@@ -65,7 +65,7 @@ class Labels:
 
 
 @dataclass(frozen=True)
-class Run:
+class Recording:
     """A run as it was recorded.
 
     Attributes:
@@ -150,13 +150,13 @@ def together(
     labels: Labels,
     frame: str,
     largest: Array | None = None,
-) -> Run:
+) -> Recording:
     """Merge the recordings of both arms into a run, the second interpolated at the times of the
     first.
 
     Args:
         name: of its file.
-        labels, frame, largest: see `Run`.
+        labels, frame, largest: see `Recording`.
 
     Raises:
         ResultsError: they hardly recorded at the same time.
@@ -174,7 +174,7 @@ def together(
         one, two = (interpolated(time, log.time, getattr(log, name)) for log in recorded)
         return one, two
 
-    return Run(
+    return Recording(
         name=name,
         time=time,
         steps=steps,
@@ -188,7 +188,7 @@ def together(
     )
 
 
-def read_run(path: Path, workcell: Workcell) -> Run:
+def read_run(path: Path, workcell: Workcell) -> Recording:
     """Read a run and its side file, the same name with the ending `.toml`.
 
     Raises:
@@ -335,7 +335,7 @@ class Places:
         return -self.wrench[:, :, 2]
 
 
-def places_of(workcell: Workcell, run: Run) -> Places:
+def places_of(workcell: Workcell, run: Recording) -> Places:
     """Convert a run to the frames of the pads."""
     pads, boxes, wrenches = [], [], []
     for i, (robot, contact) in enumerate(zip(workcell.robots, workcell.contacts, strict=True)):
@@ -361,7 +361,7 @@ def places_of(workcell: Workcell, run: Run) -> Places:
     return Places(np.stack(pads, axis=1), middle, np.stack(wrenches, axis=1))
 
 
-def tared(run: Run, places: Places) -> tuple[Places, Array]:
+def tared(run: Recording, places: Places) -> tuple[Places, Array]:
     """Subtract the sensors' offsets from a run, each as at the tare before.
 
     Returns:

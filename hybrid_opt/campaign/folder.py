@@ -91,8 +91,8 @@ def workers_for(execution: ExecutionSettings) -> Workers:
     return LocalWorkers(execution.jobs)
 
 
-FORMAT = "dual-arm-carry campaign"
-VERSION = 2
+CAMPAIGN_FORMAT = "dual-arm-carry campaign"
+CAMPAIGN_VERSION = 2
 
 _PACKAGES = ("casadi", "moocore", "numpy", "pin", "pymoo", "python-fcl", "scipy", "trimesh")
 
@@ -119,7 +119,7 @@ def configuration_of(settings: CampaignSettings, root: Path, workcell: Workcell)
     """
     file = workcell.source.relative_to(root.resolve()).as_posix()
     cell = StoredCell(workcell.name, file, workcell.digest)
-    return Configuration(FORMAT, VERSION, cell, settings, environment())
+    return Configuration(CAMPAIGN_FORMAT, CAMPAIGN_VERSION, cell, settings, environment())
 
 
 def require_equal(stored: Any, wanted: Mapping[str, Any], where: str) -> None:

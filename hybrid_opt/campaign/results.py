@@ -19,10 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_opt.campaign.candidates import decode
-from hybrid_opt.campaign.folder import FORMAT, VERSION
+from hybrid_opt.campaign.folder import CAMPAIGN_FORMAT, CAMPAIGN_VERSION
 from hybrid_opt.campaign.settings import (
     CONFIGURATION,
-    RECOMMENDED,
+    RECOMMENDED_FILE,
     UNION,
     CampaignSettings,
     Configuration,
@@ -47,14 +47,14 @@ from symbolic.array import Array, set_read_only
 from symbolic.read.cell import load as load_workcell
 from symbolic.records import Workcell
 
-ANEW = "--resume computes it anew"
+RECOMPUTE_REMEDY = "--resume computes it anew"
 
-KEPT = 64
+CACHED_TABLES = 64
 """Tables of candidates, and polished fronts, that are remembered by their content: a study's stages
 read them again and again."""
 
-_decoded = lru_cache(maxsize=KEPT)(decode)
-_record_of = lru_cache(maxsize=KEPT)(record_of)
+_decoded = lru_cache(maxsize=CACHED_TABLES)(decode)
+_record_of = lru_cache(maxsize=CACHED_TABLES)(record_of)
 
 
 @dataclass(frozen=True)
@@ -133,7 +133,7 @@ class CampaignResults:
             title: f"{counted(len(each), 'front')}, carries: {min(each)} to {max(each)}"
             for title, each in sizes.items()
         }
-        recommended = self.root / RECOMMENDED
+        recommended = self.root / RECOMMENDED_FILE
         return found | ({"carry to run": str(recommended)} if recommended.exists() else {})
 
     @property
@@ -247,7 +247,9 @@ def read_configuration(root: str | Path) -> Configuration:
     if not path.exists():
         raise ResultsError(f"{root}: is no results folder, {CONFIGURATION} is missing")
     remedy = "run the study again into another --output"
-    return from_json(Configuration, read_document(path, FORMAT, VERSION, remedy), path, remedy)
+    return from_json(
+        Configuration, read_document(path, CAMPAIGN_FORMAT, CAMPAIGN_VERSION, remedy), path, remedy
+    )
 
 
 def read_replica(root: Path, algorithm: str, number: int, objectives: tuple[str, ...]) -> Replica:
@@ -264,7 +266,7 @@ def read_replica(root: Path, algorithm: str, number: int, objectives: tuple[str,
         )
     found = _decoded(read_bytes(path), path)
     if found.objective_names != objectives:
-        raise ResultsError(f"{path}: holds other objectives than the campaign; {ANEW}")
+        raise ResultsError(f"{path}: holds other objectives than the campaign; {RECOMPUTE_REMEDY}")
     return Replica(algorithm, number, found.evaluations, found.seconds)
 
 
@@ -279,8 +281,8 @@ def is_whole(exists: bool, read: Callable[[], object]) -> bool:
         if exists:
             read()
     except ResultsError as error:
-        told = str(error).removesuffix(f"; {ANEW}")
-        warnings.warn(f"{told}; {ANEW}", DamagedResultsWarning, stacklevel=2)
+        told = str(error).removesuffix(f"; {RECOMPUTE_REMEDY}")
+        warnings.warn(f"{told}; {RECOMPUTE_REMEDY}", DamagedResultsWarning, stacklevel=2)
         return False
     return exists
 
@@ -294,7 +296,7 @@ def read_polished(root: Path, front: Front) -> PolishedFront | None:
     path = polished_file(root, *front.key)
     if not path.exists():
         return None
-    found: PolishedFront = _record_of(PolishedFront, read_bytes(path), path, ANEW)
+    found: PolishedFront = _record_of(PolishedFront, read_bytes(path), path, RECOMPUTE_REMEDY)
     task = front.cell.workcell.task
     problem = ""
     if bool(len(found.x)) != bool(len(front)):
@@ -304,7 +306,7 @@ def read_polished(root: Path, front: Front) -> PolishedFront | None:
     elif len(found.x) and ((found.x < task.lower) | (found.x > task.upper)).any():
         problem = "at x: is outside of the decision variables' bounds"
     if problem:
-        raise ResultsError(f"{path}: damaged {problem}; {ANEW}")
+        raise ResultsError(f"{path}: damaged {problem}; {RECOMPUTE_REMEDY}")
     return found if len(found.x) else replace(found, x=found.x.reshape(0, task.n_var))
 
 

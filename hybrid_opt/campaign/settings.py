@@ -161,14 +161,14 @@ REPLICAS = "replicas"
 STAGES = "stages"
 FRONTS = "fronts"
 SELECTED = "selected"
-POLISHED = "polished"
+POLISHED_FOLDER = "polished"
 POLISHED_SUFFIX = "-polished"
 DRIVABLE = "drivable"
-RECOMMENDED = "recommended.json"
+RECOMMENDED_FILE = "recommended.json"
 RECOMMENDATION = "recommendation.json"
 NO_RECOMMENDATION = "no-recommendation.json"
 SIMULATED = "simulated"
-HAND_MADE = "hand-made.json"
+HAND_MADE_FILE = "hand-made.json"
 
 
 UNION = "union"
@@ -188,7 +188,7 @@ def selected_file(root: Path, algorithm: str, replica: int) -> Path:
 
 def polished_file(root: Path, algorithm: str, replica: int) -> Path:
     """Return the file of the polished front of one replica, or of the `UNION`."""
-    return root / POLISHED / algorithm / f"{replica:02d}.json"
+    return root / POLISHED_FOLDER / algorithm / f"{replica:02d}.json"
 
 
 def polished_selected_file(root: Path, algorithm: str, replica: int) -> Path:

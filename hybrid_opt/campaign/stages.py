@@ -46,7 +46,7 @@ from hybrid_opt.cell import Cell
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.evaluate.objectives import force_kind
 from hybrid_opt.job.plan import JobCollisions, JobModel
-from hybrid_opt.progress import Progress, ShowProgress, passed_on
+from hybrid_opt.progress import Progress, ShowProgress, as_callback
 from hybrid_opt.store.files import read_record, to_json, write_atomically, write_json
 from hybrid_opt.workers import one_thread
 from symbolic.contact.registry import command_model
@@ -183,7 +183,7 @@ def drivable_stage(stages: Sequence[Stage], replicas: int | None = None) -> Stag
 
 _ANEW = "start the study anew"
 
-SHARE = 2
+COMPETITION_REPLICAS = 2
 """The competition may spend as many evaluations as this many replicas."""
 
 
@@ -205,7 +205,9 @@ def decided_cell(
         require_usable(execution)
         cell = Cell(workcell, settings.objectives)
         rng = np.random.default_rng(settings.seed)
-        competition = search_branches(cell, evaluations=SHARE * settings.evaluations, rng=rng)
+        competition = search_branches(
+            cell, evaluations=COMPETITION_REPLICAS * settings.evaluations, rng=rng
+        )
     return load(workcell.source, decided=competition.winner, text=workcell.text), competition
 
 
@@ -268,7 +270,7 @@ def store_results(
         if done + len(left) == 1:
             for path, argument in left.items():
                 with one_thread():
-                    content = function(argument, passed_on(advance))
+                    content = function(argument, as_callback(advance))
                 write_atomically(path, content)
         else:
             folder.workers.map(function, list(left.values()), store)
@@ -280,7 +282,7 @@ def loaded_cell(files: CellFiles, objectives: tuple[str, ...]) -> Cell:
 
     One thread evaluates its candidates: workers share the cores.
     """
-    return Cell.of_files(files, objectives, threads=1)
+    return Cell.from_files(files, objectives, threads=1)
 
 
 Made = TypeVar("Made")
@@ -346,7 +348,7 @@ def ready_cells(cells: Cells) -> tuple[ReadyCell, ...]:
 Maker = Callable[[], object]
 """Loads or builds functions."""
 
-_TICK = 1.0
+_ELAPSED_INTERVAL = 1.0
 """Interval at which the elapsed time is shown [s]."""
 
 
@@ -390,11 +392,14 @@ def build_all(makers: Sequence[Maker], progress: Progress) -> list[DualArmError]
     # Each waits for its compilers most of the time; expressions are made by one after the other.
     pool = ThreadPoolExecutor(len(makers))
     try:
-        with interruptible(), progress.stage("compiling", len(makers), "sets", delay=_TICK) as told:
+        with (
+            interruptible(),
+            progress.stage("compiling", len(makers), "sets", delay=_ELAPSED_INTERVAL) as told,
+        ):
             futures = [pool.submit(make) for make in makers]
             left = set(futures)
             while left:
-                done, left = wait(left, _TICK, FIRST_COMPLETED)
+                done, left = wait(left, _ELAPSED_INTERVAL, FIRST_COMPLETED)
                 told(len(done))
     finally:
         pool.shutdown(wait=False, cancel_futures=True)

@@ -116,7 +116,7 @@ def _(job: Job) -> str:
 def _forces(workcell: Workcell, time: Array, force: Array, title: str, *more: Series) -> str:
     """Plot forces (n, 2) of both arms over time (n,), and more series."""
     series = [
-        Series(robot.name, np.column_stack([time, force[:, i]]), ARMS[i])
+        Series(robot.name, np.column_stack([time, force[:, i]]), ARM_COLOURS[i])
         for i, robot in enumerate(workcell.robots)
     ] + list(more)
     return plot(series, "time [s]", title, np.concatenate([one.points for one in series]))
@@ -250,13 +250,13 @@ def _where(robot: str, joint: str) -> str:
     return f"{who}, " if who else ""
 
 
-SIZE = (5.4, 3.4)
+PLOT_SIZE = (5.4, 3.4)
 """Size of a plot [inch]."""
 
-ROOM = 0.06
+PLOT_MARGIN = 0.06
 """Share of the data's range left free around it."""
 
-ARMS = ("#3b6ea8", "#a8733b")
+ARM_COLOURS = ("#3b6ea8", "#a8733b")
 """Colours of the two robots, as in the report."""
 
 FRONT, CLOUD, REST = "#b00020", "#9aa3ab", "#1f2933"
@@ -291,10 +291,10 @@ def plot(series: list[Series], x_title: str, y_title: str, focus: Array) -> str:
         focus: (n, 2) points that the axes have to hold.
     """
     low, high = focus.min(axis=0), focus.max(axis=0)
-    room = np.maximum(ROOM * (high - low), 1e-4 * np.maximum(1.0, np.abs(high)))
+    room = np.maximum(PLOT_MARGIN * (high - low), 1e-4 * np.maximum(1.0, np.abs(high)))
     look: dict[Any, Any] = {"font.size": 8.0, "text.parse_math": False, "svg.fonttype": "none"}
     with mpl.rc_context(look):
-        figure = Figure(figsize=SIZE, layout="constrained")
+        figure = Figure(figsize=PLOT_SIZE, layout="constrained")
         axes = figure.subplots()
         for one in series:
             width = {"linewidth": one.size} if one.kind == "line" else {"markersize": 2 * one.size}

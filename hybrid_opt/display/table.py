@@ -11,13 +11,13 @@ from dataclasses import dataclass
 
 from hybrid_opt.store.files import csv_text
 
-LONG = 30
+LONGEST_CELL = 30
 """Characters of a cell from which on it takes several lines."""
 
 NOTHING = "–"
 """Text of a missing figure."""
 
-WIDTH = 100
+TERMINAL_WIDTH = 100
 """Characters of a line of text in a terminal."""
 
 
@@ -96,7 +96,7 @@ class Table:
         """Format for a terminal."""
         left = [k for k, word in enumerate(self.words) if word]
         parts = [self.title, text_table([self.header, *self.rows], left)]
-        return "\n".join(parts + ([textwrap.fill(self.note, WIDTH)] if self.note else []))
+        return "\n".join(parts + ([textwrap.fill(self.note, TERMINAL_WIDTH)] if self.note else []))
 
     def csv(self) -> str:
         """Format as comma-separated values, without title and note."""
@@ -178,11 +178,11 @@ def figures_html(figures: Mapping[str, str]) -> str:
 
 def _is_figure(cell: str) -> bool:
     """Return True if a cell is a figure, with its unit or spread."""
-    return len(cell) <= LONG and re.match(r"[-+\N{MINUS SIGN}]?\.?\d", cell) is not None
+    return len(cell) <= LONGEST_CELL and re.match(r"[-+\N{MINUS SIGN}]?\.?\d", cell) is not None
 
 
 def _html_cell(kind: str, cell: str, word: bool) -> str:
-    classes = " ".join(["word"] * word + ["long"] * (len(cell) > LONG))
+    classes = " ".join(["word"] * word + ["long"] * (len(cell) > LONGEST_CELL))
     named = f" class='{classes}'" if classes else ""
     return f"<{kind}{named}>{html.escape(cell)}</{kind}>"
 

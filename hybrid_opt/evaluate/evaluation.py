@@ -31,8 +31,8 @@ from hybrid_opt.evaluate.kernel import (
     Kernel,
     SampledVerdicts,
     collision_shares,
+    evaluate_numpy,
     load_kernel,
-    one_by_one,
 )
 from hybrid_opt.evaluate.objectives import (
     PAPER_OBJECTIVES,
@@ -253,7 +253,7 @@ class CandidateEvaluator:
         """
         x = self._checked(x)
         if self._kernel is None:
-            return one_by_one(self.outputs(x), self.checker)
+            return evaluate_numpy(self.outputs(x), self.checker)
         return self._kernel.evaluate(
             x, self._needs or (), with_collisions, self.threads, self._begin
         )
@@ -266,7 +266,7 @@ class CandidateEvaluator:
         """
         x = self._checked(x)[:1]
         outputs = self.outputs(x)
-        sampled = one_by_one(outputs, self.checker)
+        sampled = evaluate_numpy(outputs, self.checker)
         judgement = self._judge(x, sampled, outputs).judgement(0, self.objective_names)
         single = {name: values[0] for name, values in outputs.items()}
         return carry_under_time_law(self.workcell, self.functions, x[0], single, judgement)

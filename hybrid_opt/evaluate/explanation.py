@@ -16,10 +16,10 @@ from symbolic.read.arms import arm_model, link_frame, turning_joints
 from symbolic.records import Contact, Robot
 from symbolic.records.poses import box_placement, inverse
 
-STEPS = 60
+DAMPED_STEPS = 60
 """Damped steps in which an arm goes as near to a pose as it can."""
 
-LEVER = 0.1
+RADIAN_LENGTH = 0.1
 """Length that a radian counts beside a distance [m]."""
 
 DAMPING = 1e-4
@@ -140,12 +140,12 @@ def missing_reach(robot: Robot, contact: Contact, T_world_box: Array, q: Array) 
     T_box_flange = contact.T_box_pad @ inverse(robot.T_flange_pad)
     target = inverse(robot.T_world_base) @ T_world_box @ T_box_flange
     least, distance = np.inf, np.inf
-    for _ in range(STEPS):
+    for _ in range(DAMPED_STEPS):
         pin.framesForwardKinematics(model, data, q)
         here = data.oMf[flange]
         away = target[:3, 3] - here.translation
         turn = pin.log3(target[:3, :3] @ here.rotation.T)
-        error = float(np.hypot(np.linalg.norm(away), LEVER * np.linalg.norm(turn)))
+        error = float(np.hypot(np.linalg.norm(away), RADIAN_LENGTH * np.linalg.norm(turn)))
         if error < least:
             least, distance = error, float(np.linalg.norm(away))
         J = pin.computeFrameJacobian(model, data, q, flange, pin.LOCAL_WORLD_ALIGNED)

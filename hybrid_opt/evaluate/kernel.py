@@ -3,8 +3,8 @@
 Whole evaluations run in lanes: `kernel.c` calls the cell's functions sample by sample, several
 candidates side by side, sums up the violations, bounds every pair's distance, and has Coal prove of
 pairs that the bounds leave open that they are apart or intersect; the rest is left to FCL.
-Quantities per sample leave it only where they are asked for. `one_by_one` says the same in NumPy,
-from the outputs of the candidate function: the kernel's oracle, and what judges candidates of the
+Quantities per sample leave it only on request. `evaluate_numpy` computes the same in NumPy, from
+the outputs of the candidate function: the kernel's oracle, and the evaluation of candidates of the
 time law 'optimal'.
 """
 
@@ -67,7 +67,7 @@ class SampledVerdicts:
     colliding: NDArray[np.bool_]
 
 
-def one_by_one(outputs: Mapping[str, Array], checker: CollisionChecker) -> SampledVerdicts:
+def evaluate_numpy(outputs: Mapping[str, Array], checker: CollisionChecker) -> SampledVerdicts:
     """Compute the verdicts from every per-sample output of the candidate function, in NumPy."""
     violated = np.asarray(outputs["constraint"] > 0.0)
     bad = np.asarray(np.any(violated, axis=2))
@@ -271,7 +271,7 @@ def load_kernel(
         + files("hybrid_opt").joinpath("evaluate", "kernel.c").read_text()
     )
     try:
-        library = compiled.once(
+        library = compiled.memoise(
             (key, lanes),
             lambda: load_or_build_program("kernel", key, make, own, compiled.cache, lanes),
         )
@@ -285,7 +285,7 @@ def load_kernel(
     task = compiled.workcell.task
     x = np.random.default_rng(0).uniform(task.lower, task.upper, (kernel.lanes + 1, task.n_var))
     every = tuple(sample_sizes(compiled.workcell))
-    if _same(kernel.evaluate(x, every, all_forces=True), one_by_one(outputs(x), checker)):
+    if _same(kernel.evaluate(x, every, all_forces=True), evaluate_numpy(outputs(x), checker)):
         return kernel
     warn_one_lane("kernel", f"it differs from the functions that it is made of; {OTHER_COMPILER}")
     return None

@@ -32,10 +32,10 @@ from symbolic.records import Handling, Workcell
 from symbolic.records.poses import box_rotation
 from symbolic.robot.arm import REACH_TOLERANCE
 
-SAMPLES = 401
+PHASE_SAMPLES = 401
 """Samples of a phase."""
 
-STEP = 0.005
+LINE_STEP = 0.005
 """Step of Newton's method from place to place along a line [m]."""
 
 TICK = 0.008
@@ -167,7 +167,7 @@ def followed(
     end.
 
     Samples are at the places that the profile of `rise` passes at even times. Newton's method goes
-    from place to place every `STEP`, then from between these to all samples at once. Redundant
+    from place to place every `LINE_STEP`, then from between these to all samples at once. Redundant
     joints stay where they are at the known end.
 
     Args:
@@ -182,13 +182,13 @@ def followed(
         """Return the share of the line from its start; `way` is counted from the known end."""
         return 1.0 - way if at_end else way
 
-    ways, passed = np.linspace(0.0, 1.0, int(np.ceil(line.length / STEP)) + 1), [known]
+    ways, passed = np.linspace(0.0, 1.0, int(np.ceil(line.length / LINE_STEP)) + 1), [known]
     for way in ways:
         passed.append(held_at(workcell, posture, line, share(way[None]), passed[-1][None])[0])
         if not np.isfinite(passed[-1]).all():
             break
     reached = np.array([q for q in passed[1:] if np.isfinite(q).all()] or [known])
-    samples = rise(1.0, SAMPLES).value
+    samples = rise(1.0, PHASE_SAMPLES).value
     guess = interpolated(samples, ways[: len(reached)], reached)
     q = held_at(workcell, posture, line, share(samples), guess)
     lower, upper = map(workcell.stack_joint_limits, ("position_lower", "position_upper"))
@@ -227,16 +227,16 @@ def timed(model: TimingModel, line: Straight, q: Array) -> PhaseMotion:
     Args:
         q: (SAMPLES, joints) as from `followed` [rad].
     """
-    unit = rise(1.0, SAMPLES)
+    unit = rise(1.0, PHASE_SAMPLES)
     box, *targets = line.at(unit.value)
     own = joints_of(model.workcell, q)
     arms = []
     for arm, poses in enumerate(targets):
-        first = np.tile(line.held[arm, 1] - line.held[arm, 0], (SAMPLES, 1))
+        first = np.tile(line.held[arm, 1] - line.held[arm, 0], (PHASE_SAMPLES, 1))
         arms.append(model.arm_motion(arm, own[arm], poses, first))
 
     def both(name: str) -> Array:
-        return np.concatenate([arm[name].reshape(SAMPLES, -1) for arm in arms], axis=1)
+        return np.concatenate([arm[name].reshape(PHASE_SAMPLES, -1) for arm in arms], axis=1)
 
     v, w, a = unit.rate[:, None], unit.rate[:, None] ** 2, unit.second[:, None]
     way = line.box[1] - line.box[0]
@@ -272,7 +272,7 @@ def timed(model: TimingModel, line: Straight, q: Array) -> PhaseMotion:
         q_rate=q_rate / T,
         q_second=q_second / T**2,
         own_torque=moving / T**2 + both("torque_at_rest"),
-        wrench_torque=both("wrench_torque").reshape(SAMPLES, -1, 6),
+        wrench_torque=both("wrench_torque").reshape(PHASE_SAMPLES, -1, 6),
     )
 
 
@@ -315,7 +315,7 @@ def carry_motion(model: TimingModel, carry: Carry) -> PhaseMotion:
     return PhaseMotion(motion.first, **joined)
 
 
-EXCESS = 1.005
+USE_TOLERANCE = 1.005
 """Use of a limit beyond which a job is refused."""
 
 _FORCE_FLOOR = 1e-9
@@ -368,13 +368,13 @@ def pressing(
     """
     peak = float(hold.normal[sample].max())
     duration = at_even_steps(PEAK_RATE * peak / rate, TICK)
-    share = rise(duration, SAMPLES).value[:: 1 if sample == 0 else -1]
+    share = rise(duration, PHASE_SAMPLES).value[:: 1 if sample == 0 else -1]
 
     def scaled(values: Array) -> Array:
         return np.asarray(np.multiply.outer(share, values[sample]))
 
     force = Force(scaled(hold.normal), scaled(hold.least), scaled(hold.wrench))
-    return standing_still(motion, sample, np.linspace(0.0, duration, SAMPLES)), force
+    return standing_still(motion, sample, np.linspace(0.0, duration, PHASE_SAMPLES)), force
 
 
 def without_force(motion: PhaseMotion) -> Force:

@@ -25,11 +25,11 @@ from hybrid_opt.collision.certify import Certificate, SampledPath, certificates,
 from hybrid_opt.collision.checker import RESTING_TOLERANCE, CollisionChecker
 from hybrid_opt.collision.distances import BodyDistances
 from hybrid_opt.collision.judge import FCL_RESOLUTION
-from hybrid_opt.compiled_cell import CompiledCell, kept_per_workcell
+from hybrid_opt.compiled_cell import CompiledCell, cache_by_workcell
 from hybrid_opt.errors import JobError
 from hybrid_opt.job.motions import (
-    EXCESS,
-    SAMPLES,
+    PHASE_SAMPLES,
+    USE_TOLERANCE,
     Straight,
     carry_motion,
     followed,
@@ -43,7 +43,7 @@ from hybrid_opt.job.motions import (
     without_force,
 )
 from hybrid_opt.job.records import Job, Phase, PhaseMotion
-from hybrid_opt.job.smooth import WIDEST, WIDTH, rests_at_ends, without_jumps
+from hybrid_opt.job.smooth import LARGEST_WIDTH, SMOOTHING_WIDTH, rests_at_ends, without_jumps
 from hybrid_opt.robust.squeeze import Squeeze, SqueezeSettings, commanded_forces
 from hybrid_opt.timing.jerk import applicable_jerk_limits
 from hybrid_opt.timing.model import TimingModel
@@ -62,7 +62,7 @@ LARGEST_DROP = 0.3
 MOST_STEPS = 300
 BEHIND_PAD = "behind the pad: the contact plane keeps them apart"
 
-EVERY = 10
+CHECK_STRIDE = 10
 """Stride of the samples of a straight motion that are judged."""
 
 
@@ -98,8 +98,9 @@ class Around:
     def followed(
         self, workcell: Workcell, posture: NumericFunction, q: Array
     ) -> Iterator[tuple[int, Straight, Array]]:
-        """Yield side, line and both arms' joints along it (`SAMPLES`, joints) of every straight
-        motion.
+        """Yield, of every straight motion, side, line and both arms' joints along it.
+
+        The joints are (`PHASE_SAMPLES`, joints).
 
         Args:
             posture: `symbolic.robot.arm.posture_function`.
@@ -266,10 +267,10 @@ def what_blocks(
         q: (2, joints) of both arms there [rad or m].
     """
     around = collisions.around(workcell.handling, pose)
-    share = rise(1.0, SAMPLES).value[::EVERY]
+    share = rise(1.0, PHASE_SAMPLES).value[::CHECK_STRIDE]
     try:
         for _, line, way in around.followed(workcell, posture, q):
-            poses, joints = line.at(share)[0], joints_of(workcell, way[::EVERY])
+            poses, joints = line.at(share)[0], joints_of(workcell, way[::CHECK_STRIDE])
             touch = around.checker.check(poses, *joints).first_touch
             if touch is not None:
                 return f"{line.name.replace('_', ' ')}: {touch}"
@@ -320,7 +321,7 @@ class JobModel:
         self,
         timing: Timing,
         squeeze: SqueezeSettings | None = None,
-        smoothing: float = WIDTH,
+        smoothing: float = SMOOTHING_WIDTH,
         handling: Handling | None = None,
         within_jerk: bool = True,
     ) -> Job:
@@ -345,8 +346,10 @@ class JobModel:
                 f"there is no timing to export ({timing.status}: {timing.reason}); export one "
                 "that robots can drive"
             )
-        if not 0.0 <= smoothing <= WIDEST:
-            raise SettingsError(f"smoothing over {smoothing:g} s: allowed is 0 to {WIDEST:g} s")
+        if not 0.0 <= smoothing <= LARGEST_WIDTH:
+            raise SettingsError(
+                f"smoothing over {smoothing:g} s: allowed is 0 to {LARGEST_WIDTH:g} s"
+            )
         jerk = applicable_jerk_limits(self.workcell, timing.limits) if within_jerk else None
         timing = without_jumps(self.timing, timing, jerk, smoothing)
         carry = timing.driven
@@ -402,7 +405,7 @@ class JobModel:
 
     def _free(self, checker: CollisionChecker, line: Straight, motion: PhaseMotion) -> Certificate:
         """Certify a straight motion between its samples."""
-        share = rise(1.0, SAMPLES).value
+        share = rise(1.0, PHASE_SAMPLES).value
 
         def at(u: Array) -> tuple[Array, Array, Array]:
             guess = interpolated(u, share, motion.q)
@@ -432,7 +435,7 @@ class JobModel:
                     "of 0 hands the box over in the air), or choose another carry"
                 )
             name, ratio = max(use.items(), key=lambda item: item[1])
-            if ratio > EXCESS:
+            if ratio > USE_TOLERANCE:
                 raise JobError(
                     f"{title}: uses {100.0 * ratio:.1f} % of the limit on {name}; press less "
                     "(squeeze), or choose a slower timing"
@@ -483,7 +486,7 @@ def pressed(model: JobModel, timing: Timing, settings: SqueezeSettings | None = 
     return Pressed(normal, job.squeeze, job)
 
 
-_model = kept_per_workcell(JobModel)
+_model = cache_by_workcell(JobModel)
 
 
 class HasTiming(Protocol):
@@ -495,7 +498,9 @@ class HasTiming(Protocol):
 
 
 def plan_job(
-    timing: Timing | HasTiming, squeeze: SqueezeSettings | None = None, smoothing: float = WIDTH
+    timing: Timing | HasTiming,
+    squeeze: SqueezeSettings | None = None,
+    smoothing: float = SMOOTHING_WIDTH,
 ) -> Job:
     """Plan the whole job around a timed or recommended carry, see `JobModel.plan`."""
     timing = timing if isinstance(timing, Timing) else timing.timing

@@ -11,8 +11,8 @@ from scipy.interpolate import CubicHermiteSpline
 
 from hybrid_opt.collision.certify import Certificate
 from hybrid_opt.display.table import text_table
+from hybrid_opt.display_protocol import Displayable
 from hybrid_opt.robust.squeeze import Squeeze
-from hybrid_opt.shown import Displayable
 from hybrid_opt.timing.model import contact_torque
 from hybrid_opt.timing.records import Timing
 from symbolic.array import Array, interpolated, set_read_only
@@ -22,7 +22,7 @@ from symbolic.records import Workcell
 PHASES = ("approach", "press", "lift", "carry", "set_down", "release", "retreat")
 """Every phase of a job in order; without a height there is no lift or no set-down."""
 
-HELD = ("lift", "carry", "set_down")
+HELD_PHASES = ("lift", "carry", "set_down")
 """Phases in which the box is held and moves."""
 
 _STATIC = ("friction", "path speed", "joint position", "least normal force")
@@ -160,7 +160,7 @@ class Job(Displayable):
     @property
     def held(self) -> tuple[Phase, ...]:
         """The phases in which the box is held and moves."""
-        return tuple(phase for phase in self.phases if phase.name in HELD)
+        return tuple(phase for phase in self.phases if phase.name in HELD_PHASES)
 
     @property
     def peak_normal_force(self) -> Array:

@@ -22,16 +22,16 @@ from hybrid_opt.timing.records import JerkLimits, Timing, TimingLimits
 from hybrid_opt.timing.solve import time_path
 from symbolic.array import Array
 
-WIDTH = 0.05
+SMOOTHING_WIDTH = 0.05
 """Half the width of the window [s]."""
 
-WIDEST = 1.0
+LARGEST_WIDTH = 1.0
 """Largest width that may be asked for [s]."""
 
-STEP = 5e-4
+AVERAGING_STEP = 5e-4
 """Time step of the averaging [s]."""
 
-EVERY = 4
+STEPS_PER_SAMPLE = 4
 """Steps of the averaging between two samples of the carry."""
 
 RESTS = 1e-3
@@ -63,7 +63,7 @@ def acceleration_at_ends(timing: Timing) -> float:
 
 
 def without_jumps(
-    model: TimingModel, timing: Timing, jerk: JerkLimits | None, width: float = WIDTH
+    model: TimingModel, timing: Timing, jerk: JerkLimits | None, width: float = SMOOTHING_WIDTH
 ) -> Timing:
     """Compute a timing of the same path within the same limits without jumps of the acceleration,
     as jobs need it.
@@ -119,7 +119,7 @@ def _smoothed(model: TimingModel, timing: Timing, width: float) -> Timing:
     limits = timing.limits
 
     def driven(factor: float) -> _Slowdown:
-        time = np.asarray(EVERY * STEP / factor * np.arange(len(u)))
+        time = np.asarray(STEPS_PER_SAMPLE * AVERAGING_STEP / factor * np.arange(len(u)))
         carry = model.carry(motion, time, factor * rate, factor**2 * second)
         ratios = limit_ratios(carry, model.workcell, limits)
         found = check_limits(model, carry, limits, ratios)
@@ -192,15 +192,15 @@ def _between(slow: _Slowdown, fast: _Slowdown) -> float:
 
 
 def _averaged(grid_speed: Array, width: float) -> tuple[Array, Array, Array]:
-    """Compute u, u' and u'' of the averaged timing at every `EVERY`th step."""
+    """Compute u, u' and u'' of the averaged timing at every `STEPS_PER_SAMPLE`th step."""
     intervals = len(grid_speed) - 1
     grid = np.linspace(0.0, 1.0, intervals + 1)
     steps = 2.0 * np.diff(grid) / (grid_speed[:-1] + grid_speed[1:])
     begins = np.concatenate([[0.0], np.cumsum(steps)])
-    reach = int(np.ceil(width / STEP))
-    count = int(np.ceil(begins[-1] / STEP)) + 1
+    reach = int(np.ceil(width / AVERAGING_STEP))
+    count = int(np.ceil(begins[-1] / AVERAGING_STEP)) + 1
     # At rest before and after, for as long as the window reaches beyond what is kept.
-    time = STEP * np.arange(-2 * reach, count + 2 * reach)
+    time = AVERAGING_STEP * np.arange(-2 * reach, count + 2 * reach)
     interval = np.clip(np.searchsorted(begins, time, side="right") - 1, 0, intervals - 1)
     into = np.clip(time, 0.0, begins[-1]) - begins[interval]
     change = np.diff(grid_speed) / steps
@@ -210,10 +210,10 @@ def _averaged(grid_speed: Array, width: float) -> tuple[Array, Array, Array]:
     place = grid[interval] + (grid_speed[interval] + change[interval] * into / 2.0) * into
     s = np.linspace(-1.0, 1.0, 2 * reach + 1)
     kernel = (1.0 - s**2) ** 3
-    slope = -6.0 * s * (1.0 - s**2) ** 2 / (reach * STEP)
+    slope = -6.0 * s * (1.0 - s**2) ** 2 / (reach * AVERAGING_STEP)
     total = kernel.sum()
     u = np.convolve(np.clip(place, 0.0, 1.0), kernel / total, mode="valid")
     rate = np.convolve(speed, kernel / total, mode="valid")
     second = np.convolve(speed, slope / total, mode="valid")
-    keep = np.arange(0, len(u) + EVERY - 1, EVERY).clip(max=len(u) - 1)
+    keep = np.arange(0, len(u) + STEPS_PER_SAMPLE - 1, STEPS_PER_SAMPLE).clip(max=len(u) - 1)
     return np.clip(u[keep], 0.0, 1.0), np.maximum(rate[keep], 0.0), second[keep]

@@ -22,7 +22,7 @@ SEPARATING_AXES_BELOW = 0.1
 MINIMA_BELOW = 0.1
 """Pairs that stay farther apart get no interpolated minima [m]."""
 
-MEASURED_TOGETHER = 8
+DISTANCE_BATCH = 8
 """Distances that are measured together in a search for the first violation."""
 
 Stretch = tuple[slice, int]
@@ -190,8 +190,8 @@ class Distances:
         measured first, until one violates its limit."""
         places, pairs = (self.interpolated_clearance < limits).nonzero()
         order = np.argsort(self.interpolated_clearance[places, pairs], kind="stable")
-        for first in range(0, len(order), MEASURED_TOGETHER):
-            some = order[first : first + MEASURED_TOGETHER]
+        for first in range(0, len(order), DISTANCE_BATCH):
+            some = order[first : first + DISTANCE_BATCH]
             fresh = some[self._unmeasured[places[some], pairs[some]]]
             self._measure_pairs(places[fresh], pairs[fresh])
             if (self._values[places[some], pairs[some]] < limits[pairs[some]]).any():

@@ -15,7 +15,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from codegen.interpreted import InterpretedFunction
-from hybrid_opt.compiled_cell import held_function
+from hybrid_opt.compiled_cell import contact_function
 from hybrid_opt.robust.cases import RulingCases, ruling_cases
 from hybrid_opt.robust.force import BoxMotion, robust_model
 from hybrid_opt.robust.path_force import PathPoints, robust_path
@@ -47,7 +47,7 @@ class RobustSamples:
         """
         self._workcell, self._model = workcell, robust_model(workcell)
         self._cases = self._model.worst_cases(workcell.uncertainty, LEADER)
-        self._gradient = held_function(workcell, "case gradient", case_gradient_function)
+        self._gradient = contact_function(workcell, "case gradient", case_gradient_function)
         self._motion = InterpretedFunction(motion_function(workcell.task))
 
     def forces(self, found: Mapping[str, Array]) -> Array:

@@ -22,7 +22,7 @@ import numpy as np
 from hybrid_opt.carry import Judgement
 from hybrid_opt.display import table
 from hybrid_opt.errors import NoHoldError, ProposalError
-from hybrid_opt.progress import ShowProgress, counted, passed_on
+from hybrid_opt.progress import ShowProgress, as_callback, progress_bar
 from hybrid_opt.proposing.bases import base_choices
 from hybrid_opt.proposing.bounds import Bounds, Sampling
 from hybrid_opt.proposing.draft import Draft, changes, decision_bounds
@@ -235,8 +235,8 @@ def propose_classes(
         SettingsError: OMPL is not installed.
     """
     settings = settings or ProposeSettings()
-    with counted(progress, "seconds of work", ceil(settings.seconds)) as advance:
-        search = _Search(read_problem(path), rng, settings, tell, passed_on(advance))
+    with progress_bar(progress, "seconds of work", ceil(settings.seconds)) as advance:
+        search = _Search(read_problem(path), rng, settings, tell, as_callback(advance))
         return sorted(search.run(), key=lambda one: one.length)
 
 

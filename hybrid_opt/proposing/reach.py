@@ -16,7 +16,7 @@ import numpy as np
 from hybrid_opt.carry import joints_of
 from hybrid_opt.collision.certify import certify
 from hybrid_opt.collision.checker import CollisionChecker
-from hybrid_opt.compiled_cell import CompiledCell, kept_per_workcell
+from hybrid_opt.compiled_cell import CompiledCell, cache_by_workcell
 from hybrid_opt.errors import JobError
 from hybrid_opt.job.plan import JobCollisions, SupportedPose
 from hybrid_opt.job.records import Job
@@ -41,7 +41,7 @@ PROOF_POINTS = 17
 
 _CLOSER = "choose joint positions nearer to the job's"
 
-_collisions = kept_per_workcell(lambda cell: JobCollisions(CompiledCell.of(cell), everywhere=True))
+_collisions = cache_by_workcell(lambda cell: JobCollisions(CompiledCell.of(cell), everywhere=True))
 
 
 def plan_reach(job: Job, q: Array, *, rng: np.random.Generator, after: bool = False) -> Array:

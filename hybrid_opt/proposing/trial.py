@@ -18,7 +18,7 @@ from hybrid_opt.compiled_cell import InterpretedCell
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.evaluate.explanation import explain
 from hybrid_opt.job.plan import JobCollisions, what_blocks
-from hybrid_opt.static_hold import unheld
+from hybrid_opt.static_hold import static_hold_error
 from symbolic.array import Array
 from symbolic.cell_model import (
     CellBodies,
@@ -338,7 +338,9 @@ class Trial:
         """Whether the proposed carry is feasible, certified between its samples and held still at
         both ends, and if not why."""
         judgement, why = self.verdict_on(self.initial)
-        told = unheld(self.workcell, self.evaluator.outputs) if judgement.feasible else ""
+        told = (
+            static_hold_error(self.workcell, self.evaluator.outputs) if judgement.feasible else ""
+        )
         return (
             (replace(judgement, feasible=False, reason="hold"), told) if told else (judgement, why)
         )

@@ -19,7 +19,7 @@ from hybrid_opt.cell import Cell
 from hybrid_opt.robust.budget import GripBudget
 from hybrid_opt.robust.cases import LEADER
 from hybrid_opt.robust.force import BoxMotion, robust_model
-from hybrid_opt.static_hold import unheld
+from hybrid_opt.static_hold import static_hold_error
 from hybrid_opt.timing.records import PathTiming, TimingLimits
 from symbolic.array import Array
 from symbolic.errors import SettingsError
@@ -128,7 +128,7 @@ def wished_cell(cell: Cell, wish: Wish) -> Cell:
     if not changes:
         return cell
     found = cell.changed(changes)
-    reason = unheld(found.workcell)
+    reason = static_hold_error(found.workcell)
     if reason:
         raise SettingsError(f"{_listed(wish)}: {reason}")
     return found

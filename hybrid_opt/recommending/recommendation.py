@@ -15,13 +15,14 @@ from numpy.typing import NDArray
 
 from hybrid_opt.carry import Carry
 from hybrid_opt.cell import Cell
+from hybrid_opt.display_protocol import Displayable
 from hybrid_opt.errors import JobError
 from hybrid_opt.evaluate.objectives import PLANNED_FORCE, ForceKind
 from hybrid_opt.front import Front
 from hybrid_opt.job.plan import JobModel, Pressed, pressed
 from hybrid_opt.job.records import Job
 from hybrid_opt.job.smooth import driven_timing
-from hybrid_opt.progress import ShowProgress, counted
+from hybrid_opt.progress import ShowProgress, progress_bar
 from hybrid_opt.recommending.advice import Advice, advice, commanded_margins
 from hybrid_opt.recommending.choice import (
     FORCES,
@@ -46,7 +47,6 @@ from hybrid_opt.robust.budget import (
 from hybrid_opt.robust.cases import LEADER
 from hybrid_opt.robust.force import at_rest, box_motion, robust_model, thinned
 from hybrid_opt.robust.squeeze import MOST, Squeeze, largest_commanded
-from hybrid_opt.shown import Displayable
 from hybrid_opt.static_hold import static_hold
 from hybrid_opt.timing.limits import limited_force
 from hybrid_opt.timing.records import Timing
@@ -198,7 +198,7 @@ def recommend(
             "evaluations or the task wider bounds"
         )
     named: dict[str, Array] = {} if alone else {HAND_MADE: cell.initial[:-1]} | dict(others or {})
-    with counted(progress, "recommendation", STEPS + len(named)) as advance:
+    with progress_bar(progress, "recommendation", STEPS + len(named)) as advance:
         return _recommended(cell, front.x, wish, named, lambda: advance(1), alone)
 
 

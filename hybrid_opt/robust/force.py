@@ -21,7 +21,7 @@ from scipy.optimize import brentq
 
 from codegen.function import NumericFunction
 from hybrid_opt.carry import Carry
-from hybrid_opt.compiled_cell import held_function, kept_per_workcell
+from hybrid_opt.compiled_cell import cache_by_workcell, contact_function
 from hybrid_opt.robust.cases import (
     nominal_case,
     random_cases,
@@ -175,13 +175,13 @@ class RobustModel:
     """
 
     def __init__(
-        self, workcell: Workcell, load: Callable[..., NumericFunction] = held_function
+        self, workcell: Workcell, load: Callable[..., NumericFunction] = contact_function
     ) -> None:
         """Load or build the functions of pads that have one squeeze; those of others when first
         asked.
 
         Args:
-            load: makes a function as `held_function` does.
+            load: makes a function as `contact_function` does.
 
         Raises:
             SettingsError: some cases cannot be held, however hard the pads press.
@@ -482,7 +482,7 @@ def _leaves_something(workcell: Workcell, uncertainty: Uncertainty) -> bool:
     return bool(min(left) > 0.0)
 
 
-robust_model = kept_per_workcell(RobustModel)
+robust_model = cache_by_workcell(RobustModel)
 """The model of a workcell, the same one for the same record."""
 
 

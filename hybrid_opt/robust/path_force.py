@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from codegen.interpreted import InterpretedFunction
 from hybrid_opt.carry import Carry
-from hybrid_opt.compiled_cell import bound_to, held_function, kept_per_workcell
+from hybrid_opt.compiled_cell import bound_to, cache_by_workcell, contact_function
 from hybrid_opt.robust.cases import (
     FOLLOWER,
     LEADER,
@@ -103,8 +103,8 @@ class RobustPath:
         self._set, self._model = workcell.uncertainty, robust_model(workcell)
         self._cases = self._model.worst_cases(self._set, LEADER)
         # Slopes add up in loops, for which there is no form in lanes.
-        self._slopes = held_function(workcell, "case slopes", case_slopes_function, lanes=1)
-        self._difference = held_function(
+        self._slopes = contact_function(workcell, "case slopes", case_slopes_function, lanes=1)
+        self._difference = contact_function(
             workcell, "case difference", case_difference_function, lanes=0
         )
 
@@ -174,7 +174,7 @@ class RobustPath:
         return ruling.slopes(slopes[: len(points)], slopes[len(points) :])
 
 
-robust_path = kept_per_workcell(RobustPath)
+robust_path = cache_by_workcell(RobustPath)
 """The one of a workcell, the same for the same record."""
 
 

@@ -36,8 +36,8 @@ from symbolic.records import Workcell
 from symbolic.records.problems import shown, text_problem
 from symbolic.safe_io import replace_file
 
-FORMAT = "dual-arm-carry trajectory"
-VERSION = 1
+TRAJECTORY_FORMAT = "dual-arm-carry trajectory"
+TRAJECTORY_VERSION = 1
 LARGEST_DECISION = 100.0
 """Largest value of a decision vector and of a start posture [m, rad]: no cell has larger ones."""
 
@@ -137,8 +137,8 @@ def write_trajectory(
             raise ResultsError(f"{name}: found {shown(value)}; expected a finite number")
     outputs = compiled.evaluators["candidate"](x, *_standing_still(workcell))
     document = {
-        "format": FORMAT,
-        "version": VERSION,
+        "format": TRAJECTORY_FORMAT,
+        "version": TRAJECTORY_VERSION,
         "decision": x.tolist(),
         "start": [outputs["q_1"][0].tolist(), outputs["q_2"][0].tolist()],
         "figures": dict(figures),
@@ -170,7 +170,7 @@ def read_trajectory(path: str | Path) -> StoredTrajectory:
         ResultsError: the file cannot be read, or a field is wrong.
     """
     path = Path(path)
-    data = read_document(path, FORMAT, VERSION)
+    data = read_document(path, TRAJECTORY_FORMAT, TRAJECTORY_VERSION)
     read = from_json(_Content, data, path, "store the trajectory anew", is_open=False)
     try:
         cell = cell_from_json(read.cell)

@@ -11,7 +11,7 @@ from typing import Annotated
 import numpy as np
 
 from hybrid_opt.carry import Carry
-from hybrid_opt.progress import ShowProgress, counted
+from hybrid_opt.progress import ShowProgress, progress_bar
 from hybrid_opt.store.files import read_record
 from hybrid_opt.timing.drive import search_carry, search_timing
 from hybrid_opt.timing.jerk import applicable_jerk_limits, time_with_jerk
@@ -232,7 +232,7 @@ def time_trajectory(
         limits = model.drive_limits(float(path[-1]))
         kept = applicable_jerk_limits(model.workcell, limits)
     ways = 5 + (force_limit is not None) + (kept is not None) + (curve_points or 0)
-    with counted(progress, "timings", ways) as advance:
+    with progress_bar(progress, "timings", ways) as advance:
 
         def on_timing() -> None:
             advance(1)

@@ -42,7 +42,7 @@ from hybrid_opt.timing.limits import (
 )
 from hybrid_opt.timing.model import PathMotion, TimingModel
 from hybrid_opt.timing.records import (
-    FRICTION,
+    FRICTION_RATIO,
     JerkLimits,
     JerkTiming,
     Place,
@@ -237,7 +237,7 @@ class _JerkProblem:
         """Return the largest utilisation (coarse points,) at the finer points around each."""
         carry = self._carry(self._fine, c)
         ratios = limit_ratios(carry, self._model.workcell, self._limits)
-        del ratios[FRICTION]
+        del ratios[FRICTION_RATIO]
         joint, box = self._jerks(self._fine, c)
         use = np.max([*[ratio.max(axis=1) for ratio in ratios.values()], joint, box], axis=0)
         between = use[1:].reshape(-1, CHECKS_PER_POINT).max(axis=1)

@@ -14,7 +14,7 @@ from hybrid_opt.robust.force import robust_model
 from hybrid_opt.robust.path_force import BY_TIMING, PathPoints, robust_path
 from hybrid_opt.timing.model import REFINEMENT, PathMotion, TimingModel
 from hybrid_opt.timing.records import (
-    FRICTION,
+    FRICTION_RATIO,
     PER_JOINT,
     Place,
     Timing,
@@ -222,7 +222,7 @@ def limit_ratios(carry: Carry, workcell: Workcell, limits: TimingLimits) -> dict
     """
     friction = np.array([contact.friction for contact in workcell.contacts])
     bound = np.maximum(carry.normal_force * friction, LEAST_NORMAL_FORCE)
-    ratios = {FRICTION: carry.tangential_force / bound}
+    ratios = {FRICTION_RATIO: carry.tangential_force / bound}
     for limit in LIMITS:
         if not applies(limit, workcell, limits):
             continue
@@ -371,7 +371,7 @@ def most_used(use: dict[str, Utilisation]) -> Utilisation:
     candidates = [
         excess
         for name, excess in use.items()
-        if name != FRICTION or excess.ratio > 1.0 + FRICTION_ROUNDING
+        if name != FRICTION_RATIO or excess.ratio > 1.0 + FRICTION_ROUNDING
     ]
     return max(candidates, key=lambda excess: excess.ratio)
 

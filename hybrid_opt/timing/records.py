@@ -9,17 +9,17 @@ from typing import Annotated
 import numpy as np
 
 from hybrid_opt.carry import Carry
-from hybrid_opt.shown import Displayable
+from hybrid_opt.display_protocol import Displayable
 from symbolic.array import Array, Count, Figure, Range
 from symbolic.errors import SettingsError
 from symbolic.limits import LIMITS
 from symbolic.records import Workcell
 
-FRICTION = "friction"
+FRICTION_RATIO = "friction"
 """Ratio of a carry that limits no timing: the allocation of the contact forces satisfies it."""
 
 PER_JOINT = tuple(limit.name for limit in LIMITS if limit.scope == "joint")
-PER_ROBOT = (FRICTION, *(limit.name for limit in LIMITS if limit.scope == "robot"))
+PER_ROBOT = (FRICTION_RATIO, *(limit.name for limit in LIMITS if limit.scope == "robot"))
 
 
 class TimingStatus(StrEnum):

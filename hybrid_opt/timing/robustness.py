@@ -25,7 +25,7 @@ from hybrid_opt.carry import Carry
 from hybrid_opt.static_hold import mass_at_reference
 from hybrid_opt.timing.limits import SpeedProfile, has_pressure_limit, limit_ratios
 from hybrid_opt.timing.model import REFINEMENT, TimingModel
-from hybrid_opt.timing.records import FRICTION, Timing, TimingLimits
+from hybrid_opt.timing.records import FRICTION_RATIO, Timing, TimingLimits
 from symbolic.array import Array
 from symbolic.contact.elastic import free_shift, pressure_shifts
 from symbolic.contact.registry import contact_model
@@ -243,7 +243,7 @@ class TimingSensitivity:
             return limit_ratios(carry, model.workcell, timing.limits)
 
         here = ratios()
-        del here[FRICTION]  # tight by construction
+        del here[FRICTION_RATIO]  # tight by construction
         self._used = {
             name: np.nonzero(ratio >= LINEARISED_UTILISATION) for name, ratio in here.items()
         }

@@ -36,7 +36,7 @@ from hybrid_opt.timing.limits import (
 )
 from hybrid_opt.timing.model import REFINEMENT, PathMotion, TimingModel
 from hybrid_opt.timing.records import (
-    FRICTION,
+    FRICTION_RATIO,
     Place,
     Timing,
     TimingLimits,
@@ -223,7 +223,7 @@ class _CuttingPlaneProblem:
         """Tighten the intervals that exceed a limit between their points; return True if there are
         any."""
         ratios = limit_ratios(self._refined(squared), self._model.workcell, self._limits)
-        del ratios[FRICTION]
+        del ratios[FRICTION_RATIO]
         use = np.max([ratio.max(axis=1) for ratio in ratios.values()], axis=0)
         excess = use.reshape(self._model.intervals, -1).max(axis=1)
         exceeded = excess > 1.0 + RECOMPUTED_TOLERANCE / 2.0
@@ -380,7 +380,7 @@ def _solve(rows: LinearLimits, grid: Array) -> Array | SolverFailure:
         def __call__(self, path_positions: Any, order: int = 0) -> Any:
             raise NotImplementedError
 
-    class Limits(LinearConstraint):  # type: ignore[misc]
+    class ToppraLimits(LinearConstraint):  # type: ignore[misc]
         """All limits as rows F w <= g with w = (u'', u'^2)."""
 
         def compute_constraint_params(self, *_: Any) -> tuple[Any, ...]:
@@ -394,7 +394,7 @@ def _solve(rows: LinearLimits, grid: Array) -> Array | SolverFailure:
 
     with _quiet():
         algorithm = TOPPRA(
-            [Limits()],
+            [ToppraLimits()],
             Line(),
             gridpoints=grid,
             solver_wrapper="seidel",

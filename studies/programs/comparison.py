@@ -25,16 +25,16 @@ from studies.study.summary import (
     read_summary,
     reference_front,
 )
-from studies.study.tables import QUANTITIES
+from studies.study.tables import REPLICA_QUANTITIES
 from symbolic.array import Array
 
-ANEW = ("non_dominated", "hypervolume", "igd", "spacing")
+RECOMPUTED_FIGURES = ("non_dominated", "hypervolume", "igd", "spacing")
 """Figures of fronts, computed anew with the reference front of both campaigns."""
 
 STORED = ("feasible_share", "mean_excess_above_static", "payload_limit", "seconds")
 """Figures taken from summary.json."""
 
-POLISHED = "polished_"
+POLISHED_PREFIX = "polished_"
 """Prefix of the figures of polished fronts."""
 
 
@@ -138,7 +138,7 @@ def _values(
     stored = summary.algorithms[name].replicas
     better = [row.polished for row in stored if row.polished is not None]
     values: dict[str, list[float]] = {}
-    for prefix, rows in (("", stored), (POLISHED, better)):
+    for prefix, rows in (("", stored), (POLISHED_PREFIX, better)):
         own = [front for front in run.fronts if front.algorithm == name]
         fronts = [front for front in own if (front.polished is not None) == bool(prefix)]
         if not rows or not fronts:
@@ -146,7 +146,7 @@ def _values(
         anew = [front_indicators(front.objectives, reference, None, None) for front in fronts]
         known = [figure for figure in STORED if hasattr(rows[0], figure)]
         values |= {prefix + figure: [getattr(row, figure) for row in rows] for figure in known}
-        values |= {prefix + figure: [one[figure] for one in anew] for figure in ANEW}
+        values |= {prefix + figure: [one[figure] for one in anew] for figure in RECOMPUTED_FIGURES}
     return values
 
 
@@ -206,8 +206,8 @@ def as_text(found: CampaignComparison) -> str:
 
 def _quantity(figure: str) -> tuple[str, Quantity]:
     """What a figure is called, and how it reads."""
-    quantity = QUANTITIES[figure.removeprefix(POLISHED)]
-    of = "polished, " if figure.startswith(POLISHED) else ""
+    quantity = REPLICA_QUANTITIES[figure.removeprefix(POLISHED_PREFIX)]
+    of = "polished, " if figure.startswith(POLISHED_PREFIX) else ""
     return f"{of}{quantity.heading()}", quantity
 
 

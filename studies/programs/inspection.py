@@ -16,9 +16,9 @@ from hybrid_opt.compiled_cell import InterpretedCell, is_interpretable
 from hybrid_opt.evaluate.explanation import Explanation, explain, frequent
 from hybrid_opt.front import Front
 from hybrid_opt.indicators.metrics import BindingBound, binding_bounds
-from hybrid_opt.progress import Progress, passed_on
+from hybrid_opt.progress import Progress, as_callback
 from hybrid_opt.robust.budget import budget_text
-from studies.program import Finding, load_workcell, print_findings
+from studies.program import Outcome, load_workcell, print_findings
 from symbolic.array import Array
 from symbolic.cell_model import own_pairs
 from symbolic.errors import SettingsError
@@ -29,7 +29,7 @@ from symbolic.robot.branches import StartBranch
 EXPLAINED = 100
 """Most infeasible candidates that are looked at closer."""
 
-POLISH_ATTEMPTS = 10
+SHORT_POLISH_ATTEMPTS = 10
 """Solves of the short polish: the trajectory itself, then ends, middle and gaps of what it
 becomes."""
 
@@ -59,7 +59,7 @@ def inspected(
     view: Path | None = None,
     pairs: bool = False,
     progress: Progress | None = None,
-) -> Iterator[Finding]:
+) -> Iterator[Outcome]:
     """All there is to know of a cell, each finding worked out when it is asked for.
 
     Args:
@@ -76,9 +76,9 @@ def inspected(
     progress = progress or Progress(shown=False)
     is_interpreted = not polish and is_interpretable(workcell)
     cell = Cell(workcell, compiled=InterpretedCell(workcell) if is_interpreted else None)
-    yield Finding({"candidates": candidates, "seed": seed})
+    yield Outcome({"candidates": candidates, "seed": seed})
     facts = _facts(workcell)
-    yield Finding(
+    yield Outcome(
         {"name": workcell.name, "facts": facts},
         (workcell.name, "", *(f"  {heading}: {text}" for heading, text in facts.items()), ""),
     )
@@ -104,26 +104,26 @@ def inspected(
         for why in explain(cell.evaluator, cell.evaluate(carry.x)):
             whys[name] = why
         told = (f"  {whys[name]}",) if name in whys else ()
-        yield Finding({name: carry.judgement}, (f"{title}: {_judged_text(carry.judgement)}", *told))
-    yield Finding({"explained": {name: str(why) for name, why in whys.items()}})
+        yield Outcome({name: carry.judgement}, (f"{title}: {_judged_text(carry.judgement)}", *told))
+    yield Outcome({"explained": {name: str(why) for name, why in whys.items()}})
     yield _postures(cell)
     yield from _candidates(cell, candidates, seed)
     yield _pairs(cell, pairs)
     optimum = _optimum(cell, progress) if polish else None
     lines = () if optimum is None else ("", *_optimum_lines(optimum))
-    yield Finding({"optimum": optimum}, lines)
+    yield Outcome({"optimum": optimum}, lines)
     files: tuple[str, ...] = ()
     if output is not None:
         progress.note("drawing pictures (--no-pictures leaves them out)")
         files = draw(cell, carries, whys, output)
-    yield Finding({"files": files}, ("", "Pictures: " + ", ".join(files)) if files else ())
+    yield Outcome({"files": files}, ("", "Pictures: " + ", ".join(files)) if files else ())
     shown = "" if view is None else show(carries["initial"], whys.get("initial"), view)
-    yield Finding({"view": shown}, ("", f"View: {shown} (open it in a browser)") if shown else ())
+    yield Outcome({"view": shown}, ("", f"View: {shown} (open it in a browser)") if shown else ())
 
 
-def _at_rest(cell: Cell) -> Finding:
+def _at_rest(cell: Cell) -> Outcome:
     """Forces of holding the payload level and still, and whether it can be held."""
-    hold, unheld = cell.static_hold, cell.unheld
+    hold, static_hold_error = cell.static_hold, cell.static_hold_error
     force = hold.normal_force
     share = force / cell.workcell.task.reference_force
     still, objectives = (
@@ -134,19 +134,19 @@ def _at_rest(cell: Cell) -> Finding:
         f"At rest, level: normal forces {still} N, objectives {objectives}; payload at the "
         f"reference force {hold.payload_limit:.2f} kg"
     ]
-    lines += [f"Infeasible, whatever the path: {unheld}"] if unheld else []
+    lines += [f"Infeasible, whatever the path: {static_hold_error}"] if static_hold_error else []
     lines.append(f"G{budget_text(cell.workcell)[1:]}")
     values = {
         "static_normal_force": tuple(force.tolist()),
         "static_objectives": tuple(share.tolist()),
         "static_payload_limit": hold.payload_limit,
-        "unheld": unheld,
+        "unheld": static_hold_error,
         "grip": lines[-1],
     }
-    return Finding(values, tuple(lines))
+    return Outcome(values, tuple(lines))
 
 
-def _postures(cell: Cell) -> Finding:
+def _postures(cell: Cell) -> Outcome:
     """Per robot's name its postures at the start, best first."""
     robots = cell.workcell.robots
     found = cell.compiled.model.branches
@@ -158,10 +158,10 @@ def _postures(cell: Cell) -> Finding:
     for name, own in branches.items():
         lines.append(f"  {name}")
         lines += [f"  {'*' if b.chosen else ' '} {_branch_text(b)}" for b in own]
-    return Finding({"branches": branches}, tuple(lines))
+    return Outcome({"branches": branches}, tuple(lines))
 
 
-def _candidates(cell: Cell, count: int, seed: int) -> Iterator[Finding]:
+def _candidates(cell: Cell, count: int, seed: int) -> Iterator[Outcome]:
     """Random candidates: how many are feasible, and what is in the way of the others."""
     found = cell.evaluate(cell.random(count, np.random.default_rng(seed)))
     share, reasons = float(found.feasible.mean()), found.infeasible_by_reason
@@ -172,7 +172,7 @@ def _candidates(cell: Cell, count: int, seed: int) -> Iterator[Finding]:
     ]
     for name, number in reasons.items():
         lines.append(f"  {name.replace('_', ' ')}: {number} ({100.0 * number / count:.1f} %)")
-    yield Finding({"feasible_share": share, "infeasible_by_reason": reasons}, tuple(lines))
+    yield Outcome({"feasible_share": share, "infeasible_by_reason": reasons}, tuple(lines))
     failed = found[~found.feasible][:EXPLAINED]
     in_the_way = frequent(explain(cell.evaluator, failed))
     lines = []
@@ -181,10 +181,10 @@ def _candidates(cell: Cell, count: int, seed: int) -> Iterator[Finding]:
         if counts:
             lines += ["", f"{title}, in {len(failed)} of the infeasible ones:"]
             lines += [f"  {name}: {number}" for name, number in counts]
-    yield Finding({"explained_candidates": len(failed), "in_the_way": in_the_way}, tuple(lines))
+    yield Outcome({"explained_candidates": len(failed), "in_the_way": in_the_way}, tuple(lines))
 
 
-def _pairs(cell: Cell, listed: bool) -> Finding:
+def _pairs(cell: Cell, listed: bool) -> Outcome:
     """Pairs of bodies that are checked, and those that are not, and why."""
     geometry = cell.geometry
     names, active = [body.name for body in geometry.bodies], geometry.pair_names
@@ -197,7 +197,7 @@ def _pairs(cell: Cell, listed: bool) -> Finding:
     if listed:
         lines += [f"  {first} – {second}" for first, second in active]
         lines += [f"  {first} – {second}: {why}" for first, second, why in excluded]
-    return Finding({"active_pairs": active, "excluded_pairs": excluded}, tuple(lines))
+    return Outcome({"active_pairs": active, "excluded_pairs": excluded}, tuple(lines))
 
 
 def _optimum(cell: Cell, progress: Progress) -> Optimum:
@@ -206,12 +206,12 @@ def _optimum(cell: Cell, progress: Progress) -> Optimum:
     if not verdicts.feasible.all():
         return Optimum(0, (), "the hand-made trajectory, its start, is infeasible")
     try:
-        with progress.stage("short polish", POLISH_ATTEMPTS, "attempts") as advance:
+        with progress.stage("short polish", SHORT_POLISH_ATTEMPTS, "attempts") as advance:
             front = ho.polish(
                 Front.of_search(cell, "hand-made", verdicts),
                 rng=np.random.default_rng(0),
-                settings=ho.PolishSettings(attempts=POLISH_ATTEMPTS),
-                progress=passed_on(advance),
+                settings=ho.PolishSettings(attempts=SHORT_POLISH_ATTEMPTS),
+                progress=as_callback(advance),
             )
     except SettingsError as error:
         return Optimum(0, (), str(error))

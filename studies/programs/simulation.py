@@ -15,27 +15,22 @@ from scipy.spatial.transform import Rotation
 from hybrid_opt.campaign.stages import build_study
 from hybrid_opt.carry import Carry
 from hybrid_opt.cell import Cell
-from hybrid_opt.errors import WitnessError
+from hybrid_opt.errors import SimulationError
 from hybrid_opt.progress import Progress
 from hybrid_opt.robust.cases import nominal_case, random_cases
 from hybrid_opt.robust.squeeze import SqueezeSettings, commanded_forces
-from hybrid_opt.store.files import AGAIN, storing
-from hybrid_opt.store.trajectory_file import read_trajectory
-from hybrid_opt.timing.analysis import closest_to_reference_timing
-from hybrid_opt.timing.records import TimingLimits
-from hybrid_opt.timing.solve import time_path
-from hybrid_opt.witness.arms import BISECTIONS, HIGH, LOW, ArmOutcome, CellWitness, account_of
-from hybrid_opt.witness.box import (
+from hybrid_opt.simulation.arms import BISECTIONS, HIGH, LOW, ArmOutcome, CellSimulation, account_of
+from hybrid_opt.simulation.box import (
     AnyOutcome,
+    BoxSimulation,
     Outcome,
     Threshold,
-    Witness,
     bisected,
     drive_of,
     planned_moments,
     workcell_of_case,
 )
-from hybrid_opt.witness.reference import (
+from hybrid_opt.simulation.reference import (
     Control,
     Reference,
     carry_reference,
@@ -43,8 +38,13 @@ from hybrid_opt.witness.reference import (
     exported_carry,
     with_tracking_error,
 )
-from hybrid_opt.witness.scene import LARGEST_STEP, ArmSettings, Pads, SimulationSettings
-from studies.options import DRIVEN, PADS
+from hybrid_opt.simulation.scene import LARGEST_TIME_STEP, ArmSettings, Pads, SimulationSettings
+from hybrid_opt.store.files import AGAIN, storing
+from hybrid_opt.store.trajectory_file import read_trajectory
+from hybrid_opt.timing.analysis import closest_to_reference_timing
+from hybrid_opt.timing.records import TimingLimits
+from hybrid_opt.timing.solve import time_path
+from studies.options import PAD_WITNESSES, PADS_DRIVEN
 from studies.report.looks import Film, write_animation
 from symbolic.array import Array
 from symbolic.contact.registry import contact_model
@@ -60,7 +60,7 @@ def simulate_arms(
         WitnessError: with --sweep, the box holds at the lower or slips at the upper factor.
     """
     control, leader, workcell = options.controller, options.leader - 1, cell.workcell
-    witness = CellWitness(workcell, settings)
+    witness = CellSimulation(workcell, settings)
     found = account_of(cell, carry, witness, control, leader)
     threshold = found.threshold
     print(f"  {found.problem}" if threshold is None else threshold_text(threshold, settings.slip))
@@ -68,7 +68,9 @@ def simulate_arms(
     if options.sweep:
         for step in _swept(settings.time_step):
             period = max(step, settings.control_period)
-            other = CellWitness(workcell, replace(settings, time_step=step, control_period=period))
+            other = CellSimulation(
+                workcell, replace(settings, time_step=step, control_period=period)
+            )
             simulate = partial(other.simulate, reference, control)
             _tell_sweep(step, bisected(simulate, LOW, HIGH, BISECTIONS))
     peak = found.reference.normal_force.max(axis=0)
@@ -76,7 +78,7 @@ def simulate_arms(
     _tell(found.shown, carry)
     if found.squeeze.uncertainty is not None:
         _cases(cell, found.reference, settings, options)
-        rubs_less = CellWitness(worst_friction(workcell), settings)
+        rubs_less = CellSimulation(worst_friction(workcell), settings)
         pressed = partial(rubs_less.simulate, found.reference, control)
         _tell_worst(pressed, partial(rubs_less.simulate, reference, control), workcell)
     if options.film:
@@ -107,7 +109,7 @@ def _cases(
     outcomes = []
     with Progress().stage("random cases", options.runs, "simulations") as advance:
         for case in random_cases(workcell, workcell.uncertainty, options.runs, rng, leader):
-            witness = CellWitness(workcell_of_case(workcell, case), settings, case[8:11])
+            witness = CellSimulation(workcell_of_case(workcell, case), settings, case[8:11])
             told = with_tracking_error(pressed, options.tracking_error, rng, float(case[17]))
             outcomes.append(witness.simulate(told, control, tracked_share(case, leader)))
             advance(1)
@@ -144,7 +146,7 @@ def simulate_pads(
     """The threshold of a carry, its creep, and random cases, printed."""
     leader, workcell = options.leader - 1, cell.workcell
     moments = planned_moments(cell, carry) if settings.pads == "driven" else None
-    witness = Witness(workcell, settings)
+    witness = BoxSimulation(workcell, settings)
     drive = drive_of(carry, settings, leader=leader, moments=moments)
     threshold = bisected(partial(witness.simulate, drive), LOW, HIGH, PAD_BISECTIONS)
     print(threshold_text(threshold, settings.slip))
@@ -156,7 +158,7 @@ def simulate_pads(
         for step in _swept(settings.time_step):
             other = replace(settings, time_step=step)
             finer = drive_of(carry, other, leader=leader, moments=moments)
-            simulate = partial(Witness(workcell, other).simulate, finer)
+            simulate = partial(BoxSimulation(workcell, other).simulate, finer)
             _tell_sweep(step, bisected(simulate, LOW, HIGH, PAD_BISECTIONS))
     if workcell.uncertainty.is_empty:
         return
@@ -165,7 +167,7 @@ def simulate_pads(
     rng = np.random.default_rng(options.seed)
     cases = random_cases(workcell, workcell.uncertainty, options.runs, rng, leader)
     held = sum(
-        Witness(workcell_of_case(workcell, case), settings, case[8:11])
+        BoxSimulation(workcell_of_case(workcell, case), settings, case[8:11])
         .simulate(pressed, tracked_share(case, leader))
         .holds
         for case in cases
@@ -174,13 +176,13 @@ def simulate_pads(
         f"  pressed up to {forces[:, 0].max():.2f} / {forces[:, 1].max():.2f} N, {squeeze}: {held} "
         f"of {len(cases)} random cases hold (seed {options.seed})"
     )
-    rubs_less = Witness(worst_friction(workcell), settings).simulate
+    rubs_less = BoxSimulation(worst_friction(workcell), settings).simulate
     _tell_worst(partial(rubs_less, pressed), partial(rubs_less, drive), workcell)
 
 
 def _swept(step: float) -> tuple[float, float]:
     """Half the time step, and twice it where that can be followed."""
-    return step / 2.0, min(2.0 * step, LARGEST_STEP)
+    return step / 2.0, min(2.0 * step, LARGEST_TIME_STEP)
 
 
 def _tell_sweep(step: float, threshold: Threshold[AnyOutcome]) -> None:
@@ -226,11 +228,13 @@ def worst_friction(workcell: Workcell) -> Workcell:
 
 def simulate_file(options: argparse.Namespace) -> int:
     """Drive a trajectory file in the simulator and print what happens; returns the exit code."""
-    alone = options.controller in PADS
+    alone = options.controller in PAD_WITNESSES
     if alone and (options.film or options.mjcf):
-        raise WitnessError("films and MJCF files are of cells with arms; give another --controller")
+        raise SimulationError(
+            "films and MJCF files are of cells with arms; give another --controller"
+        )
     if alone:
-        pads: Pads = "driven" if options.controller == DRIVEN else "even"
+        pads: Pads = "driven" if options.controller == PADS_DRIVEN else "even"
         settings = SimulationSettings(options.time_step, pads=pads)
     else:
         period = max(options.time_step, ArmSettings.control_period)
@@ -238,8 +242,11 @@ def simulate_file(options: argparse.Namespace) -> int:
     stored = read_trajectory(options.file)
     with TemporaryDirectory() as folder:
         cell = stored.open_cell(Path(folder))
-        if options.controller == DRIVEN and not contact_model(cell.workcell).has_pressure_limit:
-            raise WitnessError(
+        if (
+            options.controller == PADS_DRIVEN
+            and not contact_model(cell.workcell).has_pressure_limit
+        ):
+            raise SimulationError(
                 "planned moments at the wrists belong to pads that choose their pressure; this "
                 f"carry is of {contact_model(cell.workcell).assumption}: give another --controller"
             )

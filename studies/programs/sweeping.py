@@ -10,13 +10,13 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
+from hybrid_opt.api import polish, search
 from hybrid_opt.cell import Cell
 from hybrid_opt.display.table import Table, number
-from hybrid_opt.door import polish, search
 from hybrid_opt.recommending.recommendation import recommend
 from hybrid_opt.store.files import to_json
 from hybrid_opt.store.trajectory_file import read_trajectory
-from hybrid_opt.sweeping import Sweep, require_keys, stored_sweep, sweep
+from hybrid_opt.sweeping import Sweep, read_sweep, require_keys, sweep
 from hybrid_opt.workers import warm_up
 from studies.program import load_workcell
 from studies.report.drawing import (
@@ -47,7 +47,7 @@ def sweep_numbers(options: argparse.Namespace) -> int:
     file.parent.mkdir(parents=True, exist_ok=True)
     shown = not options.quiet
     if file.exists():
-        x: Array = stored_sweep(file).x
+        x: Array = read_sweep(file).x
     elif options.path is not None:
         x = _of_file(cell, Path(options.path))
     else:

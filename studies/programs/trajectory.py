@@ -46,7 +46,7 @@ from hybrid_opt.timing.analysis import time_trajectory, timing_document
 from hybrid_opt.timing.model import TimingModel
 from hybrid_opt.timing.records import Timing, TimingLimits
 from hybrid_opt.timing.solve import time_path
-from studies.program import FAULT, Finding, load_workcell, print_findings
+from studies.program import FAULT, Outcome, load_workcell, print_findings
 from studies.study.tables import force_curve, margins, timings
 from symbolic.array import Array
 from symbolic.errors import SettingsError
@@ -65,7 +65,7 @@ def replay_file(options: argparse.Namespace) -> int:
 
 def _replayed(
     stored: StoredTrajectory, replayed: Replay, options: argparse.Namespace
-) -> Iterator[Finding]:
+) -> Iterator[Outcome]:
     workcell, values = replayed.cell.workcell, dict[str, Any]()
     rows = [("figure", "stored", "recomputed", "")]
     for figure in replayed.figures:
@@ -88,7 +88,7 @@ def _replayed(
         "figures": values,
         "provenance": dict(stored.provenance),
     }
-    yield Finding(document, lines)
+    yield Outcome(document, lines)
     asked = (options.planned_limit, options.force_curve)
     if options.timing or any(option is not None for option in asked):
         Progress().note("timing it, which takes some seconds")
@@ -103,7 +103,7 @@ def _replayed(
             else f"TOPP-RA disagrees on {name}: {check.duration:.3f} s, {check.reference:.3f} s"
             for name, check in timing.validations.items()
         ]
-        yield Finding({"timing": to_json(timing)}, tuple(texts))
+        yield Outcome({"timing": to_json(timing)}, tuple(texts))
 
 
 def export_file(options: argparse.Namespace) -> int:

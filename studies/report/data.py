@@ -13,7 +13,13 @@ import numpy as np
 
 from hybrid_opt.branches import BranchCompetition
 from hybrid_opt.campaign.results import CampaignResults, read_campaign
-from hybrid_opt.campaign.settings import CONFIGURATION, HAND_MADE, RECOMMENDED, SUMMARY, UNION
+from hybrid_opt.campaign.settings import (
+    CONFIGURATION,
+    HAND_MADE_FILE,
+    RECOMMENDED_FILE,
+    SUMMARY,
+    UNION,
+)
 from hybrid_opt.campaign.stages import Cells, ReadyCell, cells_of, read_branches, ready_cells
 from hybrid_opt.display.table import Table
 from hybrid_opt.errors import ResultsError
@@ -32,8 +38,7 @@ from hybrid_opt.store.trajectory_file import read_trajectory
 from hybrid_opt.timing.analysis import TimingDocument, read_timing
 from hybrid_opt.timing.records import TimingLimits
 from hybrid_opt.workers import LocalWorkers, Workers
-from studies.report.drawing import RECOMMENDED as RECOMMENDED_LOOK
-from studies.report.drawing import DrawnCarry, LineStyle, series
+from studies.report.drawing import RECOMMENDED_STYLE, DrawnCarry, LineStyle, series
 from studies.report.page_carries import RECOMMENDED_LABEL, DrawnJob, drawn_job, recommended_job
 from studies.report.pictures_cell import ReachMap, reach_map
 from studies.study.recommendation import drivable_root, is_drivable
@@ -45,14 +50,14 @@ from symbolic.read.cell_files import CellFiles, collect_cell
 from symbolic.records import Workcell
 from symbolic.records.task import initial_decision
 
-INITIAL_LABEL = Path(HAND_MADE).stem
+INITIAL_LABEL = Path(HAND_MADE_FILE).stem
 
 REACH_SEED = 0
 """Seed of the postures that the reach is drawn from; no result depends on it."""
 
 
 @dataclass(frozen=True)
-class Run:
+class ReportRun:
     """One replica of one algorithm.
 
     Attributes:
@@ -94,12 +99,12 @@ class AlgorithmRuns:
     name: str
     title: str
     look: LineStyle
-    runs: tuple[Run, ...]
+    runs: tuple[ReportRun, ...]
     representative: int
     best: DrawnCarry | None
 
     @property
-    def shown(self) -> Run:
+    def shown(self) -> ReportRun:
         """The representative run."""
         return self.runs[self.representative]
 
@@ -218,7 +223,7 @@ class ReportData(Experiment):
         """The recommended carry as robots drive it, None where they cannot."""
         job = self.job(RECOMMENDED_LABEL)
         carry = None if job is None or job.timing is None else job.timing.carry
-        return None if carry is None else DrawnCarry(RECOMMENDED_LABEL, carry, RECOMMENDED_LOOK)
+        return None if carry is None else DrawnCarry(RECOMMENDED_LABEL, carry, RECOMMENDED_STYLE)
 
     @property
     def recommended_objectives(self) -> Array | None:
@@ -252,11 +257,11 @@ def gather(results: CampaignResults, workers: Workers | None = None) -> ReportDa
         drivable = _experiment(read_campaign(place), select=False)
         jerk = limits_on_jerk(place, first.summary.recommendation)
     if drivable is not None and first.summary.recommendation is not None:
-        recommended = read_trajectory(results.root / RECOMMENDED).x
+        recommended = read_trajectory(results.root / RECOMMENDED_FILE).x
     if not (results.root / TIMING).exists():
         raise ResultsError(
             f"{results.root}: a study with --recommend-only has no report; its carry is in "
-            f"{RECOMMENDED}. Run the study without it, into another folder, for one"
+            f"{RECOMMENDED_FILE}. Run the study without it, into another folder, for one"
         )
     files = first.summary.shown_files.values()
     timings = [read_timing(results.root / TIMING / file) for file in files]
@@ -318,7 +323,7 @@ def _experiment(results: CampaignResults, select: bool = True) -> Experiment:
             front, *polished = (
                 f for f in fronts if (f.algorithm, f.replica) == (name, replica.replica)
             )
-            runs.append(Run(front, next(iter(polished), None), figures))
+            runs.append(ReportRun(front, next(iter(polished), None), figures))
         shown, best, look = entry.representative or 0, None, series(index)
         front = runs[shown].fronts[-1]
         if evaluator is not None and len(front):

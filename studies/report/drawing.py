@@ -21,6 +21,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from hybrid_opt.carry import Carry
+from hybrid_opt.display.objects import ARM_COLOURS
 from hybrid_opt.display.solids import Solid, frame_placements
 from hybrid_opt.store.files import write_atomically
 from symbolic.array import Array
@@ -94,10 +95,10 @@ class LineStyle:
 MARKED = "#b00020"
 """Colour of what stands out."""
 
-HAND_MADE = LineStyle("#555555", ":", "s", "....")
+HAND_MADE_STYLE = LineStyle("#555555", ":", "s", "....")
 """Style of the hand-made trajectory."""
 
-RECOMMENDED = LineStyle(MARKED, "-", "*", "")
+RECOMMENDED_STYLE = LineStyle(MARKED, "-", "*", "")
 """Style of the recommended carry."""
 
 SERIES = (
@@ -109,12 +110,9 @@ SERIES = (
 )
 """Styles of the algorithms in order (Okabe and Ito's colours, distinct for the colour-blind)."""
 
-ARMS = ("#3b6ea8", "#a8733b")
-"""Colours of the two robots in pictures of the cell."""
-
-PAYLOAD = "#c9a227"
+PAYLOAD_COLOUR = "#c9a227"
 OBSTACLE = "#9aa3ab"
-GROUND = "#e8e8e4"
+GROUND_COLOUR = "#e8e8e4"
 
 
 def series(index: int) -> LineStyle:
@@ -219,7 +217,7 @@ class DrawnCarry:
 
     label: str
     timed: Carry
-    look: LineStyle = HAND_MADE
+    look: LineStyle = HAND_MADE_STYLE
     source: str = ""
 
     @property
@@ -346,8 +344,8 @@ def _cut(corners: Array, of: NDArray[np.intp], limits: Array) -> tuple[Array, ND
 
 def _colour(solid: Solid) -> str:
     if solid.is_ground:
-        return GROUND
-    colours = {"robot 1": ARMS[0], "robot 2": ARMS[1], "payload": PAYLOAD}
+        return GROUND_COLOUR
+    colours = {"robot 1": ARM_COLOURS[0], "robot 2": ARM_COLOURS[1], "payload": PAYLOAD_COLOUR}
     return colours.get(solid.group, OBSTACLE)
 
 
@@ -379,7 +377,7 @@ def draw_cell(
     if ground_corners:
         flat = np.concatenate(ground_corners)
         axes.add_collection(
-            _polygons(flat, facecolors=GROUND, edgecolors=GROUND, zorder=1.0),
+            _polygons(flat, facecolors=GROUND_COLOUR, edgecolors=GROUND_COLOUR, zorder=1.0),
             autolim=False,
         )
     points, colour = np.concatenate(corners), np.concatenate(colours)

@@ -48,7 +48,7 @@ BEGIN = "<!-- measured: begin -->"
 END = "<!-- measured: end -->"
 """Marks around the tables in a Markdown file."""
 
-COLOURS = 160
+PICTURE_COLOURS = 160
 """Colours of a picture on the page; its file's are reduced to them."""
 
 
@@ -367,7 +367,7 @@ def _assumed(data: ReportData) -> str:
 
 def _picture(png: bytes, caption: str) -> str:
     with Image.open(BytesIO(png)) as whole:
-        small, made = whole.convert("RGB").quantize(COLOURS), BytesIO()
+        small, made = whole.convert("RGB").quantize(PICTURE_COLOURS), BytesIO()
     small.save(made, "PNG", optimize=True)
     content = base64.b64encode(made.getvalue()).decode("ascii")
     text = html.escape(caption)

@@ -35,14 +35,14 @@ from symbolic.array import Array, interpolated
 from symbolic.geometry.pairs import CellGeometry
 
 FRAMES_PER_SECOND = 15
-SIZE = (6.4, 4.0)
+FRAME_SIZE = (6.4, 4.0)
 """Size of a frame [inch]."""
 
 DPI = 100
 HOLD_SECONDS = 0.7
 """The last frame stays so long before a GIF begins anew."""
 
-COLOURS = 128
+GIF_COLOURS = 128
 """Colours of a GIF's palette."""
 
 
@@ -117,7 +117,7 @@ def frames(geometry: CellGeometry, film: Film) -> Iterator[NDArray[np.uint8]]:
     pose, q = (interpolated(moments, film.time, each) for each in (film.pose, film.q))
     for k, moment in enumerate(moments):
         with in_style():
-            figure = Figure(figsize=SIZE, dpi=DPI)
+            figure = Figure(figsize=FRAME_SIZE, dpi=DPI)
             axes = figure.add_axes((0.0, 0.0, 1.0, 0.93))
             draw_cell(axes, cell, ISOMETRIC, pose[k], q[k])
             draw_path(axes, ISOMETRIC, pose[: k + 1, :3], color="#b00020", linewidth=1.2)
@@ -137,7 +137,7 @@ def _pixels(figure: Figure) -> NDArray[np.uint8]:
 def _write_gif(pictures: Iterator[NDArray[np.uint8]], path: Path) -> None:
     images = [Image.fromarray(pixels) for pixels in pictures]
     # One palette for all frames, so that colours do not flicker.
-    palette = images[len(images) // 2].quantize(COLOURS, Image.Quantize.MEDIANCUT)
+    palette = images[len(images) // 2].quantize(GIF_COLOURS, Image.Quantize.MEDIANCUT)
     coded = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
     step = round(1000 / FRAMES_PER_SECOND)
     durations = [step] * (len(coded) - 1) + [step + round(1000 * HOLD_SECONDS)]

@@ -31,7 +31,7 @@ from symbolic.records import Workcell
 from symbolic.records.poses import box_rotation
 
 RECOMMENDED_LABEL = "recommended"
-RECOMMENDED = "Recommended"
+RECOMMENDED_TITLE = "Recommended"
 """The carry to run, in lists and pictures of the page."""
 
 CARRY_SAMPLES = 40
@@ -137,7 +137,7 @@ def pressure_shift(job: Job, phase: Phase) -> Array:
     return shifts
 
 
-LIMITS = (
+PHASE_LIMITS = (
     "joint velocity",
     "joint acceleration",
     "joint torque",
@@ -159,9 +159,9 @@ def phases(jobs: Sequence[DrawnJob], robots: Sequence[str]) -> Table:
 
     for found in jobs:
         if found.job is None:
-            rows.append((f"{found.label}: {found.problem}", *[NOTHING] * (4 + len(LIMITS))))
+            rows.append((f"{found.label}: {found.problem}", *[NOTHING] * (4 + len(PHASE_LIMITS))))
             continue
-        used = np.array([[phase.use[name] for name in LIMITS] for phase in found.job.phases])
+        used = np.array([[phase.use[name] for name in PHASE_LIMITS] for phase in found.job.phases])
         for phase, use in zip(found.job.phases, used, strict=True):
             name = f"{found.label}: {phase.name.replace('_', ' ')}"
             add(name, phase.begin, phase.duration, phase.force.normal.max(axis=0), use)
@@ -175,7 +175,7 @@ def phases(jobs: Sequence[DrawnJob], robots: Sequence[str]) -> Table:
             "begins [s]",
             "takes [s]",
             *(f"presses, {robot} [N]" for robot in robots),
-            *(f"{name} [%]" for name in LIMITS),
+            *(f"{name} [%]" for name in PHASE_LIMITS),
         ),
         tuple(rows),
         "Largest commanded normal forces, and largest uses of the limits with them. The "
@@ -185,10 +185,10 @@ def phases(jobs: Sequence[DrawnJob], robots: Sequence[str]) -> Table:
     )
 
 
-MAX_SAMPLES = 60
+PAGE_SAMPLES = 60
 """Samples of a trajectory on the page; its force peaks are kept besides."""
 
-DRIVEN = "as robots drive it"
+DRIVEN_TITLE = "as robots drive it"
 ASSUMED = "as the search assumed"
 WHOLE_JOB = "the whole job"
 
@@ -284,14 +284,14 @@ def page_trajectory(cells: Sequence[ReadyCell], shown: PageTrajectory) -> dict[s
     else:
         timing = time_path(driving.jobs.timing, path, limits)
     driven = timing.carry
-    motions = [] if driven is None else [_motion(DRIVEN, driven)]
+    motions = [] if driven is None else [_motion(DRIVEN_TITLE, driven)]
     if law != "optimal":
         motions.append(_motion(f"{ASSUMED}: {LAWS[law]}", judged))
     if not motions:
         motions.append(_motion(ASSUMED, judged))
     name, values = shown.source, judged.judgement.objectives
     if shown.recommended:
-        name = f"{RECOMMENDED} ({name})"
+        name = f"{RECOMMENDED_TITLE} ({name})"
     if not judged.judgement.feasible:
         name = f"{name} (infeasible)"
     figures = judged.figures.items()
@@ -372,4 +372,4 @@ def _samples(carry: ho.Carry) -> Array:
     peaks = np.concatenate([force.argmax(axis=0), force.argmin(axis=0), shift.argmax(axis=0)])
     time = carry.time - carry.time[0]
     table = np.column_stack([time, carry.pose, carry.q, force, shift])
-    return _once(table[_rows(time, MAX_SAMPLES, peaks)])
+    return _once(table[_rows(time, PAGE_SAMPLES, peaks)])

@@ -13,13 +13,14 @@ from typing import Any
 import numpy as np
 
 from hybrid_opt.campaign.stages import Cells, cells_of, ready_cells
+from hybrid_opt.display.objects import ARM_COLOURS
 from hybrid_opt.display.scene import packed, scene_data
 from hybrid_opt.workers import LocalWorkers, Workers
 from studies.report.data import Experiment, ReportData
-from studies.report.drawing import ARMS, MARKED, DrawnCarry, LineStyle
+from studies.report.drawing import MARKED, DrawnCarry, LineStyle
 from studies.report.page_carries import (
-    RECOMMENDED,
     RECOMMENDED_LABEL,
+    RECOMMENDED_TITLE,
     PageTrajectory,
     page_trajectory,
 )
@@ -30,13 +31,13 @@ from symbolic.records import Workcell
 
 Plot = dict[str, Any]
 
-MAX_CLOUD = 1500
+CLOUD_PER_ALGORITHM = 1500
 """Feasible candidates per algorithm in the background of the fronts."""
 
-ROOM = 0.06
+LOOK_MARGIN = 0.06
 """Margin beside the points that a look shows, as a share of their range."""
 
-LONGEST = 2.2
+SHOWN_SLOWDOWN = 2.2
 """Durations in the first look at time and force, over the shortest one."""
 
 HIGHEST = 1.3
@@ -86,7 +87,7 @@ def points(label: str, at: Array, members: Sequence[int], texts: Sequence[str], 
 
 def cloud(label: str, at: Array, look: LineStyle) -> Plot:
     """Feasible candidates (n, 2) in the background, thinned out."""
-    at = at[evenly(len(at), MAX_CLOUD)]
+    at = at[evenly(len(at), CLOUD_PER_ALGORITHM)]
     flat = [{"dtype": "f4", "bdata": packed(column, np.float32)} for column in at.T]
     style = {"color": look.colour, "symbol": SYMBOLS[look.marker], "size": 3, "opacity": 0.4}
     made = _scatter(f"{label}: feasible", at, mode="markers", hoverinfo="skip", marker=style)
@@ -144,7 +145,7 @@ def _legend(edge: str, place: float, size: int) -> Plot:
     return {**row, "font": {"size": size}}
 
 
-def limits(points: Array, share: float = ROOM) -> list[list[float]]:
+def limits(points: Array, share: float = LOOK_MARGIN) -> list[list[float]]:
     """Limits of both axes around points (k, 2), with this share of their range beside them."""
     points = _finite(points)
     if len(points) == 0:
@@ -174,7 +175,7 @@ def drive_look(points: Array, always: Array) -> Array:
     if len(points) == 0:
         return always
     force, duration = points.min(axis=0)
-    near = (points[:, 0] <= HIGHEST * force) & (points[:, 1] <= LONGEST * duration)
+    near = (points[:, 0] <= HIGHEST * force) & (points[:, 1] <= SHOWN_SLOWDOWN * duration)
     return np.concatenate([points[near], always])
 
 
@@ -198,7 +199,7 @@ def carry_plots(workcell: Workcell, rest: float | None) -> dict[str, Plot]:
             {
                 **curve,
                 "name": plain(robot.name),
-                "line": {"color": ARMS[i], "dash": DASHES[i], "width": 2},
+                "line": {"color": ARM_COLOURS[i], "dash": DASHES[i], "width": 2},
                 "meta": {"column": column + i, "scale": scale},
             }
             for i, robot in enumerate(workcell.robots)
@@ -215,7 +216,7 @@ def carry_plots(workcell: Workcell, rest: float | None) -> dict[str, Plot]:
             "type": "bar",
             "name": plain(f"{robot.name}{whose}"),
             "x": [f"joint {j + 1}" for j in range(joints[i])],
-            "marker": {"color": ARMS[i], "opacity": opacity},
+            "marker": {"color": ARM_COLOURS[i], "opacity": opacity},
             "meta": {"use": use, "arm": i},
         }
         for i, robot in enumerate(workcell.robots)
@@ -245,7 +246,7 @@ MAX_CELL_BYTES = 2_000_000
 
 
 @dataclass(frozen=True)
-class Group:
+class MeshGroup:
     """Trajectories that a page shows together.
 
     Attributes:
@@ -262,7 +263,7 @@ class Group:
     points: Array | None = None
 
 
-Numbered = tuple[Group, list[int]]
+Numbered = tuple[MeshGroup, list[int]]
 """A group and the numbers of its trajectories on the page."""
 
 
@@ -270,7 +271,7 @@ def page_document(data: ReportData, workers: Workers | None = None) -> dict[str,
     """Return the page's data as JSON values; without workers this process computes them."""
     # Where the cell itself is drivable there is one experiment.
     cells = [] if data.alone else [(data.files, data.objectives)]
-    drive, search = list[Group](), [] if data.alone else list(_search_groups(data))
+    drive, search = list[MeshGroup](), [] if data.alone else list(_search_groups(data))
     if data.drivable is not None:
         drive = list(_drive_groups(data, data.drivable, len(cells)))
         cells.append((data.drivable.files, data.drivable.objectives))
@@ -310,7 +311,7 @@ def _trajectory(cells: Cells, shown: PageTrajectory) -> dict[str, Any]:
     return page_trajectory(ready_cells(cells), shown)
 
 
-def _drive_groups(data: ReportData, drivable: Experiment, cell: int) -> Iterator[Group]:
+def _drive_groups(data: ReportData, drivable: Experiment, cell: int) -> Iterator[MeshGroup]:
     """The recommended carry, some of the paths' points at every force, and the fronts."""
     if data.recommended is not None:
         found = data.summary.recommendation
@@ -318,7 +319,7 @@ def _drive_groups(data: ReportData, drivable: Experiment, cell: int) -> Iterator
         shown = PageTrajectory(
             source, data.recommended, cell, recommended=True, job=data.job(RECOMMENDED_LABEL)
         )
-        yield Group(RECOMMENDED, (shown,), RECOMMENDED, CHOICE)
+        yield MeshGroup(RECOMMENDED_TITLE, (shown,), RECOMMENDED_TITLE, CHOICE)
     low, high = drivable.workcell.task.force_limit
     for carry, label, curve in curves(data):
         own, task = carry.timed.workcell.task, drivable.workcell.task
@@ -329,24 +330,24 @@ def _drive_groups(data: ReportData, drivable: Experiment, cell: int) -> Iterator
             for limit in force
             if low <= limit <= high
         )
-        yield Group(f"{label}, timed", some, f"{label}, timed", marker(carry.look, size=7))
+        yield MeshGroup(f"{label}, timed", some, f"{label}, timed", marker(carry.look, size=7))
     for look, front, opened in drivable.fronts():
         some = tuple(
             PageTrajectory(front.source, front.x[k], cell) for k in evenly(len(front), MAX_FRONT)
         )
-        yield Group(front.source, some, front.title, marker(look, opened))
+        yield MeshGroup(front.source, some, front.title, marker(look, opened))
 
 
-def _search_groups(data: ReportData) -> Iterator[Group]:
+def _search_groups(data: ReportData) -> Iterator[MeshGroup]:
     """Hand-made and selected trajectories, and the fronts of the first experiment."""
     picked = [PageTrajectory(c.source, c.x, job=data.job(c.label)) for c in data.carries]
-    yield Group("Hand-made and selected", tuple(picked))
+    yield MeshGroup("Hand-made and selected", tuple(picked))
     two = len(data.objectives) >= 2
     for style, front, opened in data.fronts():
         rows = evenly(len(front), MAX_FRONT)
         some = tuple(PageTrajectory(front.source, front.x[k], has_job=False) for k in rows)
         look = marker(style, opened) if two else None
-        yield Group(front.source, some, front.title, look, front.objectives[rows][:, :2])
+        yield MeshGroup(front.source, some, front.title, look, front.objectives[rows][:, :2])
 
 
 def curves(data: ReportData) -> Iterator[tuple[DrawnCarry, str, Array]]:
@@ -390,7 +391,7 @@ def _drive_view(
         lines.append(line(label, curve, carry.look.colour, dash))
         drawn.append(curve)
     # The recommended carry is drawn last, above all others.
-    shown = sorted(_traces(groups, found), key=lambda trace: trace["name"] == RECOMMENDED)
+    shown = sorted(_traces(groups, found), key=lambda trace: trace["name"] == RECOMMENDED_TITLE)
     timed = {f"{one['name']}, timed" for one in lines}
     chosen = np.zeros((0, 2))
     for trace in shown:
@@ -398,7 +399,7 @@ def _drive_view(
         trace["showlegend"] = trace["name"] not in timed
         # Carries that robots cannot drive have no place between force and time.
         drawn.append(at[[not found[member]["problem"] for member in trace["customdata"]]])
-        chosen = at if trace["name"] == RECOMMENDED else chosen
+        chosen = at if trace["name"] == RECOMMENDED_TITLE else chosen
     seen = drive_look(np.concatenate([*drawn, np.zeros((0, 2))]), chosen)
     kind = data.force_kind
     titles = (f"{kind.title} [N]", "duration [s]")

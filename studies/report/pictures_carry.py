@@ -15,7 +15,7 @@ from hybrid_opt.robust.force import RobustPrice
 from hybrid_opt.timing.robustness import KILOGRAM_FORCE
 from studies.report.data import ReportData
 from studies.report.drawing import (
-    HAND_MADE,
+    HAND_MADE_STYLE,
     MARKED,
     legend_below,
     limit_line,
@@ -122,7 +122,7 @@ def simulated_forces(data: ReportData) -> Figure:
     for found in data.simulations:
         # The hand-made trajectory looks as everywhere, the others by their order.
         own = found.label == data.initial.label
-        looks.append(HAND_MADE if own else series(number))
+        looks.append(HAND_MADE_STYLE if own else series(number))
         number += not own
     drawn = [(f, look) for f, look in zip(data.simulations, looks, strict=True) if len(f.time)]
 

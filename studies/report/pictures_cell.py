@@ -15,6 +15,7 @@ from matplotlib.patches import Patch
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from hybrid_opt.display.objects import ARM_COLOURS
 from hybrid_opt.display.solids import (
     Solid,
     cell_solids,
@@ -23,7 +24,6 @@ from hybrid_opt.display.solids import (
     motion_points,
 )
 from studies.report.drawing import (
-    ARMS,
     FRONT,
     ISOMETRIC,
     MARGIN,
@@ -57,10 +57,10 @@ SHARES = (0.0, 0.33, 0.66, 1.0)
 """Shares of a carry's duration, as in the paper's Figures 14 and 15."""
 
 
-STEP = 0.05
+CUBE_EDGE = 0.05
 """Edge of the cubes [m]: what a drawing of two metres shows."""
 
-POSTURES = 300_000
+REACH_POSTURES = 300_000
 """Random postures per arm; some ten per cube of the reach of an arm of 1.3 m."""
 
 
@@ -91,21 +91,21 @@ def reach_map(geometry: CellGeometry, rng: np.random.Generator) -> ReachMap:
     """
     clouds = [_pad_points(geometry, i, rng) for i in (0, 1)]
     both = np.concatenate(clouds)
-    lower = np.floor(both.min(axis=0) / STEP - 3.0) * STEP
-    shape = tuple(np.ceil((both.max(axis=0) - lower) / STEP).astype(int) + 4)
+    lower = np.floor(both.min(axis=0) / CUBE_EDGE - 3.0) * CUBE_EDGE
+    shape = tuple(np.ceil((both.max(axis=0) - lower) / CUBE_EDGE).astype(int) + 4)
     pads = []
     for cloud in clouds:
         reached = np.zeros(shape, dtype=bool)
-        index = ((cloud - lower) / STEP).astype(int)
+        index = ((cloud - lower) / CUBE_EDGE).astype(int)
         reached[index[:, 0], index[:, 1], index[:, 2]] = True
         pads.append(ndimage.binary_closing(reached, iterations=2))
     # The box's centre is where both pads, as far from it as they are, are reached.
-    offsets = [contact.T_box_pad[:3, 3] / STEP for contact in geometry.workcell.contacts]
+    offsets = [contact.T_box_pad[:3, 3] / CUBE_EDGE for contact in geometry.workcell.contacts]
     shifted = [
         ndimage.shift(reached, -np.round(offset), order=0)
         for reached, offset in zip(pads, offsets, strict=True)
     ]
-    return ReachMap(lower, STEP, (pads[0], pads[1]), shifted[0] & shifted[1])
+    return ReachMap(lower, CUBE_EDGE, (pads[0], pads[1]), shifted[0] & shifted[1])
 
 
 def _pad_points(geometry: CellGeometry, i: int, rng: np.random.Generator) -> NDArray[np.float32]:
@@ -115,10 +115,10 @@ def _pad_points(geometry: CellGeometry, i: int, rng: np.random.Generator) -> NDA
     # Single precision is far more than cubes need, and half the work.
     span = (arm.upper - arm.lower).astype(np.float32)
     q = arm.lower[:, None].astype(np.float32) + span[:, None] * rng.random(
-        (arm.joints, POSTURES), dtype=np.float32
+        (arm.joints, REACH_POSTURES), dtype=np.float32
     )
     # From the pad back to the root: points are a fifth of the work of placements.
-    points = np.tile(pad[:, None].astype(np.float32), POSTURES)
+    points = np.tile(pad[:, None].astype(np.float32), REACH_POSTURES)
     for j in reversed(range(arm.joints)):
         if arm.turning[j]:  # Rodrigues' formula about the joint's axis
             across = skew(arm.axes[j]).astype(np.float32)
@@ -167,7 +167,7 @@ def reachable_regions(geometry: CellGeometry, reach: ReachMap, carry: DrawnCarry
                 hatch=hatch,
                 label=f"pad of {name} reaches",
             )
-            for name, colour, hatch in zip(names, ARMS, HATCHES, strict=True)
+            for name, colour, hatch in zip(names, ARM_COLOURS, HATCHES, strict=True)
         ),
         Patch(facecolor="#2a8f4d", alpha=0.55, label="common region of the box centre"),
         Line2D([], [], color="#b00020", linewidth=0.9, label="bounds of the free waypoints"),
@@ -228,7 +228,7 @@ def arm_and_reach(geometry: CellGeometry, reach: ReachMap, carry: DrawnCarry) ->
     panel_label(left, "a", f"arm {shortened(robot.name)!r} at the start", bare=True)
     base = robot.T_world_base[:3, 3]
     index = int((base[0] - reach.lower[0]) / reach.step)
-    _draw_slice(right, FRONT, reach, 0, index, reach.pads[0], ARMS[0], HATCHES[0])
+    _draw_slice(right, FRONT, reach, 0, index, reach.pads[0], ARM_COLOURS[0], HATCHES[0])
     draw_cell(right, cell, FRONT, pose, q)
     bounds = _reach_bounds(reach)
     occupied = np.flatnonzero(reach.pads[0].any(axis=(0, 2)))
@@ -322,7 +322,7 @@ def _draw_reach(axes: Axes, reach: ReachMap, view: View, across: int, at: float)
     reach together, because their own regions would hide it."""
     index = int((at - reach.lower[across]) / reach.step)
     if across == 0:
-        for pads, colour, hatch in zip(reach.pads, ARMS, HATCHES, strict=True):
+        for pads, colour, hatch in zip(reach.pads, ARM_COLOURS, HATCHES, strict=True):
             _draw_slice(axes, view, reach, across, index, pads, colour, hatch)
     _draw_slice(axes, view, reach, across, index, reach.common, "#2a8f4d", "", 0.55)
 
@@ -364,7 +364,7 @@ def _draw_slice(
 OTHER_SIDE = oblique(np.deg2rad(28.0), np.deg2rad(26.0))
 """As `ISOMETRIC`, from behind."""
 
-NEAR = 0.25
+CLOSE_UP = 0.25
 """Half the width of what is shown near by [m]."""
 
 
@@ -381,7 +381,7 @@ def meeting(
     solids = cell_solids(geometry)
     whole = CutCell.of(geometry, solids, pair)
     place = meeting_place(geometry, solids, pair, pose, q)
-    near = box_corners(place - NEAR, place + NEAR)
+    near = box_corners(place - CLOSE_UP, place + CLOSE_UP)
     shown: tuple[tuple[str, View, Array], ...] = (
         ("the cell", ISOMETRIC, extent_points(geometry, solids, pose[None], q[None])),
         ("near by", ISOMETRIC, near),

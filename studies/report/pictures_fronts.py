@@ -19,7 +19,7 @@ from hybrid_opt.indicators.statistics import attainment_surfaces
 from studies.report.data import AlgorithmRuns, Experiment, ReportData
 from studies.report.drawing import (
     MARKED,
-    RECOMMENDED,
+    RECOMMENDED_STYLE,
     legend_below,
     new_figure,
     panel_label,
@@ -164,7 +164,7 @@ def _objectives(axes: Axes, data: ReportData) -> None:
 def _recommended(axes: Axes, data: ReportData) -> None:
     """The star of the recommended carry, where its objectives are those of the axes."""
     if (at := data.recommended_objectives) is not None:
-        axes.plot(*at, **RECOMMENDED.marks(9.0, MARKED), label="recommended, driven")
+        axes.plot(*at, **RECOMMENDED_STYLE.marks(9.0, MARKED), label="recommended, driven")
 
 
 def _zoom(axes: Axes, data: ReportData, sets: Sequence[Array]) -> None:
@@ -201,7 +201,7 @@ def duration_against_force(data: ReportData) -> Figure:
     always = np.zeros((0, 2))
     if choice is not None:
         always = np.array([[choice.force_limit, choice.duration]])
-        axes.plot(*always[0], **RECOMMENDED.marks(11.0, MARKED), label="recommended")
+        axes.plot(*always[0], **RECOMMENDED_STYLE.marks(11.0, MARKED), label="recommended")
     rest_line(axes, data.level_force, "at rest", across=False)
     if any(len(found) for found in drawn):
         x_limits, y_limits = limits(drive_look(np.concatenate(drawn), always))

@@ -133,7 +133,7 @@ class Score:
 
 
 @dataclass(frozen=True)
-class _Run:
+class _AlgorithmRun:
     hypervolume: float
     igd: float
     archive_hypervolume: float
@@ -147,12 +147,14 @@ def _indicators(target: AnalyticProblem, points: Evaluated) -> tuple[float, floa
     return metrics.hypervolume(front), metrics.igd(front, target.normalise(target.front))
 
 
-def _run(target: AnalyticProblem, name: str, evaluations: int, population: int, seed: int) -> _Run:
+def _run(
+    target: AnalyticProblem, name: str, evaluations: int, population: int, seed: int
+) -> _AlgorithmRun:
     algorithm = metaheuristics.make(name, sized(name, population))
     result = metaheuristics.search(target.problem, algorithm, evaluations, seed)
     # Judged anew from the decisions: an algorithm's word for feasibility is not enough.
     constraints = target.problem.evaluate(result.front.decisions, return_values_of=["G"])
-    return _Run(
+    return _AlgorithmRun(
         *_indicators(target, result.front),
         *_indicators(target, result.evaluated),
         1e6 * result.algorithm_seconds / evaluations,
@@ -167,7 +169,7 @@ def _band(problem: str, evaluations: int, algorithm: str, population: int) -> Ba
 
 
 def _score(
-    problem: str, evaluations: int, algorithm: str, population: int, runs: Sequence[_Run]
+    problem: str, evaluations: int, algorithm: str, population: int, runs: Sequence[_AlgorithmRun]
 ) -> Score:
     names = ("hypervolume", "igd", "archive_hypervolume", "archive_igd")
     found = {name: summarise([getattr(run, name) for run in runs]) for name in names}
@@ -235,7 +237,7 @@ def compare(
         for name in names
     ]
     scores: list[Score] = []
-    shifted: dict[str, list[_Run]] = {}
+    shifted: dict[str, list[_AlgorithmRun]] = {}
     start = time.perf_counter()
     for done, (target, budget, name, size) in enumerate(tasks, 1):
         runs = [_run(target, name, budget, size, seed) for seed in range(seeds)]
@@ -251,7 +253,7 @@ def compare(
     return AlgorithmTest(seeds, tuple(scores), _tests(shifted))
 
 
-def _tests(shifted: dict[str, list[_Run]]) -> tuple[RankTest, ...]:
+def _tests(shifted: dict[str, list[_AlgorithmRun]]) -> tuple[RankTest, ...]:
     tests = []
     for name in list(shifted)[1:]:
         first, others = next(iter(shifted)), shifted[name]

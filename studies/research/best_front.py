@@ -12,8 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
+from hybrid_opt.api import polish
 from hybrid_opt.campaign.stages import loaded_cell
-from hybrid_opt.door import polish
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.evaluate.objectives import PAPER_OBJECTIVES
@@ -34,10 +34,10 @@ from symbolic.records.task import initial_decision
 CANDIDATES = 4000
 """Random candidates among which starts are looked for."""
 
-ROUNDS = 14
+ROUNDS_PER_ATTEMPT = 14
 """Rounds of one attempt, more than in a study."""
 
-ATTEMPTS = 7
+ATTEMPTS_PER_START = 7
 """Attempts from each start: the point itself, then both ends and the middle, twice."""
 
 
@@ -86,7 +86,9 @@ def compute_reference_front(
     begins = [initial_decision(evaluator.workcell.task), *candidates[feasible[:starts]]]
     cell = collect_cell(evaluator.workcell)
     count = itertools.count(1)
-    first = PolishSettings(attempts=ATTEMPTS, rounds=ROUNDS, fill=FillSettings(attempts=0))
+    first = PolishSettings(
+        attempts=ATTEMPTS_PER_START, rounds=ROUNDS_PER_ATTEMPT, fill=FillSettings(attempts=0)
+    )
     with LocalWorkers(jobs) as workers:
         parts = workers.map(
             partial(_polished, cell, first),
@@ -94,7 +96,9 @@ def compute_reference_front(
             lambda *_: tell(f"start {next(count)} of {len(begins)}"),
         )
     union = np.concatenate([part.x for part in parts])
-    front = _polished(cell, PolishSettings(attempts=attempts, rounds=ROUNDS), (union, rng))
+    front = _polished(
+        cell, PolishSettings(attempts=attempts, rounds=ROUNDS_PER_ATTEMPT), (union, rng)
+    )
     tell(f"reference front: {len(front.x)} points")
     return ReferenceFront(evaluator.workcell.digest, front.objectives, front.x)
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 from studies.options import INPUT_FILE, add
 from studies.program import Parser, Program
 
-LONG = 20_000
+LONG_SEARCH = 20_000
 """Evaluations of the far longer search."""
 
 
@@ -24,7 +24,7 @@ def _add_options(parser: Parser) -> None:
         type=int,
         default=[],
         metavar="N",
-        help=f"budgets of the longer searches (default: that of equal time, and {LONG})",
+        help=f"budgets of the longer searches (default: that of equal time, and {LONG_SEARCH})",
     )
     add(parser, "--jobs")
     parser.add_argument(

@@ -26,10 +26,10 @@ import numpy as np
 
 from codegen.build import compile_function
 from codegen.interpreted import InterpretedFunction
+from hybrid_opt.api import polish, search, time_path
 from hybrid_opt.cell import Cell
 from hybrid_opt.compiled_cell import CompiledCell
 from hybrid_opt.display.table import number, text_table
-from hybrid_opt.door import polish, search, time_path
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.front import Front
 from hybrid_opt.polishing.settings import PolishSettings
@@ -48,7 +48,7 @@ from symbolic.functions import candidate_function
 from symbolic.read.cell import load
 from symbolic.records import Task, Waypoint, Workcell
 
-SAMPLES = (25, 50, 100, 200, 400)
+SAMPLE_COUNTS = (25, 50, 100, 200, 400)
 WAYPOINTS = (1, 2, 3, 4, 5, 6, 7, 8)
 
 
@@ -125,15 +125,15 @@ def benchmark(
 def _scaling(model: CellModel, candidates: int, repeats: int, seed: int) -> dict[str, Any]:
     """Compiled cost against the numbers of samples and of free waypoints."""
     task = model.workcell.task
-    by_samples = {n: replace(task, samples=n) for n in SAMPLES}
+    by_samples = {n: replace(task, samples=n) for n in SAMPLE_COUNTS}
     by_waypoints = {n: with_free_waypoints(task, n) for n in WAYPOINTS}
     samples = _costs(model, by_samples, candidates, repeats, seed, "samples")
     waypoints = _costs(model, by_waypoints, candidates, repeats, seed, "free waypoints")
     # The line goes through costs relative to the middle one, which turns taken make comparable;
     # relative weights let 25 samples count as much as 400.
-    middle = SAMPLES[len(SAMPLES) // 2]
-    n = np.array(SAMPLES)
-    relative = np.array([np.median(samples[k] / samples[middle]) for k in SAMPLES])
+    middle = SAMPLE_COUNTS[len(SAMPLE_COUNTS) // 2]
+    n = np.array(SAMPLE_COUNTS)
+    relative = np.array([np.median(samples[k] / samples[middle]) for k in SAMPLE_COUNTS])
     slope, offset = np.polyfit(n, relative, 1, w=1.0 / relative)
     unit = 1e3 * float(np.median(samples[middle]))
     deviation = np.abs((slope * n + offset) / relative - 1.0).max()
@@ -269,9 +269,9 @@ def _shares(figures: Mapping[str, Any]) -> str:
     return f"feasible {100 * figures['feasible_share']:.0f} %; compiled time: {parts}"
 
 
-EVALUATIONS = 1000
+COSTED_EVALUATIONS = 1000
 POLISH_ATTEMPTS = 4
-LEAST_SHARE = 0.02
+LEAST_LISTED_SHARE = 0.02
 """Parts below this share of their stage are summed up as 'other'."""
 
 _ROOT = Path(__file__).resolve().parents[1]
@@ -297,7 +297,7 @@ def profile_study(workcell: Workcell, seed: int) -> tuple[StageTime, ...]:
 
     def searching() -> None:
         fronts.append(
-            search(cell, "nsga2", evaluations=EVALUATIONS, rng=np.random.default_rng(seed))
+            search(cell, "nsga2", evaluations=COSTED_EVALUATIONS, rng=np.random.default_rng(seed))
         )
 
     def polishing() -> None:
@@ -305,7 +305,7 @@ def profile_study(workcell: Workcell, seed: int) -> tuple[StageTime, ...]:
         fronts.append(polish(fronts[0], rng=np.random.default_rng(seed), settings=settings))
 
     stages: dict[str, Callable[[], object]] = {
-        f"search ({EVALUATIONS} evaluations, certified)": searching,
+        f"search ({COSTED_EVALUATIONS} evaluations, certified)": searching,
         f"polish ({POLISH_ATTEMPTS} attempts)": polishing,
         "timing (one carry)": lambda: time_path(cell, fronts[0].balanced()),
     }
@@ -325,7 +325,7 @@ def _timed(name: str, run: Callable[[], object]) -> StageTime:
         part = _part("", code) if isinstance(code, str) else _part(code.co_filename, "")
         parts[part] += entry.inlinetime
     total = sum(parts.values())
-    small = {part for part, value in parts.items() if value < LEAST_SHARE * total}
+    small = {part for part, value in parts.items() if value < LEAST_LISTED_SHARE * total}
     kept = {part: value for part, value in parts.items() if part not in small}
     kept["other"] = sum(parts[part] for part in small)
     return StageTime(name, seconds, dict(sorted(kept.items(), key=lambda item: -item[1])))

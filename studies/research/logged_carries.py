@@ -5,9 +5,9 @@ press boxes between them, one file per run (controller QP, 50 Hz) or per arm (PI
 feed-forward, 100 Hz). They tell the pose of each tool, the force on it, and the box's pose by
 markers. They tell neither moments nor friction, patches, sizes or centres of mass.
 
-What is assumed, of all runs: friction within `FRICTION`, round patches of `PATCH`, the centre of
-mass in the middle between the pads, crosstalk of `CROSSTALK`, an empty box of `EMPTY` where no
-mass is stated. The squeeze is the mean of both normal forces: the box hands one on to the other,
+Assumptions about all runs: friction within `STATED_FRICTION`, round patches of `PATCH`, the centre
+of mass in the middle between the pads, crosstalk of `CROSSTALK`, an empty box of `EMPTY` if no mass
+is stated. The squeeze is the mean of both normal forces: the box hands one on to the other,
 which both sensors tell to 20 N only.
 """
 
@@ -29,7 +29,7 @@ from hybrid_opt.calibrating.recording import (
     ArmLog,
     Labels,
     Places,
-    Run,
+    Recording,
     lost_spans,
     tared,
     together,
@@ -40,11 +40,11 @@ from symbolic.contact.soft_finger import SoftPatch, least_soft_squeeze
 from symbolic.errors import SettingsError
 from symbolic.records.quantities import GRAVITY
 
-HOW = """\
+DOWNLOAD_COMMAND = """\
 git clone https://github.com/adamweinhardt/dual-arm-manipulation FOLDER
 git -C FOLDER checkout 6699139"""
 
-FRICTION = (0.57, 0.60)
+STATED_FRICTION = (0.57, 0.60)
 """The stated bracket, from slips in these logs."""
 
 PATCH = 0.03
@@ -98,7 +98,7 @@ LIFTED = 0.015
 
 
 @dataclass(frozen=True)
-class Carry:
+class LoggedCarry:
     """A logged run in the frames of its pads.
 
     Attributes:
@@ -108,7 +108,7 @@ class Carry:
         stated: whether the mass is stated.
     """
 
-    run: Run
+    run: Recording
     places: Places
     stated: bool
 
@@ -130,11 +130,11 @@ def labelled(folder: Path) -> list[Path]:
     found = [path for pattern in LABELLED for path in (folder / "experiments").glob(pattern)]
     runs = sorted(path for path in found if path.suffix == ".npz" and path.stem[-2:] != "_R")
     if not runs:
-        raise SettingsError(f"no logs in {folder}; get them by\n{HOW}")
+        raise SettingsError(f"no logs in {folder}; get them by\n{DOWNLOAD_COMMAND}")
     return runs
 
 
-def read(path: Path) -> Carry:
+def read(path: Path) -> LoggedCarry:
     """A run, from its file or from that of the left arm."""
     stamp = re.search(r"\d{8}-\d{6}", path.stem)
     mass = re.search(r"_([\d.]+)kg", path.stem)
@@ -162,7 +162,7 @@ def read(path: Path) -> Carry:
     wrench = median_filter(wrench, (GLITCH, 1, 1))
     places, _ = tared(run, Places(pads, box, wrench))
     free = without_crosstalk(places.wrench, np.array([[0.0, CROSSTALK]] * 2))
-    return Carry(run, Places(pads, box, free), mass is not None)
+    return LoggedCarry(run, Places(pads, box, free), mass is not None)
 
 
 class _Poses:
@@ -254,7 +254,7 @@ class Comparison:
     Attributes:
         time: (n,) [s].
         squeeze: (n,) mean of both normal forces [N].
-        need: (n, 2) the motion asks for, by either end of `FRICTION` [N].
+        need: (n, 2) the motion asks for, by either end of `STATED_FRICTION` [N].
         used: (n,) tangential over normal forces, as they were measured: the arms work against one
             another along the faces, too.
         slid: (n,) how far the box is below where it was between the pads, by the markers [m]; not
@@ -275,7 +275,7 @@ class Comparison:
         return np.asarray(self.squeeze / self.need[:, 0])
 
 
-def compared(carry: Carry) -> Comparison:
+def compared(carry: LoggedCarry) -> Comparison:
     """What the model asks for in a carry."""
     run, places = carry.run, carry.places
     time = np.arange(run.time[0], run.time[-1], STEP)
@@ -296,7 +296,7 @@ def compared(carry: Carry) -> Comparison:
     moment = inertia * turned.inv().apply(faster)
     needs = [
         np.asarray(_need()(force.T, moment.T, half[None], friction)).ravel()
-        for friction in FRICTION
+        for friction in STATED_FRICTION
     ]
     wrench = interpolated(time, run.time, places.wrench[:, :, :3])
     squeeze = -wrench[:, :, 2].mean(axis=1)

@@ -27,7 +27,7 @@ from hybrid_opt.metaheuristics.registry import title
 from hybrid_opt.progress import Progress
 from hybrid_opt.store.files import to_json
 from studies.research.best_front import ReferenceFront, read_reference_front
-from studies.research.control import LONG
+from studies.research.control import LONG_SEARCH
 from studies.study.summary import CampaignSummary, read_summary
 
 
@@ -58,14 +58,17 @@ def controls(
     root: Path, evaluations: Sequence[int], jobs: int, progress: Progress
 ) -> list[LongerSearch]:
     """Run longer searches of a polished study, in `ROOT/control/EVALUATIONS`, and compare; without
-    budgets, with that of equal time and `LONG`.
+    budgets, with that of equal time and `LONG_SEARCH`.
 
     Raises:
         ResultsError: the study is not complete, or was not polished.
     """
     study, summary = read_campaign(root), read_summary(root)
     settings = study.settings
-    budgets = tuple(evaluations) or (settings.evaluations + _polish_cost(root, summary), LONG)
+    budgets = tuple(evaluations) or (
+        settings.evaluations + _polish_cost(root, summary),
+        LONG_SEARCH,
+    )
     found = []
     for budget in budgets:
         longer = _search(study, replace(settings, evaluations=budget), root, jobs, progress)
@@ -125,7 +128,7 @@ def _compare(
 
 
 @dataclass(frozen=True)
-class Gap:
+class PolishGap:
     """Distance of one algorithm's fronts from a reference front, medians over the replicas.
 
     Attributes:
@@ -143,7 +146,7 @@ class Gap:
     closed: float
 
 
-def approaches(root: Path, reference: ReferenceFront) -> list[Gap]:
+def approaches(root: Path, reference: ReferenceFront) -> list[PolishGap]:
     """The distances of a polished study's fronts to a reference front.
 
     Raises:
@@ -168,11 +171,11 @@ def approaches(root: Path, reference: ReferenceFront) -> list[Gap]:
         before, after = (float(np.median(best - np.array(each))) for each in volumes)
         closed = 100.0 * (1.0 - after / before) if before else math.nan
         far, near = (float(np.median(each)) for each in igds)
-        found.append(Gap(name, before, after, far, near, closed))
+        found.append(PolishGap(name, before, after, far, near, closed))
     return found
 
 
-def approaches_text(found: Sequence[Gap]) -> str:
+def approaches_text(found: Sequence[PolishGap]) -> str:
     """The distances as a table."""
     head = ["medians over the replicas", "HV gap", "polished", "closed %", "IGD", "polished"]
     rows = [
@@ -211,7 +214,7 @@ def as_text(found: Sequence[LongerSearch]) -> str:
 
 def control(options: argparse.Namespace) -> int:
     """Hold the study of the options against longer searches; returns the exit code."""
-    found: Sequence[LongerSearch | Gap]
+    found: Sequence[LongerSearch | PolishGap]
     if options.reference is not None:
         found = near = approaches(options.results, read_reference_front(options.reference))
         text = approaches_text(near)

@@ -27,7 +27,7 @@ def _run(options: argparse.Namespace) -> int:
     from studies.research import logged_carries
 
     if options.folder is None:
-        print(f"get the logs, then name FOLDER by --folder\n{logged_carries.HOW}")
+        print(f"get the logs, then name FOLDER by --folder\n{logged_carries.DOWNLOAD_COMMAND}")
         return 0
     table = logged_carries.table(options.folder)
     print(table.markdown() if options.markdown else table.text())

@@ -11,20 +11,20 @@ from pathlib import Path
 
 import numpy as np
 
+from hybrid_opt.api import search
 from hybrid_opt.carry import Carry
 from hybrid_opt.cell import Cell
-from hybrid_opt.door import search
-from hybrid_opt.errors import WitnessError
+from hybrid_opt.errors import SimulationError
+from hybrid_opt.simulation.box import BoxSimulation, Outcome, bisected, drive_of
+from hybrid_opt.simulation.scene import SimulationSettings
 from hybrid_opt.store.files import read_record, to_json, write_json
 from hybrid_opt.timing.solve import time_path
-from hybrid_opt.witness.box import Outcome, Witness, bisected, drive_of
-from hybrid_opt.witness.scene import SimulationSettings
 from symbolic.array import Array, Figure
 from symbolic.records import Workcell
 
 WORKCELLS = Path(__file__).parents[1] / "workcells"
 
-KINDS = ("hand-made", "fastest", "random", "middle", "random", "gentlest")
+CANDIDATE_KINDS = ("hand-made", "fastest", "random", "middle", "random", "gentlest")
 """Candidates of a cell, in turn; all but the hand-made and the random ones of a short search."""
 
 FRICTIONS, SHARES = (1.0, 0.6, 0.3), (1.0, 0.9, 0.8)
@@ -34,7 +34,7 @@ of the cell's own."""
 SEARCHED = 500
 """Evaluations of the search whose front members are simulated."""
 
-DRAWN = 100
+DRAWN_CANDIDATES = 100
 """Random candidates among which a feasible one is looked for at a time."""
 
 LOW, HIGH, BISECTIONS = 0.97, 1.03, 4
@@ -121,7 +121,7 @@ def thresholds(options: argparse.Namespace) -> int:
     if path.exists():
         done = read_record(Slips, path, "delete it to begin anew")
         if (done.seed, done.layer) != (options.seed, options.layer):
-            raise WitnessError(
+            raise SimulationError(
                 f"{path} was begun with seed {done.seed} and layer {done.layer:g}; give these or "
                 "a new file"
             )
@@ -170,20 +170,20 @@ def slip_of(
     needed, settings = carry.normal_force[:, 1], SimulationSettings(layer=layer)
     if not carry.workcell.has_opposite_pads:
         settings = replace(settings, points=FINE_POINTS)
-    witness, drive = Witness(carry.workcell, settings), drive_of(carry, settings)
+    witness, drive = BoxSimulation(carry.workcell, settings), drive_of(carry, settings)
     simulate = partial(witness.simulate, drive)
     factor = begins = float("nan")
     try:
         try:
             factor = bisected(simulate, LOW, HIGH, BISECTIONS).factor
-        except WitnessError:
+        except SimulationError:
             factor = bisected(simulate, *WIDER, MORE_BISECTIONS).factor
         steady = replace(drive, press=np.full(len(drive.time), needed.max()))
         lacks, held = (
             witness.simulate(steady, share * factor) for share in (PRESSED_SHARE, HOLDING_SHARE)
         )
         begins = first_slip(lacks, held)
-    except WitnessError:
+    except SimulationError:
         pass  # stays without a number
     return Slip(
         cell=name,
@@ -227,14 +227,14 @@ class _Source:
 
     def case(self, k: int) -> tuple[str, str, Carry]:
         """Cell, candidate, and the carry with the forces planned for its friction."""
-        cell, kind = self._cell, KINDS[k % len(KINDS)]
+        cell, kind = self._cell, CANDIDATE_KINDS[k % len(CANDIDATE_KINDS)]
         model = cell.timing_model
         while True:
             x = self._candidate(kind, k)
             timing = time_path(model, x, model.drive_limits(float(x[-1])))
             if timing.ok and timing.carry is not None:
                 break
-            kind, k = "random", k + len(KINDS) * 10**6
+            kind, k = "random", k + len(CANDIDATE_KINDS) * 10**6
         payload, contacts = cell.workcell.payload, cell.workcell.contacts
         opposite, own = cell.workcell.has_opposite_pads, contacts[0].friction
         known = FRICTIONS if opposite else tuple(share * own for share in SHARES)
@@ -259,7 +259,7 @@ class _Source:
     def _random(self, rng: np.random.Generator) -> Array:
         cell = self._cell
         while True:
-            x = cell.random(DRAWN, rng)
+            x = cell.random(DRAWN_CANDIDATES, rng)
             feasible = np.flatnonzero(cell.evaluate(x).feasible)
             if len(feasible):
                 return np.asarray(x[feasible[0]])

@@ -86,7 +86,7 @@ def progress(text: str) -> None:
     print(text, file=sys.stderr, flush=True)
 
 
-ROUNDS = 2_000_000
+CLOCK_ROUNDS = 2_000_000
 BEST_OF = 5
 
 RARE = frozenset({"closer", "again", "held"})
@@ -124,9 +124,9 @@ def peak_operations() -> float | None:
     times = []
     for _ in range(BEST_OF):
         start = time.thread_time()
-        loop(ROUNDS)
+        loop(CLOCK_ROUNDS)
         times.append(time.thread_time() - start)
-    return 16.0 * ROUNDS * int(library.dual_arm_lanes()) / min(times)
+    return 16.0 * CLOCK_ROUNDS * int(library.dual_arm_lanes()) / min(times)
 
 
 def candidate_operations(model: CellModel) -> int:
@@ -139,13 +139,13 @@ def candidate_operations(model: CellModel) -> int:
     return operations(functions["path"]) + model.workcell.task.samples * each
 
 
-EVALUATIONS = 1000
+TIMED_EVALUATIONS = 1000
 """Evaluations of the NSGA-II search whose candidates are timed."""
 
 POPULATION = GeneticSettings().population
 """Candidates per batch."""
 
-SHARED = 5
+SHARE_BATCHES = 5
 """Most batches on which the shares of the time are measured."""
 
 
@@ -167,10 +167,10 @@ def with_collisions(
         The figures of the search's candidates and, as 'random', those of uniform candidates.
     """
     rng = np.random.default_rng(seed)
-    progress(f"a search of {EVALUATIONS} evaluations, whose candidates are to be timed")
+    progress(f"a search of {TIMED_EVALUATIONS} evaluations, whose candidates are to be timed")
     evaluator = CandidateEvaluator(workcell)
     problem = CarryProblem(evaluator)
-    search(problem, make("nsga2"), EVALUATIONS, rng)
+    search(problem, make("nsga2"), TIMED_EVALUATIONS, rng)
     searched = rng.choice(problem.evaluations.x, (candidates, POPULATION))
     size = (candidates, POPULATION, evaluator.n_var)
     uniform = rng.uniform(evaluator.lower, evaluator.upper, size)
@@ -198,14 +198,14 @@ def with_collisions(
             {
                 **averages,
                 "feasible_share": float(verdicts.feasible.mean()),
-                "shares": shares(evaluator, batches[:SHARED], repeats),
+                "shares": shares(evaluator, batches[:SHARE_BATCHES], repeats),
             }
         )
     ours, random = figures
     per_second = candidate_operations(evaluator.compiled.model) / (1e-3 * ours["compiled_ms"])
     ours["operations_per_second"] = per_second
     ours["share_of_peak"] = per_second / peak if peak else None
-    return {"evaluations": EVALUATIONS, "population": POPULATION, **ours, "random": random}
+    return {"evaluations": TIMED_EVALUATIONS, "population": POPULATION, **ours, "random": random}
 
 
 def shares(evaluator: CandidateEvaluator, batches: Array, repeats: int) -> dict[str, float]:

@@ -19,7 +19,7 @@ from hybrid_opt.campaign.settings import (
     DRIVABLE,
     NO_RECOMMENDATION,
     RECOMMENDATION,
-    RECOMMENDED,
+    RECOMMENDED_FILE,
     STAGES,
 )
 from hybrid_opt.errors import NoCarryError
@@ -170,7 +170,7 @@ def recommendation_stage(wish: ho.Wish) -> Stage:
     def run(folder: CampaignFolder, progress: Progress) -> None:
         found: StoredRecommendation | NoRecommendation
         try:
-            path, threads = folder.root / RECOMMENDED, folder.execution.jobs
+            path, threads = folder.root / RECOMMENDED_FILE, folder.execution.jobs
             found = recommend_from(folder.root, wish, path, progress, threads)
         except NoCarryError as error:
             found = NoRecommendation(str(error))
@@ -455,7 +455,7 @@ def _margins(found: StoredRecommendation) -> list[str]:
     return texts
 
 
-LEAST_FORCE = "least-force"
+LEAST_FORCE_PATH = "least-force"
 """The path that the other experiment ends with, beside which the recommended carry stands."""
 
 
@@ -482,7 +482,7 @@ def least_force(campaign: CampaignResults, task: Task) -> dict[str, Array]:
     if chosen is None:
         return {}
     own = campaign.workcell.task
-    return {LEAST_FORCE: resample_decisions(chosen.carry.x[: own.n_path], own, task)[0]}
+    return {LEAST_FORCE_PATH: resample_decisions(chosen.carry.x[: own.n_path], own, task)[0]}
 
 
 def is_drivable(workcell: Workcell, objectives: Sequence[str]) -> bool:

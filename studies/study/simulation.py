@@ -15,7 +15,7 @@ import numpy as np
 from hybrid_opt.campaign import CampaignFolder, Stage
 from hybrid_opt.campaign.settings import (
     POLISHED_SUFFIX,
-    RECOMMENDED,
+    RECOMMENDED_FILE,
     SELECTED,
     SIMULATED,
     UNION,
@@ -23,9 +23,11 @@ from hybrid_opt.campaign.settings import (
 )
 from hybrid_opt.campaign.stages import Cells, cells_of, ready_cells
 from hybrid_opt.display.table import Table, number
-from hybrid_opt.errors import ResultsError, WitnessError
+from hybrid_opt.errors import ResultsError, SimulationError
 from hybrid_opt.metaheuristics.registry import title
 from hybrid_opt.progress import Progress
+from hybrid_opt.simulation.arms import Account, CellSimulation, account_of
+from hybrid_opt.simulation.reference import Control, driven_carry
 from hybrid_opt.store.files import read_bytes, read_record, sha256, to_json, write_json
 from hybrid_opt.store.trajectory_file import StoredTrajectory, read_trajectory
 from hybrid_opt.timing.analysis import (
@@ -35,8 +37,6 @@ from hybrid_opt.timing.analysis import (
     timing_document,
 )
 from hybrid_opt.timing.records import TimingStatus
-from hybrid_opt.witness.arms import Account, CellWitness, account_of
-from hybrid_opt.witness.reference import Control, driven_carry
 from studies.study.recommendation import StoredRecommendation
 from studies.study.summary import read_summary
 from symbolic.array import Array, Figure, Row, Shape, evenly
@@ -216,7 +216,7 @@ def wanted_carries(root: Path) -> list[SimulationRequest]:
         f"{places.index(name)}-{name or 'hand-made'}": (file_label(file), root / SELECTED / file)
         for name, file in shown.items()
     }
-    files["9-recommended"] = ("recommended", root / RECOMMENDED)
+    files["9-recommended"] = ("recommended", root / RECOMMENDED_FILE)
     return [
         SimulationRequest(name, label, read_trajectory(path), sha256(read_bytes(path)))
         for name, (label, path) in files.items()
@@ -230,8 +230,8 @@ def _simulated(one: SimulationRequest) -> StoredSimulation:
         cell = one.trajectory.open_cell(Path(folder))
         try:
             carry = driven_carry(cell, one.trajectory.x)
-            found = account_of(cell, carry, CellWitness(cell.workcell), CONTROL)
-        except (WitnessError, SettingsError) as error:
+            found = account_of(cell, carry, CellSimulation(cell.workcell), CONTROL)
+        except (SimulationError, SettingsError) as error:
             return StoredSimulation(*whose, problem=str(error))
         return stored_simulation(found, *whose)
 

@@ -17,7 +17,7 @@ from hybrid_opt.campaign import CampaignFolder, Stage
 from hybrid_opt.campaign.results import CampaignResults, Replica, read_campaign, read_configuration
 from hybrid_opt.campaign.settings import (
     FRONTS,
-    HAND_MADE,
+    HAND_MADE_FILE,
     SELECTED,
     STAGES,
     SUMMARY,
@@ -193,7 +193,7 @@ class StoredFront:
 
 
 @dataclass(frozen=True)
-class Bounds:
+class NormalisationBounds:
     """Bounds of the decision variables on which members of the best fronts lie.
 
     Attributes:
@@ -231,7 +231,7 @@ class CampaignSummary:
     tests: tuple[RankTest, ...]
     hand_made: SelectedEntry | None = None
     union: PolishedFigures | None = None
-    bounds: Bounds = Bounds(0, ())
+    bounds: NormalisationBounds = NormalisationBounds(0, ())
     recommendation: StoredRecommendation | None = None
     no_recommendation: str = ""
 
@@ -258,7 +258,7 @@ class CampaignSummary:
             for name, entry in self.algorithms.items()
             if entry.representative is not None
         }
-        files = {"": Path(HAND_MADE)}
+        files = {"": Path(HAND_MADE_FILE)}
         for name, found in best.items():
             polished = found.polished is not None and found.polished.selected is not None
             file_of = polished_selected_file if polished else selected_file
@@ -292,10 +292,10 @@ def read_summary(root: str | Path) -> CampaignSummary:
 _OF_FRONT = ("non_dominated", "hypervolume", "igd", "igd_plus", "spacing")
 _OF_CARRY = ("mean_excess_above_static", "payload_limit")
 
-FIGURES = ("feasible", "feasible_share", *_OF_FRONT, "seconds", *_OF_CARRY)
+SUMMARISED_FIGURES = ("feasible", "feasible_share", *_OF_FRONT, "seconds", *_OF_CARRY)
 """Figures of a replica that are summarised over the replicas."""
 
-TESTED = tuple(name for name in FIGURES if name not in ("feasible", "seconds"))
+TESTED = tuple(name for name in SUMMARISED_FIGURES if name not in ("feasible", "seconds"))
 """Figures that the algorithms are compared by; the count says the same as its share."""
 
 POLISHED_FIGURES = (*_OF_FRONT, "seconds", "equivalent_evaluations", "widest_gap", *_OF_CARRY)
@@ -415,7 +415,9 @@ def _algorithm_figures(rows: Sequence[ReplicaFigures]) -> AlgorithmFigures:
         known = statistics(after, POLISHED_FIGURES)
         polished = PolishedStatistics(known, summarise(gains), better)
     representative = None if best.selected is None else best.replica
-    return AlgorithmFigures(representative, statistics(rows, FIGURES), tuple(rows), polished)
+    return AlgorithmFigures(
+        representative, statistics(rows, SUMMARISED_FIGURES), tuple(rows), polished
+    )
 
 
 def _tests(entries: Mapping[str, Sequence[ReplicaFigures]]) -> tuple[RankTest, ...]:
@@ -492,7 +494,7 @@ def _run(folder: CampaignFolder, progress: Progress, not_asked: str) -> None:
         campaign_summary(results, reference, folder.cell.static_hold, entries),
         hand_made=hand_made,
         union=None if union is None else _polished_figures(folder, union, reference),
-        bounds=Bounds(len(members), binding_bounds(folder.workcell.task, members)),
+        bounds=NormalisationBounds(len(members), binding_bounds(folder.workcell.task, members)),
         recommendation=None if isinstance(choice, NoRecommendation) else choice,
         no_recommendation=reason if choice else not_asked,
     )
@@ -514,7 +516,7 @@ def _store_hand_made(folder: CampaignFolder) -> SelectedEntry | None:
     figures, None where it has not all of them."""
     carry = folder.cell.carry(folder.cell.initial)
     source = {"source": "the workcell file's initial trajectory"}
-    file = _store(folder, folder.root / SELECTED / HAND_MADE, carry, source)
+    file = _store(folder, folder.root / SELECTED / HAND_MADE_FILE, carry, source)
     entry = carry_entry(carry, 0, file)
     numbers = [entry.objectives, entry.peak_normal_force, entry.minimum_normal_force]
     every = np.concatenate([*numbers, [entry.payload_limit, entry.duration]])

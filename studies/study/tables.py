@@ -22,21 +22,21 @@ from studies.study.recommendation import StoredRecommendation
 from studies.study.simulation import StoredSimulation
 from studies.study.summary import (
     AlgorithmFigures,
-    Bounds,
     CampaignSummary,
     FrontFigures,
+    NormalisationBounds,
     SelectedEntry,
 )
 
-FORCE = Quantity("normal force", "N")
-DURATION = Quantity("duration", "s")
+FORCE_QUANTITY = Quantity("normal force", "N")
+DURATION_QUANTITY = Quantity("duration", "s")
 FINE_DURATION = Quantity("duration", "s", 3)
-PAYLOAD = Quantity("payload at the limit", "kg")
+PAYLOAD_QUANTITY = Quantity("payload at the limit", "kg")
 ABOVE_REST = Quantity("above rest", "%")
-TORQUE = Quantity("joint torque", "%", 1, 100.0)
-SHIFT = Quantity("pressure shift", "mm", 1, 1e3)
+TORQUE_QUANTITY = Quantity("joint torque", "%", 1, 100.0)
+SHIFT_QUANTITY = Quantity("pressure shift", "mm", 1, 1e3)
 
-QUANTITIES = {
+REPLICA_QUANTITIES = {
     "feasible": Quantity("feasible", digits=0),
     "feasible_share": Quantity("feasible", "%", 1, 100.0),
     "non_dominated": Quantity("non-dominated", digits=1),
@@ -45,7 +45,7 @@ QUANTITIES = {
     "igd_plus": Quantity("IGD+", digits=5),
     "spacing": Quantity("spacing", digits=5),
     "mean_excess_above_static": ABOVE_REST,
-    "payload_limit": PAYLOAD,
+    "payload_limit": PAYLOAD_QUANTITY,
     "seconds": Quantity("computing time", "s"),
     "widest_gap": Quantity("widest gap", "%", 0, 100.0),
     "equivalent_evaluations": Quantity("evaluations as long", digits=0),
@@ -117,7 +117,7 @@ def quality(
     return Table(
         name,
         heading,
-        ("algorithm", *(QUANTITIES[key].heading() for key in _QUALITY)),
+        ("algorithm", *(REPLICA_QUANTITIES[key].heading() for key in _QUALITY)),
         tuple(rows),
         f"Mean ± standard deviation of {counted(settings.replicas, 'replica')} of "
         f"{settings.evaluations} evaluations. Hypervolume: reference 1.1 in every objective. "
@@ -147,7 +147,7 @@ def _over_replicas(figures: Sequence[FrontFigures], key: str, mean: bool = False
     only searched or only polished replicas have."""
     if not hasattr(figures[0], key):
         return NOTHING
-    found, quantity = summarise([getattr(row, key) for row in figures]), QUANTITIES[key]
+    found, quantity = summarise([getattr(row, key) for row in figures]), REPLICA_QUANTITIES[key]
     if mean:
         return quantity.mean(found.mean, found.std)
     return quantity.spread(found.median, found.quartile1, found.quartile3)
@@ -191,7 +191,7 @@ def selected(summary: CampaignSummary, with_paper: bool) -> Table:
         (
             "trajectory",
             *(f"{which}, {robot} [N]" for which in ("least", "peak") for robot in summary.robots),
-            *(quantity.heading() for quantity in (ABOVE_REST, DURATION, PAYLOAD)),
+            *(quantity.heading() for quantity in (ABOVE_REST, DURATION_QUANTITY, PAYLOAD_QUANTITY)),
         ),
         tuple(rows),
         "Selected: least mean peak force of the replica with the largest hypervolume. Above rest: "
@@ -218,8 +218,8 @@ def _pressed(
     duration: float | None,
     payload: float,
 ) -> tuple[str, ...]:
-    last = (ABOVE_REST(above_rest), DURATION(duration), PAYLOAD(payload))
-    return (label, *map(FORCE, (*least, *peak)), *last)
+    last = (ABOVE_REST(above_rest), DURATION_QUANTITY(duration), PAYLOAD_QUANTITY(payload))
+    return (label, *map(FORCE_QUANTITY, (*least, *peak)), *last)
 
 
 def replicas(summary: CampaignSummary) -> Table:
@@ -230,17 +230,17 @@ def replicas(summary: CampaignSummary) -> Table:
             better, gap, polished = NOTHING, NOTHING, entry.polished
             if polished is not None and label != title(name):
                 better = f"{polished.replicas_improved} of {len(figures)}"
-                gap = QUANTITIES["widest_gap"](polished.statistics["widest_gap"].median)
+                gap = REPLICA_QUANTITIES["widest_gap"](polished.statistics["widest_gap"].median)
             rows.append((label, *(_over_replicas(figures, key) for key in keys), better, gap))
     for label, figures in _polished_union(summary):
         found = (_over_replicas(figures, key) for key in (*keys, "widest_gap"))
         mean, payload, gap = found
         rows.append((label, mean, payload, NOTHING, gap))
-    headings = (ABOVE_REST.heading(), PAYLOAD.heading(), "better in")
+    headings = (ABOVE_REST.heading(), PAYLOAD_QUANTITY.heading(), "better in")
     return Table(
         "replicas",
         "Selected solutions of all replicas.",
-        ("algorithm", *headings, QUANTITIES["widest_gap"].heading()),
+        ("algorithm", *headings, REPLICA_QUANTITIES["widest_gap"].heading()),
         tuple(rows),
         "Median [quartiles]. Better in: replicas whose hypervolume the polish made larger. Widest "
         f"gap: between neighbours, as a share of the front's length.{_solvers(summary)}",
@@ -255,7 +255,7 @@ def effort(summary: CampaignSummary) -> Table:
     return Table(
         "effort",
         "What a replica took.",
-        ("algorithm", *(QUANTITIES[key].heading() for key in keys)),
+        ("algorithm", *(REPLICA_QUANTITIES[key].heading() for key in keys)),
         tuple((label, *(_over_replicas(row, key) for key in keys)) for label, row in every),
         "Median [quartiles]. Evaluations as long: candidates that are evaluated in the time of a "
         f"polish.{_solvers(summary)}",
@@ -278,7 +278,7 @@ def infeasible(summary: CampaignSummary) -> Table:
         total = sum(row.evaluations for row in entry.replicas)
         for reason, count in counts.items():
             shares.setdefault(reason, {})[name] = count / total
-    share, names = QUANTITIES["feasible_share"], summary.algorithms
+    share, names = REPLICA_QUANTITIES["feasible_share"], summary.algorithms
     rows = [
         (constraint_title(reason, summary.robots), *(share(own.get(name, 0.0)) for name in names))
         for reason, own in sorted(shares.items(), key=lambda each: -max(each[1].values()))
@@ -300,7 +300,7 @@ def constraint_title(name: str, robots: Sequence[str]) -> str:
     return " ".join(words)
 
 
-def bounds(search: Bounds, drivable: Bounds | None = None) -> Table:
+def bounds(search: NormalisationBounds, drivable: NormalisationBounds | None = None) -> Table:
     """The bounds of the variables that the best fronts lie on, of one or both experiments."""
     rows = []
     for name, found in (("search", search), ("drivable", drivable)):
@@ -368,7 +368,7 @@ def robust_price(price: RobustPrice, robots: Sequence[str]) -> Table:
         "The price of robustness of the recommended carry.",
         ("multiple of the uncertainty", *(f"peak, {robot} [N]" for robot in robots)),
         tuple(
-            (number(factor), *map(FORCE, peak))
+            (number(factor), *map(FORCE_QUANTITY, peak))
             for factor, peak in zip(price.factors, price.peak, strict=True)
         ),
         f"The uncertainty{of}: {price.uncertainty}. The first robot "
@@ -392,14 +392,14 @@ def simulated(found: Sequence[StoredSimulation]) -> Table:
         "The selected carries in the simulated cell.",
         {
             "carry": lambda one: one.label,
-            DURATION.heading(): lambda one: DURATION(one.duration),
+            DURATION_QUANTITY.heading(): lambda one: DURATION_QUANTITY(one.duration),
             "holds from": holds,
             "slips first": lambda one: (
                 f"pad {one.pad} at {one.begins:.2f} s" if one.pad else NOTHING
             ),
             "pressed with": pressed,
-            "peak predicted [N]": lambda one: " / ".join(map(FORCE, one.peaks[0])),
-            "peak simulated [N]": lambda one: " / ".join(map(FORCE, one.peaks[1])),
+            "peak predicted [N]": lambda one: " / ".join(map(FORCE_QUANTITY, one.peaks[0])),
+            "peak simulated [N]": lambda one: " / ".join(map(FORCE_QUANTITY, one.peaks[1])),
             "largest error [%]": lambda one: number(100.0 * one.largest_error, 1),
             "slip [mm]": lambda one: number(1e3 * one.slip, 3),
             "arrives": lambda one: "yes" if one.arrives else "NO",
@@ -425,7 +425,10 @@ def timings(timed: LabelledTimings, robots: Sequence[str]) -> Table:
             "trajectory and timing",
             FINE_DURATION.heading(),
             *(f"peak, {robot} [N]" for robot in robots),
-            *(quantity.heading() for quantity in (PAYLOAD, TORQUE, SHIFT)),
+            *(
+                quantity.heading()
+                for quantity in (PAYLOAD_QUANTITY, TORQUE_QUANTITY, SHIFT_QUANTITY)
+            ),
             "status",
             "why",
         ),
@@ -456,11 +459,11 @@ def _timing_cells(timing: StoredTiming) -> tuple[str, ...]:
     torque = (timing.joint_use or {}).get("joint torque")
     return (
         FINE_DURATION(timing.duration),
-        *map(FORCE, timing.peak_normal_force),
-        PAYLOAD(timing.payload_limit),
+        *map(FORCE_QUANTITY, timing.peak_normal_force),
+        PAYLOAD_QUANTITY(timing.payload_limit),
         # Of arms whose torques are unknown nothing is used: no share of a limit that is not there.
-        TORQUE(None if torque is None else float(torque.max()) or None),
-        SHIFT(timing.peak_pressure_shift.max()),
+        TORQUE_QUANTITY(None if torque is None else float(torque.max()) or None),
+        SHIFT_QUANTITY(timing.peak_pressure_shift.max()),
     )
 
 
@@ -494,10 +497,15 @@ def force_curve(curve: ForceCurve) -> Table:
     rows = zip(curve.force, curve.duration, curve.status, strict=False)
     return Table(
         "force_curve",
-        f"Duration against force limit (at rest {FORCE(curve.static_force)} N).",
+        f"Duration against force limit (at rest {FORCE_QUANTITY(curve.static_force)} N).",
         ("limit [N]", "limit [kgf]", FINE_DURATION.heading(), "status"),
         tuple(
-            (FORCE(force), number(force / KILOGRAM_FORCE), FINE_DURATION(duration), str(status))
+            (
+                FORCE_QUANTITY(force),
+                number(force / KILOGRAM_FORCE),
+                FINE_DURATION(duration),
+                str(status),
+            )
             for force, duration, status in rows
         ),
     )

@@ -334,7 +334,7 @@ def test_parts_and_pieces_give_the_bits_of_the_whole(
     function = long_function(LINE) if cut else caller("outer", leaf("inner"))
     x = np.random.default_rng(0).normal(size=(11, 4))
     if cut:
-        monkeypatch.setattr(parts, "LONG", CUT)
+        monkeypatch.setattr(parts, "CUT_STATEMENTS", CUT)
         monkeypatch.setattr(parts, "LEAST_ENTRY", 0)
     else:
         _, apart = in_parts(c_source(dense(function), lanes), lanes)
@@ -358,11 +358,11 @@ def test_what_several_functions_call_is_compiled_once(cache: Cache) -> None:
     assert len(list(cache.folder.glob("*.o"))) == 1
     x = np.array([0.1, -0.4, 0.7, 1.3])
     inner = compile_function(leaf("inner"), cache)
-    once = next(iter(inner(x).values()))
-    twice = next(iter(inner(once).values()))
+    memoise = next(iter(inner(x).values()))
+    twice = next(iter(inner(memoise).values()))
     first, second = (next(iter(function(x).values())) for function in built.functions.values())
     np.testing.assert_array_equal(first, twice + 1.0)
-    np.testing.assert_allclose(second, np.linalg.norm(twice) * once, rtol=1e-14)
+    np.testing.assert_allclose(second, np.linalg.norm(twice) * memoise, rtol=1e-14)
 
 
 def test_a_damaged_object_file_is_made_anew(cache: Cache) -> None:
@@ -386,7 +386,7 @@ def test_what_calls_others_or_is_short_stays_as_it_is(monkeypatch: pytest.Monkey
 def test_every_statement_stays_in_its_order_and_no_piece_is_longer_than_allowed(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(parts, "LONG", CUT)
+    monkeypatch.setattr(parts, "CUT_STATEMENTS", CUT)
     text = generated_c([dense(long_function(LINE))])
     cut = in_pieces(text)
     bodies = re.findall(

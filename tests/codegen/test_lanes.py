@@ -15,7 +15,7 @@ from codegen.build import build, compile_function, load_or_build, load_or_build_
 from codegen.cache import Cache
 from codegen.compiled import CompiledFunction
 from codegen.errors import CodegenError
-from codegen.lanes import FORMS, KEPT, lane_text
+from codegen.lanes import FORMS, KEPT_FORMS, lane_text
 from symbolic.array import Array
 from tests.codegen.samples import odd_compiler, random_function
 
@@ -135,7 +135,7 @@ def test_what_has_no_form_in_lanes_is_told(cache: Cache, monkeypatch: pytest.Mon
     np.testing.assert_allclose(made.batch(np.array([4.0, 9.0]))["root"], [2.0, 3.0])
 
 
-@pytest.mark.parametrize("example", [example for example, *_ in (*FORMS, *KEPT)])
+@pytest.mark.parametrize("example", [example for example, *_ in (*FORMS, *KEPT_FORMS)])
 def test_every_form_is_taken_and_none_beside_them(example: str) -> None:
     def text(line: str) -> str:
         return (

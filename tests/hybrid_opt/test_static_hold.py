@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import hybrid_opt as ho
-from hybrid_opt.static_hold import unheld
+from hybrid_opt.static_hold import static_hold_error
 from hybrid_opt.timing.model import TimingModel
 from studies import propose, run
 from studies.program import BAD_INPUT
@@ -58,36 +58,40 @@ def slippery(tmp_path: Path) -> Path:
 
 @pytest.mark.parametrize("path", CELLS, ids=[path.stem for path in CELLS])
 def test_every_cell_that_ships_can_be_held(path: Path) -> None:
-    assert unheld(load(path)) == ""
+    assert static_hold_error(load(path)) == ""
 
 
 def test_needed_allowed_and_remedies_are_told(slippery: Path, tmp_path: Path) -> None:
-    why = unheld(load(slippery))
+    why = static_hold_error(load(slippery))
     assert "left needs a normal force of 981 N at the start, allowed are 117.7 N" in why
     assert "right needs" in why
     mass, friction = number(why, "mass of at most"), number(why, "friction of at least")
     for lighter in (mass, 1.01 * mass):
-        enough = unheld(load(changed("rack", tmp_path, mass=lighter, friction=0.1))) == ""
+        enough = (
+            static_hold_error(load(changed("rack", tmp_path, mass=lighter, friction=0.1))) == ""
+        )
         assert enough is (lighter == mass)
     for rougher in (friction, 0.99 * friction):
-        enough = unheld(load(changed("rack", tmp_path, mass=20.0, friction=rougher))) == ""
+        enough = (
+            static_hold_error(load(changed("rack", tmp_path, mass=20.0, friction=rougher))) == ""
+        )
         assert enough is (rougher == friction)
 
 
 def test_the_whole_force_is_the_arms_payload(tmp_path: Path) -> None:
     """At mu = 1 a robot bears 12 kgf in all at 16.97 kg, though it presses with less."""
-    assert unheld(load(changed("rack", tmp_path, mass=16.9))) == ""
-    why = unheld(load(changed("rack", tmp_path, mass=17.0)))
+    assert static_hold_error(load(changed("rack", tmp_path, mass=16.9))) == ""
+    why = static_hold_error(load(changed("rack", tmp_path, mass=17.0)))
     assert "left needs a force in all of" in why
     assert number(why, "mass of at most") == pytest.approx(16.97, abs=0.01)
 
 
 def test_a_patch_that_would_do_is_told(tmp_path: Path) -> None:
-    why = unheld(load(changed("transfer", tmp_path, patch_radius=0.005)))
+    why = static_hold_error(load(changed("transfer", tmp_path, patch_radius=0.005)))
     assert "shift of the pressure of 10 mm" in why
     radius = 1e-3 * number(why, "patches of at least")
-    assert unheld(load(changed("transfer", tmp_path, patch_radius=1.001 * radius))) == ""
-    assert unheld(load(changed("transfer", tmp_path, patch_radius=0.98 * radius))) != ""
+    assert static_hold_error(load(changed("transfer", tmp_path, patch_radius=1.001 * radius))) == ""
+    assert static_hold_error(load(changed("transfer", tmp_path, patch_radius=0.98 * radius))) != ""
 
 
 def test_a_joint_that_is_too_weak_is_told() -> None:
@@ -98,18 +102,18 @@ def test_a_joint_that_is_too_weak_is_told() -> None:
     ends = np.abs(still.torque)[[0, -1]]
     limit = np.concatenate([robot.torque_max for robot in cell.workcell.robots])
     share = float((ends / limit).max())
-    assert cell.unheld == ""
+    assert cell.static_hold_error == ""
 
     def limited(factor: float) -> Workcell:
         robots = [replace(r, torque_max=factor * r.torque_max) for r in cell.workcell.robots]
         return replace(cell.workcell, robots=(robots[0], robots[1]))
 
-    assert unheld(limited(1.001 * share), cell.evaluator.outputs) == ""
-    why = unheld(limited(0.999 * share), cell.evaluator.outputs)
+    assert static_hold_error(limited(1.001 * share), cell.evaluator.outputs) == ""
+    why = static_hold_error(limited(0.999 * share), cell.evaluator.outputs)
     end, joint = np.unravel_index(int((ends / limit).argmax()), ends.shape)
     assert "joint torque" in why
     assert f"of {ends[end, joint]:.4g} N m at the {('start', 'goal')[end]}" in why
-    assert unheld(limited(0.999 * share)) == ""  # postures are not known
+    assert static_hold_error(limited(0.999 * share)) == ""  # postures are not known
 
 
 def test_no_search_begins(slippery: Path) -> None:
@@ -133,9 +137,9 @@ def test_no_study_begins(
 def test_the_inspection_says_infeasible(slippery: Path) -> None:
     parts = inspected(load(slippery), 1, 1)
     part = next(part for part in parts if "unheld" in part.values)
-    unheld = part.values["unheld"]
-    assert f"Infeasible, whatever the path: {unheld}" in part.lines
-    assert "981 N" in unheld
+    static_hold_error = part.values["unheld"]
+    assert f"Infeasible, whatever the path: {static_hold_error}" in part.lines
+    assert "981 N" in static_hold_error
 
 
 def test_no_workcell_is_proposed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -16,7 +16,7 @@ from hybrid_opt.campaign.results import read_campaign
 from hybrid_opt.indicators.metrics import non_dominated
 from hybrid_opt.polishing.records import PolishedFront, PolishEffort
 from studies.report import PAGE
-from studies.report.data import ReportData, Run, gather
+from studies.report.data import ReportData, ReportRun, gather
 from studies.study.simulation import StoredSimulation
 from studies.study.summary import PolishedFigures, front_indicators
 from tests.conftest import Once
@@ -31,7 +31,7 @@ PRINTED = "printed.txt"
 
 
 @pytest.fixture(scope="session")
-def program_run(once: Once) -> tuple[Path, str]:
+def program_run(memoise: Once) -> tuple[Path, str]:
     """A small study by the program itself: its results folder and what it printed."""
 
     def run(folder: Path) -> None:
@@ -45,7 +45,7 @@ def program_run(once: Once) -> tuple[Path, str]:
         assert "left]" in done.stderr
         (folder / PRINTED).write_text(done.stdout, "utf-8")
 
-    folder = once("study", run)
+    folder = memoise("study", run)
     return folder / "results", (folder / PRINTED).read_text("utf-8")
 
 
@@ -62,14 +62,14 @@ def report(study: Path) -> Path:
 
 
 @pytest.fixture(scope="session")
-def data(study: Path, once: Once) -> ReportData:
+def data(study: Path, memoise: Once) -> ReportData:
     """What a report of that study shows."""
 
     def make(folder: Path) -> None:
         folder.mkdir()
         (folder / "data").write_bytes(pickle.dumps(gather(read_campaign(study))))
 
-    found: ReportData = pickle.loads((once("data", make) / "data").read_bytes())
+    found: ReportData = pickle.loads((memoise("data", make) / "data").read_bytes())
     return found
 
 
@@ -84,7 +84,7 @@ def hybrid_data(data: ReportData) -> ReportData:
     indicators = front_indicators(objectives[best], objectives[best], None, None)
     figures = PolishedFigures(**indicators, **vars(effort))
 
-    def polished(run: Run) -> Run:
+    def polished(run: ReportRun) -> ReportRun:
         n = int(best.sum())
         rows, made = np.arange(n), np.ones(n, dtype=bool)
         done = PolishedFront(x[best], objectives[best], rows, made, (), 1.0, 1.0, "dense")

@@ -64,9 +64,9 @@ def _run(options: argparse.Namespace) -> int:
     from studies.research.benchmarks.measuring import measured, table
 
     known = {
-        "shelves": shelves.SOURCE,
-        "slot": slot.SOURCE,
-        "machines": machines.SOURCE,
+        "shelves": shelves.SHELVES_SOURCE,
+        "slot": slot.SLOT_SOURCE,
+        "machines": machines.MACHINES_SOURCE,
         "baxter": baxter.source(options.sample, options.seed),
     }
     if options.name not in ("", *known):

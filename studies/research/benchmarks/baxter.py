@@ -16,25 +16,30 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from studies.research.benchmarks.measuring import Benchmark, Source, Task, carry_problem
+from studies.research.benchmarks.measuring import (
+    Benchmark,
+    BenchmarkSource,
+    BenchmarkTask,
+    carry_problem,
+)
 from symbolic import safe_io
 from symbolic.array import Array
 from symbolic.errors import OutsideError
 from symbolic.read.scenes import read_message, read_scene
 
-ROOM = Path("vamp/resources/baxter")
+RESOURCES = Path("vamp/resources/baxter")
 
-HOW = f"""\
+CLONE_COMMANDS = f"""\
 git clone https://github.com/KavrakiLab/vamp FOLDER/vamp
 git -C FOLDER/vamp checkout f6de6a7
-tar -xjf FOLDER/{ROOM}/problems.tar.bz2 -C FOLDER/{ROOM}"""
+tar -xjf FOLDER/{RESOURCES}/problems.tar.bz2 -C FOLDER/{RESOURCES}"""
 
-KINDS = ("easy", "medium", "hard")
+DIFFICULTIES = ("easy", "medium", "hard")
 
 SCENES = 600
 """Scenes of each kind."""
 
-BOX = (0.10, 0.20, 0.10)
+CAN_BOX = (0.10, 0.20, 0.10)
 """A little lower than a can [m]."""
 
 BEFORE = (0.70, 0.10)
@@ -49,16 +54,16 @@ AIR = 0.01
 PADDLE = (0.06, 0.03, 0.17)
 """Paddle in place of each gripper, as long; its flat side presses: width, thickness, length [m]."""
 
-PAD = 0.14
+BAXTER_PAD = 0.14
 """Distance from a hand to the middle of its pad, on that side [m]."""
 
-NOTE = (
+BAXTER_NOTE = (
     "Published (arXiv 2309.14545): each arm to a can of its own, nothing held, no path of a box; "
     "times and rates there are of motions of free arms."
 )
 
 
-def source(count: int, seed: int) -> Source:
+def source(count: int, seed: int) -> BenchmarkSource:
     """A sample of the scenes.
 
     Args:
@@ -70,13 +75,13 @@ def source(count: int, seed: int) -> Source:
         tasks, rng = [], np.random.default_rng(seed)
         safe_io.require(there / "baxter.urdf", safe_io.URDF_BYTES)
         hands = Hands(there / "baxter.urdf")
-        for kind in KINDS:
+        for kind in DIFFICULTIES:
             scenes = there / "problems" / f"bookshelf_tall_both_arms_{kind}_baxter"
             chosen = np.sort(rng.choice(SCENES, count, replace=False) + 1).tolist()
             tasks += [_task(there, scenes, f"{kind} {k}", k, hands) for k in chosen]
-        return Benchmark("baxter", "Baxter before bookshelves", tuple(tasks), NOTE)
+        return Benchmark("baxter", "Baxter before bookshelves", tuple(tasks), BAXTER_NOTE)
 
-    return Source(HOW, ROOM, benchmark)
+    return BenchmarkSource(CLONE_COMMANDS, RESOURCES, benchmark)
 
 
 class Hands:
@@ -116,7 +121,7 @@ def request(path: Path) -> tuple[dict[str, float], dict[str, float]]:
         raise OutsideError("the request lacks start and goal joints") from error
 
 
-def _task(there: Path, scenes: Path, name: str, number: int, hands: Hands) -> Task:
+def _task(there: Path, scenes: Path, name: str, number: int, hands: Hands) -> BenchmarkTask:
     joints = request(scenes / f"request{number:04d}.yaml")
     start, goal = (hands.at(one) for one in joints)
     bodies = read_scene(scenes / f"scene{number:04d}.yaml").tables(scenes, scenes)
@@ -127,9 +132,9 @@ def _task(there: Path, scenes: Path, name: str, number: int, hands: Hands) -> Ta
     top = board["xyz"][2] + board["size"][2] / 2.0
     begins = [BEFORE[0], (start[0][1] + start[1][1]) / 2.0, BEFORE[1]]
     ends = [
-        board["xyz"][0] - board["size"][0] / 2.0 + BOX[0] / 2.0,
+        board["xyz"][0] - board["size"][0] / 2.0 + CAN_BOX[0] / 2.0,
         (goal[0][1] + goal[1][1]) / 2.0,
-        top + BOX[2] / 2.0 + AIR,
+        top + CAN_BOX[2] / 2.0 + AIR,
     ]
     cleared = [
         body
@@ -139,14 +144,14 @@ def _task(there: Path, scenes: Path, name: str, number: int, hands: Hands) -> Ta
     problem = carry_problem(
         f"Baxter, {name}",
         [_robot(there, side) for side in ("left", "right")],
-        {"size": list(BOX), "mass": 1.0},
+        {"size": list(CAN_BOX), "mass": 1.0},
         [{"patch_radius": 0.03}] * 2,
         (_upright(begins), _upright(ends)),
         cleared,
         reference_speed=0.2,
         reference_force=30.0,
     )
-    return Task(name, problem)
+    return BenchmarkTask(name, problem)
 
 
 def _upright(xyz: list[float]) -> list[float]:
@@ -162,7 +167,7 @@ def _robot(there: Path, side: str) -> dict[str, Any]:
         "chain": ["base", f"{side}_hand"],
         "drop_links": [f"{side}_gripper_base"],
         "base": {"xyz": [0.0, 0.0, 0.0]},
-        "pad": {"xyz": [0.0, PADDLE[1] / 2.0, PAD], "rpy": [-np.pi / 2.0, 0.0, 0.0]},
+        "pad": {"xyz": [0.0, PADDLE[1] / 2.0, BAXTER_PAD], "rpy": [-np.pi / 2.0, 0.0, 0.0]},
         "min_manipulability": 0.002,
         "tool": [{"name": "paddle", **paddle}],
     }

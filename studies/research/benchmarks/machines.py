@@ -10,25 +10,35 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from studies.research.benchmarks.measuring import Benchmark, Source, Task, carry_problem
+from studies.research.benchmarks.measuring import (
+    Benchmark,
+    BenchmarkSource,
+    BenchmarkTask,
+    carry_problem,
+)
 from symbolic.errors import OutsideError
 
 UR10E = Path("curobo/curobo/content/assets/robot/ur_description/dual_ur10e.urdf")
 PANDAS = Path("moveit_resources/dual_arm_panda_moveit_config/config/panda.urdf.xacro")
 
-PAD = 0.12
+MACHINES_PAD = 0.12
 """Distance from a flange to its pad [m]."""
 
 TOP = 0.1
 """Thickness of the table top [m]."""
 
-TABLE = {"name": "table", "kind": "box", "size": [0.8, 1.6, TOP], "xyz": [0.75, 0.0, TOP / 2.0]}
-GROUND = {"name": "ground", "kind": "box", "size": [4.0, 5.0, 0.1], "xyz": [0.0, 0.0, -0.06]}
+MACHINES_TABLE = {
+    "name": "table",
+    "kind": "box",
+    "size": [0.8, 1.6, TOP],
+    "xyz": [0.75, 0.0, TOP / 2.0],
+}
+GROUND_BODY = {"name": "ground", "kind": "box", "size": [4.0, 5.0, 0.1], "xyz": [0.0, 0.0, -0.06]}
 
 POSTS = (0.30, 0.45, 0.60)
 """Heights above the table [m]."""
 
-NOTE = "Nothing was published: the makers plan for each arm by itself."
+MACHINES_NOTE = "Nothing was published: the makers plan for each arm by itself."
 
 
 def benchmark(folder: Path) -> Benchmark:
@@ -38,16 +48,16 @@ def benchmark(folder: Path) -> Benchmark:
             raise OutsideError(f"{file} is not there")
     tasks = [_two_ur10e(folder / UR10E, height) for height in POSTS]
     tasks.append(_two_pandas(folder / PANDAS))
-    return Benchmark("machines", "Two arms on one base and a post", tuple(tasks), NOTE)
+    return Benchmark("machines", "Two arms on one base and a post", tuple(tasks), MACHINES_NOTE)
 
 
-def _two_ur10e(urdf: Path, post: float) -> Task:
+def _two_ur10e(urdf: Path, post: float) -> BenchmarkTask:
     arm = {"urdf": str(urdf.resolve()), "base": {"xyz": [0.0, 0.0, 0.0]}, **_pad(0.04)}
     robots = [
         {"name": "left", "chain": ["world_base_link", "tool0"], **arm},
         {"name": "right", "chain": ["world_base_link", "tool1"], **arm},
     ]
-    scene = [TABLE, _post([0.08, 0.08, post], [0.75, 0.0, TOP + post / 2.0])]
+    scene = [MACHINES_TABLE, _post([0.08, 0.08, post], [0.75, 0.0, TOP + post / 2.0])]
     problem = carry_problem(
         f"Two UR10e, a post of {post:g} m",
         robots,
@@ -58,10 +68,10 @@ def _two_ur10e(urdf: Path, post: float) -> Task:
         reference_speed=0.25,
         reference_force=98.1,
     )
-    return Task(f"UR10e over {post:g} m", problem)
+    return BenchmarkTask(f"UR10e over {post:g} m", problem)
 
 
-def _two_pandas(xacro: Path) -> Task:
+def _two_pandas(xacro: Path) -> BenchmarkTask:
     robots = [
         {
             "name": name,
@@ -80,24 +90,29 @@ def _two_pandas(xacro: Path) -> Task:
         {"size": [0.1, 2.0, 0.1], "mass": 2.0},
         [{"patch_radius": 0.03}] * 2,
         ([0.3, 0.0, 0.4, 0.0, 0.0, 0.0], [0.6, 0.0, 0.4, 0.0, 0.0, 0.0]),
-        [GROUND, _post([0.1, 0.1, 0.5], [0.45, 0.0, 0.25])],
+        [GROUND_BODY, _post([0.1, 0.1, 0.5], [0.45, 0.0, 0.25])],
         reference_speed=0.25,
         reference_force=29.43,
     )
-    return Task("Pandas with a beam", problem)
+    return BenchmarkTask("Pandas with a beam", problem)
 
 
 def _pad(radius: float) -> dict[str, Any]:
     """A pad on a rod in front of the flange."""
-    rod = {"kind": "cylinder", "radius": radius, "length": PAD, "xyz": [0.0, 0.0, PAD / 2.0]}
-    return {"pad": {"xyz": [0.0, 0.0, PAD]}, "tool": [{"name": "pad", **rod}]}
+    rod = {
+        "kind": "cylinder",
+        "radius": radius,
+        "length": MACHINES_PAD,
+        "xyz": [0.0, 0.0, MACHINES_PAD / 2.0],
+    }
+    return {"pad": {"xyz": [0.0, 0.0, MACHINES_PAD]}, "tool": [{"name": "pad", **rod}]}
 
 
 def _post(size: list[float], xyz: list[float]) -> dict[str, Any]:
     return {"name": "post", "kind": "box", "size": size, "xyz": xyz}
 
 
-SOURCE = Source(
+MACHINES_SOURCE = BenchmarkSource(
     """\
 git clone https://github.com/NVlabs/curobo FOLDER/curobo
 git -C FOLDER/curobo checkout a35a708

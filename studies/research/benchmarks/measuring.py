@@ -13,8 +13,8 @@ import cma
 import numpy as np
 
 import hybrid_opt as ho
+from hybrid_opt.api import fastest_carry
 from hybrid_opt.display.table import Table, number
-from hybrid_opt.door import fastest_carry
 from hybrid_opt.errors import NoHoldError, ProposalError
 from hybrid_opt.evaluate.evaluation import concatenated
 from hybrid_opt.proposing.proposal import worked
@@ -28,7 +28,7 @@ from symbolic.read.cell import load
 from symbolic.read.editing import completed
 from symbolic.safe_io import replace_file
 
-EVALUATIONS = 1000
+STUDY_EVALUATIONS = 1000
 """Evaluations of the search behind a fastest carry."""
 
 SHORT_EVALUATIONS, OFFSPRING = 4000, 20
@@ -40,12 +40,12 @@ SHORT_STEP = 0.1
 CHECKS, TOGETHER = 4000, 200
 """Configurations by which the rate of collision checks is measured: in all, and at once."""
 
-FRICTION = 0.8
+PAD_FRICTION = 0.8
 """Friction of every pad."""
 
 
 @dataclass(frozen=True)
-class Task:
+class BenchmarkTask:
     """One carry of a benchmark.
 
     Attributes:
@@ -77,13 +77,13 @@ class Benchmark:
 
     name: str
     title: str
-    tasks: tuple[Task, ...]
+    tasks: tuple[BenchmarkTask, ...]
     note: str
     coordinates: Callable[[Array, Array], Array] = lambda q_1, q_2: np.hstack([q_1, q_2])
 
 
 @dataclass(frozen=True)
-class Source:
+class BenchmarkSource:
     """Files of others, and the benchmark that they become.
 
     Attributes:
@@ -126,7 +126,7 @@ def carry_problem(
         "name": name,
         "robots": robots,
         "payload": payload,
-        "contacts": [{"friction": FRICTION, **pad} for pad in pads],
+        "contacts": [{"friction": PAD_FRICTION, **pad} for pad in pads],
         "task": {"start": ends[0], "goal": ends[1], **task},
         "handling": {"lift_height": 0.0, "set_down_height": 0.0},
         "environment": scene,
@@ -161,7 +161,7 @@ class TaskResult:
         duration, force: of the fastest carry [s, N].
     """
 
-    task: Task
+    task: BenchmarkTask
     refused: str = ""
     held: bool = True
     workcell: Path | None = None
@@ -176,7 +176,7 @@ class TaskResult:
 
 def measured(
     benchmark: Benchmark,
-    task: Task,
+    task: BenchmarkTask,
     output: Path,
     settings: ho.ProposeSettings,
     seed: int,
@@ -201,7 +201,7 @@ def measured(
     if not study:
         return found
     progress(f"{task.name}: the fastest carry")
-    fastest = fastest_carry(ho.Cell.load(workcell), EVALUATIONS, np.random.default_rng(seed))
+    fastest = fastest_carry(ho.Cell.load(workcell), STUDY_EVALUATIONS, np.random.default_rng(seed))
     progress(f"{task.name}: the shortest carry")
     shortest = shortest_carry(workcell, np.random.default_rng(seed))
     return replace(
@@ -263,7 +263,7 @@ def checks_per_second(workcell: Path, rng: np.random.Generator) -> float:
     return CHECKS / (worked() - begun)
 
 
-FIGURES: tuple[tuple[str, Callable[[TaskResult], float | None], int], ...] = (
+BENCHMARK_FIGURES: tuple[tuple[str, Callable[[TaskResult], float | None], int], ...] = (
     ("certified [s]", lambda one: one.certified, 1),
     ("file [s]", lambda one: one.seconds, 1),
     ("joints [rad]", lambda one: one.first.joints, 2),
@@ -286,14 +286,14 @@ def table(benchmark: Benchmark, found: list[TaskResult], rng: np.random.Generato
     between their ends; then a study's fastest carry and its shortest one. Below how many were
     found, and the rate of collision checks in the first one's cell."""
     rows = tuple(
-        (one.task.name, *(number(figure(one), digits) for _, figure, digits in FIGURES))
+        (one.task.name, *(number(figure(one), digits) for _, figure, digits in BENCHMARK_FIGURES))
         for one in found
     )
     refused = "".join(f" {one.task.name}: {one.refused}." for one in found if one.refused)
     cell = next((one.workcell for one in found if one.workcell is not None), None)
     rate = "" if cell is None else f" {checks_per_second(cell, rng):.0f} collision checks a second."
     note = f"{solved(found)}{rate} {benchmark.note}{refused}"
-    headings = ("task", *(heading for heading, _, _ in FIGURES))
+    headings = ("task", *(heading for heading, _, _ in BENCHMARK_FIGURES))
     return Table(benchmark.name, benchmark.title, headings, rows, note)
 
 

@@ -17,7 +17,12 @@ import numpy as np
 import pinocchio as pin
 from pinocchio.utils import rotate
 
-from studies.research.benchmarks.measuring import Benchmark, Source, Task, carry_problem
+from studies.research.benchmarks.measuring import (
+    Benchmark,
+    BenchmarkSource,
+    BenchmarkTask,
+    carry_problem,
+)
 from symbolic import safe_io
 from symbolic.array import Array
 from symbolic.errors import OutsideError
@@ -26,7 +31,7 @@ from symbolic.read.scenes import read_scene
 PACKAGE = "bimanual"
 """What their URDF calls the folder."""
 
-APART = 0.765
+BASE_DISTANCE = 0.765
 """Distance between both bases, along y [m]."""
 
 GRASP = 0.6
@@ -38,12 +43,12 @@ STANDING = {
 }
 """Places of the scene's models [m]."""
 
-PAD = 0.2
+SHELVES_PAD = 0.2
 """Distance from a last link to its pad: between palm and tip of their fingers [m]."""
 
-BOX = (0.12, GRASP - 2.0 * PAD, 0.12)
+SHELF_BOX = (0.12, GRASP - 2.0 * SHELVES_PAD, 0.12)
 
-ACCELERATION = [8.57, 8.57, 8.74, 11.36, 12.23, 15.72, 15.72]
+URDF_ACCELERATION = [8.57, 8.57, 8.74, 11.36, 12.23, 15.72, 15.72]
 """Accelerations as their URDF states them in an attribute of Drake's [rad/s^2]."""
 
 UPPER_ARM, FOREARM = 0.42, 0.4
@@ -65,7 +70,7 @@ CARRIES = (
 )
 """From, to, and the length that was published of IK-GCS [rad]."""
 
-NOTE = (
+SHELVES_NOTE = (
     "Published: lengths of IK-GCS (arXiv 2309.08770), which plans in 2 to 3 s once regions are "
     "grown around postures chosen by hand; IK-BiRRT takes 49 to 54 s, Atlas-BiRRT 141 to 201 s. "
     "There both ends' postures are given, nothing is held, and no speed or force is planned; here "
@@ -84,10 +89,13 @@ def benchmark(there: Path) -> Benchmark:
     for start, goal, length in CARRIES:
         problem = carry_problem(
             f"Shelves, {start} to {goal}",
-            [_robot("left", urdf, there.parent, 0.0), _robot("right", urdf, there.parent, APART)],
-            {"size": list(BOX), "mass": 2.0},
             [
-                {"xyz": [0.0, side * BOX[1] / 2.0, 0.0], "patch_radius": 0.03}
+                _robot("left", urdf, there.parent, 0.0),
+                _robot("right", urdf, there.parent, BASE_DISTANCE),
+            ],
+            {"size": list(SHELF_BOX), "mass": 2.0},
+            [
+                {"xyz": [0.0, side * SHELF_BOX[1] / 2.0, 0.0], "patch_radius": 0.03}
                 for side in (-1.0, 1.0)
             ],
             (poses[start], poses[goal]),
@@ -96,8 +104,8 @@ def benchmark(there: Path) -> Benchmark:
             reference_force=100.0,
         )
         straight = float(np.linalg.norm(given[goal] - given[start]))
-        tasks.append(Task(f"{start} to {goal}", problem, length, straight))
-    return Benchmark("shelves", "Two iiwa 14 and shelves", tuple(tasks), NOTE, coordinates)
+        tasks.append(BenchmarkTask(f"{start} to {goal}", problem, length, straight))
+    return Benchmark("shelves", "Two iiwa 14 and shelves", tuple(tasks), SHELVES_NOTE, coordinates)
 
 
 def postures(notebook: bytes) -> dict[str, Array]:
@@ -155,16 +163,16 @@ def _robot(name: str, urdf: Path, folder: Path, y: float) -> dict[str, Any]:
         "package_dirs": [str(folder.resolve())],
         "chain": ["base", "iiwa_link_7"],
         "base": {"xyz": [0.0, y, 0.0], "rpy": [0.0, 0.0, 0.0]},
-        "pad": {"xyz": [0.0, 0.0, PAD]},
-        "acceleration_max": ACCELERATION,
+        "pad": {"xyz": [0.0, 0.0, SHELVES_PAD]},
+        "acceleration_max": URDF_ACCELERATION,
         "tool": [
             GRIPPER,
             {
                 "name": "pad",
                 "kind": "cylinder",
                 "radius": 0.03,
-                "length": PAD - start,
-                "xyz": [0.0, 0.0, (PAD + start) / 2.0],
+                "length": SHELVES_PAD - start,
+                "xyz": [0.0, 0.0, (SHELVES_PAD + start) / 2.0],
             },
         ],
     }
@@ -179,7 +187,7 @@ def _scene(models: Path) -> list[dict[str, Any]]:
     ]
 
 
-SOURCE = Source(
+SHELVES_SOURCE = BenchmarkSource(
     f"""\
 git clone https://github.com/cohnt/constrained-bimanual-planning-example FOLDER/{PACKAGE}
 git -C FOLDER/{PACKAGE} checkout aca3cbd""",

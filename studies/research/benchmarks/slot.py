@@ -16,29 +16,34 @@ from typing import Any
 
 import numpy as np
 
-from studies.research.benchmarks.measuring import Benchmark, Source, Task, carry_problem
+from studies.research.benchmarks.measuring import (
+    Benchmark,
+    BenchmarkSource,
+    BenchmarkTask,
+    carry_problem,
+)
 from symbolic import safe_io
 from symbolic.errors import OutsideError
 from symbolic.read.elements import parse_elements
 
 PLATE = (0.6, 0.2, 0.02)
 
-START = [0.0, -0.45, 0.876, 0.0, 0.0, 0.0]
+SLOT_START = [0.0, -0.45, 0.876, 0.0, 0.0, 0.0]
 GOAL = [0.0, -0.65, 1.051, -np.pi / 2.0, 0.0, 0.0]
 """Lying on the riser, and standing in the slot, a millimetre of air below [m, rad]."""
 
-ARMS = {"left": (0.375, -105.0), "right": (-0.375, -75.0)}
+ARM_PLACES = {"left": (0.375, -105.0), "right": (-0.375, -75.0)}
 """Places along x [m] and yaw [degrees], on the table."""
 
-TABLE = {"name": "table", "kind": "box", "size": [1.7, 1.3, 0.04], "xyz": [0.0, -0.35, 0.7299]}
+SLOT_TABLE = {"name": "table", "kind": "box", "size": [1.7, 1.3, 0.04], "xyz": [0.0, -0.35, 0.7299]}
 
-PAD = 0.0934
+SLOT_PAD = 0.0934
 """Distance from the flange to the plate's edge, which their grip overlaps by 10 mm [m]."""
 
 HAND = 0.76
 """Mass of a hand with its fingers [kg]."""
 
-LIMITS: tuple[tuple[str, dict[str, float], float], ...] = (
+SPEED_LIMITS: tuple[tuple[str, dict[str, float], float], ...] = (
     ("joint limits", {}, 7.60),
     (
         "plate at 0.12 m/s",
@@ -64,7 +69,7 @@ JOINTS = {
 """Limits of their planner and controller, which stay 0.1 rad and 0.5 N m inside those of their
 model [rad, rad/s, rad/s^2, N m]."""
 
-NOTE = (
+SLOT_NOTE = (
     "Published (docs/trajectory_planning.md there): 15.49 s along straight lines and turns one "
     "after the other; 7.60 s with path and time optimised together, the plate at 0.12 m/s at most, "
     "8.96 s at 0.08 m/s as before; 3.6 s of planning; 7 N of internal force undisturbed, 36 N at "
@@ -77,24 +82,24 @@ NOTE = (
 def benchmark(there: Path) -> Benchmark:
     """The carry of their folder, within three kinds of limits."""
     content = safe_io.read_bytes(there / "models/scene_slot_gate.xml", safe_io.URDF_BYTES)
-    scene = [TABLE, *bodies(safe_io.text(content))]
+    scene = [SLOT_TABLE, *bodies(safe_io.text(content))]
     tasks = []
-    for name, limits, seconds in LIMITS:
+    for name, limits, seconds in SPEED_LIMITS:
         problem = carry_problem(
             f"Plate through a gate, {name}",
-            [_robot(arm) for arm in ARMS],
+            [_robot(arm) for arm in ARM_PLACES],
             {"size": list(PLATE), "mass": 1.2, **limits},
             [
                 {"xyz": [side * PLATE[0] / 2.0, 0.0, 0.0], "patch_radius": 0.009}
                 for side in (1.0, -1.0)
             ],
-            (START, GOAL),
+            (SLOT_START, GOAL),
             scene,
             reference_speed=0.08,
             reference_force=30.0,
         )
-        tasks.append(Task(name, problem, seconds=seconds))
-    return Benchmark("slot", "Two Pandas and a slot behind a gate", tuple(tasks), NOTE)
+        tasks.append(BenchmarkTask(name, problem, seconds=seconds))
+    return Benchmark("slot", "Two Pandas and a slot behind a gate", tuple(tasks), SLOT_NOTE)
 
 
 def bodies(scene: str) -> Iterator[dict[str, Any]]:
@@ -133,14 +138,14 @@ def _numbers(text: str | None) -> list[float]:
 
 
 def _robot(name: str) -> dict[str, Any]:
-    x, yaw = ARMS[name]
+    x, yaw = ARM_PLACES[name]
     return {
         "name": name,
         "urdf": "package://example-robot-data/robots/panda_description/urdf/panda.urdf",
         "chain": ["panda_link0", "panda_link8"],
         "drop_links": ["panda_hand"],
         "base": {"xyz": [x, 0.0, 0.75], "rpy": [0.0, 0.0, float(np.radians(yaw))]},
-        "pad": {"xyz": [0.0, 0.0, PAD]},
+        "pad": {"xyz": [0.0, 0.0, SLOT_PAD]},
         **JOINTS,
         "tool_load": {"mass": HAND, "centre_of_mass": [0.0, 0.0, 0.03]},
         "tool": [
@@ -155,14 +160,14 @@ def _robot(name: str) -> dict[str, Any]:
                 "name": "pad",
                 "kind": "cylinder",
                 "radius": 0.009,
-                "length": PAD - 0.07,
-                "xyz": [0.0, 0.0, (PAD + 0.07) / 2.0],
+                "length": SLOT_PAD - 0.07,
+                "xyz": [0.0, 0.0, (SLOT_PAD + 0.07) / 2.0],
             },
         ],
     }
 
 
-SOURCE = Source(
+SLOT_SOURCE = BenchmarkSource(
     """\
 git clone https://github.com/haot1an/dual-arm-cooperative-manipulation FOLDER/slot
 git -C FOLDER/slot checkout ed943f0""",

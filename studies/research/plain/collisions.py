@@ -24,7 +24,7 @@ from symbolic.geometry.pairs import build_geometry
 from symbolic.geometry.pieces import ConvexShape, Hull, Piece, shrunk
 from symbolic.records import Box, Cylinder, Mesh, Robot, Shape, Sphere, Workcell
 
-PAYLOAD = "payload"
+PAYLOAD_GROUP = "payload"
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ class PlainCollisionChecker:
         self.bodies = {name: solids for arm in self.arms for name, solids in arm.bodies.items()}
         self.payload = _solids(workcell.payload.solid, pin.SE3.Identity())
         self.shrunk = _shrunk_solids(workcell.payload.solid)
-        self.bodies[PAYLOAD] = self.payload
+        self.bodies[PAYLOAD_GROUP] = self.payload
         for body in workcell.environment:
             self.bodies[body.name] = _solids(body.shape, pin.SE3(body.pose))
             for solid in self.bodies[body.name]:
@@ -91,8 +91,8 @@ class PlainCollisionChecker:
 
     def _collides(self, pair: tuple[str, str], allowed: set[str]) -> bool:
         first, second = pair
-        resting = first == PAYLOAD and second in allowed
-        tolerance = self._tolerance(PAYLOAD in pair)
+        resting = first == PAYLOAD_GROUP and second in allowed
+        tolerance = self._tolerance(PAYLOAD_GROUP in pair)
         hit = False
         for a in self.shrunk if resting else self.bodies[first]:
             for b in self.bodies[second]:

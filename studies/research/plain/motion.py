@@ -222,7 +222,7 @@ def drive(task: Task, length: float, total: float) -> tuple[float, float, float]
     return ramp * tau, speed, cruise / ramp * (6.0 * tau - 6.0 * tau**2)
 
 
-GRAVITY = np.array([0.0, 0.0, -9.81])
+PLAIN_GRAVITY = np.array([0.0, 0.0, -9.81])
 
 
 def sample_load(workcell: Workcell, pose: Array, rate: Array, second: Array) -> dict[str, Array]:
@@ -233,7 +233,7 @@ def sample_load(workcell: Workcell, pose: Array, rate: Array, second: Array) -> 
     omega, alpha = box_rates(orientation, pose[3:], rate[3:], second[3:])
     to_com = R @ payload.centre_of_mass
     acceleration = second[:3] + np.cross(alpha, to_com) + np.cross(omega, np.cross(omega, to_com))
-    force = payload.mass * (acceleration - GRAVITY)
+    force = payload.mass * (acceleration - PLAIN_GRAVITY)
 
     normal = R @ contacts[0].T_box_pad[:3, 2]
     f_n = float(force @ normal)

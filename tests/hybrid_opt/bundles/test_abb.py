@@ -26,7 +26,7 @@ from hybrid_opt.bundles.egm import egm_files
 from hybrid_opt.bundles.job_file import Contents
 from hybrid_opt.bundles.programs.carry_job import Job
 from hybrid_opt.bundles.programs.run_egm import FromRobot, Stream, read_robot, to_robot
-from hybrid_opt.job.records import HELD, PHASES
+from hybrid_opt.job.records import HELD_PHASES, PHASES
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.robot.model import build_robot_model
@@ -279,7 +279,7 @@ def test_faults_hold_both_arms(name: str, phase: str) -> None:
         cell.cycle()
     q = np.array([row[4] for row in cell.record[-20:]])
     assert np.ptp(q, axis=0).max() < 1e-4
-    if name == "sensor" and phase not in HELD:
+    if name == "sensor" and phase not in HELD_PHASES:
         assert machine.clock.s < cell.job.pressed + 0.1, "nothing is lifted"
     if name in ("silent", "Ctrl-C"):
         assert cell.force == pytest.approx(cell.record[-1][3], rel=0.05, abs=1.0)

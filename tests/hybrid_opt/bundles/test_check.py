@@ -16,7 +16,7 @@ from hybrid_opt.bundles.job_file import Interpolation
 from hybrid_opt.cell import Cell
 from hybrid_opt.compiled_cell import InterpretedCell
 from hybrid_opt.errors import ResultsError
-from hybrid_opt.store.trajectory_file import FORMAT
+from hybrid_opt.store.trajectory_file import TRAJECTORY_FORMAT
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from tests.hybrid_opt.bundles.bundles import exported, text_of
@@ -128,7 +128,7 @@ def test_what_lies_between_samples_counts(tmp_path: Path) -> None:
         ("d.json", "{}", "no joint trajectory"),
         (
             "carry.json",
-            json.dumps({"format": FORMAT, "version": 1}),
+            json.dumps({"format": TRAJECTORY_FORMAT, "version": 1}),
             r"it is a stored carry: export it first \(python -m studies.export\)",
         ),
         ("e.csv", "a,b\n1,2\n", "no joint trajectory"),

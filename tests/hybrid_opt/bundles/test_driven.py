@@ -23,10 +23,8 @@ from hybrid_opt.bundles import BundleOptions
 from hybrid_opt.bundles.bundle import CYCLE_SKEW, SKEW, prepared, target_for
 from hybrid_opt.bundles.job_file import Contents, pad_errors
 from hybrid_opt.bundles.programs.carry_job import Job
-from hybrid_opt.timing.records import TimingLimits
-from hybrid_opt.timing.solve import time_path
-from hybrid_opt.witness.arms import ArmOutcome, CellWitness
-from hybrid_opt.witness.reference import (
+from hybrid_opt.simulation.arms import ArmOutcome, CellSimulation
+from hybrid_opt.simulation.reference import (
     BoxJob,
     Control,
     JointMotion,
@@ -34,6 +32,8 @@ from hybrid_opt.witness.reference import (
     job_reference,
     press_torque,
 )
+from hybrid_opt.timing.records import TimingLimits
+from hybrid_opt.timing.solve import time_path
 from symbolic.array import Array
 from symbolic.robot.model import build_robot_model
 from tests.hybrid_opt.bundles import test_abb, test_urscript
@@ -61,9 +61,9 @@ def fast_files() -> Contents:
 
 
 @cache
-def witness() -> CellWitness:
+def witness() -> CellSimulation:
     """Pads that press evenly, as the drivable cell's model has them."""
-    return CellWitness(rack().workcell)
+    return CellSimulation(rack().workcell)
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,7 +16,7 @@ import pytest
 from hybrid_opt.bundles import BundleOptions
 from hybrid_opt.bundles.bundle import prepared
 from hybrid_opt.bundles.urscript import FOLLOWED, normal_speed, require_followed, urscript_files
-from hybrid_opt.job.records import HELD, PHASES, Job
+from hybrid_opt.job.records import HELD_PHASES, PHASES, Job
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from tests.hybrid_opt.bundles.bundles import contents, exported, rack_driven
@@ -305,9 +305,9 @@ def test_both_arms_hold_and_press(name: str, phase: str) -> None:
     newton = found.arms[sheet.follower].record[-1][2]
     force = job.normal_force[near, sheet.follower]
     assert force.min() - 0.5 <= newton <= force.max() + 0.5
-    if phase in HELD:
+    if phase in HELD_PHASES:
         assert newton >= job.normal_force[job.span(2).start, sheet.follower] - 1.0
-    if name == "a sensor's offset" and phase not in HELD:
+    if name == "a sensor's offset" and phase not in HELD_PHASES:
         risen = job.pose[near][int(np.argmin(away)), 2] - job.pose[job.span(2).start, 2]
         assert abs(risen) < 1e-4, "nothing is lifted"
 

@@ -18,7 +18,7 @@ from rosbags.typesys import Stores, get_typestore
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from hybrid_opt.calibrating.recording import Labels, Run
+from hybrid_opt.calibrating.recording import Labels, Recording
 from studies.research.plain.arm import PlainArm
 from symbolic.array import Array
 from symbolic.read.cell import load
@@ -101,7 +101,7 @@ def run(
     truth: Truth | None = None,
     name: str = "run.csv",
     weighed: float | None = None,
-) -> Run:
+) -> Recording:
     """A run: free, tare, then every orientation at every squeeze."""
     truth = truth or Truth()
     rng = np.random.default_rng(seed)
@@ -131,7 +131,7 @@ def run(
     labels = Labels(
         weighed, False, (0.5,), tuple((s + 2 * truth.lag, s + HOLD) for s in starts.tolist()), ()
     )
-    return Run(
+    return Recording(
         name=name,
         time=time,
         steps=np.full(2, 1.0 / RATE),
@@ -145,7 +145,7 @@ def run(
     )
 
 
-def side_file(made: Run, arms: Sequence[str] = ()) -> str:
+def side_file(made: Recording, arms: Sequence[str] = ()) -> str:
     """What lies beside a run that `write` wrote."""
     labels = made.labels
     arms = arms or [f'joints = "q{i}_"\nwrench = "w{i}_"\ncommanded = "n{i}"' for i in (1, 2)]
@@ -160,7 +160,7 @@ def side_file(made: Run, arms: Sequence[str] = ()) -> str:
     return "\n".join(lines)
 
 
-def write(made: Run, folder: Path) -> Path:
+def write(made: Recording, folder: Path) -> Path:
     """A run as CSV with its side file."""
     columns = {"time": made.time}
     for i in range(2):
@@ -174,7 +174,7 @@ def write(made: Run, folder: Path) -> Path:
     return path
 
 
-def write_bag(made: Run, folder: Path) -> Path:
+def write_bag(made: Recording, folder: Path) -> Path:
     """A run as rosbag2's folder with an MCAP file and a side file; wrenches half a step late."""
     store = get_typestore(Stores.ROS2_JAZZY)
     kinds = store.types

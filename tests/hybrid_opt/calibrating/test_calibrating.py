@@ -11,7 +11,7 @@ import pytest
 
 from hybrid_opt.calibrating.estimate import FrictionRatio, delay
 from hybrid_opt.calibrating.evidence import Evidence, calibrate
-from hybrid_opt.calibrating.recording import Run, places_of
+from hybrid_opt.calibrating.recording import Recording, places_of
 from studies.research.plain.arm import PlainArm
 from symbolic.array import Array
 from tests.hybrid_opt.calibrating.generator import (
@@ -150,7 +150,7 @@ def test_the_ratio_is_the_coefficient_of_discs_that_slide(distance: float) -> No
     assert FrictionRatio(CELL)(wrench) == pytest.approx(mu, rel=0.006)
 
 
-def slipping(seed: int, name: str, squeeze: float) -> Run:
+def slipping(seed: int, name: str, squeeze: float) -> Recording:
     """A level hold that slips when it ends."""
     made = run(seed, LEVEL, (squeeze,), name=name, truth=QUIET)
     ((begin, end),) = made.labels.held
@@ -214,7 +214,7 @@ def test_an_arm_that_moves_late_is_told() -> None:
 # --- planted faults ---
 
 
-def late(made: Run, seconds: float) -> Run:
+def late(made: Recording, seconds: float) -> Recording:
     """All that the second arm recorded, on a clock that is off."""
 
     def later(values: Array) -> Array:
@@ -231,32 +231,32 @@ def late(made: Run, seconds: float) -> Run:
     )
 
 
-def changed(made: Run, **labels: object) -> Run:
+def changed(made: Recording, **labels: object) -> Recording:
     return replace(made, labels=replace(made.labels, **labels))  # type: ignore[arg-type]
 
 
-def scaled(made: Run, forces: float, moments: float, arms: slice = slice(2)) -> Run:
+def scaled(made: Recording, forces: float, moments: float, arms: slice = slice(2)) -> Recording:
     wrench = made.wrench.copy()
     wrench[:, arms] *= [forces] * 3 + [moments] * 3
     return replace(made, wrench=wrench)
 
 
-def without_command(made: Run) -> Run:
+def without_command(made: Recording) -> Recording:
     return replace(made, commanded=np.full_like(made.commanded, np.nan))
 
 
-def gripped(made: Run) -> Run:
+def gripped(made: Recording) -> Recording:
     """Tared between two holds, while the pads press and nothing was commanded."""
     (_, end), (begin, _) = made.labels.held[:2]
     return changed(without_command(made), tare=((begin + end) / 2.0,))
 
 
-def turned(made: Run, angle: float) -> Run:
+def turned(made: Recording, angle: float) -> Recording:
     """The second arm about its base."""
     return replace(made, joints=(made.joints[0], made.joints[1] + [angle, 0, 0, 0, 0, 0]))
 
 
-def without_squeeze(made: Run) -> Run:
+def without_squeeze(made: Recording) -> Recording:
     """The first hold loses its squeeze."""
     wrench, (begin, end) = made.wrench.copy(), made.labels.held[0]
     fallen = made.within((begin + end) / 2.0, end)
@@ -266,7 +266,7 @@ def without_squeeze(made: Run) -> Run:
 
 SEEDS = [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(1, 30))]
 
-FAULTS: dict[str, tuple[str, Callable[[Run], Run]]] = {
+FAULTS: dict[str, tuple[str, Callable[[Recording], Recording]]] = {
     "tare": ("missing tare", lambda made: changed(made, tare=())),
     "tare at no sample": ("missing tare", lambda made: changed(made, tare=(-9.0,))),
     "tare in a hold": (

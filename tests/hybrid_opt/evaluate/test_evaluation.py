@@ -19,8 +19,8 @@ from hybrid_opt.evaluate.explanation import explain, frequent, missing_reach
 from hybrid_opt.evaluate.kernel import (
     Kernel,
     SampledVerdicts,
+    evaluate_numpy,
     load_kernel,
-    one_by_one,
     reached_samples,
 )
 from hybrid_opt.evaluate.objectives import PAPER_OBJECTIVES
@@ -262,7 +262,7 @@ def test_verdicts_of_twenty_thousand_candidates_are_those_of_one_by_one() -> Non
 def test_every_width_and_batch_gives_the_same_bits(lanes: int) -> None:
     x = mixed(RACK, 27, 3)
     ours = fused(RACK)
-    whole = one_by_one(ours.outputs(x), ours.checker)
+    whole = evaluate_numpy(ours.outputs(x), ours.checker)
     made = kernel(RACK, lanes)
     assert_same_samples(made.evaluate(x, tuple(SAMPLE_NAMES)), whole)
     for n in (1, 2, 9):
@@ -326,7 +326,7 @@ def test_forces_that_come_last_are_those_of_one_by_one(lanes: int) -> None:
     """Where a program finds them: of all where that is wanted, else of what violates nothing."""
     x, ours, made = mixed(FORK, 21, 7), fused(FORK), kernel(FORK, lanes)
     x[::4] = initial_decision(ours.workcell.task)
-    whole, names = one_by_one(ours.outputs(x), ours.checker), tuple(SAMPLE_NAMES)
+    whole, names = evaluate_numpy(ours.outputs(x), ours.checker), tuple(SAMPLE_NAMES)
     assert_same_samples(made.evaluate(x, names, all_forces=True), whole)
     found = made.evaluate(x, names, threads=2)
     kept = (found.first_reason < 0) & ~found.colliding.any(axis=1)

@@ -120,9 +120,9 @@ def test_it_is_slowed_no_more_than_a_limit_asks_for(force: float, width: float) 
 def test_a_timing_at_rest_stays_as_it_is() -> None:
     limits = JerkLimits.from_workcell(rack().workcell)
     assert limits is not None
-    once = time_with_jerk(
+    memoise = time_with_jerk(
         rack().timing_model, rack().initial, TimingLimits(reference_speed=True), limits
     ).timing
-    assert rests_at_ends(once)
-    assert rack_jobs().plan(once).timing is once
+    assert rests_at_ends(memoise)
+    assert rack_jobs().plan(memoise).timing is memoise
     assert rack_jobs().plan(rack_timing(), smoothing=0.0).timing is rack_timing()

@@ -12,7 +12,7 @@ from collections.abc import Callable
 import numpy as np
 
 from hybrid_opt.timing.model import PathMotion, TimingModel
-from studies.research.plain.motion import GRAVITY, angular_rates, rotation
+from studies.research.plain.motion import PLAIN_GRAVITY, angular_rates, rotation
 from symbolic.array import Array
 from symbolic.records import Workcell
 from tests.hybrid_opt.timing.convex_oracle import Affine, Program, Terms
@@ -73,7 +73,7 @@ def load_of(
     omega, alpha = angular_rates(pose[3:], rate[3:], acceleration[3:])
     c = R @ centre
     moved = acceleration[:3] + np.cross(alpha, c) + np.cross(omega, np.cross(omega, c))
-    force = mass * (moved + disturbance - GRAVITY)
+    force = mass * (moved + disturbance - PLAIN_GRAVITY)
     moment = inertia @ alpha + np.cross(omega, inertia @ omega)
     to_pad = (R @ workcell.contacts[0].T_box_pad[:3, :3]).T
     return np.concatenate([to_pad @ force, to_pad @ moment])

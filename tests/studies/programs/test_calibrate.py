@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hybrid_opt.calibrating.recording import Run
+from hybrid_opt.calibrating.recording import Recording
 from studies.calibrate import main
 from symbolic.read.cell import load
 from symbolic.records.cell import USUAL_UNCERTAINTY
@@ -137,10 +137,10 @@ def test_refusals_end_with_code_one(tmp_path: Path, capsys: pytest.CaptureFixtur
     made, short = run(0), run(0, LEVEL, SQUEEZES[:1])
     out = tmp_path / "cell.toml"
     untared = replace(made, labels=replace(made.labels, tare=()))
-    unheld = replace(short, labels=replace(short.labels, held=((900.0, 902.0),)))
+    static_hold_error = replace(short, labels=replace(short.labels, held=((900.0, 902.0),)))
     for recorded, said in (
         (untared, "refused: run.csv: missing tare"),
-        (unheld, "dropout: both arms recorded from 0.00 to"),
+        (static_hold_error, "dropout: both arms recorded from 0.00 to"),
     ):
         assert main([str(RACK), str(write(recorded, tmp_path)), "--out", str(out)]) == 1
         told = capsys.readouterr()
@@ -178,7 +178,7 @@ def put(old: str, new: str) -> Edit:
 def test_what_is_wrong_with_a_side_file_is_told(
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
-    write: Callable[[Run, Path], Path],
+    write: Callable[[Recording, Path], Path],
     change: Edit,
     message: str,
 ) -> None:

@@ -160,7 +160,7 @@ def test_verdicts_are_told_before_what_takes_longer(monkeypatch: pytest.MonkeyPa
 def test_text_and_json_say_the_same_of_a_short_polish_too(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(inspection, "POLISH_ATTEMPTS", 1)
+    monkeypatch.setattr(inspection, "SHORT_POLISH_ATTEMPTS", 1)
     arguments = [str(RACK), "--candidates", "100", "--no-pictures"]
     assert inspect.main([*arguments, "--polish"]) == 0
     said = capsys.readouterr()

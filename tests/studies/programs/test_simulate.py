@@ -11,8 +11,8 @@ from PIL import Image, ImageSequence
 
 from hybrid_opt import recommend, search
 from hybrid_opt.cell import Cell
+from hybrid_opt.simulation.reference import Control
 from hybrid_opt.store.trajectory_file import write_trajectory
-from hybrid_opt.witness.reference import Control
 from studies import simulate
 from studies.research import thresholds
 from tests.studies.programs.test_carries import TABLE, stored

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from hybrid_opt.store.files import to_json, write_json
-from hybrid_opt.sweeping import Combination, Sweep, stored_sweep
+from hybrid_opt.sweeping import Combination, Sweep, read_sweep
 from studies.programs import sweeping
 from studies.programs.sweeping import _figure, _table
 from studies.sweep import main
@@ -55,7 +55,7 @@ def test_a_sweep_is_stored_listed_and_drawn(tmp_path: Path) -> None:
     )
     done = Sweep("digest", {"mass": (8.0,), "friction": (0.5, 1.0)}, np.zeros(3), rows)
     write_json(tmp_path / "sweep.json", to_json(done))
-    assert repr(stored_sweep(tmp_path / "sweep.json")) == repr(done)
+    assert repr(read_sweep(tmp_path / "sweep.json")) == repr(done)
     assert "mass 8, friction 0.5: it cannot be held" in repr(done)
     assert _table(done).rows[1] == ("8", "1", "2.500", "90.0", "")
     left, right = _figure(done).axes

@@ -327,8 +327,8 @@ def test_fits_the_window_and_cuts_nothing(closed: Page, size: tuple[int, int]) -
     assert [name for name, hidden in shown if hidden > 1] == []
 
 
-def test_hostile_names_are_shown_as_text(closed: Page, once: Once, data: ReportData) -> None:
-    page = replace(closed, report=hostile_page(once, data))
+def test_hostile_names_are_shown_as_text(closed: Page, memoise: Once, data: ReportData) -> None:
+    page = replace(closed, report=hostile_page(memoise, data))
     page.open()
     assert page("window.broken") is None
     assert page.browser.title == HOSTILE

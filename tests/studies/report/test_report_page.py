@@ -76,7 +76,7 @@ def with_hostile_names(data: ReportData) -> ReportData:
     return replace(changed, branches=BranchCompetition((WINNER, SECOND), 200, "constant"))
 
 
-def hostile_page(once: Once, data: ReportData) -> Path:
+def hostile_page(memoise: Once, data: ReportData) -> Path:
     """The page of such a cell, with few trajectories and pictures of one point."""
 
     def make(folder: Path) -> None:
@@ -87,7 +87,7 @@ def hostile_page(once: Once, data: ReportData) -> Path:
             patch.setattr(generate, "files_of", lambda *_: {"png": point.getvalue()})
             write_report(folder, with_hostile_names(data), with_paper=True, pdf=False)
 
-    return once("hostile", make) / PAGE
+    return memoise("hostile", make) / PAGE
 
 
 @pytest.fixture(scope="module")
@@ -140,8 +140,8 @@ def test_the_policy_allows_exactly_the_pages_scripts(text: str) -> None:
     assert len(scripts) == 5
 
 
-def test_hostile_names_stay_text(once: Once, data: ReportData, text: str) -> None:
-    hostile = hostile_page(once, data).read_text("utf-8")
+def test_hostile_names_stay_text(memoise: Once, data: ReportData, text: str) -> None:
+    hostile = hostile_page(memoise, data).read_text("utf-8")
     assert HOSTILE not in hostile
     assert html.escape(HOSTILE) in hostile
     assert "Start branches 2 and 0, best of 2 pairs" in hostile

@@ -27,10 +27,10 @@ from hybrid_opt.display.solids import cell_solids
 from studies.program import ReportError
 from studies.report import PAGE, looks
 from studies.report.__main__ import main
-from studies.report.data import ReportData, Run
+from studies.report.data import ReportData, ReportRun
 from studies.report.drawing import (
     FRONT,
-    HAND_MADE,
+    HAND_MADE_STYLE,
     MAX_EDGE,
     SERIES,
     SIDE,
@@ -238,7 +238,7 @@ def test_tick_labels_of_narrow_fronts_do_not_overlap(hybrid_data: ReportData, sp
     def squeezed(points: Array) -> Array:
         return np.asarray(0.4133 + span * (points - points.min()) / np.ptp(points))
 
-    def moved(run: Run) -> Run:
+    def moved(run: ReportRun) -> ReportRun:
         front, hybrid = (replace(f, objectives=squeezed(f.objectives)) for f in run.fronts)
         return replace(run, front=front, hybrid=hybrid)
 
@@ -302,7 +302,7 @@ def luminance(colour: str) -> float:
 
 
 def test_looks_differ_without_colour() -> None:
-    looks = (HAND_MADE, *SERIES)
+    looks = (HAND_MADE_STYLE, *SERIES)
     assert len({str(look.line) for look in looks}) == len(looks)
     assert len({look.marker for look in looks}) == len(looks)
     # Contrast of 2 in luminance is seen side by side: of the paper's two algorithms.

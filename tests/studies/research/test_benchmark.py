@@ -88,9 +88,9 @@ def test_derived_tasks_keep_the_ends_and_stay_on_the_trajectory(count: int) -> N
 def test_measures_the_rack_and_keeps_its_promises(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(costs, "SAMPLES", (25, 50, 100))
+    monkeypatch.setattr(costs, "SAMPLE_COUNTS", (25, 50, 100))
     monkeypatch.setattr(costs, "WAYPOINTS", (1, 3))
-    monkeypatch.setattr(turns, "EVALUATIONS", 200)
+    monkeypatch.setattr(turns, "TIMED_EVALUATIONS", 200)
     arguments = [str(RACK), "--json", "--candidates", "5", "--repeats", "2"]
     assert benchmark.main(arguments) == 0
     result: dict[str, Any] = json.loads(capsys.readouterr().out)

@@ -19,8 +19,8 @@ from hybrid_opt.proposing.via_points import travelled
 from studies.research.benchmarks import baxter, machines, measuring, shelves, slot
 from studies.research.benchmarks.__main__ import main
 from studies.research.benchmarks.measuring import (
+    BenchmarkSource,
     Length,
-    Source,
     TaskResult,
     checks_per_second,
     measured,
@@ -99,7 +99,7 @@ SLOT = "models/scene_slot_gate.xml"
 
 
 def test_the_shelves_become_problems_of_this_project(folder: Path) -> None:
-    given = shelves.SOURCE.benchmark(folder)
+    given = shelves.SHELVES_SOURCE.benchmark(folder)
     assert [task.name for task in given.tasks] == [
         "top to middle",
         "middle to bottom",
@@ -151,24 +151,24 @@ def test_the_elbow_turns_about_shoulder_and_wrist() -> None:
 @pytest.mark.parametrize(
     ("source", "file", "text", "told"),
     [
-        (shelves.SOURCE, "notebooks/main.ipynb", "{", "main.ipynb "),
-        (shelves.SOURCE, "notebooks/main.ipynb", '{"cells": 3}', "main.ipynb "),
+        (shelves.SHELVES_SOURCE, "notebooks/main.ipynb", "{", "main.ipynb "),
+        (shelves.SHELVES_SOURCE, "notebooks/main.ipynb", '{"cells": 3}', "main.ipynb "),
         (
-            shelves.SOURCE,
+            shelves.SHELVES_SOURCE,
             "notebooks/main.ipynb",
             '{"cells": [{"source": ["q_tilde_top = np.array([1])"]}]}',
             "main.ipynb ",
         ),
-        (shelves.SOURCE, "notebooks/other.ipynb", "{}", "bimanual"),
-        (slot.SOURCE, SLOT, "<mujoco><worldbody/></mujoco>", "no bodies that stand"),
-        (slot.SOURCE, SLOT, GATE.replace("0.32 0.07 0.1", "0.32 x"), "three numbers"),
-        (slot.SOURCE, SLOT, "<mujoco", "slot"),
-        (machines.SOURCE, "none", "", "dual_ur10e.urdf is not there"),
+        (shelves.SHELVES_SOURCE, "notebooks/other.ipynb", "{}", "bimanual"),
+        (slot.SLOT_SOURCE, SLOT, "<mujoco><worldbody/></mujoco>", "no bodies that stand"),
+        (slot.SLOT_SOURCE, SLOT, GATE.replace("0.32 0.07 0.1", "0.32 x"), "three numbers"),
+        (slot.SLOT_SOURCE, SLOT, "<mujoco", "slot"),
+        (machines.MACHINES_SOURCE, "none", "", "dual_ur10e.urdf is not there"),
         (baxter.source(1, 3), "none", "", "baxter: cannot be read"),
     ],
 )
 def test_what_is_not_theirs_is_refused(
-    source: Source, file: str, text: str, told: str, tmp_path: Path
+    source: BenchmarkSource, file: str, text: str, told: str, tmp_path: Path
 ) -> None:
     path = tmp_path / source.room / file
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -188,7 +188,7 @@ def test_the_program_says_how_to_get_files(capsys: pytest.CaptureFixture[str]) -
 
 
 def test_a_task_without_a_carry_says_why(folder: Path) -> None:
-    given = shelves.SOURCE.benchmark(folder)
+    given = shelves.SHELVES_SOURCE.benchmark(folder)
     task = given.tasks[0]
     task.problem["task"]["goal"][2] = 0.3
     task = replace(task, name="top to middle, 0.1 m/s")  # no folder of that name
@@ -198,7 +198,7 @@ def test_a_task_without_a_carry_says_why(folder: Path) -> None:
 
 
 def test_the_table_has_figures_where_there_are_some(folder: Path) -> None:
-    given = shelves.SOURCE.benchmark(folder)
+    given = shelves.SHELVES_SOURCE.benchmark(folder)
     some = TaskResult(given.tasks[0], "", True, None, 12.0, 20.0, Length(3.0, 2.1))
     rows = table(given, [some], RNG).rows
     assert rows[0][:7] == ("top to middle", "12.0", "20.0", "3.00", "2.10", "1.88", "2.09")
@@ -213,7 +213,7 @@ def test_machines_are_problems_whose_box_stands_clear_of_the_post(tmp_path: Path
     for file in (machines.UR10E, machines.PANDAS):
         (tmp_path / file).parent.mkdir(parents=True)
         (tmp_path / file).touch()
-    given = machines.SOURCE.benchmark(tmp_path)
+    given = machines.MACHINES_SOURCE.benchmark(tmp_path)
     assert len(given.tasks) == 4
     for task in given.tasks:
         half = np.array(task.problem["payload"]["size"]) / 2.0
@@ -250,7 +250,7 @@ def test_baxters_box_ends_on_the_board_that_the_left_hand_reaches_over(
         "</joint>"
         for side, axis, height in (("left", "s0", 0.12), ("right", "s0", 0.43))
     )
-    there = tmp_path / baxter.ROOM
+    there = tmp_path / baxter.RESOURCES
     scenes = there / "problems" / "bookshelf_tall_both_arms_easy_baxter"
     scenes.mkdir(parents=True)
     (there / "baxter.urdf").write_text(f'<robot name="b"><link name="base"/>{slides}</robot>')
@@ -262,7 +262,7 @@ def test_baxters_box_ends_on_the_board_that_the_left_hand_reaches_over(
     (scenes / "request0001.yaml").write_text(text)
     (scenes / "scene0001.yaml").write_text(SCENE)
     monkeypatch.setattr(baxter, "SCENES", 1)
-    monkeypatch.setattr(baxter, "KINDS", ("easy",))
+    monkeypatch.setattr(baxter, "DIFFICULTIES", ("easy",))
     (task,) = baxter.source(1, 3).benchmark(tmp_path).tasks
     begins, ends = (task.problem["task"][end][:3] for end in ("start", "goal"))
     np.testing.assert_allclose(begins, [baxter.BEFORE[0], 0.1, baxter.BEFORE[1]])
@@ -281,7 +281,7 @@ def test_the_slot_becomes_a_problem_within_their_limits(tmp_path: Path) -> None:
     scene = tmp_path / "slot" / "models" / "scene_slot_gate.xml"
     scene.parent.mkdir(parents=True)
     scene.write_text(GATE, encoding="utf-8")
-    given = slot.SOURCE.benchmark(tmp_path)
+    given = slot.SLOT_SOURCE.benchmark(tmp_path)
     assert [task.seconds for task in given.tasks] == [7.60, 7.60, 8.96]
     model = mujoco.MjModel.from_xml_string(GATE.replace('<include file="workcell.xml"/>', ""))
     data = mujoco.MjData(model)
@@ -306,9 +306,9 @@ def test_the_slot_becomes_a_problem_within_their_limits(tmp_path: Path) -> None:
         numbers = panda.createData()
         pin.framesForwardKinematics(panda, numbers, np.array([*q, 0.0, 0.0]))
         flange = robot.T_world_base @ numbers.oMf[panda.getFrameId("panda_link8")].homogeneous
-        pad = flange @ np.array([0.0, 0.0, slot.PAD, 1.0])
+        pad = flange @ np.array([0.0, 0.0, slot.SLOT_PAD, 1.0])
         np.testing.assert_allclose(
-            pad[:3], np.add(slot.START[:3], contact.T_box_pad[:3, 3]), atol=2e-4
+            pad[:3], np.add(slot.SLOT_START[:3], contact.T_box_pad[:3, 3]), atol=2e-4
         )
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from studies.research.logged_carries import CROSSTALK, FRICTION, TOOL, compared, read
+from studies.research.logged_carries import CROSSTALK, STATED_FRICTION, TOOL, compared, read
 from studies.research.real_runs import main
 from symbolic.array import Array
 
@@ -146,7 +146,7 @@ def test_what_was_planted_is_read(tmp_path: Path, write: Callable[[Path], Path])
     found = compared(carry)
     np.testing.assert_allclose(found.squeeze, SQUEEZE, rtol=1e-3)
     weight = MASS * (9.81 + rise(found.time, 2))
-    for k, friction in enumerate(FRICTION):
+    for k, friction in enumerate(STATED_FRICTION):
         np.testing.assert_allclose(found.need[:, k], weight / 2.0 / friction, rtol=2e-3)
     np.testing.assert_allclose(found.used, np.hypot(weight / 2.0, OPPOSED) / SQUEEZE, rtol=5e-3)
     np.testing.assert_allclose(found.margin, SQUEEZE / found.need[:, 0], rtol=1e-3)

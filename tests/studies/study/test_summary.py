@@ -42,7 +42,7 @@ from studies.study.simulation import (
     wanted_carries,
 )
 from studies.study.summary import (
-    FIGURES,
+    SUMMARISED_FIGURES,
     TESTED,
     CampaignSummary,
     ReplicaFigures,
@@ -119,7 +119,7 @@ PAIR = np.array([50.0, 51.25])
 LEAST = np.array([40.0, 41.0])
 SELECTED = SelectedEntry(1, None, np.array([0.4, 0.6]), PAIR, LEAST, PAIR - 50.0, 16.5, 3.0)
 PLAIN = ReplicaFigures(
-    **dict.fromkeys(FIGURES, 0.5) | {"feasible": 5, "non_dominated": 2},  # type: ignore[arg-type]
+    **dict.fromkeys(SUMMARISED_FIGURES, 0.5) | {"feasible": 5, "non_dominated": 2},  # type: ignore[arg-type]
     selected=SELECTED,
     replica=0,
     evaluations=10,

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from codegen.lanes import lane_text
 from codegen.source import generated_c
-from studies.research.plain.motion import GRAVITY, angular_rates, rotation, sample_load
+from studies.research.plain.motion import PLAIN_GRAVITY, angular_rates, rotation, sample_load
 from symbolic.array import Array
 from symbolic.contact.load import load_function
 from symbolic.contact.paper import allocate, normal_force_branches
@@ -271,7 +271,7 @@ def needed(cell: Workcell, pose: Array, rate: Array, second: Array) -> tuple[Arr
     acceleration = second[:3] + np.cross(alpha, c) + np.cross(omega, np.cross(omega, c))
     inertia = R @ payload.inertia @ R.T
     moment = inertia @ alpha + np.cross(omega, inertia @ omega)
-    return payload.mass * (acceleration - GRAVITY), moment, c
+    return payload.mass * (acceleration - PLAIN_GRAVITY), moment, c
 
 
 def box_load(cell: Workcell, motion: tuple[Array, Array, Array]) -> Array:

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hybrid_opt.errors import WitnessError
+from hybrid_opt.errors import SimulationError
 from hybrid_opt.proposing.problem import read_problem
-from hybrid_opt.witness.arms import CellWitness
+from hybrid_opt.simulation.arms import CellSimulation
 from symbolic.errors import OutsideError, WorkcellError
 from symbolic.read.arms import RobotModelWarning, _warn_left_out
 from symbolic.read.cell import load
@@ -108,8 +108,8 @@ def test_arms_of_unknown_torques_are_not_simulated() -> None:
     cell = load(RACK)
     unknown = [replace(robot, torque_max=np.full(6, np.inf)) for robot in cell.robots]
     free = replace(cell, robots=(unknown[0], unknown[1]))
-    with pytest.raises(WitnessError, match="torque_max, which is unknown"):
-        CellWitness(free)
+    with pytest.raises(SimulationError, match="torque_max, which is unknown"):
+        CellSimulation(free)
 
 
 def test_fast_wrists_and_light_squeezes_are_no_other_units(tmp_path: Path) -> None:

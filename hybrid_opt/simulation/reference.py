@@ -19,20 +19,20 @@ import pinocchio as pin
 
 from hybrid_opt.carry import Carry, joints_of
 from hybrid_opt.cell import Cell
-from hybrid_opt.errors import WitnessError
+from hybrid_opt.errors import SimulationError
 from hybrid_opt.job.smooth import driven_timing, without_jumps
 from hybrid_opt.robust.squeeze import Squeeze, SqueezeSettings, commanded_forces
+from hybrid_opt.simulation.box import refuse_motion_at_ends
+from hybrid_opt.simulation.scene import ArmSettings
 from hybrid_opt.timing.jerk import applicable_jerk_limits
 from hybrid_opt.timing.records import Timing
-from hybrid_opt.witness.box import refuse_motion_at_ends
-from hybrid_opt.witness.scene import ArmSettings
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.records import Workcell
 from symbolic.records.poses import box_rotation, inverse
 from symbolic.robot.model import build_robot_model
 
-SETTLE = 0.3
+REST_TIME = 0.3
 """Time at rest before a carry begins [s]."""
 
 STANDS = 0.1
@@ -153,7 +153,7 @@ def carry_reference(
     extra = np.zeros_like(planned) if press is None else press - planned
     begin = float(carry.time[0])
     motion = JointMotion(
-        time=np.concatenate([[begin - SETTLE, begin], carry.time]),
+        time=np.concatenate([[begin - REST_TIME, begin], carry.time]),
         q=_with_rest(carry.q, 1.0),
         q_rate=_with_rest(carry.stack_arms("q_rate"), 0.0),
         q_second=_with_rest(carry.stack_arms("q_second"), 0.0),
@@ -182,8 +182,8 @@ def carry_reference(
     job = BoxJob(
         start=carry.pose[0],
         goal=carry.pose[-1, :3],
-        held=(begin - SETTLE / 2.0, float(carry.time[-1])),
-        stands=begin - SETTLE + STANDS,
+        held=(begin - REST_TIME / 2.0, float(carry.time[-1])),
+        stands=begin - REST_TIME + STANDS,
     )
     effort = own + torque + pressing * repeated
     return Reference(workcell, motion, normal_force, effort, pressing, job, leader)
@@ -375,7 +375,7 @@ def exported_carry(cell: Cell, timing: Timing) -> Carry:
         JobError: there is none without jumps of acceleration.
     """
     if not timing.ok or timing.carry is None:
-        raise WitnessError(f"the trajectory cannot be driven: {timing.reason}")
+        raise SimulationError(f"the trajectory cannot be driven: {timing.reason}")
     jerk = applicable_jerk_limits(cell.workcell, timing.limits)
     found = without_jumps(cell.timing_model, timing, jerk).carry
     assert found is not None, "a timing without jumps has a carry"

@@ -17,7 +17,7 @@ from hybrid_opt.front import Front
 from hybrid_opt.metaheuristics.registry import make
 from hybrid_opt.metaheuristics.run import SearchSettings, search_carries
 from hybrid_opt.polishing.settings import PolishSettings
-from hybrid_opt.progress import ShowProgress, counted
+from hybrid_opt.progress import ShowProgress, progress_bar
 from hybrid_opt.store.trajectory_file import write_trajectory
 from hybrid_opt.timing.analysis import TimedTrajectory, time_trajectory
 from hybrid_opt.timing.jerk import time_with_jerk as solve_with_jerk
@@ -58,7 +58,7 @@ def search(
     cell.require_hold()
     if settings.initial is None and algorithm != "random":
         settings = replace(settings, initial=cell.initial[None])
-    with counted(progress, algorithm, evaluations) as advance:
+    with progress_bar(progress, algorithm, evaluations) as advance:
         found, _ = search_carries(
             cell.evaluator, algorithm, evaluations, rng, settings, advance, cell.workcell.task
         )
@@ -129,7 +129,7 @@ def time_with_jerk(
     return solve_with_jerk(cell.timing_model, decision_of(carry), limits or TimingLimits(), jerk)
 
 
-def time_every_way(
+def compare_timings(
     cell: Cell,
     carry: Carry | Array,
     *,
@@ -172,7 +172,7 @@ def fastest_carry(cell: Cell, evaluations: int, rng: np.random.Generator) -> Car
     return polish(found, rng=rng).lowest("duration")
 
 
-def compared_classes(
+def rank_homotopy_classes(
     proposals: Sequence[Proposal],
     evaluations: int,
     rng: np.random.Generator,

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 import hybrid_opt as ho
-from hybrid_opt import door
+from hybrid_opt import api
 from hybrid_opt.bundles.bundle import read_manifest
 from hybrid_opt.campaign.candidates import decode
 from hybrid_opt.campaign.search_stage import SearchRequest, search_replica
@@ -181,7 +181,7 @@ def test_a_carry_is_timed_and_exported(tmp_path: Path) -> None:
     told = read_manifest(folder)["files"]
     assert {folder / name for name in told} == set(files) - {folder / "manifest.json"}
     assert told == {name: sha256((folder / name).read_bytes()) for name in told}
-    every = ho.time_every_way(cell(), carry.x, force_limit=52.0)
+    every = ho.compare_timings(cell(), carry.x, force_limit=52.0)
     assert every.timings["force limited"].duration == pytest.approx(timing.duration)
 
 
@@ -265,11 +265,11 @@ def test_the_fastest_class_comes_first(monkeypatch: pytest.MonkeyPatch) -> None:
             raise SettingsError("no carry that holds")
         return SimpleNamespace(duration=seconds, peak_normal_force=np.array([[30.0, 31.25]]))
 
-    monkeypatch.setattr(door, "Cell", SimpleNamespace(load=load))
-    monkeypatch.setattr(door, "fastest_carry", fastest)
+    monkeypatch.setattr(api, "Cell", SimpleNamespace(load=load))
+    monkeypatch.setattr(api, "fastest_carry", fastest)
     given = [proposal(side) for side in ("right of post", "over post", "left of post")]
     told: list[str] = []
-    found, table = door.compared_classes(given, 300, np.random.default_rng(1), told.append)
+    found, table = api.rank_homotopy_classes(given, 300, np.random.default_rng(1), told.append)
     assert told == [f"study of carry {k} of 3" for k in (1, 2, 3)]
     assert [one.sides[0] for one in found] == ["left of post", "over post", "right of post"]
     assert table.rows[0] == ("left of post", "1 and 0", "4.00", "1.50", "31.2")

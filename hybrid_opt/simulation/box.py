@@ -20,8 +20,8 @@ from scipy.spatial.transform import Rotation
 
 from hybrid_opt.carry import Carry
 from hybrid_opt.cell import Cell
-from hybrid_opt.errors import WitnessError
-from hybrid_opt.witness.scene import (
+from hybrid_opt.errors import SimulationError
+from hybrid_opt.simulation.scene import (
     CARRIAGE_MASS,
     PAD_MASS,
     SimulationSettings,
@@ -42,7 +42,7 @@ BEGINS = 0.05
 SAME_TIME = 1e-9
 """Samples closer than this stand for both sides of one instant [s]."""
 
-LOOKED_AT = 2e-3
+SLIP_INTERVAL = 2e-3
 """Time between two looks at the slip [s]."""
 
 RIM_POINTS = 8
@@ -115,7 +115,7 @@ def bisected(
     slips, holds = simulate(low), simulate(high)
     if slips.holds or not holds.holds:
         what = f"holds at {low:g}" if slips.holds else f"slips at {high:g}"
-        raise WitnessError(f"the box {what} times the force; give other factors")
+        raise SimulationError(f"the box {what} times the force; give other factors")
     for _ in range(steps):
         middle = simulate((slips.factor + holds.factor) / 2.0)
         slips, holds = (slips, middle) if middle.holds else (middle, holds)
@@ -131,7 +131,9 @@ def mujoco_module() -> ModuleType:
     try:
         import mujoco
     except ImportError as error:
-        raise WitnessError("MuJoCo is not installed: pip install 'dual-arm-carry[sim]'") from error
+        raise SimulationError(
+            "MuJoCo is not installed: pip install 'dual-arm-carry[sim]'"
+        ) from error
     module: ModuleType = mujoco
     return module
 
@@ -145,7 +147,7 @@ class HeldBox:
     """
 
     def __init__(self, model: Any, data: Any, workcell: Workcell) -> None:
-        """Find pads and box in a model of `hybrid_opt.witness.scene`."""
+        """Find pads and box in a model of `hybrid_opt.simulation.scene`."""
         self.sites = [int(model.site(f"pad_{i + 1}").id) for i in (0, 1)]
         self.box = int(model.body("box").id)
         self._data = data
@@ -286,7 +288,7 @@ def refuse_motion_at_ends(carry: Carry) -> None:
         raise SettingsError("the carry does not start and end at rest; give one with a timing")
 
 
-class Witness:
+class BoxSimulation:
     """The box of one workcell between its pads.
 
     Attributes:
@@ -324,7 +326,7 @@ class Witness:
         tilts = [[int(model.joint(name).dofadr[0]) for name in tilt_names(i)] for i in driven]
         data.qpos[box : box + 7] = drive.pose[0]
         force = factor * drive.press + drive.own
-        every = max(1, round(LOOKED_AT / settings.time_step))
+        every = max(1, round(SLIP_INTERVAL / settings.time_step))
         time, slip, turn = [], [], []
         for k in range(len(drive.time)):
             data.qpos[:7], data.qvel[:6] = drive.pose[k], drive.velocity[k]

@@ -14,11 +14,9 @@ pytest.importorskip("mujoco")
 import mujoco
 
 from hybrid_opt.robust.cases import nominal_case
-from hybrid_opt.timing.records import TimingLimits
-from hybrid_opt.timing.solve import time_path
-from hybrid_opt.witness.arms import CellWitness
-from hybrid_opt.witness.box import workcell_of_case
-from hybrid_opt.witness.reference import (
+from hybrid_opt.simulation.arms import CellSimulation
+from hybrid_opt.simulation.box import workcell_of_case
+from hybrid_opt.simulation.reference import (
     BoxJob,
     Control,
     JointMotion,
@@ -28,7 +26,9 @@ from hybrid_opt.witness.reference import (
     press_torque,
     with_tracking_error,
 )
-from hybrid_opt.witness.scene import ArmSettings, joint_names
+from hybrid_opt.simulation.scene import ArmSettings, joint_names
+from hybrid_opt.timing.records import TimingLimits
+from hybrid_opt.timing.solve import time_path
 from studies.research.plain.arm import PlainArm
 from symbolic.array import Array
 from symbolic.errors import SettingsError
@@ -67,7 +67,7 @@ def standing(
     return replace(reference, effort=reference.effort + np.concatenate(lifting))
 
 
-def placed(witness: CellWitness, q: Array) -> Any:
+def placed(witness: CellSimulation, q: Array) -> Any:
     """The simulator's data where both arms' joints are at q (all joints,) [rad]."""
     data = mujoco.MjData(witness.model)
     for name, value in zip(joint_names(witness.workcell), q, strict=True):
@@ -76,7 +76,9 @@ def placed(witness: CellWitness, q: Array) -> Any:
     return data
 
 
-def pad_jacobian(cell: Workcell, witness: CellWitness, q: Array, pad: int, axis: int = 2) -> Array:
+def pad_jacobian(
+    cell: Workcell, witness: CellSimulation, q: Array, pad: int, axis: int = 2
+) -> Array:
     """(all joints,) of the pad's motion along one of its axes."""
     data = placed(witness, q)
     linear, angular = np.zeros((2, 3, witness.model.nv))
@@ -89,7 +91,7 @@ def pad_jacobian(cell: Workcell, witness: CellWitness, q: Array, pad: int, axis:
 
 def test_pads_press_with_the_torques_of_the_simulators_jacobian() -> None:
     cell, rng = hand_cell(), np.random.default_rng(1)
-    witness = CellWitness(cell)
+    witness = CellSimulation(cell)
     for q in np.concatenate(start_posture(cell)) + rng.uniform(-0.5, 0.5, (5, 12)):
         both = sum(pad_jacobian(cell, witness, q, pad) for pad in (0, 1))
         np.testing.assert_allclose(press_torque(cell, q[None])[0], both, atol=1e-12)
@@ -98,7 +100,7 @@ def test_pads_press_with_the_torques_of_the_simulators_jacobian() -> None:
 def test_pads_are_where_the_arms_hold_the_box() -> None:
     cell = hand_cell()
     posture = start_posture(cell)
-    data = placed(CellWitness(cell), np.concatenate(posture))
+    data = placed(CellSimulation(cell), np.concatenate(posture))
     for i, (robot, contact) in enumerate(zip(cell.robots, cell.contacts, strict=True)):
         in_root = PlainArm(robot, contact).place(posture[i]).homogeneous
         T_world_flange = robot.T_world_base @ in_root
@@ -110,7 +112,7 @@ def test_pads_are_where_the_arms_hold_the_box() -> None:
 def test_a_box_at_rest_slips_below_the_least_force(control: Control) -> None:
     """N = m g / (2 mu), arms and controllers included."""
     cell = hand_cell()
-    witness, reference = CellWitness(cell), standing(cell, seconds=1.0)
+    witness, reference = CellSimulation(cell), standing(cell, seconds=1.0)
     assert not witness.simulate(reference, control, 0.97).holds
     outcome = witness.simulate(reference, control, 1.03)
     assert outcome.holds
@@ -125,7 +127,7 @@ def test_what_is_fed_forward_holds_the_arms_without_error() -> None:
     forward, the box gives way at the stiffness."""
     cell = hand_cell()
     errors = [
-        np.abs(CellWitness(cell).simulate(reference, "impedance").tracking_error[-1]).max()
+        np.abs(CellSimulation(cell).simulate(reference, "impedance").tracking_error[-1]).max()
         for reference in (
             standing(cell, 0.0, 0.1, carries=False),
             standing(cell, 2.0 * LEAST, 1.0),
@@ -140,7 +142,7 @@ def test_what_is_fed_forward_holds_the_arms_without_error() -> None:
 def test_a_softer_arm_sags_more() -> None:
     cell = hand_cell()
     found = [
-        CellWitness(cell, ArmSettings(stiffness=stiffness))
+        CellSimulation(cell, ArmSettings(stiffness=stiffness))
         .simulate(standing(cell, 2.0 * LEAST, 1.0, carries=False), "impedance")
         .tracking_error[-1]
         for stiffness in (25.0, 50.0)
@@ -162,7 +164,7 @@ def test_force_control_takes_what_a_wrong_reference_adds() -> None:
         for _ in range(5):
             q[:, part] = arm.newton_step(q[0, part], target)
     nearer = replace(reference, motion=replace(reference.motion, q=q))
-    witness = CellWitness(cell)
+    witness = CellSimulation(cell)
     excess = {
         control: witness.simulate(nearer, control).normal_force[-1].mean() / (1.5 * LEAST) - 1.0
         for control in get_args(Control)
@@ -174,7 +176,7 @@ def test_force_control_takes_what_a_wrong_reference_adds() -> None:
 def test_what_pushes_the_box_along_the_normal_moves_it_by_the_weak_springs_alone() -> None:
     """3 N against two springs of 2 N/mm, however long both arms control their forces."""
     cell = hand_cell()
-    witness = CellWitness(cell, disturbance=(0.0, 0.3, 0.0))
+    witness = CellSimulation(cell, disturbance=(0.0, 0.3, 0.0))
     outcome = witness.simulate(standing(cell, 1.5 * LEAST, 2.0), "both")
     assert outcome.holds
     moved = outcome.box_position[-1, 1] - outcome.box_position[0, 1]
@@ -186,11 +188,11 @@ def test_the_simulated_case_differs_from_what_the_arms_were_told() -> None:
     reference = standing(cell, 1.1 * LEAST)
     case = nominal_case(cell)
     case[0:2] *= 0.85
-    assert not CellWitness(workcell_of_case(cell, case)).simulate(reference).holds
-    assert not CellWitness(cell, disturbance=(0.0, 0.0, 2.0)).simulate(reference).holds
+    assert not CellSimulation(workcell_of_case(cell, case)).simulate(reference).holds
+    assert not CellSimulation(cell, disturbance=(0.0, 0.0, 2.0)).simulate(reference).holds
     case = nominal_case(cell)
     case[11:15] = [0.004, 0.0, 0.004, 0.0]
-    outcome = CellWitness(workcell_of_case(cell, case)).simulate(reference)
+    outcome = CellSimulation(workcell_of_case(cell, case)).simulate(reference)
     assert outcome.holds
     moved = cell.contacts[0].T_box_pad[:3, :2] @ [0.004, 0.0]
     start = reference.job.start[:3]
@@ -213,7 +215,7 @@ def test_tracking_errors_begin_at_zero_and_stay_small() -> None:
 def test_arms_that_push_against_one_another_do_so_along_the_faces() -> None:
     """By the simulator's Jacobians: the forces of both arms cancel, and press nowhere."""
     cell = hand_cell()
-    witness, reference = CellWitness(cell), standing(cell)
+    witness, reference = CellSimulation(cell), standing(cell)
     pushed = with_tracking_error(reference, 0.0, np.random.default_rng(1), 7.0)
     more = (pushed.effort - reference.effort)[0]
     forces = []
@@ -259,11 +261,11 @@ def test_a_carrys_references_are_the_planners_torques_but_for_moments() -> None:
 
 
 def test_joints_that_slide_do_so_and_both_arms_ride_on_one_lift(tmp_path: Path) -> None:
-    witness = CellWitness(rack_on_rail(tmp_path, 0.1))
+    witness = CellSimulation(rack_on_rail(tmp_path, 0.1))
     kinds = [int(witness.model.joint(name).type[0]) for name in joint_names(witness.workcell)]
     slides, turns = mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE
     assert kinds == [slides] + 12 * [turns]
-    lift = CellWitness(machine_on_lift(tmp_path, 0.2, free=True))
+    lift = CellSimulation(machine_on_lift(tmp_path, 0.2, free=True))
     data = mujoco.MjData(lift.model)
     first, second = (int(lift.model.joint(f"joint_{i}_1").dofadr[0]) for i in (1, 2))
     data.qfrc_applied[first] = 500.0  # of the first copy alone

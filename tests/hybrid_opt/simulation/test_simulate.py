@@ -13,14 +13,14 @@ import pytest
 
 from hybrid_opt.carry import Carry
 from hybrid_opt.cell import Cell
-from hybrid_opt.errors import WitnessError
+from hybrid_opt.errors import SimulationError
 from hybrid_opt.robust.cases import nominal_case
 from hybrid_opt.robust.force import robust_model
 from hybrid_opt.robust.squeeze import SqueezeSettings, commanded_forces
-from hybrid_opt.witness.arms import Account, CellWitness
-from hybrid_opt.witness.box import Witness, bisected, drive_of, workcell_of_case
-from hybrid_opt.witness.reference import driven_carry, pressed_reference
-from hybrid_opt.witness.scene import (
+from hybrid_opt.simulation.arms import Account, CellSimulation
+from hybrid_opt.simulation.box import BoxSimulation, bisected, drive_of, workcell_of_case
+from hybrid_opt.simulation.reference import driven_carry, pressed_reference
+from hybrid_opt.simulation.scene import (
     SimulationSettings,
     compiled,
     patch_area,
@@ -33,7 +33,7 @@ from symbolic.contact.load import load_function
 from symbolic.errors import SettingsError
 from symbolic.records import Uncertainty, Workcell
 from tests.hybrid_opt.cells import shipped
-from tests.hybrid_opt.witness.carries import carry_along, least_forces
+from tests.hybrid_opt.simulation.carries import carry_along, least_forces
 from tests.symbolic.cells import (
     call,
     hand_cell,
@@ -58,13 +58,13 @@ def threshold(
     disturbance: Array = STILL[:3],
     moments: Array | None = None,
 ) -> float:
-    witness = Witness(carry.workcell, settings, disturbance)
+    witness = BoxSimulation(carry.workcell, settings, disturbance)
     drive = drive_of(carry, witness.settings, leader=leader, moments=moments)
     return bisected(partial(witness.simulate, drive), 0.9, 1.1, 5).factor
 
 
-def of_case(carry: Carry, case: Array) -> Witness:
-    return Witness(workcell_of_case(carry.workcell, case), disturbance=case[8:11])
+def of_case(carry: Carry, case: Array) -> BoxSimulation:
+    return BoxSimulation(workcell_of_case(carry.workcell, case), disturbance=case[8:11])
 
 
 @pytest.mark.parametrize("settings", [SimulationSettings(), DRIVEN])
@@ -78,7 +78,7 @@ def test_a_box_at_rest_slips_below_the_least_force(
 
 def test_moments_that_oppose_one_another_move_pressures_not_the_box() -> None:
     carry = planned(STILL)
-    witness, turned = Witness(carry.workcell, DRIVEN), []
+    witness, turned = BoxSimulation(carry.workcell, DRIVEN), []
     for moment in (0.0, 0.5, 1.0):
         # About the box's z axis: the pressure moves to one side of both pads.
         moments = np.tile([[0.0, 0.0, moment], [0.0, 0.0, -moment]], (len(carry) + 1, 1, 1))
@@ -185,7 +185,7 @@ def test_a_turning_box_stays_with_its_pads_when_pressed_well() -> None:
     path = np.array([0.05, 0.03, 0.05, 0.2, -0.15, 0.3])
     carry = carry_along(hand_cell(), path, 0.8)
     carry = replace(carry, normal_force=np.full((len(carry), 2), 120.0))
-    witness = Witness(carry.workcell)
+    witness = BoxSimulation(carry.workcell)
     outcome = witness.simulate(drive_of(carry, witness.settings))
     assert outcome.holds
     assert outcome.time[-1] == pytest.approx(carry.duration, abs=3e-3)
@@ -196,7 +196,7 @@ def test_a_turning_box_stays_with_its_pads_when_pressed_well() -> None:
 
 def test_too_little_force_is_told_with_pad_and_time() -> None:
     carry = planned(STILL)
-    witness = Witness(carry.workcell)
+    witness = BoxSimulation(carry.workcell)
     outcome = witness.simulate(drive_of(carry, witness.settings), 0.5)
     assert not outcome.holds
     assert outcome.begins(1e-3) <= outcome.time[-1]
@@ -235,9 +235,9 @@ def test_a_case_moves_pads_and_mass() -> None:
 
 def test_misuse_is_told() -> None:
     carry = planned(STILL)
-    witness = Witness(carry.workcell)
+    witness = BoxSimulation(carry.workcell)
     drive = drive_of(carry, witness.settings)
-    with pytest.raises(WitnessError, match=r"holds at 1\.5"):
+    with pytest.raises(SimulationError, match=r"holds at 1\.5"):
         bisected(partial(witness.simulate, drive), 1.5, 2.0, 1)
     with pytest.raises(SettingsError, match="time step"):
         SimulationSettings(time_step=0.01)
@@ -251,8 +251,8 @@ def test_misuse_is_told() -> None:
 
 def test_without_the_simulator_it_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "mujoco", None)
-    with pytest.raises(WitnessError, match="pip install"):
-        Witness(hand_cell())
+    with pytest.raises(SimulationError, match="pip install"):
+        BoxSimulation(hand_cell())
 
 
 def at_rest(cell: Workcell) -> tuple[Carry, Array]:
@@ -282,7 +282,7 @@ def test_the_planned_forces_are_the_least_of_pads_that_the_planned_moments_drive
     cell = with_payload(shipped(name).workcell, centre_of_mass=np.array(centre_of_mass))
     carry, moments = at_rest(cell)
     settings = SimulationSettings(pads="driven")
-    witness, drive = Witness(cell, settings), drive_of(carry, settings, moments=moments)
+    witness, drive = BoxSimulation(cell, settings), drive_of(carry, settings, moments=moments)
     assert not witness.simulate(drive, 0.98).holds
     assert witness.simulate(drive, 1.02).holds
 
@@ -290,7 +290,7 @@ def test_the_planned_forces_are_the_least_of_pads_that_the_planned_moments_drive
 def test_a_box_that_many_points_hold_stays() -> None:
     """Steps that are not solved to their last digits would let it drift by 0.05 mm."""
     carry, _ = at_rest(shipped("fork").workcell)
-    witness = Witness(carry.workcell, SimulationSettings(points=91))
+    witness = BoxSimulation(carry.workcell, SimulationSettings(points=91))
     outcome = witness.simulate(drive_of(carry, witness.settings), 1.2)
     assert outcome.slip.max() < 1e-5
 
@@ -313,7 +313,7 @@ def hand_made() -> tuple[Cell, Carry]:
 def test_a_carry_is_driven_as_its_time_law_says() -> None:
     cell, closest = hand_made()
     assert np.abs(closest.rate[[0, -1]]).max() < 1e-6
-    with pytest.raises(WitnessError, match="cannot be driven"):
+    with pytest.raises(SimulationError, match="cannot be driven"):
         driven_carry(cell, cell.initial + 5.0)
 
 
@@ -322,7 +322,7 @@ def test_forces_beside_what_was_told_are_stored_from_the_carrys_beginning() -> N
     cell, carry = hand_made()
     pressed, squeeze = pressed_reference(cell, carry)
     assert squeeze.factor is None
-    shown = CellWitness(cell.workcell).simulate(pressed, "leader")
+    shown = CellSimulation(cell.workcell).simulate(pressed, "leader")
     found = stored_simulation(Account(None, "none", pressed, squeeze, shown), "a", "b", "leader")
     assert found.arrives
     assert found.duration == pytest.approx(carry.duration)

@@ -17,9 +17,9 @@ from scipy.spatial.transform import Rotation
 
 from hybrid_opt.carry import Carry
 from hybrid_opt.cell import Cell
-from hybrid_opt.errors import WitnessError
+from hybrid_opt.errors import SimulationError
 from hybrid_opt.robust.squeeze import Squeeze
-from hybrid_opt.witness.box import (
+from hybrid_opt.simulation.box import (
     SAME_TIME,
     HeldBox,
     Outcome,
@@ -27,7 +27,7 @@ from hybrid_opt.witness.box import (
     bisected,
     mujoco_module,
 )
-from hybrid_opt.witness.reference import (
+from hybrid_opt.simulation.reference import (
     ArmController,
     ArmState,
     Control,
@@ -35,7 +35,7 @@ from hybrid_opt.witness.reference import (
     carry_reference,
     pressed_reference,
 )
-from hybrid_opt.witness.scene import (
+from hybrid_opt.simulation.scene import (
     IMPEDANCE,
     PRESSES,
     ArmSettings,
@@ -48,7 +48,7 @@ from symbolic.array import Array, interpolated
 from symbolic.records import Workcell
 from symbolic.records.poses import box_rotation
 
-LOOKED_AT = 5e-3
+LOOK_INTERVAL = 5e-3
 """Time between two looks at the box [s]."""
 
 LOW, HIGH, BISECTIONS = 0.9, 2.0, 9
@@ -142,7 +142,7 @@ class PressedBox(HeldBox):
         return pad[active], sides[active, 0] >= 0, contact.efc_address[active], axes
 
 
-class CellWitness:
+class CellSimulation:
     """A simulated workcell with its arms.
 
     Attributes:
@@ -167,7 +167,7 @@ class CellWitness:
             WitnessError: MuJoCo is not installed, or torques are unknown.
         """
         if not np.isfinite(workcell.stack_joint_limits("torque_max")).all():
-            raise WitnessError(
+            raise SimulationError(
                 "controllers of simulated arms are scaled by torque_max, which is unknown here; "
                 "give torques of all joints"
             )
@@ -190,15 +190,15 @@ class CellWitness:
                 payload, friction and the pads' places.
             factor: multiple of the normal forces to press with.
         """
-        return _Run(self, reference, control, factor).outcome()
+        return _ArmSimulation(self, reference, control, factor).outcome()
 
 
-class _Run:
+class _ArmSimulation:
     """One simulation."""
 
     def __init__(
         self,
-        witness: CellWitness,
+        witness: CellSimulation,
         reference: Reference,
         control: Control,
         factor: float,
@@ -241,7 +241,7 @@ class _Run:
         """Run the simulation."""
         settings, pads, held = self._settings, self._pads, self._reference.job.held
         per_tick = round(settings.control_period / settings.time_step)
-        every = max(1, round(LOOKED_AT / settings.control_period))
+        every = max(1, round(LOOK_INTERVAL / settings.control_period))
         seen: list[tuple[Any, ...]] = []
         holds = True
         for k, time in enumerate(self._ticks.time):
@@ -406,7 +406,7 @@ class Account:
 
 
 def account_of(
-    cell: Cell, carry: Carry, witness: CellWitness, control: Control = "leader", leader: int = 0
+    cell: Cell, carry: Carry, witness: CellSimulation, control: Control = "leader", leader: int = 0
 ) -> Account:
     """Simulate a carry at its threshold, and with the commanded forces.
 
@@ -424,7 +424,7 @@ def account_of(
         threshold = bisected(
             lambda s: witness.simulate(reference, control, s), LOW, HIGH, BISECTIONS
         )
-    except WitnessError as error:
+    except SimulationError as error:
         problem = str(error)
     pressed, squeeze = pressed_reference(cell, carry, leader)
     shown = witness.simulate(pressed, control)

@@ -6,8 +6,8 @@ import numpy as np
 
 from hybrid_opt.carry import ArmMotion, Carry
 from hybrid_opt.cell import Cell
-from hybrid_opt.witness.box import Witness, drive_of, planned_moments
-from hybrid_opt.witness.scene import SimulationSettings
+from hybrid_opt.simulation.box import BoxSimulation, drive_of, planned_moments
+from hybrid_opt.simulation.scene import SimulationSettings
 from studies.research.plain.motion import angular_rates
 from symbolic.array import Array
 from symbolic.records import Workcell
@@ -70,7 +70,7 @@ def assert_driven_pads_hold(cell: Cell, carry: Carry) -> None:
     """Pads at their rims, turned by the planned moments, hold with 5 % more than the plan, and not
     with as much less."""
     settings = SimulationSettings(pads="driven")
-    witness = Witness(cell.workcell, settings)
+    witness = BoxSimulation(cell.workcell, settings)
     drive = drive_of(carry, settings, moments=planned_moments(cell, carry))
     assert witness.simulate(drive, 1.05).holds
     assert not witness.simulate(drive, 0.95).holds

@@ -64,14 +64,14 @@ more a pad that slides is pushed off by its damping, which widens its pressure."
 CREEP = 3e3
 """MuJoCo's impratio: the factor by which frictional contacts creep less than normal ones."""
 
-TOLERANCE = 1e-12
+MUJOCO_TOLERANCE = 1e-12
 """MuJoCo's tolerance of a step's solution in a cell without a carriage. MuJoCo takes it times the
 mean inertia: with that of the carriage among them, held boxes of many points drift by 0.3 mm/s."""
 
 SUPPORT = 'solref="0.01 1" solimp="0.7 0.7 0.001"'
 """Contact of the box with its support. Much stiffer ones lose touch where accelerations jump."""
 
-LARGEST_STEP = 2e-3
+LARGEST_TIME_STEP = 2e-3
 """Longest step; with longer ones the pads' layers are too stiff to be followed [s]."""
 
 Pads = Literal["even", "driven"]
@@ -102,9 +102,9 @@ class ContactSettings:
     slip: float = 1e-3
 
     def __post_init__(self) -> None:
-        if not 0.0 < self.time_step <= LARGEST_STEP:
+        if not 0.0 < self.time_step <= LARGEST_TIME_STEP:
             raise SettingsError(
-                f"time step {self.time_step:g} s: allowed is up to {LARGEST_STEP:g} s"
+                f"time step {self.time_step:g} s: allowed is up to {LARGEST_TIME_STEP:g} s"
             )
         if self.points < 3 or not self.layer > 0.0:
             raise SettingsError("give at least three contact points and a positive layer stiffness")
@@ -239,7 +239,7 @@ def solver_options(settings: ContactSettings, gravity: Array, heaviest: float = 
     """
     return f"""<option timestep="{settings.time_step!r}" gravity="{mjcf_text(gravity)}"
     cone="elliptic" impratio="{CREEP!r}" integrator="implicitfast" solver="Newton"
-    iterations="200" tolerance="{TOLERANCE / heaviest!r}"/>"""
+    iterations="200" tolerance="{MUJOCO_TOLERANCE / heaviest!r}"/>"""
 
 
 def contact_points(
@@ -454,7 +454,7 @@ def _ties(workcell: Workcell) -> Iterator[str]:
     names = [tuple(arm_model(robot).names)[1:] for robot in workcell.robots]
     for name in common_joints(workcell.robots):
         first, second = (_name("joint", i, own.index(name)) for i, own in enumerate(names))
-        yield f'<joint joint1="{first}" joint2="{second}" solref="{2.0 * LARGEST_STEP!r} 1"/>'
+        yield f'<joint joint1="{first}" joint2="{second}" solref="{2.0 * LARGEST_TIME_STEP!r} 1"/>'
 
 
 def _arm(workcell: Workcell, settings: ArmSettings, i: int, shown: dict[Frame, list[str]]) -> str:
