@@ -7,18 +7,12 @@ from __future__ import annotations
 
 import argparse
 
-from studies.options import INPUT_FILE, add, add_looks
+from studies.options import add, add_looks
 from studies.program import Parser, Program
 
 
 def _add_options(parser: Parser) -> None:
     add(parser, "RESULTS", "--quiet")
-    parser.add_argument(
-        "--into",
-        type=INPUT_FILE,
-        metavar="FILE",
-        help="put Tables 1 and 2 between the markers of this Markdown file (default: none)",
-    )
     parser.add_argument(
         "--pdf",
         action="store_true",
@@ -33,11 +27,7 @@ def _run(options: argparse.Namespace) -> int:
     from hybrid_opt.store.files import read_json
     from hybrid_opt.workers import LocalWorkers, warm_up
 
-    if options.into:
-        from studies.report.generate import insert_tables
-
-        insert_tables(options.results, options.into)
-    elif options.animation or options.view:
+    if options.animation or options.view:
         from studies.report.looks import follow_looks
 
         follow_looks(options.results, options)

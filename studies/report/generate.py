@@ -34,19 +34,13 @@ from hybrid_opt.progress import Progress
 from hybrid_opt.store.files import to_json, write_atomically
 from hybrid_opt.timing.analysis import TimingDocument, stored_timing
 from hybrid_opt.workers import LocalWorkers, Workers
-from studies.program import ReportError
 from studies.report import PAGE, PICTURES, TABLES, pictures_carry, pictures_cell, pictures_fronts
 from studies.report.data import ReportData, gather
 from studies.report.drawing import files_of, in_style, settled
 from studies.report.page_carries import RECOMMENDED_LABEL, phases
 from studies.report.page_data import page_document
-from studies.study.summary import read_summary
 from studies.study.tables import margins, study_tables, timings
 from symbolic.contact.registry import contact_model
-
-BEGIN = "<!-- measured: begin -->"
-END = "<!-- measured: end -->"
-"""Marks around the tables in a Markdown file."""
 
 PICTURE_COLOURS = 160
 """Colours of a picture on the page; its file's are reduced to them."""
@@ -209,34 +203,6 @@ def report_tables(data: ReportData, with_paper: bool) -> tuple[Table, ...]:
     if any(document.margins for _, document in timed):
         found.append(margins(timed))
     return tuple(found)
-
-
-def insert_tables(root: Path, document: Path) -> None:
-    """Replace what stands between a Markdown file's markers by the report's Tables 1 and 2.
-
-    Raises:
-        ReportError: the file or its markers are missing.
-        ResultsError: the folder has no report.
-    """
-    summary = read_summary(root)
-    settings, machine = summary.settings, summary.environment
-    tables = [root / TABLES / f"{name}.md" for name in ("table1_quality", "table2_selected")]
-    try:
-        text = document.read_text("utf-8")
-        parts = [table.read_text("utf-8").strip() for table in tables]
-    except OSError as error:
-        raise ReportError(f"{error.filename}: cannot be read ({error.strerror})") from error
-    begin, end = text.find(BEGIN), text.find(END)
-    if begin < 0 or end < begin:
-        raise ReportError(f"{document}: needs the lines {BEGIN} and {END}")
-    head = (
-        f"{summary.workcell.name}: {counted(settings.replicas, 'replica')} of "
-        f"{settings.evaluations} evaluations, seed {settings.seed}; Python "
-        f"{machine['python']}, CasADi {machine['casadi']}, Pinocchio {machine['pin']}, pymoo "
-        f"{machine['pymoo']}."
-    )
-    body = "\n\n".join([BEGIN, head, *parts])
-    document.write_text(f"{text[:begin]}{body}\n\n{text[end:]}", "utf-8")
 
 
 def _listed(data: ReportData) -> list[ReportPicture]:

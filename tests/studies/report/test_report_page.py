@@ -27,10 +27,9 @@ from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES, PAPER_OBJECTIVES
 from hybrid_opt.indicators.metrics import BindingBound
 from hybrid_opt.job.plan import JobModel
 from hybrid_opt.robust.squeeze import SqueezeSettings
-from studies.program import ReportError
 from studies.report import PAGE, generate, page_carries, page_data
 from studies.report.data import ReportData
-from studies.report.generate import BEGIN, END, insert_tables, report_tables, write_report
+from studies.report.generate import report_tables, write_report
 from studies.report.page_carries import PageTrajectory, page_trajectory, pressure_shift
 from studies.report.page_data import page_document
 from studies.study import tables
@@ -356,25 +355,3 @@ def test_the_bounds_that_matter_are_listed(data: ReportData) -> None:
     assert [row[3] for row in rows[:2]] == ["20 of 40", "19 of 40"]
     assert len(rows) == tables.MOST_BOUNDS + 1
     assert rows[-1] == ("search", "and 12 further bounds", NOTHING, "at most 12 of 40")
-
-
-def test_tables_are_put_between_the_markers_of_a_document_and_nowhere_else(
-    data: ReportData, own_study: Path, tmp_path: Path
-) -> None:
-    document = tmp_path / "page.md"
-    document.write_text(f"before\n{BEGIN}\nformer tables\n{END}\nafter\n")
-    folder = own_study / "tables"
-    folder.mkdir(exist_ok=True)
-    for made in report_tables(data, with_paper=True):
-        (folder / f"{made.name}.md").write_text(made.markdown())
-    insert_tables(own_study, document)
-    text = document.read_text()
-    assert text.startswith(f"before\n{BEGIN}\n")
-    assert text.endswith(f"{END}\nafter\n")
-    assert "former tables" not in text
-    assert "| NSGA-II, paper | 694 | 69.4 |" in text
-    insert_tables(own_study, document)
-    assert document.read_text() == text
-    document.write_text("no markers")
-    with pytest.raises(ReportError, match="measured: begin"):
-        insert_tables(own_study, document)
