@@ -98,7 +98,7 @@ def require_arms(
 
 
 def addressed(workcell: Workcell, addresses: tuple[str, str]) -> Workcell:
-    """The cell with both controllers at these host names or IP addresses.
+    """Return the cell with the controllers at these host names or IP addresses.
 
     Raises:
         SettingsError: one is neither.
@@ -112,7 +112,7 @@ def addressed(workcell: Workcell, addresses: tuple[str, str]) -> Workcell:
 
 
 def described(robot: Robot) -> str:
-    """Words about the make in a description, in small letters."""
+    """Return words about the make in a description, in lower case."""
     urdf = robot_urdf(robot)
     words = [robot.urdf.name, urdf.name, *urdf.links]
     words += [value for _, value in robot.xacro_arguments]
@@ -120,18 +120,18 @@ def described(robot: Robot) -> str:
 
 
 def robot_prefix(name: str) -> str:
-    """A robot's name as the beginning of names in ROS and RAPID: letters, digits, underscores."""
+    """Return a robot's name as a prefix of names in ROS and RAPID: letters, digits, underscores."""
     plain = "".join(c if c.isascii() and c.isalnum() else "_" for c in name.lower())
     return f"{'r' if not plain[:1].isalpha() else ''}{plain}_"
 
 
 def comment(text: str) -> str:
-    """Text that cannot end or leave a line of comment in a robot's language."""
+    """Return a text that cannot end or leave a line of comment in a robot's language."""
     return "".join(c if " " <= c <= "~" else "?" for c in text)[:_LONGEST_COMMENT]
 
 
 def prefixes(workcell: Workcell) -> tuple[str, str]:
-    """Prefixes of the names of each robot's links and joints.
+    """Return the prefixes of the names of each robot's links and joints.
 
     Raises:
         SettingsError: the drivers' own would give both arms' joints the same names.
@@ -154,8 +154,8 @@ def prefixes(workcell: Workcell) -> tuple[str, str]:
 
 
 def ros_joints(workcell: Workcell) -> dict[str, int]:
-    """Names in ROS of all joints that the arms move, each once, and its place among both arms'
-    joints side by side: a joint that moves both arms of a machine is the first arm's.
+    """Return the names in ROS of all joints that the arms move, each once, and its index among both
+    arms' stacked joints: a joint that moves both arms of a machine is the first arm's.
 
     Raises:
         SettingsError: see `prefixes`.
@@ -166,12 +166,12 @@ def ros_joints(workcell: Workcell) -> dict[str, int]:
 
 
 def pad_frame(prefix: str, arm: int) -> str:
-    """Name of a pad's frame."""
+    """Return the name of a pad's frame."""
     return f"{prefix or f'arm_{arm + 1}_'}{PAD}"
 
 
 def description(workcell: Workcell, q: Array) -> str:
-    """The cell's URDF.
+    """Write the cell's URDF.
 
     Args:
         q: (joints,) where the simulator's joints begin, both arms side by side [rad].
@@ -247,7 +247,7 @@ def _hold(joint: ElementTree.Element, position: float) -> None:
 
 
 def _add_fixed(root: ElementTree.Element, parent: str, name: str, bodies: Sequence[Body]) -> None:
-    """Bodies at their poses on a link, as a link of their own."""
+    """Add bodies at their poses on a link, as a link of their own."""
     _joint(root, f"{name}_fixed", parent, name, np.eye(4))
     link = ElementTree.SubElement(root, "link", {"name": name})
     for body in bodies:
@@ -255,7 +255,8 @@ def _add_fixed(root: ElementTree.Element, parent: str, name: str, bodies: Sequen
 
 
 def _shapes(link: ElementTree.Element, shape: Shape | Capsule | UrdfMesh, pose: Array) -> None:
-    """A shape as visual and as collision geometry; capsules, which URDF lacks, in their parts."""
+    """Add a shape as visual and as collision geometry; capsules, which URDF lacks, in their
+    parts."""
     if isinstance(shape, Capsule):
         _shapes(link, Cylinder(shape.radius, shape.length), pose)
         for side in (-0.5, 0.5):

@@ -92,7 +92,8 @@ class Origin:
 
     @classmethod
     def of_file(cls, path: Path, content: bytes, provenance: Mapping[str, Any]) -> Origin:
-        """The origin of a trajectory file, as its place in a results folder and it itself tell.
+        """Derive the origin of a trajectory file from its place in a results folder and its
+        content.
 
         Args:
             path: RESULTS/selected/ALGORITHM/REPLICA.json, or any other.
@@ -113,7 +114,7 @@ class Origin:
         )
 
     def name(self, job: Job) -> str:
-        """A folder's name that no other carry's bundles have."""
+        """Return a folder name that no other carry's bundles have."""
         words = [_word(self.study or job.workcell.name), _word(self.algorithm)]
         words += [] if self.replica is None else [f"r{self.replica:02d}"]
         words += [] if self.point is None else [f"p{self.point:04d}"]
@@ -220,8 +221,8 @@ SET_DOWN = (
 def manifest(
     export: Export, name: str, target: Target, origin: Origin, skew: float | None
 ) -> dict[str, Any]:
-    """JSON values: what a bundle of a target and its name holds, from which trajectory, and what it
-    keeps to.
+    """Write the manifest of a target's bundle as JSON values: content, origin of the trajectory,
+    and limits.
 
     Args:
         skew: between the starts of both arms that the job was asked to survive [s].
@@ -337,7 +338,7 @@ def _skew(found: Skew) -> dict[str, Any]:
 
 
 def job_digest(job: Job) -> str:
-    """SHA-256 of what decides a job: cell, path, timing, forces."""
+    """Compute the SHA-256 of everything that decides a job: cell, path, timing, forces."""
     digest = hashlib.sha256(job.workcell.digest.encode())
     carry = job.timing.driven
     for values in (carry.x, carry.time, *(phase.force.normal for phase in job.phases)):
@@ -351,7 +352,7 @@ def _number(value: Any) -> int | None:
 
 
 def _word(text: str) -> str:
-    """Text as part of a file's name on every system."""
+    """Return a text as part of a file's name on every system."""
     kept = "".join(c if c.isascii() and c.isalnum() else "-" for c in text.lower())
     return "-".join(part for part in kept.split("-") if part)[:LONGEST_WORD].strip("-")
 
@@ -473,7 +474,7 @@ def target_for(name: str, workcell: Workcell) -> Target:
 
 
 def targets() -> dict[str, str]:
-    """What `export` writes for, by name how it is run."""
+    """Return the targets of `export`: how to run each, by name."""
     return {name: target.how_to_run for name, target in TARGETS.items()}
 
 
@@ -592,7 +593,7 @@ def write_bundle(folder: Path, contents: Contents, manifest: Mapping[str, Any]) 
 
 
 def read_manifest(folder: Path) -> dict[str, Any]:
-    """The manifest of a bundle.
+    """Read the manifest of a bundle.
 
     Raises:
         ResultsError: there is none, it is damaged, or was changed since it was written.

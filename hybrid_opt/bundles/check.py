@@ -1,4 +1,4 @@
-"""Judges any joint trajectory of both arms that claims to carry the box of a cell.
+"""Check of any joint trajectory of both arms that claims to carry the box of a cell.
 
 The trajectory may be a bundle's after someone's post-processing, or another planner's: CSV, JSON or
 ROS 2's JointTrajectory in YAML. The first arm's pad says where the box is; the second one's has to
@@ -98,7 +98,7 @@ class JointTrajectory:
 
 @dataclass(frozen=True, eq=False)
 class Finding:
-    """What a trajectory does.
+    """Result of checking a trajectory.
 
     Attributes:
         held: (n,) whether the pads hold the box there.
@@ -166,7 +166,8 @@ class Finding:
 
 
 def read_trajectory(path: Path, workcell: Workcell) -> JointTrajectory:
-    """The joints of a cell in a file: CSV, JSON (a job's, or ROS 2's message), or YAML of ROS 2.
+    """Read the joints of a cell from a file: CSV, JSON (a job's, or ROS 2's message), or YAML of
+    ROS 2.
 
     Raises:
         ResultsError: it cannot be read, or lacks joints of the cell.
@@ -198,7 +199,7 @@ Columns = tuple[Array, dict[tuple[str, str], Array]]
 
 
 def _csv_columns(text: str) -> tuple[Columns, tuple[float, float] | None]:
-    """The columns, and from when to when a column `phase` says 'carry' [s]."""
+    """Read the columns, and the time span in which a column `phase` says 'carry' [s]."""
     rows = list(csv.reader(io.StringIO(text)))
     header, body = rows[0], [row for row in rows[1:] if row]
     words = [re.sub(r"\s*\[.*\]$", "", name).strip() for name in header]
@@ -246,7 +247,7 @@ def _document_columns(document: Any) -> Columns:
 
 
 def _chosen(columns: Columns, workcell: Workcell) -> JointTrajectory:
-    """The cell's joints among named columns, under any of their usual names."""
+    """Select the cell's joints among named columns, under any of their usual names."""
     time, values = columns
     names = [
         (f"{robot.name}/{joint}", f"{prefix}{joint}", joint)
@@ -286,7 +287,7 @@ def check(
     held: tuple[float, float] | None = None,
     interpolation: Interpolation | None = None,
 ) -> Finding:
-    """What a trajectory does in a cell.
+    """Check a trajectory in a cell.
 
     Args:
         held: from when to when the pads hold the box [s]; None for the carry that the file names,
@@ -343,7 +344,7 @@ def check(
 
 
 def _places(time: Array) -> Array:
-    """Samples at times (n,), and `BETWEEN` them."""
+    """Return samples at times (n,), and at `BETWEEN` of each step."""
     steps = np.diff(time)
     inside = [time[:-1] + share * steps for share in (0.0, *BETWEEN)]
     return np.append(np.column_stack(inside).ravel(), time[-1])
@@ -361,8 +362,8 @@ def _load(cell: Cell) -> NumericFunction:
 
 
 def _certificate(cell: Cell, joints: BPoly, time: Array) -> str:
-    """The continuous verdict on the motion of joints, from the first to the last of times (n,):
-    what meets what; '' where all is proven free."""
+    """Certify the motion of joints from the first to the last of times (n,): name the first
+    colliding pair; '' if everything is proven free."""
     workcell = cell.workcell
 
     def at(places: Array) -> tuple[Array, Array, Array]:
@@ -379,7 +380,8 @@ def _certificate(cell: Cell, joints: BPoly, time: Array) -> str:
 
 
 def _held(along: Array, across: Array) -> Mask:
-    """(n,) the longest run of samples at which the pads stand as they hold the box."""
+    """Return (n,) True on the longest run of samples at which the pads' relative pose holds the
+    box."""
     near = (np.abs(along) < TOUCHING) & (across < TOUCHING)
     edges = np.flatnonzero(np.diff(np.concatenate([[0], near.astype(int), [0]])))
     runs = list(zip(edges[::2], edges[1::2], strict=True))
@@ -392,7 +394,7 @@ def _held(along: Array, across: Array) -> Mask:
 
 
 def _poses(workcell: Workcell, q: Array) -> Array:
-    """(n, 6) of the box that the first pad holds, in the task's own numbers."""
+    """Compute the poses (n, 6) of the box that the first pad holds, in the task's own numbers."""
     T_pad_box = inverse(workcell.contacts[0].T_box_pad)
     T = pad_places(workcell, 0, joints_of(workcell, q)[0]) @ T_pad_box
     orientation = workcell.task.orientation
@@ -409,7 +411,7 @@ def _most(values: Array, limit: float) -> float:
 
 
 def as_document(finding: Finding) -> Mapping[str, Any]:
-    """JSON values of a finding."""
+    """Convert the result to JSON values."""
     return {
         "duration": finding.duration,
         "interpolation": finding.interpolation,

@@ -43,7 +43,7 @@ _JOINT_UNITS = (("rad", "m"), ("rad/s", "m/s"), ("rad/s^2", "m/s^2"), ("N m", "N
 
 
 def job_table(export: Export) -> str:
-    """One row per time step, one column per quantity, named with its unit."""
+    """Write one row per time step, one column per quantity, named with its unit."""
     job, sampled = export.job, export.sampled
     robots = [robot.name for robot in job.workcell.robots]
     pose = zip(components(job.workcell.task.orientation), _POSE_UNITS, strict=True)
@@ -104,7 +104,7 @@ def recording(export: Export) -> dict[str, str | bytes]:
 
 
 def _messages(export: Export, types: Mapping[str, Any]) -> Iterator[tuple[int, str, Any]]:
-    """Every sample's messages, of these types, with their times [ns] and topics."""
+    """Yield every sample's messages, of these types, with their times [ns] and topics."""
     sampled, cell, joined = export.sampled, export.workcell, prefixes(export.workcell)
     joints = ros_joints(cell)
     places = list(joints.values())
@@ -115,18 +115,19 @@ def _messages(export: Export, types: Mapping[str, Any]) -> Iterator[tuple[int, s
     boxes = box_placement(cell.task.orientation, sampled.pose)
 
     def of(kind: str, *values: Any) -> Any:
-        """A message, of its fields in order."""
+        """Build a message from its fields in order."""
         package, name = kind.split("/")
         return types[f"{package}/msg/{name}"](*values)
 
     def placed(kind: str, T: Array) -> tuple[Any, Any]:
-        """Position, as a message of a kind, and quaternion of a pose (4, 4)."""
+        """Build the position, as a message of a kind, and the quaternion of a pose (4, 4)."""
         turn = Rotation.from_matrix(T[:3, :3]).as_quat().tolist()
         position = of(f"geometry_msgs/{kind}", *T[:3, 3].tolist())
         return position, of("geometry_msgs/Quaternion", *turn)
 
     def frames(k: int) -> Iterator[tuple[str, Array]]:
-        """The box, every link of both arms and both pads with their poses (4, 4) in the world."""
+        """Yield the box, every link of both arms and both pads with their poses (4, 4) in the
+        world."""
         yield "box", boxes[k]
         for arm, robot in enumerate(cell.robots):
             model, found, prefix = models[arm], data[arm], joined[arm]
@@ -168,7 +169,8 @@ def _messages(export: Export, types: Mapping[str, Any]) -> Iterator[tuple[int, s
 
 
 def pad_wrench(sampled: SampledJob, arm: int) -> Array:
-    """(n, 6) force and moment that a pad exerts on the box, along the pad's axes [N, N m]."""
+    """Compute the force and moment (n, 6) that a pad exerts on the box, along the pad's axes [N,
+    N m]."""
     T_box_pad = sampled.job.workcell.contacts[arm].T_box_pad
     turned = box_rotation(sampled.job.workcell.task.orientation, sampled.pose)
     R_world_pad = turned @ T_box_pad[:3, :3]

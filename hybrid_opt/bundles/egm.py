@@ -72,13 +72,14 @@ def require_egm(job: Job) -> None:
 
 
 def tasks_of(export: Export) -> tuple[str, str]:
-    """Names of both tasks."""
+    """Return the names of both tasks."""
     two_armed = all(len(joints) == SEVEN for joints in export.job.joint_names)
     return TWO_ARMED_TASKS if two_armed else TASKS
 
 
 def _checked_start(joints: int) -> Iterator[str]:
-    """No move to the first position: the way there is not checked for collisions."""
+    """Yield the check of the first position, without a move to it: that way is not checked for
+    collisions."""
     axes = [f"robax.rax_{axis}" for axis in range(1, SIX + 1)]
     axes += ["extax.eax_a"] if joints == SEVEN else []
     yield "  PROC CarryCheckStart()"
@@ -95,7 +96,7 @@ def _checked_start(joints: int) -> Iterator[str]:
 
 
 def _tool(export: Export, arm: int) -> str:
-    """A tooldata: the pad's frame on the flange, and the tool's load where it is known."""
+    """Write a tooldata: the pad's frame on the flange, and the tool's load if it is known."""
     robot = export.workcell.robots[arm]
     frame = _frame(robot.T_flange_pad)
     if robot.tool_load is None:
@@ -106,18 +107,19 @@ def _tool(export: Export, arm: int) -> str:
 
 
 def _load(mass: float, centre: Array, inertia: Array) -> str:
-    """A loaddata from a mass [kg], a centre of mass (3,) [mm] and moments (3,) [kg m^2]."""
+    """Write a loaddata from a mass [kg], a centre of mass (3,) [mm] and moments (3,) [kg m^2]."""
     return f"[{mass:.4f},{_numbers(centre)},[1,0,0,0],{_numbers(inertia)[1:-1]}]"
 
 
 def _frame(pose: Array) -> str:
-    """A RAPID pose: position [mm] and quaternion, real part first."""
+    """Write a RAPID pose: position [mm] and quaternion, real part first."""
     turn = Rotation.from_matrix(pose[:3, :3]).as_quat(scalar_first=True)
     return f"[{_numbers(1e3 * pose[:3, 3])},{_numbers(turn)}]"
 
 
 def _target(degrees: Array) -> str:
-    """A jointtarget; a seventh axis is an external one to RAPID, other external axes are unused."""
+    """Write a jointtarget; a seventh axis is an external one to RAPID, other external axes are
+    unused."""
     if len(degrees) == SIX:
         return f"[{_numbers(degrees)},[9E9,9E9,9E9,9E9,9E9,9E9]]"
     robot = np.delete(degrees, EXTRA)
@@ -147,7 +149,7 @@ seems to limit the speed itself."""
 
 
 def egm_files(export: Export) -> dict[str, str | bytes]:
-    """The stream's program, and what starts EGM in both tasks."""
+    """Write the stream's program, and the code that starts EGM in both tasks."""
     robots, follower, q = export.workcell.robots, export.follower, export.sampled.q
     J = pad_jacobians(export.workcell, follower, export.sampled.arm(follower, q))
     # Along the pad's normal, without turning it.

@@ -75,7 +75,7 @@ class Gap:
 def chosen_step(
     job: Job, steps: Sequence[float], interpolation: Interpolation, stiffness: float
 ) -> float:
-    """The longest of the steps whose force error stays within the tracking share.
+    """Return the longest of the steps whose force error stays within the tracking share.
 
     Args:
         steps: that the target can have, the longest first [s].
@@ -97,7 +97,7 @@ def chosen_step(
 
 
 def gap_of(sampled: SampledJob, interpolation: Interpolation, stiffness: float) -> Gap:
-    """What the samples of a job do to the pads, under an interpolation.
+    """Compute the error of the pads between the samples of a job under an interpolation.
 
     Args:
         stiffness: of each arm at its pad [N/m].
@@ -123,8 +123,8 @@ def gap_of(sampled: SampledJob, interpolation: Interpolation, stiffness: float) 
 
 
 def between(time: Array, known: Sequence[Array], interpolation: Interpolation) -> BPoly:
-    """The joints as a controller makes them up between samples: at times, the polynomial of least
-    degree through what is known at both ends.
+    """Interpolate joints between samples as a controller does: the polynomial of least degree
+    through the known values at both ends.
 
     Args:
         time: (n,) ascending [s].
@@ -136,7 +136,7 @@ def between(time: Array, known: Sequence[Array], interpolation: Interpolation) -
 
 
 def pad_errors(workcell: Workcell, q: Array) -> tuple[Array, Array]:
-    """How the pads of postures stand to one another against how they hold the box.
+    """Compute the error of the pads' relative pose in postures.
 
     Args:
         q: (n, joints) both arms side by side [rad].
@@ -154,7 +154,7 @@ def pad_errors(workcell: Workcell, q: Array) -> tuple[Array, Array]:
 
 
 def pad_places(workcell: Workcell, arm: int, q: Array) -> Array:
-    """(n, 4, 4) of an arm's pad in the world, at its joints (n, joints) [rad]."""
+    """Compute the poses (n, 4, 4) of an arm's pad in the world, at its joints (n, joints) [rad]."""
     robot = workcell.robots[arm]
     model = build_robot_model(robot)
     data, found = model.model.createData(), np.empty((len(q), 4, 4))
@@ -165,8 +165,8 @@ def pad_places(workcell: Workcell, arm: int, q: Array) -> Array:
 
 
 def pad_jacobians(workcell: Workcell, arm: int, q: Array) -> Array:
-    """(n, 6, n_joints) velocity of an arm's pad and its rotation per way of each joint, along the
-    flange's axes, at its joints (n, n_joints) [m/rad, 1]."""
+    """Compute the Jacobian (n, 6, n_joints) of an arm's pad, along the flange's axes, at its joints
+    (n, n_joints) [m/rad, 1]."""
     robot, found = workcell.robots[arm], np.empty((len(q), 6, q.shape[1]))
     model = build_robot_model(robot)
     data = model.model.createData()
@@ -211,7 +211,7 @@ class Stop:
 
 
 def stop_of(job: Job) -> Stop:
-    """The shortest stop along the path that the commanded forces bear.
+    """Find the shortest stop along the path that the commanded forces bear.
 
     Raises:
         JobError: none does.
@@ -229,7 +229,7 @@ def stop_of(job: Job) -> Stop:
     places, x = time[::EVERY], np.linspace(0.0, 1.0, INSTANTS)
 
     def stop(duration: float) -> Stop:
-        """One of a duration [s], tried all along the path."""
+        """Compute a stop of a duration [s], tried all along the path."""
         rate = 1.0 - x**3 * (10.0 - 15.0 * x + 6.0 * x**2)
         slope = -30.0 * x**2 * (1.0 - x) ** 2 / duration
         passed = duration * (x - 2.5 * x**4 + 3.0 * x**5 - x**6)
@@ -385,15 +385,15 @@ class Export:
         return self.sampled.effort + self._of_other(self._contact(self.sampled.wrench))
 
     def _contact(self, wrench: Array) -> Array:
-        """(n, joints) torques that exert wrenches (n, 2, 6), each arm its own [N m, N]."""
+        """Compute the joint torques (n, joints) that exert wrenches (n, 2, 6), each arm its own
+        [N m, N]."""
         sampled, model = self.sampled, _model(self.workcell)
         matrices = model.wrench_torque(np.ascontiguousarray(sampled.q), sampled.pose)
         first = len(self.job.joint_names[0])
         return contact_torque(first, matrices, np.swapaxes(wrench, 0, 1))
 
     def _of_other(self, contact: Array) -> Array:
-        """(n, joints) the other arm's torques, of torques (n, joints), in joints that move both
-        arms."""
+        """Return the other arm's torques (n, joints) in joints that move both arms."""
         found, (own, other) = np.zeros_like(contact), self.job.joint_names
         for name in common_joints(self.workcell.robots):
             both = [own.index(name), len(own) + other.index(name)]
@@ -431,12 +431,13 @@ class Export:
         )
 
     def reach(self, arm: int) -> Array:
-        """(n_joints,) largest way of an arm's pad per way of each joint at any sample [m]."""
+        """Compute the largest motion (n_joints,) of an arm's pad per motion of each joint at any
+        sample [m]."""
         J = pad_jacobians(self.workcell, arm, self.sampled.arm(arm, self.sampled.q))
         return np.asarray(np.linalg.norm(J[:, :3], axis=1).max(axis=0))
 
     def ros_joints(self, arm: int) -> list[str]:
-        """Names of an arm's joints in ROS: each behind its robot's prefix."""
+        """Return the names of an arm's joints in ROS, with its robot's prefix."""
         prefix = prefixes(self.workcell)[arm]
         return [f"{prefix}{joint}" for joint in self.job.joint_names[arm]]
 

@@ -296,7 +296,8 @@ def _franka_type(joints: Sequence[str]) -> str:
 
 
 def _contact(job: Job, arm: int) -> tuple[Array, tuple[float, float]]:
-    """The most of contact: of each joint (n_joints,) [N m], force [N] and moment [N m]."""
+    """Return the largest values of contact: of each joint (n_joints,) [N m], force [N] and
+    moment [N m]."""
     first = len(job.joint_names[0])
     span = slice(0, first) if arm == 0 else slice(first, None)
     torque = [np.abs(p.motion.contact_effort(p.force.wrench)[:, span]).max(0) for p in job.phases]

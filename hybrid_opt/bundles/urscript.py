@@ -80,7 +80,7 @@ def normal_speed(job: Job, arm: int) -> float:
 
 
 def urscript_files(export: Export) -> dict[str, str | bytes]:
-    """The programs of both arms.
+    """Write the programs of both arms.
 
     Raises:
         SettingsError: the time step is no multiple of the controller's cycle that fills every
@@ -155,7 +155,7 @@ def _payload(export: Export, arm: int) -> str:
 
 
 def _pose(T: Array) -> str:
-    """A URScript pose: position [m] and rotation vector [rad]."""
+    """Write a URScript pose: position [m] and rotation vector [rad]."""
     turn = Rotation.from_matrix(T[:3, :3]).as_rotvec()
     return f"p{_list(np.concatenate([T[:3, 3], turn]))}"
 

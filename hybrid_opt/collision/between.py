@@ -65,8 +65,8 @@ class SampledMotions:
 
 
 def check_all_between(checker: CollisionChecker, sampled: SampledMotions) -> list[MotionVerdict]:
-    """Whether anything collides between samples that are themselves free of collisions, between
-    which all of them move linearly."""
+    """Check motions between samples that are themselves free of collisions, moving linearly
+    between them."""
     return _Sweep(checker, sampled).run()
 
 
@@ -115,7 +115,7 @@ class _Sweep:
         return [self._verdict(motion, hits, left) for motion in range(n_motions)]
 
     def _verdict(self, motion: int, hits: list[Touch], left: list[Touch]) -> MotionVerdict:
-        """What was found for one motion, its intervals counted from its own first sample."""
+        """Return the verdict on one motion, its intervals counted from its own first sample."""
         kinds: tuple[tuple[Status, list[Touch]], ...] = (("collision", hits), ("undecided", left))
         for status, found in kinds:
             own = [touch for touch in found if self.owner[touch.sample] == motion]
@@ -126,7 +126,7 @@ class _Sweep:
         return MotionVerdict("free", None)
 
     def _first_intervals(self) -> Intervals:
-        """The intervals between the samples that the motion bound does not clear, found motion by
+        """Return the intervals between the samples that the motion bound does not clear, motion by
         motion: nearly all are cleared, and arrays over all of them would not stay cached."""
         found = []
         for motion, count in enumerate(self.sampled.lengths):
@@ -157,7 +157,7 @@ class _Sweep:
         return Intervals(index, start, width, a, b, *self.checker.motion(*ends), pending)
 
     def _uncleared(self, work: Intervals) -> Intervals:
-        """The intervals with pairs that the motion bound does not clear."""
+        """Return the intervals with pairs that the motion bound does not clear."""
         c_a, c_b = work.a.clearance, work.b.clearance
         halfway = c_a + c_b
         halfway -= work.chord
@@ -171,15 +171,16 @@ class _Sweep:
         return replace(work, pending=pending)[left]
 
     def _required(self, work: Intervals) -> Array:
-        """Clearance to be kept in the intervals, (m, n_pairs), or (1, n_pairs) for all [m]."""
+        """Return the clearance to be kept in the intervals, (m, n_pairs), or (1, n_pairs) for
+        all [m]."""
         owners = self.owner[work.index]
         if len(owners) and owners[0] == owners[-1] and (owners == owners[0]).all():
             return self.required[owners[:1]]
         return self.required[owners]
 
     def _given_up(self, work: Intervals, level: int) -> NDArray[np.bool_]:
-        """(m,) intervals that stay undecided: those with an end from which no shorter one could be
-        proven either, at the last level all."""
+        """Return (m,) True for intervals that stay undecided: those with an end from which no
+        shorter one could be proven either, at the last level all."""
         hopeless = np.full(len(work.index), level == DEPTH)
         if HOPELESS_DEPTH <= level < DEPTH:
             required = self.required[self.owner[work.index]]
@@ -200,7 +201,7 @@ class _Sweep:
         return self.checker.measure(*self.checker.split(end.configuration), end.clearance, wanted)
 
     def _halves(self, work: Intervals) -> Intervals:
-        """Both halves of every interval, the earlier first."""
+        """Return both halves of every interval, the earlier first."""
         middle = (work.a.configuration + work.b.configuration) / 2.0
         clearance = self.checker.bounds(*self.checker.split(middle))
         new = End(middle, clearance, np.zeros(clearance.shape, dtype=bool))
@@ -231,7 +232,7 @@ AnyRows = TypeVar("AnyRows", bound=Rows)
 
 
 def of_rows(made_of: Callable[[list[Any]], Any], records: Sequence[AnyRows]) -> AnyRows:
-    """A record like the given ones, each of its arrays made of theirs."""
+    """Build a record like the given ones, each of its arrays made of theirs."""
     parts = zip(*(vars(record).values() for record in records), strict=True)
     values = [
         of_rows(made_of, part) if isinstance(part[0], Rows) else made_of(list(part))
@@ -270,5 +271,5 @@ class Intervals(Rows):
 
 
 def _alternating(values: list[Array]) -> Array:
-    """Rows of arrays in turn."""
+    """Interleave the rows of arrays."""
     return np.stack(values, axis=1).reshape(-1, *values[0].shape[1:])

@@ -96,7 +96,7 @@ def certify(
     configuration: Configuration,
     parameters: Array,
 ) -> Certificate:
-    """`certify_all` for one path.
+    """Certify one path, see `certify_all`.
 
     Args:
         parameters: (n,) increasing path parameters to start from.
@@ -182,7 +182,8 @@ def _straight_grid(
     configurations: Configurations,
     parameters: Sequence[Array],
 ) -> _Grid:
-    """See `certify_all`. A path that is lost at a place is not refined there."""
+    """Refine the grids as `certify_all` describes. A path that is lost at a place is not refined
+    there."""
     owner = np.repeat(np.arange(len(parameters)), [len(u) for u in parameters])
     u = np.concatenate([np.asarray(grid, dtype=float) for grid in parameters])
     placed = configurations(owner, u)
@@ -216,8 +217,8 @@ def _straight_grid(
 
 
 def _farthest(checker: CollisionChecker, configuration: Array, other: Array) -> Array:
-    """(n,) largest chord of all pairs between two configurations (n, 6 + all joints) [m], some rows
-    at a time: the chords of all would not stay cached."""
+    """Compute the largest chord (n,) of all pairs between two configurations (n, 6 + all joints)
+    [m], some rows at a time: the chords of all would not stay cached."""
     off = np.empty(len(configuration))
     for start in range(0, len(off), CACHED_ROWS):
         some = slice(start, start + CACHED_ROWS)
@@ -229,7 +230,7 @@ def _farthest(checker: CollisionChecker, configuration: Array, other: Array) -> 
 def _failed_on_grid(
     checker: CollisionChecker, grid: _Grid, path: int, clearance: Array
 ) -> Certificate | None:
-    """The certificate of a path that is lost or collides at a grid point."""
+    """Return the certificate of a path that is lost or collides at a grid point, else None."""
     # In order of their owners: a slice, of which nothing is copied.
     rows = slice(*np.searchsorted(grid.owner, [path, path + 1]).tolist())
     u, placed = grid.u[rows], grid.configuration[rows]
@@ -275,7 +276,8 @@ class SampledPath:
 def configurations(
     paths: Sequence[SampledPath], posture: NumericFunction, owner: NDArray[np.intp], u: Array
 ) -> Array:
-    """Configurations (n, 6 + all joints), box pose and both arms' joints, between the samples.
+    """Compute configurations (n, 6 + all joints), box pose and both arms' joints, between the
+    samples.
 
     Joint positions are NaN where Newton's method does not reach a place from the samples around.
 
@@ -308,7 +310,7 @@ def configurations(
 def certificates(
     checker: CollisionChecker, posture: NumericFunction, paths: Sequence[SampledPath]
 ) -> list[Certificate]:
-    """The continuous verdicts on carries of one task that are free on their samples."""
+    """Certify carries of one task that are free on their samples."""
     found: list[Certificate] = []
     for first in range(0, len(paths), TOGETHER):
         some = paths[first : first + TOGETHER]

@@ -264,14 +264,14 @@ class CollisionChecker:
         return self.functions["piece_poses"].batch(pose, q_1, q_2)
 
     def _still(self) -> tuple[Array, Array]:
-        """Joints of both arms at one sample that only the box matters in."""
+        """Return joints of both arms at one sample in which only the box matters."""
         first, second = (np.zeros((1, arm.joints)) for arm in self.geometry.arms)
         return first, second
 
     def _bodies(
         self, pairs: NDArray[np.intp], resting: NDArray[np.bool_]
     ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """Both bodies of each pair (m,); the smaller payload where it rests."""
+        """Return both bodies of each pair (m,); the smaller payload where it rests."""
         first, second = self._pairs[pairs].T
         return np.where(resting, self.distances.shrunk_payload, first), second
 
@@ -315,7 +315,7 @@ class CollisionChecker:
         return found
 
     def _find_resting(self) -> list[tuple[int, Array, float]]:
-        """See `resting_places`."""
+        """Find the entries of `resting_places`."""
         task = self.geometry.workcell.task
         pairs = {names: k for k, names in enumerate(self._names)}
         found = []

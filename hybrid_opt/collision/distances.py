@@ -145,7 +145,7 @@ def shape_table(
 
 
 def _measures(shape: ConvexShape) -> tuple[int, tuple[float, float, float]]:
-    """Kind and size of a shape as `distances.cpp` counts them."""
+    """Return kind and size of a shape as `distances.cpp` numbers them."""
     match shape:
         case Box():
             x, y, z = (float(length) / 2.0 for length in shape.size)

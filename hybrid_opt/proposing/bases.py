@@ -87,8 +87,8 @@ POSES = 33
 
 
 def base_choices(problem: Problem, spins: Array, rng: np.random.Generator) -> list[dict[str, Any]]:
-    """Additions to a problem's tables that give both robots a base, the best first; both the same
-    where they are arms of one machine.
+    """Return additions to a problem's tables that give both robots a base, best first; both the
+    same if they are arms of one machine.
 
     Args:
         spins: of both pads that are tried [rad].
@@ -103,7 +103,7 @@ def base_choices(problem: Problem, spins: Array, rng: np.random.Generator) -> li
 def _scored(
     problem: Problem, spins: Array, rng: np.random.Generator
 ) -> list[tuple[float, dict[str, Any]]]:
-    """Such additions with their scores, for given contacts."""
+    """Score such additions for given contacts."""
     draft = draft_of(problem)
     scorer = PlaceScorer(problem, draft, spins, rng)
     if problem.is_machine:
@@ -131,7 +131,7 @@ def _scored(
 
 
 def draft_of(problem: Problem) -> Workcell:
-    """The cell, its robots somewhere, its redundant joints chosen."""
+    """Build the cell with its robots anywhere and its redundant joints chosen."""
     sides = [_sideways(problem, arm) for arm in (0, 1)]
     near = [_base(problem, k, at + 0.4 * out, out) for k, (at, out) in enumerate(sides)]
     if problem.is_machine:
@@ -149,7 +149,7 @@ def _standing(problem: Problem, bases: list[Array]) -> dict[str, Any]:
 
 
 def _sideways(problem: Problem, arm: int) -> tuple[Array, Array]:
-    """The middle (3,) of the way of a robot's contact and the direction (3,) outwards from it."""
+    """Compute the middle (3,) of the path of a robot's contact and the outward direction (3,)."""
     point = np.append(np.array(problem.contacts[arm]["xyz"], dtype=float), 1.0)
     ends = [(box_placement(problem.orientation, pose) @ point)[:3] for pose in problem.poses]
     middle = (ends[0] + ends[1]) / 2.0
@@ -160,7 +160,7 @@ def _sideways(problem: Problem, arm: int) -> tuple[Array, Array]:
 
 
 def _base(problem: Problem, arm: int, point: Array, outwards: Array) -> Array:
-    """(6,) on the ground below a point, looking at the carry."""
+    """Compute the base (6,) on the ground below a point, facing the carry."""
     given = problem.data["robots"][arm].get("base", {}).get("xyz", [0.0, 0.0, 0.0])
     yaw = float(np.arctan2(-outwards[1], -outwards[0]))
     return np.array([point[0], point[1], float(given[2]), 0.0, 0.0, yaw])
@@ -177,8 +177,8 @@ def _places(problem: Problem, draft: Workcell, arm: int) -> list[Array]:
 
 
 def machine_places(problem: Problem, draft: Workcell) -> list[Array]:
-    """Bases (6,) of a machine with both arms: the line through its shoulders as the line through
-    both contacts, the carry where its arms reach."""
+    """Compute bases (6,) of a machine with both arms: the line through its shoulders along the line
+    through both contacts, the carry where its arms reach."""
     own = inverse(draft.robots[0].T_world_base)
     at = [(own @ np.append(point, 1.0))[:3] for point in shoulders(draft.robots)]
     middle, outwards = _sideways(problem, 0)
@@ -200,7 +200,7 @@ def machine_places(problem: Problem, draft: Workcell) -> list[Array]:
 
 
 def _mean_reach(draft: Workcell, at: list[Array]) -> Array:
-    """(3,) from a machine's shoulders to where its arms' last joints are, in the mean of random
+    """Compute the mean vector (3,) from a machine's shoulders to its arms' last joints over random
     postures of both, in the base frame [m]."""
     rng, reaches = np.random.default_rng(0), []
     for arm in (0, 1):
@@ -255,8 +255,8 @@ class PlaceScorer:
         self._feet = [_feet(draft, arm) for arm in (0, 1)]
 
     def place(self, arm: int, base: Array) -> Base | None:
-        """What a base (6,) is worth to an arm, None where it cannot stand there or does not follow
-        the box from there."""
+        """Evaluate a base (6,) for an arm; None if it cannot stand there or does not follow the
+        box."""
         if not self._stands_free(arm, base):
             return None
         T = pose_matrix(base[:3], base[3:])
@@ -269,14 +269,14 @@ class PlaceScorer:
         return Base(base, value, self._followed(kinematics, holds))
 
     def _stands_free(self, arm: int, base: Array) -> bool:
-        """Whether nothing of the environment is where the robot would stand; its floor may be."""
+        """Return True if no environment body, except its floor, is where the robot would stand."""
         T = pose_matrix(base[:3] + np.array([0.0, 0.0, ABOVE]), base[3:])
         feet = tuple(piece.moved(T) for piece in self._feet[arm])
         return all(coal_distance(feet, pieces) > 0.0 for pieces in self._environment)
 
     def _followed(self, kinematics: ArmKinematics, holds: Sequence[Hold]) -> NDArray[np.bool_]:
-        """(k,) detours along which an arm follows the box in one of these ways to hold, its
-        redundant joints where they are."""
+        """Return (k,) True for detours along which an arm follows the box in one of these holds,
+        with fixed redundant joints."""
         robot = self._draft.robots[kinematics.arm]
         k, m, _ = self._detours.shape
         if not k:
@@ -291,8 +291,8 @@ class PlaceScorer:
         return np.asarray((fine & (kept == m)).reshape(len(holds), k).any(axis=0))
 
     def _hidden(self, arm: int, shoulder: Array) -> float:
-        """Share of start and goal at which the environment stands between a shoulder (3,) and the
-        robot's contact, looked at level."""
+        """Compute the share of start and goal at which the environment stands between a shoulder
+        (3,) and the robot's contact, in the horizontal plane."""
         point = np.append(np.array(self._problem.contacts[arm]["xyz"], dtype=float), 1.0)
         hit = 0
         for pose in self._problem.poses:
@@ -312,8 +312,8 @@ class PlaceScorer:
 
 
 def _feet(draft: Workcell, arm: int) -> tuple[Piece, ...]:
-    """What stands still of a robot, or of the machine that it is an arm of, and a foot, in the
-    base frame; of a machine they are listed with the first arm."""
+    """Return the still bodies of a robot, or of its machine, and a foot, in the base frame; of a
+    machine they are listed with the first arm."""
     robot = draft.robots[arm]
     own = inverse(robot.T_world_base)
     standing = [
@@ -326,14 +326,14 @@ def _feet(draft: Workcell, arm: int) -> tuple[Piece, ...]:
 
 
 def shared_room(first: Base, second: Base) -> float:
-    """Score for the share of detours along which both arms follow the box."""
+    """Score the share of detours along which both arms follow the box."""
     both = first.follows & second.follows
     return ROOMY * float(both.mean()) if len(both) else 0.0
 
 
 def free_detours(workcell: Workcell, start: Array, goal: Array) -> Array:
-    """(k, POSES, 6) box poses: up a little, aside, over to beside the goal, back, down. Those of
-    them on which the box meets nothing of the environment between its lifts, 0 or more.
+    """Return the detours (k, POSES, 6) that are free: up a little, aside, over to beside the goal,
+    back, down. k may be 0.
 
     Args:
         start, goal: (6,) box poses.

@@ -83,7 +83,7 @@ class Sampling:
     out_of_time: Callable[[], bool]
 
     def bounds_around(self, carry: Array) -> Bounds:
-        """Bounds around a feasible carry (n_var,).
+        """Find bounds around a feasible carry (n_var,).
 
         Their common factor is bisected. In between they move to the middle of the feasible
         candidates found, which makes room for wider ones. The carry itself stays, if it is within
@@ -120,8 +120,8 @@ class Sampling:
         return float(np.sqrt(self.low * self.high))
 
     def _bisected(self, centre: Array, scale: float) -> tuple[float, Array]:
-        """The factor at which about the wanted share is feasible, and feasible candidates near
-        it."""
+        """Bisect the factor at which about the wanted share is feasible; return it and feasible
+        candidates near it."""
         low, high, aim = NARROWEST, WIDEST, self._aim
         good = np.empty((0, len(centre)))
         for _ in range(ROUNDS):
@@ -139,8 +139,8 @@ class Sampling:
     def _judged(
         self, centre: Array, scale: float, most: int, wanted: tuple[float, float]
     ) -> tuple[Array, NDArray[np.bool_]]:
-        """Candidates (n, n_var) and verdicts (n,): at most `most`, fewer where the share of
-        feasible ones is surely outside the wanted range, or the time is up."""
+        """Evaluate candidates (n, n_var): at most `most`, fewer if the share of feasible ones is
+        surely outside the wanted range, or the time is up."""
         x, fine = np.empty((0, len(centre))), np.empty(0, dtype=bool)
         bounds = self._box(centre, scale)
         while len(x) < most:

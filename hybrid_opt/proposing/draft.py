@@ -58,7 +58,7 @@ class Draft:
         return self.waypoints[1:-1, :POSE_SIZE]
 
     def around(self, centre: Array) -> Draft:
-        """The same with another decision vector as its carry."""
+        """Return the draft with another decision vector as its carry."""
         m = len(self.workcell.task.redundant)
         return replace(self, waypoints=_as_waypoints(centre, self.waypoints, m))
 
@@ -126,8 +126,8 @@ def _boxes(found: Draft, waypoints: Array) -> Array:
 
 
 def _as_waypoints(x: Array, waypoints: Array, m: int) -> Array:
-    """Extended waypoints (n, 6 + m) of a decision vector in which all between the ends, and all
-    values of redundant joints, are free."""
+    """Compute extended waypoints (n, 6 + m) of a decision vector in which everything between the
+    ends, and all values of redundant joints, is free."""
     n = len(waypoints)
     placed = waypoints.copy()
     placed[1:-1, :POSE_SIZE] = x[: POSE_SIZE * (n - 2)].reshape(n - 2, POSE_SIZE)

@@ -79,13 +79,13 @@ class ArmKinematics:
         self.least = workcell.robots[arm].min_manipulability * MANIPULABILITY_MARGIN
 
     def moved(self, T_world_root: Array) -> ArmKinematics:
-        """The arm at another base."""
+        """Return the arm at another base."""
         geometry = replace(self.geometry, T_world_root=T_world_root)
         return ArmKinematics(self.workcell, self.arm, geometry)
 
     def held(self, spin: float = 0.0) -> Array:
-        """T_box_joint (4, 4): the arm's last joint in the box that it holds, its pad turned about
-        its normal by an angle [rad]."""
+        """Compute T_box_joint (4, 4): the last joint of the arm in the frame of the box that it
+        holds, its pad turned about its normal by an angle [rad]."""
         contact = self.workcell.contacts[self.arm]
         # The geometry's own contact is replaced by the one asked for.
         T_pad_joint = inverse(contact.T_box_pad) @ inverse(self.geometry.T_joint_box)
@@ -97,13 +97,13 @@ class ArmKinematics:
         return np.array([np.maximum(self.lower, -np.pi), np.minimum(self.upper, np.pi)])
 
     def drawn(self, count: int, rng: np.random.Generator) -> Array:
-        """(count, joints) random postures within `span` [rad or m]."""
+        """Draw random postures (count, joints) within `span` [rad or m]."""
         low, high = self.span
         return rng.uniform(low, high, (count, len(low)))
 
     def chain(self, q: Array) -> tuple[Array, Array]:
-        """Origins (n, joints, 3) and axes (n, joints, 3) of the joints, then T (n, 4, 4) of the
-        last, in the world; the last joint's placement is returned with them."""
+        """Compute origins and axes (n, joints, 6) of the joints and the last joint's placement (n,
+        4, 4), in the world."""
         n, arm = len(q), self.geometry
         T = np.broadcast_to(arm.T_world_root, (n, 4, 4))
         points, axes = np.empty((n, arm.joints, 3)), np.empty((n, arm.joints, 3))
@@ -122,7 +122,8 @@ class ArmKinematics:
         return np.concatenate([points, axes], axis=2), T
 
     def jacobian(self, frames: Array, T: Array) -> Array:
-        """(n, 6, joints) of the last joint's origin, world axes, from what `chain` gives."""
+        """Compute the Jacobian (n, 6, joints) of the last joint's origin, world axes, from the
+        results of `chain`."""
         points, axes = frames[:, :, :3], frames[:, :, 3:]
         turning = np.array(self.geometry.turning)[:, None]
         across = np.cross(axes, T[:, None, :3, 3] - points)
@@ -130,7 +131,7 @@ class ArmKinematics:
         return np.concatenate([linear, np.where(turning, axes, 0.0)], axis=2).transpose(0, 2, 1)
 
     def solve(self, q: Array, target: Array, steps: int, damping: float = 0.0) -> Postures:
-        """Newton's method from postures (n, joints) to placements (n, 4, 4) of the last joint.
+        """Solve postures (n, joints) by Newton's method for placements (n, 4, 4) of the last joint.
 
         Args:
             damping: 0 for pure Newton steps; small values keep far starts on course.
@@ -176,7 +177,7 @@ class ArmKinematics:
     def follow(
         self, q: Array, targets: Array, ends: Array | None = None, resolved: bool = False
     ) -> tuple[Array, NDArray[np.intp], Array]:
-        """Postures (n, joints) that follow placements (m, 4, 4) of the last joint.
+        """Compute postures (n, joints) that follow placements (m, 4, 4) of the last joint.
 
         Args:
             targets: one path for all, or one for each, (m, n, 4, 4).
@@ -215,8 +216,8 @@ class ArmKinematics:
         return path, kept, measure
 
     def central(self, path: Array) -> Array:
-        """Full turns (n, joints) [rad] that bring joint paths (m, n, joints) nearest to the middle
-        of the limits; none of joints that slide."""
+        """Compute the full turns (n, joints) [rad] that bring joint paths (m, n, joints) nearest to
+        the middle of the limits; zero for prismatic joints."""
         middle = (self.lower + self.upper) / 2.0
         turns = np.round((middle - (path.min(axis=0) + path.max(axis=0)) / 2.0) / (2.0 * np.pi))
         free = np.array(self.geometry.turning)
@@ -225,14 +226,14 @@ class ArmKinematics:
 
 
 def spun(contact: Contact, spin: float) -> Contact:
-    """A contact whose pad is turned about its normal by an angle [rad]."""
+    """Return a contact with its pad turned about its normal by an angle [rad]."""
     turn = pose_matrix(np.zeros(3), np.array([0.0, 0.0, spin]))
     return replace(contact, T_box_pad=contact.T_box_pad @ turn)
 
 
 def shoulders(robots: tuple[Robot, Robot]) -> Array:
-    """(2, 3) where each arm's first joint of its own is in the world, all joints at the middle of
-    their ranges [m]."""
+    """Compute the positions (2, 3) of each arm's first own joint in the world, all joints at the
+    middle of their ranges [m]."""
     found = []
     for robot in robots:
         model = arm_model(robot)
@@ -244,8 +245,8 @@ def shoulders(robots: tuple[Robot, Robot]) -> Array:
 
 
 def possible_spins(contact: Contact, spins: Array) -> Array:
-    """Those of spins (n,) [rad] that leave a robot's patches where they are: all of one round pad,
-    half turns of a rectangular one, none beside 0 where further pads stand beside the first."""
+    """Return those of spins (n,) [rad] that leave a robot's patches unchanged: all of one round
+    pad, half turns of a rectangular one, only 0 if further pads stand beside the first."""
     if contact.further:
         return np.zeros(1)
     if contact.half_sides is None:
@@ -254,8 +255,9 @@ def possible_spins(contact: Contact, spins: Array) -> Array:
 
 
 def clear_spins(query: HoldQuery, kinematics: ArmKinematics, spins: Array) -> Array:
-    """Those of spins (n,) [rad] at which what is fixed to the arm's last joint, hand, tool and pad,
-    meets nothing that stands, at the start and at the goal; all of them where none is so.
+    """Return those of spins (n,) [rad] at which the bodies fixed to the arm's last joint, hand,
+    tool and pad, meet nothing that stands, at the start and at the goal; all of them if none is
+    free.
 
     Within a shelf that is a few of twelve, on which all random starts are spent then.
     """
@@ -290,21 +292,22 @@ def clear_spins(query: HoldQuery, kinematics: ArmKinematics, spins: Array) -> Ar
 
 
 def guide(start: Array, goal: Array, bow: Array) -> Array:
-    """(GUIDE_POSES, 6 + m) from one extended pose to another, bowing out by (3,) in the middle."""
+    """Compute a path (GUIDE_POSES, 6 + m) from one extended pose to another, bowing out by (3,) in
+    the middle."""
     poses = np.linspace(start, goal, GUIDE_POSES)
     poses[:, :3] += np.sin(np.linspace(0.0, np.pi, GUIDE_POSES))[:, None] * bow
     return poses
 
 
 def _turns(axis: Array, angle: Array) -> Array:
-    """(n, 3, 3) rotations about a unit axis (Rodrigues)."""
+    """Compute rotations (n, 3, 3) about a unit axis (Rodrigues)."""
     K = np.array([[0.0, -axis[2], axis[1]], [axis[2], 0.0, -axis[0]], [-axis[1], axis[0], 0.0]])
     sine, cosine = np.sin(angle)[:, None, None], np.cos(angle)[:, None, None]
     return np.asarray(np.eye(3) + sine * K + (1.0 - cosine) * (K @ K))
 
 
 def _error(target: Array, T: Array) -> tuple[Array, Array]:
-    """Newton's right-hand side (n, 6) and the pose residual (n,)."""
+    """Compute Newton's right-hand side (n, 6) and the pose residual (n,)."""
     R, R_target = T[:, :3, :3], target[:, :3, :3]
     dR = R_target @ R.transpose(0, 2, 1)
     axis = np.stack(
@@ -420,7 +423,8 @@ class HoldQuery:
 
 
 def find_holds(query: HoldQuery, kinematics: ArmKinematics, rng: np.random.Generator) -> HoldSearch:
-    """The ways in which an arm can hold the box from start to goal, the other arm left out."""
+    """Find the holds with which an arm can carry the box from start to goal, the other arm left
+    out."""
     finder = _Finder(query, kinematics, rng)
     found, contact = finder.found, kinematics.workcell.contacts[kinematics.arm]
     spins = clear_spins(query, kinematics, possible_spins(contact, query.spins))
@@ -453,7 +457,7 @@ class _Finder:
         self._orientation = kinematics.workcell.task.orientation
 
     def start_postures(self, T_box_joint: Sequence[Array]) -> tuple[Array, NDArray[np.intp]]:
-        """Distinct postures at the start and the index of each one's spin."""
+        """Find distinct postures at the start and the index of each one's spin."""
         kinematics, found, start = self.kinematics, self.found, self.query.start
         T_world_box = box_placement(self._orientation, start)
         which = np.arange(self.query.starts) % len(T_box_joint)
@@ -487,7 +491,8 @@ class _Finder:
         return q[kept], which[kept]
 
     def colliding(self, pose: Array, q: Array) -> NDArray[np.bool_]:
-        """(n,) of postures (n, joints) that hold the box at a pose; counts what they meet."""
+        """Return (n,) True for colliding postures (n, joints) that hold the box at a pose; count
+        the pairs."""
         judge, arm = self.query.judge, self.kinematics.arm
         if judge is None or not len(q):
             return np.zeros(len(q), dtype=bool)
@@ -530,7 +535,7 @@ class _Finder:
             waiting = np.delete(waiting, arrived)
 
     def _followed(self, targets: Array, q: Array) -> tuple[NDArray[np.intp], Array, Array]:
-        """Rows that arrive, joint paths (m, n, joints) and scores (n,)."""
+        """Return the rows that arrive, joint paths (m, n, joints) and scores (n,)."""
         kinematics, redundant = self.kinematics, list(self.kinematics.redundant)
         ends = None
         if redundant:  # half of them keep their redundant joints, half move them elsewhere
@@ -571,8 +576,8 @@ class _Finder:
         return f"{joint} is at its limit there"
 
     def _resolved(self, targets: Array, q: Array) -> tuple[NDArray[np.intp], Array, Array]:
-        """As `_followed`, the redundant joints where the others are best off; only the ends count,
-        because what is planned between them need not follow the same path."""
+        """Follow as `_followed`, with redundant joints resolved; only the ends count, because the
+        planned path between them may differ."""
         ends = None
         if self.query.common is not None:
             ends = q[:, list(self.kinematics.redundant)]
@@ -591,12 +596,13 @@ class _Finder:
             ends[:, columns] = self.query.common[1]
 
     def _room(self, path: Array) -> Array:
-        """(m, n) least distance to a joint limit of joint paths (m, n, joints)."""
+        """Compute the least distance (m, n) of joint paths (m, n, joints) to a joint limit."""
         beyond = np.minimum(path - self.kinematics.lower, self.kinematics.upper - path)
         return np.asarray(beyond.min(axis=2))
 
     def _score(self, path: Array, room: Array, measure: Array) -> Array:
-        """(n,) how far from limits and singular postures, and how short between the ends."""
+        """Score (n,) paths by their distance from limits and singular postures, and by the
+        shortness between the ends."""
         comfort = np.clip(room.min(axis=0), 0.0, 0.6) / 0.6
         away = np.minimum(measure.min(axis=0) / (4.0 * self.kinematics.least), 1.0)
         apart = np.linalg.norm(path[-1] - path[0], axis=1)
@@ -613,8 +619,8 @@ def told_manipulability(kinematics: ArmKinematics, found: str) -> str:
 
 
 def _diverse(holds: Sequence[Hold], compared: int) -> list[Hold]:
-    """The best of ways that differ only in the spin and a joint about the same axis, ordered so
-    that those unlike all before them come first.
+    """Return the best of holds that differ only in the spin and a joint about the same axis, those
+    unlike all earlier ones first.
 
     Args:
         compared: joints that make a difference, from the first.
@@ -635,7 +641,7 @@ def _diverse(holds: Sequence[Hold], compared: int) -> list[Hold]:
 
 
 def spins_the_pad(kinematics: ArmKinematics) -> bool:
-    """Whether the arm's last joint turns the pad about its normal, as a spin does."""
+    """Return True if the arm's last joint turns the pad about its normal, as a spin does."""
     geometry, contact = kinematics.geometry, kinematics.workcell.contacts[kinematics.arm]
     T_joint_pad = geometry.T_joint_box @ contact.T_box_pad
     axis = geometry.axes[-1]

@@ -85,7 +85,7 @@ class _Follower:
         self.lower, self.upper = many.lower + LIMIT_MARGIN, many.upper - LIMIT_MARGIN
 
     def close(self, T_world_box: Array, extended: Array, q: Array) -> Array | str:
-        """The joints near q that hold the box there, or what is in the way."""
+        """Return the joints near q that hold the box there, or a text that names the obstacle."""
         target = self.T_root_world @ T_world_box @ self.T_box_joint
         before, q = q, q.copy()
         for joint, place in self.redundant:
@@ -150,7 +150,7 @@ class ClosedChain:
         ]
 
     def close(self, extended: Array, q: tuple[Array, Array]) -> Place | None:
-        """The configuration near given joints; collisions do not count."""
+        """Return the configuration near given joints; collisions do not count."""
         T_world_box = box_placement(self._orientation, extended[:POSE_SIZE])
         found = []
         for arm, near in zip(self._arms, q, strict=True):
@@ -164,7 +164,7 @@ class ClosedChain:
     def close_many(
         self, extended: Array, q: tuple[Array, Array], steps: int = TRACKING_STEPS
     ) -> tuple[tuple[Array, Array], NDArray[np.bool_]]:
-        """Configurations near given joints, all side by side; collisions do not count.
+        """Return configurations near given joints, all at once; collisions do not count.
 
         Args:
             extended: (n, 6 + m).
@@ -232,7 +232,7 @@ class ClosedChain:
         return [[one[0], *one[1 : 1 + self._free(one[1:])]] for one in found]
 
     def between(self, first: Place, last: Place, path: Array) -> list[Place] | None:
-        """The configurations along a path (n, 6 + m) between two of them, None if not all are free,
+        """Return the configurations along a path (n, 6 + m) between two, None if not all are free,
         or the joints do not lead from the one to the other."""
         share = np.linspace(0.0, 1.0, len(path))[:, None]
         near = [(1.0 - share) * a + share * b for a, b in zip(first.q, last.q, strict=True)]
@@ -249,18 +249,19 @@ class ClosedChain:
         return [first, *places[1:-1], last] if free else None
 
     def reach(self, begin: Place, extended: Array) -> Place | None:
-        """The configuration at the end of a straight motion, None if it is not free."""
+        """Return the configuration at the end of a straight motion, None if the motion is not
+        free."""
         found = self.way(begin, straight(begin.extended, extended))
         return None if found is None else found[-1]
 
     def way(self, begin: Place, path: Array) -> list[Place] | None:
-        """The configurations along a path (n, 6 + m) of extended poses from one of them on, None if
-        not all are free."""
+        """Return the configurations along a path (n, 6 + m) of extended poses from one of them on,
+        None if not all are free."""
         found = [begin, *self.along(begin, path[1:])]
         return found if len(found) == len(path) else None
 
     def _free(self, places: list[Place]) -> int:
-        """How many of these are free before the first that is not."""
+        """Count the free configurations before the first that is not."""
         if not places:
             return 0
         pose = np.array([place.extended[:POSE_SIZE] for place in places])
@@ -270,19 +271,20 @@ class ClosedChain:
 
 
 def levers(size: int) -> Array:
-    """(size,) what each entry of an extended pose counts in a distance."""
+    """Return the weight (size,) of each entry of an extended pose in a distance."""
     found = np.full(size, REDUNDANT_LEVER)
     found[:3], found[3:POSE_SIZE] = 1.0, LEVER
     return found
 
 
 def distance(first: Array, second: Array) -> float:
-    """Distance between extended poses [m]."""
+    """Compute the distance between extended poses [m]."""
     return float(np.linalg.norm(levers(len(first)) * (second - first)))
 
 
 def straight(first: Array, second: Array) -> Array:
-    """(n, 6 + m) extended poses on the straight line, `STEP` apart or less, ends included."""
+    """Return extended poses (n, 6 + m) on the straight line, at most `STEP` apart, ends
+    included."""
     n = max(int(np.ceil(distance(first, second) / STEP)), 1)
     return np.asarray(np.linspace(first, second, n + 1))
 
@@ -330,11 +332,11 @@ class Freedom:
     range: float
 
     def extended(self, y: Array) -> Array:
-        """(6 + m,) of coordinates (d,)."""
+        """Compute the extended pose (6 + m,) of coordinates (d,)."""
         return np.asarray(self.origin + self.directions @ y)
 
     def coordinates(self, extended: Array) -> Array:
-        """(d,) of an extended pose."""
+        """Compute the coordinates (d,) of an extended pose."""
         return np.asarray(np.linalg.pinv(self.directions) @ (extended - self.origin))
 
 
@@ -357,7 +359,7 @@ class Stray:
 
 
 def freedom(start: Array, goal: Array, stray: Stray, limits: Array) -> Freedom:
-    """Where a path from start to goal may go.
+    """Compute the subspace in which a path from start to goal may lie.
 
     Args:
         start, goal: (6 + m,).
@@ -402,7 +404,7 @@ itself first."""
 
 
 def retreats(chain: ClosedChain, ends: tuple[Place, Place]) -> Retreats:
-    """Straight motions out of start and goal along the world's axes and between them: out of a
+    """Find straight motions out of start and goal along the world's axes and between them: out of a
     shelf, for instance."""
     ways = DIRECTIONS / np.linalg.norm(DIRECTIONS, axis=1)[:, None]
     begins = [place for place in ends for _ in ways]
@@ -415,9 +417,8 @@ def retreats(chain: ClosedChain, ends: tuple[Place, Place]) -> Retreats:
 
 
 def straight_paths(chain: ClosedChain, out: Retreats, box: BoxAlone) -> Iterator[list[Place]]:
-    """Corners of free paths of a retreat, a straight motion, and the opposite of a retreat: the
-    shortest found first, along each pair of directions one. The directions are the same, or both
-    along axes of the world: up out of a bin, and into a shelf from its front."""
+    """Yield corners of free paths of a retreat, a straight motion, and the opposite of a retreat
+    along the same direction: the shortest first, one per direction."""
     ways: dict[tuple[bytes, bytes], tuple[float, tuple[int, int], list[Place]]] = {}
     axes = np.flatnonzero(np.count_nonzero(DIRECTIONS, axis=1) == 1)
     same_way = [(k, k) for k in range(len(DIRECTIONS))]
@@ -451,7 +452,7 @@ def plan(
     out_of_time: Callable[[], bool],
     seed: int,
 ) -> list[Place] | None:
-    """Corners of a free path from start to goal that RRT-Connect finds, None if it finds none.
+    """Find corners of a free path from start to goal by RRT-Connect; None without one.
 
     Args:
         chain: the arms in one way of holding.
@@ -475,7 +476,8 @@ def plan(
             states.append(state)
 
     def joined(first: State, second: State) -> bool:
-        """Whether a straight motion between two states is free, one of them reached before."""
+        """Return True if the straight motion between two states is free, one of them reached
+        before."""
         if first not in places:
             first, second = second, first
         if first not in places:
@@ -499,7 +501,7 @@ def plan(
 
 
 def _usable(stops: list[Place], place: Place, room: Freedom) -> list[Place]:
-    """Configurations that lie apart from an end and within the room."""
+    """Return the configurations that lie apart from an end and within the room."""
     at = [room.coordinates(stop.extended) for stop in stops]
     return [
         stop
@@ -510,7 +512,7 @@ def _usable(stops: list[Place], place: Place, room: Freedom) -> list[Place]:
 
 
 def same(first: Place, second: Place) -> bool:
-    """Whether both arms stand on the same branches and turns."""
+    """Return True if both arms stand on the same branches and turns."""
     apart = [np.abs(a - b).max() for a, b in zip(first.q, second.q, strict=True)]
     return bool(max(apart) < MATCH)
 
@@ -527,7 +529,7 @@ def connected(
     ended: Callable[[], bool],
     seed: int,
 ) -> list[State] | None:
-    """States of a path that RRT-Connect finds, None if it finds none.
+    """Find the states of a path by RRT-Connect; None without one.
 
     Args:
         bounds: least and largest states (d,).

@@ -126,7 +126,7 @@ class Problem:
         return [pair for pair in pairs if pair != self.contacts]
 
     def _robots(self) -> tuple[Robot, Robot]:
-        """The robots alone, wherever the box is."""
+        """Read the robots alone, wherever the box is."""
         problems = Problems()
         entries = TableReader(self.data, "", problems).tables("robots", exactly=2)
         found = [read_robot(entry, self.source.parent)[0] for entry in entries]
@@ -135,9 +135,9 @@ class Problem:
         return found[0], found[1]
 
     def sides(self) -> list[Problem]:
-        """The same problem with each pair of upright faces that the pads may press where its
-        robots have no bases yet, a machine's arms either way round; itself alone where the file
-        names the points, or a carry that goes level past two robots leaves no choice."""
+        """Return the problem with each pair of upright faces that the pads may press if its robots
+        have no bases yet, a machine's arms either way round; itself alone if the file names the
+        points, or a level carry past two robots leaves no choice."""
         entries = self.data["contacts"]
         start, goal = self.poses
         level = float(np.linalg.norm((goal - start)[:2]))
@@ -181,7 +181,7 @@ class Problem:
         return load(self.source, text=text.encode(), reach=False)
 
     def completed(self, changes: dict[str, Any], folder: Path) -> str:
-        """The file's text, completed, for a folder that paths are then relative to.
+        """Return the file's text, completed, with paths relative to a folder.
 
         Args:
             changes: as for `symbolic.read.editing.completed`.
@@ -200,7 +200,7 @@ class Problem:
 
 
 def read_problem(path: str | Path) -> Problem:
-    """The problem of a file.
+    """Read the problem of a file.
 
     Raises:
         WorkcellError: it is no TOML, or what has to be known is not there.
@@ -255,7 +255,7 @@ def _require_known(table: TableReader) -> None:
 def contact_points(
     size: Array, way: Array, R_world_box: Array, bases: Array | None
 ) -> list[list[float]]:
-    """Middles of opposite faces of the box that face the robots, one per robot [m].
+    """Compute middles of opposite faces of the box that face the robots, one per robot [m].
 
     Args:
         size: (3,) edges of the box [m].

@@ -89,7 +89,7 @@ STAND_OFFS = (0.04, 0.03, 0.02, 0.01)
 
 
 def worked() -> float:
-    """Processor time of this process and those it waited for, so far [s]."""
+    """Return the processor time of this process and its children so far [s]."""
     spent = os.times()
     return spent.user + spent.system + spent.children_user + spent.children_system
 
@@ -168,7 +168,7 @@ class Proposal:
         return " and ".join(self.sides) or "nothing"
 
     def text(self, folder: Path) -> str:
-        """The workcell file, for a folder: the problem file's text, completed.
+        """Return the workcell file for a folder: the problem file's text, completed.
 
         Raises:
             SettingsError: it is written in a way that cannot be completed.
@@ -315,7 +315,7 @@ class _Search:
         return self.settings.bases or effort >= OTHER_FACES
 
     def _round(self, lazy: _Lazy, effort: int, most: int, strays: int) -> Iterator[Proposal]:
-        """One round with one choice of bases."""
+        """Run one round with one choice of bases."""
         if lazy.setup is None and not lazy.problem:
             self._say("ways to hold the box")
             try:
@@ -347,7 +347,7 @@ class _Search:
                     yield from self._judged(lazy.setup, pair, via, box)
 
     def _is_known(self, pair: Pair, box: BoxAlone, path: Array) -> bool:
-        """Whether a carry of the class of these poses (n, 6) was found before."""
+        """Return True if a carry of the class of these poses (n, 6) was found before."""
         return bool(self.known) and (id(pair), box.passed(path)) in self.known
 
     def _failed(self, setups: list[_Lazy]) -> ProposalError:
@@ -370,7 +370,7 @@ class _Search:
     def _paths(
         self, setup: Setup, pair: Pair, effort: int, strays: int, box: BoxAlone
     ) -> Iterator[list[Place] | None]:
-        """Corners of paths in one way of holding."""
+        """Yield corners of paths with one pair of holds."""
         if not effort:
             found = straight_paths(pair.chain, pair.retreats, box)
             yield from islice(found, None if self.settings.classes > 1 else 1)
@@ -393,7 +393,7 @@ class _Search:
             )
 
     def _via_points(self, pair: Pair, corners: list[Place]) -> Array | None:
-        """The fewest via-points of a path, None where none are found."""
+        """Find the fewest via-points of a path, None without any."""
         self._say("via-points")
         dense = shortened(pair.chain, corners, self.rng)
         for count in range(1, MOST_VIA_POINTS + 1):
@@ -403,8 +403,8 @@ class _Search:
         return None
 
     def _judged(self, setup: Setup, pair: Pair, via: Array, box: BoxAlone) -> Iterator[Proposal]:
-        """The proposal with these via-points, none where the evaluator refuses it or one of its
-        class was found before."""
+        """Yield the proposal with these via-points, unless the evaluator refuses it or its class
+        was found before."""
         fitted = np.vstack([pair.start.extended, via, pair.goal.extended])
         if self._is_known(pair, box, _poses(fitted)):
             return
@@ -458,7 +458,7 @@ class _Search:
     def _draft(
         self, setup: Setup, pair: Pair, waypoints: Array, bounds: Bounds | None = None
     ) -> Draft:
-        """What is found with waypoints (n, 6 + m), rounded as a file states them."""
+        """Build the draft with waypoints (n, 6 + m), rounded as in a file."""
         spins = (pair.holds[0].spin, pair.holds[1].spin)
         rounded = np.round(waypoints, 4)
         return Draft(setup.workcell, spins, (-1, -1), rounded, setup.given, bounds)
@@ -466,13 +466,13 @@ class _Search:
     def _trial(
         self, setup: Setup, pair: Pair, waypoints: Array, bodies: CellBodies | None = None
     ) -> Trial:
-        """The carry through waypoints (n, 6 + m); bodies as of `Trial`."""
+        """Build the trial of the carry through waypoints (n, 6 + m); bodies as in `Trial`."""
         workcell = self._workcell(self._draft(setup, pair, waypoints))
         return Trial(workcell, pair.start.q, bodies, named=False)
 
     def _pads_way(self, trial: Trial) -> tuple[str, float | None]:
-        """What blocks the pads before a trial's carry or after it, '' where nothing does, and the
-        stand-off that frees them where that of the cell does not and the file states none [m]."""
+        """Return what blocks the pads before a trial's carry or after it, '' for nothing, and the
+        stand-off that frees them if the cell's does not and the file states none [m]."""
         handling = trial.workcell.handling
         blocked = grasp_blocked(trial, handling)
         if blocked and "stand_off" not in self.problem.data.get("handling", {}):
@@ -485,7 +485,7 @@ class _Search:
         return self.problem.workcell(changes(self.problem, found))
 
     def _bounds(self, trial: Trial, until: float) -> Bounds:
-        """Bounds around a trial's carry, found by a time `until` [s] after the beginning."""
+        """Find bounds around a trial's carry until a time [s] after the beginning."""
         unit, limits = decision_bounds(trial.workcell)
         low, high = self.settings.feasible
         sampling = Sampling(
@@ -502,6 +502,6 @@ class _Search:
 
 
 def _poses(waypoints: Array) -> Array:
-    """(n, 6) box poses along the spline through waypoints (w, 6 + m)."""
+    """Compute box poses (n, 6) along the spline through waypoints (w, 6 + m)."""
     basis = path_basis(len(waypoints), np.linspace(0.0, 1.0, LEAST_SAMPLES)).position
     return np.asarray((basis @ waypoints)[:, :POSE_SIZE])

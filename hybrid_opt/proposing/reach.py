@@ -45,7 +45,7 @@ _collisions = cache_by_workcell(lambda cell: JobCollisions(CompiledCell.of(cell)
 
 
 def plan_reach(job: Job, q: Array, *, rng: np.random.Generator, after: bool = False) -> Array:
-    """The way of both arms to a job's first position, free of collisions throughout.
+    """Plan the path of both arms to a job's first position, free of collisions throughout.
 
     Args:
         q: (joints,) where both arms stand, side by side [rad, or m where a joint slides].
@@ -98,19 +98,19 @@ class _Lines:
         return np.tile(self._pose, (len(q), 1)), first, second
 
     def touched(self, q: Array) -> str:
-        """What collides at joints (joints,), '' where nothing does."""
+        """Describe the collision at joints (joints,), '' for none."""
         touch = self._checker.check(*self._placed(q[None])).first_touch
         return "" if touch is None else str(touch)
 
     def free(self, first: Array, second: Array) -> bool:
-        """Whether no configuration looked at on a line collides."""
+        """Return True if no configuration checked on a line collides."""
         n = int(np.ceil(np.abs(second - first).max() / STEP)) + 1
         q = np.linspace(first, second, n + 1)[1:]
         self.looked += len(q)
         return self._checker.check(*self._placed(q)).is_free
 
     def proven(self, first: Array, second: Array) -> bool:
-        """Whether the whole line is free."""
+        """Return True if the whole line is proven free."""
 
         def at(u: Array) -> tuple[Array, Array, Array]:
             return self._placed(first + u[:, None] * (second - first))
@@ -122,7 +122,7 @@ class _Lines:
 def _connected(
     lines: _Lines, q: Array, end: Array, bounds: tuple[Array, Array], seed: int
 ) -> list[Array]:
-    """Corners that RRT-Connect finds.
+    """Find corners by RRT-Connect.
 
     Raises:
         JobError: it finds none.
@@ -144,7 +144,7 @@ def _connected(
 
 
 def _shortened(lines: _Lines, corners: list[Array]) -> list[Array]:
-    """As few of the corners as lines that are proven free can join, greedily."""
+    """Remove corners greedily while lines that are proven free join the rest."""
     found, at = [corners[0]], 0
     while at < len(corners) - 1:
         ahead = range(len(corners) - 1, at + 1, -1)

@@ -106,7 +106,7 @@ def ranked_pairs(
 
 
 def _place(task: Task, pose: Array, holds: tuple[Hold, Hold], end: int) -> Place:
-    """The closed chain at the start (0) or the goal (1)."""
+    """Build the closed chain at the start (0) or the goal (1)."""
     joints = [(hold.q_start, hold.q_goal)[end] for hold in holds]
     extended = np.zeros(task.extended_size)
     extended[:POSE_SIZE] = pose
@@ -117,7 +117,7 @@ def _place(task: Task, pose: Array, holds: tuple[Hold, Hold], end: int) -> Place
 
 
 def _free(judge: PoseJudge, *places: Place) -> bool:
-    """Whether nothing collides in any of these configurations."""
+    """Return True if nothing collides in any of these configurations."""
     return not any(
         judge.colliding(place.extended[None, :POSE_SIZE], place.q[0][None], place.q[1][None])[0]
         for place in places
@@ -125,7 +125,7 @@ def _free(judge: PoseJudge, *places: Place) -> bool:
 
 
 def _free_share(chain: ClosedChain, start: Place, goal: Place) -> float:
-    """Share of the freest guide that the chain can follow."""
+    """Compute the share of the freest guide that the chain can follow."""
     best = 0.0
     for bow in GUIDES[:GUIDES_TRIED]:
         path = guide(start.extended, goal.extended, bow)
@@ -173,7 +173,7 @@ def prepare(
     rng: np.random.Generator,
     tell: Callable[[str], None] = lambda text: None,
 ) -> Setup:
-    """Find all ways to hold.
+    """Find all holds of both arms.
 
     Args:
         given: added to the problem's tables.
@@ -218,7 +218,7 @@ def _progress(searches: Sequence[HoldSearch]) -> tuple[float, ...]:
 
 
 def redundancy(problem: Problem, workcell: Workcell) -> dict[str, Any]:
-    """The joints beyond six where the file does not name them, at the middle of their ranges."""
+    """Return the joints beyond six that the file does not name, at the middle of their ranges."""
     robots: list[dict[str, Any]] = [{}, {}]
     entries: dict[str, dict[str, Any]] = {}
     common = common_joints(workcell.robots)
@@ -240,8 +240,8 @@ def redundancy(problem: Problem, workcell: Workcell) -> dict[str, Any]:
 
 
 def redundant_joints(workcell: Workcell, arm: int, common: tuple[str, ...]) -> tuple[int, ...]:
-    """Indices of the joints of an arm without which the other six are conditioned best, in the
-    median of random postures; joints of both arms and joints that slide in any case."""
+    """Return the indices of an arm's joints without which the other six are conditioned best, in
+    the median of random postures; joints of both arms and prismatic joints in any case."""
     robot = workcell.robots[arm]
     model = arm_model(robot)
     names, beyond = list(model.names)[1:], model.nq - FOLLOWING
@@ -262,7 +262,7 @@ def redundant_joints(workcell: Workcell, arm: int, common: tuple[str, ...]) -> t
 
 
 def box_blocked(judge: PoseJudge, start: Array, goal: Array) -> str:
-    """What the box alone meets at the start or the goal, '' where it meets nothing."""
+    """Describe what the box alone meets at the start or the goal, '' for nothing."""
     found = []
     for name, pose in (("start", start), ("goal", goal)):
         for body, deep in judge.resting(pose):
@@ -273,8 +273,8 @@ def box_blocked(judge: PoseJudge, start: Array, goal: Array) -> str:
 
 
 def reach_missing(workcell: Workcell, ends: tuple[Array, Array], spins: Array) -> str:
-    """Which arm does not reach its contact at the start or the goal (6,) with any spin, and how
-    much it lacks; '' where both reach."""
+    """Describe which arm does not reach its contact at the start or the goal (6,) with any spin,
+    and by how much; '' if both reach."""
     found = []
     for arm, (name, pose) in product((0, 1), zip(("start", "goal"), ends, strict=True)):
         robot, contact = workcell.robots[arm], workcell.contacts[arm]
@@ -347,7 +347,7 @@ def _no_pair(query: HoldQuery, judge: PoseJudge, searches: Sequence[HoldSearch])
 
 
 def no_path(pairs: Iterable[Pair], refusals: Sequence[str]) -> str:
-    """What the planner met most often, and what the evaluator said of its paths."""
+    """Describe what the planner met most often, and why the evaluator refused its paths."""
     met: Counter[tuple[str, str]] = Counter()
     refused: Counter[str] = Counter()
     for pair in pairs:
@@ -373,7 +373,7 @@ def _pairs(met: Counter[tuple[str, str]]) -> str:
 
 
 def _overlap_hint(met: Counter[tuple[str, str]]) -> str:
-    """What may be done about links of one robot that meet in every posture."""
+    """Suggest a remedy for links of one robot that meet in every posture."""
     owners = [[name.partition("/")[0] for name in pair if "/" in name] for pair in met]
     if not any(len(names) == 2 and names[0] == names[1] for names in owners):
         return ""

@@ -65,7 +65,7 @@ class BoxAlone:
         ]
 
     def meets(self, path: Array) -> bool:
-        """Whether the box meets the environment at one of these poses (n, 6)."""
+        """Return True if the box meets the environment at one of these poses (n, 6)."""
         return any(
             self._meets(box, k) for box in self._boxes(path) for k in range(len(self._names))
         )
@@ -79,9 +79,9 @@ class BoxAlone:
         return self._met[key]
 
     def passed(self, path: Array) -> tuple[str, ...]:
-        """Sides on which a path (n, 6) passes what the straight motion between its ends meets, such
-        as 'over post', 'left of post' (looking along the motion), 'between post and wall' or
-        'through frame'; nothing where that is free.
+        """Return the sides on which a path (n, 6) passes what the straight motion between its ends
+        meets, such as 'over post', 'left of post' (looking along the motion), 'between post and
+        wall' or 'through frame'; empty if that is free.
 
         What the box meets at an end, such as the board that it stands on, does not count.
         """
@@ -111,9 +111,9 @@ class BoxAlone:
 def _passage(
     boxes: list[tuple[Piece, ...]], standing: Mapping[str, tuple[Piece, ...]], name: str, way: Array
 ) -> str:
-    """How a box passes one of some standing bodies while it is abreast of it: on which side, across
-    the way (3,), the gap is largest; and whether it is between parts of that body, or between it
-    and another one."""
+    """Describe how a box passes a standing body while abreast of it: on which side, across the way
+    (3,), the gap is largest; and whether it is between parts of that body, or between it and
+    another one."""
     length = float(np.linalg.norm(way))
     along = way / length if length > 0.0 else np.array([1.0, 0.0, 0.0])
     level = np.array([along[0], along[1], 0.0])
@@ -129,7 +129,7 @@ def _passage(
     abreast = min(boxes, key=lambda box: abs(_reach(box, along) - _reach(box, -along) - middle))
 
     def faces(other: tuple[Piece, ...], side: Array) -> bool:
-        """Whether the box meets the other body if it moves on to this side."""
+        """Return True if the box meets the other body when it moves on to this side."""
         across = along, np.cross(along, side)
         return any(
             _gap(abreast, (piece,), side) >= 0.0
@@ -152,13 +152,13 @@ def _passage(
 
 
 def _gap(box: tuple[Piece, ...], body: tuple[Piece, ...], direction: Array) -> float:
-    """How far a box may move in a direction (3,) before it is abreast of a body [m]; negative where
-    it is already."""
+    """Compute how far a box may move in a direction (3,) before it is abreast of a body [m];
+    negative if it already is."""
     return -_reach(body, -direction) - _reach(box, direction)
 
 
 def _reach(pieces: tuple[Piece, ...], direction: Array) -> float:
-    """How far pieces reach along a direction (3,) [m]."""
+    """Compute the extent of pieces along a direction (3,) [m]."""
     return max(float(support(piece, direction)[0]) for piece in pieces)
 
 
@@ -192,7 +192,7 @@ class PoseJudge:
         ]
 
     def with_margin(self, margin: float) -> PoseJudge:
-        """The same judge with another clearance to spare."""
+        """Return the judge with another clearance margin."""
         workcell = self.geometry.workcell
         collision = workcell.collision
         wider = replace(collision, tolerance=collision.tolerance - self.margin + margin)
@@ -201,14 +201,14 @@ class PoseJudge:
         return PoseJudge(geometry, checker, margin)
 
     def colliding(self, pose: Array, q_1: Array, q_2: Array) -> NDArray[np.bool_]:
-        """(n,) of box poses (n, 6) and both arms' joints (n, joints)."""
+        """Return (n,) True for colliding box poses (n, 6) and both arms' joints (n, joints)."""
         found = self.checker.check(pose, q_1, q_2)
         if found.first_touch is not None:
             self.met[found.first_touch.first, found.first_touch.second] += 1
         return found.colliding
 
     def arm_colliding(self, arm: int, pose: Array, q: Array) -> NDArray[np.bool_]:
-        """(n,) of one arm and the box, as if the other arm were not there."""
+        """Return (n,) True for collisions of one arm and the box, without the other arm."""
         absent = np.zeros((len(q), self.geometry.arms[1 - arm].joints))
         q_1, q_2 = (q, absent) if arm == 0 else (absent, q)
         bounds = self.checker.bounds(pose, q_1, q_2)
@@ -216,8 +216,8 @@ class PoseJudge:
         return self.checker.check(pose, q_1, q_2, bounds).colliding
 
     def resting(self, pose: Array) -> list[tuple[str, bool]]:
-        """What stands where the box (6,) is to be: environment bodies, and whether the box enters
-        them by more than what rests on something may."""
+        """Return the environment bodies at the box's pose (6,), and whether the box penetrates each
+        by more than a resting one may."""
         names = [
             (k, pair) for k, pair in enumerate(self.geometry.pair_names) if PAYLOAD_NAME in pair
         ]
@@ -236,7 +236,7 @@ class PoseJudge:
     def first_pair(
         self, pose: Array, q_1: Array, q_2: Array, arm: int | None = None
     ) -> tuple[str, str] | None:
-        """The first pair that collides in one configuration, of one arm or of all."""
+        """Return the first pair that collides in one configuration, of one arm or of all."""
         pose, q_1, q_2 = (np.atleast_2d(part) for part in (pose, q_1, q_2))
         bounds = self.checker.bounds(pose, q_1, q_2)
         if arm is not None:
@@ -246,7 +246,7 @@ class PoseJudge:
 
 
 def judge_of(geometry: CellGeometry) -> PoseJudge:
-    """The judge of a cell's collisions, with nothing to spare.
+    """Build the judge of a cell's collisions, without a margin.
 
     Raises:
         RobotModelError: a URDF does not give an arm.
@@ -330,13 +330,13 @@ class Trial:
         return initial_decision(self.workcell.task)
 
     def start_of(self, x: Array) -> tuple[Array, Array]:
-        """Both arms' postures (joints,) with which a decision vector (n_var,) begins."""
+        """Compute both arms' postures (joints,) at the start of a decision vector (n_var,)."""
         outputs = self.evaluator.outputs(x[None])
         return outputs["q_1"][0, 0], outputs["q_2"][0, 0]
 
     def verdict(self) -> tuple[Judgement, str]:
-        """Whether the proposed carry is feasible, certified between its samples and held still at
-        both ends, and if not why."""
+        """Evaluate the proposed carry, certified between its samples and held still at both ends;
+        return the verdict and the reason of a failure."""
         judgement, why = self.verdict_on(self.initial)
         told = (
             static_hold_error(self.workcell, self.evaluator.outputs) if judgement.feasible else ""
@@ -346,11 +346,11 @@ class Trial:
         )
 
     def certain(self, x: Array) -> bool:
-        """Whether a decision vector (n_var,) is feasible, between its samples too."""
+        """Return True if a decision vector (n_var,) is feasible, between its samples too."""
         return bool(self.feasible(x[None])[0]) and self.verdict_on(x)[0].feasible
 
     def verdict_on(self, x: Array) -> tuple[Judgement, str]:
-        """The same of a decision vector (n_var,)."""
+        """Evaluate a decision vector (n_var,) likewise."""
         verdicts = self.evaluator.evaluate(x[None])
         judgement = verdicts.judgement(0, self.evaluator.objective_names)
         if not judgement.feasible:
@@ -365,7 +365,8 @@ class Trial:
         return replace(judgement, feasible=False, reason="between_samples"), place
 
     def feasible(self, x: Array) -> NDArray[np.bool_]:
-        """(n,) whether decision vectors (n, n_var) are feasible on the task's samples."""
+        """Return (n,) True for decision vectors (n, n_var) that are feasible on the task's
+        samples."""
         parts = [self._feasible(x[k : k + CHUNK]) for k in range(0, len(x), CHUNK)]
         return np.concatenate(parts)
 
@@ -379,7 +380,7 @@ class Trial:
         return fine
 
     def _collides(self, placed: list[Array]) -> bool:
-        """Whether a carry collides at a sample."""
+        """Return True if a carry collides at a sample."""
         last = len(placed[0]) - 1
         coarse = np.arange(last, -1, -COARSE)
         return self._hit(placed, coarse) or self._hit(
@@ -387,7 +388,8 @@ class Trial:
         )
 
     def _hit(self, placed: list[Array], rows: NDArray[np.intp]) -> bool:
-        """Whether one of these samples collides; those with the least bounds are judged first."""
+        """Return True if one of these samples collides; those with the least bounds are checked
+        first."""
         checker = self.evaluator.checker
         pose, q_1, q_2 = (np.ascontiguousarray(values[rows]) for values in placed)
         bounds = checker.bounds(pose, q_1, q_2)
@@ -399,7 +401,7 @@ class Trial:
 
 
 def _satisfied(outputs: dict[str, Array]) -> NDArray[np.bool_]:
-    """(n,) whether all constraints but collisions hold at every sample."""
+    """Return (n,) True if all constraints but collisions hold at every sample."""
     finite = np.isfinite(outputs["time"]).all(axis=tuple(range(1, outputs["time"].ndim)))
     return np.asarray(np.all(outputs["violation"] <= 0.0, axis=1) & finite)
 
@@ -409,7 +411,7 @@ class BranchLostError(Exception):
 
 
 def _branch(branches: tuple[StartBranch, ...], q: Array) -> int:
-    """Index of the branch that is a posture."""
+    """Return the index of the branch that equals a posture."""
     apart = [
         float(np.abs(np.remainder(branch.q - q + np.pi, 2.0 * np.pi) - np.pi).max())
         for branch in branches
@@ -421,9 +423,9 @@ def _branch(branches: tuple[StartBranch, ...], q: Array) -> int:
 
 
 def grasp_blocked(trial: Trial, handling: Handling) -> str:
-    """What is in the way of the pads' approach before a trial's carry or of their retreat after
-    it, lift and set-down included, in the place of the cell's own handling; '' where nothing is, or
-    where there are no jobs of such pads."""
+    """Describe what is in the way of the pads' approach before a trial's carry or of their retreat
+    after it, lift and set-down included, with this handling; '' for nothing, or if such pads
+    have no jobs."""
     cell = replace(trial.workcell, handling=handling)
     if not cell.has_facing_pads:
         return ""

@@ -45,17 +45,17 @@ BLOCKED = 100.0
 
 
 def travelled(points: Array) -> float:
-    """Euclidean length of a path through points (n, m)."""
+    """Compute the Euclidean length of a path through points (n, m)."""
     return float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
 
 
 def joint_length(places: Sequence[Place]) -> float:
-    """How far all joints go together [rad]."""
+    """Compute the Euclidean length of the path of all joints [rad]."""
     return travelled(np.array([np.concatenate(place.q) for place in places]))
 
 
 def along(corners: Sequence[Place]) -> Array:
-    """(n, 6) box poses on the straight motions between corners."""
+    """Compute box poses (n, 6) on the straight motions between corners."""
     legs = [straight(a.extended, b.extended)[:, :POSE_SIZE] for a, b in pairwise(corners)]
     return np.vstack(legs)
 
@@ -63,7 +63,7 @@ def along(corners: Sequence[Place]) -> Array:
 def shortened(
     chain: ClosedChain, corners: Sequence[Place], rng: np.random.Generator
 ) -> list[Place]:
-    """A path without needless corners: places along it, `closed_chain.STEP` apart."""
+    """Remove needless corners of a path; return places along it, `planner.STEP` apart."""
     dense = [corners[0]]
     for corner in corners[1:]:
         found = chain.way(dense[-1], straight(dense[-1].extended, corner.extended))
@@ -88,7 +88,7 @@ def shortened(
 def fit(
     chain: ClosedChain, path: Sequence[Place], count: int, rng: np.random.Generator
 ) -> Array | None:
-    """Via-points (count, 6 + m) whose spline is free, None if none are found.
+    """Find via-points (count, 6 + m) whose spline is free, None without any.
 
     Those on the path at even distances, those whose spline is nearest to it, what lies between
     them, then random shifts of the best.
@@ -131,7 +131,7 @@ def fit(
 def straightened(
     chain: ClosedChain, start: Place, waypoints: Array, rng: np.random.Generator
 ) -> Array:
-    """Waypoints (n, 6 + m) of a free spline on which the joints go less far than on the given one.
+    """Find waypoints (n, 6 + m) of a free spline with shorter joint paths than the given one.
 
     Found by an evolution strategy, CMA-ES (Hansen, arXiv 1604.00772), from the given one on.
     """
@@ -169,7 +169,7 @@ def straightened(
 
 
 def _closed_path(chain: ClosedChain, start: Place, path: Array) -> Iterator[Place]:
-    """Configurations along extended poses (n, 6 + m) as far as the chain closes, whatever
+    """Yield configurations along extended poses (n, 6 + m) as far as the chain closes, whatever
     collides."""
     place: Place | None = start
     yield start
@@ -182,7 +182,7 @@ def _closed_path(chain: ClosedChain, start: Place, path: Array) -> Iterator[Plac
 
 
 def _lengths(chain: ClosedChain, paths: Array, near: tuple[Array, Array]) -> tuple[Array, Array]:
-    """How far the joints go [rad] along paths (k, n, 6 + m) that lie near a closed one, per arm
+    """Compute the joint path lengths [rad] along paths (k, n, 6 + m) near a closed one, per arm
     (n, joints); and what counts beside it, above 0 where a path is blocked (k,)."""
     k, n, size = paths.shape
     begin = np.tile(near[0], (k, 1)), np.tile(near[1], (k, 1))
@@ -197,7 +197,7 @@ def _lengths(chain: ClosedChain, paths: Array, near: tuple[Array, Array]) -> tup
 
 
 def free_share(chain: ClosedChain, start: Place, waypoints: Array) -> float:
-    """Share of the spline through waypoints (n, 6 + m) before it is first not free."""
+    """Compute the share of the spline through waypoints (n, 6 + m) before its first collision."""
     legs = [distance(a, b) for a, b in pairwise(waypoints)]
     n = max(LEAST_SAMPLES, int(np.ceil(1.2 * sum(legs) / STEP)))
     path = path_basis(len(waypoints), np.linspace(0.0, 1.0, n)).position @ waypoints

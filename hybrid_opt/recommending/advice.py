@@ -65,14 +65,14 @@ class Advice:
 
 
 def commanded_margins(carry: Carry, forces: Array) -> tuple[Margin, ...]:
-    """How far friction, mass and centre of mass may be off, each for itself, while commanded forces
-    (n, 2) [N] hold the carry."""
+    """Compute how far friction, mass and centre of mass may be off, each by itself, while commanded
+    forces (n, 2) [N] hold the carry."""
     workcell, model = carry.workcell, robust_model(carry.workcell)
     rows, motion = thinned(carry)
     enough, nominal = forces[rows, 1 - LEADER] * (1.0 + HOLDS), nominal_case(workcell)
 
     def last(change: Array, end: float) -> tuple[float, str]:
-        """Largest multiple of a change up to which it holds: it asks for more and more."""
+        """Find the largest multiple of a change up to which the forces hold, which rise with it."""
         low, high = 0.0, end
         for step in range(BISECTIONS):
             middle = end if step == 0 else (low + high) / 2.0
@@ -108,7 +108,7 @@ def commanded_margins(carry: Carry, forces: Array) -> tuple[Margin, ...]:
 
 
 def advice(cell: Cell, paths: DrivenPaths, option: Option, timing: Timing) -> tuple[Advice, ...]:
-    """Effects of changes of the cell on a recommended carry, most force first."""
+    """Compute the effects of changes of the cell on a recommended carry, most force first."""
     assert timing.carry is not None, "what is driven has a carry"
     # With less the path may not move: a tilted box asks for more than a level one.
     limits = np.minimum(LIMITS * option.limit, max(paths.highest_force, option.limit)).tolist()
@@ -121,7 +121,8 @@ def advice(cell: Cell, paths: DrivenPaths, option: Option, timing: Timing) -> tu
         slope = float((durations[high] - durations[low]) / (forces[high] - forces[low]))
 
     def in_time(force: float) -> float:
-        """What a change of the force to command is worth at the same force [s]."""
+        """Convert a change of the force to command to a change of duration at the same force
+        [s]."""
         spare = float(np.interp(option.commanded - force, forces, durations))
         lost = max(forces[0] - (option.commanded - force), 0.0)
         return float(spare - slope * lost - np.interp(option.commanded, forces, durations))
@@ -135,7 +136,7 @@ def advice(cell: Cell, paths: DrivenPaths, option: Option, timing: Timing) -> tu
 
 
 def changes_of_cell(workcell: Workcell, motion: BoxMotion) -> Iterator[tuple[str, float]]:
-    """Changes of the cell, and what each adds to the largest force to command along a motion
+    """Yield changes of the cell, and the rise of the largest force to command along a motion
     [N]."""
     doubt = workcell.uncertainty
 
@@ -162,8 +163,8 @@ def changes_of_cell(workcell: Workcell, motion: BoxMotion) -> Iterator[tuple[str
 
 
 def _height(workcell: Workcell) -> tuple[Array, float]:
-    """(3,) the way up in the box frame, as the box stands at its start, and how high the middle of
-    both robots' pads is over the centre of mass [m]."""
+    """Compute the upward direction (3,) in the box frame at the start, and the height of the middle
+    of both robots' pads over the centre of mass [m]."""
     pose = workcell.task.waypoints[0].lower
     up: Array = box_rotation(workcell.task.orientation, pose)[2]
     middles = [
@@ -174,7 +175,7 @@ def _height(workcell: Workcell) -> tuple[Array, float]:
 
 
 def _with_pads(workcell: Workcell, change: Callable[[Contact], Contact]) -> Workcell:
-    """The cell with every pad changed."""
+    """Return the cell with every pad changed."""
     first, second = (
         replace(change(contact), further=tuple(change(pad) for pad in contact.further))
         for contact in workcell.contacts
@@ -187,7 +188,7 @@ def _with_friction(pad: Contact) -> Contact:
 
 
 def _moved(pad: Contact, by: Array) -> Contact:
-    """Moved by (3,) in the box frame [m], as far as that leads along its face."""
+    """Move a pad by (3,) in the box frame [m], projected onto its face."""
     T, normal = pad.T_box_pad.copy(), pad.T_box_pad[:3, 2]
     T[:3, 3] += by - (by @ normal) * normal
     return replace(pad, T_box_pad=T)
@@ -201,8 +202,8 @@ def _wider(pad: Contact) -> Contact:
 
 
 def _of_pitch(cell: Cell, path: Array, option: Option, slope: float) -> Iterator[Advice]:
-    """One more degree of pitch at every via-point, the better way round, if nothing is in the
-    way."""
+    """Yield the effect of one more degree of pitch at every via-point, in the better direction, if
+    nothing is in the way."""
     if slope == 0.0:
         return
     task, varied, names = cell.workcell.task, [], []

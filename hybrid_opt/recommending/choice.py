@@ -154,7 +154,7 @@ class Goal:
 
     @classmethod
     def of(cls, wish: Wish, workcell: Workcell) -> Goal:
-        """The goal of a wish; robots never press beyond their reference forces."""
+        """Build the goal of a wish; robots never press beyond their reference forces."""
         allowed, longest = workcell.task.reference_force, math.inf
         cost: Callable[[float, float], float] = operator.mul
         if wish.force is not None:
@@ -165,20 +165,20 @@ class Goal:
 
 
 def commanded_at_most(force: float, others: Array | float = np.inf) -> Array:
-    """(2,) largest forces [N] of which one is commanded, the other the leading arm's among
-    others."""
+    """Return the largest forces (2,) [N] if one is commanded and the other is the leading arm's
+    largest of `others`."""
     found = np.broadcast_to(others, 2).astype(float)
     found[1 - LEADER] = min(found[1 - LEADER], force)
     return found
 
 
 def duration_alone(duration: float, force: float) -> float:
-    """A cost, see `Goal`."""
+    """Return the duration as cost, see `Goal`."""
     return duration
 
 
 def force_alone(duration: float, force: float) -> float:
-    """A cost, see `Goal`."""
+    """Return the force as cost, see `Goal`."""
     return force
 
 
@@ -206,8 +206,8 @@ class DrivenPaths:
     def _driven(
         self, force: Array | float, rows: Sequence[int] | None = None
     ) -> list[tuple[int, float, PathTiming]]:
-        """Every path, or some, with its force limit (k,) or one for all [N], and its fastest timing
-        within that."""
+        """Time every path, or some, within force limits (k,) or one for all [N]; yield index, limit
+        and the fastest timing."""
         chosen = list(range(len(self)) if rows is None else rows)
         limits = np.broadcast_to(np.asarray(force, dtype=float), (len(chosen),)).tolist()
         known = self._known
@@ -222,11 +222,12 @@ class DrivenPaths:
         return list(zip(chosen, limits, timings, strict=True))
 
     def durations(self, force: Array | float) -> Array:
-        """(k,) durations [s], infinite where nothing moves within the limit."""
+        """Compute durations (k,) [s], infinite where nothing moves within the limit."""
         return np.array([timing.duration for _, _, timing in self._driven(force)])
 
     def options(self, force: Array | float, rows: Sequence[int] | None = None) -> list[Option]:
-        """Every path, or some, driven within limits (k,) or one for all [N]; those that move."""
+        """Return every path, or some, timed within limits (k,) or one for all [N], except those
+        that do not move."""
         return [self._option(*each) for each in self._driven(force, rows) if each[2].ok]
 
     def _option(self, row: int, limit: float, timing: PathTiming) -> Option:
@@ -248,8 +249,8 @@ class DrivenPaths:
     def all_options(
         self, own: Array | float, told: Callable[[], None] = lambda: None
     ) -> list[Option]:
-        """Every path within its own limit (k,) [N], and, where that takes milliseconds, within
-        several limits from holding still on.
+        """Return every path within its own limit (k,) [N], and, if that takes milliseconds, within
+        several limits from the static hold upwards.
 
         Args:
             told: called `FORCES` times as the work goes on.
@@ -291,7 +292,7 @@ class Option:
 
 
 def ranked(options: Sequence[Option], goal: Goal) -> list[Option]:
-    """The options that keep to a goal, best first."""
+    """Return the options that keep to a goal, best first."""
     kept = [
         option
         for option in options
@@ -303,7 +304,7 @@ def ranked(options: Sequence[Option], goal: Goal) -> list[Option]:
 def best_of_paths(
     paths: DrivenPaths, options: Sequence[Option], goal: Goal, most: int
 ) -> Iterator[Option]:
-    """The best option of each of the best paths, their limits refined; best paths first."""
+    """Yield the best option of each of the best paths, with refined limits; best paths first."""
     best: dict[int, Option] = {}
     for option in ranked(options, goal):
         best.setdefault(option.index, option)
@@ -321,7 +322,7 @@ def best_of_paths(
 
 
 def refuse(options: Sequence[Option], wish: Wish, goal: Goal, budget: GripBudget) -> None:
-    """Say what is possible where nothing keeps to a wish.
+    """Refuse a wish that no option keeps to, and say what is possible.
 
     Raises:
         SettingsError: it does.

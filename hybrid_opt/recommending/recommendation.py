@@ -165,7 +165,7 @@ def recommend(
     progress: ShowProgress = False,
     alone: bool = False,
 ) -> Recommendation:
-    """The carry to run of a drivable front.
+    """Recommend the carry of a drivable front to run.
 
     It holds over the cell's whole uncertainty within the robots' reference forces, and has the
     least product of duration and commanded force of all that do. Where none does, the least product
@@ -268,8 +268,8 @@ def _recommended(
 def _driven(
     cell: Cell, paths: DrivenPaths, options: Sequence[Option], goal: Goal, wished: bool
 ) -> tuple[Option, Timing, bool]:
-    """The best of the best paths as robots drive them, and whether it keeps to the goal; where none
-    does and no target was wished for, the one that exceeds it least."""
+    """Return the best of the best paths as timed for robots, and whether it keeps to the goal; if
+    none does and no target was wished for, the one that exceeds it least."""
     kept, others, reason, model = [], [], "", cell.timing_model
     for first in best_of_paths(paths, options, goal, TRIED):
         own, asked = [option for option in options if option.index == first.index], goal
@@ -303,8 +303,8 @@ def _driven(
 
 
 def _largest_felt(workcell: Workcell, carry: Carry) -> Array:
-    """(2,) largest force [N] that is commanded of one arm, and that the leading one feels in the
-    worst case, as the options are judged."""
+    """Compute the largest forces (2,) [N] in the worst case: commanded of one arm, and exerted on
+    the leading one."""
     doubt, (rows, motion) = workcell.uncertainty, thinned(carry)
     most = largest_commanded(workcell, motion, carry.normal_force[rows], doubt, LEADER)
     felt = robust_model(workcell).hold(motion, doubt, LEADER)[1]
@@ -313,7 +313,7 @@ def _largest_felt(workcell: Workcell, carry: Carry) -> Array:
 
 
 def _doubts(found: Pressed) -> list[str]:
-    """What speaks against how a carry is pressed."""
+    """List objections against how a carry is pressed."""
     squeeze, doubts = found.squeeze, []
     if found.job is None:
         doubts.append(f"no job can be planned: {found.problem}")
@@ -328,7 +328,7 @@ def is_within(required: Array, allowed: Array) -> bool:
 
 
 def _better(beside: Sequence[Rival], timing: Timing, force: float) -> Iterator[str]:
-    """Says that another path is faster at the same force."""
+    """Yield the statement that another path is faster at the same force."""
     for other in beside:
         if other.duration_at_force < timing.duration * (1.0 - BETTER):
             yield (
@@ -375,7 +375,8 @@ class Rival:
 
 
 def rival(cell: Cell, label: str, path: Array, timing: Timing, force: float) -> Rival:
-    """A path (n_path,) beside a recommended carry: its timing, and the force to command [N]."""
+    """Time a path (n_path,) at a recommended carry's force, and compute its force to command [N] in
+    the same time."""
     assert timing.limits.force is not None, "drivable carries have a force limit"
     paths = DrivenPaths(cell, path)
     options = paths.all_options(timing.limits.force)
@@ -393,7 +394,7 @@ def rival(cell: Cell, label: str, path: Array, timing: Timing, force: float) -> 
 
 
 def level_force(workcell: Workcell, kind: ForceKind) -> float:
-    """Largest force of a robot that holds the payload level and still [N].
+    """Compute the largest force of a robot that holds the payload level and still [N].
 
     Raises:
         SettingsError: the uncertainty leaves no friction or patch.
@@ -404,24 +405,26 @@ def level_force(workcell: Workcell, kind: ForceKind) -> float:
 
 
 def table_forces(workcell: Workcell, kind: ForceKind = PLANNED_FORCE) -> Array:
-    """(n,) force limits of the table [N], those within the force limit's bounds."""
+    """Return the force limits (n,) of the table [N] within the force limit's bounds."""
     forces = level_force(workcell, kind) * np.array(ABOVE_STILL)
     low, high = workcell.task.force_limit
     return np.asarray(forces[(forces >= low) & (forces <= high)])
 
 
 def front_durations(paths: DrivenPaths, forces: Array) -> Array:
-    """(n,) shortest duration [s] of any of the paths at each force, infinite for none."""
+    """Compute the shortest duration (n,) [s] of any of the paths at each force, infinite for
+    none."""
     return np.array([paths.durations(float(force)).min(initial=np.inf) for force in forces])
 
 
 def spread_rows(paths: Array) -> NDArray[np.intp]:
-    """Rows of at most `MEMBERS` different ones of a front's paths (k, n), both ends among them."""
+    """Return the rows of at most `MEMBERS` different paths of a front (k, n), including both
+    ends."""
     different = np.sort(np.unique(paths, axis=0, return_index=True)[1])
     return np.asarray(different[evenly(len(different), MEMBERS)])
 
 
 def over_replicas(durations: Sequence[Array]) -> tuple[Array, Array, Array]:
-    """Median, least and largest (n,) of the replicas' durations at each force."""
+    """Compute the median, least and largest (n,) of the replicas' durations at each force."""
     every = np.array(durations)
     return np.median(every, axis=0), every.min(axis=0), every.max(axis=0)

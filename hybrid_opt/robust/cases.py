@@ -39,7 +39,7 @@ LEADER, FOLLOWER = 0, 1
 
 
 def nominal_case(workcell: Workcell) -> Array:
-    """(18,) the case that the workcell describes, laid out by `worst_cases.CASE_SIZES`."""
+    """Return the nominal case (18,) of the workcell, laid out by `worst_cases.CASE_SIZES`."""
     contacts, payload = workcell.contacts, workcell.payload
     return np.concatenate(
         [
@@ -53,7 +53,8 @@ def nominal_case(workcell: Workcell) -> Array:
 
 
 def worst_cases(workcell: Workcell, uncertainty: Uncertainty, leader: int = 0) -> Array:
-    """(k, 18) cases that ask for as much squeeze as any within the ranges, or a little more.
+    """Return the cases (k, 18) that require as much squeeze as any within the ranges, or slightly
+    more.
 
     Args:
         leader: index of the robot whose force is not commanded.
@@ -78,7 +79,7 @@ def worst_cases(workcell: Workcell, uncertainty: Uncertainty, leader: int = 0) -
 def random_cases(
     workcell: Workcell, uncertainty: Uncertainty, n: int, rng: np.random.Generator, leader: int = 0
 ) -> Array:
-    """(n, 18) cases drawn evenly from the ranges, pads from discs."""
+    """Draw cases (n, 18) uniformly from the ranges, pads from discs."""
     cases = np.tile(nominal_case(workcell), (n, 1))
     cases[:, 0:2] *= 1.0 + uncertainty.friction * rng.uniform(-1.0, 1.0, (n, 2))
     cases[:, 4] *= 1.0 + uncertainty.mass * rng.uniform(-1.0, 1.0, n)
@@ -95,7 +96,7 @@ def random_cases(
 
 
 def _in_discs(rng: np.random.Generator, radius: float, n: int, discs: int) -> Array:
-    """(n, discs, 2) drawn evenly from discs of a radius [m]."""
+    """Draw points (n, discs, 2) uniformly from discs of a radius [m]."""
     angle = rng.uniform(0.0, 2.0 * np.pi, (n, discs))
     reach = radius * np.sqrt(rng.random((n, discs)))
     return np.stack([reach * np.cos(angle), reach * np.sin(angle)], axis=2)
@@ -121,13 +122,13 @@ class RulingCases:
     share: Array
 
     def at(self, rows: NDArray[np.intp]) -> RulingCases:
-        """The cases at some of the samples."""
+        """Return the cases at some of the samples."""
         cases = self.commanded[rows], self.felt[rows]
         return RulingCases(self.leader, self.force[rows], *cases, self.share[rows])
 
     def slopes(self, commanded: Array, felt: Array) -> Array:
-        """(n, 2, m) derivatives of `force` from those of both robots' forces (n, 2, m) in the cases
-        `commanded` and `felt`."""
+        """Compute the derivatives (n, 2, m) of `force` from those of both robots' forces (n, 2, m)
+        in the cases `commanded` and `felt`."""
         follower = 1 - self.leader
         found = np.empty_like(commanded)
         found[:, follower] = commanded[:, follower]
@@ -137,9 +138,9 @@ class RulingCases:
 
 
 def felt_share(difference: Array, uncertainty: Uncertainty) -> Array:
-    """Largest share that the leading arm feels of differences between leading and commanded force
-    under the largest mass: all of one that loads it, the least mass's share of one that relieves
-    it."""
+    """Compute the largest share that the leading arm feels of the differences between leading and
+    commanded force under the largest mass: all of a difference that loads it, the least mass's
+    share of one that relieves it."""
     lightest = (1.0 - uncertainty.mass) / (1.0 + uncertainty.mass)
     return np.where(difference > 0.0, 1.0, lightest)
 
@@ -151,7 +152,7 @@ def ruling_cases(
     difference: Array | None = None,
     leading_share: float = 1.0,
 ) -> RulingCases:
-    """The cases that decide among the least normal forces (k, n, 2) [N] of the worst ones.
+    """Find the cases that decide among the least normal forces (k, n, 2) [N] of the worst ones.
 
     The difference of both forces is the motion's, whatever the squeeze, and proportional to the
     mass.

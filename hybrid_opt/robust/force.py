@@ -81,7 +81,7 @@ class BoxMotion:
     second_rate: Array
 
     def at(self, rows: NDArray[np.intp] | NDArray[np.bool_]) -> BoxMotion:
-        """The motion at some of the samples."""
+        """Return the motion at some of the samples."""
         return BoxMotion(self.pose[rows], self.rate[rows], self.second_rate[rows])
 
 
@@ -90,27 +90,27 @@ HeldMotion = BoxMotion | Carry
 
 
 def parts_of(motion: HeldMotion) -> tuple[Array, Array, Array]:
-    """What forces depend on of a motion, as functions take it."""
+    """Return pose, rate and second rate of a motion, the inputs of the force functions."""
     return motion.pose, motion.rate, motion.second_rate
 
 
 def box_motion(motion: HeldMotion) -> BoxMotion:
-    """The same alone."""
+    """Return the box poses and rates of a motion alone."""
     return BoxMotion(*parts_of(motion))
 
 
 def repeated(motion: HeldMotion, times: int) -> BoxMotion:
-    """A motion's samples several times, one after the other."""
+    """Repeat a motion's samples several times, one after the other."""
     return BoxMotion(*[np.tile(values, (times, 1)) for values in parts_of(motion)])
 
 
 def at_rest() -> BoxMotion:
-    """One sample, level and still."""
+    """Return one sample, level and still."""
     return BoxMotion(*[np.zeros((1, 6))] * 3)
 
 
 def stopped(motion: HeldMotion) -> BoxMotion:
-    """The same poses at rest."""
+    """Return the same poses at rest."""
     return BoxMotion(motion.pose, 0.0 * motion.rate, 0.0 * motion.second_rate)
 
 
@@ -239,8 +239,8 @@ class RobustModel:
     def least(
         self, motion: HeldMotion, cases: Array, leader: int, threads: int, displaced: bool
     ) -> Array:
-        """(m, 2) least normal forces [N]: what is to be commanded of one robot, and what the
-        leading one then presses with.
+        """Compute the least normal forces (m, 2) [N]: the commanded force of one robot, and the
+        resulting force of the leading one.
 
         Args:
             motion: of m samples.
@@ -254,15 +254,15 @@ class RobustModel:
     def slack(
         self, motion: HeldMotion, cases: Array, force: Array, leader: int, threads: int = 1
     ) -> Array:
-        """(m,) positive where a pressure that is known beforehand holds under commanded forces (m,)
-        [N]; elsewhere another one still may."""
+        """Compute the slack (m,), positive where a pressure known in advance holds under commanded
+        forces (m,) [N]; elsewhere another pressure still may."""
         function = self._function(case_slack_function, commanded=1 - leader)
         given = *parts_of(motion), cases, force
         return function.batch(*given, threads=threads)["slack"].ravel()
 
     def least_squeeze(self, motion: HeldMotion, cases: Array, leader: int = 0) -> Array:
-        """(k, n, 2) normal forces to command [N] that hold each of k cases (k, 18) at n samples; of
-        pads that do not face one another what `leader` presses with beside the commanded one."""
+        """Compute the normal forces (k, n, 2) to command [N] that hold each of k cases (k, 18) at n
+        samples; for pads with other normals, the force of `leader` besides the commanded one."""
         displaced = bool(cases[:, 11:15].any())
         n = len(motion.pose)
         found = np.empty((len(cases), n, 2))
@@ -275,7 +275,7 @@ class RobustModel:
         return found
 
     def nominal(self, motion: HeldMotion, leader: int = 0) -> Array:
-        """(n, 2) least normal forces of the cell as it is described [N], see `least_squeeze`."""
+        """Compute the least normal forces (n, 2) of the nominal cell [N], see `least_squeeze`."""
         return np.asarray(self.least_squeeze(motion, nominal_case(self.workcell)[None], leader)[0])
 
     @cached_property
@@ -293,8 +293,8 @@ class RobustModel:
         leader: int = 0,
         rows: NDArray[np.intp] | None = None,
     ) -> tuple[Array, Array]:
-        """Least normal force to command, and the largest that the leader then feels, (n,) [N];
-        infinite where none is found that holds every case.
+        """Compute the least normal force to command and the largest that the leader then feels,
+        (n,) [N]; infinite where no force holds every case.
 
         Args:
             rows: of the worst cases, those that are considered; None for all.
@@ -312,8 +312,8 @@ class RobustModel:
     def governing_rows(
         self, motion: HeldMotion, uncertainty: Uncertainty, leader: int = 0
     ) -> NDArray[np.intp]:
-        """Rows of the worst cases that require most at any sample, `RULING` for the command and
-        as many for what the leader feels beyond it."""
+        """Return the rows of the worst cases that require most at any sample, `RULING` for the
+        command and as many for the leader's excess."""
         worst = self.least_squeeze(motion, self.worst_cases(uncertainty, leader), leader)
         command = worst[:, :, 1 - leader]
         beyond = worst[:, :, leader] - float(self._leading_share[leader]) * command
@@ -326,7 +326,7 @@ class RobustModel:
         leader: int = 0,
         above: Array | float = 0.0,
     ) -> Array:
-        """(n,) the first of `hold`, sooner where many cases are asked.
+        """Compute the first of `hold` (n,) faster when there are many cases.
 
         A pressure that is known beforehand shows which cases ask for most at a few samples, what
         they need, and of most others that they need no more. Of more than `SAMPLES` samples, so
@@ -360,8 +360,7 @@ class RobustModel:
         return force
 
     def peak(self, motion: HeldMotion, uncertainty: Uncertainty, leader: int = 0) -> Array:
-        """(2,) the largest forces of `hold`, sooner: what the leader feels is asked for where most
-        is commanded, or where most is with the plan's difference of both forces."""
+        """Compute the largest forces (2,) of `hold` from the few samples that can attain them."""
         force, planned = self.commanded(motion, uncertainty, leader), self.nominal(motion, leader)
         felt = force + planned[:, leader] - planned[:, 1 - leader]
         most = np.unique([force.argmax(), felt.argmax()])
@@ -372,7 +371,7 @@ class RobustModel:
     def robust_force(
         self, motion: HeldMotion, uncertainty: Uncertainty | None = None, leader: int = 0
     ) -> RobustForce:
-        """The least commanded forces that hold for every case.
+        """Compute the least commanded forces that hold for every case.
 
         Args:
             uncertainty: the set; the workcell's by default.
@@ -427,8 +426,8 @@ class RobustModel:
         leader: int,
         threads: int = 1,
     ) -> Array:
-        """(k, n) share of the commanded forces (n,) that each of k cases needs; `screened` for
-        less."""
+        """Compute the share (k, n) of the commanded forces (n,) that each of k cases needs;
+        `screened` for less."""
         n, k = len(motion.pose), len(cases)
         displaced = bool(cases[:, 11:15].any())
         level = screened * (self._friction_left(cases) if displaced and self._one else 1.0)
@@ -442,14 +441,14 @@ class RobustModel:
         return share.reshape(k, n)
 
     def _friction_left(self, cases: Array) -> float:
-        """Least share of friction that displacements leave: a quick look does not see these."""
+        """Compute the least share of friction that displacements leave, which screening ignores."""
         apart = np.linalg.norm(cases[:, 11:13] - cases[:, 13:15], axis=1)
         lost = apart / (self.workcell.pad_distance * cases[:, :2].min(axis=1))
         return SCREEN_SHARE * max(0.0, 1.0 - float(lost.max()))
 
     def largest_factor(self, motion: HeldMotion, limit: Array, leader: int = 0) -> float:
-        """Largest multiple of the workcell's set whose forces stay within limits (2,) [N], at most
-        `LARGEST_FACTOR`; zero where the nominal forces exceed them."""
+        """Find the largest multiple of the workcell's set whose forces stay within limits (2,) [N],
+        at most `LARGEST_FACTOR`; zero if the nominal forces exceed them."""
         chosen = self.workcell.uncertainty
         end = allowed_factor(self.workcell, chosen)
 
@@ -462,7 +461,7 @@ class RobustModel:
 
 
 def allowed_factor(workcell: Workcell, uncertainty: Uncertainty) -> float:
-    """Largest multiple of a set that leaves some friction and patches, at most
+    """Find the largest multiple of a set that leaves some friction and patches, at most
     `LARGEST_FACTOR`."""
     low, high = 0.0, LARGEST_FACTOR
     if _leaves_something(workcell, uncertainty.scaled(high)):
@@ -475,7 +474,7 @@ def allowed_factor(workcell: Workcell, uncertainty: Uncertainty) -> float:
 
 
 def _leaves_something(workcell: Workcell, uncertainty: Uncertainty) -> bool:
-    """Whether friction, patches, mass and force are left in the worst case."""
+    """Return True if friction, patches, mass and force are positive in the worst case."""
     shares = [1.0 - uncertainty.mass, 1.0 - uncertainty.tracking]
     model = command_model(workcell)
     left = [*model.least_friction(uncertainty), model.room_for_displacements(uncertainty), *shares]
@@ -531,7 +530,7 @@ def robust_price(
     threads: int = 1,
     points: int = POINTS,
 ) -> RobustPrice:
-    """The cost of robustness against the workcell's set for a carry.
+    """Compute the cost of robustness against the workcell's set for a carry.
 
     Args:
         model: of the carry's workcell.
@@ -563,7 +562,7 @@ def robust_price(
 
 
 def thinned(carry: Carry) -> tuple[NDArray[np.intp], BoxMotion]:
-    """`SAMPLES` evenly spread samples of a carry, and those of its largest normal forces; which
-    they are, and their motion."""
+    """Return `SAMPLES` evenly spread samples of a carry and those of its largest normal forces:
+    their rows and motion."""
     rows = np.union1d(evenly(len(carry), SAMPLES), carry.normal_force.argmax(axis=0))
     return rows, box_motion(carry).at(rows)

@@ -69,7 +69,7 @@ class PathPoints:
         return len(self.a)
 
     def at(self, rows: NDArray[np.intp]) -> PathPoints:
-        """Some of them."""
+        """Return some of the points."""
         return PathPoints(*[values[rows] for values in self.driven])
 
     @property
@@ -109,7 +109,7 @@ class RobustPath:
         )
 
     def at(self, points: PathPoints) -> tuple[Array, Array]:
-        """Least normal forces that hold in every case of the workcell's set.
+        """Compute the least normal forces that hold in every case of the workcell's set.
 
         Returns:
             (n, 2) forces of both robots [N], and (n, 2, 20) their derivatives by pose, its
@@ -122,8 +122,8 @@ class RobustPath:
     def ruling_beyond(
         self, points: PathPoints, level: Array
     ) -> tuple[NDArray[np.intp], RulingCases]:
-        """The points where a force of either robot is above a level (n,) [N], and the cases that
-        decide there: slopes take as long as forces.
+        """Return the points where a force of either robot exceeds a level (n,) [N], and the cases
+        that decide there; slopes take as long as forces.
 
         Most cases are seen to need less by a pressure that shares everything evenly.
         """
@@ -146,7 +146,8 @@ class RobustPath:
         return rows, ruling_cases(known, self._set, LEADER, beyond)
 
     def most_demanding(self, points: PathPoints, count: int) -> tuple[Array, Array]:
-        """Forces of the cases that ask for most: where they rule in turn, each has its own slope.
+        """Compute the forces of the cases that require most: where several rule in turn, each has
+        its own slope.
 
         Returns:
             (n, 2, count) forces of both robots [N], the largest first, and their slopes
@@ -165,7 +166,7 @@ class RobustPath:
         return force, slope
 
     def slopes(self, points: PathPoints, ruling: RulingCases) -> Array:
-        """(n, 2, 20) of the forces that these cases decide."""
+        """Compute the slopes (n, 2, 20) of the forces that these cases decide."""
         if not len(points):
             return np.zeros((0, 2, BY_TIMING.stop))
         cases = np.concatenate([self._cases[ruling.commanded], self._cases[ruling.felt]])
@@ -225,8 +226,8 @@ class RulingForce:
     def slopes(
         self, low: Workcell, high: Workcell, motions: tuple[BoxMotion, BoxMotion], pads: bool
     ) -> tuple[float, float]:
-        """What the force changes by from here to the higher, and to the lower of two cells nearby,
-        which lie as far to either side [N].
+        """Compute the change of the force towards the higher and the lower of two neighbouring
+        cells, equally far to either side [N].
 
         Args:
             motions: at `samples`, of the lower and of the higher one.
@@ -248,7 +249,7 @@ class RulingForce:
         return self._inputs(self._workcell, self._motion, pads=True)
 
     def _inputs(self, cell: Workcell, motion: BoxMotion, pads: bool) -> Array:
-        """(k, m) what the gradient is by; or the force itself, see `slopes`."""
+        """Compute the inputs (k, m) of the gradient; or the force itself, see `slopes`."""
         cases = worst_cases(cell, cell.uncertainty, self._leader)
         assert len(cases) == self._count, "no range of the uncertainty begins or ends"
         cases = cases[self._ruling]

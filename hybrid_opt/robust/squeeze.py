@@ -79,7 +79,7 @@ class Part:
 
 
 def account(parts: Iterable[Part]) -> str:
-    """Parts as a sum."""
+    """Format parts as a sum."""
     known = list(parts)
     terms = " + ".join(f"{part.force:.1f} {part.name}" for part in known)
     return f"{terms} = {sum(part.force for part in known):.1f} N"
@@ -147,8 +147,8 @@ def pressed_beyond(
     least: Array,
     in_parts: bool = True,
 ) -> tuple[Array, Squeeze]:
-    """(n,) what the commanded robot presses with beyond the planned normal force [N], the other one
-    in the proportion of `pressed_together`, and how it came about.
+    """Compute the force (n,) commanded beyond the planned normal force [N], in the proportion of
+    `pressed_together` for the other robot, and its origin.
 
     Smooth where the planned forces are; with it neither robot ever presses less than the plan, or
     than what holds pads that press evenly, moving or stopped, in every case of the set, asks for.
@@ -191,7 +191,8 @@ def pressed_beyond(
 
 
 def _by_doubt(workcell: Workcell, leader: int, motion: HeldMotion, planned: Array) -> list[Part]:
-    """What the doubts of a cell add to the largest robust force, one after the other."""
+    """Compute what each uncertainty of a cell adds to the largest robust force, one after the
+    other."""
     doubt, names = workcell.uncertainty, tuple[str, ...]()
     before = float(_in_every_case(workcell, doubt.only(names), leader, motion, planned).max())
     parts = [Part("least force", before)]
@@ -211,8 +212,8 @@ def _in_every_case(
     motion: HeldMotion,
     planned: Array | float,
 ) -> Array:
-    """(n,) what is to be commanded so that a set is held, moving or stopped: at least what is
-    planned [N]."""
+    """Compute the force (n,) to command so that a set is held, moving or stopped: at least the
+    planned one [N]."""
     model = robust_model(workcell)
     held = model.commanded(motion, doubt, leader, planned)
     return model.commanded(stopped(motion), doubt, leader, held)
@@ -221,8 +222,8 @@ def _in_every_case(
 def largest_commanded(
     workcell: Workcell, motion: HeldMotion, planned: Array, doubt: Uncertainty, leader: int
 ) -> Array:
-    """(2,) largest forces of `commanded_forces` for what holds a motion in every case of a set [N],
-    sooner: what the leader feels is asked for where most is planned.
+    """Compute the largest forces (2,) of `commanded_forces` that hold a motion in every case of a
+    set [N], from the few samples that can attain them.
 
     Args:
         planned: (n, 2) normal forces [N].
@@ -241,8 +242,8 @@ def largest_commanded(
 
 
 def pressed_together(workcell: Workcell, leader: int) -> Array:
-    """(2,) what both robots press with for each newton that is commanded beyond the plan: an
-    internal squeeze of their pads."""
+    """Compute the force (2,) of both robots per newton commanded beyond the plan: an internal force
+    of their pads."""
     if workcell.has_opposite_pads:
         return np.ones(2)
     normals = Grasp(workcell).squeeze_normals()
@@ -252,8 +253,8 @@ def pressed_together(workcell: Workcell, leader: int) -> Array:
 def commanded_forces(
     workcell: Workcell, carry: Carry, settings: SqueezeSettings, in_parts: bool = True
 ) -> tuple[Array, Squeeze]:
-    """(n, 2) normal forces to command of both robots along a carry [N], and how they came about;
-    see `pressed_beyond`."""
+    """Compute the normal forces (n, 2) to command of both robots along a carry [N], and their
+    origin; see `pressed_beyond`."""
     held = carry.normal_force
     extra, squeeze = pressed_beyond(workcell, settings, carry.time, carry, held, in_parts)
     together = pressed_together(workcell, settings.leader)
@@ -261,7 +262,7 @@ def commanded_forces(
 
 
 def smooth_above(time: Array, values: Array, width: float) -> Array:
-    """A smooth curve that is nowhere below the given one, level at both ends.
+    """Compute a smooth curve that is nowhere below the given one, level at both ends.
 
     The largest value within a window, averaged over the same window by a smooth kernel: where the
     kernel reaches, every windowed maximum covers the point in its middle.

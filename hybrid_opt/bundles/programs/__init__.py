@@ -8,13 +8,13 @@ from string import Template
 
 
 def program(name: str) -> str:
-    """The text of a program as it stands beside the others in a bundle."""
+    """Return the text of a program as it stands beside the others in a bundle."""
     text = (files(__name__) / name).read_text("utf-8")
     return text.replace(f"from {__name__}.", "from ")
 
 
 def filled(name: str, **values: object) -> str:
-    """The text of a file with values in place of their $names.
+    """Return the text of a file with values for its $names.
 
     Raises:
         KeyError: a value is missing.

@@ -106,7 +106,7 @@ class Job:
 
     @classmethod
     def read(cls, path: Path) -> Job:
-        """The job in a file.
+        """Read the job in a file.
 
         Raises:
             Refused: it cannot be read.
@@ -127,11 +127,11 @@ class Job:
         return self.time[-1]
 
     def phase(self, s: float) -> str:
-        """The phase at a coordinate."""
+        """Return the phase at a coordinate."""
         return next((name for last, name in self._phases if s <= last), self._phases[-1][1])
 
     def begin(self, name: str) -> float:
-        """The coordinate at which a phase begins; the last one where there is none."""
+        """Return the coordinate at which a phase begins; the last one if there is none."""
         first = 0.0
         for last, phase in self._phases:
             if phase == name:
@@ -145,13 +145,13 @@ class Job:
         return next(last for last, phase in self._phases if phase == "press")
 
     def _place(self, s: float) -> tuple[int, float, float]:
-        """The sample before s, the share of its interval and the interval's length [s]."""
+        """Return the sample before s, the share of its interval and the interval's length [s]."""
         k = min(max(bisect_right(self.time, s) - 1, 0), len(self.time) - 2)
         step = self.time[k + 1] - self.time[k]
         return k, min(max((s - self.time[k]) / step, 0.0), 1.0), step
 
     def position(self, arm: int, s: float) -> list[float]:
-        """Joint positions of an arm at a coordinate [rad, m]."""
+        """Compute the joint positions of an arm at a coordinate [rad, m]."""
         k, x, step = self._place(s)
         q, v = self.robots[arm]["position"], self.robots[arm]["velocity"]
         a, b = (1.0 + 2.0 * x) * (1.0 - x) ** 2, x * (1.0 - x) ** 2 * step
@@ -162,19 +162,19 @@ class Job:
         ]
 
     def linear(self, arm: int, name: str, s: float) -> list[float]:
-        """A list per sample of an arm, linear between samples."""
+        """Interpolate a list per sample of an arm linearly between samples."""
         k, x, _ = self._place(s)
         rows = self.robots[arm][name]
         return [(1.0 - x) * a + x * b for a, b in zip(rows[k], rows[k + 1], strict=True)]
 
     def force(self, arm: int, s: float) -> float:
-        """Commanded normal force of an arm [N]."""
+        """Compute the commanded normal force of an arm [N]."""
         k, x, _ = self._place(s)
         rows = self.robots[arm]["normal_force"]
         return float((1.0 - x) * rows[k] + x * rows[k + 1])
 
     def effort(self, arm: int, gravity: str, s: float, rate: float) -> list[float]:
-        """Joint torques of an arm at a coordinate and rate [N m, N].
+        """Compute the joint torques of an arm at a coordinate and rate [N m, N].
 
         What moves arm and box goes with the square of the rate, what holds and presses stays.
 
@@ -186,13 +186,13 @@ class Job:
         return [b + (a - b) * rate * rate for a, b in zip(moving, holding, strict=True)]
 
     def distance(self, arm: int, q: Sequence[float], s: float) -> float:
-        """At most so far is the pad of a posture from its place at a coordinate [m]."""
+        """Bound the distance of a posture's pad from its place at a coordinate [m]."""
         reach = self.robots[arm]["reach"]
         planned = self.position(arm, s)
         return float(sum(r * abs(a - b) for r, a, b in zip(reach, q, planned, strict=True)))
 
     def speed(self, arm: int, s: float) -> float:
-        """At most so fast is the pad at a coordinate [m/s]."""
+        """Bound the speed of the pad at a coordinate [m/s]."""
         rates = self.linear(arm, "velocity", s)
         reach = self.robots[arm]["reach"]
         return float(sum(r * abs(v) for r, v in zip(reach, rates, strict=True)))
@@ -200,7 +200,7 @@ class Job:
     def coordinate(
         self, arm: int, q: Sequence[float], s: float, window: tuple[float, float]
     ) -> float:
-        """The coordinate that fits a posture best, of equals the nearest to s [s].
+        """Find the coordinate that fits a posture best, among equals the nearest to s [s].
 
         Args:
             window: how far from s it may be, before and behind [s].
@@ -257,7 +257,7 @@ class Clock:
             self._takes = self._stop_time if takes is None else takes
 
     def advance(self, dt: float) -> None:
-        """Let time pass [s]."""
+        """Advance the clock by a time step [s]."""
         before = self.rate
         if self.turning:
             self._since += dt
@@ -283,7 +283,7 @@ class Clock:
         return sign * 30.0 * x * x * (1.0 - x) ** 2 / self._takes
 
     def ahead(self, rate: float, step: float) -> Iterator[Moment]:
-        """From now on each step, turning to a rate, until it stands or the path ends."""
+        """Yield each step from now on, turning to a rate, until it stands or the path ends."""
         clock = copy(self)
         clock.turn(rate)
         yield Moment(0.0, clock.s, clock.rate, clock.change)
@@ -370,12 +370,12 @@ class Machine:
                 )
 
     def hold(self, reason: str) -> None:
-        """Hold where the arms were told to be, because they cannot go on."""
+        """Hold the present commanded posture, because the arms cannot go on."""
         self.clock = Clock(self.job.end, self.job.limits.stop_time, self.clock.s)
         self.state, self.reason = "held", reason
 
     def resume(self, direction: float, seen: Seen) -> None:
-        """Go on from where it is held: 1 to the end of the job, -1 back to its beginning.
+        """Resume from a hold: 1 to the end of the job, -1 back to its beginning.
 
         Raises:
             Refused: it is not held, an arm is silent or not where it is held.
@@ -389,7 +389,7 @@ class Machine:
         self.clock.turn(direction)
 
     def tick(self, dt: float, seen: Seen) -> None:
-        """Let time pass and look at the arms."""
+        """Advance the time and check the arms."""
         self.clock.advance(dt)
         limit = self.job.limits.silence
         self._silent = [self._name(arm) for arm, age in enumerate(seen.age) if age > limit]
@@ -420,7 +420,7 @@ class Machine:
             self.clock.turn(0.0, self.lead, self.stop_time)
 
     def told(self) -> str:
-        """What has happened, and how to go on."""
+        """Describe the state, and how to go on."""
         where = f"{self.job.phase(self.clock.s)}, {self.clock.s:.3f} s"
         if self.state in ("stopping", "held"):
             known = (
@@ -449,7 +449,7 @@ class Machine:
                 )
 
     def _wrong(self, seen: Seen) -> str:
-        """What speaks against going on, or ''."""
+        """Return the reason against going on, or ''."""
         limits, s = self.job.limits, self.clock.s
         # Nothing is lifted, and no job done, by an arm that stands elsewhere.
         stands = self.job.phase(s) == "press" or s in (0.0, self.job.end)

@@ -21,13 +21,13 @@ BUNDLE = Path(__file__).resolve().parent.parent
 
 
 def generate_launch_description() -> Any:
-    """What each entry under `launch` asks for."""
+    """Launch what each entry under `launch` lists."""
     config = json.loads((BUNDLE / "config/cell.json").read_text())
     return LaunchDescription([action for each in config["launch"] for action in actions(each)])
 
 
 def actions(each: dict[str, Any]) -> list[Any]:
-    """A driver's launch file or a description, a controller manager, and its controllers."""
+    """Return a driver's launch file or a description, a controller manager, and its controllers."""
     parameters: list[Any] = [str(BUNDLE / name) for name in each["parameters"]]
     outside, inside = list[Any](), list[Any]()
     if each["namespace"]:

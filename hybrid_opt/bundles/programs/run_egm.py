@@ -63,7 +63,7 @@ class Press:
         self._speed, self._compliance = config["speed"], config["compliance"]
 
     def tick(self, dt: float, wanted: float, soon: float, felt: float | None) -> None:
-        """Let time pass.
+        """Advance the time.
 
         Args:
             wanted, soon: normal force now, and when the arm has followed [N].
@@ -102,7 +102,7 @@ class Stream:
         self.dropped = 0
 
     def seen(self, now: float) -> Seen:
-        """What is known of the arms."""
+        """Return the measured state of the arms."""
         age = [now - then for then in self._news]
         q = list(self._q)
         pressing = q[self._arm]
@@ -115,7 +115,7 @@ class Stream:
         return Seen(q=q, force=list(self._force), age=age, fault=self.fault, lost=lost)
 
     def hear(self, arm: int, message: FromRobot, now: float) -> None:
-        """Take a message of an arm's controller."""
+        """Process a message of an arm's controller."""
         degrees = self._in_chain(arm, message.joints, message.further)
         if degrees is None:
             return
@@ -138,12 +138,12 @@ class Stream:
         return None
 
     def told(self) -> str:
-        """What has happened."""
+        """Describe the state."""
         strange = f" {self.dropped} packets were dropped, from other hosts or damaged."
         return self.machine.told() + (strange if self.dropped else "")
 
     def tick(self, now: float) -> None:
-        """Let time pass."""
+        """Advance the time."""
         dt = 0.0 if self._last is None else min(now - self._last, LONGEST_TICK)
         self._last = now
         before = self.machine.state
@@ -171,7 +171,7 @@ class Stream:
             print(self.told(), file=sys.stderr)
 
     def answer(self, arm: int, number: int, now: float) -> bytes:
-        """Where an arm has to be, as a message: its lag ahead of the clock."""
+        """Encode an arm's commanded position, its lag ahead of the clock, as a message."""
         clock, first = self.machine.clock, self._first[arm]
         if self.machine.state == "ready" and first is not None:
             q = first
@@ -185,7 +185,7 @@ class Stream:
         return to_robot(number, now, joints, further)
 
     def _inward(self, s: float) -> list[float]:
-        """Joints per way of the pressing pad along its normal [rad/m]."""
+        """Compute the joints per motion of the pressing pad along its normal [rad/m]."""
         rows, time = self.config["inward"], self.job.time
         k = min(max(bisect_left(time, s) - 1, 0), len(rows) - 2)
         share = min(max((s - time[k]) / (time[k + 1] - time[k]), 0.0), 1.0)
@@ -194,7 +194,7 @@ class Stream:
     def _in_chain(
         self, arm: int, joints: Sequence[float], further: Sequence[float]
     ) -> list[float] | None:
-        """Axes along the chain [degrees]: the third of seven is an external one to ABB."""
+        """Return axes along the chain [degrees]: the third of seven is an external one to ABB."""
         count = len(self.job.robots[arm]["joints"])
         if len(joints) < 6 or (count == 7 and not further):
             return None
@@ -298,7 +298,7 @@ class FromRobot:
 
 
 def read_robot(data: bytes) -> FromRobot:
-    """A message of a controller.
+    """Decode a message of a controller.
 
     Raises:
         ValueError: the bytes are none.
@@ -326,7 +326,7 @@ def read_robot(data: bytes) -> FromRobot:
 
 
 def to_robot(number: int, time: float, joints: Sequence[float], further: Sequence[float]) -> bytes:
-    """A message that tells a controller where its axes have to be.
+    """Encode a message that commands a controller's axes.
 
     Args:
         time: of the message [s].
@@ -353,7 +353,7 @@ def _doubles(data: bytes, numbers: tuple[int, ...]) -> tuple[float, ...]:
 
 
 def _fields(data: bytes) -> Iterator[tuple[int, int | bytes]]:
-    """Fields with their numbers: varints as numbers, everything else as bytes."""
+    """Yield fields with their numbers: varints as numbers, everything else as bytes."""
     place = 0
     while place < len(data):
         key, place = _varint(data, place)

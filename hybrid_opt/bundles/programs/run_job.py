@@ -63,7 +63,7 @@ def parts(time: float) -> tuple[int, int]:
 
 
 def service_of(kind: str) -> Any:
-    """The type of a service by its name PACKAGE/srv/NAME."""
+    """Return the type of a service by its name PACKAGE/srv/NAME."""
     package, _, name = kind.split("/")
     return getattr(import_module(f"{package}.srv"), name)
 
@@ -134,11 +134,11 @@ class Run:
         self.command = message.data.strip()
 
     def now(self) -> float:
-        """Time of the node's clock [s]."""
+        """Return the time of the node's clock [s]."""
         return float(self.node.get_clock().now().nanoseconds) * 1e-9
 
     def seen(self) -> Seen:
-        """What is known of the arms now."""
+        """Return the measured state of the arms now."""
         for name, future in [call for call in self._calls if call[1].done()]:
             answer = future.result()
             if not getattr(answer, "ok", getattr(answer, "success", answer is not None)):
@@ -164,7 +164,7 @@ class Run:
             rclpy.spin_once(self.node, timeout_sec=left)
 
     def wait(self, futures: Sequence[Any], what: str) -> list[Any]:
-        """The results of futures.
+        """Return the results of futures.
 
         Raises:
             Refused: they take too long.
@@ -276,7 +276,7 @@ class Run:
         return FollowJointTrajectory.Goal(trajectory=trajectory)
 
     def _joined(self, arms: Sequence[int], rows: Sequence[Sequence[Any]]) -> list[Any]:
-        """What arms' joints have, side by side; of a joint that moves both arms the first's."""
+        """Stack values of arms' joints; of a joint that moves both arms, take the first's."""
         found: dict[str, Any] = {}
         for arm, row in zip(arms, rows, strict=True):
             for name, value in zip(self.job.robots[arm]["ros_joints"], row, strict=True):
@@ -321,7 +321,7 @@ class Run:
         self._last = self._began
 
     def tick(self) -> None:
-        """Look at the arms and do what has to be done."""
+        """Check the arms and react."""
         machine = self.machine
         before, now = machine.state, self.now()
         machine.tick(now - self._last, self.seen())
@@ -334,7 +334,7 @@ class Run:
             self._resume(1.0 if self.command == "continue" else -1.0)
 
     def stop(self, reason: str) -> None:
-        """Stop for a reason of one's own."""
+        """Stop for the caller's reason."""
         if self.machine.state == "running":
             self.machine.stop(reason)
             self._stop()
