@@ -61,7 +61,7 @@ autodoc_type_aliases = {"Array": "Array"}
 
 
 def examples() -> Path:
-    """The examples as the gallery wants them: with titles, beside a link to the cells' folder."""
+    """Write the examples for the gallery: with titles, beside a link to the cells' folder."""
     folder = ROOT / "build" / "examples"
     folder.mkdir(parents=True, exist_ok=True)
     if not (folder / "studies").exists():
@@ -84,7 +84,7 @@ def examples() -> Path:
 
 
 def picture(_: Any, block: dict[str, Any], gallery: dict[str, Any]) -> str:
-    """What an example made last and has a picture, as a notebook shows it."""
+    """Return an example's last result that has a picture, as a notebook shows it."""
     for made in reversed(list(block["example_globals"].values())):
         if not inspect.isclass(made) and hasattr(made, "_repr_html_"):
             drawn = re.search("<svg.*</svg>", made._repr_html_(), flags=re.DOTALL)
@@ -96,7 +96,7 @@ def picture(_: Any, block: dict[str, Any], gallery: dict[str, Any]) -> str:
 
 
 def purposes() -> dict[str, list[str]]:
-    """The public names by purpose, as the page of the library groups them."""
+    """Return the public names by purpose, as the page of the library groups them."""
     text = (ROOT / "docs" / "reference" / "library.md").read_text("utf-8")
     section = text.split("## The names by purpose")[1].split("\n## ")[0]
     rows = re.findall(r"^\| ([a-z ]+) \| (`.*`) \|$", section, flags=re.MULTILINE)
@@ -104,7 +104,8 @@ def purposes() -> dict[str, list[str]]:
 
 
 def api() -> Path:
-    """A page for every public name, with the examples that use it, and one for stored figures."""
+    """Write a page for every public name, with the examples that use it, and one for stored
+    figures."""
     folder = ROOT / "docs" / "api"
     folder.mkdir(exist_ok=True)
     rows = {}
@@ -147,7 +148,7 @@ def api() -> Path:
 
 
 def command_line() -> Path:
-    """A page with what `--help` prints of every program."""
+    """Write a page with the `--help` of every program."""
     os.environ["COLUMNS"] = "86"
     title = "Command line"
     parts = [f"{title}\n{'=' * len(title)}\n", f"What ``{COMMAND} NAME --help`` prints.\n"]
@@ -189,8 +190,8 @@ sphinx_gallery_conf: dict[str, Any] = {
 
 
 def without_references(*given: Any) -> tuple[str | None, str | None]:
-    """A signature and what it returns, names of types as they are: inside others Sphinx writes the
-    reference that it makes of an alias."""
+    """Return a signature and its result with type names unchanged: Sphinx inserts its references of
+    aliases otherwise."""
     signature, returned = (
         text and re.sub(r"TypeAliasForwardRef\('(\w+)'\)", r"\1", text) for text in given[-2:]
     )

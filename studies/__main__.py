@@ -20,7 +20,7 @@ START = "main.start()"
 
 
 def programs() -> dict[str, tuple[str, str]]:
-    """Module and first sentence of every program, by name."""
+    """Return the module and first sentence of every program, by name."""
     folder = Path(__file__).parent
     found = {}
     doors = ("*.py", "*/*.py", "*/*/__main__.py")

@@ -56,7 +56,7 @@ def show(options: argparse.Namespace) -> int:
 
 
 def first_result(evaluations: int = QUICK_EVALUATIONS, seed: int = 1) -> Iterator[str]:
-    """What holds the rack's hand-made carry back, then a first front.
+    """Show which limits hold the rack's hand-made carry back, then a first front.
 
     Args:
         evaluations: candidates of the search.

@@ -34,12 +34,12 @@ Number = TypeVar("Number", int, float)
 
 
 def whole(low: int, high: int) -> Callable[[str], int]:
-    """A type of options that takes whole numbers of a range, ends included."""
+    """Return a type of options that takes integers of a range, ends included."""
     return _within(int, low, high, f"a whole number {low} to {high}")
 
 
 def number(low: float, high: float) -> Callable[[str], float]:
-    """A type of options that takes finite numbers of a range, ends included."""
+    """Return a type of options that takes finite numbers of a range, ends included."""
     return _within(float, low, high, f"a number {low:g} to {high:g}")
 
 
@@ -120,7 +120,7 @@ def _require_file(path: Path, kind: str = "") -> None:
 
 
 def _expected(path: Path, kind: str) -> str:
-    """What a message ends with: the kind that is expected, and where one may lie."""
+    """Return the end of a message: the expected kind of file, and where one may lie."""
     expected = f"; expected is {kind}" if kind else ""
     if not path.exists():
         folder = path.parent
@@ -333,7 +333,8 @@ def add_looks(parser: argparse.ArgumentParser) -> None:
 
 
 def stated(name: str) -> Any:
-    """What the source of a module states, without importing the module, which may take seconds.
+    """Read a value from the source of a module, without importing the module, which may take
+    seconds.
 
     Args:
         name: of a constant or of a settings' field, with module and class, as
@@ -371,7 +372,7 @@ def _statements(path: Path) -> dict[str, ast.AST]:
 
 
 def _named(body: list[ast.stmt]) -> dict[str, ast.AST]:
-    """The classes of some source, and the values that it gives to names."""
+    """Parse the classes of a source, and the values of its names."""
     found: dict[str, ast.AST] = {}
     for node in body:
         if isinstance(node, ast.ClassDef):

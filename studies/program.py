@@ -132,7 +132,8 @@ class Program:
         return f"studies.{self.name}"
 
     def parser(self, called: str = "") -> Parser:
-        """The parser of its options; `called` says how it is called, '' for `python -m`."""
+        """Build the parser of its options; `called` is the program's name in it, '' for `python
+        -m`."""
         parser = Parser(prog=called or f"python -m {self.module}", description=self.description)
         self.add_options(parser)
         parser.add_argument("--version", action=_Version, help="print the version and end")
@@ -174,7 +175,7 @@ def _done(name: str, options: argparse.Namespace) -> int:
 
 
 def load_workcell(path: Path) -> Workcell:
-    """The workcell that a program is given.
+    """Load the workcell of a program's arguments.
 
     Raises:
         WorkcellError: with all problems of the file; of a problem file, what completes it.

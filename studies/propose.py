@@ -18,7 +18,7 @@ from symbolic.errors import SettingsError
 
 
 def _ranges(text: str) -> tuple[tuple[float, float], tuple[float, float]]:
-    """The two ranges of 'LOW:HIGH,LOW:HIGH'; (0, 0) for the second where it is missing."""
+    """Parse the two ranges of 'LOW:HIGH,LOW:HIGH'; (0, 0) for a missing second one."""
     read, found = number(-1.0, 1.0), []
     for part in text.split(","):
         low, _, high = part.partition(":")
@@ -121,7 +121,8 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _teller(worked: Callable[[], float]) -> Callable[[str], None]:
-    """Prints what is being done and after how many seconds of work, every word once in a row."""
+    """Return a function that prints the current step and the seconds of work, without repeating
+    a line."""
     last = [""]
 
     def tell(text: str) -> None:

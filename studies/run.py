@@ -225,7 +225,7 @@ def study_of(workcell: Path, options: argparse.Namespace, with_paper: bool = Fal
 
 
 def _stated(field: str) -> Any:
-    """The default of a campaign's setting."""
+    """Return the default of a campaign's setting."""
     return stated(f"hybrid_opt.campaign.settings.CampaignSettings.{field}")
 
 

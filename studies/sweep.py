@@ -17,7 +17,7 @@ MOST_VALUES = 1000
 
 
 def _over(text: str) -> tuple[str, tuple[float, ...]]:
-    """A key and its values: of 'KEY=6:14:2', both ends included, or of 'KEY=6,8,11'."""
+    """Parse a key and its values: of 'KEY=6:14:2', both ends included, or of 'KEY=6,8,11'."""
     key, _, given = text.partition("=")
     read = number(-1e9, 1e9)
     parts = [read(part) for part in given.replace(",", ":").split(":")] if key and given else []

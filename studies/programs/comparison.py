@@ -134,7 +134,7 @@ def _algorithm_figures(
 def _values(
     run: CampaignResults, name: str, summary: CampaignSummary, reference: Array
 ) -> dict[str, list[float]]:
-    """An algorithm's figures by name, one per replica, those of polished fronts last."""
+    """Return an algorithm's figures by name, one per replica, those of polished fronts last."""
     stored = summary.algorithms[name].replicas
     better = [row.polished for row in stored if row.polished is not None]
     values: dict[str, list[float]] = {}
@@ -157,7 +157,7 @@ def _compared(name: str, figure: str, first: Array, second: Array) -> ComparedFi
 
 
 def _with_holm(figures: list[ComparedFigure]) -> tuple[ComparedFigure, ...]:
-    """The figures with their tests corrected as one family."""
+    """Return the figures with their tests corrected as one family."""
     tests = iter(corrected([figure.test for figure in figures if figure.test is not None]))
     return tuple(
         figure if figure.test is None else replace(figure, test=next(tests)) for figure in figures
@@ -170,7 +170,7 @@ def _short(value: object) -> str:
 
 
 def as_text(found: CampaignComparison) -> str:
-    """A comparison for people."""
+    """Format a comparison for a terminal."""
     lines = [f"A: {found.runs[0]}", f"B: {found.runs[1]}", ""]
     if not found.same_workcell:
         lines += ["The workcells differ: the figures say more about them than about the runs.", ""]
@@ -205,7 +205,7 @@ def as_text(found: CampaignComparison) -> str:
 
 
 def _quantity(figure: str) -> tuple[str, Quantity]:
-    """What a figure is called, and how it reads."""
+    """Return the name and the format of a figure."""
     quantity = REPLICA_QUANTITIES[figure.removeprefix(POLISHED_PREFIX)]
     of = "polished, " if figure.startswith(POLISHED_PREFIX) else ""
     return f"{of}{quantity.heading()}", quantity

@@ -122,7 +122,7 @@ def inspected(
 
 
 def _at_rest(cell: Cell) -> Outcome:
-    """Forces of holding the payload level and still, and whether it can be held."""
+    """Compute the forces of holding the payload level and still, and whether it can be held."""
     hold, static_hold_error = cell.static_hold, cell.static_hold_error
     force = hold.normal_force
     share = force / cell.workcell.task.reference_force
@@ -201,7 +201,7 @@ def _pairs(cell: Cell, listed: bool) -> Outcome:
 
 
 def _optimum(cell: Cell, progress: Progress) -> Optimum:
-    """A short polish of the hand-made trajectory, and the bounds that bind where it ends."""
+    """Polish the hand-made trajectory briefly; return the result and the bounds that bind there."""
     verdicts = cell.evaluate(cell.initial)
     if not verdicts.feasible.all():
         return Optimum(0, (), "the hand-made trajectory, its start, is infeasible")
@@ -300,8 +300,8 @@ def draw(
     explained: Mapping[str, Explanation],
     output: Path,
 ) -> tuple[str, ...]:
-    """The paper's Figures 4 and 5 as files in a folder, and the first collision of each carry that
-    fails, by its name; 'initial' is among them. The files' names.
+    """Draw the paper's Figures 4 and 5 as files in a folder, and the first collision of each carry
+    that fails, by its name; 'initial' is among them. Return the files' names.
 
     Raises:
         SettingsError: the folder cannot be made.

@@ -54,7 +54,8 @@ from symbolic.records import Workcell
 def simulate_arms(
     cell: Cell, carry: Carry, settings: ArmSettings, options: argparse.Namespace
 ) -> str:
-    """The threshold of a carry and random cases, printed; returns the cell as MJCF.
+    """Find the threshold of a carry, simulate random cases, and print both; return the cell as
+    MJCF.
 
     Raises:
         WitnessError: with --sweep, the box holds at the lower or slips at the upper factor.
@@ -143,7 +144,7 @@ CREEP_FACTOR = 1.05
 def simulate_pads(
     cell: Cell, carry: Carry, settings: SimulationSettings, options: argparse.Namespace
 ) -> None:
-    """The threshold of a carry, its creep, and random cases, printed."""
+    """Find the threshold of a carry, its creep, simulate random cases, and print them."""
     leader, workcell = options.leader - 1, cell.workcell
     moments = planned_moments(cell, carry) if settings.pads == "driven" else None
     witness = BoxSimulation(workcell, settings)
@@ -192,8 +193,8 @@ def _tell_sweep(step: float, threshold: Threshold[AnyOutcome]) -> None:
 def _tell_worst(
     pressed: Callable[[float], Outcome], planned: Callable[[], Outcome], workcell: Workcell
 ) -> None:
-    """What becomes of a box between pads that rub least: pressed with the least of what is
-    commanded, and with its least forces."""
+    """Print the outcome of a box between pads with the least friction: pressed with the least
+    commanded force, and with its least forces."""
     tracked = 1.0 - workcell.uncertainty.tracking
     outcome = pressed(tracked)
     print(
@@ -215,12 +216,12 @@ def threshold_text(threshold: Threshold[AnyOutcome], slip: float) -> str:
 
 
 def _moment(time: float) -> str:
-    """A time of a simulation, which presses before the carry."""
+    """Format a time of a simulation, which presses before the carry."""
     return f"{-time:.3f} s before the carry" if time < 0.0 else f"at {time:.3f} s"
 
 
 def worst_friction(workcell: Workcell) -> Workcell:
-    """The nominal case with the set's worst friction."""
+    """Return the nominal case with the set's worst friction."""
     case = nominal_case(workcell)
     case[0:2] *= 1.0 - workcell.uncertainty.friction
     return workcell_of_case(workcell, case)
@@ -274,7 +275,7 @@ def simulate_file(options: argparse.Namespace) -> int:
 
 
 def _timed(cell: Cell, x: Array, options: argparse.Namespace) -> Carry:
-    """The carry of an exported job with that timing."""
+    """Return the carry of an exported job with that timing."""
     model = cell.timing_model
     if options.planned_limit is not None:
         return exported_carry(cell, time_path(model, x, model.drive_limits(options.planned_limit)))

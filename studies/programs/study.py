@@ -97,8 +97,8 @@ class StudySettings:
 
 
 def stages(study: StudySettings, alone: bool = False) -> tuple[Stage, ...]:
-    """The stages of a study, in order; alone, its first experiment is the drivable one already, so
-    that it has no other."""
+    """Return the stages of a study, in order; without a second experiment if the first is drivable
+    already."""
     every = [search_stage()]
     if study.polish is not None:
         every.append(polish_stage(study.polish))
@@ -123,7 +123,8 @@ def stages(study: StudySettings, alone: bool = False) -> tuple[Stage, ...]:
 
 
 def report_stage(with_paper: bool, pdf: bool) -> Stage:
-    """The stage that writes pictures, tables and the page; settings as of `StudySettings`."""
+    """Return the stage that writes pictures, tables and the page; settings as in
+    `StudySettings`."""
     settings = {"with_paper": with_paper, "pdf": pdf}
 
     def run(folder: CampaignFolder, progress: Progress) -> None:
@@ -186,8 +187,8 @@ def run_study(
 
 
 def study_text(root: Path, with_paper: bool, brief: bool = False) -> str:
-    """The figures of a finished study for a terminal, the carry to run first; only that where there
-    is one and it is to be brief.
+    """Format the figures of a finished study for a terminal, the carry to run first; only that one
+    if `brief` is set and it exists.
 
     Raises:
         ResultsError: the folder is not complete or damaged.
@@ -263,8 +264,8 @@ def make_study(path: Path, options: argparse.Namespace, with_paper: bool) -> Non
 def campaign_settings(
     options: argparse.Namespace, objectives: tuple[str, ...] = PAPER_OBJECTIVES
 ) -> CampaignSettings:
-    """The settings that the options give, with these objectives where they name none; those of the
-    drivable experiment where only a recommendation is asked for.
+    """Return the settings of the options, with these objectives if they name none; those of the
+    drivable experiment if only a recommendation is wanted.
 
     Raises:
         SettingsError: a value is not allowed.

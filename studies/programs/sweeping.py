@@ -70,7 +70,7 @@ def sweep_numbers(options: argparse.Namespace) -> int:
 
 
 def _of_file(cell: Cell, path: Path) -> Array:
-    """The decision vector of a stored carry, of this cell's shape."""
+    """Return the decision vector of a stored carry, of this cell's shape."""
     x = read_trajectory(path).x
     n_path = cell.workcell.task.n_path
     if x.shape == (n_path,):
@@ -81,7 +81,7 @@ def _of_file(cell: Cell, path: Path) -> Array:
 
 
 def _table(done: Sweep, longest: int = sys.maxsize) -> Table:
-    """The table of a sweep, its remarks cut to some length."""
+    """Build the table of a sweep, with its remarks cut to a maximal length."""
     rows = [
         (
             *(f"{v:g}" for v in row.values),

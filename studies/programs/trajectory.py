@@ -142,7 +142,7 @@ def _chosen(
 
 
 def _report(job: Job, stiffness: float | None) -> str:
-    """The job's phases, what position control and a late arm do, and warnings."""
+    """Print the job's phases, the effects of position control and of a late arm, and warnings."""
     parts = [
         repr(job),
         "\nPosition control, by the arms' stiffness at their pads",

@@ -215,7 +215,7 @@ class ReportData(Experiment):
         return self.carries if recommended is None else (*self.carries, recommended)
 
     def job(self, label: str) -> DrawnJob | None:
-        """The job around the carry of a label, None where it is not planned."""
+        """Return the job around the carry of a label, None if it is not planned."""
         return next((job for job in self.jobs if job.label == label), None)
 
     @property
@@ -300,7 +300,7 @@ def gather(results: CampaignResults, workers: Workers | None = None) -> ReportDa
 
 
 def gather_carries(root: Path) -> tuple[CellGeometry, tuple[DrawnCarry, ...]]:
-    """The cell, the hand-made trajectory and every algorithm's best selected one.
+    """Collect the cell, the hand-made trajectory and every algorithm's best selected one.
 
     Raises:
         ResultsError: the folder is not complete or damaged.
@@ -344,7 +344,7 @@ def _hand_made(evaluator: CandidateEvaluator) -> DrawnCarry:
 
 
 def _titles(results: CampaignResults) -> tuple[str, ...]:
-    """The objectives' titles, with the robots' names for their numbers."""
+    """Return the objectives' titles, with the robots' names for their numbers."""
     titles = [OBJECTIVES[name].title for name in results.objectives]
     for i, robot in enumerate(results.workcell.robots):
         titles = [title.replace(f"robot {i + 1}", robot.name) for title in titles]

@@ -121,13 +121,13 @@ def series(index: int) -> LineStyle:
 
 
 def shortened(name: str, length: int = 24) -> str:
-    """A name of the workcell that leaves room for the rest of a label."""
+    """Shorten a name of the workcell so that it leaves room for the rest of a label."""
     return name if len(name) <= length else f"{name[: length - 1]}\N{HORIZONTAL ELLIPSIS}"
 
 
 def new_figure(share: float) -> Figure:
-    """An empty figure as wide as a journal's page, its height a share of that; draw it inside
-    `in_style`."""
+    """Create an empty figure as wide as a journal's page, its height a share of that; draw it
+    inside `in_style`."""
     return Figure(figsize=(FULL_WIDTH, share * FULL_WIDTH), layout="constrained")
 
 
@@ -139,7 +139,7 @@ def in_style() -> Iterator[None]:
 
 
 def settled(figure: Figure) -> Figure:
-    """The figure with its layout worked out for good: all files of it show the same."""
+    """Fix the figure's layout, so that all its files show the same."""
     with in_style():
         engine = figure.get_layout_engine()
         assert engine is not None
@@ -152,24 +152,24 @@ def settled(figure: Figure) -> Figure:
 
 
 def legend_below(figure: Figure, axes: Axes, columns: int = 0) -> None:
-    """The legend of a panel below the whole figure, in one row unless columns are given."""
+    """Draw the legend of a panel below the whole figure, in one row unless columns are given."""
     handles, labels = axes.get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=columns or len(handles))
 
 
 def limit_line(axes: Axes, level: float, label: str) -> None:
-    """A limit as a dashed line across the panel."""
+    """Draw a limit as a dashed line across the panel."""
     axes.axhline(level, color="black", linestyle="--", linewidth=0.9, label=label)
 
 
 def rest_line(axes: Axes, level: float, label: str, across: bool = True) -> None:
-    """What holds the payload still as a line, across or up the panel."""
+    """Draw the static force as a line, across or up the panel."""
     draw = axes.axhline if across else axes.axvline
     draw(level, color="black", linewidth=0.8, linestyle=(0, (7, 2, 1, 2)), label=label)
 
 
 def panel_label(axes: Axes, letter: str, text: str, bare: bool = False) -> None:
-    """'(a) text' above a panel's left corner.
+    """Write '(a) text' above a panel's left corner.
 
     Args:
         bare: whether nothing else is above the panel: to look for it takes half of a layout.
@@ -178,7 +178,7 @@ def panel_label(axes: Axes, letter: str, text: str, bare: bool = False) -> None:
 
 
 def files_of(figure: Figure, pdf: bool = True) -> dict[str, bytes]:
-    """A settled figure as files, by suffix: PNG, and PDF where it is wanted."""
+    """Return a settled figure as files, by suffix: PNG, and PDF on request."""
     wanted = {"png": {"Software": None}} | ({"pdf": {"CreationDate": None}} if pdf else {})
     files = {}
     with in_style():
@@ -270,7 +270,7 @@ SIDE = View(_X, _Z, "x [m]", "z [m]")
 
 
 def oblique(azimuth: float, elevation: float) -> View:
-    """A view from a direction: azimuth about z from +x, elevation above the ground [rad]."""
+    """Return a view from a direction: azimuth about z from +x, elevation above the ground [rad]."""
     right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
     towards = np.array(
         [
@@ -308,8 +308,8 @@ class CutCell:
     def of(
         cls, geometry: CellGeometry, solids: Sequence[Solid], marked: Collection[str] = ()
     ) -> CutCell:
-        """The cell with some of its solids, their triangles cut to `MAX_EDGE`, coloured by the
-        party they belong to, those of the marked names in red."""
+        """Cut some of the cell's solids to triangles of at most `MAX_EDGE`, coloured by group,
+        those of the marked names in red."""
         corners = [solid.vertices[solid.faces] for solid in solids]
         numbers = np.repeat(np.arange(len(solids)), [len(each) for each in corners])
         limits = np.array([np.inf if solid.is_ground else MAX_EDGE for solid in solids])
@@ -402,13 +402,13 @@ def _polygons(flat: Array, **style: Any) -> PolyCollection:
 
 
 def draw_path(axes: Axes, view: View, points: Array, **style: object) -> None:
-    """A line through world points (n, 3), above the bodies."""
+    """Draw a line through world points (n, 3), above the bodies."""
     flat = view.flat(points)
     axes.plot(flat[:, 0], flat[:, 1], zorder=4.0, **style)  # type: ignore[arg-type]
 
 
 def draw_box_edges(axes: Axes, view: View, lower: Array, upper: Array, **style: object) -> None:
-    """The twelve edges of a box along the world axes."""
+    """Draw the twelve edges of a box along the world axes."""
     flat = view.flat(box_corners(lower, upper))
     # Corners whose numbers differ in one bit are neighbours.
     edges = [flat[[i, i | bit]] for i in range(8) for bit in (1, 2, 4) if not i & bit]

@@ -61,15 +61,16 @@ class ReportPicture:
     make: Callable[[], Figure]
 
     def draw(self) -> Figure:
-        """The figure in the common style."""
+        """Draw the figure in the common style."""
         with in_style():
             return settled(self.make())
 
 
 def _of(name: str, draw: Callable[..., Figure], *given: Any, caption: str = "") -> ReportPicture:
-    """A picture whose caption is the docstring of what draws it, where there is no other."""
-    text = caption or inspect.getdoc(draw) or ""
-    return ReportPicture(name, " ".join(text.split()), partial(draw, *given))
+    """Build a picture whose caption is the docstring of its drawing function without 'Draw', unless
+    one is given."""
+    text = " ".join((caption or inspect.getdoc(draw) or "").removeprefix("Draw ").split())
+    return ReportPicture(name, text[:1].upper() + text[1:], partial(draw, *given))
 
 
 def report_pictures(data: ReportData) -> Iterator[ReportPicture]:
@@ -221,7 +222,8 @@ def _unpickled(data: bytes) -> list[ReportPicture]:
 
 
 def render_page(data: ReportData, document: dict[str, Any], tables: str, pictures: str) -> str:
-    """The page's text: what its scripts show, from `page_data`, and tables and pictures as HTML."""
+    """Write the page's text: data of its scripts, from `page_data`, and tables and pictures as
+    HTML."""
     texts = files("studies.report") / "page"
     boot, own = ((texts / name).read_text("utf-8") for name in ("boot.js", "page.js"))
     scripts = [asset(PLOTLY), asset(THREE), asset("scene.js"), own]
@@ -246,7 +248,7 @@ def render_page(data: ReportData, document: dict[str, Any], tables: str, picture
 
 
 def _block(text: str, attributes: str = "") -> str:
-    """A compressed text that `boot.js` unpacks; the time of its making is left out."""
+    """Compress a text that `boot.js` unpacks, without its creation time."""
     content = base64.b64encode(gzip.compress(text.encode(), 9, mtime=0)).decode()
     return f"<script type='application/gzip'{attributes}>{content}</script>"
 
@@ -282,7 +284,7 @@ IN_FOLDER = {"file": "file, beside this page", "export": "export, from this fold
 
 
 def _recommendation(data: ReportData) -> str:
-    """The words that the terminal opens with, too."""
+    """Return the opening words of the page, as in the terminal."""
     words = data.summary.words("")
     if words is None:
         return ""

@@ -64,7 +64,7 @@ class Film:
 
     @classmethod
     def of(cls, carry: DrawnCarry) -> Film:
-        """A carry as it was planned."""
+        """Build the film of a carry as planned."""
         return cls(carry.label, carry.timed.time, carry.timed.pose, carry.timed.q)
 
     @property
@@ -171,7 +171,7 @@ HOST = "127.0.0.1"
 
 
 def page_of(root: Path) -> bytes:
-    """The page of a results folder.
+    """Return the page of a results folder.
 
     Raises:
         DualArmError: the results are incomplete.
@@ -183,8 +183,8 @@ def page_of(root: Path) -> bytes:
 
 
 def page_server(page: bytes, port: int) -> ThreadingHTTPServer:
-    """What gives a page to a browser of this machine, listening already at a port, or at another
-    free one if that is in use.
+    """Open the server of a page for a browser of this machine, at a port, or at another free one if
+    that is in use.
 
     Raises:
         ReportError: no port is free.

@@ -66,7 +66,7 @@ class DrawnJob:
 
 
 def recommended_job(x: Array, cells: Sequence[ReadyCell]) -> DrawnJob:
-    """The job around the recommended carry x (n_var,) of the last cell, as robots drive it."""
+    """Plan the job around the recommended carry x (n_var,) of the last cell, as robots drive it."""
     model = cells[-1].jobs
     found = drawn(model, RECOMMENDED_LABEL, lambda: driven_timing(model.timing, x), True)
     if found.timing is None or found.timing.carry is None:
@@ -75,9 +75,9 @@ def recommended_job(x: Array, cells: Sequence[ReadyCell]) -> DrawnJob:
 
 
 def drawn_job(label: str, x: Array, limits: TimingLimits, cells: Sequence[ReadyCell]) -> DrawnJob:
-    """The job around a path of the first cell, x (n_var,), in the last one: timed within limits,
-    with the forces that an export commands by default, within the cell's limits on jerk, which
-    takes long."""
+    """Plan the job around a path of the first cell, x (n_var,), in the last one: timed within
+    limits, with the default forces of an export, within the cell's limits on jerk, which takes
+    long."""
     model = cells[-1].jobs
     (path,) = resample_decisions(x, cells[0].cell.workcell.task, model.workcell.task)
     return drawn(model, label, lambda: time_path(model.timing, path, limits), True)
@@ -86,7 +86,8 @@ def drawn_job(label: str, x: Array, limits: TimingLimits, cells: Sequence[ReadyC
 def drawn(
     model: JobModel, label: str, timed: Callable[[], Timing], within_jerk: bool = False
 ) -> DrawnJob:
-    """The job around a path that is timed here, also within the cell's limits on jerk if wanted."""
+    """Plan the job around a path that is timed here, also within the cell's limits on jerk if
+    wanted."""
     timing = None
     try:
         timing = timed()
@@ -119,8 +120,8 @@ def _rows(time: Array, count: int, peaks: Iterable[int]) -> NDArray[np.intp]:
 
 
 def _once(table: Array) -> Array:
-    """The samples (n, k) without those whose time, their first number, stands twice: where two
-    phases meet, and where an acceleration jumps."""
+    """Remove samples (n, k) whose time, their first number, repeats: where two phases meet, and
+    where an acceleration jumps."""
     return np.asarray(table[np.concatenate([[True], np.diff(table[:, 0]) > 1e-9])])
 
 
@@ -148,7 +149,7 @@ PHASE_LIMITS = (
 
 
 def phases(jobs: Sequence[DrawnJob], robots: Sequence[str]) -> Table:
-    """The phases of whole jobs, with the names of the robots."""
+    """Return the phases of whole jobs, with the names of the robots."""
     rows: list[tuple[str, ...]] = []
 
     def add(
@@ -262,7 +263,7 @@ def _rounded(values: Array, digits: int) -> list[float]:
 
 
 def page_trajectory(cells: Sequence[ReadyCell], shown: PageTrajectory) -> dict[str, Any]:
-    """A trajectory of the page as JSON values: its motions, and all that is said of it.
+    """Return a trajectory of the page as JSON values: its motions and texts.
 
     Args:
         cells: of the page; the last one is the cell that robots drive. Under 'optimal' carries are
@@ -328,7 +329,7 @@ def _motion(name: str, carry: ho.Carry) -> dict[str, Any]:
 
 
 def _uses(workcell: Workcell, whole: Array, contact: Sequence[Array]) -> dict[str, list[float]]:
-    """Uses of the joints' torques, of all loads and of the contacts alone."""
+    """Return uses of the joints' torques, of all loads and of the contacts alone."""
     torques = {"torqueUse": whole, "contactTorqueUse": np.concatenate(contact)}
     return {name: _rounded(torque_use(workcell, each), 3) for name, each in torques.items()}
 

@@ -61,12 +61,12 @@ DASHES = ("solid", "dash")
 
 
 def plain(text: str) -> str:
-    """A text in which plotly finds no markup."""
+    """Escape a text in which plotly finds no markup."""
     return html.escape(text, quote=False)
 
 
 def marker(look: LineStyle, opened: bool = False, size: float = 9) -> Plot:
-    """The marker of a series, open where a polished front stands beside a searched one."""
+    """Return the marker of a series, open if a polished front stands beside a searched one."""
     symbol = SYMBOLS[look.marker]
     return {"color": look.colour, "symbol": f"{symbol}-open" if opened else symbol, "size": size}
 
@@ -95,7 +95,7 @@ def cloud(label: str, at: Array, look: LineStyle) -> Plot:
 
 
 def line(label: str, at: Array, colour: str, dash: str) -> Plot:
-    """A curve through points (k, 2)."""
+    """Return a curve through points (k, 2)."""
     style = {"color": colour, "dash": dash, "width": 1.6}
     return _scatter(label, at, mode="lines", hoverinfo="skip", line=style)
 
@@ -112,7 +112,7 @@ def _scatter(label: str, at: Array, **style: Any) -> Plot:
 
 
 def front_plot(name: str, titles: tuple[str, str], traces: list[Plot], first: Array) -> Plot:
-    """A picture of fronts.
+    """Build a plot of fronts.
 
     Args:
         name: on its button.
@@ -140,7 +140,7 @@ def front_plot(name: str, titles: tuple[str, str], traces: list[Plot], first: Ar
 
 
 def _legend(edge: str, place: float, size: int) -> Plot:
-    """A legend in a row along an edge of the plot's element."""
+    """Return a legend in a row along an edge of the plot's element."""
     row = {"orientation": "h", "yref": "container", "y": place, "yanchor": edge}
     return {**row, "font": {"size": size}}
 
@@ -180,8 +180,9 @@ def drive_look(points: Array, always: Array) -> Array:
 
 
 def carry_plots(workcell: Workcell, rest: float | None) -> dict[str, Plot]:
-    """The plots of one trajectory by the ids of their elements. `meta` says what fills a trace:
-    a column of its samples and a factor, a level, or one arm's share of a list of all joints.
+    """Build the plots of one trajectory by the ids of their elements. `meta` states the content of
+    a trace: a column of its samples and a factor, a level, or one arm's share of a list of all
+    joints.
 
     Args:
         rest: largest normal force of the level payload at rest [N], None where it is not known.
@@ -312,7 +313,7 @@ def _trajectory(cells: Cells, shown: PageTrajectory) -> dict[str, Any]:
 
 
 def _drive_groups(data: ReportData, drivable: Experiment, cell: int) -> Iterator[MeshGroup]:
-    """The recommended carry, some of the paths' points at every force, and the fronts."""
+    """Yield the recommended carry, some of the paths' points at every force, and the fronts."""
     if data.recommended is not None:
         found = data.summary.recommendation
         source = "" if found is None else found.source
@@ -363,7 +364,7 @@ def curves(data: ReportData) -> Iterator[tuple[DrawnCarry, str, Array]]:
 
 
 def _traces(groups: Sequence[Numbered], found: Sequence[dict[str, Any]]) -> Iterator[Plot]:
-    """The points of groups that stand in a picture."""
+    """Yield the points of groups in a plot."""
     for group, members in groups:
         if group.look is None:
             continue
@@ -409,7 +410,7 @@ def _drive_view(
 def _search_view(
     data: ReportData, groups: Sequence[Numbered], found: Sequence[dict[str, Any]]
 ) -> Plot:
-    """The fronts of the first experiment."""
+    """Build the plot of the first experiment's fronts."""
     titles = [*data.objective_titles, "", ""]
     judged = [carry.timed.judgement for carry in data.carries]
     selected = np.array([list(one.objectives.values()) for one in judged if one is not None])

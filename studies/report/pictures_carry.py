@@ -35,7 +35,7 @@ PREDICTED: dict[str, Any] = {"color": "black", "linestyle": (0, (2, 1.5)), "line
 def _per_robot(
     data: ReportData, titles: tuple[str, str], draw: Callable[[Axes, int], None], columns: int = 0
 ) -> Figure:
-    """A panel per robot with common axes, whose titles are given, and one legend."""
+    """Create a panel per robot with common axes and titles, and one legend."""
     figure = new_figure(0.48)
     panels = figure.subplots(1, 2, sharey=True)
     for i, (axes, robot) in enumerate(zip(panels, data.workcell.robots, strict=True)):
@@ -48,7 +48,7 @@ def _per_robot(
 
 
 def normal_forces(data: ReportData) -> Figure:
-    """Normal contact forces along the selected trajectories (paper Figure 9)."""
+    """Draw normal contact forces along the selected trajectories (paper Figure 9)."""
 
     def draw(axes: Axes, i: int) -> None:
         for carry in data.drawn:
@@ -116,7 +116,7 @@ def payload(data: ReportData) -> Figure:
 
 
 def simulated_forces(data: ReportData) -> Figure:
-    """Normal forces in the simulated cell, arms under force control, beside those that were
+    """Draw normal forces in the simulated cell, arms under force control, beside those that were
     predicted for how the carries were pressed there."""
     looks, number = [], 0
     for found in data.simulations:

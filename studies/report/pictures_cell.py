@@ -177,7 +177,7 @@ def reachable_regions(geometry: CellGeometry, reach: ReachMap, carry: DrawnCarry
 
 
 def environment(geometry: CellGeometry, carry: DrawnCarry) -> Figure:
-    """The cell at the start of the carry (paper Figure 5)."""
+    """Draw the cell at the start of the carry (paper Figure 5)."""
     figure = new_figure(0.34)
     solids = cell_solids(geometry)
     cell = CutCell.of(geometry, solids)
@@ -201,7 +201,7 @@ def _draw_views(
     hidden: tuple[str, ...] = (),
     margin: float = MARGIN,
 ) -> None:
-    """The cell at one sample in panels: what is above each, its view, and points that it fits."""
+    """Draw the cell at one sample in panels: title, view, and points to fit, of each."""
     for axes, letter, (text, view, points) in zip(panels, "abc", shown, strict=True):
         draw_cell(axes, cell, view, pose, q, hidden)
         panel_label(axes, letter, text, bare=True)
@@ -209,13 +209,13 @@ def _draw_views(
 
 
 def facing(way: Array) -> View:
-    """The oblique view in which what goes along a way (3,) comes nearer: an arm is not hidden by
-    the machine that it belongs to."""
+    """Return the oblique view in which a motion along (3,) approaches the viewer: the machine does
+    not hide its arm."""
     return max(ISOMETRIC, OTHER_SIDE, key=lambda view: float(way @ view.towards))
 
 
 def arm_and_reach(geometry: CellGeometry, reach: ReachMap, carry: DrawnCarry) -> Figure:
-    """The first arm at the start and the region that its pad reaches (paper Figure 6)."""
+    """Draw the first arm at the start and the region that its pad reaches (paper Figure 6)."""
     figure = new_figure(0.5)
     left, right = figure.subplots(1, 2)
     robot = geometry.workcell.robots[0]
@@ -239,7 +239,7 @@ def arm_and_reach(geometry: CellGeometry, reach: ReachMap, carry: DrawnCarry) ->
 
 
 def motion_sequence(geometry: CellGeometry, carry: DrawnCarry) -> Figure:
-    """The cell at 0, 33, 66 and 100 % of a carry (paper Figures 14 and 15)."""
+    """Draw the cell at 0, 33, 66 and 100 % of a carry (paper Figures 14 and 15)."""
     points = motion_points(geometry, carry.timed.pose, carry.timed.q)
     cell = CutCell.of(geometry, cell_solids(geometry))
     figure = new_figure(0.74)
@@ -284,7 +284,8 @@ def paths(geometry: CellGeometry, carries: tuple[DrawnCarry, ...]) -> Figure:
 
 
 def planes(points: Array) -> tuple[tuple[View, str], tuple[View, str]]:
-    """The two planes of the world, with their names, in which points (n, 3) take most room."""
+    """Return the two coordinate planes, with their names, in which points (n, 3) extend
+    farthest."""
     extent = np.ptp(points, axis=0)
     every = (("y–z plane", FRONT, 0), ("x–z plane", SIDE, 1), ("x–y plane", _PLAN, 2))
     first, second, _ = sorted(every, key=lambda plane: float(extent[plane[2]]))
@@ -338,7 +339,7 @@ def _draw_slice(
     hatch: str,
     alpha: float = 0.35,
 ) -> None:
-    """A slice of a region (nx, ny, nz) of the grid across a world axis, filled."""
+    """Fill a slice of a region (nx, ny, nz) of the grid across a world axis."""
     mask = np.take(region, index, axis=across)
     if not mask.any():
         return
@@ -371,7 +372,7 @@ CLOSE_UP = 0.25
 def meeting(
     geometry: CellGeometry, pair: tuple[str, str], pose: Array, q: Array, title: str
 ) -> Figure:
-    """The cell with both bodies in red: all of it, and what is near them from two sides.
+    """Draw the cell with both bodies in red: all of it, and what is near them from two sides.
 
     Args:
         pair: names of the bodies.

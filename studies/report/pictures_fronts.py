@@ -143,8 +143,8 @@ def _paired(axes: Axes, algorithms: Sequence[AlgorithmRuns]) -> None:
 
 
 def _objectives(axes: Axes, data: ReportData) -> None:
-    """The axes of the first two objectives, with the level payload at rest, and the recommended
-    carry where its front is drawn."""
+    """Draw the axes of the first two objectives, with the level payload at rest, and the
+    recommended carry on its front."""
     if data.at_rest is not None:
         look: dict[str, Any] = {
             "color": "black",
@@ -162,7 +162,7 @@ def _objectives(axes: Axes, data: ReportData) -> None:
 
 
 def _recommended(axes: Axes, data: ReportData) -> None:
-    """The star of the recommended carry, where its objectives are those of the axes."""
+    """Draw the star of the recommended carry, if its objectives are those of the axes."""
     if (at := data.recommended_objectives) is not None:
         axes.plot(*at, **RECOMMENDED_STYLE.marks(9.0, MARKED), label="recommended, driven")
 
@@ -292,8 +292,8 @@ def histories(data: ReportData) -> Figure:
 
 
 def infeasibility(data: ReportData) -> Figure:
-    """What made candidates infeasible: the constraint violated first, over all replicas, and where
-    on the path."""
+    """Draw what made candidates infeasible: the constraint violated first, over all replicas, and
+    where on the path."""
     figure = new_figure(0.46)
     left, right = figure.subplots(1, 2)
     pooled = []
@@ -344,7 +344,7 @@ def infeasibility(data: ReportData) -> Figure:
 
 
 def indicators(data: ReportData) -> Figure:
-    """Indicators of every replica, with medians and quartiles."""
+    """Draw indicators of every replica, with medians and quartiles."""
     figure = new_figure(0.36)
     shown = (
         ("hypervolume", "hypervolume [-]"),

@@ -163,7 +163,7 @@ def _run(
 
 
 def _band(problem: str, evaluations: int, algorithm: str, population: int) -> Band | None:
-    """The band of Coello's MOPSO and of the variants of it, for the swarm that it holds for."""
+    """Return the band of Coello's MOPSO and of its variants, for the swarm that it holds for."""
     applies = algorithm.startswith("mopso") and population == BAND_POPULATION
     return BANDS.get((problem, evaluations)) if applies else None
 
@@ -266,7 +266,7 @@ def _tests(shifted: dict[str, list[_AlgorithmRun]]) -> tuple[RankTest, ...]:
 
 
 def table(result: AlgorithmTest) -> str:
-    """The comparison as text."""
+    """Format the comparison."""
     lines = [
         f"Mean over {result.seeds} seeds of the final front (limited size) and of all evaluated "
         "points",
@@ -424,7 +424,7 @@ def _zdt3_front() -> Array:
 
 
 def _tnk_front() -> Array:
-    """The curved constraint is active; the circular one cuts pieces out."""
+    """Sample the front: the curved constraint is active; the circular one cuts pieces out."""
     angle = np.linspace(0.0, 0.5 * np.pi, _DENSE)
     # arctan(x1 / x2) is the angle from the x2 axis.
     radius = np.sqrt(1.0 + 0.1 * np.cos(16.0 * angle))

@@ -115,7 +115,7 @@ def _polished(
 
 
 def encode(front: ReferenceFront, command: str) -> bytes:
-    """The file: two comment lines, a header, one line per point."""
+    """Write the file: two comment lines, a header, one line per point."""
     n_var = front.x.shape[1]
     lines = [
         f"# made with: {command}",

@@ -172,7 +172,7 @@ def _costs(
 
 
 def with_free_waypoints(task: Task, count: int) -> Task:
-    """The task with another number of free waypoints between its start and goal.
+    """Return the task with another number of free waypoints between its start and goal.
 
     They lie evenly along the polygon of the hand-made trajectory; each may deviate as far as the
     narrowest of the original ones.
@@ -332,7 +332,7 @@ def _timed(name: str, run: Callable[[], object]) -> StageTime:
 
 
 def _part(file: str, function: str) -> str:
-    """The room of this project or the library that a function belongs to."""
+    """Return the room of this project or the library that a function belongs to."""
     path = Path(file)
     if path.is_relative_to(_ROOT):
         return "/".join(path.relative_to(_ROOT).parts[:2]).removesuffix(".py")
@@ -343,7 +343,7 @@ def _part(file: str, function: str) -> str:
 
 
 def study_table(stages: tuple[StageTime, ...]) -> str:
-    """The figures as text."""
+    """Format the figures."""
     rows = []
     for stage in stages:
         total = sum(stage.parts.values())

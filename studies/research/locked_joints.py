@@ -37,7 +37,8 @@ class LockedReplica:
 
 
 def locks(task: Task, count: int) -> tuple[tuple[float, ...], ...]:
-    """A grid of at least `count` positions of the redundant joints, the middles of its cells."""
+    """Return a grid of at least `count` positions of the redundant joints, the middles of its
+    cells."""
     sides = max(ceil(count ** (1.0 / len(task.redundant)) - 1e-9), 1)
     shares = (np.arange(sides) + 0.5) / sides
     values = [
@@ -50,7 +51,7 @@ def locks(task: Task, count: int) -> tuple[tuple[float, ...], ...]:
 def compare(
     cell: Cell, count: int, replicas: int, evaluations: int, seed: int
 ) -> list[LockedReplica]:
-    """The replicas.
+    """Run the replicas.
 
     Raises:
         SettingsError: no joint is redundant, or one is fixed at a waypoint.
@@ -81,7 +82,7 @@ def _volume(evaluations: Evaluations) -> float:
 
 
 def as_text(found: Sequence[LockedReplica]) -> str:
-    """The comparison for people."""
+    """Format the comparison for a terminal."""
     lines = ["replica     free  best lock  locks with a carry  at"]
     for k, one in enumerate(found):
         some = sum(volume > 0.0 for volume in one.locked)

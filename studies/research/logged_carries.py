@@ -122,7 +122,7 @@ class LoggedCarry:
 
 
 def labelled(folder: Path) -> list[Path]:
-    """The labelled runs' files, one per run.
+    """Return the labelled runs' files, one per run.
 
     Raises:
         SettingsError: there are none.
@@ -135,7 +135,7 @@ def labelled(folder: Path) -> list[Path]:
 
 
 def read(path: Path) -> LoggedCarry:
-    """A run, from its file or from that of the left arm."""
+    """Read a run, from its file or from that of the left arm."""
     stamp = re.search(r"\d{8}-\d{6}", path.stem)
     mass = re.search(r"_([\d.]+)kg", path.stem)
     slip = SLIPS.get(stamp[0] if stamp else "")
@@ -276,7 +276,7 @@ class Comparison:
 
 
 def compared(carry: LoggedCarry) -> Comparison:
-    """What the model asks for in a carry."""
+    """Compute the model's forces in a logged carry."""
     run, places = carry.run, carry.places
     time = np.arange(run.time[0], run.time[-1], STEP)
     near = np.searchsorted(run.time, time).clip(0, len(run.time) - 1)

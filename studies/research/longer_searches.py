@@ -147,7 +147,7 @@ class PolishGap:
 
 
 def approaches(root: Path, reference: ReferenceFront) -> list[PolishGap]:
-    """The distances of a polished study's fronts to a reference front.
+    """Compute the distances of a polished study's fronts to a reference front.
 
     Raises:
         ResultsError: the study is not complete, was not polished, or is of another workcell.
@@ -176,7 +176,7 @@ def approaches(root: Path, reference: ReferenceFront) -> list[PolishGap]:
 
 
 def approaches_text(found: Sequence[PolishGap]) -> str:
-    """The distances as a table."""
+    """Format the distances as a table."""
     head = ["medians over the replicas", "HV gap", "polished", "closed %", "IGD", "polished"]
     rows = [
         [
@@ -193,7 +193,7 @@ def approaches_text(found: Sequence[PolishGap]) -> str:
 
 
 def as_text(found: Sequence[LongerSearch]) -> str:
-    """The comparison as a table."""
+    """Format the comparison as a table."""
     rows = [["polished front of", "search", "polished", "longer search", "HV", "wins"]]
     rows += [
         [

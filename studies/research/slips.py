@@ -207,7 +207,7 @@ def first_slip(lacks: Outcome, held: Outcome) -> float:
 
 
 def pads_of(workcell: Workcell) -> str:
-    """A key of `ALLOWED`."""
+    """Return a key of `ALLOWED`."""
     if len(workcell.pads) > 2:
         return "fork"
     return "rectangle" if any(pad.half_sides for pad in workcell.pads) else "disc"

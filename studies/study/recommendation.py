@@ -164,8 +164,8 @@ class NoRecommendation:
 
 
 def recommendation_stage(wish: ho.Wish) -> Stage:
-    """The stage that writes `recommended.json`, a trajectory file, and `recommendation.json`, or
-    `no-recommendation.json`."""
+    """Return the stage that writes `recommended.json`, a trajectory file, and
+    `recommendation.json`, or `no-recommendation.json`."""
 
     def run(folder: CampaignFolder, progress: Progress) -> None:
         found: StoredRecommendation | NoRecommendation
@@ -184,7 +184,8 @@ def recommendation_stage(wish: ho.Wish) -> Stage:
 
 
 def read_recommendation(root: Path) -> StoredRecommendation | NoRecommendation | None:
-    """The recommendation in a results folder, or why it has none; None where it was not asked.
+    """Read the recommendation in a results folder, or the reason why there is none; None if none
+    was requested.
 
     Raises:
         ResultsError: it is damaged.
@@ -288,7 +289,7 @@ def _hand_made(cell: ho.Cell) -> Array:
 
 
 def _why_none(cell: ho.Cell, results: CampaignResults) -> str:
-    """What stopped the candidates of an experiment, and its hand-made trajectory."""
+    """Describe what stopped the candidates of an experiment, and its hand-made trajectory."""
     found = concatenated([replica.evaluations for replica in results.replicas])
     stopped = ", ".join(
         f"{name.replace('_', ' ')} {100.0 * count / len(found):.1f} %"
@@ -363,7 +364,7 @@ class RecommendationText:
 
 
 def recommendation_text(found: StoredRecommendation, folder: str) -> RecommendationText:
-    """The words for a stored recommendation.
+    """Format a stored recommendation in words.
 
     Args:
         folder: of the results, in front of the files' names; '' where the reader is in it.
@@ -419,7 +420,7 @@ def _rival(rival: Rival, found: StoredRecommendation) -> str:
 
 
 def _robust(price: RobustPrice) -> str:
-    """What the set is, the largest multiple of it that the arms allow, and random cases."""
+    """Describe the set, the largest multiple of it that the arms allow, and random cases."""
     slips = "slips" if price.check.failing == 1 else "slip"
     return (
         f"in every case of {price.uncertainty.title} ({price.uncertainty}), of which the leading "
@@ -475,8 +476,8 @@ def known_paths(root: Path, task: Task) -> Array:
 
 
 def least_force(campaign: CampaignResults, task: Task) -> dict[str, Array]:
-    """The balanced path (n_path,) of all fronts of an experiment, told by the waypoints of a task,
-    by its label; empty where no carry was found."""
+    """Return the balanced path (n_path,) of all fronts of an experiment, at the waypoints of a
+    task, by its label; empty if no carry was found."""
     evaluator = CandidateEvaluator(campaign.workcell, campaign.objectives)
     chosen = select(evaluator, np.concatenate([front.x for front in campaign.fronts]))
     if chosen is None:

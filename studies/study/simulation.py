@@ -108,7 +108,7 @@ class StoredSimulation:
 def stored_simulation(
     found: Account, label: str, trajectory: str, controller: str
 ) -> StoredSimulation:
-    """An account as a study stores it: from the beginning of the carry on."""
+    """Convert an account to its stored form: from the beginning of the carry on."""
     threshold, shown, squeeze, motion = (
         found.threshold,
         found.shown,
@@ -142,7 +142,7 @@ def stored_simulation(
 
 
 def read_simulations(root: Path) -> tuple[StoredSimulation, ...]:
-    """Simulations of a study's carries, in the order of their files.
+    """Read the simulations of a study's carries, in the order of their files.
 
     Raises:
         ResultsError: a file is damaged.
@@ -173,7 +173,7 @@ class SimulationRequest:
 
 
 def simulation_stage() -> Stage:
-    """The stage that writes `simulated/`: one document per carry that the report shows."""
+    """Return the stage that writes `simulated/`: one document per carry that the report shows."""
     return Stage("simulation", _run, {"control": CONTROL})
 
 
@@ -209,7 +209,7 @@ def is_done(root: Path, one: SimulationRequest) -> bool:
 
 
 def wanted_carries(root: Path) -> list[SimulationRequest]:
-    """The carries that a report shows: hand-made, best of each algorithm, recommended."""
+    """Return the carries that a report shows: hand-made, best of each algorithm, recommended."""
     summary = read_summary(root)
     shown, places = summary.shown_files, ["", *summary.algorithms]
     files = {

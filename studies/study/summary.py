@@ -266,8 +266,8 @@ class CampaignSummary:
         return files
 
     def words(self, folder: str) -> RecommendationText | None:
-        """What a study opens with: the carry to run, or why there is none, with its folder as for
-        `recommendation_text`; None where nothing is known of either."""
+        """Return the opening words of a study: the carry to run, or why there is none, with its
+        folder as in `recommendation_text`; None if neither is known."""
         if self.recommendation is not None:
             return recommendation_text(self.recommendation, folder)
         if not self.no_recommendation:
@@ -276,7 +276,7 @@ class CampaignSummary:
 
 
 def read_summary(root: str | Path) -> CampaignSummary:
-    """The figures of summary.json.
+    """Read the figures of summary.json.
 
     Raises:
         ResultsError: it is missing, damaged, or not that of the campaign.
@@ -314,7 +314,7 @@ def reference_front(fronts: Sequence[Array]) -> Array:
 def front_indicators(
     front: Array, reference: Array, selected: SelectedCarry | None, file: str | None
 ) -> dict[str, Any]:
-    """The fields of `FrontFigures` for a front's objectives (k, n_obj)."""
+    """Compute the fields of `FrontFigures` for a front's objectives (k, n_obj)."""
     carry = None if selected is None else selected.carry
     return {
         "non_dominated": len(front),
@@ -349,7 +349,7 @@ def replica_figures(
 
 
 def best_steps(history: Array) -> tuple[Array, ...]:
-    """The evaluations at which the best of an objective changed: [evaluation, best, ...]."""
+    """Return the evaluations at which the best of an objective changed: [evaluation, best, ...]."""
     known = history[~np.isnan(history).any(axis=1)]
     first = len(history) - len(known)
     changes = np.flatnonzero((np.diff(known, axis=0) != 0.0).any(axis=1)) + 1
@@ -358,7 +358,7 @@ def best_steps(history: Array) -> tuple[Array, ...]:
 
 
 def carry_entry(carry: Carry, evaluation: int, file: str | None) -> SelectedEntry:
-    """The entry of a judged carry."""
+    """Return the entry of an evaluated carry."""
     assert carry.judgement is not None, "selected carries are judged"
     return SelectedEntry(
         evaluation=evaluation,
@@ -379,8 +379,8 @@ def campaign_summary(
     static: StaticHold,
     entries: Mapping[str, Sequence[ReplicaFigures]],
 ) -> CampaignSummary:
-    """The figures of the search and of the polish, with the reference front (k, n_obj) and per
-    algorithm the entries of `replica_figures`."""
+    """Compute the figures of the search and of the polish, with the reference front (k, n_obj) and
+    per algorithm the entries of `replica_figures`."""
     configuration = results.configuration
     corner = metrics.reference_point(len(results.objectives))
     return CampaignSummary(
@@ -447,8 +447,8 @@ PERCENTILES = (25.0, 50.0, 75.0, 100.0)
 
 
 def summary_stage(not_asked: str = "") -> Stage:
-    """The stage that computes the figures of a finished search; `not_asked` says why the study
-    recommends no carry, where it was not asked for one."""
+    """Return the stage that computes the figures of a finished search; `not_asked` is the reason of
+    a study without a recommendation."""
 
     return Stage("summary", partial(_run, not_asked=not_asked))
 
@@ -502,7 +502,7 @@ def _run(folder: CampaignFolder, progress: Progress, not_asked: str) -> None:
 
 
 def _polished_figures(folder: CampaignFolder, front: Front, reference: Array) -> PolishedFigures:
-    """The figures of a polished front, whose selected trajectory is stored."""
+    """Compute the figures of a polished front, and store its selected trajectory."""
     assert front.polished is not None
     chosen = select(folder.cell.evaluator, front.x)
     path = polished_selected_file(folder.root, *front.key)

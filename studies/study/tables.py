@@ -104,7 +104,7 @@ def quality(
     name: str = "table1_quality",
     heading: str = "Table 1. Quality of the search.",
 ) -> Table:
-    """Indicators over the replicas (paper Table 1)."""
+    """Build the table of indicators over the replicas (paper Table 1)."""
     rows = []
     for algorithm, entry in summary.algorithms.items():
         for label, figures in _variants(algorithm, entry):
@@ -128,7 +128,7 @@ def quality(
 
 
 def _variants(name: str, entry: AlgorithmFigures) -> list[tuple[str, list[FrontFigures]]]:
-    """An algorithm's replicas as searched, and as polished where they were."""
+    """Yield an algorithm's replicas as searched, and as polished if they were."""
     found: list[tuple[str, list[FrontFigures]]] = [(title(name), list(entry.replicas))]
     polished = [row.polished for row in entry.replicas if row.polished is not None]
     return found + ([(f"{title(name)} + polish", list(polished))] if polished else [])
@@ -138,7 +138,7 @@ _OF_UNION = "Union: the non-dominated candidates of all replicas, polished as on
 
 
 def _polished_union(summary: CampaignSummary) -> list[tuple[str, list[FrontFigures]]]:
-    """The polished union of a drivable experiment's fronts, where there is one."""
+    """Return the polished union of a drivable experiment's fronts, if there is one."""
     return [] if summary.union is None else [(f"{UNION} + polish", [summary.union])]
 
 
@@ -166,7 +166,7 @@ def _table(
 
 
 def selected(summary: CampaignSummary, with_paper: bool) -> Table:
-    """Normal forces of the selected trajectories (paper Table 2)."""
+    """Build the table of normal forces of the selected trajectories (paper Table 2)."""
     rows = [_forces("hand-made", summary.hand_made)]
     for name, entry in summary.algorithms.items():
         if entry.representative is None:
@@ -223,7 +223,8 @@ def _pressed(
 
 
 def replicas(summary: CampaignSummary) -> Table:
-    """Selected carries of all replicas, and what the polish made better."""
+    """Build the table of the selected carries of all replicas, and of their improvement by the
+    polish."""
     rows, keys = [], ("mean_excess_above_static", "payload_limit")
     for name, entry in summary.algorithms.items():
         for label, figures in _variants(name, entry):
@@ -263,7 +264,7 @@ def effort(summary: CampaignSummary) -> Table:
 
 
 def _solvers(summary: CampaignSummary) -> str:
-    """The solvers of the polish in a sentence, '' without one."""
+    """Describe the solvers of the polish in a sentence, '' without one."""
     rows = [row.polished for entry in summary.algorithms.values() for row in entry.replicas]
     rows.append(summary.union)
     names = sorted({polished.solver for polished in rows if polished is not None})
@@ -271,7 +272,7 @@ def _solvers(summary: CampaignSummary) -> str:
 
 
 def infeasible(summary: CampaignSummary) -> Table:
-    """What made candidates infeasible."""
+    """Build the table of the constraints that made candidates infeasible."""
     shares: dict[str, dict[str, float]] = {}
     for name, entry in summary.algorithms.items():
         counts = sum((Counter(row.infeasible_by_reason) for row in entry.replicas), Counter[str]())
@@ -293,7 +294,7 @@ def infeasible(summary: CampaignSummary) -> Table:
 
 
 def constraint_title(name: str, robots: Sequence[str]) -> str:
-    """A constraint's name as people read it, with the arm's name for its number."""
+    """Return a constraint's title, with the arm's name for its number."""
     words = name.split("_")
     if words[-1].isdigit():
         return f"{' '.join(words[:-1])}, {robots[int(words[-1]) - 1]}"
@@ -301,7 +302,8 @@ def constraint_title(name: str, robots: Sequence[str]) -> str:
 
 
 def bounds(search: NormalisationBounds, drivable: NormalisationBounds | None = None) -> Table:
-    """The bounds of the variables that the best fronts lie on, of one or both experiments."""
+    """Build the table of the bounds of the variables that the best fronts lie on, of one or both
+    experiments."""
     rows = []
     for name, found in (("search", search), ("drivable", drivable)):
         if found is None:
@@ -361,7 +363,8 @@ def time_against_force(found: StoredRecommendation) -> Table:
 
 
 def robust_price(price: RobustPrice, robots: Sequence[str]) -> Table:
-    """Forces of the recommended carry that hold for multiples of a set of cases."""
+    """Build the table of the recommended carry's forces that hold for multiples of a set of
+    cases."""
     check, of = price.check, "" if price.uncertainty.stated else ", the usual one"
     return Table(
         "robust_price",

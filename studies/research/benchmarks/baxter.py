@@ -64,7 +64,7 @@ BAXTER_NOTE = (
 
 
 def source(count: int, seed: int) -> BenchmarkSource:
-    """A sample of the scenes.
+    """Return a sample of the scenes.
 
     Args:
         count: of each kind.
@@ -104,7 +104,7 @@ class Hands:
 
 
 def request(path: Path) -> tuple[dict[str, float], dict[str, float]]:
-    """The joints in which both arms begin and end, by name.
+    """Return the joints in which both arms begin and end, by name.
 
     Raises:
         OutsideError: it is no such request.

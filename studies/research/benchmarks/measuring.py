@@ -98,7 +98,7 @@ class BenchmarkSource:
     make: Callable[[Path], Benchmark]
 
     def benchmark(self, folder: Path) -> Benchmark:
-        """The benchmark.
+        """Return the benchmark.
 
         Raises:
             SettingsError: the files are not in FOLDER, or not those.
@@ -119,9 +119,9 @@ def carry_problem(
     scene: list[dict[str, Any]],
     **task: float,
 ) -> dict[str, Any]:
-    """The tables of a problem file: a carry that begins and ends in the air. `scene` is its
-    `[[environment]]`, `pads` are its `[[contacts]]` without friction, `ends` start and goal of the
-    box, `task` further keys of `[task]`."""
+    """Return the tables of a problem file: a carry that begins and ends in the air. `scene` is its
+    `[[environment]]`, `pads` are its `[[contacts]]` without friction, `ends` start and goal of
+    the box, `task` further keys of `[task]`."""
     return {
         "name": name,
         "robots": robots,
@@ -214,8 +214,8 @@ def measured(
 
 
 def shortest_carry(workcell: Path, rng: np.random.Generator) -> ho.Carry:
-    """The carry whose joints move least, as far as an evolution strategy, CMA-ES (Hansen, arXiv
-    1604.00772), finds it from the cell's own one on, within its bounds; it holds, is free of
+    """Find the carry with the shortest joint path by an evolution strategy, CMA-ES (Hansen, arXiv
+    1604.00772), starting at the cell's own one, within its bounds; it holds, is free of
     collisions, also between its samples, and keeps the cell's largest force."""
     cell = ho.Cell.load(workcell, ("joint_length",))
     task = cell.workcell.task
@@ -281,10 +281,10 @@ BENCHMARK_FIGURES: tuple[tuple[str, Callable[[TaskResult], float | None], int], 
 
 
 def table(benchmark: Benchmark, found: list[TaskResult], rng: np.random.Generator) -> Table:
-    """The figures beside the published ones: work until the first certified carry and until its
-    file, its length over all joints and in their coordinates, in these also the straight line
-    between their ends; then a study's fastest carry and its shortest one. Below how many were
-    found, and the rate of collision checks in the first one's cell."""
+    """Build a table of the figures and the published ones: work until the first certified carry and
+    until its file, its length over all joints and in their coordinates, in these also the
+    straight line between their ends; then a study's fastest carry and its shortest one. The note
+    gives the number found, and the rate of collision checks in the first one's cell."""
     rows = tuple(
         (one.task.name, *(number(figure(one), digits) for _, figure, digits in BENCHMARK_FIGURES))
         for one in found

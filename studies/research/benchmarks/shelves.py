@@ -79,7 +79,7 @@ SHELVES_NOTE = (
 
 
 def benchmark(there: Path) -> Benchmark:
-    """The three carries of their folder."""
+    """Return the three carries of their folder."""
     given = postures(safe_io.read_bytes(there / "notebooks/main.ipynb", safe_io.WORKCELL_BYTES))
     urdf = there / "models/iiwa14_convex_decimated_collision.urdf"
     model = pin.buildModelFromUrdf(str(urdf))
@@ -147,7 +147,7 @@ def elbow_turn(q: Array) -> float:
 
 
 def _box(model: pin.Model, q: Array) -> list[float]:
-    """The box's pose where the left arm stands so; the last link points along y."""
+    """Compute the box's pose at a posture of the left arm; the last link points along y."""
     data = model.createData()
     pin.framesForwardKinematics(model, data, q)
     hand = data.oMf[model.getFrameId("iiwa_link_7")]

@@ -80,7 +80,7 @@ SLOT_NOTE = (
 
 
 def benchmark(there: Path) -> Benchmark:
-    """The carry of their folder, within three kinds of limits."""
+    """Return the carry of their folder, within three kinds of limits."""
     content = safe_io.read_bytes(there / "models/scene_slot_gate.xml", safe_io.URDF_BYTES)
     scene = [SLOT_TABLE, *bodies(safe_io.text(content))]
     tasks = []
@@ -103,7 +103,7 @@ def benchmark(there: Path) -> Benchmark:
 
 
 def bodies(scene: str) -> Iterator[dict[str, Any]]:
-    """The boxes of a scene's bodies that do not move, as bodies of a workcell.
+    """Convert the still boxes of a scene to bodies of a workcell.
 
     Raises:
         OutsideError: it is no such scene.

@@ -24,7 +24,8 @@ from symbolic.robot.arm import (
 
 
 def held_model(robot: Robot) -> tuple[pin.Model, list[int], Array]:
-    """The model of the whole description, the joints that do not move, and where they stand."""
+    """Return the model of the whole description, the joints that do not move, and their
+    positions."""
     urdf = read_urdf(robot.urdf, robot.xacro_arguments, robot.package_dirs)
     moving = moving_joints(urdf, robot.chain_root, robot.flange, robot.locked_joints)
     model = pin.buildModelFromXML(urdf.kinematics)
@@ -132,7 +133,7 @@ class PlainArm:
         return min(q, other, key=lambda found: self.residual(found, target))
 
     def begin(self, start: Array, pose: Array, values: Array) -> Array:
-        """The start posture with its redundant joints moved evenly to where they begin."""
+        """Move the redundant joints of the start posture evenly to their first positions."""
         q, change = start.copy(), np.zeros(len(start))
         change[self.redundant] = (values - start[self.redundant]) / BEGIN_STEPS
         for _ in range(BEGIN_STEPS if self.redundant else 0):

@@ -171,7 +171,7 @@ class _Arm:
 
 
 def _urdf_shape(item: pin.GeometryObject) -> Shape | coal.Capsule:
-    """The shape of a link as Pinocchio read it."""
+    """Convert the shape of a link as Pinocchio read it."""
     shape = item.geometry
     match shape:
         case coal.Box():
@@ -186,7 +186,7 @@ def _urdf_shape(item: pin.GeometryObject) -> Shape | coal.Capsule:
 
 
 def _shrunk_solids(shape: Box | Cylinder | Mesh) -> list[_Solid]:
-    """A payload smaller by the resting tolerance; how a hull shrinks is a fact of its piece."""
+    """Shrink a payload by the resting tolerance; a hull's shrinking follows from its piece."""
     less = 2.0 * RESTING_TOLERANCE
     match shape:
         case Box():

@@ -76,7 +76,7 @@ def natural_quintic(points: Array) -> Array:
 
 
 def evaluate_spline(coefficients: Array, u: float, order: int = 0) -> Array:
-    """Derivative of some order with respect to u in [0, 1] over the whole spline."""
+    """Evaluate a derivative of some order with respect to u in [0, 1] over the whole spline."""
     segments = len(coefficients)
     k = min(int(u * segments), segments - 1)
     value: Array = _powers(u * segments - k, order) @ coefficients[k] * segments**order
@@ -84,7 +84,7 @@ def evaluate_spline(coefficients: Array, u: float, order: int = 0) -> Array:
 
 
 def _powers(s: float, order: int) -> Array:
-    """Derivative of (1, s, ..., s^5)."""
+    """Compute the derivative of (1, s, ..., s^5)."""
     return np.array(
         [
             factorial(p) / factorial(p - order) * s ** (p - order) if p >= order else 0.0
@@ -283,7 +283,8 @@ def _equal_friction(f_n: float, f_t: float, mu: float) -> tuple[Array, Array]:
 
 
 def _small_program(f_n: float, f_t: float, friction: tuple[float, float]) -> tuple[Array, Array]:
-    """The quadratic program in N_1, N_2, t_1, t_2, by trying every set of active constraints."""
+    """Solve the quadratic program in N_1, N_2, t_1, t_2, by trying every set of active
+    constraints."""
     equal = np.array([[1.0, -1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 1.0]])
     # Rows that must not be positive: both friction cones, both normal forces.
     bounds = np.array(
