@@ -6,7 +6,8 @@ ways take turns, the compiled one with batches of a search's size, and a ratio i
 the rounds of the ratio within a round. The plain way is the reference that the tests hold the
 evaluator to (`studies.research.plain`). With collisions the same is measured on candidates of a
 search (`studies.research.turns`). `--study` tells instead where the time of a study goes
-(`studies.research.costs`).
+(`studies.research.costs`). `--beside CELL ...` compares the compiled way of several cells, as of
+primitives and of meshes (`studies.research.side_by_side`).
 
 The cost against the number of samples and of free waypoints is measured on cells derived from the
 given one: same start, goal and robots, the free waypoints spread along the hand-made trajectory.
@@ -14,7 +15,7 @@ given one: same start, goal and robots, the free waypoints spread along the hand
 
 from __future__ import annotations
 
-from studies.options import add, whole
+from studies.options import WORKCELL_FILE, add, whole
 from studies.program import Parser, Program
 
 
@@ -28,6 +29,14 @@ def _add_options(parser: Parser) -> None:
     add(parser, "--json", help="print JSON instead of tables")
     parser.add_argument(
         "--study", action="store_true", help="core-seconds by part of search, polish and timing"
+    )
+    parser.add_argument(
+        "--beside",
+        metavar="CELL",
+        nargs="+",
+        type=WORKCELL_FILE,
+        default=[],
+        help="workcell files to compare it with",
     )
 
 

@@ -34,6 +34,7 @@ from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.front import Front
 from hybrid_opt.polishing.settings import PolishSettings
 from studies.research.plain.candidate import PlainEvaluator, PlainJudge
+from studies.research.side_by_side import compare, table
 from studies.research.turns import (
     POPULATION,
     Evaluate,
@@ -53,9 +54,15 @@ WAYPOINTS = (1, 2, 3, 4, 5, 6, 7, 8)
 
 
 def benchmark_cell(options: argparse.Namespace) -> int:
-    """Measure the cell or the study that the options ask for; returns the exit code."""
+    """Measure the cell, cells or study that the options ask for; returns the exit code."""
     if options.study:
         print(study_table(profile_study(_workcell(options.workcell), options.seed)))
+        return 0
+    if options.beside:
+        workcells = [_workcell(path) for path in (options.workcell, *options.beside)]
+        cells = [Cell(workcell, threads=1) for workcell in workcells]
+        rows = compare(cells, options.candidates, options.repeats, options.seed)
+        print(json.dumps(rows, indent=2) if options.json else table(rows))
         return 0
     result = benchmark(
         _workcell(options.workcell), options.candidates, options.repeats, options.seed

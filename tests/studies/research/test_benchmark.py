@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from studies.research import benchmark, costs, turns
+from studies.research import benchmark, costs, side_by_side, turns
 from studies.research.costs import report
 from studies.research.turns import SLICE, Evaluate, interleaved, summary
 from symbolic.array import Array
@@ -82,6 +82,24 @@ def test_derived_tasks_keep_the_ends_and_stay_on_the_trajectory(count: int) -> N
     np.testing.assert_allclose(middle, derived.initial.reshape(-1), atol=1e-15)
     if count == len(task.initial):
         np.testing.assert_allclose(derived.initial, task.initial, atol=1e-15)
+
+
+@pytest.mark.slow
+def test_compares_cells(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The pandas are meshes; a ratio is that of the times."""
+    monkeypatch.setattr(side_by_side, "EVALUATIONS", 60)
+    pandas = str(RACK.with_name("pandas.toml"))
+    arguments = [str(RACK), "--beside", pandas, "--json", "--candidates", "2", "--repeats", "2"]
+    assert benchmark.main(arguments) == 0
+    rack, other = json.loads(capsys.readouterr().out)
+    assert (rack["near"], rack["random"], rack["search"], rack["hulls"]) == (1.0, 1.0, 1.0, 0)
+    assert other["hulls"] > 10
+    for what in ("near", "random"):
+        assert other[what] == pytest.approx(other[f"{what}_ms"] / rack[f"{what}_ms"], rel=0.5)
+        assert other[what] < 4.0
+    assert other["search"] == other["search_s"] / rack["search_s"]
 
 
 @pytest.mark.slow

@@ -1,0 +1,103 @@
+"""Cells side by side: what a candidate and a drivable search cost with primitives and with meshes.
+
+The compiled evaluations of all cells take turns, so that a ratio holds on a busy machine.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from hybrid_opt.api import search
+from hybrid_opt.cell import Cell
+from hybrid_opt.display.table import number, text_table
+from studies.research.turns import POPULATION, Evaluate, interleaved, progress
+from symbolic.array import Array
+from symbolic.geometry.pieces import Hull
+
+SPREAD = 0.02
+"""Standard deviation of candidates near the hand-made path, as a share of the bounds' width."""
+
+EVALUATIONS = 400
+"""Evaluations of a drivable search."""
+
+
+def compare(
+    cells: Sequence[Cell], batches: int, repeats: int, seed: int = 0
+) -> list[dict[str, Any]]:
+    """Measure the compiled evaluation of cells, collisions included, in the thread's own time.
+
+    Args:
+        batches: of a search's population, near the hand-made path and random, for each cell.
+        repeats: rounds with each batch.
+        seed: of the candidates and of the searches.
+
+    Returns:
+        For each cell its numbers of bodies, pieces, hulls and pairs; milliseconds per candidate
+        'near_ms' and 'random_ms', means over the rounds; core-seconds 'search_s' of a drivable
+        search; and means of the ratios to the first cell, 'near', 'random' and 'search'.
+    """
+    rows: list[dict[str, Any]] = [_contents(cell) for cell in cells]
+    for what in ("near", "random"):
+        progress(f"{batches * repeats} rounds of {what} candidates")
+        rng = np.random.default_rng(seed)
+        ways: dict[str, Evaluate] = {str(k): cell.evaluate for k, cell in enumerate(cells)}
+        x = {str(k): _candidates(cell, what, batches, rng) for k, cell in enumerate(cells)}
+        times = interleaved(ways, x, repeats)
+        for k, row in enumerate(rows):
+            row[f"{what}_ms"] = float(1e3 * np.mean(times[str(k)]) / POPULATION)
+            row[what] = float(np.mean(times[str(k)] / times["0"]))
+    for cell, row in zip(cells, rows, strict=True):
+        progress(f"{row['cell']}: a drivable search")
+        row["search_s"] = _search_seconds(cell, seed)
+        row["search"] = row["search_s"] / rows[0]["search_s"]
+    return rows
+
+
+def _contents(cell: Cell) -> dict[str, Any]:
+    pieces = [piece for body in cell.geometry.bodies for piece in body.pieces]
+    return {
+        "cell": cell.workcell.name,
+        "bodies": len(cell.geometry.bodies),
+        "pieces": len(pieces),
+        "hulls": sum(isinstance(piece.shape, Hull) for piece in pieces),
+        "pairs": len(cell.geometry.active),
+    }
+
+
+def _candidates(cell: Cell, what: str, batches: int, rng: np.random.Generator) -> Array:
+    """Candidates (batches, population, n_var)."""
+    size = (batches, POPULATION, cell.n_var)
+    if what == "random":
+        return rng.uniform(cell.lower, cell.upper, size)
+    steps = SPREAD * (cell.upper - cell.lower) * rng.standard_normal(size)
+    return np.clip(cell.initial + steps, cell.lower, cell.upper)
+
+
+def _search_seconds(cell: Cell, seed: int) -> float:
+    """Core-seconds of a drivable search whose functions are compiled already."""
+    drivable = cell.drivable()
+    drivable.evaluate(drivable.initial)
+    start = time.process_time()
+    search(drivable, "nsga2", evaluations=EVALUATIONS, rng=np.random.default_rng(seed))
+    return time.process_time() - start
+
+
+def table(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Format the figures of `compare`."""
+    counts = ("bodies", "pieces", "hulls", "pairs")
+    costs = (("near_ms", "near"), ("random_ms", "random"), ("search_s", "search"))
+    head = ("cell", *counts, "near, ms", "over", "random, ms", "over", "search, core-s", "over")
+    lines: list[Sequence[str]] = [head]
+    for row in rows:
+        figures = [
+            text for cost, ratio in costs for text in (number(row[cost], 3), number(row[ratio], 2))
+        ]
+        lines.append((row["cell"], *(str(row[count]) for count in counts), *figures))
+    return (
+        "a candidate near the hand-made path, a random one, a drivable search of "
+        f"{EVALUATIONS}; each over the first cell's\n{text_table(lines)}"
+    )
