@@ -1,0 +1,166 @@
+"""First carries for the problems that ship, and what comes of them.
+
+Twelve problems of two UR5, UR10, Panda or xArm7: flat, over a wall, past a post, into and off a
+shelf, out of a bin, turned, pitched, turned over. Each is proposed from nothing with every seed;
+with --recommend a drivable search, a polish and a recommendation follow, which compile.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from importlib.resources import files
+from pathlib import Path
+from statistics import median
+from typing import TYPE_CHECKING
+
+from studies.options import INPUT_FILE, add, stated, whole
+from studies.program import FAULT, Parser, Program
+
+if TYPE_CHECKING:
+    import hybrid_opt as ho
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """One proposal.
+
+    Attributes:
+        problem, seed: what was asked for.
+        problem_met: why there is no carry, '' where there is one.
+        certified: core-seconds to the first certified carry, imports left out.
+        seconds: core-seconds of the whole proposal.
+        length: how far all joints go together [rad].
+        passes: what it passes, on which side.
+        duration: of the recommended carry [s].
+        force: to command, the larger of both arms [N].
+        allowed: whether that force is within the reference force in every case.
+    """
+
+    problem: str
+    seed: int
+    problem_met: str = ""
+    certified: float | None = None
+    seconds: float | None = None
+    length: float | None = None
+    passes: str = ""
+    duration: float | None = None
+    force: float | None = None
+    allowed: bool | None = None
+
+
+def shipped_problems() -> list[Path]:
+    """Return the problem files of `studies/problems`."""
+    return sorted(Path(str(files("studies"))).joinpath("problems").glob("*.toml"))
+
+
+def attempt(path: Path, seed: int, seconds: float, evaluations: int) -> Attempt:
+    """Propose a carry for a problem, and recommend one where a search gets evaluations."""
+    import numpy as np
+
+    import hybrid_opt as ho
+
+    try:
+        found = ho.propose(
+            path,
+            rng=np.random.default_rng(seed),
+            settings=ho.ProposeSettings(seconds=seconds),
+        )
+    except ho.DualArmError as error:
+        return Attempt(path.stem, seed, str(error).removeprefix(f"{path}: "))
+    known = Attempt(path.stem, seed, "", found.certified, found.seconds, found.length, found.passes)
+    if not evaluations:
+        return known
+    best = _recommended(found, seed, evaluations)
+    return Attempt(
+        **asdict(known)
+        | {
+            "duration": best.duration,
+            "force": float(best.commanded.max()),
+            "allowed": best.fits,
+        }
+    )
+
+
+def _recommended(found: ho.Proposal, seed: int, evaluations: int) -> ho.Recommendation:
+    from tempfile import TemporaryDirectory
+
+    import numpy as np
+
+    import hybrid_opt as ho
+
+    rng = np.random.default_rng(seed)
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "cell.toml"
+        path.write_text(found.text(path.parent), encoding="utf-8")
+        cell = ho.Cell.load(path).drivable()
+        front = ho.polish(ho.search(cell, "nsga2", evaluations=evaluations, rng=rng), rng=rng)
+        return ho.recommend(front)
+
+
+def _lines(tried: list[Attempt]) -> Iterator[str]:
+    from hybrid_opt.display.table import number, text_table
+
+    head = ("problem", "seed", "certified [s]", "all [s]", "way [rad]", "lasts [s]", "N", "")
+    rows: list[tuple[str, ...]] = [head]
+    for one in tried:
+        figures = (one.certified, one.seconds, one.length, one.duration, one.force)
+        note = one.problem_met or one.passes
+        if one.allowed is False:
+            note += ", beyond the reference force"
+        rows.append((one.problem, str(one.seed), *map(number, figures), note))
+    yield text_table(rows, left=(0, len(head) - 1))
+    certified = [one.certified for one in tried if one.certified is not None]
+    yield f"{len(certified)} of {len(tried)} found" + (
+        f"; first carry after {median(certified):.1f} s of work in the median" if certified else ""
+    )
+
+
+def _add_options(parser: Parser) -> None:
+    parser.add_argument(
+        "problems",
+        nargs="*",
+        metavar="PROBLEM",
+        type=INPUT_FILE,
+        help="problem files (default: those that ship)",
+    )
+    parser.add_argument(
+        "--seeds", type=whole(1, 1000), default=3, metavar="N", help="seeds 1 to N of each"
+    )
+    add(
+        parser,
+        "--time",
+        default=stated("hybrid_opt.proposing.proposal.ProposeSettings.seconds"),
+        help="seconds of work for each proposal",
+    )
+    parser.add_argument(
+        "--recommend",
+        type=whole(10, 10**6),
+        default=0,
+        metavar="N",
+        help="search N drivable carries around each proposal, polish, and recommend one",
+    )
+    add(parser, "--json")
+
+
+def _run(options: argparse.Namespace) -> int:
+    paths = [Path(path) for path in options.problems] or shipped_problems()
+    tried = [
+        attempt(path, seed, options.time, options.recommend)
+        for path in paths
+        for seed in range(1, options.seeds + 1)
+    ]
+    if options.json:
+        print(json.dumps([asdict(one) for one in tried], indent=1))
+    else:
+        print("\n".join(_lines(tried)))
+    return FAULT if any(one.problem_met for one in tried) else 0
+
+
+main = Program("research.problems", __doc__, _add_options, _run)
+
+
+if __name__ == "__main__":
+    main.start()
