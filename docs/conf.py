@@ -148,14 +148,14 @@ def api() -> Path:
 
 
 def command_line() -> Path:
-    """Write a page with the `--help` of every program."""
+    """Return a page with what `--help-all` prints of every program."""
     os.environ["COLUMNS"] = "86"
     title = "Command line"
-    parts = [f"{title}\n{'=' * len(title)}\n", f"What ``{COMMAND} NAME --help`` prints.\n"]
+    parts = [f"{title}\n{'=' * len(title)}\n", f"What ``{COMMAND} NAME --help-all`` prints.\n"]
     for name, (module, _) in programs().items():
         shown = io.StringIO()
         with redirect_stdout(shown), suppress(SystemExit):
-            import_module(module).main(["--help"], f"{COMMAND} {name}")
+            import_module(module).main(["--help-all"], f"{COMMAND} {name}")
         text = "\n".join(f"   {line}".rstrip() for line in shown.getvalue().splitlines())
         parts.append(f"{name}\n{'-' * len(name)}\n\n.. code-block:: text\n\n{text}\n")
     path = ROOT / "docs" / "reference" / "command-line.rst"

@@ -6,10 +6,9 @@ and writes it as one bundle with a manifest, in a folder of its own below DIR.
 
 from __future__ import annotations
 
-import argparse
 from pathlib import Path
 
-from studies.options import add, require_extra, stated
+from studies.options import WORKCELL_FILE, add, stated
 from studies.program import Parser, Program
 
 TIMINGS = ("closest", "fastest", "force")
@@ -19,9 +18,9 @@ def _add_options(parser: Parser) -> None:
     add(parser, "FILE")
     parser.add_argument(
         "--target",
-        metavar="{" + ",".join(stated("hybrid_opt.bundles.bundle.TARGETS")) + "}",
+        metavar="NAME",
         required=True,
-        help="what is to run it",
+        help=f"what is to run it: {', '.join(stated('hybrid_opt.bundles.bundle.TARGETS'))}",
     )
     add(
         parser,
@@ -80,6 +79,14 @@ def _add_options(parser: Parser) -> None:
         "(default: what the target leaves to chance, 0 where one clock drives both arms)",
     )
     parser.add_argument(
+        "--driver",
+        type=WORKCELL_FILE,
+        metavar="FILE",
+        help="take [robots.driver] and [robots.tool_load] from the [[robots]] of this file, by "
+        "their names, in place of those of the stored cell: the workcell file, or one with these "
+        "alone (default: those of the stored cell)",
+    )
+    parser.add_argument(
         "--address",
         nargs=2,
         metavar=("HOST", "HOST"),
@@ -93,13 +100,12 @@ def _add_options(parser: Parser) -> None:
     )
 
 
-def _complete(options: argparse.Namespace) -> None:
-    if options.target == "mcap":
-        require_extra("ros", "a bundle for mcap")
-
-
 main = Program(
-    "export", __doc__, _add_options, "studies.programs.trajectory.export_file", complete=_complete
+    "export",
+    __doc__,
+    _add_options,
+    "studies.programs.trajectory.export_file",
+    further=("--use", "--planned-limit", "--squeeze", "--smoothing", "--step", "--any-arm"),
 )
 
 

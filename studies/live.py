@@ -27,18 +27,23 @@ def _add_options(parser: Parser) -> None:
 
 
 def serve(options: argparse.Namespace) -> int:
-    """Serve a cell until Ctrl-C; returns the exit code.
+    """Serve a cell until Ctrl-C, opened with a carry within the reference force where there is one.
+
+    Returns:
+        The exit code.
 
     Raises:
         DualArmError: the cell has no drivable form, or viser is missing.
     """
     from hybrid_opt.campaign.stages import build_study
     from hybrid_opt.progress import Progress
+    from hybrid_opt.recommending.choice import gentle_start
 
     workcell = load_workcell(options.workcell)
     cell = ho.Cell(workcell)
-    build_study(cell.drivable(), Progress(), polish=False)
-    page = ho.live(cell, port=options.port)
+    drivable = cell.drivable()
+    build_study(drivable, Progress(), polish=False)
+    page = ho.live(cell, port=options.port, x=gentle_start(drivable))
     print(f"Open {page.url} in a browser; Ctrl-C ends it.", file=sys.stderr)
     try:
         threading.Event().wait()

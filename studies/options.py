@@ -270,11 +270,19 @@ _SHARED: dict[str, dict[str, Any]] = {
         "help": "the arm that keeps its place",
     },
     "--output": {"type": OUTPUT_FOLDER},
+    "--paper": {
+        "action": "store_true",
+        "help": "also draw the paper's pictures, and show the carries of its search on the page",
+    },
     "--quiet": {
         "action": "store_true",
         "help": "no progress on standard error (default: shown)",
     },
     "--seed": {"type": seed, "default": 1, "metavar": "N", "help": "of the randomness"},
+    "--target": {
+        "metavar": "NAME",
+        "help": "state first what the cell lacks for this target of an export",
+    },
     "--time": {"type": number(1.0, 1e6), "metavar": "S"},
 }
 
@@ -292,26 +300,24 @@ def add(parser: argparse._ActionsContainer, *names: str, **own: Any) -> None:
 
 
 def add_wishes(parser: argparse._ActionsContainer) -> None:
-    """Add the targets of a recommendation; `Wish` takes them."""
+    """Add the wishes for a recommended carry, as `Wish` takes them."""
     parser.add_argument(
         "--duration",
         type=force,
         metavar="S",
-        help="recommend the least force of the carries of at most S seconds (default: the least "
-        "product of duration and commanded force)",
+        help="recommend the least force of all carries of at most S seconds (default: the least "
+        "product of both)",
     )
     add(
         parser,
         "--force-limit",
-        help="recommend the shortest carry that needs at most N newtons commanded (default: the "
-        "least product of duration and commanded force)",
+        help="recommend the shortest carry that needs at most N newtons commanded (default: none)",
     )
     parser.add_argument(
         "--payload",
         type=force,
         metavar="KG",
-        help="recommend for a box of KG kilograms: forces, timing and job are those that it takes "
-        "(default: the mass of the workcell)",
+        help="recommend for a box of KG kilograms (default: the mass of the workcell)",
     )
 
 

@@ -15,6 +15,7 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass
 from importlib import import_module
 from pathlib import Path
+from textwrap import wrap
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from studies.options import PathType, check_paths
@@ -44,6 +45,13 @@ class _Help(argparse.HelpFormatter):
             return super()._get_default_metavar_for_optional(action)
         return "N"
 
+    def _split_lines(self, text: str, width: int) -> list[str]:
+        return wrap(" ".join(text.split()), width, break_on_hyphens=False)
+
+    def _fill_text(self, text: str, width: int, indent: str) -> str:
+        lines = self._split_lines(text, width - len(indent))
+        return "\n".join(f"{indent}{line}" for line in lines)
+
     def _get_help_string(self, action: argparse.Action) -> str:
         # Python 3.11 and 3.12 write the default of --x and --no-x themselves.
         told = (action.help or "").removesuffix(" (default: %(default)s)")
@@ -64,11 +72,53 @@ class _Help(argparse.HelpFormatter):
 class Parser(argparse.ArgumentParser):
     """A parser that says in one line what is wrong with a command, and what may be meant."""
 
-    def __init__(self, *, prog: str, description: str | None) -> None:
-        """Options are not abbreviated; `--help` tells their defaults."""
+    def __init__(self, *, prog: str, description: str | None, further: Sequence[str] = ()) -> None:
+        """Do not abbreviate options; `--help` states their defaults.
+
+        Args:
+            further: options that `--help` only names and `--help-all` explains.
+        """
         super().__init__(
             prog=prog, description=description, allow_abbrev=False, formatter_class=_Help
         )
+        self._further = tuple(further)
+        told = "explain every option and end" if further else argparse.SUPPRESS
+        self.add_argument("--help-all", action=_HelpAll, help=told)
+
+    def format_usage(self) -> str:
+        """Return the required arguments; the help has the others."""
+        formatter = self._get_formatter()
+        words = [
+            " ".join([*action.option_strings[:1], str(action.metavar or action.dest.upper())])
+            for action in self._actions
+            if action.required
+        ]
+        formatter.add_usage(f"%(prog)s [options] {' '.join(words)}".rstrip(), (), ())
+        return formatter.format_help()
+
+    def format_help(self) -> str:
+        """Return the help of the options that most users need."""
+        return self._help(self._further)
+
+    def format_whole_help(self) -> str:
+        """Return the help of all options."""
+        return self._help(())
+
+    def _help(self, hidden: Sequence[str]) -> str:
+        formatter = self._get_formatter()
+        formatter.add_text(self.description)
+        for group in self._action_groups:
+            formatter.start_section(group.title)
+            formatter.add_text(group.description)
+            formatter.add_arguments(
+                action
+                for action in group._group_actions
+                if not set(action.option_strings) & set(hidden)
+            )
+            formatter.end_section()
+        if hidden:
+            formatter.add_text(f"Further options, explained by --help-all: {', '.join(hidden)}")
+        return f"{self.format_usage()}\n{formatter.format_help()}"
 
     def error(self, message: str) -> NoReturn:
         """Print the message and end the program with code 2."""
@@ -82,11 +132,25 @@ class Parser(argparse.ArgumentParser):
         self.exit(BAD_INPUT, f"{self.prog}: {message}{''.join(meant)}; see --help\n")
 
 
+class _HelpAll(argparse.Action):
+    """Explains every option."""
+
+    def __init__(self, option_strings: Sequence[str], dest: str, help: str) -> None:
+        nothing = argparse.SUPPRESS
+        super().__init__(option_strings, nothing, nargs=0, default=nothing, help=help)
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
+        assert isinstance(parser, Parser), "only such parsers have the option"
+        print(parser.format_whole_help())
+        parser.exit()
+
+
 class _Version(argparse.Action):
     """Looks the version up only where it is asked for."""
 
     def __init__(self, option_strings: Sequence[str], dest: str, help: str) -> None:
-        super().__init__(option_strings, argparse.SUPPRESS, nargs=0, help=help)
+        nothing = argparse.SUPPRESS
+        super().__init__(option_strings, nothing, nargs=0, default=nothing, help=help)
 
     def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
         print_version()
@@ -117,6 +181,7 @@ class Program:
         interrupted: what to say after Ctrl-C.
         complete: fills in places that follow from other options and requires the extras that the
             options need; called before paths are checked.
+        further: options that only `--help-all` explains.
     """
 
     name: str
@@ -125,6 +190,7 @@ class Program:
     run: Callable[[argparse.Namespace], int] | str
     interrupted: str = "interrupted"
     complete: Callable[[argparse.Namespace], None] = lambda options: None
+    further: tuple[str, ...] = ()
 
     @property
     def module(self) -> str:
@@ -132,15 +198,15 @@ class Program:
         return f"studies.{self.name}"
 
     def parser(self, called: str = "") -> Parser:
-        """Build the parser of its options; `called` is the program's name in it, '' for `python
-        -m`."""
-        parser = Parser(prog=called or f"python -m {self.module}", description=self.description)
+        """Return the parser of its options; `called` says how, '' for `python -m`."""
+        prog = called or f"python -m {self.module}"
+        parser = Parser(prog=prog, description=self.description, further=self.further)
         self.add_options(parser)
         parser.add_argument("--version", action=_Version, help="print the version and end")
         parser.add_argument(
             VERBOSE,
             action="store_true",
-            help="also show what the libraries warn of (default: only this project's own warnings)",
+            help="also show warnings of the libraries",
         )
         return parser
 

@@ -9,6 +9,7 @@ search can start with.
 from __future__ import annotations
 
 import argparse
+import shlex
 import sys
 from collections.abc import Callable
 
@@ -73,6 +74,7 @@ def _add_options(parser: Parser) -> None:
         default=stated("hybrid_opt.proposing.proposal.ProposeSettings.seconds"),
         help="seconds that it may work, its start included, whatever else the machine does",
     )
+    add(parser, "--target")
     add(parser, "--seed", help="of its randomness")
     add(parser, "--quiet", help="do not say what is being done")
 
@@ -81,11 +83,15 @@ def _run(options: argparse.Namespace) -> int:
     import numpy as np
 
     import hybrid_opt as ho
+    from hybrid_opt.bundles.bundle import missing_text
+    from hybrid_opt.proposing.problem import read_problem
     from hybrid_opt.proposing.proposal import worked
     from hybrid_opt.robust.budget import budget_text
     from hybrid_opt.store.files import AGAIN, write_atomically
 
     problem, output = options.problem, options.output
+    if options.target is not None:
+        print(missing_text(options.target, read_problem(problem).workcell({})), flush=True)
     own = sys.argv[-len(options.arguments) :] == options.arguments
     begun = 0.0 if own else worked()  # of a process of its own imports count
     tell = (lambda text: None) if options.quiet else _teller(lambda: worked() - begun)
@@ -117,7 +123,15 @@ def _run(options: argparse.Namespace) -> int:
         assert grip.cell.workcell.text is not None, "it was read from a file"
         write_atomically(output, grip.cell.workcell.text, AGAIN)
         print(f"{output}: {grip}")
+    print(f"next: {_next_command(options)}")
     return 0
+
+
+def _next_command(options: argparse.Namespace) -> str:
+    """Return the command that makes a study of the proposed cell."""
+    target = [] if options.target is None else ["--target", options.target]
+    words = ["python", "-m", "studies.run", str(options.output), "--quick", *target]
+    return shlex.join(words)
 
 
 def _teller(worked: Callable[[], float]) -> Callable[[str], None]:

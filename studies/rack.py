@@ -7,7 +7,7 @@ from functools import partial
 from importlib.resources import as_file, files
 
 from studies.program import Program
-from studies.run import DESCRIPTION, add_options, complete, study_of
+from studies.run import DESCRIPTION, FURTHER, add_options, complete, study_of
 
 
 def _run(options: argparse.Namespace) -> int:
@@ -21,6 +21,7 @@ main = Program(
     partial(add_options, output="results/rack"),
     _run,
     complete=partial(complete, name="rack"),
+    further=FURTHER,
 )
 
 

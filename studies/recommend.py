@@ -54,7 +54,8 @@ def _run(options: argparse.Namespace) -> int:
     from hybrid_opt.campaign.results import read_campaign
     from hybrid_opt.progress import Progress
     from hybrid_opt.recommending.choice import Wish
-    from studies.study.recommendation import recommend_from, recommendation_text
+    from studies.study.answer import answer
+    from studies.study.recommendation import recommend_from
 
     root, doubt = options.results, None
     if options.uncertainty is not None:
@@ -64,7 +65,7 @@ def _run(options: argparse.Namespace) -> int:
         options.duration, options.force_limit, options.payload, options.reference_force, doubt
     )
     found = recommend_from(root, wish, options.output, Progress(not options.quiet))
-    print(recommendation_text(found, str(root)).terminal())
+    print(answer(found, str(root)).terminal())
     return 0
 
 

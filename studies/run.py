@@ -37,6 +37,28 @@ KNOWN: tuple[str, ...] = stated("hybrid_opt.metaheuristics.registry.REGISTRY")
 
 DEFAULT_ALGORITHMS = "hybrid_opt.campaign.settings.ALGORITHMS"
 
+FURTHER = (
+    "--algorithm",
+    "--population",
+    "--objective",
+    "--first-generation",
+    "--constraint-handling",
+    "--polish",
+    "--polish-attempts",
+    "--polish-solver",
+    "--drivable",
+    "--drivable-replicas",
+    "--simulate",
+    "--report",
+    "--executor",
+    "--scheduler",
+    "--quiet",
+    "--animation",
+    "--view",
+    "--port",
+)
+"""Options of a study that `--help` only names."""
+
 WORKERS_LOAD = (
     "hybrid_opt.campaign.polish_stage",
     "studies.study.recommendation",
@@ -56,15 +78,13 @@ def add_options(parser: Parser, output: str) -> None:
         "--quick",
         action="store_true",
         help=f"a small but complete study: {QUICK_REPLICAS} replicas of {QUICK_EVALUATIONS} "
-        "evaluations where no other numbers are given, polished to a third as many points in fewer "
-        "attempts, its pictures as PNG only",
+        "evaluations where no other numbers are given, a shorter polish, pictures as PNG only",
     )
     search.add_argument(
         "--recommend-only",
         action="store_true",
-        help="only what the carry to run needs: the drivable search, one replica of one algorithm "
-        "where no other numbers are given, its polish and the recommendation; no experiment of the "
-        "paper, no pictures",
+        help="only the carry to run: one drivable search, its polish and the recommendation; no "
+        "experiment of the paper, no page",
     )
     search.add_argument(
         "--evaluations",
@@ -121,7 +141,7 @@ def add_options(parser: Parser, output: str) -> None:
         "--seed",
         type=int,
         default=_stated("seed"),
-        help="the same seed gives the same results to the bit",
+        help="the same seed gives the same results",
     )
     after = parser.add_argument_group("after the search (decides what is made of the results)")
     after.add_argument(
@@ -161,6 +181,7 @@ def add_options(parser: Parser, output: str) -> None:
         f"{stated('hybrid_opt.campaign.stages.DRIVABLE_REPLICAS')})",
     )
     add_wishes(after)
+    add(after, "--target")
     after.add_argument(
         "--simulate",
         action="store_true",
@@ -171,8 +192,9 @@ def add_options(parser: Parser, output: str) -> None:
         "--report",
         action=argparse.BooleanOptionalAction,
         default=True,
-        help="write pictures, tables and report.html",
+        help="write report.html, the pictures of the recommended carry, and all tables",
     )
+    add(after, "--paper")
     work = parser.add_argument_group("work (does not change the results)")
     add(
         work,
@@ -184,13 +206,12 @@ def add_options(parser: Parser, output: str) -> None:
     work.add_argument(
         "--resume",
         action="store_true",
-        help="continue what the results folder holds (default: refuse to touch it)",
+        help="continue what the results folder holds",
     )
     work.add_argument(
         "--overwrite",
         action="store_true",
-        help="remove the results that the folder holds and begin anew (default: refuse to touch "
-        "it)",
+        help="remove what the results folder holds and begin anew",
     )
     add(work, "--jobs", type=int)
     work.add_argument(
@@ -259,6 +280,7 @@ main = Program(
     _add_options,
     lambda options: study_of(options.workcell, options),
     complete=lambda options: complete(options, options.workcell.stem),
+    further=FURTHER,
 )
 
 

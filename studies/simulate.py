@@ -88,6 +88,7 @@ main = Program(
     _add_options,
     "studies.programs.simulation.simulate_file",
     complete=lambda options: require_extra("sim", "a simulation"),
+    further=("--tracking-error", "--stiffness", "--time-step", "--sweep"),
 )
 
 

@@ -76,7 +76,7 @@ def commands(text: str) -> list[tuple[str, list[str]]]:
 @cache
 def help_of(module: str) -> str:
     finished = subprocess.run(
-        [sys.executable, "-m", module, "--help"],
+        [sys.executable, "-m", module, "--help-all" if module.startswith("studies.") else "--help"],
         capture_output=True,
         text=True,
         timeout=HANGS,

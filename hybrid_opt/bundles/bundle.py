@@ -12,12 +12,13 @@ import shutil
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from hybrid_opt.bundles.arms import ABB, SEVEN, SIX, UR, addressed, require_arms
 from hybrid_opt.bundles.data import data_files
-from hybrid_opt.bundles.egm import egm_files, require_egm
+from hybrid_opt.bundles.egm import SECTION_OF_EACH, egm_files, require_egm
 from hybrid_opt.bundles.job_file import (
     BundleOptions,
     Contents,
@@ -137,6 +138,8 @@ class Target:
         axes: numbers of turning joints that a maker's targets can hold.
         has_address: whether it has to know where the controllers are.
         require: refuses a job before it is sampled, for further reasons.
+        require_equipment: refuses a cell whose drivers lack something, given the index of the
+            leading arm.
         stiffness: where that of the arms comes from: 'stated' by the cell, required; 'gains' that
             the bundle writes; '' if the target does not depend on it.
     """
@@ -152,6 +155,7 @@ class Target:
     axes: tuple[int, ...] = (SIX,)
     has_address: bool = False
     require: Callable[[Job], None] = lambda job: None
+    require_equipment: Callable[[Workcell, int], None] = lambda workcell, leader: None
     stiffness: str = ""
 
     def refuse(self, job: Job, name: str, any_arm: bool) -> None:
@@ -166,6 +170,7 @@ class Target:
         if self.maker:
             needs = (self.maker, self.axes, self.has_address)
             require_arms(job.workcell, name, *needs, any_arm=any_arm)
+        self.require_equipment(job.workcell, job.squeeze.leader)
         self.require(job)
 
     def stiffness_of(self, job: Job, name: str) -> float | None:
@@ -178,19 +183,26 @@ class Target:
         """
         if self.stiffness == "gains":
             return pad_stiffness(job)
-        first, second = (robot.driver.stiffness for robot in job.workcell.robots)
+        return self.stated_stiffness(job.workcell, name)
+
+    def stated_stiffness(self, workcell: Workcell, name: str) -> float | None:
+        """Return the stiffness that a cell states; None if nothing depends on it.
+
+        Raises:
+            SettingsError: the target depends on it, and nobody has measured it.
+        """
+        first, second = (robot.driver.stiffness for robot in workcell.robots)
         if first is not None and second is not None:
             return 2.0 / (1.0 / first + 1.0 / second)
         if self.stiffness != "stated":
             return None
-        unknown = next(r.name for r in job.workcell.robots if r.driver.stiffness is None)
+        unknown = next(r.name for r in workcell.robots if r.driver.stiffness is None)
         raise SettingsError(
             f"{name} presses as hard as the stiffness of {unknown!r} at its pad makes it, and "
             "nobody states that. Measure it: press both pads against one another, move one by 0.1 "
             "mm a step along the normal and read the force; equal arms have twice its slope. "
-            "Then write [robots.driver] with stiffness = ... in N/m into the workcell's section of "
-            "each robot before the study, because a stored trajectory keeps its cell, or export "
-            "with --stiffness"
+            f"Then write [robots.driver] with stiffness = ... in N/m into {SECTION_OF_EACH}, or "
+            "export with --stiffness"
         )
 
 
@@ -288,6 +300,52 @@ def manifest(
     }
 
 
+def readme(document: Mapping[str, Any], contents: Contents) -> str:
+    """Return the first file that a person opens: what a bundle is, how it runs, who stops it."""
+    squeeze, machine = document["squeeze"], document["machine"]
+    phases = [
+        f"| {phase['name'].replace('_', ' ')} | {phase['begin']:.2f} | {phase['duration']:.2f} | "
+        f"{max(phase['peak_normal_force']):.1f} |"
+        for phase in document["phases"]
+    ]
+    runs = [] if not machine["carried_out_by"] else ["", "## What stops it", ""]
+    if runs:
+        runs += [f"{machine['carried_out_by']}. It stops both arms when", ""]
+        runs += [f"- {reason}" for reason in machine["stops_when"]]
+    warned = [f"- {warning}" for warning in document["warnings"]]
+    return "\n".join(
+        [
+            f"# {document['name']} for {document['target']}",
+            "",
+            f"The whole job of *{document['workcell']['name']}*: {document['duration']:.2f} s, "
+            f"pressed with at most {squeeze['force']:.1f} N. {squeeze['force_controlled']} is "
+            "force-controlled. "
+            f"{squeeze['text'][0].upper()}{squeeze['text'][1:]}.",
+            "",
+            "## How to run it",
+            "",
+            f"{document['how_to_run'][0].upper()}{document['how_to_run'][1:]}.",
+            *runs,
+            *(["", "## Read before it runs", "", *warned] if warned else []),
+            "",
+            "## Phases",
+            "",
+            "| phase | begins [s] | takes [s] | presses [N] |",
+            "|---|---|---|---|",
+            *phases,
+            "",
+            "## Files",
+            "",
+            f"- `{MANIFEST}`: all of this for programs, with limits, origin and a digest of every "
+            "file",
+            *(f"- `{name}`" for name in contents),
+            "",
+            f"Written by {document['written_by']}.",
+            "",
+        ]
+    )
+
+
 def warnings_of(job: Job) -> list[str]:
     """Warnings that an engineer should read before this job runs."""
     cell, found = job.workcell, []
@@ -307,12 +365,15 @@ def warnings_of(job: Job) -> list[str]:
     for names, when in zip(job.stands_on, ("before", "after"), strict=True):
         if not names:
             found.append(f"nothing that the cell describes holds the box {when} the carry")
-    found += [
+    return [*found, *_missing_loads(cell)]
+
+
+def _missing_loads(workcell: Workcell) -> list[str]:
+    return [
         f"no tool_load is given for {robot.name}: torques and tool data leave out the pad's mass"
-        for robot in cell.robots
+        for robot in workcell.robots
         if robot.tool_load is None
     ]
-    return found
 
 
 def _position(found: PositionControl) -> dict[str, Any]:
@@ -357,7 +418,7 @@ def _word(text: str) -> str:
     return "-".join(part for part in kept.split("-") if part)[:LONGEST_WORD].strip("-")
 
 
-MANIFEST = "manifest.json"
+MANIFEST, README = "manifest.json", "README.md"
 FORMAT = "dual-arm-carry bundle"
 VERSION = 2
 
@@ -414,7 +475,7 @@ TARGETS: Mapping[str, Target] = {
         ABB,
         (SIX, SEVEN),
         has_address=True,
-        require=require_egm,
+        require_equipment=require_egm,
         stiffness="stated",
     ),
     "ur-script": Target(
@@ -473,6 +534,53 @@ def target_for(name: str, workcell: Workcell) -> Target:
     return TORQUE[driver_of(workcell)] if name == "torque" else TARGETS[name]
 
 
+def missing_for(name: str, workcell: Workcell, leader: int = 0) -> tuple[str, ...]:
+    """List what a cell lacks for a target, before any carry of it is known.
+
+    Args:
+        name: of the target.
+        leader: index of the arm that keeps its place.
+
+    Raises:
+        SettingsError: the target is unknown.
+    """
+    require_target(name)
+    try:
+        found = target_for(name, workcell)
+    except SettingsError as error:
+        return (str(error),)
+    arms = partial(require_arms, workcell, name, found.maker, found.axes)
+    checks: list[Callable[[], object]] = [arms] if found.maker else []
+    checks += [partial(arms, has_address=True)] if found.maker and found.has_address else []
+    checks += [partial(found.require_equipment, workcell, leader)]
+    checks += (
+        [partial(found.stated_stiffness, workcell, name)] if found.stiffness != "gains" else []
+    )
+    problems = list[str]()
+    for check in checks:
+        try:
+            check()
+        except SettingsError as error:
+            problems.append(str(error))
+    return (*dict.fromkeys(problems), *_missing_loads(workcell))
+
+
+def missing_text(name: str, workcell: Workcell) -> str:
+    """State what a cell lacks for a target, for a terminal.
+
+    Raises:
+        SettingsError: the target is unknown.
+    """
+    problems = missing_for(name, workcell)
+    if not problems:
+        return f"{name}: the cell states all that the target needs"
+    listed = "".join(f"\n  - {problem}" for problem in problems)
+    return (
+        f"{name} needs more than the cell states; drivers and tool loads may follow, by export "
+        f"--driver FILE:{listed}"
+    )
+
+
 def targets() -> dict[str, str]:
     """Return the targets of `export`: how to run each, by name."""
     return {name: target.how_to_run for name, target in TARGETS.items()}
@@ -519,8 +627,9 @@ def export(
                 "what a skew does depends on the stiffness of the arms: --stiffness"
             )
         require_skew(whole, skew, sheet.stiffness)
-    contents = found.files(sheet)
     document = manifest(sheet, target, found, origin, skew)
+    contents = found.files(sheet)
+    contents = {README: readme(document, contents), **contents}
     return write_bundle(Path(folder) / document["name"] / target, contents, document)
 
 

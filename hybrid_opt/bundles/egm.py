@@ -21,9 +21,9 @@ from scipy.spatial.transform import Rotation
 from hybrid_opt.bundles.arms import SEVEN, SIX, comment
 from hybrid_opt.bundles.job_file import Export, job_text, pad_jacobians
 from hybrid_opt.bundles.programs import filled, program
-from hybrid_opt.job.records import Job
 from symbolic.array import Array
 from symbolic.errors import SettingsError
+from symbolic.records import Workcell
 
 TASKS = ("T_ROB1", "T_ROB2")
 TWO_ARMED_TASKS = ("T_ROB_L", "T_ROB_R")
@@ -39,24 +39,29 @@ UNKNOWN_TOOL_MASS = 0.1
 """[kg] where the workcell gives no `tool_load`; RAPID wants more than none."""
 
 
-BEFORE_THE_STUDY = "before the study: a stored trajectory keeps the cell that it was found in"
-"""Where a driver's key may be stated."""
+SECTION_OF_EACH = (
+    "the workcell's section of each robot before the study, or into a file for export --driver"
+)
+"""Where a driver's key may be stated: a stored trajectory keeps the cell that it was found in."""
 
 
-def require_egm(job: Job) -> None:
-    """Refuse a job whose pressing arm has no force sensor, or of arms whose lag nobody states.
+def require_egm(workcell: Workcell, leader: int) -> None:
+    """Refuse a cell whose pressing arm has no force sensor, or with arms whose lag nobody states.
+
+    Args:
+        leader: index of the arm that keeps its place.
 
     Raises:
         SettingsError: with the reason.
     """
-    leader, robots = job.squeeze.leader, job.workcell.robots
+    robots = workcell.robots
     robot, other = robots[1 - leader], robots[leader]
     if not robot.driver.force_control:
         remedy = (
             f"let {other.name!r} press, which has it (--leader {2 - leader})"
             if other.driver.force_control
             else "where it has the option and its sensor, write [robots.driver] with "
-            f"force_control = true into its section of the workcell {BEFORE_THE_STUDY}"
+            f"force_control = true into {SECTION_OF_EACH}"
         )
         raise SettingsError(
             f"abb-egm would not squeeze: positions alone do not press, and {robot.name!r} is not "
@@ -66,8 +71,7 @@ def require_egm(job: Job) -> None:
         if not robot.driver.lag > 0.0:
             raise SettingsError(
                 f"abb-egm compensates the lag of {robot.name!r}, 0.01 to 0.08 s by what others "
-                "measured: write [robots.driver] with lag = ... in seconds into its section of "
-                f"the workcell {BEFORE_THE_STUDY}"
+                f"measured: write [robots.driver] with lag = ... in seconds into {SECTION_OF_EACH}"
             )
 
 

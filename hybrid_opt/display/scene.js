@@ -47,6 +47,9 @@
     }
   }
 
+  /* Where one looks from at first [rad]. */
+  const AZIMUTH = (-152 * Math.PI) / 180, ELEVATION = (24 * Math.PI) / 180;
+
   class CellScene {
     constructor(element, data) {
       this.element = element;
@@ -159,12 +162,28 @@
     }
 
     resetView() {
-      const { centre, radius } = this.data.view;
-      this.target = new THREE.Vector3(...centre);
-      this.distance = 1.2 * radius / Math.tan((this.camera.fov * Math.PI) / 360);
-      this.azimuth = (-152 * Math.PI) / 180;
-      this.elevation = (24 * Math.PI) / 180;
+      const { lower, upper } = this.data.view;
+      this.target = new THREE.Vector3(...lower.map((low, k) => (low + upper[k]) / 2));
+      this.azimuth = AZIMUTH;
+      this.elevation = ELEVATION;
+      this.distance = this.fitted = this.fit();
       this.render();
+    }
+
+    /* The distance from which the box around both arms and the payload fills the picture. */
+    fit() {
+      const { lower, upper } = this.data.view;
+      const flat = Math.cos(ELEVATION), slope = Math.tan((this.camera.fov * Math.PI) / 360);
+      const towards = [flat * Math.cos(AZIMUTH), flat * Math.sin(AZIMUTH), Math.sin(ELEVATION)];
+      const right = [-Math.sin(AZIMUTH), Math.cos(AZIMUTH), 0];
+      const up = [-Math.sin(ELEVATION) * Math.cos(AZIMUTH), -Math.sin(ELEVATION) * Math.sin(AZIMUTH), flat];
+      const along = (axis, v) => axis[0] * v[0] + axis[1] * v[1] + axis[2] * v[2];
+      const needed = [...Array(8).keys()].map((corner) => {
+        const v = lower.map((low, k) => ((corner >> k) & 1 ? 0.5 : -0.5) * (upper[k] - low));
+        const [x, y] = [Math.abs(along(right, v)) / this.camera.aspect, Math.abs(along(up, v))];
+        return along(towards, v) + Math.max(x, y) / slope;
+      });
+      return 1.03 * Math.max(...needed);
     }
 
     resize() {
@@ -173,16 +192,18 @@
       this.renderer.setSize(width, height);
       this.camera.aspect = width / height;
       this.camera.updateProjectionMatrix();
+      const before = this.fitted;
+      this.fitted = this.fit();
+      this.distance *= this.fitted / before;
       this.render();
     }
 
     render() {
-      const reach = this.distance * Math.max(1, 1.25 / Math.max(this.camera.aspect, 0.3));
-      const flat = reach * Math.cos(this.elevation);
+      const flat = this.distance * Math.cos(this.elevation);
       this.camera.position.set(
         this.target.x + flat * Math.cos(this.azimuth),
         this.target.y + flat * Math.sin(this.azimuth),
-        this.target.z + reach * Math.sin(this.elevation));
+        this.target.z + this.distance * Math.sin(this.elevation));
       this.camera.lookAt(this.target);
       this.renderer.render(this.scene, this.camera);
     }

@@ -31,7 +31,7 @@ def scene_data(
     Args:
         marked: names of bodies that are shown in red.
     """
-    points = motion_points(geometry, carry.pose, carry.q)
+    points = motion_points(geometry, carry.pose, carry.q, moving=True)
     lower, upper = points.min(axis=0), points.max(axis=0)
     # How the page reads the last three numbers of a pose; the reference as x y z w.
     orientation = geometry.workcell.task.orientation
@@ -53,10 +53,8 @@ def scene_data(
             for contact in geometry.workcell.contacts
         ],
         "solids": [_solid(solid, solid.name in marked) for solid in cell_solids(geometry)],
-        "view": {
-            "centre": ((lower + upper) / 2.0).tolist(),
-            "radius": float(np.linalg.norm(upper - lower)) / 2.0,
-        },
+        # A box around what moves.
+        "view": {"lower": lower.tolist(), "upper": upper.tolist()},
     }
 
 

@@ -179,7 +179,14 @@ _VIEWED = 12
 """Approximate number of a carry's samples by which the viewpoint of its scene is chosen."""
 
 
-def motion_points(geometry: CellGeometry, pose: Array, q: Array) -> Array:
-    """Compute the points (k, 3) that frame a picture of a whole motion, see `extent_points`."""
+def motion_points(geometry: CellGeometry, pose: Array, q: Array, moving: bool = False) -> Array:
+    """Return points (k, 3) that a picture of a whole motion has to show, see `extent_points`.
+
+    Args:
+        moving: whether only arms and payload count.
+    """
     every = slice(None, None, max(1, len(pose) // _VIEWED))
-    return extent_points(geometry, cell_solids(geometry), pose[every], q[every])
+    solids = cell_solids(geometry)
+    if moving:
+        solids = tuple(solid for solid in solids if solid.frame.kind != "world")
+    return extent_points(geometry, solids, pose[every], q[every])

@@ -48,7 +48,7 @@ LEAST_HEIGHT = 2e-3
 
 @dataclass(frozen=True)
 class Advice:
-    """Effect of one change of the cell or the path.
+    """Effect of one change of the cell or of one via-point, the path kept otherwise.
 
     Attributes:
         change: the quantity, and by how much it changes.

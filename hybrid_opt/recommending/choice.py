@@ -189,6 +189,7 @@ class DrivenPaths:
     Attributes:
         x: (k, n_path) free waypoints.
         highest_force: the largest force limit that is tried [N].
+        robust: whether limits are of forces that hold in every case, not of planned ones.
     """
 
     def __init__(self, cell: Cell, x: Array) -> None:
@@ -196,7 +197,7 @@ class DrivenPaths:
         self.x = np.atleast_2d(np.asarray(x, dtype=float))
         self._model = robust_model(cell.workcell)
         self.highest_force = cell.workcell.task.force_limit[1]
-        self._timer, self._robust = cell.path_timer, cell.force_kind.robust
+        self._timer, self.robust = cell.path_timer, cell.force_kind.robust
         self._known = self._timer.path_limits(self.x)
         self._failures = self._timer.path_errors(self._known)
 
@@ -216,7 +217,7 @@ class DrivenPaths:
         timings = self._timer.time_from_coefficients(
             self.x[chosen],
             known,
-            [TimingLimits(force=limit, robust=self._robust) for limit in limits],
+            [TimingLimits(force=limit, robust=self.robust) for limit in limits],
             [self._failures[row] for row in chosen],
         )
         return list(zip(chosen, limits, timings, strict=True))
@@ -256,7 +257,7 @@ class DrivenPaths:
             told: called `FORCES` times as the work goes on.
         """
         found, limits = self.options(own), []
-        if not self._robust:
+        if not self.robust:
             still = np.array([timing.limited_force for _, _, timing in self._driven(1e-6)])
             least = np.where(np.isfinite(still), still, self.highest_force)
             low = np.minimum((1.0 + LEAST_ABOVE_STILL) * least, self.highest_force)
@@ -319,6 +320,18 @@ def best_of_paths(
                 known += paths.options(between, [option.index] * len(between))
             option = ranked(known, goal)[0]
         yield option
+
+
+def gentle_start(cell: Cell) -> Array:
+    """Return the hand-made carry (n_var,) of a drivable cell with the force limit of its least
+    product of duration and commanded force within the reference forces; where nothing fits, with
+    the force limit that needs least."""
+    paths = DrivenPaths(cell, cell.initial[:-1])
+    options = paths.all_options(float(cell.initial[-1]))
+    best = next(best_of_paths(paths, options, Goal.of(Wish(), cell.workcell), 1), None)
+    if best is None:
+        best = min(options, key=lambda each: each.commanded, default=None)
+    return cell.initial if best is None else np.append(paths.x[0], best.limit)
 
 
 def refuse(options: Sequence[Option], wish: Wish, goal: Goal, budget: GripBudget) -> None:

@@ -17,7 +17,7 @@ from hybrid_opt.carry import Carry
 from hybrid_opt.cell import Cell
 from hybrid_opt.display_protocol import Displayable
 from hybrid_opt.errors import JobError
-from hybrid_opt.evaluate.objectives import PLANNED_FORCE, ForceKind
+from hybrid_opt.evaluate.objectives import ROBUST_FORCE, ForceKind
 from hybrid_opt.front import Front
 from hybrid_opt.job.plan import JobModel, Pressed, pressed
 from hybrid_opt.job.records import Job
@@ -40,9 +40,11 @@ from hybrid_opt.recommending.choice import (
 from hybrid_opt.robust.budget import (
     GripBudget,
     Remedy,
+    Reserve,
     cheapest_remedies,
     grip_budget,
     remedies_text,
+    reserve,
 )
 from hybrid_opt.robust.cases import LEADER
 from hybrid_opt.robust.force import at_rest, box_motion, robust_model, thinned
@@ -92,6 +94,8 @@ class Recommendation(Displayable):
         budget: what holding still takes of the reference forces.
         remedies: where the reference forces do not allow it, the smallest changes of the cell with
             which they do.
+        reserve: how heavy and how slippery the box may be within the reference forces, in every
+            case.
         why: what it was chosen by.
     """
 
@@ -111,6 +115,7 @@ class Recommendation(Displayable):
     required: Array
     budget: GripBudget
     remedies: tuple[Remedy, ...]
+    reserve: Reserve
     why: str
 
     @property
@@ -154,7 +159,9 @@ class Recommendation(Displayable):
             objection = f"N{self.objection[1:]}"
             lines = [objection, f"If you allow {self.required.max():.1f} N: {found}"]
         lines += [f"  {self.why}", f"  {self.squeeze}: {self.squeeze.account}"]
-        lines += [f"  {each}" for each in (*self.rivals, *self.advice)]
+        lines += [f"  within the reference force: {self.reserve}"]
+        lines += [f"  {each}" for each in self.rivals]
+        lines += [f"  on this path, {each}" for each in self.advice]
         return "\n".join(lines + [f"  warning: {text}" for text in self.warnings])
 
 
@@ -229,12 +236,12 @@ def _recommended(
     forces, squeeze, job, doubts = held.forces, held.squeeze, held.job, _doubts(held)
     commanded = np.asarray(forces.max(axis=0)) if job is None else job.peak_normal_force
     allowed, remedies = cell.workcell.task.reference_force, tuple[Remedy, ...]()
-    required = np.maximum(commanded, _largest_felt(cell.workcell, carry))
+    required = np.maximum(commanded, required_forces(cell.workcell, carry))
+    largest = carry.normal_force[:, 1 - LEADER], forces[:, 1 - LEADER]
+    most = box_motion(carry).at(np.union1d(*[np.argsort(-each)[:MOST] for each in largest]))
+    needs = (robust_model(cell.workcell), most, required, allowed)
     if not is_within(required, allowed):
-        largest = carry.normal_force[:, 1 - LEADER], forces[:, 1 - LEADER]
-        most = np.union1d(*[np.argsort(-each)[:MOST] for each in largest])
-        model = robust_model(cell.workcell)
-        remedies = cheapest_remedies(model, box_motion(carry).at(most), required, allowed)
+        remedies = cheapest_remedies(*needs)
     told()
     beside = []
     for label, path in named.items():
@@ -261,6 +268,7 @@ def _recommended(
         required=required,
         budget=budget,
         remedies=remedies,
+        reserve=Reserve(np.nan, np.nan) if alone else reserve(*needs),
         why=why,
     )
 
@@ -285,7 +293,7 @@ def _driven(
             if not timing.ok or timing.carry is None:
                 reason = timing.reason
                 break
-            most = _largest_felt(cell.workcell, timing.carry)
+            most = required_forces(cell.workcell, timing.carry)
             late, hard = timing.duration / goal.longest, float((most / goal.hardest).max())
             found = (option, timing)
             if max(late, hard) <= 1.0 + BETTER:
@@ -302,9 +310,9 @@ def _driven(
     return *min(kept or others, key=lambda each: each[0])[1], bool(kept)
 
 
-def _largest_felt(workcell: Workcell, carry: Carry) -> Array:
-    """Compute the largest forces (2,) [N] in the worst case: commanded of one arm, and exerted on
-    the leading one."""
+def required_forces(workcell: Workcell, carry: Carry) -> Array:
+    """Compute the largest force (2,) [N] of each robot in every case of the uncertainty: commanded
+    of the force-controlled arm, commanded of the leading one or felt by it."""
     doubt, (rows, motion) = workcell.uncertainty, thinned(carry)
     most = largest_commanded(workcell, motion, carry.normal_force[rows], doubt, LEADER)
     felt = robust_model(workcell).hold(motion, doubt, LEADER)[1]
@@ -404,27 +412,40 @@ def level_force(workcell: Workcell, kind: ForceKind) -> float:
     return float(np.max(robust_model(workcell).hold(at_rest(), workcell.uncertainty)))
 
 
-def table_forces(workcell: Workcell, kind: ForceKind = PLANNED_FORCE) -> Array:
-    """Return the force limits (n,) of the table [N] within the force limit's bounds."""
-    forces = level_force(workcell, kind) * np.array(ABOVE_STILL)
-    low, high = workcell.task.force_limit
-    return np.asarray(forces[(forces >= low) & (forces <= high)])
+def table_forces(workcell: Workcell) -> Array:
+    """Return the commanded forces (n,) [N] of the table of durations: some multiples of what holds
+    the payload level and still in every case, and the reference force.
+
+    Raises:
+        SettingsError: the uncertainty leaves no friction or patch.
+    """
+    allowed = float(workcell.task.reference_force[1 - LEADER])
+    forces = level_force(workcell, ROBUST_FORCE) * np.array(ABOVE_STILL)
+    return np.append(forces[forces < allowed], allowed)
 
 
-def front_durations(paths: DrivenPaths, forces: Array) -> Array:
-    """Compute the shortest duration (n,) [s] of any of the paths at each force, infinite for
-    none."""
-    return np.array([paths.durations(float(force)).min(initial=np.inf) for force in forces])
+def commanded_durations(paths: DrivenPaths, limits: Array | float, forces: Array) -> Array:
+    """Compute the shortest duration (n,) [s] of any of the paths with at most each commanded force
+    (n,) [N], limits on jerk left out; infinite where none can be driven.
+
+    Args:
+        limits: (k,) own limit of each path's planned force, or one for all [N].
+    """
+    if not len(paths):
+        return np.full(len(forces), np.inf)
+    if paths.robust:  # the limit is one of what is commanded
+        return np.array([paths.durations(force).min() for force in forces.tolist()])
+    options = paths.all_options(limits)
+
+    def shortest(force: float) -> float:
+        goal = Goal(np.inf, commanded_at_most(force), duration_alone)
+        best = best_of_paths(paths, options, goal, TRIED)
+        return min((option.duration for option in best), default=np.inf)
+
+    return np.array([shortest(force) for force in forces.tolist()])
 
 
 def spread_rows(paths: Array) -> NDArray[np.intp]:
-    """Return the rows of at most `MEMBERS` different paths of a front (k, n), including both
-    ends."""
+    """Return rows of at most `MEMBERS` different ones of a front's paths (k, n), with both ends."""
     different = np.sort(np.unique(paths, axis=0, return_index=True)[1])
     return np.asarray(different[evenly(len(different), MEMBERS)])
-
-
-def over_replicas(durations: Sequence[Array]) -> tuple[Array, Array, Array]:
-    """Compute the median, least and largest (n,) of the replicas' durations at each force."""
-    every = np.array(durations)
-    return np.median(every, axis=0), every.min(axis=0), every.max(axis=0)

@@ -23,7 +23,7 @@ from hybrid_opt.robust.force import (
 from hybrid_opt.robust.squeeze import DOUBTS
 from symbolic.array import Array, Figure, Pair
 from symbolic.errors import SettingsError
-from symbolic.records import Uncertainty, Workcell
+from symbolic.records import Contact, Uncertainty, Workcell
 from symbolic.records.quantities import FRICTION
 
 LISTED = 3
@@ -44,6 +44,12 @@ LEAST_MASS = 1e-3
 ROUNDING = 1e-6
 """Share by which a force may exceed a limit that it meets exactly."""
 
+HEAVIEST = 1e3
+"""Factor up to which a heavier payload is considered."""
+
+LEAST_FRICTION = 0.02
+"""Share of the friction coefficients down to which less friction is considered."""
+
 
 @dataclass(frozen=True)
 class Remedy:
@@ -59,6 +65,25 @@ class Remedy:
 
     def __str__(self) -> str:
         return f"{self.change} ({100.0 * self.share:+.1f} %)"
+
+
+@dataclass(frozen=True)
+class Reserve:
+    """How far payload and friction may be off, each alone, within the reference forces.
+
+    The motion stays as it is and is held in every case of the uncertainty about the changed value;
+    the pads press as hard as that takes.
+
+    Attributes:
+        payload: the largest mass; the inertia grows with it [kg].
+        friction: the least coefficient of the more slippery pad.
+    """
+
+    payload: Figure
+    friction: Figure
+
+    def __str__(self) -> str:
+        return f"a box of up to {self.payload:.1f} kg, or friction down to {self.friction:.2f}"
 
 
 @dataclass(frozen=True)
@@ -174,6 +199,42 @@ def cheapest_remedies(
     Returns:
         The smallest relative changes first.
     """
+    excess = _excess(model, motion, required, allowed)
+    found = [*_stronger(required, allowed), *_of_cell(model.workcell, excess)]
+    return tuple(sorted(found, key=lambda each: abs(each.share))[:most])
+
+
+def reserve(model: RobustModel, motion: HeldMotion, required: Array, allowed: Array) -> Reserve:
+    """Compute the largest payload and the least friction with which forces along a motion fit.
+
+    Args:
+        model, motion, required, allowed: as of `cheapest_remedies`.
+
+    Returns:
+        NaN for what no value within the considered range achieves.
+    """
+    excess, workcell = _excess(model, motion, required, allowed), model.workcell
+    friction = min(pad.friction for pad in workcell.contacts)
+    heavier = _last_factor(lambda f: excess(_with_mass(workcell, f)), LEAST_MASS, HEAVIEST)
+    rougher = FRICTION.high / max(pad.friction for pad in workcell.contacts)
+    smoother = _last_factor(lambda f: excess(_with_friction(workcell, f)), rougher, LEAST_FRICTION)
+    return Reserve(heavier * workcell.payload.mass, smoother * friction)
+
+
+def _last_factor(excess: Callable[[float], float], near: float, far: float) -> float:
+    """Return the factor nearest to `far` without excess, NaN where even `near` has some."""
+    if excess(near) > 0.0:
+        return float("nan")
+    if excess(far) <= 0.0:
+        return far
+    root = float(brentq(excess, near, far, xtol=PRECISION))
+    return root + copysign(PRECISION, near - far)
+
+
+def _excess(
+    model: RobustModel, motion: HeldMotion, required: Array, allowed: Array
+) -> Callable[[Workcell], float]:
+    """Return the excess of a changed cell's forces over what is allowed, as a share of it."""
     known = largest_forces(model, motion)
     rows = model.governing_rows(motion, model.workcell.uncertainty, LEADER)
     # What a command holds beyond its motion, as by smoothing, stays in proportion.
@@ -186,8 +247,22 @@ def cheapest_remedies(
             return UNBOUNDED
         return min(float((scale * force / allowed).max()) - 1.0, UNBOUNDED)
 
-    found = [*_stronger(required, allowed), *_of_cell(model.workcell, excess)]
-    return tuple(sorted(found, key=lambda each: abs(each.share))[:most])
+    return excess
+
+
+def _with_mass(workcell: Workcell, factor: float) -> Workcell:
+    payload = workcell.payload
+    heavier = replace(payload, mass=factor * payload.mass, inertia=factor * payload.inertia)
+    return replace(workcell, payload=heavier)
+
+
+def _with_friction(workcell: Workcell, factor: float) -> Workcell:
+    def changed(pad: Contact) -> Contact:
+        further = tuple(changed(each) for each in pad.further)
+        return replace(pad, friction=factor * pad.friction, further=further)
+
+    first, second = map(changed, workcell.contacts)
+    return replace(workcell, contacts=(first, second))
 
 
 def _stronger(required: Array, allowed: Array) -> Iterator[Remedy]:
@@ -202,22 +277,13 @@ def _of_cell(workcell: Workcell, excess: Callable[[Workcell], float]) -> Iterato
     """Yield what mass, friction and uncertainty would have to be."""
     payload, contacts, doubt = workcell.payload, workcell.contacts, workcell.uncertainty
 
-    def with_mass(factor: float) -> Workcell:
-        inertia = factor * payload.inertia
-        lighter = replace(payload, mass=factor * payload.mass, inertia=inertia)
-        return replace(workcell, payload=lighter)
-
-    def with_friction(factor: float) -> Workcell:
-        first, second = (replace(pad, friction=factor * pad.friction) for pad in contacts)
-        return replace(workcell, contacts=(first, second))
-
-    lighter = _smallest_change(lambda factor: excess(with_mass(factor)), LEAST_MASS)
+    lighter = _smallest_change(lambda factor: excess(_with_mass(workcell, factor)), LEAST_MASS)
     if lighter is not None:
         mass = _three_digits(lighter * payload.mass, floor)
         yield Remedy(f"a mass of {mass:g} kg", mass / payload.mass - 1.0)
     coefficients = sorted({pad.friction for pad in contacts})
     rougher = _smallest_change(
-        lambda factor: excess(with_friction(factor)), FRICTION.high / coefficients[-1]
+        lambda factor: excess(_with_friction(workcell, factor)), FRICTION.high / coefficients[-1]
     )
     if rougher is not None:
         rounded = [_three_digits(rougher * value, ceil) for value in coefficients]

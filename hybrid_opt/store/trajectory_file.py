@@ -250,13 +250,15 @@ class Replay:
         )
 
 
-def replay(stored: StoredTrajectory, folder: Path) -> Replay:
-    """Unpack a stored trajectory's workcell into a folder and evaluate the trajectory again.
+def replay(stored: StoredTrajectory, cell: Cell) -> Replay:
+    """Evaluate a stored trajectory again.
+
+    Args:
+        cell: that of `StoredTrajectory.open_cell`.
 
     Raises:
-        DualArmError: the stored workcell is not valid, or its model cannot be built.
+        DualArmError: its model cannot be built.
     """
-    cell = stored.open_cell(folder)
     carry = cell.carry(stored.x)
     recomputed = carry.figures
     differences = [

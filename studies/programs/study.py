@@ -6,6 +6,7 @@ import argparse
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+from hybrid_opt.bundles.bundle import missing_text
 from hybrid_opt.campaign import (
     CampaignFolder,
     CampaignSettings,
@@ -17,7 +18,7 @@ from hybrid_opt.campaign import (
     search_stage,
 )
 from hybrid_opt.campaign.polish_stage import polish_stage
-from hybrid_opt.campaign.settings import ALGORITHMS, DRIVABLE, SUMMARY, chosen
+from hybrid_opt.campaign.settings import ALGORITHMS, DRIVABLE, RECOMMENDED, SUMMARY, chosen
 from hybrid_opt.campaign.stages import (
     build_study,
     decided_cell,
@@ -47,6 +48,7 @@ from hybrid_opt.static_hold import require_hold
 from studies.options import QUICK_EVALUATIONS, QUICK_REPLICAS
 from studies.program import load_workcell
 from studies.report import PAGE, TABLES
+from studies.study.answer import EXPORT_TARGET, export_command
 from studies.study.recommendation import is_drivable, known_paths, recommendation_stage
 from studies.study.simulation import (
     limits_on_jerk,
@@ -80,6 +82,7 @@ class StudySettings:
         simulate: whether the selected carries are driven in the simulated cell.
         report: whether figures, tables and the page are written.
         with_paper: whether the figures stand beside those that the paper states.
+        paper: whether the report has the paper's pictures.
         pdf: whether pictures are also written as PDF.
         recommend_only: whether nothing is made that the recommendation does not need.
     """
@@ -92,6 +95,7 @@ class StudySettings:
     simulate: bool = False
     report: bool = True
     with_paper: bool = False
+    paper: bool = False
     pdf: bool = True
     recommend_only: bool = False
 
@@ -118,14 +122,13 @@ def stages(study: StudySettings, alone: bool = False) -> tuple[Stage, ...]:
     if study.simulate:
         every.append(simulation_stage())
     if study.report:
-        every.append(report_stage(study.with_paper, study.pdf))
+        every.append(report_stage(study))
     return tuple(every)
 
 
-def report_stage(with_paper: bool, pdf: bool) -> Stage:
-    """Return the stage that writes pictures, tables and the page; settings as in
-    `StudySettings`."""
-    settings = {"with_paper": with_paper, "pdf": pdf}
+def report_stage(study: StudySettings) -> Stage:
+    """Return the stage that writes pictures, tables and the page."""
+    settings = {"with_paper": study.with_paper, "pdf": study.pdf, "paper": study.paper}
 
     def run(folder: CampaignFolder, progress: Progress) -> None:
         # Drawing libraries are heavy: they are imported when something is drawn.
@@ -194,8 +197,8 @@ def study_text(root: Path, with_paper: bool, brief: bool = False) -> str:
         ResultsError: the folder is not complete or damaged.
     """
     summary = read_summary(root)
-    words = summary.words(str(root))
-    carry = "" if words is None else words.terminal()
+    opening = summary.answer(str(root))
+    carry = "" if opening is None else opening.terminal()
     if carry and brief:
         return carry
     beside = (root / DRIVABLE / SUMMARY).exists()
@@ -225,6 +228,8 @@ def make_study(path: Path, options: argparse.Namespace, with_paper: bool) -> Non
         DualArmError: the workcell, an option or the results folder is wrong, or work failed.
     """
     cell = load_workcell(path)
+    if options.target is not None:
+        print(missing_text(options.target, cell), flush=True)
     if options.recommend_only:
         drivable = Cell(cell).drivable()  # keeps the file of its workcell
         cell = drivable.workcell
@@ -250,11 +255,15 @@ def make_study(path: Path, options: argparse.Namespace, with_paper: bool) -> Non
         report=options.report and not options.recommend_only,
         recommend_only=options.recommend_only,
         with_paper=with_paper,
+        paper=options.paper,
         pdf=not options.quick,
     )
     print(run_study(cell, settings, execution, Progress(not options.quiet), study))
     if study.report:
         print(f"Report: {execution.output / PAGE}; all tables: {execution.output / TABLES}")
+    if (execution.output / RECOMMENDED).exists():
+        command = export_command(execution.output / RECOMMENDED, options.target or EXPORT_TARGET)
+        print(f"next: {command}")
     if options.animation or options.view:
         from studies.report.looks import follow_looks
 

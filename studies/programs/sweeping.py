@@ -11,8 +11,10 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from hybrid_opt.api import polish, search
+from hybrid_opt.campaign.stages import build_study
 from hybrid_opt.cell import Cell
 from hybrid_opt.display.table import Table, number
+from hybrid_opt.progress import Progress
 from hybrid_opt.recommending.recommendation import recommend
 from hybrid_opt.store.files import to_json
 from hybrid_opt.store.trajectory_file import read_trajectory
@@ -46,6 +48,7 @@ def sweep_numbers(options: argparse.Namespace) -> int:
     file = Path(options.output) / "sweep.json"
     file.parent.mkdir(parents=True, exist_ok=True)
     shown = not options.quiet
+    build_study(cell, Progress(shown), polish=options.path is None)
     if file.exists():
         x: Array = read_sweep(file).x
     elif options.path is not None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import shlex
 from collections.abc import Iterator
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -12,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from hybrid_opt.bundles import BundleOptions, Origin, export
-from hybrid_opt.bundles.bundle import read_manifest, require_target, warnings_of
+from hybrid_opt.bundles.bundle import README, read_manifest, require_target, warnings_of
 from hybrid_opt.bundles.check import as_document, check
 from hybrid_opt.bundles.check import read_trajectory as joint_trajectory
 from hybrid_opt.campaign.stages import build_study
@@ -47,9 +48,12 @@ from hybrid_opt.timing.model import TimingModel
 from hybrid_opt.timing.records import Timing, TimingLimits
 from hybrid_opt.timing.solve import time_path
 from studies.program import FAULT, Outcome, load_workcell, print_findings
+from studies.study.answer import job_text
 from studies.study.tables import force_curve, margins, timings
+from symbolic import safe_io
 from symbolic.array import Array
-from symbolic.errors import SettingsError
+from symbolic.errors import DualArmError, OutsideError, SettingsError, WorkcellError
+from symbolic.records import Workcell
 
 NOT_STATED = "the usual one, because the workcell states no [uncertainty]"
 
@@ -58,7 +62,9 @@ def replay_file(options: argparse.Namespace) -> int:
     """Re-evaluate a trajectory file and print both figures; returns the exit code."""
     stored = read_trajectory(options.file)
     with TemporaryDirectory() as folder:
-        replayed = replay(stored, Path(folder))
+        cell = stored.open_cell(Path(folder))
+        build_study(cell, Progress(), polish=False, drivable=False)
+        replayed = replay(stored, cell)
         print_findings(_replayed(stored, replayed, options), options.json)
     return 0 if replayed.reproduced else FAULT
 
@@ -89,6 +95,8 @@ def _replayed(
         "provenance": dict(stored.provenance),
     }
     yield Outcome(document, lines)
+    if workcell.task.time_law == "optimal":
+        yield _driven(replayed.cell, stored.x)
     asked = (options.planned_limit, options.force_curve)
     if options.timing or any(option is not None for option in asked):
         Progress().note("timing it, which takes some seconds")
@@ -106,6 +114,20 @@ def _replayed(
         yield Outcome({"timing": to_json(timing)}, tuple(texts))
 
 
+def _driven(cell: Cell, x: Array) -> Outcome:
+    """Plan the job around a drivable carry x (n_var,) as a study and an export do by default."""
+    try:
+        job = JobModel(cell.compiled, cell.timing_model).plan(driven_timing(cell.timing_model, x))
+    except DualArmError as error:
+        return Outcome({"job": None}, (f"no job can be planned: {error}",))
+    values = {
+        "duration": job.phase("carry").duration,
+        "commanded_force": job.squeeze.force,
+        "job_duration": job.duration,
+    }
+    return Outcome({"job": values}, (f"as its job drives it: {job_text(job)}",))
+
+
 def export_file(options: argparse.Namespace) -> int:
     """Write the bundle of a trajectory file and print its job; returns the exit code."""
     require_target(options.target)
@@ -116,6 +138,8 @@ def export_file(options: argparse.Namespace) -> int:
     squeeze = SqueezeSettings(options.squeeze, options.leader - 1)
     with TemporaryDirectory() as folder:
         cell = stored.open_cell(Path(folder))
+        if options.driver is not None:
+            cell = cell.changed(driver_changes(options.driver, cell.workcell))
         build_study(cell, Progress(), polish=False, drivable=False)
         timing = _chosen(cell.timing_model, stored, options.use, options.planned_limit)
         jobs = JobModel(cell.compiled, cell.timing_model)
@@ -123,9 +147,43 @@ def export_file(options: argparse.Namespace) -> int:
         origin = Origin.of_file(path, read_bytes(path), stored.provenance)
         files = export(job, options.target, options.output, origin=origin, options=bundle)
         document = read_manifest(files[0].parent)
-        print(_report(job, document["start_skew"]["stiffness"]))
-    print(f"\n{len(files)} files in {files[0].parent}")
+        print(f"{job_text(job)}\n\n{_report(job, document['start_skew']['stiffness'])}")
+    place = files[0].parent
+    print(f"\n{len(files)} files in {place}; {README} there says what they are and how they run")
+    print(f"next: cd {shlex.quote(str(place))}, then {document['how_to_run']}")
     return 0
+
+
+def driver_changes(path: Path, workcell: Workcell) -> dict[str, Any]:
+    """Read what a file states of the drivers and tool loads of a workcell's robots.
+
+    Args:
+        path: a file with `[[robots]]` sections: of them the keys `name`, `driver` and `tool_load`
+            count.
+
+    Returns:
+        Changes as `Cell.changed` takes them.
+
+    Raises:
+        WorkcellError: the file cannot be read, or states nothing of these robots.
+    """
+    try:
+        entries = safe_io.toml_tables(safe_io.read_bytes(path, safe_io.WORKCELL_BYTES))
+    except OutsideError as error:
+        raise WorkcellError(str(path), (f"file: {error}",)) from error
+    robots, names = entries.get("robots"), [robot.name for robot in workcell.robots]
+    found = {
+        f"robots[{names.index(entry['name'])}].{key}": entry[key]
+        for entry in (robots if isinstance(robots, list) else ())
+        if isinstance(entry, dict) and entry.get("name") in names
+        for key in ("driver", "tool_load")
+        if key in entry
+    }
+    if not found:
+        known = " or ".join(map(repr, names))
+        problem = f"robots: states no driver and no tool_load of a robot called {known}"
+        raise WorkcellError(str(path), (problem,))
+    return found
 
 
 def _chosen(

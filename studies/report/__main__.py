@@ -13,6 +13,7 @@ from studies.program import Parser, Program
 
 def _add_options(parser: Parser) -> None:
     add(parser, "RESULTS", "--quiet")
+    add(parser, "--paper")
     parser.add_argument(
         "--pdf",
         action="store_true",
@@ -39,7 +40,8 @@ def _run(options: argparse.Namespace) -> int:
         stored = read_json(marker) if marker.exists() else {}
         made = stored.get("settings", {}) if isinstance(stored, dict) else {}
         pdf = options.pdf or bool(made.get("pdf", True))
-        settings = {"with_paper": bool(made.get("with_paper")), "pdf": pdf}
+        paper = options.paper or bool(made.get("paper"))
+        settings = {"with_paper": bool(made.get("with_paper")), "pdf": pdf, "paper": paper}
         with LocalWorkers(0) as workers:
             make_report(options.results, settings, Progress(not options.quiet), workers)
         print(f"Report: {options.results / 'report.html'}")

@@ -33,7 +33,6 @@ from hybrid_opt.evaluate.objectives import (
 )
 from hybrid_opt.front import Front, selected_row
 from hybrid_opt.metaheuristics.registry import title
-from hybrid_opt.recommending.recommendation import level_force
 from hybrid_opt.store.trajectory_file import read_trajectory
 from hybrid_opt.timing.analysis import TimingDocument, read_timing
 from hybrid_opt.timing.records import TimingLimits
@@ -172,15 +171,14 @@ class ReportData(Experiment):
             no such values.
         initial: the hand-made trajectory.
         timings: of the hand-made and the selected trajectories by label, as `carries` has them.
-        reach: where the arms reach.
-        level_force: largest of the forces of `force_kind` that hold the level payload at rest [N].
+        reach: where the arms reach, None in a report without the paper's pictures.
         drivable: the drivable experiment, None without one.
         recommended: decision vector of the carry to run, None without one.
         jerk: what limits on jerk cost the selected carries and the recommended one, None without
             limits.
         branches: how the start branches were decided, None where the workcell decides them.
         simulations: of the carries that were driven in the simulated cell, empty without.
-        jobs: the whole jobs around the recommended, the hand-made and the selected trajectories.
+        jobs: the whole jobs around the recommended and the hand-made trajectory.
     """
 
     root: Path
@@ -189,8 +187,7 @@ class ReportData(Experiment):
     at_rest: Array | None
     initial: DrawnCarry
     timings: tuple[tuple[str, TimingDocument], ...]
-    reach: ReachMap
-    level_force: float
+    reach: ReachMap | None
     drivable: Experiment | None = None
     recommended: Array | None = None
     jerk: Table | None = None
@@ -238,12 +235,15 @@ class ReportData(Experiment):
         return None
 
 
-def gather(results: CampaignResults, workers: Workers | None = None) -> ReportData:
+def gather(
+    results: CampaignResults, workers: Workers | None = None, paper: bool = True
+) -> ReportData:
     """Evaluate what is drawn in detail.
 
     Args:
         results: of a finished study.
         workers: make the calls that take long, None for this process.
+        paper: whether the paper's pictures are drawn, too.
 
     Raises:
         ResultsError: the folder is not complete or damaged.
@@ -268,18 +268,20 @@ def gather(results: CampaignResults, workers: Workers | None = None) -> ReportDa
     if len(timings) != len(carries):
         raise ResultsError(f"{results.root / SUMMARY}: damaged: does not fit the fronts beside it")
     geometry = build_geometry(results.workcell)
-    calls: list[Callable[[Sequence[ReadyCell]], Any]] = [partial(_reach, geometry)]
+    calls: list[Callable[[Sequence[ReadyCell]], Any]] = []
     if recommended is not None:
         calls.append(partial(recommended_job, recommended))
     slow = TimingLimits(reference_speed=True)
-    calls += [partial(drawn_job, carry.label, carry.x, slow) for carry in carries]
+    calls.append(partial(drawn_job, initial.label, initial.x, slow))
+    calls += [partial(_reach, geometry)] if paper else []
     forces = first.summary.static_hold.normal_force / first.summary.reference_force
     known = dict(zip(PAPER_OBJECTIVES, forces, strict=True))
     still = [known.get(name) for name in first.objectives[:2]]
     alone = results.workcell.task.time_law == "optimal"
     # Jobs are what robots are told: by the cell that they drive.
     cells = cells_of(first.files, results.objectives, alone)
-    reach, *jobs = (workers or LocalWorkers()).map(partial(_call, cells), calls)
+    made = (workers or LocalWorkers()).map(partial(_call, cells), calls)
+    reach, jobs = (made[-1], made[:-1]) if paper else (None, made)
     return ReportData(
         **vars(first),
         root=results.root,
@@ -289,7 +291,6 @@ def gather(results: CampaignResults, workers: Workers | None = None) -> ReportDa
         initial=initial,
         timings=tuple(zip((carry.label for carry in carries), timings, strict=True)),
         reach=reach,
-        level_force=level_force((drivable or first).workcell, first.force_kind),
         drivable=drivable,
         recommended=recommended,
         jerk=jerk,

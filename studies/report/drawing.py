@@ -157,15 +157,15 @@ def legend_below(figure: Figure, axes: Axes, columns: int = 0) -> None:
     figure.legend(handles, labels, loc="outside lower center", ncols=columns or len(handles))
 
 
-def limit_line(axes: Axes, level: float, label: str) -> None:
-    """Draw a limit as a dashed line across the panel."""
-    axes.axhline(level, color="black", linestyle="--", linewidth=0.9, label=label)
-
-
-def rest_line(axes: Axes, level: float, label: str, across: bool = True) -> None:
-    """Draw the static force as a line, across or up the panel."""
+def limit_line(axes: Axes, level: float, label: str, across: bool = True) -> None:
+    """Draw a limit as a dashed line, across or up the panel."""
     draw = axes.axhline if across else axes.axvline
-    draw(level, color="black", linewidth=0.8, linestyle=(0, (7, 2, 1, 2)), label=label)
+    draw(level, color="black", linestyle="--", linewidth=0.9, label=label)
+
+
+def rest_line(axes: Axes, level: float, label: str) -> None:
+    """Draw what holds the payload still as a line across the panel."""
+    axes.axhline(level, color="black", linewidth=0.8, linestyle=(0, (7, 2, 1, 2)), label=label)
 
 
 def panel_label(axes: Axes, letter: str, text: str, bare: bool = False) -> None:

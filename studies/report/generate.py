@@ -15,7 +15,7 @@ import inspect
 import json
 import math
 import pickle
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from importlib.resources import files
@@ -37,8 +37,10 @@ from hybrid_opt.workers import LocalWorkers, Workers
 from studies.report import PAGE, PICTURES, TABLES, pictures_carry, pictures_cell, pictures_fronts
 from studies.report.data import ReportData, gather
 from studies.report.drawing import files_of, in_style, settled
+from studies.report.opening import answer_html
 from studies.report.page_carries import RECOMMENDED_LABEL, phases
 from studies.report.page_data import page_document
+from studies.report.pictures_cell import ReachMap
 from studies.study.tables import margins, study_tables, timings
 from symbolic.contact.registry import contact_model
 
@@ -74,8 +76,35 @@ def _of(name: str, draw: Callable[..., Figure], *given: Any, caption: str = "") 
 
 
 def report_pictures(data: ReportData) -> Iterator[ReportPicture]:
-    """All pictures that the data allows, in the paper's order, then those beyond the paper."""
-    cell, arm = (data.geometry, data.reach, data.initial), data.workcell.robots[0].name
+    """Yield all pictures that the data allows: of the recommended carry, then the paper's in its
+    order."""
+    yield from _first_pictures(data)
+    if data.reach is not None:
+        yield from _paper_pictures(data, data.reach)
+
+
+def _first_pictures(data: ReportData) -> Iterator[ReportPicture]:
+    sequence, choice = pictures_cell.motion_sequence, data.summary.recommendation
+    moments = "at 0, 33, 66 and 100 % of its duration"
+    if choice is not None:
+        draw = pictures_fronts.duration_against_force
+        yield _of("duration_against_force", draw, data, choice)
+    if (driven := data.recommended_carry) is not None:
+        text = f"The recommended carry {moments}."
+        yield _of(f"motion_{driven.label}", sequence, data.geometry, driven, caption=text)
+    if choice is not None and choice.price is not None:
+        found = choice.price.uncertainty
+        text = (
+            "The price of robustness: largest normal forces of the recommended carry that hold in "
+            f"every case of a multiple of {found.title} ({found})."
+        )
+        yield _of("robust_price", pictures_carry.robust_price, data, choice.price, caption=text)
+    if any(len(found.time) for found in data.simulations):
+        yield _of("simulated_forces", pictures_carry.simulated_forces, data)
+
+
+def _paper_pictures(data: ReportData, reach: ReachMap) -> Iterator[ReportPicture]:
+    cell, arm = (data.geometry, reach, data.initial), data.workcell.robots[0].name
     arm = f"Collision shapes of the arm {arm!r}, and the reach of its pad (paper Figure 6)."
     yield _of("fig04_reachable_regions", pictures_cell.reachable_regions, *cell)
     yield _of("fig05_cell", pictures_cell.environment, data.geometry, data.initial)
@@ -89,38 +118,15 @@ def report_pictures(data: ReportData) -> Iterator[ReportPicture]:
     yield _of("residual_moments", pictures_carry.residual_moments, data)
     yield _of("fig12_payload", pictures_carry.payload, data)
     yield _of("fig13_paths", pictures_cell.paths, data.geometry, data.drawn)
-    paper = " (paper Figures 14 and 15)"
-    drawn = [
-        (a.name, a.best, f"The trajectory selected from {a.best.label},", paper)
-        for a in data.algorithms
-        if a.best is not None
-    ]
-    if (driven := data.recommended_carry) is not None:
-        drawn.append((driven.label, driven, "The recommended carry", ""))
-    for name, carry, whose, source in drawn:
-        text = f"{whose} at 0, 33, 66 and 100 % of its duration{source}."
-        sequence = pictures_cell.motion_sequence
-        yield _of(f"motion_{name}", sequence, data.geometry, carry, caption=text)
-    if any(timed.force_curve is not None for _, timed in data.timings):
-        text = (
-            f"Drivable durations against the {data.force_kind.title}: single paths timed anew at "
-            "every limit, and the members of the drivable fronts, whose lines are the fastest path "
-            "at every force (median and range of the replicas). All other limits hold throughout, "
-            "those on jerk only for the star."
-        )
-        draw_curves = pictures_fronts.duration_against_force
-        yield _of("duration_against_force", draw_curves, data, caption=text)
-    choice = data.summary.recommendation
-    if choice is not None and choice.price is not None:
-        found = choice.price.uncertainty
-        whose = "the workcell's [uncertainty]" if found.stated else "the usual uncertainty"
-        text = (
-            "The price of robustness: largest normal forces of the recommended carry that hold in "
-            f"every case of a multiple of {whose} ({found})."
-        )
-        yield _of("robust_price", pictures_carry.robust_price, data, choice.price, caption=text)
-    if any(len(found.time) for found in data.simulations):
-        yield _of("simulated_forces", pictures_carry.simulated_forces, data)
+    for algorithm in data.algorithms:
+        if algorithm.best is not None:
+            text = (
+                f"The trajectory selected from {algorithm.best.label}, at 0, 33, 66 and 100 % of "
+                "its duration (paper Figures 14 and 15)."
+            )
+            given = (data.geometry, algorithm.best)
+            sequence = pictures_cell.motion_sequence
+            yield _of(f"motion_{algorithm.name}", sequence, *given, caption=text)
 
 
 def _search_pictures(data: ReportData) -> Iterator[ReportPicture]:
@@ -138,13 +144,17 @@ def _search_pictures(data: ReportData) -> Iterator[ReportPicture]:
 def make_report(
     root: Path, settings: Mapping[str, bool], progress: Progress, workers: Workers
 ) -> None:
-    """Write the report of a results folder; settings as `write_report` has them.
+    """Write the report of a results folder.
+
+    Args:
+        settings: as `write_report` has them, and `paper`: whether the paper's pictures are drawn.
 
     Raises:
         DualArmError: the folder is not complete, or cannot be written.
     """
-    data = gather(read_campaign(root), workers)
-    write_report(root, data, **settings, progress=progress, workers=workers)
+    own = {name: value for name, value in settings.items() if name != "paper"}
+    data = gather(read_campaign(root), workers, settings["paper"])
+    write_report(root, data, **own, progress=progress, workers=workers)
 
 
 def write_report(
@@ -182,12 +192,16 @@ def write_report(
         shown = zip(pictures, drawn, strict=True)
         page = render_page(
             data,
-            page_document(data, workers),
-            "".join(table.html() for table in tables),
-            "".join(_picture(made["png"], picture.caption) for picture, made in shown),
+            page_document(data, workers, data.reach is not None),
+            tables,
+            [_picture(made["png"], picture.caption) for picture, made in shown],
         )
         write_atomically(root / PAGE, page.encode())
         advance(1)
+
+
+FIRST_TABLES = ("time_against_force", "robust_price", "simulation", "phases")
+"""Tables of what is recommended, which the page shows before those of the paper's experiment."""
 
 
 def report_tables(data: ReportData, with_paper: bool) -> tuple[Table, ...]:
@@ -221,29 +235,59 @@ def _unpickled(data: bytes) -> list[ReportPicture]:
     return _listed(pickle.loads(data))
 
 
-def render_page(data: ReportData, document: dict[str, Any], tables: str, pictures: str) -> str:
-    """Write the page's text: data of its scripts, from `page_data`, and tables and pictures as
-    HTML."""
+def render_page(
+    data: ReportData, document: dict[str, Any], tables: Sequence[Table], pictures: Sequence[str]
+) -> str:
+    """Return the page's text.
+
+    Args:
+        document: what its scripts show, from `page_data`.
+        tables: all of the report.
+        pictures: as HTML, in the order of `report_pictures`.
+    """
     texts = files("studies.report") / "page"
     boot, own = ((texts / name).read_text("utf-8") for name in ("boot.js", "page.js"))
     scripts = [asset(PLOTLY), asset(THREE), asset("scene.js"), own]
     shown = ("workcell", "settings", "environment")
     settings = {key: to_json(getattr(data.summary, key)) for key in shown}
+    first = sum(1 for _ in _first_pictures(data))
     return Template((texts / "page.html").read_text("utf-8")).substitute(
         policy=_policy([boot, *scripts]),
         title=html.escape(data.workcell.name),
         lead=html.escape(_lead(data)),
-        recommendation=_recommendation(data),
-        facts=_facts(data),
+        answer=answer_html(data),
         style=(texts / "page.css").read_text("utf-8"),
-        tables=tables,
-        pictures=pictures,
+        first_tables=_tables(tables, of_paper=False),
+        first_pictures="".join(pictures[:first]),
+        paper=_paper_text(data),
+        facts=_facts(data),
+        tables=_tables(tables, of_paper=True),
+        pictures="".join(pictures[first:]),
         configuration=html.escape(json.dumps(settings, indent=2, ensure_ascii=False)),
         workcell=html.escape(data.workcell.source.read_text("utf-8")),
         blocks="\n".join(
             [_block(embedded_json(document), " id='report-data'"), *map(_block, scripts)]
         ),
         boot=boot,
+    )
+
+
+def _tables(tables: Sequence[Table], of_paper: bool) -> str:
+    chosen = (table for table in tables if (table.name not in FIRST_TABLES) == of_paper)
+    return "".join(table.html() for table in chosen)
+
+
+def _paper_text(data: ReportData) -> str:
+    """Say where the paper's pictures are, or how to draw them."""
+    if data.reach is not None:
+        return (
+            "<p>The same pictures lie beside this page in the folder <code>figures</code>: as PNG "
+            "and, but for a quick study, PDF.</p>"
+        )
+    command = "python -m studies.report . --paper"
+    return (
+        "<p>The paper's pictures, and the carries of its search on this page: "
+        f"<code>{command}</code> in the folder of this page.</p>"
     )
 
 
@@ -276,30 +320,6 @@ def _lead(data: ReportData) -> str:
         f"{len(task.free_indices)} of them free. {names}: "
         f"{counted(settings.replicas, 'replica')} of {settings.evaluations} evaluations each, "
         f"seed {settings.seed}.{chosen}"
-    )
-
-
-IN_FOLDER = {"file": "file, beside this page", "export": "export, from this folder"}
-"""Headings of what names files, and how the page calls them, which moves with its folder."""
-
-
-def _recommendation(data: ReportData) -> str:
-    """Return the opening words of the page, as in the terminal."""
-    words = data.summary.words("")
-    if words is None:
-        return ""
-    told = [(heading, html.escape(text)) for heading, text in words.facts]
-    facts = "".join(
-        f"<dt>{html.escape(IN_FOLDER.get(heading, heading))}</dt>"
-        f"<dd>{f'<code>{text}</code>' if heading in IN_FOLDER else text}</dd>"
-        for heading, text in told
-    )
-    warnings = "".join(
-        f"<p class='warning'>Warning: {html.escape(text)}</p>" for text in words.warnings
-    )
-    return (
-        f"<section class='recommendation'><h2>{html.escape(words.headline)}</h2>"
-        f"<dl>{facts}</dl>{warnings}</section>"
     )
 
 

@@ -1,5 +1,8 @@
-"""The trajectories of a report and the whole jobs around them: what robots drive, what the search
-assumed, and what is saved. Each is worked out for itself, in any process."""
+"""The trajectories of a report, and the whole jobs around the recommended and the hand-made one.
+
+Each is computed for itself, in any process: how robots drive it, how hard they press, what the
+search assumed, and what is saved.
+"""
 
 from __future__ import annotations
 
@@ -20,6 +23,8 @@ from hybrid_opt.job.plan import JobModel
 from hybrid_opt.job.records import Job, Phase
 from hybrid_opt.job.smooth import driven_timing
 from hybrid_opt.robust.cases import LEADER
+from hybrid_opt.robust.force import BoxMotion, box_motion, robust_model
+from hybrid_opt.robust.squeeze import SqueezeSettings, commanded_forces
 from hybrid_opt.timing.analysis import drivable_timing
 from hybrid_opt.timing.records import JerkLimits, Timing, TimingLimits
 from hybrid_opt.timing.robustness import Margin, robustness_margins
@@ -28,7 +33,6 @@ from symbolic.array import Array
 from symbolic.errors import DualArmError
 from symbolic.path.pieces import resample_decisions
 from symbolic.records import Workcell
-from symbolic.records.poses import box_rotation
 
 RECOMMENDED_LABEL = "recommended"
 RECOMMENDED_TITLE = "Recommended"
@@ -40,8 +44,8 @@ PHASE_SAMPLES = 7
 
 WITHOUT_JERK = "; its carry without the limits on jerk, which an export keeps"
 
-_TOUCHES = 1e-6
-"""Normal force from which on a pad has a centre of pressure [N]."""
+HELD = ("lift", "carry", "set_down")
+"""Phases in which the pads alone hold the box."""
 
 
 @dataclass(frozen=True)
@@ -100,16 +104,32 @@ def drawn(
 
 
 def job_samples(job: Job) -> Array:
-    """(k, 11 + joints) time, box pose, joints, commanded normal forces and shifts of the centres of
-    pressure: some samples of each phase, and the peaks of the forces."""
+    """Return samples (k, 11 + joints) of a job: some of each phase, and the peaks of the forces.
+
+    The columns are time [s], box pose, joints, both commanded normal forces, and what of
+    `needed_forces` the force-controlled arm has to press with, NaN while the box stands [N].
+    """
     parts = []
     for phase in job.phases:
         motion, force = phase.motion, phase.force.normal
         count = CARRY_SAMPLES if phase.name == "carry" else PHASE_SAMPLES
         rows = _rows(motion.time, count, force.argmax(axis=0))
-        time, shift = phase.begin + motion.time, pressure_shift(job, phase)
-        parts.append(np.column_stack([time, motion.pose, motion.q, force, shift])[rows])
+        needed = np.full((len(rows), 2), np.nan)
+        if phase.name in HELD:
+            held = BoxMotion(motion.pose, motion.rate, motion.second_rate).at(rows)
+            needed = needed_forces(job.workcell, held)
+        time = phase.begin + motion.time
+        table = np.column_stack([time, motion.pose, motion.q, force])[rows]
+        parts.append(np.column_stack([table, needed]))
     return _once(np.concatenate(parts))
+
+
+def needed_forces(workcell: Workcell, motion: BoxMotion) -> Array:
+    """Compute the least normal forces (n, 2) [N] of the force-controlled arm that hold a motion: in
+    every case of the uncertainty, and where everything is as described."""
+    model = robust_model(workcell)
+    every = model.commanded(motion, workcell.uncertainty, LEADER)
+    return np.column_stack([every, model.nominal(motion, LEADER)[:, 1 - LEADER]])
 
 
 def _rows(time: Array, count: int, peaks: Iterable[int]) -> NDArray[np.intp]:
@@ -123,19 +143,6 @@ def _once(table: Array) -> Array:
     """Remove samples (n, k) whose time, their first number, repeats: where two phases meet, and
     where an acceleration jumps."""
     return np.asarray(table[np.concatenate([[True], np.diff(table[:, 0]) > 1e-9])])
-
-
-def pressure_shift(job: Job, phase: Phase) -> Array:
-    """(n, 2) distance of each centre of pressure from its nominal contact point [m]."""
-    rotation = box_rotation(job.workcell.task.orientation, phase.motion.pose)
-    shifts = np.zeros_like(phase.force.normal)
-    for arm, contact in enumerate(job.workcell.contacts):
-        tangents = rotation @ contact.T_box_pad[:3, :2]
-        tilting = np.einsum("nij,ni->nj", tangents, phase.force.wrench[:, arm, 3:])
-        normal = phase.force.normal[:, arm]
-        pressed = normal > _TOUCHES
-        shifts[pressed, arm] = np.linalg.norm(tilting[pressed], axis=1) / normal[pressed]
-    return shifts
 
 
 PHASE_LIMITS = (
@@ -193,7 +200,7 @@ DRIVEN_TITLE = "as robots drive it"
 ASSUMED = "as the search assumed"
 WHOLE_JOB = "the whole job"
 
-NO_JOB = "shown of selected carries and of time against force only; an export plans any"
+NO_JOB = "shown of the recommended and the hand-made carry only; an export plans any"
 """Why a trajectory that can be driven has none."""
 
 LAWS = {"constant": "constant speed", "ramped": "ramped speed"}
@@ -207,10 +214,8 @@ class PageTrajectory:
         source: whose it is, stored with a saved file.
         x: (n_var,) decision vector.
         cell: number of its cell among those of the page.
-        recommended: whether it is the carry to run, driven within the cell's limits on jerk, where
-            it has any.
-        job: the whole job around it, where it is planned already.
-        has_job: whether one is planned where it is not.
+        recommended: whether it is the carry to run.
+        job: the whole job around it, None where none is shown.
     """
 
     source: str
@@ -218,7 +223,6 @@ class PageTrajectory:
     cell: int = 0
     recommended: bool = False
     job: DrawnJob | None = None
-    has_job: bool = True
 
 
 def _with_job(trajectory: dict[str, Any], found: DrawnJob) -> None:
@@ -235,16 +239,14 @@ def _with_job(trajectory: dict[str, Any], found: DrawnJob) -> None:
         "payloadLimit": motions[0]["payloadLimit"],
         **_uses(job.workcell, np.concatenate([p.effort for p in job.phases]), contact),
         "data": packed(job_samples(job), np.float32),
-        "commanded": round(_commanded(job), 4),
+        "isCommanded": True,
         "remark": found.remark,
         "phases": [_phase(phase) for phase in job.phases],
     }
     motions.insert(1, motion)
-
-
-def _commanded(job: Job) -> float:
-    """Largest force that is commanded of the force-controlled arm [N]."""
-    return float(job.peak_normal_force[1 - LEADER])
+    # In whole cycles of the controllers.
+    trajectory["duration"] = round(job.phase("carry").duration, 5)
+    trajectory["commanded"] = round(float(job.peak_normal_force[1 - LEADER]), 4)
 
 
 def _phase(phase: Phase) -> dict[str, Any]:
@@ -263,44 +265,46 @@ def _rounded(values: Array, digits: int) -> list[float]:
 
 
 def page_trajectory(cells: Sequence[ReadyCell], shown: PageTrajectory) -> dict[str, Any]:
-    """Return a trajectory of the page as JSON values: its motions and texts.
+    """Return a trajectory of the page as JSON values: its motions, and its words.
+
+    Carries of the time law 'optimal' are driven within their force limits and the limits on jerk,
+    as jobs drive them, with the forces to command. Others are timed as close to the reference
+    speeds as limits allow, with planned forces.
 
     Args:
-        cells: of the page; the last one is the cell that robots drive. Under 'optimal' carries are
-            timed within their force limits, else as close to the reference speeds as limits allow.
+        cells: of the page; the last one is the cell that robots drive.
     """
     cell, driving = cells[shown.cell].cell, cells[-1]
     law = cell.workcell.task.time_law
     judged = cell.carry(shown.x)
     assert judged.judgement is not None, "carries of a cell are judged"
-    task = driving.cell.workcell.task
-    path = resample_decisions(shown.x, cell.workcell.task, task)[0, : task.n_path]
-    limits = _limits(cell, shown.x)
-    if shown.recommended:
-        # The recommended carry is driven as an export does, others without limits on jerk.
-        timing = driven_timing(cell.timing_model, shown.x)
-    elif limits.robust:
-        # Anew, robust forces take long: as the search found it.
-        timing = drivable_timing(cell.timing_model, shown.x)
-    else:
-        timing = time_path(driving.jobs.timing, path, limits)
-    driven = timing.carry
-    motions = [] if driven is None else [_motion(DRIVEN_TITLE, driven)]
+    timing, problem = _timed(cell, driving, shown)
+    driven, commanded, motions = None if timing is None else timing.carry, None, []
+    if driven is not None and law == "optimal":
+        try:
+            commanded, _ = commanded_forces(
+                driven.workcell, driven, SqueezeSettings(), in_parts=False
+            )
+        except DualArmError as error:
+            problem = str(error)
+    if driven is not None:
+        motions.append(_motion(DRIVEN_TITLE, driven, commanded))
     if law != "optimal":
         motions.append(_motion(f"{ASSUMED}: {LAWS[law]}", judged))
     if not motions:
         motions.append(_motion(ASSUMED, judged))
-    name, values = shown.source, judged.judgement.objectives
+    name = shown.source
     if shown.recommended:
         name = f"{RECOMMENDED_TITLE} ({name})"
     if not judged.judgement.feasible:
         name = f"{name} (infeasible)"
     figures = judged.figures.items()
     found = {
-        "label": f"{name}: {_values(cell, judged, timing, shown.job)}",
-        "objectives": [float(value) for value in values.values()],
-        "problem": "" if timing.ok else f"robots cannot drive it: {timing.reason}",
-        "force": max(motions[0]["peaks"]) if driven is None else round(timing.peak_force, 4),
+        "objectives": [float(value) for value in judged.judgement.objectives.values()],
+        "problem": problem,
+        "duration": motions[0]["duration"],
+        "planned": round(float((driven or judged).peak_normal_force.max()), 4),
+        "commanded": None if commanded is None else round(float(commanded[:, 1 - LEADER].max()), 4),
         "motions": motions,
         "cell": shown.cell,
         "decision": shown.x.tolist(),
@@ -310,22 +314,48 @@ def page_trajectory(cells: Sequence[ReadyCell], shown: PageTrajectory) -> dict[s
     }
     if shown.job is not None:
         _with_job(found, shown.job)
-    elif not shown.has_job:
+    else:
         found["jobProblem"] = NO_JOB
-    elif timing.ok:
-        _with_job(found, drawn(driving.jobs, shown.source, lambda: timing))
+    most = float(driving.cell.workcell.task.reference_force[1 - LEADER])
+    found["beyond"] = found["commanded"] is not None and found["commanded"] > most * ROUNDED
+    found["label"] = f"{name}: {_values(cell, judged, found)}"
+    if found["beyond"]:
+        found["label"] += f", above the reference force of {most:.1f} N"
     return found
 
 
-def _motion(name: str, carry: ho.Carry) -> dict[str, Any]:
-    return {
+ROUNDED = 1.001
+"""Factor of a force that still counts as within a limit: timings agree that closely."""
+
+
+def _timed(cell: ho.Cell, driving: ReadyCell, shown: PageTrajectory) -> tuple[Timing | None, str]:
+    """Time a trajectory of a cell as robots drive it, or say why they cannot."""
+    task = driving.cell.workcell.task
+    try:
+        if cell.workcell.task.time_law != "optimal":
+            path = resample_decisions(shown.x, cell.workcell.task, task)[0, : task.n_path]
+            timing = time_path(driving.jobs.timing, path, ho.TimingLimits(reference_speed=True))
+        elif cell.force_kind.robust and not shown.recommended:
+            # Anew, robust forces take long: as the search found it.
+            timing = drivable_timing(cell.timing_model, shown.x)
+        else:
+            timing = driven_timing(cell.timing_model, shown.x)
+    except DualArmError as error:
+        return None, f"robots cannot drive it: {error}"
+    return timing, "" if timing.ok else f"robots cannot drive it: {timing.reason}"
+
+
+def _motion(name: str, carry: ho.Carry, commanded: Array | None = None) -> dict[str, Any]:
+    force = carry.normal_force if commanded is None else commanded
+    found = {
         "name": name,
-        "peaks": _rounded(carry.peak_normal_force, 4),
+        "peaks": _rounded(force.max(axis=0), 4),
         "duration": round(carry.duration, 5),
         "payloadLimit": round(carry.payload_limit, 4),
         **_uses(carry.workcell, carry.torque, [carry.contact_torque]),
-        "data": packed(_samples(carry), np.float32),
+        "data": packed(_samples(carry, commanded), np.float32),
     }
+    return found if commanded is None else {**found, "isCommanded": True}
 
 
 def _uses(workcell: Workcell, whole: Array, contact: Sequence[Array]) -> dict[str, list[float]]:
@@ -341,36 +371,33 @@ def torque_use(workcell: Workcell, torque: Array) -> Array:
     )
 
 
-def _limits(cell: ho.Cell, x: Array) -> ho.TimingLimits:
-    if cell.workcell.task.time_law == "optimal":
-        return cell.timing_model.drive_limits(float(x[-1]))
-    return ho.TimingLimits(reference_speed=True)
-
-
-def _values(cell: ho.Cell, judged: ho.Carry, timing: ho.Timing, job: DrawnJob | None) -> str:
-    """Title of a trajectory: its objectives, forces and times with their units; of one whose job
-    is planned what is commanded."""
-    if cell.workcell.task.time_law == "optimal":
-        if job is not None and job.job is not None:
-            duration = job.job.phase("carry").duration
-            return f"{duration:.2f} s, pressed with {_commanded(job.job):.1f} N"
-        if timing.carry is not None:
-            return f"{timing.duration:.2f} s, {timing.peak_force:.2f} N"
-        return f"{judged.duration:.2f} s, {judged.peak_normal_force.max():.2f} N"
+def _values(cell: ho.Cell, judged: ho.Carry, found: dict[str, Any]) -> str:
+    """Title of a trajectory: time and commanded force as robots drive it; of a search's other
+    carries their planned forces or objectives."""
+    if found["commanded"] is not None:
+        return f"{found['duration']:.2f} s, press with {found['commanded']:.1f} N"
     assert judged.judgement is not None, "carries of a cell are judged"
-    found = judged.judgement.objectives
-    if tuple(found) != PAPER_OBJECTIVES:
-        return ", ".join(f"{name.replace('_', ' ')} {found[name]:.4f}" for name in found)
-    return ", ".join(
+    values = judged.judgement.objectives
+    if cell.workcell.task.time_law == "optimal":
+        return f"{found['duration']:.2f} s, {found['planned']:.1f} N planned"
+    if tuple(values) != PAPER_OBJECTIVES:
+        return ", ".join(f"{name.replace('_', ' ')} {values[name]:.4f}" for name in values)
+    forces = ", ".join(
         f"{robot.name} {force:.2f} N"
         for robot, force in zip(cell.workcell.robots, judged.peak_normal_force, strict=True)
     )
+    return f"{forces} planned"
 
 
-def _samples(carry: ho.Carry) -> Array:
-    """(k, 11 + joints) time, pose, joints, normal forces and pressure shifts at some samples."""
-    force, shift = carry.normal_force, carry.pressure_shift
-    peaks = np.concatenate([force.argmax(axis=0), force.argmin(axis=0), shift.argmax(axis=0)])
+def _samples(carry: ho.Carry, commanded: Array | None) -> Array:
+    """Return some samples (k, 11 + joints) of a carry, see `job_samples`; without commanded forces
+    the planned ones, and nothing that is needed."""
+    force = carry.normal_force if commanded is None else commanded
+    peaks = np.concatenate([force.argmax(axis=0), force.argmin(axis=0)])
     time = carry.time - carry.time[0]
-    table = np.column_stack([time, carry.pose, carry.q, force, shift])
-    return _once(table[_rows(time, PAGE_SAMPLES, peaks)])
+    rows = _rows(time, PAGE_SAMPLES, peaks)
+    needed = np.full((len(rows), 2), np.nan)
+    if commanded is not None:
+        needed = needed_forces(carry.workcell, box_motion(carry).at(rows))
+    table = np.column_stack([time, carry.pose, carry.q, force])[rows]
+    return _once(np.column_stack([table, needed]))

@@ -15,9 +15,12 @@ import numpy as np
 from hybrid_opt.campaign.stages import Cells, cells_of, ready_cells
 from hybrid_opt.display.objects import ARM_COLOURS
 from hybrid_opt.display.scene import packed, scene_data
+from hybrid_opt.indicators.metrics import front_of
+from hybrid_opt.recommending.recommendation import ABOVE_STILL, level_force
+from hybrid_opt.robust.cases import LEADER
 from hybrid_opt.workers import LocalWorkers, Workers
 from studies.report.data import Experiment, ReportData
-from studies.report.drawing import MARKED, DrawnCarry, LineStyle
+from studies.report.drawing import MARKED, LineStyle
 from studies.report.page_carries import (
     RECOMMENDED_LABEL,
     RECOMMENDED_TITLE,
@@ -40,8 +43,8 @@ LOOK_MARGIN = 0.06
 SHOWN_SLOWDOWN = 2.2
 """Durations in the first look at time and force, over the shortest one."""
 
-HIGHEST = 1.3
-"""Forces there, over the least one."""
+HIGHEST = 1.15
+"""Forces there, over the allowed one."""
 
 SYMBOLS = {
     "o": "circle",
@@ -55,9 +58,6 @@ SYMBOLS = {
 
 CHOICE = {"color": MARKED, "symbol": "star", "size": 17}
 """Marker of the recommended carry."""
-
-DASHES = ("solid", "dash")
-"""Dashes of the two robots' lines."""
 
 
 def plain(text: str) -> str:
@@ -161,57 +161,58 @@ def _finite(points: Array) -> Array:
     return points[np.isfinite(points).all(axis=1)]
 
 
-def drive_look(points: Array, always: Array) -> Array:
-    """Points (k, 2) of force and duration that the first look shows.
+def drive_look(points: Array, always: Array, allowed: float) -> Array:
+    """Return the points (k, 2) of force and duration that the first look shows.
 
-    Both ends of a drivable front are long and flat: forces next to that of holding still, and
-    durations next to the shortest. Neither is to squash what lies between.
+    Both ends of a drivable front are long and flat. Neither is to squash what lies between.
 
     Args:
         points: of the fronts and curves.
         always: (n, 2) what the look has to show besides.
+        allowed: the reference force [N].
     """
     points = _finite(points)
     if len(points) == 0:
         return always
-    force, duration = points.min(axis=0)
-    near = (points[:, 0] <= HIGHEST * force) & (points[:, 1] <= SHOWN_SLOWDOWN * duration)
+    duration = points[:, 1].min()
+    near = (points[:, 0] <= HIGHEST * allowed) & (points[:, 1] <= SHOWN_SLOWDOWN * duration)
     return np.concatenate([points[near], always])
 
 
-def carry_plots(workcell: Workcell, rest: float | None) -> dict[str, Plot]:
-    """Build the plots of one trajectory by the ids of their elements. `meta` states the content of
-    a trace: a column of its samples and a factor, a level, or one arm's share of a list of all
-    joints.
-
-    Args:
-        rest: largest normal force of the level payload at rest [N], None where it is not known.
-    """
-    joints = [len(robot.torque_max) for robot in workcell.robots]
-    radius = 1e3 * min(contact.patch_radius for contact in workcell.contacts)
-    force = 7 + sum(joints)
+def carry_plots(workcell: Workcell) -> dict[str, Plot]:
+    """Return the plots of one trajectory by the ids of their elements. `meta` says what fills a
+    trace: a column of its samples, a level, or one arm's share of a list of all joints; and what it
+    is called where forces are planned ones."""
+    joints, arm = [len(robot.torque_max) for robot in workcell.robots], 1 - LEADER
+    force, robot = 7 + sum(joints), plain(workcell.robots[arm].name)
     curve = {"type": "scatter", "mode": "lines"}
-    plots = {}
-    for name, title, column, scale, label, level in (
-        ("force-plot", "normal force [N]", force, 1.0, "level payload at rest", rest),
-        ("pressure-plot", "pressure shift [mm]", force + 2, 1e3, "patch radius", radius),
-    ):
-        traces = [
-            {
-                **curve,
-                "name": plain(robot.name),
-                "line": {"color": ARM_COLOURS[i], "dash": DASHES[i], "width": 2},
-                "meta": {"column": column + i, "scale": scale},
-            }
-            for i, robot in enumerate(workcell.robots)
-        ]
-        if level is not None:
-            look = {"color": "#000", "dash": "dot", "width": 1.5}
-            meta = {"level": level}
-            traces.append({**curve, "name": label, "hoverinfo": "name", "line": look, "meta": meta})
-        y = {"title": {"text": title}, "rangemode": "normal"}
-        x = {"title": {"text": "time [s]", "standoff": 6}}
-        plots[name] = _carry_plot(traces, showlegend=True, xaxis=x, yaxis=y)
+    traces = [
+        {
+            **curve,
+            "name": name,
+            "line": {"color": colour, "dash": dash, "width": width},
+            "meta": {"column": column, "planned": planned},
+        }
+        for name, planned, column, colour, dash, width in (
+            (
+                f"commanded, {robot}",
+                f"planned, {robot}",
+                force + arm,
+                ARM_COLOURS[arm],
+                "solid",
+                2.4,
+            ),
+            ("needed in every case", "", force + 2, "#b00020", "solid", 1.4),
+            ("needed if all is as described", "", force + 3, "#555555", "dash", 1.4),
+        )
+    ]
+    level = float(workcell.task.reference_force[arm])
+    look = {"color": "#000", "dash": "dot", "width": 1.5}
+    allowed = {"name": f"allowed {level:.1f} N", "hoverinfo": "name", "line": look}
+    traces.append({**curve, **allowed, "meta": {"level": level}})
+    y = {"title": {"text": "normal force [N]"}, "rangemode": "tozero"}
+    x = {"title": {"text": "time [s]", "standoff": 6}}
+    plots = {"force-plot": _carry_plot(traces, showlegend=True, xaxis=x, yaxis=y)}
     bars = [
         {
             "type": "bar",
@@ -237,10 +238,13 @@ def _carry_plot(traces: list[Plot], **layout: Any) -> Plot:
 
 
 MAX_FRONT = 40
-"""Trajectories of one front on the page, spread evenly over it."""
+"""Trajectories of one front of the search on the page, spread evenly over it."""
 
-CURVE_MEMBERS = 6
-"""Points of a path's time against force that can be clicked."""
+MAX_DRIVEN = 16
+"""Likewise of a front that robots drive: limits on jerk take a second of work each."""
+
+CURVE_MEMBERS = 4
+"""Points of the hand-made path's time against force."""
 
 MAX_CELL_BYTES = 2_000_000
 """A cell whose files are larger is not put into the page, so that nothing can be saved from it."""
@@ -254,7 +258,9 @@ class MeshGroup:
         listed: name of their list.
         shown: the trajectories.
         label, look: of their points in the picture; without a look they are only listed.
-        points: (k, 2) of the picture, None for the force and the duration as robots drive them.
+        points: (k, 2) of the picture, None for the commanded force and the duration as robots
+            drive them.
+        joined: whether a line joins the points.
     """
 
     listed: str
@@ -262,17 +268,25 @@ class MeshGroup:
     label: str = ""
     look: Plot | None = None
     points: Array | None = None
+    joined: bool = False
 
 
 Numbered = tuple[MeshGroup, list[int]]
 """A group and the numbers of its trajectories on the page."""
 
 
-def page_document(data: ReportData, workers: Workers | None = None) -> dict[str, Any]:
-    """Return the page's data as JSON values; without workers this process computes them."""
+def page_document(
+    data: ReportData, workers: Workers | None = None, paper: bool = True
+) -> dict[str, Any]:
+    """Return the page's data as JSON values; without workers this process computes them.
+
+    Args:
+        paper: whether the first experiment's selected carries and fronts are shown, too.
+    """
     # Where the cell itself is drivable there is one experiment.
     cells = [] if data.alone else [(data.files, data.objectives)]
-    drive, search = list[MeshGroup](), [] if data.alone else list(_search_groups(data))
+    drive = list[MeshGroup]()
+    search = [] if data.alone else list(_search_groups(data, paper or data.drivable is None))
     if data.drivable is not None:
         drive = list(_drive_groups(data, data.drivable, len(cells)))
         cells.append((data.drivable.files, data.drivable.objectives))
@@ -286,9 +300,9 @@ def page_document(data: ReportData, workers: Workers | None = None) -> dict[str,
     views = []
     if data.drivable is not None:
         views.append(_drive_view(data, data.drivable, numbered[: len(drive)], found))
-    if search:
+    if any(group.look for group in search):
         views.append(_search_view(data, numbered[len(drive) :], found))
-    still, force = data.at_rest, data.workcell.task.reference_force
+    driven = data.recommended_carry or data.carries[-1]
     return {
         "joints": [len(robot.torque_max) for robot in data.workcell.robots],
         "robots": [robot.name for robot in data.workcell.robots],
@@ -296,15 +310,13 @@ def page_document(data: ReportData, workers: Workers | None = None) -> dict[str,
         "first": int(data.drivable is None and len(numbered[0][1]) > 1),
         "trajectories": found,
         "views": views,
-        "plots": carry_plots(
-            data.workcell, None if still is None else float((still * force).max())
-        ),
+        "plots": carry_plots((data.drivable or data).workcell),
         "lists": [{"label": group.listed, "members": members} for group, members in numbered],
         "cells": [
             cell_to_json(files) if sum(map(len, files.files.values())) <= MAX_CELL_BYTES else None
             for files, _ in cells
         ],
-        **scene_data(data.geometry, data.carries[-1].timed),
+        **scene_data(data.geometry, driven.timed),
     }
 
 
@@ -313,7 +325,7 @@ def _trajectory(cells: Cells, shown: PageTrajectory) -> dict[str, Any]:
 
 
 def _drive_groups(data: ReportData, drivable: Experiment, cell: int) -> Iterator[MeshGroup]:
-    """Yield the recommended carry, some of the paths' points at every force, and the fronts."""
+    """Yield the recommended carry, the hand-made path at some forces, and the final fronts."""
     if data.recommended is not None:
         found = data.summary.recommendation
         source = "" if found is None else found.source
@@ -321,59 +333,61 @@ def _drive_groups(data: ReportData, drivable: Experiment, cell: int) -> Iterator
             source, data.recommended, cell, recommended=True, job=data.job(RECOMMENDED_LABEL)
         )
         yield MeshGroup(RECOMMENDED_TITLE, (shown,), RECOMMENDED_TITLE, CHOICE)
-    low, high = drivable.workcell.task.force_limit
-    for carry, label, curve in curves(data):
-        own, task = carry.timed.workcell.task, drivable.workcell.task
-        source, path = carry.source, resample_decisions(carry.x, own, task)[0, : task.n_path]
-        force = curve[evenly(len(curve), CURVE_MEMBERS), 0]
-        some = tuple(
-            PageTrajectory(source, np.append(path, limit), cell)
-            for limit in force
-            if low <= limit <= high
-        )
-        yield MeshGroup(f"{label}, timed", some, f"{label}, timed", marker(carry.look, size=7))
-    for look, front, opened in drivable.fronts():
-        some = tuple(
-            PageTrajectory(front.source, front.x[k], cell) for k in evenly(len(front), MAX_FRONT)
-        )
-        yield MeshGroup(front.source, some, front.title, marker(look, opened))
+    (low, high), task = drivable.workcell.task.force_limit, drivable.workcell.task
+    (path,) = resample_decisions(data.initial.x, data.initial.timed.workcell.task, task)
+    still = level_force(drivable.workcell, drivable.force_kind)
+    limits = np.array(ABOVE_STILL)[evenly(len(ABOVE_STILL), CURVE_MEMBERS)] * still
+    some = tuple(
+        PageTrajectory(data.initial.source, np.append(path[: task.n_path], limit), cell)
+        for limit in limits.tolist()
+        if low <= limit <= high
+    )
+    look = marker(data.initial.look, size=7)
+    label = data.initial.label
+    yield MeshGroup(f"{label}, driven", some, label, look, joined=True)
+    for look_of, front, replaced in drivable.fronts():
+        if not replaced:
+            rows = evenly(len(front), MAX_DRIVEN)
+            some = tuple(PageTrajectory(front.source, front.x[k], cell) for k in rows)
+            yield MeshGroup(front.source, some, front.title, marker(look_of))
 
 
-def _search_groups(data: ReportData) -> Iterator[MeshGroup]:
-    """Hand-made and selected trajectories, and the fronts of the first experiment."""
+def _search_groups(data: ReportData, paper: bool) -> Iterator[MeshGroup]:
+    """Yield the hand-made and the selected trajectories, and the fronts of the first experiment;
+    without the paper's the hand-made one alone."""
     picked = [PageTrajectory(c.source, c.x, job=data.job(c.label)) for c in data.carries]
+    if not paper:
+        yield MeshGroup("Hand-made", tuple(picked[:1]))
+        return
     yield MeshGroup("Hand-made and selected", tuple(picked))
     two = len(data.objectives) >= 2
     for style, front, opened in data.fronts():
         rows = evenly(len(front), MAX_FRONT)
-        some = tuple(PageTrajectory(front.source, front.x[k], has_job=False) for k in rows)
+        some = tuple(PageTrajectory(front.source, front.x[k]) for k in rows)
         look = marker(style, opened) if two else None
         yield MeshGroup(front.source, some, front.title, look, front.objectives[rows][:, :2])
 
 
-def curves(data: ReportData) -> Iterator[tuple[DrawnCarry, str, Array]]:
-    """Hand-made and selected paths: carry, label, and where they can be driven force limits [N] and
-    durations [s] (k, 2)."""
-    for carry, (_, timed) in zip(data.carries, data.timings, strict=True):
-        if timed.force_curve is None:
-            continue
-        length = len(timed.force_curve.force)
-        curve = np.column_stack([timed.force_curve.force, timed.force_curve.duration[:length]])
-        label = carry.label if carry is data.initial else f"{carry.label}: least force"
-        yield carry, label, curve[np.isfinite(curve[:, 1])]
-
-
 def _traces(groups: Sequence[Numbered], found: Sequence[dict[str, Any]]) -> Iterator[Plot]:
-    """Yield the points of groups in a plot."""
+    """Yield the points of groups that stand in a picture."""
     for group, members in groups:
         if group.look is None:
             continue
-        at = group.points
+        at, look = group.points, group.look
         if at is None:
-            # The largest limited force [N] and the duration [s] as robots drive it.
-            driven = [(found[k]["force"], found[k]["motions"][0]["duration"]) for k in members]
-            at = np.array(driven)
-        yield points(group.label, at, members, [found[k]["label"] for k in members], group.look)
+            held = [k for k in members if found[k]["commanded"] is not None]
+            members = sorted(held, key=lambda k: found[k]["commanded"])
+            at = np.array([(found[k]["commanded"], found[k]["duration"]) for k in members])
+            beyond = [found[k]["beyond"] for k in members]
+            symbol = look["symbol"]
+            if any(beyond):
+                symbols = [f"{symbol}-open" if far else symbol for far in beyond]
+                look = {**look, "symbol": symbols}
+        trace = points(group.label, at, members, [found[k]["label"] for k in members], look)
+        if group.joined:
+            line = {"color": look["color"], "dash": "dot", "width": 1.4}
+            trace |= {"mode": "lines+markers", "line": line}
+        yield trace
 
 
 def _drive_view(
@@ -382,29 +396,33 @@ def _drive_view(
     groups: Sequence[Numbered],
     found: Sequence[dict[str, Any]],
 ) -> Plot:
-    """Time against force of hand-made path, the other experiment's optimum and the fronts."""
-    clouds, lines, drawn = [], [], []
-    for algorithm in drivable.solved:
-        at = drivable.driven(algorithm.shown.feasible)
-        clouds.append(cloud(algorithm.title, at, algorithm.look))
-    for carry, label, curve in curves(data):
-        dash = "dot" if carry is data.initial else "dash"
-        lines.append(line(label, curve, carry.look.colour, dash))
-        drawn.append(curve)
+    """Return time against commanded force of the hand-made path and the fronts, as jobs drive
+    them, with the recommended carry and the allowed force."""
+    allowed = float(drivable.workcell.task.reference_force[1 - LEADER])
     # The recommended carry is drawn last, above all others.
     shown = sorted(_traces(groups, found), key=lambda trace: trace["name"] == RECOMMENDED_TITLE)
-    timed = {f"{one['name']}, timed" for one in lines}
-    chosen = np.zeros((0, 2))
-    for trace in shown:
-        at = np.column_stack([trace["x"], trace["y"]])
-        trace["showlegend"] = trace["name"] not in timed
-        # Carries that robots cannot drive have no place between force and time.
-        drawn.append(at[[not found[member]["problem"] for member in trace["customdata"]]])
-        chosen = at if trace["name"] == RECOMMENDED_TITLE else chosen
-    seen = drive_look(np.concatenate([*drawn, np.zeros((0, 2))]), chosen)
-    kind = data.force_kind
-    titles = (f"{kind.title} [N]", "duration [s]")
-    return front_plot(f"Time against {kind.name}", titles, [*clouds, *lines, *shown], seen)
+    at = {t["name"]: np.column_stack([t["x"], t["y"]]) for t in shown}
+    hand_made = data.initial.label
+    chosen = at.get(RECOMMENDED_TITLE, np.zeros((0, 2)))
+    own = [points for name, points in at.items() if name != hand_made]
+    best = front_of(np.concatenate([*own, np.zeros((0, 2))]))
+    joined = line("front", best[np.argsort(best[:, 0])], "#555555", "solid")
+    every = np.concatenate([*at.values(), np.zeros((0, 2))])
+    least = np.array([[allowed, every[:, 1].min(initial=np.inf)]])
+    seen = drive_look(every, np.concatenate([chosen, least]), allowed)
+    titles = ("largest commanded force [N]", "duration of the carry [s]")
+    view = front_plot("Time against commanded force", titles, [joined, *shown], seen)
+    view["layout"] |= _allowed(allowed)
+    return view
+
+
+def _allowed(force: float) -> Plot:
+    """Return a line up the picture at the reference force, with its name."""
+    look = {"color": "#8a6d00", "dash": "dash", "width": 1.6}
+    line = {"type": "line", "x0": force, "x1": force, "yref": "paper", "y0": 0, "y1": 1}
+    text = {"x": force, "yref": "paper", "y": 1, "text": f"allowed {force:.1f} N"}
+    place = {"showarrow": False, "xanchor": "right", "yanchor": "top"}
+    return {"shapes": [{**line, "line": look}], "annotations": [text | place]}
 
 
 def _search_view(
@@ -426,4 +444,4 @@ def _search_view(
         searched.append(data.at_rest[None])
     first = np.concatenate([points[:, :2] for points in searched]) if two else np.zeros((0, 2))
     axes = (f"{titles[0]} [-]", f"{titles[1]} [-]")
-    return front_plot("The search's objectives", axes, [*traces, *shown], first)
+    return front_plot("The paper's search, planned forces", axes, [*traces, *shown], first)

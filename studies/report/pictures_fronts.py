@@ -9,24 +9,25 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.path import Path
 from matplotlib.ticker import MaxNLocator
 
 from hybrid_opt.display.table import counted
 from hybrid_opt.evaluate.evaluation import FEASIBLE, REASONS
 from hybrid_opt.indicators.metrics import best_so_far, front_of
 from hybrid_opt.indicators.statistics import attainment_surfaces
-from studies.report.data import AlgorithmRuns, Experiment, ReportData
+from studies.report.data import AlgorithmRuns, ReportData
 from studies.report.drawing import (
     MARKED,
     RECOMMENDED_STYLE,
     legend_below,
+    limit_line,
     new_figure,
     panel_label,
-    rest_line,
+    series,
     shortened,
 )
-from studies.report.page_data import curves, drive_look, limits
+from studies.report.page_carries import RECOMMENDED_LABEL
+from studies.report.page_data import limits
 from studies.study.recommendation import StoredRecommendation
 from studies.study.tables import constraint_title
 from symbolic.array import Array
@@ -179,66 +180,25 @@ def _zoom(axes: Axes, data: ReportData, sets: Sequence[Array]) -> None:
     axes.set_ylim(*y_limits)
 
 
-def duration_against_force(data: ReportData) -> Figure:
-    """Durations for each limit on the forces: of single paths, and of the drivable fronts
-    where there are any: members at their peak forces, and the fastest of a replica's paths at
-    every force (median and range of the replicas)."""
+def duration_against_force(data: ReportData, choice: StoredRecommendation) -> Figure:
+    """Shortest drivable durations with at most a commanded force, held in every case of the
+    uncertainty: single paths, and all paths that the recommended carry was chosen from. Limits on
+    jerk hold only for the star."""
     figure = new_figure(0.5)
     axes = figure.subplots()
-    drawn = []
-    for carry, label, curve in curves(data):
-        marked = "" if data.drivable else carry.look.marker
-        axes.plot(*curve.T, **carry.look.drawn, marker=marked, markersize=3.5, label=label)
-        drawn.append(curve)
-    choice = data.summary.recommendation
-    if data.drivable is not None:
-        for look, front, opened in data.drivable.fronts():
-            found = data.drivable.driven(front.objectives)
-            axes.plot(*found.T, **look.marks(4.0, opened=opened), label=front.title)
-            drawn.append(found)
-        if choice is not None:
-            drawn += _replicas(axes, data.drivable, choice)
-    always = np.zeros((0, 2))
-    if choice is not None:
-        always = np.array([[choice.force_limit, choice.duration]])
-        axes.plot(*always[0], **RECOMMENDED_STYLE.marks(11.0, MARKED), label="recommended")
-    rest_line(axes, data.level_force, "at rest", across=False)
-    if any(len(found) for found in drawn):
-        x_limits, y_limits = limits(drive_look(np.concatenate(drawn), always))
-        at_rest = data.level_force - 0.02 * (x_limits[1] - x_limits[0])
-        axes.set_xlim(min(at_rest, x_limits[0]), x_limits[1])
-        axes.set_ylim(*y_limits)
-    axes.set_xlabel(f"{data.force_kind.title} [N]")
+    force, looks = np.array(choice.durations.forces), {RECOMMENDED_LABEL: RECOMMENDED_STYLE}
+    looks |= {data.initial.label: data.initial.look}
+    for k, row in enumerate(choice.durations.rows):
+        look = looks.get(row.label, series(k))
+        axes.plot(force, row.durations, **look.drawn, marker=look.marker, label=row.label)
+    star = RECOMMENDED_STYLE.marks(11.0, MARKED)
+    axes.plot(choice.force, choice.duration, **star, label="recommended, within limits on jerk")
+    if choice.allowed is not None:
+        limit_line(axes, float(choice.allowed.min()), "reference force", across=False)
+    axes.set_xlabel("largest commanded force [N]")
     axes.set_ylabel("duration [s]")
-    _forget_unseen(axes)
-    legend_below(figure, axes, 4)
+    legend_below(figure, axes, 3)
     return figure
-
-
-def _forget_unseen(axes: Axes) -> None:
-    """Take what lies outside the axes' limits out of their legend."""
-    for line in axes.lines:
-        at = line.get_transform().transform(np.column_stack(line.get_data()))
-        if not Path(at[np.isfinite(at).all(axis=1)]).intersects_bbox(axes.bbox, filled=False):
-            line.set_label("_")
-
-
-def _replicas(axes: Axes, drivable: Experiment, choice: StoredRecommendation) -> list[Array]:
-    """Durations of the best fronts' paths at the same forces; returns the points of the medians."""
-    # Where a front was polished, only the polished one.
-    looks = {front.title: look for look, front, opened in drivable.fronts() if not opened}
-    force, drawn = np.array(choice.durations.forces), []
-    for row in choice.durations.rows:
-        if row.label not in looks:
-            continue
-        colour, label = looks[row.label].colour, f"{row.label}: fastest path"
-        if row.replicas > 1:
-            label = f"{row.label}: {counted(row.replicas, 'replica')}"
-        axes.plot(force, row.median, color=colour, linestyle="-", linewidth=0.9, label=label)
-        axes.fill_between(force, row.least, row.largest, color=colour, alpha=0.2, linewidth=0.0)
-        median = np.array(row.median)
-        drawn.append(np.stack([force, median], axis=1)[np.isfinite(median)])
-    return drawn
 
 
 LATE = 0.5

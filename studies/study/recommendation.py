@@ -1,10 +1,8 @@
-"""The drivable fronts with the paths that stand beside them; the carry to run: the stage that picks
-it, and its words."""
+"""The carry to run: the stage that recommends it from the drivable fronts, and its record."""
 
 from __future__ import annotations
 
 import math
-import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,7 +24,7 @@ from hybrid_opt.errors import NoCarryError
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator, concatenated
 from hybrid_opt.evaluate.explanation import explain
 from hybrid_opt.evaluate.objectives import DRIVABLE_PAIRS, PLANNED_FORCE, ROBUST_FORCE, ForceKind
-from hybrid_opt.front import Front, select
+from hybrid_opt.front import select
 from hybrid_opt.progress import Advance, Progress
 from hybrid_opt.recommending.advice import Advice
 from hybrid_opt.recommending.choice import DrivenPaths, wished_cell
@@ -35,15 +33,14 @@ from hybrid_opt.recommending.recommendation import (
     STEPS,
     Recommendation,
     Rival,
-    front_durations,
-    over_replicas,
+    commanded_durations,
     spread_rows,
     table_forces,
 )
-from hybrid_opt.robust.budget import Remedy
+from hybrid_opt.robust.budget import Remedy, Reserve
 from hybrid_opt.robust.cases import LEADER
 from hybrid_opt.robust.force import RobustPrice, robust_model, robust_price
-from hybrid_opt.robust.squeeze import Part, account
+from hybrid_opt.robust.squeeze import Part
 from hybrid_opt.store.files import read_record, to_json, write_json
 from hybrid_opt.store.trajectory_file import write_trajectory
 from hybrid_opt.timing.jerk import applicable_jerk_limits
@@ -55,29 +52,25 @@ from symbolic.records import Task, Workcell
 
 @dataclass(frozen=True)
 class StoredDurations:
-    """How long paths take at the forces of a table [s], null where they cannot move.
+    """Shortest durations at the forces of a table [s], null where a path cannot move.
 
     Attributes:
-        label: whose they are.
-        replicas: how many fronts stand behind the figures, 1 for a single path.
-        median, least, largest: over the replicas, one per force.
+        label: of a path, or of all paths that the carry was chosen from.
+        durations: one per force, limits on jerk left out.
     """
 
     label: str
-    replicas: Count
-    median: tuple[Figure, ...]
-    least: tuple[Figure, ...]
-    largest: tuple[Figure, ...]
+    durations: tuple[Figure, ...]
 
 
 @dataclass(frozen=True)
 class ForceTable:
-    """Durations at the same forces.
+    """Durations at the same commanded forces.
 
     Attributes:
-        forces: limits on both forces [N].
-        rows: hand-made path, recommended one, optimum of the other experiment, then every
-            algorithm's fronts.
+        forces: largest forces to command of the force-controlled arm [N]; the last one is the
+            reference force.
+        rows: hand-made path, recommended one, optimum of the other experiment, the front.
     """
 
     forces: tuple[float, ...]
@@ -92,7 +85,6 @@ class StoredRecommendation:
         wish, why: what was asked for, as values and as words.
         source: whose it is, as 'NSGA-II, polished, replica 3'.
         file: its trajectory file, relative to the folder.
-        export: the command that makes of it what robots need, run in the folder.
         duration: as robots drive it, limits on jerk kept [s].
         force: largest force to command of the force-controlled arm [N]; the one force.
         parts: what it is made of, its sum.
@@ -103,25 +95,27 @@ class StoredRecommendation:
             about these; else null.
         without_jerk: duration without the cell's limits on jerk [s], null where there are none.
         squeeze, squeeze_reason: largest normal force to command of each robot [N], and why.
-        payload_limit: payload that the robots bear on the same motion, nothing uncertain [kg].
+        payload_limit: payload that the robots bear on the same motion with planned forces, nothing
+            uncertain [kg].
         rivals: other paths at the same force and in the same time, the hand-made one first.
         margins: how far the cell's description may be off at the commanded force.
         advice: what changes of the cell would change.
         warnings: what speaks against it.
         considered: carries that it was chosen from.
-        durations: how long all fronts take at the same forces.
+        durations: of paths and the front at the same commanded forces.
         price: of robustness, null where no set leaves friction and patches.
         required: largest force that either arm presses with or feels in any case [N].
         allowed: the robots' reference forces [N].
         at_rest: what holding still takes of them, in words.
         remedies: where they do not allow the carry, the smallest changes with which they do.
+        reserve: how heavy and how slippery the box may be within the reference forces, in every
+            case of the uncertainty; null where that is not known.
     """
 
     wish: ho.Wish
     why: str
     source: str
     file: str
-    export: str
     duration: float
     force: float
     parts: tuple[Part, ...]
@@ -144,6 +138,12 @@ class StoredRecommendation:
     allowed: Pair | None = None
     at_rest: str = ""
     remedies: tuple[Remedy, ...] = ()
+    reserve: Reserve | None = None
+
+    @property
+    def fits(self) -> bool:
+        """Return True if it holds in every case within the reference forces."""
+        return not self.remedies
 
     @property
     def force_kind(self) -> ForceKind:
@@ -217,7 +217,7 @@ def recommend_from(
     drivable = read_campaign(drivable_root(root, campaign.workcell, campaign.objectives))
     threads = threads or available_cores()
     cell = wished_cell(ho.Cell(drivable.workcell, drivable.objectives, threads), wish)
-    own, best, fronts = _hand_made(cell), union(drivable.fronts), drivable.fronts
+    own, best = _hand_made(cell), union(drivable.fronts)
     x = np.vstack([*(front.x[row, None] for front, row in best), own])
     sources = [*(front.source for front, _ in best), *[HAND_MADE] * len(own)]
     if len(x) == 0:
@@ -225,12 +225,12 @@ def recommend_from(
     alone = is_drivable(campaign.workcell, campaign.objectives)
     others = {} if alone else least_force(campaign, cell.workcell.task)
     # The choice with its rivals, the table's rows and the price.
-    steps = STEPS + 4 + 2 * len(others) + len(fronts)
+    steps = STEPS + 5 + 2 * len(others)
     with progress.stage("recommendation", steps, "steps") as advance:
         found = ho.recommend(
             ho.Front.of(cell, x), wish, others, progress=lambda done, total: advance(1)
         )
-        durations = _force_table(cell, fronts, others, found, advance)
+        durations = _force_table(cell, x, others, found, advance)
         price, driven = None, found.carry.workcell
         if not driven.uncertainty.is_empty:
             rng = np.random.default_rng(campaign.settings.seed)
@@ -254,7 +254,6 @@ def recommend_from(
         why=found.why,
         source=source,
         file=file,
-        export=export_command(Path(file)),
         duration=found.duration,
         force=found.force,
         parts=found.squeeze.parts,
@@ -277,6 +276,7 @@ def recommend_from(
         allowed=found.budget.allowed,
         at_rest=str(found.budget),
         remedies=found.remedies,
+        reserve=found.reserve,
     )
 
 
@@ -307,154 +307,28 @@ def _why_none(cell: ho.Cell, results: CampaignResults) -> str:
 
 def _force_table(
     cell: ho.Cell,
-    fronts: Sequence[Front],
+    x: Array,
     others: Mapping[str, Array],
     found: Recommendation,
     advance: Advance,
 ) -> ForceTable:
-    """Every front's durations at the same forces, that of the recommended carry among them."""
-    task = cell.workcell.task
-    forces = np.unique(np.append(table_forces(cell.workcell, cell.force_kind), found.limit))
-
-    def durations(paths: Array) -> Array:
-        least = np.full(len(forces), np.inf)
-        if len(paths):
-            least = front_durations(DrivenPaths(cell, paths), forces)
-        advance(1)
-        return least
-
-    paths = {HAND_MADE: cell.initial[: task.n_path], "recommended": found.x[: task.n_path]}
-    every = {label: [durations(path[None])] for label, path in (paths | dict(others)).items()}
-    for front in fronts:
-        members = front.x[:, : task.n_path]
-        every.setdefault(front.title, []).append(durations(members[spread_rows(members)]))
+    """Time paths, and the front of carries x (k, n_var), at the same commanded forces, that of the
+    recommended carry among them."""
+    n = cell.workcell.task.n_path
+    forces = np.unique(np.append(table_forces(cell.workcell), found.force))
+    paths = {HAND_MADE: cell.initial[:n], "recommended": found.x[:n]} | dict(others)
+    chosen = x[spread_rows(x[:, :n])]
+    every = {label: (path[None], np.array([found.limit])) for label, path in paths.items()}
     rows = []
-    for label, known in every.items():
-        median, least, largest = (tuple(each.tolist()) for each in over_replicas(known))
-        rows.append(StoredDurations(label, len(known), median, least, largest))
+    for label, (known, limits) in (every | {FRONT: (chosen[:, :n], chosen[:, -1])}).items():
+        durations = commanded_durations(DrivenPaths(cell, known), limits, forces)
+        rows.append(StoredDurations(label, tuple(durations.tolist())))
+        advance(1)
     return ForceTable(tuple(forces.tolist()), tuple(rows))
 
 
-EXPORT_TARGET = "torque"
-
-ADVICE, NOTICED = 3, 0.05
-"""Most changes that a terminal lists, and the least change of the force by one [N]."""
-
-
-@dataclass(frozen=True)
-class RecommendationText:
-    """The opening text of a study.
-
-    Attributes:
-        headline: the carry in one line.
-        facts: heading and text, in the order in which they matter.
-        warnings: what speaks against it.
-    """
-
-    headline: str
-    facts: tuple[tuple[str, str], ...]
-    warnings: tuple[str, ...]
-
-    def terminal(self) -> str:
-        """Text for a terminal."""
-        width = max(len(heading) for heading, _ in self.facts)
-        lines = [self.headline]
-        lines += [f"  {heading:<{width}}  {text}" for heading, text in self.facts]
-        return "\n".join(lines + [f"  WARNING: {text}" for text in self.warnings])
-
-
-def recommendation_text(found: StoredRecommendation, folder: str) -> RecommendationText:
-    """Format a stored recommendation in words.
-
-    Args:
-        folder: of the results, in front of the files' names; '' where the reader is in it.
-    """
-    job = f", the whole job {found.job_duration:.1f} s" if math.isfinite(found.job_duration) else ""
-    carry = f"{found.duration:.2f} s, press with {found.force:.1f} N{job}"
-    headline, facts = f"Run this carry: {carry}", list[tuple[str, str]]()
-    if found.remedies:
-        headline = f"No carry fits: {found.at_rest}"
-        facts = [
-            ("what would do", ", or ".join(map(str, found.remedies))),
-            (f"if you allow {found.required:.1f} N", carry),
-        ]
-    facts += [
-        ("why", f"{found.why}; of {found.considered} drivable carries, from {found.source}"),
-        ("file", str(Path(folder) / found.file)),
-        ("export", export_command(Path(folder) / found.file)),
-        ("the force", f"{account(found.parts)}; {found.squeeze_reason}"),
-        *[(rival.label, _rival(rival, found)) for rival in found.rivals],
-        ("margins", "; ".join(_margins(found)) or "not known"),
-        *([("grip", found.at_rest)] if found.at_rest and not found.remedies else []),
-    ]
-    told = [str(each) for each in found.advice if abs(each.force) >= NOTICED][:ADVICE]
-    if told:
-        facts.append(("with this path", "; ".join(told)))
-    if found.price is not None:
-        facts.append(("holds", _robust(found.price)))
-    return RecommendationText(headline, tuple(facts), found.warnings)
-
-
-def export_command(path: Path) -> str:
-    """Return the command that makes of a trajectory file, timed within its own limits, what robots
-    need."""
-    output = path.with_name(f"{path.stem}-{EXPORT_TARGET}")
-    return (
-        f"python -m studies.export {shlex.quote(str(path))} --target {EXPORT_TARGET} "
-        f"--output {shlex.quote(str(output))}"
-    )
-
-
-def _rival(rival: Rival, found: StoredRecommendation) -> str:
-    """Another path beside the recommended carry."""
-    duration, force = rival.duration_at_force, rival.force_at_duration
-    same_force = "cannot be held with the same force"
-    same_time = "cannot be driven in the same time"
-    if math.isfinite(duration):
-        same_force = f"{duration:.2f} s at the same force ({_percent(duration / found.duration)})"
-    if math.isfinite(force):
-        same_time = f"{force:.1f} N in the same time ({_percent(force / found.force)})"
-        if found.allowed is not None and force > found.allowed.min():
-            same_time += f", above the reference force of {found.allowed.min():.1f} N"
-    return f"{same_force}, {same_time}"
-
-
-def _robust(price: RobustPrice) -> str:
-    """Describe the set, the largest multiple of it that the arms allow, and random cases."""
-    slips = "slips" if price.check.failing == 1 else "slip"
-    return (
-        f"in every case of {price.uncertainty.title} ({price.uncertainty}), of which the leading "
-        f"arm feels up to {max(price.commanded):.1f} N; the reference forces would hold "
-        f"{price.largest_factor:.2f} times as much; "
-        f"{price.check.failing or 'none'} of {price.check.cases} random cases {slips}"
-    )
-
-
-def _percent(ratio: float) -> str:
-    return f"{100.0 * (ratio - 1.0):+.1f} %"
-
-
-def _margins(found: StoredRecommendation) -> list[str]:
-    """Margins of friction, force and mass at the commanded force, and the nearest limit of the
-    centre of mass along each axis."""
-    texts = []
-    for margin in found.margins:
-        if margin.quantity == "friction of both contacts":
-            texts.append(f"friction down to {margin.limit:.2f}")
-        elif margin.quantity == "share of the force that is missing":
-            texts.append(f"{100.0 * margin.limit:.0f} % less force")
-        elif margin.quantity == "mass":
-            texts.append(f"mass up to {margin.limit:.1f} kg")
-    offs = {
-        margin.quantity[-1]: abs(margin.limit - margin.nominal)
-        for margin in sorted(found.margins, key=lambda m: -abs(m.limit - m.nominal))
-        if margin.quantity.startswith("centre of mass")
-    }
-    if offs:
-        along = ", ".join(f"{1e3 * offs[axis]:.0f} mm along {axis}" for axis in sorted(offs))
-        texts.append(f"centre of mass off by {along}")
-    return texts
-
+FRONT = "the front"
+"""All paths that the recommended carry was chosen from."""
 
 LEAST_FORCE_PATH = "least-force"
 """The path that the other experiment ends with, beside which the recommended carry stands."""

@@ -54,12 +54,11 @@ from hybrid_opt.store.files import (
     write_json,
 )
 from hybrid_opt.store.trajectory_file import write_trajectory
+from studies.study.answer import Answer, Fact, answer
 from studies.study.recommendation import (
     NoRecommendation,
-    RecommendationText,
     StoredRecommendation,
     read_recommendation,
-    recommendation_text,
 )
 from symbolic.array import Array, Count, Figure, Pair, Range, Row
 
@@ -265,14 +264,19 @@ class CampaignSummary:
             files[name] = file_of(Path(), name, found.replica).relative_to(SELECTED)
         return files
 
-    def words(self, folder: str) -> RecommendationText | None:
-        """Return the opening words of a study: the carry to run, or why there is none, with its
-        folder as in `recommendation_text`; None if neither is known."""
+    def answer(self, folder: str) -> Answer | None:
+        """Return what a study opens with: the carry to run, or why there is none; None where
+        neither is known.
+
+        Args:
+            folder: of the results, as for `studies.study.answer.answer`.
+        """
         if self.recommendation is not None:
-            return recommendation_text(self.recommendation, folder)
+            return answer(self.recommendation, folder)
         if not self.no_recommendation:
             return None
-        return RecommendationText("No carry is recommended", (("why", self.no_recommendation),), ())
+        why = Fact("why", self.no_recommendation)
+        return Answer("bad", "No carry is recommended", details=(why,))
 
 
 def read_summary(root: str | Path) -> CampaignSummary:

@@ -347,18 +347,16 @@ def rank_tests(summary: CampaignSummary) -> Table:
 
 
 def time_against_force(found: StoredRecommendation) -> Table:
-    """How long paths and fronts take at the same forces."""
+    """Tabulate how long paths and the front take at the same commanded forces."""
     table = found.durations
     return Table(
         "time_against_force",
-        f"Time against {found.force_kind.name}: shortest drivable durations [s].",
-        ("path or front", *(f"{force:.2f} N" for force in table.forces)),
-        tuple(
-            (row.label, *map(FINE_DURATION.spread, row.median, row.least, row.largest))
-            for row in table.rows
-        ),
-        "Every path timed anew at the force. Of fronts the fastest member: median over the "
-        "replicas [least, most]. Union: of all replicas' fronts, polished as one.",
+        "Time against commanded force: shortest drivable durations [s].",
+        ("path or front", *(f"{force:.1f} N" for force in table.forces)),
+        tuple((row.label, *map(FINE_DURATION, row.durations)) for row in table.rows),
+        "Every path timed anew with at most that force commanded, held in every case of the "
+        "uncertainty, limits on jerk left out. The last force is the reference force. The front: "
+        "all paths that the recommended carry was chosen from.",
     )
 
 

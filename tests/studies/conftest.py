@@ -25,6 +25,7 @@ from tests.symbolic.cells import ROOT
 TRANSFER = ROOT / "studies" / "workcells" / "transfer.toml"
 
 SMALL = ["--evaluations", "120", "--replicas", "2", "--seed", "3", "--jobs", "1", "--no-polish"]
+SMALL += ["--paper"]
 """Options of the study."""
 
 PRINTED = "printed.txt"

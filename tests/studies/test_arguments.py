@@ -110,7 +110,6 @@ def test_a_wrong_place_is_refused_before_anything_heavy_is_imported(
         ("run cell --simulate", "mujoco"),
         ("run cell --executor dask", "distributed"),
         ("run cell --animation new/x.mp4", "imageio_ffmpeg"),
-        ("export carry.json --target mcap", "rosbags"),
         ("research.thresholds", "mujoco"),
     ],
 )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import signal
 import subprocess
 import sys
@@ -141,6 +142,22 @@ def test_help_imports_nothing_heavy() -> None:
     assert (done.stderr, int(count)) == ("", len(PROGRAMS))
     assert set(imported).isdisjoint(HEAVY)
     assert "numpy" in imported
+
+
+@pytest.mark.parametrize("name", PROGRAMS)
+def test_help_fits_a_screen_and_hides_nothing_unnamed(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    module, _ = programs()[name]
+    parser = import_module(module).main.parser()
+    brief, whole = parser.format_help(), parser.format_whole_help()
+    assert sum(1 + max(len(line) - 1, 0) // 80 for line in brief.splitlines()) <= 50
+    for action in parser._actions:
+        if action.help != argparse.SUPPRESS:
+            first = (action.option_strings or [action.dest])[-1].removeprefix("--no-")
+            assert first in whole or first.upper() in whole
+            assert first in brief or first.upper() in brief
 
 
 def test_the_installed_command_runs_every_program(

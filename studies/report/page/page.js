@@ -11,7 +11,7 @@
   const CONFIG = { ...OWN,
     modeBarButtonsToRemove: ["sendChartToCloud", "lasso2d", "autoScale2d"] };
   const PLAIN = { ...OWN, displayModeBar: false };
-  const STAR = "star", NEAR = 12, OVER_TIME = ["force-plot", "pressure-plot"];
+  const STAR = "star", NEAR = 12, OVER_TIME = "force-plot";
   const dark = window.matchMedia("(prefers-color-scheme: dark)");
 
   function button(parent, text, act) {
@@ -78,8 +78,8 @@
   function drawFront() {
     const view = data.views[state.view];
     const range = state.whole ? view.whole : view.first;
-    const below = 60 + legendHeight(view.data, $("front-plot").clientWidth - 85);
-    $("front-plot").style.height = `${340 + below}px`;
+    const below = 55 + legendHeight(view.data, $("front-plot").clientWidth - 85);
+    $("front-plot").style.height = `${Math.max(460, 300 + below)}px`;
     const { margin, xaxis, yaxis } = view.layout;
     const layout = themed({ ...view.layout, margin: { ...margin, b: below },
       xaxis: { ...xaxis, range: range[0].slice() }, yaxis: { ...yaxis, range: range[1].slice() } });
@@ -119,18 +119,17 @@
     button($("views"), "Whole fronts", () => { state.whole = !state.whole; drawFront(); }).id = "whole";
   }
 
-  /* Both plots over time, with the samples of a motion. */
+  /* Forces over time, with the samples of a motion; of planned ones nothing else is known. */
   function drawOverTime(motion) {
     const samples = samplesOf(motion);
-    OVER_TIME.forEach((id) => {
-      const { data: traces, layout } = data.plots[id];
-      const filled = traces.map((trace) => "level" in trace.meta
-        ? { ...tinted(trace), x: [0, samples.end], y: [trace.meta.level, trace.meta.level] }
-        : { ...trace, x: samples.times,
-          y: samples.rows.map((row) => trace.meta.scale * row[trace.meta.column]) });
-      Plotly.react(id, filled, themed({ ...layout, shapes: marks(motion, 0),
-        xaxis: { ...layout.xaxis, range: [0, samples.end] } }), PLAIN);
-    });
+    const { data: traces, layout } = data.plots[OVER_TIME];
+    const known = traces.filter((trace) => motion.isCommanded || trace.meta.planned || "level" in trace.meta);
+    const filled = known.map((trace) => "level" in trace.meta
+      ? { ...tinted(trace), x: [0, samples.end], y: [trace.meta.level, trace.meta.level] }
+      : { ...tinted(trace), name: motion.isCommanded ? trace.name : trace.meta.planned,
+        x: samples.times, y: samples.rows.map((row) => row[trace.meta.column]) });
+    Plotly.react(OVER_TIME, filled, themed({ ...layout, shapes: marks(motion, 0),
+      xaxis: { ...layout.xaxis, range: [0, samples.end] } }), PLAIN);
   }
 
   /* The cursor, and where phases begin. */
@@ -206,11 +205,10 @@
     const carry = carries[state.selected];
     const motion = shown();
     const peaks = data.robots.map((robot, i) => `${robot} ${motion.peaks[i].toFixed(2)} N`);
-    const what = motion.phases ? `commanded at most ${peaks.join(", ")} (${motion.remark})`
-      : `peak normal forces ${peaks.join(", ")}`;
-    const problems = [carry.problem, carry.jobProblem && `no whole job: ${carry.jobProblem}`];
-    $("figures-of-choice").textContent = [`${motion.duration.toFixed(2)} s, ${what}, payload at ` +
-      `the limit ${motion.payloadLimit.toFixed(2)} kg (${motion.name})`,
+    const what = motion.isCommanded ? `commanded at most ${peaks.join(", ")}`
+      : `planned at most ${peaks.join(", ")}`;
+    const problems = [motion.remark, carry.problem, carry.jobProblem && `no whole job: ${carry.jobProblem}`];
+    $("figures-of-choice").textContent = [`${motion.name}: ${motion.duration.toFixed(2)} s, ${what}`,
       ...problems.filter((text) => text)].join("; ");
     drawOverTime(motion);
     fillPhases();
@@ -236,6 +234,15 @@
     setTimeout(() => URL.revokeObjectURL(link.href), 1000);
   }
 
+  /* The command before a button; where a browser keeps its clipboard to itself it is marked. */
+  function copy(made) {
+    const text = made.previousElementSibling.querySelector("code");
+    getSelection().selectAllChildren(text);
+    const say = () => { made.textContent = "Copied"; };
+    if (navigator.clipboard) navigator.clipboard.writeText(text.textContent).then(say, () => {});
+    else if (document.execCommand("copy")) say();
+  }
+
   function seek(share) {
     const samples = samplesOf(shown());
     state.share = Math.min(1, Math.max(0, share));
@@ -254,8 +261,7 @@
     const now = performance.now();
     if (!state.playing || now - state.marked > 120) {
       state.marked = now;
-      OVER_TIME.forEach((id) =>
-        Plotly.relayout(id, { shapes: marks(shown(), time) }));
+      Plotly.relayout(OVER_TIME, { shapes: marks(shown(), time) });
     }
   }
 
@@ -291,20 +297,10 @@
 
   /* --- the table of all carries --- */
 
-  /* As its job drives it, where one is planned: in whole cycles of the controllers. */
-  function duration(carry) {
-    const phases = carry.motions.flatMap((motion) => motion.phases || []);
-    return (phases.find((phase) => phase.name === "carry") || carry.motions[0]).duration;
-  }
-
-  /* The largest force that is commanded of the force-controlled arm; NaN without a job. */
-  function commanded(carry) {
-    return carry.motions.find((motion) => motion.phases)?.commanded ?? NaN;
-  }
-
-  const TOLD = [["carry", (c) => c.label.split(": ")[0]], ["time [s]", duration],
-    ["force [N]", (c) => c.force], ["commanded [N]", commanded],
-    ["payload at the limit [kg]", (c) => c.motions[0].payloadLimit]];
+  const orNone = (value) => value ?? NaN;
+  const TOLD = [["carry", (c) => c.label.split(": ")[0]], ["time [s]", (c) => c.duration],
+    ["commanded [N]", (c) => orNone(c.commanded)], ["planned [N]", (c) => c.planned],
+    ["payload, planned forces [kg]", (c) => c.motions[0].payloadLimit]];
   const listing = { column: 1, sign: 1, brushed: null };
   const recommended = data.lists.find((list) => list.label === "Recommended")?.members[0];
 
@@ -312,7 +308,7 @@
     const [name, time, force] = TOLD.slice(0, 3).map(([, of]) => of(carries[k]));
     const most = (id) => ($(id).value === "" ? Infinity : Number($(id).value));
     return name.toLowerCase().includes($("filter-text").value.toLowerCase()) &&
-      time <= most("filter-time") && force <= most("filter-force") &&
+      time <= most("filter-time") && !(force > most("filter-force")) &&
       (!listing.brushed || listing.brushed.has(k));
   }
 
@@ -337,6 +333,10 @@
       TOLD.forEach(([, of], i) => {
         const told = of(carries[k]), cell = line.insertCell();
         const text = i ? (told !== told ? "\u2013" : told.toFixed(2)) : (k === recommended ? "\u2605 " : "") + told;
+        if (i === 2 && carries[k].beyond) {
+          cell.className = "beyond";
+          cell.title = "above the allowed force";
+        }
         if (i) { cell.textContent = text; return; }
         button(cell, text, () => select(k)).addEventListener("focus", () => pictures && mark(k));
       });
@@ -403,6 +403,13 @@
   });
   $("save").addEventListener("click", save);
   $("play").addEventListener("click", () => setPlaying(!state.playing));
+  $("play-job")?.addEventListener("click", () => {
+    if (recommended !== undefined) select(recommended);
+    seek(0);
+    setPlaying(true);
+    $("scene").scrollIntoView({ block: "nearest" });
+  });
+  document.querySelectorAll(".copy").forEach((made) => made.addEventListener("click", () => copy(made)));
   $("scrub").addEventListener("input", (event) => {
     setPlaying(false);
     seek(Number(event.target.value) / 1000);

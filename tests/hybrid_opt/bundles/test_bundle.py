@@ -14,12 +14,13 @@ from typing import Any
 import pytest
 
 from hybrid_opt.bundles import BundleOptions, Origin, export
-from hybrid_opt.bundles.bundle import read_manifest, write_bundle
+from hybrid_opt.bundles.bundle import missing_for, read_manifest, write_bundle
 from hybrid_opt.errors import JobError, ResultsError
 from hybrid_opt.job.records import Job
 from hybrid_opt.store.files import sha256
 from hybrid_opt.timing.records import Timing
 from symbolic.errors import SettingsError
+from symbolic.records.cell import ToolLoad
 from tests.hybrid_opt.bundles.bundles import DRIVER, driven, rack_driven
 from tests.hybrid_opt.job.jobs import rack_job, rack_jobs, rack_timing
 
@@ -160,6 +161,10 @@ def test_the_manifest_says_what_it_is(tmp_path: Path) -> None:
     assert rack_job().workcell.task.allocation == "paper"
     assert squeeze["assumes"].endswith("by moments commanded at both wrists")
     assert document["units"]["force"] == "N"
+    (page,) = (path.read_text() for path in tmp_path.rglob("README.md"))
+    assert f"{document['duration']:.2f} s, pressed with at most {squeeze['force']:.1f} N" in page
+    assert all(f"`{name}`" in page for name in document["files"] if name != "README.md")
+    assert all(warning in page for warning in document["warnings"])
     assert document["how_to_run"]
     assert any("tool_load" in warning for warning in document["warnings"])
     rough = written(rack_jobs().plan(rack_timing(), smoothing=0.0), "data", tmp_path, step=0.1)
@@ -224,7 +229,7 @@ REFUSED: dict[str, tuple[str, Callable[[], Job | Timing], dict[str, Any], str]] 
     "not UR's language": ("ur-script", by, {}, "does not look like an arm of UR"),
     "no force": (
         *("abb-egm", lambda: by(force_control=False), {}),
-        "would not squeeze: positions.*before the study",
+        "would not squeeze: positions.*before the study, or into a file for export --driver",
     ),
     "no lag": ("abb-egm", lambda: by(lag=0.0), {}, "compensates the lag of 'left'"),
     "no stiffness": (
@@ -254,6 +259,26 @@ def test_a_target_says_what_it_lacks(name: str, tmp_path: Path) -> None:
     with pytest.raises(SettingsError, match=told):
         written(job(), target, tmp_path, **options)
     assert not list(tmp_path.iterdir())
+
+
+def test_a_cell_says_what_it_lacks_for_a_target() -> None:
+    """Before any carry, in the words that refuse an export."""
+    bare, equipped = by(address="", force_control=False, stiffness=None).workcell, by().workcell
+    told = missing_for("abb-egm", bare)
+    wanted = (
+        "where the controller",
+        "would not squeeze",
+        "nobody states",
+        "tool_load",
+        "tool_load",
+    )
+    assert len(told) == len(wanted)
+    assert all(word in problem for word, problem in zip(wanted, told, strict=True))
+    loads = tuple(replace(robot, tool_load=ToolLoad(0.5)) for robot in equipped.robots)
+    assert missing_for("abb-egm", replace(equipped, robots=(loads[0], loads[1]))) == ()
+    assert "driven by abb-egm" in missing_for("torque", equipped)[0]
+    with pytest.raises(SettingsError, match="unknown target"):
+        missing_for("xml", bare)
 
 
 def test_the_other_arm_is_named_where_it_can_press(tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ from hybrid_opt.recommending.recommendation import (
     HAND_MADE,
     STEPS,
     Recommendation,
-    front_durations,
+    commanded_durations,
     spread_rows,
     table_forces,
 )
@@ -361,13 +361,40 @@ def test_odd_wishes_are_refused(values: dict[str, Any]) -> None:
 
 
 def test_a_front_is_as_fast_as_its_fastest_member(drivable: ho.Cell, front: ho.Front) -> None:
+    """Within a commanded force, which grows with the multiple of what holds still in every case."""
     forces = table_forces(drivable.workcell)
-    assert forces == pytest.approx(np.array([1.02, 1.04, 1.06, 1.08, 1.12, 1.2]) * 49.05)
-    members = front.x[spread_rows(front.x[:, :-1])]
-    paths = DrivenPaths(drivable, members[:, :-1])
-    every = np.array([paths.durations(force) for force in forces])
-    np.testing.assert_array_equal(front_durations(paths, forces), every.min(axis=1))
-    np.testing.assert_array_equal(members[[0, -1]], front.x[[0, -1]])
+    still = ho.grip_budget(drivable.workcell).required.max()
+    allowed = drivable.workcell.task.reference_force.max()
+    expected = [m * still for m in (1.02, 1.04, 1.06, 1.08, 1.12, 1.2) if m * still < allowed]
+    assert forces == pytest.approx(np.array([*expected, allowed]), rel=1e-3)
+    members = front.x[spread_rows(front.x[:, :-1])][:2]
+    limits = members[:, -1]
+    whole = commanded_durations(DrivenPaths(drivable, members[:, :-1]), limits, forces)
+    alone = [
+        commanded_durations(DrivenPaths(drivable, x[None, :-1]), x[-1], forces) for x in members
+    ]
+    np.testing.assert_array_equal(whole, np.min(alone, axis=0))
+    assert (np.diff(whole[np.isfinite(whole)]) <= 1e-9).all(), "more force, less time"
+
+
+def test_the_reserve_is_used_up_at_the_reference_force(
+    drivable: ho.Cell, found: Recommendation
+) -> None:
+    """By the forces of the changed cells, found anew."""
+    payload, allowed = drivable.workcell.payload, found.budget.allowed.max()
+    assert payload.mass < found.reserve.payload < found.carry.payload_limit
+    assert found.reserve.friction < drivable.workcell.contacts[0].friction
+    factor = found.reserve.payload / payload.mass
+    heavier = replace(payload, mass=factor * payload.mass, inertia=factor * payload.inertia)
+    first, second = (
+        replace(pad, friction=found.reserve.friction) for pad in drivable.workcell.contacts
+    )
+    for cell in (
+        replace(drivable.workcell, payload=heavier),
+        replace(drivable.workcell, contacts=(first, second)),
+    ):
+        held = robust_model(cell).hold(found.carry, cell.uncertainty)
+        assert max(each.max() for each in held) == pytest.approx(allowed, rel=5e-3)
 
 
 def test_options_are_those_of_the_independent_timing(drivable: ho.Cell, front: ho.Front) -> None:

@@ -136,6 +136,27 @@ def test_a_bundle_is_written(
     assert (folder / "data" / "mine.txt").read_text() == "mine"
 
 
+def test_drivers_may_come_from_a_file_after_the_study(
+    of_a_study: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    driver = {"address": "10.0.0.1", "force_control": True, "lag": 0.03, "stiffness": 1e4}
+    names = [robot.name for robot in load(RACK).robots]
+    listed = "\n".join(f"{key} = {json.dumps(value)}" for key, value in driver.items())
+    file = tmp_path / "drivers.toml"
+    entries = [f'[[robots]]\nname = "{name}"\n[robots.driver]\n{listed}\n' for name in names]
+    file.write_text("\n".join(entries), "utf-8")
+    arguments = [str(of_a_study), "--target", "abb-egm", "--output", str(tmp_path / "bundles")]
+    assert export.main(arguments) == 2
+    assert "where the controller of" in capsys.readouterr().err
+    assert export.main([*arguments, "--driver", str(file)]) == 0
+    assert "next: cd " in capsys.readouterr().out
+    (config,) = (tmp_path / "bundles").rglob("egm.json")
+    assert json.loads(config.read_text())["addresses"] == ["10.0.0.1", "10.0.0.1"]
+    file.write_text('[[robots]]\nname = "nobody"\n', "utf-8")
+    assert export.main([*arguments, "--driver", str(file)]) == 2
+    assert "states no driver" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

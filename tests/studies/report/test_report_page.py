@@ -26,14 +26,14 @@ from hybrid_opt.display.table import NOTHING
 from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES, PAPER_OBJECTIVES
 from hybrid_opt.indicators.metrics import BindingBound
 from hybrid_opt.job.plan import JobModel
-from hybrid_opt.robust.squeeze import SqueezeSettings
+from hybrid_opt.job.smooth import driven_timing
 from studies.report import PAGE, generate, page_carries, page_data
 from studies.report.data import ReportData
 from studies.report.generate import report_tables, write_report
-from studies.report.page_carries import PageTrajectory, page_trajectory, pressure_shift
+from studies.report.page_carries import PageTrajectory, page_trajectory
 from studies.report.page_data import page_document
 from studies.study import tables
-from studies.study.recommendation import recommendation_text
+from studies.study.answer import answer
 from symbolic.array import Array
 from symbolic.contact.elastic import free_shift
 from symbolic.read.cell import load
@@ -83,6 +83,7 @@ def hostile_page(memoise: Once, data: ReportData) -> Path:
         Image.new("RGB", (1, 1)).save(point, "PNG")
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(page_data, "MAX_FRONT", 2)
+            patch.setattr(page_data, "MAX_DRIVEN", 2)
             patch.setattr(generate, "files_of", lambda *_: {"png": point.getvalue()})
             write_report(folder, with_hostile_names(data), with_paper=True, pdf=False)
 
@@ -187,83 +188,87 @@ def test_data_of_the_page_are_the_trajectories(data: ReportData, document: dict[
     assert len(shown) <= 70
     best = data.solved[0].best
     assert best is not None
-    # In both pictures: once as it was selected, and at some of the forces of its curve.
     name = f"{best.label}, replica {front.replica}: least force: "
-    assert sum(one["label"].startswith(name) for one in document["trajectories"]) >= 2
+    assert sum(one["label"].startswith(name) for one in document["trajectories"]) == 1
 
 
-def test_every_point_shows_what_robots_drive_and_its_job(
+def test_points_of_fronts_are_what_jobs_drive_and_press(
     data: ReportData, document: dict[str, Any], text: str
 ) -> None:
-    """Timed by `time_path` and planned by `plan_job`, named by algorithm, replica and values."""
+    """Timed within limits on jerk and pressed as their jobs are, planned here one by one."""
     assert data.drivable is not None
-    view, (_, front, _) = document["views"][0], next(data.drivable.fronts())
-    group = next(g for g in points(view) if g["name"] == front.title)
-    assert len(group["customdata"]) == len(front.x)
     cell = Cell(data.drivable.workcell, DRIVABLE_OBJECTIVES)
-    for k in (0, len(front.x) - 1):
-        x = front.x[k]
-        timing = ho.time_path(cell, x, ho.TimingLimits(force=float(x[-1])))
-        shown = document["trajectories"][group["customdata"][k]]
-        motion, whole = shown["motions"]
-        assert motion["duration"] == pytest.approx(timing.duration, abs=1e-5)
-        assert max(motion["peaks"]) <= x[-1] * 1.005
-        assert (group["x"][k], group["y"][k]) == (max(motion["peaks"]), motion["duration"])
-        assert shown["label"].startswith(f"{front.source}: {timing.duration:.2f} s, ")
-        assert timing.carry is not None
-        torque = np.abs(timing.carry.torque).max(axis=0)
-        use = 100.0 * torque / data.workcell.stack_joint_limits("torque_max")
-        np.testing.assert_allclose(motion["torqueUse"], use, atol=1e-2)
-        job = JobModel(cell.compiled, cell.timing_model).plan(timing, within_jerk=False)
-        assert whole["name"] == "the whole job"
-        assert whole["duration"] == pytest.approx(job.duration, abs=1e-5)
-        assert whole["peaks"] == pytest.approx(job.peak_normal_force, abs=1e-3)
-        for mine, phase in zip(whole["phases"], job.phases, strict=True):
-            assert mine["name"] == phase.name.replace("_", " ")
-            assert mine["duration"] == pytest.approx(phase.duration, abs=1e-5)
-            assert mine["use"] == pytest.approx(100.0 * phase.use[mine["most"]], abs=1e-2)
-        effort = np.concatenate([phase.effort for phase in job.phases])
-        use = 100.0 * np.abs(effort).max(axis=0) / data.workcell.stack_joint_limits("torque_max")
-        np.testing.assert_allclose(whole["torqueUse"], use, atol=1e-2)
-        table = samples(whole)
-        assert np.all(np.diff(table[:, 0]) > 0.0)
-        ends = [job.phases[0].motion.q[0], job.phases[-1].motion.q[-1]]
-        np.testing.assert_allclose(table[[0, -1], 7:19], ends, atol=1e-5)
-        np.testing.assert_allclose(table[[0, -1], 19:21], 0.0)
-    searched = document["trajectories"][points(document["views"][1])[0]["customdata"][0]]
-    names = ["as robots drive it", "as the search assumed: ramped speed"]
-    assert [motion["name"] for motion in searched["motions"]] == names
-    assert "an export plans any" in searched["jobProblem"]
+    allowed = cell.workcell.task.reference_force.max()
+    view = document["views"][0]
+    assert view["layout"]["shapes"][0]["x0"] == allowed
+    numbers = [k for group in points(view) for k in group["customdata"]]
+    assert len(numbers) == len(set(numbers)), "one marker a point"
+    model, shown = JobModel(cell.compiled, cell.timing_model), document["trajectories"]
+    group = next(g for g in points(view) if g["name"] == data.drivable.solved[0].title)
+    assert group["x"] == sorted(group["x"])
+    for k in (0, len(group["customdata"]) - 1):
+        found = shown[group["customdata"][k]]
+        x = np.array(found["decision"])
+        job = model.plan(driven_timing(cell.timing_model, x))
+        assert (group["x"][k], group["y"][k]) == (found["commanded"], found["duration"])
+        # A job's carry takes whole ticks.
+        assert found["duration"] == pytest.approx(job.phase("carry").duration, abs=0.01)
+        assert found["commanded"] == pytest.approx(job.squeeze.force, rel=2e-3)
+        assert found["planned"] < found["commanded"]
+        assert found["beyond"] == (found["commanded"] > 1.001 * allowed)
+        assert ("above the reference force" in found["label"]) == found["beyond"]
+        assert found["jobProblem"].endswith("an export plans any")
+    # The front that is drawn has the star on it, as its job drives it.
+    choice = data.summary.recommendation
+    assert choice is not None
+    (star,) = (g for g in points(view) if g["name"] == "Recommended")
+    assert star["x"][0] == pytest.approx(choice.force, abs=1e-3)
+    assert star["y"][0] == pytest.approx(choice.duration, abs=1e-5)
+    front = next(trace for trace in view["data"] if trace["name"] == "front")
+    assert (star["x"][0], star["y"][0]) in zip(front["x"], front["y"], strict=True)
+    assert np.all(np.diff(front["x"]) > 0.0)
+    assert np.all(np.diff(front["y"]) < 0.0)
     assert "Phases of the whole jobs." in text
-    assert [job.label for job in data.jobs][:2] == ["recommended", "hand-made"]
+    assert [job.label for job in data.jobs] == ["recommended", "hand-made"]
     assert not any(job.problem for job in data.jobs)
+
+
+def test_what_is_commanded_is_never_less_than_what_is_needed(document: dict[str, Any]) -> None:
+    whole = document["trajectories"][document["first"]]["motions"][1]
+    assert whole["name"] == "the whole job"
+    table = samples(whole)
+    assert np.all(np.diff(table[:, 0]) > 0.0)
+    commanded, every, described = table[:, 20], table[:, 21], table[:, 22]
+    held = np.isfinite(every)
+    assert 0 < held.sum() < len(table), "the box stands before and after"
+    assert (commanded[held] >= every[held] * (1.0 - 1e-5)).all()
+    assert (every[held] >= described[held] * (1.0 - 1e-5)).all()
+    assert commanded.max() == pytest.approx(whole["peaks"][1], abs=1e-3)
+
+
+def test_without_the_papers_pictures_the_page_has_the_recommended_carry_alone(
+    data: ReportData, tmp_path: Path
+) -> None:
+    brief = replace(data, reach=None)
+    names = [picture.name for picture in generate.report_pictures(brief)]
+    assert names == ["duration_against_force", "motion_recommended", "robust_price"]
+    document = page_document(brief, paper=False)
+    assert [group["label"] for group in document["lists"]][-1] == "Hand-made"
+    assert len(document["views"]) == 1
+    page = generate.render_page(brief, document, report_tables(brief, False), [""] * len(names))
+    assert "python -m studies.report . --paper" in page
+    assert "Table 1. Quality of the search." in page
 
 
 def test_points_are_named_by_what_was_minimised(data: ReportData) -> None:
     cell = Cell(data.workcell, ("mean_force", "friction_use"))
     ready = ReadyCell(cell, JobModel(cell.compiled, cell.timing_model))
-    shown = PageTrajectory("NSGA-II, replica 1", data.initial.x, has_job=False)
+    shown = PageTrajectory("NSGA-II, replica 1", data.initial.x)
     trajectory = page_trajectory((ready,), shown)
     mean, friction = trajectory["objectives"]
     assert trajectory["label"] == (
         f"NSGA-II, replica 1: mean force {mean:.4f}, friction use {friction:.4f}"
     )
-
-
-def test_pressure_shifts_are_those_of_the_plan(data: ReportData) -> None:
-    """Without more squeeze than planned, the wrenches put the centre of pressure where the plan
-    has it."""
-    cell = Cell(data.workcell)
-    timing = ho.time_path(cell, data.initial.x, ho.TimingLimits(reference_speed=True))
-    model = JobModel(cell.compiled, cell.timing_model)
-    settings = SqueezeSettings(factor=1.0, smoothing=0.002)
-    job = model.plan(timing, settings, within_jerk=False)
-    carry = job.timing.carry
-    assert carry is not None
-    phase = job.phase("carry")
-    shift = pressure_shift(job, phase)[: len(carry)]
-    extra = phase.force.normal[: len(carry)] / carry.normal_force
-    np.testing.assert_allclose(shift * extra, carry.pressure_shift, atol=2e-5)
 
 
 def test_the_page_begins_with_the_recommended_carry(
@@ -275,11 +280,11 @@ def test_the_page_begins_with_the_recommended_carry(
     assert first["label"].startswith("Recommended")
     # A job's carry takes whole ticks.
     assert first["motions"][0]["duration"] == pytest.approx(found.duration, abs=0.01)
-    assert f"pressed with {found.force:.1f} N" in first["label"]
-    words = recommendation_text(found, "")
-    for _, sentence in words.facts:
-        assert html.escape(sentence) in text
-    assert html.escape(words.headline) in text
+    assert f"press with {found.force:.1f} N" in first["label"]
+    opening = answer(found, "")
+    for fact in (*opening.facts, *opening.commands, *opening.details):
+        assert html.escape(fact.text) in text
+    assert html.escape(opening.headline) in text
     assert "The forces of this experiment are of pads that choose their pressure, by" in text
     assert "What robots drive is of pads that press evenly, on arms that keep" in text
 
@@ -319,7 +324,7 @@ def test_the_first_look_is_not_squashed(document: dict[str, Any], data: ReportDa
 def test_polished_fronts_stand_beside_the_searchs(
     hybrid_data: ReportData, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    named = {"label": "", "problem": "", "force": 1.0, "motions": [{"duration": 1.0}]}
+    named = {"label": "", "commanded": 1.0, "duration": 1.0, "beyond": False}
     monkeypatch.setattr(page_data, "page_trajectory", lambda *_: named)
     groups = points(page_document(hybrid_data)["views"][1])
     assert [group["name"] for group in groups] == [

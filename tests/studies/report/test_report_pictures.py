@@ -55,6 +55,10 @@ from symbolic.read.cell import load
 from tests.studies.conftest import TRANSFER
 
 NAMES = (
+    "duration_against_force",
+    "motion_recommended",
+    "robust_price",
+    "simulated_forces",
     "fig04_reachable_regions",
     "fig05_cell",
     "fig06_arm",
@@ -72,10 +76,6 @@ NAMES = (
     "fig13_paths",
     "motion_nsga2",
     "motion_mopso",
-    "motion_recommended",
-    "duration_against_force",
-    "robust_price",
-    "simulated_forces",
 )
 
 HYBRID = ("polish", "simulated_forces")
@@ -338,6 +338,7 @@ def test_views_are_rotations(view: View) -> None:
 
 def test_reach_holds_the_carry_and_ends_where_the_arm_does(data: ReportData) -> None:
     reach = data.reach
+    assert reach is not None
     for pose in data.initial.timed.pose[::10]:
         cube = tuple(((pose[:3] - reach.lower) / reach.step).astype(int))
         assert reach.common[cube]

@@ -28,15 +28,17 @@ from hybrid_opt.progress import Progress
 from hybrid_opt.recommending.choice import Wish
 from hybrid_opt.store.trajectory_file import read_trajectory, replay
 from hybrid_opt.timing.analysis import read_timing
-from studies import rack, recommend, run
+from studies import export, rack, recommend, run
+from studies import replay as replay_program
+from studies.program import Program
 from studies.programs.study import campaign_settings, polish_settings, study_text
 from studies.report import PAGE
 from studies.report import __main__ as report
+from studies.study.answer import answer, carry_text
 from studies.study.recommendation import (
     StoredRecommendation,
     read_recommendation,
     recommend_from,
-    recommendation_text,
 )
 from studies.study.summary import read_summary
 from symbolic.read.cell import load
@@ -93,16 +95,17 @@ def test_study_opens_with_a_carry_to_run(program_run: tuple[Path, str], tmp_path
     root, printed = program_run
     found = read_summary(root).recommendation
     assert found is not None
-    words = recommendation_text(found, str(root))
-    assert printed.startswith(words.terminal())
+    opening = answer(found, str(root))
+    assert printed.startswith(opening.terminal())
     assert f"Run this carry: {found.duration:.2f} s, press with {found.force:.1f} N" in printed
     assert sum(part.force for part in found.parts) == pytest.approx(found.force)
     assert f"= {found.force:.1f} N; holds pads that press evenly in every case" in printed
     assert "--target torque --output" in printed
-    assert "--force-limit" not in found.export, "a carry is exported as it is stored"
-    assert str(root) not in found.export, "it holds wherever the folder is moved"
+    (command,) = (fact.text for fact in answer(found, "").commands if fact.is_command)
+    assert "--force-limit" not in command, "a carry is exported as it is stored"
+    assert str(root) not in command, "it holds wherever the folder is moved"
     stored = read_trajectory(root / found.file)
-    assert replay(stored, tmp_path).reproduced
+    assert replay(stored, stored.open_cell(tmp_path)).reproduced
     assert stored.x[-1] == found.force_limit
     drivable = read_campaign(root / "drivable")
     assert drivable.objectives == ("duration", "peak_force")
@@ -111,8 +114,8 @@ def test_study_opens_with_a_carry_to_run(program_run: tuple[Path, str], tmp_path
     assert (fronts[:, :-1] == stored.x[:-1]).all(axis=1).any()
     assert [rival.label for rival in found.rivals] == ["hand-made", "least-force"]
     labels = [row.label for row in found.durations.rows]
-    assert labels == ["hand-made", "recommended", "least-force", "NSGA-II", "MOPSO"]
-    assert [row.replicas for row in found.durations.rows] == [1, 1, 1, 2, 2]
+    assert labels == ["hand-made", "recommended", "least-force", "the front"]
+    assert found.durations.forces[-1] == 117.68
     for folder, law in ((root, "ramped"), (root / "drivable", "optimal")):
         task, hand_made = read_campaign(folder).workcell.task, folder / "selected/hand-made.json"
         assert task.time_law == law
@@ -123,6 +126,30 @@ def test_study_opens_with_a_carry_to_run(program_run: tuple[Path, str], tmp_path
     assert jerk is not None
     assert jerk.duration > jerk.without
     assert max(jerk.joint_use, jerk.payload_use) == pytest.approx(1.0, abs=0.01)
+
+
+def test_every_program_states_the_same_carry(
+    program_run: tuple[Path, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Terminal, page, recommend, replay and export: the line of the carry to the last digit."""
+    root, printed = program_run
+    found = read_summary(root).recommendation
+    assert found is not None
+    line = carry_text(found.duration, found.force, found.job_duration)
+    file, page = root / found.file, (root / PAGE).read_text("utf-8")
+    assert f"Run this carry: {line}\n" in printed
+    assert f"Run this carry: {line}<" in page
+    for fact in answer(found, "").facts:
+        assert re.search(rf"  {fact.heading} +{re.escape(fact.sentence)}\n", printed)
+        assert html.escape(fact.text) in page
+    calls: list[tuple[Program, list[str]]] = [
+        (recommend.main, [str(root), "--output", str(tmp_path / "again.json"), "--quiet"]),
+        (replay_program.main, [str(file)]),
+        (export.main, [str(file), "--target", "torque", "--output", str(tmp_path / "bundle")]),
+    ]
+    for program, arguments in calls:
+        assert program(arguments) == 0
+        assert line in capsys.readouterr().out, program.name
 
 
 def test_drivable_fronts_are_polished_as_one_and_others_replica_by_replica(study: Path) -> None:

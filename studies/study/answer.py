@@ -1,0 +1,244 @@
+"""The words and numbers that a study opens with: the carry to run, in every program the same.
+
+The terminal prints them, the page shows them first, `studies.replay` and `studies.export` repeat
+the line of the carry. Forces are commanded ones unless they are called planned.
+"""
+
+from __future__ import annotations
+
+import math
+import shlex
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from hybrid_opt.job.records import Job
+from hybrid_opt.recommending.recommendation import Rival
+from hybrid_opt.robust.cases import LEADER
+from hybrid_opt.robust.force import RobustPrice
+from hybrid_opt.robust.squeeze import account
+from studies.study.recommendation import StoredRecommendation
+
+State = Literal["good", "doubtful", "bad"]
+"""Verdicts on a carry: it holds in every case without a warning; with one; it does not fit."""
+
+EXPORT_TARGET = "torque"
+
+ADVICE, NOTICED = 3, 0.05
+"""Most changes that a terminal lists, and the least change of the force by one [N]."""
+
+
+@dataclass(frozen=True)
+class Fact:
+    """One line of an answer.
+
+    Attributes:
+        heading: what it is about.
+        text: one phrase.
+        is_command: whether the text is to be copied into a shell.
+        note: what belongs to it in smaller letters.
+    """
+
+    heading: str
+    text: str
+    is_command: bool = False
+    note: str = ""
+
+    @property
+    def sentence(self) -> str:
+        """Text and note in one line."""
+        return f"{self.text}, {self.note}" if self.note else self.text
+
+
+@dataclass(frozen=True)
+class Answer:
+    """The opening of a study.
+
+    Attributes:
+        state: the verdict on the carry.
+        headline: the carry in one line.
+        facts: time, force, job, and whether it holds, the first screen of the page.
+        commands: what to run next.
+        details: everything else, in the order in which it matters.
+        warnings: what speaks against the carry.
+    """
+
+    state: State
+    headline: str
+    facts: tuple[Fact, ...] = ()
+    commands: tuple[Fact, ...] = ()
+    details: tuple[Fact, ...] = ()
+    warnings: tuple[str, ...] = ()
+
+    def terminal(self) -> str:
+        """Return the text for a terminal."""
+        shown = (*self.facts, *self.commands, *self.details)
+        width = max(len(fact.heading) for fact in shown)
+        lines = [self.headline]
+        lines += [f"  {fact.heading:<{width}}  {fact.sentence}" for fact in shown]
+        return "\n".join(lines + [f"  WARNING: {text}" for text in self.warnings])
+
+
+def carry_text(duration: float, force: float, job_duration: float) -> str:
+    """Return the line of a carry: its duration [s], the largest force to command [N] and the
+    duration of the whole job [s], NaN without one."""
+    job = f", the whole job {seconds(job_duration)}" if math.isfinite(job_duration) else ""
+    return f"{seconds(duration)}, press with {newtons(force)}{job}"
+
+
+def job_text(job: Job) -> str:
+    """Return the line of the carry of a planned job."""
+    return carry_text(job.phase("carry").duration, job.squeeze.force, job.duration)
+
+
+def seconds(duration: float) -> str:
+    """Return a duration as the first screen writes it."""
+    return f"{duration:.2f} s"
+
+
+def newtons(force: float) -> str:
+    """Return a force as the first screen writes it."""
+    return f"{force:.1f} N"
+
+
+def answer(found: StoredRecommendation, folder: str) -> Answer:
+    """Put a stored recommendation into words.
+
+    Args:
+        folder: of the results, in front of the files' names; '' where the reader is in it.
+    """
+    carry = carry_text(found.duration, found.force, found.job_duration)
+    headline, file = f"Run this carry: {carry}", Path(folder) / found.file
+    details = [
+        Fact("why", f"{found.why}; of {found.considered} drivable carries, from {found.source}")
+    ]
+    if not found.fits:
+        headline = f"No carry fits: {found.at_rest}"
+        details = [
+            Fact("what would do", ", or ".join(map(str, found.remedies))),
+            Fact(f"if you allow {newtons(found.required)}", carry),
+            *details,
+        ]
+    details += [
+        Fact("the force", f"{account(found.parts)}; {found.squeeze_reason}"),
+        *[Fact(rival.label, _rival(rival, found)) for rival in found.rivals],
+    ]
+    if found.reserve is not None and math.isfinite(found.reserve.payload):
+        details.append(Fact("reserve", f"{found.reserve}, {_WITHIN}"))
+    if found.at_rest and found.fits:
+        details.append(Fact("grip", found.at_rest))
+    told = [str(each) for each in found.advice if abs(each.force) >= NOTICED][:ADVICE]
+    if told:
+        details.append(Fact("on this path", "; ".join(told)))
+    if found.price is not None:
+        details.append(Fact("checked", _checked(found.price)))
+    details.append(Fact("with this force", f"{'; '.join(_margins(found)) or 'not known'}"))
+    return Answer(
+        state_of(found),
+        headline,
+        _facts(found),
+        (
+            Fact("file", str(file)),
+            Fact("next", export_command(file), is_command=True),
+        ),
+        tuple(details),
+        found.warnings,
+    )
+
+
+_WITHIN = "each alone, in every case within the reference force on this path"
+
+
+def state_of(found: StoredRecommendation) -> State:
+    """Return the verdict on a carry by what is true of it."""
+    failing = found.price is not None and found.price.check.failing > 0
+    if not found.fits or failing or not math.isfinite(found.job_duration):
+        return "bad"
+    return "doubtful" if found.warnings else "good"
+
+
+def _facts(found: StoredRecommendation) -> tuple[Fact, ...]:
+    allowed = "" if found.allowed is None else f"{newtons(found.allowed[1 - LEADER])} are allowed"
+    job = Fact("whole job", "cannot be planned")
+    if math.isfinite(found.job_duration):
+        job = Fact("whole job", seconds(found.job_duration), note="from approach to retreat")
+    return (
+        Fact("time", seconds(found.duration), note="limits on jerk kept"),
+        Fact("force", f"{newtons(found.force)} commanded", note=allowed),
+        job,
+        Fact("holds", holds_text(found)),
+    )
+
+
+def holds_text(found: StoredRecommendation) -> str:
+    """Say whether a carry holds in every case of the uncertainty within the reference forces."""
+    if not found.fits:
+        return f"not within the reference force: {newtons(found.required)} are needed"
+    if found.price is None:
+        return "if everything is exactly as described: the cell states no uncertainty"
+    failing = found.price.check.failing
+    if failing:
+        return f"not in {failing} of {found.price.check.cases} random cases"
+    return f"in every case of {found.price.uncertainty.title}"
+
+
+def export_command(path: Path, target: str = EXPORT_TARGET) -> str:
+    """Return the command that makes of a trajectory file, timed within its own limits, what robots
+    need.
+
+    Args:
+        target: of the export.
+    """
+    output = path.with_name(f"{path.stem}-{target}")
+    return (
+        f"python -m studies.export {shlex.quote(str(path))} --target {target} "
+        f"--output {shlex.quote(str(output))}"
+    )
+
+
+def _rival(rival: Rival, found: StoredRecommendation) -> str:
+    """Compare another path with the recommended carry."""
+    duration, force = rival.duration_at_force, rival.force_at_duration
+    same_force = "cannot be held with the same force"
+    same_time = "cannot be driven in the same time"
+    if math.isfinite(duration):
+        slower = _percent(duration / found.duration)
+        same_force = f"{seconds(duration)} at the same force ({slower})"
+    if math.isfinite(force):
+        same_time = f"{newtons(force)} in the same time ({_percent(force / found.force)})"
+        if found.allowed is not None and force > found.allowed.min():
+            same_time += f", above the reference force of {newtons(found.allowed.min())}"
+    return f"{same_force}, {same_time}"
+
+
+def _checked(price: RobustPrice) -> str:
+    """Describe the set, the largest multiple of it that the arms allow, and random cases."""
+    slips = "slips" if price.check.failing == 1 else "slip"
+    return (
+        f"{price.check.failing or 'none'} of {price.check.cases} random cases {slips} "
+        f"({price.uncertainty}); the leading arm feels up to {newtons(max(price.commanded))}; the "
+        f"reference forces would hold {price.largest_factor:.2f} times as much"
+    )
+
+
+def _percent(ratio: float) -> str:
+    return f"{100.0 * (ratio - 1.0):+.1f} %"
+
+
+def _margins(found: StoredRecommendation) -> list[str]:
+    """List what may be off alone while the commanded force stays: force, and the centre of mass
+    along each axis up to the nearer limit."""
+    texts = [
+        f"up to {100.0 * margin.limit:.0f} % of it may be missing"
+        for margin in found.margins
+        if margin.quantity == "share of the force that is missing"
+    ]
+    offs = {
+        margin.quantity[-1]: abs(margin.limit - margin.nominal)
+        for margin in sorted(found.margins, key=lambda m: -abs(m.limit - m.nominal))
+        if margin.quantity.startswith("centre of mass")
+    }
+    if offs:
+        along = ", ".join(f"{1e3 * offs[axis]:.0f} mm along {axis}" for axis in sorted(offs))
+        texts.append(f"or the centre of mass off by {along}, all else as described")
+    return texts
