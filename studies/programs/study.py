@@ -18,7 +18,7 @@ from hybrid_opt.campaign import (
     search_stage,
 )
 from hybrid_opt.campaign.polish_stage import polish_stage
-from hybrid_opt.campaign.settings import ALGORITHMS, DRIVABLE, RECOMMENDED, SUMMARY, chosen
+from hybrid_opt.campaign.settings import ALGORITHMS, DRIVABLE, RECOMMENDED_FILE, SUMMARY, chosen
 from hybrid_opt.campaign.stages import (
     build_study,
     decided_cell,
@@ -261,8 +261,8 @@ def make_study(path: Path, options: argparse.Namespace, with_paper: bool) -> Non
     print(run_study(cell, settings, execution, Progress(not options.quiet), study))
     if study.report:
         print(f"Report: {execution.output / PAGE}; all tables: {execution.output / TABLES}")
-    if (execution.output / RECOMMENDED).exists():
-        command = export_command(execution.output / RECOMMENDED, options.target or EXPORT_TARGET)
+    if (execution.output / RECOMMENDED_FILE).exists():
+        command = export_command(execution.output / RECOMMENDED_FILE, options.target or EXPORT_TARGET)
         print(f"next: {command}")
     if options.animation or options.view:
         from studies.report.looks import follow_looks
