@@ -262,7 +262,9 @@ def make_study(path: Path, options: argparse.Namespace, with_paper: bool) -> Non
     if study.report:
         print(f"Report: {execution.output / PAGE}; all tables: {execution.output / TABLES}")
     if (execution.output / RECOMMENDED_FILE).exists():
-        command = export_command(execution.output / RECOMMENDED_FILE, options.target or EXPORT_TARGET)
+        command = export_command(
+            execution.output / RECOMMENDED_FILE, options.target or EXPORT_TARGET
+        )
         print(f"next: {command}")
     if options.animation or options.view:
         from studies.report.looks import follow_looks
