@@ -317,7 +317,7 @@ def _grasp(
     def found() -> GraspNumbers:
         # Not imported at the top: few cells have such pads.
         from symbolic.contact.grasp import Grasp
-        from symbolic.contact.worst_cases import GraspSqueeze
+        from symbolic.contact.grasp_squeeze import GraspSqueeze
 
         made = Grasp(cell) if commanded is None else GraspSqueeze(cell, commanded)
         return made.complete()

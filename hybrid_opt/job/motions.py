@@ -22,12 +22,13 @@ from hybrid_opt.carry import Carry, joints_of
 from hybrid_opt.errors import JobError
 from hybrid_opt.job.records import Force, PhaseMotion
 from hybrid_opt.robust.force import BoxMotion
-from hybrid_opt.robust.squeeze import Squeeze, SqueezeSettings, pressed_beyond, pressed_together
+from hybrid_opt.robust.squeeze import Squeeze, SqueezeSettings, pressed_beyond
 from hybrid_opt.timing.model import TimingModel
 from hybrid_opt.timing.records import JerkLimits
 from symbolic.array import Array, interpolated
 from symbolic.contact.force_closure import robot_wrenches
 from symbolic.contact.grasp import Grasp
+from symbolic.contact.registry import command_model
 from symbolic.records import Handling, Workcell
 from symbolic.records.poses import box_rotation
 from symbolic.robot.arm import REACH_TOLERANCE
@@ -345,7 +346,9 @@ def holding(
     load = model.load(box.pose, box.rate, box.second_rate)
     least, wrench = load["normal_force"], np.stack([load["wrench_1"], load["wrench_2"]], axis=1)
     extra, squeeze = pressed_beyond(model.workcell, settings, time, box, least)
-    normal = least + np.multiply.outer(extra, pressed_together(model.workcell, squeeze.leader))
+    normal = least + np.multiply.outer(
+        extra, command_model(model.workcell).pressed_together(squeeze.leader)
+    )
     wrench = wrench + extra[:, None, None] * unit_squeeze(model.workcell, box.pose, squeeze.leader)
     cuts = np.cumsum([len(motion.time) for motion in motions])[:-1]
     parts = zip(*(np.split(values, cuts) for values in (normal, least, wrench)), strict=True)

@@ -73,7 +73,8 @@ class RobustSamples:
 
     def _ruling(self, motion: BoxMotion) -> RulingCases:
         worst = self._model.least_squeeze(motion, self._cases)
-        return ruling_cases(worst, self._workcell.uncertainty, LEADER)
+        share = float(self._model.leading_share[LEADER])
+        return ruling_cases(worst, self._workcell.uncertainty, LEADER, leading_share=share)
 
 
 class RobustForces:

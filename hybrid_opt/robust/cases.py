@@ -113,6 +113,7 @@ class RulingCases:
         commanded: (n,) the case that decides the first.
         felt: (n,) the case in which the leading arm feels most beyond it.
         share: (n,) of the difference of both forces there that it feels.
+        leading_share: rise of the leading arm's force per newton of the commanded one.
     """
 
     leader: int
@@ -120,20 +121,22 @@ class RulingCases:
     commanded: NDArray[np.intp]
     felt: NDArray[np.intp]
     share: Array
+    leading_share: float
 
     def at(self, rows: NDArray[np.intp]) -> RulingCases:
         """Return the cases at some of the samples."""
         cases = self.commanded[rows], self.felt[rows]
-        return RulingCases(self.leader, self.force[rows], *cases, self.share[rows])
+        found = self.force[rows], *cases, self.share[rows]
+        return RulingCases(self.leader, *found, self.leading_share)
 
     def slopes(self, commanded: Array, felt: Array) -> Array:
         """Compute the derivatives (n, 2, m) of `force` from those of both robots' forces (n, 2, m)
         in the cases `commanded` and `felt`."""
-        follower = 1 - self.leader
+        follower, share = 1 - self.leader, self.leading_share
         found = np.empty_like(commanded)
         found[:, follower] = commanded[:, follower]
-        step = felt[:, self.leader] - felt[:, follower]
-        found[:, self.leader] = commanded[:, follower] + self.share[:, None] * step
+        step = felt[:, self.leader] - share * felt[:, follower]
+        found[:, self.leader] = share * commanded[:, follower] + self.share[:, None] * step
         return found
 
 
@@ -170,4 +173,4 @@ def ruling_cases(
     force = np.empty(worst.shape[1:])
     force[:, follower] = worst[commanded, every, follower]
     force[:, leader] = leading_share * force[:, follower] + (share * difference)[felt, every]
-    return RulingCases(leader, force, commanded, felt, share[felt, every])
+    return RulingCases(leader, force, commanded, felt, share[felt, every], leading_share)

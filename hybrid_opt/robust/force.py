@@ -31,7 +31,6 @@ from hybrid_opt.robust.cases import (
 from symbolic.array import Array, Count, Figure, Pair, Row, Shape, evenly
 from symbolic.contact.registry import command_model
 from symbolic.contact.worst_cases import (
-    GraspSqueeze,
     case_slack_function,
     case_squeeze_function,
 )
@@ -279,12 +278,9 @@ class RobustModel:
         return np.asarray(self.least_squeeze(motion, nominal_case(self.workcell)[None], leader)[0])
 
     @cached_property
-    def _leading_share(self) -> Array:
-        """(2,) rise of each leading robot's force per newton of the other, commanded one."""
-        if self._one:
-            return np.ones(2)
-        normals = GraspSqueeze(self.workcell, 1).squeeze_normals()
-        return normals / normals[::-1]
+    def leading_share(self) -> Array:
+        """`ContactModel.leading_share` of the commanded forces (2,)."""
+        return command_model(self.workcell).leading_share
 
     def hold(
         self,
@@ -304,7 +300,7 @@ class RobustModel:
         """
         cases = self.worst_cases(uncertainty, leader)
         worst = self.least_squeeze(motion, cases if rows is None else cases[rows], leader)
-        follower, share = 1 - leader, float(self._leading_share[leader])
+        follower, share = 1 - leader, float(self.leading_share[leader])
         force = ruling_cases(worst, uncertainty, leader, leading_share=share).force
         force[np.isnan(force)] = np.inf
         return force[:, follower], force[:, leader]
@@ -316,7 +312,7 @@ class RobustModel:
         command and as many for the leader's excess."""
         worst = self.least_squeeze(motion, self.worst_cases(uncertainty, leader), leader)
         command = worst[:, :, 1 - leader]
-        beyond = worst[:, :, leader] - float(self._leading_share[leader]) * command
+        beyond = worst[:, :, leader] - float(self.leading_share[leader]) * command
         return np.unique([(-each).argsort(axis=0)[:RULING] for each in (command, beyond)])
 
     def commanded(
@@ -362,7 +358,8 @@ class RobustModel:
     def peak(self, motion: HeldMotion, uncertainty: Uncertainty, leader: int = 0) -> Array:
         """Compute the largest forces (2,) of `hold` from the few samples that can attain them."""
         force, planned = self.commanded(motion, uncertainty, leader), self.nominal(motion, leader)
-        felt = force + planned[:, leader] - planned[:, 1 - leader]
+        share = self.leading_share[leader]
+        felt = share * force + planned[:, leader] - share * planned[:, 1 - leader]
         most = np.unique([force.argmax(), felt.argmax()])
         peaks = np.full(2, force.max())
         peaks[leader] = self.hold(box_motion(motion).at(most), uncertainty, leader)[1].max()

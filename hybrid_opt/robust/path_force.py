@@ -33,7 +33,7 @@ from hybrid_opt.robust.force import (
 from symbolic.array import Array
 from symbolic.contact.registry import command_model
 from symbolic.contact.worst_cases import (
-    case_difference_function,
+    case_excess_function,
     case_gradient_function,
     case_origin_load_function,
     case_slopes_function,
@@ -102,11 +102,10 @@ class RobustPath:
             )
         self._set, self._model = workcell.uncertainty, robust_model(workcell)
         self._cases = self._model.worst_cases(self._set, LEADER)
+        self._share = float(self._model.leading_share[LEADER])
         # Slopes add up in loops, for which there is no form in lanes.
         self._slopes = contact_function(workcell, "case slopes", case_slopes_function, lanes=1)
-        self._difference = contact_function(
-            workcell, "case difference", case_difference_function, lanes=0
-        )
+        self._excess = contact_function(workcell, "case excess", case_excess_function, lanes=0)
 
     def at(self, points: PathPoints) -> tuple[Array, Array]:
         """Compute the least normal forces that hold in every case of the workcell's set.
@@ -116,7 +115,7 @@ class RobustPath:
             derivatives by u, u'' and u'^2.
         """
         least = self._model.least_squeeze(points.motion, self._cases, LEADER)
-        ruling = ruling_cases(least, self._set, LEADER)
+        ruling = ruling_cases(least, self._set, LEADER, leading_share=self._share)
         return ruling.force, self.slopes(points, ruling)
 
     def ruling_beyond(
@@ -129,9 +128,9 @@ class RobustPath:
         """
         n, k = len(points), len(self._cases)
         every, cases = repeated(points.motion, k), np.repeat(self._cases, n, axis=0)
-        difference = self._difference.batch(*parts_of(every), cases)["difference"].reshape(k, n)
+        difference = self._excess.batch(*parts_of(every), cases)["excess"].reshape(k, n)
         felt = (felt_share(difference, self._set) * difference).max(axis=0)
-        room = level - np.maximum(felt, 0.0)
+        room = np.minimum(level, (level - felt) / max(self._share, LEAST_SHARE))
         left = ~(self._model.slack(every, cases, np.tile(room, k), LEADER) > 0.0)
         found = np.full((k * n, 2), BELOW)
         if left.any():
@@ -142,8 +141,8 @@ class RobustPath:
         # A case that leaves the force below the level can yet be the one that the leader feels.
         known = least[:, rows]
         own, beyond = known[:, :, FOLLOWER], difference[:, rows]
-        known[:, :, LEADER] = np.where(own == BELOW, BELOW, own + beyond)
-        return rows, ruling_cases(known, self._set, LEADER, beyond)
+        known[:, :, LEADER] = np.where(own == BELOW, BELOW, self._share * own + beyond)
+        return rows, ruling_cases(known, self._set, LEADER, beyond, self._share)
 
     def most_demanding(self, points: PathPoints, count: int) -> tuple[Array, Array]:
         """Compute the forces of the cases that require most: where several rule in turn, each has
@@ -154,14 +153,14 @@ class RobustPath:
             (n, 2, count, 20).
         """
         n, least = len(points), self._model.least_squeeze(points.motion, self._cases, LEADER)
-        ruling = ruling_cases(least, self._set, LEADER)
+        ruling = ruling_cases(least, self._set, LEADER, leading_share=self._share)
         first = np.argsort(-least[:, :, FOLLOWER], axis=0)[:count]
-        beyond = ruling.force[:, LEADER] - ruling.force[:, FOLLOWER]
+        beyond = ruling.force[:, LEADER] - self._share * ruling.force[:, FOLLOWER]
         force, slope = np.empty((n, 2, count)), np.empty((n, 2, count, BY_TIMING.stop))
         for j, case in enumerate(first):
             one = replace(ruling, commanded=case)
             force[:, FOLLOWER, j] = least[case, np.arange(n), FOLLOWER]
-            force[:, LEADER, j] = force[:, FOLLOWER, j] + beyond
+            force[:, LEADER, j] = self._share * force[:, FOLLOWER, j] + beyond
             slope[:, :, j] = self.slopes(points, one)
         return force, slope
 
@@ -178,6 +177,9 @@ class RobustPath:
 robust_path = cache_by_workcell(RobustPath)
 """The one of a workcell, the same for the same record."""
 
+
+LEAST_SHARE = 1e-200
+"""Stands for no share of the commanded force in quotients."""
 
 TIED = 1e-6
 """Share of the largest force by which another one that rules as well may be less."""

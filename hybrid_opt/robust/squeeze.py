@@ -26,7 +26,7 @@ from hybrid_opt.robust.force import (
     stopped,
 )
 from symbolic.array import Array
-from symbolic.contact.grasp import Grasp
+from symbolic.contact.registry import command_model
 from symbolic.errors import SettingsError
 from symbolic.records import Uncertainty, Workcell
 
@@ -148,7 +148,7 @@ def pressed_beyond(
     in_parts: bool = True,
 ) -> tuple[Array, Squeeze]:
     """Compute the force (n,) commanded beyond the planned normal force [N], in the proportion of
-    `pressed_together` for the other robot, and its origin.
+    `ContactModel.pressed_together` for the other robot, and its origin.
 
     Smooth where the planned forces are; with it neither robot ever presses less than the plan, or
     than what holds pads that press evenly, moving or stopped, in every case of the set, asks for.
@@ -176,7 +176,7 @@ def pressed_beyond(
         least = np.maximum(least, model.nominal(motion, leader))
         still = model.nominal(stopped(motion), leader)[:, 1 - leader]
         held = least[:, 1 - leader]
-        own = least.mean(axis=1) if workcell.has_opposite_pads else held
+        own = least.mean(axis=1) if command_model(workcell).has_scalar_squeeze else held
         needed = np.maximum(held + (settings.factor - 1.0) * own, still)
         parts = [Part("least force", float(held.max()))]
         parts.append(Part("factor", float(needed.max() - held.max())))
@@ -236,18 +236,9 @@ def largest_commanded(
     there, own = box.at(most), planned[most, follower]
     level = _in_every_case(workcell, doubt, leader, there, own).max()
     forces = np.full(2, _in_every_case(workcell, doubt, leader, box, level).max())
-    together = pressed_together(workcell, leader)[leader]
+    together = command_model(workcell).pressed_together(leader)[leader]
     forces[leader] = (planned[most, leader] + together * (forces[follower] - own)).max()
     return forces
-
-
-def pressed_together(workcell: Workcell, leader: int) -> Array:
-    """Compute the force (2,) of both robots per newton commanded beyond the plan: an internal force
-    of their pads."""
-    if workcell.has_opposite_pads:
-        return np.ones(2)
-    normals = Grasp(workcell).squeeze_normals()
-    return np.asarray(normals / normals[1 - leader])
 
 
 def commanded_forces(
@@ -257,7 +248,7 @@ def commanded_forces(
     origin; see `pressed_beyond`."""
     held = carry.normal_force
     extra, squeeze = pressed_beyond(workcell, settings, carry.time, carry, held, in_parts)
-    together = pressed_together(workcell, settings.leader)
+    together = command_model(workcell).pressed_together(settings.leader)
     return held + np.multiply.outer(extra, together), squeeze
 
 

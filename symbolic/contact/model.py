@@ -211,6 +211,44 @@ class ContactModel(ABC):
         centre = uncertainty.centre_of_mass + uncertainty.pad_position * across
         return centre, np.zeros((1, 4))
 
+    def commanded_forces(
+        self, normal: Expression, friction: Expression, tracking: Expression, opposed: Expression
+    ) -> Expression:
+        """Return the normal forces (2,) to command where the least ones (2,) hold [N]: both press
+        as much more, because the motion decides the difference of both.
+
+        Args:
+            normal: (2,) least normal forces [N].
+            friction: (2,) Coulomb coefficients.
+            tracking: (2,) share of its force that either robot lacks.
+            opposed: tangential force with which the arms work against one another [N].
+        """
+        share, held = tracking / (1.0 - tracking), opposed / ca.fmin(friction[0], friction[1])
+        # Entry by entry: CasADi 3.8 loses the derivative of a product of vectors here.
+        more = held + sum(share[i] * (normal[i] + held) for i in (0, 1))
+        return ca.vertcat(normal[0] + more, normal[1] + more)
+
+    @property
+    def leading_share(self) -> Array:
+        """Rise (2,) of the force of either robot as the leading one, per newton more that is
+        commanded of the other."""
+        return np.ones(2)
+
+    def leading_excess(self, load: ContactLoad, opposed: Expression) -> Expression:
+        """Return what robot 1 presses with beyond its `leading_share` of the force that is
+        commanded of robot 2 [N].
+
+        Args:
+            load: on both contacts.
+            opposed: tangential force with which the arms work against one another [N].
+        """
+        return ca.dot(load.force, load.axes[:, 2])
+
+    def pressed_together(self, leader: int) -> Array:
+        """Return what both robots (2,) press with for each newton that is commanded beyond the
+        plan."""
+        return np.ones(2)
+
     def room_for_displacements(self, uncertainty: Uncertainty) -> float:
         """Return what displacements leave of the room in which forces are looked for [m]; more than
         zero if they leave any."""

@@ -10,6 +10,8 @@ import numpy as np
 
 from symbolic.array import Array
 from symbolic.contact.force_closure import has_force_closure, least_distance
+from symbolic.contact.grasp import Grasp
+from symbolic.contact.grasp_squeeze import GraspSqueeze
 from symbolic.contact.model import ContactLoad, ContactModel, HeldLoad, ImplicitVariables, Problem
 from symbolic.contact.soft_finger import SoftPatch, least_soft_squeeze
 from symbolic.records import Workcell
@@ -122,3 +124,14 @@ class SoftFingerGrasp(SoftFinger):
         """See `ContactModel`."""
         off = uncertainty.pad_position + uncertainty.apart / 2.0
         return LARGEST_DISPLACEMENT * least_distance(self.workcell) - off
+
+    @property
+    def leading_share(self) -> Array:
+        """See `ContactModel`: from the squeeze that worst cases start from."""
+        normals = GraspSqueeze(self.workcell, 1).squeeze_normals()
+        return np.asarray(normals / normals[::-1])
+
+    def pressed_together(self, leader: int) -> Array:
+        """See `ContactModel`: an internal squeeze of the pads."""
+        normals = Grasp(self.workcell).squeeze_normals()
+        return np.asarray(normals / normals[1 - leader])

@@ -30,14 +30,13 @@ from typing import Any
 
 import casadi as ca
 
-from symbolic.contact.central_path import least
-from symbolic.contact.force_closure import (
-    LOAD_SIZE,
-    derived,
-    has_force_closure,
-    smaller_patches,
+from symbolic.contact.force_closure import LOAD_SIZE
+from symbolic.contact.grasp_squeeze import (
+    GraspSqueeze,
+    against_internal,
+    commanded_forces,
+    commanded_slack,
 )
-from symbolic.contact.grasp import BEYOND, SCALE_FLOOR, Grasp
 from symbolic.contact.load import required
 from symbolic.contact.model import ContactLoad, ImplicitVariables
 from symbolic.contact.registry import command_model
@@ -50,7 +49,6 @@ from symbolic.expression import (
     sx_parameters,
 )
 from symbolic.records import Workcell
-from symbolic.records.numbered import NumberedWorkcell
 
 CASE_SIZES = {
     "friction": 2,
@@ -144,13 +142,13 @@ def case_slopes_function(workcell: Workcell) -> ca.Function:
     return named_function("case_slopes", inputs, outputs, cse=False)
 
 
-def case_difference_function(workcell: Workcell) -> ca.Function:
-    """pose, rate, second_rate (6,) and a case (18,), see `CASE_SIZES`, to difference N_1 - N_2 [N],
-    which no squeeze changes."""
+def case_excess_function(workcell: Workcell) -> ca.Function:
+    """pose, rate, second_rate (6,) and a case (18,), see `CASE_SIZES`, to excess [N]: what robot 1
+    presses with beyond what any commanded force of robot 2 makes it press with."""
     inputs = _inputs(ca.SX, sx_parameters(workcell.payload))
-    motion = [inputs[name] for name in MOTION]
-    (difference,) = ca.cse([case_in_pad_axes(workcell, motion, inputs["case"])[0][2]])
-    return named_function("case_difference", inputs, {"difference": difference}, cse=False)
+    load, opposed = case_contact_load(workcell, inputs), case_parts(inputs["case"])[-1]
+    excess = command_model(workcell).leading_excess(load, opposed)
+    return named_function("case_excess", inputs, {"excess": ca.cse([excess])[0]}, cse=False)
 
 
 def case_slack_function(workcell: Workcell, commanded: int = 1) -> ca.Function:
@@ -171,12 +169,10 @@ def case_slack_function(workcell: Workcell, commanded: int = 1) -> ca.Function:
         sizes = _sizes_function(squeeze)(case, *numbers)
         load = _origin_load(workcell, inputs)
         left = (1.0 - tracking[commanded]) * force
-        left -= internal * _against_internal(squeeze)(friction, sizes, *numbers)
+        left -= internal * against_internal(squeeze)(friction, sizes, *numbers)
         slack = [commanded_slack(squeeze, load, friction, sizes, displacement, left)]
     else:
-        difference = case_in_pad_axes(workcell, [inputs[name] for name in MOTION], case)[0][2]
-        n_1 = force + difference if commanded == 1 else force
-        slack = [n_1 - _least_force(workcell, None, inputs)[0]]
+        slack = [force - _least_force(workcell, None, inputs)[commanded]]
     own = {name: inputs[name] for name in (*MOTION, "case")} | {"force": force} | given
     found = slack if squeeze is None else ca.cse(slack)
     return named_function("case_slack", own, {"slack": found[0]}, cse=False)
@@ -219,10 +215,10 @@ def _least_force(
         load = _origin_load(workcell, inputs)
         load = load if isinstance(beside, float) else load + beside
         return _to_command_of(squeeze, load, case, handed, differentiable)
-    force, moment, arms = case_in_pad_axes(workcell, [inputs[name] for name in MOTION], case)
-    asked = ContactLoad(force, moment, arms, ca.SX(ca.DM.eye(3)), friction)
-    held = command_model(workcell).hold(asked, implicit, displaced)
-    return ca.densify(_to_command(held.normal, case))
+    model, load = command_model(workcell), case_contact_load(workcell, inputs)
+    *_, tracking, opposed = case_parts(case)
+    held = model.hold(load, implicit, displaced)
+    return ca.densify(model.commanded_forces(held.normal, friction, tracking, opposed))
 
 
 def _origin_load(workcell: Workcell, inputs: dict[str, Expression]) -> Expression:
@@ -230,38 +226,21 @@ def _origin_load(workcell: Workcell, inputs: dict[str, Expression]) -> Expressio
     return case_origin_load_function(workcell)(*[inputs[name] for name in names])
 
 
-def _to_command(normal: Expression, case: Expression) -> Expression:
-    """(2,) normal forces to command where least ones (2,) hold: the motion fixes their difference,
-    so that both press as much more."""
-    *_, tracking, _ = case_parts(case)
-    share, opposed = tracking / (1.0 - tracking), _against_arms(case)
-    # Entry by entry: CasADi 3.8 loses the derivative of a product of vectors here.
-    more = opposed + sum(share[i] * (normal[i] + opposed) for i in (0, 1))
-    return ca.vertcat(normal[0] + more, normal[1] + more)
-
-
-def _against_arms(case: Expression) -> Expression:
-    """Normal force that holds the opposed tangential force of a case at either pad [N]."""
-    friction, *_, internal = case_parts(case)
-    return internal / ca.fmin(friction[0], friction[1])
-
-
 def case_parts(case: ca.SX | ca.MX) -> list[ca.SX | ca.MX]:
     """The parts of a case (18,), see `CASE_SIZES`."""
     return list(ca.vertsplit(case, [0, *accumulate(CASE_SIZES.values())]))
 
 
-def case_in_pad_axes(
-    workcell: Workcell, motion: list[ca.SX], case: ca.SX
-) -> tuple[ca.SX, ca.SX, tuple[ca.SX, ca.SX]]:
-    """What a case asks of two pads with opposite normals, along the axes of contact 1: force and
-    moment about the nominal centre of mass, (3,) each, and the displaced contacts' arms from there.
+def case_contact_load(workcell: Workcell, inputs: Mapping[str, Expression]) -> ContactLoad:
+    """Return the load of the contacts in a case, along the axes of contact 1, about the nominal
+    centre of mass.
 
     Args:
-        motion: pose, rate, second_rate (6,).
-        case: (18,), see `CASE_SIZES`.
+        workcell: the cell.
+        inputs: pose, rate, second_rate (6,) and case (18,), see `CASE_SIZES`.
     """
-    displacement = case_parts(case)[5]
+    case = inputs["case"]
+    friction, *_, displacement, _, _ = case_parts(case)
     nominal = number(workcell.payload.centre_of_mass)
     axes = number(workcell.contacts[0].T_box_pad[:3, :3])
     arms = [
@@ -269,9 +248,11 @@ def case_in_pad_axes(
         + ca.vertcat(displacement[2 * i : 2 * i + 2], 0.0)
         for i, contact in enumerate(workcell.contacts)
     ]
-    in_box = case_load_function(workcell)(*motion, case, *sx_parameters(workcell.payload).values())
+    motion = [inputs[name] for name in MOTION]
+    numbers = sx_parameters(workcell.payload).values()
+    in_box = case_load_function(workcell)(*motion, case, *numbers)
     force, moment = (ca.mtimes(axes.T, part) for part in in_box)
-    return force, moment, (arms[0], arms[1])
+    return ContactLoad(force, moment, (arms[0], arms[1]), ca.SX(ca.DM.eye(3)), friction)
 
 
 def case_load_function(workcell: Workcell) -> ca.Function:
@@ -307,7 +288,7 @@ def _to_command_of(
     commanded, given = squeeze.commanded, list(handed.values())
     sizes = _sizes_function(squeeze)(case, *given)
     force = commanded_forces(squeeze, load, friction, sizes, displacement, handed, differentiable)
-    needed = force[commanded] + internal * _against_internal(squeeze)(friction, sizes, *given)
+    needed = force[commanded] + internal * against_internal(squeeze)(friction, sizes, *given)
     more = needed / (1.0 - tracking[commanded]) - force[commanded]
     normals = squeeze.normals
     shares = as_mx(normals / normals[commanded], squeeze.given, handed)
@@ -331,147 +312,3 @@ def case_origin_load_function(workcell: Workcell) -> ca.Function:
     force, moment = case_load_function(workcell)(*inputs)
     about = moment + ca.cross(ca.SX(number(workcell.payload.centre_of_mass)), force)
     return ca.Function("origin_load", inputs, ca.cse([ca.vertcat(force, about)]))
-
-
-DISPLACED = 6
-"""Repetitions by which what displaced forces turn about is found: each takes the error to its
-displacement over the pads' distances."""
-
-REACHES = (0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95)
-"""Sizes of the patches, as shares, at which a squeeze to start from is looked for."""
-
-ROUNDING = 1e-6
-"""Share of the commanded force by which balancing displaced forces may exceed it."""
-
-OTHER_WEIGHT = 1e-3
-"""Weight of the other robot's normal force, which alone may be anything: what it adds to the
-commanded force makes that a little more than the least."""
-
-
-class GraspSqueeze(Grasp):
-    """Least normal force of one robot, plus a little of the other's; see `OTHER_WEIGHT`. Inputs are
-    load, coefficients and sizes of the patches over the cell's own, (2,) by robot, and the pads'
-    displacements (4,), the same for all pads of a robot, along their tangents.
-
-    Attributes:
-        workcell: the cell.
-        commanded: index of the robot whose force is commanded.
-    """
-
-    def __init__(self, workcell: Workcell, commanded: int) -> None:
-        """Find the squeeze to start from, within smaller patches where these close the grasp.
-
-        Raises:
-            SettingsError: no squeeze holds the payload whatever is asked.
-        """
-        if isinstance(workcell, NumberedWorkcell):
-            numbers = workcell.squeezes[commanded]
-        else:
-            shares = (s for s in REACHES if has_force_closure(smaller_patches(workcell, s)))
-            numbers = derived(workcell, next(shares, 1.0))
-        super().__init__(workcell, numbers)
-        self.workcell, self.commanded = workcell, commanded
-        self.cell_sizes = (*self.cell_sizes, ("reach", 2), ("displacement", 4))
-
-    def _nominal(self) -> tuple[list[float], ...]:
-        """See `Grasp`."""
-        return (*super()._nominal(), [1.0, 1.0], [0.0] * 4)
-
-    def balanced(self, free: ca.SX, cell: list[ca.SX]) -> list[ca.SX]:
-        """See `symbolic.contact.central_path.Program`."""
-        load, friction, reach, displacement = cell
-        wrenches = self._left_by(load, free, [friction, reach])
-        for _ in range(DISPLACED):
-            turned = self._turned(wrenches, displacement, [friction, reach])
-            wrenches = self._left_by(
-                load - ca.vertcat(ca.SX.zeros(3), turned), free, [friction, reach]
-            )
-        return wrenches
-
-    def _turned(self, wrenches: list[ca.SX], displacement: ca.SX, sizes: list[ca.SX]) -> ca.SX:
-        """Moment (3,) of scaled wrenches' forces about where they would act."""
-        total = ca.SX.zeros(3)
-        for i, (pad, robot, own) in enumerate(zip(self._pads, self.robots, wrenches, strict=True)):
-            normal, *tangent = ca.vertsplit((self.units(i, *sizes) * own)[:3])
-            moved = ca.vertcat(displacement[2 * robot : 2 * robot + 2], 0.0)
-            force = ca.vertcat(*tangent, normal)
-            total += ca.mtimes(number(pad.T_box_pad[:3, :3]), ca.cross(moved, force))
-        return total
-
-    def effort(self, wrenches: list[ca.SX], cell: list[ca.SX]) -> ca.SX:
-        """See `symbolic.contact.central_path.Program`."""
-        total = 0.0
-        for wrench, robot in zip(wrenches, self.robots, strict=True):
-            total += wrench[0] * (1.0 if robot == self.commanded else OTHER_WEIGHT)
-        return total
-
-    def told(self, wrenches: list[ca.SX], sizes: list[ca.SX]) -> tuple[ca.SX, ca.SX | float]:
-        """See `Grasp`."""
-        force = [ca.SX(0.0), ca.SX(0.0)]
-        for own, robot in zip(wrenches, self.robots, strict=True):
-            force[robot] += own[0]
-        force[self.commanded] += OTHER_WEIGHT * force[1 - self.commanded]
-        return ca.vertcat(*force), BEYOND
-
-
-def commanded_forces(
-    squeeze: GraspSqueeze,
-    load: ca.MX,
-    friction: ca.MX,
-    share: ca.MX,
-    displacement: ca.MX,
-    handed: dict[str, ca.MX] | None = None,
-    differentiable: bool = False,
-) -> ca.MX:
-    """(2,) normal forces of the robots [N]: what is commanded, a convex function of the load, and
-    what the other one then presses with. Beyond any limit where the grasp does not close.
-
-    Args:
-        load: (6,) force and moment about the box frame's origin, along the box's axes.
-        friction: (2,) Coulomb coefficients of the robots' pads.
-        share: (2,) sizes of their patches over the cell's own.
-        displacement: (4,) of the pads [m].
-        handed: the squeeze's given numbers, where they are symbols.
-        differentiable: whether first derivatives are wanted.
-    """
-    handed = handed or {}
-    reach = share / as_mx(ca.SX(number(squeeze.numbers.reach)), squeeze.given, handed)
-    cell = [load, friction, reach, displacement]
-    return squeeze.solved(cell, list(handed.values()), differentiable)
-
-
-def commanded_slack(
-    squeeze: GraspSqueeze,
-    load: ca.SX,
-    friction: ca.SX,
-    share: ca.SX,
-    displacement: ca.SX,
-    force: ca.SX,
-) -> ca.SX:
-    """Positive where the least wrenches that balance a load, and as much of the squeeze as makes
-    the commanded force (arguments as in `commanded_forces`), lie within all cones."""
-    reach = share / squeeze.numbers.reach
-    asked, given = squeeze.asked(load, friction, reach), squeeze.squeezed(friction, reach)
-    own = [k for k, robot in enumerate(squeeze.robots) if robot == squeeze.commanded]
-    pressed = (force - sum(asked[k][0] for k in own)) / sum(given[k][0] for k in own)
-    held = [a + pressed * g for a, g in zip(asked, given, strict=True)]
-    held = squeeze.balanced(squeeze.free(held), [load, friction, reach, displacement])
-    enough = ca.fmin(pressed, (1.0 + ROUNDING) * force - sum(held[k][0] for k in own))
-    slack = [patch.slack(state) for patch, state in zip(squeeze.patches, held, strict=True)]
-    return ca.fmin(least(slack), enough)
-
-
-def _against_internal(squeeze: GraspSqueeze) -> ca.Function:
-    """friction and sizes of the patches, (2,) by robot, to the commanded force beyond the least [N]
-    per newton of tangential force of any pad: what the squeeze leaves of that pad's friction holds
-    it."""
-    friction, share = ca.SX.sym("friction", 2), ca.SX.sym("share", 2)
-    given = squeeze.squeezed(friction, share / squeeze.numbers.reach)
-    left = [
-        friction[r] * (given[k][0] - ca.norm_2(given[k][1:3]) - ca.fabs(given[k][3]))
-        for k, r in enumerate(squeeze.robots)
-    ]
-    pressed = squeeze.normals[squeeze.commanded]
-    held = ca.fmax(least(left), SCALE_FLOOR)
-    inputs = [friction, share, *squeeze.given.values()]
-    return ca.Function("against_internal", inputs, [pressed / held])

@@ -10,11 +10,11 @@ import pytest
 
 from hybrid_opt.job.motions import PEAK_RATE, at_even_steps, rise, unit_squeeze
 from hybrid_opt.job.smooth import acceleration_at_ends, rests_at_ends, without_jumps
-from hybrid_opt.robust.squeeze import pressed_together
 from hybrid_opt.timing.jerk import time_with_jerk
 from hybrid_opt.timing.limits import check_limits, most_used
 from hybrid_opt.timing.records import JerkLimits, Timing, TimingLimits
 from hybrid_opt.timing.solve import time_path
+from symbolic.contact.registry import command_model
 from symbolic.path.spline import path_basis
 from symbolic.read.cell import load
 from symbolic.records.poses import box_rotation
@@ -59,7 +59,7 @@ def test_more_squeeze_balances_itself_within_all_cones(name: str) -> None:
         for contact, wrench in zip(cell.contacts, wrenches, strict=True):
             total[3:] += np.cross(turned @ contact.T_box_pad[:3, 3], wrench[:3])
         np.testing.assert_allclose(total, 0.0, atol=1e-9)
-        together = pressed_together(cell, leader)
+        together = command_model(cell).pressed_together(leader)
         assert together[1 - leader] == 1.0
         for contact, wrench, share in zip(cell.contacts, wrenches, together, strict=True):
             pushed = (turned @ contact.T_box_pad[:3, :3]).T @ wrench[:3]

@@ -12,13 +12,13 @@ from symbolic.array import Array
 from symbolic.contact.central_path import START_WEIGHT
 from symbolic.contact.force_closure import has_force_closure, smaller_patches, state_to_box
 from symbolic.contact.grasp import REST_WEIGHT, Grasp
-from symbolic.contact.soft_grasp import SoftGrasp
-from symbolic.contact.worst_cases import (
+from symbolic.contact.grasp_squeeze import (
     OTHER_WEIGHT,
     GraspSqueeze,
     commanded_forces,
     commanded_slack,
 )
+from symbolic.contact.soft_grasp import SoftGrasp
 from symbolic.errors import SettingsError
 from symbolic.records import Contact, Workcell
 from tests.symbolic.contact.oracle import (
