@@ -144,6 +144,10 @@ def api() -> Path:
         index.append(f"{heading}\n{'-' * len(heading)}\n\n{listed_here}\n")
     index.append(f".. toctree::\n   :hidden:\n\n{listed}\n")
     _write(folder / "index.rst", "\n".join(index))
+    current = {f"{name}.rst" for name in (*ho.__all__, "summary", "index")}
+    for old in folder.glob("*.rst"):
+        if old.name not in current:  # a page of an earlier build
+            old.unlink()
     return folder
 
 
