@@ -16,7 +16,7 @@ from symbolic.limits import LIMITS
 from symbolic.records import Workcell
 
 FRICTION_RATIO = "friction"
-"""Ratio of a carry that limits no timing: the allocation of the contact forces satisfies it."""
+"""Ratio of a carry that limits no timing: the contact forces satisfy it."""
 
 PER_JOINT = tuple(limit.name for limit in LIMITS if limit.scope == "joint")
 PER_ROBOT = (FRICTION_RATIO, *(limit.name for limit in LIMITS if limit.scope == "robot"))

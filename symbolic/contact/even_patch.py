@@ -1,4 +1,4 @@
-"""A patch under even pressure in the allocation's interior-point method, disc or rectangle.
+"""A patch under even pressure in the interior-point method of contact forces, disc or rectangle.
 
 It bears the wrenches within the limit surface of `symbolic.contact.soft_finger`: with what friction
 leaves beside the tangential force, grip = sqrt(N^2 - |T|^2) (forces over N, tangential ones over

@@ -65,7 +65,7 @@ WHOLE = ca.SX.ones(2)
 
 
 class Grasp:
-    """The pads of one workcell, as the allocation's program. Compared by identity.
+    """The pads of one workcell, as a convex program. Compared by identity.
 
     Attributes:
         robots: per pad the index of its robot.

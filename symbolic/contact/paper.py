@@ -1,4 +1,4 @@
-"""The paper's allocation: least contact forces of two facing pads, then their centres of pressure.
+"""The paper's model: least contact forces of two facing pads, then their centres of pressure.
 
 Paper Eqs. 34-42 and 50. With antiparallel contact normals n and -n and the resultant force
 F = m (a - g) split into F_n = F.n and F_t = |F - F_n n|, the problem
@@ -11,7 +11,7 @@ share of contact 1. Its solution is the largest of five smooth functions (see
 
     N_1 + N_2 = max( F_t / mu,  |F_n|,  (mu F_t + mu^2 |F_n|) / (1 + mu^2) ).
 
-Centres of pressure: paper Eqs. 51-59. The forces are those of the allocation; each may act anywhere
+Centres of pressure: paper Eqs. 51-59. The forces are those of the program; each may act anywhere
 in the tangent plane of its contact, and the shifts are the least-norm ones that minimise the moment
 left over.
 """

@@ -1,6 +1,6 @@
 """Forces and pressure at samples, with exact derivatives.
 
-By the paper's allocation all normal forces are the largest of functions that are linear in the
+In the paper's model all normal forces are the largest of functions that are linear in the
 normal component F_n and the tangential magnitude F_t of the required force
 (`symbolic.contact.paper.normal_force_branches`), so that these two, and not the kinked forces, are
 differentiated; those of soft fingers are differentiated themselves. The share of each patch that
