@@ -60,7 +60,6 @@ CASES = (
     ("recommend", "folder", "is no results folder, configuration.json is missing"),
     ("recommend", "study --output new --duration 0", "--duration: found '0'"),
     ("compare", "study new", "new: does not exist"),
-    ("report", "study --into new", "No such file or directory"),
     ("calibrate", "cell new", "new: does not exist"),
     ("check", "cell new", "No such file or directory"),
     ("scene", "new", "No such file or directory"),
