@@ -91,6 +91,9 @@ class FrankaWorld(World):
         """One cycle of libfranka, once both arms are controlled."""
         if not all(self._controls):
             return
+        if self.log and self.log[-1].startswith("held"):
+            # Nobody is there to say how to go on.
+            self.interrupt()
         for arm, control in enumerate(self._controls):
             controller, _ = self.of(arm)
             state, _ = control.readOnce()
@@ -148,11 +151,13 @@ class Outcome:
     document: dict[str, Any]
 
     @property
-    def held(self) -> NDArray[np.bool_]:
-        """(n,) cycles of the carry."""
+    def aloft(self) -> NDArray[np.bool_]:
+        """(n,) cycles of the carry in which sagging arms cannot have set the box down."""
         (phase,) = (each for each in self.document["phases"] if each["name"] == "carry")
-        begin, end = (self.document["time"][phase[name]] for name in ("first", "last"))
-        return np.asarray((self.time > begin) & (self.time < end))
+        known, poses = np.array(self.document["time"]), np.array(self.document["box"]["pose"])
+        far = np.linalg.norm(poses[:, :3] - poses[-1, :3], axis=1)
+        end = known[np.flatnonzero(far > self.document["machine"]["limits"]["path"])[-1]]
+        return np.asarray((self.time > known[phase["first"]]) & (self.time < end))
 
     @property
     def commanded(self) -> Array:

@@ -27,6 +27,9 @@ from symbolic.records.poses import box_placement
 PATIENCE = 300.0
 """Longest wait of the scene and of the program for one another [s]."""
 
+OPTION = {"cone": "elliptic", "impratio": "50"}
+"""Of MuJoCo: with its defaults what is held by friction creeps (documentation of `impratio`)."""
+
 CYCLE = 0.001
 """Of libfranka [s]."""
 
@@ -55,6 +58,9 @@ class Scene:
 
     def build(self, simulator: MujocoSimulator) -> None:
         """Add arms with pads at their flanges, a box and its supports; nothing else collides."""
+        option = simulator.scene.find("option")
+        assert option is not None
+        option.attrib.update(OPTION)
         friction = f"{self.cell.contacts[0].friction} 0.02 0.001"
         for robot, q in zip(self.cell.robots, self.q, strict=True):
             simulator.add_robot(initial_q=q)

@@ -2,8 +2,9 @@
 
 Plays the drivers of the bundle in FOLDER: real actions, services, messages and quality of service
 over FastDDS, around the rules of `controlled.py`. A fault happens WHEN seconds after the first
-goal's start; negative, from the beginning. FOLDER/start gets this start as text, in seconds of the
-system's clock. On SIGTERM, FOLDER/cell.npz gets what happened.
+goal's start; negative, from the beginning. FOLDER/clock gets the time since this start [s]. On
+SIGTERM, FOLDER/cell.npz gets what happened. Time is that of /clock and slower than this machine's,
+which is loaded by more than one cell.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from typing import Any
 
 import numpy as np
 import rclpy
+from builtin_interfaces.msg import Time
 from control_msgs.action import FollowJointTrajectory
 from geometry_msgs.msg import WrenchStamped
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
@@ -31,6 +33,9 @@ from tests.hybrid_opt.bundles.controlled import SUCCEEDED, ControlledCell
 
 CYCLE = 0.01
 """Of controllers and topics [s]; those of robots are shorter."""
+
+SPEED = 0.3
+"""Of the cell's time over this machine's."""
 
 
 class RosCell(ControlledCell):
@@ -62,12 +67,13 @@ class RosCell(ControlledCell):
             source and node.create_publisher(WrenchStamped, source["topic"], quality)
             for source in self.config["wrench"]
         ]
+        self._folder, self._now = folder, 100.0
         self._clock = node.create_publisher(Clock, "/clock", 1)
-        node.create_timer(CYCLE, self._cycle)
+        node.create_timer(CYCLE / SPEED, self._cycle)
 
     def time(self) -> float:
-        """Time of the node's clock [s]."""
-        return float(self.node.get_clock().now().nanoseconds) * 1e-9
+        """Time of /clock [s]."""
+        return self._now
 
     def _service(self, name: str, kind: str) -> Any:
         def answer(request: Any, response: Any) -> Any:
@@ -107,9 +113,13 @@ class RosCell(ControlledCell):
         )
 
     def _cycle(self) -> None:
+        self._now += CYCLE
         self.drive()
-        stamp = self.node.get_clock().now().to_msg()
-        # Heard where the bundle is for a simulator.
+        sec, nanosec = divmod(round(self._now * 1e9), 10**9)
+        stamp = Time(sec=sec, nanosec=nanosec)
+        if len(self.starts) >= len(self.controllers):
+            (self._folder / "new").write_text(str(self._now - self.starts[0]), "utf-8")
+            (self._folder / "new").replace(self._folder / "clock")
         self._clock.publish(Clock(clock=stamp))
         for arm, robot in enumerate(self.robots):
             if not self.silent[arm]:
@@ -165,9 +175,6 @@ def main() -> None:
     print("ready", flush=True)
     while not ends:
         rclpy.spin_once(node, timeout_sec=0.1)
-        if len(cell.starts) == len(cell.controllers):
-            (folder / "starting").write_text(str(cell.starts[0]), "utf-8")
-            (folder / "starting").replace(folder / "start")
         if pending and cell.starts and cell.time() >= cell.starts[0] + pending[0][0]:
             cell.fault(*pending.pop()[1:])
     time, q, effort = (np.array(column) for column in zip(*cell.record, strict=True))

@@ -36,7 +36,6 @@ PACKAGES = (
     "ros-jazzy-python-cmake-module==0.11.1",
     "ros-jazzy-rosidl-core-generators==0.2.0",
     "catkin_pkg>=1,<2",
-    "scipy>=1.15,<2",
 )
 
 INTERFACES = {

@@ -1,11 +1,12 @@
 """The unedited `run_job.py` over ROS 2's own client library, messages and FastDDS, with faults.
 
-`python -m tests.vendor.ros_environment` makes the environment that it needs. Everything runs in
-real time; a run takes as long as its job.
+`python -m tests.vendor.ros_environment` makes the environment that it needs. The cell brings its
+own time, as a simulator does: of the bundle, only `simulated` in `config/cell.json` is changed.
 """
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import subprocess
@@ -29,8 +30,11 @@ pytestmark = pytest.mark.vendor
 
 ROOT = Path(__file__).resolve().parents[2]
 
-LONGEST = 90.0
+LONGEST = 300.0
 """A program that is not done by then waits for ever [s]."""
+
+SPEED = 0.3
+"""Of the cell's time (`ros_cell.py`) over this machine's."""
 
 SKEW = 0.010
 """Allowed between the starts of both arms [s]."""
@@ -69,21 +73,35 @@ class Live:
     def __init__(self, folder: Path, variables: dict[str, str], program: Any) -> None:
         self.folder, self.program, self._variables = folder, program, variables
 
+    def said(self) -> str:
+        """What the program has said."""
+        return (self.folder / "log").read_text("utf-8")
+
+    def leave(self) -> int:
+        """Wait for the program's end, and leave a job that is held; returns the exit code."""
+        begin, is_left = time.monotonic(), False
+        while self.program.poll() is None:
+            assert time.monotonic() - begin < LONGEST, self.said()
+            if not is_left and "held in" in self.said():
+                self.program.send_signal(signal.SIGINT)
+                is_left = True
+            time.sleep(0.1)
+        return int(self.program.returncode)
+
     def wait_for(self, text: str, after: float = 0.0) -> None:
         """Wait until the program has said something, and some time longer [s]."""
         begin = time.monotonic()
-        while text not in (self.folder / "log").read_text("utf-8"):
-            assert time.monotonic() - begin < LONGEST, (self.folder / "log").read_text("utf-8")
+        while text not in self.said():
+            assert time.monotonic() - begin < LONGEST, self.said()
             time.sleep(0.01)
         time.sleep(after)
 
     def wait_until(self, s: float) -> None:
-        """Wait until the job is at a coordinate [s]."""
-        starts, begin = self.folder / "start", time.monotonic()
-        while not starts.exists():
-            assert time.monotonic() - begin < LONGEST, (self.folder / "log").read_text("utf-8")
+        """Wait until the controllers are at a coordinate of the job [s]."""
+        clock, begin = self.folder / "clock", time.monotonic()
+        while not clock.exists() or float(clock.read_text("utf-8")) < s:
+            assert time.monotonic() - begin < LONGEST, self.said()
             time.sleep(0.01)
-        time.sleep(max(0.0, float(starts.read_text("utf-8")) + s - time.time()))
 
     def command(self, word: str) -> None:
         """Say something on `/carry/command`, as `ros2 topic pub --once` does."""
@@ -122,7 +140,9 @@ def run(
         fault: name, time and arm, as of `ros_cell.py`.
         act: is called while both run.
     """
-    write_bundle(folder, contents("torque", driver), {})
+    files = dict(contents("torque", driver))
+    config = json.loads(files["config/cell.json"]) | {"simulated": True}
+    write_bundle(folder, files | {"config/cell.json": json.dumps(config)}, {})
     variables = os.environ | {
         "ROS_DOMAIN_ID": str(os.getpid() % 100 + 1),
         "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
@@ -135,8 +155,9 @@ def run(
             [PYTHON, folder / "run_job.py"], env=variables, stdout=out, stderr=subprocess.STDOUT
         )
         try:
-            act(Live(folder, variables, program))
-            code = program.wait(LONGEST)
+            live = Live(folder, variables, program)
+            act(live)
+            code = live.leave()
         finally:
             program.kill()
             program.wait()
@@ -216,11 +237,10 @@ FAULTS = {
 def test_a_fault_stops_both_arms(name: str, tmp_path: Path) -> None:
     """The arm without the fault stops at the place that the program names, and presses."""
 
-    def leave(live: Live) -> None:
+    def held(live: Live) -> None:
         live.wait_for("held in", after=1.0)
-        live.program.send_signal(signal.SIGINT)
 
-    found = run("franka", tmp_path, name, middle(), 1, act=leave)
+    found = run("franka", tmp_path, name, middle(), 1, act=held)
     assert found.code == 1, found.log
     assert any(text in found.log for text in FAULTS[name].split("|")), found.log
     stopped = end_of_motion(found) - found.starts[0]
@@ -238,6 +258,7 @@ def test_ctrl_c_holds_and_back_brings_the_box_home(tmp_path: Path) -> None:
         live.program.send_signal(signal.SIGINT)
         live.wait_for("held in", after=0.5)
         live.command("back")
+        live.program.wait(LONGEST)
 
     found = run("ur", tmp_path, act=act)
     assert found.code == 3, found.log
@@ -250,7 +271,7 @@ def test_a_pause_of_the_program_stops_nothing(pause: float, tmp_path: Path) -> N
     def act(live: Live) -> None:
         live.wait_until(middle())
         live.program.send_signal(signal.SIGSTOP)
-        time.sleep(pause)
+        time.sleep(pause / SPEED)
         live.program.send_signal(signal.SIGCONT)
 
     found = run("franka", tmp_path, act=act)
@@ -264,7 +285,7 @@ def test_controllers_end_the_job_of_a_killed_program(tmp_path: Path) -> None:
     def act(live: Live) -> None:
         live.wait_until(middle())
         live.program.kill()
-        time.sleep(job().end - middle() + 1.0)
+        live.wait_until(job().end + 0.5)
 
     found = run("ur", tmp_path, act=act)
     assert found.code == -signal.SIGKILL

@@ -2,11 +2,11 @@
 
 The controllers are C++; these are their rules, after ros2_controllers jazzy
 (joint_trajectory_controller.cpp: goals of an inactive controller are rejected, :1401; what is
-validated, :1740; a hold has no effort, :2083; trajectory.cpp: efforts are linear between points,
-:296). libfranka sets a load only while no motion runs. Arms follow their commands at once; their
-sensors feel what the job's nearest sample presses.
+validated, :1740; a hold has no effort, :2083; trajectory.cpp: quintic positions and linear efforts
+between points, :296). libfranka sets a load only while no motion runs. Arms follow their commands
+at once; their sensors feel what the job's nearest sample presses.
 
-NumPy and SciPy only: environments of ROS 2 import it, too.
+NumPy only: environments of ROS 2 import it, too.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import BPoly
 
 Array = NDArray[np.float64]
 
@@ -45,9 +44,8 @@ class Controller:
         self.is_active = self.refuses = False
         self.aborts_at: float | None = None
         self.stands = np.zeros(len(q), dtype=bool)
-        self._spline: BPoly | None = None
-        self._times = np.zeros(1)
-        self._rows = np.zeros((1, len(q)))
+        self._times: Array | None = None
+        self._pieces, self._rows = np.zeros((6, 1, len(q))), np.zeros((1, len(q)))
         self._start = 0.0
         self._ended: Ended | None = None
 
@@ -85,20 +83,19 @@ class Controller:
             return np.asarray(rows[:, order])
 
         self._start, times = seconds(trajectory.header.stamp) or self.time(), times_of(points)
-        known = np.stack([column(n) for n in ("positions", "velocities", "accelerations")], axis=1)
-        rows = column("effort")
+        known = [column(name) for name in ("positions", "velocities", "accelerations", "effort")]
         if len(times) == 1:
             # From where it is to a single point.
-            here = np.stack([self.desired, *np.zeros((2, len(self.q)))])
+            here = [self.desired, *np.zeros((2, len(self.q))), self.effort]
+            known = [np.stack([first, *rows]) for first, rows in zip(here, known, strict=True)]
             times = np.array([self.time() - self._start, *times])
-            known, rows = np.stack([here, *known]), np.stack([self.effort, *rows])
-        self._times, self._rows = times, rows
-        self._spline = BPoly.from_derivatives(times, known)
+        self._times, self._rows = times, known[3]
+        self._pieces = quintics(times, *known[:3])
         self._ended = ended
 
     def _hold(self) -> None:
         """`set_hold_position`: where it is, without effort."""
-        self._spline, self.effort = None, np.zeros(len(self.q))
+        self._times, self.effort = None, np.zeros(len(self.q))
         self.desired, self.rate = self.q.copy(), np.zeros(len(self.q))
 
     def _end(self, status: int, text: str) -> None:
@@ -109,7 +106,7 @@ class Controller:
     def step(self) -> None:
         """Sample the reference."""
         now = self.time()
-        if self._spline is None or now < self._start + self._times[0]:
+        if self._times is None or now < self._start + self._times[0]:
             return
         if self.aborts_at is not None and now >= self.aborts_at:
             self.aborts_at = None
@@ -118,12 +115,35 @@ class Controller:
             return
         time = now - self._start
         place = float(np.clip(time, self._times[0], self._times[-1]))
-        self.desired, self.rate = np.asarray(self._spline(place)), np.zeros(len(self.q))
+        k = min(int(np.searchsorted(self._times, place, side="right")), len(self._times) - 1) - 1
+        x, step = place - self._times[k], self._times[k + 1] - self._times[k]
+        piece = self._pieces[:, k]
+        self.desired, self.rate = x ** np.arange(6) @ piece, np.zeros(len(self.q))
         if self._times[0] < time < self._times[-1]:
-            self.rate = np.asarray(self._spline(place, 1))
-        self.effort = np.array([np.interp(place, self._times, c) for c in self._rows.T])
+            self.rate = np.arange(1, 6) * x ** np.arange(5) @ piece[1:]
+        self.effort = self._rows[k] + x / step * (self._rows[k + 1] - self._rows[k])
         if time >= self._times[-1] and self._ended is not None:
             self._end(SUCCEEDED, "Goal successfully reached!")
+
+
+def quintics(times: Array, position: Array, velocity: Array, acceleration: Array) -> Array:
+    """Coefficients (6, n - 1, joints) of polynomials from each of n points to the next one."""
+    h = np.diff(times)[:, None]
+    p, (v, v1), (a, a1) = (
+        np.diff(position, axis=0),
+        (velocity[:-1], velocity[1:]),
+        (acceleration[:-1], acceleration[1:]),
+    )
+    return np.stack(
+        [
+            position[:-1],
+            v,
+            a / 2.0,
+            (20.0 * p - (8.0 * v1 + 12.0 * v) * h - (3.0 * a - a1) * h**2) / (2.0 * h**3),
+            (-30.0 * p + (14.0 * v1 + 16.0 * v) * h + (3.0 * a - 2.0 * a1) * h**2) / (2.0 * h**4),
+            (12.0 * p - 6.0 * (v1 + v) * h - (a - a1) * h**2) / (2.0 * h**5),
+        ]
+    )
 
 
 def seconds(stamp: Any) -> float:
