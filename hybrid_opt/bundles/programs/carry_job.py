@@ -11,6 +11,7 @@ Positions are cubic between samples, forces linear. Standard library only, Pytho
 from __future__ import annotations
 
 import json
+import math
 from bisect import bisect_right
 from collections.abc import Iterator, Sequence
 from copy import copy
@@ -30,6 +31,9 @@ STILL = 1e-9
 
 SEARCH_STEP = 0.004
 """Between places that are compared with a measured posture [s]."""
+
+FINE = 0.002
+"""Longest step over which a changing rate is integrated [s]."""
 
 NEAR = 0.002
 """A pad so near to its place is there [m]."""
@@ -257,7 +261,12 @@ class Clock:
             self._takes = self._stop_time if takes is None else takes
 
     def advance(self, dt: float) -> None:
-        """Advance the clock by a time step [s]."""
+        """Advance time [s]; the coordinate does not depend on the number of calls."""
+        count = max(1, math.ceil(dt / FINE)) if self.turning else 1
+        for _ in range(count):
+            self._step(dt / count)
+
+    def _step(self, dt: float) -> None:
         before = self.rate
         if self.turning:
             self._since += dt

@@ -88,6 +88,16 @@ def test_what_is_ahead_is_what_happens() -> None:
     assert list(Clock(1.0, 0.5, 0.0, 1.0).ahead(1.0, 0.3))[-1].s == 1.0
 
 
+@pytest.mark.parametrize("step", [0.004, 0.05, 0.13])
+def test_a_stop_ends_at_one_place_however_often_the_clock_is_looked_at(step: float) -> None:
+    """Over a turn from rate 1 to 0 in 0.1 s the smooth profile covers half of it, after 0.04 s."""
+    clock = Clock(10.0, 0.5, 1.0, 1.0)
+    clock.turn(0.0, 0.04, 0.1)
+    while clock.turning:
+        clock.advance(step)
+    assert clock.s == pytest.approx(1.0 + 0.04 + 0.05, abs=1e-4)
+
+
 def moved(q: list[float] | None, by: float) -> list[float]:
     assert q is not None
     return [value + by for value in q]
