@@ -16,7 +16,7 @@ import numpy as np
 from codegen.function import NumericFunction
 from hybrid_opt.display_protocol import Displayable, Page, display
 from hybrid_opt.indicators.metrics import excess_above_static
-from hybrid_opt.static_hold import payload_limit, static_hold
+from hybrid_opt.static_hold import limited_force, payload_limit, static_hold
 from symbolic.array import Array, set_read_only
 from symbolic.path.spline import sample_basis
 from symbolic.records import Workcell
@@ -165,7 +165,8 @@ class Carry(Displayable):
     @property
     def payload_limit(self) -> float:
         """Least payload at which a robot's whole force reaches its reference force [kg]."""
-        return payload_limit(self.workcell, self.peak_resultant_force)
+        forces = self.peak_normal_force, self.peak_resultant_force
+        return payload_limit(self.workcell, limited_force(self.workcell, *forces))
 
     @property
     def excess_above_static(self) -> Array:

@@ -60,7 +60,15 @@ def static_hold(workcell: Workcell) -> StaticHold:
     whole = np.linalg.norm(outputs["contact_force"].reshape(2, 3), axis=1)
     for force in (normal, whole):
         force.setflags(write=False)
-    return StaticHold(normal, whole, payload_limit(workcell, whole))
+    return StaticHold(
+        normal, whole, payload_limit(workcell, limited_force(workcell, normal, whole))
+    )
+
+
+def limited_force(workcell: Workcell, normal: Array, whole: Array) -> Array:
+    """Return the forces that reference forces limit: whole ones of pads, which arms press with, and
+    holding forces of hands that hold by themselves."""
+    return whole if contact_model(workcell).is_squeeze else normal
 
 
 def mass_at_reference(workcell: Workcell, force: Array) -> Array:
@@ -232,8 +240,9 @@ class _Still:
         for i, robot in enumerate(workcell.robots):
             allowed = float(workcell.task.reference_force[i])
             normal = mass * float(load["normal_force"][i])
+            most = mass * float(limited_force(workcell, load["normal_force"], whole)[i])
             # Where a pad presses too hard already, its whole force says nothing new.
-            name, force = (NORMAL, normal) if normal > allowed else (WHOLE, mass * float(whole[i]))
+            name, force = (WHOLE, most) if normal <= allowed < most else (NORMAL, normal)
             yield StaticUtilisation(name, robot.name, where, force, allowed, "N")
             if contact_model(workcell).has_pressure_limit:
                 shift, radius = float(load["pressure_shift"][i]), workcell.contacts[i].patch_radius

@@ -14,9 +14,10 @@ entries that NumPy derives from several keys have names of their own.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, fields, is_dataclass, replace
 from functools import cache, cached_property, lru_cache, partial
+from itertools import repeat
 from math import prod
 from pathlib import Path
 from types import MappingProxyType
@@ -27,7 +28,9 @@ import numpy as np
 
 from symbolic.array import Array
 from symbolic.cell_model import CellBodies, CellModel
+from symbolic.contact.elastic import layer_shares
 from symbolic.contact.force_closure import grasp_shapes, left_components
+from symbolic.contact.holding_hands import opposed_needs
 from symbolic.contact.registry import command_model, contact_model
 from symbolic.contact.soft_finger import SoftPatch
 from symbolic.geometry.screen import Screen, ScreenBase, ScreenBody
@@ -285,8 +288,14 @@ def _workcell(take: _Take, cell: Workcell) -> NumberedWorkcell:
     names += ["angular_velocity_max", "angular_acceleration_max"]
     own = {name: take(HELD, f"payload.{name}", getattr(payload, name)) for name in names}
     payload = _as(NumberedPayload, payload, **own, given=take.group(HELD))
+    holds = any(contact.holding_force for contact in cell.contacts)
+    hands: Iterator[tuple[Array | None, Array | None]] = repeat((None, None))
+    if holds:
+        needs = opposed_needs(cell.pads, cell.pad_robots)
+        hands = zip(layer_shares(cell.pads), needs, strict=True)
     contacts: Any = tuple(
-        _contact(take, f"contacts[{i}]", contact, cell) for i, contact in enumerate(cell.contacts)
+        _contact(take, f"contacts[{i}]", contact, cell, hands)
+        for i, contact in enumerate(cell.contacts)
     )
     return NumberedWorkcell(
         name="",
@@ -384,7 +393,14 @@ def _turn(take: _Take, group: str, path: str, rotation: Array) -> Any:
     return take(group, f"{path}.base.rpy", rotation)
 
 
-def _contact(take: _Take, path: str, contact: Contact, cell: Workcell) -> Any:
+def _contact(
+    take: _Take,
+    path: str,
+    contact: Contact,
+    cell: Workcell,
+    hands: Iterator[tuple[Array | None, Array | None]],
+) -> Any:
+    share, opposed = next(hands)
     pose = (take(HELD, f"{path} pose", part) for part in _split(contact.T_box_pad))
     patch = SoftPatch.of(contact, cell.contacts[0].T_box_pad[:3, :3])
     sides = contact.half_sides
@@ -398,11 +414,14 @@ def _contact(take: _Take, path: str, contact: Contact, cell: Workcell) -> Any:
         if sides is None
         else tuple(take(HELD, f"{path}.patch_size[{k}]", side) for k, side in enumerate(sides)),
         further=tuple(
-            _contact(take, f"{path}.further[{k}]", pad, cell)
+            _contact(take, f"{path}.further[{k}]", pad, cell, hands)
             for k, pad in enumerate(contact.further)
         ),
         twist=take(HELD, f"{path} twist", patch.twist),
         spread=take(HELD, f"{path} spread", patch.spread),
+        share=None if share is None else take(HELD, f"{path} share", share),
+        opposed=None if opposed is None else take(HELD, f"{path} opposed", opposed),
+        holding_force=0.0,
     )
 
 

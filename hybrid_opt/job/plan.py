@@ -49,6 +49,7 @@ from hybrid_opt.timing.jerk import applicable_jerk_limits
 from hybrid_opt.timing.model import TimingModel
 from hybrid_opt.timing.records import JerkLimits, Timing
 from symbolic.array import Array, interpolated
+from symbolic.contact.registry import require_squeeze
 from symbolic.errors import SettingsError
 from symbolic.geometry.bodies import CollisionBody
 from symbolic.geometry.pairs import ActivePair, CellGeometry, build_geometry, ignored_pairs
@@ -308,10 +309,12 @@ class JobModel:
             timing: its timing model, where there is one.
 
         Raises:
+            SettingsError: the hands hold by themselves.
             DualArmError: the model cannot be built.
         """
         compiled = CompiledCell.of(cell)
         self.workcell = compiled.workcell
+        require_squeeze(self.workcell, "a job")
         self.timing = TimingModel(compiled) if timing is None else timing
         self._posture: NumericFunction = compiled.evaluators["posture"]
         self._collisions = JobCollisions(compiled)

@@ -440,7 +440,7 @@ class RobustModel:
     def _friction_left(self, cases: Array) -> float:
         """Compute the least share of friction that displacements leave, which screening ignores."""
         apart = np.linalg.norm(cases[:, 11:13] - cases[:, 13:15], axis=1)
-        lost = apart / (self.workcell.pad_distance * cases[:, :2].min(axis=1))
+        lost = command_model(self.workcell).friction_lost(apart) / cases[:, :2].min(axis=1)
         return SCREEN_SHARE * max(0.0, 1.0 - float(lost.max()))
 
     def largest_factor(self, motion: HeldMotion, limit: Array, leader: int = 0) -> float:

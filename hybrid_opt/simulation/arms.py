@@ -45,6 +45,7 @@ from hybrid_opt.simulation.scene import (
     patch_area,
 )
 from symbolic.array import Array, interpolated
+from symbolic.contact.registry import require_squeeze
 from symbolic.records import Workcell
 from symbolic.records.poses import box_rotation
 
@@ -175,6 +176,7 @@ class CellSimulation:
         self.settings = settings or ArmSettings()
         self.disturbance = np.asarray(disturbance, dtype=float)
         self.mujoco = mujoco_module()
+        require_squeeze(workcell, "a simulation")
         self.model, self.text = compiled(self.mujoco, cell_text(workcell, self.settings))
 
     def simulate(

@@ -32,6 +32,7 @@ from hybrid_opt.simulation.scene import (
     tilt_names,
 )
 from symbolic.array import Array, interpolated
+from symbolic.contact.registry import require_squeeze
 from symbolic.errors import SettingsError
 from symbolic.records import Contact, Workcell
 from symbolic.records.poses import box_rotation
@@ -312,6 +313,7 @@ class BoxSimulation:
         self.workcell = workcell
         self.settings = settings or SimulationSettings()
         self._mujoco = mujoco_module()
+        require_squeeze(workcell, "a simulation")
         self._disturbance = disturbance
         self._model = cache(self._compiled)
 

@@ -22,7 +22,7 @@ from scipy.optimize import linprog
 from scipy.sparse import csr_array
 
 from hybrid_opt.carry import Carry
-from hybrid_opt.static_hold import mass_at_reference
+from hybrid_opt.static_hold import limited_force, mass_at_reference
 from hybrid_opt.timing.limits import SpeedProfile, has_pressure_limit, limit_ratios
 from hybrid_opt.timing.model import REFINEMENT, TimingModel
 from hybrid_opt.timing.records import FRICTION_RATIO, Timing, TimingLimits
@@ -90,8 +90,9 @@ class Margin:
 
 def payload_sensitivity(carry: Carry) -> PayloadSensitivity:
     """Return forces against payload mass for an unchanged timing."""
-    cell, resultant = carry.workcell, carry.peak_resultant_force
-    return PayloadSensitivity(cell.payload.mass, resultant, mass_at_reference(cell, resultant))
+    cell = carry.workcell
+    limited = limited_force(cell, carry.peak_normal_force, carry.peak_resultant_force)
+    return PayloadSensitivity(cell.payload.mass, limited, mass_at_reference(cell, limited))
 
 
 def robustness_margins(model: TimingModel, carry: Carry) -> tuple[Margin, ...]:

@@ -33,7 +33,7 @@ def layer_shares(pads: Sequence[Contact]) -> Array:
     The load is force and moment about the box frame's origin, box axes; a wrench is that of the pad
     on the payload about the pad's place, in the pad's axes [N, N m].
     """
-    maps, stiff = [wrench_to_box(pad) for pad in pads], [_stiffness(pad) for pad in pads]
+    maps, stiff = [wrench_to_box(pad) for pad in pads], [layer_stiffness(pad) for pad in pads]
     whole = sum(A @ K @ A.T for A, K in zip(maps, stiff, strict=True))
     return np.array([K @ A.T @ np.linalg.inv(whole) for A, K in zip(maps, stiff, strict=True)])
 
@@ -76,8 +76,9 @@ def kern(pad: Contact) -> tuple[Any, Any]:
     return pad.half_sides[0] / 3.0, pad.half_sides[1] / 3.0
 
 
-def _stiffness(pad: Contact) -> Array:
-    """(6, 6) of a pad's layer, in its axes, over that of a unit of area across it."""
+def layer_stiffness(pad: Contact) -> Array:
+    """Return the stiffness (6, 6) of a pad's layer, in its axes, over that of a unit of area across
+    it."""
     area = pad.area
     # Means of the squared coordinates: the side, or the radius of a ring or a disc, times the kern.
     if pad.half_sides is None:

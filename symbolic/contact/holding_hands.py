@@ -21,15 +21,23 @@ slides or lifts leaks.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import casadi as ca
 import numpy as np
 
-from symbolic.contact.elastic import kern
+from symbolic.array import Array
+from symbolic.contact.elastic import kern, layer_shares, layer_stiffness
+from symbolic.contact.force_closure import wrench_to_box
+from symbolic.contact.model import ContactLoad, ContactModel, HeldLoad, ImplicitVariables, Problem
 from symbolic.contact.soft_finger import SoftPatch
 from symbolic.expression import Expression, number
 from symbolic.records import Contact
+from symbolic.records.cell import Uncertainty
+from symbolic.records.numbered import NumberedContact
+from symbolic.records.quantities import GRAVITY
 
 KAPPA_DISC, KAPPA = 0.3, 0.5
 """Coefficients of (2) for discs, and for rings and rectangles: the least of one digit that never
@@ -86,3 +94,152 @@ def needed_holding_forces(
 
 def _length(*components: Expression) -> Expression:
     return ca.sqrt(sum(component**2 for component in components) + FLOOR**2)
+
+
+def opposed_needs(pads: Sequence[Contact], robots: Sequence[int]) -> Array:
+    """Return what one newton between the arms asks of each hand (n, 3), whatever its direction: a
+    and b of a / mu + b against sliding, and against lifting [1].
+
+    Arms whose relative place is off by a displacement work against one another: both arms' layers
+    are springs in series. Bounds of all directions add up, so that a hand needs no more.
+    """
+    maps, stiff = [wrench_to_box(pad) for pad in pads], [layer_stiffness(pad) for pad in pads]
+    wholes = [np.zeros((6, 6)), np.zeros((6, 6))]
+    for A, K, i in zip(maps, stiff, robots, strict=True):
+        wholes[i] += A @ K @ A.T
+    softness = [np.linalg.inv(whole) for whole in wholes]
+    series = np.linalg.inv(softness[0] + softness[1])[:, :3]
+    wrench = series @ np.linalg.inv(series[:3])
+    found = []
+    for pad, A, K, i in zip(pads, maps, stiff, robots, strict=True):
+        own, patch = K @ A.T @ softness[i] @ wrench, HandPatch.of(pad)
+        along, across, torsion = own[:2], own[2:3], own[5:] / float(patch.twist)
+        tilting = own[3:5] / np.array(patch.kern[::-1])[:, None]
+        t, n, m, s = (float(np.linalg.norm(part, 2)) for part in (along, across, tilting, torsion))
+        m *= 1.0 if patch.is_round else np.sqrt(2.0)
+        found.append([np.sqrt(t**2 + s**2 + patch.kappa * t * s), n, m + n])
+    return np.array(found)
+
+
+class HoldingHands(ContactModel):
+    """Hands of both arms, any number with any normals. What counts as the normal force of an arm is
+    the largest holding force that any of its hands needs. In worst cases the hands of both arms
+    count together: no force is commanded, and a limit is one for both."""
+
+    assumption = "hands that hold by themselves, on arms that keep their poses"
+    is_squeeze = False
+
+    @property
+    def problem(self) -> Problem | None:
+        """See `ContactModel`."""
+        pads = [f"contacts[{i}]" for i, c in enumerate(self.workcell.contacts) if c.kind == "pad"]
+        if pads:
+            return (
+                pads[0],
+                "is a pad, which only a squeeze holds; holding hands need kind = 'cup', 'magnet' "
+                "or 'fingers' and a holding_force on both arms",
+            )
+        first, second = (contact.holding_force for contact in self.workcell.contacts)
+        if first != second:
+            return (
+                "contacts[1].holding_force",
+                f"found {second:g} N, and {first:g} N on the other arm; allowed is the same on "
+                "both: a force limit is one for both arms",
+            )
+        return None
+
+    @property
+    def level_force(self) -> float:
+        """Holding force that a hand needs if the payload is level and still [N]."""
+        payload, contacts = self.workcell.payload, self.workcell.contacts
+        centre = payload.centre_of_mass
+        load = ContactLoad(
+            ca.DM(-payload.mass * np.array(GRAVITY)),
+            ca.DM.zeros(3),
+            tuple(ca.DM(contact.T_box_pad[:3, 3] - centre) for contact in contacts),
+            ca.DM(contacts[0].T_box_pad[:3, :3]),
+            ca.DM([contact.friction for contact in contacts]),
+        )
+        return float(ca.evalf(ca.mmax(self.hold(load).normal)))
+
+    def hold(
+        self,
+        load: ContactLoad,
+        implicit: ImplicitVariables | None = None,
+        displaced: bool = False,
+    ) -> HeldLoad:
+        """See `ContactModel`. What counts as tangential is what the holding force bears by
+        friction, so that it never exceeds friction times the normal force."""
+        workcell = self.workcell
+        places = [number(contact.T_box_pad[:3, 3]) for contact in workcell.contacts]
+        # The axes of the box, along those of the load.
+        box = ca.mtimes(load.axes, number(workcell.contacts[0].T_box_pad[:3, :3]).T)
+        in_box = ca.mtimes(box.T, load.force)
+        centre = places[0] - ca.mtimes(box.T, load.arms[0])
+        about = ca.mtimes(box.T, load.moment) + ca.cross(centre, in_box)
+        whole = ca.vertcat(in_box, about)
+        needed, rubbed = [ca.SX(0.0), ca.SX(0.0)], [ca.SX(0.0), ca.SX(0.0)]
+        forces, moments = ([ca.SX.zeros(3), ca.SX.zeros(3)] for _ in range(2))
+        for hand, i, share in zip(workcell.pads, workcell.pad_robots, self._shares, strict=True):
+            own, friction = ca.mtimes(share, whole), load.friction[i]
+            lifting, sliding = needed_holding_forces(own, friction, HandPatch.of(hand))
+            needed[i] = ca.fmax(needed[i], ca.fmax(lifting, sliding))
+            rubbed[i] = ca.fmax(rubbed[i], _length(own[0], own[1]) - friction * own[2])
+            turn = ca.mtimes(box, number(hand.T_box_pad[:3, :3]))
+            force = ca.mtimes(turn, own[:3])
+            lever = ca.mtimes(box, number(hand.T_box_pad[:3, 3]) - places[i])
+            forces[i] += force
+            moments[i] += ca.mtimes(turn, own[3:]) + ca.cross(lever, force)
+        point = load.moment - sum(
+            ca.cross(arm, force) for arm, force in zip(load.arms, forces, strict=True)
+        )
+        none = ca.SX.zeros(3)
+        return HeldLoad(
+            ca.vertcat(*needed),
+            ca.vertcat(*rubbed),
+            (forces[0], forces[1]),
+            (none, none),
+            (moments[0], moments[1]),
+            point,
+            point - moments[0] - moments[1],
+        )
+
+    def friction_lost(self, apart: Array) -> Array:
+        """See `ContactModel`. No squeeze makes a moment of displacements."""
+        return 0.0 * apart
+
+    def worst_displacements(self, uncertainty: Uncertainty) -> tuple[Array, Array]:
+        """See `ContactModel`. Hands off their places leave the centre of mass as much off."""
+        off = uncertainty.pad_position + uncertainty.apart / 2.0
+        return uncertainty.centre_of_mass + off, np.zeros((1, 4))
+
+    def leading_excess(self, load: ContactLoad, opposed: Expression) -> Expression:
+        """See `ContactModel`. Both count together."""
+        return ca.SX(0.0)
+
+    def commanded_forces(
+        self, normal: Expression, friction: Expression, tracking: Expression, opposed: Expression
+    ) -> Expression:
+        """See `ContactModel`. Some of the holding force, of a vacuum say, may be missing."""
+        most = ca.SX(0.0)
+        for (a, b, lifting), i in zip(self._opposed, self.workcell.pad_robots, strict=True):
+            most = ca.fmax(most, ca.fmax(a / friction[i] + b, lifting))
+        needed = ca.fmax(normal[0], normal[1]) + opposed * most
+        needed /= 1.0 - ca.fmax(tracking[0], tracking[1])
+        return ca.vertcat(needed, needed)
+
+    @property
+    def _opposed(self) -> list[list[Any]]:
+        """Per hand its row of `opposed_needs`; symbols if the cell's numbers are."""
+        pads = self.workcell.pads
+        if isinstance(pads[0], NumberedContact):
+            return [ca.vertsplit(p.opposed) for p in pads if isinstance(p, NumberedContact)]
+        return [list(row) for row in opposed_needs(pads, self.workcell.pad_robots)]
+
+    @property
+    def _shares(self) -> list[Any]:
+        """Per hand its matrix of `layer_shares`; symbols if the cell's numbers are."""
+        pads = self.workcell.pads
+        if isinstance(pads[0], NumberedContact):
+            return [pad.share for pad in pads if isinstance(pad, NumberedContact)]
+        return list(map(ca.DM, layer_shares(pads)))

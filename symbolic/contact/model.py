@@ -21,6 +21,7 @@ import numpy as np
 from symbolic.array import Array
 from symbolic.expression import Expression
 from symbolic.records.cell import Uncertainty, Workcell
+from symbolic.records.quantities import GRAVITY
 
 Problem = tuple[str, str]
 """Key of the workcell file, and a message."""
@@ -124,12 +125,15 @@ class ContactModel(ABC):
             because forces do not grow with the moments.
         has_elastic_layers: whether pads are layers that `symbolic.contact.elastic` describes.
         has_closed_form: whether `hold` gives the forces; else a program finds them.
+        is_squeeze: whether the arms hold the payload by pressing it between them, so that forces
+            are commanded, and reference forces limit the whole force of a robot as well.
     """
 
     assumption: ClassVar[str]
     has_pressure_limit: ClassVar[bool] = False
     has_elastic_layers: ClassVar[bool] = False
     has_closed_form: ClassVar[bool] = True
+    is_squeeze: ClassVar[bool] = True
 
     def __init__(self, workcell: Workcell) -> None:
         self.workcell = workcell
@@ -149,6 +153,12 @@ class ContactModel(ABC):
     @abstractmethod
     def problem(self) -> Problem | None:
         """Key and message if the pads do not hold the payload under every motion, else None."""
+
+    @property
+    def level_force(self) -> float:
+        """Normal force that holds the payload level and still between upright contacts [N]."""
+        weight = -self.workcell.payload.mass * GRAVITY[2]
+        return float(weight / sum(contact.friction for contact in self.workcell.contacts))
 
     @abstractmethod
     def hold(
@@ -192,13 +202,14 @@ class ContactModel(ABC):
         squeeze into a moment, which a coefficient lower by 2 e / L stands for, L being their
         distance.
         """
-        displaced = 2.0 * uncertainty.pad_position + uncertainty.apart
-        return self._tilted_friction(uncertainty) - displaced / self.workcell.pad_distance
-
-    def _tilted_friction(self, uncertainty: Uncertainty) -> Array:
         friction = np.array([contact.friction for contact in self.workcell.contacts])
         left = np.tan(np.arctan(friction * (1.0 - uncertainty.friction)) - uncertainty.turned)
-        return np.asarray(left)
+        apart = np.array(2.0 * uncertainty.pad_position + uncertainty.apart)
+        return np.asarray(left - self.friction_lost(apart))
+
+    def friction_lost(self, apart: Array) -> Array:
+        """Return the coefficients that stand for pads displaced apart by distances [m]."""
+        return apart / self.workcell.pad_distance
 
     def worst_displacements(self, uncertainty: Uncertainty) -> tuple[Array, Array]:
         """Return half the widths (3,) of the range of the centre of mass, and the displacements

@@ -109,9 +109,9 @@ class SoftFingerGrasp(SoftFinger):
             "or add a pad (further)",
         )
 
-    def least_friction(self, uncertainty: Uncertainty) -> Array:
+    def friction_lost(self, apart: Array) -> Array:
         """See `ContactModel`. Displacements are cases of their own."""
-        return self._tilted_friction(uncertainty)
+        return 0.0 * apart
 
     def worst_displacements(self, uncertainty: Uncertainty) -> tuple[Array, Array]:
         """See `ContactModel`. To first order no displacements are worse than the corners of squares

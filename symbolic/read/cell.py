@@ -127,7 +127,8 @@ def _build(
     payload = read_payload(table.table("payload"), folder)
     contacts = [read_contact(entry, payload) for entry in table.tables("contacts", exactly=2)]
     check_count(contacts, problems)
-    task, redundant = read_task(table.table("task"))
+    holding = np.array([contact.holding_force for contact in contacts])
+    task, redundant = read_task(table.table("task"), holding)
     environment = tuple(read_body(entry, folder) for entry in table.tables("environment"))
     collision = table.table("collision", {}).record(CollisionSettings)
     for index, pair in enumerate(collision.ignored):
@@ -146,7 +147,7 @@ def _build(
         robots=(robots[0][0], robots[1][0]),
         payload=payload,
         contacts=(contacts[0], contacts[1]),
-        task=with_force_limit(task, payload, contacts),
+        task=task,
         environment=environment,
         collision=collision,
         start_branch=(robots[0][1], robots[1][1]),
@@ -154,6 +155,8 @@ def _build(
         uncertainty=uncertainty,
         handling=handling,
     )
+    if not problems.found:
+        workcell = with_force_limit(workcell)
     try:
         identity = "" if problems.found else _digest(content, workcell)
     except OutsideError as error:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import cast, get_args
 
 import numpy as np
 
@@ -12,6 +13,7 @@ from symbolic.errors import CollisionModelError
 from symbolic.read.tables import TableReader, read_file, read_inertia
 from symbolic.records import Contact, Cylinder, Mesh, Payload
 from symbolic.records import quantities as quantity
+from symbolic.records.cell import HandKind
 from symbolic.records.poses import read_only, transform
 from symbolic.records.problems import Problems
 
@@ -113,7 +115,7 @@ def _read_inertia(table: TableReader, kind: str, solid: Payload) -> Array:
 
 
 FACE_TOLERANCE = 1e-6  # [m], how far a contact may be written off its face; it is moved onto it
-MOST_PADS = 4
+MOST_PADS, MOST_HANDS = 4, 16  # of both arms
 SHAPE_KEYS = tuple(
     f"payload.{key}" for key in ("kind", "size", "radius", "length", "path", "scale")
 )
@@ -131,12 +133,20 @@ def read_contact(table: TableReader, payload: Payload) -> Contact:
         radius, half_sides = float(np.hypot(*sides)), (float(sides[0]), float(sides[1]))
     else:
         radius = table.number("patch_radius", quantity.PATCH_RADIUS)
+    kind = cast("HandKind", table.choice("kind", get_args(HandKind), "pad"))
+    force = table.number("holding_force", quantity.FORCE) if kind != "pad" else 0.0
+    if kind == "pad" and table.has("holding_force"):
+        table.add(
+            "holding_force", "found for a pad; allowed with kind = 'cup', 'magnet', 'fingers'"
+        )
+    if kind == "cup" and half_sides is not None:
+        table.add("patch_size", "found for a cup; allowed is the patch_radius of its lip")
     known = table.clean("patch_radius", "patch_size") and table.problems.clean(*SHAPE_KEYS)
 
     def pad(place: TableReader, further: tuple[Contact, ...] = ()) -> Contact:
         pose = _read_place(place, payload if known else None, radius, half_sides)
         place.close()
-        return Contact(pose, friction, radius, half_sides, further)
+        return Contact(pose, friction, radius, half_sides, further, kind, force)
 
     return pad(table, tuple(pad(entry) for entry in table.tables("further")))
 
@@ -144,8 +154,9 @@ def read_contact(table: TableReader, payload: Payload) -> Contact:
 def check_count(contacts: list[Contact], problems: Problems) -> None:
     """Check that there are at most `MOST_PADS` pads."""
     count = sum(1 + len(contact.further) for contact in contacts)
-    if count > MOST_PADS:
-        problems.add("contacts", f"found {count} pads; allowed are {MOST_PADS} on both arms")
+    allowed = MOST_HANDS if any(contact.holding_force for contact in contacts) else MOST_PADS
+    if count > allowed:
+        problems.add("contacts", f"found {count} pads; allowed are {allowed} on both arms")
 
 
 def _read_place(

@@ -17,14 +17,13 @@ import numpy as np
 import pinocchio as pin
 
 from symbolic.array import Array
-from symbolic.contact.registry import CONTACT_MODELS
+from symbolic.contact.registry import CONTACT_MODELS, contact_model
 from symbolic.read.arms import FOLLOWING, arm_model, common_joints, link_frame, turning_joints
 from symbolic.read.payload import SHAPE_KEYS
 from symbolic.read.tables import TableReader, checked_vector
 from symbolic.records import (
     POSE_SIZE,
     Contact,
-    Payload,
     RedundantJoint,
     Robot,
     Task,
@@ -43,7 +42,6 @@ from symbolic.records.poses import (
     rotation_from_rpy,
 )
 from symbolic.records.problems import Problems, shown
-from symbolic.records.quantities import GRAVITY
 from symbolic.records.task import components
 
 MAX_WAYPOINTS = 100
@@ -55,7 +53,7 @@ MOST_TURN = 5.0
 FORCE_LIMIT_MARGIN = 1.001
 
 
-def read_task(table: TableReader) -> tuple[Task, tuple[RedundancyEntry, ...]]:
+def read_task(table: TableReader, holding: Array) -> tuple[Task, tuple[RedundancyEntry, ...]]:
     """Read the task (fixed poses, waypoints, sampling, limits) and the entries of redundant
     joints."""
     orientation = _orientation(table)
@@ -74,12 +72,18 @@ def read_task(table: TableReader) -> tuple[Task, tuple[RedundancyEntry, ...]]:
     time_law = cast("TimeLaw", table.choice("time_law", get_args(TimeLaw), "constant"))
     pieces = table.integer("drivable_pieces", 1, MAX_PIECES, 1)
     redundant = read_redundant(table, len(waypoints))
+    holds, given = bool(holding.any()), {}
+    if holds:
+        given["reference_force"] = read_only(holding)
+        if table.has("reference_force"):
+            table.add("reference_force", "found beside holding_force of the contacts, its value")
     task = table.record(
         Task,
+        **given,
         waypoints=waypoints,
         time_law=time_law,
         initial=_read_initial(table, [w for w in waypoints if not w.is_fixed], names),
-        allocation=_allocation(table, time_law),
+        allocation=_allocation(table, time_law, holds),
         force_limit=_force_limit(table),
         redundant=(),
         orientation=orientation,
@@ -90,12 +94,16 @@ def read_task(table: TableReader) -> tuple[Task, tuple[RedundancyEntry, ...]]:
     return task, redundant
 
 
-def _allocation(table: TableReader, time_law: TimeLaw) -> str:
-    """Read the allocation of forces; the default is 'soft-finger' under the law 'optimal', else
-    'paper'."""
+def _allocation(table: TableReader, time_law: TimeLaw, holds: bool) -> str:
+    """Read the contact model's name; the default is 'holding-hands' for hands that hold by
+    themselves, else 'soft-finger' under the law 'optimal', else 'paper'."""
     driven = time_law == "optimal"
-    usual = _known_allocation(table, "allocation", "soft-finger" if driven else "paper")
+    pads = "soft-finger" if driven else "paper"
+    usual = _known_allocation(table, "allocation", "holding-hands" if holds else pads)
     own = _known_allocation(table, "drivable_allocation", usual)
+    for key, name in (("allocation", usual), ("drivable_allocation", own)):
+        if holds and name != "holding-hands":
+            table.add(key, f"found {name!r}; hands that hold by themselves have 'holding-hands'")
     return own if driven else usual
 
 
@@ -124,17 +132,16 @@ def _check_vectors(task: Task, problems: Problems) -> None:
             )
 
 
-def with_force_limit(task: Task, payload: Payload, contacts: Sequence[Contact]) -> Task:
-    """Return the task with the default bounds of the force limit if its file has none.
-
-    From a thousandth above the force that holds the payload level and still between upright
-    contacts to the smaller reference force.
-    """
+def with_force_limit(workcell: Workcell) -> Workcell:
+    """Return the workcell with the default bounds of the force limit if its file has none: from a
+    thousandth above the force that holds the payload level and still to the smaller reference
+    force."""
+    task = workcell.task
     if np.isfinite(task.force_limit[1]):
-        return task
-    still = payload.mass * -GRAVITY[2] / sum(contact.friction for contact in contacts)
-    highest = max(float(task.reference_force.min()), FORCE_LIMIT_MARGIN * still)
-    return replace(task, force_limit=(FORCE_LIMIT_MARGIN * still, highest))
+        return workcell
+    least = FORCE_LIMIT_MARGIN * contact_model(workcell).level_force
+    highest = max(float(task.reference_force.min()), least)
+    return replace(workcell, task=replace(task, force_limit=(least, highest)))
 
 
 def _orientation(table: TableReader) -> Orientation:

@@ -57,10 +57,14 @@ class NumberedPayload(Payload):
 
 @dataclass(frozen=True)
 class NumberedContact(Contact):
-    """A contact. twist, spread: see `symbolic.contact.soft_finger.SoftPatch`."""
+    """A contact. twist, spread: see `symbolic.contact.soft_finger.SoftPatch`. share, opposed: of
+    a hand that holds by itself, see `symbolic.contact.elastic.layer_shares` and
+    `symbolic.contact.holding_hands.opposed_needs`."""
 
     twist: Any = None
     spread: Any = None
+    share: Any = None
+    opposed: Any = None
 
 
 @dataclass(frozen=True)

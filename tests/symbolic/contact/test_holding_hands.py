@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
+from functools import cache
+from pathlib import Path
 
 import casadi as ca
 import clarabel
@@ -12,12 +15,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from hybrid_opt.robust.force import BoxMotion, interpreted_robust_model
 from symbolic.array import Array
-from symbolic.contact.elastic import SHEAR, kern, layer_shares
+from symbolic.contact.elastic import SHEAR, kern, layer_shares, layer_stiffness
 from symbolic.contact.force_closure import wrench_to_box
-from symbolic.contact.holding_hands import HandPatch, needed_holding_forces
-from symbolic.records import Contact
-from symbolic.records.poses import transform
+from symbolic.contact.holding_hands import HandPatch, needed_holding_forces, opposed_needs
+from symbolic.contact.load import load_function
+from symbolic.contact.registry import require_squeeze
+from symbolic.errors import SettingsError, WorkcellError
+from symbolic.read.cell import load
+from symbolic.records import Contact, Workcell
+from symbolic.records.poses import box_rotation, transform
+from tests.symbolic.cells import RACK, call, standing_text
 from tests.symbolic.contact.oracle import solved
 
 RADIUS, FRICTION = 0.04, 0.5
@@ -233,3 +242,101 @@ def test_sliding_needs_what_even_pressure_bears(name: str, lever: float) -> None
 def test_a_cups_lip_has_the_moments_of_a_ring() -> None:
     assert kern(CUP) == (RADIUS / 2.0,) * 2
     assert kern(DISC) == (RADIUS / 4.0,) * 2
+
+
+# --- a cell ---
+
+
+@cache
+def palletising() -> Workcell:
+    return load(RACK.with_name("palletising.toml"))
+
+
+@cache
+def load_of_cell() -> ca.Function:
+    return load_function(palletising())
+
+
+@given(seed=SEEDS)
+def test_an_arm_needs_what_its_most_loaded_hand_needs(seed: int) -> None:
+    cell = palletising()
+    pose, rate, second = np.random.default_rng(seed).normal(0.0, 0.4, (3, 6))
+    found = call(load_of_cell(), pose, rate, second)
+    rotation = box_rotation(cell.task.orientation, pose)
+    wrench = np.zeros(6)
+    for i, contact in enumerate(cell.contacts):
+        force, moment = (rotation.T @ part for part in np.split(found[f"wrench_{i + 1}"], 2))
+        wrench += [*force, *(moment + np.cross(contact.T_box_pad[:3, 3], force))]
+    total = sum(rotation.T @ force for force in np.split(found["contact_force"], 2))
+    np.testing.assert_allclose(wrench[:3], total, atol=1e-9)
+    about = rotation.T @ found["required_moment"] + np.cross(cell.payload.centre_of_mass, total)
+    np.testing.assert_allclose(wrench[3:], about, atol=1e-9)
+    shares = layer_shares(cell.pads)
+    each = [needed(pad, share @ wrench).max() for pad, share in zip(cell.pads, shares, strict=True)]
+    expected = [max(0.0, *each[:4]), max(0.0, *each[4:])]
+    np.testing.assert_allclose(found["normal_force"], expected, rtol=1e-9, atol=1e-9)
+    assert (found["tangential_force"] <= 0.5 * found["normal_force"] + 1e-9).all()
+
+
+@given(seed=SEEDS)
+def test_opposed_arms_ask_for_no_more_than_their_bound(seed: int) -> None:
+    """The layers of both arms as springs in series, displaced in a random direction."""
+    hands, robots = random_hands(seed, 4), (0, 0, 1, 1)
+    bounds, own = opposed_needs(hands, robots), hands[:2]
+    softness = [np.linalg.inv(whole_stiffness(hands[i : i + 2])) for i in (0, 2)]
+    moved = np.append(np.random.default_rng(seed).normal(size=3), np.zeros(3))
+    wrench = np.linalg.solve(softness[0] + softness[1], moved)
+    wrench /= np.linalg.norm(wrench[:3])
+    for hand, share, (a, b, lifting) in zip(own, layer_shares(own), bounds, strict=False):
+        found = needed(hand, share @ wrench)
+        assert found[0] <= lifting * (1.0 + 1e-9)
+        assert found[1] <= (a / hand.friction + b) * (1.0 + 1e-9)
+
+
+def whole_stiffness(hands: tuple[Contact, ...]) -> Array:
+    maps = [wrench_to_box(hand) for hand in hands]
+    stiff = [layer_stiffness(hand) for hand in hands]
+    return np.asarray(sum(A @ K @ A.T for A, K in zip(maps, stiff, strict=True)))
+
+
+def test_robust_forces_hold_random_cases() -> None:
+    cell, rng = palletising(), np.random.default_rng(1)
+    model = interpreted_robust_model(cell)
+    motion = BoxMotion(*rng.normal(0.0, 0.3, (3, 4, 6)))
+    force = model.robust_force(motion)
+    assert (force.commanded == force.leading).all()
+    assert (force.commanded > 1.3 * force.nominal.max(axis=1)).all()
+    assert model.check(motion, force, 500, rng).holds
+
+
+CUP_KEYS = 'kind = "cup"'
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("holding_force = 140.0", "", "holding_force"),
+        (CUP_KEYS, "", "holding_force: found for a pad"),
+        ("patch_radius = 0.03", "patch_size = [0.04, 0.04]", "patch_size: found for a cup"),
+        ("samples = 80", "samples = 80\nreference_force = 90.0", "reference_force"),
+        ("samples = 80", 'samples = 80\nallocation = "paper"', "task.allocation: found 'paper'"),
+    ],
+)
+def test_what_does_not_fit_hands_is_refused(tmp_path: Path, old: str, new: str, said: str) -> None:
+    text = standing_text(RACK.with_name("palletising.toml")).replace(old, new)
+    (tmp_path / "cell.toml").write_text(text)
+    with pytest.raises(WorkcellError, match=re.escape(said)):
+        load(tmp_path / "cell.toml")
+
+
+def test_hands_of_both_arms_hold_with_the_same_force(tmp_path: Path) -> None:
+    text = standing_text(RACK.with_name("palletising.toml"))
+    text = text.replace("holding_force = 140.0", "holding_force = 120.0", 1)
+    (tmp_path / "cell.toml").write_text(text)
+    with pytest.raises(WorkcellError, match="the same on both"):
+        load(tmp_path / "cell.toml")
+
+
+def test_what_squeezes_is_refused_to_hands() -> None:
+    with pytest.raises(SettingsError, match="hold by themselves"):
+        require_squeeze(palletising(), "a job")
