@@ -39,7 +39,7 @@ from symbolic.read.cell import changed
 from symbolic.records import Workcell
 from symbolic.records.task import waypoints_of
 
-DIFFERENCE_STEP = 1e-5
+NUMBER_STEP = 1e-5
 """Half the distance of two cells nearby, in the number's unit."""
 
 LEAST_EFFECT = 1e-7
@@ -221,7 +221,7 @@ def sensitivities(carry: Carry | Timing, *, progress: ShowProgress = False) -> S
         if not drive.moved_by(number) and number.section == "robots":
             continue
         try:
-            low, high = (number.moved(workcell, by) for by in (-DIFFERENCE_STEP, DIFFERENCE_STEP))
+            low, high = (number.moved(workcell, by) for by in (-NUMBER_STEP, NUMBER_STEP))
         except WorkcellError as error:
             missing[number.key] = str(error).splitlines()[-1].strip(" -")
             continue
@@ -233,14 +233,14 @@ def sensitivities(carry: Carry | Timing, *, progress: ShowProgress = False) -> S
             )
         elif drive.moved_by(number):
             changes = drive.durations(number, low, high)
-            longer = changes[0] / DIFFERENCE_STEP, changes[1] / DIFFERENCE_STEP
+            longer = changes[0] / NUMBER_STEP, changes[1] / NUMBER_STEP
             if not np.isfinite(changes).all():
                 longer, missing[number.key] = (None, None), "duration: no timing nearby holds"
         rise = fall = 0.0
         if number.section != "robots":
             motions = drive.motion(low, ruling.samples), drive.motion(high, ruling.samples)
             rise, fall = ruling.slopes(low, high, motions, number.section == "contacts")
-        forces = rise / DIFFERENCE_STEP, fall / DIFFERENCE_STEP
+        forces = rise / NUMBER_STEP, fall / NUMBER_STEP
         rows.append(Sensitivity(number.key, number.value, number.unit, *forces, *longer))
     duration = drive.carry.duration
 

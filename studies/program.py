@@ -349,7 +349,7 @@ def _show_warnings(verbose: bool) -> None:
 
 
 @dataclass(frozen=True)
-class Outcome:
+class ProgramResult:
     """One thing that a program found out.
 
     Attributes:
@@ -361,7 +361,7 @@ class Outcome:
     lines: tuple[str, ...] = ()
 
 
-def print_findings(findings: Iterable[Outcome], as_json: bool) -> None:
+def print_findings(findings: Iterable[ProgramResult], as_json: bool) -> None:
     """Print each when it is found, or all at once as one JSON object."""
     values: dict[str, Any] = {}
     for finding in findings:

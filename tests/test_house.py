@@ -119,3 +119,31 @@ def test_another_projects_package_is_named(tmp_path: Path, package: str, file: s
         last = done.stderr.splitlines()[-1]
         assert last.startswith(f"ImportError: dual-arm-carry needs its own package '{package}'")
         assert str(foreign) in last
+
+
+def definitions() -> Iterator[tuple[str, str, str]]:
+    """Every class and constant of a module as its name, a text of what it is, and the module.
+
+    Programs that bundles carry along import nothing of this project, so they are left out.
+    """
+    programs = ROOT / "hybrid_opt" / "bundles" / "programs"
+    for path in modules(*PACKAGES):
+        if path.parent == programs:
+            continue
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        for node in ast.walk(tree):
+            if isinstance(node, ast.ClassDef):
+                yield node.name, f"class of {named(path)}", named(path)
+        for node in tree.body:
+            if isinstance(node, ast.Assign | ast.AnnAssign) and node.value is not None:
+                targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+                for target in targets:
+                    if isinstance(target, ast.Name) and target.id.strip("_").isupper():
+                        yield target.id, ast.unparse(node.value), named(path)
+
+
+def test_no_class_and_no_constant_is_defined_twice_with_another_meaning() -> None:
+    meanings: dict[str, dict[str, str]] = {}
+    for name, meaning, path in definitions():
+        meanings.setdefault(name, {})[meaning] = path
+    assert not {name: sorted(found.values()) for name, found in meanings.items() if len(found) > 1}

@@ -34,7 +34,7 @@ _LONGEST_COMMENT = 60
 WORLD, PAD = "world", "contact_pad"
 PLUGIN = "gz_ros2_control/GazeboSimSystem"
 COMMANDS = ("effort",)
-STATES = ("position", "velocity", "effort")
+STATE_INTERFACES = ("position", "velocity", "effort")
 
 ABB = "ABB"
 
@@ -290,7 +290,7 @@ def _add_hardware(root: ElementTree.Element, joints: Sequence[str], q: Array) ->
         joint = ElementTree.SubElement(control, "joint", {"name": name})
         for command in COMMANDS:
             ElementTree.SubElement(joint, "command_interface", {"name": command})
-        for state in STATES:
+        for state in STATE_INTERFACES:
             interface = ElementTree.SubElement(joint, "state_interface", {"name": state})
             if state == "position":
                 value = ElementTree.SubElement(interface, "param", {"name": "initial_value"})

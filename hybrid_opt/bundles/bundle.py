@@ -28,7 +28,13 @@ from hybrid_opt.bundles.job_file import (
     gap_of,
     stop_of,
 )
-from hybrid_opt.bundles.torque import STEPS, driver_of, pad_stiffness, require_torque, torque_files
+from hybrid_opt.bundles.torque import (
+    TORQUE_STEPS,
+    driver_of,
+    pad_stiffness,
+    require_torque,
+    torque_files,
+)
 from hybrid_opt.bundles.urscript import require_followed, urscript_files
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.job.compliance import (
@@ -429,7 +435,7 @@ CYCLE_SKEW = 0.002
 
 _TORQUE = Target(
     torque_files,
-    STEPS,
+    TORQUE_STEPS,
     "quintic",
     "start your simulator with description/cell.urdf, ros2 launch launch/simulation.launch.py, "
     "then python3 run_job.py",
@@ -446,7 +452,7 @@ _DRIVEN = replace(
     skew=CYCLE_SKEW,
 )
 
-TORQUE: Mapping[str, Target] = {
+TORQUE_DRIVERS: Mapping[str, Target] = {
     "simulation": _TORQUE,
     "franka": replace(
         _DRIVEN,
@@ -502,7 +508,7 @@ TARGETS: Mapping[str, Target] = {
         "Foxglove, or play it: ros2 bag play job.mcap",
     ),
 }
-"""Every target by its name; `TORQUE` has the drivers of torque."""
+"""Every target by its name; `TORQUE_DRIVERS` has the drivers of torque."""
 
 GONE = {
     "ros2-control": "torque",
@@ -531,7 +537,7 @@ def target_for(name: str, workcell: Workcell) -> Target:
         SettingsError: the name is unknown, or no driver takes torques for these arms.
     """
     require_target(name)
-    return TORQUE[driver_of(workcell)] if name == "torque" else TARGETS[name]
+    return TORQUE_DRIVERS[driver_of(workcell)] if name == "torque" else TARGETS[name]
 
 
 def missing_for(name: str, workcell: Workcell, leader: int = 0) -> tuple[str, ...]:

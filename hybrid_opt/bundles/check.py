@@ -65,7 +65,7 @@ SHORTEST = 4
 TOUCHING = 0.005
 """Largest change of the pads' places to one another at which they are taken to hold the box [m]."""
 
-CLOSED = 1e-3
+CLOSED_CHAIN_CHANGE = 1e-3
 """Largest change at which the closed chain counts as closed [m]."""
 
 EXCESS = 1.005
@@ -131,7 +131,7 @@ class Finding:
         if not self.held.any():
             return ["the pads hold the box nowhere: another cell, or another order of the joints?"]
         found = []
-        if max(self.along, self.across) > CLOSED:
+        if max(self.along, self.across) > CLOSED_CHAIN_CHANGE:
             found.append(
                 f"the chain is not closed: the pads miss one another by {1e3 * self.along:.2f} mm "
                 f"along and {1e3 * self.across:.2f} mm across the normal"

@@ -180,7 +180,7 @@ def pad_jacobians(workcell: Workcell, arm: int, q: Array) -> Array:
 STOP_TIMES = (0.1, 0.15, 0.2, 0.3, 0.45, 0.7, 1.0, 1.5, 2.0, 3.0)
 """Times of a stop that are tried, the shortest first [s]."""
 
-EVERY = 5
+STOP_STRIDE = 5
 """Stride of the job's own samples at which a stop is tried."""
 
 INSTANTS = 9
@@ -226,7 +226,7 @@ def stop_of(job: Job) -> Stop:
         for name in ("pose", "rate", "second_rate", "q_rate", "q_second")
     }
     columns["force"] = np.concatenate([phase.force.normal for phase in job.phases])
-    places, x = time[::EVERY], np.linspace(0.0, 1.0, INSTANTS)
+    places, x = time[::STOP_STRIDE], np.linspace(0.0, 1.0, INSTANTS)
 
     def stop(duration: float) -> Stop:
         """Compute a stop of a duration [s], tried all along the path."""

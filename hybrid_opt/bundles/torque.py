@@ -51,7 +51,7 @@ CONTROLLER = "carry_controller"
 RATES = {"simulation": 1000, "franka": 1000, "ur": 500}
 """Rate of each driver's cycle [Hz]."""
 
-STEPS = (0.02, 0.01, 0.005)
+TORQUE_STEPS = (0.02, 0.01, 0.005)
 """Time steps between two points [s]."""
 
 GAIN, DAMPING = 7.0, 0.7
@@ -61,7 +61,7 @@ FASTEST = 250.0
 """Largest natural frequency of a joint under its gains [rad/s], half of the slowest driver's rate:
 light joints are softer, so that a sampled controller keeps them stable."""
 
-EVERY = 10
+MODEL_STRIDE = 10
 """Stride of the job's own samples at which inertia and stiffness are computed."""
 
 TORQUE_RATE = 1000.0
@@ -136,7 +136,7 @@ def pad_stiffness(job: Job) -> float:
     first = len(job.joint_names[0])
     for arm, robot in enumerate(job.workcell.robots):
         span = slice(0, first) if arm == 0 else slice(first, None)
-        q = np.concatenate([phase.motion.q[::EVERY, span] for phase in job.held])
+        q = np.concatenate([phase.motion.q[::MODEL_STRIDE, span] for phase in job.held])
         along = robot.T_flange_pad[:3, 2] @ pad_jacobians(job.workcell, arm, q)[:, :3]
         compliance = compliance + (along**2 / gains[span]).sum(axis=1)
     return float(2.0 / compliance.min())
@@ -230,7 +230,7 @@ def joint_inertia(job: Job) -> Array:
     for robot, joints in zip(job.workcell.robots, job.joint_names, strict=True):
         model = build_robot_model(robot).model
         data, span = model.createData(), slice(begin, begin + len(joints))
-        q = np.concatenate([phase.motion.q[::EVERY, span] for phase in job.phases])
+        q = np.concatenate([phase.motion.q[::MODEL_STRIDE, span] for phase in job.phases])
         found.append(np.mean([np.diag(pin.crba(model, data, row)) for row in q], axis=0))
         begin += len(joints)
     return np.concatenate(found)

@@ -18,7 +18,7 @@ from typing import Any, Literal, Self, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_opt.collision.checker import CollisionChecker, Touch
+from hybrid_opt.collision.checker import CollidingPair, CollisionChecker
 from symbolic.array import Array
 
 Status = Literal["free", "collision", "undecided"]
@@ -44,7 +44,7 @@ class MotionVerdict:
     """
 
     status: Status
-    touch: Touch | None
+    touch: CollidingPair | None
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,7 @@ class _Sweep:
         n_motions = len(self.sampled.lengths)
         # A motion's earliest interval with a collision so far.
         beyond = np.full(n_motions, len(self.owner))
-        hits, left = list[Touch](), list[Touch]()
+        hits, left = list[CollidingPair](), list[CollidingPair]()
         work = self._first_intervals()
         for level in range(DEPTH + 1):
             if level > 0:
@@ -114,9 +114,14 @@ class _Sweep:
             work = self._halves(work)
         return [self._verdict(motion, hits, left) for motion in range(n_motions)]
 
-    def _verdict(self, motion: int, hits: list[Touch], left: list[Touch]) -> MotionVerdict:
+    def _verdict(
+        self, motion: int, hits: list[CollidingPair], left: list[CollidingPair]
+    ) -> MotionVerdict:
         """Return the verdict on one motion, its intervals counted from its own first sample."""
-        kinds: tuple[tuple[Status, list[Touch]], ...] = (("collision", hits), ("undecided", left))
+        kinds: tuple[tuple[Status, list[CollidingPair]], ...] = (
+            ("collision", hits),
+            ("undecided", left),
+        )
         for status, found in kinds:
             own = [touch for touch in found if self.owner[touch.sample] == motion]
             if own:
@@ -186,7 +191,9 @@ class _Sweep:
             required = self.required[self.owner[work.index]]
             for end in (work.a, work.b):
                 asked = work.pending & end.measured & ~(end.clearance > required)
-                hopeless |= self.checker.too_near(end.configuration, asked, required).any(axis=1)
+                hopeless |= self.checker.violates_clearance(end.configuration, asked, required).any(
+                    axis=1
+                )
         return hopeless
 
     def _measure(self, work: Intervals, end: End, last: bool) -> NDArray[np.intp]:
@@ -215,10 +222,10 @@ class _Sweep:
             np.repeat(work.pending, 2, axis=0),
         )
 
-    def _touch(self, work: Intervals, row: int, pair: int, fraction: float) -> Touch:
+    def _touch(self, work: Intervals, row: int, pair: int, fraction: float) -> CollidingPair:
         place = float(work.start[row] + work.width[row] * fraction)
         names = self.checker.geometry.pair_names[pair]
-        return Touch(int(work.index[row]), *names, fraction=place)
+        return CollidingPair(int(work.index[row]), *names, fraction=place)
 
 
 class Rows:

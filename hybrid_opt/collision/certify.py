@@ -22,7 +22,7 @@ from hybrid_opt.collision.between import (
     check_all_between,
     of_rows,
 )
-from hybrid_opt.collision.checker import CollisionChecker, Touch
+from hybrid_opt.collision.checker import CollidingPair, CollisionChecker
 from symbolic.array import Array
 from symbolic.errors import DualArmError, SettingsError
 from symbolic.path.spline import path_position
@@ -65,7 +65,7 @@ class Certificate:
     """
 
     is_free: bool
-    at_sample: Touch | None
+    at_sample: CollidingPair | None
     at_parameter: float
     motion: MotionVerdict | None
     grid_points: int

@@ -24,7 +24,7 @@ from symbolic.records import PAYLOAD_NAME
 
 
 @dataclass(frozen=True)
-class Touch:
+class CollidingPair:
     """Two bodies in collision, or that come too near to prove that they are not.
 
     Attributes:
@@ -52,7 +52,7 @@ class Verdict:
     """
 
     colliding: NDArray[np.bool_]
-    first_touch: Touch | None
+    first_touch: CollidingPair | None
 
     @property
     def is_free(self) -> bool:
@@ -143,7 +143,7 @@ class CollisionChecker:
         first = None
         if hits.any():
             k = int(np.argmax(hits))
-            first = Touch(int(rows[k]), *self._names[pairs[k]])
+            first = CollidingPair(int(rows[k]), *self._names[pairs[k]])
         return Verdict(colliding, first)
 
     def collisions(
@@ -222,7 +222,7 @@ class CollisionChecker:
         clearance[rows, pairs] = np.fmax(clearance[rows, pairs], apart[free])
         return hits
 
-    def too_near(
+    def violates_clearance(
         self, configuration: Array, wanted: NDArray[np.bool_], required: Array
     ) -> NDArray[np.bool_]:
         """Find wanted pairs of n configurations that nothing can prove to be farther apart than

@@ -36,7 +36,7 @@ FIRST_CELLS = 16
 TIGHT = 0.25
 """Share of the distance at a cell's centre that its bound must reach."""
 
-ROUNDING = 1e-8
+TABLE_ROUNDING = 1e-8
 """Part of a cell by which a position may be attributed to the cell beside it, and how far rounded
 poses may displace a point [m]."""
 
@@ -125,7 +125,7 @@ def _tabulate(given: CacheKey) -> NDArray[np.float32]:
         cells, bounds, loose = cells[within], bounds[within], loose[within]
         rows, moving = np.nonzero(loose)
         lower, upper = distances.bounds((cells + 0.5) * width, rows, moving)
-        motion = reach[moving].sum(axis=1) * (0.5 + ROUNDING) * width + ROUNDING
+        motion = reach[moving].sum(axis=1) * (0.5 + TABLE_ROUNDING) * width + TABLE_ROUNDING
         bounds[rows, moving] = np.maximum(bounds[rows, moving], lower - motion)
         nearest, farthest = np.full((2, len(cells)), np.inf)
         np.minimum.at(nearest, rows, lower)

@@ -19,11 +19,11 @@ from hybrid_opt.proposing.holding import (
     Hold,
     HoldQuery,
     find_holds,
-    shoulders,
+    shoulder_positions,
 )
 from hybrid_opt.proposing.problem import Problem
 from hybrid_opt.proposing.setup import redundancy
-from hybrid_opt.proposing.trial import BoxAlone
+from hybrid_opt.proposing.trial import PayloadSceneChecker
 from symbolic.array import Array
 from symbolic.geometry.bodies import WORLD, MeshReader, collision_bodies, shape_pieces
 from symbolic.geometry.pairs import coal_distance
@@ -39,20 +39,20 @@ DISTANCES = (0.35, 0.45, 0.55, 0.65, 0.75)
 MACHINE_DISTANCES = (0.28, 0.34, 0.40, 0.46, 0.52)
 """Distances of the line through a machine's shoulders from the middle of the carry, likewise."""
 
-SHIFTS = (0.0, -0.2, 0.2)
+BASE_SHIFTS = (0.0, -0.2, 0.2)
 """Shifts of a base along the carry, likewise."""
 
 BEHIND = 0.05
 """A machine's arms reach ahead if they do so by this much in the mean of their postures, in the
 stretched arm's length."""
 
-POSTURES = 500
+REACH_MEAN_POSTURES = 500
 """Postures in that mean."""
 
 MOST_CHOICES = 6
 """Pairs of bases that are handed on."""
 
-STARTS = 192
+PLACE_STARTS = 192
 """Random postures by which a place is judged."""
 
 EVERY_SPIN = 2
@@ -76,7 +76,7 @@ HIDDEN = 2.0
 ARM_RADIUS = 0.05
 """Radius of the arm that must fit between them [m]."""
 
-LIFT = 0.03
+LIFT_HEIGHT = 0.03
 """How far the box is lifted off what it stands on, and lowered in the end [m]."""
 
 ASIDE = (0.15, 0.25, 0.40)
@@ -115,7 +115,7 @@ def _scored(
                 value = min(first.value, second.value) + shared_room(first, second)
                 found.append((value, _standing(problem, [base] * 2)))
         return found
-    best: list[list[Base]] = []
+    best: list[list[RankedBase]] = []
     for arm in (0, 1):
         tried = [scorer.place(arm, base) for base in _places(problem, draft, arm)]
         places = [place for place in tried if place is not None]
@@ -172,7 +172,7 @@ def _places(problem: Problem, draft: Workcell, arm: int) -> list[Array]:
     along = np.cross(outwards, [0.0, 0.0, 1.0])
     return [
         _base(problem, arm, middle + length * (away * outwards + shift * along), outwards)
-        for away, shift in product(DISTANCES, SHIFTS)
+        for away, shift in product(DISTANCES, BASE_SHIFTS)
     ]
 
 
@@ -180,7 +180,7 @@ def machine_places(problem: Problem, draft: Workcell) -> list[Array]:
     """Compute bases (6,) of a machine with both arms: the line through its shoulders along the line
     through both contacts, the carry where its arms reach."""
     own = inverse(draft.robots[0].T_world_base)
-    at = [(own @ np.append(point, 1.0))[:3] for point in shoulders(draft.robots)]
+    at = [(own @ np.append(point, 1.0))[:3] for point in shoulder_positions(draft.robots)]
     middle, outwards = _sideways(problem, 0)
     middle = (middle + _sideways(problem, 1)[0]) / 2.0
     across = at[0] - at[1]
@@ -205,14 +205,14 @@ def _mean_reach(draft: Workcell, at: list[Array]) -> Array:
     rng, reaches = np.random.default_rng(0), []
     for arm in (0, 1):
         kinematics = ArmKinematics(draft, arm)
-        _, T = kinematics.chain(kinematics.drawn(POSTURES, rng))
+        _, T = kinematics.chain(kinematics.drawn(REACH_MEAN_POSTURES, rng))
         own = inverse(draft.robots[arm].T_world_base)
         reaches.append((own @ T.mean(axis=0)[:, 3])[:3] - at[arm])
     return np.asarray((reaches[0] + reaches[1]) / 2.0)
 
 
 @dataclass(frozen=True, eq=False)
-class Base:
+class RankedBase:
     """A base from which an arm follows the box.
 
     Attributes:
@@ -244,17 +244,17 @@ class PlaceScorer:
         start, goal = problem.poses
         self._detours = free_detours(draft, start, goal)
         own = [inverse(robot.T_world_base) for robot in draft.robots]
-        at = zip(own, shoulders(draft.robots), strict=True)
+        at = zip(own, shoulder_positions(draft.robots), strict=True)
         self._shoulders = [(T @ np.append(point, 1.0))[:3] for T, point in at]
         self._arms = [ArmKinematics(draft, arm) for arm in (0, 1)]
-        self._query = HoldQuery(start, goal, spins[::EVERY_SPIN], None, STARTS, GUIDES_TRIED)
+        self._query = HoldQuery(start, goal, spins[::EVERY_SPIN], None, PLACE_STARTS, GUIDES_TRIED)
         meshes = MeshReader()
         self._environment = [
             shape_pieces(body.shape, body.pose, body.name, meshes) for body in draft.environment
         ]
         self._feet = [_feet(draft, arm) for arm in (0, 1)]
 
-    def place(self, arm: int, base: Array) -> Base | None:
+    def place(self, arm: int, base: Array) -> RankedBase | None:
         """Evaluate a base (6,) for an arm; None if it cannot stand there or does not follow the
         box."""
         if not self._stands_free(arm, base):
@@ -266,7 +266,7 @@ class PlaceScorer:
             return None
         hidden = self._hidden(arm, (T @ np.append(self._shoulders[arm], 1.0))[:3])
         value = holds[0].score + 0.05 * len(holds) - HIDDEN * hidden
-        return Base(base, value, self._followed(kinematics, holds))
+        return RankedBase(base, value, self._followed(kinematics, holds))
 
     def _stands_free(self, arm: int, base: Array) -> bool:
         """Return True if no environment body, except its floor, is where the robot would stand."""
@@ -325,7 +325,7 @@ def _feet(draft: Workcell, arm: int) -> tuple[Piece, ...]:
     return (Piece(FOOT, pose_matrix([0.0, 0.0, FOOT.length / 2.0], np.zeros(3))), *standing)
 
 
-def shared_room(first: Base, second: Base) -> float:
+def shared_room(first: RankedBase, second: RankedBase) -> float:
     """Score the share of detours along which both arms follow the box."""
     both = first.follows & second.follows
     return ROOMY * float(both.mean()) if len(both) else 0.0
@@ -343,17 +343,20 @@ def free_detours(workcell: Workcell, start: Array, goal: Array) -> Array:
     ways = np.vstack([ways, [0.0, 0.0, 1.0]])
     found = [_detour(start, goal, away * way) for away in ASIDE for way in ways]
     straight = _detour(start, goal, np.zeros(3))
-    box = BoxAlone(workcell)
+    box = PayloadSceneChecker(workcell)
 
     def free(path: Array) -> bool:
-        lifts = np.minimum(abs(path - path[0]).max(axis=1), abs(path - path[-1]).max(axis=1)) < LIFT
+        lifts = (
+            np.minimum(abs(path - path[0]).max(axis=1), abs(path - path[-1]).max(axis=1))
+            < LIFT_HEIGHT
+        )
         return not box.meets(path[~lifts])
 
     return np.array([path for path in (straight, *found) if free(path)]).reshape(-1, POSES, 6)
 
 
 def _detour(start: Array, goal: Array, aside: Array) -> Array:
-    lift = np.array([0.0, 0.0, LIFT, 0.0, 0.0, 0.0])
+    lift = np.array([0.0, 0.0, LIFT_HEIGHT, 0.0, 0.0, 0.0])
     beside = np.append(aside, np.zeros(3))
     corners = [start, start + lift, start + lift + beside]
     corners += [end + lift + beside * far for end, far in ((goal, 1.0), (goal, 0.0))] + [goal]

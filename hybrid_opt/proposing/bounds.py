@@ -10,34 +10,34 @@ from numpy.typing import NDArray
 
 from symbolic.array import Array
 
-WIDEST = 8.0
+LARGEST_BOUND_FACTOR = 8.0
 """Largest factor of the half-widths."""
 
-NARROWEST = 0.02
+LEAST_FACTOR = 0.02
 """Least factor."""
 
-DRAWN = 64
+CANDIDATES_PER_ROUND = 64
 """Candidates per round of the bisection."""
 
 CONFIRMED = 250
 """Candidates by which the share of the final bounds is measured."""
 
-ROUNDS = 7
+BISECTION_ROUNDS = 7
 """Rounds of the bisection."""
 
-BATCH = 32
+CANDIDATES_PER_BATCH = 32
 """Candidates that are judged before the clock is looked at."""
 
-STEPS = (0.8, 1.2)
+BOUND_FACTORS = (0.8, 1.2)
 """Factor of the next bounds where too few, or too many, are feasible."""
 
 EMPTY_STEP = 0.5
 """The same where none is."""
 
-KEPT = (1.0, 0.75, 0.5)
+BOUND_CENTRES = (1.0, 0.75, 0.5)
 """How near the carry is looked for to the one that bounds were asked for, from their middle."""
 
-CENTRING = 3
+CENTRING_MOVES = 3
 """Times that bounds may move to where feasible candidates lie."""
 
 
@@ -90,7 +90,7 @@ class Sampling:
         them: where they move to is longer.
         """
         scale, centre = 0.5, carry
-        for _ in range(CENTRING):
+        for _ in range(CENTRING_MOVES):
             scale, good = self._bisected(centre, scale)
             if len(good) < 6 or self.out_of_time():
                 break
@@ -100,18 +100,18 @@ class Sampling:
             centre = moved
         wanted = 1.3 * self.low, 0.85 * self.high
         tried: list[tuple[float, float, int]] = []
-        for _ in range(ROUNDS):
+        for _ in range(BISECTION_ROUNDS):
             _, fine = self._judged(centre, scale, CONFIRMED, wanted)
             share = float(fine.mean())
             tried.append((scale, share, len(fine)))
             if wanted[0] <= share <= wanted[1] or self.out_of_time():
                 break
-            step = EMPTY_STEP if share == 0.0 else STEPS[share > self._aim]
-            scale = float(np.clip(step * scale, NARROWEST, WIDEST))
+            step = EMPTY_STEP if share == 0.0 else BOUND_FACTORS[share > self._aim]
+            scale = float(np.clip(step * scale, LEAST_FACTOR, LARGEST_BOUND_FACTOR))
         scale, share, count = min(tried, key=lambda one: abs(np.log((one[1] + 1e-3) / self._aim)))
         lower, upper = self._box(centre, scale)
         near = np.clip(carry, lower, upper)
-        between = (np.round(centre + keep * (near - centre), 4) for keep in KEPT)
+        between = (np.round(centre + keep * (near - centre), 4) for keep in BOUND_CENTRES)
         found = next((x for x in between if self.certain(x)), centre)
         return Bounds(found, lower, upper, share, count)
 
@@ -122,10 +122,10 @@ class Sampling:
     def _bisected(self, centre: Array, scale: float) -> tuple[float, Array]:
         """Bisect the factor at which about the wanted share is feasible; return it and feasible
         candidates near it."""
-        low, high, aim = NARROWEST, WIDEST, self._aim
+        low, high, aim = LEAST_FACTOR, LARGEST_BOUND_FACTOR, self._aim
         good = np.empty((0, len(centre)))
-        for _ in range(ROUNDS):
-            x, fine = self._judged(centre, scale, DRAWN, (0.65 * aim, 1.35 * aim))
+        for _ in range(BISECTION_ROUNDS):
+            x, fine = self._judged(centre, scale, CANDIDATES_PER_ROUND, (0.65 * aim, 1.35 * aim))
             share = float(fine.mean())
             if share >= aim:
                 low, good = scale, x[fine]
@@ -133,7 +133,11 @@ class Sampling:
                 high = scale
             if abs(share - aim) < 0.35 * aim or self.out_of_time():
                 break
-            scale = float(np.sqrt(low * high)) if high < WIDEST else min(2.0 * scale, WIDEST)
+            scale = (
+                float(np.sqrt(low * high))
+                if high < LARGEST_BOUND_FACTOR
+                else min(2.0 * scale, LARGEST_BOUND_FACTOR)
+            )
         return scale, good
 
     def _judged(
@@ -144,7 +148,9 @@ class Sampling:
         x, fine = np.empty((0, len(centre))), np.empty(0, dtype=bool)
         bounds = self._box(centre, scale)
         while len(x) < most:
-            more = self.rng.uniform(*bounds, (min(BATCH, most - len(x)), len(centre)))
+            more = self.rng.uniform(
+                *bounds, (min(CANDIDATES_PER_BATCH, most - len(x)), len(centre))
+            )
             x, fine = np.vstack([x, more]), np.append(fine, self.feasible(more))
             found, spread = int(fine.sum()), 2.0 * np.sqrt(fine.sum() + 1.0)
             beyond = found + spread < wanted[0] * len(x) or found - spread > wanted[1] * len(x)

@@ -18,13 +18,13 @@ from hybrid_opt.proposing.holding import (
 from symbolic.array import Array
 from symbolic.records.poses import box_placement
 
-DRAWN = 64
+COMPARED_POSITIONS = 64
 """Positions that are compared."""
 
-STARTS = 24
+COMPARED_STARTS = 24
 """Random postures of either arm by which one is compared."""
 
-STEPS = 25
+REACHING_STEPS = 25
 """Newton steps from these."""
 
 MOVED = 4
@@ -50,13 +50,13 @@ def common_positions(
     low, high = np.maximum(spans[0][0], spans[1][0]), np.minimum(spans[0][1], spans[1][1])
     held = np.clip(0.0, low, high)
     yield np.array([held, held])
-    drawn = rng.uniform(low, high, (DRAWN - 2, len(low)))
+    drawn = rng.uniform(low, high, (COMPARED_POSITIONS - 2, len(low)))
     positions = np.vstack([held, (low + high) / 2.0, drawn])
     start, goal = (
         np.min([_reaching(arm, pose, query.spins, positions, rng) for arm in arms], axis=0)
         for pose in (query.start, query.goal)
     )
-    ways = {(k, k) for k in range(DRAWN)}
+    ways = {(k, k) for k in range(COMPARED_POSITIONS)}
     ways |= set(product(np.argsort(-start)[:MOVED].tolist(), np.argsort(-goal)[:MOVED].tolist()))
 
     def promise(way: tuple[int, int]) -> float:
@@ -76,10 +76,10 @@ def _reaching(
     T_world_box = box_placement(arm.workcell.task.orientation, pose)
     possible = possible_spins(arm.workcell.contacts[arm.arm], spins)
     targets = np.array([T_world_box @ arm.held(spin) for spin in possible])
-    q = arm.drawn(len(positions) * STARTS, rng)
-    q[:, arm.common] = np.repeat(positions, STARTS, axis=0)
-    found = arm.solve(q, targets[np.arange(len(q)) % len(targets)], STEPS, SEARCH_DAMPING)
+    q = arm.drawn(len(positions) * COMPARED_STARTS, rng)
+    q[:, arm.common] = np.repeat(positions, COMPARED_STARTS, axis=0)
+    found = arm.solve(q, targets[np.arange(len(q)) % len(targets)], REACHING_STEPS, SEARCH_DAMPING)
     q = found.q + np.vstack([arm.central(row[None, None])[0] for row in found.q])
     inside = (q >= arm.lower + LIMIT_MARGIN) & (q <= arm.upper - LIMIT_MARGIN)
     fine = inside.all(axis=1) & (found.residual <= REACHED) & (found.manipulability >= arm.least)
-    return np.asarray(fine.reshape(-1, STARTS).mean(axis=1))
+    return np.asarray(fine.reshape(-1, COMPARED_STARTS).mean(axis=1))

@@ -9,10 +9,10 @@ from symbolic.read.task import MOST_TURN
 from symbolic.records import POSE_SIZE, Workcell
 from symbolic.records.poses import Orientation
 
-UNITS = 1e4
+RECIPROCAL_UNIT = 1e4
 """Reciprocal of the unit that bounds are rounded to [1/m, 1/rad]."""
 
-ROUNDING = 6
+COUNTED_DECIMALS = 6
 """Decimals of a number in these units that count; the rest is floating-point error."""
 
 USUAL_POSE = np.array([10.0, 10.0, 10.0, 3.14, 1.57, 3.14])
@@ -71,14 +71,14 @@ def limits_around(workcell: Workcell, waypoints: Array) -> Array:
 def rounded_outwards(bounds: Array, limits: Array) -> Array:
     """Round bounds (2, ...) to decimals, the lower down and the upper up, but not beyond limits.
 
-    A decimal times `UNITS` may lie beside the whole number that it stands for: 1e4 * 2.8065 is
+    A decimal times `RECIPROCAL_UNIT` may differ from its integer by rounding: 1e4 * 2.8065 is
     28065.000000000004.
     """
-    low, high = np.round(UNITS * bounds, ROUNDING)
+    low, high = np.round(RECIPROCAL_UNIT * bounds, COUNTED_DECIMALS)
     return np.array(
         [
-            np.maximum(np.floor(low) / UNITS, limits[0]),
-            np.minimum(np.ceil(high) / UNITS, limits[1]),
+            np.maximum(np.floor(low) / RECIPROCAL_UNIT, limits[0]),
+            np.minimum(np.ceil(high) / RECIPROCAL_UNIT, limits[1]),
         ]
     )
 

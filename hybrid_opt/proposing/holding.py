@@ -31,7 +31,7 @@ STEP_LIMIT = 0.4
 TRACKING_STEPS = 4
 """Newton steps from one pose of a path to the next."""
 
-CENTRING = 0.03
+DRIFT_SHARE = 0.03
 """Share of the way to the middle of their ranges that joints drift from pose to pose."""
 
 GUIDE_POSES = 25
@@ -89,7 +89,7 @@ class ArmKinematics:
         contact = self.workcell.contacts[self.arm]
         # The geometry's own contact is replaced by the one asked for.
         T_pad_joint = inverse(contact.T_box_pad) @ inverse(self.geometry.T_joint_box)
-        return np.asarray(spun(contact, spin).T_box_pad @ T_pad_joint)
+        return np.asarray(rotate_about_normal(contact, spin).T_box_pad @ T_pad_joint)
 
     @property
     def span(self) -> Array:
@@ -168,7 +168,7 @@ class ArmKinematics:
             inverted = own.transpose(0, 2, 1) @ np.linalg.inv(
                 own @ own.transpose(0, 2, 1) + 1e-9 * np.eye(6)
             )
-            drift = CENTRING * (middle - q) * moving if step == 0 else np.zeros_like(q)
+            drift = DRIFT_SHARE * (middle - q) * moving if step == 0 else np.zeros_like(q)
             missing = error - np.einsum("nij,nj->ni", own, drift)
             q += drift + np.einsum("nij,nj->ni", inverted, missing)
         measure = np.abs(np.linalg.det(J[:, :, self.following]))
@@ -225,13 +225,13 @@ class ArmKinematics:
         return np.asarray(2.0 * np.pi * turns * free)
 
 
-def spun(contact: Contact, spin: float) -> Contact:
+def rotate_about_normal(contact: Contact, spin: float) -> Contact:
     """Return a contact with its pad turned about its normal by an angle [rad]."""
     turn = pose_matrix(np.zeros(3), np.array([0.0, 0.0, spin]))
     return replace(contact, T_box_pad=contact.T_box_pad @ turn)
 
 
-def shoulders(robots: tuple[Robot, Robot]) -> Array:
+def shoulder_positions(robots: tuple[Robot, Robot]) -> Array:
     """Compute the positions (2, 3) of each arm's first own joint in the world, all joints at the
     middle of their ranges [m]."""
     found = []
@@ -291,7 +291,7 @@ def clear_spins(query: HoldQuery, kinematics: ArmKinematics, spins: Array) -> Ar
     return found if len(found) else spins
 
 
-def guide(start: Array, goal: Array, bow: Array) -> Array:
+def initial_arc(start: Array, goal: Array, bow: Array) -> Array:
     """Compute a path (GUIDE_POSES, 6 + m) from one extended pose to another, bowing out by (3,) in
     the middle."""
     poses = np.linspace(start, goal, GUIDE_POSES)
@@ -517,7 +517,7 @@ class _Finder:
         for bow in GUIDES[: self.query.guides]:
             if not len(waiting) or len(self.found.holds) >= ENOUGH_HOLDS:
                 return
-            T_world_box = box_placement(self._orientation, guide(start, goal, bow))
+            T_world_box = box_placement(self._orientation, initial_arc(start, goal, bow))
             targets = T_world_box[:, None] @ T_box_joint[waiting]
             arrived, path, score = self._followed(targets, q[waiting])
             left = np.setdiff1d(np.arange(len(waiting)), arrived)

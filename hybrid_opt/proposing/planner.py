@@ -31,13 +31,13 @@ from hybrid_opt.proposing.holding import (
     ArmKinematics,
     Hold,
 )
-from hybrid_opt.proposing.trial import BoxAlone, PoseJudge
+from hybrid_opt.proposing.trial import PayloadSceneChecker, PoseJudge
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.records import POSE_SIZE, Workcell
 from symbolic.records.poses import box_placement, inverse
 
-STEP = 0.02
+PATH_STEP = 0.02
 """Distance between configurations that are looked at, see `LEVERS` [m]."""
 
 LEVER = 0.3
@@ -49,14 +49,14 @@ REDUNDANT_LEVER = 0.2
 TOGETHER = 8
 """Configurations that are judged at once."""
 
-CLOSED = 1e-6
+CHAIN_RESIDUAL = 1e-6
 """Pose residual of a closed chain [m, rad]."""
 
-NEWTON_STEPS = 8
+CHAIN_NEWTON_STEPS = 8
 
 
 @dataclass(frozen=True, eq=False)
-class Place:
+class ChainConfiguration:
     """A configuration of the closed chain.
 
     Attributes:
@@ -90,7 +90,7 @@ class _Follower:
         before, q = q, q.copy()
         for joint, place in self.redundant:
             q[joint] = extended[place]
-        for _ in range(NEWTON_STEPS):
+        for _ in range(CHAIN_NEWTON_STEPS):
             pin.computeJointJacobians(self.model, self.data, q)
             here = self.data.oMi[self.last]
             turn = pin.log3(target[:3, :3] @ here.rotation.T)
@@ -98,7 +98,7 @@ class _Follower:
             J = pin.getJointJacobian(self.model, self.data, self.last, pin.LOCAL_WORLD_ALIGNED)[
                 :, self.many.following
             ]
-            if error @ error < CLOSED**2:
+            if error @ error < CHAIN_RESIDUAL**2:
                 break
             try:
                 step = np.linalg.solve(J, error)
@@ -149,7 +149,7 @@ class ClosedChain:
             for arm, (hold, model) in enumerate(zip(holds, models, strict=True))
         ]
 
-    def close(self, extended: Array, q: tuple[Array, Array]) -> Place | None:
+    def close(self, extended: Array, q: tuple[Array, Array]) -> ChainConfiguration | None:
         """Return the configuration near given joints; collisions do not count."""
         T_world_box = box_placement(self._orientation, extended[:POSE_SIZE])
         found = []
@@ -159,7 +159,7 @@ class ClosedChain:
                 self.refused[closed] += 1
                 return None
             found.append(closed)
-        return Place(extended, (found[0], found[1]))
+        return ChainConfiguration(extended, (found[0], found[1]))
 
     def close_many(
         self, extended: Array, q: tuple[Array, Array], steps: int = TRACKING_STEPS
@@ -186,10 +186,10 @@ class ClosedChain:
             found.append(there.q)
         return (found[0], found[1]), closed
 
-    def along(self, begin: Place, path: Array) -> Iterator[Place]:
+    def along(self, begin: ChainConfiguration, path: Array) -> Iterator[ChainConfiguration]:
         """Follow extended poses (n, 6 + m) as far as they are free; the first is where to begin."""
-        batch: list[Place] = []
-        place: Place | None = begin
+        batch: list[ChainConfiguration] = []
+        place: ChainConfiguration | None = begin
         for extended in path:
             assert place is not None
             place = self.close(extended, place.q)
@@ -204,12 +204,14 @@ class ClosedChain:
                 batch = []
         yield from batch[: self._free(batch)]
 
-    def along_many(self, begins: Sequence[Place], paths: Array) -> list[list[Place]]:
+    def along_many(
+        self, begins: Sequence[ChainConfiguration], paths: Array
+    ) -> list[list[ChainConfiguration]]:
         """Follow paths side by side, each as far as it is free.
 
         Args:
             begins: a configuration at the begin of each path.
-            paths: (k, n, 6 + m) extended poses, `STEP` apart or less.
+            paths: (k, n, 6 + m) extended poses, `PATH_STEP` apart or less.
 
         Returns:
             The configurations along each path, its begin first.
@@ -225,18 +227,20 @@ class ClosedChain:
             alive, q = alive[on], (there[0][on], there[1][on])
             step = step[0][on], step[1][on]
             for row, k in enumerate(alive.tolist()):
-                found[k].append(Place(extended[k], (q[0][row], q[1][row])))
+                found[k].append(ChainConfiguration(extended[k], (q[0][row], q[1][row])))
             if not len(alive):
                 break
         self.looked += sum(map(len, found)) - len(found)
         return [[one[0], *one[1 : 1 + self._free(one[1:])]] for one in found]
 
-    def between(self, first: Place, last: Place, path: Array) -> list[Place] | None:
+    def between(
+        self, first: ChainConfiguration, last: ChainConfiguration, path: Array
+    ) -> list[ChainConfiguration] | None:
         """Return the configurations along a path (n, 6 + m) between two, None if not all are free,
         or the joints do not lead from the one to the other."""
         share = np.linspace(0.0, 1.0, len(path))[:, None]
         near = [(1.0 - share) * a + share * b for a, b in zip(first.q, last.q, strict=True)]
-        q, closed = self.close_many(path, (near[0], near[1]), NEWTON_STEPS)
+        q, closed = self.close_many(path, (near[0], near[1]), CHAIN_NEWTON_STEPS)
         self.looked += len(path)
         whole = np.hstack(q)
         joined = np.abs(np.diff(whole, axis=0)).max(initial=0.0) <= JUMP
@@ -244,23 +248,23 @@ class ClosedChain:
         begins = np.abs(whole[0] - np.concatenate(first.q)).max() < MATCH
         if not (closed.all() and joined and begins and arrives):
             return None
-        places = [Place(each, (q[0][k], q[1][k])) for k, each in enumerate(path)]
+        places = [ChainConfiguration(each, (q[0][k], q[1][k])) for k, each in enumerate(path)]
         free = self._free(places[1:-1]) == len(places) - 2
         return [first, *places[1:-1], last] if free else None
 
-    def reach(self, begin: Place, extended: Array) -> Place | None:
+    def reach(self, begin: ChainConfiguration, extended: Array) -> ChainConfiguration | None:
         """Return the configuration at the end of a straight motion, None if the motion is not
         free."""
         found = self.way(begin, straight(begin.extended, extended))
         return None if found is None else found[-1]
 
-    def way(self, begin: Place, path: Array) -> list[Place] | None:
+    def way(self, begin: ChainConfiguration, path: Array) -> list[ChainConfiguration] | None:
         """Return the configurations along a path (n, 6 + m) of extended poses from one of them on,
         None if not all are free."""
         found = [begin, *self.along(begin, path[1:])]
         return found if len(found) == len(path) else None
 
-    def _free(self, places: list[Place]) -> int:
+    def _free(self, places: list[ChainConfiguration]) -> int:
         """Count the free configurations before the first that is not."""
         if not places:
             return 0
@@ -270,7 +274,7 @@ class ClosedChain:
         return int(np.argmax(hit)) if hit.any() else len(places)
 
 
-def levers(size: int) -> Array:
+def metric_weights(size: int) -> Array:
     """Return the weight (size,) of each entry of an extended pose in a distance."""
     found = np.full(size, REDUNDANT_LEVER)
     found[:3], found[3:POSE_SIZE] = 1.0, LEVER
@@ -279,13 +283,13 @@ def levers(size: int) -> Array:
 
 def distance(first: Array, second: Array) -> float:
     """Compute the distance between extended poses [m]."""
-    return float(np.linalg.norm(levers(len(first)) * (second - first)))
+    return float(np.linalg.norm(metric_weights(len(first)) * (second - first)))
 
 
 def straight(first: Array, second: Array) -> Array:
-    """Return extended poses (n, 6 + m) on the straight line, at most `STEP` apart, ends
+    """Return extended poses (n, 6 + m) on the straight line, at most `PATH_STEP` apart, ends
     included."""
-    n = max(int(np.ceil(distance(first, second) / STEP)), 1)
+    n = max(int(np.ceil(distance(first, second) / PATH_STEP)), 1)
     return np.asarray(np.linspace(first, second, n + 1))
 
 
@@ -304,7 +308,7 @@ RETREAT_STOPS = 4
 STRAIGHT_TRIED = 100
 """Straight motions of the box between two retreats that are tried with the arms."""
 
-BETWEEN = np.array([0.5, 0.25, 0.75, 0.375, 0.625, 0.125, 0.875])
+LINE_SHARES = np.array([0.5, 0.25, 0.75, 0.375, 0.625, 0.125, 0.875])
 """Places on them where the box alone is checked first."""
 
 REDUNDANT_ASIDE = 5.0
@@ -315,7 +319,7 @@ MATCH = 1e-3
 
 
 @dataclass(frozen=True)
-class Freedom:
+class AffineSubspace:
     """The extended poses among which a path is looked for: origin + directions @ y.
 
     Attributes:
@@ -341,13 +345,13 @@ class Freedom:
 
 
 @dataclass(frozen=True)
-class Stray:
+class Corridor:
     """How far a path may stray.
 
     Attributes:
         tilt: how far the box may turn away from the turn between start and goal [rad]; 0: it turns
             from the one to the other and no other way.
-        range: see `Freedom`.
+        range: see `AffineSubspace`.
         aside: how far the box may be beyond start and goal along each of the world's axes [m].
         towards: (3,) the axis along which alone it may, and the sign; None: all, either way.
     """
@@ -358,7 +362,7 @@ class Stray:
     towards: tuple[int, int, int] | None = None
 
 
-def freedom(start: Array, goal: Array, stray: Stray, limits: Array) -> Freedom:
+def search_subspace(start: Array, goal: Array, stray: Corridor, limits: Array) -> AffineSubspace:
     """Compute the subspace in which a path from start to goal may lie.
 
     Args:
@@ -366,7 +370,7 @@ def freedom(start: Array, goal: Array, stray: Stray, limits: Array) -> Freedom:
         stray: how far it may stray; redundant joints `REDUNDANT_ASIDE` times as far.
         limits: (m, 2) of the redundant joints [rad or m].
     """
-    size, weight, tilt = len(start), levers(len(start)), stray.tilt
+    size, weight, tilt = len(start), metric_weights(len(start)), stray.tilt
     aside = np.full(size, stray.aside)
     aside[POSE_SIZE:] *= REDUNDANT_ASIDE
     less, more = aside.copy(), aside.copy()
@@ -395,31 +399,33 @@ def freedom(start: Array, goal: Array, stray: Stray, limits: Array) -> Freedom:
         low.append(0.0)
         high.append(length)
     bounds = np.array(low) - 1e-9, np.array(high) + 1e-9
-    return Freedom(start, np.column_stack(columns), *bounds, stray.range)
+    return AffineSubspace(start, np.column_stack(columns), *bounds, stray.range)
 
 
-Retreats = tuple[list[list[Place]], list[list[Place]]]
+Retreats = tuple[list[list[ChainConfiguration]], list[list[ChainConfiguration]]]
 """Free configurations from the start and from the goal along the same directions, in order, the end
 itself first."""
 
 
-def retreats(chain: ClosedChain, ends: tuple[Place, Place]) -> Retreats:
+def retreats(chain: ClosedChain, ends: tuple[ChainConfiguration, ChainConfiguration]) -> Retreats:
     """Find straight motions out of start and goal along the world's axes and between them: out of a
     shelf, for instance."""
     ways = DIRECTIONS / np.linalg.norm(DIRECTIONS, axis=1)[:, None]
     begins = [place for place in ends for _ in ways]
     away = np.array([place.extended for place in begins])
     away[:, :3] += RETREAT * np.tile(ways, (len(ends), 1))
-    steps = round(RETREAT / STEP)
+    steps = round(RETREAT / PATH_STEP)
     paths = np.linspace([place.extended for place in begins], away, steps + 1, axis=1)
     found = chain.along_many(begins, paths)
     return found[: len(ways)], found[len(ways) :]
 
 
-def straight_paths(chain: ClosedChain, out: Retreats, box: BoxAlone) -> Iterator[list[Place]]:
+def straight_paths(
+    chain: ClosedChain, out: Retreats, box: PayloadSceneChecker
+) -> Iterator[list[ChainConfiguration]]:
     """Yield corners of free paths of a retreat, a straight motion, and the opposite of a retreat
     along the same direction: the shortest first, one per direction."""
-    ways: dict[tuple[bytes, bytes], tuple[float, tuple[int, int], list[Place]]] = {}
+    ways: dict[tuple[bytes, bytes], tuple[float, tuple[int, int], list[ChainConfiguration]]] = {}
     axes = np.flatnonzero(np.count_nonzero(DIRECTIONS, axis=1) == 1)
     same_way = [(k, k) for k in range(len(DIRECTIONS))]
     for along in (*same_way, *permutations(axes.tolist(), 2)):
@@ -431,7 +437,7 @@ def straight_paths(chain: ClosedChain, out: Retreats, box: BoxAlone) -> Iterator
     tried, done = 0, set[tuple[int, int]]()
     for _, along, corners in sorted(ways.values(), key=lambda way: way[0]):
         begin, end = corners[1].extended, corners[2].extended
-        if along in done or box.is_between(begin[:POSE_SIZE], end[:POSE_SIZE], BETWEEN):
+        if along in done or box.is_between(begin[:POSE_SIZE], end[:POSE_SIZE], LINE_SHARES):
             continue
         there = chain.reach(corners[1], end)
         tried += 1
@@ -446,12 +452,12 @@ def straight_paths(chain: ClosedChain, out: Retreats, box: BoxAlone) -> Iterator
 def plan(
     chain: ClosedChain,
     out: Retreats,
-    room: Freedom,
+    room: AffineSubspace,
     *,
     most: int,
     out_of_time: Callable[[], bool],
     seed: int,
-) -> list[Place] | None:
+) -> list[ChainConfiguration] | None:
     """Find corners of a free path from start to goal by RRT-Connect; None without one.
 
     Args:
@@ -465,8 +471,8 @@ def plan(
     Raises:
         SettingsError: OMPL is not installed.
     """
-    places: dict[State, Place] = {}
-    ways: dict[State, Place] = {}
+    places: dict[State, ChainConfiguration] = {}
+    ways: dict[State, ChainConfiguration] = {}
     ends: tuple[list[State], list[State]] = ([], [])
     for states, ways_out in zip(ends, out, strict=True):
         place = ways_out[0][0]
@@ -500,7 +506,9 @@ def plan(
     return [place for k, place in enumerate(found) if k == 0 or place is not found[k - 1]]
 
 
-def _usable(stops: list[Place], place: Place, room: Freedom) -> list[Place]:
+def _usable(
+    stops: list[ChainConfiguration], place: ChainConfiguration, room: AffineSubspace
+) -> list[ChainConfiguration]:
     """Return the configurations that lie apart from an end and within the room."""
     at = [room.coordinates(stop.extended) for stop in stops]
     return [
@@ -511,7 +519,7 @@ def _usable(stops: list[Place], place: Place, room: Freedom) -> list[Place]:
     ]
 
 
-def same(first: Place, second: Place) -> bool:
+def same(first: ChainConfiguration, second: ChainConfiguration) -> bool:
     """Return True if both arms stand on the same branches and turns."""
     apart = [np.abs(a - b).max() for a, b in zip(first.q, second.q, strict=True)]
     return bool(max(apart) < MATCH)

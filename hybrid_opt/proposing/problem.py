@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from hybrid_opt.proposing.decimals import pose_limits, readable_turns
-from hybrid_opt.proposing.holding import shoulders
+from hybrid_opt.proposing.holding import shoulder_positions
 from symbolic import safe_io
 from symbolic.array import Array
 from symbolic.errors import OutsideError, WorkcellError
@@ -106,7 +106,9 @@ class Problem:
         found = [robot.get("base", {}).get("xyz") for robot in self.data["robots"]]
         if not all(isinstance(xyz, list) and len(xyz) == 3 for xyz in found):
             return None
-        return shoulders(self._robots()) if self.is_machine else np.array(found, dtype=float)
+        return (
+            shoulder_positions(self._robots()) if self.is_machine else np.array(found, dtype=float)
+        )
 
     def other_contacts(self) -> list[list[dict[str, Any]]]:
         """Return the other pairs of faces that the pads may press, both ways round, the most

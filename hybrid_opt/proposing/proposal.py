@@ -26,10 +26,16 @@ from hybrid_opt.progress import ShowProgress, as_callback, progress_bar
 from hybrid_opt.proposing.bases import base_choices
 from hybrid_opt.proposing.bounds import Bounds, Sampling
 from hybrid_opt.proposing.draft import Draft, changes, decision_bounds
-from hybrid_opt.proposing.planner import Place, Stray, freedom, plan, straight_paths
+from hybrid_opt.proposing.planner import (
+    ChainConfiguration,
+    Corridor,
+    plan,
+    search_subspace,
+    straight_paths,
+)
 from hybrid_opt.proposing.problem import Problem, read_problem
 from hybrid_opt.proposing.setup import Pair, Setup, no_path, prepare
-from hybrid_opt.proposing.trial import BoxAlone, BranchLostError, Trial, grasp_blocked
+from hybrid_opt.proposing.trial import BranchLostError, PayloadSceneChecker, Trial, grasp_blocked
 from hybrid_opt.proposing.via_points import (
     LEAST_SAMPLES,
     MOST_VIA_POINTS,
@@ -45,7 +51,7 @@ from symbolic.errors import SettingsError, WorkcellError
 from symbolic.path.spline import path_basis
 from symbolic.records import POSE_SIZE, Workcell
 
-ROUNDS = ((0, 12, 0), (500, 12, 2), (2500, 6, 6), (8000, 16, 6), (30000, 24, 6))
+SEARCH_ROUNDS = ((0, 12, 0), (500, 12, 2), (2500, 6, 6), (8000, 16, 6), (30000, 24, 6))
 """Configurations that the planner may look at for a path, 0 for straight motions alone, how many
 pairs of holds get them, and among how many of `STRAYS`: short tries of all before long ones."""
 
@@ -54,12 +60,12 @@ OTHER_FACES = 8000
 hold it by those that face them."""
 
 STRAYS = (
-    Stray(0.0, 0.15, 0.8),
-    Stray(0.3, 0.15, 0.8),
-    Stray(0.0, 0.15, 0.3),
-    Stray(0.0, 0.05, 0.3),
-    Stray(0.0, 0.15, 0.15),
-    Stray(0.3, 0.05, 0.8),
+    Corridor(0.0, 0.15, 0.8),
+    Corridor(0.3, 0.15, 0.8),
+    Corridor(0.0, 0.15, 0.3),
+    Corridor(0.0, 0.05, 0.3),
+    Corridor(0.0, 0.15, 0.15),
+    Corridor(0.3, 0.05, 0.8),
 )
 """What paths are looked for among; the narrower, the sooner a gap is found, if it is there."""
 
@@ -296,7 +302,7 @@ class _Search:
             choices += [{"contacts": pair} for pair in self.problem.other_contacts()]
         setups = [_Lazy(given, spins) for given in choices]
         found: list[Proposal] = []
-        for effort, most, strays in ROUNDS:
+        for effort, most, strays in SEARCH_ROUNDS:
             for setup in setups:
                 for one in self._round(setup, effort, most, strays):
                     found.append(one)
@@ -326,7 +332,7 @@ class _Search:
                 lazy.problem = str(error)
         if lazy.setup is None:
             return
-        box = BoxAlone(lazy.setup.workcell)
+        box = PayloadSceneChecker(lazy.setup.workcell)
         for number, pair in enumerate(lazy.setup.pairs[:most]):
             if self.too_late:
                 break
@@ -346,7 +352,7 @@ class _Search:
                 if not self.out_of_time:
                     yield from self._judged(lazy.setup, pair, via, box)
 
-    def _is_known(self, pair: Pair, box: BoxAlone, path: Array) -> bool:
+    def _is_known(self, pair: Pair, box: PayloadSceneChecker, path: Array) -> bool:
         """Return True if a carry of the class of these poses (n, 6) was found before."""
         return bool(self.known) and (id(pair), box.passed(path)) in self.known
 
@@ -368,8 +374,8 @@ class _Search:
         return ProposalError(f"{begin}: {met or 'no path was tried yet'}")
 
     def _paths(
-        self, setup: Setup, pair: Pair, effort: int, strays: int, box: BoxAlone
-    ) -> Iterator[list[Place] | None]:
+        self, setup: Setup, pair: Pair, effort: int, strays: int, box: PayloadSceneChecker
+    ) -> Iterator[list[ChainConfiguration] | None]:
         """Yield corners of paths with one pair of holds."""
         if not effort:
             found = straight_paths(pair.chain, pair.retreats, box)
@@ -381,7 +387,7 @@ class _Search:
             if self.too_late:
                 return
             ends = pair.start.extended, pair.goal.extended
-            room = freedom(*ends, stray, np.array(limits).reshape(-1, 2))
+            room = search_subspace(*ends, stray, np.array(limits).reshape(-1, 2))
             seed = int(self.rng.integers(1, 2**31))
             yield plan(
                 pair.chain,
@@ -392,7 +398,7 @@ class _Search:
                 seed=seed,
             )
 
-    def _via_points(self, pair: Pair, corners: list[Place]) -> Array | None:
+    def _via_points(self, pair: Pair, corners: list[ChainConfiguration]) -> Array | None:
         """Find the fewest via-points of a path, None without any."""
         self._say("via-points")
         dense = shortened(pair.chain, corners, self.rng)
@@ -402,7 +408,9 @@ class _Search:
                 return via
         return None
 
-    def _judged(self, setup: Setup, pair: Pair, via: Array, box: BoxAlone) -> Iterator[Proposal]:
+    def _judged(
+        self, setup: Setup, pair: Pair, via: Array, box: PayloadSceneChecker
+    ) -> Iterator[Proposal]:
         """Yield the proposal with these via-points, unless the evaluator refuses it or its class
         was found before."""
         fitted = np.vstack([pair.start.extended, via, pair.goal.extended])

@@ -24,7 +24,7 @@ from hybrid_opt.proposing.planner import connected
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 
-STEP = 0.04
+JOINT_STEP = 0.04
 """Largest change of a joint between configurations that are looked at [rad or m]."""
 
 RANGE = 1.5
@@ -104,7 +104,7 @@ class _Lines:
 
     def free(self, first: Array, second: Array) -> bool:
         """Return True if no configuration checked on a line collides."""
-        n = int(np.ceil(np.abs(second - first).max() / STEP)) + 1
+        n = int(np.ceil(np.abs(second - first).max() / JOINT_STEP)) + 1
         q = np.linspace(first, second, n + 1)[1:]
         self.looked += len(q)
         return self._checker.check(*self._placed(q)).is_free

@@ -24,12 +24,12 @@ from hybrid_opt.proposing.holding import (
     HoldQuery,
     HoldSearch,
     find_holds,
-    guide,
+    initial_arc,
     possible_spins,
-    spun,
+    rotate_about_normal,
     told_manipulability,
 )
-from hybrid_opt.proposing.planner import ClosedChain, Place, Retreats, retreats
+from hybrid_opt.proposing.planner import ChainConfiguration, ClosedChain, Retreats, retreats
 from hybrid_opt.proposing.problem import Problem
 from hybrid_opt.proposing.trial import MARGINS, PoseJudge, judge_of
 from hybrid_opt.robust.budget import budget_text
@@ -41,7 +41,7 @@ from symbolic.read.editing import merged
 from symbolic.records import POSE_SIZE, Task, Workcell
 from symbolic.records.poses import box_placement
 
-GUIDES_TRIED = 3
+RANKING_GUIDES = 3
 """Guides by which pairs are ranked: straight, bowing up, and far up."""
 
 MOST_PAIRS = 32
@@ -66,8 +66,8 @@ class Pair:
     """
 
     holds: tuple[Hold, Hold]
-    start: Place
-    goal: Place
+    start: ChainConfiguration
+    goal: ChainConfiguration
     chain: ClosedChain
     promise: float
 
@@ -105,7 +105,7 @@ def ranked_pairs(
     return sorted(found, key=lambda pair: -pair.promise)
 
 
-def _place(task: Task, pose: Array, holds: tuple[Hold, Hold], end: int) -> Place:
+def _place(task: Task, pose: Array, holds: tuple[Hold, Hold], end: int) -> ChainConfiguration:
     """Build the closed chain at the start (0) or the goal (1)."""
     joints = [(hold.q_start, hold.q_goal)[end] for hold in holds]
     extended = np.zeros(task.extended_size)
@@ -113,10 +113,10 @@ def _place(task: Task, pose: Array, holds: tuple[Hold, Hold], end: int) -> Place
     for arm, q in enumerate(joints):
         for joint, place in task.redundant_of(arm):
             extended[place] = q[joint]
-    return Place(extended, (joints[0], joints[1]))
+    return ChainConfiguration(extended, (joints[0], joints[1]))
 
 
-def _free(judge: PoseJudge, *places: Place) -> bool:
+def _free(judge: PoseJudge, *places: ChainConfiguration) -> bool:
     """Return True if nothing collides in any of these configurations."""
     return not any(
         judge.colliding(place.extended[None, :POSE_SIZE], place.q[0][None], place.q[1][None])[0]
@@ -124,11 +124,11 @@ def _free(judge: PoseJudge, *places: Place) -> bool:
     )
 
 
-def _free_share(chain: ClosedChain, start: Place, goal: Place) -> float:
+def _free_share(chain: ClosedChain, start: ChainConfiguration, goal: ChainConfiguration) -> float:
     """Compute the share of the freest guide that the chain can follow."""
     best = 0.0
-    for bow in GUIDES[:GUIDES_TRIED]:
-        path = guide(start.extended, goal.extended, bow)
+    for bow in GUIDES[:RANKING_GUIDES]:
+        path = initial_arc(start.extended, goal.extended, bow)
         forth = sum(1 for _ in chain.along(start, path))
         back = sum(1 for _ in chain.along(goal, path[::-1])) if forth < len(path) else forth
         best = max(best, (forth + back) / (2 * len(path)))
@@ -290,7 +290,7 @@ def reach_missing(workcell: Workcell, ends: tuple[Array, Array], spins: Array) -
         missing = min(
             missing_reach(
                 robot,
-                spun(contact, possible[which[k]]),
+                rotate_about_normal(contact, possible[which[k]]),
                 T_world_box,
                 np.clip(near.q[k], *kinematics.span),
             )

@@ -43,14 +43,14 @@ MARGINS = (0.01, 0.004, 0.0015, 0.0005, 0.0)
 [m]."""
 
 
-LOOKED_AT = 0.02
+CONTACT_STEP = 0.02
 """Step along a straight motion of the box at which it is checked for contact [m]."""
 
 LEVEL = 0.1
 """Least level share of a motion that has a left and a right."""
 
 
-class BoxAlone:
+class PayloadSceneChecker:
     """The box among the environment, without the arms."""
 
     def __init__(self, workcell: Workcell) -> None:
@@ -85,7 +85,7 @@ class BoxAlone:
 
         What the box meets at an end, such as the board that it stands on, does not count.
         """
-        n = max(int(np.ceil(np.linalg.norm(path[-1, :3] - path[0, :3]) / LOOKED_AT)), 2)
+        n = max(int(np.ceil(np.linalg.norm(path[-1, :3] - path[0, :3]) / CONTACT_STEP)), 2)
         straight = self._boxes(np.linspace(path[0], path[-1], n + 1))
         ends, between = (straight[0], straight[-1]), straight[1:-1]
         way, placed = path[-1, :3] - path[0, :3], self._boxes(path)

@@ -8,7 +8,15 @@ from itertools import pairwise
 import numpy as np
 
 from hybrid_opt.proposing.holding import JUMP
-from hybrid_opt.proposing.planner import STEP, ClosedChain, Place, distance, levers, same, straight
+from hybrid_opt.proposing.planner import (
+    PATH_STEP,
+    ChainConfiguration,
+    ClosedChain,
+    distance,
+    metric_weights,
+    same,
+    straight,
+)
 from symbolic.array import Array
 from symbolic.path.spline import path_basis
 from symbolic.records import POSE_SIZE
@@ -49,21 +57,21 @@ def travelled(points: Array) -> float:
     return float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
 
 
-def joint_length(places: Sequence[Place]) -> float:
+def joint_length(places: Sequence[ChainConfiguration]) -> float:
     """Compute the Euclidean length of the path of all joints [rad]."""
     return travelled(np.array([np.concatenate(place.q) for place in places]))
 
 
-def along(corners: Sequence[Place]) -> Array:
+def along(corners: Sequence[ChainConfiguration]) -> Array:
     """Compute box poses (n, 6) on the straight motions between corners."""
     legs = [straight(a.extended, b.extended)[:, :POSE_SIZE] for a, b in pairwise(corners)]
     return np.vstack(legs)
 
 
 def shortened(
-    chain: ClosedChain, corners: Sequence[Place], rng: np.random.Generator
-) -> list[Place]:
-    """Remove needless corners of a path; return places along it, `planner.STEP` apart."""
+    chain: ClosedChain, corners: Sequence[ChainConfiguration], rng: np.random.Generator
+) -> list[ChainConfiguration]:
+    """Remove needless corners of a path; return places along it, `planner.PATH_STEP` apart."""
     dense = [corners[0]]
     for corner in corners[1:]:
         found = chain.way(dense[-1], straight(dense[-1].extended, corner.extended))
@@ -86,7 +94,7 @@ def shortened(
 
 
 def fit(
-    chain: ClosedChain, path: Sequence[Place], count: int, rng: np.random.Generator
+    chain: ClosedChain, path: Sequence[ChainConfiguration], count: int, rng: np.random.Generator
 ) -> Array | None:
     """Find via-points (count, 6 + m) whose spline is free, None without any.
 
@@ -129,7 +137,7 @@ def fit(
 
 
 def straightened(
-    chain: ClosedChain, start: Place, waypoints: Array, rng: np.random.Generator
+    chain: ClosedChain, start: ChainConfiguration, waypoints: Array, rng: np.random.Generator
 ) -> Array:
     """Find waypoints (n, 6 + m) of a free spline with shorter joint paths than the given one.
 
@@ -138,7 +146,7 @@ def straightened(
     # Not imported at the top: it brings Matplotlib, and a first carry is there before.
     import cma
 
-    lever = levers(waypoints.shape[1])
+    lever = metric_weights(waypoints.shape[1])
     basis = path_basis(len(waypoints), np.linspace(0.0, 1.0, MEASURED)).position
     places = list(_closed_path(chain, start, basis @ waypoints))
     if len(places) < MEASURED:
@@ -168,10 +176,12 @@ def straightened(
     return next((one for _, one in shorter if free_share(chain, start, one) == 1.0), waypoints)
 
 
-def _closed_path(chain: ClosedChain, start: Place, path: Array) -> Iterator[Place]:
+def _closed_path(
+    chain: ClosedChain, start: ChainConfiguration, path: Array
+) -> Iterator[ChainConfiguration]:
     """Yield configurations along extended poses (n, 6 + m) as far as the chain closes, whatever
     collides."""
-    place: Place | None = start
+    place: ChainConfiguration | None = start
     yield start
     for extended in path[1:]:
         assert place is not None
@@ -196,9 +206,9 @@ def _lengths(chain: ClosedChain, paths: Array, near: tuple[Array, Array]) -> tup
     return np.linalg.norm(steps, axis=2).sum(axis=1), BLOCKED * (lost + met / 2.0)
 
 
-def free_share(chain: ClosedChain, start: Place, waypoints: Array) -> float:
+def free_share(chain: ClosedChain, start: ChainConfiguration, waypoints: Array) -> float:
     """Compute the share of the spline through waypoints (n, 6 + m) before its first collision."""
     legs = [distance(a, b) for a, b in pairwise(waypoints)]
-    n = max(LEAST_SAMPLES, int(np.ceil(1.2 * sum(legs) / STEP)))
+    n = max(LEAST_SAMPLES, int(np.ceil(1.2 * sum(legs) / PATH_STEP)))
     path = path_basis(len(waypoints), np.linspace(0.0, 1.0, n)).position @ waypoints
     return sum(1 for _ in chain.along(start, path)) / n

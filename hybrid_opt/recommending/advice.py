@@ -25,18 +25,18 @@ from symbolic.records import Contact, Workcell
 from symbolic.records.poses import box_rotation
 from symbolic.records.task import POSE_SIZE, components
 
-BISECTIONS = 20
+MARGIN_BISECTIONS = 20
 
 MILLIMETRE = 1e-3
 
-FRICTION = 0.05
+FRICTION_CHANGE = 0.05
 
-DEGREE = np.pi / 180.0
+DEGREE_CHANGE = np.pi / 180.0
 
 PITCH = 4
 """Index of the pitch among the numbers of a pose."""
 
-LIMITS = 1.0 + np.array([-0.02, 0.0, 0.02, 0.05, 0.1, 0.2, 0.4, 0.8])
+FORCE_MULTIPLES = 1.0 + np.array([-0.02, 0.0, 0.02, 0.05, 0.1, 0.2, 0.4, 0.8])
 """Multiples of the force limit at which the path's duration is computed."""
 
 LOOKED_AT = 8
@@ -74,7 +74,7 @@ def commanded_margins(carry: Carry, forces: Array) -> tuple[Margin, ...]:
     def last(change: Array, end: float) -> tuple[float, str]:
         """Find the largest multiple of a change up to which the forces hold, which rise with it."""
         low, high = 0.0, end
-        for step in range(BISECTIONS):
+        for step in range(MARGIN_BISECTIONS):
             middle = end if step == 0 else (low + high) / 2.0
             needed = model.least_squeeze(motion, (nominal + middle * change)[None], LEADER)
             holds = bool((needed[0, :, 1 - LEADER] <= enough).all())
@@ -111,7 +111,9 @@ def advice(cell: Cell, paths: DrivenPaths, option: Option, timing: Timing) -> tu
     """Compute the effects of changes of the cell on a recommended carry, most force first."""
     assert timing.carry is not None, "what is driven has a carry"
     # With less the path may not move: a tilted box asks for more than a level one.
-    limits = np.minimum(LIMITS * option.limit, max(paths.highest_force, option.limit)).tolist()
+    limits = np.minimum(
+        FORCE_MULTIPLES * option.limit, max(paths.highest_force, option.limit)
+    ).tolist()
     near = [each for limit in limits for each in paths.options(limit, [option.index])]
     forces = np.maximum.accumulate([each.commanded for each in near])
     durations, steps = np.array([each.duration for each in near]), np.flatnonzero(np.diff(forces))
@@ -147,7 +149,7 @@ def changes_of_cell(workcell: Workcell, motion: BoxMotion) -> Iterator[tuple[str
     at = motion.at(np.argsort(-now)[:LOOKED_AT])
     up, height = _height(workcell)
     changes: dict[str, Callable[[Contact], Contact]] = {
-        f"friction {FRICTION:g} higher": _with_friction,
+        f"friction {FRICTION_CHANGE:g} higher": _with_friction,
         "pads 1 mm lower": partial(_moved, by=-MILLIMETRE * up),
         "patches 1 mm wider to each side": _wider,
     }
@@ -184,7 +186,7 @@ def _with_pads(workcell: Workcell, change: Callable[[Contact], Contact]) -> Work
 
 
 def _with_friction(pad: Contact) -> Contact:
-    return replace(pad, friction=pad.friction + FRICTION)
+    return replace(pad, friction=pad.friction + FRICTION_CHANGE)
 
 
 def _moved(pad: Contact, by: Array) -> Contact:
@@ -210,7 +212,7 @@ def _of_pitch(cell: Cell, path: Array, option: Option, slope: float) -> Iterator
     for place in range(len(task.free_indices)):
         for sign in (1.0, -1.0):
             other = path.copy()
-            other[POSE_SIZE * place + PITCH] += sign * DEGREE
+            other[POSE_SIZE * place + PITCH] += sign * DEGREE_CHANGE
             varied.append(other)
             name = components(task.orientation)[PITCH]
             names.append(f"{sign:+.0f} degree of {name} at via-point {place + 1}")

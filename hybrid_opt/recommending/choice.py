@@ -36,7 +36,7 @@ ROUNDS = 6
 LEAST_ABOVE_STILL = 1e-3
 """Least limit, as a share above holding still."""
 
-LOOKED_AT = 32
+SAMPLES_PRESSED = 32
 """Samples of largest planned force at which it is computed how hard to press."""
 
 
@@ -243,7 +243,7 @@ class DrivenPaths:
         )
         rate, second_rate = first * v[:, None], first * a[:, None] + second * v[:, None] ** 2
         motion = BoxMotion(pose, rate, second_rate)
-        most = np.argsort(-self._model.nominal(motion).max(axis=1))[:LOOKED_AT]
+        most = np.argsort(-self._model.nominal(motion).max(axis=1))[:SAMPLES_PRESSED]
         force = self._model.peak(motion.at(most), self._model.workcell.uncertainty, LEADER)
         return Option(row, limit, timing.duration, force)
 

@@ -46,7 +46,7 @@ LARGEST_FORCE = 1e5
 
 MOST_NUMBERS = 10_000
 
-START_TOLERANCE = 1e-6
+START_POSTURE_TOLERANCE = 1e-6
 """Largest difference of the start postures [rad]."""
 
 ABSOLUTE_TOLERANCE = 1e-9
@@ -245,7 +245,7 @@ class Replay:
     @property
     def reproduced(self) -> bool:
         """True if every stored figure and the start postures were reproduced."""
-        return self.start_difference <= START_TOLERANCE and all(
+        return self.start_difference <= START_POSTURE_TOLERANCE and all(
             figure.same for figure in self.figures
         )
 

@@ -18,7 +18,7 @@ from hybrid_opt.front import Front
 from hybrid_opt.indicators.metrics import BindingBound, binding_bounds
 from hybrid_opt.progress import Progress, as_callback
 from hybrid_opt.robust.budget import budget_text
-from studies.program import Outcome, load_workcell, print_findings
+from studies.program import ProgramResult, load_workcell, print_findings
 from symbolic.array import Array
 from symbolic.cell_model import own_pairs
 from symbolic.errors import SettingsError
@@ -59,7 +59,7 @@ def inspected(
     view: Path | None = None,
     pairs: bool = False,
     progress: Progress | None = None,
-) -> Iterator[Outcome]:
+) -> Iterator[ProgramResult]:
     """All there is to know of a cell, each finding worked out when it is asked for.
 
     Args:
@@ -76,9 +76,9 @@ def inspected(
     progress = progress or Progress(shown=False)
     is_interpreted = not polish and is_interpretable(workcell)
     cell = Cell(workcell, compiled=InterpretedCell(workcell) if is_interpreted else None)
-    yield Outcome({"candidates": candidates, "seed": seed})
+    yield ProgramResult({"candidates": candidates, "seed": seed})
     facts = _facts(workcell)
-    yield Outcome(
+    yield ProgramResult(
         {"name": workcell.name, "facts": facts},
         (workcell.name, "", *(f"  {heading}: {text}" for heading, text in facts.items()), ""),
     )
@@ -104,24 +104,28 @@ def inspected(
         for why in explain(cell.evaluator, cell.evaluate(carry.x)):
             whys[name] = why
         told = (f"  {whys[name]}",) if name in whys else ()
-        yield Outcome({name: carry.judgement}, (f"{title}: {_judged_text(carry.judgement)}", *told))
-    yield Outcome({"explained": {name: str(why) for name, why in whys.items()}})
+        yield ProgramResult(
+            {name: carry.judgement}, (f"{title}: {_judged_text(carry.judgement)}", *told)
+        )
+    yield ProgramResult({"explained": {name: str(why) for name, why in whys.items()}})
     yield _postures(cell)
     yield from _candidates(cell, candidates, seed)
     yield _pairs(cell, pairs)
     optimum = _optimum(cell, progress) if polish else None
     lines = () if optimum is None else ("", *_optimum_lines(optimum))
-    yield Outcome({"optimum": optimum}, lines)
+    yield ProgramResult({"optimum": optimum}, lines)
     files: tuple[str, ...] = ()
     if output is not None:
         progress.note("drawing pictures (--no-pictures leaves them out)")
         files = draw(cell, carries, whys, output)
-    yield Outcome({"files": files}, ("", "Pictures: " + ", ".join(files)) if files else ())
+    yield ProgramResult({"files": files}, ("", "Pictures: " + ", ".join(files)) if files else ())
     shown = "" if view is None else show(carries["initial"], whys.get("initial"), view)
-    yield Outcome({"view": shown}, ("", f"View: {shown} (open it in a browser)") if shown else ())
+    yield ProgramResult(
+        {"view": shown}, ("", f"View: {shown} (open it in a browser)") if shown else ()
+    )
 
 
-def _at_rest(cell: Cell) -> Outcome:
+def _at_rest(cell: Cell) -> ProgramResult:
     """Compute the forces of holding the payload level and still, and whether it can be held."""
     hold, static_hold_error = cell.static_hold, cell.static_hold_error
     force = hold.normal_force
@@ -143,10 +147,10 @@ def _at_rest(cell: Cell) -> Outcome:
         "unheld": static_hold_error,
         "grip": lines[-1],
     }
-    return Outcome(values, tuple(lines))
+    return ProgramResult(values, tuple(lines))
 
 
-def _postures(cell: Cell) -> Outcome:
+def _postures(cell: Cell) -> ProgramResult:
     """Per robot's name its postures at the start, best first."""
     robots = cell.workcell.robots
     found = cell.compiled.model.branches
@@ -158,10 +162,10 @@ def _postures(cell: Cell) -> Outcome:
     for name, own in branches.items():
         lines.append(f"  {name}")
         lines += [f"  {'*' if b.chosen else ' '} {_branch_text(b)}" for b in own]
-    return Outcome({"branches": branches}, tuple(lines))
+    return ProgramResult({"branches": branches}, tuple(lines))
 
 
-def _candidates(cell: Cell, count: int, seed: int) -> Iterator[Outcome]:
+def _candidates(cell: Cell, count: int, seed: int) -> Iterator[ProgramResult]:
     """Random candidates: how many are feasible, and what is in the way of the others."""
     found = cell.evaluate(cell.random(count, np.random.default_rng(seed)))
     share, reasons = float(found.feasible.mean()), found.infeasible_by_reason
@@ -172,7 +176,7 @@ def _candidates(cell: Cell, count: int, seed: int) -> Iterator[Outcome]:
     ]
     for name, number in reasons.items():
         lines.append(f"  {name.replace('_', ' ')}: {number} ({100.0 * number / count:.1f} %)")
-    yield Outcome({"feasible_share": share, "infeasible_by_reason": reasons}, tuple(lines))
+    yield ProgramResult({"feasible_share": share, "infeasible_by_reason": reasons}, tuple(lines))
     failed = found[~found.feasible][:EXPLAINED]
     in_the_way = frequent(explain(cell.evaluator, failed))
     lines = []
@@ -181,10 +185,12 @@ def _candidates(cell: Cell, count: int, seed: int) -> Iterator[Outcome]:
         if counts:
             lines += ["", f"{title}, in {len(failed)} of the infeasible ones:"]
             lines += [f"  {name}: {number}" for name, number in counts]
-    yield Outcome({"explained_candidates": len(failed), "in_the_way": in_the_way}, tuple(lines))
+    yield ProgramResult(
+        {"explained_candidates": len(failed), "in_the_way": in_the_way}, tuple(lines)
+    )
 
 
-def _pairs(cell: Cell, listed: bool) -> Outcome:
+def _pairs(cell: Cell, listed: bool) -> ProgramResult:
     """Pairs of bodies that are checked, and those that are not, and why."""
     geometry = cell.geometry
     names, active = [body.name for body in geometry.bodies], geometry.pair_names
@@ -197,7 +203,7 @@ def _pairs(cell: Cell, listed: bool) -> Outcome:
     if listed:
         lines += [f"  {first} – {second}" for first, second in active]
         lines += [f"  {first} – {second}: {why}" for first, second, why in excluded]
-    return Outcome({"active_pairs": active, "excluded_pairs": excluded}, tuple(lines))
+    return ProgramResult({"active_pairs": active, "excluded_pairs": excluded}, tuple(lines))
 
 
 def _optimum(cell: Cell, progress: Progress) -> Optimum:

@@ -15,7 +15,7 @@ from codegen.cache import Cache, largest_size
 from codegen.interpreted import Agreement, compare
 from hybrid_opt.compiled_cell import EVALUATOR_LANES, EVALUATORS, SCREENING, CompiledCell
 from hybrid_opt.display.table import text_table
-from studies.program import FAULT, Outcome, load_workcell, print_findings
+from studies.program import FAULT, ProgramResult, load_workcell, print_findings
 from symbolic.records import Workcell
 
 if TYPE_CHECKING:
@@ -31,7 +31,7 @@ def regenerate(options: argparse.Namespace) -> int:
 
 def _regenerated(
     cache: Cache, options: argparse.Namespace, found: list[Agreement]
-) -> Iterator[Outcome]:
+) -> Iterator[ProgramResult]:
     """Yield one finding per action; comparisons are added to `found`.
 
     The workcell is read and its expressions are made before `--clean` removes anything.
@@ -41,15 +41,15 @@ def _regenerated(
         None if options.workcell is None else CompiledCell(load_workcell(options.workcell), cache)
     )
     sets = [] if cell is None or (options.study and not options.clean) else _function_sets(cell)
-    yield Outcome({"cache": str(cache.folder)})
+    yield ProgramResult({"cache": str(cache.folder)})
     if options.clean:
         removed = cache.clean()
         said = f"{removed} libraries removed from {cache.folder}"
-        yield Outcome({"removed": removed}, (said,))
+        yield ProgramResult({"removed": removed}, (said,))
     if cell is not None and options.study:
         seconds = _build_study(cell.workcell)
         said = f"what a study needs is in {cache.folder}, after {seconds:.1f} s"
-        yield Outcome({"seconds": seconds}, (said,))
+        yield ProgramResult({"seconds": seconds}, (said,))
     elif cell is not None:
         yield from _built(cell, sets, cache, options, found)
     if options.cache:
@@ -58,7 +58,7 @@ def _regenerated(
             f"{cache.folder} holds {usage.libraries} libraries in {usage.files} files, "
             f"{usage.size / 2**30:.2f} of {largest / 2**30:g} GiB"
         )
-        yield Outcome({"usage": usage}, (said,))
+        yield ProgramResult({"usage": usage}, (said,))
 
 
 FunctionSets: TypeAlias = "list[tuple[Mapping[str, ca.Function], str]]"
@@ -93,7 +93,7 @@ def _built(
     cache: Cache,
     options: argparse.Namespace,
     found: list[Agreement],
-) -> Iterator[Outcome]:
+) -> Iterator[ProgramResult]:
     """Compile the functions of the evaluator, and compare them with the interpreted ones."""
     from symbolic.parameters import GROUPS
 
@@ -101,7 +101,7 @@ def _built(
     how = {"rebuild": options.check, "lanes": EVALUATOR_LANES}
     builds = [build(functions, cache, key=key, **how) for functions, key in sets]
     reports = [report for each in builds for report in each.reports]
-    yield Outcome({"functions": reports}, (_report_table(reports),))
+    yield ProgramResult({"functions": reports}, (_report_table(reports),))
     if not options.check:
         return
     bounds = {"x": (task.lower, task.upper)}
@@ -114,7 +114,7 @@ def _built(
         for name, function in functions.items()
     ]
     checks = [asdict(comparison) | {"agrees": comparison.agrees} for comparison in found]
-    yield Outcome({"check": checks}, ("", _check_table(found)))
+    yield ProgramResult({"check": checks}, ("", _check_table(found)))
 
 
 def _report_table(reports: Sequence[FunctionReport]) -> str:

@@ -47,7 +47,7 @@ from hybrid_opt.timing.analysis import time_trajectory, timing_document
 from hybrid_opt.timing.model import TimingModel
 from hybrid_opt.timing.records import Timing, TimingLimits
 from hybrid_opt.timing.solve import time_path
-from studies.program import FAULT, Outcome, load_workcell, print_findings
+from studies.program import FAULT, ProgramResult, load_workcell, print_findings
 from studies.study.answer import job_text
 from studies.study.tables import force_curve, margins, timings
 from symbolic import safe_io
@@ -71,7 +71,7 @@ def replay_file(options: argparse.Namespace) -> int:
 
 def _replayed(
     stored: StoredTrajectory, replayed: Replay, options: argparse.Namespace
-) -> Iterator[Outcome]:
+) -> Iterator[ProgramResult]:
     workcell, values = replayed.cell.workcell, dict[str, Any]()
     rows = [("figure", "stored", "recomputed", "")]
     for figure in replayed.figures:
@@ -94,7 +94,7 @@ def _replayed(
         "figures": values,
         "provenance": dict(stored.provenance),
     }
-    yield Outcome(document, lines)
+    yield ProgramResult(document, lines)
     if workcell.task.time_law == "optimal":
         yield _driven(replayed.cell, stored.x)
     asked = (options.planned_limit, options.force_curve)
@@ -111,21 +111,21 @@ def _replayed(
             else f"TOPP-RA disagrees on {name}: {check.duration:.3f} s, {check.reference:.3f} s"
             for name, check in timing.validations.items()
         ]
-        yield Outcome({"timing": to_json(timing)}, tuple(texts))
+        yield ProgramResult({"timing": to_json(timing)}, tuple(texts))
 
 
-def _driven(cell: Cell, x: Array) -> Outcome:
+def _driven(cell: Cell, x: Array) -> ProgramResult:
     """Plan the job around a drivable carry x (n_var,) as a study and an export do by default."""
     try:
         job = JobModel(cell.compiled, cell.timing_model).plan(driven_timing(cell.timing_model, x))
     except DualArmError as error:
-        return Outcome({"job": None}, (f"no job can be planned: {error}",))
+        return ProgramResult({"job": None}, (f"no job can be planned: {error}",))
     values = {
         "duration": job.phase("carry").duration,
         "commanded_force": job.squeeze.force,
         "job_duration": job.duration,
     }
-    return Outcome({"job": values}, (f"as its job drives it: {job_text(job)}",))
+    return ProgramResult({"job": values}, (f"as its job drives it: {job_text(job)}",))
 
 
 def export_file(options: argparse.Namespace) -> int:

@@ -262,7 +262,7 @@ class View:
 
 _X, _Y, _Z = np.eye(3)
 
-FRONT = View(-_Y, _Z, "y [m]", "z [m]", mirrored=True)
+FRONT_VIEW = View(-_Y, _Z, "y [m]", "z [m]", mirrored=True)
 """View from -x, as one stands before the rack."""
 
 SIDE = View(_X, _Z, "x [m]", "z [m]")

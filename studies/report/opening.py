@@ -6,7 +6,7 @@ import html
 
 from hybrid_opt.robust.cases import LEADER
 from studies.report.data import ReportData
-from studies.study.answer import Answer, Fact, newtons
+from studies.study.answer import Fact, StudyAnswer, newtons
 from studies.study.recommendation import StoredRecommendation
 
 
@@ -72,7 +72,7 @@ def _command(fact: Fact) -> str:
     )
 
 
-def _details(found: Answer) -> str:
+def _details(found: StudyAnswer) -> str:
     if not found.details:
         return ""
     facts = "".join(

@@ -39,7 +39,7 @@ RECOMMENDED_TITLE = "Recommended"
 """The carry to run, in lists and pictures of the page."""
 
 CARRY_SAMPLES = 40
-PHASE_SAMPLES = 7
+PAGE_PHASE_SAMPLES = 7
 """Samples of the carry, and of every other phase, for a motion on the page."""
 
 WITHOUT_JERK = "; its carry without the limits on jerk, which an export keeps"
@@ -112,7 +112,7 @@ def job_samples(job: Job) -> Array:
     parts = []
     for phase in job.phases:
         motion, force = phase.motion, phase.force.normal
-        count = CARRY_SAMPLES if phase.name == "carry" else PHASE_SAMPLES
+        count = CARRY_SAMPLES if phase.name == "carry" else PAGE_PHASE_SAMPLES
         rows = _rows(motion.time, count, force.argmax(axis=0))
         needed = np.full((len(rows), 2), np.nan)
         if phase.name in HELD:

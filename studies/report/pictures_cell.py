@@ -24,7 +24,7 @@ from hybrid_opt.display.solids import (
     motion_points,
 )
 from studies.report.drawing import (
-    FRONT,
+    FRONT_VIEW,
     ISOMETRIC,
     MARGIN,
     SIDE,
@@ -142,12 +142,14 @@ def reachable_regions(geometry: CellGeometry, reach: ReachMap, carry: DrawnCarry
     centre, and the bounds of the free waypoints (paper Figure 4)."""
     figure = new_figure(0.42)
     corners = box_corners(*_reach_bounds(reach))
-    left, right = figure.subplots(1, 2, width_ratios=[aspect(v, corners) for v in (FRONT, SIDE)])
+    left, right = figure.subplots(
+        1, 2, width_ratios=[aspect(v, corners) for v in (FRONT_VIEW, SIDE)]
+    )
     lowest, highest = (np.array(corners) for corners in zip(*_free_bounds(geometry), strict=True))
     middle = (lowest.min(axis=0) + highest.max(axis=0)) / 2.0
     fixed = _fixed(geometry)
     for axes, view, across, letter, text in (
-        (left, FRONT, 0, "a", f"front view, slice at x = {_metres(middle[0])}"),
+        (left, FRONT_VIEW, 0, "a", f"front view, slice at x = {_metres(middle[0])}"),
         (right, SIDE, 1, "b", f"side view, slice at y = {_metres(middle[1])}"),
     ):
         _draw_reach(axes, reach, view, across, float(middle[across]))
@@ -183,7 +185,7 @@ def environment(geometry: CellGeometry, carry: DrawnCarry) -> Figure:
     cell = CutCell.of(geometry, solids)
     pose, q = _start(carry)
     points = extent_points(geometry, solids, pose[None], q[None])
-    views = (FRONT, SIDE, ISOMETRIC)
+    views = (FRONT_VIEW, SIDE, ISOMETRIC)
     panels = figure.subplots(1, 3, width_ratios=[aspect(view, points) for view in views])
     shown = [
         (text, view, points) for text, view in zip(("front", "side", "oblique"), views, strict=True)
@@ -228,12 +230,12 @@ def arm_and_reach(geometry: CellGeometry, reach: ReachMap, carry: DrawnCarry) ->
     panel_label(left, "a", f"arm {shortened(robot.name)!r} at the start", bare=True)
     base = robot.T_world_base[:3, 3]
     index = int((base[0] - reach.lower[0]) / reach.step)
-    _draw_slice(right, FRONT, reach, 0, index, reach.pads[0], ARM_COLOURS[0], HATCHES[0])
-    draw_cell(right, cell, FRONT, pose, q)
+    _draw_slice(right, FRONT_VIEW, reach, 0, index, reach.pads[0], ARM_COLOURS[0], HATCHES[0])
+    draw_cell(right, cell, FRONT_VIEW, pose, q)
     bounds = _reach_bounds(reach)
     occupied = np.flatnonzero(reach.pads[0].any(axis=(0, 2)))
     bounds[:, 1] = reach.lower[1] + reach.step * np.array([occupied[0] - 1, occupied[-1] + 2])
-    frame_axes(right, FRONT, box_corners(*bounds), margin=0.0)
+    frame_axes(right, FRONT_VIEW, box_corners(*bounds), margin=0.0)
     panel_label(right, "b", f"reach of its pad, slice at x = {_metres(base[0])}", bare=True)
     return figure
 
@@ -287,7 +289,7 @@ def planes(points: Array) -> tuple[tuple[View, str], tuple[View, str]]:
     """Return the two coordinate planes, with their names, in which points (n, 3) extend
     farthest."""
     extent = np.ptp(points, axis=0)
-    every = (("y–z plane", FRONT, 0), ("x–z plane", SIDE, 1), ("x–y plane", _PLAN, 2))
+    every = (("y–z plane", FRONT_VIEW, 0), ("x–z plane", SIDE, 1), ("x–y plane", _PLAN, 2))
     first, second, _ = sorted(every, key=lambda plane: float(extent[plane[2]]))
     return (first[1], first[0]), (second[1], second[0])
 

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Attempt:
+class ProblemAttempt:
     """One proposal.
 
     Attributes:
@@ -56,7 +56,7 @@ def shipped_problems() -> list[Path]:
     return sorted(Path(str(files("studies"))).joinpath("problems").glob("*.toml"))
 
 
-def attempt(path: Path, seed: int, seconds: float, evaluations: int) -> Attempt:
+def attempt(path: Path, seed: int, seconds: float, evaluations: int) -> ProblemAttempt:
     """Propose a carry for a problem, and recommend one where a search gets evaluations."""
     import numpy as np
 
@@ -69,12 +69,14 @@ def attempt(path: Path, seed: int, seconds: float, evaluations: int) -> Attempt:
             settings=ho.ProposeSettings(seconds=seconds),
         )
     except ho.DualArmError as error:
-        return Attempt(path.stem, seed, str(error).removeprefix(f"{path}: "))
-    known = Attempt(path.stem, seed, "", found.certified, found.seconds, found.length, found.passes)
+        return ProblemAttempt(path.stem, seed, str(error).removeprefix(f"{path}: "))
+    known = ProblemAttempt(
+        path.stem, seed, "", found.certified, found.seconds, found.length, found.passes
+    )
     if not evaluations:
         return known
     best = _recommended(found, seed, evaluations)
-    return Attempt(
+    return ProblemAttempt(
         **asdict(known)
         | {
             "duration": best.duration,
@@ -100,7 +102,7 @@ def _recommended(found: ho.Proposal, seed: int, evaluations: int) -> ho.Recommen
         return ho.recommend(front)
 
 
-def _lines(tried: list[Attempt]) -> Iterator[str]:
+def _lines(tried: list[ProblemAttempt]) -> Iterator[str]:
     from hybrid_opt.display.table import number, text_table
 
     head = ("problem", "seed", "certified [s]", "all [s]", "way [rad]", "lasts [s]", "N", "")

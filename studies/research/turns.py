@@ -139,7 +139,7 @@ def candidate_operations(model: CellModel) -> int:
     return operations(functions["path"]) + model.workcell.task.samples * each
 
 
-TIMED_EVALUATIONS = 1000
+TURN_EVALUATIONS = 1000
 """Evaluations of the NSGA-II search whose candidates are timed."""
 
 POPULATION = GeneticSettings().population
@@ -167,10 +167,10 @@ def with_collisions(
         The figures of the search's candidates and, as 'random', those of uniform candidates.
     """
     rng = np.random.default_rng(seed)
-    progress(f"a search of {TIMED_EVALUATIONS} evaluations, whose candidates are to be timed")
+    progress(f"a search of {TURN_EVALUATIONS} evaluations, whose candidates are to be timed")
     evaluator = CandidateEvaluator(workcell)
     problem = CarryProblem(evaluator)
-    search(problem, make("nsga2"), TIMED_EVALUATIONS, rng)
+    search(problem, make("nsga2"), TURN_EVALUATIONS, rng)
     searched = rng.choice(problem.evaluations.x, (candidates, POPULATION))
     size = (candidates, POPULATION, evaluator.n_var)
     uniform = rng.uniform(evaluator.lower, evaluator.upper, size)
@@ -205,7 +205,7 @@ def with_collisions(
     per_second = candidate_operations(evaluator.compiled.model) / (1e-3 * ours["compiled_ms"])
     ours["operations_per_second"] = per_second
     ours["share_of_peak"] = per_second / peak if peak else None
-    return {"evaluations": TIMED_EVALUATIONS, "population": POPULATION, **ours, "random": random}
+    return {"evaluations": TURN_EVALUATIONS, "population": POPULATION, **ours, "random": random}
 
 
 def shares(evaluator: CandidateEvaluator, batches: Array, repeats: int) -> dict[str, float]:

@@ -51,7 +51,7 @@ class Fact:
 
 
 @dataclass(frozen=True)
-class Answer:
+class StudyAnswer:
     """The opening of a study.
 
     Attributes:
@@ -101,7 +101,7 @@ def newtons(force: float) -> str:
     return f"{force:.1f} N"
 
 
-def answer(found: StoredRecommendation, folder: str) -> Answer:
+def answer(found: StoredRecommendation, folder: str) -> StudyAnswer:
     """Put a stored recommendation into words.
 
     Args:
@@ -133,7 +133,7 @@ def answer(found: StoredRecommendation, folder: str) -> Answer:
     if found.price is not None:
         details.append(Fact("checked", _checked(found.price)))
     details.append(Fact("with this force", f"{'; '.join(_margins(found)) or 'not known'}"))
-    return Answer(
+    return StudyAnswer(
         state_of(found),
         headline,
         _facts(found),

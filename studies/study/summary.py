@@ -54,7 +54,7 @@ from hybrid_opt.store.files import (
     write_json,
 )
 from hybrid_opt.store.trajectory_file import write_trajectory
-from studies.study.answer import Answer, Fact, answer
+from studies.study.answer import Fact, StudyAnswer, answer
 from studies.study.recommendation import (
     NoRecommendation,
     StoredRecommendation,
@@ -264,7 +264,7 @@ class CampaignSummary:
             files[name] = file_of(Path(), name, found.replica).relative_to(SELECTED)
         return files
 
-    def answer(self, folder: str) -> Answer | None:
+    def answer(self, folder: str) -> StudyAnswer | None:
         """Return what a study opens with: the carry to run, or why there is none; None where
         neither is known.
 
@@ -276,7 +276,7 @@ class CampaignSummary:
         if not self.no_recommendation:
             return None
         why = Fact("why", self.no_recommendation)
-        return Answer("bad", "No carry is recommended", details=(why,))
+        return StudyAnswer("bad", "No carry is recommended", details=(why,))
 
 
 def read_summary(root: str | Path) -> CampaignSummary:

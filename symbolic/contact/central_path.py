@@ -6,10 +6,10 @@
 The method is primal-dual with a predictor and a corrector (Mehrotra, SIAM J. Optim. 2, 1992): each
 step aims at the central path's place of a smaller weight, to second order by what a first step
 to weight zero leaves out. It starts within the cones, the load balanced, and takes some six steps;
-at most `STEPS`, each of which is passed over once the weight is small enough, so that the whole is
-one expression and compiles. Six components of the wrenches are what the others leave. Starts from a
-neighbouring sample's solution take more steps where several candidates run in lanes, and some never
-arrive.
+at most `CENTRAL_PATH_STEPS`, each of which is skipped once the weight is small enough, so that the
+whole is one expression and compiles. Six components of the wrenches are what the others leave.
+Starts from a neighbouring sample's solution take more steps where several candidates run in lanes,
+and some never arrive.
 
 A patch's state lies within its cone and begins with its scaled wrench, see
 `symbolic.contact.force_closure`. The cone is one of positive semidefinite matrices X: those of a
@@ -39,7 +39,7 @@ FINAL_WEIGHT = 1e-8
 """Last weight of the barriers over the effort, which ends above the least by at most the sum of
 the patches' degrees times this: 6e-8 of it for two round ones."""
 
-NEAR = 2.0
+END_WEIGHT_FACTOR = 2.0
 """Multiple of the final weight at which the steps end."""
 
 CENTRING, CENTRED = 30, 1e-8
@@ -49,7 +49,7 @@ Newton's decrement, over the weight, that counts as being there."""
 NEWTON_STEPS = 100
 """The same from states that may be far from it, at most."""
 
-STEPS = 30
+CENTRAL_PATH_STEPS = 30
 STEP_SHARE, LAST_SHARE, APPROACH = 0.97, 0.999, 100.0
 """Largest share of the way to the cones' boundary in one step; the same near the end; and how many
 times the weight, over the effort, what is left near the end may be."""
@@ -67,7 +67,7 @@ PROGRAMS = 16
 AnyExpression = TypeVar("AnyExpression", ca.SX, ca.MX)
 
 
-class Program(Protocol):
+class ConvexProgram(Protocol):
     """What a set of contacts has to balance, and at what cost.
 
     Its scaled wrenches are those of `symbolic.contact.force_closure`; `cell` are its inputs, in
@@ -159,7 +159,7 @@ class Patch(ABC):
 
 
 @dataclass(frozen=True)
-class Step:
+class NewtonStep:
     """A step of X and multipliers.
 
     Attributes:
@@ -193,14 +193,14 @@ class LocalPatch(Protocol):
     def pull(self, weight: ca.SX, correction: ca.SX) -> ca.SX:
         """(n,) what multipliers of a weight and a correction give to X where that stays."""
 
-    def step(self, weight: ca.SX, correction: ca.SX, change: ca.SX) -> Step:
+    def step(self, weight: ca.SX, correction: ca.SX, change: ca.SX) -> NewtonStep:
         """The step to these multipliers that changes X by (n,)."""
 
 
 # --- the method ---
 
 
-def least_effort(program: Program, *cell: ca.MX, differentiable: bool = False) -> ca.MX:
+def least_effort(program: ConvexProgram, *cell: ca.MX, differentiable: bool = False) -> ca.MX:
     """Scaled wrenches of least effort side by side, in the order of the program's patches.
 
     Args:
@@ -218,16 +218,16 @@ def least_effort(program: Program, *cell: ca.MX, differentiable: bool = False) -
 
 
 @lru_cache(PROGRAMS)
-def central_path(program: Program, final_weight: float = FINAL_WEIGHT) -> ca.Function:
+def central_path(program: ConvexProgram, final_weight: float = FINAL_WEIGHT) -> ca.Function:
     """The cell to an iterate of all patches near the central path's place of a last weight."""
     cell = _handed(program)
     step = _step(program, final_weight)
-    iterate = _repeated(program, step, STEPS, _start(program)(*cell), cell)
+    iterate = _repeated(program, step, CENTRAL_PATH_STEPS, _start(program)(*cell), cell)
     return ca.Function("central_path", cell, [iterate])
 
 
 @lru_cache(PROGRAMS)
-def centred(program: Program, final_weight: float = FINAL_WEIGHT) -> ca.Function:
+def centred(program: ConvexProgram, final_weight: float = FINAL_WEIGHT) -> ca.Function:
     """The cell to states of all patches on the central path. Their derivatives count as zero."""
     cell = _handed(program)
     owns = ca.vertsplit(central_path(program, final_weight)(*cell), ends_of(program))
@@ -239,7 +239,7 @@ def centred(program: Program, final_weight: float = FINAL_WEIGHT) -> ca.Function
 
 
 def _repeated(
-    program: Program, step: ca.Function, most: int, iterate: ca.MX, cell: list[ca.MX]
+    program: ConvexProgram, step: ca.Function, most: int, iterate: ca.MX, cell: list[ca.MX]
 ) -> ca.MX:
     """The iterate after at most that many steps, in whole blocks, as long as they go on."""
     held = [ca.MX.sym("iterate", iterate.shape[0]), ca.MX.sym("goes_on")]
@@ -258,7 +258,7 @@ def _repeated(
 
 
 @lru_cache(PROGRAMS)
-def _step(program: Program, final_weight: float = FINAL_WEIGHT) -> ca.Function:
+def _step(program: ConvexProgram, final_weight: float = FINAL_WEIGHT) -> ca.Function:
     """An iterate, a flag that does not matter and the cell to the next one and whether to go on."""
     iterate, cell = ca.SX.sym("iterate", ends_of(program)[-1]), _cell(program)
     owns = zip(program.patches, ca.vertsplit(iterate, ends_of(program)), strict=True)
@@ -268,7 +268,7 @@ def _step(program: Program, final_weight: float = FINAL_WEIGHT) -> ca.Function:
     stiff = [own.stiffness for own in local]
     equations = Equations(program, cell, [own.state for own in local], stiff)
 
-    def steps(aimed: ca.SX, corrections: list[ca.SX]) -> list[Step]:
+    def steps(aimed: ca.SX, corrections: list[ca.SX]) -> list[NewtonStep]:
         pairs = [*zip(local, corrections, strict=True)]
         changes = equations.changes([own.pull(aimed, correction) for own, correction in pairs])
         moves = zip(pairs, changes, strict=True)
@@ -287,12 +287,12 @@ def _step(program: Program, final_weight: float = FINAL_WEIGHT) -> ca.Function:
     return ca.Function(
         "step",
         [iterate, ca.SX.sym("goes_on"), *cell, *program.given.values()],
-        ca.cse([iterate + length * change, gap > NEAR * degree * final]),
+        ca.cse([iterate + length * change, gap > END_WEIGHT_FACTOR * degree * final]),
     )
 
 
 @lru_cache(PROGRAMS)
-def barrier_step(program: Program, final_weight: float = FINAL_WEIGHT) -> ca.Function:
+def barrier_step(program: ConvexProgram, final_weight: float = FINAL_WEIGHT) -> ca.Function:
     """As `_step`, from states to those of the final weight, by Newton's step of the barriers alone;
     where they have arrived there, its derivatives by the cell are those of the central path."""
     states, cell = ca.SX.sym("states", state_ends(program)[-1]), _cell(program)
@@ -308,7 +308,7 @@ def barrier_step(program: Program, final_weight: float = FINAL_WEIGHT) -> ca.Fun
 
 
 def against_barriers(
-    program: Program, states: list[ca.SX], cell: list[ca.SX], final_weight: float
+    program: ConvexProgram, states: list[ca.SX], cell: list[ca.SX], final_weight: float
 ) -> tuple[ca.SX, list[ca.SX], Equations]:
     """The weight, the barriers' pulls at it, and Newton's equations of effort and barriers."""
     weight = final_weight * program.effort(wrenches_of(program, states), cell)
@@ -319,7 +319,7 @@ def against_barriers(
 
 
 def central_point(
-    program: Program, states: Array, cell: list[Array], share: float
+    program: ConvexProgram, states: Array, cell: list[Array], share: float
 ) -> tuple[Array, Array]:
     """States (n,) on the central path, and their slopes (n, m) by the program's first input (m,).
 
@@ -347,7 +347,7 @@ def _length(lowest: list[ca.SX], share: ca.SX | float) -> ca.SX:
 
 
 @lru_cache(PROGRAMS)
-def _start(program: Program) -> ca.Function:
+def _start(program: ConvexProgram) -> ca.Function:
     """The program's start, as an iterate on the central path of a problem like it."""
     cell = _cell(program)
     states, share = program.start(cell)
@@ -431,7 +431,7 @@ class Equations:
     """
 
     def __init__(
-        self, program: Program, cell: list[ca.SX], states: list[ca.SX], stiffness: list[ca.SX]
+        self, program: ConvexProgram, cell: list[ca.SX], states: list[ca.SX], stiffness: list[ca.SX]
     ) -> None:
         """Factors.
 
@@ -479,7 +479,7 @@ class Equations:
         return found
 
 
-def efforts(program: Program, states: list[ca.SX], cell: list[ca.SX]) -> list[ca.SX]:
+def efforts(program: ConvexProgram, states: list[ca.SX], cell: list[ca.SX]) -> list[ca.SX]:
     """The effort at states, its slope (n,) and curvature (n, n)."""
     symbols = [ca.SX.sym("state", state.shape[0]) for state in states]
     effort, whole = program.effort(wrenches_of(program, symbols), cell), ca.vertcat(*symbols)
@@ -488,32 +488,32 @@ def efforts(program: Program, states: list[ca.SX], cell: list[ca.SX]) -> list[ca
     return found
 
 
-def _handed(program: Program) -> list[ca.MX]:
+def _handed(program: ConvexProgram) -> list[ca.MX]:
     """The cell and the given numbers, as inputs of functions that hand them on."""
     given = ((name, numbers.numel()) for name, numbers in program.given.items())
     return [ca.MX.sym(name, size) for name, size in (*program.cell_sizes, *given)]
 
 
-def _cell(program: Program) -> list[ca.SX]:
+def _cell(program: ConvexProgram) -> list[ca.SX]:
     """The cell, without the given numbers."""
     return [ca.SX.sym(name, size) for name, size in program.cell_sizes]
 
 
-def wrenches_of(program: Program, owns: list[AnyExpression]) -> list[AnyExpression]:
+def wrenches_of(program: ConvexProgram, owns: list[AnyExpression]) -> list[AnyExpression]:
     """The wrenches with which the patches' states or iterates begin."""
     return [own[: patch.wrench_size] for patch, own in zip(program.patches, owns, strict=True)]
 
 
-def degree_of(program: Program) -> float:
+def degree_of(program: ConvexProgram) -> float:
     """Pairing of all X with S over the weight on the central path."""
     return sum(patch.degree for patch in program.patches)
 
 
-def ends_of(program: Program) -> list[int]:
+def ends_of(program: ConvexProgram) -> list[int]:
     """Where in an iterate the patches' own ones begin, and its size."""
     return [0, *accumulate(patch.iterate_size for patch in program.patches)]
 
 
-def state_ends(program: Program) -> list[int]:
+def state_ends(program: ConvexProgram) -> list[int]:
     """Where in the states of all patches the patches' own ones begin, and their size."""
     return [0, *accumulate(patch.state_size for patch in program.patches)]

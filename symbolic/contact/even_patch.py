@@ -24,7 +24,7 @@ from dataclasses import dataclass
 
 import casadi as ca
 
-from symbolic.contact.central_path import Factors, Patch, Step
+from symbolic.contact.central_path import Factors, NewtonStep, Patch
 from symbolic.contact.force_closure import EVEN
 from symbolic.contact.soft_finger import SoftPatch, torsion_capacity
 
@@ -132,7 +132,7 @@ class LocalEven:
         """See `symbolic.contact.central_path.LocalPatch`."""
         return -weight * self.slope - correction
 
-    def step(self, weight: ca.SX, correction: ca.SX, change: ca.SX) -> Step:
+    def step(self, weight: ca.SX, correction: ca.SX, change: ca.SX) -> NewtonStep:
         """See `symbolic.contact.central_path.LocalPatch`."""
         lowest, grown = self.patch.lowest(self.state, change), weight - self.stored
         of_state = lowest / self.trust
@@ -149,6 +149,6 @@ class LocalEven:
             multiplier = self.multiplier + length * turned
             return ca.fmax(DEGREE * (self.stored + length * grown), ca.dot(state, multiplier))
 
-        return Step(
+        return NewtonStep(
             ca.vertcat(change, turned, grown), of_state, lowest / SAFE, second_order, gap_after
         )

@@ -41,14 +41,14 @@ TANGENTIAL = (1, 2, 3)
 DIRECTIONS, TORSIONS = 24, 4
 """Directions of friction, and shares of it in every direction, that stand for a patch's cone."""
 
-NEWTON_STEPS = 100
+CLOSURE_NEWTON_STEPS = 100
 BALANCED = 1e-6
 """Newton decrement at which the search ends; what it leaves out of balance is mended after it."""
 
-LEAST_SHARE = 0.05
+LEAST_FRICTION_SHARE = 0.05
 """Least share of the friction that a squeeze is looked for at."""
 
-BISECTIONS = 6
+SQUEEZE_BISECTIONS = 6
 
 PARALLEL = 1.0 - 1e-6
 """Cosine of the angle between two normals that count as one."""
@@ -68,30 +68,30 @@ LEAST_NEW = 0.1
 
 
 @dataclass(frozen=True)
-class Squeeze:
+class InternalForce:
     """An internal squeeze of a grasp.
 
     Attributes:
         states: per pad its state, at the nominal friction; the normal forces sum to one.
-        least_share: share of the friction, at least `LEAST_SHARE`, that such a squeeze needs.
+        least_share: share of the friction, at least `LEAST_FRICTION_SHARE`, that such a squeeze needs.
     """
 
     states: tuple[Array, ...]
     least_share: float
 
 
-def closing_squeeze(workcell: Workcell) -> Squeeze | None:
+def closing_squeeze(workcell: Workcell) -> InternalForce | None:
     """A squeeze of a workcell's pads that holds with as little as half the friction (on a
     logarithmic scale) between the nominal and the least; None where the grasp is not closed with
     `SPARE_FRICTION`.
     """
     if _balanced_states(workcell, SPARE_FRICTION) is None:
         return None
-    low, high = LEAST_SHARE, SPARE_FRICTION
+    low, high = LEAST_FRICTION_SHARE, SPARE_FRICTION
     if _balanced_states(workcell, low) is not None:
         high = low
     else:
-        for _ in range(BISECTIONS):
+        for _ in range(SQUEEZE_BISECTIONS):
             middle = float(np.sqrt(low * high))
             if _balanced_states(workcell, middle) is None:
                 low = middle
@@ -99,7 +99,7 @@ def closing_squeeze(workcell: Workcell) -> Squeeze | None:
                 high = middle
     states = _balanced_states(workcell, float(np.sqrt(high * SPARE_FRICTION)))
     assert states is not None
-    return Squeeze(states, high)
+    return InternalForce(states, high)
 
 
 def has_force_closure(workcell: Workcell) -> bool:
@@ -170,7 +170,7 @@ def _weights(columns: Array) -> Array | None:
     if np.linalg.matrix_rank(columns) < columns.shape[1]:
         return None
     y = np.zeros(columns.shape[1])
-    for _ in range(NEWTON_STEPS):
+    for _ in range(CLOSURE_NEWTON_STEPS):
         weights = 1.0 / (1.0 + columns @ y)
         scaled = weights[:, None] * columns
         gradient = -scaled.sum(axis=0)

@@ -57,7 +57,7 @@ ALIKE = 0.1
 """Squeeze, over the scale, up to which a load counts as like that at rest."""
 
 
-SIZES = ("friction", "reach")
+SCALING_INPUTS = ("friction", "reach")
 """Inputs after the load that scale states; others may follow."""
 
 WHOLE = ca.SX.ones(2)
@@ -69,7 +69,7 @@ class Grasp:
 
     Attributes:
         robots: per pad the index of its robot.
-        patches, cell_sizes, given: see `symbolic.contact.central_path.Program`.
+        patches, cell_sizes, given: see `symbolic.contact.central_path.ConvexProgram`.
         friction: (2,) coefficients of the robots' pads.
         numbers: what else its formulas are made of.
     """
@@ -103,11 +103,11 @@ class Grasp:
         return len(self._free)
 
     def free(self, wrenches: list[ca.SX]) -> ca.SX:
-        """See `symbolic.contact.central_path.Program`."""
+        """See `symbolic.contact.central_path.ConvexProgram`."""
         return ca.vertcat(*wrenches)[self._free.tolist()]
 
     def balanced(self, free: ca.SX, cell: list[ca.SX]) -> list[ca.SX]:
-        """See `symbolic.contact.central_path.Program`."""
+        """See `symbolic.contact.central_path.ConvexProgram`."""
         load, *sizes = cell
         return self._left_by(load, free, sizes)
 
@@ -132,7 +132,7 @@ class Grasp:
     def start(self, cell: list[ca.SX]) -> tuple[list[ca.SX], ca.SX]:
         """For loads like that at rest what to first order lies on their central path, else the
         least states that balance them; and as much of the squeeze as takes that into the cones."""
-        load, *sizes = cell[: 1 + len(SIZES)]
+        load, *sizes = cell[: 1 + len(SCALING_INPUTS)]
         given, rest = self.squeezed(*sizes), ca.SX(number(self.numbers.load_at_rest))
         states, slopes = self._at_rest
         times = ca.fmax(ca.dot(rest, load) / ca.sumsqr(rest), 0.0)
@@ -167,7 +167,7 @@ class Grasp:
         """The numbers with those of the central path's place under the load at rest, of a grasp
         without symbols."""
         inputs = [self.numbers.load_at_rest, *map(np.array, self._nominal())]
-        load, *sizes = [ca.SX(ca.DM(value)) for value in inputs][: 1 + len(SIZES)]
+        load, *sizes = [ca.SX(ca.DM(value)) for value in inputs][: 1 + len(SCALING_INPUTS)]
         asked, given = self.asked(load, *sizes), self.squeezed(*sizes)
         held = ca.vertcat(*asked) + self._pressed(given, asked) * ca.vertcat(*given)
         rest, slopes = central_point(self, np.array(ca.evalf(held)), inputs, REST_WEIGHT)
@@ -222,11 +222,11 @@ class Grasp:
         load, *others = cell
         size = ca.sqrt(ca.sumsqr(load[:3]) + ca.sumsqr(load[3:] / MOMENT_ARM) + SCALE_FLOOR**2)
         found = least_effort(self, load / size, *others, *given, differentiable=differentiable)
-        return self._in_newtons()(found, size, *others[: len(SIZES)], *given)
+        return self._in_newtons()(found, size, *others[: len(SCALING_INPUTS)], *given)
 
     def _in_newtons(self) -> ca.Function:
         found, size = ca.SX.sym("w", self._wrench_ends[-1]), ca.SX.sym("s")
-        names = [name for name, _ in self.cell_sizes if name in SIZES]
+        names = [name for name, _ in self.cell_sizes if name in SCALING_INPUTS]
         sizes = [ca.SX.sym(name, 2) for name in names]
         told, beyond = self.told(ca.vertsplit(found, self._wrench_ends), sizes)
         squeezed = zip(self.patches, self.squeezed(*sizes), strict=True)
@@ -242,7 +242,7 @@ class Grasp:
 
         Args:
             wrenches: scaled ones.
-            sizes: `SIZES` as far as they are inputs.
+            sizes: `SCALING_INPUTS` as far as they are inputs.
         """
         whole = [whole_wrench(self.units(i, *sizes) * own) for i, own in enumerate(wrenches)]
         beyond = ca.DM([BEYOND, 0, 0, 0, 0, 0])

@@ -60,7 +60,7 @@ class GraspSqueeze(Grasp):
         return (*super()._nominal(), [1.0, 1.0], [0.0] * 4)
 
     def balanced(self, free: ca.SX, cell: list[ca.SX]) -> list[ca.SX]:
-        """See `symbolic.contact.central_path.Program`."""
+        """See `symbolic.contact.central_path.ConvexProgram`."""
         load, friction, reach, displacement = cell
         wrenches = self._left_by(load, free, [friction, reach])
         for _ in range(DISPLACED):
@@ -81,7 +81,7 @@ class GraspSqueeze(Grasp):
         return total
 
     def effort(self, wrenches: list[ca.SX], cell: list[ca.SX]) -> ca.SX:
-        """See `symbolic.contact.central_path.Program`."""
+        """See `symbolic.contact.central_path.ConvexProgram`."""
         total = 0.0
         for wrench, robot in zip(wrenches, self.robots, strict=True):
             total += wrench[0] * (1.0 if robot == self.commanded else OTHER_WEIGHT)

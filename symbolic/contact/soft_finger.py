@@ -36,7 +36,7 @@ from symbolic.expression import Expression, number
 from symbolic.records import Contact
 from symbolic.records.numbered import NumberedContact
 
-NEWTON_STEPS = 3
+GRIP_NEWTON_STEPS = 3
 """Newton steps for given tangential forces, from `_first_grip`: relative errors of forces are then
 below 1e-6, of pads of one size 1e-9. One less where results take two more, see
 `symbolic.contact.model.ImplicitVariables`."""
@@ -255,7 +255,7 @@ def _pressed(
     more = implicit.steps if implicit is not None else 0
     beginning = other_grip_squared(in_order([ca.sqrt(square) for square in squares])[0])
     grip = _first_grip(asked, (twist, half), share, squared, beginning)
-    for _ in range(NEWTON_STEPS - max(0, more - 1)):
+    for _ in range(GRIP_NEWTON_STEPS - max(0, more - 1)):
         grip = newton(grip)
     if implicit is not None:
         grip = implicit.detach(grip)

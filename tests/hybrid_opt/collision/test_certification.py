@@ -23,7 +23,7 @@ from hybrid_opt.collision.certify import (
     certify,
     configurations,
 )
-from hybrid_opt.collision.checker import CollisionChecker, Touch
+from hybrid_opt.collision.checker import CollidingPair, CollisionChecker
 from hybrid_opt.collision.distances import BodyDistances
 from hybrid_opt.evaluate.evaluation import BETWEEN_SAMPLES, REASONS, CandidateEvaluator
 from hybrid_opt.indicators.metrics import non_dominated
@@ -210,7 +210,7 @@ def test_carries_that_share_a_path_are_certified_once(monkeypatch: pytest.Monkey
 
 
 def test_a_certificate_says_what_speaks_against_the_path() -> None:
-    touch = Touch(3, "payload", "shelf", 0.5)
+    touch = CollidingPair(3, "payload", "shelf", 0.5)
     assert Certificate(False, touch, 0.3, None, 10, 0.0).problem == "payload meets shelf"
     assert "does not follow" in Certificate(False, None, 0.3, None, 10, 0.0, lost=True).problem
     assert Certificate(True, None, np.nan, None, 10, 0.0).problem == ""

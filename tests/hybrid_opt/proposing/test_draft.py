@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hybrid_opt.proposing.bounds import Bounds
-from hybrid_opt.proposing.decimals import UNITS, readable_turns, rounded_outwards
+from hybrid_opt.proposing.decimals import RECIPROCAL_UNIT, readable_turns, rounded_outwards
 from hybrid_opt.proposing.draft import Draft, changes, decision_bounds
 from hybrid_opt.proposing.problem import Problem, read_problem
 from symbolic.read.editing import merged
@@ -42,7 +42,7 @@ def test_bounds_are_rounded_outwards_within_limits(low: float, width: float, roo
     noise = 1e-10
     assert limits[0] <= found[0] <= bounds[0] + noise
     assert bounds[1] - noise <= found[1] <= limits[1]
-    assert np.abs(found - bounds).max() <= 1.0 / UNITS
+    assert np.abs(found - bounds).max() <= 1.0 / RECIPROCAL_UNIT
 
 
 def read_back(problem: Problem, found: Draft) -> tuple[Task, list[str]]:

@@ -16,7 +16,7 @@ from hybrid_opt.errors import JobError, ProposalError
 from hybrid_opt.job.plan import job_geometry
 from hybrid_opt.proposing.bases import (
     ASIDE,
-    LIFT,
+    LIFT_HEIGHT,
     POSES,
     PlaceScorer,
     base_choices,
@@ -393,7 +393,7 @@ def test_without_obstacles_every_detour_is_free() -> None:
     # Some poses stand a little beside the corner.
     assert away[0] == 0.0
     assert away.max() == pytest.approx(max(ASIDE), abs=0.02)
-    assert found[:, :, 2].max() == pytest.approx(GOAL[2] + LIFT + max(ASIDE), abs=0.05)
+    assert found[:, :, 2].max() == pytest.approx(GOAL[2] + LIFT_HEIGHT + max(ASIDE), abs=0.05)
     wall = {"wall": ([0.0, 0.0, 0.9], [2.0, 2.0, 0.02])}
     assert free_detours(cell_with(wall), START, GOAL).shape == (0, POSES, 6)
 
@@ -410,7 +410,7 @@ def test_what_is_left_leads_around_the_shelf() -> None:
         if not any(
             meets(pose, size)
             for pose in path
-            if min(np.abs(pose - end).max() for end in ends) >= LIFT
+            if min(np.abs(pose - end).max() for end in ends) >= LIFT_HEIGHT
         )
     ]
     np.testing.assert_array_equal(found, np.array(expected))

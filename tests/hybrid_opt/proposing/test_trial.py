@@ -13,12 +13,19 @@ import trimesh
 from hybrid_opt.errors import JobError
 from hybrid_opt.proposing.draft import Draft, changes
 from hybrid_opt.proposing.holding import ArmKinematics
-from hybrid_opt.proposing.planner import Place, Stray, freedom, plan, straight, straight_paths
+from hybrid_opt.proposing.planner import (
+    ChainConfiguration,
+    Corridor,
+    plan,
+    search_subspace,
+    straight,
+    straight_paths,
+)
 from hybrid_opt.proposing.problem import read_problem
 from hybrid_opt.proposing.proposal import ProposeSettings
 from hybrid_opt.proposing.proposal import _Search as Search
 from hybrid_opt.proposing.setup import Setup, prepare, redundancy
-from hybrid_opt.proposing.trial import BoxAlone, Trial, grasp_blocked, judge_of
+from hybrid_opt.proposing.trial import PayloadSceneChecker, Trial, grasp_blocked, judge_of
 from hybrid_opt.proposing.via_points import fit, free_share, joint_length, shortened, straightened
 from symbolic.array import Array
 from symbolic.cell_model import build_cell_model, own_pairs
@@ -71,13 +78,13 @@ WAY = np.linspace(-0.45, 0.45, 41)
 BOW = 0.5 * np.cos(np.pi * WAY / 0.9)
 
 
-def box_among(more: str, folder: Path, before: str | None = None) -> BoxAlone:
+def box_among(more: str, folder: Path, before: str | None = None) -> PayloadSceneChecker:
     """The box among what stands in the problem with a post, up to a word where one is given, and
     more."""
     text = POST.read_text(encoding="utf-8")
     path = folder / "problem.toml"
     path.write_text(text[: None if before is None else text.index(before)] + more)
-    return BoxAlone(read_problem(path).workcell())
+    return PayloadSceneChecker(read_problem(path).workcell())
 
 
 def way_by(y: float = 0.0, z: float = 0.0, height: float = 0.35) -> Array:
@@ -243,26 +250,26 @@ def shelf(tmp_path_factory: pytest.TempPathFactory) -> Setup:
     return prepare(problem, {}, SPINS, np.random.default_rng(3))
 
 
-def found_in(setup: Setup, seed: int, out_of_time: bool = False) -> list[Place] | None:
+def found_in(setup: Setup, seed: int, out_of_time: bool = False) -> list[ChainConfiguration] | None:
     pair = setup.pairs[0]
     ends = pair.start.extended, pair.goal.extended
-    room = freedom(*ends, Stray(0.0, 0.15, 0.8), NO_LIMITS)
+    room = search_subspace(*ends, Corridor(0.0, 0.15, 0.8), NO_LIMITS)
     until = {"most": 20_000, "out_of_time": lambda: out_of_time}
     return plan(pair.chain, pair.retreats, room, **until, seed=seed)  # type: ignore[arg-type]
 
 
-def planned(setup: Setup, seed: int) -> list[Place]:
+def planned(setup: Setup, seed: int) -> list[ChainConfiguration]:
     found = found_in(setup, seed)
     assert found is not None
     return found
 
 
 @pytest.fixture(scope="module")
-def first(shelf: Setup) -> list[Place]:
+def first(shelf: Setup) -> list[ChainConfiguration]:
     return planned(shelf, 1)
 
 
-def shortened_path(setup: Setup, corners: list[Place]) -> list[Place]:
+def shortened_path(setup: Setup, corners: list[ChainConfiguration]) -> list[ChainConfiguration]:
     """Places along corners without needless ones; FCL without screening finds them free."""
     pair = setup.pairs[0]
     path = shortened(pair.chain, corners, np.random.default_rng(0))
@@ -274,7 +281,9 @@ def shortened_path(setup: Setup, corners: list[Place]) -> list[Place]:
     return path
 
 
-def test_paths_hold_the_box_with_both_arms_and_are_free(shelf: Setup, first: list[Place]) -> None:
+def test_paths_hold_the_box_with_both_arms_and_are_free(
+    shelf: Setup, first: list[ChainConfiguration]
+) -> None:
     pair, path = shelf.pairs[0], shortened_path(shelf, first)
     poses = np.array([place.extended for place in path])
     for arm in (0, 1):
@@ -292,7 +301,7 @@ def test_paths_hold_the_box_with_both_arms_and_are_free(shelf: Setup, first: lis
 def test_straight_motions_lead_out_of_the_shelf_and_in_again(shelf: Setup) -> None:
     """Of three: away from the rack, up beside it, back."""
     pair = shelf.pairs[0]
-    corners = next(straight_paths(pair.chain, pair.retreats, BoxAlone(shelf.workcell)))
+    corners = next(straight_paths(pair.chain, pair.retreats, PayloadSceneChecker(shelf.workcell)))
     out, over = (corners[k + 1].extended - corners[k].extended for k in (0, 1))
     assert out[0] < -0.2
     assert over[2] > 0.3
@@ -303,13 +312,15 @@ def test_where_no_straight_motion_is_free_none_is_made_up(shelf: Setup) -> None:
     pair = shelf.pairs[0]
     ends = pair.start, pair.goal
     alone = tuple([[end]] * len(ways) for end, ways in zip(ends, pair.retreats, strict=True))
-    assert not list(straight_paths(pair.chain, (alone[0], alone[1]), BoxAlone(shelf.workcell)))
+    assert not list(
+        straight_paths(pair.chain, (alone[0], alone[1]), PayloadSceneChecker(shelf.workcell))
+    )
 
 
 def test_shortcuts_make_the_way_of_the_joints_shorter(shelf: Setup) -> None:
     """A path that wanders to both sides, on a task that is symmetric."""
     pair = shelf.pairs[0]
-    corners = next(straight_paths(pair.chain, pair.retreats, BoxAlone(shelf.workcell)))
+    corners = next(straight_paths(pair.chain, pair.retreats, PayloadSceneChecker(shelf.workcell)))
     path = np.array([corner.extended for corner in corners])
     path = np.insert(path, 2, (path[1] + path[2]) / 2.0, axis=0)
     path[2, 1] += 0.08
@@ -327,7 +338,7 @@ def test_shortcuts_make_the_way_of_the_joints_shorter(shelf: Setup) -> None:
 
 
 def test_few_via_points_follow_a_path_and_are_straightened(
-    shelf: Setup, first: list[Place]
+    shelf: Setup, first: list[ChainConfiguration]
 ) -> None:
     """As far as the spline stays free."""
     pair, rng = shelf.pairs[0], np.random.default_rng(0)
@@ -348,7 +359,7 @@ def test_few_via_points_follow_a_path_and_are_straightened(
     assert lengths[1] < 0.97 * lengths[0]
 
 
-def test_the_same_seed_gives_the_same_path(shelf: Setup, first: list[Place]) -> None:
+def test_the_same_seed_gives_the_same_path(shelf: Setup, first: list[ChainConfiguration]) -> None:
     for a, b in zip(first, planned(shelf, 1), strict=True):
         np.testing.assert_array_equal(a.extended, b.extended)
 
@@ -359,11 +370,11 @@ def test_what_may_be_spent_on_a_path_is_kept(shelf: Setup) -> None:
 
 def test_a_tilted_path_may_turn_and_a_level_one_may_not() -> None:
     start, goal = np.zeros(6), np.array([0.5, 0.0, 0.0, 0.0, 0.0, 0.3])
-    level = freedom(start, goal, Stray(0.0, 0.1, 1.0), NO_LIMITS)
+    level = search_subspace(start, goal, Corridor(0.0, 0.1, 1.0), NO_LIMITS)
     assert level.directions.shape == (6, 4)
     np.testing.assert_allclose(level.extended(level.coordinates(goal)), goal, atol=1e-12)
     assert np.all(level.coordinates(goal) <= level.upper)
-    tilted = freedom(start, goal, Stray(0.2, 0.1, 1.0), NO_LIMITS)
+    tilted = search_subspace(start, goal, Corridor(0.2, 0.1, 1.0), NO_LIMITS)
     assert tilted.directions.shape == (6, 6)
     turned = np.array([0.0, 0.0, 0.0, 0.15, -0.15, 0.0])
     inside = tilted.coordinates(turned)
@@ -373,7 +384,9 @@ def test_a_tilted_path_may_turn_and_a_level_one_may_not() -> None:
 
 def test_redundant_joints_stray_farther_than_the_box_and_not_beyond_their_limits() -> None:
     start, goal = np.zeros(8), np.array([0.5, 0.0, 0.0, 0.0, 0.0, 0.0, 0.4, 0.0])
-    room = freedom(start, goal, Stray(0.0, 0.1, 0.2), np.array([[-0.3, 2.0], [-3.0, 3.0]]))
+    room = search_subspace(
+        start, goal, Corridor(0.0, 0.1, 0.2), np.array([[-0.3, 2.0], [-3.0, 3.0]])
+    )
     least, most = room.extended(room.lower), room.extended(room.upper)
     np.testing.assert_allclose(least, [-0.2, -0.2, -0.2, 0, 0, 0, -0.3, -1.0], atol=1e-7)
     np.testing.assert_allclose(most, [0.7, 0.2, 0.2, 0, 0, 0, 1.4, 1.0], atol=1e-7)
@@ -381,7 +394,7 @@ def test_redundant_joints_stray_farther_than_the_box_and_not_beyond_their_limits
 
 def test_a_path_may_be_kept_to_one_side() -> None:
     start, goal = np.zeros(6), np.array([0.5, 0.0, 0.1, 0.0, 0.0, 0.0])
-    room = freedom(start, goal, Stray(0.0, 0.15, 0.8, (0, -1, 0)), NO_LIMITS)
+    room = search_subspace(start, goal, Corridor(0.0, 0.15, 0.8, (0, -1, 0)), NO_LIMITS)
     low, high = room.extended(room.lower), room.extended(room.upper)
     np.testing.assert_allclose(low[:3], [0.0, -0.8, 0.0], atol=1e-6)
     np.testing.assert_allclose(high[:3], [0.5, 0.0, 0.1], atol=1e-6)

@@ -29,7 +29,7 @@ from studies.report import PAGE, looks
 from studies.report.__main__ import main
 from studies.report.data import ReportData, ReportRun
 from studies.report.drawing import (
-    FRONT,
+    FRONT_VIEW,
     HAND_MADE_STYLE,
     MAX_EDGE,
     SERIES,
@@ -329,7 +329,7 @@ def test_faces_are_small_and_leave_no_cracks(data: ReportData) -> None:
         assert areas[1] == pytest.approx(areas[0], rel=1e-9)
 
 
-@pytest.mark.parametrize("view", [FRONT, SIDE, oblique(0.3, 0.5), oblique(-2.0, -0.4)])
+@pytest.mark.parametrize("view", [FRONT_VIEW, SIDE, oblique(0.3, 0.5), oblique(-2.0, -0.4)])
 def test_views_are_rotations(view: View) -> None:
     axes = np.array([view.right, view.up, view.towards])
     np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=1e-12)

@@ -108,7 +108,7 @@ def test_measures_the_rack_and_keeps_its_promises(
 ) -> None:
     monkeypatch.setattr(costs, "SAMPLE_COUNTS", (25, 50, 100))
     monkeypatch.setattr(costs, "WAYPOINTS", (1, 3))
-    monkeypatch.setattr(turns, "TIMED_EVALUATIONS", 200)
+    monkeypatch.setattr(turns, "TURN_EVALUATIONS", 200)
     arguments = [str(RACK), "--json", "--candidates", "5", "--repeats", "2"]
     assert benchmark.main(arguments) == 0
     result: dict[str, Any] = json.loads(capsys.readouterr().out)
