@@ -73,7 +73,8 @@ class InternalForce:
 
     Attributes:
         states: per pad its state, at the nominal friction; the normal forces sum to one.
-        least_share: share of the friction, at least `LEAST_FRICTION_SHARE`, that such a squeeze needs.
+        least_share: share of the friction, at least `LEAST_FRICTION_SHARE`, that such a squeeze
+            needs.
     """
 
     states: tuple[Array, ...]
