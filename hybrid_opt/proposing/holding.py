@@ -48,12 +48,18 @@ class Postures:
     Attributes:
         q: (n, joints) [rad or m].
         residual: (n,) from the pose that was wanted [m, rad].
-        manipulability: (n,) abs(det J) of the joints that follow [m^3].
+        determinant: (n,) det J of the joints that follow [m^3]; where its sign changes along a
+            path, the arm passes a singular posture.
     """
 
     q: Array
     residual: Array
-    manipulability: Array
+    determinant: Array
+
+    @property
+    def manipulability(self) -> Array:
+        """(n,) abs(det J) [m^3]."""
+        return np.abs(self.determinant)
 
 
 class ArmKinematics:
@@ -130,6 +136,13 @@ class ArmKinematics:
         linear = np.where(turning, across, axes)
         return np.concatenate([linear, np.where(turning, axes, 0.0)], axis=2).transpose(0, 2, 1)
 
+    def side(self, q: Array) -> float:
+        """Return the sign of det J in a posture (joints,): a path on which it changes passes a
+        singular posture."""
+        return float(
+            np.sign(np.linalg.det(self.jacobian(*self.chain(q[None]))[0][:, self.following]))
+        )
+
     def solve(self, q: Array, target: Array, steps: int, damping: float = 0.0) -> Postures:
         """Solve postures (n, joints) by Newton's method for placements (n, 4, 4) of the last joint.
 
@@ -149,7 +162,7 @@ class ArmKinematics:
             move = np.linalg.solve(normal, right)[..., 0]
             most = np.maximum(np.abs(move).max(axis=1, keepdims=True), STEP_LIMIT)
             q[:, self.following] += move * (STEP_LIMIT / most)
-        return Postures(q, residual, np.abs(np.linalg.det(J)))
+        return Postures(q, residual, np.linalg.det(J))
 
     def track(self, q: Array, target: Array, held: Sequence[int] = ()) -> Postures:
         """Find the next posture (n, joints) at placements (n, 4, 4), all joints but those held
@@ -171,8 +184,7 @@ class ArmKinematics:
             drift = DRIFT_SHARE * (middle - q) * moving if step == 0 else np.zeros_like(q)
             missing = error - np.einsum("nij,nj->ni", own, drift)
             q += drift + np.einsum("nij,nj->ni", inverted, missing)
-        measure = np.abs(np.linalg.det(J[:, :, self.following]))
-        return Postures(q, residual, measure)
+        return Postures(q, residual, np.linalg.det(J[:, :, self.following]))
 
     def follow(
         self, q: Array, targets: Array, ends: Array | None = None, resolved: bool = False
@@ -187,12 +199,12 @@ class ArmKinematics:
 
         Returns:
             Joint paths (m, n, joints); of each posture the number of placements that it reached
-            without a jump; manipulability (m, n).
+            without a jump; manipulability (m, n), negative beyond a singular posture.
         """
         m, n = len(targets), len(q)
         path, measure = np.tile(q, (m, 1, 1)), np.zeros((m, n))
         kept, alive = np.zeros(n, dtype=np.intp), np.arange(n)
-        change, redundant = np.zeros_like(q), list(self.redundant)
+        change, redundant, side = np.zeros_like(q), list(self.redundant), np.ones(n)
         for k, target in enumerate(targets):
             before = path[max(k - 1, 0), alive]
             guess = before + change
@@ -212,7 +224,8 @@ class ArmKinematics:
             alive, change = alive[on], found.q[on] - before[on] if k else change[on]
             path[k:, alive] = found.q[on]
             kept[alive] += 1
-            measure[k, alive] = found.manipulability[on]
+            side = side[on] if k else np.sign(found.determinant[on])
+            measure[k, alive] = found.determinant[on] * side
         return path, kept, measure
 
     def central(self, path: Array) -> Array:
@@ -568,7 +581,7 @@ class _Finder:
         if not reaches:
             return "it does not reach farther in one motion"
         if measure < kinematics.least:
-            return told_manipulability(kinematics, f"is {measure:.2g} m^3 there")
+            return told_manipulability(kinematics, f"is {max(measure, 0.0):.2g} m^3 there")
         room = np.minimum(q - kinematics.lower, kinematics.upper - q)
         joint = list(arm_model(kinematics.workcell.robots[kinematics.arm]).names)[1:][
             int(np.argmin(room))

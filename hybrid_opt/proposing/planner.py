@@ -82,6 +82,7 @@ class _Follower:
         self.T_root_world = inverse(robot.T_world_base)
         key = f"robots[{many.arm}].min_manipulability = {robot.min_manipulability:g} m^3"
         self.singular = f"{robot.name} is near a singular posture ({key})"
+        self.side = many.side(hold.q_start)
         self.lower, self.upper = many.lower + LIMIT_MARGIN, many.upper - LIMIT_MARGIN
 
     def close(self, T_world_box: Array, extended: Array, q: Array) -> Array | str:
@@ -114,7 +115,7 @@ class _Follower:
         beyond = np.flatnonzero((q < self.lower) | (q > self.upper))
         if len(beyond):
             return f"{self.name}/{self.names[beyond[0]]} is at its limit"
-        if abs(np.linalg.det(J)) < self.many.least:
+        if self.side * np.linalg.det(J) < self.many.least:
             return self.singular
         return q
 
@@ -181,7 +182,8 @@ class ClosedChain:
             for joint, place in arm.redundant:
                 guess[:, joint] = extended[:, place]
             there = arm.many.solve(guess, T_world_box @ arm.T_box_joint, steps)
-            closed &= (there.residual <= REACHED) & (there.manipulability >= arm.many.least)
+            closed &= there.residual <= REACHED
+            closed &= arm.side * there.determinant >= arm.many.least
             closed &= np.all((there.q >= arm.lower) & (there.q <= arm.upper), axis=1)
             found.append(there.q)
         return (found[0], found[1]), closed
