@@ -45,7 +45,7 @@ CLOSURE_NEWTON_STEPS = 100
 BALANCED = 1e-6
 """Newton decrement at which the search ends; what it leaves out of balance is mended after it."""
 
-LEAST_FRICTION_SHARE = 0.05
+LEAST_SQUEEZE_SHARE = 0.05
 """Least share of the friction that a squeeze is looked for at."""
 
 SQUEEZE_BISECTIONS = 6
@@ -73,7 +73,7 @@ class InternalForce:
 
     Attributes:
         states: per pad its state, at the nominal friction; the normal forces sum to one.
-        least_share: share of the friction, at least `LEAST_FRICTION_SHARE`, that such a squeeze
+        least_share: share of the friction, at least `LEAST_SQUEEZE_SHARE`, that such a squeeze
             needs.
     """
 
@@ -88,7 +88,7 @@ def closing_squeeze(workcell: Workcell) -> InternalForce | None:
     """
     if _balanced_states(workcell, SPARE_FRICTION) is None:
         return None
-    low, high = LEAST_FRICTION_SHARE, SPARE_FRICTION
+    low, high = LEAST_SQUEEZE_SHARE, SPARE_FRICTION
     if _balanced_states(workcell, low) is not None:
         high = low
     else:
