@@ -73,14 +73,14 @@ def polish(
     paths: Sequence[Carry | Array] = (),
     progress: ShowProgress = False,
 ) -> Front:
-    """Improve a front: both peak forces with an interior-point method, or, under the time law
-    'optimal', path and speed profile together.
+    """Improve a front: both peak forces with an interior-point method, or, in drivable cells,
+    path and speed profile together.
 
     Args:
         rng: spreads the starts of some attempts.
         settings: see `hybrid_opt.polishing.settings`; None for the usual ones of the time law.
         paths: carries of the cell whose paths are known to be good, or their decision vectors,
-            with or without a force limit; under the time law 'optimal' only. The front is nowhere
+            with or without a force limit; in drivable cells only. The front is nowhere
             behind them. The hand-made path always takes part.
         progress: True for a bar, or what takes attempts done and those expected in all: what is
             left to do shows on the way, and both are equal in the end.

@@ -5,7 +5,7 @@ the same number of evaluations, and the better half goes on. A pair is as good a
 the carries that it found so far; while it has none, as the least penalty. The rounds of a pair are
 one search: each begins with the best that the pair knows.
 
-Under the time law 'optimal' pairs compete by the carries that the same paths make from rest to rest
+In drivable cells pairs compete by the carries that the same paths make from rest to rest
 under 'ramped': what arms reach and hit does not depend on the law, and that one is judged in lanes.
 """
 
@@ -26,7 +26,8 @@ from hybrid_opt.progress import ShowProgress, progress_bar
 from symbolic.array import Array
 from symbolic.errors import SettingsError, WorkcellError
 from symbolic.functions import CONSTRAINTS
-from symbolic.records import SEARCHED_BRANCH, TimeLaw
+from symbolic.records import SEARCHED_BRANCH
+from symbolic.records.time_law import RAMPED
 
 SAMPLED = 32
 """Random candidates of which a pair has to hold one, where it does not hold the hand-made
@@ -73,12 +74,12 @@ class BranchCompetition:
     Attributes:
         pairs: their results.
         evaluations: of all pairs together.
-        time_law: under which they competed.
+        law: name of the time law under which they competed.
     """
 
     pairs: tuple[PairResult, ...]
     evaluations: int
-    time_law: TimeLaw
+    law: str
 
     @property
     def winner(self) -> tuple[int, int]:
@@ -91,7 +92,7 @@ class BranchCompetition:
         text = (
             f"start branches {first.branches[0]} and {first.branches[1]}, best of "
             f"{len(tried)} pairs in {self.evaluations} evaluations under the time law "
-            f"{self.time_law}, those by which {len(self.pairs)} pairs were tried out included: "
+            f"{self.law}, those by which {len(self.pairs)} pairs were tried out included: "
         )
         if not first.hypervolume:
             return f"{text}no pair found a feasible carry, least penalty {first.least_penalty:.4f}"
@@ -170,7 +171,7 @@ def search_branches(
             objectives.
         WorkcellError: no pair holds any trajectory that was tried.
     """
-    if cell.workcell.task.time_law == "optimal":
+    if cell.workcell.task.law.is_drivable:
         cell = _from_rest_to_rest(cell)
     if len(cell.objective_names) != len(REFERENCE_POINT):
         raise SettingsError("start branches compete by the hypervolume of two objectives")
@@ -208,12 +209,12 @@ def search_branches(
     ranked = sorted([*pairs, *out], key=_standing)
     results = tuple(pair.result() for pair in ranked)
     spent = sum(pair.evaluations for pair in results)
-    return BranchCompetition(results, spent, cell.workcell.task.time_law)
+    return BranchCompetition(results, spent, cell.workcell.task.law.name)
 
 
 def _from_rest_to_rest(cell: Cell) -> Cell:
     """Return the cell under 'ramped', with the paper's objectives."""
-    task = replace(cell.workcell.task, time_law="ramped")
+    task = replace(cell.workcell.task, time_law=RAMPED)
     return Cell(replace(cell.workcell, task=task), PAPER_OBJECTIVES, cell.threads)
 
 

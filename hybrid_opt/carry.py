@@ -30,7 +30,7 @@ FORCE_LIMIT = "force_limit"
 JOINT_TORQUE = "joint_torque"
 NO_TIMING = "no_timing"
 DRIVE_CONSTRAINTS = (FORCE_LIMIT, JOINT_TORQUE, NO_TIMING)
-"""Names of the time law 'optimal'.
+"""Constraints of drivable cells.
 
 force_limit, joint_torque: standing still needs more; violation: its share of the limit, minus 1.
 no_timing: the solver of timings fails the path for any other reason; violation: 1.
@@ -260,7 +260,7 @@ def joints_of(workcell: Workcell, values: Array) -> tuple[Array, Array]:
     return values[:, :first], values[:, first:]
 
 
-def carry_under_time_law(
+def carry_from_outputs(
     workcell: Workcell,
     functions: Mapping[str, NumericFunction],
     x: Array,
@@ -280,7 +280,7 @@ def carry_under_time_law(
     return Carry(
         workcell=workcell,
         x=np.array(x),
-        timing=workcell.task.time_law,
+        timing=workcell.task.law.name,
         parameter=np.linspace(0.0, 1.0, len(time)),
         time=time,
         pose=outputs["pose"],
@@ -326,7 +326,7 @@ def _joint_rates(
     takes the box's (one-sided at the ends). Under 'ramped' the law's own u' and u'' drive the
     joints' finite differences over u, so that an arm rests wherever the box does.
     """
-    if workcell.task.time_law == "constant":
+    if workcell.task.law.has_differences:
         time = outputs["time"].reshape(-1)
         rate = np.gradient(q, time, axis=0, edge_order=2)
         return rate, np.gradient(rate, time, axis=0, edge_order=2)

@@ -150,7 +150,7 @@ class Cell:
         return cell
 
     def drivable(self) -> Cell:
-        """Return the drivable variant of the cell: under the time law 'optimal', searched for
+        """Return the drivable variant of the cell: with the fastest timings, searched for
         duration and peak force, the robust one if robust forces are minimised
         (docs/explanation/timing.md).
 

@@ -309,7 +309,7 @@ class InterpretedCell(CompiledCell):
 def is_interpretable(workcell: Workcell) -> bool:
     """Return True if candidates take CasADi's interpreter milliseconds: no program solves for their
     forces, and no compiled passes time them."""
-    return contact_model(workcell).has_closed_form and workcell.task.time_law != "optimal"
+    return contact_model(workcell).has_closed_form and not workcell.task.law.is_drivable
 
 
 @lru_cache

@@ -93,13 +93,13 @@ class Front(Displayable):
         from hybrid_opt.polishing.polisher import Polisher
 
         cell, task = self.cell, self.cell.workcell.task
-        settings = settings or default_settings(task.time_law)
+        settings = settings or default_settings(task.law.is_drivable)
         polisher = Polisher(cell.evaluator, settings, cell.polish_functions)
         known = [np.asarray(decision_of(path), dtype=float) for path in paths]
-        if known and task.time_law != "optimal":
+        if known and not task.law.is_drivable:
             raise SettingsError(
-                f"known paths take part in polishes of drivable carries only; the time law is "
-                f"'{task.time_law}': polish the front of Cell.drivable()"
+                f"known paths take part in polishes of drivable carries only; this one has "
+                f"{task.law.title}: polish the front of Cell.drivable()"
             )
         for path in known:
             if path.shape not in ((task.n_path,), (task.n_var,)) or not np.isfinite(path).all():
@@ -270,10 +270,10 @@ def select(
 
 
 def selected_row(evaluator: CandidateEvaluator, x: Array) -> int:
-    """Return the index of the selected carry of a front (k, n_var), k > 0: the balanced one, under
-    the time law 'optimal' the knee of duration and larger peak force."""
+    """Return the index of the selected carry of a front (k, n_var), k > 0: the balanced one, in
+    drivable cells the knee of duration and larger peak force."""
     peaks, durations = _peaks_and_durations(evaluator, x)
-    if evaluator.workcell.task.time_law != "optimal":
+    if not evaluator.workcell.task.law.is_drivable:
         return balanced(peaks)
     return knee(np.column_stack([durations, peaks.max(axis=1)]))
 

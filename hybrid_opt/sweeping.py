@@ -124,7 +124,7 @@ def sweep(
     cell.
 
     Args:
-        cell: under the time law 'optimal', see `Cell.drivable`.
+        cell: a drivable one, see `Cell.drivable`.
         path: a good carry of the cell, such as the recommended one, or its decision vector.
         over: values by key path, see `Cell.changed`.
         fixed: whether the path stays as it is; otherwise it is polished in every changed cell.
@@ -138,10 +138,10 @@ def sweep(
         WorkcellError: a key leads nowhere.
     """
     x = np.asarray(path.x if isinstance(path, Carry) else path, dtype=float)
-    if cell.workcell.task.time_law != "optimal" or x.shape != (cell.n_var,):
+    if not cell.workcell.task.law.is_drivable or x.shape != (cell.n_var,):
         raise SettingsError(
             f"a sweep takes a drivable cell (Cell.drivable) and a carry of it; the time law is "
-            f"{cell.workcell.task.time_law!r}, the path has shape {x.shape} of ({cell.n_var},)"
+            f"{cell.workcell.task.law.name!r}, the path has shape {x.shape} of ({cell.n_var},)"
         )
     values = {key: tuple(map(float, each)) for key, each in over.items()}
     require_keys(cell, values)

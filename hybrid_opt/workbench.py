@@ -64,7 +64,7 @@ class SessionVerdict:
     """A carry in a cell.
 
     Attributes:
-        cell: the changed cell under the time law 'optimal', None where the change is refused.
+        cell: the changed cell as a drivable one, None where the change is refused.
         carry: the carry in that cell, None likewise.
         text: whether the carry is feasible, or why not.
         feasible: whether it is.
@@ -88,7 +88,7 @@ class Session:
     Attributes:
         base: the cell as it was given.
         changes: by key path of the workcell file, see `Cell.changed`.
-        x: (n_var,) decision vector of the carry under the time law 'optimal'.
+        x: (n_var,) decision vector of the carry in a drivable cell.
         verdict: the verdict on that carry.
     """
 
@@ -102,14 +102,14 @@ class Session:
             DualArmError: the cell has no drivable form, or x does not fit.
         """
         self.base = cell
-        self._drivable = cell if cell.workcell.task.time_law == "optimal" else cell.drivable()
+        self._drivable = cell if cell.workcell.task.law.is_drivable else cell.drivable()
         self.changes: dict[str, Any] = {}
         self.x = np.array(self._drivable.initial if x is None else x, dtype=float)
         self.verdict = self._judged(self._drivable)
 
     @property
     def cell(self) -> Cell:
-        """The changed cell under the time law 'optimal'."""
+        """The changed cell as a drivable one."""
         return self.verdict.cell or self._drivable
 
     def change(self, changes: Mapping[str, Any]) -> SessionVerdict:

@@ -81,7 +81,7 @@ def first_result(evaluations: int = QUICK_EVALUATIONS, seed: int = 1) -> Iterato
     )
     rng = np.random.default_rng(seed)
     front = ho.search(cell, "nsga2", evaluations=evaluations, rng=rng)
-    front = ho.polish(front, rng=rng, settings=quick_settings("optimal"), progress=True)
+    front = ho.polish(front, rng=rng, settings=quick_settings(is_drivable=True), progress=True)
     carries = sorted(front, key=lambda carry: carry.duration)
     carries = [
         carry for carry in carries if carry.duration < LARGEST_SLOWDOWN * carries[0].duration

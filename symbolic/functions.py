@@ -77,14 +77,14 @@ def candidate_function(model: CellModel) -> ca.Function:
     (9,): largest positive value of each constraint over the samples; violation_time (9,): time
     for which each is violated, over the duration.
 
-    Under the time law 'optimal' the inputs of `DRIVE_INPUTS` follow x.
+    In drivable cells the inputs of `DRIVE_INPUTS` follow x.
     """
     workcell = model.workcell
     n = workcell.task.samples
     x, basis, handed = ca.MX.sym("x", workcell.task.n_var), sample_basis(workcell.task), _all(model)
     inputs = {"x": x}
     waypoints, own = _waypoints(workcell.task, x, handed), select_parameters(handed, workcell.task)
-    if workcell.task.time_law == "optimal":
+    if workcell.task.law.is_drivable:
         inputs |= {name: ca.MX.sym(name, n) for name in DRIVE_INPUTS}
         path = driven_path(basis, waypoints, *[inputs[name].T for name in DRIVE_INPUTS])
     else:
@@ -134,7 +134,7 @@ def _constraints(
 
 def motion_function(model: CellModel) -> ca.Function:
     """Build the evaluator without forces, much cheaper where a solver finds those; not for
-    'optimal'.
+    drivable cells.
 
     Outputs as of `candidate_function`: time, pose, q_1, q_2, and the violation (9,) of reach,
     joint limits and singularity; friction and pressure count as satisfied.
@@ -208,7 +208,8 @@ def force_sizes(workcell: Workcell) -> dict[str, int]:
 
 
 def sample_functions(model: CellModel) -> dict[str, ca.Function]:
-    """Build a candidate's function in parts, to be composed sample by sample; not for 'optimal'.
+    """Build a candidate's function in parts, to be composed sample by sample; not for drivable
+    cells.
 
     path: x (n_var,) -> time (1, n), pose (6 + m, n), extended by the redundant joints, rate,
     second_rate (6, n). start: first pose, joints of both arms there -> state_1, state_2 before the
@@ -354,7 +355,7 @@ def _constraint_function(workcell: Workcell) -> ca.Function:
         values[f"singularity_{arm}"] = ca.if_else(
             lost > 0.5, 0.0, 1.0 - inputs[f"manipulability_{arm}"] / robot.min_manipulability
         )
-        allowed = 1.0 + (TIMING_TOLERANCE if workcell.task.time_law == "optimal" else 0.0)
+        allowed = 1.0 + (TIMING_TOLERANCE if workcell.task.law.is_drivable else 0.0)
         values[f"pressure_{arm}"] = inputs["pressure_shift"][i] / contact.patch_radius - allowed
         limit = contact.friction * inputs["normal_force"][i]
         cones.append((inputs["tangential_force"][i] - limit) / weight - FRICTION_TOLERANCE)

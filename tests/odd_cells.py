@@ -13,7 +13,7 @@ import trimesh
 
 from symbolic.array import Array
 from symbolic.read.cell import load
-from symbolic.records import TimeLaw, Waypoint, Workcell
+from symbolic.records import Waypoint, Workcell
 from symbolic.records.poses import Orientation, rotation_from_rpy
 from tests.machines import MACHINES, SINGLE, machine_cell, single_cell
 from tests.symbolic.cells import fixed, free, hand_cell, with_task
@@ -126,7 +126,7 @@ REFERENCE = Orientation("quaternion", rotation_from_rpy([0.0, -QUARTER, 0.0]))
 """Rotation vectors count from a box that lies on its side."""
 
 
-def turned_cell(time_law: TimeLaw = "constant") -> Workcell:
+def turned_cell(time_law: str = "constant") -> Workcell:
     """The hand-written cell with the box turned over; waypoints may tilt it as well."""
     return with_task(
         hand_cell(),

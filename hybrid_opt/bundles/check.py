@@ -373,7 +373,7 @@ def _certificate(cell: Cell, joints: BPoly, time: Array) -> str:
         q_1, q_2 = (np.ascontiguousarray(q) for q in joints_of(workcell, joints(places)))
         return np.ascontiguousarray(pose), q_1, q_2
 
-    # Not the evaluator's: under the time law 'optimal' that brings the timing of paths.
+    # Not the evaluator's: in drivable cells that brings the timing of paths.
     checker = CollisionChecker(cell.compiled.geometry, cell.compiled.screening)
     found = certify(checker, at, time)
     return "" if found.is_free else f"{found.problem} at {found.at_parameter:.3f} s"

@@ -172,7 +172,7 @@ class CampaignResults:
     def to_polish(self) -> tuple[Front, ...]:
         """The fronts that a polish begins with: every replica's, of a drivable experiment the
         `UNION` of all."""
-        if self.workcell.task.time_law != "optimal":
+        if not self.workcell.task.law.is_drivable:
             return self.searched
         every = concatenated([found.evaluations for found in self.replicas])
         return (Front.of_search(self.cell, UNION, every),)

@@ -316,7 +316,7 @@ class ReadyCell:
         cell = Cell(workcell, objectives)
         cell.carry(cell.initial)
         search_carry(cell.timing_model, cell.initial)
-        if workcell.task.time_law == "optimal" and cell.force_kind.robust:
+        if workcell.task.law.is_drivable and cell.force_kind.robust:
             search_timing(cell.timing_model, cell.initial)
         return cls(cell, JobModel(cell.compiled, cell.timing_model))
 
@@ -372,7 +372,7 @@ def build_study(cell: Cell, progress: Progress, polish: bool = True, drivable: b
     if cache.read_record(key) is not None:
         return
     # Drivable cells have the longest functions.
-    drivable &= cell.workcell.task.time_law != "optimal"
+    drivable &= not cell.workcell.task.law.is_drivable
     cells = [cell.drivable(), cell] if drivable else [cell]
     makers = [make for each in cells for make in _makers(each, polish)]
     failures = build_all(makers, progress)
@@ -421,7 +421,7 @@ def _makers(cell: Cell, polish: bool) -> Iterator[Maker]:
     from hybrid_opt.timing.path_timer import PATH_INTERVALS
 
     compiled, workcell = cell.compiled, cell.workcell
-    driven = workcell.task.time_law == "optimal"
+    driven = workcell.task.law.is_drivable
     known = (
         is_polishable(workcell, cell.force_kind.robust)
         if driven

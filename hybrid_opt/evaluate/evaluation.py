@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from codegen.function import NumericFunction
-from hybrid_opt.carry import DRIVE_CONSTRAINTS, Carry, Judgement, carry_under_time_law
+from hybrid_opt.carry import DRIVE_CONSTRAINTS, Carry, Judgement, carry_from_outputs
 from hybrid_opt.collision.certify import (
     Certificate,
     LostPathError,
@@ -60,7 +60,7 @@ REASONS = (*CONSTRAINTS, COLLISION, BETWEEN_SAMPLES, NOT_FINITE, *DRIVE_CONSTRAI
 
 between_samples: not proven free of collisions between the samples; only fronts are certified.
 not_finite: an objective is NaN or infinite (a solver or model failure, never a front member).
-The rest only under the time law 'optimal', see `hybrid_opt.carry.DRIVE_CONSTRAINTS`.
+The rest only in drivable cells, see `hybrid_opt.carry.DRIVE_CONSTRAINTS`.
 """
 
 FEASIBLE = -1
@@ -147,7 +147,7 @@ class CandidateEvaluator:
         functions: the cell's compiled functions by name.
         checker: FCL's verdict on samples.
         n_var, lower, upper: size and bounds of the decision vector.
-        driver: what drives candidates of the time law 'optimal', None under the others.
+        driver: what drives candidates of drivable cells, None in others.
         threads: threads that share a batch.
     """
 
@@ -165,7 +165,7 @@ class CandidateEvaluator:
         Args:
             objectives: what to minimise, by name or as one's own record.
             functions: those of `symbolic.functions`, if not to be loaded or built here.
-            driver: under the time law 'optimal', likewise.
+            driver: in drivable cells, likewise.
             compiled: where functions are taken from, if others share it.
 
         Raises:
@@ -196,7 +196,7 @@ class CandidateEvaluator:
         return load_kernel(self.compiled, self.checker, self.outputs) if self._in_lanes else None
 
     def _driver(self, threads: int) -> CandidateDriver | None:
-        if self.workcell.task.time_law != "optimal":
+        if not self.workcell.task.law.is_drivable:
             return None
         # Not imported at the top: other time laws need no timing, and hence no CasADi.
         from hybrid_opt.timing.drive import CandidateDriver
@@ -224,7 +224,7 @@ class CandidateEvaluator:
 
     def outputs(self, x: Array) -> dict[str, Array]:
         """Compute every per-sample output for decision vectors (n, n_var), see
-        `symbolic.functions`; under the time law 'optimal' also those of
+        `symbolic.functions`; in drivable cells also those of
         `hybrid_opt.timing.drive.CandidateDriver.outputs`."""
         x = self._checked(x)
         if self.driver is not None:
@@ -269,7 +269,7 @@ class CandidateEvaluator:
         sampled = evaluate_numpy(outputs, self.checker)
         judgement = self._judge(x, sampled, outputs).judgement(0, self.objective_names)
         single = {name: values[0] for name, values in outputs.items()}
-        return carry_under_time_law(self.workcell, self.functions, x[0], single, judgement)
+        return carry_from_outputs(self.workcell, self.functions, x[0], single, judgement)
 
     def certificate(self, x: Array) -> Certificate:
         """Certify one decision vector (n_var,) between its samples.

@@ -4,8 +4,8 @@ Whole evaluations run in lanes: `kernel.c` calls the cell's functions sample by 
 candidates side by side, sums up the violations, bounds every pair's distance, and has Coal prove of
 pairs that the bounds leave open that they are apart or intersect; the rest is left to FCL.
 Quantities per sample leave it only on request. `evaluate_numpy` computes the same in NumPy, from
-the outputs of the candidate function: the kernel's oracle, and the evaluation of candidates of the
-time law 'optimal'.
+the outputs of the candidate function: the kernel's oracle, and the evaluation of candidates of
+drivable cells.
 """
 
 from __future__ import annotations

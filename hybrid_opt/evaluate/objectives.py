@@ -58,7 +58,7 @@ class ForceKind:
 
     Attributes:
         robust: whether they hold in every case of the workcell's uncertainty.
-        drivable: the pair of objectives of the time law 'optimal': how long a carry takes and how
+        drivable: the pair of objectives of drivable cells: how long a carry takes and how
             hard it presses.
         name: of the forces, in sentences.
         title: of the largest force, for axes.
@@ -250,7 +250,7 @@ _ROBUST = tuple(OBJECTIVES[name].evaluate for name in ("robust_force", *ROBUST_O
 
 
 def force_kind(objectives: Sequence[str | Objective]) -> ForceKind:
-    """Return the kind of forces that the time law 'optimal' limits: robust ones if those are
+    """Return the kind of forces that drivable cells limit: robust ones if those are
     minimised.
 
     Raises:

@@ -91,7 +91,7 @@ def without_jumps(
 def driven_limits(model: TimingModel, x: Array) -> TimingLimits:
     """Return the limits of a job's carry x (n_var,): its own force limit if its time law has one,
     else the reference speeds."""
-    if model.workcell.task.time_law == "optimal":
+    if model.workcell.task.law.is_drivable:
         return model.drive_limits(float(x[-1]))
     return TimingLimits(reference_speed=True)
 

@@ -73,7 +73,7 @@ class PolishFunctions:
 
     Attributes:
         built: by name; see `symbolic.smooth`: forces and pressure at samples, inverse kinematics of
-            both arms, under the time law 'optimal' limits along a driven path; rows at places of
+            both arms, in drivable cells limits along a driven path; rows at places of
             the path, missing ones compiled on first use.
         model: arms and bodies of the cell.
         separable: pairs with known gaps; see `gaps`.
@@ -117,7 +117,7 @@ def sample_quantities(workcell: Workcell) -> tuple[Quantity, ...]:
     Driven carries have limits at the intervals of their timing, not at samples. The forces of pads
     anywhere have no closed form: a program finds them from the load.
     """
-    if workcell.task.time_law == "optimal":
+    if workcell.task.law.is_drivable:
         return ()
     model = contact_model(workcell)
     if model.has_closed_form:
@@ -170,7 +170,7 @@ def polish_functions(compiled: CompiledCell) -> PolishFunctions:
     built |= compiled.functions("polish rows", rows, details, levels=levels, lanes=0)
     if "load" in quantities:
         built |= compiled.functions("held", _held, levels=levels, lanes=0, bodies=False)
-    if compiled.workcell.task.time_law == "optimal":
+    if compiled.workcell.task.law.is_drivable:
         built |= compiled.functions("driven", driven_functions, lanes=0, bodies=False)
         if not contact_model(compiled.workcell).has_closed_form:
             built |= compiled.functions(

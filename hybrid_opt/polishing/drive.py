@@ -220,12 +220,12 @@ class DriveStepMethod(StepMethod[DriveIterate, DriveStep]):
             is_coarse: move the waypoints of the file only.
 
         Raises:
-            SettingsError: the time law is not 'optimal', or forces have no closed form.
+            SettingsError: the cell is not drivable, or forces have no closed form.
         """
         driver, task = cell.evaluator.driver, cell.task
         if driver is None or not is_polishable(cell.workcell, driver.robust):
             raise SettingsError(
-                f"the polish of drivable carries needs the time law 'optimal'; {UNPOLISHABLE}: "
+                f"the polish of drivable carries needs a drivable cell; {UNPOLISHABLE}: "
                 "switch the polish off"
             )
         super().__init__(cell, RowSelector(cell), CarryReader(cell))

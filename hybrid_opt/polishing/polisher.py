@@ -42,7 +42,7 @@ class Polisher:
     Attributes:
         evaluator: full model.
         settings: effort and tolerances.
-        solver: of both peak forces; None under the time law 'optimal'.
+        solver: of both peak forces; None in drivable cells.
         drive_method: step method of drivable carries; None under other time laws.
     """
 
@@ -59,13 +59,13 @@ class Polisher:
 
         Raises:
             SettingsError: the evaluator's objectives are not those of the polish: both peak forces,
-                planned or robust, or under the time law 'optimal' duration and one of them; the
+                planned or robust, or in drivable cells duration and one of them; the
                 pads do not close their grasp, or robust forces are those of pads without opposite
                 normals.
             DualArmError: the functions cannot be built.
         """
         self.evaluator, self.settings = evaluator, settings
-        driven = evaluator.workcell.task.time_law == "optimal"
+        driven = evaluator.workcell.task.law.is_drivable
         _require_objectives(evaluator, DRIVABLE_PAIRS if driven else FORCE_PAIRS, driven)
         functions = functions or polish_functions(evaluator.compiled)
         cell = SmoothCell(evaluator, functions, settings.clearance)

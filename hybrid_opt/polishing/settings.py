@@ -65,7 +65,7 @@ class FillSettings:
 
 @dataclass(frozen=True)
 class DrivableSettings:
-    """Polish under the time law 'optimal'; see `hybrid_opt.polishing.drive_front`.
+    """Settings of the polish of drivable cells; see `hybrid_opt.polishing.drive_front`.
 
     Attributes:
         first_rounds: trust-region iterations of the first path at most.
@@ -110,14 +110,14 @@ class PolishSettings:
         require_allowed(self, "polish ")
 
 
-def default_settings(time_law: str) -> PolishSettings:
-    """Return the settings of a full study under a time law."""
-    return PolishSettings(attempts=DRIVABLE_ATTEMPTS) if time_law == "optimal" else PolishSettings()
+def default_settings(is_drivable: bool) -> PolishSettings:
+    """Return the settings of a full study of a cell or its drivable variant."""
+    return PolishSettings(attempts=DRIVABLE_ATTEMPTS) if is_drivable else PolishSettings()
 
 
-def quick_settings(time_law: str) -> PolishSettings:
+def quick_settings(is_drivable: bool) -> PolishSettings:
     """Return settings of a small study: a third as many points from fewer attempts."""
-    if time_law == "optimal":
+    if is_drivable:
         return PolishSettings(
             attempts=QUICK_DRIVABLE_ATTEMPTS, drivable=DrivableSettings(members=10)
         )

@@ -25,6 +25,7 @@ from symbolic.records import Robot, Workcell
 from symbolic.records import quantities as quantity
 from symbolic.records.poses import Orientation, box_placement, rotation_from_rpy
 from symbolic.records.problems import Problems
+from symbolic.records.time_law import OPTIMAL
 
 UPRIGHT = 0.7
 """Share of the vertical from which on an edge of the box counts as upright."""
@@ -241,10 +242,11 @@ def _require_known(table: TableReader) -> None:
             "found a fixed one; allowed is a carry from start to goal, put fixed poses into the "
             "proposed file",
         )
-    if task.raw("time_law", None) == "optimal":
+    if task.raw("time_law", None) == OPTIMAL:
         task.add(
             "time_law",
-            "found 'optimal'; allowed are 'constant' and 'ramped', change it in the proposed file",
+            f"found {OPTIMAL!r}; allowed are 'constant' and 'ramped', change it in the proposed "
+            "file",
         )
     if all("xyz" in entry for entry in contacts):
         return

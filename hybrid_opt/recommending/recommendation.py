@@ -179,7 +179,7 @@ def recommend(
     of all is given, with what would have to change (`Recommendation.objection`).
 
     Args:
-        front: of a cell under the time law 'optimal', see `Cell.drivable`.
+        front: of a drivable cell, see `Cell.drivable`.
         wish: another target, or other numbers of the cell: paths are timed, pressed and planned
             for these.
         others: (n_path,) paths by label, beside which the answer stands; the hand-made one always
@@ -194,9 +194,9 @@ def recommend(
     """
     wish = wish or Wish()
     cell = wished_cell(front.cell, wish)
-    if cell.workcell.task.time_law != "optimal":
+    if not cell.workcell.task.law.is_drivable:
         raise SettingsError(
-            f"the cell's time law is {cell.workcell.task.time_law!r}, which no robot drives; give "
+            f"the cell's time law is {cell.workcell.task.law.name!r}, which no robot drives; give "
             "the front of cell.drivable()"
         )
     if len(front) == 0:

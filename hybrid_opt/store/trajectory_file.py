@@ -155,9 +155,9 @@ def write_trajectory(
 
 
 def _standing_still(workcell: Workcell) -> tuple[Array, ...]:
-    """Return the inputs of a candidate besides x: under 'optimal' a timing at rest, which the start
-    postures do not depend on."""
-    if workcell.task.time_law != "optimal":
+    """Return the inputs of a candidate besides x: in drivable cells a timing at rest, on which
+    the start postures do not depend."""
+    if not workcell.task.law.is_drivable:
         return ()
     still = np.zeros(workcell.task.samples)
     return np.linspace(0.0, 1.0, workcell.task.samples), still, still

@@ -1,4 +1,4 @@
-"""Candidates of the time law 'optimal': the timing of their paths, and the violations of paths
+"""Candidates of drivable cells: the timing of their paths, and the violations of paths
 without one.
 
 A candidate is a path and a force limit. Its timing is the fastest from rest to rest within this
@@ -18,7 +18,7 @@ from hybrid_opt.carry import (
     JOINT_TORQUE,
     NO_TIMING,
     Carry,
-    carry_under_time_law,
+    carry_from_outputs,
 )
 from hybrid_opt.timing.model import TimingModel
 from hybrid_opt.timing.path_timer import PathTimer
@@ -29,7 +29,7 @@ _AT_REST = {"normal force": FORCE_LIMIT, "joint torque": JOINT_TORQUE}
 
 
 class CandidateDriver:
-    """Times candidates of one workcell with the time law 'optimal'.
+    """Times candidates of one drivable workcell.
 
     Attributes:
         timer: times their paths.
@@ -146,11 +146,11 @@ def search_carry(model: TimingModel, x: Array) -> Carry:
     """
     x = model.checked(x)
     functions = model.compiled.evaluators
-    if model.workcell.task.time_law != "optimal":
-        return carry_under_time_law(model.workcell, functions, x, functions["candidate"](x))
+    if not model.workcell.task.law.is_drivable:
+        return carry_from_outputs(model.workcell, functions, x, functions["candidate"](x))
     outputs = _driver_of(model).outputs(functions["candidate"], x[None])
     single = {name: values[0] for name, values in outputs.items()}
-    return carry_under_time_law(model.workcell, functions, x, single)
+    return carry_from_outputs(model.workcell, functions, x, single)
 
 
 @lru_cache(maxsize=2)

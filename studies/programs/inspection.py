@@ -239,7 +239,7 @@ def _facts(workcell: Workcell) -> dict[str, str]:
     facts["contacts"] = f"friction {friction}, patch radius {radius} mm"
     facts["task"] = (
         f"{len(task.waypoints)} poses, {len(task.free_indices)} of them free ({task.n_var} "
-        f"variables), {task.samples} samples, time law {task.time_law}, "
+        f"variables), {task.samples} samples, time law {task.law.name}, "
         f"{task.reference_speed:g} m/s"
     )
     facts["environment"] = ", ".join(body.name for body in workcell.environment) or "empty"

@@ -233,7 +233,7 @@ def make_study(path: Path, options: argparse.Namespace, with_paper: bool) -> Non
     if options.recommend_only:
         drivable = Cell(cell).drivable()  # keeps the file of its workcell
         cell = drivable.workcell
-    driven = cell.task.time_law == "optimal"
+    driven = cell.task.law.is_drivable
     settings = campaign_settings(options, DRIVABLE_OBJECTIVES if driven else PAPER_OBJECTIVES)
     alone = is_drivable(cell, settings.objectives)
     polishable = alone or (not driven and settings.objectives in FORCE_PAIRS)
@@ -246,10 +246,10 @@ def make_study(path: Path, options: argparse.Namespace, with_paper: bool) -> Non
         overwrite=options.overwrite,
     )
     study = StudySettings(
-        polish=polish_settings(options, polishable, cell.task.time_law),
+        polish=polish_settings(options, polishable, driven),
         drivable=options.drivable,
         drivable_replicas=options.drivable_replicas,
-        drivable_polish=polish_settings(options, True, "optimal"),
+        drivable_polish=polish_settings(options, True, is_drivable=True),
         wish=Wish(options.duration, options.force_limit, options.payload),
         simulate=options.simulate,
         report=options.report and not options.recommend_only,
@@ -305,17 +305,21 @@ def campaign_settings(
 
 
 def polish_settings(
-    options: argparse.Namespace, usual: bool, time_law: str
+    options: argparse.Namespace, usual: bool, is_drivable: bool
 ) -> PolishSettings | None:
-    """How the options want fronts under a time law polished, None for not at all; `usual` decides
-    where they do not say.
+    """Return the polish settings that the options ask for, None for no polish.
+
+    Args:
+        options: of the program.
+        usual: whether to polish if they do not say.
+        is_drivable: whether the fronts are of a drivable cell.
 
     Raises:
         SettingsError: a value is not allowed.
     """
     if not (usual if options.polish is None else options.polish):
         return None
-    chosen = (quick_settings if options.quick else default_settings)(time_law)
+    chosen = (quick_settings if options.quick else default_settings)(is_drivable)
     asked = options.polish_attempts
     attempts = chosen.attempts if asked is None else asked
     return replace(chosen, attempts=attempts, solver=options.polish_solver)

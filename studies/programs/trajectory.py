@@ -95,7 +95,7 @@ def _replayed(
         "provenance": dict(stored.provenance),
     }
     yield ProgramResult(document, lines)
-    if workcell.task.time_law == "optimal":
+    if workcell.task.law.is_drivable:
         yield _driven(replayed.cell, stored.x)
     asked = (options.planned_limit, options.force_curve)
     if options.timing or any(option is not None for option in asked):

@@ -277,7 +277,7 @@ def gather(
     forces = first.summary.static_hold.normal_force / first.summary.reference_force
     known = dict(zip(PAPER_OBJECTIVES, forces, strict=True))
     still = [known.get(name) for name in first.objectives[:2]]
-    alone = results.workcell.task.time_law == "optimal"
+    alone = results.workcell.task.law.is_drivable
     # Jobs are what robots are told: by the cell that they drive.
     cells = cells_of(first.files, results.objectives, alone)
     made = (workers or LocalWorkers()).map(partial(_call, cells), calls)

@@ -203,8 +203,6 @@ WHOLE_JOB = "the whole job"
 NO_JOB = "shown of the recommended and the hand-made carry only; an export plans any"
 """Why a trajectory that can be driven has none."""
 
-LAWS = {"constant": "constant speed", "ramped": "ramped speed"}
-
 
 @dataclass(frozen=True)
 class PageTrajectory:
@@ -267,7 +265,7 @@ def _rounded(values: Array, digits: int) -> list[float]:
 def page_trajectory(cells: Sequence[ReadyCell], shown: PageTrajectory) -> dict[str, Any]:
     """Return a trajectory of the page as JSON values: its motions, and its words.
 
-    Carries of the time law 'optimal' are driven within their force limits and the limits on jerk,
+    Drivable carries are driven within their force limits and the limits on jerk,
     as jobs drive them, with the forces to command. Others are timed as close to the reference
     speeds as limits allow, with planned forces.
 
@@ -275,12 +273,12 @@ def page_trajectory(cells: Sequence[ReadyCell], shown: PageTrajectory) -> dict[s
         cells: of the page; the last one is the cell that robots drive.
     """
     cell, driving = cells[shown.cell].cell, cells[-1]
-    law = cell.workcell.task.time_law
+    law = cell.workcell.task.law
     judged = cell.carry(shown.x)
     assert judged.judgement is not None, "carries of a cell are judged"
     timing, problem = _timed(cell, driving, shown)
     driven, commanded, motions = None if timing is None else timing.carry, None, []
-    if driven is not None and law == "optimal":
+    if driven is not None and law.is_drivable:
         try:
             commanded, _ = commanded_forces(
                 driven.workcell, driven, SqueezeSettings(), in_parts=False
@@ -289,8 +287,8 @@ def page_trajectory(cells: Sequence[ReadyCell], shown: PageTrajectory) -> dict[s
             problem = str(error)
     if driven is not None:
         motions.append(_motion(DRIVEN_TITLE, driven, commanded))
-    if law != "optimal":
-        motions.append(_motion(f"{ASSUMED}: {LAWS[law]}", judged))
+    if not law.is_drivable:
+        motions.append(_motion(f"{ASSUMED}: {law.title}", judged))
     if not motions:
         motions.append(_motion(ASSUMED, judged))
     name = shown.source
@@ -332,7 +330,7 @@ def _timed(cell: ho.Cell, driving: ReadyCell, shown: PageTrajectory) -> tuple[Ti
     """Time a trajectory of a cell as robots drive it, or say why they cannot."""
     task = driving.cell.workcell.task
     try:
-        if cell.workcell.task.time_law != "optimal":
+        if not cell.workcell.task.law.is_drivable:
             path = resample_decisions(shown.x, cell.workcell.task, task)[0, : task.n_path]
             timing = time_path(driving.jobs.timing, path, ho.TimingLimits(reference_speed=True))
         elif cell.force_kind.robust and not shown.recommended:
@@ -378,7 +376,7 @@ def _values(cell: ho.Cell, judged: ho.Carry, found: dict[str, Any]) -> str:
         return f"{found['duration']:.2f} s, press with {found['commanded']:.1f} N"
     assert judged.judgement is not None, "carries of a cell are judged"
     values = judged.judgement.objectives
-    if cell.workcell.task.time_law == "optimal":
+    if cell.workcell.task.law.is_drivable:
         return f"{found['duration']:.2f} s, {found['planned']:.1f} N planned"
     if tuple(values) != PAPER_OBJECTIVES:
         return ", ".join(f"{name.replace('_', ' ')} {values[name]:.4f}" for name in values)

@@ -362,7 +362,7 @@ def least_force(campaign: CampaignResults, task: Task) -> dict[str, Array]:
 
 def is_drivable(workcell: Workcell, objectives: Sequence[str]) -> bool:
     """Whether an experiment already is the search for carries as robots drive them."""
-    return workcell.task.time_law == "optimal" and tuple(objectives) in DRIVABLE_PAIRS
+    return workcell.task.law.is_drivable and tuple(objectives) in DRIVABLE_PAIRS
 
 
 def drivable_root(root: Path, workcell: Workcell, objectives: Sequence[str]) -> Path:

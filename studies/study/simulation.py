@@ -268,7 +268,7 @@ def timing_stage(curves: bool = True) -> Stage:
         requests = [
             (read_trajectory(selected / f).x, CURVE_POINTS if f in timed else None) for f in files
         ]
-        driven = folder.workcell.task.time_law == "optimal"
+        driven = folder.workcell.task.law.is_drivable
         cells = cells_of(folder.files, folder.settings.objectives, driven)
         with progress.stage(TIMING, len(requests), "trajectories") as advance:
             call = partial(_document, cells)

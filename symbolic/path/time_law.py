@@ -67,7 +67,7 @@ def timed_path(
         handed: the task's numbers.
     """
     pose = ca.mtimes(waypoints, ca.DM(basis.position.T))
-    if task.time_law == "constant":
+    if task.law.has_differences:
         return _constant(task, pose, rounding, handed)
     first = ca.mtimes(waypoints, ca.DM(basis.first.T))
     second = ca.mtimes(waypoints, ca.DM(basis.second.T))

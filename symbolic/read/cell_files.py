@@ -4,7 +4,7 @@ The layout keeps the file's own relative references valid, so that the workcell'
 the same. Absolute references are replaced by relative ones. Unpacking writes below one folder
 only, and refuses files that refer to anything outside it.
 
-The drivable variant of a cell is the same under the time law 'optimal': its file is the original's
+The drivable variant of a cell is the same under the time law `OPTIMAL`: its file is the original's
 text with one key changed, comments and all else as they were.
 """
 
@@ -39,6 +39,7 @@ from symbolic.read.tables import checked
 from symbolic.read.urdf import parse_urdf, read_urdf
 from symbolic.records import Robot, Workcell
 from symbolic.records.problems import FirstProblem, shown
+from symbolic.records.time_law import OPTIMAL
 
 MAX_FILES = 1000
 MAX_TOTAL_BYTES = safe_io.CELL_BYTES
@@ -436,14 +437,14 @@ def _meshes(bodies: Any) -> Iterator[tuple[str, None]]:
 
 
 def drivable_files(stored: CellFiles) -> CellFiles:
-    """Return the files of a cell (`collect_cell`) with the time law changed to 'optimal'.
+    """Return the files of a cell (`collect_cell`) with the time law changed to `OPTIMAL`.
 
     Raises:
         BundleError: the file writes the task in a way that cannot be changed line by line, or the
             changed cell is not valid.
     """
     content = stored.files[stored.workcell]
-    law = {"task": {"time_law": "optimal"}}
+    law = {"task": {"time_law": OPTIMAL}}
     with _told(f"{stored.workcell}: the time law cannot be changed:"):
         changed = completed(safe_io.text(content), parse_toml(content), law).encode()
     draft = replace(stored, files={**stored.files, stored.workcell: changed}, digest="")

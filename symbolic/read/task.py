@@ -27,7 +27,6 @@ from symbolic.records import (
     RedundantJoint,
     Robot,
     Task,
-    TimeLaw,
     Waypoint,
     Workcell,
 )
@@ -43,6 +42,7 @@ from symbolic.records.poses import (
 )
 from symbolic.records.problems import Problems, shown
 from symbolic.records.task import components
+from symbolic.records.time_law import CONSTANT, TIME_LAWS, TimeLaw
 
 MAX_WAYPOINTS = 100
 MAX_PIECES = 10
@@ -69,7 +69,8 @@ def read_task(table: TableReader, holding: Array) -> tuple[Task, tuple[Redundanc
                 "waypoints",
                 f"found {len(waypoints)} poses with start and goal; allowed are {MAX_WAYPOINTS}",
             )
-    time_law = cast("TimeLaw", table.choice("time_law", get_args(TimeLaw), "constant"))
+    time_law = table.choice("time_law", tuple(TIME_LAWS), CONSTANT)
+    law = TIME_LAWS[time_law or CONSTANT]
     pieces = table.integer("drivable_pieces", 1, MAX_PIECES, 1)
     redundant = read_redundant(table, len(waypoints))
     holds, given = bool(holding.any()), {}
@@ -81,30 +82,29 @@ def read_task(table: TableReader, holding: Array) -> tuple[Task, tuple[Redundanc
         Task,
         **given,
         waypoints=waypoints,
-        time_law=time_law,
+        time_law=law.name,
         initial=_read_initial(table, [w for w in waypoints if not w.is_fixed], names),
-        allocation=_allocation(table, time_law, holds),
+        allocation=_allocation(table, law, holds),
         force_limit=_force_limit(table),
         redundant=(),
         orientation=orientation,
-        pieces=pieces if time_law == "optimal" else 1,
+        pieces=pieces if law.is_drivable else 1,
     )
     if orientation.is_vector:
         _check_vectors(task, table.problems)
     return task, redundant
 
 
-def _allocation(table: TableReader, time_law: TimeLaw, holds: bool) -> str:
+def _allocation(table: TableReader, law: TimeLaw, holds: bool) -> str:
     """Read the contact model's name; the default is 'holding-hands' for hands that hold by
-    themselves, else 'soft-finger' under the law 'optimal', else 'paper'."""
-    driven = time_law == "optimal"
-    pads = "soft-finger" if driven else "paper"
+    themselves, else 'soft-finger' in drivable cells, else 'paper'."""
+    pads = "soft-finger" if law.is_drivable else "paper"
     usual = _known_allocation(table, "allocation", "holding-hands" if holds else pads)
     own = _known_allocation(table, "drivable_allocation", usual)
     for key, name in (("allocation", usual), ("drivable_allocation", own)):
         if holds and name != "holding-hands":
             table.add(key, f"found {name!r}; hands that hold by themselves have 'holding-hands'")
-    return own if driven else usual
+    return own if law.is_drivable else usual
 
 
 def _known_allocation(table: TableReader, key: str, usual: str) -> str:

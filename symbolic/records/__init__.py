@@ -38,7 +38,6 @@ from symbolic.records.task import (
     AllowedContact,
     RedundantJoint,
     Task,
-    TimeLaw,
     Waypoint,
 )
 
@@ -64,7 +63,6 @@ __all__ = [
     "Shape",
     "Sphere",
     "Task",
-    "TimeLaw",
     "ToolLoad",
     "Uncertainty",
     "Waypoint",

@@ -1,7 +1,7 @@
 """The task of a carry, and its decision vector.
 
 The decision vector holds the free waypoints of a task's path, one after the other. The free values
-of the redundant joints follow them, joint by joint; under the time law 'optimal' the force limit
+of the redundant joints follow them, joint by joint; in drivable cells the force limit
 [N] is the last. Here they are put into the path, and taken out, as numbers; as expressions it is
 `symbolic.path.spline.waypoint_matrix` and `extended_matrix`.
 """
@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Annotated, Literal
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,8 +20,7 @@ from symbolic.array import Array, Filling, Pair, Range
 from symbolic.records import quantities as quantity
 from symbolic.records.poses import Orientation
 from symbolic.records.problems import Label
-
-TimeLaw = Literal["constant", "ramped", "optimal"]
+from symbolic.records.time_law import CONSTANT, TIME_LAWS, TimeLaw
 
 POSE_SIZE = 6
 """x, y, z [m] and three numbers of the orientation [rad], see `symbolic.records.poses`."""
@@ -96,16 +95,16 @@ class Task:
     Attributes:
         waypoints: the ordered poses of the path; the first and last are fixed.
         samples: number of samples along the path, ends included.
-        time_law: 'constant' (the paper's), 'ramped' (from rest to rest) or 'optimal' (the fastest
-            from rest to rest within all limits and a force limit that is a decision variable).
-        reference_speed: [m/s], speed of the box centre (cruise speed of 'ramped').
+        time_law: name of the time law, see `symbolic.records.time_law`.
+        reference_speed: [m/s], speed of the box centre, or cruise speed between ramps.
         reference_angular_speed: [rad/s], for steps that mostly rotate.
-        ramp_time: [s], duration of each ramp of 'ramped'.
+        ramp_time: [s], duration of each ramp, if the speed has any.
         reference_force: (2,) [N], normalises each robot's normal force.
         initial: (n_free, 6), the hand-made trajectory's free waypoints.
         allowed_contacts: contacts that are no collisions, see AllowedContact.
         allocation: name of the contact model, see `symbolic.contact.registry`.
-        force_limit: (2,) bounds of the force limit, the last decision variable of 'optimal' [N].
+        force_limit: (2,) bounds of the force limit, the last decision variable of drivable
+            carries [N].
         redundant: the joints whose paths are decided beside the box's, see RedundantJoint.
         orientation: what the last three numbers of every pose mean.
         pieces: of the path between two waypoints that its file states, see `symbolic.path.pieces`.
@@ -113,7 +112,7 @@ class Task:
 
     waypoints: tuple[Waypoint, ...]
     samples: Annotated[int, Range(5, 2_000)] = 100
-    time_law: TimeLaw = "constant"
+    time_law: str = CONSTANT
     reference_speed: Annotated[float, quantity.SPEED]
     reference_angular_speed: Annotated[float, quantity.ANGULAR_SPEED] = 0.5
     ramp_time: Annotated[float, quantity.DURATION] = 0.5
@@ -172,9 +171,15 @@ class Task:
         return found
 
     @property
+    def law(self) -> TimeLaw:
+        """The time law."""
+        return TIME_LAWS[self.time_law]
+
+    @property
     def n_var(self) -> int:
-        """Number of decision variables: those of the path, then under 'optimal' the force limit."""
-        return self.n_path + (self.time_law == "optimal")
+        """Number of decision variables: those of the path, and the force limit of drivable
+        carries."""
+        return self.n_path + self.law.is_drivable
 
     @property
     def lower(self) -> Array:
@@ -189,7 +194,7 @@ class Task:
     def _bounds(self, name: str, force: float) -> Array:
         parts = [getattr(self.waypoints[i], name) for i in self.free_indices]
         parts += [getattr(joint, name)[joint.moving] for joint in self.redundant]
-        return np.concatenate(parts + ([np.array([force])] if self.time_law == "optimal" else []))
+        return np.concatenate(parts + ([np.array([force])] if self.law.is_drivable else []))
 
 
 # --- the decision vector ---
@@ -227,7 +232,7 @@ def decision_of(task: Task, waypoints: Array) -> Array:
     """Return the decision vector (n_var,) of all waypoints (n_waypoints, 6 + m); a force limit
     takes its upper bound."""
     path = np.array(waypoints[task.free_entries], dtype=float)
-    return np.append(path, task.force_limit[1]) if task.time_law == "optimal" else path
+    return np.append(path, task.force_limit[1]) if task.law.is_drivable else path
 
 
 def initial_decision(task: Task) -> Array:

@@ -98,7 +98,7 @@ class SampleBlock:
 def sample_blocks(task: Task) -> tuple[SampleBlock, ...]:
     """Divide the task's samples among functions."""
     n, position = task.samples, sample_basis(task).position
-    if task.time_law != "constant":
+    if not task.law.has_differences:
         return (SampleBlock("path", np.arange(n)[None, :], position[None]),)
     inner = np.arange(2, n - 2)
     windows = np.array([position[k - 2 : k + 3] for k in inner]).reshape(
@@ -129,7 +129,7 @@ def sample_functions(workcell: Workcell, quantity: Quantity) -> dict[str, ca.Fun
     """
     makers = {"force": _force_function, "pressure": _margin_function, "load": _load_function}
     sample = makers[quantity](workcell)
-    if workcell.task.time_law != "constant":
+    if not workcell.task.law.has_differences:
         return _whole_path(workcell, quantity, sample)
     columns: dict[Block, tuple[int, ...]] = {"inner": (2,), "first": (0, 1), "last": (3, 4)}
     functions: dict[str, ca.Function] = {}

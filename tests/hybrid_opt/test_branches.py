@@ -101,7 +101,7 @@ def test_drivable_carries_choose_branches_under_the_ramped_law() -> None:
         replace(workcell, task=task, start_branch=(SEARCHED_BRANCH, -1)), DRIVABLE_OBJECTIVES
     )
     found = search_branches(cell, evaluations=50, rng=np.random.default_rng(1))
-    assert found.time_law == "ramped"
+    assert found.law == "ramped"
     assert "evaluations under the time law ramped" in str(found)
     ramped = Cell(replace(workcell, start_branch=(SEARCHED_BRANCH, -1)))
     assert found == search_branches(ramped, evaluations=50, rng=np.random.default_rng(1))

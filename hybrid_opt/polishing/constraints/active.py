@@ -50,7 +50,7 @@ ACTIVE_ROW_LIFETIME = 3
 class RowSelector:
     """Selects the rows of a program for candidates of one evaluator.
 
-    Carries under the time law 'optimal' have no rows at samples: `hybrid_opt.polishing.drive`
+    Carries in drivable cells have no rows at samples: `hybrid_opt.polishing.drive`
     limits their forces.
     """
 
@@ -61,7 +61,7 @@ class RowSelector:
         sampled: dict[type, ConstraintKind[Any]] = {ForceRow: self.forces}
         if contact_model(cell.workcell).has_pressure_limit:
             sampled[PressureRow] = Pressure(cell)
-        driven = cell.task.time_law == "optimal"
+        driven = cell.task.law.is_drivable
         self._kinds: dict[type, ConstraintKind[Any]] = ({} if driven else sampled) | {
             Clearance: self._distances,
             SeparatingAxisGap: SeparatingAxisGaps(cell),

@@ -158,7 +158,7 @@ def timed_motion(task: Task, x: Array) -> tuple[Array, Array, Array, Array]:
     coefficients = natural_quintic(waypoints(task, x))
     u = np.linspace(0.0, 1.0, task.samples)
     pose = np.array([evaluate_spline(coefficients, value) for value in u])
-    if task.time_law == "constant":
+    if task.law.has_differences:
         time = _constant_time(task, pose)
         rate = np.gradient(pose, time, axis=0, edge_order=2)
         return time, pose, rate, np.gradient(rate, time, axis=0, edge_order=2)

@@ -324,15 +324,15 @@ def test_options_are_explained_and_become_settings() -> None:
     told = re.split(r"\n(?=  --)", parser.format_help())[1:]
     assert len(told) == len([action for action in parser._actions if action.dest != "help"])
     assert all(re.search(r"\(default:", option) for option in told)
-    assert polish_settings(parser.parse_args([]), True, "constant") == usual
-    assert polish_settings(parser.parse_args(["--no-polish"]), True, "constant") is None
+    assert polish_settings(parser.parse_args([]), True, is_drivable=False) == usual
+    assert polish_settings(parser.parse_args(["--no-polish"]), True, is_drivable=False) is None
     arguments = (
         "--algorithm mopso --algorithm random --population mopso=30 --objective duration "
         "--first-generation random --constraint-handling constraints --seed 7 --evaluations 50 "
         "--replicas 3 --polish --polish-solver ipopt --polish-attempts 3"
     )
     options = parser.parse_args(arguments.split())
-    polish, settings = polish_settings(options, True, "constant"), campaign_settings(options)
+    polish, settings = polish_settings(options, True, is_drivable=False), campaign_settings(options)
     assert polish is not None
     assert (polish.solver, polish.attempts) == ("ipopt", 3)
     assert list(settings.algorithms) == ["mopso", "random"]

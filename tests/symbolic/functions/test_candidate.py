@@ -18,7 +18,7 @@ from symbolic.cell_model import CellModel, build_cell_model
 from symbolic.functions import CONSTRAINTS, candidate_function
 from symbolic.path_motion import path_motion_function
 from symbolic.records import Robot, Waypoint, Workcell
-from symbolic.records.task import TimeLaw, initial_decision
+from symbolic.records.task import initial_decision
 from tests.odd_cells import (
     free_pandas,
     locked_pandas,
@@ -297,7 +297,7 @@ def test_a_moving_lift_moves_both_arms_alike(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("time_law", ["constant", "ramped"])
-def test_turned_candidates_are_those_of_the_plain_reference(time_law: TimeLaw) -> None:
+def test_turned_candidates_are_those_of_the_plain_reference(time_law: str) -> None:
     cell = turned_cell(time_law)
     plain = PlainEvaluator(cell, start_posture(cell))
     for seed in (1, 2):

@@ -21,7 +21,6 @@ from symbolic.geometry.pairs import coal_distance
 from symbolic.path.rotation import rotation_matrix
 from symbolic.records.cell import PAYLOAD_NAME, Box, Workcell
 from symbolic.records.poses import Orientation
-from symbolic.records.task import TimeLaw
 from symbolic.robot.arm import flange_target, manipulability, pose_error
 from symbolic.smooth.passage import (
     PARALLEL_GAP,
@@ -205,7 +204,7 @@ def test_joint_rows_are_their_definitions(arm: int) -> None:
     assert float(manipulability(jacobian)) == pytest.approx(abs(np.linalg.det(jacobian)))
 
 
-def cell_with(time_law: TimeLaw, samples: int = 12, allocation: str = "paper") -> Workcell:
+def cell_with(time_law: str, samples: int = 12, allocation: str = "paper") -> Workcell:
     cell = hand_cell()
     task = replace(cell.task, time_law=time_law, samples=samples, allocation=allocation)
     return replace(cell, task=task)
@@ -232,7 +231,7 @@ def split_of(
     ("samples", "allocation"), [(5, "paper"), (6, "paper"), (12, "paper"), (12, "soft-finger")]
 )
 def test_the_largest_branch_is_the_evaluators_normal_force(
-    time_law: TimeLaw, samples: int, allocation: str
+    time_law: str, samples: int, allocation: str
 ) -> None:
     cell = cell_with(time_law, samples, allocation)
     evaluate = candidate_function(hand_model(cell))
@@ -263,7 +262,7 @@ def test_a_rounded_time_law_is_near_the_sharp_one_and_nearer_the_less_it_is_roun
 )
 @pytest.mark.parametrize("time_law", ["constant", "ramped"])
 def test_derivatives_are_those_of_the_values(
-    time_law: TimeLaw, quantity: Quantity, allocation: str, rounding: float
+    time_law: str, quantity: Quantity, allocation: str, rounding: float
 ) -> None:
     cell = cell_with(time_law, allocation=allocation)
     functions = sample_functions(cell, quantity)
