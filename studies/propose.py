@@ -107,7 +107,7 @@ def _run(options: argparse.Namespace) -> int:
         tell=tell,
     )
     if options.study is not None:
-        from hybrid_opt.api import rank_homotopy_classes
+        from hybrid_opt.proposing.ranking import rank_homotopy_classes
 
         rng = np.random.default_rng(options.seed)
         proposals, table = rank_homotopy_classes(proposals, options.study, rng, tell)

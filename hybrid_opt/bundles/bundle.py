@@ -6,11 +6,7 @@ A bundle has a folder of its own and is written whole or not at all; no other fi
 from __future__ import annotations
 
 import hashlib
-import json
-import os
-import shutil
 from collections.abc import Callable, Mapping
-from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -36,7 +32,6 @@ from hybrid_opt.bundles.torque import (
     torque_files,
 )
 from hybrid_opt.bundles.urscript import require_followed, urscript_files
-from hybrid_opt.errors import ResultsError
 from hybrid_opt.job.compliance import (
     SKEWS,
     STIFFNESSES,
@@ -51,12 +46,12 @@ from hybrid_opt.job.compliance import (
 from hybrid_opt.job.plan import plan_job
 from hybrid_opt.job.records import Job, sample_job
 from hybrid_opt.job.smooth import RESTS, acceleration_at_ends
-from hybrid_opt.store.files import AGAIN, own_version, read_bytes, read_document, sha256, storing
+from hybrid_opt.store.bundle_file import MANIFEST, write_bundle
+from hybrid_opt.store.files import own_version, sha256
 from hybrid_opt.timing.records import Timing
 from symbolic.contact.registry import contact_model
 from symbolic.errors import SettingsError
 from symbolic.records import Workcell
-from symbolic.safe_io import replace_file, sync_folder
 
 UNITS = {
     "length": "m",
@@ -424,9 +419,7 @@ def _word(text: str) -> str:
     return "-".join(part for part in kept.split("-") if part)[:LONGEST_WORD].strip("-")
 
 
-MANIFEST, README = "manifest.json", "README.md"
-FORMAT = "dual-arm-carry bundle"
-VERSION = 2
+README = "README.md"
 
 RUN = "run_job.py looks at both arms a hundred times a second and replaces their goals"
 
@@ -659,97 +652,3 @@ def prepared(job: Job, name: str, options: BundleOptions) -> Export:
     sampled = sample_job(job, step)
     gap = None if k is None else gap_of(sampled, target.interpolation, k)
     return Export(sampled, k, gap, stop_of(job))
-
-
-def write_bundle(folder: Path, contents: Contents, manifest: Mapping[str, Any]) -> tuple[Path, ...]:
-    """Write a bundle, or replace an older one of the same folder, in one step.
-
-    Everything is written beside the folder first, so that a full disk leaves what was there.
-
-    Args:
-        folder: of the bundle alone.
-        contents: its files.
-        manifest: JSON values; the digests of the files and of itself are added.
-
-    Returns:
-        The files written, the manifest first.
-
-    Raises:
-        ResultsError: it cannot be written, or the folder holds something else.
-    """
-    _require_own(folder)
-    data = {
-        name: text.encode() if isinstance(text, str) else text for name, text in contents.items()
-    }
-    document = {"format": FORMAT, "version": VERSION, **manifest}
-    document["files"] = {name: sha256(content) for name, content in data.items()}
-    document["sha256"] = sha256(_text(document))
-    text = _text(document)
-    draft = folder.with_name(f".{folder.name}.{os.getpid()}")
-    old = folder.with_name(f".{folder.name}.old")
-    with storing(folder, AGAIN):
-        try:
-            for name, content in ((MANIFEST, text), *data.items()):
-                (draft / name).parent.mkdir(parents=True, exist_ok=True)
-                replace_file(draft / name, content)
-            if folder.exists():
-                shutil.rmtree(old, ignore_errors=True)
-                os.rename(folder, old)
-            os.rename(draft, folder)
-        except OSError:
-            if old.exists() and not folder.exists():
-                os.rename(old, folder)
-            with suppress(OSError):
-                shutil.rmtree(draft)
-            raise
-        shutil.rmtree(old, ignore_errors=True)
-        sync_folder(folder.parent)
-    return tuple(folder / name for name in (MANIFEST, *data))
-
-
-def read_manifest(folder: Path) -> dict[str, Any]:
-    """Read the manifest of a bundle.
-
-    Raises:
-        ResultsError: there is none, it is damaged, or was changed since it was written.
-    """
-    path = folder / MANIFEST
-    document = read_document(path, FORMAT, VERSION)
-    files = document.get("files")
-    if not isinstance(files, dict) or not all(isinstance(f, str) for f in files.values()):
-        raise ResultsError(f"{path}: damaged (files: expected digests by name)")
-    if document.pop("sha256", None) != sha256(_text(document)):
-        raise ResultsError(f"{path}: was changed since it was written, its checksum differs")
-    return document
-
-
-def _require_own(folder: Path) -> None:
-    """Refuse to replace a folder that is not a bundle as it was written.
-
-    Raises:
-        ResultsError: with the first file that is someone else's.
-    """
-    if not os.path.lexists(folder):
-        return
-    remedy = "it stays as it is: move it away, or choose another --output"
-    if folder.is_symlink() or not folder.is_dir():
-        raise ResultsError(f"{folder} is in the way of a bundle; {remedy}")
-    found = sorted(path for path in folder.rglob("*") if path.is_symlink() or not path.is_dir())
-    if not found:
-        return
-    try:
-        files = read_manifest(folder)["files"]
-    except ResultsError as error:
-        raise ResultsError(f"{found[0]} is in the way of a bundle ({error}); {remedy}") from error
-    for path in found:
-        name = path.relative_to(folder).as_posix()
-        if name == MANIFEST:
-            continue
-        if name not in files or path.is_symlink():
-            raise ResultsError(f"{path} is no file of this bundle; {remedy}")
-        if sha256(read_bytes(path)) != files[name]:
-            raise ResultsError(f"{path} was changed since it was written; {remedy}")
-
-
-def _text(document: Mapping[str, Any]) -> bytes:
-    return (json.dumps(document, indent=1, allow_nan=False) + "\n").encode()

@@ -37,12 +37,14 @@ from hybrid_opt.evaluate.evaluation import Evaluations, concatenated
 from hybrid_opt.front import Front
 from hybrid_opt.indicators import metrics
 from hybrid_opt.polishing.records import PolishedFront
+from hybrid_opt.store.bundle_file import MANIFEST, read_manifest
 from hybrid_opt.store.files import (
     from_json,
     read_bytes,
     read_document,
     record_of,
 )
+from hybrid_opt.store.trajectory_file import read_trajectory
 from symbolic.array import Array, set_read_only
 from symbolic.read.cell import load as load_workcell
 from symbolic.records import Workcell
@@ -322,10 +324,6 @@ def load(path: str | Path) -> Cell | Carry | CampaignResults | Mapping[str, Any]
         WorkcellError: the workcell file is wrong.
         ResultsError: there is nothing of the kind, or it is damaged.
     """
-    # Not imported at the top: what writes bundles takes long to load.
-    from hybrid_opt.bundles.bundle import MANIFEST, read_manifest
-    from hybrid_opt.store.trajectory_file import read_trajectory
-
     path = Path(path)
     if path.suffix == ".toml":
         return Cell.load(path)

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from hybrid_opt.bundles import BundleOptions, Origin, export
-from hybrid_opt.bundles.bundle import README, read_manifest, require_target, warnings_of
+from hybrid_opt.bundles.bundle import README, require_target, warnings_of
 from hybrid_opt.bundles.check import as_document, check
 from hybrid_opt.bundles.check import read_trajectory as joint_trajectory
 from hybrid_opt.campaign.stages import build_study
@@ -41,6 +41,7 @@ from hybrid_opt.robust.force import (
     robust_price,
 )
 from hybrid_opt.robust.squeeze import SqueezeSettings
+from hybrid_opt.store.bundle_file import read_manifest
 from hybrid_opt.store.files import read_bytes, to_json
 from hybrid_opt.store.trajectory_file import Replay, StoredTrajectory, read_trajectory, replay
 from hybrid_opt.timing.analysis import time_trajectory, timing_document

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from hybrid_opt.bundles.bundle import read_manifest, write_bundle
 from hybrid_opt.errors import ResultsError
+from hybrid_opt.store.bundle_file import read_manifest, write_bundle
 from hybrid_opt.store.files import read_json, sha256, write_atomically, write_json
 from hybrid_opt.store.trajectory_file import read_trajectory, write_trajectory
 from tests.faults.test_kills import contents, differences, ended, started, study

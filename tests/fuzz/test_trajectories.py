@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from hypothesis import strategies as st
 
-from hybrid_opt.bundles.bundle import MANIFEST, read_manifest, write_bundle
+from hybrid_opt.store.bundle_file import MANIFEST, read_manifest, write_bundle
 from hybrid_opt.store.files import sha256
 from hybrid_opt.store.trajectory_file import read_trajectory, write_trajectory
 from tests.fuzz.damage import MANY, Bytes, Checks, Tree, all_kept, byte_damage, kept, tree_damage

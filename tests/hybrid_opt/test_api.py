@@ -10,22 +10,18 @@ from dataclasses import fields
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
 
 import hybrid_opt as ho
-from hybrid_opt import api
-from hybrid_opt.bundles.bundle import read_manifest
 from hybrid_opt.campaign.candidates import decode
 from hybrid_opt.campaign.search_stage import SearchRequest, search_replica
 from hybrid_opt.campaign.settings import CampaignSettings
-from hybrid_opt.display.table import NOTHING
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.indicators import metrics
 from hybrid_opt.polishing.settings import FillSettings, ProbeSettings
+from hybrid_opt.store.bundle_file import read_manifest
 from hybrid_opt.store.files import sha256
 from symbolic.array import Array
 from symbolic.errors import SettingsError
@@ -238,39 +234,3 @@ def test_calls_tell_how_far_they_are(capsys: pytest.CaptureFixture[str]) -> None
     assert told == [(20, 50), (40, 50), (50, 50)]
     ho.search(cell(), evaluations=60, rng=np.random.default_rng(1), progress=True)
     assert "nsga2: 100%" in capsys.readouterr().err
-
-
-SECONDS = {"over post": 2.0, "left of post": 1.5, "right of post": None}
-
-
-def proposal(side: str) -> Any:
-    """As much of a proposal as is compared; its file says which it is."""
-    return SimpleNamespace(
-        sides=(side,),
-        passes=side,
-        length=4.0,
-        found=SimpleNamespace(branches=(1, 0)),
-        text=lambda folder: side,
-    )
-
-
-def test_the_fastest_class_comes_first(monkeypatch: pytest.MonkeyPatch) -> None:
-    def load(path: Path) -> str:
-        return path.read_text(encoding="utf-8")
-
-    def fastest(side: str, evaluations: int, rng: np.random.Generator) -> Any:
-        assert evaluations == 300
-        seconds = SECONDS[side]
-        if seconds is None:
-            raise SettingsError("no carry that holds")
-        return SimpleNamespace(duration=seconds, peak_normal_force=np.array([[30.0, 31.25]]))
-
-    monkeypatch.setattr(api, "Cell", SimpleNamespace(load=load))
-    monkeypatch.setattr(api, "fastest_carry", fastest)
-    given = [proposal(side) for side in ("right of post", "over post", "left of post")]
-    told: list[str] = []
-    found, table = api.rank_homotopy_classes(given, 300, np.random.default_rng(1), told.append)
-    assert told == [f"study of carry {k} of 3" for k in (1, 2, 3)]
-    assert [one.sides[0] for one in found] == ["left of post", "over post", "right of post"]
-    assert table.rows[0] == ("left of post", "1 and 0", "4.00", "1.50", "31.2")
-    assert table.rows[2][3:] == (NOTHING, NOTHING)

@@ -24,9 +24,10 @@ import numpy as np
 import pytest
 
 from hybrid_opt.bundles import BundleOptions
-from hybrid_opt.bundles.bundle import prepared, write_bundle
+from hybrid_opt.bundles.bundle import prepared
 from hybrid_opt.bundles.egm import egm_files
 from hybrid_opt.bundles.job_file import Contents
+from hybrid_opt.store.bundle_file import write_bundle
 from symbolic.array import Array
 from tests.hybrid_opt.bundles.bundles import DRIVER, driven
 from tests.hybrid_opt.bundles.bundles import read_job as job

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hybrid_opt.bundles.bundle import write_bundle
+from hybrid_opt.store.bundle_file import write_bundle
 from symbolic.array import Array
 from tests.hybrid_opt.bundles.bundles import contents
 from tests.hybrid_opt.bundles.bundles import read_job as job

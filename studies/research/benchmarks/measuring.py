@@ -13,11 +13,11 @@ import cma
 import numpy as np
 
 import hybrid_opt as ho
-from hybrid_opt.api import fastest_carry
 from hybrid_opt.display.table import Table, number
 from hybrid_opt.errors import NoHoldError, ProposalError
 from hybrid_opt.evaluate.evaluation import concatenated
 from hybrid_opt.proposing.proposal import worked
+from hybrid_opt.proposing.ranking import fastest_carry
 from hybrid_opt.proposing.trial import judge_of
 from hybrid_opt.proposing.via_points import travelled
 from studies.research.turns import progress

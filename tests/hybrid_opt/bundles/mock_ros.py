@@ -19,8 +19,8 @@ from unittest.mock import patch
 
 from rosbags.typesys import Stores, get_typestore
 
-from hybrid_opt.bundles.bundle import write_bundle
 from hybrid_opt.bundles.job_file import Contents
+from hybrid_opt.store.bundle_file import write_bundle
 from tests.hybrid_opt.bundles.controlled import SUCCEEDED, ControlledCell
 
 STEP = 0.005

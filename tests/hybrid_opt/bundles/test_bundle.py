@@ -14,9 +14,10 @@ from typing import Any
 import pytest
 
 from hybrid_opt.bundles import BundleOptions, Origin, export
-from hybrid_opt.bundles.bundle import missing_for, read_manifest, write_bundle
+from hybrid_opt.bundles.bundle import missing_for
 from hybrid_opt.errors import JobError, ResultsError
 from hybrid_opt.job.records import Job
+from hybrid_opt.store.bundle_file import read_manifest, write_bundle
 from hybrid_opt.store.files import sha256
 from hybrid_opt.timing.records import Timing
 from symbolic.errors import SettingsError

@@ -20,9 +20,10 @@ import yaml
 import yourdfpy
 
 from hybrid_opt.bundles.arms import description, ros_joints
-from hybrid_opt.bundles.bundle import target_for, write_bundle
+from hybrid_opt.bundles.bundle import target_for
 from hybrid_opt.bundles.job_file import pad_places
 from hybrid_opt.bundles.torque import driver_of, joint_inertia, joint_stiffness, pad_stiffness
+from hybrid_opt.store.bundle_file import write_bundle
 from symbolic.errors import SettingsError
 from symbolic.records.poses import pose_matrix
 from tests.hybrid_opt.bundles.bundles import DRIVER, contents, driven, exported, text_of

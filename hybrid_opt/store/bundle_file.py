@@ -1,0 +1,115 @@
+"""A bundle as files: written in one step with digests in its manifest, read without trust."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from hybrid_opt.errors import ResultsError
+from hybrid_opt.store.files import AGAIN, read_bytes, read_document, sha256, storing
+from symbolic.safe_io import replace_file, sync_folder
+
+MANIFEST = "manifest.json"
+BUNDLE_FORMAT = "dual-arm-carry bundle"
+BUNDLE_VERSION = 2
+
+
+def write_bundle(
+    folder: Path, contents: Mapping[str, str | bytes], manifest: Mapping[str, Any]
+) -> tuple[Path, ...]:
+    """Write a bundle, or replace an older one of the same folder, in one step.
+
+    Everything is written beside the folder first, so that a full disk leaves what was there.
+
+    Args:
+        folder: of the bundle alone.
+        contents: its files.
+        manifest: JSON values; the digests of the files and of itself are added.
+
+    Returns:
+        The files written, the manifest first.
+
+    Raises:
+        ResultsError: it cannot be written, or the folder holds something else.
+    """
+    _require_own(folder)
+    data = {
+        name: text.encode() if isinstance(text, str) else text for name, text in contents.items()
+    }
+    document = {"format": BUNDLE_FORMAT, "version": BUNDLE_VERSION, **manifest}
+    document["files"] = {name: sha256(content) for name, content in data.items()}
+    document["sha256"] = sha256(_text(document))
+    text = _text(document)
+    draft = folder.with_name(f".{folder.name}.{os.getpid()}")
+    old = folder.with_name(f".{folder.name}.old")
+    with storing(folder, AGAIN):
+        try:
+            for name, content in ((MANIFEST, text), *data.items()):
+                (draft / name).parent.mkdir(parents=True, exist_ok=True)
+                replace_file(draft / name, content)
+            if folder.exists():
+                shutil.rmtree(old, ignore_errors=True)
+                os.rename(folder, old)
+            os.rename(draft, folder)
+        except OSError:
+            if old.exists() and not folder.exists():
+                os.rename(old, folder)
+            with suppress(OSError):
+                shutil.rmtree(draft)
+            raise
+        shutil.rmtree(old, ignore_errors=True)
+        sync_folder(folder.parent)
+    return tuple(folder / name for name in (MANIFEST, *data))
+
+
+def read_manifest(folder: Path) -> dict[str, Any]:
+    """Read the manifest of a bundle.
+
+    Raises:
+        ResultsError: there is none, it is damaged, or was changed since it was written.
+    """
+    path = folder / MANIFEST
+    document = read_document(path, BUNDLE_FORMAT, BUNDLE_VERSION)
+    files = document.get("files")
+    if not isinstance(files, dict) or not all(isinstance(f, str) for f in files.values()):
+        raise ResultsError(f"{path}: damaged (files: expected digests by name)")
+    if document.pop("sha256", None) != sha256(_text(document)):
+        raise ResultsError(f"{path}: was changed since it was written, its checksum differs")
+    return document
+
+
+def _require_own(folder: Path) -> None:
+    """Refuse to replace a folder that is not a bundle as it was written.
+
+    Raises:
+        ResultsError: with the first file that is someone else's.
+    """
+    if not os.path.lexists(folder):
+        return
+    remedy = "it stays as it is: move it away, or choose another --output"
+    if folder.is_symlink() or not folder.is_dir():
+        raise ResultsError(f"{folder} is in the way of a bundle; {remedy}")
+    found = sorted(path for path in folder.rglob("*") if path.is_symlink() or not path.is_dir())
+    if not found:
+        return
+    try:
+        files = read_manifest(folder)["files"]
+    except ResultsError as error:
+        raise ResultsError(f"{found[0]} is in the way of a bundle ({error}); {remedy}") from error
+    for path in found:
+        name = path.relative_to(folder).as_posix()
+        if name == MANIFEST:
+            continue
+        if name not in files or path.is_symlink():
+            raise ResultsError(f"{path} is no file of this bundle; {remedy}")
+        if sha256(read_bytes(path)) != files[name]:
+            raise ResultsError(f"{path} was changed since it was written; {remedy}")
+
+
+def _text(document: Mapping[str, Any]) -> bytes:
+    return (json.dumps(document, indent=1, allow_nan=False) + "\n").encode()
