@@ -27,10 +27,6 @@ if TYPE_CHECKING:
     from hybrid_opt.api import time_path as time_path
     from hybrid_opt.api import time_with_jerk as time_with_jerk
     from hybrid_opt.branches import search_branches as search_branches
-    from hybrid_opt.bundles.bundle import Origin as Origin
-    from hybrid_opt.bundles.bundle import export as export
-    from hybrid_opt.bundles.bundle import targets as targets
-    from hybrid_opt.bundles.job_file import BundleOptions as BundleOptions
     from hybrid_opt.campaign.results import load as load
     from hybrid_opt.carry import Carry as Carry
     from hybrid_opt.cell import Cell as Cell
@@ -40,9 +36,21 @@ if TYPE_CHECKING:
     from hybrid_opt.errors import ResultsError as ResultsError
     from hybrid_opt.evaluate.objectives import Objective as Objective
     from hybrid_opt.evaluate.objectives import objectives as objectives
+    from hybrid_opt.extras.bundles.bundle import Origin as Origin
+    from hybrid_opt.extras.bundles.bundle import export as export
+    from hybrid_opt.extras.bundles.bundle import targets as targets
+    from hybrid_opt.extras.bundles.job_file import BundleOptions as BundleOptions
+    from hybrid_opt.extras.gripping import Grip as Grip
+    from hybrid_opt.extras.gripping import propose_grip as propose_grip
+    from hybrid_opt.extras.proposing.proposal import Proposal as Proposal
+    from hybrid_opt.extras.proposing.proposal import ProposeSettings as ProposeSettings
+    from hybrid_opt.extras.proposing.proposal import propose as propose
+    from hybrid_opt.extras.proposing.proposal import propose_classes as propose_classes
+    from hybrid_opt.extras.proposing.reach import plan_reach as plan_reach
+    from hybrid_opt.extras.sweeping import Sweep as Sweep
+    from hybrid_opt.extras.sweeping import sweep as sweep
+    from hybrid_opt.extras.workbench import live as live
     from hybrid_opt.front import Front as Front
-    from hybrid_opt.gripping import Grip as Grip
-    from hybrid_opt.gripping import propose_grip as propose_grip
     from hybrid_opt.job.plan import plan_job as plan_job
     from hybrid_opt.job.records import Job as Job
     from hybrid_opt.metaheuristics.mopso import MopsoSettings as MopsoSettings
@@ -50,11 +58,6 @@ if TYPE_CHECKING:
     from hybrid_opt.metaheuristics.registry import algorithms as algorithms
     from hybrid_opt.metaheuristics.run import SearchSettings as SearchSettings
     from hybrid_opt.polishing.settings import PolishSettings as PolishSettings
-    from hybrid_opt.proposing.proposal import Proposal as Proposal
-    from hybrid_opt.proposing.proposal import ProposeSettings as ProposeSettings
-    from hybrid_opt.proposing.proposal import propose as propose
-    from hybrid_opt.proposing.proposal import propose_classes as propose_classes
-    from hybrid_opt.proposing.reach import plan_reach as plan_reach
     from hybrid_opt.recommending.choice import Wish as Wish
     from hybrid_opt.recommending.recommendation import Recommendation as Recommendation
     from hybrid_opt.recommending.recommendation import recommend as recommend
@@ -63,13 +66,10 @@ if TYPE_CHECKING:
     from hybrid_opt.robust.squeeze import SqueezeSettings as SqueezeSettings
     from hybrid_opt.sensitivity import Sensitivities as Sensitivities
     from hybrid_opt.sensitivity import sensitivities as sensitivities
-    from hybrid_opt.sweeping import Sweep as Sweep
-    from hybrid_opt.sweeping import sweep as sweep
     from hybrid_opt.timing.records import JerkLimits as JerkLimits
     from hybrid_opt.timing.records import JerkTiming as JerkTiming
     from hybrid_opt.timing.records import Timing as Timing
     from hybrid_opt.timing.records import TimingLimits as TimingLimits
-    from hybrid_opt.workbench import live as live
     from symbolic.errors import DualArmError as DualArmError
     from symbolic.errors import SettingsError as SettingsError
     from symbolic.errors import WorkcellError as WorkcellError

@@ -34,8 +34,8 @@ def _add_options(parser: Parser) -> None:
 
 def calibrate(options: argparse.Namespace) -> int:
     """Do what the options ask for, and print it; returns the exit code."""
-    from hybrid_opt.calibrating import evidence as found_in
-    from hybrid_opt.calibrating.recording import read_run
+    from hybrid_opt.extras.calibrating import evidence as found_in
+    from hybrid_opt.extras.calibrating.recording import read_run
     from hybrid_opt.store.files import AGAIN, write_atomically
 
     output = options.out

@@ -26,7 +26,7 @@ def _add_options(parser: Parser) -> None:
     )
     parser.add_argument(
         "--interpolation",
-        choices=stated("hybrid_opt.bundles.job_file.Interpolation"),
+        choices=stated("hybrid_opt.extras.bundles.job_file.Interpolation"),
         help="how the controller moves between samples (default: the highest that the file's "
         "velocities and accelerations allow)",
     )

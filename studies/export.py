@@ -20,7 +20,7 @@ def _add_options(parser: Parser) -> None:
         "--target",
         metavar="NAME",
         required=True,
-        help=f"what is to run it: {', '.join(stated('hybrid_opt.bundles.bundle.TARGETS'))}",
+        help=f"what is to run it: {', '.join(stated('hybrid_opt.extras.bundles.bundle.TARGETS'))}",
     )
     add(
         parser,

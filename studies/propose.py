@@ -71,7 +71,7 @@ def _add_options(parser: Parser) -> None:
     add(
         parser,
         "--time",
-        default=stated("hybrid_opt.proposing.proposal.ProposeSettings.seconds"),
+        default=stated("hybrid_opt.extras.proposing.proposal.ProposeSettings.seconds"),
         help="seconds that it may work, its start included, whatever else the machine does",
     )
     add(parser, "--target")
@@ -83,9 +83,9 @@ def _run(options: argparse.Namespace) -> int:
     import numpy as np
 
     import hybrid_opt as ho
-    from hybrid_opt.bundles.bundle import missing_text
-    from hybrid_opt.proposing.problem import read_problem
-    from hybrid_opt.proposing.proposal import worked
+    from hybrid_opt.extras.bundles.bundle import missing_text
+    from hybrid_opt.extras.proposing.problem import read_problem
+    from hybrid_opt.extras.proposing.proposal import worked
     from hybrid_opt.robust.budget import budget_text
     from hybrid_opt.store.files import AGAIN, write_atomically
 
@@ -107,7 +107,7 @@ def _run(options: argparse.Namespace) -> int:
         tell=tell,
     )
     if options.study is not None:
-        from hybrid_opt.proposing.ranking import rank_homotopy_classes
+        from hybrid_opt.extras.proposing.ranking import rank_homotopy_classes
 
         rng = np.random.default_rng(options.seed)
         proposals, table = rank_homotopy_classes(proposals, options.study, rng, tell)

@@ -24,7 +24,7 @@ def _add_options(parser: Parser) -> None:
     add(parser, "FILE")
     parser.add_argument(
         "--controller",
-        choices=(*PAD_WITNESSES, *stated("hybrid_opt.simulation.reference.Control")),
+        choices=(*PAD_WITNESSES, *stated("hybrid_opt.extras.simulation.reference.Control")),
         default="leader",
         help="of the arms: one leads and the other is force-controlled along the normal (leader), "
         "both are (both), both are springs about the plan (impedance); or no arms, pads on a "
@@ -54,14 +54,14 @@ def _add_options(parser: Parser) -> None:
     parser.add_argument(
         "--stiffness",
         type=number(1e-3, 1e9),
-        default=stated("hybrid_opt.simulation.scene.ArmSettings.stiffness"),
+        default=stated("hybrid_opt.extras.simulation.scene.ArmSettings.stiffness"),
         metavar="1/RAD",
         help="of each joint over its largest torque",
     )
     parser.add_argument(
         "--time-step",
         type=number(1e-6, 1.0),
-        default=stated("hybrid_opt.simulation.scene.ContactSettings.time_step"),
+        default=stated("hybrid_opt.extras.simulation.scene.ContactSettings.time_step"),
         metavar="S",
         help="of the simulation",
     )

@@ -31,7 +31,7 @@ ROOMS = {
     ),
     "browser": (
         "hybrid_opt/display/test_view.py",
-        "hybrid_opt/workbench/test_live_page.py",
+        "hybrid_opt/extras/workbench/test_live_page.py",
         "studies/report/test_report_browser.py",
     ),
     "heavy": (
@@ -47,14 +47,14 @@ ROOMS = {
 models and conic programs. Single tests say so themselves."""
 
 PLAIN = (
-    "hybrid_opt/calibrating",
+    "hybrid_opt/extras/calibrating",
     "hybrid_opt/display/test_solids.py",
     "hybrid_opt/display/test_table.py",
     "hybrid_opt/indicators/test_metrics.py",
     "hybrid_opt/metaheuristics/test_run.py",
     "hybrid_opt/metaheuristics/test_mopso.py",
     "hybrid_opt/polishing/test_climbing.py",
-    "hybrid_opt/proposing/test_problem.py",
+    "hybrid_opt/extras/proposing/test_problem.py",
     "hybrid_opt/timing/test_adapter.py",
     "studies/test_options.py",
 )

@@ -16,11 +16,15 @@ from hybrid_opt.campaign.stages import build_study
 from hybrid_opt.carry import Carry
 from hybrid_opt.cell import Cell
 from hybrid_opt.errors import SimulationError
-from hybrid_opt.progress import Progress
-from hybrid_opt.robust.cases import nominal_case, random_cases
-from hybrid_opt.robust.squeeze import SqueezeSettings, commanded_forces
-from hybrid_opt.simulation.arms import BISECTIONS, HIGH, LOW, ArmOutcome, CellSimulation, account_of
-from hybrid_opt.simulation.box import (
+from hybrid_opt.extras.simulation.arms import (
+    BISECTIONS,
+    HIGH,
+    LOW,
+    ArmOutcome,
+    CellSimulation,
+    account_of,
+)
+from hybrid_opt.extras.simulation.box import (
     AnyOutcome,
     BoxSimulation,
     Outcome,
@@ -30,7 +34,7 @@ from hybrid_opt.simulation.box import (
     planned_moments,
     workcell_of_case,
 )
-from hybrid_opt.simulation.reference import (
+from hybrid_opt.extras.simulation.reference import (
     Control,
     Reference,
     carry_reference,
@@ -38,7 +42,15 @@ from hybrid_opt.simulation.reference import (
     exported_carry,
     with_tracking_error,
 )
-from hybrid_opt.simulation.scene import LARGEST_TIME_STEP, ArmSettings, Pads, SimulationSettings
+from hybrid_opt.extras.simulation.scene import (
+    LARGEST_TIME_STEP,
+    ArmSettings,
+    Pads,
+    SimulationSettings,
+)
+from hybrid_opt.progress import Progress
+from hybrid_opt.robust.cases import nominal_case, random_cases
+from hybrid_opt.robust.squeeze import SqueezeSettings, commanded_forces
 from hybrid_opt.store.files import AGAIN, storing
 from hybrid_opt.store.trajectory_file import read_trajectory
 from hybrid_opt.timing.analysis import closest_to_reference_timing

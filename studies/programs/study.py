@@ -6,7 +6,6 @@ import argparse
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from hybrid_opt.bundles.bundle import missing_text
 from hybrid_opt.campaign import (
     CampaignFolder,
     CampaignSettings,
@@ -34,6 +33,7 @@ from hybrid_opt.evaluate.objectives import (
     PAPER_OBJECTIVES,
     force_kind,
 )
+from hybrid_opt.extras.bundles.bundle import missing_text
 from hybrid_opt.polishing.drive import UNPOLISHABLE, is_polishable
 from hybrid_opt.polishing.polisher import has_polishable_forces
 from hybrid_opt.polishing.settings import (

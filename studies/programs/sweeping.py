@@ -14,11 +14,11 @@ from hybrid_opt.api import polish, search
 from hybrid_opt.campaign.stages import build_study
 from hybrid_opt.cell import Cell
 from hybrid_opt.display.table import Table, number
+from hybrid_opt.extras.sweeping import Sweep, read_sweep, require_keys, sweep
 from hybrid_opt.progress import Progress
 from hybrid_opt.recommending.recommendation import recommend
 from hybrid_opt.store.files import to_json
 from hybrid_opt.store.trajectory_file import read_trajectory
-from hybrid_opt.sweeping import Sweep, read_sweep, require_keys, sweep
 from hybrid_opt.workers import warm_up
 from studies.program import load_workcell
 from studies.report.drawing import (
@@ -39,7 +39,7 @@ REMARK = 60
 def sweep_numbers(options: argparse.Namespace) -> int:
     """Sweep, and print and write what was found."""
     if options.jobs != 1:
-        warm_up("hybrid_opt.sweeping")  # while this process finds the first path
+        warm_up("hybrid_opt.extras.sweeping")  # while this process finds the first path
     cell, over = Cell(load_workcell(options.workcell)).drivable(), dict(options.over)
     try:
         require_keys(cell, over)

@@ -12,15 +12,15 @@ from typing import Any
 
 import numpy as np
 
-from hybrid_opt.bundles import BundleOptions, Origin, export
-from hybrid_opt.bundles.bundle import README, require_target, warnings_of
-from hybrid_opt.bundles.check import as_document, check
-from hybrid_opt.bundles.check import read_trajectory as joint_trajectory
 from hybrid_opt.campaign.stages import build_study
 from hybrid_opt.carry import Carry
 from hybrid_opt.cell import Cell
 from hybrid_opt.compiled_cell import InterpretedCell
 from hybrid_opt.display.table import number, text_table
+from hybrid_opt.extras.bundles import BundleOptions, Origin, export
+from hybrid_opt.extras.bundles.bundle import README, require_target, warnings_of
+from hybrid_opt.extras.bundles.check import as_document, check
+from hybrid_opt.extras.bundles.check import read_trajectory as joint_trajectory
 from hybrid_opt.job.compliance import (
     SKEWS,
     STIFFNESSES,

@@ -24,8 +24,9 @@ from scipy.ndimage import median_filter
 from scipy.signal import savgol_filter
 from scipy.spatial.transform import Rotation, Slerp
 
-from hybrid_opt.calibrating.estimate import without_crosstalk
-from hybrid_opt.calibrating.recording import (
+from hybrid_opt.display.table import Table, number
+from hybrid_opt.extras.calibrating.estimate import without_crosstalk
+from hybrid_opt.extras.calibrating.recording import (
     ArmLog,
     Labels,
     Places,
@@ -34,7 +35,6 @@ from hybrid_opt.calibrating.recording import (
     tared,
     together,
 )
-from hybrid_opt.display.table import Table, number
 from symbolic.array import Array, interpolated
 from symbolic.contact.soft_finger import SoftPatch, least_soft_squeeze
 from symbolic.errors import SettingsError

@@ -134,7 +134,7 @@ def _add_options(parser: Parser) -> None:
     add(
         parser,
         "--time",
-        default=stated("hybrid_opt.proposing.proposal.ProposeSettings.seconds"),
+        default=stated("hybrid_opt.extras.proposing.proposal.ProposeSettings.seconds"),
         help="seconds of work for each proposal",
     )
     parser.add_argument(

@@ -34,7 +34,7 @@ def _add_options(parser: Parser) -> None:
         help="where they are stored (default: results/thresholds.json)",
     )
     add(parser, "--seed", help="of the random candidates and of the searches")
-    layer = stated("hybrid_opt.simulation.scene.ContactSettings.layer")
+    layer = stated("hybrid_opt.extras.simulation.scene.ContactSettings.layer")
     parser.add_argument(
         "--layer",
         type=number(1e6, 1e10),

@@ -24,10 +24,10 @@ from hybrid_opt.campaign.settings import (
 from hybrid_opt.campaign.stages import Cells, cells_of, ready_cells
 from hybrid_opt.display.table import Table, number
 from hybrid_opt.errors import ResultsError, SimulationError
+from hybrid_opt.extras.simulation.arms import Account, CellSimulation, account_of
+from hybrid_opt.extras.simulation.reference import Control, driven_carry
 from hybrid_opt.metaheuristics.registry import title
 from hybrid_opt.progress import Progress
-from hybrid_opt.simulation.arms import Account, CellSimulation, account_of
-from hybrid_opt.simulation.reference import Control, driven_carry
 from hybrid_opt.store.files import read_bytes, read_record, sha256, to_json, write_json
 from hybrid_opt.store.trajectory_file import StoredTrajectory, read_trajectory
 from hybrid_opt.timing.analysis import (

@@ -341,7 +341,7 @@ def test_parts_and_pieces_give_the_bits_of_the_whole(
         assert len(apart) == (1 if lanes == 1 else 2)
     parted = compile_function(function, cache, level=1, lanes=lanes).batch(x)
     assert cut or len(list(cache.folder.glob("*.o"))) == len(apart)
-    for name in ("LONG", "LEAST_BYTES", "LEAST_ENTRY"):
+    for name in ("CUT_STATEMENTS", "LEAST_BYTES", "LEAST_ENTRY"):
         monkeypatch.setattr(parts, name, 10**9)
     whole = compile_function(function, cache, level=1, lanes=lanes).batch(x)
     assert len(list(cache.folder.glob("*.so"))) == 2

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 import hybrid_opt as ho
-from hybrid_opt.bundles.arms import ABB, require_arms
 from hybrid_opt.cell import Cell
 from hybrid_opt.collision.certify import SampledPath, configurations
 from hybrid_opt.display.scene import scene_data
 from hybrid_opt.display.solids import frame_placements
 from hybrid_opt.evaluate.evaluation import REASONS, LockedEvaluator
+from hybrid_opt.extras.bundles.arms import ABB, require_arms
 from studies.research.plain.candidate import PlainJudge
 from symbolic.array import Array
 from symbolic.errors import SettingsError

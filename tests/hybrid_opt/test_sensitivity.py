@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import hybrid_opt as ho
-from hybrid_opt import sweeping
+from hybrid_opt.extras import sweeping
 from hybrid_opt.front import Front
 from hybrid_opt.robust.cases import LEADER, worst_cases
 from hybrid_opt.robust.force import robust_model

@@ -19,7 +19,7 @@ from symbolic.errors import WorkcellError
 from symbolic.read.cell import load
 from symbolic.records import Workcell
 from tests.hybrid_opt.cells import shipped
-from tests.hybrid_opt.proposing.problems import shipped_problem
+from tests.hybrid_opt.extras.proposing.problems import shipped_problem
 from tests.symbolic.cells import RACK
 
 GRAVITY = 9.81

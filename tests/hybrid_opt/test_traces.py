@@ -73,7 +73,7 @@ def search() -> ho.Front:
     ("operation", "files", "depth"),
     [
         (lambda: cell().evaluate(cell().initial), 6, 8),
-        (lambda: ho.time_path(cell(), cell().initial, ho.TimingLimits(force=60.0)), 13, 12),
+        (lambda: ho.time_path(cell(), cell().initial, ho.TimingLimits(force=60.0)), 15, 12),
         pytest.param(search, 37, 18, marks=pytest.mark.slow),
         pytest.param(lambda: polished.__wrapped__(), 54, 27, marks=pytest.mark.slow),
         pytest.param(lambda: ho.recommend(polished()), 57, 26, marks=pytest.mark.slow),

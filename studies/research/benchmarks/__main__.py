@@ -33,7 +33,7 @@ def _add_options(parser: Parser) -> None:
     add(
         parser,
         "--time",
-        default=stated("hybrid_opt.proposing.proposal.ProposeSettings.seconds"),
+        default=stated("hybrid_opt.extras.proposing.proposal.ProposeSettings.seconds"),
         help="seconds that a proposal may work",
     )
     add(
@@ -59,7 +59,7 @@ def _add_options(parser: Parser) -> None:
 def _run(options: argparse.Namespace) -> int:
     import numpy as np
 
-    from hybrid_opt.proposing.proposal import ProposeSettings
+    from hybrid_opt.extras.proposing.proposal import ProposeSettings
     from studies.research.benchmarks import baxter, machines, shelves, slot
     from studies.research.benchmarks.measuring import measured, table
 

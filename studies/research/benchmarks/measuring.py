@@ -16,10 +16,10 @@ import hybrid_opt as ho
 from hybrid_opt.display.table import Table, number
 from hybrid_opt.errors import NoHoldError, ProposalError
 from hybrid_opt.evaluate.evaluation import concatenated
-from hybrid_opt.proposing.proposal import worked
-from hybrid_opt.proposing.ranking import fastest_carry
-from hybrid_opt.proposing.trial import judge_of
-from hybrid_opt.proposing.via_points import travelled
+from hybrid_opt.extras.proposing.proposal import worked
+from hybrid_opt.extras.proposing.ranking import fastest_carry
+from hybrid_opt.extras.proposing.trial import judge_of
+from hybrid_opt.extras.proposing.via_points import travelled
 from studies.research.turns import progress
 from symbolic.array import Array
 from symbolic.errors import OutsideError, SettingsError

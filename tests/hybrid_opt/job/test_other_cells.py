@@ -12,18 +12,18 @@ import numpy as np
 import pytest
 import yaml
 
-from hybrid_opt.bundles import TARGETS, BundleOptions, export
-from hybrid_opt.bundles.bundle import prepared, target_for
 from hybrid_opt.cell import Cell
 from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES
+from hybrid_opt.extras.bundles import TARGETS, BundleOptions, export
+from hybrid_opt.extras.bundles.bundle import prepared, target_for
 from hybrid_opt.job.plan import JobModel
 from hybrid_opt.job.smooth import driven_timing, without_jumps
 from hybrid_opt.robust.force import thinned
 from hybrid_opt.robust.squeeze import largest_commanded
 from hybrid_opt.timing.records import JerkLimits
 from symbolic.errors import SettingsError
-from tests.hybrid_opt.bundles.bundles import driven
 from tests.hybrid_opt.cells import shipped
+from tests.hybrid_opt.extras.bundles.bundles import driven
 from tests.hybrid_opt.job.jobs import planned
 from tests.symbolic.cells import RACK
 

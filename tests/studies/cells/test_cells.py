@@ -74,7 +74,7 @@ def test_its_carry_is_feasible_certified_and_drivable_and_pads_hold_it(name: str
         assert timing.carry is not None
         assert limits.force is None or timing.carry.normal_force.max() <= 1.003 * limits.force
     pytest.importorskip("mujoco")
-    from tests.hybrid_opt.simulation.carries import assert_driven_pads_hold
+    from tests.hybrid_opt.extras.simulation.carries import assert_driven_pads_hold
 
     slow = time_path(cell.timing_model, cell.initial, TimingLimits(reference_speed=True))
     assert slow.carry is not None

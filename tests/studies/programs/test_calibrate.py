@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hybrid_opt.calibrating.recording import Recording
+from hybrid_opt.extras.calibrating.recording import Recording
 from studies.calibrate import main
 from symbolic.read.cell import load
 from symbolic.records.cell import USUAL_UNCERTAINTY
-from tests.hybrid_opt.calibrating.generator import (
+from tests.hybrid_opt.extras.calibrating.generator import (
     CELL,
     LEVEL,
     SQUEEZES,

@@ -275,7 +275,7 @@ def test_what_is_wrong_is_told_in_one_line(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    """What the check finds is tested in tests/hybrid_opt/bundles."""
+    """What the check finds is tested in tests/hybrid_opt/extras/bundles."""
     monkeypatch.chdir(file.parent)
     Path("odd.json").write_text("{}", encoding="utf-8")
     Path("odd.csv").write_text("time,left_joint_1\n0,0\n", encoding="utf-8")

@@ -11,7 +11,7 @@ from PIL import Image, ImageSequence
 
 from hybrid_opt import recommend, search
 from hybrid_opt.cell import Cell
-from hybrid_opt.simulation.reference import Control
+from hybrid_opt.extras.simulation.reference import Control
 from hybrid_opt.store.trajectory_file import write_trajectory
 from studies import simulate
 from studies.research import thresholds

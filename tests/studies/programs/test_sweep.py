@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from hybrid_opt.extras.sweeping import Combination, Sweep, read_sweep
 from hybrid_opt.store.files import to_json, write_json
-from hybrid_opt.sweeping import Combination, Sweep, read_sweep
 from studies.programs import sweeping
 from studies.programs.sweeping import _figure, _table
 from studies.sweep import main

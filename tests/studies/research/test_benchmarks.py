@@ -14,8 +14,8 @@ from scipy.spatial.transform import Rotation
 
 import hybrid_opt as ho
 from hybrid_opt.display.table import NOTHING
-from hybrid_opt.proposing.problem import read_problem
-from hybrid_opt.proposing.via_points import travelled
+from hybrid_opt.extras.proposing.problem import read_problem
+from hybrid_opt.extras.proposing.via_points import travelled
 from studies.research.benchmarks import baxter, machines, measuring, shelves, slot
 from studies.research.benchmarks.__main__ import main
 from studies.research.benchmarks.measuring import (

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 import hybrid_opt as ho
-from hybrid_opt.proposing.problem import read_problem
+from hybrid_opt.extras.proposing.problem import read_problem
 from studies.research.problems import attempt, shipped_problems
 
 PROBLEMS = [pytest.param(path, id=path.stem) for path in shipped_problems()]

@@ -12,7 +12,7 @@ import pinocchio as pin
 import pytest
 import trimesh
 
-from hybrid_opt.proposing.problem import read_problem
+from hybrid_opt.extras.proposing.problem import read_problem
 from symbolic.array import Array
 from symbolic.errors import CollisionModelError
 from symbolic.geometry.bodies import MeshReader, _link_pieces, collision_bodies

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from hybrid_opt.errors import SimulationError
-from hybrid_opt.proposing.problem import read_problem
-from hybrid_opt.simulation.arms import CellSimulation
+from hybrid_opt.extras.proposing.problem import read_problem
+from hybrid_opt.extras.simulation.arms import CellSimulation
 from symbolic.errors import OutsideError, WorkcellError
 from symbolic.read.arms import RobotModelWarning, _warn_left_out
 from symbolic.read.cell import load

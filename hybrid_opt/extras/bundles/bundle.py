@@ -1,0 +1,654 @@
+"""The forms of bundles by name, the manifest that describes each, and how one is written.
+
+A bundle has a folder of its own and is written whole or not at all; no other file is touched.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from hybrid_opt.extras.bundles.arms import ABB, SEVEN, SIX, UR, addressed, require_arms
+from hybrid_opt.extras.bundles.data import data_files
+from hybrid_opt.extras.bundles.egm import SECTION_OF_EACH, egm_files, require_egm
+from hybrid_opt.extras.bundles.job_file import (
+    BundleOptions,
+    Contents,
+    Export,
+    Interpolation,
+    chosen_step,
+    gap_of,
+    stop_of,
+)
+from hybrid_opt.extras.bundles.torque import (
+    TORQUE_STEPS,
+    driver_of,
+    pad_stiffness,
+    require_torque,
+    torque_files,
+)
+from hybrid_opt.extras.bundles.urscript import require_followed, urscript_files
+from hybrid_opt.job.compliance import (
+    SKEWS,
+    STIFFNESSES,
+    TRACKED,
+    PositionControl,
+    Skew,
+    largest_skew,
+    position_control,
+    require_skew,
+    skewed,
+)
+from hybrid_opt.job.plan import plan_job
+from hybrid_opt.job.records import Job, sample_job
+from hybrid_opt.job.smooth import RESTS, acceleration_at_ends
+from hybrid_opt.store.bundle_file import MANIFEST, write_bundle
+from hybrid_opt.store.files import own_version, sha256
+from hybrid_opt.timing.records import Timing
+from symbolic.contact.registry import contact_model
+from symbolic.errors import SettingsError
+from symbolic.records import Workcell
+
+UNITS = {
+    "length": "m",
+    "angle": "rad (RAPID: degrees, mm)",
+    "time": "s",
+    "force": "N",
+    "torque": "N m",
+    "stiffness": "N/m",
+}
+
+SKEW = 0.01
+"""Largest start skew expected of two controllers with clocks of their own [s]."""
+
+LONGEST_WORD = 40
+
+DIGEST_LENGTH = 8
+
+
+@dataclass(frozen=True)
+class Origin:
+    """Origin of a carry.
+
+    Attributes:
+        study: name of the study or, without one, of the workcell.
+        algorithm: name of the search, with '-polished' where its front was polished.
+        replica: number of the replica; None where there is none.
+        point: row of the candidate among the evaluations, or another number of the point.
+        file: the trajectory file, '' where there is none.
+        sha256: digest of that file.
+        provenance: as stored in it.
+    """
+
+    study: str = ""
+    algorithm: str = ""
+    replica: int | None = None
+    point: int | None = None
+    file: str = ""
+    sha256: str = ""
+    provenance: Mapping[str, Any] = field(default_factory=dict)
+
+    @classmethod
+    def of_file(cls, path: Path, content: bytes, provenance: Mapping[str, Any]) -> Origin:
+        """Derive the origin of a trajectory file from its place in a results folder and its
+        content.
+
+        Args:
+            path: RESULTS/selected/ALGORITHM/REPLICA.json, or any other.
+            content: of the file.
+            provenance: as stored in it.
+        """
+        path = path.resolve()
+        selected = len(path.parts) > 4 and path.parts[-3] == "selected"
+        algorithm = path.parts[-2] if selected else provenance.get("algorithm")
+        return cls(
+            study=path.parts[-4] if selected else path.stem,
+            algorithm=algorithm if isinstance(algorithm, str) else "",
+            replica=_number(provenance.get("replica")),
+            point=_number(provenance.get("row")),
+            file=path.name,
+            sha256=sha256(content),
+            provenance=provenance,
+        )
+
+    def name(self, job: Job) -> str:
+        """Return a folder name that no other carry's bundles have."""
+        words = [_word(self.study or job.workcell.name), _word(self.algorithm)]
+        words += [] if self.replica is None else [f"r{self.replica:02d}"]
+        words += [] if self.point is None else [f"p{self.point:04d}"]
+        return "-".join(word for word in [*words, job_digest(job)[:DIGEST_LENGTH]] if word)
+
+
+@dataclass(frozen=True)
+class Target:
+    """What a bundle is for.
+
+    Attributes:
+        files: from an export to file contents by path.
+        steps: time steps that it can have, the longest first [s].
+        interpolation: how it moves between two samples.
+        how_to_run: in words.
+        reaction: who carries out a stop, in words; '' for data that nobody runs.
+        start: how both arms start together, in words.
+        skew: between their starts, which a job has to survive [s]; None where nobody asks.
+        maker: whose arms it is for, one of those of `hybrid_opt.extras.bundles.arms`; '' for all.
+        axes: numbers of turning joints that a maker's targets can hold.
+        has_address: whether it has to know where the controllers are.
+        require: refuses a job before it is sampled, for further reasons.
+        require_equipment: refuses a cell whose drivers lack something, given the index of the
+            leading arm.
+        stiffness: where that of the arms comes from: 'stated' by the cell, required; 'gains' that
+            the bundle writes; '' if the target does not depend on it.
+    """
+
+    files: Callable[[Export], Contents]
+    steps: tuple[float, ...]
+    interpolation: Interpolation
+    how_to_run: str
+    reaction: str = ""
+    start: str = "up to what plays the file"
+    skew: float | None = None
+    maker: str = ""
+    axes: tuple[int, ...] = (SIX,)
+    has_address: bool = False
+    require: Callable[[Job], None] = lambda job: None
+    require_equipment: Callable[[Workcell, int], None] = lambda workcell, leader: None
+    stiffness: str = ""
+
+    def refuse(self, job: Job, name: str, any_arm: bool) -> None:
+        """Refuse a job that is not for this target of a name, before it is sampled.
+
+        Args:
+            any_arm: whether the user wants a maker's language for arms of others.
+
+        Raises:
+            SettingsError: the arms are not those that the target is for, or lack what it needs.
+        """
+        if self.maker:
+            needs = (self.maker, self.axes, self.has_address)
+            require_arms(job.workcell, name, *needs, any_arm=any_arm)
+        self.require_equipment(job.workcell, job.squeeze.leader)
+        self.require(job)
+
+    def stiffness_of(self, job: Job, name: str) -> float | None:
+        """Return the stiffness of each arm at its pad [N/m]; None if nothing depends on it.
+
+        Both arms hold the box in series: of k_1 and k_2 it is 2 / (1 / k_1 + 1 / k_2).
+
+        Raises:
+            SettingsError: the target depends on it, and nobody has measured it.
+        """
+        if self.stiffness == "gains":
+            return pad_stiffness(job)
+        return self.stated_stiffness(job.workcell, name)
+
+    def stated_stiffness(self, workcell: Workcell, name: str) -> float | None:
+        """Return the stiffness that a cell states; None if nothing depends on it.
+
+        Raises:
+            SettingsError: the target depends on it, and nobody has measured it.
+        """
+        first, second = (robot.driver.stiffness for robot in workcell.robots)
+        if first is not None and second is not None:
+            return 2.0 / (1.0 / first + 1.0 / second)
+        if self.stiffness != "stated":
+            return None
+        unknown = next(r.name for r in workcell.robots if r.driver.stiffness is None)
+        raise SettingsError(
+            f"{name} presses as hard as the stiffness of {unknown!r} at its pad makes it, and "
+            "nobody states that. Measure it: press both pads against one another, move one by 0.1 "
+            "mm a step along the normal and read the force; equal arms have twice its slope. "
+            f"Then write [robots.driver] with stiffness = ... in N/m into {SECTION_OF_EACH}, or "
+            "export with --stiffness"
+        )
+
+
+STATES = {
+    "ready": "both arms are looked at: news from both, pads at their first places, nothing pressed",
+    "running": "both arms follow the path; phases follow one another without a gap",
+    "stopping": "both arms come to rest at the same place of the path, within the stop time",
+    "held": "both arms keep that place and the squeeze that belongs to it",
+    "done": "the job's end, or back at its beginning",
+}
+
+STOPS = (
+    "an arm is silent for longer than `silence`",
+    "a pad is farther from its path than `path`",
+    "an arm is later than `behind`, or both are farther apart along the path than `skew`",
+    "a measured force misses its reference by more than the share `force` while pads alone hold "
+    "the box",
+    "a controller refuses or ends its goal",
+    "someone asks for it: Ctrl-C, or the stop signal of the target",
+)
+
+SET_DOWN = (
+    "from `held` the job goes on to its end ('continue'), or back along the same path to where the "
+    "box stood ('back'), which takes the same forces"
+)
+
+
+def manifest(
+    export: Export, name: str, target: Target, origin: Origin, skew: float | None
+) -> dict[str, Any]:
+    """Write the manifest of a target's bundle as JSON values: content, origin of the trajectory,
+    and limits.
+
+    Args:
+        skew: between the starts of both arms that the job was asked to survive [s].
+    """
+    job, k = export.job, export.stiffness
+    step: dict[str, Any] = {"step": export.step}
+    if export.gap is not None:
+        step = asdict(export.gap) | {"stiffness": k, "allowed_share": TRACKED}
+    skews: dict[str, Any] = {"how": target.start, "required": skew, "stiffness": k}
+    if k is not None:
+        skews |= {"survived": largest_skew(job, k)}
+        skews |= {"cases": [_skew(skewed(job, delay, k)) for delay in SKEWS]}
+    return {
+        "target": name,
+        "name": origin.name(job),
+        "digest": job_digest(job),
+        "workcell": {"name": job.workcell.name, "digest": job.workcell.digest},
+        "trajectory": {k: v for k, v in vars(origin).items() if k != "provenance"},
+        "timing": {"status": job.timing.status.value, "reason": job.timing.reason},
+        "duration": job.duration,
+        "samples": len(export.sampled.time),
+        "robots": [
+            {"name": robot.name, "joints": list(joints)}
+            for robot, joints in zip(job.workcell.robots, job.joint_names, strict=True)
+        ],
+        "phases": [
+            {
+                "name": phase.name,
+                "begin": phase.begin,
+                "duration": phase.duration,
+                "peak_normal_force": phase.force.normal.max(axis=0).tolist(),
+                "free_of_collisions": phase.certificate.is_free,
+                "most_used": phase.most_used,
+                "limits": {name: float(use) for name, use in phase.use.items()},
+            }
+            for phase in job.phases
+        ],
+        "stands_on": [list(names) for names in job.stands_on],
+        "squeeze": {
+            "text": str(job.squeeze),
+            "factor": job.squeeze.factor,
+            "force": job.squeeze.force,
+            "assumes": f"the planned wrenches are of {contact_model(job.workcell).assumption}",
+            "parts": {part.name: part.force for part in job.squeeze.parts},
+            "force_controlled": job.workcell.robots[export.follower].name,
+            "peak_normal_force": job.peak_normal_force.tolist(),
+        },
+        "machine": {
+            "carried_out_by": target.reaction,
+            "states": STATES,
+            "stops_when": list(STOPS),
+            "stop": asdict(export.stop),
+            "limits": asdict(export.limits),
+            "set_down": SET_DOWN,
+        },
+        "time_step": step,
+        "position_control": [_position(position_control(job, k)) for k in STIFFNESSES],
+        "start_skew": skews,
+        "warnings": warnings_of(job),
+        "units": UNITS,
+        "how_to_run": target.how_to_run,
+        "written_by": f"dual-arm-carry {own_version()}",
+    }
+
+
+def readme(document: Mapping[str, Any], contents: Contents) -> str:
+    """Return the first file that a person opens: what a bundle is, how it runs, who stops it."""
+    squeeze, machine = document["squeeze"], document["machine"]
+    phases = [
+        f"| {phase['name'].replace('_', ' ')} | {phase['begin']:.2f} | {phase['duration']:.2f} | "
+        f"{max(phase['peak_normal_force']):.1f} |"
+        for phase in document["phases"]
+    ]
+    runs = [] if not machine["carried_out_by"] else ["", "## What stops it", ""]
+    if runs:
+        runs += [f"{machine['carried_out_by']}. It stops both arms when", ""]
+        runs += [f"- {reason}" for reason in machine["stops_when"]]
+    warned = [f"- {warning}" for warning in document["warnings"]]
+    return "\n".join(
+        [
+            f"# {document['name']} for {document['target']}",
+            "",
+            f"The whole job of *{document['workcell']['name']}*: {document['duration']:.2f} s, "
+            f"pressed with at most {squeeze['force']:.1f} N. {squeeze['force_controlled']} is "
+            "force-controlled. "
+            f"{squeeze['text'][0].upper()}{squeeze['text'][1:]}.",
+            "",
+            "## How to run it",
+            "",
+            f"{document['how_to_run'][0].upper()}{document['how_to_run'][1:]}.",
+            *runs,
+            *(["", "## Read before it runs", "", *warned] if warned else []),
+            "",
+            "## Phases",
+            "",
+            "| phase | begins [s] | takes [s] | presses [N] |",
+            "|---|---|---|---|",
+            *phases,
+            "",
+            "## Files",
+            "",
+            f"- `{MANIFEST}`: all of this for programs, with limits, origin and a digest of every "
+            "file",
+            *(f"- `{name}`" for name in contents),
+            "",
+            f"Written by {document['written_by']}.",
+            "",
+        ]
+    )
+
+
+def warnings_of(job: Job) -> list[str]:
+    """Warnings that an engineer should read before this job runs."""
+    cell, found = job.workcell, []
+    peak, rated = job.peak_normal_force, cell.task.reference_force
+    for robot, force, most in zip(cell.robots, peak, rated, strict=True):
+        if force > most:
+            found.append(
+                f"{robot.name} is commanded {force:.1f} N, more than its reference force of "
+                f"{most:.1f} N"
+            )
+    jump = acceleration_at_ends(job.timing)
+    if jump > RESTS:
+        found.append(
+            f"the carry begins or ends with {100.0 * jump:.0f} % of a joint's largest "
+            "acceleration: its timing bounds no jerk, and a controller will lag behind it there"
+        )
+    for names, when in zip(job.stands_on, ("before", "after"), strict=True):
+        if not names:
+            found.append(f"nothing that the cell describes holds the box {when} the carry")
+    return [*found, *_missing_loads(cell)]
+
+
+def _missing_loads(workcell: Workcell) -> list[str]:
+    return [
+        f"no tool_load is given for {robot.name}: torques and tool data leave out the pad's mass"
+        for robot in workcell.robots
+        if robot.tool_load is None
+    ]
+
+
+def _position(found: PositionControl) -> dict[str, Any]:
+    return {
+        "stiffness": found.stiffness,
+        "penetration": found.penetration.tolist(),
+        "force_error_of_0.1_mm_each": found.force_error,
+        "share_of_force": found.share,
+        "margin": found.margin,
+        "enough": found.verdict,
+    }
+
+
+def _skew(found: Skew) -> dict[str, Any]:
+    return {
+        "delay": found.delay,
+        "displacement": found.displacement,
+        "force_change": found.force_change,
+        "share_of_force": found.share,
+        "margin": found.margin,
+        "holds": found.survived,
+    }
+
+
+def job_digest(job: Job) -> str:
+    """Compute the SHA-256 of everything that decides a job: cell, path, timing, forces."""
+    digest = hashlib.sha256(job.workcell.digest.encode())
+    carry = job.timing.driven
+    for values in (carry.x, carry.time, *(phase.force.normal for phase in job.phases)):
+        digest.update(values.tobytes())
+    return digest.hexdigest()
+
+
+def _number(value: Any) -> int | None:
+    is_number = isinstance(value, int) and not isinstance(value, bool) and 0 <= value < 10**9
+    return value if is_number else None
+
+
+def _word(text: str) -> str:
+    """Return a text as part of a file's name on every system."""
+    kept = "".join(c if c.isascii() and c.isalnum() else "-" for c in text.lower())
+    return "-".join(part for part in kept.split("-") if part)[:LONGEST_WORD].strip("-")
+
+
+README = "README.md"
+
+RUN = "run_job.py looks at both arms a hundred times a second and replaces their goals"
+
+CYCLE_SKEW = 0.002
+"""Skew of two drivers whose goals bear one start: a cycle of the slower one [s]."""
+
+_TORQUE = Target(
+    torque_files,
+    TORQUE_STEPS,
+    "quintic",
+    "start your simulator with description/cell.urdf, ros2 launch launch/simulation.launch.py, "
+    "then python3 run_job.py",
+    RUN,
+    "one controller drives all joints: both arms start in the same cycle",
+    0.0,
+    require=require_torque,
+    stiffness="gains",
+)
+
+_DRIVEN = replace(
+    _TORQUE,
+    start="the goals of both controllers bear one start time of one computer's clock",
+    skew=CYCLE_SKEW,
+)
+
+TORQUE_DRIVERS: Mapping[str, Target] = {
+    "simulation": _TORQUE,
+    "franka": replace(
+        _DRIVEN,
+        how_to_run="no end effector in Desk; ros2 launch launch/franka.launch.py, then python3 "
+        "run_job.py",
+    ),
+    "ur": replace(
+        _DRIVEN,
+        how_to_run="PolyScope 5.25.1 or 10.12.1, no TCP offset; power both arms on and release "
+        "their brakes; ros2 launch launch/ur.launch.py, then python3 run_job.py",
+    ),
+}
+"""The torque target by its drivers."""
+
+TARGETS: Mapping[str, Target] = {
+    "torque": _TORQUE,
+    "abb-egm": Target(
+        egm_files,
+        (0.02, 0.01, 0.005),
+        "cubic",
+        "load T_ROB1/CarryEgm1.mod and T_ROB2/CarryEgm2.mod, jog both robots to carryFirst, run "
+        "CarryEgm in both tasks, then python3 run_egm.py; first without the box",
+        "run_egm.py streams both arms from one clock and lets it stand still",
+        "one clock streams the positions of both arms",
+        0.004,
+        ABB,
+        (SIX, SEVEN),
+        has_address=True,
+        require_equipment=require_egm,
+        stiffness="stated",
+    ),
+    "ur-script": Target(
+        urscript_files,
+        (0.008, 0.004, 0.002),
+        "linear",
+        "a draft that nobody has run on a controller: wire digital outputs 0 and 1 of each arm to "
+        "inputs 0 and 1 of the other, move both arms to the first position, run one program on "
+        "each; first without the box",
+        "either program stretches the time of its points until it stands, servoj and force mode "
+        "hold; so does the other's as soon as the heartbeat on output 1 stops",
+        "both programs meet before the job over a digital line each way: what remains is a cycle "
+        "and the lines' latency",
+        SKEW,
+        UR,
+        require=require_followed,
+        stiffness="stated",
+    ),
+    "data": Target(
+        data_files,
+        (0.008,),
+        "cubic",
+        "read job.csv with anything; job.schema.json describes job.json; open job.mcap in "
+        "Foxglove, or play it: ros2 bag play job.mcap",
+    ),
+}
+"""Every target by its name; `TORQUE_DRIVERS` has the drivers of torque."""
+
+GONE = {
+    "ros2-control": "torque",
+    "franka-ros2": "torque",
+    "ur-ros2": "torque (direct torque from PolyScope 5.23 or 10.10), or the draft ur-script",
+    "abb-rapid": "abb-egm",
+    "csv": "data",
+    "json": "data",
+    "mcap": "data",
+}
+"""Targets of earlier versions, and their replacements."""
+
+
+def require_target(name: str) -> None:
+    """Refuse an unknown target, and one that is no longer written."""
+    if name in GONE:
+        raise SettingsError(f"target {name!r} is no longer written; use {GONE[name]}")
+    if name not in TARGETS:
+        raise SettingsError(f"unknown target {name!r}; known are {', '.join(TARGETS)}")
+
+
+def target_for(name: str, workcell: Workcell) -> Target:
+    """Return the target of a name, with the driver that the cell's arms have.
+
+    Raises:
+        SettingsError: the name is unknown, or no driver takes torques for these arms.
+    """
+    require_target(name)
+    return TORQUE_DRIVERS[driver_of(workcell)] if name == "torque" else TARGETS[name]
+
+
+def missing_for(name: str, workcell: Workcell, leader: int = 0) -> tuple[str, ...]:
+    """List what a cell lacks for a target, before any carry of it is known.
+
+    Args:
+        name: of the target.
+        leader: index of the arm that keeps its place.
+
+    Raises:
+        SettingsError: the target is unknown.
+    """
+    require_target(name)
+    try:
+        found = target_for(name, workcell)
+    except SettingsError as error:
+        return (str(error),)
+    arms = partial(require_arms, workcell, name, found.maker, found.axes)
+    checks: list[Callable[[], object]] = [arms] if found.maker else []
+    checks += [partial(arms, has_address=True)] if found.maker and found.has_address else []
+    checks += [partial(found.require_equipment, workcell, leader)]
+    checks += (
+        [partial(found.stated_stiffness, workcell, name)] if found.stiffness != "gains" else []
+    )
+    problems = list[str]()
+    for check in checks:
+        try:
+            check()
+        except SettingsError as error:
+            problems.append(str(error))
+    return (*dict.fromkeys(problems), *_missing_loads(workcell))
+
+
+def missing_text(name: str, workcell: Workcell) -> str:
+    """State what a cell lacks for a target, for a terminal.
+
+    Raises:
+        SettingsError: the target is unknown.
+    """
+    problems = missing_for(name, workcell)
+    if not problems:
+        return f"{name}: the cell states all that the target needs"
+    listed = "".join(f"\n  - {problem}" for problem in problems)
+    return (
+        f"{name} needs more than the cell states; drivers and tool loads may follow, by export "
+        f"--driver FILE:{listed}"
+    )
+
+
+def targets() -> dict[str, str]:
+    """Return the targets of `export`: how to run each, by name."""
+    return {name: target.how_to_run for name, target in TARGETS.items()}
+
+
+def export(
+    job: Job | Timing,
+    target: str,
+    folder: str | Path,
+    *,
+    origin: Origin | None = None,
+    options: BundleOptions | None = None,
+) -> tuple[Path, ...]:
+    """Write a whole job as one bundle, FOLDER/NAME/TARGET, with a manifest.
+
+    Args:
+        job: as `plan_job` makes it, or a timing that robots can drive, for the job around it with
+            default forces.
+        target: name of one of `TARGETS`.
+        folder: what the bundle's own folder is made in.
+        origin: where the carry comes from, for the name; by default the workcell's name.
+        options: None for the defaults.
+
+    Returns:
+        The files written, the manifest first.
+
+    Raises:
+        SettingsError: the target is unknown, the step out of range or too long for the forces, the
+            timing failed, or the target is not for these arms.
+        JobError: the job cannot be done, a stop or the skew between both arms breaks its squeeze.
+        ResultsError: the bundle cannot be written, or something else is in its place.
+    """
+    options, origin = options or BundleOptions(), origin or Origin()
+    whole = job if isinstance(job, Job) else plan_job(job)
+    if options.addresses is not None:
+        whole = replace(whole, workcell=addressed(whole.workcell, options.addresses))
+    found = target_for(target, whole.workcell)
+    found.refuse(whole, target, options.any_arm)
+    skew = found.skew if options.skew is None else options.skew
+    sheet = prepared(whole, target, options)
+    if skew is not None:
+        if sheet.stiffness is None:
+            raise SettingsError(
+                "what a skew does depends on the stiffness of the arms: --stiffness"
+            )
+        require_skew(whole, skew, sheet.stiffness)
+    document = manifest(sheet, target, found, origin, skew)
+    contents = found.files(sheet)
+    contents = {README: readme(document, contents), **contents}
+    return write_bundle(Path(folder) / document["name"] / target, contents, document)
+
+
+def prepared(job: Job, name: str, options: BundleOptions) -> Export:
+    """Return a job sampled at the requested step, or at the longest step that keeps the forces.
+
+    Args:
+        name: of the target, which has the steps.
+
+    Raises:
+        SettingsError: the step is out of range, none keeps the forces, or the target needs a
+            stiffness that nobody states.
+        JobError: no stop along the path keeps the forces.
+    """
+    target, step, k = target_for(name, job.workcell), options.step, options.stiffness
+    k = target.stiffness_of(job, name) if k is None else k
+    if step is None:
+        step = target.steps[0]
+        if k is not None:
+            step = chosen_step(job, target.steps, target.interpolation, k)
+    sampled = sample_job(job, step)
+    gap = None if k is None else gap_of(sampled, target.interpolation, k)
+    return Export(sampled, k, gap, stop_of(job))

@@ -1,0 +1,426 @@
+"""Check of any joint trajectory of both arms that claims to carry the box of a cell.
+
+The trajectory may be a bundle's after someone's post-processing, or another planner's: CSV, JSON or
+ROS 2's JointTrajectory in YAML. The first arm's pad says where the box is; the second one's has to
+be where the box then has it (the closed chain). What the box needs in between follows from the
+cell's own forces.
+
+Controllers make up the motion between samples. It is judged as well: chain, limits and forces at
+`BETWEEN` of each step, collisions by a proof along the whole motion.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+from scipy.interpolate import BPoly, CubicSpline
+from scipy.spatial.transform import Rotation
+
+from codegen.function import NumericFunction
+from hybrid_opt.carry import joints_of
+from hybrid_opt.cell import Cell
+from hybrid_opt.collision.certify import certify
+from hybrid_opt.collision.checker import CollisionChecker
+from hybrid_opt.display.table import text_table
+from hybrid_opt.errors import ResultsError
+from hybrid_opt.extras.bundles.arms import prefixes
+from hybrid_opt.extras.bundles.job_file import (
+    BETWEEN,
+    DERIVATIVES,
+    Interpolation,
+    between,
+    pad_errors,
+    pad_places,
+)
+from hybrid_opt.job.motions import joint_use
+from hybrid_opt.store.files import read_bytes
+from hybrid_opt.store.trajectory_file import TRAJECTORY_FORMAT as CARRY_FORMAT
+from symbolic.array import Array
+from symbolic.errors import SettingsError
+from symbolic.read.arms import arm_model
+from symbolic.records import Workcell
+from symbolic.records.poses import inverse
+
+if TYPE_CHECKING:
+    import casadi as ca
+
+    from symbolic.cell_model import CellModel
+
+LARGEST_FILE = 64 * 2**20
+"""[bytes]."""
+
+SHORTEST = 4
+"""Least samples of a trajectory."""
+
+TOUCHING = 0.005
+"""Largest change of the pads' places to one another at which they are taken to hold the box [m]."""
+
+CLOSED_CHAIN_CHANGE = 1e-3
+"""Largest change at which the closed chain counts as closed [m]."""
+
+EXCESS = 1.005
+"""Use of a limit beyond which it counts as exceeded."""
+
+
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class JointTrajectory:
+    """Both arms' joints over time.
+
+    Attributes:
+        time: (n,) ascending [s].
+        known: (n, joints) each, both arms side by side: positions, and velocities and accelerations
+            where the file has them [rad, m, s].
+        carry: from when to when it carries, where the file says so [s].
+    """
+
+    time: Array
+    known: tuple[Array, ...]
+    carry: tuple[float, float] | None = None
+
+    @property
+    def q(self) -> Array:
+        """(n, joints) positions [rad, m]."""
+        return self.known[0]
+
+
+@dataclass(frozen=True, eq=False)
+class Finding:
+    """Result of checking a trajectory.
+
+    Attributes:
+        held: (n,) whether the pads hold the box there.
+        along, across: largest change of the pads' places to one another while they hold it, along
+            the normal and across it [m].
+        use: largest value over its limit by constraint.
+        collides: what collides first while the box is held, or cannot be proven free; '' for
+            nothing.
+        normal_force: (2,) largest normal force that each arm needs [N].
+        rated: (2,) their reference forces [N].
+        balanced: whether friction and patches can hold the box everywhere.
+        duration: of the trajectory [s].
+        interpolation: how it moves between samples.
+    """
+
+    held: Mask
+    along: float
+    across: float
+    use: dict[str, float]
+    collides: str
+    normal_force: Array
+    rated: Array
+    balanced: bool
+    duration: float
+    interpolation: Interpolation
+
+    @property
+    def problems(self) -> list[str]:
+        """Reasons not to drive it."""
+        if not self.held.any():
+            return ["the pads hold the box nowhere: another cell, or another order of the joints?"]
+        found = []
+        if max(self.along, self.across) > CLOSED_CHAIN_CHANGE:
+            found.append(
+                f"the chain is not closed: the pads miss one another by {1e3 * self.along:.2f} mm "
+                f"along and {1e3 * self.across:.2f} mm across the normal"
+            )
+        found += [
+            f"uses {100.0 * ratio:.1f} % of the limit on {name}"
+            for name, ratio in self.use.items()
+            if ratio > EXCESS
+        ]
+        if self.collides:
+            found.append(f"collisions: {self.collides}")
+        if not self.balanced:
+            found.append("no forces of the pads balance the box everywhere")
+        for arm, (force, most) in enumerate(zip(self.normal_force, self.rated, strict=True), 1):
+            if force > most:
+                found.append(f"arm {arm} needs {force:.1f} N, its reference force is {most:.1f} N")
+        return found
+
+    def __repr__(self) -> str:
+        share = float(self.held.mean())
+        rows = [
+            ["duration", f"{self.duration:.3f} s"],
+            ["between samples", self.interpolation],
+            ["the box is held", f"{100.0 * share:.0f} % of the samples"],
+            ["closed chain", f"{1e3 * self.along:.3f} mm along, {1e3 * self.across:.3f} mm across"],
+            *([f"use of {name}", f"{100.0 * ratio:.1f} %"] for name, ratio in self.use.items()),
+            ["collisions", self.collides or "none, proven also between samples"],
+            ["normal forces", " / ".join(f"{force:.2f} N" for force in self.normal_force)],
+        ]
+        verdict = "; ".join(self.problems) or "it can be driven"
+        return f"{text_table([['what', 'found'], *rows], left=(0, 1))}\nverdict: {verdict}"
+
+
+def read_trajectory(path: Path, workcell: Workcell) -> JointTrajectory:
+    """Read the joints of a cell from a file: CSV, JSON (a job's, or ROS 2's message), or YAML of
+    ROS 2.
+
+    Raises:
+        ResultsError: it cannot be read, or lacks joints of the cell.
+    """
+    content = read_bytes(path)
+    if len(content) > LARGEST_FILE:
+        raise ResultsError(f"{path}: larger than {LARGEST_FILE // 2**20} MiB")
+    try:
+        text = content.decode("utf-8")
+        if path.suffix.lower() == ".csv":
+            columns, carry = _csv_columns(text)
+        else:
+            is_json = path.suffix.lower() == ".json"
+            document = json.loads(text) if is_json else yaml.load(text, Loader=yaml.CSafeLoader)
+            columns, carry = _document_columns(document), None
+            # Before and after the carry of a whole job the box touches what it stands on.
+            for phase in document.get("phases", ()):
+                if phase["name"] == "carry":
+                    carry = document["time"][phase["first"]], document["time"][phase["last"]]
+        return replace(_chosen(columns, workcell), carry=carry)
+    except (ValueError, KeyError, TypeError, IndexError, yaml.YAMLError, csv.Error) as error:
+        raise ResultsError(f"{path}: no joint trajectory of both arms ({error})") from error
+
+
+QUANTITIES = ("position", "velocity", "acceleration")
+
+Columns = tuple[Array, dict[tuple[str, str], Array]]
+"""Times (n,); positions, velocities and accelerations (n,) by quantity and the joint's name."""
+
+
+def _csv_columns(text: str) -> tuple[Columns, tuple[float, float] | None]:
+    """Read the columns, and the time span in which a column `phase` says 'carry' [s]."""
+    rows = list(csv.reader(io.StringIO(text)))
+    header, body = rows[0], [row for row in rows[1:] if row]
+    words = [re.sub(r"\s*\[.*\]$", "", name).strip() for name in header]
+    (at,) = (k for k, word in enumerate(words) if word.lower() in ("time", "t"))
+
+    def column(k: int) -> Array:
+        return np.array([float(row[k]) for row in body])
+
+    found: dict[tuple[str, str], Array] = {}
+    for k, word in enumerate(words):
+        name, _, what = word.rpartition(" ")
+        if what in QUANTITIES:
+            found[what, name] = column(k)
+        elif not name and k != at and what != "phase":
+            found["position", what] = column(k)
+    time, carry = column(at), None
+    if "phase" in words:
+        phase = words.index("phase")
+        carried = [t for t, row in zip(time.tolist(), body, strict=True) if row[phase] == "carry"]
+        carry = (carried[0], carried[-1]) if carried else None
+    return (time, found), carry
+
+
+def _document_columns(document: Any) -> Columns:
+    if document.get("format") == CARRY_FORMAT:
+        raise ValueError("it is a stored carry: export it first (python -m studies.export)")
+    if "robots" in document:
+        found = {
+            (what, f"{robot['name']}/{joint}"): values.astype(float)
+            for robot in document["robots"]
+            for what in QUANTITIES
+            for joint, values in zip(robot["joints"], np.array(robot[what]).T, strict=True)
+        }
+        return np.array(document["time"], dtype=float), found
+    for key in ("goal", "joint_trajectory", "trajectory"):
+        document = document.get(key, document)
+    names, points, found = document["joint_names"], document["points"], {}
+    stamps = [point["time_from_start"] for point in points]
+    time = np.array([stamp["sec"] + 1e-9 * stamp.get("nanosec", 0) for stamp in stamps])
+    for what, plural in zip(QUANTITIES, ("positions", "velocities", "accelerations"), strict=True):
+        if what == "position" or all(point.get(plural) for point in points):
+            rows = np.array([point[plural] for point in points], dtype=float)
+            found |= {(what, name): row for name, row in zip(names, rows.T, strict=True)}
+    return time, found
+
+
+def _chosen(columns: Columns, workcell: Workcell) -> JointTrajectory:
+    """Select the cell's joints among named columns, under any of their usual names."""
+    time, values = columns
+    names = [
+        (f"{robot.name}/{joint}", f"{prefix}{joint}", joint)
+        for robot, prefix in zip(workcell.robots, prefixes(workcell), strict=True)
+        for joint in list(arm_model(robot).names)[1:]
+    ]
+    plain = [each[2] for each in names]
+    picked = []
+    for known in names:
+        # A name that both arms have says nothing.
+        usable = known if plain.count(known[2]) == 1 else known[:2]
+        found = next((name for name in usable if ("position", name) in values), None)
+        if found is None:
+            has = ", ".join(name for what, name in values if what == "position")
+            raise ValueError(f"there is no joint {usable[1]!r}; it has {has}")
+        picked.append(found)
+    tables: list[Array] = []
+    for what in QUANTITIES:
+        if not all((what, name) in values for name in picked):
+            break
+        tables.append(np.column_stack([values[what, name] for name in picked]))
+    for rows in tables:
+        if len(time) < SHORTEST or rows.shape != (len(time), len(names)):
+            raise ValueError(
+                f"{len(time)} times for {len(rows)} postures; at least {SHORTEST} are needed"
+            )
+        if not np.isfinite(rows).all():
+            raise ValueError("all numbers have to be finite")
+    if not (np.isfinite(time).all() and (np.diff(time) > 0.0).all()):
+        raise ValueError("times have to ascend")
+    return JointTrajectory(time - time[0], tuple(tables))
+
+
+def check(
+    cell: Cell,
+    trajectory: JointTrajectory,
+    held: tuple[float, float] | None = None,
+    interpolation: Interpolation | None = None,
+) -> Finding:
+    """Check a trajectory in a cell.
+
+    Args:
+        held: from when to when the pads hold the box [s]; None for the carry that the file names,
+            else for the longest while in which the pads stand to one another as they hold it.
+        interpolation: what the controller does between samples; None for the one that takes all
+            that is known at them, as ROS 2's joint trajectory controller does.
+
+    Raises:
+        SettingsError: nothing lies in that time, or the file lacks what the interpolation takes.
+    """
+    workcell, time = cell.workcell, trajectory.time
+    held = held or trajectory.carry
+    kind = interpolation or tuple(DERIVATIVES)[len(trajectory.known) - 1]
+    if len(trajectory.known) < DERIVATIVES[kind]:
+        raise SettingsError(
+            f"{kind} motion between samples takes {', '.join(QUANTITIES[: DERIVATIVES[kind]])}; "
+            f"the file has {', '.join(QUANTITIES[: len(trajectory.known)])}: choose another one"
+        )
+    joints = between(time, trajectory.known, kind)
+    mask = _held(*pad_errors(workcell, trajectory.q))
+    if held is not None:
+        mask = np.asarray((time >= held[0]) & (time <= held[1]))
+    if held is not None and mask.sum() < SHORTEST:
+        raise SettingsError(f"under {SHORTEST} samples lie between {held[0]:g} and {held[1]:g} s")
+    places = _places(time)
+    # Straight lines have no accelerations: those of a smooth motion along them are told.
+    smooth = CubicSpline(time, trajectory.q) if kind == "linear" else joints
+    use = joint_use(workcell, joints(places), joints(places, 1), smooth(places, 2))
+    rated = np.asarray(workcell.task.reference_force, dtype=float)
+    if not mask.any():
+        nothing, end = np.zeros(2), float(time[-1])
+        return Finding(mask, np.inf, np.inf, use, "", nothing, rated, False, end, kind)
+    carried = time[mask]
+    places = _places(carried)
+    along, across = pad_errors(workcell, joints(places))
+    motion = CubicSpline(carried, _poses(workcell, joints(carried)))
+    pose, rate, second = (np.ascontiguousarray(motion(places, order)) for order in range(3))
+    force = _load(cell).batch(pose, rate, second)["normal_force"]
+    payload = workcell.payload
+    use["payload velocity"] = _most(rate[:, :3], payload.velocity_max)
+    use["payload acceleration"] = _most(second[:, :3], payload.acceleration_max)
+    return Finding(
+        held=mask,
+        along=float(np.abs(along).max()),
+        across=float(across.max()),
+        use=use,
+        collides=_certificate(cell, joints, carried),
+        normal_force=np.nanmax(force, axis=0),
+        rated=rated,
+        balanced=bool(np.isfinite(force).all()),
+        duration=float(time[-1]),
+        interpolation=kind,
+    )
+
+
+def _places(time: Array) -> Array:
+    """Return samples at times (n,), and at `BETWEEN` of each step."""
+    steps = np.diff(time)
+    inside = [time[:-1] + share * steps for share in (0.0, *BETWEEN)]
+    return np.append(np.column_stack(inside).ravel(), time[-1])
+
+
+def _load(cell: Cell) -> NumericFunction:
+    """Return `load_function` alone: a timing model brings the compiled passes."""
+
+    def make(model: CellModel) -> Mapping[str, ca.Function]:
+        from symbolic.contact.load import load_function
+
+        return {"load": load_function(model.workcell)}
+
+    return cell.compiled.functions("load", make, bodies=False)["load"]
+
+
+def _certificate(cell: Cell, joints: BPoly, time: Array) -> str:
+    """Certify the motion of joints from the first to the last of times (n,): name the first
+    colliding pair; '' if everything is proven free."""
+    workcell = cell.workcell
+
+    def at(places: Array) -> tuple[Array, Array, Array]:
+        # In order of time: angles are counted on from one place to the next.
+        every = np.union1d(time, places)
+        pose = _poses(workcell, joints(every))[np.searchsorted(every, places)]
+        q_1, q_2 = (np.ascontiguousarray(q) for q in joints_of(workcell, joints(places)))
+        return np.ascontiguousarray(pose), q_1, q_2
+
+    # Not the evaluator's: in drivable cells that brings the timing of paths.
+    checker = CollisionChecker(cell.compiled.geometry, cell.compiled.screening)
+    found = certify(checker, at, time)
+    return "" if found.is_free else f"{found.problem} at {found.at_parameter:.3f} s"
+
+
+def _held(along: Array, across: Array) -> Mask:
+    """Return (n,) True on the longest run of samples at which the pads' relative pose holds the
+    box."""
+    near = (np.abs(along) < TOUCHING) & (across < TOUCHING)
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], near.astype(int), [0]])))
+    runs = list(zip(edges[::2], edges[1::2], strict=True))
+    mask = np.zeros(len(near), dtype=bool)
+    if runs:
+        begin, end = max(runs, key=lambda run: run[1] - run[0])
+        if end - begin >= SHORTEST:
+            mask[begin:end] = True
+    return mask
+
+
+def _poses(workcell: Workcell, q: Array) -> Array:
+    """Compute the poses (n, 6) of the box that the first pad holds, in the task's own numbers."""
+    T_pad_box = inverse(workcell.contacts[0].T_box_pad)
+    T = pad_places(workcell, 0, joints_of(workcell, q)[0]) @ T_pad_box
+    orientation = workcell.task.orientation
+    if orientation.is_vector:
+        turned = T[:, :3, :3] @ orientation.reference.T
+        numbers = Rotation.from_matrix(turned).as_rotvec()
+    else:
+        numbers = Rotation.from_matrix(T[:, :3, :3]).as_euler("xyz")
+    return np.ascontiguousarray(np.column_stack([T[:, :3, 3], orientation.unwrapped(numbers)]))
+
+
+def _most(values: Array, limit: float) -> float:
+    return float(np.linalg.norm(values, axis=1).max()) / limit
+
+
+def as_document(finding: Finding) -> Mapping[str, Any]:
+    """Convert the result to JSON values."""
+    return {
+        "duration": finding.duration,
+        "interpolation": finding.interpolation,
+        "held": float(finding.held.mean()),
+        "closed_chain": {"along": finding.along, "across": finding.across},
+        "use": finding.use,
+        "collides": finding.collides,
+        "normal_force": finding.normal_force.tolist(),
+        "reference_force": finding.rated.tolist(),
+        "balanced": finding.balanced,
+        "problems": finding.problems,
+    }

@@ -1,0 +1,494 @@
+"""A job on its way into a bundle, and the file that all programs read: job.json.
+
+`job.schema.json` describes the file for others; its version rises with every change that breaks a
+reader.
+
+Its time steps are chosen by what they do to the gap between the pads. Between two samples a
+controller makes up the motion: along straight lines of the joints, cubic or quintic ones. Each
+arm's pad then misses its path a little, not both alike, and the gap between the pads changes. Arms
+of a stiffness k at their pads turn a change d of the gap into a force k d / 2.
+
+Controllers differ in who makes up for gravity: efforts are therefore given with gravity, the whole
+torque of a joint, and without it, for controllers that add what bears arm and tool themselves.
+What the pads exert on the box is part of both.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property
+from typing import Any, Literal
+
+import numpy as np
+import pinocchio as pin
+from scipy.interpolate import BPoly
+
+from hybrid_opt.compiled_cell import cache_by_workcell
+from hybrid_opt.errors import JobError
+from hybrid_opt.extras.bundles.arms import prefixes
+from hybrid_opt.extras.bundles.programs.carry_job import FORMAT, VERSION, Limits
+from hybrid_opt.job.compliance import TRACKED, largest_skew, require_delay, require_stiffness
+from hybrid_opt.job.motions import unit_squeeze
+from hybrid_opt.job.records import HELD_PHASES, Job, SampledJob, sample_job
+from hybrid_opt.timing.model import TimingModel, contact_torque
+from symbolic.array import Array, interpolated
+from symbolic.errors import SettingsError
+from symbolic.read.arms import common_joints
+from symbolic.records import Workcell
+from symbolic.robot.model import build_robot_model
+
+Interpolation = Literal["linear", "cubic", "quintic"]
+
+DERIVATIVES: Mapping[Interpolation, int] = {"linear": 1, "cubic": 2, "quintic": 3}
+"""Derivatives that each takes of a sample: position, also velocity, also acceleration."""
+
+BETWEEN = (0.25, 0.5, 0.75)
+"""Shares of a step at which the pads are looked at."""
+
+MOST_INTERVALS = 1500
+"""Steps that are looked at, evenly spread."""
+
+
+@dataclass(frozen=True)
+class Gap:
+    """Effect of a time step on the pads while they hold the box.
+
+    Attributes:
+        step: [s].
+        interpolation: between two samples.
+        along: largest change of the distance between the pads along the normal [m].
+        across: largest displacement of one against the other across it [m].
+        force: error of the normal forces that the change along the normal makes [N].
+        share: the same, of the least commanded normal force.
+    """
+
+    step: float
+    interpolation: Interpolation
+    along: float
+    across: float
+    force: float
+    share: float
+
+
+def chosen_step(
+    job: Job, steps: Sequence[float], interpolation: Interpolation, stiffness: float
+) -> float:
+    """Return the longest of the steps whose force error stays within the tracking share.
+
+    Args:
+        steps: that the target can have, the longest first [s].
+        stiffness: of each arm at its pad [N/m].
+
+    Raises:
+        SettingsError: none does.
+    """
+    for step in steps:
+        found = gap_of(sample_job(job, step), interpolation, stiffness)
+        if found.share <= TRACKED:
+            return step
+    raise SettingsError(
+        f"with {interpolation} motion between samples {1e3 * steps[-1]:g} ms apart the gap of the "
+        f"pads is wrong by {1e3 * found.along:.2f} mm; arms of {stiffness:g} N/m then miss their "
+        f"force by {found.force:.1f} N, {100.0 * found.share:.0f} %: choose a slower timing, "
+        "or another target"
+    )
+
+
+def gap_of(sampled: SampledJob, interpolation: Interpolation, stiffness: float) -> Gap:
+    """Compute the error of the pads between the samples of a job under an interpolation.
+
+    Args:
+        stiffness: of each arm at its pad [N/m].
+    """
+    job, time = sampled.job, sampled.time
+    spans = [sampled.span(job.phases.index(phase)) for phase in job.held]
+    starts = np.concatenate([np.arange(span.start, span.stop - 1) for span in spans])
+    starts = starts[:: -(-len(starts) // MOST_INTERVALS)]
+    steps = np.diff(time)[starts]
+    places = np.concatenate([time[starts] + share * steps for share in BETWEEN])
+    joints = between(time, (sampled.q, sampled.q_rate, sampled.q_second), interpolation)
+    along, across = pad_errors(job.workcell, joints(places))
+    least = min(float(sampled.normal_force[span].min()) for span in spans)
+    force = stiffness / 2.0 * float(np.abs(along).max())
+    return Gap(
+        step=float(np.diff(time).max()),
+        interpolation=interpolation,
+        along=float(np.abs(along).max()),
+        across=float(across.max()),
+        force=force,
+        share=force / least,
+    )
+
+
+def between(time: Array, known: Sequence[Array], interpolation: Interpolation) -> BPoly:
+    """Interpolate joints between samples as a controller does: the polynomial of least degree
+    through the known values at both ends.
+
+    Args:
+        time: (n,) ascending [s].
+        known: (n, joints) each: positions, then velocities and accelerations as far as the
+            interpolation takes them [rad, m, s].
+    """
+    taken = np.stack(known[: DERIVATIVES[interpolation]], axis=1)
+    return BPoly.from_derivatives(time, taken)
+
+
+def pad_errors(workcell: Workcell, q: Array) -> tuple[Array, Array]:
+    """Compute the error of the pads' relative pose in postures.
+
+    Args:
+        q: (n, joints) both arms side by side [rad].
+
+    Returns:
+        (n,) the distance between the pads along the first one's normal less the planned one [m],
+        and (n,) their displacement across it [m].
+    """
+    first = len(workcell.robots[0].torque_max)
+    T = [pad_places(workcell, arm, own) for arm, own in enumerate((q[:, :first], q[:, first:]))]
+    apart = np.einsum("nji,nj->ni", T[0][:, :3, :3], T[1][:, :3, 3] - T[0][:, :3, 3])
+    one, other = (contact.T_box_pad for contact in workcell.contacts)
+    missed = apart - one[:3, :3].T @ (other[:3, 3] - one[:3, 3])
+    return missed[:, 2], np.linalg.norm(missed[:, :2], axis=1)
+
+
+def pad_places(workcell: Workcell, arm: int, q: Array) -> Array:
+    """Compute the poses (n, 4, 4) of an arm's pad in the world, at its joints (n, joints) [rad]."""
+    robot = workcell.robots[arm]
+    model = build_robot_model(robot)
+    data, found = model.model.createData(), np.empty((len(q), 4, 4))
+    for k, row in enumerate(q):
+        pin.framesForwardKinematics(model.model, data, row)
+        found[k] = data.oMf[model.flange_id].homogeneous
+    return np.asarray(robot.T_world_base @ found @ robot.T_flange_pad)
+
+
+def pad_jacobians(workcell: Workcell, arm: int, q: Array) -> Array:
+    """Compute the Jacobian (n, 6, n_joints) of an arm's pad, along the flange's axes, at its joints
+    (n, n_joints) [m/rad, 1]."""
+    robot, found = workcell.robots[arm], np.empty((len(q), 6, q.shape[1]))
+    model = build_robot_model(robot)
+    data = model.model.createData()
+    for k, row in enumerate(q):
+        J = pin.computeFrameJacobian(model.model, data, row, model.flange_id, pin.LOCAL)
+        J[:3] += np.cross(J[3:].T, robot.T_flange_pad[:3, 3]).T
+        found[k] = J
+    return found
+
+
+STOP_TIMES = (0.1, 0.15, 0.2, 0.3, 0.45, 0.7, 1.0, 1.5, 2.0, 3.0)
+"""Times of a stop that are tried, the shortest first [s]."""
+
+STOP_STRIDE = 5
+"""Stride of the job's own samples at which a stop is tried."""
+
+INSTANTS = 9
+"""Instants at which a stop is looked at."""
+
+JOINT_USE = 1.1
+"""Joint acceleration of a stop over its limit, if it can be had: timings use the limits whole."""
+
+_model = cache_by_workcell(TimingModel)
+
+
+@dataclass(frozen=True)
+class Stop:
+    """How a job stops along its path.
+
+    Attributes:
+        time: from the planned speed to rest [s].
+        force_use: largest normal force that holds the box in a stop, over the commanded one.
+        joint_use: largest joint acceleration of a stop over its limit.
+        quick: the shortest time that the commanded forces bear, whatever the joints' limits, for
+            arms that have lost one another [s].
+    """
+
+    time: float
+    force_use: float
+    joint_use: float
+    quick: float
+
+
+def stop_of(job: Job) -> Stop:
+    """Find the shortest stop along the path that the commanded forces bear.
+
+    Raises:
+        JobError: none does.
+    """
+    model, motions = _model(job.workcell), [phase.motion for phase in job.phases]
+    time = np.concatenate([phase.begin + phase.motion.time for phase in job.phases])
+    held = np.concatenate(
+        [np.full(len(p.motion.time), float(p.name in HELD_PHASES)) for p in job.phases]
+    )
+    columns = {
+        name: np.concatenate([getattr(motion, name) for motion in motions])
+        for name in ("pose", "rate", "second_rate", "q_rate", "q_second")
+    }
+    columns["force"] = np.concatenate([phase.force.normal for phase in job.phases])
+    places, x = time[::STOP_STRIDE], np.linspace(0.0, 1.0, INSTANTS)
+
+    def stop(duration: float) -> Stop:
+        """Compute a stop of a duration [s], tried all along the path."""
+        rate = 1.0 - x**3 * (10.0 - 15.0 * x + 6.0 * x**2)
+        slope = -30.0 * x**2 * (1.0 - x) ** 2 / duration
+        passed = duration * (x - 2.5 * x**4 + 3.0 * x**5 - x**6)
+        s = np.minimum(places[:, None] + passed, time[-1]).ravel()
+        r, change = (np.tile(each, len(places))[:, None] for each in (rate, slope))
+        at = {name: interpolated(s, time, values) for name, values in columns.items()}
+        second = at["q_second"] * r**2 + at["q_rate"] * change
+        joint_use = float(
+            (np.abs(second) / job.workcell.stack_joint_limits("acceleration_max")).max()
+        )
+        # Between two samples of phases that hold the box, pads alone hold it.
+        alone = np.interp(s, time, held) == 1.0
+        box = (at["pose"], at["rate"] * r, at["second_rate"] * r**2 + at["rate"] * change)
+        load = model.load(*(np.ascontiguousarray(values[alone]) for values in box))
+        return Stop(
+            duration, float((load["normal_force"] / at["force"][alone]).max()), joint_use, duration
+        )
+
+    found = [stop(duration) for duration in STOP_TIMES]
+    bearing = [each for each in found if each.force_use <= 1.0]
+    if not bearing:
+        raise JobError(
+            f"a stop along the path within {STOP_TIMES[-1]:g} s asks for "
+            f"{100.0 * found[-1].force_use:.1f} % of the commanded forces: press more (squeeze), "
+            "or choose a slower timing"
+        )
+    gentle = [each for each in bearing if each.joint_use <= JOINT_USE]
+    return replace(gentle[0] if gentle else bearing[-1], quick=bearing[0].time)
+
+
+START, PATH = 0.005, 0.02
+"""Largest distance of a pad from its first place and from its path [m]."""
+
+BEHIND, LAGS = 0.05, 3.0
+"""How far an arm may lag behind its reference [s]; at least this multiple of its usual lag."""
+
+LEAST_SKEW, MOST_SKEW = 0.008, 0.05
+"""Range of the distance of both arms along the path that a program watches for [s]: less cannot be
+told from measured postures."""
+
+LEAST_BAND, MOST_BAND = 0.05, 0.3
+"""Range of the share by which a measured force may miss its reference."""
+
+SILENCE = 0.1
+"""Longest time without news from an arm [s]."""
+
+
+Contents = Mapping[str, str | bytes]
+"""File contents by path within a bundle."""
+
+
+@dataclass(frozen=True)
+class BundleOptions:
+    """How a job is written.
+
+    Attributes:
+        step: time between samples [s]; None for the longest that keeps the forces.
+        any_arm: write a maker's own language for arms that do not look like that maker's.
+        stiffness: of each arm at its pad along the normal [N/m]; None for that of the cell's
+            drivers, or of the gains where the target has gains.
+        skew: between the starts of both arms that the job has to survive [s]; None for what the
+            target leaves to chance.
+        addresses: host names or IP addresses of both controllers, in place of those of the
+            workcell; None for those.
+    """
+
+    step: float | None = None
+    any_arm: bool = False
+    stiffness: float | None = None
+    skew: float | None = None
+    addresses: tuple[str, str] | None = None
+
+    def __post_init__(self) -> None:
+        if self.stiffness is not None:
+            require_stiffness(self.stiffness)
+        if self.skew is not None:
+            require_delay(self.skew)
+
+
+@dataclass(frozen=True, eq=False)
+class Export:
+    """A job on its way into a bundle.
+
+    Attributes:
+        sampled: the job at the target's time steps.
+        stiffness: of each arm at its pad along the normal [N/m]; None if nothing depends on it.
+        gap: what the time steps do to the pads; None without a stiffness.
+        stop: how it stops along the path.
+    """
+
+    sampled: SampledJob
+    stiffness: float | None
+    gap: Gap | None
+    stop: Stop
+
+    @property
+    def job(self) -> Job:
+        """The whole job."""
+        return self.sampled.job
+
+    @property
+    def workcell(self) -> Workcell:
+        """The cell."""
+        return self.sampled.job.workcell
+
+    @property
+    def follower(self) -> int:
+        """The arm that is force-controlled."""
+        return 1 - self.job.squeeze.leader
+
+    @property
+    def lag(self) -> float:
+        """Delay of the slower arm behind its command [s]."""
+        return max(robot.driver.lag for robot in self.workcell.robots)
+
+    @property
+    def step(self) -> float:
+        """The longest time between two samples [s]."""
+        return float(np.diff(self.sampled.time).max())
+
+    @cached_property
+    def gravity(self) -> Array:
+        """(n, joints) torques that bear the arms and their tools alone [N m, N]."""
+        found = []
+        for arm, robot in enumerate(self.workcell.robots):
+            numeric = build_robot_model(robot).model
+            data, rows = numeric.createData(), self.sampled.arm(arm, self.sampled.q)
+            found.append(np.array([pin.computeGeneralizedGravity(numeric, data, q) for q in rows]))
+        return np.concatenate(found, axis=1)
+
+    @cached_property
+    def holding(self) -> Array:
+        """(n, joints) torques that stand still there and press as commanded, with gravity [N m,
+        N]."""
+        sampled, model = self.sampled, _model(self.workcell)
+        wrench = sampled.wrench.copy()
+        for phase in self.job.held:
+            span = sampled.span(self.job.phases.index(phase))
+            pose = np.ascontiguousarray(sampled.pose[span])
+            load = model.load(pose, np.zeros_like(pose), np.zeros_like(pose))
+            # The leader's force differs from the other's by what the box needs: the mean is
+            # squeezed.
+            extra = (sampled.normal_force[span] - load["normal_force"]).mean(axis=1)
+            both = np.stack([load["wrench_1"], load["wrench_2"]], axis=1)
+            wrench[span] = both + extra[:, None, None] * unit_squeeze(self.workcell, pose)
+        contact = self._contact(wrench)
+        return self.gravity + contact + self._of_other(contact)
+
+    @cached_property
+    def effort(self) -> Array:
+        """(n, joints) torques of the motion as commanded, with gravity; those of a joint that moves
+        both arms bear the contact of both [N m, N]."""
+        return self.sampled.effort + self._of_other(self._contact(self.sampled.wrench))
+
+    def _contact(self, wrench: Array) -> Array:
+        """Compute the joint torques (n, joints) that exert wrenches (n, 2, 6), each arm its own
+        [N m, N]."""
+        sampled, model = self.sampled, _model(self.workcell)
+        matrices = model.wrench_torque(np.ascontiguousarray(sampled.q), sampled.pose)
+        first = len(self.job.joint_names[0])
+        return contact_torque(first, matrices, np.swapaxes(wrench, 0, 1))
+
+    def _of_other(self, contact: Array) -> Array:
+        """Return the other arm's torques (n, joints) in joints that move both arms."""
+        found, (own, other) = np.zeros_like(contact), self.job.joint_names
+        for name in common_joints(self.workcell.robots):
+            both = [own.index(name), len(own) + other.index(name)]
+            found[:, both] = contact[:, both[::-1]]
+        return found
+
+    @property
+    def joint_columns(self) -> dict[str, Array]:
+        """(n, joints) by name what joints do: positions, their derivatives, efforts."""
+        sampled = self.sampled
+        return {
+            "position": sampled.q,
+            "velocity": sampled.q_rate,
+            "acceleration": sampled.q_second,
+            "effort_with_gravity": self.effort,
+            "effort_without_gravity": self.effort - self.gravity,
+        }
+
+    @cached_property
+    def limits(self) -> Limits:
+        """When programs stop."""
+        held = [phase.force for phase in self.job.held]
+        spare = min(float(((f.normal - f.least) / f.normal).min()) for f in held)
+        k = self.stiffness
+        survived = LEAST_SKEW if k is None else largest_skew(self.job, k)
+        return Limits(
+            stop_time=self.stop.time,
+            quick_stop=self.stop.quick,
+            start=START,
+            path=PATH,
+            behind=max(BEHIND, LAGS * self.lag),
+            skew=float(np.clip(survived, LEAST_SKEW, MOST_SKEW)),
+            force=float(np.clip(spare, LEAST_BAND, MOST_BAND)),
+            silence=SILENCE,
+        )
+
+    def reach(self, arm: int) -> Array:
+        """Compute the largest motion (n_joints,) of an arm's pad per motion of each joint at any
+        sample [m]."""
+        J = pad_jacobians(self.workcell, arm, self.sampled.arm(arm, self.sampled.q))
+        return np.asarray(np.linalg.norm(J[:, :3], axis=1).max(axis=0))
+
+    def ros_joints(self, arm: int) -> list[str]:
+        """Return the names of an arm's joints in ROS, with its robot's prefix."""
+        prefix = prefixes(self.workcell)[arm]
+        return [f"{prefix}{joint}" for joint in self.job.joint_names[arm]]
+
+    @cached_property
+    def document(self) -> dict[str, Any]:
+        """The content of job.json."""
+        sampled, job = self.sampled, self.job
+        orientation = self.workcell.task.orientation
+        spans = map(sampled.span, range(len(job.phases)))
+        return {
+            "format": FORMAT,
+            "version": VERSION,
+            "workcell": self.workcell.name,
+            "time": sampled.time.tolist(),
+            "phases": [
+                {"name": phase.name, "first": span.start, "last": span.stop - 1}
+                for phase, span in zip(job.phases, spans, strict=True)
+            ],
+            "box": {
+                "pose": sampled.pose.tolist(),
+                "rotation": orientation.rotation,
+                "reference": orientation.reference.tolist(),
+            },
+            "machine": {"limits": asdict(self.limits)},
+            "robots": [self._robot(arm) for arm in (0, 1)],
+        }
+
+    def _robot(self, arm: int) -> dict[str, Any]:
+        sampled = self.sampled
+        robot = self.workcell.robots[arm]
+        rows = self.joint_columns | {
+            "hold_effort_with_gravity": self.holding,
+            "hold_effort_without_gravity": self.holding - self.gravity,
+        }
+        return {
+            "name": robot.name,
+            "joints": list(self.job.joint_names[arm]),
+            "ros_joints": self.ros_joints(arm),
+            "force_controlled": arm == self.follower,
+            "reach": self.reach(arm).tolist(),
+            **{name: sampled.arm(arm, values).tolist() for name, values in rows.items()},
+            "normal_force": sampled.normal_force[:, arm].tolist(),
+            "wrench": sampled.wrench[:, arm].tolist(),
+        }
+
+    def tool_load(self, arm: int) -> tuple[float, Array]:
+        """Return the tool's mass [kg] and its centre (3,) in the flange's frame [m]."""
+        load = self.workcell.robots[arm].tool_load
+        return (0.0, np.zeros(3)) if load is None else (load.mass, load.centre_of_mass)
+
+
+def job_text(export: Export) -> str:
+    """Return the text of job.json."""
+    return json.dumps(export.document, allow_nan=False, separators=(",", ":")) + "\n"

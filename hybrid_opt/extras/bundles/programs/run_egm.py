@@ -1,0 +1,402 @@
+"""Streams the job to both arms of an ABB cell: python3 run_egm.py [--check]
+
+Start CarryEgm in both tasks first. One clock drives both arms: each message of a controller is
+answered with where its arm has to be, its lag ahead. The arm that presses is moved along its pad's
+normal until its sensor feels the force of the job. Ctrl-C, an arm that is silent, late or off its
+path, a force out of its band: the clock stops, both arms hold their places and press on. Then type
+'continue' or 'back' to set the box down; 'leave' ends the stream, the controllers hold the arms.
+
+Messages are protocol buffers of version 2, numbers of fields after egm.proto of RobotWare: EgmRobot
+header 1 (seqno 1), feedBack 2 (joints 1: joints 1; externalJoints 3: joints 1), mciState 5,
+measuredForce 9; EgmSensor header 1 (seqno 1, tm 2, mtype 3), planned 2 (joints 1, externalJoints
+3). Joints are in degrees.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import select
+import signal
+import socket
+import struct
+import sys
+import time
+from bisect import bisect_left
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from hybrid_opt.extras.bundles.programs.carry_job import Job, Machine, Refused, Seen
+
+BUNDLE = Path(__file__).resolve().parent
+
+PATIENCE = 30.0
+"""Longest wait for both controllers [s]."""
+
+LONGEST_TICK = 0.02
+"""At most so much of the job passes between two messages [s]: a pause of this computer does not
+make the arms jump."""
+
+MOST_PRESSED = 1.2
+"""Measured over commanded force beyond which the pad goes no farther into the box."""
+
+CTRL_C = "Ctrl-C"
+
+
+class Press:
+    """The way of the pressing pad along its normal, from the force that it has to make and the one
+    that it feels.
+
+    Attributes:
+        way: beyond the planned place, into the box [m].
+    """
+
+    def __init__(self, config: dict[str, Any]) -> None:
+        """Begin at the planned place."""
+        self.way = 0.0
+        self._missing = 0.0
+        self._gain, self._most = config["gain"], config["most"]
+        self._speed, self._compliance = config["speed"], config["compliance"]
+
+    def tick(self, dt: float, wanted: float, soon: float, felt: float | None) -> None:
+        """Advance the time.
+
+        Args:
+            wanted, soon: normal force now, and when the arm has followed [N].
+            felt: what the sensor feels [N]; None before it tells.
+        """
+        if wanted <= 0.0:
+            self._missing = 0.0
+        elif felt is not None:
+            self._missing += self._gain * (wanted - felt) * dt
+        target = self._compliance * max(soon, 0.0) + self._missing
+        target = min(max(target, -self._most), self._most)
+        if felt is not None and felt > MOST_PRESSED * max(wanted, soon):
+            # Stiffer than measured, or not where it should be: no farther into it.
+            target = min(target, self.way)
+        step = self._speed * dt
+        self.way += min(max(target - self.way, -step), step)
+
+
+class Stream:
+    """Answers both controllers."""
+
+    def __init__(self, job: Job, config: dict[str, Any]) -> None:
+        """Wait for both controllers."""
+        self.job, self.config = job, config
+        self.machine = Machine(job, 0.0, sensors=config["sensors"])
+        self.press = Press(config["press"])
+        self.fault, self.command = "", ""
+        self._arm: int = config["press"]["arm"]
+        self._q: list[list[float] | None] = [None, None]
+        self._first: list[list[float] | None] = [None, None]
+        self._force: list[float | None] = [None, None]
+        self._news = [-math.inf, -math.inf]
+        self._last: float | None = None
+        # A name that is no address is looked up once, before the stream.
+        self._hosts = [socket.gethostbyname(host) for host in config["addresses"]]
+        self.dropped = 0
+
+    def seen(self, now: float) -> Seen:
+        """Return the measured state of the arms."""
+        age = [now - then for then in self._news]
+        q = list(self._q)
+        pressing = q[self._arm]
+        if pressing is not None:
+            # Where it would be without what it is moved into the box.
+            inward = self._inward(self.machine.clock.s)
+            way = self.press.way
+            q[self._arm] = [a - way * slope for a, slope in zip(pressing, inward, strict=True)]
+        lost = self.fault not in ("", CTRL_C)
+        return Seen(q=q, force=list(self._force), age=age, fault=self.fault, lost=lost)
+
+    def hear(self, arm: int, message: FromRobot, now: float) -> None:
+        """Process a message of an arm's controller."""
+        degrees = self._in_chain(arm, message.joints, message.further)
+        if degrees is None:
+            return
+        self._q[arm] = [math.radians(value) for value in degrees]
+        self._first[arm] = self._first[arm] or self._q[arm]
+        self._news[arm] = now
+        if self.config["sensors"][arm] and len(message.force) >= 3:
+            # About carryPad, whose z axis is the pad's normal.
+            self._force[arm] = abs(message.force[2])
+        if self.machine.state == "running" and not message.running:
+            name = self.job.robots[arm]["name"]
+            self.fault = self.fault or f"the controller of {name} does not follow"
+
+    def read(self, arm: int, data: bytes, host: str) -> FromRobot | None:
+        """Read a packet; drop and count one that another host sent or that is damaged."""
+        if host == self._hosts[arm]:
+            with suppress(ValueError, struct.error):
+                return read_robot(data)
+        self.dropped += 1
+        return None
+
+    def told(self) -> str:
+        """Describe the state."""
+        strange = f" {self.dropped} packets were dropped, from other hosts or damaged."
+        return self.machine.told() + (strange if self.dropped else "")
+
+    def tick(self, now: float) -> None:
+        """Advance the time."""
+        dt = 0.0 if self._last is None else min(now - self._last, LONGEST_TICK)
+        self._last = now
+        before = self.machine.state
+        if before == "ready":
+            return
+        self.machine.tick(dt, self.seen(now))
+        clock = self.machine.clock
+        soon = clock.s + clock.rate * self.config["lags"][self._arm]
+        wanted, later = (self.job.force(self._arm, s) for s in (clock.s, soon))
+        own, other = self._force[self._arm], self._force[1 - self._arm]
+        # A job that stops may do so because a sensor is wrong: what was integrated stays.
+        felt = None
+        if self.machine.state == "running":
+            felt = own if own is not None else other
+        self.press.tick(dt, wanted, later, felt)
+        if self.machine.state == "held" and self.command in ("continue", "back"):
+            direction = 1.0 if self.command == "continue" else -1.0
+            self.command = self.fault = ""
+            try:
+                self.machine.resume(direction, self.seen(now))
+            except Refused as error:
+                self.machine.hold(str(error))
+                print(self.told(), file=sys.stderr)
+        if before != self.machine.state:
+            print(self.told(), file=sys.stderr)
+
+    def answer(self, arm: int, number: int, now: float) -> bytes:
+        """Encode an arm's commanded position, its lag ahead of the clock, as a message."""
+        clock, first = self.machine.clock, self._first[arm]
+        if self.machine.state == "ready" and first is not None:
+            q = first
+        else:
+            ahead = clock.s + clock.rate * self.config["lags"][arm]
+            q = self.job.position(arm, ahead)
+            if arm == self._arm:
+                inward = self._inward(clock.s)
+                q = [value + self.press.way * slope for value, slope in zip(q, inward, strict=True)]
+        joints, further = self._as_abb(arm, [math.degrees(value) for value in q])
+        return to_robot(number, now, joints, further)
+
+    def _inward(self, s: float) -> list[float]:
+        """Compute the joints per motion of the pressing pad along its normal [rad/m]."""
+        rows, time = self.config["inward"], self.job.time
+        k = min(max(bisect_left(time, s) - 1, 0), len(rows) - 2)
+        share = min(max((s - time[k]) / (time[k + 1] - time[k]), 0.0), 1.0)
+        return [a + share * (b - a) for a, b in zip(rows[k], rows[k + 1], strict=True)]
+
+    def _in_chain(
+        self, arm: int, joints: Sequence[float], further: Sequence[float]
+    ) -> list[float] | None:
+        """Return axes along the chain [degrees]: the third of seven is an external one to ABB."""
+        count = len(self.job.robots[arm]["joints"])
+        if len(joints) < 6 or (count == 7 and not further):
+            return None
+        found = list(joints[:6])
+        return found if count == 6 else [*found[:2], further[0], *found[2:]]
+
+    def _as_abb(self, arm: int, degrees: list[float]) -> tuple[list[float], list[float]]:
+        count = len(self.job.robots[arm]["joints"])
+        if count == 6:
+            return degrees, []
+        return degrees[:2] + degrees[3:], [degrees[2]]
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Stream the job; returns the exit code: 0 when it is done."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--check", action="store_true", help="look at both arms and move nothing")
+    options = parser.parse_args(arguments)
+    try:
+        job = Job.read(BUNDLE / "job.json")
+        config = json.loads((BUNDLE / "config/egm.json").read_text("utf-8"))
+        stream = Stream(job, config)
+        sockets = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in config["ports"]]
+        for each, port in zip(sockets, config["ports"], strict=True):
+            each.bind(("", port))
+        return streamed(stream, sockets, options.check)
+    except (OSError, Refused) as error:
+        print(error, file=sys.stderr)
+        return 2
+
+
+def streamed(stream: Stream, sockets: Sequence[socket.socket], check: bool) -> int:
+    """Answer both controllers until the job is done; returns the exit code.
+
+    Raises:
+        Refused: a controller does not begin, or an arm is not at its first place.
+    """
+
+    def interrupted(*_: object) -> None:
+        if stream.machine.state == "held":
+            stream.command = "leave"
+        stream.fault = stream.fault or CTRL_C
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, interrupted)
+    begin = time.monotonic()
+    waiting: list[Any] = [*sockets, sys.stdin]
+    while stream.machine.state != "done":
+        ready, _, _ = select.select(waiting, [], [], 0.01)
+        now = time.monotonic()
+        stream.tick(now)
+        for arm, source in enumerate(sockets):
+            if source in ready:
+                data, address = source.recvfrom(4096)
+                message = stream.read(arm, data, address[0])
+                if message is None:
+                    continue
+                stream.hear(arm, message, now)
+                source.sendto(stream.answer(arm, message.number, now), address)
+        if sys.stdin in ready:
+            line = sys.stdin.readline()
+            stream.command = line.strip()
+            if not line:
+                waiting.remove(sys.stdin)
+        if stream.machine.state == "ready" and all(q is not None for q in stream.seen(now).q):
+            stream.machine.start(stream.seen(now))
+            if check:
+                print("both arms are at their first places", file=sys.stderr)
+                return 0
+        if stream.machine.state == "ready" and now - begin > PATIENCE:
+            raise Refused("a controller is silent: is CarryEgm running in both tasks?")
+        if stream.machine.state == "held" and stream.command == "leave":
+            print(f"left while {stream.told()}", file=sys.stderr)
+            return 1
+    return 0 if stream.machine.clock.s > 0.0 else 3
+
+
+CORRECTION = 3
+"""Type of a message to the controller."""
+
+RUNNING = 3
+"""State of EGM in which the controller follows."""
+
+
+@dataclass(frozen=True)
+class FromRobot:
+    """What a controller tells.
+
+    Attributes:
+        number: of the message.
+        joints, further: axes of the robot, and external ones [degrees].
+        force: of the sensor: force [N] and moment; () without one.
+        running: whether the controller follows.
+    """
+
+    number: int
+    joints: tuple[float, ...]
+    further: tuple[float, ...]
+    force: tuple[float, ...]
+    running: bool
+
+
+def read_robot(data: bytes) -> FromRobot:
+    """Decode a message of a controller.
+
+    Raises:
+        ValueError: the bytes are none.
+    """
+    number, running = 0, False
+    joints: tuple[float, ...] = ()
+    further: tuple[float, ...] = ()
+    force: tuple[float, ...] = ()
+    for field, value in _fields(data):
+        if isinstance(value, int):
+            continue
+        inner = list(_fields(value))
+        if field == 1:
+            number = next((v for f, v in inner if f == 1 and isinstance(v, int)), 0)
+        elif field == 2:
+            parts = {f: v for f, v in inner if isinstance(v, bytes)}
+            joints = _doubles(parts.get(1, b""), (1,))
+            further = _doubles(parts.get(3, b""), (1,))
+        elif field == 5:
+            running = any(f == 1 and v == RUNNING for f, v in inner)
+        elif field == 9:
+            # Newer controllers tell first whether force control is active.
+            force = _doubles(value, (1, 2))
+    return FromRobot(number, joints, further, force, running)
+
+
+def to_robot(number: int, time: float, joints: Sequence[float], further: Sequence[float]) -> bytes:
+    """Encode a message that commands a controller's axes.
+
+    Args:
+        time: of the message [s].
+        joints, further: axes of the robot, and external ones [degrees].
+    """
+    header = _number(1, number) + _number(2, round(1e3 * time) % 2**32) + _number(3, CORRECTION)
+    planned = _bytes(1, _packed(joints))
+    if further:
+        planned += _bytes(3, _packed(further))
+    return _bytes(1, header) + _bytes(2, planned)
+
+
+def _packed(values: Sequence[float]) -> bytes:
+    # Repeated doubles of version 2 are written one by one.
+    return b"".join(_raw(1 << 3 | 1) + struct.pack("<d", value) for value in values)
+
+
+def _doubles(data: bytes, numbers: tuple[int, ...]) -> tuple[float, ...]:
+    found: list[float] = []
+    for field, value in _fields(data):
+        if field in numbers and isinstance(value, bytes) and len(value) % 8 == 0:
+            found += struct.unpack(f"<{len(value) // 8}d", value)
+    return tuple(found)
+
+
+def _fields(data: bytes) -> Iterator[tuple[int, int | bytes]]:
+    """Yield fields with their numbers: varints as numbers, everything else as bytes."""
+    place = 0
+    while place < len(data):
+        key, place = _varint(data, place)
+        kind = key & 7
+        if kind == 0:
+            value, place = _varint(data, place)
+            yield key >> 3, value
+            continue
+        size = {1: 8, 5: 4}.get(kind)
+        if kind == 2:
+            size, place = _varint(data, place)
+        if size is None or place + size > len(data):
+            raise ValueError("this is no message of EGM")
+        yield key >> 3, data[place : place + size]
+        place += size
+
+
+def _varint(data: bytes, place: int) -> tuple[int, int]:
+    value = 0
+    for k in range(10):
+        if place + k >= len(data):
+            break
+        value |= (data[place + k] & 0x7F) << (7 * k)
+        if data[place + k] < 0x80:
+            return value, place + k + 1
+    raise ValueError("this is no message of EGM")
+
+
+def _raw(value: int) -> bytes:
+    found = b""
+    while value >= 0x80:
+        found += bytes([value & 0x7F | 0x80])
+        value >>= 7
+    return found + bytes([value])
+
+
+def _number(field: int, value: int) -> bytes:
+    return _raw(field << 3) + _raw(value)
+
+
+def _bytes(field: int, value: bytes) -> bytes:
+    return _raw(field << 3 | 2) + _raw(len(value)) + value
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,416 @@
+"""Runs the job: python3 run_job.py [--check], beside the launched controllers.
+
+Both arms get the whole job at once. While they drive it, this program looks at them a hundred times
+a second. Ctrl-C, an arm that is silent, late or off its path, a force out of its band: both arms
+stop along the path and keep the squeeze. Then tell it on the topic /carry/command (std_msgs/String)
+how to set the box down: 'continue' or 'back'; 'leave' ends the program, the arms hold on.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import signal
+import sys
+from collections.abc import Sequence
+from contextlib import suppress
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import rclpy
+from action_msgs.msg import GoalStatus
+from builtin_interfaces.msg import Duration, Time
+from control_msgs.action import FollowJointTrajectory
+from geometry_msgs.msg import WrenchStamped
+from rclpy.action import ActionClient
+from rclpy.parameter import Parameter
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.signals import SignalHandlerOptions
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Header, String
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
+
+from hybrid_opt.extras.bundles.programs.carry_job import Job, Machine, Moment, Refused, Seen
+
+BUNDLE = Path(__file__).resolve().parent
+
+PERIOD = 0.01
+"""Between two looks at the arms [s]."""
+
+LEAD = 0.5
+"""From building the goals to their common start [s]."""
+
+PATIENCE = 10.0
+"""Longest wait for something of the controllers [s]."""
+
+LEAD_OF_STOP = 0.04
+"""From the decision to stop to when the arms leave their course [s]: time for the message."""
+
+SETTLE = 0.5
+"""To hear from both arms, before the first look [s]."""
+
+CTRL_C = "Ctrl-C"
+
+NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
+"""Of measurements: hears reliable publishers and those of best effort, keeps no queue."""
+
+
+def parts(time: float) -> tuple[int, int]:
+    """Whole seconds and the nanoseconds beyond them."""
+    return divmod(round(time * 1e9), 10**9)
+
+
+def service_of(kind: str) -> Any:
+    """Return the type of a service by its name PACKAGE/srv/NAME."""
+    package, _, name = kind.split("/")
+    return getattr(import_module(f"{package}.srv"), name)
+
+
+def fill(message: Any, values: dict[str, Any]) -> None:
+    """Set fields of a message.
+
+    Raises:
+        AttributeError: it has no such field.
+    """
+    for name, value in values.items():
+        if isinstance(value, dict):
+            fill(getattr(message, name), value)
+        else:
+            setattr(message, name, value)
+
+
+class Run:
+    """A run of the job by both arms' controllers, as config/cell.json describes them."""
+
+    def __init__(self, node: Any, job: Job, config: dict[str, Any]) -> None:
+        """Subscribe to both arms, with nothing sent."""
+        self.node, self.job, self.config = node, job, config
+        sensors = [source is not None for source in config["wrench"]]
+        self.machine = Machine(job, config["lag"], LEAD_OF_STOP, sensors)
+        self.fault, self.command, self.lost = "", "", False
+        self._began, self._last = 0.0, 0.0
+        self._q: list[dict[str, float]] = [{}, {}]
+        self._measured = [-math.inf, -math.inf]
+        self._force: list[float | None] = [None, None]
+        self._felt = [-math.inf, -math.inf]
+        self._goals = 0
+        self._calls: list[tuple[str, Any]] = []
+        self._clients: dict[str, Any] = {}
+        for topic in config["joint_states"]:
+            node.create_subscription(JointState, topic, self._joints, NEWEST)
+        for arm, source in enumerate(config["wrench"]):
+            if source is not None:
+                self._listen(arm, source)
+        node.create_subscription(String, "/carry/command", self._commanded, 10)
+        self._actions = [
+            ActionClient(node, FollowJointTrajectory, group["action"]) for group in config["groups"]
+        ]
+
+    def _joints(self, message: Any) -> None:
+        for arm, robot in enumerate(self.job.robots):
+            known = dict(zip(message.name, message.position, strict=False))
+            if all(name in known for name in robot["ros_joints"]):
+                self._q[arm] = known
+                self._measured[arm] = self._stamp(message)
+
+    def _stamp(self, message: Any) -> float:
+        """Return when a message was measured [s]; its arrival where it bears no stamp."""
+        stamp = message.header.stamp
+        return stamp.sec + 1e-9 * stamp.nanosec or self.now()
+
+    def _listen(self, arm: int, source: dict[str, Any]) -> None:
+        axis = source["axis"]
+
+        def heard(message: Any) -> None:
+            force = message.wrench.force
+            along = axis[0] * force.x + axis[1] * force.y + axis[2] * force.z
+            self._force[arm], self._felt[arm] = abs(along), self._stamp(message)
+
+        self.node.create_subscription(WrenchStamped, source["topic"], heard, NEWEST)
+
+    def _commanded(self, message: Any) -> None:
+        self.command = message.data.strip()
+
+    def now(self) -> float:
+        """Return the time of the node's clock [s]."""
+        return float(self.node.get_clock().now().nanoseconds) * 1e-9
+
+    def seen(self) -> Seen:
+        """Return the measured state of the arms now."""
+        for name, future in [call for call in self._calls if call[1].done()]:
+            answer = future.result()
+            if not getattr(answer, "ok", getattr(answer, "success", answer is not None)):
+                reason = getattr(answer, "error", getattr(answer, "message", ""))
+                self.fault = self.fault or f"{name} was refused: {reason or 'without a reason'}"
+        self._calls = [call for call in self._calls if not call[1].done()]
+        now, silence = self.now(), self.job.limits.silence
+        felt = zip(self._force, self._felt, strict=True)
+        return Seen(
+            q=[
+                [known[name] for name in robot["ros_joints"]] if known else None
+                for known, robot in zip(self._q, self.job.robots, strict=True)
+            ],
+            force=[force if now - then <= silence else None for force, then in felt],
+            age=[max(0.0, now - then) for then in self._measured],
+            fault=self.fault,
+            lost=self.lost,
+        )
+
+    def spin(self, until: float) -> None:
+        """Handle what comes in until a time [s]."""
+        while (left := until - self.now()) > 0.0:
+            rclpy.spin_once(self.node, timeout_sec=left)
+
+    def wait(self, futures: Sequence[Any], what: str) -> list[Any]:
+        """Return the results of futures.
+
+        Raises:
+            Refused: they take too long.
+        """
+        begin = self.now()
+        while not all(future.done() for future in futures):
+            if self.now() - begin > PATIENCE:
+                raise Refused(f"{what} does not answer")
+            rclpy.spin_once(self.node, timeout_sec=PERIOD)
+        return [future.result() for future in futures]
+
+    def call(self, name: str, kind: str, requests: Sequence[dict[str, Any]]) -> Any:
+        """Call a service; a refusal becomes a fault when it arrives.
+
+        Args:
+            requests: the same one as versions of the driver define it; the first that fits is sent.
+
+        Raises:
+            Refused: none fits.
+        """
+        for request in requests:
+            message = service_of(kind).Request()
+            try:
+                fill(message, request)
+            except AttributeError:
+                continue
+            break
+        else:
+            raise Refused(f"{name}: this driver defines another {kind}")
+        future = self._clients[name].call_async(message)
+        self._calls.append((name, future))
+        return future
+
+    def _find(self, name: str, kind: str) -> None:
+        """Find a service before anything moves."""
+        self._clients[name] = self.node.create_client(service_of(kind), name)
+        if not self._clients[name].wait_for_service(timeout_sec=PATIENCE):
+            raise Refused(f"{name} is not there; are the controllers launched?")
+
+    def prepare(self) -> None:
+        """Make the arms ready: look at them, then call what config/cell.json lists, in its order.
+
+        Raises:
+            Refused: something is not there or says no, or an arm is not at its first place.
+        """
+        for group, client in zip(self.config["groups"], self._actions, strict=True):
+            if not client.wait_for_server(timeout_sec=PATIENCE):
+                raise Refused(f"{group['action']} is not there; are the controllers launched?")
+        for call in self.config["prepare"]:
+            self._find(call["name"], call["kind"])
+        self.check()
+        for call in self.config["prepare"]:
+            self.wait([self.call(**call)], call["name"])
+            if self.seen().fault:
+                raise Refused(self.fault)
+
+    def check(self) -> None:
+        """Look at both arms.
+
+        Raises:
+            Refused: they are not ready for the job.
+        """
+        while self.now() == 0.0:
+            # A simulator's clock is not there yet.
+            rclpy.spin_once(self.node, timeout_sec=PERIOD)
+        self.spin(self.now() + SETTLE)
+        self.machine.check(self.seen())
+
+    def send(self, moments: Sequence[Moment], begin: float) -> None:
+        """Send every group its part of the path, and hear whether it is accepted.
+
+        Args:
+            begin: when the first moment is [s].
+
+        Raises:
+            Refused: a controller does not take it.
+        """
+        goals = [self._goal(group["arms"], moments, begin) for group in self.config["groups"]]
+        # Large goals take long to build: none is sent before all are there.
+        both = zip(self._actions, goals, strict=True)
+        sent = [client.send_goal_async(goal) for client, goal in both]
+        self._goals += 1
+        handles = self.wait(sent, "a controller")
+        taken = dict(zip((g["action"] for g in self.config["groups"]), handles, strict=True))
+        refusing = [action for action, handle in taken.items() if not handle.accepted]
+        if refusing:
+            raise Refused(f"{' and '.join(refusing)} does not take its goal")
+        for group, handle in zip(self.config["groups"], handles, strict=True):
+            handle.get_result_async().add_done_callback(self._ended(group["action"], self._goals))
+
+    def _ended(self, action: str, number: int) -> Any:
+        def ended(future: Any) -> None:
+            done = future.result()
+            if number == self._goals and done.status != GoalStatus.STATUS_SUCCEEDED:
+                told = done.result.error_string or f"status {done.status}"
+                self.fault = self.fault or f"{action} ended: {told}"
+                self.lost = True
+
+        return ended
+
+    def _goal(self, arms: Sequence[int], moments: Sequence[Moment], begin: float) -> Any:
+        # Without tolerances: a controller that gives up by itself drops the squeeze.
+        sec, nanosec = parts(begin)
+        trajectory = JointTrajectory(
+            header=Header(stamp=Time(sec=sec, nanosec=nanosec)),
+            joint_names=self._joined(arms, [self.job.robots[arm]["ros_joints"] for arm in arms]),
+            points=[self._point(arms, moment) for moment in moments],
+        )
+        return FollowJointTrajectory.Goal(trajectory=trajectory)
+
+    def _joined(self, arms: Sequence[int], rows: Sequence[Sequence[Any]]) -> list[Any]:
+        """Stack values of arms' joints; of a joint that moves both arms, take the first's."""
+        found: dict[str, Any] = {}
+        for arm, row in zip(arms, rows, strict=True):
+            for name, value in zip(self.job.robots[arm]["ros_joints"], row, strict=True):
+                found.setdefault(name, value)
+        return list(found.values())
+
+    def _point(self, arms: Sequence[int], at: Moment) -> Any:
+        job, r = self.job, at.rate
+        rates = self._joined(arms, [job.linear(arm, "velocity", at.s) for arm in arms])
+        seconds = self._joined(arms, [job.linear(arm, "acceleration", at.s) for arm in arms])
+        sec, nanosec = parts(at.time)
+        efforts = [job.effort(arm, "without_gravity", at.s, r) for arm in arms]
+        return JointTrajectoryPoint(
+            positions=self._joined(arms, [job.position(arm, at.s) for arm in arms]),
+            velocities=[r * v for v in rates],
+            accelerations=[r * r * a + at.change * v for v, a in zip(rates, seconds, strict=True)],
+            effort=self._joined(arms, efforts),
+            time_from_start=Duration(sec=sec, nanosec=nanosec),
+        )
+
+    def start(self) -> None:
+        """Send the whole job and begin.
+
+        Raises:
+            Refused: the arms are not ready for it.
+        """
+        self.machine.start(self.seen())
+        self._begin(1.0)
+
+    def _begin(self, rate: float) -> None:
+        moments = list(self.machine.clock.ahead(rate, self.config["step"]))
+        self._began = self.now() + LEAD
+        try:
+            self.send(moments, self._began)
+        except Refused as error:
+            # A controller that has taken its goal does not begin alone: it holds what it holds.
+            self.machine.hold(str(error))
+            with suppress(Refused):
+                self.send([Moment(0.0, self.machine.clock.s, 0.0, 0.0)], self._began)
+            raise
+        self.spin(self._began)
+        self._last = self._began
+
+    def tick(self) -> None:
+        """Check the arms and react."""
+        machine = self.machine
+        before, now = machine.state, self.now()
+        machine.tick(now - self._last, self.seen())
+        self._last = now
+        if before == "running" and machine.state in ("stopping", "held"):
+            self._stop()
+        if before != machine.state:
+            self.node.get_logger().info(machine.told())
+        if machine.state == "held" and self.command in ("continue", "back"):
+            self._resume(1.0 if self.command == "continue" else -1.0)
+
+    def stop(self, reason: str) -> None:
+        """Stop for the caller's reason."""
+        if self.machine.state == "running":
+            self.machine.stop(reason)
+            self._stop()
+
+    def _stop(self) -> None:
+        if self.machine.state == "held":
+            # At its end: the controllers hold what they reached.
+            return
+        # With the start of what is driven now: the new points are a continuation of the old ones,
+        # the first of which is over when they arrive, so that nothing is made up in between.
+        gone = self.now() - self._began
+        ahead = self.machine.clock.ahead(0.0, self.config["step"])
+        moments = [Moment(gone + m.time, m.s, m.rate, m.change) for m in ahead]
+        try:
+            self.send(moments, self._began)
+        except Refused as error:
+            self.node.get_logger().error(f"{error}; the job goes on to its end as planned")
+
+    def _resume(self, direction: float) -> None:
+        self.command, self.fault, self.lost = "", "", False
+        try:
+            self.machine.resume(direction, self.seen())
+            self._begin(direction)
+        except Refused as error:
+            self.machine.hold(str(error))
+            self.node.get_logger().error(self.machine.told())
+
+    def interrupt(self, *_: object) -> None:
+        """Ctrl-C stops the job; while it is held, for whatever reason, ends the program."""
+        if self.machine.state == "held":
+            self.command = "leave"
+        self.fault = self.fault or CTRL_C
+
+    def look_after(self) -> int:
+        """Look after a run that has begun, to its end; returns the exit code."""
+        machine = self.machine
+        try:
+            while machine.state != "done":
+                self.spin(self.now() + PERIOD)
+                self.tick()
+                if machine.state == "held" and self.command == "leave":
+                    self.node.get_logger().error(f"left while {machine.told()}")
+                    return 1
+        except BaseException:
+            self.stop("run_job.py has failed")
+            raise
+        return 0 if machine.clock.s > 0.0 else 3
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the job; returns the exit code: 0 when it is done."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--check", action="store_true", help="look at both arms and move nothing")
+    options = parser.parse_args(arguments)
+    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+    config = json.loads((BUNDLE / "config/cell.json").read_text("utf-8"))
+    clock = Parameter("use_sim_time", value=config["simulated"])
+    node = rclpy.create_node("run_job", parameter_overrides=[clock])
+    try:
+        run = Run(node, Job.read(BUNDLE / "job.json"), config)
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, run.interrupt)
+        if options.check:
+            run.check()
+            node.get_logger().info("both arms are at their first places")
+            return 0
+        run.prepare()
+        run.check()
+        run.start()
+        return run.look_after()
+    except Refused as error:
+        node.get_logger().error(str(error))
+        return 2
+    finally:
+        rclpy.shutdown()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

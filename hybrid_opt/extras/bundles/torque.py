@@ -1,0 +1,322 @@
+"""The torque target: joint trajectory controllers that command efforts with gains, for ROS 2.
+
+Both arms are soft joints about the path; the efforts that accelerate, carry and press go with it as
+feed-forward, without gravity, which the robots or the simulator compensate. Each of these drivers
+takes such efforts (jazzy, or main where that is named):
+
+- joint_trajectory_controller adds the effort of a point to the gains' if `effort` is its only
+  command interface (ros2_controllers jazzy, joint_trajectory_controller.cpp:417; validation
+  :1805; Humble rejects efforts, :1587).
+- franka_ros2 (jazzy): torques without gravity; topics and services in the namespace of the arm,
+  the wrench with best effort (franka_robot_state_broadcaster.cpp:125); libfranka sets the load
+  only while no motion runs, so the controller becomes active after it.
+- ur_robot_driver: direct torque from PolyScope 5.23.0 or 10.10.0 (main, hardware_interface.cpp
+  :1479; its page force_torque_control.rst requires 5.25.1 or 10.12.1), without gravity (same page);
+  the wrench on `~/wrench` (force_torque_sensor_broadcaster.cpp:120); two forms of SetPayload
+  (gpio_controller.cpp `setPayload` of main and of jazzy).
+- gz_ros2_control and mujoco_ros2_control, with the arms' links exempt from gravity.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+
+from hybrid_opt.extras.bundles.arms import (
+    FRANKA,
+    SEVEN,
+    SIX,
+    UR,
+    described,
+    description,
+    prefixes,
+    require_arms,
+    ros_joints,
+)
+from hybrid_opt.extras.bundles.job_file import Export, job_text, pad_jacobians
+from hybrid_opt.extras.bundles.programs import filled, program
+from hybrid_opt.job.records import Job
+from symbolic.array import Array
+from symbolic.errors import SettingsError
+from symbolic.records import Workcell
+from symbolic.robot.model import build_robot_model
+
+CONTROLLER = "carry_controller"
+
+RATES = {"simulation": 1000, "franka": 1000, "ur": 500}
+"""Rate of each driver's cycle [Hz]."""
+
+TORQUE_STEPS = (0.02, 0.01, 0.005)
+"""Time steps between two points [s]."""
+
+GAIN, DAMPING = 7.0, 0.7
+"""Stiffness of a joint over its largest torque [1/rad], and damping ratio at its mean inertia."""
+
+FASTEST = 250.0
+"""Largest natural frequency of a joint under its gains [rad/s], half of the slowest driver's rate:
+light joints are softer, so that a sampled controller keeps them stable."""
+
+MODEL_STRIDE = 10
+"""Stride of the job's own samples at which inertia and stiffness are computed."""
+
+TORQUE_RATE = 1000.0
+"""Fastest change of a torque that libfranka takes [N m/s] (kMaxTorqueRate)."""
+
+CONTACT, SPARE_FORCE, SPARE_TORQUE = 1.5, 20.0, 5.0
+"""A collision exceeds this multiple of the planned contact by this force [N] or torque [N m]."""
+
+UR_TYPE = r"(?<![a-z0-9])ur\d+e?(?![a-z0-9])"
+
+FRANKA_TYPES = ("fer", "fp3", "fr3", "fr3v2")
+"""Arms that franka_description has (folder `robots`), by the beginnings of their joints' names."""
+
+
+def driver_of(workcell: Workcell) -> str:
+    """Return the driver of the arms, 'franka' or 'ur'; 'simulation' for arms without an address.
+
+    Raises:
+        SettingsError: there is no driver for arms with addresses, or only one has an address.
+    """
+    addresses = [robot.driver.address for robot in workcell.robots]
+    if not any(addresses):
+        return "simulation"
+    if not all(addresses):
+        raise SettingsError(
+            "only one of both arms has an address: give [robots.driver] of the other one too, or "
+            "of none for a simulator"
+        )
+    for driver, maker, axes in (("franka", FRANKA, SEVEN), ("ur", UR, SIX)):
+        try:
+            require_arms(workcell, "torque", maker, (axes,))
+        except SettingsError:
+            continue
+        return driver
+    raise SettingsError(
+        "no driver takes torques for these arms: Franka's and Universal Robots' do, a simulator "
+        "(leave out the addresses) does for all; ABB's arms are driven by abb-egm"
+    )
+
+
+def require_torque(job: Job) -> None:
+    """Refuse joints that franka_ros2 does not know."""
+    if driver_of(job.workcell) != "franka":
+        return
+    for robot, joints in zip(job.workcell.robots, job.joint_names, strict=True):
+        if _franka_type(joints) not in FRANKA_TYPES:
+            raise SettingsError(
+                f"the joints of {robot.name!r} are called {joints[0]!r} ... {joints[-1]!r}; "
+                f"franka_ros2 knows TYPE_joint1 to TYPE_joint7 of {', '.join(FRANKA_TYPES)} (a "
+                "Panda is 'fer'): use franka_description's file of the arm"
+            )
+        if robot.driver.prefix and not robot.driver.prefix.endswith("_"):
+            raise SettingsError(
+                f"the prefix {robot.driver.prefix!r} of {robot.name!r} has to end with '_': "
+                "franka_description puts one behind it"
+            )
+
+
+def joint_stiffness(job: Job) -> Array:
+    """Return the proportional gains (joints,) of both arms [N m/rad, N/m]."""
+    largest = job.workcell.stack_joint_limits("torque_max")
+    return np.minimum(GAIN * largest, FASTEST**2 * joint_inertia(job))
+
+
+def pad_stiffness(job: Job) -> float:
+    """Return the stiffness of each arm at its pad along the normal that the gains make [N/m].
+
+    With compliances c_i = n' J K^-1 J' n of both arms in series it is 2 / (c_1 + c_2), the largest
+    along the job.
+    """
+    gains, compliance = joint_stiffness(job), np.array([0.0])
+    first = len(job.joint_names[0])
+    for arm, robot in enumerate(job.workcell.robots):
+        span = slice(0, first) if arm == 0 else slice(first, None)
+        q = np.concatenate([phase.motion.q[::MODEL_STRIDE, span] for phase in job.held])
+        along = robot.T_flange_pad[:3, 2] @ pad_jacobians(job.workcell, arm, q)[:, :3]
+        compliance = compliance + (along**2 / gains[span]).sum(axis=1)
+    return float(2.0 / compliance.min())
+
+
+def torque_files(export: Export) -> dict[str, str | bytes]:
+    """Return the programs, the controllers, and `config/cell.json` with what the driver needs.
+
+    Raises:
+        SettingsError: a torque changes faster than libfranka takes.
+    """
+    driver = driver_of(export.workcell)
+    if driver == "simulation":
+        joints = ros_joints(export.workcell)
+        files: dict[str, str | bytes] = {
+            "description/cell.urdf": description(export.workcell, export.sampled.q[0]),
+            "config/controllers.yaml": _controllers(export, driver, joints, {}),
+        }
+        known = [dict[str, Any]()]
+    else:
+        known, files, begin = [], {}, 0
+        for arm in (0, 1):
+            values, broadcasters = (_franka if driver == "franka" else _ur)(export, arm)
+            known.append(values)
+            joints = {name: begin + k for k, name in enumerate(export.ros_joints(arm))}
+            begin += len(joints)
+            text = _controllers(export, driver, joints, broadcasters)
+            files[f"config/controllers_{arm + 1}.yaml"] = text
+    config: dict[str, Any] = {}
+    for values in known:
+        for name, entries in json.loads(filled(f"cell_{driver}.json", **values)).items():
+            config[name] = config.get(name, []) + entries if isinstance(entries, list) else entries
+    usual = {"simulated": driver == "simulation", "lag": export.lag, "step": export.step}
+    return {
+        "job.json": job_text(export),
+        "config/cell.json": json.dumps(usual | config, indent=1, allow_nan=False) + "\n",
+        "run_job.py": program("run_job.py"),
+        "carry_job.py": program("carry_job.py"),
+        f"launch/{driver}.launch.py": program("cell.launch.py"),
+        **files,
+    }
+
+
+def _controllers(
+    export: Export,
+    driver: str,
+    joints: Mapping[str, int],
+    broadcasters: Mapping[str, Mapping[str, Any]],
+) -> str:
+    """Return the parameters of a controller manager and its controllers, as JSON, which is YAML.
+
+    Args:
+        joints: names in ROS by their places among both arms' joints.
+        broadcasters: parameters by the names of further controllers; `type` is the manager's.
+    """
+    cell = export.workcell
+    rates = [robot.driver.rate for robot in cell.robots if robot.driver.rate is not None]
+    stiffness, inertia = joint_stiffness(export.job), joint_inertia(export.job)
+    damping = 2.0 * DAMPING * np.sqrt(stiffness * inertia)
+    gains = {n: {"p": float(stiffness[k]), "d": float(damping[k])} for n, k in joints.items()}
+    carry = {
+        "type": "joint_trajectory_controller/JointTrajectoryController",
+        "joints": list(joints),
+        "command_interfaces": ["effort"],
+        "state_interfaces": ["position", "velocity"],
+        "interpolate_from_desired_state": True,
+        "allow_nonzero_velocity_at_trajectory_end": False,
+        "action_monitor_rate": 100.0,
+        # It never gives up by itself: what it holds then presses with no effort. run_job.py
+        # monitors the arms.
+        "constraints": {"stopped_velocity_tolerance": 0.0, "goal_time": 0.0},
+        "gains": gains,
+    }
+    states = {"type": "joint_state_broadcaster/JointStateBroadcaster"}
+    known = {"joint_state_broadcaster": states, **broadcasters, CONTROLLER: carry}
+    manager: dict[str, Any] = {n: {"type": values["type"]} for n, values in known.items()}
+    manager["update_rate"] = round(min(rates, default=RATES[driver]))
+    found: dict[str, Any] = {"controller_manager": {"ros__parameters": manager}}
+    for name, values in known.items():
+        own = {key: value for key, value in values.items() if key != "type"}
+        found |= {name: {"ros__parameters": own}} if own else {}
+    return json.dumps({"/**": found}, indent=1, allow_nan=False) + "\n"
+
+
+def joint_inertia(job: Job) -> Array:
+    """Return the mean inertia (joints,) that each motor feels along the job, arm and tool alone.
+
+    Diagonal elements of the joint-space inertia matrix [kg m^2, kg].
+    """
+    found, begin = [], 0
+    for robot, joints in zip(job.workcell.robots, job.joint_names, strict=True):
+        model = build_robot_model(robot).model
+        data, span = model.createData(), slice(begin, begin + len(joints))
+        q = np.concatenate([phase.motion.q[::MODEL_STRIDE, span] for phase in job.phases])
+        found.append(np.mean([np.diag(pin.crba(model, data, row)) for row in q], axis=0))
+        begin += len(joints)
+    return np.concatenate(found)
+
+
+def _values(export: Export, arm: int) -> dict[str, Any]:
+    """Return what the templates of all drivers fill in for an arm."""
+    robot, prefix = export.workcell.robots[arm], prefixes(export.workcell)[arm]
+    mass, centre = export.tool_load(arm)
+    spaces = [prefix.rstrip("_") for prefix in prefixes(export.workcell)]
+    if not all(spaces) or spaces[0] == spaces[1]:
+        spaces = ["arm_1", "arm_2"]
+    return {
+        "arm": arm,
+        "number": arm + 1,
+        "space": spaces[arm],
+        "prefix": prefix,
+        "address": json.dumps(robot.driver.address),
+        "axis": robot.T_flange_pad[:3, 2].tolist(),
+        "mass": mass,
+        "centre": centre.tolist(),
+        "centre_of_gravity": json.dumps(dict(zip("xyz", centre.tolist(), strict=True))),
+    }
+
+
+def _franka(export: Export, arm: int) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
+    """Return the values of an arm of Franka for its template, and its broadcasters.
+
+    Raises:
+        SettingsError: a torque changes faster than libfranka takes.
+    """
+    rate = np.abs(np.diff(export.effort - export.gravity, axis=0))
+    rate /= np.diff(export.sampled.time)[:, None]
+    if rate.max() > TORQUE_RATE:
+        raise SettingsError(
+            f"a joint torque changes by {rate.max():.0f} N m/s; libfranka takes "
+            f"{TORQUE_RATE:.0f}: limit the jerk (jerk_max), or choose a slower timing"
+        )
+    load = export.workcell.robots[arm].tool_load
+    inertia = np.zeros((3, 3)) if load is None else load.inertia
+    torque, (force, moment) = _contact(export.job, arm)
+    forces = [CONTACT * force + SPARE_FORCE] * 3 + [CONTACT * moment + SPARE_TORQUE] * 3
+    values = _values(export, arm)
+    values |= {
+        "kind": _franka_type(export.job.joint_names[arm]),
+        "prefix": values["prefix"].removesuffix("_"),
+        "inertia": inertia.T.ravel().tolist(),
+        "torques": (CONTACT * torque + SPARE_TORQUE).tolist(),
+        "forces": forces,
+    }
+    state = {
+        "type": "franka_robot_state_broadcaster/FrankaRobotStateBroadcaster",
+        "robot_type": values["kind"],
+        "arm_prefix": values["prefix"],
+    }
+    return values, {"franka_robot_state_broadcaster": state}
+
+
+def _franka_type(joints: Sequence[str]) -> str:
+    """Return the TYPE of joints TYPE_joint1 ...; '' where they are called otherwise."""
+    kind = joints[0].removesuffix("_joint1")
+    return kind if list(joints) == [f"{kind}_joint{k}" for k in range(1, 8)] else ""
+
+
+def _contact(job: Job, arm: int) -> tuple[Array, tuple[float, float]]:
+    """Return the largest values of contact: of each joint (n_joints,) [N m], force [N] and
+    moment [N m]."""
+    first = len(job.joint_names[0])
+    span = slice(0, first) if arm == 0 else slice(first, None)
+    torque = [np.abs(p.motion.contact_effort(p.force.wrench)[:, span]).max(0) for p in job.phases]
+    wrench = np.concatenate([phase.force.wrench[:, arm] for phase in job.phases])
+    size = [float(np.linalg.norm(part, axis=1).max()) for part in (wrench[:, :3], wrench[:, 3:])]
+    return np.max(torque, axis=0), (size[0], size[1])
+
+
+def _ur(export: Export, arm: int) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
+    """Return the values of an arm of Universal Robots for its template, and its broadcasters."""
+    found = re.search(UR_TYPE, described(export.workcell.robots[arm]))
+    values = _values(export, arm)
+    prefix = values["prefix"]
+    wrench = {
+        "type": "force_torque_sensor_broadcaster/ForceTorqueSensorBroadcaster",
+        "sensor_name": f"{prefix}tcp_fts_sensor",
+        "state_interface_names": [f"{k}.{a}" for k in ("force", "torque") for a in "xyz"],
+        "frame_id": f"{prefix}tool0_controller",
+    }
+    status = {"type": "ur_controllers/GPIOController", "tf_prefix": prefix}
+    broadcasters = {"force_torque_sensor_broadcaster": wrench, "io_and_status_controller": status}
+    return values | {"kind": found.group() if found else "ur10e"}, broadcasters

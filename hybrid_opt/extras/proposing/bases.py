@@ -1,0 +1,368 @@
+"""Where two robots may stand: places beside the carry, compared by how well the arms follow it, and
+by how many ways they follow on which the box alone goes around what stands in between.
+
+Heights are those of the file, or the world's zero: what a robot stands on is built by people.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import product
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hybrid_opt.extras.proposing.holding import (
+    ArmKinematics,
+    Hold,
+    HoldQuery,
+    find_holds,
+    shoulder_positions,
+)
+from hybrid_opt.extras.proposing.problem import Problem
+from hybrid_opt.extras.proposing.setup import redundancy
+from hybrid_opt.extras.proposing.trial import PayloadSceneChecker
+from symbolic.array import Array
+from symbolic.geometry.bodies import WORLD, MeshReader, collision_bodies, shape_pieces
+from symbolic.geometry.pairs import coal_distance
+from symbolic.geometry.pieces import Piece
+from symbolic.read.cell import stretched_length
+from symbolic.read.editing import merged
+from symbolic.records import Cylinder, Workcell
+from symbolic.records.poses import box_placement, inverse, pose_matrix, transform
+
+DISTANCES = (0.35, 0.45, 0.55, 0.65, 0.75)
+"""Distances of a base from the middle of its contact's way, sideways, in stretched arms."""
+
+MACHINE_DISTANCES = (0.28, 0.34, 0.40, 0.46, 0.52)
+"""Distances of the line through a machine's shoulders from the middle of the carry, likewise."""
+
+BASE_SHIFTS = (0.0, -0.2, 0.2)
+"""Shifts of a base along the carry, likewise."""
+
+BEHIND = 0.05
+"""A machine's arms reach ahead if they do so by this much in the mean of their postures, in the
+stretched arm's length."""
+
+REACH_MEAN_POSTURES = 500
+"""Postures in that mean."""
+
+MOST_CHOICES = 6
+"""Pairs of bases that are handed on."""
+
+PLACE_STARTS = 192
+"""Random postures by which a place is judged."""
+
+EVERY_SPIN = 2
+"""Stride among the pads' spins by which it is judged."""
+
+GUIDES_TRIED = 2
+"""Guides by which it is judged."""
+
+FOOT = Cylinder(0.12, 0.20)
+"""Foot that stands on the ground at a base and may touch nothing else [m]."""
+
+ROOMY = 4.0
+"""Score if both arms follow the box along all of them."""
+
+ABOVE = 0.02
+"""How far above its floor a robot is looked at [m]."""
+
+HIDDEN = 2.0
+"""Cost if something stands between a shoulder and its contact."""
+
+ARM_RADIUS = 0.05
+"""Radius of the arm that must fit between them [m]."""
+
+LIFT_HEIGHT = 0.03
+"""How far the box is lifted off what it stands on, and lowered in the end [m]."""
+
+ASIDE = (0.15, 0.25, 0.40)
+"""How far it goes aside, level in eight directions or up [m]."""
+
+POSES = 33
+"""Poses along a detour."""
+
+
+def base_choices(problem: Problem, spins: Array, rng: np.random.Generator) -> list[dict[str, Any]]:
+    """Return additions to a problem's tables that give both robots a base, best first; both the
+    same if they are arms of one machine.
+
+    Args:
+        spins: of both pads that are tried [rad].
+    """
+    found: list[tuple[float, dict[str, Any]]] = []
+    for side in problem.sides():
+        found += _scored(side, spins, rng)
+    found.sort(key=lambda item: -item[0])
+    return [choice for _, choice in found[:MOST_CHOICES]]
+
+
+def _scored(
+    problem: Problem, spins: Array, rng: np.random.Generator
+) -> list[tuple[float, dict[str, Any]]]:
+    """Score such additions for given contacts."""
+    draft = draft_of(problem)
+    scorer = PlaceScorer(problem, draft, spins, rng)
+    if problem.is_machine:
+        found = []
+        for base in machine_places(problem, draft):
+            first = scorer.place(0, base)
+            second = None if first is None else scorer.place(1, base)
+            if first is not None and second is not None:
+                value = min(first.value, second.value) + shared_room(first, second)
+                found.append((value, _standing(problem, [base] * 2)))
+        return found
+    best: list[list[RankedBase]] = []
+    for arm in (0, 1):
+        tried = [scorer.place(arm, base) for base in _places(problem, draft, arm)]
+        places = [place for place in tried if place is not None]
+        places.sort(key=lambda place: -place.value)
+        best.append(places[:3])
+    return [
+        (
+            first.value + second.value + shared_room(first, second),
+            _standing(problem, [first.base, second.base]),
+        )
+        for first, second in product(*best)
+    ]
+
+
+def draft_of(problem: Problem) -> Workcell:
+    """Build the cell with its robots anywhere and its redundant joints chosen."""
+    sides = [_sideways(problem, arm) for arm in (0, 1)]
+    near = [_base(problem, k, at + 0.4 * out, out) for k, (at, out) in enumerate(sides)]
+    if problem.is_machine:
+        near = [(near[0] + near[1]) / 2.0] * 2
+    given = _standing(problem, near)
+    return problem.workcell(merged(given, redundancy(problem, problem.workcell(given))))
+
+
+def _standing(problem: Problem, bases: list[Array]) -> dict[str, Any]:
+    robots = [
+        {"base": {"xyz": np.round(base[:3], 4).tolist(), "rpy": np.round(base[3:], 6).tolist()}}
+        for base in bases
+    ]
+    return {"contacts": problem.contacts, "robots": robots}
+
+
+def _sideways(problem: Problem, arm: int) -> tuple[Array, Array]:
+    """Compute the middle (3,) of the path of a robot's contact and the outward direction (3,)."""
+    point = np.append(np.array(problem.contacts[arm]["xyz"], dtype=float), 1.0)
+    ends = [(box_placement(problem.orientation, pose) @ point)[:3] for pose in problem.poses]
+    middle = (ends[0] + ends[1]) / 2.0
+    centre = (problem.poses[0][:3] + problem.poses[1][:3]) / 2.0
+    outwards = (middle - centre) * [1.0, 1.0, 0.0]
+    length = float(np.linalg.norm(outwards))
+    return middle, outwards / length if length > 1e-9 else np.array([0.0, 1.0 - 2.0 * arm, 0.0])
+
+
+def _base(problem: Problem, arm: int, point: Array, outwards: Array) -> Array:
+    """Compute the base (6,) on the ground below a point, facing the carry."""
+    given = problem.data["robots"][arm].get("base", {}).get("xyz", [0.0, 0.0, 0.0])
+    yaw = float(np.arctan2(-outwards[1], -outwards[0]))
+    return np.array([point[0], point[1], float(given[2]), 0.0, 0.0, yaw])
+
+
+def _places(problem: Problem, draft: Workcell, arm: int) -> list[Array]:
+    middle, outwards = _sideways(problem, arm)
+    _, length = stretched_length(draft.robots[arm])
+    along = np.cross(outwards, [0.0, 0.0, 1.0])
+    return [
+        _base(problem, arm, middle + length * (away * outwards + shift * along), outwards)
+        for away, shift in product(DISTANCES, BASE_SHIFTS)
+    ]
+
+
+def machine_places(problem: Problem, draft: Workcell) -> list[Array]:
+    """Compute bases (6,) of a machine with both arms: the line through its shoulders along the line
+    through both contacts, the carry where its arms reach."""
+    own = inverse(draft.robots[0].T_world_base)
+    at = [(own @ np.append(point, 1.0))[:3] for point in shoulder_positions(draft.robots)]
+    middle, outwards = _sideways(problem, 0)
+    middle = (middle + _sideways(problem, 1)[0]) / 2.0
+    across = at[0] - at[1]
+    yaw = float(np.arctan2(outwards[1], outwards[0]) - np.arctan2(across[1], across[0]))
+    R = pose_matrix(np.zeros(3), np.array([0.0, 0.0, yaw]))[:3, :3]
+    ahead = np.cross(outwards, [0.0, 0.0, 1.0])
+    length = min(stretched_length(robot)[1] for robot in draft.robots)
+    height = float(problem.data["robots"][0].get("base", {}).get("xyz", [0.0, 0.0, 0.0])[2])
+    towards = float(ahead @ R @ _mean_reach(draft, at))
+    found = []
+    for away, side in product(MACHINE_DISTANCES, (1.0, -1.0)):
+        if side * towards < -BEHIND * length:
+            continue
+        point = middle - side * away * length * ahead - R @ (at[0] + at[1]) / 2.0
+        found.append(np.array([point[0], point[1], height, 0.0, 0.0, yaw]))
+    return found
+
+
+def _mean_reach(draft: Workcell, at: list[Array]) -> Array:
+    """Compute the mean vector (3,) from a machine's shoulders to its arms' last joints over random
+    postures of both, in the base frame [m]."""
+    rng, reaches = np.random.default_rng(0), []
+    for arm in (0, 1):
+        kinematics = ArmKinematics(draft, arm)
+        _, T = kinematics.chain(kinematics.drawn(REACH_MEAN_POSTURES, rng))
+        own = inverse(draft.robots[arm].T_world_base)
+        reaches.append((own @ T.mean(axis=0)[:, 3])[:3] - at[arm])
+    return np.asarray((reaches[0] + reaches[1]) / 2.0)
+
+
+@dataclass(frozen=True, eq=False)
+class RankedBase:
+    """A base from which an arm follows the box.
+
+    Attributes:
+        base: (6,) its pose.
+        value: how well.
+        follows: (k,) along which detours.
+    """
+
+    base: Array
+    value: float
+    follows: NDArray[np.bool_]
+
+
+class PlaceScorer:
+    """Compares places of robots for given contacts."""
+
+    def __init__(
+        self, problem: Problem, draft: Workcell, spins: Array, rng: np.random.Generator
+    ) -> None:
+        """Prepare both arms.
+
+        Args:
+            problem: with its contacts.
+            draft: its cell, the robots somewhere, redundant joints chosen.
+            spins: of both pads that are tried [rad].
+            rng: its only randomness.
+        """
+        self._problem, self._draft, self._rng = problem, draft, rng
+        start, goal = problem.poses
+        self._detours = free_detours(draft, start, goal)
+        own = [inverse(robot.T_world_base) for robot in draft.robots]
+        at = zip(own, shoulder_positions(draft.robots), strict=True)
+        self._shoulders = [(T @ np.append(point, 1.0))[:3] for T, point in at]
+        self._arms = [ArmKinematics(draft, arm) for arm in (0, 1)]
+        self._query = HoldQuery(start, goal, spins[::EVERY_SPIN], None, PLACE_STARTS, GUIDES_TRIED)
+        meshes = MeshReader()
+        self._environment = [
+            shape_pieces(body.shape, body.pose, body.name, meshes) for body in draft.environment
+        ]
+        self._feet = [_feet(draft, arm) for arm in (0, 1)]
+
+    def place(self, arm: int, base: Array) -> RankedBase | None:
+        """Evaluate a base (6,) for an arm; None if it cannot stand there or does not follow the
+        box."""
+        if not self._stands_free(arm, base):
+            return None
+        T = pose_matrix(base[:3], base[3:])
+        kinematics = self._arms[arm].moved(T)
+        holds = find_holds(self._query, kinematics, self._rng).holds
+        if not holds:
+            return None
+        hidden = self._hidden(arm, (T @ np.append(self._shoulders[arm], 1.0))[:3])
+        value = holds[0].score + 0.05 * len(holds) - HIDDEN * hidden
+        return RankedBase(base, value, self._followed(kinematics, holds))
+
+    def _stands_free(self, arm: int, base: Array) -> bool:
+        """Return True if no environment body, except its floor, is where the robot would stand."""
+        T = pose_matrix(base[:3] + np.array([0.0, 0.0, ABOVE]), base[3:])
+        feet = tuple(piece.moved(T) for piece in self._feet[arm])
+        return all(coal_distance(feet, pieces) > 0.0 for pieces in self._environment)
+
+    def _followed(self, kinematics: ArmKinematics, holds: Sequence[Hold]) -> NDArray[np.bool_]:
+        """Return (k,) True for detours along which an arm follows the box in one of these holds,
+        with fixed redundant joints."""
+        robot = self._draft.robots[kinematics.arm]
+        k, m, _ = self._detours.shape
+        if not k:
+            return np.zeros(0, dtype=bool)
+        T_world_box = box_placement(self._draft.task.orientation, self._detours.reshape(k * m, -1))
+        rows = [(T_world_box @ kinematics.held(hold.spin)).reshape(k, m, 4, 4) for hold in holds]
+        targets = np.concatenate(rows).swapaxes(0, 1)
+        q = np.repeat([hold.q_start for hold in holds], k, axis=0)
+        path, kept, measure = kinematics.follow(q, targets)
+        inside = (path >= kinematics.lower) & (path <= kinematics.upper)
+        fine = inside.all(axis=(0, 2)) & (measure.min(axis=0) >= robot.min_manipulability)
+        return np.asarray((fine & (kept == m)).reshape(len(holds), k).any(axis=0))
+
+    def _hidden(self, arm: int, shoulder: Array) -> float:
+        """Compute the share of start and goal at which the environment stands between a shoulder
+        (3,) and the robot's contact, in the horizontal plane."""
+        point = np.append(np.array(self._problem.contacts[arm]["xyz"], dtype=float), 1.0)
+        hit = 0
+        for pose in self._problem.poses:
+            T_world_box = box_placement(self._problem.orientation, pose)
+            there = (T_world_box @ point)[:3]
+            aside = there - T_world_box[:3, 3]
+            there = there + 2.0 * ARM_RADIUS * aside / max(float(np.linalg.norm(aside)), 1e-9)
+            line = (shoulder - there) * [1.0, 1.0, 0.0]
+            length = float(np.linalg.norm(line))
+            if length < ARM_RADIUS:
+                continue
+            # The cylinder's axis along the line.
+            turn = pose_matrix(np.zeros(3), [0.0, np.pi / 2.0, np.arctan2(line[1], line[0])])
+            way = Piece(Cylinder(ARM_RADIUS, length), transform(turn[:3, :3], there + line / 2.0))
+            hit += any(coal_distance((way,), pieces) <= 0.0 for pieces in self._environment)
+        return hit / 2.0
+
+
+def _feet(draft: Workcell, arm: int) -> tuple[Piece, ...]:
+    """Return the still bodies of a robot, or of its machine, and a foot, in the base frame; of a
+    machine they are listed with the first arm."""
+    robot = draft.robots[arm]
+    own = inverse(robot.T_world_base)
+    standing = [
+        piece.moved(own)
+        for body in collision_bodies(draft)
+        if body.frame == WORLD and body.name.startswith(f"{robot.name}/")
+        for piece in body.pieces
+    ]
+    return (Piece(FOOT, pose_matrix([0.0, 0.0, FOOT.length / 2.0], np.zeros(3))), *standing)
+
+
+def shared_room(first: RankedBase, second: RankedBase) -> float:
+    """Score the share of detours along which both arms follow the box."""
+    both = first.follows & second.follows
+    return ROOMY * float(both.mean()) if len(both) else 0.0
+
+
+def free_detours(workcell: Workcell, start: Array, goal: Array) -> Array:
+    """Return the detours (k, POSES, 6) that are free: up a little, aside, over to beside the goal,
+    back, down. k may be 0.
+
+    Args:
+        start, goal: (6,) box poses.
+    """
+    angles = np.arange(8) * np.pi / 4.0
+    ways = np.column_stack([np.cos(angles), np.sin(angles), np.zeros(8)])
+    ways = np.vstack([ways, [0.0, 0.0, 1.0]])
+    found = [_detour(start, goal, away * way) for away in ASIDE for way in ways]
+    straight = _detour(start, goal, np.zeros(3))
+    box = PayloadSceneChecker(workcell)
+
+    def free(path: Array) -> bool:
+        lifts = (
+            np.minimum(abs(path - path[0]).max(axis=1), abs(path - path[-1]).max(axis=1))
+            < LIFT_HEIGHT
+        )
+        return not box.meets(path[~lifts])
+
+    return np.array([path for path in (straight, *found) if free(path)]).reshape(-1, POSES, 6)
+
+
+def _detour(start: Array, goal: Array, aside: Array) -> Array:
+    lift = np.array([0.0, 0.0, LIFT_HEIGHT, 0.0, 0.0, 0.0])
+    beside = np.append(aside, np.zeros(3))
+    corners = [start, start + lift, start + lift + beside]
+    corners += [end + lift + beside * far for end, far in ((goal, 1.0), (goal, 0.0))] + [goal]
+    points = np.array(corners)
+    length = np.linalg.norm(np.diff(points[:, :3], axis=0), axis=1)
+    length[2] = max(length[2], 1e-3)  # a turn on the spot takes place there
+    along = np.concatenate([[0.0], np.cumsum(np.maximum(length, 1e-9))])
+    places = np.linspace(0.0, along[-1], POSES)
+    return np.column_stack([np.interp(places, along, points[:, k]) for k in range(6)])

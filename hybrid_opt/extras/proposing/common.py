@@ -1,0 +1,85 @@
+"""Positions of the joints that move both arms of a machine, drawn once for both."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from itertools import product
+
+import numpy as np
+
+from hybrid_opt.extras.proposing.holding import (
+    LIMIT_MARGIN,
+    REACHED,
+    SEARCH_DAMPING,
+    ArmKinematics,
+    HoldQuery,
+    possible_spins,
+)
+from symbolic.array import Array
+from symbolic.records.poses import box_placement
+
+COMPARED_POSITIONS = 64
+"""Positions that are compared."""
+
+COMPARED_STARTS = 24
+"""Random postures of either arm by which one is compared."""
+
+REACHING_STEPS = 25
+"""Newton steps from these."""
+
+MOVED = 4
+"""Positions at the start, and at the goal, among which common joints may move."""
+
+MOVE_COST = 0.05
+"""Share of reaching postures that a radian, or a metre, of their motion has to be worth."""
+
+
+def common_positions(
+    arms: Sequence[ArmKinematics], query: HoldQuery, rng: np.random.Generator
+) -> Iterator[Array | None]:
+    """Yield positions (2, k) of the common joints at the start and at the goal: that at which a
+    locked joint is held, then the most promising first; None once if there are no common joints.
+
+    A position is as promising as the share of random postures from which both arms reach the box
+    with it, within their limits and away from singular postures.
+    """
+    if not arms[0].common:
+        yield None
+        return
+    spans = [arm.span[:, arm.common] for arm in arms]
+    low, high = np.maximum(spans[0][0], spans[1][0]), np.minimum(spans[0][1], spans[1][1])
+    held = np.clip(0.0, low, high)
+    yield np.array([held, held])
+    drawn = rng.uniform(low, high, (COMPARED_POSITIONS - 2, len(low)))
+    positions = np.vstack([held, (low + high) / 2.0, drawn])
+    start, goal = (
+        np.min([_reaching(arm, pose, query.spins, positions, rng) for arm in arms], axis=0)
+        for pose in (query.start, query.goal)
+    )
+    ways = {(k, k) for k in range(COMPARED_POSITIONS)}
+    ways |= set(product(np.argsort(-start)[:MOVED].tolist(), np.argsort(-goal)[:MOVED].tolist()))
+
+    def promise(way: tuple[int, int]) -> float:
+        move = float(np.linalg.norm(positions[way[1]] - positions[way[0]]))
+        return float(min(start[way[0]], goal[way[1]])) - MOVE_COST * move
+
+    ordered = sorted(ways - {(0, 0)}, key=lambda way: (-promise(way), way))
+    found = [way for way in ordered if min(start[way[0]], goal[way[1]]) > 0.0]
+    yield from (positions[list(way)] for way in found)
+
+
+def _reaching(
+    arm: ArmKinematics, pose: Array, spins: Array, positions: Array, rng: np.random.Generator
+) -> Array:
+    """Compute the share (n,) of random postures that reach the box (6,) with each of the positions
+    (n, k) of the common joints."""
+    T_world_box = box_placement(arm.workcell.task.orientation, pose)
+    possible = possible_spins(arm.workcell.contacts[arm.arm], spins)
+    targets = np.array([T_world_box @ arm.held(spin) for spin in possible])
+    q = arm.drawn(len(positions) * COMPARED_STARTS, rng)
+    q[:, arm.common] = np.repeat(positions, COMPARED_STARTS, axis=0)
+    found = arm.solve(q, targets[np.arange(len(q)) % len(targets)], REACHING_STEPS, SEARCH_DAMPING)
+    q = found.q + np.vstack([arm.central(row[None, None])[0] for row in found.q])
+    inside = (q >= arm.lower + LIMIT_MARGIN) & (q <= arm.upper - LIMIT_MARGIN)
+    fine = inside.all(axis=1) & (found.residual <= REACHED) & (found.manipulability >= arm.least)
+    return np.asarray(fine.reshape(-1, COMPARED_STARTS).mean(axis=1))

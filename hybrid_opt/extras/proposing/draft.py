@@ -1,0 +1,140 @@
+"""A path as it was found, and the changes of a problem file that write it down."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from hybrid_opt.extras.proposing.bounds import Bounds
+from hybrid_opt.extras.proposing.decimals import (
+    joint_limits,
+    limits_around,
+    pose_limits,
+    readable_turns,
+    rounded_outwards,
+)
+from hybrid_opt.extras.proposing.problem import DRAFT_ROOM, Problem
+from symbolic.array import Array
+from symbolic.read.editing import merged
+from symbolic.records import POSE_SIZE, Workcell
+
+UNIT = np.array([0.10, 0.10, 0.10, 0.08, 0.08, 0.08])
+"""Half-widths of a pose that are scaled together [m, rad]."""
+
+REDUNDANT_UNIT = 0.15
+"""Half-width of a redundant joint's value [rad or m]."""
+
+CARRY_DECIMALS = 5
+"""Decimals of a carry in a file [m, rad]: a hundredth of a millimetre."""
+
+
+@dataclass(frozen=True, eq=False)
+class Draft:
+    """A path as found, and the cell it was found in.
+
+    Attributes:
+        workcell: the cell that it was found in, with its redundant joints chosen.
+        spins: of both pads, beside those of the file [rad].
+        branches: of both robots, -1 where they are not known yet.
+        waypoints: (n, 6 + m) extended poses, start and goal included.
+        given: what was added to the problem's tables before, such as bases.
+        bounds: of the decision vector, None where they are not known yet.
+        stand_off: of the pads [m]; None where the usual one is free, or none that was tried.
+    """
+
+    workcell: Workcell
+    spins: tuple[float, float]
+    branches: tuple[int, int]
+    waypoints: Array
+    given: dict[str, Any] = field(default_factory=dict)
+    bounds: Bounds | None = None
+    stand_off: float | None = None
+
+    @property
+    def via(self) -> Array:
+        """(n - 2, 6) poses between start and goal."""
+        return self.waypoints[1:-1, :POSE_SIZE]
+
+    def around(self, centre: Array) -> Draft:
+        """Return the draft with another decision vector as its carry."""
+        m = len(self.workcell.task.redundant)
+        return replace(self, waypoints=_as_waypoints(centre, self.waypoints, m))
+
+
+def changes(problem: Problem, found: Draft) -> dict[str, Any]:
+    """Return the additions that complete the problem's tables."""
+    poses = readable_turns(found.waypoints[:, :POSE_SIZE], found.workcell.task.orientation)
+    waypoints = np.hstack([poses, found.waypoints[:, POSE_SIZE:]])
+    lower, upper = _boxes(found, waypoints)
+    task: dict[str, Any] = {
+        "initial": _plain(np.round(poses[1:-1], CARRY_DECIMALS)),
+        "waypoints": [
+            {"lower": _plain(low), "upper": _plain(high)}
+            for low, high in zip(lower[1:-1, :6], upper[1:-1, :6], strict=True)
+        ],
+    }
+    if found.workcell.task.redundant:
+        task["redundant"] = [
+            {
+                "joint": joint.name,
+                "initial": _plain(np.round(waypoints[:, POSE_SIZE + k], CARRY_DECIMALS)),
+                "lower": _plain(lower[:, POSE_SIZE + k]),
+                "upper": _plain(upper[:, POSE_SIZE + k]),
+            }
+            for k, joint in enumerate(found.workcell.task.redundant)
+        ]
+    robots: list[dict[str, Any]] = []
+    contacts: list[dict[str, Any]] = []
+    for i, robot in enumerate(found.workcell.robots):
+        entry: dict[str, Any] = {"start_branch": found.branches[i]}
+        if robot.redundant_joints:
+            entry["redundant_joints"] = list(robot.redundant_joints)
+        robots.append(entry)
+        spin = float(problem.data["contacts"][i].get("spin", 0.0)) + found.spins[i]
+        contacts.append(
+            {
+                **found.given.get("contacts", problem.contacts)[i],
+                "spin": round(float(np.remainder(spin + np.pi, 2 * np.pi) - np.pi), 9),
+            }
+        )
+    chosen: dict[str, Any] = {"robots": robots, "contacts": contacts, "task": task}
+    if found.stand_off is not None:
+        chosen["handling"] = {"stand_off": found.stand_off}
+    whole: dict[str, Any] = merged(found.given, chosen)
+    return whole
+
+
+def decision_bounds(workcell: Workcell) -> tuple[Array, Array]:
+    """Compute half-widths (n_var,) that are scaled together, and limits (2, n_var) of bounds around
+    the workcell's hand-made trajectory."""
+    task, n = workcell.task, len(workcell.task.waypoints)
+    poses = [pose_limits(pose, task.orientation) for pose in task.initial]
+    joints = np.repeat(joint_limits(workcell), n, axis=1)
+    unit = [np.tile(UNIT, len(poses)), np.full(joints.shape[1], REDUNDANT_UNIT)]
+    return np.concatenate(unit), np.hstack([*poses, joints])
+
+
+def _boxes(found: Draft, waypoints: Array) -> Array:
+    """Compute bounds (2, n, 6 + m) of waypoints (n, 6 + m), with decimals that the reader takes."""
+    bounds = np.array([waypoints - DRAFT_ROOM, waypoints + DRAFT_ROOM])
+    if found.bounds is not None:
+        both, m = (found.bounds.lower, found.bounds.upper), len(found.workcell.task.redundant)
+        bounds = np.array([_as_waypoints(side, waypoints, m) for side in both])
+    return rounded_outwards(bounds, limits_around(found.workcell, waypoints))
+
+
+def _as_waypoints(x: Array, waypoints: Array, m: int) -> Array:
+    """Compute extended waypoints (n, 6 + m) of a decision vector in which everything between the
+    ends, and all values of redundant joints, is free."""
+    n = len(waypoints)
+    placed = waypoints.copy()
+    placed[1:-1, :POSE_SIZE] = x[: POSE_SIZE * (n - 2)].reshape(n - 2, POSE_SIZE)
+    placed[:, POSE_SIZE:] = x[POSE_SIZE * (n - 2) :].reshape(m, n).T
+    return placed
+
+
+def _plain(values: Array) -> Any:
+    """Convert to lists of numbers, none of them -0.0."""
+    return (values + 0.0).tolist()

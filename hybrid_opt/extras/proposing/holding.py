@@ -1,0 +1,664 @@
+"""The ways in which an arm can hold the box: spins of its pad, postures, and where they lead.
+
+Many postures of one arm are worked out at once, in NumPy side by side, because spins, bases and
+branches are compared before anything is compiled.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from hybrid_opt.extras.proposing.trial import PoseJudge
+from symbolic.array import Array
+from symbolic.geometry.bodies import WORLD, ArmGeometry, Frame, arm_geometry
+from symbolic.geometry.pairs import coal_distance
+from symbolic.read.arms import arm_model, common_joints
+from symbolic.records import Contact, Robot, Workcell
+from symbolic.records.poses import box_placement, inverse, pose_matrix
+
+REACHED = 1e-6
+"""Pose residual of a reached posture [m, rad]."""
+
+STEP_LIMIT = 0.4
+"""Largest change of a joint in one step [rad]."""
+
+TRACKING_STEPS = 4
+"""Newton steps from one pose of a path to the next."""
+
+DRIFT_SHARE = 0.03
+"""Share of the way to the middle of their ranges that joints drift from pose to pose."""
+
+GUIDE_POSES = 25
+"""Poses of a guide that postures are followed along."""
+
+JUMP = 0.5
+"""Largest change of a joint between poses of a path [rad]."""
+
+
+@dataclass(frozen=True)
+class Postures:
+    """n postures of one arm.
+
+    Attributes:
+        q: (n, joints) [rad or m].
+        residual: (n,) from the pose that was wanted [m, rad].
+        determinant: (n,) det J of the joints that follow [m^3]; where its sign changes along a
+            path, the arm passes a singular posture.
+    """
+
+    q: Array
+    residual: Array
+    determinant: Array
+
+    @property
+    def manipulability(self) -> Array:
+        """(n,) abs(det J) [m^3]."""
+        return np.abs(self.determinant)
+
+
+class ArmKinematics:
+    """One arm of a cell as numbers.
+
+    Attributes:
+        workcell: the cell.
+        arm: index of the arm.
+        geometry: its joints.
+        redundant: indices of the joints that stay where they are; the other six follow the box.
+        common: indices of those that move the other arm too, in the order of the task.
+        lower, upper: (joints,) limits [rad or m].
+        least: manipulability of a first path.
+    """
+
+    def __init__(self, workcell: Workcell, arm: int, geometry: ArmGeometry | None = None) -> None:
+        self.workcell, self.arm = workcell, arm
+        self.geometry = geometry = geometry or arm_geometry(workcell, arm)
+        self.redundant = tuple(joint for joint, _ in workcell.task.redundant_of(arm))
+        self.common = [joint.drives[arm] for joint in workcell.task.redundant if joint.is_common]
+        self.following = [k for k in range(geometry.joints) if k not in self.redundant]
+        self.lower, self.upper = np.asarray(geometry.lower), np.asarray(geometry.upper)
+        self.least = workcell.robots[arm].min_manipulability * MANIPULABILITY_MARGIN
+
+    def moved(self, T_world_root: Array) -> ArmKinematics:
+        """Return the arm at another base."""
+        geometry = replace(self.geometry, T_world_root=T_world_root)
+        return ArmKinematics(self.workcell, self.arm, geometry)
+
+    def held(self, spin: float = 0.0) -> Array:
+        """Compute T_box_joint (4, 4): the last joint of the arm in the frame of the box that it
+        holds, its pad turned about its normal by an angle [rad]."""
+        contact = self.workcell.contacts[self.arm]
+        # The geometry's own contact is replaced by the one asked for.
+        T_pad_joint = inverse(contact.T_box_pad) @ inverse(self.geometry.T_joint_box)
+        return np.asarray(rotate_about_normal(contact, spin).T_box_pad @ T_pad_joint)
+
+    @property
+    def span(self) -> Array:
+        """(2, joints) the limits, within half a turn either way [rad or m]."""
+        return np.array([np.maximum(self.lower, -np.pi), np.minimum(self.upper, np.pi)])
+
+    def drawn(self, count: int, rng: np.random.Generator) -> Array:
+        """Draw random postures (count, joints) within `span` [rad or m]."""
+        low, high = self.span
+        return rng.uniform(low, high, (count, len(low)))
+
+    def chain(self, q: Array) -> tuple[Array, Array]:
+        """Compute origins and axes (n, joints, 6) of the joints and the last joint's placement (n,
+        4, 4), in the world."""
+        n, arm = len(q), self.geometry
+        T = np.broadcast_to(arm.T_world_root, (n, 4, 4))
+        points, axes = np.empty((n, arm.joints, 3)), np.empty((n, arm.joints, 3))
+        for k in range(arm.joints):
+            T = T @ arm.origins[k]
+            moved = np.zeros((n, 4, 4))
+            moved[:, 3, 3] = 1.0
+            axis = arm.axes[k]
+            if arm.turning[k]:
+                moved[:, :3, :3] = _turns(axis, q[:, k])
+            else:
+                moved[:, :3, :3] = np.eye(3)
+                moved[:, :3, 3] = q[:, k, None] * axis
+            points[:, k], axes[:, k] = T[:, :3, 3], T[:, :3, :3] @ axis
+            T = T @ moved
+        return np.concatenate([points, axes], axis=2), T
+
+    def jacobian(self, frames: Array, T: Array) -> Array:
+        """Compute the Jacobian (n, 6, joints) of the last joint's origin, world axes, from the
+        results of `chain`."""
+        points, axes = frames[:, :, :3], frames[:, :, 3:]
+        turning = np.array(self.geometry.turning)[:, None]
+        across = np.cross(axes, T[:, None, :3, 3] - points)
+        linear = np.where(turning, across, axes)
+        return np.concatenate([linear, np.where(turning, axes, 0.0)], axis=2).transpose(0, 2, 1)
+
+    def side(self, q: Array) -> float:
+        """Return the sign of det J in a posture (joints,): a path on which it changes passes a
+        singular posture."""
+        return float(
+            np.sign(np.linalg.det(self.jacobian(*self.chain(q[None]))[0][:, self.following]))
+        )
+
+    def solve(self, q: Array, target: Array, steps: int, damping: float = 0.0) -> Postures:
+        """Solve postures (n, joints) by Newton's method for placements (n, 4, 4) of the last joint.
+
+        Args:
+            damping: 0 for pure Newton steps; small values keep far starts on course.
+        """
+        q = np.array(q, dtype=float)
+        for step in range(steps + 1):
+            frames, T = self.chain(q)
+            J = self.jacobian(frames, T)[:, :, self.following]
+            error, residual = _error(target, T)
+            if step == steps or float(residual.max(initial=0.0)) < REACHED / 10.0:
+                break
+            normal = np.einsum("nki,nkj->nij", J, J)
+            normal += (damping * np.minimum(residual, 1.0) ** 2 + 1e-12)[:, None, None] * np.eye(6)
+            right = np.einsum("nki,nk->ni", J, error)[..., None]
+            move = np.linalg.solve(normal, right)[..., 0]
+            most = np.maximum(np.abs(move).max(axis=1, keepdims=True), STEP_LIMIT)
+            q[:, self.following] += move * (STEP_LIMIT / most)
+        return Postures(q, residual, np.linalg.det(J))
+
+    def track(self, q: Array, target: Array, held: Sequence[int] = ()) -> Postures:
+        """Find the next posture (n, joints) at placements (n, 4, 4), all joints but those held
+        moving: steps of least norm that drift to the middle of the joints' ranges where the box
+        leaves them free."""
+        q = np.array(q, dtype=float)
+        middle = (self.lower + self.upper) / 2.0
+        moving = np.isin(np.arange(q.shape[1]), held, invert=True)
+        for step in range(TRACKING_STEPS + 1):
+            frames, T = self.chain(q)
+            J = self.jacobian(frames, T)
+            error, residual = _error(target, T)
+            if step == TRACKING_STEPS:
+                break
+            own = J * moving
+            inverted = own.transpose(0, 2, 1) @ np.linalg.inv(
+                own @ own.transpose(0, 2, 1) + 1e-9 * np.eye(6)
+            )
+            drift = DRIFT_SHARE * (middle - q) * moving if step == 0 else np.zeros_like(q)
+            missing = error - np.einsum("nij,nj->ni", own, drift)
+            q += drift + np.einsum("nij,nj->ni", inverted, missing)
+        return Postures(q, residual, np.linalg.det(J[:, :, self.following]))
+
+    def follow(
+        self, q: Array, targets: Array, ends: Array | None = None, resolved: bool = False
+    ) -> tuple[Array, NDArray[np.intp], Array]:
+        """Compute postures (n, joints) that follow placements (m, 4, 4) of the last joint.
+
+        Args:
+            targets: one path for all, or one for each, (m, n, 4, 4).
+            ends: (n, redundant) where the redundant joints are at the end; None: they stay.
+            resolved: whether they go where the joints keep to the middle of their ranges instead;
+                common ones only without `ends`.
+
+        Returns:
+            Joint paths (m, n, joints); of each posture the number of placements that it reached
+            without a jump; manipulability (m, n), negative beyond a singular posture.
+        """
+        m, n = len(targets), len(q)
+        path, measure = np.tile(q, (m, 1, 1)), np.zeros((m, n))
+        kept, alive = np.zeros(n, dtype=np.intp), np.arange(n)
+        change, redundant, side = np.zeros_like(q), list(self.redundant), np.ones(n)
+        for k, target in enumerate(targets):
+            before = path[max(k - 1, 0), alive]
+            guess = before + change
+            if ends is not None:
+                begin = q[alive][:, redundant]
+                guess[:, redundant] = begin + (ends[alive] - begin) * (k / max(m - 1, 1))
+            there = np.broadcast_to(target, (n, 4, 4))[alive]
+            if resolved:
+                held = [] if ends is None else self.common
+                placed = before.copy()
+                placed[:, held] = guess[:, held]
+                found = self.track(placed, there, held)
+            else:
+                found = self.solve(guess, there, TRACKING_STEPS)
+            near = np.abs(found.q - before).max(axis=1) <= JUMP
+            on = (found.residual <= REACHED) & near
+            alive, change = alive[on], found.q[on] - before[on] if k else change[on]
+            path[k:, alive] = found.q[on]
+            kept[alive] += 1
+            side = side[on] if k else np.sign(found.determinant[on])
+            measure[k, alive] = found.determinant[on] * side
+        return path, kept, measure
+
+    def central(self, path: Array) -> Array:
+        """Compute the full turns (n, joints) [rad] that bring joint paths (m, n, joints) nearest to
+        the middle of the limits; zero for prismatic joints."""
+        middle = (self.lower + self.upper) / 2.0
+        turns = np.round((middle - (path.min(axis=0) + path.max(axis=0)) / 2.0) / (2.0 * np.pi))
+        free = np.array(self.geometry.turning)
+        free[list(self.redundant)] = False
+        return np.asarray(2.0 * np.pi * turns * free)
+
+
+def rotate_about_normal(contact: Contact, spin: float) -> Contact:
+    """Return a contact with its pad turned about its normal by an angle [rad]."""
+    turn = pose_matrix(np.zeros(3), np.array([0.0, 0.0, spin]))
+    return replace(contact, T_box_pad=contact.T_box_pad @ turn)
+
+
+def shoulder_positions(robots: tuple[Robot, Robot]) -> Array:
+    """Compute the positions (2, 3) of each arm's first own joint in the world, all joints at the
+    middle of their ranges [m]."""
+    found = []
+    for robot in robots:
+        model = arm_model(robot)
+        own = [name not in common_joints(robots) for name in list(model.names)[1:]].index(True)
+        data, q = model.createData(), (robot.position_lower + robot.position_upper) / 2.0
+        pin.forwardKinematics(model, data, q)
+        found.append((robot.T_world_base @ data.oMi[own + 1].homogeneous)[:3, 3])
+    return np.array(found)
+
+
+def possible_spins(contact: Contact, spins: Array) -> Array:
+    """Return those of spins (n,) [rad] that leave a robot's patches unchanged: all of one round
+    pad, half turns of a rectangular one, only 0 if further pads stand beside the first."""
+    if contact.further:
+        return np.zeros(1)
+    if contact.half_sides is None:
+        return spins
+    return np.asarray(spins[np.abs(np.sin(spins)) < 1e-9])
+
+
+def clear_spins(query: HoldQuery, kinematics: ArmKinematics, spins: Array) -> Array:
+    """Return those of spins (n,) [rad] at which the bodies fixed to the arm's last joint, hand,
+    tool and pad, meet nothing that stands, at the start and at the goal; all of them if none is
+    free.
+
+    Within a shelf that is a few of twelve, on which all random starts are spent then.
+    """
+    if query.judge is None:
+        return spins
+    geometry = query.judge.geometry
+    last = Frame("link", kinematics.arm, kinematics.geometry.joints - 1)
+    bodies = [
+        (geometry.bodies[pair.first], geometry.bodies[pair.second]) for pair in geometry.active
+    ]
+    pairs = [
+        (a, b) if a.frame == last else (b, a)
+        for a, b in bodies
+        if last in (a.frame, b.frame) and WORLD in (a.frame, b.frame)
+    ]
+    task = kinematics.workcell.task
+    ends = box_placement(task.orientation, np.array([query.start, query.goal]))
+
+    def clear(spin: float) -> bool:
+        T_box_joint = kinematics.held(spin)
+        return all(
+            coal_distance(
+                tuple(piece.moved(end @ T_box_joint) for piece in hand.pieces), standing.pieces
+            )
+            > 0.0
+            for end in ends
+            for hand, standing in pairs
+        )
+
+    found = np.array([spin for spin in spins if clear(spin)])
+    return found if len(found) else spins
+
+
+def initial_arc(start: Array, goal: Array, bow: Array) -> Array:
+    """Compute a path (GUIDE_POSES, 6 + m) from one extended pose to another, bowing out by (3,) in
+    the middle."""
+    poses = np.linspace(start, goal, GUIDE_POSES)
+    poses[:, :3] += np.sin(np.linspace(0.0, np.pi, GUIDE_POSES))[:, None] * bow
+    return poses
+
+
+def _turns(axis: Array, angle: Array) -> Array:
+    """Compute rotations (n, 3, 3) about a unit axis (Rodrigues)."""
+    K = np.array([[0.0, -axis[2], axis[1]], [axis[2], 0.0, -axis[0]], [-axis[1], axis[0], 0.0]])
+    sine, cosine = np.sin(angle)[:, None, None], np.cos(angle)[:, None, None]
+    return np.asarray(np.eye(3) + sine * K + (1.0 - cosine) * (K @ K))
+
+
+def _error(target: Array, T: Array) -> tuple[Array, Array]:
+    """Compute Newton's right-hand side (n, 6) and the pose residual (n,)."""
+    R, R_target = T[:, :3, :3], target[:, :3, :3]
+    dR = R_target @ R.transpose(0, 2, 1)
+    axis = np.stack(
+        [dR[:, 2, 1] - dR[:, 1, 2], dR[:, 0, 2] - dR[:, 2, 0], dR[:, 1, 0] - dR[:, 0, 1]], axis=1
+    )
+    dp = target[:, :3, 3] - T[:, :3, 3]
+    turn_squared = np.sum((R_target - R) ** 2, axis=(1, 2)) / 2.0
+    residual = np.sqrt(np.sum(dp**2, axis=1) + turn_squared)
+    return np.concatenate([dp, axis / 2.0], axis=1), residual
+
+
+STARTS = 768
+"""Random starts of the search for postures."""
+
+SEARCH_STEPS = 50
+"""Newton steps of the search."""
+
+SEARCH_DAMPING = 1e-3
+"""Damping of these steps."""
+
+GUIDES = np.array(
+    [[0, 0, 0], [0, 0, 0.2], [0, 0, 0.4], [0.25, 0, 0], [-0.25, 0, 0], [0, 0.25, 0], [0, -0.25, 0]]
+)
+"""How far guides bow out from the straight line at its middle [m]; collisions do not count."""
+
+SAME_POSTURE = 0.05
+"""Postures nearer than this in every joint are one [rad], of an arm of six joints."""
+
+SAME_REDUNDANT = 0.3
+"""The same of an arm with redundant joints."""
+
+SPIN_OF_FILE = 0.1
+"""Score for keeping the spin of the file."""
+
+LENGTH_COST = 0.3
+"""Cost of the joints' way between start and goal, in a straight line [1/rad]."""
+
+ENOUGH_HOLDS = 96
+"""Ways to hold of one arm after which no further guide is tried: the first are the straightest."""
+
+MOST_HOLDS = 24
+"""Ways to hold of one arm that are kept, the best first."""
+
+LIMIT_MARGIN = 0.02
+"""Distance to joint limits of a first path [rad]."""
+
+MANIPULABILITY_MARGIN = 1.1
+"""Its least manipulability, in that of the cell."""
+
+
+@dataclass(frozen=True, eq=False)
+class Hold:
+    """One way for one arm to hold the box.
+
+    Attributes:
+        spin: beside that of the file [rad].
+        q_start, q_goal: (joints,) postures at both ends of the carry, joined by a guide.
+        score: larger is better.
+    """
+
+    spin: float
+    q_start: Array
+    q_goal: Array
+    score: float
+
+
+@dataclass
+class HoldSearch:
+    """Result of the search for ways to hold with one arm.
+
+    Attributes:
+        holds: the best first.
+        within: postures that hold the box at the start, within limits and away from singularities.
+        free: of these free of collisions.
+        joints: how often each joint was beyond its limits, by index.
+        pairs: pairs in the way at the start, or where none is led to the goal there.
+        kept: largest share of the straight line that a free posture follows.
+        stopped: why that one goes no farther.
+        manipulability: largest at the start among postures within limits [m^3].
+    """
+
+    holds: list[Hold] = field(default_factory=list)
+    within: int = 0
+    free: int = 0
+    joints: Counter[int] = field(default_factory=Counter)
+    pairs: Counter[tuple[str, str]] = field(default_factory=Counter)
+    kept: float = 0.0
+    stopped: str = ""
+    manipulability: float = 0.0
+
+
+@dataclass(frozen=True)
+class HoldQuery:
+    """What an arm has to hold.
+
+    Attributes:
+        start, goal: (6,) box poses.
+        spins: of the pad beside that of the file [rad].
+        judge: of collisions; None: they do not count.
+        starts: random starts of the search for postures.
+        guides: how many of `GUIDES` are tried.
+        common: (2, k) joints that move both arms, at the start and at the goal [rad or m]; None:
+            they are free, as the other redundant ones.
+    """
+
+    start: Array
+    goal: Array
+    spins: Array
+    judge: PoseJudge | None
+    starts: int = STARTS
+    guides: int = len(GUIDES)
+    common: Array | None = None
+
+
+def find_holds(query: HoldQuery, kinematics: ArmKinematics, rng: np.random.Generator) -> HoldSearch:
+    """Find the holds with which an arm can carry the box from start to goal, the other arm left
+    out."""
+    finder = _Finder(query, kinematics, rng)
+    found, contact = finder.found, kinematics.workcell.contacts[kinematics.arm]
+    spins = clear_spins(query, kinematics, possible_spins(contact, query.spins))
+    T_box_joint = [kinematics.held(spin) for spin in spins]
+    q, which = finder.start_postures(T_box_joint)
+    if not len(q):
+        return found
+    hit = finder.colliding(query.start, q)
+    q, which = q[~hit], which[~hit]
+    found.free = len(q)
+    finder.lead(spins[which], np.array(T_box_joint)[which], q)
+    found.holds.sort(key=lambda hold: -hold.score)
+    compared = kinematics.geometry.joints - spins_the_pad(kinematics)
+    found.holds = _diverse(found.holds, compared)[:MOST_HOLDS]
+    return found
+
+
+class _Finder:
+    """The search for one arm's ways to hold.
+
+    Attributes:
+        found: the result so far.
+    """
+
+    def __init__(
+        self, query: HoldQuery, kinematics: ArmKinematics, rng: np.random.Generator
+    ) -> None:
+        self.query, self.kinematics, self.rng = query, kinematics, rng
+        self.found = HoldSearch()
+        self._orientation = kinematics.workcell.task.orientation
+
+    def start_postures(self, T_box_joint: Sequence[Array]) -> tuple[Array, NDArray[np.intp]]:
+        """Find distinct postures at the start and the index of each one's spin."""
+        kinematics, found, start = self.kinematics, self.found, self.query.start
+        T_world_box = box_placement(self._orientation, start)
+        which = np.arange(self.query.starts) % len(T_box_joint)
+        targets = np.array([T_world_box @ T for T in T_box_joint])[which]
+        centre = (kinematics.lower + kinematics.upper) / 2.0
+        half = (kinematics.upper - kinematics.lower) / 2.0
+        half = np.where(kinematics.geometry.turning, np.minimum(half, np.pi), half)
+        q = centre + half * self.rng.uniform(-1.0, 1.0, (self.query.starts, len(half)))
+        if self.query.common is not None:
+            q[:, kinematics.common] = self.query.common[0]
+        solved = kinematics.solve(q, targets, SEARCH_STEPS, SEARCH_DAMPING)
+        good = solved.residual <= REACHED
+        q, which, measure = solved.q[good], which[good], solved.manipulability[good]
+        if not len(q):
+            return q, which
+        q = q + np.vstack([kinematics.central(row[None, None])[0] for row in q])
+        beyond = (q < kinematics.lower + LIMIT_MARGIN) | (q > kinematics.upper - LIMIT_MARGIN)
+        for joint in np.flatnonzero(beyond.any(axis=0)).tolist():
+            found.joints[joint] = int(beyond[:, joint].sum())
+        inside = ~beyond.any(axis=1)
+        found.manipulability = float(measure[inside].max(initial=0.0))
+        fine = inside & (measure >= kinematics.least)
+        q, which = q[fine], which[fine]
+        kept: list[int] = []
+        same = SAME_REDUNDANT if kinematics.redundant else SAME_POSTURE
+        for k in range(len(q)):
+            rivals = [j for j in kept if which[j] == which[k]]
+            if not rivals or np.abs(q[rivals] - q[k]).max(axis=1).min() > same:
+                kept.append(k)
+        found.within = len(kept)
+        return q[kept], which[kept]
+
+    def colliding(self, pose: Array, q: Array) -> NDArray[np.bool_]:
+        """Return (n,) True for colliding postures (n, joints) that hold the box at a pose; count
+        the pairs."""
+        judge, arm = self.query.judge, self.kinematics.arm
+        if judge is None or not len(q):
+            return np.zeros(len(q), dtype=bool)
+        hit = judge.arm_colliding(arm, np.tile(pose, (len(q), 1)), q)
+        absent = np.zeros(judge.geometry.arms[1 - arm].joints)
+        for row in np.flatnonzero(hit)[:MOST_HOLDS].tolist():
+            q_1, q_2 = (q[row], absent) if arm == 0 else (absent, q[row])
+            pair = judge.first_pair(pose, q_1, q_2, arm)
+            if pair is not None:
+                self.found.pairs[pair] += 1
+        return hit
+
+    def lead(self, spin: Array, T_box_joint: Array, q: Array) -> None:
+        """Follow postures (n, joints) along guides to the goal, until enough arrive; add those.
+
+        Args:
+            spin: (n,) of each [rad].
+            T_box_joint: (n, 4, 4) of each.
+        """
+        start, goal = self.query.start, self.query.goal
+        waiting = np.arange(len(q))
+        for bow in GUIDES[: self.query.guides]:
+            if not len(waiting) or len(self.found.holds) >= ENOUGH_HOLDS:
+                return
+            T_world_box = box_placement(self._orientation, initial_arc(start, goal, bow))
+            targets = T_world_box[:, None] @ T_box_joint[waiting]
+            arrived, path, score = self._followed(targets, q[waiting])
+            left = np.setdiff1d(np.arange(len(waiting)), arrived)
+            if self.kinematics.redundant and len(left):
+                also, path[:, left], score[left] = self._resolved(
+                    targets[:, left], q[waiting[left]]
+                )
+                arrived = np.union1d(arrived, left[also])
+            hit = self.colliding(goal, path[-1, arrived])
+            for at in arrived[~hit].tolist():
+                row = waiting[at]
+                value = float(score[at] + SPIN_OF_FILE * (spin[row] == 0.0))
+                hold = Hold(float(spin[row]), path[0, at], path[-1, at], value)
+                self.found.holds.append(hold)
+            waiting = np.delete(waiting, arrived)
+
+    def _followed(self, targets: Array, q: Array) -> tuple[NDArray[np.intp], Array, Array]:
+        """Return the rows that arrive, joint paths (m, n, joints) and scores (n,)."""
+        kinematics, redundant = self.kinematics, list(self.kinematics.redundant)
+        ends = None
+        if redundant:  # half of them keep their redundant joints, half move them elsewhere
+            ends = q[:, redundant].copy()
+            low, high = kinematics.lower[redundant], kinematics.upper[redundant]
+            moving = self.rng.random(len(q)) < 0.5
+            drawn = self.rng.uniform(low + LIMIT_MARGIN, high - LIMIT_MARGIN, ends.shape)
+            ends[moving] = np.clip(drawn, ends - 2.0, ends + 2.0)[moving]
+            self._place_common(ends)
+        path, kept, measure = kinematics.follow(q, targets, ends)
+        path = path + kinematics.central(path)
+        room = self._room(path)
+        fine = (room >= LIMIT_MARGIN) & (measure >= kinematics.least)
+        until = np.where(fine.all(axis=0), len(targets), np.argmin(fine, axis=0))
+        share = np.minimum(kept, until)
+        farthest = int(np.argmax(share))
+        at = int(share[farthest])
+        if at > self.found.kept * len(targets):
+            self.found.kept = at / len(targets)
+            if at < len(targets):
+                reaches = bool(at < kept[farthest])
+                where = path[at, farthest], float(measure[at, farthest])
+                self.found.stopped = self._stop(*where, reaches)
+        arrived = np.flatnonzero(share == len(targets))
+        return arrived, path, self._score(path, room, measure)
+
+    def _stop(self, q: Array, measure: float, reaches: bool) -> str:
+        """Say why a posture (joints,) is not part of a path."""
+        kinematics = self.kinematics
+        if not reaches:
+            return "it does not reach farther in one motion"
+        if measure < kinematics.least:
+            return told_manipulability(kinematics, f"is {max(measure, 0.0):.2g} m^3 there")
+        room = np.minimum(q - kinematics.lower, kinematics.upper - q)
+        joint = list(arm_model(kinematics.workcell.robots[kinematics.arm]).names)[1:][
+            int(np.argmin(room))
+        ]
+        return f"{joint} is at its limit there"
+
+    def _resolved(self, targets: Array, q: Array) -> tuple[NDArray[np.intp], Array, Array]:
+        """Follow as `_followed`, with redundant joints resolved; only the ends count, because the
+        planned path between them may differ."""
+        ends = None
+        if self.query.common is not None:
+            ends = q[:, list(self.kinematics.redundant)]
+            self._place_common(ends)
+        path, kept, measure = self.kinematics.follow(q, targets, ends, resolved=True)
+        room = self._room(path)
+        self.found.kept = max(self.found.kept, float(kept.max(initial=0)) / len(targets))
+        fine = (room[-1] >= LIMIT_MARGIN) & (measure[-1] >= self.kinematics.least)
+        arrived = np.flatnonzero((kept == len(targets)) & fine)
+        return arrived, path, self._score(path, room, measure)
+
+    def _place_common(self, ends: Array) -> None:
+        """Set the common joints among the redundant ones (n, redundant) to where they end."""
+        if self.query.common is not None:
+            columns = [self.kinematics.redundant.index(k) for k in self.kinematics.common]
+            ends[:, columns] = self.query.common[1]
+
+    def _room(self, path: Array) -> Array:
+        """Compute the least distance (m, n) of joint paths (m, n, joints) to a joint limit."""
+        beyond = np.minimum(path - self.kinematics.lower, self.kinematics.upper - path)
+        return np.asarray(beyond.min(axis=2))
+
+    def _score(self, path: Array, room: Array, measure: Array) -> Array:
+        """Score (n,) paths by their distance from limits and singular postures, and by the
+        shortness between the ends."""
+        comfort = np.clip(room.min(axis=0), 0.0, 0.6) / 0.6
+        away = np.minimum(measure.min(axis=0) / (4.0 * self.kinematics.least), 1.0)
+        apart = np.linalg.norm(path[-1] - path[0], axis=1)
+        return np.asarray(comfort + away - LENGTH_COST * apart)
+
+
+def told_manipulability(kinematics: ArmKinematics, found: str) -> str:
+    """Say that the manipulability found is too small, with the key that decides."""
+    robot = kinematics.workcell.robots[kinematics.arm]
+    return (
+        f"abs(det J) {found}, too near a singular posture; allowed is {MANIPULABILITY_MARGIN:g} "
+        f"times robots[{kinematics.arm}].min_manipulability = {robot.min_manipulability:g} m^3"
+    )
+
+
+def _diverse(holds: Sequence[Hold], compared: int) -> list[Hold]:
+    """Return the best of holds that differ only in the spin and a joint about the same axis, those
+    unlike all earlier ones first.
+
+    Args:
+        compared: joints that make a difference, from the first.
+    """
+    first: list[Hold] = []
+    later: list[Hold] = []
+    for hold in holds:
+        apart = [
+            float(np.abs((other.q_start - hold.q_start)[:compared]).max())
+            for other in (*first, *later)
+        ]
+        nearest = min(apart, default=np.inf)
+        if nearest > 4 * SAME_REDUNDANT:
+            first.append(hold)
+        elif nearest > SAME_POSTURE:
+            later.append(hold)
+    return first + later
+
+
+def spins_the_pad(kinematics: ArmKinematics) -> bool:
+    """Return True if the arm's last joint turns the pad about its normal, as a spin does."""
+    geometry, contact = kinematics.geometry, kinematics.workcell.contacts[kinematics.arm]
+    T_joint_pad = geometry.T_joint_box @ contact.T_box_pad
+    axis = geometry.axes[-1]
+    aside = T_joint_pad[:3, 3] - (T_joint_pad[:3, 3] @ axis) * axis
+    parallel = abs(float(T_joint_pad[:3, 2] @ axis)) > 1.0 - 1e-6
+    last_follows = geometry.joints - 1 not in kinematics.redundant
+    return bool(geometry.turning[-1] and last_follows and parallel and np.linalg.norm(aside) < 1e-4)

@@ -1,0 +1,601 @@
+"""A collision-free path of the box with both arms, over the closed chain.
+
+First of straight motions alone: out of the start, over, into the goal. Where none is free,
+RRT-Connect of OMPL (Kuffner and LaValle, ICRA 2000) looks among all poses, from everything that
+straight motions out of start and goal lead to. Both move in the coordinates of the box path, which
+the spline joins later too, not in those of the joints: both arms' joints follow, branch and all,
+and are kept beside every pose that was reached. It is the only module that needs OMPL.
+
+Of the closed chain, both arms and the box that they hold, the box pose and the redundant joints'
+values are free; the six other joints of each arm follow by Newton's method from the pose before, so
+that an arm never changes its branch.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import pairwise, permutations, product
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from hybrid_opt.extras.proposing.holding import (
+    JUMP,
+    LIMIT_MARGIN,
+    REACHED,
+    TRACKING_STEPS,
+    ArmKinematics,
+    Hold,
+)
+from hybrid_opt.extras.proposing.trial import PayloadSceneChecker, PoseJudge
+from symbolic.array import Array
+from symbolic.errors import SettingsError
+from symbolic.records import POSE_SIZE, Workcell
+from symbolic.records.poses import box_placement, inverse
+
+PATH_STEP = 0.02
+"""Distance between configurations that are looked at, see `LEVERS` [m]."""
+
+LEVER = 0.3
+"""Length that a radian of the box's turn counts beside a distance [m]."""
+
+REDUNDANT_LEVER = 0.2
+"""Length that a radian of a redundant joint counts [m]."""
+
+TOGETHER = 8
+"""Configurations that are judged at once."""
+
+CHAIN_RESIDUAL = 1e-6
+"""Pose residual of a closed chain [m, rad]."""
+
+CHAIN_NEWTON_STEPS = 8
+
+
+@dataclass(frozen=True, eq=False)
+class ChainConfiguration:
+    """A configuration of the closed chain.
+
+    Attributes:
+        extended: (6 + m,) box pose [m, rad] and redundant joints [rad or m].
+        q: per arm the joints (n,) [rad or m].
+    """
+
+    extended: Array
+    q: tuple[Array, Array]
+
+
+class _Follower:
+    """One arm with pinocchio's numbers."""
+
+    def __init__(self, many: ArmKinematics, hold: Hold, model: pin.Model) -> None:
+        robot = many.workcell.robots[many.arm]
+        self.name, self.model, self.many = robot.name, model, many
+        self.data = self.model.createData()
+        self.names = list(self.model.names)[1:]
+        self.last = self.model.njoints - 1
+        self.redundant = many.workcell.task.redundant_of(many.arm)
+        self.T_box_joint = many.held(hold.spin)
+        self.T_root_world = inverse(robot.T_world_base)
+        key = f"robots[{many.arm}].min_manipulability = {robot.min_manipulability:g} m^3"
+        self.singular = f"{robot.name} is near a singular posture ({key})"
+        self.side = many.side(hold.q_start)
+        self.lower, self.upper = many.lower + LIMIT_MARGIN, many.upper - LIMIT_MARGIN
+
+    def close(self, T_world_box: Array, extended: Array, q: Array) -> Array | str:
+        """Return the joints near q that hold the box there, or a text that names the obstacle."""
+        target = self.T_root_world @ T_world_box @ self.T_box_joint
+        before, q = q, q.copy()
+        for joint, place in self.redundant:
+            q[joint] = extended[place]
+        for _ in range(CHAIN_NEWTON_STEPS):
+            pin.computeJointJacobians(self.model, self.data, q)
+            here = self.data.oMi[self.last]
+            turn = pin.log3(target[:3, :3] @ here.rotation.T)
+            error = np.concatenate([target[:3, 3] - here.translation, turn])
+            J = pin.getJointJacobian(self.model, self.data, self.last, pin.LOCAL_WORLD_ALIGNED)[
+                :, self.many.following
+            ]
+            if error @ error < CHAIN_RESIDUAL**2:
+                break
+            try:
+                step = np.linalg.solve(J, error)
+            except np.linalg.LinAlgError:
+                return self.singular
+            if np.abs(step).max() > JUMP:
+                return f"{self.name} does not reach"
+            q[self.many.following] += step
+        else:
+            return f"{self.name} does not reach"
+        if np.abs(q - before).max() > JUMP:
+            return f"{self.name} does not reach"
+        beyond = np.flatnonzero((q < self.lower) | (q > self.upper))
+        if len(beyond):
+            return f"{self.name}/{self.names[beyond[0]]} is at its limit"
+        if self.side * np.linalg.det(J) < self.many.least:
+            return self.singular
+        return q
+
+
+class ClosedChain:
+    """Both arms in one way of holding. Not to be shared between threads.
+
+    Attributes:
+        judge: of collisions.
+        looked: configurations looked at so far.
+        refused: how often what other than a collision was in the way.
+    """
+
+    def __init__(
+        self,
+        workcell: Workcell,
+        judge: PoseJudge,
+        holds: tuple[Hold, Hold],
+        models: tuple[pin.Model, pin.Model],
+    ) -> None:
+        """Prepare both arms.
+
+        Args:
+            workcell: with its redundant joints chosen.
+            models: of both arms (`symbolic.read.arms.arm_model`).
+        """
+        self.judge, self.looked = judge, 0
+        self._orientation = workcell.task.orientation
+        self.refused: Counter[str] = Counter()
+        self._arms = [
+            _Follower(ArmKinematics(workcell, arm, judge.geometry.arms[arm]), hold, model)
+            for arm, (hold, model) in enumerate(zip(holds, models, strict=True))
+        ]
+
+    def close(self, extended: Array, q: tuple[Array, Array]) -> ChainConfiguration | None:
+        """Return the configuration near given joints; collisions do not count."""
+        T_world_box = box_placement(self._orientation, extended[:POSE_SIZE])
+        found = []
+        for arm, near in zip(self._arms, q, strict=True):
+            closed = arm.close(T_world_box, extended, near)
+            if isinstance(closed, str):
+                self.refused[closed] += 1
+                return None
+            found.append(closed)
+        return ChainConfiguration(extended, (found[0], found[1]))
+
+    def close_many(
+        self, extended: Array, q: tuple[Array, Array], steps: int = TRACKING_STEPS
+    ) -> tuple[tuple[Array, Array], NDArray[np.bool_]]:
+        """Return configurations near given joints, all at once; collisions do not count.
+
+        Args:
+            extended: (n, 6 + m).
+            q: per arm (n, joints).
+            steps: of Newton's method, at most.
+
+        Returns:
+            Per arm the joints (n, joints), and which configurations (n,) are closed within limits.
+        """
+        T_world_box = box_placement(self._orientation, extended[:, :POSE_SIZE])
+        closed, found = np.ones(len(extended), dtype=bool), []
+        for arm, near in zip(self._arms, q, strict=True):
+            guess = near.copy()
+            for joint, place in arm.redundant:
+                guess[:, joint] = extended[:, place]
+            there = arm.many.solve(guess, T_world_box @ arm.T_box_joint, steps)
+            closed &= there.residual <= REACHED
+            closed &= arm.side * there.determinant >= arm.many.least
+            closed &= np.all((there.q >= arm.lower) & (there.q <= arm.upper), axis=1)
+            found.append(there.q)
+        return (found[0], found[1]), closed
+
+    def along(self, begin: ChainConfiguration, path: Array) -> Iterator[ChainConfiguration]:
+        """Follow extended poses (n, 6 + m) as far as they are free; the first is where to begin."""
+        batch: list[ChainConfiguration] = []
+        place: ChainConfiguration | None = begin
+        for extended in path:
+            assert place is not None
+            place = self.close(extended, place.q)
+            self.looked += 1
+            if place is not None:
+                batch.append(place)
+            if place is None or len(batch) == TOGETHER:
+                free = self._free(batch)
+                yield from batch[:free]
+                if place is None or free < len(batch):
+                    return
+                batch = []
+        yield from batch[: self._free(batch)]
+
+    def along_many(
+        self, begins: Sequence[ChainConfiguration], paths: Array
+    ) -> list[list[ChainConfiguration]]:
+        """Follow paths side by side, each as far as it is free.
+
+        Args:
+            begins: a configuration at the begin of each path.
+            paths: (k, n, 6 + m) extended poses, `PATH_STEP` apart or less.
+
+        Returns:
+            The configurations along each path, its begin first.
+        """
+        found = [[begin] for begin in begins]
+        alive = np.arange(len(begins))
+        q = np.array([begin.q[0] for begin in begins]), np.array([begin.q[1] for begin in begins])
+        step = np.zeros_like(q[0]), np.zeros_like(q[1])
+        for extended in paths.transpose(1, 0, 2)[1:]:
+            there, on = self.close_many(extended[alive], (q[0] + step[0], q[1] + step[1]))
+            step = there[0] - q[0], there[1] - q[1]
+            on &= np.max(np.abs(np.hstack(step)), axis=1) <= JUMP
+            alive, q = alive[on], (there[0][on], there[1][on])
+            step = step[0][on], step[1][on]
+            for row, k in enumerate(alive.tolist()):
+                found[k].append(ChainConfiguration(extended[k], (q[0][row], q[1][row])))
+            if not len(alive):
+                break
+        self.looked += sum(map(len, found)) - len(found)
+        return [[one[0], *one[1 : 1 + self._free(one[1:])]] for one in found]
+
+    def between(
+        self, first: ChainConfiguration, last: ChainConfiguration, path: Array
+    ) -> list[ChainConfiguration] | None:
+        """Return the configurations along a path (n, 6 + m) between two, None if not all are free,
+        or the joints do not lead from the one to the other."""
+        share = np.linspace(0.0, 1.0, len(path))[:, None]
+        near = [(1.0 - share) * a + share * b for a, b in zip(first.q, last.q, strict=True)]
+        q, closed = self.close_many(path, (near[0], near[1]), CHAIN_NEWTON_STEPS)
+        self.looked += len(path)
+        whole = np.hstack(q)
+        joined = np.abs(np.diff(whole, axis=0)).max(initial=0.0) <= JUMP
+        arrives = np.abs(whole[-1] - np.concatenate(last.q)).max() < MATCH
+        begins = np.abs(whole[0] - np.concatenate(first.q)).max() < MATCH
+        if not (closed.all() and joined and begins and arrives):
+            return None
+        places = [ChainConfiguration(each, (q[0][k], q[1][k])) for k, each in enumerate(path)]
+        free = self._free(places[1:-1]) == len(places) - 2
+        return [first, *places[1:-1], last] if free else None
+
+    def reach(self, begin: ChainConfiguration, extended: Array) -> ChainConfiguration | None:
+        """Return the configuration at the end of a straight motion, None if the motion is not
+        free."""
+        found = self.way(begin, straight(begin.extended, extended))
+        return None if found is None else found[-1]
+
+    def way(self, begin: ChainConfiguration, path: Array) -> list[ChainConfiguration] | None:
+        """Return the configurations along a path (n, 6 + m) of extended poses from one of them on,
+        None if not all are free."""
+        found = [begin, *self.along(begin, path[1:])]
+        return found if len(found) == len(path) else None
+
+    def _free(self, places: list[ChainConfiguration]) -> int:
+        """Count the free configurations before the first that is not."""
+        if not places:
+            return 0
+        pose = np.array([place.extended[:POSE_SIZE] for place in places])
+        q_1, q_2 = (np.array([place.q[arm] for place in places]) for arm in (0, 1))
+        hit = self.judge.colliding(pose, q_1, q_2)
+        return int(np.argmax(hit)) if hit.any() else len(places)
+
+
+def metric_weights(size: int) -> Array:
+    """Return the weight (size,) of each entry of an extended pose in a distance."""
+    found = np.full(size, REDUNDANT_LEVER)
+    found[:3], found[3:POSE_SIZE] = 1.0, LEVER
+    return found
+
+
+def distance(first: Array, second: Array) -> float:
+    """Compute the distance between extended poses [m]."""
+    return float(np.linalg.norm(metric_weights(len(first)) * (second - first)))
+
+
+def straight(first: Array, second: Array) -> Array:
+    """Return extended poses (n, 6 + m) on the straight line, at most `PATH_STEP` apart, ends
+    included."""
+    n = max(int(np.ceil(distance(first, second) / PATH_STEP)), 1)
+    return np.asarray(np.linspace(first, second, n + 1))
+
+
+RETREAT = 0.6
+"""Longest straight motion out of the start, or the goal, that is tried [m]."""
+
+SHORT_RETREAT = 0.06
+"""Shortest one that is of use [m]."""
+
+DIRECTIONS = np.array([way for way in product((-1.0, 0.0, 1.0), repeat=3) if any(way)])
+"""Directions of retreats, along the world's axes and between them."""
+
+RETREAT_STOPS = 4
+"""Stride of a retreat's configurations at which the box may turn to the other end's pose."""
+
+STRAIGHT_TRIED = 100
+"""Straight motions of the box between two retreats that are tried with the arms."""
+
+LINE_SHARES = np.array([0.5, 0.25, 0.75, 0.375, 0.625, 0.125, 0.875])
+"""Places on them where the box alone is checked first."""
+
+REDUNDANT_ASIDE = 5.0
+"""How far redundant joints may stray per metre of the box [rad/m]."""
+
+MATCH = 1e-3
+"""Largest difference of joints of two trees that meet [rad]: both arms on the same branch."""
+
+
+@dataclass(frozen=True)
+class AffineSubspace:
+    """The extended poses among which a path is looked for: origin + directions @ y.
+
+    Attributes:
+        origin: (6 + m,).
+        directions: (6 + m, d), so that distances of y are those of `closed_chain.distance`.
+        lower, upper: (d,) bounds of y [m].
+        range: longest motion that the planner's trees grow by [m].
+    """
+
+    origin: Array
+    directions: Array
+    lower: Array
+    upper: Array
+    range: float
+
+    def extended(self, y: Array) -> Array:
+        """Compute the extended pose (6 + m,) of coordinates (d,)."""
+        return np.asarray(self.origin + self.directions @ y)
+
+    def coordinates(self, extended: Array) -> Array:
+        """Compute the coordinates (d,) of an extended pose."""
+        return np.asarray(np.linalg.pinv(self.directions) @ (extended - self.origin))
+
+
+@dataclass(frozen=True)
+class Corridor:
+    """How far a path may stray.
+
+    Attributes:
+        tilt: how far the box may turn away from the turn between start and goal [rad]; 0: it turns
+            from the one to the other and no other way.
+        range: see `AffineSubspace`.
+        aside: how far the box may be beyond start and goal along each of the world's axes [m].
+        towards: (3,) the axis along which alone it may, and the sign; None: all, either way.
+    """
+
+    tilt: float
+    range: float
+    aside: float
+    towards: tuple[int, int, int] | None = None
+
+
+def search_subspace(start: Array, goal: Array, stray: Corridor, limits: Array) -> AffineSubspace:
+    """Compute the subspace in which a path from start to goal may lie.
+
+    Args:
+        start, goal: (6 + m,).
+        stray: how far it may stray; redundant joints `REDUNDANT_ASIDE` times as far.
+        limits: (m, 2) of the redundant joints [rad or m].
+    """
+    size, weight, tilt = len(start), metric_weights(len(start)), stray.tilt
+    aside = np.full(size, stray.aside)
+    aside[POSE_SIZE:] *= REDUNDANT_ASIDE
+    less, more = aside.copy(), aside.copy()
+    if stray.towards is not None:
+        less[:3] *= np.less(stray.towards, 0)
+        more[:3] *= np.greater(stray.towards, 0)
+    lower, upper = np.minimum(start, goal) - less, np.maximum(start, goal) + more
+    lower[POSE_SIZE:] = np.maximum(lower[POSE_SIZE:], limits[:, 0])
+    upper[POSE_SIZE:] = np.minimum(upper[POSE_SIZE:], limits[:, 1])
+    columns, low, high = [], [], []
+    turn = (goal - start) * ((np.arange(size) >= 3) & (np.arange(size) < 6))
+    length = float(np.linalg.norm(weight * turn))
+    for k in range(size):
+        angle = 3 <= k < 6
+        if angle and tilt == 0.0:
+            continue
+        column = np.zeros(size)
+        column[k] = 1.0 / weight[k]
+        least = min(start[k], goal[k]) - tilt if angle else lower[k]
+        most = max(start[k], goal[k]) + tilt if angle else upper[k]
+        columns.append(column)
+        low.append(weight[k] * (least - start[k]))
+        high.append(weight[k] * (most - start[k]))
+    if tilt == 0.0 and length > 0.0:
+        columns.append(turn / length)
+        low.append(0.0)
+        high.append(length)
+    bounds = np.array(low) - 1e-9, np.array(high) + 1e-9
+    return AffineSubspace(start, np.column_stack(columns), *bounds, stray.range)
+
+
+Retreats = tuple[list[list[ChainConfiguration]], list[list[ChainConfiguration]]]
+"""Free configurations from the start and from the goal along the same directions, in order, the end
+itself first."""
+
+
+def retreats(chain: ClosedChain, ends: tuple[ChainConfiguration, ChainConfiguration]) -> Retreats:
+    """Find straight motions out of start and goal along the world's axes and between them: out of a
+    shelf, for instance."""
+    ways = DIRECTIONS / np.linalg.norm(DIRECTIONS, axis=1)[:, None]
+    begins = [place for place in ends for _ in ways]
+    away = np.array([place.extended for place in begins])
+    away[:, :3] += RETREAT * np.tile(ways, (len(ends), 1))
+    steps = round(RETREAT / PATH_STEP)
+    paths = np.linspace([place.extended for place in begins], away, steps + 1, axis=1)
+    found = chain.along_many(begins, paths)
+    return found[: len(ways)], found[len(ways) :]
+
+
+def straight_paths(
+    chain: ClosedChain, out: Retreats, box: PayloadSceneChecker
+) -> Iterator[list[ChainConfiguration]]:
+    """Yield corners of free paths of a retreat, a straight motion, and the opposite of a retreat
+    along the same direction: the shortest first, one per direction."""
+    ways: dict[tuple[bytes, bytes], tuple[float, tuple[int, int], list[ChainConfiguration]]] = {}
+    axes = np.flatnonzero(np.count_nonzero(DIRECTIONS, axis=1) == 1)
+    same_way = [(k, k) for k in range(len(DIRECTIONS))]
+    for along in (*same_way, *permutations(axes.tolist(), 2)):
+        first, last = out[0][along[0]], out[1][along[1]]
+        for a, b in product(first[::RETREAT_STOPS], last[::RETREAT_STOPS]):
+            corners = [first[0], a, b, last[0]]
+            length = sum(distance(p.extended, q.extended) for p, q in pairwise(corners))
+            ways.setdefault((a.extended.tobytes(), b.extended.tobytes()), (length, along, corners))
+    tried, done = 0, set[tuple[int, int]]()
+    for _, along, corners in sorted(ways.values(), key=lambda way: way[0]):
+        begin, end = corners[1].extended, corners[2].extended
+        if along in done or box.is_between(begin[:POSE_SIZE], end[:POSE_SIZE], LINE_SHARES):
+            continue
+        there = chain.reach(corners[1], end)
+        tried += 1
+        if there is not None and same(there, corners[2]):
+            done.add(along)
+            tried = 0
+            yield corners
+        elif tried == STRAIGHT_TRIED:
+            return
+
+
+def plan(
+    chain: ClosedChain,
+    out: Retreats,
+    room: AffineSubspace,
+    *,
+    most: int,
+    out_of_time: Callable[[], bool],
+    seed: int,
+) -> list[ChainConfiguration] | None:
+    """Find corners of a free path from start to goal by RRT-Connect; None without one.
+
+    Args:
+        chain: the arms in one way of holding.
+        out: where straight motions lead out of start and goal.
+        room: where the path may go.
+        most: configurations that may be looked at.
+        out_of_time: whether to come to an end in any case.
+        seed: of the planner's randomness, at least 1.
+
+    Raises:
+        SettingsError: OMPL is not installed.
+    """
+    places: dict[State, ChainConfiguration] = {}
+    ways: dict[State, ChainConfiguration] = {}
+    ends: tuple[list[State], list[State]] = ([], [])
+    for states, ways_out in zip(ends, out, strict=True):
+        place = ways_out[0][0]
+        for stop in (place, *_usable([way[-1] for way in ways_out], place, room)):
+            state: State = tuple(room.coordinates(stop.extended).tolist())
+            places[state], ways[state] = stop, place
+            states.append(state)
+
+    def joined(first: State, second: State) -> bool:
+        """Return True if the straight motion between two states is free, one of them reached
+        before."""
+        if first not in places:
+            first, second = second, first
+        if first not in places:
+            return False
+        found = chain.reach(places[first], room.extended(np.array(second)))
+        return found is not None and same(places.setdefault(second, found), found)
+
+    last = chain.looked + most
+    path = connected(
+        (room.lower, room.upper),
+        room.range,
+        joined,
+        ends,
+        lambda: chain.looked >= last or out_of_time(),
+        seed,
+    )
+    if path is None or any(state not in places for state in path):
+        return None
+    found = [ways[path[0]], *(places[state] for state in path), ways[path[-1]]]
+    return [place for k, place in enumerate(found) if k == 0 or place is not found[k - 1]]
+
+
+def _usable(
+    stops: list[ChainConfiguration], place: ChainConfiguration, room: AffineSubspace
+) -> list[ChainConfiguration]:
+    """Return the configurations that lie apart from an end and within the room."""
+    at = [room.coordinates(stop.extended) for stop in stops]
+    return [
+        stop
+        for stop, y in zip(stops, at, strict=True)
+        if distance(place.extended, stop.extended) >= SHORT_RETREAT
+        and bool(np.all((y >= room.lower) & (y <= room.upper)))
+    ]
+
+
+def same(first: ChainConfiguration, second: ChainConfiguration) -> bool:
+    """Return True if both arms stand on the same branches and turns."""
+    apart = [np.abs(a - b).max() for a, b in zip(first.q, second.q, strict=True)]
+    return bool(max(apart) < MATCH)
+
+
+State = tuple[float, ...]
+"""Coordinates that the planner moves in."""
+
+
+def connected(
+    bounds: tuple[Array, Array],
+    longest: float,
+    joined: Callable[[State, State], bool],
+    ends: Sequence[Sequence[State]],
+    ended: Callable[[], bool],
+    seed: int,
+) -> list[State] | None:
+    """Find the states of a path by RRT-Connect; None without one.
+
+    Args:
+        bounds: least and largest states (d,).
+        longest: motion that the planner's trees grow by.
+        joined: whether the straight motion between two states is free.
+        ends: states to begin with, and to end with, one of each.
+        ended: whether to come to an end.
+        seed: of its randomness, at least 1.
+
+    Raises:
+        SettingsError: OMPL is not installed.
+    """
+    try:
+        from ompl import base, geometric, util
+    except ImportError as error:
+        raise SettingsError(
+            "a first path is planned by OMPL, which is not installed: "
+            'pip install "dual-arm-carry[propose]"'
+        ) from error
+    util.setLogLevel(util.LogLevel.LOG_NONE)  # also says that seeds were drawn before
+    util.RNG.setSeed(seed)
+    size = len(bounds[0])
+
+    def values(state: Any) -> State:
+        return tuple(state[k] for k in range(size))
+
+    class Validator(base.MotionValidator):  # type: ignore[misc]
+        """Asks whether motions are free."""
+
+        def checkMotion(self, first: Any, second: Any) -> bool:
+            return joined(values(first), values(second))
+
+    space, limits = base.RealVectorStateSpace(size), base.RealVectorBounds(size)
+    for k, (low, high) in enumerate(zip(*bounds, strict=True)):
+        limits.setLow(k, float(low))
+        limits.setHigh(k, float(high))
+    space.setBounds(limits)
+    information = base.SpaceInformation(space)
+    information.setStateValidityChecker(lambda state: True)
+    asked = Validator(information)
+    information.setMotionValidator(asked)
+    information.setup()
+    problem, goals = base.ProblemDefinition(information), base.GoalStates(information)
+    for states, add in zip(ends, (problem.addStartState, goals.addState), strict=True):
+        for known in states:
+            state = space.allocState()
+            for k, value in enumerate(known):
+                state[k] = value
+            add(state)
+    problem.setGoal(goals)
+    planner = geometric.RRTConnect(information)
+    planner.setRange(longest)
+    planner.setProblemDefinition(problem)
+    planner.setup()
+    planner.solve(base.PlannerTerminationCondition(ended))
+    if not problem.hasExactSolution():
+        return None
+    path = problem.getSolutionPath()
+    return [values(path.getState(k)) for k in range(path.getStateCount())]

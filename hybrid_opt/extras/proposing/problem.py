@@ -1,0 +1,278 @@
+"""The problem file: a workcell file in which a person has left out what is to be proposed."""
+
+from __future__ import annotations
+
+import copy
+import os
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hybrid_opt.extras.proposing.decimals import pose_limits, readable_turns
+from hybrid_opt.extras.proposing.holding import shoulder_positions
+from symbolic import safe_io
+from symbolic.array import Array
+from symbolic.errors import OutsideError, WorkcellError
+from symbolic.read.cell import load
+from symbolic.read.descriptions import PACKAGE_SCHEME
+from symbolic.read.editing import completed, merged, with_paths
+from symbolic.read.robots import read_robot
+from symbolic.read.tables import TableReader
+from symbolic.records import Robot, Workcell
+from symbolic.records import quantities as quantity
+from symbolic.records.poses import Orientation, box_placement, rotation_from_rpy
+from symbolic.records.problems import Problems
+from symbolic.records.time_law import OPTIMAL
+
+UPRIGHT = 0.7
+"""Share of the vertical from which on an edge of the box counts as upright."""
+
+LEAST_LEVEL = 0.1
+"""How far a carry goes level, at least, for its direction to count [m]."""
+
+PROPOSED = ("waypoints", "initial", "redundant")
+"""Keys of the task that are proposed anew, whatever the file has."""
+
+DRAFT_ROOM = 0.01
+"""Half-width of bounds before any are known; of no meaning [m, rad]."""
+
+
+@dataclass(frozen=True)
+class Problem:
+    """A problem file.
+
+    Attributes:
+        source: the file.
+        text: its content, without what is proposed anew.
+        data: its tables, without what is proposed anew.
+    """
+
+    source: Path
+    text: str
+    data: dict[str, Any]
+
+    @property
+    def poses(self) -> tuple[Array, Array]:
+        """(6,) start and goal of the box, the goal's angles on the turns nearest the start's;
+        rotation vectors as they are."""
+        start, goal = (np.array(self.data["task"][key], dtype=float) for key in ("start", "goal"))
+        goal[3:] = self.orientation.unwrapped(np.array([start[3:], goal[3:]]))[1]
+        return start, goal
+
+    @property
+    def orientation(self) -> Orientation:
+        """Meaning of the last three numbers of a pose."""
+        task = self.data["task"]
+        if task.get("rotation") != "quaternion":
+            return Orientation()
+        reference = rotation_from_rpy(task.get("rotation_reference", [0.0, 0.0, 0.0]))
+        return Orientation("quaternion", reference)
+
+    @property
+    def is_machine(self) -> bool:
+        """Whether both robots are arms of one machine: other chains of one file at one base, which
+        may be missing."""
+        first, second = self.data["robots"]
+        keys = ("robot", "urdf", "xacro_arguments", "base")
+        same = all(first.get(key) == second.get(key) for key in keys)
+        chains = first.get("chain"), second.get("chain")
+        return same and all(chains) and chains[0] != chains[1]
+
+    @cached_property
+    def contacts(self) -> list[dict[str, Any]]:
+        """Both contacts' points, the middles of opposite faces where the file has none: those that
+        face the robots (the shoulders of a machine with both arms), or those that the carry passes
+        sideways where the robots have no bases.
+
+        Raises:
+            WorkcellError: shoulders are asked for, and the robots are wrong.
+        """
+        entries = self.data["contacts"]
+        if all("xyz" in entry for entry in entries):
+            return [{"xyz": entry["xyz"]} for entry in entries]
+        bases = self._bases
+        start, goal = self.poses
+        size = np.array(self.data["payload"]["size"], dtype=float)
+        R_world_box = box_placement(self.orientation, start)[:3, :3]
+        points = contact_points(size, np.array([start, goal]), R_world_box, bases)
+        return [{"xyz": point} for point in points]
+
+    @cached_property
+    def _bases(self) -> Array | None:
+        """Positions (2, 3) of the robots' bases, of a machine those of its shoulders; None if the
+        file has none [m]."""
+        found = [robot.get("base", {}).get("xyz") for robot in self.data["robots"]]
+        if not all(isinstance(xyz, list) and len(xyz) == 3 for xyz in found):
+            return None
+        return (
+            shoulder_positions(self._robots()) if self.is_machine else np.array(found, dtype=float)
+        )
+
+    def other_contacts(self) -> list[list[dict[str, Any]]]:
+        """Return the other pairs of faces that the pads may press, both ways round, the most
+        promising first: upright faces, then those that face the robots. None if the file names
+        points or has no bases."""
+        if self._bases is None or all("xyz" in entry for entry in self.data["contacts"]):
+            return []
+        R = box_placement(self.orientation, self.poses[0])[:3, :3]
+        size = np.array(self.data["payload"]["size"], dtype=float)
+        along = self._bases[0] - self._bases[1]
+        faces = [(axis, side) for axis in range(3) for side in (1.0, -1.0)]
+        faces.sort(
+            key=lambda face: (abs(R[2, face[0]]) > UPRIGHT, -face[1] * (along @ R[:, face[0]]))
+        )
+        points = [side * size[axis] / 2.0 * np.eye(3)[axis] for axis, side in faces]
+        pairs = [[{"xyz": (0.0 + s * p).tolist()} for s in (1.0, -1.0)] for p in points]
+        return [pair for pair in pairs if pair != self.contacts]
+
+    def _robots(self) -> tuple[Robot, Robot]:
+        """Read the robots alone, wherever the box is."""
+        problems = Problems()
+        entries = TableReader(self.data, "", problems).tables("robots", exactly=2)
+        found = [read_robot(entry, self.source.parent)[0] for entry in entries]
+        if problems.found:
+            raise WorkcellError(str(self.source), problems.messages())
+        return found[0], found[1]
+
+    def sides(self) -> list[Problem]:
+        """Return the problem with each pair of upright faces that the pads may press if its robots
+        have no bases yet, a machine's arms either way round; itself alone if the file names the
+        points, or a level carry past two robots leaves no choice."""
+        entries = self.data["contacts"]
+        start, goal = self.poses
+        level = float(np.linalg.norm((goal - start)[:2]))
+        if all("xyz" in entry for entry in entries) or not (self.is_machine or level < LEAST_LEVEL):
+            return [self]
+        R = box_placement(self.orientation, start)[:3, :3]
+        found = []
+        for axis in np.flatnonzero(np.abs(R[2]) <= UPRIGHT):
+            point = np.zeros(3)
+            point[axis] = float(self.data["payload"]["size"][axis]) / 2.0
+            for side in (1.0, -1.0) if self.is_machine else (1.0,):
+                data = copy.deepcopy(self.data)
+                for entry, xyz in zip(data["contacts"], (point, -point), strict=True):
+                    entry["xyz"] = (side * xyz).tolist()
+                found.append(replace(self, data=data))
+        return found
+
+    def workcell(self, changes: dict[str, Any] | None = None) -> Workcell:
+        """Read the workcell, with one free waypoint halfway unless `changes` has waypoints.
+
+        Reach is not checked: spins and bases are chosen later.
+
+        Args:
+            changes: as for `symbolic.read.editing.completed`.
+
+        Raises:
+            WorkcellError: with all problems of the file.
+        """
+        changes = merged({"contacts": self.contacts}, changes or {})
+        task = dict(self.data["task"])
+        if "waypoints" not in changes.get("task", {}):
+            (middle,) = readable_turns(np.mean(self.poses, axis=0)[None], self.orientation)
+            low, high = pose_limits(middle, self.orientation)
+            task["waypoints"] = [
+                {
+                    "lower": np.maximum(middle - DRAFT_ROOM, low).tolist(),
+                    "upper": np.minimum(middle + DRAFT_ROOM, high).tolist(),
+                }
+            ]
+        text = completed("", self.data | {"task": task}, changes)
+        return load(self.source, text=text.encode(), reach=False)
+
+    def completed(self, changes: dict[str, Any], folder: Path) -> str:
+        """Return the file's text, completed, with paths relative to a folder.
+
+        Args:
+            changes: as for `symbolic.read.editing.completed`.
+
+        Raises:
+            SettingsError: the file is written in a way that cannot be completed.
+        """
+        here, there = self.source.parent, folder.resolve()
+
+        def moved(name: str) -> str:
+            is_relative = not os.path.isabs(name) and not name.startswith(PACKAGE_SCHEME)
+            return os.path.relpath(here / name, there) if is_relative else name
+
+        paths = {} if there == here else with_paths(self.data, moved)
+        return completed(self.text, self.data, merged(paths, changes))
+
+
+def read_problem(path: str | Path) -> Problem:
+    """Read the problem of a file.
+
+    Raises:
+        WorkcellError: it is no TOML, or what has to be known is not there.
+    """
+    path = Path(path)
+    try:
+        source = safe_io.resolved(path)
+        text = safe_io.text(safe_io.read_bytes(source, safe_io.WORKCELL_BYTES))
+        data = safe_io.toml_tables(text.encode())
+    except OutsideError as error:
+        raise WorkcellError(str(path), (f"file: {error}",)) from error
+    problems = Problems()
+    _require_known(TableReader(data, "", problems))
+    if problems.found:
+        raise WorkcellError(str(path), problems.messages())
+    text = completed(text, data, {"task": dict.fromkeys(PROPOSED)})
+    for key in PROPOSED:
+        data["task"].pop(key, None)
+    return Problem(source, text, data)
+
+
+def _require_known(table: TableReader) -> None:
+    """Record what this module needs and lacks; the reader of workcell files checks the rest."""
+    task, payload = table.table("task"), table.table("payload")
+    _, contacts = (table.tables(key, exactly=2) for key in ("robots", "contacts"))
+    if table.problems.found:
+        return
+    start, goal = (task.vector(key, quantity.POSE) for key in ("start", "goal"))
+    if task.clean("start", "goal") and np.array_equal(start, goal):
+        task.add("goal", "found the start again; allowed is another pose")
+    task.vector("rotation_reference", (quantity.ANGLE,) * 3, (0.0, 0.0, 0.0))
+    waypoints = task.raw("waypoints", [])
+    if isinstance(waypoints, list) and any("fixed" in w for w in waypoints if isinstance(w, dict)):
+        task.add(
+            "waypoints",
+            "found a fixed one; allowed is a carry from start to goal, put fixed poses into the "
+            "proposed file",
+        )
+    if task.raw("time_law", None) == OPTIMAL:
+        task.add(
+            "time_law",
+            f"found {OPTIMAL!r}; allowed are 'constant' and 'ramped', change it in the proposed "
+            "file",
+        )
+    if all("xyz" in entry for entry in contacts):
+        return
+    if payload.raw("kind", "box") != "box":
+        table.add("contacts", "xyz is needed for a payload that is no box")
+    else:
+        payload.vector("size", (quantity.PAYLOAD_SIZE,) * 3)
+
+
+def contact_points(
+    size: Array, way: Array, R_world_box: Array, bases: Array | None
+) -> list[list[float]]:
+    """Compute middles of opposite faces of the box that face the robots, one per robot [m].
+
+    Args:
+        size: (3,) edges of the box [m].
+        way: (2, 6) start and goal.
+        R_world_box: (3, 3) at the start.
+        bases: (2, 3) positions of the robots [m]; None: the faces that the carry passes sideways.
+    """
+    along = way[1, :3] - way[0, :3] if bases is None else bases[0] - bases[1]
+    share = np.abs(R_world_box.T @ (along * [1.0, 1.0, 0.0]))
+    upright = np.abs(R_world_box[2]) > UPRIGHT
+    share[upright] = np.inf if bases is None else -1.0
+    axis = int(np.argmin(share) if bases is None else np.argmax(share))
+    side = 1.0 if bases is None else float(np.sign(along @ R_world_box[:, axis]) or 1.0)
+    point = np.zeros(3)
+    point[axis] = side * size[axis] / 2.0
+    return [point.tolist(), (0.0 - point).tolist()]

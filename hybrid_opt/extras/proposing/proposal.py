@@ -1,0 +1,520 @@
+"""A complete workcell with a first carry, from robots, payload, start, goal and environment alone.
+
+In this order: both arms' ways to hold the box are compared (spins of the pads, postures), pairs of
+them ranked; a planner looks for a free path of the box with both arms over the closed chain; the
+fewest via-points are taken whose spline is free; the evaluator judges that carry, and random ones
+around it until the bounds hold the wanted share of feasible ones. What is written was judged again
+as it is read from the file.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
+from itertools import islice
+from math import ceil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hybrid_opt.carry import Judgement
+from hybrid_opt.display import table
+from hybrid_opt.errors import NoHoldError, ProposalError
+from hybrid_opt.extras.proposing.bases import base_choices
+from hybrid_opt.extras.proposing.bounds import Bounds, Sampling
+from hybrid_opt.extras.proposing.draft import Draft, changes, decision_bounds
+from hybrid_opt.extras.proposing.planner import (
+    ChainConfiguration,
+    Corridor,
+    plan,
+    search_subspace,
+    straight_paths,
+)
+from hybrid_opt.extras.proposing.problem import Problem, read_problem
+from hybrid_opt.extras.proposing.setup import Pair, Setup, no_path, prepare
+from hybrid_opt.extras.proposing.trial import (
+    BranchLostError,
+    PayloadSceneChecker,
+    Trial,
+    grasp_blocked,
+)
+from hybrid_opt.extras.proposing.via_points import (
+    LEAST_SAMPLES,
+    MOST_VIA_POINTS,
+    along,
+    fit,
+    shortened,
+    straightened,
+    travelled,
+)
+from hybrid_opt.progress import ShowProgress, as_callback, progress_bar
+from symbolic.array import Array
+from symbolic.cell_model import CellBodies
+from symbolic.errors import SettingsError, WorkcellError
+from symbolic.path.spline import path_basis
+from symbolic.records import POSE_SIZE, Workcell
+
+SEARCH_ROUNDS = ((0, 12, 0), (500, 12, 2), (2500, 6, 6), (8000, 16, 6), (30000, 24, 6))
+"""Configurations that the planner may look at for a path, 0 for straight motions alone, how many
+pairs of holds get them, and among how many of `STRAYS`: short tries of all before long ones."""
+
+OTHER_FACES = 8000
+"""Configurations for a path from which on other faces of the box are pressed too, if both arms can
+hold it by those that face them."""
+
+STRAYS = (
+    Corridor(0.0, 0.15, 0.8),
+    Corridor(0.3, 0.15, 0.8),
+    Corridor(0.0, 0.15, 0.3),
+    Corridor(0.0, 0.05, 0.3),
+    Corridor(0.0, 0.15, 0.15),
+    Corridor(0.3, 0.05, 0.8),
+)
+"""What paths are looked for among; the narrower, the sooner a gap is found, if it is there."""
+
+SIDES = ((0, 0, 1), (0, 1, 0), (0, -1, 0), (1, 0, 0), (-1, 0, 0))
+"""Ways to stray, each by itself, among which further classes are looked for."""
+
+FEW = 3
+"""Via-points that are taken at once; where a path needs more, others are tried first."""
+
+LONG_TRIED = 2
+"""Most paths with more via-points that are judged."""
+
+LONGER = 2.5
+"""Multiple of the time that a user is told to try where it was too short."""
+
+MOST_CLASSES = 100
+
+PLANNING = 0.7
+"""Share of the time after which no path is looked for any more."""
+
+SPINS = 12
+"""Spins of a pad that are tried."""
+
+STAND_OFFS = (0.04, 0.03, 0.02, 0.01)
+"""Distances of the pads before and after a carry that are tried where the usual one is blocked [m].
+"""
+
+
+def worked() -> float:
+    """Return the processor time of this process and its children so far [s]."""
+    spent = os.times()
+    return spent.user + spent.system + spent.children_user + spent.children_system
+
+
+@dataclass(frozen=True)
+class ProposeSettings:
+    """How a carry is looked for.
+
+    Attributes:
+        seconds: for all of it.
+        feasible: least and largest share of random candidates within the bounds that is feasible.
+        bases: whether the robots' bases are proposed too; of those in the file only the height
+            counts.
+        classes: carries of different classes that are looked for, as far as the time goes.
+        clock: what seconds are counted by; other programs' work does not count.
+        used: seconds that were used before, such as by a program's start.
+    """
+
+    seconds: float = 120.0
+    feasible: tuple[float, float] = (0.02, 0.20)
+    bases: bool = False
+    classes: int = 1
+    clock: Callable[[], float] = worked
+    used: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not 1.0 <= self.seconds <= 1e6:
+            raise SettingsError(f"seconds: found {self.seconds:g}; allowed is 1 to 1e6")
+        if not 1 <= self.classes <= MOST_CLASSES:
+            raise SettingsError(f"classes: found {self.classes}; allowed is 1 to {MOST_CLASSES}")
+        low, high = self.feasible
+        if not 0.0 < low < high <= 1.0:
+            raise SettingsError(
+                f"feasible: found {low:g} and {high:g}; allowed are shares 0 < least < largest <= 1"
+            )
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """A workcell with a certified carry.
+
+    Attributes:
+        problem: where it comes from.
+        found: what was found, as values of the workcell.
+        judgement: the evaluator's verdict on the carry, certified between its samples.
+        feasible_share: of random candidates within the bounds.
+        candidates: number of candidates by which that was measured.
+        seconds: time that the proposal took.
+        certified: seconds until the first carry was certified, before bounds around it.
+        q: per arm its joints (n, joints) at the task's samples [rad or m].
+        sides: sides on which it passes what a straight motion of the box would meet.
+        blocked: what is in the way of the pads before the carry or after it, '' where nothing is,
+            or no time was left to look.
+    """
+
+    problem: Problem
+    found: Draft
+    judgement: Judgement
+    feasible_share: float
+    candidates: int
+    seconds: float
+    certified: float
+    q: tuple[Array, Array]
+    sides: tuple[str, ...]
+    blocked: str = ""
+
+    @property
+    def length(self) -> float:
+        """How far both arms' joints go together, as the Euclidean length of their path [rad]."""
+        return travelled(np.hstack(self.q))
+
+    @property
+    def passes(self) -> str:
+        """What it passes, and on which side; 'nothing' where a straight motion of the box would
+        meet nothing but what it stands on."""
+        return " and ".join(self.sides) or "nothing"
+
+    def text(self, folder: Path) -> str:
+        """Return the workcell file for a folder: the problem file's text, completed.
+
+        Raises:
+            SettingsError: it is written in a way that cannot be completed.
+        """
+        return self.problem.completed(changes(self.problem, self.found), folder)
+
+    def __str__(self) -> str:
+        forces = ", ".join(f"{value:.4f}" for value in self.judgement.objectives.values())
+        spins = " and ".join(f"{np.degrees(spin):.0f}" for spin in self.found.spins)
+        where = f" {self.passes}," if self.sides else ""
+        return (
+            f"a carry{where} through {table.counted(len(self.found.via), 'via-point')}, joints go "
+            f"{self.length:.2f} rad, certified; objectives {forces}; "
+            f"spins {spins} deg, start branches {self.found.branches[0]} and "
+            f"{self.found.branches[1]}; {100.0 * self.feasible_share:.1f} % of "
+            f"{self.candidates} random candidates feasible; {self.seconds:.1f} s"
+            + (
+                f"; stand-off {1e3 * self.found.stand_off:.0f} mm"
+                if self.found.stand_off is not None
+                else ""
+            )
+            + (f"; no whole job yet: {self.blocked}" if self.blocked else "")
+        )
+
+
+def propose(
+    path: str | Path,
+    *,
+    rng: np.random.Generator,
+    settings: ProposeSettings | None = None,
+    tell: Callable[[str], None] = lambda text: None,
+    progress: ShowProgress = False,
+) -> Proposal:
+    """Propose a complete workcell for a problem file; of several classes that whose joints go least
+    far. Arguments and errors as for `propose_classes`."""
+    return propose_classes(path, rng=rng, settings=settings, tell=tell, progress=progress)[0]
+
+
+def propose_classes(
+    path: str | Path,
+    *,
+    rng: np.random.Generator,
+    settings: ProposeSettings | None = None,
+    tell: Callable[[str], None] = lambda text: None,
+    progress: ShowProgress = False,
+) -> list[Proposal]:
+    """Propose complete workcells whose carries are of different classes, those whose joints go
+    least far first: they pass what is in the way on different sides, or hold the box in other
+    postures.
+
+    Args:
+        path: a workcell file in which what is proposed may be missing
+            (docs/tutorials/two-robots.md).
+        rng: its only randomness. The same state gives the same proposals where time does not run
+            out.
+        settings: how many are looked for, among others; None for the defaults: one.
+        tell: called with what is being done.
+        progress: True for a bar, or what takes the seconds worked and those that it may work; most
+            proposals need a part of them.
+
+    Raises:
+        WorkcellError: the file is wrong.
+        ProposalError: no carry was found; the text says what is in the way.
+        SettingsError: OMPL is not installed.
+    """
+    settings = settings or ProposeSettings()
+    with progress_bar(progress, "seconds of work", ceil(settings.seconds)) as advance:
+        search = _Search(read_problem(path), rng, settings, tell, as_callback(advance))
+        return sorted(search.run(), key=lambda one: one.length)
+
+
+@dataclass
+class _Lazy:
+    """A choice of bases, prepared when its turn comes."""
+
+    given: dict[str, Any]
+    spins: Array
+    setup: Setup | None = None
+    problem: str = ""
+
+
+@dataclass
+class _Search:
+    """One proposal on its way."""
+
+    problem: Problem
+    rng: np.random.Generator
+    settings: ProposeSettings
+    tell: Callable[[str], None]
+    count: Callable[[int, int], None]
+    begun: float = 0.0
+    refusals: list[str] = field(default_factory=list)
+    known: set[tuple[int, tuple[str, ...]]] = field(default_factory=set)
+    """Classes that were found: the pair that holds the box, by identity, and the sides."""
+
+    @property
+    def spent(self) -> float:
+        """Seconds so far."""
+        return self.settings.used + self.settings.clock() - self.begun
+
+    @property
+    def out_of_time(self) -> bool:
+        """Whether to come to an end."""
+        return self.spent > self.settings.seconds
+
+    @property
+    def too_late(self) -> bool:
+        """Whether it is too late for another path: bounds and verdicts take time as well."""
+        return self.spent > PLANNING * self.settings.seconds
+
+    def _say(self, text: str) -> None:
+        """Say what is being done, and how much of the time is gone."""
+        self.tell(text)
+        limit = ceil(self.settings.seconds)
+        self.count(min(int(self.spent), limit), limit)
+
+    def run(self) -> list[Proposal]:
+        self.begun = self.settings.clock()
+        self._say("bases" if self.settings.bases else "ways to hold the box")
+        spins = 2.0 * np.pi * np.arange(SPINS) / SPINS
+        choices: list[dict[str, Any]] = [{}]
+        if self.settings.bases:
+            choices = base_choices(self.problem, spins, self.rng)
+        else:
+            choices += [{"contacts": pair} for pair in self.problem.other_contacts()]
+        setups = [_Lazy(given, spins) for given in choices]
+        found: list[Proposal] = []
+        for effort, most, strays in SEARCH_ROUNDS:
+            for setup in setups:
+                for one in self._round(setup, effort, most, strays):
+                    found.append(one)
+                    self._say(f"carry {len(found)} passes {one.passes}")
+                    if len(found) == self.settings.classes:
+                        return found
+                if self.too_late or (setup.setup and not self._takes_all(effort)):
+                    break
+        if not found:
+            raise self._failed(setups)
+        return found
+
+    def _takes_all(self, effort: int) -> bool:
+        """Return True if a round takes every choice: of bases each, of faces of the box only late
+        ones, as long as those that face the robots can be held."""
+        return self.settings.bases or effort >= OTHER_FACES
+
+    def _round(self, lazy: _Lazy, effort: int, most: int, strays: int) -> Iterator[Proposal]:
+        """Run one round with one choice of bases."""
+        if lazy.setup is None and not lazy.problem:
+            self._say("ways to hold the box")
+            try:
+                lazy.setup = prepare(self.problem, lazy.given, lazy.spins, self.rng, self._say)
+            except (ProposalError, WorkcellError) as error:
+                if isinstance(error, WorkcellError) and not lazy.given:
+                    raise  # the file is wrong, not the bases that were tried
+                lazy.problem = str(error)
+        if lazy.setup is None:
+            return
+        box = PayloadSceneChecker(lazy.setup.workcell)
+        for number, pair in enumerate(lazy.setup.pairs[:most]):
+            if self.too_late:
+                break
+            self._say(f"paths of pair {number + 1} of {len(lazy.setup.pairs)}")
+            long: list[Array] = []
+            for corners in self._paths(lazy.setup, pair, effort, strays, box):
+                if corners is None or self._is_known(pair, box, along(corners)):
+                    continue
+                via = self._via_points(pair, corners)
+                if via is None:
+                    continue
+                if len(via) > FEW:  # another path may do with fewer
+                    long.append(via)
+                    continue
+                yield from self._judged(lazy.setup, pair, via, box)
+            for via in sorted(long, key=len)[: LONG_TRIED + self.settings.classes - 1]:
+                if not self.out_of_time:
+                    yield from self._judged(lazy.setup, pair, via, box)
+
+    def _is_known(self, pair: Pair, box: PayloadSceneChecker, path: Array) -> bool:
+        """Return True if a carry of the class of these poses (n, 6) was found before."""
+        return bool(self.known) and (id(pair), box.passed(path)) in self.known
+
+    def _failed(self, setups: list[_Lazy]) -> ProposalError:
+        begin = f"{self.problem.source}: no carry found in {self.spent:.0f} s"
+        if not setups:
+            return ProposalError(
+                f"{begin}: no bases from which both arms follow the box were found"
+            )
+        tried = next((lazy for lazy in setups if lazy.setup is not None), setups[0])
+        if tried.setup is None and tried.problem:
+            more = len(setups) > 1 and not self.settings.bases
+            others = "; nor can it be held by any other pair of faces" if more else ""
+            return NoHoldError(f"{begin}: {tried.problem}{others}")
+        met = "" if tried.setup is None else no_path(tried.setup.pairs, self.refusals)
+        if self.too_late:
+            longer = f"{LONGER * self.settings.seconds:.0f}"
+            begin = f"{begin}, when it was out of time; try {longer} s (--time {longer})"
+        return ProposalError(f"{begin}: {met or 'no path was tried yet'}")
+
+    def _paths(
+        self, setup: Setup, pair: Pair, effort: int, strays: int, box: PayloadSceneChecker
+    ) -> Iterator[list[ChainConfiguration] | None]:
+        """Yield corners of paths with one pair of holds."""
+        if not effort:
+            found = straight_paths(pair.chain, pair.retreats, box)
+            yield from islice(found, None if self.settings.classes > 1 else 1)
+            return
+        limits = [(joint.lower.min(), joint.upper.max()) for joint in setup.workcell.task.redundant]
+        sided = [replace(STRAYS[0], towards=side) for side in SIDES]
+        for stray in (*STRAYS[:strays], *(sided if self.settings.classes > 1 else ())):
+            if self.too_late:
+                return
+            ends = pair.start.extended, pair.goal.extended
+            room = search_subspace(*ends, stray, np.array(limits).reshape(-1, 2))
+            seed = int(self.rng.integers(1, 2**31))
+            yield plan(
+                pair.chain,
+                pair.retreats,
+                room,
+                most=effort,
+                out_of_time=lambda: self.too_late,
+                seed=seed,
+            )
+
+    def _via_points(self, pair: Pair, corners: list[ChainConfiguration]) -> Array | None:
+        """Find the fewest via-points of a path, None without any."""
+        self._say("via-points")
+        dense = shortened(pair.chain, corners, self.rng)
+        for count in range(1, MOST_VIA_POINTS + 1):
+            via = fit(pair.chain, dense, count, self.rng)
+            if via is not None or self.too_late:
+                return via
+        return None
+
+    def _judged(
+        self, setup: Setup, pair: Pair, via: Array, box: PayloadSceneChecker
+    ) -> Iterator[Proposal]:
+        """Yield the proposal with these via-points, unless the evaluator refuses it or its class
+        was found before."""
+        fitted = np.vstack([pair.start.extended, via, pair.goal.extended])
+        if self._is_known(pair, box, _poses(fitted)):
+            return
+        self._say("the evaluator's verdict")
+        begun = self.spent
+        first = self._trial(setup, pair, fitted)
+        certified = self.spent if first.verdict()[0].feasible else None
+        self._say("a shorter way")
+        straight = straightened(pair.chain, pair.start, fitted, self.rng)
+        found = self._trial(setup, pair, straight, first.bodies)
+        judgement, why = found.verdict()
+        if not judgement.feasible:
+            if certified is None:
+                self.refusals.append(why)
+                return
+            found, straight = first, fitted
+        certified = certified or self.spent
+        if self._is_known(pair, box, _poses(straight)):
+            return
+        self._say("bounds")
+        # The verdict on the file takes about as long as these did.
+        bounds = self._bounds(found, self.settings.seconds - 1.5 * (self.spent - begun))
+        moved = self._draft(setup, pair, straight, bounds).around(bounds.carry)
+        self._say("the evaluator's verdict on the file")
+        try:
+            last = Trial(self._workcell(moved), found.start_of(bounds.carry), found.bodies)
+        except BranchLostError:
+            self.refusals.append("the start posture is not among the arm's start branches")
+            return
+        judgement, why = last.verdict()
+        if not judgement.feasible:
+            self.refusals.append(why)
+            return
+        outputs = last.evaluator.outputs(last.initial[None])
+        self.known.add((id(pair), box.passed(_poses(straight))))
+        self._say("the pads' way to the box")
+        blocked, stand_off = ("", None) if self.out_of_time else self._pads_way(last)
+        yield Proposal(
+            self.problem,
+            replace(moved, branches=last.branches, stand_off=stand_off),
+            judgement,
+            bounds.share,
+            bounds.candidates,
+            self.spent,
+            certified,
+            (outputs["q_1"][0], outputs["q_2"][0]),
+            box.passed(outputs["pose"][0]),
+            blocked,
+        )
+
+    def _draft(
+        self, setup: Setup, pair: Pair, waypoints: Array, bounds: Bounds | None = None
+    ) -> Draft:
+        """Build the draft with waypoints (n, 6 + m), rounded as in a file."""
+        spins = (pair.holds[0].spin, pair.holds[1].spin)
+        rounded = np.round(waypoints, 4)
+        return Draft(setup.workcell, spins, (-1, -1), rounded, setup.given, bounds)
+
+    def _trial(
+        self, setup: Setup, pair: Pair, waypoints: Array, bodies: CellBodies | None = None
+    ) -> Trial:
+        """Build the trial of the carry through waypoints (n, 6 + m); bodies as in `Trial`."""
+        workcell = self._workcell(self._draft(setup, pair, waypoints))
+        return Trial(workcell, pair.start.q, bodies, named=False)
+
+    def _pads_way(self, trial: Trial) -> tuple[str, float | None]:
+        """Return what blocks the pads before a trial's carry or after it, '' for nothing, and the
+        stand-off that frees them if the cell's does not and the file states none [m]."""
+        handling = trial.workcell.handling
+        blocked = grasp_blocked(trial, handling)
+        if blocked and "stand_off" not in self.problem.data.get("handling", {}):
+            for stand_off in STAND_OFFS:
+                if not grasp_blocked(trial, replace(handling, stand_off=stand_off)):
+                    return "", stand_off
+        return blocked, None
+
+    def _workcell(self, found: Draft) -> Workcell:
+        return self.problem.workcell(changes(self.problem, found))
+
+    def _bounds(self, trial: Trial, until: float) -> Bounds:
+        """Find bounds around a trial's carry until a time [s] after the beginning."""
+        unit, limits = decision_bounds(trial.workcell)
+        low, high = self.settings.feasible
+        sampling = Sampling(
+            trial.feasible,
+            trial.certain,
+            unit,
+            limits,
+            self.rng,
+            low,
+            high,
+            lambda: self.spent > until,
+        )
+        return sampling.bounds_around(trial.initial)
+
+
+def _poses(waypoints: Array) -> Array:
+    """Compute box poses (n, 6) along the spline through waypoints (w, 6 + m)."""
+    basis = path_basis(len(waypoints), np.linspace(0.0, 1.0, LEAST_SAMPLES)).position
+    return np.asarray((basis @ waypoints)[:, :POSE_SIZE])

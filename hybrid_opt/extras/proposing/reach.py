@@ -1,0 +1,153 @@
+"""The way of both arms from wherever they stand to where a job begins, or back from its end, the
+box standing.
+
+An arm cannot change its branch while it holds the box. Where a job begins in another branch than
+the one that its arm stands in, the change happens here. Both arms move at once, in straight lines
+of their joints from corner to corner; RRT-Connect of OMPL looks for the corners, shortcuts leave
+out what they can, and every line is proven free of collisions.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+
+from hybrid_opt.carry import joints_of
+from hybrid_opt.collision.certify import certify
+from hybrid_opt.collision.checker import CollisionChecker
+from hybrid_opt.compiled_cell import CompiledCell, cache_by_workcell
+from hybrid_opt.errors import JobError
+from hybrid_opt.extras.proposing.planner import connected
+from hybrid_opt.job.plan import JobCollisions, SupportedPose
+from hybrid_opt.job.records import Job
+from symbolic.array import Array
+from symbolic.errors import SettingsError
+
+JOINT_STEP = 0.04
+"""Largest change of a joint between configurations that are looked at [rad or m]."""
+
+RANGE = 1.5
+"""Longest line that the planner's trees grow by [rad]."""
+
+MOST_LOOKED = 400_000
+"""Configurations that one attempt may look at."""
+
+ATTEMPTS = 8
+"""Attempts, each after a line that could not be proven free."""
+
+PROOF_POINTS = 17
+"""Grid that the proof of a line starts from."""
+
+_CLOSER = "choose joint positions nearer to the job's"
+
+_collisions = cache_by_workcell(lambda cell: JobCollisions(CompiledCell.of(cell), everywhere=True))
+
+
+def plan_reach(job: Job, q: Array, *, rng: np.random.Generator, after: bool = False) -> Array:
+    """Plan the path of both arms to a job's first position, free of collisions throughout.
+
+    Args:
+        q: (joints,) where both arms stand, side by side [rad, or m where a joint slides].
+        rng: its only randomness.
+        after: the way from the job's last position to q instead.
+
+    Returns:
+        (n, joints) corners, both ends included. Both arms drive straight lines of their joints
+        between them, each line in the same time.
+
+    Raises:
+        SettingsError: q does not fit the cell or exceeds a joint's limits, or OMPL is not
+            installed.
+        JobError: something collides where the arms stand, or no way was found.
+    """
+    cell, end = job.workcell, job.phases[-1 if after else 0].motion.q[-1 if after else 0]
+    q = np.asarray(q, dtype=float)
+    bounds = cell.stack_joint_limits("position_lower"), cell.stack_joint_limits("position_upper")
+    if q.shape != end.shape or not bool(np.all((q >= bounds[0]) & (q <= bounds[1]))):
+        raise SettingsError(
+            f"q has shape {q.shape}; needs {len(end)} joint positions within their limits"
+        )
+    lines = _Lines(job, after)
+    touch = lines.touched(q)
+    if touch:
+        raise JobError(f"at these joint positions {touch}; choose others")
+    for _ in range(ATTEMPTS):
+        corners = [q, end]
+        if not lines.proven(q, end):
+            corners = _connected(lines, q, end, bounds, int(rng.integers(1, 2**31)))
+            corners = _shortened(lines, corners)
+        if all(lines.proven(a, b) for a, b in pairwise(corners)):
+            return np.array(corners[::-1] if after else corners)
+    raise JobError(f"no way of the arms that is free of collisions was found; {_CLOSER}")
+
+
+class _Lines:
+    """Straight lines of both arms' joints, the box standing where a job finds or leaves it."""
+
+    def __init__(self, job: Job, after: bool) -> None:
+        end = -1 if after else 0
+        stands, carried = job.phases[end].motion.pose[end], job.phase("carry").motion.pose[end]
+        place = SupportedPose(stands, float(carried[2] - stands[2]), job.stands_on[end])
+        self._checker: CollisionChecker = _collisions(job.workcell).checker([place])
+        self._cell, self._pose = job.workcell, stands
+        self.looked = 0
+
+    def _placed(self, q: Array) -> tuple[Array, Array, Array]:
+        first, second = map(np.ascontiguousarray, joints_of(self._cell, q))
+        return np.tile(self._pose, (len(q), 1)), first, second
+
+    def touched(self, q: Array) -> str:
+        """Describe the collision at joints (joints,), '' for none."""
+        touch = self._checker.check(*self._placed(q[None])).first_touch
+        return "" if touch is None else str(touch)
+
+    def free(self, first: Array, second: Array) -> bool:
+        """Return True if no configuration checked on a line collides."""
+        n = int(np.ceil(np.abs(second - first).max() / JOINT_STEP)) + 1
+        q = np.linspace(first, second, n + 1)[1:]
+        self.looked += len(q)
+        return self._checker.check(*self._placed(q)).is_free
+
+    def proven(self, first: Array, second: Array) -> bool:
+        """Return True if the whole line is proven free."""
+
+        def at(u: Array) -> tuple[Array, Array, Array]:
+            return self._placed(first + u[:, None] * (second - first))
+
+        grid = np.linspace(0.0, 1.0, PROOF_POINTS)
+        return self.free(first, second) and certify(self._checker, at, grid).is_free
+
+
+def _connected(
+    lines: _Lines, q: Array, end: Array, bounds: tuple[Array, Array], seed: int
+) -> list[Array]:
+    """Find corners by RRT-Connect.
+
+    Raises:
+        JobError: it finds none.
+    """
+    last = lines.looked + MOST_LOOKED
+    path = connected(
+        bounds,
+        RANGE,
+        lambda first, second: lines.free(np.array(first), np.array(second)),
+        [[tuple(q.tolist())], [tuple(end.tolist())]],
+        lambda: lines.looked >= last,
+        seed,
+    )
+    if path is None:
+        raise JobError(
+            f"no way of the arms was found among {MOST_LOOKED} configurations; {_CLOSER}"
+        )
+    return [q, *map(np.array, path[1:-1]), end]
+
+
+def _shortened(lines: _Lines, corners: list[Array]) -> list[Array]:
+    """Remove corners greedily while lines that are proven free join the rest."""
+    found, at = [corners[0]], 0
+    while at < len(corners) - 1:
+        ahead = range(len(corners) - 1, at + 1, -1)
+        at = next((k for k in ahead if lines.proven(corners[at], corners[k])), at + 1)
+        found.append(corners[at])
+    return found

@@ -1,0 +1,380 @@
+"""A problem made ready for a path: reach first, then both arms' ways to hold and their pairs;
+and, where one of these is missing, why."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from functools import cache, cached_property
+from itertools import combinations, islice, product
+from typing import Any
+
+import numpy as np
+
+from hybrid_opt.errors import ProposalError
+from hybrid_opt.evaluate.explanation import missing_reach
+from hybrid_opt.extras.proposing.common import common_positions
+from hybrid_opt.extras.proposing.holding import (
+    GUIDES,
+    REACHED,
+    SEARCH_DAMPING,
+    ArmKinematics,
+    Hold,
+    HoldQuery,
+    HoldSearch,
+    find_holds,
+    initial_arc,
+    possible_spins,
+    rotate_about_normal,
+    told_manipulability,
+)
+from hybrid_opt.extras.proposing.planner import ChainConfiguration, ClosedChain, Retreats, retreats
+from hybrid_opt.extras.proposing.problem import Problem
+from hybrid_opt.extras.proposing.trial import MARGINS, PoseJudge, judge_of
+from hybrid_opt.robust.budget import budget_text
+from hybrid_opt.static_hold import require_hold
+from symbolic.array import Array
+from symbolic.geometry.pairs import build_geometry
+from symbolic.read.arms import FOLLOWING, arm_model, common_joints, turning_joints
+from symbolic.read.editing import merged
+from symbolic.records import POSE_SIZE, Task, Workcell
+from symbolic.records.poses import box_placement
+
+RANKING_GUIDES = 3
+"""Guides by which pairs are ranked: straight, bowing up, and far up."""
+
+MOST_PAIRS = 32
+"""Pairs that are looked at closer, the best of both arms' own scores."""
+
+ENOUGH_PAIRS = 4
+"""Pairs after which no further position of the joints that move both arms is tried."""
+
+MOST_POSITIONS = 6
+"""Most positions of these that are tried."""
+
+
+@dataclass(frozen=True, eq=False)
+class Pair:
+    """Both arms' ways to hold.
+
+    Attributes:
+        holds: of both arms.
+        start, goal: the closed chain at both ends.
+        chain: it, with a judge that keeps as much clearance as both ends do.
+        promise: larger is better.
+    """
+
+    holds: tuple[Hold, Hold]
+    start: ChainConfiguration
+    goal: ChainConfiguration
+    chain: ClosedChain
+    promise: float
+
+    @cached_property
+    def retreats(self) -> Retreats:
+        """Where straight motions lead out of start and goal."""
+        return retreats(self.chain, (self.start, self.goal))
+
+
+def ranked_pairs(
+    workcell: Workcell, judge: PoseJudge, holds: Sequence[Sequence[Hold]], ends: tuple[Array, Array]
+) -> list[Pair]:
+    """Return the pairs whose arms do not meet at start and goal, the most promising first.
+
+    Args:
+        workcell: with its redundant joints chosen.
+        judge: of collisions, with nothing to spare.
+        holds: per arm, with the same positions of the joints that move both.
+        ends: start and goal poses of the box (6,).
+    """
+    scored = [(a.score + b.score, (a, b)) for a in holds[0] for b in holds[1]]
+    scored.sort(key=lambda item: -item[0])
+    judges = cache(judge.with_margin)
+    models = (arm_model(workcell.robots[0]), arm_model(workcell.robots[1]))
+    found: list[Pair] = []
+    for score, pair in scored[:MOST_PAIRS]:
+        start, goal = (_place(workcell.task, pose, pair, k) for k, pose in enumerate(ends))
+        wide = next(
+            (judges(margin) for margin in MARGINS if _free(judges(margin), start, goal)), None
+        )
+        if wide is not None:
+            chain = ClosedChain(workcell, wide, pair, models)
+            promise = _free_share(chain, start, goal) + 0.1 * score
+            found.append(Pair(pair, start, goal, chain, promise))
+    return sorted(found, key=lambda pair: -pair.promise)
+
+
+def _place(task: Task, pose: Array, holds: tuple[Hold, Hold], end: int) -> ChainConfiguration:
+    """Build the closed chain at the start (0) or the goal (1)."""
+    joints = [(hold.q_start, hold.q_goal)[end] for hold in holds]
+    extended = np.zeros(task.extended_size)
+    extended[:POSE_SIZE] = pose
+    for arm, q in enumerate(joints):
+        for joint, place in task.redundant_of(arm):
+            extended[place] = q[joint]
+    return ChainConfiguration(extended, (joints[0], joints[1]))
+
+
+def _free(judge: PoseJudge, *places: ChainConfiguration) -> bool:
+    """Return True if nothing collides in any of these configurations."""
+    return not any(
+        judge.colliding(place.extended[None, :POSE_SIZE], place.q[0][None], place.q[1][None])[0]
+        for place in places
+    )
+
+
+def _free_share(chain: ClosedChain, start: ChainConfiguration, goal: ChainConfiguration) -> float:
+    """Compute the share of the freest guide that the chain can follow."""
+    best = 0.0
+    for bow in GUIDES[:RANKING_GUIDES]:
+        path = initial_arc(start.extended, goal.extended, bow)
+        forth = sum(1 for _ in chain.along(start, path))
+        back = sum(1 for _ in chain.along(goal, path[::-1])) if forth < len(path) else forth
+        best = max(best, (forth + back) / (2 * len(path)))
+    return best
+
+
+POSTURES = 200
+"""Random postures by which redundant joints are chosen, and from which arms reach for the box."""
+
+REACH_STEPS = 40
+"""Newton steps from these."""
+
+NEAREST = 8
+"""Postures from which missing reach is measured, those that come nearest."""
+
+MISSING = 1e-3
+"""Reach that counts as missing [m]."""
+
+TOLD = 3
+"""Most pairs or joints that are named."""
+
+
+@dataclass(frozen=True, eq=False)
+class Setup:
+    """A cell and the pairs of ways to hold in it.
+
+    Attributes:
+        given: what was added to the problem's tables before, such as bases.
+        workcell: the cell, its redundant joints chosen.
+        pairs: the most promising first.
+    """
+
+    given: dict[str, Any]
+    workcell: Workcell
+    pairs: list[Pair]
+
+
+def prepare(
+    problem: Problem,
+    given: dict[str, Any],
+    spins: Array,
+    rng: np.random.Generator,
+    tell: Callable[[str], None] = lambda text: None,
+) -> Setup:
+    """Find all holds of both arms.
+
+    Args:
+        given: added to the problem's tables.
+        spins: of both pads that are tried [rad].
+        tell: called with the budget of the grip, before any search.
+
+    Raises:
+        ProposalError: an arm cannot hold the box at start and goal; the text says why.
+        WorkcellError: the problem is wrong, or no arms could hold the payload still.
+    """
+    start, goal = problem.poses
+    given = merged(given, redundancy(problem, problem.workcell(given)))
+    workcell = problem.workcell(given)
+    require_hold(workcell)
+    tell(budget_text(workcell))
+    lacking = reach_missing(workcell, (start, goal), spins)
+    if lacking:
+        raise ProposalError(lacking)
+    judge = judge_of(build_geometry(workcell))
+    blocked = box_blocked(judge, start, goal)
+    if blocked:
+        raise ProposalError(blocked)
+    query = HoldQuery(start, goal, spins, judge)
+    arms = [ArmKinematics(workcell, arm) for arm in (0, 1)]
+    pairs: list[Pair] = []
+    tried: list[list[HoldSearch]] = []
+    for common in islice(common_positions(arms, query, rng), MOST_POSITIONS):
+        at = replace(query, common=common)
+        searches = [find_holds(at, arm, rng) for arm in arms]
+        tried.append(searches)
+        pairs += ranked_pairs(workcell, judge, [found.holds for found in searches], (start, goal))
+        if len(pairs) >= ENOUGH_PAIRS:
+            break
+    if not pairs:
+        raise ProposalError(_no_pair(query, judge, max(tried, key=_progress)))
+    return Setup(given, workcell, sorted(pairs, key=lambda pair: -pair.promise))
+
+
+def _progress(searches: Sequence[HoldSearch]) -> tuple[float, ...]:
+    """Order searches of both arms by how far the arm that comes less far comes."""
+    return min((len(one.holds), one.kept, one.free, one.within) for one in searches)
+
+
+def redundancy(problem: Problem, workcell: Workcell) -> dict[str, Any]:
+    """Return the joints beyond six that the file does not name, at the middle of their ranges."""
+    robots: list[dict[str, Any]] = [{}, {}]
+    entries: dict[str, dict[str, Any]] = {}
+    common = common_joints(workcell.robots)
+    for i, robot in enumerate(workcell.robots):
+        model = arm_model(robot)
+        if model.nq == FOLLOWING:
+            continue
+        names = list(model.names)[1:]
+        chosen = list(robot.redundant_joints)
+        if not problem.data["robots"][i].get("redundant_joints"):
+            chosen = [names[k] for k in redundant_joints(workcell, i, common)]
+        robots[i]["redundant_joints"] = chosen
+        for name in chosen:
+            joint = names.index(name)
+            middle = float(robot.position_lower[joint] + robot.position_upper[joint]) / 2.0
+            key = name if name in common else f"{robot.name}/{name}"
+            entries.setdefault(key, {"joint": key, "initial": middle})
+    return {"robots": robots, "task": {"redundant": list(entries.values())}} if entries else {}
+
+
+def redundant_joints(workcell: Workcell, arm: int, common: tuple[str, ...]) -> tuple[int, ...]:
+    """Return the indices of an arm's joints without which the other six are conditioned best, in
+    the median of random postures; joints of both arms and prismatic joints in any case."""
+    robot = workcell.robots[arm]
+    model = arm_model(robot)
+    names, beyond = list(model.names)[1:], model.nq - FOLLOWING
+    held = [names.index(name) for name in common]
+    sliding = [k for k, turns in enumerate(turning_joints(model)) if not turns and k not in held]
+    forced = [*held, *sliding][:beyond]
+    kinematics = ArmKinematics(workcell, arm)
+    q = kinematics.drawn(POSTURES, np.random.default_rng(0))
+    jacobian = kinematics.jacobian(*kinematics.chain(q))
+
+    def condition(joints: tuple[int, ...]) -> float:
+        rest = [k for k in range(model.nq) if k not in joints]
+        return float(np.median(np.linalg.svd(jacobian[:, :, rest], compute_uv=False)[:, -1]))
+
+    others = [k for k in range(model.nq) if k not in forced]
+    found = combinations(others, beyond - len(forced))
+    return max((tuple(sorted((*forced, *more))) for more in found), key=condition)
+
+
+def box_blocked(judge: PoseJudge, start: Array, goal: Array) -> str:
+    """Describe what the box alone meets at the start or the goal, '' for nothing."""
+    found = []
+    for name, pose in (("start", start), ("goal", goal)):
+        for body, deep in judge.resting(pose):
+            told = f"payload meets {body} at the {name}"
+            allowed = "raise it, or let it rest there by [[task.allowed_contacts]]"
+            found.append(told if deep else f"{told}, by less than 1 mm: {allowed}")
+    return "; ".join(found)
+
+
+def reach_missing(workcell: Workcell, ends: tuple[Array, Array], spins: Array) -> str:
+    """Describe which arm does not reach its contact at the start or the goal (6,) with any spin,
+    and by how much; '' if both reach."""
+    found = []
+    for arm, (name, pose) in product((0, 1), zip(("start", "goal"), ends, strict=True)):
+        robot, contact = workcell.robots[arm], workcell.contacts[arm]
+        kinematics = ArmKinematics(workcell, arm)
+        T_world_box = box_placement(workcell.task.orientation, pose)
+        possible = possible_spins(contact, spins)
+        T = np.array([T_world_box @ kinematics.held(spin) for spin in possible])
+        which = np.arange(POSTURES) % len(possible)
+        q = kinematics.drawn(POSTURES, np.random.default_rng(0))
+        near = kinematics.solve(q, T[which], REACH_STEPS, SEARCH_DAMPING)
+        if near.residual.min() <= REACHED:
+            continue
+        missing = min(
+            missing_reach(
+                robot,
+                rotate_about_normal(contact, possible[which[k]]),
+                T_world_box,
+                np.clip(near.q[k], *kinematics.span),
+            )
+            for k in np.argsort(near.residual)[:NEAREST]
+        )
+        if missing > MISSING:
+            found.append(f"{robot.name} lacks {missing:.3f} m to its contact at the {name}")
+    return "; ".join(found)
+
+
+def _arm_missing(kinematics: ArmKinematics, search: HoldSearch) -> str:
+    robot = kinematics.workcell.robots[kinematics.arm]
+    names = list(arm_model(robot).names)[1:]
+    if not search.within:
+        joints = ", ".join(names[joint] for joint, _ in search.joints.most_common(TOLD))
+        told = f"beyond limits are most often {joints}"
+        if search.manipulability or not joints:  # some are within limits
+            told = told_manipulability(kinematics, f"is at most {search.manipulability:.2g} m^3")
+        return f"{robot.name} has no usable posture at the start: {told}"
+    if not search.free:
+        return (
+            f"{robot.name} collides at the start in every posture: {_pairs(search.pairs)}"
+            f"{_overlap_hint(search.pairs)}"
+        )
+    if search.pairs and search.kept >= 1.0:
+        return (
+            f"{robot.name} collides in every posture that leads from the start to the goal: "
+            f"{_pairs(search.pairs)}"
+        )
+    return (
+        f"{robot.name} follows at most {100.0 * search.kept:.0f} % of the way to the goal: "
+        f"{search.stopped}"
+    )
+
+
+def _no_pair(query: HoldQuery, judge: PoseJudge, searches: Sequence[HoldSearch]) -> str:
+    """Say which arm cannot hold the box, or which bodies meet where either arm alone is free."""
+    told = [
+        _arm_missing(ArmKinematics(judge.geometry.workcell, arm), one)
+        for arm, one in enumerate(searches)
+        if not one.holds
+    ]
+    if told:
+        return "; ".join(told)
+    met: Counter[tuple[str, str]] = Counter()
+    for end, pose in enumerate((query.start, query.goal)):
+        for a in searches[0].holds[:8]:
+            for b in searches[1].holds[:8]:
+                joints = [(hold.q_start, hold.q_goal)[end] for hold in (a, b)]
+                pair = judge.first_pair(pose, joints[0], joints[1])
+                if pair is not None:
+                    met[pair] += 1
+    return f"both arms' postures collide at the start or the goal: {_pairs(met)}"
+
+
+def no_path(pairs: Iterable[Pair], refusals: Sequence[str]) -> str:
+    """Describe what the planner met most often, and why the evaluator refused its paths."""
+    met: Counter[tuple[str, str]] = Counter()
+    refused: Counter[str] = Counter()
+    for pair in pairs:
+        met += pair.chain.judge.met
+        refused += pair.chain.refused
+    told = []
+    if met:
+        told.append(f"most often in the way: {_pairs(met)}")
+    if refused:
+        told.append(", ".join(name for name, _ in refused.most_common(TOLD)))
+    if refusals:
+        (text, count), *_ = Counter(refusals).most_common(1)
+        told.append(f"the evaluator refused {len(refusals)} carries, {count} because {text}")
+    return "; ".join(told)
+
+
+def _pairs(met: Counter[tuple[str, str]]) -> str:
+    total = max(sum(met.values()), 1)
+    return ", ".join(
+        f"{' – '.join(pair)} ({100.0 * count / total:.0f} %)"
+        for pair, count in met.most_common(TOLD)
+    )
+
+
+def _overlap_hint(met: Counter[tuple[str, str]]) -> str:
+    """Suggest a remedy for links of one robot that meet in every posture."""
+    owners = [[name.partition("/")[0] for name in pair if "/" in name] for pair in met]
+    if not any(len(names) == 2 and names[0] == names[1] for names in owners):
+        return ""
+    return " (links that overlap by design are left out by srdf or [[collision.ignored]])"

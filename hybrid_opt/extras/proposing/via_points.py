@@ -1,0 +1,214 @@
+"""Via-points through which the quintic spline follows a planned path without collision."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from itertools import pairwise
+
+import numpy as np
+
+from hybrid_opt.extras.proposing.holding import JUMP
+from hybrid_opt.extras.proposing.planner import (
+    PATH_STEP,
+    ChainConfiguration,
+    ClosedChain,
+    distance,
+    metric_weights,
+    same,
+    straight,
+)
+from symbolic.array import Array
+from symbolic.path.spline import path_basis
+from symbolic.records import POSE_SIZE
+
+SHORTCUTS = 80
+"""Shortcuts of a path that are tried."""
+
+SHORTER = 0.99
+"""Largest length of a shortcut, as a share of the length that it replaces."""
+
+MOST_VIA_POINTS = 6
+"""Via-points of a proposal; more make a search long."""
+
+LEAST_SAMPLES = 60
+"""Places of a spline that are looked at, at least."""
+
+SHIFTS = 12
+"""Random shifts of via-points that are tried where fits collide."""
+
+SHIFT = 0.04
+"""Standard deviation of the shifts [m], and in a turn counted by its lever."""
+
+GENERATIONS = 60
+"""Generations of the evolution strategy that shortens a free spline."""
+
+OFFSPRING = 16
+"""Splines of a generation."""
+
+MEASURED = 24
+"""Places of a spline by which the strategy measures its length and looks for collisions."""
+
+BLOCKED = 100.0
+"""Cost of a spline whose places are all out of reach; half as much where all collide [rad]."""
+
+
+def travelled(points: Array) -> float:
+    """Compute the Euclidean length of a path through points (n, m)."""
+    return float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
+
+
+def joint_length(places: Sequence[ChainConfiguration]) -> float:
+    """Compute the Euclidean length of the path of all joints [rad]."""
+    return travelled(np.array([np.concatenate(place.q) for place in places]))
+
+
+def along(corners: Sequence[ChainConfiguration]) -> Array:
+    """Compute box poses (n, 6) on the straight motions between corners."""
+    legs = [straight(a.extended, b.extended)[:, :POSE_SIZE] for a, b in pairwise(corners)]
+    return np.vstack(legs)
+
+
+def shortened(
+    chain: ClosedChain, corners: Sequence[ChainConfiguration], rng: np.random.Generator
+) -> list[ChainConfiguration]:
+    """Remove needless corners of a path; return places along it, `planner.PATH_STEP` apart."""
+    dense = [corners[0]]
+    for corner in corners[1:]:
+        found = chain.way(dense[-1], straight(dense[-1].extended, corner.extended))
+        dense += found[1:] if found and same(found[-1], corner) else [corner]
+    for _ in range(SHORTCUTS):
+        if len(dense) < 4:
+            break
+        first, last = sorted(rng.choice(len(dense), 2, replace=False).tolist())
+        if last - first < 3:
+            continue
+        old = dense[first : last + 1]
+        path = straight(old[0].extended, old[-1].extended)
+        if rng.random() < 0.5:  # in one coordinate alone, the others go on as they do
+            path, column = np.array([place.extended for place in old]), rng.integers(path.shape[1])
+            path[:, column] = np.linspace(path[0, column], path[-1, column], len(path))
+        found = chain.between(old[0], old[-1], path)
+        if found and joint_length(found) < SHORTER * joint_length(old):
+            dense[first : last + 1] = found
+    return dense
+
+
+def fit(
+    chain: ClosedChain, path: Sequence[ChainConfiguration], count: int, rng: np.random.Generator
+) -> Array | None:
+    """Find via-points (count, 6 + m) whose spline is free, None without any.
+
+    Those on the path at even distances, those whose spline is nearest to it, what lies between
+    them, then random shifts of the best.
+
+    Args:
+        path: from start to goal.
+        count: via-points.
+        rng: of the shifts.
+    """
+    points = np.array([place.extended for place in path])
+    steps = [distance(a, b) for a, b in pairwise(points)]
+    share = np.concatenate([[0.0], np.cumsum(steps)])
+    u = np.linspace(0.0, 1.0, LEAST_SAMPLES)
+    even = np.column_stack([np.interp(u * share[-1], share, column) for column in points.T])
+    at = np.linspace(0.0, 1.0, count + 2)
+    on_path = np.column_stack([np.interp(at * share[-1], share, column) for column in points.T])
+    basis = path_basis(count + 2, u).position
+    rest = even - basis[:, [0, -1]] @ on_path[[0, -1]]
+    nearest = on_path.copy()
+    nearest[1:-1] = np.linalg.lstsq(basis[:, 1:-1], rest, rcond=None)[0]
+    best, most = on_path, -1.0
+    for weight in (0.0, 0.5, 1.0):
+        waypoints = (1.0 - weight) * on_path + weight * nearest
+        free = free_share(chain, path[0], waypoints)
+        if free == 1.0:
+            return waypoints[1:-1]
+        if free > most:
+            best, most = waypoints, free
+    for _ in range(SHIFTS):
+        waypoints = best.copy()
+        waypoints[1:-1, :3] += rng.normal(0.0, SHIFT, (count, 3))
+        free = free_share(chain, path[0], waypoints)
+        if free == 1.0:
+            return waypoints[1:-1]
+        if free > most:
+            best, most = waypoints, free
+    return None
+
+
+def straightened(
+    chain: ClosedChain, start: ChainConfiguration, waypoints: Array, rng: np.random.Generator
+) -> Array:
+    """Find waypoints (n, 6 + m) of a free spline with shorter joint paths than the given one.
+
+    Found by an evolution strategy, CMA-ES (Hansen, arXiv 1604.00772), from the given one on.
+    """
+    # Not imported at the top: it brings Matplotlib, and a first carry is there before.
+    import cma
+
+    lever = metric_weights(waypoints.shape[1])
+    basis = path_basis(len(waypoints), np.linspace(0.0, 1.0, MEASURED)).position
+    places = list(_closed_path(chain, start, basis @ waypoints))
+    if len(places) < MEASURED:
+        return waypoints
+    shorter: list[tuple[float, Array]] = []
+    least = joint_length(places)
+    near = np.array([place.q[0] for place in places]), np.array([place.q[1] for place in places])
+
+    def moved(y: Array) -> Array:
+        inner = y.reshape(-1, len(lever)) / lever
+        return np.vstack([waypoints[0], inner, waypoints[-1]])
+
+    options = {"popsize": OFFSPRING, "seed": int(rng.integers(1, 2**31)), "verbose": -9}
+    strategy = cma.CMAEvolutionStrategy((waypoints[1:-1] * lever).ravel(), SHIFT / 2.0, options)
+    for _ in range(GENERATIONS):
+        asked = strategy.ask()
+        tried = [moved(np.asarray(y)) for y in asked]
+        lengths, blocked = _lengths(chain, np.array([basis @ one for one in tried]), near)
+        strategy.tell(asked, (lengths + blocked).tolist())
+        k = int(np.argmin(lengths + blocked))
+        if blocked[k] == 0.0 and lengths[k] < least:
+            shorter.append((float(lengths[k]), tried[k]))
+        if strategy.stop():
+            break
+    # All places are looked at in the end: most of these are on the way to a shorter one.
+    shorter.sort(key=lambda item: item[0])
+    return next((one for _, one in shorter if free_share(chain, start, one) == 1.0), waypoints)
+
+
+def _closed_path(
+    chain: ClosedChain, start: ChainConfiguration, path: Array
+) -> Iterator[ChainConfiguration]:
+    """Yield configurations along extended poses (n, 6 + m) as far as the chain closes, whatever
+    collides."""
+    place: ChainConfiguration | None = start
+    yield start
+    for extended in path[1:]:
+        assert place is not None
+        place = chain.close(extended, place.q)
+        if place is None:
+            return
+        yield place
+
+
+def _lengths(chain: ClosedChain, paths: Array, near: tuple[Array, Array]) -> tuple[Array, Array]:
+    """Compute the joint path lengths [rad] along paths (k, n, 6 + m) near a closed one, per arm
+    (n, joints); and what counts beside it, above 0 where a path is blocked (k,)."""
+    k, n, size = paths.shape
+    begin = np.tile(near[0], (k, 1)), np.tile(near[1], (k, 1))
+    flat = paths.reshape(-1, size)
+    q, closed = chain.close_many(flat, begin)
+    steps = np.diff(np.hstack(q).reshape(k, n, -1), axis=1)
+    closed &= np.abs(np.hstack(q) - np.hstack(begin)).max(axis=1) <= JUMP
+    hit = np.zeros(k * n, dtype=bool)
+    hit[closed] = chain.judge.colliding(flat[closed, :POSE_SIZE], q[0][closed], q[1][closed])
+    lost, met = ((~closed).reshape(k, n).mean(axis=1), hit.reshape(k, n).mean(axis=1))
+    return np.linalg.norm(steps, axis=2).sum(axis=1), BLOCKED * (lost + met / 2.0)
+
+
+def free_share(chain: ClosedChain, start: ChainConfiguration, waypoints: Array) -> float:
+    """Compute the share of the spline through waypoints (n, 6 + m) before its first collision."""
+    legs = [distance(a, b) for a, b in pairwise(waypoints)]
+    n = max(LEAST_SAMPLES, int(np.ceil(1.2 * sum(legs) / PATH_STEP)))
+    path = path_basis(len(waypoints), np.linspace(0.0, 1.0, n)).position @ waypoints
+    return sum(1 for _ in chain.along(start, path)) / n

@@ -1,0 +1,386 @@
+"""A driven box in MuJoCo: pressed with a multiple of a force, does it stay in place?
+
+The carriage is set to the planned state of the box frame at every step and accelerated as planned
+within it, so that the pads move exactly as planned, as on stiff arms; the box, free, is held by
+friction alone. `Outcome`, `Threshold` and `HeldBox` are those of whole cells, too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cache
+from types import ModuleType
+from typing import Any, Generic, TypeVar
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.interpolate import CubicHermiteSpline
+from scipy.spatial.transform import Rotation
+
+from hybrid_opt.carry import Carry
+from hybrid_opt.cell import Cell
+from hybrid_opt.errors import SimulationError
+from hybrid_opt.extras.simulation.scene import (
+    CARRIAGE_MASS,
+    PAD_MASS,
+    SimulationSettings,
+    compiled,
+    rim,
+    scene_text,
+    tilt_centre,
+    tilt_names,
+)
+from symbolic.array import Array, interpolated
+from symbolic.contact.registry import require_squeeze
+from symbolic.errors import SettingsError
+from symbolic.records import Contact, Workcell
+from symbolic.records.poses import box_rotation
+
+BEGINS = 0.05
+"""Share of the slip that counts as one at which it is said to begin."""
+
+SAME_TIME = 1e-9
+"""Samples closer than this stand for both sides of one instant [s]."""
+
+SLIP_INTERVAL = 2e-3
+"""Time between two looks at the slip [s]."""
+
+RIM_POINTS = 8
+"""Places on the rim of each robot's first patch where the slip is measured."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Outcome of one simulation, at n moments.
+
+    Attributes:
+        factor: multiple of the pressing force.
+        holds: whether the box slipped by less than the settings' slip.
+        time: (n,) when it was looked at, from the settled state on [s].
+        slip: (n, 2) largest displacement in the plane of each pad since then [m].
+        turn: (n,) angle by which the box turned between its pads since then [rad].
+    """
+
+    factor: float
+    holds: bool
+    time: Array
+    slip: Array
+    turn: Array
+
+    @property
+    def pad(self) -> int:
+        """Index of the pad with the larger slip at the end."""
+        return int(self.slip[-1].argmax())
+
+    def begins(self, slip: float) -> float:
+        """Return the time at which the slip first exceeds `BEGINS` times `slip` [s]; infinite if
+        never."""
+        beyond = np.flatnonzero(self.slip.max(axis=1) > BEGINS * slip)
+        return float(self.time[beyond[0]]) if len(beyond) else float("inf")
+
+
+AnyOutcome = TypeVar("AnyOutcome", bound=Outcome)
+
+
+@dataclass(frozen=True)
+class Threshold(Generic[AnyOutcome]):
+    """The least multiple of a force that holds.
+
+    Attributes:
+        slips, holds: simulations right below and above it.
+    """
+
+    slips: AnyOutcome
+    holds: AnyOutcome
+
+    @property
+    def factor(self) -> float:
+        """Middle of both multiples."""
+        return (self.slips.factor + self.holds.factor) / 2.0
+
+
+def bisected(
+    simulate: Callable[[float], AnyOutcome], low: float, high: float, steps: int
+) -> Threshold[AnyOutcome]:
+    """Find the least factor with which a simulation holds, by bisection.
+
+    Args:
+        simulate: a factor to what it shows.
+        low, high: factors between which it is looked for.
+        steps: bisections.
+
+    Raises:
+        WitnessError: the box holds at the lower or slips at the higher factor.
+    """
+    slips, holds = simulate(low), simulate(high)
+    if slips.holds or not holds.holds:
+        what = f"holds at {low:g}" if slips.holds else f"slips at {high:g}"
+        raise SimulationError(f"the box {what} times the force; give other factors")
+    for _ in range(steps):
+        middle = simulate((slips.factor + holds.factor) / 2.0)
+        slips, holds = (slips, middle) if middle.holds else (middle, holds)
+    return Threshold(slips, holds)
+
+
+def mujoco_module() -> ModuleType:
+    """Import the simulator.
+
+    Raises:
+        WitnessError: it is not installed.
+    """
+    try:
+        import mujoco
+    except ImportError as error:
+        raise SimulationError(
+            "MuJoCo is not installed: pip install 'dual-arm-carry[sim]'"
+        ) from error
+    module: ModuleType = mujoco
+    return module
+
+
+class HeldBox:
+    """Pose of the box between its pads in one simulation, at the beginning of its last step.
+
+    Attributes:
+        sites: of the two pads.
+        box: the body.
+    """
+
+    def __init__(self, model: Any, data: Any, workcell: Workcell) -> None:
+        """Find pads and box in a model of `hybrid_opt.extras.simulation.scene`."""
+        self.sites = [int(model.site(f"pad_{i + 1}").id) for i in (0, 1)]
+        self.box = int(model.body("box").id)
+        self._data = data
+        rims = np.array([rim(contact, RIM_POINTS) for contact in workcell.contacts])
+        self._rims = np.concatenate([rims, np.zeros((2, RIM_POINTS, 1))], axis=2)
+        self._settled: tuple[Array, Array] | None = None
+
+    def look(self) -> tuple[Array, float]:
+        """Measure the displacement of the box over the patches' rims in the planes of the pads (2,)
+        [m], and its rotation between them [rad], since the first call."""
+        axes = self._data.site_xmat[self.sites].reshape(2, 3, 3)
+        places = self._data.site_xpos[self.sites][:, None]
+        position = self._data.xpos[self.box]
+        rotation = self._data.xmat[self.box].reshape(3, 3)
+        turned = axes[0].T @ rotation
+        if self._settled is None:
+            world = self._rims @ np.swapaxes(axes, 1, 2) + places
+            self._settled = (world - position) @ rotation, turned
+        on_box, at_first = self._settled
+        moved = (on_box @ rotation.T + position - places) @ axes - self._rims
+        slip = np.linalg.norm(moved[..., :2], axis=2).max(axis=1)
+        return slip, float(Rotation.from_matrix(at_first.T @ turned).magnitude())
+
+
+@dataclass(frozen=True)
+class Drive:
+    """The carriage's motion and the pressing force at n time steps.
+
+    Attributes:
+        leader: index of the pad that keeps its place on the carriage.
+        time: (n,) from minus the time to settle to the end of the carry [s].
+        pose: (n, 7) of the box frame: place in the world [m], unit quaternion, real part first.
+        velocity, acceleration: (n, 6) linear in the world, angular in the box frame [m, rad, s].
+        press: (n,) normal force of the other pad [N].
+        own: (n,) force that the sliding pad's own mass takes along its normal [N].
+        tilt: (n, 2, 2) planned moments of both pads about the x and y axes of their frames [N m].
+    """
+
+    leader: int
+    time: Array
+    pose: Array
+    velocity: Array
+    acceleration: Array
+    press: Array
+    own: Array
+    tilt: Array
+
+
+def planned_moments(cell: Cell, carry: Carry) -> Array:
+    """Compute the moments (n + 1, 2, 3) of each robot's planned wrenches about the middle of its
+    pads, for the carry's own friction and centre of mass [N m], world frame: at rest before it,
+    then at its samples."""
+    workcell = carry.workcell
+    still = np.zeros_like(carry.rate[:1])
+    known = replace(
+        carry,
+        pose=np.concatenate([carry.pose[:1], carry.pose]),
+        rate=np.concatenate([still, carry.rate]),
+        second_rate=np.concatenate([still, carry.second_rate]),
+    )
+    friction = np.array([contact.friction for contact in workcell.contacts])
+    load = cell.timing_model.uncertain_load(known, friction, workcell.payload.centre_of_mass)
+    rotation = box_rotation(workcell.task.orientation, known.pose)
+    moments = []
+    for i, contact in enumerate(workcell.contacts):
+        wrench = load[f"wrench_{i + 1}"]
+        arm = rotation @ contact.T_box_pad[:3, :3] @ tilt_centre(contact)
+        moments.append(wrench[:, 3:] - np.cross(arm, wrench[:, :3]))
+    return np.stack(moments, axis=1)
+
+
+def drive_of(
+    carry: Carry,
+    settings: SimulationSettings,
+    press: Array | None = None,
+    leader: int = 0,
+    moments: Array | None = None,
+) -> Drive:
+    """Compute the motion of a carry from rest to rest, with the box at rest before it.
+
+    Args:
+        press: (n,) force to press with at the carry's samples; the planned normal force of the
+            arm that does not lead by default [N].
+        leader: index of the arm that keeps its place.
+        moments: what turns driven pads, see `planned_moments`; none by default.
+
+    Raises:
+        SettingsError: the carry does not start and end at rest, or the force does not fit it.
+    """
+    refuse_motion_at_ends(carry)
+    force = carry.normal_force[:, 1 - leader] if press is None else press
+    if force.shape != carry.time.shape:
+        raise SettingsError(f"forces of shape {force.shape} for {len(carry)} samples")
+    begin, end = float(carry.time[0]), float(carry.time[-1])
+    steps = int(np.ceil((end - begin + settings.settle) / settings.time_step)) + 1
+    time = begin - settings.settle + settings.time_step * np.arange(steps)
+    # A step takes the new velocity all along it: poses and accelerations are those amid steps.
+    clipped, amid = (np.clip(at, begin, end) for at in (time, time + settings.time_step / 2.0))
+    single = np.concatenate([[True], np.diff(carry.time) > SAME_TIME])
+    path = CubicHermiteSpline(carry.time[single], carry.pose[single], carry.rate[single])
+    rotation = box_rotation(carry.workcell.task.orientation, path(amid))
+    turn = Rotation.from_matrix(rotation).as_quat(scalar_first=True)
+    omega = interpolated(clipped, carry.time, carry.angular_velocity)
+    acceleration, alpha = (
+        ((amid > begin) & (amid < end))[:, None] * interpolated(amid, carry.time, values)
+        for values in (carry.second_rate[:, :3], carry.angular_acceleration)
+    )
+    slider = carry.workcell.contacts[1 - leader]
+    R_box_pad = slider.T_box_pad[:3, :3]
+    arm = rotation @ (slider.T_box_pad[:3, 3] + R_box_pad @ tilt_centre(slider))
+    at_pad = acceleration + np.cross(alpha, arm) + np.cross(omega, np.cross(omega, arm))
+    spin, spin_rate = (np.einsum("nji,nj->ni", rotation, values) for values in (omega, alpha))
+    tilt = np.zeros((steps, 2, 2))
+    for i, contact in enumerate(carry.workcell.contacts if moments is not None else ()):
+        assert moments is not None
+        moment = interpolated(clipped, carry.time, moments[1:, i])
+        moment[time < begin] = moments[0, i]
+        tilt[:, i] = np.einsum("nji,nj->ni", rotation @ contact.T_box_pad[:3, :2], moment)
+    return Drive(
+        leader=leader,
+        time=np.asarray(time),
+        pose=np.column_stack([path(amid)[:, :3], turn]),
+        velocity=np.column_stack([path(clipped, 1)[:, :3], spin]),
+        acceleration=np.column_stack([acceleration, spin_rate]),
+        press=np.interp(clipped, carry.time, force),
+        own=PAD_MASS * np.einsum("ni,ni->n", at_pad, rotation @ R_box_pad[:, 2]),
+        tilt=tilt,
+    )
+
+
+def refuse_motion_at_ends(carry: Carry) -> None:
+    """Refuse a carry that no simulation can begin with.
+
+    Raises:
+        SettingsError: the carry does not start and end at rest.
+    """
+    if max(np.abs(carry.rate[[0, -1]]).max(), np.abs(carry.angular_velocity[[0, -1]]).max()) > 1e-3:
+        raise SettingsError("the carry does not start and end at rest; give one with a timing")
+
+
+class BoxSimulation:
+    """The box of one workcell between its pads.
+
+    Attributes:
+        workcell, settings: what is simulated, and how.
+    """
+
+    def __init__(
+        self,
+        workcell: Workcell,
+        settings: SimulationSettings | None = None,
+        disturbance: ArrayLike = (0.0, 0.0, 0.0),
+    ) -> None:
+        """Describe the scene; nothing is simulated yet.
+
+        Args:
+            disturbance: (3,) acceleration beside the motion's, world frame [m/s^2].
+
+        Raises:
+            WitnessError: MuJoCo is not installed.
+        """
+        self.workcell = workcell
+        self.settings = settings or SimulationSettings()
+        self._mujoco = mujoco_module()
+        require_squeeze(workcell, "a simulation")
+        self._disturbance = disturbance
+        self._model = cache(self._compiled)
+
+    def simulate(self, drive: Drive, factor: float = 1.0) -> Outcome:
+        """Simulate one carry with the pressing force times a factor, up to its end or to a slip."""
+        mujoco, model, settings = self._mujoco, self._model(drive.leader), self.settings
+        data = mujoco.MjData(model)
+        held = HeldBox(model, data, self.workcell)
+        box, moves = (int(getattr(model.joint("box"), at)[0]) for at in ("qposadr", "dofadr"))
+        press = int(model.joint("press").dofadr[0])
+        driven = (0, 1) if settings.pads == "driven" else ()
+        tilts = [[int(model.joint(name).dofadr[0]) for name in tilt_names(i)] for i in driven]
+        data.qpos[box : box + 7] = drive.pose[0]
+        force = factor * drive.press + drive.own
+        every = max(1, round(SLIP_INTERVAL / settings.time_step))
+        time, slip, turn = [], [], []
+        for k in range(len(drive.time)):
+            data.qpos[:7], data.qvel[:6] = drive.pose[k], drive.velocity[k]
+            if drive.time[k] < drive.time[0] + settings.settle / 4.0:
+                # It stands until the pads press: what hardly holds it does not stop a falling box.
+                data.qvel[moves : moves + 6] = 0.0
+            data.qfrc_applied[:6] = CARRIAGE_MASS * drive.acceleration[k]
+            data.qfrc_applied[press] = force[k]
+            for i in driven:
+                data.qfrc_applied[tilts[i]] = drive.tilt[k, i]
+            mujoco.mj_step(model, data)
+            if k % every or drive.time[k] < drive.time[0] + settings.settle / 2.0:
+                continue
+            moved, turned = held.look()
+            time.append(float(drive.time[k]))
+            slip.append(moved)
+            turn.append(turned)
+            if not moved.max() <= settings.slip:
+                break
+        holds = bool(slip[-1].max() <= settings.slip)
+        return Outcome(factor, holds, np.array(time), np.array(slip), np.array(turn))
+
+    def _compiled(self, leader: int) -> Any:
+        text = scene_text(self.workcell, self.settings, leader, self._disturbance)
+        return compiled(self._mujoco, text)[0]
+
+
+def workcell_of_case(workcell: Workcell, case: Array) -> Workcell:
+    """Return the workcell of a case (18,), see `symbolic.contact.worst_cases.CASE_SIZES`, except
+    the disturbance and the arms' errors."""
+    payload = workcell.payload
+    mass, centre = float(case[4]), case[5:8]
+    # The inertia is known about the nominal centre of mass: Steiner's theorem takes it to the true.
+    d = centre - payload.centre_of_mass
+    facing, planes = workcell.has_facing_pads, [c.T_box_pad[:3, :2] for c in workcell.contacts]
+    planes[1] = planes[0] if facing else planes[1]
+    inertia = mass / payload.mass * payload.inertia - mass * (d @ d * np.eye(3) - np.outer(d, d))
+    first, second = (
+        _displaced(contact, float(case[i]), float(case[2 + i]), plane @ case[11 + 2 * i :][:2])
+        for i, (contact, plane) in enumerate(zip(workcell.contacts, planes, strict=True))
+    )
+    return replace(
+        workcell,
+        payload=replace(payload, mass=mass, centre_of_mass=centre, inertia=inertia),
+        contacts=(first, second),
+    )
+
+
+def _displaced(contact: Contact, friction: float, radius: float, by: Array) -> Contact:
+    T_box_pad = contact.T_box_pad.copy()
+    T_box_pad[:3, 3] += by
+    further = tuple(_displaced(pad, friction, pad.patch_radius, by) for pad in contact.further)
+    return replace(
+        contact, T_box_pad=T_box_pad, friction=friction, patch_radius=radius, further=further
+    )

@@ -1,0 +1,382 @@
+"""References of a simulated cell, and the controllers that follow them.
+
+References say where joints have to be, and how hard pads press. Controllers are as real cells have
+them: joint impedance, and force control along the contact normal. All feed forward the arms' own
+inverse dynamics and the planned forces at the pads, but no moments: these are left to stiffness.
+`impedance`: every joint is a spring and a damper about its reference. `leader`: so is the leading
+arm; the other has no stiffness along the normal and an integral control of its normal force
+instead. `both`: both are so, with the mean of their force errors and a weak spring along the normal
+each, since nothing else keeps the box in its place between them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+import pinocchio as pin
+
+from hybrid_opt.carry import Carry, joints_of
+from hybrid_opt.cell import Cell
+from hybrid_opt.errors import SimulationError
+from hybrid_opt.extras.simulation.box import refuse_motion_at_ends
+from hybrid_opt.extras.simulation.scene import ArmSettings
+from hybrid_opt.job.smooth import driven_timing, without_jumps
+from hybrid_opt.robust.squeeze import Squeeze, SqueezeSettings, commanded_forces
+from hybrid_opt.timing.jerk import applicable_jerk_limits
+from hybrid_opt.timing.records import Timing
+from symbolic.array import Array
+from symbolic.errors import SettingsError
+from symbolic.records import Workcell
+from symbolic.records.poses import box_rotation, inverse
+from symbolic.robot.model import build_robot_model
+
+REST_TIME = 0.3
+"""Time at rest before a carry begins [s]."""
+
+STANDS = 0.1
+"""Time of it for which something else still holds the box [s]."""
+
+TOUCHES = 5.0
+"""Reference of a normal force from which on force control has taken over whole [N]."""
+
+
+@dataclass(frozen=True, eq=False)
+class JointMotion:
+    """Both arms' joints stacked at n moments, times not decreasing.
+
+    Attributes:
+        time: (n,) [s].
+        q, q_rate, q_second: (n, all joints) positions and their time derivatives [rad, s].
+    """
+
+    time: Array
+    q: Array
+    q_rate: Array
+    q_second: Array
+
+
+@dataclass(frozen=True, eq=False)
+class BoxJob:
+    """The job of the box.
+
+    Attributes:
+        start: (6,) its pose at first.
+        goal: (3,) where its centre has to end [m]; None where nobody asks.
+        held: from when to when pads alone hold it: slip is measured in between [s].
+        stands: until when something that is not modelled holds it in place [s].
+    """
+
+    start: Array
+    goal: Array | None
+    held: tuple[float, float]
+    stands: float = -np.inf
+
+
+@dataclass(frozen=True, eq=False)
+class Reference:
+    """References of a whole job at n moments.
+
+    Attributes:
+        workcell: the cell as it was planned for.
+        motion: the joints.
+        normal_force: (n, 2) force that each pad has to press with; zero where it need not touch
+            [N].
+        effort: (n, all joints) joint torques to feed forward, pressing included [N m].
+        press_torque: (n, all joints) torques of each arm's joints that press with 1 N.
+        job: what is to happen to the box.
+        leader: index of the arm that keeps its place where the other alone controls its force.
+    """
+
+    workcell: Workcell
+    motion: JointMotion
+    normal_force: Array
+    effort: Array
+    press_torque: Array
+    job: BoxJob
+    leader: int = 0
+
+
+def job_reference(
+    workcell: Workcell,
+    motion: JointMotion,
+    normal_force: Array,
+    job: BoxJob,
+    effort: Array | None = None,
+) -> Reference:
+    """Build references from joints and forces.
+
+    Args:
+        normal_force: (n, 2) force that each pad has to press with [N].
+        effort: (n, all joints) joint torques to feed forward: inverse dynamics and the contacts'
+            wrenches, pressing included; without, inverse dynamics and pressing, so that the
+            controllers' stiffness has to carry the box [N m].
+
+    Raises:
+        SettingsError: the arrays do not fit one another, or times decrease.
+    """
+    n, joints = motion.q.shape
+    if motion.q_rate.shape != (n, joints) or motion.q_second.shape != (n, joints):
+        raise SettingsError("rates of the joints do not fit their positions")
+    if motion.time.shape != (n,) or normal_force.shape != (n, 2) or n < 2:
+        raise SettingsError(f"{len(motion.time)} times and {len(normal_force)} forces for {n} rows")
+    if (np.diff(motion.time) < 0.0).any():
+        raise SettingsError("times decrease")
+    pressing = press_torque(workcell, motion.q)
+    if effort is None:
+        repeated = np.repeat(normal_force, _counts(workcell), axis=1)
+        effort = inverse_dynamics(workcell, motion) + pressing * repeated
+    elif effort.shape != (n, joints):
+        raise SettingsError(f"efforts of shape {effort.shape} for {n} x {joints} joints")
+    return Reference(workcell, motion, normal_force, effort, pressing, job)
+
+
+def carry_reference(
+    cell: Cell, carry: Carry, press: Array | None = None, leader: int = 0
+) -> Reference:
+    """Build the reference of a carry from rest to rest, after some time at rest, with the forces of
+    its planned wrenches.
+
+    Args:
+        press: (n,) normal force to command the arm that does not lead; its planned one by default
+            [N].
+        leader: index of the arm whose force is the planned one and what the other adds.
+
+    Raises:
+        SettingsError: the carry does not start and end at rest, or the force does not fit it.
+    """
+    refuse_motion_at_ends(carry)
+    planned = carry.normal_force[:, 1 - leader]
+    if press is not None and press.shape != planned.shape:
+        raise SettingsError(f"forces of shape {press.shape} for {len(carry)} samples")
+    extra = np.zeros_like(planned) if press is None else press - planned
+    begin = float(carry.time[0])
+    motion = JointMotion(
+        time=np.concatenate([[begin - REST_TIME, begin], carry.time]),
+        q=_with_rest(carry.q, 1.0),
+        q_rate=_with_rest(carry.stack_arms("q_rate"), 0.0),
+        q_second=_with_rest(carry.stack_arms("q_second"), 0.0),
+    )
+    pose, rate, second = (
+        _with_rest(values, keep)
+        for values, keep in ((carry.pose, 1.0), (carry.rate, 0.0), (carry.second_rate, 0.0))
+    )
+    model, workcell = cell.timing_model, carry.workcell
+    known = replace(carry, pose=pose, rate=rate, second_rate=second)
+    friction = np.array([contact.friction for contact in workcell.contacts])
+    load = model.uncertain_load(known, friction, workcell.payload.centre_of_mass)
+    rotation = box_rotation(workcell.task.orientation, pose)
+    one, two = (
+        np.einsum("nji,nj->ni", rotation, load[name][:, :3]) for name in ("wrench_1", "wrench_2")
+    )
+    torque = _force_torque(workcell, motion.q, (one, two))
+    # At rest before the carry the pads press as they will have to when it begins.
+    extra = np.concatenate([[extra[0]] * 2, extra])
+    starting = (carry.normal_force[0] - load["normal_force"][0]).max()
+    extra[:2] += max(0.0, float(starting))
+    normal_force = load["normal_force"] + extra[:, None]
+    pressing = press_torque(workcell, motion.q)
+    own = inverse_dynamics(workcell, motion)
+    repeated = np.repeat(np.column_stack([extra, extra]), _counts(workcell), axis=1)
+    job = BoxJob(
+        start=carry.pose[0],
+        goal=carry.pose[-1, :3],
+        held=(begin - REST_TIME / 2.0, float(carry.time[-1])),
+        stands=begin - REST_TIME + STANDS,
+    )
+    effort = own + torque + pressing * repeated
+    return Reference(workcell, motion, normal_force, effort, pressing, job, leader)
+
+
+def with_tracking_error(
+    reference: Reference, amplitude: float, rng: np.random.Generator, opposed: float = 0.0
+) -> Reference:
+    """Return references with a random sinusoidal error of each joint, starting at zero, and arms
+    that push against each other.
+
+    Frequencies are drawn from 0.3 to 1.5 Hz. All else that is fed forward stays.
+
+    Args:
+        amplitude: of each joint's sinusoid [rad].
+        opposed: force of either arm along the first pad's face, in a random direction [N].
+    """
+    workcell, turned = reference.workcell, rng.uniform(0.0, 2.0 * np.pi)
+    along = opposed * np.array([np.cos(turned), np.sin(turned), 0.0])
+    force = workcell.contacts[0].T_box_pad[:3, :3] @ along
+    pushed = _force_torque(workcell, reference.motion.q, (force, -force))
+    motion = reference.motion
+    joints = motion.q.shape[1]
+    omega = 2.0 * np.pi * rng.uniform(0.3, 1.5, joints)
+    phase = rng.uniform(0.0, 2.0 * np.pi, joints)
+    angle = np.outer(motion.time - motion.time[0], omega) + phase
+    off = amplitude * (np.sin(angle) - np.sin(phase)) / 2.0
+    rate = amplitude * omega * np.cos(angle) / 2.0
+    moved = replace(motion, q=motion.q + off, q_rate=motion.q_rate + rate)
+    return replace(reference, motion=moved, effort=reference.effort + pushed)
+
+
+def press_torque(workcell: Workcell, q: Array) -> Array:
+    """Compute the torques (n, all joints) of each arm's joints that press with 1 N, at joints (n,
+    all).
+
+    Both press along the normals where these are opposite, else along the line between the middles
+    of their pads, so that what they add cancels in the payload.
+    """
+    middles = [
+        np.mean([pad.T_box_pad[:3, 3] for pad in (contact, *contact.further)], axis=0)
+        for contact in workcell.contacts
+    ]
+    forces = []
+    for i, contact in enumerate(workcell.contacts):
+        normal, line = contact.T_box_pad[:3, 2], middles[1 - i] - middles[i]
+        pushed = normal if workcell.has_opposite_pads else line
+        forces.append(pushed / (normal @ pushed))
+    return _force_torque(workcell, q, (forces[0], forces[1]))
+
+
+def _force_torque(workcell: Workcell, q: Array, forces: tuple[Array, Array]) -> Array:
+    """Compute the torques (n, all joints) of forces (3,) or (n, 3) on the box, in its frame, one of
+    each robot in the middle of its pads [N m]."""
+    found = []
+    parts = zip(workcell.robots, workcell.contacts, forces, joints_of(workcell, q), strict=True)
+    for robot, contact, force, values in parts:
+        T_flange_box = robot.T_flange_pad @ inverse(contact.T_box_pad)
+        pads = [T_flange_box @ pad.T_box_pad for pad in contact.further]
+        middle = np.mean([robot.T_flange_pad, *pads], axis=0)[:3, 3]
+        pushed = np.broadcast_to(force @ T_flange_box[:3, :3].T, (len(values), 3))
+        wrench = np.column_stack([pushed, np.cross(middle, pushed)])
+        arm = build_robot_model(robot)
+        data, torque = arm.model.createData(), np.empty_like(values)
+        for k, row in enumerate(values):
+            J = pin.computeFrameJacobian(arm.model, data, row, arm.flange_id, pin.LOCAL)
+            torque[k] = J.T @ wrench[k]
+        found.append(torque)
+    return np.concatenate(found, axis=1)
+
+
+def inverse_dynamics(workcell: Workcell, motion: JointMotion) -> Array:
+    """Compute the torques (n, all joints) that move the bare arms [N m]."""
+    found = []
+    parts = [joints_of(workcell, values) for values in (motion.q, motion.q_rate, motion.q_second)]
+    for robot, *rows in zip(workcell.robots, *parts, strict=True):
+        model = build_robot_model(robot).model
+        data = model.createData()
+        found.append(np.array([pin.rnea(model, data, *row) for row in zip(*rows, strict=True)]))
+    return np.concatenate(found, axis=1)
+
+
+def _counts(workcell: Workcell) -> list[int]:
+    return [len(robot.torque_max) for robot in workcell.robots]
+
+
+def _with_rest(values: Array, keep: float) -> Array:
+    """Prepend two rows: the first one, times `keep`."""
+    return np.concatenate([keep * values[:1], keep * values[:1], values])
+
+
+Control = Literal["impedance", "leader", "both"]
+
+
+@dataclass(frozen=True, eq=False)
+class ArmState:
+    """One arm at one moment.
+
+    Attributes:
+        error, error_rate: (n_joints,) reference less position, and its rate [rad, s].
+        jacobian: (6, n_joints) of the pad, linear velocities first, world axes.
+        normal: (3,) of the pad, into the box.
+        force: normal force, as measured or as both arms share it [N].
+    """
+
+    error: Array
+    error_rate: Array
+    jacobian: Array
+    normal: Array
+    force: float
+
+
+class ArmController:
+    """Controller of one arm, with the integral of its force error.
+
+    Attributes:
+        is_force_controlled: whether it controls its force along the normal.
+    """
+
+    def __init__(
+        self,
+        settings: ArmSettings,
+        gains: tuple[Array, Array],
+        pad_stiffness: float,
+        is_force_controlled: bool,
+        drift_stiffness: float,
+    ) -> None:
+        """Start with no integral.
+
+        Args:
+            gains: stiffness and damping of the joints [N m/rad, N m s/rad].
+            pad_stiffness: of the pads' layers; without force control, the arm aims as far beyond
+                the contact as they give [N/m].
+            drift_stiffness: what is left of it along the normal [N/m].
+        """
+        self.is_force_controlled = is_force_controlled
+        self._settings = settings
+        self._stiffness, self._damping = gains
+        self._pad_stiffness = pad_stiffness
+        self._drift_stiffness = drift_stiffness
+        self._integral = 0.0
+
+    def torque(self, state: ArmState, effort: Array, normal_force: float) -> Array:
+        """Compute the joint torques (n_joints,) [N m].
+
+        Args:
+            effort: (n_joints,) to feed forward [N m].
+            normal_force: reference [N].
+        """
+        pressed, moved = 0.0, -normal_force / self._pad_stiffness
+        along = state.normal @ state.jacobian[:3]
+        if self.is_force_controlled:
+            touches = min(1.0, max(0.0, normal_force / TOUCHES))
+            if touches == 1.0 and state.force > 0.0:
+                gain = self._settings.force_gain * self._settings.control_period
+                self._integral += gain * (normal_force - state.force)
+            distance = float(along @ state.error)
+            pressed = touches * (self._integral + self._drift_stiffness * distance)
+            moved = touches * distance
+        # Without the part that moves the pad along its normal, or with more of it.
+        linear = np.concatenate([moved * state.normal, np.zeros(3)])
+        error = state.error - np.linalg.pinv(state.jacobian) @ linear
+        sprung: Array = self._stiffness * error + self._damping * state.error_rate
+        return effort + sprung + pressed * along
+
+
+def pressed_reference(cell: Cell, carry: Carry, leader: int = 0) -> tuple[Reference, Squeeze]:
+    """Build a job's reference: with robust forces if the workcell states its uncertainty, smoothed
+    so that controllers can follow them and never below the needed ones."""
+    forces, squeeze = commanded_forces(cell.workcell, carry, SqueezeSettings(leader=leader))
+    return carry_reference(cell, carry, forces[:, 1 - leader], leader), squeeze
+
+
+def driven_carry(cell: Cell, x: Array) -> Carry:
+    """Compute a decision vector's carry from rest to rest, timed as in a job.
+
+    Raises:
+        WitnessError: there is none.
+        JobError: there is none without jumps of acceleration.
+    """
+    return exported_carry(cell, driven_timing(cell.timing_model, x))
+
+
+def exported_carry(cell: Cell, timing: Timing) -> Carry:
+    """Compute the carry of a timing, timed as in a job.
+
+    Raises:
+        WitnessError: there is none.
+        JobError: there is none without jumps of acceleration.
+    """
+    if not timing.ok or timing.carry is None:
+        raise SimulationError(f"the trajectory cannot be driven: {timing.reason}")
+    jerk = applicable_jerk_limits(cell.workcell, timing.limits)
+    found = without_jumps(cell.timing_model, timing, jerk).carry
+    assert found is not None, "a timing without jumps has a carry"
+    return found

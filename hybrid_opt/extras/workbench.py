@@ -1,0 +1,525 @@
+"""A cell that is changed interactively, with a carry evaluated after every change: a session, and
+its page in a browser with handles to drag, fields for numbers, verdict and forces."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from hybrid_opt.api import save, search, time_path
+from hybrid_opt.carry import Carry
+from hybrid_opt.cell import Cell
+from hybrid_opt.display.solids import Solid, cell_solids, frame_placements, motion_points
+from hybrid_opt.errors import DisplayError, ResultsError
+from hybrid_opt.evaluate.explanation import explain
+from hybrid_opt.extras.bundles.bundle import TARGETS, export
+from hybrid_opt.job.plan import plan_job
+from hybrid_opt.metaheuristics.run import SearchSettings
+from hybrid_opt.robust.squeeze import Squeeze, SqueezeSettings, commanded_forces
+from hybrid_opt.timing.records import TimingLimits
+from symbolic.array import Array
+from symbolic.errors import DualArmError, WorkcellError
+from symbolic.path.pieces import coarse_task, resample_decisions
+from symbolic.read.cell_files import collect_cell, unpack_cell
+from symbolic.records import POSE_SIZE, Workcell
+from symbolic.records.poses import box_placement, inverse, rpy_from_rotation, transform
+
+SEARCH_EVALUATIONS = 400
+"""Candidates of a search around the carry at hand: 1.6 s on the rack."""
+
+SEARCH_WIDTH = 0.05
+"""Standard deviation of its first generation around that carry, over the bounds' width."""
+
+FIRST = 39
+"""Carries of that generation that are near; with the one at hand a whole population."""
+
+
+@dataclass(frozen=True)
+class Handle:
+    """A draggable part of a cell.
+
+    Attributes:
+        key: in the workcell file: 'task.start', 'environment.top board', 'robots[0].base' or
+            'contacts[0]'.
+        title: how it is called.
+        pose: (4, 4) in the world.
+        turns: whether it may be turned; a pad stays on its face.
+    """
+
+    key: str
+    title: str
+    pose: Array
+    turns: bool = True
+
+
+@dataclass(frozen=True, eq=False)
+class SessionVerdict:
+    """A carry in a cell.
+
+    Attributes:
+        cell: the changed cell as a drivable one, None where the change is refused.
+        carry: the carry in that cell, None likewise.
+        text: whether the carry is feasible, or why not.
+        feasible: whether it is.
+        commanded: (n, 2) normal forces to command [N], None where the carry is not feasible.
+        squeeze: how these came about.
+        seconds: time that the verdict took.
+    """
+
+    cell: Cell | None
+    carry: Carry | None
+    text: str
+    feasible: bool
+    commanded: Array | None
+    squeeze: Squeeze | None
+    seconds: float
+
+
+class Session:
+    """A cell with what was changed of it, and the carry that is looked at.
+
+    Attributes:
+        base: the cell as it was given.
+        changes: by key path of the workcell file, see `Cell.changed`.
+        x: (n_var,) decision vector of the carry in a drivable cell.
+        verdict: the verdict on that carry.
+    """
+
+    def __init__(self, cell: Cell, x: Array | None = None) -> None:
+        """Look at a carry.
+
+        Args:
+            x: its decision vector in `cell.drivable()`; None for the hand-made carry.
+
+        Raises:
+            DualArmError: the cell has no drivable form, or x does not fit.
+        """
+        self.base = cell
+        self._drivable = cell if cell.workcell.task.law.is_drivable else cell.drivable()
+        self.changes: dict[str, Any] = {}
+        self.x = np.array(self._drivable.initial if x is None else x, dtype=float)
+        self.verdict = self._judged(self._drivable)
+
+    @property
+    def cell(self) -> Cell:
+        """The changed cell as a drivable one."""
+        return self.verdict.cell or self._drivable
+
+    def change(self, changes: Mapping[str, Any]) -> SessionVerdict:
+        """Apply more changes; a refused change leaves the session as it is.
+
+        Args:
+            changes: by key path of the workcell file; 'force_limit' is that of the carry [N].
+        """
+        begin = time.perf_counter()
+        wanted = self.changes | dict(changes)
+        limit = wanted.pop("force_limit", None)
+        try:
+            cell = self._drivable.changed(wanted) if wanted else self._drivable
+        except WorkcellError as error:
+            text = "; ".join(error.problems)
+            took = time.perf_counter() - begin
+            return SessionVerdict(None, None, f"refused: {text}", False, None, None, took)
+        if limit is not None:
+            low, high = cell.workcell.task.force_limit
+            self.x[-1] = min(max(float(limit), low), high)
+        self.changes = wanted
+        self.verdict = self._judged(cell, begin)
+        return self.verdict
+
+    def move(self, handle: Handle, pose: Array) -> SessionVerdict:
+        """Move a handle to another pose (4, 4) of the world, see `handles`."""
+        return self.change(moved(self.cell.workcell, handle, pose))
+
+    def optimise(
+        self, rng: np.random.Generator, evaluations: int = SEARCH_EVALUATIONS
+    ) -> SessionVerdict:
+        """Search around the present carry for the least product of duration and force."""
+        task, cell = self.cell.workcell.task, self.cell
+        width = np.where(np.isfinite(task.upper - task.lower), task.upper - task.lower, 0.0)
+        near = self.x + SEARCH_WIDTH * width * rng.standard_normal((FIRST, task.n_var))
+        first = np.clip(np.vstack([self.x, near]), task.lower, task.upper)
+        settings = SearchSettings(initial=first)
+        front = search(cell, evaluations=evaluations, rng=rng, settings=settings)
+        # The path at hand may have waypoints between those that a search draws.
+        tried = cell.evaluator.certified(cell.evaluate(np.vstack([self.x, front.x])))
+        if tried.feasible.any():
+            product = np.where(tried.feasible, np.prod(tried.objectives, axis=1), np.inf)
+            self.x = np.array(tried.x[np.argmin(product)])
+        self.verdict = self._judged(cell)
+        return self.verdict
+
+    def save(self, folder: str | Path) -> Path:
+        """Write the changed cell, with the present path as its hand-made one, and every file that
+        it needs into a folder of its own; return the workcell file.
+
+        Raises:
+            DualArmError: the folder is not empty, or cannot be written.
+        """
+        folder = Path(folder)
+        if folder.exists() and any(folder.iterdir()):
+            raise ResultsError(f"{folder}: is not empty; save the cell into a folder of its own")
+        task = coarse_task(self.base.workcell.task)
+        (x,) = resample_decisions(self.x, self.cell.workcell.task, task)
+        poses = x[: task.n_box].reshape(-1, POSE_SIZE)
+        cell = self.base.changed(self.changes | {"task.initial": poses.tolist()})
+        return unpack_cell(collect_cell(cell.workcell), folder).source
+
+    def export(self, target: str, folder: str | Path) -> tuple[Path, ...]:
+        """Write the whole job around the carry for robots, and the carry itself as carry.json.
+
+        Raises:
+            DualArmError: see `hybrid_opt.export`; the carry is not feasible.
+        """
+        carry = self.verdict.carry
+        if carry is None or not self.verdict.feasible:
+            raise ResultsError(f"this carry cannot be driven: {self.verdict.text}")
+        limits = TimingLimits(force=float(self.x[-1]))
+        timing = time_path(self.cell, carry, limits)
+        Path(folder).mkdir(parents=True, exist_ok=True)
+        save(carry, Path(folder) / "carry.json", {"by": "hand"})
+        return export(plan_job(timing), target, folder)
+
+    def _judged(self, cell: Cell, begin: float | None = None) -> SessionVerdict:
+        begin = time.perf_counter() if begin is None else begin
+        carry = cell.carry(self.x)
+        judgement = carry.judgement
+        assert judgement is not None, "a cell judges its carries"
+        commanded, squeeze = None, None
+        text = f"feasible, {carry.duration:.3f} s"
+        if judgement.feasible:
+            try:
+                given = cell.workcell, carry, SqueezeSettings()
+                commanded, squeeze = commanded_forces(*given, in_parts=False)
+                most = cell.workcell.task.reference_force
+                text += f", press with {squeeze.force:.1f} N"
+                if (commanded.max(axis=0) > most).any():
+                    text += f", more than the reference force of {most.min():.1f} N"
+            except DualArmError as error:
+                text += f"; {error}"
+        else:
+            text = f"infeasible: {explain(cell.evaluator, cell.evaluate(self.x))[0]}"
+        took = time.perf_counter() - begin
+        return SessionVerdict(cell, carry, text, judgement.feasible, commanded, squeeze, took)
+
+
+def handles(workcell: Workcell) -> tuple[Handle, ...]:
+    """Return the parts of a cell that may be dragged: start, goal, bodies around, bases and
+    pads."""
+    task, bodies = workcell.task, workcell.environment
+    first, last = (
+        box_placement(task.orientation, task.waypoints[k].lower[:POSE_SIZE]) for k in (0, -1)
+    )
+    found = [Handle("task.start", "start", first), Handle("task.goal", "goal", last)]
+    names = [body.name for body in bodies]
+    found += [
+        Handle(f"environment.{body.name}", body.name, body.pose)
+        for body in bodies
+        if names.count(body.name) == 1
+    ]
+    for k, robot in enumerate(workcell.robots):
+        found.append(Handle(f"robots[{k}].base", f"base of {robot.name}", robot.T_world_base))
+    for k, (robot, contact) in enumerate(zip(workcell.robots, workcell.contacts, strict=True)):
+        pose = first @ contact.T_box_pad
+        found.append(Handle(f"contacts[{k}]", f"pad of {robot.name}", pose, turns=False))
+    return tuple(found)
+
+
+def moved(workcell: Workcell, handle: Handle, pose: Array) -> dict[str, Any]:
+    """Return the changes, by key path, that move a handle to another pose (4, 4) of the world."""
+    xyz = [round(value, 6) for value in pose[:3, 3].tolist()]
+    rpy = [round(value, 6) for value in rpy_from_rotation(pose[:3, :3]).tolist()]
+    section = handle.key.partition(".")[0].partition("[")[0]
+    if section == "task":
+        orientation = workcell.task.orientation
+        if orientation.is_vector:
+            turn = Rotation.from_matrix(pose[:3, :3] @ orientation.reference.T)
+            rpy = [round(value, 6) for value in turn.as_rotvec().tolist()]
+        return {handle.key: [*xyz, *rpy]}
+    if section == "robots":
+        return {handle.key: {"xyz": xyz, "rpy": rpy}}
+    if section == "environment":
+        return {f"{handle.key}.xyz": xyz, f"{handle.key}.rpy": rpy}
+    contact = workcell.contacts[int(handle.key[len("contacts[") : -1])]
+    task = workcell.task
+    box = box_placement(task.orientation, task.waypoints[0].lower[:POSE_SIZE])
+    shift = (inverse(box) @ pose)[:3, 3] - contact.T_box_pad[:3, 3]
+    normal = contact.T_box_pad[:3, 2]
+    place = contact.T_box_pad[:3, 3] + shift - normal * (normal @ shift)
+    return {f"{handle.key}.xyz": [round(value, 6) for value in place.tolist()]}
+
+
+# --- in a browser ---
+
+
+LOCAL_HOST = "127.0.0.1"
+
+GROUP_COLOURS = {
+    "robot": (148, 156, 166),
+    "payload": (222, 158, 64),
+    "environment": (196, 202, 208),
+}
+
+FRAME = 0.04
+"""Time between two frames of a carry that plays [s]."""
+
+
+class Workbench:
+    """A cell in a browser, served on this machine alone.
+
+    One thread works: it takes what was asked last, so that dragging never queues.
+
+    Attributes:
+        session: what is looked at.
+        url: of the page.
+    """
+
+    def __init__(self, session: Session, port: int = 8080, seed: int = 1) -> None:
+        """Serve it.
+
+        Args:
+            port: where to listen; another free one is taken if it is in use.
+            seed: of searches.
+
+        Raises:
+            DisplayError: viser is missing.
+        """
+        try:
+            import viser
+        except ImportError as error:
+            raise DisplayError(
+                "the live view needs viser: pip install 'dual-arm-carry[live]'"
+            ) from error
+        self.session = session
+        self._rng = np.random.default_rng(seed)
+        self._news = threading.Condition()
+        self._changes: dict[str, Any] = {}
+        self._tasks: list[Callable[[], None]] = []
+        self._closed = False
+        self._solids: dict[str, tuple[Solid, Any]] = {}
+        self._server = viser.ViserServer(LOCAL_HOST, port, label="dual-arm carry", verbose=False)
+        self.url = f"http://{LOCAL_HOST}:{self._server.get_port()}"
+        self._server.gui.configure_theme(show_logo=False, show_share_button=False)
+        self._build()
+        self._show(session.verdict)
+        self._look()
+        self._thread = threading.Thread(target=self._work, daemon=True)
+        self._thread.start()
+
+    def ask(self, changes: dict[str, Any]) -> None:
+        """Request an evaluation of changes; of several that wait, the last of a key counts."""
+        with self._news:
+            self._changes |= changes
+            self._news.notify()
+
+    def do(self, task: Callable[[], None]) -> None:
+        """Request another task, done in order."""
+        with self._news:
+            self._tasks.append(task)
+            self._news.notify()
+
+    def close(self) -> None:
+        """Stop serving."""
+        with self._news:
+            self._closed = True
+            self._news.notify()
+        self._thread.join()
+        self._server.stop()
+
+    def _repr_html_(self) -> str:
+        return f'<iframe src="{self.url}" style="width:100%;height:640px;border:0"></iframe>'
+
+    # --- the page ---
+
+    def _build(self) -> None:
+        gui, workcell = self._server.gui, self.session.cell.workcell
+        self._verdict = gui.add_markdown("")
+        known = {handle.title: handle for handle in handles(workcell)}
+        choice = gui.add_dropdown("drag", ["nothing", *known], initial_value="nothing")
+        choice.on_update(lambda _: self._grasp(known.get(choice.value)))
+        self._gizmo: Any = None
+        for key, label, start in (
+            ("payload.mass", "mass [kg]", workcell.payload.mass),
+            ("contacts.friction", "friction", workcell.contacts[0].friction),
+        ):
+            self._field(key, gui.add_number(label, start, min=1e-3, step=0.01))
+        low, high = workcell.task.force_limit
+        limit = gui.add_slider("force limit [N]", low, high, 0.1, float(self.session.x[-1]))
+        limit.on_update(lambda _: self.ask({"force_limit": limit.value}))
+        self._limit: Any = limit
+        self._place: Any = gui.add_slider("place [%]", 0, 100, 1, 0)
+        self._place.on_update(lambda _: self.ask({}))
+        self._plays = gui.add_checkbox("play", False)
+        self._plays.on_update(lambda _: self.ask({}))
+        gui.add_button("optimise from here").on_click(lambda _: self.do(self._optimise))
+        self._itself = gui.add_checkbox("optimise when at rest", False)
+        names = [robot.name for robot in workcell.robots]
+        rows = tuple(np.zeros(2) for _ in range(5))
+        lines = ("#1f6fb4", "#d1603d", "#1f6fb4", "#d1603d")
+        labels = [*(f"{name}, least" for name in names), *(f"{name}, pressed" for name in names)]
+        series: list[Any] = [{"label": "time [s]"}]
+        for k, (label, colour) in enumerate(zip(labels, lines, strict=True)):
+            series.append({"label": label, "stroke": colour, "width": 1 + 2 * (k > 1)})
+        self._plot = gui.add_uplot(
+            rows,
+            tuple(series),
+            title="normal forces [N]",
+            scales={"x": {"time": False}},
+            aspect=1.4,
+        )
+        folder = gui.add_text("folder", "live")
+        gui.add_button("save the cell").on_click(
+            lambda _: self.do(lambda: self._told(f"saved: {self.session.save(folder.value)}"))
+        )
+        target = gui.add_dropdown("target", list(TARGETS), initial_value="torque")
+        gui.add_button("export the job").on_click(
+            lambda _: self.do(
+                lambda: self._told(
+                    f"written: {self.session.export(target.value, folder.value)[0].parent}"
+                )
+            )
+        )
+
+    def _look(self) -> None:
+        """Set the camera to see the whole motion from the front, above."""
+        carry = self.session.verdict.carry
+        assert carry is not None, "a session begins with a carry"
+        points = motion_points(self._geometry, carry.pose, carry.q)
+        lower, upper = points.min(axis=0), points.max(axis=0)
+        centre, far = (lower + upper) / 2.0, float(np.linalg.norm(upper - lower))
+        self._server.initial_camera.look_at = centre
+        self._server.initial_camera.position = centre + far * np.array([-0.75, -0.45, 0.5])
+
+    def _field(self, key: str, field: Any) -> None:
+        field.on_update(lambda _: self.ask({key: field.value}))
+
+    def _grasp(self, handle: Handle | None) -> None:
+        """Show the arrows of one handle, or of none."""
+        if self._gizmo is not None:
+            self._gizmo.remove()
+            self._gizmo = None
+        if handle is None:
+            return
+        now = {one.key: one for one in handles(self.session.cell.workcell)}[handle.key]
+        gizmo = self._server.scene.add_transform_controls(
+            "/handle",
+            scale=0.25,
+            disable_rotations=not now.turns,
+            position=now.pose[:3, 3],
+            wxyz=Rotation.from_matrix(now.pose[:3, :3]).as_quat(scalar_first=True),
+            depth_test=False,
+        )
+        self._gizmo = gizmo
+
+        @gizmo.on_update
+        def _(_: Any) -> None:
+            turn = Rotation.from_quat(gizmo.wxyz, scalar_first=True).as_matrix()
+            pose = transform(turn, gizmo.position)
+            self.ask(moved(self.session.cell.workcell, now, pose))
+
+    # --- the one thread that works ---
+
+    def _work(self) -> None:
+        last, rested = time.perf_counter(), True
+        while True:
+            with self._news:
+                if not (self._changes or self._tasks or self._closed):
+                    self._news.wait(FRAME if self._plays.value else 0.5)
+                if self._closed:
+                    return
+                changes, self._changes = self._changes, {}
+                task = self._tasks.pop(0) if self._tasks else None
+            try:
+                if changes:
+                    self._show(self.session.change(changes))
+                    rested = False
+                elif not rested and task is None and self._itself.value:
+                    self._optimise()
+                    rested = True
+                if task is not None:
+                    task()
+            except DualArmError as error:
+                self._told(str(error))
+            now = time.perf_counter()
+            if self._plays.value:
+                carry = self.session.verdict.carry
+                duration = carry.duration if carry is not None else 1.0
+                self._place.value = round(self._place.value + 100.0 * (now - last) / duration) % 101
+            last = now
+            self._pose()
+
+    def _optimise(self) -> None:
+        self._told("optimising ...")
+        self._show(self.session.optimise(self._rng))
+
+    def _told(self, text: str) -> None:
+        self._verdict.content = text
+
+    def _show(self, verdict: SessionVerdict) -> None:
+        state, _, rest = verdict.text.partition(" ")
+        self._told(f"**{state}** {rest}\n\njudged in {1e3 * verdict.seconds:.1f} ms")
+        if verdict.carry is None:
+            return
+        carry = verdict.carry
+        pressed = carry.normal_force if verdict.commanded is None else verdict.commanded
+        columns = (carry.time - carry.time[0], *carry.normal_force.T, *pressed.T)
+        self._plot.data = tuple(np.ascontiguousarray(column) for column in columns)
+        self._limit.value = float(self.session.x[-1])
+        self._draw(verdict)
+        self._pose()
+
+    def _draw(self, verdict: SessionVerdict) -> None:
+        """Draw meshes of bodies that are new, or changed their shape or pose."""
+        assert verdict.cell is not None
+        self._geometry = verdict.cell.geometry
+        scene = self._server.scene
+        for solid in cell_solids(self._geometry):
+            known = self._solids.get(solid.name)
+            if known is not None and known[0] is solid:
+                continue
+            mesh = scene.add_mesh_simple(
+                f"/bodies/{solid.name.replace('/', ' ')}",
+                solid.vertices,
+                solid.faces,
+                color=GROUP_COLOURS.get(solid.group, GROUP_COLOURS["robot"]),
+                flat_shading=True,
+                side="double",
+            )
+            self._solids[solid.name] = (solid, mesh)
+
+    def _pose(self) -> None:
+        """Draw everything that moves at the selected sample."""
+        carry = self.session.verdict.carry
+        if carry is None:
+            return
+        sample = round(self._place.value / 100.0 * (len(carry) - 1))
+        rows = slice(sample, sample + 1)
+        placed = frame_placements(self._geometry, carry.pose[rows], carry.q[rows])
+        with self._server.atomic():
+            for solid, mesh in self._solids.values():
+                if solid.frame.kind != "world":
+                    T = placed[solid.frame][0]
+                    mesh.position = T[:3, 3]
+                    mesh.wxyz = Rotation.from_matrix(T[:3, :3]).as_quat(scalar_first=True)
+
+
+def live(cell: Cell, port: int = 8080, x: Array | None = None) -> Workbench:
+    """Open a cell in a browser of this machine, to be changed by hand.
+
+    Args:
+        port: where to listen; another free one is taken if it is in use.
+        x: (n_var,) the carry to look at, a decision vector of `cell.drivable()`; None for the
+            hand-made one.
+
+    Raises:
+        DisplayError: viser is missing.
+        DualArmError: the cell has no drivable form.
+    """
+    return Workbench(Session(cell, x), port)
