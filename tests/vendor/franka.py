@@ -27,15 +27,15 @@ import yaml
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from hybrid_opt.bundles import BundleOptions
-from hybrid_opt.bundles.bundle import prepared, target_for
-from hybrid_opt.bundles.job_file import Contents
+from hybrid_opt.extras.bundles import BundleOptions
+from hybrid_opt.extras.bundles.bundle import prepared, target_for
+from hybrid_opt.extras.bundles.job_file import Contents
 from studies.report.looks import Film, write_animation
 from symbolic.array import Array
 from symbolic.records import Workcell
-from tests.hybrid_opt.bundles.bundles import DRIVER, driven
-from tests.hybrid_opt.bundles.mock_ros import World, run
 from tests.hybrid_opt.cells import shipped
+from tests.hybrid_opt.extras.bundles.bundles import DRIVER, driven
+from tests.hybrid_opt.extras.bundles.mock_ros import World, run
 from tests.hybrid_opt.job.jobs import planned
 from tests.vendor.franka_scene import CYCLE, PATIENCE, Scene, simulate
 

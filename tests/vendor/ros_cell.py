@@ -29,7 +29,7 @@ from rclpy.task import Future
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 
-from tests.hybrid_opt.bundles.controlled import SUCCEEDED, ControlledCell
+from tests.hybrid_opt.extras.bundles.controlled import SUCCEEDED, ControlledCell
 
 CYCLE = 0.01
 """Of controllers and topics [s]; those of robots are shorter."""

@@ -23,15 +23,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hybrid_opt.bundles import BundleOptions
-from hybrid_opt.bundles.bundle import prepared
-from hybrid_opt.bundles.egm import egm_files
-from hybrid_opt.bundles.job_file import Contents
+from hybrid_opt.extras.bundles import BundleOptions
+from hybrid_opt.extras.bundles.bundle import prepared
+from hybrid_opt.extras.bundles.egm import egm_files
+from hybrid_opt.extras.bundles.job_file import Contents
 from hybrid_opt.store.bundle_file import write_bundle
 from symbolic.array import Array
-from tests.hybrid_opt.bundles.bundles import DRIVER, driven
-from tests.hybrid_opt.bundles.bundles import read_job as job
-from tests.hybrid_opt.bundles.test_abb import CYCLE, STIFFNESS, gap
+from tests.hybrid_opt.extras.bundles.bundles import DRIVER, driven
+from tests.hybrid_opt.extras.bundles.bundles import read_job as job
+from tests.hybrid_opt.extras.bundles.test_abb import CYCLE, STIFFNESS, gap
 from tests.hybrid_opt.job.jobs import rack_job
 
 pytestmark = pytest.mark.vendor

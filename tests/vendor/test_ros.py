@@ -22,8 +22,8 @@ import pytest
 
 from hybrid_opt.store.bundle_file import write_bundle
 from symbolic.array import Array
-from tests.hybrid_opt.bundles.bundles import contents
-from tests.hybrid_opt.bundles.bundles import read_job as job
+from tests.hybrid_opt.extras.bundles.bundles import contents
+from tests.hybrid_opt.extras.bundles.bundles import read_job as job
 from tests.vendor.ros_environment import ENVIRONMENT, PYTHON
 
 pytestmark = pytest.mark.vendor
