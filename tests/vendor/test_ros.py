@@ -237,10 +237,10 @@ FAULTS = {
 def test_a_fault_stops_both_arms(name: str, tmp_path: Path) -> None:
     """The arm without the fault stops at the place that the program names, and presses."""
 
-    def held(live: Live) -> None:
+    def wait_until_held(live: Live) -> None:
         live.wait_for("held in", after=1.0)
 
-    found = run("franka", tmp_path, name, middle(), 1, act=held)
+    found = run("franka", tmp_path, name, middle(), 1, act=wait_until_held)
     assert found.code == 1, found.log
     assert any(text in found.log for text in FAULTS[name].split("|")), found.log
     stopped = end_of_motion(found) - found.starts[0]
