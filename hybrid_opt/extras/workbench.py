@@ -199,7 +199,7 @@ class Session:
                 given = cell.workcell, carry, SqueezeSettings()
                 commanded, squeeze = commanded_forces(*given, in_parts=False)
                 most = cell.workcell.task.reference_force
-                text += f", press with {squeeze.force:.1f} N"
+                text += f", {squeeze.order} {squeeze.force:.1f} N"
                 if (commanded.max(axis=0) > most).any():
                     text += f", more than the reference force of {most.min():.1f} N"
             except DualArmError as error:

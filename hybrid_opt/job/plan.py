@@ -49,7 +49,7 @@ from hybrid_opt.timing.jerk import applicable_jerk_limits
 from hybrid_opt.timing.model import TimingModel
 from hybrid_opt.timing.records import JerkLimits, Timing
 from symbolic.array import Array, interpolated
-from symbolic.contact.registry import require_squeeze
+from symbolic.contact.registry import squeeze_problem
 from symbolic.errors import SettingsError
 from symbolic.geometry.bodies import CollisionBody
 from symbolic.geometry.pairs import ActivePair, CellGeometry, build_geometry, ignored_pairs
@@ -309,12 +309,10 @@ class JobModel:
             timing: its timing model, where there is one.
 
         Raises:
-            SettingsError: the hands hold by themselves.
             DualArmError: the model cannot be built.
         """
         compiled = CompiledCell.of(cell)
         self.workcell = compiled.workcell
-        require_squeeze(self.workcell, "a job")
         self.timing = TimingModel(compiled) if timing is None else timing
         self._posture: NumericFunction = compiled.evaluators["posture"]
         self._collisions = JobCollisions(compiled)
@@ -342,8 +340,11 @@ class JobModel:
 
         Raises:
             SettingsError: the timing failed, or the squeeze is not possible.
-            JobError: an arm does not reach a place, something collides, or a limit is exceeded.
+            JobError: the hands hold by themselves, an arm does not reach a place, something
+                collides, or a limit is exceeded.
         """
+        if problem := squeeze_problem(self.workcell, "a job"):
+            raise JobError(problem)
         if timing.carry is None or not timing.ok:
             raise SettingsError(
                 f"there is no timing to export ({timing.status}: {timing.reason}); export one "

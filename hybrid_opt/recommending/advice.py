@@ -42,6 +42,10 @@ FORCE_MULTIPLES = 1.0 + np.array([-0.02, 0.0, 0.02, 0.05, 0.1, 0.2, 0.4, 0.8])
 LOOKED_AT = 8
 """Samples of largest commanded force at which small changes are judged."""
 
+SIDE = 0.5
+"""Largest cosine between upwards and the normal of a contact at a side of the payload, along which
+a contact can be moved up or down."""
+
 LEAST_HEIGHT = 2e-3
 """Height of the pads over the centre of mass above which the advice mentions it [m]."""
 
@@ -150,12 +154,14 @@ def changes_of_cell(workcell: Workcell, motion: BoxMotion) -> Iterator[tuple[str
     up, height = _height(workcell)
     changes: dict[str, Callable[[Contact], Contact]] = {
         f"friction {FRICTION_CHANGE:g} higher": _with_friction,
-        "pads 1 mm lower": partial(_moved, by=-MILLIMETRE * up),
         "patches 1 mm wider to each side": _wider,
     }
+    is_held_at_sides = all(abs(each.T_box_pad[:3, 2] @ up) < SIDE for each in workcell.contacts)
+    if is_held_at_sides:
+        changes["pads 1 mm lower"] = partial(_moved, by=-MILLIMETRE * up)
     for name, change in changes.items():
         yield name, float(needed(_with_pads(workcell, change), at).max() - now.max())
-    if abs(height) > LEAST_HEIGHT:
+    if is_held_at_sides and abs(height) > LEAST_HEIGHT:
         level = _with_pads(workcell, partial(_moved, by=-height * up))
         side = "above" if height > 0.0 else "below"
         yield (

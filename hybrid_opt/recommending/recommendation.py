@@ -153,7 +153,7 @@ class Recommendation(Displayable):
 
     def __repr__(self) -> str:
         job = "" if self.job is None else f", the job takes {self.job.duration:.2f} s"
-        found = f"{self.duration:.3f} s, press with {self.force:.1f} N{job}"
+        found = f"{self.duration:.3f} s, {self.squeeze.order} {self.force:.1f} N{job}"
         lines = [f"Recommended: {found}"]
         if not self.fits:
             objection = f"N{self.objection[1:]}"

@@ -110,6 +110,8 @@ class Squeeze:
         smoothing: half the width of the time window of the smoothing [s].
         parts: of the largest force that is commanded, the least that holds first; they add up to
             it.
+        holders: what holds the payload, in words.
+        order: what the force asks of them, as in 'press with 80 N'.
     """
 
     leader: int
@@ -117,6 +119,8 @@ class Squeeze:
     uncertainty: Uncertainty | None
     smoothing: float
     parts: tuple[Part, ...]
+    holders: str
+    order: str
 
     @property
     def force(self) -> float:
@@ -130,13 +134,10 @@ class Squeeze:
 
     def __str__(self) -> str:
         if self.uncertainty is None:
-            return f"{self.factor:g} times the least that holds pads that press evenly"
+            return f"{self.factor:g} times the least that holds {self.holders}"
         if self.uncertainty.is_empty:
-            return (
-                "the least that holds pads that press evenly: the cell states that nothing is "
-                "uncertain"
-            )
-        return f"holds pads that press evenly in every case of {self.uncertainty.title}"
+            return f"the least that holds {self.holders}: the cell states that nothing is uncertain"
+        return f"holds {self.holders} in every case of {self.uncertainty.title}"
 
 
 def pressed_beyond(
@@ -162,7 +163,7 @@ def pressed_beyond(
     Raises:
         SettingsError: the uncertainty leaves no friction or patch.
     """
-    leader = settings.leader
+    leader, contact = settings.leader, command_model(workcell)
     planned, doubt = least[:, 1 - leader], workcell.uncertainty
     if settings.factor is None:
         needed = _in_every_case(workcell, doubt, leader, motion, planned)
@@ -176,7 +177,7 @@ def pressed_beyond(
         least = np.maximum(least, model.nominal(motion, leader))
         still = model.nominal(stopped(motion), leader)[:, 1 - leader]
         held = least[:, 1 - leader]
-        own = least.mean(axis=1) if command_model(workcell).has_scalar_squeeze else held
+        own = least.mean(axis=1) if contact.has_scalar_squeeze else held
         needed = np.maximum(held + (settings.factor - 1.0) * own, still)
         parts = [Part("least force", float(held.max()))]
         parts.append(Part("factor", float(needed.max() - held.max())))
@@ -186,6 +187,8 @@ def pressed_beyond(
         doubt if settings.factor is None else None,
         settings.smoothing,
         tuple(parts),
+        contact.holders,
+        contact.order,
     )
     return smooth_above(time, needed, settings.smoothing) - planned, squeeze
 

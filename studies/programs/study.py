@@ -261,7 +261,8 @@ def make_study(path: Path, options: argparse.Namespace, with_paper: bool) -> Non
     print(run_study(cell, settings, execution, Progress(not options.quiet), study))
     if study.report:
         print(f"Report: {execution.output / PAGE}; all tables: {execution.output / TABLES}")
-    if (execution.output / RECOMMENDED_FILE).exists():
+    recommended = read_summary(execution.output).recommendation
+    if recommended is not None and recommended.has_job:
         command = export_command(
             execution.output / RECOMMENDED_FILE, options.target or EXPORT_TARGET
         )

@@ -30,6 +30,7 @@ from hybrid_opt.timing.records import JerkLimits, Timing, TimingLimits
 from hybrid_opt.timing.robustness import Margin, robustness_margins
 from hybrid_opt.timing.solve import time_path
 from symbolic.array import Array
+from symbolic.contact.registry import contact_model
 from symbolic.errors import DualArmError
 from symbolic.path.pieces import resample_decisions
 from symbolic.records import Workcell
@@ -373,7 +374,8 @@ def _values(cell: ho.Cell, judged: ho.Carry, found: dict[str, Any]) -> str:
     """Title of a trajectory: time and commanded force as robots drive it; of a search's other
     carries their planned forces or objectives."""
     if found["commanded"] is not None:
-        return f"{found['duration']:.2f} s, press with {found['commanded']:.1f} N"
+        order = contact_model(cell.workcell).order
+        return f"{found['duration']:.2f} s, {order} {found['commanded']:.1f} N"
     assert judged.judgement is not None, "carries of a cell are judged"
     values = judged.judgement.objectives
     if cell.workcell.task.law.is_drivable:

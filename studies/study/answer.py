@@ -79,16 +79,17 @@ class StudyAnswer:
         return "\n".join(lines + [f"  WARNING: {text}" for text in self.warnings])
 
 
-def carry_text(duration: float, force: float, job_duration: float) -> str:
-    """Return the line of a carry: its duration [s], the largest force to command [N] and the
-    duration of the whole job [s], NaN without one."""
+def carry_text(duration: float, force: float, job_duration: float, order: str) -> str:
+    """Return the line of a carry: its duration [s], the largest force to command [N], the duration
+    of the whole job [s], NaN without one, and what the force asks of the contacts."""
     job = f", the whole job {seconds(job_duration)}" if math.isfinite(job_duration) else ""
-    return f"{seconds(duration)}, press with {newtons(force)}{job}"
+    return f"{seconds(duration)}, {order} {newtons(force)}{job}"
 
 
 def job_text(job: Job) -> str:
     """Return the line of the carry of a planned job."""
-    return carry_text(job.phase("carry").duration, job.squeeze.force, job.duration)
+    carried, squeeze = job.phase("carry").duration, job.squeeze
+    return carry_text(carried, squeeze.force, job.duration, squeeze.order)
 
 
 def seconds(duration: float) -> str:
@@ -107,7 +108,7 @@ def answer(found: StoredRecommendation, folder: str) -> StudyAnswer:
     Args:
         folder: of the results, in front of the files' names; '' where the reader is in it.
     """
-    carry = carry_text(found.duration, found.force, found.job_duration)
+    carry = carry_text(found.duration, found.force, found.job_duration, found.order)
     headline, file = f"Run this carry: {carry}", Path(folder) / found.file
     details = [
         Fact("why", f"{found.why}; of {found.considered} drivable carries, from {found.source}")
@@ -132,15 +133,15 @@ def answer(found: StoredRecommendation, folder: str) -> StudyAnswer:
         details.append(Fact("on this path", "; ".join(told)))
     if found.price is not None:
         details.append(Fact("checked", _checked(found.price)))
+    commands = [Fact("file", str(file))]
+    if found.has_job:
+        commands.append(Fact("next", export_command(file), is_command=True))
     details.append(Fact("with this force", f"{'; '.join(_margins(found)) or 'not known'}"))
     return StudyAnswer(
         state_of(found),
         headline,
         _facts(found),
-        (
-            Fact("file", str(file)),
-            Fact("next", export_command(file), is_command=True),
-        ),
+        tuple(commands),
         tuple(details),
         found.warnings,
     )

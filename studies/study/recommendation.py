@@ -95,6 +95,7 @@ class StoredRecommendation:
             about these; else null.
         without_jerk: duration without the cell's limits on jerk [s], null where there are none.
         squeeze, squeeze_reason: largest normal force to command of each robot [N], and why.
+        order: what the force asks of the contacts, as in 'press with'.
         payload_limit: payload that the robots bear on the same motion with planned forces, nothing
             uncertain [kg].
         rivals: other paths at the same force and in the same time, the hand-made one first.
@@ -139,6 +140,12 @@ class StoredRecommendation:
     at_rest: str = ""
     remedies: tuple[Remedy, ...] = ()
     reserve: Reserve | None = None
+    order: str = "press with"
+
+    @property
+    def has_job(self) -> bool:
+        """Return True if robots can be given a job around the carry."""
+        return math.isfinite(self.job_duration)
 
     @property
     def fits(self) -> bool:
@@ -277,6 +284,7 @@ def recommend_from(
         at_rest=str(found.budget),
         remedies=found.remedies,
         reserve=found.reserve,
+        order=found.squeeze.order,
     )
 
 

@@ -128,6 +128,8 @@ class HoldingHands(ContactModel):
 
     assumption = "hands that hold by themselves, on arms that keep their poses"
     is_squeeze = False
+    holders = "hands that hold by themselves"
+    order = "hold with"
 
     @property
     def problem(self) -> Problem | None:

@@ -127,6 +127,8 @@ class ContactModel(ABC):
         has_closed_form: whether `hold` gives the forces; else a program finds them.
         is_squeeze: whether the arms hold the payload by pressing it between them, so that forces
             are commanded, and reference forces limit the whole force of a robot as well.
+        holders: what commanded forces hold the payload with, in words.
+        order: what a force asks of them, as in 'press with 80 N'.
     """
 
     assumption: ClassVar[str]
@@ -134,6 +136,8 @@ class ContactModel(ABC):
     has_elastic_layers: ClassVar[bool] = False
     has_closed_form: ClassVar[bool] = True
     is_squeeze: ClassVar[bool] = True
+    holders: ClassVar[str] = "pads that press evenly"
+    order: ClassVar[str] = "press with"
 
     def __init__(self, workcell: Workcell) -> None:
         self.workcell = workcell

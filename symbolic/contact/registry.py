@@ -24,17 +24,24 @@ def contact_model(workcell: Workcell) -> ContactModel:
     return CONTACT_MODELS[workcell.task.allocation](workcell)
 
 
+def squeeze_problem(workcell: Workcell, purpose: str) -> str:
+    """Return why a purpose does not fit hands that hold by themselves; '' for pads that press."""
+    if contact_model(workcell).is_squeeze:
+        return ""
+    return (
+        f"{purpose} is for pads that press the payload between them; the hands of this cell "
+        "hold by themselves (docs/explanation/limits.md)"
+    )
+
+
 def require_squeeze(workcell: Workcell, purpose: str) -> None:
     """Refuse hands that hold by themselves.
 
     Raises:
         SettingsError: the arms do not press the payload between them.
     """
-    if not contact_model(workcell).is_squeeze:
-        raise SettingsError(
-            f"{purpose} is for pads that press the payload between them; the hands of this cell "
-            "hold by themselves (docs/explanation/limits.md)"
-        )
+    if problem := squeeze_problem(workcell, purpose):
+        raise SettingsError(problem)
 
 
 def command_model(workcell: Workcell) -> ContactModel:

@@ -23,7 +23,7 @@ from hybrid_opt.recommending.recommendation import (
     table_forces,
 )
 from hybrid_opt.robust.cases import random_cases
-from hybrid_opt.robust.force import BoxMotion, RobustModel, robust_model
+from hybrid_opt.robust.force import BoxMotion, RobustModel, robust_model, thinned
 from hybrid_opt.robust.squeeze import commanded_forces
 from hybrid_opt.timing.solve import time_path
 from symbolic.array import Array
@@ -459,3 +459,23 @@ def test_changes_of_pads_anywhere_are_those_of_the_file(name: str) -> None:
     level = f"pads at the height of the centre of mass, now {height:.0f} mm above it"
     assert told[level] == pytest.approx(force(lower(height / 1e3)) - now, rel=1e-3)
     assert all(change < 0.0 for change in told.values())
+
+
+@pytest.mark.slow
+def test_hands_that_hold_by_themselves_are_recommended_without_a_job() -> None:
+    cell = ho.example("palletising").drivable()
+    front = ho.search(cell, "nsga2", evaluations=150, rng=np.random.default_rng(1))
+    found = ho.recommend(front)
+    assert found.fits
+    assert (found.required <= cell.workcell.task.reference_force).all()
+    assert found.squeeze.force == pytest.approx(sum(part.force for part in found.squeeze.parts))
+    text = repr(found)
+    assert f"{found.duration:.3f} s, hold with {found.force:.1f} N" in text
+    assert "holds hands that hold by themselves in every case" in text
+    assert not any("lower" in each.change for each in found.advice), "cups lie on the top"
+    assert found.job is None
+    assert any("no job can be planned" in each for each in found.warnings)
+    # Half the force does not hold a case of the uncertainty: the command is not too high.
+    _, moved = thinned(found.carry)
+    needed = robust_model(cell.workcell).commanded(moved, cell.workcell.uncertainty, 0)
+    assert 0.5 * found.force < needed.max() <= found.force * 1.001

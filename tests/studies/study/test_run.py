@@ -135,7 +135,7 @@ def test_every_program_states_the_same_carry(
     root, printed = program_run
     found = read_summary(root).recommendation
     assert found is not None
-    line = carry_text(found.duration, found.force, found.job_duration)
+    line = carry_text(found.duration, found.force, found.job_duration, found.order)
     file, page = root / found.file, (root / PAGE).read_text("utf-8")
     assert f"Run this carry: {line}\n" in printed
     assert f"Run this carry: {line}<" in page
