@@ -126,7 +126,7 @@ def definitions() -> Iterator[tuple[str, str, str]]:
 
     Programs that bundles carry along import nothing of this project, so they are left out.
     """
-    programs = ROOT / "hybrid_opt" / "bundles" / "programs"
+    programs = ROOT / "hybrid_opt" / "extras" / "bundles" / "programs"
     for path in modules(*PACKAGES):
         if path.parent == programs:
             continue

@@ -42,7 +42,7 @@ FORCE_MULTIPLES = 1.0 + np.array([-0.02, 0.0, 0.02, 0.05, 0.1, 0.2, 0.4, 0.8])
 LOOKED_AT = 8
 """Samples of largest commanded force at which small changes are judged."""
 
-SIDE = 0.5
+LARGEST_SIDE_COSINE = 0.5
 """Largest cosine between upwards and the normal of a contact at a side of the payload, along which
 a contact can be moved up or down."""
 
@@ -156,7 +156,9 @@ def changes_of_cell(workcell: Workcell, motion: BoxMotion) -> Iterator[tuple[str
         f"friction {FRICTION_CHANGE:g} higher": _with_friction,
         "patches 1 mm wider to each side": _wider,
     }
-    is_held_at_sides = all(abs(each.T_box_pad[:3, 2] @ up) < SIDE for each in workcell.contacts)
+    is_held_at_sides = all(
+        abs(each.T_box_pad[:3, 2] @ up) < LARGEST_SIDE_COSINE for each in workcell.contacts
+    )
     if is_held_at_sides:
         changes["pads 1 mm lower"] = partial(_moved, by=-MILLIMETRE * up)
     for name, change in changes.items():

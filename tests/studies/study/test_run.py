@@ -321,9 +321,11 @@ def test_a_study_without_a_recommendation_says_why(
 
 def test_options_are_explained_and_become_settings() -> None:
     parser, usual = rack.main.parser(), ho.PolishSettings()
-    told = re.split(r"\n(?=  --)", parser.format_help())[1:]
+    told = re.split(r"\n(?=  --)", parser.format_whole_help())[1:]
     assert len(told) == len([action for action in parser._actions if action.dest != "help"])
-    assert all(re.search(r"\(default:", option) for option in told)
+    valued = [option for option in told if not option.lstrip().startswith(("--help", "--version"))]
+    assert len(valued) == len(told) - 2
+    assert all(re.search(r"\(default:", option) for option in valued)
     assert polish_settings(parser.parse_args([]), True, is_drivable=False) == usual
     assert polish_settings(parser.parse_args(["--no-polish"]), True, is_drivable=False) is None
     arguments = (
