@@ -116,7 +116,7 @@ def test_seed_matters(tmp_path: Path, undisturbed: dict[str, bytes]) -> None:
     assert not set(found.values()) & set(undisturbed.values())
 
 
-@pytest.mark.parametrize("jobs", ["1", "2"])
+@pytest.mark.parametrize("jobs", ["1", pytest.param("2", marks=pytest.mark.slow)])
 def test_killed_at_any_moment_and_resumed(
     tmp_path: Path, jobs: str, undisturbed: dict[str, bytes]
 ) -> None:

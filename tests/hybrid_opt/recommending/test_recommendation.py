@@ -434,7 +434,8 @@ WIDER: dict[str, dict[str, list[float]]] = {
 }
 
 
-@pytest.mark.parametrize("name", ["fork", pytest.param("drum", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["fork", "drum"])
 def test_changes_of_pads_anywhere_are_those_of_the_file(name: str) -> None:
     workcell, moved = model(name).workcell, motion(name)
     told = dict(changes_of_cell(workcell, moved))
