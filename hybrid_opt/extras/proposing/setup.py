@@ -35,6 +35,7 @@ from hybrid_opt.extras.proposing.trial import MARGINS, PoseJudge, judge_of
 from hybrid_opt.robust.budget import budget_text
 from hybrid_opt.static_hold import require_hold
 from symbolic.array import Array
+from symbolic.contact.registry import require_squeeze
 from symbolic.geometry.pairs import build_geometry
 from symbolic.read.arms import FOLLOWING, arm_model, common_joints, turning_joints
 from symbolic.read.editing import merged
@@ -183,10 +184,12 @@ def prepare(
     Raises:
         ProposalError: an arm cannot hold the box at start and goal; the text says why.
         WorkcellError: the problem is wrong, or no arms could hold the payload still.
+        SettingsError: the hands hold by themselves.
     """
     start, goal = problem.poses
     given = merged(given, redundancy(problem, problem.workcell(given)))
     workcell = problem.workcell(given)
+    require_squeeze(workcell, "a proposal")
     require_hold(workcell)
     tell(budget_text(workcell))
     lacking = reach_missing(workcell, (start, goal), spins)
