@@ -48,7 +48,7 @@ from hybrid_opt.static_hold import require_hold
 from studies.options import QUICK_EVALUATIONS, QUICK_REPLICAS
 from studies.program import load_workcell
 from studies.report import PAGE, TABLES
-from studies.study.answer import EXPORT_TARGET, export_command
+from studies.study.answer import export_command
 from studies.study.recommendation import is_drivable, known_paths, recommendation_stage
 from studies.study.simulation import (
     limits_on_jerk,
@@ -262,11 +262,10 @@ def make_study(path: Path, options: argparse.Namespace, with_paper: bool) -> Non
     if study.report:
         print(f"Report: {execution.output / PAGE}; all tables: {execution.output / TABLES}")
     recommended = read_summary(execution.output).recommendation
-    if recommended is not None and recommended.has_job:
-        command = export_command(
-            execution.output / RECOMMENDED_FILE, options.target or EXPORT_TARGET
-        )
-        print(f"next: {command}")
+    if options.target is not None and recommended is not None and recommended.has_job:
+        # The answer names the export for any simulator.
+        command = export_command(execution.output / RECOMMENDED_FILE, options.target)
+        print(f"for {options.target}: {command}")
     if options.animation or options.view:
         from studies.report.looks import follow_looks
 
