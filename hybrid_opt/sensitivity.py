@@ -24,7 +24,7 @@ from hybrid_opt.display_protocol import Displayable
 from hybrid_opt.progress import ShowProgress, track
 from hybrid_opt.robust.cases import LEADER
 from hybrid_opt.robust.force import BoxMotion
-from hybrid_opt.robust.path_force import RulingForce
+from hybrid_opt.robust.path_force import GoverningForce
 from hybrid_opt.timing.limits import limit_ratios
 from hybrid_opt.timing.model import TimingModel
 from hybrid_opt.timing.records import Timing
@@ -212,7 +212,7 @@ def sensitivities(carry: Carry | Timing, *, progress: ShowProgress = False) -> S
             fastest, or the uncertainty leaves nothing that holds.
     """
     drive = _Law(carry) if isinstance(carry, Carry) else _Fastest(carry)
-    workcell, ruling = drive.carry.workcell, RulingForce(drive.carry, LEADER)
+    workcell, ruling = drive.carry.workcell, GoverningForce(drive.carry, LEADER)
     rows, missing = [], {}
     for number in track(progress, "sensitivities", list(_numbers(workcell))):
         if number.section == "uncertainty" and number.value == 0.0:

@@ -168,8 +168,8 @@ class CollisionChecker:
         placed = self._place(pose, q_1[samples], q_2[samples])
         return self._decide(placed, rows, pairs, self._resting(pose, rows, pairs))
 
-    def enters(self, pose: Array, pair: int) -> bool:
-        """Return True if the box at (6,) enters a body of the environment deeper than one that
+    def penetrates(self, pose: Array, pair: int) -> bool:
+        """Return True if the box at (6,) penetrates a body of the environment deeper than one that
         rests may.
 
         Args:

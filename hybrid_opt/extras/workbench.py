@@ -197,7 +197,7 @@ class Session:
         if judgement.feasible:
             try:
                 given = cell.workcell, carry, SqueezeSettings()
-                commanded, squeeze = commanded_forces(*given, in_parts=False)
+                commanded, squeeze = commanded_forces(*given, itemised=False)
                 most = cell.workcell.task.reference_force
                 text += f", {squeeze.order} {squeeze.force:.1f} N"
                 if (commanded.max(axis=0) > most).any():

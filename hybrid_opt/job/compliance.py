@@ -90,7 +90,7 @@ class Skew:
     late: int
 
     @property
-    def survived(self) -> bool:
+    def is_held(self) -> bool:
         """True if friction still holds the box everywhere."""
         return self.margin >= 0.0
 
@@ -147,11 +147,11 @@ def largest_skew(job: Job, stiffness: float) -> float:
         SettingsError: the stiffness is not positive.
     """
     low, high = 0.0, LARGEST_SKEW
-    if skewed(job, high, stiffness).survived:
+    if skewed(job, high, stiffness).is_held:
         return high
     for _ in range(_BISECTIONS):
         middle = (low + high) / 2.0
-        if skewed(job, middle, stiffness).survived:
+        if skewed(job, middle, stiffness).is_held:
             low = middle
         else:
             high = middle
@@ -170,7 +170,7 @@ def require_skew(job: Job, delay: float, stiffness: float) -> None:
         JobError: friction would not hold the box; the message says by how much, and what would.
     """
     found = skewed(job, delay, stiffness)
-    if found.survived:
+    if found.is_held:
         return
     raise JobError(
         f"a skew of {1e3 * delay:g} ms brings the pads {1e3 * found.displacement:.1f} mm apart; "
@@ -244,7 +244,7 @@ def skew_text(found: Sequence[Skew]) -> str:
             f"{each.force_change:.1f}",
             f"{100.0 * each.share:.0f} %",
             f"{each.margin:.1f}",
-            "holds" if each.survived else "SLIPS",
+            "holds" if each.is_held else "SLIPS",
         ]
         for each in found
     ]

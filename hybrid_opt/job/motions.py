@@ -22,7 +22,7 @@ from hybrid_opt.carry import Carry, joints_of
 from hybrid_opt.errors import JobError
 from hybrid_opt.job.records import Force, PhaseMotion
 from hybrid_opt.robust.force import BoxMotion
-from hybrid_opt.robust.squeeze import Squeeze, SqueezeSettings, pressed_beyond
+from hybrid_opt.robust.squeeze import Squeeze, SqueezeSettings, extra_normal_force
 from hybrid_opt.timing.model import TimingModel
 from hybrid_opt.timing.records import JerkLimits
 from symbolic.array import Array, interpolated
@@ -56,7 +56,7 @@ _MOVING = ("rate", "second_rate", "q_rate", "q_second")
 
 
 @dataclass(frozen=True)
-class Rise:
+class RestToRestProfile:
     """The profile and its derivatives by time at n samples, evenly spaced over a duration.
 
     Attributes:
@@ -71,7 +71,7 @@ class Rise:
     third: Array
 
 
-def rise(duration: float, samples: int) -> Rise:
+def rest_to_rest_profile(duration: float, samples: int) -> RestToRestProfile:
     """Compute the rest-to-rest profile from 0 to 1 within a duration [s]."""
     share = np.linspace(0.0, 1.0, samples)
     # Rounding must not leave [0, 1]; the last values of a polynomial of degree 7 would.
@@ -79,7 +79,7 @@ def rise(duration: float, samples: int) -> Rise:
     derivatives = [_H.deriv(k)(share) / duration**k for k in (1, 2, 3)]
     for derivative in derivatives:
         derivative[[0, -1]] = 0.0
-    return Rise(duration * share, value, *derivatives)
+    return RestToRestProfile(duration * share, value, *derivatives)
 
 
 def at_even_steps(duration: float, step: float) -> float:
@@ -161,15 +161,15 @@ def lines_around(
     return before, after
 
 
-def followed(
+def follow_line(
     workcell: Workcell, posture: NumericFunction, line: Straight, known: Array, at_end: bool
 ) -> Array:
     """Compute both arms' joints (SAMPLES, joints) along a line, by Newton's method from a known
     end.
 
-    Samples are at the places that the profile of `rise` passes at even times. Newton's method goes
-    from place to place every `LINE_STEP`, then from between these to all samples at once. Redundant
-    joints stay where they are at the known end.
+    Samples are at the places that `rest_to_rest_profile` passes at even times. Newton's method goes
+    from place to place every `LINE_STEP`, then from these to all samples at once. Redundant joints
+    stay where they are at the known end.
 
     Args:
         posture: compiled `symbolic.robot.arm.posture_function`.
@@ -185,13 +185,15 @@ def followed(
 
     ways, passed = np.linspace(0.0, 1.0, int(np.ceil(line.length / LINE_STEP)) + 1), [known]
     for way in ways:
-        passed.append(held_at(workcell, posture, line, share(way[None]), passed[-1][None])[0])
+        passed.append(
+            solve_joints_at(workcell, posture, line, share(way[None]), passed[-1][None])[0]
+        )
         if not np.isfinite(passed[-1]).all():
             break
     reached = np.array([q for q in passed[1:] if np.isfinite(q).all()] or [known])
-    samples = rise(1.0, PHASE_SAMPLES).value
+    samples = rest_to_rest_profile(1.0, PHASE_SAMPLES).value
     guess = interpolated(samples, ways[: len(reached)], reached)
-    q = held_at(workcell, posture, line, share(samples), guess)
+    q = solve_joints_at(workcell, posture, line, share(samples), guess)
     lower, upper = map(workcell.stack_joint_limits, ("position_lower", "position_upper"))
     outside = ((q < lower) | (q > upper)).any(axis=1)
     lost = ~np.isfinite(q).all(axis=1)
@@ -205,7 +207,7 @@ def followed(
     return q[:: -1 if at_end else 1]
 
 
-def held_at(
+def solve_joints_at(
     workcell: Workcell, posture: NumericFunction, line: Straight, share: Array, guess: Array
 ) -> Array:
     """Compute both arms' joints (n, joints) at shares (n,) of a line, from guesses (n, joints)
@@ -222,13 +224,13 @@ def held_at(
     return np.concatenate(found, axis=1)
 
 
-def timed(model: TimingModel, line: Straight, q: Array) -> PhaseMotion:
+def time_line(model: TimingModel, line: Straight, q: Array) -> PhaseMotion:
     """Compute the motion along a line from rest to rest, as fast as its speed and the limits allow.
 
     Args:
         q: (SAMPLES, joints) as from `followed` [rad].
     """
-    unit = rise(1.0, PHASE_SAMPLES)
+    unit = rest_to_rest_profile(1.0, PHASE_SAMPLES)
     box, *targets = line.at(unit.value)
     own = joints_of(model.workcell, q)
     arms = []
@@ -345,7 +347,7 @@ def holding(
     )
     load = model.load(box.pose, box.rate, box.second_rate)
     least, wrench = load["normal_force"], np.stack([load["wrench_1"], load["wrench_2"]], axis=1)
-    extra, squeeze = pressed_beyond(model.workcell, settings, time, box, least)
+    extra, squeeze = extra_normal_force(model.workcell, settings, time, box, least)
     normal = least + np.multiply.outer(
         extra, command_model(model.workcell).pressed_together(squeeze.leader)
     )
@@ -371,7 +373,7 @@ def pressing(
     """
     peak = float(hold.normal[sample].max())
     duration = at_even_steps(PEAK_RATE * peak / rate, TICK)
-    share = rise(duration, PHASE_SAMPLES).value[:: 1 if sample == 0 else -1]
+    share = rest_to_rest_profile(duration, PHASE_SAMPLES).value[:: 1 if sample == 0 else -1]
 
     def scaled(values: Array) -> Array:
         return np.asarray(np.multiply.outer(share, values[sample]))
@@ -380,7 +382,7 @@ def pressing(
     return standing_still(motion, sample, np.linspace(0.0, duration, PHASE_SAMPLES)), force
 
 
-def without_force(motion: PhaseMotion) -> Force:
+def zero_forces(motion: PhaseMotion) -> Force:
     """Return the forces of pads that touch nothing."""
     n = len(motion.time)
     return Force(np.zeros((n, 2)), np.zeros((n, 2)), np.zeros((n, 2, 6)))

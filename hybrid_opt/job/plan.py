@@ -32,18 +32,18 @@ from hybrid_opt.job.motions import (
     USE_TOLERANCE,
     Straight,
     carry_motion,
-    followed,
-    held_at,
+    follow_line,
     holding,
     lines_around,
     phase_use,
     pressing,
-    rise,
-    timed,
-    without_force,
+    rest_to_rest_profile,
+    solve_joints_at,
+    time_line,
+    zero_forces,
 )
 from hybrid_opt.job.records import Job, Phase, PhaseMotion
-from hybrid_opt.job.smooth import LARGEST_WIDTH, SMOOTHING_WIDTH, rests_at_ends, without_jumps
+from hybrid_opt.job.smooth import LARGEST_WIDTH, SMOOTHING_WIDTH, has_rest_at_ends, without_jumps
 from hybrid_opt.robust.squeeze import Squeeze, SqueezeSettings, commanded_forces
 from hybrid_opt.timing.jerk import applicable_jerk_limits
 from hybrid_opt.timing.model import TimingModel
@@ -83,7 +83,7 @@ class SupportedPose:
 
 
 @dataclass(frozen=True)
-class Around:
+class StraightMotions:
     """Straight motions and supports before a carry and after it.
 
     Attributes:
@@ -112,7 +112,7 @@ class Around:
         """
         for side, (lines, known) in enumerate(zip(self.lines, q, strict=True)):
             for line in lines:
-                way = followed(workcell, posture, line, known, at_end=side == 0)
+                way = follow_line(workcell, posture, line, known, at_end=side == 0)
                 yield side, line, way
                 known = way[-side]
 
@@ -175,14 +175,14 @@ class JobCollisions:
         names = [bodies[body].name for body in below[touched].tolist()]
         return SupportedPose(_lowered(pose, found), found, tuple(names))
 
-    def around(self, handling: Handling, pose: Array) -> Around:
+    def straight_motions(self, handling: Handling, pose: Array) -> StraightMotions:
         """Plan the straight motions around a carry whose box begins and ends at poses (2, 6)."""
         heights = (handling.lift_height, handling.set_down_height)
         before, after = (self.standing(*each) for each in zip(pose, heights, strict=True))
         stands = (before.pose, after.pose)
         lines = lines_around(self._workcell, handling, stands, pose)
         checker = self.checker((before, after))
-        return Around(checker, lines, (before.bodies, after.bodies))
+        return StraightMotions(checker, lines, (before.bodies, after.bodies))
 
     def checker(self, places: Sequence[SupportedPose]) -> CollisionChecker:
         """Build the checker of a job whose box stands at these places before and after the
@@ -250,7 +250,7 @@ def _lowered(pose: Array, drop: float) -> Array:
     return lowered
 
 
-def what_blocks(
+def describe_obstruction(
     workcell: Workcell,
     collisions: JobCollisions,
     posture: NumericFunction,
@@ -267,8 +267,8 @@ def what_blocks(
         pose: (2, 6) of the box where the carry begins and ends.
         q: (2, joints) of both arms there [rad or m].
     """
-    around = collisions.around(workcell.handling, pose)
-    share = rise(1.0, PHASE_SAMPLES).value[::CHECK_STRIDE]
+    around = collisions.straight_motions(workcell.handling, pose)
+    share = rest_to_rest_profile(1.0, PHASE_SAMPLES).value[::CHECK_STRIDE]
     try:
         for _, line, way in around.followed(workcell, posture, q):
             poses, joints = line.at(share)[0], joints_of(workcell, way[::CHECK_STRIDE])
@@ -316,7 +316,9 @@ class JobModel:
         self.timing = TimingModel(compiled) if timing is None else timing
         self._posture: NumericFunction = compiled.evaluators["posture"]
         self._collisions = JobCollisions(compiled)
-        self._known: dict[tuple[Handling, bytes], tuple[Around, list[Phase], list[Phase]]] = {}
+        self._known: dict[
+            tuple[Handling, bytes], tuple[StraightMotions, list[Phase], list[Phase]]
+        ] = {}
 
     def plan(
         self,
@@ -361,7 +363,7 @@ class JobModel:
         around, (*before, first), (*after, last) = self._around(carry, handling)
         motion = carry_motion(self.timing, carry)
         middle = Phase(
-            "carry", 0.0, motion, without_force(motion), self._proof(around.checker, carry), {}
+            "carry", 0.0, motion, zero_forces(motion), self._proof(around.checker, carry), {}
         )
         loaded = [*before[::-1], middle, *after]
         settings = squeeze or SqueezeSettings()
@@ -381,7 +383,9 @@ class JobModel:
             self.timing.joint_names,
         )
 
-    def _around(self, carry: Carry, handling: Handling) -> tuple[Around, list[Phase], list[Phase]]:
+    def _around(
+        self, carry: Carry, handling: Handling
+    ) -> tuple[StraightMotions, list[Phase], list[Phase]]:
         """Plan the moving phases before a carry and after it, either from the carry outwards;
         cached for carries with the same ends."""
         pose, q = carry.pose[[0, -1]], carry.q[[0, -1]].round(_SAME_POSTURE)
@@ -390,12 +394,12 @@ class JobModel:
             return self._known[key]
         if len(self._known) >= _MOST_KNOWN:
             self._known.clear()
-        around = self._collisions.around(handling, pose)
+        around = self._collisions.straight_motions(handling, pose)
         found: tuple[list[Phase], list[Phase]] = ([], [])
         for side, line, way in around.followed(self.workcell, self._posture, q):
-            motion = timed(self.timing, line, way)
+            motion = time_line(self.timing, line, way)
             proof = self._free(around.checker, line, motion)
-            found[side].append(Phase(line.name, 0.0, motion, without_force(motion), proof, {}))
+            found[side].append(Phase(line.name, 0.0, motion, zero_forces(motion), proof, {}))
         self._known[key] = around, *found
         return self._known[key]
 
@@ -409,11 +413,11 @@ class JobModel:
 
     def _free(self, checker: CollisionChecker, line: Straight, motion: PhaseMotion) -> Certificate:
         """Certify a straight motion between its samples."""
-        share = rise(1.0, PHASE_SAMPLES).value
+        share = rest_to_rest_profile(1.0, PHASE_SAMPLES).value
 
         def at(u: Array) -> tuple[Array, Array, Array]:
             guess = interpolated(u, share, motion.q)
-            q = held_at(self.workcell, self._posture, line, u, guess)
+            q = solve_joints_at(self.workcell, self._posture, line, u, guess)
             return line.at(u)[0], *joints_of(self.workcell, q)
 
         return certify(checker, at, np.linspace(0.0, 1.0, FIRST_POINTS))
@@ -425,7 +429,7 @@ class JobModel:
         begin = 0.0
         for draft in drafts:
             # Jumps that a carry is to keep are reported elsewhere.
-            jumps = draft.name == "carry" and not rests_at_ends(timing)
+            jumps = draft.name == "carry" and not has_rest_at_ends(timing)
             kept = None if jumps else jerk
             use = phase_use(self.workcell, draft.motion, draft.force, kept)
             if draft.name == "carry":
@@ -449,7 +453,7 @@ class JobModel:
 
 
 @dataclass(frozen=True)
-class Pressed:
+class CommandedForces:
     """Commanded forces of a timed carry.
 
     Attributes:
@@ -466,7 +470,9 @@ class Pressed:
     problem: str = ""
 
 
-def pressed(model: JobModel, timing: Timing, settings: SqueezeSettings | None = None) -> Pressed:
+def command_forces(
+    model: JobModel, timing: Timing, settings: SqueezeSettings | None = None
+) -> CommandedForces:
     """Compute the forces to press with along a timed carry, as its job does.
 
     Args:
@@ -482,12 +488,12 @@ def pressed(model: JobModel, timing: Timing, settings: SqueezeSettings | None = 
         job = model.plan(timing, settings)
     except JobError as error:
         forces, squeeze = commanded_forces(model.workcell, timing.driven, settings)
-        return Pressed(forces, squeeze, None, str(error))
+        return CommandedForces(forces, squeeze, None, str(error))
     carried = job.phase("carry")
     along = (carried.motion.time, carried.force.normal)
     time = job.timing.driven.time
     normal = np.column_stack([np.interp(time, along[0], force) for force in along[1].T])
-    return Pressed(normal, job.squeeze, job)
+    return CommandedForces(normal, job.squeeze, job)
 
 
 _model = cache_by_workcell(JobModel)

@@ -187,7 +187,7 @@ class Job(Displayable):
                 text_table([head, *rows], left=(0, 4)),
                 f"commanded: {self.squeeze}; robot "
                 f"{self.workcell.robots[1 - self.squeeze.leader].name!r} is force-controlled",
-                f"  {self.squeeze.account}",
+                f"  {self.squeeze.breakdown}",
             ]
         )
 

@@ -50,7 +50,7 @@ _INSIDE = 0.01
 """Share of an interval of factors that is kept from its ends."""
 
 
-def rests_at_ends(timing: Timing) -> bool:
+def has_rest_at_ends(timing: Timing) -> bool:
     """Return True if all joints begin and end without acceleration."""
     return acceleration_at_ends(timing) <= RESTS
 
@@ -78,7 +78,7 @@ def without_jumps(
         JobError: slowing down by half does not bring it within its limits, or those on jerk cannot
             be kept.
     """
-    if width == 0.0 or rests_at_ends(timing):
+    if width == 0.0 or has_rest_at_ends(timing):
         return timing
     if jerk is None:
         return _smoothed(model, timing, width)

@@ -124,7 +124,7 @@ class WarmSampling(FloatRandomSampling):  # type: ignore[misc]
         return samples
 
 
-class FillingMating(Mating):  # type: ignore[misc]
+class ExhaustiveMating(Mating):  # type: ignore[misc]
     """Mating that always fills its offspring: uniform samples replace missing unique ones.
 
     pymoo stops a run early when crossover and mutation yield duplicates only, as happens in a

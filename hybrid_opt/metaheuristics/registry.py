@@ -18,7 +18,12 @@ from pymoo.operators.crossover.sbx import SBX
 from pymoo.operators.mutation.pm import PM
 from pymoo.operators.selection.tournament import TournamentSelection
 
-from hybrid_opt.metaheuristics.guarded import FillingMating, Guarded, WarmSampling, feasible_front
+from hybrid_opt.metaheuristics.guarded import (
+    ExhaustiveMating,
+    Guarded,
+    WarmSampling,
+    feasible_front,
+)
 from hybrid_opt.metaheuristics.mopso import Mopso, MopsoSettings, Points, Share
 from symbolic.array import Array, Range, require_allowed
 from symbolic.errors import SettingsError
@@ -76,7 +81,7 @@ def _genetic(
     kind: type[Algorithm], compare: Any, settings: GeneticSettings, initial: Array | None
 ) -> Algorithm:
     """Build an algorithm that mates the winners of tournaments decided by `compare`."""
-    mating = FillingMating(
+    mating = ExhaustiveMating(
         TournamentSelection(func_comp=compare),
         SBX(eta=settings.crossover_eta, prob=settings.crossover_probability),
         PM(eta=settings.mutation_eta, prob_var=settings.mutation_probability),

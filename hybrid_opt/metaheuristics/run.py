@@ -47,7 +47,7 @@ class Evaluator(Protocol):
         the samples."""
 
 
-def disarmed(evaluations: Evaluations) -> Evaluations:
+def reject_non_finite(evaluations: Evaluations) -> Evaluations:
     """Make every candidate with a non-finite figure infeasible.
 
     The last line of defence: whatever an evaluator returns, no NaN or infinity can look like a
@@ -135,7 +135,7 @@ class CarryProblem(Problem):  # type: ignore[misc]
         return concatenated(self.batches)
 
     def _evaluate(self, x: Array, out: dict[str, Any], *args: Any, **kwargs: Any) -> None:
-        batch = disarmed(self.evaluator.evaluate(x))
+        batch = reject_non_finite(self.evaluator.evaluate(x))
         self.batches.append(batch)
         self.evaluated(len(batch.feasible))
         if self.handling == "penalty":

@@ -16,7 +16,7 @@ import numpy as np
 
 from codegen.interpreted import InterpretedFunction
 from hybrid_opt.compiled_cell import contact_function
-from hybrid_opt.robust.cases import RulingCases, ruling_cases
+from hybrid_opt.robust.cases import GoverningCases, governing_cases
 from hybrid_opt.robust.force import BoxMotion, robust_model
 from hybrid_opt.robust.path_force import PathPoints, robust_path
 from symbolic.array import Array
@@ -53,7 +53,7 @@ class RobustSamples:
     def forces(self, found: Mapping[str, Array]) -> Array:
         """Compute normal forces (n, 2) [N] from the evaluator's outputs for one candidate."""
         motion = BoxMotion(*[found[name] for name in ("pose", "rate", "second_rate")])
-        return self._ruling(motion).force
+        return self._governing(motion).force
 
     def first(self, x: Array) -> tuple[Array, Array]:
         """Compute forces (n, 2) [N] of a decision vector (n_var,) and their derivatives (n, 2,
@@ -62,19 +62,19 @@ class RobustSamples:
         rows = out["motion"][0]
         by_x = out["slope"][0].reshape(*rows.shape, len(x))
         parts = [np.ascontiguousarray(rows[:, at : at + 6]) for at in (0, 6, 12)]
-        ruling = self._ruling(BoxMotion(*parts))
-        slopes = ruling.slopes(
+        governing = self._governing(BoxMotion(*parts))
+        slopes = governing.slopes(
             *[
                 self._gradient.batch(*parts, self._cases[case])["slope"]
-                for case in (ruling.commanded, ruling.felt)
+                for case in (governing.commanded, governing.leading)
             ]
         )
-        return ruling.force, np.einsum("nrm,nmx->nrx", slopes, by_x)
+        return governing.force, np.einsum("nrm,nmx->nrx", slopes, by_x)
 
-    def _ruling(self, motion: BoxMotion) -> RulingCases:
+    def _governing(self, motion: BoxMotion) -> GoverningCases:
         worst = self._model.least_squeeze(motion, self._cases)
         share = float(self._model.leading_share[LEADER])
-        return ruling_cases(worst, self._workcell.uncertainty, LEADER, leading_share=share)
+        return governing_cases(worst, self._workcell.uncertainty, LEADER, leading_share=share)
 
 
 class RobustForces:
@@ -115,6 +115,6 @@ class RobustForces:
         found = weight[:, :size].copy()
         shares = weight[:, size:].reshape(-1, 2, GOVERNING_CASES).sum(axis=2)
         for arm, branches in enumerate(self._branches):
-            ruling = branches[np.argmax(value[:, :size] @ branches.T, axis=1)]
-            found += shares[:, arm, None] * ruling
+            governing = branches[np.argmax(value[:, :size] @ branches.T, axis=1)]
+            found += shares[:, arm, None] * governing
         return found

@@ -17,7 +17,7 @@ from hybrid_opt.carry import Carry
 from hybrid_opt.cell import Cell
 from hybrid_opt.recommending.choice import DrivenPaths, Option
 from hybrid_opt.robust.cases import LEADER, nominal_case
-from hybrid_opt.robust.force import HOLDS, BoxMotion, robust_model, thinned
+from hybrid_opt.robust.force import HOLDS, BoxMotion, robust_model, subsample
 from hybrid_opt.timing.records import Timing
 from hybrid_opt.timing.robustness import Margin
 from symbolic.array import Array
@@ -72,7 +72,7 @@ def commanded_margins(carry: Carry, forces: Array) -> tuple[Margin, ...]:
     """Compute how far friction, mass and centre of mass may be off, each by itself, while commanded
     forces (n, 2) [N] hold the carry."""
     workcell, model = carry.workcell, robust_model(carry.workcell)
-    rows, motion = thinned(carry)
+    rows, motion = subsample(carry)
     enough, nominal = forces[rows, 1 - LEADER] * (1.0 + HOLDS), nominal_case(workcell)
 
     def last(change: Array, end: float) -> tuple[float, str]:
@@ -135,7 +135,7 @@ def advice(cell: Cell, paths: DrivenPaths, option: Option, timing: Timing) -> tu
 
     found = [
         Advice(change, force, in_time(force))
-        for change, force in changes_of_cell(cell.workcell, thinned(timing.carry)[1])
+        for change, force in changes_of_cell(cell.workcell, subsample(timing.carry)[1])
     ]
     found += _of_pitch(cell, paths.x[option.index], option, slope)
     return tuple(sorted(found, key=lambda each: each.force))

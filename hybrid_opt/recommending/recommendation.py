@@ -19,7 +19,7 @@ from hybrid_opt.display_protocol import Displayable
 from hybrid_opt.errors import JobError
 from hybrid_opt.evaluate.objectives import ROBUST_FORCE, ForceKind
 from hybrid_opt.front import Front
-from hybrid_opt.job.plan import JobModel, Pressed, pressed
+from hybrid_opt.job.plan import CommandedForces, JobModel, command_forces
 from hybrid_opt.job.records import Job
 from hybrid_opt.job.smooth import driven_timing
 from hybrid_opt.progress import ShowProgress, progress_bar
@@ -47,7 +47,7 @@ from hybrid_opt.robust.budget import (
     reserve,
 )
 from hybrid_opt.robust.cases import LEADER
-from hybrid_opt.robust.force import at_rest, box_motion, robust_model, thinned
+from hybrid_opt.robust.force import at_rest, box_motion, robust_model, subsample
 from hybrid_opt.robust.squeeze import MOST, Squeeze, largest_commanded
 from hybrid_opt.static_hold import static_hold
 from hybrid_opt.timing.limits import limited_force
@@ -90,7 +90,7 @@ class Recommendation(Displayable):
         rivals: the hand-made path, and others, at the same commanded force and in the same time.
         advice: what changes of the cell would change.
         warnings: what speaks against it, sentences; empty where nothing does.
-        required: (2,) largest force of each robot in any case, commanded or felt [N].
+        required: (2,) largest force of each robot in any case, commanded or resulting [N].
         budget: what holding still takes of the reference forces.
         remedies: where the reference forces do not allow it, the smallest changes of the cell with
             which they do.
@@ -109,7 +109,7 @@ class Recommendation(Displayable):
     squeeze: Squeeze
     job: Job | None
     margins: tuple[Margin, ...]
-    rivals: tuple[Rival, ...]
+    rivals: tuple[Alternative, ...]
     advice: tuple[Advice, ...]
     warnings: tuple[str, ...]
     required: Array
@@ -158,7 +158,7 @@ class Recommendation(Displayable):
         if not self.fits:
             objection = f"N{self.objection[1:]}"
             lines = [objection, f"If you allow {self.required.max():.1f} N: {found}"]
-        lines += [f"  {self.why}", f"  {self.squeeze}: {self.squeeze.account}"]
+        lines += [f"  {self.why}", f"  {self.squeeze}: {self.squeeze.breakdown}"]
         lines += [f"  within the reference force: {self.reserve}"]
         lines += [f"  {each}" for each in self.rivals]
         lines += [f"  on this path, {each}" for each in self.advice]
@@ -232,8 +232,8 @@ def _recommended(
     told()
     carry = timing.carry
     assert carry is not None, "what is recommended has a timing"
-    held = pressed(JobModel(cell.compiled, cell.timing_model), timing)
-    forces, squeeze, job, doubts = held.forces, held.squeeze, held.job, _doubts(held)
+    held = command_forces(JobModel(cell.compiled, cell.timing_model), timing)
+    forces, squeeze, job, doubts = held.forces, held.squeeze, held.job, _objections(held)
     commanded = np.asarray(forces.max(axis=0)) if job is None else job.peak_normal_force
     allowed, remedies = cell.workcell.task.reference_force, tuple[Remedy, ...]()
     required = np.maximum(commanded, required_forces(cell.workcell, carry))
@@ -245,7 +245,7 @@ def _recommended(
     told()
     beside = []
     for label, path in named.items():
-        beside.append(rival(cell, label, path, timing, squeeze.force))
+        beside.append(time_alternative(cell, label, path, timing, squeeze.force))
         told()
     margins = () if alone else commanded_margins(carry, forces)
     told()
@@ -311,16 +311,16 @@ def _driven(
 
 
 def required_forces(workcell: Workcell, carry: Carry) -> Array:
-    """Compute the largest force (2,) [N] of each robot in every case of the uncertainty: commanded
-    of the force-controlled arm, commanded of the leading one or felt by it."""
-    doubt, (rows, motion) = workcell.uncertainty, thinned(carry)
-    most = largest_commanded(workcell, motion, carry.normal_force[rows], doubt, LEADER)
-    felt = robust_model(workcell).hold(motion, doubt, LEADER)[1]
-    most[LEADER] = max(most[LEADER], felt.max())
+    """Compute the largest force (2,) [N] of each robot in any case of the uncertainty, commanded
+    or resulting."""
+    uncertainty, (rows, motion) = workcell.uncertainty, subsample(carry)
+    most = largest_commanded(workcell, motion, carry.normal_force[rows], uncertainty, LEADER)
+    leading = robust_model(workcell).hold(motion, uncertainty, LEADER)[1]
+    most[LEADER] = max(most[LEADER], leading.max())
     return most
 
 
-def _doubts(found: Pressed) -> list[str]:
+def _objections(found: CommandedForces) -> list[str]:
     """List objections against how a carry is pressed."""
     squeeze, doubts = found.squeeze, []
     if found.job is None:
@@ -335,7 +335,7 @@ def is_within(required: Array, allowed: Array) -> bool:
     return bool((required <= allowed * (1.0 + BETTER)).all())
 
 
-def _better(beside: Sequence[Rival], timing: Timing, force: float) -> Iterator[str]:
+def _better(beside: Sequence[Alternative], timing: Timing, force: float) -> Iterator[str]:
     """Yield the statement that another path is faster at the same force."""
     for other in beside:
         if other.duration_at_force < timing.duration * (1.0 - BETTER):
@@ -357,7 +357,7 @@ MEMBERS = 24
 
 
 @dataclass(frozen=True, repr=False)
-class Rival:
+class Alternative:
     """A path driven as fast as the same limits allow, those on jerk among them.
 
     Attributes:
@@ -382,7 +382,9 @@ class Rival:
         return f"{self.label}: {force}, {time}"
 
 
-def rival(cell: Cell, label: str, path: Array, timing: Timing, force: float) -> Rival:
+def time_alternative(
+    cell: Cell, label: str, path: Array, timing: Timing, force: float
+) -> Alternative:
     """Time a path (n_path,) at a recommended carry's force, and compute its force to command [N] in
     the same time."""
     assert timing.limits.force is not None, "drivable carries have a force limit"
@@ -398,7 +400,7 @@ def rival(cell: Cell, label: str, path: Array, timing: Timing, force: float) -> 
             longer = max(driven.duration / found.duration, 1.0) if driven.ok else 1.0
     in_time = Goal(timing.duration / longer, np.full(2, np.inf), force_alone)
     same = next(best_of_paths(paths, options, in_time, 1), None)
-    return Rival(label, duration, float("inf") if same is None else same.commanded)
+    return Alternative(label, duration, float("inf") if same is None else same.commanded)
 
 
 def level_force(workcell: Workcell, kind: ForceKind) -> float:

@@ -17,10 +17,10 @@ from hybrid_opt.robust.force import (
     BoxMotion,
     HeldMotion,
     RobustModel,
+    at_standstill,
     interpreted_robust_model,
-    stopped,
 )
-from hybrid_opt.robust.squeeze import DOUBTS
+from hybrid_opt.robust.squeeze import UNCERTAINTY_SOURCES
 from symbolic.array import Array, Figure, Pair
 from symbolic.errors import SettingsError
 from symbolic.records import Contact, Uncertainty, Workcell
@@ -172,10 +172,10 @@ def largest_forces(
     Raises:
         SettingsError: the uncertainty leaves no friction or patch.
     """
-    doubt, forces = model.workcell.uncertainty, np.zeros(2)
-    for each in (motion, stopped(motion)):
-        command, felt = model.hold(each, doubt, LEADER, rows)
-        forces = np.maximum(forces, np.array([felt.max(), command.max()]))
+    uncertainty, forces = model.workcell.uncertainty, np.zeros(2)
+    for each in (motion, at_standstill(motion)):
+        command, leading = model.hold(each, uncertainty, LEADER, rows)
+        forces = np.maximum(forces, np.array([leading.max(), command.max()]))
     return forces
 
 
@@ -275,7 +275,7 @@ def _stronger(required: Array, allowed: Array) -> Iterator[Remedy]:
 
 def _of_cell(workcell: Workcell, excess: Callable[[Workcell], float]) -> Iterator[Remedy]:
     """Yield what mass, friction and uncertainty would have to be."""
-    payload, contacts, doubt = workcell.payload, workcell.contacts, workcell.uncertainty
+    payload, contacts, uncertainty = workcell.payload, workcell.contacts, workcell.uncertainty
 
     lighter = _smallest_change(lambda factor: excess(_with_mass(workcell, factor)), LEAST_MASS)
     if lighter is not None:
@@ -291,14 +291,14 @@ def _of_cell(workcell: Workcell, excess: Callable[[Workcell], float]) -> Iterato
         yield Remedy(f"friction of {named}", rounded[0] / coefficients[0] - 1.0)
 
     def with_ranges(names: tuple[str, ...], factor: float) -> Uncertainty:
-        return replace(doubt, **{name: factor * getattr(doubt, name) for name in names})
+        return replace(uncertainty, **{name: factor * getattr(uncertainty, name) for name in names})
 
     def excess_within(names: tuple[str, ...], factor: float) -> float:
         return excess(replace(workcell, uncertainty=with_ranges(names, factor)))
 
-    every = tuple(name for names in DOUBTS.values() for name in names)
-    for names in (every, *DOUBTS.values()):
-        if doubt.only(names).is_empty:
+    every = tuple(name for names in UNCERTAINTY_SOURCES.values() for name in names)
+    for names in (every, *UNCERTAINTY_SOURCES.values()):
+        if uncertainty.only(names).is_empty:
             continue
         narrower = _smallest_change(partial(excess_within, names), NARROWEST)
         if narrower is not None:

@@ -1,25 +1,23 @@
-"""Cases of an uncertainty set: the worst ones, random ones, and those that decide both robots'
-forces.
+"""Cases of an uncertainty set: the worst ones, random ones, and those that decide the forces.
 
-Which are worst follows from the least squeeze that a case asks for:
+The worst cases follow from the least squeeze that holds a case:
 
-- it falls with friction, whose cones grow, so that both coefficients are at their least;
-- it is proportional to the mass, which is at its largest;
-- it is a convex function of the required force and moment, and these are affine in the centre of
-  mass and in the disturbance, each for itself (`symbolic.contact.worst_cases`), so that it is
-  largest at vertices of both ranges;
-- pads press evenly about their displaced places. Two with opposite normals, displaced
-  alike by e, leave the centre of mass as much beside them. Displaced apart, they turn the squeeze
-  into a moment, which a difference of their tangential forces of up to 2 e N / L each carries, L
-  being their distance: a coefficient of friction that is lower by 2 e / L stands for it. Both at
-  once suffice within 0.3 % of the force. What the arms' places are off one another adds to 2 e.
-  Of pads anywhere the corners of squares about the discs of displacements are taken; that nothing
-  between them is worse is true to first order in e, and what random cases check;
-- a pad that is tilted by t against its face presses along its own axis: the cone about that axis
-  which lies within the face's own has the coefficient tan(atan mu - t), exact in the worst
-  direction;
-- the force that is commanded grows with the share of it that may be missing, and with the opposed
-  force (`symbolic.contact.worst_cases`).
+- It falls with friction, because the friction cones grow. So both coefficients are least.
+- It is proportional to the mass. So the mass is largest.
+- It is convex in the required force and moment. These are affine in the centre of mass and in the
+  disturbance separately (`symbolic.contact.worst_cases`). So it is largest at vertices of both
+  ranges.
+- Two pads with opposite normals that are both displaced by e shift the centre of mass by e relative
+  to them. Pads displaced in opposite directions turn the squeeze into a moment. A difference of
+  the tangential forces of up to 2 e N / L each balances it, L being the distance of the pads. This
+  is covered by a coefficient of friction that is lower by 2 e / L. Applying both at once costs at
+  most 0.3 % of the force. The error of the arms' relative pose adds to 2 e.
+- For pads with any normals the corners of squares around the discs of displacements are used. To
+  first order in e no displacement between them is worse; random cases check the rest.
+- A pad tilted by t against its face presses along its own axis. The cone about that axis within
+  the face's friction cone has the coefficient tan(atan mu - t), exact in the worst direction.
+- The commanded force grows with the share of it that may be missing, and with the opposed force
+  (`symbolic.contact.worst_cases`).
 """
 
 from __future__ import annotations
@@ -35,7 +33,7 @@ from symbolic.contact.registry import command_model
 from symbolic.records import Uncertainty, Workcell
 
 LEADER, FOLLOWER = 0, 1
-"""The arm that keeps its place, and the other, whose force is commanded."""
+"""Indices of the arm that keeps its place, and of the arm whose force is commanded."""
 
 
 def nominal_case(workcell: Workcell) -> Array:
@@ -53,8 +51,7 @@ def nominal_case(workcell: Workcell) -> Array:
 
 
 def worst_cases(workcell: Workcell, uncertainty: Uncertainty, leader: int = 0) -> Array:
-    """Return the cases (k, 18) that require as much squeeze as any within the ranges, or slightly
-    more.
+    """Return cases (k, 18) whose largest squeeze is at least that of every case within the ranges.
 
     Args:
         leader: index of the robot whose force is not commanded.
@@ -103,74 +100,82 @@ def _in_discs(rng: np.random.Generator, radius: float, n: int, discs: int) -> Ar
 
 
 @dataclass(frozen=True)
-class RulingCases:
-    """The worst cases that decide the forces; n samples.
+class GoverningCases:
+    """Worst cases that decide the forces; n samples.
 
     Attributes:
         leader: index of the arm that keeps its place.
-        force: (n, 2) what is commanded of the force-controlled arm, and the largest that the other
-            feels [N].
-        commanded: (n,) the case that decides the first.
-        felt: (n,) the case in which the leading arm feels most beyond it.
-        share: (n,) of the difference of both forces there that it feels.
-        leading_share: rise of the leading arm's force per newton of the commanded one.
+        force: (n, 2) by robot: commanded force of the force-controlled arm, largest resulting force
+            of the leading arm [N].
+        commanded: (n,) row of the case that decides the commanded force.
+        leading: (n,) row of the case with the largest excess of the leading arm's force over the
+            commanded one.
+        share: (n,) transmitted share of that excess, see `transmitted_share`.
+        leading_share: rise of the leading arm's force per newton of commanded force.
     """
 
     leader: int
     force: Array
     commanded: NDArray[np.intp]
-    felt: NDArray[np.intp]
+    leading: NDArray[np.intp]
     share: Array
     leading_share: float
 
-    def at(self, rows: NDArray[np.intp]) -> RulingCases:
+    def at(self, rows: NDArray[np.intp]) -> GoverningCases:
         """Return the cases at some of the samples."""
-        cases = self.commanded[rows], self.felt[rows]
+        cases = self.commanded[rows], self.leading[rows]
         found = self.force[rows], *cases, self.share[rows]
-        return RulingCases(self.leader, *found, self.leading_share)
+        return GoverningCases(self.leader, *found, self.leading_share)
 
-    def slopes(self, commanded: Array, felt: Array) -> Array:
-        """Compute the derivatives (n, 2, m) of `force` from those of both robots' forces (n, 2, m)
-        in the cases `commanded` and `felt`."""
+    def slopes(self, commanded: Array, leading: Array) -> Array:
+        """Compute the derivatives (n, 2, m) of `force`.
+
+        Args:
+            commanded, leading: (n, 2, m) derivatives of both robots' forces in these cases.
+        """
         follower, share = 1 - self.leader, self.leading_share
         found = np.empty_like(commanded)
         found[:, follower] = commanded[:, follower]
-        step = felt[:, self.leader] - share * felt[:, follower]
+        step = leading[:, self.leader] - share * leading[:, follower]
         found[:, self.leader] = share * commanded[:, follower] + self.share[:, None] * step
         return found
 
 
-def felt_share(difference: Array, uncertainty: Uncertainty) -> Array:
-    """Compute the largest share that the leading arm feels of the differences between leading and
-    commanded force under the largest mass: all of a difference that loads it, the least mass's
-    share of one that relieves it."""
+def transmitted_share(difference: Array, uncertainty: Uncertainty) -> Array:
+    """Compute the largest share of force differences that acts on the leading arm.
+
+    The differences, leading less commanded force, are those under the largest mass. A positive one
+    acts in full. A negative one is least for the least mass: (1 - m) / (1 + m) of it acts, m being
+    the uncertainty of the mass.
+    """
     lightest = (1.0 - uncertainty.mass) / (1.0 + uncertainty.mass)
     return np.where(difference > 0.0, 1.0, lightest)
 
 
-def ruling_cases(
+def governing_cases(
     worst: Array,
     uncertainty: Uncertainty,
     leader: int,
     difference: Array | None = None,
     leading_share: float = 1.0,
-) -> RulingCases:
-    """Find the cases that decide among the least normal forces (k, n, 2) [N] of the worst ones.
+) -> GoverningCases:
+    """Find the worst cases that decide the forces.
 
-    The difference of both forces is the motion's, whatever the squeeze, and proportional to the
-    mass.
+    The motion fixes the difference of both forces, independent of the squeeze and proportional to
+    the mass.
 
     Args:
-        difference: (k, n) leading less commanded force [N], where `worst` does not tell all.
-        leading_share: what the leading arm presses more for each newton more that is commanded.
+        worst: (k, n, 2) least normal forces of k cases at n samples [N].
+        difference: (k, n) leading less commanded force [N]; by default that of `worst`.
+        leading_share: rise of the leading arm's force per newton of commanded force.
     """
     follower, every = 1 - leader, np.arange(worst.shape[1])
     if difference is None:
         difference = worst[:, :, leader] - leading_share * worst[:, :, follower]
-    share = felt_share(difference, uncertainty)
+    share = transmitted_share(difference, uncertainty)
     commanded = worst[:, :, follower].argmax(axis=0)
-    felt = (share * difference).argmax(axis=0)
+    leading = (share * difference).argmax(axis=0)
     force = np.empty(worst.shape[1:])
     force[:, follower] = worst[commanded, every, follower]
-    force[:, leader] = leading_share * force[:, follower] + (share * difference)[felt, every]
-    return RulingCases(leader, force, commanded, felt, share[felt, every], leading_share)
+    force[:, leader] = leading_share * force[:, follower] + (share * difference)[leading, every]
+    return GoverningCases(leader, force, commanded, leading, share[leading, every], leading_share)

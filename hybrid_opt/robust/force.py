@@ -1,10 +1,10 @@
-"""The least commanded forces that hold for every case of a set, and the price of robustness: forces
-against the size of a set, and the largest that arms allow.
+"""Least commanded forces that hold every case of an uncertainty set, and the price of robustness:
+forces against the size of the set, and the largest set that the arms' forces allow.
 
-One arm leads: its pad keeps its place and presses as hard as the motion asks. The other is
-force-controlled: its normal force is commanded beforehand, the same in all cases. With N_1 - N_2
-fixed by the motion (and the case), the commanded force decides the squeeze. Pads press evenly in
-every case (`symbolic.contact.worst_cases`), whatever the plan takes them for.
+The leading arm is position controlled; its normal force follows from the motion. The other arm is
+force controlled: its normal force is commanded beforehand, the same in all cases. Motion and case
+fix N_1 - N_2, so that the commanded force decides the squeeze. Pads press evenly in every case
+(`symbolic.contact.worst_cases`), whichever contact model the plan uses.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from codegen.function import NumericFunction
 from hybrid_opt.carry import Carry
 from hybrid_opt.compiled_cell import cache_by_workcell, contact_function
 from hybrid_opt.robust.cases import (
+    governing_cases,
     nominal_case,
     random_cases,
-    ruling_cases,
     worst_cases,
 )
 from symbolic.array import Array, Count, Figure, Pair, Row, Shape, evenly
@@ -44,31 +44,31 @@ if TYPE_CHECKING:
 BATCH = 100_000
 """Samples that are evaluated at once."""
 
-FEW, RULING = 3, 4
-"""Samples at which cases that may ask for most are looked for, and how many at each."""
+SCREENING_SAMPLES, GOVERNING_CASES = 3, 4
+"""Samples at which governing cases are sought, and their number at each."""
 
 BISECTIONS = 30
 LARGEST_FACTOR, FACTOR_ERROR = 20.0, 1e-6
-"""The largest multiple of a set that is looked for, and how far off one that is found may be."""
+"""Largest multiple of a set that is considered, and the error of a result."""
 
 SCREENED = 0.97
-"""Share of the commanded force that is enough for most cases, as a quick look tells."""
+"""Share of the commanded force that suffices for most cases, by a test without a solver."""
 
 SCREEN_SHARE = 0.99
-"""Share of the friction that displacements leave, of which a quick look makes use: the coefficient
-that stands for them is right to 0.3 %."""
+"""Share of the friction left by displacements that the test uses: the coefficient that represents
+displacements is right to 0.3 %."""
 
 HOLDS = 1e-6
 """Excess over the commanded force that counts as rounding, as a share of it."""
 
 MOST, POINTS = 2.0, 9
-"""Largest multiple of the set whose force is given, and how many from zero on."""
+"""Largest multiple of the set in a price of robustness, and number of multiples."""
 
 CASES = 100_000
-"""Random cases that every priced carry is held against."""
+"""Random cases in which every priced carry is checked."""
 
 SAMPLES = 100
-"""Samples of a carry that are judged, beside those of its largest forces."""
+"""Evenly spread samples of a carry that are evaluated, besides those of its largest forces."""
 
 
 @dataclass(frozen=True)
@@ -85,22 +85,22 @@ class BoxMotion:
 
 
 HeldMotion = BoxMotion | Carry
-"""A motion whose robust forces can be asked for."""
+"""A motion with poses and their time derivatives."""
 
 
-def parts_of(motion: HeldMotion) -> tuple[Array, Array, Array]:
+def motion_inputs(motion: HeldMotion) -> tuple[Array, Array, Array]:
     """Return pose, rate and second rate of a motion, the inputs of the force functions."""
     return motion.pose, motion.rate, motion.second_rate
 
 
 def box_motion(motion: HeldMotion) -> BoxMotion:
     """Return the box poses and rates of a motion alone."""
-    return BoxMotion(*parts_of(motion))
+    return BoxMotion(*motion_inputs(motion))
 
 
-def repeated(motion: HeldMotion, times: int) -> BoxMotion:
+def tile_motion(motion: HeldMotion, times: int) -> BoxMotion:
     """Repeat a motion's samples several times, one after the other."""
-    return BoxMotion(*[np.tile(values, (times, 1)) for values in parts_of(motion)])
+    return BoxMotion(*[np.tile(values, (times, 1)) for values in motion_inputs(motion)])
 
 
 def at_rest() -> BoxMotion:
@@ -108,7 +108,7 @@ def at_rest() -> BoxMotion:
     return BoxMotion(*[np.zeros((1, 6))] * 3)
 
 
-def stopped(motion: HeldMotion) -> BoxMotion:
+def at_standstill(motion: HeldMotion) -> BoxMotion:
     """Return the same poses at rest."""
     return BoxMotion(motion.pose, 0.0 * motion.rate, 0.0 * motion.second_rate)
 
@@ -122,7 +122,7 @@ class RobustForce:
         uncertainty: the set.
         nominal: (n, 2) least normal forces for the nominal case [N].
         commanded: (n,) normal force of the force-controlled arm [N].
-        leading: (n,) largest normal force that the leading arm feels in any case [N].
+        leading: (n,) largest normal force of the leading arm in any case [N].
     """
 
     leader: int
@@ -144,8 +144,8 @@ class SampledCheck:
     """Random cases under commanded forces.
 
     Attributes:
-        cases: number of cases, each at all samples of the carry.
-        failing: how many of them the commanded force does not hold somewhere.
+        cases: number of cases, each checked at all samples of the carry.
+        failing: number of cases that need more than the commanded force at some sample.
         closest: largest share of the commanded force that any case needs, at least `SCREENED`.
     """
 
@@ -155,19 +155,19 @@ class SampledCheck:
 
     @property
     def holds(self) -> bool:
-        """Whether none slips and no centre of pressure leaves its patch."""
+        """True if the commanded forces hold every case."""
         return self.failing == 0
 
     @property
     def hardest(self) -> str:
-        """`closest` in words."""
+        """`closest` as a text."""
         most = "at most " if self.closest == SCREENED else ""
         return f"{most}{100.0 * self.closest:.2f} %"
 
 
 class RobustModel:
-    """The compiled functions behind robust forces of one workcell's carries. A `leader` is the
-    index of the arm that keeps its place, whose force is not commanded.
+    """Robust forces of one workcell's carries, from compiled functions. `leader` is the index of
+    the arm that keeps its place, whose force is not commanded.
 
     Attributes:
         workcell: the cell.
@@ -176,11 +176,10 @@ class RobustModel:
     def __init__(
         self, workcell: Workcell, load: Callable[..., NumericFunction] = contact_function
     ) -> None:
-        """Load or build the functions of pads that have one squeeze; those of others when first
-        asked.
+        """Load or build the functions of pads with a scalar squeeze; those of others on first use.
 
         Args:
-            load: makes a function as `contact_function` does.
+            load: makes a function, with the arguments of `contact_function`.
 
         Raises:
             SettingsError: some cases cannot be held, however hard the pads press.
@@ -203,7 +202,8 @@ class RobustModel:
         """Return a model with the same functions.
 
         Args:
-            workcell: differs from this one in what cases state: friction, mass, uncertainty.
+            workcell: differs from this one only in friction, mass and uncertainty, which cases
+                state.
         """
         other = copy(self)
         other.workcell = workcell
@@ -218,17 +218,21 @@ class RobustModel:
         return self._functions[key]
 
     def _squeeze(self, commanded: int, displaced: bool) -> NumericFunction:
-        # Only where there is one squeeze do these make a difference, or none, to the function.
+        # Functions of pads with any normals depend on the robot, and always allow displacements.
         commanded, displaced = (1, displaced) if self._one else (commanded, True)
         return self._function(case_squeeze_function, commanded=commanded, displaced=displaced)
 
     def worst_cases(self, uncertainty: Uncertainty, leader: int) -> Array:
-        """`worst_cases` of a set that leaves friction, patch and force; not to be modified."""
+        """Return `worst_cases` of a set, read-only.
+
+        Raises:
+            SettingsError: the set leaves no friction or patch.
+        """
         return self._worst(CacheKey(uncertainty, leader, known=(id(uncertainty), leader)))
 
     def _checked_cases(self, seen: CacheKey) -> Array:
         uncertainty, leader = seen.given
-        if not _leaves_something(self.workcell, uncertainty):
+        if not _has_positive_remainders(self.workcell, uncertainty):
             raise SettingsError(
                 "the uncertainty leaves no friction or no patch; make its shares, tilt or "
                 f"displacements smaller ({uncertainty})"
@@ -242,33 +246,33 @@ class RobustModel:
         resulting force of the leading one.
 
         Args:
-            motion: of m samples.
-            cases: (m, 18), one at each.
+            motion: m samples.
+            cases: (m, 18), one case per sample.
             threads: 0 for one per core.
-            displaced: whether any of the cases displaces a pad; without, it is faster.
+            displaced: some case displaces a pad; computing without is faster.
         """
         function = self._squeeze(1 - leader, displaced)
-        return function.batch(*parts_of(motion), cases, threads=threads)["normal_force"]
+        return function.batch(*motion_inputs(motion), cases, threads=threads)["normal_force"]
 
     def slack(
         self, motion: HeldMotion, cases: Array, force: Array, leader: int, threads: int = 1
     ) -> Array:
-        """Compute the slack (m,), positive where a pressure known in advance holds under commanded
-        forces (m,) [N]; elsewhere another pressure still may."""
+        """Compute the slack (m,) of `case_slack_function` under commanded forces (m,) [N]. A
+        positive slack proves that the force holds; a negative one proves nothing."""
         function = self._function(case_slack_function, commanded=1 - leader)
-        given = *parts_of(motion), cases, force
+        given = *motion_inputs(motion), cases, force
         return function.batch(*given, threads=threads)["slack"].ravel()
 
     def least_squeeze(self, motion: HeldMotion, cases: Array, leader: int = 0) -> Array:
-        """Compute the normal forces (k, n, 2) to command [N] that hold each of k cases (k, 18) at n
-        samples; for pads with other normals, the force of `leader` besides the commanded one."""
+        """Compute the least normal forces (k, n, 2) [N] that hold each of k cases (k, 18) at n
+        samples: the commanded one, and the resulting one of `leader`."""
         displaced = bool(cases[:, 11:15].any())
         n = len(motion.pose)
         found = np.empty((len(cases), n, 2))
         step = max(1, BATCH // n)
         for start in range(0, len(cases), step):
             some = cases[start : start + step]
-            every, moved = np.repeat(some, n, axis=0), repeated(motion, len(some))
+            every, moved = np.repeat(some, n, axis=0), tile_motion(motion, len(some))
             forces = self.least(moved, every, leader, 1, displaced)
             found[start : start + step] = forces.reshape(len(some), n, 2)
         return found
@@ -289,11 +293,11 @@ class RobustModel:
         leader: int = 0,
         rows: NDArray[np.intp] | None = None,
     ) -> tuple[Array, Array]:
-        """Compute the least normal force to command and the largest that the leader then feels,
-        (n,) [N]; infinite where no force holds every case.
+        """Compute the least commanded normal force and the largest resulting one of the leading
+        arm, (n,) each [N]; infinite where no force holds every case.
 
         Args:
-            rows: of the worst cases, those that are considered; None for all.
+            rows: rows of the worst cases to consider; None for all.
 
         Raises:
             SettingsError: the set leaves no friction or patch.
@@ -301,19 +305,19 @@ class RobustModel:
         cases = self.worst_cases(uncertainty, leader)
         worst = self.least_squeeze(motion, cases if rows is None else cases[rows], leader)
         follower, share = 1 - leader, float(self.leading_share[leader])
-        force = ruling_cases(worst, uncertainty, leader, leading_share=share).force
+        force = governing_cases(worst, uncertainty, leader, leading_share=share).force
         force[np.isnan(force)] = np.inf
         return force[:, follower], force[:, leader]
 
     def governing_rows(
         self, motion: HeldMotion, uncertainty: Uncertainty, leader: int = 0
     ) -> NDArray[np.intp]:
-        """Return the rows of the worst cases that require most at any sample, `RULING` for the
-        command and as many for the leader's excess."""
+        """Return the rows of the worst cases that need the largest forces at any sample:
+        `GOVERNING_CASES` by the commanded force, and as many by the leading arm's excess."""
         worst = self.least_squeeze(motion, self.worst_cases(uncertainty, leader), leader)
         command = worst[:, :, 1 - leader]
         beyond = worst[:, :, leader] - float(self.leading_share[leader]) * command
-        return np.unique([(-each).argsort(axis=0)[:RULING] for each in (command, beyond)])
+        return np.unique([(-each).argsort(axis=0)[:GOVERNING_CASES] for each in (command, beyond)])
 
     def commanded(
         self,
@@ -322,25 +326,25 @@ class RobustModel:
         leader: int = 0,
         above: Array | float = 0.0,
     ) -> Array:
-        """Compute the first of `hold` (n,) faster when there are many cases.
+        """Compute the commanded force (n,) of `hold`, faster for many cases [N].
 
-        A pressure that is known beforehand shows which cases ask for most at a few samples, what
-        they need, and of most others that they need no more. Of more than `SAMPLES` samples, so
-        many are asked all cases, and the others those that rule there.
+        `slack` finds the cases with the largest forces at a few samples; their forces are solved
+        for. `slack` then proves that most other cases need no more. Of more than `SAMPLES` samples,
+        `SAMPLES` are checked in all cases, the others in the cases that govern there.
 
         Args:
-            above: (n,) what is commanded anyway, or one for all [N]; less is not told.
+            above: (n,) lower bound of the result, or one for all samples [N].
         """
         cases, n = self.worst_cases(uncertainty, leader), len(motion.pose)
-        few = evenly(n, FEW)
+        few = evenly(n, SCREENING_SAMPLES)
         at_few = box_motion(motion).at(few)
         planned = self.nominal(at_few, leader)[:, 1 - leader]
-        rows, every = repeated(at_few, len(cases)), np.repeat(cases, len(few), axis=0)
+        rows, every = tile_motion(at_few, len(cases)), np.repeat(cases, len(few), axis=0)
         slack = self.slack(rows, every, np.tile(planned, len(cases)), leader)
-        ruling = np.unique(slack.reshape(len(cases), -1).argsort(axis=0)[:RULING])
-        needed = self.least_squeeze(motion, cases[ruling], leader)[:, :, 1 - leader]
+        governing = np.unique(slack.reshape(len(cases), -1).argsort(axis=0)[:GOVERNING_CASES])
+        needed = self.least_squeeze(motion, cases[governing], leader)[:, :, 1 - leader]
         force: Array = np.maximum(needed.max(axis=0), above)
-        others = np.delete(cases, ruling, axis=0)
+        others = np.delete(cases, governing, axis=0)
         thin = evenly(n, SAMPLES)
         held, step, last = force[thin], max(1, BATCH // len(thin)), [others[:0]]
         for start in range(0, len(others), step):
@@ -359,8 +363,8 @@ class RobustModel:
         """Compute the largest forces (2,) of `hold` from the few samples that can attain them."""
         force, planned = self.commanded(motion, uncertainty, leader), self.nominal(motion, leader)
         share = self.leading_share[leader]
-        felt = share * force + planned[:, leader] - share * planned[:, 1 - leader]
-        most = np.unique([force.argmax(), felt.argmax()])
+        leading = share * force + planned[:, leader] - share * planned[:, 1 - leader]
+        most = np.unique([force.argmax(), leading.argmax()])
         peaks = np.full(2, force.max())
         peaks[leader] = self.hold(box_motion(motion).at(most), uncertainty, leader)[1].max()
         return peaks
@@ -392,12 +396,12 @@ class RobustModel:
         rng: np.random.Generator,
         threads: int = 1,
     ) -> SampledCheck:
-        """Hold n random cases of the set against the commanded forces, at every sample.
+        """Check the commanded forces in n random cases of the set, at every sample.
 
         Args:
-            motion: whose forces they are.
+            motion: the motion of the forces.
             rng: draws the cases.
-            threads: 0 for one per core; has no influence on what is found.
+            threads: 0 for one per core; has no influence on the result.
         """
         failing, closest, left = 0, SCREENED, n
         step = max(1, BATCH // len(motion.pose))
@@ -405,7 +409,7 @@ class RobustModel:
             cases = random_cases(
                 self.workcell, force.uncertainty, min(step, left), rng, force.leader
             )
-            # Only what needs more than the closest so far can say more; beyond 1 all are counted.
+            # Shares below the closest so far need no solver; all shares beyond 1 are counted.
             enough, leader = min(closest, 1.0), force.leader
             share = self._shares(motion, force.commanded, cases, enough, leader, threads)
             share = share.max(axis=1)
@@ -423,12 +427,12 @@ class RobustModel:
         leader: int,
         threads: int = 1,
     ) -> Array:
-        """Compute the share (k, n) of the commanded forces (n,) that each of k cases needs;
-        `screened` for less."""
+        """Compute the share (k, n) of the commanded forces (n,) that each of k cases needs, at
+        least `screened`."""
         n, k = len(motion.pose), len(cases)
         displaced = bool(cases[:, 11:15].any())
         level = screened * (self._friction_left(cases) if displaced and self._one else 1.0)
-        rows = repeated(motion, k)
+        rows = tile_motion(motion, k)
         every, commanded = np.repeat(cases, n, axis=0), np.tile(force, k)
         left = ~(self.slack(rows, every, level * commanded, leader, threads) > 0.0)
         share = np.full(n * k, screened)
@@ -438,7 +442,7 @@ class RobustModel:
         return share.reshape(k, n)
 
     def _friction_left(self, cases: Array) -> float:
-        """Compute the least share of friction that displacements leave, which screening ignores."""
+        """Compute the least share of friction left by displacements: `slack` knows none."""
         apart = np.linalg.norm(cases[:, 11:13] - cases[:, 13:15], axis=1)
         lost = command_model(self.workcell).friction_lost(apart) / cases[:, :2].min(axis=1)
         return SCREEN_SHARE * max(0.0, 1.0 - float(lost.max()))
@@ -461,16 +465,16 @@ def allowed_factor(workcell: Workcell, uncertainty: Uncertainty) -> float:
     """Find the largest multiple of a set that leaves some friction and patches, at most
     `LARGEST_FACTOR`."""
     low, high = 0.0, LARGEST_FACTOR
-    if _leaves_something(workcell, uncertainty.scaled(high)):
+    if _has_positive_remainders(workcell, uncertainty.scaled(high)):
         return high
     for _ in range(BISECTIONS):
         middle = (low + high) / 2.0
-        leaves = _leaves_something(workcell, uncertainty.scaled(middle))
+        leaves = _has_positive_remainders(workcell, uncertainty.scaled(middle))
         low, high = (middle, high) if leaves else (low, middle)
     return low
 
 
-def _leaves_something(workcell: Workcell, uncertainty: Uncertainty) -> bool:
+def _has_positive_remainders(workcell: Workcell, uncertainty: Uncertainty) -> bool:
     """Return True if friction, patches, mass and force are positive in the worst case."""
     shares = [1.0 - uncertainty.mass, 1.0 - uncertainty.tracking]
     model = command_model(workcell)
@@ -483,7 +487,7 @@ robust_model = cache_by_workcell(RobustModel)
 
 
 def interpreted_robust_model(workcell: Workcell) -> RobustModel:
-    """Return the model of what is commanded without compiling it, for a few samples."""
+    """Return the model without compiling its functions, for a few samples."""
     # Not imported at the top: what is compiled already needs no CasADi.
     from codegen.interpreted import InterpretedFunction
 
@@ -502,11 +506,11 @@ class RobustPrice:
     Attributes:
         uncertainty: the set.
         factors: (k,) multiples of the set for which a force was found.
-        peak: (k, 2) largest normal force of each robot under them [N].
-        commanded: (2,) under the set itself [N].
+        peak: (k, 2) largest normal force of each robot for each multiple [N].
+        commanded: (2,) largest normal force of each robot for the set itself [N].
         limit: (2,) reference forces [N].
-        largest_factor: the largest multiple that they allow, see `RobustModel.largest_factor`.
-        check: random cases of the set itself under its forces.
+        largest_factor: see `RobustModel.largest_factor`.
+        check: commanded forces checked in random cases of the set.
     """
 
     uncertainty: Uncertainty
@@ -527,21 +531,21 @@ def robust_price(
     threads: int = 1,
     points: int = POINTS,
 ) -> RobustPrice:
-    """Compute the cost of robustness against the workcell's set for a carry.
+    """Compute the price of robustness of a carry against the workcell's set.
 
     Args:
         model: of the carry's workcell.
         rng: draws the random cases.
-        cases: how many.
-        threads: that hold them against the forces, 0 for one per core.
-        points: how many multiples of the set.
+        cases: number of random cases.
+        threads: 0 for one per core.
+        points: number of multiples of the set.
 
     Raises:
         SettingsError: the set leaves no friction or patch.
     """
     workcell = model.workcell
     uncertainty = workcell.uncertainty
-    (_, motion), limit = thinned(carry), workcell.task.reference_force
+    (_, motion), limit = subsample(carry), workcell.task.reference_force
     force = model.robust_force(motion, uncertainty, leader)
     factors = np.linspace(0.0, MOST, points)
     factors = factors[factors < allowed_factor(workcell, uncertainty)]
@@ -558,8 +562,8 @@ def robust_price(
     )
 
 
-def thinned(carry: Carry) -> tuple[NDArray[np.intp], BoxMotion]:
-    """Return `SAMPLES` evenly spread samples of a carry and those of its largest normal forces:
-    their rows and motion."""
+def subsample(carry: Carry) -> tuple[NDArray[np.intp], BoxMotion]:
+    """Return rows and motion of `SAMPLES` evenly spread samples of a carry, and of the samples with
+    its largest normal forces."""
     rows = np.union1d(evenly(len(carry), SAMPLES), carry.normal_force.argmax(axis=0))
     return rows, box_motion(carry).at(rows)

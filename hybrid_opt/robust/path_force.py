@@ -1,7 +1,7 @@
 """Robust forces at points of a path as functions of u'' and u'^2, with their slopes.
 
 In every case the least squeeze is convex in the required force and moment, and these are affine in
-(u'', u'^2). So is the largest over the worst cases, whose slopes are those of the case that rules.
+(u'', u'^2). So is the largest over the worst cases, whose slopes are those of the governing case.
 """
 
 from __future__ import annotations
@@ -18,17 +18,17 @@ from hybrid_opt.compiled_cell import bound_to, cache_by_workcell, contact_functi
 from hybrid_opt.robust.cases import (
     FOLLOWER,
     LEADER,
-    RulingCases,
-    felt_share,
-    ruling_cases,
+    GoverningCases,
+    governing_cases,
+    transmitted_share,
     worst_cases,
 )
 from hybrid_opt.robust.force import (
     BoxMotion,
     box_motion,
-    parts_of,
-    repeated,
+    motion_inputs,
     robust_model,
+    tile_motion,
 )
 from symbolic.array import Array
 from symbolic.contact.registry import command_model
@@ -115,22 +115,22 @@ class RobustPath:
             derivatives by u, u'' and u'^2.
         """
         least = self._model.least_squeeze(points.motion, self._cases, LEADER)
-        ruling = ruling_cases(least, self._set, LEADER, leading_share=self._share)
-        return ruling.force, self.slopes(points, ruling)
+        governing = governing_cases(least, self._set, LEADER, leading_share=self._share)
+        return governing.force, self.slopes(points, governing)
 
-    def ruling_beyond(
+    def governing_above(
         self, points: PathPoints, level: Array
-    ) -> tuple[NDArray[np.intp], RulingCases]:
-        """Return the points where a force of either robot exceeds a level (n,) [N], and the cases
-        that decide there; slopes take as long as forces.
+    ) -> tuple[NDArray[np.intp], GoverningCases]:
+        """Return the points where a force of either robot exceeds a level (n,) [N], and their
+        governing cases; the slopes of all points would take as long as the forces.
 
-        Most cases are seen to need less by a pressure that shares everything evenly.
+        `RobustModel.slack` proves that most cases need less.
         """
         n, k = len(points), len(self._cases)
-        every, cases = repeated(points.motion, k), np.repeat(self._cases, n, axis=0)
-        difference = self._excess.batch(*parts_of(every), cases)["excess"].reshape(k, n)
-        felt = (felt_share(difference, self._set) * difference).max(axis=0)
-        room = np.minimum(level, (level - felt) / max(self._share, LEAST_SHARE))
+        every, cases = tile_motion(points.motion, k), np.repeat(self._cases, n, axis=0)
+        difference = self._excess.batch(*motion_inputs(every), cases)["excess"].reshape(k, n)
+        excess = (transmitted_share(difference, self._set) * difference).max(axis=0)
+        room = np.minimum(level, (level - excess) / max(self._share, LEAST_SHARE))
         left = ~(self._model.slack(every, cases, np.tile(room, k), LEADER) > 0.0)
         found = np.full((k * n, 2), BELOW)
         if left.any():
@@ -138,40 +138,40 @@ class RobustPath:
             found[left] = self._model.least(*wanted, LEADER, 1, displaced=False)
         least = found.reshape(k, n, 2)
         rows = np.flatnonzero(least[:, :, FOLLOWER].max(axis=0) > room)
-        # A case that leaves the force below the level can yet be the one that the leader feels.
+        # A case with a commanded force below the level may still govern the leading arm's force.
         known = least[:, rows]
         own, beyond = known[:, :, FOLLOWER], difference[:, rows]
         known[:, :, LEADER] = np.where(own == BELOW, BELOW, self._share * own + beyond)
-        return rows, ruling_cases(known, self._set, LEADER, beyond, self._share)
+        return rows, governing_cases(known, self._set, LEADER, beyond, self._share)
 
     def most_demanding(self, points: PathPoints, count: int) -> tuple[Array, Array]:
-        """Compute the forces of the cases that require most: where several rule in turn, each has
-        its own slope.
+        """Compute the forces and slopes of the cases with the largest commanded forces, because
+        each governing case has its own slope.
 
         Returns:
             (n, 2, count) forces of both robots [N], the largest first, and their slopes
             (n, 2, count, 20).
         """
         n, least = len(points), self._model.least_squeeze(points.motion, self._cases, LEADER)
-        ruling = ruling_cases(least, self._set, LEADER, leading_share=self._share)
+        governing = governing_cases(least, self._set, LEADER, leading_share=self._share)
         first = np.argsort(-least[:, :, FOLLOWER], axis=0)[:count]
-        beyond = ruling.force[:, LEADER] - self._share * ruling.force[:, FOLLOWER]
+        beyond = governing.force[:, LEADER] - self._share * governing.force[:, FOLLOWER]
         force, slope = np.empty((n, 2, count)), np.empty((n, 2, count, BY_TIMING.stop))
         for j, case in enumerate(first):
-            one = replace(ruling, commanded=case)
+            one = replace(governing, commanded=case)
             force[:, FOLLOWER, j] = least[case, np.arange(n), FOLLOWER]
             force[:, LEADER, j] = self._share * force[:, FOLLOWER, j] + beyond
             slope[:, :, j] = self.slopes(points, one)
         return force, slope
 
-    def slopes(self, points: PathPoints, ruling: RulingCases) -> Array:
+    def slopes(self, points: PathPoints, governing: GoverningCases) -> Array:
         """Compute the slopes (n, 2, 20) of the forces that these cases decide."""
         if not len(points):
             return np.zeros((0, 2, BY_TIMING.stop))
-        cases = np.concatenate([self._cases[ruling.commanded], self._cases[ruling.felt]])
+        cases = np.concatenate([self._cases[governing.commanded], self._cases[governing.leading]])
         twice = [np.concatenate([values, values]) for values in points.driven]
         slopes = self._slopes.batch(*twice, cases)["slope"]
-        return ruling.slopes(slopes[: len(points)], slopes[len(points) :])
+        return governing.slopes(slopes[: len(points)], slopes[len(points) :])
 
 
 robust_path = cache_by_workcell(RobustPath)
@@ -182,35 +182,35 @@ LEAST_SHARE = 1e-200
 """Stands for no share of the commanded force in quotients."""
 
 TIED = 1e-6
-"""Share of the largest force by which another one that rules as well may be less."""
+"""Share of the largest force by which the force of a further governing case may be less."""
 
 TRIFLE = 1e-9
-"""Share of a friction by which it is the lower one."""
+"""Relative reduction of a friction coefficient that makes it the lower one."""
 
 SMOOTH = 1e-2
-"""Share of a change by which it may differ either way where only one case rules."""
+"""Relative difference of both one-sided changes up to which one case governs."""
 
 
-class RulingForce:
-    """The largest force to command of a carry that holds in every case of its cell's uncertainty.
+class GoverningForce:
+    """The largest commanded force of a carry that holds in every case of its cell's uncertainty.
 
-    Its derivative is that of what rules (Danskin): by its motion, by its case and by the cell's
-    numbers, or, of pads anywhere, by the load: the multipliers of the balance of forces. Where
-    several rule it is the largest of theirs either way.
+    Its derivative is that of the governing case (Danskin's theorem): by the motion, the case and
+    the cell's parameters, or, for pads with any normals, by the load. Where several cases govern,
+    the directional derivative is the largest of theirs.
 
     Attributes:
         force: [N].
-        samples: (k,) of the carry at which it is needed, one per ruling case.
+        samples: (k,) of the carry at which it is needed, one per governing case.
     """
 
     def __init__(self, carry: Carry, leader: int) -> None:
-        """Find what rules.
+        """Find the governing cases.
 
         Args:
             leader: index of the arm whose force is not commanded.
 
         Raises:
-            SettingsError: the uncertainty leaves nothing that holds.
+            SettingsError: no force holds under the uncertainty.
         """
         model = robust_model(carry.workcell)
         self._workcell, self._leader = model.workcell, leader
@@ -220,10 +220,10 @@ class RulingForce:
         cases = worst_cases(model.workcell, carry.workcell.uncertainty, leader)
         least = model.least_squeeze(box_motion(carry).at(few), cases, leader)[:, :, 1 - leader]
         self.force = float(least.max())
-        self._ruling, at = np.nonzero(least >= (1.0 - TIED) * self.force)
+        self._governing, at = np.nonzero(least >= (1.0 - TIED) * self.force)
         self.samples = few[at]
         self._count, self._motion = len(cases), box_motion(carry).at(self.samples)
-        self._cases = cases[self._ruling]
+        self._cases = cases[self._governing]
 
     def slopes(
         self, low: Workcell, high: Workcell, motions: tuple[BoxMotion, BoxMotion], pads: bool
@@ -232,8 +232,8 @@ class RulingForce:
         cells, equally far to either side [N].
 
         Args:
-            motions: at `samples`, of the lower and of the higher one.
-            pads: whether the cells' pads differ. What pads anywhere need is solved for again then.
+            motions: motions of the lower and of the higher cell at `samples`.
+            pads: the cells' pads differ; forces of pads with any normals are then solved for again.
         """
         before, after = (
             self._inputs(cell, at, pads) for cell, at in zip((low, high), motions, strict=True)
@@ -251,11 +251,12 @@ class RulingForce:
         return self._inputs(self._workcell, self._motion, pads=True)
 
     def _inputs(self, cell: Workcell, motion: BoxMotion, pads: bool) -> Array:
-        """Compute the inputs (k, m) of the gradient; or the force itself, see `slopes`."""
+        """Compute the inputs (k, m) of the gradient, or the forces (k, 1) of pads with any normals
+        if the pads differ."""
         cases = worst_cases(cell, cell.uncertainty, self._leader)
         assert len(cases) == self._count, "no range of the uncertainty begins or ends"
-        cases = cases[self._ruling]
-        moved = np.hstack([*parts_of(motion), cases])
+        cases = cases[self._governing]
+        moved = np.hstack([*motion_inputs(motion), cases])
         if self._squeezed:
             held = WorkcellParameters(cell).vector(HELD)
             return np.hstack([moved, np.tile(held, (len(moved), 1))])
@@ -264,13 +265,13 @@ class RulingForce:
             rows = [np.split(row, (6, 12, 18)) for row in moved]
             return np.array([[float(least(*row)[1 - self._leader])] for row in rows])
         load = case_origin_load_function(cell)
-        known = zip(*parts_of(self._motion), self._cases, strict=True)
+        known = zip(*motion_inputs(self._motion), self._cases, strict=True)
         return np.hstack([moved, [np.array(load(*row)).ravel() for row in known]])
 
     @cached_property
     def _gradient(self) -> Array:
-        """(k, 2, m) of the force of each ruling case by `_inputs`, were either friction the lower
-        one by a trifle: the lower one decides what the opposed force takes."""
+        """Gradient (k, 2, m) of each governing case's force by `_inputs`, with either friction
+        slightly lower: the lower coefficient decides the share of the opposed force."""
         if self._squeezed:
             numbers = WorkcellParameters(self._workcell)
             made = case_gradient_function(numbers.symbols(), numbers=True)
@@ -282,6 +283,6 @@ class RulingForce:
         for arm in (0, 1):
             cases = self._cases.copy()
             cases[:, arm] *= 1.0 - TRIFLE
-            found = function.batch(*parts_of(self._motion), cases)["slope"]
+            found = function.batch(*motion_inputs(self._motion), cases)["slope"]
             slopes.append(found[:, 1 - self._leader])
         return np.stack(slopes, axis=1)

@@ -1,13 +1,13 @@
-"""How hard to press, over time: normal forces to command, at least what holds the box, smooth.
+"""Commanded normal forces over time: smooth, and never below the forces that hold the box.
 
-With N_1 - N_2 fixed by the motion, the force of one arm decides both: the leading arm keeps its
-place and feels what follows, the other is force-controlled (`hybrid_opt.robust`). Force
-beyond the plan presses both pads against one another and moves nothing. Of pads without opposite
-normals an internal squeeze within all friction cones does.
+The motion fixes N_1 - N_2, so that the force of one arm decides both. The leading arm is position
+controlled, the other is force controlled (`hybrid_opt.robust`). Additional force presses both pads
+against each other and moves nothing; pads without opposite normals add an internal squeeze within
+all friction cones.
 
-The plan may assume pads that choose their pressure. What is commanded always holds pads that press
-evenly as well (`hybrid_opt.robust.force`), in every case of the cell's set: one number says how
-hard to press, and `Squeeze.parts` what it is made of.
+Planned forces may assume pads that choose their pressure. Commanded forces also hold pads that
+press evenly (`hybrid_opt.robust.force`), in every case of the cell's set. `Squeeze.parts` lists
+the contributions to the largest one.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from scipy.ndimage import maximum_filter1d
 from hybrid_opt.carry import Carry
 from hybrid_opt.robust.force import (
     HeldMotion,
+    at_standstill,
     box_motion,
     robust_model,
-    stopped,
 )
 from symbolic.array import Array
 from symbolic.contact.registry import command_model
@@ -35,7 +35,7 @@ SMOOTHING = 0.1
 """Half the width of the time window over which commanded forces are smoothed [s]."""
 
 MOST = 16
-"""Samples with the largest demand, for which the share of each doubt is reported."""
+"""Samples with the largest forces, for which contributions are reported."""
 
 STEP = 1e-3
 """Time step of the smoothing [s]."""
@@ -43,11 +43,11 @@ STEP = 1e-3
 
 @dataclass(frozen=True)
 class SqueezeSettings:
-    """How hard to press.
+    """Settings of the commanded forces.
 
     Attributes:
-        factor: commanded squeeze over the least that holds; None for what holds in every case of
-            the workcell's uncertainty.
+        factor: commanded squeeze over the least that holds; None for the force that holds in every
+            case of the workcell's uncertainty.
         leader: index of the arm that keeps its place.
         smoothing: half the width of the time window of the smoothing [s].
     """
@@ -71,21 +71,21 @@ class SqueezeSettings:
 
 
 @dataclass(frozen=True)
-class Part:
-    """Rise of the force-controlled arm's largest force by one doubt [N]."""
+class Contribution:
+    """Rise of the force-controlled arm's largest force by one uncertainty [N]."""
 
     name: str
     force: float
 
 
-def account(parts: Iterable[Part]) -> str:
-    """Format parts as a sum."""
-    known = list(parts)
-    terms = " + ".join(f"{part.force:.1f} {part.name}" for part in known)
-    return f"{terms} = {sum(part.force for part in known):.1f} N"
+def breakdown_text(contributions: Iterable[Contribution]) -> str:
+    """Format contributions as a sum."""
+    known = list(contributions)
+    terms = " + ".join(f"{each.force:.1f} {each.name}" for each in known)
+    return f"{terms} = {sum(each.force for each in known):.1f} N"
 
 
-DOUBTS = {
+UNCERTAINTY_SOURCES = {
     "friction": ("friction",),
     "mass": ("mass",),
     "centre of mass": ("centre_of_mass",),
@@ -96,29 +96,29 @@ DOUBTS = {
     "arms against one another": ("internal_force",),
     "tracking": ("tracking",),
 }
-"""Parts of a set in the order in which they add to the force, and whose ranges they are."""
+"""Sources of uncertainty in the order in which they are added, with the ranges of each."""
 
 
 @dataclass(frozen=True)
 class Squeeze:
-    """How the commanded forces came about.
+    """Origin of the commanded forces.
 
     Attributes:
         leader: index of the arm that keeps its place; the other is force-controlled.
         factor: commanded squeeze over the least that holds, None where the forces are robust ones.
         uncertainty: the set that the forces hold for, None where a factor was taken.
         smoothing: half the width of the time window of the smoothing [s].
-        parts: of the largest force that is commanded, the least that holds first; they add up to
-            it.
-        holders: what holds the payload, in words.
-        order: what the force asks of them, as in 'press with 80 N'.
+        parts: contributions to the largest commanded force, the least force first; their sum is
+            that force.
+        holders: name of the pads or hands that hold the payload.
+        order: command to them, as in 'press with 80 N'.
     """
 
     leader: int
     factor: float | None
     uncertainty: Uncertainty | None
     smoothing: float
-    parts: tuple[Part, ...]
+    parts: tuple[Contribution, ...]
     holders: str
     order: str
 
@@ -128,9 +128,9 @@ class Squeeze:
         return sum(part.force for part in self.parts)
 
     @property
-    def account(self) -> str:
-        """The parts as a sum."""
-        return account(self.parts)
+    def breakdown(self) -> str:
+        """The contributions as a sum."""
+        return breakdown_text(self.parts)
 
     def __str__(self) -> str:
         if self.uncertainty is None:
@@ -140,51 +140,51 @@ class Squeeze:
         return f"holds {self.holders} in every case of {self.uncertainty.title}"
 
 
-def pressed_beyond(
+def extra_normal_force(
     workcell: Workcell,
     settings: SqueezeSettings,
     time: Array,
     motion: HeldMotion,
     least: Array,
-    in_parts: bool = True,
+    itemised: bool = True,
 ) -> tuple[Array, Squeeze]:
-    """Compute the force (n,) commanded beyond the planned normal force [N], in the proportion of
-    `ContactModel.pressed_together` for the other robot, and its origin.
+    """Compute the force (n,) that the force-controlled arm presses beyond its planned force [N],
+    and its origin. The force of the other arm rises by `ContactModel.pressed_together`.
 
-    Smooth where the planned forces are; with it neither robot ever presses less than the plan, or
-    than what holds pads that press evenly, moving or stopped, in every case of the set, asks for.
+    The commanded force is smooth where the planned forces are. Neither robot presses less than
+    planned, or less than evenly pressing pads need in every case of the set, in motion or at rest.
 
     Args:
         time: (n,) of the samples, not decreasing [s].
         motion: of the box at the samples.
         least: (n, 2) planned normal forces [N].
-        in_parts: whether each doubt is asked for its part of robust forces; else there is one.
+        itemised: state the contribution of each source of uncertainty; else one for all.
 
     Raises:
         SettingsError: the uncertainty leaves no friction or patch.
     """
     leader, contact = settings.leader, command_model(workcell)
-    planned, doubt = least[:, 1 - leader], workcell.uncertainty
+    planned, uncertainty = least[:, 1 - leader], workcell.uncertainty
     if settings.factor is None:
-        needed = _in_every_case(workcell, doubt, leader, motion, planned)
-        parts = [Part("in every case", float(needed.max()))]
-        if in_parts:
+        needed = _in_every_case(workcell, uncertainty, leader, motion, planned)
+        parts = [Contribution("in every case", float(needed.max()))]
+        if itemised:
             most = np.union1d(np.argsort(-needed)[:MOST], np.argsort(-planned)[:MOST])
             there = box_motion(motion).at(most)
-            parts = _by_doubt(workcell, leader, there, planned[most])
+            parts = _contributions(workcell, leader, there, planned[most])
     else:
         model = robust_model(workcell)
         least = np.maximum(least, model.nominal(motion, leader))
-        still = model.nominal(stopped(motion), leader)[:, 1 - leader]
+        still = model.nominal(at_standstill(motion), leader)[:, 1 - leader]
         held = least[:, 1 - leader]
         own = least.mean(axis=1) if contact.has_scalar_squeeze else held
         needed = np.maximum(held + (settings.factor - 1.0) * own, still)
-        parts = [Part("least force", float(held.max()))]
-        parts.append(Part("factor", float(needed.max() - held.max())))
+        parts = [Contribution("least force", float(held.max()))]
+        parts.append(Contribution("factor", float(needed.max() - held.max())))
     squeeze = Squeeze(
         leader,
         settings.factor,
-        doubt if settings.factor is None else None,
+        uncertainty if settings.factor is None else None,
         settings.smoothing,
         tuple(parts),
         contact.holders,
@@ -193,37 +193,38 @@ def pressed_beyond(
     return smooth_above(time, needed, settings.smoothing) - planned, squeeze
 
 
-def _by_doubt(workcell: Workcell, leader: int, motion: HeldMotion, planned: Array) -> list[Part]:
-    """Compute what each uncertainty of a cell adds to the largest robust force, one after the
-    other."""
-    doubt, names = workcell.uncertainty, tuple[str, ...]()
-    before = float(_in_every_case(workcell, doubt.only(names), leader, motion, planned).max())
-    parts = [Part("least force", before)]
-    for name, ranges in DOUBTS.items():
+def _contributions(
+    workcell: Workcell, leader: int, motion: HeldMotion, planned: Array
+) -> list[Contribution]:
+    """Compute the rise of the largest robust force by each source of uncertainty, in order."""
+    uncertainty, names = workcell.uncertainty, tuple[str, ...]()
+    before = float(_in_every_case(workcell, uncertainty.only(names), leader, motion, planned).max())
+    parts = [Contribution("least force", before)]
+    for name, ranges in UNCERTAINTY_SOURCES.items():
         names += ranges
-        if not doubt.only(ranges).is_empty:
-            force = _in_every_case(workcell, doubt.only(names), leader, motion, planned).max()
-            parts.append(Part(name, float(force) - before))
+        if not uncertainty.only(ranges).is_empty:
+            force = _in_every_case(workcell, uncertainty.only(names), leader, motion, planned).max()
+            parts.append(Contribution(name, float(force) - before))
             before = float(force)
     return parts
 
 
 def _in_every_case(
     workcell: Workcell,
-    doubt: Uncertainty,
+    uncertainty: Uncertainty,
     leader: int,
     motion: HeldMotion,
     planned: Array | float,
 ) -> Array:
-    """Compute the force (n,) to command so that a set is held, moving or stopped: at least the
-    planned one [N]."""
+    """Compute the force (n,) that holds every case of a set in motion and at rest [N]; at least the
+    planned one."""
     model = robust_model(workcell)
-    held = model.commanded(motion, doubt, leader, planned)
-    return model.commanded(stopped(motion), doubt, leader, held)
+    held = model.commanded(motion, uncertainty, leader, planned)
+    return model.commanded(at_standstill(motion), uncertainty, leader, held)
 
 
 def largest_commanded(
-    workcell: Workcell, motion: HeldMotion, planned: Array, doubt: Uncertainty, leader: int
+    workcell: Workcell, motion: HeldMotion, planned: Array, uncertainty: Uncertainty, leader: int
 ) -> Array:
     """Compute the largest forces (2,) of `commanded_forces` that hold a motion in every case of a
     set [N], from the few samples that can attain them.
@@ -237,29 +238,29 @@ def largest_commanded(
     follower, box = 1 - leader, box_motion(motion)
     most = np.argsort(-planned[:, follower])[:MOST]
     there, own = box.at(most), planned[most, follower]
-    level = _in_every_case(workcell, doubt, leader, there, own).max()
-    forces = np.full(2, _in_every_case(workcell, doubt, leader, box, level).max())
+    level = _in_every_case(workcell, uncertainty, leader, there, own).max()
+    forces = np.full(2, _in_every_case(workcell, uncertainty, leader, box, level).max())
     together = command_model(workcell).pressed_together(leader)[leader]
     forces[leader] = (planned[most, leader] + together * (forces[follower] - own)).max()
     return forces
 
 
 def commanded_forces(
-    workcell: Workcell, carry: Carry, settings: SqueezeSettings, in_parts: bool = True
+    workcell: Workcell, carry: Carry, settings: SqueezeSettings, itemised: bool = True
 ) -> tuple[Array, Squeeze]:
     """Compute the normal forces (n, 2) to command of both robots along a carry [N], and their
-    origin; see `pressed_beyond`."""
+    origin; see `extra_normal_force`."""
     held = carry.normal_force
-    extra, squeeze = pressed_beyond(workcell, settings, carry.time, carry, held, in_parts)
+    extra, squeeze = extra_normal_force(workcell, settings, carry.time, carry, held, itemised)
     together = command_model(workcell).pressed_together(settings.leader)
     return held + np.multiply.outer(extra, together), squeeze
 
 
 def smooth_above(time: Array, values: Array, width: float) -> Array:
-    """Compute a smooth curve that is nowhere below the given one, level at both ends.
+    """Compute a smooth upper bound of a curve, level at both ends.
 
-    The largest value within a window, averaged over the same window by a smooth kernel: where the
-    kernel reaches, every windowed maximum covers the point in its middle.
+    It is the maximum within a window, averaged over the same window by a smooth kernel. Every
+    maximum under the kernel covers the point in the kernel's middle, so the average does too.
 
     Args:
         time: (n,) not decreasing [s].

@@ -300,7 +300,7 @@ def _robust_forces_above(
     known, rows = False, np.arange(0, len(points), every)
     for part in np.array_split(rows, -(-len(rows) // ROBUST_BATCH)):
         least = np.full(len(part), level)
-        above, ruling = robust_path(workcell).ruling_beyond(points.at(part), least)
+        above, ruling = robust_path(workcell).governing_above(points.at(part), least)
         found[part[above]] = np.maximum(found[part[above]], ruling.force)
         known = known or len(above) > 0
     return known

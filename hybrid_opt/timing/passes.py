@@ -218,7 +218,7 @@ class RobustCuttingPlanes:
         found: list[AtRest | None] = [None] * n
         path, sample = np.divmod(np.arange(n * samples), samples)
         points = self._points(path, sample, *np.zeros((2, n * samples)))
-        rows, ruling = self._forces.ruling_beyond(points, CUT_ABOVE * self._limit[path])
+        rows, ruling = self._forces.governing_above(points, CUT_ABOVE * self._limit[path])
         force, slope = ruling.force, self._forces.slopes(points.at(rows), ruling)
         for k in np.unique(path[rows]):
             own = path[rows] == k
@@ -241,7 +241,7 @@ class RobustCuttingPlanes:
         a = (rise * self._intervals / 2.0).reshape(-1)
         path, sample = np.repeat(chosen, per), np.tile(self._sample, m)
         points, limit = self._points(path, sample, a, w), self._limit[path]
-        rows, ruling = self._forces.ruling_beyond(points, CUT_ABOVE * limit)
+        rows, ruling = self._forces.governing_above(points, CUT_ABOVE * limit)
         force = ruling.force
         exceeded = np.zeros(len(self._limit), dtype=bool)
         exceeded[path[rows][force.max(axis=1) > (1.0 + CUT_TOLERANCE) * limit[rows]]] = True

@@ -20,5 +20,5 @@ found: ho.Recommendation = ho.recommend(
     front, ho.Wish(force=100.0, uncertainty=ho.Uncertainty(mass=0.02))
 )
 print(found)
-print(found.squeeze.account, *found.advice, *found.margins, sep="\n")
+print(found.squeeze.breakdown, *found.advice, *found.margins, sep="\n")
 print(found.carry)

@@ -16,5 +16,5 @@ for phase in job.phases:
     print(phase.name, phase.duration, "free of collisions:", phase.certificate.is_free)
 for stiffness in (1e4, 1e5, 1e6):
     print(stiffness, position_control(job, stiffness).verdict)
-print("10 ms late:", skewed(job, 0.01, 1e4).survived)
-print("survived [ms]:", 1e3 * largest_skew(job, 1e4))
+print("10 ms late:", skewed(job, 0.01, 1e4).is_held)
+print("is_held [ms]:", 1e3 * largest_skew(job, 1e4))

@@ -1,4 +1,4 @@
-"""A workcell's functions as C: compiled, kept and checked, for `dual-arm-carry regenerate`."""
+"""What `studies.regenerate` does: a workcell's functions as C, compiled, kept and checked."""
 
 from __future__ import annotations
 

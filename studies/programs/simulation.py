@@ -1,4 +1,4 @@
-"""A stored trajectory in the simulator: under its controllers, or on pads alone."""
+"""What `studies.simulate` does: a stored trajectory under its controllers, or on pads alone."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from hybrid_opt.extras.simulation.arms import (
     LOW,
     ArmOutcome,
     CellSimulation,
-    account_of,
+    simulate_carry,
 )
 from hybrid_opt.extras.simulation.box import (
     AnyOutcome,
@@ -74,7 +74,7 @@ def simulate_arms(
     """
     control, leader, workcell = options.controller, options.leader - 1, cell.workcell
     witness = CellSimulation(workcell, settings)
-    found = account_of(cell, carry, witness, control, leader)
+    found = simulate_carry(cell, carry, witness, control, leader)
     threshold = found.threshold
     print(f"  {found.problem}" if threshold is None else threshold_text(threshold, settings.slip))
     reference = carry_reference(cell, carry, leader=leader)

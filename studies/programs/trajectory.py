@@ -30,7 +30,7 @@ from hybrid_opt.job.compliance import (
     skew_text,
     skewed,
 )
-from hybrid_opt.job.plan import JobModel, pressed
+from hybrid_opt.job.plan import JobModel, command_forces
 from hybrid_opt.job.records import Job
 from hybrid_opt.job.smooth import driven_limits, driven_timing
 from hybrid_opt.progress import Progress
@@ -249,9 +249,9 @@ def _robust_forces(cell: Cell, x: Array, options: argparse.Namespace) -> int:
         "the other's force is commanded"
     )
     print(f"  the set is {named}: {uncertainty}", flush=True)
-    held = pressed(JobModel(cell.compiled, model), timing, SqueezeSettings(leader=leader))
+    held = command_forces(JobModel(cell.compiled, model), timing, SqueezeSettings(leader=leader))
     whose = "the whole job" if held.job else f"the carry alone (no whole job: {held.problem})"
-    print(f"  commanded of {whose}: {held.squeeze.account}", flush=True)
+    print(f"  commanded of {whose}: {held.squeeze.breakdown}", flush=True)
     exit_code = 0
     if uncertainty.is_empty:
         print("  nothing is uncertain, so there is nothing to check: state what may be off")

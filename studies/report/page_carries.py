@@ -282,7 +282,7 @@ def page_trajectory(cells: Sequence[ReadyCell], shown: PageTrajectory) -> dict[s
     if driven is not None and law.is_drivable:
         try:
             commanded, _ = commanded_forces(
-                driven.workcell, driven, SqueezeSettings(), in_parts=False
+                driven.workcell, driven, SqueezeSettings(), itemised=False
             )
         except DualArmError as error:
             problem = str(error)

@@ -1,6 +1,6 @@
 """The words and numbers that a study opens with: the carry to run, in every program the same.
 
-The terminal prints them, the page shows them first, `replay` and `export` repeat
+The terminal prints them, the page shows them first, `studies.replay` and `studies.export` repeat
 the line of the carry. Forces are commanded ones unless they are called planned.
 """
 
@@ -13,14 +13,16 @@ from pathlib import Path
 from typing import Literal
 
 from hybrid_opt.job.records import Job
-from hybrid_opt.recommending.recommendation import Rival
+from hybrid_opt.recommending.recommendation import Alternative
 from hybrid_opt.robust.cases import LEADER
 from hybrid_opt.robust.force import RobustPrice
-from hybrid_opt.robust.squeeze import account
+from hybrid_opt.robust.squeeze import breakdown_text
 from studies.study.recommendation import StoredRecommendation
 
 State = Literal["good", "doubtful", "bad"]
 """Verdicts on a carry: it holds in every case without a warning; with one; it does not fit."""
+
+EXPORT_TARGET = "torque"
 
 ADVICE, NOTICED = 3, 0.05
 """Most changes that a terminal lists, and the least change of the force by one [N]."""
@@ -119,7 +121,7 @@ def answer(found: StoredRecommendation, folder: str) -> StudyAnswer:
             *details,
         ]
     details += [
-        Fact("the force", f"{account(found.parts)}; {found.squeeze_reason}"),
+        Fact("the force", f"{breakdown_text(found.parts)}; {found.squeeze_reason}"),
         *[Fact(rival.label, _rival(rival, found)) for rival in found.rivals],
     ]
     if found.reserve is not None and math.isfinite(found.reserve.payload):
@@ -133,7 +135,7 @@ def answer(found: StoredRecommendation, folder: str) -> StudyAnswer:
         details.append(Fact("checked", _checked(found.price)))
     commands = [Fact("file", str(file))]
     if found.has_job:
-        commands.append(Fact("next", export_command(file, found.target), is_command=True))
+        commands.append(Fact("next", export_command(file), is_command=True))
     details.append(Fact("with this force", f"{'; '.join(_margins(found)) or 'not known'}"))
     return StudyAnswer(
         state_of(found),
@@ -181,7 +183,7 @@ def holds_text(found: StoredRecommendation) -> str:
     return f"in every case of {found.price.uncertainty.title}"
 
 
-def export_command(path: Path, target: str) -> str:
+def export_command(path: Path, target: str = EXPORT_TARGET) -> str:
     """Return the command that makes of a trajectory file, timed within its own limits, what robots
     need.
 
@@ -190,12 +192,12 @@ def export_command(path: Path, target: str) -> str:
     """
     output = path.with_name(f"{path.stem}-{target}")
     return (
-        f"dual-arm-carry export {shlex.quote(str(path))} --target {target} "
+        f"python -m studies.export {shlex.quote(str(path))} --target {target} "
         f"--output {shlex.quote(str(output))}"
     )
 
 
-def _rival(rival: Rival, found: StoredRecommendation) -> str:
+def _rival(rival: Alternative, found: StoredRecommendation) -> str:
     """Compare another path with the recommended carry."""
     duration, force = rival.duration_at_force, rival.force_at_duration
     same_force = "cannot be held with the same force"

@@ -31,8 +31,8 @@ from hybrid_opt.recommending.choice import DrivenPaths, wished_cell
 from hybrid_opt.recommending.recommendation import (
     HAND_MADE,
     STEPS,
+    Alternative,
     Recommendation,
-    Rival,
     commanded_durations,
     spread_rows,
     table_forces,
@@ -40,7 +40,7 @@ from hybrid_opt.recommending.recommendation import (
 from hybrid_opt.robust.budget import Remedy, Reserve
 from hybrid_opt.robust.cases import LEADER
 from hybrid_opt.robust.force import RobustPrice, robust_model, robust_price
-from hybrid_opt.robust.squeeze import Part
+from hybrid_opt.robust.squeeze import Contribution
 from hybrid_opt.store.files import read_record, to_json, write_json
 from hybrid_opt.store.trajectory_file import write_trajectory
 from hybrid_opt.timing.jerk import applicable_jerk_limits
@@ -77,10 +77,6 @@ class ForceTable:
     rows: tuple[StoredDurations, ...]
 
 
-EXPORT_TARGET = "torque"
-"""Target of the export that a study names by default: its bundle runs in a simulator."""
-
-
 @dataclass(frozen=True)
 class StoredRecommendation:
     """The carry to run.
@@ -100,7 +96,6 @@ class StoredRecommendation:
         without_jerk: duration without the cell's limits on jerk [s], null where there are none.
         squeeze, squeeze_reason: largest normal force to command of each robot [N], and why.
         order: what the force asks of the contacts, as in 'press with'.
-        target: of the export that the study names.
         payload_limit: payload that the robots bear on the same motion with planned forces, nothing
             uncertain [kg].
         rivals: other paths at the same force and in the same time, the hand-made one first.
@@ -124,14 +119,14 @@ class StoredRecommendation:
     file: str
     duration: float
     force: float
-    parts: tuple[Part, ...]
+    parts: tuple[Contribution, ...]
     job_duration: Figure
     force_limit: float
     peak_force: Pair
     squeeze: Pair
     squeeze_reason: str
     payload_limit: float
-    rivals: tuple[Rival, ...]
+    rivals: tuple[Alternative, ...]
     margins: tuple[Margin, ...]
     advice: tuple[Advice, ...]
     warnings: tuple[str, ...]
@@ -146,7 +141,6 @@ class StoredRecommendation:
     remedies: tuple[Remedy, ...] = ()
     reserve: Reserve | None = None
     order: str = "press with"
-    target: str = EXPORT_TARGET
 
     @property
     def has_job(self) -> bool:
@@ -176,19 +170,15 @@ class NoRecommendation:
     reason: str
 
 
-def recommendation_stage(wish: ho.Wish, target: str) -> Stage:
+def recommendation_stage(wish: ho.Wish) -> Stage:
     """Return the stage that writes `recommended.json`, a trajectory file, and
-    `recommendation.json`, or `no-recommendation.json`.
-
-    Args:
-        target: of the export that the recommendation names.
-    """
+    `recommendation.json`, or `no-recommendation.json`."""
 
     def run(folder: CampaignFolder, progress: Progress) -> None:
         found: StoredRecommendation | NoRecommendation
         try:
             path, threads = folder.root / RECOMMENDED_FILE, folder.execution.jobs
-            found = recommend_from(folder.root, wish, path, progress, target, threads)
+            found = recommend_from(folder.root, wish, path, progress, threads)
         except NoCarryError as error:
             found = NoRecommendation(str(error))
         none = isinstance(found, NoRecommendation)
@@ -197,7 +187,7 @@ def recommendation_stage(wish: ho.Wish, target: str) -> Stage:
         (folder.root / other).unlink(missing_ok=True)
         write_json(folder.root / written, to_json(found))
 
-    return Stage("recommendation", run, {"wish": to_json(wish), "target": target})
+    return Stage("recommendation", run, to_json(wish))
 
 
 def read_recommendation(root: Path) -> StoredRecommendation | NoRecommendation | None:
@@ -216,19 +206,13 @@ def read_recommendation(root: Path) -> StoredRecommendation | NoRecommendation |
 
 
 def recommend_from(
-    root: Path,
-    wish: ho.Wish,
-    path: Path,
-    progress: Progress,
-    target: str = EXPORT_TARGET,
-    threads: int = 0,
+    root: Path, wish: ho.Wish, path: Path, progress: Progress, threads: int = 0
 ) -> StoredRecommendation:
     """Recommend a carry of a study's drivable fronts, and store it; returns what is said of it.
 
     Args:
         root: the results folder, its drivable experiment done.
         path: the trajectory file to write.
-        target: of the export that the recommendation names.
         threads: threads that time carries, 0 for one per core; results do not depend on it.
 
     Raises:
@@ -301,7 +285,6 @@ def recommend_from(
         remedies=found.remedies,
         reserve=found.reserve,
         order=found.squeeze.order,
-        target=target,
     )
 
 

@@ -24,7 +24,7 @@ from hybrid_opt.campaign.settings import (
 from hybrid_opt.campaign.stages import Cells, cells_of, ready_cells
 from hybrid_opt.display.table import Table, number
 from hybrid_opt.errors import ResultsError, SimulationError
-from hybrid_opt.extras.simulation.arms import Account, CellSimulation, account_of
+from hybrid_opt.extras.simulation.arms import CarrySimulation, CellSimulation, simulate_carry
 from hybrid_opt.extras.simulation.reference import Control, driven_carry
 from hybrid_opt.metaheuristics.registry import title
 from hybrid_opt.progress import Progress
@@ -106,7 +106,7 @@ class StoredSimulation:
 
 
 def stored_simulation(
-    found: Account, label: str, trajectory: str, controller: str
+    found: CarrySimulation, label: str, trajectory: str, controller: str
 ) -> StoredSimulation:
     """Convert an account to its stored form: from the beginning of the carry on."""
     threshold, shown, squeeze, motion = (
@@ -230,7 +230,7 @@ def _simulated(one: SimulationRequest) -> StoredSimulation:
         cell = one.trajectory.open_cell(Path(folder))
         try:
             carry = driven_carry(cell, one.trajectory.x)
-            found = account_of(cell, carry, CellSimulation(cell.workcell), CONTROL)
+            found = simulate_carry(cell, carry, CellSimulation(cell.workcell), CONTROL)
         except (SimulationError, SettingsError) as error:
             return StoredSimulation(*whose, problem=str(error))
         return stored_simulation(found, *whose)

@@ -19,7 +19,7 @@ from hybrid_opt.polishing.settings import (
     ProbeSettings,
 )
 from hybrid_opt.progress import Progress
-from hybrid_opt.robust.force import BoxMotion, interpreted_robust_model, parts_of
+from hybrid_opt.robust.force import BoxMotion, interpreted_robust_model, motion_inputs
 from studies.programs.study import StudySettings, run_study
 from studies.report import PAGE
 from studies.study.recommendation import read_recommendation
@@ -127,7 +127,7 @@ def motion() -> BoxMotion:
 
 
 def test_its_forces_are_those_of_a_motion(workcell: Workcell, motion: BoxMotion) -> None:
-    out = InterpretedFunction(load_function(workcell)).batch(*parts_of(motion))
+    out = InterpretedFunction(load_function(workcell)).batch(*motion_inputs(motion))
     force = workcell.payload.mass * (motion.second_rate[:, :3] - np.array(GRAVITY))
     np.testing.assert_allclose(out["contact_force"], np.hstack([force / 2.0] * 2), atol=1e-9)
     normal = workcell.contacts[0].T_box_pad[:3, 2]

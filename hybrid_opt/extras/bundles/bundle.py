@@ -246,7 +246,7 @@ def manifest(
         step = asdict(export.gap) | {"stiffness": k, "allowed_share": TRACKED}
     skews: dict[str, Any] = {"how": target.start, "required": skew, "stiffness": k}
     if k is not None:
-        skews |= {"survived": largest_skew(job, k)}
+        skews |= {"is_held": largest_skew(job, k)}
         skews |= {"cases": [_skew(skewed(job, delay, k)) for delay in SKEWS]}
     return {
         "target": name,
@@ -395,7 +395,7 @@ def _skew(found: Skew) -> dict[str, Any]:
         "force_change": found.force_change,
         "share_of_force": found.share,
         "margin": found.margin,
-        "holds": found.survived,
+        "holds": found.is_held,
     }
 
 

@@ -418,14 +418,14 @@ class Export:
         held = [phase.force for phase in self.job.held]
         spare = min(float(((f.normal - f.least) / f.normal).min()) for f in held)
         k = self.stiffness
-        survived = LEAST_SKEW if k is None else largest_skew(self.job, k)
+        is_held = LEAST_SKEW if k is None else largest_skew(self.job, k)
         return Limits(
             stop_time=self.stop.time,
             quick_stop=self.stop.quick,
             start=START,
             path=PATH,
             behind=max(BEHIND, LAGS * self.lag),
-            skew=float(np.clip(survived, LEAST_SKEW, MOST_SKEW)),
+            skew=float(np.clip(is_held, LEAST_SKEW, MOST_SKEW)),
             force=float(np.clip(spare, LEAST_BAND, MOST_BAND)),
             silence=SILENCE,
         )

@@ -93,17 +93,17 @@ class Load:
     residual: float
 
     @property
-    def sees_mass(self) -> bool:
+    def is_mass_observable(self) -> bool:
         """True if the holds show the mass."""
         return bool(self.deviations[0] <= SEEN_MASS * abs(self.mass))
 
     @property
-    def sees_centre(self) -> Array:
+    def observable_centre(self) -> Array:
         """(3,) True per axis of the box along which they show the centre of mass."""
         return np.asarray(self.deviations[1:4] <= SEEN_CENTRE)
 
     @property
-    def sees_crosstalk(self) -> Array:
+    def observable_crosstalk(self) -> Array:
         """(2, 2) True per crosstalk that they show."""
         return np.asarray(self.deviations[4:].reshape(2, 2) <= SEEN_CROSSTALK)
 

@@ -101,7 +101,7 @@ class Evidence:
         """Add a quantity."""
         self.entries.append(EvidenceEntry(name, found, key))
 
-    def doubt(self, name: str, value: Any) -> None:
+    def set_uncertainty(self, name: str, value: Any) -> None:
         """Set a range of `[uncertainty]`, rounded up."""
         up = np.ceil(np.maximum(1e4 * np.asarray(value, dtype=float) - 1e-6, 0.0)) / 1e4
         self.ranges[name] = up.tolist()
@@ -236,10 +236,10 @@ def _load(sound: Sound, evidence: Evidence) -> Load | None:
         return None
     source = f"from {len(holds)} holds, {load.residual:.2f} N left"
     share = SURE * float(load.deviations[0]) / load.mass
-    if load.sees_mass:
+    if load.is_mass_observable:
         told = f"{load.mass:.3f} kg ± {100.0 * share:.1f} % (3 σ), {source}"
         evidence.tell("mass", told, "payload.mass")
-        evidence.doubt("mass", max(share, LEAST_MASS))
+        evidence.set_uncertainty("mass", max(share, LEAST_MASS))
     else:
         text = (
             "mass and crosstalk cannot be told apart; record holds at three squeezes, or state the "
@@ -247,18 +247,20 @@ def _load(sound: Sound, evidence: Evidence) -> Load | None:
         )
         names = ", ".join(run.name for run, _ in sound if not run.labels.empty)
         evidence.faults.append(Fault(names, "load not seen", text))
-    payload: dict[str, Any] = {"mass": round(load.mass, 4)} if load.sees_mass else {}
+    payload: dict[str, Any] = {"mass": round(load.mass, 4)} if load.is_mass_observable else {}
     spread = load.deviations[1:4]
-    if load.sees_mass and load.sees_centre.all():
+    if load.is_mass_observable and load.observable_centre.all():
         told = ", ".join(
             f"{1e3 * value:.1f} ± {1e3 * SURE * wide:.1f}"
             for value, wide in zip(load.centre, spread, strict=True)
         )
         evidence.tell("centre of mass", f"{told} mm (3 σ), {source}", "payload.centre_of_mass")
         payload["centre_of_mass"] = np.round(load.centre, 5).tolist()
-        evidence.doubt("centre_of_mass", np.maximum(SURE * spread, LEAST_CENTRE))
+        evidence.set_uncertainty("centre_of_mass", np.maximum(SURE * spread, LEAST_CENTRE))
     else:
-        unseen = [axis for axis, seen in zip("xyz", load.sees_centre, strict=True) if not seen]
+        unseen = [
+            axis for axis, seen in zip("xyz", load.observable_centre, strict=True) if not seen
+        ]
         evidence.asks.append(
             f"holds tilted by 14 degrees, either way about both level axes, at three squeezes: the "
             f"centre of mass cannot be seen along {', '.join(unseen or 'xyz')}"
@@ -266,7 +268,7 @@ def _load(sound: Sound, evidence: Evidence) -> Load | None:
     if payload:
         evidence.tables["payload"] = payload
     for i in range(2):
-        seen = load.sees_crosstalk[i]
+        seen = load.observable_crosstalk[i]
         told = ", ".join(
             f"{value:.3f} ± {SURE * wide:.3f}" if known else "not seen"
             for value, wide, known in zip(
@@ -282,7 +284,11 @@ def _load(sound: Sound, evidence: Evidence) -> Load | None:
 
 def _friction(sound: Sound, load: Load | None, evidence: Evidence) -> None:
     """Bracket the friction: greatest ratio that held, least that slipped."""
-    if load is None or not load.sees_crosstalk.all() or not evidence.workcell.has_opposite_pads:
+    if (
+        load is None
+        or not load.observable_crosstalk.all()
+        or not evidence.workcell.has_opposite_pads
+    ):
         return
     ratio_of = FrictionRatio(evidence.workcell)
     held: list[tuple[float, str]] = []
@@ -318,7 +324,7 @@ def _friction(sound: Sound, load: Load | None, evidence: Evidence) -> None:
     share = max((high - low) / 2.0 / middle, LEAST_FRICTION)
     evidence.tell("friction", f"{low:.3f} to {high:.3f}", "contacts.friction")
     evidence.tables["contacts"] = [{"friction": round(middle, 3)}] * 2
-    evidence.doubt("friction", share)
+    evidence.set_uncertainty("friction", share)
 
 
 def _tracking(sound: Sound, evidence: Evidence) -> None:
@@ -346,7 +352,7 @@ def _tracking(sound: Sound, evidence: Evidence) -> None:
         if lags:
             evidence.tell(f"lag of the force, arm {i + 1}", f"{max(lags):.3f} s at most")
     if worst:
-        evidence.doubt("tracking", float(np.clip(1.0 - min(worst), 0.0, 0.9)))
+        evidence.set_uncertainty("tracking", float(np.clip(1.0 - min(worst), 0.0, 0.9)))
 
 
 def _drift(sound: Sound, evidence: Evidence) -> None:
@@ -381,7 +387,7 @@ def _drift(sound: Sound, evidence: Evidence) -> None:
         rms, most = float(np.sqrt(np.mean(values**2))), float(np.quantile(values, 0.99))
         told = f"{scale * rms:.2g} {unit} rms, {scale * most:.2g} {unit} (99 %), by the joints"
         evidence.tell(name, told, f"uncertainty.{key}")
-        evidence.doubt(key, most)
+        evidence.set_uncertainty(key, most)
     if delays:
         most = max(delays, key=abs)
         evidence.tell("delay of arm 2 after arm 1", f"{most:.3f} s at most")

@@ -450,7 +450,7 @@ def find_holds(query: HoldQuery, kinematics: ArmKinematics, rng: np.random.Gener
     found.free = len(q)
     finder.lead(spins[which], np.array(T_box_joint)[which], q)
     found.holds.sort(key=lambda hold: -hold.score)
-    compared = kinematics.geometry.joints - spins_the_pad(kinematics)
+    compared = kinematics.geometry.joints - has_wrist_spin(kinematics)
     found.holds = _diverse(found.holds, compared)[:MOST_HOLDS]
     return found
 
@@ -581,7 +581,7 @@ class _Finder:
         if not reaches:
             return "it does not reach farther in one motion"
         if measure < kinematics.least:
-            return told_manipulability(kinematics, f"is {max(measure, 0.0):.2g} m^3 there")
+            return manipulability_hint(kinematics, f"is {max(measure, 0.0):.2g} m^3 there")
         room = np.minimum(q - kinematics.lower, kinematics.upper - q)
         joint = list(arm_model(kinematics.workcell.robots[kinematics.arm]).names)[1:][
             int(np.argmin(room))
@@ -622,7 +622,7 @@ class _Finder:
         return np.asarray(comfort + away - LENGTH_COST * apart)
 
 
-def told_manipulability(kinematics: ArmKinematics, found: str) -> str:
+def manipulability_hint(kinematics: ArmKinematics, found: str) -> str:
     """Say that the manipulability found is too small, with the key that decides."""
     robot = kinematics.workcell.robots[kinematics.arm]
     return (
@@ -653,7 +653,7 @@ def _diverse(holds: Sequence[Hold], compared: int) -> list[Hold]:
     return first + later
 
 
-def spins_the_pad(kinematics: ArmKinematics) -> bool:
+def has_wrist_spin(kinematics: ArmKinematics) -> bool:
     """Return True if the arm's last joint turns the pad about its normal, as a spin does."""
     geometry, contact = kinematics.geometry, kinematics.workcell.contacts[kinematics.arm]
     T_joint_pad = geometry.T_joint_box @ contact.T_box_pad

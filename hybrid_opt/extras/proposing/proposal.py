@@ -45,9 +45,9 @@ from hybrid_opt.extras.proposing.via_points import (
     MOST_VIA_POINTS,
     along,
     fit,
-    shortened,
-    straightened,
-    travelled,
+    path_length,
+    remove_corners,
+    shorten_spline,
 )
 from hybrid_opt.progress import ShowProgress, as_callback, progress_bar
 from symbolic.array import Array
@@ -170,7 +170,7 @@ class Proposal:
     @property
     def length(self) -> float:
         """How far both arms' joints go together, as the Euclidean length of their path [rad]."""
-        return travelled(np.hstack(self.q))
+        return path_length(np.hstack(self.q))
 
     @property
     def passes(self) -> str:
@@ -359,7 +359,7 @@ class _Search:
 
     def _is_known(self, pair: Pair, box: PayloadSceneChecker, path: Array) -> bool:
         """Return True if a carry of the class of these poses (n, 6) was found before."""
-        return bool(self.known) and (id(pair), box.passed(path)) in self.known
+        return bool(self.known) and (id(pair), box.sides_passed(path)) in self.known
 
     def _failed(self, setups: list[_Lazy]) -> ProposalError:
         begin = f"{self.problem.source}: no carry found in {self.spent:.0f} s"
@@ -406,7 +406,7 @@ class _Search:
     def _via_points(self, pair: Pair, corners: list[ChainConfiguration]) -> Array | None:
         """Find the fewest via-points of a path, None without any."""
         self._say("via-points")
-        dense = shortened(pair.chain, corners, self.rng)
+        dense = remove_corners(pair.chain, corners, self.rng)
         for count in range(1, MOST_VIA_POINTS + 1):
             via = fit(pair.chain, dense, count, self.rng)
             if via is not None or self.too_late:
@@ -426,7 +426,7 @@ class _Search:
         first = self._trial(setup, pair, fitted)
         certified = self.spent if first.verdict()[0].feasible else None
         self._say("a shorter way")
-        straight = straightened(pair.chain, pair.start, fitted, self.rng)
+        straight = shorten_spline(pair.chain, pair.start, fitted, self.rng)
         found = self._trial(setup, pair, straight, first.bodies)
         judgement, why = found.verdict()
         if not judgement.feasible:
@@ -452,7 +452,7 @@ class _Search:
             self.refusals.append(why)
             return
         outputs = last.evaluator.outputs(last.initial[None])
-        self.known.add((id(pair), box.passed(_poses(straight))))
+        self.known.add((id(pair), box.sides_passed(_poses(straight))))
         self._say("the pads' way to the box")
         blocked, stand_off = ("", None) if self.out_of_time else self._pads_way(last)
         yield Proposal(
@@ -464,7 +464,7 @@ class _Search:
             self.spent,
             certified,
             (outputs["q_1"][0], outputs["q_2"][0]),
-            box.passed(outputs["pose"][0]),
+            box.sides_passed(outputs["pose"][0]),
             blocked,
         )
 

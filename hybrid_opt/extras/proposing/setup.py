@@ -25,9 +25,9 @@ from hybrid_opt.extras.proposing.holding import (
     HoldSearch,
     find_holds,
     initial_arc,
+    manipulability_hint,
     possible_spins,
     rotate_about_normal,
-    told_manipulability,
 )
 from hybrid_opt.extras.proposing.planner import ChainConfiguration, ClosedChain, Retreats, retreats
 from hybrid_opt.extras.proposing.problem import Problem
@@ -311,7 +311,7 @@ def _arm_missing(kinematics: ArmKinematics, search: HoldSearch) -> str:
         joints = ", ".join(names[joint] for joint, _ in search.joints.most_common(TOLD))
         told = f"beyond limits are most often {joints}"
         if search.manipulability or not joints:  # some are within limits
-            told = told_manipulability(kinematics, f"is at most {search.manipulability:.2g} m^3")
+            told = manipulability_hint(kinematics, f"is at most {search.manipulability:.2g} m^3")
         return f"{robot.name} has no usable posture at the start: {told}"
     if not search.free:
         return (

@@ -17,7 +17,7 @@ from hybrid_opt.collision.checker import CollisionChecker
 from hybrid_opt.compiled_cell import InterpretedCell
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.evaluate.explanation import explain
-from hybrid_opt.job.plan import JobCollisions, what_blocks
+from hybrid_opt.job.plan import JobCollisions, describe_obstruction
 from hybrid_opt.static_hold import static_hold_error
 from symbolic.array import Array
 from symbolic.cell_model import (
@@ -78,7 +78,7 @@ class PayloadSceneChecker:
             self._met[key] = self.meets(begin + shares[:, None] * (end - begin))
         return self._met[key]
 
-    def passed(self, path: Array) -> tuple[str, ...]:
+    def sides_passed(self, path: Array) -> tuple[str, ...]:
         """Return the sides on which a path (n, 6) passes what the straight motion between its ends
         meets, such as 'over post', 'left of post' (looking along the motion), 'between post and
         wall' or 'through frame'; empty if that is free.
@@ -230,7 +230,7 @@ class PoseJudge:
                 continue
             at, pair_number = np.zeros(1, dtype=np.intp), np.full(1, number)
             if self.checker.collisions(pose[None], q_1, q_2, at, pair_number)[0]:
-                found.append((other, self.checker.enters(pose, number)))
+                found.append((other, self.checker.penetrates(pose, number)))
         return found
 
     def first_pair(
@@ -433,4 +433,4 @@ def grasp_blocked(trial: Trial, handling: Handling) -> str:
     q = np.hstack([found["q_1"][0], found["q_2"][0]])[[0, -1]]
     collisions = JobCollisions(InterpretedCell(cell, model=trial.model))
     posture = trial.evaluator.functions["posture"]
-    return what_blocks(cell, collisions, posture, found["pose"][0][[0, -1]], q)
+    return describe_obstruction(cell, collisions, posture, found["pose"][0][[0, -1]], q)

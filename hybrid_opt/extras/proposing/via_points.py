@@ -52,14 +52,14 @@ BLOCKED = 100.0
 """Cost of a spline whose places are all out of reach; half as much where all collide [rad]."""
 
 
-def travelled(points: Array) -> float:
+def path_length(points: Array) -> float:
     """Compute the Euclidean length of a path through points (n, m)."""
     return float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
 
 
 def joint_length(places: Sequence[ChainConfiguration]) -> float:
     """Compute the Euclidean length of the path of all joints [rad]."""
-    return travelled(np.array([np.concatenate(place.q) for place in places]))
+    return path_length(np.array([np.concatenate(place.q) for place in places]))
 
 
 def along(corners: Sequence[ChainConfiguration]) -> Array:
@@ -68,7 +68,7 @@ def along(corners: Sequence[ChainConfiguration]) -> Array:
     return np.vstack(legs)
 
 
-def shortened(
+def remove_corners(
     chain: ClosedChain, corners: Sequence[ChainConfiguration], rng: np.random.Generator
 ) -> list[ChainConfiguration]:
     """Remove needless corners of a path; return places along it, `planner.PATH_STEP` apart."""
@@ -136,7 +136,7 @@ def fit(
     return None
 
 
-def straightened(
+def shorten_spline(
     chain: ClosedChain, start: ChainConfiguration, waypoints: Array, rng: np.random.Generator
 ) -> Array:
     """Find waypoints (n, 6 + m) of a free spline with shorter joint paths than the given one.

@@ -1,7 +1,7 @@
 """A whole cell in MuJoCo: both arms under their controllers, the box between their pads.
 
-Nothing moves but by the joints' torques, gravity and contacts. `account_of` says of a carry from
-which force on it holds, and how it presses.
+Only joint torques, gravity and contacts move anything. `simulate_carry` finds the least multiple of
+the planned forces that holds a carry, and simulates it with the commanded ones.
 """
 
 from __future__ import annotations
@@ -388,7 +388,7 @@ Indices = NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)
-class Account:
+class CarrySimulation:
     """Simulations of one carry.
 
     Attributes:
@@ -407,9 +407,9 @@ class Account:
     shown: ArmOutcome
 
 
-def account_of(
+def simulate_carry(
     cell: Cell, carry: Carry, witness: CellSimulation, control: Control = "leader", leader: int = 0
-) -> Account:
+) -> CarrySimulation:
     """Simulate a carry at its threshold, and with the commanded forces.
 
     Args:
@@ -430,4 +430,4 @@ def account_of(
         problem = str(error)
     pressed, squeeze = pressed_reference(cell, carry, leader)
     shown = witness.simulate(pressed, control)
-    return Account(threshold, problem, pressed, squeeze, shown)
+    return CarrySimulation(threshold, problem, pressed, squeeze, shown)

@@ -19,7 +19,7 @@ from hybrid_opt.evaluate.evaluation import concatenated
 from hybrid_opt.extras.proposing.proposal import worked
 from hybrid_opt.extras.proposing.ranking import fastest_carry
 from hybrid_opt.extras.proposing.trial import judge_of
-from hybrid_opt.extras.proposing.via_points import travelled
+from hybrid_opt.extras.proposing.via_points import path_length
 from studies.research.turns import progress
 from symbolic.array import Array
 from symbolic.errors import OutsideError, SettingsError
@@ -244,7 +244,7 @@ def _joints(carry: ho.Carry) -> tuple[Array, Array]:
 
 def length(benchmark: Benchmark, q: tuple[Array, Array]) -> Length:
     """How far both arms' joints (n, joints) go along a carry."""
-    return Length(travelled(np.hstack(q)), travelled(benchmark.coordinates(*q)))
+    return Length(path_length(np.hstack(q)), path_length(benchmark.coordinates(*q)))
 
 
 def checks_per_second(workcell: Path, rng: np.random.Generator) -> float:

@@ -8,8 +8,8 @@ from functools import cache
 import numpy as np
 import pytest
 
-from hybrid_opt.job.motions import PEAK_RATE, at_even_steps, rise, unit_squeeze
-from hybrid_opt.job.smooth import acceleration_at_ends, rests_at_ends, without_jumps
+from hybrid_opt.job.motions import PEAK_RATE, at_even_steps, rest_to_rest_profile, unit_squeeze
+from hybrid_opt.job.smooth import acceleration_at_ends, has_rest_at_ends, without_jumps
 from hybrid_opt.timing.jerk import time_with_jerk
 from hybrid_opt.timing.limits import check_limits, most_used
 from hybrid_opt.timing.records import JerkLimits, Timing, TimingLimits
@@ -24,7 +24,7 @@ from tests.symbolic.cells import RACK
 
 
 def test_the_profile_goes_from_rest_to_rest() -> None:
-    found = rise(2.0, 4001)
+    found = rest_to_rest_profile(2.0, 4001)
     assert found.value[0] == 0.0
     assert found.value[-1] == pytest.approx(1.0, abs=1e-12)
     assert (np.diff(found.value) >= 0.0).all()
@@ -78,7 +78,7 @@ def fast(force: float = FORCE) -> Timing:
 @pytest.mark.parametrize("width", [0.02, 0.1])
 def test_a_time_optimal_timing_loses_its_jumps(width: float) -> None:
     timing = fast()
-    assert not rests_at_ends(timing)
+    assert not has_rest_at_ends(timing)
     found = without_jumps(rack().timing_model, timing, None, width)
     carry, cell = found.driven, rack().workcell
     assert acceleration_at_ends(found) == 0.0
@@ -123,6 +123,6 @@ def test_a_timing_at_rest_stays_as_it_is() -> None:
     memoise = time_with_jerk(
         rack().timing_model, rack().initial, TimingLimits(reference_speed=True), limits
     ).timing
-    assert rests_at_ends(memoise)
+    assert has_rest_at_ends(memoise)
     assert rack_jobs().plan(memoise).timing is memoise
     assert rack_jobs().plan(rack_timing(), smoothing=0.0).timing is rack_timing()

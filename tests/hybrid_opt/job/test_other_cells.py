@@ -19,7 +19,7 @@ from hybrid_opt.extras.bundles import TARGETS, BundleOptions, export
 from hybrid_opt.extras.bundles.bundle import prepared, target_for
 from hybrid_opt.job.plan import JobModel
 from hybrid_opt.job.smooth import driven_timing, without_jumps
-from hybrid_opt.robust.force import thinned
+from hybrid_opt.robust.force import subsample
 from hybrid_opt.robust.squeeze import largest_commanded
 from hybrid_opt.timing.records import JerkLimits
 from symbolic.contact.registry import contact_model
@@ -53,7 +53,7 @@ def test_every_cell_that_ships_has_a_job(name: str) -> None:
     job = model.plan(timing)
     assert all(phase.certificate.is_free for phase in job.phases)
     carry, doubt = timing.driven, cell.workcell.uncertainty
-    rows, motion = thinned(carry)
+    rows, motion = subsample(carry)
     sooner = largest_commanded(cell.workcell, motion, carry.normal_force[rows], doubt, 0)
     forces = job.phase("carry").force.normal.max(axis=0)
     np.testing.assert_allclose(sooner, forces, rtol=0.01)

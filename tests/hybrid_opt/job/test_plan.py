@@ -21,7 +21,7 @@ from hybrid_opt.job.compliance import (
     require_skew,
     skewed,
 )
-from hybrid_opt.job.motions import straight, timed
+from hybrid_opt.job.motions import straight, time_line
 from hybrid_opt.job.plan import JobModel
 from hybrid_opt.job.records import PHASES, Job, Phase, sample_job
 from hybrid_opt.robust.squeeze import SqueezeSettings
@@ -271,7 +271,7 @@ def test_straight_phases_take_the_time_that_jerk_asks_for() -> None:
     model.workcell = replace(model.workcell, robots=(tight, second))
     old = job.phase("lift")
     line = straight(model.workcell, "lift", old.motion.pose[[0, -1]], (0.0, 0.0), 0.1)
-    motion = timed(model, line, old.motion.q)
+    motion = time_line(model, line, old.motion.q)
     assert motion.duration > old.duration
     joints = np.diff(motion.q_second[:, :6], axis=0) / np.diff(motion.time)[:, None]
     # Whole ticks round the duration up.
@@ -305,7 +305,7 @@ def test_a_late_arm_lags_by_the_way_of_that_time() -> None:
     assert skewed(job, 0.0, 1e4).margin == pytest.approx(force_margin(job))
     margins = [skewed(job, delay, 1e4).margin for delay in (0.0, 0.005, 0.01, 0.02)]
     assert margins == sorted(margins, reverse=True)
-    assert not skewed(job, 0.01, 1e5).survived
+    assert not skewed(job, 0.01, 1e5).is_held
 
 
 def test_the_worse_of_both_arms_counts() -> None:
@@ -337,8 +337,8 @@ def test_a_skew_that_breaks_the_squeeze_is_refused_with_a_figure() -> None:
     job, stiffness = rack_job(), 5e4
     most = largest_skew(job, stiffness)
     assert 0.0 < most < LARGEST_SKEW
-    assert skewed(job, most, stiffness).survived
-    assert not skewed(job, 1.01 * most, stiffness).survived
+    assert skewed(job, most, stiffness).is_held
+    assert not skewed(job, 1.01 * most, stiffness).is_held
     require_skew(job, most, stiffness)
     missing = -skewed(job, 0.02, stiffness).margin
     with pytest.raises(JobError, match=rf"20 ms .*{missing:.1f} N .*with {1e3 * most:.1f} ms they"):

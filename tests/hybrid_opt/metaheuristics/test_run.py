@@ -24,7 +24,12 @@ from hybrid_opt.metaheuristics import (
     settings_of,
 )
 from hybrid_opt.metaheuristics.guarded import violation_of
-from hybrid_opt.metaheuristics.run import WORST_PENALTY, CarryProblem, SearchSettings, disarmed
+from hybrid_opt.metaheuristics.run import (
+    WORST_PENALTY,
+    CarryProblem,
+    SearchSettings,
+    reject_non_finite,
+)
 from studies.research import analytic
 from symbolic.array import Array
 from symbolic.errors import SettingsError
@@ -286,7 +291,7 @@ def test_no_figure_that_is_not_finite_gets_out(figure: str, value: float, handli
 def test_disarmed_candidates_are_worst_and_say_why() -> None:
     x = np.array([[0.31, 0.5, 0.5, 0.5], [0.5, 0.5, 0.5, 0.5]])
     before = verdicts(x)
-    after = disarmed(before)
+    after = reject_non_finite(before)
     assert np.isnan(before.objectives[0]).all()
     assert before.feasible.tolist() == [True, True]
     assert after.feasible.tolist() == [False, True]

@@ -23,7 +23,7 @@ from hybrid_opt.recommending.recommendation import (
     table_forces,
 )
 from hybrid_opt.robust.cases import random_cases
-from hybrid_opt.robust.force import BoxMotion, RobustModel, robust_model, thinned
+from hybrid_opt.robust.force import BoxMotion, RobustModel, robust_model, subsample
 from hybrid_opt.robust.squeeze import commanded_forces
 from hybrid_opt.timing.solve import time_path
 from symbolic.array import Array
@@ -477,6 +477,6 @@ def test_hands_that_hold_by_themselves_are_recommended_without_a_job() -> None:
     assert found.job is None
     assert any("no job can be planned" in each for each in found.warnings)
     # Half the force does not hold a case of the uncertainty: the command is not too high.
-    _, moved = thinned(found.carry)
+    _, moved = subsample(found.carry)
     needed = robust_model(cell.workcell).commanded(moved, cell.workcell.uncertainty, 0)
     assert 0.5 * found.force < needed.max() <= found.force * 1.001

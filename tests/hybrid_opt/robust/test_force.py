@@ -285,7 +285,7 @@ def test_forces_and_slopes_are_those_of_the_motion() -> None:
         np.testing.assert_allclose(whole[:, :, column], difference, atol=2e-3)
     # Where a force is above a level, the same; nowhere else.
     level = np.full(POINTS, float(np.median(value.max(axis=1))))
-    rows, ruling = robust.ruling_beyond(points, level)
+    rows, ruling = robust.governing_above(points, level)
     beyond = robust.slopes(points.at(rows), ruling)
     np.testing.assert_array_equal(rows, np.flatnonzero(value.max(axis=1) > level))
     assert 0 < len(rows) < POINTS

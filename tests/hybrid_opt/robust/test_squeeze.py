@@ -16,14 +16,14 @@ from hybrid_opt.robust.force import (
     RobustModel,
     robust_model,
     robust_price,
-    thinned,
+    subsample,
 )
 from hybrid_opt.robust.squeeze import (
-    DOUBTS,
+    UNCERTAINTY_SOURCES,
     Squeeze,
     SqueezeSettings,
     commanded_forces,
-    pressed_beyond,
+    extra_normal_force,
     smooth_above,
 )
 from symbolic.array import Array
@@ -104,11 +104,14 @@ def test_the_force_is_the_sum_of_its_parts() -> None:
     the force, the arms' own force adds to it, tracking scales both."""
     cell = replace(rack().workcell, uncertainty=replace(SET, centre_of_mass=np.zeros(3)))
     still = BoxMotion(np.zeros((2, 6)), np.zeros((2, 6)), np.zeros((2, 6)))
-    extra, squeeze = pressed_beyond(
+    extra, squeeze = extra_normal_force(
         cell, SqueezeSettings(), np.array([0.0, 1.0]), still, np.zeros((2, 2))
     )
     parts = {part.name: part.force for part in squeeze.parts}
-    assert list(parts) == ["least force", *[name for name in DOUBTS if name != "centre of mass"]]
+    assert list(parts) == [
+        "least force",
+        *[name for name in UNCERTAINTY_SOURCES if name != "centre of mass"],
+    ]
     assert extra.max() == pytest.approx(sum(parts.values()))
     weight = 10.0 * 9.81 / 2.0
     assert parts["least force"] == pytest.approx(weight, rel=1e-6)
@@ -117,7 +120,7 @@ def test_the_force_is_the_sum_of_its_parts() -> None:
     mu = np.tan(np.arctan(0.8) - 0.025) - (2.0 * 0.003 + 0.004) / 0.4
     assert parts["arms against one another"] == pytest.approx(5.0 / mu, rel=1e-6)
     assert parts["tracking"] == pytest.approx(squeeze.force * 0.1, rel=1e-6)
-    assert squeeze.account.endswith(f"tracking = {squeeze.force:.1f} N")
+    assert squeeze.breakdown.endswith(f"tracking = {squeeze.force:.1f} N")
 
 
 def test_a_stated_stiffness_makes_a_force_of_the_arms_places() -> None:
@@ -170,7 +173,7 @@ def test_a_carry_is_priced_under_its_cells_own_set() -> None:
 
 def test_the_largest_forces_are_among_the_thinned_samples() -> None:
     carry = rack_carry()
-    _, motion = thinned(carry)
+    _, motion = subsample(carry)
     assert SAMPLES <= len(motion.pose) <= SAMPLES + 2
     for row in carry.normal_force.argmax(axis=0):
         assert (motion.pose == carry.pose[row]).all(axis=1).any()
@@ -182,6 +185,6 @@ def test_what_is_commanded_holds_even_pads(name: str, settings: SqueezeSettings)
     """Although the plan, here none at all, asks for less."""
     cell, still = load(RACK.with_name(f"{name}.toml")), BoxMotion(*[np.zeros((2, 6))] * 3)
     model, time = robust_model(cell), np.array([0.0, 1.0])
-    extra, squeeze = pressed_beyond(cell, settings, time, still, np.zeros((2, 2)))
+    extra, squeeze = extra_normal_force(cell, settings, time, still, np.zeros((2, 2)))
     assert (extra >= model.nominal(still)[:, 1] * (1.0 - 1e-9)).all()
     assert "press evenly" in str(squeeze)

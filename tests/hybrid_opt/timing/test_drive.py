@@ -93,8 +93,8 @@ def test_objectives_are_those_of_time_path_at_the_candidates_force() -> None:
         pose, rate = outputs["pose"][k], outputs["rate"][k]
         np.testing.assert_allclose(rate[[0, -1]], 0.0, atol=1e-9)
         steps = np.diff(outputs["time"][k])[:, None]
-        travelled = np.cumsum(steps * (rate[1:] + rate[:-1]) / 2.0, axis=0)
-        np.testing.assert_allclose(travelled, pose[1:] - pose[0], atol=6e-3)
+        path_length = np.cumsum(steps * (rate[1:] + rate[:-1]) / 2.0, axis=0)
+        np.testing.assert_allclose(path_length, pose[1:] - pose[0], atol=6e-3)
         assert outputs["normal_force"][k].max() <= row[-1] * 1.005
 
 

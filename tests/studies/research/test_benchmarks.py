@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 import hybrid_opt as ho
 from hybrid_opt.display.table import NOTHING
 from hybrid_opt.extras.proposing.problem import read_problem
-from hybrid_opt.extras.proposing.via_points import travelled
+from hybrid_opt.extras.proposing.via_points import path_length
 from studies.research.benchmarks import baxter, machines, measuring, shelves, slot
 from studies.research.benchmarks.__main__ import main
 from studies.research.benchmarks.measuring import (
@@ -145,7 +145,7 @@ def test_the_elbow_turns_about_shoulder_and_wrist() -> None:
         by = shelves.elbow_turn(wider[1]) - shelves.elbow_turn(wider[0])
         assert by == pytest.approx(angle, abs=1e-8)
         path = shelves.coordinates(np.zeros((2, 7)), np.array(wider))
-        assert travelled(path) == pytest.approx(abs(angle), abs=1e-8)
+        assert path_length(path) == pytest.approx(abs(angle), abs=1e-8)
 
 
 @pytest.mark.parametrize(
@@ -326,7 +326,7 @@ def test_the_shortest_carry_is_shorter_than_the_one_it_began_with_and_certified(
     cell = ho.Cell.load(RACK)
     begin = cell.carry(cell.initial)
     found = measuring.shortest_carry(RACK, np.random.default_rng(1))
-    ways = [travelled(np.hstack([arm.q for arm in carry.arms])) for carry in (begin, found)]
+    ways = [path_length(np.hstack([arm.q for arm in carry.arms])) for carry in (begin, found)]
     assert ways[1] < 0.9 * ways[0]
     assert cell.certify(found).is_free
     assert ((found.x >= cell.workcell.task.lower) & (found.x <= cell.workcell.task.upper)).all()

@@ -30,8 +30,8 @@ from hybrid_opt.extras.proposing.via_points import (
     fit,
     free_share,
     joint_length,
-    shortened,
-    straightened,
+    remove_corners,
+    shorten_spline,
 )
 from symbolic.array import Array
 from symbolic.cell_model import build_cell_model, own_pairs
@@ -113,10 +113,10 @@ def test_a_path_says_on_which_side_it_passes_what_is_in_the_way(
 ) -> None:
     """A post from 0 to 0.6 m, a box that would meet it; left and right change with the way."""
     box, path = box_among("", tmp_path), way_by(y, z)
-    assert box.passed(path) == (forth,)
-    assert box.passed(path[::-1]) == (back,)
+    assert box.sides_passed(path) == (forth,)
+    assert box.sides_passed(path[::-1]) == (back,)
     path[:, 2] += 0.5
-    assert box.passed(path) == (), "the straight motion is free there"
+    assert box.sides_passed(path) == (), "the straight motion is free there"
 
 
 @pytest.mark.parametrize(
@@ -134,9 +134,9 @@ length = 0.60
 xyz = [0.0, 0.8, 0.3]
 """
     box, way = box_among(second, tmp_path), way_by(0.8 * aside)
-    assert box.passed(way) == (told,)
+    assert box.sides_passed(way) == (told,)
     way[1:-1, 2] += 0.5  # above both
-    assert not box.passed(way)[0].startswith("between")
+    assert not box.sides_passed(way)[0].startswith("between")
 
 
 def test_a_path_through_a_frame_is_told(tmp_path: Path) -> None:
@@ -148,12 +148,12 @@ def test_a_path_through_a_frame_is_told(tmp_path: Path) -> None:
     (tmp_path / "frame.stl").write_bytes(trimesh.exchange.stl.export_stl(frame_mesh))
     frame = '[[environment]]\nname = "frame"\nkind = "mesh"\npath = "frame.stl"\n'
     box = box_among(frame, tmp_path, before="[[environment]]")
-    assert box.passed(way_by(z=0.8)) == ("through frame",)
-    assert box.passed(way_by(z=3.4)) == ("over frame",)
+    assert box.sides_passed(way_by(z=0.8)) == ("through frame",)
+    assert box.sides_passed(way_by(z=3.4)) == ("over frame",)
 
 
 def test_what_the_box_stands_on_is_not_passed(tmp_path: Path) -> None:
-    assert box_among("", tmp_path).passed(way_by(1.0, height=0.115)) == ("left of post",)
+    assert box_among("", tmp_path).sides_passed(way_by(1.0, height=0.115)) == ("left of post",)
 
 
 def test_the_torso_counts_for_both_arms_of_a_machine(tmp_path: Path) -> None:
@@ -278,7 +278,7 @@ def first(shelf: Setup) -> list[ChainConfiguration]:
 def shortened_path(setup: Setup, corners: list[ChainConfiguration]) -> list[ChainConfiguration]:
     """Places along corners without needless ones; FCL without screening finds them free."""
     pair = setup.pairs[0]
-    path = shortened(pair.chain, corners, np.random.default_rng(0))
+    path = remove_corners(pair.chain, corners, np.random.default_rng(0))
     np.testing.assert_array_equal(path[0].extended, pair.start.extended)
     np.testing.assert_allclose(path[-1].extended, pair.goal.extended, atol=1e-12)
     poses = np.array([place.extended for place in path])
@@ -338,7 +338,7 @@ def test_shortcuts_make_the_way_of_the_joints_shorter(shelf: Setup) -> None:
     dense = [wandering[0]]
     for corner in wandering[1:]:
         dense += pair.chain.along(dense[-1], straight(dense[-1].extended, corner.extended)[1:])
-    short = shortened(pair.chain, wandering, np.random.default_rng(0))
+    short = remove_corners(pair.chain, wandering, np.random.default_rng(0))
     assert joint_length(short) < 0.95 * joint_length(dense)
     assert max(abs(place.extended[1]) for place in short) < 0.04
 
@@ -348,14 +348,14 @@ def test_few_via_points_follow_a_path_and_are_straightened(
 ) -> None:
     """As far as the spline stays free."""
     pair, rng = shelf.pairs[0], np.random.default_rng(0)
-    path = shortened(pair.chain, first, rng)
+    path = remove_corners(pair.chain, first, rng)
     straight = np.array([pair.start.extended, pair.goal.extended])
     assert free_share(pair.chain, pair.start, straight) < 1.0
     fits = (fit(pair.chain, path, count, rng) for count in (1, 2, 3, 4, 5))
     via = next(each for each in fits if each is not None)
     whole = np.vstack([straight[:1], via, straight[1:]])
     assert free_share(pair.chain, pair.start, whole) == 1.0
-    short = straightened(pair.chain, pair.start, whole, rng)
+    short = shorten_spline(pair.chain, pair.start, whole, rng)
     np.testing.assert_array_equal(short[[0, -1]], whole[[0, -1]])
     assert free_share(pair.chain, pair.start, short) == 1.0
     lengths = []

@@ -14,7 +14,7 @@ import pytest
 from hybrid_opt.carry import Carry
 from hybrid_opt.cell import Cell
 from hybrid_opt.errors import SimulationError
-from hybrid_opt.extras.simulation.arms import Account, CellSimulation
+from hybrid_opt.extras.simulation.arms import CarrySimulation, CellSimulation
 from hybrid_opt.extras.simulation.box import BoxSimulation, bisected, drive_of, workcell_of_case
 from hybrid_opt.extras.simulation.reference import driven_carry, pressed_reference
 from hybrid_opt.extras.simulation.scene import (
@@ -323,7 +323,9 @@ def test_forces_beside_what_was_told_are_stored_from_the_carrys_beginning() -> N
     pressed, squeeze = pressed_reference(cell, carry)
     assert squeeze.factor is None
     shown = CellSimulation(cell.workcell).simulate(pressed, "leader")
-    found = stored_simulation(Account(None, "none", pressed, squeeze, shown), "a", "b", "leader")
+    found = stored_simulation(
+        CarrySimulation(None, "none", pressed, squeeze, shown), "a", "b", "leader"
+    )
     assert found.arrives
     assert found.duration == pytest.approx(carry.duration)
     assert 0.0 <= found.time[0] < 0.02
