@@ -1,4 +1,4 @@
-"""Calibrate a cell from its own runs: `python -m studies.calibrate CELL RUN... --out CELL2`.
+"""Calibrate a cell from its own runs: `dual-arm-carry calibrate CELL RUN... --out CELL2`.
 
 From recordings (MCAP, rosbag2, CSV, RTDE's as well) with a side file in TOML each it
 tells the sensors' offsets and crosstalk, mass, centre of mass, a bracket of the friction, how

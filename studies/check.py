@@ -1,4 +1,4 @@
-"""Judge any joint trajectory of both arms: `python -m studies.check WORKCELL TRAJECTORY`.
+"""Judge any joint trajectory of both arms: `dual-arm-carry check WORKCELL TRAJECTORY`.
 
 The trajectory may be a bundle's, edited or not, or another planner's: CSV, JSON, or ROS 2's
 JointTrajectory in YAML. Tells how well the chain of arms and box is closed, the limits that it

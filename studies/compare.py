@@ -1,4 +1,4 @@
-"""Compare two campaigns: `python -m studies.compare RUN_A RUN_B`.
+"""Compare two campaigns: `dual-arm-carry compare RUN_A RUN_B`.
 
 Prints, per algorithm that both ran, medians and quartiles of every figure over the replicas, an
 exact Mann-Whitney test with its effect size, and what differs between the two configurations;

@@ -1,4 +1,4 @@
-"""A stored trajectory as a bundle that a cell can run: `python -m studies.export FILE`.
+"""A stored trajectory as a bundle that a cell can run: `dual-arm-carry export FILE`.
 
 Plans the whole job around the trajectory (approach, press, lift, carry, set down, release, retreat)
 and writes it as one bundle with a manifest, in a folder of its own below DIR.

@@ -1,4 +1,4 @@
-"""A cell in the browser, to be changed by hand: `python -m studies.live WORKCELL`.
+"""A cell in the browser, to be changed by hand: `dual-arm-carry live WORKCELL`.
 
 Start, goal, bodies around, bases and pads can be dragged; mass, friction and force limit have
 fields. What is changed is judged at once; a button searches for a better carry from the one on the

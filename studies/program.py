@@ -257,7 +257,7 @@ def load_workcell(path: Path) -> Workcell:
             if isinstance(task, dict) and task.keys().isdisjoint({"waypoints", "initial"}):
                 raise DualArmError(
                     f"{error}\nIt has no carry yet; a workcell with one is made of such a problem "
-                    f"file by: python -m studies.propose {shlex.quote(str(path))}"
+                    f"file by: dual-arm-carry propose {shlex.quote(str(path))}"
                 ) from error
         raise
 

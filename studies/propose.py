@@ -130,7 +130,7 @@ def _run(options: argparse.Namespace) -> int:
 def _next_command(options: argparse.Namespace) -> str:
     """Return the command that makes a study of the proposed cell."""
     target = [] if options.target is None else ["--target", options.target]
-    words = ["python", "-m", "studies.run", str(options.output), "--quick", *target]
+    words = ["dual-arm-carry", "run", str(options.output), "--quick", *target]
     return shlex.join(words)
 
 

@@ -1,4 +1,4 @@
-"""Recommend another carry of a study: `python -m studies.recommend RESULTS --force-limit 52`.
+"""Recommend another carry of a study: `dual-arm-carry recommend RESULTS --force-limit 52`.
 
 Times, presses and plans the paths of its drivable fronts anew, for another payload, reference force
 or uncertainty where these are given, and stores the trajectory. The study's own recommendation
@@ -36,6 +36,7 @@ def _add_options(parser: Parser) -> None:
         metavar="FILE",
         help="the trajectory file (default: recommended-WISH.json in RESULTS)",
     )
+    add(parser, "--target", help="of the export that the answer names (default: torque)")
     add(parser, "--quiet")
 
 
@@ -52,11 +53,14 @@ def _uncertainty(text: str) -> float | dict[str, float]:
 
 def _run(options: argparse.Namespace) -> int:
     from hybrid_opt.campaign.results import read_campaign
+    from hybrid_opt.extras.bundles.bundle import require_target
     from hybrid_opt.progress import Progress
     from hybrid_opt.recommending.choice import Wish
     from studies.study.answer import answer
-    from studies.study.recommendation import recommend_from
+    from studies.study.recommendation import EXPORT_TARGET, recommend_from
 
+    target = options.target or EXPORT_TARGET
+    require_target(target)
     root, doubt = options.results, None
     if options.uncertainty is not None:
         known = read_campaign(root).workcell.uncertainty
@@ -64,7 +68,7 @@ def _run(options: argparse.Namespace) -> int:
     wish = Wish(
         options.duration, options.force_limit, options.payload, options.reference_force, doubt
     )
-    found = recommend_from(root, wish, options.output, Progress(not options.quiet))
+    found = recommend_from(root, wish, options.output, Progress(not options.quiet), target)
     print(answer(found, str(root)).terminal())
     return 0
 

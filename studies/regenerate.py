@@ -1,4 +1,4 @@
-"""Generate and compile the functions of a workcell: `python -m studies.regenerate WORKCELL`.
+"""Generate and compile the functions of a workcell: `dual-arm-carry regenerate WORKCELL`.
 
 The compiled functions are kept in the cache (DUAL_ARM_CACHE, by default in the user's cache
 folder).

@@ -1,4 +1,4 @@
-"""Re-evaluate a stored trajectory from its file alone: `python -m studies.replay FILE`.
+"""Re-evaluate a stored trajectory from its file alone: `dual-arm-carry replay FILE`.
 
 Compares its figures with the stored ones, and times it for real robots (studies.export writes it
 for them). Exit code 1 where a figure differs.

@@ -1,4 +1,4 @@
-"""Forces that hold whatever the case: `python -m studies.robust FILE`.
+"""Forces that hold whatever the case: `dual-arm-carry robust FILE`.
 
 What is commanded of a stored trajectory, driven as its job does, so that it holds in every case of
 its workcell's [uncertainty], or of a usual set without one: what the force is made of, its price,

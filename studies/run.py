@@ -1,4 +1,4 @@
-"""Run a whole study of a workcell: `python -m studies.run WORKCELL`."""
+"""Run a whole study of a workcell: `dual-arm-carry run WORKCELL`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Obstacles of another program's scene as bodies of a workcell: `python -m studies.scene SCENE`.
+"""Obstacles of another program's scene as bodies of a workcell: `dual-arm-carry scene SCENE`.
 
 SCENE is SDF (a world or a model), MJCF, or a planning scene of MoveIt (its message in YAML, or the
 text that its panel saves, .scene). Prints the `[[environment]]` tables, or adds them to a workcell

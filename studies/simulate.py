@@ -1,4 +1,4 @@
-"""A simulator as witness of a stored trajectory: `python -m studies.simulate FILE`.
+"""A simulator as witness of a stored trajectory: `dual-arm-carry simulate FILE`.
 
 Drives it in MuJoCo, pressed with multiples of the planned normal forces: the least multiple that
 holds, when and where the box slips, and random cases of the workcell's [uncertainty] under its

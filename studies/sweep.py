@@ -1,4 +1,4 @@
-"""What other numbers do to a carry: `python -m studies.sweep WORKCELL --over KEY=FIRST:LAST:STEP`.
+"""What other numbers do to a carry: `dual-arm-carry sweep WORKCELL --over KEY=FIRST:LAST:STEP`.
 
 For every combination of the values the duration of the recommended carry and the force to press
 with: a table, a figure, and `sweep.json`, which is continued where it exists. KEY is a path of the

@@ -1,8 +1,8 @@
 """Plan a whole job, export it for robots, and store a carry with its whole cell in one file.
 
 `ho.plan_job` plans what happens before and after the carry (docs/explanation/job.md);
-docs/reference/bundles.md describes the targets. A stored carry holds its whole cell; `python -m
-studies.replay` evaluates it anywhere.
+docs/reference/bundles.md describes the targets. A stored carry holds its whole cell;
+`dual-arm-carry replay` evaluates it anywhere.
 """
 
 import hybrid_opt as ho

@@ -1,7 +1,7 @@
 """Compare two algorithms over some seeds; the spread between seeds is part of the answer.
 
-Campaigns with replicas, rank tests and effect sizes are `python -m studies.run` and
-`python -m studies.compare`.
+Campaigns with replicas, rank tests and effect sizes are `dual-arm-carry run` and
+`dual-arm-carry compare`.
 """
 
 import numpy as np

@@ -2,7 +2,7 @@
 
 `ho.sweep` gives duration and commanded force of the recommended carry for every combination of some
 numbers. Without `fixed=True` the path is polished anew in every cell. With `file=` a sweep can be
-continued; with `jobs=` workers share it. `python -m studies.sweep` adds a table and a figure.
+continued; with `jobs=` workers share it. `dual-arm-carry sweep` adds a table and a figure.
 """
 
 import hybrid_opt as ho

@@ -2,7 +2,7 @@
 
 `ho.propose_grip` moves both pads alike on their faces, within ranges [m], to where the hand-made
 path of the cell has the least product of duration and commanded force as robots drive it; with the
-pads there it is certified. `python -m studies.propose --grips` does it for a proposed carry.
+pads there it is certified. `dual-arm-carry propose --grips` does it for a proposed carry.
 """
 
 import hybrid_opt as ho

@@ -1,4 +1,4 @@
-"""The examples, and the cells, problems and robots they read: `python -m studies.examples FOLDER`.
+"""The examples, and the cells, problems and robots they read: `dual-arm-carry examples FOLDER`.
 
 A notebook and numbered programs are copied to FOLDER/studies and run in FOLDER as they do in the
 repository: `python studies/examples/01_evaluate.py`.

@@ -1,4 +1,4 @@
-"""Two campaigns beside one another, for `studies.compare`."""
+"""Two campaigns beside one another, for `dual-arm-carry compare`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What `studies.inspect` finds out about a workcell before a study."""
+"""What `dual-arm-carry inspect` finds out about a workcell before a study."""
 
 from __future__ import annotations
 

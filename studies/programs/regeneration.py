@@ -1,4 +1,4 @@
-"""What `studies.regenerate` does: a workcell's functions as C, compiled, kept and checked."""
+"""A workcell's functions as C: compiled, kept and checked, for `dual-arm-carry regenerate`."""
 
 from __future__ import annotations
 

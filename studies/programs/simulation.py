@@ -1,4 +1,4 @@
-"""What `studies.simulate` does: a stored trajectory under its controllers, or on pads alone."""
+"""A stored trajectory in the simulator: under its controllers, or on pads alone."""
 
 from __future__ import annotations
 

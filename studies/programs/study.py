@@ -17,7 +17,7 @@ from hybrid_opt.campaign import (
     search_stage,
 )
 from hybrid_opt.campaign.polish_stage import polish_stage
-from hybrid_opt.campaign.settings import ALGORITHMS, DRIVABLE, RECOMMENDED_FILE, SUMMARY, chosen
+from hybrid_opt.campaign.settings import ALGORITHMS, DRIVABLE, SUMMARY, chosen
 from hybrid_opt.campaign.stages import (
     build_study,
     decided_cell,
@@ -48,8 +48,12 @@ from hybrid_opt.static_hold import require_hold
 from studies.options import QUICK_EVALUATIONS, QUICK_REPLICAS
 from studies.program import load_workcell
 from studies.report import PAGE, TABLES
-from studies.study.answer import export_command
-from studies.study.recommendation import is_drivable, known_paths, recommendation_stage
+from studies.study.recommendation import (
+    EXPORT_TARGET,
+    is_drivable,
+    known_paths,
+    recommendation_stage,
+)
 from studies.study.simulation import (
     limits_on_jerk,
     read_simulations,
@@ -79,6 +83,7 @@ class StudySettings:
         drivable_replicas: of that search per algorithm, see `drivable_settings`.
         drivable_polish: how their fronts are polished, None for not at all.
         wish: what is asked of the recommended one of them.
+        target: of the export that the recommendation names, None for any simulator.
         simulate: whether the selected carries are driven in the simulated cell.
         report: whether figures, tables and the page are written.
         with_paper: whether the figures stand beside those that the paper states.
@@ -92,6 +97,7 @@ class StudySettings:
     drivable_replicas: int | None = None
     drivable_polish: PolishSettings | None = None
     wish: Wish = field(default_factory=Wish)
+    target: str | None = None
     simulate: bool = False
     report: bool = True
     with_paper: bool = False
@@ -114,7 +120,7 @@ def stages(study: StudySettings, alone: bool = False) -> tuple[Stage, ...]:
         driven = [search_stage(), *inner, summary_stage(), timing_stage(curves=False)]
         every.append(drivable_stage(driven, study.drivable_replicas))
     if study.drivable:
-        every.append(recommendation_stage(study.wish))
+        every.append(recommendation_stage(study.wish, study.target or EXPORT_TARGET))
     every.append(summary_stage("" if study.drivable else NOT_ASKED))
     if study.recommend_only:
         return tuple(every)
@@ -251,6 +257,7 @@ def make_study(path: Path, options: argparse.Namespace, with_paper: bool) -> Non
         drivable_replicas=options.drivable_replicas,
         drivable_polish=polish_settings(options, True, is_drivable=True),
         wish=Wish(options.duration, options.force_limit, options.payload),
+        target=options.target,
         simulate=options.simulate,
         report=options.report and not options.recommend_only,
         recommend_only=options.recommend_only,
@@ -261,11 +268,6 @@ def make_study(path: Path, options: argparse.Namespace, with_paper: bool) -> Non
     print(run_study(cell, settings, execution, Progress(not options.quiet), study))
     if study.report:
         print(f"Report: {execution.output / PAGE}; all tables: {execution.output / TABLES}")
-    recommended = read_summary(execution.output).recommendation
-    if options.target is not None and recommended is not None and recommended.has_job:
-        # The answer names the export for any simulator.
-        command = export_command(execution.output / RECOMMENDED_FILE, options.target)
-        print(f"for {options.target}: {command}")
     if options.animation or options.view:
         from studies.report.looks import follow_looks
 

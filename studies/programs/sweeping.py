@@ -1,4 +1,4 @@
-"""What `studies.sweep` does: the first path, every combination, a table and a figure."""
+"""What `dual-arm-carry sweep` does: the first path, every combination, a table and a figure."""
 
 from __future__ import annotations
 

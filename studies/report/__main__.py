@@ -1,6 +1,6 @@
 """Write a study's report anew, animate its trajectory, or watch it.
 
-`python -m studies.report RESULTS` needs nothing but the results folder of a study.
+`dual-arm-carry report RESULTS` needs nothing but the results folder of a study.
 """
 
 from __future__ import annotations

@@ -284,7 +284,7 @@ def _paper_text(data: ReportData) -> str:
             "<p>The same pictures lie beside this page in the folder <code>figures</code>: as PNG "
             "and, but for a quick study, PDF.</p>"
         )
-    command = "python -m studies.report . --paper"
+    command = "dual-arm-carry report . --paper"
     return (
         "<p>The paper's pictures, and the carries of its search on this page: "
         f"<code>{command}</code> in the folder of this page.</p>"

@@ -1,6 +1,6 @@
 """The words and numbers that a study opens with: the carry to run, in every program the same.
 
-The terminal prints them, the page shows them first, `studies.replay` and `studies.export` repeat
+The terminal prints them, the page shows them first, `replay` and `export` repeat
 the line of the carry. Forces are commanded ones unless they are called planned.
 """
 
@@ -21,8 +21,6 @@ from studies.study.recommendation import StoredRecommendation
 
 State = Literal["good", "doubtful", "bad"]
 """Verdicts on a carry: it holds in every case without a warning; with one; it does not fit."""
-
-EXPORT_TARGET = "torque"
 
 ADVICE, NOTICED = 3, 0.05
 """Most changes that a terminal lists, and the least change of the force by one [N]."""
@@ -135,7 +133,7 @@ def answer(found: StoredRecommendation, folder: str) -> StudyAnswer:
         details.append(Fact("checked", _checked(found.price)))
     commands = [Fact("file", str(file))]
     if found.has_job:
-        commands.append(Fact("next", export_command(file), is_command=True))
+        commands.append(Fact("next", export_command(file, found.target), is_command=True))
     details.append(Fact("with this force", f"{'; '.join(_margins(found)) or 'not known'}"))
     return StudyAnswer(
         state_of(found),
@@ -183,7 +181,7 @@ def holds_text(found: StoredRecommendation) -> str:
     return f"in every case of {found.price.uncertainty.title}"
 
 
-def export_command(path: Path, target: str = EXPORT_TARGET) -> str:
+def export_command(path: Path, target: str) -> str:
     """Return the command that makes of a trajectory file, timed within its own limits, what robots
     need.
 
@@ -192,7 +190,7 @@ def export_command(path: Path, target: str = EXPORT_TARGET) -> str:
     """
     output = path.with_name(f"{path.stem}-{target}")
     return (
-        f"python -m studies.export {shlex.quote(str(path))} --target {target} "
+        f"dual-arm-carry export {shlex.quote(str(path))} --target {target} "
         f"--output {shlex.quote(str(output))}"
     )
 

@@ -77,6 +77,10 @@ class ForceTable:
     rows: tuple[StoredDurations, ...]
 
 
+EXPORT_TARGET = "torque"
+"""Target of the export that a study names by default: its bundle runs in a simulator."""
+
+
 @dataclass(frozen=True)
 class StoredRecommendation:
     """The carry to run.
@@ -96,6 +100,7 @@ class StoredRecommendation:
         without_jerk: duration without the cell's limits on jerk [s], null where there are none.
         squeeze, squeeze_reason: largest normal force to command of each robot [N], and why.
         order: what the force asks of the contacts, as in 'press with'.
+        target: of the export that the study names.
         payload_limit: payload that the robots bear on the same motion with planned forces, nothing
             uncertain [kg].
         rivals: other paths at the same force and in the same time, the hand-made one first.
@@ -141,6 +146,7 @@ class StoredRecommendation:
     remedies: tuple[Remedy, ...] = ()
     reserve: Reserve | None = None
     order: str = "press with"
+    target: str = EXPORT_TARGET
 
     @property
     def has_job(self) -> bool:
@@ -170,15 +176,19 @@ class NoRecommendation:
     reason: str
 
 
-def recommendation_stage(wish: ho.Wish) -> Stage:
+def recommendation_stage(wish: ho.Wish, target: str) -> Stage:
     """Return the stage that writes `recommended.json`, a trajectory file, and
-    `recommendation.json`, or `no-recommendation.json`."""
+    `recommendation.json`, or `no-recommendation.json`.
+
+    Args:
+        target: of the export that the recommendation names.
+    """
 
     def run(folder: CampaignFolder, progress: Progress) -> None:
         found: StoredRecommendation | NoRecommendation
         try:
             path, threads = folder.root / RECOMMENDED_FILE, folder.execution.jobs
-            found = recommend_from(folder.root, wish, path, progress, threads)
+            found = recommend_from(folder.root, wish, path, progress, target, threads)
         except NoCarryError as error:
             found = NoRecommendation(str(error))
         none = isinstance(found, NoRecommendation)
@@ -187,7 +197,7 @@ def recommendation_stage(wish: ho.Wish) -> Stage:
         (folder.root / other).unlink(missing_ok=True)
         write_json(folder.root / written, to_json(found))
 
-    return Stage("recommendation", run, to_json(wish))
+    return Stage("recommendation", run, {"wish": to_json(wish), "target": target})
 
 
 def read_recommendation(root: Path) -> StoredRecommendation | NoRecommendation | None:
@@ -206,13 +216,19 @@ def read_recommendation(root: Path) -> StoredRecommendation | NoRecommendation |
 
 
 def recommend_from(
-    root: Path, wish: ho.Wish, path: Path, progress: Progress, threads: int = 0
+    root: Path,
+    wish: ho.Wish,
+    path: Path,
+    progress: Progress,
+    target: str = EXPORT_TARGET,
+    threads: int = 0,
 ) -> StoredRecommendation:
     """Recommend a carry of a study's drivable fronts, and store it; returns what is said of it.
 
     Args:
         root: the results folder, its drivable experiment done.
         path: the trajectory file to write.
+        target: of the export that the recommendation names.
         threads: threads that time carries, 0 for one per core; results do not depend on it.
 
     Raises:
@@ -285,6 +301,7 @@ def recommend_from(
         remedies=found.remedies,
         reserve=found.reserve,
         order=found.squeeze.order,
+        target=target,
     )
 
 

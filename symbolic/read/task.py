@@ -158,7 +158,7 @@ def _orientation(table: TableReader) -> Orientation:
 
 def _force_limit(table: TableReader) -> tuple[float, float]:
     """Read the bounds of the force limit; the upper one is infinite if the file has none."""
-    if "force_limit" not in table:
+    if not table.has("force_limit"):
         return (0.0, np.inf)
     low, high = table.vector("force_limit", (quantity.FORCE,) * 2)
     if low > high:

@@ -227,7 +227,7 @@ def test_a_problem_file_names_the_program_for_it(
     assert import_module(f"studies.{name}").main([str(problem)]) == 2
     told = capsys.readouterr().err
     assert "contacts[0].xyz: is missing" in told
-    assert told.endswith(f"by: python -m studies.propose {problem}\n")
+    assert told.endswith(f"by: dual-arm-carry propose {problem}\n")
 
 
 def test_a_programs_name_stands_before_its_message(capsys: pytest.CaptureFixture[str]) -> None:

@@ -225,7 +225,7 @@ def _csv_columns(text: str) -> tuple[Columns, tuple[float, float] | None]:
 
 def _document_columns(document: Any) -> Columns:
     if document.get("format") == CARRY_FORMAT:
-        raise ValueError("it is a stored carry: export it first (python -m studies.export)")
+        raise ValueError("it is a stored carry: export it first (dual-arm-carry export)")
     if "robots" in document:
         found = {
             (what, f"{robot['name']}/{joint}"): values.astype(float)

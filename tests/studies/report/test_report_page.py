@@ -256,7 +256,7 @@ def test_without_the_papers_pictures_the_page_has_the_recommended_carry_alone(
     assert [group["label"] for group in document["lists"]][-1] == "Hand-made"
     assert len(document["views"]) == 1
     page = generate.render_page(brief, document, report_tables(brief, False), [""] * len(names))
-    assert "python -m studies.report . --paper" in page
+    assert "dual-arm-carry report . --paper" in page
     assert "Table 1. Quality of the search." in page
 
 

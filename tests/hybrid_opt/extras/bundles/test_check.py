@@ -129,7 +129,7 @@ def test_what_lies_between_samples_counts(tmp_path: Path) -> None:
         (
             "carry.json",
             json.dumps({"format": TRAJECTORY_FORMAT, "version": 1}),
-            r"it is a stored carry: export it first \(python -m studies.export\)",
+            r"it is a stored carry: export it first \(dual-arm-carry export\)",
         ),
         ("e.csv", "a,b\n1,2\n", "no joint trajectory"),
         ("f.csv", "", "no joint trajectory"),
