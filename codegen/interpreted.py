@@ -1,12 +1,16 @@
 """CasADi's own evaluation, the oracle of the compiled functions: outputs and first derivatives.
 
-It also serves where a function is evaluated so few times that compiling it would take longer.
+It also serves where a function is evaluated so few times that compiling it would take longer. Then
+CasADi's instructions of a function of scalars are run over many samples at once (`tape.cpp`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache, cached_property
+from importlib import import_module
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -18,6 +22,8 @@ from codegen.errors import CodegenError
 from codegen.function import NumericFunction, Signature
 from codegen.source import dense
 from symbolic.array import Array
+from symbolic.errors import BridgeError
+from symbolic.robot.bridge import REMEDY
 
 AGREEMENT_TOLERANCE = 1e-10
 """Largest relative difference allowed between compiled and interpreted."""
@@ -27,8 +33,47 @@ RESIDUE = 1e-6
 compared to this instead of to their own size."""
 
 
+@cache
+def compiled_tape() -> Any:
+    """Load the compiled module.
+
+    Raises:
+        BridgeError: it is missing or cannot be loaded.
+    """
+    try:
+        return import_module("codegen._tape")
+    except ImportError as error:
+        raise BridgeError(
+            f"the compiled part of the interpreter cannot be loaded ({error}); {REMEDY}"
+        ) from error
+
+
+def tape_of(function: ca.Function) -> Any:
+    """Return the instructions of a function of scalars for many samples at once; None where it is
+    no such function, or has others than `tape.cpp` knows."""
+    if not function.is_a("SXFunction"):
+        return None
+    known = {getattr(ca, f"OP_{name}"): k for k, name in enumerate(compiled_tape().OPERATIONS)}
+    numbers = range(function.n_instructions())
+    codes = [function.instruction_id(k) for k in numbers]
+    if not known.keys() >= set(codes):
+        return None
+    rows = []
+    for k, code in zip(numbers, codes, strict=True):
+        given, made = function.instruction_input(k), function.instruction_output(k)
+        constant = function.instruction_constant(k) if code == ca.OP_CONST else 0.0
+        if code == ca.OP_INPUT:
+            row = (made[0], *given)
+        elif code == ca.OP_OUTPUT:
+            row = (made[0], given[0], made[1])
+        else:
+            row = (made[0], *given, *[0] * (2 - len(given)))
+        rows.append((known[code], *row, constant))
+    return compiled_tape().Tape(*map(list, zip(*rows, strict=True)), function.sz_w())
+
+
 class InterpretedFunction(NumericFunction):
-    """A CasADi function evaluated by CasADi's interpreter: the same results, slower.
+    """A CasADi function evaluated by its instructions: the same results, slower.
 
     Attributes:
         function: what it wraps.
@@ -50,6 +95,9 @@ class InterpretedFunction(NumericFunction):
         n: int,
         threads: int,
     ) -> None:
+        if n > 1 and self._tape is not None:
+            self._tape.run(list(inputs), list(batched), list(outputs), n)
+            return
         # One evaluation's memory serves all: CasADi is told addresses once a batch.
         own = [
             np.empty(array.shape[1:]) if per else array
@@ -66,6 +114,10 @@ class InterpretedFunction(NumericFunction):
             evaluate()
             for array, one in zip(outputs, found, strict=True):
                 array[k] = one
+
+    @cached_property
+    def _tape(self) -> Any:
+        return tape_of(self.function)
 
     def _evaluator(self, inputs: Sequence[Array], outputs: Sequence[Array]) -> Callable[[], None]:
         """Bind the function to arrays that it reads and writes at each call."""

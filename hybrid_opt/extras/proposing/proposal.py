@@ -51,7 +51,7 @@ from hybrid_opt.extras.proposing.via_points import (
 )
 from hybrid_opt.progress import ShowProgress, as_callback, progress_bar
 from symbolic.array import Array
-from symbolic.cell_model import CellBodies
+from symbolic.cell_model import CellBodies, build_cell_bodies
 from symbolic.errors import SettingsError, WorkcellError
 from symbolic.path.spline import path_basis
 from symbolic.records import POSE_SIZE, Workcell
@@ -481,6 +481,7 @@ class _Search:
     ) -> Trial:
         """Build the trial of the carry through waypoints (n, 6 + m); bodies as in `Trial`."""
         workcell = self._workcell(self._draft(setup, pair, waypoints))
+        bodies = bodies or build_cell_bodies(workcell, setup.bodies)
         return Trial(workcell, pair.start.q, bodies, named=False)
 
     def _pads_way(self, trial: Trial) -> tuple[str, float | None]:

@@ -35,8 +35,8 @@ from hybrid_opt.extras.proposing.trial import MARGINS, PoseJudge, judge_of
 from hybrid_opt.robust.budget import budget_text
 from hybrid_opt.static_hold import require_hold
 from symbolic.array import Array
+from symbolic.cell_model import CellBodies, build_cell_bodies
 from symbolic.contact.registry import require_squeeze
-from symbolic.geometry.pairs import build_geometry
 from symbolic.read.arms import FOLLOWING, arm_model, common_joints, turning_joints
 from symbolic.read.editing import merged
 from symbolic.records import POSE_SIZE, Task, Workcell
@@ -159,11 +159,13 @@ class Setup:
     Attributes:
         given: what was added to the problem's tables before, such as bases.
         workcell: the cell, its redundant joints chosen.
+        bodies: its arms and bodies.
         pairs: the most promising first.
     """
 
     given: dict[str, Any]
     workcell: Workcell
+    bodies: CellBodies
     pairs: list[Pair]
 
 
@@ -195,7 +197,8 @@ def prepare(
     lacking = reach_missing(workcell, (start, goal), spins)
     if lacking:
         raise ProposalError(lacking)
-    judge = judge_of(build_geometry(workcell))
+    bodies = build_cell_bodies(workcell)
+    judge = judge_of(bodies)
     blocked = box_blocked(judge, start, goal)
     if blocked:
         raise ProposalError(blocked)
@@ -212,7 +215,7 @@ def prepare(
             break
     if not pairs:
         raise ProposalError(_no_pair(query, judge, max(tried, key=_progress)))
-    return Setup(given, workcell, sorted(pairs, key=lambda pair: -pair.promise))
+    return Setup(given, workcell, bodies, sorted(pairs, key=lambda pair: -pair.promise))
 
 
 def _progress(searches: Sequence[HoldSearch]) -> tuple[float, ...]:

@@ -29,14 +29,12 @@ from symbolic.cell_model import (
 from symbolic.contact.registry import contact_model
 from symbolic.functions import motion_function
 from symbolic.geometry.bodies import MeshReader, shape_pieces
-from symbolic.geometry.clearance import screening_functions
 from symbolic.geometry.pairs import CellGeometry, coal_distance
 from symbolic.geometry.pieces import Piece, support
 from symbolic.records import PAYLOAD_NAME, Handling, Workcell
 from symbolic.records.poses import box_placement
 from symbolic.records.task import initial_decision
 from symbolic.robot.branches import StartBranch
-from symbolic.robot.model import build_robot_model
 
 MARGINS = (0.01, 0.004, 0.0015, 0.0005, 0.0)
 """Clearances that a first path may keep beyond the cell's tolerance, the widest possible counts
@@ -245,18 +243,13 @@ class PoseJudge:
         return None if touch is None else (touch.first, touch.second)
 
 
-def judge_of(geometry: CellGeometry) -> PoseJudge:
-    """Build the judge of a cell's collisions, without a margin.
-
-    Raises:
-        RobotModelError: a URDF does not give an arm.
-    """
-    models = [build_robot_model(robot) for robot in geometry.workcell.robots]
-    made = screening_functions(geometry, (models[0].joint_placements, models[1].joint_placements))
+def judge_of(bodies: CellBodies) -> PoseJudge:
+    """Build the judge of a cell's collisions, without a margin."""
+    made = bodies.screening
     functions = {
         name: InterpretedFunction(made[name]) for name in made if not name.endswith("motion")
     }
-    return PoseJudge(geometry, CollisionChecker(geometry, functions), 0.0)
+    return PoseJudge(bodies.geometry, CollisionChecker(bodies.geometry, functions), 0.0)
 
 
 SAME_BRANCH = 0.02

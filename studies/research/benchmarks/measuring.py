@@ -22,8 +22,8 @@ from hybrid_opt.extras.proposing.trial import judge_of
 from hybrid_opt.extras.proposing.via_points import path_length
 from studies.research.turns import progress
 from symbolic.array import Array
+from symbolic.cell_model import build_cell_bodies
 from symbolic.errors import OutsideError, SettingsError
-from symbolic.geometry.pairs import build_geometry
 from symbolic.read.cell import load
 from symbolic.read.editing import completed
 from symbolic.safe_io import replace_file
@@ -251,7 +251,7 @@ def checks_per_second(workcell: Path, rng: np.random.Generator) -> float:
     """How many random configurations of both arms a cell's collision judge looks at in a second of
     work, nothing of it compiled, as a proposal asks it."""
     cell = load(workcell)
-    judge = judge_of(build_geometry(cell))
+    judge = judge_of(build_cell_bodies(cell))
     q_1, q_2 = (
         rng.uniform(arm.lower, arm.upper, (CHECKS, arm.joints)) for arm in judge.geometry.arms
     )

@@ -31,14 +31,16 @@ from hybrid_opt.extras.proposing.holding import (
     clear_spins,
     find_holds,
     possible_spins,
+    rotate_about_normal,
 )
 from hybrid_opt.extras.proposing.problem import Problem, read_problem
 from hybrid_opt.extras.proposing.setup import Setup, prepare, reach_missing
 from hybrid_opt.extras.proposing.trial import judge_of
 from hybrid_opt.job.plan import job_geometry
 from symbolic.array import Array
+from symbolic.cell_model import build_cell_bodies
 from symbolic.errors import SettingsError, WorkcellError
-from symbolic.geometry.pairs import build_geometry, coal_distance
+from symbolic.geometry.pairs import coal_distance
 from symbolic.read.arms import arm_model
 from symbolic.read.cell import load
 from symbolic.read.editing import completed, merged
@@ -124,7 +126,7 @@ def test_spins_are_left_out_at_which_the_pad_meets_what_stands(rack_cell: Workce
     at = pose_matrix(np.array([0.22, 0.0, -0.05]), np.zeros(3))
     bar = Body("bar", Box(np.full(3, 0.1)), pad @ at)
     cell = replace(rack_cell, robots=(robot, rack_cell.robots[1]), environment=(bar,))
-    judge, arm = judge_of(build_geometry(cell)), ArmKinematics(cell, 0)
+    judge, arm = judge_of(build_cell_bodies(cell)), ArmKinematics(cell, 0)
     spins = SPINS[::3]
     query = HoldQuery(start, goal, spins, judge)
     np.testing.assert_allclose(clear_spins(query, arm, spins), spins[1:])
@@ -417,3 +419,19 @@ def test_what_is_left_leads_around_the_shelf() -> None:
     farthest = found[np.arange(len(found)), np.abs(found[:, :, :2]).sum(axis=2).argmax(axis=1)]
     assert 0 < len(found) < len(every) / 3
     assert np.all(farthest[:, 0] < 0.1), "through the back"
+
+
+def test_a_cell_that_holds_the_box_otherwise_shares_functions_that_say_the_same(
+    rack_cell: Workcell,
+) -> None:
+    """Turned pads change no pair that may meet; a thing that stands there does."""
+    known, rng = build_cell_bodies(rack_cell), np.random.default_rng(0)
+    first, second = (rotate_about_normal(contact, 1.0) for contact in rack_cell.contacts)
+    turned = replace(rack_cell, contacts=(first, second))
+    shared, own = build_cell_bodies(turned, known), build_cell_bodies(turned)
+    assert shared.screening is known.screening
+    at = [rng.normal(size=6) for _ in range(3)]
+    for name in ("clearance", "piece_poses"):
+        np.testing.assert_array_equal(shared.screening[name](*at)[0], own.screening[name](*at)[0])
+    emptied = build_cell_bodies(replace(rack_cell, environment=()), known)
+    assert emptied.screening is not known.screening

@@ -34,9 +34,8 @@ from hybrid_opt.extras.proposing.via_points import (
     shorten_spline,
 )
 from symbolic.array import Array
-from symbolic.cell_model import build_cell_model, own_pairs
+from symbolic.cell_model import build_cell_bodies, build_cell_model, own_pairs
 from symbolic.functions import CONSTRAINTS, candidate_function, motion_function
-from symbolic.geometry.pairs import build_geometry
 from symbolic.geometry.pieces import support
 from symbolic.path.spline import path_basis
 from symbolic.read.cell import load
@@ -162,7 +161,7 @@ def test_the_torso_counts_for_both_arms_of_a_machine(tmp_path: Path) -> None:
     path.write_text(BAXTER, encoding="utf-8")
     problem = read_problem(path)
     given = redundancy(problem, problem.workcell({}))
-    judge = judge_of(build_geometry(problem.workcell(given)))
+    judge = judge_of(build_cell_bodies(problem.workcell(given)))
     rng, met = np.random.default_rng(0), []
     pose = np.array([2.0, 0.0, 1.0, 0.0, 0.0, 0.0])
     for arm in (0, 1):
