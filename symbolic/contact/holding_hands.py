@@ -9,11 +9,11 @@ with G + N. It needs
     G >= sqrt(|T|^2 + t^2 + kappa |T| t) / mu - N,  t = |tau| / c,  so that nothing slides.      (2)
 
 The kern is the shift of the centre of pressure that takes the pressure off a rim; of a rectangle
-both axes add up. c is the mean distance of the patch's points from its centre. kappa fits (2) to
-the limit curve of a patch under even pressure (Howe and Cutkosky, IJRR 1996): a disc needs 0 to
-2.1 % more than exact, the ring of a cup's lip 0 to 3.0 %, a rectangle -0.2 to 10.5 % up to sides of
-2 to 1. Both right sides are convex in the load and of degree one: a multiple of the load needs the
-multiple of the force, and a sum needs at most the sum.
+both axes add up. c is the mean distance of the patch's points from its centre. kappa makes (2)
+safe against the limit curve of a patch under even pressure (Howe and Cutkosky, IJRR 1996): a disc
+needs 0 to 2.1 % more than exact, the ring of a cup's lip 0 to 3.0 %, a rectangle 0 to 11 % up to
+sides of 2 to 1, and up to 21 % at 5 to 1. Both right sides are convex in the load and of degree
+one: a multiple of the load needs the multiple of the force, and a sum needs at most the sum.
 
 Each hand is to hold its own share, although others could take over what it cannot: a cup that
 slides or lifts leaks.
@@ -39,9 +39,12 @@ from symbolic.records.cell import Uncertainty
 from symbolic.records.numbered import NumberedContact
 from symbolic.records.quantities import GRAVITY
 
-KAPPA_DISC, KAPPA = 0.3, 0.5
-"""Coefficients of (2) for discs, and for rings and rectangles: the least of one digit that never
-asks a disc or a ring for less than its limit curve does."""
+KAPPA_DISC, KAPPA_RING = 0.3, 0.5
+"""Coefficients of (2): the least of one digit that never ask for less than the limit curve does."""
+
+KAPPA_RECTANGLE = (0.75, 0.7)
+"""Likewise a and b of the coefficient 1 - 1 / (a + b q) of a rectangle whose sides are as q to 1:
+0.31 of a square, 1 of a line."""
 
 FLOOR = 1e-9
 """Added in squares to forces [N] and moments [N m], so that lengths have slopes at zero."""
@@ -61,14 +64,18 @@ class HandPatch:
     kern: tuple[Expression, Expression]
     is_round: bool
     twist: Expression
-    kappa: float
+    kappa: Expression
 
     @classmethod
     def of(cls, hand: Contact) -> HandPatch:
         """Return the patch of a hand, whose lengths may be symbols."""
         is_round = hand.half_sides is None
         twist = hand.patch_radius if hand.is_ring else SoftPatch.of(hand, np.eye(3)).twist
-        kappa = KAPPA_DISC if is_round and not hand.is_ring else KAPPA
+        kappa: Expression = KAPPA_RING if hand.is_ring else KAPPA_DISC
+        if hand.half_sides is not None:
+            x, y = hand.half_sides
+            offset, slope = KAPPA_RECTANGLE
+            kappa = 1.0 - 1.0 / (offset + slope * ca.fmax(x, y) / ca.fmin(x, y))
         return cls(kern(hand), is_round, number(twist), kappa)
 
 

@@ -226,11 +226,19 @@ def least_against_sliding(hand: Contact, wrench: Array, count: int) -> float:
     return float(found[0] - wrench[2])
 
 
-@pytest.mark.parametrize("name", sorted(HANDS))
-@pytest.mark.parametrize("lever", [0.0, 0.1, 0.3, 0.7, 1.5, 100.0])
+RECTANGLES = {
+    f"{x:g} to {y:g}": replace(
+        FINGER, half_sides=(0.005 * x, 0.005 * y), patch_radius=0.005 * np.hypot(x, y)
+    )
+    for x, y in [(1.0, 1.0), (2.0, 1.0), (1.0, 3.0), (5.0, 1.0), (10.0, 1.0)]
+}
+
+
+@pytest.mark.parametrize("name", [*sorted(HANDS), *RECTANGLES])
+@pytest.mark.parametrize("lever", [0.0, 0.1, 0.2, 0.3, 0.7, 1.5, 100.0])
 def test_sliding_needs_what_even_pressure_bears(name: str, lever: float) -> None:
     """Torsion in radii times the tangential force; the model is on the safe side."""
-    hand, beyond = HANDS[name], {"disc": 0.022, "cup": 0.031, "finger": 0.11}[name]
+    hand, beyond = (HANDS | RECTANGLES)[name], {"disc": 0.022, "cup": 0.031}.get(name, 0.25)
     for angle in (0.0, 0.6, 1.57):
         tangential = np.array([np.cos(angle), np.sin(angle)]) / (1.0 + lever) * 40.0
         torsion = lever / (1.0 + lever) * 40.0 * hand.patch_radius
