@@ -30,6 +30,11 @@ PATIENCE = 300.0
 OPTION = {"cone": "elliptic", "impratio": "50"}
 """Of MuJoCo: with its defaults what is held by friction creeps (documentation of `impratio`)."""
 
+FRICTION = "0.002 1"
+"""Time constant of friction in contacts with the pads [s], two steps. MuJoCo's constraints neglect
+the acceleration that the arms' joints cause at constant speeds, here up to 0.5 m/s^2; friction lets
+a held box slide by that over 2 / time constant: with the usual 0.02 s at 5 mm/s."""
+
 CYCLE = 0.001
 """Of libfranka [s]."""
 
@@ -75,6 +80,10 @@ class Scene:
             assert isinstance(pad.shape, Box)
             geom = _box(flange, f"pad_{robot.name}", pad.shape.size, friction, mass="0.2")
             _place(geom, pad.pose)
+            contact = simulator.scene.find("contact")
+            assert contact is not None
+            pair = {"geom1": f"pad_{robot.name}", "geom2": "box", "solreffriction": FRICTION}
+            ElementTree.SubElement(contact, "pair", pair)
         size = self.cell.payload.size
         for name, pose in (("start", self.start), ("goal", self.goal)):
             height = pose[2] - size[2] / 2.0

