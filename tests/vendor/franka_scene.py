@@ -134,13 +134,10 @@ def simulate(scene: Scene, there: Connection, now: Any) -> None:
                 server.run_once()
                 if there.poll():
                     return
+            now[:] = _state(simulator, scene.cell)
             while _hear(server, fresh, there):
                 simulator.step()
-                data = simulator.data
-                assert data is not None
-                forces = [_pressed(simulator, f"pad_{robot.name}") for robot in scene.cell.robots]
-                box = data.body("box")
-                now[:] = [*forces, *box.xpos, *box.xquat]
+                now[:] = _state(simulator, scene.cell)
                 for each in server.robot_servers:
                     each.send_state()
 
@@ -171,6 +168,14 @@ def _hear(server: SimulationServer, fresh: list[bool], there: Connection) -> boo
         if there.poll() or now > begin + PATIENCE:
             return False
     return True
+
+
+def _state(simulator: MujocoSimulator, cell: Workcell) -> list[float]:
+    """Force of each pad on the box [N], place of the box [m], its quaternion."""
+    assert simulator.data is not None
+    box = simulator.data.body("box")
+    forces = [_pressed(simulator, f"pad_{robot.name}") for robot in cell.robots]
+    return [*forces, *box.xpos, *box.xquat]
 
 
 def _pressed(simulator: MujocoSimulator, pad: str) -> float:
