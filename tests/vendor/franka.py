@@ -174,18 +174,19 @@ class Outcome:
         return np.array(self.document["box"]["pose"][-1][:3])
 
 
-def carry(cell: Workcell, files: Contents, share: float = 1.0) -> Outcome:
+def carry(cell: Workcell, files: Contents, share: float = 1.0, high: float = 0.0) -> Outcome:
     """Run a bundle of two Frankas in a scene of two FR3.
 
     Args:
         cell: of the bundle.
         files: of the bundle.
         share: of the feed-forward efforts that is commanded; the sensors feel it as the whole.
+        high: by which the support at the goal is higher than planned [m].
     """
     document = json.loads(files["job.json"])
     first = [tuple(robot["position"][0]) for robot in document["robots"]]
     poses = np.array(document["box"]["pose"])
-    scene = Scene(cell, (first[0], first[1]), poses[0], poses[-1])
+    scene = Scene(cell, (first[0], first[1]), poses[0], poses[-1] + high * np.eye(6)[2])
     spawn = mp.get_context("spawn")
     here, there = spawn.Pipe()
     now = spawn.Array("d", 9, lock=False)

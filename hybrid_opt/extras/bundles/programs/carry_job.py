@@ -49,6 +49,9 @@ UNLOADED = 0.07
 """Largest force before the first contact, over the largest commanded one: an offset of the sensor
 becomes an error of the squeeze."""
 
+TOUCH = 0.005
+"""A box that is set down may stand so far above its planned place [m]."""
+
 STRIKES = 3
 """Looks in a row at which something has to be wrong, beside a stop that is asked for."""
 
@@ -107,6 +110,7 @@ class Job:
         self._phases: list[tuple[float, str]] = [
             (self.time[phase["last"]], phase["name"]) for phase in document["phases"]
         ]
+        self._early: list[tuple[list[float], list[float]]] | None = None
 
     @classmethod
     def read(cls, path: Path) -> Job:
@@ -143,6 +147,38 @@ class Job:
             first = last
         return self.end
 
+    def is_touching(self, s: float) -> bool:
+        """Return True if the box is so low in its set-down that it may stand."""
+        if self.phase(s) != "set_down" or self.is_standing:
+            return False
+        places, (k, x, _) = self.document["box"]["pose"], self._place(s)
+        last = places[bisect_right(self.time, self.begin("release")) - 1][:3]
+        here = ((1.0 - x) * a + x * b for a, b in zip(places[k], places[k + 1], strict=True))
+        return math.dist(last, list(here)[:3]) <= TOUCH
+
+    def stand(self, s: float, q: Sequence[Sequence[float] | None]) -> None:
+        """Move the release and what follows to a coordinate of the set-down, because the box stands
+        there.
+
+        As the commanded forces fall, the arms' references move to where the arms are, so that those
+        which are soft let go as well.
+
+        Args:
+            q: measured joint positions of each arm; None where there are none [rad, m].
+        """
+        end, self._early = self.begin("release"), None
+        ways = []
+        for arm, known in enumerate(q):
+            here, planned = self.position(arm, s), self.position(arm, end)
+            up = [a - b for a, b in zip(here, planned, strict=True)]
+            ways.append((up, [a - b for a, b in zip(known or here, here, strict=True)]))
+        self._early = ways
+
+    @property
+    def is_standing(self) -> bool:
+        """True if the box stood before the end of its set-down."""
+        return self._early is not None
+
     @cached_property
     def pressed(self) -> float:
         """The coordinate from which the pads hold the box alone: the end of its press."""
@@ -160,10 +196,16 @@ class Job:
         q, v = self.robots[arm]["position"], self.robots[arm]["velocity"]
         a, b = (1.0 + 2.0 * x) * (1.0 - x) ** 2, x * (1.0 - x) ** 2 * step
         c, d = x * x * (3.0 - 2.0 * x), x * x * (x - 1.0) * step
-        return [
+        found = [
             a * q0 + b * v0 + c * q1 + d * v1
             for q0, v0, q1, v1 in zip(q[k], v[k], q[k + 1], v[k + 1], strict=True)
         ]
+        release = self.begin("release") if self._early else math.inf
+        if self._early and s >= release:
+            free = 1.0 - self.force(arm, s) / self.force(arm, release)
+            ways = zip(found, *self._early[arm], strict=True)
+            return [own + up + free * off for own, up, off in ways]
+        return found
 
     def linear(self, arm: int, name: str, s: float) -> list[float]:
         """Interpolate a list per sample of an arm linearly between samples."""
@@ -324,7 +366,8 @@ class Seen:
 
 
 class Machine:
-    """Runs a job: `ready`, `running`, `stopping`, `held`, `done`.
+    """Runs a job: `ready`, `running`, `stopping`, `held`, `done`; `landing` stops where the box
+    stands before the end of its set-down, and goes on with the release there.
 
     Attributes:
         state: one of these.
@@ -391,6 +434,8 @@ class Machine:
         """
         if self.state != "held":
             raise Refused(f"the job is {self.state}; it goes on only from where it is held")
+        if direction < 0.0 and self.job.is_standing:
+            raise Refused("the box stands: 'continue' lets go of it")
         if seen.fault:
             raise Refused(seen.fault)
         self._require_places(seen, self.job.limits.path)
@@ -407,18 +452,39 @@ class Machine:
                 (self.clock.rate > 0.0 and self.clock.s >= self.job.end)
                 or (self.clock.rate < 0.0 and self.clock.s <= 0.0)
             ):
-                wrong = self._wrong(seen)
+                wrong = self._wrong(seen) or self._wrong_force(seen)
                 if wrong:
                     self.hold(wrong)
                 else:
                     self.state = "done"
                 return
-            wrong = self._wrong(seen)
-            self._strikes = self._strikes + 1 if wrong else 0
+            wrong, force = self._wrong(seen), self._wrong_force(seen)
+            self._strikes = self._strikes + 1 if wrong or force else 0
             if seen.fault or self._strikes >= STRIKES:
-                self.stop(seen.fault or wrong, quick=seen.lost or not seen.fault)
+                if not (seen.fault or wrong) and self.clock.rate > 0.0 and self._lands(force):
+                    return
+                self.stop(seen.fault or wrong or force, quick=seen.lost or not seen.fault)
         elif self.state == "stopping" and not self.clock.turning:
             self.state = "held"
+        elif self.state == "landing" and not self.clock.turning:
+            self.job.stand(self.clock.s, seen.q)
+            self.clock = Clock(self.job.end, self.job.limits.stop_time, self.job.begin("release"))
+            self.state = "held"
+            try:
+                self.resume(1.0, seen)
+            except Refused as error:
+                self.hold(str(error))
+
+    def _lands(self, force: str) -> bool:
+        """Return True if a wrong force in the last part of the set-down means that the box stands;
+        stop there, unless the release begins sooner."""
+        if not self.job.is_touching(self.clock.s):
+            return False
+        takes = self.job.limits.quick_stop
+        if self.clock.s + self.lead + takes / 2.0 < self.job.begin("release"):
+            self.state, self.reason, self.stop_time = "landing", force, takes
+            self.clock.turn(0.0, self.lead, takes)
+        return True
 
     def stop(self, reason: str, quick: bool = False) -> None:
         """Stop along the path and hold; quickly where an arm does not do what it is told."""
@@ -431,6 +497,8 @@ class Machine:
     def told(self) -> str:
         """Describe the state, and how to go on."""
         where = f"{self.job.phase(self.clock.s)}, {self.clock.s:.3f} s"
+        if self.state == "landing":
+            return f"the box stands in {where}: {self.reason}. Both arms let go of it there"
         if self.state in ("stopping", "held"):
             known = (
                 f"{' and '.join(self._silent)} is silent: look whether it still holds"
@@ -458,7 +526,7 @@ class Machine:
                 )
 
     def _wrong(self, seen: Seen) -> str:
-        """Return the reason against going on, or ''."""
+        """Return what places and their news say against going on, or ''."""
         limits, s = self.job.limits, self.clock.s
         # Nothing is lifted, and no job done, by an arm that stands elsewhere.
         stands = self.job.phase(s) == "press" or s in (0.0, self.job.end)
@@ -489,13 +557,13 @@ class Machine:
             apart = abs(coordinates[0] - coordinates[1])
             if apart * self.job.speed(0, s) > limits.skew * self.job.fastest:
                 return f"the arms are {1e3 * apart:.0f} ms apart along the path"
-        return self._wrong_force(seen)
+        silent = [a for a in (0, 1) if self._sensors[a] and seen.force[a] is None]
+        return self._no_force(silent[0]) if silent else ""
 
     def _wrong_force(self, seen: Seen) -> str:
+        """Return what the measured forces say against going on, or ''."""
         s, lift = self.clock.s, self.job.pressed
         for arm, measured in enumerate(seen.force):
-            if self._sensors[arm] and measured is None:
-                return self._no_force(arm)
             wanted = self.job.force(arm, s)
             # Before the box is lifted the pads have to press.
             pressed = s <= lift and wanted >= PRESSED * self.job.force(arm, lift)

@@ -326,8 +326,10 @@ class Run:
         before, now = machine.state, self.now()
         machine.tick(now - self._last, self.seen())
         self._last = now
-        if before == "running" and machine.state in ("stopping", "held"):
+        if before == "running" and machine.state in ("stopping", "landing", "held"):
             self._stop()
+        if before == "landing" and machine.state == "running":
+            self._go_on(1.0)
         if before != machine.state:
             self.node.get_logger().info(machine.told())
         if machine.state == "held" and self.command in ("continue", "back"):
@@ -357,6 +359,14 @@ class Run:
         self.command, self.fault, self.lost = "", "", False
         try:
             self.machine.resume(direction, self.seen())
+        except Refused as error:
+            self.machine.hold(str(error))
+            self.node.get_logger().error(self.machine.told())
+        else:
+            self._go_on(direction)
+
+    def _go_on(self, direction: float) -> None:
+        try:
             self._begin(direction)
         except Refused as error:
             self.machine.hold(str(error))

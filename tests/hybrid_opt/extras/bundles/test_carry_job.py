@@ -206,6 +206,45 @@ def test_one_strange_look_stops_nothing() -> None:
     assert machine.state == "running"
 
 
+def height(s: float) -> float:
+    """Of the box above where it is set down [m]."""
+    places = np.array(job().document["box"]["pose"])[:, 2]
+    return float(np.interp(s, job().time, places) - places[-1])
+
+
+@pytest.mark.parametrize(("above", "state"), [(0.003, "done"), (0.008, "held")])
+def test_a_box_that_stands_early_is_let_go_there(above: float, state: str) -> None:
+    """Soft arms stay where it stands, and press half as much again until their efforts fall."""
+    own = Job(job().document)
+    release = own.begin("release")
+    touch = max(s for s in np.arange(release - 2.0, release, 1e-3) if height(s) >= above)
+    machine = Machine(own, 0.0)
+    machine.start(Seen(posture(0.0)))
+    machine.clock = Clock(own.end, own.limits.stop_time, touch - 0.1, 1.0)
+    stands, told, count = posture(touch), [posture(touch - 0.1)], 0
+    while machine.state not in ("held", "done") and count < 3000:
+        s = machine.clock.s
+        seen = Seen(told[-1], [own.force(arm, s) for arm in (0, 1)])
+        if s >= touch:
+            seen = Seen(stands, [1.5 * force for force in seen.force if force is not None])
+        if own.phase(s) == "retreat":
+            seen.q = told[-1]
+        machine.tick(PERIOD / 2.0, seen)
+        told.append([own.position(arm, machine.clock.s) for arm in (0, 1)])
+        count += 1
+    assert machine.state == state, machine.told()
+    assert own.is_standing == (state == "done")
+    steps = np.abs(np.diff(np.array(told, dtype=float), axis=0)).max(axis=(0, 2))
+    assert steps.max() < 0.01, "no reference jumps"
+    if state == "done":
+        end = own.begin("retreat")
+        reached = [own.position(arm, end) for arm in (0, 1)]
+        np.testing.assert_allclose(reached, np.array(stands, dtype=float), atol=1e-9)
+        machine.hold("asked")
+        with pytest.raises(Refused, match="the box stands"):
+            machine.resume(-1.0, Seen(told[-1]))
+
+
 def test_a_job_begins_only_in_its_first_places() -> None:
     with pytest.raises(Refused, match="the pad of left is up to"):
         Machine(job(), 0.0).start(Seen([moved(posture(0.0)[0], 0.02), posture(0.0)[1]]))
