@@ -1,7 +1,7 @@
 """The description of a dual-arm cell and its physics as CasADi expressions.
 
-records: what a cell is. path, contact: what a carry asks of it, as functions of records. read:
-bytes to records. robot, geometry: models of arms and bodies. path_motion, limits: what a timing
-needs. smooth: the polish's program. functions: what is compiled. Imports run against this order.
-No optimiser is called here; CONTRIBUTING.md lists what is.
+records: the data of a cell. path, contact: physics as functions of records. read: readers from
+bytes to records. robot, geometry: models of arms and bodies. path_motion, limits: inputs of a
+timing. smooth: the polish's program. functions: the compiled functions. Imports run against this
+order. No optimiser is called here.
 """

@@ -54,7 +54,7 @@ class Range:
 
 
 @dataclass(frozen=True)
-class Form:
+class TextPattern:
     """Allowed form of a text.
 
     Attributes:
@@ -73,16 +73,16 @@ class Shape:
 
 
 @dataclass(frozen=True)
-class Filling:
+class BroadcastScalar:
     """Marks an array that a single number may fill."""
 
 
 @dataclass(frozen=True)
-class Missing:
+class AllowMissing:
     """Marks a number, or an array's numbers, that may be missing: not finite."""
 
 
-Figure = Annotated[float, Missing()]
+Figure = Annotated[float, AllowMissing()]
 """A number, NaN or infinite where there is none."""
 
 Count = Annotated[int, Range(0, 10**12)]

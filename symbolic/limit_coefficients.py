@@ -178,7 +178,7 @@ def force_functions(workcell: Workcell) -> tuple[ca.Function, ca.Function]:
         asked += handed.values()
         load, by_timing = _load_function(workcell)(*asked)
         soft = SoftGrasp(Grasp(workcell), TIMING_BARRIER_WEIGHT)
-        found, state = soft.solved(load, handed), ca.MX.sym("solved", soft.size)
+        found, state = soft.solve(load, handed), ca.MX.sym("solved", soft.size)
         normal, slope = soft.slopes()(state, *handed.values())
         slopes = ca.horzsplit(ca.mtimes(slope.T, by_timing))
         alone = ca.densify(ca.mtimes(soft.normals, found))

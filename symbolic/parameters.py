@@ -29,8 +29,8 @@ import numpy as np
 from symbolic.array import Array
 from symbolic.cell_model import CellBodies, CellModel
 from symbolic.contact.elastic import layer_shares
-from symbolic.contact.force_closure import grasp_shapes, left_components
-from symbolic.contact.holding_hands import opposed_needs
+from symbolic.contact.force_closure import dependent_components, grasp_shapes
+from symbolic.contact.holding_hands import internal_force_needs
 from symbolic.contact.registry import command_model, contact_model
 from symbolic.contact.soft_finger import SoftPatch
 from symbolic.geometry.screen import Screen, ScreenBase, ScreenBody
@@ -291,7 +291,7 @@ def _workcell(take: _Take, cell: Workcell) -> NumberedWorkcell:
     holds = any(contact.holding_force for contact in cell.contacts)
     hands: Iterator[tuple[Array | None, Array | None]] = repeat((None, None))
     if holds:
-        needs = opposed_needs(cell.pads, cell.pad_robots)
+        needs = internal_force_needs(cell.pads, cell.pad_robots)
         hands = zip(layer_shares(cell.pads), needs, strict=True)
     contacts: Any = tuple(
         _contact(take, f"contacts[{i}]", contact, cell, hands)
@@ -342,7 +342,7 @@ def _grasp(
 
     shapes = grasp_shapes(cell)
     numbers = {name: taken(name, shape) for name, shape in shapes.items()}
-    return GraspNumbers(left=left_components(cell), **numbers, given=take.group(group))
+    return GraspNumbers(left=dependent_components(cell), **numbers, given=take.group(group))
 
 
 def _as(kind: Any, record: Any, **changes: Any) -> Any:

@@ -1,14 +1,13 @@
-"""Reading and writing of files from outside the program, with bounds on type, size and content.
+"""Reading and writing of files with bounds on type, size and content.
 
-Every file that the project did not write in the same breath is read here, whatever its format:
-a workcell, a URDF, a mesh, a stored result, a trajectory, an entry of the cache. A path may lead
-through symbolic links to anything; what is opened is looked at before it is read. Texts are UTF-8.
-JSON and TOML are measured (depth, number of values) before a parser builds them.
+Every file that may come from outside is read here: workcells, URDFs, meshes, stored results,
+trajectories, cache entries. Symbolic links are followed; the opened file is checked before it is
+read. Texts are UTF-8. Depth and number of values of JSON and TOML are checked before a parser
+builds them.
 
-The messages say what was found and what to do, but not in which file: whoever asked knows its
-name and where it was named.
+Messages state the problem and the remedy, but not the file's name; the caller adds it.
 
-Files are written in one step, by `replace_file`, which every layer's own errors surround.
+`replace_file` writes a file in one step.
 """
 
 from __future__ import annotations

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_opt.polishing.solvers.base import Residuals
-from symbolic.array import Array, Count, Figure, Missing, Range, Shape
+from symbolic.array import AllowMissing, Array, Count, Figure, Range, Shape
 
 Aim = Literal["point", "extreme", "balance", "gap", "probe"]
 Status = Literal["accepted", "optimal", "rejected", "failed"]
@@ -41,9 +41,9 @@ class PolishOutcome:
     parent: Annotated[int, Range(-1, 10**9)]
     status: Status
     reason: str
-    x: Annotated[Array, Shape((None,)), Missing()]
-    start: Annotated[Array, Shape((2,)), Missing()]
-    objectives: Annotated[Array, Shape((2,)), Missing()]
+    x: Annotated[Array, Shape((None,)), AllowMissing()]
+    start: Annotated[Array, Shape((2,)), AllowMissing()]
+    objectives: Annotated[Array, Shape((2,)), AllowMissing()]
     residuals: Residuals
     iterations: Count
     rounds: Count

@@ -298,12 +298,12 @@ def _of_cell(workcell: Workcell, excess: Callable[[Workcell], float]) -> Iterato
 
     every = tuple(name for names in UNCERTAINTY_SOURCES.values() for name in names)
     for names in (every, *UNCERTAINTY_SOURCES.values()):
-        if uncertainty.only(names).is_empty:
+        if uncertainty.restrict_to(names).is_empty:
             continue
         narrower = _smallest_change(partial(excess_within, names), NARROWEST)
         if narrower is not None:
             factor = floor(100.0 * narrower) / 100.0
-            change = f"[uncertainty] with {with_ranges(names, factor).only(names)}"
+            change = f"[uncertainty] with {with_ranges(names, factor).restrict_to(names)}"
             if names == every:
                 change = f"every range of the uncertainty {factor:g} times as wide"
             yield Remedy(change, factor - 1.0)

@@ -478,7 +478,7 @@ def _has_positive_remainders(workcell: Workcell, uncertainty: Uncertainty) -> bo
     """Return True if friction, patches, mass and force are positive in the worst case."""
     shares = [1.0 - uncertainty.mass, 1.0 - uncertainty.tracking]
     model = command_model(workcell)
-    left = [*model.least_friction(uncertainty), model.room_for_displacements(uncertainty), *shares]
+    left = [*model.least_friction(uncertainty), model.displacement_margin(uncertainty), *shares]
     return bool(min(left) > 0.0)
 
 

@@ -149,7 +149,7 @@ def extra_normal_force(
     itemised: bool = True,
 ) -> tuple[Array, Squeeze]:
     """Compute the force (n,) that the force-controlled arm presses beyond its planned force [N],
-    and its origin. The force of the other arm rises by `ContactModel.pressed_together`.
+    and its origin. The force of the other arm rises by `ContactModel.internal_force_ratio`.
 
     The commanded force is smooth where the planned forces are. Neither robot presses less than
     planned, or less than evenly pressing pads need in every case of the set, in motion or at rest.
@@ -198,12 +198,16 @@ def _contributions(
 ) -> list[Contribution]:
     """Compute the rise of the largest robust force by each source of uncertainty, in order."""
     uncertainty, names = workcell.uncertainty, tuple[str, ...]()
-    before = float(_in_every_case(workcell, uncertainty.only(names), leader, motion, planned).max())
+    before = float(
+        _in_every_case(workcell, uncertainty.restrict_to(names), leader, motion, planned).max()
+    )
     parts = [Contribution("least force", before)]
     for name, ranges in UNCERTAINTY_SOURCES.items():
         names += ranges
-        if not uncertainty.only(ranges).is_empty:
-            force = _in_every_case(workcell, uncertainty.only(names), leader, motion, planned).max()
+        if not uncertainty.restrict_to(ranges).is_empty:
+            force = _in_every_case(
+                workcell, uncertainty.restrict_to(names), leader, motion, planned
+            ).max()
             parts.append(Contribution(name, float(force) - before))
             before = float(force)
     return parts
@@ -240,7 +244,7 @@ def largest_commanded(
     there, own = box.at(most), planned[most, follower]
     level = _in_every_case(workcell, uncertainty, leader, there, own).max()
     forces = np.full(2, _in_every_case(workcell, uncertainty, leader, box, level).max())
-    together = command_model(workcell).pressed_together(leader)[leader]
+    together = command_model(workcell).internal_force_ratio(leader)[leader]
     forces[leader] = (planned[most, leader] + together * (forces[follower] - own)).max()
     return forces
 
@@ -252,7 +256,7 @@ def commanded_forces(
     origin; see `extra_normal_force`."""
     held = carry.normal_force
     extra, squeeze = extra_normal_force(workcell, settings, carry.time, carry, held, itemised)
-    together = command_model(workcell).pressed_together(settings.leader)
+    together = command_model(workcell).internal_force_ratio(settings.leader)
     return held + np.multiply.outer(extra, together), squeeze
 
 

@@ -39,7 +39,7 @@ from hybrid_opt.timing.records import (
 from hybrid_opt.timing.robustness import Margin, robustness_margins
 from hybrid_opt.timing.solve import time_path
 from hybrid_opt.timing.topp_ra import validate_timing
-from symbolic.array import Array, Count, Figure, Missing, Pair, Row, Shape
+from symbolic.array import AllowMissing, Array, Count, Figure, Pair, Row, Shape
 from symbolic.errors import SettingsError
 from symbolic.path.pieces import resample_decisions
 from symbolic.records import Workcell
@@ -66,7 +66,7 @@ class ForceCurve:
     """
 
     force: Row
-    duration: Annotated[Array, Shape((None,)), Missing()]
+    duration: Annotated[Array, Shape((None,)), AllowMissing()]
     status: tuple[TimingStatus, ...]
     static_force: float
     unlimited_force: Figure

@@ -1,5 +1,6 @@
-"""What pads do: the forces that hold a moving payload, and what patches can carry.
+"""Contact forces: the least forces that hold a moving payload, and the limits of contact patches.
 
-load: forces of one sample. paper, grasp: how they are found. worst_cases: how much is
-needed where something is uncertain. central_path: the interior-point method behind them.
+model, registry: contact models by name. load: forces at one sample. paper, soft_finger, grasp: how
+the models find forces. worst_cases: forces under uncertainty. central_path: the interior-point
+method behind them.
 """

@@ -3,21 +3,18 @@
     minimise effort(w_1, ..., w_k)  subject to  the wrenches w_i balance the load,
                                                 each lies within its patch's cone
 
-The method is primal-dual with a predictor and a corrector (Mehrotra, SIAM J. Optim. 2, 1992): each
-step aims at the central path's place of a smaller weight, to second order by what a first step
-to weight zero leaves out. It starts within the cones, the load balanced, and takes some six steps;
-at most `CENTRAL_PATH_STEPS`, each of which is skipped once the weight is small enough, so that the
-whole is one expression and compiles. Six components of the wrenches are what the others leave.
-Starts from a neighbouring sample's solution take more steps where several candidates run in lanes,
-and some never arrive.
+The method is primal-dual with a predictor and a corrector (Mehrotra, SIAM J. Optim. 2, 1992). The
+predictor is a first step to weight zero. The corrector aims at a point of the central path with a
+smaller weight and includes the predictor's second-order terms. The start lies within the cones and
+balances the load. Some six steps suffice; at most `CENTRAL_PATH_STEPS` are in the expression, each
+skipped once the weight is small enough, so that the whole compiles. The load and the free
+components determine the other six components of the wrenches. Starts from a neighbouring sample's
+solution need more steps where several candidates run in lanes, and some do not converge.
 
 A patch's state lies within its cone and begins with its scaled wrench, see
-`symbolic.contact.force_closure`. The cone is one of positive semidefinite matrices X: those of a
-rectangle's corners are real 2 by 2 (`symbolic.contact.rectangular_patch`), a disc's is complex 3 by
-3 (`symbolic.contact.round_patch`). An iterate of the method has such an X and as large a matrix S
-of multipliers, both positive definite, whose product is a multiple of one on the central path.
-Newton's step takes S + dS = weight / X - sym(X^-1 dX S) - correction: the direction of Helmberg,
-Rendl, Vanderbei and Wolkowicz (SIAM J. Optim. 6, 1996), seen from X.
+`symbolic.contact.force_closure`. The cone of a kind of patch is given by its barrier
+(`symbolic.contact.even_patch`). An iterate holds a state X and multipliers S; their product is the
+weight on the central path.
 """
 
 from __future__ import annotations
@@ -36,42 +33,42 @@ from symbolic.array import Array
 from symbolic.expression import reciprocal
 
 FINAL_WEIGHT = 1e-8
-"""Last weight of the barriers over the effort, which ends above the least by at most the sum of
-the patches' degrees times this: 6e-8 of it for two round ones."""
+"""Last weight of the barriers over the effort. The effort exceeds the least by at most this times
+the sum of the patches' degrees, relatively."""
 
 END_WEIGHT_FACTOR = 2.0
 """Multiple of the final weight at which the steps end."""
 
 CENTRING, CENTRED = 30, 1e-8
-"""Newton steps of the barriers alone, at most, from there onto the central path; the square of
-Newton's decrement, over the weight, that counts as being there."""
+"""Largest number of Newton steps of the barriers alone, from there onto the central path; squared
+Newton decrement over the weight at which they end."""
 
 NEWTON_STEPS = 100
-"""The same from states that may be far from it, at most."""
+"""Largest number of such steps from any states within the cones."""
 
 CENTRAL_PATH_STEPS = 30
 STEP_SHARE, LAST_SHARE, APPROACH = 0.97, 0.999, 100.0
-"""Largest share of the way to the cones' boundary in one step; the same near the end; and how many
-times the weight, over the effort, what is left near the end may be."""
+"""Largest share of the way to the cones' boundary in one step; the same near the end; near the end,
+the remaining share is this times the weight over the effort."""
 
 START_WEIGHT = 0.5
-"""Weight of a start whose multipliers are not known, over the effort there per degree."""
+"""Weight of a start with unknown multipliers, over the effort there per degree."""
 
 BLOCK = 10
-"""Steps that are passed over at once where nothing goes on: each costs a copy of the iterate."""
+"""Steps that are skipped together once converged: each skipped step copies the iterate."""
 
 PROGRAMS = 16
-"""How many programs' functions are kept."""
+"""Number of programs whose functions are cached."""
 
 
 AnyExpression = TypeVar("AnyExpression", ca.SX, ca.MX)
 
 
 class ConvexProgram(Protocol):
-    """What a set of contacts has to balance, and at what cost.
+    """A load that a set of contacts has to balance, and the cost of their wrenches.
 
-    Its scaled wrenches are those of `symbolic.contact.force_closure`; `cell` are its inputs, in
-    order.
+    Wrenches are scaled as in `symbolic.contact.force_closure`. `cell` holds the inputs in the order
+    of `cell_sizes`.
     """
 
     @property
@@ -84,34 +81,37 @@ class ConvexProgram(Protocol):
 
     @property
     def given(self) -> dict[str, ca.SX]:
-        """Numbers in its formulas that are symbols, by group: inputs behind the cell."""
+        """Symbolic parameters in the formulas, by group; they are inputs after those of the
+        cell."""
 
     def free(self, wrenches: list[ca.SX]) -> ca.SX:
-        """The components that are free."""
+        """Select the free components of all wrenches."""
 
     def balanced(self, free: ca.SX, cell: list[ca.SX]) -> list[ca.SX]:
-        """All wrenches from these: six other components are what they leave; affine."""
+        """Compute all wrenches from the free components, affinely: the load determines the other
+        six."""
 
     def effort(self, wrenches: list[ca.SX], cell: list[ca.SX]) -> ca.SX:
-        """What is minimised: a sum over the contacts, each convex and at most quadratic."""
+        """Compute the minimised cost: a sum over the contacts, each term convex and at most
+        quadratic."""
 
     def start(self, cell: list[ca.SX]) -> tuple[list[ca.SX], ca.SX]:
-        """States of all patches, well within their cones, that balance the load, and the weight to
-        begin with, over the effort there per degree."""
+        """Return a start: states of all patches, well within their cones, that balance the load;
+        and the initial weight over effort per degree."""
 
     def __hash__(self) -> int:
-        """Functions are kept by program."""
+        """Hash by identity: compiled functions are cached by program."""
 
 
 class Patch(ABC):
-    """A kind of patch.
+    """A kind of contact patch, with the barrier of its cone.
 
     Attributes:
-        wrench_size: entries of a scaled wrench: all six, or those that the patch can bear.
-        state_size: entries of a program's state.
-        iterate_size: entries of an iterate: all that X is made of, the state first; multipliers.
-        correction_size: entries of a correction.
-        degree: pairing of X with S over the weight on the central path.
+        wrench_size: entries of a scaled wrench: six, or those that the patch can bear.
+        state_size: entries of a state.
+        iterate_size: entries of an iterate: the state, further entries of X, and multipliers.
+        correction_size: entries of a second-order correction.
+        degree: trace of X S over the weight on the central path.
     """
 
     wrench_size: ClassVar[int]
@@ -122,35 +122,35 @@ class Patch(ABC):
 
     @abstractmethod
     def centred(self, state: ca.SX, weight: ca.SX) -> ca.SX:
-        """An iterate whose X S is the weight, from a program's state."""
+        """Return an iterate with X S equal to the weight, from a state."""
 
     @abstractmethod
     def local(self, iterate: ca.SX) -> LocalPatch:
-        """What steps from an iterate need."""
+        """Return the derivatives that steps from an iterate need."""
 
     @abstractmethod
     def potential(self, state: ca.SX) -> ca.SX:
-        """The barrier at a program's state, of which `centred` has the multipliers."""
+        """Compute the barrier at a state; `centred` has its multipliers."""
 
     @abstractmethod
     def lowest(self, state: ca.SX, change: ca.SX) -> ca.SX:
-        """Bound from below of what a change of a program's state adds to the eigenvalues of X, over
-        them."""
+        """Bound the least relative change of the eigenvalues of X by a change of the state, from
+        below."""
 
     @abstractmethod
     def slack(self, state: ca.SX) -> ca.SX:
-        """Positive within the cone, not so beyond its boundary; of a program's state."""
+        """Compute the slack of a state: positive inside the cone, at most zero outside."""
 
     def barrier(self, state: ca.SX) -> tuple[ca.SX, ca.SX]:
-        """The barrier's gradient (n,) and Hessian (n, n) at a program's state."""
+        """Compute the barrier's gradient (n,) and Hessian (n, n) at a state."""
         symbol = ca.SX.sym("state", self.state_size)
         curvature, slope = ca.hessian(self.potential(symbol), symbol)
         found = ca.substitute([ca.densify(slope), curvature], [symbol], [state])
         return found[0], found[1]
 
     def third(self, state: ca.SX, along: ca.SX, columns: ca.SX) -> ca.SX:
-        """The barrier's third derivative at a program's state, along a direction (n,) and each of
-        some columns (n, k)."""
+        """Compute the barrier's third derivative (n, k) at a state, along a direction (n,) and each
+        of some columns (n, k)."""
         sizes = (1, 1, columns.shape[1])
         symbol, one, others = symbols = [ca.SX.sym("s", self.state_size, k) for k in sizes]
         slope = ca.gradient(self.potential(symbol), symbol)
@@ -160,14 +160,15 @@ class Patch(ABC):
 
 @dataclass(frozen=True)
 class NewtonStep:
-    """A step of X and multipliers.
+    """A step of X and its multipliers.
 
     Attributes:
-        change: (iterate_size,) of the iterate.
-        lowest_of_state: bound from below of what it adds to the eigenvalues of X, over them.
-        lowest: the bound for both X and S.
-        second_order: () to (correction_size,) what the whole step leaves out: sym(X^-1 dX dS).
-        gap_after: a share of the step to the pairing of X with S after it.
+        change: (iterate_size,) change of the iterate.
+        lowest_of_state: lower bound of the least relative change of the eigenvalues of X.
+        lowest: the same bound for X and S.
+        second_order: function that returns the correction (correction_size,) of a full step,
+            sym(X^-1 dX dS).
+        gap_after: function of the step's length that returns the trace of X S after it.
     """
 
     change: ca.SX
@@ -181,9 +182,9 @@ class LocalPatch(Protocol):
     """A patch at an iterate.
 
     Attributes:
-        state: (n,) all that X is made of, the wrench first.
-        stiffness: (n, n) what the multipliers give less for a change of it.
-        gap: pairing of X with S.
+        state: (n,) entries of X, the wrench first.
+        stiffness: (n, n) decrease of the multipliers per change of the state.
+        gap: trace of X S.
     """
 
     state: ca.SX
@@ -191,23 +192,24 @@ class LocalPatch(Protocol):
     gap: ca.SX
 
     def pull(self, weight: ca.SX, correction: ca.SX) -> ca.SX:
-        """(n,) what multipliers of a weight and a correction give to X where that stays."""
+        """Compute the multipliers (n,) for a weight and a correction at an unchanged state."""
 
     def step(self, weight: ca.SX, correction: ca.SX, change: ca.SX) -> NewtonStep:
-        """The step to these multipliers that changes X by (n,)."""
+        """Return the step to these multipliers with a change (n,) of the state."""
 
 
 # --- the method ---
 
 
 def least_effort(program: ConvexProgram, *cell: ca.MX, differentiable: bool = False) -> ca.MX:
-    """Scaled wrenches of least effort side by side, in the order of the program's patches.
+    """Build the scaled wrenches of least effort, side by side in the order of the program's
+    patches.
 
     Args:
-        cell: the program's inputs, its given numbers behind them.
-        differentiable: whether first derivatives are wanted. They are those of the central path, on
-            which the wrenches then lie after some more steps: the last one is differentiated, the
-            states it starts from are not. Second ones are not to be had so.
+        cell: the program's inputs, followed by its symbolic parameters.
+        differentiable: make first derivatives exact. They are those of the central path, onto which
+            further steps move the wrenches; only the last step is differentiated. Second
+            derivatives are wrong.
     """
     if differentiable:
         states, _ = barrier_step(program)(centred(program)(*cell), 1.0, *cell)
@@ -219,8 +221,9 @@ def least_effort(program: ConvexProgram, *cell: ca.MX, differentiable: bool = Fa
 
 @lru_cache(PROGRAMS)
 def central_path(program: ConvexProgram, final_weight: float = FINAL_WEIGHT) -> ca.Function:
-    """The cell to an iterate of all patches near the central path's place of a last weight."""
-    cell = _handed(program)
+    """Build the function from the cell to an iterate of all patches near the central path at a
+    final weight."""
+    cell = _mx_inputs(program)
     step = _step(program, final_weight)
     iterate = _repeated(program, step, CENTRAL_PATH_STEPS, _start(program)(*cell), cell)
     return ca.Function("central_path", cell, [iterate])
@@ -228,8 +231,9 @@ def central_path(program: ConvexProgram, final_weight: float = FINAL_WEIGHT) -> 
 
 @lru_cache(PROGRAMS)
 def centred(program: ConvexProgram, final_weight: float = FINAL_WEIGHT) -> ca.Function:
-    """The cell to states of all patches on the central path. Their derivatives count as zero."""
-    cell = _handed(program)
+    """Build the function from the cell to states of all patches on the central path, with zero
+    derivatives."""
+    cell = _mx_inputs(program)
     owns = ca.vertsplit(central_path(program, final_weight)(*cell), ends_of(program))
     near = [own[: patch.state_size] for patch, own in zip(program.patches, owns, strict=True)]
     step = barrier_step(program, final_weight)
@@ -241,9 +245,9 @@ def centred(program: ConvexProgram, final_weight: float = FINAL_WEIGHT) -> ca.Fu
 def _repeated(
     program: ConvexProgram, step: ca.Function, most: int, iterate: ca.MX, cell: list[ca.MX]
 ) -> ca.MX:
-    """The iterate after at most that many steps, in whole blocks, as long as they go on."""
+    """Repeat a step at most `most` times, in whole blocks, while its flag says so."""
     held = [ca.MX.sym("iterate", iterate.shape[0]), ca.MX.sym("goes_on")]
-    inputs = [*held, *_handed(program)]
+    inputs = [*held, *_mx_inputs(program)]
     keep = ca.Function("keep", inputs, held)
 
     def after(count: int, one: ca.Function, state: list[ca.MX], cell: list[ca.MX]) -> list[ca.MX]:
@@ -259,8 +263,8 @@ def _repeated(
 
 @lru_cache(PROGRAMS)
 def _step(program: ConvexProgram, final_weight: float = FINAL_WEIGHT) -> ca.Function:
-    """An iterate, a flag that does not matter and the cell to the next one and whether to go on."""
-    iterate, cell = ca.SX.sym("iterate", ends_of(program)[-1]), _cell(program)
+    """Build a step: iterate, unused flag and cell to the next iterate and a flag to continue."""
+    iterate, cell = ca.SX.sym("iterate", ends_of(program)[-1]), _sx_inputs(program)
     owns = zip(program.patches, ca.vertsplit(iterate, ends_of(program)), strict=True)
     local = [patch.local(own) for patch, own in owns]
     degree = degree_of(program)
@@ -293,24 +297,25 @@ def _step(program: ConvexProgram, final_weight: float = FINAL_WEIGHT) -> ca.Func
 
 @lru_cache(PROGRAMS)
 def barrier_step(program: ConvexProgram, final_weight: float = FINAL_WEIGHT) -> ca.Function:
-    """As `_step`, from states to those of the final weight, by Newton's step of the barriers alone;
-    where they have arrived there, its derivatives by the cell are those of the central path."""
-    states, cell = ca.SX.sym("states", state_ends(program)[-1]), _cell(program)
+    """Build a Newton step of the barriers alone, from states to states of the final weight. On the
+    central path, its derivatives by the cell are those of the path. Inputs as of `_step`."""
+    states, cell = ca.SX.sym("states", state_ends(program)[-1]), _sx_inputs(program)
     owns = ca.vertsplit(states, state_ends(program))
-    weight, pulls, equations = against_barriers(program, owns, cell, final_weight)
+    weight, pulls, equations = barrier_equations(program, owns, cell, final_weight)
     changes = equations.changes(pulls)
     moves = zip(program.patches, owns, changes, strict=True)
     length = _length([patch.lowest(*move) for patch, *move in moves], STEP_SHARE)
-    goes_on = equations.downhill(pulls, changes) > CENTRED * weight
+    goes_on = equations.decrement(pulls, changes) > CENTRED * weight
     inputs = [states, ca.SX.sym("goes_on"), *cell, *program.given.values()]
     found = states + length * ca.vertcat(*changes)
     return ca.Function("barrier_step", inputs, ca.cse([found, goes_on]))
 
 
-def against_barriers(
+def barrier_equations(
     program: ConvexProgram, states: list[ca.SX], cell: list[ca.SX], final_weight: float
 ) -> tuple[ca.SX, list[ca.SX], Equations]:
-    """The weight, the barriers' pulls at it, and Newton's equations of effort and barriers."""
+    """Return the weight, the barriers' multipliers at it, and Newton's equations of effort and
+    barriers."""
     weight = final_weight * program.effort(wrenches_of(program, states), cell)
     patches = zip(program.patches, states, strict=True)
     slopes, curvatures = zip(*[patch.barrier(own) for patch, own in patches], strict=True)
@@ -321,12 +326,13 @@ def against_barriers(
 def central_point(
     program: ConvexProgram, states: Array, cell: list[Array], share: float
 ) -> tuple[Array, Array]:
-    """States (n,) on the central path, and their slopes (n, m) by the program's first input (m,).
+    """Compute states (n,) on the central path, and their derivatives (n, m) by the program's first
+    input (m,).
 
     Args:
         states: (n,) of all patches, within their cones, that balance the load.
         cell: the inputs.
-        share: the weight, over the effort there per degree.
+        share: the weight over effort per degree.
     """
     final_weight = share / degree_of(program)
     step = barrier_step(program, final_weight)
@@ -336,20 +342,20 @@ def central_point(
             break
     load, at = ca.SX.sym("load", len(cell[0])), ca.vertsplit(ca.SX(states), state_ends(program))
     known = [load, *[ca.SX(ca.DM(value)) for value in cell[1:]]]
-    equations = against_barriers(program, at, known, final_weight)[-1]
-    slopes = equations.settled(ca.jacobian(equations.missing, load))
+    equations = barrier_equations(program, at, known, final_weight)[-1]
+    slopes = equations.constrained(ca.jacobian(equations.missing, load))
     return np.array(states).ravel(), np.array(ca.evalf(slopes))
 
 
 def _length(lowest: list[ca.SX], share: ca.SX | float) -> ca.SX:
-    """Length of a step: at most whole, and at most a share of the way to the boundary."""
-    return ca.fmin(1.0, share / ca.fmax(-least(lowest), share))
+    """Compute the length of a step: at most one, and at most a share of the way to the boundary."""
+    return ca.fmin(1.0, share / ca.fmax(-minimum(lowest), share))
 
 
 @lru_cache(PROGRAMS)
 def _start(program: ConvexProgram) -> ca.Function:
-    """The program's start, as an iterate on the central path of a problem like it."""
-    cell = _cell(program)
+    """Build the program's start as an iterate on the central path of a similar problem."""
+    cell = _sx_inputs(program)
     states, share = program.start(cell)
     effort = program.effort(wrenches_of(program, states), cell)
     weight = effort * (share / degree_of(program))
@@ -361,8 +367,8 @@ def _start(program: ConvexProgram) -> ca.Function:
 # --- Newton's equations ---
 
 
-def least(values: list[ca.SX]) -> ca.SX:
-    """The least of some values."""
+def minimum(values: list[ca.SX]) -> ca.SX:
+    """Return the least of some values."""
     found = values[0]
     for value in values[1:]:
         found = ca.fmin(found, value)
@@ -370,21 +376,23 @@ def least(values: list[ca.SX]) -> ca.SX:
 
 
 def symmetric(rows: Sequence[Sequence[ca.SX]]) -> ca.SX:
-    """A symmetric matrix (n, n) from its rows, each up to the diagonal."""
+    """Build a symmetric matrix (n, n) from its rows, each up to the diagonal."""
     n = range(len(rows))
     columns = [ca.vertcat(*[rows[max(i, j)][min(i, j)] for i in n]) for j in n]
     return ca.horzcat(ca.SX(len(rows), 0), *columns)
 
 
 class Factors:
-    """L D L' of the first k unknowns of a symmetric matrix, all by default; zeros cost nothing.
+    """Factors L D L' of the first k unknowns of a symmetric matrix, by default all; zeros cost
+    nothing.
 
     Attributes:
-        left: (n - k, n - k) matrix of the others, once these are eliminated.
+        schur_complement: (n - k, n - k) matrix of the other unknowns after elimination of the
+            first.
     """
 
     def __init__(self, matrix: ca.SX, k: int | None = None) -> None:
-        """Factor; what is above the diagonal is not read."""
+        """Factor the lower triangle of `matrix`."""
         n = range(matrix.shape[0])
         rows = [[matrix[i, j] for j in range(i + 1)] for i in n]
         self._below: list[dict[int, ca.SX]] = []  # the columns of L, without zeros
@@ -398,19 +406,19 @@ class Factors:
             self._below.append(below)
             self._over_pivot.append(over)
         rest = n[len(self._below) :]
-        self.left = symmetric([rows[i][rest.start :] for i in rest])
+        self.schur_complement = symmetric([rows[i][rest.start :] for i in rest])
 
-    def reduced(self, right: ca.SX) -> ca.SX:
-        """(n,) a right side; in the first unknowns' place what `first` takes, then what is left for
-        the others."""
+    def forward(self, right: ca.SX) -> ca.SX:
+        """Eliminate the first unknowns from a right side (n,)."""
         found = ca.vertsplit(right)
         for p, below in enumerate(self._below):
             for i, share in below.items():
                 found[i] = found[i] - share * found[p]
         return ca.vertcat(*found)
 
-    def solved(self, reduced: ca.SX, others: ca.SX | None = None) -> ca.SX:
-        """(n,) unknowns from `reduced` and the other unknowns (n - k,)."""
+    def backward(self, reduced: ca.SX, others: ca.SX | None = None) -> ca.SX:
+        """Compute the unknowns (n,) from the result of `forward` and the other unknowns (n -
+        k,)."""
         first = ca.vertsplit(reduced)[: len(self._below)]
         found = [value * over for value, over in zip(first, self._over_pivot, strict=True)]
         found += [] if others is None else ca.vertsplit(others)
@@ -421,30 +429,30 @@ class Factors:
 
 
 class Equations:
-    """Newton's equations of a program: what moves beside the wrenches is eliminated first, patch by
-    patch, then the wrenches' components that are free are solved for.
+    """Newton's equations of a program. States beside the wrenches are eliminated first, patch by
+    patch; then the free components of the wrenches are solved for.
 
     Attributes:
         effort: at the states.
-        missing: (n,) what the states lack to balance the load.
-        slope, curvature: (n,) and (n, n) of the effort.
+        missing: (n,) change of the states that balances the load.
+        slope, curvature: (n,) and (n, n) derivatives of the effort.
     """
 
     def __init__(
         self, program: ConvexProgram, cell: list[ca.SX], states: list[ca.SX], stiffness: list[ca.SX]
     ) -> None:
-        """Factors.
+        """Factor the equations.
 
         Args:
-            states: of each patch (m,) its wrench and what moves beside it.
-            stiffness: of each patch (m, m).
+            states: (m,) of each patch.
+            stiffness: (m, m) of each patch.
         """
         self._ends = [0, *accumulate(state.shape[0] for state in states)]
         starts = zip(self._ends, program.patches, strict=False)
         self._wrench = [at + k for at, patch in starts for k in range(patch.wrench_size)]
         beside = [k for k in range(self._ends[-1]) if k not in self._wrench]
         self._order = [*beside, *self._wrench]
-        self.effort, self.slope, self.curvature = efforts(program, states, cell)
+        self.effort, self.slope, self.curvature = effort_derivatives(program, states, cell)
         wrenches = wrenches_of(program, states)
         at, self.missing = program.free(wrenches), ca.SX(self._ends[-1], 1)
         self.missing[self._wrench] = ca.vertcat(*program.balanced(at, cell)) - ca.vertcat(*wrenches)
@@ -452,35 +460,40 @@ class Equations:
         self._by_free = ca.jacobian(ca.vertcat(*program.balanced(free, cell)), free)
         self._stiff = self.curvature + ca.diagcat(*stiffness)
         self._first = Factors(self._stiff[self._order, self._order], len(beside))
-        self._last = Factors(ca.mtimes([self._by_free.T, self._first.left, self._by_free]))
+        self._last = Factors(
+            ca.mtimes([self._by_free.T, self._first.schur_complement, self._by_free])
+        )
 
-    def downhill(self, pulls: list[ca.SX], changes: list[ca.SX]) -> ca.SX:
-        """How fast effort and barriers fall along changes: the decrement's square, times the
-        weight."""
+    def decrement(self, pulls: list[ca.SX], changes: list[ca.SX]) -> ca.SX:
+        """Compute the squared Newton decrement times the weight, for multipliers and the changes
+        that follow."""
         return ca.dot(ca.vertcat(*pulls) - self.slope, ca.vertcat(*changes))
 
     def changes(self, pulls: list[ca.SX]) -> list[ca.SX]:
-        """Changes of all states (m,) under the pulls (m,) of the patches' multipliers."""
+        """Compute the changes (m,) of each patch's state for its multipliers (m,)."""
         pull = ca.vertcat(*pulls) - self.slope - ca.mtimes(self._stiff, self.missing)
-        found: list[ca.SX] = ca.vertsplit(self.missing + self.pulled(pull), self._ends)
+        found: list[ca.SX] = ca.vertsplit(self.missing + self.balanced_change(pull), self._ends)
         return found
 
-    def settled(self, moved: ca.SX) -> ca.SX:
-        """Changes (n, k) of states that are moved (n, k), what is free following as is best."""
+    def constrained(self, moved: ca.SX) -> ca.SX:
+        """Compute the changes (n, k) of states whose dependent components move by (n, k); the free
+        components minimise effort and barriers."""
         pulls = ca.horzsplit(-ca.mtimes(self._stiff, moved))
-        return moved + ca.horzcat(*map(self.pulled, pulls))
+        return moved + ca.horzcat(*map(self.balanced_change, pulls))
 
-    def pulled(self, pull: ca.SX) -> ca.SX:
-        """Changes (n,) under a pull (n,) that leave the load balanced."""
-        reduced, found = self._first.reduced(pull[self._order]), ca.SX(*pull.shape)
-        left = self._last.reduced(ca.mtimes(self._by_free.T, reduced[-len(self._wrench) :]))
-        wrenches = ca.mtimes(self._by_free, self._last.solved(left))
-        found[self._order] = self._first.solved(reduced, wrenches)
+    def balanced_change(self, pull: ca.SX) -> ca.SX:
+        """Compute the change (n,) for multipliers (n,) that keeps the load balanced."""
+        reduced, found = self._first.forward(pull[self._order]), ca.SX(*pull.shape)
+        left = self._last.forward(ca.mtimes(self._by_free.T, reduced[-len(self._wrench) :]))
+        wrenches = ca.mtimes(self._by_free, self._last.backward(left))
+        found[self._order] = self._first.backward(reduced, wrenches)
         return found
 
 
-def efforts(program: ConvexProgram, states: list[ca.SX], cell: list[ca.SX]) -> list[ca.SX]:
-    """The effort at states, its slope (n,) and curvature (n, n)."""
+def effort_derivatives(
+    program: ConvexProgram, states: list[ca.SX], cell: list[ca.SX]
+) -> list[ca.SX]:
+    """Compute the effort at states, its gradient (n,) and Hessian (n, n)."""
     symbols = [ca.SX.sym("state", state.shape[0]) for state in states]
     effort, whole = program.effort(wrenches_of(program, symbols), cell), ca.vertcat(*symbols)
     by = [effort, *ca.hessian(effort, whole)[::-1]]
@@ -488,32 +501,32 @@ def efforts(program: ConvexProgram, states: list[ca.SX], cell: list[ca.SX]) -> l
     return found
 
 
-def _handed(program: ConvexProgram) -> list[ca.MX]:
-    """The cell and the given numbers, as inputs of functions that hand them on."""
+def _mx_inputs(program: ConvexProgram) -> list[ca.MX]:
+    """Return MX symbols for the cell and the symbolic parameters."""
     given = ((name, numbers.numel()) for name, numbers in program.given.items())
     return [ca.MX.sym(name, size) for name, size in (*program.cell_sizes, *given)]
 
 
-def _cell(program: ConvexProgram) -> list[ca.SX]:
-    """The cell, without the given numbers."""
+def _sx_inputs(program: ConvexProgram) -> list[ca.SX]:
+    """Return SX symbols for the cell without the symbolic parameters."""
     return [ca.SX.sym(name, size) for name, size in program.cell_sizes]
 
 
 def wrenches_of(program: ConvexProgram, owns: list[AnyExpression]) -> list[AnyExpression]:
-    """The wrenches with which the patches' states or iterates begin."""
+    """Select the wrenches at the beginning of the patches' states or iterates."""
     return [own[: patch.wrench_size] for patch, own in zip(program.patches, owns, strict=True)]
 
 
 def degree_of(program: ConvexProgram) -> float:
-    """Pairing of all X with S over the weight on the central path."""
+    """Sum the patches' degrees."""
     return sum(patch.degree for patch in program.patches)
 
 
 def ends_of(program: ConvexProgram) -> list[int]:
-    """Where in an iterate the patches' own ones begin, and its size."""
+    """Return the first entry of each patch in an iterate, and the iterate's size."""
     return [0, *accumulate(patch.iterate_size for patch in program.patches)]
 
 
 def state_ends(program: ConvexProgram) -> list[int]:
-    """Where in the states of all patches the patches' own ones begin, and their size."""
+    """Return the first entry of each patch in the states of all patches, and their size."""
     return [0, *accumulate(patch.state_size for patch in program.patches)]

@@ -1,15 +1,15 @@
-"""Elastic layers between arms that keep their poses and the payload: how they share a load, and
-where pads then press.
+"""Elastic layers between the payload and arms that keep their poses: their shares of a load, and
+the resulting shift of the pressure.
 
-Each pad is a layer of springs, of equal stiffness all over its area. The payload moves by six
-numbers until all layers together bear the load. With a pad's stiffness K_i and the map A_i from its
-wrench to one about the box frame it bears K_i A_i^T (sum_j A_j K_j A_j^T)^-1 of the load: a
+Each pad is a layer of springs with equal stiffness over its area. The payload moves by six numbers
+until all layers together balance the load. With a pad's stiffness K_i and the map A_i from its
+wrench to one about the box frame, its share is K_i A_i^T (sum_j A_j K_j A_j^T)^-1 of the load: a
 constant matrix.
 
-Pads that press evenly are a limit (`symbolic.contact.soft_finger`): a layer that gives lets the box
-turn a little against the arms, and its pressure tilts with it. What a layer then carries as moments
-about its tangents shifts its pressure. A shift of a quarter of a disc's radius, of half a cup's, or
-of a third of a rectangle's half side, takes the pressure off a rim.
+Evenly pressing pads (`symbolic.contact.soft_finger`) are a limit: the box on a soft layer turns a
+little relative to the arms, and its pressure tilts. The layer's moments about its tangents shift
+its centre of pressure. A shift of a quarter of a disc's radius, of half a cup's, or of a third of a
+rectangle's half side, makes the pressure at a rim vanish.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ SHEAR = 1.0 / 3.0
 
 
 def layer_shares(pads: Sequence[Contact]) -> Array:
-    """Return the matrices (n, 6, 6) from a load to the wrenches that n pads bear of it.
+    """Compute the matrices (n, 6, 6) from a load to its shares, the wrenches of n pads.
 
     The load is force and moment about the box frame's origin, box axes; a wrench is that of the pad
     on the payload about the pad's place, in the pad's axes [N, N m].
@@ -39,11 +39,11 @@ def layer_shares(pads: Sequence[Contact]) -> Array:
 
 
 def pressure_shifts(workcell: Workcell, load: Array, normal: Array) -> Array:
-    """Return the shifts (n, 2) of the centres of pressure over those that take the pressure off a
-    rim; the largest of a robot's pads.
+    """Compute the shifts (n, 2) of the centres of pressure over the shifts at which the pressure at
+    a rim vanishes; the largest of a robot's pads.
 
     Args:
-        workcell: its pads share each robot's normal force by their areas.
+        workcell: its pads share each robot's normal force in proportion to their areas.
         load: (n, 6) force and moment about the box frame's origin, box axes [N, N m].
         normal: (n, 2) normal forces of the robots [N].
     """
@@ -63,13 +63,14 @@ def pressure_shifts(workcell: Workcell, load: Array, normal: Array) -> Array:
 
 
 def free_shift(pad: Contact) -> float:
-    """Return the shift of a pad's centre of pressure that takes the pressure off its rim [m]."""
+    """Compute the shift of a pad's centre of pressure at which the pressure at a rim vanishes
+    [m]."""
     return float(min(kern(pad)))
 
 
 def kern(pad: Contact) -> tuple[Any, Any]:
-    """Return the shifts of the centre of pressure along a pad's axes that take the pressure off its
-    rim, numbers or symbols [m]."""
+    """Compute the shifts along a pad's axes at which the pressure at a rim vanishes, numbers or
+    symbols [m]."""
     if pad.half_sides is None:
         share = 2.0 if pad.is_ring else 4.0
         return pad.patch_radius / share, pad.patch_radius / share
@@ -77,8 +78,8 @@ def kern(pad: Contact) -> tuple[Any, Any]:
 
 
 def layer_stiffness(pad: Contact) -> Array:
-    """Return the stiffness (6, 6) of a pad's layer, in its axes, over that of a unit of area across
-    it."""
+    """Compute the stiffness (6, 6) of a pad's layer, in its axes, over the normal stiffness per
+    area."""
     area = pad.area
     # Means of the squared coordinates: the side, or the radius of a ring or a disc, times the kern.
     if pad.half_sides is None:

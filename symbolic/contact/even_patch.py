@@ -1,21 +1,20 @@
 """A patch under even pressure in the interior-point method of contact forces, disc or rectangle.
 
-It bears the wrenches within the limit surface of `symbolic.contact.soft_finger`: with what friction
-leaves beside the tangential force, grip = sqrt(N^2 - |T|^2) (forces over N, tangential ones over
-mu), torsion up to f = grip lever(grip / N). f is concave and of degree one, so that
+Its cone is the limit surface of `symbolic.contact.soft_finger`. With grip = sqrt(N^2 - |T|^2), the
+friction left beside the tangential force (forces over N, tangential ones over mu), torsion is at
+most f = grip lever(grip / N). f is concave and of degree one, so that
 
     -log(f^2 - M^2)
 
 is a barrier of degree 2. The cone is not one of positive semidefinite matrices and its dual has no
-closed form, so that steps are those of the barrier alone. An iterate has the state x, multipliers z
-and the weight w at which z should be -w grad; how far it is from that tells whether the iterate is
-near the central path. With the barrier's second and third derivatives H and T,
+closed form, so that steps use the barrier alone. An iterate has the state x, multipliers z and the
+weight w at which z should be -w grad; the distance of z from that shows whether the iterate is near
+the central path. With the barrier's second and third derivatives H and T,
 
-    z + dz = -weight grad - w H dx - correction,   correction = w / 2 T[dx, dx] - w H dx,
+    z + dz = -weight grad - w H dx - correction,   correction = w / 2 T[dx, dx] - w H dx.
 
-the correction being what a step to weight zero leaves out (Coey, Kapelevich and Vielma, Math.
-Program. Comput. 15, 2023). It takes twice as many steps as with the other patches, each a fraction
-of theirs.
+The correction has the second-order terms of a step to weight zero (Coey, Kapelevich and Vielma,
+Math. Program. Comput. 15, 2023).
 """
 
 from __future__ import annotations
@@ -31,18 +30,17 @@ from symbolic.contact.soft_finger import SoftPatch, torsion_capacity
 DEGREE = 2.0
 
 CHORDS = 5
-"""Chords of the concave slack along a step; each ends within the cone."""
+"""Secant steps on the concave slack along a step; each ends within the cone."""
 
 LEAST_LENGTH = 1e-12
-"""Least length of a step; the boundary is never nearer."""
-
+"""Least length of a step."""
 
 NEAR_PATH, OFF_PATH = 0.1, 0.6
-"""Distance of the multipliers from the barrier's, in its own metric, up to which a step may aim as
-low as it leads, and from which on it has to come back to the central path first."""
+"""Distances of the multipliers from the barrier's, in its Hessian's norm: a step aims freely below
+the first one, and back at the central path above the second one."""
 
 LEAST_TRUST = 1e-3
-"""Share of the way that a step may then still aim at."""
+"""Share of the way that a step above the second distance may aim at."""
 
 SAFE = 0.9
 """Largest share of the way to the boundary in one step: Newton's method leaves it slowly."""
@@ -50,10 +48,10 @@ SAFE = 0.9
 
 @dataclass(frozen=True)
 class EvenPatch(Patch):
-    """A patch that presses evenly.
+    """A patch with uniform pressure.
 
     Attributes:
-        shape: its lengths over the patch's radius, in the pad's axes.
+        shape: lengths of the patch over its radius, in the pad's axes.
     """
 
     shape: SoftPatch
@@ -74,9 +72,9 @@ class EvenPatch(Patch):
         return -ca.log(torsion_capacity(grip, state[1:3], self.shape)[0] ** 2 - state[3] ** 2)
 
     def lowest(self, state: ca.SX, change: ca.SX) -> ca.SX:
-        """Minus one over a length of the change that surely stays within the cone, nearly the
+        """Compute -1 / t for a length t of the change that stays within the cone; t is nearly the
         longest."""
-        # Where friction ends: the lower eigenvalue of (N, T), as of a corner's force.
+        # The friction limit: the lower eigenvalue of (N, T).
         square = self._grip_squared(state)
         mean = (state[0] * change[0] - ca.dot(state[1:3], change[1:3])) / square
         lower = mean - ca.sqrt(
@@ -91,7 +89,7 @@ class EvenPatch(Patch):
         return -1.0 / ca.fmax(near, LEAST_LENGTH)
 
     def slack(self, state: ca.SX) -> ca.SX:
-        """Torsion that is left, or what friction lacks."""
+        """Compute the remaining torsion, or the missing friction as a negative number."""
         grip = ca.sqrt(ca.fmax(self._grip_squared(state), 0.0))
         torsion = torsion_capacity(grip, state[1:3], self.shape)[0] - ca.fabs(state[3])
         friction = state[0] - ca.sqrt(ca.sumsqr(state[1:3]))
@@ -106,13 +104,13 @@ class LocalEven:
     """See `symbolic.contact.central_path.LocalPatch`.
 
     Attributes:
-        slope, curvature: (4,) and (4, 4) of the barrier.
-        stored, weight: as the iterate says, and as is taken.
-        trust: share of the way to the boundary that a step's aim may rely on.
+        slope, curvature: (4,) and (4, 4) derivatives of the barrier.
+        stored, weight: weight of the iterate, and the one that is used.
+        trust: share of the way to the boundary that a step may aim at.
     """
 
     def __init__(self, patch: EvenPatch, iterate: ca.SX) -> None:
-        """The barrier's derivatives; the weight is at least what the multipliers say."""
+        """Compute the barrier's derivatives. The weight is at least that of the multipliers."""
         self.patch = patch
         self.state, self.multiplier, weight = ca.vertsplit(
             iterate, [0, len(EVEN), 2 * len(EVEN), patch.iterate_size]
@@ -124,7 +122,7 @@ class LocalEven:
         self.stiffness = self.weight * self.curvature
         off = self.multiplier / self.weight + self.slope
         factors = Factors(self.curvature)
-        away = ca.sqrt(ca.fmax(ca.dot(off, factors.solved(factors.reduced(off))), 0.0))
+        away = ca.sqrt(ca.fmax(ca.dot(off, factors.backward(factors.forward(off))), 0.0))
         near = (OFF_PATH - away) / (OFF_PATH - NEAR_PATH)
         self.trust = ca.fmin(ca.fmax(near, LEAST_TRUST), 1.0)
 

@@ -1,15 +1,15 @@
-"""Force closure: whether pads anywhere on a payload can hold it against whatever the motion asks.
+"""Force closure: whether pads with any normals can hold a payload under every motion.
 
 They can if an internal squeeze exists that lies strictly within every patch's cone (Bicchi and
-Kumar, Robotic grasping and contact: a review, ICRA 2000): pressing along it carries anything.
+Kumar, Robotic grasping and contact: a review, ICRA 2000): enough of it balances any load.
 
-Pads press evenly (`symbolic.contact.soft_finger`), so that a pad bears no moment but that about its
-normal. Its state, in its axes, z into the payload, is N, T / mu and M / (mu r), with the normal
-force N, the tangential force T (2,), the moment M about the normal through the patch's centre, and
-r the patch's radius or half diagonal.
+Pads press evenly (`symbolic.contact.soft_finger`), so that the only moment of a pad is torsion
+about its normal. Its state, in its axes, z into the payload, is N, T / mu and M / (mu r): normal
+force N, tangential force T (2,), moment M about the normal through the patch's centre, and r the
+patch's radius or half diagonal.
 
-What formulas of pads anywhere hold beside the pads' own numbers, the squeeze to start from and how
-wrenches balance a load, is derived here, too (`derived`).
+`derive_grasp_numbers` derives the constants in formulas of such pads: the squeeze to start from,
+and the maps that balance a load.
 """
 
 from __future__ import annotations
@@ -33,28 +33,28 @@ WRENCH_SIZE = 6
 """Entries of a pad's wrench: N, T (2,) [N], the first moment of the pressure (2,) and M [N m]."""
 
 EVEN = (0, 1, 2, 5)
-"""Entries of a wrench that a patch under even pressure can bear: its state."""
+"""Nonzero entries of a wrench of a patch under even pressure: its state."""
 
 TANGENTIAL = (1, 2, 3)
-"""Entries of a state that friction carries."""
+"""Entries of a state that are borne by friction."""
 
 DIRECTIONS, TORSIONS = 24, 4
-"""Directions of friction, and shares of it in every direction, that stand for a patch's cone."""
+"""Directions of friction, and shares of it in every direction, that sample a patch's cone."""
 
 CLOSURE_NEWTON_STEPS = 100
 BALANCED = 1e-6
-"""Newton decrement at which the search ends; what it leaves out of balance is mended after it."""
+"""Newton decrement at which the search ends; a projection then removes the residual load."""
 
 LEAST_SQUEEZE_SHARE = 0.05
-"""Least share of the friction that a squeeze is looked for at."""
+"""Least share of the friction at which a squeeze is sought."""
 
 SQUEEZE_BISECTIONS = 6
 
 PARALLEL = 1.0 - 1e-6
-"""Cosine of the angle between two normals that count as one."""
+"""Cosine of the angle between two normals that count as equal."""
 
 SPARE_FRICTION = 0.95
-"""Share of their friction with which pads still have to close their grasp."""
+"""Share of their friction with which pads must close their grasp."""
 
 LOAD_SIZE = 6
 """Force and moment about the box frame's origin, along the box's axes [N, N m]."""
@@ -62,9 +62,8 @@ LOAD_SIZE = 6
 MOMENT_ARM = 0.1
 """Lever of moments in the load's scale [m]: about half a payload, so they count like forces."""
 
-
 LEAST_NEW = 0.1
-"""Share of a component's effect that no earlier one has, for it to be one that is left."""
+"""Least share of a component's effect outside the span of earlier ones to select it."""
 
 
 @dataclass(frozen=True)
@@ -72,9 +71,9 @@ class InternalForce:
     """An internal squeeze of a grasp.
 
     Attributes:
-        states: per pad its state, at the nominal friction; the normal forces sum to one.
-        least_share: share of the friction, at least `LEAST_SQUEEZE_SHARE`, that such a squeeze
-            needs.
+        states: state of each pad, at the nominal friction; the normal forces sum to one.
+        least_share: least share of the friction, not below `LEAST_SQUEEZE_SHARE`, with which an
+            internal squeeze exists.
     """
 
     states: tuple[Array, ...]
@@ -82,10 +81,8 @@ class InternalForce:
 
 
 def closing_squeeze(workcell: Workcell) -> InternalForce | None:
-    """A squeeze of a workcell's pads that holds with as little as half the friction (on a
-    logarithmic scale) between the nominal and the least; None where the grasp is not closed with
-    `SPARE_FRICTION`.
-    """
+    """Find an internal squeeze for a friction at the geometric mean of the nominal and the least
+    one that closes the grasp. Return None for a grasp that is not closed with `SPARE_FRICTION`."""
     if _balanced_states(workcell, SPARE_FRICTION) is None:
         return None
     low, high = LEAST_SQUEEZE_SHARE, SPARE_FRICTION
@@ -104,16 +101,14 @@ def closing_squeeze(workcell: Workcell) -> InternalForce | None:
 
 
 def has_force_closure(workcell: Workcell) -> bool:
-    """Whether a workcell's pads hold its payload whatever the motion asks."""
+    """Return True if a workcell's pads hold its payload under every motion."""
     return _balanced_states(workcell, SPARE_FRICTION) is not None
 
 
-def pressed_alike(workcell: Workcell) -> Array:
-    """(k, pads) coefficients of normal forces that are zero: pads side by side on one arm that
-    press evenly press with one pressure, because the arm keeps their common plane's orientation.
-
-    Pads of one arm with different normals press as the motion asks.
-    """
+def equal_pressure_rows(workcell: Workcell) -> Array:
+    """Return rows (k, pads) of coefficients of normal forces whose sums are zero: pads of one arm
+    with the same normal press with equal pressure, because the arm keeps the orientation of their
+    common plane. Pads of one arm with different normals press as the motion requires."""
     pads, robots, rows = workcell.pads, workcell.pad_robots, []
     for k in range(1, len(pads)):
         first = robots.index(robots[k])
@@ -126,13 +121,14 @@ def pressed_alike(workcell: Workcell) -> Array:
 
 
 def balance_maps(workcell: Workcell, in_units: bool = False) -> list[Array]:
-    """Per pad (6 + k, 4), from its state to what is balanced: force and moment about the box
-    frame's origin, along the box's axes, then the rows of `pressed_alike`.
+    """Return, for each pad, the matrix (6 + k, 4) from its state to the balanced quantities: force
+    and moment about the box frame's origin, along the box's axes, then the rows of
+    `equal_pressure_rows`.
 
     Args:
-        in_units: for states whose friction and radius are taken out.
+        in_units: for states in newtons and newton metres, without friction and radius.
     """
-    alike, found = pressed_alike(workcell), []
+    alike, found = equal_pressure_rows(workcell), []
     for i, pad in enumerate(workcell.pads):
         if in_units:
             pad = replace(pad, friction=1.0, patch_radius=1.0, half_sides=None)
@@ -144,10 +140,8 @@ def balance_maps(workcell: Workcell, in_units: bool = False) -> list[Array]:
 
 
 def _balanced_states(workcell: Workcell, share: float) -> tuple[Array, ...] | None:
-    """States within the cones at a share of the friction, whose wrenches cancel.
-
-    They are weighted sums of points on the cones' boundaries, all weights positive.
-    """
+    """Find states within the cones at a share of the friction, whose wrenches sum to zero. They are
+    sums of points on the cones' boundaries with positive weights."""
     maps = balance_maps(workcell)
     lessened = [_with_friction(_generators(pad), share) for pad in workcell.pads]
     columns = np.vstack([rows @ A.T for rows, A in zip(lessened, maps, strict=True)])
@@ -163,10 +157,11 @@ def _balanced_states(workcell: Workcell, share: float) -> tuple[Array, ...] | No
 
 
 def _weights(columns: Array) -> Array | None:
-    """Positive weights (n,) that sum to one and cancel the rows a_j of `columns` (n, m), or None.
+    """Find positive weights (n,) with sum one and zero weighted sum of the rows a_j of `columns`
+    (n, m), else None.
 
-    At the analytic centre of the polytope 1 + a_j . y > 0, which exists if and only if such weights
-    do, the weights 1 / (1 + a_j . y) are.
+    The analytic centre of the polytope 1 + a_j . y > 0 exists if and only if such weights do. The
+    weights are proportional to 1 / (1 + a_j . y) there.
     """
     if np.linalg.matrix_rank(columns) < columns.shape[1]:
         return None
@@ -184,7 +179,8 @@ def _weights(columns: Array) -> Array | None:
 
 
 def state_to_box(contact: Contact) -> Array:
-    """(6, 4) from a patch's state to force and moment about the box frame's origin, box axes."""
+    """Return the matrix (6, 4) from a patch's state to force and moment about the box frame's
+    origin, box axes."""
     mu, r = contact.friction, contact.patch_radius
     local = np.zeros((WRENCH_SIZE, WRENCH_SIZE))
     local[[0, 1, 2], [1, 2, 0]] = mu, mu, 1.0
@@ -194,7 +190,8 @@ def state_to_box(contact: Contact) -> Array:
 
 
 def wrench_to_box(contact: Contact) -> Array:
-    """(6, 6) from a wrench about a pad's centre, in its axes, to one about the box frame."""
+    """Return the matrix (6, 6) from a wrench about a pad's centre, in its axes, to one about the
+    box frame."""
     R, p = contact.T_box_pad[:3, :3], contact.T_box_pad[:3, 3]
     return np.block([[R, np.zeros((3, 3))], [skew(p) @ R, R]])
 
@@ -206,8 +203,8 @@ def _with_friction(states: Array, share: float) -> Array:
 
 
 def scaled_patch(contact: Contact) -> SoftPatch:
-    """A contact's patch under even pressure in its own axes, its lengths over its radius: of every
-    disc the same."""
+    """Return a contact's patch with lengths over its radius, in its own axes; equal for all
+    discs."""
     if contact.half_sides is None:
         return SoftPatch(2.0 / 3.0, np.eye(2))
     own = SoftPatch.of(contact, contact.T_box_pad[:3, :3])
@@ -215,7 +212,7 @@ def scaled_patch(contact: Contact) -> SoftPatch:
 
 
 def _generators(contact: Contact) -> Array:
-    """(n, 4) states on the boundary of a patch's cone that span it, each with N = 1."""
+    """Return states (n, 4) on the boundary of a patch's cone that span it, each with N = 1."""
     patch, rows = scaled_patch(contact), []
     for angle in 2.0 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS:
         for share in np.linspace(0.0, 1.0, TORSIONS + 1)[:-1]:
@@ -226,15 +223,15 @@ def _generators(contact: Contact) -> Array:
     return np.array(rows)
 
 
-# --- what formulas hold beside the pads' own numbers ---
+# --- constants of a grasp's formulas ---
 
 
-def left_components(workcell: Workcell) -> tuple[int, ...]:
-    """Components of the states that are what the others leave: the first ones that reach every
-    load, forces before moments.
+def dependent_components(workcell: Workcell) -> tuple[int, ...]:
+    """Select the components of the states that the others and the load determine: the first ones
+    that reach every load, forces before moments.
 
-    The choice is structure: it knows neither friction nor sizes, and slightly other places of pads
-    do not change it, as they would change pivots that are nearly alike.
+    The choice depends on neither friction nor sizes, and is stable under small displacements of
+    pads; pivots of nearly equal size would not be.
     """
     effects = np.hstack(balance_maps(workcell, in_units=True)).astype(float)
     effects[3:LOAD_SIZE] /= MOMENT_ARM
@@ -247,7 +244,8 @@ def left_components(workcell: Workcell) -> tuple[int, ...]:
 
 
 def _new_columns(matrix: Array, order: Sequence[int], least: float) -> list[int]:
-    """Columns, in an order, of which more than a length is outside the span of those before."""
+    """Select columns, in an order, whose part outside the span of the earlier ones is longer than
+    `least`."""
     taken: list[int] = []
     span = np.zeros((len(matrix), 0))
     for k in order:
@@ -259,16 +257,16 @@ def _new_columns(matrix: Array, order: Sequence[int], least: float) -> list[int]
     return taken
 
 
-def derived(workcell: Workcell, reach: float = 1.0) -> GraspNumbers:
-    """The numbers of a grasp, without those of its place at rest.
+def derive_grasp_numbers(workcell: Workcell, reach: float = 1.0) -> GraspNumbers:
+    """Derive the constants of a grasp, except its states at rest.
 
     Args:
         reach: size of the patches that the squeeze has to lie within, over the cell's own.
 
     Raises:
-        SettingsError: no squeeze holds the payload whatever is asked.
+        SettingsError: no internal squeeze exists.
     """
-    left = np.array(left_components(workcell))
+    left = np.array(dependent_components(workcell))
     cell = workcell if reach == 1.0 else smaller_patches(workcell, reach)
     squeeze = closing_squeeze(cell)
     if squeeze is None:
@@ -276,7 +274,7 @@ def derived(workcell: Workcell, reach: float = 1.0) -> GraspNumbers:
             "the pads do not close their grasp: no internal squeeze lies within their friction "
             "cones; raise the friction or turn them towards one another"
         )
-    # The least states that balance a load, whether they lie within the cones or not.
+    # The least-norm states that balance a load, inside the cones or not.
     whole, in_units = (np.hstack(balance_maps(cell, units)) for units in (False, True))
     free = np.setdiff1d(np.arange(in_units.shape[1]), left)
     to_left = np.linalg.inv(in_units[:, left]).astype(float)
@@ -296,9 +294,9 @@ def derived(workcell: Workcell, reach: float = 1.0) -> GraspNumbers:
 
 
 def grasp_shapes(workcell: Workcell) -> dict[str, Any]:
-    """Shapes of all arrays of `GraspNumbers`; `shapes` has one per pad."""
+    """Return the shapes of all arrays of `GraspNumbers`; `shapes` has one per pad."""
     pads = workcell.pads
-    b, n = len(left_components(workcell)), len(EVEN) * len(pads)
+    b, n = len(dependent_components(workcell)), len(EVEN) * len(pads)
     return {
         "squeeze": (n,),
         "spread": (n, LOAD_SIZE),
@@ -314,7 +312,8 @@ def grasp_shapes(workcell: Workcell) -> dict[str, Any]:
 
 
 def _shape(pad: Contact) -> Array:
-    """What a pad's cone depends on: mean distance and spread over its radius; none of a disc."""
+    """Return the mean distance and the spread of a rectangular patch over its radius; empty for a
+    disc."""
     if pad.half_sides is None:
         return np.zeros(0)
     patch = scaled_patch(pad)
@@ -322,7 +321,7 @@ def _shape(pad: Contact) -> Array:
 
 
 def least_distance(workcell: Workcell) -> float:
-    """Least distance between two pads of different robots [m]."""
+    """Compute the least distance between two pads of different robots [m]."""
     places = [
         np.array([pad.T_box_pad[:3, 3] for pad in (contact, *contact.further)])
         for contact in workcell.contacts
@@ -331,7 +330,7 @@ def least_distance(workcell: Workcell) -> float:
 
 
 def smaller_patches(workcell: Workcell, share: float) -> Workcell:
-    """The cell with smaller patches about the same places."""
+    """Return the cell with smaller patches at the same places."""
 
     def smaller(contact: Contact) -> Contact:
         sides = contact.half_sides
@@ -347,8 +346,8 @@ def smaller_patches(workcell: Workcell, share: float) -> Workcell:
 
 
 def robot_wrenches(workcell: Workcell) -> Array:
-    """(6, 6 k) from all pads' wrenches, see `grasp_wrenches`, to force and moment of the robot that
-    has the pad about its nominal contact point, along the axes of contact 1."""
+    """Return the matrix (6, 6 k) from all pads' wrenches, see `grasp_wrenches`, to force and moment
+    of the first robot about its nominal contact point, along the axes of contact 1."""
     axes, columns = workcell.contacts[0].T_box_pad[:3, :3], []
     for pad, robot in zip(workcell.pads, workcell.pad_robots, strict=True):
         force, moment = np.zeros((2, 3, WRENCH_SIZE))
@@ -364,7 +363,7 @@ def robot_wrenches(workcell: Workcell) -> Array:
 
 
 def _load_at_rest(workcell: Workcell) -> Array:
-    """(6,) of the payload as it stands at the start, as a direction that is scaled like loads."""
+    """Return the load (6,) of the payload at rest at the start, divided by the load's scale."""
     turn = box_rotation(workcell.task.orientation, workcell.task.waypoints[0].lower)
     force = -turn.T @ np.array(GRAVITY)
     moment = np.cross(workcell.payload.centre_of_mass, force)
@@ -373,5 +372,5 @@ def _load_at_rest(workcell: Workcell) -> Array:
 
 
 def _cleaned(matrix: Array) -> Array:
-    """Without what is zero but for rounding."""
+    """Set entries that are zero but for rounding to zero."""
     return np.where(np.abs(matrix) < 1e-14 * np.abs(matrix).max(), 0.0, matrix)

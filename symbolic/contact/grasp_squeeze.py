@@ -1,39 +1,40 @@
-"""The least squeeze of pads anywhere: the commanded force of one robot that holds a load.
+"""Least squeeze of pads with any normals: the commanded force of one robot that holds a load.
 
-The objective is linear in the program of `symbolic.contact.grasp`, so that the commanded force is a
-convex function of the load.
+The program is that of `symbolic.contact.grasp` with a linear objective, so that the commanded force
+is a convex function of the load.
 """
 
 from __future__ import annotations
 
 import casadi as ca
 
-from symbolic.contact.central_path import least
-from symbolic.contact.force_closure import derived, has_force_closure, smaller_patches
+from symbolic.contact.central_path import minimum
+from symbolic.contact.force_closure import derive_grasp_numbers, has_force_closure, smaller_patches
 from symbolic.contact.grasp import BEYOND, SCALE_FLOOR, Grasp
 from symbolic.expression import as_mx, number
 from symbolic.records import Workcell
 from symbolic.records.numbered import NumberedWorkcell
 
 DISPLACED = 6
-"""Repetitions by which what displaced forces turn about is found: each takes the error to its
-displacement over the pads' distances."""
+"""Fixed-point iterations for the moments of displaced forces: each multiplies the error by the
+displacement over the pads' distance."""
 
 REACHES = (0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95)
-"""Sizes of the patches, as shares, at which a squeeze to start from is looked for."""
+"""Relative sizes of the patches at which an initial squeeze is sought."""
 
 ROUNDING = 1e-6
-"""Share of the commanded force by which balancing displaced forces may exceed it."""
+"""Share of the commanded force by which displaced forces may exceed it."""
 
 OTHER_WEIGHT = 1e-3
-"""Weight of the other robot's normal force, which alone may be anything: what it adds to the
-commanded force makes that a little more than the least."""
+"""Weight of the other robot's normal force, which makes the solution unique. It raises the
+commanded force slightly above the least."""
 
 
 class GraspSqueeze(Grasp):
-    """Least normal force of one robot, plus a little of the other's; see `OTHER_WEIGHT`. Inputs are
-    load, coefficients and sizes of the patches over the cell's own, (2,) by robot, and the pads'
-    displacements (4,), the same for all pads of a robot, along their tangents.
+    """Program of the least normal force of one robot, plus `OTHER_WEIGHT` times the other's.
+
+    Inputs: load; friction coefficients and sizes of the patches over the cell's own, (2,) by robot;
+    displacements (4,) along the pads' tangents, the same for all pads of a robot.
 
     Attributes:
         workcell: the cell.
@@ -41,16 +42,16 @@ class GraspSqueeze(Grasp):
     """
 
     def __init__(self, workcell: Workcell, commanded: int) -> None:
-        """Find the squeeze to start from, within smaller patches where these close the grasp.
+        """Find the initial squeeze, within the smallest patches of `REACHES` that close the grasp.
 
         Raises:
-            SettingsError: no squeeze holds the payload whatever is asked.
+            SettingsError: no internal squeeze exists.
         """
         if isinstance(workcell, NumberedWorkcell):
             numbers = workcell.squeezes[commanded]
         else:
             shares = (s for s in REACHES if has_force_closure(smaller_patches(workcell, s)))
-            numbers = derived(workcell, next(shares, 1.0))
+            numbers = derive_grasp_numbers(workcell, next(shares, 1.0))
         super().__init__(workcell, numbers)
         self.workcell, self.commanded = workcell, commanded
         self.cell_sizes = (*self.cell_sizes, ("reach", 2), ("displacement", 4))
@@ -62,16 +63,16 @@ class GraspSqueeze(Grasp):
     def balanced(self, free: ca.SX, cell: list[ca.SX]) -> list[ca.SX]:
         """See `symbolic.contact.central_path.ConvexProgram`."""
         load, friction, reach, displacement = cell
-        wrenches = self._left_by(load, free, [friction, reach])
+        wrenches = self._balanced_wrenches(load, free, [friction, reach])
         for _ in range(DISPLACED):
             turned = self._turned(wrenches, displacement, [friction, reach])
-            wrenches = self._left_by(
+            wrenches = self._balanced_wrenches(
                 load - ca.vertcat(ca.SX.zeros(3), turned), free, [friction, reach]
             )
         return wrenches
 
     def _turned(self, wrenches: list[ca.SX], displacement: ca.SX, sizes: list[ca.SX]) -> ca.SX:
-        """Moment (3,) of scaled wrenches' forces about where they would act."""
+        """Compute the moment (3,) that displaced scaled wrenches add."""
         total = ca.SX.zeros(3)
         for i, (pad, robot, own) in enumerate(zip(self._pads, self.robots, wrenches, strict=True)):
             normal, *tangent = ca.vertsplit((self.units(i, *sizes) * own)[:3])
@@ -87,7 +88,7 @@ class GraspSqueeze(Grasp):
             total += wrench[0] * (1.0 if robot == self.commanded else OTHER_WEIGHT)
         return total
 
-    def told(self, wrenches: list[ca.SX], sizes: list[ca.SX]) -> tuple[ca.SX, ca.SX | float]:
+    def result(self, wrenches: list[ca.SX], sizes: list[ca.SX]) -> tuple[ca.SX, ca.SX | float]:
         """See `Grasp`."""
         force = [ca.SX(0.0), ca.SX(0.0)]
         for own, robot in zip(wrenches, self.robots, strict=True):
@@ -105,21 +106,22 @@ def commanded_forces(
     handed: dict[str, ca.MX] | None = None,
     differentiable: bool = False,
 ) -> ca.MX:
-    """(2,) normal forces of the robots [N]: what is commanded, a convex function of the load, and
-    what the other one then presses with. Beyond any limit where the grasp does not close.
+    """Build the normal forces (2,) of the robots [N]: the commanded one, a convex function of the
+    load, and the resulting one of the other robot. Both exceed any limit if the grasp does not
+    close.
 
     Args:
         load: (6,) force and moment about the box frame's origin, along the box's axes.
         friction: (2,) Coulomb coefficients of the robots' pads.
-        share: (2,) sizes of their patches over the cell's own.
+        share: (2,) sizes of the robots' patches over the cell's own.
         displacement: (4,) of the pads [m].
-        handed: the squeeze's given numbers, where they are symbols.
-        differentiable: whether first derivatives are wanted.
+        handed: symbolic parameters of the squeeze.
+        differentiable: make first derivatives exact.
     """
     handed = handed or {}
     reach = share / as_mx(ca.SX(number(squeeze.numbers.reach)), squeeze.given, handed)
     cell = [load, friction, reach, displacement]
-    return squeeze.solved(cell, list(handed.values()), differentiable)
+    return squeeze.solve(cell, list(handed.values()), differentiable)
 
 
 def commanded_slack(
@@ -130,30 +132,34 @@ def commanded_slack(
     displacement: ca.SX,
     force: ca.SX,
 ) -> ca.SX:
-    """Positive where the least wrenches that balance a load, and as much of the squeeze as makes
-    the commanded force (arguments as in `commanded_forces`), lie within all cones."""
+    """Build the slack of a commanded force, a sufficient test. It is positive if the least-norm
+    states plus the squeeze that needs this force lie within all cones. Arguments as of
+    `commanded_forces`."""
     reach = share / squeeze.numbers.reach
-    asked, given = squeeze.asked(load, friction, reach), squeeze.squeezed(friction, reach)
+    asked, given = (
+        squeeze.least_states(load, friction, reach),
+        squeeze.squeeze_states(friction, reach),
+    )
     own = [k for k, robot in enumerate(squeeze.robots) if robot == squeeze.commanded]
     pressed = (force - sum(asked[k][0] for k in own)) / sum(given[k][0] for k in own)
     held = [a + pressed * g for a, g in zip(asked, given, strict=True)]
     held = squeeze.balanced(squeeze.free(held), [load, friction, reach, displacement])
     enough = ca.fmin(pressed, (1.0 + ROUNDING) * force - sum(held[k][0] for k in own))
     slack = [patch.slack(state) for patch, state in zip(squeeze.patches, held, strict=True)]
-    return ca.fmin(least(slack), enough)
+    return ca.fmin(minimum(slack), enough)
 
 
-def against_internal(squeeze: GraspSqueeze) -> ca.Function:
-    """friction and sizes of the patches, (2,) by robot, to the commanded force beyond the least [N]
-    per newton of tangential force of any pad: what the squeeze leaves of that pad's friction holds
-    it."""
+def internal_force_gain(squeeze: GraspSqueeze) -> ca.Function:
+    """Build the function from friction and sizes of the patches, (2,) by robot, to the additional
+    commanded force [N] per newton of tangential force between the arms at any pad, borne by the
+    friction that the squeeze leaves."""
     friction, share = ca.SX.sym("friction", 2), ca.SX.sym("share", 2)
-    given = squeeze.squeezed(friction, share / squeeze.numbers.reach)
+    given = squeeze.squeeze_states(friction, share / squeeze.numbers.reach)
     left = [
         friction[r] * (given[k][0] - ca.norm_2(given[k][1:3]) - ca.fabs(given[k][3]))
         for k, r in enumerate(squeeze.robots)
     ]
     pressed = squeeze.normals[squeeze.commanded]
-    held = ca.fmax(least(left), SCALE_FLOOR)
+    held = ca.fmax(minimum(left), SCALE_FLOOR)
     inputs = [friction, share, *squeeze.given.values()]
-    return ca.Function("against_internal", inputs, [pressed / held])
+    return ca.Function("internal_force_gain", inputs, [pressed / held])

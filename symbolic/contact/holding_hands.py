@@ -1,22 +1,23 @@
-"""Hands that hold by themselves: cups, magnets and grippers, each with a holding force of its own.
+"""Hands that hold by themselves: cups, magnets and grippers, each with its own holding force.
 
-A hand pulls the payload against itself with the holding force G. Of the load it bears a share
+A hand pulls the payload against itself with the holding force G. It bears a share of the load
 (`symbolic.contact.elastic.layer_shares`): the normal force N, positive if it presses, the
 tangential force T, moments M_x and M_y about the tangents and the torsion tau. Its patch presses
-with G + N. It needs
+with G + N. Required is
 
     G >= |M| / kern - N                                             so that no rim lifts off,    (1)
     G >= sqrt(|T|^2 + t^2 + kappa |T| t) / mu - N,  t = |tau| / c,  so that nothing slides.      (2)
 
-The kern is the shift of the centre of pressure that takes the pressure off a rim; of a rectangle
-both axes add up. c is the mean distance of the patch's points from its centre. kappa makes (2)
-safe against the limit curve of a patch under even pressure (Howe and Cutkosky, IJRR 1996): a disc
-needs 0 to 2.1 % more than exact, the ring of a cup's lip 0 to 3.0 %, a rectangle 0 to 11 % up to
-sides of 2 to 1, and up to 21 % at 5 to 1. Both right sides are convex in the load and of degree
-one: a multiple of the load needs the multiple of the force, and a sum needs at most the sum.
+The kern is the shift of the centre of pressure at which the pressure at a rim vanishes; of a
+rectangle both axes add up. c is the mean distance of the patch's points from its centre. kappa
+makes (2) safe against the limit curve of a patch under even pressure (Howe and Cutkosky, IJRR
+1996): a disc requires 0 to 2.1 % more than exact, the ring of a cup's lip 0 to 3.0 %, a rectangle 0
+to 11 % up to sides of 2 to 1, and up to 21 % at 5 to 1. Both right sides are convex in the load and
+of degree one: a multiple of the load requires that multiple of the force, and a sum at most the
+sum.
 
-Each hand is to hold its own share, although others could take over what it cannot: a cup that
-slides or lifts leaks.
+Each hand has to hold its own share, although others could take over a part of it: a cup that slides
+or lifts leaks.
 """
 
 from __future__ import annotations
@@ -56,7 +57,7 @@ class HandPatch:
 
     Attributes:
         kern: along the axes of the hand [m].
-        is_round: whether the patch is a disc or a ring.
+        is_round: the patch is a disc or a ring.
         twist: c of (2) [m].
         kappa: of (2).
     """
@@ -79,11 +80,11 @@ class HandPatch:
         return cls(kern(hand), is_round, number(twist), kappa)
 
 
-def needed_holding_forces(
+def required_holding_forces(
     wrench: Expression, friction: Expression, patch: HandPatch
 ) -> tuple[Expression, Expression]:
-    """Return the holding forces that (1) and (2) ask of a hand [N]; below zero where the load
-    presses it on.
+    """Compute the holding forces that (1) and (2) require of a hand [N]; negative if the load
+    presses it on strongly enough.
 
     Args:
         wrench: (6,) of the hand on the payload, T, N, M_x, M_y, tau in its axes [N, N m].
@@ -103,12 +104,12 @@ def _length(*components: Expression) -> Expression:
     return ca.sqrt(sum(component**2 for component in components) + FLOOR**2)
 
 
-def opposed_needs(pads: Sequence[Contact], robots: Sequence[int]) -> Array:
-    """Return what one newton between the arms asks of each hand (n, 3), whatever its direction: a
-    and b of a / mu + b against sliding, and against lifting [1].
+def internal_force_needs(pads: Sequence[Contact], robots: Sequence[int]) -> Array:
+    """Compute the additional holding force (n, 3) of each hand per newton between the arms, for the
+    worst direction: a and b of a / mu + b against sliding, and the force against lifting [1].
 
-    Arms whose relative place is off by a displacement work against one another: both arms' layers
-    are springs in series. Bounds of all directions add up, so that a hand needs no more.
+    Arms with an error of their relative pose work against each other; both arms' layers are springs
+    in series. Bounds over all directions are summed, so that the result is an upper bound.
     """
     maps, stiff = [wrench_to_box(pad) for pad in pads], [layer_stiffness(pad) for pad in pads]
     wholes = [np.zeros((6, 6)), np.zeros((6, 6))]
@@ -129,9 +130,9 @@ def opposed_needs(pads: Sequence[Contact], robots: Sequence[int]) -> Array:
 
 
 class HoldingHands(ContactModel):
-    """Hands of both arms, any number with any normals. What counts as the normal force of an arm is
-    the largest holding force that any of its hands needs. In worst cases the hands of both arms
-    count together: no force is commanded, and a limit is one for both."""
+    """Hands of both arms, any number with any normals. The normal force of an arm stands for the
+    largest holding force that any of its hands needs. In worst cases the hands of both arms count
+    together: no force is commanded, and one limit applies to both."""
 
     assumption = "hands that hold by themselves, on arms that keep their poses"
     is_squeeze = False
@@ -159,7 +160,7 @@ class HoldingHands(ContactModel):
 
     @property
     def level_force(self) -> float:
-        """Holding force that a hand needs if the payload is level and still [N]."""
+        """Holding force that a hand needs with the payload level and still [N]."""
         payload, contacts = self.workcell.payload, self.workcell.contacts
         centre = payload.centre_of_mass
         load = ContactLoad(
@@ -177,8 +178,8 @@ class HoldingHands(ContactModel):
         implicit: ImplicitVariables | None = None,
         displaced: bool = False,
     ) -> HeldLoad:
-        """See `ContactModel`. What counts as tangential is what the holding force bears by
-        friction, so that it never exceeds friction times the normal force."""
+        """See `ContactModel`. The tangential force is the part of the load that the holding force
+        bears by friction, so that it never exceeds friction times the normal force."""
         workcell = self.workcell
         places = [number(contact.T_box_pad[:3, 3]) for contact in workcell.contacts]
         # The axes of the box, along those of the load.
@@ -191,7 +192,7 @@ class HoldingHands(ContactModel):
         forces, moments = ([ca.SX.zeros(3), ca.SX.zeros(3)] for _ in range(2))
         for hand, i, share in zip(workcell.pads, workcell.pad_robots, self._shares, strict=True):
             own, friction = ca.mtimes(share, whole), load.friction[i]
-            lifting, sliding = needed_holding_forces(own, friction, HandPatch.of(hand))
+            lifting, sliding = required_holding_forces(own, friction, HandPatch.of(hand))
             needed[i] = ca.fmax(needed[i], ca.fmax(lifting, sliding))
             rubbed[i] = ca.fmax(rubbed[i], _length(own[0], own[1]) - friction * own[2])
             turn = ca.mtimes(box, number(hand.T_box_pad[:3, :3]))
@@ -214,22 +215,23 @@ class HoldingHands(ContactModel):
         )
 
     def friction_lost(self, apart: Array) -> Array:
-        """See `ContactModel`. No squeeze makes a moment of displacements."""
+        """See `ContactModel`. There is no squeeze that displacements could turn into a moment."""
         return 0.0 * apart
 
     def worst_displacements(self, uncertainty: Uncertainty) -> tuple[Array, Array]:
-        """See `ContactModel`. Hands off their places leave the centre of mass as much off."""
+        """See `ContactModel`. Displaced hands shift the centre of mass relative to them."""
         off = uncertainty.pad_position + uncertainty.apart / 2.0
         return uncertainty.centre_of_mass + off, np.zeros((1, 4))
 
     def leading_excess(self, load: ContactLoad, opposed: Expression) -> Expression:
-        """See `ContactModel`. Both count together."""
+        """See `ContactModel`. The hands of both arms count together."""
         return ca.SX(0.0)
 
     def commanded_forces(
         self, normal: Expression, friction: Expression, tracking: Expression, opposed: Expression
     ) -> Expression:
-        """See `ContactModel`. Some of the holding force, of a vacuum say, may be missing."""
+        """See `ContactModel`. A share of the holding force, for example of a vacuum, may be
+        missing."""
         most = ca.SX(0.0)
         for (a, b, lifting), i in zip(self._opposed, self.workcell.pad_robots, strict=True):
             most = ca.fmax(most, ca.fmax(a / friction[i] + b, lifting))
@@ -239,11 +241,11 @@ class HoldingHands(ContactModel):
 
     @property
     def _opposed(self) -> list[list[Any]]:
-        """Per hand its row of `opposed_needs`; symbols if the cell's numbers are."""
+        """Per hand its row of `internal_force_needs`; symbols if the cell's numbers are."""
         pads = self.workcell.pads
         if isinstance(pads[0], NumberedContact):
             return [ca.vertsplit(p.opposed) for p in pads if isinstance(p, NumberedContact)]
-        return [list(row) for row in opposed_needs(pads, self.workcell.pad_robots)]
+        return [list(row) for row in internal_force_needs(pads, self.workcell.pad_robots)]
 
     @property
     def _shares(self) -> list[Any]:

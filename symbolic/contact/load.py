@@ -51,7 +51,7 @@ nominal contact point, world axes [N, N m].
 """
 
 SIZES = {"pose": 6, "rate": 6, "second_rate": 6, "friction": 2, "centre_of_mass": 3}
-"""Inputs of `uncertain_load_function` and how many entries each has."""
+"""Inputs of `uncertain_load_function` and their sizes."""
 
 SAMPLE_SIZES = (
     ("pose", 6),
@@ -60,14 +60,14 @@ SAMPLE_SIZES = (
     ("friction", 2),
     ("centre_of_mass", 3),
 )
-"""Inputs of the functions that allocate anew; force and moment in the world frame."""
+"""Inputs of functions of one sample's forces; force and moment in the world frame."""
 
 
 def load_function(workcell: Workcell) -> ca.Function:
-    """Contact forces and centres of pressure from a box pose and its time derivatives.
+    """Build the function of contact forces and centres of pressure at one sample of the box motion.
 
-    Inputs: pose, rate, second_rate (6,) as in `symbolic.path.time_law.TimedPath`.
-    Outputs: see `LOAD_OUTPUTS`.
+    Inputs: pose, rate, second_rate (6,) as in `symbolic.path.time_law.TimedPath`. Outputs: see
+    `LOAD_OUTPUTS`.
     """
     payload = workcell.payload
     own: list[Expression] = [frictions(workcell), ca.SX(number(payload.centre_of_mass))]
@@ -83,14 +83,14 @@ def load_function(workcell: Workcell) -> ca.Function:
 
 
 def frictions(workcell: Workcell) -> ca.SX:
-    """(2,) Coulomb coefficients of the contacts."""
+    """Return the Coulomb coefficients (2,) of the contacts."""
     return ca.vertcat(*[ca.SX(number(contact.friction)) for contact in workcell.contacts])
 
 
 def resultant_force(
     mass: float, offset: ca.SX, omega: ca.SX, alpha: ca.SX, acceleration: ca.SX
 ) -> ca.SX:
-    """Resultant force (3,) on a turning and accelerating box, world frame (Eq. 34) [N].
+    """Compute the resultant force (3,) on a turning and accelerating box, world frame (Eq. 34) [N].
 
     Args:
         offset: (3,) from the box centre to its centre of mass [m].
@@ -102,10 +102,10 @@ def resultant_force(
 
 
 def uncertain_load_function(workcell: Workcell) -> ca.Function:
-    """`load_function` with further inputs for what is known least.
+    """Build `load_function` with friction and centre of mass as further inputs.
 
-    Inputs: pose, rate, second_rate (6,); friction (2,) coefficients of the contacts;
-    centre_of_mass (3,) in the box frame [m]. Outputs: see `LOAD_OUTPUTS`.
+    Inputs: pose, rate, second_rate (6,); friction (2,) coefficients of the contacts; centre_of_mass
+    (3,) in the box frame [m]. Outputs: see `LOAD_OUTPUTS`.
     """
     if contact_model(workcell).has_closed_form:
         return _closed_load_function(workcell)
@@ -141,7 +141,7 @@ def _closed_load_function(workcell: Workcell) -> ca.Function:
 
 
 def _grasp_load_function(workcell: Workcell) -> ca.Function:
-    """The least forces of pads anywhere, see `symbolic.contact.grasp`."""
+    """Build the load function of pads with any normals, see `symbolic.contact.grasp`."""
     inputs = {name: ca.MX.sym(name, size) for name, size in SIZES.items()}
     names = ("angular_velocity", "angular_acceleration", "force", "required_moment")
     given = [ca.SX.sym(name, size) for name, size in SIZES.items() if name != "friction"]
@@ -158,7 +158,7 @@ def _grasp_load_function(workcell: Workcell) -> ca.Function:
 
 
 def _named(inputs: dict[str, ca.MX], outputs: dict[str, ca.MX]) -> ca.Function:
-    """`uncertain_load_function` from its inputs and outputs."""
+    """Build `uncertain_load_function` from its inputs and outputs."""
     ordered = {name: outputs[name] for name in LOAD_OUTPUTS}
     return named_function("uncertain_load", inputs, ordered, cse=False)
 
@@ -166,8 +166,8 @@ def _named(inputs: dict[str, ca.MX], outputs: dict[str, ca.MX]) -> ca.Function:
 def required(
     workcell: Workcell, pose: ca.SX, rate: ca.SX, second: ca.SX, centre_of_mass: ca.SX | ca.DM
 ) -> list[ca.SX]:
-    """R_world_box (3, 3), the angular velocity and acceleration, and the force and moment about the
-    centre of mass that the motion asks for, (3,) each, world."""
+    """Compute the dynamics of the box: R_world_box (3, 3), angular velocity and acceleration,
+    required force, and required moment about the centre of mass, (3,) each, world axes."""
     turned = workcell.task.orientation
     rotation = rotation_matrix(turned, pose[3:])
     omega = angular_velocity(turned, pose[3:], rate[3:])
@@ -179,7 +179,7 @@ def required(
 
 
 def _sample_function(workcell: Workcell) -> ca.Function:
-    """pose, force, moment (world), friction and centre of mass to the outputs `GRASP_OUTPUTS`."""
+    """Build the function from `SAMPLE_SIZES` to `GRASP_OUTPUTS`."""
     inputs, given = [ca.MX.sym(*entry) for entry in SAMPLE_SIZES], mx_parameters(workcell.payload)
     pose, force, moment, friction, centre_of_mass = inputs
     asked = (pose, force, moment, centre_of_mass)
@@ -190,7 +190,7 @@ def _sample_function(workcell: Workcell) -> ca.Function:
 
 
 def _length(vector: Expression) -> Expression:
-    """Length with a finite derivative at zero; 1e-12 m is far below any patch."""
+    """Compute a length with a finite derivative at zero; 1e-12 m is far below any patch."""
     return ca.sqrt(ca.sumsqr(vector) + 1e-24)
 
 
@@ -208,17 +208,17 @@ GRASP_OUTPUTS = (
     "wrench_1",
     "wrench_2",
 )
-"""Entries of `LOAD_OUTPUTS` that the program finds."""
+"""Entries of `LOAD_OUTPUTS` that follow from the program's wrenches."""
 
 LEAST_FORCE = 1e-9
-"""Normal force below which a centre of pressure counts as the patch's [N]."""
+"""Normal force below which the centre of pressure counts as that of the patch [N]."""
 
 _ASKED = (("pose", 6), ("force", 3), ("moment", 3), ("centre_of_mass", 3))
 
 
 def box_load_function(workcell: Workcell) -> ca.Function:
-    """pose, force, moment about the centre of mass (world) and centre of mass to force and moment
-    about the box frame's origin (6,), along the box's axes."""
+    """Build the function from `_ASKED` (world axes) to force and moment (6,) about the box frame's
+    origin, along the box's axes."""
     pose, force, moment, centre_of_mass = inputs = [ca.SX.sym(*entry) for entry in _ASKED]
     to_box = rotation_matrix(workcell.task.orientation, pose[3:]).T
     in_box = ca.mtimes(to_box, force)
@@ -227,7 +227,7 @@ def box_load_function(workcell: Workcell) -> ca.Function:
 
 
 def grasp_world_function(workcell: Workcell) -> ca.Function:
-    """The inputs of `box_load_function` and the pads' wrenches (6 k,), see
+    """Build the function from the inputs of `box_load_function` and the pads' wrenches (6 k,), see
     `symbolic.contact.grasp.grasp_wrenches`, to `GRASP_OUTPUTS`."""
     pose, _, moment, centre_of_mass = inputs = [ca.SX.sym(*entry) for entry in _ASKED]
     pads, robots = workcell.pads, workcell.pad_robots

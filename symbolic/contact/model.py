@@ -1,11 +1,11 @@
-"""The contact model of a workcell: how its pads bear a load, what limits that, what is commanded.
+"""Contact models: the forces with which pads hold a load, their limits, and commanded forces.
 
-A workcell file names a model, `symbolic.contact.registry` makes it, and all rooms ask it. A new
-model is a subclass of `ContactModel` and a line in the registry.
+A workcell file names a model and `symbolic.contact.registry` makes it. A new model is a subclass of
+`ContactModel` and a line in the registry.
 
-`ContactModel.hold` gives the forces of a load as an expression; planned forces, their limits and
-derivatives, worst cases and commanded forces follow from it. Where a model has no closed form, the
-program of `symbolic.contact.grasp` finds the forces.
+`ContactModel.hold` gives the forces under a load as an expression; planned forces, their limits and
+derivatives, worst cases and commanded forces follow from it. The program of
+`symbolic.contact.grasp` finds the forces of models without a closed form.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ Both = tuple[Expression, Expression]
 
 @dataclass(frozen=True)
 class ContactLoad:
-    """The load that two contacts bear; all vectors along the same axes, the world's for instance.
+    """The load on two contacts; all vectors along the same axes, for example the world's.
 
     Attributes:
         force, moment: (3,) on the payload, about its centre of mass [N, N m].
-        arms: (3,) each, from there to the nominal contact points [m].
+        arms: (3,) each, from the centre of mass to the nominal contact points [m].
         axes: (3, 3) tangents and normal of contact 1 as columns.
         friction: (2,) Coulomb coefficients.
     """
@@ -50,15 +50,15 @@ class ContactLoad:
 
 @dataclass(frozen=True)
 class HeldLoad:
-    """The forces with which two contacts bear a load.
+    """The forces of two contacts that balance a load.
 
     Attributes:
         normal, tangential: (2,) normal forces and magnitudes of the tangential ones [N].
         forces: (3,) each, on the payload [N].
         shifts: (3,) each, of the centres of pressure [m].
         moments: (3,) each, on the payload about the nominal contact points [N m].
-        point_residual, residual: (3,) moment missing with the forces at the nominal points, and
-            with the moments [N m].
+        point_residual, residual: (3,) unbalanced moment with the forces at the nominal points, and
+            with `moments` as well [N m].
     """
 
     normal: Expression
@@ -71,20 +71,19 @@ class HeldLoad:
 
     @property
     def wrenches(self) -> Both:
-        """(6,) each, force and moment."""
+        """Force and moment (6,) of each contact."""
         first, second = (ca.vertcat(*pair) for pair in zip(self.forces, self.moments, strict=True))
         return first, second
 
 
 @dataclass
 class ImplicitVariables:
-    """Symbols for values that Newton's method found. Results then depend on the symbols; `replaced`
-    puts the values back.
+    """Symbols for the results of Newton's method. Outputs depend on the symbols; `replaced` inserts
+    the values.
 
     Attributes:
-        steps: of Newton's method from the symbol to what the results depend on. With one, first
-            derivatives are exact although they take the symbol for a constant; with two, second
-            derivatives as well. None for results without derivatives.
+        steps: Newton steps between a symbol and the outputs. One step makes first derivatives exact
+            although the symbol counts as constant; two make second derivatives exact as well.
     """
 
     steps: int = 2
@@ -98,16 +97,16 @@ class ImplicitVariables:
 
     @property
     def symbols(self) -> ca.SX:
-        """(k,) all symbols."""
+        """All symbols (k,)."""
         return ca.vertcat(ca.SX(0, 1), *[symbol for symbol, _ in self._found])
 
     @property
     def values(self) -> ca.SX:
-        """(k,) values of the symbols."""
+        """Values (k,) of the symbols."""
         return ca.vertcat(ca.SX(0, 1), *[value for _, value in self._found])
 
     def replaced(self, outputs: list[Expression]) -> list[Expression]:
-        """Return outputs with the values in the symbols' place."""
+        """Return outputs with the values inserted for the symbols."""
         if not self._found:
             return outputs
         found: list[Expression] = ca.substitute(outputs, [self.symbols], [self.values])
@@ -115,20 +114,20 @@ class ImplicitVariables:
 
 
 class ContactModel(ABC):
-    """The pads of one workcell as a model takes them. Two pads with opposite normals, unless a
-    subclass says otherwise.
+    """A model of one workcell's pads: two pads with opposite normals, unless a subclass says
+    otherwise.
 
     Attributes:
         workcell: the cell; its numbers may be symbols.
-        assumption: the pads that planned forces are of, in words.
-        has_pressure_limit: whether the shift of the pressure within a patch is a limit of its own,
-            because forces do not grow with the moments.
-        has_elastic_layers: whether pads are layers that `symbolic.contact.elastic` describes.
-        has_closed_form: whether `hold` gives the forces; else a program finds them.
-        is_squeeze: whether the arms hold the payload by pressing it between them, so that forces
-            are commanded, and reference forces limit the whole force of a robot as well.
-        holders: what commanded forces hold the payload with, in words.
-        order: what a force asks of them, as in 'press with 80 N'.
+        assumption: the pads that planned forces assume, for messages.
+        has_pressure_limit: the shift of the pressure within a patch is a limit of its own, because
+            forces do not grow with the moments.
+        has_elastic_layers: pads are elastic layers (`symbolic.contact.elastic`).
+        has_closed_form: `hold` gives the forces; else a program finds them.
+        is_squeeze: the arms press the payload between them: forces are commanded, and reference
+            forces limit the whole force of a robot as well.
+        holders: the pads or hands that commanded forces assume, for messages.
+        order: the command to them, as in 'press with 80 N'.
     """
 
     assumption: ClassVar[str]
@@ -144,19 +143,19 @@ class ContactModel(ABC):
 
     @property
     def has_scalar_squeeze(self) -> bool:
-        """Whether the force of one pad decides that of the other, so that the least squeeze says
-        all of a case."""
+        """True if the force of one pad determines that of the other, so that one number, the least
+        squeeze, describes a case."""
         return self.has_closed_form
 
     @property
     def command_model(self) -> ContactModel:
-        """The model of commanded forces, and so of worst cases."""
+        """The contact model of commanded forces and worst cases."""
         return self
 
     @property
     @abstractmethod
     def problem(self) -> Problem | None:
-        """Key and message if the pads do not hold the payload under every motion, else None."""
+        """Key and message if the pads cannot hold the payload under every motion, else None."""
 
     @property
     def level_force(self) -> float:
@@ -171,40 +170,40 @@ class ContactModel(ABC):
         implicit: ImplicitVariables | None = None,
         displaced: bool = False,
     ) -> HeldLoad:
-        """Return the least contact forces that bear a load.
+        """Return the least contact forces that balance a load.
 
         Args:
             load: on both contacts.
-            implicit: receives what Newton's method finds, for derivatives.
-            displaced: whether the arms of the load may place the pads beside one another.
+            implicit: collects results of Newton's method, for derivatives.
+            displaced: the pads may be laterally offset from each other by the arms of the load.
         """
 
-    # --- what the polish differentiates ---
+    # --- smooth quantities for the polish ---
 
     @property
     def force_branches(self) -> Array:
-        """(2, branches, 2) coefficients of both `force_quantities` in the branches of each normal
-        force, which is the largest of them."""
+        """Coefficients (2, branches, 2) of the branches of each normal force by both
+        `force_quantities`; the largest branch is the force."""
         return np.eye(2)[:, None]
 
     def force_quantities(self, load: ContactLoad, held: HeldLoad) -> Expression:
-        """Return two smooth quantities (2,) that normal forces are made of [N]."""
+        """Return two smooth quantities (2,) of which the branches of the normal forces are linear
+        functions [N]."""
         return held.normal
 
     def planned_quantities(self, found: Mapping[str, Array]) -> Array:
-        """Return these quantities (n, 2) from outputs of n samples, `LOAD_OUTPUTS` of
-        `symbolic.contact.load` [N]."""
+        """Return `force_quantities` (n, 2) of n samples from their `LOAD_OUTPUTS` [N]."""
         return found["normal_force"]
 
     # --- worst cases ---
 
     def least_friction(self, uncertainty: Uncertainty) -> Array:
-        """Return (2,) coefficients of friction that stand for the worst of a set, zero or less for
-        none.
+        """Compute the coefficients of friction (2,) that cover the worst case of a set; zero or
+        less if none is left.
 
-        A pad tilted by t has the coefficient tan(atan mu - t). Pads displaced apart by 2 e turn the
-        squeeze into a moment, which a coefficient lower by 2 e / L stands for, L being their
-        distance.
+        A pad tilted by t has the coefficient tan(atan mu - t). Pads displaced in opposite
+        directions by 2 e turn the squeeze into a moment, which is covered by a coefficient lower by
+        2 e / L, L being their distance.
         """
         friction = np.array([contact.friction for contact in self.workcell.contacts])
         left = np.tan(np.arctan(friction * (1.0 - uncertainty.friction)) - uncertainty.turned)
@@ -212,14 +211,15 @@ class ContactModel(ABC):
         return np.asarray(left - self.friction_lost(apart))
 
     def friction_lost(self, apart: Array) -> Array:
-        """Return the coefficients that stand for pads displaced apart by distances [m]."""
+        """Return the reduction of the coefficients that covers relative displacements of the pads
+        [m]."""
         return apart / self.workcell.pad_distance
 
     def worst_displacements(self, uncertainty: Uncertainty) -> tuple[Array, Array]:
-        """Return half the widths (3,) of the range of the centre of mass, and the displacements
-        (k, 4) of both pads along their tangents that stand for a set's worst [m].
+        """Return half-widths (3,) of the range of the centre of mass, and displacements (k, 4) of
+        both pads along their tangents, that cover a set's displacements [m].
 
-        Pads that are displaced alike leave the centre of mass as much beside them.
+        A common displacement of both pads shifts the centre of mass relative to them.
         """
         normal = self.workcell.contacts[0].T_box_pad[:3, 2]
         across = np.sqrt(np.maximum(1.0 - normal**2, 0.0))
@@ -229,14 +229,14 @@ class ContactModel(ABC):
     def commanded_forces(
         self, normal: Expression, friction: Expression, tracking: Expression, opposed: Expression
     ) -> Expression:
-        """Return the normal forces (2,) to command where the least ones (2,) hold [N]: both press
-        as much more, because the motion decides the difference of both.
+        """Return the normal forces (2,) to command for least normal forces (2,) [N]. Both rise by
+        the same amount, because the motion fixes their difference.
 
         Args:
             normal: (2,) least normal forces [N].
             friction: (2,) Coulomb coefficients.
-            tracking: (2,) share of its force that either robot lacks.
-            opposed: tangential force with which the arms work against one another [N].
+            tracking: (2,) missing share of each robot's force.
+            opposed: tangential force of the arms against each other [N].
         """
         share, held = tracking / (1.0 - tracking), opposed / ca.fmin(friction[0], friction[1])
         # Entry by entry: CasADi 3.8 loses the derivative of a product of vectors here.
@@ -245,26 +245,26 @@ class ContactModel(ABC):
 
     @property
     def leading_share(self) -> Array:
-        """Rise (2,) of the force of either robot as the leading one, per newton more that is
-        commanded of the other."""
+        """Rise (2,) of each robot's force, as the leading one, per newton of the other's commanded
+        force."""
         return np.ones(2)
 
     def leading_excess(self, load: ContactLoad, opposed: Expression) -> Expression:
-        """Return what robot 1 presses with beyond its `leading_share` of the force that is
-        commanded of robot 2 [N].
+        """Return the force of robot 1 beyond `leading_share` times the commanded force of robot 2
+        [N].
 
         Args:
             load: on both contacts.
-            opposed: tangential force with which the arms work against one another [N].
+            opposed: tangential force of the arms against each other [N].
         """
         return ca.dot(load.force, load.axes[:, 2])
 
-    def pressed_together(self, leader: int) -> Array:
-        """Return what both robots (2,) press with for each newton that is commanded beyond the
+    def internal_force_ratio(self, leader: int) -> Array:
+        """Return the rise (2,) of both robots' forces per newton that is commanded beyond the
         plan."""
         return np.ones(2)
 
-    def room_for_displacements(self, uncertainty: Uncertainty) -> float:
-        """Return what displacements leave of the room in which forces are looked for [m]; more than
-        zero if they leave any."""
+    def displacement_margin(self, uncertainty: Uncertainty) -> float:
+        """Return the remaining range of displacements in which forces can be computed [m]; zero or
+        less if the set's displacements exceed it."""
         return np.inf

@@ -34,12 +34,13 @@ def required_force(
     mass: float,
     acceleration: Expression,
 ) -> Expression:
-    """Resultant force (3,) on the box [N], from its centre of mass's acceleration (Eq. 34)."""
+    """Compute the resultant force (3,) on the box [N] from the acceleration of its centre of mass
+    (Eq. 34)."""
     return mass * (acceleration - ca.DM(GRAVITY))
 
 
 def split_force(force: Expression, normal: Expression) -> tuple[Expression, Expression, Expression]:
-    """Normal component, tangential magnitude and unit tangential direction of a force.
+    """Split a force into normal component, tangential magnitude and unit tangential direction.
 
     Args:
         force: (3,) [N].
@@ -54,7 +55,7 @@ def split_force(force: Expression, normal: Expression) -> tuple[Expression, Expr
 def normal_force_branches(
     f_n: Expression, f_t: Expression, friction: tuple[float, float]
 ) -> Expression:
-    """The five smooth functions (5,) whose largest is the normal force N_2 of contact 2 [N].
+    """Compute five smooth functions (5,); the largest is the normal force N_2 of contact 2 [N].
 
     N_1 = N_2 + F_n. In order: both friction cones tight; contact 2 unloaded; contact 1
     unloaded; least effort with only the cone of contact 2 tight; with only that of contact 1.
@@ -74,7 +75,7 @@ def normal_force_branches(
 def allocate(
     force: Expression, normal: Expression, friction: tuple[float, float]
 ) -> tuple[Expression, Expression, Both]:
-    """Minimum-effort contact forces for a resultant force.
+    """Compute the contact forces of least effort for a resultant force.
 
     Args:
         force: (3,) resultant force on the box, world frame [N].
@@ -101,19 +102,20 @@ def allocate(
 RELATIVE_DAMPING = 1e-8
 """Damping of the normal equations relative to their trace.
 
-Where one contact is unloaded or nothing is tangential, a direction of moment cannot be had, and
-rounding over the damping is the error that remains.
+With an unloaded contact or without tangential forces, moments in some direction cannot be balanced;
+the remaining error is rounding over the damping.
 """
 
 REFINEMENTS = 7
-"""Repeated solves for what is left (iterated Tikhonov regularisation): they take the damping's
-own error to its eighth power, below rounding wherever a moment can be had at all."""
+"""Repeated solves for the residual (iterated Tikhonov regularisation): they raise the relative
+error of the damping to its eighth power, below rounding wherever the moment can be balanced."""
 
 
 def required_moment(
     inertia: Expression, rotation: Expression, velocity: Expression, acceleration: Expression
 ) -> Expression:
-    """Moment (3,) about the centre of mass that the rotation needs (Eqs. 52-53) [N m].
+    """Compute the moment (3,) about the centre of mass that the rotation requires (Eqs. 52-53) [N
+    m].
 
     Args:
         inertia: (3, 3) about the centre of mass, box axes [kg m^2].
@@ -132,18 +134,17 @@ def pressure_shift(
     forces: tuple[Expression, Expression],
     tangents: tuple[Expression, Expression],
 ) -> tuple[Both, Expression, Expression]:
-    """Least-norm shifts of both centres of pressure (Eqs. 54-59).
+    """Compute the least-norm shifts of both centres of pressure (Eqs. 54-59).
 
     Args:
         moment: (3,) required moment about the centre of mass [N m].
         arms: (3,) each, from the centre of mass to the nominal contact points [m].
         forces: (3,) each, contact forces on the box [N].
-        tangents: two orthonormal tangent vectors (3, 2) spanning both contact planes, which
-            are parallel; the two entries are the columns.
+        tangents: two orthonormal vectors (3,) that span both contact planes, which are parallel.
 
     Returns:
-        Shifts (3,) in the tangent planes [m], and the moment (3,) that is missing with the forces
-        at the nominal points, and with the shifts applied, world frame [N m].
+        Shifts (3,) in the tangent planes [m], and the unbalanced moments (3,) with the forces at
+        the nominal points and with the shifts applied, world frame [N m].
     """
     point_residual = moment - ca.cross(arms[0], forces[0]) - ca.cross(arms[1], forces[1])
     plane = ca.horzcat(*tangents)
@@ -162,7 +163,7 @@ def pressure_shift(
 
 
 def _solve_symmetric_3(matrix: Expression, right: Expression) -> Expression:
-    """Solution of a symmetric positive definite 3 by 3 system by its LDL^T factors."""
+    """Solve a symmetric positive definite 3 by 3 system by its LDL^T factors."""
     d_1 = matrix[0, 0]
     l_21, l_31 = matrix[1, 0] / d_1, matrix[2, 0] / d_1
     d_2 = matrix[1, 1] - l_21 * matrix[1, 0]

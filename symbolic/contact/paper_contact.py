@@ -17,8 +17,8 @@ from symbolic.expression import Expression
 class PaperContact(ContactModel):
     """Two round pads with opposite normals that choose their pressure.
 
-    That takes commanded moments at both wrists, which few cells have. What is commanded therefore
-    holds pads that press evenly.
+    Such pads need commanded moments at both wrists, which few cells have. So commanded forces hold
+    evenly pressing pads.
     """
 
     assumption = "pads that choose their pressure, by moments commanded at both wrists"

@@ -25,7 +25,8 @@ def contact_model(workcell: Workcell) -> ContactModel:
 
 
 def squeeze_problem(workcell: Workcell, purpose: str) -> str:
-    """Return why a purpose does not fit hands that hold by themselves; '' for pads that press."""
+    """Return why a purpose does not apply to hands that hold by themselves; '' for pads that
+    press."""
     if contact_model(workcell).is_squeeze:
         return ""
     return (

@@ -18,17 +18,17 @@ from symbolic.records import Workcell
 from symbolic.records.cell import Uncertainty
 
 PAD_OFFSET_SHARE = 0.9
-"""Share of friction times the pads' distance by which pads may lie beside one another: the line
-between them then lies well within their friction cones, and pressing harder carries any moment."""
+"""Largest lateral offset of the pads over friction times their distance: the line between them then
+lies well within their friction cones, so that pressing harder balances any moment."""
 
 LARGEST_DISPLACEMENT = 0.2
-"""Displacement of pads anywhere, over the least distance of two pads of different robots, up to
-which forces are looked for."""
+"""Largest displacement of pads with any normals in which forces are computed, over the least
+distance between two pads of different robots."""
 
 
 def soft_finger(workcell: Workcell) -> ContactModel:
-    """Return the model of a workcell's soft fingers: in closed form for two pads with opposite
-    normals."""
+    """Return the model of a workcell's soft fingers; it has a closed form for two pads with
+    opposite normals."""
     return (SoftFinger if workcell.has_opposite_pads else SoftFingerGrasp)(workcell)
 
 
@@ -49,7 +49,7 @@ class SoftFinger(ContactModel):
             "contacts[1].xyz",
             f"faces a point {beside:g} m beside contacts[0]; pads that press evenly allow less "
             f"than {PAD_OFFSET_SHARE * room:g} m here, {PAD_OFFSET_SHARE:g} of friction times the "
-            "pads' distance, so that pressing harder holds whatever happens",
+            "pads' distance, so that pressing harder holds under every motion",
         )
 
     def hold(
@@ -91,8 +91,8 @@ class SoftFinger(ContactModel):
 
 
 class SoftFingerGrasp(SoftFinger):
-    """Pads anywhere, several of one arm included. The program of `symbolic.contact.grasp` finds
-    their forces."""
+    """Soft fingers with any normals, also several per arm. The program of `symbolic.contact.grasp`
+    finds their forces."""
 
     has_closed_form = False
 
@@ -104,13 +104,13 @@ class SoftFingerGrasp(SoftFinger):
         return (
             "contacts",
             "the pads do not close their grasp: no squeeze within their friction cones holds the "
-            "payload against whatever the motion asks; allowed is enough friction (with 5 % to "
+            "payload under every motion; allowed is enough friction (with 5 % to "
             "spare) along the lines between them: turn them towards one another, raise friction "
             "or add a pad (further)",
         )
 
     def friction_lost(self, apart: Array) -> Array:
-        """See `ContactModel`. Displacements are cases of their own."""
+        """See `ContactModel`. Displacements have their own cases."""
         return 0.0 * apart
 
     def worst_displacements(self, uncertainty: Uncertainty) -> tuple[Array, Array]:
@@ -120,18 +120,18 @@ class SoftFingerGrasp(SoftFinger):
         signs = product((-1.0, 1.0) if off > 0.0 else (0.0,), repeat=4)
         return uncertainty.centre_of_mass, np.array([off * np.array(at) for at in signs])
 
-    def room_for_displacements(self, uncertainty: Uncertainty) -> float:
+    def displacement_margin(self, uncertainty: Uncertainty) -> float:
         """See `ContactModel`."""
         off = uncertainty.pad_position + uncertainty.apart / 2.0
         return LARGEST_DISPLACEMENT * least_distance(self.workcell) - off
 
     @property
     def leading_share(self) -> Array:
-        """See `ContactModel`: from the squeeze that worst cases start from."""
+        """See `ContactModel`: that of the initial squeeze of `GraspSqueeze`."""
         normals = GraspSqueeze(self.workcell, 1).squeeze_normals()
         return np.asarray(normals / normals[::-1])
 
-    def pressed_together(self, leader: int) -> Array:
+    def internal_force_ratio(self, leader: int) -> Array:
         """See `ContactModel`: an internal squeeze of the pads."""
         normals = Grasp(self.workcell).squeeze_normals()
         return np.asarray(normals / normals[1 - leader])

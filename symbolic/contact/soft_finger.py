@@ -1,22 +1,22 @@
 """Least contact forces of two soft fingers: elastic pads that press evenly, on arms that keep the
 orientation of their pads.
 
-Such a pad carries a normal force N, a tangential force T and a torsion tau about its normal, but
-no tilting moment (soft-finger contact: Howe and Cutkosky, IJRR 1996). Two of them with opposite
-normals share a load in one way only, up to the squeeze: a difference of their tangential forces
-carries the moments across the line between them, torsion carries the moment about it. Friction
-holds within the limit surface of a patch under even pressure. With a = mu N and
-s = 1 - |T|^2 / a^2 it is
+A soft finger bears a normal force N, a tangential force T and a torsion tau about its normal, but
+no tilting moment (soft-finger contact: Howe and Cutkosky, IJRR 1996). For a given squeeze, two of
+them with opposite normals share a load in one way only: a difference of their tangential forces
+balances the moments across the line between them, torsion balances the moment about it. Friction
+holds within the limit surface of a patch under even pressure. With a = mu N and s = 1 - |T|^2 / a^2
+it is
 
     |tau| <= a sqrt(s) (h / 2 + s (c - h / 2) - 3/80 c s (1 - s))                            (1)
 
-c is the mean distance of the patch's points from its centre, which bounds pure torsion; h is twice
-the root of the mean square of their coordinates along T: what is left for torsion when a patch
-begins to slide. Both ends are exact. A disc of radius r has c = 2/3 r and h = r: (1) asks for
-0.4 % less to 0.3 % more force than its exact limit curve. Rectangles: 0.7 % less to 2.9 % more up
-to sides of 2 to 1, 6.5 % more at 5 to 1.
+c is the mean distance of the patch's points from its centre, which bounds pure torsion. h is twice
+the root mean square of their coordinates along T, which bounds torsion as the patch begins to
+slide. Both ends are exact. A disc of radius r has c = 2/3 r and h = r; (1) needs 0.4 % less to 0.3
+% more force than its exact limit curve. For rectangles it is 0.7 % less to 2.9 % more up to sides
+of 2 to 1, and 6.5 % more at 5 to 1.
 
-The capacities of both pads add up: the one that slips first hands torsion over to the other.
+The torsion capacities of both pads add up: the pad that slips first passes torsion to the other.
 
 Coordinates: tangents a, b and normal n = a x b of contact 1. Forces in N, lengths in m.
 """
@@ -37,29 +37,27 @@ from symbolic.records import Contact
 from symbolic.records.numbered import NumberedContact
 
 GRIP_NEWTON_STEPS = 3
-"""Newton steps for given tangential forces, from `_first_grip`: relative errors of forces are then
-below 1e-6, of pads of one size 1e-9. One less where results take two more, see
-`symbolic.contact.model.ImplicitVariables`."""
+"""Newton steps for given tangential forces, from `_first_grip`. Relative errors of forces are then
+below 1e-6, or 1e-9 for pads of equal size. `ImplicitVariables` with two steps replaces one."""
 
 LEAST_GRIP = 0.05
-"""Least grip that these start from, as a share of what the first pad would need for all torsion:
-torsion has no slope where there is no grip, and a step from there leads far away."""
+"""Least initial grip over the grip that the first pad needs for all torsion: without grip, torsion
+has no slope, and a Newton step leads far away."""
 
 OFFSET_STEPS = 7
-"""Secant steps where the pads lie beside one another."""
+"""Secant steps for laterally offset pads."""
 
 LEAST_SLOPE = 1e-3
-"""Least slope of those steps: where pressing harder asks for nearly as much more, nothing holds."""
+"""Least slope of those steps: nothing holds if a harder squeeze needs nearly as much more."""
 
 LEVER_FLOOR = 1e-12
-"""Keeps a slope of the torsion by the grip positive [m]."""
+"""Lower bound of the slope of the torsion by the grip [m]."""
 
 BEND = 3.0 / 80.0
-"""Last coefficient of (1): least largest error for a disc."""
+"""Last coefficient of (1): it minimises the largest error for a disc."""
 
 FORCE_FLOOR = 1e-9
-"""Added in squares to forces [N], so that lengths have slopes where there is no force."""
-
+"""Added in squares to forces [N], so that lengths have slopes at zero force."""
 
 Load: TypeAlias = tuple[Expression, Expression, Expression]
 """Tangential force (2,) of each contact [N], and the torsion that both carry together [N m]."""
@@ -67,13 +65,13 @@ Load: TypeAlias = tuple[Expression, Expression, Expression]
 
 @dataclass(frozen=True)
 class SoftPatch:
-    """What a patch's shape means for torsion under even pressure.
+    """Lengths of a patch that determine its torsion capacity under even pressure.
 
     Attributes:
         twist: mean distance of the points from the centre [m].
-        spread: (2, 2) makes of a unit vector along the tangents of contact 1 one whose length is
-            twice the root of the mean square of the points' coordinates along it [m]; the radius
-            times a rotation for a disc.
+        spread: (2, 2) matrix; the length of its product with a unit vector along the tangents of
+            contact 1 is twice the root mean square of the points' coordinates along that vector
+            [m]. For a disc it is the radius times a rotation.
     """
 
     twist: float | ca.SX
@@ -81,11 +79,11 @@ class SoftPatch:
 
     @classmethod
     def of(cls, contact: Contact, axes: Array) -> SoftPatch:
-        """The patch of a contact.
+        """Return the patch of a contact.
 
         Args:
-            contact: of a round or rectangular patch.
-            axes: (3, 3) those of contact 1 in the box frame.
+            contact: with a round or rectangular patch.
+            axes: (3, 3) of contact 1 in the box frame.
         """
         if isinstance(contact, NumberedContact):
             return cls(contact.twist, contact.spread)
@@ -106,8 +104,8 @@ class SoftFingers:
     Attributes:
         normal: (2,) N_1, N_2 [N].
         tangent_1, tangent_2: (2,) tangential forces on the box [N].
-        torsion: moment about n that both carry together [N m].
-        capacity: (2,) torsion that each could carry beside its tangential force [N m].
+        torsion: moment about n that both bear together [N m].
+        capacity: (2,) torsion that each could bear beside its tangential force [N m].
     """
 
     normal: Expression
@@ -120,12 +118,12 @@ class SoftFingers:
 def torsion_capacity(
     grip: Expression, tangent: Expression, patch: SoftPatch
 ) -> tuple[Expression, Expression]:
-    """The right side of (1) [N m], and its slope by sqrt(grip^2 - |tangent|^2) [m].
+    """Compute the right side of (1) [N m], and its derivative by sqrt(grip^2 - |tangent|^2) [m].
 
     Args:
-        grip: sqrt(mu^2 N^2 - |T|^2), what friction leaves beside the tangential force [N].
+        grip: sqrt(mu^2 N^2 - |T|^2), the friction left beside the tangential force [N].
         tangent: (2,) tangential force [N].
-        patch: the pad's.
+        patch: of the pad.
     """
     return _capacity(grip, _squared(tangent), patch.twist, _half_spread(patch, tangent))
 
@@ -133,7 +131,7 @@ def torsion_capacity(
 def _capacity(
     grip: Expression, squared: Expression, twist: Expression, half: Expression
 ) -> tuple[Expression, Expression]:
-    """The same from the squared tangential force [N^2], c and h / 2 [m]."""
+    """Compute `torsion_capacity` from the squared tangential force [N^2], c and h / 2 [m]."""
     s = grip**2 / (grip**2 + squared)
     bend = BEND * twist
     # h / 2 + s (c - h / 2) - bend s (1 - s)
@@ -148,7 +146,7 @@ def _squared(tangent: Expression) -> Expression:
 
 
 def _half_spread(patch: SoftPatch, tangent: Expression) -> Expression:
-    """h / 2 of (1) [m]."""
+    """Compute h / 2 of (1) [m]."""
     spread = ca.mtimes(number(patch.spread), tangent)
     return ca.sqrt(ca.sumsqr(spread) / _squared(tangent) + 1e-24) / 2.0
 
@@ -162,23 +160,23 @@ def least_soft_squeeze(
     offset: bool = False,
     implicit: ImplicitVariables | None = None,
 ) -> SoftFingers:
-    """The least normal forces that hold.
+    """Compute the forces with the least squeeze that balances a load.
 
     Args:
-        force, moment: (3,) that the contacts have to give, about the payload's centre of mass.
-        arms: (3,) each, from there to the contacts.
+        force, moment: (3,) of the contacts on the payload, about its centre of mass [N, N m].
+        arms: (3,) each, from the centre of mass to the contacts [m].
         friction: (2,) Coulomb coefficients.
         patches: of both pads.
-        offset: whether the contacts may lie beside one another, seen along n; tangential forces
-            and torsion then depend on the squeeze.
-        implicit: see `symbolic.contact.model.ImplicitVariables`; without effect with `offset`.
+        offset: the contacts may be laterally offset; tangential forces and torsion then depend on
+            the squeeze.
+        implicit: see `symbolic.contact.model.ImplicitVariables`; unused with `offset`.
     """
     apart = arms[0] - arms[1]
     # About the middle of the contacts: apart x half the difference of both forces, and torsion.
     rest = moment - ca.cross((arms[0] + arms[1]) / 2.0, force)
 
     def shared(squeeze: Expression) -> Load:
-        """What both contacts carry under N_1 + N_2 = squeeze."""
+        """Compute the loads of both contacts for N_1 + N_2 = squeeze."""
         half = ca.vertcat(
             (rest[1] + apart[0] * squeeze / 2.0) / apart[2],
             (apart[1] * squeeze / 2.0 - rest[0]) / apart[2],
@@ -189,8 +187,8 @@ def least_soft_squeeze(
     squeeze = ca.fabs(force[2]) if offset else ca.SX(0.0)
     load = shared(squeeze)
     normal, capacity = _pressed(load, force[2], friction, patches, None if offset else implicit)
-    # The least squeeze for what a squeeze asks is a convex function of it: secants reach the one
-    # that asks for itself.
+    # The least squeeze for the load of a squeeze is a convex function of it: secants converge to
+    # its fixed point.
     before = squeeze
     for step in range(OFFSET_STEPS if offset else 0):
         found = normal[0] + normal[1]
@@ -213,7 +211,8 @@ def _pressed(
     patches: tuple[SoftPatch, SoftPatch],
     implicit: ImplicitVariables | None,
 ) -> tuple[Expression, Expression]:
-    """Least normal forces (2,) [N] and torsion capacities (2,) [N m] for given tangential forces.
+    """Compute the least normal forces (2,) [N] and torsion capacities (2,) [N m] for given
+    tangential forces.
 
     Args:
         load: tangential force (2,) of each contact, and the torsion.
@@ -224,7 +223,7 @@ def _pressed(
     *tangents, torsion = load
     asked, squares = ca.fabs(torsion), [_squared(tangent) for tangent in tangents]
     least = [ca.sqrt(square) / friction[i] for i, square in enumerate(squares)]
-    # The pad that slips first: what its friction leaves beside the tangential force is solved for.
+    # Unknown: the grip of the pad that slips first, its friction left beside the tangential force.
     first_binds = least[0] - difference > least[1]
 
     def in_order(of: Sequence[Expression] | Expression) -> Both:
@@ -233,12 +232,12 @@ def _pressed(
     halves = [_half_spread(patch, tangents[i]) for i, patch in enumerate(patches)]
     mu, squared, half = in_order(friction), in_order(squares), in_order(halves)
     twist = in_order([patch.twist for patch in patches])
-    # How far the other pad's normal force is beyond the first's, and its friction over the first's.
+    # Excess of the other pad's normal force over the first's, and ratio of the coefficients.
     beyond = ca.if_else(first_binds, -difference, difference)
     share, ahead = mu[1] / mu[0], mu[0] * beyond
 
     def other_grip_squared(bound: Expression) -> Expression:
-        """From what the first pad bears by friction [N], mu N."""
+        """Compute the squared grip of the second pad from mu N of the first [N]."""
         return ca.fmax((share * (bound + ahead)) ** 2 - squared[1], 0.0) + FORCE_FLOOR**2
 
     def newton(grip: Expression) -> Expression:
@@ -274,14 +273,14 @@ def _first_grip(
     squared: Both,
     ahead: Expression,
 ) -> Expression:
-    """About the grip of the pad that slips first [N], from levers of torsion that are linear in s.
+    """Estimate the grip of the pad that slips first [N], with torsion levers linear in s.
 
     Args:
-        asked: absolute torsion that both pads carry.
-        levers: c and h / 2 of both pads; here and in what follows first that which slips first.
+        asked: absolute torsion of both pads together.
+        levers: c and h / 2 of both pads; in all pairs the pad that slips first comes first.
         share: friction of the other pad over that of the first.
         squared: squares of the tangential forces.
-        ahead: square of the other pad's grip when the first begins to slide without torsion.
+        ahead: squared grip of the other pad when the first begins to slide without torsion.
     """
     twist, half = levers
     # As if the other pad had the same normal force, and the first no tangential force.

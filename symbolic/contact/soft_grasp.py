@@ -1,14 +1,15 @@
-"""Normal forces of pads anywhere on their program's central path, with exact derivatives.
+"""Normal forces of pads with any normals on their program's central path, with exact derivatives.
 
 The least effort has kinks in the load, where a cone begins or ceases to be tight. At a weight mu of
-the barriers the states s of all patches, affine in the load w and in what is free, y, minimise
+the barriers, the states s of all patches, affine in the load w and in the free components y,
+minimise
 
-    f(y, w) = log effort(s) + mu * sum of the patches' barriers,    s = Y y + W w,
+    f(y, w) = log effort(s) + mu * sum of the patches' barriers,    s = Y y + W w.
 
-which is the central path of `symbolic.contact.central_path`: weight over effort is mu. It is smooth
-and as homogeneous in the load as the least effort itself, above which its own lies by at most mu
-times the patches' degrees, relatively; the normal forces C s tend to those of least effort. By the
-implicit function theorem, with F = D^2 f and T = D^3 f, both by s,
+This is the central path of `symbolic.contact.central_path` with weight over effort equal to mu. The
+solution is smooth, and homogeneous in the load like the least effort. Its effort exceeds the least
+one by at most mu times the patches' degrees, relatively; its normal forces C s tend to those of
+least effort. By the implicit function theorem, with F = D^2 f and T = D^3 f, both by s,
 
     Y' F Y dy = -Y' F W dw,    U = ds/dw = Y dy/dw + W,    d(C s)/dw = C U,
     d^2(weight . C s)/dw^2 = U' T[d] U,    Y' F Y p = -Y' C' weight,    d = Y p.
@@ -21,9 +22,9 @@ from __future__ import annotations
 import casadi as ca
 import numpy as np
 
-from symbolic.contact.central_path import against_barriers, centred, state_ends, wrenches_of
+from symbolic.contact.central_path import barrier_equations, centred, state_ends, wrenches_of
 from symbolic.contact.force_closure import LOAD_SIZE, MOMENT_ARM
-from symbolic.contact.grasp import SCALE_FLOOR, Grasp, whole_wrench
+from symbolic.contact.grasp import SCALE_FLOOR, Grasp, full_wrench
 from symbolic.expression import as_mx, mx_symbols
 
 POLISH_STEPS = 2
@@ -34,13 +35,13 @@ ROBOTS = 2
 
 
 class SoftGrasp:
-    """The program of a grasp's pads at their own friction, at one weight. Its functions take the
-    grasp's given numbers last.
+    """The program of a grasp's pads at their nominal friction, at one weight of the barriers. The
+    last inputs of its functions are the grasp's symbolic parameters.
 
     Attributes:
         grasp: the pads.
         weight: mu.
-        size, ends: of the states of all patches together, and where each begins.
+        size, ends: size of the states of all patches together, and the first entry of each.
         normals: C (2, size).
     """
 
@@ -53,19 +54,19 @@ class SoftGrasp:
         self.normals = ca.sparsify(ca.DM(normals))
 
     def first(self) -> ca.Function:
-        """load (6,), see `symbolic.contact.grasp.grasp_wrenches`, to normal (2,) forces of the
-        robots [N], slope (6, 2), their gradients, and state (size,)."""
+        """Build the function from load (6,), see `symbolic.contact.grasp.grasp_wrenches`, to the
+        normal forces (2,) of the robots [N], their gradients slope (6, 2), and state (size,)."""
         load, handed = ca.MX.sym("load", LOAD_SIZE), mx_symbols(self.grasp.given)
-        state = self.solved(load, handed)
+        state = self.solve(load, handed)
         outputs = [*self.slopes()(state, *handed.values()), state]
         inputs, names = [load, *handed.values()], ["load", *handed]
         return ca.Function("held_first", inputs, outputs, names, ["normal", "slope", "state"])
 
-    def solved(self, load: ca.MX, handed: dict[str, ca.MX]) -> ca.MX:
-        """The state (size,) that holds a load (6,).
+    def solve(self, load: ca.MX, handed: dict[str, ca.MX]) -> ca.MX:
+        """Build the state (size,) that balances a load (6,).
 
         Args:
-            handed: the given numbers.
+            handed: the symbolic parameters.
         """
         given = list(handed.values())
         friction = as_mx(self.grasp.friction, self.grasp.given, handed)
@@ -77,12 +78,13 @@ class SoftGrasp:
         return state
 
     def wrenches(self, slopes: bool) -> ca.Function:
-        """state (size,) to wrenches (6 k,) of all pads, see
-        `symbolic.contact.grasp.grasp_wrenches`, and where asked for, to by_load (6 k, 6)."""
+        """Build the function from state (size,) to the wrenches (6 k,) of all pads, see
+        `symbolic.contact.grasp.grasp_wrenches`, and with `slopes` to their derivatives (6 k, 6) by
+        the load."""
         state = ca.SX.sym("state", self.size)
         own = wrenches_of(self.grasp, ca.vertsplit(state, self.ends))
         units = [self.grasp.units(i, self.grasp.friction) * wrench for i, wrench in enumerate(own)]
-        outputs = [ca.vertcat(*map(whole_wrench, units))]
+        outputs = [ca.vertcat(*map(full_wrench, units))]
         if slopes:
             by_state = ca.jacobian(outputs[0], state)
             outputs.append(ca.mtimes(by_state, _Local(self, state).by_load()))
@@ -90,11 +92,11 @@ class SoftGrasp:
         return ca.Function("held_wrenches", [state, *self.grasp.given.values()], results)
 
     def second(self) -> ca.Function:
-        """state (size,) and weight (2,) to curvature (6, 6), the weighted second derivatives of the
-        normal forces by the load."""
+        """Build the function from state (size,) and weight (2,) to curvature (6, 6), the weighted
+        second derivatives of the normal forces by the load."""
         state, weight = ca.SX.sym("state", self.size), ca.SX.sym("weight", ROBOTS)
         local = _Local(self, state)
-        along = local.pulled(-ca.mtimes(self.normals.T, weight))
+        along = local.solve(-ca.mtimes(self.normals.T, weight))
         curvature = local.third(along, local.by_load())
         return ca.Function(
             "held_second",
@@ -105,7 +107,8 @@ class SoftGrasp:
         )
 
     def slopes(self) -> ca.Function:
-        """A state to both normal forces and their gradients by the load (6, 2)."""
+        """Build the function from a state to both normal forces and their gradients (6, 2) by the
+        load."""
         state = ca.SX.sym("state", self.size)
         by_load = _Local(self, state).by_load()
         outputs = [ca.mtimes(self.normals, state), ca.mtimes(self.normals, by_load).T]
@@ -113,25 +116,25 @@ class SoftGrasp:
         return ca.Function("slopes", inputs, ca.cse([ca.densify(value) for value in outputs]))
 
     def _newton(self) -> ca.Function:
-        """A state to the next one, under the same load."""
+        """Build a Newton step of a state under the same load."""
         state = ca.SX.sym("state", self.size)
         local = _Local(self, state)
         inputs = [state, *self.grasp.given.values()]
-        return ca.Function("newton", inputs, [ca.cse(state + local.pulled(-local.slope))])
+        return ca.Function("newton", inputs, [ca.cse(state + local.solve(-local.slope))])
 
 
 class _Local:
-    """Derivatives of f at a state: those of the barriers, patch by patch, and those of log effort,
-    whose curvature Q / effort - g g' is of rank one beside a diagonal.
+    """Derivatives of f at a state: those of the barriers, patch by patch, and those of log effort.
+    The latter's curvature Q / effort - g g' is a rank-one change of a diagonal.
 
     Attributes:
-        slope: g plus the barriers' (n,).
+        slope: gradient (n,) of f: g plus the barriers'.
     """
 
     def __init__(self, program: SoftGrasp, state: ca.SX) -> None:
         self._program, grasp = program, program.grasp
         self._owns, load = ca.vertsplit(state, program.ends), ca.SX.sym("load", LOAD_SIZE)
-        _, pulls, equations = against_barriers(
+        _, pulls, equations = barrier_equations(
             grasp, self._owns, [load, grasp.friction], program.weight
         )
         self._equations, self._effort = equations, equations.effort
@@ -139,23 +142,23 @@ class _Local:
         self.slope = self._g - ca.vertcat(*pulls) / self._effort
         self._loaded = ca.jacobian(equations.missing, load)
         # The equations are those of f times the effort, without g g'.
-        self._answer = self._effort * equations.pulled(self._g)
+        self._answer = self._effort * equations.balanced_change(self._g)
         self._share = 1.0 / (1.0 - ca.dot(self._g, self._answer))
 
-    def pulled(self, pull: ca.SX) -> ca.SX:
-        """Y y (n,) of Y' F Y y = Y' pull."""
-        return self._with_g(self._effort * self._equations.pulled(pull))
+    def solve(self, pull: ca.SX) -> ca.SX:
+        """Compute Y y (n,) of Y' F Y y = Y' pull."""
+        return self._with_g(self._effort * self._equations.balanced_change(pull))
 
     def by_load(self) -> ca.SX:
-        """U (n, 6)."""
-        return self._with_g(self._equations.settled(self._loaded))
+        """Compute U (n, 6), the derivatives of the state by the load."""
+        return self._with_g(self._equations.constrained(self._loaded))
 
     def _with_g(self, found: ca.SX) -> ca.SX:
-        """From what holds without g g' (n, k), by Sherman and Morrison's formula."""
+        """Correct solutions (n, k) without g g' by the Sherman-Morrison formula."""
         return found + ca.mtimes(self._answer, self._share * ca.mtimes(self._g.T, found))
 
     def third(self, along: ca.SX, by_load: ca.SX) -> ca.SX:
-        """U' T[d] U for a direction d (n,)."""
+        """Compute U' T[d] U for a direction d (n,)."""
         rows = zip(
             self._program.grasp.patches,
             self._owns,

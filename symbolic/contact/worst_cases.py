@@ -1,25 +1,23 @@
-"""The least force that holds a moving payload in one case of what is not exactly known.
+"""Least force that holds a moving payload in one case of an uncertainty set.
 
-A case says what friction, mass, centre of mass, pad positions and disturbance really are. What is
-known of the payload's inertia is taken to hold about the nominal centre of mass, whatever the true
-one, and to grow with the mass: with it the required force and moment are affine in the centre of
-mass and in the disturbance, each for itself.
+A case states the true friction, mass, centre of mass, pad positions and disturbance. The payload's
+inertia is taken about the nominal centre of mass and grows with the mass. So the required force and
+moment are affine in the centre of mass and in the disturbance separately.
 
-Of opposite pads it is the least squeeze, of pads anywhere the least force of one robot: a linear
-objective in the program of `symbolic.contact.grasp`. That force is commanded before the case is
-known. Whatever wrenches of all pads then carry the load, an internal squeeze can be added to them
-that presses this robot's pads harder, so that with more than its least force the load is held as
-well.
+Of opposite pads it is the least squeeze. Of pads with any normals it is the least force of one
+robot, a linear objective in the program of `symbolic.contact.grasp`. That force is commanded before
+the case is known. An internal squeeze can be added to any wrenches that balance the load, so that
+more than the least force holds the load as well.
 
-The contact model of what is commanded decides (`ContactModel.command_model`): arms that command a
-normal force alone have pads that press evenly, about their displaced places, whatever the plan
-takes them for.
+`ContactModel.command_model` is the contact model of commanded forces: arms that command a normal
+force alone have pads that press evenly about their displaced places, whichever pads the plan
+assumes.
 
-What is commanded is more: a share of it may be missing, and the arms may work against one another.
-With N a pad's least normal force, e the missing share and T the opposed tangential force, it is
-(N + T / mu) / (1 - e). Friction's cones are convex and contain (T / mu, T), so that N + T / mu
-holds whichever way T acts; where the pad carries no torsion and T acts along its load, nothing less
-does.
+The commanded force is larger than the least force: a share of it may be missing, and the arms may
+work against each other. With N a pad's least normal force, e the missing share and T the opposed
+tangential force, it is (N + T / mu) / (1 - e). Friction cones are convex and contain (T / mu, T),
+so that N + T / mu holds for every direction of T; it is the least such force if the pad bears no
+torsion and T acts along its load.
 """
 
 from __future__ import annotations
@@ -33,9 +31,9 @@ import casadi as ca
 from symbolic.contact.force_closure import LOAD_SIZE
 from symbolic.contact.grasp_squeeze import (
     GraspSqueeze,
-    against_internal,
     commanded_forces,
     commanded_slack,
+    internal_force_gain,
 )
 from symbolic.contact.load import required
 from symbolic.contact.model import ContactLoad, ImplicitVariables
@@ -62,11 +60,11 @@ CASE_SIZES = {
 }
 """Parts of a case, in order: coefficients; radii of the patches [m]; mass [kg]; centre of mass in
 the box frame [m]; acceleration beside the motion's, world frame [m/s^2]; displacements of both
-pads along the tangents of contact 1 [m], of pads anywhere along their own; share of its commanded
-normal force that either robot lacks, none of the one that leads; opposed tangential force [N]."""
+pads along the tangents of contact 1 [m], of pads with any normals along their own; missing share of
+each robot's commanded normal force, zero for the leading one; opposed tangential force [N]."""
 
 SQUARED_SPEED_FLOOR = 1e-12
-"""Floor of u'^2 [1/s^2]; what it adds to a force is far below rounding."""
+"""Floor of u'^2 [1/s^2]; its effect on a force is far below rounding."""
 
 CASE_SIZE = sum(CASE_SIZES.values())
 
@@ -77,19 +75,20 @@ MOTION = ("pose", "rate", "second_rate")
 def case_squeeze_function(
     workcell: Workcell, commanded: int = 1, displaced: bool = True
 ) -> ca.Function:
-    """pose, rate, second_rate (6,) and a case (18,), see `CASE_SIZES`, to normal_force (2,) [N].
+    """Build the function of the least force in a case: pose, rate, second_rate (6,) and a case
+    (18,), see `CASE_SIZES`, to normal_force (2,) [N].
 
-    Of pads that have one squeeze the least: with more of it they can carry the case, with less not.
-    Of others the least of the commanded robot, and what the other one then presses with.
+    With a scalar squeeze, both forces are least: more holds the case, less does not. Else the force
+    of the commanded robot is least, and the other one follows.
 
     Args:
         commanded: index of the robot whose force is commanded.
-        displaced: whether cases may displace the pads, which costs soft fingers more.
+        displaced: cases may displace the pads, which costs soft fingers more.
 
     Raises:
-        SettingsError: pads anywhere do not close their grasp.
+        SettingsError: no internal squeeze exists.
     """
-    squeeze, inputs = _asked(workcell, commanded)
+    squeeze, inputs = _program_and_inputs(workcell, commanded)
     force = _least_force(workcell, squeeze, inputs, displaced=displaced)
     return named_function("case_squeeze", inputs, {"normal_force": force}, cse=False)
 
@@ -97,18 +96,19 @@ def case_squeeze_function(
 def case_gradient_function(
     workcell: Workcell, commanded: int = 1, numbers: bool = False
 ) -> ca.Function:
-    """As `case_squeeze_function`, and slope (NumPy shape (2, 18)), of each force by pose, rate and
-    second_rate; of pads that have one squeeze in cases without displaced ones.
+    """Build `case_squeeze_function` with a further output slope (NumPy shape (2, 18)): derivatives
+    of each force by pose, rate and second_rate; with a scalar squeeze for cases without displaced
+    pads.
 
     Args:
-        numbers: whether slope goes on, by the case (18,) and by the cell's numbers; of pads
-            anywhere in place of these by the load (6,) of `case_origin_load_function`.
+        numbers: append derivatives by the case (18,), and by the cell's parameters; of pads with
+            any normals by the load (6,) of `case_origin_load_function` instead of the parameters.
     """
-    squeeze, inputs = _asked(workcell, commanded)
+    squeeze, inputs = _program_and_inputs(workcell, commanded)
     by = [*inputs.values()] if numbers else [inputs[name] for name in MOTION]
     if squeeze is None:
         implicit = ImplicitVariables()
-        # Pads that are moved alone lie beside one another then.
+        # Derivatives by the pads' places offset them laterally.
         force = _least_force(workcell, None, inputs, implicit, True, displaced=numbers)
         slope = ca.densify(ca.horzcat(*[ca.jacobian(force, part) for part in by]).T)
         found = implicit.replaced([force, slope])
@@ -124,14 +124,15 @@ def case_gradient_function(
 
 
 def case_slopes_function(workcell: Workcell) -> ca.Function:
-    """Box pose and its derivatives by u (6,), u'', u'^2 and a case (18,), see `CASE_SIZES`, to
-    normal_force (2,) [N] as of `case_squeeze_function`, and slope (NumPy shape (2, 20)), of each
-    force by pose, both derivatives, u'' and u'^2; of cases without displaced pads."""
+    """Build the function of forces along a path: box pose and its derivatives by u (6,), u'', u'^2
+    and a case (18,), see `CASE_SIZES`, to normal_force (2,) [N] as of `case_squeeze_function`, and
+    slope (NumPy shape (2, 20)), their derivatives by pose, both derivatives, u'' and u'^2. For
+    cases without displaced pads."""
     inputs = _inputs(ca.SX, sx_parameters(workcell.payload))
     path = {name: ca.SX.sym(name, 6) for name in ("pose", "first", "second")}
     path |= {"a": ca.SX.sym("a"), "w": ca.SX.sym("w")}
     pose, first, second, a, w = path.values()
-    # A root has no slope at rest, what follows from its square has.
+    # u' has no derivative by u'^2 at rest; the floor bounds it.
     motion = (pose, first * ca.sqrt(w + SQUARED_SPEED_FLOOR), first * a + second * w)
     implicit, driven = ImplicitVariables(), inputs | dict(zip(MOTION, motion, strict=True))
     force = _least_force(workcell, None, driven, implicit)
@@ -143,8 +144,8 @@ def case_slopes_function(workcell: Workcell) -> ca.Function:
 
 
 def case_excess_function(workcell: Workcell) -> ca.Function:
-    """pose, rate, second_rate (6,) and a case (18,), see `CASE_SIZES`, to excess [N]: what robot 1
-    presses with beyond what any commanded force of robot 2 makes it press with."""
+    """Build the function from pose, rate, second_rate (6,) and a case (18,), see `CASE_SIZES`, to
+    excess [N], see `ContactModel.leading_excess`."""
     inputs = _inputs(ca.SX, sx_parameters(workcell.payload))
     load, opposed = case_contact_load(workcell, inputs), case_parts(inputs["case"])[-1]
     excess = command_model(workcell).leading_excess(load, opposed)
@@ -152,10 +153,11 @@ def case_excess_function(workcell: Workcell) -> ca.Function:
 
 
 def case_slack_function(workcell: Workcell, commanded: int = 1) -> ca.Function:
-    """pose, rate, second_rate (6,), a case (18,) and the commanded force [N] to slack.
+    """Build a sufficient test of a commanded force: pose, rate, second_rate (6,), a case (18,) and
+    the force [N] to slack.
 
-    Where it is positive, one pressure that is known holds the case; elsewhere
-    `case_squeeze_function` knows. It takes a thirtieth of that one's time.
+    A positive slack proves that the force holds the case; otherwise only `case_squeeze_function`
+    can tell. The test takes a thirtieth of that function's time.
     """
     squeeze = (
         None if command_model(workcell).has_scalar_squeeze else GraspSqueeze(workcell, commanded)
@@ -169,7 +171,7 @@ def case_slack_function(workcell: Workcell, commanded: int = 1) -> ca.Function:
         sizes = _sizes_function(squeeze)(case, *numbers)
         load = _origin_load(workcell, inputs)
         left = (1.0 - tracking[commanded]) * force
-        left -= internal * against_internal(squeeze)(friction, sizes, *numbers)
+        left -= internal * internal_force_gain(squeeze)(friction, sizes, *numbers)
         slack = [commanded_slack(squeeze, load, friction, sizes, displacement, left)]
     else:
         slack = [force - _least_force(workcell, None, inputs)[commanded]]
@@ -178,10 +180,11 @@ def case_slack_function(workcell: Workcell, commanded: int = 1) -> ca.Function:
     return named_function("case_slack", own, {"slack": found[0]}, cse=False)
 
 
-def _asked(
+def _program_and_inputs(
     workcell: Workcell, commanded: int = 1
 ) -> tuple[GraspSqueeze | None, dict[str, Expression]]:
-    """The program of pads anywhere, and the inputs of functions of a cell's least force."""
+    """Return the program of pads with any normals, else None, and the inputs of functions of least
+    forces."""
     if command_model(workcell).has_scalar_squeeze:
         return None, _inputs(ca.SX, sx_parameters(workcell.payload))
     squeeze = GraspSqueeze(workcell, commanded)
@@ -189,7 +192,7 @@ def _asked(
 
 
 def _inputs(kind: Any, given: Mapping[str, Expression]) -> dict[str, Expression]:
-    """Motion, case and numbers by name."""
+    """Return symbols for motion, case and parameters by name."""
     motion = {name: kind.sym(name, 6) for name in MOTION}
     return motion | {"case": kind.sym("case", CASE_SIZE)} | dict(given)
 
@@ -203,10 +206,11 @@ def _least_force(
     displaced: bool = False,
     beside: Expression | float = 0.0,
 ) -> Expression:
-    """(2,) normal forces to command [N].
+    """Build the commanded normal forces (2,) [N].
 
     Args:
-        beside: load (6,) about the box frame's origin beside that of the case, of pads anywhere.
+        beside: load (6,) in addition to that of the case, about the box frame's origin, for pads
+            with any normals.
     """
     case = inputs["case"]
     friction, *_ = case_parts(case)
@@ -214,7 +218,7 @@ def _least_force(
         handed = {name: inputs[name] for name in squeeze.given}
         load = _origin_load(workcell, inputs)
         load = load if isinstance(beside, float) else load + beside
-        return _to_command_of(squeeze, load, case, handed, differentiable)
+        return _commanded_by_program(squeeze, load, case, handed, differentiable)
     model, load = command_model(workcell), case_contact_load(workcell, inputs)
     *_, tracking, opposed = case_parts(case)
     held = model.hold(load, implicit, displaced)
@@ -227,7 +231,7 @@ def _origin_load(workcell: Workcell, inputs: dict[str, Expression]) -> Expressio
 
 
 def case_parts(case: ca.SX | ca.MX) -> list[ca.SX | ca.MX]:
-    """The parts of a case (18,), see `CASE_SIZES`."""
+    """Split a case (18,) into its parts, see `CASE_SIZES`."""
     return list(ca.vertsplit(case, [0, *accumulate(CASE_SIZES.values())]))
 
 
@@ -256,8 +260,8 @@ def case_contact_load(workcell: Workcell, inputs: Mapping[str, Expression]) -> C
 
 
 def case_load_function(workcell: Workcell) -> ca.Function:
-    """pose, rate, second_rate and a case to the force and the moment about the nominal centre of
-    mass that the case asks for, (3,) each, box axes."""
+    """Build the function from pose, rate, second_rate and a case to the required force and moment
+    about the nominal centre of mass, (3,) each, box axes."""
     payload = workcell.payload
     inputs = [*_inputs(ca.SX, sx_parameters(payload)).values()]
     pose, rate, second, case, *_ = inputs
@@ -266,39 +270,41 @@ def case_load_function(workcell: Workcell) -> ca.Function:
     pushed = ca.vertcat(second[:3] + disturbance, second[3:])
     at_nominal = required(workcell, pose, rate, pushed, nominal)[3]
     rotation, *_, force, turning = required(workcell, pose, rate, pushed, centre)
-    # About the nominal centre of mass; the true one's distance turns the force on a mass there.
+    # About the nominal centre of mass: the force on a mass there acts at the true one.
     moment = turning + ca.cross(ca.mtimes(rotation, centre - nominal), at_nominal)
     share = mass / payload.mass
     parts = ca.cse([share * ca.mtimes(rotation.T, part) for part in (force, moment)])
     return ca.Function("case_load", inputs, parts)
 
 
-# --- pads anywhere ---
+# --- pads with any normals ---
 
 
-def _to_command_of(
+def _commanded_by_program(
     squeeze: GraspSqueeze,
     load: ca.MX,
     case: ca.MX,
     handed: dict[str, ca.MX],
     differentiable: bool = False,
 ) -> ca.MX:
-    """(2,) normal forces of pads anywhere to command [N] in a case whose load (6,) is known."""
+    """Build the commanded normal forces (2,) [N] of pads with any normals in a case with a known
+    load (6,)."""
     friction, *_, displacement, tracking, internal = case_parts(case)
     commanded, given = squeeze.commanded, list(handed.values())
     sizes = _sizes_function(squeeze)(case, *given)
     force = commanded_forces(squeeze, load, friction, sizes, displacement, handed, differentiable)
-    needed = force[commanded] + internal * against_internal(squeeze)(friction, sizes, *given)
+    needed = force[commanded] + internal * internal_force_gain(squeeze)(friction, sizes, *given)
     more = needed / (1.0 - tracking[commanded]) - force[commanded]
     normals = squeeze.normals
     shares = as_mx(normals / normals[commanded], squeeze.given, handed)
-    # One entry after the other: a scalar times a vector repeats it by a form without lanes.
+    # Entry by entry: CasADi repeats a scalar times a vector by an operation without lanes.
     force += ca.vertcat(*[more * shares[i] for i in (0, 1)])
     return force
 
 
 def _sizes_function(squeeze: GraspSqueeze) -> ca.Function:
-    """A case to the sizes (2,) of the robots' patches over the cell's own."""
+    """Build the function from a case to the sizes (2,) of the robots' patches over the cell's
+    own."""
     case = ca.SX.sym("case", CASE_SIZE)
     radius = case_parts(case)[1]
     own = [ca.SX(number(contact.patch_radius)) for contact in squeeze.workcell.contacts]
@@ -307,7 +313,8 @@ def _sizes_function(squeeze: GraspSqueeze) -> ca.Function:
 
 
 def case_origin_load_function(workcell: Workcell) -> ca.Function:
-    """The load about the box frame's origin (6,), box axes."""
+    """Build the function from pose, rate, second_rate and a case to the load (6,) about the box
+    frame's origin, box axes."""
     inputs = [*_inputs(ca.SX, sx_parameters(workcell.payload)).values()]
     force, moment = case_load_function(workcell)(*inputs)
     about = moment + ca.cross(ca.SX(number(workcell.payload.centre_of_mass)), force)

@@ -93,7 +93,7 @@ class ArmGeometry(ContentRecord):
 
     @cached_property
     def chain(self) -> str:
-        """Digest of its joints, wherever it stands and whatever it holds."""
+        """Digest of its joints, independent of its base and of the box that it holds."""
         own = self.origins, self.axes, self.turning, self.lower, self.upper
         return digest_of_parts(own)
 

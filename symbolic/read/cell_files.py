@@ -84,7 +84,7 @@ def collect_cell(workcell: Workcell) -> CellFiles:
 def _collected(
     source: Path, digest: str, branches: tuple[int, int], text: bytes | None
 ) -> CellFiles:
-    with _told("the workcell cannot be stored:"):
+    with _as_bundle_errors("the workcell cannot be stored:"):
         current = load(source, decided=branches, text=text)
     if current.digest != digest:
         raise BundleError(
@@ -122,7 +122,7 @@ def unpack_cell(stored: CellFiles, folder: Path, check_digest: bool = True) -> W
     except OSError as error:
         raise BundleError(f"stored {shown(name)} cannot be unpacked ({error.strerror})") from error
     _check_references(stored, root)
-    with _told("the stored workcell is not valid:"):
+    with _as_bundle_errors("the stored workcell is not valid:"):
         workcell = load(root / stored.workcell, stored=True)
     if check_digest and workcell.digest != stored.digest:
         raise BundleError("the stored workcell's digest does not match its files")
@@ -236,7 +236,7 @@ def _check_references(stored: CellFiles, root: Path) -> None:
         if package_dirs is None:
             continue
         folders = [joined(base, entry) for entry in package_dirs]
-        with _told(f"the stored {shown(target)} is not valid:"):
+        with _as_bundle_errors(f"the stored {shown(target)} is not valid:"):
             if is_xacro(stored.files[target]):
                 raise OutsideError(
                     "holds xacro macros, which are never expanded from a stored cell"
@@ -295,7 +295,7 @@ class CellCollector:
                 content = _content(self._source.parent / reference, safe_io.MESH_BYTES)
                 self._files[self._place(reference)] = content
         changes = merged({"robots": described}, with_paths(data, self._address))
-        with _told(f"{self._source.name}:"):
+        with _as_bundle_errors(f"{self._source.name}:"):
             self._text = completed(safe_io.text(self._text), stated, changes).encode()
 
     def layout(self) -> tuple[str, dict[str, bytes], tuple[str, ...]]:
@@ -337,7 +337,7 @@ class CellCollector:
     def _with_meshes(self, robot: Robot, place: str, packages: list[tuple[Path, str]]) -> bytes:
         """Add the meshes of a URDF; return its content with this machine's addresses replaced."""
         path = robot.urdf
-        with _told():
+        with _as_bundle_errors():
             content = description_content(path, robot.xacro_arguments, robot.package_dirs)
             named = parse_urdf(content, path.name)
         for address in dict.fromkeys((*named.collision_meshes, *named.visual_meshes)):
@@ -370,12 +370,12 @@ class CellCollector:
 
 
 def _content(path: Path, most: int) -> bytes:
-    with _told(str(path)):
+    with _as_bundle_errors(str(path)):
         return safe_io.read_bytes(path, most)
 
 
 @contextmanager
-def _told(subject: str = "") -> Iterator[None]:
+def _as_bundle_errors(subject: str = "") -> Iterator[None]:
     """Raise errors of other modules as a `BundleError` about `subject`."""
     try:
         yield
@@ -405,7 +405,7 @@ def parse_toml(content: bytes) -> dict[str, Any]:
     Raises:
         BundleError: it is not TOML.
     """
-    with _told("the stored workcell:"):
+    with _as_bundle_errors("the stored workcell:"):
         return safe_io.toml_tables(content)
 
 
@@ -445,7 +445,7 @@ def drivable_files(stored: CellFiles) -> CellFiles:
     """
     content = stored.files[stored.workcell]
     law = {"task": {"time_law": OPTIMAL}}
-    with _told(f"{stored.workcell}: the time law cannot be changed:"):
+    with _as_bundle_errors(f"{stored.workcell}: the time law cannot be changed:"):
         changed = completed(safe_io.text(content), parse_toml(content), law).encode()
     draft = replace(stored, files={**stored.files, stored.workcell: changed}, digest="")
     with TemporaryDirectory() as folder:

@@ -326,10 +326,10 @@ def _limit(size: int) -> None:
         _, hard = resource.getrlimit(kind)
         most = most if hard == resource.RLIM_INFINITY else min(most, hard)
         resource.setrlimit(kind, (most, most))
-    sys.addaudithook(_refuse_deeds)
+    sys.addaudithook(_refuse_access)
 
 
-def _refuse_deeds(event: str, arguments: tuple[Any, ...]) -> None:
+def _refuse_access(event: str, arguments: tuple[Any, ...]) -> None:
     """Audit hook: let an expansion read files, and refuse everything else that its expressions
     try."""
     writes = event == "open" and isinstance(arguments[2], int) and arguments[2] & _WRITING

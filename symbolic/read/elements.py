@@ -136,7 +136,7 @@ class ElementReader:
             for index, element in enumerate(self.element.findall(tag))
         ]
 
-    def only(self, tags: Sequence[str]) -> ElementReader:
+    def one_of(self, tags: Sequence[str]) -> ElementReader:
         """Return the first inner element, whose tag must be one of `tags`."""
         element = next(iter(self.element), None)
         if element is None or element.tag not in tags:

@@ -225,13 +225,13 @@ def _read_description(
     drop_links = table.texts("drop_links", "names or patterns of links")
     urdf: Urdf | None = None
     if table.clean("urdf", "xacro_arguments", "package_dirs"):
-        with _told(table, "urdf"):
+        with _recorded(table, "urdf"):
             urdf = read_urdf(path, arguments, package_dirs)
     if arguments and urdf is not None and not stored and not is_xacro(path.read_bytes()):
         table.add("xacro_arguments", f"given for {path.name}, which is no xacro file")
     if urdf is not None and drop_links:
         kept, urdf = urdf, None
-        with _told(table, "drop_links"):
+        with _recorded(table, "drop_links"):
             urdf = without_links(kept, drop_links)
     model = None
     if urdf is not None:
@@ -245,7 +245,7 @@ def _read_description(
     if table.has("srdf"):
         srdf = _read_described(table, "srdf", folder, package_dirs)
         if table.clean("srdf"):
-            with _told(table, "srdf"):
+            with _recorded(table, "srdf"):
                 read_srdf(srdf)
     described = {
         "urdf": path,
@@ -266,7 +266,7 @@ def _argument(value: str, folder: Path) -> str:
 
 
 @contextmanager
-def _told(table: TableReader, key: str) -> Iterator[None]:
+def _recorded(table: TableReader, key: str) -> Iterator[None]:
     """Record errors about the content that a key names as problems of that key."""
     try:
         yield
@@ -352,12 +352,12 @@ def _read_model(
     """Return the arm's model, or record problems and return None."""
     moving: tuple[str, ...] | None = None
     model: pin.Model | None = None
-    with _told(table, "urdf"):
+    with _recorded(table, "urdf"):
         reduced_model(urdf)
-        with _told(table, "chain"):
+        with _recorded(table, "chain"):
             moving = moving_joints(urdf, root, flange, locked)
     if moving is not None:
-        with _told(table, "locked_joints"):
+        with _recorded(table, "locked_joints"):
             model = reduced_model(urdf, held_joints(urdf, moving, locked))
     if model is None:
         return None

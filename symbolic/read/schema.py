@@ -15,7 +15,7 @@ from inspect import getdoc
 from types import UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
-from symbolic.array import Filling, Range, Shape
+from symbolic.array import BroadcastScalar, Range, Shape
 from symbolic.contact.registry import CONTACT_MODELS
 from symbolic.read.payload import MOST_HANDS, PAYLOAD_KINDS
 from symbolic.read.robots import LIMIT_KEYS, MAX_START_BRANCH, UNKNOWN_TORQUE
@@ -146,7 +146,9 @@ def _task() -> Schema:
         **_fields(Task, *derived, "pieces", "time_law"),
         "start": _with("pose of the box: x, y, z, roll, pitch, yaw [m, rad]", pose),
         "goal": _with("likewise, at the end", pose),
-        "rotation": _with("what the last three numbers of a pose mean", _words(get_args(Rotation))),
+        "rotation": _with(
+            "meaning of the last three numbers of a pose", _words(get_args(Rotation))
+        ),
         "rotation_reference": _with(
             "roll, pitch, yaw that rotation vectors turn [rad]", _vector(quantity.ANGLE, 3)
         ),
@@ -195,7 +197,7 @@ def _kind(kind: Any) -> Schema:
     allowed = next((mark for mark in marks if isinstance(mark, Range)), None)
     shape = next((mark for mark in marks if isinstance(mark, Shape)), None)
     if shape is not None and allowed is not None:
-        filling = any(isinstance(mark, Filling) for mark in marks)
+        filling = any(isinstance(mark, BroadcastScalar) for mark in marks)
         return _vector(allowed, shape.sizes[0] or 0, filling)
     if is_dataclass(kind):
         assert isinstance(kind, type), "annotations name classes"

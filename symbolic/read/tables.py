@@ -36,7 +36,7 @@ from typing import (
 import numpy as np
 
 from symbolic import safe_io
-from symbolic.array import Array, Filling, Form, Missing, Range, Shape
+from symbolic.array import AllowMissing, Array, BroadcastScalar, Range, Shape, TextPattern
 from symbolic.errors import DualArmError, OutsideError
 from symbolic.records import Body, Box, Cylinder, Mesh, Sphere
 from symbolic.records import quantities as quantity
@@ -276,7 +276,7 @@ def checked(kind: Any, value: Any, path: str, problems: Problems) -> Any:
             }
         problem = "allowed is a table"
     else:
-        if value is None and any(isinstance(mark, Missing) for mark in marks):
+        if value is None and any(isinstance(mark, AllowMissing) for mark in marks):
             return math.nan
         return _single(kind, marks, value, path, problems)
     problems.add(path, f"found {shown(value)}; {problem}")
@@ -307,7 +307,7 @@ def _single(kind: Any, marks: Sequence[Any], value: Any, path: str, problems: Pr
         span = f" {low} to {high}" if ranges else ""
         problem = "" if fits else f"allowed is a whole number{span}"
     else:
-        forms = [mark.problem(value) for mark in marks if isinstance(mark, Form)]
+        forms = [mark.problem(value) for mark in marks if isinstance(mark, TextPattern)]
         problem = "".join(forms) if isinstance(value, str) or forms else "allowed is a text"
     if not problem:
         return value
@@ -373,9 +373,9 @@ def _array(
     """Check a read-only array of numbers, finite unless the annotation allows missing entries."""
     for mark in marks:
         if isinstance(mark, Range):
-            filling = any(isinstance(other, Filling) for other in marks)
+            filling = any(isinstance(other, BroadcastScalar) for other in marks)
             return checked_vector(value, (mark,) * (shape.sizes[0] or 0), path, problems, filling)
-    may_miss = any(isinstance(mark, Missing) for mark in marks)
+    may_miss = any(isinstance(mark, AllowMissing) for mark in marks)
     expected = " x ".join("any" if size is None else str(size) for size in shape.sizes)
     try:
         found = np.array(value, dtype=float)

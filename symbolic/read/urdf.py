@@ -203,7 +203,7 @@ def _inertia_problem(inertia: Array, mass: float) -> str:
 def _collision(part: ElementReader) -> UrdfCollision:
     pose = pose_of(part)
     shape: Box | Cylinder | Sphere | Capsule | UrdfMesh = Sphere(1.0)
-    element = part.required("geometry").only(("box", "cylinder", "sphere", "capsule", "mesh"))
+    element = part.required("geometry").one_of(("box", "cylinder", "sphere", "capsule", "mesh"))
     size = quantity.SHAPE_SIZE
     match element.tag:
         case "box":

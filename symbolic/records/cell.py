@@ -16,12 +16,12 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 
-from symbolic.array import Array, Filling, Range, Vector
+from symbolic.array import Array, BroadcastScalar, Range, Vector
 from symbolic.errors import SettingsError
 from symbolic.records import quantities as quantity
 from symbolic.records.content import digest_of_parts
 from symbolic.records.poses import inverse, read_only
-from symbolic.records.problems import Label, form_of
+from symbolic.records.problems import Label, text_pattern
 from symbolic.records.task import Task
 
 
@@ -51,7 +51,7 @@ class Sphere:
     radius: Annotated[float, quantity.SHAPE_SIZE]
 
 
-Scale = Annotated[Vector, quantity.SCALE, Filling()]
+Scale = Annotated[Vector, quantity.SCALE, BroadcastScalar()]
 
 
 @dataclass(frozen=True)
@@ -110,28 +110,28 @@ class ToolLoad:
     inertia: Array = field(default_factory=lambda: read_only(np.zeros((3, 3))))
 
 
-ADDRESS = form_of(
+ADDRESS = text_pattern(
     r"[A-Za-z0-9](?:[A-Za-z0-9.:-]{0,251}[A-Za-z0-9])?", "a host name or an IP address"
 )
 """Host names, IPv4 and IPv6 addresses; nothing that ends a string of a robot's language."""
 
-PREFIX = form_of(r"(?:[A-Za-z][A-Za-z0-9_]{0,39})?", "letters, digits, _, with a letter first")
+PREFIX = text_pattern(r"(?:[A-Za-z][A-Za-z0-9_]{0,39})?", "letters, digits, _, with a letter first")
 """What names of joints may begin with in ROS; '' for nothing."""
 
 
 @dataclass(frozen=True)
 class Driver:
-    """How the controller of an arm is reached, and what it is able to do.
+    """Connection to an arm's controller, and its abilities.
 
     Attributes:
-        address: host name or IP address; '' where nobody says.
-        prefix: of the arm's joints as its driver names them; None for the robot's name.
-        rate: of the driver's cycle [Hz]; None for what the target has.
+        address: host name or IP address; '' if unknown.
+        prefix: prefix of the arm's joint names in its driver; None for the robot's name.
+        rate: of the driver's cycle [Hz]; None for the target's default.
         lag: delay of the arm behind its command [s].
-        force_control: whether the controller has its maker's force control, where that is an
-            option: a sensor at the flange, and instructions that press with a force.
-        stiffness: of the arm under its controller, at the pad along its normal [N/m]; None if
-            nobody measured it.
+        force_control: the controller has its maker's optional force control: a sensor at the
+            flange, and instructions that press with a force.
+        stiffness: of the arm under its controller, at the pad along its normal [N/m]; None if not
+            measured.
     """
 
     address: Annotated[str, ADDRESS] = ""
@@ -144,7 +144,7 @@ class Driver:
 
 @dataclass(frozen=True, kw_only=True)
 class Robot:
-    """One arm: its model file, where it stands, what it carries and what it may do.
+    """One arm: its model file, base, tool and limits.
 
     Attributes:
         name: unique in the workcell.
@@ -165,11 +165,11 @@ class Robot:
         xacro_arguments: names and values of the xacro file's arguments.
         srdf: file whose disabled pairs of links are not checked for collision.
         chain_root: link of the URDF that the arm begins at, the flange being its other end; ''
-            where every joint that is not locked belongs to the arm.
-        drop_links: links, by name or pattern, that are left out with all that hangs on them.
-        tool_load: mass and inertia of the tool; None where nothing is known of them.
+            if every joint that is not locked belongs to the arm.
+        drop_links: names or patterns of links that are left out, with all links behind them.
+        tool_load: mass and inertia of the tool; None if unknown.
         redundant_joints: names of the joints beyond six, whose paths are part of the decision
-            vector; () where the arm has six.
+            vector; () for an arm with six joints.
         jerk_max: (n,) [rad/s^3], or None without limits.
         driver: of its controller, for bundles.
     """
@@ -198,7 +198,7 @@ class Robot:
     driver: Driver = field(default_factory=Driver)
 
 
-# --- the payload, how it is held, and how sure that is ---
+# --- the payload, its contacts, and their uncertainty ---
 
 
 @dataclass(frozen=True)
@@ -361,7 +361,7 @@ class Uncertainty:
         }
         return replace(self, **ranges)
 
-    def only(self, names: Iterable[str]) -> Uncertainty:
+    def restrict_to(self, names: Iterable[str]) -> Uncertainty:
         """Return the set restricted to some of its ranges; the others are zero."""
         none = Uncertainty()
         others = {name: getattr(none, name) for name in RANGES if name not in names}

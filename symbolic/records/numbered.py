@@ -59,7 +59,7 @@ class NumberedPayload(Payload):
 class NumberedContact(Contact):
     """A contact. twist, spread: see `symbolic.contact.soft_finger.SoftPatch`. share, opposed: of
     a hand that holds by itself, see `symbolic.contact.elastic.layer_shares` and
-    `symbolic.contact.holding_hands.opposed_needs`."""
+    `symbolic.contact.holding_hands.internal_force_needs`."""
 
     twist: Any = None
     spread: Any = None

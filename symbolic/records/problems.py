@@ -10,7 +10,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Annotated, Any
 
-from symbolic.array import Form
+from symbolic.array import TextPattern
 
 MAX_NAME_LENGTH = 80
 
@@ -123,18 +123,18 @@ def text_problem(value: Any) -> str:
     return ""
 
 
-Label = Annotated[str, Form(text_problem)]
+Label = Annotated[str, TextPattern(text_problem)]
 """A text for people and reports."""
 
 
-def form_of(pattern: str, meaning: str) -> Form:
+def text_pattern(pattern: str, meaning: str) -> TextPattern:
     """Return the form of texts that match a pattern; `meaning` describes it in messages."""
     form = re.compile(pattern)
 
     def problem(value: Any) -> str:
         return "" if isinstance(value, str) and form.fullmatch(value) else f"allowed: {meaning}"
 
-    return Form(problem)
+    return TextPattern(problem)
 
 
 # --- patterns that stand for several names ---

@@ -16,7 +16,7 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from symbolic.array import Array, Filling, Pair, Range
+from symbolic.array import Array, BroadcastScalar, Pair, Range
 from symbolic.records import quantities as quantity
 from symbolic.records.poses import Orientation
 from symbolic.records.problems import Label
@@ -116,7 +116,7 @@ class Task:
     reference_speed: Annotated[float, quantity.SPEED]
     reference_angular_speed: Annotated[float, quantity.ANGULAR_SPEED] = 0.5
     ramp_time: Annotated[float, quantity.DURATION] = 0.5
-    reference_force: Annotated[Pair, quantity.FORCE, Filling()]
+    reference_force: Annotated[Pair, quantity.FORCE, BroadcastScalar()]
     initial: Array
     allowed_contacts: tuple[AllowedContact, ...] = ()
     allocation: str = "paper"

@@ -92,7 +92,7 @@ class Halves(ContactModel):
         """See `ContactModel`."""
         return self.hold(load).normal[0] + opposed / load.friction[0]
 
-    def pressed_together(self, leader: int) -> Array:
+    def internal_force_ratio(self, leader: int) -> Array:
         """See `ContactModel`."""
         return np.asarray(np.eye(2)[1 - leader])
 

@@ -59,7 +59,7 @@ def test_more_squeeze_balances_itself_within_all_cones(name: str) -> None:
         for contact, wrench in zip(cell.contacts, wrenches, strict=True):
             total[3:] += np.cross(turned @ contact.T_box_pad[:3, 3], wrench[:3])
         np.testing.assert_allclose(total, 0.0, atol=1e-9)
-        together = command_model(cell).pressed_together(leader)
+        together = command_model(cell).internal_force_ratio(leader)
         assert together[1 - leader] == 1.0
         for contact, wrench, share in zip(cell.contacts, wrenches, together, strict=True):
             pushed = (turned @ contact.T_box_pad[:3, :3]).T @ wrench[:3]

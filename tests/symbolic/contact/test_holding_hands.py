@@ -19,7 +19,7 @@ from hybrid_opt.robust.force import BoxMotion, interpreted_robust_model
 from symbolic.array import Array
 from symbolic.contact.elastic import SHEAR, kern, layer_shares, layer_stiffness
 from symbolic.contact.force_closure import wrench_to_box
-from symbolic.contact.holding_hands import HandPatch, needed_holding_forces, opposed_needs
+from symbolic.contact.holding_hands import HandPatch, internal_force_needs, required_holding_forces
 from symbolic.contact.load import load_function
 from symbolic.contact.registry import require_squeeze
 from symbolic.errors import SettingsError, WorkcellError
@@ -41,7 +41,7 @@ SEEDS = st.integers(0, 2**31)
 
 def needed(hand: Contact, wrench: Array) -> Array:
     """(2,) forces against lifting and against sliding [N]."""
-    found = needed_holding_forces(ca.DM(wrench), hand.friction, HandPatch.of(hand))
+    found = required_holding_forces(ca.DM(wrench), hand.friction, HandPatch.of(hand))
     return np.array([float(value) for value in found])
 
 
@@ -290,7 +290,7 @@ def test_an_arm_needs_what_its_most_loaded_hand_needs(seed: int) -> None:
 def test_opposed_arms_ask_for_no_more_than_their_bound(seed: int) -> None:
     """The layers of both arms as springs in series, displaced in a random direction."""
     hands, robots = random_hands(seed, 4), (0, 0, 1, 1)
-    bounds, own = opposed_needs(hands, robots), hands[:2]
+    bounds, own = internal_force_needs(hands, robots), hands[:2]
     softness = [np.linalg.inv(whole_stiffness(hands[i : i + 2])) for i in (0, 2)]
     moved = np.append(np.random.default_rng(seed).normal(size=3), np.zeros(3))
     wrench = np.linalg.solve(softness[0] + softness[1], moved)
