@@ -17,7 +17,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from hybrid_opt.carry import Carry
-from hybrid_opt.display.table import figures_html, lines, number
+from hybrid_opt.display.table import figures_html, lines, torque_use
 from hybrid_opt.evaluate.objectives import PAPER_OBJECTIVES
 from hybrid_opt.front import Front
 from hybrid_opt.indicators.metrics import excess_above_static
@@ -128,8 +128,8 @@ def _(found: Recommendation) -> str:
 
 
 def _torques(uses: Array) -> str:
-    """Format uses of torques [%]; a use of zero is that of an arm whose torques are unknown."""
-    return ", ".join(number(use or None, 1, 100.0) for use in uses.tolist())
+    """Format uses of torques [%]."""
+    return ", ".join(map(torque_use, uses.tolist()))
 
 
 def _pair(values: Array, digits: int) -> str:

@@ -28,6 +28,15 @@ def number(value: float | None, digits: int = 2, scale: float = 1.0) -> str:
     return f"{value * scale:z.{digits}f}"
 
 
+UNPUBLISHED = "unknown"
+"""Cell of a figure that nobody published."""
+
+
+def torque_use(use: float | None) -> str:
+    """Format a use of joint torques [%]; `UNPUBLISHED` for zero, the use of unknown limits."""
+    return UNPUBLISHED if use == 0.0 else number(use, 1, 100.0)
+
+
 def counted(count: int, noun: str) -> str:
     """Format a number of things; the plural of the noun ends in s."""
     return f"{count} {noun}" if count == 1 else f"{count} {noun}s"

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 import hybrid_opt as ho
 from hybrid_opt.campaign.stages import ReadyCell
 from hybrid_opt.display.scene import packed
-from hybrid_opt.display.table import NOTHING, Table, number
+from hybrid_opt.display.table import NOTHING, Table, number, torque_use
 from hybrid_opt.evaluate.objectives import PAPER_OBJECTIVES
 from hybrid_opt.job.motions import TICK
 from hybrid_opt.job.plan import JobModel
@@ -163,8 +163,12 @@ def phases(jobs: Sequence[DrawnJob], robots: Sequence[str]) -> Table:
     def add(
         name: str, begin: float | None, takes: float, force: Array, use: Iterable[float]
     ) -> None:
-        figures = [*force, *(100.0 * value for value in use)]
-        rows.append((name, number(begin), number(takes), *(number(each, 1) for each in figures)))
+        forces = (number(each, 1) for each in force)
+        uses = (
+            torque_use(value) if limit == "joint torque" else number(value, 1, 100.0)
+            for limit, value in zip(PHASE_LIMITS, use, strict=True)
+        )
+        rows.append((name, number(begin), number(takes), *forces, *uses))
 
     for found in jobs:
         if found.job is None:
@@ -259,8 +263,9 @@ def _phase(phase: Phase) -> dict[str, Any]:
     }
 
 
-def _rounded(values: Array, digits: int) -> list[float]:
-    return [round(value, digits) for value in values.tolist()]
+def _rounded(values: Array, digits: int) -> list[float | None]:
+    """Round values for JSON, which has no NaN."""
+    return [None if np.isnan(value) else round(value, digits) for value in values.tolist()]
 
 
 def page_trajectory(cells: Sequence[ReadyCell], shown: PageTrajectory) -> dict[str, Any]:
@@ -357,17 +362,21 @@ def _motion(name: str, carry: ho.Carry, commanded: Array | None = None) -> dict[
     return found if commanded is None else {**found, "isCommanded": True}
 
 
-def _uses(workcell: Workcell, whole: Array, contact: Sequence[Array]) -> dict[str, list[float]]:
-    """Return uses of the joints' torques, of all loads and of the contacts alone."""
+def _uses(
+    workcell: Workcell, whole: Array, contact: Sequence[Array]
+) -> dict[str, list[float | None]]:
+    """Return uses of the joints' torques, of all loads and of the contacts alone; None where the
+    largest allowed is unknown."""
     torques = {"torqueUse": whole, "contactTorqueUse": np.concatenate(contact)}
-    return {name: _rounded(torque_use(workcell, each), 3) for name, each in torques.items()}
+    return {name: _rounded(joint_torque_use(workcell, each), 3) for name, each in torques.items()}
 
 
-def torque_use(workcell: Workcell, torque: Array) -> Array:
-    """(joints,) largest use of each joint's torque (n, joints) in percent."""
-    return np.asarray(
-        100.0 * np.abs(torque).max(axis=0) / workcell.stack_joint_limits("torque_max")
-    )
+def joint_torque_use(workcell: Workcell, torque: Array) -> Array:
+    """(joints,) largest use of each joint's torque (n, joints) in percent; NaN where the largest
+    allowed is unknown."""
+    limit = workcell.stack_joint_limits("torque_max")
+    use = 100.0 * np.abs(torque).max(axis=0) / limit
+    return np.where(np.isfinite(limit), use, np.nan)
 
 
 def _values(cell: ho.Cell, judged: ho.Carry, found: dict[str, Any]) -> str:

@@ -216,16 +216,17 @@ def carry_plots(workcell: Workcell) -> dict[str, Plot]:
     bars = [
         {
             "type": "bar",
-            "name": plain(f"{robot.name}{whose}"),
+            "name": plain(f"{robot.name}{whose if judged else ', torques unknown'}"),
             "x": [f"joint {j + 1}" for j in range(joints[i])],
             "marker": {"color": ARM_COLOURS[i], "opacity": opacity},
             "meta": {"use": use, "arm": i},
         }
         for i, robot in enumerate(workcell.robots)
+        for judged in [bool(np.isfinite(robot.torque_max).all())]
         for use, whose, opacity in (
             ("torqueUse", "", 1.0),
             ("contactTorqueUse", ", load alone", 0.45),
-        )
+        )[: 2 if judged else 1]
     ]
     y = {"title": {"text": "largest joint torque [% of maximum]"}, "rangemode": "tozero"}
     plots["torque-plot"] = _carry_plot(bars, barmode="group", yaxis=y)

@@ -11,6 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
+from hybrid_opt.display.table import UNPUBLISHED
 from hybrid_opt.robust.force import RobustPrice
 from hybrid_opt.timing.robustness import KILOGRAM_FORCE
 from studies.report.data import ReportData
@@ -25,7 +26,7 @@ from studies.report.drawing import (
     series,
     shortened,
 )
-from studies.report.page_carries import torque_use
+from studies.report.page_carries import joint_torque_use
 from symbolic.array import Array
 
 PREDICTED: dict[str, Any] = {"color": "black", "linestyle": (0, (2, 1.5)), "linewidth": 0.8}
@@ -146,26 +147,29 @@ def joint_torques(data: ReportData) -> Figure:
     split = [len(data.workcell.robots[0].torque_max)]
     kinds = (("contact wrench alone", "contact_torque"), ("with the arm", "torque"))
     uses = {
-        (row, carry.label): np.split(torque_use(data.workcell, getattr(carry.timed, name)), split)
+        (row, carry.label): np.split(joint_torque_use(data.workcell, torque), split)
         for row, (_, name) in enumerate(kinds)
         for carry in data.drawn
+        for torque in [getattr(carry.timed, name)]
     }
     # One scale for all panels, so that they can be compared.
-    top = max(float(use.max()) for both in uses.values() for use in both)
+    known = [use.max() for both in uses.values() for use in both if np.isfinite(use).all()]
+    top = float(max(known, default=100.0))
     for row, (text, _) in enumerate(kinds):
         for i, robot in enumerate(data.workcell.robots):
             axes, joints = panels[row, i], len(robot.torque_max)
             angles, most = np.linspace(0.0, 2.0 * np.pi, joints + 1), np.zeros(joints)
             for carry in data.drawn:
                 use = uses[row, carry.label][i]
-                most = np.maximum(most, use)
+                most = np.fmax(most, use)
                 looks = {**carry.look.drawn, "marker": carry.look.marker, "markersize": 3}
                 axes.plot(angles, [*use, use[0]], **looks, label=carry.label)
             axes.set_xticks(angles[:-1], [f"joint {j + 1}" for j in range(joints)])
             axes.tick_params(axis="x", pad=4)
             _label_rings(axes, most, top)
             letter = "abcd"[2 * row + i]
-            axes.set_title(f"({letter}) {shortened(robot.name)!r}: {text} [% of maximum]", pad=12)
+            unit = "% of maximum" if np.isfinite(robot.torque_max).all() else UNPUBLISHED
+            axes.set_title(f"({letter}) {shortened(robot.name)!r}: {text} [{unit}]", pad=12)
     legend_below(figure, panels[0, 0])
     return figure
 

@@ -12,7 +12,7 @@ from dataclasses import replace
 from typing import Any
 
 from hybrid_opt.campaign.settings import UNION
-from hybrid_opt.display.table import NOTHING, Quantity, Table, counted, number
+from hybrid_opt.display.table import NOTHING, Quantity, Table, counted, number, torque_use
 from hybrid_opt.indicators.statistics import summarise
 from hybrid_opt.metaheuristics.registry import title
 from hybrid_opt.robust.force import RobustPrice
@@ -462,8 +462,7 @@ def _timing_cells(timing: StoredTiming) -> tuple[str, ...]:
         FINE_DURATION(timing.duration),
         *map(FORCE_QUANTITY, timing.peak_normal_force),
         PAYLOAD_QUANTITY(timing.payload_limit),
-        # Of arms whose torques are unknown nothing is used: no share of a limit that is not there.
-        TORQUE_QUANTITY(None if torque is None else float(torque.max()) or None),
+        torque_use(None if torque is None else float(torque.max())),
         SHIFT_QUANTITY(timing.peak_pressure_shift.max()),
     )
 

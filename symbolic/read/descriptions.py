@@ -220,6 +220,27 @@ def is_xacro(content: bytes) -> bool:
     return _XACRO.search(content) is not None and _MACRO.search(content) is not None
 
 
+_KINEMATICS = re.compile(
+    rb"""<xacro:arg\s[^>]*?name\s*=\s*["'](\w*kinematics\w*)["']""", re.IGNORECASE
+)
+_NOMINAL = re.compile(r"default_kinematics\.ya?ml$", re.IGNORECASE)
+
+
+def nominal_kinematics(content: bytes, arguments: Arguments) -> str:
+    """Return the name of a xacro file's argument for an arm's own calibration, where its value is
+    missing or the maker's nominal one; '' where there is no such argument, or a value.
+
+    Args:
+        content: of the file.
+        arguments: as of `description_content`.
+    """
+    given = dict(arguments)
+    names = (name.decode() for name in _KINEMATICS.findall(content))
+    return next(
+        (name for name in names if _NOMINAL.search(given.get(name, "")) or name not in given), ""
+    )
+
+
 @lru_cache(maxsize=8)
 def _expanded(
     path: Path, content: bytes, arguments: Arguments, package_dirs: tuple[Path, ...]

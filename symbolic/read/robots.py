@@ -46,6 +46,7 @@ from symbolic.read.descriptions import (
     find_package,
     further_package_dirs,
     is_xacro,
+    nominal_kinematics,
     resolve_mesh,
 )
 from symbolic.read.tables import TableReader, read_body, read_file, read_inertia, read_pose
@@ -227,8 +228,8 @@ def _read_description(
     if table.clean("urdf", "xacro_arguments", "package_dirs"):
         with _recorded(table, "urdf"):
             urdf = read_urdf(path, arguments, package_dirs)
-    if arguments and urdf is not None and not stored and not is_xacro(path.read_bytes()):
-        table.add("xacro_arguments", f"given for {path.name}, which is no xacro file")
+    if urdf is not None and not stored:
+        _check_arguments(table, path, arguments)
     if urdf is not None and drop_links:
         kept, urdf = urdf, None
         with _recorded(table, "drop_links"):
@@ -258,6 +259,29 @@ def _read_description(
         "drop_links": drop_links,
     }
     return described, model
+
+
+def _check_arguments(table: TableReader, path: Path, arguments: Arguments) -> None:
+    """Refuse arguments for a file that takes none, and warn of a calibration that is not given."""
+    content = safe_io.read_bytes(path, safe_io.URDF_BYTES)
+    if not is_xacro(content):
+        if arguments:
+            table.add("xacro_arguments", f"given for {path.name}, which is no xacro file")
+        return
+    name = nominal_kinematics(content, arguments)
+    if name:
+        _warn_nominal(table.text("name"), name)
+
+
+@cache
+def _warn_nominal(robot: str, argument: str) -> None:
+    """Warn once that a robot's calibration is not given."""
+    warnings.warn(
+        f"robot {robot!r} has its maker's nominal kinematics; name the file of the arm's own "
+        f"calibration by xacro_arguments.{argument}",
+        RobotModelWarning,
+        stacklevel=2,
+    )
 
 
 def _argument(value: str, folder: Path) -> str:

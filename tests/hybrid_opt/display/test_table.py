@@ -10,7 +10,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hybrid_opt.display.table import NOTHING, Quantity, Table, counted, number, text_table
+from hybrid_opt.display.table import (
+    NOTHING,
+    Quantity,
+    Table,
+    counted,
+    number,
+    text_table,
+    torque_use,
+)
 
 TEXTS = st.text(st.characters(blacklist_categories=("Cs", "Cc")), min_size=1, max_size=20)
 
@@ -28,6 +36,10 @@ def test_columns_are_aligned_and_the_head_is_underlined() -> None:
 def test_figures_that_do_not_exist_are_a_dash() -> None:
     assert [number(v, 2) for v in (1.005, None, math.nan, math.inf)] == ["1.00", *[NOTHING] * 3]
     assert number(0.5, 1, 100.0) == "50.0"
+
+
+def test_no_share_is_stated_of_torques_that_nobody_published() -> None:
+    assert [torque_use(use) for use in (0.0, 0.1234, None)] == ["unknown", "12.3", NOTHING]
 
 
 def test_one_thing_is_not_plural() -> None:

@@ -49,6 +49,7 @@ from studies.report.looks import (
     page_server,
     write_animation,
 )
+from studies.report.pictures_carry import joint_torques
 from studies.report.pictures_cell import facing, planes
 from symbolic.array import Array
 from symbolic.read.cell import load
@@ -165,6 +166,19 @@ def test_joint_torques_have_one_scale(drawn: Drawn) -> None:
     panels = drawn["fig10_joint_torques"][1].get_axes()
     assert len(panels) == 4
     assert len({axes.get_ylim() for axes in panels}) == 1
+
+
+def test_an_arm_of_unknown_torques_has_an_empty_panel_that_says_so(
+    hybrid_data: ReportData,
+) -> None:
+    cell = hybrid_data.workcell
+    unknown = replace(cell.robots[0], torque_max=np.full(6, np.inf))
+    data = replace(hybrid_data, workcell=replace(cell, robots=(unknown, cell.robots[1])))
+    panels = joint_torques(data).get_axes()
+    told = ["unknown" in panel.get_title() for panel in panels]
+    assert told == [True, False, True, False]
+    for panel, is_empty in zip(panels, told, strict=True):
+        assert np.isnan(panel.lines[0].get_ydata()).all() == is_empty
 
 
 @pytest.mark.parametrize(

@@ -9,10 +9,12 @@ import pytest
 
 from symbolic.errors import OutsideError, UrdfError
 from symbolic.read import descriptions
+from symbolic.read.arms import RobotModelWarning
 from symbolic.read.cell import load
 from symbolic.read.cell_files import collect_cell, unpack_cell
-from symbolic.read.descriptions import description_content, is_xacro
+from symbolic.read.descriptions import description_content, is_xacro, nominal_kinematics
 from symbolic.read.editing import completed, with_paths
+from symbolic.read.robots import _warn_nominal
 from symbolic.read.urdf import read_urdf
 from tests.symbolic.cells import GOFA
 from tests.symbolic.read.samples import sample_data
@@ -179,6 +181,29 @@ def test_generated_urdfs_that_keep_the_namespace_are_read_as_they_are(tmp_path: 
     assert description_content(path) == path.read_bytes()
 
 
+@pytest.mark.parametrize(
+    ("given", "expected"),
+    [
+        ({}, "kinematics_params"),
+        ({"kinematics_params": "config/ur5e/default_kinematics.yaml"}, "kinematics_params"),
+        ({"kinematics_params": "my_robot_calibration.yaml"}, ""),
+        ({"tool": "cup"}, "kinematics_params"),
+    ],
+)
+def test_a_calibration_that_is_not_given_is_told(
+    given: dict[str, str], expected: str, tmp_path: Path
+) -> None:
+    """Arguments as in the descriptions of Universal Robots and Elite Robots."""
+    path = write(
+        tmp_path,
+        '<xacro:arg name="tool" default="none"/>\n<xacro:arg\n  name="kinematics_params" '
+        'default="$(find arm)/config/default_kinematics.yaml"/><link name="base"/>',
+    )
+    assert nominal_kinematics(path.read_bytes(), tuple(given.items())) == expected
+    other = write(tmp_path, '<xacro:arg name="tool" default="none"/>', "other.xacro")
+    assert nominal_kinematics(other.read_bytes(), ()) == ""
+
+
 def test_paths_in_arguments_are_relative_to_the_workcell_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -201,6 +226,12 @@ def test_paths_in_arguments_are_relative_to_the_workcell_file(
     monkeypatch.chdir("/")
     cell = load(path)
     assert [len(robot.torque_max) for robot in cell.robots] == [6, 6]
+    _warn_nominal.cache_clear()
+    given = '<xacro:arg name="kinematics_config" default=""/>' + main
+    write(tmp_path / "robots", given)
+    told = r"'left' has .* nominal kinematics; .* xacro_arguments\.kinematics_config"
+    with pytest.warns(RobotModelWarning, match=told):
+        load(path)
 
     def moved(name: str) -> str:
         return os.path.relpath(path.parent / name, tmp_path)
