@@ -14,11 +14,9 @@ from hybrid_opt.errors import WorkerError
 from hybrid_opt.workers import (
     RESUME_HINT,
     Argument,
-    OnResult,
     Result,
     Workers,
     call_safely,
-    ignore_result,
 )
 from symbolic.errors import DualArmError, SettingsError
 
@@ -41,7 +39,7 @@ Environment = Mapping[str, str]
 
 
 class DaskWorkers(Workers):
-    """Makes calls on the workers of a Dask cluster, which repeats what is lost with a worker.
+    """Makes calls on the workers of a Dask cluster, which repeats calls lost with a worker.
 
     Workers need this package and its dependencies in the same versions, and a C compiler.
     """
@@ -58,38 +56,32 @@ class DaskWorkers(Workers):
         self._resources = ExitStack()
         self._client: Any = None
 
-    def map(
-        self,
-        function: Callable[[Argument], Result],
-        arguments: Sequence[Argument],
-        on_result: OnResult = ignore_result,
-    ) -> list[Result]:
-        """Call a function with every argument on the cluster, see `Workers.map`.
+    def _results(
+        self, function: Callable[[Argument], Result], arguments: Sequence[Argument]
+    ) -> Iterator[tuple[int, Result]]:
+        """Yield index and result of each call as it ends.
 
         Raises:
             SettingsError: Dask is not installed, or no scheduler or worker answers.
-            WorkerError: workers do not fit or were lost.
+            WorkerError: the software of a worker differs, or workers were lost.
         """
         if not arguments:
-            return []
+            return
         self._connect()
         executor, wanted = self._client.get_executor(pure=False), dict(self._environment())
         calls = {
             executor.submit(_call, self._environment, wanted, function, argument): index
             for index, argument in enumerate(arguments)
         }
-        results: dict[int, Result] = {}
         left, connected = set(calls), time.monotonic()
         while left:
             done, left = wait(left, _CONNECTION_INTERVAL, FIRST_COMPLETED)
             for call in done:
-                results[calls[call]] = result = self._result(call)
-                on_result(calls[call], result)
+                yield calls[call], self._result(call)
             if self._client.status == _CONNECTED:
                 connected = time.monotonic()
             elif time.monotonic() - connected > LOST_SECONDS or self._client.status == "closed":
                 self._give_up("does not answer any more")
-        return [results[index] for index in range(len(arguments))]
 
     def close(self) -> None:
         """Disconnect; calls that are not finished are cancelled."""

@@ -48,14 +48,13 @@ def ignore_result(index: int, result: object) -> None:
 class Workers(ABC):
     """Makes calls; use it in a `with` block, at whose end all work ends."""
 
-    @abstractmethod
     def map(
         self,
         function: Callable[[Argument], Result],
         arguments: Sequence[Argument],
         on_result: OnResult = ignore_result,
     ) -> list[Result]:
-        """Call a function with every argument; returns the results in the arguments' order.
+        """Call a function with every argument; return the results in the arguments' order.
 
         Args:
             on_result: called in this process with index and result of each call as it ends.
@@ -63,6 +62,21 @@ class Workers(ABC):
         Raises:
             DualArmError: a call failed with this text, or workers were lost.
         """
+        results: dict[int, Result] = {}
+        try:
+            for index, result in self._results(function, arguments):
+                results[index] = result
+                on_result(index, result)
+        except BaseException:
+            self.close()
+            raise
+        return [results[index] for index in range(len(arguments))]
+
+    @abstractmethod
+    def _results(
+        self, function: Callable[[Argument], Result], arguments: Sequence[Argument]
+    ) -> Iterator[tuple[int, Result]]:
+        """Yield index and result of each call as it ends."""
 
     @abstractmethod
     def close(self) -> None:
@@ -81,8 +95,8 @@ class Workers(ABC):
 
 
 class LocalWorkers(Workers):
-    """Makes calls in processes of this machine; a single call, or all of them with one job, in this
-    process, where nothing protects it from what the call does."""
+    """Makes calls in processes of this machine. A single call, or all of them with one job, run in
+    this process, without protection from crashes."""
 
     def __init__(self, jobs: int = 1) -> None:
         """Start nothing yet; `jobs` are the most processes, 0 for one per core."""
@@ -91,27 +105,22 @@ class LocalWorkers(Workers):
         self._processes = set[BaseProcess]()
         self._lifeline: Connection | None = None
 
-    def map(
-        self,
-        function: Callable[[Argument], Result],
-        arguments: Sequence[Argument],
-        on_result: OnResult = ignore_result,
-    ) -> list[Result]:
-        """Call a function with every argument in processes, see `Workers.map`."""
-        results: dict[int, Result] = {}
+    def _results(
+        self, function: Callable[[Argument], Result], arguments: Sequence[Argument]
+    ) -> Iterator[tuple[int, Result]]:
         if min(self._jobs, len(arguments)) <= 1:
             for index, argument in enumerate(arguments):
                 with one_thread():
-                    results[index] = function(argument)
-                on_result(index, results[index])
-        deaths = 0
-        while len(results) < len(arguments):
-            left = [k for k in range(len(arguments)) if k not in results]
+                    result = function(argument)
+                yield index, result
+            return
+        left, deaths = dict(enumerate(arguments)), 0
+        while left:
             try:
-                calls = self._submit(function, {k: arguments[k] for k in left})
-                for index, result in finished(calls):
-                    results[index], deaths = result, 0
-                    on_result(index, result)
+                for index, result in finished(self._submit(function, left)):
+                    del left[index]
+                    deaths = 0
+                    yield index, result
             except BrokenExecutor as error:
                 self.close()
                 deaths += 1
@@ -121,10 +130,6 @@ class LocalWorkers(Workers):
                         "memory, or started by a script without `if __name__ == '__main__':`?); "
                         f"{RESUME_HINT}, perhaps with fewer --jobs"
                     ) from error
-            except BaseException:
-                self.close()
-                raise
-        return [results[index] for index in range(len(arguments))]
 
     def _submit(
         self, function: Callable[[Argument], Result], arguments: Mapping[int, Argument]

@@ -25,7 +25,7 @@ from symbolic.limit_coefficients import (
     limit_numbers,
     sample_limits_function,
 )
-from symbolic.limits import BlockLayout, limit_layout
+from symbolic.limits import LIMITS, BlockLayout, limit_layout
 from symbolic.records import Workcell
 
 DRIVEN_FIRST, DRIVEN_SECOND = "driven_first", "driven_second"
@@ -53,7 +53,7 @@ class DrivenLayout(BlockLayout):
 
 
 def driven_layout(workcell: Workcell) -> DrivenLayout:
-    """Return the layout for a workcell's arms.
+    """Return the layout for a workcell's arms: a block for each block of `LIMITS`, and the load.
 
     Blocks, in order:
 
@@ -66,17 +66,23 @@ def driven_layout(workcell: Workcell) -> DrivenLayout:
     force (2): normal component and tangential magnitude of the required force, from which the
     paper's normal forces follow (`planned_branches`), or both normal forces of soft fingers [N].
 
-    load (6): force and moment that the pads have to balance, as
-    `symbolic.contact.grasp.grasp_wrenches` takes it [N, N m].
-
     torque (joints): over their limits, signed.
 
     pressure (2): shifts of the centres of pressure over their patches' radii.
+
+    load (6): force and moment that the pads have to balance, see
+    `symbolic.contact.grasp.grasp_wrenches` [N, N m]; in place of force, torque and pressure if a
+    program finds the forces.
     """
-    j, closed = limit_layout(workcell).joints, int(contact_model(workcell).has_closed_form)
-    sizes = {"speed": j + 2, "acceleration": j, "cone": 2, "force": 2 * closed}
-    sizes |= {"load": LOAD_SIZE * (1 - closed), "torque": j * closed, "pressure": 2 * closed}
-    return DrivenLayout(j, sizes, workcell.task.extended_size, not closed)
+    joints, by_program = limit_layout(workcell).joints, not contact_model(workcell).has_closed_form
+    entries = {"joint": joints, "payload": 1, "robot": 2}
+    sizes = dict.fromkeys([limit.block for limit in LIMITS], 0)
+    for limit in LIMITS:
+        is_force = limit.group != "motion"
+        if limit.option != "reference_speed" and not (is_force and by_program):
+            sizes[limit.block] += entries[limit.scope]
+    sizes["load"] = LOAD_SIZE * by_program
+    return DrivenLayout(joints, sizes, workcell.task.extended_size, by_program)
 
 
 def planned_branches(workcell: Workcell) -> Array:
