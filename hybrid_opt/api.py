@@ -148,8 +148,8 @@ def save(carry: Carry, path: str | Path, provenance: Mapping[str, Any] | None = 
     """Store a carry of `Cell.carry` with its whole cell in one file; see docs/reference/bundles.md.
 
     Args:
-        path: the file, replaced where it exists.
-        provenance: JSON values that say how it came about.
+        path: the file, replaced if it exists.
+        provenance: origin of the carry as JSON values.
 
     Raises:
         ResultsError: the workcell was changed after reading, or the file cannot be written.

@@ -1,7 +1,7 @@
 """Protocol of objects with a display in a terminal and in a notebook.
 
-They do not know how they look: the rooms of `hybrid_opt.display` do, which are imported when an
-object is shown.
+The modules of `hybrid_opt.display` define how objects look; they are imported when an object is
+shown.
 """
 
 from __future__ import annotations

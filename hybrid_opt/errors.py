@@ -36,4 +36,4 @@ class ProposalError(DualArmError):
 
 
 class NoHoldError(ProposalError):
-    """No way was found to hold the box at start and goal, so that no path was looked for."""
+    """No way was found to hold the box at start and goal, so that no path was sought."""

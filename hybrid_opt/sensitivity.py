@@ -1,11 +1,11 @@
 """Sensitivities of a carry's force and duration to every number of a cell.
 
-The path stays, driven by the task's time law or as fast as limits allow. The force is the largest
-to command that holds in every case of the cell's uncertainty, as a recommendation commands it. Its
-derivatives, and those of a time law's duration, are exact by what formulas take
-(`hybrid_opt.robust.path_force`); the fastest duration's follow from what its limits leave at the
-same speeds (`hybrid_opt.timing.robustness`). How formulas' inputs and ratios over limits follow
-from a number of the file is read off two cells nearby.
+The path is fixed, and driven by the task's time law or as fast as limits allow. The force is the
+largest commanded one that holds in every case of the cell's uncertainty, as in a recommendation.
+Its derivatives by the inputs of formulas are exact (`hybrid_opt.robust.path_force`), and so are
+those of a time law's duration. Derivatives of the fastest duration follow from the slacks of its
+limits at the same speeds (`hybrid_opt.timing.robustness`). The dependence of these inputs and
+slacks on a number of the file is computed by differences of two neighbouring cells.
 """
 
 from __future__ import annotations

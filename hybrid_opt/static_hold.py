@@ -1,5 +1,5 @@
-"""Static hold of the payload: its forces, which no carry falls far below, the payload limit that
-follows, and whether robots and pads can bear it."""
+"""Static hold of the payload: its forces, the payload limit that follows, and whether robots and
+pads can bear it. No carry has much smaller forces."""
 
 from __future__ import annotations
 

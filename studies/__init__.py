@@ -1,4 +1,4 @@
-"""Programs to run: `python -m studies.rack` and its siblings, with the cells they need."""
+"""Programs: `python -m studies.rack` and others, with the cells they need."""
 
 from __future__ import annotations
 

@@ -98,7 +98,7 @@ def first_result(evaluations: int = QUICK_EVALUATIONS, seed: int = 1) -> Iterato
 
 
 def _held(timing: ho.Timing) -> str:
-    """Which limits a carry is at."""
+    """Return the limits that a carry uses fully."""
     if not timing.ok:
         return timing.reason
     # The least forces always use the whole friction.

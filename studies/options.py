@@ -69,11 +69,11 @@ force = number(1e-3, 1e6)
 
 @dataclass(frozen=True)
 class PathType:
-    """The type of an argument that is a path.
+    """Type of an argument that is a path.
 
     Attributes:
-        check: raises a `DualArmError` where the path is not as the program needs it; called once
-            the whole command line is parsed.
+        check: raises a `DualArmError` for an unsuitable path; called after the whole command line
+            is parsed.
     """
 
     check: Callable[[Path], None]
@@ -120,7 +120,7 @@ def _require_file(path: Path, kind: str = "") -> None:
 
 
 def _expected(path: Path, kind: str) -> str:
-    """Return the end of a message: the expected kind of file, and where one may lie."""
+    """Return the end of a message: the expected kind of file, and its usual place."""
     expected = f"; expected is {kind}" if kind else ""
     if not path.exists():
         folder = path.parent
@@ -233,7 +233,7 @@ EXTRAS = {
 
 
 def require_extra(extra: str, use: str) -> None:
-    """Refuse what needs an extra that is not installed; nothing of it is imported.
+    """Refuse a use whose extra is not installed, without importing it.
 
     Args:
         extra: of `EXTRAS`.
@@ -291,8 +291,8 @@ def add(parser: argparse._ActionsContainer, *names: str, **own: Any) -> None:
     """Add options that several programs have.
 
     Args:
-        names: of the table; of one that stands by its place in capitals.
-        own: what of it differs in this program.
+        names: names in the table; positional ones in capitals.
+        own: attributes that differ in this program.
     """
     for name in names:
         place = {} if name.startswith("-") else {"metavar": name}

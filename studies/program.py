@@ -1,4 +1,4 @@
-"""What every program has in common: its options, how it ends, its messages beside the results."""
+"""Common parts of all programs: options, exit codes, messages."""
 
 from __future__ import annotations
 
@@ -38,7 +38,8 @@ VERBOSE = "--verbose"
 
 
 class _Help(argparse.HelpFormatter):
-    """Tells the default of every option, unless its text does; numbers stand as N."""
+    """Formatter that states the default of every option, unless its text does; numbers stand as
+    N."""
 
     def _get_default_metavar_for_optional(self, action: argparse.Action) -> str:
         if action.type is None or isinstance(action.type, PathType):
@@ -70,7 +71,7 @@ class _Help(argparse.HelpFormatter):
 
 
 class Parser(argparse.ArgumentParser):
-    """A parser that says in one line what is wrong with a command, and what may be meant."""
+    """Parser that reports a mistake in one line, with a suggestion."""
 
     def __init__(self, *, prog: str, description: str | None, further: Sequence[str] = ()) -> None:
         """Do not abbreviate options; `--help` states their defaults.
@@ -133,7 +134,7 @@ class Parser(argparse.ArgumentParser):
 
 
 class _HelpAll(argparse.Action):
-    """Explains every option."""
+    """Action that explains every option."""
 
     def __init__(self, option_strings: Sequence[str], dest: str, help: str) -> None:
         nothing = argparse.SUPPRESS
@@ -146,7 +147,7 @@ class _HelpAll(argparse.Action):
 
 
 class _Version(argparse.Action):
-    """Looks the version up only where it is asked for."""
+    """Action that looks up the version on request only."""
 
     def __init__(self, option_strings: Sequence[str], dest: str, help: str) -> None:
         nothing = argparse.SUPPRESS
@@ -194,7 +195,7 @@ class Program:
 
     @property
     def module(self) -> str:
-        """Its door, as `python -m` takes it."""
+        """Module name for `python -m`."""
         return f"studies.{self.name}"
 
     def parser(self, called: str = "") -> Parser:
@@ -300,8 +301,8 @@ def run_program(main: Callable[[], int]) -> int:
 
 
 def _leave() -> None:
-    """End at once where threads are at work, for which the interpreter would wait: what they make
-    is of no use any more. Files are replaced in one step, so that none is left half written."""
+    """End the process at once if threads are at work, because the interpreter would wait for them.
+    Files are replaced in one step, so that none is left half written."""
     main = threading.main_thread()
     if any(not each.daemon for each in threading.enumerate() if each is not main):
         sys.stderr.flush()
@@ -327,8 +328,8 @@ def carry_out(program: str, work: Callable[[], int], interrupted: str = "interru
 
 
 def _show_warnings(verbose: bool) -> None:
-    """Tell every warning of this project once, and all others if verbose, in place of Python's way,
-    which prints a line of source code."""
+    """Print every warning of this project once, and all others if verbose, without a line of source
+    code."""
     told: set[str] = set()
 
     def show(message: Warning | str, category: type[Warning], *_: object, **__: object) -> None:
@@ -350,10 +351,10 @@ def _show_warnings(verbose: bool) -> None:
 
 @dataclass(frozen=True)
 class ProgramResult:
-    """One thing that a program found out.
+    """One result of a program.
 
     Attributes:
-        values: by name, for JSON; records are left to `dataclasses.asdict`.
+        values: by name, for JSON; `dataclasses.asdict` converts records.
         lines: the same for people.
     """
 
@@ -362,7 +363,7 @@ class ProgramResult:
 
 
 def print_findings(findings: Iterable[ProgramResult], as_json: bool) -> None:
-    """Print each when it is found, or all at once as one JSON object."""
+    """Print each result when it is found, or all at the end as one JSON object."""
     values: dict[str, Any] = {}
     for finding in findings:
         values |= finding.values

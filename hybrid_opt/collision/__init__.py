@@ -1,1 +1,1 @@
-"""Collision checking: python-fcl judges, the compiled bounds decide what it has to judge."""
+"""Collision checking: compiled bounds decide most pairs, python-fcl the others."""

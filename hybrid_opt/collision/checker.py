@@ -25,12 +25,12 @@ from symbolic.records import PAYLOAD_NAME
 
 @dataclass(frozen=True)
 class CollidingPair:
-    """Two bodies in collision, or that come too near to prove that they are not.
+    """Two colliding bodies, or two bodies too near for a proof that they do not collide.
 
     Attributes:
-        sample: index of the sample, or of the one before.
+        sample: index of the sample, or of the sample before.
         first, second: names of the bodies.
-        fraction: how far from the sample to the next, 0 to 1.
+        fraction: position between the sample and the next, 0 to 1.
     """
 
     sample: int
@@ -56,7 +56,7 @@ class Verdict:
 
     @property
     def is_free(self) -> bool:
-        """Whether no sample collides."""
+        """True if no sample collides."""
         return self.first_touch is None
 
 
@@ -169,11 +169,11 @@ class CollisionChecker:
         return self._decide(placed, rows, pairs, self._resting(pose, rows, pairs))
 
     def penetrates(self, pose: Array, pair: int) -> bool:
-        """Return True if the box at (6,) penetrates a body of the environment deeper than one that
-        rests may.
+        """Return True if the box at a pose (6,) penetrates a body of the environment deeper than a
+        resting box may.
 
         Args:
-            pair: of payload and body.
+            pair: index of the pair of payload and body.
         """
         placed = self._place(pose[None], *self._still())
         zero = np.zeros(1, dtype=np.intp)
@@ -182,8 +182,8 @@ class CollisionChecker:
     def motion(
         self, start: tuple[Array, Array, Array], end: tuple[Array, Array, Array]
     ) -> tuple[Array, Array]:
-        """Chord and bend (n, n_pairs) [m] of every pair between configurations (pose, q_1, q_2),
-        each (n, 6), see `symbolic.geometry.clearance`."""
+        """Compute chord and bend (n, n_pairs) [m] of every pair between two configurations (pose,
+        q_1, q_2), see `symbolic.geometry.clearance`."""
         asked = [self.functions[f"{block}motion"] for block in self.geometry.asked]
         found = [function.batch(*start, *end) for function in asked]
         chord, bend = (
@@ -264,7 +264,7 @@ class CollisionChecker:
         return self.functions["piece_poses"].batch(pose, q_1, q_2)
 
     def _still(self) -> tuple[Array, Array]:
-        """Return joints of both arms at one sample in which only the box matters."""
+        """Return joints of both arms for one sample of which only the box is used."""
         first, second = (np.zeros((1, arm.joints)) for arm in self.geometry.arms)
         return first, second
 

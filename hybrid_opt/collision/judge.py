@@ -1,8 +1,8 @@
-"""The bodies of a cell as python-fcl objects: the judge of collisions.
+"""The bodies of a cell as python-fcl objects, for collision verdicts.
 
-It has the last word where a proof is within FCL's resolution of contact
-(`hybrid_opt.collision.checker`). FCL's distances may exceed the truth by tenths of a millimetre;
-they come from Coal (`hybrid_opt.collision.distances`).
+FCL decides pairs that are closer to contact than its resolution (`hybrid_opt.collision.checker`).
+Its distances may exceed the true ones by tenths of a millimetre; distances come from Coal
+(`hybrid_opt.collision.distances`).
 """
 
 from __future__ import annotations

@@ -63,7 +63,7 @@ THREE, PLOTLY = "vendor/three.min.js", "vendor/plotly-basic.min.js"
 
 
 def asset(name: str) -> str:
-    """Read the text of a script or page that ships with this room."""
+    """Read the text of a script or page of this package."""
     return (files("hybrid_opt.display") / name).read_text("utf-8")
 
 
@@ -100,12 +100,12 @@ MAX_SAMPLES = 200
 
 @dataclass(frozen=True)
 class Look:
-    """A sample of a carry to look at first.
+    """The first view of a carry.
 
     Attributes:
         sample: number of the sample.
-        text: what is to be seen there.
-        bodies: names of those that are shown in red.
+        text: caption of the view.
+        bodies: names of the bodies that are shown in red.
     """
 
     sample: int

@@ -1,7 +1,7 @@
 """Choice of the places where two pads press on their faces, by the cost of the hand-made path.
 
-The places are numbers of the cell, so that each trial takes what a changed cell takes, without a
-compiler. Both pads move alike, so that they stay opposite one another.
+The places are parameters of the cell, so that a trial costs as much as a changed cell and needs no
+compiler. Both pads move alike, so that they stay opposite each other.
 """
 
 from __future__ import annotations

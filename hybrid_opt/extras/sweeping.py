@@ -1,9 +1,9 @@
 """Sweep over numbers of a cell: duration and force of its recommended carry for every combination.
 
-Of each combination the carry that is recommended is asked for: the path of its neighbour, polished
-in the changed cell, or one path that stays as it is. Combinations that differ in the last key alone
-are neighbours, computed one after the other. The path of the cell as it is takes part everywhere,
-so that a combination which hardly holds does not lead its neighbours astray.
+The carry of a combination has the path of its neighbour, polished in the changed cell, or one fixed
+path. Combinations that differ in the last key alone are neighbours, computed one after the other.
+The path of the unchanged cell is tried for every combination, so that a combination that hardly
+holds does not mislead its neighbours.
 """
 
 from __future__ import annotations
@@ -200,7 +200,7 @@ class _Chains:
         return None
 
     def store(self, row: Combination) -> None:
-        """Take in a row, and write the file."""
+        """Add a row, and write the file."""
         self.done[row.values] = row
         self._write()
 
@@ -214,12 +214,12 @@ class _Chains:
 
 @dataclass(frozen=True)
 class _Request:
-    """What all combinations of a sweep share; the cell is loaded once in each process.
+    """The common data of all combinations of a sweep; each process loads the cell once.
 
     Attributes:
-        cell: as it is.
+        cell: the unchanged cell.
         x: (n_var,) a good carry of it.
-        fixed: whether the path stays.
+        fixed: the path is kept.
         keys: of the combinations.
     """
 

@@ -48,9 +48,9 @@ class Handle:
     Attributes:
         key: in the workcell file: 'task.start', 'environment.top board', 'robots[0].base' or
             'contacts[0]'.
-        title: how it is called.
+        title: its name for people.
         pose: (4, 4) in the world.
-        turns: whether it may be turned; a pad stays on its face.
+        turns: it may be rotated; a pad stays on its face.
     """
 
     key: str
@@ -83,10 +83,10 @@ class SessionVerdict:
 
 
 class Session:
-    """A cell with what was changed of it, and the carry that is looked at.
+    """A cell with interactive changes, and the carry under evaluation.
 
     Attributes:
-        base: the cell as it was given.
+        base: the unchanged cell.
         changes: by key path of the workcell file, see `Cell.changed`.
         x: (n_var,) decision vector of the carry in a drivable cell.
         verdict: the verdict on that carry.
@@ -274,10 +274,10 @@ FRAME = 0.04
 class Workbench:
     """A cell in a browser, served on this machine alone.
 
-    One thread works: it takes what was asked last, so that dragging never queues.
+    One thread works. It always takes the latest request, so that dragging never queues.
 
     Attributes:
-        session: what is looked at.
+        session: the shown session.
         url: of the page.
     """
 

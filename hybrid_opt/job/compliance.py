@@ -1,7 +1,6 @@
-"""Effects of stiffness on forces: arms that track positions, and arms that start at different
-times.
+"""Effects of stiffness on forces: position-controlled arms, and arms that start at different times.
 
-An arm that tracks positions presses by aiming into the box; its stiffness k at the pad turns the
+A position-controlled arm presses by aiming into the box; its stiffness k at the pad turns the
 penetration into force. Both arms hold the box in series, so that a relative displacement d of the
 pads changes the squeeze by k d / 2.
 """

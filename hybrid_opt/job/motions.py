@@ -363,13 +363,13 @@ def pressing(
     """Compute forces that rise from zero to those of one sample, or fall for the last, while
     everything stands still.
 
-    The box's weight goes over from what it stands on to the arms with the same profile, so that
-    friction is used no more than when the box is held.
+    The weight of the box passes from its support to the arms with the same profile, so that
+    friction is never used more than while the box is held.
 
     Args:
-        motion, hold: a phase of which this is one end.
+        motion, hold: the phase that begins or ends here.
         sample: 0 or -1.
-        rate: fastest change of a normal force [N/s].
+        rate: largest rate of a normal force [N/s].
     """
     peak = float(hold.normal[sample].max())
     duration = at_even_steps(PEAK_RATE * peak / rate, TICK)
@@ -383,7 +383,7 @@ def pressing(
 
 
 def zero_forces(motion: PhaseMotion) -> Force:
-    """Return the forces of pads that touch nothing."""
+    """Return zero forces for a motion in which the pads touch nothing."""
     n = len(motion.time)
     return Force(np.zeros((n, 2)), np.zeros((n, 2)), np.zeros((n, 2, 6)))
 
@@ -393,7 +393,7 @@ def unit_squeeze(workcell: Workcell, pose: Array, leader: int = 0) -> Array:
     plan.
 
     Of pads with opposite normals both forces act on one line, midway between the nominal points,
-    and balance one another. Of others it is an internal squeeze within all friction cones.
+    and cancel. Of others it is an internal squeeze within all friction cones.
 
     Args:
         pose: (n, 6) of the box [m, rad].

@@ -69,12 +69,12 @@ CHECK_STRIDE = 10
 
 @dataclass(frozen=True)
 class SupportedPose:
-    """Pose in which a box stands.
+    """Pose of a box on its support.
 
     Attributes:
         pose: (6,) of the box [m, rad].
-        height: how far below the carry's end it is [m].
-        bodies: names of what it stands on, empty where nothing is beneath.
+        height: distance below the carry's end [m].
+        bodies: names of the supporting bodies, empty without any.
     """
 
     pose: Array
@@ -99,13 +99,13 @@ class StraightMotions:
     def followed(
         self, workcell: Workcell, posture: NumericFunction, q: Array
     ) -> Iterator[tuple[int, Straight, Array]]:
-        """Yield, of every straight motion, side, line and both arms' joints along it.
+        """Yield side, line and both arms' joints along each straight motion.
 
         The joints are (`PHASE_SAMPLES`, joints).
 
         Args:
             posture: `symbolic.robot.arm.posture_function`.
-            q: (2, joints) of both arms where the carry begins and ends [rad or m].
+            q: (2, joints) of both arms at the beginning and end of the carry [rad or m].
 
         Raises:
             JobError: an arm does not reach a place within its joint range.
@@ -458,10 +458,10 @@ class CommandedForces:
 
     Attributes:
         forces: (n, 2) normal forces to command along the carry [N].
-        squeeze: how they came about.
-        job: the whole job around it, whose forces they are; None where none can be planned: then
-            they are the carry's alone.
-        problem: why there is no job, '' where there is one.
+        squeeze: origin of the forces.
+        job: the whole job that they belong to; None if none can be planned, then they are the
+            carry's alone.
+        problem: reason why there is no job, else ''.
     """
 
     forces: Array
@@ -473,12 +473,12 @@ class CommandedForces:
 def command_forces(
     model: JobModel, timing: Timing, settings: SqueezeSettings | None = None
 ) -> CommandedForces:
-    """Compute the forces to press with along a timed carry, as its job does.
+    """Compute the forces to command along a timed carry, as in its job.
 
     Args:
         model: of the carry's workcell.
         timing: without jumps of acceleration.
-        settings: how hard to press; None for the defaults.
+        settings: of the forces; None for the defaults.
 
     Raises:
         SettingsError: the timing failed, or the uncertainty leaves no friction or patch.

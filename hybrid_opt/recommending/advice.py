@@ -1,8 +1,8 @@
-"""How far the cell may be off at the commanded force, and what changes of it would change.
+"""Margins of the cell's description at the commanded force, and effects of changes of the cell.
 
-The commanded force is that of the worst case where the carry asks for most. What a small change of
-the cell changes there is its derivative, by differences; what more or less force means in time is
-the path's own duration within other limits of the force.
+The commanded force is that of the worst case at the sample with the largest force. The effect of a
+small change of the cell on it is a derivative, by differences. The duration that a change of force
+is worth follows from timings of the path within other limits of the force.
 """
 
 from __future__ import annotations
@@ -69,8 +69,8 @@ class Advice:
 
 
 def commanded_margins(carry: Carry, forces: Array) -> tuple[Margin, ...]:
-    """Compute how far friction, mass and centre of mass may be off, each by itself, while commanded
-    forces (n, 2) [N] hold the carry."""
+    """Compute the largest deviations of friction, mass and centre of mass, each alone, with which
+    commanded forces (n, 2) [N] hold the carry."""
     workcell, model = carry.workcell, robust_model(carry.workcell)
     rows, motion = subsample(carry)
     enough, nominal = forces[rows, 1 - LEADER] * (1.0 + HOLDS), nominal_case(workcell)

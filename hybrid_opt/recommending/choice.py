@@ -42,16 +42,16 @@ SAMPLES_PRESSED = 32
 
 @dataclass(frozen=True)
 class Wish:
-    """Target of a recommendation, and what of the cell is replaced for it.
+    """Target of a recommendation, and changes of the cell for it.
 
-    With neither a duration nor a force the least product of duration and commanded force is sought.
+    Without a duration or a force, the product of duration and commanded force is minimised.
 
     Attributes:
-        duration: longest time of the carry, limits on jerk kept; the least force is sought [s].
-        force: largest force to command; the shortest duration is sought [N].
-        payload: mass in place of the cell's; the inertia grows with it [kg].
-        reference_force: of both robots, in place of the cell's [N].
-        uncertainty: in place of the cell's.
+        duration: longest time of the carry, limits on jerk kept; the force is minimised [s].
+        force: largest commanded force; the duration is minimised [N].
+        payload: mass instead of the cell's; the inertia grows with it [kg].
+        reference_force: of both robots, instead of the cell's [N].
+        uncertainty: instead of the cell's.
     """
 
     duration: float | None = None
@@ -87,7 +87,7 @@ class Wish:
 
     @property
     def target(self) -> str:
-        """What is sought, in words."""
+        """The target as a text."""
         if self.duration is not None:
             return f"the least force of all carries of at most {self.duration:g} s"
         if self.force is not None:
@@ -140,12 +140,12 @@ def _listed(wish: Wish) -> str:
 
 @dataclass(frozen=True)
 class Goal:
-    """What an option has to keep to, and what is to be least.
+    """Limits of an option, and its cost.
 
     Attributes:
-        longest: [s].
-        hardest: (2,) force of each robot that holds in every case [N].
-        cost: of duration [s] and commanded force [N].
+        longest: largest duration [s].
+        hardest: (2,) largest force of each robot that holds in every case [N].
+        cost: function of duration [s] and commanded force [N] to minimise.
     """
 
     longest: float

@@ -1,7 +1,7 @@
-"""The carry to run, how hard to press, and why: what `hybrid_opt.recommend` gives.
+"""The carry to run with its commanded force, and the reasons: the result of `hybrid_opt.recommend`.
 
-One carry with one duration, the driven one, and one force, the commanded one: its job's. It holds
-in every case of the cell's uncertainty with what is commanded.
+It is one carry with one duration, as robots drive it, and one force, the commanded force of its
+job, which holds in every case of the cell's uncertainty.
 """
 
 from __future__ import annotations
@@ -125,7 +125,7 @@ class Recommendation(Displayable):
 
     @property
     def objection(self) -> str:
-        """Why it must not be run as it is, and what would do; '' where it fits."""
+        """Reason not to run it as it is, with a remedy; '' if it fits."""
         if self.fits:
             return ""
         return f"no carry fits: {self.budget}; {remedies_text(self.remedies, 'for this carry')}"
@@ -321,7 +321,7 @@ def required_forces(workcell: Workcell, carry: Carry) -> Array:
 
 
 def _objections(found: CommandedForces) -> list[str]:
-    """List objections against how a carry is pressed."""
+    """List objections against the commanded forces of a carry."""
     squeeze, doubts = found.squeeze, []
     if found.job is None:
         doubts.append(f"no job can be planned: {found.problem}")
@@ -336,7 +336,7 @@ def is_within(required: Array, allowed: Array) -> bool:
 
 
 def _better(beside: Sequence[Alternative], timing: Timing, force: float) -> Iterator[str]:
-    """Yield the statement that another path is faster at the same force."""
+    """Yield a statement for each path that is faster at the same force."""
     for other in beside:
         if other.duration_at_force < timing.duration * (1.0 - BETTER):
             yield (

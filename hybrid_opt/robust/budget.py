@@ -1,5 +1,5 @@
-"""The budget of a grip: the force that holds the payload still in every case of the uncertainty,
-against what the robots may press with, and the smallest changes of the cell with which it fits."""
+"""Budget of a grip: the force that holds the payload still in every case of the uncertainty, the
+allowed force, and the smallest changes of the cell with which it fits."""
 
 from __future__ import annotations
 
@@ -69,10 +69,10 @@ class Remedy:
 
 @dataclass(frozen=True)
 class Reserve:
-    """How far payload and friction may be off, each alone, within the reference forces.
+    """Largest payload and least friction, each alone, within the reference forces.
 
-    The motion stays as it is and is held in every case of the uncertainty about the changed value;
-    the pads press as hard as that takes.
+    The motion is unchanged. It is held in every case of the uncertainty about the changed value,
+    with the commanded forces that this needs.
 
     Attributes:
         payload: the largest mass; the inertia grows with it [kg].
@@ -88,14 +88,14 @@ class Reserve:
 
 @dataclass(frozen=True)
 class GripBudget:
-    """The forces that hold the payload still in every case, against the reference forces.
+    """Forces that hold the payload still in every case, and the reference forces.
 
     Attributes:
-        required: (2,) largest force of each robot at either end of the path, infinite where no
-            force holds every case [N].
+        required: (2,) largest force of each robot at either end of the path, infinite if no force
+            holds every case [N].
         allowed: (2,) reference forces [N].
         uncertainty: the set of cases.
-        remedies: the smallest changes with which it fits, empty where it does.
+        remedies: the smallest changes with which it fits, empty if it does.
     """
 
     required: Pair
@@ -125,7 +125,7 @@ class GripBudget:
 
 
 def budget_text(workcell: Workcell) -> str:
-    """State the budget of a cell, with what would do where it is exceeded, for a terminal."""
+    """Format the budget of a cell for a terminal, with remedies if it is exceeded."""
     try:
         budget = grip_budget(workcell)
     except SettingsError as error:
@@ -143,11 +143,11 @@ def remedies_text(remedies: tuple[Remedy, ...], purpose: str) -> str:
 
 
 def grip_budget(workcell: Workcell) -> GripBudget:
-    """Compute what holding the payload still at both ends of its path takes. Nothing is compiled.
+    """Compute the force that holds the payload still at both ends of its path, without compiling.
 
     Raises:
-        SettingsError: some cases cannot be held, however hard the pads press, or the uncertainty
-            leaves no friction or patch.
+        SettingsError: some cases cannot be held by any force, or the uncertainty leaves no friction
+            or patch.
     """
     model, allowed = interpreted_robust_model(workcell), workcell.task.reference_force
     waypoints = workcell.task.waypoints
@@ -164,10 +164,10 @@ def largest_forces(
     model: RobustModel, motion: HeldMotion, rows: NDArray[np.intp] | None = None
 ) -> Array:
     """Compute the largest force (2,) [N] that holds a motion, and the same poses at rest, in every
-    case: what is commanded of one robot, and what the leading one feels.
+    case: commanded of one robot, resulting of the leading one.
 
     Args:
-        rows: of the worst cases, those that are considered; None for all.
+        rows: rows of the worst cases to consider; None for all.
 
     Raises:
         SettingsError: the uncertainty leaves no friction or patch.
@@ -186,15 +186,15 @@ def cheapest_remedies(
     allowed: Array,
     most: int = LISTED,
 ) -> tuple[Remedy, ...]:
-    """Find the changes of reference forces, mass, friction or uncertainty, each with all else as it
-    is, with which forces along a motion fit.
+    """Find changes of reference forces, mass, friction or uncertainty, each alone, with which the
+    forces along a motion fit.
 
     Args:
-        model: of what is commanded.
-        motion: samples at which most is required.
-        required: (2,) largest force of each robot, of which the model may know a part [N].
+        model: of the commanded forces.
+        motion: samples with the largest required forces.
+        required: (2,) largest force of each robot [N]; it may exceed that of the model's samples.
         allowed: (2,) [N].
-        most: how many.
+        most: number of remedies.
 
     Returns:
         The smallest relative changes first.

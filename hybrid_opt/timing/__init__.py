@@ -1,1 +1,1 @@
-"""Timing of a carry that real robots can drive: limits judged, timings found and recomputed."""
+"""Timings of a carry for real robots: limits, fastest timings, and their verification."""

@@ -13,7 +13,7 @@ import hybrid_opt as ho
 
 
 def height(outputs: Mapping[str, np.ndarray], workcell: ho.Workcell) -> np.ndarray:
-    """Largest height of the box over the goal's, one value per candidate."""
+    """Compute the largest height of the box over the goal's, one value per candidate."""
     goal = workcell.task.waypoints[-1].lower[2]
     return np.asarray(outputs["pose"][:, :, 2].max(axis=1) / (2.0 * goal))
 

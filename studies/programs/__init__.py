@@ -1,1 +1,1 @@
-"""What the programs do, apart from their options: imported when they run."""
+"""The work of the programs, apart from their options; imported when they run."""

@@ -1,4 +1,4 @@
-"""What `dual-arm-carry inspect` finds out about a workcell before a study."""
+"""Facts about a workcell before a study, for `studies.inspect`."""
 
 from __future__ import annotations
 
@@ -60,15 +60,15 @@ def inspected(
     pairs: bool = False,
     progress: Progress | None = None,
 ) -> Iterator[ProgramResult]:
-    """All there is to know of a cell, each finding worked out when it is asked for.
+    """Yield all findings about a cell, each computed on request.
 
     Args:
-        candidates: random ones to judge, at least 1.
+        candidates: number of random candidates, at least 1.
         seed: of their randomness.
         output: folder for the pictures, None to draw none.
-        polish: whether to polish the hand-made trajectory shortly, to see which bounds bind.
+        polish: polish the hand-made trajectory briefly, to find active bounds.
         view: file for a page that shows the hand-made trajectory, None for none.
-        pairs: whether every pair of bodies is listed as text.
+        pairs: list every pair of bodies.
 
     Raises:
         DualArmError: the model cannot be built, or a picture cannot be written.
@@ -151,7 +151,7 @@ def _at_rest(cell: Cell) -> ProgramResult:
 
 
 def _postures(cell: Cell) -> ProgramResult:
-    """Per robot's name its postures at the start, best first."""
+    """Return the postures at the start per robot's name, best first."""
     robots = cell.workcell.robots
     found = cell.compiled.model.branches
     branches = {
@@ -166,7 +166,7 @@ def _postures(cell: Cell) -> ProgramResult:
 
 
 def _candidates(cell: Cell, count: int, seed: int) -> Iterator[ProgramResult]:
-    """Random candidates: how many are feasible, and what is in the way of the others."""
+    """Evaluate random candidates: the number of feasible ones, and the obstacles of the others."""
     found = cell.evaluate(cell.random(count, np.random.default_rng(seed)))
     share, reasons = float(found.feasible.mean()), found.infeasible_by_reason
     lines = [
@@ -191,7 +191,7 @@ def _candidates(cell: Cell, count: int, seed: int) -> Iterator[ProgramResult]:
 
 
 def _pairs(cell: Cell, listed: bool) -> ProgramResult:
-    """Pairs of bodies that are checked, and those that are not, and why."""
+    """List the pairs of bodies that are checked, and the others with reasons."""
     geometry = cell.geometry
     names, active = [body.name for body in geometry.bodies], geometry.pair_names
     excluded = tuple((names[p.first], names[p.second], p.reason) for p in geometry.excluded)
@@ -286,7 +286,8 @@ def _branch(cell: Cell, arm: int, branch: StartBranch) -> Branch:
 
 
 def _clearance_mm(cell: Cell, arm: int, branch: StartBranch) -> float | None:
-    """FCL's least distance of one arm from all but the other along the samples that it keeps."""
+    """Measure the least distance of one arm from all other bodies along the samples that it keeps,
+    by FCL."""
     checker, kept = cell.evaluator.checker, max(branch.kept, 1)
     own = own_pairs(cell.geometry, arm)
     if not own:

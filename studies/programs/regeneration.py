@@ -1,4 +1,4 @@
-"""A workcell's functions as C: compiled, kept and checked, for `dual-arm-carry regenerate`."""
+"""Generation, compilation and check of a workcell's functions, for `studies.regenerate`."""
 
 from __future__ import annotations
 

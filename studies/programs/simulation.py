@@ -1,4 +1,5 @@
-"""A stored trajectory in the simulator: under its controllers, or on pads alone."""
+"""Simulation of a stored trajectory with its controllers or with pads alone, for
+`studies.simulate`."""
 
 from __future__ import annotations
 
@@ -116,7 +117,7 @@ def _tell(outcome: ArmOutcome, carry: Carry) -> None:
 def _cases(
     cell: Cell, pressed: Reference, settings: ArmSettings, options: argparse.Namespace
 ) -> None:
-    """Random cases with tracking errors under the robust force."""
+    """Simulate random cases with tracking errors under the robust force."""
     workcell, rng, leader = cell.workcell, np.random.default_rng(options.seed), options.leader - 1
     control: Control = options.controller
     outcomes = []
@@ -135,7 +136,7 @@ def _cases(
 
 
 def tracked_share(case: Array, leader: int) -> float:
-    """Share of the commanded force that a case leaves."""
+    """Return the share of the commanded force that remains in a case."""
     return 1.0 - float(case[16 - leader])
 
 
@@ -194,7 +195,7 @@ def simulate_pads(
 
 
 def _swept(step: float) -> tuple[float, float]:
-    """Half the time step, and twice it where that can be followed."""
+    """Simulate with half and twice the time step, as far as this can be simulated."""
     return step / 2.0, min(2.0 * step, LARGEST_TIME_STEP)
 
 
@@ -218,7 +219,8 @@ def _tell_worst(
 
 
 def threshold_text(threshold: Threshold[AnyOutcome], slip: float) -> str:
-    """One line: the factors on both sides, and where and when the box slips."""
+    """Format a threshold in one line: the factors on both sides, and where and when the box
+    slips."""
     slips, holds = threshold.slips, threshold.holds
     return (
         f"  holds from {holds.factor:.4f} times the planned force on, slips at {slips.factor:.4f}: "

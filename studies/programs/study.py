@@ -146,7 +146,8 @@ def report_stage(study: StudySettings) -> Stage:
 
 
 def _paths_beside(folder: CampaignFolder) -> Array:
-    """Paths that a study's first experiment ended with; the drivable one lies in its folder."""
+    """Return the paths that a study's first experiment ended with, for the drivable one in its
+    folder."""
     return known_paths(folder.root.parent, folder.workcell.task)
 
 

@@ -1,4 +1,4 @@
-"""What `dual-arm-carry sweep` does: the first path, every combination, a table and a figure."""
+"""First path, combinations, table and figure of a sweep, for `studies.sweep`."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ def _table(done: Sweep, longest: int = sys.maxsize) -> Table:
 
 
 def _figure(done: Sweep) -> Figure:
-    """Duration and force over the last key, a line per combination of the others."""
+    """Draw duration and force over the last key, a line per combination of the others."""
     figure = new_figure(0.45)
     panels = figure.subplots(1, 2)
     *outer, last = done.over

@@ -1,4 +1,4 @@
-"""What programs do with a trajectory: replay it, export it, judge it, find forces that hold."""
+"""Work on a trajectory for several programs: replay, export, check, robust forces."""
 
 from __future__ import annotations
 
@@ -218,7 +218,7 @@ def _report(job: Job, stiffness: float | None) -> str:
 
 
 def check_file(options: argparse.Namespace) -> int:
-    """Print what a joint trajectory does in a cell; returns the exit code."""
+    """Print the check of a joint trajectory in a cell; return the exit code."""
     workcell = load_workcell(options.workcell)
     cell = Cell(workcell, compiled=InterpretedCell(workcell))
     trajectory = joint_trajectory(options.trajectory, cell.workcell)
@@ -292,7 +292,8 @@ def _priced(model: RobustModel, carry: Carry, options: argparse.Namespace) -> in
 
 
 def _timed(cell: Cell, x: Array, limit: float) -> list[str]:
-    """How fast the path is within a force limit [N] on planned forces and on robust ones."""
+    """Report the fastest timing of a path within a force limit [N], on planned forces and on robust
+    ones."""
     found = []
     for text, robust in (("planned forces", False), ("forces that hold in all cases", True)):
         timing = time_path(cell.timing_model, x, TimingLimits(force=limit, robust=robust))

@@ -116,12 +116,12 @@ GROUND_COLOUR = "#e8e8e4"
 
 
 def series(index: int) -> LineStyle:
-    """Style of the algorithm at a position."""
+    """Return the style of the algorithm at a position."""
     return SERIES[index % len(SERIES)]
 
 
 def shortened(name: str, length: int = 24) -> str:
-    """Shorten a name of the workcell so that it leaves room for the rest of a label."""
+    """Shorten a name of the workcell to fit a label."""
     return name if len(name) <= length else f"{name[: length - 1]}\N{HORIZONTAL ELLIPSIS}"
 
 
@@ -133,7 +133,7 @@ def new_figure(share: float) -> Figure:
 
 @contextmanager
 def in_style() -> Iterator[None]:
-    """Whatever is drawn in the `with` block has the common style."""
+    """Draw with the common style in the `with` block."""
     with mpl.rc_context(RC):
         yield
 
@@ -164,7 +164,7 @@ def limit_line(axes: Axes, level: float, label: str, across: bool = True) -> Non
 
 
 def rest_line(axes: Axes, level: float, label: str) -> None:
-    """Draw what holds the payload still as a line across the panel."""
+    """Draw the static forces as a line across the panel."""
     axes.axhline(level, color="black", linewidth=0.8, linestyle=(0, (7, 2, 1, 2)), label=label)
 
 
@@ -327,8 +327,9 @@ class CutCell:
 
 
 def _cut(corners: Array, of: NDArray[np.intp], limits: Array) -> tuple[Array, NDArray[np.intp]]:
-    """Triangles (n, 3, 3) halved across their longest edges until none is longer than the limit of
-    what it is of (n,), and of what they are then. Neighbours share the places of their cuts."""
+    """Halve triangles (n, 3, 3) across their longest edges until none exceeds the limit of its
+    solid; return them and the indices of their solids. Neighbours share the places of their cuts.
+    """
     while True:
         lengths = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2)
         long = lengths.max(axis=1) > limits[of]
@@ -441,11 +442,11 @@ def _negated(value: float, _: object) -> str:
 
 
 def aspect(view: View, points: Array) -> float:
-    """Width over height of world points (n, 3) in a view."""
+    """Compute width over height of world points (n, 3) in a view."""
     width, height = np.ptp(view.flat(points), axis=0)
     return float(width / height)
 
 
 def box_corners(lower: Array, upper: Array) -> Array:
-    """(8, 3) corners of a box along the world axes."""
+    """Return the corners (8, 3) of a box along the world axes."""
     return np.array(list(product(*zip(lower, upper, strict=True))))

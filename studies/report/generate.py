@@ -221,7 +221,7 @@ def report_tables(data: ReportData, with_paper: bool) -> tuple[Table, ...]:
 
 
 def _listed(data: ReportData) -> list[ReportPicture]:
-    """All pictures, not yet drawn; a context of work, in any process."""
+    """Return all pictures without drawing them; the context of a worker's calls."""
     return list(report_pictures(data))
 
 
@@ -298,7 +298,8 @@ def _block(text: str, attributes: str = "") -> str:
 
 
 def _policy(scripts: list[str]) -> str:
-    """Only these inline scripts; styles and pictures of the page itself; no request."""
+    """Return the content security policy: these inline scripts, styles and pictures of the page, no
+    request."""
     hashes = [
         base64.b64encode(hashlib.sha256(script.encode()).digest()).decode() for script in scripts
     ]
@@ -346,7 +347,7 @@ def _facts(data: ReportData) -> str:
 
 
 def _assumed(data: ReportData) -> str:
-    """Which pads the forces of both experiments are of."""
+    """State which pads the forces of both experiments assume."""
     said = f"The forces of this experiment are of {contact_model(data.workcell).assumption}."
     if data.drivable is None:
         return said

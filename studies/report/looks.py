@@ -1,5 +1,5 @@
-"""Looks at a study's trajectories besides its report: an animation file (GIF through Pillow, MP4
-through imageio's ffmpeg), or a browser, served on this machine alone."""
+"""Views of a study's trajectories: an animation file (GIF through Pillow, MP4 through imageio's
+ffmpeg), or a browser page served on this machine alone."""
 
 from __future__ import annotations
 
@@ -109,7 +109,7 @@ def write_animation(geometry: CellGeometry, film: Film, path: Path) -> None:
 
 
 def frames(geometry: CellGeometry, film: Film) -> Iterator[NDArray[np.uint8]]:
-    """(height, width, 3) pictures, evenly spaced in time."""
+    """Draw pictures (height, width, 3), evenly spaced in time."""
     cell = CutCell.of(geometry, cell_solids(geometry))
     points = motion_points(geometry, film.pose, film.q)
     count = max(2, round(film.duration * FRAMES_PER_SECOND) + 1)

@@ -38,7 +38,7 @@ def _tile(fact: Fact, choice: StoredRecommendation | None) -> str:
 
 
 def _bar(choice: StoredRecommendation) -> str:
-    """Return the force as a bar up to the allowed one, in the parts that it is made of."""
+    """Draw the force and its contributions as a bar up to the allowed one."""
     allowed = choice.force if choice.allowed is None else float(choice.allowed[1 - LEADER])
     whole = max(allowed, choice.force)
     parts = "".join(

@@ -1,7 +1,7 @@
 """The trajectories of a report, and the whole jobs around the recommended and the hand-made one.
 
-Each is computed for itself, in any process: how robots drive it, how hard they press, what the
-search assumed, and what is saved.
+Each trajectory is computed independently, in any process: its timing, commanded forces, the
+assumptions of the search, and its saved file.
 """
 
 from __future__ import annotations
@@ -51,15 +51,15 @@ HELD = ("lift", "carry", "set_down")
 
 @dataclass(frozen=True)
 class DrawnJob:
-    """A job as a report shows it, or why there is none.
+    """A job for a report, or the reason why there is none.
 
     Attributes:
-        label: whose it is.
-        problem: why it cannot be planned, '' where it can.
-        job: None where it cannot be planned.
-        remark: how its forces came about, and what its timing leaves out.
-        timing: of its path, None where that failed.
-        margins: of the recommended one, how wrong the cell's description may be.
+        label: of its trajectory.
+        problem: reason why it cannot be planned, else ''.
+        job: None if it cannot be planned.
+        remark: origin of its forces, and limits that its timing ignores.
+        timing: of its path, None if that failed.
+        margins: largest errors of the cell's description that the recommended one tolerates.
     """
 
     label: str
@@ -107,8 +107,8 @@ def drawn(
 def job_samples(job: Job) -> Array:
     """Return samples (k, 11 + joints) of a job: some of each phase, and the peaks of the forces.
 
-    The columns are time [s], box pose, joints, both commanded normal forces, and what of
-    `needed_forces` the force-controlled arm has to press with, NaN while the box stands [N].
+    The columns are time [s], box pose, joints, both commanded normal forces, and the
+    `needed_forces` of the force-controlled arm, NaN while the box stands [N].
     """
     parts = []
     for phase in job.phases:
@@ -127,14 +127,14 @@ def job_samples(job: Job) -> Array:
 
 def needed_forces(workcell: Workcell, motion: BoxMotion) -> Array:
     """Compute the least normal forces (n, 2) [N] of the force-controlled arm that hold a motion: in
-    every case of the uncertainty, and where everything is as described."""
+    every case of the uncertainty, and in the nominal case."""
     model = robust_model(workcell)
     every = model.commanded(motion, workcell.uncertainty, LEADER)
     return np.column_stack([every, model.nominal(motion, LEADER)[:, 1 - LEADER]])
 
 
 def _rows(time: Array, count: int, peaks: Iterable[int]) -> NDArray[np.intp]:
-    """Rows of samples evenly spread in time, and those of peaks."""
+    """Return rows of samples evenly spread in time, and of peaks."""
     moments = np.linspace(time[0], time[-1], min(len(time), count))
     even = np.searchsorted(time, moments).clip(max=len(time) - 1)
     return np.unique([0, *even, *peaks, len(time) - 1])
@@ -380,8 +380,8 @@ def joint_torque_use(workcell: Workcell, torque: Array) -> Array:
 
 
 def _values(cell: ho.Cell, judged: ho.Carry, found: dict[str, Any]) -> str:
-    """Title of a trajectory: time and commanded force as robots drive it; of a search's other
-    carries their planned forces or objectives."""
+    """Return the title of a trajectory: its duration and commanded force; for another carry of a
+    search, its planned forces or objectives."""
     if found["commanded"] is not None:
         order = contact_model(cell.workcell).order
         return f"{found['duration']:.2f} s, {order} {found['commanded']:.1f} N"

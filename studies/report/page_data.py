@@ -1,5 +1,4 @@
-"""What the page shows: which trajectories, in which groups, and the interactive pictures
-that they stand in, as plotly's JSON values."""
+"""Content of the page as plotly's JSON values: trajectories in groups, and interactive plots."""
 
 from __future__ import annotations
 
@@ -72,7 +71,7 @@ def marker(look: LineStyle, opened: bool = False, size: float = 9) -> Plot:
 
 
 def points(label: str, at: Array, members: Sequence[int], texts: Sequence[str], look: Plot) -> Plot:
-    """Points (k, 2) that show their trajectories, of these numbers on the page, when clicked."""
+    """Return points (k, 2) that show their trajectories when clicked."""
     at = np.asarray(at, dtype=float).reshape(-1, 2)
     return _scatter(
         label,
@@ -101,7 +100,7 @@ def line(label: str, at: Array, colour: str, dash: str) -> Plot:
 
 
 def mark(label: str, at: Array) -> Plot:
-    """One point (2,) with its name."""
+    """Return one point (2,) with its name."""
     look = {"color": "#1d2327", "size": 11, "symbol": "x-thin", "line": {"width": 2.5}}
     return _scatter(label, at[None], mode="markers", hoverinfo="name", marker=look)
 
@@ -146,7 +145,7 @@ def _legend(edge: str, place: float, size: int) -> Plot:
 
 
 def limits(points: Array, share: float = LOOK_MARGIN) -> list[list[float]]:
-    """Limits of both axes around points (k, 2), with this share of their range beside them."""
+    """Return limits of both axes around points (k, 2), with a share of their range beside them."""
     points = _finite(points)
     if len(points) == 0:
         return [[0.0, 1.0], [0.0, 1.0]]

@@ -109,7 +109,8 @@ def reach_map(geometry: CellGeometry, rng: np.random.Generator) -> ReachMap:
 
 
 def _pad_points(geometry: CellGeometry, i: int, rng: np.random.Generator) -> NDArray[np.float32]:
-    """(POSTURES, 3) pad positions in the world, of random postures within the joint limits."""
+    """Compute pad positions (POSTURES, 3) in the world of random postures within the joint
+    limits."""
     arm, contact = geometry.arms[i], geometry.workcell.contacts[i]
     pad = (arm.T_joint_box @ contact.T_box_pad)[:3, 3]
     # Single precision is far more than cubes need, and half the work.
@@ -132,14 +133,14 @@ def _pad_points(geometry: CellGeometry, i: int, rng: np.random.Generator) -> NDA
 
 
 def _seen(T: Array, points: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Points (3, n) from the frame that T (4, 4) maps into another, in that one."""
+    """Transform points (3, n) by T (4, 4)."""
     placed = T.astype(np.float32)
     return np.asarray(placed[:3, :3] @ points + placed[:3, 3:])
 
 
 def reachable_regions(geometry: CellGeometry, reach: ReachMap, carry: DrawnCarry) -> Figure:
-    """Reach of both pads (positions, sampled within the joint limits), the common region of the box
-    centre, and the bounds of the free waypoints (paper Figure 4)."""
+    """Draw the reach of both pads (positions, sampled within the joint limits), the common region
+    of the box centre, and the bounds of the free waypoints (paper Figure 4)."""
     figure = new_figure(0.42)
     corners = box_corners(*_reach_bounds(reach))
     left, right = figure.subplots(
@@ -262,7 +263,7 @@ def motion_sequence(geometry: CellGeometry, carry: DrawnCarry) -> Figure:
 
 
 def paths(geometry: CellGeometry, carries: tuple[DrawnCarry, ...]) -> Figure:
-    """Paths of the box centre (paper Figure 13)."""
+    """Draw the paths of the box centre (paper Figure 13)."""
     # A plane that they hardly leave is seen edge-on once.
     cell = _fixed(geometry)
     points = np.concatenate([carry.timed.pose[:, :3] for carry in carries])
@@ -321,8 +322,8 @@ def _reach_bounds(reach: ReachMap) -> Array:
 
 
 def _draw_reach(axes: Axes, reach: ReachMap, view: View, across: int, at: float) -> None:
-    """Slices of the reach across a world axis; along the line between the arms only what both
-    reach together, because their own regions would hide it."""
+    """Draw slices of the reach across a world axis; along the line between the arms only the common
+    reach, because the own regions would hide it."""
     index = int((at - reach.lower[across]) / reach.step)
     if across == 0:
         for pads, colour, hatch in zip(reach.pads, ARM_COLOURS, HATCHES, strict=True):
@@ -374,11 +375,11 @@ CLOSE_UP = 0.25
 def meeting(
     geometry: CellGeometry, pair: tuple[str, str], pose: Array, q: Array, title: str
 ) -> Figure:
-    """Draw the cell with both bodies in red: all of it, and what is near them from two sides.
+    """Draw two colliding bodies in red: the whole cell, and their surroundings from two sides.
 
     Args:
         pair: names of the bodies.
-        pose, q: (6,) of the box and (all joints,) where they meet [m, rad].
+        pose, q: (6,) of the box and (all joints,) at the collision [m, rad].
     """
     figure = new_figure(0.36)
     solids = cell_solids(geometry)
@@ -402,7 +403,8 @@ def meeting_place(
     pose: Array,
     q: Array,
 ) -> Array:
-    """(3,) middle of what both bodies' bounding boxes share in the world [m]."""
+    """Compute the middle (3,) of the intersection of both bodies' bounding boxes in the world
+    [m]."""
     placed = frame_placements(geometry, pose[None], q[None])
     low, high = np.full(3, -np.inf), np.full(3, np.inf)
     for name in pair:

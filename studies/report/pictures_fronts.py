@@ -97,7 +97,7 @@ def attainment(data: ReportData) -> Figure:
 
 
 def _attained(title: str, percentile: float) -> str:
-    """Legend of a surface; both quartiles look alike and share one entry."""
+    """Return the legend of a surface; both quartiles look alike and share one entry."""
     if percentile not in QUARTILES:
         return f"{title}: median"
     shares = " and ".join(f"{share:.0f} %" for share in QUARTILES)
@@ -124,7 +124,7 @@ def polish(data: ReportData) -> Figure:
 
 
 def _paired(axes: Axes, algorithms: Sequence[AlgorithmRuns]) -> None:
-    """Hypervolumes of all replicas before and after."""
+    """Draw the hypervolumes of all replicas before and after."""
     names = []
     for k, algorithm in enumerate(algorithms):
         look = algorithm.look

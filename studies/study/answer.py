@@ -1,7 +1,7 @@
-"""The words and numbers that a study opens with: the carry to run, in every program the same.
+"""Texts of a study's result: the carry to run, the same in every program.
 
-The terminal prints them, the page shows them first, `replay` and `export` repeat
-the line of the carry. Forces are commanded ones unless they are called planned.
+The terminal prints them, the page shows them first, `studies.replay` and `studies.export` repeat
+the carry's line. Forces are commanded ones unless they are called planned.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ class Fact:
     """One line of an answer.
 
     Attributes:
-        heading: what it is about.
+        heading: its subject.
         text: one phrase.
-        is_command: whether the text is to be copied into a shell.
-        note: what belongs to it in smaller letters.
+        is_command: the text is to be copied into a shell.
+        note: remark in smaller letters.
     """
 
     heading: str
@@ -55,10 +55,10 @@ class StudyAnswer:
     Attributes:
         state: the verdict on the carry.
         headline: the carry in one line.
-        facts: time, force, job, and whether it holds, the first screen of the page.
-        commands: what to run next.
-        details: everything else, in the order in which it matters.
-        warnings: what speaks against the carry.
+        facts: the first screen of the page: time, force, job, and whether the forces hold.
+        commands: next commands.
+        details: everything else, the most important first.
+        warnings: objections against the carry.
     """
 
     state: State
@@ -78,33 +78,33 @@ class StudyAnswer:
 
 
 def carry_text(duration: float, force: float, job_duration: float, order: str) -> str:
-    """Return the line of a carry: its duration [s], the largest force to command [N], the duration
-    of the whole job [s], NaN without one, and what the force asks of the contacts."""
+    """Format the line of a carry: its duration [s], its largest commanded force [N], the duration
+    of the whole job [s], NaN without one, and the command to the contacts."""
     job = f", the whole job {seconds(job_duration)}" if math.isfinite(job_duration) else ""
     return f"{seconds(duration)}, {order} {newtons(force)}{job}"
 
 
 def job_text(job: Job) -> str:
-    """Return the line of the carry of a planned job."""
+    """Format the line of a planned job's carry."""
     carried, squeeze = job.phase("carry").duration, job.squeeze
     return carry_text(carried, squeeze.force, job.duration, squeeze.order)
 
 
 def seconds(duration: float) -> str:
-    """Return a duration as the first screen writes it."""
+    """Format a duration for the first screen."""
     return f"{duration:.2f} s"
 
 
 def newtons(force: float) -> str:
-    """Return a force as the first screen writes it."""
+    """Format a force for the first screen."""
     return f"{force:.1f} N"
 
 
 def answer(found: StoredRecommendation, folder: str) -> StudyAnswer:
-    """Put a stored recommendation into words.
+    """Format a stored recommendation as an answer.
 
     Args:
-        folder: of the results, in front of the files' names; '' where the reader is in it.
+        folder: of the results, in front of the files' names; '' if it is the working folder.
     """
     carry = carry_text(found.duration, found.force, found.job_duration, found.order)
     headline, file = f"Run this carry: {carry}", Path(folder) / found.file
@@ -149,7 +149,7 @@ _WITHIN = "each alone, in every case within the reference force on this path"
 
 
 def state_of(found: StoredRecommendation) -> State:
-    """Return the verdict on a carry by what is true of it."""
+    """Return the verdict on a carry from its properties."""
     failing = found.price is not None and found.price.check.failing > 0
     if not found.fits or failing or not math.isfinite(found.job_duration):
         return "bad"
@@ -182,8 +182,7 @@ def holds_text(found: StoredRecommendation) -> str:
 
 
 def export_command(path: Path, target: str) -> str:
-    """Return the command that makes of a trajectory file, timed within its own limits, what robots
-    need.
+    """Return the command that exports a trajectory file, timed within its own limits.
 
     Args:
         target: of the export.
@@ -225,8 +224,8 @@ def _percent(ratio: float) -> str:
 
 
 def _margins(found: StoredRecommendation) -> list[str]:
-    """List what may be off alone while the commanded force stays: force, and the centre of mass
-    along each axis up to the nearer limit."""
+    """Describe the largest single deviations that the commanded force tolerates: of force, and of
+    the centre of mass along each axis up to the nearer limit."""
     texts = [
         f"up to {100.0 * margin.limit:.0f} % of it may be missing"
         for margin in found.margins

@@ -112,7 +112,7 @@ def addressed(workcell: Workcell, addresses: tuple[str, str]) -> Workcell:
 
 
 def described(robot: Robot) -> str:
-    """Return words about the make in a description, in lower case."""
+    """Return the words of a description that may name its maker, in lower case."""
     urdf = robot_urdf(robot)
     words = [robot.urdf.name, urdf.name, *urdf.links]
     words += [value for _, value in robot.xacro_arguments]
@@ -126,7 +126,7 @@ def robot_prefix(name: str) -> str:
 
 
 def comment(text: str) -> str:
-    """Return a text that cannot end or leave a line of comment in a robot's language."""
+    """Return a text that cannot break out of a comment line in a robot's language."""
     return "".join(c if " " <= c <= "~" else "?" for c in text)[:_LONGEST_COMMENT]
 
 

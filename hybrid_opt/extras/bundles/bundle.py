@@ -116,7 +116,7 @@ class Origin:
         )
 
     def name(self, job: Job) -> str:
-        """Return a folder name that no other carry's bundles have."""
+        """Return a folder name that is unique to this carry."""
         words = [_word(self.study or job.workcell.name), _word(self.algorithm)]
         words += [] if self.replica is None else [f"r{self.replica:02d}"]
         words += [] if self.point is None else [f"p{self.point:04d}"]
@@ -180,7 +180,7 @@ class Target:
         Both arms hold the box in series: of k_1 and k_2 it is 2 / (1 / k_1 + 1 / k_2).
 
         Raises:
-            SettingsError: the target depends on it, and nobody has measured it.
+            SettingsError: the target depends on an unknown stiffness.
         """
         if self.stiffness == "gains":
             return pad_stiffness(job)
@@ -190,7 +190,7 @@ class Target:
         """Return the stiffness that a cell states; None if nothing depends on it.
 
         Raises:
-            SettingsError: the target depends on it, and nobody has measured it.
+            SettingsError: the target depends on an unknown stiffness.
         """
         first, second = (robot.driver.stiffness for robot in workcell.robots)
         if first is not None and second is not None:
@@ -302,7 +302,7 @@ def manifest(
 
 
 def readme(document: Mapping[str, Any], contents: Contents) -> str:
-    """Return the first file that a person opens: what a bundle is, how it runs, who stops it."""
+    """Return the README of a bundle: its content, how to run it, and who stops the robots."""
     squeeze, machine = document["squeeze"], document["machine"]
     phases = [
         f"| {phase['name'].replace('_', ' ')} | {phase['begin']:.2f} | {phase['duration']:.2f} | "

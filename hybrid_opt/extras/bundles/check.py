@@ -1,12 +1,11 @@
 """Check of any joint trajectory of both arms that claims to carry the box of a cell.
 
-The trajectory may be a bundle's after someone's post-processing, or another planner's: CSV, JSON or
-ROS 2's JointTrajectory in YAML. The first arm's pad says where the box is; the second one's has to
-be where the box then has it (the closed chain). What the box needs in between follows from the
-cell's own forces.
+The trajectory may be an edited one of a bundle, or another planner's: CSV, JSON or ROS 2's
+JointTrajectory in YAML. The first arm's pad gives the pose of the box; the second arm's pad has to
+hold it there (the closed chain). The cell's contact model gives the forces that the box needs.
 
-Controllers make up the motion between samples. It is judged as well: chain, limits and forces at
-`BETWEEN` of each step, collisions by a proof along the whole motion.
+Controllers interpolate between samples. The interpolated motion is checked as well: chain, limits
+and forces at `BETWEEN` of each step, collisions by a proof along the whole motion.
 """
 
 from __future__ import annotations
@@ -127,7 +126,7 @@ class Finding:
 
     @property
     def problems(self) -> list[str]:
-        """Reasons not to drive it."""
+        """Reasons against running the trajectory."""
         if not self.held.any():
             return ["the pads hold the box nowhere: another cell, or another order of the joints?"]
         found = []

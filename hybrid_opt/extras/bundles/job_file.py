@@ -337,7 +337,7 @@ class Export:
 
     @property
     def follower(self) -> int:
-        """The arm that is force-controlled."""
+        """Index of the force-controlled arm."""
         return 1 - self.job.squeeze.leader
 
     @property
@@ -352,7 +352,7 @@ class Export:
 
     @cached_property
     def gravity(self) -> Array:
-        """(n, joints) torques that bear the arms and their tools alone [N m, N]."""
+        """Torques (n, joints) that balance the weight of the arms and their tools [N m, N]."""
         found = []
         for arm, robot in enumerate(self.workcell.robots):
             numeric = build_robot_model(robot).model
@@ -362,8 +362,7 @@ class Export:
 
     @cached_property
     def holding(self) -> Array:
-        """(n, joints) torques that stand still there and press as commanded, with gravity [N m,
-        N]."""
+        """Torques (n, joints) at rest with the commanded forces, gravity included [N m, N]."""
         sampled, model = self.sampled, _model(self.workcell)
         wrench = sampled.wrench.copy()
         for phase in self.job.held:
@@ -380,8 +379,8 @@ class Export:
 
     @cached_property
     def effort(self) -> Array:
-        """(n, joints) torques of the motion as commanded, with gravity; those of a joint that moves
-        both arms bear the contact of both [N m, N]."""
+        """Torques (n, joints) of the motion with the commanded forces, gravity included; those of a
+        joint that moves both arms balance the contacts of both [N m, N]."""
         return self.sampled.effort + self._of_other(self._contact(self.sampled.wrench))
 
     def _contact(self, wrench: Array) -> Array:
@@ -402,7 +401,7 @@ class Export:
 
     @property
     def joint_columns(self) -> dict[str, Array]:
-        """(n, joints) by name what joints do: positions, their derivatives, efforts."""
+        """Joint quantities (n, joints) by name: positions, their derivatives, efforts."""
         sampled = self.sampled
         return {
             "position": sampled.q,
@@ -414,7 +413,7 @@ class Export:
 
     @cached_property
     def limits(self) -> Limits:
-        """When programs stop."""
+        """Limits at which programs stop the job."""
         held = [phase.force for phase in self.job.held]
         spare = min(float(((f.normal - f.least) / f.normal).min()) for f in held)
         k = self.stiffness

@@ -94,17 +94,17 @@ class Load:
 
     @property
     def is_mass_observable(self) -> bool:
-        """True if the holds show the mass."""
+        """True if the holds determine the mass."""
         return bool(self.deviations[0] <= SEEN_MASS * abs(self.mass))
 
     @property
     def observable_centre(self) -> Array:
-        """(3,) True per axis of the box along which they show the centre of mass."""
+        """(3,) True per axis of the box along which the holds determine the centre of mass."""
         return np.asarray(self.deviations[1:4] <= SEEN_CENTRE)
 
     @property
     def observable_crosstalk(self) -> Array:
-        """(2, 2) True per crosstalk that they show."""
+        """(2, 2) True per crosstalk that the holds determine."""
         return np.asarray(self.deviations[4:].reshape(2, 2) <= SEEN_CROSSTALK)
 
 
@@ -201,12 +201,11 @@ def delay(
 
     Args:
         time: (n,) [s].
-        most: largest delay that is looked for [s].
-        apart: delay that does not count [s], None for none.
+        most: largest delay that is considered [s].
+        apart: a delay that is excluded [s], None for none.
 
     Returns:
-        where the rates of both correlate best; None where they hardly do, or hardly better than
-        with a delay that does not count.
+        The delay of the largest correlation of both rates; None for a weak correlation.
     """
     wide = round(SMOOTHED / GRID_STEP)
     if not 4 * wide < (time[-1] - time[0]) / GRID_STEP < LARGEST_GRID:

@@ -63,11 +63,11 @@ SAME_BOX = 0.03
 
 @dataclass(frozen=True)
 class EvidenceEntry:
-    """One quantity that the runs show.
+    """One quantity that the runs determine.
 
     Attributes:
-        name, found: in words.
-        key: of the workcell file that has it now, '' where it has none.
+        name, found: for messages.
+        key: key of the workcell file with its present value, '' without one.
     """
 
     name: str
@@ -82,10 +82,10 @@ class Evidence:
     Attributes:
         workcell: the cell.
         runs: names of the recordings.
-        entries: what was found.
-        faults: what is wrong with the runs.
-        asks: what to record for what is not seen.
-        tables: of the workcell file, as changed: keys, or one mapping per contact.
+        entries: the results.
+        faults: faults of the runs.
+        asks: recordings that would determine the missing quantities.
+        tables: changed tables of the workcell file: keys, or one mapping per contact.
         ranges: of `[uncertainty]`.
     """
 

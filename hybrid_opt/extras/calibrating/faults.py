@@ -58,10 +58,10 @@ class Fault:
     """A fault of a recording.
 
     Attributes:
-        run: its name; '' for all.
+        run: name of the recording; '' for all.
         name: of the fault.
-        text: what was found, and what to do.
-        serious: whether the run (all runs) says nothing of sensors, load and friction.
+        text: the problem, and the remedy.
+        serious: the run (all runs) cannot be used for sensors, load and friction.
     """
 
     run: str

@@ -217,8 +217,8 @@ class RankedBase:
 
     Attributes:
         base: (6,) its pose.
-        value: how well.
-        follows: (k,) along which detours.
+        value: score; larger is better.
+        follows: (k,) detours along which the arm follows.
     """
 
     base: Array
@@ -291,8 +291,8 @@ class PlaceScorer:
         return np.asarray((fine & (kept == m)).reshape(len(holds), k).any(axis=0))
 
     def _hidden(self, arm: int, shoulder: Array) -> float:
-        """Compute the share of start and goal at which the environment stands between a shoulder
-        (3,) and the robot's contact, in the horizontal plane."""
+        """Compute the share of start and goal at which the environment lies between a shoulder (3,)
+        and the robot's contact, in the horizontal plane."""
         point = np.append(np.array(self._problem.contacts[arm]["xyz"], dtype=float), 1.0)
         hit = 0
         for pose in self._problem.poses:

@@ -37,11 +37,11 @@ MOVE_COST = 0.05
 def common_positions(
     arms: Sequence[ArmKinematics], query: HoldQuery, rng: np.random.Generator
 ) -> Iterator[Array | None]:
-    """Yield positions (2, k) of the common joints at the start and at the goal: that at which a
-    locked joint is held, then the most promising first; None once if there are no common joints.
+    """Yield positions (2, k) of the common joints at the start and at the goal: that of locked
+    joints, then those with the largest score; None once if there are no common joints.
 
-    A position is as promising as the share of random postures from which both arms reach the box
-    with it, within their limits and away from singular postures.
+    The score of a position is the share of random postures from which both arms reach the box with
+    it, within their limits and away from singular postures.
     """
     if not arms[0].common:
         yield None

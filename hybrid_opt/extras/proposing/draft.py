@@ -1,4 +1,4 @@
-"""A path as it was found, and the changes of a problem file that write it down."""
+"""A found path, and the changes of a problem file that describe it."""
 
 from __future__ import annotations
 

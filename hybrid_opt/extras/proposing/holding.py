@@ -519,11 +519,12 @@ class _Finder:
         return hit
 
     def lead(self, spin: Array, T_box_joint: Array, q: Array) -> None:
-        """Follow postures (n, joints) along guides to the goal, until enough arrive; add those.
+        """Follow postures (n, joints) along guides to the goal, until enough arrive; add those as
+        holds.
 
         Args:
-            spin: (n,) of each [rad].
-            T_box_joint: (n, 4, 4) of each.
+            spin: (n,) spin of each posture [rad].
+            T_box_joint: (n, 4, 4) of each posture.
         """
         start, goal = self.query.start, self.query.goal
         waiting = np.arange(len(q))
@@ -576,7 +577,7 @@ class _Finder:
         return arrived, path, self._score(path, room, measure)
 
     def _stop(self, q: Array, measure: float, reaches: bool) -> str:
-        """Say why a posture (joints,) is not part of a path."""
+        """Return the reason why a posture (joints,) is not part of a path."""
         kinematics = self.kinematics
         if not reaches:
             return "it does not reach farther in one motion"
@@ -623,7 +624,7 @@ class _Finder:
 
 
 def manipulability_hint(kinematics: ArmKinematics, found: str) -> str:
-    """Say that the manipulability found is too small, with the key that decides."""
+    """Describe a manipulability that is too small, with the key of its limit."""
     robot = kinematics.workcell.robots[kinematics.arm]
     return (
         f"abs(det J) {found}, too near a singular posture; allowed is {MANIPULABILITY_MARGIN:g} "
@@ -632,11 +633,11 @@ def manipulability_hint(kinematics: ArmKinematics, found: str) -> str:
 
 
 def _diverse(holds: Sequence[Hold], compared: int) -> list[Hold]:
-    """Return the best of holds that differ only in the spin and a joint about the same axis, those
-    unlike all earlier ones first.
+    """Sort holds so that those unlike all earlier ones come first; of holds that differ only in the
+    spin and a joint about the same axis, keep the best.
 
     Args:
-        compared: joints that make a difference, from the first.
+        compared: joints that distinguish holds, from the first.
     """
     first: list[Hold] = []
     later: list[Hold] = []
@@ -654,7 +655,7 @@ def _diverse(holds: Sequence[Hold], compared: int) -> list[Hold]:
 
 
 def has_wrist_spin(kinematics: ArmKinematics) -> bool:
-    """Return True if the arm's last joint turns the pad about its normal, as a spin does."""
+    """Return True if the arm's last joint turns the pad about its normal."""
     geometry, contact = kinematics.geometry, kinematics.workcell.contacts[kinematics.arm]
     T_joint_pad = geometry.T_joint_box @ contact.T_box_pad
     axis = geometry.axes[-1]

@@ -121,12 +121,12 @@ class _Follower:
 
 
 class ClosedChain:
-    """Both arms in one way of holding. Not to be shared between threads.
+    """Both arms with one way to hold the box. Not to be shared between threads.
 
     Attributes:
-        judge: of collisions.
-        looked: configurations looked at so far.
-        refused: how often what other than a collision was in the way.
+        judge: checks collisions.
+        looked: number of checked configurations.
+        refused: number of refusals by reason, collisions excluded.
     """
 
     def __init__(
@@ -348,14 +348,14 @@ class AffineSubspace:
 
 @dataclass(frozen=True)
 class Corridor:
-    """How far a path may stray.
+    """Limits on the deviation of a path from the straight motion.
 
     Attributes:
-        tilt: how far the box may turn away from the turn between start and goal [rad]; 0: it turns
-            from the one to the other and no other way.
+        tilt: largest rotation of the box away from the rotation between start and goal [rad]; 0
+            allows none.
         range: see `AffineSubspace`.
-        aside: how far the box may be beyond start and goal along each of the world's axes [m].
-        towards: (3,) the axis along which alone it may, and the sign; None: all, either way.
+        aside: largest distance of the box beyond start and goal along each of the world's axes [m].
+        towards: (3,) signed axis along which alone this applies; None for all axes, either way.
     """
 
     tilt: float

@@ -1,4 +1,4 @@
-"""The problem file: a workcell file in which a person has left out what is to be proposed."""
+"""The problem file: a workcell file without the quantities that are to be proposed."""
 
 from __future__ import annotations
 

@@ -169,13 +169,13 @@ class Proposal:
 
     @property
     def length(self) -> float:
-        """How far both arms' joints go together, as the Euclidean length of their path [rad]."""
+        """Euclidean length of the path of both arms' joints [rad]."""
         return path_length(np.hstack(self.q))
 
     @property
     def passes(self) -> str:
-        """What it passes, and on which side; 'nothing' where a straight motion of the box would
-        meet nothing but what it stands on."""
+        """The obstacles that it passes, and on which side; 'nothing' if a straight motion of the
+        box meets nothing but its support."""
         return " and ".join(self.sides) or "nothing"
 
     def text(self, folder: Path) -> str:
@@ -253,7 +253,7 @@ def propose_classes(
 
 @dataclass
 class _Lazy:
-    """A choice of bases, prepared when its turn comes."""
+    """A choice of bases that is prepared on first use."""
 
     given: dict[str, Any]
     spins: Array
@@ -263,7 +263,7 @@ class _Lazy:
 
 @dataclass
 class _Search:
-    """One proposal on its way."""
+    """One proposal in progress."""
 
     problem: Problem
     rng: np.random.Generator
@@ -291,7 +291,7 @@ class _Search:
         return self.spent > PLANNING * self.settings.seconds
 
     def _say(self, text: str) -> None:
-        """Say what is being done, and how much of the time is gone."""
+        """Report the current step and the elapsed share of the time."""
         self.tell(text)
         limit = ceil(self.settings.seconds)
         self.count(min(int(self.spent), limit), limit)

@@ -1,5 +1,5 @@
-"""A problem made ready for a path: reach first, then both arms' ways to hold and their pairs;
-and, where one of these is missing, why."""
+"""A problem prepared for a path search: reach, both arms' ways to hold, and their pairs; else the
+reason why one of these is missing."""
 
 from __future__ import annotations
 
@@ -57,13 +57,13 @@ MOST_POSITIONS = 6
 
 @dataclass(frozen=True, eq=False)
 class Pair:
-    """Both arms' ways to hold.
+    """A way to hold for each arm.
 
     Attributes:
         holds: of both arms.
         start, goal: the closed chain at both ends.
-        chain: it, with a judge that keeps as much clearance as both ends do.
-        promise: larger is better.
+        chain: the closed chain, whose judge requires as much clearance as both ends have.
+        promise: score; larger is better.
     """
 
     holds: tuple[Hold, Hold]
@@ -279,8 +279,8 @@ def box_blocked(judge: PoseJudge, start: Array, goal: Array) -> str:
 
 
 def reach_missing(workcell: Workcell, ends: tuple[Array, Array], spins: Array) -> str:
-    """Describe which arm does not reach its contact at the start or the goal (6,) with any spin,
-    and by how much; '' if both reach."""
+    """Describe the arm that does not reach its contact at the start or the goal (6,) with any spin,
+    and the missing distance; '' if both reach."""
     found = []
     for arm, (name, pose) in product((0, 1), zip(("start", "goal"), ends, strict=True)):
         robot, contact = workcell.robots[arm], workcell.contacts[arm]

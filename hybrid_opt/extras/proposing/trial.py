@@ -1,5 +1,5 @@
-"""What is judged before anything is compiled, CasADi's interpreter inside: the box alone, postures
-of the cell, and a proposed carry by the evaluator."""
+"""Checks before anything is compiled, by CasADi's interpreter: the box alone, postures of the cell,
+and a proposed carry by the evaluator."""
 
 from __future__ import annotations
 
@@ -161,17 +161,17 @@ def _reach(pieces: tuple[Piece, ...], direction: Array) -> float:
 
 
 class PoseJudge:
-    """Says which configurations collide, with some clearance to spare.
+    """Checks configurations for collisions, with a clearance margin.
 
     Attributes:
         geometry: the cell's bodies and pairs.
         margin: clearance beyond the cell's tolerance that counts as a collision [m].
-        checker: that it asks.
-        met: how often each pair was in the way since it was emptied.
+        checker: the collision checker.
+        met: number of collisions per pair since it was cleared.
     """
 
     def __init__(self, geometry: CellGeometry, checker: CollisionChecker, margin: float) -> None:
-        """Use `judge_of`."""
+        """Store the parts; `judge_of` makes them."""
         self.geometry = geometry
         self.margin = margin
         self.met: Counter[tuple[str, str]] = Counter()
@@ -328,8 +328,8 @@ class Trial:
         return outputs["q_1"][0, 0], outputs["q_2"][0, 0]
 
     def verdict(self) -> tuple[Judgement, str]:
-        """Evaluate the proposed carry, certified between its samples and held still at both ends;
-        return the verdict and the reason of a failure."""
+        """Evaluate the proposed carry: on its samples, between them, and held still at both ends.
+        Return the verdict and the reason of a failure."""
         judgement, why = self.verdict_on(self.initial)
         told = (
             static_hold_error(self.workcell, self.evaluator.outputs) if judgement.feasible else ""
@@ -416,9 +416,8 @@ def _branch(branches: tuple[StartBranch, ...], q: Array) -> int:
 
 
 def grasp_blocked(trial: Trial, handling: Handling) -> str:
-    """Describe what is in the way of the pads' approach before a trial's carry or of their retreat
-    after it, lift and set-down included, with this handling; '' for nothing, or if such pads
-    have no jobs."""
+    """Describe the obstacle of the pads' approach before a trial's carry or of their retreat after
+    it, lift and set-down included; '' for none, or if such pads have no jobs."""
     cell = replace(trial.workcell, handling=handling)
     if not cell.has_facing_pads:
         return ""

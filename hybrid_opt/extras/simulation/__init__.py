@@ -1,5 +1,5 @@
-"""Simulated carries: does the box stay where the planned forces hold it?
+"""Simulated carries: whether the planned forces hold the box in place.
 
-box: the box between pads that are driven. arms: a whole cell under its controllers. reference: its
-commands and controllers. scene: both as MJCF.
+box: the box between driven pads. arms: a whole cell under its controllers. reference: its commands
+and controllers. scene: both as MJCF.
 """

@@ -83,7 +83,8 @@ class ArmOutcome(Outcome):
 
 
 class PressedBox(HeldBox):
-    """Measures the pads' normal forces as well, and corrects the contacts' acceleration."""
+    """A box whose pads' normal forces are measured, and whose contacts' acceleration is
+    corrected."""
 
     def __init__(self, mujoco: ModuleType, model: Any, data: Any, workcell: Workcell) -> None:
         """Find the pads' contact points as well."""
@@ -101,7 +102,7 @@ class PressedBox(HeldBox):
 
     @property
     def normal_forces(self) -> Array:
-        """(2,) what the points of each pad press together, in the last step [N]."""
+        """(2,) sum of the normal forces at each pad's points in the last step [N]."""
         pad, _, address, _ = self._contacts()
         return np.bincount(pad, self._data.efc_force[address], 2).astype(float)
 
@@ -392,12 +393,12 @@ class CarrySimulation:
     """Simulations of one carry.
 
     Attributes:
-        threshold: the least multiple of the planned forces that holds; None where there is none
+        threshold: the least multiple of the planned forces that holds; None if there is none
             between `LOW` and `HIGH`.
-        problem: why there is none, '' where there is.
-        reference: the cell's commands in the run that is shown.
-        squeeze: how its forces came about.
-        shown: that run.
+        problem: reason why there is none, else ''.
+        reference: the cell's commands in the shown simulation.
+        squeeze: origin of its forces.
+        shown: outcome of that simulation.
     """
 
     threshold: Threshold[ArmOutcome] | None

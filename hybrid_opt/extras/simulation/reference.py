@@ -62,10 +62,10 @@ class BoxJob:
     """The job of the box.
 
     Attributes:
-        start: (6,) its pose at first.
-        goal: (3,) where its centre has to end [m]; None where nobody asks.
-        held: from when to when pads alone hold it: slip is measured in between [s].
-        stands: until when something that is not modelled holds it in place [s].
+        start: (6,) its first pose.
+        goal: (3,) wanted final position of its centre [m]; None if not checked.
+        held: interval in which the pads alone hold it, in which slip is measured [s].
+        stands: end of the time in which an unmodelled support holds it [s].
     """
 
     start: Array

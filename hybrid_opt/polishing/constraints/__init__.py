@@ -1,1 +1,2 @@
-"""What each kind of constraint calls near, requires and finds violated: one file per kind."""
+"""Constraints of the polish: rows near their bounds, required values and violations; one file per
+kind."""

@@ -57,7 +57,7 @@ STRIKES = 3
 
 
 class Refused(Exception):
-    """The job cannot begin, or go on; the message says why."""
+    """The job cannot begin or go on; the message says why."""
 
 
 @dataclass(frozen=True)
@@ -126,7 +126,7 @@ class Job:
 
     @cached_property
     def fastest(self) -> float:
-        """At most so fast is the first arm's pad [m/s]."""
+        """Largest speed of the first arm's pad [m/s]."""
         return max(self.speed(0, s) for s in self.time)
 
     @property
@@ -181,7 +181,7 @@ class Job:
 
     @cached_property
     def pressed(self) -> float:
-        """The coordinate from which the pads hold the box alone: the end of its press."""
+        """Coordinate at the end of the press, from which the pads alone hold the box."""
         return next(last for last, phase in self._phases if phase == "press")
 
     def _place(self, s: float) -> tuple[int, float, float]:
@@ -264,7 +264,7 @@ class Job:
 
 @dataclass(frozen=True)
 class Moment:
-    """The path at a time from now [s]: its coordinate, its rate, and how the rate changes."""
+    """The path at a time from now [s]: its coordinate, its rate, and the derivative of the rate."""
 
     time: float
     s: float
@@ -526,7 +526,7 @@ class Machine:
                 )
 
     def _wrong(self, seen: Seen) -> str:
-        """Return what places and their news say against going on, or ''."""
+        """Return the reason not to go on, or ''."""
         limits, s = self.job.limits, self.clock.s
         # Nothing is lifted, and no job done, by an arm that stands elsewhere.
         stands = self.job.phase(s) == "press" or s in (0.0, self.job.end)

@@ -48,11 +48,10 @@ CTRL_C = "Ctrl-C"
 
 
 class Press:
-    """The way of the pressing pad along its normal, from the force that it has to make and the one
-    that it feels.
+    """Position of the pressing pad along its normal, from commanded and measured force.
 
     Attributes:
-        way: beyond the planned place, into the box [m].
+        way: distance beyond the planned place, into the box [m].
     """
 
     def __init__(self, config: dict[str, Any]) -> None:
@@ -66,8 +65,8 @@ class Press:
         """Advance the time.
 
         Args:
-            wanted, soon: normal force now, and when the arm has followed [N].
-            felt: what the sensor feels [N]; None before it tells.
+            wanted, soon: commanded normal force now, and after the arm's lag [N].
+            felt: measured force [N]; None before the first measurement.
         """
         if wanted <= 0.0:
             self._missing = 0.0
@@ -281,13 +280,13 @@ RUNNING = 3
 
 @dataclass(frozen=True)
 class FromRobot:
-    """What a controller tells.
+    """A message of a controller.
 
     Attributes:
         number: of the message.
         joints, further: axes of the robot, and external ones [degrees].
-        force: of the sensor: force [N] and moment; () without one.
-        running: whether the controller follows.
+        force: measured force [N] and moment; () without a sensor.
+        running: the controller follows commands.
     """
 
     number: int

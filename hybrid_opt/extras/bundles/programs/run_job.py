@@ -205,10 +205,11 @@ class Run:
             raise Refused(f"{name} is not there; are the controllers launched?")
 
     def prepare(self) -> None:
-        """Make the arms ready: look at them, then call what config/cell.json lists, in its order.
+        """Prepare the arms: check them, then call the services that config/cell.json lists, in its
+        order.
 
         Raises:
-            Refused: something is not there or says no, or an arm is not at its first place.
+            Refused: a service is missing or refuses, or an arm is not at its first place.
         """
         for group, client in zip(self.config["groups"], self._actions, strict=True):
             if not client.wait_for_server(timeout_sec=PATIENCE):
@@ -234,13 +235,13 @@ class Run:
         self.machine.check(self.seen())
 
     def send(self, moments: Sequence[Moment], begin: float) -> None:
-        """Send every group its part of the path, and hear whether it is accepted.
+        """Send every group its part of the path, and wait until it is accepted.
 
         Args:
-            begin: when the first moment is [s].
+            begin: time of the first point [s].
 
         Raises:
-            Refused: a controller does not take it.
+            Refused: a controller rejects it.
         """
         goals = [self._goal(group["arms"], moments, begin) for group in self.config["groups"]]
         # Large goals take long to build: none is sent before all are there.
@@ -379,7 +380,7 @@ class Run:
         self.fault = self.fault or CTRL_C
 
     def look_after(self) -> int:
-        """Look after a run that has begun, to its end; returns the exit code."""
+        """Supervise a run that has begun until its end; return the exit code."""
         machine = self.machine
         try:
             while machine.state != "done":
