@@ -27,6 +27,8 @@ QUICK_EVALUATIONS, QUICK_REPLICAS = 300, 2
 
 PADS_DRIVEN = "pads-driven"
 
+HANDS = "hands"
+
 PAD_WITNESSES = ("pads", PADS_DRIVEN)
 """The witnesses without arms, beside the controllers of those with them."""
 

@@ -1,6 +1,6 @@
 """A simulator as witness of a stored trajectory: `dual-arm-carry simulate FILE`.
 
-Drives it in MuJoCo, pressed with multiples of the planned normal forces: the least multiple that
+Drives it in MuJoCo, pressed or held with multiples of the planned forces: the least multiple that
 holds, when and where the box slips, and random cases of the workcell's [uncertainty] under its
 robust forces.
 """
@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from studies.options import (
     FILM_FILE,
+    HANDS,
     OUTPUT_FILE,
     PAD_WITNESSES,
     add,
@@ -24,12 +25,16 @@ def _add_options(parser: Parser) -> None:
     add(parser, "FILE")
     parser.add_argument(
         "--controller",
-        choices=(*PAD_WITNESSES, *stated("hybrid_opt.extras.simulation.reference.Control")),
-        default="leader",
-        help="of the arms: one leads and the other is force-controlled along the normal (leader), "
-        "both are (both), both are springs about the plan (impedance); or no arms, pads on a "
-        "carriage that follows the plan exactly (pads), or pads at their rims, turned by the "
-        "planned moments, as the allocation paper assumes (pads-driven)",
+        choices=(
+            HANDS,
+            *PAD_WITNESSES,
+            *stated("hybrid_opt.extras.simulation.reference.Control"),
+        ),
+        help="(default: leader, or hands where they hold by themselves) of the arms: one leads and "
+        "the other is force-controlled along the normal (leader), both are (both), both are "
+        "springs about the plan (impedance); or no arms, pads on a carriage that follows the plan "
+        "exactly (pads), pads at their rims, turned by the planned moments, as the allocation "
+        "paper assumes (pads-driven), or hands that hold by themselves (hands)",
     )
     parser.add_argument(
         "--timing",

@@ -31,10 +31,12 @@ from hybrid_opt.extras.simulation.box import (
     Outcome,
     Threshold,
     bisected,
+    carriage_motion,
     drive_of,
     planned_moments,
     workcell_of_case,
 )
+from hybrid_opt.extras.simulation.hands import HAND_SETTINGS, HandSimulation, swing_frequency
 from hybrid_opt.extras.simulation.reference import (
     Control,
     Reference,
@@ -57,7 +59,7 @@ from hybrid_opt.store.trajectory_file import read_trajectory
 from hybrid_opt.timing.analysis import closest_to_reference_timing
 from hybrid_opt.timing.records import TimingLimits
 from hybrid_opt.timing.solve import time_path
-from studies.options import PAD_WITNESSES, PADS_DRIVEN
+from studies.options import HANDS, PAD_WITNESSES, PADS_DRIVEN
 from studies.report.looks import Film, write_animation
 from symbolic.array import Array
 from symbolic.contact.registry import contact_model
@@ -153,6 +155,11 @@ PAD_BISECTIONS = 9
 
 CREEP_FACTOR = 1.05
 
+USUAL_CONTROLLER: Control = "leader"
+
+HANDS_LOW = 0.5
+"""Factor at which hands are expected to lose the payload: others take over what one cannot hold."""
+
 
 def simulate_pads(
     cell: Cell, carry: Carry, settings: SimulationSettings, options: argparse.Namespace
@@ -192,6 +199,41 @@ def simulate_pads(
     )
     rubs_less = BoxSimulation(worst_friction(workcell), settings).simulate
     _tell_worst(partial(rubs_less, pressed), partial(rubs_less, drive), workcell)
+
+
+def simulate_hands(
+    cell: Cell, carry: Carry, settings: SimulationSettings, options: argparse.Namespace
+) -> None:
+    """Find the threshold of a carry in hands, simulate random cases, and print both."""
+    workcell = cell.workcell
+    planned, motion = carry.peak_normal_force, carriage_motion(carry, settings)
+    print(
+        f"  without arms; the payload swings at {swing_frequency(workcell, settings):.1f} Hz on "
+        "layers of rubber"
+    )
+    simulate = partial(HandSimulation(workcell, settings).simulate, motion, planned)
+    found = bisected(simulate, HANDS_LOW, HIGH, PAD_BISECTIONS)
+    slips = found.slips
+    what = "a rim lifts" if slips.lifts else f"one slips beyond {1e3 * settings.slip:g} mm"
+    print(
+        f"  holds from {found.holds.factor:.4f} times the planned forces on; at "
+        f"{slips.factor:.4f} {what}: a hand of arm {slips.pad + 1}, {_moment(slips.time[-1])}"
+    )
+    if workcell.uncertainty.is_empty:
+        return
+    forces, squeeze = commanded_forces(workcell, carry, SqueezeSettings(leader=options.leader - 1))
+    holding = forces.max(axis=0)
+    rng = np.random.default_rng(options.seed)
+    cases = random_cases(workcell, workcell.uncertainty, options.runs, rng)
+    held = np.zeros(2, dtype=int)
+    for case in cases:
+        drawn = HandSimulation(workcell_of_case(workcell, case), settings, case[8:11])
+        left = 1.0 - case[15:17].max()
+        held += [drawn.simulate(motion, holding, share * left).holds for share in (1.0, 0.5)]
+    print(
+        f"  hold with {holding[0]:.2f} / {holding[1]:.2f} N, {squeeze}: {held[0]} of {len(cases)} "
+        f"random cases hold (seed {options.seed}), {held[1]} with half of it"
+    )
 
 
 def _swept(step: float) -> tuple[float, float]:
@@ -243,40 +285,31 @@ def worst_friction(workcell: Workcell) -> Workcell:
 
 def simulate_file(options: argparse.Namespace) -> int:
     """Drive a trajectory file in the simulator and print what happens; returns the exit code."""
-    alone = options.controller in PAD_WITNESSES
-    if alone and (options.film or options.mjcf):
-        raise SimulationError(
-            "films and MJCF files are of cells with arms; give another --controller"
-        )
-    if alone:
-        pads: Pads = "driven" if options.controller == PADS_DRIVEN else "even"
-        settings = SimulationSettings(options.time_step, pads=pads)
-    else:
-        period = max(options.time_step, ArmSettings.control_period)
-        arms = ArmSettings(options.time_step, control_period=period, stiffness=options.stiffness)
+    pads: Pads = "driven" if options.controller == PADS_DRIVEN else "even"
+    settings = SimulationSettings(options.time_step, pads=pads)
+    period = max(options.time_step, ArmSettings.control_period)
+    arms = ArmSettings(options.time_step, control_period=period, stiffness=options.stiffness)
     stored = read_trajectory(options.file)
     with TemporaryDirectory() as folder:
         cell = stored.open_cell(Path(folder))
-        if (
-            options.controller == PADS_DRIVEN
-            and not contact_model(cell.workcell).has_pressure_limit
-        ):
-            raise SimulationError(
-                "planned moments at the wrists belong to pads that choose their pressure; this "
-                f"carry is of {contact_model(cell.workcell).assumption}: give another --controller"
-            )
+        options.controller = _controller(cell.workcell, options)
         progress = Progress()
         build_study(cell, progress, polish=False, drivable=False)
         carry = _timed(cell, stored.x, options)
         peak = carry.peak_normal_force
+        held = "holding" if options.controller == HANDS else "normal"
         print(
-            f"{cell.workcell.name}: {carry.duration:.2f} s, planned normal forces up to "
+            f"{cell.workcell.name}: {carry.duration:.2f} s, planned {held} forces up to "
             f"{peak[0]:.2f} / {peak[1]:.2f} N; controller {options.controller}, arm "
             f"{options.leader} leads",
             flush=True,
         )
         progress.note("simulating: the least force that holds, then random cases")
-        if alone:
+        if options.controller == HANDS:
+            hands = replace(HAND_SETTINGS, time_step=options.time_step)
+            simulate_hands(cell, carry, hands, options)
+            return 0
+        if options.controller in PAD_WITNESSES:
             simulate_pads(cell, carry, settings, options)
             return 0
         text = simulate_arms(cell, carry, arms, options)
@@ -286,6 +319,30 @@ def simulate_file(options: argparse.Namespace) -> int:
             path.write_text(text, encoding="utf-8")
         print(f"  cell written to {path}")
     return 0
+
+
+def _controller(workcell: Workcell, options: argparse.Namespace) -> str:
+    """Return the controller to simulate; by default what fits the cell.
+
+    Raises:
+        SimulationError: the one that is asked for does not fit.
+    """
+    model, chosen = contact_model(workcell), options.controller
+    usual = USUAL_CONTROLLER if model.is_squeeze else HANDS
+    if (chosen or usual) in (HANDS, *PAD_WITNESSES) and (options.film or options.mjcf):
+        raise SimulationError(
+            "films and MJCF files are of cells with arms; give another --controller"
+        )
+    if chosen is not None and (chosen == HANDS) != (usual == HANDS):
+        raise SimulationError(
+            f"--controller {chosen} does not fit this cell of {model.assumption}; leave it out"
+        )
+    if chosen == PADS_DRIVEN and not model.has_pressure_limit:
+        raise SimulationError(
+            "planned moments at the wrists belong to pads that choose their pressure; this "
+            f"carry is of {model.assumption}: give another --controller"
+        )
+    return chosen or usual
 
 
 def _timed(cell: Cell, x: Array, options: argparse.Namespace) -> Carry:

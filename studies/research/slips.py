@@ -178,7 +178,7 @@ def slip_of(
             factor = bisected(simulate, LOW, HIGH, BISECTIONS).factor
         except SimulationError:
             factor = bisected(simulate, *WIDER, MORE_BISECTIONS).factor
-        steady = replace(drive, press=np.full(len(drive.time), needed.max()))
+        steady = replace(drive, press=np.full_like(drive.press, needed.max()))
         lacks, held = (
             witness.simulate(steady, share * factor) for share in (PRESSED_SHARE, HOLDING_SHARE)
         )

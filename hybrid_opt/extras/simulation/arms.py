@@ -177,7 +177,7 @@ class CellSimulation:
         self.settings = settings or ArmSettings()
         self.disturbance = np.asarray(disturbance, dtype=float)
         self.mujoco = mujoco_module()
-        require_squeeze(workcell, "a simulation")
+        require_squeeze(workcell, "a simulation of pads")
         self.model, self.text = compiled(self.mujoco, cell_text(workcell, self.settings))
 
     def simulate(

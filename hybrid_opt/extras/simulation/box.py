@@ -174,24 +174,49 @@ class HeldBox:
 
 
 @dataclass(frozen=True)
+class CarriageMotion:
+    """The carriage's motion at n time steps.
+
+    Attributes:
+        time: (n,) from minus the time to settle to the end of the carry [s].
+        pose: (n, 7) of the box frame: place in the world [m], unit quaternion, real part first.
+        velocity, acceleration: (n, 6) linear in the world, angular in the box frame [m, rad, s].
+        rotation: (n, 3, 3) R_world_box.
+    """
+
+    time: Array
+    pose: Array
+    velocity: Array
+    acceleration: Array
+    rotation: Array
+
+    def acceleration_at(self, place: Array) -> Array:
+        """Compute the acceleration (n, 3) of a place in the box frame, along its axes [m/s^2]."""
+        spin, spin_rate = self.velocity[:, 3:], self.acceleration[:, 3:]
+        linear = np.einsum("nji,nj->ni", self.rotation, self.acceleration[:, :3])
+        turned: Array = linear + np.cross(spin_rate, place)
+        return turned + np.cross(spin, np.cross(spin, place))
+
+    def apply(self, data: Any, k: int) -> None:
+        """Set the carriage of a simulation, its first body, to step k."""
+        data.qpos[:7], data.qvel[:6] = self.pose[k], self.velocity[k]
+        data.qfrc_applied[:6] = CARRIAGE_MASS * self.acceleration[k]
+
+
+@dataclass(frozen=True)
 class Drive:
     """The carriage's motion and the pressing force at n time steps.
 
     Attributes:
         leader: index of the pad that keeps its place on the carriage.
-        time: (n,) from minus the time to settle to the end of the carry [s].
-        pose: (n, 7) of the box frame: place in the world [m], unit quaternion, real part first.
-        velocity, acceleration: (n, 6) linear in the world, angular in the box frame [m, rad, s].
+        motion: of the carriage.
         press: (n,) normal force of the other pad [N].
         own: (n,) force that the sliding pad's own mass takes along its normal [N].
         tilt: (n, 2, 2) planned moments of both pads about the x and y axes of their frames [N m].
     """
 
     leader: int
-    time: Array
-    pose: Array
-    velocity: Array
-    acceleration: Array
+    motion: CarriageMotion
     press: Array
     own: Array
     tilt: Array
@@ -238,10 +263,38 @@ def drive_of(
     Raises:
         SettingsError: the carry does not start and end at rest, or the force does not fit it.
     """
-    refuse_motion_at_ends(carry)
     force = carry.normal_force[:, 1 - leader] if press is None else press
     if force.shape != carry.time.shape:
         raise SettingsError(f"forces of shape {force.shape} for {len(carry)} samples")
+    motion = carriage_motion(carry, settings)
+    begin, end = float(carry.time[0]), float(carry.time[-1])
+    clipped = np.clip(motion.time, begin, end)
+    slider = carry.workcell.contacts[1 - leader]
+    R_box_pad = slider.T_box_pad[:3, :3]
+    at_pad = motion.acceleration_at(slider.T_box_pad[:3, 3] + R_box_pad @ tilt_centre(slider))
+    tilt = np.zeros((len(motion.time), 2, 2))
+    for i, contact in enumerate(carry.workcell.contacts if moments is not None else ()):
+        assert moments is not None
+        moment = interpolated(clipped, carry.time, moments[1:, i])
+        moment[motion.time < begin] = moments[0, i]
+        axes = motion.rotation @ contact.T_box_pad[:3, :2]
+        tilt[:, i] = np.einsum("nji,nj->ni", axes, moment)
+    return Drive(
+        leader=leader,
+        motion=motion,
+        press=np.interp(clipped, carry.time, force),
+        own=PAD_MASS * at_pad @ R_box_pad[:, 2],
+        tilt=tilt,
+    )
+
+
+def carriage_motion(carry: Carry, settings: SimulationSettings) -> CarriageMotion:
+    """Compute the motion of a carry from rest to rest, with the box at rest before it.
+
+    Raises:
+        SettingsError: the carry does not start and end at rest.
+    """
+    refuse_motion_at_ends(carry)
     begin, end = float(carry.time[0]), float(carry.time[-1])
     steps = int(np.ceil((end - begin + settings.settle) / settings.time_step)) + 1
     time = begin - settings.settle + settings.time_step * np.arange(steps)
@@ -256,26 +309,13 @@ def drive_of(
         ((amid > begin) & (amid < end))[:, None] * interpolated(amid, carry.time, values)
         for values in (carry.second_rate[:, :3], carry.angular_acceleration)
     )
-    slider = carry.workcell.contacts[1 - leader]
-    R_box_pad = slider.T_box_pad[:3, :3]
-    arm = rotation @ (slider.T_box_pad[:3, 3] + R_box_pad @ tilt_centre(slider))
-    at_pad = acceleration + np.cross(alpha, arm) + np.cross(omega, np.cross(omega, arm))
     spin, spin_rate = (np.einsum("nji,nj->ni", rotation, values) for values in (omega, alpha))
-    tilt = np.zeros((steps, 2, 2))
-    for i, contact in enumerate(carry.workcell.contacts if moments is not None else ()):
-        assert moments is not None
-        moment = interpolated(clipped, carry.time, moments[1:, i])
-        moment[time < begin] = moments[0, i]
-        tilt[:, i] = np.einsum("nji,nj->ni", rotation @ contact.T_box_pad[:3, :2], moment)
-    return Drive(
-        leader=leader,
+    return CarriageMotion(
         time=np.asarray(time),
         pose=np.column_stack([path(amid)[:, :3], turn]),
         velocity=np.column_stack([path(clipped, 1)[:, :3], spin]),
         acceleration=np.column_stack([acceleration, spin_rate]),
-        press=np.interp(clipped, carry.time, force),
-        own=PAD_MASS * np.einsum("ni,ni->n", at_pad, rotation @ R_box_pad[:, 2]),
-        tilt=tilt,
+        rotation=rotation,
     )
 
 
@@ -313,7 +353,7 @@ class BoxSimulation:
         self.workcell = workcell
         self.settings = settings or SimulationSettings()
         self._mujoco = mujoco_module()
-        require_squeeze(workcell, "a simulation")
+        require_squeeze(workcell, "a simulation of pads")
         self._disturbance = disturbance
         self._model = cache(self._compiled)
 
@@ -326,24 +366,24 @@ class BoxSimulation:
         press = int(model.joint("press").dofadr[0])
         driven = (0, 1) if settings.pads == "driven" else ()
         tilts = [[int(model.joint(name).dofadr[0]) for name in tilt_names(i)] for i in driven]
-        data.qpos[box : box + 7] = drive.pose[0]
+        motion = drive.motion
+        data.qpos[box : box + 7] = motion.pose[0]
         force = factor * drive.press + drive.own
         every = max(1, round(SLIP_INTERVAL / settings.time_step))
         time, slip, turn = [], [], []
-        for k in range(len(drive.time)):
-            data.qpos[:7], data.qvel[:6] = drive.pose[k], drive.velocity[k]
-            if drive.time[k] < drive.time[0] + settings.settle / 4.0:
+        for k, now in enumerate(motion.time):
+            motion.apply(data, k)
+            if now < motion.time[0] + settings.settle / 4.0:
                 # It stands until the pads press: what hardly holds it does not stop a falling box.
                 data.qvel[moves : moves + 6] = 0.0
-            data.qfrc_applied[:6] = CARRIAGE_MASS * drive.acceleration[k]
             data.qfrc_applied[press] = force[k]
             for i in driven:
                 data.qfrc_applied[tilts[i]] = drive.tilt[k, i]
             mujoco.mj_step(model, data)
-            if k % every or drive.time[k] < drive.time[0] + settings.settle / 2.0:
+            if k % every or now < motion.time[0] + settings.settle / 2.0:
                 continue
             moved, turned = held.look()
-            time.append(float(drive.time[k]))
+            time.append(float(now))
             slip.append(moved)
             turn.append(turned)
             if not moved.max() <= settings.slip:

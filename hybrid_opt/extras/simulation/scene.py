@@ -178,12 +178,23 @@ def scene_text(
         disturbance: (3,) acceleration that the pads have to give the box beside the motion's,
             world frame [m/s^2]; it acts like a change of gravity.
     """
+    pads = "\n".join(_pad_text(workcell, settings, i, slides=i != leader) for i in (0, 1))
+    return carriage_text(workcell, settings, disturbance, pads)
+
+
+def carriage_text(
+    workcell: Workcell,
+    settings: ContactSettings,
+    disturbance: ArrayLike,
+    bodies: str,
+    actuators: str = "",
+) -> str:
+    """Write the MJCF document of a free payload between the bodies of a carriage."""
     payload, touched = workcell.payload, 'contype="0" conaffinity="1"'
     if presses_on_box(workcell):
         faces = f'<geom type="box" size="{mjcf_text(payload.size / 2.0)}" {touched}/>'
     else:
         faces = plates(workcell, touched)
-    pads = "\n".join(_pad_text(workcell, settings, i, slides=i != leader) for i in (0, 1))
     return f"""
 <mujoco>
   <compiler angle="radian"/>
@@ -193,18 +204,22 @@ def scene_text(
       <freejoint/>
       <inertial pos="0 0 0" mass="{CARRIAGE_MASS!r}"
         diaginertia="{mjcf_text([CARRIAGE_MASS] * 3)}"/>
-      {pads}
+      {bodies}
     </body>
     {box_body(payload, faces)}
   </worldbody>
+  <actuator>{actuators}</actuator>
 </mujoco>"""
 
 
-def compiled(mujoco: ModuleType, text: str) -> tuple[Any, str]:
+def compiled(mujoco: ModuleType, text: str, damping: float = LAYER_DAMPING) -> tuple[Any, str]:
     """Compile the simulator's model of a scene; also return the scene as MuJoCo reads it.
 
     The pads' points state their stiffness [N/m] as negative `solref`. MuJoCo wants it times a
     regularisation, which follows from the masses that are compiled.
+
+    Args:
+        damping: ratio of the points' layers.
     """
     scene = mujoco.MjSpec.from_string(text)
     model = scene.compile()
@@ -215,7 +230,7 @@ def compiled(mujoco: ModuleType, text: str) -> tuple[Any, str]:
         pad = int(model.geom_bodyid[geom.id])
         inverse_mass = float(model.body_invweight0[[pad, box], 0].sum())
         pulled = -float(geom.solref[0]) * inverse_mass * (1.0 - IMPEDANCE) / IMPEDANCE
-        damped = 2.0 * LAYER_DAMPING * np.sqrt(pulled)
+        damped = 2.0 * damping * np.sqrt(pulled)
         geom.solref = [-pulled * IMPEDANCE, -damped * IMPEDANCE]
     return scene.compile(), scene.to_xml()
 
@@ -255,16 +270,21 @@ def contact_points(
     text = []
     for pad in (contact, *contact.further):
         around = pressed_places(pad, pads, settings.points)
-        in_pad = np.column_stack([around, np.full(len(around), -POINT_RADIUS)])
         T = T_body_pad if pad is contact else T_body_box @ pad.T_box_pad
-        stiffness = settings.layer * pad.area / len(around)
-        text += [
-            f'<geom type="sphere" size="{POINT_RADIUS!r}" contype="{PRESSES}" conaffinity="0" '
-            f'priority="1" friction="{contact.friction!r} 0 0" pos="{mjcf_text(place)}" '
-            f'solref="{-stiffness!r} -1" solimp="{IMPEDANCE!r} {IMPEDANCE!r} 0.001"/>'
-            for place in in_pad @ T[:3, :3].T + T[:3, 3]
-        ]
+        text.append(point_geoms(pad, settings.layer, around, T))
     return "\n".join(text)
+
+
+def point_geoms(pad: Contact, layer: float, points: Array, T_body_pad: Array) -> str:
+    """Write spheres at points (n, 2) of a pad, touching its plane, as geoms of a body."""
+    in_pad = np.column_stack([points, np.full(len(points), -POINT_RADIUS)])
+    stiffness = layer * pad.area / len(points)
+    return "\n".join(
+        f'<geom type="sphere" size="{POINT_RADIUS!r}" contype="{PRESSES}" conaffinity="0" '
+        f'priority="1" friction="{pad.friction!r} 0 0" pos="{mjcf_text(place)}" '
+        f'solref="{-stiffness!r} -1" solimp="{IMPEDANCE!r} {IMPEDANCE!r} 0.001"/>'
+        for place in in_pad @ T_body_pad[:3, :3].T + T_body_pad[:3, 3]
+    )
 
 
 def patch_area(contact: Contact) -> float:

@@ -4,56 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from hybrid_opt.carry import ArmMotion, Carry
+from hybrid_opt.carry import Carry
 from hybrid_opt.cell import Cell
 from hybrid_opt.extras.simulation.box import BoxSimulation, drive_of, planned_moments
 from hybrid_opt.extras.simulation.scene import SimulationSettings
-from studies.research.plain.motion import angular_rates
 from symbolic.array import Array
-from symbolic.records import Workcell
-
-SAMPLES = 101
-
-
-def carry_along(workcell: Workcell, path: Array, duration: float) -> Carry:
-    """A carry from rest to rest by path (6,), a pose's change, with as yet no forces.
-
-    The motion is the quintic 10 s^3 - 15 s^4 + 6 s^5.
-    """
-    s = np.linspace(0.0, 1.0, SAMPLES)
-    place = 10 * s**3 - 15 * s**4 + 6 * s**5
-    speed = (30 * s**2 - 60 * s**3 + 30 * s**4) / duration
-    growth = (60 * s - 180 * s**2 + 120 * s**3) / duration**2
-    start = np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
-    pose, rate, second = (
-        start + np.outer(place, path),
-        np.outer(speed, path),
-        np.outer(growth, path),
-    )
-    turning = [
-        angular_rates(*rows) for rows in zip(pose[:, 3:], rate[:, 3:], second[:, 3:], strict=True)
-    ]
-    none = np.zeros((SAMPLES, 6))
-    arm = ArmMotion(none, none, none, none, none)
-    return Carry(
-        workcell=workcell,
-        x=np.zeros(1),
-        timing="limits",
-        parameter=s,
-        time=duration * s,
-        pose=pose,
-        rate=rate,
-        second_rate=second,
-        angular_velocity=np.array([omega for omega, _ in turning]),
-        angular_acceleration=np.array([alpha for _, alpha in turning]),
-        normal_force=np.zeros((SAMPLES, 2)),
-        tangential_force=np.zeros((SAMPLES, 2)),
-        contact_force=np.zeros((SAMPLES, 2, 3)),
-        pressure_shift=np.zeros((SAMPLES, 2)),
-        point_moment_residual=np.zeros((SAMPLES, 3)),
-        moment_residual=np.zeros((SAMPLES, 3)),
-        arms=(arm, arm),
-    )
 
 
 def least_forces(carry: Carry) -> Array:

@@ -1,0 +1,298 @@
+"""Hands that hold by themselves in MuJoCo: with how much force does nothing slip and no rim lift?
+
+The carriage moves as planned and carries one body per hand: a cup on bellows, a magnet or a finger
+on its rubber. Its lip is a set of points, each a spring across the patch; between the lip and the
+carriage the layer gives along the patch and about its normal. Both are one elastic layer of
+`ContactSettings.layer` per area across and a third of that along, that of all hands alike. The
+holding force is the pull of an adhesion actuator on the payload, and hands stand as deep as it
+presses their layers.
+
+How hands share a load, when a point slides and which pressure a rim keeps, follow from these
+springs and Coulomb's law at each point. A planned carry gives nothing but its motion.
+"""
+
+from __future__ import annotations
+
+from copy import copy
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.linalg import block_diag, eigh
+from scipy.spatial.transform import Rotation
+
+from hybrid_opt.extras.simulation.box import (
+    SLIP_INTERVAL,
+    CarriageMotion,
+    Outcome,
+    mujoco_module,
+)
+from hybrid_opt.extras.simulation.scene import (
+    SimulationSettings,
+    carriage_text,
+    compiled,
+    placed,
+    point_geoms,
+    rim,
+)
+from symbolic.array import Array
+from symbolic.contact.elastic import SHEAR, layer_stiffness
+from symbolic.contact.force_closure import wrench_to_box
+from symbolic.contact.registry import contact_model
+from symbolic.errors import SettingsError
+from symbolic.records import Contact, Workcell
+
+HAND_FREQUENCY = 500.0
+"""Of a hand on its layer [rad/s]: it gives a hand's mass, whose inertia is fed forward."""
+
+LIP_DAMPING = 0.05
+"""Damping ratio of the layers across their patches. Two hands that face one another cannot give
+way: what slides between them is braked by this damping, times its speed."""
+
+SHEAR_DAMPING = 0.7
+"""Damping ratio of the layers along their patches, with the payload's mass."""
+
+HAND_SETTINGS = SimulationSettings(settle=0.4)
+"""Usual settings: hands take the payload's weight so slowly that it hardly swings."""
+
+TAKEN = 0.75
+"""Share of the time to settle in which they do."""
+
+RINGS = 3
+"""Rings of points of equal areas that a disc has; a cup's lip has the points of one."""
+
+RIM_PLACES = 32
+"""Places on a hand's rim where slip and lift are measured."""
+
+
+HAND_JOINTS = ("x", "y", "turn")
+"""Of a hand on its layer."""
+
+
+@dataclass(frozen=True)
+class HandOutcome(Outcome):
+    """Outcome of one simulation of hands; a factor is one of their holding forces.
+
+    Attributes:
+        lift: (n, 2) how far the payload is off the rim of any hand of each robot [m]; negative
+            while all of them press.
+    """
+
+    lift: Array
+
+    @property
+    def lifts(self) -> bool:
+        """Whether a rim lifted at the end."""
+        return bool(self.lift[-1].max() > 0.0)
+
+
+class HandSimulation:
+    """The payload of one workcell in its hands.
+
+    Attributes:
+        workcell, settings: what is simulated, and how.
+    """
+
+    def __init__(
+        self,
+        workcell: Workcell,
+        settings: SimulationSettings | None = None,
+        disturbance: ArrayLike = (0.0, 0.0, 0.0),
+    ) -> None:
+        """Describe the scene; nothing is simulated yet.
+
+        Args:
+            disturbance: (3,) acceleration beside the motion's, world frame [m/s^2].
+
+        Raises:
+            SimulationError: MuJoCo is not installed.
+            SettingsError: the pads press the payload between them.
+        """
+        if contact_model(workcell).is_squeeze:
+            raise SettingsError("pads press the payload between them; simulate them as pads")
+        self.workcell = workcell
+        self.settings = settings or HAND_SETTINGS
+        self._mujoco = mujoco_module()
+        self._disturbance = disturbance
+        self._model = cache(self._compiled)
+
+    def simulate(
+        self, motion: CarriageMotion, holding_force: ArrayLike, factor: float = 1.0
+    ) -> HandOutcome:
+        """Simulate one carry up to its end, a slip or a lifted rim.
+
+        Args:
+            holding_force: of each hand, or (2,) of the hands of either robot [N].
+            factor: multiple of it with which they hold.
+        """
+        mujoco, settings = self._mujoco, self.settings
+        model = copy(self._model())
+        hands = self._hands
+        force = factor * np.broadcast_to(holding_force, 2)[list(self.workcell.pad_robots)]
+        stiffness = np.array([settings.layer * hand.area for hand in hands])
+        for k, hand in enumerate(hands):
+            depth = max(0.0, force[k]) / stiffness[k]
+            model.body(f"hand_{k}").pos[:] = hand.T_box_pad[:3, 3] + depth * hand.T_box_pad[:3, 2]
+        data = mujoco.MjData(model)
+        held = HeldInHands(model, data, self.workcell)
+        box = int(model.joint("box").qposadr[0])
+        joints = [
+            [int(model.joint(f"{name}_{k}").dofadr[0]) for name in HAND_JOINTS] for k in held.each
+        ]
+        own = np.stack([_own(hand, settings, motion) for hand in hands], axis=1)
+        data.qpos[box : box + 7] = motion.pose[0]
+        data.ctrl[:] = force
+        gravity, taken = model.opt.gravity.copy(), TAKEN * settings.settle
+        every = max(1, round(SLIP_INTERVAL / settings.time_step))
+        seen = []
+        for k, time in enumerate(motion.time):
+            motion.apply(data, k)
+            # What stands beneath the payload gives its weight to the hands little by little.
+            given = min(1.0, (time - motion.time[0]) / taken)
+            model.opt.gravity[:] = gravity * given**2 * (3.0 - 2.0 * given)
+            data.qfrc_applied[joints] = own[k]
+            mujoco.mj_step(model, data)
+            if k % every or time < motion.time[0] + taken:
+                continue
+            slip, lift, turned = held.look()
+            seen.append((float(time), slip, turned, lift))
+            if not (slip.max() <= settings.slip and lift.max() <= 0.0):
+                break
+        times, slips, turns, lifts = (np.array(values) for values in zip(*seen, strict=True))
+        holds = bool(slips[-1].max() <= settings.slip and lifts[-1].max() <= 0.0)
+        return HandOutcome(factor, holds, times, slips, turns, lifts)
+
+    @property
+    def _hands(self) -> tuple[Contact, ...]:
+        return self.workcell.pads
+
+    def _compiled(self) -> Any:
+        settings, payload = self.settings, self.workcell.payload
+        each = payload.mass / len(self._hands)
+        hands = "\n".join(_hand_text(hand, settings, k, each) for k, hand in enumerate(self._hands))
+        pulls = "".join(
+            f'<adhesion body="hand_{k}" ctrlrange="0 1e6" gain="1"/>'
+            for k in range(len(self._hands))
+        )
+        text = carriage_text(self.workcell, settings, self._disturbance, hands, pulls)
+        return compiled(self._mujoco, text, LIP_DAMPING)[0]
+
+
+class HeldInHands:
+    """Pose of the payload in its hands in one simulation.
+
+    Attributes:
+        each: indices of the hands.
+    """
+
+    def __init__(self, model: Any, data: Any, workcell: Workcell) -> None:
+        """Find hands and payload in a model."""
+        self.each, self._robots = range(len(workcell.pads)), np.array(workcell.pad_robots)
+        self._bodies = [int(model.body(f"hand_{k}").id) for k in self.each]
+        self._box, self._carriage = (int(model.body(name).id) for name in ("box", "carriage"))
+        self._data = data
+        rims = np.array([rim(hand, RIM_PLACES) for hand in workcell.pads])
+        self._rims = np.concatenate([rims, np.zeros((*rims.shape[:2], 1))], axis=2)
+        T = np.array([hand.T_box_pad for hand in workcell.pads])
+        self._on_box = self._rims @ np.swapaxes(T[:, :3, :3], 1, 2) + T[:, None, :3, 3]
+        self._settled: tuple[Array, Array] | None = None
+
+    def look(self) -> tuple[Array, Array, float]:
+        """Measure (2,) largest slip of each robot's hands along their patches since the first call
+        and largest lift off a rim [m], and the rotation since then [rad]."""
+        data = self._data
+        axes = data.xmat[self._bodies].reshape(-1, 3, 3)
+        rotation = data.xmat[self._box].reshape(3, 3)
+        face = self._on_box @ rotation.T + data.xpos[self._box] - data.xpos[self._bodies][:, None]
+        on_lip = face @ axes
+        turned = data.xmat[self._carriage].reshape(3, 3).T @ rotation
+        if self._settled is None:
+            self._settled = on_lip, turned
+        moved = np.linalg.norm((on_lip - self._settled[0])[..., :2], axis=2).max(axis=1)
+        off = on_lip[..., 2].max(axis=1)
+        slip, lift = (
+            np.array([values[self._robots == i].max() for i in (0, 1)]) for values in (moved, off)
+        )
+        turn = Rotation.from_matrix(self._settled[1].T @ turned).magnitude()
+        return slip, lift, float(turn)
+
+
+def swing_frequency(workcell: Workcell, settings: SimulationSettings = HAND_SETTINGS) -> float:
+    """Compute the lowest frequency with which the payload swings on the layers of its hands, on
+    arms that stand still [Hz]."""
+    payload = workcell.payload
+    maps = [wrench_to_box(hand) for hand in workcell.pads]
+    stiffness = sum(
+        A @ (settings.layer * layer_stiffness(hand)) @ A.T
+        for A, hand in zip(maps, workcell.pads, strict=True)
+    )
+    # Velocities of the centre of mass from those of the box frame.
+    to_centre = np.eye(6)
+    to_centre[:3, 3:] = np.cross(np.eye(3), payload.centre_of_mass)
+    inertia = block_diag(payload.mass * np.eye(3), payload.inertia)
+    squares = eigh(stiffness, to_centre.T @ inertia @ to_centre, eigvals_only=True)
+    return float(np.sqrt(squares[0]) / (2.0 * np.pi))
+
+
+def lip_points(hand: Contact, points: int) -> Array:
+    """Compute points (n, 2) of a hand that press on the payload, with the patch's mean squares [m].
+
+    Args:
+        points: about how many a patch has; a cup's lip has a third of them.
+    """
+    if hand.half_sides is None:
+        angle = 2.0 * np.pi * np.arange(points // RINGS) / (points // RINGS)
+        around = np.column_stack([np.cos(angle), np.sin(angle)])
+        radii = [1.0] if hand.is_ring else np.sqrt((np.arange(RINGS) + 0.5) / RINGS)
+        return np.concatenate([hand.patch_radius * r * around for r in radii])
+    x, y = hand.half_sides
+    rows = max(2, round(float(np.sqrt(points * y / x))))
+    columns = max(2, round(points / rows))
+    # Centres of equal parts, apart as far as makes up for the spread of each part.
+    across, along = (
+        ((2.0 * np.arange(n) + 1.0) / n - 1.0) / np.sqrt(1.0 - 1.0 / n**2) for n in (columns, rows)
+    )
+    return np.asarray([(x * a, y * b) for a in across for b in along])
+
+
+def _along(hand: Contact, settings: SimulationSettings) -> tuple[float, float]:
+    """Return the stiffness of a hand's layer along it and about its normal [N/m, N m/rad]."""
+    points = lip_points(hand, settings.points)
+    shear = SHEAR * settings.layer * hand.area
+    return shear, shear * float((points**2).sum(axis=1).mean())
+
+
+def _own(hand: Contact, settings: SimulationSettings, motion: CarriageMotion) -> Array:
+    """Compute the forces (n, 3) that move a hand itself along its joints [N, N m]."""
+    inertia = np.array(_along(hand, settings)) / HAND_FREQUENCY**2
+    R = hand.T_box_pad[:3, :3]
+    linear = motion.acceleration_at(hand.T_box_pad[:3, 3]) @ R[:, :2]
+    return np.column_stack(
+        [inertia[0] * linear, inertia[1] * (motion.acceleration[:, 3:] @ R[:, 2])]
+    )
+
+
+def _hand_text(hand: Contact, settings: SimulationSettings, k: int, borne: float) -> str:
+    """Write a hand as a body of the carriage.
+
+    Args:
+        borne: its share of the payload's mass [kg].
+    """
+    shear, torsion = _along(hand, settings)
+    mass, inertia = shear / HAND_FREQUENCY**2, torsion / HAND_FREQUENCY**2
+    damping = 2.0 * SHEAR_DAMPING * np.sqrt(shear * (mass + borne))
+    twisting = damping * torsion / shear
+    joints = "".join(
+        f'<joint name="{name}_{k}" type="slide" axis="{axis}" stiffness="{shear!r}" '
+        f'damping="{float(damping)!r}"/>'
+        for name, axis in zip(HAND_JOINTS[:2], ("1 0 0", "0 1 0"), strict=True)
+    )
+    return f"""<body name="hand_{k}" gravcomp="1" {placed(hand.T_box_pad)}>
+        {joints}
+        <joint name="turn_{k}" type="hinge" axis="0 0 1" stiffness="{torsion!r}"
+          damping="{float(twisting)!r}"/>
+        <inertial pos="0 0 0" mass="{mass!r}" diaginertia="{inertia!r} {inertia!r} {inertia!r}"/>
+        {point_geoms(hand, settings.layer, lip_points(hand, settings.points), np.eye(4))}
+      </body>"""
