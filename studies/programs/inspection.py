@@ -22,6 +22,7 @@ from studies.program import ProgramResult, load_workcell, print_findings
 from symbolic.array import Array
 from symbolic.cell_model import own_pairs
 from symbolic.errors import SettingsError
+from symbolic.geometry.bodies import MeshReader, collision_bodies
 from symbolic.records import Workcell
 from symbolic.records.task import straight_line
 from symbolic.robot.branches import StartBranch
@@ -110,6 +111,7 @@ def inspected(
     yield ProgramResult({"explained": {name: str(why) for name, why in whys.items()}})
     yield _postures(cell)
     yield from _candidates(cell, candidates, seed)
+    yield _meshes(workcell)
     yield _pairs(cell, pairs)
     optimum = _optimum(cell, progress) if polish else None
     lines = () if optimum is None else ("", *_optimum_lines(optimum))
@@ -188,6 +190,27 @@ def _candidates(cell: Cell, count: int, seed: int) -> Iterator[ProgramResult]:
     yield ProgramResult(
         {"explained_candidates": len(failed), "in_the_way": in_the_way}, tuple(lines)
     )
+
+
+def _meshes(workcell: Workcell) -> ProgramResult:
+    """Sizes of the meshes as read, and of their convex pieces, by file."""
+    reader = MeshReader()
+    collision_bodies(workcell, reader)
+    sizes = {
+        path.name: {
+            "parts": mesh.parts,
+            "vertices": mesh.vertices,
+            "pieces": len(mesh.hulls),
+            "corners": sum(len(hull.vertices) for hull in mesh.hulls),
+        }
+        for (path, _), mesh in reader.known.items()
+    }
+    lines = [
+        f"  {name}: {size['vertices']} vertices in {size['parts']} part(s) became "
+        f"{size['corners']} in {size['pieces']} convex piece(s)"
+        for name, size in sizes.items()
+    ]
+    return ProgramResult({"meshes": sizes}, ("", "Meshes:", *lines) if lines else ())
 
 
 def _pairs(cell: Cell, listed: bool) -> ProgramResult:

@@ -14,7 +14,7 @@ import pinocchio as pin
 
 from symbolic.array import Array
 from symbolic.errors import CollisionModelError
-from symbolic.geometry.pieces import Hull, Piece, check_piece
+from symbolic.geometry.pieces import CutMesh, Hull, Piece, check_piece
 from symbolic.read.arms import ArmLinks, arm_links, arm_model, link_frame, one_machine, robot_urdf
 from symbolic.read.descriptions import resolve_mesh
 from symbolic.read.urdf import UrdfMesh
@@ -109,15 +109,20 @@ class ArmGeometry(ContentRecord):
         return np.asarray(np.where(self.turning, 0.0, most))
 
 
-def collision_bodies(workcell: Workcell) -> tuple[CollisionBody, ...]:
+def collision_bodies(
+    workcell: Workcell, meshes: MeshReader | None = None
+) -> tuple[CollisionBody, ...]:
     """Return all bodies: robot 1, robot 2, payload, environment, each in the order of its file.
 
     What stands still of a robot that is a chain of a larger machine counts as environment.
 
+    Args:
+        meshes: reads the meshes; None for a new one.
+
     Raises:
         CollisionModelError: a shape or mesh is unusable, or two bodies share a name.
     """
-    meshes = MeshReader()
+    meshes = meshes or MeshReader()
     links = (arm_links(workcell.robots, 0), arm_links(workcell.robots, 1))
     bodies = [b for i in (0, 1) for b in _robot_bodies(workcell.robots[i], i, links[i], meshes)]
     if one_machine(workcell.robots):  # what a joint of both arms moves belongs to the first
@@ -277,11 +282,14 @@ def _located(mesh: UrdfMesh, robot: Robot, owner: str) -> Mesh:
 
 class MeshReader:
     """Reader of a cell's meshes: each is read and decomposed once, within `MOST_CELL_FACES`
-    together."""
+    together.
+
+    Attributes:
+        known: by file and scale.
+    """
 
     def __init__(self) -> None:
-        self._known: dict[tuple[Path, tuple[float, ...]], tuple[Hull, ...]] = {}
-        self._triangles = 0
+        self.known: dict[tuple[Path, tuple[float, ...]], CutMesh] = {}
 
     def hulls(self, mesh: Mesh) -> tuple[Hull, ...]:
         """Return the convex pieces of a mesh.
@@ -294,17 +302,16 @@ class MeshReader:
         from symbolic.read.meshes import MOST_CELL_FACES
 
         key = (mesh.path, tuple(mesh.scale))
-        if key not in self._known:
-            hulls, faces = _cut_file(*key, _state(mesh.path))
-            self._triangles += faces
-            if self._triangles > MOST_CELL_FACES:
+        if key not in self.known:
+            found = _cut_file(*key, _state(mesh.path))
+            faces = found.faces + sum(known.faces for known in self.known.values())
+            if faces > MOST_CELL_FACES:
                 raise CollisionModelError(
-                    f"{mesh.path}: with its {faces} triangles the cell's meshes have "
-                    f"{self._triangles}; allowed are {MOST_CELL_FACES} together: simplify the "
-                    "largest"
+                    f"{mesh.path}: with its {found.faces} triangles the cell's meshes have "
+                    f"{faces}; allowed are {MOST_CELL_FACES} together: simplify the largest"
                 )
-            self._known[key] = hulls
-        return self._known[key]
+            self.known[key] = found
+        return self.known[key].hulls
 
 
 def _state(path: Path) -> tuple[int, int]:
@@ -318,18 +325,15 @@ def _state(path: Path) -> tuple[int, int]:
 
 
 @lru_cache(maxsize=64)
-def _cut_file(
-    path: Path, scale: tuple[float, ...], state: tuple[int, int]
-) -> tuple[tuple[Hull, ...], int]:
-    """Compute the convex pieces of a mesh file and its number of triangles.
+def _cut_file(path: Path, scale: tuple[float, ...], state: tuple[int, int]) -> CutMesh:
+    """Compute the convex pieces of a mesh file.
 
     Kept beyond one cell: what tries a cell out reads its robots several times.
     """
     from symbolic.geometry.hulls import cut
     from symbolic.read.meshes import read_mesh
 
-    mesh = read_mesh(path, np.array(scale))
-    return cut(mesh, path), len(mesh.faces)
+    return cut(read_mesh(path, np.array(scale)), path)
 
 
 def shape_pieces(

@@ -4,12 +4,13 @@ A watertight component is cut by planes where that makes the hulls of its parts 
 smaller. The hull of a part contains the part's surface and, with the cut's outline, the cap
 that closes it: so the union of the hulls contains the solid. A component with holes has no
 inside; its whole hull is used, with a warning. CoACD and V-HACD remesh or voxelise first and
-promise no containment.
+promise no containment. The hulls are then simplified: `simplify` joins and thins them outwards.
 """
 
 from __future__ import annotations
 
 import warnings
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +20,7 @@ from scipy.spatial import ConvexHull, QhullError
 
 from symbolic.array import Array
 from symbolic.errors import CollisionModelError, DualArmWarning
-from symbolic.geometry.pieces import Hull
+from symbolic.geometry.pieces import CutMesh, Hull
 from symbolic.read.meshes import read_mesh
 from symbolic.records.quantities import SMALLEST_SIZE
 
@@ -42,11 +43,11 @@ def convex_pieces(path: Path, scale: Array) -> tuple[Hull, ...]:
     Raises:
         CollisionModelError: unreadable, empty, flat, with non-finite vertices, or enormous.
     """
-    return cut(read_mesh(path, scale), path)
+    return cut(read_mesh(path, scale), path).hulls
 
 
-def cut(mesh: trimesh.Trimesh, path: Path) -> tuple[Hull, ...]:
-    """Decompose a mesh of `read_mesh` into convex pieces; `path` names it in messages.
+def cut(mesh: trimesh.Trimesh, path: Path) -> CutMesh:
+    """Decompose a mesh of `read_mesh` into few convex pieces; `path` names it in messages.
 
     Raises:
         CollisionModelError: a part has no convex hull.
@@ -66,6 +67,7 @@ def cut(mesh: trimesh.Trimesh, path: Path) -> tuple[Hull, ...]:
         if len(small):
             joined = np.vstack([mesh.triangles[faces] for faces in small])
             pieces.append(hull_of(_thickened(joined)))
+        hulls = simplify(pieces)
     except QhullError as error:
         raise CollisionModelError(
             f"{path}: a part of the mesh has no convex hull; remove triangles that are points or "
@@ -84,7 +86,7 @@ def cut(mesh: trimesh.Trimesh, path: Path) -> tuple[Hull, ...]:
             f"around the {len(small)} smallest is used as their collision shape. Remove screws and "
             "the like to get a tighter shape",
         )
-    return _outermost(pieces)
+    return CutMesh(hulls, len(mesh.faces), len(mesh.vertices), len(large) + len(small))
 
 
 def _warn(path: Path, text: str) -> None:
@@ -115,21 +117,6 @@ def _parts(mesh: trimesh.Trimesh) -> tuple[list[trimesh.Trimesh], list[NDArray[n
     found = mesh.submesh(parts[:large], only_watertight=False, repair=False)
     assert isinstance(found, list), "parts that are not appended to one another are a list"
     return found, parts[large:]
-
-
-def _outermost(pieces: list[Hull]) -> tuple[Hull, ...]:
-    """Remove pieces that lie in another: screws and bearings inside a housing."""
-    volumes = [hull_volume(piece.vertices[piece.faces]) for piece in pieces]
-    kept: list[tuple[Hull, Array]] = []
-    for k in np.argsort(volumes, kind="stable")[::-1]:
-        piece = pieces[k]
-        inside = (
-            np.all(piece.vertices @ planes[:, :3].T + planes[:, 3] <= 1e-12) for _, planes in kept
-        )
-        if not any(inside):
-            kept.append((piece, ConvexHull(piece.vertices).equations))
-    chosen = {id(piece) for piece, _ in kept}
-    return tuple(piece for piece in pieces if id(piece) in chosen)
 
 
 def _thickened(triangles: Array) -> Array:
@@ -229,3 +216,126 @@ def _clip(triangles: Array, axis: int, level: float, side: float) -> Array:
         else:
             kept += [np.stack([ab, b, c], axis=1), np.stack([ab, c, ac], axis=1)]
     return np.concatenate(kept)
+
+
+# --- simplification ---
+
+
+STAND_OUT = 1e-4
+"""How far a simplified hull may stand out from those that it replaces [m]."""
+
+
+SMALL_PART = 0.01
+"""Hulls that fit into a cube of this edge together share one hull [m]."""
+
+
+THINNED_SHARE = 0.75
+"""A hull is thinned if at most this share of its corners is left."""
+
+
+ROUNDOFF = 1e-12
+"""How far beyond a plane a point counts as on it [m]."""
+
+
+START_DIRECTIONS = np.array([u for u in product((-1.0, 0.0, 1.0), repeat=3) if any(u)])
+"""The corners that are farthest along these are kept by any thinning."""
+
+
+def simplify(hulls: list[Hull]) -> tuple[Hull, ...]:
+    """Return fewer hulls with fewer corners, whose union contains all of the given ones.
+
+    Hulls inside another are dropped: duplicates, screws and bearings inside a housing. One that
+    stands out from a larger one by at most `STAND_OUT`, and small ones near each other, are joined:
+    their common hull takes their place. Each is then thinned, see `thin`.
+    """
+    kept: dict[int, _Growth] = {}
+    volumes = [hull_volume(hull.vertices[hull.faces]) for hull in hulls]
+    for k in np.argsort(volumes, kind="stable")[::-1].tolist():
+        corners = hulls[k].vertices
+        if any(other.hull_contains(corners) for other in kept.values()):
+            continue
+        host = next((key for key, other in kept.items() if other.takes_in(corners)), None)
+        if host is None:
+            kept[k] = _Growth(hulls[k])
+        else:
+            both = np.concatenate([kept[host].hull.vertices, corners])
+            kept[host] = _Growth(hull_of(both))
+    return tuple(thin(kept[k].hull) for k in sorted(kept))
+
+
+def thin(hull: Hull) -> Hull:
+    """Return a hull of fewer corners that contains a hull, and stands out from it by at most
+    `STAND_OUT`.
+
+    Some corners are kept and moved outwards by a linear map. They suffice once the hull of the
+    kept ones contains what the map moves to the corners: the map of one then contains the other.
+    The hull is returned as it is if that saves few corners.
+    """
+    growth, corners = _Growth(hull), hull.vertices
+    seeds = np.unique(np.argmax(corners @ growth.axes @ START_DIRECTIONS.T, axis=0))
+    kept, most = seeds, THINNED_SHARE * len(corners)
+    while len(kept) <= most:
+        try:
+            planes = ConvexHull(corners[kept]).equations
+        except QhullError:  # the kept corners are in a plane
+            return hull
+        open_faces = [face for face in planes if _beyond(growth.preimage, face[None])]
+        if not open_faces:
+            found = hull_of(growth.moved(corners[kept]))
+            return found if _Growth(found).hull_contains(corners) else hull
+        along = corners @ np.array(open_faces)[:, :3].T
+        more = np.union1d(kept, np.argmax(along, axis=0))
+        if len(more) == len(kept):
+            return hull
+        kept = more
+    return hull
+
+
+class _Growth:
+    """A linear map about the middle of a hull that moves none of its points farther than
+    `STAND_OUT`, and every face outwards: it stretches the hull along its principal axes.
+
+    Attributes:
+        hull: the hull.
+        planes: (n, 4) of its faces: outward normal and offset.
+        axes: (3, 3) principal axes of its corners as columns.
+        preimage: (m, 3) points that the map moves to its corners.
+    """
+
+    def __init__(self, hull: Hull) -> None:
+        corners = hull.vertices
+        self.hull = hull
+        self.planes = ConvexHull(corners).equations
+        _, self.axes = np.linalg.eigh(np.cov(corners.T))
+        along = corners @ self.axes
+        self._middle = self.axes @ (along.min(axis=0) + along.max(axis=0)) / 2.0
+        off = (corners - self._middle) @ self.axes
+        shares = off / np.abs(off).max(axis=0)
+        longest = np.linalg.norm(shares, axis=1).max()
+        self._factors = 1.0 + STAND_OUT / longest / np.abs(off).max(axis=0)
+        self.preimage = self._stretched(corners, 1.0 / self._factors)
+
+    def moved(self, points: Array) -> Array:
+        """Map points (n, 3)."""
+        return self._stretched(points, self._factors)
+
+    def hull_contains(self, points: Array) -> bool:
+        """Return True if all points (n, 3) are in the hull."""
+        return not _beyond(points, self.planes)
+
+    def takes_in(self, points: Array) -> bool:
+        """Return True if the hull may be replaced by the common one with points (n, 3)."""
+        both = np.stack([points.min(axis=0), self.hull.vertices.min(axis=0)])
+        high = np.maximum(points.max(axis=0), self.hull.vertices.max(axis=0))
+        if np.all(high - both.min(axis=0) <= SMALL_PART):
+            return True
+        return self.hull_contains(self._stretched(points, 1.0 / self._factors))
+
+    def _stretched(self, points: Array, factors: Array) -> Array:
+        off = (points - self._middle) @ self.axes
+        return np.asarray(self._middle + (off * factors) @ self.axes.T)
+
+
+def _beyond(points: Array, planes: Array) -> bool:
+    """Return True if a point (n, 3) is beyond one of the planes (m, 4)."""
+    return bool(np.any(points @ planes[:, :3].T + planes[:, 3] > ROUNDOFF))

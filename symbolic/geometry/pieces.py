@@ -29,6 +29,22 @@ class Hull:
     faces: NDArray[np.int64]
 
 
+@dataclass(frozen=True)
+class CutMesh:
+    """A mesh and its convex pieces.
+
+    Attributes:
+        hulls: their union contains it.
+        faces, vertices, parts: numbers of its triangles, of their corners and of its connected
+            components.
+    """
+
+    hulls: tuple[Hull, ...]
+    faces: int
+    vertices: int
+    parts: int
+
+
 ConvexShape = Box | Cylinder | Sphere | Capsule | Hull
 
 

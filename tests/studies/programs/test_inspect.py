@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import tomllib
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
@@ -12,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import trimesh
 from PIL import Image
 
 from hybrid_opt.cell import Cell
@@ -26,7 +28,8 @@ from studies.programs.inspection import Optimum, inspected, show
 from studies.report.pictures_cell import meeting_place
 from symbolic.read.cell import load
 from symbolic.read.editing import completed
-from symbolic.records import Mesh, Workcell
+from symbolic.records import Body, Mesh, Workcell
+from symbolic.records.poses import pose_matrix
 from symbolic.records.task import straight_line
 from tests.studies.conftest import TRANSFER
 from tests.symbolic.cells import RACK, standing_text
@@ -68,13 +71,25 @@ def test_the_second_cell_is_worth_searching_and_counts_are_the_evaluators(
     assert sum(found.infeasible_by_reason.values()) == (~verdicts.feasible).sum()
 
 
-def test_a_new_cell_needs_no_compiler(
+def test_a_new_cell_needs_no_compiler_and_its_meshes_are_told(
     transfer: Workcell, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
+    box, ball = trimesh.creation.box((0.3, 0.2, 0.1)), trimesh.creation.icosphere(radius=0.04)
+    both = trimesh.util.concatenate([box, ball])
+    (tmp_path / "part.stl").write_bytes(trimesh.exchange.stl.export_stl(both))
+    away = pose_matrix([0.0, 0.0, 4.0], [0.0, 0.0, 0.0])
+    part = Body("part", Mesh(tmp_path / "part.stl", np.ones(3)), away)
+    cell = replace(transfer, environment=(*transfer.environment, part))
     monkeypatch.setenv("DUAL_ARM_CACHE", str(tmp_path / "cache"))
     monkeypatch.setenv("CC", "no-such-compiler")
-    told = find(transfer, 1, 1).lines
-    assert any("At rest, level" in line for line in told)
+    found = find(cell, 1, 1)
+    assert any("At rest, level" in line for line in found.lines)
+    vertices = 8 + len(ball.vertices)
+    assert found.meshes == {
+        "part.stl": {"parts": 2, "vertices": vertices, "pieces": 1, "corners": 8}
+    }
+    told = f"  part.stl: {vertices} vertices in 2 part(s) became 8 in 1 convex piece(s)"
+    assert told in found.lines
     assert not (tmp_path / "cache").exists()
 
 
