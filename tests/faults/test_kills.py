@@ -8,6 +8,7 @@ of a worker.
 from __future__ import annotations
 
 import gzip
+import itertools
 import json
 import os
 import random
@@ -215,6 +216,33 @@ def test_a_study_struck_in_every_stage_is_the_same(tmp_path: Path) -> None:
         assert ended(start(), said) == 0, said.read_text()
         assert differences(expected, contents(output)) == []
         assert hits >= len(STAGES)
+
+
+KILLS = 20
+
+
+@pytest.mark.slow
+def test_a_study_killed_twenty_times_at_random_moments_is_the_same(tmp_path: Path) -> None:
+    """Moments are drawn over half of what a whole study takes, so that most runs are killed and
+    some come to their end; then another folder begins."""
+    begin = time.monotonic()
+    expected, _ = undisturbed(tmp_path / "peace", report=False)
+    longest, rng, said = (time.monotonic() - begin) / 2.0, random.Random(20), tmp_path / "said"
+    kills = 0
+    for number in itertools.count():
+        output, code = tmp_path / f"killed-{number}", -1
+        while code != 0:
+            process = started(study(output, output.exists(), report=False), said)
+            with suppress(subprocess.TimeoutExpired):
+                process.wait(timeout=rng.uniform(0.0, longest))
+            if process.poll() is None:
+                strike(process, "kill all", rng)
+                kills += 1
+            code = ended(process, said)
+            assert code in (0, -signal.SIGKILL), said.read_text()
+        assert differences(expected, contents(output)) == []
+        if kills >= KILLS:
+            return
 
 
 STRUCK = ("search", "polish", "timing")
