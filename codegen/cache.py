@@ -139,7 +139,8 @@ def largest_size() -> int:
     except (ValueError, OverflowError):
         raise CodegenError(
             f"the environment variable DUAL_ARM_CACHE_LIMIT holds {own[:40]!r}; allowed is a "
-            "number of gibibytes"
+            "number of gibibytes",
+            code="cache-limit",
         ) from None
 
 
@@ -404,7 +405,9 @@ class Cache:
         except OSError as error:
             raise CodegenError(_cannot_use(self.folder, error)) from error
         if not stat.S_ISDIR(own.st_mode):
-            raise CodegenError(f"the cache {self.folder} is not a folder; {_OTHER_FOLDER}")
+            raise CodegenError(
+                f"the cache {self.folder} is not a folder; {_OTHER_FOLDER}", code="no-folder"
+            )
         _require_own(self.folder, own)
         for parent in dict.fromkeys([*self.folder.parents, *self.folder.resolve().parents]):
             mode = parent.stat().st_mode
@@ -412,7 +415,8 @@ class Cache:
                 raise CodegenError(
                     f"compiled code in the cache {self.folder} is refused: others can write to "
                     f"{parent} (mode {stat.S_IMODE(mode):04o}) and could exchange it; run "
-                    f"`chmod go-w {parent}`, or {_OTHER_FOLDER}"
+                    f"`chmod go-w {parent}`, or {_OTHER_FOLDER}",
+                    code="exchangeable-by-others",
                 )
 
     def _read_own(self, path: Path) -> bytes | None:
@@ -462,13 +466,15 @@ def _require_own(path: Path, found: os.stat_result) -> None:
     if found.st_uid != os.geteuid():
         raise CodegenError(
             f"compiled code in {path} is refused: it belongs to user {found.st_uid}, not to you "
-            f"({os.geteuid()}); remove it, or {_OTHER_FOLDER}"
+            f"({os.geteuid()}); remove it, or {_OTHER_FOLDER}",
+            code="owned-by-another",
         )
     if found.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
         raise CodegenError(
             f"compiled code in {path} is refused: others can write to it (mode "
             f"{stat.S_IMODE(found.st_mode):04o}); if you trust its content, run "
-            f"`chmod go-w {path}`, otherwise remove it, or {_OTHER_FOLDER}"
+            f"`chmod go-w {path}`, otherwise remove it, or {_OTHER_FOLDER}",
+            code="writable-by-others",
         )
 
 
@@ -477,4 +483,4 @@ def _writing(folder: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise CodegenError(_cannot_use(folder, error)) from error
+        raise CodegenError(_cannot_use(folder, error), code="cache-unusable") from error

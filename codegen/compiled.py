@@ -264,7 +264,8 @@ def cannot_load(name: str, error: Exception) -> CodegenError:
     """Build the error for a library of the cache that cannot be loaded, with the remedy."""
     return CodegenError(
         f"{name}: the compiled library cannot be loaded: {error}; if its folder does not allow "
-        "programs, name another one in the environment variable DUAL_ARM_CACHE"
+        "programs, name another one in the environment variable DUAL_ARM_CACHE",
+        code="not-loadable",
     )
 
 

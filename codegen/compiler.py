@@ -215,14 +215,16 @@ class Compiler:
                 raise CodegenError(
                     f"the C compiler {self.command[0]} made a library at -O{level} that cannot be "
                     f"loaded: {error}; {_OTHER_COMPILER}, or if {folder.parent} does not allow "
-                    "programs, another folder in the environment variable DUAL_ARM_CACHE"
+                    "programs, another folder in the environment variable DUAL_ARM_CACHE",
+                    code="not-loadable",
                 ) from error
             whole.restype = ctypes.c_double
             found, expected = whole(squares, len(roots) // len(LEVELS)), float(sum(roots))
             if found != expected:
                 raise CodegenError(
                     f"the C compiler {self.command[0]} makes wrong code at -O{level}: a sum is "
-                    f"{found!r} in place of {expected!r}; {_OTHER_COMPILER}"
+                    f"{found!r} in place of {expected!r}; {_OTHER_COMPILER}",
+                    code="wrong-code",
                 )
 
     def _run(self, command: Sequence[str], source: Path, result: Path) -> None:
@@ -251,7 +253,8 @@ class Compiler:
             except subprocess.TimeoutExpired as error:
                 raise CodegenError(
                     f"the C compiler {self.command[0]} took longer than {MOST_SECONDS:g} s over "
-                    f"{source.name} and was ended; {_OTHER_COMPILER}"
+                    f"{source.name} and was ended; {_OTHER_COMPILER}",
+                    code="compiler-hangs",
                 ) from error
             finally:
                 with _BEGINNING:
@@ -260,11 +263,14 @@ class Compiler:
                     _end(process)
         if process.returncode != 0:
             stop_if_interrupted()
-            raise CodegenError(_failure(self.command[0], source, process.returncode, said))
+            raise CodegenError(
+                _failure(self.command[0], source, process.returncode, said), code="compiler-failed"
+            )
         if not result.is_file() or result.stat().st_size == 0:
             raise CodegenError(
                 f"the C compiler {self.command[0]} reported success but made no library of "
-                f"{source.name}; {_OTHER_COMPILER}"
+                f"{source.name}; {_OTHER_COMPILER}",
+                code="no-library",
             )
 
 
@@ -301,7 +307,8 @@ def find_compiler() -> Compiler:
         raise CodegenError(
             f"no C compiler that works was found ({tried}), and without one nothing can be "
             "computed: install one (Debian and Ubuntu: `apt install g++`; without rights to, `pip "
-            "install ziglang`), or name it in the environment variable CC"
+            "install ziglang`), or name it in the environment variable CC",
+            code="no-compiler",
         )
     return found
 
@@ -312,7 +319,8 @@ def _words(cc: str) -> list[str]:
     except ValueError as error:
         raise CodegenError(
             f"the environment variable CC holds {cc[:60]!r}, which is no command ({error}); "
-            "correct or unset it"
+            "correct or unset it",
+            code="no-command",
         ) from error
 
 

@@ -170,7 +170,9 @@ class NumericFunction(ABC):
         """
         self._require_count(len(inputs))
         if threads < 0:
-            raise CodegenError(f"{self.name}: threads is {threads}; give 0 (all cores) or more")
+            raise CodegenError(
+                f"{self.name}: threads is {threads}; give 0 (all cores) or more", code="threads"
+            )
         arrays: list[Array] = []
         batched: list[bool] = []
         n = -1
@@ -183,7 +185,8 @@ class NumericFunction(ABC):
                 if n not in (-1, array.shape[0]):
                     raise CodegenError(
                         f"{self.name}: input '{name}' has {array.shape[0]} candidates, an input "
-                        f"before it {n}; give each the same number, or one value for all"
+                        f"before it {n}; give each the same number, or one value for all",
+                        code="candidate-count",
                     )
                 n = array.shape[0]
             arrays.append(array)
@@ -191,7 +194,8 @@ class NumericFunction(ABC):
         if n < 0:
             raise CodegenError(
                 f"{self.name}: no input has a leading axis of candidates; give at least one as "
-                "(n, *shape), or call the function for one evaluation"
+                "(n, *shape), or call the function for one evaluation",
+                code="no-leading-axis",
             )
         outputs = [np.empty((n, *shape)) for shape in self.output_shapes]
         if n:
@@ -230,7 +234,8 @@ class NumericFunction(ABC):
                 raise CodegenError(
                     f"{self.name}: array '{name}' is {array.dtype} {array.shape}, C-contiguous "
                     f"{flags.c_contiguous}, writable {flags.writeable}; needed is C-contiguous "
-                    f"writable float64 {shape}"
+                    f"writable float64 {shape}",
+                    code="wrong-array",
                 )
         split = len(self.input_names)
         inputs = dict(zip(names[:split], own[:split], strict=True))
@@ -270,7 +275,8 @@ class NumericFunction(ABC):
         if given != len(self.input_names):
             raise CodegenError(
                 f"{self.name}: {given} inputs given, {len(self.input_names)} needed: "
-                f"{', '.join(self.input_names)}"
+                f"{', '.join(self.input_names)}",
+                code="input-count",
             )
 
     def _as_array(self, given: ArrayLike, name: str) -> Array:
@@ -281,7 +287,8 @@ class NumericFunction(ABC):
                 array = array.astype(_FLOAT, casting="same_kind")
         except (TypeError, ValueError) as error:
             raise CodegenError(
-                f"{self.name}: input '{name}' is not an array of real numbers: {error}"
+                f"{self.name}: input '{name}' is not an array of real numbers: {error}",
+                code="input-type",
             ) from error
         flags = array.flags
         if flags.carray or (flags.c_contiguous and flags.aligned):
@@ -289,7 +296,9 @@ class NumericFunction(ABC):
         return array.copy(order="C")
 
     def _wrong_shape(self, name: str, found: Shape, needed: str) -> CodegenError:
-        return CodegenError(f"{self.name}: input '{name}' has shape {found}, needed is {needed}")
+        return CodegenError(
+            f"{self.name}: input '{name}' has shape {found}, needed is {needed}", code="input-shape"
+        )
 
 
 @dataclass(frozen=True)
@@ -342,7 +351,10 @@ class PreparedBatch:
         """
         wanted = self.size if count is None else count
         if not 0 <= wanted <= self.size:
-            raise CodegenError(f"{wanted} evaluations wanted; there is room for {self.size}")
+            raise CodegenError(
+                f"{wanted} evaluations wanted; there is room for {self.size}",
+                code="too-many-evaluations",
+            )
         if wanted:
             self._run(wanted)
         return self.outputs

@@ -3,9 +3,27 @@
 Each package above has an `errors` module with those that it alone raises.
 """
 
+import re
+
 
 class DualArmError(Exception):
     """Root of all errors raised on purpose by this project; the text says what to do."""
+
+    def __init__(self, text: str = "", *, code: str = "") -> None:
+        super().__init__(text)
+        self._code = code
+
+    @property
+    def code(self) -> str:
+        """Name of the mistake for programs, such as `not-json`, which stays when the text changes.
+
+        An error that passes another one on has its code; one without any has its class's name.
+        """
+        cause = self.__cause__
+        if not self._code and isinstance(cause, DualArmError):
+            return cause.code
+        name = type(self).__name__.removesuffix("Error")
+        return self._code or re.sub(r"(?<!^)(?=[A-Z])", "-", name).lower()
 
 
 class DualArmWarning(UserWarning):

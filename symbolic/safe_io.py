@@ -72,7 +72,7 @@ def resolved(path: Path) -> Path:
     try:
         return path.resolve(strict=True)
     except (OSError, ValueError, RuntimeError) as error:
-        raise OutsideError(f"cannot be read ({_reason(error)})") from error
+        raise OutsideError(f"cannot be read ({_reason(error)})", code="unreadable") from error
 
 
 def read_bytes(
@@ -113,7 +113,8 @@ def text(content: bytes) -> str:
         return content.decode("utf-8")
     except UnicodeDecodeError as error:
         raise OutsideError(
-            f"byte {error.start} is not UTF-8; allowed is text in UTF-8, save it so"
+            f"byte {error.start} is not UTF-8; allowed is text in UTF-8, save it so",
+            code="not-utf-8",
         ) from error
 
 
@@ -129,10 +130,11 @@ def xml_text(content: bytes) -> str:
     if declared and declared[1].lower() not in ("utf-8", "utf8", "us-ascii", "ascii"):
         raise OutsideError(
             f"declares the encoding {ascii(declared[1])[:60]}; allowed is UTF-8, save it so and "
-            'declare encoding="utf-8"'
+            'declare encoding="utf-8"',
+            code="encoding",
         )
     if "<!DOCTYPE" in document:
-        raise OutsideError("has a document type (<!DOCTYPE>); remove it")
+        raise OutsideError("has a document type (<!DOCTYPE>); remove it", code="document-type")
     return document
 
 
@@ -146,15 +148,17 @@ def json_value(content: bytes) -> Any:
     count = sum(content.count(mark) for mark in (b",", b"[", b"{"))
     # Quotation marks within texts count as well, so there may be more of them.
     if count > MAX_JSON_VALUES or content.count(b'"') > 8 * MAX_JSON_VALUES:
-        raise OutsideError(f"holds more than {MAX_JSON_VALUES} values, which is the limit")
+        raise OutsideError(
+            f"holds more than {MAX_JSON_VALUES} values, which is the limit", code="too-many-values"
+        )
     found = text(content)
     depth = _json_depth(found)
     if depth > MAX_NESTING:
-        raise OutsideError(f"nested {depth} deep; allowed is {MAX_NESTING}")
+        raise OutsideError(f"nested {depth} deep; allowed is {MAX_NESTING}", code="too-deep")
     try:
         value = json.loads(found, parse_constant=_refuse_constant, parse_float=_finite)
     except ValueError as error:
-        raise OutsideError(f"not JSON: {_one_line(error)}") from error
+        raise OutsideError(f"not JSON: {_one_line(error)}", code="not-json") from error
     if _SURROGATE.search(found):
         _refuse_surrogates(value)
     return value
@@ -168,21 +172,23 @@ def toml_tables(content: bytes) -> dict[str, Any]:
     """
     found = text(content)
     if found.startswith("\ufeff"):
-        raise OutsideError("begins with a byte order mark; save it as UTF-8 without one")
+        raise OutsideError(
+            "begins with a byte order mark; save it as UTF-8 without one", code="byte-order-mark"
+        )
     if any(
         _LONG.match(found, *match.span("further"))
         for match in _KEYS_AND_TEXTS.finditer(found)
         if match["further"]
     ):
-        raise OutsideError(f"a key of more than {MAX_NESTING} parts; {_TOO_DEEP}")
+        raise OutsideError(f"a key of more than {MAX_NESTING} parts; {_TOO_DEEP}", code="too-deep")
     try:
         tables = tomllib.loads(found)
     except RecursionError as error:
-        raise OutsideError(_TOO_DEEP) from error
+        raise OutsideError(_TOO_DEEP, code="too-deep") from error
     except ValueError as error:  # also from numbers with too many digits
-        raise OutsideError(f"not valid TOML: {_one_line(error)}") from error
+        raise OutsideError(f"not valid TOML: {_one_line(error)}", code="not-toml") from error
     if _depth(tables) > MAX_NESTING:
-        raise OutsideError(_TOO_DEEP)
+        raise OutsideError(_TOO_DEEP, code="too-deep")
     return tables
 
 
@@ -204,16 +210,19 @@ def _opened(path: Path) -> Iterator[int]:
         finally:
             os.close(handle)
     except (OSError, ValueError) as error:
-        raise OutsideError(f"cannot be read ({_reason(error)})") from error
+        raise OutsideError(f"cannot be read ({_reason(error)})", code="unreadable") from error
 
 
 def _require_regular(found: os.stat_result, most: int) -> None:
     if not stat.S_ISREG(found.st_mode):
         kind = next((name for test, name in _KINDS if test(found.st_mode)), "no regular file")
-        raise OutsideError(f"cannot be read (it is {kind}); allowed is a regular file")
+        raise OutsideError(
+            f"cannot be read (it is {kind}); allowed is a regular file", code="no-regular-file"
+        )
     if found.st_size > most:
         raise OutsideError(
-            f"is too large ({megabytes(found.st_size)}); allowed are {megabytes(most)}"
+            f"is too large ({megabytes(found.st_size)}); allowed are {megabytes(most)}",
+            code="too-large",
         )
 
 
@@ -225,7 +234,7 @@ def _content(handle: int, most: int) -> bytes:
     while len(content) <= most and (part := os.read(handle, min(found.st_size + 1, 2**24))):
         content += part
     if len(content) > most:
-        raise OutsideError(f"is too large; allowed are {megabytes(most)}")
+        raise OutsideError(f"is too large; allowed are {megabytes(most)}", code="too-large")
     return bytes(content)
 
 
@@ -280,7 +289,8 @@ def _refuse_surrogates(value: Any) -> None:
                 one.encode("utf-8")
             except UnicodeEncodeError as error:
                 raise OutsideError(
-                    f"the text {ascii(one)[:60]} holds half a surrogate pair; write the character"
+                    f"the text {ascii(one)[:60]} holds half a surrogate pair; write the character",
+                    code="half-surrogate",
                 ) from error
 
 

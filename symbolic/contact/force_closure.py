@@ -272,7 +272,8 @@ def derive_grasp_numbers(workcell: Workcell, reach: float = 1.0) -> GraspNumbers
     if squeeze is None:
         raise SettingsError(
             "the pads do not close their grasp: no internal squeeze lies within their friction "
-            "cones; raise the friction or turn them towards one another"
+            "cones; raise the friction or turn them towards one another",
+            code="no-grasp",
         )
     # The least-norm states that balance a load, inside the cones or not.
     whole, in_units = (np.hstack(balance_maps(cell, units)) for units in (False, True))

@@ -42,7 +42,7 @@ def require_squeeze(workcell: Workcell, purpose: str) -> None:
         SettingsError: the arms do not press the payload between them.
     """
     if problem := squeeze_problem(workcell, purpose):
-        raise SettingsError(problem)
+        raise SettingsError(problem, code="needs-pads")
 
 
 def command_model(workcell: Workcell) -> ContactModel:

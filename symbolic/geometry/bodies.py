@@ -141,7 +141,9 @@ def collision_bodies(
     counts = Counter(body.name for body in bodies)
     repeated = sorted(name for name, count in counts.items() if count > 1)
     if repeated:
-        raise CollisionModelError(f"collision bodies share the name(s) {repeated}; rename them")
+        raise CollisionModelError(
+            f"collision bodies share the name(s) {repeated}; rename them", code="same-name"
+        )
     return tuple(bodies)
 
 
@@ -181,7 +183,8 @@ def _check_effort(bodies: list[CollisionBody], most_pieces: int) -> None:
         raise CollisionModelError(
             f"the cell's bodies have {pieces} convex pieces, {len(largest.pieces)} of them "
             f"{largest.name!r}; allowed are {most_pieces}: simplify the meshes, or raise "
-            "collision.most_pieces in the workcell file and wait"
+            "collision.most_pieces in the workcell file and wait",
+            code="too-many-pieces",
         )
     corners = {body.name: sum(map(_corners, body.pieces)) for body in bodies}
     if sum(corners.values()) > MOST_CORNERS:
@@ -189,7 +192,8 @@ def _check_effort(bodies: list[CollisionBody], most_pieces: int) -> None:
         raise CollisionModelError(
             f"the convex pieces of the cell's meshes have {sum(corners.values())} corners, "
             f"{corners[name]} of them {name!r}; allowed are {MOST_CORNERS}: simplify the meshes "
-            "for collision checking"
+            "for collision checking",
+            code="too-many-corners",
         )
 
 
@@ -272,7 +276,8 @@ def _located(mesh: UrdfMesh, robot: Robot, owner: str) -> Mesh:
     if path is None:
         looked = ", ".join(map(str, robot.package_dirs)) or "none given"
         raise CollisionModelError(
-            f"{owner}: mesh {shown(mesh.address)} not found; package folders looked in: {looked}"
+            f"{owner}: mesh {shown(mesh.address)} not found; package folders looked in: {looked}",
+            code="mesh-not-found",
         )
     return Mesh(path, mesh.scale)
 
@@ -308,7 +313,8 @@ class MeshReader:
             if faces > MOST_CELL_FACES:
                 raise CollisionModelError(
                     f"{mesh.path}: with its {found.faces} triangles the cell's meshes have "
-                    f"{faces}; allowed are {MOST_CELL_FACES} together: simplify the largest"
+                    f"{faces}; allowed are {MOST_CELL_FACES} together: simplify the largest",
+                    code="too-many-triangles",
                 )
             self.known[key] = found
         return self.known[key].hulls

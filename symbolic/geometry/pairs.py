@@ -283,7 +283,8 @@ def _check_tools(bodies: tuple[CollisionBody, ...], arms: tuple[ArmGeometry, Arm
             raise CollisionModelError(
                 f"the tool part {body.name!r} enters the payload by more than "
                 f"{1e3 * MOST_ENTERED:g} mm where the robot holds it; move or shorten the part, or "
-                "move the pad's frame to its tip (robots.pad)"
+                "move the pad's frame to its tip (robots.pad)",
+                code="tool-in-payload",
             )
 
 
@@ -378,7 +379,8 @@ def ignored_pairs(
             if not found:
                 raise CollisionModelError(
                     f"collision.ignored names {pattern!r}; the bodies are "
-                    f"{', '.join(sorted(names))}"
+                    f"{', '.join(sorted(names))}",
+                    code="unknown-body",
                 )
             sides.append(found)
         for first in sides[0]:

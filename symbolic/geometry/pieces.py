@@ -95,13 +95,15 @@ def check_piece(piece: Piece, owner: str) -> None:
             raise CollisionModelError(
                 f"{owner}: {type(shape).__name__.lower()} {name} is {value:g} m; "
                 f"every extent of a collision shape must be at least {SMALLEST_SIZE:g} m: "
-                "correct the size or remove the shape"
+                "correct the size or remove the shape",
+                code="extent",
             )
     R = piece.rotation
     if not np.all(np.isfinite(piece.pose)) or not np.allclose(R.T @ R, np.eye(3), atol=1e-9):
         raise CollisionModelError(
             f"{owner}: the pose of a {type(shape).__name__.lower()} is not a rotation and a "
-            "finite translation; correct the pose"
+            "finite translation; correct the pose",
+            code="pose",
         )
 
 
@@ -242,7 +244,8 @@ def contains(cover: Piece, piece: Piece, tolerance: float = 1e-12) -> bool:
         case _:
             raise CollisionModelError(
                 f"containment in a {type(cover.shape).__name__.lower()} cannot be proven; "
-                "cover with boxes and spheres"
+                "cover with boxes and spheres",
+                code="containment",
             )
 
 

@@ -44,13 +44,15 @@ def chain_joints(urdf: Urdf, root: str, tip: str) -> tuple[str, ...]:
         if link not in links:
             raise RobotModelError(
                 f"found {link!r}, no link of {urdf.file}"
-                f"{suggestion(link, links) or f'; it has {listed(links)}'}"
+                f"{suggestion(link, links) or f'; it has {listed(links)}'}",
+                code="unknown-link",
             )
     way = list(urdf.above(tip))
     ends = [tip, *(urdf.joints[name].parent for name in way)]
     if root not in ends:
         raise RobotModelError(
-            f"{tip!r} does not hang on {root!r}; allowed are two links one behind the other"
+            f"{tip!r} does not hang on {root!r}; allowed are two links one behind the other",
+            code="not-connected",
         )
     below = way[: ends.index(root)]
     return tuple(name for name in reversed(below) if urdf.joints[name].kind != "fixed")
@@ -76,12 +78,15 @@ def held_joints(urdf: Urdf, moving: Sequence[str], locked: Positions) -> Positio
     for name in given:
         if name not in free:
             hint = suggestion(name, free) or f"; it has {listed(free)}"
-            raise RobotModelError(f"no moving joint {name!r} in {urdf.file}{hint}")
+            raise RobotModelError(
+                f"no moving joint {name!r} in {urdf.file}{hint}", code="unknown-joint"
+            )
     for name in moving:
         if urdf.joints[name].mimics:
             raise RobotModelError(
                 f"joint {name!r} of the chain mimics {urdf.joints[name].mimics!r}; allowed are "
-                "joints that move by themselves"
+                "joints that move by themselves",
+                code="mimicking-joint",
             )
 
     def position(name: str) -> float:
@@ -96,7 +101,8 @@ def held_joints(urdf: Urdf, moving: Sequence[str], locked: Positions) -> Positio
         if joint.mimics in moving:
             raise RobotModelError(
                 f"joint {name!r} mimics {joint.mimics!r}, which moves; hold it (locked_joints) or "
-                "drop its links (drop_links)"
+                "drop its links (drop_links)",
+                code="mimics-moving-joint",
             )
         return joint.multiplier * position(joint.mimics) + joint.offset
 
@@ -146,13 +152,18 @@ def without_links(urdf: Urdf, patterns: tuple[str, ...]) -> Urdf:
         found = matching(pattern, urdf.links)
         if not found:
             hint = suggestion(pattern, urdf.links) or f"; it has {listed(urdf.links)}"
-            raise RobotModelError(f"found {pattern!r}, which matches no link of {urdf.file}{hint}")
+            raise RobotModelError(
+                f"found {pattern!r}, which matches no link of {urdf.file}{hint}",
+                code="unknown-link",
+            )
         dropped.update(found)
     for link in urdf.links:
         if any(urdf.joints[name].parent in dropped for name in urdf.above(link)):
             dropped.add(link)
     if len(dropped) == len(urdf.links):
-        raise RobotModelError(f"every link of {urdf.file} would be dropped; keep the arm")
+        raise RobotModelError(
+            f"every link of {urdf.file} would be dropped; keep the arm", code="no-link-left"
+        )
     joints = {name: joint for name, joint in urdf.joints.items() if joint.child not in dropped}
     tree = ElementTree.fromstring(urdf.kinematics)
     for element in list(tree):

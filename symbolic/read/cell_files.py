@@ -89,7 +89,8 @@ def _collected(
     if current.digest != digest:
         raise BundleError(
             f"{source.name} does not describe the workcell in memory (it was changed after "
-            "reading); store trajectories of a workcell as its file has it"
+            "reading); store trajectories of a workcell as its file has it",
+            code="changed-in-memory",
         )
     collector = CellCollector(source, text)
     collector.collect(current)
@@ -125,7 +126,7 @@ def unpack_cell(stored: CellFiles, folder: Path, check_digest: bool = True) -> W
     with _as_bundle_errors("the stored workcell is not valid:"):
         workcell = load(root / stored.workcell, stored=True)
     if check_digest and workcell.digest != stored.digest:
-        raise BundleError("the stored workcell's digest does not match its files")
+        raise BundleError("the stored workcell's digest does not match its files", code="digest")
     return workcell
 
 
@@ -172,7 +173,7 @@ def cell_from_json(data: Any) -> CellFiles:
     try:
         stored: StoredFiles = checked(StoredFiles, data, "cell", FirstProblem())
     except ValueError as error:
-        raise BundleError(str(error)) from error
+        raise BundleError(str(error), code="field") from error
     for name in ("files", "folders"):
         if len(getattr(stored, name)) > MAX_FILES:
             raise BundleError(f"cell.{name}: expected at most {MAX_FILES}")
@@ -207,18 +208,23 @@ def _unpacked(entry: StoredFile, where: str, room: int) -> bytes:
             # The limit keeps a small file from unfolding into a huge one.
             content = zlib.decompressobj().decompress(packed, room + 1)
     except (ValueError, zlib.error) as error:
-        raise BundleError(f"{where}.content: cannot be decoded ({error})") from error
+        raise BundleError(
+            f"{where}.content: cannot be decoded ({error})", code="not-decodable"
+        ) from error
     if len(content) > room:
-        raise BundleError(f"{where}: the files exceed {MAX_TOTAL_BYTES // 2**20} MiB unpacked")
+        raise BundleError(
+            f"{where}: the files exceed {MAX_TOTAL_BYTES // 2**20} MiB unpacked", code="too-large"
+        )
     if hashlib.sha256(content).hexdigest() != entry.sha256:
-        raise BundleError(f"{where}: the content of {shown(entry.path)} is damaged")
+        raise BundleError(f"{where}: the content of {shown(entry.path)} is damaged", code="damaged")
     return content
 
 
 def _check_name(name: str, key: str) -> None:
     if not _is_plain(name) or ".." in name.split("/"):
         raise BundleError(
-            f"{key}: stored path {shown(name)} is not allowed; only plain relative paths are"
+            f"{key}: stored path {shown(name)} is not allowed; only plain relative paths are",
+            code="path",
         )
 
 
@@ -232,14 +238,18 @@ def _check_references(stored: CellFiles, root: Path) -> None:
     for reference, package_dirs in references(parse_toml(stored.files[stored.workcell])):
         target = joined(base, reference)
         if target not in stored.files:
-            raise BundleError(f"the stored workcell names {shown(reference)}, which is not stored")
+            raise BundleError(
+                f"the stored workcell names {shown(reference)}, which is not stored",
+                code="not-stored",
+            )
         if package_dirs is None:
             continue
         folders = [joined(base, entry) for entry in package_dirs]
         with _as_bundle_errors(f"the stored {shown(target)} is not valid:"):
             if is_xacro(stored.files[target]):
                 raise OutsideError(
-                    "holds xacro macros, which are never expanded from a stored cell"
+                    "holds xacro macros, which are never expanded from a stored cell",
+                    code="xacro-macros",
                 )
             if is_mjcf(stored.files[target]):
                 raise OutsideError("is MJCF, which a stored cell holds as URDF")
@@ -249,7 +259,8 @@ def _check_references(stored: CellFiles, root: Path) -> None:
             bases = folders if address.startswith("package://") else [posixpath.dirname(target)]
             if any(f"{joined(folder, relative)}/".startswith(("/", "../")) for folder in bases):
                 raise BundleError(
-                    f"the stored {shown(target)} names {shown(address)}, not stored with it"
+                    f"the stored {shown(target)} names {shown(address)}, not stored with it",
+                    code="not-stored",
                 )
 
 
@@ -424,7 +435,9 @@ def references(data: Mapping[str, Any]) -> Iterator[tuple[str, list[str] | None]
         yield from _meshes(data.get("environment", []))
         yield from _meshes([data.get("payload", {})])
     except (KeyError, TypeError, AttributeError) as error:
-        raise BundleError(f"the stored workcell lacks or misuses the key {error}") from error
+        raise BundleError(
+            f"the stored workcell lacks or misuses the key {error}", code="missing-key"
+        ) from error
 
 
 def _meshes(bodies: Any) -> Iterator[tuple[str, None]]:

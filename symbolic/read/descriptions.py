@@ -204,7 +204,8 @@ def description_content(
     if expanded is None:
         raise OutsideError(
             f"takes longer than {CPU_SECONDS} s to be expanded; does a macro call itself, or an "
-            "expression count too far?"
+            "expression count too far?",
+            code="too-slow",
         )
     return expanded
 
@@ -260,7 +261,7 @@ def _expanded(
     if answer is None:
         return None, ()
     if "refused" in answer:
-        raise OutsideError(answer["refused"])
+        raise OutsideError(answer["refused"], code=answer["code"])
     return answer["urdf"].encode(), _state(answer["included"])
 
 
@@ -287,7 +288,8 @@ def _answer(request: Any) -> Any:
             return json.loads(answer.read())
         except ValueError as error:
             raise OutsideError(
-                f"holds xacro macros that cannot be expanded: their process ended with code {code}"
+                f"holds xacro macros that cannot be expanded: their process ended with code {code}",
+                code="not-expandable",
             ) from error
 
 
@@ -330,7 +332,8 @@ def main() -> int:
     try:
         found = _expand(xacro, path, request["arguments"], request["package_dirs"])
     except Exception as error:  # a macro may raise anything
-        found = {"refused": _refusal(error, xacro)}
+        refusal = _refusal(error, xacro)
+        found = {"refused": str(refusal), "code": refusal.code}
     json.dump(found, answer)
     answer.flush()
     return 0
@@ -355,7 +358,9 @@ def _refuse_access(event: str, arguments: tuple[Any, ...]) -> None:
     try."""
     writes = event == "open" and isinstance(arguments[2], int) and arguments[2] & _WRITING
     if writes or (event.startswith(_REFUSED) and event not in _LOOKING):
-        raise OutsideError(f"holds an expression that does more than compute ({event})")
+        raise OutsideError(
+            f"holds an expression that does more than compute ({event})", code="not-arithmetic"
+        )
 
 
 def _expand(
@@ -369,7 +374,8 @@ def _expand(
         if package is None:
             raise OutsideError(
                 f"names the package {name!r}, which is not found; name the folder that holds it "
-                "in package_dirs, or set ROS_PACKAGE_PATH or AMENT_PREFIX_PATH"
+                "in package_dirs, or set ROS_PACKAGE_PATH or AMENT_PREFIX_PATH",
+                code="package-not-found",
             )
         found[name] = package
         return str(package)
@@ -383,7 +389,8 @@ def _expand(
     text = document.documentElement.toxml()
     if len(text) > safe_io.URDF_BYTES:
         raise OutsideError(
-            f"expands to more than {safe_io.megabytes(safe_io.URDF_BYTES)}, which is the limit"
+            f"expands to more than {safe_io.megabytes(safe_io.URDF_BYTES)}, which is the limit",
+            code="too-large",
         )
     return {"urdf": text, "included": list(dict.fromkeys(map(str, xacro.all_includes)))}
 
@@ -407,8 +414,8 @@ def _by_package(address: str, packages: Mapping[str, Path]) -> str:
     return address
 
 
-def _refusal(error: BaseException, xacro: Any) -> str:
-    """Describe an error by its causes, with the file and the macro."""
+def _refusal(error: BaseException, xacro: Any) -> OutsideError:
+    """Return the refusal that an error stands for by its causes, with the file and the macro."""
     causes = [error]
     for one in causes:  # an error and those that it was made of
         inner = (getattr(one, "exc", None), one.__cause__, one.__context__)
@@ -416,21 +423,28 @@ def _refusal(error: BaseException, xacro: Any) -> str:
         causes += [cause for cause in new if all(cause is not met for met in causes)]
     for cause in causes:
         if isinstance(cause, OutsideError):
-            return str(cause)
+            return cause
     files = [Path(file).name for file in xacro.filestack or () if file is not None]
     macros = [macro.body.getAttribute("name") for macro in xacro.macrostack or ()]
     where = [f"file {files[-1]}"] if len(files) > 1 else []
     where += [f"macro {macros[-1]}"] if macros else []
     place = f" ({', '.join(where)})" if where else ""
     if any(isinstance(cause, MemoryError) for cause in causes):
-        return f"needs too much memory to be expanded{place}; simplify its expressions and macros"
+        return OutsideError(
+            f"needs too much memory to be expanded{place}; simplify its expressions and macros",
+            code="too-much-memory",
+        )
     if any(isinstance(cause, RecursionError) for cause in causes):
-        return (
+        return OutsideError(
             f"is nested too deeply to be expanded{place}; does a macro call or a file include "
-            "itself?"
+            "itself?",
+            code="too-deep",
         )
     reason = " ".join(str(error).split()) or type(error).__name__
-    return f"holds xacro macros that cannot be expanded: {reason[:300]}{place}"
+    return OutsideError(
+        f"holds xacro macros that cannot be expanded: {reason[:300]}{place}",
+        code="not-expandable",
+    )
 
 
 if __name__ == "__main__":

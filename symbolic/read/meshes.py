@@ -54,7 +54,7 @@ def read_mesh(path: Path, scale: Array) -> trimesh.Trimesh:
 def _sound(mesh: trimesh.Trimesh, scale: Array) -> trimesh.Trimesh:
     """Scale a mesh and check that it is finite, within bounds and not flat."""
     if not np.all(np.isfinite(mesh.vertices)):
-        raise OutsideError("the mesh has vertices that are not finite numbers")
+        raise OutsideError("the mesh has vertices that are not finite numbers", code="not-finite")
     _require_few(len(mesh.faces), MOST_FACES, "triangles")
     with np.errstate(over="ignore"):
         mesh.vertices = np.asarray(mesh.vertices, dtype=float) * (scale * _collada_unit(mesh))
@@ -64,13 +64,15 @@ def _sound(mesh: trimesh.Trimesh, scale: Array) -> trimesh.Trimesh:
     if not largest <= LARGEST_EXTENT:
         raise OutsideError(
             f"enormous mesh, {largest:g} m from its origin; at most {LARGEST_EXTENT:g} m is "
-            "allowed: is the file in millimetres? Set its scale"
+            "allowed: is the file in millimetres? Set its scale",
+            code="mesh-too-far",
         )
     extents = np.ptp(mesh.vertices, axis=0)
     if extents.min() < SMALLEST_SIZE:
         raise OutsideError(
             f"the mesh is flat, extents {np.round(extents, 9).tolist()} m; give it a thickness or "
-            "use a box"
+            "use a box",
+            code="flat-mesh",
         )
     mesh.merge_vertices()
     return mesh
@@ -80,7 +82,8 @@ def _require_few(count: int, most: int, meaning: str) -> None:
     if count > most:
         raise OutsideError(
             f"enormous mesh, {count} {meaning}; at most {most} are allowed: simplify it for "
-            "collision checking"
+            "collision checking",
+            code="mesh-too-large",
         )
 
 
@@ -89,7 +92,8 @@ def _read(path: Path) -> trimesh.Trimesh:
     kind = path.suffix.lower().removeprefix(".")
     if kind not in FORMATS:
         raise OutsideError(
-            f"cannot be read as a mesh; allowed are the formats {', '.join(FORMATS)}"
+            f"cannot be read as a mesh; allowed are the formats {', '.join(FORMATS)}",
+            code="mesh-format",
         )
     try:
         content = safe_io.read_bytes(path, safe_io.MESH_BYTES)
@@ -112,10 +116,11 @@ def _read(path: Path) -> trimesh.Trimesh:
     except Exception as error:  # trimesh raises whatever its many readers raise
         said = (str(error).splitlines() or [type(error).__name__])[0][:200]
         raise OutsideError(
-            f"cannot be read as a mesh ({said}); give an STL, DAE, OBJ or PLY file"
+            f"cannot be read as a mesh ({said}); give an STL, DAE, OBJ or PLY file",
+            code="mesh-format",
         ) from error
     if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
-        raise OutsideError("the mesh is empty; export triangles")
+        raise OutsideError("the mesh is empty; export triangles", code="empty-mesh")
     corners = mesh.vertices.shape[1:] == (3,) and mesh.faces.shape[1:] == (3,)
     if not corners or mesh.faces.min() < 0 or mesh.faces.max() >= len(mesh.vertices):
         raise OutsideError("the mesh is not made of triangles with three corners of its own")

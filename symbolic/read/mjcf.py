@@ -32,7 +32,7 @@ def compiled(path: Path) -> Any:
     try:
         import mujoco
     except ImportError as error:
-        raise OutsideError(NO_READER) from error
+        raise OutsideError(NO_READER, code="missing-extra") from error
     try:
         spec = mujoco.MjSpec.from_file(str(path))
         return mujoco, spec, spec.compile()

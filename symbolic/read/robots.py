@@ -443,7 +443,7 @@ def named_robot(name: str) -> NamedRobot:
         OutsideError: none has that name, a package is missing, or the download failed.
     """
     if not _ROBOT_NAME.fullmatch(name):
-        raise OutsideError("is no name; allowed are letters, digits, '_' and '-'")
+        raise OutsideError("is no name; allowed are letters, digits, '_' and '-'", code="no-name")
     return _downloaded(name) if name.endswith("_description") else _installed(name)
 
 
@@ -463,7 +463,7 @@ def _installed(name: str) -> NamedRobot:
             if named
             else suggestion(name, known) or f"; {FILES} has {', '.join(known)}"
         )
-        raise OutsideError(f"is the name of no description{meant}")
+        raise OutsideError(f"is the name of no description{meant}", code="unknown-description")
     return NamedRobot(path, (), (folder.parent,))
 
 
@@ -481,7 +481,8 @@ def _downloaded(name: str) -> NamedRobot:
     if find_spec(f"{MODULES}.{name}") is None:
         raise OutsideError(
             f"is the name of no description of {MODULES}{suggestion(name, _modules())}; "
-            f"python -m {MODULES} list shows all"
+            f"python -m {MODULES} list shows all",
+            code="unknown-description",
         )
     try:
         with redirect_stdout(sys.stderr):  # it tells what it clones
@@ -489,7 +490,8 @@ def _downloaded(name: str) -> NamedRobot:
     except Exception as error:  # of git, of the network, of the file system
         reason = " ".join(str(error).split())[-300:]
         raise OutsideError(
-            f"cannot be downloaded; is the network reachable, and git installed? ({reason})"
+            f"cannot be downloaded; is the network reachable, and git installed? ({reason})",
+            code="no-download",
         ) from error
     found = [getattr(module, f"{kind}_PATH", None) for kind in ("URDF", "XACRO", "MJCF")]
     path = next(filter(None, found), None)

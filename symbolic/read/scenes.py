@@ -58,7 +58,9 @@ def read_scene(path: Path) -> ImportedScene:
         told = "".join(f"\n  - {problem}" for problem in found.problems.messages())
         raise SceneError(f"{path.name}: cannot be read as a scene{told}")
     if not found.bodies and not found.left_out:
-        raise SceneError("; ".join([f"{path.name}: holds no obstacle", *found.notes[:5]]))
+        raise SceneError(
+            "; ".join([f"{path.name}: holds no obstacle", *found.notes[:5]]), code="no-obstacle"
+        )
     return ImportedScene(
         tuple(found.bodies), tuple(found.left_out), tuple(found.notes), found.files
     )

@@ -25,6 +25,7 @@ from codegen.function import Signature
 from codegen.parts import PIECE, in_parts, in_pieces
 from codegen.source import c_source, dense, generated_c, handwritten_source
 from tests.codegen.samples import ASKED, odd_compiler, square
+from tests.refusals import refused
 from tests.waiting import HANGS, soon, until
 
 
@@ -161,12 +162,12 @@ def test_without_a_compiler_nothing_is_made(cache: Cache, monkeypatch: pytest.Mo
         raise AssertionError("made before the compiler was looked for")
 
     monkeypatch.setenv("CC", "gcc '-O2")
-    with pytest.raises(CodegenError, match=r"CC holds .* which is no command"):
+    with refused(CodegenError, "no-command", "gcc '-O2"):
         compile_function(functions()["norm"], cache)
     monkeypatch.setenv("CC", "/missing/cc")
-    with pytest.raises(CodegenError, match=r"no C compiler .*CC names '/missing/cc'"):
+    with refused(CodegenError, "no-compiler", "/missing/cc"):
         load_or_build("cell", refuse, cache)
-    with pytest.raises(CodegenError, match="apt install"):
+    with refused(CodegenError, "no-compiler", "apt install"):
         compile_function(functions()["norm"], cache)
     assert not cache.folder.exists()
 
@@ -186,7 +187,7 @@ def test_compilers_are_tried_in_order(tmp_path: Path, monkeypatch: pytest.Monkey
     compiler._find.cache_clear()
     for cc in ("", "   "):
         monkeypatch.setenv("CC", cc)
-        with pytest.raises(CodegenError, match=r"no C compiler .* cc, gcc, clang and the package"):
+        with refused(CodegenError, "no-compiler", "cc, gcc, clang"):
             find_compiler()
 
 
@@ -204,7 +205,7 @@ def test_the_compiler_of_a_package_is_found_last_and_works(
         assert compiled(np.full(4, 1.5))["y"] == 3.0
     # Without the flag a part at -O0 needs handlers that nobody links.
     bare = replace(found, command=found.command[:-1])
-    with pytest.raises(CodegenError, match=r"at -O1 that cannot be loaded: .*ubsan"):
+    with refused(CodegenError, "not-loadable", "-O1", "ubsan"):
         bare.self_test(tmp_path)
     monkeypatch.setenv("CC", f"{sys.executable} -m ziglang cc")
     assert find_compiler() == found
@@ -219,26 +220,31 @@ FULL = 'echo "cc1: fatal error: No space left on device" >&2\nexit 1\n'
 
 
 @pytest.mark.parametrize(
-    ("script", "words"),
+    ("script", "code", "quoted"),
     [
-        ("exit 0\n", "reported success but made no library"),
-        (OUTPUT + ': > "$2"\n', "reported success but made no library"),
-        (OUTPUT + 'echo nonsense > "$2"\n', r"a library at -O0 that cannot be loaded: .*too short"),
-        (OUTPUT + 'cp /bin/ls "$2"\n', r"a library at -O0 that cannot be loaded: .*position"),
-        (WRONG, r"makes wrong code at -O0: a sum is 2470\.0 in place of 190\.0"),
-        ("kill -9 $$\n", "was ended by signal 9"),
-        ("exit 3\n", r"failed at part_0\.c: no message"),
-        (FULL, r"part_0\.c: cc1: .*No space left on device; "),
-        (SMALL + OUTPUT + 'echo nonsense > "$2"\n', "the compiled library cannot be loaded"),
-        (f"{SMALL}exit 3\n", r"failed at square\.c: no message"),
+        ("exit 0\n", "no-library", "part_0.c"),
+        (OUTPUT + ': > "$2"\n', "no-library", "part_0.c"),
+        (OUTPUT + 'echo nonsense > "$2"\n', "not-loadable", "-O0"),
+        (OUTPUT + 'cp /bin/ls "$2"\n', "not-loadable", "-O0"),
+        (WRONG, "wrong-code", "2470.0"),
+        ("kill -9 $$\n", "compiler-failed", "signal 9"),
+        ("exit 3\n", "compiler-failed", "part_0.c"),
+        (FULL, "compiler-failed", "No space left on device"),
+        (SMALL + OUTPUT + 'echo nonsense > "$2"\n', "not-loadable", "square"),
+        (f"{SMALL}exit 3\n", "compiler-failed", "square.c"),
     ],
 )
 def test_a_compiler_that_fails_lies_or_dies_is_told(
-    cache: Cache, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, script: str, words: str
+    cache: Cache,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    script: str,
+    code: str,
+    quoted: str,
 ) -> None:
     odd_compiler(tmp_path, monkeypatch, ASKED + script)
     for _ in range(2):  # nothing of it may be taken for a library the second time
-        with pytest.raises(CodegenError, match=words) as told:
+        with refused(CodegenError, code, quoted) as told:
             build(square(), cache)
         assert "\n" not in str(told.value)
     monkeypatch.delenv("CC")
@@ -250,7 +256,7 @@ def test_a_compiler_that_hangs_is_ended(
 ) -> None:
     monkeypatch.setattr("codegen.compiler.MOST_SECONDS", 0.5)
     odd_compiler(tmp_path, monkeypatch, f"{ASKED}{SMALL}exec sleep 60\n")
-    with soon(), pytest.raises(CodegenError, match=r"took longer than 0\.5 s over square\.c"):
+    with soon(), refused(CodegenError, "compiler-hangs", "0.5 s", "square.c"):
         build(square(), cache)
 
 

@@ -29,6 +29,7 @@ from codegen.interpreted import (
 )
 from symbolic.array import Array
 from tests.codegen.samples import random_function, small
+from tests.refusals import refused
 
 Make = Callable[[ca.Function], NumericFunction]
 
@@ -104,9 +105,9 @@ def test_a_prepared_batch_equals_a_batch_to_the_bit(make: Make) -> None:
     assert prepared() is found
     assert not own[:2].any()
     assert not own[13:].any()
-    with pytest.raises(CodegenError, match="room for 11"):
+    with refused(CodegenError, "too-many-evaluations", 11):
         prepared(12)
-    with pytest.raises(CodegenError, match="matrix"):
+    with refused(CodegenError, "wrong-array", "matrix"):
         function.prepared(4, ["vector"], {"matrix": matrices[rows]})
 
 
@@ -179,32 +180,32 @@ def test_any_layout_is_taken(make: Make) -> None:
 VECTOR, MATRIX, LOCKED = np.zeros(3), np.zeros((4, 2)), np.zeros((5, 4, 2))
 LOCKED.flags.writeable = False
 WRONG: list[tuple[tuple[Any, ...], str]] = [
-    ((VECTOR,), "1 inputs given, 2 needed: x, y"),
-    ((np.zeros(4), MATRIX), r"'x' has shape \(4,\), needed is \(3,\)"),
-    ((VECTOR, np.zeros((2, 4))), r"'y' has shape \(2, 4\), needed is \(4, 2\)"),
-    ((np.zeros(3, complex), MATRIX), "'x' is not an array of real numbers"),
-    ((["a", "b", "c"], MATRIX), "'x' is not an array of real numbers"),
-    (([[1.0], [1.0, 2.0], []], MATRIX), "'x' is not an array of real numbers"),
+    ((VECTOR,), "input-count"),
+    ((np.zeros(4), MATRIX), "input-shape"),
+    ((VECTOR, np.zeros((2, 4))), "input-shape"),
+    ((np.zeros(3, complex), MATRIX), "input-type"),
+    ((["a", "b", "c"], MATRIX), "input-type"),
+    (([[1.0], [1.0, 2.0], []], MATRIX), "input-type"),
 ]
 WRONG_BATCHES: list[tuple[tuple[Array, Array], int, str]] = [
-    ((VECTOR, MATRIX), 1, "no input has a leading axis"),
-    ((np.zeros((5, 3)), np.zeros((6, 4, 2))), 1, "'y' has 6 candidates, an input before it 5"),
-    ((np.zeros((5, 4)), MATRIX), 1, "has shape"),
-    ((np.zeros((5, 3)), MATRIX), -1, "threads is -1"),
+    ((VECTOR, MATRIX), 1, "no-leading-axis"),
+    ((np.zeros((5, 3)), np.zeros((6, 4, 2))), 1, "candidate-count"),
+    ((np.zeros((5, 4)), MATRIX), 1, "input-shape"),
+    ((np.zeros((5, 3)), MATRIX), -1, "threads"),
 ]
 
 
 def test_wrong_inputs_batches_and_memory_are_told(make: Make) -> None:
     function = make(small())
-    for inputs, message in WRONG:
-        with pytest.raises(CodegenError, match=message):
+    for inputs, code in WRONG:
+        with refused(CodegenError, code):
             function(*inputs)
-    for batches, threads, message in WRONG_BATCHES:
-        with pytest.raises(CodegenError, match=message):
+    for batches, threads, code in WRONG_BATCHES:
+        with refused(CodegenError, code):
             function.batch(*batches, threads=threads)
     wrong: Any
     for wrong in (LOCKED, LOCKED.astype(np.float32), np.empty((5, 4, 4))[:, :, ::2], np.empty(40)):
-        with pytest.raises(CodegenError, match="needed is C-contiguous writable float64"):
+        with refused(CodegenError, "wrong-array", "'a'"):
             function.prepared(5, given={"a": wrong})
 
 

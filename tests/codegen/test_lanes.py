@@ -14,7 +14,7 @@ from codegen import compiled as compiled_module
 from codegen.build import build, compile_function, load_or_build, load_or_build_program
 from codegen.cache import Cache
 from codegen.compiled import CompiledFunction
-from codegen.errors import CodegenError
+from codegen.errors import FormError
 from codegen.lanes import FORMS, KEPT_FORMS, lane_text
 from symbolic.array import Array
 from tests.codegen.samples import odd_compiler, random_function
@@ -127,10 +127,10 @@ def test_what_has_no_form_in_lanes_is_told(cache: Cache, monkeypatch: pytest.Mon
     q = ca.MX.sym("q")
     function = ca.Function("root", [q], [finder(x0=1.0, p=q)["x"]], ["q"], ["root"])
     monkeypatch.setattr(compiled_module, "_warned", False)
-    with pytest.warns(RuntimeWarning, match=r"no form in lanes: `.*`; .* lanes=1"):
+    with pytest.warns(RuntimeWarning, match="lanes=1"):
         made = compile_function(function, cache, lanes=0)
     assert made.lanes == 1
-    with pytest.raises(CodegenError, match="no form in lanes"):
+    with pytest.raises(FormError):
         load_or_build_program("root", "root", lambda: {"root": function}, "", cache)
     np.testing.assert_allclose(made.batch(np.array([4.0, 9.0]))["root"], [2.0, 3.0])
 
@@ -146,13 +146,13 @@ def test_every_form_is_taken_and_none_beside_them(example: str) -> None:
 
     assert "own_f0" in lane_text(text(example), "own").text
     for unknown in (f"{example} a0=(a0>a1);", f"{example} casadi_qp(w1);"):
-        with pytest.raises(CodegenError, match="no form in lanes") as told:
+        with pytest.raises(FormError) as told:
             lane_text(text(unknown), "own")
         assert unknown in str(told.value)
 
 
 def test_a_text_without_an_entry_is_told() -> None:
-    with pytest.raises(CodegenError, match="called from outside"):
+    with pytest.raises(FormError):
         lane_text("int main(void) { return 0; }\n", "own")
 
 

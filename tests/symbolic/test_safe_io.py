@@ -20,6 +20,7 @@ from hypothesis import strategies as st
 from symbolic import safe_io
 from symbolic.errors import OutsideError
 from symbolic.safe_io import replace_file
+from tests.refusals import refused
 from tests.waiting import soon
 
 MOST = 1000
@@ -41,14 +42,14 @@ def test_the_limit_is_exact(tmp_path: Path) -> None:
     assert len(safe_io.read_bytes(path, MOST)) == MOST
     path.write_bytes(b"x" * (MOST + 1))
     for refuse in (safe_io.read_bytes, safe_io.require):
-        with pytest.raises(OutsideError, match=r"is too large .* allowed are"):
+        with refused(OutsideError, "too-large"):
             refuse(path, MOST)
 
 
 def test_a_file_that_hides_its_size_is_read_no_further() -> None:
     maps = Path("/proc/self/maps")
     assert maps.stat().st_size == 0
-    with pytest.raises(OutsideError, match="is too large"):
+    with refused(OutsideError, "too-large"):
         safe_io.read_bytes(maps, 10)
     assert safe_io.read_bytes(maps, 10_000_000)
 
@@ -59,20 +60,20 @@ def test_what_is_no_regular_file_is_refused_at_once(tmp_path: Path) -> None:
         listening.bind(str(tmp_path / "socket"))
         (tmp_path / "loop").symlink_to(tmp_path / "loop")
         odd = [
-            (tmp_path / "pipe", "it is a pipe"),
-            (Path("/dev/zero"), "it is a device"),
-            (tmp_path, "it is a folder"),
-            (tmp_path / "socket", "No such device"),
-            (tmp_path / "loop", "symbolic links|Symlink loop"),
-            (tmp_path / "gone", "No such file"),
-            (tmp_path / ("x" * 5000), "File name too long"),
-            (tmp_path / "a\0b", "null byte"),
+            (tmp_path / "pipe", "no-regular-file"),
+            (Path("/dev/zero"), "no-regular-file"),
+            (tmp_path, "no-regular-file"),
+            (tmp_path / "socket", "unreadable"),
+            (tmp_path / "loop", "unreadable"),
+            (tmp_path / "gone", "unreadable"),
+            (tmp_path / ("x" * 5000), "unreadable"),
+            (tmp_path / "a\0b", "unreadable"),
         ]
-        for path, words in odd:
-            with soon(), pytest.raises(OutsideError, match=rf"cannot be read \(.*{words}"):
+        for path, code in odd:
+            with soon(), refused(OutsideError, code):
                 safe_io.read_bytes(path, MOST)
     for path in (tmp_path / "loop", tmp_path / "gone", tmp_path / ("x" * 5000)):
-        with pytest.raises(OutsideError, match="cannot be read"):
+        with refused(OutsideError, "unreadable"):
             safe_io.resolved(path)
 
 
@@ -113,45 +114,45 @@ def test_the_depth_is_that_of_the_value(value: Any) -> None:
     for _ in range(safe_io.MAX_NESTING - depth(value)):
         nested = [nested]
     assert safe_io.json_value(json.dumps(nested).encode()) == nested
-    with pytest.raises(OutsideError, match="nested 51 deep; allowed is 50"):
+    with refused(OutsideError, "too-deep", 51, 50):
         safe_io.json_value(json.dumps([nested]).encode())
 
 
 JSON: list[tuple[bytes, str]] = [
-    (b"", "not JSON"),
-    (b"{", "not JSON"),
-    (b"NaN", "NaN is no JSON number"),
-    (b"[1e400]", "1e400 is no finite number"),
-    (b"-Infinity", "no JSON number"),
-    (b"9" * 5000, "whole number of more than 4300 digits"),
-    (b'"\\ud800"', "half a surrogate pair"),
-    (b'{"\\udfff": 1}', "half a surrogate pair"),
-    (b'[[{"a": "x\\uD800y"}]]', "half a surrogate pair"),
-    (b"[" * 100_000, "nested 100000 deep"),
-    (b"[" + b"0," * safe_io.MAX_JSON_VALUES + b"0]", "more than 1000000 values"),
-    (b"[" + b'"",' * 100 + b'"\xff"]', "byte 302 is not UTF-8"),
+    (b"", "not-json"),
+    (b"{", "not-json"),
+    (b"NaN", "not-json"),
+    (b"[1e400]", "not-json"),
+    (b"-Infinity", "not-json"),
+    (b"9" * 5000, "not-json"),
+    (b'"\\ud800"', "half-surrogate"),
+    (b'{"\\udfff": 1}', "half-surrogate"),
+    (b'[[{"a": "x\\uD800y"}]]', "half-surrogate"),
+    (b"[" * 100_000, "too-deep"),
+    (b"[" + b"0," * safe_io.MAX_JSON_VALUES + b"0]", "too-many-values"),
+    (b"[" + b'"",' * 100 + b'"\xff"]', "not-utf-8"),
 ]
 TOML: list[tuple[bytes, str]] = [
-    (b"a = ", "not valid TOML"),
-    (b"\xef\xbb\xbfa = 1", "byte order mark"),
-    (b"a.b = 1\na = 2", "not valid TOML"),
-    (b"a = " + b"9" * 5000, "whole number of more than 4300 digits"),
-    (b"a = " + b"[" * 100_000, "nested too deeply"),
-    (b"a = " + b"[" * 60 + b"]" * 60, "nested too deeply; allowed is a depth of 50"),
-    (b"a" + b".a" * 100_000 + b" = 1", "more than 50 parts"),
-    (b"[" + b'"a" . ' * 100_000 + b"a]", "more than 50 parts"),
-    (b"x = {" + b"'a'." * 60 + b"a = 1}", "more than 50 parts"),
+    (b"a = ", "not-toml"),
+    (b"\xef\xbb\xbfa = 1", "byte-order-mark"),
+    (b"a.b = 1\na = 2", "not-toml"),
+    (b"a = " + b"9" * 5000, "not-toml"),
+    (b"a = " + b"[" * 100_000, "too-deep"),
+    (b"a = " + b"[" * 60 + b"]" * 60, "too-deep"),
+    (b"a" + b".a" * 100_000 + b" = 1", "too-deep"),
+    (b"[" + b'"a" . ' * 100_000 + b"a]", "too-deep"),
+    (b"x = {" + b"'a'." * 60 + b"a = 1}", "too-deep"),
 ]
 XML: list[tuple[bytes, str]] = [
-    ('<a b="\xe9"/>'.encode("latin-1"), "not UTF-8"),
-    ('<?xml version="1.0" encoding="utf-16"?><a/>'.encode("utf-16"), "not UTF-8"),
-    (b'<?xml version="1.0" encoding="utf-7"?>+ADw-!DOCTYPE a+AD4-<a/>', "'utf-7'; allowed is"),
-    (b"<!DOCTYPE a><a/>", "document type"),
+    ('<a b="\xe9"/>'.encode("latin-1"), "not-utf-8"),
+    ('<?xml version="1.0" encoding="utf-16"?><a/>'.encode("utf-16"), "not-utf-8"),
+    (b'<?xml version="1.0" encoding="utf-7"?>+ADw-!DOCTYPE a+AD4-<a/>', "encoding"),
+    (b"<!DOCTYPE a><a/>", "document-type"),
 ]
 
 
 @pytest.mark.parametrize(
-    ("read", "content", "words"),
+    ("read", "content", "code"),
     [
         *((safe_io.json_value, *case) for case in JSON),
         *((safe_io.toml_tables, *case) for case in TOML),
@@ -159,9 +160,9 @@ XML: list[tuple[bytes, str]] = [
     ],
 )
 def test_what_is_no_such_document_is_refused(
-    read: Callable[[bytes], Any], content: bytes, words: str
+    read: Callable[[bytes], Any], content: bytes, code: str
 ) -> None:
-    with soon(), pytest.raises(OutsideError, match=words):
+    with soon(), refused(OutsideError, code):
         read(content)
 
 

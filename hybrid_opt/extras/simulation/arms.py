@@ -171,7 +171,8 @@ class CellSimulation:
         if not np.isfinite(workcell.stack_joint_limits("torque_max")).all():
             raise SimulationError(
                 "controllers of simulated arms are scaled by torque_max, which is unknown here; "
-                "give torques of all joints"
+                "give torques of all joints",
+                code="unknown-torques",
             )
         self.workcell = workcell
         self.settings = settings or ArmSettings()

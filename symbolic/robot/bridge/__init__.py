@@ -77,7 +77,9 @@ def require_same_minor(built: dict[str, str], installed: dict[str, str]) -> None
         if installed[library].split(".")[:2] != version.split(".")[:2]
     ]
     if different:
-        raise BridgeError(f"the compiled modules do not fit: {'; '.join(different)}; {REMEDY}")
+        raise BridgeError(
+            f"the compiled modules do not fit: {'; '.join(different)}; {REMEDY}", code="versions"
+        )
 
 
 @cache
@@ -87,7 +89,7 @@ def _extension() -> ModuleType:
         extension = import_module("symbolic.robot.bridge._pinocchio_casadi")
     except ImportError as error:
         raise BridgeError(
-            f"the Pinocchio-CasADi bridge cannot be loaded ({error}); {REMEDY}"
+            f"the Pinocchio-CasADi bridge cannot be loaded ({error}); {REMEDY}", code="not-loadable"
         ) from error
     require_same_minor(
         {"pinocchio": extension.PINOCCHIO_VERSION, "casadi": extension.CASADI_VERSION},

@@ -38,6 +38,7 @@ from symbolic.records import (
     Sphere,
 )
 from symbolic.records.content import CacheKey
+from tests.refusals import refused
 from tests.symbolic.cells import ROOT
 from tests.symbolic.geometry.collision_cells import (
     functions_of,
@@ -203,17 +204,17 @@ def test_the_user_may_leave_out_pairs_with_a_reason() -> None:
         assert reason(geometry, f"left/link_{k}", "payload").endswith("held")
     assert "ignored" not in reason(geometry, "right/link_1", "payload")
     wrong = CollisionSettings(ignored=(IgnoredPair("payload", "celing", ""),))
-    with pytest.raises(CollisionModelError, match=r"'celing'.*ground"):
+    with refused(CollisionModelError, "unknown-body", "'celing'", "ground"):
         build_geometry(replace(rack(), collision=wrong))
 
 
 def test_bodies_need_different_names_and_a_size() -> None:
     cell = rack()
     twin = replace(cell, environment=(*cell.environment, cell.environment[0]))
-    with pytest.raises(CollisionModelError, match=r"share the name.*bottom board"):
+    with refused(CollisionModelError, "same-name", "bottom board"):
         collision_bodies(twin)
     dot = Body("dot", Sphere(0.0), np.eye(4))
-    with pytest.raises(CollisionModelError, match="'dot': sphere radius is 0 m"):
+    with refused(CollisionModelError, "extent", "'dot'", "radius"):
         collision_bodies(replace(cell, environment=(dot,)))
 
 
@@ -227,8 +228,9 @@ def test_a_mesh_that_is_nowhere_is_named(tmp_path: Path) -> None:
     path.write_text(
         URDF.format(link=f"<collision><geometry>{mesh}</geometry></collision>", rest="")
     )
-    message = r"link 'a' of x\.urdf: .*not found; package folders.*none given"
-    with pytest.raises(CollisionModelError, match=message):
+    with refused(
+        CollisionModelError, "mesh-not-found", "link 'a' of x.urdf", "package://no/where.stl"
+    ):
         _link_pieces(replace(rack().robots[0], urdf=path), ("a", "bare"), MeshReader())
 
 
@@ -257,17 +259,17 @@ def test_meshes_are_read_once_and_within_limits_together(
     first, second = collision_bodies(twice)[-2:]
     assert first.pieces[0].shape is second.pieces[0].shape
     monkeypatch.setattr("symbolic.geometry.bodies.MOST_CORNERS", 1000)
-    with pytest.raises(CollisionModelError, match=r"1284 corners, 642 of them 'ball'.*simplify"):
+    with refused(CollisionModelError, "too-many-corners", 1284, 642, "'ball'"):
         collision_bodies(twice)
     monkeypatch.setattr("symbolic.read.meshes.MOST_CELL_FACES", 2000)
     larger = replace(ball, name="larger", shape=Mesh(path, 2.0 * np.ones(3)))
-    with pytest.raises(CollisionModelError, match=r"ball\.stl: with its 1280.*have 2560; allowed"):
+    with refused(CollisionModelError, "too-many-triangles", "ball.stl", 1280, 2560):
         collision_bodies(replace(twice, environment=(*twice.environment, larger)))
 
 
 def test_more_pieces_than_allowed_are_told() -> None:
     few = replace(rack(), collision=CollisionSettings(most_pieces=20))
-    with pytest.raises(CollisionModelError, match=r"allowed are 20.*raise collision.most_pieces"):
+    with refused(CollisionModelError, "too-many-pieces", 20, "collision.most_pieces"):
         collision_bodies(few)
 
 
@@ -277,9 +279,7 @@ def test_a_tool_that_enters_the_payload_is_told_by_name() -> None:
     part = left.tool[0]
     assert isinstance(part.shape, Cylinder)
     longer = replace(part, shape=replace(part.shape, length=part.shape.length + 0.01))
-    with pytest.raises(
-        CollisionModelError, match="'left/pad' enters the payload by more than 1 mm"
-    ):
+    with refused(CollisionModelError, "tool-in-payload", "'left/pad'"):
         build_geometry(replace(cell, robots=(replace(left, tool=(longer,)), cell.robots[1])))
 
 

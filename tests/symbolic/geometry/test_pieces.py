@@ -37,6 +37,7 @@ from symbolic.geometry.pieces import (
 from symbolic.records import Box, Capsule, Cylinder, Sphere
 from symbolic.records.poses import pose_matrix
 from tests.machines import ur10_urdf
+from tests.refusals import refused
 from tests.symbolic.geometry.collision_cells import geometry_of
 from tests.waiting import soon
 
@@ -138,7 +139,7 @@ def test_containment_is_exact_not_sampled() -> None:
     cylinder = Piece(Cylinder(0.5, 1.0), np.eye(4))
     assert contains(inner, cylinder)
     assert not contains(inner, Piece(Cylinder(0.5 + 1e-9, 1.0), np.eye(4)))
-    with pytest.raises(CollisionModelError, match="cannot be proven"):
+    with refused(CollisionModelError, "containment"):
         contains(cylinder, inner)
 
 
@@ -181,20 +182,20 @@ def test_covers_of_real_links_contain_them(cell: str) -> None:
 @pytest.mark.parametrize(
     ("shape", "word"),
     [
-        (Box(np.array([0.0, 1.0, 1.0])), r"size\[0\] is 0 m"),
-        (Cylinder(0.0, 1.0), "radius is 0 m"),
-        (Cylinder(0.1, -1.0), "length is -1 m"),
-        (Sphere(float("nan")), "radius is nan m"),
-        (Capsule(0.1, 0.0), "length is 0 m"),
+        (Box(np.array([0.0, 1.0, 1.0])), "size[0]"),
+        (Cylinder(0.0, 1.0), "radius"),
+        (Cylinder(0.1, -1.0), "length"),
+        (Sphere(float("nan")), "radius"),
+        (Capsule(0.1, 0.0), "length"),
     ],
 )
 def test_shapes_without_size_are_refused(shape: ConvexShape, word: str) -> None:
-    with pytest.raises(CollisionModelError, match=f"'shelf'.*{word}.*correct the size"):
+    with refused(CollisionModelError, "extent", "'shelf'", word):
         check_piece(Piece(shape, np.eye(4)), "'shelf'")
 
 
 def test_poses_that_are_no_poses_are_refused() -> None:
-    with pytest.raises(CollisionModelError, match="not a rotation"):
+    with refused(CollisionModelError, "pose", "'shelf'"):
         check_piece(Piece(Sphere(1.0), 2.0 * np.eye(4)), "'shelf'")
 
 
@@ -340,51 +341,52 @@ def encoded(encoding: str) -> bytes:
     return f'<?xml version="1.0" encoding="{encoding}"?><!DOCTYPE a><COLLADA/>'.encode(encoding)
 
 
-UNREAD = "cannot be read|empty"
+EMPTY, FORMAT, LARGER = "empty-mesh", "mesh-format", "mesh-too-large"
 NO_NUMBER = b"v 0 0 0\nv 1 0 0\nv 0 nan 0\nv 0 0 1\nf 1 2 3\nf 1 2 4\nf 2 3 4\nf 1 3 4\n"
 ENTITY = b'<?xml version="1.0"?><!DOCTYPE a [<!ENTITY b "c">]><COLLADA>&b;</COLLADA>'
 LARGE = trimesh.creation.box((300.0, 200.0, 100.0))
 
 
 @pytest.mark.parametrize(
-    ("name", "content", "message"),
+    ("name", "content", "code"),
     [
-        ("m.stl", flat, "flat.*give it a thickness"),
-        ("m.stl", lambda: b"solid nothing\nendsolid nothing\n", UNREAD),
-        ("m.stl", lambda: b"not a mesh at all", UNREAD),
-        ("m.stl", lambda: stl(LARGE), "enormous.*150 m from its origin.*millimetres"),
-        ("m.stl", lambda: loose(190_000), "enormous mesh, 190000 triangles.*simplify"),
-        *((f"m.{kind}", archive, UNREAD) for kind in ("zip", "stl", "ply", "glb")),
-        ("m.ply", lambda: promising("ascii"), ""),
-        ("m.ply", lambda: promising("binary_little_endian"), ""),
-        ("m.obj", lambda: NO_NUMBER, "not finite"),
-        ("m.dae", lambda: ENTITY, "the mesh has a document type"),
-        ("m.dae", lambda: encoded("utf-16"), "the mesh byte 0 is"),
-        ("m.dae", lambda: encoded("utf-7"), "the mesh declares the enco"),
-        ("m.obj", lambda: endless("v 0 0 0\n", "f 1 1 1\n"), r"enormous mesh, \d+ words"),
-        ("m.obj", lambda: endless("v 0 0 0\nf ", "1\u00a0"), r"enormous mesh, \d+ words"),
-        ("m.off", lambda: endless("OFF\n9 9 0\n", "0 0 0\n"), r"enormous mesh, \d+ words"),
+        ("m.stl", flat, "flat-mesh"),
+        ("m.stl", lambda: b"solid nothing\nendsolid nothing\n", EMPTY),
+        ("m.stl", lambda: b"not a mesh at all", EMPTY),
+        ("m.stl", lambda: stl(LARGE), "mesh-too-far"),
+        ("m.stl", lambda: loose(190_000), LARGER),
+        *((f"m.{kind}", archive, FORMAT) for kind in ("zip", "ply", "glb")),
+        ("m.stl", archive, EMPTY),
+        ("m.ply", lambda: promising("ascii"), EMPTY),
+        ("m.ply", lambda: promising("binary_little_endian"), FORMAT),
+        ("m.obj", lambda: NO_NUMBER, "not-finite"),
+        ("m.dae", lambda: ENTITY, "document-type"),
+        ("m.dae", lambda: encoded("utf-16"), "not-utf-8"),
+        ("m.dae", lambda: encoded("utf-7"), "encoding"),
+        ("m.obj", lambda: endless("v 0 0 0\n", "f 1 1 1\n"), LARGER),
+        ("m.obj", lambda: endless("v 0 0 0\nf ", "1\u00a0"), LARGER),
+        ("m.off", lambda: endless("OFF\n9 9 0\n", "0 0 0\n"), LARGER),
         (
             "m.ply",
             lambda: endless("ply\nformat ascii 1.0\ncomment binary\n", "0 0 0\n"),
-            r"enormous mesh, \d+ words",
+            LARGER,
         ),
-        ("m.dae", lambda: endless("<COLLADA>", "<a/>"), r"enormous mesh, \d+ elements"),
-        ("m.dae", lambda: endless("<COLLADA>", "<a b='' c=''/>"), r"enormous mesh, \d+ elements"),
+        ("m.dae", lambda: endless("<COLLADA>", "<a/>"), LARGER),
+        ("m.dae", lambda: endless("<COLLADA>", "<a b='' c=''/>"), LARGER),
     ],
 )
 def test_unusable_meshes_are_told_at_once(
-    tmp_path: Path, name: str, content: Callable[[], bytes], message: str
+    tmp_path: Path, name: str, content: Callable[[], bytes], code: str
 ) -> None:
     (tmp_path / name).write_bytes(content())
-    with soon(), pytest.raises(CollisionModelError, match=rf"{name}: .*({message})"):
+    with soon(), refused(CollisionModelError, code, f"{name}: "):
         convex_pieces(tmp_path / name, ONES)
 
 
 def test_what_is_missing_or_a_pipe_is_named(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe.stl")
-    for name, why in (("gone.stl", "No such file"), ("pipe.stl", "it is a pipe")):
-        with pytest.raises(CollisionModelError, match=rf"{name}: the mesh cannot be read \({why}"):
+    for name, code in (("gone.stl", "unreadable"), ("pipe.stl", "no-regular-file")):
+        with refused(CollisionModelError, code, name):
             convex_pieces(tmp_path / name, ONES)
 
 
@@ -394,7 +396,7 @@ def test_a_scale_beyond_all_bounds_is_told(
 ) -> None:
     path = tmp_path / "box.stl"
     trimesh.creation.box((20.0, 20.0, 20.0)).export(path)
-    with pytest.raises(CollisionModelError, match=r"enormous mesh.*Set its scale"):
+    with refused(CollisionModelError, "mesh-too-far"):
         convex_pieces(path, np.array(scale))
 
 

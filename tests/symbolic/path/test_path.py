@@ -167,7 +167,7 @@ def test_only_what_robots_drive_is_cut_into_pieces() -> None:
     driven = load(RACK, text=text.replace(law, 'time_law = "optimal"').encode())
     assert len(driven.task.waypoints) == 9
     assert driven.task.pieces == 2
-    with pytest.raises(WorkcellError, match=r"task\.drivable_pieces: found 0; allowed is a whole"):
+    with pytest.raises(WorkcellError, match=r"task\.drivable_pieces: .*0"):
         load(RACK, text=with_pieces(0).encode())
 
 

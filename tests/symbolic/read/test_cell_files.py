@@ -27,6 +27,7 @@ from symbolic.read.cell_files import (
 from symbolic.read.descriptions import resolve_mesh
 from symbolic.records import Mesh, Workcell
 from tests.machines import ur10_urdf
+from tests.refusals import refused
 from tests.symbolic.cells import GOFA, RACK, rack_cell
 
 BODY = '\n[[environment]]\nname = "stone"\nkind = "mesh"\npath = {path}\nxyz = [2.0, 2.0, 0.0]\n'
@@ -132,10 +133,10 @@ def test_a_workcell_changed_in_memory_or_on_disk_is_refused(tmp_path: Path) -> N
     path = write_cell(tmp_path, '"stone.stl"')
     trimesh.creation.box((0.1, 0.1, 0.1)).export(path.parent / "stone.stl")
     cell = load(path)
-    with pytest.raises(BundleError, match="changed after reading"):
+    with refused(BundleError, "changed-in-memory"):
         collect_cell(replace(cell, payload=replace(cell.payload, mass=11.0)))
     path.write_text(path.read_text(encoding="utf-8") + "# later\n", encoding="utf-8")
-    with pytest.raises(BundleError, match="changed after reading"):
+    with refused(BundleError, "changed-in-memory"):
         collect_cell(cell)
 
 
@@ -160,31 +161,31 @@ def test_paths_that_leave_the_folder_are_refused(name: str, tmp_path: Path) -> N
     data = document()
     data["files"] = [*data["files"], entry(name, b"x")]
     last = len(data["files"]) - 1
-    with pytest.raises(BundleError, match=rf"cell\.files\[{last}\]\.path: .* not allowed"):
+    with refused(BundleError, "path", f"cell.files[{last}].path"):
         cell_from_json(data)
-    with pytest.raises(BundleError, match=r"cell\.files: .* not allowed"):
+    with refused(BundleError, "path", "cell.files"):
         unpack_cell(CellFiles("a", {"a": b"", name: b""}, (), ""), tmp_path)
-    with pytest.raises(BundleError, match=r"cell\.folders: .* not allowed"):
+    with refused(BundleError, "path", "cell.folders"):
         unpack_cell(CellFiles("a", {"a": b""}, (name,), ""), tmp_path)
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "message"),
+    ("old", "new", "code"),
     [
-        ('urdf = "../robots/gofa12.urdf"', 'urdf = "/etc/passwd"', "not stored"),
-        ('urdf = "../robots/gofa12.urdf"', 'urdf = "../../../etc/passwd"', "not stored"),
-        ("urdf =", "arm =", "lacks or misuses"),
-        ("[[robots]]", "[[robots", "not valid TOML"),
-        ("mass = 10.0", "mass = -10.0", "not valid"),
+        ('urdf = "../robots/gofa12.urdf"', 'urdf = "/etc/passwd"', "not-stored"),
+        ('urdf = "../robots/gofa12.urdf"', 'urdf = "../../../etc/passwd"', "not-stored"),
+        ("urdf =", "arm =", "missing-key"),
+        ("[[robots]]", "[[robots", "not-toml"),
+        ("mass = 10.0", "mass = -10.0", "workcell"),
         ("mass = 10.0", "mass = 10.5", "digest"),
     ],
 )
-def test_a_tampered_workcell_is_refused(old: str, new: str, message: str, tmp_path: Path) -> None:
+def test_a_tampered_workcell_is_refused(old: str, new: str, code: str, tmp_path: Path) -> None:
     stored = collect_cell(rack_cell())
     text = stored.files[stored.workcell].decode()
     assert old in text
     files = {**stored.files, stored.workcell: text.replace(old, new).encode()}
-    with pytest.raises(BundleError, match=message):
+    with refused(BundleError, code):
         unpack_cell(replace(stored, files=files), tmp_path)
 
 
@@ -196,26 +197,26 @@ def test_a_urdf_that_names_files_outside_is_refused(tmp_path: Path) -> None:
     for address in (b"/etc/passwd", b"&#46;./../../x.stl", b"file:///etc/passwd"):
         bad = stored.files[urdf].replace(box, b'<mesh filename="' + address + b'"/>')
         folder = tmp_path / hashlib.sha256(address).hexdigest()
-        with pytest.raises(BundleError, match="not stored with it"):
+        with refused(BundleError, "not-stored"):
             unpack_cell(replace(stored, files={**stored.files, urdf: bad}), folder)
 
 
 @pytest.mark.parametrize(
-    ("changes", "message"),
+    ("changes", "code"),
     [
         ({"sha256": "0" * 64}, "damaged"),
-        ({"encoding": "pickle"}, "encoding"),
-        (entry("bomb", b"x") | {"content": "!!!"}, "decoded"),
-        (entry("bomb", bytes(10**8)), "exceed"),
+        ({"encoding": "pickle"}, "field"),
+        (entry("bomb", b"x") | {"content": "!!!"}, "not-decodable"),
+        (entry("bomb", bytes(10**8)), "too-large"),
     ],
 )
 def test_damaged_and_exploding_content_is_refused(
-    changes: dict[str, str], message: str, monkeypatch: pytest.MonkeyPatch
+    changes: dict[str, str], code: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("symbolic.read.cell_files.MAX_TOTAL_BYTES", 10**6)
     data = document()
     data["files"][0] |= changes
-    with pytest.raises(BundleError, match=message):
+    with refused(BundleError, code):
         cell_from_json(data)
 
 
@@ -275,7 +276,7 @@ def test_xacro_and_packages_of_this_machine_become_part_of_the_files(
         else content
         for name, content in stored.files.items()
     }
-    with pytest.raises(BundleError, match="xacro macros"):
+    with refused(BundleError, "xacro-macros"):
         unpack_cell(replace(stored, files=harmful), tmp_path / "harm")
 
 

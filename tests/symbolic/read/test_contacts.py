@@ -239,7 +239,7 @@ def test_redundant_joints_are_as_many_as_there_are_beyond_six(tmp_path: Path) ->
     path = single_cell(SINGLE["panda"], tmp_path, {})
     named = '"redundant_joints" = ["panda_joint1", "panda_joint3"], "base" ='
     path.write_text(path.read_text().replace('"base" =', named))
-    with pytest.raises(WorkcellError, match=r"redundant_joints: found 2 names; allowed are 1"):
+    with pytest.raises(WorkcellError, match=r"redundant_joints: .*2.* 1 "):
         load(path)
     path.write_text(path.read_text().replace('"panda_joint1", "panda_joint3"', '"panda_joint5"'))
     assert load(path).robots[0].redundant_joints == ("panda_joint5",)

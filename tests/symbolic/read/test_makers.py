@@ -17,6 +17,7 @@ from symbolic.read.arms import RobotModelWarning, _warn_left_out
 from symbolic.read.cell import load
 from symbolic.read.robots import _warn_unjudged, named_robot
 from symbolic.records import Workcell
+from tests.refusals import refused
 from tests.symbolic.cells import RACK
 from tests.torso import Torso
 
@@ -79,7 +80,7 @@ def test_empty_links_that_mimic_a_moving_joint_are_left_out_with_a_note(
     """In front of the joint and behind it; each is said once."""
     _warn_left_out.cache_clear()
     torso = Torso(more=MIMIC.format(parent=parent, inertial=""))
-    with pytest.warns(RobotModelWarning, match="'marker_joint' does not follow 'torso_joint_0'"):
+    with pytest.warns(RobotModelWarning, match="'marker_joint' .*'torso_joint_0'"):
         found = cell(torso, tmp_path)
     plain = cell(Torso(), tmp_path)
     for robot, other in zip(found.robots, plain.robots, strict=True):
@@ -88,7 +89,7 @@ def test_empty_links_that_mimic_a_moving_joint_are_left_out_with_a_note(
 
 def test_links_with_mass_that_mimic_a_moving_joint_are_refused(tmp_path: Path) -> None:
     torso = Torso(more=MIMIC.format(parent="chest", inertial=INERTIAL))
-    with pytest.raises(WorkcellError, match="'marker_joint' mimics 'torso_joint_0', which moves"):
+    with refused(WorkcellError, "workcell", "'marker_joint'", "'torso_joint_0'"):
         cell(torso, tmp_path)
 
 
@@ -98,7 +99,7 @@ def test_efforts_of_zero_are_no_torques_until_the_file_says_unknown(tmp_path: Pa
     with pytest.raises(WorkcellError, match=told):
         cell(torso, tmp_path)
     _warn_unjudged.cache_clear()
-    with pytest.warns(RobotModelWarning, match="'left' has torque_max"):
+    with pytest.warns(RobotModelWarning, match="'left' .*torque_max"):
         found = cell(torso, tmp_path, robots=[{"torque_max": "unknown"}] * 2)
     for robot in found.robots:
         np.testing.assert_array_equal(robot.torque_max, np.full(7, np.inf))
@@ -108,7 +109,7 @@ def test_arms_of_unknown_torques_are_not_simulated() -> None:
     cell = load(RACK)
     unknown = [replace(robot, torque_max=np.full(6, np.inf)) for robot in cell.robots]
     free = replace(cell, robots=(unknown[0], unknown[1]))
-    with pytest.raises(SimulationError, match="torque_max, which is unknown"):
+    with refused(SimulationError, "unknown-torques", "torque_max"):
         CellSimulation(free)
 
 
@@ -146,5 +147,5 @@ def _ends(line: str, told: str) -> bool:
 def test_a_file_without_links_is_passed_over() -> None:
     assert named_robot("ur3").path.name == "ur3_robot.urdf"
     assert named_robot("ur5").path.name == "ur5_robot.urdf"
-    with pytest.raises(OutsideError, match="is the name of no description"):
+    with refused(OutsideError, "unknown-description"):
         named_robot("ur4")

@@ -32,6 +32,7 @@ from symbolic.read.meshes import read_mesh
 from symbolic.read.urdf import FULL_TURNS, Urdf, UrdfMesh, parse_urdf, read_urdf
 from symbolic.records import Box, Robot, ToolLoad
 from tests.machines import robot_record
+from tests.refusals import refused
 from tests.symbolic.read.samples import GOFA, sample_data, write
 
 ROUNDED = 2e-5
@@ -224,7 +225,7 @@ def test_a_cell_of_mjcf_is_stored_with_its_digest(gofa: Path, tmp_path: Path) ->
     for robot in data["robots"]:
         robot["urdf"] = "gofa.xml"
     shutil.copy(gofa, tmp_path)
-    with pytest.raises(WorkcellError, match="give velocity_max here"):
+    with pytest.raises(WorkcellError, match=r"robots\[0\]\.velocity_max"):
         load(write(tmp_path, data))
     for robot in data["robots"]:
         robot["velocity_max"] = 2.0
@@ -270,7 +271,7 @@ def test_mjcf_needs_mujoco(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
     path = tmp_path / "arm.xml"
     path.write_text(body(""), encoding="utf-8")
     monkeypatch.setitem(sys.modules, "mujoco", None)
-    with pytest.raises(UrdfError, match=r"pip install 'dual-arm-carry\[sim\]'"):
+    with refused(UrdfError, "missing-extra", "dual-arm-carry[sim]"):
         read_urdf(path)
 
 
@@ -329,15 +330,15 @@ def test_a_chain_goes_from_root_to_tip() -> None:
 
 
 @pytest.mark.parametrize(
-    ("root", "tip", "message"),
+    ("root", "tip", "code"),
     [
-        ("torsi", "left_5", "no link of machine.urdf; did you mean 'torso'"),
-        ("left_5", "torso", "does not hang on"),
-        ("left_0", "right_5", "does not hang on"),
+        ("torsi", "left_5", "unknown-link"),
+        ("left_5", "torso", "not-connected"),
+        ("left_0", "right_5", "not-connected"),
     ],
 )
-def test_links_that_are_no_chain_are_told(root: str, tip: str, message: str) -> None:
-    with pytest.raises(RobotModelError, match=message):
+def test_links_that_are_no_chain_are_told(root: str, tip: str, code: str) -> None:
+    with refused(RobotModelError, code, root):
         chain_joints(urdf(), root, tip)
 
 
@@ -368,17 +369,17 @@ def test_a_fixed_joint_may_bear_a_links_name() -> None:
 
 
 def test_joints_that_cannot_be_held_are_told() -> None:
-    with pytest.raises(RobotModelError, match=r"no moving joint 'lifd'.*did you mean 'lift'"):
+    with refused(RobotModelError, "unknown-joint", "'lifd'", "'lift'"):
         held_joints(urdf(), (), (("lifd", 0.0),))
-    with pytest.raises(RobotModelError, match="'left_follow' mimics 'left_grip', which moves"):
+    with refused(RobotModelError, "mimics-moving-joint", "'left_follow'", "'left_grip'"):
         held_joints(urdf(), ("left_grip",), ())
-    with pytest.raises(RobotModelError, match="'left_follow' of the chain mimics"):
+    with refused(RobotModelError, "mimicking-joint", "'left_follow'"):
         held_joints(urdf(), ("left_follow",), ())
 
 
 def test_joints_that_follow_one_another_are_told_and_unknown_ones_are_left() -> None:
     circle = machine().replace('mimic joint="left_grip"', 'mimic joint="left_follow"')
-    with pytest.raises(RobotModelError, match="follow one another in a circle"):
+    with pytest.raises(UrdfError, match="'left_follow'/mimic"):
         parse_urdf(circle.encode(), "m")
     unknown = machine().replace('mimic joint="left_grip"', 'mimic joint="nowhere"')
     assert parse_urdf(unknown.encode(), "m").joints["left_follow"].mimics == ""
@@ -392,9 +393,9 @@ def test_dropped_links_take_along_what_hangs_on_them() -> None:
     assert set(kept.collisions) == set(kept.links)
     full = pin.buildModelFromXML(kept.kinematics)
     assert full.njoints - 1 == len(kept.joints) == 1 + 7 + 1
-    with pytest.raises(RobotModelError, match=r"matches no link.*did you mean"):
+    with refused(RobotModelError, "unknown-link", "'left_thump'", "'left_thumb'"):
         without_links(urdf(), ("left_thump",))
-    with pytest.raises(RobotModelError, match="every link"):
+    with refused(RobotModelError, "no-link-left"):
         without_links(urdf(), ("*",))
 
 

@@ -316,7 +316,7 @@ def test_further_checks_run_on_a_valid_cell_only(tmp_path: Path) -> None:
         seen.append(workcell.name)
         return ["task.start: no joint angles reach it; allowed is a pose within reach"]
 
-    with pytest.raises(WorkcellError, match=r"task\.start: no joint angles"):
+    with pytest.raises(WorkcellError, match=r"task\.start: "):
         load(RACK, checks=[no_solution])
     data = sample_data()
     put(data, "payload.mass", -1)

@@ -19,6 +19,7 @@ from symbolic.read.scenes import read_scene
 from symbolic.read.tables import TableReader, read_body
 from symbolic.records import Body, Box, Cylinder, Mesh, Sphere
 from symbolic.records.problems import Problems
+from tests.refusals import refused
 
 
 def scene(folder: Path, text: str, name: str = "scene.sdf") -> ImportedScene:
@@ -215,10 +216,10 @@ def test_what_is_no_body_is_told(tmp_path: Path, shape: str, why: str) -> None:
     ],
 )
 def test_a_broken_scene_is_refused(tmp_path: Path, text: str, words: str) -> None:
-    refused(tmp_path, "scene.sdf", text, words)
+    require_refusal(tmp_path, "scene.sdf", text, words)
 
 
-def refused(folder: Path, name: str, text: str, words: str) -> None:
+def require_refusal(folder: Path, name: str, text: str, words: str) -> None:
     with pytest.raises(SceneError) as told:
         scene(folder, text, name)
     assert str(told.value).startswith(f"{name}: ")
@@ -226,7 +227,7 @@ def refused(folder: Path, name: str, text: str, words: str) -> None:
 
 
 def test_a_missing_scene_is_told(tmp_path: Path) -> None:
-    with pytest.raises(SceneError, match=r"none\.sdf: cannot be read"):
+    with refused(SceneError, "unreadable", "none.sdf"):
         read_scene(tmp_path / "none.sdf")
 
 
@@ -380,7 +381,7 @@ OBJECT = "world: {collision_objects: [{id: a, "
     ],
 )
 def test_a_broken_planning_scene_is_refused(tmp_path: Path, text: str, words: str) -> None:
-    refused(tmp_path, "s.scene" if text.startswith("name") else "s.yaml", text, words)
+    require_refusal(tmp_path, "s.scene" if text.startswith("name") else "s.yaml", text, words)
 
 
 # --- MJCF ---
@@ -443,10 +444,10 @@ def test_a_scene_that_is_only_to_be_seen_says_so(tmp_path: Path) -> None:
     ghost = '<geom name="ghost" size="0.1" contype="0" conaffinity="0"/>'
     visual = f"<visual name='v'><geometry>{BALL}</geometry></visual>"
     for text, told in (
-        (f"<mujoco><worldbody>{ghost}</worldbody></mujoco>", "ghost: is no body, only to be seen"),
-        (sdf(f"<model name='m'><link name='l'>{visual}</link></model>"), "m l: is no body"),
+        (f"<mujoco><worldbody>{ghost}</worldbody></mujoco>", "ghost: "),
+        (sdf(f"<model name='m'><link name='l'>{visual}</link></model>"), "m l: "),
     ):
-        with pytest.raises(SceneError, match=f"holds no obstacle; (.*; )?{told}"):
+        with refused(SceneError, "no-obstacle", told):
             scene(tmp_path, text, "scene.xml")
 
 

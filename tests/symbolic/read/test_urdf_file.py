@@ -19,6 +19,7 @@ from symbolic.read.robots import named_robot
 from symbolic.read.urdf import MOST_LINKS, parse_urdf, read_srdf, read_urdf
 from symbolic.records import IgnoredPair
 from tests.machines import robot_record, ur10_urdf
+from tests.refusals import refused
 from tests.symbolic.read.samples import GOFA
 from tests.waiting import soon
 
@@ -126,7 +127,7 @@ CASES: list[tuple[Callable[[str], str], str, str]] = [
 TEXT = GOFA.read_text("utf-8")
 EVERY = sorted(ur10_urdf().parents[2].rglob("*.urdf"))
 # A humanoid with inertias below zero, and a file that includes others.
-REFUSED = {"romeo_laas_small.urdf": "allowed are none below zero", "ur3.urdf": "has no links"}
+REFUSED = {"romeo_laas_small.urdf": "'body'/inertial/inertia", "ur3.urdf": "robot: "}
 
 
 @pytest.mark.parametrize("path", EVERY, ids=[path.name for path in EVERY])
@@ -185,9 +186,9 @@ def test_a_long_chain_is_refused_and_does_not_crash(tmp_path: Path) -> None:
     path = tmp_path / "chain.urdf"
     path.write_text(chain(MOST_LINKS))
     assert reduced_model(read_urdf(path)).njoints == 1
-    for links, words in ((MOST_LINKS + 1, "has 501 links"), (50_000, "more than 100000 elements")):
+    for links, number in ((MOST_LINKS + 1, "501"), (50_000, "100000")):
         path.write_text(chain(links))
-        with soon(), pytest.raises(UrdfError, match=words):
+        with soon(), pytest.raises(UrdfError, match=number):
             reduced_model(read_urdf(path))
 
 
@@ -301,7 +302,7 @@ def test_what_has_no_such_name(name: str, told: str) -> None:
 
 
 def test_a_failed_download_is_one_message(no_network: Path) -> None:
-    with pytest.raises(OutsideError, match="is the network reachable, and git installed") as told:
+    with refused(OutsideError, "no-download") as told:
         named_robot("ur10e_description")
     assert "\n" not in str(told.value)
 

@@ -16,6 +16,7 @@ from symbolic.read.descriptions import description_content, is_xacro, nominal_ki
 from symbolic.read.editing import completed, with_paths
 from symbolic.read.robots import _warn_nominal
 from symbolic.read.urdf import read_urdf
+from tests.refusals import refused
 from tests.symbolic.cells import GOFA
 from tests.symbolic.read.samples import sample_data
 
@@ -69,7 +70,7 @@ def test_found_packages_leave_no_folder_in_mesh_addresses(tmp_path: Path) -> Non
     path = write(tmp_path, mesh)
     urdf = read_urdf(path, package_dirs=[tmp_path / "packages"])
     assert urdf.collision_meshes == ("package://arm/meshes/base.stl",)
-    with pytest.raises(UrdfError, match="names the package 'arm', which is not found"):
+    with refused(UrdfError, "package-not-found", "'arm'"):
         read_urdf(path)
 
 
@@ -88,7 +89,7 @@ def test_found_packages_leave_no_folder_in_mesh_addresses(tmp_path: Path) -> Non
 )
 def test_what_cannot_be_expanded_is_told_in_one_line(tmp_path: Path, body: str) -> None:
     path = write(tmp_path, body + '<xacro:if value="1"/>')
-    with pytest.raises(OutsideError, match="cannot be expanded: ") as caught:
+    with refused(OutsideError, "not-expandable") as caught:
         description_content(path)
     assert "\n" not in str(caught.value)
 
@@ -103,21 +104,21 @@ def macros(depth: int) -> str:
     return f"{''.join(calls)}{last}<xacro:m0/>"
 
 
-MEMORY, DEPTH, TIME = "needs too much memory", "nested too deeply", "takes longer than 5 s"
+MEMORY, DEPTH, TIME = "too-much-memory", "too-deep", "too-slow"
 UNBOUNDED = {
     "text": ("<link name=\"${'x' * 10**10}\"/>", MEMORY),
     "list": ('<link name="${len([0 for k in python.range(10**12)])}"/>', MEMORY),
     "recursion": (
         '<xacro:macro name="a" params=""><xacro:a/></xacro:macro><xacro:a/>',
-        DEPTH + r".*\(macro a\)",
+        DEPTH,
     ),
     "include": ('<xacro:include filename="arm.urdf.xacro"/>', DEPTH),
     "elements": ("<a>" * 20_000 + "${1}" + "</a>" * 20_000, DEPTH),
-    "long": ("<link name=\"${'x' * 2**25}\"/>", "expands to more than 16 MiB"),
+    "long": ("<link name=\"${'x' * 2**25}\"/>", "too-large"),
     "power": ('<link name="${10**10**10}"/>', TIME),
     "evaluated power": ('<link name="$(eval 10**10**10)"/>', TIME),
     "sum": ('<link name="${python.sum(python.range(10**12))}"/>', TIME),
-    "calls": (macros(40), f"{TIME}|{MEMORY}"),
+    "calls": (macros(40), TIME),
     "expressions": ('<link name="' + "${1}" * 500_000 + '"/>', TIME),
 }
 
@@ -125,15 +126,16 @@ UNBOUNDED = {
 @pytest.mark.parametrize(
     "kind",
     [
-        pytest.param(kind, marks=pytest.mark.slow if TIME in words else ())
-        for kind, (_, words) in UNBOUNDED.items()
+        pytest.param(kind, marks=pytest.mark.slow if code == TIME else ())
+        for kind, (_, code) in UNBOUNDED.items()
     ],
 )
 def test_an_expansion_without_end_is_ended(tmp_path: Path, kind: str) -> None:
-    body, words = UNBOUNDED[kind]
+    body, code = UNBOUNDED[kind]
     path = write(tmp_path, body + '<xacro:if value="1"/>')
-    with pytest.raises(OutsideError, match=words):
+    with pytest.raises(OutsideError) as told:
         description_content(path)
+    assert told.value.code in ((TIME, MEMORY) if kind == "calls" else (code,)), told.value
 
 
 def test_an_expansion_that_took_too_long_is_not_begun_again(
@@ -144,7 +146,7 @@ def test_an_expansion_that_took_too_long_is_not_begun_again(
     # The process answers nothing where it takes too long.
     monkeypatch.setattr(descriptions, "_answer", begun.append)
     for _ in range(2):
-        with pytest.raises(OutsideError, match=TIME):
+        with refused(OutsideError, TIME):
             description_content(path)
     assert len(begun) == 1
 
@@ -157,7 +159,7 @@ def test_an_expression_that_finds_a_way_out_does_nothing(tmp_path: Path) -> None
     target = tmp_path / "written"
     found = f"[c for c in {ESCAPED} if c.__name__ == '_wrap_close']"
     deed = f"[c.__init__.__globals__['system']('touch {target}') for c in {found}]"
-    with pytest.raises(OutsideError, match="does more than compute"):
+    with refused(OutsideError, "not-arithmetic"):
         description_content(write(tmp_path, f'<link name="${{{deed}}}"/>'))
     assert not target.exists()
 
@@ -167,11 +169,11 @@ def test_values_and_includes_are_read_through_the_door(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
     values = "<link name=\"${xacro.load_yaml('values.yaml')['link']}\"/>"
     assert b'name="base"' in description_content(write(tmp_path, values))
-    for body, words in (
-        (values.replace("values.yaml", "/dev/zero"), "includes zero, which .*it is a device"),
-        ('<xacro:include filename="pipe"/>', "it is a pipe"),
+    for body, name in (
+        (values.replace("values.yaml", "/dev/zero"), "zero"),
+        ('<xacro:include filename="pipe"/>', "pipe"),
     ):
-        with pytest.raises(OutsideError, match=words):
+        with refused(OutsideError, "no-regular-file", name):
             description_content(write(tmp_path, body))
 
 

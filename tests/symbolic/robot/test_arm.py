@@ -36,6 +36,7 @@ from symbolic.robot.arm import (
 )
 from symbolic.robot.model import build_robot_model
 from tests.machines import robot_record, ur10_urdf
+from tests.refusals import refused
 from tests.symbolic.cells import call, gofa_model, hand_cell, start_posture
 from tests.symbolic.read.samples import GOFA
 
@@ -188,7 +189,7 @@ def test_torque_on_a_tilted_base(q: Array, v: Array, a: Array, roll: float, pitc
 @pytest.mark.parametrize(
     ("change", "told"),
     [
-        ({"locked_joints": (("joint_6", 0.0),)}, "gofa12.*found 5 joints"),
+        ({"locked_joints": (("joint_6", 0.0),)}, "gofa12.* 5 "),
         ({"flange": "tool1"}, "'tool1'.*'tool0'"),
         ({"urdf": Path("absent.urdf")}, r"absent\.urdf"),
     ],
@@ -298,9 +299,9 @@ def test_inverse_dynamics(case: Case, seed: int) -> None:
 
 def test_what_is_no_frame_or_no_model_is_told() -> None:
     model = MODELS["manipulator"]()
-    with pytest.raises(IndexError, match=f"frame 1000 of a model with {model.nframes} frames"):
+    with pytest.raises(IndexError, match=f"1000 .*{model.nframes}"):
         bridge.frame_kinematics(model, 1000)
-    with pytest.raises(ValueError, match="not a serialised Pinocchio model"):
+    with pytest.raises(ValueError, match="signature"):
         bridge.inverse_dynamics(SimpleNamespace(saveToString=lambda: "22 nonsense"))
 
 
@@ -315,7 +316,7 @@ def fresh_extension() -> Iterator[None]:
 @pytest.mark.usefixtures("fresh_extension")
 def test_missing_extension_names_the_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "symbolic.robot.bridge._pinocchio_casadi", None)
-    with pytest.raises(BridgeError, match=r"cannot be loaded .*pip install -e \."):
+    with refused(BridgeError, "not-loadable", "pip install -e ."):
         bridge.inverse_dynamics(MODELS["manipulator"]())
 
 
@@ -324,12 +325,9 @@ def test_extension_built_for_other_versions(monkeypatch: pytest.MonkeyPatch) -> 
     other = ModuleType("symbolic.robot.bridge._pinocchio_casadi")
     other.PINOCCHIO_VERSION, other.CASADI_VERSION = "3.9.0", "3.7.2"  # type: ignore[attr-defined]
     monkeypatch.setitem(sys.modules, other.__name__, other)
-    with pytest.raises(BridgeError) as caught:
+    numbers = (f"pinocchio {pin.__version__}", "3.9.0", "3.7.2", "pip install -e .")
+    with refused(BridgeError, "versions", *numbers):
         bridge.inverse_dynamics(MODELS["manipulator"]())
-    message = str(caught.value)
-    assert f"pinocchio {pin.__version__} is installed, 3.9.0 was compiled against" in message
-    assert "3.7.2 was compiled against" in message
-    assert "pip install -e ." in message
 
 
 @pytest.mark.parametrize(
@@ -346,7 +344,7 @@ def test_only_the_patch_version_may_differ(built: str, installed: str, fits: boo
     if fits:
         bridge.require_same_minor(*versions)
     else:
-        with pytest.raises(BridgeError, match=installed):
+        with refused(BridgeError, "versions", installed):
             bridge.require_same_minor(*versions)
 
 
