@@ -139,6 +139,19 @@ def skewed(job: Job, delay: float, stiffness: float) -> Skew:
     )
 
 
+def separation(job: Job, delay: float) -> float:
+    """Compute how far a delay [s] of either arm moves the pads apart while the box is held [m].
+
+    One arm that stops by itself is a late one: the delay is the time until the other has gone as
+    far as it will, at the planned speed.
+    """
+    return max(
+        float(np.linalg.norm(_displacement(job, phase, late, delay)[1], axis=1).max())
+        for phase in job.held
+        for late in (0, 1)
+    )
+
+
 def largest_skew(job: Job, stiffness: float) -> float:
     """Compute the longest delay of either arm that friction survives, up to `LARGEST_SKEW` [s].
 
@@ -179,7 +192,9 @@ def require_skew(job: Job, delay: float, stiffness: float) -> None:
     )
 
 
-def _skewed(job: Job, phase: Phase, late: int, delay: float, stiffness: float) -> Skew:
+def _displacement(job: Job, phase: Phase, late: int, delay: float) -> tuple[Array, Array, Array]:
+    """Compute what the delay of an arm does to its pad in a phase: samples (n,) that differ in
+    time, displacement (n, 3) and contact normal (n, 3), world frame [m]."""
     motion, contact = phase.motion, job.workcell.contacts[late]
     keep = np.concatenate([[True], np.diff(motion.time) > 0.0])
     time = motion.time[keep]
@@ -188,7 +203,11 @@ def _skewed(job: Job, phase: Phase, late: int, delay: float, stiffness: float) -
     orientation, point = job.workcell.task.orientation, contact.T_box_pad[:3, 3]
     rotation, earlier = box_rotation(orientation, now), box_rotation(orientation, before)
     moved = before[:, :3] + earlier @ point - now[:, :3] - rotation @ point
-    normal = rotation @ contact.T_box_pad[:3, 2]
+    return keep, moved, rotation @ contact.T_box_pad[:3, 2]
+
+
+def _skewed(job: Job, phase: Phase, late: int, delay: float, stiffness: float) -> Skew:
+    keep, moved, normal = _displacement(job, phase, late, delay)
     along = np.einsum("ni,ni->n", moved, normal)
     across = np.linalg.norm(moved - along[:, None] * normal, axis=1)
     change = stiffness / 2.0 * along

@@ -55,7 +55,7 @@ from hybrid_opt.timing.records import Timing
 from hybrid_opt.timing.robustness import Margin
 from symbolic.array import Array, Figure, evenly
 from symbolic.errors import SettingsError
-from symbolic.records import Workcell
+from symbolic.records import Workcell, quantities
 
 HAND_MADE = "hand-made"
 """Name of the workcell file's own trajectory."""
@@ -247,6 +247,11 @@ def _recommended(
     for label, path in named.items():
         beside.append(time_alternative(cell, label, path, timing, squeeze.force))
         told()
+    better = tuple(_better(beside, timing, squeeze.force))
+    if not alone and cell.workcell.handling.partner_stop is not None:
+        free = cell.changed({"handling.partner_stop": quantities.SEPARATION.high})
+        label = "the same path without partner_stop"
+        beside.append(time_alternative(free, label, carry.x[:-1], timing, squeeze.force))
     margins = () if alone else commanded_margins(carry, forces)
     told()
     hints = () if alone else advice(cell, paths, option, timing)
@@ -264,7 +269,7 @@ def _recommended(
         margins=margins,
         rivals=tuple(beside),
         advice=hints,
-        warnings=(*doubts, *_better(beside, timing, squeeze.force)),
+        warnings=(*doubts, *better),
         required=required,
         budget=budget,
         remedies=remedies,

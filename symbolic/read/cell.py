@@ -164,6 +164,9 @@ def _build(
         identity = ""
     check_all(workcell, problems, reach)
     workcell = with_redundancy(workcell, redundant, problems)
+    # The distance that one arm's stop may cost limits the speed as the payload's own limit does.
+    slowed = min(payload.velocity_max, handling.speed_max)
+    workcell = replace(workcell, payload=replace(workcell.payload, velocity_max=slowed))
     if workcell.task.pieces > 1 and not problems.found:
         # Not imported at the top: it needs CasADi.
         from symbolic.path.pieces import refined_task

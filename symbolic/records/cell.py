@@ -409,6 +409,11 @@ that squeeze boxes (adamweinhardt/dual-arm-manipulation, commit 6699139, 206 run
 contains the arms' relative angle. docs/explanation/robust.md says more."""
 
 
+PARTNER_TIME = 0.2
+"""Assumed time from one arm's stop until the other has gone as far as it will at full speed [s]:
+0.12 s to notice and to tell it, and half of a stop of 0.16 s. Bundles compute their own."""
+
+
 @dataclass(frozen=True)
 class Handling:
     """Motion of the robots before and after the carry.
@@ -422,6 +427,8 @@ class Handling:
         lift_height: how far below the carry's start the box stands [m]; None for the height above
             what lies beneath it.
         set_down_height: likewise below the carry's goal.
+        partner_stop: how far the pads may move apart along the path when one arm stops by itself,
+            until the other one stands as well [m]; None without a limit.
     """
 
     stand_off: Annotated[float, quantity.STAND_OFF] = 0.05
@@ -430,6 +437,12 @@ class Handling:
     lifting_speed: Annotated[float, quantity.SPEED] = 0.1
     lift_height: Annotated[float, quantity.LIFT] | None = None
     set_down_height: Annotated[float, quantity.LIFT] | None = None
+    partner_stop: Annotated[float, quantity.SEPARATION] | None = None
+
+    @property
+    def speed_max(self) -> float:
+        """Largest speed of the box with which `partner_stop` is kept [m/s]."""
+        return np.inf if self.partner_stop is None else self.partner_stop / PARTNER_TIME
 
 
 # --- identity ---

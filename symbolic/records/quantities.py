@@ -70,6 +70,7 @@ TOLERANCE = Range(0.0, 0.1, "m", mistaken=_MILLIMETRES)
 
 STAND_OFF = Range(1e-3, 0.5, "m", mistaken=_MILLIMETRES)
 LIFT = Range(0.0, 0.5, "m", mistaken=_MILLIMETRES)
+SEPARATION = Range(1e-3, 1.0, "m", mistaken=_MILLIMETRES)
 RATE = Range(10.0, 8000.0, "Hz", mistaken=(("kHz", 1e3),))
 LAG = Range(0.0, 0.5, "s", mistaken=(("ms", 1e-3),))
 FORCE_RATE = Range(1.0, 1e4, "N/s")

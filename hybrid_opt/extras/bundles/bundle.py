@@ -211,6 +211,7 @@ STATES = {
     "ready": "both arms are looked at: news from both, pads at their first places, nothing pressed",
     "running": "both arms follow the path; phases follow one another without a gap",
     "stopping": "both arms come to rest at the same place of the path, within the stop time",
+    "landing": "the box stands before the end of its set-down: both arms let go of it there",
     "held": "both arms keep that place and the squeeze that belongs to it",
     "done": "the job's end, or back at its beginning",
 }
@@ -246,7 +247,7 @@ def manifest(
         step = asdict(export.gap) | {"stiffness": k, "allowed_share": TRACKED}
     skews: dict[str, Any] = {"how": target.start, "required": skew, "stiffness": k}
     if k is not None:
-        skews |= {"is_held": largest_skew(job, k)}
+        skews |= {"survived": largest_skew(job, k)}
         skews |= {"cases": [_skew(skewed(job, delay, k)) for delay in SKEWS]}
     return {
         "target": name,
@@ -288,6 +289,7 @@ def manifest(
             "states": STATES,
             "stops_when": list(STOPS),
             "stop": asdict(export.stop),
+            "partner_stop": asdict(export.partner_stop) | {"text": str(export.partner_stop)},
             "limits": asdict(export.limits),
             "set_down": SET_DOWN,
         },
@@ -313,6 +315,7 @@ def readme(document: Mapping[str, Any], contents: Contents) -> str:
     if runs:
         runs += [f"{machine['carried_out_by']}. It stops both arms when", ""]
         runs += [f"- {reason}" for reason in machine["stops_when"]]
+        runs += ["", f"{machine['partner_stop']['text']}."]
     warned = [f"- {warning}" for warning in document["warnings"]]
     return "\n".join(
         [

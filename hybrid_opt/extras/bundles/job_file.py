@@ -29,7 +29,13 @@ from hybrid_opt.compiled_cell import cache_by_workcell
 from hybrid_opt.errors import JobError
 from hybrid_opt.extras.bundles.arms import prefixes
 from hybrid_opt.extras.bundles.programs.carry_job import FORMAT, VERSION, Limits
-from hybrid_opt.job.compliance import TRACKED, largest_skew, require_delay, require_stiffness
+from hybrid_opt.job.compliance import (
+    TRACKED,
+    largest_skew,
+    require_delay,
+    require_stiffness,
+    separation,
+)
 from hybrid_opt.job.motions import unit_squeeze
 from hybrid_opt.job.records import HELD_PHASES, Job, SampledJob, sample_job
 from hybrid_opt.timing.model import TimingModel, contact_torque
@@ -273,8 +279,39 @@ told from measured postures."""
 LEAST_BAND, MOST_BAND = 0.05, 0.3
 """Range of the share by which a measured force may miss its reference."""
 
+TOLD = 0.07
+"""From the look at which an arm is wrong to when the other one leaves its course [s]: two looks
+more, and the time of a message (`STRIKES` of carry_job.py, `PERIOD` and `LEAD_OF_STOP` of
+run_job.py)."""
+
 SILENCE = 0.1
 """Longest time without news from an arm [s]."""
+
+
+@dataclass(frozen=True)
+class PartnerStop:
+    """What it costs when one arm stops by itself at the worst moment of a job.
+
+    Attributes:
+        time: until the other arm has gone as far as it will, at the planned speed [s].
+        distance: by which the pads are then apart from their relative place [m].
+        survived: distance at which friction still holds the box; None without a stiffness [m].
+        allowed: the cell's `handling.partner_stop` [m].
+    """
+
+    time: float
+    distance: float
+    survived: float | None
+    allowed: float | None
+
+    def __str__(self) -> str:
+        friction = ""
+        if self.survived is not None:
+            friction = f"; friction holds the box up to {1e3 * self.survived:.0f} mm"
+        return (
+            "If one arm stops by itself, the other one stops as well, and the pads are up to "
+            f"{1e3 * self.distance:.0f} mm off their places{friction}"
+        )
 
 
 Contents = Mapping[str, str | bytes]
@@ -417,17 +454,39 @@ class Export:
         held = [phase.force for phase in self.job.held]
         spare = min(float(((f.normal - f.least) / f.normal).min()) for f in held)
         k = self.stiffness
-        is_held = LEAST_SKEW if k is None else largest_skew(self.job, k)
+        survived = LEAST_SKEW if k is None else largest_skew(self.job, k)
         return Limits(
             stop_time=self.stop.time,
             quick_stop=self.stop.quick,
             start=START,
             path=PATH,
             behind=max(BEHIND, LAGS * self.lag),
-            skew=float(np.clip(is_held, LEAST_SKEW, MOST_SKEW)),
+            skew=float(np.clip(survived, LEAST_SKEW, MOST_SKEW)),
             force=float(np.clip(spare, LEAST_BAND, MOST_BAND)),
             silence=SILENCE,
         )
+
+    @cached_property
+    def partner_stop(self) -> PartnerStop:
+        """What one arm's stop costs.
+
+        Raises:
+            JobError: more than the cell allows.
+        """
+        # The other one goes on until both are `skew` apart, then half as far as without a stop.
+        time = self.limits.skew + TOLD + self.stop.quick / 2.0
+        job, k = self.job, self.stiffness
+        survived = None if k is None else separation(job, largest_skew(job, k))
+        allowed = self.workcell.handling.partner_stop
+        found = PartnerStop(time, separation(job, time), survived, allowed)
+        if allowed is not None and found.distance > allowed:
+            raise JobError(
+                f"when one arm stops, the pads end {1e3 * found.distance:.0f} mm apart after "
+                f"{time:.2f} s; handling.partner_stop allows {1e3 * allowed:.0f} mm: time the "
+                f"carry with partner_stop = {allowed**2 / found.distance:.3f}, or press more, "
+                "which shortens the stop"
+            )
+        return found
 
     def reach(self, arm: int) -> Array:
         """Compute the largest motion (n_joints,) of an arm's pad per motion of each joint at any

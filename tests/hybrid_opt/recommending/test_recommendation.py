@@ -153,6 +153,21 @@ def test_wishes_are_kept_and_little_is_given_away(
     assert slow.force < found.force
 
 
+def test_the_cost_of_a_partners_stop_is_told(
+    drivable: ho.Cell, front: ho.Front, found: Recommendation
+) -> None:
+    """60 mm within 0.2 s are 0.3 m/s, and the same path without that limit is faster."""
+    slow = drivable.changed({"handling.partner_stop": 0.06})
+    answer = ho.recommend(ho.Front.of(slow, front.x[[found.member]]))
+    speed = np.linalg.norm(answer.carry.rate[:, :3], axis=1).max()
+    assert speed == pytest.approx(0.3, rel=1e-3)
+    other = answer.rivals[-1]
+    assert "without partner_stop" in repr(answer)
+    assert other.duration_at_force == pytest.approx(found.duration, rel=0.02)
+    assert other.duration_at_force < answer.duration
+    assert not [text for text in answer.warnings if "partner_stop" in text]
+
+
 def test_more_payload_takes_more_force(drivable: ho.Cell, front: ho.Front) -> None:
     """In the command, in the job, and by a model of the heavier box that shares nothing with it."""
     box, last = drivable.workcell.payload, 0.0

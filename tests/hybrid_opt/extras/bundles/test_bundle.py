@@ -11,15 +11,18 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from hybrid_opt.errors import JobError, ResultsError
 from hybrid_opt.extras.bundles import BundleOptions, Origin, export
 from hybrid_opt.extras.bundles.bundle import missing_for
-from hybrid_opt.job.records import Job
+from hybrid_opt.extras.bundles.job_file import pad_places
+from hybrid_opt.job.records import Job, sample_job
 from hybrid_opt.store.bundle_file import read_manifest, write_bundle
 from hybrid_opt.store.files import sha256
 from hybrid_opt.timing.records import Timing
+from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.records.cell import ToolLoad
 from tests.hybrid_opt.extras.bundles.bundles import DRIVER, driven, rack_driven
@@ -187,7 +190,7 @@ def test_the_manifest_says_what_it_is(tmp_path: Path) -> None:
 def test_the_manifest_says_how_the_job_stops(tmp_path: Path) -> None:
     document = written(rack_job(), "torque", tmp_path)
     machine, step = document["machine"], document["time_step"]
-    assert set(machine["states"]) == {"ready", "running", "stopping", "held", "done"}
+    assert set(machine["states"]) == {*("ready", "running", "stopping", "landing", "held", "done")}
     assert machine["carried_out_by"].startswith("run_job.py")
     assert machine["stop"]["force_use"] <= 1.0
     assert machine["limits"]["stop_time"] == machine["stop"]["time"]
@@ -195,6 +198,39 @@ def test_the_manifest_says_how_the_job_stops(tmp_path: Path) -> None:
     assert step["interpolation"] == "quintic"
     assert step["share"] <= step["allowed_share"]
     assert step["force"] == pytest.approx(step["stiffness"] / 2.0 * step["along"])
+
+
+def test_one_arms_stop_costs_distance(tmp_path: Path) -> None:
+    """The pads are apart by what their speed covers until the other arm stands; a cell may allow
+    less, and the smaller limit that its refusal names is enough for the same distance over time."""
+    stop = written(rack_job(), "torque", tmp_path)["machine"]["partner_stop"]
+    speed = max(
+        float(np.linalg.norm(np.diff(places[:, :3, 3], axis=0), axis=1).max() / 1e-3)
+        for arm in (0, 1)
+        for places in [pad_places(rack_job().workcell, arm, fine_positions(arm))]
+    )
+    assert stop["distance"] == pytest.approx(speed * stop["time"], rel=0.02)
+    assert stop["survived"] < stop["distance"]
+    assert stop["allowed"] is None
+
+    def limited(allowed: float) -> Job:
+        cell = rack_job().workcell
+        handling = replace(cell.handling, partner_stop=allowed)
+        return replace(rack_job(), workcell=replace(cell, handling=handling))
+
+    enough = written(limited(1.01 * stop["distance"]), "torque", tmp_path)
+    assert enough["machine"]["partner_stop"]["distance"] == stop["distance"]
+    with pytest.raises(JobError, match=r"handling.partner_stop allows 20 mm") as refusal:
+        written(limited(0.02), "torque", tmp_path)
+    named = float(str(refusal.value).rpartition("partner_stop = ")[2].partition(",")[0])
+    assert named * stop["distance"] == pytest.approx(0.02**2, rel=0.05)
+
+
+def fine_positions(arm: int) -> Array:
+    """(n, joints) of an arm in the carry, every millisecond."""
+    sampled = sample_job(rack_job(), 1e-3)
+    (index,) = (k for k, phase in enumerate(rack_job().phases) if phase.name == "carry")
+    return sampled.arm(arm, sampled.q[sampled.span(index)])
 
 
 def test_two_controllers_have_to_survive_their_skew(tmp_path: Path) -> None:
