@@ -27,6 +27,7 @@ from hybrid_opt.extras.bundles import BundleOptions
 from hybrid_opt.extras.bundles.bundle import prepared
 from hybrid_opt.extras.bundles.egm import egm_files
 from hybrid_opt.extras.bundles.job_file import Contents
+from hybrid_opt.extras.bundles.programs.carry_job import SLOW
 from hybrid_opt.store.bundle_file import write_bundle
 from symbolic.array import Array
 from tests.hybrid_opt.extras.bundles.bundles import DRIVER, driven
@@ -41,6 +42,9 @@ LONGEST = 60.0
 
 LAG = 0.028
 """With which both arms follow [s]."""
+
+TRACKED = 0.10
+"""Allowed error of the forces in the carry, over the commanded ones."""
 
 
 @cache
@@ -173,13 +177,18 @@ def middle() -> float:
 def test_the_job_is_done_and_presses(controllers: Controllers) -> None:
     controllers.run(lambda: False)
     assert controllers.program.returncode == 0, controllers.said()
-    s, force = (np.array([row[k] for row in controllers.record]) for k in (0, 1))
-    held = (s > job().begin("carry")) & (s < job().begin("set_down"))
-    wanted = np.array([job().force(controllers._pressing, each) for each in s[held]])
-    ratio = force[held] / wanted
-    print(f"force over command {ratio.min():.3f} to {ratio.max():.3f}")
-    # An answer that comes a cycle late to one arm moves the pads apart by what they cover in 4 ms.
-    assert np.abs(ratio - 1.0).max() < job().limits.force
+    leader = 1 - controllers._pressing
+    part = slice(0, 6) if leader == 0 else slice(6, None)
+    ratio = []
+    for since, force, q in controllers.record[::5]:
+        # Where the leading arm is: late by its lag, and by what it takes to see it move. A slow
+        # one says too little of it.
+        s = job().coordinate(leader, q[part].tolist(), since, (-0.2, 0.2))
+        in_carry = job().begin("carry") < s < job().begin("set_down")
+        if in_carry and job().speed(leader, s) > SLOW * job().fastest:
+            ratio.append(force / job().force(controllers._pressing, s))
+    print(f"force over command {min(ratio):.3f} to {max(ratio):.3f}")
+    assert np.abs(np.array(ratio) - 1.0).max() < TRACKED
     last = np.concatenate([job().position(arm, job().end) for arm in (0, 1)])
     np.testing.assert_allclose(controllers.q, last, atol=1e-3)
 

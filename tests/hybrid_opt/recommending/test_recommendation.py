@@ -163,8 +163,7 @@ def test_the_cost_of_a_partners_stop_is_told(
     assert speed == pytest.approx(0.3, rel=1e-3)
     other = answer.rivals[-1]
     assert "without partner_stop" in repr(answer)
-    assert other.duration_at_force == pytest.approx(found.duration, rel=0.02)
-    assert other.duration_at_force < answer.duration
+    assert found.duration < other.duration_at_force < answer.duration
     assert not [text for text in answer.warnings if "partner_stop" in text]
 
 
