@@ -279,7 +279,7 @@ told from measured postures."""
 LEAST_BAND, MOST_BAND = 0.05, 0.3
 """Range of the share by which a measured force may miss its reference."""
 
-TOLD = 0.07
+REACTION = 0.07
 """From the look at which an arm is wrong to when the other one leaves its course [s]: two looks
 more, and the time of a message (`STRIKES` of carry_job.py, `PERIOD` and `LEAD_OF_STOP` of
 run_job.py)."""
@@ -474,7 +474,7 @@ class Export:
             JobError: more than the cell allows.
         """
         # The other one goes on until both are `skew` apart, then half as far as without a stop.
-        time = self.limits.skew + TOLD + self.stop.quick / 2.0
+        time = self.limits.skew + REACTION + self.stop.quick / 2.0
         job, k = self.job, self.stiffness
         survived = None if k is None else separation(job, largest_skew(job, k))
         allowed = self.workcell.handling.partner_stop
