@@ -39,14 +39,14 @@ CELL = Path(__file__).parents[1] / "workcells" / "palletising.toml"
 
 KINDS = ("cups above", "cups beside", "magnets", "fingers")
 
-CARRY_SAMPLES = 101
+QUINTIC_SAMPLES = 101
 
 SWINGS = 12.0
 """How often a payload swings on its layers in a carry, at least; the model is of layers that do not
 swing."""
 
-LOW, HIGH, BISECTIONS = 0.5, 1.5, 9
-"""Factors between which a threshold is looked for, to 0.2 %."""
+LOW, HIGH, BISECTIONS = 0.5, 1.5, 7
+"""Factors between which a threshold is looked for, to 0.4 %."""
 
 
 @dataclass(frozen=True)
@@ -116,7 +116,7 @@ def carry_along(workcell: Workcell, path: Array, duration: float) -> Carry:
 
     The motion is the quintic 10 s^3 - 15 s^4 + 6 s^5.
     """
-    s = np.linspace(0.0, 1.0, CARRY_SAMPLES)
+    s = np.linspace(0.0, 1.0, QUINTIC_SAMPLES)
     place = 10 * s**3 - 15 * s**4 + 6 * s**5
     speed = (30 * s**2 - 60 * s**3 + 30 * s**4) / duration
     growth = (60 * s - 180 * s**2 + 120 * s**3) / duration**2
@@ -129,7 +129,7 @@ def carry_along(workcell: Workcell, path: Array, duration: float) -> Carry:
     turning = [
         angular_rates(*rows) for rows in zip(pose[:, 3:], rate[:, 3:], second[:, 3:], strict=True)
     ]
-    none = np.zeros((CARRY_SAMPLES, 6))
+    none = np.zeros((QUINTIC_SAMPLES, 6))
     arm = ArmMotion(none, none, none, none, none)
     return Carry(
         workcell=workcell,
@@ -142,12 +142,12 @@ def carry_along(workcell: Workcell, path: Array, duration: float) -> Carry:
         second_rate=second,
         angular_velocity=np.array([omega for omega, _ in turning]),
         angular_acceleration=np.array([alpha for _, alpha in turning]),
-        normal_force=np.zeros((CARRY_SAMPLES, 2)),
-        tangential_force=np.zeros((CARRY_SAMPLES, 2)),
-        contact_force=np.zeros((CARRY_SAMPLES, 2, 3)),
-        pressure_shift=np.zeros((CARRY_SAMPLES, 2)),
-        point_moment_residual=np.zeros((CARRY_SAMPLES, 3)),
-        moment_residual=np.zeros((CARRY_SAMPLES, 3)),
+        normal_force=np.zeros((QUINTIC_SAMPLES, 2)),
+        tangential_force=np.zeros((QUINTIC_SAMPLES, 2)),
+        contact_force=np.zeros((QUINTIC_SAMPLES, 2, 3)),
+        pressure_shift=np.zeros((QUINTIC_SAMPLES, 2)),
+        point_moment_residual=np.zeros((QUINTIC_SAMPLES, 3)),
+        moment_residual=np.zeros((QUINTIC_SAMPLES, 3)),
         arms=(arm, arm),
     )
 
