@@ -96,11 +96,13 @@ class _Sweep:
         for level in range(DEPTH + 1):
             if level > 0:
                 work = self._uncleared(work)
-            for end, fraction in ((work.a, 0.0), (work.b, 1.0)):
+            for end, fraction in ((work.b, 1.0), (work.a, 0.0)):
                 hit = self._measure(work, end, level == DEPTH)
                 for row in np.flatnonzero(hit >= 0).tolist():
                     hits.append(self._touch(work, row, int(hit[row]), fraction))
                     np.minimum.at(beyond, self.owner[work.index[row]], work.index[row])
+                if end is work.b:
+                    work.hand_on()
             # Samples after a collision say nothing new.
             work = self._uncleared(work[work.index < beyond[self.owner[work.index]]])
             given_up = self._given_up(work, level)
@@ -275,6 +277,16 @@ class Intervals(Rows):
     chord: Array
     bend: Array
     pending: NDArray[np.bool_]
+
+    def hand_on(self) -> None:
+        """Copy what was measured at the end of an interval to the start of the next one, where both
+        are one place."""
+        same = np.all(self.b.configuration[:-1] == self.a.configuration[1:], axis=1)
+        before = np.flatnonzero(same)
+        after = before + 1
+        known = np.fmax(self.a.clearance[after], self.b.clearance[before])
+        self.a.clearance[after] = known
+        self.a.measured[after] |= self.b.measured[before]
 
 
 def _alternating(values: list[Array]) -> Array:

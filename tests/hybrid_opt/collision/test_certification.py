@@ -336,6 +336,24 @@ def test_a_curved_path_around_the_plate_is_certified() -> None:
     assert not collision_mask(judge, *arc(np.linspace(0.0, 1.0, 2000))).any()
 
 
+def test_no_pair_is_measured_twice_at_a_place(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where two intervals meet, and at places that stay between shorter ones."""
+    judge, measure, seen = checker(gap=2e-6), CollisionChecker.measure, list[tuple[bytes, int]]()
+
+    def noted(self: CollisionChecker, *given: Any) -> Any:
+        *configuration, _, wanted = given
+        places = np.hstack(configuration)
+        seen.extend((places[row].tobytes(), int(pair)) for row, pair in np.argwhere(wanted))
+        return measure(self, *given)
+
+    monkeypatch.setattr(CollisionChecker, "measure", noted)
+    pose, q_1, q_2 = passing(np.zeros(5))
+    pose[:, 1] = np.linspace(-0.05, 0.05, 5)
+    check_between(judge, np.hstack([pose, q_1, q_2]))
+    assert len(seen) > 10
+    assert len(set(seen)) == len(seen)
+
+
 def test_a_path_that_jumps_is_refused() -> None:
     def jump(u: Array) -> Configurations:
         return passing(np.where(u < 0.337, -0.6, 0.6))
