@@ -14,13 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_opt.extras.proposing.holding import (
-    ArmKinematics,
-    Hold,
-    HoldQuery,
-    find_holds,
-    shoulder_positions,
-)
+from hybrid_opt.extras.proposing.holding import Hold, HoldQuery, find_holds
+from hybrid_opt.extras.proposing.kinematics import ArmKinematics, shoulder_positions
 from hybrid_opt.extras.proposing.problem import Problem
 from hybrid_opt.extras.proposing.setup import redundancy
 from hybrid_opt.extras.proposing.trial import PayloadSceneChecker

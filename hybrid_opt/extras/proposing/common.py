@@ -9,12 +9,11 @@ import numpy as np
 
 from hybrid_opt.extras.proposing.holding import (
     LIMIT_MARGIN,
-    REACHED,
     SEARCH_DAMPING,
-    ArmKinematics,
     HoldQuery,
     possible_spins,
 )
+from hybrid_opt.extras.proposing.kinematics import REACHED, ArmKinematics
 from symbolic.array import Array
 from symbolic.records.poses import box_placement
 

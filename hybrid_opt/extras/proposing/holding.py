@@ -1,260 +1,34 @@
-"""The ways in which an arm can hold the box: spins of its pad, postures, and where they lead.
+"""Ways for one arm to hold the box: spins of its pad, start postures, and their paths to the goal.
 
-Many postures of one arm are worked out at once, in NumPy side by side, because spins, bases and
-branches are compared before anything is compiled.
+Many postures are computed side by side, because spins, bases and branches are compared before
+anything is compiled.
 """
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
-import pinocchio as pin
 from numpy.typing import NDArray
 
+from hybrid_opt.extras.proposing.kinematics import (
+    MANIPULABILITY_MARGIN,
+    REACHED,
+    ArmKinematics,
+    has_wrist_spin,
+)
 from hybrid_opt.extras.proposing.trial import PoseJudge
 from symbolic.array import Array
-from symbolic.geometry.bodies import WORLD, ArmGeometry, Frame, arm_geometry
+from symbolic.geometry.bodies import WORLD, Frame
 from symbolic.geometry.pairs import coal_distance
-from symbolic.read.arms import arm_model, common_joints
-from symbolic.records import Contact, Robot, Workcell
-from symbolic.records.poses import box_placement, inverse, pose_matrix
-
-REACHED = 1e-6
-"""Pose residual of a reached posture [m, rad]."""
-
-STEP_LIMIT = 0.4
-"""Largest change of a joint in one step [rad]."""
-
-TRACKING_STEPS = 4
-"""Newton steps from one pose of a path to the next."""
-
-DRIFT_SHARE = 0.03
-"""Share of the way to the middle of their ranges that joints drift from pose to pose."""
+from symbolic.read.arms import arm_model
+from symbolic.records import Contact
+from symbolic.records.poses import box_placement
 
 GUIDE_POSES = 25
 """Poses of a guide that postures are followed along."""
-
-JUMP = 0.5
-"""Largest change of a joint between poses of a path [rad]."""
-
-
-@dataclass(frozen=True)
-class Postures:
-    """n postures of one arm.
-
-    Attributes:
-        q: (n, joints) [rad or m].
-        residual: (n,) from the pose that was wanted [m, rad].
-        determinant: (n,) det J of the joints that follow [m^3]; where its sign changes along a
-            path, the arm passes a singular posture.
-    """
-
-    q: Array
-    residual: Array
-    determinant: Array
-
-    @property
-    def manipulability(self) -> Array:
-        """(n,) abs(det J) [m^3]."""
-        return np.abs(self.determinant)
-
-
-class ArmKinematics:
-    """One arm of a cell as numbers.
-
-    Attributes:
-        workcell: the cell.
-        arm: index of the arm.
-        geometry: its joints.
-        redundant: indices of the joints that stay where they are; the other six follow the box.
-        common: indices of those that move the other arm too, in the order of the task.
-        lower, upper: (joints,) limits [rad or m].
-        least: manipulability of a first path.
-    """
-
-    def __init__(self, workcell: Workcell, arm: int, geometry: ArmGeometry | None = None) -> None:
-        self.workcell, self.arm = workcell, arm
-        self.geometry = geometry = geometry or arm_geometry(workcell, arm)
-        self.redundant = tuple(joint for joint, _ in workcell.task.redundant_of(arm))
-        self.common = [joint.drives[arm] for joint in workcell.task.redundant if joint.is_common]
-        self.following = [k for k in range(geometry.joints) if k not in self.redundant]
-        self.lower, self.upper = np.asarray(geometry.lower), np.asarray(geometry.upper)
-        self.least = workcell.robots[arm].min_manipulability * MANIPULABILITY_MARGIN
-
-    def moved(self, T_world_root: Array) -> ArmKinematics:
-        """Return the arm at another base."""
-        geometry = replace(self.geometry, T_world_root=T_world_root)
-        return ArmKinematics(self.workcell, self.arm, geometry)
-
-    def held(self, spin: float = 0.0) -> Array:
-        """Compute T_box_joint (4, 4): the last joint of the arm in the frame of the box that it
-        holds, its pad turned about its normal by an angle [rad]."""
-        contact = self.workcell.contacts[self.arm]
-        # The geometry's own contact is replaced by the one asked for.
-        T_pad_joint = inverse(contact.T_box_pad) @ inverse(self.geometry.T_joint_box)
-        return np.asarray(rotate_about_normal(contact, spin).T_box_pad @ T_pad_joint)
-
-    @property
-    def span(self) -> Array:
-        """(2, joints) the limits, within half a turn either way [rad or m]."""
-        return np.array([np.maximum(self.lower, -np.pi), np.minimum(self.upper, np.pi)])
-
-    def drawn(self, count: int, rng: np.random.Generator) -> Array:
-        """Draw random postures (count, joints) within `span` [rad or m]."""
-        low, high = self.span
-        return rng.uniform(low, high, (count, len(low)))
-
-    def chain(self, q: Array) -> tuple[Array, Array]:
-        """Compute origins and axes (n, joints, 6) of the joints and the last joint's placement (n,
-        4, 4), in the world."""
-        n, arm = len(q), self.geometry
-        T = np.broadcast_to(arm.T_world_root, (n, 4, 4))
-        points, axes = np.empty((n, arm.joints, 3)), np.empty((n, arm.joints, 3))
-        for k in range(arm.joints):
-            T = T @ arm.origins[k]
-            moved = np.zeros((n, 4, 4))
-            moved[:, 3, 3] = 1.0
-            axis = arm.axes[k]
-            if arm.turning[k]:
-                moved[:, :3, :3] = _turns(axis, q[:, k])
-            else:
-                moved[:, :3, :3] = np.eye(3)
-                moved[:, :3, 3] = q[:, k, None] * axis
-            points[:, k], axes[:, k] = T[:, :3, 3], T[:, :3, :3] @ axis
-            T = T @ moved
-        return np.concatenate([points, axes], axis=2), T
-
-    def jacobian(self, frames: Array, T: Array) -> Array:
-        """Compute the Jacobian (n, 6, joints) of the last joint's origin, world axes, from the
-        results of `chain`."""
-        points, axes = frames[:, :, :3], frames[:, :, 3:]
-        turning = np.array(self.geometry.turning)[:, None]
-        across = np.cross(axes, T[:, None, :3, 3] - points)
-        linear = np.where(turning, across, axes)
-        return np.concatenate([linear, np.where(turning, axes, 0.0)], axis=2).transpose(0, 2, 1)
-
-    def side(self, q: Array) -> float:
-        """Return the sign of det J in a posture (joints,): a path on which it changes passes a
-        singular posture."""
-        return float(
-            np.sign(np.linalg.det(self.jacobian(*self.chain(q[None]))[0][:, self.following]))
-        )
-
-    def solve(self, q: Array, target: Array, steps: int, damping: float = 0.0) -> Postures:
-        """Solve postures (n, joints) by Newton's method for placements (n, 4, 4) of the last joint.
-
-        Args:
-            damping: 0 for pure Newton steps; small values keep far starts on course.
-        """
-        q = np.array(q, dtype=float)
-        for step in range(steps + 1):
-            frames, T = self.chain(q)
-            J = self.jacobian(frames, T)[:, :, self.following]
-            error, residual = _error(target, T)
-            if step == steps or float(residual.max(initial=0.0)) < REACHED / 10.0:
-                break
-            normal = np.einsum("nki,nkj->nij", J, J)
-            normal += (damping * np.minimum(residual, 1.0) ** 2 + 1e-12)[:, None, None] * np.eye(6)
-            right = np.einsum("nki,nk->ni", J, error)[..., None]
-            move = np.linalg.solve(normal, right)[..., 0]
-            most = np.maximum(np.abs(move).max(axis=1, keepdims=True), STEP_LIMIT)
-            q[:, self.following] += move * (STEP_LIMIT / most)
-        return Postures(q, residual, np.linalg.det(J))
-
-    def track(self, q: Array, target: Array, held: Sequence[int] = ()) -> Postures:
-        """Find the next posture (n, joints) at placements (n, 4, 4), all joints but those held
-        moving: steps of least norm that drift to the middle of the joints' ranges where the box
-        leaves them free."""
-        q = np.array(q, dtype=float)
-        middle = (self.lower + self.upper) / 2.0
-        moving = np.isin(np.arange(q.shape[1]), held, invert=True)
-        for step in range(TRACKING_STEPS + 1):
-            frames, T = self.chain(q)
-            J = self.jacobian(frames, T)
-            error, residual = _error(target, T)
-            if step == TRACKING_STEPS:
-                break
-            own = J * moving
-            inverted = own.transpose(0, 2, 1) @ np.linalg.inv(
-                own @ own.transpose(0, 2, 1) + 1e-9 * np.eye(6)
-            )
-            drift = DRIFT_SHARE * (middle - q) * moving if step == 0 else np.zeros_like(q)
-            missing = error - np.einsum("nij,nj->ni", own, drift)
-            q += drift + np.einsum("nij,nj->ni", inverted, missing)
-        return Postures(q, residual, np.linalg.det(J[:, :, self.following]))
-
-    def follow(
-        self, q: Array, targets: Array, ends: Array | None = None, resolved: bool = False
-    ) -> tuple[Array, NDArray[np.intp], Array]:
-        """Compute postures (n, joints) that follow placements (m, 4, 4) of the last joint.
-
-        Args:
-            targets: one path for all, or one for each, (m, n, 4, 4).
-            ends: (n, redundant) where the redundant joints are at the end; None: they stay.
-            resolved: whether they go where the joints keep to the middle of their ranges instead;
-                common ones only without `ends`.
-
-        Returns:
-            Joint paths (m, n, joints); of each posture the number of placements that it reached
-            without a jump; manipulability (m, n), negative beyond a singular posture.
-        """
-        m, n = len(targets), len(q)
-        path, measure = np.tile(q, (m, 1, 1)), np.zeros((m, n))
-        kept, alive = np.zeros(n, dtype=np.intp), np.arange(n)
-        change, redundant, side = np.zeros_like(q), list(self.redundant), np.ones(n)
-        for k, target in enumerate(targets):
-            before = path[max(k - 1, 0), alive]
-            guess = before + change
-            if ends is not None:
-                begin = q[alive][:, redundant]
-                guess[:, redundant] = begin + (ends[alive] - begin) * (k / max(m - 1, 1))
-            there = np.broadcast_to(target, (n, 4, 4))[alive]
-            if resolved:
-                held = [] if ends is None else self.common
-                placed = before.copy()
-                placed[:, held] = guess[:, held]
-                found = self.track(placed, there, held)
-            else:
-                found = self.solve(guess, there, TRACKING_STEPS)
-            near = np.abs(found.q - before).max(axis=1) <= JUMP
-            on = (found.residual <= REACHED) & near
-            alive, change = alive[on], found.q[on] - before[on] if k else change[on]
-            path[k:, alive] = found.q[on]
-            kept[alive] += 1
-            side = side[on] if k else np.sign(found.determinant[on])
-            measure[k, alive] = found.determinant[on] * side
-        return path, kept, measure
-
-    def central(self, path: Array) -> Array:
-        """Compute the full turns (n, joints) [rad] that bring joint paths (m, n, joints) nearest to
-        the middle of the limits; zero for prismatic joints."""
-        middle = (self.lower + self.upper) / 2.0
-        turns = np.round((middle - (path.min(axis=0) + path.max(axis=0)) / 2.0) / (2.0 * np.pi))
-        free = np.array(self.geometry.turning)
-        free[list(self.redundant)] = False
-        return np.asarray(2.0 * np.pi * turns * free)
-
-
-def rotate_about_normal(contact: Contact, spin: float) -> Contact:
-    """Return a contact with its pad turned about its normal by an angle [rad]."""
-    turn = pose_matrix(np.zeros(3), np.array([0.0, 0.0, spin]))
-    return replace(contact, T_box_pad=contact.T_box_pad @ turn)
-
-
-def shoulder_positions(robots: tuple[Robot, Robot]) -> Array:
-    """Compute the positions (2, 3) of each arm's first own joint in the world, all joints at the
-    middle of their ranges [m]."""
-    found = []
-    for robot in robots:
-        model = arm_model(robot)
-        own = [name not in common_joints(robots) for name in list(model.names)[1:]].index(True)
-        data, q = model.createData(), (robot.position_lower + robot.position_upper) / 2.0
-        pin.forwardKinematics(model, data, q)
-        found.append((robot.T_world_base @ data.oMi[own + 1].homogeneous)[:3, 3])
-    return np.array(found)
 
 
 def possible_spins(contact: Contact, spins: Array) -> Array:
@@ -312,26 +86,6 @@ def initial_arc(start: Array, goal: Array, bow: Array) -> Array:
     return poses
 
 
-def _turns(axis: Array, angle: Array) -> Array:
-    """Compute rotations (n, 3, 3) about a unit axis (Rodrigues)."""
-    K = np.array([[0.0, -axis[2], axis[1]], [axis[2], 0.0, -axis[0]], [-axis[1], axis[0], 0.0]])
-    sine, cosine = np.sin(angle)[:, None, None], np.cos(angle)[:, None, None]
-    return np.asarray(np.eye(3) + sine * K + (1.0 - cosine) * (K @ K))
-
-
-def _error(target: Array, T: Array) -> tuple[Array, Array]:
-    """Compute Newton's right-hand side (n, 6) and the pose residual (n,)."""
-    R, R_target = T[:, :3, :3], target[:, :3, :3]
-    dR = R_target @ R.transpose(0, 2, 1)
-    axis = np.stack(
-        [dR[:, 2, 1] - dR[:, 1, 2], dR[:, 0, 2] - dR[:, 2, 0], dR[:, 1, 0] - dR[:, 0, 1]], axis=1
-    )
-    dp = target[:, :3, 3] - T[:, :3, 3]
-    turn_squared = np.sum((R_target - R) ** 2, axis=(1, 2)) / 2.0
-    residual = np.sqrt(np.sum(dp**2, axis=1) + turn_squared)
-    return np.concatenate([dp, axis / 2.0], axis=1), residual
-
-
 STARTS = 768
 """Random starts of the search for postures."""
 
@@ -366,9 +120,6 @@ MOST_HOLDS = 24
 
 LIMIT_MARGIN = 0.02
 """Distance to joint limits of a first path [rad]."""
-
-MANIPULABILITY_MARGIN = 1.1
-"""Its least manipulability, in that of the cell."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -652,14 +403,3 @@ def _diverse(holds: Sequence[Hold], compared: int) -> list[Hold]:
         elif nearest > SAME_POSTURE:
             later.append(hold)
     return first + later
-
-
-def has_wrist_spin(kinematics: ArmKinematics) -> bool:
-    """Return True if the arm's last joint turns the pad about its normal."""
-    geometry, contact = kinematics.geometry, kinematics.workcell.contacts[kinematics.arm]
-    T_joint_pad = geometry.T_joint_box @ contact.T_box_pad
-    axis = geometry.axes[-1]
-    aside = T_joint_pad[:3, 3] - (T_joint_pad[:3, 3] @ axis) * axis
-    parallel = abs(float(T_joint_pad[:3, 2] @ axis)) > 1.0 - 1e-6
-    last_follows = geometry.joints - 1 not in kinematics.redundant
-    return bool(geometry.turning[-1] and last_follows and parallel and np.linalg.norm(aside) < 1e-4)

@@ -23,14 +23,8 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from hybrid_opt.extras.proposing.holding import (
-    JUMP,
-    LIMIT_MARGIN,
-    REACHED,
-    TRACKING_STEPS,
-    ArmKinematics,
-    Hold,
-)
+from hybrid_opt.extras.proposing.holding import LIMIT_MARGIN, Hold
+from hybrid_opt.extras.proposing.kinematics import JUMP, REACHED, TRACKING_STEPS, ArmKinematics
 from hybrid_opt.extras.proposing.trial import PayloadSceneChecker, PoseJudge
 from symbolic.array import Array
 from symbolic.errors import SettingsError

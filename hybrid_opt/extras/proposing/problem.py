@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from hybrid_opt.extras.proposing.decimals import pose_limits, readable_turns
-from hybrid_opt.extras.proposing.holding import shoulder_positions
+from hybrid_opt.extras.proposing.kinematics import shoulder_positions
 from symbolic import safe_io
 from symbolic.array import Array
 from symbolic.errors import OutsideError, WorkcellError

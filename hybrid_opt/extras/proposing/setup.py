@@ -17,9 +17,7 @@ from hybrid_opt.evaluate.explanation import missing_reach
 from hybrid_opt.extras.proposing.common import common_positions
 from hybrid_opt.extras.proposing.holding import (
     GUIDES,
-    REACHED,
     SEARCH_DAMPING,
-    ArmKinematics,
     Hold,
     HoldQuery,
     HoldSearch,
@@ -27,8 +25,8 @@ from hybrid_opt.extras.proposing.holding import (
     initial_arc,
     manipulability_hint,
     possible_spins,
-    rotate_about_normal,
 )
+from hybrid_opt.extras.proposing.kinematics import REACHED, ArmKinematics, rotate_about_normal
 from hybrid_opt.extras.proposing.planner import ChainConfiguration, ClosedChain, Retreats, retreats
 from hybrid_opt.extras.proposing.problem import Problem
 from hybrid_opt.extras.proposing.trial import MARGINS, PoseJudge, judge_of

@@ -7,7 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from hybrid_opt.extras.proposing.holding import JUMP
+from hybrid_opt.extras.proposing.kinematics import JUMP
 from hybrid_opt.extras.proposing.planner import (
     PATH_STEP,
     ChainConfiguration,

@@ -25,14 +25,8 @@ from hybrid_opt.extras.proposing.bases import (
     shared_room,
 )
 from hybrid_opt.extras.proposing.common import common_positions
-from hybrid_opt.extras.proposing.holding import (
-    ArmKinematics,
-    HoldQuery,
-    clear_spins,
-    find_holds,
-    possible_spins,
-    rotate_about_normal,
-)
+from hybrid_opt.extras.proposing.holding import HoldQuery, clear_spins, find_holds, possible_spins
+from hybrid_opt.extras.proposing.kinematics import ArmKinematics, rotate_about_normal
 from hybrid_opt.extras.proposing.problem import Problem, read_problem
 from hybrid_opt.extras.proposing.setup import Setup, prepare, reach_missing
 from hybrid_opt.extras.proposing.trial import judge_of

@@ -12,7 +12,7 @@ import trimesh
 
 from hybrid_opt.errors import JobError
 from hybrid_opt.extras.proposing.draft import Draft, changes
-from hybrid_opt.extras.proposing.holding import ArmKinematics
+from hybrid_opt.extras.proposing.kinematics import ArmKinematics
 from hybrid_opt.extras.proposing.planner import (
     ChainConfiguration,
     Corridor,
