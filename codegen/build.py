@@ -254,7 +254,7 @@ def load_or_build(
         lanes: evaluations of a batch that run side by side; 0 for what suits the machine.
 
     Raises:
-        CodegenError: see `compile_function`; and whatever `make` raises.
+        CodegenError: see `compile_function`; also the errors of `make`.
     """
     cache = cache or Cache()
     full = _set_key(key, levels, lanes, cache)
@@ -275,7 +275,7 @@ def load_or_compile(
 
     Raises:
         CodegenError: there is no C compiler; or it cannot be compiled, cached or loaded; and
-            whatever `make` raises.
+            Also the errors of `make`.
     """
 
     def source() -> Iterable[CSource]:

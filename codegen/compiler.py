@@ -28,7 +28,7 @@ FLAGS = (
     # CasADi's own entry points stay visible, so that `casadi.external` can use a library as well.
     "-DGCC_HASCLASSVISIBILITY",
     "-fno-math-errno",
-    # Without fused multiply-adds the results are the same to the last bit, whatever the processor.
+    # Without fused multiply-adds all processors give the same bits.
     # Never -ffast-math: NaN must stay NaN.
     "-ffp-contract=off",
 )

@@ -98,7 +98,7 @@ class InterpretedFunction(NumericFunction):
         if n > 1 and self._tape is not None:
             self._tape.run(list(inputs), list(batched), list(outputs), n)
             return
-        # One evaluation's memory serves all: CasADi is told addresses once a batch.
+        # One evaluation's memory serves all: CasADi gets addresses once a batch.
         own = [
             np.empty(array.shape[1:]) if per else array
             for array, per in zip(inputs, batched, strict=True)

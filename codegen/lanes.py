@@ -18,7 +18,7 @@ with an example, and in `KEPT_FORMS`, those that mean the same for lanes as for 
 (the types of `codegen/c/lanes.h`) constants are equal in all lanes, comparisons and choices are
 masks, and a branch of `casadi.Function.if_else` runs if any lane needs it. A line of any other form
 raises a `FormError` with its text: a new version of CasADi, or a function of it that was not
-used before, then asks for one more entry here.
+used before, then needs one more entry here.
 """
 
 from __future__ import annotations

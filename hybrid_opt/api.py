@@ -49,7 +49,7 @@ def search(
         WorkcellError: the payload cannot be held still, so that there is nothing to search for.
     """
     settings = settings or SearchSettings()
-    make(algorithm, settings.algorithm)  # mistakes are told before anything is compiled
+    make(algorithm, settings.algorithm)  # refuses mistakes before anything is compiled
     cell.require_hold()
     if settings.initial is None and algorithm != "random":
         settings = replace(settings, initial=cell.initial[None])

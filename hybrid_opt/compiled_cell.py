@@ -203,7 +203,7 @@ class CompiledCell:
         set's).
 
         Args:
-            details: whatever else that is.
+            details: further ingredients.
             bodies: whether bodies belong to it.
         """
         numbers = self.numbers
@@ -230,7 +230,7 @@ class CompiledCell:
         Args:
             name: of the set.
             make: makes the functions from the model with symbols.
-            details: whatever else `make` depends on.
+            details: further ingredients of `make`.
             lanes, levels: see `codegen.build.build`.
             bodies: whether it depends on the bodies.
 

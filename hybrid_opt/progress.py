@@ -129,7 +129,7 @@ class Progress:
             def advance(count: int, total: int | None = None) -> None:
                 _set_total(bar, total)
                 if bar.total is not None and bar.n + count > bar.total:
-                    bar.total = None  # more than was thought: nobody knows how much is left
+                    bar.total = None  # more than expected: the rest is unknown
                 bar.update(count)
 
             yield advance

@@ -218,7 +218,7 @@ class _Still:
         self._postures = dict(zip(self._poses, postures, strict=False))
         self._models: list[RobotModel] = []
         if postures:
-            # Not imported at the top: what asks for forces alone needs no Pinocchio.
+            # Not imported at the top: forces alone need no Pinocchio.
             from symbolic.robot.model import build_robot_model
 
             self._models = [build_robot_model(robot) for robot in workcell.robots]

@@ -228,8 +228,8 @@ def _without_interrupts() -> Iterator[None]:
 
 @contextmanager
 def _interrupts_later() -> Iterator[None]:
-    """Raise Ctrl-C at the end of the `with` block only: nobody knows of a process whose start it
-    interrupts."""
+    """Raise Ctrl-C at the end of the `with` block only: a process whose start it interrupts would
+    be lost."""
     if current_thread() is not main_thread():
         yield
         return

@@ -1,10 +1,9 @@
 """Calibrate a cell from its own runs: `dual-arm-carry calibrate CELL RUN... --out CELL2`.
 
-From recordings (MCAP, rosbag2, CSV, RTDE's as well) with a side file in TOML each it
-tells the sensors' offsets and crosstalk, mass, centre of mass, a bracket of the friction, how
-forces follow their commands, how the pads drift; and writes the workcell file with that in it. It
-names what is wrong with a run, or missing (docs/how-to/calibration.md). Exit code 1 where something
-is refused.
+From recordings (MCAP, rosbag2, CSV, also RTDE's) with a side file in TOML each it estimates the
+sensors' offsets and crosstalk, mass, centre of mass, a bracket of the friction, the tracking of
+forces and the drift of the pads, and writes the workcell file with these values. It names faults of
+runs and missing runs (docs/how-to/calibration.md). Exit code 1 if a recording is refused.
 """
 
 from __future__ import annotations
@@ -33,7 +32,7 @@ def _add_options(parser: Parser) -> None:
 
 
 def calibrate(options: argparse.Namespace) -> int:
-    """Do what the options ask for, and print it; returns the exit code."""
+    """Calibrate as the options state, and print the result; return the exit code."""
     from hybrid_opt.extras.calibrating import evidence as found_in
     from hybrid_opt.extras.calibrating.recording import read_run
     from hybrid_opt.store.files import AGAIN, write_atomically

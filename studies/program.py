@@ -266,7 +266,7 @@ def load_workcell(path: Path) -> Workcell:
 def run_program(main: Callable[[], int]) -> int:
     """Run a program's main function as a process of its own; returns the exit code.
 
-    Warnings of this project are told once, in one line; those of libraries (divisions by zero,
+    Warnings of this project are printed once, in one line; those of libraries (divisions by zero,
     deprecations) only with `--verbose`, also in the processes that this one starts.
     """
     _show_warnings(verbose=VERBOSE in sys.argv[1:])

@@ -72,7 +72,7 @@ def _add_options(parser: Parser) -> None:
         parser,
         "--time",
         default=stated("hybrid_opt.extras.proposing.proposal.ProposeSettings.seconds"),
-        help="seconds that it may work, its start included, whatever else the machine does",
+        help="time limit in seconds, start included",
     )
     add(parser, "--target")
     add(parser, "--seed", help="of its randomness")

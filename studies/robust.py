@@ -1,9 +1,9 @@
-"""Forces that hold whatever the case: `dual-arm-carry robust FILE`.
+"""Forces that hold in every case: `dual-arm-carry robust FILE`.
 
-What is commanded of a stored trajectory, driven as its job does, so that it holds in every case of
-its workcell's [uncertainty], or of a usual set without one: what the force is made of, its price,
-the largest set that the reference forces allow, and random cases. Exit code 1 where one of them
-fails.
+Prints the commanded force of a stored trajectory, timed as in its job, that holds in every case of
+its workcell's [uncertainty], or of the usual set without one: its contributions, the price of
+robustness, the largest set that the reference forces allow, and a check in random cases. Exit code
+1 if one of them fails.
 """
 
 from __future__ import annotations

@@ -228,7 +228,7 @@ def add_options(parser: Parser, output: str) -> None:
 
 
 def study_of(workcell: Path, options: argparse.Namespace, with_paper: bool = False) -> int:
-    """Make the study of a workcell's file that the options ask for, with the paper's figures beside
+    """Make the study of a workcell's file as the options state, with the paper's figures beside
     its own where they are wanted; returns the exit code."""
     again = [part for part in options.arguments if part not in ("--resume", "--overwrite")]
     command = " ".join([options.called, shlex.join([*again, "--resume"])])

@@ -102,7 +102,7 @@ def build_cell_model(
 ) -> CellModel:
     """Read the robots, list all start branches and choose one per arm.
 
-    The workcell's `start_branch` picks from the ranked branches; -1 stands for the best.
+    The workcell's `start_branch` selects one of the ranked branches; -1 is the best.
 
     Args:
         bodies: of the same cell, if they are known; its path may be another one.

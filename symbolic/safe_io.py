@@ -35,7 +35,7 @@ CELL_BYTES = 128 * MEBIBYTE
 """Largest workcell file, URDF, mesh, and sum of all files that one workcell names."""
 
 MOST_BYTES = 512 * MEBIBYTE
-"""Largest file that is read, whatever it is."""
+"""Largest file that is read."""
 
 MAX_JSON_VALUES = 1_000_000
 """Most values of one JSON document: each takes up to about 200 bytes once it is read."""
@@ -203,7 +203,7 @@ def megabytes(size: float) -> str:
 @contextmanager
 def _opened(path: Path) -> Iterator[int]:
     try:
-        # Without O_NONBLOCK the opening of a pipe would wait for somebody to write to it.
+        # Without O_NONBLOCK the opening of a pipe would wait for a writer.
         handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC | os.O_NOCTTY)
         try:
             yield handle

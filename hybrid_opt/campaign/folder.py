@@ -84,7 +84,7 @@ class ExecutionSettings:
 
 
 def workers_for(execution: ExecutionSettings) -> Workers:
-    """Return the workers that the settings ask for; none is started yet."""
+    """Return the workers of the settings; none is started yet."""
     if execution.executor == "dask":
         assert execution.scheduler is not None
         return DaskWorkers(execution.scheduler, environment)
@@ -252,8 +252,8 @@ _ELSEWHERE = "choose another --output, or remove those results with --overwrite"
 def _clear(root: Path) -> None:
     """Remove everything in a results folder.
 
-    Marks of what is done go first and the configuration last: whatever moment ends it, nothing
-    looks done that is not there, and the folder can be overwritten again.
+    Marks of finished stages go first and the configuration last: after an interruption at any
+    moment no missing file looks finished, and the folder can be overwritten again.
     """
     order = {STAGES: 0, CONFIGURATION: 2}
     with storing(root):

@@ -39,7 +39,7 @@ def search_replica(request: SearchRequest, progress: ShowProgress = False) -> by
     """Search one replica from its seed; returns the content of its file."""
     settings, algorithm = request.settings, request.algorithm
     cell = loaded_cell(request.files, settings.objectives)
-    # None stands for the hand-made trajectory.
+    # None: the hand-made trajectory.
     initial = None if settings.starts_from_initial(algorithm) else np.empty((0, cell.n_var))
     how = SearchSettings(settings.algorithms[algorithm], settings.constraint_handling, initial)
     rng = settings.replica_rng(algorithm, request.replica)

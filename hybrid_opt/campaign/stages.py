@@ -355,9 +355,8 @@ _ELAPSED_INTERVAL = 1.0
 def build_study(cell: Cell, progress: Progress, polish: bool = True, drivable: bool = True) -> None:
     """Load or build the functions of a study, with all compilers in parallel.
 
-    What a polish compiles when its solves first ask for it, rows of arms' clearances, is not among
-    them. Where all was built before nothing is done; what cannot be built is left to who asks for
-    it.
+    Rows of arms' clearances are compiled later, by the solves of a polish. A failed build is
+    reported by the first caller of its functions.
 
     Args:
         cell: read from a file.

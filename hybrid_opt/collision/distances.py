@@ -1,7 +1,7 @@
 """Distances of a cell's bodies by Coal, proven by their shapes (`distances.cpp`).
 
 A lower bound is the gap between both bodies along a direction that Coal's GJK proposes. It never
-exceeds their distance, whatever the solver says, and is within 1e-8 m of it where GJK converges.
+exceeds their distance, whether the solver converges or not; if it does, it is within 1e-8 m of it.
 An upper bound below zero is the radius of a ball inside the Minkowski difference, so the depth of
 an intersection is at least as large.
 """

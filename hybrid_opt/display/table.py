@@ -29,7 +29,7 @@ def number(value: float | None, digits: int = 2, scale: float = 1.0) -> str:
 
 
 UNPUBLISHED = "unknown"
-"""Cell of a figure that nobody published."""
+"""Cell of an unpublished figure."""
 
 
 def torque_use(use: float | None) -> str:

@@ -167,12 +167,12 @@ def _friction_use(outputs: Outputs, workcell: Workcell) -> Array:
 def _robust_forces(outputs: Outputs, workcell: Workcell) -> Array:
     """Compute the peaks (n, 2) over the reference force of each arm's robust force.
 
-    Arm 1 leads, the force of arm 2 is commanded (`hybrid_opt.robust`). A timing that limits them
-    tells those of the whole path.
+    Arm 1 leads, the force of arm 2 is commanded (`hybrid_opt.robust`). A timing that limits robust
+    forces gives the peaks of the whole path.
     """
     if "robust_force" in outputs:
         return np.asarray(outputs["robust_force"] / workcell.task.reference_force)
-    # Only who asks for it pays for its compilation.
+    # Imported here: only this objective needs its compiled functions.
     from hybrid_opt.robust.force import BoxMotion, robust_model
 
     n, samples = outputs["pose"].shape[:2]

@@ -54,7 +54,7 @@ class Combination:
         duration: of the carry as robots drive it [s]; NaN where there is none.
         force: the largest to be commanded [N]; likewise.
         x: (n_var,) its decision vector, or () where there is none.
-        remark: why there is none, or what speaks against it.
+        remark: reason why there is none, or an objection.
     """
 
     values: tuple[float, ...]

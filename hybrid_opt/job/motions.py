@@ -45,7 +45,7 @@ their ends."""
 
 LIFTING_ACCELERATION = 0.5
 """Largest of the box when it is lifted off and set down [m/s^2]: a twentieth of gravity, so that
-these short ways ask for no more force than the carry."""
+these short motions need no more force than the carry."""
 
 PEAK_RATE = 35.0 / 16.0
 """Largest h' over s in [0, 1]."""

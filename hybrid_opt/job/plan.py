@@ -332,13 +332,13 @@ class JobModel:
 
         Args:
             timing: of a carry of this workcell, one that robots can drive.
-            squeeze: how hard to press; None for the defaults.
-            smoothing: half the width of the window over which a timing whose acceleration jumps is
-                averaged [s]; zero leaves it as it is. Where the workcell limits jerk, any other
-                value asks for a timing within these limits instead.
-            handling: in place of the workcell's own.
-            within_jerk: whether the carry is timed within the workcell's limits on jerk, which
-                takes about a second; else it is averaged as without them.
+            squeeze: settings of the commanded forces; None for the defaults.
+            smoothing: half the width of the window over which a timing with jumps of acceleration
+                is averaged [s]; zero keeps it unchanged. In a workcell with limits on jerk, any
+                other value gives a timing within these limits instead.
+            handling: instead of the workcell's own.
+            within_jerk: time the carry within the workcell's limits on jerk, which takes about a
+                second; else it is averaged.
 
         Raises:
             SettingsError: the timing failed, or the squeeze is not possible.

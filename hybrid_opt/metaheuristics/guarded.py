@@ -54,7 +54,7 @@ class Guarded(Algorithm):  # type: ignore[misc]
     bases.
 
     - The last generation is cut so that exactly the evaluations of an `n_eval` termination
-      are spent, whatever the population size.
+      are spent, for every population size.
     - A point with a NaN or infinite objective or constraint is infeasible, without limit,
       also on a problem without constraints; it loses every comparison and enters no front.
     """

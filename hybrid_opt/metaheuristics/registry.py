@@ -187,7 +187,7 @@ def make(
             being uniformly random; None for all random.
 
     Raises:
-        SettingsError: as `settings_of`; wrong `initial` points are told when the run starts.
+        SettingsError: as `settings_of`; wrong `initial` points are refused when the run starts.
     """
     if dataclasses.is_dataclass(settings):
         settings = dataclasses.asdict(settings)

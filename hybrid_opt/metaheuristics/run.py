@@ -50,8 +50,8 @@ class Evaluator(Protocol):
 def reject_non_finite(evaluations: Evaluations) -> Evaluations:
     """Make every candidate with a non-finite figure infeasible.
 
-    The last line of defence: whatever an evaluator returns, no NaN or infinity can look like a
-    good candidate. Such candidates get `WORST_PENALTY` and the reason `NOT_FINITE`.
+    No NaN or infinity of any evaluator can then look like a good candidate. Such candidates get
+    `WORST_PENALTY` and the reason `NOT_FINITE`.
     """
     finite = np.isfinite(evaluations.violation).all(axis=1)
     finite &= np.isfinite(evaluations.violation_time).all(axis=1)

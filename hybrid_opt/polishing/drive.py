@@ -367,7 +367,7 @@ class DriveStepMethod(StepMethod[DriveIterate, DriveStep]):
             asked = QuadraticProgram(model[0], g, linear.A, linear.b, *box)
             answer = solve_quadratic(asked)
             if answer is None:
-                # Rows that the box has no room for are asked for as far as they are kept now.
+                # Infeasible within the trust region: rows keep their present violation at most.
                 answer = solve_quadratic(replace(asked, b=np.maximum(linear.b, 0.0)))
             if answer is None:
                 return None

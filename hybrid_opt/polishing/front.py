@@ -228,7 +228,7 @@ class PolishRun(ABC, Generic[AnyAttempt]):
             if gain.max() <= IMPROVEMENT_TOLERANCE:
                 return self._not_improved(answer, attempt)
         elif attempt.aim == "probe":
-            # Dominated or not: it tells what lies there, and may be continued.
+            # Kept even if dominated: solves may continue from it.
             if gain.max() <= IMPROVEMENT_TOLERANCE:
                 return self._not_improved(answer, attempt)
         elif self._archive.dominates(objectives):

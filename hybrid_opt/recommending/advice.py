@@ -114,7 +114,7 @@ def commanded_margins(carry: Carry, forces: Array) -> tuple[Margin, ...]:
 def advice(cell: Cell, paths: DrivenPaths, option: Option, timing: Timing) -> tuple[Advice, ...]:
     """Compute the effects of changes of the cell on a recommended carry, most force first."""
     assert timing.carry is not None, "what is driven has a carry"
-    # With less the path may not move: a tilted box asks for more than a level one.
+    # With less the path may have no timing: a tilted box needs more than a level one.
     limits = np.minimum(
         FORCE_MULTIPLES * option.limit, max(paths.highest_force, option.limit)
     ).tolist()

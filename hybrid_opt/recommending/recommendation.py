@@ -84,15 +84,15 @@ class Recommendation(Displayable):
         force_kind: which forces its limit is about, and the front's.
         limited_force: (2,) largest of them of each robot along the carry [N].
         commanded: (2,) largest normal force to command of each robot [N].
-        squeeze: how these forces came about, and what they are made of.
-        job: the whole job around it, None where none can be planned.
-        margins: how wrong the cell's description may be at the commanded force.
+        squeeze: origin and contributions of these forces.
+        job: the whole job around it, None if none can be planned.
+        margins: largest errors of the cell's description at the commanded force.
         rivals: the hand-made path, and others, at the same commanded force and in the same time.
-        advice: what changes of the cell would change.
-        warnings: what speaks against it, sentences; empty where nothing does.
+        advice: effects of changes of the cell.
+        warnings: objections, as sentences.
         required: (2,) largest force of each robot in any case, commanded or resulting [N].
-        budget: what holding still takes of the reference forces.
-        remedies: where the reference forces do not allow it, the smallest changes of the cell with
+        budget: the grip budget at rest.
+        remedies: if the reference forces do not allow it, the smallest changes of the cell with
             which they do.
         reserve: how heavy and how slippery the box may be within the reference forces, in every
             case.

@@ -33,10 +33,10 @@ PRECISION = 1e-4
 """Error of the factor of a remedy, on the safe side."""
 
 UNBOUNDED = 1e3
-"""Excess that stands for cases that no force holds: roots are bracketed by finite numbers."""
+"""Excess if no force holds a case: root finding needs finite numbers."""
 
 NARROWEST = 1e-6
-"""Factor that stands for a range without width: with none there would be fewer worst cases."""
+"""Factor in place of zero: a range of zero width would change the number of worst cases."""
 
 LEAST_MASS = 1e-3
 """Share of the mass down to which a lighter payload is considered."""

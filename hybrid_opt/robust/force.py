@@ -190,7 +190,7 @@ class RobustModel:
         self.workcell = workcell
         self._load = load
         self._functions: dict[tuple[object, ...], NumericFunction] = {}
-        # Many motions are asked about under a few sets.
+        # A few sets serve many motions.
         self._worst = lru_cache(maxsize=8)(self._checked_cases)
         self._one = command_model(workcell).has_scalar_squeeze
         if self._one:

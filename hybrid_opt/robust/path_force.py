@@ -47,7 +47,7 @@ BY_TIMING = slice(18, 20)
 """Where a slope's entries by u'' and u'^2 are."""
 
 BELOW = -np.inf
-"""Normal force that stands for a case that less than the limit holds."""
+"""Normal force of cases that need less than the limit; their force is not computed."""
 
 
 @dataclass(frozen=True)

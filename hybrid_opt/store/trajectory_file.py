@@ -122,7 +122,7 @@ def write_trajectory(
         cell: as read from its file; compiled, where several are stored.
         x: (n_var,) decision vector.
         figures: finite numbers by name, as from `Carry.figures`.
-        provenance: JSON values: algorithm, seed, versions and whatever else explains it.
+        provenance: JSON values: algorithm, seed, versions and other origins.
 
     Raises:
         ResultsError: the workcell was changed after reading, or a value cannot be stored.

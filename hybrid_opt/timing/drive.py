@@ -73,7 +73,7 @@ class CandidateDriver:
             unknown = np.full(2, np.nan)
             known = [timing.robust_force for timing in timings]
             forces["robust_force"] = [unknown if force is None else force for force in known]
-        # Where the path itself fails no timing tells the forces: those of its samples at rest.
+        # A path without a timing gets the forces of its samples at rest.
         sampled = outputs["normal_force"].max(axis=1)
         for name, values in forces.items():
             force = np.array(values).reshape(-1, 2)

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 def regenerate(options: argparse.Namespace) -> int:
-    """Do what the options ask for, and print it; returns the exit code."""
+    """Generate, compile and check as the options state; return the exit code."""
     cache, found = Cache(), list[Agreement]()
     print_findings(_regenerated(cache, options, found), options.json)
     return 0 if all(comparison.agrees for comparison in found) else FAULT
@@ -105,7 +105,7 @@ def _built(
     if not options.check:
         return
     bounds = {"x": (task.lower, task.upper)}
-    # The cell's own numbers, whatever is drawn.
+    # The cell's own parameters are not drawn.
     bounds |= {name: (cell.vector(name),) * 2 for name in GROUPS}
     rng = np.random.default_rng(options.seed)
     found += [

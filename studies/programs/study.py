@@ -82,7 +82,7 @@ class StudySettings:
         drivable: whether carries are also searched for as robots drive them.
         drivable_replicas: of that search per algorithm, see `drivable_settings`.
         drivable_polish: how their fronts are polished, None for not at all.
-        wish: what is asked of the recommended one of them.
+        wish: target of the recommendation among them.
         target: of the export that the recommendation names, None for any simulator.
         simulate: whether the selected carries are driven in the simulated cell.
         report: whether figures, tables and the page are written.
@@ -310,7 +310,7 @@ def campaign_settings(
 def polish_settings(
     options: argparse.Namespace, usual: bool, is_drivable: bool
 ) -> PolishSettings | None:
-    """Return the polish settings that the options ask for, None for no polish.
+    """Return the polish settings of the options, None for no polish.
 
     Args:
         options: of the program.

@@ -278,7 +278,7 @@ def gather(
     known = dict(zip(PAPER_OBJECTIVES, forces, strict=True))
     still = [known.get(name) for name in first.objectives[:2]]
     alone = results.workcell.task.law.is_drivable
-    # Jobs are what robots are told: by the cell that they drive.
+    # Jobs belong to the drivable cell.
     cells = cells_of(first.files, results.objectives, alone)
     made = (workers or LocalWorkers()).map(partial(_call, cells), calls)
     reach, jobs = (made[-1], made[:-1]) if paper else (None, made)

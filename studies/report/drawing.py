@@ -58,7 +58,7 @@ RC: dict[Any, Any] = {
     "patch.linewidth": 0.6,
     "text.parse_math": False,
     "pdf.fonttype": 42,
-    # Layout is worked out at the resolution that it is drawn at, and only where it is asked for.
+    # Layout is computed at the drawing resolution, and only on request.
     "figure.dpi": PNG_DPI,
     "figure.autolayout": False,
     "figure.constrained_layout.use": False,

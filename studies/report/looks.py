@@ -74,9 +74,9 @@ class Film:
 
 
 def follow_looks(root: Path, options: argparse.Namespace) -> None:
-    """Do what `studies.options.add_looks` lets a user ask for: write the best selected trajectory
-    of the first algorithm that has one; serve the report until Ctrl-C, without a report a page that
-    plays the best selected trajectory.
+    """Show a study as the options of `studies.options.add_looks` state: write an animation of the
+    best selected trajectory of the first algorithm that has one; serve the report until Ctrl-C, or
+    without a report a page that plays that trajectory.
 
     Raises:
         DualArmError: the results, a suffix or a library do not fit, or no port is free.

@@ -99,23 +99,24 @@ class StoredRecommendation:
             about these; else null.
         without_jerk: duration without the cell's limits on jerk [s], null where there are none.
         squeeze, squeeze_reason: largest normal force to command of each robot [N], and why.
-        order: what the force asks of the contacts, as in 'press with'.
+        order: command to the contacts, as in 'press with'.
         target: of the export that the study names.
         payload_limit: payload that the robots bear on the same motion with planned forces, nothing
             uncertain [kg].
         rivals: other paths at the same force and in the same time, the hand-made one first.
-        margins: how far the cell's description may be off at the commanded force.
-        advice: what changes of the cell would change.
-        warnings: what speaks against it.
+        margins: largest errors of the cell's description at the commanded force.
+        advice: effects of changes of the cell.
+        warnings: objections.
         considered: carries that it was chosen from.
         durations: of paths and the front at the same commanded forces.
         price: of robustness, null where no set leaves friction and patches.
-        required: largest force that either arm presses with or feels in any case [N].
+        required: largest force of either arm in any case, commanded or resulting [N].
         allowed: the robots' reference forces [N].
-        at_rest: what holding still takes of them, in words.
-        remedies: where they do not allow the carry, the smallest changes with which they do.
-        reserve: how heavy and how slippery the box may be within the reference forces, in every
-            case of the uncertainty; null where that is not known.
+        at_rest: text of the grip budget.
+        remedies: if the reference forces do not allow the carry, the smallest changes with which
+            they do.
+        reserve: heaviest box and least friction within the reference forces, in every case of the
+            uncertainty; null if unknown.
     """
 
     wish: ho.Wish

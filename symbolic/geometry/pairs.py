@@ -260,7 +260,7 @@ def _sorted(seen: CacheKey) -> _PairStatus:
         or never_meet(a, b, arms, tolerance)
         or _always_touching(a, b, arms)
     )
-    # An arm's own links keep apart, or do not, whatever is held.
+    # The distances of an arm's own links do not depend on the payload.
     links = a.group == b.group and not (a.is_tool or b.is_tool)
     return _PairStatus(apart, not (apart and links), bool(rigid) or _is_far(a, b))
 

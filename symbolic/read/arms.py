@@ -209,7 +209,7 @@ def reduced_model(urdf: Urdf, held: Positions = ()) -> pin.Model:
     Args:
         urdf: the robot's description.
         held: names of joints and the positions they are held at [rad or m]; a joint of several
-            axes is held at its neutral position, whatever is given.
+            axes is always held at its neutral position.
 
     Raises:
         RobotModelError: Pinocchio refuses the description.

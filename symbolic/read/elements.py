@@ -200,7 +200,7 @@ class ElementReader:
             told = f"found {shown(value)}; allowed: {count}"
             self.problems.add(path, "is missing" if value is None else told)
             return read_only(np.ones(len(allowed)))
-        # A word that is no number is told as a text that is none.
+        # A word that is no number is reported as such.
         numbers = [float(word) if _XML_NUMBER.fullmatch(word) else word for word in words]
         if len(allowed) == 1:
             return read_only([checked_number(numbers[0], allowed[0], path, self.problems)])

@@ -38,7 +38,7 @@ def read_payload(table: TableReader, folder: Path) -> Payload:
                 f"{half[axis]:g} m from its geometric centre",
             )
     inertia = _read_inertia(table, kind, solid)
-    if not kind:  # without a kind nobody can say which keys are unknown
+    if not kind:  # without a kind no key is known
         return solid
     return table.record(
         Payload,

@@ -135,7 +135,7 @@ LIMIT_KEYS = {
 
 
 UNKNOWN_TORQUE = "unknown"
-"""The value of `torque_max` that stands for torques that nobody published."""
+"""Value of `torque_max` for unpublished torques."""
 
 
 @cache
@@ -485,7 +485,7 @@ def _downloaded(name: str) -> NamedRobot:
             code="unknown-description",
         )
     try:
-        with redirect_stdout(sys.stderr):  # it tells what it clones
+        with redirect_stdout(sys.stderr):  # it prints the repository that it clones
             module = import_module(f"{MODULES}.{name}")
     except Exception as error:  # of git, of the network, of the file system
         reason = " ".join(str(error).split())[-300:]

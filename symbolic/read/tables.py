@@ -428,7 +428,7 @@ def read_body(table: TableReader, folder: Path) -> Body:
     """Read a named collision shape with its pose; mesh paths are relative to `folder`."""
     name, pose = table.text("name"), _xyz_rpy(table)
     kind = table.choice("kind", tuple(SHAPES))
-    if not kind:  # without a kind nobody can say which keys are unknown
+    if not kind:  # without a kind no key is known
         return Body(name, Sphere(1.0), pose)
     files = {"path": read_file(table, "path", folder, safe_io.MESH_BYTES)} if kind == "mesh" else {}
     return Body(name, table.record(SHAPES[kind], **files), pose)

@@ -35,7 +35,7 @@ class Problems:
     uncounted: int = 0
 
     open: bool = False
-    """Whether keys that nobody asks for are none."""
+    """True if unknown keys are no problem."""
 
     def add(self, path: str, text: str) -> None:
         """Record that the value at `path` is wrong; `text` says what is found and allowed.
@@ -137,7 +137,7 @@ def text_pattern(pattern: str, meaning: str) -> TextPattern:
     return TextPattern(problem)
 
 
-# --- patterns that stand for several names ---
+# --- patterns for several names ---
 
 
 def matching(pattern: str, names: Iterable[str]) -> tuple[str, ...]:

@@ -125,19 +125,19 @@ class Origin:
 
 @dataclass(frozen=True)
 class Target:
-    """What a bundle is for.
+    """A kind of bundle, by its drivers.
 
     Attributes:
         files: from an export to file contents by path.
         steps: time steps that it can have, the longest first [s].
         interpolation: how it moves between two samples.
-        how_to_run: in words.
-        reaction: who carries out a stop, in words; '' for data that nobody runs.
-        start: how both arms start together, in words.
-        skew: between their starts, which a job has to survive [s]; None where nobody asks.
-        maker: whose arms it is for, one of those of `hybrid_opt.extras.bundles.arms`; '' for all.
+        how_to_run: text for the README.
+        reaction: text on who carries out a stop; '' for data that is not run.
+        start: text on the common start of both arms.
+        skew: delay between their starts that a job has to tolerate [s]; None if not checked.
+        maker: of the arms, one of those of `hybrid_opt.extras.bundles.arms`; '' for all.
         axes: numbers of turning joints that a maker's targets can hold.
-        has_address: whether it has to know where the controllers are.
+        has_address: it needs the addresses of the controllers.
         require: refuses a job before it is sampled, for further reasons.
         require_equipment: refuses a cell whose drivers lack something, given the index of the
             leading arm.
@@ -208,8 +208,8 @@ class Target:
 
 
 STATES = {
-    "ready": "both arms are looked at: news from both, pads at their first places, nothing pressed",
-    "running": "both arms follow the path; phases follow one another without a gap",
+    "ready": "both arms are checked: both report, pads are at their first places, nothing presses",
+    "running": "both arms follow the path; phases follow each other without a gap",
     "stopping": "both arms come to rest at the same place of the path, within the stop time",
     "landing": "the box stands before the end of its set-down: both arms let go of it there",
     "held": "both arms keep that place and the squeeze that belongs to it",
@@ -223,7 +223,7 @@ STOPS = (
     "a measured force misses its reference by more than the share `force` while pads alone hold "
     "the box",
     "a controller refuses or ends its goal",
-    "someone asks for it: Ctrl-C, or the stop signal of the target",
+    "a request: Ctrl-C, or the stop signal of the target",
 )
 
 SET_DOWN = (
@@ -643,7 +643,7 @@ def prepared(job: Job, name: str, options: BundleOptions) -> Export:
 
     Raises:
         SettingsError: the step is out of range, none keeps the forces, or the target needs a
-            stiffness that nobody states.
+            stiffness that is unknown.
         JobError: no stop along the path keeps the forces.
     """
     target, step, k = target_for(name, job.workcell), options.step, options.stiffness

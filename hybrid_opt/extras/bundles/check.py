@@ -312,7 +312,7 @@ def check(
     if held is not None and mask.sum() < SHORTEST:
         raise SettingsError(f"under {SHORTEST} samples lie between {held[0]:g} and {held[1]:g} s")
     places = _places(time)
-    # Straight lines have no accelerations: those of a smooth motion along them are told.
+    # Straight lines have no accelerations: those of a smooth motion through the samples count.
     smooth = CubicSpline(time, trajectory.q) if kind == "linear" else joints
     use = joint_use(workcell, joints(places), joints(places, 1), smooth(places, 2))
     rated = np.asarray(workcell.task.reference_force, dtype=float)

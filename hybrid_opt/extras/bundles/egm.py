@@ -46,7 +46,7 @@ SECTION_OF_EACH = (
 
 
 def require_egm(workcell: Workcell, leader: int) -> None:
-    """Refuse a cell whose pressing arm has no force sensor, or with arms whose lag nobody states.
+    """Refuse a cell whose pressing arm has no force sensor, or with arms of unknown lag.
 
     Args:
         leader: index of the arm that keeps its place.

@@ -206,8 +206,8 @@ class Stop:
         time: from the planned speed to rest [s].
         force_use: largest normal force that holds the box in a stop, over the commanded one.
         joint_use: largest joint acceleration of a stop over its limit.
-        quick: the shortest time that the commanded forces bear, whatever the joints' limits, for
-            arms that have lost one another [s].
+        quick: the shortest time that the commanded forces bear, joint limits ignored, for arms that
+            no longer move together [s].
     """
 
     time: float

@@ -222,7 +222,7 @@ def _controllers(
 
 
 def joint_inertia(job: Job) -> Array:
-    """Return the mean inertia (joints,) that each motor feels along the job, arm and tool alone.
+    """Return the mean inertia (joints,) about each joint along the job, of arm and tool alone.
 
     Diagonal elements of the joint-space inertia matrix [kg m^2, kg].
     """

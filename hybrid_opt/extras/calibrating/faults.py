@@ -23,13 +23,14 @@ VANISHED = 0.1
 """Share of a hold's usual squeeze below which it has vanished."""
 
 LEAST_NORMAL = 0.5
-"""Normal over whole force below which a frame is not what it is said to be: friction of 1.7."""
+"""Normal over whole force below which the stated frame is wrong: a friction of 1.7."""
 
 LARGEST_CLOCK_OFFSET = 0.03
-"""Difference of both arms' clocks that is told [s]: the box hands normal forces on at once."""
+"""Least difference of both arms' clocks that is reported [s]: the box transmits normal forces at
+once."""
 
 LARGEST_DELAY = 5.0
-"""Largest delay between two clocks that is looked for [s]."""
+"""Largest delay between two clocks that is considered [s]."""
 
 LONGEST_STEP = 0.5
 """Usual step of a recording above which its times are in another unit [s]."""

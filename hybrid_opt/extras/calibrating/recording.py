@@ -413,7 +413,7 @@ def read_topics(path: Path, topics: Collection[str]) -> dict[str, Messages]:
                 found[connection.topic].append(((stamp - reader.start_time) * 1e-9, message))
     except ResultsError:
         raise
-    # A damaged file makes readers and decoders raise whatever their bytes lead them to.
+    # Readers and decoders raise many kinds of errors for a damaged file.
     except (AnyReaderError, ReaderError, OSError, ValueError, KeyError, IndexError) as error:
         raise ResultsError(f"{path}: no recording that can be read: {error}") from error
     return found

@@ -34,7 +34,7 @@ LEAST_LEVEL = 0.1
 """How far a carry goes level, at least, for its direction to count [m]."""
 
 PROPOSED = ("waypoints", "initial", "redundant")
-"""Keys of the task that are proposed anew, whatever the file has."""
+"""Keys of the task that are always proposed anew."""
 
 DRAFT_ROOM = 0.01
 """Half-width of bounds before any are known; of no meaning [m, rad]."""
@@ -88,7 +88,7 @@ class Problem:
         sideways where the robots have no bases.
 
         Raises:
-            WorkcellError: shoulders are asked for, and the robots are wrong.
+            WorkcellError: shoulders are needed, and the robots are wrong.
         """
         entries = self.data["contacts"]
         if all("xyz" in entry for entry in entries):

@@ -84,7 +84,7 @@ LONG_TRIED = 2
 """Most paths with more via-points that are judged."""
 
 LONGER = 2.5
-"""Multiple of the time that a user is told to try where it was too short."""
+"""Multiple of a too short time that a message suggests."""
 
 MOST_CLASSES = 100
 

@@ -70,7 +70,7 @@ class PayloadSceneChecker:
 
     def is_between(self, begin: Array, end: Array, shares: Array) -> bool:
         """Return True if the box meets the environment between two poses (6,), at shares (n,) of
-        the straight motion; remembered, because all ways to hold ask for the same ones."""
+        the straight motion. Cached, because all ways to hold share these motions."""
         key = begin.tobytes(), end.tobytes()
         if key not in self._met:
             self._met[key] = self.meets(begin + shares[:, None] * (end - begin))
@@ -253,8 +253,8 @@ def judge_of(bodies: CellBodies) -> PoseJudge:
 
 
 SAME_BRANCH = 0.02
-"""Largest difference of joints, full turns apart, of the posture that a path began with and the
-branch that stands for it [rad or m]."""
+"""Largest difference of joints, up to full turns, between a path's first posture and its branch
+[rad or m]."""
 
 COARSE = 9
 """Stride of the samples judged first: most candidates that collide do so there."""

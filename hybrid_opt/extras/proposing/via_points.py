@@ -179,8 +179,8 @@ def shorten_spline(
 def _closed_path(
     chain: ClosedChain, start: ChainConfiguration, path: Array
 ) -> Iterator[ChainConfiguration]:
-    """Yield configurations along extended poses (n, 6 + m) as far as the chain closes, whatever
-    collides."""
+    """Yield configurations along extended poses (n, 6 + m) as far as the chain closes, collisions
+    ignored."""
     place: ChainConfiguration | None = start
     yield start
     for extended in path[1:]:

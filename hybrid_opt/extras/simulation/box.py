@@ -41,7 +41,7 @@ BEGINS = 0.05
 """Share of the slip that counts as one at which it is said to begin."""
 
 SAME_TIME = 1e-9
-"""Samples closer than this stand for both sides of one instant [s]."""
+"""Samples closer than this are both sides of one instant [s]."""
 
 SLIP_INTERVAL = 2e-3
 """Time between two looks at the slip [s]."""

@@ -481,7 +481,7 @@ def _arm(workcell: Workcell, settings: ArmSettings, i: int, shown: dict[Frame, l
     """Write the nested bodies of one arm, its pad on the last."""
     model, geometry = arm_model(workcell.robots[i]), arm_geometry(workcell, i)
     contact = workcell.contacts[i]
-    # The pad stands where the nominal contact has it, whatever the place on the box is.
+    # The pad stands at the nominal contact, wherever the box is displaced to.
     T_joint_pad = geometry.T_joint_box @ contact.T_box_pad
     armature = settings.armature * workcell.robots[i].torque_max
     inner = f"""{pad_site(i, T_joint_pad)}

@@ -53,7 +53,7 @@ TOUCH = 0.005
 """A box that is set down may stand so far above its planned place [m]."""
 
 STRIKES = 3
-"""Looks in a row at which something has to be wrong, beside a stop that is asked for."""
+"""Consecutive checks with the same fault before a stop; a requested stop acts at once."""
 
 
 class Refused(Exception):
@@ -66,7 +66,7 @@ class Limits:
 
     Attributes:
         stop_time: from the planned speed to rest along the path [s].
-        quick_stop: the same where an arm does not do what it is told [s].
+        quick_stop: the same for an arm that does not follow its commands [s].
         start: largest distance of a pad from its first place [m].
         path: largest distance of a pad from its path [m].
         behind: how far an arm may lag behind its reference [s].
@@ -276,7 +276,7 @@ class Clock:
     """The coordinate of the path and its rate.
 
     Attributes:
-        s: where both arms are told to be [s].
+        s: commanded coordinate of both arms [s].
         rate: of s over time.
     """
 
@@ -348,14 +348,14 @@ class Clock:
 
 @dataclass
 class Seen:
-    """What is known of the arms at a moment.
+    """Measured state of the arms at a moment.
 
     Attributes:
-        q: measured joint positions of each arm; None where there are none [rad, m].
-        force: measured normal force of each pad; None where nobody measures it [N].
+        q: measured joint positions of each arm; None if unknown [rad, m].
+        force: measured normal force of each pad; None if not measured [N].
         age: time since each arm's posture was measured [s].
-        fault: why to stop; '' for no reason.
-        lost: whether that is an arm that does not do what it is told.
+        fault: reason to stop; '' for none.
+        lost: the reason is an arm that does not follow its commands.
     """
 
     q: list[list[float] | None] = field(default_factory=lambda: [None, None])
@@ -487,7 +487,7 @@ class Machine:
         return True
 
     def stop(self, reason: str, quick: bool = False) -> None:
-        """Stop along the path and hold; quickly where an arm does not do what it is told."""
+        """Stop along the path and hold; quickly if an arm does not follow its commands."""
         if self.state == "running":
             self.state, self.reason = "stopping", reason
             limits = self.job.limits

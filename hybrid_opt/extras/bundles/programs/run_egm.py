@@ -1,10 +1,11 @@
 """Streams the job to both arms of an ABB cell: python3 run_egm.py [--check]
 
 Start CarryEgm in both tasks first. One clock drives both arms: each message of a controller is
-answered with where its arm has to be, its lag ahead. The arm that presses is moved along its pad's
-normal until its sensor feels the force of the job. Ctrl-C, an arm that is silent, late or off its
-path, a force out of its band: the clock stops, both arms hold their places and press on. Then type
-'continue' or 'back' to set the box down; 'leave' ends the stream, the controllers hold the arms.
+answered with the arm's commanded position, its lag ahead. The arm that presses is moved along its
+pad's normal until its sensor measures the force of the job. Ctrl-C, an arm that is silent, late or
+off its path, or a force out of its band stops the clock; both arms hold their places and keep
+pressing. Then type 'continue' or 'back' to set the box down; 'leave' ends the stream, and the
+controllers hold the arms.
 
 Messages are protocol buffers of version 2, numbers of fields after egm.proto of RobotWare: EgmRobot
 header 1 (seqno 1), feedBack 2 (joints 1: joints 1; externalJoints 3: joints 1), mciState 5,

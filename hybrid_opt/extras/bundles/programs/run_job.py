@@ -374,7 +374,7 @@ class Run:
             self.node.get_logger().error(self.machine.told())
 
     def interrupt(self, *_: object) -> None:
-        """Ctrl-C stops the job; while it is held, for whatever reason, ends the program."""
+        """On Ctrl-C stop the job; while it is held, end the program."""
         if self.machine.state == "held":
             self.command = "leave"
         self.fault = self.fault or CTRL_C
