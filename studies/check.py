@@ -14,21 +14,21 @@ from studies.program import Parser, Program
 def _add_options(parser: Parser) -> None:
     add(parser, "WORKCELL")
     parser.add_argument(
-        "trajectory", metavar="TRAJECTORY", type=INPUT_FILE, help="the file to judge"
+        "trajectory", metavar="TRAJECTORY", type=INPUT_FILE, help="the file to check"
     )
     parser.add_argument(
         "--held",
         nargs=2,
         type=number(0.0, 1e6),
         metavar=("BEGIN", "END"),
-        help="from when to when the pads hold the box [s] (default: the carry that the file names, "
-        "else the longest time in which both pads are placed as when they hold it)",
+        help="interval in which the pads hold the box [s] (default: the carry that the file names, "
+        "else the longest interval in which the pads' relative pose holds it)",
     )
     parser.add_argument(
         "--interpolation",
         choices=stated("hybrid_opt.extras.bundles.job_file.Interpolation"),
-        help="how the controller moves between samples (default: the highest that the file's "
-        "velocities and accelerations allow)",
+        help="interpolation of the controller between samples (default: the highest order that the "
+        "file's velocities and accelerations allow)",
     )
     add(parser, "--json")
 

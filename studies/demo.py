@@ -32,7 +32,7 @@ def _add_options(parser: Parser) -> None:
         "--open",
         action=argparse.BooleanOptionalAction,
         default=True,
-        help="open the page in a browser, where there is one",
+        help="open the page in a browser, if there is one",
     )
 
 

@@ -20,7 +20,7 @@ def _add_options(parser: Parser) -> None:
         "--target",
         metavar="NAME",
         required=True,
-        help=f"what is to run it: {', '.join(stated('hybrid_opt.extras.bundles.bundle.TARGETS'))}",
+        help=f"the kind of bundle: {', '.join(stated('hybrid_opt.extras.bundles.bundle.TARGETS'))}",
     )
     add(
         parser,
@@ -32,22 +32,22 @@ def _add_options(parser: Parser) -> None:
     parser.add_argument(
         "--use",
         choices=TIMINGS,
-        help="the timing of the carry: closest to the reference speed, the fastest, or the fastest "
-        "below --planned-limit (default: force where that is given or the trajectory has a limit "
-        "of its own, as recommended ones, else closest)",
+        help="timing of the carry: closest to the reference speed, fastest, or fastest within "
+        "--planned-limit (default: force if that is given or the trajectory has its own limit, as "
+        "recommended ones; else closest)",
     )
     add(
         parser,
         "--planned-limit",
-        help="largest planned normal force [N], the largest robust one of a trajectory that was "
-        "searched for robust forces (default: the trajectory's own, where it has one)",
+        help="largest planned normal force [N]; the largest robust force if the trajectory was "
+        "searched for robust forces (default: the trajectory's own limit, if any)",
     )
     parser.add_argument(
         "--squeeze",
         type=float,
         metavar="FACTOR",
-        help="commanded squeeze over the least that holds pads that press evenly (default: what "
-        "holds them in every case of the cell's [uncertainty], or of the usual one)",
+        help="commanded squeeze over the least that holds evenly pressing pads (default: the force "
+        "that holds in every case of the cell's [uncertainty], or of the usual one)",
     )
     add(parser, "--leader")
     parser.add_argument(
@@ -55,8 +55,8 @@ def _add_options(parser: Parser) -> None:
         type=float,
         default=stated("hybrid_opt.job.smooth.SMOOTHING_WIDTH"),
         metavar="S",
-        help="half the width of the window over which a timing whose acceleration jumps is "
-        "averaged [s]; 0 leaves it as it is",
+        help="half the width of the window over which a timing with jumps of acceleration is "
+        "averaged [s]; 0 keeps it unchanged",
     )
     parser.add_argument(
         "--step",
@@ -68,23 +68,22 @@ def _add_options(parser: Parser) -> None:
         "--stiffness",
         type=float,
         metavar="N/m",
-        help="of each arm at its pad along the normal, for what a late arm and the time step do "
-        "(default: that of [robots.driver], or of the gains that the bundle has)",
+        help="stiffness of each arm at its pad along the normal; it turns errors of a late arm and "
+        "of the time step into forces (default: that of [robots.driver], or of the bundle's gains)",
     )
     parser.add_argument(
         "--skew",
         type=float,
         metavar="S",
-        help="between the starts of both arms [s]; a job whose squeeze it breaks is refused "
-        "(default: what the target leaves to chance, 0 where one clock drives both arms)",
+        help="delay between the starts of both arms that the job must tolerate [s] (default: the "
+        "largest of the target, 0 if one clock drives both arms)",
     )
     parser.add_argument(
         "--driver",
         type=WORKCELL_FILE,
         metavar="FILE",
-        help="take [robots.driver] and [robots.tool_load] from the [[robots]] of this file, by "
-        "their names, in place of those of the stored cell: the workcell file, or one with these "
-        "alone (default: those of the stored cell)",
+        help="take [robots.driver] and [robots.tool_load] of the robots, by name, from this file: "
+        "a workcell file, or one with these sections alone (default: those of the stored cell)",
     )
     parser.add_argument(
         "--address",
@@ -96,7 +95,7 @@ def _add_options(parser: Parser) -> None:
     parser.add_argument(
         "--any-arm",
         action="store_true",
-        help="also write a maker's own language for arms of others",
+        help="write a maker's own language also for other arms",
     )
 
 

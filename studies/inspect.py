@@ -24,9 +24,9 @@ def _add_options(parser: Parser) -> None:
         type=whole(1, 10**7),
         default=250,
         metavar="N",
-        help="random candidates to judge",
+        help="random candidates to evaluate",
     )
-    add(parser, "--seed", help="of their randomness")
+    add(parser, "--seed", help="seed of these candidates")
     add(
         parser,
         "--output",
@@ -36,12 +36,12 @@ def _add_options(parser: Parser) -> None:
     parser.add_argument(
         "--polish",
         action="store_true",
-        help="polish the hand-made trajectory shortly, to see which bounds bind",
+        help="polish the hand-made trajectory briefly, to find active bounds",
     )
     parser.add_argument(
         "--view",
         action="store_true",
-        help="write a page that plays the hand-made trajectory, from where it first fails",
+        help="write a page that plays the hand-made trajectory, from its first failure",
     )
     parser.add_argument("--no-pictures", action="store_true", help="draw nothing")
     parser.add_argument("--pairs", action="store_true", help="list every pair of bodies")

@@ -22,7 +22,7 @@ def _add_options(parser: Parser) -> None:
         "--port",
         type=whole(1, 65535),
         default=8080,
-        help="where to listen; another free one is taken if it is in use",
+        help="port of the page; another free one is taken if it is in use",
     )
 
 

@@ -280,10 +280,10 @@ _SHARED: dict[str, dict[str, Any]] = {
         "action": "store_true",
         "help": "no progress on standard error (default: shown)",
     },
-    "--seed": {"type": seed, "default": 1, "metavar": "N", "help": "of the randomness"},
+    "--seed": {"type": seed, "default": 1, "metavar": "N", "help": "seed of the random generator"},
     "--target": {
         "metavar": "NAME",
-        "help": "state first what the cell lacks for this target of an export",
+        "help": "first list the data that the cell lacks for this export target",
     },
     "--time": {"type": number(1.0, 1e6), "metavar": "S"},
 }
@@ -307,13 +307,13 @@ def add_wishes(parser: argparse._ActionsContainer) -> None:
         "--duration",
         type=force,
         metavar="S",
-        help="recommend the least force of all carries of at most S seconds (default: the least "
-        "product of both)",
+        help="recommend the carry of least force within S seconds (default: the least product of "
+        "duration and force)",
     )
     add(
         parser,
         "--force-limit",
-        help="recommend the shortest carry that needs at most N newtons commanded (default: none)",
+        help="recommend the shortest carry within N newtons of commanded force (default: none)",
     )
     parser.add_argument(
         "--payload",
@@ -337,7 +337,9 @@ def add_looks(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="serve the report's page, where trajectories play, to a browser of this machine",
     )
-    group.add_argument("--port", type=whole(0, 65535), default=8080, metavar="N", help="of --view")
+    group.add_argument(
+        "--port", type=whole(0, 65535), default=8080, metavar="N", help="port of --view"
+    )
 
 
 def stated(name: str) -> Any:

@@ -44,29 +44,30 @@ def _add_options(parser: Parser) -> None:
     parser.add_argument(
         "--bases",
         action="store_true",
-        help="propose where the robots stand as well; only the height of their bases counts then",
+        help="also propose the robots' bases, at the heights of the file",
     )
     add(
         parser,
         "--classes",
-        help="look for up to N carries that pass what is in the way on different sides, or hold "
-        "the box in other postures; the first goes into the workcell file, the others into files "
-        "whose names end in -2 and so on",
+        help="propose up to N carries that pass obstacles on different sides, or hold the box in "
+        "other postures; the first goes into the workcell file, the others into files whose names "
+        "end in -2 and so on",
     )
     parser.add_argument(
         "--study",
         type=whole(100, 10**6),
         metavar="N",
-        help="search N carries around each of them as robots drive it, polish, and put the class "
-        "of the fastest first (default: that whose joints go least far): compiles, and takes its "
-        "time beside --time",
+        help="search N drivable carries around each of them, polish, and put the class of the "
+        "fastest first (default: that with the shortest joint path); compiles, and takes time "
+        "besides --time",
     )
     parser.add_argument(
         "--grips",
         type=_ranges,
         metavar="LOW:HIGH,LOW:HIGH",
-        help="how far the pads may go from there upwards, and along their faces [m], for the carry "
-        "that was found: compiles, and takes its time beside --time; write --grips=-0.04:0.01",
+        help="move the pads within these ranges upwards and along their faces [m], for the best "
+        "grip of the proposed carry; compiles, and takes time besides --time; write "
+        "--grips=-0.04:0.01",
     )
     add(
         parser,
@@ -75,8 +76,8 @@ def _add_options(parser: Parser) -> None:
         help="time limit in seconds, start included",
     )
     add(parser, "--target")
-    add(parser, "--seed", help="of its randomness")
-    add(parser, "--quiet", help="do not say what is being done")
+    add(parser, "--seed")
+    add(parser, "--quiet")
 
 
 def _run(options: argparse.Namespace) -> int:

@@ -26,8 +26,8 @@ def _add_options(parser: Parser) -> None:
         "--uncertainty",
         type=_uncertainty,
         metavar="SET",
-        help="a factor on every range of the uncertainty, or ranges as friction=0.1,mass=0.02 in "
-        "place of the workcell's (default: the workcell's)",
+        help="a factor on every range of the uncertainty, or ranges as friction=0.1,mass=0.02 "
+        "(default: the workcell's)",
     )
     add(
         parser,
@@ -36,7 +36,7 @@ def _add_options(parser: Parser) -> None:
         metavar="FILE",
         help="the trajectory file (default: recommended-WISH.json in RESULTS)",
     )
-    add(parser, "--target", help="of the export that the answer names (default: torque)")
+    add(parser, "--target", help="target of the printed export command (default: torque)")
     add(parser, "--quiet")
 
 

@@ -15,30 +15,30 @@ from studies.program import Parser, Program
 def _add_options(parser: Parser) -> None:
     add(parser, "WORKCELL", nargs="?", help="workcell file (TOML)")
     parser.add_argument(
-        "--clean", action="store_true", help="empty the cache first; alone, only that"
+        "--clean", action="store_true", help="empty the cache first, or only, without a workcell"
     )
     parser.add_argument(
         "--cache",
         action="store_true",
-        help="say what the cache holds; alone, only that. Beyond 4 GiB, or the gibibytes in "
-        "DUAL_ARM_CACHE_LIMIT, it loses what was not used for longest",
+        help="print the content of the cache, or only that, without a workcell. Beyond 4 GiB, or "
+        "the gibibytes in DUAL_ARM_CACHE_LIMIT, the least recently used libraries are removed",
     )
     parser.add_argument(
         "--check",
         action="store_true",
         help="compile anew and compare with the interpreted functions on random inputs, outputs "
-        "and first derivatives; exit code 1 where they differ",
+        "and first derivatives; exit code 1 if they differ",
     )
     parser.add_argument(
         "--study",
         action="store_true",
-        help="build everything that a study of the workcell compiles beforehand, its drivable "
-        "experiment included, and say how long that took",
+        help="build all functions of a study of the workcell, its drivable experiment included, "
+        "and print the time",
     )
     parser.add_argument(
         "--samples", type=whole(1, 10**6), default=20, help="random inputs per function"
     )
-    add(parser, "--seed", default=0, help="of the random inputs")
+    add(parser, "--seed", default=0, help="seed of the random inputs")
     add(parser, "--json", help="print JSON instead of tables")
 
 

@@ -18,13 +18,13 @@ def _add_options(parser: Parser) -> None:
     add(
         parser,
         "--planned-limit",
-        help="tell also the fastest timing whose planned normal forces stay below this [N]",
+        help="also print the fastest timing within this limit of the planned normal forces [N]",
     )
     parser.add_argument(
         "--force-curve",
         type=int,
         metavar="POINTS",
-        help="tell also the durations at this many limits of the planned force",
+        help="also print the durations at this number of limits of the planned force",
     )
     add(parser, "--json")
 

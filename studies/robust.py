@@ -24,10 +24,10 @@ def _add_options(parser: Parser) -> None:
     add(
         parser,
         "--planned-limit",
-        help="tell also how fast the path can be driven with planned forces below this [N], and "
-        "with forces below it that hold in all cases (arm 1 leads)",
+        help="also print the fastest timings within this limit [N] of planned forces, and of "
+        "forces that hold in all cases (arm 1 leads)",
     )
-    add(parser, "--seed", help="of the random cases")
+    add(parser, "--seed", help="seed of the random cases")
 
 
 main = Program("robust", __doc__, _add_options, "studies.programs.trajectory.robust_forces")

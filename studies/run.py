@@ -78,7 +78,7 @@ def add_options(parser: Parser, output: str) -> None:
         "--quick",
         action="store_true",
         help=f"a small but complete study: {QUICK_REPLICAS} replicas of {QUICK_EVALUATIONS} "
-        "evaluations where no other numbers are given, a shorter polish, pictures as PNG only",
+        "evaluations by default, a shorter polish, pictures as PNG only",
     )
     search.add_argument(
         "--recommend-only",
@@ -103,7 +103,7 @@ def add_options(parser: Parser, output: str) -> None:
         nargs="+",
         action="extend",
         metavar="NAME",
-        help=f"which of {', '.join(KNOWN)} (default: {' '.join(stated(DEFAULT_ALGORITHMS))})",
+        help=f"algorithms, of {', '.join(KNOWN)} (default: {' '.join(stated(DEFAULT_ALGORITHMS))})",
     )
     search.add_argument(
         "--population",
@@ -118,7 +118,7 @@ def add_options(parser: Parser, output: str) -> None:
         nargs="+",
         action="extend",
         metavar="NAME",
-        help=f"what to minimise, of {', '.join(OBJECTIVES)} "
+        help=f"objectives to minimise, of {', '.join(OBJECTIVES)} "
         f"(default: {' '.join(PAPER_OBJECTIVES)}, in a cell under the time law 'optimal' "
         f"{' '.join(DRIVABLE_OBJECTIVES)})",
     )
@@ -126,15 +126,15 @@ def add_options(parser: Parser, output: str) -> None:
         "--first-generation",
         choices=stated("hybrid_opt.campaign.settings.FirstGeneration"),
         default=_stated("first_generation"),
-        help="what searches start from: random candidates and the workcell's hand-made initial "
-        "trajectory, or random ones alone",
+        help="start of searches: random candidates with the workcell's hand-made trajectory, or "
+        "random ones alone",
     )
     search.add_argument(
         "--constraint-handling",
         choices=stated("hybrid_opt.metaheuristics.run.ConstraintHandling"),
         default=_stated("constraint_handling"),
-        help="how the search learns of infeasibility: by the paper's penalised objectives, or by "
-        "constraint domination",
+        help="constraints of the search: the paper's penalised objectives, or constraint "
+        "domination",
     )
     add(
         search,
@@ -143,7 +143,7 @@ def add_options(parser: Parser, output: str) -> None:
         default=_stated("seed"),
         help="the same seed gives the same results",
     )
-    after = parser.add_argument_group("after the search (decides what is made of the results)")
+    after = parser.add_argument_group("after the search (decides everything but the candidates)")
     after.add_argument(
         "--polish",
         action=argparse.BooleanOptionalAction,
@@ -155,23 +155,22 @@ def add_options(parser: Parser, output: str) -> None:
         "--polish-attempts",
         type=int,
         metavar="N",
-        help="attempts that the polish of one front may take before it is filled between its ends "
-        f"(default: {PolishSettings().attempts}, with --quick {QUICK_ATTEMPTS}); of a drivable "
-        f"one force limits of its sweep (default: {DRIVABLE_ATTEMPTS}, {QUICK_DRIVABLE_ATTEMPTS})",
+        help="attempts of the polish of one front before its gaps are filled (default: "
+        f"{PolishSettings().attempts}, with --quick {QUICK_ATTEMPTS}); for a drivable front, force "
+        f"limits of the sweep (default: {DRIVABLE_ATTEMPTS}, {QUICK_DRIVABLE_ATTEMPTS})",
     )
     after.add_argument(
         "--polish-solver",
         choices=SOLVERS,
         default=PolishSettings().solver,
-        help="what solves the polish's programs of both peak forces: a dense interior-point "
-        "method, or IPOPT, for comparison",
+        help="solver of the polish of both peak forces: a dense interior-point method, or IPOPT "
+        "for comparison",
     )
     after.add_argument(
         "--drivable",
         action=argparse.BooleanOptionalAction,
         default=True,
-        help="also search for carries as robots drive them, of least duration and force, and "
-        "recommend one",
+        help="also search for drivable carries of least duration and force, and recommend one",
     )
     after.add_argument(
         "--drivable-replicas",
@@ -185,8 +184,7 @@ def add_options(parser: Parser, output: str) -> None:
     after.add_argument(
         "--simulate",
         action="store_true",
-        help="have the selected carries driven in the simulated cell, which needs MuJoCo: "
-        "pip install 'dual-arm-carry[sim]'",
+        help="simulate the selected carries in MuJoCo: pip install 'dual-arm-carry[sim]'",
     )
     after.add_argument(
         "--report",
@@ -206,22 +204,22 @@ def add_options(parser: Parser, output: str) -> None:
     work.add_argument(
         "--resume",
         action="store_true",
-        help="continue what the results folder holds",
+        help="continue the study in the results folder",
     )
     work.add_argument(
         "--overwrite",
         action="store_true",
-        help="remove what the results folder holds and begin anew",
+        help="remove the study in the results folder and begin anew",
     )
     add(work, "--jobs", type=int)
     work.add_argument(
         "--executor",
         choices=stated("hybrid_opt.campaign.folder.ExecutorName"),
         default="processes",
-        help="where the work is done: on this machine or on a Dask cluster",
+        help="workers: processes of this machine, or a Dask cluster",
     )
     work.add_argument(
-        "--scheduler", metavar="ADDRESS", help="of Dask, as tcp://HOST:8786 (default: none)"
+        "--scheduler", metavar="ADDRESS", help="Dask scheduler, as tcp://HOST:8786 (default: none)"
     )
     add(work, "--quiet")
     add_looks(parser)

@@ -30,25 +30,30 @@ def _add_options(parser: Parser) -> None:
             *PAD_WITNESSES,
             *stated("hybrid_opt.extras.simulation.reference.Control"),
         ),
-        help="(default: leader, or hands where they hold by themselves) of the arms: one leads and "
-        "the other is force-controlled along the normal (leader), both are (both), both are "
-        "springs about the plan (impedance); or no arms, pads on a carriage that follows the plan "
-        "exactly (pads), pads at their rims, turned by the planned moments, as the allocation "
-        "paper assumes (pads-driven), or hands that hold by themselves (hands)",
+        help="controllers: one arm leads and the other is force-controlled along the normal "
+        "(leader), both are force-controlled (both), both are springs about the plan (impedance); "
+        "or without arms: pads on a carriage that follows the plan exactly (pads), pads that press "
+        "at their rims, turned by the planned moments, as the allocation paper assumes "
+        "(pads-driven), or hands that hold by themselves (hands) (default: hands for such hands, "
+        "else leader)",
     )
     parser.add_argument(
         "--timing",
         choices=("search", "closest", "fastest"),
         default="search",
-        help="how it is driven: as what it was searched for (within its force limit, or closest to "
-        "the reference speeds where it has none), closest to them, or as fast as can be",
+        help="timing: that of its search (within its force limit, else closest to the reference "
+        "speeds), closest to the reference speeds, or fastest",
     )
-    add(parser, "--planned-limit", help="fastest with planned normal forces below this [N]")
+    add(
+        parser,
+        "--planned-limit",
+        help="fastest timing within this limit of the planned normal forces [N]",
+    )
     add(parser, "--leader")
     parser.add_argument(
         "--runs", type=whole(0, 10**6), default=20, help="random cases of the uncertainty"
     )
-    add(parser, "--seed", help="of the random cases")
+    add(parser, "--seed", help="seed of the random cases")
     parser.add_argument(
         "--tracking-error",
         type=number(0.0, 1.0),
@@ -61,17 +66,17 @@ def _add_options(parser: Parser) -> None:
         type=number(1e-3, 1e9),
         default=stated("hybrid_opt.extras.simulation.scene.ArmSettings.stiffness"),
         metavar="1/RAD",
-        help="of each joint over its largest torque",
+        help="stiffness of each joint over its largest torque",
     )
     parser.add_argument(
         "--time-step",
         type=number(1e-6, 1.0),
         default=stated("hybrid_opt.extras.simulation.scene.ContactSettings.time_step"),
         metavar="S",
-        help="of the simulation",
+        help="time step of the simulation",
     )
     parser.add_argument(
-        "--sweep", action="store_true", help="the threshold at half and twice the time step, too"
+        "--sweep", action="store_true", help="repeat with half and twice the time step"
     )
     parser.add_argument(
         "--film",

@@ -47,14 +47,14 @@ def _add_options(parser: Parser) -> None:
         "--path",
         type=TRAJECTORY_FILE,
         metavar="FILE",
-        help="keep the path of this trajectory file throughout (default: the path that is "
-        "recommended for the cell, polished in every changed cell)",
+        help="keep the path of this trajectory file throughout (default: the recommended path of "
+        "the cell, polished in every changed cell)",
     )
     parser.add_argument(
         "--evaluations",
         type=whole(1, 10**6),
         default=1000,
-        help="of the search for the first path",
+        help="evaluations of the search for the first path",
     )
     add(parser, "--output", default="results/sweep", metavar="DIR", help="folder of the results")
     add(parser, "--jobs", "--seed", "--json", "--quiet")

@@ -17,7 +17,7 @@ def _add_options(parser: Parser) -> None:
     parser.add_argument(
         "--pdf",
         action="store_true",
-        help="write pictures as PDF, too (default: as the study did, all but a --quick one)",
+        help="also write pictures as PDF (default: as the study did, all but a --quick one)",
     )
     add_looks(parser)
 
