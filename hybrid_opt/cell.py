@@ -331,5 +331,7 @@ def example(name: str = "rack", objectives: Sequence[str | Objective] = PAPER_OB
     folder = Path(str(files("studies"))) / "workcells"
     known = sorted(path.stem for path in folder.glob("*.toml"))
     if name not in known:
-        raise SettingsError(f"no cell {name!r} ships; known are {', '.join(known)}")
+        raise SettingsError(
+            f"no cell {name!r} ships; known are {', '.join(known)}", code="unknown-cell"
+        )
     return Cell.load(folder / f"{name}.toml", objectives)

@@ -163,7 +163,7 @@ class Front(Displayable):
             SettingsError: the front is empty, or there is no such robot.
         """
         if robot not in (0, 1):
-            raise SettingsError(f"robot {robot!r}; allowed are 0 and 1")
+            raise SettingsError(f"robot {robot!r}; allowed are 0 and 1", code="robot")
         return self[int(np.argmin(self._peaks()[:, robot]))]
 
     def lowest(self, objective: str) -> Carry:
@@ -174,7 +174,8 @@ class Front(Displayable):
         """
         if objective not in self.objective_names:
             raise SettingsError(
-                f"objective {objective!r}; this front has {', '.join(self.objective_names)}"
+                f"objective {objective!r}; this front has {', '.join(self.objective_names)}",
+                code="unknown-objective",
             )
         self._require_members()
         return self[int(np.argmin(self.objectives[:, self.objective_names.index(objective)]))]
@@ -197,7 +198,8 @@ class Front(Displayable):
         if len(self) == 0:
             raise SettingsError(
                 "the front is empty: no feasible candidate was found; give the search more "
-                "evaluations or the task wider bounds"
+                "evaluations or the task wider bounds",
+                code="empty-front",
             )
 
 
@@ -247,9 +249,9 @@ def knee(points: Array) -> int:
     """
     points = np.asarray(points, dtype=float)
     if len(points) == 0:
-        raise SettingsError("the front is empty: it has no knee")
+        raise SettingsError("the front is empty: it has no knee", code="empty-front")
     if not (points > 0.0).all():
-        raise SettingsError("the knee needs objectives above zero")
+        raise SettingsError("the knee needs objectives above zero", code="not-positive")
     return int(np.argmin(np.log(points).sum(axis=1)))
 
 

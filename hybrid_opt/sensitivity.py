@@ -262,7 +262,8 @@ class _Law:
         if carry.timing not in ("constant", "ramped"):
             raise SettingsError(
                 f"a carry under the timing {carry.timing!r}; give the timing itself, as of "
-                "ho.time_path, or a carry of Cell.carry under the time law 'constant' or 'ramped'"
+                "ho.time_path, or a carry of Cell.carry under the time law 'constant' or 'ramped'",
+                code="timing",
             )
         self.carry = carry
 
@@ -298,7 +299,8 @@ class _Fastest:
     def __init__(self, timing: Timing) -> None:
         if timing.limits.robust:
             raise SettingsError(
-                "the timing limits robust forces; give one within a limit of planned ones, or none"
+                "the timing limits robust forces; give one within a limit of planned ones, or none",
+                code="robust-timing",
             )
         if timing.carry is None:
             raise SettingsError(f"there is no timing: {timing.reason}")

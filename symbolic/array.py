@@ -137,7 +137,10 @@ def require_allowed(settings: object, whose: str = "") -> None:
             (kind,) = choices
         if get_origin(kind) is Literal and value not in get_args(kind):
             known = ", ".join(get_args(kind))
-            raise SettingsError(f"{whose}{name.replace('_', ' ')} {value!r}; known are {known}")
+            raise SettingsError(
+                f"{whose}{name.replace('_', ' ')} {value!r}; known are {known}",
+                code="unknown-choice",
+            )
         allowed = [mark for mark in getattr(kind, "__metadata__", ()) if isinstance(mark, Range)]
         whole = get_args(kind)[:1] == (int,)
         numbers = int if whole else int | float
@@ -146,5 +149,6 @@ def require_allowed(settings: object, whose: str = "") -> None:
             if not (is_number and mark.low <= value <= mark.high):
                 kind_of = "are whole numbers" if whole else "is"
                 raise SettingsError(
-                    f"{whose}{name} is {value!r}; allowed {kind_of} {mark.low} to {mark.high}"
+                    f"{whose}{name} is {value!r}; allowed {kind_of} {mark.low} to {mark.high}",
+                    code="range",
                 )

@@ -113,7 +113,9 @@ def decode(content: bytes, path: Path) -> EvaluatedCandidates:
         _, feasible, position = values[:, :3].T
         _check(values, feasible, values[:, 3 : 3 + n_var])
     except (OSError, EOFError, zlib.error, ValueError, KeyError, IndexError) as error:
-        raise ResultsError(f"{path}: damaged ({error}); --resume computes it anew") from error
+        raise ResultsError(
+            f"{path}: damaged ({error}); --resume computes it anew", code="damaged"
+        ) from error
     groups = _groups(n_var, objectives, stored)
     ends = np.cumsum([len(group) for group in groups.values()])[:-1]
     parts = dict(zip(groups, np.split(values[:, 3:], ends, axis=1), strict=True))

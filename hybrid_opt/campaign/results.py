@@ -247,7 +247,9 @@ def read_configuration(root: str | Path) -> Configuration:
     if not path.parent.exists():
         raise ResultsError(f"{root}: does not exist; name the results folder of a study")
     if not path.exists():
-        raise ResultsError(f"{root}: is no results folder, {CONFIGURATION} is missing")
+        raise ResultsError(
+            f"{root}: is no results folder, {CONFIGURATION} is missing", code="no-results-folder"
+        )
     remedy = "run the study again into another --output"
     return from_json(
         Configuration, read_document(path, CAMPAIGN_FORMAT, CAMPAIGN_VERSION, remedy), path, remedy

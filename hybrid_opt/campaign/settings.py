@@ -50,7 +50,9 @@ def chosen(
         SettingsError: a name is missing, unknown or there twice.
     """
     if not names or len(set(names)) != len(names):
-        raise SettingsError(f"algorithms {tuple(names)}: name at least one, each once")
+        raise SettingsError(
+            f"algorithms {tuple(names)}: name at least one, each once", code="repeated"
+        )
     sizes = dict(populations)
     if len(sizes) != len(populations) or not sizes.keys() <= set(names):
         raise SettingsError(

@@ -132,7 +132,8 @@ def check_stages(folder: CampaignFolder, stages: Sequence[Stage]) -> None:
             raise ResultsError(
                 f"{folder.root}: the stage '{stage.name}' was run with {marker.settings}, now "
                 f"asked for is {dict(stage.settings)}; choose another --output, or begin anew with "
-                "--overwrite"
+                "--overwrite",
+                code="another-stage-setting",
             )
 
 

@@ -209,7 +209,8 @@ def _straight_grid(
     else:
         raise SettingsError(
             f"the path is still {np.max(off):g} m off straight motion in an interval of length "
-            f"{float(np.min(work.u_b - work.u_a)):g}: it jumps; give a continuous one"
+            f"{float(np.min(work.u_b - work.u_a)):g}: it jumps; give a continuous one",
+            code="jumps",
         )
     owner, u, placed = (np.concatenate(arrays) for arrays in zip(*places, strict=True))
     order = np.lexsort((u, owner))

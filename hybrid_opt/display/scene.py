@@ -158,7 +158,9 @@ class CarryView:
         try:
             Path(path).write_text(self.page(), encoding="utf-8")
         except OSError as error:
-            raise DisplayError(f"{path}: cannot be written ({error.strerror})") from error
+            raise DisplayError(
+                f"{path}: cannot be written ({error.strerror})", code="not-writable"
+            ) from error
 
     def __repr__(self) -> str:
         return (

@@ -270,10 +270,14 @@ def select_objectives(wanted: Sequence[str | Objective]) -> tuple[Objective, ...
     unknown = [name for name in wanted if isinstance(name, str) and name not in OBJECTIVES]
     if unknown:
         raise SettingsError(
-            f"unknown objective {', '.join(map(shown, unknown))}; known are {', '.join(OBJECTIVES)}"
+            f"unknown objective {', '.join(map(shown, unknown))}; known are "
+            f"{', '.join(OBJECTIVES)}",
+            code="unknown-objective",
         )
     found = tuple(OBJECTIVES[entry] if isinstance(entry, str) else entry for entry in wanted)
     names = [objective.name for objective in found]
     if not names or len(set(names)) != len(names):
-        raise SettingsError(f"objectives {', '.join(names)}: name at least one, each once")
+        raise SettingsError(
+            f"objectives {', '.join(names)}: name at least one, each once", code="repeated"
+        )
     return found

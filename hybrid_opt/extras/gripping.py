@@ -82,12 +82,15 @@ def propose_grip(
     """
     for low, high in (up, along):
         if not -1.0 <= low <= high <= 1.0:
-            raise SettingsError(f"a range from {low:g} to {high:g} m: allowed is -1 <= low <= high")
+            raise SettingsError(
+                f"a range from {low:g} to {high:g} m: allowed is -1 <= low <= high", code="range"
+            )
     drivable = cell.drivable()
     if not all(contact_model(each.workcell).has_closed_form for each in (cell, drivable)):
         raise SettingsError(
             "places of pads are compared where their forces have a closed form: two pads with "
-            "opposite normals"
+            "opposite normals",
+            code="no-closed-form",
         )
     ways, tried = _ways(cell.workcell), dict[tuple[float, float], tuple[float, float, float]]()
     bounds = np.array([up, along])
@@ -118,7 +121,9 @@ def propose_grip(
         x = found.initial
         if found.evaluator.certified(found.evaluate(x)).feasible.all():
             return Grip(found, *at, *tried[at][1:], before[0])
-    raise SettingsError("no place of the pads within the ranges lets the hand-made path be driven")
+    raise SettingsError(
+        "no place of the pads within the ranges lets the hand-made path be driven", code="no-place"
+    )
 
 
 def _ways(workcell: Workcell) -> Array:

@@ -106,7 +106,7 @@ def require_keys(cell: Cell, over: Mapping[str, Sequence[float]]) -> None:
         SettingsError, WorkcellError: as of `sweep`.
     """
     if not over or not all(map(len, over.values())):
-        raise SettingsError("a sweep needs keys, and values of each")
+        raise SettingsError("a sweep needs keys, and values of each", code="no-values")
     cell.changed({key: each[0] for key, each in over.items()})
 
 
@@ -141,7 +141,8 @@ def sweep(
     if not cell.workcell.task.law.is_drivable or x.shape != (cell.n_var,):
         raise SettingsError(
             f"a sweep takes a drivable cell (Cell.drivable) and a carry of it; the time law is "
-            f"{cell.workcell.task.law.name!r}, the path has shape {x.shape} of ({cell.n_var},)"
+            f"{cell.workcell.task.law.name!r}, the path has shape {x.shape} of ({cell.n_var},)",
+            code="not-drivable",
         )
     values = {key: tuple(map(float, each)) for key, each in over.items()}
     require_keys(cell, values)
@@ -151,7 +152,8 @@ def sweep(
         known = read_sweep(file)
         if (known.about, dict(known.over)) != (about, values):
             raise SettingsError(
-                f"{file} holds the sweep of another cell, or over other values: {_OTHER_FILE}"
+                f"{file} holds the sweep of another cell, or over other values: {_OTHER_FILE}",
+                code="another-sweep",
             )
     chains = _Chains(known, file)
     with progress_bar(progress, "sweep", chains.size) as advance, LocalWorkers(jobs) as workers:

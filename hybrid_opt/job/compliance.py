@@ -188,7 +188,8 @@ def require_skew(job: Job, delay: float, stiffness: float) -> None:
         f"a skew of {1e3 * delay:g} ms brings the pads {1e3 * found.displacement:.1f} mm apart; "
         f"arms of {stiffness:g} N/m then miss {-found.margin:.1f} N to hold the box, with "
         f"{1e3 * largest_skew(job, stiffness):.1f} ms they hold it: press more (squeeze), choose "
-        "a slower timing, or give the stiffness and the skew that your arms have"
+        "a slower timing, or give the stiffness and the skew that your arms have",
+        code="skew-too-long",
     )
 
 
@@ -228,13 +229,15 @@ def _skewed(job: Job, phase: Phase, late: int, delay: float, stiffness: float) -
 def require_stiffness(stiffness: float) -> None:
     """Refuse a stiffness [N/m] that is not positive."""
     if not 0.0 < stiffness < float("inf"):
-        raise SettingsError(f"stiffness {stiffness:g} N/m: give a finite positive one")
+        raise SettingsError(
+            f"stiffness {stiffness:g} N/m: give a finite positive one", code="stiffness"
+        )
 
 
 def require_delay(delay: float) -> None:
     """Refuse a delay [s] out of range."""
     if not 0.0 <= delay <= LARGEST_SKEW:
-        raise SettingsError(f"skew of {delay:g} s: allowed is 0 to {LARGEST_SKEW:g} s")
+        raise SettingsError(f"skew of {delay:g} s: allowed is 0 to {LARGEST_SKEW:g} s", code="skew")
 
 
 def position_text(found: Sequence[PositionControl]) -> str:

@@ -350,7 +350,8 @@ class JobModel:
         if timing.carry is None or not timing.ok:
             raise SettingsError(
                 f"there is no timing to export ({timing.status}: {timing.reason}); export one "
-                "that robots can drive"
+                "that robots can drive",
+                code="no-timing",
             )
         if not 0.0 <= smoothing <= LARGEST_WIDTH:
             raise SettingsError(
@@ -440,13 +441,15 @@ class JobModel:
                 raise JobError(
                     f"{title}: {100.0 * found.at_parameter:.0f} % along its way {found.problem}; "
                     "change stand_off, lift_height or set_down_height under [handling] (a height "
-                    "of 0 hands the box over in the air), or choose another carry"
+                    "of 0 hands the box over in the air), or choose another carry",
+                    code="in-the-way",
                 )
             name, ratio = max(use.items(), key=lambda item: item[1])
             if ratio > USE_TOLERANCE:
                 raise JobError(
                     f"{title}: uses {100.0 * ratio:.1f} % of the limit on {name}; press less "
-                    "(squeeze), or choose a slower timing"
+                    "(squeeze), or choose a slower timing",
+                    code="beyond-a-limit",
                 )
             yield replace(draft, begin=begin, use=use)
             begin += draft.duration
@@ -515,5 +518,7 @@ def plan_job(
     """Plan the whole job around a timed or recommended carry, see `JobModel.plan`."""
     timing = timing if isinstance(timing, Timing) else timing.timing
     if timing.carry is None:
-        raise SettingsError(f"there is no timing to export ({timing.status}: {timing.reason})")
+        raise SettingsError(
+            f"there is no timing to export ({timing.status}: {timing.reason})", code="no-timing"
+        )
     return _model(timing.carry.workcell).plan(timing, squeeze, smoothing)

@@ -63,7 +63,8 @@ class Guarded(Algorithm):  # type: ignore[misc]
         if problem.n_eq_constr > 0:
             raise SettingsError(
                 f"the problem has {problem.n_eq_constr} equality constraints; "
-                "state them as inequalities with a tolerance"
+                "state them as inequalities with a tolerance",
+                code="equalities",
             )
         super()._setup(problem, **kwargs)
 
@@ -115,11 +116,15 @@ class WarmSampling(FloatRandomSampling):  # type: ignore[misc]
         if initial.shape[1] != problem.n_var or len(initial) > n_samples:
             raise SettingsError(
                 f"initial points have shape {initial.shape}; allowed are at most {n_samples} "
-                f"(the population) of {problem.n_var} values"
+                f"(the population) of {problem.n_var} values",
+                code="shape",
             )
         # Written so that a NaN coordinate is refused too.
         if not ((initial >= problem.xl) & (initial <= problem.xu)).all():
-            raise SettingsError("an initial point lies outside the bounds; move it inside")
+            raise SettingsError(
+                "an initial point lies outside the bounds; move it inside",
+                code="outside-the-bounds",
+            )
         samples[: len(initial)] = initial
         return samples
 

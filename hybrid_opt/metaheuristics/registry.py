@@ -161,13 +161,17 @@ def settings_of(name: str, overrides: Mapping[str, object] | None = None) -> Alg
         SettingsError: unknown algorithm or setting, or a value outside its range.
     """
     if name not in REGISTRY:
-        raise SettingsError(f"unknown algorithm {shown(name)}; known are {', '.join(REGISTRY)}")
+        raise SettingsError(
+            f"unknown algorithm {shown(name)}; known are {', '.join(REGISTRY)}",
+            code="unknown-algorithm",
+        )
     defaults = REGISTRY[name].defaults
     known = [field.name for field in dataclasses.fields(defaults)]
     unknown = [key for key in overrides or {} if key not in known]
     if unknown:
         raise SettingsError(
-            f"{name}: unknown setting {', '.join(unknown)}; known are {', '.join(known)}"
+            f"{name}: unknown setting {', '.join(unknown)}; known are {', '.join(known)}",
+            code="unknown-setting",
         )
     return dataclasses.replace(defaults, **dict(overrides or {}))  # type: ignore[arg-type]
 

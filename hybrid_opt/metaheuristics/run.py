@@ -209,9 +209,11 @@ def search(
         SettingsError: no budget, or an algorithm that already ran.
     """
     if evaluations < 1:
-        raise SettingsError(f"evaluations is {evaluations}; at least 1 is needed")
+        raise SettingsError(f"evaluations is {evaluations}; at least 1 is needed", code="budget")
     if algorithm.problem is not None:
-        raise SettingsError("this algorithm already ran; make a new one for each run")
+        raise SettingsError(
+            "this algorithm already ran; make a new one for each run", code="already-ran"
+        )
     start = time.perf_counter()
     inside = 0.0
     batches: list[Evaluated] = []

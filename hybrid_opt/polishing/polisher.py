@@ -145,7 +145,8 @@ def _require_objectives(
         named = " or ".join(" and ".join(pair) for pair in pairs)
         raise SettingsError(
             f"{'under the time law optimal ' if driven else ''}the polish minimises {named}; the "
-            f"objectives are {', '.join(names)}: switch the polish off for them"
+            f"objectives are {', '.join(names)}: switch the polish off for them",
+            code="objectives",
         )
     if not has_polishable_forces(evaluator.workcell, names):
         raise SettingsError(

@@ -347,7 +347,8 @@ def refuse(options: Sequence[Option], wish: Wish, goal: Goal, budget: GripBudget
         shortest = min(option.duration for option in held)
         raise SettingsError(
             f"duration {wish.duration:g} s: no carry of the front is so short; the shortest takes "
-            f"{shortest:.3f} s, before limits on jerk"
+            f"{shortest:.3f} s, before limits on jerk",
+            code="too-short",
         )
     if not options:
         raise SettingsError("no carry of the front can be driven: it cannot even be held still")
@@ -356,5 +357,6 @@ def refuse(options: Sequence[Option], wish: Wish, goal: Goal, budget: GripBudget
     raise SettingsError(
         f"{_listed(wish)}: no carry of the front holds within {goal.hardest.min():.1f} N in every "
         f"case of {budget.uncertainty.title}; the gentlest needs {least:.1f} N commanded; "
-        f"{budget}{remedies}"
+        f"{budget}{remedies}",
+        code="too-gentle",
     )

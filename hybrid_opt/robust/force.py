@@ -235,7 +235,8 @@ class RobustModel:
         if not _has_positive_remainders(self.workcell, uncertainty):
             raise SettingsError(
                 "the uncertainty leaves no friction or no patch; make its shares, tilt or "
-                f"displacements smaller ({uncertainty})"
+                f"displacements smaller ({uncertainty})",
+                code="no-friction",
             )
         return worst_cases(self.workcell, uncertainty, leader)
 
@@ -384,7 +385,8 @@ class RobustModel:
         commanded, leading = self.hold(motion, chosen, leader)
         if not np.isfinite(commanded).all():
             raise SettingsError(
-                f"no force was found that holds every case ({chosen}); make its ranges smaller"
+                f"no force was found that holds every case ({chosen}); make its ranges smaller",
+                code="no-force",
             )
         return RobustForce(leader, chosen, self.nominal(motion, leader), commanded, leading)
 

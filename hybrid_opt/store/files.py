@@ -54,9 +54,12 @@ def storing(path: Path, remedy: str = RESUME) -> Iterator[None]:
         if error.errno in _FULL:
             raise ResultsError(
                 f"{path}: no space left to write ({error.strerror}); everything stored before is "
-                f"kept: {remedy}"
+                f"kept: {remedy}",
+                code="no-space",
             ) from error
-        raise ResultsError(f"{path}: cannot be written ({error.strerror})") from error
+        raise ResultsError(
+            f"{path}: cannot be written ({error.strerror})", code="not-writable"
+        ) from error
 
 
 def write_atomically(path: Path, content: bytes, remedy: str = RESUME) -> None:

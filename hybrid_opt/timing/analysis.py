@@ -151,7 +151,7 @@ def duration_against_force_limit(
         SettingsError: fewer than two points.
     """
     if points < 2:
-        raise SettingsError(f"{points} points of the force curve; give at least 2")
+        raise SettingsError(f"{points} points of the force curve; give at least 2", code="too-few")
     motion = model.path_motion(x)
     still = np.zeros(len(motion.parameter))
     static = _peak_force(model, model.carry(motion, still, still, still))

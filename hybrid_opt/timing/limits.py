@@ -454,7 +454,8 @@ def drive_path(
     if grid_speed.shape != (model.intervals + 1,) or not moves:
         raise SettingsError(
             f"path speeds of shape {grid_speed.shape}; needs {model.intervals + 1} that never "
-            "stand still over an interval"
+            "stand still over an interval",
+            code="shape",
         )
     motion = model.path_motion(x) if motion is None else motion
     failure = path_error(model, motion)

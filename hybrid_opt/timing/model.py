@@ -307,7 +307,9 @@ class TimingModel:
         x = np.ascontiguousarray(x, dtype=float)
         n_var = self.workcell.task.n_var
         if x.shape != (n_var,) or not np.isfinite(x).all():
-            raise SettingsError(f"decision vector of shape {x.shape}; needs {n_var} finite numbers")
+            raise SettingsError(
+                f"decision vector of shape {x.shape}; needs {n_var} finite numbers", code="shape"
+            )
         return x
 
 
@@ -326,7 +328,7 @@ def sample_limits_set(compiled: CompiledCell, lanes: int) -> NumericFunction:
 def require_intervals(intervals: int) -> None:
     """Raise an error for a number of intervals out of range."""
     if not 10 <= intervals <= 2000:
-        raise SettingsError(f"{intervals} intervals; allowed are 10 to 2000")
+        raise SettingsError(f"{intervals} intervals; allowed are 10 to 2000", code="intervals")
 
 
 def contact_torque(first: int, wrench_torque: Array, wrenches: Iterable[Array]) -> Array:

@@ -109,7 +109,8 @@ class PathTimer:
         (n_var,) = self._path.input_shapes[0]
         if x.shape != (len(limits), n_var) or not np.isfinite(x).all():
             raise SettingsError(
-                f"waypoints of shape {x.shape}; needs {len(limits)} rows of {n_var} finite numbers"
+                f"waypoints of shape {x.shape}; needs {len(limits)} rows of {n_var} finite numbers",
+                code="shape",
             )
         return self.time_from_coefficients(x, self.path_limits(x), limits)
 

@@ -100,9 +100,11 @@ class TimingLimits:
 
     def __post_init__(self) -> None:
         if self.robust and self.force is None:
-            raise SettingsError("robust forces are limited by a force: give one")
+            raise SettingsError("robust forces are limited by a force: give one", code="no-force")
         if self.force is not None and not 0.0 < self.force < float("inf"):
-            raise SettingsError(f"force limit {self.force:g} N: give a finite positive force")
+            raise SettingsError(
+                f"force limit {self.force:g} N: give a finite positive force", code="force"
+            )
 
 
 @dataclass(frozen=True)
@@ -124,7 +126,7 @@ class JerkLimits:
             SettingsError: a limit is not positive.
         """
         if not (np.all(np.asarray(self.joints) > 0.0) and self.payload > 0.0):
-            raise SettingsError("jerk limits: give positive ones [rad/s^3, m/s^3]")
+            raise SettingsError("jerk limits: give positive ones [rad/s^3, m/s^3]", code="jerk")
 
     @classmethod
     def from_workcell(cls, workcell: Workcell) -> JerkLimits | None:

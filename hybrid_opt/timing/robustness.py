@@ -266,7 +266,9 @@ class TimingSensitivity:
         self._left = np.maximum(1.0 - used, 0.0)
         self._least = self._least_change(self._left)
         if not self._least > -OPTIMALITY_GAP * timing.duration:
-            raise SettingsError("the timing is not the fastest within its limits; time it again")
+            raise SettingsError(
+                "the timing is not the fastest within its limits; time it again", code="not-fastest"
+            )
 
     def changes(self, low: dict[str, Array], high: dict[str, Array]) -> tuple[float, float]:
         """Compute the changes of the duration [s] towards two cells.

@@ -78,7 +78,7 @@ def validate_timing(model: TimingModel, timing: Timing) -> Validation:
         SettingsError: there is no timing.
     """
     if timing.carry is None:
-        raise SettingsError(f"there is no timing to validate: {timing.reason}")
+        raise SettingsError(f"there is no timing to validate: {timing.reason}", code="no-timing")
     motion = model.path_motion(timing.carry.x)
     return Validation(timing.duration, toppra_timing(model, motion, timing.limits).duration)
 

@@ -16,6 +16,7 @@ from hybrid_opt.store.bundle_file import read_manifest, write_bundle
 from hybrid_opt.store.files import read_json, sha256, write_atomically, write_json
 from hybrid_opt.store.trajectory_file import read_trajectory, write_trajectory
 from tests.faults.test_kills import contents, differences, ended, started, study
+from tests.refusals import refused
 from tests.symbolic.cells import ROOT, rack_cell
 from tests.waiting import HANGS
 
@@ -83,7 +84,7 @@ def test_a_full_disk_is_told_and_what_was_there_is_kept(disk: Path, kind: str) -
     path = disk / "file"
     write_json(disk / "before.json", {"kept": True})
     fill(disk)
-    with pytest.raises(ResultsError, match=r"file: (no space left to write|cannot be written)"):
+    with pytest.raises(ResultsError, match="file: "):
         WRITERS[kind](path)
     assert read_json(disk / "before.json") == {"kept": True}
     (disk / "filler").unlink()
@@ -104,7 +105,7 @@ def test_a_trajectory_is_replaced_only_by_a_whole_one(disk: Path) -> None:
     path = disk / "trajectory.json"
     _trajectory(path)
     fill(disk)
-    with pytest.raises(ResultsError, match=r"No space left.*make room and try again"):
+    with refused(ResultsError, "no-space"):
         _trajectory(path)
     assert read_trajectory(path).figures == {"duration": 1.0}
 
@@ -114,7 +115,7 @@ def test_a_bundle_is_replaced_only_by_a_whole_one(disk: Path) -> None:
     folder = disk / "bundle"
     write_bundle(folder, {"job.csv": "before"}, {})
     fill(disk)
-    with pytest.raises(ResultsError, match=r"No space left.*make room and try again"):
+    with refused(ResultsError, "no-space"):
         write_bundle(folder, {"job.csv": "x" * 500_000}, {})
     assert read_manifest(folder)["files"] == {"job.csv": sha256(b"before")}
     assert (folder / "job.csv").read_text() == "before"

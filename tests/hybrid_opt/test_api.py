@@ -29,6 +29,7 @@ from symbolic.read.cell_files import collect_cell
 from symbolic.records import Workcell
 from tests.hybrid_opt.campaign.fake import RACK
 from tests.hybrid_opt.cells import shipped
+from tests.refusals import refused
 
 EVALUATIONS = 120
 
@@ -51,9 +52,9 @@ def polished() -> ho.Front:
 
 
 def test_an_unknown_objective_is_refused_where_a_cell_is_loaded() -> None:
-    with pytest.raises(SettingsError, match="unknown objective 'speed'; known are peak_force_1"):
+    with refused(SettingsError, "unknown-objective", "'speed'", "peak_force_1"):
         ho.Cell.load(RACK, ["speed"])
-    with pytest.raises(SettingsError, match="each once"):
+    with refused(SettingsError, "repeated"):
         ho.Cell(ho.Cell.load(RACK).workcell, ["duration", "duration"])
 
 
@@ -61,7 +62,7 @@ def test_an_unknown_algorithm_is_told_before_anything_is_compiled(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(ho.Cell, "evaluator", property(lambda cell: pytest.fail("compiled")))
-    with pytest.raises(SettingsError, match="unknown algorithm"):
+    with refused(SettingsError, "unknown-algorithm"):
         ho.search(ho.example("rack"), "simplex", rng=np.random.default_rng(1))
 
 
@@ -74,7 +75,7 @@ def test_everything_that_is_promised_is_there() -> None:
     assert set(ho.__all__) <= set(dir(ho))
     for name in ho.__all__:
         assert getattr(ho, name).__name__ == name
-    with pytest.raises(AttributeError, match="no attribute 'Front2'"):
+    with pytest.raises(AttributeError, match="'Front2'"):
         _ = ho.Front2
 
 
@@ -116,9 +117,9 @@ def test_selections() -> None:
     for robot in (0, 1):
         assert front().lowest_force(robot).peak_normal_force[robot] == peaks[:, robot].min()
     np.testing.assert_array_equal(front().lowest("peak_force_2").x, front().lowest_force(1).x)
-    with pytest.raises(SettingsError, match="allowed are 0 and 1"):
+    with refused(SettingsError, "robot", 2):
         front().lowest_force(2)
-    with pytest.raises(SettingsError, match="this front has peak_force_1"):
+    with refused(SettingsError, "unknown-objective", "peak_force_1"):
         front().lowest("duration")
 
 
@@ -133,7 +134,7 @@ def test_an_empty_front_says_so() -> None:
         pytest.fail("this candidate was to be infeasible")
     assert "0 carries" in repr(empty)
     assert "<svg" not in empty._repr_html_()
-    with pytest.raises(SettingsError, match="front is empty"):
+    with refused(SettingsError, "empty-front"):
         empty.balanced()
 
 
@@ -199,7 +200,7 @@ def test_what_there_is_to_choose_from() -> None:
     assert set(cell().objective_names) <= set(ho.objectives())
     assert {"torque", "data"} <= set(ho.targets())
     assert repr(ho.example("rack")) == repr(ho.Cell.load(RACK))
-    with pytest.raises(SettingsError, match="no cell 'shelf' ships; known are corner, drum"):
+    with refused(SettingsError, "unknown-cell", "'shelf'", "drum"):
         ho.example("shelf")
     assert ho.__version__ == version("dual-arm-carry")
 
@@ -217,7 +218,7 @@ def test_what_was_stored_is_read_back(tmp_path: Path) -> None:
     assert isinstance(manifest, Mapping)
     assert manifest["written_by"].endswith(ho.__version__)
     assert isinstance(ho.load(RACK), ho.Cell)
-    with pytest.raises(ResultsError, match="is no results folder"):
+    with refused(ResultsError, "no-results-folder"):
         ho.load(tmp_path)
 
 

@@ -22,6 +22,7 @@ from symbolic.array import Array
 from symbolic.contact.worst_cases import case_gradient_function, case_squeeze_function
 from symbolic.errors import SettingsError, WorkcellError
 from tests.hybrid_opt.cells import drivable, shipped
+from tests.refusals import refused
 
 H = 1e-4
 """Share of a usual change by which numbers are changed."""
@@ -172,13 +173,13 @@ def test_what_has_no_sensitivities_is_refused() -> None:
     cell = shipped("rack")
     timing = ho.time_path(cell, cell.initial)
     assert timing.carry is not None
-    with pytest.raises(SettingsError, match="give the timing itself"):
+    with refused(SettingsError, "timing"):
         ho.sensitivities(timing.carry)
     robust = replace(timing, limits=ho.TimingLimits(force=150.0, robust=True))
-    with pytest.raises(SettingsError, match="robust forces"):
+    with refused(SettingsError, "robust-timing"):
         ho.sensitivities(robust)
     slower = drive_path(cell.timing_model, cell.initial, 0.9 * timing.grid_speed, timing.limits)
-    with pytest.raises(SettingsError, match="not the fastest"):
+    with refused(SettingsError, "not-fastest"):
         ho.sensitivities(slower)
 
 
@@ -245,7 +246,7 @@ def test_a_fixed_path_is_what_it_is_in_each_cell(
         patched.setattr(sweeping, "_row", again)
         same = ho.sweep(cell, cell.initial, OVER, fixed=True, file=file)
     assert repr(same) == repr(found)
-    with pytest.raises(SettingsError, match="another cell, or over other values"):
+    with refused(SettingsError, "another-sweep"):
         ho.sweep(cell, cell.initial, OVER, file=file)
 
 
@@ -259,9 +260,9 @@ def test_a_polished_path_is_better_than_the_fixed_one(cell: ho.Cell) -> None:
 
 
 def test_wrong_sweeps_are_refused(cell: ho.Cell) -> None:
-    with pytest.raises(SettingsError, match="needs keys, and values of each"):
+    with refused(SettingsError, "no-values"):
         ho.sweep(cell, cell.initial, {})
-    with pytest.raises(SettingsError, match="takes a drivable cell"):
+    with refused(SettingsError, "not-drivable"):
         ho.sweep(shipped("rack"), cell.initial[:-1], OVER)
     with pytest.raises(WorkcellError, match=r"payload\.weight"):
         ho.sweep(cell, cell.initial, {"payload.weight": [1.0]})
@@ -319,9 +320,9 @@ def test_the_cell_is_certified_and_differs_in_its_pads_alone(grip: ho.Grip) -> N
 
 
 def test_what_cannot_be_compared_is_told() -> None:
-    with pytest.raises(SettingsError, match="closed form"):
+    with refused(SettingsError, "no-closed-form"):
         ho.propose_grip(shipped("fork"), (0.0, 0.01), (0.0, 0.0))
-    with pytest.raises(SettingsError, match=r"a range from 0\.02 to 0\.01 m"):
+    with refused(SettingsError, "range", "0.02", "0.01"):
         ho.propose_grip(shipped("rack"), (0.02, 0.01), (0.0, 0.0))
-    with pytest.raises(SettingsError, match="no place of the pads"):
+    with refused(SettingsError, "no-place"):
         ho.propose_grip(shipped("rack"), (0.2, 0.2), (0.0, 0.0))

@@ -523,7 +523,9 @@ def require_target(name: str) -> None:
     if name in GONE:
         raise SettingsError(f"target {name!r} is no longer written; use {GONE[name]}")
     if name not in TARGETS:
-        raise SettingsError(f"unknown target {name!r}; known are {', '.join(TARGETS)}")
+        raise SettingsError(
+            f"unknown target {name!r}; known are {', '.join(TARGETS)}", code="unknown-target"
+        )
 
 
 def target_for(name: str, workcell: Workcell) -> Target:
@@ -626,7 +628,8 @@ def export(
     if skew is not None:
         if sheet.stiffness is None:
             raise SettingsError(
-                "what a skew does depends on the stiffness of the arms: --stiffness"
+                "what a skew does depends on the stiffness of the arms: --stiffness",
+                code="no-stiffness",
             )
         require_skew(whole, skew, sheet.stiffness)
     document = manifest(sheet, target, found, origin, skew)

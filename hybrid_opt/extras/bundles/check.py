@@ -261,7 +261,7 @@ def _chosen(columns: Columns, workcell: Workcell) -> JointTrajectory:
         found = next((name for name in usable if ("position", name) in values), None)
         if found is None:
             has = ", ".join(name for what, name in values if what == "position")
-            raise ValueError(f"there is no joint {usable[1]!r}; it has {has}")
+            raise ValueError(f"there is no joint {usable[1]!r}; it has {has}", code="unknown-joint")
         picked.append(found)
     tables: list[Array] = []
     for what in QUANTITIES:
@@ -276,7 +276,7 @@ def _chosen(columns: Columns, workcell: Workcell) -> JointTrajectory:
         if not np.isfinite(rows).all():
             raise ValueError("all numbers have to be finite")
     if not (np.isfinite(time).all() and (np.diff(time) > 0.0).all()):
-        raise ValueError("times have to ascend")
+        raise ValueError("times have to ascend", code="times-decrease")
     return JointTrajectory(time - time[0], tuple(tables))
 
 
@@ -310,7 +310,9 @@ def check(
     if held is not None:
         mask = np.asarray((time >= held[0]) & (time <= held[1]))
     if held is not None and mask.sum() < SHORTEST:
-        raise SettingsError(f"under {SHORTEST} samples lie between {held[0]:g} and {held[1]:g} s")
+        raise SettingsError(
+            f"under {SHORTEST} samples lie between {held[0]:g} and {held[1]:g} s", code="too-few"
+        )
     places = _places(time)
     # Straight lines have no accelerations: those of a smooth motion through the samples count.
     smooth = CubicSpline(time, trajectory.q) if kind == "linear" else joints

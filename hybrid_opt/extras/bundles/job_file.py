@@ -98,7 +98,8 @@ def chosen_step(
         f"with {interpolation} motion between samples {1e3 * steps[-1]:g} ms apart the gap of the "
         f"pads is wrong by {1e3 * found.along:.2f} mm; arms of {stiffness:g} N/m then miss their "
         f"force by {found.force:.1f} N, {100.0 * found.share:.0f} %: choose a slower timing, "
-        "or another target"
+        "or another target",
+        code="gap-between-samples",
     )
 
 
@@ -260,7 +261,8 @@ def stop_of(job: Job) -> Stop:
         raise JobError(
             f"a stop along the path within {STOP_TIMES[-1]:g} s asks for "
             f"{100.0 * found[-1].force_use:.1f} % of the commanded forces: press more (squeeze), "
-            "or choose a slower timing"
+            "or choose a slower timing",
+            code="command-changes-too-fast",
         )
     gentle = [each for each in bearing if each.joint_use <= JOINT_USE]
     return replace(gentle[0] if gentle else bearing[-1], quick=bearing[0].time)

@@ -88,7 +88,8 @@ def driver_of(workcell: Workcell) -> str:
     if not all(addresses):
         raise SettingsError(
             "only one of both arms has an address: give [robots.driver] of the other one too, or "
-            "of none for a simulator"
+            "of none for a simulator",
+            code="one-address",
         )
     for driver, maker, axes in (("franka", FRANKA, SEVEN), ("ur", UR, SIX)):
         try:

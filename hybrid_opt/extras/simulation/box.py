@@ -265,7 +265,7 @@ def drive_of(
     """
     force = carry.normal_force[:, 1 - leader] if press is None else press
     if force.shape != carry.time.shape:
-        raise SettingsError(f"forces of shape {force.shape} for {len(carry)} samples")
+        raise SettingsError(f"forces of shape {force.shape} for {len(carry)} samples", code="shape")
     motion = carriage_motion(carry, settings)
     begin, end = float(carry.time[0]), float(carry.time[-1])
     clipped = np.clip(motion.time, begin, end)
@@ -326,7 +326,9 @@ def refuse_motion_at_ends(carry: Carry) -> None:
         SettingsError: the carry does not start and end at rest.
     """
     if max(np.abs(carry.rate[[0, -1]]).max(), np.abs(carry.angular_velocity[[0, -1]]).max()) > 1e-3:
-        raise SettingsError("the carry does not start and end at rest; give one with a timing")
+        raise SettingsError(
+            "the carry does not start and end at rest; give one with a timing", code="not-at-rest"
+        )
 
 
 class BoxSimulation:

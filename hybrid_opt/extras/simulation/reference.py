@@ -120,15 +120,19 @@ def job_reference(
     if motion.q_rate.shape != (n, joints) or motion.q_second.shape != (n, joints):
         raise SettingsError("rates of the joints do not fit their positions")
     if motion.time.shape != (n,) or normal_force.shape != (n, 2) or n < 2:
-        raise SettingsError(f"{len(motion.time)} times and {len(normal_force)} forces for {n} rows")
+        raise SettingsError(
+            f"{len(motion.time)} times and {len(normal_force)} forces for {n} rows", code="shape"
+        )
     if (np.diff(motion.time) < 0.0).any():
-        raise SettingsError("times decrease")
+        raise SettingsError("times decrease", code="times-decrease")
     pressing = press_torque(workcell, motion.q)
     if effort is None:
         repeated = np.repeat(normal_force, _counts(workcell), axis=1)
         effort = inverse_dynamics(workcell, motion) + pressing * repeated
     elif effort.shape != (n, joints):
-        raise SettingsError(f"efforts of shape {effort.shape} for {n} x {joints} joints")
+        raise SettingsError(
+            f"efforts of shape {effort.shape} for {n} x {joints} joints", code="shape"
+        )
     return Reference(workcell, motion, normal_force, effort, pressing, job)
 
 
@@ -149,7 +153,7 @@ def carry_reference(
     refuse_motion_at_ends(carry)
     planned = carry.normal_force[:, 1 - leader]
     if press is not None and press.shape != planned.shape:
-        raise SettingsError(f"forces of shape {press.shape} for {len(carry)} samples")
+        raise SettingsError(f"forces of shape {press.shape} for {len(carry)} samples", code="shape")
     extra = np.zeros_like(planned) if press is None else press - planned
     begin = float(carry.time[0])
     motion = JointMotion(
@@ -375,7 +379,9 @@ def exported_carry(cell: Cell, timing: Timing) -> Carry:
         JobError: there is none without jumps of acceleration.
     """
     if not timing.ok or timing.carry is None:
-        raise SimulationError(f"the trajectory cannot be driven: {timing.reason}")
+        raise SimulationError(
+            f"the trajectory cannot be driven: {timing.reason}", code="not-drivable"
+        )
     jerk = applicable_jerk_limits(cell.workcell, timing.limits)
     found = without_jumps(cell.timing_model, timing, jerk).carry
     assert found is not None, "a timing without jumps has a carry"

@@ -104,10 +104,14 @@ class ContactSettings:
     def __post_init__(self) -> None:
         if not 0.0 < self.time_step <= LARGEST_TIME_STEP:
             raise SettingsError(
-                f"time step {self.time_step:g} s: allowed is up to {LARGEST_TIME_STEP:g} s"
+                f"time step {self.time_step:g} s: allowed is up to {LARGEST_TIME_STEP:g} s",
+                code="time-step",
             )
         if self.points < 3 or not self.layer > 0.0:
-            raise SettingsError("give at least three contact points and a positive layer stiffness")
+            raise SettingsError(
+                "give at least three contact points and a positive layer stiffness",
+                code="contact-points",
+            )
         if not self.slip > 0.0:
             raise SettingsError("give a positive slip")
 
@@ -161,7 +165,9 @@ class ArmSettings(ContactSettings):
         super().__post_init__()
         steps = self.control_period / self.time_step
         if not (steps > 0.99 and abs(steps - round(steps)) < 1e-6):
-            raise SettingsError("give a control period that is a multiple of the time step")
+            raise SettingsError(
+                "give a control period that is a multiple of the time step", code="control-period"
+            )
         positive = (self.arrival, self.stiffness, self.damping_ratio)
         other = (self.armature, self.force_gain, self.drift_stiffness, self.support_friction)
         if not (min(positive) > 0.0 and min(other) >= 0.0):

@@ -28,6 +28,7 @@ from hybrid_opt.evaluate.evaluation import REASONS, Evaluations
 from hybrid_opt.store.files import from_json, to_json
 from symbolic.errors import SettingsError
 from tests.hybrid_opt.campaign.fake import OBJECTIVES, verdicts
+from tests.refusals import refused
 
 PATH = Path("00.csv.gz")
 
@@ -97,7 +98,7 @@ def test_a_small_file_does_not_unfold_into_a_huge_one() -> None:
     packed = gzip.compress(header + b"0" * 2**28, 1)
     tracemalloc.reset_peak()
     before = tracemalloc.get_traced_memory()[0]
-    with pytest.raises(ResultsError, match=r"a line of more than"):
+    with refused(ResultsError, "damaged"):
         decode(packed, PATH)
     assert tracemalloc.get_traced_memory()[1] - before < 2**24
     tracemalloc.stop()
@@ -124,7 +125,7 @@ def test_a_small_file_does_not_unfold_into_a_huge_one() -> None:
 def test_damage_is_told(spoil: Callable[[bytes], bytes]) -> None:
     spoilt = gzip.compress(spoil(gzip.decompress(encode(table()))))
     for content in (spoilt, encode(table())[:-20], b"not gzip"):
-        with pytest.raises(ResultsError, match=r"00.csv.gz: damaged"):
+        with refused(ResultsError, "damaged", "00.csv.gz"):
             decode(content, PATH)
 
 
@@ -177,7 +178,7 @@ def test_the_drivable_experiment_is_about_the_same_forces(
     assert drivable_settings(settings) == replace(settings, objectives=drivable, replicas=3)
     assert drivable_settings(replace(settings, replicas=2)).replicas == 2
     assert drivable_settings(settings, 7).replicas == 7
-    with pytest.raises(SettingsError, match="replicas is 0"):
+    with refused(SettingsError, "range", "replicas is 0"):
         drivable_settings(settings, 0)
 
 

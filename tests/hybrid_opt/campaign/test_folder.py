@@ -23,6 +23,7 @@ from hybrid_opt.errors import ResultsError
 from hybrid_opt.progress import Progress
 from symbolic.read.cell import load
 from tests.hybrid_opt.campaign.fake import RACK
+from tests.refusals import refused
 
 SETTINGS = CampaignSettings(evaluations=200, replicas=2)
 
@@ -34,7 +35,7 @@ def begun(root: Path) -> ExecutionSettings:
         return execution
 
 
-def refused(
+def folder_refused(
     message: str,
     execution: ExecutionSettings,
     settings: CampaignSettings = SETTINGS,
@@ -64,7 +65,7 @@ def refused(
 def test_other_settings_are_never_mixed(
     tmp_path: Path, change: dict[str, Any], message: str
 ) -> None:
-    refused(message, begun(tmp_path), replace(SETTINGS, **change))
+    folder_refused(message, begun(tmp_path), replace(SETTINGS, **change))
 
 
 @pytest.mark.parametrize("key", ["numpy", "sources"])
@@ -73,7 +74,7 @@ def test_other_software_is_never_mixed(tmp_path: Path, key: str) -> None:
     stored = json.loads(path.read_text())
     stored["environment"][key] = "0.1"
     path.write_text(json.dumps(stored))
-    refused(rf'environment.{key}: stored "0.1", now', execution)
+    folder_refused(rf'environment.{key}: stored "0.1", now', execution)
 
 
 def changed_cell(folder: Path) -> Path:
@@ -86,7 +87,7 @@ def changed_cell(folder: Path) -> Path:
 
 def test_other_workcell_is_never_mixed(tmp_path: Path) -> None:
     execution, cell = begun(tmp_path / "a"), changed_cell(tmp_path)
-    refused("holds results of another workcell", execution, cell=cell)
+    folder_refused("holds results of another workcell", execution, cell=cell)
 
 
 def test_results_are_overwritten_where_that_is_asked_for(tmp_path: Path) -> None:
@@ -107,7 +108,7 @@ def test_what_is_no_results_folder_is_not_touched(tmp_path: Path, asked: dict[st
     kept = tmp_path / "thesis.tex"
     kept.write_text("years of work")
     execution = ExecutionSettings(tmp_path, 1, **asked)
-    refused(r"is no results folder, but not empty \(thesis.tex\)", execution)
+    folder_refused(r"is no results folder, but not empty \(thesis.tex\)", execution)
     assert kept.read_text() == "years of work"
 
 
@@ -123,7 +124,7 @@ def test_the_stored_workcell_does_not_follow_the_file(tmp_path: Path) -> None:
 
 def test_existing_results_are_not_touched_without_resume(tmp_path: Path) -> None:
     execution = replace(begun(tmp_path), resume=False)
-    refused("holds a campaign already; continue it with --resume", execution)
+    folder_refused("holds a campaign already; continue it with --resume", execution)
 
 
 def test_a_changed_copy_of_the_workcell_is_told_and_a_missing_one_made_again(
@@ -132,7 +133,7 @@ def test_a_changed_copy_of_the_workcell_is_told_and_a_missing_one_made_again(
     execution = begun(tmp_path)
     copy = next((tmp_path / "workcell").rglob("*.toml"))
     copy.write_text(copy.read_text().replace("mass = 10.0", "mass = 9.0"))
-    refused("was changed after the campaign began", execution)
+    folder_refused("was changed after the campaign began", execution)
     shutil.rmtree(tmp_path / "workcell")
     with open_folder(SETTINGS, execution, load(RACK)) as folder:
         assert folder.workcell.digest == load(RACK).digest
@@ -215,13 +216,13 @@ def test_what_follows_an_interrupted_stage_runs_again(tmp_path: Path) -> None:
 def test_a_damaged_marker_is_told(tmp_path: Path, content: str) -> None:
     run(tmp_path, Stage("polish", noting([], "polish")))
     (tmp_path / "stages/polish.json").write_text(content)
-    with pytest.raises(ResultsError, match=r"polish.json: damaged"):
+    with pytest.raises(ResultsError, match=r"polish\.json"):
         run(tmp_path, Stage("polish", noting([], "polish")))
 
 
 def test_a_stage_of_other_settings_is_refused(tmp_path: Path) -> None:
     ran: list[str] = []
     run(tmp_path, Stage("polish", noting(ran, "polish"), {"attempts": 20}))
-    with pytest.raises(ResultsError, match=r"'polish' was run with .*20.*, now asked for is .*30"):
+    with refused(ResultsError, "another-stage-setting", "'polish'", "20", "30"):
         run(tmp_path, Stage("polish", noting(ran, "polish"), {"attempts": 30}))
     assert ran == ["polish"]

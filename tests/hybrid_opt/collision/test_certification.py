@@ -39,6 +39,7 @@ from symbolic.records.task import extended_waypoints, initial_decision
 from symbolic.robot.model import build_robot_model
 from tests.hybrid_opt.cells import shipped
 from tests.hybrid_opt.collision.test_checker import check_between, collision_mask
+from tests.refusals import refused
 from tests.symbolic.geometry.collision_cells import Configurations, functions_of, rack
 from tests.symbolic.read.samples import RACK
 
@@ -103,7 +104,7 @@ def test_a_path_that_an_arm_cannot_follow_is_told(evaluator: CandidateEvaluator)
     assert 0.0 < verdict.at_parameter < 1.0
     lost = np.array(evaluator.workcell.task.initial)
     lost[0, 2] += 3.0
-    with pytest.raises(LostPathError, match="an arm"):
+    with pytest.raises(LostPathError):
         evaluator.certificate(lost.reshape(-1))
 
 
@@ -358,5 +359,5 @@ def test_a_path_that_jumps_is_refused() -> None:
     def jump(u: Array) -> Configurations:
         return passing(np.where(u < 0.337, -0.6, 0.6))
 
-    with pytest.raises(SettingsError, match="jumps"):
+    with refused(SettingsError, "jumps"):
         certify(checker(), jump, np.linspace(0.0, 1.0, 5))

@@ -34,6 +34,7 @@ from studies.research import analytic
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from tests.hybrid_opt.campaign.fake import FakeEvaluator, FakeSource, verdicts
+from tests.refusals import refused
 
 NAMES = names()
 
@@ -152,16 +153,16 @@ def test_warm_start_is_evaluated_first(name: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("initial", "message"),
+    ("initial", "code"),
     [
-        ([[0.5, 0.5]], "of 3 values"),
-        (np.full((41, 3), 0.5), "at most 40"),
-        ([[0.5, 1.5, 0.5]], "outside the bounds"),
-        ([[0.5, np.nan, 0.5]], "outside the bounds"),
+        ([[0.5, 0.5]], "shape"),
+        (np.full((41, 3), 0.5), "shape"),
+        ([[0.5, 1.5, 0.5]], "outside-the-bounds"),
+        ([[0.5, np.nan, 0.5]], "outside-the-bounds"),
     ],
 )
-def test_wrong_warm_start_is_refused(initial: Any, message: str) -> None:
-    with pytest.raises(SettingsError, match=message):
+def test_wrong_warm_start_is_refused(initial: Any, code: str) -> None:
+    with refused(SettingsError, code):
         run("nsga2", Counting(), 60, initial=np.asarray(initial))
 
 
@@ -197,13 +198,13 @@ def test_violation_sums_what_is_exceeded() -> None:
 @pytest.mark.parametrize(
     ("name", "settings", "message"),
     [
-        ("nsga3", None, "unknown algorithm 'nsga3'; known are nsga2, mopso"),
-        ("mopso", {"swarn": 4}, "unknown setting swarn; known are swarm, archive"),
-        ("mopso", {"swarm": 0}, "swarm is 0; allowed are whole numbers 1 to"),
+        ("nsga3", None, "'nsga3'.*nsga2, mopso"),
+        ("mopso", {"swarn": 4}, "swarn.*swarm, archive"),
+        ("mopso", {"swarm": 0}, "swarm is 0.* 1 "),
         ("mopso", {"inertia": float("nan")}, "inertia is nan"),
-        ("mopso", {"swarm": "many"}, "swarm is 'many'; allowed are whole"),
-        ("mopso", {"swarm": 12.5}, "swarm is 12.5; allowed are whole"),
-        ("mopso", {"inertia": "much"}, "mopso: inertia is 'much'; allowed is 0.0 to 1.0"),
+        ("mopso", {"swarm": "many"}, "swarm is 'many'"),
+        ("mopso", {"swarm": 12.5}, "swarm is 12.5"),
+        ("mopso", {"inertia": "much"}, "mopso: inertia .*'much'.*0.0.*1.0"),
         ("nsga2", {"population": 2}, "population is 2"),
         ("nsga2", {"mutation_probability": 1.5}, "mutation_probability is 1.5"),
         ("random", {"batch": 0}, "batch is 0"),
@@ -217,18 +218,18 @@ def test_wrong_settings_are_told(name: str, settings: Any, message: str) -> None
 def test_an_algorithm_runs_once() -> None:
     algorithm = make("nsga2")
     search(Counting(), algorithm, 40, 1)
-    with pytest.raises(SettingsError, match="already ran"):
+    with refused(SettingsError, "already-ran"):
         search(Counting(), algorithm, 40, 1)
 
 
 def test_a_budget_is_needed() -> None:
-    with pytest.raises(SettingsError, match="at least 1 is needed"):
+    with refused(SettingsError, "budget"):
         search(Counting(), make("nsga2"), 0, 1)
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_equalities_are_refused(name: str) -> None:
-    with pytest.raises(SettingsError, match="1 equality constraints"):
+    with refused(SettingsError, "equalities"):
         run(name, Counting(equalities=1), 40)
 
 
@@ -240,7 +241,7 @@ def test_effective_settings_make_the_same_algorithm(name: str) -> None:
         search(Counting(), make(name, settings), 60, 3) for settings in (effective, overrides)
     )
     assert bits(first) == bits(second)
-    with pytest.raises(SettingsError, match="unknown setting"):
+    with refused(SettingsError, "unknown-setting"):
         make("random", settings_of("nsga2"))
 
 
@@ -325,7 +326,7 @@ def test_every_candidate_is_kept_in_order(sizes: list[int]) -> None:
 
 
 def test_unknown_handling_is_told() -> None:
-    with pytest.raises(SettingsError, match="'hope'; known are penalty, constraints"):
+    with refused(SettingsError, "unknown-choice", "'hope'", "penalty, constraints"):
         SearchSettings(constraint_handling="hope")  # type: ignore[arg-type]
 
 

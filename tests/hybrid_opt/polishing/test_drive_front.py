@@ -113,7 +113,7 @@ def test_they_do_so_at_the_front_door() -> None:
     for path in (known, known[:-1]):
         polished = ho.polish(front, rng=rng(0), settings=settings, paths=[path])
         np.testing.assert_array_equal(polished.x, wanted.x)
-    with pytest.raises(SettingsError, match=r"shape \(5,\); needs 18 finite numbers"):
+    with pytest.raises(SettingsError, match=r"\(5,\).* 18 "):
         ho.polish(front, rng=rng(0), paths=[known[:5]])
 
 

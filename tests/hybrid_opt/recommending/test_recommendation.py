@@ -35,6 +35,7 @@ from symbolic.records.cell import RANGES
 from tests.hybrid_opt import cells
 from tests.hybrid_opt.robust.test_force import SMALL as SET
 from tests.hybrid_opt.robust.test_force import model, motion
+from tests.refusals import refused
 from tests.symbolic.read.samples import RACK
 
 
@@ -231,7 +232,7 @@ def test_other_numbers_of_the_cell_are_those_of_its_file(
     assert str(found.squeeze.uncertainty) == str(doubt)
     wide = ho.recommend(few, alone=True)
     assert found.force < wide.force  # less is uncertain
-    with pytest.raises(SettingsError, match="no range wind"):
+    with pytest.raises(SettingsError, match="wind"):
         doubt.changed({"wind": 1.0})
 
 
@@ -348,11 +349,11 @@ def test_where_nothing_fits_it_says_what_would_do(drivable: ho.Cell, front: ho.F
 def test_wishes_that_nothing_answers_say_what_is_possible(
     drivable: ho.Cell, front: ho.Front
 ) -> None:
-    with pytest.raises(SettingsError, match="the shortest takes"):
+    with refused(SettingsError, "too-short"):
         ho.recommend(front, ho.Wish(duration=0.5))
-    with pytest.raises(SettingsError, match=r"the gentlest needs 9\d\.\d N commanded"):
+    with pytest.raises(SettingsError, match=r" 9\d\.\d N "):
         ho.recommend(front, ho.Wish(force=40.0))
-    with pytest.raises(SettingsError, match=r"payload 30 kg: it cannot be held still: .* 147"):
+    with pytest.raises(SettingsError, match=r"30 kg.* 147"):
         ho.recommend(front, ho.Wish(payload=30.0))
     with pytest.raises(SettingsError, match="empty"):
         ho.recommend(replace(front, x=np.zeros((0, 19))))

@@ -25,6 +25,7 @@ from tests.hybrid_opt.timing.cells import (
     timing_of,
     with_robots,
 )
+from tests.refusals import refused
 from tests.symbolic.cells import (
     RACK,
     fixed,
@@ -115,8 +116,8 @@ def test_a_tilted_box_is_not_driven_where_it_could_not_rest_within_the_limit() -
     assert found.ok
     assert found.duration == pytest.approx(other.duration, rel=3e-3)
     too_low = TimingLimits(force=float(0.999 * still))
-    for refused in (timer.time(x.ravel(), too_low), by_toppra(model, x.ravel(), too_low)):
-        assert refused.status is TimingStatus.INFEASIBLE_AT_REST
+    for low in (timer.time(x.ravel(), too_low), by_toppra(model, x.ravel(), too_low)):
+        assert low.status is TimingStatus.INFEASIBLE_AT_REST
 
 
 def test_limits_used_up_at_rest_are_named_as_time_path_names_them() -> None:
@@ -174,11 +175,11 @@ def test_limits_that_the_passes_do_not_support_are_timed_by_toppra(
 
 
 def test_misuse_is_refused() -> None:
-    with pytest.raises(SettingsError, match="intervals"):
+    with refused(SettingsError, "intervals"):
         PathTimer(hand_cell(), intervals=5)
-    with pytest.raises(SettingsError, match="finite"):
+    with refused(SettingsError, "shape"):
         timer_of(hand_cell()).time(np.full(18, np.nan), TimingLimits())
-    with pytest.raises(SettingsError, match="path speeds"):
+    with refused(SettingsError, "shape"):
         drive_path(hand_timing(INTERVALS), initial(), np.zeros(INTERVALS + 1), TimingLimits())
     too_fast = np.sin(np.linspace(0.0, np.pi, INTERVALS + 1))
     check_limits = drive_path(hand_timing(INTERVALS), initial(), 10.0 * too_fast, TimingLimits())

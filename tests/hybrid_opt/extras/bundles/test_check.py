@@ -21,6 +21,7 @@ from symbolic.array import Array
 from symbolic.errors import SettingsError
 from tests.hybrid_opt.extras.bundles.bundles import exported, text_of
 from tests.hybrid_opt.job.jobs import rack, rack_job
+from tests.refusals import refused
 
 JOINTS = [f"{arm}_joint_{j}" for arm in ("left", "right") for j in range(1, 7)]
 
@@ -144,11 +145,11 @@ def test_what_cannot_be_judged_is_told(tmp_path: Path) -> None:
     """A joint of another name, times that stand still, a while without samples."""
     time, q, _, _ = carried()
     renamed = [*JOINTS[:3], "elbow", *JOINTS[4:]]
-    with pytest.raises(ResultsError, match="there is no joint 'left_joint_4'"):
+    with refused(ResultsError, "unknown-joint", "'left_joint_4'"):
         judged(tmp_path / "a.yaml", ros(time, q, names=renamed))
-    with pytest.raises(ResultsError, match="times have to ascend"):
+    with refused(ResultsError, "times-decrease"):
         judged(tmp_path / "a.yaml", ros(0.0 * time, q))
-    with pytest.raises(SettingsError, match="samples lie between"):
+    with refused(SettingsError, "too-few"):
         judged(tmp_path / "a.yaml", ros(time, q), (90.0, 99.0))
 
 

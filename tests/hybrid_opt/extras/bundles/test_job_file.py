@@ -40,6 +40,7 @@ from symbolic.read.arms import arm_model
 from tests.hybrid_opt.cells import shipped
 from tests.hybrid_opt.extras.bundles.bundles import contents, exported, text_of
 from tests.hybrid_opt.job.jobs import rack, rack_job
+from tests.refusals import refused
 
 
 def sampled() -> SampledJob:
@@ -274,7 +275,7 @@ def test_the_step_follows_from_the_stiffness() -> None:
     assert gap_of(sample_job(rack_job(), stiff), "linear", 1e5).share <= TRACKED
     longer = steps[steps.index(stiff) - 1]
     assert gap_of(sample_job(rack_job(), longer), "linear", 1e5).share > TRACKED
-    with pytest.raises(SettingsError, match="the gap of the pads is wrong by"):
+    with refused(SettingsError, "gap-between-samples"):
         chosen_step(rack_job(), (0.2,), "linear", 1e6)
 
 

@@ -9,6 +9,8 @@ from typing import Any, get_args
 import numpy as np
 import pytest
 
+from tests.refusals import refused
+
 pytest.importorskip("mujoco")
 
 import mujoco
@@ -254,9 +256,9 @@ def test_a_carrys_references_are_the_planners_torques_but_for_moments() -> None:
     np.testing.assert_allclose(more, 7.0 * planned.press_torque[2:], atol=1e-9)
     # At rest before, with what the beginning will need.
     assert (planned.normal_force[0] >= carry.normal_force[0] - 1e-9).all()
-    with pytest.raises(SettingsError, match="samples"):
+    with refused(SettingsError, "shape"):
         carry_reference(cell, carry, np.ones(3))
-    with pytest.raises(SettingsError, match="start and end at rest"):
+    with refused(SettingsError, "not-at-rest"):
         carry_reference(cell, replace(carry, rate=np.ones_like(carry.rate)))
 
 
@@ -281,13 +283,13 @@ def test_misuse_is_told() -> None:
     reference = standing(cell)
     force = reference.normal_force
     backwards = replace(reference.motion, time=reference.motion.time[::-1])
-    with pytest.raises(SettingsError, match="times decrease"):
+    with refused(SettingsError, "times-decrease"):
         job_reference(cell, backwards, force, reference.job)
-    with pytest.raises(SettingsError, match="efforts of shape"):
+    with refused(SettingsError, "shape", "(2, 3)"):
         job_reference(cell, reference.motion, force, reference.job, np.zeros((2, 3)))
-    with pytest.raises(SettingsError, match="3 forces for 2 rows"):
+    with refused(SettingsError, "shape"):
         job_reference(cell, reference.motion, np.zeros((3, 2)), reference.job)
-    with pytest.raises(SettingsError, match="multiple of the time step"):
+    with refused(SettingsError, "control-period"):
         ArmSettings(control_period=7e-4)
-    with pytest.raises(SettingsError, match="time step"):
+    with refused(SettingsError, "time-step"):
         ArmSettings(time_step=0.01)

@@ -35,6 +35,7 @@ from symbolic.errors import SettingsError
 from symbolic.records import Uncertainty, Workcell
 from tests.hybrid_opt.cells import shipped
 from tests.hybrid_opt.extras.simulation.carries import least_forces
+from tests.refusals import refused
 from tests.symbolic.cells import (
     call,
     hand_cell,
@@ -238,15 +239,15 @@ def test_misuse_is_told() -> None:
     carry = planned(STILL)
     witness = BoxSimulation(carry.workcell)
     drive = drive_of(carry, witness.settings)
-    with pytest.raises(SimulationError, match=r"holds at 1\.5"):
+    with pytest.raises(SimulationError, match=r"1\.5"):
         bisected(partial(witness.simulate, drive), 1.5, 2.0, 1)
-    with pytest.raises(SettingsError, match="time step"):
+    with refused(SettingsError, "time-step"):
         SimulationSettings(time_step=0.01)
-    with pytest.raises(SettingsError, match="contact points"):
+    with refused(SettingsError, "contact-points"):
         SimulationSettings(layer=0.0)
-    with pytest.raises(SettingsError, match="start and end at rest"):
+    with refused(SettingsError, "not-at-rest"):
         drive_of(replace(carry, rate=np.ones((len(carry), 6))), witness.settings)
-    with pytest.raises(SettingsError, match="samples"):
+    with refused(SettingsError, "shape"):
         drive_of(carry, witness.settings, np.ones(3))
 
 
@@ -314,7 +315,7 @@ def hand_made() -> tuple[Cell, Carry]:
 def test_a_carry_is_driven_as_its_time_law_says() -> None:
     cell, closest = hand_made()
     assert np.abs(closest.rate[[0, -1]]).max() < 1e-6
-    with pytest.raises(SimulationError, match="cannot be driven"):
+    with refused(SimulationError, "not-drivable"):
         driven_carry(cell, cell.initial + 5.0)
 
 
