@@ -15,6 +15,8 @@ from importlib.resources import files
 from pathlib import Path
 
 import pytest
+from packaging.requirements import Requirement
+from packaging.specifiers import SpecifierSet
 
 from studies.options import EXTRAS
 from tests.waiting import HANGS
@@ -82,11 +84,30 @@ def test_studies_carries_its_data(path: str) -> None:
     assert files("studies").joinpath(path).read_text().strip()
 
 
-def test_build_and_run_time_versions_agree() -> None:
-    build = set(PROJECT["build-system"]["requires"])
-    run = set(PROJECT["project"]["dependencies"])
-    assert {"casadi>=3.8.2,<3.9", "libpinocchio>=4.1,<4.2"} <= build
-    assert {"casadi>=3.8.2,<3.9", "pin>=4.1,<4.2"} <= run
+RUN_AS = {"libpinocchio": "pin", "libcoal": "coal"}
+"""Packages that bring headers, and those that bring the same libraries to a user."""
+
+
+def specifiers(listed: list[str]) -> dict[str, SpecifierSet]:
+    found = map(Requirement, listed)
+    return {RUN_AS.get(each.name, each.name): each.specifier for each in found}
+
+
+def test_what_is_compiled_against_is_what_runs() -> None:
+    """One minor version of each library, at build time, at run time and in the tested set."""
+    build = specifiers(PROJECT["build-system"]["requires"])
+    run = specifiers(PROJECT["project"]["dependencies"])
+    lines = (ROOT / "constraints.txt").read_text().splitlines()
+    tested = specifiers([line for line in lines if not line.startswith("#")])
+    shared = build.keys() & run.keys()
+    assert {"casadi", "pin", "coal"} <= shared
+    for name in shared:
+        assert build[name] == run[name], name
+        (pinned,) = tested[name]
+        assert pinned.operator == "=="
+        major, minor, *_ = map(int, pinned.version.split("."))
+        assert pinned.version in run[name]
+        assert f"{major}.{minor + 1}" not in run[name]
 
 
 def test_messages_name_extras_as_a_user_of_the_wheel_installs_them() -> None:

@@ -261,7 +261,7 @@ def _chosen(columns: Columns, workcell: Workcell) -> JointTrajectory:
         found = next((name for name in usable if ("position", name) in values), None)
         if found is None:
             has = ", ".join(name for what, name in values if what == "position")
-            raise ValueError(f"there is no joint {usable[1]!r}; it has {has}", code="unknown-joint")
+            raise ValueError(f"there is no joint {usable[1]!r}; it has {has}")
         picked.append(found)
     tables: list[Array] = []
     for what in QUANTITIES:
@@ -276,7 +276,7 @@ def _chosen(columns: Columns, workcell: Workcell) -> JointTrajectory:
         if not np.isfinite(rows).all():
             raise ValueError("all numbers have to be finite")
     if not (np.isfinite(time).all() and (np.diff(time) > 0.0).all()):
-        raise ValueError("times have to ascend", code="times-decrease")
+        raise ValueError("times have to ascend")
     return JointTrajectory(time - time[0], tuple(tables))
 
 

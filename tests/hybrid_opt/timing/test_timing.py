@@ -267,9 +267,9 @@ def off_centre(allocation: str) -> TimingModel:
 
 
 def test_what_soft_fingers_hold_can_be_timed() -> None:
-    refused = time_path(off_centre("paper"), initial(), TimingLimits())
-    assert refused.status is TimingStatus.INFEASIBLE_AT_REST
-    assert refused.place.constraint == "pressure shift"
+    found = time_path(off_centre("paper"), initial(), TimingLimits())
+    assert found.status is TimingStatus.INFEASIBLE_AT_REST
+    assert found.place.constraint == "pressure shift"
     model = off_centre("soft-finger")
     timing = time_path(model, initial(), TimingLimits())
     assert timing.status is TimingStatus.OK
@@ -367,6 +367,6 @@ def test_toppra_confirms_the_timings_of_the_passes(limits: TimingLimits) -> None
 
 
 def test_a_path_without_timing_cannot_be_validated() -> None:
-    refused = time_path(hand_timing(), initial(), TimingLimits(force=30.0))
+    untimed = time_path(hand_timing(), initial(), TimingLimits(force=30.0))
     with refused(SettingsError, "no-timing"):
-        validate_timing(hand_timing(), refused)
+        validate_timing(hand_timing(), untimed)
