@@ -17,6 +17,7 @@ from hybrid_opt.display.table import text_table
 from hybrid_opt.errors import JobError
 from hybrid_opt.job.records import Job, Phase
 from symbolic.array import Array
+from symbolic.contact.registry import contact_model
 from symbolic.errors import SettingsError
 from symbolic.records.poses import box_rotation
 
@@ -211,10 +212,10 @@ def _skewed(job: Job, phase: Phase, late: int, delay: float, stiffness: float) -
     keep, moved, normal = _displacement(job, phase, late, delay)
     along = np.einsum("ni,ni->n", moved, normal)
     across = np.linalg.norm(moved - along[:, None] * normal, axis=1)
-    change = stiffness / 2.0 * along
-    friction = min(contact.friction for contact in job.workcell.contacts)
-    commanded, least = phase.force.normal[keep], phase.force.least[keep]
-    needed = least + (stiffness / 2.0 * across / friction)[:, None]
+    model = contact_model(job.workcell)
+    change, more = model.pulled_apart(along, across, stiffness)
+    commanded, least = model.held_with(phase.force.normal[keep]), phase.force.least[keep]
+    needed = least + more[:, None]
     return Skew(
         delay,
         stiffness,

@@ -28,7 +28,7 @@ from hybrid_opt.timing.records import JerkLimits
 from symbolic.array import Array, interpolated
 from symbolic.contact.force_closure import robot_wrenches
 from symbolic.contact.grasp import Grasp
-from symbolic.contact.registry import command_model
+from symbolic.contact.registry import command_model, contact_model
 from symbolic.records import Handling, Workcell
 from symbolic.records.poses import box_rotation
 from symbolic.robot.arm import REACH_TOLERANCE
@@ -122,18 +122,18 @@ def straight(
     workcell: Workcell, name: str, box: Array, away: tuple[float, float], speed: float
 ) -> Straight:
     """Build the motion of the box between two poses of the same orientation, with both pads along
-    their normals.
+    their approach.
 
     Args:
         box: (2, 6) its poses at beginning and end.
         away: distances of the pads from it then [m].
         speed: largest [m/s].
     """
-    held = np.array([box, box])
-    for arm, contact in enumerate(workcell.contacts):
+    held, contact = np.array([box, box]), contact_model(workcell)
+    for arm in (0, 1):
         for end, distance in enumerate(away):
             rotation = box_rotation(workcell.task.orientation, box[end])
-            held[arm, end, :3] -= distance * (rotation @ contact.T_box_pad[:3, 2])
+            held[arm, end, :3] -= distance * (rotation @ contact.approach(arm))
     return Straight(name, box, held, speed)
 
 
@@ -382,6 +382,18 @@ def pressing(
     return standing_still(motion, sample, np.linspace(0.0, duration, PHASE_SAMPLES)), force
 
 
+def waiting(motion: PhaseMotion, sample: int, duration: float) -> tuple[PhaseMotion, Force]:
+    """Stand still at one sample of a motion while hands take hold or let go, without forces.
+
+    Args:
+        sample: 0 or -1.
+        duration: at least [s].
+    """
+    time = np.linspace(0.0, at_even_steps(duration, TICK), PHASE_SAMPLES)
+    still = standing_still(motion, sample, time)
+    return still, zero_forces(still)
+
+
 def zero_forces(motion: PhaseMotion) -> Force:
     """Return zero forces for a motion in which the pads touch nothing."""
     n = len(motion.time)
@@ -393,12 +405,15 @@ def unit_squeeze(workcell: Workcell, pose: Array, leader: int = 0) -> Array:
     plan.
 
     Of pads with opposite normals both forces act on one line, midway between the nominal points,
-    and cancel. Of others it is an internal squeeze within all friction cones.
+    and cancel. Of others it is an internal squeeze within all friction cones. Hands that hold by
+    themselves exert none.
 
     Args:
         pose: (n, 6) of the box [m, rad].
         leader: index of the arm that is not commanded.
     """
+    if not contact_model(workcell).is_squeeze:
+        return np.zeros((len(pose), 2, 6))
     turned = box_rotation(workcell.task.orientation, pose)
     if not workcell.has_opposite_pads:
         grasp = Grasp(workcell)
@@ -433,6 +448,10 @@ def phase_use(
 
     effort = motion.own_torque + motion.contact_effort(force.wrench)
     payload, bounded = workcell.payload, dict[str, float]()
+    contact = contact_model(workcell)
+    held = np.maximum(contact.held_with(force.normal), _FORCE_FLOOR)
+    if not contact.is_squeeze:
+        bounded["holding force"] = _most(force.normal / held)
     if jerk is not None and np.isfinite(jerk.joints).any():
         bounded["joint jerk"] = _most(_jerk(motion.time, motion.q_second) / jerk.joints)
     if jerk is not None and np.isfinite(jerk.payload):
@@ -443,7 +462,7 @@ def phase_use(
         "joint torque": _most(np.abs(effort) / workcell.stack_joint_limits("torque_max")),
         "payload velocity": _most(_length(motion.rate) / payload.velocity_max),
         "payload acceleration": _most(_length(motion.second_rate) / payload.acceleration_max),
-        "least normal force": _most(force.least / np.maximum(force.normal, _FORCE_FLOOR)),
+        "least normal force": _most(force.least / held),
     }
 
 

@@ -1,7 +1,8 @@
 """Plan of a whole job around the timing of a carry. docs/explanation/job.md explains the phases.
 
 Pads approach along the contact normals, press while the box stands, take over its weight with the
-press, lift it off, carry it, set it down, let go, and retreat. Every phase but the carry follows a
+press, lift it off, carry it, set it down, let go, and retreat. Hands that hold by themselves take
+hold before they take over the weight (`ContactModel.closing`). Every phase but the carry follows a
 smooth profile from rest to rest (`hybrid_opt.job.motions`).
 
 Contact rules. A body of an arm's last link that lies behind the plane of its pad may touch the box:
@@ -40,16 +41,17 @@ from hybrid_opt.job.motions import (
     rest_to_rest_profile,
     solve_joints_at,
     time_line,
+    waiting,
     zero_forces,
 )
-from hybrid_opt.job.records import Job, Phase, PhaseMotion
+from hybrid_opt.job.records import SWITCHES, Job, Phase, PhaseMotion
 from hybrid_opt.job.smooth import LARGEST_WIDTH, SMOOTHING_WIDTH, has_rest_at_ends, without_jumps
 from hybrid_opt.robust.squeeze import Squeeze, SqueezeSettings, commanded_forces
 from hybrid_opt.timing.jerk import applicable_jerk_limits
 from hybrid_opt.timing.model import TimingModel
 from hybrid_opt.timing.records import JerkLimits, Timing
 from symbolic.array import Array, interpolated
-from symbolic.contact.registry import squeeze_problem
+from symbolic.contact.registry import contact_model
 from symbolic.errors import SettingsError
 from symbolic.geometry.bodies import CollisionBody
 from symbolic.geometry.pairs import ActivePair, CellGeometry, build_geometry, ignored_pairs
@@ -342,11 +344,8 @@ class JobModel:
 
         Raises:
             SettingsError: the timing failed, or the squeeze is not possible.
-            JobError: the hands hold by themselves, an arm does not reach a place, something
-                collides, or a limit is exceeded.
+            JobError: an arm does not reach a place, something collides, or a limit is exceeded.
         """
-        if problem := squeeze_problem(self.workcell, "a job"):
-            raise JobError(problem)
         if timing.carry is None or not timing.ok:
             raise SettingsError(
                 f"there is no timing to export ({timing.status}: {timing.reason}); export one "
@@ -370,15 +369,21 @@ class JobModel:
         settings = squeeze or SqueezeSettings()
         forces, chosen = holding(self.timing, settings, [part.motion for part in loaded])
         held = [replace(part, force=force) for part, force in zip(loaded, forces, strict=True)]
-        rate, ends = handling.pressing_rate, (("press", first, 0), ("release", last, -1))
-        press, release = (
-            Phase(name, 0.0, *pressing(held[k].motion, held[k].force, k, rate), end.certificate, {})
-            for name, end, k in ends
-        )
+
+        def standing(name: str, end: Phase, k: int) -> Phase:
+            if name in SWITCHES:
+                found = waiting(held[k].motion, k, handling.grip_time)
+            else:
+                found = pressing(held[k].motion, held[k].force, k, handling.pressing_rate)
+            return Phase(name, 0.0, *found, end.certificate, {})
+
+        contact = contact_model(self.workcell)
+        closing = [standing(name, first, 0) for name in contact.closing]
+        opening = [standing(name, last, -1) for name in contact.opening]
         return Job(
             self.workcell,
             timing,
-            tuple(self._phases([first, press, *held, release, last], timing, jerk)),
+            tuple(self._phases([first, *closing, *held, *opening, last], timing, jerk)),
             chosen,
             around.stands_on,
             self.timing.joint_names,
@@ -427,7 +432,7 @@ class JobModel:
         self, drafts: Sequence[Phase], timing: Timing, jerk: JerkLimits | None
     ) -> Iterator[Phase]:
         """Yield the phases in order, with their uses; raise if one collides or exceeds a limit."""
-        begin = 0.0
+        begin, contact = 0.0, contact_model(self.workcell)
         for draft in drafts:
             # Jumps that a carry is to keep are reported elsewhere.
             jumps = draft.name == "carry" and not has_rest_at_ends(timing)
@@ -446,9 +451,10 @@ class JobModel:
                 )
             name, ratio = max(use.items(), key=lambda item: item[1])
             if ratio > USE_TOLERANCE:
+                less = "press less (squeeze), or " if contact.is_squeeze else ""
                 raise JobError(
-                    f"{title}: uses {100.0 * ratio:.1f} % of the limit on {name}; press less "
-                    "(squeeze), or choose a slower timing",
+                    f"{title}: uses {100.0 * ratio:.1f} % of the limit on {name}; {less}choose a "
+                    "slower timing",
                     code="beyond-a-limit",
                 )
             yield replace(draft, begin=begin, use=use)

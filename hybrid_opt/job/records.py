@@ -16,11 +16,17 @@ from hybrid_opt.robust.squeeze import Squeeze
 from hybrid_opt.timing.model import contact_torque
 from hybrid_opt.timing.records import Timing
 from symbolic.array import Array, interpolated, set_read_only
+from symbolic.contact.registry import contact_model
 from symbolic.errors import SettingsError
 from symbolic.records import Workcell
 
 PHASES = ("approach", "press", "lift", "carry", "set_down", "release", "retreat")
-"""Every phase of a job in order; without a height there is no lift or no set-down."""
+"""Every phase of a job of pads in order; without a height there is no lift or no set-down. Of hands
+that hold by themselves, `ContactModel.closing` and `opening` stand for press and release."""
+
+SWITCHES = {"grip_on": True, "grip_off": False}
+"""Phases at whose beginning the outputs of hands are switched, and what to; at their end the inputs
+have to say the same."""
 
 HELD_PHASES = ("lift", "carry", "set_down")
 """Phases in which the box is held and moves."""
@@ -92,7 +98,7 @@ class Phase:
     """One phase of a job.
 
     Attributes:
-        name: one of `PHASES`.
+        name: one of `PHASES`, or of the contact model's own.
         begin: when it begins, from the beginning of the job [s].
         motion, force: what happens in it.
         certificate: the continuous verdict on its collisions.
@@ -163,6 +169,18 @@ class Job(Displayable):
         return tuple(phase for phase in self.phases if phase.name in HELD_PHASES)
 
     @property
+    def follower(self) -> int | None:
+        """The arm that is force-controlled; None where hands hold by themselves."""
+        return 1 - self.squeeze.leader if contact_model(self.workcell).is_squeeze else None
+
+    @property
+    def control(self) -> str:
+        """What controllers do while the box is held, in words."""
+        if self.follower is None:
+            return "both arms keep their places"
+        return f"robot {self.workcell.robots[self.follower].name!r} is force-controlled"
+
+    @property
     def peak_normal_force(self) -> Array:
         """(2,) largest commanded normal force of each robot [N]."""
         peaks = [phase.force.normal.max(axis=0) for phase in self.phases]
@@ -179,14 +197,13 @@ class Job(Displayable):
             ]
             for phase in self.phases
         ]
-        head = ["phase", "begins [s]", "takes [s]", "presses [N]", "most used"]
+        head = ["phase", "begins [s]", "takes [s]", "force [N]", "most used"]
         stands = [" and ".join(names) or "nothing" for names in self.stands_on]
         return "\n".join(
             [
                 f"Job, {self.duration:.3f} s; the box stands on {stands[0]}, then on {stands[1]}",
                 text_table([head, *rows], left=(0, 4)),
-                f"commanded: {self.squeeze}; robot "
-                f"{self.workcell.robots[1 - self.squeeze.leader].name!r} is force-controlled",
+                f"commanded: {self.squeeze}; {self.control}",
                 f"  {self.squeeze.breakdown}",
             ]
         )

@@ -202,11 +202,12 @@ def _chosen(
 
 def _report(job: Job, stiffness: float | None) -> str:
     """Print the job's phases, the effects of position control and of a late arm, and warnings."""
-    parts = [
-        repr(job),
-        "\nPosition control, by the arms' stiffness at their pads",
-        position_text([position_control(job, each) for each in STIFFNESSES]),
-    ]
+    parts = [repr(job)]
+    if job.follower is not None:
+        parts += [
+            "\nPosition control, by the arms' stiffness at their pads",
+            position_text([position_control(job, each) for each in STIFFNESSES]),
+        ]
     if stiffness is not None:
         parts += [
             f"\nEither arm late, at {stiffness:.6g} N/m: up to "

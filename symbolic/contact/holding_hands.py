@@ -47,6 +47,9 @@ KAPPA_RECTANGLE = (0.75, 0.7)
 """Likewise a and b of the coefficient 1 - 1 / (a + b q) of a rectangle whose sides are as q to 1:
 0.31 of a square, 1 of a line."""
 
+LEAST_MEAN_NORMAL = 0.1
+"""Length of an arm's mean normal below which its hands are fingers around an edge."""
+
 FLOOR = 1e-9
 """Added in squares to forces [N] and moments [N m], so that lengths have slopes at zero."""
 
@@ -138,6 +141,8 @@ class HoldingHands(ContactModel):
     is_squeeze = False
     holders = "hands that hold by themselves"
     order = "hold with"
+    closing = ("grip_on", "load")
+    opening = ("unload", "grip_off")
 
     @property
     def problem(self) -> Problem | None:
@@ -232,12 +237,38 @@ class HoldingHands(ContactModel):
     ) -> Expression:
         """See `ContactModel`. A share of the holding force, for example of a vacuum, may be
         missing."""
+        needed = ca.fmax(normal[0], normal[1]) + opposed * self._opposed_need(friction)
+        needed /= 1.0 - ca.fmax(tracking[0], tracking[1])
+        return ca.vertcat(needed, needed)
+
+    def approach(self, arm: int) -> Array:
+        """See `ContactModel`. The hands of an arm come along their normals; fingers, whose normals
+        balance, across them from outside."""
+        of_arm = zip(self.workcell.pads, self.workcell.pad_robots, strict=True)
+        T = np.array([pad.T_box_pad for pad, robot in of_arm if robot == arm])
+        normals, middle = T[:, :3, 2], T[:, :3, 3].mean(axis=0)
+        way = normals.mean(axis=0)
+        if np.linalg.norm(way) < LEAST_MEAN_NORMAL:
+            way = (middle @ normals[0]) * normals[0] - middle
+        return np.asarray(way / np.linalg.norm(way))
+
+    def held_with(self, commanded: Array) -> Array:
+        """See `ContactModel`. Hands hold with all of their force."""
+        own = [contact.holding_force for contact in self.workcell.contacts]
+        return np.broadcast_to(own, commanded.shape)
+
+    def pulled_apart(self, along: Array, across: Array, stiffness: float) -> tuple[Array, Array]:
+        """See `ContactModel`. Each direction counts like the worst."""
+        friction = ca.DM([contact.friction for contact in self.workcell.contacts])
+        most = float(ca.evalf(self._opposed_need(friction)))
+        return 0.0 * along, stiffness / 2.0 * np.hypot(along, across) * most
+
+    def _opposed_need(self, friction: Expression) -> Expression:
+        """Return the most that one newton between the arms asks of a hand."""
         most = ca.SX(0.0)
         for (a, b, lifting), i in zip(self._opposed, self.workcell.pad_robots, strict=True):
             most = ca.fmax(most, ca.fmax(a / friction[i] + b, lifting))
-        needed = ca.fmax(normal[0], normal[1]) + opposed * most
-        needed /= 1.0 - ca.fmax(tracking[0], tracking[1])
-        return ca.vertcat(needed, needed)
+        return most
 
     @property
     def _opposed(self) -> list[list[Any]]:

@@ -128,6 +128,8 @@ class ContactModel(ABC):
             forces limit the whole force of a robot as well.
         holders: the pads or hands that commanded forces assume, for messages.
         order: the command to them, as in 'press with 80 N'.
+        closing, opening: phases of a job in which standing arms take hold of the payload, and let
+            go of it.
     """
 
     assumption: ClassVar[str]
@@ -137,6 +139,8 @@ class ContactModel(ABC):
     is_squeeze: ClassVar[bool] = True
     holders: ClassVar[str] = "pads that press evenly"
     order: ClassVar[str] = "press with"
+    closing: ClassVar[tuple[str, ...]] = ("press",)
+    opening: ClassVar[tuple[str, ...]] = ("release",)
 
     def __init__(self, workcell: Workcell) -> None:
         self.workcell = workcell
@@ -268,3 +272,24 @@ class ContactModel(ABC):
         """Return the remaining range of displacements in which forces can be computed [m]; zero or
         less if the set's displacements exceed it."""
         return np.inf
+
+    # --- jobs ---
+
+    def approach(self, arm: int) -> Array:
+        """Return the direction (3,) in which an arm's pad comes to the payload, box frame."""
+        return self.workcell.contacts[arm].T_box_pad[:3, 2]
+
+    def held_with(self, commanded: Array) -> Array:
+        """Return the normal forces (n, 2) that hold where these are commanded [N]."""
+        return commanded
+
+    def pulled_apart(self, along: Array, across: Array, stiffness: float) -> tuple[Array, Array]:
+        """Return the changes (n,) of the normal forces and of the least ones where the arms, in
+        series, are displaced against one another [N].
+
+        Args:
+            along, across: displacements (n,) of one pad, along the normal and across it [m].
+            stiffness: of each arm at its pad [N/m].
+        """
+        friction = min(contact.friction for contact in self.workcell.contacts)
+        return stiffness / 2.0 * along, stiffness / 2.0 * across / friction

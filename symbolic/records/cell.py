@@ -118,6 +118,12 @@ ADDRESS = text_pattern(
 PREFIX = text_pattern(r"(?:[A-Za-z][A-Za-z0-9_]{0,39})?", "letters, digits, _, with a letter first")
 """What names of joints may begin with in ROS; '' for nothing."""
 
+SIGNAL = text_pattern(
+    r"(?:/?[A-Za-z0-9][A-Za-z0-9_/]{0,79})?",
+    "the number of a digital line, a signal's name, or a name of ROS that begins with /",
+)
+"""What the outputs and inputs of hands are called; '' for none."""
+
 
 @dataclass(frozen=True)
 class Driver:
@@ -132,6 +138,8 @@ class Driver:
             flange, and instructions that press with a force.
         stiffness: of the arm under its controller, at the pad along its normal [N/m]; None if not
             measured.
+        grip_output: output that switches the hands of the arm; '' for none.
+        grip_input: input that is on while they hold; '' for none.
     """
 
     address: Annotated[str, ADDRESS] = ""
@@ -140,6 +148,8 @@ class Driver:
     lag: Annotated[float, quantity.LAG] = 0.0
     force_control: bool = False
     stiffness: Annotated[float, quantity.PAD_STIFFNESS] | None = None
+    grip_output: Annotated[str, SIGNAL] = ""
+    grip_input: Annotated[str, SIGNAL] = ""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -429,6 +439,9 @@ class Handling:
         set_down_height: likewise below the carry's goal.
         partner_stop: how far the pads may move apart along the path when one arm stops by itself,
             until the other one stands as well [m]; None without a limit.
+        grip_time: from when the outputs of hands are switched to when they hold, or have let go
+            [s].
+        grip_limit: longest wait for the inputs of hands beyond that [s].
     """
 
     stand_off: Annotated[float, quantity.STAND_OFF] = 0.05
@@ -438,6 +451,8 @@ class Handling:
     lift_height: Annotated[float, quantity.LIFT] | None = None
     set_down_height: Annotated[float, quantity.LIFT] | None = None
     partner_stop: Annotated[float, quantity.SEPARATION] | None = None
+    grip_time: Annotated[float, quantity.GRIP_TIME] = 0.5
+    grip_limit: Annotated[float, quantity.GRIP_TIME] = 3.0
 
     @property
     def speed_max(self) -> float:

@@ -74,6 +74,7 @@ SEPARATION = Range(1e-3, 1.0, "m", mistaken=_MILLIMETRES)
 RATE = Range(10.0, 8000.0, "Hz", mistaken=(("kHz", 1e3),))
 LAG = Range(0.0, 0.5, "s", mistaken=(("ms", 1e-3),))
 FORCE_RATE = Range(1.0, 1e4, "N/s")
+GRIP_TIME = Range(0.0, 30.0, "s", mistaken=(("ms", 1e-3),))
 
 
 GRAVITY = (0.0, 0.0, -9.81)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from xml.etree import ElementTree
 
 import numpy as np
@@ -95,6 +95,52 @@ def require_arms(
                 '[robots.driver] with address = "..." into its section of the workcell, or export '
                 "with --address HOST HOST, in the order of the robots"
             )
+
+
+SECTION_OF_EACH = (
+    "the workcell's section of each robot before the study, or into a file for export --driver"
+)
+"""Where a driver's key may be stated: a stored trajectory keeps the cell that it was found in."""
+
+
+@dataclass(frozen=True)
+class Lines:
+    """The names by which a target switches and hears hands.
+
+    Attributes:
+        output, input: patterns of them.
+        meaning: of both, in words.
+    """
+
+    output: str
+    input: str
+    meaning: str
+
+    def require(self, workcell: Workcell, target: str) -> None:
+        """Refuse drivers whose names a target does not take; inputs may be left out.
+
+        Raises:
+            SettingsError: with the key, and what it means to the target.
+        """
+        for robot in workcell.robots:
+            driver = robot.driver
+            known = [("grip_output", self.output, driver.grip_output)]
+            known += [("grip_input", self.input, driver.grip_input)] if driver.grip_input else []
+            for key, pattern, found in known:
+                if not re.fullmatch(pattern, found):
+                    raise SettingsError(
+                        f"{target} reaches the hands of {robot.name!r} by {self.meaning}; "
+                        f'{key} is {found!r}: write [robots.driver] with {key} = "..." into '
+                        f"{SECTION_OF_EACH}"
+                    )
+
+
+SERVICES = Lines(
+    "/.+",
+    "/.+",
+    "a service of std_srvs/srv/SetBool and a topic of std_msgs/msg/Bool, /NAME each",
+)
+"""Of ROS 2, whatever arms."""
 
 
 def addressed(workcell: Workcell, addresses: tuple[str, str]) -> Workcell:

@@ -12,9 +12,19 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from hybrid_opt.extras.bundles.arms import ABB, SEVEN, SIX, UR, addressed, require_arms
+from hybrid_opt.extras.bundles.arms import (
+    ABB,
+    SECTION_OF_EACH,
+    SERVICES,
+    SEVEN,
+    SIX,
+    UR,
+    Lines,
+    addressed,
+    require_arms,
+)
 from hybrid_opt.extras.bundles.data import data_files
-from hybrid_opt.extras.bundles.egm import SECTION_OF_EACH, egm_files, require_egm
+from hybrid_opt.extras.bundles.egm import egm_files, require_egm
 from hybrid_opt.extras.bundles.job_file import (
     BundleOptions,
     Contents,
@@ -49,7 +59,7 @@ from hybrid_opt.job.smooth import RESTS, acceleration_at_ends
 from hybrid_opt.store.bundle_file import MANIFEST, write_bundle
 from hybrid_opt.store.files import own_version, sha256
 from hybrid_opt.timing.records import Timing
-from symbolic.contact.registry import contact_model
+from symbolic.contact.registry import contact_model, require_squeeze
 from symbolic.errors import SettingsError
 from symbolic.records import Workcell
 
@@ -141,6 +151,7 @@ class Target:
         require: refuses a job before it is sampled, for further reasons.
         require_equipment: refuses a cell whose drivers lack something, given the index of the
             leading arm.
+        lines: how it switches and hears hands that hold by themselves; None if it does not.
         stiffness: where that of the arms comes from: 'stated' by the cell, required; 'gains' that
             the bundle writes; '' if the target does not depend on it.
     """
@@ -157,6 +168,7 @@ class Target:
     has_address: bool = False
     require: Callable[[Job], None] = lambda job: None
     require_equipment: Callable[[Workcell, int], None] = lambda workcell, leader: None
+    lines: Lines | None = None
     stiffness: str = ""
 
     def refuse(self, job: Job, name: str, any_arm: bool) -> None:
@@ -168,11 +180,25 @@ class Target:
         Raises:
             SettingsError: the arms are not those that the target is for, or lack what it needs.
         """
+        self.require_hands(job.workcell, name)
         if self.maker:
             needs = (self.maker, self.axes, self.has_address)
             require_arms(job.workcell, name, *needs, any_arm=any_arm)
         self.require_equipment(job.workcell, job.squeeze.leader)
         self.require(job)
+
+    def require_hands(self, workcell: Workcell, name: str) -> None:
+        """Refuse hands that hold by themselves if the target of a name does not reach them.
+
+        Raises:
+            SettingsError: it switches none, or not by the names of the drivers.
+        """
+        if contact_model(workcell).is_squeeze:
+            return
+        if self.lines is None:
+            require_squeeze(workcell, f"the target {name}")
+        else:
+            self.lines.require(workcell, name)
 
     def stiffness_of(self, job: Job, name: str) -> float | None:
         """Return the stiffness of each arm at its pad [N/m]; None if nothing depends on it.
@@ -277,11 +303,12 @@ def manifest(
         "stands_on": [list(names) for names in job.stands_on],
         "squeeze": {
             "text": str(job.squeeze),
+            "order": job.squeeze.order,
             "factor": job.squeeze.factor,
             "force": job.squeeze.force,
             "assumes": f"the planned wrenches are of {contact_model(job.workcell).assumption}",
             "parts": {part.name: part.force for part in job.squeeze.parts},
-            "force_controlled": job.workcell.robots[export.follower].name,
+            "control": job.control,
             "peak_normal_force": job.peak_normal_force.tolist(),
         },
         "machine": {
@@ -294,7 +321,9 @@ def manifest(
             "set_down": SET_DOWN,
         },
         "time_step": step,
-        "position_control": [_position(position_control(job, k)) for k in STIFFNESSES],
+        "position_control": [
+            _position(position_control(job, k)) for k in STIFFNESSES if job.follower is not None
+        ],
         "start_skew": skews,
         "warnings": warnings_of(job),
         "units": UNITS,
@@ -321,10 +350,9 @@ def readme(document: Mapping[str, Any], contents: Contents) -> str:
         [
             f"# {document['name']} for {document['target']}",
             "",
-            f"The whole job of *{document['workcell']['name']}*: {document['duration']:.2f} s, "
-            f"pressed with at most {squeeze['force']:.1f} N. {squeeze['force_controlled']} is "
-            "force-controlled. "
-            f"{squeeze['text'][0].upper()}{squeeze['text'][1:]}.",
+            f"The whole job of *{document['workcell']['name']}*: {document['duration']:.2f} s. "
+            f"{squeeze['order'].capitalize()} at most {squeeze['force']:.1f} N; "
+            f"{squeeze['control']}. {squeeze['text'][0].upper()}{squeeze['text'][1:]}.",
             "",
             "## How to run it",
             "",
@@ -334,7 +362,7 @@ def readme(document: Mapping[str, Any], contents: Contents) -> str:
             "",
             "## Phases",
             "",
-            "| phase | begins [s] | takes [s] | presses [N] |",
+            "| phase | begins [s] | takes [s] | force [N] |",
             "|---|---|---|---|",
             *phases,
             "",
@@ -369,6 +397,13 @@ def warnings_of(job: Job) -> list[str]:
     for names, when in zip(job.stands_on, ("before", "after"), strict=True):
         if not names:
             found.append(f"nothing that the cell describes holds the box {when} the carry")
+    if job.follower is None:
+        found += [
+            f"{robot.name} has no grip_input: nobody looks whether its hands hold before the box "
+            "is lifted and while it is carried"
+            for robot in cell.robots
+            if not robot.driver.grip_input
+        ]
     return [*found, *_missing_loads(cell)]
 
 
@@ -439,6 +474,7 @@ _TORQUE = Target(
     "one controller drives all joints: both arms start in the same cycle",
     0.0,
     require=require_torque,
+    lines=SERVICES,
     stiffness="gains",
 )
 
@@ -457,6 +493,11 @@ TORQUE_DRIVERS: Mapping[str, Target] = {
     ),
     "ur": replace(
         _DRIVEN,
+        lines=Lines(
+            r"\d|1[0-7]|/.+",
+            r"\d|1[0-7]|/.+",
+            "the number of a digital line, 0 to 17, or by services and topics of ROS, /NAME each",
+        ),
         how_to_run="PolyScope 5.25.1 or 10.12.1, no TCP offset; power both arms on and release "
         "their brakes; ros2 launch launch/ur.launch.py, then python3 run_job.py",
     ),
@@ -494,6 +535,11 @@ TARGETS: Mapping[str, Target] = {
         SKEW,
         UR,
         require=require_followed,
+        lines=Lines(
+            "[2-7]",
+            "[4-7]",
+            "numbers of digital lines, outputs 2 to 7 and inputs 4 to 7 of its own",
+        ),
         stiffness="stated",
     ),
     "data": Target(
@@ -502,6 +548,7 @@ TARGETS: Mapping[str, Target] = {
         "cubic",
         "read job.csv with anything; job.schema.json describes job.json; open job.mcap in "
         "Foxglove, or play it: ros2 bag play job.mcap",
+        lines=Lines(".*", ".*", ""),
     ),
 }
 """Every target by its name; `TORQUE_DRIVERS` has the drivers of torque."""
@@ -557,6 +604,7 @@ def missing_for(name: str, workcell: Workcell, leader: int = 0) -> tuple[str, ..
     checks: list[Callable[[], object]] = [arms] if found.maker else []
     checks += [partial(arms, has_address=True)] if found.maker and found.has_address else []
     checks += [partial(found.require_equipment, workcell, leader)]
+    checks += [partial(found.require_hands, workcell, name)]
     checks += (
         [partial(found.stated_stiffness, workcell, name)] if found.stiffness != "gains" else []
     )

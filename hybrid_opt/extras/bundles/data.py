@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from hybrid_opt.extras.bundles.arms import WORLD, description, pad_frame, prefixes, ros_joints
 from hybrid_opt.extras.bundles.job_file import Export, job_text
-from hybrid_opt.job.records import SampledJob
+from hybrid_opt.job.records import SWITCHES, SampledJob
 from hybrid_opt.store.files import csv_text
 from symbolic.array import Array
 from symbolic.read.arms import arm_model, link_frame, turning_joints
@@ -61,6 +61,9 @@ def job_table(export: Export) -> str:
     header += [f"{robot} normal force [N]" for robot in robots]
     header += [f"{robot} wrench {name}" for robot in robots for name in _WRENCH]
     columns += [sampled.normal_force, sampled.wrench.reshape(len(sampled.time), -1)]
+    if job.follower is None:
+        header += [f"{robot} grip output [0 or 1]" for robot in robots]
+        columns += [export.gripped[:, None]] * 2
     table = np.concatenate(columns, axis=1).tolist()
     rows = zip(sampled.time.tolist(), sampled.phase_names, table, strict=True)
     return csv_text(header, ([time, phase, *row] for time, phase, row in rows))
@@ -72,6 +75,7 @@ RECORDED = (
     "geometry_msgs/msg/WrenchStamped",
     "tf2_msgs/msg/TFMessage",
     "std_msgs/msg/String",
+    "std_msgs/msg/Bool",
 )
 """Types of the messages of a recording."""
 
@@ -148,6 +152,10 @@ def _messages(export: Export, types: Mapping[str, Any]) -> Iterator[tuple[int, s
             )
         if k in begins:
             yield stamp, "/phase", of("std_msgs/String", begins[k])
+        if begins.get(k) in SWITCHES:
+            for arm, prefix in enumerate(joined):
+                topic = f"/{pad_frame(prefix, arm)}/grip_output"
+                yield stamp, topic, of("std_msgs/Bool", SWITCHES[begins[k]])
         time = of("builtin_interfaces/Time", *divmod(stamp, 10**9))
         world = of("std_msgs/Header", time, WORLD)
         rows = (each[k, places] for each in (sampled.q, sampled.q_rate, export.effort))

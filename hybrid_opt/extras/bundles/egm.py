@@ -18,7 +18,7 @@ from collections.abc import Iterator
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hybrid_opt.extras.bundles.arms import SEVEN, SIX, comment
+from hybrid_opt.extras.bundles.arms import SECTION_OF_EACH, SEVEN, SIX, comment
 from hybrid_opt.extras.bundles.job_file import Export, job_text, pad_jacobians
 from hybrid_opt.extras.bundles.programs import filled, program
 from symbolic.array import Array
@@ -37,12 +37,6 @@ START_TOLERANCE = 1.0
 
 UNKNOWN_TOOL_MASS = 0.1
 """[kg] where the workcell gives no `tool_load`; RAPID wants more than none."""
-
-
-SECTION_OF_EACH = (
-    "the workcell's section of each robot before the study, or into a file for export --driver"
-)
-"""Where a driver's key may be stated: a stored trajectory keeps the cell that it was found in."""
 
 
 def require_egm(workcell: Workcell, leader: int) -> None:

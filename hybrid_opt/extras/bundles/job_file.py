@@ -37,9 +37,10 @@ from hybrid_opt.job.compliance import (
     separation,
 )
 from hybrid_opt.job.motions import unit_squeeze
-from hybrid_opt.job.records import HELD_PHASES, Job, SampledJob, sample_job
+from hybrid_opt.job.records import HELD_PHASES, SWITCHES, Job, SampledJob, sample_job
 from hybrid_opt.timing.model import TimingModel, contact_torque
 from symbolic.array import Array, interpolated
+from symbolic.contact.registry import contact_model
 from symbolic.errors import SettingsError
 from symbolic.read.arms import common_joints
 from symbolic.records import Workcell
@@ -117,7 +118,8 @@ def gap_of(sampled: SampledJob, interpolation: Interpolation, stiffness: float) 
     places = np.concatenate([time[starts] + share * steps for share in BETWEEN])
     joints = between(time, (sampled.q, sampled.q_rate, sampled.q_second), interpolation)
     along, across = pad_errors(job.workcell, joints(places))
-    least = min(float(sampled.normal_force[span].min()) for span in spans)
+    held = contact_model(job.workcell).held_with(sampled.normal_force)
+    least = min(float(held[span].min()) for span in spans)
     force = stiffness / 2.0 * float(np.abs(along).max())
     return Gap(
         step=float(np.diff(time).max()),
@@ -232,7 +234,8 @@ def stop_of(job: Job) -> Stop:
         name: np.concatenate([getattr(motion, name) for motion in motions])
         for name in ("pose", "rate", "second_rate", "q_rate", "q_second")
     }
-    columns["force"] = np.concatenate([phase.force.normal for phase in job.phases])
+    commanded = np.concatenate([phase.force.normal for phase in job.phases])
+    columns["force"] = contact_model(job.workcell).held_with(commanded)
     places, x = time[::STOP_STRIDE], np.linspace(0.0, 1.0, INSTANTS)
 
     def stop(duration: float) -> Stop:
@@ -376,7 +379,7 @@ class Export:
 
     @property
     def follower(self) -> int:
-        """Index of the force-controlled arm."""
+        """Index of the force-controlled arm where pads press."""
         return 1 - self.job.squeeze.leader
 
     @property
@@ -451,6 +454,15 @@ class Export:
         }
 
     @cached_property
+    def gripped(self) -> Array:
+        """(n,) 1 where the outputs of hands are on, else 0."""
+        found = np.zeros(len(self.sampled.time))
+        for index, phase in enumerate(self.job.phases):
+            if phase.name in SWITCHES:
+                found[self.sampled.span(index).start :] = SWITCHES[phase.name]
+        return found
+
+    @cached_property
     def limits(self) -> Limits:
         """Limits at which programs stop the job."""
         held = [phase.force for phase in self.job.held]
@@ -466,6 +478,7 @@ class Export:
             skew=float(np.clip(survived, LEAST_SKEW, MOST_SKEW)),
             force=float(np.clip(spare, LEAST_BAND, MOST_BAND)),
             silence=SILENCE,
+            grip=self.workcell.handling.grip_limit,
         )
 
     @cached_property
@@ -514,6 +527,7 @@ class Export:
             "time": sampled.time.tolist(),
             "phases": [
                 {"name": phase.name, "first": span.start, "last": span.stop - 1}
+                | ({"grip": SWITCHES[phase.name]} if phase.name in SWITCHES else {})
                 for phase, span in zip(job.phases, spans, strict=True)
             ],
             "box": {
@@ -536,7 +550,7 @@ class Export:
             "name": robot.name,
             "joints": list(self.job.joint_names[arm]),
             "ros_joints": self.ros_joints(arm),
-            "force_controlled": arm == self.follower,
+            "force_controlled": arm == self.job.follower,
             "reach": self.reach(arm).tolist(),
             **{name: sampled.arm(arm, values).tolist() for name, values in rows.items()},
             "normal_force": sampled.normal_force[:, arm].tolist(),

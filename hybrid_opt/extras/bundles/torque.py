@@ -15,6 +15,11 @@ takes such efforts (jazzy, or main where that is named):
   the wrench on `~/wrench` (force_torque_sensor_broadcaster.cpp:120); two forms of SetPayload
   (gpio_controller.cpp `setPayload` of main and of jazzy).
 - gz_ros2_control and mujoco_ros2_control, with the arms' links exempt from gravity.
+
+Hands that hold by themselves are switched by a service of std_srvs/SetBool and heard on a topic of
+std_msgs/Bool, or on a UR by its digital lines: `~/set_io` with FUN_SET_DIGITAL_OUT = 1 (ur_msgs
+SetIO.srv) and pins 0 to 17 (gpio_controller.cpp `setIO`), `~/io_states` with `digital_in_states` of
+pin and state (same file, `publishIO`).
 """
 
 from __future__ import annotations
@@ -171,6 +176,9 @@ def torque_files(export: Export) -> dict[str, str | bytes]:
         for name, entries in json.loads(filled(f"cell_{driver}.json", **values)).items():
             config[name] = config.get(name, []) + entries if isinstance(entries, list) else entries
     usual = {"simulated": driver == "simulation", "lag": export.lag, "step": export.step}
+    if export.job.follower is None:
+        config["wrench"] = [None, None]
+        config["grip"] = [_grip(export, arm) for arm in (0, 1)]
     return {
         "job.json": job_text(export),
         "config/cell.json": json.dumps(usual | config, indent=1, allow_nan=False) + "\n",
@@ -179,6 +187,26 @@ def torque_files(export: Export) -> dict[str, str | bytes]:
         f"launch/{driver}.launch.py": program("cell.launch.py"),
         **files,
     }
+
+
+def _grip(export: Export, arm: int) -> dict[str, Any]:
+    """Return how the hands of an arm are switched, and where they tell that they hold."""
+    driver = export.workcell.robots[arm].driver
+    io = f"/{_values(export, arm)['space']}/io_and_status_controller"
+    if driver.grip_output.isdecimal():
+        set_io = {"fun": 1, "pin": int(driver.grip_output)}
+        requests = {"on": set_io | {"state": 1.0}, "off": set_io | {"state": 0.0}}
+        output = {"name": f"{io}/set_io", "kind": "ur_msgs/srv/SetIO", **requests}
+    else:
+        requests = {"on": {"data": True}, "off": {"data": False}}
+        output = {"name": driver.grip_output, "kind": "std_srvs/srv/SetBool", **requests}
+    source: dict[str, Any] | None = None
+    if driver.grip_input.isdecimal():
+        kind, pin = "ur_msgs/msg/IOStates", int(driver.grip_input)
+        source = {"topic": f"{io}/io_states", "kind": kind, "pin": pin}
+    elif driver.grip_input:
+        source = {"topic": driver.grip_input, "kind": "std_msgs/msg/Bool", "pin": None}
+    return output | {"input": source}
 
 
 def _controllers(

@@ -8,7 +8,9 @@ path, under force. `programs/carry.script` has all but the numbers of a job.
 
 Force mode does not execute motion along its compliant axis (ur_robot_driver main,
 doc/usage/force_torque_control.rst): along the normals the pressing arm follows the other one by the
-error of its force alone. set_target_payload zeroes the force sensor (script manual): the programs
+error of its force alone. Hands that hold by themselves are switched and heard over standard
+digital lines (set_standard_digital_out, get_standard_digital_in); neither arm is under force then.
+set_target_payload zeroes the force sensor (script manual): the programs
 state the tool's load once, before the first contact, and the box is never part of it.
 """
 
@@ -25,7 +27,7 @@ from hybrid_opt.extras.bundles.job_file import Export
 from hybrid_opt.extras.bundles.programs import filled
 from hybrid_opt.extras.bundles.programs.carry_job import PRESSED
 from hybrid_opt.job.motions import TICK
-from hybrid_opt.job.records import HELD_PHASES, Job
+from hybrid_opt.job.records import HELD_PHASES, SWITCHES, Job
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.records.poses import box_rotation
@@ -49,6 +51,8 @@ def require_followed(job: Job) -> None:
     Raises:
         SettingsError: with the speed, and what would do.
     """
+    if job.follower is None:
+        return
     speeds = [normal_speed(job, arm) for arm in (0, 1)]
     leader = job.squeeze.leader
     found, other = speeds[1 - leader], speeds[leader]
@@ -105,9 +109,19 @@ def _program(export: Export, arm: int) -> str:
     job, robot = export.job, export.workcell.robots[arm]
     step, phases = float(np.diff(export.sampled.time).mean()), enumerate(job.phases)
     reach = enumerate(export.document["robots"][arm]["reach"])
-    calls = [f"  {phase.name}()" for phase in job.phases]
-    release = [phase.name for phase in job.phases].index("release")
-    calls.insert(release + 1, "  end_force_mode()")
+    names = [phase.name for phase in job.phases]
+    calls, hands = [f"  {name}()" for name in names], ""
+    if job.follower is None:
+        calls = ["  gripping = run watch_hands()", *calls, "  kill gripping"]
+        hands = filled(
+            "hands.script",
+            output=robot.driver.grip_output,
+            input=robot.driver.grip_input or 0,
+            hears=bool(robot.driver.grip_input),
+            most=math.ceil(export.limits.grip / CYCLE),
+        )
+    else:
+        calls.insert(names.index("release") + 1, "  end_force_mode()")
     return filled(
         "carry.script",
         title=f"{comment(job.workcell.name)}: robot {comment(robot.name)}",
@@ -121,10 +135,11 @@ def _program(export: Export, arm: int) -> str:
         start=export.limits.start,
         change=f"{step / export.stop.quick:.7f}",
         step=f"{step:.6g}",
-        presses=arm == export.follower,
+        presses=arm == job.follower,
         followed=FOLLOWED,
         every=max(1, math.floor(FORCE_EVERY / step + 1e-9)),
         band=f"{export.limits.force:.3f}",
+        hands=hands,
         phases="\n".join(line for k, p in phases for line in _phase(export, arm, k, p.name)),
         calls="\n".join(calls),
     )
@@ -137,6 +152,15 @@ def _phase(export: Export, arm: int, index: int, name: str) -> Iterator[str]:
     most = float(force[span].max())
     every = math.ceil(FORCE_EVERY / float(np.diff(sampled.time).mean()) - 1e-9)
     yield f"  def {name}():"
+    if name in SWITCHES:
+        yield f"    grip({SWITCHES[name]})"
+    if export.job.follower is None:
+        for k in range(span.start + 1, span.stop):
+            yield f"    go({_list(q[k])}, 0.0)"
+        if name in SWITCHES:
+            yield f"    wait_for_hands({SWITCHES[name]})"
+        yield "  end"
+        return
     for k in range(span.start + 1, span.stop):
         # Until the next reference no less than is needed.
         ahead = k + every + 3

@@ -13,7 +13,6 @@ import pytest
 import yaml
 
 from hybrid_opt.cell import Cell
-from hybrid_opt.errors import JobError
 from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES
 from hybrid_opt.extras.bundles import TARGETS, BundleOptions, export
 from hybrid_opt.extras.bundles.bundle import prepared, target_for
@@ -22,7 +21,6 @@ from hybrid_opt.job.smooth import driven_timing, without_jumps
 from hybrid_opt.robust.force import subsample
 from hybrid_opt.robust.squeeze import largest_commanded
 from hybrid_opt.timing.records import JerkLimits
-from symbolic.contact.registry import contact_model
 from symbolic.errors import SettingsError
 from tests.hybrid_opt.cells import shipped
 from tests.hybrid_opt.extras.bundles.bundles import driven
@@ -46,10 +44,6 @@ def test_every_cell_that_ships_has_a_job(name: str) -> None:
     cell = shipped(name).drivable()
     timing = driven_timing(cell.timing_model, cell.initial)
     model = JobModel(cell.compiled, cell.timing_model)
-    if not contact_model(cell.workcell).is_squeeze:
-        with pytest.raises(JobError, match="hold by themselves"):
-            model.plan(timing)
-        return
     job = model.plan(timing)
     assert all(phase.certificate.is_free for phase in job.phases)
     carry, doubt = timing.driven, cell.workcell.uncertainty

@@ -5,6 +5,9 @@ drives s: at rate 1 the job runs as planned, at rate 0 both arms hold their plac
 rate -1 the job runs backwards, which takes the same forces. Whatever goes wrong, the clock stops
 smoothly: both arms come to rest at the same coordinate and keep the squeeze that belongs to it.
 
+Hands that hold by themselves are switched on and off while the arms stand still, and the clock
+waits there until their inputs say the same. Nothing else switches them: after any fault they hold.
+
 Positions are cubic between samples, forces linear. Standard library only, Python 3.10 or newer.
 """
 
@@ -73,6 +76,7 @@ class Limits:
         skew: how far both arms may be apart along the path [s].
         force: share by which a measured force may miss its reference while the box is held.
         silence: largest age of a measurement [s].
+        grip: longest wait for the inputs of hands [s].
     """
 
     stop_time: float
@@ -83,6 +87,21 @@ class Limits:
     skew: float
     force: float
     silence: float
+    grip: float
+
+
+@dataclass(frozen=True)
+class Switch:
+    """A phase in which hands are switched.
+
+    Attributes:
+        begin, end: its coordinates [s].
+        on: what they are switched to on the way forward.
+    """
+
+    begin: float
+    end: float
+    on: bool
 
 
 class Job:
@@ -111,6 +130,11 @@ class Job:
             (self.time[phase["last"]], phase["name"]) for phase in document["phases"]
         ]
         self._early: list[tuple[list[float], list[float]]] | None = None
+        self.switches = [
+            Switch(self.time[phase["first"]], self.time[phase["last"]], phase["grip"])
+            for phase in document["phases"]
+            if "grip" in phase
+        ]
 
     @classmethod
     def read(cls, path: Path) -> Job:
@@ -181,8 +205,25 @@ class Job:
 
     @cached_property
     def pressed(self) -> float:
-        """Coordinate at the end of the press, from which the pads alone hold the box."""
-        return next(last for last, phase in self._phases if phase == "press")
+        """Coordinate from which the pads or hands alone hold the box."""
+        return min(self.begin(name) for name in HELD)
+
+    def is_gripped(self, s: float) -> bool:
+        """Return True if the pads touch the box before it is lifted."""
+        return self._phases[0][0] < s <= self.pressed
+
+    def grips(self, s: float, direction: float) -> bool:
+        """Return True if hands are switched on at a coordinate, on the way forward or back."""
+        passed = [
+            switch.on
+            for switch in self.switches
+            if (s >= switch.begin if direction > 0.0 else s > switch.end)
+        ]
+        return passed[-1] if passed else False
+
+    def holds(self, s: float) -> bool:
+        """Return True if hands have to hold at a coordinate in either direction."""
+        return self.grips(s, 1.0) and self.grips(s, -1.0)
 
     def _place(self, s: float) -> tuple[int, float, float]:
         """Return the sample before s, the share of its interval and the interval's length [s]."""
@@ -282,9 +323,14 @@ class Clock:
 
     def __init__(self, end: float, stop_time: float, s: float = 0.0, rate: float = 0.0) -> None:
         """Stand at a coordinate, or run through it."""
-        self.s, self.rate, self._end, self._stop_time = s, rate, end, stop_time
+        self.s, self.rate, self._stop_time = s, rate, stop_time
+        self._low, self._high = 0.0, end
         self._takes = stop_time
         self._from, self._to, self._since = rate, rate, 0.0
+
+    def keep(self, low: float, high: float) -> None:
+        """Keep the coordinate between two from now on [s]."""
+        self._low, self._high = low, high
 
     @property
     def turning(self) -> bool:
@@ -317,7 +363,7 @@ class Clock:
             self.rate = self._from + (self._to - self._from) * smooth
             if x >= 1.0:
                 self.rate = self._from = self._to
-        self.s = min(max(self.s + dt * (before + self.rate) / 2.0, 0.0), self._end)
+        self.s = min(max(self.s + dt * (before + self.rate) / 2.0, self._low), self._high)
 
     @property
     def _share(self) -> float:
@@ -334,11 +380,11 @@ class Clock:
         return sign * 30.0 * x * x * (1.0 - x) ** 2 / self._takes
 
     def ahead(self, rate: float, step: float) -> Iterator[Moment]:
-        """Yield each step from now on, turning to a rate, until it stands or the path ends."""
+        """Yield each step from now on, turning to a rate, until it stands or has to."""
         clock = copy(self)
         clock.turn(rate)
         yield Moment(0.0, clock.s, clock.rate, clock.change)
-        last = self._end if rate > 0.0 else 0.0
+        last = self._high if rate > 0.0 else self._low
         count = 0
         while clock.turning or (abs(clock.rate) > STILL and clock.s != last):
             clock.advance(step)
@@ -354,6 +400,7 @@ class Seen:
         q: measured joint positions of each arm; None if unknown [rad, m].
         force: measured normal force of each pad; None if not measured [N].
         age: time since each arm's posture was measured [s].
+        grip: input of each arm's hands: they hold; None if unknown.
         fault: reason to stop; '' for none.
         lost: the reason is an arm that does not follow its commands.
     """
@@ -361,6 +408,7 @@ class Seen:
     q: list[list[float] | None] = field(default_factory=lambda: [None, None])
     force: list[float | None] = field(default_factory=lambda: [None, None])
     age: list[float] = field(default_factory=lambda: [0.0, 0.0])
+    grip: list[bool | None] = field(default_factory=lambda: [None, None])
     fault: str = ""
     lost: bool = False
 
@@ -374,6 +422,7 @@ class Machine:
         reason: why it stopped last.
         clock: of the path.
         stop_time: of the stop that runs, or of the last one [s].
+        opened: the last look found that hands do what they were told, so that the clock goes on.
     """
 
     def __init__(
@@ -382,6 +431,7 @@ class Machine:
         lag: float = 0.0,
         lead: float = 0.0,
         sensors: Sequence[bool] = (False, False),
+        inputs: Sequence[bool] = (False, False),
     ) -> None:
         """Stand at the beginning.
 
@@ -389,11 +439,14 @@ class Machine:
             lag: by which the arms follow their commands in any case [s].
             lead: from the decision to stop to its effect on the commands [s].
             sensors: per arm, True if its force has to be measured.
+            inputs: per arm, True if something has to tell whether its hands hold.
         """
         self.job, self.lag, self.lead, self._sensors = job, lag, lead, sensors
         self.state, self.reason = "ready", ""
         self.clock, self.stop_time = Clock(job.end, job.limits.stop_time), job.limits.stop_time
         self._strikes, self._silent = 0, list[str]()
+        self._inputs, self._gates, self._waited = inputs, list[float](), 0.0
+        self._direction, self.opened = 1.0, False
 
     def start(self, seen: Seen) -> None:
         """Begin the job.
@@ -405,6 +458,7 @@ class Machine:
         self.check(seen)
         self.state = "running"
         self.clock = Clock(self.job.end, self.job.limits.stop_time, 0.0, 1.0)
+        self._aim(1.0)
 
     def check(self, seen: Seen) -> None:
         """Refuse arms that are not ready for the job; see `start`."""
@@ -414,6 +468,8 @@ class Machine:
         for arm, force in enumerate(seen.force):
             if self._sensors[arm] and force is None:
                 raise Refused(self._no_force(arm))
+            if self._inputs[arm] and seen.grip[arm] is not False:
+                raise Refused(f"{self._grip(arm, seen)} before they are at the box")
             most = UNLOADED * max(self.job.robots[arm]["normal_force"])
             if force is not None and abs(force) > most:
                 raise Refused(
@@ -440,11 +496,51 @@ class Machine:
             raise Refused(seen.fault)
         self._require_places(seen, self.job.limits.path)
         self.state, self._strikes = "running", 0
+        self._aim(direction)
         self.clock.turn(direction)
+
+    @property
+    def grip(self) -> bool:
+        """True if the outputs of hands have to be on, once the job has begun."""
+        return self.job.grips(self.clock.s, self._direction)
+
+    def _aim(self, direction: float) -> None:
+        """Set the places ahead at which the clock has to wait for the inputs of hands."""
+        self._direction, s, found = direction, self.clock.s, self.job.switches
+        gates = [switch.end for switch in found if switch.end >= s]
+        if direction < 0.0:
+            gates = [switch.begin for switch in reversed(found) if switch.begin <= s]
+        self._gates = gates if any(self._inputs) else []
+        self._next_gate()
+
+    def _next_gate(self) -> None:
+        """Let the clock go as far as the next of these places."""
+        self._waited = 0.0
+        low, high = 0.0, self.job.end
+        if self._gates and self._direction > 0.0:
+            high = self._gates[0]
+        elif self._gates:
+            low = self._gates[0]
+        self.clock.keep(low, high)
+
+    def _wait(self, dt: float, seen: Seen) -> None:
+        """Wait for hands where the clock has to; go on when all that tell anything agree."""
+        if self.clock.turning or self._gates[:1] != [self.clock.s]:
+            return
+        self._waited += dt
+        told = zip(self._inputs, seen.grip, strict=True)
+        late = [arm for arm, (told_of, on) in enumerate(told) if told_of and on is not self.grip]
+        if not late:
+            self._gates.pop(0)
+            self._next_gate()
+            self.opened = True
+        elif self._waited > self.job.limits.grip:
+            self.hold(f"{self._grip(late[0], seen)} after {self.job.limits.grip:g} s")
 
     def tick(self, dt: float, seen: Seen) -> None:
         """Advance the time and check the arms."""
         self.clock.advance(dt)
+        self.opened = False
         limit = self.job.limits.silence
         self._silent = [self._name(arm) for arm, age in enumerate(seen.age) if age > limit]
         if self.state == "running":
@@ -464,6 +560,8 @@ class Machine:
                 if not (seen.fault or wrong) and self.clock.rate > 0.0 and self._lands(force):
                     return
                 self.stop(seen.fault or wrong or force, quick=seen.lost or not seen.fault)
+            else:
+                self._wait(dt, seen)
         elif self.state == "stopping" and not self.clock.turning:
             self.state = "held"
         elif self.state == "landing" and not self.clock.turning:
@@ -503,13 +601,25 @@ class Machine:
             known = (
                 f"{' and '.join(self._silent)} is silent: look whether it still holds"
                 if self._silent
-                else "Both arms report and are commanded to hold their places and press"
+                else f"Both arms report and are commanded to hold their places and {self._keeps}"
             )
             return (
                 f"{self.state} in {where}: {self.reason}. {known}. To set the box down: 'continue' "
                 "to the end of the job, or 'back' to where the box stood"
             )
         return f"{self.state} ({where})"
+
+    @property
+    def _keeps(self) -> str:
+        if not self.job.switches:
+            return "press"
+        return f"keep their hands switched {'on' if self.grip else 'off'}"
+
+    def _grip(self, arm: int, seen: Seen) -> str:
+        """Tell what the input of an arm's hands says."""
+        if seen.grip[arm] is None:
+            return f"nothing is heard of the input of {self._name(arm)}'s hands"
+        return f"the hands of {self._name(arm)} {'hold' if seen.grip[arm] else 'do not hold'}"
 
     def _name(self, arm: int) -> str:
         return str(self.job.robots[arm]["name"])
@@ -529,7 +639,7 @@ class Machine:
         """Return the reason not to go on, or ''."""
         limits, s = self.job.limits, self.clock.s
         # Nothing is lifted, and no job done, by an arm that stands elsewhere.
-        stands = self.job.phase(s) == "press" or s in (0.0, self.job.end)
+        stands = self.job.is_gripped(s) or s in (0.0, self.job.end)
         most = limits.path / 2.0 if stands else limits.path
         coordinates = []
         direction = 1.0 if self.clock.rate >= 0.0 else -1.0
@@ -558,7 +668,13 @@ class Machine:
             if apart * self.job.speed(0, s) > limits.skew * self.job.fastest:
                 return f"the arms are {1e3 * apart:.0f} ms apart along the path"
         silent = [a for a in (0, 1) if self._sensors[a] and seen.force[a] is None]
-        return self._no_force(silent[0]) if silent else ""
+        return self._no_force(silent[0]) if silent else self._wrong_grip(seen)
+
+    def _wrong_grip(self, seen: Seen) -> str:
+        for arm, on in enumerate(seen.grip):
+            if self._inputs[arm] and (on is None or (self.job.holds(self.clock.s) and not on)):
+                return self._grip(arm, seen)
+        return ""
 
     def _wrong_force(self, seen: Seen) -> str:
         """Return what the measured forces say against going on, or ''."""

@@ -4,6 +4,9 @@ Both arms get the whole job at once. While they drive it, this program looks at 
 a second. Ctrl-C, an arm that is silent, late or off its path, a force out of its band: both arms
 stop along the path and keep the squeeze. Then tell it on the topic /carry/command (std_msgs/String)
 how to set the box down: 'continue' or 'back'; 'leave' ends the program, the arms hold on.
+
+Hands that hold by themselves are switched where config/cell.json says, and waited for; a stop, an
+end of this program or its failure switch nothing.
 """
 
 from __future__ import annotations
@@ -62,10 +65,10 @@ def parts(time: float) -> tuple[int, int]:
     return divmod(round(time * 1e9), 10**9)
 
 
-def service_of(kind: str) -> Any:
-    """Return the type of a service by its name PACKAGE/srv/NAME."""
-    package, _, name = kind.split("/")
-    return getattr(import_module(f"{package}.srv"), name)
+def type_of(kind: str) -> Any:
+    """Return the type of a message or service by its name PACKAGE/msg/NAME or PACKAGE/srv/NAME."""
+    package, what, name = kind.split("/")
+    return getattr(import_module(f"{package}.{what}"), name)
 
 
 def fill(message: Any, values: dict[str, Any]) -> None:
@@ -88,13 +91,18 @@ class Run:
         """Subscribe to both arms, with nothing sent."""
         self.node, self.job, self.config = node, job, config
         sensors = [source is not None for source in config["wrench"]]
-        self.machine = Machine(job, config["lag"], LEAD_OF_STOP, sensors)
+        self._grips: list[dict[str, Any] | None] = config.get("grip", [None, None])
+        inputs = [bool(grip and grip["input"]) for grip in self._grips]
+        self.machine = Machine(job, config["lag"], LEAD_OF_STOP, sensors, inputs)
         self.fault, self.command, self.lost = "", "", False
         self._began, self._last = 0.0, 0.0
         self._q: list[dict[str, float]] = [{}, {}]
         self._measured = [-math.inf, -math.inf]
         self._force: list[float | None] = [None, None]
         self._felt = [-math.inf, -math.inf]
+        self._holds: list[bool | None] = [None, None]
+        self._told = [-math.inf, -math.inf]
+        self._switched: bool | None = None
         self._goals = 0
         self._calls: list[tuple[str, Any]] = []
         self._clients: dict[str, Any] = {}
@@ -103,6 +111,9 @@ class Run:
         for arm, source in enumerate(config["wrench"]):
             if source is not None:
                 self._listen(arm, source)
+        for arm, grip in enumerate(self._grips):
+            if grip and grip["input"]:
+                self._listen_to_hands(arm, grip["input"])
         node.create_subscription(String, "/carry/command", self._commanded, 10)
         self._actions = [
             ActionClient(node, FollowJointTrajectory, group["action"]) for group in config["groups"]
@@ -130,6 +141,33 @@ class Run:
 
         self.node.create_subscription(WrenchStamped, source["topic"], heard, NEWEST)
 
+    def _listen_to_hands(self, arm: int, source: dict[str, Any]) -> None:
+        pin = source["pin"]
+
+        def heard(message: Any) -> None:
+            if pin is None:
+                self._holds[arm] = bool(message.data)
+            else:
+                lines = message.digital_in_states
+                self._holds[arm] = next(
+                    (bool(line.state) for line in lines if line.pin == pin), None
+                )
+            self._told[arm] = self.now()
+
+        self.node.create_subscription(type_of(source["kind"]), source["topic"], heard, NEWEST)
+
+    def _switch(self) -> None:
+        """Switch the hands where the job does; a refusal becomes a fault when it arrives."""
+        if self.machine.grip == self._switched:
+            return
+        self._switched = self.machine.grip
+        level = "on" if self._switched else "off"
+        calls = [(grip["name"], grip["kind"], [grip[level]]) for grip in filter(None, self._grips)]
+        for k, call in enumerate(calls):
+            # One valve may serve both arms.
+            if call not in calls[:k]:
+                self.call(*call)
+
     def _commanded(self, message: Any) -> None:
         self.command = message.data.strip()
 
@@ -147,6 +185,7 @@ class Run:
         self._calls = [call for call in self._calls if not call[1].done()]
         now, silence = self.now(), self.job.limits.silence
         felt = zip(self._force, self._felt, strict=True)
+        holds = zip(self._holds, self._told, strict=True)
         return Seen(
             q=[
                 [known[name] for name in robot["ros_joints"]] if known else None
@@ -154,6 +193,7 @@ class Run:
             ],
             force=[force if now - then <= silence else None for force, then in felt],
             age=[max(0.0, now - then) for then in self._measured],
+            grip=[on if now - then <= silence else None for on, then in holds],
             fault=self.fault,
             lost=self.lost,
         )
@@ -186,7 +226,7 @@ class Run:
             Refused: none fits.
         """
         for request in requests:
-            message = service_of(kind).Request()
+            message = type_of(kind).Request()
             try:
                 fill(message, request)
             except AttributeError:
@@ -200,7 +240,7 @@ class Run:
 
     def _find(self, name: str, kind: str) -> None:
         """Find a service before anything moves."""
-        self._clients[name] = self.node.create_client(service_of(kind), name)
+        self._clients[name] = self.node.create_client(type_of(kind), name)
         if not self._clients[name].wait_for_service(timeout_sec=PATIENCE):
             raise Refused(f"{name} is not there; are the controllers launched?")
 
@@ -214,7 +254,7 @@ class Run:
         for group, client in zip(self.config["groups"], self._actions, strict=True):
             if not client.wait_for_server(timeout_sec=PATIENCE):
                 raise Refused(f"{group['action']} is not there; are the controllers launched?")
-        for call in self.config["prepare"]:
+        for call in (*self.config["prepare"], *filter(None, self._grips)):
             self._find(call["name"], call["kind"])
         self.check()
         for call in self.config["prepare"]:
@@ -327,6 +367,9 @@ class Run:
         before, now = machine.state, self.now()
         machine.tick(now - self._last, self.seen())
         self._last = now
+        if machine.opened:
+            self._go_on(machine.clock.rate)
+        self._switch()
         if before == "running" and machine.state in ("stopping", "landing", "held"):
             self._stop()
         if before == "landing" and machine.state == "running":

@@ -24,6 +24,9 @@ SUCCEEDED, CANCELED, ABORTED = 4, 5, 6
 
 FLOAT_EPSILON = 1.1920929e-07
 
+VALVE = 0.2
+"""From a switched output of hands to what they do [s]."""
+
 Ended = Callable[[int, str], None]
 """Gets the status of a goal that has ended, and why."""
 
@@ -165,6 +168,8 @@ class ControlledCell:
         silent: arms that publish no joint states.
         offset: by which an arm's encoders are wrong [rad].
         felt: offset of each sensor [N]; None for one that is silent.
+        switched: when the hands of an arm were switched, and whether on: (time, arm, on).
+        leaks: arms whose hands do not hold.
     """
 
     def __init__(self, job: dict[str, Any], config: dict[str, Any]) -> None:
@@ -173,6 +178,9 @@ class ControlledCell:
         self.record: list[tuple[Any, ...]] = []
         self.silent, self.offset = [False, False], [0.0, 0.0]
         self.felt: list[float | None] = [0.0, 0.0]
+        self.grips: list[dict[str, Any]] = config.get("grip", [])
+        self.switched: list[tuple[float, int, bool]] = []
+        self.leaks = [False, False]
         self.controllers: dict[str, Controller] = {}
         self._arms: dict[int, tuple[Controller, list[int]]] = {}
         for group in config["groups"]:
@@ -226,9 +234,27 @@ class ControlledCell:
         far += np.abs(effort - self.effort(arm)).max(axis=1)
         return float(self.robots[arm]["normal_force"][int(np.argmin(far))])
 
+    def is_on(self, arm: int, before: float = 0.0) -> bool:
+        """Whether the output of an arm's hands was on some time before now [s]."""
+        past = [on for then, a, on in self.switched if a == arm and then <= self.time() - before]
+        return past[-1] if past else False
+
+    def holds(self, arm: int) -> bool:
+        """What the input of an arm's hands says."""
+        return self.is_on(arm, VALVE) and not self.leaks[arm]
+
+    def _switch(self, name: str, kind: str, request: Any) -> None:
+        for arm, grip in enumerate(self.grips):
+            if name == grip["name"]:
+                is_line = kind.endswith("SetIO")
+                assert not is_line or (request.fun, request.pin) == (1, grip["on"]["pin"])
+                on = request.state > 0.0 if is_line else request.data
+                self.switched.append((self.time(), arm, bool(on)))
+
     def serve(self, name: str, kind: str, request: Any) -> dict[str, Any]:
         """Answer a call of a service by the fields of its response."""
         self.calls.append((name, request))
+        self._switch(name, kind, request)
         space = name.split("/")[1]
         own = [c for action, c in self.controllers.items() if action.startswith(f"/{space}/")]
         own = own or list(self.controllers.values())

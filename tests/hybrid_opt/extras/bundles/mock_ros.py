@@ -34,6 +34,8 @@ JOINTS_EVERY = 0.01
 
 SERVICES: dict[str, set[str]] = {
     "std_srvs/srv/Trigger": set(),
+    "std_srvs/srv/SetBool": {"data"},
+    "ur_msgs/srv/SetIO": {"fun", "pin", "state"},
     "controller_manager_msgs/srv/SwitchController": {
         "activate_controllers",
         "deactivate_controllers",
@@ -62,7 +64,7 @@ MESSAGES = (
     ("builtin_interfaces", "Duration", "Time"),
     ("geometry_msgs", "WrenchStamped"),
     ("sensor_msgs", "JointState"),
-    ("std_msgs", "Header", "String"),
+    ("std_msgs", "Bool", "Header", "String"),
     ("trajectory_msgs", "JointTrajectory", "JointTrajectoryPoint"),
 )
 """Packages and the messages that a program may use."""
@@ -163,6 +165,13 @@ class World(ControlledCell):
                 wrench = Message(force=Message(xyz))
                 told.append((source["topic"], Message(header=header, wrench=wrench)))
 
+        for arm, grip in enumerate(self.grips):
+            source = grip["input"]
+            if source and not self.silent[arm]:
+                line = Message(pin=source["pin"], state=self.holds(arm))
+                lines = Message(digital_in_states=[Message(pin=17, state=True), line])
+                told.append((source["topic"], lines if source["pin"] else Message(data=line.state)))
+
         def arrive() -> None:
             for topic, message in told:
                 for heard in self.subscriptions.get(topic, []):
@@ -257,6 +266,7 @@ def _modules(world: World) -> dict[str, ModuleType]:
         },
         "rclpy.signals": {"SignalHandlerOptions": SimpleNamespace(NO=0)},
         "action_msgs.msg": {"GoalStatus": SimpleNamespace(STATUS_SUCCEEDED=SUCCEEDED)},
+        "ur_msgs.msg": {"IOStates": Message},
         "control_msgs.action": {"FollowJointTrajectory": SimpleNamespace(Goal=Message)},
     }
     for package, *names in MESSAGES:

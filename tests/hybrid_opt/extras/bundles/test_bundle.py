@@ -167,7 +167,9 @@ def test_the_manifest_says_what_it_is(tmp_path: Path) -> None:
     assert squeeze["assumes"].endswith("by moments commanded at both wrists")
     assert document["units"]["force"] == "N"
     (page,) = (path.read_text() for path in tmp_path.rglob("README.md"))
-    assert f"{document['duration']:.2f} s, pressed with at most {squeeze['force']:.1f} N" in page
+    assert (
+        f"{document['duration']:.2f} s. Press with at most {squeeze['force']:.1f} N; robot" in page
+    )
     assert all(f"`{name}`" in page for name in document["files"] if name != "README.md")
     assert all(warning in page for warning in document["warnings"])
     assert document["how_to_run"]
