@@ -89,7 +89,10 @@ class CompiledFunction(NumericFunction):
         for offset in self._offsets:
             ports[slot] = base + offset
             slot += 2
-        self._check(self._one.run(work.ports_address, 0, 1, work), "")
+        status = self._one.function(work.ports_address, work.address, 0, 1)
+        self._one.idle.append(work)
+        if status != _SUCCESS:
+            raise self._failure(status, "")
 
     def _evaluate_batch(
         self,
@@ -173,7 +176,11 @@ class CompiledFunction(NumericFunction):
     def _run_chunk(self, ports_address: int, begin: int, end: int) -> None:
         several = self.lanes > 1 and end - begin > 1
         driver = self._in_lanes if several and self._in_lanes is not None else self._one
-        self._check(driver.run(ports_address, begin, end), " of the batch")
+        work = driver.taken()
+        status = driver.function(ports_address, work.address, begin, end)
+        driver.idle.append(work)
+        if status != _SUCCESS:
+            raise self._failure(status, " of the batch")
 
     def _lanes_agree(self) -> bool:
         """Return True if a ragged batch in lanes gives the bits of single evaluations."""
@@ -196,38 +203,34 @@ class CompiledFunction(NumericFunction):
             self._evaluate_batch(own, batched, one, 1, 1)
         return all(map(_same, together, apart))
 
-    def _check(self, status: int, of: str) -> None:
-        if status != _SUCCESS:
-            raise CodegenError(f"{self.name}: the function failed at candidate {status}{of}")
+    def _failure(self, candidate: int, of: str) -> CodegenError:
+        return CodegenError(f"{self.name}: the function failed at candidate {candidate}{of}")
 
 
 class _Driver:
     """One of a library's drivers, with work memory that is reused between calls.
 
     Attributes:
+        function: evaluates candidates begin to end by the address of their ports and that of work
+            memory; returns the first that failed, or `_SUCCESS`.
         address: of the function.
+        idle: work memory that no thread uses.
     """
 
     def __init__(self, function: Any, sizes: Sequence[int], n_ports: int) -> None:
         function.argtypes = [ctypes.c_void_p] * 2 + [ctypes.c_longlong] * 2
         function.restype = ctypes.c_longlong
-        self._function, self._sizes, self._n_ports = function, tuple(sizes), n_ports
+        self.function: Callable[[int, int, int, int], int] = function
+        self._sizes, self._n_ports = tuple(sizes), n_ports
         self.address = ctypes.cast(function, ctypes.c_void_p).value or 0
-        self._idle, self._own = deque[_Work](), threading.local()
+        self.idle, self._own = deque[_Work](), threading.local()
 
     def taken(self) -> _Work:
         """Take work memory that no other thread uses."""
         try:
-            return self._idle.pop()
+            return self.idle.pop()
         except IndexError:
             return _Work(self._sizes, self._n_ports)
-
-    def run(self, ports_address: int, begin: int, end: int, work: _Work | None = None) -> int:
-        """Evaluate candidates begin to end; return the first that failed, or `_SUCCESS`."""
-        work = self.taken() if work is None else work
-        status: int = self._function(ports_address, work.address, begin, end)
-        self._idle.append(work)
-        return status
 
     @property
     def own(self) -> _Work:

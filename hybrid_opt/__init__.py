@@ -53,10 +53,10 @@ if TYPE_CHECKING:
     from hybrid_opt.front import Front as Front
     from hybrid_opt.job.plan import plan_job as plan_job
     from hybrid_opt.job.records import Job as Job
+    from hybrid_opt.metaheuristics.algorithms import GeneticSettings as GeneticSettings
     from hybrid_opt.metaheuristics.mopso import MopsoSettings as MopsoSettings
-    from hybrid_opt.metaheuristics.registry import GeneticSettings as GeneticSettings
-    from hybrid_opt.metaheuristics.registry import algorithms as algorithms
     from hybrid_opt.metaheuristics.run import SearchSettings as SearchSettings
+    from hybrid_opt.metaheuristics.run import algorithms as algorithms
     from hybrid_opt.polishing.settings import PolishSettings as PolishSettings
     from hybrid_opt.recommending.choice import Wish as Wish
     from hybrid_opt.recommending.recommendation import Recommendation as Recommendation

@@ -12,10 +12,9 @@ import numpy as np
 from hybrid_opt.carry import Carry, decision_of
 from hybrid_opt.cell import Cell
 from hybrid_opt.front import Front
-from hybrid_opt.metaheuristics.registry import make
-from hybrid_opt.metaheuristics.run import SearchSettings, search_carries
-from hybrid_opt.polishing.settings import PolishSettings
-from hybrid_opt.progress import ShowProgress, progress_bar
+from hybrid_opt.metaheuristics.run import SearchSettings, make, search_carries
+from hybrid_opt.polishing.settings import PolishSettings, default_settings
+from hybrid_opt.progress import ShowProgress, as_callback, progress_bar
 from hybrid_opt.store.trajectory_file import write_trajectory
 from hybrid_opt.timing.analysis import TimedTrajectory, time_trajectory
 from hybrid_opt.timing.jerk import time_with_jerk as solve_with_jerk
@@ -50,12 +49,12 @@ def search(
     """
     settings = settings or SearchSettings()
     make(algorithm, settings.algorithm)  # refuses mistakes before anything is compiled
-    cell.require_hold()
+    evaluator = cell.holding_evaluator
     if settings.initial is None and algorithm != "random":
         settings = replace(settings, initial=cell.initial[None])
     with progress_bar(progress, algorithm, evaluations) as advance:
         found, _ = search_carries(
-            cell.evaluator, algorithm, evaluations, rng, settings, advance, cell.workcell.task
+            evaluator, algorithm, evaluations, rng, settings, advance, cell.workcell.task
         )
     return Front.of_search(cell, algorithm, found)
 
@@ -83,7 +82,25 @@ def polish(
     Raises:
         SettingsError: the cell's objectives are not those of the polish, or a path does not fit.
     """
-    return front.polish(rng=rng, settings=settings, paths=paths, progress=progress)
+    cell, task = front.cell, front.cell.workcell.task
+    settings = settings or default_settings(task.law.is_drivable)
+    polisher = cell.polisher(settings)
+    known = [np.asarray(decision_of(path), dtype=float) for path in paths]
+    if known and not task.law.is_drivable:
+        raise SettingsError(
+            f"known paths take part in polishes of drivable carries only; this one has "
+            f"{task.law.title}: polish the front of Cell.drivable()"
+        )
+    for path in known:
+        if path.shape not in ((task.n_path,), (task.n_var,)) or not np.isfinite(path).all():
+            raise SettingsError(
+                f"a known path of shape {path.shape}; needs {task.n_path} finite numbers, or "
+                f"{task.n_var} with a force limit"
+            )
+    beside = np.array([path[: task.n_path] for path in known]).reshape(-1, task.n_path)
+    with progress_bar(progress, "polish", settings.attempts) as advance:
+        done = polisher.polish(front.x, rng, paths=beside, on_progress=as_callback(advance))
+    return front.after(done)
 
 
 def time_path(cell: Cell, carry: Carry | Array, limits: TimingLimits | None = None) -> Timing:

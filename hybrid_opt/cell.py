@@ -26,7 +26,7 @@ from hybrid_opt.evaluate.objectives import (
     force_kind,
     select_objectives,
 )
-from hybrid_opt.static_hold import StaticHold, require_hold, static_hold, static_hold_error
+from hybrid_opt.static_hold import StaticHold, hold_error, static_hold, static_hold_error
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.geometry.pairs import CellGeometry
@@ -34,12 +34,16 @@ from symbolic.path.pieces import coarse_task, resample_decisions
 from symbolic.read.cell import changed, load
 from symbolic.read.cell_files import CellFiles, collect_cell, drivable_files, unpack_cell
 from symbolic.records import Workcell
+from symbolic.records.poses import read_only
 from symbolic.records.task import initial_decision
 
 if TYPE_CHECKING:
     # Not imported at run time before they are needed: a search needs none of them.
     from hybrid_opt.collision.certify import Certificate
     from hybrid_opt.polishing.cell import PolishFunctions
+    from hybrid_opt.polishing.polisher import Polisher
+    from hybrid_opt.polishing.settings import PolishSettings
+    from hybrid_opt.robust.budget import GripBudget
     from hybrid_opt.timing.model import TimingModel
     from hybrid_opt.timing.path_timer import PathTimer
 
@@ -82,6 +86,7 @@ class Cell:
         select_objectives(objectives)
         self._objectives = tuple(objectives)
         self._folder: TemporaryDirectory[str] | None = None  # of its files
+        self._polishers: dict[PolishSettings, Polisher] = {}
 
     def __reduce__(self) -> tuple[type[Cell], tuple[Any, ...]]:
         """Pickle the description: another process loads its functions anew."""
@@ -203,6 +208,27 @@ class Cell:
 
         return polish_functions(self.compiled)
 
+    def polisher(self, settings: PolishSettings) -> Polisher:
+        """Return the polisher of the cell's fronts with these settings, made when first needed.
+
+        Raises:
+            SettingsError: the cell's objectives or pads are not those of the polish.
+        """
+        # Not imported at the top: solvers take long to load.
+        from hybrid_opt.polishing.polisher import Polisher
+
+        if settings not in self._polishers:
+            polisher = Polisher(self.evaluator, settings, self.polish_functions)
+            self._polishers[settings] = polisher
+        return self._polishers[settings]
+
+    @cached_property
+    def grip_budget(self) -> GripBudget:
+        """What holding the payload at rest costs of the allowed forces, see `ho.grip_budget`."""
+        from hybrid_opt.robust.budget import grip_budget
+
+        return grip_budget(self.workcell)
+
     @cached_property
     def static_hold(self) -> StaticHold:
         """The forces of holding the payload level and still."""
@@ -221,8 +247,18 @@ class Cell:
         Raises:
             WorkcellError: it cannot; the text says what is needed, allowed, and what would do.
         """
-        require_hold(self.workcell)
-        require_hold(self.workcell, self.evaluator.outputs)
+        if self.static_hold_error:
+            raise hold_error(self.workcell, self.static_hold_error)
+
+    @cached_property
+    def holding_evaluator(self) -> CandidateEvaluator:
+        """`evaluator` of a payload that can be held still.
+
+        Raises:
+            WorkcellError: as of `require_hold`.
+        """
+        self.require_hold()
+        return self.evaluator
 
     @property
     def geometry(self) -> CellGeometry:
@@ -264,10 +300,10 @@ class Cell:
         """(n_var,) upper bounds of the decision vector [m, rad]."""
         return self.workcell.task.upper
 
-    @property
+    @cached_property
     def initial(self) -> Array:
-        """(n_var,) the hand-made trajectory of the workcell file."""
-        return initial_decision(self.workcell.task)
+        """(n_var,) the hand-made trajectory of the workcell file; read-only."""
+        return read_only(initial_decision(self.workcell.task))
 
     def evaluate(self, x: Array) -> Evaluations:
         """Evaluate decision vectors (n, n_var) on the task's samples.

@@ -9,20 +9,18 @@ fronts reach down to forces at which a carry hardly moves; their knee is selecte
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_opt.carry import Carry, decision_of
+from hybrid_opt.carry import Carry
 from hybrid_opt.cell import Cell
 from hybrid_opt.display_protocol import Displayable
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator, Evaluations
 from hybrid_opt.indicators import metrics
 from hybrid_opt.polishing.records import PolishedFront
-from hybrid_opt.polishing.settings import PolishSettings, default_settings
-from hybrid_opt.progress import ShowProgress, as_callback, progress_bar
 from symbolic.array import Array, set_read_only
 from symbolic.errors import SettingsError
 
@@ -80,38 +78,6 @@ class Front(Displayable):
         """Return the front after its polish."""
         return replace(self, x=polish.x, objectives=polish.objectives, polished=polish)
 
-    def polish(
-        self,
-        *,
-        rng: np.random.Generator,
-        settings: PolishSettings | None = None,
-        paths: Sequence[Carry | Array] = (),
-        progress: ShowProgress = False,
-    ) -> Front:
-        """Improve the front, see `hybrid_opt.polish`."""
-        # Not imported at the top: solvers take long to load.
-        from hybrid_opt.polishing.polisher import Polisher
-
-        cell, task = self.cell, self.cell.workcell.task
-        settings = settings or default_settings(task.law.is_drivable)
-        polisher = Polisher(cell.evaluator, settings, cell.polish_functions)
-        known = [np.asarray(decision_of(path), dtype=float) for path in paths]
-        if known and not task.law.is_drivable:
-            raise SettingsError(
-                f"known paths take part in polishes of drivable carries only; this one has "
-                f"{task.law.title}: polish the front of Cell.drivable()"
-            )
-        for path in known:
-            if path.shape not in ((task.n_path,), (task.n_var,)) or not np.isfinite(path).all():
-                raise SettingsError(
-                    f"a known path of shape {path.shape}; needs {task.n_path} finite numbers, or "
-                    f"{task.n_var} with a force limit"
-                )
-        beside = np.array([path[: task.n_path] for path in known]).reshape(-1, task.n_path)
-        with progress_bar(progress, "polish", settings.attempts) as advance:
-            done = polisher.polish(self.x, rng, paths=beside, on_progress=as_callback(advance))
-        return self.after(done)
-
     @property
     def key(self) -> tuple[str, int]:
         """Algorithm and number of the replica, 0 if it belongs to none."""
@@ -121,7 +87,7 @@ class Front(Displayable):
     def title(self) -> str:
         """The algorithm's, and whether polished."""
         # Not imported at the top: the searches take long to load.
-        from hybrid_opt.metaheuristics.registry import title
+        from hybrid_opt.metaheuristics.run import title
 
         return title(self.algorithm) + ("" if self.polished is None else ", polished")
 

@@ -25,8 +25,7 @@ from hybrid_opt.progress import ShowProgress, track
 from hybrid_opt.robust.cases import LEADER
 from hybrid_opt.robust.force import BoxMotion
 from hybrid_opt.robust.path_force import GoverningForce
-from hybrid_opt.timing.limits import limit_ratios
-from hybrid_opt.timing.model import TimingModel
+from hybrid_opt.timing.model import CarryLimits, TimingModel
 from hybrid_opt.timing.records import Timing
 from hybrid_opt.timing.robustness import TimingSensitivity
 from symbolic import safe_io
@@ -330,7 +329,7 @@ class _Fastest:
         if not number.is_limit:
             model = TimingModel(self._compiled.with_parameters(workcell))
             carry = self._near.speeds.carry(model, model.path_motion(carry.x))
-        return limit_ratios(carry, workcell, self._limits)
+        return CarryLimits(workcell).ratios(carry, self._limits)
 
     def motion(self, workcell: Workcell, samples: NDArray[np.intp]) -> BoxMotion:
         """Compute the motion at some samples, in another cell."""

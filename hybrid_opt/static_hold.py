@@ -194,7 +194,12 @@ def require_hold(workcell: Workcell, outputs: Outputs | None = None) -> None:
     """
     told = static_hold_error(workcell, outputs)
     if told:
-        raise WorkcellError(str(workcell.source), (f"payload: {told}",))
+        raise hold_error(workcell, told)
+
+
+def hold_error(workcell: Workcell, told: str) -> WorkcellError:
+    """Return the error of a payload that cannot be held still."""
+    return WorkcellError(str(workcell.source), (f"payload: {told}",))
 
 
 def _ends(workcell: Workcell, outputs: Outputs) -> list[tuple[Array, Array]]:

@@ -33,7 +33,7 @@ DESCRIPTION = (
     "polish them, recommend one to run, and write a report."
 )
 
-KNOWN: tuple[str, ...] = stated("hybrid_opt.metaheuristics.registry.REGISTRY")
+KNOWN: tuple[str, ...] = stated("hybrid_opt.metaheuristics.run.REGISTRY")
 
 DEFAULT_ALGORITHMS = "hybrid_opt.campaign.settings.ALGORITHMS"
 

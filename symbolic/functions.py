@@ -62,7 +62,7 @@ DRIVE_INPUTS = ("drive_time", "drive_speed", "drive_acceleration")
 """(n,) times [s], u' [1/s] and u'' [1/s^2] at the samples, found by a solver."""
 
 TIMING_TOLERANCE = 5e-3
-"""Excess over a limit that a timing may have, as a share of it (`hybrid_opt.timing.limits`)."""
+"""Excess over a limit that a timing may have, as a share of it (`hybrid_opt.timing.solve`)."""
 
 FRICTION_TOLERANCE = 1e-9
 """Rounding allowed in a tight friction cone, as a share of the payload's weight."""

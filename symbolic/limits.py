@@ -27,7 +27,7 @@ class Limit:
     """One limit on the timing of a path.
 
     Attributes:
-        name: in messages, records and `hybrid_opt.timing.limits.limit_ratios`.
+        name: in messages, records and `hybrid_opt.timing.model.CarryLimits.ratios`.
         symbol: in the compiled passes.
         unit: of the limited quantity.
         expression: the limited ratio; its limit is 1.

@@ -45,7 +45,7 @@ from hybrid_opt.campaign.settings import (
 from hybrid_opt.cell import Cell
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.evaluate.objectives import force_kind
-from hybrid_opt.job.plan import JobCollisions, JobModel
+from hybrid_opt.job.plan import JobCollisions, JobModel, job_model
 from hybrid_opt.progress import Progress, ShowProgress, as_callback
 from hybrid_opt.store.files import read_record, to_json, write_atomically, write_json
 from hybrid_opt.workers import one_thread
@@ -312,14 +312,14 @@ class ReadyCell:
     def of(cls, objectives: tuple[str, ...], workcell: Workcell) -> ReadyCell:
         """Load everything that is loaded on first use, since the cell's files exist only now."""
         # Not imported at the top: other stages time nothing.
-        from hybrid_opt.timing.drive import search_carry, search_timing
+        from hybrid_opt.timing.path_timer import search_carry, search_timing
 
         cell = Cell(workcell, objectives)
         cell.carry(cell.initial)
         search_carry(cell.timing_model, cell.initial)
         if workcell.task.law.is_drivable and cell.force_kind.robust:
             search_timing(cell.timing_model, cell.initial)
-        return cls(cell, JobModel(cell.compiled, cell.timing_model))
+        return cls(cell, job_model(cell.timing_model))
 
 
 Cells = tuple[tuple[CellFiles, tuple[str, ...]], ...]

@@ -15,11 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from codegen.function import NumericFunction
-from hybrid_opt.collision.distances import INTERSECTING, OPEN, BodyDistances
+from hybrid_opt.collision.distances import FCL_RESOLUTION, INTERSECTING, OPEN, BodyDistances, Judge
 from hybrid_opt.collision.joint_tables import JointTable, joint_tables
-from hybrid_opt.collision.judge import FCL_RESOLUTION, Judge
 from symbolic.array import Array
-from symbolic.geometry.pairs import CellGeometry
+from symbolic.geometry.pairs import FAR, CellGeometry
 from symbolic.records import PAYLOAD_NAME
 
 
@@ -88,6 +87,7 @@ class CollisionChecker:
         self.geometry, self.functions = geometry, functions
         self.distances = BodyDistances(geometry, RESTING_TOLERANCE)
         self.judge = Judge(self.distances)
+        self._place = functions["piece_poses"].batch
         self.free_beyond = geometry.tolerance + FCL_RESOLUTION
         self._pairs = np.array([(p.first, p.second) for p in geometry.active]).reshape(-1, 2)
         self._names = geometry.pair_names
@@ -108,8 +108,10 @@ class CollisionChecker:
             pose: (n, 6) box poses [m, rad].
             q_1, q_2: (n, joints) joint positions [rad].
         """
-        asked = [self.functions[f"{block}clearance"] for block in self.geometry.asked]
-        found = self.geometry.of_active([f.batch(pose, q_1, q_2)["clearance"] for f in asked])
+        parts = [self.functions["clearance"].batch(pose, q_1, q_2)["clearance"]]
+        if FAR in self.geometry.asked:
+            parts.append(self.functions[f"{FAR}clearance"].batch(pose, q_1, q_2)["clearance"])
+        found = self.geometry.of_active(parts)
         for table in self.tables:
             tabulated = table.look_up((q_1, q_2)[table.robot])
             found[:, table.pair] = np.fmax(found[:, table.pair], tabulated)
@@ -259,9 +261,6 @@ class CollisionChecker:
             _, upper = self._bounds_of_pairs(placed, *np.divmod(some, len(self._pairs)))
             best = min(best, float(upper.min()))
         return max(best, 0.0)
-
-    def _place(self, pose: Array, q_1: Array, q_2: Array) -> Mapping[str, Array]:
-        return self.functions["piece_poses"].batch(pose, q_1, q_2)
 
     def _still(self) -> tuple[Array, Array]:
         """Return joints of both arms for one sample of which only the box is used."""

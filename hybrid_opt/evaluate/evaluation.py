@@ -8,10 +8,10 @@ The same evaluation also returns each constraint's violation for constraint domi
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, fields, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -48,7 +48,7 @@ from symbolic.records import Workcell
 from symbolic.records.task import extended_waypoints
 
 if TYPE_CHECKING:
-    from hybrid_opt.timing.drive import CandidateDriver
+    from hybrid_opt.timing.path_timer import CandidateDriver
 
 
 COLLISION = "collision"
@@ -178,9 +178,14 @@ class CandidateEvaluator:
         self.objective_names = tuple(objective.name for objective in self.objectives)
         self.threads = threads
         self.functions = self.compiled.evaluators if functions is None else functions
-        self._candidate = self.functions["candidate"]
         self.checker = CollisionChecker(self.compiled.geometry, self.functions)
         self.driver = self._driver(threads) if driver is None else driver
+        candidate = self.functions["candidate"]
+        self._outputs: Callable[[Array], dict[str, Array]] = (
+            partial(candidate.batch, threads=threads)
+            if self.driver is None
+            else partial(self.driver.outputs, candidate)
+        )
         self.n_var = workcell.task.n_var
         self.lower = workcell.task.lower
         self.upper = workcell.task.upper
@@ -199,8 +204,7 @@ class CandidateEvaluator:
         if not self.workcell.task.law.is_drivable:
             return None
         # Not imported at the top: other time laws need no timing, and hence no CasADi.
-        from hybrid_opt.timing.drive import CandidateDriver
-        from hybrid_opt.timing.path_timer import PathTimer
+        from hybrid_opt.timing.path_timer import CandidateDriver, PathTimer
 
         timer = PathTimer(self.compiled, threads=threads)
         return CandidateDriver(timer, threads, force_kind(self.objectives).robust)
@@ -225,38 +229,26 @@ class CandidateEvaluator:
     def outputs(self, x: Array) -> dict[str, Array]:
         """Compute every per-sample output for decision vectors (n, n_var), see
         `symbolic.functions`; in drivable cells also those of
-        `hybrid_opt.timing.drive.CandidateDriver.outputs`."""
-        x = self._checked(x)
-        if self.driver is not None:
-            return self.driver.outputs(self._candidate, x)
-        return self._candidate.batch(x, threads=self.threads)
+        `hybrid_opt.timing.path_timer.CandidateDriver.outputs`."""
+        return self._outputs(self._checked(x))
 
     def evaluate(self, x: Array, with_collisions: bool = True) -> Evaluations:
         """Evaluate decision vectors (n, n_var).
 
         Args:
-            with_collisions: see `sampled`.
+            with_collisions: False leaves collisions out where the evaluation is in lanes.
 
         Raises:
             SettingsError: x has the wrong shape.
         """
         x = self._checked(x)
-        sampled = self.sampled(x, with_collisions)
-        whole = self._kernel is None or self._needs is not None
-        return self._judge(x, sampled, sampled.outputs if whole else self.outputs(x))
-
-    def sampled(self, x: Array, with_collisions: bool = True) -> SampledVerdicts:
-        """Evaluate decision vectors (n, n_var) on their samples, before objectives.
-
-        Args:
-            with_collisions: False leaves collisions out where the evaluation is in lanes.
-        """
-        x = self._checked(x)
         if self._kernel is None:
-            return evaluate_numpy(self.outputs(x), self.checker)
-        return self._kernel.evaluate(
+            outputs = self._outputs(x)
+            return self._judge(x, evaluate_numpy(outputs, self.checker), outputs)
+        sampled = self._kernel.evaluate(
             x, self._needs or (), with_collisions, self.threads, self._begin
         )
+        return self._judge(x, sampled, sampled.outputs if self._needs else self._outputs(x))
 
     def carry(self, x: Array) -> Carry:
         """Evaluate one decision vector (n_var,) under the task's time law.

@@ -16,7 +16,6 @@ from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.records import Workcell
 from symbolic.records.problems import shown
-from symbolic.records.task import initial_decision, waypoints_of
 
 Outputs = Mapping[str, Array]
 """Batch outputs of the candidate function, each with a leading axis over candidates."""
@@ -186,11 +185,7 @@ def _robust_forces(outputs: Outputs, workcell: Workcell) -> Array:
 def duration_unit(workcell: Workcell) -> float:
     """Compute the time [s] that the objective `duration` counts as one: twice that along the
     hand-made trajectory's straight pieces at the reference speeds."""
-    task = workcell.task
-    steps = np.diff(waypoints_of(task, initial_decision(task)), axis=0)
-    lengths = np.linalg.norm(steps[:, :3], axis=1) / task.reference_speed
-    turns = np.linalg.norm(steps[:, 3:], axis=1) / task.reference_angular_speed
-    return 2.0 * float(np.maximum(lengths, turns).sum())
+    return 2.0 * workcell.task.initial_time
 
 
 _FORCE = ("normal_force",)

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Protocol
 
 import numpy as np
@@ -24,9 +25,8 @@ from codegen.function import NumericFunction
 from hybrid_opt.carry import Carry, joints_of
 from hybrid_opt.collision.certify import Certificate, SampledPath, certificates, certify
 from hybrid_opt.collision.checker import RESTING_TOLERANCE, CollisionChecker
-from hybrid_opt.collision.distances import BodyDistances
-from hybrid_opt.collision.judge import FCL_RESOLUTION
-from hybrid_opt.compiled_cell import CompiledCell, cache_by_workcell
+from hybrid_opt.collision.distances import FCL_RESOLUTION, BodyDistances
+from hybrid_opt.compiled_cell import CACHED_WORKCELLS, CompiledCell, cache_by_workcell
 from hybrid_opt.errors import JobError
 from hybrid_opt.job.motions import (
     PHASE_SAMPLES,
@@ -459,6 +459,12 @@ class JobModel:
                 )
             yield replace(draft, begin=begin, use=use)
             begin += draft.duration
+
+
+@lru_cache(maxsize=CACHED_WORKCELLS)
+def job_model(timing: TimingModel) -> JobModel:
+    """Return the planner of the jobs of a timing model's workcell, made once."""
+    return JobModel(timing.compiled, timing)
 
 
 @dataclass(frozen=True)

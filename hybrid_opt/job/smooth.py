@@ -16,10 +16,9 @@ import numpy as np
 
 from hybrid_opt.errors import JobError
 from hybrid_opt.timing.jerk import applicable_jerk_limits, time_with_jerk
-from hybrid_opt.timing.limits import check_limits, limit_ratios, most_used
 from hybrid_opt.timing.model import TimingModel
 from hybrid_opt.timing.records import JerkLimits, Timing, TimingLimits
-from hybrid_opt.timing.solve import time_path
+from hybrid_opt.timing.solve import check_limits, most_used, time_path
 from symbolic.array import Array
 
 SMOOTHING_WIDTH = 0.05
@@ -121,7 +120,7 @@ def _smoothed(model: TimingModel, timing: Timing, width: float) -> Timing:
     def driven(factor: float) -> _Slowdown:
         time = np.asarray(STEPS_PER_SAMPLE * AVERAGING_STEP / factor * np.arange(len(u)))
         carry = model.carry(motion, time, factor * rate, factor**2 * second)
-        ratios = limit_ratios(carry, model.workcell, limits)
+        ratios = model.carry_limits.ratios(carry, limits)
         found = check_limits(model, carry, limits, ratios)
         columns = [ratio.ravel() for name, ratio in ratios.items() if name != "friction"]
         return _Slowdown(factor, found, most_used(found.use).ratio - 1.0, np.concatenate(columns))

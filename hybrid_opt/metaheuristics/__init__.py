@@ -1,6 +1,5 @@
 """NSGA-II, MOPSO and others by name, on pymoo's Algorithm interface."""
 
-from hybrid_opt.metaheuristics.registry import make, names, settings_of
-from hybrid_opt.metaheuristics.run import Evaluated, SearchResult, search
+from hybrid_opt.metaheuristics.run import Evaluated, SearchResult, make, names, search, settings_of
 
 __all__ = ["Evaluated", "SearchResult", "make", "names", "search", "settings_of"]

@@ -18,15 +18,13 @@ from pymoo.core.algorithm import Algorithm
 from pymoo.core.population import Population
 from pymoo.core.problem import Problem
 
-from hybrid_opt.metaheuristics.guarded import Guarded, WarmSampling
+from hybrid_opt.metaheuristics.algorithms import Guarded, Points, Share, WarmSampling
 from symbolic.array import Array, Range, require_allowed
 from symbolic.errors import SettingsError
 
 Indices = NDArray[np.intp]
 
-Share = Annotated[float, Range(0.0, 1.0)]
 Pull = Annotated[float, Range(0.0, 4.0)]
-Points = Annotated[int, Range(1, 100_000)]
 
 
 @dataclass(frozen=True)

@@ -1,25 +1,130 @@
-"""A search among a cell's carries: pymoo's problem, the run that spends the evaluations, and the
-record of all evaluated candidates."""
+"""A search among a cell's carries: the algorithms by name, pymoo's problem, the run that spends the
+evaluations, and the record of all evaluated candidates.
+
+pymoo's own MOPSO_CD, CMOPSO and NSGA3 draw from unseeded generators.
+"""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
+from functools import partial
 from typing import Any, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+from pymoo.algorithms.moo.nsga2 import binary_tournament
+from pymoo.algorithms.moo.sms import cv_and_dom_tournament
 from pymoo.core.algorithm import Algorithm
 from pymoo.core.problem import Problem
 
 from hybrid_opt.evaluate.evaluation import NOT_FINITE, REASONS, Evaluations, concatenated
-from hybrid_opt.metaheuristics.guarded import violation_of
-from hybrid_opt.metaheuristics.registry import AlgorithmSettings, make
+from hybrid_opt.metaheuristics.algorithms import (
+    GeneticSettings,
+    GuardedNsga2,
+    GuardedSmsEmoa,
+    RandomSearch,
+    RandomSettings,
+    genetic,
+    violation_of,
+)
+from hybrid_opt.metaheuristics.mopso import Mopso, MopsoSettings
 from symbolic.array import Array, require_allowed, set_read_only
 from symbolic.errors import SettingsError
 from symbolic.path.pieces import coarse_task, resample_decisions
 from symbolic.records import Task
+from symbolic.records.problems import shown
+
+# --- the algorithms by name ---
+
+
+AlgorithmSettings = GeneticSettings | MopsoSettings | RandomSettings
+
+
+@dataclass(frozen=True)
+class _Entry:
+    title: str
+    build: Callable[[Any, Array | None], Algorithm]
+    defaults: AlgorithmSettings
+
+
+_NSGA2 = partial(genetic, GuardedNsga2, binary_tournament)
+_SMS_EMOA = partial(genetic, GuardedSmsEmoa, cv_and_dom_tournament)
+
+REGISTRY: dict[str, _Entry] = {
+    "nsga2": _Entry("NSGA-II", _NSGA2, GeneticSettings()),
+    "mopso": _Entry("MOPSO", Mopso, MopsoSettings()),
+    "mopso-turbulent": _Entry(
+        "MOPSO, turbulent", Mopso, MopsoSettings(inertia=0.45, mutation_share=0.75)
+    ),
+    "sms-emoa": _Entry("SMS-EMOA", _SMS_EMOA, GeneticSettings()),
+    "random": _Entry("random search", RandomSearch, RandomSettings()),
+}
+
+
+def names() -> tuple[str, ...]:
+    """Return the names that `make` accepts."""
+    return tuple(REGISTRY)
+
+
+def algorithms() -> dict[str, str]:
+    """Return the searches that `make` accepts: titles by name."""
+    return {name: entry.title for name, entry in REGISTRY.items()}
+
+
+def title(name: str) -> str:
+    """Return an algorithm's title in print; an unknown name is returned unchanged."""
+    return REGISTRY[name].title if name in REGISTRY else name
+
+
+def settings_of(name: str, overrides: Mapping[str, object] | None = None) -> AlgorithmSettings:
+    """Return the effective settings of an algorithm: its defaults with `overrides`.
+
+    Raises:
+        SettingsError: unknown algorithm or setting, or a value outside its range.
+    """
+    if name not in REGISTRY:
+        raise SettingsError(
+            f"unknown algorithm {shown(name)}; known are {', '.join(REGISTRY)}",
+            code="unknown-algorithm",
+        )
+    defaults = REGISTRY[name].defaults
+    known = [field.name for field in fields(defaults)]
+    unknown = [key for key in overrides or {} if key not in known]
+    if unknown:
+        raise SettingsError(
+            f"{name}: unknown setting {', '.join(unknown)}; known are {', '.join(known)}",
+            code="unknown-setting",
+        )
+    return replace(defaults, **dict(overrides or {}))  # type: ignore[arg-type]
+
+
+def make(
+    name: str,
+    settings: AlgorithmSettings | Mapping[str, object] | None = None,
+    initial: Array | None = None,
+) -> Algorithm:
+    """Build a fresh algorithm for one run.
+
+    Args:
+        name: one of `names()`.
+        settings: from `settings_of`, or values that differ from the defaults, see
+            `REGISTRY`.
+        initial: (k, n_var) decision vectors that the first generation starts with, the rest
+            being uniformly random; None for all random.
+
+    Raises:
+        SettingsError: as `settings_of`; wrong `initial` points are refused when the run starts.
+    """
+    if is_dataclass(settings):
+        settings = asdict(settings)
+    effective = settings_of(name, settings)
+    return REGISTRY[name].build(effective, initial)
+
+
+# --- the problem ---
+
 
 ConstraintHandling = Literal["penalty", "constraints"]
 """How a search learns of infeasibility: by the paper's penalised objectives, or by objectives
@@ -72,31 +177,6 @@ def reject_non_finite(evaluations: Evaluations) -> Evaluations:
     return replace(evaluations, **changed)
 
 
-class StatedPaths:
-    """Evaluates decision vectors of a task's coarse waypoints, see `symbolic.path.pieces`.
-
-    Attributes:
-        objective_names, n_var, lower, upper: see `Evaluator`.
-    """
-
-    def __init__(self, evaluator: Evaluator, task: Task) -> None:
-        self._evaluator, self._task, self._stated = evaluator, task, coarse_task(task)
-        self.objective_names, self.n_var = evaluator.objective_names, self._stated.n_var
-        self.lower, self.upper = self._stated.lower, self._stated.upper
-
-    def evaluate(self, x: Array) -> Evaluations:
-        """Evaluate as `Evaluator`; the returned candidates are the task's own."""
-        return self._evaluator.evaluate(resample_decisions(x, self._stated, self._task))
-
-    def certified(self, evaluations: Evaluations) -> Evaluations:
-        """Certify as `Evaluator`."""
-        return self._evaluator.certified(evaluations)
-
-    def drawn(self, x: Array | None) -> Array | None:
-        """Convert candidates of the task (n, its n_var) to the coarse task that searches use."""
-        return None if x is None else resample_decisions(x, self._task, self._stated)
-
-
 class CarryProblem(Problem):  # type: ignore[misc]
     """A cell's candidates as a vectorised pymoo problem that stores its evaluations.
 
@@ -106,6 +186,8 @@ class CarryProblem(Problem):  # type: ignore[misc]
 
     Attributes:
         evaluator: what evaluates.
+        drawn, task: task of the drawn candidates and of the evaluated ones, None for the same; see
+            `symbolic.path.pieces`.
         handling: see above.
         evaluated: called with the number of candidates after each batch.
         batches: the evaluations of each call, in order.
@@ -116,13 +198,22 @@ class CarryProblem(Problem):  # type: ignore[misc]
         evaluator: Evaluator,
         handling: ConstraintHandling = "penalty",
         evaluated: Callable[[int], None] = lambda count: None,
+        task: Task | None = None,
     ) -> None:
+        """Pose the problem.
+
+        Args:
+            task: of the candidates, where only the waypoints of its file are drawn.
+        """
+        self.task = task if task is not None and task.pieces > 1 else None
+        self.drawn = None if self.task is None else coarse_task(self.task)
+        bounds = evaluator if self.drawn is None else self.drawn
         super().__init__(
-            n_var=evaluator.n_var,
+            n_var=bounds.n_var,
             n_obj=len(evaluator.objective_names),
             n_ieq_constr=len(REASONS) if handling == "constraints" else 0,
-            xl=evaluator.lower,
-            xu=evaluator.upper,
+            xl=bounds.lower,
+            xu=bounds.upper,
         )
         self.evaluator = evaluator
         self.handling = handling
@@ -135,6 +226,8 @@ class CarryProblem(Problem):  # type: ignore[misc]
         return concatenated(self.batches)
 
     def _evaluate(self, x: Array, out: dict[str, Any], *args: Any, **kwargs: Any) -> None:
+        if self.drawn is not None and self.task is not None:
+            x = resample_decisions(x, self.drawn, self.task)
         batch = reject_non_finite(self.evaluator.evaluate(x))
         self.batches.append(batch)
         self.evaluated(len(batch.feasible))
@@ -281,11 +374,10 @@ def search_carries(
     Raises:
         SettingsError: an unknown algorithm or a value that is not allowed.
     """
+    problem = CarryProblem(evaluator, settings.constraint_handling, evaluated, task)
     initial = settings.initial
-    if task is not None and task.pieces > 1:
-        evaluator = StatedPaths(evaluator, task)
-        initial = evaluator.drawn(initial)
-    problem = CarryProblem(evaluator, settings.constraint_handling, evaluated)
+    if initial is not None and problem.task is not None and problem.drawn is not None:
+        initial = resample_decisions(initial, problem.task, problem.drawn)
     search(problem, make(algorithm, settings.algorithm, initial), evaluations, rng)
     sizes = [len(batch) for batch in problem.batches]
     generation = np.repeat(np.arange(1, len(sizes) + 1), sizes)

@@ -41,7 +41,8 @@ class PlacedCarry:
         manipulability: (reached, 2) |det J| over its least value.
         split: (n, 2) on samples: components of the normal forces, see `symbolic.smooth.samples`: of
             soft fingers the forces themselves, otherwise normal component and tangential magnitude
-            of the required force [N]; undefined if the pads do not face one another.
+            of the required force [N]; undefined if the pads do not face one another, and in
+            drivable cells.
         force: (n, 2) on samples: minimised normal forces, planned or robust [N].
         peak: (2,) their peaks over the reference forces.
         shift: (n, 2) on samples: shifts of the centres of pressure over the patch radii.
@@ -206,6 +207,10 @@ class CarryReader:
         self._evaluator, self._grid, self._robust = cell.evaluator, cell.grid, cell.robust
         self._functions = cell.functions
         self._radii = [contact.patch_radius for contact in cell.workcell.contacts]
+        # Drivable carries have no rows of forces at samples.
+        self._split_of = (
+            None if cell.task.law.is_drivable else contact_model(cell.workcell).planned_quantities
+        )
 
     def read(self, x: Array) -> PlacedCarry:
         """Evaluate a decision vector (n_var,)."""
@@ -247,7 +252,7 @@ class CarryReader:
             reached=reached,
             unreachable_arms=tuple(np.flatnonzero(~followed.all(axis=0)).tolist()),
             manipulability=np.sqrt(np.maximum(np.column_stack(squares), 0.0))[:reached],
-            split=contact_model(evaluator.workcell).planned_quantities(found),
+            split=force if self._split_of is None else self._split_of(found),
             force=minimised,
             peak=minimised.max(axis=0) / task.reference_force,
             shift=found["pressure_shift"] / self._radii,

@@ -251,6 +251,7 @@ class SmoothCell:
         free: rows and columns of the variables among the extended waypoints.
         blocks: division of the samples among functions.
         coefficients: (2, branches, 2) of `force_branches`.
+        has_pressure_limit: whether the contact model limits the shift of the pressure.
         still: (n_waypoints, 6 + m) extended waypoints without the variables.
     """
 
@@ -271,7 +272,9 @@ class SmoothCell:
         self.centre = (self.task.upper + self.task.lower) / 2.0
         self.half = np.where(half > 0.0, half, 1.0)
         self.blocks = sample_blocks(self.task)
-        self.coefficients = contact_model(self.workcell).force_branches
+        model = contact_model(self.workcell)
+        self.coefficients = model.force_branches
+        self.has_pressure_limit = model.has_pressure_limit
         self.free = self.task.free_entries
         self._n_path = self.task.n_path
         fixed = [waypoint.lower for waypoint in self.task.waypoints]

@@ -44,7 +44,7 @@ from hybrid_opt.polishing.solvers.quadratic import (
     solve_quadratic,
 )
 from hybrid_opt.robust.path_force import PathPoints, robust_path
-from hybrid_opt.timing.drive import CandidateDriver
+from hybrid_opt.timing.path_timer import CandidateDriver
 from hybrid_opt.timing.records import PathTiming
 from symbolic.array import Array
 from symbolic.contact.registry import command_model

@@ -22,11 +22,10 @@ from hybrid_opt.polishing.point import Solution
 from hybrid_opt.polishing.records import PolishOutcome, Status
 from hybrid_opt.polishing.settings import PolishSettings
 from hybrid_opt.polishing.starts import rotated_starts
-from hybrid_opt.timing.drive import CandidateDriver
-from hybrid_opt.timing.limits import drive_path
 from hybrid_opt.timing.model import TimingModel
+from hybrid_opt.timing.path_timer import CandidateDriver
+from hybrid_opt.timing.solve import drive_path
 from symbolic.array import Array
-from symbolic.contact.registry import contact_model
 from symbolic.path.pieces import coarse_task, resample_decisions
 from symbolic.records.task import initial_decision
 
@@ -93,7 +92,7 @@ def recheck_timing(driver: CandidateDriver, model: TimingModel, x: Array) -> str
     Args:
         model: of the driver's workcell and intervals.
     """
-    (timing,) = driver.timings(np.asarray(x)[None])
+    timing, _ = driver.time_candidate(np.asarray(x))
     if not timing.ok:
         return f"no timing: {timing.status}"
     limits = driver.limits(float(x[-1]))
@@ -151,7 +150,7 @@ class DriveRun(PolishRun[DriveAttempt]):
         self._announce(1 + ahead)
         paths, durations = self._known_paths(limits[0])
         self._attempt(paths[int(np.argmin(durations))], limits[0], "stated")
-        if contact_model(self._method.cell.workcell).has_pressure_limit:
+        if self._method.cell.has_pressure_limit:
             middle = self._intermediate_force(limits[0], fast)
             turned_paths = self._rotated(middle)
             self._announce(len(turned_paths) + ahead)

@@ -101,6 +101,9 @@ class IntervalGrid:
         robust: robust forces, None if planned ones are limited.
         layout: of the quantities.
         load: slice of the load among them.
+        rest: slice of what is limited at rest: the pressure if it is, else load or forces.
+        has_pressure_limit: whether the pressure is.
+        variables: of a point, see `DrivenLayout.variables`.
         spread: (variables of the path, n_path) path by the program's variables.
         moved: (points, moving, n_path) poses and derivatives by the program's variables.
         threads: threads that share a batch of points.
@@ -131,6 +134,10 @@ class IntervalGrid:
         )
         self.layout = driven_layout(workcell)
         self.load = self.layout.block("load")
+        self.has_pressure_limit = contact_model(workcell).has_pressure_limit
+        forces = "load" if self.layout.by_program else "force"
+        self.rest = self.layout.block("pressure" if self.has_pressure_limit else forces)
+        self.variables = self.layout.variables
 
     def by_path(self, slope: Array, points: NDArray[np.intp]) -> Array:
         """Return slopes (rows, n_path) by the program's variables from slopes (rows, moving) at
@@ -216,15 +223,12 @@ class IntervalValues:
         first = self._functions.built[DRIVEN_FIRST]
         out = first.batch(*begins[:-2], still, still, threads=grid.threads)
         follow = [along[::2] for along in self._follow]
-        by_pressure = contact_model(grid.workcell).has_pressure_limit
-        by_program = grid.layout.by_program
-        block = grid.layout.block("pressure" if by_pressure else "load" if by_program else "force")
-        value, slope = out["value"][:, block], out["slope"][:, block]
+        value, slope = out["value"][:, grid.rest], out["slope"][:, grid.rest]
         slope = _followed(grid, slope, follow)[:, :, : grid.moving]
-        if by_program:
+        if grid.layout.by_program:
             pressed = self._functions.built[grasp_force_name("first")].batch(value)
             value, slope = pressed["normal"], _by_load(pressed, slope)
-        whole = 1.0 if by_pressure else force
+        whole = 1.0 if grid.has_pressure_limit else force
         return value.reshape(-1) / whole, slope.reshape(-1, grid.moving) / whole
 
     def rows(self) -> Array:
@@ -250,7 +254,7 @@ class IntervalValues:
             weight = weight.copy()
             weight[:, self._grid.load] += np.einsum("prl,pr->pl", self._held["slope"], pressing)
         at = np.flatnonzero(np.abs(weight).max(axis=1) > 0.0)
-        n, variables = len(at), self._grid.layout.variables
+        n, variables = len(at), self._grid.variables
         pose, moving = self._grid.pose, self._grid.moving
         local = moving + 2
         spread = np.zeros((n, local, variables))

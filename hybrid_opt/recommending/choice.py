@@ -214,10 +214,10 @@ class DrivenPaths:
         known = self._known
         if rows is not None:
             known = {name: values[chosen] for name, values in known.items()}
-        timings = self._timer.time_from_coefficients(
+        timings = self._timer.time_all(
             self.x[chosen],
-            known,
             [TimingLimits(force=limit, robust=self.robust) for limit in limits],
+            known,
             [self._failures[row] for row in chosen],
         )
         return list(zip(chosen, limits, timings, strict=True))

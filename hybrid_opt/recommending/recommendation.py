@@ -19,7 +19,7 @@ from hybrid_opt.display_protocol import Displayable
 from hybrid_opt.errors import JobError
 from hybrid_opt.evaluate.objectives import ROBUST_FORCE, ForceKind
 from hybrid_opt.front import Front
-from hybrid_opt.job.plan import CommandedForces, JobModel, command_forces
+from hybrid_opt.job.plan import CommandedForces, command_forces, job_model
 from hybrid_opt.job.records import Job
 from hybrid_opt.job.smooth import driven_timing
 from hybrid_opt.progress import ShowProgress, progress_bar
@@ -42,7 +42,6 @@ from hybrid_opt.robust.budget import (
     Remedy,
     Reserve,
     cheapest_remedies,
-    grip_budget,
     remedies_text,
     reserve,
 )
@@ -50,7 +49,6 @@ from hybrid_opt.robust.cases import LEADER
 from hybrid_opt.robust.force import at_rest, box_motion, robust_model, subsample
 from hybrid_opt.robust.squeeze import MOST, Squeeze, largest_commanded
 from hybrid_opt.static_hold import static_hold
-from hybrid_opt.timing.limits import limited_force
 from hybrid_opt.timing.records import Timing
 from hybrid_opt.timing.robustness import Margin
 from symbolic.array import Array, Figure, evenly
@@ -220,7 +218,7 @@ def _recommended(
     rows = spread_rows(given[:, :-1])
     paths = DrivenPaths(cell, given[rows, :-1])
     options = paths.all_options(given[rows, -1], told)
-    goal, budget = Goal.of(wish, cell.workcell), grip_budget(cell.workcell)
+    goal, budget = Goal.of(wish, cell.workcell), cell.grip_budget
     why = str(wish)
     if not wish.has_target and not any((each.force <= goal.hardest).all() for each in options):
         goal = replace(goal, hardest=np.full(2, np.inf))
@@ -230,9 +228,9 @@ def _recommended(
     if not is_kept:
         why = "least excess over the reference force of the carries that were driven"
     told()
-    carry = timing.carry
+    carry, limits = timing.carry, cell.timing_model.carry_limits
     assert carry is not None, "what is recommended has a timing"
-    held = command_forces(JobModel(cell.compiled, cell.timing_model), timing)
+    held = command_forces(job_model(cell.timing_model), timing)
     forces, squeeze, job, doubts = held.forces, held.squeeze, held.job, _objections(held)
     commanded = np.asarray(forces.max(axis=0)) if job is None else job.peak_normal_force
     allowed, remedies = cell.workcell.task.reference_force, tuple[Remedy, ...]()
@@ -262,7 +260,7 @@ def _recommended(
         x=carry.x,
         timing=timing,
         force_kind=cell.force_kind,
-        limited_force=limited_force(carry, cell.workcell, timing.limits).max(axis=0),
+        limited_force=limits.limited_force(carry, timing.limits).max(axis=0),
         commanded=commanded,
         squeeze=squeeze,
         job=job,

@@ -13,19 +13,10 @@ import numpy as np
 from hybrid_opt.carry import Carry
 from hybrid_opt.progress import ShowProgress, progress_bar
 from hybrid_opt.store.files import read_record
-from hybrid_opt.timing.drive import search_carry, search_timing
 from hybrid_opt.timing.jerk import applicable_jerk_limits, time_with_jerk
-from hybrid_opt.timing.limits import (
-    RECOMPUTED_TOLERANCE,
-    check_limits,
-    drive_path,
-    duration_at_speed_limits,
-    joint_use,
-    limited_force,
-    most_used,
-    path_error,
-)
+from hybrid_opt.timing.limits import duration_at_speed_limits
 from hybrid_opt.timing.model import TimingModel
+from hybrid_opt.timing.path_timer import search_carry, search_timing
 from hybrid_opt.timing.records import (
     JerkTiming,
     Place,
@@ -37,8 +28,16 @@ from hybrid_opt.timing.records import (
     limit_place,
 )
 from hybrid_opt.timing.robustness import Margin, robustness_margins
-from hybrid_opt.timing.solve import time_path
-from hybrid_opt.timing.topp_ra import validate_timing
+from hybrid_opt.timing.solve import (
+    RECOMPUTED_TOLERANCE,
+    check_limits,
+    drive_path,
+    joint_use,
+    most_used,
+    path_error,
+    time_path,
+    validate_timing,
+)
 from symbolic.array import AllowMissing, Array, Count, Figure, Pair, Row, Shape
 from symbolic.errors import SettingsError
 from symbolic.path.pieces import resample_decisions
@@ -176,7 +175,7 @@ def duration_against_force_limit(
 
 def _peak_force(model: TimingModel, carry: Carry) -> float:
     """Return the largest force that the model limits [N]."""
-    return float(limited_force(carry, model.workcell, model.drive_limits(1.0)).max())
+    return float(model.carry_limits.limited_force(carry, model.drive_limits(1.0)).max())
 
 
 @dataclass(frozen=True)
@@ -390,5 +389,5 @@ def stored_timing(timing: Timing) -> StoredTiming:
         peak_pressure_shift=carry.peak_pressure_shift,
         peak_point_moment_residual=points,
         peak_moment_residual=moments,
-        joint_use=joint_use(carry, carry.workcell),
+        joint_use=joint_use(carry),
     )

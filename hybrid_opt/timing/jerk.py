@@ -29,17 +29,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 
 from hybrid_opt.carry import Carry
-from hybrid_opt.timing.limits import (
-    LEAST_SPEED_FACTOR,
-    LINEARISED_ABOVE,
-    RECOMPUTED_TOLERANCE,
-    PathLimits,
-    check_limits,
-    largest_speed_factor,
-    limit_ratios,
-    most_used,
-    squared_speed_limit,
-)
+from hybrid_opt.timing.limits import LINEARISED_ABOVE, PathLimits, squared_speed_limit
 from hybrid_opt.timing.model import PathMotion, TimingModel
 from hybrid_opt.timing.records import (
     FRICTION_RATIO,
@@ -50,7 +40,14 @@ from hybrid_opt.timing.records import (
     TimingLimits,
     TimingStatus,
 )
-from hybrid_opt.timing.solve import time_path
+from hybrid_opt.timing.solve import (
+    LEAST_SPEED_FACTOR,
+    RECOMPUTED_TOLERANCE,
+    check_limits,
+    largest_speed_factor,
+    most_used,
+    time_path,
+)
 from symbolic.array import Array
 from symbolic.contact.registry import command_model
 from symbolic.records import Workcell
@@ -190,7 +187,7 @@ class _JerkProblem:
         """Add limits on speeds and accelerations of joints and box."""
         at, first_basis = self._coarse, self._coarse.first_basis
         squared_by, acceleration_by = at.local(at.squared_by), at.local(at.acceleration_by)
-        most = squared_speed_limit(at.motion, self._model.workcell, self._limits)
+        most = squared_speed_limit(self._model, at.motion, self._limits)
         rows.add_upper_bounds(squared_by / np.minimum(most, 1e6)[:, None], at.keep, first_basis)
         alpha, beta = self._at.joint_accelerations()
         by = alpha[:, :, None] * acceleration_by[:, None, :]
@@ -236,7 +233,7 @@ class _JerkProblem:
     def _excess(self, c: Array) -> Array:
         """Return the largest utilisation (coarse points,) at the finer points around each."""
         carry = self._carry(self._fine, c)
-        ratios = limit_ratios(carry, self._model.workcell, self._limits)
+        ratios = self._model.carry_limits.ratios(carry, self._limits)
         del ratios[FRICTION_RATIO]
         joint, box = self._jerks(self._fine, c)
         use = np.max([*[ratio.max(axis=1) for ratio in ratios.values()], joint, box], axis=0)

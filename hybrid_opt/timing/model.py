@@ -1,5 +1,6 @@
-"""Compiled functions of timings, built once per workcell, and their results: the geometry of a path
-at samples of its parameter and between them, and its loads."""
+"""What timings of one workcell's carries are computed from, made once: the limits of a carry, and
+compiled functions of the geometry of a path, at samples of its parameter and between them, and of
+its loads."""
 
 from __future__ import annotations
 
@@ -15,12 +16,16 @@ from scipy.interpolate import CubicSpline
 from codegen.function import NumericFunction
 from hybrid_opt.carry import ArmMotion, Carry, joints_of
 from hybrid_opt.compiled_cell import CompiledCell
+from hybrid_opt.robust.force import robust_model
+from hybrid_opt.robust.path_force import PathPoints, RobustPath, robust_path
 from hybrid_opt.timing.passes import ForwardBackwardPasses
-from hybrid_opt.timing.records import TimingLimits
+from hybrid_opt.timing.records import FRICTION_RATIO, TimingLimits
 from symbolic.array import Array
 from symbolic.cell_model import CellModel
+from symbolic.contact.registry import command_model, contact_model
 from symbolic.errors import SettingsError
 from symbolic.functions import timing_functions
+from symbolic.limits import LIMITS, Limit
 from symbolic.records import Workcell
 
 INTERVALS = 200
@@ -31,6 +36,18 @@ REFINEMENT = 10
 
 _SPLINE_EVERY = 2
 """Samples per knot of the interpolating splines."""
+
+EXACT_FORCE_ABOVE = 0.98
+"""Robust forces above this share of a limit are computed exactly."""
+
+PEAK_SEARCH_STRIDE = 20
+"""Stride of the samples in the search for the largest robust force."""
+
+ROBUST_BATCH = 2000
+"""Samples of a carry whose cases are in memory together."""
+
+LEAST_NORMAL_FORCE = 1e-9
+"""A contact with less normal force carries nothing [N]."""
 
 if TYPE_CHECKING:
     import casadi as ca
@@ -112,6 +129,123 @@ _BOX, _ARMS = (
 )
 
 
+# --- the limits of a carry ---
+
+
+class CarryLimits:
+    """The limits of a workcell's carries, recomputed from physical quantities alone.
+
+    Attributes:
+        workcell: the cell.
+        bounds: by name of `symbolic.limits.LIMITS` the largest values, where the workcell states
+            them: (all joints,), (2,) of robots, or of the payload.
+        has_pressure_limit: whether its contact model limits the shift of the pressure.
+    """
+
+    def __init__(self, workcell: Workcell) -> None:
+        self.workcell = workcell
+        self.has_pressure_limit = contact_model(workcell).has_pressure_limit
+        self.bounds = {limit.name: _bound_of(limit, workcell) for limit in LIMITS if limit.bound}
+        self._friction = np.array([contact.friction for contact in workcell.contacts])
+
+    def applies(self, limit: Limit, limits: TimingLimits) -> bool:
+        """Return True if one of `LIMITS` applies."""
+        if limit.option == "pressure":
+            return limits.pressure and self.has_pressure_limit
+        return not limit.option or bool(getattr(limits, limit.option))
+
+    def ratios(self, carry: Carry, limits: TimingLimits) -> dict[str, Array]:
+        """Compute every limited quantity over its limit at every sample.
+
+        Returns:
+            By name of `symbolic.limits.LIMITS`, and friction: (n, all joints) for joints, (n, 2)
+            for robots, (n, 1) for the payload; only the limits that apply.
+        """
+        bound = np.maximum(carry.normal_force * self._friction, LEAST_NORMAL_FORCE)
+        ratios = {FRICTION_RATIO: carry.tangential_force / bound}
+        for limit in LIMITS:
+            if not self.applies(limit, limits):
+                continue
+            if limit.block == "force":
+                assert limits.force is not None
+                ratios[limit.name] = self._near_limit(carry, limits) / limits.force
+            elif not limit.carry:
+                # The reference speeds: of the two limits on the payload's speed.
+                task = self.workcell.task
+                ratios[limit.name] = np.maximum(
+                    row_lengths(carry.rate[:, :3]) / task.reference_speed,
+                    row_lengths(carry.angular_velocity) / task.reference_angular_speed,
+                )
+            elif limit.scope == "joint":
+                ratios[limit.name] = np.abs(carry.stack_arms(limit.carry)) / self.bounds[limit.name]
+            elif limit.scope == "payload":
+                vector = getattr(carry, limit.carry)[:, :3]
+                ratios[limit.name] = row_lengths(vector) / self.bounds[limit.name]
+            else:
+                ratios[limit.name] = getattr(carry, limit.carry) / self.bounds[limit.name]
+        return ratios
+
+    def limited_force(self, carry: Carry, limits: TimingLimits) -> Array:
+        """Return the limited normal forces (n, 2): planned, and robust ones where these are
+        limited."""
+        if not limits.robust:
+            return carry.normal_force
+        workcell = self.workcell
+        commanded, leading = robust_model(workcell).hold(carry, workcell.uncertainty)
+        return np.maximum(carry.normal_force, np.stack([leading, commanded], axis=1))
+
+    def _near_limit(self, carry: Carry, limits: TimingLimits) -> Array:
+        """Compute `limited_force`, exactly only where it matters.
+
+        Robust forces below `EXACT_FORCE_ABOVE` of the limit and below the carry's largest are
+        replaced by the planned ones, which takes a fraction of the time.
+        """
+        if not limits.robust or limits.force is None:
+            return self.limited_force(carry, limits)
+        if not command_model(self.workcell).has_scalar_squeeze:
+            return self.limited_force(carry, limits)
+        n = len(carry)
+        points = PathPoints(carry.pose, carry.rate, carry.second_rate, np.zeros(n), np.ones(n))
+        found, path = carry.normal_force.copy(), robust_path(self.workcell)
+        if _robust_forces_above(EXACT_FORCE_ABOVE * limits.force, points, path, found):
+            return found
+        # Nearly the largest one is among a few; only what exceeds that can be larger.
+        _robust_forces_above(0.0, points, path, found, every=PEAK_SEARCH_STRIDE)
+        _robust_forces_above(float(found.max()), points, path, found)
+        return found
+
+
+def _bound_of(limit: Limit, workcell: Workcell) -> Array:
+    if limit.scope == "joint":
+        return workcell.stack_joint_limits(limit.bound)
+    if limit.scope == "payload":
+        return np.asarray(getattr(workcell.payload, limit.bound), dtype=float)
+    return np.array([getattr(contact, limit.bound) for contact in workcell.contacts])
+
+
+def _robust_forces_above(
+    level: float, points: PathPoints, path: RobustPath, found: Array, every: int = 1
+) -> bool:
+    """Write the robust forces above a level [N], of every `every`-th point, into forces (n, 2);
+    return True if there are any."""
+    known, rows = False, np.arange(0, len(points), every)
+    for part in np.array_split(rows, -(-len(rows) // ROBUST_BATCH)):
+        least = np.full(len(part), level)
+        above, ruling = path.governing_above(points.at(part), least)
+        found[part[above]] = np.maximum(found[part[above]], ruling.force)
+        known = known or len(above) > 0
+    return known
+
+
+def row_lengths(vectors: Array) -> Array:
+    """Return the lengths (n, 1) of vectors (n, k)."""
+    length: Array = np.linalg.norm(vectors, axis=1, keepdims=True)
+    return length
+
+
+# --- the compiled functions ---
+
+
 class TimingModel:
     """Timing of one workcell's trajectories.
 
@@ -121,6 +255,7 @@ class TimingModel:
         intervals: pieces of constant path acceleration.
         is_robust: whether force limits apply to every case of the workcell's uncertainty.
         passes: the compiled timing at these intervals.
+        carry_limits: the limits of the cell's carries.
         joint_names: names of both arms' joints.
     """
 
@@ -146,6 +281,7 @@ class TimingModel:
         self.intervals, self.is_robust = intervals, robust
         self.passes = ForwardBackwardPasses(compiled, intervals)
         self.joint_names = self.passes.joint_names
+        self.carry_limits = CarryLimits(self.workcell)
         self._sample_limits = sample_limits_set(compiled, lanes=1)
         samples = REFINEMENT * intervals + 1
         self._latest: PathMotion | None = None
@@ -192,7 +328,7 @@ class TimingModel:
         for values, pose, moved in zip(extended, box, joints, strict=True):
             values[:, :6] = pose[some]
             for arm, own in enumerate(joints_of(self.workcell, moved[some])):
-                for joint, place in task.redundant_of(arm):
+                for joint, place in task.redundant_places[arm]:
                     values[:, place] = own[:, joint]
         q = map(np.ascontiguousarray, joints_of(self.workcell, motion.q[some]))
         rows = self._sample_limits.batch(*extended, *q)["limits"]
@@ -311,6 +447,53 @@ class TimingModel:
                 f"decision vector of shape {x.shape}; needs {n_var} finite numbers", code="shape"
             )
         return x
+
+
+@dataclass(frozen=True)
+class SpeedProfile:
+    """Path speeds with constant u'' on intervals, at `REFINEMENT` samples per interval, both ends
+    of every interval included.
+
+    Attributes:
+        index: (n,) of the samples among those of a path's motion.
+        time: (n,) [s].
+        share: (n,) positions of the samples within their intervals.
+        a, w: (n,) u'' and u'^2.
+    """
+
+    index: NDArray[np.intp]
+    time: Array
+    share: Array
+    a: Array
+    w: Array
+
+    @classmethod
+    def from_grid_speed(cls, grid_speed: Array) -> SpeedProfile:
+        """Sample path speeds u' at the grid points (intervals + 1,) [1/s]."""
+        squared, intervals = grid_speed**2, len(grid_speed) - 1
+        share = np.linspace(0.0, 1.0, REFINEMENT + 1)
+        w = squared[:-1, None] + np.outer(np.diff(squared), share)
+        speed = np.sqrt(np.maximum(w, 0.0))
+        # Average speed over a piece of constant acceleration is that of its ends.
+        total = speed[:, :1] + speed
+        elapsed = 2.0 * share / intervals / np.where(total > 0.0, total, 1.0)
+        starts = np.concatenate([[0.0], np.cumsum(elapsed[:, -1])])[:-1]
+        index = REFINEMENT * np.arange(intervals)[:, None] + np.arange(REFINEMENT + 1)
+        return cls(
+            index.reshape(-1),
+            (starts[:, None] + elapsed).reshape(-1),
+            np.tile(share, intervals),
+            np.repeat(np.diff(squared) * intervals / 2.0, REFINEMENT + 1),
+            w.reshape(-1),
+        )
+
+    def carry(
+        self, model: TimingModel, motion: PathMotion, a: float = 0.0, w: float = 0.0
+    ) -> Carry:
+        """Return the carry of a path at these speeds, with `a` added to u'' and `w` to u'^2
+        everywhere."""
+        speed = np.sqrt(np.maximum(self.w + w, 0.0))
+        return model.carry(motion.at(self.index), self.time, speed, self.a + a)
 
 
 def sample_limits_set(compiled: CompiledCell, lanes: int) -> NumericFunction:

@@ -92,21 +92,21 @@ class ForwardBackwardPasses:
             limits: (n,) that the passes support.
         """
         found: list[PathTiming | None] = [None] * len(limits)
-        for robust, run in ((False, self._time_planned), (True, self._time_robust)):
+        for robust in (False, True):
             some = [row for row, each in enumerate(limits) if each.robust is robust]
             if not some:
                 continue
             options = np.array([_options(limits[row]) for row in some])
             # All of them without a copy.
             chosen = paths if len(some) == len(limits) else {k: v[some] for k, v in paths.items()}
-            for row, timing in zip(some, run(chosen, options), strict=True):
+            if robust:
+                timings = self._time_robust(chosen, options)
+            else:
+                out = self._passes.batch(chosen["limits"], options, threads=self._threads)
+                timings = [self._timing(out, k) for k in range(len(some))]
+            for row, timing in zip(some, timings, strict=True):
                 found[row] = timing
         return [timing for timing in found if timing is not None]
-
-    def _time_planned(self, paths: Mapping[str, Array], options: Array) -> list[PathTiming]:
-        assert self._passes is not None, "see `supports`"
-        out = self._passes.batch(paths["limits"], options, threads=self._threads)
-        return [self._timing(out, k) for k in range(len(options))]
 
     def _time_robust(self, paths: Mapping[str, Array], options: Array) -> list[PathTiming]:
         drive = RobustCuttingPlanes(self._cut_passes, robust_path(self.workcell), paths, options)
@@ -128,9 +128,7 @@ class ForwardBackwardPasses:
 
     @cached_property
     def _cut_passes(self) -> NumericFunction:
-        passes = forward_backward_passes(self._compiled, self.intervals, CUTS_PER_SAMPLE)
-        assert passes is not None, "see `supports`"
-        return passes
+        return forward_backward_passes(self._compiled, self.intervals, CUTS_PER_SAMPLE)
 
     def _timing(self, out: dict[str, Array], k: int) -> PathTiming:
         status = PASS_STATUSES[int(out["status"][k])]

@@ -41,8 +41,8 @@ class Place:
     """Limit and position on the path of an event.
 
     Attributes:
-        constraint: limit, as `hybrid_opt.timing.limits.limit_ratios` names it, or condition of the
-            path itself.
+        constraint: limit, as `hybrid_opt.timing.model.CarryLimits.ratios` names it, or condition
+            of the path itself.
         robot: name of the robot, '' for a limit of the box.
         joint: name of the joint, '' without one.
         sample: index of the sample, on the reporting function's grid.
@@ -68,7 +68,7 @@ def limit_place(
     sample: int,
     parameter: float,
 ) -> Place:
-    """Return the place of a limit's use, by the column of its `limits.limit_ratios`."""
+    """Return the place of a limit's use, by the column of its `CarryLimits.ratios`."""
     robot, joint = "", ""
     if constraint in PER_JOINT:
         arm = int(column >= len(joint_names[0]))
@@ -306,3 +306,43 @@ def failed_timing(status: TimingStatus, place: Place, intervals: int) -> PathTim
     """Return the answer for a path without a timing."""
     speed = np.zeros(intervals + 1)
     return PathTiming(status, place, float("inf"), np.full(2, np.nan), {}, speed)
+
+
+# --- errors of a path ---
+
+
+LEAST_MOTION = 1e-9
+"""A path along which box and joints move less does not move [m, rad]."""
+
+ARM_CHECKS = (
+    (TimingStatus.OFF_PATH, "reach", "loses the path"),
+    (TimingStatus.JOINT_LIMITS, "joint position", "leaves its joint range"),
+    (TimingStatus.NEAR_SINGULAR, "manipulability", "comes too near a singular posture"),
+)
+"""Errors of an arm along a path, in the order of reporting: the timing's status, its name in a
+`Place`, and the robot's failure, for people."""
+
+
+def arm_path_error(
+    workcell: Workcell, pose: Array, lost: Array, limit_margin: Array, manipulability: Array
+) -> Timing | None:
+    """Return the error of a path without feasible timing, with arm and place, else None.
+
+    Args:
+        pose: (n, 6) box poses at uniform samples.
+        lost, limit_margin, manipulability: (n, 2) by sample and arm, as of
+            `symbolic.robot.arm.TRACK_OUTPUTS`.
+    """
+    if float(np.abs(pose - pose[0]).max()) < LEAST_MOTION:
+        reason = "all poses of the path are the same: there is nothing to time"
+        return Timing(TimingStatus.NO_MOTION, reason, Place("path length", "", "", 0, 0.0), None)
+    least = [robot.min_manipulability for robot in workcell.robots]
+    found = (lost > 0.5, limit_margin < 0.0, manipulability < least)
+    for failed, (status, constraint, text) in zip(found, ARM_CHECKS, strict=True):
+        if failed.any():
+            sample = int(np.argmax(failed.any(axis=1)))
+            robot = workcell.robots[int(np.argmax(failed[sample]))].name
+            place = Place(constraint, robot, "", sample, sample / (len(pose) - 1))
+            reason = f"robot {robot!r} {text} at u = {place.parameter:.4f}"
+            return Timing(status, reason, place, None)
+    return None

@@ -23,9 +23,8 @@ from scipy.sparse import csr_array
 
 from hybrid_opt.carry import Carry
 from hybrid_opt.static_hold import limited_force, mass_at_reference
-from hybrid_opt.timing.limits import SpeedProfile, has_pressure_limit, limit_ratios
-from hybrid_opt.timing.model import REFINEMENT, TimingModel
-from hybrid_opt.timing.records import FRICTION_RATIO, Timing, TimingLimits
+from hybrid_opt.timing.model import REFINEMENT, SpeedProfile, TimingModel
+from hybrid_opt.timing.records import FRICTION_RATIO, Timing
 from symbolic.array import Array
 from symbolic.contact.elastic import free_shift, pressure_shifts
 from symbolic.contact.registry import contact_model
@@ -110,7 +109,7 @@ def robustness_margins(model: TimingModel, carry: Carry) -> tuple[Margin, ...]:
     radius = np.array([contact.patch_radius for contact in contacts])
     centre, own_torque = np.array(payload.centre_of_mass), carry.stack_arms("own_torque")
     wrench_torque = model.wrench_torque(carry.q, carry.pose)
-    has_patches = has_pressure_limit(workcell, TimingLimits())
+    has_patches = model.carry_limits.has_pressure_limit
 
     def failure(friction: Array, centre: Array) -> str:
         """Return the name of the most exceeded limit, or '' if all hold."""
@@ -241,7 +240,7 @@ class TimingSensitivity:
 
         def ratios(**more: float) -> dict[str, Array]:
             carry = at.carry(model, motion, **more)
-            return limit_ratios(carry, model.workcell, timing.limits)
+            return model.carry_limits.ratios(carry, timing.limits)
 
         here = ratios()
         del here[FRICTION_RATIO]  # tight by construction

@@ -1,25 +1,44 @@
-"""The fastest timing of a path: one front for the methods that compute it."""
+"""The fastest timing of a path: one front for the methods that compute it, and the check of any
+timing against every limit, recomputed from physical quantities alone."""
 
 from __future__ import annotations
 
 import time
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import cache
 
 import numpy as np
 
-from hybrid_opt.timing.limits import (
-    LEAST_SPEED_FACTOR,
-    RECOMPUTED_TOLERANCE,
-    SpeedProfile,
-    check_limits,
-    largest_speed_factor,
-    most_used,
-    path_error,
+from hybrid_opt.carry import Carry
+from hybrid_opt.timing.model import CarryLimits, PathMotion, SpeedProfile, TimingModel
+from hybrid_opt.timing.records import (
+    FRICTION_RATIO,
+    PER_JOINT,
+    PathTiming,
+    Timing,
+    TimingLimits,
+    TimingStatus,
+    Utilisation,
+    Validation,
+    arm_path_error,
+    limit_place,
 )
-from hybrid_opt.timing.model import PathMotion, TimingModel
-from hybrid_opt.timing.records import PathTiming, Timing, TimingLimits, TimingStatus
 from symbolic.array import Array
+from symbolic.errors import SettingsError
+from symbolic.functions import TIMING_TOLERANCE
+
+FRICTION_ROUNDING = 1e-6
+"""The least-effort forces are on the friction cones; an excess up to this is rounding."""
+
+RECOMPUTED_TOLERANCE = TIMING_TOLERANCE
+"""Largest accepted excess of a recomputed limit, as a share of it."""
+
+LEAST_SPEED_FACTOR = 0.98
+"""A timing that has to be slowed further to satisfy its limits has not converged."""
+
+FACTOR_TOLERANCE = 1e-4
+"""Share of a limit that a factor on the speeds may leave unused."""
 
 
 def time_path(
@@ -46,8 +65,9 @@ def time_path(
     motion = model.path_motion(x) if motion is None else motion
     timing = path_error(model, motion) or _error_at_rest(model, motion, limits)
     if timing is None:
-        compute = _time_by_passes if model.passes.supports(limits) else _time_by_programs
-        timing = compute(model, motion, limits)
+        solve = _run_passes if model.passes.supports(limits) else _run_programs
+        found = solve(model, motion, limits)
+        timing = found if isinstance(found, Timing) else _slow_down(model, motion, limits, found)
     return replace(timing, seconds=time.perf_counter() - begin, limits=limits)
 
 
@@ -65,31 +85,11 @@ def _error_at_rest(model: TimingModel, motion: PathMotion, limits: TimingLimits)
     return replace(timing, status=TimingStatus.INFEASIBLE_AT_REST, reason=reason, carry=None)
 
 
-def _time_by_passes(model: TimingModel, motion: PathMotion, limits: TimingLimits) -> Timing:
+def _run_passes(
+    model: TimingModel, motion: PathMotion, limits: TimingLimits
+) -> PathTiming | Timing:
     (found,) = model.passes.time(model.path_coefficients(motion), [limits])
-    if not np.isfinite(found.duration):
-        return _pass_error(found, model.intervals)
-
-    carry, factor = SpeedProfile.from_grid_speed(found.grid_speed).carry(model, motion), 1.0
-    timing = check_limits(model, carry, limits)
-    if most_used(timing.use).ratio > 1.0 + RECOMPUTED_TOLERANCE:
-
-        @cache
-        def driven(factor: float) -> Timing:
-            speeds = SpeedProfile.from_grid_speed(factor * found.grid_speed)
-            return check_limits(model, speeds.carry(model, motion), limits)
-
-        factor = largest_speed_factor(lambda slower: most_used(driven(slower).use).ratio)
-        timing = driven(factor)
-    slowed = factor * found.slowed
-    if factor < LEAST_SPEED_FACTOR or not found.ok:
-        reason = (
-            f"the limits hold, but only after slowing to {slowed:.3f} of the speed found in "
-            f"{found.sweeps} iterations; the timing is not the fastest"
-        )
-        timing = replace(timing, status=TimingStatus.NOT_CONVERGED, reason=reason)
-    speed = factor * found.grid_speed
-    return replace(timing, grid_speed=speed, iterations=found.sweeps, slowed=slowed)
+    return found if np.isfinite(found.duration) else _pass_error(found, model.intervals)
 
 
 def _pass_error(found: PathTiming, intervals: int) -> Timing:
@@ -103,8 +103,176 @@ def _pass_error(found: PathTiming, intervals: int) -> Timing:
     return Timing(found.status, reason, place, None, iterations=found.sweeps)
 
 
-def _time_by_programs(model: TimingModel, motion: PathMotion, limits: TimingLimits) -> Timing:
+def _run_programs(
+    model: TimingModel, motion: PathMotion, limits: TimingLimits
+) -> PathTiming | Timing:
     # Not imported at the top: TOPP-RA takes long to load.
     from hybrid_opt.timing.topp_ra import toppra_timing
 
     return toppra_timing(model, motion, limits)
+
+
+def time_by_programs(model: TimingModel, motion: PathMotion, limits: TimingLimits) -> Timing:
+    """Compute the fastest timing by TOPP-RA's linear programs; see `hybrid_opt.timing.topp_ra`.
+
+    Args:
+        motion: of a path that both arms follow and that can be held at rest.
+    """
+    found = _run_programs(model, motion, limits)
+    return found if isinstance(found, Timing) else _slow_down(model, motion, limits, found)
+
+
+def validate_timing(model: TimingModel, timing: Timing) -> Validation:
+    """Time the path of a timing of `time_path` again by TOPP-RA, within the same limits.
+
+    Raises:
+        SettingsError: there is no timing.
+    """
+    if timing.carry is None:
+        raise SettingsError(f"there is no timing to validate: {timing.reason}", code="no-timing")
+    motion = model.path_motion(timing.carry.x)
+    return Validation(timing.duration, time_by_programs(model, motion, timing.limits).duration)
+
+
+def _slow_down(
+    model: TimingModel, motion: PathMotion, limits: TimingLimits, found: PathTiming
+) -> Timing:
+    """Recompute a timing on refined samples; slow it down uniformly if it exceeds a limit there."""
+
+    @cache
+    def driven(factor: float) -> Timing:
+        speeds = SpeedProfile.from_grid_speed(factor * found.grid_speed)
+        return check_limits(model, speeds.carry(model, motion), limits)
+
+    carry, factor = SpeedProfile.from_grid_speed(found.grid_speed).carry(model, motion), 1.0
+    timing = check_limits(model, carry, limits)
+    if most_used(timing.use).ratio > 1.0 + RECOMPUTED_TOLERANCE:
+        factor = largest_speed_factor(lambda slower: most_used(driven(slower).use).ratio)
+        timing = driven(factor)
+    slowed = factor * found.slowed
+    if factor < LEAST_SPEED_FACTOR or not found.ok:
+        reason = (
+            f"the limits hold, but only after slowing to {slowed:.3f} of the speed found in "
+            f"{found.sweeps} iterations; the timing is not the fastest"
+        )
+        timing = replace(timing, status=TimingStatus.NOT_CONVERGED, reason=reason)
+    speed = factor * found.grid_speed
+    return replace(timing, grid_speed=speed, iterations=found.sweeps, slowed=slowed)
+
+
+# --- the check of a timing ---
+
+
+def path_error(model: TimingModel, motion: PathMotion) -> Timing | None:
+    """Return the error of a path without feasible timing, else None."""
+    arms = motion.lost, motion.limit_margin, motion.manipulability
+    return arm_path_error(model.workcell, motion.pose, *arms)
+
+
+def check_limits(
+    model: TimingModel,
+    carry: Carry,
+    limits: TimingLimits,
+    ratios: Mapping[str, Array] | None = None,
+) -> Timing:
+    """Return a carry as a timing with status `OK`, with the utilisation of its limits.
+
+    Args:
+        ratios: those of `CarryLimits.ratios`, if known.
+    """
+    ratios = model.carry_limits.ratios(carry, limits) if ratios is None else ratios
+    use = dict[str, Utilisation]()
+    for name, ratio in ratios.items():
+        sample, column = np.unravel_index(int(np.argmax(ratio)), ratio.shape)
+        where = int(column), int(sample), float(carry.parameter[sample])
+        place = limit_place(model.workcell, model.joint_names, name, *where)
+        use[name] = Utilisation(float(ratio[sample, column]), place)
+    place = most_used(use).place
+    reason = f"{carry.duration:.3f} s; most used: {place}"
+    return Timing(TimingStatus.OK, reason, place, carry, use, limits=limits)
+
+
+def joint_use(carry: Carry) -> dict[str, Array]:
+    """Return the largest utilisation of every joint's limits over the carry, (all joints,) per
+    joint constraint; `contact torque` is the share of the contact wrench alone."""
+    limits = CarryLimits(carry.workcell)
+    ratios = limits.ratios(carry, TimingLimits())
+    use = {name: ratios[name].max(axis=0) for name in PER_JOINT}
+    limit = limits.bounds["joint torque"]
+    return use | {"contact torque": (np.abs(carry.contact_torque) / limit).max(axis=0)}
+
+
+def largest_speed_factor(use: Callable[[float], float]) -> float:
+    """Return the largest factor on the speeds, at most one, without an exceeded limit, by a
+    function of the factor to the largest utilisation; one if none exceeds `RECOMPUTED_TOLERANCE`.
+    """
+    fast = use(1.0)
+    if fast <= 1.0 + RECOMPUTED_TOLERANCE:
+        return 1.0
+    # What limits are about grows about as the square of the speeds does.
+    low, high, slow, turn = 0.0, 1.0, 0.0, 0
+    while slow < 1.0 - FACTOR_TOLERANCE and high - low > FACTOR_TOLERANCE / 2.0:
+        turn += 1
+        share = (1.0 - FACTOR_TOLERANCE / 2.0 - slow) / (fast - slow)
+        factor = np.sqrt(low**2 + share * (high**2 - low**2))
+        # Every third is halfway, in case the guesses come nearer from one side only.
+        factor = float((low + high) / 2.0 if turn % 3 == 0 else factor)
+        found = use(factor)
+        if found > 1.0:
+            high, fast = factor, found
+        else:
+            low, slow = factor, found
+    return low
+
+
+def most_used(use: dict[str, Utilisation]) -> Utilisation:
+    """Return the largest utilisation; friction, tight by construction, counts only if violated."""
+    candidates = [
+        excess
+        for name, excess in use.items()
+        if name != FRICTION_RATIO or excess.ratio > 1.0 + FRICTION_ROUNDING
+    ]
+    return max(candidates, key=lambda excess: excess.ratio)
+
+
+def drive_path(
+    model: TimingModel,
+    x: Array,
+    grid_speed: Array,
+    limits: TimingLimits,
+    motion: PathMotion | None = None,
+) -> Timing:
+    """Check a given timing of a path against every limit.
+
+    Args:
+        model: its intervals are those of the timing.
+        x: (n_var,) decision vector.
+        grid_speed: (intervals + 1,) path speed u' at the grid points [1/s].
+        motion: geometry of the path, if known.
+
+    Returns:
+        Status `OK`, or `EXCEEDED` with the limit and the place; or the error of the path itself.
+
+    Raises:
+        SettingsError: x or the speeds do not fit.
+    """
+    grid_speed = np.asarray(grid_speed, dtype=float)
+    moves = np.all(grid_speed[:-1] + grid_speed[1:] > 0.0) if grid_speed.ndim == 1 else False
+    if grid_speed.shape != (model.intervals + 1,) or not moves:
+        raise SettingsError(
+            f"path speeds of shape {grid_speed.shape}; needs {model.intervals + 1} that never "
+            "stand still over an interval",
+            code="shape",
+        )
+    motion = model.path_motion(x) if motion is None else motion
+    failure = path_error(model, motion)
+    if failure is not None:
+        return failure
+    timing = check_limits(
+        model, SpeedProfile.from_grid_speed(grid_speed).carry(model, motion), limits
+    )
+    timing, excess = replace(timing, grid_speed=grid_speed), most_used(timing.use)
+    if excess.ratio <= 1.0 + RECOMPUTED_TOLERANCE:
+        return timing
+    reason = f"uses {100.0 * excess.ratio:.1f} % of the limit: {excess.place}"
+    return replace(timing, status=TimingStatus.EXCEEDED, reason=reason)

@@ -14,37 +14,29 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
-from functools import cache
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from hybrid_opt.carry import Carry
 from hybrid_opt.timing.limits import (
-    LEAST_SPEED_FACTOR,
     LINEARISED_ABOVE,
-    RECOMPUTED_TOLERANCE,
     PathLimits,
-    SpeedProfile,
-    check_limits,
     duration_at_speed_limits,
-    largest_speed_factor,
-    limit_ratios,
-    most_used,
     squared_speed_limit,
 )
-from hybrid_opt.timing.model import REFINEMENT, PathMotion, TimingModel
+from hybrid_opt.timing.model import REFINEMENT, PathMotion, SpeedProfile, TimingModel
 from hybrid_opt.timing.records import (
     FRICTION_RATIO,
+    PathTiming,
     Place,
     Timing,
     TimingLimits,
     TimingStatus,
-    Validation,
 )
 from symbolic.array import Array
-from symbolic.errors import SettingsError
+from symbolic.functions import TIMING_TOLERANCE
 
 MAX_ITERATIONS = 25
 """Linear problems per timing at most."""
@@ -71,23 +63,16 @@ class LinearLimits:
     bound: Array
 
 
-def validate_timing(model: TimingModel, timing: Timing) -> Validation:
-    """Time the path of a timing of `time_path` again by TOPP-RA, within the same limits.
-
-    Raises:
-        SettingsError: there is no timing.
-    """
-    if timing.carry is None:
-        raise SettingsError(f"there is no timing to validate: {timing.reason}", code="no-timing")
-    motion = model.path_motion(timing.carry.x)
-    return Validation(timing.duration, toppra_timing(model, motion, timing.limits).duration)
-
-
-def toppra_timing(model: TimingModel, motion: PathMotion, limits: TimingLimits) -> Timing:
+def toppra_timing(
+    model: TimingModel, motion: PathMotion, limits: TimingLimits
+) -> PathTiming | Timing:
     """Compute the fastest timing by a sequence of TOPP-RA's linear programs.
 
     Args:
         motion: of a path that both arms follow and that can be held at rest.
+
+    Returns:
+        The timing, not recomputed yet, or the solver's failure.
     """
     return _CuttingPlaneProblem(model, motion, limits).solve()
 
@@ -120,7 +105,7 @@ class _CuttingPlaneProblem:
     def _first_rows(self) -> Iterator[LinearLimits]:
         """Return limits that are linear: on speeds, which bound u'^2 alone, and on joint
         accelerations; and supporting lines of the convex ones before any timing is known."""
-        limit = squared_speed_limit(self._at.motion, self._model.workcell, self._limits)
+        limit = squared_speed_limit(self._model, self._at.motion, self._limits)
         limit = np.minimum(limit, SPEED_CEILING / self._scale**2)[:, None]
         one, alpha, beta = np.ones_like(limit), *self._at.joint_accelerations()
         yield LinearLimits(
@@ -137,7 +122,7 @@ class _CuttingPlaneProblem:
         for force in self._at.forces(still, still):
             yield tangent_rows(*force, _pairs(still, still))
 
-    def solve(self) -> Timing:
+    def solve(self) -> PathTiming | Timing:
         """Solve linear problems until recomputed limits hold and the timing settles."""
         squared = np.zeros(0)
         settled = False
@@ -150,7 +135,15 @@ class _CuttingPlaneProblem:
             settled = self._advance(squared) and not self._tighten(squared)
             if settled:
                 break
-        return self._finish(squared, iteration, settled)
+        return PathTiming(
+            status=TimingStatus.OK if settled else TimingStatus.NOT_CONVERGED,
+            place=Place("path timing", "", "", 0, 0.0),
+            duration=self._duration,
+            peak_force=np.full(2, np.nan),
+            use={},
+            grid_speed=np.sqrt(squared) / self._scale,
+            sweeps=iteration,
+        )
 
     def _interval_rows(self, rows: list[LinearLimits]) -> LinearLimits:
         """Express the rows of each interval's points by its u'' and its initial u'^2."""
@@ -222,31 +215,13 @@ class _CuttingPlaneProblem:
     def _tighten(self, squared: Array) -> bool:
         """Tighten the intervals that exceed a limit between their points; return True if there are
         any."""
-        ratios = limit_ratios(self._refined(squared), self._model.workcell, self._limits)
+        ratios = self._model.carry_limits.ratios(self._refined(squared), self._limits)
         del ratios[FRICTION_RATIO]
         use = np.max([ratio.max(axis=1) for ratio in ratios.values()], axis=0)
         excess = use.reshape(self._model.intervals, -1).max(axis=1)
-        exceeded = excess > 1.0 + RECOMPUTED_TOLERANCE / 2.0
+        exceeded = excess > 1.0 + TIMING_TOLERANCE / 2.0
         self._tightened = np.where(exceeded, self._tightened * excess, self._tightened)
         return bool(exceeded.any())
-
-    def _finish(self, squared: Array, iterations: int, settled: bool) -> Timing:
-        """Recompute on refined samples; slow down uniformly if a limit is still exceeded."""
-
-        @cache
-        def driven(factor: float) -> Timing:
-            return check_limits(self._model, self._refined(factor**2 * squared), self._limits)
-
-        factor = largest_speed_factor(lambda slower: most_used(driven(slower).use).ratio)
-        timing = driven(factor)
-        if factor < LEAST_SPEED_FACTOR or not settled:
-            reason = (
-                f"the limits hold, but only after slowing to {factor:.3f} of the speed found in "
-                f"{iterations} iterations; the timing is not the fastest"
-            )
-            timing = replace(timing, status=TimingStatus.NOT_CONVERGED, reason=reason)
-        speed = np.sqrt(factor**2 * squared) / self._scale
-        return replace(timing, grid_speed=speed, iterations=iterations, slowed=factor)
 
     def _refined(self, squared: Array) -> Carry:
         speeds = SpeedProfile.from_grid_speed(np.sqrt(squared) / self._scale)

@@ -16,7 +16,7 @@ from hybrid_opt.campaign.settings import DRIVABLE, SUMMARY
 from hybrid_opt.display.table import NOTHING, Quantity, Table, number
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.indicators.statistics import RankTest, Summary, corrected, rank_test, summarise
-from hybrid_opt.metaheuristics.registry import title
+from hybrid_opt.metaheuristics.run import title
 from hybrid_opt.store.files import to_json
 from studies.study.summary import (
     LEAST_TESTED,

@@ -30,7 +30,7 @@ from hybrid_opt.job.compliance import (
     skew_text,
     skewed,
 )
-from hybrid_opt.job.plan import JobModel, command_forces
+from hybrid_opt.job.plan import command_forces, job_model
 from hybrid_opt.job.records import Job
 from hybrid_opt.job.smooth import driven_limits, driven_timing
 from hybrid_opt.progress import Progress
@@ -118,7 +118,7 @@ def _replayed(
 def _driven(cell: Cell, x: Array) -> ProgramResult:
     """Plan the job around a drivable carry x (n_var,) as a study and an export do by default."""
     try:
-        job = JobModel(cell.compiled, cell.timing_model).plan(driven_timing(cell.timing_model, x))
+        job = job_model(cell.timing_model).plan(driven_timing(cell.timing_model, x))
     except DualArmError as error:
         return ProgramResult({"job": None}, (f"no job can be planned: {error}",))
     values = {
@@ -143,7 +143,7 @@ def export_file(options: argparse.Namespace) -> int:
             cell = cell.changed(driver_changes(options.driver, cell.workcell))
         build_study(cell, Progress(), polish=False, drivable=False)
         timing = _chosen(cell.timing_model, stored, options.use, options.planned_limit)
-        jobs = JobModel(cell.compiled, cell.timing_model)
+        jobs = job_model(cell.timing_model)
         job = jobs.plan(timing, squeeze, options.smoothing)
         origin = Origin.of_file(path, read_bytes(path), stored.provenance)
         files = export(job, options.target, options.output, origin=origin, options=bundle)
@@ -250,7 +250,7 @@ def _robust_forces(cell: Cell, x: Array, options: argparse.Namespace) -> int:
         "the other's force is commanded"
     )
     print(f"  the set is {named}: {uncertainty}", flush=True)
-    held = command_forces(JobModel(cell.compiled, model), timing, SqueezeSettings(leader=leader))
+    held = command_forces(job_model(cell.timing_model), timing, SqueezeSettings(leader=leader))
     whose = "the whole job" if held.job else f"the carry alone (no whole job: {held.problem})"
     print(f"  commanded of {whose}: {held.squeeze.breakdown}", flush=True)
     exit_code = 0

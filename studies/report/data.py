@@ -32,7 +32,7 @@ from hybrid_opt.evaluate.objectives import (
     force_kind,
 )
 from hybrid_opt.front import Front, selected_row
-from hybrid_opt.metaheuristics.registry import title
+from hybrid_opt.metaheuristics.run import title
 from hybrid_opt.store.trajectory_file import read_trajectory
 from hybrid_opt.timing.analysis import TimingDocument, read_timing
 from hybrid_opt.timing.records import TimingLimits

@@ -99,7 +99,7 @@ def benchmark(
     progress("building the evaluator")
     evaluator = CandidateEvaluator(workcell, compiled=compiled)
     ways: dict[str, Evaluate] = {
-        "compiled": lambda x: evaluator.sampled(x, with_collisions=False),
+        "compiled": lambda x: evaluator.evaluate(x, with_collisions=False),
         "interpreted": InterpretedFunction(candidate_function(model)),
         "plain": PlainEvaluator(workcell, model.start),
     }

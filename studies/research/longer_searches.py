@@ -23,7 +23,7 @@ from hybrid_opt.campaign.settings import CONFIGURATION
 from hybrid_opt.display.table import number, text_table
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.indicators import metrics
-from hybrid_opt.metaheuristics.registry import title
+from hybrid_opt.metaheuristics.run import title
 from hybrid_opt.progress import Progress
 from hybrid_opt.store.files import to_json
 from studies.research.best_front import ReferenceFront, read_reference_front

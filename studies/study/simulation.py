@@ -26,7 +26,7 @@ from hybrid_opt.display.table import Table, number
 from hybrid_opt.errors import ResultsError, SimulationError
 from hybrid_opt.extras.simulation.arms import CarrySimulation, CellSimulation, simulate_carry
 from hybrid_opt.extras.simulation.reference import Control, driven_carry
-from hybrid_opt.metaheuristics.registry import title
+from hybrid_opt.metaheuristics.run import title
 from hybrid_opt.progress import Progress
 from hybrid_opt.store.files import read_bytes, read_record, sha256, to_json, write_json
 from hybrid_opt.store.trajectory_file import StoredTrajectory, read_trajectory

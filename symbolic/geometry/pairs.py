@@ -49,6 +49,10 @@ CONTACT_POSTURES = 300
 """Random postures in which a pair has to touch to count as always touching."""
 
 
+FAR = "far_"
+"""Prefix of the functions of the pairs that few cells check, see `CellGeometry.near`."""
+
+
 @dataclass(frozen=True)
 class ActivePair:
     """Two bodies, as indices into the cell's bodies, to be checked now, or with other
@@ -92,12 +96,12 @@ class CellGeometry:
     possible: tuple[ActivePair, ...]
     near: int
 
-    @property
+    @cached_property
     def blocks(self) -> Mapping[str, range]:
         """Return the blocks of possible pairs that are bounded together, by their functions'
         prefix."""
         far = range(self.near, len(self.possible))
-        return {"": range(self.near)} | ({"far_": far} if far else {})
+        return {"": range(self.near)} | ({FAR: far} if far else {})
 
     @cached_property
     def columns(self) -> NDArray[np.intp]:

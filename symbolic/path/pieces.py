@@ -118,8 +118,9 @@ def resample_decisions(x: Array, source: Task, target: Task) -> Array:
     if len(source.waypoints) == len(target.waypoints):
         return x
     by, n = _through(len(source.waypoints), len(target.waypoints)), target.n_path
-    paths = [(by @ extended_waypoints(source, row))[target.free_entries] for row in x]
-    within = np.clip(np.reshape(paths, (-1, n)), target.lower[:n], target.upper[:n])
+    rows, columns = target.free_entries
+    paths = (by @ extended_waypoints(source, x))[:, rows, columns]
+    within = np.clip(paths, target.lower[:n], target.upper[:n])
     return np.hstack([within, x[:, source.n_path :]])
 
 

@@ -575,12 +575,12 @@ class Workcell:
         """Stack a limit that each robot states per joint, both arms: (joints,)."""
         return np.concatenate([getattr(robot, name) for robot in self.robots])
 
-    @property
+    @cached_property
     def has_facing_pads(self) -> bool:
         """Whether two round pads with opposite normals hold the payload."""
         return self.has_opposite_pads and not any(c.half_sides for c in self.contacts)
 
-    @property
+    @cached_property
     def has_opposite_pads(self) -> bool:
         """True if two pads with opposite normals hold the payload, with patches of any shape."""
         if any(contact.further for contact in self.contacts):
@@ -588,30 +588,30 @@ class Workcell:
         first, second = (contact.T_box_pad[:3, 2] for contact in self.contacts)
         return bool((np.abs(first + second) <= OPPOSITE).all())
 
-    @property
+    @cached_property
     def pad_distance(self) -> float:
         """Distance of the contacts along the first one's normal [m]."""
         first, second = (contact.T_box_pad[:3, 3] for contact in self.contacts)
         return abs(float((first - second) @ self.contacts[0].T_box_pad[:3, 2]))
 
-    @property
+    @cached_property
     def pad_offset(self) -> float:
         """Lateral offset of the contacts, seen along the first one's normal [m]."""
         first, second = (contact.T_box_pad[:3, 3] for contact in self.contacts)
         normal, apart = self.contacts[0].T_box_pad[:3, 2], first - second
         return float(np.linalg.norm(apart - (apart @ normal) * normal))
 
-    @property
+    @cached_property
     def has_offset_pads(self) -> bool:
         """True if the contacts are offset laterally."""
         return self.pad_offset > OFFSET_TOLERANCE
 
-    @property
+    @cached_property
     def pads(self) -> tuple[Contact, ...]:
         """All pads: those of the first robot, then those of the second."""
         return tuple(pad for contact in self.contacts for pad in (contact, *contact.further))
 
-    @property
+    @cached_property
     def pad_robots(self) -> tuple[int, ...]:
         """Per pad the index of the robot that holds it."""
         return tuple(i for i, c in enumerate(self.contacts) for _ in range(1 + len(c.further)))

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cached_property, partial
 from typing import Any, Literal
 
 import numpy as np
@@ -53,9 +55,10 @@ class Orientation:
             return ("rotation x", "rotation y", "rotation z")
         return ("roll", "pitch", "yaw")
 
-    def unwrapped(self, numbers: Array) -> Array:
-        """Return numbers (n, 3) along a path, with angles unwrapped."""
-        return numbers if self.is_vector else np.unwrap(numbers, axis=0)
+    @cached_property
+    def unwrapped(self) -> Callable[[Array], Array]:
+        """Function of numbers (..., n, 3) along a path to the same with angles unwrapped."""
+        return np.asarray if self.is_vector else partial(np.unwrap, axis=-2)
 
 
 # --- homogeneous transforms ---

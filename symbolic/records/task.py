@@ -125,32 +125,36 @@ class Task:
     orientation: Orientation = field(default_factory=Orientation)
     pieces: int = 1
 
-    @property
+    @cached_property
     def extended_size(self) -> int:
         """Entries of an extended pose: the box pose, then the redundant joints."""
         return POSE_SIZE + len(self.redundant)
 
-    def redundant_of(self, arm: int) -> tuple[tuple[int, int], ...]:
-        """Return, per redundant joint of robot `arm`, its index in the arm and its place in the
-        extended pose."""
+    @cached_property
+    def redundant_places(self) -> tuple[tuple[tuple[int, int], ...], ...]:
+        """Per robot and redundant joint of it: its index in the arm and its place in the extended
+        pose."""
         return tuple(
-            (joint.drives[arm], POSE_SIZE + k)
-            for k, joint in enumerate(self.redundant)
-            if joint.drives[arm] >= 0
+            tuple(
+                (joint.drives[arm], POSE_SIZE + k)
+                for k, joint in enumerate(self.redundant)
+                if joint.drives[arm] >= 0
+            )
+            for arm in (0, 1)
         )
 
-    @property
+    @cached_property
     def free_indices(self) -> tuple[int, ...]:
         """Positions of the free waypoints in `waypoints`."""
         return tuple(i for i, w in enumerate(self.waypoints) if not w.is_fixed)
 
-    @property
+    @cached_property
     def n_path(self) -> int:
         """Number of variables of the path: six per free waypoint (paper Eq. 14), then the free
         values of the redundant joints, joint by joint."""
         return len(self.free_entries[0])
 
-    @property
+    @cached_property
     def n_box(self) -> int:
         """Number of variables of the box path, the first of the decision vector."""
         return POSE_SIZE * len(self.free_indices)
@@ -170,12 +174,30 @@ class Task:
             part.flags.writeable = False
         return found
 
-    @property
+    @cached_property
+    def initial_time(self) -> float:
+        """Time along the straight pieces of the hand-made trajectory at the reference speeds
+        [s]."""
+        steps = np.diff(waypoints_of(self, initial_decision(self)), axis=0)
+        lengths = np.linalg.norm(steps[:, :3], axis=1) / self.reference_speed
+        turns = np.linalg.norm(steps[:, 3:], axis=1) / self.reference_angular_speed
+        return float(np.maximum(lengths, turns).sum())
+
+    @cached_property
+    def fixed_waypoints(self) -> Array:
+        """(n_waypoints, 6 + m) extended waypoints, with free entries at their lower bounds;
+        read-only."""
+        poses = np.array([waypoint.lower for waypoint in self.waypoints])
+        points = np.column_stack([poses, *[joint.lower for joint in self.redundant]])
+        points.flags.writeable = False
+        return points
+
+    @cached_property
     def law(self) -> TimeLaw:
         """The time law."""
         return TIME_LAWS[self.time_law]
 
-    @property
+    @cached_property
     def n_var(self) -> int:
         """Number of decision variables: those of the path, and the force limit of drivable
         carries."""
@@ -206,17 +228,19 @@ def components(orientation: Orientation) -> tuple[str, ...]:
 
 
 def waypoints_of(task: Task, x: Array) -> Array:
-    """Return all waypoints (n_waypoints, 6) of a decision vector (n_var,), angles unwrapped."""
-    return extended_waypoints(task, x)[:, :POSE_SIZE]
+    """Return all waypoints (..., n_waypoints, 6) of decision vectors (..., n_var), angles
+    unwrapped."""
+    return extended_waypoints(task, x)[..., :POSE_SIZE]
 
 
 def extended_waypoints(task: Task, x: Array) -> Array:
-    """Return all waypoints (n_waypoints, 6 + m) of a decision vector (n_var,): poses, then
+    """Return all waypoints (..., n_waypoints, 6 + m) of decision vectors (..., n_var): poses, then
     redundant joints."""
-    points = np.array([waypoint.lower for waypoint in task.waypoints])
-    points = np.column_stack([points, *[joint.lower for joint in task.redundant]])
-    points[task.free_entries] = x[: task.n_path]
-    points[:, 3:POSE_SIZE] = task.orientation.unwrapped(points[:, 3:POSE_SIZE])
+    points = np.empty((*x.shape[:-1], *task.fixed_waypoints.shape))
+    points[...] = task.fixed_waypoints
+    rows, columns = task.free_entries
+    points[..., rows, columns] = x[..., : task.n_path]
+    points[..., 3:POSE_SIZE] = task.orientation.unwrapped(points[..., 3:POSE_SIZE])
     return points
 
 
@@ -224,7 +248,7 @@ def place_redundant(task: Task, extended: Array, joints: Sequence[Array]) -> Non
     """Write the redundant joints of the extended poses (n, 6 + m) into both arms' joints (n,
     joints), in place."""
     for arm, q in enumerate(joints):
-        for joint, place in task.redundant_of(arm):
+        for joint, place in task.redundant_places[arm]:
             q[:, joint] = extended[:, place]
 
 

@@ -98,12 +98,8 @@ class SeparatingAxisGap(PathConstraint):
     pair: int
     direction: int
 
+    family: ClassVar[str] = "separation"
     scale: ClassVar[float] = 0.01
-
-    @property
-    def family(self) -> str:
-        """Return the family of all pairs and directions."""
-        return "separation"
 
     def expression(self, place: PathPointSymbols, numbers: ca.SX) -> ca.SX:
         """Return the gap."""
@@ -127,13 +123,9 @@ class AxisSwitchGap(PathConstraint):
     before: int
     after: int
 
+    family: ClassVar[str] = "passing"
     scale: ClassVar[float] = 0.01
     moving: ClassVar[bool] = True
-
-    @property
-    def family(self) -> str:
-        """Return the family of all pairs and directions."""
-        return "passing"
 
     def expression(self, place: PathPointSymbols, numbers: ca.SX) -> ca.SX:
         """Return the height at which the lines of both gaps meet."""

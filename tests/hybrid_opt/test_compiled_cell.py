@@ -32,8 +32,8 @@ from hybrid_opt.polishing.polisher import Polisher
 from hybrid_opt.polishing.settings import PolishSettings
 from hybrid_opt.progress import Progress
 from hybrid_opt.robust.force import RobustModel, at_rest, robust_model
-from hybrid_opt.timing.drive import search_carry
 from hybrid_opt.timing.model import TimingModel
+from hybrid_opt.timing.path_timer import search_carry
 from symbolic.cell_model import CellModel
 from symbolic.parameters import START
 from tests.symbolic.cells import RACK, hand_cell, hand_model, rack_cell

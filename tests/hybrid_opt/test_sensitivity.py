@@ -16,7 +16,7 @@ from hybrid_opt.front import Front
 from hybrid_opt.robust.cases import LEADER, worst_cases
 from hybrid_opt.robust.force import robust_model
 from hybrid_opt.sensitivity import Sensitivity
-from hybrid_opt.timing.limits import drive_path
+from hybrid_opt.timing.solve import drive_path
 from symbolic import safe_io
 from symbolic.array import Array
 from symbolic.contact.worst_cases import case_gradient_function, case_squeeze_function

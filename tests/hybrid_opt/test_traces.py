@@ -53,9 +53,13 @@ def cell() -> ho.Cell:
 
 
 @cache
+def driven() -> ho.Cell:
+    return cell().drivable()
+
+
+@cache
 def front() -> ho.Front:
-    rng = np.random.default_rng(1)
-    return ho.search(cell().drivable(), "nsga2", evaluations=300, rng=rng)
+    return ho.search(driven(), "nsga2", evaluations=300, rng=np.random.default_rng(1))
 
 
 @cache
@@ -65,18 +69,17 @@ def polished() -> ho.Front:
 
 
 def search() -> ho.Front:
-    rng = np.random.default_rng(3)
-    return ho.search(cell().drivable(), "nsga2", evaluations=80, rng=rng)
+    return ho.search(driven(), "nsga2", evaluations=80, rng=np.random.default_rng(3))
 
 
 @pytest.mark.parametrize(
     ("operation", "files", "depth"),
     [
-        (lambda: cell().evaluate(cell().initial), 6, 8),
-        (lambda: ho.time_path(cell(), cell().initial, ho.TimingLimits(force=60.0)), 15, 12),
-        pytest.param(search, 37, 18, marks=pytest.mark.slow),
-        pytest.param(lambda: polished.__wrapped__(), 54, 27, marks=pytest.mark.slow),
-        pytest.param(lambda: ho.recommend(polished()), 57, 26, marks=pytest.mark.slow),
+        (lambda: cell().evaluate(cell().initial), 5, 7),
+        (lambda: ho.time_path(cell(), cell().initial, ho.TimingLimits(force=60.0)), 9, 11),
+        pytest.param(search, 20, 12, marks=pytest.mark.slow),
+        pytest.param(lambda: polished.__wrapped__(), 37, 22, marks=pytest.mark.slow),
+        pytest.param(lambda: ho.recommend(polished()), 45, 24, marks=pytest.mark.slow),
     ],
 )
 def test_an_operation_runs_through_few_files(

@@ -71,7 +71,7 @@ class _Follower:
         self.data = self.model.createData()
         self.names = list(self.model.names)[1:]
         self.last = self.model.njoints - 1
-        self.redundant = many.workcell.task.redundant_of(many.arm)
+        self.redundant = many.workcell.task.redundant_places[many.arm]
         self.T_box_joint = many.held(hold.spin)
         self.T_root_world = inverse(robot.T_world_base)
         key = f"robots[{many.arm}].min_manipulability = {robot.min_manipulability:g} m^3"

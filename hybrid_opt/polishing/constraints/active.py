@@ -13,7 +13,7 @@ its former side of an edge.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -36,7 +36,6 @@ from hybrid_opt.polishing.constraints.kinds import (
 )
 from hybrid_opt.polishing.rows import ForceRow, PathRow, PressureRow, Row
 from symbolic.array import Array
-from symbolic.contact.registry import contact_model
 from symbolic.smooth.passage import AxisSwitchGap, SeparatingAxisGap
 from symbolic.smooth.places import Clearance, JointLimit, ManipulabilityLimit
 
@@ -59,7 +58,7 @@ class RowSelector:
         self._movable = cell.grid.movable
         self._distances = Clearances(cell)
         sampled: dict[type, ConstraintKind[Any]] = {ForceRow: self.forces}
-        if contact_model(cell.workcell).has_pressure_limit:
+        if cell.has_pressure_limit:
             sampled[PressureRow] = Pressure(cell)
         driven = cell.task.law.is_drivable
         self._kinds: dict[type, ConstraintKind[Any]] = ({} if driven else sampled) | {
@@ -72,7 +71,12 @@ class RowSelector:
 
     def near_rows(self, carry: PlacedCarry, limits: MinimisedForces) -> set[Row]:
         """Return rows of all constraints near their bounds at a candidate."""
-        return self._rows(lambda kind: kind.near_rows(carry, limits))
+        rows = set[Row]()
+        for kind in self._kinds.values():
+            for row in kind.near_rows(carry, limits):
+                if self._counts(row):
+                    rows.add(row)
+        return rows
 
     def violated_rows(
         self, carry: PlacedCarry, known: PlacedCarry, program_rows: Collection[Row]
@@ -82,8 +86,13 @@ class RowSelector:
         Args:
             program_rows: rows of the program. Their forces are no violation: they raise the peaks.
         """
-        violated = self._rows(lambda kind: kind.violated_rows(carry, known))
-        return {row for row in violated if row not in program_rows or not isinstance(row, ForceRow)}
+        rows = set[Row]()
+        for kind in self._kinds.values():
+            for row in kind.violated_rows(carry, known):
+                is_peak = isinstance(row, ForceRow) and row in program_rows
+                if self._counts(row) and not is_peak:
+                    rows.add(row)
+        return rows
 
     def has_violation(
         self, carry: PlacedCarry, known: PlacedCarry, program_rows: Collection[Row]
@@ -102,7 +111,10 @@ class RowSelector:
         self, carry: PlacedCarry, rows: Iterable[Row], is_relaxed: bool = False
     ) -> dict[Row, float]:
         """Return the required value of each row at a candidate; see `ConstraintKind`."""
-        return self._by_kind(rows, lambda kind, own: kind.required_values(carry, own, is_relaxed))
+        values: dict[Row, float] = {}
+        for kind, own in self._by_kind(rows).items():
+            values.update(zip(own, kind.required_values(carry, own, is_relaxed), strict=True))
+        return values
 
     def tightened_bounds(
         self,
@@ -112,11 +124,11 @@ class RowSelector:
         before: Mapping[Row, float],
     ) -> dict[Row, float]:
         """Return the required values of violated rows; see `ConstraintKind`."""
-
-        def tighten(kind: ConstraintKind[Any], own: list[Row]) -> list[float]:
-            return kind.tightened_bounds(carry, known, own, [before.get(row, 0.0) for row in own])
-
-        return self._by_kind(rows, tighten)
+        values: dict[Row, float] = {}
+        for kind, own in self._by_kind(rows).items():
+            margins = [before.get(row, 0.0) for row in own]
+            values.update(zip(own, kind.tightened_bounds(carry, known, own, margins), strict=True))
+        return values
 
     def persists(self, row: Row) -> bool:
         """Return True if a row's tightened bound stays valid at other candidates."""
@@ -125,24 +137,14 @@ class RowSelector:
     def _kind_of(self, row: Row) -> ConstraintKind[Any]:
         return self._kinds[type(row.constraint) if isinstance(row, PathRow) else type(row)]
 
-    def _rows(self, ask: Callable[[ConstraintKind[Any]], Iterable[Row]]) -> set[Row]:
-        kinds = self._kinds.values()
-        return {row for kind in kinds for row in ask(kind) if self._counts(row)}
-
     def _counts(self, row: Row) -> bool:
         return not isinstance(row, PathRow) or self._movable(row.place)
 
-    def _by_kind(
-        self, rows: Iterable[Row], ask: Callable[[ConstraintKind[Any], list[Row]], list[float]]
-    ) -> dict[Row, float]:
+    def _by_kind(self, rows: Iterable[Row]) -> dict[ConstraintKind[Any], list[Row]]:
         groups: dict[ConstraintKind[Any], list[Row]] = {}
         for row in rows:
             groups.setdefault(self._kind_of(row), []).append(row)
-        return {
-            row: value
-            for kind, own in groups.items()
-            for row, value in zip(own, ask(kind, own), strict=True)
-        }
+        return groups
 
 
 class WorkingSet:

@@ -86,8 +86,12 @@ class DistanceConstraintKind(ConstraintKind[PathRow]):
         chosen = [k for k, row in enumerate(rows) if row.place < carry.reached]
         if not chosen:
             return values.tolist()
-        truth = self._measured(carry, [rows[k] for k in chosen])
-        wanted = self.wanted[[pair_of(rows[k]) for k in chosen]]
+        # The least distance in the window of each row.
+        pairs, window = [pair_of(rows[k]) for k in chosen], self.window
+        at = [slice(max(0, rows[k].place - window), rows[k].place + window + 1) for k in chosen]
+        stretches = list(zip(at, pairs, strict=True))
+        truth = np.array(carry.distances.least(stretches, MEASURED_BELOW))
+        wanted = self.wanted[pairs]
         if is_relaxed:
             wanted = np.where(truth > 0.0, np.minimum(wanted, truth), wanted)
         smooth = smooth_values(self.cell, carry, [rows[k] for k in chosen])
@@ -100,14 +104,6 @@ class DistanceConstraintKind(ConstraintKind[PathRow]):
         pairs = np.flatnonzero(close.any(axis=0)).tolist()
         truth = carry.distances.at(close)
         return {pair: truth[:, pair].copy() for pair in pairs}
-
-    def _measured(self, carry: PlacedCarry, rows: Sequence[PathRow]) -> Array:
-        """Measure the least distance in the window of each row."""
-        stretches = [
-            (slice(max(0, row.place - self.window), row.place + self.window + 1), pair_of(row))
-            for row in rows
-        ]
-        return np.array(carry.distances.least(stretches, MEASURED_BELOW))
 
 
 def pair_of(row: PathRow) -> int:

@@ -20,9 +20,9 @@ from hybrid_opt.collision.distances import (
     INTERSECTING,
     OPEN,
     compiled_distances,
+    fcl_object,
     shape_table,
 )
-from hybrid_opt.collision.judge import fcl_object
 from symbolic.array import Array
 from symbolic.geometry.bodies import collision_bodies
 from symbolic.geometry.hulls import hull_of

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from codegen import compiled as compiled_module
-from hybrid_opt.collision.judge import FCL_RESOLUTION
+from hybrid_opt.collision.distances import FCL_RESOLUTION
 from hybrid_opt.evaluate.evaluation import FEASIBLE, REASONS, CandidateEvaluator, Evaluations
 from hybrid_opt.evaluate.explanation import explain, frequent, missing_reach
 from hybrid_opt.evaluate.kernel import (

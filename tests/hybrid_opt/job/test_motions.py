@@ -11,9 +11,8 @@ import pytest
 from hybrid_opt.job.motions import PEAK_RATE, at_even_steps, rest_to_rest_profile, unit_squeeze
 from hybrid_opt.job.smooth import acceleration_at_ends, has_rest_at_ends, without_jumps
 from hybrid_opt.timing.jerk import time_with_jerk
-from hybrid_opt.timing.limits import check_limits, most_used
 from hybrid_opt.timing.records import JerkLimits, Timing, TimingLimits
-from hybrid_opt.timing.solve import time_path
+from hybrid_opt.timing.solve import check_limits, most_used, time_path
 from symbolic.contact.registry import command_model
 from symbolic.path.spline import path_basis
 from symbolic.read.cell import load

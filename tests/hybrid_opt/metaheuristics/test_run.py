@@ -23,7 +23,7 @@ from hybrid_opt.metaheuristics import (
     search,
     settings_of,
 )
-from hybrid_opt.metaheuristics.guarded import violation_of
+from hybrid_opt.metaheuristics.algorithms import violation_of
 from hybrid_opt.metaheuristics.run import (
     WORST_PENALTY,
     CarryProblem,

@@ -16,8 +16,8 @@ from hybrid_opt.polishing.drive_front import recheck_timing
 from hybrid_opt.polishing.point import Solution
 from hybrid_opt.polishing.polisher import Polisher
 from hybrid_opt.polishing.settings import DrivableSettings, PolishSettings
-from hybrid_opt.timing.drive import CandidateDriver
 from hybrid_opt.timing.model import TimingModel
+from hybrid_opt.timing.path_timer import CandidateDriver
 from symbolic.array import Array
 from symbolic.read.cell import load
 from symbolic.records import Workcell
@@ -79,7 +79,7 @@ def disbelieved(driver: CandidateDriver | None, model: TimingModel, x: Array) ->
     """Why the timing of a decision vector is not believed: by the tenfold grid, or by the
     independent one."""
     assert driver is not None
-    found, other = driver.timings(x[None])[0], by_toppra(model, x, driver.limits(float(x[-1])))
+    found, other = driver.time_candidate(x)[0], by_toppra(model, x, driver.limits(float(x[-1])))
     if not other.ok or abs(found.duration / other.duration - 1.0) > 5e-3:
         return f"{found.duration:.3f} s, by the independent timing {other.duration:.3f} s"
     return recheck_timing(driver, model, x)

@@ -10,8 +10,7 @@ import numpy as np
 from hybrid_opt.compiled_cell import CompiledCell
 from hybrid_opt.timing.model import TimingModel
 from hybrid_opt.timing.records import Timing, TimingLimits, TimingStatus
-from hybrid_opt.timing.solve import time_path
-from hybrid_opt.timing.topp_ra import toppra_timing
+from hybrid_opt.timing.solve import time_by_programs, time_path
 from symbolic.array import Array
 from symbolic.records import Workcell
 from tests.symbolic.cells import hand_cell, hand_model
@@ -62,5 +61,5 @@ def by_toppra(model: TimingModel, x: Array, limits: TimingLimits) -> Timing:
     at rest are those of `time_path`."""
     timing = time_path(model, x, limits)
     if timing.ok or timing.status in (TimingStatus.SOLVER_FAILED, TimingStatus.NOT_CONVERGED):
-        return toppra_timing(model, model.path_motion(x), limits)
+        return time_by_programs(model, model.path_motion(x), limits)
     return timing

@@ -65,7 +65,7 @@ def shortest_duration(model: TimingModel, x: Array, start: Array) -> float:
     result = solver(
         x0=start[1:-1] ** 2,
         lbx=1e-9,
-        ubx=squared_speed_limit(motion, cell, TimingLimits())[1:-1],
+        ubx=squared_speed_limit(model, motion, TimingLimits())[1:-1],
         lbg=-1.0,
         ubg=1.0,
     )

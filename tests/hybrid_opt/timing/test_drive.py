@@ -18,8 +18,7 @@ from hybrid_opt.indicators.metrics import non_dominated
 from hybrid_opt.metaheuristics.run import CarryProblem
 from hybrid_opt.robust.force import robust_model
 from hybrid_opt.timing.analysis import drivable_timing
-from hybrid_opt.timing.drive import CandidateDriver
-from hybrid_opt.timing.path_timer import PATH_INTERVALS, PathTimer
+from hybrid_opt.timing.path_timer import PATH_INTERVALS, CandidateDriver, PathTimer
 from hybrid_opt.timing.records import TimingLimits, TimingStatus
 from symbolic.array import Array
 from symbolic.functions import candidate_function
@@ -165,7 +164,7 @@ def test_a_drivable_carry_is_timed_as_the_search_found_it() -> None:
     driver = evaluator().driver
     assert driver is not None
     for x in candidates(3):
-        timing, (found,) = drivable_timing(model, x), driver.timings(x[None])
+        timing, (found, _) = drivable_timing(model, x), driver.time_candidate(x)
         assert timing.ok
         assert timing.duration == pytest.approx(found.duration, rel=1e-9)
         assert timing.driven.normal_force.max() <= 1.005 * x[-1]

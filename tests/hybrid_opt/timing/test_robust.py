@@ -14,17 +14,15 @@ from hybrid_opt.robust.cases import worst_cases
 from hybrid_opt.robust.force import robust_model
 from hybrid_opt.static_hold import static_hold
 from hybrid_opt.timing.analysis import closest_to_reference_timing
-from hybrid_opt.timing.drive import search_carry
-from hybrid_opt.timing.limits import SpeedProfile, check_limits, drive_path, limit_ratios
-from hybrid_opt.timing.model import TimingModel
-from hybrid_opt.timing.path_timer import PathTimer
+from hybrid_opt.timing.model import SpeedProfile, TimingModel
+from hybrid_opt.timing.path_timer import PathTimer, search_carry
 from hybrid_opt.timing.records import TimingLimits, TimingStatus
 from hybrid_opt.timing.robustness import (
     Margin,
     payload_sensitivity,
     robustness_margins,
 )
-from hybrid_opt.timing.solve import time_path
+from hybrid_opt.timing.solve import check_limits, drive_path, time_path
 from symbolic.records import Uncertainty, Workcell
 from tests.hybrid_opt.timing import convex_oracle
 from tests.hybrid_opt.timing.cells import hand_timing, initial, near_initial, timing_of
@@ -83,7 +81,7 @@ def test_the_use_of_the_limit_is_that_of_all_cases(share: float) -> None:
     limits = TimingLimits(force=limit, robust=True)
     use = check_limits(model, plain(), limits).use["normal force"]
     assert use.ratio == pytest.approx(held.peak.max() / limit, rel=1e-6)
-    every = limit_ratios(plain(), model.workcell, limits)["normal force"].max(axis=1)
+    every = model.carry_limits.ratios(plain(), limits)["normal force"].max(axis=1)
     needed = np.maximum(held.commanded, held.leading) / limit
     near = needed > 0.985
     np.testing.assert_allclose(every[near], needed[near], rtol=1e-6)

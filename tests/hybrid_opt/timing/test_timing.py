@@ -22,12 +22,11 @@ from hybrid_opt.timing.analysis import (
     timing_document,
 )
 from hybrid_opt.timing.jerk import time_with_jerk
-from hybrid_opt.timing.limits import limit_ratios
 from hybrid_opt.timing.model import TimingModel
 from hybrid_opt.timing.records import JerkLimits, Timing, TimingLimits, TimingStatus
 from hybrid_opt.timing.robustness import robustness_margins
-from hybrid_opt.timing.solve import time_path
-from hybrid_opt.timing.topp_ra import linearised_rows, validate_timing
+from hybrid_opt.timing.solve import time_path, validate_timing
+from hybrid_opt.timing.topp_ra import linearised_rows
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.read.cell import load
@@ -49,7 +48,7 @@ STATIC = WEIGHT / 2.0
 
 def worst_ratios(model: TimingModel, timing: Timing, limits: TimingLimits) -> Array:
     """Largest use of any limit but friction on each interval of the refined samples."""
-    ratios = limit_ratios(timing.driven, model.workcell, limits)
+    ratios = model.carry_limits.ratios(timing.driven, limits)
     del ratios["friction"]
     use = np.max([ratio.max(axis=1) for ratio in ratios.values()], axis=0)
     most_used: Array = use.reshape(model.intervals, -1).max(axis=1)

@@ -20,8 +20,7 @@ from hybrid_opt.robust.force import BoxMotion, RobustModel
 from hybrid_opt.robust.path_force import RobustPath
 from hybrid_opt.timing.model import TimingModel
 from hybrid_opt.timing.records import TimingLimits
-from hybrid_opt.timing.solve import time_path
-from hybrid_opt.timing.topp_ra import toppra_timing
+from hybrid_opt.timing.solve import time_by_programs, time_path
 from studies.programs.inspection import inspected
 from studies.research.locked_joints import compare, locks
 from studies.research.plain.collisions import PlainCollisionChecker
@@ -137,7 +136,7 @@ def test_compiled_passes_agree_with_the_independent_timing() -> None:
     assert cell.path_timer.passes.supports(limits)
     found = cell.path_timer.time(path, limits)
     model = TimingModel(cell.compiled, cell.path_timer.intervals)
-    other = toppra_timing(model, model.path_motion(path), limits)
+    other = time_by_programs(model, model.path_motion(path), limits)
     assert found.ok
     assert found.duration == pytest.approx(other.duration, rel=5e-3)
     assert found.peak_force.max() == pytest.approx(30.0, rel=2e-3)
