@@ -48,11 +48,11 @@ class CompiledCell:
     def __init__(
         self, workcell: Workcell, cache: Cache | None = None, model: CellModel | None = None
     ) -> None:
-        """Nothing is built yet.
+        """Describe the cell; nothing is built yet.
 
         Args:
-            model: the cell's symbolic model where it does not follow from the workcell alone, such
-                as with other start postures than the stated criterion's.
+            model: the cell's symbolic model, if it does not follow from the workcell alone, for
+                example with other start postures.
 
         Raises:
             CodegenError: there is no C compiler, and the cache knows of none.

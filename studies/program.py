@@ -199,7 +199,8 @@ class Program:
         return f"studies.{self.name}"
 
     def parser(self, called: str = "") -> Parser:
-        """Return the parser of its options; `called` says how, '' for `python -m`."""
+        """Return the parser of its options; `called` is the name in its usage line, '' for `python
+        -m`."""
         prog = called or f"python -m {self.module}"
         parser = Parser(prog=prog, description=self.description, further=self.further)
         self.add_options(parser)

@@ -207,7 +207,7 @@ class CampaignResults:
 
 def union(fronts: Sequence[Front]) -> list[tuple[Front, int]]:
     """Return the members of several fronts that no other one dominates, by increasing objectives,
-    each as its front and its row there."""
+    each as its front and its index there."""
     members = [(front, row) for front in fronts for row in range(len(front))]
     objectives = np.concatenate([front.objectives for front in fronts])
     return [members[k] for k in metrics.front_rows(objectives, np.ones(len(members), dtype=bool))]

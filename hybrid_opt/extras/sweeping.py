@@ -236,7 +236,7 @@ _LOADED: dict[tuple[Any, ...], Cell] = {}
 
 
 def _loaded(cell: Cell) -> Cell:
-    """Return the cell that this process has loaded, where it is the same one."""
+    """Return the given cell as loaded before in this process."""
     key = cell.workcell.digest, *cell.objectives
     if key not in _LOADED:
         _LOADED.clear()

@@ -156,7 +156,7 @@ class ForceProgram:
         x: Array,
         radius: float,
     ) -> None:
-        """Around a candidate.
+        """Form the program around a candidate.
 
         Args:
             required: the rows, and what each has to keep; forces stay below their peaks.

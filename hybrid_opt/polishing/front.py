@@ -84,7 +84,7 @@ class ParetoArchive:
         return index, values[index]
 
     def span(self) -> Array:
-        """Return the scale (2,) of each objective."""
+        """Return the range (2,) of each objective over the front, not below `LEAST_SPAN`."""
         values = np.array(self.objectives)[self.front_indices()]
         return np.asarray(np.maximum(np.ptp(values, axis=0), LEAST_SPAN))
 

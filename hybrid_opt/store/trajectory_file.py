@@ -75,8 +75,7 @@ class StoredTrajectory:
 
     @property
     def objectives(self) -> tuple[str, ...]:
-        """The library's objectives that it was stored with, those of the paper where there are
-        none."""
+        """Names of the stored objectives that the library knows, else the paper's."""
         named = {f"{OBJECTIVE}{name}": name for name in OBJECTIVES}
         found = tuple(named[figure] for figure in self.figures if figure in named)
         return found or PAPER_OBJECTIVES

@@ -193,7 +193,7 @@ def _candidates(cell: Cell, count: int, seed: int) -> Iterator[ProgramResult]:
 
 
 def _meshes(workcell: Workcell) -> ProgramResult:
-    """Sizes of the meshes as read, and of their convex pieces, by file."""
+    """Return sizes of the meshes as read, and of their convex pieces, by file."""
     reader = MeshReader()
     collision_bodies(workcell, reader)
     sizes = {

@@ -146,8 +146,7 @@ def report_stage(study: StudySettings) -> Stage:
 
 
 def _paths_beside(folder: CampaignFolder) -> Array:
-    """Return the paths that a study's first experiment ended with, for the drivable one in its
-    folder."""
+    """Return the paths that the first experiment of a study found, for its drivable experiment."""
     return known_paths(folder.root.parent, folder.workcell.task)
 
 

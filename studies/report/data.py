@@ -144,8 +144,8 @@ class Experiment:
         return any(run.hybrid is not None for a in self.algorithms for run in a.runs)
 
     def fronts(self) -> Iterator[tuple[LineStyle, Front, bool]]:
-        """Fronts of the representative runs with their looks, and whether a polished one stands
-        beside each; then the polished union."""
+        """Return fronts of the representative runs with their looks, and whether a polished one
+        stands beside each; then the polished union."""
         for algorithm in self.solved:
             found = algorithm.shown.fronts
             after = found[-1] if self.union is None else self.union
@@ -154,7 +154,7 @@ class Experiment:
             yield series(len(self.algorithms)), self.union, False
 
     def driven(self, objectives: Array) -> Array:
-        """(k, 2) force [N] and duration [s] of a drivable experiment's objectives (k, 2)."""
+        """Return (k, 2) force [N] and duration [s] of a drivable experiment's objectives (k, 2)."""
         reference = float(self.workcell.task.reference_force.max())
         return objectives[:, ::-1] * [reference, duration_unit(self.workcell)]
 
@@ -313,7 +313,7 @@ def gather_carries(root: Path) -> tuple[CellGeometry, tuple[DrawnCarry, ...]]:
 
 
 def _experiment(results: CampaignResults, select: bool = True) -> Experiment:
-    """One experiment; its best trajectories are selected where that is wanted."""
+    """Build an experiment, with its best trajectories selected on request."""
     summary, fronts = read_summary(results.root), results.fronts
     union = next((front for front in fronts if front.algorithm == UNION), None)
     evaluator = results.cell.evaluator if select else None

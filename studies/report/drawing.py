@@ -80,7 +80,8 @@ class LineStyle:
         return {"color": self.colour, "linestyle": self.line}
 
     def marks(self, size: float, edge: str = "black", opened: bool = False) -> dict[str, Any]:
-        """Keywords of marks without a line, open ones in the colour alone, for Matplotlib."""
+        """Return Matplotlib's keywords of marks without a line; open ones have a coloured edge
+        alone."""
         return {
             "marker": self.marker,
             "linestyle": "none",
@@ -256,7 +257,7 @@ class View:
         return np.cross(self.right, self.up)
 
     def flat(self, points: Array) -> Array:
-        """(..., 2) picture coordinates of world points (..., 3)."""
+        """Return (..., 2) picture coordinates of world points (..., 3)."""
         return np.stack([points @ self.right, points @ self.up], axis=-1)
 
 
@@ -398,7 +399,8 @@ def draw_cell(
 
 
 def _polygons(flat: Array, **style: Any) -> PolyCollection:
-    """Polygons (n, k, 2): one array is taken over faster than the sequence that the stubs name."""
+    """Return polygons (n, k, 2) unchanged: Matplotlib takes one array faster than the sequence of
+    its stubs."""
     return PolyCollection(flat, **style)  # type: ignore[arg-type]
 
 

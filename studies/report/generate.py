@@ -205,7 +205,7 @@ FIRST_TABLES = ("time_against_force", "robust_price", "simulation", "phases")
 
 
 def report_tables(data: ReportData, with_paper: bool) -> tuple[Table, ...]:
-    """All tables of a report, see `study_tables`."""
+    """Return all tables of a report, see `study_tables`."""
     beside = None if data.drivable is None or data.alone else data.drivable.summary
     found = list(study_tables(data.summary, beside, data.jerk, data.simulations, with_paper))
     robots = data.summary.robots

@@ -372,8 +372,8 @@ def _uses(
 
 
 def joint_torque_use(workcell: Workcell, torque: Array) -> Array:
-    """(joints,) largest use of each joint's torque (n, joints) in percent; NaN where the largest
-    allowed is unknown."""
+    """Return (joints,) largest use of each joint's torque (n, joints) in percent; NaN where the
+    largest allowed is unknown."""
     limit = workcell.stack_joint_limits("torque_max")
     use = 100.0 * np.abs(torque).max(axis=0) / limit
     return np.where(np.isfinite(limit), use, np.nan)

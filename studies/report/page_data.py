@@ -85,7 +85,7 @@ def points(label: str, at: Array, members: Sequence[int], texts: Sequence[str], 
 
 
 def cloud(label: str, at: Array, look: LineStyle) -> Plot:
-    """Feasible candidates (n, 2) in the background, thinned out."""
+    """Return feasible candidates (n, 2) in the background, thinned out."""
     at = at[evenly(len(at), CLOUD_PER_ALGORITHM)]
     flat = [{"dtype": "f4", "bdata": packed(column, np.float32)} for column in at.T]
     style = {"color": look.colour, "symbol": SYMBOLS[look.marker], "size": 3, "opacity": 0.4}

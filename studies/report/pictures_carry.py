@@ -77,8 +77,8 @@ def pressure_shift(data: ReportData) -> Figure:
 
 
 def payload(data: ReportData) -> Figure:
-    """Largest contact force of each robot against the payload's mass, for unchanged motion (paper
-    Figure 12)."""
+    """Draw the largest contact force of each robot against the payload's mass, for unchanged motion
+    (paper Figure 12)."""
     reference = data.workcell.task.reference_force / KILOGRAM_FORCE
     limits = np.concatenate([c.sensitivity.mass_by_resultant for c in data.drawn])
     masses = np.array([0.75 * limits.min(), 1.1 * limits.max()])
@@ -140,8 +140,8 @@ def simulated_forces(data: ReportData) -> Figure:
 
 
 def joint_torques(data: ReportData) -> Figure:
-    """Largest joint torque over its maximum: of the contact wrench alone, and with the arm's own
-    weight and motion (paper Figure 10)."""
+    """Draw the largest joint torque over its maximum: of the contact wrench alone, and with the
+    arm's own weight and motion (paper Figure 10)."""
     figure = new_figure(0.98)
     panels = figure.subplots(2, 2, subplot_kw={"projection": "polar"})
     split = [len(data.workcell.robots[0].torque_max)]
@@ -186,8 +186,8 @@ def _label_rings(axes: Axes, most: Array, top: float) -> None:
 
 
 def residual_moments(data: ReportData) -> Figure:
-    """Moment that is missing with forces at the nominal contact points, and with the centres of
-    pressure shifted."""
+    """Draw the moment that is missing with forces at the nominal contact points, and with the
+    centres of pressure shifted."""
     figure = new_figure(0.42)
     axes = figure.subplots()
     for carry in data.drawn:
@@ -203,7 +203,8 @@ def residual_moments(data: ReportData) -> Figure:
 
 
 def robust_price(data: ReportData, price: RobustPrice) -> Figure:
-    """Peak normal forces of the recommended carry against the multiple of the uncertainty."""
+    """Draw the peak normal forces of the recommended carry against the multiple of the
+    uncertainty."""
     figure = new_figure(0.5)
     axes = figure.subplots()
     for i, robot in enumerate(data.workcell.robots):

@@ -37,7 +37,7 @@ QUARTILES = (25.0, 75.0)
 
 
 def fronts(data: ReportData) -> Figure:
-    """Feasible candidates and non-dominated ones of each algorithm's run with the largest
+    """Draw the feasible candidates and non-dominated ones of each algorithm's run with the largest
     hypervolume (paper Figure 7). The cross is the level payload at rest, the star the planned
     forces, or time and force, of the recommended carry as robots drive it."""
     figure = new_figure(0.5)
@@ -65,7 +65,7 @@ def fronts(data: ReportData) -> Figure:
 
 
 def attainment(data: ReportData) -> Figure:
-    """Empirical attainment surfaces: what a quarter, half and three quarters of the replicas
+    """Draw empirical attainment surfaces: what a quarter, half and three quarters of the replicas
     reached or bettered."""
     figure = new_figure(0.48)
     groups = {"search": [[run.front.objectives for run in a.runs] for a in data.algorithms]}
@@ -105,7 +105,7 @@ def _attained(title: str, percentile: float) -> str:
 
 
 def polish(data: ReportData) -> Figure:
-    """Fronts before and after the polish, and the hypervolume of every replica."""
+    """Draw fronts before and after the polish, and the hypervolume of every replica."""
     figure = new_figure(0.5)
     left, right = figure.subplots(1, 2)
     drawn = []
@@ -169,7 +169,8 @@ def _recommended(axes: Axes, data: ReportData) -> None:
 
 
 def _zoom(axes: Axes, data: ReportData, sets: Sequence[Array]) -> None:
-    """Limits around fronts, their corner at rest and the carry recommended from them included."""
+    """Return limits around fronts, their corner at rest and the carry recommended from them
+    included."""
     points = [np.atleast_2d(points)[:, :2] for points in sets if len(points)]
     if data.at_rest is not None:
         points.append(data.at_rest[None])
@@ -181,9 +182,9 @@ def _zoom(axes: Axes, data: ReportData, sets: Sequence[Array]) -> None:
 
 
 def duration_against_force(data: ReportData, choice: StoredRecommendation) -> Figure:
-    """Shortest drivable durations with at most a commanded force, held in every case of the
-    uncertainty: single paths, and all paths that the recommended carry was chosen from. Limits on
-    jerk hold only for the star."""
+    """Draw the shortest drivable durations with at most a commanded force, held in every case of
+    the uncertainty: single paths, and all paths that the recommended carry was chosen from. Limits
+    on jerk hold only for the star."""
     figure = new_figure(0.5)
     axes = figure.subplots()
     force, looks = np.array(choice.durations.forces), {RECOMMENDED_LABEL: RECOMMENDED_STYLE}
@@ -206,8 +207,8 @@ LATE = 0.5
 
 
 def histories(data: ReportData) -> Figure:
-    """Best feasible value of each objective so far, in the same runs; the inset enlarges the second
-    half (paper Figure 8)."""
+    """Draw the best feasible value of each objective so far, in the same runs; the inset enlarges
+    the second half (paper Figure 8)."""
     figure = new_figure(0.5)
     axes = figure.subplots()
     inset = axes.inset_axes((0.42, 0.47, 0.56, 0.46))

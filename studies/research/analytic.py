@@ -88,10 +88,10 @@ BANDS: dict[tuple[str, int], Band] = {
 def judge(
     ours: Summary, reference: float, *, higher_is_better: bool, std: float | None = None
 ) -> Verdict | None:
-    """Whether our mean agrees with a band's.
+    """Return True if our mean agrees with a band's.
 
-    The band is the reference mean plus and minus three standard errors of the difference of
-    the two means. The reference's spread is taken as ours where it is not known.
+    The band is the reference mean plus and minus three standard errors of the difference of the two
+    means. The reference's spread is taken as ours where it is not known.
 
     Returns:
         None where fewer than two seeds leave the spread unknown.
@@ -396,7 +396,8 @@ def make(name: str) -> AnalyticProblem:
 
 
 def _evenly(curve: Array) -> Array:
-    """Non-dominated part of a dense curve, resampled at equal arc lengths of its pieces."""
+    """Return the non-dominated part of a dense curve, resampled at equal arc lengths of its
+    pieces."""
     front = moocore.filter_dominated(curve)
     front = front[np.argsort(front[:, 0], kind="stable")]
     step = np.linalg.norm(np.diff(front / np.ptp(front, axis=0), axis=0), axis=1)
@@ -433,7 +434,8 @@ def _tnk_front() -> Array:
 
 
 def _srn_front() -> Array:
-    """From the point nearest to (2, 1) on the line, up x1 = -2.5, then along the circle."""
+    """Sample the front from the point nearest to (2, 1) on the line, up x1 = -2.5, then along the
+    circle."""
     line_x2 = np.linspace(2.5, 3.7, _DENSE)
     line = np.column_stack([3.0 * line_x2 - 10.0, line_x2])
     column_x2 = np.linspace(2.5, np.sqrt(225.0 - 2.5**2), _DENSE)
@@ -445,7 +447,8 @@ def _srn_front() -> Array:
 
 
 def _osy_front() -> Array:
-    """Five pieces with x4 = x6 = 0 (Deb 2001, Multi-objective optimization, section 8.3.3)."""
+    """Return five pieces with x4 = x6 = 0 (Deb 2001, Multi-objective optimization, section
+    8.3.3)."""
     s = np.linspace(0.0, 1.0, _DENSE // 5)
     one, zero = np.ones_like(s), np.zeros_like(s)
     bend = np.linspace(37.0 / 9.0 - 1.0 / 18.0, 5.0, len(s))

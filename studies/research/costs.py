@@ -130,7 +130,7 @@ def benchmark(
 
 
 def _scaling(model: CellModel, candidates: int, repeats: int, seed: int) -> dict[str, Any]:
-    """Compiled cost against the numbers of samples and of free waypoints."""
+    """Compute the compiled cost against the numbers of samples and of free waypoints."""
     task = model.workcell.task
     by_samples = {n: replace(task, samples=n) for n in SAMPLE_COUNTS}
     by_waypoints = {n: with_free_waypoints(task, n) for n in WAYPOINTS}
@@ -167,7 +167,8 @@ def _costs(
     seed: int,
     what: str,
 ) -> dict[int, Array]:
-    """Seconds per candidate (rounds,) of the compiled evaluator for each task, taken in turns."""
+    """Compute seconds per candidate (rounds,) of the compiled evaluator for each task, taken in
+    turns."""
     ways: dict[str, Evaluate] = {}
     x: dict[str, Array] = {}
     for n, task in tasks.items():
@@ -229,7 +230,7 @@ def _processor() -> str:
 
 
 def report(result: Mapping[str, Any]) -> str:
-    """All figures of `benchmark`."""
+    """Compute all figures of `benchmark`."""
     machine, scaling, searched = result["machine"], result["scaling"], result["with_collisions"]
     line, random = scaling["samples_line"], searched["random"]
     ways: list[tuple[str, ...]]

@@ -189,7 +189,8 @@ def _arm(time: Array, force: Array, commanded: Array, poses: _Poses) -> _Arm:
 
 
 def _one_file(path: Path) -> list[_Arm]:
-    """Both arms, along the axes of their bases; grasps and normals are told in the world, too."""
+    """Return both arms, along the axes of their bases; grasps and normals are in the world as
+    well."""
     found = []
     with np.load(path) as log:
         time = log["t_epoch"] - log["t_epoch"][0]
@@ -212,7 +213,8 @@ def _one_file(path: Path) -> list[_Arm]:
 
 
 def _two_files(left: Path) -> list[_Arm]:
-    """Both arms, along the axes of the world; turns along those of the bases, half a turn apart."""
+    """Return both arms, along the axes of the world; turns along those of the bases, half a turn
+    apart."""
     found, begin = [], 0.0
     for i, path in enumerate((left, left.with_stem(left.stem.removesuffix("_L") + "_R"))):
         with np.load(path) as log:
@@ -233,8 +235,8 @@ def _two_files(left: Path) -> list[_Arm]:
 
 @cache
 def _need() -> ca.Function:
-    """Mean normal force that holds, of force and moment about the middle of facing pads along the
-    axes of the first, half their distance and the friction."""
+    """Return the mean normal force that holds, of force and moment about the middle of facing pads
+    along the axes of the first, half their distance and the friction."""
     force, moment = ca.SX.sym("force", 3), ca.SX.sym("moment", 3)
     half, friction = ca.SX.sym("half"), ca.SX.sym("friction")
     patch = SoftPatch(2.0 / 3.0 * PATCH, PATCH * np.eye(2))
@@ -323,8 +325,8 @@ def compared(carry: LoggedCarry) -> Comparison:
 
 
 def _by_markers(places: Places) -> tuple[Array, Array]:
-    """(n,) how far a box's upright axis has leant since the start [rad], and (n,) at which samples
-    its markers are believed: it leans little and stands between the pads."""
+    """Compute how far (n,) a box's upright axis has leant since the start [rad], and the samples
+    (n,) at which its markers are valid: it leans little and stands between the pads."""
     start = Rotation.from_matrix(places.box[: 2 * GLITCH, :3, :3]).mean()
     up = (Rotation.from_matrix(places.box[:, :3, :3]) * start.inv()).as_matrix()[:, 2, 2]
     lean = np.arccos(np.clip(up, -1.0, 1.0))
@@ -352,8 +354,8 @@ CREPT = 0.025
 
 
 def table(folder: Path) -> Table:
-    """Every labelled run at its least margin, those that lost their box when they did; the largest
-    friction used, slide and lean until then.
+    """Return every labelled run at its least margin, those that lost their box when they did; the
+    largest friction used, slide and lean until then.
 
     Raises:
         SettingsError: there are no logs.

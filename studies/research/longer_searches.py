@@ -79,7 +79,7 @@ def controls(
 
 
 def _polish_cost(root: Path, summary: CampaignSummary) -> int:
-    """Candidate evaluations that take as long as the most expensive polish of the study."""
+    """Return candidate evaluations that take as long as the most expensive polish of the study."""
     costs = [
         row.polished.equivalent_evaluations
         for entry in summary.algorithms.values()

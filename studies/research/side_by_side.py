@@ -69,7 +69,7 @@ def _contents(cell: Cell) -> dict[str, Any]:
 
 
 def _candidates(cell: Cell, what: str, batches: int, rng: np.random.Generator) -> Array:
-    """Candidates (batches, population, n_var)."""
+    """Return candidates (batches, population, n_var)."""
     size = (batches, POPULATION, cell.n_var)
     if what == "random":
         return rng.uniform(cell.lower, cell.upper, size)
@@ -78,7 +78,7 @@ def _candidates(cell: Cell, what: str, batches: int, rng: np.random.Generator) -
 
 
 def _search_seconds(cell: Cell, seed: int) -> float:
-    """Core-seconds of a drivable search whose functions are compiled already."""
+    """Return core-seconds of a drivable search whose functions are compiled already."""
     drivable = cell.drivable()
     drivable.evaluate(drivable.initial)
     start = time.process_time()

@@ -143,7 +143,7 @@ def thresholds(options: argparse.Namespace) -> int:
 
 
 def summary(found: Sequence[Slip]) -> str:
-    """How many carries are as they should be."""
+    """Count how many carries are as they should be."""
     lines = []
     for pads, allowed in ALLOWED.items():
         some = np.array([slip.threshold for slip in found if slip.pads == pads])
@@ -199,8 +199,8 @@ def slip_of(
 
 
 def first_slip(lacks: Outcome, held: Outcome) -> float:
-    """When a box that lacks force has moved farther in the plane of a pad than the same box that is
-    held by more, by `FARTHER` [s]; NaN where it has not."""
+    """Find when a box that lacks force has moved farther in the plane of a pad than the same box
+    that is held by more, by `FARTHER` [s]; NaN where it has not."""
     n = min(len(lacks.time), len(held.time))
     beyond = np.flatnonzero((lacks.slip[:n] - held.slip[:n]).max(axis=1) > FARTHER)
     return float(lacks.time[beyond[0]]) if len(beyond) else float("nan")
@@ -226,7 +226,7 @@ class _Source:
         self._front: Array | None = None
 
     def case(self, k: int) -> tuple[str, str, Carry]:
-        """Cell, candidate, and the carry with the forces planned for its friction."""
+        """Return cell, candidate, and the carry with the forces planned for its friction."""
         cell, kind = self._cell, CANDIDATE_KINDS[k % len(CANDIDATE_KINDS)]
         model = cell.timing_model
         while True:

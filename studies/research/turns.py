@@ -36,12 +36,12 @@ there."""
 def interleaved(
     ways: Mapping[str, Evaluate], x: Mapping[str, Array], repeats: int
 ) -> dict[str, Array]:
-    """Seconds per call of every way in every round (rounds,); the ways take turns.
+    """Compute seconds per call of every way in every round (rounds,); the ways take turns.
 
     Args:
         ways: functions of one decision vector, or of one batch of them, by name.
-        x: per way what it is called with: decision vectors (n, n_var) or batches
-            (n, size, n_var), the same n for all.
+        x: per way what it is called with: decision vectors (n, n_var) or batches (n, size, n_var),
+            the same n for all.
         repeats: rounds with each of the n.
     """
     counts = {}
@@ -58,7 +58,7 @@ def interleaved(
 
 
 def _seconds(evaluate: Evaluate, x: Array, first: int, count: int) -> float:
-    """Seconds per call for `count` rows of x one after the other."""
+    """Compute seconds per call for `count` rows of x one after the other."""
     start = time.thread_time()
     for k in range(first, first + count):
         evaluate(x[k % len(x)])
@@ -68,7 +68,7 @@ def _seconds(evaluate: Evaluate, x: Array, first: int, count: int) -> float:
 def summary(
     times: Mapping[str, Array], average: Callable[[Array], np.floating] = np.median
 ) -> dict[str, float]:
-    """Averages [ms] of every way and averages of the ratios within a round.
+    """Compute averages [ms] of every way and averages of the ratios within a round.
 
     Args:
         times: seconds per candidate (rounds,) of 'compiled', 'interpreted' and 'plain'.
@@ -112,7 +112,8 @@ DUAL_ARM_EXPORT double dual_arm_peak(long long rounds) {
 
 
 def peak_operations() -> float | None:
-    """Additions and multiplications per second that one core does in lanes; None without lanes.
+    """Compute additions and multiplications per second that one core does in lanes; None without
+    lanes.
 
     Measured: the best of some runs of a loop of sixteen independent chains.
     """
@@ -130,7 +131,7 @@ def peak_operations() -> float | None:
 
 
 def candidate_operations(model: CellModel) -> int:
-    """Operations of one candidate with collisions, counted in its CasADi functions.
+    """Compute the operations of one candidate with collisions, counted in its CasADi functions.
 
     Without the branches that few samples take; a sine or cosine counts as one.
     """
@@ -209,7 +210,7 @@ def with_collisions(
 
 
 def shares(evaluator: CandidateEvaluator, batches: Array, repeats: int) -> dict[str, float]:
-    """Where the time of the compiled way goes, as shares of the whole.
+    """Compute the shares of the time of the compiled way.
 
     candidate: path, arms, forces and objectives. collisions: bounds, proofs and FCL.
 

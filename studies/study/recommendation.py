@@ -307,8 +307,8 @@ def recommend_from(
 
 
 def _hand_made(cell: ho.Cell) -> Array:
-    """(1, n) the hand-made carry within the largest force limit, none where it is not feasible: a
-    front may lie behind it where the search was short."""
+    """Return (1, n) the hand-made carry within the largest force limit, none where it is not
+    feasible: a front may lie behind it where the search was short."""
     x = np.append(cell.initial[:-1], cell.workcell.task.force_limit[1])
     found = cell.evaluator.certified(cell.evaluate(x))
     return np.asarray(found.x[found.feasible])
@@ -361,8 +361,8 @@ LEAST_FORCE_PATH = "least-force"
 
 
 def known_paths(root: Path, task: Task) -> Array:
-    """Paths (m, n_path) that another experiment ends with, told by the waypoints of a task: of all
-    polished fronts together the balanced one, of each of them both ends and the middle.
+    """Return paths (m, n_path) that another experiment ends with, in the waypoints of a task: of
+    all polished fronts together the balanced one, of each of them both ends and the middle.
 
     Raises:
         ResultsError: the experiment's folder is not complete or damaged.
@@ -387,11 +387,11 @@ def least_force(campaign: CampaignResults, task: Task) -> dict[str, Array]:
 
 
 def is_drivable(workcell: Workcell, objectives: Sequence[str]) -> bool:
-    """Whether an experiment already is the search for carries as robots drive them."""
+    """Return True if an experiment already is the search for carries as robots drive them."""
     return workcell.task.law.is_drivable and tuple(objectives) in DRIVABLE_PAIRS
 
 
 def drivable_root(root: Path, workcell: Workcell, objectives: Sequence[str]) -> Path:
-    """Folder of a study's drivable experiment: one inside, unless the study's first experiment, of
-    this cell and these objectives, is the only one."""
+    """Return the folder of a study's drivable experiment: one inside, unless the study's first
+    experiment, of this cell and these objectives, is the only one."""
     return root if is_drivable(workcell, objectives) else root / DRIVABLE

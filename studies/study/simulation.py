@@ -200,7 +200,7 @@ def _file(root: Path, name: str) -> Path:
 
 
 def is_done(root: Path, one: SimulationRequest) -> bool:
-    """Whether this very trajectory was simulated."""
+    """Return True if this very trajectory was simulated."""
     try:
         stored = read_record(StoredSimulation, _file(root, one.name), "")
     except ResultsError:
@@ -287,8 +287,8 @@ def _document(cells: Cells, request: Request) -> TimingDocument:
 
 
 def limits_on_jerk(root: Path, recommended: StoredRecommendation | None) -> Table | None:
-    """Costs of the cell's limits on jerk for the selected carries, the hand-made one's first, and
-    for the recommended one; None where no jerk is limited.
+    """Return the costs of the cell's limits on jerk for the selected carries, the hand-made one's
+    first, and for the recommended one; None where no jerk is limited.
 
     Args:
         root: results folder of the drivable experiment.

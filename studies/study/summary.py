@@ -311,7 +311,8 @@ exact test can reach, 2 / binomial(2 n, n), is 0.028 or more before any correcti
 
 
 def reference_front(fronts: Sequence[Array]) -> Array:
-    """(k, n_obj) non-dominated union of fronts; of all of a campaign, its reference for IGD."""
+    """Return (k, n_obj) non-dominated union of fronts; of all of a campaign, its reference for
+    IGD."""
     return metrics.front_of(np.concatenate(fronts))
 
 
@@ -337,7 +338,7 @@ def front_indicators(
 def replica_figures(
     replica: Replica, reference: Array, selected: SelectedCarry | None, file: str | None
 ) -> ReplicaFigures:
-    """One replica's entry in the summary; figures that do not exist are NaN or infinite."""
+    """Return one replica's entry in the summary; figures that do not exist are NaN or infinite."""
     found = replica.evaluations
     feasible = found.feasible
     return ReplicaFigures(

@@ -69,7 +69,7 @@ def study_tables(
     simulations: Sequence[StoredSimulation] = (),
     with_paper: bool = False,
 ) -> tuple[Table, ...]:
-    """All tables that need no more than a study's documents.
+    """Return all tables that need no more than a study's documents.
 
     Args:
         summary: of its first experiment.
@@ -143,8 +143,8 @@ def _polished_union(summary: CampaignSummary) -> list[tuple[str, list[FrontFigur
 
 
 def _over_replicas(figures: Sequence[FrontFigures], key: str, mean: bool = False) -> str:
-    """Median and quartiles of a figure over replicas, or mean and standard deviation; some figures
-    only searched or only polished replicas have."""
+    """Format median and quartiles of a figure over replicas, or mean and standard deviation; some
+    figures only searched or only polished replicas have."""
     if not hasattr(figures[0], key):
         return NOTHING
     found, quantity = summarise([getattr(row, key) for row in figures]), REPLICA_QUANTITIES[key]
@@ -160,7 +160,7 @@ def _table(
     of: Iterable[Any],
     note: str,
 ) -> Table:
-    """One row per record, by what its columns make of it."""
+    """Build a table with one row per record; `columns` maps names to functions of a record."""
     rows = tuple(tuple(told(one) for told in columns.values()) for one in of)
     return Table(name, heading, tuple(columns), rows, note)
 
@@ -329,7 +329,7 @@ def bounds(search: NormalisationBounds, drivable: NormalisationBounds | None = N
 
 
 def rank_tests(summary: CampaignSummary) -> Table:
-    """Mann-Whitney tests between algorithms."""
+    """Build the table of Mann-Whitney tests between algorithms."""
     return _table(
         "tests",
         "Comparison over replicas.",
@@ -380,7 +380,7 @@ def robust_price(price: RobustPrice, robots: Sequence[str]) -> Table:
 
 
 def simulated(found: Sequence[StoredSimulation]) -> Table:
-    """Carries in the simulated cell."""
+    """Build the table of carries in the simulated cell."""
 
     def holds(one: StoredSimulation) -> str:
         return f"{one.slips:.3f} to {one.holds:.3f}" if math.isfinite(one.holds) else one.problem
@@ -418,7 +418,7 @@ LabelledTimings = Sequence[tuple[str, TimingDocument]]
 
 
 def timings(timed: LabelledTimings, robots: Sequence[str]) -> Table:
-    """Durations and forces under the search's timing and under drivable ones."""
+    """Build the table of durations and forces under the search's timing and under drivable ones."""
     return Table(
         "timing",
         "What real timing makes of the selected trajectories.",
@@ -468,8 +468,8 @@ def _timing_cells(timing: StoredTiming) -> tuple[str, ...]:
 
 
 def margins(timed: LabelledTimings) -> Table:
-    """How far the model's assumptions may be off under the drivable timing, which at least one of
-    the trajectories has."""
+    """Compute how far the model's assumptions may be off under the drivable timing, which at least
+    one of the trajectories has."""
     judged = [(label, document.margins) for label, document in timed if document.margins]
     rows = []
     for found in zip(*(margins for _, margins in judged), strict=True):
@@ -493,7 +493,7 @@ def margins(timed: LabelledTimings) -> Table:
 
 
 def force_curve(curve: ForceCurve) -> Table:
-    """Durations against force limits."""
+    """Build the table of durations against force limits."""
     rows = zip(curve.force, curve.duration, curve.status, strict=False)
     return Table(
         "force_curve",

@@ -465,7 +465,7 @@ class _Chain:
         return bool(np.all((q >= self.robot.position_lower) & (q <= self.robot.position_upper)))
 
     def starts(self) -> Array:
-        """Return the middle posture and random ones."""
+        """Return start postures: the middle of the limits, then random ones."""
         rng = np.random.default_rng(0)
         q = np.vstack([self.middle, rng.uniform(self.low, self.high, (SEEDS, len(self.low)))])
         for joint, value in self.held.items():

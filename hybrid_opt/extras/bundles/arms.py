@@ -301,8 +301,8 @@ def _add_fixed(root: ElementTree.Element, parent: str, name: str, bodies: Sequen
 
 
 def _shapes(link: ElementTree.Element, shape: Shape | Capsule | UrdfMesh, pose: Array) -> None:
-    """Add a shape as visual and as collision geometry; capsules, which URDF lacks, in their
-    parts."""
+    """Add a shape as visual and as collision geometry. URDF has no capsules: their cylinder and
+    spheres are added."""
     if isinstance(shape, Capsule):
         _shapes(link, Cylinder(shape.radius, shape.length), pose)
         for side in (-0.5, 0.5):

@@ -379,7 +379,7 @@ def readme(document: Mapping[str, Any], contents: Contents) -> str:
 
 
 def warnings_of(job: Job) -> list[str]:
-    """Warnings that an engineer should read before this job runs."""
+    """List warnings that an engineer should read before this job runs."""
     cell, found = job.workcell, []
     peak, rated = job.peak_normal_force, cell.task.reference_force
     for robot, force, most in zip(cell.robots, peak, rated, strict=True):

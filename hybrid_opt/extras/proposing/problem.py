@@ -226,7 +226,7 @@ def read_problem(path: str | Path) -> Problem:
 
 
 def _require_known(table: TableReader) -> None:
-    """Record what this module needs and lacks; the reader of workcell files checks the rest."""
+    """Report missing keys that a proposal needs; the reader of workcell files checks the rest."""
     task, payload = table.table("task"), table.table("payload")
     _, contacts = (table.tables(key, exactly=2) for key in ("robots", "contacts"))
     if table.problems.found:

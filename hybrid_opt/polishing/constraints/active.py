@@ -206,7 +206,7 @@ class WorkingSet:
         return is_new
 
     def add(self, rows: Iterable[Row], x: Array) -> None:
-        """Add rows that a step to x showed to be missing, with their usual bounds."""
+        """Add the rows that were missing for a step to x, with their usual bounds."""
         self._tightened.update(dict.fromkeys(rows, (-np.inf, x)))
 
     def mark_active(self, rows: Iterable[Row]) -> None:

@@ -160,8 +160,8 @@ class SeparatingAxisGaps(DistanceConstraintKind):
                 yield separation(pair, gaps, place)
 
     def violated_rows(self, carry: PlacedCarry, known: PlacedCarry) -> Iterable[PathRow]:
-        """Around places that are too close and far from every kink of the known candidate, in
-        whose directions the rows are."""
+        """Return rows at places that are too close and far from every kink of the known candidate,
+        in whose directions the rows are."""
         half = self.grid.places(KINK_WINDOW) // 2
         for pair, gaps, place, near in violated_passages(self, carry, known):
             if not near:

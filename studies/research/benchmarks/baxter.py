@@ -92,7 +92,7 @@ class Hands:
         self._data = self._model.createData()
 
     def at(self, joints: dict[str, float]) -> tuple[Array, Array]:
-        """Positions (3,) of the left and the right hand [m]."""
+        """Return positions (3,) of the left and the right hand [m]."""
         q = pin.neutral(self._model)
         for name, value in joints.items():
             if self._model.existJointName(name):

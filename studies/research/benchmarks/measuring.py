@@ -243,13 +243,13 @@ def _joints(carry: ho.Carry) -> tuple[Array, Array]:
 
 
 def length(benchmark: Benchmark, q: tuple[Array, Array]) -> Length:
-    """How far both arms' joints (n, joints) go along a carry."""
+    """Compute the length of the path of both arms' joints (n, joints)."""
     return Length(path_length(np.hstack(q)), path_length(benchmark.coordinates(*q)))
 
 
 def checks_per_second(workcell: Path, rng: np.random.Generator) -> float:
-    """How many random configurations of both arms a cell's collision judge looks at in a second of
-    work, nothing of it compiled, as a proposal asks it."""
+    """Measure how many random configurations of both arms a cell's collision judge checks per
+    second of work, without compiled functions, as in a proposal."""
     cell = load(workcell)
     judge = judge_of(build_cell_bodies(cell))
     q_1, q_2 = (
@@ -298,7 +298,7 @@ def table(benchmark: Benchmark, found: list[TaskResult], rng: np.random.Generato
 
 
 def solved(found: list[TaskResult]) -> str:
-    """How many carries were found, and after how much work their verdict stood."""
+    """Format the number of carries found, and the work until each verdict."""
     held = [one for one in found if one.held]
     times = sorted(one.certified for one in found if one.certified is not None)
     told = (

@@ -109,8 +109,8 @@ def benchmark(there: Path) -> Benchmark:
 
 
 def postures(notebook: bytes) -> dict[str, Array]:
-    """By shelf the eight coordinates (8,) of the notebook: the left arm's joints, and the turn of
-    the right arm's elbow about the line from shoulder to wrist [rad].
+    """Read the eight coordinates (8,) of the notebook by shelf: the left arm's joints, and the turn
+    of the right arm's elbow about the line from shoulder to wrist [rad].
 
     Raises:
         OutsideError: it is no notebook that has them.
@@ -128,7 +128,7 @@ def postures(notebook: bytes) -> dict[str, Array]:
 
 
 def coordinates(q_1: Array, q_2: Array) -> Array:
-    """(n, 8) their coordinates of both arms' joints (n, 7), see `postures`.
+    """Convert both arms' joints (n, 7) to their coordinates (n, 8), see `postures`.
 
     The turn is counted from the plane through the arm's first axis. Where the wrist is on that axis
     it is without meaning.
@@ -137,7 +137,8 @@ def coordinates(q_1: Array, q_2: Array) -> Array:
 
 
 def elbow_turn(q: Array) -> float:
-    """Angle of an iiwa's elbow about the line from shoulder to wrist, for joints (7,) [rad]."""
+    """Return the angle of an iiwa's elbow about the line from shoulder to wrist, for joints (7,)
+    [rad]."""
     upper = rotate("z", q[0]) @ rotate("y", q[1])
     elbow = upper @ [0.0, 0.0, UPPER_ARM]
     wrist = elbow + upper @ rotate("z", q[2]) @ rotate("y", -q[3]) @ [0.0, 0.0, FOREARM]
@@ -179,7 +180,7 @@ def _robot(name: str, urdf: Path, folder: Path, y: float) -> dict[str, Any]:
 
 
 def _scene(models: Path) -> list[dict[str, Any]]:
-    """Table and shelves as bodies of a workcell."""
+    """Return the table and shelves as bodies of a workcell."""
     return [
         {**table, "xyz": (np.array(table["xyz"]) + at).tolist()}
         for name, at in STANDING.items()

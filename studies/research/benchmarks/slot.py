@@ -127,7 +127,7 @@ def bodies(scene: str) -> Iterator[dict[str, Any]]:
 
 
 def _numbers(text: str | None) -> list[float]:
-    """Three of an attribute."""
+    """Read the three numbers of an attribute."""
     try:
         found = [float(each) for each in (text or "").split()]
     except ValueError:

@@ -65,26 +65,26 @@ class PlainArm:
         self.T_flange_pad = pin.SE3(robot.T_flange_pad)
 
     def flange_target(self, pose: Array) -> pin.SE3:
-        """Flange placement in the root that puts the pad on its contact."""
+        """Compute the flange placement in the root that puts the pad on its contact."""
         world_box = pin.SE3(box_rotation(self.orientation, pose[3:]), pose[:3])
         world_pad = world_box * pin.SE3(self.contact.T_box_pad)
         return self.T_root_world * world_pad * self.T_flange_pad.inverse()
 
     def place(self, q: Array) -> pin.SE3:
-        """Flange placement in the root; leaves the frames of `data` up to date."""
+        """Compute the flange placement in the root; leaves the frames of `data` up to date."""
         pin.forwardKinematics(self.model, self.data, q)
         pin.updateFramePlacements(self.model, self.data)
         return self.data.oMf[self.flange]
 
     def jacobian(self, q: Array) -> Array:
-        """(6, n) of the flange, linear rows first, axes of the root."""
+        """Compute the Jacobian (6, n) of the flange, linear rows first, axes of the root."""
         J: Array = pin.computeFrameJacobian(
             self.model, self.data, q, self.flange, pin.LOCAL_WORLD_ALIGNED
         )
         return J
 
     def newton_step(self, q: Array, target: pin.SE3) -> Array:
-        """One Newton step, shortened to `MAX_JOINT_STEP`; none at a singular posture."""
+        """Compute one Newton step, shortened to `MAX_JOINT_STEP`; none at a singular posture."""
         here = self.place(q)
         turn = Rotation.from_matrix(target.rotation @ here.rotation.T).as_rotvec()
         angle = float(np.linalg.norm(turn))
@@ -102,7 +102,8 @@ class PlainArm:
         return moved
 
     def residual(self, q: Array, target: pin.SE3) -> float:
-        """Distance and twice the sine of half the angle between placement and target, joined."""
+        """Compute the distance and twice the sine of half the angle between placement and target,
+        joined."""
         here = self.place(q)
         angle = Rotation.from_matrix(target.rotation @ here.rotation.T).magnitude()
         distance = np.linalg.norm(target.translation - here.translation)
@@ -111,7 +112,7 @@ class PlainArm:
     def search(
         self, previous: Array, change: Array, curve: Array, target: pin.SE3, values: Array
     ) -> Array:
-        """Joints (n,) for the next target by Newton's method from the joints before.
+        """Compute joints (n,) for the next target by Newton's method from the joints before.
 
         Args:
             change, curve: (n,) the last difference of the joints, and its difference.
@@ -143,7 +144,7 @@ class PlainArm:
     def follow(
         self, start: Array, poses: Array, wrenches: Array, values: Array | None = None
     ) -> dict[str, Array]:
-        """Every output of `symbolic.robot.arm.TRACK_OUTPUTS` along the samples.
+        """Compute every output of `symbolic.robot.arm.TRACK_OUTPUTS` along the samples.
 
         Args:
             start: (joints,) at the first pose [rad or m].

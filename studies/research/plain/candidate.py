@@ -83,7 +83,7 @@ class PlainEvaluator:
         return PlainCandidate(outputs, names, next((each[0] for each in here if each), ""))
 
     def _constraints(self, outputs: dict[str, Array], k: int) -> list[float]:
-        """Values of `CONSTRAINTS` at sample k."""
+        """Compute values of `CONSTRAINTS` at sample k."""
         workcell, values = self.workcell, {}
         friction = []
         for i, contact in enumerate(workcell.contacts):
@@ -108,7 +108,7 @@ class PlainEvaluator:
 
 
 def _violated(constraint: Array) -> list[list[str]]:
-    """Per sample the violated constraints, in order."""
+    """Return the violated constraints of each sample, in order."""
     return [
         [name for name, value in zip(CONSTRAINTS, values, strict=True) if value > 0.0]
         for values in constraint

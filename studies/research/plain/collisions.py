@@ -104,7 +104,8 @@ class PlainCollisionChecker:
         return hit
 
     def _tolerance(self, of_payload: bool) -> float:
-        """Distance up to which bodies collide [m]: displaced pads have the payload elsewhere."""
+        """Compute the distance up to which bodies collide [m]: displaced pads have the payload
+        elsewhere."""
         doubt = self.workcell.uncertainty
         displaced = doubt.pad_position if of_payload and doubt.stated else 0.0
         return self.workcell.collision.tolerance + displaced
@@ -115,7 +116,7 @@ class PlainCollisionChecker:
             solid.move(world_box)
 
     def _resting_places(self) -> list[tuple[str, Array, float]]:
-        """Body, place and departure of every allowed contact that a fixed pose makes."""
+        """Return body, place and departure of every allowed contact that a fixed pose makes."""
         task, places = self.workcell.task, []
         for waypoint in task.waypoints:
             if not waypoint.is_fixed:
@@ -129,7 +130,7 @@ class PlainCollisionChecker:
         return places
 
     def _allowed(self, centre: Array) -> set[str]:
-        """Bodies that the payload may touch with its centre here."""
+        """Return the bodies that the payload may touch with its centre here."""
         return {
             body
             for body, place, departure in self.resting

@@ -21,7 +21,7 @@ NODES = 14
 
 
 def waypoints(task: Task, x: Array) -> Array:
-    """All waypoints (n_waypoints, 6) of a decision vector, angles unwrapped."""
+    """Compute all waypoints (n_waypoints, 6) of a decision vector, angles unwrapped."""
     free = iter(np.reshape(x[: task.n_box], (-1, 6)))
     rows = np.array([w.lower if w.is_fixed else next(free) for w in task.waypoints])
     rows[:, 3:] = task.orientation.unwrapped(rows[:, 3:])
@@ -29,7 +29,7 @@ def waypoints(task: Task, x: Array) -> Array:
 
 
 def redundant_path(task: Task, x: Array) -> Array:
-    """Values (samples, m) of the redundant joints of a decision vector."""
+    """Compute values (samples, m) of the redundant joints of a decision vector."""
     free = iter(x[task.n_box :])
     columns = [
         [low if low == high else next(free) for low, high in zip(j.lower, j.upper, strict=True)]
@@ -41,11 +41,12 @@ def redundant_path(task: Task, x: Array) -> Array:
 
 
 def natural_quintic(points: Array) -> Array:
-    """Coefficients (n_segments, 6 powers, dim) of the natural quintic spline through points.
+    """Compute coefficients (n_segments, 6 powers, dim) of the natural quintic spline through
+    points.
 
-    Powers of the local parameter s in [0, 1] of each segment. The conditions are written down
-    one by one and solved: values at both ends of every segment, derivatives 1 to 4 continuous at
-    inner knots, derivatives 3 and 4 zero at both ends. Two points are joined by a straight line.
+    Powers of the local parameter s in [0, 1] of each segment. The conditions are written down one
+    by one and solved: values at both ends of every segment, derivatives 1 to 4 continuous at inner
+    knots, derivatives 3 and 4 zero at both ends. Two points are joined by a straight line.
     """
     segments = len(points) - 1
     if segments == 1:
@@ -94,13 +95,13 @@ def _powers(s: float, order: int) -> Array:
 
 
 def rotation(rpy: Array) -> Array:
-    """R_world_box (3, 3) by roll, pitch, yaw."""
+    """Compute R_world_box (3, 3) by roll, pitch, yaw."""
     matrix: Array = Rotation.from_euler("xyz", rpy).as_matrix()
     return matrix
 
 
 def box_rotation(orientation: Orientation, numbers: Array) -> Array:
-    """R_world_box (3, 3) by what the cell's numbers mean."""
+    """Compute R_world_box (3, 3) in the cell's convention."""
     if not orientation.is_vector:
         return rotation(numbers)
     turn: Array = Rotation.from_rotvec(numbers).as_matrix()
@@ -108,14 +109,14 @@ def box_rotation(orientation: Orientation, numbers: Array) -> Array:
 
 
 def euler_axes(rpy: Array) -> tuple[Array, Array, Array]:
-    """World axes about which roll, pitch and yaw turn, in this order."""
+    """Compute the world axes about which roll, pitch and yaw turn, in this order."""
     yaw = Rotation.from_euler("z", rpy[2])
     pitch = Rotation.from_euler("ZY", [rpy[2], rpy[1]])
     return pitch.apply([1.0, 0.0, 0.0]), yaw.apply([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0])
 
 
 def angular_rates(rpy: Array, rate: Array, second: Array) -> tuple[Array, Array]:
-    """Angular velocity and acceleration (3,) in the world frame of roll, pitch, yaw.
+    """Compute angular velocity and acceleration (3,) in the world frame of roll, pitch, yaw.
 
     Each axis is carried round by the turns outside it: d axis / dt = omega_outer x axis.
     """
@@ -132,7 +133,7 @@ def angular_rates(rpy: Array, rate: Array, second: Array) -> tuple[Array, Array]
 
 
 def vector_rates(vector: Array, rate: Array, second: Array) -> tuple[Array, Array]:
-    """Angular velocity and acceleration (3,) in the world frame of a rotation vector.
+    """Compute angular velocity and acceleration (3,) in the world frame of a rotation vector.
 
     omega = integral of exp(s v) v' over s in [0, 1]; exp(s v) itself turns with the same integral
     up to s (Chirikjian, Stochastic Models, Information Theory, and Lie Groups 2, 2012, 10.7).
@@ -149,7 +150,7 @@ def vector_rates(vector: Array, rate: Array, second: Array) -> tuple[Array, Arra
 def box_rates(
     orientation: Orientation, numbers: Array, rate: Array, second: Array
 ) -> tuple[Array, Array]:
-    """Angular velocity and acceleration (3,) by what the cell's numbers mean."""
+    """Compute angular velocity and acceleration (3,) in the cell's convention."""
     return (vector_rates if orientation.is_vector else angular_rates)(numbers, rate, second)
 
 
@@ -226,7 +227,7 @@ PLAIN_GRAVITY = np.array([0.0, 0.0, -9.81])
 
 
 def sample_load(workcell: Workcell, pose: Array, rate: Array, second: Array) -> dict[str, Array]:
-    """Every load quantity of one sample, named as in `LOAD_OUTPUTS`."""
+    """Compute every load quantity of one sample, named as in `LOAD_OUTPUTS`."""
     payload, contacts = workcell.payload, workcell.contacts
     orientation = workcell.task.orientation
     R = box_rotation(orientation, pose[3:])
@@ -268,7 +269,8 @@ def sample_load(workcell: Workcell, pose: Array, rate: Array, second: Array) -> 
 
 
 def allocate(f_n: float, f_t: float, friction: tuple[float, float]) -> tuple[Array, Array]:
-    """Least-effort normal forces (2,) and tangential shares (2,) of a resultant force [N]."""
+    """Compute the least-effort normal forces (2,) and tangential shares (2,) of a resultant force
+    [N]."""
     if friction[0] == friction[1]:
         return _equal_friction(f_n, f_t, friction[0])
     return _small_program(f_n, f_t, friction)

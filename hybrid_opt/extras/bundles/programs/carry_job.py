@@ -433,11 +433,11 @@ class Machine:
         sensors: Sequence[bool] = (False, False),
         inputs: Sequence[bool] = (False, False),
     ) -> None:
-        """Stand at the beginning.
+        """Begin at the start of the job, at rest.
 
         Args:
-            lag: by which the arms follow their commands in any case [s].
-            lead: from the decision to stop to its effect on the commands [s].
+            lag: delay of the arms behind their commands [s].
+            lead: time from the decision to stop to its effect on the commands [s].
             sensors: per arm, True if its force has to be measured.
             inputs: per arm, True if something has to tell whether its hands hold.
         """

@@ -61,7 +61,7 @@ NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
 def parts(time: float) -> tuple[int, int]:
-    """Whole seconds and the nanoseconds beyond them."""
+    """Split a time [s] into whole seconds and nanoseconds."""
     return divmod(round(time * 1e9), 10**9)
 
 
