@@ -41,7 +41,7 @@ KINDS = ("cups above", "cups beside", "magnets", "fingers")
 
 QUINTIC_SAMPLES = 101
 
-SWINGS = 12.0
+SWINGS = 15.0
 """How often a payload swings on its layers in a carry, at least; the model is of layers that do not
 swing."""
 

@@ -103,6 +103,28 @@ def test_the_recommended_carry_is_held_over_the_whole_uncertainty(
     assert "least forces with the set's worst friction: slip" in out
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("recommended", ["palletising", "plate"], indirect=True)
+def test_hands_hold_the_recommended_carry_over_the_whole_uncertainty(
+    recommended: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert simulate.main([str(recommended), "--runs", "20"]) == 0
+    out = capsys.readouterr().out
+    assert float(out.split("holds from ")[1].split()[0]) <= 1.02
+    assert "20 of 20 random cases hold (seed 1), 0 with half of it" in out
+
+
+@pytest.mark.parametrize("name", ["palletising", "rack"])
+def test_a_controller_of_other_hands_is_refused(
+    tmp_path: Path, name: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    cell, path = Cell.load(RACK.with_name(f"{name}.toml")).drivable(), tmp_path / "carry.json"
+    write_trajectory(path, cell.workcell, cell.initial, {}, {"algorithm": "nsga2"})
+    controller = "hands" if name == "rack" else "leader"
+    assert simulate.main([str(path), "--controller", controller]) == 2
+    assert f"--controller {controller} does not fit this cell" in capsys.readouterr().err
+
+
 def test_wrong_input_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert simulate.main([str(tmp_path / "none.json")]) == 2
     assert "none.json" in capsys.readouterr().err
