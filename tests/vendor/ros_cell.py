@@ -121,12 +121,16 @@ class RosCell(ControlledCell):
             (self._folder / "new").write_text(str(self._now - self.starts[0]), "utf-8")
             (self._folder / "new").replace(self._folder / "clock")
         self._clock.publish(Clock(clock=stamp))
-        for arm, robot in enumerate(self.robots):
-            if not self.silent[arm]:
-                message = JointState(name=robot["ros_joints"])
-                message.header.stamp = stamp
-                message.position = (self.q(arm) + self.offset[arm]).tolist()
-                self._states[arm % len(self._states)].publish(message)
+        for place, states in enumerate(self._states):
+            # One message of all joints, as joint_state_broadcaster publishes it.
+            arms = [a for a in (0, 1) if a % len(self._states) == place and not self.silent[a]]
+            message = JointState()
+            message.header.stamp = stamp
+            message.name = [name for arm in arms for name in self.robots[arm]["ros_joints"]]
+            message.position = [q for arm in arms for q in self.q(arm) + self.offset[arm]]
+            if arms:
+                states.publish(message)
+        for arm in (0, 1):
             felt, publisher = self.felt[arm], self._wrenches[arm]
             if publisher and felt is not None:
                 wrench = WrenchStamped()
