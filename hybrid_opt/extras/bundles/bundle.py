@@ -268,6 +268,7 @@ def manifest(
         skew: between the starts of both arms that the job was asked to survive [s].
     """
     job, k = export.job, export.stiffness
+    is_lost = bool(target.reaction and export.partner_stop.warning)
     step: dict[str, Any] = {"step": export.step}
     if export.gap is not None:
         step = asdict(export.gap) | {"stiffness": k, "allowed_share": TRACKED}
@@ -325,7 +326,7 @@ def manifest(
             _position(position_control(job, k)) for k in STIFFNESSES if job.follower is not None
         ],
         "start_skew": skews,
-        "warnings": warnings_of(job),
+        "warnings": warnings_of(job) + ([export.partner_stop.warning] if is_lost else []),
         "units": UNITS,
         "how_to_run": target.how_to_run,
         "written_by": f"dual-arm-carry {own_version()}",

@@ -318,6 +318,17 @@ class PartnerStop:
             f"{1e3 * self.distance:.0f} mm off their places{friction}"
         )
 
+    @property
+    def warning(self) -> str:
+        """Say what keeps a box that such a stop may lose; '' where friction holds it."""
+        if self.survived is None or self.distance <= self.survived:
+            return ""
+        return (
+            f"one arm's own stop may lose the box: it moves the pads {1e3 * self.distance:.0f} mm "
+            f"apart, friction holds up to {1e3 * self.survived:.0f} mm; time the carry with "
+            f"[handling] partner_stop = {self.survived:.3f}"
+        )
+
 
 Contents = Mapping[str, str | bytes]
 """File contents by path within a bundle."""

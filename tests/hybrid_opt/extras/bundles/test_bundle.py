@@ -215,6 +215,8 @@ def test_one_arms_stop_costs_distance(tmp_path: Path) -> None:
     assert stop["distance"] == pytest.approx(speed * stop["time"], rel=0.02)
     assert stop["survived"] < stop["distance"]
     assert stop["allowed"] is None
+    (page,) = (path.read_text() for path in tmp_path.rglob("README.md"))
+    assert f"partner_stop = {stop['survived']:.3f}" in page
 
     def limited(allowed: float) -> Job:
         cell = rack_job().workcell
