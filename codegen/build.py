@@ -96,8 +96,8 @@ class Library:
     """A library of the cache, loaded.
 
     Attributes:
-        entry: what the cache holds of it.
-        handle: what it offers, by attribute.
+        entry: its entry in the cache.
+        handle: its functions, by attribute.
     """
 
     entry: CacheEntry
@@ -121,7 +121,7 @@ class FunctionReport:
         name: in the set that was built.
         operations: instructions per evaluation, see `codegen.source.operations`.
         c_bytes: size of the C text.
-        compile_seconds: what the compiler took, now or when the cached library was made.
+        compile_seconds: time of the compiler, now or when the cached library was made.
         level: the compiler's optimisation level.
         from_cache: whether the library was there already.
     """
@@ -212,7 +212,7 @@ def build(
         cache: where libraries are kept; by default the user's.
         key: under which `load_or_build` is to find them; None if it is not to.
         levels: optimisation level per name, where the default by size is not wanted.
-        rebuild: compile also what is in the cache.
+        rebuild: compile also functions in the cache.
         lanes: evaluations of a batch that run side by side; 0 for what suits the machine.
 
     Raises:

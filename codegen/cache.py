@@ -165,7 +165,7 @@ class CacheEntry:
     """A library found in the cache, its content verified.
 
     Attributes:
-        key: what it was asked for by.
+        key: its key.
         library: path of the shared library.
         facts: what was stored with it.
     """
@@ -265,7 +265,7 @@ class Cache:
         Args:
             find: loads it; None where it is missing, damaged or cannot be loaded.
             make: makes and keeps it.
-            anew: make also what is there.
+            anew: make it even if it is there.
 
         Returns:
             It, and whether it was there already.

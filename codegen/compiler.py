@@ -143,7 +143,7 @@ class Compiler:
         command: its absolute path, then arguments that the user's CC carries.
         version: everything that it says of itself, target included.
         machine: the flag for the machine's own instruction set; empty if it knows none.
-        instructions: what it defines for that set.
+        instructions: its macros for that set.
     """
 
     command: tuple[str, ...]

@@ -76,7 +76,7 @@ class InterpretedFunction(NumericFunction):
     """A CasADi function evaluated by its instructions: the same results, slower.
 
     Attributes:
-        function: what it wraps.
+        function: the CasADi function.
     """
 
     def __init__(self, function: ca.Function) -> None:

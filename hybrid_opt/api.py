@@ -41,7 +41,7 @@ def search(
         rng: the search's only randomness; the same state gives the same front to the bit.
         settings: see there; None for the defaults. Where it names no initial candidates, the
             hand-made trajectory is in the first generation of all but the random search.
-        progress: True for a bar, or what takes candidates done and in all.
+        progress: True for a bar, or a function of candidates done and in all.
 
     Raises:
         SettingsError: an unknown algorithm or a value that is not allowed.
@@ -76,7 +76,7 @@ def polish(
         paths: carries of the cell whose paths are known to be good, or their decision vectors,
             with or without a force limit; in drivable cells only. The front is nowhere
             behind them. The hand-made path always takes part.
-        progress: True for a bar, or what takes attempts done and those expected in all: what is
+        progress: True for a bar, or a function of attempts done and those expected in all: what is
             left to do shows on the way, and both are equal in the end.
 
     Raises:
@@ -154,7 +154,7 @@ def compare_timings(
     Args:
         force_limit: normal force [N] of a force-limited timing, None for no such timing.
         curve_points: points of the curve of duration against force limit, None for no curve.
-        progress: True for a bar, or what takes timings done and in all, the margins as one.
+        progress: True for a bar, or a function of timings done and in all, the margins as one.
     """
     return time_trajectory(
         cell.timing_model, decision_of(carry), force_limit, curve_points, progress=progress

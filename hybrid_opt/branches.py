@@ -164,7 +164,7 @@ def search_branches(
             and round, beside those in which pairs are tried out.
         rng: its only randomness.
         algorithm: that searches.
-        progress: True for a bar, or what takes searches done and in all.
+        progress: True for a bar, or a function of searches done and in all.
 
     Raises:
         SettingsError: candidates of this cell are not evaluated in lanes, or it has not two

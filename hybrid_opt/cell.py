@@ -245,7 +245,7 @@ class Cell:
         """Refuse a payload that cannot be held still; checks without compiled code come first.
 
         Raises:
-            WorkcellError: it cannot; the text says what is needed, allowed, and what would do.
+            WorkcellError: it cannot; the text states the needed and allowed values, and remedies.
         """
         if self.static_hold_error:
             raise hold_error(self.workcell, self.static_hold_error)

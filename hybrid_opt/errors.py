@@ -32,7 +32,7 @@ class JobError(DualArmError):
 
 
 class ProposalError(DualArmError):
-    """No carry was found for a problem; the text says what is in the way."""
+    """No carry was found for a problem; the text names the obstacle."""
 
 
 class NoHoldError(ProposalError):

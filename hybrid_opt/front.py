@@ -37,7 +37,7 @@ class Front(Displayable):
         x: (k, n_var) decision vectors.
         objectives: (k, n_obj).
         evaluations: every candidate of the search, in order.
-        polished: what the polish did, None without one.
+        polished: record of its polish, None without one.
         replica: of a study, from 0; None where it is of none.
     """
 

@@ -91,7 +91,7 @@ class Progress:
 
     Attributes:
         shown: False to show nothing.
-        of: what the stages belong to, in front of their titles.
+        of: name in front of the stages' titles.
     """
 
     def __init__(self, shown: bool = True, of: str = "") -> None:
@@ -105,11 +105,11 @@ class Progress:
         """Show a line during the `with` block.
 
         Args:
-            title: what is being done.
+            title: the current work.
             total: units in all.
-            unit: what is counted.
+            unit: name of a counted unit.
             done: units that an earlier attempt did.
-            delay: what is over sooner is not shown [s].
+            delay: shorter work is not shown [s].
         """
         bar = tqdm(
             total=total,

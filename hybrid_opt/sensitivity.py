@@ -204,7 +204,7 @@ def sensitivities(carry: Carry | Timing, *, progress: ShowProgress = False) -> S
         carry: under the time law of its task; or the fastest timing of a path within limits. Of a
             timing the force is that of the same motion, and the duration that of the fastest one
             within the same limits, a limit of force included.
-        progress: True for a bar, or what takes numbers done and in all.
+        progress: True for a bar, or a function of numbers done and in all.
 
     Raises:
         SettingsError: the carry has another timing, a timing limits robust forces or is not the

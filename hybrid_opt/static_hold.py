@@ -125,7 +125,7 @@ class StaticUtilisation:
     """Use of a limit while standing still at one end of the path.
 
     Attributes:
-        quantity: what is limited.
+        quantity: the limited quantity.
         whose: the robot, or robot/joint.
         where: 'start' or 'goal'.
         needed, allowed: [unit].

@@ -203,7 +203,7 @@ def _controller(modules: int) -> ThreadpoolController:
 def warm_up(*modules: str) -> None:
     """Start the server that workers come from, and let it load modules meanwhile.
 
-    For programs; without it, each worker loads what it needs.
+    For programs; without it, each worker loads its own modules.
     """
     multiprocessing.get_context("forkserver").set_forkserver_preload(list(modules))
     with _without_interrupts():

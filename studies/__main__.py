@@ -68,7 +68,7 @@ def main(arguments: Sequence[str] | None = None, called: str = "python -m studie
 
 
 def command() -> None:
-    """Run what the installed command is given, and end the process."""
+    """Run the installed command, and end the process."""
     sys.exit(run_program(partial(main, called=COMMAND)))
 
 

@@ -96,7 +96,7 @@ _SECTION = re.compile(rb"^\s*\[+\s*(task|payload|robots|contacts)\b", re.MULTILI
 
 
 def _kind_of(path: Path) -> str:
-    """Name what a path holds; '' where that is unknown."""
+    """Name the content of a path; '' if unknown."""
     if path.is_dir():
         is_study = (path / stated("hybrid_opt.campaign.settings.CONFIGURATION")).exists()
         return RESULTS if is_study else "a folder"
@@ -239,7 +239,7 @@ def require_extra(extra: str, use: str) -> None:
 
     Args:
         extra: of `EXTRAS`.
-        use: what needs it, for the message.
+        use: the feature that needs it, for the message.
 
     Raises:
         SettingsError: a module of it is missing.
@@ -351,7 +351,7 @@ def stated(name: str) -> Any:
             'hybrid_opt.campaign.settings.CampaignSettings.seed'.
 
     Returns:
-        The value; of a `Literal` what it allows, of a table its keys.
+        The value; of a `Literal` its allowed values, of a table its keys.
 
     Raises:
         LookupError: the source states no such value.

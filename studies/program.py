@@ -174,12 +174,12 @@ class Program:
 
     Attributes:
         name: below `studies`.
-        description: what it does, for its help.
+        description: of its work, for its help.
         add_options: adds its options; `--verbose` is there.
         run: does its work with the options, returns the exit code; or the name, with its module's,
             of a function that does, its libraries in one thread. Beside the options it finds
             `called`, as the program was called, and `arguments`, the words of its command line.
-        interrupted: what to say after Ctrl-C.
+        interrupted: text after Ctrl-C.
         complete: fills in places that follow from other options and requires the extras that the
             options need; called before paths are checked.
         further: options that only `--help-all` explains.
@@ -316,7 +316,7 @@ def carry_out(program: str, work: Callable[[], int], interrupted: str = "interru
     Args:
         program: how it is called, in front of the message.
         work: returns the exit code.
-        interrupted: what to say after Ctrl-C.
+        interrupted: text after Ctrl-C.
     """
     try:
         return work()

@@ -58,7 +58,7 @@ class TextPattern:
     """Allowed form of a text.
 
     Attributes:
-        problem: what is wrong with a value, '' where nothing is.
+        problem: function that describes the fault of a value, '' without one.
     """
 
     problem: Callable[[Any], str]
@@ -126,7 +126,7 @@ def require_allowed(settings: object, whose: str = "") -> None:
         whose: the settings are, in front of the message.
 
     Raises:
-        SettingsError: with the value, and what is allowed.
+        SettingsError: with the value and the allowed ones.
     """
     for name, kind in get_type_hints(type(settings), include_extras=True).items():
         value: Any = getattr(settings, name)

@@ -63,7 +63,7 @@ class Parameter:
 
     Attributes:
         group: they belong to.
-        key: path in the workcell file, or what they are.
+        key: path in the workcell file, or a description.
         shape: () of one.
     """
 

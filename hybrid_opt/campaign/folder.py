@@ -56,8 +56,8 @@ class ExecutionSettings:
         jobs: worker processes, 0 for one per core that this process may use.
         executor: 'processes' of this machine, or 'dask' for a cluster.
         scheduler: address of the Dask scheduler, only with 'dask'.
-        resume: continue what the results folder holds.
-        overwrite: remove what a study left in the results folder, and begin anew.
+        resume: continue the study in the results folder.
+        overwrite: remove the study in the results folder, and begin anew.
     """
 
     output: Path
@@ -71,7 +71,7 @@ class ExecutionSettings:
         """Check every value.
 
         Raises:
-            SettingsError: with the value, and what is allowed.
+            SettingsError: with the value and the allowed ones.
         """
         require_allowed(self)
         if self.resume and self.overwrite:
@@ -157,7 +157,7 @@ class CampaignFolder:
 
     Attributes:
         root: the folder.
-        settings: what is computed.
+        settings: of the campaign.
         execution: how.
         cell: of the folder's own copy of the workcell, with the settings' objectives.
         files: the workcell's files.

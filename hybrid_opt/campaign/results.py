@@ -67,7 +67,7 @@ class Replica:
         algorithm: its name.
         replica: its number, from 0.
         evaluations: every candidate in the order of evaluation.
-        seconds: what the search took.
+        seconds: duration of the search.
     """
 
     algorithm: str
@@ -100,7 +100,7 @@ class CampaignResults:
 
     Attributes:
         root: the results folder.
-        configuration: what is in its configuration.json.
+        configuration: content of its configuration.json.
         cell: of the folder's copy of the workcell, with the study's objectives.
         replicas: of all algorithms, by algorithm and number.
     """

@@ -74,7 +74,7 @@ class CampaignSettings:
         seed: the campaign's seed; every replica derives its own from it.
         objectives: names known to `hybrid_opt.evaluate.objectives`, each once.
         constraint_handling: 'penalty' (the paper's) or 'constraints'.
-        first_generation: what the searches start from; uniform random search is always all random.
+        first_generation: start of the searches; uniform random search is always all random.
     """
 
     algorithms: Mapping[str, Mapping[str, Any]] = field(default_factory=lambda: chosen(ALGORITHMS))
@@ -89,7 +89,7 @@ class CampaignSettings:
         """Check every value and fill in the algorithms' settings.
 
         Raises:
-            SettingsError: with the value, and what is allowed.
+            SettingsError: with the value and the allowed ones.
         """
         require_allowed(self)
         select_objectives(self.objectives)
@@ -137,7 +137,7 @@ class StoredCell:
 
 @dataclass(frozen=True)
 class Configuration:
-    """configuration.json: what the results depend on."""
+    """configuration.json: everything that decides the results."""
 
     format: str
     version: int

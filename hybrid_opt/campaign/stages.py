@@ -64,7 +64,7 @@ class Stage:
         name: unique; names its marker.
         run: does it.
         settings: what decides its results besides the campaign, as JSON values.
-        whole: whether what it left is still there and undamaged; looked at once it is done.
+        whole: returns True if its results are there and undamaged; called once it is done.
     """
 
     name: str
@@ -78,7 +78,7 @@ def run_stages(folder: CampaignFolder, stages: Sequence[Stage], progress: Progre
 
     Raises:
         ResultsError: a stage began with other settings.
-        DualArmError: what a stage raises.
+        DualArmError: as of a stage.
     """
     check_stages(folder, stages)
     for number, stage in enumerate(stages):

@@ -34,7 +34,7 @@ class Solid:
 
     Attributes:
         name, group: of the collision body.
-        frame: what it is fixed to.
+        frame: the frame that it is fixed to.
         vertices: (n, 3) [m].
         faces: (m, 3) indices, outward.
         is_ground: whether it is a large fixed plate.

@@ -74,7 +74,7 @@ class Evaluations:
     Attributes:
         x: (n, n_var) decision vectors.
         objectives: (n, m) values without penalty; only meaningful where feasible.
-        penalised: (n, m) objectives with the paper's penalty, always finite; what a search sees.
+        penalised: (n, m) objectives with the paper's penalty, always finite, for searches.
         feasible: (n,).
         reason: (n,) index into `REASONS` of the constraint violated first along the path, or
             `FEASIBLE`.
@@ -143,7 +143,7 @@ class CandidateEvaluator:
     Attributes:
         workcell: the cell.
         compiled: where its functions come from.
-        objectives, objective_names: what is minimised, and its names.
+        objectives, objective_names: the minimised objectives, and their names.
         functions: the cell's compiled functions by name.
         checker: FCL's verdict on samples.
         n_var, lower, upper: size and bounds of the decision vector.

@@ -145,7 +145,7 @@ class Kernel:
         """Evaluate decision vectors (n, n_var).
 
         Args:
-            wanted: of `sample_sizes`, what is needed per sample.
+            wanted: those of `sample_sizes` that are needed per sample.
             with_collisions: False leaves collisions out.
             begin: joints of both arms, side by side, that hold the box at the start; None for
                 those of the cell's start branches.

@@ -30,7 +30,7 @@ class Objective:
 
     Attributes:
         name: its name on the command line and in results.
-        title: what it is, for axes and tables.
+        title: its name on axes and in tables.
         evaluate: its values (n,).
         needs: the outputs that it uses; evaluation is slower where it is not said (None).
     """

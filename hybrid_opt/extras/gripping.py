@@ -74,7 +74,7 @@ def propose_grip(
         along: how far they may go level along their faces: of the first robot's pad to its left,
             seen from the robot.
         trials: places that are tried.
-        progress: True for a bar, or what takes places done and in all.
+        progress: True for a bar, or a function of places done and in all.
 
     Raises:
         SettingsError: a range is empty or none, the pads are others, or nothing within the ranges

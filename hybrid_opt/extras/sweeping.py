@@ -100,7 +100,7 @@ def read_sweep(file: Path) -> Sweep:
 
 
 def require_keys(cell: Cell, over: Mapping[str, Sequence[float]]) -> None:
-    """Refuse a sweep over what a cell does not have, before any work.
+    """Refuse a sweep over keys that a cell does not have, before any work.
 
     Raises:
         SettingsError, WorkcellError: as of `sweep`.
@@ -130,7 +130,7 @@ def sweep(
         fixed: whether the path stays as it is; otherwise it is polished in every changed cell.
         file: where combinations are stored as they are done, and are found again; None for none.
         jobs: worker processes, 0 for one per core; has no influence on the answer.
-        progress: True for a bar, or what takes combinations done and in all.
+        progress: True for a bar, or a function of combinations done and in all.
 
     Raises:
         SettingsError: the cell has another time law, the path does not fit it, there are no values,
@@ -171,10 +171,10 @@ def sweep(
 
 
 class _Chains:
-    """Chains of combinations that differ in the last key alone, each with what is done of it.
+    """Chains of combinations that differ in the last key alone, each with its finished rows.
 
     Attributes:
-        sweep: its rows are what is done, in the order of the sweep.
+        sweep: its rows are the finished ones, in the order of the sweep.
         size: combinations in all.
         columns: values of the last key.
         done: rows by their values.

@@ -67,7 +67,7 @@ class RankTest:
         a12: Vargha and Delaney's effect size, the chance that a value of the first sample
             exceeds one of the second, ties counting half; 0.5 is no effect.
         magnitude: of |a12 - 0.5|: small from 0.06, medium from 0.14, large from 0.21.
-        figure: what was compared, '' where that is stated elsewhere.
+        figure: the compared figure, '' if stated elsewhere.
     """
 
     first: str

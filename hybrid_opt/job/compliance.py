@@ -48,7 +48,7 @@ class PositionControl:
         penetration: (2,) largest that each arm has to aim into the box [m].
         force_error: change of force by `POSITION_ERROR` of both arms [N].
         share: of the least commanded force while the box is held.
-        margin: least force beyond what holds the box while it is held [N].
+        margin: least excess over the force that holds the box [N].
     """
 
     stiffness: float
@@ -77,7 +77,7 @@ class Skew:
         displacement: largest relative displacement of the pads [m].
         force_change: largest change of the normal forces [N].
         share: the same, of the normal force commanded at that moment.
-        margin: least normal force beyond what then holds the box [N].
+        margin: least excess over the normal force that then holds the box [N].
         late: index of the arm whose delay leaves that least.
     """
 

@@ -91,7 +91,7 @@ class StraightMotions:
     Attributes:
         checker: of the whole job.
         lines: straight motions before the carry and after it, either from the carry outwards.
-        stands_on: names of what the box stands on before and after.
+        stands_on: names of the box's supports before and after.
     """
 
     checker: CollisionChecker

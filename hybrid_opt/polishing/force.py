@@ -159,7 +159,7 @@ class ForceProgram:
         """Form the program around a candidate.
 
         Args:
-            required: the rows, and what each has to keep; forces stay below their peaks.
+            required: the rows and their required values; forces stay below their peaks.
             carry: the candidate x (n_var,) on places.
             radius: half the width of the box of trust, in halves of the variables' ranges.
         """

@@ -101,7 +101,7 @@ class IntervalGrid:
         robust: robust forces, None if planned ones are limited.
         layout: of the quantities.
         load: slice of the load among them.
-        rest: slice of what is limited at rest: the pressure if it is, else load or forces.
+        rest: slice of the quantities limited at rest: the pressure, else load or forces.
         has_pressure_limit: whether the pressure is.
         variables: of a point, see `DrivenLayout.variables`.
         spread: (variables of the path, n_path) path by the program's variables.

@@ -64,7 +64,7 @@ class Wish:
         """Refuse two targets, and values that are not positive.
 
         Raises:
-            SettingsError: with what was found.
+            SettingsError: with the values.
         """
         if self.duration is not None and self.force is not None:
             raise SettingsError("duration and force are wished for; give at most one of them")
@@ -335,7 +335,7 @@ def gentle_start(cell: Cell) -> Array:
 
 
 def refuse(options: Sequence[Option], wish: Wish, goal: Goal, budget: GripBudget) -> None:
-    """Refuse a wish that no option keeps to, and say what is possible.
+    """Refuse a wish that no option fulfils, and state the possible values.
 
     Raises:
         SettingsError: it does.

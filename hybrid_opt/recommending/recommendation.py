@@ -74,7 +74,7 @@ class Recommendation(Displayable):
     """The carry to run.
 
     Attributes:
-        wish: what was asked for.
+        wish: the target.
         member: its path's place in the front that it was chosen from.
         x: (n_var,) decision vector: the path, then the force limit [N].
         timing: as robots drive it, every limit recomputed, limits on jerk among them where the cell
@@ -94,7 +94,7 @@ class Recommendation(Displayable):
             which they do.
         reserve: how heavy and how slippery the box may be within the reference forces, in every
             case.
-        why: what it was chosen by.
+        why: the reason of the choice.
     """
 
     wish: Wish
@@ -182,7 +182,7 @@ def recommend(
             for these.
         others: (n_path,) paths by label, beside which the answer stands; the hand-made one always
             is.
-        progress: True for a bar, or what takes steps done and in all.
+        progress: True for a bar, or a function of steps done and in all.
         alone: whether margins, rivals and advice are left out.
 
     Raises:
@@ -364,7 +364,7 @@ class Alternative:
     """A path driven as fast as the same limits allow, those on jerk among them.
 
     Attributes:
-        label: what it is.
+        label: its name.
         duration_at_force: [s] with the recommended carry's commanded force, infinite where it
             cannot.
         force_at_duration: force to command [N] in the recommended carry's time, infinite where it

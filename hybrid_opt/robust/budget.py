@@ -211,7 +211,7 @@ def reserve(model: RobustModel, motion: HeldMotion, required: Array, allowed: Ar
         model, motion, required, allowed: as of `cheapest_remedies`.
 
     Returns:
-        NaN for what no value within the considered range achieves.
+        NaN if no value within the considered range suffices.
     """
     excess, workcell = _excess(model, motion, required, allowed), model.workcell
     friction = min(pad.friction for pad in workcell.contacts)
@@ -234,7 +234,7 @@ def _last_factor(excess: Callable[[float], float], near: float, far: float) -> f
 def _excess(
     model: RobustModel, motion: HeldMotion, required: Array, allowed: Array
 ) -> Callable[[Workcell], float]:
-    """Return the excess of a changed cell's forces over what is allowed, as a share of it."""
+    """Return the relative excess of a changed cell's forces over the allowed ones."""
     known = largest_forces(model, motion)
     rows = model.governing_rows(motion, model.workcell.uncertainty, LEADER)
     # What a command holds beyond its motion, as by smoothing, stays in proportion.

@@ -24,7 +24,7 @@ def write_bundle(
 ) -> tuple[Path, ...]:
     """Write a bundle, or replace an older one of the same folder, in one step.
 
-    Everything is written beside the folder first, so that a full disk leaves what was there.
+    Everything is written beside the folder first, so that a full disk leaves the old files.
 
     Args:
         folder: of the bundle alone.

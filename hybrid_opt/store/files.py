@@ -46,7 +46,7 @@ def storing(path: Path, remedy: str = RESUME) -> Iterator[None]:
     """Report a failure to store `path` as one clear message.
 
     Args:
-        remedy: what to do where the disk is full.
+        remedy: advice for a full disk.
     """
     try:
         yield
@@ -66,7 +66,7 @@ def write_atomically(path: Path, content: bytes, remedy: str = RESUME) -> None:
     """Replace a file in one step, durably; make its folder if it is missing.
 
     Args:
-        remedy: what to do where the disk is full.
+        remedy: advice for a full disk.
 
     Raises:
         ResultsError: it cannot be written.
@@ -114,11 +114,11 @@ def from_json(
         kind: the record's class.
         value: the values.
         path: of the file, or what else they are called in messages.
-        remedy: what to do about a damaged file.
+        remedy: advice for a damaged file.
         is_open: whether keys that are no fields are left alone.
 
     Raises:
-        ResultsError: they describe none; with the field and what is wrong with it.
+        ResultsError: they describe none; with the field and its fault.
     """
     try:
         record: Record = checked(kind, value, "", FirstProblem(open=is_open))
@@ -154,7 +154,7 @@ def read_json(path: Path, remedy: str = "") -> Any:
 
     Args:
         path: the file.
-        remedy: what to do where it is damaged.
+        remedy: advice for a damaged file.
 
     Raises:
         ResultsError: the file cannot be read or is not JSON.
@@ -175,7 +175,7 @@ def read_document(path: Path, form: str, version: int, remedy: str = "") -> dict
     """Read a JSON object that names its format and version, which are left in it.
 
     Args:
-        remedy: what to do where it is damaged, or something else.
+        remedy: advice for a damaged or other file.
 
     Raises:
         ResultsError: the file cannot be read, or is of another format or version.

@@ -421,7 +421,7 @@ def _judged_text(judgement: Judgement) -> str:
 
 
 def inspect(options: argparse.Namespace) -> int:
-    """Inspect the workcell that the options name, and print what is found; returns the exit code.
+    """Inspect the workcell that the options name, and print the findings; return the exit code.
 
     Raises:
         DualArmError: the workcell is wrong, or a picture cannot be written.

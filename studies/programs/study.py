@@ -228,7 +228,7 @@ def study_text(root: Path, with_paper: bool, brief: bool = False) -> str:
 
 
 def make_study(path: Path, options: argparse.Namespace, with_paper: bool) -> None:
-    """Make a study of a workcell's file, print its figures, and show what was asked for.
+    """Make a study of a workcell's file, print its figures, and show the requested views.
 
     Raises:
         DualArmError: the workcell, an option or the results folder is wrong, or work failed.

@@ -37,7 +37,7 @@ REMARK = 60
 
 
 def sweep_numbers(options: argparse.Namespace) -> int:
-    """Sweep, and print and write what was found."""
+    """Sweep, and print and write the results."""
     if options.jobs != 1:
         warm_up("hybrid_opt.extras.sweeping")  # while this process finds the first path
     cell, over = Cell(load_workcell(options.workcell)).drivable(), dict(options.over)

@@ -156,7 +156,7 @@ def export_file(options: argparse.Namespace) -> int:
 
 
 def driver_changes(path: Path, workcell: Workcell) -> dict[str, Any]:
-    """Read what a file states of the drivers and tool loads of a workcell's robots.
+    """Read drivers and tool loads of a workcell's robots from a file.
 
     Args:
         path: a file with `[[robots]]` sections: of them the keys `name`, `driver` and `tool_load`

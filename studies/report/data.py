@@ -60,8 +60,8 @@ class ReportRun:
     """One replica of one algorithm.
 
     Attributes:
-        front: what the search found.
-        hybrid: what the polish made of it, None without a polish.
+        front: of the search.
+        hybrid: its polished front, None without a polish.
         figures: indicators of both, as in summary.json.
     """
 
@@ -77,7 +77,7 @@ class ReportRun:
 
     @property
     def fronts(self) -> tuple[Front, ...]:
-        """What the search found, and what the polish made of it, where it has members."""
+        """The non-empty fronts of the search and of its polish."""
         return (self.front, *([self.hybrid] if self.hybrid else []))
 
 
@@ -115,7 +115,7 @@ class Experiment:
     Attributes:
         workcell: the cell.
         files: its files.
-        objectives: names of what the search minimised.
+        objectives: names of the search's objectives.
         summary: the content of summary.json.
         algorithms: in the campaign's order.
         union: of a drivable experiment the polished union of all fronts, None without a polish.
@@ -161,7 +161,7 @@ class Experiment:
 
 @dataclass(frozen=True)
 class ReportData(Experiment):
-    """Everything that a report shows: the first experiment, and what stands beside it.
+    """Content of a report: the first experiment, and everything beside it.
 
     Attributes:
         root: the results folder.
@@ -238,7 +238,7 @@ class ReportData(Experiment):
 def gather(
     results: CampaignResults, workers: Workers | None = None, paper: bool = True
 ) -> ReportData:
-    """Evaluate what is drawn in detail.
+    """Evaluate the drawn carries in detail.
 
     Args:
         results: of a finished study.

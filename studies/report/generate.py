@@ -54,7 +54,7 @@ class ReportPicture:
 
     Attributes:
         name: of its files, without suffix.
-        caption: what it shows, one or two sentences of plain text.
+        caption: one or two sentences of plain text.
         make: draws it, without style.
     """
 
@@ -241,7 +241,7 @@ def render_page(
     """Return the page's text.
 
     Args:
-        document: what its scripts show, from `page_data`.
+        document: data of its scripts, from `page_data`.
         tables: all of the report.
         pictures: as HTML, in the order of `report_pictures`.
     """

@@ -51,7 +51,7 @@ class Film:
     """A motion to be shown.
 
     Attributes:
-        label: what stands above it.
+        label: text above it.
         time: (n,) [s].
         pose: (n, 6) of the box [m, rad].
         q: (n, all joints) of both arms side by side [rad].

@@ -167,7 +167,7 @@ def drive_look(points: Array, always: Array, allowed: float) -> Array:
 
     Args:
         points: of the fronts and curves.
-        always: (n, 2) what the look has to show besides.
+        always: (n, 2) further points that the view has to show.
         allowed: the reference force [N].
     """
     points = _finite(points)

@@ -86,12 +86,12 @@ class StoredRecommendation:
     """The carry to run.
 
     Attributes:
-        wish, why: what was asked for, as values and as words.
+        wish, why: the target, as values and as text.
         source: whose it is, as 'NSGA-II, polished, replica 3'.
         file: its trajectory file, relative to the folder.
         duration: as robots drive it, limits on jerk kept [s].
         force: largest force to command of the force-controlled arm [N]; the one force.
-        parts: what it is made of, its sum.
+        parts: contributions whose sum is the force.
         job_duration: of the whole job [s], null where none can be planned.
         force_limit: of the search [N].
         peak_force: largest planned normal force of each robot [N].
@@ -224,7 +224,7 @@ def recommend_from(
     target: str = EXPORT_TARGET,
     threads: int = 0,
 ) -> StoredRecommendation:
-    """Recommend a carry of a study's drivable fronts, and store it; returns what is said of it.
+    """Recommend a carry of a study's drivable fronts, and store it; return its text.
 
     Args:
         root: the results folder, its drivable experiment done.
@@ -234,7 +234,7 @@ def recommend_from(
 
     Raises:
         NoCarryError: no drivable carry was found; the text says why.
-        SettingsError: no carry can do what is wished for.
+        SettingsError: no carry fulfils the wish.
         ResultsError: the folder is not complete or damaged, or the file cannot be written.
     """
     campaign = read_campaign(root)

@@ -130,7 +130,7 @@ class ReplicaFigures(FrontFigures):
     Attributes:
         replica: its number, from 0.
         evaluations, feasible, feasible_share: candidates.
-        seconds: what the search took.
+        seconds: duration of the search.
         infeasible_by_reason: candidates by what made them infeasible.
         best_so_far: evaluations at which the best of an objective changed: number, then the best.
         polished: None where the replica's front was not polished.

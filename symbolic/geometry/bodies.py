@@ -52,7 +52,7 @@ class CollisionBody(ContentRecord):
     Attributes:
         name: environment bodies keep theirs; links and tools are 'robot/link'.
         group: which of the four parties of the cell it belongs to.
-        frame: what it is fixed to.
+        frame: the frame that it is fixed to.
         pieces: its convex pieces, in that frame.
         is_tool: whether it is part of a robot's tool.
         carries: arms (0, 1) of a machine that have this link as their mount, see

@@ -82,7 +82,7 @@ class CellGeometry:
         active: pairs to be checked; the order of every clearance vector.
         excluded: all other pairs, with the reason.
         possible: pairs that are checked with some numbers of the cell, or while the box is not
-            held, the active ones among them; the order of what is compiled.
+            held, the active ones among them; the order of compiled functions.
         near: how many of these come first because most cells check some of them. The others are
             bounded where some are active: what a grasp holds together, and of every arm what comes
             before its second joint with anything but its own arm and the payload.

@@ -109,11 +109,11 @@ class ScreenBody(ContentRecord):
 
     Attributes:
         group: see `CollisionBody`.
-        frame: what it is fixed to; 'world' with a robot for what stands at that one's base.
-        cover: simple shapes that contain it, in that frame, what stands at a base in that one's;
-            () of an obstacle.
+        frame: the frame that it is fixed to; 'world' with a robot for bodies at that robot's base.
+        cover: simple shapes that contain it, in that frame or in that of its base; () of an
+            obstacle.
         chain: likewise in that frame, or in the world; None of an obstacle.
-        extent: (2 n + 2, 3) of what stands at a base: least and largest coordinates in the world of
+        extent: (2 n + 2, 3) of bodies at a base: least and largest coordinates in the world of
             all, then of each of n simple shapes [m].
         reach: None of what stands.
         pieces: of each the pose in its frame: rotation (3, 3), None for the frame's, and centre

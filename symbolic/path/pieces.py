@@ -86,7 +86,7 @@ def hierarchical_basis(task: Task) -> tuple[Array, Array]:
     waypoint takes along those of finer grids, on the path through the grid where it is first.
 
     Returns:
-        (n_path, n_path) what each move does, and (n_path,) the square of the spacing of each
+        (n_path, n_path) effect of each move, and (n_path,) the square of the spacing of each
         move's grid, in that of the stated ones: accelerations for equal moves go by its inverse.
     """
     (rows, columns), m = task.free_entries, len(task.waypoints)

@@ -30,8 +30,8 @@ def completed(text: str, data: Mapping[str, Any], changes: Changes) -> str:
 
     Args:
         text: the file; '' to write `data` without comments.
-        data: what the file holds, without what is replaced.
-        changes: what is set.
+        data: content of the file without the replaced values.
+        changes: the values to set.
 
     Raises:
         SettingsError: the file is written in a way that cannot be completed.
@@ -47,7 +47,7 @@ def with_paths(data: Mapping[str, Any], change: Callable[[str], str]) -> Changes
 
     Args:
         data: the tables of a workcell file.
-        change: from a path, or an address of a package, to what takes its place.
+        change: from a path, or an address of a package, to its replacement.
     """
 
     def changed(table: Any, *keys: str) -> dict[str, Any]:
@@ -79,9 +79,9 @@ def extended(text: str, data: Mapping[str, Any], key: str, tables: list[dict[str
     """Return a workcell file's text with tables appended to an array, such as `[[environment]]`.
 
     Args:
-        text, data: the file, and what it holds.
+        text, data: the file, and its content.
         key: of the array, at the top level; it may be missing.
-        tables: what is added.
+        tables: the new tables.
 
     Raises:
         SettingsError: see `completed`.

@@ -71,7 +71,7 @@ def mjcf_as_urdf(path: Path, content: bytes) -> bytes:
             count as they are when the process reads them first.
 
     Raises:
-        OutsideError: MuJoCo does not take it, or it holds what a URDF has no words for.
+        OutsideError: MuJoCo does not take it, or a URDF cannot express its content.
     """
     mujoco, spec, model = compiled(path)
     if any(np.any(mesh.refpos) or abs(mesh.refquat[0]) < 1.0 for mesh in spec.meshes):

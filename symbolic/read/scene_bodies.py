@@ -54,7 +54,7 @@ class ImportedScene:
 
     Attributes:
         bodies: in the world; every name is a body's of an environment, and unique.
-        left_out: what is no body of it, each 'NAME: why'.
+        left_out: parts that are no bodies, each 'NAME: why'.
         notes: differences between a body and its scene, and bodies that are only visible, each
             'NAME: text'.
         files: meshes that stand in the scene itself, STL by the path that their body names.

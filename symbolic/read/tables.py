@@ -202,7 +202,7 @@ class TableReader:
         """Read a record whose fields are the table's keys, except those passed as `given`.
 
         Raises:
-            ValueError: the record itself refuses what its fields allow.
+            ValueError: the record itself refuses the values.
         """
         found, own_hints = dict(given), _hints(cast("Any", kind))
         for field in fields(kind):  # type: ignore[arg-type]
@@ -441,7 +441,7 @@ def read_file(
 
     Args:
         table, key: where it is named.
-        folder: what its path is relative to.
+        folder: base of its relative path.
         most: its largest size [bytes].
         at: where it is, if its name is no path but an address.
     """
@@ -467,7 +467,7 @@ def read_inertia(table: TableReader, bound: float, allowed: str = "a 3 x 3 matri
     Args:
         table: where it stands.
         bound: no principal moment can exceed this [kg m^2].
-        allowed: what a message says is allowed.
+        allowed: the allowed values, for a message.
     """
     value = table.raw("inertia")
     path, problems = table.at("inertia"), table.problems

@@ -480,7 +480,7 @@ def posture_path(
     limits.
 
     Args:
-        robot, contact: the arm and what it holds the box by.
+        robot, contact: the arm and its contact.
         task: with or without its redundant joints.
         held: joints that stand still, by their indices [rad or m].
 

@@ -553,7 +553,7 @@ class Workcell:
             -1 for the stated criterion's choice, or `SEARCHED_BRANCH`: all compete, see
             `hybrid_opt.branches`, and until then it is the criterion's choice.
         source: the file it came from.
-        reading: what it was like when it was read from `source`.
+        reading: its state when it was read from `source`.
         text: what was read in the place of that file's content; None for that.
     """
 

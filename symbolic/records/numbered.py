@@ -105,14 +105,14 @@ class GraspNumbers:
     parameters: n entries of all pads' states; b rows of balance.
 
     Attributes:
-        left: (b,) which of the n components are what the others leave.
+        left: (b,) the dependent ones of the n components.
         squeeze: (n,) internal squeeze to start from.
         spread: (n, 6) the least states that balance a load.
         load_to_left, free_to_left: (b, 6) and (b, n - b), what the load and the free components
             leave to the others, in units of `symbolic.contact.grasp.Grasp.units`.
         to_robots: (6, 6 k) from all pads' wrenches to force and moment of the robot that has the
             pad, see `symbolic.contact.force_closure`.
-        shapes: per pad what its cone depends on, its lengths over its radius; () of a disc.
+        shapes: lengths of each pad over its radius, on which its cone depends; () of a disc.
         load_at_rest: (6,) direction of the load at the start.
         rest, rest_slopes: (n,) and (n, 6) states on the central path there, and their slopes.
         reach: size of the patches that the squeeze lies within, over the cell's own.

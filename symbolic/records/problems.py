@@ -38,7 +38,7 @@ class Problems:
     """True if unknown keys are no problem."""
 
     def add(self, path: str, text: str) -> None:
-        """Record that the value at `path` is wrong; `text` says what is found and allowed.
+        """Record that the value at `path` is wrong; `text` states the found and the allowed value.
 
         After `MOST_PROBLEMS` they are only counted.
         """
@@ -109,7 +109,7 @@ _short.maxlist = _short.maxdict = 60
 
 
 def text_problem(value: Any) -> str:
-    """Return what is wrong with a value as a text for reports, or an empty string."""
+    """Return the fault of a value as a text for reports, or an empty string."""
     if not isinstance(value, str):
         return "allowed is a text"
     if not value.strip():

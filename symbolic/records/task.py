@@ -106,7 +106,7 @@ class Task:
         force_limit: (2,) bounds of the force limit, the last decision variable of drivable
             carries [N].
         redundant: the joints whose paths are decided beside the box's, see RedundantJoint.
-        orientation: what the last three numbers of every pose mean.
+        orientation: meaning of the last three numbers of every pose.
         pieces: of the path between two waypoints that its file states, see `symbolic.path.pieces`.
     """
 

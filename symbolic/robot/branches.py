@@ -261,7 +261,7 @@ def start_branches(
 
     Args:
         arm: 0 or 1.
-        search: what they are found with; None for the interpreted functions, without clearance.
+        search: the functions of the search; None for the interpreted functions, without clearance.
     """
     robot, contact = workcell.robots[arm], workcell.contacts[arm]
     search = search or interpreted_search(workcell, arm, model)

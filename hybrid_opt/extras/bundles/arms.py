@@ -120,7 +120,7 @@ class Lines:
         """Refuse drivers whose names a target does not take; inputs may be left out.
 
         Raises:
-            SettingsError: with the key, and what it means to the target.
+            SettingsError: with the key, and its meaning for the target.
         """
         for robot in workcell.robots:
             driver = robot.driver

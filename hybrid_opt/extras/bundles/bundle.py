@@ -587,7 +587,7 @@ def target_for(name: str, workcell: Workcell) -> Target:
 
 
 def missing_for(name: str, workcell: Workcell, leader: int = 0) -> tuple[str, ...]:
-    """List what a cell lacks for a target, before any carry of it is known.
+    """List the data that a cell lacks for a target, before any carry is known.
 
     Args:
         name: of the target.
@@ -619,7 +619,7 @@ def missing_for(name: str, workcell: Workcell, leader: int = 0) -> tuple[str, ..
 
 
 def missing_text(name: str, workcell: Workcell) -> str:
-    """State what a cell lacks for a target, for a terminal.
+    """List the data that a cell lacks for a target, for a terminal.
 
     Raises:
         SettingsError: the target is unknown.
@@ -653,7 +653,7 @@ def export(
         job: as `plan_job` makes it, or a timing that robots can drive, for the job around it with
             default forces.
         target: name of one of `TARGETS`.
-        folder: what the bundle's own folder is made in.
+        folder: parent of the bundle's own folder.
         origin: where the carry comes from, for the name; by default the workcell's name.
         options: None for the defaults.
 

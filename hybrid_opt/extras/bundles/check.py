@@ -291,11 +291,11 @@ def check(
     Args:
         held: from when to when the pads hold the box [s]; None for the carry that the file names,
             else for the longest while in which the pads stand to one another as they hold it.
-        interpolation: what the controller does between samples; None for the one that takes all
+        interpolation: of the controller between samples; None for the one that takes all
             that is known at them, as ROS 2's joint trajectory controller does.
 
     Raises:
-        SettingsError: nothing lies in that time, or the file lacks what the interpolation takes.
+        SettingsError: nothing lies in that time, or the file lacks columns of the interpolation.
     """
     workcell, time = cell.workcell, trajectory.time
     held = held or trajectory.carry

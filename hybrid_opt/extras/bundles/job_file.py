@@ -369,7 +369,7 @@ class Export:
     Attributes:
         sampled: the job at the target's time steps.
         stiffness: of each arm at its pad along the normal [N/m]; None if nothing depends on it.
-        gap: what the time steps do to the pads; None without a stiffness.
+        gap: effect of the time steps on the pads; None without a stiffness.
         stop: how it stops along the path.
     """
 

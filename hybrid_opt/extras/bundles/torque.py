@@ -266,7 +266,7 @@ def joint_inertia(job: Job) -> Array:
 
 
 def _values(export: Export, arm: int) -> dict[str, Any]:
-    """Return what the templates of all drivers fill in for an arm."""
+    """Return an arm's values for the templates of all drivers."""
     robot, prefix = export.workcell.robots[arm], prefixes(export.workcell)[arm]
     mass, centre = export.tool_load(arm)
     spaces = [prefix.rstrip("_") for prefix in prefixes(export.workcell)]

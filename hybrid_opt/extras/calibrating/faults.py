@@ -290,7 +290,7 @@ def load_faults(holds: list[MeasuredHold], load: Load, moments: bool) -> list[Fa
     """Find faults in the balance of all holds: other units, swapped arms, or an unknown cause.
 
     Args:
-        load: what they show together.
+        load: their common estimate.
         moments: whether the sensors tell moments.
     """
     left = LARGEST_RESIDUAL * abs(load.mass * GRAVITY[2])

@@ -67,7 +67,7 @@ class Sampling:
         feasible: (n,) verdicts on decision vectors (n, n_var).
         certain: whether one decision vector is feasible between its samples too.
         unit: (n_var,) half-widths that are scaled together [m, rad].
-        limits: (2, n_var) what no bounds exceed.
+        limits: (2, n_var) limits of all bounds.
         rng: the randomness.
         low, high: share that is wanted.
         out_of_time: whether to come to an end.

@@ -39,7 +39,7 @@ class Draft:
         spins: of both pads, beside those of the file [rad].
         branches: of both robots, -1 where they are not known yet.
         waypoints: (n, 6 + m) extended poses, start and goal included.
-        given: what was added to the problem's tables before, such as bases.
+        given: earlier additions to the problem's tables, such as bases.
         bounds: of the decision vector, None where they are not known yet.
         stand_off: of the pads [m]; None where the usual one is free, or none that was tried.
     """

@@ -46,8 +46,8 @@ class Problem:
 
     Attributes:
         source: the file.
-        text: its content, without what is proposed anew.
-        data: its tables, without what is proposed anew.
+        text: its content, without the keys to propose.
+        data: its tables, without the keys to propose.
     """
 
     source: Path
@@ -206,7 +206,7 @@ def read_problem(path: str | Path) -> Problem:
     """Read the problem of a file.
 
     Raises:
-        WorkcellError: it is no TOML, or what has to be known is not there.
+        WorkcellError: it is no TOML, or required keys are missing.
     """
     path = Path(path)
     try:

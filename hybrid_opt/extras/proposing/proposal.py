@@ -144,7 +144,7 @@ class Proposal:
 
     Attributes:
         problem: where it comes from.
-        found: what was found, as values of the workcell.
+        found: the proposed values of the workcell.
         judgement: the evaluator's verdict on the carry, certified between its samples.
         feasible_share: of random candidates within the bounds.
         candidates: number of candidates by which that was measured.
@@ -236,13 +236,13 @@ def propose_classes(
         rng: its only randomness. The same state gives the same proposals where time does not run
             out.
         settings: how many are looked for, among others; None for the defaults: one.
-        tell: called with what is being done.
-        progress: True for a bar, or what takes the seconds worked and those that it may work; most
+        tell: called with a text on the current step.
+        progress: True for a bar, or a function of the seconds worked and those allowed; most
             proposals need a part of them.
 
     Raises:
         WorkcellError: the file is wrong.
-        ProposalError: no carry was found; the text says what is in the way.
+        ProposalError: no carry was found; the text names the obstacle.
         SettingsError: OMPL is not installed.
     """
     settings = settings or ProposeSettings()

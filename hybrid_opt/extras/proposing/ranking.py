@@ -37,7 +37,7 @@ def rank_homotopy_classes(
     Args:
         evaluations: of the search within each class.
         rng: its only randomness.
-        tell: called with what is being done.
+        tell: called with a text on the current step.
     """
     rows = []
     for k, proposal in enumerate(proposals, 1):

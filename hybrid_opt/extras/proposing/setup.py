@@ -155,7 +155,7 @@ class Setup:
     """A cell and the pairs of ways to hold in it.
 
     Attributes:
-        given: what was added to the problem's tables before, such as bases.
+        given: earlier additions to the problem's tables, such as bases.
         workcell: the cell, its redundant joints chosen.
         bodies: its arms and bodies.
         pairs: the most promising first.
@@ -266,7 +266,7 @@ def redundant_joints(workcell: Workcell, arm: int, common: tuple[str, ...]) -> t
 
 
 def box_blocked(judge: PoseJudge, start: Array, goal: Array) -> str:
-    """Describe what the box alone meets at the start or the goal, '' for nothing."""
+    """Describe the obstacle of the box alone at the start or the goal, '' for none."""
     found = []
     for name, pose in (("start", start), ("goal", goal)):
         for body, deep in judge.resting(pose):
@@ -351,7 +351,7 @@ def _no_pair(query: HoldQuery, judge: PoseJudge, searches: Sequence[HoldSearch])
 
 
 def no_path(pairs: Iterable[Pair], refusals: Sequence[str]) -> str:
-    """Describe what the planner met most often, and why the evaluator refused its paths."""
+    """Describe the planner's most frequent obstacle, and why the evaluator refused its paths."""
     met: Counter[tuple[str, str]] = Counter()
     refused: Counter[str] = Counter()
     for pair in pairs:

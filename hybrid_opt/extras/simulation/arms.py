@@ -148,7 +148,7 @@ class CellSimulation:
     """A simulated workcell with its arms.
 
     Attributes:
-        workcell, settings: what is simulated, and how.
+        workcell, settings: the cell, and settings of the simulation.
         mujoco, model, text: the simulator, its model, and this as MJCF.
         disturbance: (3,) [m/s^2].
     """

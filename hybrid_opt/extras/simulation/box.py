@@ -106,7 +106,7 @@ def bisected(
     """Find the least factor with which a simulation holds, by bisection.
 
     Args:
-        simulate: a factor to what it shows.
+        simulate: function of a factor that returns its outcome.
         low, high: factors between which it is looked for.
         steps: bisections.
 
@@ -335,7 +335,7 @@ class BoxSimulation:
     """The box of one workcell between its pads.
 
     Attributes:
-        workcell, settings: what is simulated, and how.
+        workcell, settings: the cell, and settings of the simulation.
     """
 
     def __init__(

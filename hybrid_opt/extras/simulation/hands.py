@@ -92,7 +92,7 @@ class HandSimulation:
     """The payload of one workcell in its hands.
 
     Attributes:
-        workcell, settings: what is simulated, and how.
+        workcell, settings: the cell, and settings of the simulation.
     """
 
     def __init__(

@@ -85,7 +85,7 @@ class Reference:
             [N].
         effort: (n, all joints) joint torques to feed forward, pressing included [N m].
         press_torque: (n, all joints) torques of each arm's joints that press with 1 N.
-        job: what is to happen to the box.
+        job: of the box.
         leader: index of the arm that keeps its place where the other alone controls its force.
     """
 
@@ -321,7 +321,7 @@ class ArmController:
             gains: stiffness and damping of the joints [N m/rad, N m s/rad].
             pad_stiffness: of the pads' layers; without force control, the arm aims as far beyond
                 the contact as they give [N/m].
-            drift_stiffness: what is left of it along the normal [N/m].
+            drift_stiffness: remaining stiffness along the normal [N/m].
         """
         self.is_force_controlled = is_force_controlled
         self._settings = settings

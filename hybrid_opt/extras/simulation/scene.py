@@ -149,7 +149,7 @@ class ArmSettings(ContactSettings):
             [kg m^2 / (N m)]; no description of a robot states it.
         force_gain: of the integral force control [1/s].
         drift_stiffness: along the normal, of each arm where both are force-controlled [N/m].
-        support_friction: between the box and what it stands on.
+        support_friction: between the box and its support.
     """
 
     control_period: float = 1e-3
@@ -256,7 +256,7 @@ def solver_options(settings: ContactSettings, gravity: Array, heaviest: float = 
     """Write MuJoCo's options: elliptic cones, solved to many digits, with hardly any creep.
 
     Args:
-        heaviest: mass of what is far heavier than the box, if anything is [kg].
+        heaviest: mass of a body much heavier than the box, if any [kg].
     """
     return f"""<option timestep="{settings.time_step!r}" gravity="{mjcf_text(gravity)}"
     cone="elliptic" impratio="{CREEP!r}" integrator="implicitfast" solver="Newton"
@@ -357,7 +357,7 @@ def presses_on_box(workcell: Workcell) -> bool:
 def plates(workcell: Workcell, touched: str) -> str:
     """Write a flat plate under each pad, as geoms of the box: the contact surface of other shapes.
 
-    The planner takes patches for flat; a pad is moulded to what it holds.
+    The planner takes patches for flat; a pad takes the shape of the payload.
 
     Args:
         touched: attributes that say what may touch them.

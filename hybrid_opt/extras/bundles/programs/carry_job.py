@@ -263,7 +263,7 @@ class Job:
     def effort(self, arm: int, gravity: str, s: float, rate: float) -> list[float]:
         """Compute the joint torques of an arm at a coordinate and rate [N m, N].
 
-        What moves arm and box goes with the square of the rate, what holds and presses stays.
+        Efforts of the motion scale with the square of the rate, those that hold and press do not.
 
         Args:
             gravity: 'with_gravity' or 'without_gravity'.

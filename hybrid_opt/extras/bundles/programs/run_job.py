@@ -199,7 +199,7 @@ class Run:
         )
 
     def spin(self, until: float) -> None:
-        """Handle what comes in until a time [s]."""
+        """Handle messages until a time [s]."""
         while (left := until - self.now()) > 0.0:
             rclpy.spin_once(self.node, timeout_sec=left)
 
