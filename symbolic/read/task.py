@@ -238,7 +238,8 @@ FULL_TURN = 2.0 * np.pi
 """Widest default bounds of a joint, about its initial value [rad]: beyond it repeats itself."""
 
 MOST_BEYOND = 6
-"""Most joints beyond six of one arm: the choice among them is made by trying all."""
+"""Most joints beyond six of one arm, without those that move both: the choice among them is made by
+trying all."""
 
 
 @dataclass(frozen=True)
@@ -286,8 +287,9 @@ def with_redundancy(
     common = common_joints(workcell.robots)
     arms, found = [], []
     for i, robot in enumerate(workcell.robots):
-        if len(names[i]) - FOLLOWING > MOST_BEYOND:
-            told = f"found {len(names[i])} joints that move; allowed are {FOLLOWING + MOST_BEYOND}"
+        most = FOLLOWING + MOST_BEYOND + len(common)
+        if len(names[i]) > most:
+            told = f"found {len(names[i])} joints that move; allowed are {most}"
             problems.add(f"robots[{i}].chain", f"{told}: hold others by locked_joints")
             return workcell
         path, redundant = _choice(workcell, i, entries, common)

@@ -11,6 +11,7 @@ import pytest
 
 from hybrid_opt.errors import SimulationError
 from hybrid_opt.extras.proposing.problem import read_problem
+from hybrid_opt.extras.proposing.setup import redundancy
 from hybrid_opt.extras.simulation.arms import CellSimulation
 from symbolic.errors import OutsideError, WorkcellError
 from symbolic.read.arms import RobotModelWarning, _warn_left_out
@@ -91,6 +92,16 @@ def test_links_with_mass_that_mimic_a_moving_joint_are_refused(tmp_path: Path) -
     torso = Torso(more=MIMIC.format(parent="chest", inertial=INERTIAL))
     with refused(WorkcellError, "workcell", "'marker_joint'", "'torso_joint_0'"):
         cell(torso, tmp_path)
+
+
+def test_a_torso_may_have_as_many_joints_as_it_likes(tmp_path: Path) -> None:
+    """Seven below arms of six: thirteen joints move each flange, seven of them both."""
+    axes = ("1 0 0", "0 1 0", "0 1 0", "0 1 0", "1 0 0", "0 0 1", "0 1 0")
+    found = cell(Torso(axes), tmp_path)
+    assert [len(robot.position_lower) for robot in found.robots] == [13, 13]
+    chosen = read_problem(tmp_path / "torso.toml")
+    complete = chosen.workcell(redundancy(chosen, found))
+    assert [joint.drives for joint in complete.task.redundant] == [(k, k) for k in range(7)]
 
 
 def test_efforts_of_zero_are_no_torques_until_the_file_says_unknown(tmp_path: Path) -> None:

@@ -33,6 +33,7 @@ from tests.hybrid_opt.extras.proposing.problems import (
     tiago_problem,
     turned_problem,
 )
+from tests.torso import Torso
 
 RACK = Path("studies/workcells/rack.toml")
 
@@ -226,13 +227,18 @@ def test_generated_cells_get_carries(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["tiago", "baxter", "pandas", "drum", "fork", "turned", "pitched"])
+@pytest.mark.parametrize(
+    "name", ["tiago", "baxter", "torso", "pandas", "drum", "fork", "turned", "pitched"]
+)
 @pytest.mark.filterwarnings("ignore::symbolic.geometry.hulls.CollisionModelWarning")
 def test_cells_of_every_kind_get_carries(name: str, tmp_path: Path) -> None:
     """Machines with both arms in one file, portals, other payloads and pads, a box turned over."""
     path = tmp_path / "problem.toml"
     if name == "tiago":
         path = tiago_problem(tmp_path)
+    elif name == "torso":  # of six joints, as RB-Y1's
+        axes = ("1 0 0", "0 1 0", "0 1 0", "0 1 0", "1 0 0", "0 0 1")
+        path = Torso(axes).problem(tmp_path)
     elif name == "baxter":
         path.write_text(BAXTER, encoding="utf-8")
     elif name in ("turned", "pitched"):
