@@ -33,6 +33,7 @@ from hybrid_opt.extras.proposing.planner import (
     straight_paths,
 )
 from hybrid_opt.extras.proposing.problem import Problem, read_problem
+from hybrid_opt.extras.proposing.remedies import REMEDY_SECONDS, remedies_text
 from hybrid_opt.extras.proposing.setup import Pair, Setup, no_path, prepare
 from hybrid_opt.extras.proposing.trial import (
     BranchLostError,
@@ -115,6 +116,7 @@ class ProposeSettings:
         bases: whether the robots' bases are proposed too; of those in the file only the height
             counts.
         classes: carries of different classes that are looked for, as far as the time goes.
+        remedies: whether the least change is looked for with which a box that cannot be held can.
         clock: what seconds are counted by; other programs' work does not count.
         used: seconds that were used before, such as by a program's start.
     """
@@ -123,6 +125,7 @@ class ProposeSettings:
     feasible: tuple[float, float] = (0.02, 0.20)
     bases: bool = False
     classes: int = 1
+    remedies: bool = True
     clock: Callable[[], float] = worked
     used: float = 0.0
 
@@ -371,12 +374,20 @@ class _Search:
         if tried.setup is None and tried.problem:
             more = len(setups) > 1 and not self.settings.bases
             others = "; nor can it be held by any other pair of faces" if more else ""
-            return NoHoldError(f"{begin}: {tried.problem}{others}")
+            return NoHoldError(f"{begin}: {tried.problem}{others}{self._remedies(tried.spins)}")
         met = "" if tried.setup is None else no_path(tried.setup.pairs, self.refusals)
         if self.too_late:
             longer = f"{LONGER * self.settings.seconds:.0f}"
             begin = f"{begin}, when it was out of time; try {longer} s (--time {longer})"
         return ProposalError(f"{begin}: {met or 'no path was tried yet'}")
+
+    def _remedies(self, spins: Array) -> str:
+        """Describe the least changes with which the box can be held, as far as the time goes."""
+        if self.settings.bases or not self.settings.remedies:
+            return ""
+        self._say("the least change with which the box can be held")
+        last = min(self.settings.seconds, self.spent + REMEDY_SECONDS)
+        return remedies_text(self.problem, spins, self.rng, lambda: self.spent > last)
 
     def _paths(
         self, setup: Setup, pair: Pair, effort: int, strays: int, box: PayloadSceneChecker

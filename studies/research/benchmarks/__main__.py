@@ -76,7 +76,7 @@ def _run(options: argparse.Namespace) -> int:
         for name, source in chosen.items():
             print(f"{name}: get its files, then name FOLDER by --folder\n{source.how}")
         return 0
-    settings = ProposeSettings(seconds=options.time, classes=options.classes)
+    settings = ProposeSettings(seconds=options.time, classes=options.classes, remedies=False)
     for source in chosen.values():
         given = source.benchmark(options.folder)
         found = [

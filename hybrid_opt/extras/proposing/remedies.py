@@ -1,0 +1,141 @@
+"""The least changes of a problem with which both arms can hold the box at start and goal: bases
+moved or raised, longer tools, another height of the goal. Each is tried, not computed."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from hybrid_opt.errors import ProposalError
+from hybrid_opt.extras.proposing.problem import Problem
+from hybrid_opt.extras.proposing.setup import prepare
+from symbolic.array import Array
+from symbolic.errors import WorkcellError
+from symbolic.records.poses import rotation_from_rpy
+
+AMOUNTS = (0.05, 0.10, 0.15, 0.20, 0.30, 0.40)
+"""Changes that are tried [m], the least of all kinds first."""
+
+ENOUGH_CHANGES = 3
+"""Kinds of changes after which no others are looked for."""
+
+REMEDY_SECONDS = 30.0
+"""Work that the search may take [s]."""
+
+Tables = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class ProblemChange:
+    """A kind of change.
+
+    Attributes:
+        text: what is changed, with a place for the amount in metres.
+        change: changes a problem's tables by an amount [m].
+    """
+
+    text: str
+    change: Callable[[Problem, Tables, float], None]
+
+    def applied(self, problem: Problem, amount: float) -> Problem:
+        """Return the problem changed by an amount [m]."""
+        data = copy.deepcopy(problem.data)
+        self.change(problem, data, amount)
+        return replace(problem, data=data)
+
+
+def _towards(problem: Problem) -> Array:
+    """Compute the horizontal unit vectors (2, 3) from both bases to the middle of the carry; of a
+    machine with two arms the same."""
+    middle = np.mean(problem.poses, axis=0)[:3]
+    bases = np.array([robot["base"]["xyz"] for robot in problem.data["robots"]], dtype=float)
+    away = (middle - bases) * [1.0, 1.0, 0.0]
+    return np.asarray(away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-9))
+
+
+def _move_bases(sign: float) -> Callable[[Problem, Tables, float], None]:
+    def change(problem: Problem, data: Tables, amount: float) -> None:
+        for robot, way in zip(data["robots"], _towards(problem), strict=True):
+            moved = np.array(robot["base"]["xyz"]) + sign * amount * way
+            robot["base"]["xyz"] = np.round(moved, 4).tolist()
+
+    return change
+
+
+def _raise_bases(problem: Problem, data: Tables, amount: float) -> None:
+    for robot in data["robots"]:
+        robot["base"]["xyz"][2] = round(robot["base"]["xyz"][2] + amount, 4)
+
+
+def _lengthen_tools(problem: Problem, data: Tables, amount: float) -> None:
+    """Move the pads along their normals; the tools' bodies stay."""
+    for robot in data["robots"]:
+        pad = robot["pad"]
+        normal = rotation_from_rpy(pad.get("rpy", [0.0, 0.0, 0.0]))[:, 2]
+        pad["xyz"] = np.round(np.array(pad["xyz"]) + amount * normal, 4).tolist()
+
+
+def _shift_goal(sign: float) -> Callable[[Problem, Tables, float], None]:
+    def change(problem: Problem, data: Tables, amount: float) -> None:
+        data["task"]["goal"][2] = round(data["task"]["goal"][2] + sign * amount, 4)
+
+    return change
+
+
+PROBLEM_CHANGES = (
+    ProblemChange("bases {:.2f} m nearer", _move_bases(1.0)),
+    ProblemChange("bases {:.2f} m farther away", _move_bases(-1.0)),
+    ProblemChange("bases {:.2f} m higher", _raise_bases),
+    ProblemChange("tools {:.2f} m longer", _lengthen_tools),
+    ProblemChange("goal {:.2f} m lower", _shift_goal(-1.0)),
+    ProblemChange("goal {:.2f} m higher", _shift_goal(1.0)),
+)
+
+
+def least_changes(
+    problem: Problem, spins: Array, rng: np.random.Generator, is_over: Callable[[], bool]
+) -> list[tuple[ProblemChange, float]]:
+    """Find changes, and their amounts [m], with which both arms can hold the box; the least first,
+    each kind once.
+
+    Args:
+        problem: whose file states the bases and the pads' places.
+        spins: of both pads that are tried [rad].
+        is_over: whether to come to an end.
+    """
+    found: dict[ProblemChange, float] = {}
+    for amount in AMOUNTS:
+        for kind in PROBLEM_CHANGES:
+            if len(found) == ENOUGH_CHANGES or is_over():
+                return list(found.items())
+            if kind not in found and _can_hold(kind.applied(problem, amount), spins, rng):
+                found[kind] = amount
+    return list(found.items())
+
+
+def _can_hold(problem: Problem, spins: Array, rng: np.random.Generator) -> bool:
+    try:
+        prepare(problem, {}, spins, rng)
+    except (ProposalError, WorkcellError):
+        return False
+    return True
+
+
+def remedies_text(
+    problem: Problem, spins: Array, rng: np.random.Generator, is_over: Callable[[], bool]
+) -> str:
+    """Describe such changes, '' where the file states no bases, or none was found."""
+    robots = problem.data["robots"]
+    if not all(
+        "xyz" in robot.get("base", {}) and "xyz" in robot.get("pad", {}) for robot in robots
+    ):
+        return ""
+    found = least_changes(problem, spins, rng, is_over)
+    if not found:
+        return ""
+    told = ", or ".join(kind.text.format(amount) for kind, amount in found)
+    return f"; both arms could hold it with {told}"
