@@ -310,8 +310,8 @@ def _one_line(error: Exception) -> str:
 def replace_file(path: Path, content: bytes, mode: int = 0o666) -> None:
     """Replace a file durably: an interruption at any moment leaves the old content or the new one.
 
-    The new content is written beside it first, as `.NAME.draft`; whoever writes the same file
-    meanwhile waits. What an ended process left there is overwritten.
+    The new content is written to `.NAME.draft` beside it first, under a lock: a second writer of
+    the same file waits. A draft of a killed process is overwritten.
 
     Args:
         path: the file, in an existing folder.
@@ -319,7 +319,7 @@ def replace_file(path: Path, content: bytes, mode: int = 0o666) -> None:
         mode: permissions of the file, as far as the process's mask allows them.
 
     Raises:
-        OSError: it cannot be written; what was written beside it is removed.
+        OSError: it cannot be written; the draft is removed.
     """
     draft = path.with_name(f".{path.name}.draft")
     with _alone(draft, mode) as file:

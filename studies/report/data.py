@@ -140,12 +140,12 @@ class Experiment:
 
     @property
     def has_hybrid(self) -> bool:
-        """Whether fronts were polished."""
+        """True if fronts were polished."""
         return any(run.hybrid is not None for a in self.algorithms for run in a.runs)
 
     def fronts(self) -> Iterator[tuple[LineStyle, Front, bool]]:
-        """Return fronts of the representative runs with their looks, and whether a polished one
-        stands beside each; then the polished union."""
+        """Return the fronts of the representative runs: each with its look, and True if its
+        polished front follows; then the polished union."""
         for algorithm in self.solved:
             found = algorithm.shown.fronts
             after = found[-1] if self.union is None else self.union
@@ -197,7 +197,7 @@ class ReportData(Experiment):
 
     @property
     def alone(self) -> bool:
-        """Whether the first experiment is the drivable one."""
+        """True if the first experiment is the drivable one."""
         return is_drivable(self.workcell, self.objectives)
 
     @property

@@ -90,12 +90,12 @@ class Slip:
 
     @property
     def within(self) -> bool:
-        """Whether the threshold is as near one as it should be."""
+        """True if the threshold is within its bounds about one."""
         return abs(self.threshold - 1.0) <= ALLOWED[self.pads]
 
     @property
     def in_place(self) -> bool:
-        """Whether the box slips first where the plan asks for most."""
+        """True if the box slips first where the planned force is largest."""
         return abs(self.begins - self.planned) <= SAME_PLACE
 
     def __str__(self) -> str:

@@ -276,7 +276,7 @@ class Contact:
 
     @property
     def is_ring(self) -> bool:
-        """Whether the patch presses along its rim alone."""
+        """True if the patch presses along its rim alone."""
         return self.kind == "cup"
 
     @property
@@ -577,7 +577,7 @@ class Workcell:
 
     @cached_property
     def has_facing_pads(self) -> bool:
-        """Whether two round pads with opposite normals hold the payload."""
+        """True if two round pads with opposite normals hold the payload."""
         return self.has_opposite_pads and not any(c.half_sides for c in self.contacts)
 
     @cached_property

@@ -39,7 +39,7 @@ class Waypoint:
 
     @property
     def is_fixed(self) -> bool:
-        """Whether the task fixes this pose."""
+        """True if the task fixes this pose."""
         return bool(np.all(self.lower == self.upper))
 
 

@@ -95,7 +95,7 @@ class Recording:
 
     @property
     def has_moments(self) -> bool:
-        """Whether moments were recorded, of both arms."""
+        """True if moments were recorded, of both arms."""
         return bool(np.isfinite(self.wrench[:, :, 3:]).all())
 
     def within(self, begin: float, end: float) -> Array:

@@ -73,7 +73,7 @@ class Problem:
 
     @property
     def is_machine(self) -> bool:
-        """Whether both robots are arms of one machine: other chains of one file at one base, which
+        """True if both robots are arms of one machine: other chains of one file at one base, which
         may be missing."""
         first, second = self.data["robots"]
         keys = ("robot", "urdf", "xacro_arguments", "base")

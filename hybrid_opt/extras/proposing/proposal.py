@@ -229,16 +229,13 @@ def propose_classes(
     tell: Callable[[str], None] = lambda text: None,
     progress: ShowProgress = False,
 ) -> list[Proposal]:
-    """Propose complete workcells whose carries are of different classes, those whose joints go
-    least far first: they pass what is in the way on different sides, or hold the box in other
-    postures.
+    """Propose complete workcells whose carries are of different classes, by increasing length of
+    the joint paths. Classes pass obstacles on different sides, or hold the box in other postures.
 
     Args:
-        path: a workcell file in which what is proposed may be missing
-            (docs/tutorials/two-robots.md).
-        rng: its only randomness. The same state gives the same proposals where time does not run
-            out.
-        settings: how many are looked for, among others; None for the defaults: one.
+        path: a problem file (docs/tutorials/two-robots.md).
+        rng: its only randomness. The same state gives the same proposals unless time runs out.
+        settings: number of proposals, among others; None for the defaults: one.
         tell: called with a text on the current step.
         progress: True for a bar, or a function of the seconds worked and those allowed; most
             proposals need a part of them.
@@ -285,12 +282,12 @@ class _Search:
 
     @property
     def out_of_time(self) -> bool:
-        """Whether to come to an end."""
+        """True if no time is left."""
         return self.spent > self.settings.seconds
 
     @property
     def too_late(self) -> bool:
-        """Whether it is too late for another path: bounds and verdicts take time as well."""
+        """True if it is too late for another path: bounds and verdicts take time as well."""
         return self.spent > PLANNING * self.settings.seconds
 
     def _say(self, text: str) -> None:

@@ -84,7 +84,7 @@ class HandOutcome(Outcome):
 
     @property
     def lifts(self) -> bool:
-        """Whether a rim lifted at the end."""
+        """True if a rim lifted at the end."""
         return bool(self.lift[-1].max() > 0.0)
 
 

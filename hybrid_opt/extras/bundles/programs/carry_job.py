@@ -334,7 +334,7 @@ class Clock:
 
     @property
     def turning(self) -> bool:
-        """Whether the rate changes."""
+        """True if the rate changes."""
         return self._from != self._to
 
     def turn(self, rate: float, after: float = 0.0, takes: float | None = None) -> None:
