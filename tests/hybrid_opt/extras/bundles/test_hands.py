@@ -3,6 +3,7 @@ the box."""
 
 from __future__ import annotations
 
+import ast
 import csv
 import io
 import json
@@ -21,9 +22,11 @@ from hybrid_opt.extras.bundles import TARGETS, BundleOptions, export
 from hybrid_opt.extras.bundles.bundle import TORQUE_DRIVERS, missing_for, prepared
 from hybrid_opt.extras.bundles.job_file import Contents, Export
 from hybrid_opt.extras.bundles.programs import carry_job as programs
+from hybrid_opt.extras.bundles.programs import filled
 from hybrid_opt.extras.bundles.programs.carry_job import Machine, Refused, Seen
+from hybrid_opt.extras.bundles.urscript import urscript_files
 from hybrid_opt.job.plan import JobModel
-from hybrid_opt.job.records import Job
+from hybrid_opt.job.records import SWITCHES, Job
 from hybrid_opt.timing.model import TimingModel
 from hybrid_opt.timing.records import TimingLimits
 from hybrid_opt.timing.solve import time_path
@@ -32,7 +35,9 @@ from symbolic.errors import SettingsError
 from symbolic.records import Driver
 from tests.hybrid_opt.cells import shipped
 from tests.hybrid_opt.extras.bundles.bundles import DRIVER, driven
+from tests.hybrid_opt.extras.bundles.controlled import VALVE
 from tests.hybrid_opt.extras.bundles.mock_ros import World, run
+from tests.hybrid_opt.extras.bundles.test_urscript import CYCLE, Pair, as_python
 
 PERIOD, LOOK = 0.01, 0.02
 """Between two looks of programs, and of the many faults [s]."""
@@ -341,6 +346,117 @@ def test_no_fault_drops_the_box(name: str, phase: str, word: str, tmp_path: Path
         assert held, world.log
     if held:
         assert code == {"leave": 1, "back": 3, "continue": 0}[word], world.log
+
+
+# --- URScript ---
+
+
+OUTPUT, INPUT, STEP = 2, 5, 0.008
+
+POINTS = 60
+"""Of each phase of a small job."""
+
+LIFTED = 0.1
+"""Joint position beyond which the box of the small job is off its places [rad]."""
+
+
+def small_programs() -> list[ast.Module]:
+    """Both arms' programs of a job that turns every joint by 0.5 rad and back."""
+    ways = {"lift": (0.0, 0.5), "set_down": (0.5, 0.0)}
+    lines, calls = list[str](), list[str]()
+    for name in ("grip_on", "lift", "set_down", "grip_off"):
+        rows = np.linspace(*ways.get(name, (0.0, 0.0)), POINTS)
+        on = SWITCHES.get(name)
+        lines += [f"  def {name}():", *([] if on is None else [f"    grip({on})"])]
+        lines += [f"    go({[float(value)] * 6}, 0.0)" for value in rows]
+        lines += [*([] if on is None else [f"    wait_for_hands({on})"]), "  end"]
+        calls.append(f"  {name}()")
+    hands = filled("hands.script", output=OUTPUT, input=INPUT, hears=True, most=500)
+    text = filled(
+        "carry.script",
+        title="small",
+        first=[0.0] * 6,
+        tcp="p[0.0, 0.0, 0.0, 0.0, 0.0, 0.0]",
+        payload="0.0, [0.0, 0.0, 0.0]",
+        away="    away = norm(here[0] - target[0])",
+        start=0.005,
+        change=f"{STEP / 0.2:.7f}",
+        step=STEP,
+        presses=False,
+        followed=0.05,
+        every=1,
+        band=0.1,
+        hands=hands,
+        phases="\n".join(lines),
+        calls="\n".join(["  gripping = run watch_hands()", *calls, "  kill gripping"]),
+    )
+    return [as_python(text), as_python(text)]
+
+
+class Gripping(Pair):
+    """Both programs with valves: an input follows its output after `VALVE`, unless it leaks."""
+
+    def __init__(self, leaks: dict[int, float], most: float = 60.0) -> None:
+        super().__init__([np.zeros(6), np.zeros(6)], {}, small_programs())
+        self.most, self.leaks, self.age = most, leaks, [9.0, 9.0]
+        self.run()
+
+    def cycled(self) -> None:
+        for k, arm in enumerate(self.arms):
+            self.age[k] = 0.0 if arm.outs[OUTPUT] != arm.shown[OUTPUT] else self.age[k] + CYCLE
+            if self.age[k] >= VALVE:
+                arm.buttons[INPUT] = arm.outs[OUTPUT] and self.time < self.leaks.get(k, np.inf)
+            assert arm.outs[OUTPUT] or arm.q.max() < LIFTED, "the box falls"
+
+    def told(self, text: str) -> bool:
+        return any(f"textmsg {text}" in arm.log for arm in self.arms)
+
+
+def test_both_programs_switch_and_wait_for_hands() -> None:
+    found = Gripping({})
+    for arm in found.arms:
+        assert arm.log[-1] == "ended", arm.log
+        assert max(row[1].max() for row in arm.record) == pytest.approx(0.5)
+        assert not arm.outs[OUTPUT]
+        assert not arm.pressed
+    apart = [np.array([row[1] for row in arm.record[:1200]]) for arm in found.arms]
+    count = min(map(len, apart))
+    # Both lift in the same cycle, or the next one.
+    assert np.abs(apart[0][:count] - apart[1][:count]).max() <= 2.0 * 0.5 / POINTS / 4.0 + 1e-9
+
+
+@pytest.mark.parametrize("arm", [0, 1])
+def test_a_leak_stops_both_programs_with_hands_on(arm: int) -> None:
+    lifts = 0.06 + POINTS * STEP + 0.1
+    found = Gripping({arm: lifts + 0.3}, 4.0)
+    assert found.told("the hands do not hold")
+    for each in found.arms:
+        assert np.ptp([row[1] for row in each.record[-200:]], axis=0).max() < 1e-9
+        assert each.outs[OUTPUT]
+        assert each.q.max() > LIFTED
+
+
+def test_programs_of_hands_that_never_hold_lift_nothing() -> None:
+    found = Gripping({1: 0.0}, 4.0)
+    assert found.told("the hands do not do what they are told")
+    assert max(row[1].max() for arm in found.arms for row in arm.record) == 0.0
+    assert all(arm.outs[OUTPUT] for arm in found.arms)
+
+
+def test_programs_of_a_job_switch_hands_in_their_phases() -> None:
+    found = sheet("ur-script", with_lines(str(OUTPUT), str(INPUT)), STEP)
+    texts = [str(text) for text in urscript_files(found).values()]
+    assert len(texts) == 2
+    for text in texts:
+        as_python(text)
+        for name, on in SWITCHES.items():
+            body = text.split(f"  def {name}():")[1].split("\n  end\n")[0].strip()
+            assert body.startswith(f"grip({on})")
+            assert body.endswith(f"wait_for_hands({on})")
+        calls = text.split("gripping = run watch_hands()")[1].split("kill gripping")[0]
+        assert [line.strip("() ") for line in calls.split()] == [p.name for p in found.job.phases]
+        assert f"set_standard_digital_out({OUTPUT}, level)" in text
+        assert "    feel(" not in text.split("def approach")[1]
 
 
 # --- other targets ---

@@ -178,9 +178,14 @@ class Pair:
         most: when it ends at the latest [s].
     """
 
-    def __init__(self, starts: list[Array], at: dict[float, Callable[[Pair], None]]) -> None:
+    def __init__(
+        self,
+        starts: list[Array],
+        at: dict[float, Callable[[Pair], None]],
+        modules: list[ast.Module] | None = None,
+    ) -> None:
         self.time, self.at, self.most = 0.0, dict(at), 60.0
-        first, second = map(partial(Arm, self), starts, programs())
+        first, second = map(partial(Arm, self), starts, modules or programs())
         self.arms: tuple[Arm, Arm] = first, second
 
     def run(self) -> Pair:
@@ -188,6 +193,7 @@ class Pair:
             for arm in self._running():
                 arm.cycle()
             self.time += CYCLE
+            self.cycled()
             for arm in self.arms:
                 arm.shown, arm.felt = list(arm.outs), arm.newton
             for when in [when for when in self.at if when <= self.time]:
@@ -197,6 +203,9 @@ class Pair:
             for arm in self.arms:
                 arm.record.append((self.time, arm.q.copy(), arm.newton))
         return self
+
+    def cycled(self) -> None:
+        """What is wired to both arms follows their outputs."""
 
     def _running(self) -> list[Arm]:
         return [arm for arm in self.arms if not (arm.stopped or arm.ended)]
