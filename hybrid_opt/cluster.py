@@ -116,7 +116,7 @@ class DaskWorkers(Workers):
             client = connect(self._address, timeout=CONNECT_SECONDS, set_as_default=False)
         except (OSError, ValueError, TimeoutError) as error:
             told = f"no Dask scheduler answers at {self._address} ({error})"
-            raise SettingsError(told) from error
+            raise SettingsError(told, code="no-scheduler") from error
         with ExitStack() as opened:
             opened.enter_context(_without_tracebacks())
             opened.enter_context(client)
@@ -124,7 +124,7 @@ class DaskWorkers(Workers):
                 client.wait_for_workers(1, timeout=CONNECT_SECONDS)
             except TimeoutError as error:
                 told = f"the scheduler at {self._address} has no workers"
-                raise SettingsError(told) from error
+                raise SettingsError(told, code="no-workers") from error
             self._resources = opened.pop_all()
         self._client = client
 
@@ -139,7 +139,8 @@ def _require_address(address: str) -> None:
     except (ValueError, NotImplementedError) as error:
         said = str(error) if len(address) < 200 else "it is too long"
         raise SettingsError(
-            f"{address[:200]!a} is no address of a Dask scheduler ({said}); give tcp://HOST:8786"
+            f"{address[:200]!a} is no address of a Dask scheduler ({said}); give tcp://HOST:8786",
+            code="address",
         ) from error
 
 

@@ -165,7 +165,9 @@ class Session:
         """
         folder = Path(folder)
         if folder.exists() and any(folder.iterdir()):
-            raise ResultsError(f"{folder}: is not empty; save the cell into a folder of its own")
+            raise ResultsError(
+                f"{folder}: is not empty; save the cell into a folder of its own", code="not-empty"
+            )
         task = coarse_task(self.base.workcell.task)
         (x,) = resample_decisions(self.x, self.cell.workcell.task, task)
         poses = x[: task.n_box].reshape(-1, POSE_SIZE)

@@ -129,7 +129,9 @@ def write_trajectory(
     compiled, x = CompiledCell.of(cell), np.asarray(x, dtype=float)
     workcell = compiled.workcell
     if x.shape != (workcell.task.n_var,) or not np.isfinite(x).all():
-        raise ResultsError(f"decision vector: expected {workcell.task.n_var} finite numbers")
+        raise ResultsError(
+            f"decision vector: expected {workcell.task.n_var} finite numbers", code="shape"
+        )
     for name, value in figures.items():
         is_number = isinstance(value, int | float) and not isinstance(value, bool)
         if not (is_number and math.isfinite(value)):

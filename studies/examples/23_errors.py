@@ -14,4 +14,4 @@ cell = ho.example("rack")
 try:
     ho.search(cell, "simplex", rng=np.random.default_rng(1))
 except ho.DualArmError as error:
-    print(f"\n{type(error).__name__}: {error}")
+    print(f"\n{type(error).__name__} ({error.code}): {error}")

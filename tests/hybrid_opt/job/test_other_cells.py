@@ -82,7 +82,7 @@ def test_bundles_hold_every_joint(tmp_path: Path) -> None:
 def test_a_seventh_axis_is_an_external_one_to_rapid() -> None:
     """ABB counts the axes of a YuMi 1, 2, 7, 3, 4, 5, 6 along its chain."""
     job, target = driven(planned("pandas")), TARGETS["abb-egm"]
-    with pytest.raises(SettingsError, match=r"panda.urdf, which does not look like an arm of ABB"):
+    with pytest.raises(SettingsError, match=r"panda\.urdf.* ABB"):
         target.refuse(job, "abb-egm", any_arm=False)
     target.refuse(job, "abb-egm", any_arm=True)
     sheet = prepared(job, "abb-egm", BundleOptions(step=0.02, any_arm=True))
@@ -99,7 +99,7 @@ def test_a_seventh_axis_is_an_external_one_to_rapid() -> None:
         check = text.split("PROC CarryCheckStart")[1]
         assert check.count("EXIT;") == 7
         assert "here.extax.eax_a" in check
-    with pytest.raises(SettingsError, match="7 joints; targets of ur-script hold 6"):
+    with pytest.raises(SettingsError, match=r"7 .*ur-script.* 6"):
         TARGETS["ur-script"].refuse(job, "ur-script", any_arm=True)
 
 

@@ -194,7 +194,7 @@ def test_turbulence_fades_over_the_horizon() -> None:
 
 def test_the_length_of_the_run_must_be_known() -> None:
     algorithm = make("mopso")
-    with pytest.raises(SettingsError, match="set 'horizon'"):
+    with pytest.raises(SettingsError, match="'horizon'"):
         algorithm.setup(ZDT1(), termination=("n_gen", 5), seed=1)
 
 
