@@ -175,7 +175,7 @@ def test_the_library_page_groups_every_public_name_once() -> None:
     assert sorted(re.findall(r"`(\w+)`", section)) == sorted(ho.__all__)
 
 
-MOST_WORDS = 20_300
+MOST_WORDS = 20_500
 """Largest number of words of all pages together."""
 
 
