@@ -65,6 +65,9 @@ LARGEST_DROP = 0.3
 MOST_STEPS = 300
 BEHIND_PAD = "behind the pad: the contact plane keeps them apart"
 
+SAME_PLANE = 1e-9
+"""Cosine with a normal above which an approach does not pass the pad's plane."""
+
 CHECK_STRIDE = 10
 """Stride of the samples of a straight motion that are judged."""
 
@@ -236,14 +239,21 @@ def job_geometry(workcell: Workcell, everywhere: bool = False) -> CellGeometry:
 
 
 def _behind_pad(body: CollisionBody, geometry: CellGeometry) -> bool:
-    """Return True if a body moves with its arm's pad and lies behind its plane."""
-    arm = body.frame.robot
+    """Return True if a body moves with its arm's pads and lies behind the plane of one of them, in
+    which or from which the arm approaches."""
+    arm, workcell = body.frame.robot, geometry.workcell
     if arm < 0 or body.frame.joint != len(geometry.arms[arm].axes) - 1:
         return False
-    T_joint_pad = geometry.arms[arm].T_joint_box @ geometry.workcell.contacts[arm].T_box_pad
-    normal, origin = T_joint_pad[:3, 2], T_joint_pad[:3, 3]
-    ahead = max(float(support(piece, normal[None])[0]) for piece in body.pieces)
-    return bool(ahead - normal @ origin <= RESTING_TOLERANCE)
+    way = contact_model(workcell).approach(arm)
+    for pad, robot in zip(workcell.pads, workcell.pad_robots, strict=True):
+        if robot != arm or pad.T_box_pad[:3, 2] @ way < -SAME_PLANE:
+            continue
+        T_joint_pad = geometry.arms[arm].T_joint_box @ pad.T_box_pad
+        normal, origin = T_joint_pad[:3, 2], T_joint_pad[:3, 3]
+        ahead = max(float(support(piece, normal[None])[0]) for piece in body.pieces)
+        if ahead - normal @ origin <= RESTING_TOLERANCE:
+            return True
+    return False
 
 
 def _lowered(pose: Array, drop: float) -> Array:

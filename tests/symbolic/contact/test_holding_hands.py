@@ -21,7 +21,7 @@ from symbolic.contact.elastic import SHEAR, kern, layer_shares, layer_stiffness
 from symbolic.contact.force_closure import wrench_to_box
 from symbolic.contact.holding_hands import HandPatch, internal_force_needs, required_holding_forces
 from symbolic.contact.load import load_function
-from symbolic.contact.registry import require_squeeze
+from symbolic.contact.registry import contact_model, require_squeeze
 from symbolic.errors import SettingsError, WorkcellError
 from symbolic.read.cell import load
 from symbolic.records import Contact, Workcell
@@ -355,3 +355,16 @@ def test_hands_of_both_arms_hold_with_the_same_force(tmp_path: Path) -> None:
 def test_what_squeezes_is_refused_to_hands() -> None:
     with refused(SettingsError, "needs-pads"):
         require_squeeze(hands_cell("palletising"), "a job")
+
+
+def test_cups_come_along_their_normals_and_fingers_across_them_from_outside() -> None:
+    for name, normal in (("palletising", [0.0, 0.0, -1.0]), ("plate", None)):
+        cell = load(RACK.with_name(f"{name}.toml"))
+        for arm, contact in enumerate(cell.contacts):
+            way = contact_model(cell).approach(arm)
+            assert np.linalg.norm(way) == pytest.approx(1.0)
+            if normal is not None:
+                np.testing.assert_allclose(way, normal, atol=1e-12)
+            else:
+                assert way @ contact.T_box_pad[:3, 2] == pytest.approx(0.0, abs=1e-12)
+                assert way @ contact.T_box_pad[:3, 3] < 0.0
