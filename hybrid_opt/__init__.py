@@ -38,8 +38,8 @@ if TYPE_CHECKING:
     from hybrid_opt.evaluate.objectives import objectives as objectives
     from hybrid_opt.extras.bundles.bundle import Origin as Origin
     from hybrid_opt.extras.bundles.bundle import export as export
-    from hybrid_opt.extras.bundles.bundle import targets as targets
     from hybrid_opt.extras.bundles.job_file import BundleOptions as BundleOptions
+    from hybrid_opt.extras.bundles.targets import targets as targets
     from hybrid_opt.extras.gripping import Grip as Grip
     from hybrid_opt.extras.gripping import propose_grip as propose_grip
     from hybrid_opt.extras.proposing.proposal import Proposal as Proposal

@@ -20,7 +20,7 @@ def _add_options(parser: Parser) -> None:
         "--target",
         metavar="NAME",
         required=True,
-        help=f"the kind of bundle: {', '.join(stated('hybrid_opt.extras.bundles.bundle.TARGETS'))}",
+        help=f"kind of bundle: {', '.join(stated('hybrid_opt.extras.bundles.targets.TARGETS'))}",
     )
     add(
         parser,

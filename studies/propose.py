@@ -84,7 +84,7 @@ def _run(options: argparse.Namespace) -> int:
     import numpy as np
 
     import hybrid_opt as ho
-    from hybrid_opt.extras.bundles.bundle import missing_text
+    from hybrid_opt.extras.bundles.targets import missing_text
     from hybrid_opt.extras.proposing.problem import read_problem
     from hybrid_opt.extras.proposing.proposal import worked
     from hybrid_opt.robust.budget import budget_text

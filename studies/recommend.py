@@ -53,7 +53,7 @@ def _uncertainty(text: str) -> float | dict[str, float]:
 
 def _run(options: argparse.Namespace) -> int:
     from hybrid_opt.campaign.results import read_campaign
-    from hybrid_opt.extras.bundles.bundle import require_target
+    from hybrid_opt.extras.bundles.targets import require_target
     from hybrid_opt.progress import Progress
     from hybrid_opt.recommending.choice import Wish
     from studies.study.answer import answer

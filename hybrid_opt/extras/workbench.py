@@ -19,7 +19,8 @@ from hybrid_opt.cell import Cell
 from hybrid_opt.display.solids import Solid, cell_solids, frame_placements, motion_points
 from hybrid_opt.errors import DisplayError, ResultsError
 from hybrid_opt.evaluate.explanation import explain
-from hybrid_opt.extras.bundles.bundle import TARGETS, export
+from hybrid_opt.extras.bundles.bundle import export
+from hybrid_opt.extras.bundles.targets import TARGETS
 from hybrid_opt.job.plan import plan_job
 from hybrid_opt.metaheuristics.run import SearchSettings
 from hybrid_opt.robust.squeeze import Squeeze, SqueezeSettings, commanded_forces

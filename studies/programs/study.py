@@ -33,7 +33,7 @@ from hybrid_opt.evaluate.objectives import (
     PAPER_OBJECTIVES,
     force_kind,
 )
-from hybrid_opt.extras.bundles.bundle import missing_text
+from hybrid_opt.extras.bundles.targets import missing_text
 from hybrid_opt.polishing.drive import UNPOLISHABLE, is_polishable
 from hybrid_opt.polishing.polisher import has_polishable_forces
 from hybrid_opt.polishing.settings import (

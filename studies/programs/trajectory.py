@@ -18,9 +18,10 @@ from hybrid_opt.cell import Cell
 from hybrid_opt.compiled_cell import InterpretedCell
 from hybrid_opt.display.table import number, text_table
 from hybrid_opt.extras.bundles import BundleOptions, Origin, export
-from hybrid_opt.extras.bundles.bundle import README, require_target, warnings_of
+from hybrid_opt.extras.bundles.bundle import README, warnings_of
 from hybrid_opt.extras.bundles.check import as_document, check
 from hybrid_opt.extras.bundles.check import read_trajectory as joint_trajectory
+from hybrid_opt.extras.bundles.targets import require_target
 from hybrid_opt.job.compliance import (
     SKEWS,
     STIFFNESSES,

@@ -28,8 +28,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from hybrid_opt.extras.bundles import BundleOptions
-from hybrid_opt.extras.bundles.bundle import prepared, target_for
+from hybrid_opt.extras.bundles.bundle import prepared
 from hybrid_opt.extras.bundles.job_file import Contents
+from hybrid_opt.extras.bundles.targets import target_for
 from studies.report.looks import Film, write_animation
 from symbolic.array import Array
 from symbolic.records import Handling, Workcell

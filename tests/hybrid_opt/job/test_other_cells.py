@@ -15,7 +15,8 @@ import yaml
 from hybrid_opt.cell import Cell
 from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES
 from hybrid_opt.extras.bundles import TARGETS, BundleOptions, export
-from hybrid_opt.extras.bundles.bundle import prepared, target_for
+from hybrid_opt.extras.bundles.bundle import prepared
+from hybrid_opt.extras.bundles.targets import target_for
 from hybrid_opt.job.plan import JobModel
 from hybrid_opt.job.smooth import driven_timing, without_jumps
 from hybrid_opt.robust.force import subsample

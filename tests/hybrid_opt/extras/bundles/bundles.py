@@ -40,7 +40,7 @@ def exported(target: str, driver: str = "simulation") -> Export:
         driver: of the target torque, whatever the makers of the arms.
     """
     options = BundleOptions(step=STEPS.get(target, 0.05), any_arm=True)
-    with patch("hybrid_opt.extras.bundles.bundle.driver_of", return_value=driver):
+    with patch("hybrid_opt.extras.bundles.targets.driver_of", return_value=driver):
         return prepared(rack_driven(), target, options)
 
 

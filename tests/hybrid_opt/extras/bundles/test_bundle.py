@@ -16,8 +16,8 @@ import pytest
 
 from hybrid_opt.errors import JobError, ResultsError
 from hybrid_opt.extras.bundles import BundleOptions, Origin, export
-from hybrid_opt.extras.bundles.bundle import missing_for
 from hybrid_opt.extras.bundles.job_file import pad_places
+from hybrid_opt.extras.bundles.targets import missing_for
 from hybrid_opt.job.records import Job, sample_job
 from hybrid_opt.store.bundle_file import read_manifest, write_bundle
 from hybrid_opt.store.files import sha256

@@ -20,9 +20,10 @@ import pytest
 pytest.importorskip("mujoco")
 
 from hybrid_opt.extras.bundles import BundleOptions
-from hybrid_opt.extras.bundles.bundle import CYCLE_SKEW, SKEW, prepared, target_for
+from hybrid_opt.extras.bundles.bundle import prepared
 from hybrid_opt.extras.bundles.job_file import Contents, pad_errors
 from hybrid_opt.extras.bundles.programs.carry_job import Job
+from hybrid_opt.extras.bundles.targets import CYCLE_SKEW, SKEW, target_for
 from hybrid_opt.extras.simulation.arms import ArmOutcome, CellSimulation
 from hybrid_opt.extras.simulation.reference import (
     BoxJob,

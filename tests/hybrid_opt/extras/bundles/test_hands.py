@@ -19,11 +19,12 @@ import pytest
 from hybrid_opt.cell import Cell
 from hybrid_opt.compiled_cell import InterpretedCell
 from hybrid_opt.extras.bundles import TARGETS, BundleOptions, export
-from hybrid_opt.extras.bundles.bundle import TORQUE_DRIVERS, missing_for, prepared
+from hybrid_opt.extras.bundles.bundle import prepared
 from hybrid_opt.extras.bundles.job_file import Contents, Export
 from hybrid_opt.extras.bundles.programs import carry_job as programs
 from hybrid_opt.extras.bundles.programs import filled
 from hybrid_opt.extras.bundles.programs.carry_job import Machine, Refused, Seen
+from hybrid_opt.extras.bundles.targets import TORQUE_DRIVERS, missing_for
 from hybrid_opt.extras.bundles.urscript import urscript_files
 from hybrid_opt.job.plan import JobModel
 from hybrid_opt.job.records import SWITCHES, Job
@@ -90,7 +91,7 @@ def sheet(target: str, job: Job, step: float = 0.05) -> Export:
 def torque(driver: str) -> Contents:
     """The files of the target torque."""
     with (
-        patch("hybrid_opt.extras.bundles.bundle.driver_of", return_value=driver),
+        patch("hybrid_opt.extras.bundles.targets.driver_of", return_value=driver),
         patch("hybrid_opt.extras.bundles.torque.driver_of", return_value=driver),
     ):
         return TORQUE_DRIVERS[driver].files(sheet("torque", with_lines(*NAMES[driver])))

@@ -20,8 +20,8 @@ import yaml
 import yourdfpy
 
 from hybrid_opt.extras.bundles.arms import description, ros_joints
-from hybrid_opt.extras.bundles.bundle import target_for
 from hybrid_opt.extras.bundles.job_file import pad_places
+from hybrid_opt.extras.bundles.targets import target_for
 from hybrid_opt.extras.bundles.torque import (
     driver_of,
     joint_inertia,
