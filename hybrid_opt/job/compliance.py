@@ -44,11 +44,11 @@ class PositionControl:
     """Forces under position control at one stiffness.
 
     Attributes:
-        stiffness: of each arm at its pad [N/m].
-        penetration: (2,) largest that each arm has to aim into the box [m].
-        force_error: change of force by `POSITION_ERROR` of both arms [N].
-        share: of the least commanded force while the box is held.
-        margin: least excess over the force that holds the box [N].
+        stiffness: stiffness of each arm at its pad [N/m].
+        penetration: (2,) largest depth inside the box at which each arm has to aim [m].
+        force_error: change of the normal force if both arms err by `POSITION_ERROR` [N].
+        share: `force_error` over the least commanded force while the box is held.
+        margin: least excess of the commanded force over the force that holds the box [N].
     """
 
     stiffness: float
@@ -72,13 +72,13 @@ class Skew:
     """Effect of a delay of one arm while the box is held, at one stiffness.
 
     Attributes:
-        delay: [s].
-        stiffness: of each arm at its pad, in all directions [N/m].
+        delay: delay of one arm behind the other [s].
+        stiffness: stiffness of each arm at its pad, the same in all directions [N/m].
         displacement: largest relative displacement of the pads [m].
         force_change: largest change of the normal forces [N].
-        share: the same, of the normal force commanded at that moment.
-        margin: least excess over the normal force that then holds the box [N].
-        late: index of the arm whose delay leaves that least.
+        share: `force_change` over the normal force commanded at the same moment.
+        margin: least excess of the changed normal force over the force that holds the box [N].
+        late: index of the delayed arm in the worse of both cases.
     """
 
     delay: float
@@ -116,14 +116,15 @@ def force_margin(job: Job) -> float:
 
 
 def skewed(job: Job, delay: float, stiffness: float) -> Skew:
-    """Compute the effect of a delay of either arm while the box is held: the worse of both.
+    """Compute the effect of a delay of one arm while the box is held, for the worse of both arms.
 
-    Pads and box as springs, quasi-static: the pads' relative displacement along the normal changes
-    the squeeze, the one across it has to be borne by friction as well.
+    The arms are springs, quasi-static. A relative displacement of the pads along the normal changes
+    the squeeze. A displacement across the normal adds a tangential force for friction to bear.
 
     Args:
-        delay: [s].
-        stiffness: of each arm at its pad [N/m].
+        job: the whole job.
+        delay: delay of one arm behind the other [s].
+        stiffness: stiffness of each arm at its pad [N/m].
 
     Raises:
         SettingsError: the stiffness is not positive, or the delay out of range.
@@ -141,10 +142,10 @@ def skewed(job: Job, delay: float, stiffness: float) -> Skew:
 
 
 def separation(job: Job, delay: float) -> float:
-    """Compute how far a delay [s] of either arm moves the pads apart while the box is held [m].
+    """Compute the largest relative displacement of the pads [m] by a delay [s] of either arm.
 
-    One arm that stops by itself is a late one: the delay is the time until the other has gone as
-    far as it will, at the planned speed.
+    Only the phases that hold the box count. An arm that stops alone is also a delayed arm: the
+    delay is then the time that the other arm goes on at the planned speed.
     """
     return max(
         float(np.linalg.norm(_displacement(job, phase, late, delay)[1], axis=1).max())
@@ -154,7 +155,9 @@ def separation(job: Job, delay: float) -> float:
 
 
 def largest_skew(job: Job, stiffness: float) -> float:
-    """Compute the longest delay of either arm that friction survives, up to `LARGEST_SKEW` [s].
+    """Compute the longest delay [s] of either arm at which friction holds the box.
+
+    The result is at most `LARGEST_SKEW`.
 
     Raises:
         SettingsError: the stiffness is not positive.
@@ -172,11 +175,12 @@ def largest_skew(job: Job, stiffness: float) -> float:
 
 
 def require_skew(job: Job, delay: float, stiffness: float) -> None:
-    """Refuse a job whose squeeze a delay of either arm breaks.
+    """Refuse a job in which friction would not hold the box after a delay of either arm.
 
     Args:
-        delay: [s].
-        stiffness: of each arm at its pad [N/m].
+        job: the whole job.
+        delay: delay of one arm behind the other [s].
+        stiffness: stiffness of each arm at its pad [N/m].
 
     Raises:
         SettingsError: the stiffness is not positive, or the delay out of range.

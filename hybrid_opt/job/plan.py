@@ -77,9 +77,9 @@ class SupportedPose:
     """Pose of a box on its support.
 
     Attributes:
-        pose: (6,) of the box [m, rad].
-        height: distance below the carry's end [m].
-        bodies: names of the supporting bodies, empty without any.
+        pose: (6,) pose of the box on the support, world frame [m, rad].
+        height: height of the carry's end above this pose [m].
+        bodies: names of the supporting bodies; empty if there are none.
     """
 
     pose: Array
@@ -92,9 +92,10 @@ class StraightMotions:
     """Straight motions and supports before a carry and after it.
 
     Attributes:
-        checker: of the whole job.
-        lines: straight motions before the carry and after it, either from the carry outwards.
-        stands_on: names of the box's supports before and after.
+        checker: collision checker of the whole job.
+        lines: two lists, the straight motions before and after the carry; each list begins with the
+            motion next to the carry.
+        stands_on: names of the bodies that support the box before and after the carry.
     """
 
     checker: CollisionChecker
@@ -104,13 +105,16 @@ class StraightMotions:
     def followed(
         self, workcell: Workcell, posture: NumericFunction, q: Array
     ) -> Iterator[tuple[int, Straight, Array]]:
-        """Yield side, line and both arms' joints along each straight motion.
+        """Yield side, line and joint positions of each straight motion.
 
-        The joints are (`PHASE_SAMPLES`, joints).
+        The side is 0 before the carry and 1 after it. The joint positions of both arms are
+        (`PHASE_SAMPLES`, joints) [rad or m].
 
         Args:
-            posture: `symbolic.robot.arm.posture_function`.
-            q: (2, joints) of both arms at the beginning and end of the carry [rad or m].
+            workcell: the cell.
+            posture: compiled `symbolic.robot.arm.posture_function`.
+            q: (2, joints) joint positions of both arms at the beginning and end of the carry
+                [rad or m].
 
         Raises:
             JobError: an arm does not reach a place within its joint range.
@@ -126,7 +130,7 @@ class JobCollisions:
     """The collision model of one workcell's jobs. Not to be shared between threads.
 
     Attributes:
-        geometry: bodies and pairs; beside those of the carry, both arms' against the box.
+        geometry: bodies and pairs to check: those of the carry, and each arm's bodies with the box.
     """
 
     def __init__(self, compiled: CompiledCell, everywhere: bool = False) -> None:
@@ -143,11 +147,12 @@ class JobCollisions:
         self._functions = compiled.screening
 
     def standing(self, pose: Array, height: float | None) -> SupportedPose:
-        """Find where the box stands below a pose (6,).
+        """Find the supported pose of the box straight below a pose (6,) [m, rad].
 
         Args:
-            height: how far below [m]; None to lower it until it touches something, and not at all
-                where nothing is found within `LARGEST_DROP`.
+            pose: (6,) pose of the box at an end of the carry, world frame [m, rad].
+            height: distance to lower the box [m]; None to lower the box until it touches a body. If
+                no body is within `LARGEST_DROP`, the box is then not lowered.
         """
         distances = BodyDistances(self.geometry, RESTING_TOLERANCE)
         payload, bodies = self.geometry.index(PAYLOAD_NAME), self.geometry.bodies
@@ -181,7 +186,7 @@ class JobCollisions:
         return SupportedPose(_lowered(pose, found), found, tuple(names))
 
     def straight_motions(self, handling: Handling, pose: Array) -> StraightMotions:
-        """Plan the straight motions around a carry whose box begins and ends at poses (2, 6)."""
+        """Plan the straight motions around a carry from the first to the second pose (2, 6)."""
         heights = (handling.lift_height, handling.set_down_height)
         before, after = (self.standing(*each) for each in zip(pose, heights, strict=True))
         stands = (before.pose, after.pose)
@@ -190,8 +195,11 @@ class JobCollisions:
         return StraightMotions(checker, lines, (before.bodies, after.bodies))
 
     def checker(self, places: Sequence[SupportedPose]) -> CollisionChecker:
-        """Build the checker of a job whose box stands at these places before and after the
-        carry."""
+        """Build the collision checker of a job; the box may touch its supports at these places.
+
+        Args:
+            places: supported poses of the box before and after the carry.
+        """
         task = self._workcell.task
         poses = tuple(Waypoint(place.pose, place.pose) for place in places)
         contacts = tuple(
@@ -209,11 +217,13 @@ class JobCollisions:
 
 
 def job_geometry(workcell: Workcell, everywhere: bool = False) -> CellGeometry:
-    """Return the bodies and pairs of a cell whose box is not always held; see the module's contact
-    rules.
+    """Return the bodies of a cell and the pairs of bodies that a job has to check for collisions.
+
+    The contact rules of the module decide which pairs of an arm's body and the box are checked.
 
     Args:
-        everywhere: whether bodies behind a pad are checked against the box as well.
+        workcell: the cell.
+        everywhere: True to check also the bodies behind a pad against the box.
 
     Raises:
         CollisionModelError: a shape is unusable, or an ignored pair names no body.
@@ -269,15 +279,16 @@ def describe_obstruction(
     pose: Array,
     q: Array,
 ) -> str:
-    """Describe the first straight motion around a carry that an arm does not follow, or that
-    collides; '' if all are free on their samples.
+    """Describe the first straight motion around a carry that collides or leaves an arm's reach.
+
+    The result is '' if every motion is reached and free of collisions at the checked samples.
 
     Args:
-        workcell: two round pads of it face one another.
-        collisions: of its jobs.
-        posture: `symbolic.robot.arm.posture_function`.
-        pose: (2, 6) of the box where the carry begins and ends.
-        q: (2, joints) of both arms there [rad or m].
+        workcell: cell with two opposite round pads.
+        collisions: collision model of the cell's jobs.
+        posture: compiled `symbolic.robot.arm.posture_function`.
+        pose: (2, 6) poses of the box at the beginning and end of the carry [m, rad].
+        q: (2, joints) joint positions of both arms at these poses [rad or m].
     """
     around = collisions.straight_motions(workcell.handling, pose)
     share = rest_to_rest_profile(1.0, PHASE_SAMPLES).value[::CHECK_STRIDE]
@@ -343,14 +354,14 @@ class JobModel:
         """Plan the whole job around a timed carry.
 
         Args:
-            timing: of a carry of this workcell, one that robots can drive.
+            timing: drivable timing of a carry of this workcell.
             squeeze: settings of the commanded forces; None for the defaults.
             smoothing: half the width of the window over which a timing with jumps of acceleration
                 is averaged [s]; zero keeps it unchanged. In a workcell with limits on jerk, any
                 other value gives a timing within these limits instead.
-            handling: instead of the workcell's own.
-            within_jerk: time the carry within the workcell's limits on jerk, which takes about a
-                second; else it is averaged.
+            handling: heights, speeds and stand-off of the job; None for the workcell's own.
+            within_jerk: True to time the carry within the workcell's limits on jerk, in about a
+                second; False to average its accelerations.
 
         Raises:
             SettingsError: the timing failed, or the squeeze is not possible.
@@ -473,7 +484,7 @@ class JobModel:
 
 @lru_cache(maxsize=CACHED_WORKCELLS)
 def job_model(timing: TimingModel) -> JobModel:
-    """Return the planner of the jobs of a timing model's workcell, made once."""
+    """Return the job planner of a timing model's workcell; repeated calls return the same one."""
     return JobModel(timing.compiled, timing)
 
 
@@ -484,9 +495,9 @@ class CommandedForces:
     Attributes:
         forces: (n, 2) normal forces to command along the carry [N].
         squeeze: origin of the forces.
-        job: the whole job that they belong to; None if none can be planned, then they are the
-            carry's alone.
-        problem: reason why there is no job, else ''.
+        job: the whole job around the carry; None if no job can be planned. The forces are then
+            computed for the carry alone.
+        problem: reason why no job can be planned, else ''.
     """
 
     forces: Array
@@ -498,12 +509,12 @@ class CommandedForces:
 def command_forces(
     model: JobModel, timing: Timing, settings: SqueezeSettings | None = None
 ) -> CommandedForces:
-    """Compute the forces to command along a timed carry, as in its job.
+    """Compute the normal forces to command along a timed carry, as its job commands them.
 
     Args:
-        model: of the carry's workcell.
-        timing: without jumps of acceleration.
-        settings: of the forces; None for the defaults.
+        model: job planner of the carry's workcell.
+        timing: timing of the carry, without jumps of acceleration.
+        settings: settings of the commanded forces; None for the defaults.
 
     Raises:
         SettingsError: the timing failed, or the uncertainty leaves no friction or patch.
@@ -537,7 +548,17 @@ def plan_job(
     squeeze: SqueezeSettings | None = None,
     smoothing: float = SMOOTHING_WIDTH,
 ) -> Job:
-    """Plan the whole job around a timed or recommended carry, see `JobModel.plan`."""
+    """Plan the whole job around a timed or recommended carry.
+
+    Args:
+        timing: drivable timing, or an object with one.
+        squeeze: settings of the commanded forces; None for the defaults.
+        smoothing: half the width of the window over which jumps of acceleration are averaged [s].
+
+    Raises:
+        SettingsError: the timing failed, or the squeeze is not possible.
+        JobError: an arm does not reach a place, something collides, or a limit is exceeded.
+    """
     timing = timing if isinstance(timing, Timing) else timing.timing
     if timing.carry is None:
         raise SettingsError(

@@ -44,16 +44,16 @@ LARGEST_STEP = 1.0
 class PhaseMotion:
     """Motion of box and arms in a phase at n samples; world frame, both arms' joints stacked.
 
-    A sample may stand twice where an acceleration jumps, once for each side.
+    Where an acceleration jumps, the sample stands twice: with the value before and after the jump.
 
     Attributes:
         first: number of the first arm's joints.
         time: (n,) from the beginning of the phase [s].
         pose, rate, second_rate: (n, 6) box pose [m, rad] and its time derivatives.
-        q, q_rate, q_second: (n, joints) [rad, s].
-        own_torque: (n, joints) torques of the bare arms' motion and weight [N m].
-        wrench_torque: (n, joints, 6) from each robot's wrench on the box (force and moment about
-            the nominal contact point, world axes) to its joint torques.
+        q, q_rate, q_second: (n, joints) joint positions [rad] and their time derivatives.
+        own_torque: (n, joints) joint torques of the arms' motion and weight without contacts [N m].
+        wrench_torque: (n, joints, 6) matrix that maps a robot's wrench on the box (force and moment
+            about the nominal contact point, world axes) to the robot's joint torques.
     """
 
     first: int
@@ -69,7 +69,7 @@ class PhaseMotion:
 
     @property
     def duration(self) -> float:
-        """[s]."""
+        """Duration of the phase [s]."""
         return float(self.time[-1])
 
     def contact_effort(self, wrench: Array) -> Array:
@@ -84,8 +84,8 @@ class Force:
     Attributes:
         normal: (n, 2) commanded normal force of each robot [N].
         least: (n, 2) least normal force that holds the box, the planned one [N].
-        wrench: (n, 2, 6) of each robot on the box about its nominal contact point, with the
-            commanded normal forces [N, N m].
+        wrench: (n, 2, 6) wrench of each robot on the box about the robot's nominal contact point,
+            with the commanded normal forces [N, N m].
     """
 
     normal: Array
@@ -98,11 +98,13 @@ class Phase:
     """One phase of a job.
 
     Attributes:
-        name: one of `PHASES`, or of the contact model's own.
-        begin: when it begins, from the beginning of the job [s].
-        motion, force: what happens in it.
-        certificate: the continuous verdict on its collisions.
-        use: largest value over its limit by constraint, with the commanded forces.
+        name: one of `PHASES`, or the name of a phase that the contact model adds.
+        begin: time from the beginning of the job to that of the phase [s].
+        motion: motion of box and arms in the phase.
+        force: forces of the robots in the phase.
+        certificate: verdict on collisions along the whole path of the phase.
+        use: by name of a constraint, the largest ratio of value to limit, with the commanded
+            forces.
     """
 
     name: str
@@ -114,18 +116,18 @@ class Phase:
 
     @property
     def duration(self) -> float:
-        """[s]."""
+        """Duration of the phase [s]."""
         return self.motion.duration
 
     @property
     def most_used(self) -> str:
-        """The limit of arms and box that its motion and its forces use most."""
+        """Name of the constraint with the largest use, without those of `_STATIC`."""
         use = {name: ratio for name, ratio in self.use.items() if name not in _STATIC}
         return max(use, key=lambda name: use[name])
 
     @property
     def effort(self) -> Array:
-        """(n, joints) joint torques of arms and commanded contact wrenches together [N m]."""
+        """Joint torques (n, joints) of the arms' motion, weight and commanded wrenches [N m]."""
         return self.motion.own_torque + self.motion.contact_effort(self.force.wrench)
 
     def __post_init__(self) -> None:
@@ -139,12 +141,12 @@ class Job(Displayable):
 
     Attributes:
         workcell: the cell.
-        timing: of the carry.
-        phases: in order.
-        squeeze: how hard the robots press, and why.
-        stands_on: (2,) names of the bodies that the box stands on before and after; empty where
-            it is handed over in the air.
-        joint_names: of both arms.
+        timing: timing of the carry.
+        phases: phases of the job in order of time.
+        squeeze: origin of the commanded normal forces.
+        stands_on: names of the bodies that support the box before and after the job, two tuples; a
+            tuple is empty where the box is handed over in the air.
+        joint_names: names of each arm's joints, two tuples.
     """
 
     workcell: Workcell
@@ -156,11 +158,11 @@ class Job(Displayable):
 
     @property
     def duration(self) -> float:
-        """[s]."""
+        """Duration of the whole job [s]."""
         return self.phases[-1].begin + self.phases[-1].duration
 
     def phase(self, name: str) -> Phase:
-        """Return the phase of a name."""
+        """Return the phase with this name."""
         return next(phase for phase in self.phases if phase.name == name)
 
     @property
@@ -170,19 +172,19 @@ class Job(Displayable):
 
     @property
     def follower(self) -> int | None:
-        """The arm that is force-controlled; None where hands hold by themselves."""
+        """Index of the force-controlled arm; None where hands grip the box without a squeeze."""
         return 1 - self.squeeze.leader if contact_model(self.workcell).is_squeeze else None
 
     @property
     def control(self) -> str:
-        """What controllers do while the box is held, in words."""
+        """Sentence on which arm is force-controlled while the box is held."""
         if self.follower is None:
             return "both arms keep their places"
         return f"robot {self.workcell.robots[self.follower].name!r} is force-controlled"
 
     @property
     def peak_normal_force(self) -> Array:
-        """(2,) largest commanded normal force of each robot [N]."""
+        """Largest commanded normal force (2,) of each robot in the job [N]."""
         peaks = [phase.force.normal.max(axis=0) for phase in self.phases]
         return np.asarray(np.max(peaks, axis=0))
 
@@ -213,17 +215,18 @@ class Job(Displayable):
 class SampledJob:
     """A job at n samples; both arms' joints side by side, world frame, read-only.
 
-    Where two phases meet stands one sample, the last of the earlier one.
+    Two successive phases share one sample, the last of the earlier phase.
 
     Attributes:
         job: the job.
         time: (n,) from the beginning of the job [s].
-        last: per phase the index of its last sample.
-        pose: (n, 6) of the box [m, rad].
-        q, q_rate, q_second: (n, joints) [rad, s].
-        effort: (n, joints) torques of arms and commanded contact wrenches [N m].
-        normal_force: (n, 2) commanded [N].
-        wrench: (n, 2, 6) of each robot on the box about its nominal contact point [N, N m].
+        last: index of the last sample of each phase.
+        pose: (n, 6) box poses [m, rad].
+        q, q_rate, q_second: (n, joints) joint positions [rad] and their time derivatives.
+        effort: (n, joints) joint torques of motion, weight and commanded wrenches [N m].
+        normal_force: (n, 2) commanded normal force of each robot [N].
+        wrench: (n, 2, 6) wrench of each robot on the box about the robot's nominal contact point
+            [N, N m].
     """
 
     job: Job
@@ -241,19 +244,19 @@ class SampledJob:
         set_read_only(self)
 
     def span(self, index: int) -> slice:
-        """Return the samples of a phase, both ends included."""
+        """Return the slice of samples of the phase with this index, both ends included."""
         return slice(self.last[index - 1] if index else 0, self.last[index] + 1)
 
     @property
     def phase_names(self) -> tuple[str, ...]:
-        """(n,) the phase that leads to each sample."""
+        """Name of the phase of each sample (n,); a shared sample counts to the earlier phase."""
         names: list[str] = []
         for phase, last in zip(self.job.phases, self.last, strict=True):
             names += [phase.name] * (last + 1 - len(names))
         return tuple(names)
 
     def arm(self, index: int, values: Array) -> Array:
-        """Return the columns of one arm (0 or 1) of (n, joints)."""
+        """Return the columns of one arm (0 or 1) from values (n, joints) of both arms."""
         first = len(self.job.joint_names[0])
         return values[:, :first] if index == 0 else values[:, first:]
 
