@@ -33,15 +33,18 @@ def search(
     settings: SearchSettings | None = None,
     progress: ShowProgress = False,
 ) -> Front:
-    """Search for the carries of least objectives.
+    """Search for the carries with the least objectives and return them as a front.
 
     Args:
-        algorithm: one of `algorithms()`.
-        evaluations: candidates that may be evaluated.
-        rng: the search's only randomness; the same state gives the same front to the bit.
-        settings: see there; None for the defaults. Where it names no initial candidates, the
-            hand-made trajectory is in the first generation of all but the random search.
-        progress: True for a bar, or a function of candidates done and in all.
+        cell: the cell to search.
+        algorithm: name of the search algorithm, one of `algorithms()`.
+        evaluations: largest number of candidates to evaluate.
+        rng: random generator; the same state gives exactly the same front.
+        settings: settings of the search, None for the defaults. Without initial candidates in
+            the settings, the first generation contains the cell's hand-made trajectory, except
+            in the random search.
+        progress: True for a progress bar, or a function that is called with the number of
+            candidates evaluated and their total.
 
     Raises:
         SettingsError: an unknown algorithm or a value that is not allowed.
@@ -67,17 +70,20 @@ def polish(
     paths: Sequence[Carry | Array] = (),
     progress: ShowProgress = False,
 ) -> Front:
-    """Improve a front: both peak forces with an interior-point method, or, in drivable cells,
-    path and speed profile together.
+    """Improve the carries of a front by nonlinear programming and return the polished front.
+
+    The polish lowers both peak normal forces. In drivable cells, path and speed profile are
+    optimised together.
 
     Args:
-        rng: spreads the starts of some attempts.
-        settings: see `hybrid_opt.polishing.settings`; None for the usual ones of the time law.
-        paths: carries of the cell whose paths are known to be good, or their decision vectors,
-            with or without a force limit; in drivable cells only. The front is nowhere
-            behind them. The hand-made path always takes part.
-        progress: True for a bar, or a function of attempts done and those expected in all: what is
-            left to do shows on the way, and both are equal in the end.
+        front: the front to improve.
+        rng: random generator that perturbs the starts of some attempts.
+        settings: settings of the polish, None for the defaults of the cell's time law.
+        paths: good carries of the same cell as additional starts, or their decision vectors
+            (n_var,), or (n_path,) without the force limit. Only drivable cells take them. No
+            given path dominates a point of the result. The hand-made path is always a start.
+        progress: True for a progress bar, or a function that is called with the number of
+            attempts done and the number expected in all; the second number may change.
 
     Raises:
         SettingsError: the cell's objectives are not those of the polish, or a path does not fit.
@@ -104,12 +110,13 @@ def polish(
 
 
 def time_path(cell: Cell, carry: Carry | Array, limits: TimingLimits | None = None) -> Timing:
-    """Compute the fastest timing from rest to rest that robots can drive.
+    """Compute the fastest timing of a path from rest to rest within the limits of the robots.
 
     Args:
-        carry: the carry whose path is timed, or its decision vector (n_var,).
-        limits: beyond the cell's own speeds and accelerations, which always hold; None for the
-            joint torques and the contact patches.
+        cell: the cell of the carry.
+        carry: a carry with the path to time, or its decision vector (n_var,).
+        limits: additional limits; None limits the joint torques and the pressure shifts on the
+            contact patches. The cell's limits on speed and acceleration always apply.
 
     Raises:
         SettingsError: the carry does not fit the cell.
@@ -123,12 +130,15 @@ def time_with_jerk(
     limits: TimingLimits | None = None,
     jerk: JerkLimits | None = None,
 ) -> JerkTiming:
-    """Compute a fast timing within limits on jerk as well, at rest without acceleration at both
-    ends.
+    """Compute a fast timing of a path within limits on jerk.
+
+    Speed and acceleration are zero at both ends.
 
     Args:
-        carry, limits: as for `time_path`.
-        jerk: largest jerks; None for those that the workcell states.
+        cell: the cell of the carry.
+        carry: a carry with the path to time, or its decision vector (n_var,).
+        limits: limits besides jerk, as for `time_path`; None for the defaults.
+        jerk: limits on jerk, None for the limits in the workcell file.
 
     Raises:
         SettingsError: the carry does not fit the cell, or no jerk is limited.
@@ -149,12 +159,17 @@ def compare_timings(
     curve_points: int | None = None,
     progress: ShowProgress = False,
 ) -> TimedTrajectory:
-    """Compare the search's timing and the drivable ones of a carry, with margins.
+    """Compare the timing of the search with drivable timings of the same path, with margins.
 
     Args:
-        force_limit: normal force [N] of a force-limited timing, None for no such timing.
-        curve_points: points of the curve of duration against force limit, None for no curve.
-        progress: True for a bar, or a function of timings done and in all, the margins as one.
+        cell: the cell of the carry.
+        carry: a carry with the path to time, or its decision vector (n_var,).
+        force_limit: largest normal force [N] of an additional force-limited timing, None for no
+            such timing.
+        curve_points: number of points on the curve of duration against force limit, None for no
+            curve.
+        progress: True for a progress bar, or a function that is called with the number of
+            timings done and their total; all margins together count as one timing.
     """
     return time_trajectory(
         cell.timing_model, decision_of(carry), force_limit, curve_points, progress=progress
@@ -162,11 +177,12 @@ def compare_timings(
 
 
 def save(carry: Carry, path: str | Path, provenance: Mapping[str, Any] | None = None) -> None:
-    """Store a carry of `Cell.carry` with its whole cell in one file; see docs/reference/bundles.md.
+    """Store a carry and its whole cell in one trajectory file (docs/reference/bundles.md).
 
     Args:
-        path: the file, replaced if it exists.
-        provenance: origin of the carry as JSON values.
+        carry: the carry to store, from `Cell.carry`.
+        path: path of the file; an existing file is replaced.
+        provenance: origin of the carry as JSON values by name (algorithm, seed, ...).
 
     Raises:
         ResultsError: the workcell was changed after reading, or the file cannot be written.

@@ -1,9 +1,9 @@
 """One carry: motion of box and arms, and the forces between them, under one timing.
 
-`Cell.carry` gives a candidate under the task's own time law, as a search sees it; `time_path` gives
-one under a timing that robots can drive; exports take one at even time steps. All are this record.
-What both robots have alike (forces) has an axis over the robots; what belongs to an arm's joints,
-of which arms may have different numbers, is in `arms`.
+`Cell.carry` returns a carry under the task's time law. `time_path` returns a timing within the
+limits of the robots, which also contains a carry. Exports sample a carry at even time steps.
+Forces have an axis over the two robots. Joint quantities are in `arms`, because the arms may have
+different numbers of joints.
 """
 
 from __future__ import annotations
@@ -32,23 +32,24 @@ NO_TIMING = "no_timing"
 DRIVE_CONSTRAINTS = (FORCE_LIMIT, JOINT_TORQUE, NO_TIMING)
 """Constraints of drivable cells.
 
-force_limit, joint_torque: standing still needs more; violation: its share of the limit, minus 1.
-no_timing: the solver of timings fails the path for any other reason; violation: 1.
+force_limit, joint_torque: holding the box at rest needs more than the limit allows; the violation
+is the needed value over the limit, minus 1.
+no_timing: the timing solver rejects the path for any other reason; the violation is 1.
 """
 
 STANDSTILL = 1e-30
-"""Squared length of a path's tangent below which it counts as none [(m, rad per u)^2]."""
+"""Squared length of a path's tangent below which the tangent counts as zero [(m, rad per u)^2]."""
 
 
 @dataclass(frozen=True)
 class Judgement:
-    """The evaluator's verdict on one candidate, on the task's samples.
+    """Feasibility and objectives of one candidate, evaluated at the task's samples.
 
     Attributes:
-        feasible: whether it satisfies every constraint.
-        reason: the constraint violated first along the path, '' if none is.
-        position: path parameter in [0, 1] of that first violation, None if there is none.
-        objectives: values by name, without penalty.
+        feasible: True if the candidate satisfies every constraint.
+        reason: name of the constraint violated first along the path, '' for a feasible candidate.
+        position: path parameter in [0, 1] of the first violation, None without a violation.
+        objectives: objective values by name, without penalty.
     """
 
     feasible: bool
@@ -68,7 +69,8 @@ class ArmMotion:
     """One arm along a carry, n samples; arrays are read-only.
 
     Attributes:
-        q, q_rate, q_second: (n, n_joints) joint positions and their time derivatives [rad, s].
+        q, q_rate, q_second: (n, n_joints) joint positions [rad], velocities [rad/s] and
+            accelerations [rad/s^2].
         contact_torque: (n, n_joints) joint torques of the contact wrench alone [N m].
         own_torque: (n, n_joints) joint torques of the bare arm's motion and weight [N m].
     """
@@ -96,20 +98,21 @@ class Carry(Displayable):
     for each side.
 
     Attributes:
-        workcell: the cell.
+        workcell: the description of the cell.
         x: (n_var,) decision vector.
-        timing: the task's time law, 'constant' or 'ramped', or 'limits' where a timing was found.
-        parameter: (n,) path parameter u.
-        time: (n,) [s].
-        pose, rate, second_rate: (n, 6) box pose [m, rad] and its time derivatives.
-        angular_velocity, angular_acceleration: (n, 3) of the box [rad/s, rad/s^2].
-        normal_force, tangential_force: (n, 2) [N].
-        contact_force: (n, 2, 3) force of each robot on the box [N].
-        pressure_shift: (n, 2) [m].
+        timing: name of the time law, 'constant' or 'ramped', or 'limits' for a computed timing.
+        parameter: (n,) path parameter u in [0, 1].
+        time: (n,) time of each sample [s].
+        pose, rate, second_rate: (n, 6) box pose [m, rad] and its first and second time derivative.
+        angular_velocity, angular_acceleration: (n, 3) angular velocity [rad/s] and angular
+            acceleration [rad/s^2] of the box.
+        normal_force, tangential_force: (n, 2) normal and tangential force of each robot [N].
+        contact_force: (n, 2, 3) force vector of each robot on the box [N].
+        pressure_shift: (n, 2) shift of the centre of pressure at each contact [m].
         point_moment_residual: (n, 3) moment missing with the forces at the nominal points [N m].
         moment_residual: (n, 3) moment missing with the pressure shifted [N m].
         arms: the motion of each robot's joints.
-        judgement: the evaluator's verdict on the candidate, None where it was not asked for.
+        judgement: feasibility and objectives of the candidate, None if not evaluated.
     """
 
     workcell: Workcell
@@ -170,12 +173,12 @@ class Carry(Displayable):
 
     @property
     def excess_above_static(self) -> Array:
-        """(2,) how far the peak normal forces lie above the static hold [%]."""
+        """(2,) excess of the peak normal forces over the forces of the static hold [%]."""
         return excess_above_static(self.peak_normal_force, static_hold(self.workcell).normal_force)
 
     @property
     def mean_excess_above_static(self) -> float:
-        """How far the mean of both peaks lies above that of the static hold [%]."""
+        """Excess of the mean of both peak normal forces over the mean of the static hold [%]."""
         still = static_hold(self.workcell).normal_force.mean()
         return float(excess_above_static(self.peak_normal_force.mean(), still))
 
@@ -192,7 +195,7 @@ class Carry(Displayable):
 
     @property
     def peak_contact_torque_use(self) -> Array:
-        """(2,) per arm the largest joint torque of the contact wrench over that joint's limit."""
+        """(2,) for each arm, the largest ratio of a contact torque to the joint's torque limit."""
         return np.array(
             [
                 float((np.abs(arm.contact_torque) / robot.torque_max).max())
@@ -216,14 +219,18 @@ class Carry(Displayable):
         return self.stack_arms("torque")
 
     def stack_arms(self, name: str) -> Array:
-        """Stack a quantity of both arms' `ArmMotion`: (n, all joints), the first arm's first."""
+        """Return one quantity of both arms side by side (n, all joints), the first arm first.
+
+        Args:
+            name: attribute name in `ArmMotion`.
+        """
         return np.concatenate([getattr(arm, name) for arm in self.arms], axis=1)
 
     @property
     def figures(self) -> dict[str, float]:
-        """Figures of an evaluated carry for storage and reports, SI units.
+        """Scalar figures of an evaluated carry by name, in SI units, for storage and reports.
 
-        `feasible` is 1 or 0; `objective_<name>` are without penalty; means are over time.
+        `feasible` is 1 or 0. `objective_<name>` has no penalty. Mean forces are means over time.
         """
         judgement = self.judgement
         assert judgement is not None, "figures are those of a carry that the evaluator judged"
@@ -248,14 +255,14 @@ class Carry(Displayable):
         """Show the carry in three dimensions: in a notebook's cell, or saved as a page.
 
         Args:
-            height: of the notebook's cell [px].
+            height: height of the view in a notebook [px].
         """
         page: Page = display("scene").CarryView(self, height)
         return page
 
 
 def joints_of(workcell: Workcell, values: Array) -> tuple[Array, Array]:
-    """Split stacked joints (n, all joints) into (n, n_joints) of each arm."""
+    """Split joint values of both arms (n, all joints) into one array (n, n_joints) per arm."""
     first = len(workcell.robots[0].velocity_max)
     return values[:, :first], values[:, first:]
 
@@ -267,13 +274,14 @@ def carry_from_outputs(
     outputs: Mapping[str, Array],
     judgement: Judgement | None = None,
 ) -> Carry:
-    """Build the carry of one candidate from its outputs.
+    """Build the carry of one candidate from the outputs of the compiled candidate function.
 
     Args:
-        functions: with both arms' `inverse_dynamics_i`, see `symbolic.functions`.
+        workcell: the description of the cell.
+        functions: compiled functions by name, with `inverse_dynamics_1` and `inverse_dynamics_2`.
         x: (n_var,) decision vector.
-        outputs: of the compiled candidate function for x, without an axis over candidates.
-        judgement: the evaluator's verdict, where there is one.
+        outputs: output arrays by name for x, without an axis over candidates.
+        judgement: feasibility and objectives of the candidate, None if not evaluated.
     """
     time = outputs["time"].reshape(-1)
     arms = [_arm(workcell, functions[f"inverse_dynamics_{arm}"], x, outputs, arm) for arm in (1, 2)]
@@ -300,7 +308,7 @@ def carry_from_outputs(
 
 
 def decision_of(carry: Carry | Array) -> Array:
-    """Return the decision vector (n_var,) of a carry, or the vector itself."""
+    """Return the decision vector (n_var,) of a carry; return a given vector unchanged."""
     return carry.x if isinstance(carry, Carry) else carry
 
 

@@ -52,14 +52,14 @@ _EVALUATED_AT_ONCE = 500
 
 
 class Cell:
-    """A workcell with its compiled functions, each set loaded or built when first needed.
+    """A workcell with its compiled functions.
 
-    A first use compiles; later ones, also by other programs, load what was compiled. Not to be
-    shared between threads.
+    Functions are compiled at their first use and cached on disk; later uses load them, also in
+    other programs. A cell must not be shared between threads.
 
     Attributes:
-        workcell: the description.
-        compiled: its compiled functions, made from one symbolic model.
+        workcell: the description of the cell.
+        compiled: the compiled functions of the workcell, made from one symbolic model.
     """
 
     def __init__(
@@ -72,10 +72,13 @@ class Cell:
         """Describe a cell; nothing is compiled yet.
 
         Args:
-            objectives: what searches minimise: names of `OBJECTIVES`, or records of one's own.
-            compiled: where its functions come from, such as an `InterpretedCell` of the workcell.
-            threads: for the evaluation of candidates, 0 for one per core; has no influence on
-                results. By default one per core, in a worker process, which shares them, one.
+            workcell: the description of the cell.
+            objectives: objectives that searches minimise: names in `OBJECTIVES`, or `Objective`
+                records.
+            threads: number of threads that evaluate candidates, 0 for one per core; the results
+                do not depend on the number. None means one per core, or one in a worker process.
+            compiled: source of the compiled functions, None for the default. An
+                `InterpretedCell` of the workcell is another source.
 
         Raises:
             SettingsError: an objective is unknown, or given twice.
@@ -127,7 +130,11 @@ class Cell:
         return cell
 
     def with_start_branches(self, branches: tuple[int, int]) -> Cell:
-        """Return the cell with the start branches set that its file leaves to a search, read anew.
+        """Read the workcell file again and return the cell with given start branches.
+
+        Args:
+            branches: for each arm, the number of the start branch that replaces "search" in the
+                file.
 
         Raises:
             WorkcellError: the file was changed and is wrong now.
@@ -137,13 +144,14 @@ class Cell:
         return Cell(decided, self._objectives, self._threads)
 
     def changed(self, changes: Mapping[str, Any]) -> Cell:
-        """Return the cell with other numbers, in memory, without compiling again.
+        """Return a copy of the cell with changed parameters, without compiling again.
 
-        It can be stored, searched, polished and exported like any other.
+        The changed cell can be stored, searched, polished and exported like any other cell.
 
         Args:
-            changes: values by key path as in the workcell file: 'payload.mass',
-                'contacts.friction' of both, 'contacts[0].friction', 'environment.top board.xyz'.
+            changes: new values by key path in the workcell file: 'payload.mass',
+                'contacts.friction' (both contacts), 'contacts[0].friction',
+                'environment.top board.xyz'.
 
         Raises:
             WorkcellError: a path leads nowhere, or the changed cell is wrong; the message lists
@@ -155,11 +163,11 @@ class Cell:
         return cell
 
     def drivable(self) -> Cell:
-        """Return the drivable variant of the cell: with the fastest timings, searched for
-        duration and peak force, the robust one if robust forces are minimised
-        (docs/explanation/timing.md).
+        """Return the drivable variant of the cell (docs/explanation/timing.md).
 
-        Its workcell file lies in a temporary folder that lasts as long as the cell.
+        Carries of this variant have their fastest timing. The objectives are duration and peak
+        force, or peak robust force if this cell minimises robust forces. The new workcell file
+        lies in a temporary folder that lasts as long as the cell.
 
         Raises:
             BundleError: the workcell file cannot be changed, or was since it was read.
@@ -189,27 +197,30 @@ class Cell:
 
     @cached_property
     def timing_model(self) -> TimingModel:
-        """Timing model of carries."""
+        """Model that computes drivable timings of carries."""
         from hybrid_opt.timing.model import TimingModel
 
         return TimingModel(self.compiled, robust=self.force_kind.robust)
 
     @cached_property
     def path_timer(self) -> PathTimer:
-        """Timer of many paths, in compiled code."""
+        """Solver that times many paths in compiled code."""
         from hybrid_opt.timing.path_timer import PathTimer
 
         return PathTimer(self.compiled, threads=self.threads)
 
     @cached_property
     def polish_functions(self) -> PolishFunctions:
-        """Functions from which polishes are assembled."""
+        """Compiled functions of the polish."""
         from hybrid_opt.polishing.cell import polish_functions
 
         return polish_functions(self.compiled)
 
     def polisher(self, settings: PolishSettings) -> Polisher:
-        """Return the polisher of the cell's fronts with these settings, made when first needed.
+        """Return the polisher for fronts of this cell; the same settings return the same object.
+
+        Args:
+            settings: settings of the polish.
 
         Raises:
             SettingsError: the cell's objectives or pads are not those of the polish.
@@ -224,51 +235,53 @@ class Cell:
 
     @cached_property
     def grip_budget(self) -> GripBudget:
-        """What holding the payload at rest costs of the allowed forces, see `ho.grip_budget`."""
+        """Commanded force that holds the payload at rest, compared with the reference force."""
         from hybrid_opt.robust.budget import grip_budget
 
         return grip_budget(self.workcell)
 
     @cached_property
     def static_hold(self) -> StaticHold:
-        """The forces of holding the payload level and still."""
+        """Forces that hold the payload level and at rest."""
         return static_hold(self.workcell)
 
     @cached_property
     def static_hold_error(self) -> str:
-        """Reason why the payload cannot be held still, and a remedy; '' if it can."""
+        """Reason why the payload cannot be held at rest, with a remedy; '' if it can be held."""
         return static_hold_error(self.workcell) or static_hold_error(
             self.workcell, self.evaluator.outputs
         )
 
     def require_hold(self) -> None:
-        """Refuse a payload that cannot be held still; checks without compiled code come first.
+        """Raise an error if the payload cannot be held at rest.
 
         Raises:
-            WorkcellError: it cannot; the text states the needed and allowed values, and remedies.
+            WorkcellError: the payload cannot be held; the text states the needed and allowed
+                values, and remedies.
         """
         if self.static_hold_error:
             raise hold_error(self.workcell, self.static_hold_error)
 
     @cached_property
     def holding_evaluator(self) -> CandidateEvaluator:
-        """`evaluator` of a payload that can be held still.
+        """Evaluator of candidates, after a check that the payload can be held at rest.
 
         Raises:
-            WorkcellError: as of `require_hold`.
+            WorkcellError: the payload cannot be held at rest.
         """
         self.require_hold()
         return self.evaluator
 
     @property
     def geometry(self) -> CellGeometry:
-        """The collision bodies and the pairs of them that are checked."""
+        """Collision bodies, and the pairs of bodies that are checked for collision."""
         return self.evaluator.checker.geometry
 
     @property
     def force_kind(self) -> ForceKind:
-        """Kind of forces that limits of drivable carries are about: robust ones if these are
-        minimised.
+        """Kind of force that the limits of drivable carries bound.
+
+        The limits bound robust forces if the objectives contain robust forces, else planned ones.
 
         Raises:
             SettingsError: an objective is unknown.
@@ -277,17 +290,17 @@ class Cell:
 
     @property
     def objectives(self) -> tuple[str | Objective, ...]:
-        """What searches minimise, as it was given."""
+        """Objectives that searches minimise, as names or records, as given at construction."""
         return self._objectives
 
     @property
     def objective_names(self) -> tuple[str, ...]:
-        """What searches minimise."""
+        """Names of the objectives that searches minimise."""
         return self.evaluator.objective_names
 
     @property
     def n_var(self) -> int:
-        """Number of decision variables, six per free waypoint."""
+        """Length of the decision vector."""
         return self.workcell.task.n_var
 
     @property
@@ -302,11 +315,14 @@ class Cell:
 
     @cached_property
     def initial(self) -> Array:
-        """(n_var,) the hand-made trajectory of the workcell file; read-only."""
+        """(n_var,) decision vector of the workcell file's hand-made trajectory; read-only."""
         return read_only(initial_decision(self.workcell.task))
 
     def evaluate(self, x: Array) -> Evaluations:
-        """Evaluate decision vectors (n, n_var) on the task's samples.
+        """Evaluate candidates at the task's samples.
+
+        Args:
+            x: (n, n_var) decision vectors, or one (n_var,).
 
         Raises:
             SettingsError: x has the wrong shape.
@@ -318,8 +334,10 @@ class Cell:
         )
 
     def random(self, count: int, rng: np.random.Generator) -> Array:
-        """Draw decision vectors (count, n_var) uniformly from the bounds of the coarse task's
-        waypoints."""
+        """Draw random decision vectors (count, n_var).
+
+        The waypoints that the workcell file states are drawn uniformly within their bounds.
+        """
         task, drawn = self.workcell.task, coarse_task(self.workcell.task)
         x = rng.uniform(drawn.lower, drawn.upper, (count, drawn.n_var))
         return resample_decisions(x, drawn, task)
@@ -336,11 +354,11 @@ class Cell:
         """Certify that one carry is free of collisions along its continuous path.
 
         Args:
-            x: (n_var,) decision vector, or a carry.
+            x: decision vector (n_var,) of the carry, or the carry itself.
 
         Raises:
             SettingsError: x has the wrong shape.
-            LostPathError: an arm loses the path, so that no more can be said.
+            LostPathError: an arm cannot follow the path, so that no certificate is possible.
         """
         return self.evaluator.certificate(x.x if isinstance(x, Carry) else x)
 
@@ -360,6 +378,10 @@ class Cell:
 
 def example(name: str = "rack", objectives: Sequence[str | Objective] = PAPER_OBJECTIVES) -> Cell:
     """Load a cell that ships with the project.
+
+    Args:
+        name: name of the workcell file in `studies/workcells`, without its ending.
+        objectives: objectives that searches minimise, names or `Objective` records.
 
     Raises:
         SettingsError: there is none of that name; the message lists them.

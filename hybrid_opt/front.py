@@ -1,5 +1,4 @@
-"""A front: the feasible carries that no other one dominates, from a search or a polish; and the
-carry selected from it.
+"""Fronts (non-dominated feasible carries of a search or polish), and selection of one carry.
 
 The balanced carry has the least mean of both robots' peak normal forces. Where one robot can
 relieve the other at no cost, a polished front is flat: many points have the same mean to five
@@ -32,13 +31,13 @@ class Front(Displayable):
     Every member is proven free of collisions between the samples too.
 
     Attributes:
-        cell: the cell.
-        algorithm: what found it, as 'nsga2', or a word for how else it came about.
-        x: (k, n_var) decision vectors.
-        objectives: (k, n_obj).
-        evaluations: every candidate of the search, in order.
-        polished: record of its polish, None without one.
-        replica: of a study, from 0; None where it is of none.
+        cell: the cell of the carries.
+        algorithm: name of the search algorithm, as 'nsga2', or another word for the origin.
+        x: (k, n_var) decision vectors of the carries.
+        objectives: (k, n_obj) objectives of the carries.
+        evaluations: every candidate of the search, in order of evaluation.
+        polished: record of the polish, None for a front that was not polished.
+        replica: number of the replica in its study, from 0; None outside of studies.
     """
 
     cell: Cell
@@ -56,16 +55,24 @@ class Front(Displayable):
     def of_search(
         cls, cell: Cell, algorithm: str, evaluations: Evaluations, replica: int | None = None
     ) -> Front:
-        """Return the front of evaluations that `CandidateEvaluator.certified` has processed."""
+        """Return the front of a search's evaluations.
+
+        Args:
+            cell: the cell that was searched.
+            algorithm: name of the search algorithm.
+            evaluations: all candidates, already processed by `CandidateEvaluator.certified`.
+            replica: number of the replica in its study, None outside of studies.
+        """
         rows = metrics.front_rows(evaluations.objectives, evaluations.feasible)
         x, objectives = evaluations.x[rows], evaluations.objectives[rows]
         return cls(cell, algorithm, x, objectives, evaluations, replica=replica)
 
     @classmethod
     def of(cls, cell: Cell, x: Array) -> Front:
-        """Evaluate carries that are known to be feasible and free, and return them as a front.
+        """Evaluate feasible, collision-free carries and return them as a front.
 
         Args:
+            cell: the cell of the carries.
             x: (k, n_var) decision vectors by increasing first objective.
 
         Raises:
@@ -75,17 +82,21 @@ class Front(Displayable):
         return cls(cell, "given", found.x, found.objectives, found)
 
     def after(self, polish: PolishedFront) -> Front:
-        """Return the front after its polish."""
+        """Return this front with its carries replaced by the polished ones.
+
+        Args:
+            polish: result of the polish of this front.
+        """
         return replace(self, x=polish.x, objectives=polish.objectives, polished=polish)
 
     @property
     def key(self) -> tuple[str, int]:
-        """Algorithm and number of the replica, 0 if it belongs to none."""
+        """Algorithm name and replica number; the number is 0 for a front outside of studies."""
         return self.algorithm, self.replica or 0
 
     @property
     def title(self) -> str:
-        """The algorithm's, and whether polished."""
+        """Title of the algorithm, followed by ', polished' for a polished front."""
         # Not imported at the top: the searches take long to load.
         from hybrid_opt.metaheuristics.run import title
 
@@ -93,26 +104,28 @@ class Front(Displayable):
 
     @property
     def source(self) -> str:
-        """The title with the number of the replica, as its files have it."""
+        """Title of the front, followed by the replica number for a front of a study."""
         return self.title if self.replica is None else f"{self.title}, replica {self.replica}"
 
     @property
     def objective_names(self) -> tuple[str, ...]:
-        """Names of the objectives."""
+        """Names of the n_obj objectives, in the order of the columns of `objectives`."""
         return self.cell.objective_names
 
     def __len__(self) -> int:
         return len(self.x)
 
     def __getitem__(self, index: int) -> Carry:
-        """Return a member in detail, by its index on the front."""
+        """Return the carry at an index of the front, with every physical quantity."""
         return self.cell.carry(self.x[index])
 
     def __iter__(self) -> Iterator[Carry]:
         return (self[index] for index in range(len(self)))
 
     def balanced(self) -> Carry:
-        """Return the member of least mean of both robots' peak normal forces, see `balanced`.
+        """Return the carry with the least mean of the two robots' peak normal forces.
+
+        Among nearly equal means (`TIE`), the carry with the least larger peak is returned.
 
         Raises:
             SettingsError: the front is empty.
@@ -120,10 +133,10 @@ class Front(Displayable):
         return self[balanced(self._peaks())]
 
     def lowest_force(self, robot: int) -> Carry:
-        """Return the member of least peak normal force of one robot.
+        """Return the carry with the least peak normal force of one robot.
 
         Args:
-            robot: 0 or 1.
+            robot: index of the robot, 0 or 1.
 
         Raises:
             SettingsError: the front is empty, or there is no such robot.
@@ -133,7 +146,10 @@ class Front(Displayable):
         return self[int(np.argmin(self._peaks()[:, robot]))]
 
     def lowest(self, objective: str) -> Carry:
-        """Return the member with the least value of one of the objectives.
+        """Return the carry with the least value of one objective.
+
+        Args:
+            objective: name of the objective, one of `objective_names`.
 
         Raises:
             SettingsError: the front is empty, or was not searched for that objective.
@@ -147,13 +163,16 @@ class Front(Displayable):
         return self[int(np.argmin(self.objectives[:, self.objective_names.index(objective)]))]
 
     def hypervolume(self, reference: Array | None = None) -> float:
-        """Compute the volume that the front dominates up to a reference point (n_obj,), by default
-        the paper's 1.1."""
+        """Compute the hypervolume of the objectives that the front dominates.
+
+        Args:
+            reference: (n_obj,) reference point, None for the paper's 1.1 in each objective.
+        """
         point = metrics.reference_point(len(self.objective_names))
         return metrics.hypervolume(self.objectives, point if reference is None else reference)
 
     def spacing(self) -> float:
-        """Compute the unevenness of the front, see `hybrid_opt.indicators.metrics.spacing`."""
+        """Compute the standard deviation of nearest-neighbour distances on the front; 0 is even."""
         return metrics.spacing(self.objectives)
 
     def _peaks(self) -> Array:
@@ -170,7 +189,7 @@ class Front(Displayable):
 
 
 TIE = 3e-4
-"""Relative difference below which two mean forces are equal to any robot: 15 mN on the rack."""
+"""Relative difference below which two mean forces count as equal: 15 mN on the rack cell."""
 
 _CHUNK = 256
 """Candidates evaluated at once; every sample of each is held in memory."""
@@ -181,8 +200,8 @@ class SelectedCarry:
     """The carry selected from a front.
 
     Attributes:
-        row: its row among the replica's evaluations, or in the polished front.
-        carry: the carry with its verdict, under the task's time law.
+        row: row of the carry in the evaluations of the replica, or in the polished front.
+        carry: the selected carry under the task's time law, with its judgement.
     """
 
     row: int
@@ -190,25 +209,33 @@ class SelectedCarry:
 
     @property
     def objectives(self) -> Array:
-        """(n_obj,) without penalty."""
+        """(n_obj,) objectives of the carry without penalty."""
         assert self.carry.judgement is not None
         return np.array(list(self.carry.judgement.objectives.values()))
 
 
 def balanced(peak_normal_force: Array) -> int:
-    """Return the index of the least mean of both robots' peak forces (k, 2); among means that
-    differ by less than `TIE`, that of the least larger force."""
+    """Return the index of the carry with the least mean of both robots' peak normal forces.
+
+    Among means that differ by less than `TIE`, the carry with the least larger peak is chosen.
+
+    Args:
+        peak_normal_force: (k, 2) peak normal force of each robot in k carries [N].
+    """
     mean = peak_normal_force.mean(axis=1)
     equal = mean <= mean.min() * (1.0 + TIE)
     return int(np.argmin(np.where(equal, peak_normal_force.max(axis=1), np.inf)))
 
 
 def knee(points: Array) -> int:
-    """Return the index of the point (k, 2) with the least product of objectives, both positive.
+    """Return the index of the point with the least product of its two objectives.
 
-    Beside it one per cent of either objective buys at most one per cent of the other. The distance
-    from the line between the front's ends (Das 1999) would depend on how far the ends were
-    explored: one long carry at almost the least force moves it by a newton.
+    Next to the knee, raising one objective by one per cent lowers the other by at most one.
+    The distance from the line between the front's ends (Das 1999) would depend on how far the
+    ends were explored: one long carry at almost the least force moves the knee by a newton.
+
+    Args:
+        points: (k, 2) positive objectives of the points.
 
     Raises:
         SettingsError: there are no points, or an objective is not positive.
@@ -224,11 +251,12 @@ def knee(points: Array) -> int:
 def select(
     evaluator: CandidateEvaluator, x: Array, rows: NDArray[np.intp] | None = None
 ) -> SelectedCarry | None:
-    """Select the carry that represents a front, None if the front is empty.
+    """Select the carry that represents a front; return None for an empty front.
 
     Args:
-        x: (k, n_var) the front's decision vectors.
-        rows: (k,) what `SelectedCarry.row` names them by, None for their places in the front.
+        evaluator: evaluator of the cell's candidates.
+        x: (k, n_var) decision vectors of the front.
+        rows: (k,) values of `SelectedCarry.row` for the carries, None for 0 to k - 1.
     """
     if len(x) == 0:
         return None
@@ -238,8 +266,14 @@ def select(
 
 
 def selected_row(evaluator: CandidateEvaluator, x: Array) -> int:
-    """Return the index of the selected carry of a front (k, n_var), k > 0: the balanced one, in
-    drivable cells the knee of duration and larger peak force."""
+    """Return the index of the selected carry of a front.
+
+    The balanced carry is selected; in drivable cells, the knee of duration and larger peak force.
+
+    Args:
+        evaluator: evaluator of the cell's candidates.
+        x: (k, n_var) decision vectors of the front, k > 0.
+    """
     peaks, durations = _peaks_and_durations(evaluator, x)
     if not evaluator.workcell.task.law.is_drivable:
         return balanced(peaks)
