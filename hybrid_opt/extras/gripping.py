@@ -39,12 +39,13 @@ class Grip:
     """A place of both pads on their faces.
 
     Attributes:
-        cell: with it, and nothing else changed.
-        up, along: from where the pads were, upwards and level along the faces [m].
-        duration: of the hand-made path as robots drive it with least product of duration and
-            commanded force, before limits on jerk [s].
-        force: to command then [N].
-        before: the same product where the pads were [N s]; infinite where they did not hold.
+        cell: the cell with the pads at this place, and nothing else changed.
+        up, along: shift of the pads from their former place, upwards and level along the faces [m].
+        duration: duration of the hand-made path at the least product of duration and commanded
+            force, without limits on jerk [s].
+        force: commanded force at this duration [N].
+        before: least product with the pads at their former place [N s]; infinite if the pads did
+            not hold there.
     """
 
     cell: Cell
@@ -69,12 +70,12 @@ def propose_grip(
     """Find the best place of the pads for the cell's hand-made path, and certify the path with it.
 
     Args:
-        cell: with upright faces where the pads press, and forces in closed form.
-        up: how far the pads may go upwards from where they are.
-        along: how far they may go level along their faces: of the first robot's pad to its left,
-            seen from the robot.
-        trials: places that are tried.
-        progress: True for a bar, or a function of places done and in all.
+        cell: cell with pads on upright faces, and forces in closed form.
+        up: range of the shift of the pads upwards [m].
+        along: range of the level shift along the faces [m]; positive is to the left of the first
+            robot's pad, seen from the robot.
+        trials: number of places to try.
+        progress: True for a progress bar, or a function of the numbers of done and of all places.
 
     Raises:
         SettingsError: a range is empty or none, the pads are others, or nothing within the ranges

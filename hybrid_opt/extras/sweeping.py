@@ -50,11 +50,11 @@ class Combination:
     """The carry of one combination of numbers.
 
     Attributes:
-        values: by key, in the order of the sweep.
-        duration: of the carry as robots drive it [s]; NaN where there is none.
-        force: the largest to be commanded [N]; likewise.
-        x: (n_var,) its decision vector, or () where there is none.
-        remark: reason why there is none, or an objection.
+        values: values of the changed numbers by key, in the order of the sweep.
+        duration: duration of the carry [s]; NaN if there is no carry.
+        force: largest commanded force of the carry [N]; NaN if there is no carry.
+        x: (n_var,) decision vector of the carry; empty if there is no carry.
+        remark: reason why there is no carry, or an objection to the carry.
     """
 
     values: tuple[float, ...]
@@ -70,9 +70,9 @@ class Sweep:
 
     Attributes:
         about: digest of the cell, of what it minimises, and of whether the path is fixed.
-        over: the values of every key.
-        x: (n_var,) where all begin.
-        rows: combinations that are done, the last key fastest.
+        over: swept values by key.
+        x: (n_var,) decision vector of the unchanged cell's carry, the start of the sweep.
+        rows: finished combinations; the last key varies fastest.
     """
 
     about: str
@@ -124,13 +124,14 @@ def sweep(
     cell.
 
     Args:
-        cell: a drivable one, see `Cell.drivable`.
-        path: a good carry of the cell, such as the recommended one, or its decision vector.
+        cell: drivable cell, see `Cell.drivable`.
+        path: good carry of the cell, such as the recommended one, or the carry's decision vector.
         over: values by key path, see `Cell.changed`.
-        fixed: whether the path stays as it is; otherwise it is polished in every changed cell.
-        file: where combinations are stored as they are done, and are found again; None for none.
-        jobs: worker processes, 0 for one per core; has no influence on the answer.
-        progress: True for a bar, or a function of combinations done and in all.
+        fixed: True to keep the path; False to polish the path in every changed cell.
+        file: file that stores finished combinations, to resume the sweep; None for no file.
+        jobs: number of worker processes, 0 for one per core; has no influence on the result.
+        progress: True for a progress bar, or a function of the numbers of done and of all
+            combinations.
 
     Raises:
         SettingsError: the cell has another time law, the path does not fit it, there are no values,

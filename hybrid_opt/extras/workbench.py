@@ -47,11 +47,11 @@ class Handle:
     """A draggable part of a cell.
 
     Attributes:
-        key: in the workcell file: 'task.start', 'environment.top board', 'robots[0].base' or
+        key: key in the workcell file: 'task.start', 'environment.top board', 'robots[0].base' or
             'contacts[0]'.
         title: its name for people.
-        pose: (4, 4) in the world.
-        turns: it may be rotated; a pad stays on its face.
+        pose: (4, 4) pose in the world.
+        turns: True if the part may be rotated; a pad stays on its face.
     """
 
     key: str
@@ -62,16 +62,16 @@ class Handle:
 
 @dataclass(frozen=True, eq=False)
 class SessionVerdict:
-    """A carry in a cell.
+    """Verdict on a carry in a changed cell.
 
     Attributes:
-        cell: the changed cell as a drivable one, None where the change is refused.
-        carry: the carry in that cell, None likewise.
-        text: whether the carry is feasible, or why not.
-        feasible: whether it is.
-        commanded: (n, 2) normal forces to command [N], None where the carry is not feasible.
-        squeeze: how these came about.
-        seconds: time that the verdict took.
+        cell: the changed cell as a drivable one; None if the change is refused.
+        carry: the carry in the changed cell; None if the change is refused.
+        text: verdict as a text, with the reason if the carry is not feasible.
+        feasible: True if the carry is feasible.
+        commanded: (n, 2) commanded normal forces [N]; None if the carry is not feasible.
+        squeeze: origin of the commanded forces.
+        seconds: computing time of the verdict [s].
     """
 
     cell: Cell | None
@@ -117,7 +117,8 @@ class Session:
         """Apply more changes; a refused change leaves the session as it is.
 
         Args:
-            changes: by key path of the workcell file; 'force_limit' is that of the carry [N].
+            changes: new values by key path of the workcell file; the key 'force_limit' is the
+                force limit of the carry [N].
         """
         begin = time.perf_counter()
         wanted = self.changes | dict(changes)
@@ -136,7 +137,7 @@ class Session:
         return self.verdict
 
     def move(self, handle: Handle, pose: Array) -> SessionVerdict:
-        """Move a handle to another pose (4, 4) of the world, see `handles`."""
+        """Move a draggable part, a handle, to another pose (4, 4) in the world."""
         return self.change(moved(self.cell.workcell, handle, pose))
 
     def optimise(
@@ -317,13 +318,13 @@ class Workbench:
         self._thread.start()
 
     def ask(self, changes: dict[str, Any]) -> None:
-        """Request an evaluation of changes; of several that wait, the last of a key counts."""
+        """Request an evaluation of changes by key; the last waiting value of a key counts."""
         with self._news:
             self._changes |= changes
             self._news.notify()
 
     def do(self, task: Callable[[], None]) -> None:
-        """Request another task, done in order."""
+        """Request a task; tasks run one after the other."""
         with self._news:
             self._tasks.append(task)
             self._news.notify()
@@ -517,9 +518,8 @@ def live(cell: Cell, port: int = 8080, x: Array | None = None) -> Workbench:
     """Open a cell in a browser of this machine, to be changed by hand.
 
     Args:
-        port: where to listen; another free one is taken if it is in use.
-        x: (n_var,) the carry to look at, a decision vector of `cell.drivable()`; None for the
-            hand-made one.
+        port: port to listen at; if the port is in use, a free port is taken.
+        x: (n_var,) decision vector of a carry of `cell.drivable()`; None for the hand-made carry.
 
     Raises:
         DisplayError: viser is missing.

@@ -55,9 +55,9 @@ class Advice:
     """Effect of one change of the cell or of one via-point, the path kept otherwise.
 
     Attributes:
-        change: the quantity, and by how much it changes.
-        force: change of the force to command, in the same time [N].
-        duration: change of the duration, with the same force [s].
+        change: the changed quantity with the size of its change.
+        force: change of the commanded force at the same duration [N].
+        duration: change of the duration at the same commanded force [s].
     """
 
     change: str
@@ -69,8 +69,14 @@ class Advice:
 
 
 def commanded_margins(carry: Carry, forces: Array) -> tuple[Margin, ...]:
-    """Compute the largest deviations of friction, mass and centre of mass, each alone, with which
-    commanded forces (n, 2) [N] hold the carry."""
+    """Compute the largest deviation of each quantity at which the commanded forces hold the carry.
+
+    The quantities are friction, mass and centre of mass. Only one deviates at a time.
+
+    Args:
+        carry: the carry at n samples.
+        forces: (n, 2) commanded normal forces [N].
+    """
     workcell, model = carry.workcell, robust_model(carry.workcell)
     rows, motion = subsample(carry)
     enough, nominal = forces[rows, 1 - LEADER] * (1.0 + HOLDS), nominal_case(workcell)
@@ -112,7 +118,7 @@ def commanded_margins(carry: Carry, forces: Array) -> tuple[Margin, ...]:
 
 
 def advice(cell: Cell, paths: DrivenPaths, option: Option, timing: Timing) -> tuple[Advice, ...]:
-    """Compute the effects of changes of the cell on a recommended carry, most force first."""
+    """Compute effects of changes of the cell on a carry, the largest decrease of force first."""
     assert timing.carry is not None, "what is driven has a carry"
     # With less the path may have no timing: a tilted box needs more than a level one.
     limits = np.minimum(

@@ -47,11 +47,12 @@ class Wish:
     Without a duration or a force, the product of duration and commanded force is minimised.
 
     Attributes:
-        duration: longest time of the carry, limits on jerk kept; the force is minimised [s].
-        force: largest commanded force; the duration is minimised [N].
-        payload: mass instead of the cell's; the inertia grows with it [kg].
-        reference_force: of both robots, instead of the cell's [N].
-        uncertainty: instead of the cell's.
+        duration: longest allowed duration of the carry within limits on jerk [s]; the commanded
+            force is then minimised.
+        force: largest allowed commanded force [N]; the duration is then minimised.
+        payload: mass of the payload in place of the cell's [kg]; the inertia grows in proportion.
+        reference_force: reference force of both robots in place of the cell's [N].
+        uncertainty: uncertainty in place of the cell's.
     """
 
     duration: float | None = None
@@ -76,7 +77,7 @@ class Wish:
 
     @property
     def numbers(self) -> dict[str, float]:
-        """The values that are given, without the uncertainty, by name."""
+        """Given numbers by name of their attribute; the uncertainty is not among them."""
         values = {name: getattr(self, name) for name in _UNITS}
         return {name: value for name, value in values.items() if value is not None}
 
@@ -143,8 +144,8 @@ class Goal:
     """Limits of an option, and its cost.
 
     Attributes:
-        longest: largest duration [s].
-        hardest: (2,) largest force of each robot that holds in every case [N].
+        longest: largest allowed duration [s].
+        hardest: (2,) largest allowed robust force of each robot [N].
         cost: function of duration [s] and commanded force [N] to minimise.
     """
 
@@ -165,31 +166,36 @@ class Goal:
 
 
 def commanded_at_most(force: float, others: Array | float = np.inf) -> Array:
-    """Return the largest forces (2,) [N] if one is commanded and the other is the leading arm's
-    largest of `others`."""
+    """Return the largest allowed forces (2,) [N] of both robots for a limit on the commanded force.
+
+    Args:
+        force: largest commanded force of the force-controlled arm [N].
+        others: other limit of the forces, a number or one per robot (2,) [N].
+    """
     found = np.broadcast_to(others, 2).astype(float)
     found[1 - LEADER] = min(found[1 - LEADER], force)
     return found
 
 
 def duration_alone(duration: float, force: float) -> float:
-    """Return the duration as cost, see `Goal`."""
+    """Return the duration [s] as the cost of an option."""
     return duration
 
 
 def force_alone(duration: float, force: float) -> float:
-    """Return the force as cost, see `Goal`."""
+    """Return the commanded force [N] as the cost of an option."""
     return force
 
 
 class DrivenPaths:
-    """Paths of one cell with their geometry, so that each further timing is cheap; driven within
-    the limits of the cell's drivable carries.
+    """Paths of one cell with stored geometry, to be timed repeatedly within force limits.
+
+    Timings keep the limits of the cell's drivable carries.
 
     Attributes:
-        x: (k, n_path) free waypoints.
-        highest_force: the largest force limit that is tried [N].
-        robust: whether limits are of forces that hold in every case, not of planned ones.
+        x: (k, n_path) decision vectors of the k paths without force limit.
+        highest_force: largest force limit that is tried [N].
+        robust: True if force limits bound the robust forces, False if the planned forces.
     """
 
     def __init__(self, cell: Cell, x: Array) -> None:
@@ -223,12 +229,22 @@ class DrivenPaths:
         return list(zip(chosen, limits, timings, strict=True))
 
     def durations(self, force: Array | float) -> Array:
-        """Compute durations (k,) [s], infinite where nothing moves within the limit."""
+        """Compute the shortest duration (k,) of each path within a force limit [s].
+
+        The duration is infinite for a path that has no timing within the limit.
+
+        Args:
+            force: force limit, one per path (k,) or one for all [N].
+        """
         return np.array([timing.duration for _, _, timing in self._driven(force)])
 
     def options(self, force: Array | float, rows: Sequence[int] | None = None) -> list[Option]:
-        """Return every path, or some, timed within limits (k,) or one for all [N], except those
-        that do not move."""
+        """Time paths within force limits and return one option per path that has a timing.
+
+        Args:
+            force: force limit, one per timed path or one for all [N].
+            rows: indices of the paths to time; None for all.
+        """
         return [self._option(*each) for each in self._driven(force, rows) if each[2].ok]
 
     def _option(self, row: int, limit: float, timing: PathTiming) -> Option:
@@ -250,11 +266,14 @@ class DrivenPaths:
     def all_options(
         self, own: Array | float, told: Callable[[], None] = lambda: None
     ) -> list[Option]:
-        """Return every path within its own limit (k,) [N], and, if that takes milliseconds, within
-        several limits from the static hold upwards.
+        """Return the options of every path within the path's own force limit and within others.
+
+        The others are `FORCES` limits, from just above the static hold to `highest_force`. They are
+        left out where force limits bound robust forces.
 
         Args:
-            told: called `FORCES` times as the work goes on.
+            own: own force limit, one per path (k,) or one for all [N].
+            told: function without arguments, called `FORCES` times for a progress display.
         """
         found, limits = self.options(own), []
         if not self.robust:
@@ -272,13 +291,13 @@ class DrivenPaths:
 
 @dataclass(frozen=True)
 class Option:
-    """A path driven within a limit of the planned force.
+    """A path timed within a force limit.
 
     Attributes:
-        index: of the path.
-        limit: [N].
-        duration: without limits on jerk [s].
-        force: (2,) largest force of each robot that holds in every case [N].
+        index: index of the path.
+        limit: force limit [N].
+        duration: duration without limits on jerk [s].
+        force: (2,) largest robust force of each robot [N].
     """
 
     index: int
@@ -293,7 +312,7 @@ class Option:
 
 
 def ranked(options: Sequence[Option], goal: Goal) -> list[Option]:
-    """Return the options that keep to a goal, best first."""
+    """Return the options within the limits of a goal, in order of increasing cost."""
     kept = [
         option
         for option in options
@@ -305,7 +324,16 @@ def ranked(options: Sequence[Option], goal: Goal) -> list[Option]:
 def best_of_paths(
     paths: DrivenPaths, options: Sequence[Option], goal: Goal, most: int
 ) -> Iterator[Option]:
-    """Yield the best option of each of the best paths, with refined limits; best paths first."""
+    """Yield the option of least cost of each of the best paths, least cost first.
+
+    Force limits between those of the known options are tried as well.
+
+    Args:
+        paths: the paths, to time within further force limits.
+        options: known options.
+        goal: limits and cost of an option.
+        most: largest number of paths.
+    """
     best: dict[int, Option] = {}
     for option in ranked(options, goal):
         best.setdefault(option.index, option)
@@ -323,9 +351,14 @@ def best_of_paths(
 
 
 def gentle_start(cell: Cell) -> Array:
-    """Return the hand-made carry (n_var,) of a drivable cell with the force limit of its least
-    product of duration and commanded force within the reference forces; where nothing fits, with
-    the force limit that needs least."""
+    """Return the decision vector (n_var,) of the hand-made carry with its best force limit.
+
+    The best limit has the least product of duration and commanded force within the reference
+    forces. If no limit keeps the reference forces, the one with the least commanded force is taken.
+
+    Args:
+        cell: drivable cell.
+    """
     paths = DrivenPaths(cell, cell.initial[:-1])
     options = paths.all_options(float(cell.initial[-1]))
     best = next(best_of_paths(paths, options, Goal.of(Wish(), cell.workcell), 1), None)
@@ -335,10 +368,16 @@ def gentle_start(cell: Cell) -> Array:
 
 
 def refuse(options: Sequence[Option], wish: Wish, goal: Goal, budget: GripBudget) -> None:
-    """Refuse a wish that no option fulfils, and state the possible values.
+    """Raise an error with the possible values if no option fulfils a wish.
+
+    Args:
+        options: options of the front's paths.
+        wish: the wish, for the message.
+        goal: limits of the wish.
+        budget: grip budget of the cell, for the message.
 
     Raises:
-        SettingsError: it does.
+        SettingsError: no option fulfils the wish.
     """
     if ranked(options, goal):
         return

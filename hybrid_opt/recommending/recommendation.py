@@ -74,27 +74,26 @@ class Recommendation(Displayable):
     """The carry to run.
 
     Attributes:
-        wish: the target.
-        member: its path's place in the front that it was chosen from.
+        wish: target of the recommendation.
+        member: index of the carry's path in the front.
         x: (n_var,) decision vector: the path, then the force limit [N].
-        timing: as robots drive it, every limit recomputed, limits on jerk among them where the cell
-            states any.
-        force_kind: which forces its limit is about, and the front's.
-        limited_force: (2,) largest of them of each robot along the carry [N].
+        timing: timing of the carry within all limits, those on jerk included, without jumps of
+            acceleration.
+        force_kind: kind of force, planned or robust, that the force limit bounds.
+        limited_force: (2,) largest force of this kind of each robot along the carry [N].
         commanded: (2,) largest normal force to command of each robot [N].
         squeeze: origin and contributions of these forces.
-        job: the whole job around it, None if none can be planned.
-        margins: largest errors of the cell's description at the commanded force.
-        rivals: the hand-made path, and others, at the same commanded force and in the same time.
-        advice: effects of changes of the cell.
-        warnings: objections, as sentences.
-        required: (2,) largest force of each robot in any case, commanded or resulting [N].
-        budget: the grip budget at rest.
-        remedies: if the reference forces do not allow it, the smallest changes of the cell with
-            which they do.
-        reserve: how heavy and how slippery the box may be within the reference forces, in every
-            case.
-        why: the reason of the choice.
+        job: the whole job around the carry; None if no job can be planned.
+        margins: largest errors of the cell's description at which the commanded force holds.
+        rivals: other paths, the hand-made one among them, at the same force or duration.
+        advice: effects of changes of the cell on force and duration.
+        warnings: objections to the carry, as sentences.
+        required: (2,) largest force of each robot in any case of the uncertainty [N].
+        budget: grip budget of the box at rest.
+        remedies: smallest changes of the cell with which the required forces keep the reference
+            forces; empty if they already do.
+        reserve: largest mass and least friction of the box within the reference forces.
+        why: reason of the choice, as a text.
     """
 
     wish: Wish
@@ -118,19 +117,19 @@ class Recommendation(Displayable):
 
     @property
     def fits(self) -> bool:
-        """Return True if it holds in every case within the reference forces."""
+        """Return True if the required forces are within the reference forces."""
         return is_within(self.required, self.budget.allowed)
 
     @property
     def objection(self) -> str:
-        """Reason not to run it as it is, with a remedy; '' if it fits."""
+        """Reason not to run the carry, with a remedy; '' if the reference forces suffice."""
         if self.fits:
             return ""
         return f"no carry fits: {self.budget}; {remedies_text(self.remedies, 'for this carry')}"
 
     @property
     def carry(self) -> Carry:
-        """The carry as robots drive it."""
+        """Carry under the recommended timing."""
         assert self.timing.carry is not None, "what is recommended has a timing"
         return self.timing.carry
 
@@ -172,18 +171,17 @@ def recommend(
 ) -> Recommendation:
     """Recommend the carry of a drivable front to run.
 
-    It holds over the cell's whole uncertainty within the robots' reference forces, and has the
-    least product of duration and commanded force of all that do. Where none does, the least product
-    of all is given, with what would have to change (`Recommendation.objection`).
+    By default this is the carry with the least product of duration and commanded force. Only
+    carries count whose robust forces stay within the reference forces. If there is none, all count,
+    and `Recommendation.objection` states the necessary changes of the cell.
 
     Args:
-        front: of a drivable cell, see `Cell.drivable`.
-        wish: another target, or other numbers of the cell: paths are timed, pressed and planned
-            for these.
-        others: (n_path,) paths by label, beside which the answer stands; the hand-made one always
-            is.
-        progress: True for a bar, or a function of steps done and in all.
-        alone: whether margins, rivals and advice are left out.
+        front: front of a drivable cell, see `Cell.drivable`.
+        wish: another target, or other numbers of the cell; None for the default target.
+        others: further paths (n_path,) by label, to compare with the recommended carry; the
+            hand-made path is always compared.
+        progress: True for a progress bar, or a function of the numbers of done and of all steps.
+        alone: True to leave out margins, rivals and advice.
 
     Raises:
         SettingsError: the cell has another time law, the front is empty, no member can do what is
@@ -314,8 +312,10 @@ def _driven(
 
 
 def required_forces(workcell: Workcell, carry: Carry) -> Array:
-    """Compute the largest force (2,) [N] of each robot in any case of the uncertainty, commanded
-    or resulting."""
+    """Compute the largest normal force (2,) [N] of each robot in any case of the uncertainty.
+
+    It is the commanded force of the force-controlled arm and the resulting force of the leader.
+    """
     uncertainty, (rows, motion) = workcell.uncertainty, subsample(carry)
     most = largest_commanded(workcell, motion, carry.normal_force[rows], uncertainty, LEADER)
     leading = robust_model(workcell).hold(motion, uncertainty, LEADER)[1]
@@ -334,7 +334,7 @@ def _objections(found: CommandedForces) -> list[str]:
 
 
 def is_within(required: Array, allowed: Array) -> bool:
-    """Return True if forces (2,) [N] are within limits, as exactly as carries are timed."""
+    """Return True if forces (2,) [N] exceed limits (2,) [N] by no more than a share `BETTER`."""
     return bool((required <= allowed * (1.0 + BETTER)).all())
 
 
@@ -361,14 +361,14 @@ MEMBERS = 24
 
 @dataclass(frozen=True, repr=False)
 class Alternative:
-    """A path driven as fast as the same limits allow, those on jerk among them.
+    """A path that is compared with the recommended carry under the same limits.
 
     Attributes:
-        label: its name.
-        duration_at_force: [s] with the recommended carry's commanded force, infinite where it
-            cannot.
-        force_at_duration: force to command [N] in the recommended carry's time, infinite where it
-            cannot.
+        label: name of the path.
+        duration_at_force: shortest duration with the recommended carry's commanded force [s];
+            infinite if that force does not suffice.
+        force_at_duration: least commanded force in the recommended carry's duration [N]; infinite
+            if that duration is too short.
     """
 
     label: str
@@ -388,8 +388,15 @@ class Alternative:
 def time_alternative(
     cell: Cell, label: str, path: Array, timing: Timing, force: float
 ) -> Alternative:
-    """Time a path (n_path,) at a recommended carry's force, and compute its force to command [N] in
-    the same time."""
+    """Compare a path with a recommended carry at the same force, and in the same duration.
+
+    Args:
+        cell: drivable cell.
+        label: name of the path.
+        path: (n_path,) the path.
+        timing: timing of the recommended carry.
+        force: commanded force of the recommended carry [N].
+    """
     assert timing.limits.force is not None, "drivable carries have a force limit"
     paths = DrivenPaths(cell, path)
     options = paths.all_options(timing.limits.force)
@@ -407,7 +414,11 @@ def time_alternative(
 
 
 def level_force(workcell: Workcell, kind: ForceKind) -> float:
-    """Compute the largest force of a robot that holds the payload level and still [N].
+    """Compute the force [N] that holds the payload level and still, the larger of both robots.
+
+    Args:
+        workcell: the cell.
+        kind: planned or robust force.
 
     Raises:
         SettingsError: the uncertainty leaves no friction or patch.
@@ -418,8 +429,10 @@ def level_force(workcell: Workcell, kind: ForceKind) -> float:
 
 
 def table_forces(workcell: Workcell) -> Array:
-    """Return the commanded forces (n,) [N] of the table of durations: some multiples of what holds
-    the payload level and still in every case, and the reference force.
+    """Return the commanded forces (n,) [N] of the table of durations.
+
+    They are multiples of the robust force that holds the payload level and still, and the reference
+    force.
 
     Raises:
         SettingsError: the uncertainty leaves no friction or patch.
@@ -430,11 +443,14 @@ def table_forces(workcell: Workcell) -> Array:
 
 
 def commanded_durations(paths: DrivenPaths, limits: Array | float, forces: Array) -> Array:
-    """Compute the shortest duration (n,) [s] of any of the paths with at most each commanded force
-    (n,) [N], limits on jerk left out; infinite where none can be driven.
+    """Compute the shortest duration (n,) of any path for each largest commanded force [s].
+
+    Limits on jerk are left out. The duration is infinite if no path has a timing.
 
     Args:
-        limits: (k,) own limit of each path's planned force, or one for all [N].
+        paths: k paths.
+        limits: own force limit, one per path (k,) or one for all [N].
+        forces: (n,) largest commanded forces [N].
     """
     if not len(paths):
         return np.full(len(forces), np.inf)
@@ -451,6 +467,6 @@ def commanded_durations(paths: DrivenPaths, limits: Array | float, forces: Array
 
 
 def spread_rows(paths: Array) -> NDArray[np.intp]:
-    """Return rows of at most `MEMBERS` different ones of a front's paths (k, n), with both ends."""
+    """Return evenly spread rows of at most `MEMBERS` different paths (k, n), both ends included."""
     different = np.sort(np.unique(paths, axis=0, return_index=True)[1])
     return np.asarray(different[evenly(len(different), MEMBERS)])
