@@ -1,5 +1,7 @@
-"""Static hold of the payload: its forces, the payload limit that follows, and whether robots and
-pads can bear it. No carry has much smaller forces."""
+"""Static hold of the payload: forces, payload limit, and check of all limits at rest.
+
+No carry has much smaller forces.
+"""
 
 from __future__ import annotations
 
@@ -24,10 +26,10 @@ if TYPE_CHECKING:
     from symbolic.robot.model import RobotModel
 
 UTILISATION_TOLERANCE = 1e-6
-"""Share by which a limit may be exceeded that is met exactly."""
+"""Share of a limit by which a value may exceed the limit, for rounding errors."""
 
 Outputs = Callable[[Array], dict[str, Array]]
-"""Every per-sample output of decision vectors (n, n_var)."""
+"""Function from decision vectors (n, n_var) to all per-sample output arrays by name."""
 
 REMEDY_BISECTIONS = 24
 """Bisections for the mass or the friction that would do."""
@@ -35,7 +37,7 @@ REMEDY_BISECTIONS = 24
 
 @dataclass(frozen=True)
 class StaticHold:
-    """A level box at rest.
+    """Forces that hold the payload level and at rest.
 
     Attributes:
         normal_force: (2,) normal force of each robot [N], read-only.
@@ -66,8 +68,16 @@ def static_hold(workcell: Workcell) -> StaticHold:
 
 
 def limited_force(workcell: Workcell, normal: Array, whole: Array) -> Array:
-    """Return the forces that reference forces limit: whole ones of pads, which arms press with, and
-    holding forces of hands that hold by themselves."""
+    """Return the forces that the reference forces limit.
+
+    For pads these are the whole contact forces; for hands that grip on their own, the normal
+    forces.
+
+    Args:
+        workcell: the description of the cell.
+        normal: (2,) normal force of each robot [N].
+        whole: (2,) magnitude of each robot's contact force [N].
+    """
     return whole if contact_model(workcell).is_squeeze else normal
 
 
@@ -100,16 +110,16 @@ _load_of = cache_by_workcell(uncertain_load_function)
 def still_load(
     workcell: Workcell, pose: Array, friction: float = 1.0, function: ca.Function | None = None
 ) -> dict[str, Array]:
-    """Compute the load of the contacts while the payload stands still in a pose; the only source of
-    static normal forces.
+    """Compute the contact forces and moments of the payload at rest in one pose.
 
     Args:
-        pose: (6,) of the box [m, rad].
-        friction: factor on both coefficients.
-        function: another `symbolic.contact.load.uncertain_load_function` than the cell's.
+        workcell: the description of the cell.
+        pose: (6,) box pose [m, rad].
+        friction: factor on both friction coefficients.
+        function: load function in place of the cell's, from `uncertain_load_function`.
 
     Returns:
-        `symbolic.contact.load.LOAD_OUTPUTS`, flat.
+        Flat arrays by the names in `symbolic.contact.load.LOAD_OUTPUTS`.
     """
     coefficients = [friction * contact.friction for contact in workcell.contacts]
     centre = workcell.payload.centre_of_mass
@@ -122,13 +132,14 @@ def still_load(
 
 @dataclass(frozen=True)
 class StaticUtilisation:
-    """Use of a limit while standing still at one end of the path.
+    """Needed and allowed value of one limited quantity with the payload at rest.
 
     Attributes:
-        quantity: the limited quantity.
-        whose: the robot, or robot/joint.
-        where: 'start' or 'goal'.
-        needed, allowed: [unit].
+        quantity: name of the limited quantity.
+        whose: name of the robot, or robot/joint.
+        where: end of the path, 'start' or 'goal'.
+        needed, allowed: needed value and limit, in the unit of `unit`.
+        unit: unit of both values, as text.
     """
 
     quantity: str
@@ -160,17 +171,15 @@ PRESSURE, TORQUE = "shift of the pressure", "joint torque"
 
 
 def static_hold_error(workcell: Workcell, outputs: Outputs | None = None) -> str:
-    """Return why the payload cannot be held still at the start or the goal, with a remedy; '' if it
-    can.
+    """Return why the payload cannot be held at rest, with a remedy; '' if it can be held.
 
-    Normal forces and whole forces are held against the reference forces, which are what the robots
-    may carry, shifts of the pressure against the patches where they are a limit.
+    The payload is checked at the start and the goal. Forces are compared with the reference
+    forces, and pressure shifts with the patch radius if the contact model limits them.
 
     Args:
-        workcell: the cell.
-        outputs: of decision vectors, as `CandidateEvaluator.outputs` gives them; with it joint
-            torques count as well, in the postures that the hand-made trajectory begins and ends
-            with.
+        workcell: the description of the cell.
+        outputs: `CandidateEvaluator.outputs`, to check joint torques as well, in the first and
+            last posture of the hand-made trajectory; None for no check of torques.
 
     Raises:
         RobotModelError: a URDF does not give an arm.
@@ -187,10 +196,14 @@ def static_hold_error(workcell: Workcell, outputs: Outputs | None = None) -> str
 
 
 def require_hold(workcell: Workcell, outputs: Outputs | None = None) -> None:
-    """Refuse a cell whose payload cannot be held still, see `static_hold_error`.
+    """Raise an error if the payload of a cell cannot be held at rest.
+
+    Args:
+        workcell: the description of the cell.
+        outputs: `CandidateEvaluator.outputs`, to check joint torques as well, or None.
 
     Raises:
-        WorkcellError: it cannot.
+        WorkcellError: the payload cannot be held; the message has the reason and a remedy.
     """
     told = static_hold_error(workcell, outputs)
     if told:
@@ -198,7 +211,7 @@ def require_hold(workcell: Workcell, outputs: Outputs | None = None) -> None:
 
 
 def hold_error(workcell: Workcell, told: str) -> WorkcellError:
-    """Return the error of a payload that cannot be held still."""
+    """Return the error for a payload that cannot be held at rest; `told` is the reason."""
     return WorkcellError(str(workcell.source), (f"payload: {told}",))
 
 

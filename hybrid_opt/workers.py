@@ -46,7 +46,7 @@ def ignore_result(index: int, result: object) -> None:
 
 
 class Workers(ABC):
-    """Makes calls; use it in a `with` block, at whose end all work ends."""
+    """Processes that call functions in parallel; the end of a `with` block stops all work."""
 
     def map(
         self,
@@ -57,10 +57,13 @@ class Workers(ABC):
         """Call a function with every argument; return the results in the arguments' order.
 
         Args:
-            on_result: called in this process with index and result of each call as it ends.
+            function: function of one argument that can be pickled.
+            arguments: one argument for each call.
+            on_result: function that this process calls with the index and the result of each
+                finished call.
 
         Raises:
-            DualArmError: a call failed with this text, or workers were lost.
+            DualArmError: a call failed with this text, or worker processes died.
         """
         results: dict[int, Result] = {}
         try:
@@ -95,11 +98,13 @@ class Workers(ABC):
 
 
 class LocalWorkers(Workers):
-    """Makes calls in processes of this machine. A single call, or all of them with one job, run in
-    this process, without protection from crashes."""
+    """Worker processes on this machine.
+
+    A single call, or every call with one job, runs in this process and can crash it.
+    """
 
     def __init__(self, jobs: int = 1) -> None:
-        """Start nothing yet; `jobs` are the most processes, 0 for one per core."""
+        """Set the largest number of processes, 0 for one per core; no process starts yet."""
         self._jobs = jobs or available_cores()
         self._pool: ProcessPoolExecutor | None = None
         self._processes = set[BaseProcess]()
@@ -165,14 +170,17 @@ class LocalWorkers(Workers):
 
 
 def finished(calls: dict[Future[Result], int]) -> Iterator[tuple[int, Result]]:
-    """Yield index and result of each call as it ends."""
+    """Yield index and result of each call in the order of completion.
+
+    Args:
+        calls: index of each submitted call.
+    """
     for call in as_completed(calls):
         yield calls[call], call.result()
 
 
 def call_safely(function: Callable[[Argument], Result], argument: Argument) -> Result:
-    """Call a function in a worker: with linear algebra in one thread, and with errors that can be
-    pickled, which not every exception can."""
+    """Call a function with one linear-algebra thread; convert errors to picklable ones."""
     try:
         with one_thread():
             return function(argument)
@@ -201,9 +209,12 @@ def _controller(modules: int) -> ThreadpoolController:
 
 
 def warm_up(*modules: str) -> None:
-    """Start the server that workers come from, and let it load modules meanwhile.
+    """Start the server process that forks workers, with modules loaded in advance.
 
-    For programs; without it, each worker loads its own modules.
+    Without this call, each worker loads its own modules.
+
+    Args:
+        modules: names of the modules to load.
     """
     multiprocessing.get_context("forkserver").set_forkserver_preload(list(modules))
     with _without_interrupts():

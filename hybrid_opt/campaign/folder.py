@@ -84,7 +84,7 @@ class ExecutionSettings:
 
 
 def workers_for(execution: ExecutionSettings) -> Workers:
-    """Return the workers of the settings; none is started yet."""
+    """Return the workers that the execution settings ask for, not started yet."""
     if execution.executor == "dask":
         assert execution.scheduler is not None
         return DaskWorkers(execution.scheduler, environment)
@@ -99,8 +99,7 @@ _PACKAGES = ("casadi", "moocore", "numpy", "pin", "pymoo", "python-fcl", "scipy"
 
 @cache
 def environment() -> Mapping[str, str]:
-    """Return the versions of everything that takes part in a search, and a digest of the own
-    sources."""
+    """Return by name the software versions that affect a search, and a digest of the sources."""
     versions = {name: version(name) for name in _PACKAGES}
     versions["dual-arm-carry"] = own_version()  # beside the digest of the sources
     versions["sources"] = source_digest("symbolic", "codegen", "hybrid_opt")
@@ -113,9 +112,9 @@ def configuration_of(settings: CampaignSettings, root: Path, workcell: Workcell)
     """Return the configuration that identifies a campaign.
 
     Args:
-        settings: the campaign's.
+        settings: settings of the campaign.
         root: the results folder.
-        workcell: the folder's copy.
+        workcell: the workcell, read from the copy in the results folder.
     """
     file = workcell.source.relative_to(root.resolve()).as_posix()
     cell = StoredCell(workcell.name, file, workcell.digest)
@@ -123,10 +122,15 @@ def configuration_of(settings: CampaignSettings, root: Path, workcell: Workcell)
 
 
 def require_equal(stored: Any, wanted: Mapping[str, Any], where: str) -> None:
-    """Refuse to continue a campaign of another identity.
+    """Raise an error if a stored configuration differs from the current one.
+
+    Args:
+        stored: stored JSON values.
+        wanted: current JSON values by name.
+        where: name of the file or folder, for the error message.
 
     Raises:
-        ResultsError: with every value that differs.
+        ResultsError: values differ; the message lists all of them.
     """
     listed = "\n".join(
         f"  - {key}: stored {json.dumps(old)}, now {json.dumps(new)}"
@@ -141,8 +145,16 @@ def require_equal(stored: Any, wanted: Mapping[str, Any], where: str) -> None:
 
 
 def differences(first: Any, second: Any, key: str = "") -> Iterator[tuple[str, Any, Any]]:
-    """Yield the differences of two trees of JSON values: keys joined by points, and both values,
-    None for a missing one."""
+    """Yield the differences of two trees of JSON values.
+
+    Args:
+        first: JSON values.
+        second: JSON values to compare with `first`.
+        key: key path of both trees, put in front of the yielded keys.
+
+    Yields:
+        Key path joined by points, value in `first`, value in `second`; None if missing.
+    """
     if isinstance(first, dict) and isinstance(second, dict):
         for name in dict.fromkeys((*first, *second)):
             inner = f"{key}.{name}" if key else name
@@ -157,11 +169,11 @@ class CampaignFolder:
 
     Attributes:
         root: the folder.
-        settings: of the campaign.
-        execution: how.
-        cell: of the folder's own copy of the workcell, with the settings' objectives.
-        files: the workcell's files.
-        workers: make the calls of its stages.
+        settings: settings of the campaign.
+        execution: settings of the execution.
+        cell: cell of the workcell copy in the folder, with the objectives of the settings.
+        files: files of the workcell.
+        workers: workers that run the computations of the stages.
     """
 
     root: Path
@@ -173,7 +185,7 @@ class CampaignFolder:
 
     @property
     def workcell(self) -> Workcell:
-        """The cell's description."""
+        """Description of the cell."""
         return self.cell.workcell
 
 
@@ -187,8 +199,11 @@ def open_folder(
     """Start or continue a campaign in its results folder, locked for the `with` block.
 
     Args:
-        workers: make the calls of its stages; None for those of the execution, which end with the
-            `with` block.
+        settings: settings of the campaign.
+        execution: settings of the execution.
+        workcell: the workcell of the campaign.
+        workers: workers that run the computations of the stages. None starts the workers of the
+            execution settings and ends them with the `with` block.
 
     Raises:
         ResultsError: the folder is in use, holds something else, or is to be continued but was
@@ -223,11 +238,11 @@ def open_folder(
 
 
 def require_usable(execution: ExecutionSettings) -> None:
-    """Refuse a results folder that may not be worked in, before any work.
+    """Raise an error if the results folder cannot be used.
 
     Raises:
-        ResultsError: it holds a campaign that is neither to be continued nor overwritten, or
-            something else.
+        ResultsError: the folder holds a campaign without the setting `resume` or `overwrite`, or
+            other files.
     """
     root = execution.output
     if (root / CONFIGURATION).exists():

@@ -52,8 +52,7 @@ from symbolic.records import Workcell
 RECOMPUTE_REMEDY = "--resume computes it anew"
 
 CACHED_TABLES = 64
-"""Tables of candidates, and polished fronts, that are remembered by their content: a study's stages
-read them again and again."""
+"""Largest number of decoded tables, and of polished fronts, in memory: stages read them often."""
 
 _decoded = lru_cache(maxsize=CACHED_TABLES)(decode)
 _record_of = lru_cache(maxsize=CACHED_TABLES)(record_of)
@@ -61,13 +60,13 @@ _record_of = lru_cache(maxsize=CACHED_TABLES)(record_of)
 
 @dataclass(frozen=True)
 class Replica:
-    """A replica whose search is done; arrays are read-only.
+    """A replica with a finished search; arrays are read-only.
 
     Attributes:
-        algorithm: its name.
-        replica: its number, from 0.
+        algorithm: name of the search algorithm.
+        replica: number of the replica, from 0.
         evaluations: every candidate in the order of evaluation.
-        seconds: duration of the search.
+        seconds: duration of the search [s].
     """
 
     algorithm: str
@@ -90,7 +89,7 @@ class Replica:
 
     @property
     def front_x(self) -> Array:
-        """(k, n_var) their decision vectors."""
+        """(k, n_var) decision vectors of the non-dominated feasible candidates."""
         return self.evaluations.x[self.front_rows]
 
 
@@ -100,9 +99,9 @@ class CampaignResults:
 
     Attributes:
         root: the results folder.
-        configuration: content of its configuration.json.
-        cell: of the folder's copy of the workcell, with the study's objectives.
-        replicas: of all algorithms, by algorithm and number.
+        configuration: content of configuration.json in the results folder.
+        cell: cell of the workcell copy in the folder, with the objectives of the study.
+        replicas: replicas of all algorithms, ordered by algorithm and number.
     """
 
     root: Path
@@ -140,31 +139,31 @@ class CampaignResults:
 
     @property
     def workcell(self) -> Workcell:
-        """The cell's description."""
+        """Description of the cell."""
         return self.cell.workcell
 
     @property
     def settings(self) -> CampaignSettings:
-        """The campaign's."""
+        """Settings of the campaign."""
         return self.configuration.settings
 
     @property
     def algorithms(self) -> tuple[str, ...]:
-        """Names, in order."""
+        """Names of the search algorithms, in the order of the settings."""
         return tuple(self.settings.algorithms)
 
     @property
     def objectives(self) -> tuple[str, ...]:
-        """Names, in order."""
+        """Names of the objectives, in the order of the settings."""
         return self.settings.objectives
 
     def of(self, algorithm: str) -> tuple[Replica, ...]:
-        """Return the replicas of one algorithm."""
+        """Return the replicas of the algorithm with this name, by replica number."""
         return tuple(found for found in self.replicas if found.algorithm == algorithm)
 
     @cached_property
     def searched(self) -> tuple[Front, ...]:
-        """The fronts of all replicas as searched."""
+        """Fronts of all replicas before the polish."""
         return tuple(
             Front.of_search(self.cell, found.algorithm, found.evaluations, found.replica)
             for found in self.replicas
@@ -172,8 +171,11 @@ class CampaignResults:
 
     @cached_property
     def to_polish(self) -> tuple[Front, ...]:
-        """The fronts that a polish begins with: every replica's, of a drivable experiment the
-        `UNION` of all."""
+        """Fronts that the polish starts from.
+
+        These are the fronts of all replicas; in a drivable experiment, one front of the
+        non-dominated candidates of all replicas (`UNION`).
+        """
         if not self.workcell.task.law.is_drivable:
             return self.searched
         every = concatenated([found.evaluations for found in self.replicas])
@@ -181,11 +183,12 @@ class CampaignResults:
 
     @property
     def fronts(self) -> tuple[Front, ...]:
-        """The fronts of all replicas as searched, each with its polished one after it, and the
-        polished union.
+        """Fronts of all replicas, each followed by the polished front if there is one.
+
+        The polished union comes last, if there is one.
 
         Raises:
-            ResultsError: a polished one is damaged.
+            ResultsError: the file of a polished front is damaged.
         """
         found = list[Front | None]()
         for front in self.searched:
@@ -193,10 +196,14 @@ class CampaignResults:
         return tuple(front for front in (*found, self.polished(UNION)) if front is not None)
 
     def polished(self, algorithm: str, replica: int = 0) -> Front | None:
-        """Return the polished front of a replica, or of the `UNION`; None if it was not polished.
+        """Return the polished front of a replica or of the union, None without a polish.
+
+        Args:
+            algorithm: name of the algorithm, or `UNION`.
+            replica: number of the replica, from 0.
 
         Raises:
-            ResultsError: it is damaged.
+            ResultsError: the file of the polished front is damaged.
         """
         for front in self.to_polish:
             if front.key == (algorithm, replica):
@@ -206,18 +213,27 @@ class CampaignResults:
 
 
 def union(fronts: Sequence[Front]) -> list[tuple[Front, int]]:
-    """Return the members of several fronts that no other one dominates, by increasing objectives,
-    each as its front and its index there."""
+    """Return the non-dominated carries of several fronts together.
+
+    Args:
+        fronts: fronts with the same objectives.
+
+    Returns:
+        For each carry, its front and its index in that front; by increasing objectives.
+    """
     members = [(front, row) for front in fronts for row in range(len(front))]
     objectives = np.concatenate([front.objectives for front in fronts])
     return [members[k] for k in metrics.front_rows(objectives, np.ones(len(members), dtype=bool))]
 
 
 def read_campaign(root: str | Path) -> CampaignResults:
-    """Read a campaign whose search is complete.
+    """Read a campaign with a complete search.
+
+    Args:
+        root: the results folder.
 
     Raises:
-        ResultsError: the folder holds none, a replica is missing, or a file is damaged.
+        ResultsError: the folder holds no campaign, a replica is missing, or a file is damaged.
         WorkcellError: the stored workcell cannot be read.
     """
     root = Path(root)
@@ -240,8 +256,11 @@ def read_campaign(root: str | Path) -> CampaignResults:
 def read_configuration(root: str | Path) -> Configuration:
     """Read the configuration of a campaign.
 
+    Args:
+        root: the results folder.
+
     Raises:
-        ResultsError: the folder holds none, a damaged one, or one of another version.
+        ResultsError: the configuration is missing, damaged, or of another version.
     """
     path = Path(root) / CONFIGURATION
     if not path.parent.exists():
@@ -257,10 +276,16 @@ def read_configuration(root: str | Path) -> Configuration:
 
 
 def read_replica(root: Path, algorithm: str, number: int, objectives: tuple[str, ...]) -> Replica:
-    """Read one replica whose search is done.
+    """Read one replica with a finished search.
+
+    Args:
+        root: the results folder.
+        algorithm: name of the search algorithm.
+        number: number of the replica, from 0.
+        objectives: names of the campaign's objectives, in order.
 
     Raises:
-        ResultsError: it is not done, or its file is damaged.
+        ResultsError: the search is not finished, or the file is damaged.
     """
     path = replica_file(root, algorithm, number)
     if not path.exists():
@@ -278,8 +303,8 @@ def is_whole(exists: bool, read: Callable[[], object]) -> bool:
     """Return True if a stage's result exists and can be read; report damage as a warning.
 
     Args:
-        exists: whether it is there.
-        read: raises a `ResultsError` where it is damaged.
+        exists: True if the result exists.
+        read: function that reads the result, and raises a `ResultsError` if it is damaged.
     """
     try:
         if exists:
@@ -292,7 +317,11 @@ def is_whole(exists: bool, read: Callable[[], object]) -> bool:
 
 
 def read_polished(root: Path, front: Front) -> PolishedFront | None:
-    """Read the polished front; None if it was not polished.
+    """Read the polished front that belongs to a front; return None without a polish.
+
+    Args:
+        root: the results folder.
+        front: the front before the polish.
 
     Raises:
         ResultsError: the file is damaged.
@@ -319,12 +348,18 @@ _OPENED: list[TemporaryDirectory[str]] = []
 
 
 def load(path: str | Path) -> Cell | Carry | CampaignResults | Mapping[str, Any]:
-    """Read a file of this project: a workcell file as a `Cell`, a trajectory file as a `Carry`, the
-    results folder of a study as its fronts (`.cell`, `.fronts`), a bundle as its manifest.
+    """Read a file or folder of this project.
+
+    Args:
+        path: a workcell file (.toml), a trajectory file, a results folder, or a bundle.
+
+    Returns:
+        A `Cell` of a workcell file, a `Carry` of a trajectory file, the `CampaignResults` of a
+        results folder, or the manifest of a bundle (JSON values by name).
 
     Raises:
         WorkcellError: the workcell file is wrong.
-        ResultsError: there is nothing of the kind, or it is damaged.
+        ResultsError: the path is none of these, or the content is damaged.
     """
     path = Path(path)
     if path.suffix == ".toml":

@@ -18,17 +18,17 @@ from symbolic.array import Range, require_allowed
 from symbolic.errors import SettingsError
 
 FirstGeneration = Literal["initial", "random"]
-"""'initial': uniformly random but for the workcell's hand-made trajectory; 'random': all."""
+"""'random': all candidates uniformly random; 'initial': one is the hand-made trajectory."""
 
 Budget = Annotated[int, Range(1, 10**9)]
 Runs = Annotated[int, Range(1, 10_000)]
 Seed = Annotated[int, Range(0, 2**63 - 1)]
 
 ALGORITHMS = ("nsga2", "mopso")
-"""The algorithms of a campaign that names none."""
+"""Default search algorithms of a campaign."""
 
 SIZE_KEYS = ("population", "swarm", "batch")
-"""What the algorithms' settings call the candidates of one generation."""
+"""Names of the setting for the number of candidates per generation, in all algorithms."""
 
 
 def sized(algorithm: str, size: int) -> dict[str, Any]:
@@ -43,7 +43,7 @@ def chosen(
     """Return the algorithms of a campaign with their non-default settings.
 
     Args:
-        names: known to `hybrid_opt.metaheuristics`, each once.
+        names: names of search algorithms in `hybrid_opt.metaheuristics`, each once.
         populations: (algorithm, candidates per generation), each algorithm at most once.
 
     Raises:
@@ -67,14 +67,15 @@ class CampaignSettings:
     """Everything that decides a campaign's results, besides the workcell.
 
     Attributes:
-        algorithms: settings of each algorithm by its name, see `hybrid_opt.metaheuristics`; the
-            defaults of those that are not given are filled in.
-        evaluations: budget of every replica.
+        algorithms: settings of each algorithm by algorithm name (`hybrid_opt.metaheuristics`);
+            missing settings get their defaults.
+        evaluations: number of candidates that every replica evaluates.
         replicas: independent runs per algorithm.
         seed: the campaign's seed; every replica derives its own from it.
-        objectives: names known to `hybrid_opt.evaluate.objectives`, each once.
+        objectives: names of objectives in `hybrid_opt.evaluate.objectives`, each once.
         constraint_handling: 'penalty' (the paper's) or 'constraints'.
-        first_generation: start of the searches; uniform random search is always all random.
+        first_generation: candidates at the start of a search, 'initial' or 'random'; the random
+            search ignores this setting.
     """
 
     algorithms: Mapping[str, Mapping[str, Any]] = field(default_factory=lambda: chosen(ALGORITHMS))
@@ -125,9 +126,9 @@ class StoredCell:
     """The workcell of a campaign.
 
     Attributes:
-        name: for people.
-        file: of the folder's copy, relative to the folder.
-        digest: of the workcell.
+        name: title of the workcell, for people.
+        file: path of the workcell copy, relative to the results folder.
+        digest: digest of the workcell and its files.
     """
 
     name: str
@@ -137,7 +138,7 @@ class StoredCell:
 
 @dataclass(frozen=True)
 class Configuration:
-    """configuration.json: everything that decides the results."""
+    """Content of configuration.json: everything that decides the results of a campaign."""
 
     format: str
     version: int
@@ -148,7 +149,7 @@ class Configuration:
 
 @dataclass(frozen=True)
 class StageMark:
-    """stages/NAME.json: how far a stage is, its own settings, and the time spent on it [s]."""
+    """Content of stages/NAME.json: status, settings and computing time [s] of one stage."""
 
     status: StageStatus
     settings: Mapping[str, Any]
@@ -174,8 +175,9 @@ HAND_MADE_FILE = "hand-made.json"
 
 
 UNION = "union"
-"""Name of the non-dominated candidates of all searches together, where others have an algorithm's:
-the one front of a drivable experiment that is polished."""
+"""Name of the front of all replicas together, in place of an algorithm's name.
+
+A drivable experiment polishes this front alone."""
 
 
 def replica_file(root: Path, algorithm: str, replica: int) -> Path:

@@ -27,15 +27,15 @@ def write_bundle(
     Everything is written beside the folder first, so that a full disk leaves the old files.
 
     Args:
-        folder: of the bundle alone.
-        contents: its files.
-        manifest: JSON values; the digests of the files and of itself are added.
+        folder: folder that holds nothing but the bundle.
+        contents: content of each file, by path relative to the folder.
+        manifest: JSON values by name; the digests of the files and the manifest are added.
 
     Returns:
-        The files written, the manifest first.
+        Paths of the written files, the manifest first.
 
     Raises:
-        ResultsError: it cannot be written, or the folder holds something else.
+        ResultsError: the bundle cannot be written, or the folder holds other files.
     """
     _require_own(folder)
     data = {
@@ -68,10 +68,10 @@ def write_bundle(
 
 
 def read_manifest(folder: Path) -> dict[str, Any]:
-    """Read the manifest of a bundle.
+    """Read the manifest of a bundle and return its JSON values by name.
 
     Raises:
-        ResultsError: there is none, it is damaged, or was changed since it was written.
+        ResultsError: the manifest is missing, damaged, or was changed after writing.
     """
     path = folder / MANIFEST
     document = read_document(path, BUNDLE_FORMAT, BUNDLE_VERSION)

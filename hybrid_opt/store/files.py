@@ -36,16 +36,17 @@ LOCK = ".lock"
 
 RESUME = "make room and continue with --resume"
 AGAIN = "make room and try again"
-"""Advice about a full disk: for a study's own files, and for any other."""
+"""Advice in error messages about a full disk: `RESUME` for files of a study, `AGAIN` for others."""
 
 _FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 
 
 @contextmanager
 def storing(path: Path, remedy: str = RESUME) -> Iterator[None]:
-    """Report a failure to store `path` as one clear message.
+    """Convert errors of the `with` block's file operations to a `ResultsError`.
 
     Args:
+        path: path of the file or folder, for the error message.
         remedy: advice for a full disk.
     """
     try:
@@ -63,13 +64,15 @@ def storing(path: Path, remedy: str = RESUME) -> Iterator[None]:
 
 
 def write_atomically(path: Path, content: bytes, remedy: str = RESUME) -> None:
-    """Replace a file in one step, durably; make its folder if it is missing.
+    """Replace a file in one step, durably; create a missing folder.
 
     Args:
+        path: path of the file.
+        content: new content of the file.
         remedy: advice for a full disk.
 
     Raises:
-        ResultsError: it cannot be written.
+        ResultsError: the file cannot be written.
     """
     with storing(path, remedy):
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -77,7 +80,7 @@ def write_atomically(path: Path, content: bytes, remedy: str = RESUME) -> None:
 
 
 def write_json(path: Path, document: Any) -> None:
-    """Store JSON values, see `write_atomically`; NaN and infinities are refused."""
+    """Write JSON values to a file in one step; NaN and infinities raise a `ValueError`."""
     text = json.dumps(document, indent=1, allow_nan=False)
     write_atomically(path, (text + "\n").encode())
 
@@ -85,7 +88,7 @@ def write_json(path: Path, document: Any) -> None:
 def to_json(value: Any) -> Any:
     """Convert a record to JSON values.
 
-    Numbers that are not finite become null. Fields without a value that have none by default are
+    Numbers that are not finite become null. Fields with the value None and the default None are
     left out.
     """
     if is_dataclass(value):
@@ -111,14 +114,14 @@ def from_json(
     """Read a record from JSON values.
 
     Args:
-        kind: the record's class.
-        value: the values.
-        path: of the file, or what else they are called in messages.
+        kind: class of the record.
+        value: the JSON values.
+        path: path of the file, or another name of the values, for error messages.
         remedy: advice for a damaged file.
-        is_open: whether keys that are no fields are left alone.
+        is_open: True to ignore unknown keys, False to refuse them.
 
     Raises:
-        ResultsError: they describe none; with the field and its fault.
+        ResultsError: a field is wrong; the message names the field and the problem.
     """
     try:
         record: Record = checked(kind, value, "", FirstProblem(open=is_open))
@@ -129,21 +132,33 @@ def from_json(
 
 
 def read_record(kind: type[Record], path: Path, remedy: str) -> Record:
-    """Read a file with one record; see `from_json`.
+    """Read one record from a JSON file.
+
+    Args:
+        kind: class of the record.
+        path: path of the file.
+        remedy: advice for a damaged file.
 
     Raises:
-        ResultsError: it cannot be read or is damaged.
+        ResultsError: the file cannot be read or is damaged.
     """
     return record_of(kind, read_bytes(path), path, remedy)
 
 
 def record_of(kind: type[Record], content: bytes, path: Path | str, remedy: str) -> Record:
-    """Read the record in a file's content; see `read_record`."""
+    """Read one record from the content of a JSON file.
+
+    Args:
+        kind: class of the record.
+        content: content of the file.
+        path: path of the file, for error messages.
+        remedy: advice for a damaged file.
+    """
     return from_json(kind, json_of(content, path, remedy), path, remedy)
 
 
 def csv_text(header: Sequence[str], rows: Iterable[Sequence[str | float]]) -> str:
-    """Format comma-separated values, with the fewest digits that give the same bits back."""
+    """Format a header and rows as CSV text; numbers keep their exact value."""
     text = io.StringIO()
     csv.writer(text, lineterminator="\n").writerows([header, *rows])
     return text.getvalue()
@@ -163,7 +178,7 @@ def read_json(path: Path, remedy: str = "") -> Any:
 
 
 def json_of(content: bytes, path: Path | str, remedy: str = "") -> Any:
-    """Parse the JSON values of a file's content; see `read_json`."""
+    """Parse the content of a JSON file; `path` and `remedy` appear in error messages."""
     try:
         return safe_io.json_value(content)
     except OutsideError as error:
@@ -172,10 +187,16 @@ def json_of(content: bytes, path: Path | str, remedy: str = "") -> Any:
 
 
 def read_document(path: Path, form: str, version: int, remedy: str = "") -> dict[str, Any]:
-    """Read a JSON object that names its format and version, which are left in it.
+    """Read a JSON object and check its entries `format` and `version`.
 
     Args:
-        remedy: advice for a damaged or other file.
+        path: path of the file.
+        form: expected format.
+        version: expected version.
+        remedy: advice for a damaged file or another format.
+
+    Returns:
+        All entries by name, with `format` and `version`.
 
     Raises:
         ResultsError: the file cannot be read, or is of another format or version.
@@ -194,7 +215,8 @@ def read_bytes(path: Path) -> bytes:
     """Read a file's content.
 
     Raises:
-        ResultsError: it cannot be read, is no regular file, or larger than `safe_io.MOST_BYTES`.
+        ResultsError: the file cannot be read, is no regular file, or is larger than
+            `safe_io.MOST_BYTES`.
     """
     try:
         return safe_io.read_bytes(path, safe_io.MOST_BYTES)
@@ -203,16 +225,18 @@ def read_bytes(path: Path) -> bytes:
 
 
 def sha256(content: bytes) -> str:
-    """Compute the SHA-256 as hexadecimal text."""
+    """Compute the SHA-256 digest of bytes as hexadecimal text."""
     return hashlib.sha256(content).hexdigest()
 
 
 @contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """Hold a results folder for this process alone; the lock goes with the process.
+    """Lock a results folder for this process within a `with` block.
+
+    The lock also ends with the process.
 
     Raises:
-        ResultsError: another process holds it, or the folder cannot be written.
+        ResultsError: another process holds the lock, or the folder cannot be written.
     """
     path = folder / LOCK
     with storing(path):
@@ -235,7 +259,7 @@ def locked(folder: Path) -> Iterator[None]:
 
 
 def own_version() -> str:
-    """Return the installed version; sources without an installation have none."""
+    """Return the installed version of this project, 'not installed' without an installation."""
     try:
         return version("dual-arm-carry")
     except PackageNotFoundError:

@@ -39,20 +39,20 @@ from symbolic.safe_io import replace_file
 TRAJECTORY_FORMAT = "dual-arm-carry trajectory"
 TRAJECTORY_VERSION = 1
 LARGEST_DECISION = 100.0
-"""Largest value of a decision vector and of a start posture [m, rad]: no cell has larger ones."""
+"""Largest absolute value in a decision vector or start posture [m, rad]; no cell needs more."""
 
 LARGEST_FORCE = 1e5
-"""Largest last value of a decision vector, which may be a force limit [N]."""
+"""Largest last value of a decision vector; the last value may be a force limit [N]."""
 
 MOST_NUMBERS = 10_000
 
 START_POSTURE_TOLERANCE = 1e-6
-"""Largest difference of the start postures [rad]."""
+"""Largest difference of start postures [rad] that counts as reproduced."""
 
 ABSOLUTE_TOLERANCE = 1e-9
 
 RELATIVE_TOLERANCE = 1e-6
-"""Two evaluations of one trajectory may differ by this much: other compiler, other machine."""
+"""Relative difference of a figure between compilers or machines that counts as reproduced."""
 
 
 @dataclass(frozen=True)
@@ -62,9 +62,9 @@ class StoredTrajectory:
     Attributes:
         x: (n_var,) decision vector.
         start: joint positions (joints,) of each arm at the first sample [rad or m].
-        figures: the figures it was stored with, SI units.
-        provenance: how it came about (algorithm, seed, versions, ...), JSON values.
-        cell: the workcell's files.
+        figures: figures of the carry by name at the time of storing, SI units.
+        provenance: origin of the trajectory (algorithm, seed, versions, ...) as JSON values.
+        cell: files of the workcell.
     """
 
     x: Array
@@ -75,21 +75,21 @@ class StoredTrajectory:
 
     @property
     def objectives(self) -> tuple[str, ...]:
-        """Names of the stored objectives that the library knows, else the paper's."""
+        """Names of the stored objectives, or the paper's objectives if none is known."""
         named = {f"{OBJECTIVE}{name}": name for name in OBJECTIVES}
         found = tuple(named[figure] for figure in self.figures if figure in named)
         return found or PAPER_OBJECTIVES
 
     def open_cell(self, folder: Path) -> Cell:
-        """Open its cell, which minimises the stored objectives; write its files below a folder.
+        """Write the workcell's files to a folder and return the cell with the stored objectives.
 
         Raises:
-            ResultsError: as of `unpack`.
+            ResultsError: the stored workcell is not valid, or does not fit the decision vector.
         """
         return Cell(self.unpack(folder), self.objectives)
 
     def unpack(self, folder: Path) -> Workcell:
-        """Write the workcell's files below a folder and read it.
+        """Write the workcell's files to a folder and return the workcell read from them.
 
         Raises:
             ResultsError: the stored workcell is not valid, or does not fit the decision vector.
@@ -118,7 +118,8 @@ def write_trajectory(
 
     Args:
         path: the file to write; its folder has to exist.
-        cell: as read from its file; compiled, where several are stored.
+        cell: the workcell, unchanged since reading, or the compiled cell. A compiled cell saves
+            time if several trajectories are stored.
         x: (n_var,) decision vector.
         figures: finite numbers by name, as from `Carry.figures`.
         provenance: JSON values: algorithm, seed, versions and other origins.
@@ -214,7 +215,7 @@ class _Content:
 
 @dataclass(frozen=True)
 class FigureComparison:
-    """A stored figure and the recomputed one, None if nothing computes it."""
+    """A stored figure and its recomputed value, None if the figure cannot be recomputed."""
 
     name: str
     stored: float
@@ -222,7 +223,7 @@ class FigureComparison:
 
     @property
     def same(self) -> bool:
-        """True if both agree to the tolerances of a re-evaluation."""
+        """True if the stored and the recomputed value agree within the tolerances."""
         if self.recomputed is None:
             return False
         allowed = ABSOLUTE_TOLERANCE + RELATIVE_TOLERANCE * abs(self.stored)
@@ -234,8 +235,8 @@ class Replay:
     """A re-evaluated trajectory.
 
     Attributes:
-        cell: as unpacked from the file.
-        figures: every stored figure, compared.
+        cell: the cell from the trajectory file.
+        figures: comparison of every stored figure.
         start_difference: largest difference of the start postures [rad].
     """
 
@@ -252,13 +253,14 @@ class Replay:
 
 
 def replay(stored: StoredTrajectory, cell: Cell) -> Replay:
-    """Evaluate a stored trajectory again.
+    """Evaluate a stored trajectory again and compare all stored figures.
 
     Args:
-        cell: that of `StoredTrajectory.open_cell`.
+        stored: the stored trajectory.
+        cell: the cell from `StoredTrajectory.open_cell`.
 
     Raises:
-        DualArmError: its model cannot be built.
+        DualArmError: the model of the cell cannot be built.
     """
     carry = cell.carry(stored.x)
     recomputed = carry.figures
