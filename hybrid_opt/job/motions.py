@@ -92,11 +92,11 @@ class Straight:
     """A straight translation of the box, of both pads, or of all.
 
     Attributes:
-        name: of the phase.
-        box: (2, 6) box poses at beginning and end.
-        held: (2, 2, 6) by arm the box poses that its pad holds at beginning and end; where they
-            are not those of the box the pad is away from it.
-        speed: largest [m/s].
+        name: name of the phase.
+        box: (2, 6) box poses at beginning and end [m, rad].
+        held: (2, 2, 6) for each arm, the poses at beginning and end of a box that its pad would
+            touch [m, rad]; they differ from `box` where the pad is away from the box.
+        speed: largest speed [m/s].
     """
 
     name: str
@@ -106,7 +106,7 @@ class Straight:
 
     @property
     def length(self) -> float:
-        """Length of the longest way [m]."""
+        """Length of the longest translation of box and pads [m]."""
         ways = np.concatenate([self.box[None], self.held])
         return float(np.linalg.norm((ways[:, 1] - ways[:, 0])[:, :3], axis=1).max())
 
@@ -125,9 +125,9 @@ def straight(
     their approach.
 
     Args:
-        box: (2, 6) its poses at beginning and end.
-        away: distances of the pads from it then [m].
-        speed: largest [m/s].
+        box: (2, 6) box poses at beginning and end [m, rad].
+        away: distance of the pads from the box at beginning and end [m].
+        speed: largest speed [m/s].
     """
     held, contact = np.array([box, box]), contact_model(workcell)
     for arm in (0, 1):
@@ -143,9 +143,9 @@ def lines_around(
     """Build the straight motions before a carry and after it, either list from the carry outwards.
 
     Args:
-        handling: how; the workcell's own or another.
-        stands: (6,) poses of the box where it stands before and after the carry.
-        pose: (2, 6) of the box where the carry begins and ends.
+        handling: heights, speeds and stand-off of the job.
+        stands: two poses (6,) of the box on its supports before and after the carry [m, rad].
+        pose: (2, 6) box poses at the beginning and end of the carry [m, rad].
     """
     away, speed = handling.stand_off, handling.pressing_speed
     stand, down = (np.tile(box, (2, 1)) for box in stands)
@@ -173,7 +173,8 @@ def follow_line(
 
     Args:
         posture: compiled `symbolic.robot.arm.posture_function`.
-        known: (joints,) at the end of the line where `at_end`, else at its beginning [rad].
+        known: (joints,) joint positions at one end of the line [rad].
+        at_end: True if they are known at the end of the line, False if at its beginning.
 
     Raises:
         JobError: an arm does not reach a place within its joint range.
@@ -228,7 +229,7 @@ def time_line(model: TimingModel, line: Straight, q: Array) -> PhaseMotion:
     """Compute the motion along a line from rest to rest, as fast as its speed and the limits allow.
 
     Args:
-        q: (SAMPLES, joints) as from `followed` [rad].
+        q: (SAMPLES, joints) joint positions along the line, as from `follow_line` [rad].
     """
     unit = rest_to_rest_profile(1.0, PHASE_SAMPLES)
     box, *targets = line.at(unit.value)
@@ -367,8 +368,8 @@ def pressing(
     friction is never used more than while the box is held.
 
     Args:
-        motion, hold: the phase that begins or ends here.
-        sample: 0 or -1.
+        motion, hold: motion and forces of the phase that follows or precedes.
+        sample: 0 for the beginning of that phase, -1 for its end.
         rate: largest rate of a normal force [N/s].
     """
     peak = float(hold.normal[sample].max())
@@ -386,8 +387,8 @@ def waiting(motion: PhaseMotion, sample: int, duration: float) -> tuple[PhaseMot
     """Stand still at one sample of a motion while hands take hold or let go, without forces.
 
     Args:
-        sample: 0 or -1.
-        duration: at least [s].
+        sample: 0 for the first sample of the motion, -1 for the last.
+        duration: least duration of the standstill [s].
     """
     time = np.linspace(0.0, at_even_steps(duration, TICK), PHASE_SAMPLES)
     still = standing_still(motion, sample, time)

@@ -95,7 +95,8 @@ class GripBudget:
             holds every case [N].
         allowed: (2,) reference forces [N].
         uncertainty: the set of cases.
-        remedies: the smallest changes with which it fits, empty if it does.
+        remedies: smallest changes of the cell with which the required forces keep the allowed ones;
+            empty if they already do.
     """
 
     required: Pair
@@ -136,7 +137,7 @@ def budget_text(workcell: Workcell) -> str:
 
 
 def remedies_text(remedies: tuple[Remedy, ...], purpose: str) -> str:
-    """Return alternatives as a sentence, '' without any."""
+    """Return the remedies as a sentence of alternatives; '' if there are none."""
     if not remedies:
         return ""
     return f"{', or '.join(map(str, remedies))}: any of these would do {purpose}"
@@ -163,10 +164,11 @@ def grip_budget(workcell: Workcell) -> GripBudget:
 def largest_forces(
     model: RobustModel, motion: HeldMotion, rows: NDArray[np.intp] | None = None
 ) -> Array:
-    """Compute the largest force (2,) [N] that holds a motion, and the same poses at rest, in every
-    case: commanded of one robot, resulting of the leading one.
+    """Compute the largest robust force (2,) of each robot for a motion and its poses at rest [N].
 
     Args:
+        model: robust forces of the workcell.
+        motion: samples of the motion.
         rows: rows of the worst cases to consider; None for all.
 
     Raises:
@@ -190,11 +192,11 @@ def cheapest_remedies(
     forces along a motion fit.
 
     Args:
-        model: of the commanded forces.
+        model: robust forces of the workcell.
         motion: samples with the largest required forces.
-        required: (2,) largest force of each robot [N]; it may exceed that of the model's samples.
-        allowed: (2,) [N].
-        most: number of remedies.
+        required: (2,) largest force of each robot [N]; it may exceed the force at the samples.
+        allowed: (2,) reference force of each robot [N].
+        most: largest number of remedies.
 
     Returns:
         The smallest relative changes first.
@@ -208,10 +210,13 @@ def reserve(model: RobustModel, motion: HeldMotion, required: Array, allowed: Ar
     """Compute the largest payload and the least friction with which forces along a motion fit.
 
     Args:
-        model, motion, required, allowed: as of `cheapest_remedies`.
+        model: robust forces of the workcell.
+        motion: samples with the largest required forces.
+        required: (2,) largest force of each robot [N].
+        allowed: (2,) reference force of each robot [N].
 
     Returns:
-        NaN if no value within the considered range suffices.
+        Mass [kg] and friction, NaN if no value within the considered range suffices.
     """
     excess, workcell = _excess(model, motion, required, allowed), model.workcell
     friction = min(pad.friction for pad in workcell.contacts)

@@ -76,7 +76,7 @@ def worst_cases(workcell: Workcell, uncertainty: Uncertainty, leader: int = 0) -
 def random_cases(
     workcell: Workcell, uncertainty: Uncertainty, n: int, rng: np.random.Generator, leader: int = 0
 ) -> Array:
-    """Draw cases (n, 18) uniformly from the ranges, pads from discs."""
+    """Draw n random cases (n, 18) of a set, uniform in its ranges and discs of pad positions."""
     cases = np.tile(nominal_case(workcell), (n, 1))
     cases[:, 0:2] *= 1.0 + uncertainty.friction * rng.uniform(-1.0, 1.0, (n, 2))
     cases[:, 4] *= 1.0 + uncertainty.mass * rng.uniform(-1.0, 1.0, n)
@@ -109,7 +109,7 @@ class GoverningCases:
             of the leading arm [N].
         commanded: (n,) row of the case that decides the commanded force.
         leading: (n,) row of the case with the largest excess of the leading arm's force over the
-            commanded one.
+            commanded force.
         share: (n,) transmitted share of that excess, see `transmitted_share`.
         leading_share: rise of the leading arm's force per newton of commanded force.
     """

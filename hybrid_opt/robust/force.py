@@ -104,12 +104,12 @@ def tile_motion(motion: HeldMotion, times: int) -> BoxMotion:
 
 
 def at_rest() -> BoxMotion:
-    """Return one sample, level and still."""
+    """Return a motion of one sample: the box level and at rest."""
     return BoxMotion(*[np.zeros((1, 6))] * 3)
 
 
 def at_standstill(motion: HeldMotion) -> BoxMotion:
-    """Return the same poses at rest."""
+    """Return the poses of a motion with zero rates."""
     return BoxMotion(motion.pose, 0.0 * motion.rate, 0.0 * motion.second_rate)
 
 
@@ -133,7 +133,7 @@ class RobustForce:
 
     @property
     def peak(self) -> Array:
-        """(2,) largest normal force of each robot [N]."""
+        """Largest normal force (2,) of each robot [N]."""
         peaks = [float(self.commanded.max())] * 2
         peaks[self.leader] = float(self.leading.max())
         return np.array(peaks)
@@ -166,8 +166,9 @@ class SampledCheck:
 
 
 class RobustModel:
-    """Robust forces of one workcell's carries, from compiled functions. `leader` is the index of
-    the arm that keeps its place, whose force is not commanded.
+    """Robust forces of one workcell's carries, from compiled functions.
+
+    The argument `leader` is always the index of the position-controlled arm.
 
     Attributes:
         workcell: the cell.
@@ -243,14 +244,16 @@ class RobustModel:
     def least(
         self, motion: HeldMotion, cases: Array, leader: int, threads: int, displaced: bool
     ) -> Array:
-        """Compute the least normal forces (m, 2) [N]: the commanded force of one robot, and the
-        resulting force of the leading one.
+        """Compute the least normal forces (m, 2) of both robots that hold each sample's case [N].
+
+        The leading arm's force results from the commanded force of the other arm.
 
         Args:
-            motion: m samples.
-            cases: (m, 18), one case per sample.
-            threads: 0 for one per core.
-            displaced: some case displaces a pad; computing without is faster.
+            motion: motion at m samples.
+            cases: (m, 18) one case per sample.
+            leader: index of the leading arm.
+            threads: number of threads, 0 for one per core.
+            displaced: True if a case displaces a pad; False is faster.
         """
         function = self._squeeze(1 - leader, displaced)
         return function.batch(*motion_inputs(motion), cases, threads=threads)["normal_force"]
@@ -265,8 +268,13 @@ class RobustModel:
         return function.batch(*given, threads=threads)["slack"].ravel()
 
     def least_squeeze(self, motion: HeldMotion, cases: Array, leader: int = 0) -> Array:
-        """Compute the least normal forces (k, n, 2) [N] that hold each of k cases (k, 18) at n
-        samples: the commanded one, and the resulting one of `leader`."""
+        """Compute the least normal forces (k, n, 2) of both robots [N] for k cases at n samples.
+
+        Args:
+            motion: motion at n samples.
+            cases: (k, 18) the cases.
+            leader: index of the leading arm; its force results from the other, commanded one.
+        """
         displaced = bool(cases[:, 11:15].any())
         n = len(motion.pose)
         found = np.empty((len(cases), n, 2))
@@ -279,7 +287,7 @@ class RobustModel:
         return found
 
     def nominal(self, motion: HeldMotion, leader: int = 0) -> Array:
-        """Compute the least normal forces (n, 2) of the nominal cell [N], see `least_squeeze`."""
+        """Compute the least normal forces (n, 2) of both robots that hold the nominal case [N]."""
         return np.asarray(self.least_squeeze(motion, nominal_case(self.workcell)[None], leader)[0])
 
     @cached_property
@@ -294,10 +302,15 @@ class RobustModel:
         leader: int = 0,
         rows: NDArray[np.intp] | None = None,
     ) -> tuple[Array, Array]:
-        """Compute the least commanded normal force and the largest resulting one of the leading
-        arm, (n,) each [N]; infinite where no force holds every case.
+        """Compute the least commanded normal force (n,) that holds every case of a set [N].
+
+        Also return the largest resulting normal force (n,) of the leading arm [N]. Both are
+        infinite where no force holds every case.
 
         Args:
+            motion: motion at n samples.
+            uncertainty: the set.
+            leader: index of the leading arm.
             rows: rows of the worst cases to consider; None for all.
 
         Raises:
@@ -327,7 +340,7 @@ class RobustModel:
         leader: int = 0,
         above: Array | float = 0.0,
     ) -> Array:
-        """Compute the commanded force (n,) of `hold`, faster for many cases [N].
+        """Compute the least commanded force (n,) that holds every case [N], faster than `hold`.
 
         `slack` finds the cases with the largest forces at a few samples; their forces are solved
         for. `slack` then proves that most other cases need no more. Of more than `SAMPLES` samples,
@@ -361,7 +374,11 @@ class RobustModel:
         return force
 
     def peak(self, motion: HeldMotion, uncertainty: Uncertainty, leader: int = 0) -> Array:
-        """Compute the largest forces (2,) of `hold` from the few samples that can attain them."""
+        """Compute the largest normal force (2,) of each robot over a motion in any case [N].
+
+        The forces are those of `hold`, computed only at the few samples that can attain the
+        largest.
+        """
         force, planned = self.commanded(motion, uncertainty, leader), self.nominal(motion, leader)
         share = self.leading_share[leader]
         leading = share * force + planned[:, leader] - share * planned[:, 1 - leader]
@@ -511,7 +528,7 @@ class RobustPrice:
         peak: (k, 2) largest normal force of each robot for each multiple [N].
         commanded: (2,) largest normal force of each robot for the set itself [N].
         limit: (2,) reference forces [N].
-        largest_factor: see `RobustModel.largest_factor`.
+        largest_factor: largest multiple of the set whose forces keep the reference forces.
         check: commanded forces checked in random cases of the set.
     """
 
@@ -536,10 +553,12 @@ def robust_price(
     """Compute the price of robustness of a carry against the workcell's set.
 
     Args:
-        model: of the carry's workcell.
-        rng: draws the random cases.
+        model: robust forces of the carry's workcell.
+        carry: the carry.
+        rng: generator of the random cases.
+        leader: index of the arm that keeps its place.
         cases: number of random cases.
-        threads: 0 for one per core.
+        threads: number of threads, 0 for one per core.
         points: number of multiples of the set.
 
     Raises:
@@ -565,7 +584,9 @@ def robust_price(
 
 
 def subsample(carry: Carry) -> tuple[NDArray[np.intp], BoxMotion]:
-    """Return rows and motion of `SAMPLES` evenly spread samples of a carry, and of the samples with
-    its largest normal forces."""
+    """Return row indices and motion of some samples of a carry.
+
+    The samples are `SAMPLES` evenly spread ones and those with each robot's largest normal force.
+    """
     rows = np.union1d(evenly(len(carry), SAMPLES), carry.normal_force.argmax(axis=0))
     return rows, box_motion(carry).at(rows)

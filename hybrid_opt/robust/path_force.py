@@ -52,7 +52,7 @@ BELOW = -np.inf
 
 @dataclass(frozen=True)
 class PathPoints:
-    """n driven points of paths.
+    """n points of paths with path acceleration and squared path speed.
 
     Attributes:
         pose, first, second: (n, 6) box poses and their derivatives by u.
@@ -74,12 +74,12 @@ class PathPoints:
 
     @property
     def driven(self) -> tuple[Array, ...]:
-        """As `case_slopes_function` takes them."""
+        """Points in the form that `case_slopes_function` takes."""
         return self.pose, self.first, self.second, self.a, self.w
 
     @property
     def motion(self) -> BoxMotion:
-        """Poses and their time derivatives."""
+        """Box poses and their time derivatives at the points."""
         rate = self.first * np.sqrt(np.maximum(self.w, 0.0))[:, None]
         second = self.first * self.a[:, None] + self.second * self.w[:, None]
         return BoxMotion(self.pose, rate, second)
@@ -199,8 +199,8 @@ class GoverningForce:
     the directional derivative is the largest of theirs.
 
     Attributes:
-        force: [N].
-        samples: (k,) of the carry at which it is needed, one per governing case.
+        force: the force [N].
+        samples: (k,) samples of the carry that need this force, one per governing case.
     """
 
     def __init__(self, carry: Carry, leader: int) -> None:

@@ -110,8 +110,8 @@ class Squeeze:
         smoothing: half the width of the time window of the smoothing [s].
         parts: contributions to the largest commanded force, the least force first; their sum is
             that force.
-        holders: name of the pads or hands that hold the payload.
-        order: command to them, as in 'press with 80 N'.
+        holders: word for the pads or hands that hold the payload.
+        order: word for their command, as in 'press with 80 N'.
     """
 
     leader: int
@@ -124,7 +124,7 @@ class Squeeze:
 
     @property
     def force(self) -> float:
-        """Largest force that is commanded of the force-controlled arm [N]."""
+        """Largest commanded normal force of the force-controlled arm [N]."""
         return sum(part.force for part in self.parts)
 
     @property
@@ -155,8 +155,8 @@ def extra_normal_force(
     planned, or less than evenly pressing pads need in every case of the set, in motion or at rest.
 
     Args:
-        time: (n,) of the samples, not decreasing [s].
-        motion: of the box at the samples.
+        time: (n,) times of the samples, not decreasing [s].
+        motion: motion of the box at the samples.
         least: (n, 2) planned normal forces [N].
         itemised: state the contribution of each source of uncertainty; else one for all.
 
@@ -230,11 +230,12 @@ def _in_every_case(
 def largest_commanded(
     workcell: Workcell, motion: HeldMotion, planned: Array, uncertainty: Uncertainty, leader: int
 ) -> Array:
-    """Compute the largest forces (2,) of `commanded_forces` that hold a motion in every case of a
-    set [N], from the few samples that can attain them.
+    """Compute the largest of the `commanded_forces` (2,) that hold a motion in every case [N].
+
+    Only the few samples that can attain the largest forces are computed.
 
     Args:
-        planned: (n, 2) normal forces [N].
+        planned: (n, 2) planned normal forces [N].
 
     Raises:
         SettingsError: the uncertainty leaves no friction or patch.
@@ -252,8 +253,11 @@ def largest_commanded(
 def commanded_forces(
     workcell: Workcell, carry: Carry, settings: SqueezeSettings, itemised: bool = True
 ) -> tuple[Array, Squeeze]:
-    """Compute the normal forces (n, 2) to command of both robots along a carry [N], and their
-    origin; see `extra_normal_force`."""
+    """Compute the normal forces (n, 2) of both robots along a carry [N], and their origin.
+
+    The force-controlled arm's planned force rises by `extra_normal_force`, the leader's by this
+    times `ContactModel.internal_force_ratio`.
+    """
     held = carry.normal_force
     extra, squeeze = extra_normal_force(workcell, settings, carry.time, carry, held, itemised)
     together = command_model(workcell).internal_force_ratio(settings.leader)
