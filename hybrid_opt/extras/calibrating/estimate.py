@@ -57,10 +57,11 @@ class MeasuredHold:
     """A box held still, in means over a short time.
 
     Attributes:
-        pads: (2, 4, 4), the pads in the box frame.
-        gravity: (3,) in the box frame [m/s^2].
-        wrench: (2, 6) that acts on each arm, about its pad, along its axes, without offset.
-        mass: of the box, weighed [kg]; None where it was not.
+        pads: (2, 4, 4) poses of the pads in the box frame.
+        gravity: (3,) gravity in the box frame [m/s^2].
+        wrench: (2, 6) wrench on each arm about the arm's pad, along the pad's axes, without the
+            sensor's offset [N, N m].
+        mass: weighed mass of the box [kg]; None if the box was not weighed.
     """
 
     pads: Array
@@ -70,7 +71,7 @@ class MeasuredHold:
 
     @property
     def normal(self) -> Array:
-        """(2,) normal forces [N]."""
+        """Normal force (2,) of each arm [N]."""
         return -self.wrench[:, 2]
 
 
@@ -79,11 +80,11 @@ class Load:
     """Estimate from holds; standard deviations are infinite where the holds show nothing.
 
     Attributes:
-        mass: [kg].
-        centre: (3,) in the box frame [m].
-        crosstalk: (2, 2) of each arm along its pad's x and y [N/N].
-        deviations: (8,) of mass, centre and crosstalk, in this order.
-        residual: root mean square of the force that (1) leaves [N].
+        mass: mass of the box [kg].
+        centre: (3,) centre of mass in the box frame [m].
+        crosstalk: (2, 2) crosstalk of each arm's sensor along the pad's x and y [N/N].
+        deviations: (8,) standard deviations of mass, centre and crosstalk, in this order.
+        residual: root mean square of the residual force of Eq. (1) [N].
     """
 
     mass: float
@@ -99,12 +100,12 @@ class Load:
 
     @property
     def observable_centre(self) -> Array:
-        """(3,) True per axis of the box along which the holds determine the centre of mass."""
+        """True (3,) for each box axis along which the holds determine the centre of mass."""
         return np.asarray(self.deviations[1:4] <= SEEN_CENTRE)
 
     @property
     def observable_crosstalk(self) -> Array:
-        """(2, 2) True per crosstalk that the holds determine."""
+        """True (2, 2) for each number of crosstalk that the holds determine."""
         return np.asarray(self.deviations[4:].reshape(2, 2) <= SEEN_CROSSTALK)
 
 
@@ -112,8 +113,8 @@ def fit_load(holds: Sequence[MeasuredHold], moments: bool = True) -> Load:
     """Estimate the load and the crosstalk that explain holds best.
 
     Args:
-        holds: at least one.
-        moments: whether the sensors tell moments; without them nothing shows the centre of mass.
+        holds: at least one hold.
+        moments: True if the sensors measure moments; the centre of mass is unknown without them.
     """
     rows, values, forces = [], [], []
     for hold in holds:

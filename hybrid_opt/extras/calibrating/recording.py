@@ -50,11 +50,11 @@ class Labels:
     """Labels of a run in its side file, times on its clock [s].
 
     Attributes:
-        mass: of the box, weighed [kg]; None where it was not.
-        empty: whether no box was held at any time.
-        tare: instants at which both arms stood still and touched nothing.
-        held: from when to when the pads held the box without slip.
-        slip_at: instants at which it began to slip.
+        mass: weighed mass of the box [kg]; None if the box was not weighed.
+        empty: True if no box was held at any time.
+        tare: instants at which both arms stood still and touched nothing [s].
+        held: intervals in which the pads held the box without slip [s].
+        slip_at: instants at which the box began to slip [s].
     """
 
     mass: Annotated[float, quantity.MASS] | None = None
@@ -69,17 +69,17 @@ class Recording:
     """A run as it was recorded.
 
     Attributes:
-        name: of its file.
-        time: (n,) ascending [s].
-        steps: (2,) usual step of each arm's recording [s].
-        joints: (n, joints) of each arm [rad or m].
+        name: name of the file.
+        time: (n,) ascending times [s].
+        steps: (2,) usual time step of each arm's recording [s].
+        joints: joint positions (n, joints) of each arm [rad or m].
         wrench: (n, 2, 6) force and moment that act on each arm, in `frame` [N, N m]; moments are
             not finite where none were recorded.
         commanded: (n, 2) normal force [N]; not finite where none was recorded.
-        lost: from when to when an arm recorded nothing new, far longer than usual [s].
-        frame: one of `FRAMES`.
-        largest: (2,) force and moment that the sensors can measure [N, N m]; infinite if not said.
-        labels: see there.
+        lost: intervals, far longer than the usual step, without new samples of an arm [s].
+        frame: frame of the wrenches, one of `FRAMES`.
+        largest: (2,) largest measurable force and moment [N, N m]; infinite if not stated.
+        labels: labels of the side file.
     """
 
     name: str
@@ -119,11 +119,11 @@ class ArmLog:
     """Recording of one arm, at m samples.
 
     Attributes:
-        time: (m,) ascending [s].
-        joints: (m, joints) [rad or m].
-        wrench: (m, 6) that acts on the arm [N, N m].
-        commanded: (m,) normal force [N].
-        lost: from when to when it recorded nothing new [s].
+        time: (m,) ascending times [s].
+        joints: (m, joints) joint positions [rad or m].
+        wrench: (m, 6) wrench on the arm [N, N m].
+        commanded: (m,) commanded normal force [N].
+        lost: intervals without new samples [s].
     """
 
     time: Array
@@ -320,9 +320,9 @@ class Places:
     """Poses of both pads in a run, and the wrenches on them.
 
     Attributes:
-        pads: (n, 2, 4, 4), the pads in the world.
-        box: (n, 4, 4), the box between them: in the middle of where either pad puts it.
-        wrench: (n, 2, 6) that acts on each arm, about its pad and along the pad's axes [N, N m].
+        pads: (n, 2, 4, 4) poses of the pads in the world.
+        box: (n, 4, 4) poses of the box in the world: the middle of the poses by either pad.
+        wrench: (n, 2, 6) wrench on each arm about the arm's pad, along the pad's axes [N, N m].
     """
 
     pads: Array
@@ -331,7 +331,7 @@ class Places:
 
     @property
     def normal(self) -> Array:
-        """(n, 2) normal forces [N]."""
+        """Normal forces (n, 2) of both arms [N]."""
         return -self.wrench[:, :, 2]
 
 

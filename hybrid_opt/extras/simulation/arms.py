@@ -61,8 +61,9 @@ class ArmOutcome(Outcome):
     """Outcome of one simulation of a whole cell, at n moments; the slip only while it is held.
 
     Attributes:
-        normal_force, normal_force_reference: (n, 2) measured and commanded [N].
-        q: (n, all joints) [rad].
+        normal_force: (n, 2) measured normal force of each arm [N].
+        normal_force_reference: (n, 2) commanded normal force of each arm [N].
+        q: (n, all joints) joint positions of both arms [rad].
         tracking_error: (n, all joints) reference less position [rad].
         torque_use: (all joints,) largest torque of each joint over its largest allowed.
         box_position: (n, 3) of the box frame [m].

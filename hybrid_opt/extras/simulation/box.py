@@ -107,8 +107,8 @@ def bisected(
 
     Args:
         simulate: function of a factor that returns its outcome.
-        low, high: factors between which it is looked for.
-        steps: bisections.
+        low, high: factors at which the box slips, and at which it holds.
+        steps: number of bisections.
 
     Raises:
         WitnessError: the box holds at the lower or slips at the higher factor.

@@ -62,10 +62,10 @@ class BoxJob:
     """The job of the box.
 
     Attributes:
-        start: (6,) its first pose.
-        goal: (3,) wanted final position of its centre [m]; None if not checked.
-        held: interval in which the pads alone hold it, in which slip is measured [s].
-        stands: end of the time in which an unmodelled support holds it [s].
+        start: (6,) first pose of the box [m, rad].
+        goal: (3,) desired final position of the box centre [m]; None if not checked.
+        held: interval in which only the pads hold the box and slip is measured [s].
+        stands: time until which an unmodelled support holds the box [s].
     """
 
     start: Array
@@ -288,8 +288,8 @@ class ArmState:
 
     Attributes:
         error, error_rate: (n_joints,) reference less position, and its rate [rad, s].
-        jacobian: (6, n_joints) of the pad, linear velocities first, world axes.
-        normal: (3,) of the pad, into the box.
+        jacobian: (6, n_joints) Jacobian of the pad, linear velocities first, world axes.
+        normal: (3,) normal of the pad into the box, world axes.
         force: normal force, as measured or as both arms share it [N].
     """
 
