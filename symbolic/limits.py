@@ -27,18 +27,19 @@ class Limit:
     """One limit on the timing of a path.
 
     Attributes:
-        name: in messages, records and `hybrid_opt.timing.model.CarryLimits.ratios`.
-        symbol: in the compiled passes.
-        unit: of the limited quantity.
+        name: name in messages, records and `hybrid_opt.timing.model.CarryLimits.ratios`.
+        symbol: name of the limit in the compiled passes.
+        unit: unit of the limited quantity.
         expression: the limited ratio; its limit is 1.
-        group: limits that are tightened together.
-        scope: number of its values.
-        block: of `limit_layout` and of `symbolic.smooth.driven.driven_layout`.
-        option: field of `hybrid_opt.timing.records.TimingLimits` that switches it on, else ''.
-        path: quantity of the path whose first and, for accelerations, second derivative by u it
-            bounds: q, pose or angular of `symbolic.path_motion`; '' for a limit on forces.
-        carry: the quantity of a carry.
-        bound: field of the robots or of the payload with the largest value.
+        group: group of limits that are tightened together.
+        scope: whether the limit has one value per joint, per robot or for the payload.
+        block: name of a block in `limit_layout` and `symbolic.smooth.driven.driven_layout`.
+        option: field of `hybrid_opt.timing.records.TimingLimits` that switches the limit on, else
+            ''.
+        path: limited quantity of `symbolic.path_motion` (q, pose or angular), else ''. The limit
+            bounds its first derivative by u and, for accelerations, its second as well.
+        carry: name of the limited quantity in a carry, else ''.
+        bound: field of the robots or of the payload that states the largest value, else ''.
     """
 
     name: str
@@ -55,7 +56,7 @@ class Limit:
 
     @property
     def is_signed(self) -> bool:
-        """Return True if its quantity has both signs, each with the same limit."""
+        """Return True if the limited quantity has both signs, each with the same limit."""
         return self.block in ("acceleration", "torque")
 
 

@@ -49,10 +49,10 @@ BOX_OUTPUTS = (
 """Per sample of the box, world frame.
 
 rotation (9,): R_world_box row by row. angular_first, angular_second (3,): the angular velocity is
-angular_first u', the angular acceleration angular_first u'' + angular_second u'^2. normal (3,): of
-contact 1; contact 2 has its opposite. force_by_... (3,) [kg m]: the required force is
-force_by_acceleration u'' + force_by_speed u'^2 - m g. moment_by_... (3,) [kg m^2]: the required
-moment about the centre of mass, likewise, without a constant.
+angular_first u', the angular acceleration angular_first u'' + angular_second u'^2. normal (3,): the
+unit normal of contact 1; contact 2 has the opposite normal. force_by_... (3,) [kg m]: the required
+force is force_by_acceleration u'' + force_by_speed u'^2 - m g. moment_by_... (3,) [kg m^2]: the
+required moment about the centre of mass is moment_by_acceleration u'' + moment_by_speed u'^2.
 """
 
 ARM_OUTPUTS = (
@@ -75,12 +75,13 @@ torque_at_rest [N m]. wrench_torque (6 n,): the (n, 6) matrix, row by row, from 
 def path_motion_function(model: CellModel, samples: int) -> ca.Function:
     """Return decision vector x (n_var,) -> geometry of the carry at uniform samples of u in [0, 1].
 
-    Outputs (NumPy shapes, n samples): pose, pose_first, pose_second (n, 6), the box pose and its
-    derivatives by u; those of `BOX_OUTPUTS`; and per arm i = 1, 2 those of
-    `symbolic.robot.arm.TRACK_OUTPUTS` without the joint torque and of `ARM_OUTPUTS`, as q_i (n,
-    joints) and so on.
+    Outputs (NumPy shapes, n samples): pose, pose_first and pose_second (n, 6) are the box pose and
+    its first and second derivative by u. The names in `BOX_OUTPUTS` follow. The names in
+    `symbolic.robot.arm.TRACK_OUTPUTS` (without joint_torque) and in `ARM_OUTPUTS` follow for each
+    arm i = 1, 2, with the suffix _i: for example q_1 (n, joints).
 
     Args:
+        model: symbolic model of the cell.
         samples: number of samples, at least 3.
     """
     workcell = model.workcell
@@ -126,13 +127,17 @@ def start_posture(model: CellModel, arm: int, handed: Handed) -> ca.MX:
 def extended_motion(
     task: Task, x: ca.MX, basis: PathBasis, waypoints: ca.MX, handed: Handed = NONE
 ) -> list[ca.MX]:
-    """Return extended poses and their first and second derivative by u (6 + m, n), at the samples
-    of a basis.
+    """Return the extended poses and their first and second derivatives by u at n samples.
 
     Args:
+        task: task with m redundant joints.
         x: (n_var,) decision vector.
-        waypoints: (6, n_waypoints) of the box.
+        basis: spline basis at the n samples.
+        waypoints: (6, n_waypoints) box poses at the waypoints.
         handed: parameters of the task.
+
+    Returns:
+        Three matrices (6 + m, n): the extended poses, their first and their second derivatives.
     """
     whole = extended_matrix(task, x, waypoints, handed)
     matrices = (basis.position, basis.first, basis.second)
@@ -140,7 +145,11 @@ def extended_motion(
 
 
 def box_function(workcell: Workcell) -> ca.Function:
-    """Return `BOX_OUTPUTS` of one sample by the box pose and its derivatives by u."""
+    """Return the function that computes `BOX_OUTPUTS` of one sample.
+
+    Inputs: pose, first, second (6,), the box pose and its first and second derivative by u; then
+    the parameters of the payload.
+    """
     pose, first, second = (ca.SX.sym(name, 6) for name in ("pose", "first", "second"))
     payload = workcell.payload
     turned = workcell.task.orientation
@@ -167,10 +176,11 @@ def box_function(workcell: Workcell) -> ca.Function:
 def arm_derivative_function(
     robot: Robot, model: RobotModel, contact: Contact, name: str
 ) -> ca.Function:
-    """Return `ARM_OUTPUTS` of one sample.
+    """Return the function that computes `ARM_OUTPUTS` of one sample.
 
-    Inputs: q (n,) that holds the box at the pose; pose, first, second (6 + m,): the extended pose
-    and its derivatives by u.
+    Inputs: q (n,), the joints with which the arm holds the box at the pose; pose, first, second
+    (6 + m,), the extended pose and its first and second derivative by u; then the parameters of
+    the robot.
     """
     n = model.n_joints
     q, names = ca.SX.sym("q", n), ("pose", "first", "second")

@@ -1,9 +1,9 @@
 """Refinement of a task's path: free waypoints between those of the file, on the same spline.
 
-The pieces between the stated waypoints are halved, or cut into more, by free waypoints. The path's
-knots are uniform and its spline's end conditions do not depend on them, so that every path through
-the stated waypoints is one through all of them, to the bit at the stated ones. Searches draw the
-stated waypoints; a polish moves all of them.
+A piece is the path between two stated waypoints, those of the file. Free waypoints cut each piece
+into `Task.pieces` equal parts. The knots are uniform and the end conditions do not depend on them.
+Every path through the stated waypoints is therefore also a path of the refined task. Searches draw
+the stated waypoints; a polish moves all waypoints.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from symbolic.records.task import RedundantJoint, Task, Waypoint, extended_waypo
 
 
 def refined_task(task: Task) -> Task:
-    """Return a task with the waypoints of its pieces, between those of its file.
+    """Return the task with free waypoints added between the waypoints of its file.
 
-    Bounds hold every path that the stated ones allow.
+    The bounds of the added waypoints admit every path that the bounds in the file admit.
     """
     n = len(task.waypoints)
     by = _through(n, (n - 1) * task.pieces + 1)
@@ -73,21 +73,25 @@ def _with_waypoints(
 
 
 def coarse_entries(task: Task) -> NDArray[np.intp]:
-    """Return the indices (n_path of the coarse task,) of the path variables that belong to
-    waypoints of the file."""
+    """Return the indices of the path variables that belong to waypoints of the file.
+
+    Returns:
+        Integer array with one index per path variable of the coarse task.
+    """
     return np.flatnonzero(task.free_entries[0] % task.pieces == 0)
 
 
 def hierarchical_basis(task: Task) -> tuple[Array, Array]:
-    """Compute a hierarchical basis of the path variables: moves of coarse waypoints, then of finer
-    ones.
+    """Compute a hierarchical basis of the path variables, from coarse to fine waypoints.
 
-    The grid of stated waypoints is refined, by halves as long as that is possible. A move of a
-    waypoint takes along those of finer grids, on the path through the grid where it is first.
+    The grid of stated waypoints is refined in steps, by halves as long as that is possible. Each
+    waypoint belongs to the coarsest grid that contains the waypoint. A move of a waypoint also
+    moves all waypoints of finer grids: they stay on the spline through the waypoint's grid.
 
     Returns:
-        (n_path, n_path) effect of each move, and (n_path,) the square of the spacing of each
-        move's grid, in that of the stated ones: accelerations for equal moves go by its inverse.
+        (n_path, n_path) matrix whose column j is the change of all path variables for a unit move
+        of variable j; and (n_path,) squared grid spacing of each variable, relative to the spacing
+        of the stated waypoints. Accelerations for equal moves are proportional to its inverse.
     """
     (rows, columns), m = task.free_entries, len(task.waypoints)
     by, square = np.zeros((task.n_path, task.n_path)), np.zeros(task.n_path)
@@ -109,10 +113,18 @@ def _steps(pieces: int) -> list[int]:
 
 
 def resample_decisions(x: Array, source: Task, target: Task) -> Array:
-    """Convert decision vectors (n, n_path or more) of one task to the waypoints of another: the
-    same paths if the target has all waypoints of the source, else paths through the common ones.
+    """Convert decision vectors of one task to the waypoints of another task.
 
-    What follows the path, a force limit, stays.
+    The paths stay the same if the target has all waypoints of the source. Otherwise the new paths
+    pass through the common waypoints. Path variables are clipped to the bounds of the target.
+
+    Args:
+        x: (n, source.n_path or more) decision vectors; entries after the path variables are kept.
+        source: task of x.
+        target: task of the result.
+
+    Returns:
+        (n, target.n_path or more) decision vectors.
     """
     x = np.atleast_2d(x)
     if len(source.waypoints) == len(target.waypoints):
