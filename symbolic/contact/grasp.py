@@ -70,14 +70,15 @@ class Grasp:
         robots: index of each pad's robot.
         patches, cell_sizes, given: see `symbolic.contact.central_path.ConvexProgram`.
         friction: (2,) coefficients of the robots' pads.
-        numbers: the other constants in the formulas.
+        numbers: derived constants of the grasp.
     """
 
     def __init__(self, workcell: Workcell, numbers: GraspNumbers | None = None) -> None:
-        """Derive the constants, unless they are given or symbols of the cell.
+        """Derive the constants of the grasp, unless `numbers` or the workcell states them.
 
         Args:
-            numbers: constants of the grasp, if known.
+            workcell: cell with the pads, the payload and the friction coefficients.
+            numbers: constants of the grasp; None to take or derive them from the workcell.
 
         Raises:
             SettingsError: no internal squeeze exists.

@@ -30,7 +30,7 @@ class PathBasis:
     Attributes:
         parameter: (n,) path parameter u of every sample.
         position: (n, n_waypoints), value of the spline.
-        first, second: (n, n_waypoints), its first and second derivative with respect to u.
+        first, second: (n, n_waypoints), first and second derivative of the spline by u.
     """
 
     parameter: Array
@@ -55,7 +55,12 @@ def path_basis(n_waypoints: int, parameter: Array) -> PathBasis:
 
 
 def path_position(n_waypoints: int, parameter: Array) -> Array:
-    """Compute `PathBasis.position` only."""
+    """Compute the matrix (n, n_waypoints) from waypoints to path positions at n values of u.
+
+    Args:
+        n_waypoints: number of waypoints, at least 2.
+        parameter: (n,) values of u in [0, 1].
+    """
     if n_waypoints == 2:
         return path_basis(n_waypoints, parameter).position
     return np.ascontiguousarray(_natural_splines(n_waypoints)[0](parameter), dtype=float)
@@ -92,12 +97,15 @@ def _fixed(task: Task, value: Any, x: Expression, handed: Handed) -> Expression:
 
 
 def waypoint_matrix(task: Task, x: Expression, handed: Handed = NONE) -> Expression:
-    """Compute all waypoints (6, n_waypoints) from the decision vector (paper Eq. 17), angles
-    unwrapped.
+    """Compute all waypoints from the decision vector, with unwrapped angles (paper Eq. 17).
 
     Args:
-        x: (n_var,) free waypoints in path order, each a pose.
-        handed: the task's numbers.
+        task: task that states the fixed waypoints.
+        x: (n_var,) decision vector; it starts with the poses of the free waypoints in path order.
+        handed: parameters of the task as inputs of a function of MX, if there are any.
+
+    Returns:
+        (6, n_waypoints) box poses: positions [m], orientations [rad].
     """
     columns = []
     taken = 0
@@ -118,13 +126,16 @@ def waypoint_matrix(task: Task, x: Expression, handed: Handed = NONE) -> Express
 def extended_matrix(
     task: Task, x: Expression, waypoints: Expression, handed: Handed = NONE
 ) -> Expression:
-    """Compute the extended waypoints (6 + m, n_waypoints): the redundant joints' values below the
-    poses.
+    """Compute the extended waypoints: box poses, and below them the redundant joints.
 
     Args:
+        task: task with m redundant joints.
         x: (n_var,) decision vector.
-        waypoints: (6, n_waypoints) from `waypoint_matrix`.
-        handed: the task's numbers.
+        waypoints: (6, n_waypoints) box poses from `waypoint_matrix`.
+        handed: parameters of the task as inputs of a function of MX, if there are any.
+
+    Returns:
+        (6 + m, n_waypoints) poses and redundant joint positions.
     """
     if not task.redundant:
         return waypoints

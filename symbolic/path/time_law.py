@@ -1,16 +1,15 @@
 """Time laws: the time of each sample, and the velocity and acceleration of the box there.
 
-`constant` is the paper's (Eqs. 22-26): every step takes its length over the reference speed,
-velocity and acceleration are second-order finite differences on those times, one-sided at the
-ends. It starts and stops at full speed, which no robot can do. The paper gives a pure rotation
-no time at all; here a step takes at least the time that its rotation needs at the reference
-angular speed.
+`constant` is the law of the paper (Eqs. 22-26). The duration of a step is its length over the
+reference speed. Velocity and acceleration are second-order finite differences, one-sided at the
+ends. The box starts and stops at full speed, which no robot can do. The paper gives a pure rotation
+no time; here a step takes at least its rotation angle over the reference angular speed.
 
-`ramped` drives the same geometry from rest to rest: the speed rises by a smooth cubic step to
-the reference speed, cruises, and falls again; derivatives are exact.
+`ramped` moves the box along the same path from rest to rest. The speed rises by a smooth cubic step
+to the reference speed, stays constant, and falls again. Derivatives are exact.
 
-`optimal` is no expression: a solver finds how the path is driven (`hybrid_opt.timing`), and
-`driven_path` takes what it found.
+`optimal` is no expression: a solver (`hybrid_opt.timing`) finds the times and path speeds, and
+`driven_path` computes the motion from them.
 """
 
 from __future__ import annotations
@@ -58,13 +57,15 @@ def timed_path(
     rounding: ca.MX | None = None,
     handed: Handed = NONE,
 ) -> TimedPath:
-    """Compute the poses at the samples of `basis` with the task's time law.
+    """Compute the box motion at the samples of `basis` with the task's time law.
 
     Args:
-        waypoints: (6, n_waypoints) from `symbolic.path.spline.waypoint_matrix`.
-        rounding: share of a step's duration by which the constant-speed law's kink is rounded,
-            where rotation takes over from translation; None for none.
-        handed: the task's numbers.
+        task: task that states the time law and the reference speeds.
+        basis: spline basis at the samples.
+        waypoints: (6, n_waypoints) box poses from `symbolic.path.spline.waypoint_matrix`.
+        rounding: relative width that smooths the maximum of translation and rotation time in the
+            `constant` law; None for the exact maximum.
+        handed: parameters of the task as inputs of a function of MX, if there are any.
     """
     pose = ca.mtimes(waypoints, ca.DM(basis.position.T))
     if task.law.has_differences:
@@ -77,10 +78,11 @@ def timed_path(
 def driven_path(
     basis: PathBasis, waypoints: ca.MX, time: ca.MX, speed: ca.MX, acceleration: ca.MX
 ) -> TimedPath:
-    """Compute the poses at the samples of `basis`, with times and path speeds from a solver.
+    """Compute the box motion at the samples of `basis`, with times and path speeds from a solver.
 
     Args:
-        waypoints: (6, n_waypoints) from `symbolic.path.spline.waypoint_matrix`.
+        basis: spline basis at the samples.
+        waypoints: (6, n_waypoints) box poses from `symbolic.path.spline.waypoint_matrix`.
         time, speed, acceleration: (1, n) times [s], u' [1/s] and u'' [1/s^2] of the samples.
     """
     pose, first, second = (
