@@ -81,8 +81,11 @@ class InternalForce:
 
 
 def closing_squeeze(workcell: Workcell) -> InternalForce | None:
-    """Find an internal squeeze for a friction at the geometric mean of the nominal and the least
-    one that closes the grasp. Return None for a grasp that is not closed with `SPARE_FRICTION`."""
+    """Find an internal squeeze of the grasp; return None if `SPARE_FRICTION` does not close it.
+
+    The squeeze is found for the geometric mean of two frictions: the nominal friction and the least
+    friction that closes the grasp.
+    """
     if _balanced_states(workcell, SPARE_FRICTION) is None:
         return None
     low, high = LEAST_SQUEEZE_SHARE, SPARE_FRICTION
@@ -106,9 +109,12 @@ def has_force_closure(workcell: Workcell) -> bool:
 
 
 def equal_pressure_rows(workcell: Workcell) -> Array:
-    """Return rows (k, pads) of coefficients of normal forces whose sums are zero: pads of one arm
-    with the same normal press with equal pressure, because the arm keeps the orientation of their
-    common plane. Pads of one arm with different normals press as the motion requires."""
+    """Return the matrix (k, pads) whose product with the pads' normal forces is zero.
+
+    Each row states that two pads of one arm with the same normal press with equal pressure: the arm
+    keeps the orientation of their common plane. Pads with different normals press as the motion
+    requires.
+    """
     pads, robots, rows = workcell.pads, workcell.pad_robots, []
     for k in range(1, len(pads)):
         first = robots.index(robots[k])
