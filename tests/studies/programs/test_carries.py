@@ -67,7 +67,7 @@ def test_the_force_is_that_of_the_exported_job(
 ) -> None:
     """Timed within its force limit and the cell's limits on jerk, and lifted."""
     cell = ho.example("rack").drivable()
-    x = cell.initial
+    x = cell.initial.copy()
     x[-1] = 60.0
     path = tmp_path / "t.json"
     write_trajectory(path, cell.compiled, x, {}, {"algorithm": "hand"})

@@ -300,8 +300,11 @@ def test_tables_of_carries_have_the_recommended_one(data: ReportData) -> None:
     assert all(row[0].endswith(" [mm]") for row in rooms)
     patch = data.workcell.contacts[0]
     assert [float(row[1]) for row in rooms] == [pytest.approx(1e3 * free_shift(patch))] * 2
-    # A carry that is driven lifts off nowhere, and shifts the pressure somewhat.
-    assert all(0.0 < float(row[-1].split()[0]) < float(row[1]) for row in rooms)
+    # No pad lifts off; a carry that turns the payload shifts the pressure, others need not.
+    left = np.array([[float(entry.split()[0]) for entry in row[1:]] for row in rooms])
+    assert (left > 0.0).all()
+    assert (left <= left[:, :1]).all()
+    assert (left < left[:, :1]).any()
     for name in ("table2_selected", "time_against_force", "jerk", "timing", "phases"):
         assert any(row[0].startswith("recommended") for row in tables[name].rows), name
     (row,) = (row for row in tables["jerk"].rows if row[0] == "recommended")

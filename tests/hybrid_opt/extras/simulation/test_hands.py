@@ -17,7 +17,7 @@ from hybrid_opt.extras.simulation.hands import (
     lip_points,
     swing_frequency,
 )
-from studies.research.hand_thresholds import KINDS, carry_along, draw, needed_force, threshold
+from studies.research.hand_carries import KINDS, carry_along, draw, needed_force, threshold
 from symbolic.contact.elastic import kern
 from symbolic.errors import SettingsError
 from symbolic.records import Contact, Workcell

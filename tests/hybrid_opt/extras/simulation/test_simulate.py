@@ -27,7 +27,7 @@ from hybrid_opt.extras.simulation.scene import (
 from hybrid_opt.robust.cases import nominal_case
 from hybrid_opt.robust.force import robust_model
 from hybrid_opt.robust.squeeze import SqueezeSettings, commanded_forces
-from studies.research.hand_thresholds import carry_along
+from studies.research.hand_carries import carry_along
 from studies.study.simulation import MOST_SAMPLES, stored_simulation
 from symbolic.array import Array
 from symbolic.contact.load import load_function

@@ -1,0 +1,227 @@
+"""Carries in hands that hold by themselves: their holding forces, simulated and by the model."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import cycle, islice
+from pathlib import Path
+
+import numpy as np
+
+from hybrid_opt.carry import ArmMotion, Carry
+from hybrid_opt.extras.simulation.box import bisected, carriage_motion
+from hybrid_opt.extras.simulation.hands import (
+    HAND_SETTINGS,
+    HandSimulation,
+    swing_frequency,
+)
+from hybrid_opt.robust.force import box_motion, interpreted_robust_model
+from studies.research.plain.motion import angular_rates
+from symbolic.array import Array
+from symbolic.read.cell import load
+from symbolic.records import Contact, Workcell
+from symbolic.records.cell import HandKind
+from symbolic.records.poses import transform
+
+CELL = Path(__file__).parents[1] / "workcells" / "palletising.toml"
+"""Whose payload and hands are exchanged; its arms do not matter."""
+
+KINDS = ("cups above", "cups beside", "magnets", "fingers")
+
+QUINTIC_SAMPLES = 101
+
+SWINGS = 15.0
+"""How often a payload swings on its layers in a carry, at least; the model is of layers that do not
+swing."""
+
+LOW, HIGH, BISECTIONS = 0.5, 1.5, 7
+"""Factors between which a threshold is looked for, to 0.4 %."""
+
+
+@dataclass(frozen=True)
+class HandThreshold:
+    """What the simulator says of one carry.
+
+    Attributes:
+        kind: of the hands, one of `KINDS`.
+        hands: how many.
+        swings: how often the payload would swing on its layers in the carry.
+        needed: holding force that the contact model asks for [N].
+        ratio: least holding force in the simulator over it.
+        lifts: whether a rim lifts below that; else something slips.
+    """
+
+    kind: str
+    hands: int
+    swings: float
+    needed: float
+    ratio: float
+    lifts: bool
+
+    def __str__(self) -> str:
+        return (
+            f"{self.kind:12} {self.hands:5} {self.swings:7.1f} {self.needed:9.2f} N "
+            f"{self.ratio:7.3f}  {'lifts' if self.lifts else 'slips'}"
+        )
+
+
+def draw(kind: str, rng: np.random.Generator, least_swings: float = SWINGS) -> Carry:
+    """Draw a payload in hands of a kind and its carry, among those that swing often enough."""
+    while True:
+        workcell = _draw_cell(kind, rng)
+        turned = rng.uniform(-0.4, 0.4, 3) * rng.integers(0, 2)
+        path = np.concatenate([rng.uniform(-0.4, 0.4, 3), turned])
+        carry = carry_along(workcell, path, rng.uniform(0.8, 1.6))
+        if swing_frequency(workcell) * carry.duration >= least_swings:
+            return carry
+
+
+def needed_force(carry: Carry) -> float:
+    """Compute the holding force that the contact model asks of the hands of a carry [N]."""
+    model = interpreted_robust_model(carry.workcell)
+    return float(model.nominal(box_motion(carry)).max())
+
+
+def threshold(kind: str, carry: Carry) -> HandThreshold:
+    """Find the least holding force of a carry in the simulator."""
+    workcell = carry.workcell
+    needed = needed_force(carry)
+    simulate = partial(
+        HandSimulation(workcell).simulate, carriage_motion(carry, HAND_SETTINGS), needed
+    )
+    found = bisected(simulate, LOW, HIGH, BISECTIONS)
+    return HandThreshold(
+        kind,
+        len(workcell.pads),
+        swing_frequency(workcell) * carry.duration,
+        needed,
+        found.factor,
+        found.slips.lifts,
+    )
+
+
+def carry_along(workcell: Workcell, path: Array, duration: float) -> Carry:
+    """Return a carry from rest to rest by path (6,), a pose's change, with as yet no forces.
+
+    The motion is the quintic 10 s^3 - 15 s^4 + 6 s^5.
+    """
+    s = np.linspace(0.0, 1.0, QUINTIC_SAMPLES)
+    place = 10 * s**3 - 15 * s**4 + 6 * s**5
+    speed = (30 * s**2 - 60 * s**3 + 30 * s**4) / duration
+    growth = (60 * s - 180 * s**2 + 120 * s**3) / duration**2
+    start = np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
+    pose, rate, second = (
+        start + np.outer(place, path),
+        np.outer(speed, path),
+        np.outer(growth, path),
+    )
+    turning = [
+        angular_rates(*rows) for rows in zip(pose[:, 3:], rate[:, 3:], second[:, 3:], strict=True)
+    ]
+    none = np.zeros((QUINTIC_SAMPLES, 6))
+    arm = ArmMotion(none, none, none, none, none)
+    return Carry(
+        workcell=workcell,
+        x=np.zeros(1),
+        timing="limits",
+        parameter=s,
+        time=duration * s,
+        pose=pose,
+        rate=rate,
+        second_rate=second,
+        angular_velocity=np.array([omega for omega, _ in turning]),
+        angular_acceleration=np.array([alpha for _, alpha in turning]),
+        normal_force=np.zeros((QUINTIC_SAMPLES, 2)),
+        tangential_force=np.zeros((QUINTIC_SAMPLES, 2)),
+        contact_force=np.zeros((QUINTIC_SAMPLES, 2, 3)),
+        pressure_shift=np.zeros((QUINTIC_SAMPLES, 2)),
+        point_moment_residual=np.zeros((QUINTIC_SAMPLES, 3)),
+        moment_residual=np.zeros((QUINTIC_SAMPLES, 3)),
+        arms=(arm, arm),
+    )
+
+
+def _draw_cell(kind: str, rng: np.random.Generator) -> Workcell:
+    """Draw a payload of 3 to 15 kg and the hands of two arms at opposite sides or edges of it."""
+    is_plate = kind == "fingers"
+    lower, upper = ([0.3, 0.4, 0.004], [0.6, 0.8, 0.02]) if is_plate else ([0.3] * 3, [0.6] * 3)
+    size = rng.uniform(lower, upper)
+    if kind != "cups beside":
+        size[2] *= 0.6 if not is_plate else 1.0
+    mass = rng.uniform(3.0, 8.0 if is_plate else 15.0)
+    friction, radius = rng.uniform(0.3, 0.7), rng.uniform(0.02, 0.04)
+    half = np.array([rng.uniform(0.02, 0.04), rng.uniform(0.01, 0.02)])
+    apart = rng.uniform(1.2, 3.0) * radius
+    arms = []
+    for side in (1.0, -1.0):
+        along = rng.uniform(-0.1, 0.1) * size[0]
+        if is_plate:
+            edge = side * (size[1] / 2.0 - 1.2 * half[1])
+            places = [([along, edge, z * size[2] / 2.0], [0.0, 0.0, -z]) for z in (1.0, -1.0)]
+        elif kind == "cups beside":
+            height = rng.uniform(-0.1, 0.3) * size[2]
+            places = [
+                ([x, side * size[1] / 2.0, height], [0.0, -side, 0.0]) for x in (apart, -apart)
+            ]
+        else:
+            inwards = apart + 1.1 * radius + rng.uniform(0.0, 0.05)
+            centre = side * (size[1] / 2.0 - inwards)
+            rows = (apart, -apart) if kind == "cups above" else (0.0,)
+            down, top = [0.0, 0.0, -1.0], size[2] / 2.0
+            places = [([along + x, centre + y, top], down) for x in (apart, -apart) for y in rows]
+        sort: HandKind = "cup"
+        if kind in ("magnets", "fingers"):
+            sort = "magnet" if kind == "magnets" else "fingers"
+        hands = [
+            Contact(
+                transform(_axes(np.array(normal)), np.array(place)),
+                friction,
+                float(np.hypot(*half)) if is_plate else radius,
+                half_sides=(float(half[0]), float(half[1])) if is_plate else None,
+                kind=sort,
+                holding_force=1.0,
+            )
+            for place, normal in places
+        ]
+        arms.append(replace(hands[0], further=tuple(hands[1:])))
+    inertia = mass / 12.0 * np.diag(size[[1, 2, 0]] ** 2 + size[[2, 0, 1]] ** 2)
+    cell = load(CELL)
+    payload = replace(
+        cell.payload,
+        size=size,
+        mass=mass,
+        centre_of_mass=rng.uniform(-0.06, 0.06, 3) * size,
+        inertia=inertia,
+    )
+    return replace(cell, payload=payload, contacts=(arms[0], arms[1]))
+
+
+def _axes(normal: Array) -> Array:
+    """Return axes (3, 3) with z along a normal and x along that of the payload."""
+    x = np.array([1.0, 0.0, 0.0])
+    return np.column_stack([x, np.cross(normal, x), normal])
+
+
+def summary(found: Sequence[HandThreshold]) -> str:
+    """Return one line about all ratios."""
+    ratios = np.array([one.ratio for one in found])
+    return (
+        f"{len(found)} carries: ratio {ratios.min():.3f} to {ratios.max():.3f}, median "
+        f"{np.median(ratios):.3f}; {int(((ratios >= 0.80) & (ratios <= 1.02)).sum())} within 0.80 "
+        "to 1.02"
+    )
+
+
+def thresholds(options: argparse.Namespace) -> int:
+    """Print the threshold of every carry; returns the exit code."""
+    print("hands        count  swings     needed     ratio  below it")
+    found = []
+    for k, kind in enumerate(islice(cycle(KINDS), options.carries)):
+        carry = draw(kind, np.random.default_rng([options.seed, k]), options.swings)
+        found.append(threshold(kind, carry))
+        print(found[-1], flush=True)
+    print(summary(found))
+    return 0
