@@ -91,7 +91,7 @@ def hierarchical_basis(task: Task) -> tuple[Array, Array]:
     Returns:
         (n_path, n_path) matrix whose column j is the change of all path variables for a unit move
         of variable j; and (n_path,) squared grid spacing of each variable, relative to the spacing
-        of the stated waypoints. Accelerations for equal moves are proportional to its inverse.
+        of the stated waypoints. Accelerations of equal moves are inversely proportional to it.
     """
     (rows, columns), m = task.free_entries, len(task.waypoints)
     by, square = np.zeros((task.n_path, task.n_path)), np.zeros(task.n_path)
@@ -116,7 +116,7 @@ def resample_decisions(x: Array, source: Task, target: Task) -> Array:
     """Convert decision vectors of one task to the waypoints of another task.
 
     The paths stay the same if the target has all waypoints of the source. Otherwise the new paths
-    pass through the common waypoints. Path variables are clipped to the bounds of the target.
+    pass through the common waypoints, and path variables are clipped to the bounds of the target.
 
     Args:
         x: (n, source.n_path or more) decision vectors; entries after the path variables are kept.
